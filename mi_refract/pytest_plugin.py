@@ -53,7 +53,7 @@ def assert_image_unbiased() -> Callable[..., Comparison]:
     ) -> Comparison:
         __tracebackhide__ = True
         if runs < 2:
-            raise ValueError(f"runs = {runs}; expected at least 2, or the noise is not known")
+            raise ValueError(f"runs = {runs}; expected at least 2, to estimate the noise")
 
         from mi_refract.image_diff.file_pair import read_renders
 

@@ -73,7 +73,7 @@ def _command(
         list[str] | None,
         typer.Argument(
             metavar="STUDY",
-            help=f"Studies to run: {', '.join(ROOMS)}. Default: all; of the profile quick, a selection.",
+            help=f"Studies to run: {', '.join(ROOMS)}. Default: all studies; in the profile quick, a selection.",
         ),
     ] = None,
     profile: Annotated[
@@ -107,7 +107,9 @@ def _command(
     if profile not in PROFILES:
         raise Misuse(f"unknown profile {profile!r}; expected {', '.join(PROFILES)}")
     if write_tables and profile == "quick":
-        raise Misuse("--write-tables with the profile 'quick'; expected --profile standard, --profile full")
+        raise Misuse(
+            "--write-tables needs more than the profile 'quick'; expected --profile standard or --profile full"
+        )
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -136,9 +138,9 @@ def _join(folders: list[Path], studies: list[str], target: ClusterTarget) -> Non
     if not folders:
         return
     if studies and "suite" not in studies:
-        raise Misuse(f"--renderer {folders[0]} without suite; expected the study suite")
+        raise Misuse(f"--renderer {folders[0]} is used by the study `suite` only; add `suite`")
     if target.given:
-        raise Misuse(f"--renderer {folders[0]} with workers, which do not have it; expected no workers")
+        raise Misuse(f"--renderer {folders[0]} cannot be sent to workers; remove --workers or --scheduler")
     from validation.suite import rendered_images
     from validation.suite.renderers import table
 

@@ -65,7 +65,9 @@ SAMPLE_MUELLER = limit(6, "radicand errors: one on either side of the boundary, 
 # √(1 − 2x) ≥ 0.025, so while condition · u ≤ 0.487.
 MIRAGE = limit(2.0, "error of the cosine over condition · u, as long as condition · u ≤ FIRST_ORDER")
 FIRST_ORDER = limit(0.487, "condition · u up to which the bound of first order holds")
-LIGHT_PIPE = limit(1.0, "each total internal reflection keeps the error so far and adds at most u: only signs change")
+LIGHT_PIPE = limit(
+    1.0, "each total internal reflection keeps the accumulated error and adds at most u: only signs change"
+)
 SYSTEM = limit(1.0, "the condition counts u for every rounding; inputs take √3/2 of it, a form at the limit 0.8724")
 PRINT = limit(1.0, "what printing rounds to: 11 surfaces of 20u each, u = 2⁻⁵³, are far below CODE V's digits")
 
@@ -118,7 +120,7 @@ EDIT = limit(
 FROZEN = limit(1e-5, "of a pixel: the order in which samples are added up")
 
 STOPPED_WRONGLY = limit(1e-3, "probability of more renders beyond the error that they ended by, if it is below 5 %")
-PASSES_TIME = limit(1.03, "over one call of `mi.render`: each pass is traced anew, and its samples are read again")
+PASSES_TIME = limit(1.03, "over one call of `mi.render`: each pass is traced again, and its samples are read again")
 
 # Efficiency ----------------------------------------------------------------------------------------------------
 

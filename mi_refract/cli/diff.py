@@ -56,23 +56,30 @@ def _print_methods(wanted: bool) -> None:
 
 
 Names = Annotated[
-    list[str] | None, typer.Argument(metavar="NAME", help="Only these images: paths in the folders, * and ?.")
+    list[str] | None,
+    typer.Argument(metavar="NAME", help="Only these images: paths in the folders (wildcards: * and ?)."),
 ]
 Method = Annotated[str, typer.Option(help=f"Comparison method: {'|'.join((AUTO, *METHODS))}; see --methods.")]
 Set = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help=f"A key of [defaults] in {FILE}, but map, for all images; see --methods."),
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help=f"Set a key of [defaults] in {FILE}, except map, for all images; see --methods.",
+    ),
 ]
 Idiff = Annotated[
     str | None,
-    typer.Option("--idiff", metavar="FLAGS", help="Flags of OpenImageIO's idiff: --method tolerance with them."),
+    typer.Option("--idiff", metavar="FLAGS", help="Use --method tolerance with these flags of OpenImageIO's idiff."),
 ]
 File = Annotated[
     Path | None,
-    typer.Option(metavar="FILE.toml", help=f"Settings of single images; by default {FILE} beside the references."),
+    typer.Option(
+        metavar="FILE.toml", help=f"File with settings of images. Default: {FILE} in the folder of the references."
+    ),
 ]
 MaxValues = Annotated[
-    int, typer.Option("--max-values", metavar="N", min=1, help="Width × height × channels of an image, at most.")
+    int, typer.Option("--max-values", metavar="N", min=1, help="Largest image to read: width × height × channels.")
 ]
 
 
@@ -90,13 +97,13 @@ def diff(
     max_values: MaxValues = MAX_VALUES,
     renders: Annotated[bool, typer.Option("--renders", help="Each folder holds several renders of one image.")] = False,
     inconclusive: Annotated[
-        Inconclusive | None, typer.Option(help="What an inconclusive image counts as; exit code 3 by default.")
+        Inconclusive | None, typer.Option(help="Count an inconclusive image as pass or fail. Default: exit code 3.")
     ] = None,
     report: Annotated[
         str,
         typer.Option(
             metavar="OUT.html|FOLDER/",
-            help="Write an HTML page with the images; a folder has them all, one page a pair.",
+            help="Write an HTML page with the images, or a folder with one page per pair.",
         ),
     ] = "",
     report_url: Annotated[
@@ -104,13 +111,13 @@ def diff(
         typer.Option(
             metavar="URL",
             envvar="MI_REFRACT_REPORT_URL",
-            help="Where the report will be published, for the job's summary; below URL/ every page is linked.",
+            help="Address of the published report, for links in the job's summary; URL/ links every page.",
         ),
     ] = "",
     junit: Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")] = None,
     json: Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")] = None,
     github: Annotated[
-        bool, typer.Option("--github", help="Print GitHub annotations, write the job's summary.")
+        bool, typer.Option("--github", help="Print GitHub annotations and write the job's summary.")
     ] = False,
     methods: Annotated[
         bool,
@@ -176,9 +183,11 @@ def diff(
 def accept(
     reference: Annotated[
         Path | None,
-        typer.Argument(help="As for diff; with --from optional: by default the paths that were compared."),
+        typer.Argument(metavar="REFERENCE", help="As for diff. Optional with --from; default: the compared paths."),
     ] = None,
-    test: Annotated[Path | None, typer.Argument(help="As for diff; with --from optional, as REFERENCE.")] = None,
+    test: Annotated[
+        Path | None, typer.Argument(metavar="TEST", help="As for diff. Optional with --from, like REFERENCE.")
+    ] = None,
     names: Names = None,
     method: Method = AUTO,
     options: Set = None,
@@ -187,18 +196,20 @@ def accept(
     max_values: MaxValues = MAX_VALUES,
     source: Annotated[
         Path | None,
-        typer.Option("--from", metavar="OUT.json", help="What diff --json wrote: exactly the images that it compared."),
+        typer.Option(
+            "--from", metavar="OUT.json", help="Accept exactly the images that diff --json OUT.json compared."
+        ),
     ] = None,
     as_variant: Annotated[
         str,
         typer.Option(
             metavar="NAME",
-            help="Keep the references: the new images become further ones, named by `accept` of the settings.",
+            help="Keep the references; add the new images as further ones, named by `accept` in the settings.",
         ),
     ] = "",
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
 ) -> None:
-    """Show which images are not equal to their references, ask, and copy them over. Nothing is deleted."""
+    """Copy new images over references that they are not equal to, after confirmation. Nothing is deleted."""
     require_extra("scipy")
     from mi_refract.image_diff import accept as accepting
 
@@ -206,9 +217,11 @@ def accept(
         from mi_refract.image_diff import results_file
 
         if (reference is None) != (test is None):
-            raise ValueError(f"{reference}: one path; expected with --from both folders before any names, or none")
+            raise ValueError(
+                f"{reference}: only one path; with --from, give both folders before any names, or no folder"
+            )
         if options or method != AUTO or idiff is not None:
-            raise ValueError("--from takes what was compared; expected no --method, --set or --idiff")
+            raise ValueError("--from repeats an earlier comparison; do not combine it with --method, --set or --idiff")
         results = results_file.read(source, reference, test)
         results = replace(results, results=tuple(pairing.named(results.results, names or [])))
         results = results_file.with_settings(
@@ -234,7 +247,7 @@ def accept(
         print("nothing to accept")
         return
     if not yes and not sys.stdin.isatty():
-        raise ValueError("accept asks on a terminal only; elsewhere expected --yes")
+        raise ValueError("accept asks for confirmation on a terminal; without a terminal, pass --yes")
     if not yes and not typer.confirm(f"Accept {len(copies)} as the reference{'' if len(copies) == 1 else 's'}?"):
         print("nothing accepted")
         raise typer.Exit(1)

@@ -139,7 +139,10 @@ def run(
     context: typer.Context,
     command: Annotated[
         list[str] | None,
-        typer.Argument(metavar="-- COMMAND", help="Reads rays from stdin, writes answers to stdout, as CSV."),
+        typer.Argument(
+            metavar="-- COMMAND",
+            help="The command to run; it reads rays from stdin and writes answers to stdout, as CSV.",
+        ),
     ] = None,
     renderer: Annotated[
         Path | None,
@@ -197,7 +200,7 @@ def run(
     if not functions:
         raise ValueError(f"{renderer}: no function{f' in {precision}' if precision else ''}; expected [[rays]]")
     if len(functions) > 1 and (report or junit or json):
-        raise ValueError(f"{renderer}: {len(functions)} functions, and one report; expected --precision of one of them")
+        raise ValueError(f"{renderer}: {len(functions)} functions, but one report; select a function with --precision")
     codes = []
     for function in functions:
         words = renderer_file.filled(function.command)

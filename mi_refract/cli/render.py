@@ -32,10 +32,10 @@ def render(
         typer.Option("-D", metavar="NAME=VALUE", help="Replace the value of a <default>; may be repeated."),
     ] = None,
     variant: Annotated[
-        str | None, typer.Option(help="A Mitsuba variant; without it llvm_ad_rgb where that runs, else scalar_rgb.")
+        str | None, typer.Option(help="Mitsuba variant. Default: llvm_ad_rgb where it runs, else scalar_rgb.")
     ] = None,
     spp: Annotated[
-        int | None, typer.Option(min=1, max=2**32 - 1, help="Samples per pixel; without it what the scene says.")
+        int | None, typer.Option(min=1, max=2**32 - 1, help="Samples per pixel. Default: the number in the scene.")
     ] = None,
     until: Annotated[
         str | None, typer.Option(metavar="SHARE", help="Stop when the relative RMSE falls below this, e.g. 1%.")
@@ -51,7 +51,7 @@ def render(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the sampler.")] = 0,
     pass_spp: Annotated[
-        int | None, typer.Option(min=1, max=2**32 - 1, help="Samples per pixel of a pass, which bound the memory.")
+        int | None, typer.Option(min=1, max=2**32 - 1, help="Samples per pixel in one pass; fewer need less memory.")
     ] = None,
     restart: Annotated[
         bool, typer.Option("--restart", help="Start over; ignore any checkpoint or existing image.")
@@ -61,7 +61,11 @@ def render(
     ] = None,
     allow_plugins: Annotated[
         list[str] | None,
-        typer.Option("--allow-plugins", metavar="NAME", help="Also allow this plugin, which ships with the scene."),
+        typer.Option(
+            "--allow-plugins",
+            metavar="NAME",
+            help="Also allow this plugin, which ships with the scene; may be repeated.",
+        ),
     ] = None,
     scheduler: Annotated[
         str | None,
@@ -71,7 +75,8 @@ def render(
         int | None, typer.Option(min=1, max=1024, help="Number of single-threaded worker processes (Dask).")
     ] = None,
     bundle_limit: Annotated[
-        int, typer.Option(min=1, metavar="MIB", help="MiB of a scene's files that may be sent to workers.")
+        int,
+        typer.Option(min=1, metavar="MIB", help="Largest total size of a scene's files to send to workers, in MiB."),
     ] = 256,
     mixed_workers: Annotated[
         bool,

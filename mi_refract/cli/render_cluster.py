@@ -29,12 +29,11 @@ class ClusterOptions:
     def check(self, plugins: Collection[str]) -> None:
         """UsageError for options that exclude each other, MissingExtraError without Dask. `plugins`: of the scene."""
         if self.mixed_workers and not self.target.given:
-            raise UsageError("--mixed-workers; expected --scheduler ADDRESS or --workers N with it")
+            raise UsageError("--mixed-workers requires --scheduler ADDRESS or --workers N")
         self.target.check()
         if self.target.given and plugins:
             raise UsageError(
-                f"--allow-plugins {min(plugins)}: native code is not sent to workers; "
-                "expected no --scheduler and no --workers"
+                f"--allow-plugins {min(plugins)}: native code is not sent to workers; remove --scheduler or --workers"
             )
 
 

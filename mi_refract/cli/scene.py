@@ -27,15 +27,20 @@ def _scene() -> None:
 @app.command()
 def export(
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="A Mitsuba scene, or the name of one in scenes/.")],
-    to: Annotated[str, typer.Option(metavar="TARGET", help="cycles|luxcore|radiance|raysect|povray|mitsuba|obj+json")],
+    to: Annotated[
+        str, typer.Option(metavar="TARGET", help="Renderer: cycles|luxcore|radiance|raysect|povray|mitsuba|obj+json.")
+    ],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="FOLDER", help="A new or empty folder; NAME-TARGET by default."),
+        typer.Option("-o", "--output", metavar="FOLDER", help="A new or empty folder. Default: NAME-TARGET."),
     ] = None,
     level: Annotated[
-        int | None, typer.Option(help="Subdivision of curved shapes, 0 to 8; one more halves the edges. 5 by default.")
+        int | None, typer.Option(help="Subdivision of curved shapes, 0 to 8; each level halves the edges. Default: 5.")
     ] = None,
-    define: Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Replace a <default>.")] = None,
+    define: Annotated[
+        list[str] | None,
+        typer.Option("-D", metavar="NAME=VALUE", help="Replace the value of a <default>; may be repeated."),
+    ] = None,
 ) -> None:
     """Write a Mitsuba scene as triangles for another renderer, with a README.txt that says how to render it."""
     defines = scene_files.parse_defines(define or [])

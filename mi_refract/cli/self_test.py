@@ -21,26 +21,27 @@ SCENE = ".xml"
 Images = Annotated[
     Path | None,
     typer.Argument(
-        metavar="REFERENCE", help="An image, a folder of renders of one image, or a scene; by default a glass ball."
+        metavar="REFERENCE", help="An image, a folder of renders of one image, or a scene. Default: a glass ball."
     ),
 ]
 AllowPlugins = Annotated[
-    list[str] | None, typer.Option(metavar="NAME", help="Also allow this plugin, which ships with the scene.")
+    list[str] | None,
+    typer.Option(metavar="NAME", help="Also allow this plugin, which ships with the scene; may be repeated."),
 ]
 
 
 def self_test(reference: Images = None, max_values: MaxValues = MAX_VALUES, allow_plugins: AllowPlugins = None) -> None:
     """Inject synthetic defects into REFERENCE and report which methods detect them.
 
-    Exit code 0: every defect that had to be detected was, 1: one was missed, or equal images were called different, 2:
-    REFERENCE cannot be read.
+    Exit code 0: every defect that had to be detected was detected, 1: one was missed, or equal images were reported as
+    different, 2: REFERENCE cannot be read.
     """
     from mi_refract.image_diff import self_test as self_tests
 
     require_extra("scipy")
     is_scene = reference is not None and reference.suffix == SCENE
     if allow_plugins and not is_scene:
-        raise ValueError("--allow-plugins: only a scene brings plugins; expected with SCENE.xml")
+        raise ValueError("--allow-plugins applies to scenes only; expected a scene SCENE.xml as REFERENCE")
     if reference is not None and not is_scene:
         renders = self_tests.read_images(reference, max_values)
     else:

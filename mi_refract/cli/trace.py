@@ -32,18 +32,22 @@ def trace(
     as_json: Annotated[bool, typer.Option("--json", help="Print the paths as JSON.")] = False,
     table: Annotated[bool, typer.Option("--table", help="Print focal points and spot sizes.")] = False,
     plane: Annotated[
-        str | None, typer.Option(metavar="X,Y[,DEGREES]", help="Add spots on the plane there, across +x or DEGREES.")
+        str | None,
+        typer.Option(
+            metavar="X,Y[,DEGREES]", help="Also print spots on the plane through X,Y, perpendicular to +x or DEGREES."
+        ),
     ] = None,
     branches: Annotated[
         int | None, typer.Option(min=0, help="Largest number of partial reflections on a path.")
     ] = None,
-    rays: Annotated[int | None, typer.Option(min=1, help="Number of rays of each beam that has several.")] = None,
+    rays: Annotated[int | None, typer.Option(min=1, help="Number of rays in each beam that has several.")] = None,
     max_depth: Annotated[int | None, typer.Option(min=1, help="Largest number of boundaries on a path.")] = None,
     wavelengths: Annotated[
-        str | None, typer.Option(metavar="NM,NM|COUNT", help="Wavelengths in nm, or how many, in place of the scene's.")
+        str | None,
+        typer.Option(metavar="NM,NM|COUNT", help="Wavelengths in nm, or their number; replaces those of the scene."),
     ] = None,
     precision: Annotated[str, typer.Option(help="float64, or float32 with LLVM or CUDA.")] = "float64",
-    formula: Annotated[str | None, typer.Option(help="A formula of refraction; the planar one by default.")] = None,
+    formula: Annotated[str | None, typer.Option(help="Formula of refraction. Default: the planar formula.")] = None,
     arrays: Annotated[str | None, typer.Option("--backend", help="llvm, cuda or scalar; see `doctor`.")] = None,
     keys: Annotated[
         bool, typer.Option("--keys", is_eager=True, callback=_print_keys, help="Print all keys of a scene file.")

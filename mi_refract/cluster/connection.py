@@ -96,7 +96,7 @@ def _client(address: str, security: Security) -> Client:
         # First, as a client that found nobody would take 16 s to give up.
         kind = asyncio.run(_kind(address, security))
         if kind != "Scheduler":
-            raise ValueError(f"a {kind} answers")
+            raise ValueError(f"a Dask {kind} answers there")
         # Results come from the workers themselves where these can be reached, else through the scheduler.
         return distributed.Client(
             address, security=security, timeout=PATIENCE, set_as_default=False, direct_to_workers=True
@@ -132,7 +132,7 @@ def cluster_errors(client: Client) -> Iterator[None]:
         yield
     except KilledWorker as error:
         count, last = error.allowed_failures + 1, error.last_worker.address
-        text = f"{count} workers were lost that ran the same task, the last {last}"
+        text = f"{count} workers were lost while they ran the same task; the last was {last}"
         raise NoWorkersError(f"{address}: {text}; expected workers with enough memory") from None
     except (CommClosedError, CancelledError):
         raise LostSchedulerError(lost) from None

@@ -57,7 +57,7 @@ def started(workers: int) -> Iterator[tuple[str, Any]]:
         answer = process.stdout.readline().decode().strip()
         if not answer.startswith("tls://"):
             reason = answer or f"ended with status {process.wait()}"
-            raise NoWorkersError(f"--workers {workers}: no local cluster: {reason}; expected fewer workers")
+            raise NoWorkersError(f"--workers {workers}: the local cluster did not start: {reason}; try fewer workers")
         yield answer, security
     finally:
         with contextlib.suppress(BrokenPipeError):

@@ -65,7 +65,7 @@ class Workers:
         if not self.accepted:
             reason = "; ".join(self.refused.values()) or ("workers do not answer" if self._asked else "no workers")
             text = f"{self._address}: no worker that may {self.task}: {reason}"
-            raise NoWorkersError(f"{text}; expected at least one like this process")
+            raise NoWorkersError(f"{text}; expected at least one with the software and hardware of this process")
 
     @property
     def _address(self) -> str:

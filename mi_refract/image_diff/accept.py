@@ -61,11 +61,11 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
             continue
         target = result.target or results.reference
         if variant and result.reference is None:
-            raise ValueError(f"{result.test}: has no reference yet; expected without --as-variant")
+            raise ValueError(f"{result.test}: has no reference yet; accept it without --as-variant first")
         if variant:
             target = pairing.variant(target, result.how, variant)
         if target in taken or (variant and target.exists() and target not in result.variants):
-            raise ValueError(f"{target}: the reference of another image, too; expected one new image for each")
+            raise ValueError(f"{target}: also the reference of another image; expected a reference of its own")
         taken.add(target)
         try:
             images = image_file.read_parts(result.test, result.how.max_values)
@@ -73,7 +73,9 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
             raise UnreadableImage(result, describe(error)) from error
         finite = all(np.isfinite(image.pixels).all() for image in images)
         if not result.how.options.get("allow_nonfinite") and not finite:
-            raise ValueError(f"{result.test}: values that are not finite; expected with --set allow_nonfinite=true")
+            raise ValueError(
+                f"{result.test}: values that are not finite; to accept them, pass --set allow_nonfinite=true"
+            )
         if target.suffix.lower() != result.test.suffix.lower():
             raise ValueError(f"{target}: expected a name that ends in {result.test.suffix}, as {result.test} does")
         yield Copy(result.test, target, result.digests[result.test], result.digests.get(target, ""))

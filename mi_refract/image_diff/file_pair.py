@@ -54,14 +54,14 @@ def read_renders(folder: Path, max_values: int = MAX_VALUES) -> list[Image]:
     if failed:
         raise OSError(failed[0][1])
     if not paths:
-        raise ValueError(f"{folder}: holds no image; expected several renders of one")
+        raise ValueError(f"{folder}: contains no image; expected several renders of one image")
     read = functools.partial(image_file.read, max_values=max_values)
     images = list(bounded_map(read, paths.values(), lambda path: 0, max_values, THREADS))  # all are needed at once
     sums: dict[float, Image] = {}
     for image in images:
         other = sums.setdefault(float(image.pixels.sum(dtype=np.float64)), image)
         if other is not image and np.array_equal(image.pixels, other.pixels):
-            raise ValueError(f"{image.path}: the same pixels as {other.path}; expected renders of different seeds")
+            raise ValueError(f"{image.path}: the same pixels as {other.path}; expected renders with different seeds")
     return images
 
 
@@ -93,7 +93,7 @@ def compare(
         raise FileNotFoundError(f"{pairing.beside(how.variance, path, roots[0])}: no such file; expected a variance")
     file = pairing.beside(how.mask, result.target or path, roots[0]) if how.mask else None
     if (file or how.ignore) and reference[-1].place:
-        raise ValueError(f"{path}: several parts or MIP levels; expected with a mask one image")
+        raise ValueError(f"{path}: has several parts or MIP levels; masks are supported for single images only")
     mask = masks.made(reference[0], file, how.ignore, how.max_values)
     reference, test = ([masks.applied(image, mask) for image in side] for side in (reference, test))
     if path.is_dir():
@@ -113,7 +113,7 @@ def _with_variance(images: Sequence[Image], root: Path, how: ComparisonSpec) -> 
         return images
     file = pairing.beside(how.variance, images[0].path, root)
     if file == images[0].path:
-        raise ValueError(f"variance = {how.variance!r}: is {file} itself; expected the name of another image")
+        raise ValueError(f"variance = {how.variance!r}: names {file} itself; expected another image")
     return [variances.with_file(images[0], file, how.max_values)] if file.exists() else images
 
 

@@ -43,7 +43,7 @@ def flip(
     test: Image,
     *,
     local: Annotated[
-        float, "mean FLIP error allowed in any square of 0.12 degrees, 0 to 1; in wider ones less"
+        float, "mean FLIP error allowed in any square of 0.12 degrees, 0 to 1; less in wider squares"
     ] = LOCAL,
     patch: Annotated[float, "FLIP error that may fill a square of 0.24 degrees, 0 to 1"] = PATCH,
     largest: Annotated[float, "FLIP error that no pixel may exceed, 0 to 1"] = 1.0,
@@ -162,10 +162,10 @@ def _linear(image: Image) -> Pixels:
     """Linear H × W × 3 float32; values that are not finite become 0."""
     names = _colours(image)
     if names != RGB and len(names) != 1:
-        raise ValueError(f"{image.path}: channels {', '.join(names)}; expected by FLIP: R, G, B, or one")
+        raise ValueError(f"{image.path}: channels {', '.join(names)}; FLIP needs R, G, B, or a single channel")
     pixels = np.nan_to_num(image.select(names), nan=0.0, posinf=0.0, neginf=0.0)
     if np.abs(pixels).max() > np.finfo(np.float32).max:
-        raise ValueError(f"{image.path}: values beyond those of float32; expected by FLIP: up to 3.4e38")
+        raise ValueError(f"{image.path}: values exceed the range of float32, in which FLIP computes (3.4e38)")
     pixels = pixels.astype(np.float32, copy=False)
     if encoding(image) == "sRGB":
         pixels = srgb_decode(pixels).astype(np.float32)

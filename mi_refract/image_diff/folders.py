@@ -65,7 +65,9 @@ def diff(
         name = reference.resolve().name
         every = [Pair(name, reference, test, reference, settings.of(name))]
     else:
-        raise NotADirectoryError(f"{test if reference.is_dir() else reference}; expected with --renders: a folder")
+        raise NotADirectoryError(
+            f"{test if reference.is_dir() else reference}: not a folder; --renders expects folders"
+        )
     unused = settings.unused([pair.name for pair in every]) if reference.is_dir() and not renders else []
     pairs = [*pairing.named(every, names), *pairing.wrong_entries(settings, every)]
     results = Results(reference, test, (), renders, inconclusive, tuple(unused), settings.flags)
@@ -158,7 +160,7 @@ def _judged(result: Result, roots: tuple[Path, Path], read: Read, keep: bool) ->
     for path in (reference, *result.variants):
         try:
             if path.samefile(new):
-                raise ValueError(f"{new}: the same file as the reference {path}; expected two")
+                raise ValueError(f"{new}: the same file as the reference {path}; expected two different files")
             one, two = read(path), read(new)
             if isinstance(one, Exception):
                 raise one

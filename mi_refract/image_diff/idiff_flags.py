@@ -59,7 +59,7 @@ def parse(text: str) -> Flags:
         count = 1 if flag in THRESHOLDS else IMAGE.get(flag, 0)
         values, words = words[:count], words[count:]
         if len(values) < count:
-            raise ValueError(f"{word}: nothing follows; expected {word} VALUE")
+            raise ValueError(f"{word}: no value follows; expected {word} VALUE")
         if flag in THRESHOLDS:
             option, default = THRESHOLDS[flag]
             options[option] = _number(word, values[0], whole=isinstance(default, int))
@@ -68,9 +68,9 @@ def parse(text: str) -> Flags:
         elif flag == "-p":
             raise ValueError("-p: idiff's perceptual test; expected --method flip, which replaces it")
         elif not flag.startswith("-"):
-            raise ValueError(f"{word}: no flag; expected the flags alone, without idiff and the images")
+            raise ValueError(f"{word}: not a flag; expected only flags, without the command idiff and the images")
         elif flag != EVERY and flag not in QUIET:
-            raise ValueError(f"{word}: no flag of idiff; expected {', '.join((*THRESHOLDS, EVERY, *QUIET, *IMAGE))}")
+            raise ValueError(f"{word}: not a flag of idiff; expected {', '.join((*THRESHOLDS, EVERY, *QUIET, *IMAGE))}")
         every = every or flag == EVERY
     return Flags(options, every, tuple(ignored))
 

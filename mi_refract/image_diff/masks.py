@@ -45,7 +45,7 @@ def made(reference: Image, path: Path | None, rectangles: Sequence[Rectangle], m
         part = counts[max(top, 0) : max(top + rows, 0), max(left, 0) : max(left + columns, 0)]
         if not part.size:
             ignore = [x, y, columns, rows]
-            raise ValueError(f"ignore = {ignore}; expected a rectangle that holds pixels of {reference.path}")
+            raise ValueError(f"ignore = {ignore}; expected a rectangle that overlaps {reference.path}")
         part[:] = False
     if not counts.any():
         raise ValueError(f"{path or 'ignore'}: leaves no pixel of {reference.path}; expected at least one")

@@ -186,7 +186,7 @@ def _compare(
         result = chosen.function(*(sides if single else bare), allow_nonfinite=allow_nonfinite, **checked)
         doubt = _untested(sides[0][0], sides[1][0], allow_nonfinite) if single and result.is_equal else ""
     elif not single:
-        raise ValueError(f"{method}: {len(bare[0])} and {len(bare[1])} images; expected one a side")
+        raise ValueError(f"{method}: {len(bare[0])} and {len(bare[1])} images; expected one per side")
     else:
         a, b, besides = shared_channels(bare[0][0], bare[1][0])
         if reason := preconditions(a, b, allow_nonfinite):

@@ -50,7 +50,7 @@ def require_apart(reference: Path, test: Path, maps: Sequence[Map] = (), new: bo
     if maps and test.is_dir():
         return
     if reference.exists() and reference.samefile(test):
-        raise ValueError(f"{test}: the same as the reference {reference}; expected two")
+        raise ValueError(f"{test}: the same path as the reference {reference}; expected two different paths")
     inner, outer = reference.resolve(), test.resolve()
     if inner.is_relative_to(outer) or outer.is_relative_to(inner):
         raise ValueError(f"{test}: one path contains the other, {reference}; use separate folders")
@@ -66,7 +66,7 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Pair]:
     (old, lost), (new, missed) = images_in(reference) if known else ({}, []), images_in(test)
     for folder, nothing in ((reference, known and not old and not lost), (test, not new and not missed)):
         if nothing:
-            raise ValueError(f"{folder}: holds no image; expected at least one")
+            raise ValueError(f"{folder}: contains no image; expected at least one")
     if settings.maps:
         pairs = _mapped(old, new, settings.maps)
     else:
@@ -96,7 +96,9 @@ def named(items: Sequence[Named], patterns: Sequence[str]) -> list[Named]:
     """
     for pattern in patterns:
         if not any(name_patterns.matches(pattern, item.name) for item in items):
-            raise ValueError(f"{pattern}: matches no image; expected the path of an image in its folder, * and ?")
+            raise ValueError(
+                f"{pattern}: matches no image; expected the path of an image in its folder (wildcards: * and ?)"
+            )
     return [item for item in items if not patterns or any(name_patterns.matches(p, item.name) for p in patterns)]
 
 
@@ -184,7 +186,7 @@ def variant(target: Path, how: ComparisonSpec, name: str) -> Path:
     ValueError where there is none, or for a name that would not match it.
     """
     if not name.strip() or name.startswith(".") or set(name) & set("/\\*?\0"):
-        raise ValueError(f"--as-variant {name!r}; expected a part of a file name, as macos")
+        raise ValueError(f"--as-variant {name!r}; expected part of a file name, such as macos")
     fields = name_patterns.fields(target.name)
     for template in how.accept:
         if not set(template) & set("*?") and name in template:
@@ -194,8 +196,8 @@ def variant(target: Path, how: ComparisonSpec, name: str) -> Path:
             filled = name_patterns.filled(template.replace("*", "{*}"), fields | {"*": name})
             return target.parent / filled
     raise ValueError(
-        f"{target}: its settings have no `accept` with {name} or one *; expected in mi-refract.toml, below "
-        f'[defaults], accept = ["{{stem}}-{name}{{suffix}}"]'
+        f"{target}: no template in `accept` contains {name} or exactly one *; add to [defaults] in mi-refract.toml: "
+        f'accept = ["{{stem}}-{name}{{suffix}}"]'
     )
 
 

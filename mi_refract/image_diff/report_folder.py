@@ -73,13 +73,15 @@ def require_free(path: Path, *sides: Path) -> None:
     """
     for side in sides:
         if side.is_dir() and path.resolve().is_relative_to(side.resolve()):
-            raise ValueError(f"{path}: in {side}, where it would be compared; expected a folder outside")
+            raise ValueError(f"{path}: is inside {side}, so it would be compared; use another folder")
     if not path.is_dir():
         if path.exists():
             raise NotADirectoryError(f"{path}: expected a file name that ends in .html, or a folder")
         atomic.check_parent(path.resolve())
     elif foreign := _foreign(path):
-        raise ValueError(f"{path}: holds {foreign}, no report of ours; expected a new or empty folder, or a report")
+        raise ValueError(
+            f"{path}: contains {foreign}, not part of a report; expected a new or empty folder, or an old report"
+        )
 
 
 def _foreign(path: Path) -> str:

@@ -90,7 +90,7 @@ class Result:
                 variants = f"; matches {self.matched.name}"
             elif self.variants and self.status is not Status.EQUAL:
                 count = len(self.variants)
-                variants = f"; nor is it {'its variant' if count == 1 else f'one of its {count} variants'}"
+                variants = f"; {'its variant differs' if count == 1 else f'its {count} variants differ'}, too"
             return self.comparison.reason + variants
         if self.status is Status.SKIPPED:
             return "skipped by the settings"

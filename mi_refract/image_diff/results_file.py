@@ -76,7 +76,7 @@ def read(path: str | Path, reference: Path | None = None, test: Path | None = No
     except ValueError as error:
         raise ValueError(f"{error}; {EXPECTED}") from None
     if document.renders:
-        raise ValueError(f"{path}: of --renders; expected of a comparison of single images")
+        raise ValueError(f"{path}: written with --renders; expected the JSON of a comparison of single images")
     before = Path(document.reference), Path(document.test)
     now = reference or before[0], test or before[1]
     results = tuple(
@@ -130,6 +130,6 @@ def with_settings(results: Results, settings: Settings) -> Results:
     for result in results.results:
         how = settings.of(result.name)
         if result.status in FAILED and (result.how.variance or how.reads_variance):
-            raise ValueError(f"{result.name}: has a variance in a file of its own; expected accept without --from")
+            raise ValueError(f"{result.name}: its variance is in a separate file; accept it without --from")
         changed.append(replace(result, how=replace(how, options=result.how.options)))
     return replace(results, results=tuple(changed))

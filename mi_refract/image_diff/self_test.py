@@ -229,7 +229,7 @@ def examine(renders: Pixels, case: str, trials: int = TRIALS, null_pairs: int = 
     ValueError for values that are not finite: a planted NaN could not be distinguished from one that was there.
     """
     if not len(renders) or not np.isfinite(renders).all():
-        raise ValueError(f"{case}: expected for a self-test: one or more renders, every value of them finite")
+        raise ValueError(f"{case}: a self-test needs at least one render, with finite values only")
     rng, renders = np.random.default_rng(SEED), renders.astype(np.float32)  # as files hold them
     half = len(renders) // 2 if len(renders) >= RENDERS else 0
     setting = f"{len(renders)} renders" if len(renders) > 1 else "1 render"

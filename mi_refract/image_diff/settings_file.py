@@ -69,7 +69,8 @@ class Keys(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
         Meta(description="rectangles of pixels that do not count: x, y, width, height"),
     ] = None
     variance: Annotated[
-        str | None, Meta(description="an image of the variance of one sample of each pixel, beside each side's own")
+        str | None,
+        Meta(description="an image with the variance of one sample of each pixel, beside the image of each side"),
     ] = None
     channels: Annotated[
         list[Text] | dict[Text, Text] | None,

@@ -454,7 +454,7 @@ def compare_stacks(reference: Array, test: Array, tile: int, family_error: float
     """
     same_shape(reference[0], test[0])
     if min(len(reference), len(test)) < 2:
-        raise ValueError(f"welch: {len(reference)} and {len(test)} renders; expected at least 2 a side")
+        raise ValueError(f"welch: {len(reference)} and {len(test)} renders; expected at least 2 per side")
     evidence = from_renders(list(reference), list(test), tile)
     return TileTests([compare_tiles(evidence.one, evidence.two, margin)], family_error)
 

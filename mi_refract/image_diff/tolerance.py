@@ -34,15 +34,19 @@ def tolerance(
     test: Image,
     *,
     fail: Annotated[float, "absolute difference up to which values count as equal"] = 0.004,
-    fail_relative: Annotated[float, "relative difference up to which they do, as a share of the mean of both"] = 0.001,
+    fail_relative: Annotated[
+        float, "relative difference up to which values count as equal, as a share of the mean of both"
+    ] = 0.001,
     fail_percent: Annotated[float, "percentage of the pixels that may differ by more than both"] = 0.02,
     hard_fail: Annotated[
         float, "largest absolute difference of any value, where more than allow_failures pixels differ"
     ] = np.inf,
     allow_failures: Annotated[int, "number of pixels that may differ by any amount"] = 0,
     warn: Annotated[float, "absolute difference above which a pixel counts for a warning"] = np.inf,
-    warn_relative: Annotated[float, "relative difference above which it does, as a share of the mean of both"] = 0.0,
-    warn_percent: Annotated[float, "percentage of the pixels that may do so without a warning"] = 0.0,
+    warn_relative: Annotated[
+        float, "relative difference above which a pixel counts for a warning, as a share of the mean"
+    ] = 0.0,
+    warn_percent: Annotated[float, "percentage of the pixels that may exceed both without a warning"] = 0.0,
     hard_warn: Annotated[float, "absolute difference of any value above which there is a warning"] = np.inf,
 ) -> Comparison:
     """Differences within absolute and relative thresholds, except for a few pixels, as `idiff` counts them.

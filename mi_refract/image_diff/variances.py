@@ -77,7 +77,7 @@ def with_file(image: Image, path: Path, most: int = MAX_VALUES) -> Image:
     file = image_file.read(path, most)
     if file.pixels.shape[:2] != image.pixels.shape[:2]:
         (height, width), wrong = image.pixels.shape[:2], file.pixels.shape[:2]
-        raise ValueError(f"{path}: {wrong[1]} × {wrong[0]}; expected a variance of {width} × {height}")
+        raise ValueError(f"{path}: {wrong[1]} × {wrong[0]}; expected a variance image of {width} × {height}")
     if FREEDOM in file.metadata:
         said = {FREEDOM: _freedom(file), **{name: file.metadata.get(name, "") for name in (FILTER, AREA)}}
         image = replace(image, metadata=image.metadata | said)
@@ -88,7 +88,7 @@ def with_file(image: Image, path: Path, most: int = MAX_VALUES) -> Image:
         names += XYZ
     if not names:
         has, needed = ", ".join(file.channels), ", ".join(image.channels)
-        raise ValueError(f"{path}: variances of {has}; expected of channels of {image.path}, {needed}")
+        raise ValueError(f"{path}: variances of channels {has}; expected channels of {image.path}: {needed}")
     return replace(image, variances={name: file.select([name])[..., 0] for name in names})
 
 

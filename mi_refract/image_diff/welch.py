@@ -42,13 +42,13 @@ def compare_renders(
     resolution: Annotated[
         float, "relative difference of a tile that the noise must not hide, or the result is inconclusive"
     ] = 0.05,
-    hidden: Annotated[float, "share of the tiles, in any channel, whose noise may hide it"] = 0.1,
+    hidden: Annotated[float, "share of the tiles, in any channel, whose noise may hide such a difference"] = 0.1,
     pixels: Annotated[
         str, "test single pixels as well: yes; no for renders that share a fixed grid of samples"
     ] = "yes",
-    spp: Annotated[int, "samples per pixel of each image; 0: as their headers say"] = 0,
-    spp_reference: Annotated[int, "the reference's, where the sides differ; 0: `spp`"] = 0,
-    spp_test: Annotated[int, "the new image's, where the sides differ; 0: `spp`"] = 0,
+    spp: Annotated[int, "samples per pixel of each image; 0: the number in its header"] = 0,
+    spp_reference: Annotated[int, "samples per pixel of the reference, where the sides differ; 0: `spp`"] = 0,
+    spp_test: Annotated[int, "samples per pixel of the new image, where the sides differ; 0: `spp`"] = 0,
 ) -> Comparison:
     """Independent renders: Welch's t-test on the means of tiles and channels.
 
@@ -127,15 +127,17 @@ def _checked_counts(
     """
     if min(len(reference), len(test)) < 2:
         raise ValueError(
-            f"welch: {len(reference)} and {len(test)} renders; expected at least 2 a side, or one a side with its "
-            "variance, in channels as m2_R, R.variance or in a file (`variance`)"
+            f"welch: {len(reference)} and {len(test)} renders; expected at least 2 per side, or one per side "
+            "with its variance, in channels such as m2_R or R.variance, or in a file (`variance`)"
         )
     for side in (reference, test):
         if all(_identical(side[0], image) for image in side):
             continue  # without noise
         for a, b in itertools.combinations(side, 2):
             if _identical(a, b) and (a.pixels != a.pixels[0, 0]).any():  # black ones may be the same
-                raise ValueError(f"{b.path}: the same image as {a.path}; expected independent renders, of other seeds")
+                raise ValueError(
+                    f"{b.path}: the same image as {a.path}; expected independent renders with different seeds"
+                )
     sides = list(zip(("reference", "test"), spp, (reference, test), strict=True))
     if not all(count or SPP in image.metadata for _, count, side in sides for image in side):
         return (len(reference), len(test)), "renders"
@@ -157,7 +159,7 @@ def _of_estimates(a: Estimate, b: Estimate, tile: int) -> tuple[list[str], Evide
     b = replace(b, variance=b.variance[..., [b.image.channels.index(name) for name in a.image.channels]])
     known = a.known | b.known
     if not known.any():
-        raise ValueError(f"{b.image.path}: no variance of a channel of {a.image.path}; expected `channels`, `variance`")
+        raise ValueError(f"{b.image.path}: no variance for any channel of {a.image.path}; set `channels` or `variance`")
     names = [name for name, is_known in zip(a.image.channels, known, strict=True) if is_known]
     (m1, v1), (m2, v2) = ((finite(x.image.select(names)).astype(np.float64), x.variance[..., known]) for x in (a, b))
     only_one, only_two = ~b.known[known], ~a.known[known]

@@ -167,13 +167,13 @@ def _checked(path: Path, max_values: int, multiplied: bool) -> tuple[ImageInput,
     if not begin:
         raise ImageError(f"{path}: corrupt {kind} file: it is empty")
     if begin == LFS_POINTER:
-        raise ImageError(f"{path}: a Git LFS pointer, not the image; `{_lfs_pull(path)}` brings it")
+        raise ImageError(f"{path}: a Git LFS pointer, not the image; run `{_lfs_pull(path)}` to fetch it")
     # Others hold 8 bytes a value or fewer, and are asked below.
     return _opened(path, kind, max_values, max_values * (1 if begin.startswith(WHEN_OPENED) else 8), multiplied), kind
 
 
 def _lfs_pull(path: Path) -> str:
-    """The command that brings a file of Git LFS; its pattern begins at the repository's root."""
+    """The command that fetches a file from Git LFS; its pattern begins at the repository's root."""
     full = path.absolute()
     root = next((folder for folder in full.parents if (folder / ".git").exists()), None)
     pattern = re.sub(r"[][*?,\\]", "?", (full.relative_to(root) if root else path).as_posix())
@@ -310,7 +310,7 @@ def _image(path: Path, source: ImageInput, kind: str, values: tuple[int, int], a
     known = dict(pair.split(":") for pair in oiio.get_string_attribute("extension_list").split(";") if pair)
     endings = known.get(found, found).split(",")
     if path.suffix[1:].lower() not in endings or found == "null":  # which is black, whatever the file holds
-        raise ImageError(f"{path}: holds an image of format {found}; expected the format that the name says")
+        raise ImageError(f"{path}: holds an image of format {found}; expected the format that its file name indicates")
     if spec.deep:
         raise ImageError(f"{path}: expected an image without deep samples")
     if min(spec.width, spec.height, spec.nchannels) < 1 or spec.depth > 1:

@@ -66,7 +66,7 @@ def run(
             out, said = _read(process, deadline, most)
             process.wait(max(0, deadline - time.monotonic()))
         except subprocess.TimeoutExpired:
-            raise TimeoutError(f"no end within {timeout:g} s") from None
+            raise TimeoutError(f"did not end within {timeout:g} s") from None
         finally:
             with contextlib.suppress(ProcessLookupError, PermissionError):  # macOS forbids it for a group of zombies
                 os.killpg(process.pid, signal.SIGKILL)

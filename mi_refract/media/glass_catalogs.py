@@ -69,7 +69,7 @@ def load(catalog: str, glass: str, label: str) -> Medium:
         raise ValueError(f"{label}: unknown glass; expected one of the catalogue's {len(glasses)}; nearest: {near}")
     row = glasses[name := known[_plain(glass)]]
     if not row.coefficients:
-        raise ValueError(f"{label}: its catalogue prints no formula of this glass; expected another, or table(…)")
+        raise ValueError(f"{label}: its catalogue has no formula for this glass; use another glass, or table(…)")
     if catalog in POWERS:
         powers = zip(POWERS[catalog], row.coefficients, strict=True)
         form, coefficients = polynomial({p: x / NANOMETRES**p for p, x in powers})

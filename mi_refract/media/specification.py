@@ -61,7 +61,7 @@ def _formula(text: str, label: str) -> Medium:
     form, coefficients, (low, high) = FORMULAS_OF_N[call[1]](call[2], label)
     for name, pole in form.poles(coefficients).items():
         if VISIBLE[0] <= pole <= VISIBLE[1]:
-            raise ValueError(f"{label}: {name}: n is infinite at {pole:.6g} nm; expected no such pole in 360 … 830 nm")
+            raise ValueError(f"{label}: {name}: n is infinite at {pole:.6g} nm; expected no pole in 360 … 830 nm")
         low, high = (max(low, pole), high) if pole < VISIBLE[0] else (low, min(high, pole))
     medium = Medium(text, form, coefficients, (low, high))
     import numpy as np
@@ -70,7 +70,9 @@ def _formula(text: str, label: str) -> Medium:
     wavelengths = np.linspace(low, high, 471)
     if low <= high and (missing := np.isnan(medium.index_or_nan(wavelengths))).any():
         at = wavelengths[missing][0]
-        raise ValueError(f"{label}: n is no positive number at {at:.6g} nm; expected one at all of 360 … 830 nm")
+        raise ValueError(
+            f"{label}: n is not positive at {at:.6g} nm; expected a positive index everywhere in 360 … 830 nm"
+        )
     return medium
 
 

@@ -81,7 +81,8 @@ class Curve:
         """
         arcs = np.flatnonzero(~self.straight)
         if not 0 < len(arcs) <= facets:
-            raise ValueError(f"facets: {facets}, for {len(arcs)} arcs; expected an arc at least, and a facet for each")
+            text = f"facets: {facets}, for {len(arcs)} arcs"
+            raise ValueError(f"{text}; expected one or more arcs, and a facet or more for each")
         steps = np.ones(len(self), int)
         steps[arcs] = np.diff(np.arange(len(arcs) + 1) * facets // len(arcs))
         chords = [self._piece(j).outline(int(n))[:-1] for j, n in enumerate(steps)]

@@ -43,7 +43,7 @@ class Light:
         if not isinstance(spec, str):
             numbers = tuple(np.ravel(spec).tolist())
             if len(numbers) not in (1, len(self)):
-                raise ValueError(f"{where}: {len(numbers)} numbers; expected 1 for all or each of {len(self)} colours")
+                raise ValueError(f"{where}: {len(numbers)} numbers; expected 1, or one for each of {len(self)} colours")
             return numbers * (len(self) // len(numbers))
         medium = media.parse(spec, where)
         wavelengths = np.array(self.wavelengths or (media.LINES["d"],) * len(self))
@@ -71,7 +71,7 @@ def of_wavelengths(nm: Sequence[float] | int, power: str = "flat") -> Light:
 
 def parsed(text: str) -> list[float] | int:
     """Wavelengths in nm with commas between them, or how many. ValueError for anything else."""
-    accepted = f"expected wavelengths in nm as 486.1,587.6, or a number of them from 2 to {MOST}"
+    accepted = f"expected wavelengths in nm, such as 486.1,587.6, or how many, from 2 to {MOST}"
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:

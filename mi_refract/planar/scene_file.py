@@ -191,7 +191,7 @@ class Parallel(Beam, tag="parallel", kw_only=True):
 
     start: Annotated[Point, _doc("start of the first ray")] = field(name="from")
     to: Annotated[Point, _doc("start of the last ray")]
-    direction: Annotated[Direction, _doc("of all rays: degrees, or [x, y] that is not [0, 0]")]
+    direction: Annotated[Direction, _doc("direction of all rays: degrees, or [x, y] that is not [0, 0]")]
     count: Annotated[Count, _doc("number of rays; 1: from the middle")]
 
 
@@ -207,7 +207,7 @@ class Rays(Beam, tag="rays", kw_only=True):
     """Rays one by one."""
 
     origins: Annotated[Points, _doc("their starts")]
-    directions: Annotated[list[Direction], _doc("one for each start, as of `parallel`")]
+    directions: Annotated[list[Direction], _doc("a direction for each start, as for `parallel`")]
 
     def __post_init__(self) -> None:
         """ValueError for another number of directions than of origins."""
@@ -263,7 +263,7 @@ class SceneTable(Struct, kw_only=True, forbid_unknown_fields=True):
 
     title: Annotated[Text | None, _doc("title of the figure; the file's name by default")] = None
     index: Annotated[Index, _doc("index of the medium around all shapes, as `n` of a shape")] = 1.0
-    colours: Annotated[Names | None, _doc("names, by matplotlib; one for each index")] = None
+    colours: Annotated[Names | None, _doc("names that matplotlib knows; one for each index")] = None
     wavelengths: Annotated[Wavelengths | None, _doc("in nm, in place of `colours`; or how many, 380 to 730 nm")] = None
     light: Annotated[Literal["flat", "D65"], _doc("powers of the wavelengths: equal, or of daylight")] = "flat"
     max_depth: Annotated[int, Meta(ge=1, le=100_000), _doc("largest number of boundaries that a ray meets")] = 16
@@ -365,7 +365,7 @@ def _light(table: SceneTable, wavelengths: Sequence[float] | int | None) -> Ligh
     if chosen is None:
         return of_names(table.colours)
     if table.colours:
-        raise ValueError("colours: beside wavelengths; expected one of them")
+        raise ValueError("colours and wavelengths are both set; expected one of them")
     return of_wavelengths(chosen, table.light)
 
 
@@ -380,20 +380,21 @@ def _parts(tables: Sequence[AnyShape], ambient: Indices, light: Light) -> list[P
         n = {key: light.indices(x, f"{where}.{key}") for key, x in values.items() if x is not None}
         if isinstance(shape, Inside) and shape.within is not None:
             if shape.outside is not None:
-                raise ValueError(f"{where}.within: {shape.within!r}, beside `outside`; expected one of them")
+                raise ValueError(f"{where}.within: {shape.within!r}, but `outside` is set too; expected one of them")
             if shape.within not in media:
-                known = ", ".join(map(repr, media)) or "none so far"
+                known = ", ".join(map(repr, media)) or "none"
                 raise ValueError(f"{where}.within: {shape.within!r}; expected the name of a shape above: {known}")
             n["outside"] = media[shape.within]
         n.setdefault("outside", ambient)
         if isinstance(shape, Solid) and shape.name:
             if shape.name in media:
-                raise ValueError(f"{where}.name: {shape.name!r} is another shape's; expected a new one")
+                raise ValueError(f"{where}.name: {shape.name!r} is the name of another shape; expected a unique name")
             media[shape.name] = n["n"]
         curves = shape.layers if isinstance(shape, Luneburg) else 1
         pieces += curves * max(shape.facets or 4, len(getattr(shape, "points", ()))) * len(light)
         if pieces > PIECES:
-            raise ValueError(f"{where}: {pieces} pieces and more; expected {PIECES}, colours times those of all shapes")
+            most = f"at most {PIECES} pieces of curves in all shapes together, once for each colour"
+            raise ValueError(f"{where}: {pieces} or more pieces; expected {most}")
         first = len(parts)
         try:
             with np.errstate(all="ignore"):
@@ -416,7 +417,7 @@ def _rays(tables: Sequence[AnyBeam]) -> tuple[Array, Array, NDArray[np.intp]]:
     sizes = list(itertools.accumulate(len(b.origins) if isinstance(b, Rays) else b.count for b in tables))
     for j, count in enumerate(sizes):
         if count > RAYS:
-            raise ValueError(f"beam[{j}].count: {count} rays with the beams before; expected up to {RAYS}")
+            raise ValueError(f"beam[{j}].count: {count} rays in this beam and those before it; expected up to {RAYS}")
     rays = []
     for j, beam in enumerate(tables):
         try:

@@ -35,7 +35,7 @@ def polygon(points: ArrayLike, arcs: Sequence[float] | None = None) -> Curve:
     curve = _chain(points, arcs, closed=True)
     size = area(curve)
     if abs(size) <= 1e-12 * np.ptp(curve.vertices, 0).max() ** 2:
-        raise ValueError("points: they enclose no area; expected three that are not on a line, or an arc")
+        raise ValueError("points: they enclose no area; expected three points that are not on a line, or an arc")
     return curve if size > 0 else curve.reversed()
 
 
@@ -46,7 +46,7 @@ def _chain(points: ArrayLike, arcs: Sequence[float] | None, closed: bool) -> Cur
     if len(corners) < 2:
         raise ValueError(f"points: {len(corners)}; expected at least 2")
     if len(turns) != pieces or not all(abs(turn) < 360 for turn in turns):
-        raise ValueError(f"arcs: {len(turns)} for {pieces} pieces; expected one a piece, above -360 and below 360")
+        raise ValueError(f"arcs: {len(turns)} for {pieces} pieces; expected one per piece, above -360 and below 360")
     if not any(turns):
         return polygonal(corners, closed)
     vertices, control, weight = [corners[0]], [], []
@@ -142,10 +142,10 @@ def lens(
         rims = [vertex + depths[0], vertex + thickness + depths[1]]
     if math.isnan(rims[0] + rims[1]):
         ends = (1 / (abs(c) * math.sqrt(1 + k)) for c, k in zip(curvature, conic, strict=True) if c and k > -1)
-        raise ValueError(f"radius = {radius:g}: a surface ends before; expected at most {min(ends, default=0):g}")
+        raise ValueError(f"radius = {radius:g}: a surface is smaller; expected at most {min(ends, default=0):g}")
     if rims[1] < rims[0]:
         meet = _tip(curvature, thickness, conic)[1]
-        raise ValueError(f"radius = {radius:g}: the surfaces meet before; expected at most {meet:g}, or no radius")
+        raise ValueError(f"radius = {radius:g}: the surfaces meet within it; expected at most {meet:g}, or no radius")
     front = _surface(vertex, rims[0], radius, curvature[0], conic[0])
     back = _surface(vertex + thickness, rims[1], radius, curvature[1], conic[1])
     return joined(front, back.reversed())
@@ -170,7 +170,7 @@ def _tip(curvature: Sequence[float], thickness: float, conic: Sequence[float]) -
         if square > 0 and 1 - c1 * k1 * z >= -FLAT and 1 - c2 * k2 * (z - t) >= -FLAT:
             tips.append((math.sqrt(square), z))
     if not tips:
-        raise ValueError(f"curvature = {list(curvature)}: the surfaces never meet; expected only with a radius")
+        raise ValueError(f"curvature = {list(curvature)}: the surfaces never meet; expected a radius")
     radius, z = min(tips)
     return z, radius
 

@@ -46,7 +46,7 @@ def boundaries(parts: list[Part]) -> tuple[Segments, ...]:
     for part, pieces in zip(parts, np.bincount(owner, kept), strict=True):
         if not pieces:
             size = f"beside coordinates of {np.abs(vertices).max():g}; expected above {NEAR:.0e} of that"
-            raise ValueError(f"{part.where}: a point, {size}")
+            raise ValueError(f"{part.where}: it shrinks to a point {size}")
     _, original, same = np.unique(
         _numbers(np.minimum(first, last), np.maximum(first, last), bends), return_index=True, return_inverse=True
     )

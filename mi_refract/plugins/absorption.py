@@ -53,7 +53,7 @@ def read_absorption(plugin: str, props: Properties, side: str) -> Absorption | N
     sigma, colour, distance = f"{side}_absorption", f"{side}_colour", f"{side}_colour_distance"
     if sigma in props:
         if colour in props or distance in props:
-            raise ValueError(f"{plugin}: {sigma} beside {colour}; expected one of the two")
+            raise ValueError(f"{plugin}: {sigma} and {colour} are both set; expected one of them")
         name, length = sigma, 0.0
     elif (colour in props) != (distance in props):
         missing = distance if colour in props else colour

@@ -144,7 +144,10 @@ def read_ratio(v: Variant, props: Properties) -> tuple[DispersiveRatio | Texture
     d_line = media.LINES["d"]
     if not all(isinstance(index, Medium) for index in indices.values()):
         if dispersive:
-            raise ValueError(f"{PLUGIN}: {dispersive[0]}; expected beside a texture one index for all wavelengths")
+            raise ValueError(
+                f"{PLUGIN}: {dispersive[0]} is dispersive, but the other index is a texture; expected one index for "
+                "all wavelengths"
+            )
         return TexturedRatio(v, {k: x.index(d_line) if isinstance(x, Medium) else x for k, x in indices.items()}), 1.0
     inside, outside = indices.values()
     number = float(media.relative_index(inside, outside, d_line))
@@ -155,8 +158,8 @@ def read_ratio(v: Variant, props: Properties) -> tuple[DispersiveRatio | Texture
         elif lost := lost_colour(medium):
             text = f"{label} has an index from {medium.valid[0]:g} to {medium.valid[1]:g} nm"
             if lost > LOST:
-                expected = f"a medium with at most {LOST:.1%}"
-                raise ValueError(f"{text}: outside it is {lost:.1%} of the colour; expected {expected}")
+                expected = f"at most {LOST:.1%}"
+                raise ValueError(f"{text}: {lost:.1%} of the colour lies outside; expected {expected}")
             warn_once(f"{text}; other light ({lost:.1e} of the colour) is lost there")
     return DispersiveRatio(v, inside, outside) if dispersive else None, number
 
@@ -180,7 +183,7 @@ def read_ior(props: Properties, name: str, default: str) -> float:
     index = read_index(mi, props, name, default)
     if isinstance(index, Medium) and not index.dispersive:
         return float(index.index(media.LINES["d"]))
-    raise ValueError(f"{PLUGIN}: {name} = {props[name]}; expected here one index for all wavelengths, everywhere")
+    raise ValueError(f"{PLUGIN}: {name} = {props[name]}; expected one number for all wavelengths and points")
 
 
 def read_index(v: Variant, props: Properties, name: str, default: str) -> Medium | Texture:
@@ -201,5 +204,5 @@ def read_index(v: Variant, props: Properties, name: str, default: str) -> Medium
         return media.parse(knots.values[0], name=label)
     table = "table(" + ", ".join(f"{w!r}: {n!r}" for w, n in zip(*knots, strict=True)) + ")"
     if not v.is_spectral:
-        raise ValueError(f"{label}: a spectrum has become a colour here; expected {name} = {table!r}, a string")
+        raise ValueError(f"{label}: this variant makes a spectrum a colour; use the string {name} = {table!r}")
     return media.parse(table, name=label)

@@ -95,8 +95,8 @@ class Crossings:
         for position, (crossed, _, _, stepped_over) in rows.items():
             if contradicts(crossed, stepped_over):
                 raise ValueError(
-                    f"refract_path: {names[position]} absorbs, and is so thin that rays step over it; expected a sheet "
-                    "thicker than 1e-4 of its largest coordinate: move the scene to the origin"
+                    f"refract_path: {names[position]} absorbs, and is so thin that rays miss one of its sides; "
+                    "expected a sheet thicker than 1e-4 of its largest coordinate: move the scene to the origin"
                 )
         wrong = [(first, position) for position, (n, x, first, _) in rows.items() if contradicts(n, x)]
         if wrong:
@@ -104,7 +104,8 @@ class Crossings:
             camera = "camera_absorption, or the sensor's medium, as the camera's surroundings absorb"
             outside = "ext_absorption (or ext_colour) as the medium around it absorbs"
             raise ValueError(
-                f"refract_path: light comes to {names[position]} through another absorption than its BSDF says; "
+                f"refract_path: inconsistent absorption at {names[position]}: the medium that light arrives in "
+                "differs from the one its BSDF declares; "
                 f"expected {f'{outside}; {camera}' if first else f'{camera}; {outside}'}"
             )
 
@@ -209,7 +210,7 @@ def check_media(v: Variant, scene: Scene) -> None:
             if medium is not None and absorbing:
                 raise ValueError(
                     f"refract_path: {shape_name(shapes, i)} has an {side} medium in a scene whose BSDFs absorb; "
-                    "expected media of shapes only, or absorption of BSDFs only"
+                    "expected either media of shapes or absorption of BSDFs, not both"
                 )
 
 

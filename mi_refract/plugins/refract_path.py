@@ -151,7 +151,9 @@ def integrator_class(v: Variant) -> type:
             if medium is not None or self.camera:  # rays start on the near plane
                 sensors = scene.sensors()
                 if not self.rendering and len(sensors) != 1:  # another integrator does not say which one it renders
-                    raise ValueError(f"{INTEGRATOR}: a camera in an absorbing medium; expected one sensor in the scene")
+                    raise ValueError(
+                        f"{INTEGRATOR}: the camera is in an absorbing medium; expected one sensor in the scene"
+                    )
                 if (place := self.near if self.rendering else to_camera(sensors[0])) is not None:
                     way = (place @ ray.o).z / (place @ ray.d).z
             if needs.shape_media:
@@ -165,9 +167,9 @@ def integrator_class(v: Variant) -> type:
             # Local memory has no derivatives, and the evaluated loops that derivatives need have no local memory.
             symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
             if self.deterministic and not needs.deterministic:
-                raise ValueError(f"{INTEGRATOR}: deterministic; expected scenes of smooth dielectrics and conductors")
+                raise ValueError(f"{INTEGRATOR}: deterministic = true; expected only smooth dielectrics and conductors")
             if self.deterministic and not symbolic:
-                raise ValueError(f"{INTEGRATOR}: deterministic; expected renders that are not differentiated")
+                raise ValueError(f"{INTEGRATOR}: deterministic = true; such a render cannot be differentiated")
             if not symbolic and needs.refracting and needs.smooth and needs.area:
                 warn_once(
                     f"{INTEGRATOR}: derivatives leave out edges of area lights that move, seen through a boundary from "

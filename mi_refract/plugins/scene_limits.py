@@ -97,7 +97,7 @@ def _read(path: Path, folders: list[Path], text: SceneText, depth: int) -> None:
             folders.insert(0, text.searched[-1])
             _limit(path, len(text.searched), FOLDERS, "<path> elements")
         elif element == b"spectrum" and re.fullmatch(r"[^\s,:]+:[^\s,:]+", values.get("value", "").strip()):
-            expected = "a number, or two pairs and more of a wavelength in nm and a value"
+            expected = "a number, or at least two pairs of a wavelength in nm and a value"
             raise ValueError(f"{path}: {values.get('name')} = {values['value']!r}; expected {expected}")
         elif name := values.get("filename"):
             # Mitsuba looks for an included file beside the file that includes it, for a spectrum in <path>s first.

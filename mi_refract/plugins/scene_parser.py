@@ -106,7 +106,7 @@ class ParsedScene:
         for props, read in ((node.props, copy.props) for node, copy in zip(nodes, seen.nodes, strict=True)):
             plugin = props.plugin_name()
             if (name := NEEDED.get(plugin)) and name not in props:
-                raise ValueError(f"{path}: plugin {plugin!r} without {name!r}; expected one with it")
+                raise ValueError(f"{path}: plugin {plugin!r} lacks its parameter {name!r}")
             for name, value in _texts(read):
                 if moved and value in moved:
                     props[name] = value = moved[value]

@@ -79,7 +79,9 @@ def _as_npz(rays: RaySet) -> bytes:
 def _write_exr(path: Path, rays: RaySet) -> None:
     """One pixel per ray, row by row, at most 1024 pixels wide."""
     if rays.precision != "f32" or len(rays) > MOST_EXR_RAYS:
-        raise ValueError(f"{path}: {len(rays)} rays in {rays.precision}; expected in EXR: f32, up to {MOST_EXR_RAYS}")
+        raise ValueError(
+            f"{path}: {len(rays)} rays in {rays.precision}; EXR holds f32 only, and up to {MOST_EXR_RAYS} rays"
+        )
     width = min(len(rays), _EXR_WIDTH)
     height = -(-len(rays) // width)
     columns = RAY_LAYOUTS[media_rays.has_media(rays.header)]

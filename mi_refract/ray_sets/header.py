@@ -54,7 +54,7 @@ class RaysHeader(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         keys = {"wavelength, medium": self.columns_of_media, "media": self.media, "wavelengths": self.wavelengths}
         missing = [key for key, value in keys.items() if value is UNSET]
         if 0 < len(missing) < len(keys):
-            raise ValueError(f"no key `{missing[0]}`; expected {', '.join(f'`{key}`' for key in keys)}, or none")
+            raise ValueError(f"no key `{missing[0]}`; expected all of {', '.join(f'`{key}`' for key in keys)}, or none")
 
 
 def check(header: Mapping[str, Any], rays: int) -> None:
@@ -65,7 +65,7 @@ def check(header: Mapping[str, Any], rays: int) -> None:
     convert(dict(header), RaysHeader, "header")
     count, regimes = header["count"], header["regimes"]
     if count * len(regimes) != rays or not rays:
-        found = f"the header is of {len(regimes)} × {count} rays, the file has {rays}"
+        found = f"the header declares {len(regimes)} × {count} rays, the file has {rays}"
         raise ValueError(f"{found}; expected `count` rays of each regime")
     for i, (name, ends) in enumerate(regimes.items()):
         if ends != [i * count, (i + 1) * count - 1]:
@@ -78,7 +78,7 @@ def as_json(text: str) -> Any:
     try:
         return json.loads(text)
     except RecursionError:
-        raise ValueError("nested too deep; expected JSON") from None
+        raise ValueError("nested too deeply; expected JSON") from None
 
 
 def shown(value: Any) -> str:

@@ -50,7 +50,7 @@ def header_of(specs: Sequence[str], wavelengths: Sequence[float], precision: str
     if max(len(specs), len(wavelengths)) > MOST_MEDIA:
         raise ValueError(f"{found}; expected up to {MOST_MEDIA} of each")
     if wrong := [x for x in wavelengths if not 0 < x < LARGEST_WAVELENGTH]:
-        raise ValueError(f"wavelength {wrong[0]:g}; expected nm, above 0")
+        raise ValueError(f"wavelength {wrong[0]:g}; expected nm, a number above 0")
     rounded = _rounded(wavelengths, precision)
     if len(np.unique(rounded)) < len(rounded) or not rounded.all():
         raise ValueError(
@@ -78,8 +78,8 @@ def check(header: Header) -> None:
 def check_regimes(header: Header) -> None:
     """ValueError, one line, for a regime whose ratios are its own, or for fewer rays than there are combinations."""
     if refused := [name for name in header["regimes"] if name in REGIMES and name not in NAMES]:
-        found = f"regime {refused[0]!r} has ratios of indices of its own"
-        raise ValueError(f"{found}; expected with media: {', '.join(map(repr, NAMES))}")
+        found = f"regime {refused[0]!r} defines its own ratios of indices"
+        raise ValueError(f"{found}; with media, expected one of {', '.join(map(repr, NAMES))}")
     if header["count"] < (least := len(header["media"]) * len(header["wavelengths"])):
         found = f"{header['count']} rays of each regime"
         raise ValueError(f"{found}; expected {least} or more, one for each medium, wavelength and side of the surface")

@@ -47,7 +47,7 @@ class RaysCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         ),
     ] = 0.0
     lengths: Annotated[str, Meta(description="what it does with vectors that are not unit")] = ""
-    remark: Annotated[str, Meta(description="what else is known of it")] = ""
+    remark: Annotated[str, Meta(description="what else is known about it")] = ""
     recorded: Annotated[
         dict[str, float | list[float]],  # msgspec 0.22 misreads limits within a union with a list
         Meta(description="the largest angle in radians of an earlier run, by set of rays: a number, or [from, to]"),
@@ -86,7 +86,7 @@ class ImagesCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     spp: Annotated[
         dict[str, Annotated[int, Meta(ge=1)]], Meta(description="samples a pixel by scene; no other scene is rendered")
     ]
-    assumed: Annotated[tuple[Text, ...], Meta(description="in what its model differs")] = ()
+    assumed: Annotated[tuple[Text, ...], Meta(description="how its model differs from Mitsuba's")] = ()
     deviations: Annotated[dict[str, Text], Meta(description="scenes on which it is known to differ, and why")] = (
         msgspec.field(name="deviation", default_factory=dict)
     )
@@ -105,7 +105,8 @@ class RendererFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     images: Annotated[ImagesCommand | None, Meta(description="`[images]`: how it renders a scene")] = None
     lens: Annotated[tuple[Text, ...], Meta(description="a command that traces a lens, for the study `lenses`")] = ()
     install: Annotated[
-        dict[str, Any] | None, Meta(description="`[install]`: how to install it; of the renderers of this project only")
+        dict[str, Any] | None,
+        Meta(description="`[install]`: how to install it; only for the renderers of this project"),
     ] = None
 
     def __post_init__(self) -> None:

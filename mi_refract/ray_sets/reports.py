@@ -42,7 +42,7 @@ TERMS = {
     "relative to their lengths; u is half an ulp. Of a wrong decision on TIR: of inputs beyond the critical angle",
     "right": f"answers that are not wrong, with m up to {RIGHT:g}; the others are only as good as the error bound",
     "exact": "answers that are the certified direction, rounded: no formula can do better",
-    "wrong": "answers whose error exceeds the bound, whose TIR is misclassified beyond it, or that are no direction",
+    "wrong": "answers whose error exceeds the bound, whose TIR is misclassified beyond it, or that are not a direction",
 }
 MEANING = f"right: backward error m ≤ {RIGHT:g} u (exact for inputs perturbed by at most {RIGHT:g} roundings)"
 _SIGNALLED = "total internal reflection is signalled by"
@@ -130,7 +130,7 @@ def explained(findings: Findings) -> list[str]:
     if certain or not findings.explanations or findings.exit_code > 1:
         return certain
     nearest = max(findings.explanations, key=lambda mistake: mistake.share)
-    return ["none of the usual mistakes explains the answers", *([line(nearest)] if nearest.share > 0 else [])]
+    return ["none of the common mistakes explains the answers", *([line(nearest)] if nearest.share > 0 else [])]
 
 
 def grade(errors: RegimeErrors) -> str:

@@ -41,7 +41,7 @@ def answers_of(
     except TooMuchOutputError as error:
         raise ValueError(f"{name}: {error}; expected one answer a ray") from None
     except TimeoutError:
-        raise ValueError(f"{name}: no answer within {timeout:g} s; expected a longer --timeout") from None
+        raise ValueError(f"{name}: did not finish within {timeout:g} s; set a longer --timeout") from None
     except OSError as error:
         raise type(error)(f"{name}: cannot be started: {error.strerror or error}") from None
     if ended.status:

@@ -117,7 +117,7 @@ def make_given(name: str, ratios: ArrayLike, precision: DTypeLike, seed: int = 0
     regime, k = REGIMES[name], rounded(np.asarray(ratios, float), precision)
     if not regime.takes_k:
         taking = ", ".join(repr(other) for other in REGIMES if REGIMES[other].takes_k)
-        raise ValueError(f"regime {name!r}: its ratios of indices are its own; expected {taking}")
+        raise ValueError(f"regime {name!r}: it defines its own ratios of indices; expected one of {taking}")
     if (k < regime.least_k).any():
         raise ValueError(f"regime {name!r}: k = {k.min():.6g}; expected {regime.least_k:g} or more")
     if not regime.angle:

@@ -103,7 +103,10 @@ def resume(
     if saved.exists() and not restart:
         progress = checkpoint.read(saved, progress.identity)
         if spp is not None and progress.done > spp:
-            raise ValueError(f"{saved}: holds {progress.done} spp; expected at least so many, or --restart")
+            raise ValueError(
+                f"{saved}: already holds {progress.done} samples per pixel; expected --spp {progress.done} or more, or "
+                "--restart"
+            )
         if progress.rest is not None and progress.done != spp:
             progress.rest = None  # it was the last pass, of fewer samples: a whole one takes its place
     elif not restart:
@@ -112,7 +115,7 @@ def resume(
             progress = image
     begun = progress.identity.get(PASS) if progress.tree.passes else None
     if begun and limits.pass_spp not in (None, begun):
-        raise ValueError(f"{saved}: passes of {begun} samples per pixel; expected --pass-spp {begun}, or --restart")
+        raise ValueError(f"{saved}: has passes of {begun} samples per pixel; expected --pass-spp {begun}, or --restart")
     chosen = plan(begun or limits.pass_spp, progress.base.spp if progress.base else 0)
     progress.identity[PASS] = chosen.spp
     return LongRender(job, path, limits, parsed, scene, renderer, spp, chosen, progress)
@@ -171,7 +174,9 @@ class LongRender:
         """
         with lock.held(lock_of(self.output), "a render", self.output, "another file"):
             if self._file_stamps() != self._files_before:
-                raise BlockingIOError(f"{self.output}: another render was there meanwhile; expected to try again")
+                raise BlockingIOError(
+                    f"{self.output}: written by another render in the meantime; run the command again"
+                )
             self.checkpoints.active = True
             try:
                 return self._run(passes or ThisProcess(self.renderer), watch)

@@ -32,7 +32,9 @@ def seed_of(seed: int, number: int) -> int:
 def scalar_seed_of(seed: int, number: int, pixels: int) -> int:
     """The same in scalar variants, for a film of so many pixels. ValueError where passes would repeat."""
     if number >= (most := (MASK + 1) // pixels):
-        raise ValueError(f"pass {number} of {pixels} pixels; scalar variants take up to {most} passes; more --pass-spp")
+        raise ValueError(
+            f"pass {number} of {pixels} pixels; scalar variants support up to {most}; use a larger --pass-spp"
+        )
     return (_mix(seed) + number) % most
 
 
@@ -92,7 +94,7 @@ def plan_passes(
     if min(spp, total or spp) * pixels > MASK:
         raise ValueError(f"{spp} samples per pixel in a pass of {pixels} pixels; expected up to 2³² − 1 samples in all")
     if asked and accepted(asked) != asked:
-        raise ValueError(f"{asked} samples per pixel in a pass; the sampler takes {accepted(asked)}")
+        raise ValueError(f"{asked} samples per pixel in a pass; the sampler supports {accepted(asked)}")
     if total and not asked:
         spp = spp if moments else min(spp, max(1, total // FEW))
     while spp > 1 and accepted(spp) != spp:

@@ -26,7 +26,7 @@ from .scene_files import load_parsed, parse_scene
 MEBIBYTE = 2**20
 LIMIT = 256  # MiB
 _KEPT = 2  # bundles and scenes that a process keeps
-_EXPECTED = "expected with a cluster: a name relative to the scene's folder"
+_EXPECTED = "a cluster needs a name relative to the scene's folder"
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def pack(parsed: ParsedScene, defines: Mapping[str, str], limit: int = LIMIT) ->
         largest = max(sizes, key=sizes.__getitem__)
         listed = f"{size / MEBIBYTE:.1f} MiB of files, the largest {largest} ({sizes[largest] / MEBIBYTE:.1f} MiB)"
         more = f"--bundle-limit {-(-size // MEBIBYTE)}, if all workers have the memory"
-        raise ValueError(f"{parsed.path}: {listed}; expected with a cluster: {limit} MiB, or {more}")
+        raise ValueError(f"{parsed.path}: {listed}; the limit for a cluster is {limit} MiB; raise it by {more}")
     parent = Path(scene).parent
     files = {path: Path(path).read_bytes() for path in sizes}
     moved = {
@@ -78,7 +78,7 @@ def _absolute(path: Path) -> str:
     """Without `..`; ValueError where that is another file, because a folder on the way is a symbolic link."""
     normal = os.path.abspath(path)  # noqa: PTH100 (`Path.absolute` leaves "..")
     if not Path(normal).exists() or not os.path.samefile(path, normal):  # noqa: PTH121
-        raise ValueError(f"{path}: '..' after a symbolic link; expected with a cluster: a name without it")
+        raise ValueError(f"{path}: '..' after a symbolic link; for a cluster, use a name without '..'")
     return normal
 
 

@@ -45,7 +45,7 @@ def parse_scene(path: str | os.PathLike[str], defines: Mapping[str, str] | None 
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such scene file")
     if taken := [name for name in TAKEN if name in defines]:
-        raise ValueError(f"define {taken[0]!r}: taken by Mitsuba's parser; expected any name but {TAKEN}")
+        raise ValueError(f"define {taken[0]!r}: reserved by Mitsuba's parser; expected any name except {TAKEN}")
     with _in_one_line(path):
         return scene_parser.parse(path, defines)
 
@@ -69,7 +69,7 @@ def load_parsed(
         if not isinstance(scene, mi.Scene):
             raise ValueError(f"{path}: holds a {type(scene).__name__}; expected a <scene>")
         if not scene.sensors():
-            raise ValueError(f"{path}: a scene without a sensor; expected at least one")
+            raise ValueError(f"{path}: the scene has no sensor; expected at least one")
         check_integrator(scene)
         width, height = scene.sensors()[0].film().crop_size()
         if width * height > PIXELS:

@@ -57,7 +57,7 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) ->
 
 def _max_depth(integrator: Node) -> int:
     if integrator.type not in INTEGRATORS:
-        raise integrator.error("an integrator of another kind", ", ".join(INTEGRATORS))
+        raise integrator.error("this integrator is not supported", ", ".join(INTEGRATORS))
     depth = integrator.value(int, "max_depth", -1)
     if depth < 1:
         raise integrator.error(f"max_depth = {depth}", "a positive whole number")
@@ -71,7 +71,7 @@ def _max_depth(integrator: Node) -> int:
 def _camera(sensor: Node) -> Camera:
     """A perspective sensor. Clip planes are ignored: they are assumed to cut nothing away."""
     if sensor.type != "perspective":
-        raise sensor.error("a sensor of another kind", "perspective")
+        raise sensor.error("this sensor is not supported", "perspective")
     frame = sensor.transform()
     width = height = 0
     for child in sensor.children():
@@ -125,10 +125,10 @@ def _sky(emitter: Node) -> Colour | Environment:
             raise emitter.error(f"{path}: {pixels.shape[1]} × {pixels.shape[0]} × {pixels.shape[2]}", "finite RGB")
         rotation = emitter.transform()[:3, :3]
         if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-9):
-            raise emitter.error("to_world is no rotation", "a rotation")
+            raise emitter.error("to_world is not a rotation", "a rotation")
         sky = Environment(scale * pixels, rotation)
     else:
-        raise emitter.error("an emitter of another kind", "constant, envmap, and area on a shape")
+        raise emitter.error("this emitter is not supported", "constant, envmap, and area on a shape")
     emitter.ignore("sampling_weight", "mis_compensation")
     emitter.finish()
     return sky

@@ -98,7 +98,7 @@ def _parts(shape: Node, surface: Surface, level: int) -> tuple[Triangles, ...]:
     if shape.type in SHAPES:
         return (SHAPES[shape.type][1](level),)
     if shape.type not in FILES:
-        raise shape.error("a shape of another type", f"{', '.join((*SHAPES, *FILES))}")
+        raise shape.error("this shape is not supported", f"{', '.join((*SHAPES, *FILES))}")
     path, flat = shape.scene.resolve(shape.value(str, "filename")), shape.value(bool, "face_normals", False)
     try:
         with scene_parser.folders(scene_parser.own_folder()):
@@ -180,7 +180,7 @@ def _scattering(bsdf: Node) -> Surface:
         colours, scales = _colours(bsdf, "reflectance", DEFAULT[0])
         bsdf.finish()
         return Surface(tuple(map(Diffuse, colours)), scales, one_sided=any(colour != BLACK for colour in colours))
-    raise bsdf.error("a BSDF of another kind", f"diffuse, twosided, {', '.join(GLASSES)}")
+    raise bsdf.error("this BSDF is not supported", f"diffuse, twosided, {', '.join(GLASSES)}")
 
 
 def _colours(node: Node, name: str, default: float | None) -> tuple[tuple[Colour, ...], tuple[float, float] | None]:

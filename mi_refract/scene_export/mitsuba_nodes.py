@@ -58,7 +58,10 @@ class Node:
     def finish(self) -> None:
         """ValueError where a parameter was not taken."""
         if self.unread:
-            raise self.error(f"its {' and '.join(sorted(self.unread))}", "a plain scene without")
+            names, one = " and ".join(sorted(self.unread)), len(self.unread) == 1
+            raise self.error(
+                f"{names} {'is' if one else 'are'} not supported", f"a scene without {'it' if one else 'them'}"
+            )
 
     def error(self, what: str, accepted: str) -> ValueError:
         """The error that names the file and the plugin, what is wrong, and what would be accepted."""

@@ -34,7 +34,7 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
     place = Path(folder).resolve()
     if place.is_dir():
         if any(place.iterdir()):
-            raise FileExistsError(f"{folder}: holds files already; expected a new folder or an empty one")
+            raise FileExistsError(f"{folder}: already contains files; expected a new folder or an empty one")
     elif place.exists():
         raise NotADirectoryError(f"{folder}: is not a folder; expected a new folder or an empty one")
     atomic.check_parent(place)

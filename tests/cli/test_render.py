@@ -121,7 +121,7 @@ BAD = {
     "define without a name": ({}, ("-D", "=dielectric"), "-D =dielectric; expected NAME=VALUE"),
     "define twice": ({}, ("-D", "bsdf=a", "-D", "bsdf=b"), "bsdf is given twice"),
     "define of nothing": ({}, ("-D", "bdsf=dielectric"), "bdsf"),
-    "define of the parser": ({}, ("-D", "config=x"), "taken by Mitsuba's parser"),
+    "define of the parser": ({}, ("-D", "config=x"), "reserved by Mitsuba's parser"),
     "plugin of another kind": ({}, ("-D", "bsdf=../evil"), "plugin '../evil': neither Mitsuba's nor mi_refract's"),
     "no plugin": ({}, ("-D", "bsdf=nonesuch"), "nonesuch"),
     "no samples": ({}, ("--spp", "0"), "--spp"),
@@ -134,7 +134,7 @@ BAD = {
     "malformed": (SCENE.replace("</shape>", ""), (), "mismatch"),
     "unknown parameter": (SCENE.replace("max_depth", "max_dept"), (), "max_dept"),
     "a BSDF": ('<bsdf version="3.0.0" type="dielectric"/>', (), "holds a BSDF; expected a <scene>"),
-    "no sensor": ('<scene version="3.0.0"/>', (), "without a sensor"),
+    "no sensor": ('<scene version="3.0.0"/>', (), "the scene has no sensor"),
     "empty": ("", (), "scene.xml"),
 }
 

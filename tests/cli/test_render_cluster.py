@@ -59,7 +59,7 @@ def refused(outcome, *messages):
     [
         (("--scheduler", "tcp://h:1", "--workers", 2), "--scheduler and --workers; expected one of them"),
         (("--workers", 0), "--workers"),
-        (("--mixed-workers",), "expected --scheduler ADDRESS or --workers N with it"),
+        (("--mixed-workers",), "--mixed-workers requires --scheduler ADDRESS or --workers N"),
         (("--workers", 1, "--allow-plugins", "evil"), "--allow-plugins evil: native code is not sent to workers"),
         (("--scheduler", "nonsense"), "--scheduler nonsense: no Dask scheduler answers: missing port number"),
         (("--scheduler", "tcp://127.0.0.1:9"), "--scheduler tcp://127.0.0.1:9: no Dask scheduler answers: "),
@@ -73,7 +73,7 @@ def test_misuse(render, scene, options, message):
 def test_too_large_for_a_cluster(render, scene):
     scene.write_text(SCENE + f"<!-- {'x' * 2**20} -->")
     found = render("--workers", 1, "--bundle-limit", 1)
-    refused(found, f"{scene}: 1.0 MiB of files", "expected with a cluster: 1 MiB, or --bundle-limit 2")
+    refused(found, f"{scene}: 1.0 MiB of files", "the limit for a cluster is 1 MiB; raise it by --bundle-limit 2")
 
 
 def test_another_libllvm_is_refused_unless_mixed_workers_are_accepted(render, monkeypatch):

@@ -43,7 +43,7 @@ def test_level_0_is_not_the_default(export):
         (["prism", "--to", "blender"], "expected cycles, luxcore, radiance"),
         (["prism", "--to", "povray"], "a diffuse surface"),
         (["prism", "--to", "cycles", "-o", "no/where"], "not a folder"),
-        (["prism", "--to", "cycles", "-o", "full"], "holds files already"),
+        (["prism", "--to", "cycles", "-o", "full"], "already contains files"),
         (["prism", "--to", "cycles", "-D", "nothing=1"], "nothing"),
         (["prism", "--to", "cycles", "--level", "20"], "expected a whole number from 0 to 8"),
         (["prism"], "--to"),

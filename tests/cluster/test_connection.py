@@ -144,4 +144,4 @@ with local_cluster.started(1) as (address, _):
 
 def test_a_cluster_that_cannot_start(monkeypatch):
     monkeypatch.setattr(sys, "executable", "/bin/false")
-    assert refusal(workers=1) == "--workers 1: no local cluster: ended with status 1; expected fewer workers"
+    assert refusal(workers=1) == "--workers 1: the local cluster did not start: ended with status 1; try fewer workers"

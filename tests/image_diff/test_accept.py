@@ -95,7 +95,7 @@ def test_a_bad_reference_can_be_replaced(folders):
 
 def test_values_that_are_not_finite_become_no_reference(folders):
     image(folders[1] / "same.exr", value=np.inf)
-    with pytest.raises(ValueError, match="not finite; expected with --set allow_nonfinite=true"):
+    with pytest.raises(ValueError, match="not finite; to accept them, pass --set allow_nonfinite=true"):
         to_accept(*folders)
     assert len(to_accept(*folders, Settings((Entry("same.exr", {"allow_nonfinite": True}),)))) == 3
 
@@ -247,7 +247,10 @@ def test_accept_does_not_ask_a_script(run, pair, monkeypatch):
     before = tree(pair[0])
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
     code, out, err = run("accept", *pair)
-    assert (code, err) == (2, "mi-refract: accept asks on a terminal only; elsewhere expected --yes\n")
+    assert (code, err) == (
+        2,
+        "mi-refract: accept asks for confirmation on a terminal; without a terminal, pass --yes\n",
+    )
     assert "louder.exr" in out and tree(pair[0]) == before
 
 
@@ -354,7 +357,7 @@ SPOILED = {
     "status": (lambda d: d["results"][0].update(status="fine"), "results[0].status: invalid enum value 'fine'"),
     "status of a type": (lambda d: d["results"][0].update(status=[]), "results[0].status: expected `str`"),
     "name": (lambda d: d["results"][0].update(name=None), "results[0].name: expected `str`"),
-    "renders": (lambda d: d.update(renders=True), "of --renders; expected "),
+    "renders": (lambda d: d.update(renders=True), "written with --renders; expected "),
     "path": (lambda d: d["results"][0].update(test=7), "results[0].test: expected "),
     "NUL": (lambda d: d["results"][0].update(test="a\0b"), "results[0].test: expected "),
     "outside": (lambda d: entry(d, "louder.exr").update(target="/etc/x.exr"), "expected a path in "),
@@ -394,8 +397,8 @@ def test_bad_words_with_from(run, compared):
     old, new, out = compared
     for words, message in [
         (["--from", out.with_name("none.json")], "none.json"),
-        ([old, "--from", out], "one path; expected with --from both folders before any names, or none"),
-        (["--from", out, "--set", "fail=1"], "--from takes what was compared"),
+        ([old, "--from", out], "only one path; with --from, give both folders before any names, or no folder"),
+        (["--from", out, "--set", "fail=1"], "--from repeats an earlier comparison"),
         ([old, new, "none*", "--from", out], "none*: matches no image; expected "),
         ([], "two paths are needed"),
     ]:
@@ -434,7 +437,7 @@ def test_a_variant_is_replaced_where_it_is_what_was_compared(run, pair, tmp_path
     assert tree(old)["louder-macos.exr"] == tree(new)["louder.exr"]
 
 
-NO_ACCEPT = "settings have no `accept` with macos or one *; expected in mi-refract.toml, below [defaults]"
+NO_ACCEPT = "no template in `accept` contains macos or exactly one *; add to [defaults] in mi-refract.toml"
 
 
 @pytest.mark.parametrize(
@@ -442,13 +445,10 @@ NO_ACCEPT = "settings have no `accept` with macos or one *; expected in mi-refra
     [
         ("", "macos", NO_ACCEPT),
         ('[defaults]\naccept = ["{stem}-*-*.exr"]', "macos", NO_ACCEPT),
-        *(
-            (SETTINGS, name, f"--as-variant '{name}'; expected a part of a file name")
-            for name in ("a/b", "*", " ", "..")
-        ),
-        ('[defaults]\naccept = ["equal-*.exr"]', "one", "equal-one.exr: the reference of another image"),
+        *((SETTINGS, name, f"--as-variant '{name}'; expected part of a file name") for name in ("a/b", "*", " ", "..")),
+        ('[defaults]\naccept = ["equal-*.exr"]', "one", "equal-one.exr: also the reference of another image"),
         ('[defaults]\naccept = ["{stem}-*.png"]', "one", "expected a name that ends in .exr"),
-        ("added", "macos", "inner/added.exr: has no reference yet; expected without --as-variant"),
+        ("added", "macos", "inner/added.exr: has no reference yet; accept it without --as-variant first"),
     ],
 )
 def test_no_variant_where_its_name_says_nothing(run, pair, settings, name, message):

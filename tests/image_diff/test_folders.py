@@ -185,11 +185,11 @@ def test_nothing_to_compare(folders, tmp_path):
     (empty / "notes.txt").write_text("no image")
     (tmp_path / "link").symlink_to(old)
     for reference, test, error, message in [
-        (old, empty, ValueError, "empty: holds no image"),
-        (empty, new, ValueError, "empty: holds no image"),
-        (old, old, ValueError, "the same as the reference"),
-        (old, tmp_path / "link", ValueError, "the same as the reference"),
-        (old / "same.exr", old / "same.exr", ValueError, "the same as the reference"),
+        (old, empty, ValueError, "empty: contains no image"),
+        (empty, new, ValueError, "empty: contains no image"),
+        (old, old, ValueError, "the same path as the reference"),
+        (old, tmp_path / "link", ValueError, "the same path as the reference"),
+        (old / "same.exr", old / "same.exr", ValueError, "the same path as the reference"),
         (old, old / "inner", ValueError, "one path contains the other"),
         (tmp_path, new, ValueError, "one path contains the other"),
         (old, new / "same.exr", ValueError, "cannot compare a folder with a file"),
@@ -290,9 +290,9 @@ def test_bad_renders(tmp_path):
     (twice / "again.exr").write_bytes((twice / "3.exr").read_bytes())
     (tmp_path / "empty").mkdir()
     for folder, message in [
-        (twice, "expected renders of different seeds"),
+        (twice, "expected renders with different seeds"),
         (samples(tmp_path / "one", 1, 200), "one"),
-        (tmp_path / "empty", "empty: holds no image"),
+        (tmp_path / "empty", "empty: contains no image"),
     ]:
         results = diff.diff(good, folder, renders=True)
         assert results.exit_code == 2 and message in results.results[0].error
@@ -301,7 +301,7 @@ def test_bad_renders(tmp_path):
     results = diff.diff(good, sizes, renders=True, maps=True)
     assert results.exit_code == 2 and results.results[0].error.startswith(f"{sizes / '2.exr'}: size 48 × 16")
     assert results.results[0].images.keys() == {"reference"} and results.results[0].unread
-    with pytest.raises(NotADirectoryError, match=r"0\.exr; expected with --renders: a folder"):
+    with pytest.raises(NotADirectoryError, match=r"0\.exr: not a folder; --renders expects folders"):
         diff.diff(good, twice / "0.exr", renders=True)
 
 

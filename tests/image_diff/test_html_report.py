@@ -196,8 +196,9 @@ def test_a_pair_that_does_not_fit_keeps_its_numbers_and_is_named(tmp_path, monke
     assert len(roles(text)) == 6 * pairs and text.count("12 tiles differ.") == 3
     assert text.count("the page is full") == 3 - pairs
     assert (
-        f"Left out, as a page has 15 MB at most: images of {3 - pairs} of 3 failures. A folder has them all: " in text
-    )
+        f"Left out, because a page is limited to 15 MB: images of {3 - pairs} of 3 failures. "
+        "A report in a folder has no limit: "
+    ) in text
     assert "<code>mi-refract diff a b --report report/</code>" in text
 
 
@@ -227,7 +228,7 @@ def test_a_page_of_thousands_is_no_larger_than_its_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(html_report, "LIMIT", 600_000)
     text = written(tmp_path, Results(tmp_path / "a", tmp_path, (*bad, *equal)))
     assert len(text.encode()) <= 600_000
-    listed = html.unescape(re.search("at most: (.*?)\\.", text)[1])
+    listed = html.unescape(re.search("limited to 15 MB: (.*?)\\.", text)[1])
     articles, lines = text.count("<article"), len(re.findall("<tr data-text", text))
     more = [int(each) for each in re.findall(r"… and (\d+) more", text)]
     assert articles >= 20 and lines >= articles and articles + lines + sum(more) == 1200

@@ -54,9 +54,9 @@ def test_what_is_printed_or_drawn_is_taken_and_said():
 
 
 BAD = {
-    "unknown": ("-fale 1", "-fale: no flag of idiff; expected -fail, "),
+    "unknown": ("-fale 1", "-fale: not a flag of idiff; expected -fail, "),
     "perceptual": ("-fail 1 -p", "-p: idiff's perceptual test; expected --method flip"),
-    "no value": ("-fail", "-fail: nothing follows; expected -fail VALUE"),
+    "no value": ("-fail", "-fail: no value follows; expected -fail VALUE"),
     "no number": ("-fail many", "-fail many; expected a number of at least 0"),
     "comma": ("-fail 0,5", "-fail 0,5; expected a number"),
     "negative": ("-fail -1", "-fail -1; expected a number"),
@@ -64,8 +64,8 @@ BAD = {
     "underscore": ("-fail 1_0", "-fail 1_0; expected a number"),
     "share of a pixel": ("-allowfailures 0.5", "-allowfailures 0.5; expected a whole number"),
     "infinite": ("-allowfailures inf", "-allowfailures inf; expected a whole number"),
-    "program": ("idiff -fail 1", "idiff: no flag; expected the flags alone"),
-    "file": ("-fail 1 a.exr", "a.exr: no flag; expected"),
+    "program": ("idiff -fail 1", "idiff: not a flag; expected only flags"),
+    "file": ("-fail 1 a.exr", "a.exr: not a flag; expected"),
     "quote": ("-o 'a", '"-o \'a": No closing quotation; expected flags of idiff'),
 }
 

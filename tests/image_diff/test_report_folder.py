@@ -144,7 +144,7 @@ def test_warnings_variants_and_masks_are_shown(tmp_path):
         "matches a-macos.exr" in index.text and index.text.count("warning: the mask leaves out 83% of the pixels") == 2
     )
     assert index.of("details")[0].keys() == {"open"}  # an equal image with a warning is not folded away
-    assert "nor is it its variant" in index.text
+    assert "its variant differs, too" in index.text
     (page,) = (tmp_path / "report" / "pairs").iterdir()
     assert "left out" in [each["data-role"] for each in Page(page).of("div", "pane")]
 
@@ -192,7 +192,9 @@ def test_a_folder_with_anything_else_is_left_alone(sides, tmp_path, name):
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         (place / name).write_text("mine")
         before = tree(place)
-        with pytest.raises(ValueError, match=r"report: holds .*, no report of ours; expected a new or empty folder"):
+        with pytest.raises(
+            ValueError, match=r"report: contains .*, not part of a report; expected a new or empty folder"
+        ):
             written(sides, place)
         assert tree(place) == before
 

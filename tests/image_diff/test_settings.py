@@ -235,7 +235,7 @@ BAD_ENTRIES = {
     "empty rectangle": (f"{A}ignore = [[0, 0, 0, 3]]", "expected `int` >= 1"),
     "flat rectangle": (f"{A}ignore = [[3, 0, 5, 0]]", "expected `int` >= 1"),
     "option of neither": (f"{A}changed = 1", "image[0]: changed: not an option of auto; expected "),
-    "flags": (f'{A}idiff = "-fale 1"', "image[0]: idiff: -fale: no flag of idiff; expected -fail,"),
+    "flags": (f'{A}idiff = "-fale 1"', "image[0]: idiff: -fale: not a flag of idiff; expected -fail,"),
     "flags of another": (f'{A}method = "flip"\nidiff = ""', "image[0]: unknown key `idiff`"),
     "conflict": (f"{A}fail = 1\n{A}fail = 2", "image[1]: fail: 2.0, but 1.0 in image[0] for the same name 'a'"),
 }
@@ -282,7 +282,7 @@ def test_settings_in_words(method, words, values):
         ("welch", ["tile=1.5"], None, "--set: tile: expected `int`"),
         ("auto", ["variance=../a.exr"], None, "--set: variance: '../a.exr'; expected a relative path"),
         *(("auto", [f"channels={text}"], None, "--set: channels") for text in ("", "X,", "X,X", "a=X,b=X", "=X", "X=")),
-        ("auto", [], "-fale 1", "--set: idiff: -fale: no flag of idiff"),
+        ("auto", [], "-fale 1", "--set: idiff: -fale: not a flag of idiff"),
         ("exact", [], "", "--idiff with --method exact; expected --method tolerance, or none"),
         ("auto", ["method=exact"], "", "--idiff with --method exact; expected --method tolerance, or none"),
         ("flip", ["idiff=-a"], None, "--idiff with --method flip; expected --method tolerance, or none"),

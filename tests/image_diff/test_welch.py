@@ -772,7 +772,7 @@ def test_stacks_of_other_shapes_or_too_few():
     with pytest.raises(ValueError, match="different shapes"):
         compare_stacks(many, np.ones((3, 16, 8, 3)), 8, 1e-3)
     for sides in ((many[:1], many), (many, many[:1])):
-        with pytest.raises(ValueError, match="expected at least 2 a side"):
+        with pytest.raises(ValueError, match="expected at least 2 per side"):
             compare_stacks(*sides, 8, 1e-3)
 
 

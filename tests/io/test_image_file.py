@@ -239,7 +239,7 @@ size 12345
 
 
 def command_in(error):
-    return re.fullmatch(r".*: a Git LFS pointer, not the image; `(.*)` brings it", str(error.value))[1]
+    return re.fullmatch(r".*: a Git LFS pointer, not the image; run `(.*)` to fetch it", str(error.value))[1]
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.png", "in a folder/a[1],*.tif"])

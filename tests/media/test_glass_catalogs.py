@@ -88,7 +88,7 @@ def test_an_unknown_glass_is_told_the_nearest_three():
 
 @READS
 def test_a_glass_that_is_printed_without_a_formula_is_refused():
-    with pytest.raises(ValueError, match="its catalogue prints no formula of this glass; expected another, or table"):
+    with pytest.raises(ValueError, match="its catalogue has no formula for this glass; use another glass, or table"):
         media.parse("HIKARI:J-PSKH8")
 
 

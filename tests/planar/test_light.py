@@ -69,7 +69,11 @@ BAD = {
     "one": ("[486.1327, 587.5618]", "1", "wavelengths: expected `int` >= 2"),
     "negative": ("[486.1327, 587.5618]", "[-500]", "wavelengths[0]: expected `float` > 0.0"),
     "many": ("[486.1327, 587.5618]", "257", "wavelengths: expected `int` <= 256"),
-    "both": ("wavelengths =", 'colours = ["red", "blue"]\nwavelengths =', "colours: beside wavelengths; expected one"),
+    "both": (
+        "wavelengths =",
+        'colours = ["red", "blue"]\nwavelengths =',
+        "colours and wavelengths are both set; expected one",
+    ),
     "light": ("wavelengths =", 'light = "A"\nwavelengths =', "light: invalid enum value 'A'; expected D65, flat"),
 }
 
@@ -83,7 +87,7 @@ def test_what_is_refused_is_one_line(old, new, said, tmp_path):
 
 @pytest.mark.parametrize("text", ["", "red", "1", "nan", "450,", "-450", "inf"])
 def test_words_that_are_no_wavelengths(text):
-    with pytest.raises(ValueError, match="expected wavelengths in nm as"):
+    with pytest.raises(ValueError, match="expected wavelengths in nm, such as"):
         light.parsed(text)
 
 

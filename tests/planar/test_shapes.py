@@ -209,7 +209,7 @@ def test_a_surface_reaches_as_far_as_it_exists():
             radius = 1 / (c * math.sqrt(1 + conic))
             hemisphere = shapes.lens((c, c), 1, radius=radius, conic=(conic, conic))
             assert off_conic(hemisphere.vertices[0], c, conic) <= 8 * ULP * radius
-            with pytest.raises(ValueError, match="a surface ends before"):
+            with pytest.raises(ValueError, match="a surface is smaller"):
                 shapes.lens((c, c), 1, radius=radius * (1 + 1e-14), conic=(conic, conic))
 
 
@@ -219,8 +219,8 @@ def test_a_surface_reaches_as_far_as_it_exists():
         (((0.02, 0.03), 1.0, None), "curvature.*never meet"),
         (((0.0, 0.0), 1.0, None), "curvature.*never meet"),
         (((0.1, -0.5), 20.5, None), "curvature.*never meet"),  # but their far halves do
-        (((0.02, -0.02), 1.0, 60.0), "radius = 60: a surface ends before; expected at most 50"),
-        (((0.02, -0.02), 1.0, 20.0), "radius = 20: the surfaces meet before; expected at most 7.05"),
+        (((0.02, -0.02), 1.0, 60.0), "radius = 60: a surface is smaller; expected at most 50"),
+        (((0.02, -0.02), 1.0, 20.0), "radius = 20: the surfaces meet within it; expected at most 7.05"),
     ],
 )
 def test_impossible_lenses_are_refused(arguments, found):

@@ -104,7 +104,7 @@ BAD = [
     ({"int_colour": 0.5, "int_colour_distance": math.inf}, "int_colour_distance = inf; expected"),
     (
         {"int_colour": 0.5, "int_colour_distance": 1.0, "int_absorption": 1.0},
-        "int_absorption beside int_colour; expected one of the two",
+        "int_absorption and int_colour are both set; expected one of them",
     ),
 ]
 

@@ -194,7 +194,9 @@ def test_a_spectrum_may_jump_between_knots_that_agree_to_nine_digits(spectral_va
 
 
 def test_a_medium_whose_range_leaves_out_colour_is_refused(spectral_variant):
-    with pytest.raises(RuntimeError, match=r"int_ior: .* from 420 to 830 nm: outside it is .* expected a medium with"):
+    with pytest.raises(
+        RuntimeError, match=r"int_ior: .* from 420 to 830 nm: .* of the colour lies outside; expected at most"
+    ):
         load("table(420: 1.5, 830: 1.4)")
 
 

@@ -58,5 +58,7 @@ def test_the_texture_is_a_parameter(typical_variant):
 
 
 def test_beside_a_texture_an_index_is_the_same_for_all_wavelengths(typical_variant):
-    with pytest.raises(RuntimeError, match=r"refract: ext_ior; expected beside a texture one index for all"):
+    with pytest.raises(
+        RuntimeError, match=r"refract: ext_ior is dispersive, but the other index is a texture; expected one index"
+    ):
         load(ext_ior="cauchy(1.5, 4000)")

@@ -90,7 +90,7 @@ def test_sets_that_exr_cannot_hold(tmp_path):
         (ray_set.make(("generic",), 2, "f64"), "2 rays in f64"),
         (Large(two.rays, two.ids, two.header), "16777217 rays in f32"),
     ):
-        with pytest.raises(ValueError, match=f"{words}; expected in EXR: f32, up to 16777216$"):
+        with pytest.raises(ValueError, match=f"{words}; EXR holds f32 only, and up to 16777216 rays$"):
             files.write(tmp_path / "rays.exr", rays)
 
 
@@ -159,12 +159,12 @@ def text_of(rays):
 
 
 HEADERS = {
-    "three rays unjudged": ({"regimes": {"generic": [0, 0]}, "count": 1}, "is of 1 × 1 rays, the file has 4"),
+    "three rays unjudged": ({"regimes": {"generic": [0, 0]}, "count": 1}, "declares 1 × 1 rays, the file has 4"),
     "a gap": ({"regimes": {"generic": [0, 0], "critical": [2, 3]}}, "'generic' has the ids [0, 0]; expected [0, 1]"),
     "two at once": ({"regimes": {"generic": [0, 1], "critical": [1, 2]}}, "'critical' has the ids [1, 2]"),
-    "no regime": ({"regimes": {}}, "the header is of 0 × 2 rays"),
+    "no regime": ({"regimes": {}}, "the header declares 0 × 2 rays"),
     "numbers as text": ({"regimes": {"generic": ["0", "1"]}}, "header: regimes"),
-    "a count that is too large": ({"count": 10**12}, "the header is of 2 × 1000000000000 rays, the file has 4"),
+    "a count that is too large": ({"count": 10**12}, "the header declares 2 × 1000000000000 rays, the file has 4"),
     "a count without an end": ({"count": 10**400}, "header: count"),
     "a count that is true": ({"count": True}, "header: count: expected `int`, got `bool`"),
     "another precision": ({"precision": "f16"}, "header: precision: invalid enum value 'f16'"),

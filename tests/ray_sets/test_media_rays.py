@@ -166,9 +166,9 @@ INVALID = {
     "a medium twice": ({"media": (CROWN, FLINT, f" {CROWN}")}, "2 times; expected each once"),
     "one in f32": ({"wavelengths": (500.0, 500.000001)}, "are not all different in f32; expected each once"),
     "none in f32": ({"wavelengths": (1e-60,)}, "are not all different in f32"),
-    "not a number": ({"wavelengths": (float("nan"),)}, "wavelength nan; expected nm, above 0"),
-    "negative": ({"wavelengths": (500.0, -1.0)}, "wavelength -1; expected nm, above 0"),
-    "infinite": ({"wavelengths": (float("inf"),)}, "wavelength inf; expected nm, above 0"),
+    "not a number": ({"wavelengths": (float("nan"),)}, "wavelength nan; expected nm, a number above 0"),
+    "negative": ({"wavelengths": (500.0, -1.0)}, "wavelength -1; expected nm, a number above 0"),
+    "infinite": ({"wavelengths": (float("inf"),)}, "wavelength inf; expected nm, a number above 0"),
     "out of range": ({"wavelengths": (500.0, 900.0)}, "no index at 900 nm"),
     "many media": ({"media": tuple(f"1.{i}" for i in range(10, 75))}, "65 media and 2 wavelengths; expected up to 64"),
     "many wavelengths": ({"wavelengths": tuple(range(400, 465))}, "3 media and 65 wavelengths; expected up to 64"),
@@ -179,7 +179,10 @@ INVALID = {
     "an index without end": ({"media": ("1e9",)}, "n = 1e+09 beside air at 486.13269 nm; expected 1e-06 … 1e+06"),
     "few rays": ({"count": 11}, "11 rays of each regime; expected 12 or more, one for each medium"),
     **{
-        name: ({"names": ("generic", name)}, f"regime {name!r} has ratios of indices of its own; expected with media: ")
+        name: (
+            {"names": ("generic", name)},
+            f"regime {name!r} defines its own ratios of indices; with media, expected one of ",
+        )
         for name in regimes.REGIMES
         if name not in media_rays.NAMES
     },
@@ -216,7 +219,10 @@ def test_without_the_extra_it_is_named(monkeypatch):
 
 
 HEADERS = {
-    "no wavelengths": ({"wavelengths": None}, "header: no key `wavelengths`; expected `wavelength, medium`, `media`"),
+    "no wavelengths": (
+        {"wavelengths": None},
+        "header: no key `wavelengths`; expected all of `wavelength, medium`, `media`",
+    ),
     "no media": ({"media": None}, "header: no key `media`"),
     "no words": ({"wavelength, medium": None}, "header: no key `wavelength, medium`"),
     "media in text": ({"media": CROWN}, "header: media: expected `array`"),
@@ -241,7 +247,10 @@ HEADERS = {
     "out of range": ({"wavelengths": [486.1327, 900.0]}, "no index at 900 nm"),
     "equal": ({"wavelengths": [500.0, 500.0]}, "are not all different in f32"),
     "more than rays": ({"wavelengths": [400.0 + i for i in range(9)]}, "12 rays of each regime; expected 54 or more"),
-    "another regime": ({"regimes": {"k ≫ 1": [0, 11]}}, "has ratios of indices of its own; expected with media"),
+    "another regime": (
+        {"regimes": {"k ≫ 1": [0, 11]}},
+        "defines its own ratios of indices; with media, expected one of",
+    ),
 }
 
 

@@ -40,7 +40,7 @@ OTHERS = "the others are within the error bound of the formula decomposed"
 SOME_RIGHT = f"16 of 20 answers are right, {OTHERS}; {LARGEST}"
 TWO = regime(), regime("critical", 3e-7)
 MISMATCH = "10 answers, but they do not match the rays"
-NONE_OF_THEM = "none of the usual mistakes explains the answers"
+NONE_OF_THEM = "none of the common mistakes explains the answers"
 LINE = "eta inverted: k was n_to / n_from (97.0% of the answers on which it has an effect)"
 NEAREST = "handedness: text 0.25 (25.0% of the answers on which it has an effect)"
 

@@ -247,7 +247,9 @@ def test_angles_follow_from_ratios_that_are_given(name, angle, precision):
 
 def test_ratios_that_no_regime_takes():
     for name in set(REGIMES) - set(GIVEN):
-        with pytest.raises(ValueError, match=r"its ratios of indices are its own; expected 'generic', .*'tangential'$"):
+        with pytest.raises(
+            ValueError, match=r"it defines its own ratios of indices; expected one of 'generic', .*'tangential'$"
+        ):
             make_given(name, [1.5], np.float32)
     with pytest.raises(ValueError, match=r"regime 'critical': k = 0\.9; expected 1 or more"):
         make_given("critical", [1.5, 0.9], np.float64)

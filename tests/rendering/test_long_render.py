@@ -300,7 +300,7 @@ def test_a_file_of_somebody_else_is_not_resumed_from(tmp_path, llvm):
     [
         ({"seed": 1}, "seed was 0, is 1"),
         ({"pass_spp": 8}, "passes of 4 samples per pixel"),
-        ({"spp": 8}, "holds 12 spp; expected at least so many, or --restart"),
+        ({"spp": 8}, "already holds 12 samples per pixel; expected --spp 12 or more, or --restart"),
     ],
 )
 def test_a_checkpoint_of_another_render_is_refused_by_name(tmp_path, llvm, other, message):
@@ -426,7 +426,7 @@ def test_two_renders_into_one_file(tmp_path, llvm):
 
     first.run(watch)
     assert len(refused) == 5
-    with pytest.raises(BlockingIOError, match="another render was there meanwhile"):
+    with pytest.raises(BlockingIOError, match="written by another render in the meantime"):
         second.run()
 
 

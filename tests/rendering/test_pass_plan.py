@@ -33,7 +33,7 @@ def test_the_seeds_of_scalar_variants_are_in_a_row():
     most = 2**32 // 3000
     assert [scalar_seed_of(0, p, 3000) for p in (0, 1, most - 1)] == [0, 1, most - 1]
     assert scalar_seed_of(1, 5, 3000) == (0x514E28B7 + 5) % most
-    with pytest.raises(ValueError, match="scalar variants take up to"):
+    with pytest.raises(ValueError, match="scalar variants support up to"):
         scalar_seed_of(0, most, 3000)
 
 
@@ -72,7 +72,7 @@ def test_without_moments_a_short_render_has_eight_passes():
 def test_a_pass_is_one_that_the_sampler_takes():
     assert plan_passes(2**18, 100, None, square, moments=True) == PassPlan(4, 100)  # 8 would become 9
     assert plan_passes(2**18, 102, 9, square, moments=True) == PassPlan(9, 103)  # 11 × 9, and 3 become 4
-    with pytest.raises(ValueError, match="8 samples per pixel in a pass; the sampler takes 9"):
+    with pytest.raises(ValueError, match="8 samples per pixel in a pass; the sampler supports 9"):
         plan_passes(64, 100, 8, square, moments=True)
 
 

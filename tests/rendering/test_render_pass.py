@@ -201,5 +201,5 @@ def test_passes_of_scalar_variants_share_no_random_numbers(tmp_path):
     same = by_mitsuba(renderer.scene, 1105, 1, 0), by_mitsuba(renderer.scene, 2867, 1, 0)
     np.testing.assert_array_equal(*same)
     assert not np.array_equal(renderer.render(1105, 1).total, renderer.render(2867, 1).total)
-    with pytest.raises(ValueError, match="pass 1048576 of 4096 pixels; scalar variants take up to 1048576"):
+    with pytest.raises(ValueError, match="pass 1048576 of 4096 pixels; scalar variants support up to 1048576"):
         renderer.render(2**20, 1)

@@ -120,16 +120,14 @@ def test_too_large(folder, monkeypatch):
     scene = written(folder)
     mi.Bitmap(np.random.default_rng(0).random((400, 400, 3), np.float32)).write(str(folder / "common" / "bright.exr"))
     message = rf"{scene}: 1\.\d MiB of files, the largest {folder}/common/bright\.exr \(1\.\d MiB\); "
-    message += "expected with a cluster: 1 MiB, or --bundle-limit 2, if all workers have the memory"
+    message += "the limit for a cluster is 1 MiB; raise it by --bundle-limit 2, if all workers have the memory"
     parsed = parse_scene(scene)
     monkeypatch.delattr(scene_bundle.Path, "read_bytes")  # known before anything is in memory
     with pytest.raises(ValueError, match=message):
         scene_bundle.pack(parsed, {}, 1)
 
 
-ABSOLUTE = (
-    "by an absolute name or from the working folder; expected with a cluster: a name relative to the scene's folder"
-)
+ABSOLUTE = "by an absolute name or from the working folder; a cluster needs a name relative to the scene's folder"
 BRIGHT = "../common/bright.exr"
 SPECTRUM = '<emitter type="constant"><spectrum name="radiance" filename="{common}/glass.spd"/></emitter>'
 
@@ -147,7 +145,7 @@ SPECTRUM = '<emitter type="constant"><spectrum name="radiance" filename="{common
         (
             "link/../common/bright.exr",
             SKY,
-            "link/../common/bright.exr: '..' after a symbolic link; expected with a cluster",
+            "link/../common/bright.exr: '..' after a symbolic link; for a cluster, use",
         ),
     ],
 )

@@ -21,11 +21,11 @@ NAMES = sorted(path.stem for path in SCENES.glob("*.xml"))
 PLANE = ["diamond", "lightpipe", "nested", "prism", "slab"]  # nothing in them is curved
 # What no plain scene holds, and what is said of it.
 NO_PLAIN_SCENE = {
-    "diamond_fire": "MATERIAL:diamond; expected here one index for all wavelengths",
-    "dispersive_prism": r"sellmeier\(.*\); expected here one index for all wavelengths",
-    "green_bottle": "glass_air: its int_colour and int_colour_distance; expected a plain scene without",
-    "spectrum_on_screen": r"sellmeier\(.*\); expected here one index for all wavelengths",
-    "rainbow_drop": "MATERIAL:water; expected here one index for all wavelengths",
+    "diamond_fire": "MATERIAL:diamond; expected one number for all wavelengths",
+    "dispersive_prism": r"sellmeier\(.*\); expected one number for all wavelengths",
+    "green_bottle": "glass_air: int_colour and int_colour_distance are not supported; expected a scene without them",
+    "spectrum_on_screen": r"sellmeier\(.*\); expected one number for all wavelengths",
+    "rainbow_drop": "MATERIAL:water; expected one number for all wavelengths",
 }
 
 

@@ -64,7 +64,7 @@ def test_what_is_there_stays(small, tmp_path):
     (tmp_path / "full" / "mine.txt").write_text("mine")
     (tmp_path / "file").write_text("mine")
     cases = [
-        ("full", "holds files"),
+        ("full", "already contains files"),
         ("file", "not a folder"),
         ("none/below", "not a folder"),
         ("file/below", "not a f"),

@@ -122,3 +122,11 @@ def test_the_tests_of_a_module_come_first():
 
 def test_without_a_checkout_it_is_not_run(tmp_path):
     assert code_mutants.missing(tmp_path) == "no folder of tests beside the package: run it in a checkout"
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["3", "4", "5"], ["-1"], ["many"]], ids=str)
+def test_other_arguments_are_one_line(capsys, arguments):
+    assert code_mutants.main(arguments) == 2
+    assert capsys.readouterr().err.splitlines() == [
+        "usage: python -m validation.robustness.code_mutants COUNT [SEED], whole numbers"
+    ]

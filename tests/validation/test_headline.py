@@ -82,7 +82,7 @@ BODY = Row("ground_truth", "refract", "prism", "llvm_ad_rgb", {"error / bound": 
         ([BODY], 0, "yes", ["Yes.", "Through 1 bodies", "all its rays stay within"], ["direction"]),
         ([dataclasses.replace(BODY, values={"error / bound": 2.0})], 0, "no", ["No:", "some of its rays leave"], []),
         ([SCALAR, SLOW], 1, "yes", ["in double precision"], ["single"]),
-        ([SCALAR, SLOW], 2, "plain", ["67 times as long", "use a compiled one"], ["%"]),
+        ([SCALAR, SLOW], 2, "plain", ["67 times as long", "use a compiled variant"], ["%"]),
         ([SPHERE, FAST], 2, "plain", ["10 % slower", "5.5 % (`balls`)"], []),
         ([SPHERE, MIRAGE, *TRACED], 3, "yes", ["1 of 2 scenes they do not differ", "In `mirage`, 1.0 % of"], []),
         ([SPHERE, MIRAGE, *TRACED], 3, "yes", ["follows all 64 exact", "`dielectric` loses 11", "even exact"], []),

@@ -127,6 +127,6 @@ def test_what_cannot_join_is_misuse_in_a_line(tmp_path, capsys, toml, said):
 def test_a_name_that_is_taken_and_a_study_without_renderers(tmp_path, capsys):
     shutil.copytree(table.SYSTEMS_FOLDER / "pyglm", tmp_path / "pyglm")
     assert command.main(["suite", "--renderer", str(tmp_path / "pyglm"), "--out", str(tmp_path / "out")]) == 2
-    assert "'pyglm' is in the table" in capsys.readouterr().err
+    assert "'pyglm' is already the name of a renderer" in capsys.readouterr().err
     assert command.main(["diff", "--renderer", str(tmp_path / "pyglm"), "--out", str(tmp_path / "out")]) == 2
-    assert "without suite" in capsys.readouterr().err
+    assert "is used by the study `suite` only" in capsys.readouterr().err

@@ -74,9 +74,9 @@ BY_A_DRIVER = ("glsl", "materialx", "wgsl")
 REASONS = {
     "exception": "ended with status 1: RuntimeError: out of glass",
     "killed": "was killed by SIGKILL",
-    "bytes": "no text",
+    "bytes": "bytes that are not text",
     "an id missing": "id 0",
-    "hangs": "no end within 2 s",
+    "hangs": "did not end within 2 s",
 }
 
 
@@ -285,7 +285,9 @@ def test_the_list_says_what_is_there(elsewhere, capsys, monkeypatch):
     assert command.main(["renderers"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == list(SYSTEMS)
-    assert [line.split()[1] for line in lines] == ["here" if s.needs is None else "absent" for s in SYSTEMS.values()]
+    assert [line.split()[1] for line in lines] == [
+        "installed" if s.needs is None else "absent" for s in SYSTEMS.values()
+    ]
 
 
 @pytest.mark.parametrize(
@@ -387,7 +389,7 @@ def test_a_program_that_hangs_takes_its_children_with_it(tmp_path):
     child = f"p = subprocess.Popen(['sleep', '1000']); open({str(where)!r}, 'w').write(str(p.pid))"
     hangs = [sys.executable, "-c", f"import subprocess, time; {child}; time.sleep(1000)"]
     for timeout in (3, 60):  # a busy machine may not even have started it in the shorter time
-        with pytest.raises(environments.Broken, match=f"no end within {timeout} s"):
+        with pytest.raises(environments.Broken, match=f"did not end within {timeout} s"):
             environments.run(hangs, "", timeout)
         if where.exists():
             break

@@ -243,7 +243,7 @@ KINDS = {
     ),
     "other antialiasing": Kind("the 16 samples on a grid that is turned", redrawn(turn=0.46)),
     "less antialiasing": Kind("4 samples instead of 16", redrawn(samples=2)),
-    "a quarter pixel": Kind("the camera has moved so far", redrawn(shift=0.25)),
+    "a quarter pixel": Kind("the camera moved by this distance", redrawn(shift=0.25)),
     "JPEG": Kind("quality 98, without subsampling of the colours", _jpeg),
     "half floats": Kind("an HDR image of 6 stops, rounded to 11 bits", _half_floats),
     "no antialiasing": Kind("1 sample instead of 16; seen in some images", redrawn(samples=1), due=None),

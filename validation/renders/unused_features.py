@@ -39,7 +39,7 @@ TERMS = {
     "edit": "the same for one index edited, to the next image",
     "boundaries": "surfaces that a path from the camera meets on average, without roulette",
     "call": "seconds of one call of `sample`, over the built-in's",
-    "frozen": "time of an image under `dr.freeze`, over that of the same one traced anew; warm",
+    "frozen": "time of an image under `dr.freeze`, over that of the same image traced again; warm",
     "off after an edit": "largest difference of the two after an edit of an index: 0 unless the frozen one is stale",
 }
 NAME = "features"

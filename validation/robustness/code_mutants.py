@@ -257,7 +257,10 @@ STUDY = Study(
 
 
 def main(arguments: Sequence[str]) -> int:
-    """`COUNT [SEED]`; 1 where the bound is broken."""
+    """`COUNT [SEED]`; 1 where the bound is broken, 2 for other arguments."""
+    if not 1 <= len(arguments) <= 2 or not all(word.isdecimal() for word in arguments):
+        print(f"usage: python -m {MODULE} COUNT [SEED], whole numbers", file=sys.stderr)
+        return 2
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # removes the copy
     count, seed = int(arguments[0]), int(arguments[1]) if arguments[1:] else SEED
     if reason := missing():

@@ -43,7 +43,7 @@ QUESTIONS = {
     "trusted": "How far can each formula be trusted?",
     "fast": "Is it as fast as `dielectric`?",
     "differ": "Where do the two differ, and which is right there?",
-    "missing": "What was not run, and what would bring it?",
+    "missing": "What was not run, and what does it need?",
 }
 
 

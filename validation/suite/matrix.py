@@ -88,7 +88,7 @@ def table(rows: list[Row]) -> tuple[str, list[str], list[list[str]]]:
         if row.study == NAME:
             systems.setdefault(row.subject, {})[row.case] = row
     if not any(row.values for cells in systems.values() for row in cells.values()):
-        raise ValueError("README: no other renderer was run; its table needs some")
+        raise ValueError("README: no other renderer was run; its table needs at least one")
     checks = [check for names in CHECKS.values() for check in names]
     lines = [[system, *(_text(cells.get(check)) for check in checks)] for system, cells in systems.items()]
     return TEXT, ["", *checks], lines

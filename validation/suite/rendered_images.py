@@ -156,7 +156,9 @@ def join(system: System) -> None:
         if scene not in SCENES:
             raise ValueError(f"{where}spp, images.deviation: {scene!r}; expected {', '.join(SCENES)}")
     if system.title in IMAGE_RENDERERS:
-        raise ValueError(f"{system.folder}: title: {system.title!r} is another's; expected a new one")
+        raise ValueError(
+            f"{system.folder}: title: {system.title!r} is the title of another renderer; expected a unique title"
+        )
     assumed = images.assumed or ("not said.",)
     IMAGE_RENDERERS[system.title] = ImageRenderer(system.name, by_command(system), images.spp, assumed)
     TERMS[f"{system.title}, assumed"] = " ".join(assumed)

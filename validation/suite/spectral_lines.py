@@ -185,7 +185,7 @@ def spectral(text: str, wavelength: float) -> str:
     ):
         text, count = re.subn(pattern, by, text)
         if count != times:
-            raise ValueError(f"{pattern!r} is there {count} times; expected {times}")
+            raise ValueError(f"{pattern!r} occurs {count} times; expected {times}")
     return text
 
 

@@ -33,9 +33,9 @@ def files(plain: PlainScene) -> Files:
     for mesh in plain.meshes:
         place = f"{plain.name}: {mesh.name}"
         if isinstance(mesh.material, Glass) and not is_closed(mesh.faces):
-            raise ValueError(f"{place}: glass with an open surface; for POV-Ray expected a closed surface")
+            raise ValueError(f"{place}: glass with an open surface; POV-Ray needs a closed surface")
         if isinstance(mesh.material, Diffuse) and any(mesh.material.reflectance):
-            raise ValueError(f"{place}: a diffuse surface; for POV-Ray expected glass and lights")
+            raise ValueError(f"{place}: a diffuse surface; the export to POV-Ray supports glass and lights only")
     # POV-Ray assumes that the outermost medium has index 1: indices are relative to that one.
     glasses = [(mesh.vertices[:, 0].max(), mesh.material) for mesh in plain.meshes if isinstance(mesh.material, Glass)]
     outside = max(glasses, key=lambda glass: glass[0])[1].ext_ior if glasses else 1.0

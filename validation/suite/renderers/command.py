@@ -84,5 +84,5 @@ def _line(system: System) -> str:
     draws = any(renderer.system == system.name for renderer in IMAGE_RENDERERS.values())
     able = {"rays": system.calls, "images": draws, "lenses": system.lens}
     does = " and ".join(word for word, can in able.items() if can)
-    state = "absent" if environments.absent(system) else "here"
-    return f"{system.name:10} {state:7} {does:16} {system.megabytes:5} MB  {system.source}  [{system.licence}]"
+    state = "absent" if environments.absent(system) else "installed"
+    return f"{system.name:10} {state:9} {does:16} {system.megabytes:5} MB  {system.source}  [{system.licence}]"

@@ -116,7 +116,7 @@ def install(system: System) -> None:
         _said_version.cache_clear()
         return
     if not locked(system).exists():
-        raise OSError(f"{system.name}: no lock of its packages; expected {locked(system)}")
+        raise OSError(f"{system.name}: its packages have no lock; expected {locked(system)}")
     shutil.rmtree(folder(system), ignore_errors=True)
     folder(system).mkdir(parents=True)
     if isinstance(needs, Npm):
@@ -196,7 +196,7 @@ def run(command: Sequence[str], given: str = "", timeout: float | None = None, w
     try:
         return ended.out.decode()
     except UnicodeDecodeError:
-        raise Broken(f"wrote {len(ended.out)} bytes that are no text") from None
+        raise Broken(f"wrote {len(ended.out)} bytes that are not text") from None
 
 
 def _last_word(said: bytes) -> str:

@@ -71,7 +71,7 @@ class System:
 
     @property
     def source(self) -> str:
-        """What brings it, in its pinned version."""
+        """How to install it, in its pinned version."""
         match self.needs:
             case Pip(requirements=given):
                 return f"pip install {' '.join(given)}"

@@ -24,6 +24,6 @@ def join(folder: Path) -> System:
     """Take the renderer of a folder into the table. ValueError where one has its name; other errors as of `load`."""
     system = load(folder)
     if system.name in SYSTEMS:
-        raise ValueError(f"{folder}: {system.name!r} is in the table; expected a folder of another name")
+        raise ValueError(f"{folder}: {system.name!r} is already the name of a renderer; rename the folder")
     SYSTEMS[system.name] = system
     return system
