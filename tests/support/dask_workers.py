@@ -16,6 +16,7 @@ from support.processes import ENVIRONMENT
 from mi_refract.cluster.worker_facts import facts
 from mi_refract.cluster.workers import Workers
 
+
 def accepted(client: Any, variant: str, **options: Any) -> Workers:
     """The workers of a client that are like this process, after all have answered."""
     workers = Workers(client, variant, facts(variant), **options)
