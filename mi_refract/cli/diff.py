@@ -61,7 +61,9 @@ Names = Annotated[
 Method = Annotated[str, typer.Option(help=f"Comparison method: {'|'.join((AUTO, *METHODS))}; see --methods.")]
 Set = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help=f"A key of [defaults] in {FILE}, but map, for all images; see --methods."),
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help=f"A key of [defaults] in {FILE}, but map, for all images; see --methods."
+    ),
 ]
 Idiff = Annotated[
     str | None,
