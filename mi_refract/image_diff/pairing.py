@@ -92,14 +92,20 @@ Named = TypeVar("Named", Pair, Result)
 def named(items: Sequence[Named], patterns: Sequence[str]) -> list[Named]:
     """The pairs, or results, whose names match one of the patterns; all without patterns.
 
-    ValueError for a pattern that matches none.
+    A pattern that is the name of an image, such as "a*.exr", is that image alone. ValueError for one that matches none.
     """
+    names = {item.name for item in items}
+    chosen: set[str] = set()
     for pattern in patterns:
-        if not any(name_patterns.matches(pattern, item.name) for item in items):
+        matched = {
+            name for name in names if name == pattern or (pattern not in names and name_patterns.matches(pattern, name))
+        }
+        if not matched:
             raise ValueError(
                 f"{pattern}: matches no image; expected the path of an image in its folder (wildcards: * and ?)"
             )
-    return [item for item in items if not patterns or any(name_patterns.matches(p, item.name) for p in patterns)]
+        chosen |= matched
+    return [item for item in items if not patterns or item.name in chosen]
 
 
 def wrong_entries(settings: Settings, pairs: Sequence[Pair]) -> list[Pair]:

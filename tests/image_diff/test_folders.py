@@ -249,6 +249,19 @@ def test_the_commands_do_what_they_say(tmp_path, run, name, flags, files, expect
     assert run(*shlex.split(commands[0])[1:])[0] == 0
 
 
+def test_a_name_with_a_star_is_that_of_one_image(tmp_path, run):
+    """The command that accepts "a*.exr" leaves "ab.exr" as it is."""
+    old, new = tmp_path / "old", tmp_path / "new"
+    for side, gain in ((old, 1.0), (new, 1.2)):
+        for name in ("a*.exr", "ab.exr"):
+            image(side / name, gain=gain)
+    results = diff.diff(old, new)
+    (command,) = (results.accept(result) for result in results.results if result.name == "a*.exr")
+    assert run("accept", "--yes", *shlex.split(command)[2:])[0] == 0
+    assert [result.name for result in diff.diff(old, new).of(Status.DIFFERENT)] == ["ab.exr"]
+    assert len(diff.diff(old, new, names=["?*.exr"]).results) == 2
+
+
 def test_there_are_commands_only_for_what_can_be_done(folders):
     results = diff.diff(*folders)
     commands = {r.name: (bool(results.reproduce(r)), bool(results.accept(r))) for r in results.results}
