@@ -63,7 +63,9 @@ Method = Annotated[str, typer.Option(help=f"Comparison method: {'|'.join((AUTO, 
 Set = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="KEY=VALUE", help=f"Set a key of [defaults] in {FILE} for all images; see --methods."
+        "--set",
+        metavar="KEY=VALUE",
+        help=f"Set a key of [defaults] in {FILE}, except map, for all images; see --methods.",
     ),
 ]
 Idiff = Annotated[

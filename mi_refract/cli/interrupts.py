@@ -26,7 +26,7 @@ def end_at_once(*, even_if_ignored: bool) -> None:
 
     For the process's own command line, in its main thread. Call it before numpy, Mitsuba or Dr.Jit is imported: the
     threads that they start block what their parent blocks. A signal that the caller has ignored, such as SIGINT of a
-    shell's background job or SIGHUP of `nohup`, stays ignored; SIGINT not with `even_if_ignored`.
+    shell's background job or SIGHUP of `nohup`, stays ignored; but with `even_if_ignored` SIGINT ends the process.
     """
     ignored = {number for number in _ENDING if signal.getsignal(number) is signal.SIG_IGN}
     _blocked.update(_ENDING - ignored | {signal.SIGINT})  # Mitsuba's handler would take it even where it is ignored

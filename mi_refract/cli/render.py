@@ -95,9 +95,9 @@ def render(
     defines = scene_files.parse_defines(define or [])
     cluster = ClusterOptions(ClusterTarget(scheduler, workers), bundle_limit, mixed_workers=mixed_workers)
     cluster.check(allow_plugins or ())
-    share = parse_share(until, "--until") if until else None
-    tile_share = parse_share(until_tile, "--until-tile") if until_tile else None
-    seconds = parse_seconds(duration, "--time") if duration else None
+    share = None if until is None else parse_share(until, "--until")
+    tile_share = None if until_tile is None else parse_share(until_tile, "--until-tile")
+    seconds = None if duration is None else parse_seconds(duration, "--time")
     if preview is not None:
         writable(preview, (".png",))
     chosen = activate(variant)

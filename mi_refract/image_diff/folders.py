@@ -129,10 +129,13 @@ def _compared(pair: Pair, results: Results, *, keep: bool, digests: bool) -> Res
     images, unread = dict[str, Image](), []
     for role, path in (("reference", pair.reference), ("test", pair.test)):
         side = read(path) if path else ()
-        if isinstance(side, Exception):
-            unread.append(one_line(str(side)))
-        elif side:
-            images[role] = file_pair.mean_image(side)
+        try:
+            if isinstance(side, Exception):
+                raise side
+            if side:
+                images[role] = file_pair.mean_image(side)  # renders of several sizes have none
+        except Exception as error:  # the page says why it lacks the image
+            unread.append(one_line(str(error)))
     return replace(result, images=images, unread=" ".join(unread))
 
 
@@ -143,7 +146,7 @@ def _read(path: Path, how: ComparisonSpec, renders: bool) -> Sequence[Image] | E
     """All renders of a folder, or all images of a file; or why they cannot be read."""
     try:
         return file_pair.read_renders(path, how.max_values) if renders else file_pair.read(path, how)
-    except (ValueError, OSError, MemoryError) as error:
+    except Exception as error:  # of whatever kind: it is raised where the images are compared
         return error
 
 

@@ -179,9 +179,13 @@ def from_words(method: str, words: Sequence[str], idiff: str | None = None) -> E
         if not equals or key in table:
             raise ValueError(f"--set {word}; expected KEY=VALUE, each key once")
         table[key] = _value(key, value)
+    for key, by_option in (("method", method != AUTO), ("idiff", idiff is not None)):
+        if by_option and key in table:
+            raise ValueError(f"--set {key}={table[key]} with --{key}; expected one of them")
+    named = table.get("method", method)
+    if (idiff is not None or "idiff" in table) and named not in (AUTO, TOLERANCE):
+        raise ValueError(f"--idiff with --method {named}; expected --method {TOLERANCE}, or none")
     if idiff is not None:
-        if method not in (AUTO, TOLERANCE):
-            raise ValueError(f"--idiff with --method {method}; expected --method {TOLERANCE}, or none")
         table["idiff"], method = idiff, TOLERANCE
     values = _values(table, Keys, "--set", method)
     return Entry("", values if method == AUTO else {"method": method, **values}, COMMAND_LINE)

@@ -19,10 +19,6 @@ class MissingExtraError(MiRefractError, ImportError):
     """A package of an optional extra is not installed."""
 
 
-class TableError(MiRefractError, ValueError):
-    """A table of rays, answers or settings that cannot be read."""
-
-
 class ImageError(MiRefractError, ValueError):
     """A file that is not a readable image, or larger than allowed."""
 

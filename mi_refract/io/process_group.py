@@ -78,8 +78,10 @@ def run(
 
 def _feed(process: subprocess.Popen[bytes], given: bytes) -> None:
     assert process.stdin
+    rest = memoryview(given)
     with contextlib.suppress(OSError):  # nobody reads it
-        process.stdin.write(given)
+        while rest:
+            rest = rest[process.stdin.write(rest) :]  # Linux writes up to 2 GiB at a time
     with contextlib.suppress(OSError):
         process.stdin.close()
 
@@ -109,9 +111,10 @@ def _read(process: subprocess.Popen[bytes], deadline: float, most: int) -> tuple
 
 @contextlib.contextmanager
 def _signals_raise() -> Iterator[Callable[[], None]]:
-    """SIGINT, SIGTERM and SIGHUP, where they would end us, raise within: from the call of what is yielded on.
+    """Within, SIGINT, SIGTERM and SIGHUP raise where they would end us: as soon as the yielded function was called.
 
-    What comes before it raises then: the program that is being started must be known to be ended. In the main thread.
+    A signal before that call is kept, and raised by the call: until the program is started there is nothing to end.
+    Only in the main thread.
     """
     caught: list[int] = []
     ready: list[bool] = []

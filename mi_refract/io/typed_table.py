@@ -37,13 +37,50 @@ def convert(value: Any, kind: type[T], where: str, *, infinite: bool = False) ->
     try:
         _check_finite(value, "$", infinite)
         return msgspec.convert(value, kind)
+    except UnicodeEncodeError:  # of JSON, which can spell half a character
+        raise ValueError(f"{where}: a text with half of a surrogate pair; expected Unicode") from None
     except msgspec.ValidationError as error:
         message, _, path = str(error).partition(" - at `")
-        key = re.sub(r"^(key` in `)?\$\.?", "", path.removesuffix("`"))
-        message = f"{message[0].lower()}{message[1:]}"
-        if message.startswith("object contains unknown field") and not key:
-            message = f"unknown key{message[29:]}; expected {', '.join(getattr(kind, '__struct_encode_fields__', ()))}"
+        path = path.removesuffix("`")
+        key = re.sub(r"^(key` in `)?\$\.?", "", path)
+        message = f"{message[0].lower()}{message[1:]}".replace("object contains unknown field", "unknown key")
+        if message.startswith(("unknown key", "invalid ")) and (names := _names(kind, value, path)):
+            message = f"{message}; expected {', '.join(names)}"
         raise ValueError(" ".join(f"{where}: {f'{key}: ' if key else ''}{message}".split())) from None
+
+
+def _names(kind: Any, value: Any, path: str) -> list[str]:
+    """What may stand at the path where msgspec found another name: keys of a table, or words. Empty where unknown."""
+    kinds = _alternatives(msgspec.inspect.type_info(kind))
+    for index, name in re.findall(r"\[([^]]*)\]|\.([^.[]+)", path):
+        if name and (tags := [each.tag for each in kinds if getattr(each, "tag_field", None) == name]):
+            return tags
+        if name:
+            found = [
+                field.type for each in _structs(kinds, value) for field in each.fields if field.encode_name == name
+            ]
+        else:
+            found = [each.item_type for each in kinds if hasattr(each, "item_type")]
+        kinds = [each for one in found for each in _alternatives(one)]
+        if isinstance(value, dict):
+            value = value.get(name)  # None of the dots that msgspec writes for a name that a user chose
+        else:
+            value = value[int(index)] if isinstance(value, list) and index else None
+    words = [str(word) for each in kinds for word in getattr(each, "values", ())]
+    return words or [field.encode_name for each in _structs(kinds, value) for field in each.fields]
+
+
+def _alternatives(kind: Any) -> list[Any]:
+    """The members of a union, or the type itself, without its description."""
+    if isinstance(kind, msgspec.inspect.Metadata):
+        return _alternatives(kind.type)
+    return list(kind.types) if isinstance(kind, msgspec.inspect.UnionType) else [kind]
+
+
+def _structs(kinds: list[Any], value: Any) -> list[Any]:
+    """Those of the types that describe this table."""
+    structs = [each for each in kinds if isinstance(each, msgspec.inspect.StructType) and isinstance(value, dict)]
+    return [each for each in structs if each.tag_field is None or each.tag == value.get(each.tag_field)]
 
 
 def _check_finite(value: Any, path: str, infinite: bool) -> None:

@@ -226,6 +226,8 @@ def _rays_of(beam: AnyBeam) -> tuple[Array, Array]:
             return origins, np.broadcast_to(_unit_vector("direction", beam.direction), origins.shape)
         case Fan():
             angles = _spread(*beam.angles, beam.count)
+            if not np.isfinite(angles).all():
+                raise ValueError(f"angles: {list(beam.angles)}; expected a finite difference")
             return np.broadcast_to(beam.at, (beam.count, 2)), np.array([unit(angle) for angle in angles])
         case Rays():
             return np.array(beam.origins), np.array([_unit_vector("directions", value) for value in beam.directions])
@@ -419,7 +421,8 @@ def _rays(tables: Sequence[AnyBeam]) -> tuple[Array, Array, NDArray[np.intp]]:
     rays = []
     for j, beam in enumerate(tables):
         try:
-            rays.append(_rays_of(beam))
+            with np.errstate(all="ignore"):
+                rays.append(_rays_of(beam))
         except ValueError as error:
             raise ValueError(f"beam[{j}].{error}") from None
         _check_range(f"beam[{j}]", rays[-1][0])

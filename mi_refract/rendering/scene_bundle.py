@@ -52,13 +52,14 @@ def pack(parsed: ParsedScene, defines: Mapping[str, str], limit: int = LIMIT) ->
     """
     named, xml, scene = parsed.files(), [_absolute(path) for path in parsed.xml], _absolute(parsed.path)
     paths = {name: _absolute(path) for name, path in named.items()}
-    files = {path: Path(path).read_bytes() for path in (*xml, *paths.values())}
-    if (size := sum(map(len, files.values()))) > limit * MEBIBYTE:
-        largest = max(files, key=lambda path: len(files[path]))
-        listed = f"{size / MEBIBYTE:.1f} MiB of files, the largest {largest} ({len(files[largest]) / MEBIBYTE:.1f} MiB)"
+    sizes = {path: Path(path).stat().st_size for path in (*xml, *paths.values())}
+    if (size := sum(sizes.values())) > limit * MEBIBYTE:  # before they are in memory
+        largest = max(sizes, key=sizes.__getitem__)
+        listed = f"{size / MEBIBYTE:.1f} MiB of files, the largest {largest} ({sizes[largest] / MEBIBYTE:.1f} MiB)"
         more = f"--bundle-limit {-(-size // MEBIBYTE)}, if all workers have the memory"
         raise ValueError(f"{parsed.path}: {listed}; the limit for a cluster is {limit} MiB; raise it by {more}")
     parent = Path(scene).parent
+    files = {path: Path(path).read_bytes() for path in sizes}
     moved = {
         name: path
         for name, path in paths.items()
@@ -137,8 +138,9 @@ def unpack(bundle: SceneBundle, folder: str) -> Path:
     """Write the files of a bundle below `folder`, once in a process: the folder that stands for the root."""
     root = _unpacked.get(bundle.digest)
     if root is None or not root.is_dir():
-        root = _unpacked[bundle.digest] = Path(tempfile.mkdtemp(prefix="scene-", dir=folder))
+        root = Path(tempfile.mkdtemp(prefix="scene-", dir=folder))
         _write(root, bundle.files, bundle.folders)
+        _unpacked[bundle.digest] = root  # only when it is complete
         if len(_unpacked) > _KEPT:
             shutil.rmtree(_unpacked.popitem(last=False)[1], ignore_errors=True)
     return root

@@ -89,7 +89,8 @@ def test_no_error_with_one_image_ends_the_run(folders, monkeypatch, where, error
         return works(first, *more, **options)
 
     monkeypatch.setattr(module, name, fail)
-    check_one_error(diff.diff(*folders), "same.exr", words)
+    for maps in (False, True):
+        check_one_error(diff.diff(*folders, maps=maps), "same.exr", words)
 
 
 @pytest.mark.parametrize("link", [os.symlink, os.link])
@@ -295,6 +296,11 @@ def test_bad_renders(tmp_path):
     ]:
         results = diff.diff(good, folder, renders=True)
         assert results.exit_code == 2 and message in results.results[0].error
+    sizes = samples(tmp_path / "sizes", first=300)
+    image(sizes / "2.exr", shape=(16, 48, 3))  # such renders have no mean to show
+    results = diff.diff(good, sizes, renders=True, maps=True)
+    assert results.exit_code == 2 and results.results[0].error.startswith(f"{sizes / '2.exr'}: size 48 × 16")
+    assert results.results[0].images.keys() == {"reference"} and results.results[0].unread
     with pytest.raises(NotADirectoryError, match=r"0\.exr: not a folder; --renders expects folders"):
         diff.diff(good, twice / "0.exr", renders=True)
 

@@ -284,6 +284,10 @@ def test_settings_in_words(method, words, values):
         *(("auto", [f"channels={text}"], None, "--set: channels") for text in ("", "X,", "X,X", "a=X,b=X", "=X", "X=")),
         ("auto", [], "-fale 1", "--set: idiff: -fale: not a flag of idiff"),
         ("exact", [], "", "--idiff with --method exact; expected --method tolerance, or none"),
+        ("auto", ["method=exact"], "", "--idiff with --method exact; expected --method tolerance, or none"),
+        ("flip", ["idiff=-a"], None, "--idiff with --method flip; expected --method tolerance, or none"),
+        ("flip", ["method=exact"], None, "--set method=exact with --method; expected one of them"),
+        ("auto", ["idiff=-a"], "-a", "--set idiff=-a with --idiff; expected one of them"),
     ],
 )
 def test_bad_settings_in_words(method, words, idiff, message):

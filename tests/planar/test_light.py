@@ -74,7 +74,7 @@ BAD = {
         'colours = ["red", "blue"]\nwavelengths =',
         "colours and wavelengths are both set; expected one",
     ),
-    "light": ("wavelengths =", 'light = "A"\nwavelengths =', "light: invalid enum value 'A'"),
+    "light": ("wavelengths =", 'light = "A"\nwavelengths =', "light: invalid enum value 'A'; expected D65, flat"),
 }
 
 

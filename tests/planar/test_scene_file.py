@@ -183,7 +183,7 @@ def test_rays_start_at_round_numbers_where_they_can(tmp_path):
 
 BAD = {  # what is replaced, by what: the place and what was found or expected
     "unknown key": ("max_depth = 5", "max_depths = 5", "unknown key `max_depths`; expected title, index"),
-    "unknown key of a shape": ("facets = 20", "radius = 3", "shape[2]: object contains unknown field `radius`"),
+    "unknown key of a shape": ("facets = 20", "radius = 3", "shape[2]: unknown key `radius`; expected scale, rotate"),
     "missing key": ("radius = 0.2", "", "shape[1]: object missing required field `radius`"),
     "wrong type": ("radius = 2\n", 'radius = "2"\n', "shape[0].radius: expected `float`, got `str`"),
     "bool": ("radius = 2\n", "radius = true\n", "shape[0].radius: expected `float`, got `bool`"),
@@ -199,7 +199,7 @@ BAD = {  # what is replaced, by what: the place and what was found or expected
     "max_depth 0": ("max_depth = 5", "max_depth = 0", "max_depth: expected `int` >= 1"),
     "branches": ("branches = 1", "branches = -1", "branches: expected `int` >= 0"),
     "view": ("view = [-2, 2,", "view = [2, -2,", "view: [2.0, -2.0, -1.5, 1.5]; expected [x0, x1, y0, y1], x0 < x1"),
-    "unknown kind": ('"ellipse"', '"elipse"', "shape[2].kind: invalid value 'elipse'"),
+    "unknown kind": ('"ellipse"', '"elipse"', "shape[2].kind: invalid value 'elipse'; expected polygon, rectangle"),
     "kind missing": ('kind = "ellipse"', "", "shape[2]: object missing required field `kind`"),
     "kind as a list": ('kind = "fan"', "kind = []", "beam[1].kind: expected `str`, got `list`"),
     "name taken": (
@@ -225,6 +225,7 @@ BAD = {  # what is replaced, by what: the place and what was found or expected
     "no direction": ("direction = [3, 4]", "direction = [0, 0]", "beam[0].direction: [0, 0]; expected degrees, or"),
     "three coordinates": ("at = [-5, 0]", "at = [-5, 0, 1]", "beam[1].at: expected `array` of length 2, got 3"),
     "far away": ("origins = [[0, 1]", "origins = [[0, 1e101]", "beam[2]: coordinates beyond 1e+100"),
+    "angles without a difference": ("[-90, 90]", "[-1e308, 1e308]", "beam[1].angles: [-1e+308, 1e+308]"),
     "too few directions": ("[180, [0, -1e300]]", "[180]", "beam[2]: directions: 1, for 2 origins"),
     "one table": ("[[shape]]", "[shape]", "expected TOML"),
     "syntax": ("max_depth = 5", "max_depth = = 5", "(at line 5, column 13); expected TOML"),

@@ -80,8 +80,11 @@ deviation = {{ prism = "no dispersion" }}
     [
         ("", "object missing required field `title`"),
         ('title = "T"\n', "no [[rays]] and no [images]; expected one of them"),
-        (f'title = "T"\n{RAYS}speed = 3\n', "rays[0]: object contains unknown field `speed`"),
-        (f'title = "T"\n{RAYS.replace("f32", "f16")}', "rays[0].precision: invalid enum value 'f16'"),
+        (f'title = "T"\n{RAYS}speed = 3\n', "rays[0]: unknown key `speed`; expected title, precision"),
+        (
+            f'title = "T"\n{RAYS.replace("f32", "f16")}',
+            "rays[0].precision: invalid enum value 'f16'; expected f32, f64",
+        ),
         (f'title = "T"\n{RAYS}{RAYS}', "rays: two functions have the title 'r, f32'"),
         (f'title = "T"\n{RAYS.replace("./r", "{rays}")}', "rays[0]: command: {rays}: 'rays'; expected {python}"),
         (f'title = "T"\n{RAYS}gives_up = -1\n', "rays[0].gives_up: expected `float` >= 0"),

@@ -45,8 +45,8 @@ def written(folder, texture="../common/bright.exr", more=SKY):
     return path
 
 
-def pack(scene, defines=None, limit=256):
-    return scene_bundle.pack(parse_scene(scene, defines), defines or {}, limit)
+def pack(scene, defines=None):
+    return scene_bundle.pack(parse_scene(scene, defines), defines or {})
 
 
 def image(scene):
@@ -94,6 +94,19 @@ def test_unpacked_and_loaded_once_for_each_set_of_defines(folder, tmp_path_facto
     np.testing.assert_allclose(image(other), 3 * image(one), rtol=1e-6)
 
 
+def test_what_was_unpacked_in_part_is_unpacked_again(folder, tmp_path_factory, monkeypatch):
+    bundle, target = pack(written(folder)), str(tmp_path_factory.mktemp("there"))
+
+    def full(*_):
+        raise OSError("No space left on device")
+
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
+        patch.setattr(scene_bundle.Path, "write_bytes", full)
+        scene_bundle.unpack(bundle, target)
+    root = scene_bundle.unpack(bundle, target)
+    assert {"/" + str(path.relative_to(root)) for path in root.rglob("*") if path.is_file()} == {*bundle.files}
+
+
 def test_the_digest_is_of_every_byte(folder):
     before = pack(written(folder)).digest
     assert pack(written(folder)).digest == before
@@ -103,13 +116,15 @@ def test_the_digest_is_of_every_byte(folder):
     assert pack(written(folder)).digest != before
 
 
-def test_too_large(folder):
+def test_too_large(folder, monkeypatch):
     scene = written(folder)
     mi.Bitmap(np.random.default_rng(0).random((400, 400, 3), np.float32)).write(str(folder / "common" / "bright.exr"))
     message = rf"{scene}: 1\.\d MiB of files, the largest {folder}/common/bright\.exr \(1\.\d MiB\); "
     message += "the limit for a cluster is 1 MiB; raise it by --bundle-limit 2, if all workers have the memory"
+    parsed = parse_scene(scene)
+    monkeypatch.delattr(scene_bundle.Path, "read_bytes")  # known before anything is in memory
     with pytest.raises(ValueError, match=message):
-        pack(scene, limit=1)
+        scene_bundle.pack(parsed, {}, 1)
 
 
 ABSOLUTE = "by an absolute name or from the working folder; a cluster needs a name relative to the scene's folder"

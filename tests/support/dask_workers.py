@@ -16,8 +16,6 @@ from support.processes import ENVIRONMENT
 from mi_refract.cluster.worker_facts import facts
 from mi_refract.cluster.workers import Workers
 
-_PID = "import os; from distributed import get_worker"
-
 
 def accepted(client: Any, variant: str, **options: Any) -> Workers:
     """The workers of a client that are like this process, after all have answered."""

@@ -60,6 +60,13 @@ def test_tests_that_fail_without_a_mutant_are_an_error(tree):
         list(code_mutants.examine([mutant], tree))
 
 
+def test_tests_that_cannot_start_without_a_mutant_are_an_error(tree):
+    """pytest then names no test that failed, and every mutant would count as killed."""
+    (tree / "tests/conftest.py").write_text("raise ImportError\n")
+    with pytest.raises(ValueError, match=r"tests/accuracy/test_tiny.py.* fails without a mutant"):
+        list(code_mutants.examine([planted(tree, "return 2 + 3")], tree))
+
+
 def test_what_cannot_change_behaviour_is_no_mutant(tree):
     mutants = code_mutants.every(tree, PATH)
     assert {mutant.line for mutant in mutants} == {

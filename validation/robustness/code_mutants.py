@@ -204,11 +204,13 @@ def examine(mutants: Sequence[Mutant], root: Path = ROOT) -> Iterator[tuple[Muta
                     if result.worker_outcome is not WorkerOutcome.NORMAL:
                         raise ValueError(f"{here[i]}: not tested: {result.output[-300:]}")
                     test = re.search(r"^(?:FAILED|ERROR) ([^\s\[]+)", result.output, re.MULTILINE)
-                    if test and test[1] not in passed:
-                        outcome, _ = run_tests(template.format(**words, tests=test[1]), config.timeout)
+                    # Where no test is named, it hung, or pytest could not start: then all must pass without it.
+                    tests = test[1] if test else " ".join(guards(root, path))
+                    if result.is_killed and tests not in passed:
+                        outcome, _ = run_tests(template.format(**words, tests=tests), config.timeout)
                         if outcome is not TestOutcome.SURVIVED:
-                            raise ValueError(f"{test[1]} fails without a mutant")
-                        passed.add(test[1])
+                            raise ValueError(f"{tests} fails without a mutant")
+                        passed.add(tests)
             for i, result in results.items():
                 yield here[i], result.is_killed
 
