@@ -43,7 +43,7 @@ def _require_file(path: Path) -> None:
     """OSError where `path` exists and is not a regular file: a device or pipe must not be replaced by a file."""
     names = [path, path.parent / path.readlink()] if path.is_symlink() else [path]
     if any(name.parent.resolve().is_relative_to("/proc") for name in names):  # /dev/stdout, /dev/fd/3: may be of a file
-        raise OSError(f"{path}: is a pipe or stream; expected the name of a file")
+        raise OSError(f"{path}: is a stream; expected the name of a file")
     kind = stat.S_IFMT(path.stat().st_mode) if path.exists() else stat.S_IFREG
     if kind == stat.S_IFDIR:
         raise IsADirectoryError(f"{path}: is a folder; expected the name of a file")

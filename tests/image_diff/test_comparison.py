@@ -243,7 +243,7 @@ def test_what_float32_does_not_hold_is_compared_or_refused():
         one, two = (Image(of(SMOOTH).path, np.full((16, 16, 3), x), ("R", "G", "B")) for x in (a, b))
         found = compare("tolerance", one, two, fail=0.0, fail_relative=0.0)
         assert (found.verdict, found.metrics[1].value) == (DIFFERENT, abs(a - b))
-    with pytest.raises(ValueError, match=r"beyond those of float32"):
+    with pytest.raises(ValueError, match=r"exceed the range of float32"):
         compare("flip", Image(one.path, one.pixels * 1e30, one.channels), two)
 
 
@@ -351,9 +351,9 @@ def test_the_number_of_images_must_fit_the_method():
     one, two = of(SMOOTH), [of(SMOOTH)] * 2
     assert [choice(*sides)[0] for sides in (([one], [one]), (two, two))] == ["tolerance", "welch"]
     for sides in ((one, one), (two, one), (one, two)):
-        with pytest.raises(ValueError, match="at least 2 a side"):
+        with pytest.raises(ValueError, match="at least 2 per side"):
             compare("welch", *sides)
-    with pytest.raises(ValueError, match="one a side"):
+    with pytest.raises(ValueError, match="one per side"):
         compare("exact", two, two)
     with pytest.raises(ValueError, match="no image"):
         compare("exact", [], one)
