@@ -108,6 +108,8 @@ def visible():
 
 def test_what_nobody_sees_is_equal_and_what_a_person_sees_is_different(visible):
     assert {row.verdict for row in visible.values()} == {"pass", "info"}
+    dues = [kind.due for kind in KINDS.values()]
+    assert dues.count(False) >= 3 and dues.count(True) >= 3
     for name, row in visible.items():
         if KINDS[name].due is not None:  # else it is seen by some, in some images: nothing is demanded
             assert (row.values[visible_changes.ERROR] > 1) == KINDS[name].due
@@ -121,6 +123,7 @@ def test_what_nobody_sees_is_equal_and_what_a_person_sees_is_different(visible):
     [
         (0.1, 0.12, {"one code", "a quarter pixel"}),
         (0.5, 0.03, {"one code"}),
+        (1.0, 1.0, {"line", "moved object", "brighter surface", "light on a surface"}),
         (9.0, 0.12, {"line", "moved object", "colour of an object"}),
         (0.5, 1.0, {"brighter surface", "light on a surface"}),
     ],
