@@ -68,10 +68,6 @@ Set = Annotated[
         help=f"Set a key of [defaults] in {FILE}, except map, for all images; see --methods.",
     ),
 ]
-Idiff = Annotated[
-    str | None,
-    typer.Option("--idiff", metavar="FLAGS", help="Use --method tolerance with these flags of OpenImageIO's idiff."),
-]
 File = Annotated[
     Path | None,
     typer.Option(
@@ -92,7 +88,6 @@ def diff(
     names: Names = None,
     method: Method = AUTO,
     options: Set = None,
-    idiff: Idiff = None,
     settings: File = None,
     max_values: MaxValues = MAX_VALUES,
     renders: Annotated[bool, typer.Option("--renders", help="Each folder holds several renders of one image.")] = False,
@@ -134,7 +129,7 @@ def diff(
     require_extra("scipy", *(("jinja2", "matplotlib") if report else ()))
     if test is None and not check_settings:
         raise ValueError("two paths are needed; expected mi-refract diff REFERENCE TEST")
-    chosen = _settings(reference, method, options or [], idiff, settings, max_values)
+    chosen = _settings(reference, method, options or [], settings, max_values)
     if check_settings or test is None:
         raise typer.Exit(_check_settings(reference, test or reference, names or [], chosen))
     for path, suffix in ((junit, ".xml"), (json, ".json")):
@@ -191,7 +186,6 @@ def accept(
     names: Names = None,
     method: Method = AUTO,
     options: Set = None,
-    idiff: Idiff = None,
     settings: File = None,
     max_values: MaxValues = MAX_VALUES,
     source: Annotated[
@@ -220,18 +214,16 @@ def accept(
             raise ValueError(
                 f"{reference}: only one path; with --from, give both folders before any names, or no folder"
             )
-        if options or method != AUTO or idiff is not None:
-            raise ValueError("--from repeats an earlier comparison; do not combine it with --method, --set or --idiff")
+        if options or method != AUTO:
+            raise ValueError("--from repeats an earlier comparison; do not combine it with --method or --set")
         results = results_file.read(source, reference, test)
         results = replace(results, results=tuple(pairing.named(results.results, names or [])))
-        results = results_file.with_settings(
-            results, _settings(results.reference, AUTO, [], None, settings, max_values)
-        )
+        results = results_file.with_settings(results, _settings(results.reference, AUTO, [], settings, max_values))
         text_reports.print_errors(results)
     elif reference is None or test is None:
         raise ValueError("two paths are needed; expected mi-refract accept REFERENCE TEST, or --from OUT.json")
     else:
-        chosen = _settings(reference, method, options or [], idiff, settings, max_values)
+        chosen = _settings(reference, method, options or [], settings, max_values)
         with _progress() as progress:
             results = folders.diff(reference, test, chosen, names=names or [], to_accept=True, progress=progress)
         text_reports.print_results(results)
@@ -264,14 +256,11 @@ def require_extra(*packages: str) -> None:
         raise ValueError("comparing needs the extra `diff`: pip install 'mi-refract[diff]'")
 
 
-def _settings(
-    reference: Path, method: str, words: Sequence[str], idiff: str | None, file: Path | None, max_values: int
-) -> Settings:
+def _settings(reference: Path, method: str, words: Sequence[str], file: Path | None, max_values: int) -> Settings:
     """What the options and the settings file say. ValueError or OSError for what they cannot mean."""
     beside = (reference if reference.is_dir() else reference.parent) / FILE
     path = file or (beside if beside.exists() else None)
     flags = ["--method", method] if method != AUTO else []
-    flags += ["--idiff", idiff] if idiff is not None else []
     flags += [each for word in words for each in ("--set", word)]
     flags += ["--max-values", str(max_values)] if max_values != MAX_VALUES else []
     flags += ["--settings", str(file)] if file else []
@@ -279,7 +268,7 @@ def _settings(
         return Settings()
     from mi_refract.image_diff import settings_file
 
-    layer = settings_file.from_words(method, words, idiff)
+    layer = settings_file.from_words(method, words)
     settings = settings_file.load(path, layer, max_values) if path else Settings((layer,), max_values=max_values)
     return replace(settings, flags=tuple(flags))
 

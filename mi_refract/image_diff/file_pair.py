@@ -18,7 +18,7 @@ from mi_refract.io import image_file
 from mi_refract.io.bounded_map import bounded_map
 from mi_refract.io.image_file import MAX_VALUES, Image
 
-from . import channels, idiff_flags, masks, methods, pairing, variances
+from . import channels, masks, methods, pairing, variances
 from .comparison import Comparison, Verdict
 from .results import Result
 from .settings import ComparisonSpec
@@ -37,19 +37,8 @@ class Judged:
     warning: str
 
 
-def read(path: Path, how: ComparisonSpec) -> list[Image]:
-    """Every image of a file; with flags of `idiff` in the numbers that it compares, and without -a the first alone.
-
-    Raises what `image_file.read_parts` raises.
-    """
-    if how.idiff is None:
-        return image_file.read_parts(path, how.max_values)
-    first_only = not idiff_flags.parse(how.idiff).every
-    return image_file.read_parts(path, how.max_values, first_only=first_only, as_idiff=True)
-
-
 def read_renders(folder: Path, max_values: int = MAX_VALUES) -> list[Image]:
-    """The renders of one image in a folder. ValueError where two are the same, seed and all; otherwise as `read`."""
+    """The renders of one image in a folder. Errors: of `image_file.read`, and ValueError for equal ones."""
     paths, failed = pairing.images_in(folder)
     if failed:
         raise OSError(failed[0][1])
@@ -134,9 +123,7 @@ def _compare_parts(
     places = {part: one[part].place or two[part].place for part in compared}
     shown = min(compared, key=lambda part: WORST.index(compared[part].verdict))
     worst, reason = compared[shown], compared[shown].reason
-    if places[shown] and len(compared) == 1:
-        reason += f"; of several images in the file only {places[shown]} is compared"
-    elif places[shown]:
+    if places[shown]:
         alike = sum(comparison.verdict is worst.verdict for comparison in compared.values())
         reason = f"{places[shown]}: {reason}; {worst.verdict}: {alike} of {len(compared)} parts and MIP levels"
     verdict, warning = worst.verdict, ""

@@ -145,7 +145,7 @@ Read = Callable[[Path], Sequence[Image] | Exception]
 def _read(path: Path, how: ComparisonSpec, renders: bool) -> Sequence[Image] | Exception:
     """All renders of a folder, or all images of a file; or why they cannot be read."""
     try:
-        return file_pair.read_renders(path, how.max_values) if renders else file_pair.read(path, how)
+        return file_pair.read_renders(path, how.max_values) if renders else image_file.read_parts(path, how.max_values)
     except Exception as error:  # of whatever kind: it is raised where the images are compared
         return error
 

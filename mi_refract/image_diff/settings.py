@@ -25,7 +25,6 @@ FILE = "mi-refract.toml"
 DEFAULTS, COMMAND_LINE = "defaults", "command line"
 SYSTEMS = {"linux": "linux", "darwin": "macos", "win32": "windows"}  # by sys.platform
 PROCESSORS = {"x86_64": "x86_64", "amd64": "x86_64", "arm64": "arm64", "aarch64": "arm64"}  # by platform.machine()
-TOLERANCE = "tolerance"  # the method that the flags of idiff are for
 
 
 @dataclass(frozen=True)
@@ -34,10 +33,9 @@ class ComparisonSpec:
 
     `max_values`: width × height × channels of an image, at most. `skip`: not compared at all. `accept`: templates of
     other references, each as good as the first. `mask`, `ignore`: pixels that do not count, as a template of an image
-    and as rectangles. `idiff`: the flags of `idiff` that the options come from. `variance`: a template of the image
-    that holds the variance of one sample of each pixel. `channels`: those that are compared, by their names in the
-    reference and in the new image; none: all. `entries`: the tables of the settings file that apply. `error`: why the
-    settings cannot be applied.
+    and as rectangles. `variance`: a template of the image that holds the variance of one sample of each pixel.
+    `channels`: those that are compared, by their names in the reference and in the new image; none: all.
+    `entries`: the tables of the settings file that apply. `error`: why the settings cannot be applied.
     """
 
     method: str = AUTO
@@ -48,7 +46,6 @@ class ComparisonSpec:
     accept: tuple[str, ...] = ()
     mask: str = ""
     ignore: tuple[Rectangle, ...] = ()
-    idiff: str | None = None
     variance: str = ""
     channels: Names = ()
     entries: tuple[str, ...] = ()
@@ -65,8 +62,8 @@ class Entry:
     """One layer of settings.
 
     `pattern`: of the names of its images; "" for `[defaults]` and the command line, which are for all. `values`: of
-    `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `variance`, `channels`, `idiff`, `allow_nonfinite` and the
-    options of methods. `where`: its name in messages. `when`: platforms, one of which must be this one; none: all.
+    `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `variance`, `channels`, `allow_nonfinite` and the options
+    of methods. `where`: its name in messages. `when`: platforms, one of which must be this one; none: all.
     `error`: what is wrong with it.
     """
 
@@ -152,10 +149,10 @@ def _merged(layers: Sequence[Entry]) -> dict[str, Any]:
     method = merged["method"]
     options = {key: merged.pop(key) for key in list(merged) if key in options_of(None)}
     for name in options.keys() - options_of(method):
-        expected = ", ".join(sorted(options_of(method) - {"allow_nonfinite", "idiff"})) or "none"
+        expected = ", ".join(sorted(options_of(method) - {"allow_nonfinite"})) or "none"
         raise ValueError(f"{set_by[name]}: {name}: not an option of {method}; expected {expected}")
     merged.pop("reason", None)
-    return merged | {"idiff": options.pop("idiff", None), "options": options}
+    return merged | {"options": options}
 
 
 @functools.cache
@@ -164,7 +161,7 @@ def options_of(method: str | None) -> frozenset[str]:
     if method is None:
         return frozenset().union(*map(options_of, METHODS))
     names = options_of_auto() if method == AUTO else METHODS[method].options
-    return frozenset(names) | {"allow_nonfinite"} | ({"idiff"} if method == TOLERANCE else set())
+    return frozenset(names) | {"allow_nonfinite"}
 
 
 def written(channels: Names) -> str:

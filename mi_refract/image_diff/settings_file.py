@@ -24,9 +24,9 @@ from msgspec import Meta
 from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.typed_table import convert, key_table, parse_toml
 
-from . import idiff_flags, name_patterns
+from . import name_patterns
 from .methods import AUTO, METHODS, options_of_auto
-from .settings import COMMAND_LINE, DEFAULTS, PROCESSORS, SYSTEMS, TOLERANCE, Entry, Map, Settings
+from .settings import COMMAND_LINE, DEFAULTS, PROCESSORS, SYSTEMS, Entry, Map, Settings
 
 ACCEPTED = (AUTO, *METHODS)
 WORDS = tuple(dict.fromkeys((*SYSTEMS.values(), *PROCESSORS.values())))
@@ -169,8 +169,8 @@ def load(path: str | Path, command_line: Entry | None = None, max_values: int = 
     return Settings(tuple(rules), maps, max_values)
 
 
-def from_words(method: str, words: Sequence[str], idiff: str | None = None) -> Entry:
-    """The layer of the command line: `--method`, `--set KEY=VALUE`, `--idiff`. ValueError for anything else."""
+def from_words(method: str, words: Sequence[str]) -> Entry:
+    """The layer of the command line: `--method`, `--set KEY=VALUE`. ValueError for anything else."""
     if method not in ACCEPTED:
         raise ValueError(f"--method {method}; expected {', '.join(ACCEPTED)}")
     table: dict[str, Any] = {}
@@ -179,14 +179,8 @@ def from_words(method: str, words: Sequence[str], idiff: str | None = None) -> E
         if not equals or key in table:
             raise ValueError(f"--set {word}; expected KEY=VALUE, each key once")
         table[key] = _value(key, value)
-    for key, by_option in (("method", method != AUTO), ("idiff", idiff is not None)):
-        if by_option and key in table:
-            raise ValueError(f"--set {key}={table[key]} with --{key}; expected one of them")
-    named = table.get("method", method)
-    if (idiff is not None or "idiff" in table) and named not in (AUTO, TOLERANCE):
-        raise ValueError(f"--idiff with --method {named}; expected --method {TOLERANCE}, or none")
-    if idiff is not None:
-        table["idiff"], method = idiff, TOLERANCE
+    if method != AUTO and "method" in table:
+        raise ValueError(f"--set method={table['method']} with --method; expected one of them")
     values = _values(table, Keys, "--set", method)
     return Entry("", values if method == AUTO else {"method": method, **values}, COMMAND_LINE)
 
@@ -208,7 +202,7 @@ def _value(key: str, text: str) -> Any:
 
 def _values(table: dict[str, Any], kind: type[Keys], where: str, method: str | None = None) -> dict[str, Any]:
     """The checked values of the keys that are set. Options are those of the method, or of any where none is set."""
-    method = table.get("method", TOLERANCE if "idiff" in table else method)
+    method = table.get("method", method)
     fields = _options(method if method in ACCEPTED else None)
     struct: Any = msgspec.defstruct(kind.__name__, fields, bases=(kind,), forbid_unknown_fields=True, kw_only=True)
     checked = convert(table, struct, where, infinite=True)
@@ -218,13 +212,7 @@ def _values(table: dict[str, Any], kind: type[Keys], where: str, method: str | N
     if "channels" in values:
         named = values["channels"]
         values["channels"] = tuple(named.items()) if isinstance(named, dict) else tuple(zip(named, named, strict=True))
-    if "idiff" not in values:
-        return values
-    try:
-        flags = idiff_flags.parse(values["idiff"])
-    except ValueError as error:
-        raise ValueError(f"{where}: idiff: {error}") from None
-    return {**flags.options, "method": TOLERANCE, **values}
+    return values
 
 
 def _options(method: str | None) -> list[tuple[str, Any, Any]]:
@@ -232,14 +220,10 @@ def _options(method: str | None) -> list[tuple[str, Any, Any]]:
     options = options_of_auto() if method == AUTO else METHODS[method].options if method else {}
     if method is None:
         options = {name: option for each in METHODS.values() for name, option in each.options.items()}
-    fields: list[tuple[str, Any, Any]] = [
+    return [
         (name, Annotated[option.type, Meta(description=option.help)], option.default)
         for name, option in options.items()
     ]
-    if method in (None, TOLERANCE):
-        meaning = Meta(description="flags of OpenImageIO's `idiff`; the method is `tolerance`")
-        fields.append(("idiff", Annotated[str, meaning], ""))
-    return fields
 
 
 def _listed(value: Any) -> list[Any]:

@@ -23,7 +23,6 @@ from mi_refract.io.sanitise import printable
 from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.row import strict
 
-from . import idiff_flags
 from .pairing import Pair
 from .results import FAILED, Result, Results, Status
 from .settings import written
@@ -55,9 +54,8 @@ Rows = list[tuple[str, ...]]  # of a table; the first holds the names of the col
 def print_results(results: Results) -> None:
     """Print the table on stdout, and on stderr a line for each image that could not be compared, and for warnings."""
     print_errors(results)
-    lines = without_effect(results) + [f"{pattern}: matches no image" for pattern in results.unused]
-    for line in lines:
-        print(f"mi-refract: {printable(line)}", file=sys.stderr)
+    for pattern in results.unused:
+        print(f"mi-refract: {printable(pattern)}: matches no image", file=sys.stderr)
     if len(results.results) > len(results.of(Status.ERROR)):
         print_table(table(results), STYLES)
         more = len([result for result in results.of(Status.EQUAL) if not result.warning]) - FEW
@@ -142,13 +140,6 @@ def settings_table(pairs: Sequence[Pair]) -> Rows:
     return rows
 
 
-def without_effect(results: Results) -> list[str]:
-    """A line for each set of `idiff`'s flags with some that have no effect here."""
-    texts = {result.how.idiff or "" for result in results.results}
-    ignored = (idiff_flags.parse(text).ignored for text in sorted(texts))
-    return [f"idiff {' '.join(flags)}: no effect; --report OUT.html shows the difference" for flags in ignored if flags]
-
-
 def why(result: Result) -> str:
     """The reason of the verdict, the warning, and the settings' reason where the image has settings of its own."""
     warned = f"; warning: {result.warning}" if result.warning else ""
@@ -216,7 +207,6 @@ def _entry(results: Results, result: Result) -> dict[str, Any]:
         "method": _method(result),
         "method_why": comparison.chosen if comparison else "",
         "options": dict(how.options),
-        "idiff": how.idiff,
         "channels": [list(pair) for pair in how.channels],
         "variance": how.variance if how.reads_variance else "",
         "mask": how.mask,

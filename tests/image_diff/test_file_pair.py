@@ -102,16 +102,9 @@ def test_a_part_that_one_side_lacks_is_a_difference(tmp_path, number, words):
     assert compared(two, one).reason.startswith(words.replace("is missing", "was added"))
 
 
-def test_without_a_the_first_is_compared_as_idiff_does_and_that_is_said(tmp_path):
-    one, two = parts(tmp_path / "a.exr", SMALL), parts(tmp_path / "b.exr", with_change(SMALL, 1))
-    found = compared(one, two, from_words("auto", [], "-fail .01"))
-    assert str(found.status) == "equal"
-    assert found.reason.endswith("; of several images in the file only part 0 is compared")
-    assert str(compared(one, two, from_words("auto", [], "-a -fail .01")).status) == "different"
-
-
 def test_a_warning_names_its_place_and_the_others_are_counted(tmp_path):
-    flags = from_words("auto", [], "-a -fail .001 -failpercent 60")
+    words = ["fail=.001", "fail_percent=60", "fail_relative=0", "warn=1e-6", "warn_relative=0", "warn_percent=0"]
+    flags = from_words("tolerance", words)
     one = parts(tmp_path / "a.exr", SMALL)
     some = [np.where(each > 0.9, each + 0.01, each) for each in SMALL]
     found = compared(one, parts(tmp_path / "b.exr", [SMALL[0], some[1], SMALL[2]]), flags)

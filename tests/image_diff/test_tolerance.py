@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from support.diff_images import IDIFF
 from support.diff_images import of as image
 
 from mi_refract.image_diff.comparison import Verdict, passes_black
-from mi_refract.image_diff.idiff_flags import parse
 from mi_refract.image_diff.methods import compare
 from mi_refract.image_diff.tolerance import accepts_black, tolerance
 
@@ -52,7 +52,7 @@ def test_random_images_and_thresholds():
     seen = {}
     for _ in range(2000):
         a, b = random_pair(rng)
-        options = {name: float(rng.choice(THRESHOLDS)) for name in parse("").options}
+        options = {name: float(rng.choice(THRESHOLDS)) for name, _ in IDIFF.values()}
         options |= {f"{x}_percent": float(rng.choice([0, 5, 12.5, 100 / 3, 50, 100])) for x in ("fail", "warn")}
         options |= {
             "allow_failures": int(rng.choice([0, 0, 1, 3])),
@@ -165,7 +165,7 @@ def test_failures_that_are_allowed_would_let_black_pass():
 def test_where_black_is_accepted_is_where_it_passes_alone():
     rng = np.random.default_rng(3)
     pixels = rng.choice([0.0, 0.003, 0.004, 0.05, 0.5], (8, 8, 3)).astype(np.float32)
-    options = {**parse("-fail .004 -hardfail .001").options}
+    options = dict(IDIFF.values()) | {"fail": 0.004, "hard_fail": 0.001}
     accepted = accepts_black(pixels, options)
     for y, x in np.ndindex(8, 8):
         assert accepted[y, x] == passes_black(tolerance, [image(pixels[y : y + 1, x : x + 1])], options)
