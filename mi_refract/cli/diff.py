@@ -8,12 +8,11 @@ from __future__ import annotations
 import contextlib
 import enum
 import importlib.util
-import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -25,10 +24,6 @@ from mi_refract.io.atomic import writable
 from mi_refract.io.exit_code import MISUSE
 from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.sanitise import printable
-
-if TYPE_CHECKING:
-    from mi_refract.image_diff.html_report import Page
-    from mi_refract.image_diff.report_folder import Folder
 
 HTML = (".html", ".htm")
 
@@ -94,19 +89,13 @@ def diff(
     inconclusive: Annotated[
         Inconclusive | None, typer.Option(help="Count an inconclusive image as pass or fail. Default: exit code 3.")
     ] = None,
-    report: Annotated[
-        str,
-        typer.Option(
-            metavar="OUT.html|FOLDER/",
-            help="Write an HTML page with the images, or a folder with one page per pair.",
-        ),
-    ] = "",
+    report: Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML page with the images.")] = None,
     report_url: Annotated[
         str,
         typer.Option(
             metavar="URL",
             envvar="MI_REFRACT_REPORT_URL",
-            help="Address of the published report, for links in the job's summary; URL/ links every page.",
+            help="Address of the published report, for a link in the job's summary.",
         ),
     ] = "",
     junit: Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")] = None,
@@ -132,32 +121,32 @@ def diff(
     chosen = _settings(reference, method, options or [], settings, max_values)
     if check_settings or test is None:
         raise typer.Exit(_check_settings(reference, test or reference, names or [], chosen))
-    for path, suffix in ((junit, ".xml"), (json, ".json")):
+    for path, suffixes in ((report, HTML), (junit, (".xml",)), (json, (".json",))):
         if path:
-            writable(path, (suffix,))
-    if _is_folder(report):
-        from mi_refract.image_diff import report_folder
+            writable(path, suffixes)
+    page = None
+    if report:
+        from mi_refract.image_diff.html_report import Page
 
-        report_folder.require_free(Path(report), reference, test)
-    with _report(report) as page:
-        with _progress() as progress:
-            results = folders.diff(
-                reference,
-                test,
-                chosen,
-                names=names or [],
-                renders=renders,
-                inconclusive=inconclusive or "",
-                view=page.view if page else None,
-                digests=bool(json),
-                progress=progress,
-            )
-        text_reports.print_results(results)
-        if page:
-            from mi_refract.io.provenance import provenance
+        page = Page(report)
+    with _progress() as progress:
+        results = folders.diff(
+            reference,
+            test,
+            chosen,
+            names=names or [],
+            renders=renders,
+            inconclusive=inconclusive or "",
+            view=page.view if page else None,
+            digests=bool(json),
+            progress=progress,
+        )
+    text_reports.print_results(results)
+    if page:
+        from mi_refract.io.provenance import provenance
 
-            software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
-            page.write(results, software, results.command("diff", *(names or [])), str(json or ""))
+        software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
+        page.write(results, software, results.command("diff", *(names or [])), str(json or ""))
     if junit:
         text_reports.write_junit(junit, results)
     if json:
@@ -165,13 +154,7 @@ def diff(
     if github:
         for line in text_reports.workflow_commands(results):
             print(line)
-        pages = None
-        if report:
-            from mi_refract.image_diff import html_report
-
-            page_of = html_report.page_of if _is_folder(report) else lambda result: ""
-            pages = text_reports.Pages(report, page_of, report_url)
-        text_reports.append_summary(results, pages)
+        text_reports.append_summary(results, str(report or ""), report_url)
     raise typer.Exit(results.exit_code)
 
 
@@ -287,29 +270,6 @@ def _check_settings(reference: Path, test: Path, names: Sequence[str], chosen: S
 
 
 # Output -------------------------------------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def _report(report: str) -> Iterator[Page | Folder | None]:
-    """The writer of the report, if any. ValueError or OSError where it cannot be written."""
-    if _is_folder(report):
-        from mi_refract.image_diff import report_folder
-
-        with report_folder.writing(Path(report)) as folder:
-            yield folder
-    elif report:
-        from mi_refract.image_diff import html_report
-
-        yield html_report.Page(writable(report, HTML))
-    else:
-        yield None
-
-
-def _is_folder(report: str) -> bool:
-    """Whether the report is a folder: it ends in /, has no ending, or is one already."""
-    path = Path(report)
-    named_so = report.endswith(("/", os.sep)) or not path.suffix
-    return bool(report) and (named_so or (path.suffix.lower() not in HTML and path.is_dir()))
 
 
 @contextlib.contextmanager

@@ -16,7 +16,6 @@ __all__ = [
     "methods",
     "pairing",
     "pixelwise",
-    "report_folder",
     "results",
     "results_file",
     "self_test",

@@ -12,8 +12,7 @@ import re
 import sys
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import quote
@@ -282,60 +281,42 @@ def _message(text: object) -> str:
     return printable(text).replace("%", "%25")
 
 
-@dataclass(frozen=True)
-class Pages:
-    """Where a report is, for links: `name`, and `page` of each result ("" in one file). `url`: where it is published.
-
-    Below a URL that ends in / every page has its own; another one is that of an archive, in which none has.
-    """
-
-    name: str
-    page: Callable[[Result], str]
-    url: str = ""
-
-
-def append_summary(results: Results, pages: Pages | None = None) -> None:
+def append_summary(results: Results, report: str = "", url: str = "") -> None:
     """Append the Markdown to the file that GitHub names in $GITHUB_STEP_SUMMARY, where it does. OSError."""
     if path := os.environ.get("GITHUB_STEP_SUMMARY"):
         with Path(path).open("a", encoding="utf-8") as file:
-            file.write(markdown(results, pages))
+            file.write(markdown(results, report, url))
 
 
-def markdown(results: Results, pages: Pages | None = None) -> str:
-    """A heading with the sentence, where the report is, and a table of what is not equal or has a warning."""
+def markdown(results: Results, report: str = "", url: str = "") -> str:
+    """A heading with the sentence, where the report is, and a table of what is not equal or has a warning.
+
+    No summary can show an image of an artefact, nor link into one. So a report without a `url` is only named.
+    """
     failed = [*results.of(*FAILED), *_warned(results)]
-    lines = [f"### mi-refract diff: {sentence(results)}", "", *([_where(pages), ""] if pages else [])]
-    columns = ["verdict", "image", "method", "why"]
-    if pages and any(map(pages.page, failed[:1])):
-        columns.append("page")
+    lines = [f"### mi-refract diff: {sentence(results)}", ""]
+    if report:
+        run = [os.environ.get(f"GITHUB_{name}", "") for name in ("SERVER_URL", "REPOSITORY", "RUN_ID")]
+        words, place = f"Report: {_literal(report)}", ""
+        if url:
+            words, place = "Report: ", _link(report, url)
+        elif all(run):
+            artefacts = _link("artefacts of this run", f"{run[0]}/{run[1]}/actions/runs/{run[2]}#artifacts")
+            place = f", where it is uploaded among the {artefacts}"
+        lines += [words + place, ""]
     if failed:
-        lines += [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
+        lines += ["| verdict | image | method | why |", "|---|---|---|---|"]
     for result in failed[:SUMMARY_ROWS]:
         words = (_word(result), result.name, _method(result, in_words=True), why(result))
-        cells = [_literal(word) for word in words]
-        if pages and "page" in columns:
-            page = pages.page(result)
-            cells.append(_link(page, pages.url + page if pages.url.endswith("/") else ""))
-        lines.append(f"| {' | '.join(cells)} |")
+        lines.append(f"| {' | '.join(map(_literal, words))} |")
     if len(failed) > SUMMARY_ROWS:
         lines += ["", f"… and {len(failed) - SUMMARY_ROWS} more"]
     return "\n".join(lines) + "\n\n"
 
 
-def _where(pages: Pages) -> str:
-    """Where a reader finds the report: no summary can show an image of an artefact, nor link into one."""
-    if pages.url:
-        return "Report: " + _link(pages.name, pages.url + ("index.html" if pages.url.endswith("/") else ""))
-    run = [os.environ.get(f"GITHUB_{name}", "") for name in ("SERVER_URL", "REPOSITORY", "RUN_ID")]
-    if not all(run):
-        return f"Report: {_literal(pages.name)}"
-    link = _link("artefacts of this run", f"{run[0]}/{run[1]}/actions/runs/{run[2]}#artifacts")
-    return f"Report: {_literal(pages.name)}, where it is uploaded among the {link}"
-
-
 def _link(text: str, url: str) -> str:
-    """The text with a link to a URL, which is escaped so that it ends where the link does; without one the text."""
-    return f"[{_literal(text)}]({quote(printable(url), safe=':/?#&=%@+,;~$!*[]-._')})" if url else _literal(text)
+    """The text with a link to a URL, which is escaped so that it ends where the link does."""
+    return f"[{_literal(text)}]({quote(printable(url), safe=':/?#&=%@+,;~$!*[]-._')})"
 
 
 def _literal(text: str) -> str:
