@@ -71,7 +71,6 @@ FILLED = {
     "Ray",
     "SceneText",
     "Scatter",
-    "SearchState",
     "Start",
     "Tally",
 }
