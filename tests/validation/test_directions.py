@@ -1,6 +1,7 @@
-"""The studies of directions: the fast screen is the oracle's, the worst rays are replayed, and planted defects are seen."""
+"""The studies of directions: the fast screen is right, the worst rays are replayed, and planted defects are seen."""
 
 import dataclasses
+import itertools
 
 import drjit as dr
 import mitsuba as mi
@@ -120,7 +121,7 @@ def test_the_search_finds_defects_that_sampling_misses(vectorised):
 def test_the_herd_stays_in_its_domain_and_gets_no_better(vectorised):
     names = ("generic", "lengths", "axes, signed zeros")
     first, *_, last = herds = [search.climb("promoted", PROMOTED, names, vectorised, g) for g in (0, 1, 12)]
-    assert all((y.score >= x.score).all() for x, y in zip(herds, herds[1:], strict=False))
+    assert all((y.score >= x.score).all() for x, y in itertools.pairwise(herds))
     assert (last.score > first.score).any()
     unit, slack = last.regime == 0, 3**0.5 / 2 * vectorised.roundoff  # rounding moves a length by √3/2 u
     for v in (last.rays.a, last.rays.n):

@@ -56,8 +56,8 @@ def rainbow_incidence(index: Any, order: Any) -> Any:
 def hemispherical(index: float) -> dict[str, np.longdouble]:
     """R_e and R_i, the shares of diffuse light that are reflected outside and inside, of the exact index n > 1.
 
-    Outside, R_e = ∫₀¹ R(x) 2x dx over the cosine x. With y = n cosθ_t = √(x² + κ), κ = n² − 1 and v = x + y, Snell's law
-    reads y − x = κ/v. So x = (v² − κ)/2v, y = (v² + κ)/2v, 2x dx = (v − κ²/v³)/2 dv, and both amplitudes,
+    Outside, R_e = ∫₀¹ R(x) 2x dx over the cosine x. With y = n cosθ_t = √(x² + κ), κ = n² − 1 and v = x + y, Snell's
+    law reads y − x = κ/v. So x = (v² − κ)/2v, y = (v² + κ)/2v, 2x dx = (v − κ²/v³)/2 dv, and both amplitudes,
 
         r_s = (x − y)/(x + y) = −κ/v²,   r_p = (y − n² x)/(y + n² x) = −κ (v² − n² − 1)/((n² + 1) v² − κ²),
 

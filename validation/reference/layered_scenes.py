@@ -115,7 +115,7 @@ STEP = 0.02  # by which a solid is smaller than the one around it, where no ligh
 
 
 def _read(scene: str) -> Layers:
-    """The layers that a scene file holds: BSDFs to_1, to_2, …, and boxes layer_i, from the top, or cylinders shell_i."""
+    """The layers that a scene file holds: BSDFs to_1, to_2, …, and boxes layer_i from the top, or cylinders shell_i."""
     root = ET.parse(SCENES / f"{scene}.xml").getroot()
 
     def values(path: str, name: str = "value") -> list[float]:
