@@ -142,11 +142,11 @@ def _join(folders: list[Path], studies: list[str], target: ClusterTarget) -> Non
     if target.given:
         raise Misuse(f"--renderer {folders[0]} cannot be sent to workers; remove --workers or --scheduler")
     from validation.suite import rendered_images
-    from validation.suite.renderers import table
+    from validation.suite.renderers import system
 
     for folder in folders:
         try:
-            rendered_images.join(table.join(folder))
+            rendered_images.join(system.join(folder))
         except (ValueError, OSError) as error:
             raise Misuse(str(error)) from None
 
