@@ -69,7 +69,6 @@ FILLED = {
     "PathState",
     "Progress",
     "Ray",
-    "SceneText",
     "Scatter",
     "Start",
     "Tally",
