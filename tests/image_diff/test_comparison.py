@@ -335,7 +335,6 @@ def test_channels_are_grouped_by_what_they_are_part_of():
         ("welch", {"tile": 0}, "positive"),
         ("welch", {"tile": True}, "type int"),
         ("welch", {"family_error": 1.0}, "less than 1"),
-        ("welch", {"correction": "none"}, "sidak, holm"),
         ("welch", {"equivalence_margin": float("nan")}, "at least 0"),
         ("welch", {"resolution": 0.0}, "more than 0"),
         ("welch", {"hidden": float("nan")}, "0 to 1"),

@@ -10,8 +10,7 @@ import pytest
 from support.diff_images import of
 
 from mi_refract.image_diff.comparison import Verdict
-from mi_refract.image_diff.flip import encoding, flip
-from mi_refract.image_diff.local_error import local_error, patch_error, windows
+from mi_refract.image_diff.flip import encoding, flip, local_error, patch_error, windows
 from mi_refract.image_diff.methods import compare
 from mi_refract.io import image_file
 

@@ -5,7 +5,7 @@ import pytest
 
 from mi_refract.image_diff import methods, self_test
 from mi_refract.image_diff.comparison import Comparison, Verdict
-from mi_refract.image_diff.defects import DEFECTS
+from mi_refract.image_diff.self_test import DEFECTS
 from mi_refract.io import image_file
 
 IMAGE = 0.2 + 0.8 * np.random.default_rng(5).random((32, 32, 3))

@@ -10,7 +10,7 @@ from support.diff_images import of as image
 from mi_refract.image_diff.comparison import Verdict, passes_black
 from mi_refract.image_diff.idiff_flags import parse
 from mi_refract.image_diff.methods import compare
-from mi_refract.image_diff.tolerance import accepts_black, tolerance
+from mi_refract.image_diff.pixelwise import tolerance, tolerance_accepts_black
 
 THRESHOLDS = (0.0, 1e-6, 1 / 255, 0.004, 0.01, 0.1, 1.0)
 FACTORS = (1, 1, 1, 0.5, 2, 1 + 6e-8, 1 - 6e-8, 1 + 1e-6)
@@ -166,7 +166,7 @@ def test_where_black_is_accepted_is_where_it_passes_alone():
     rng = np.random.default_rng(3)
     pixels = rng.choice([0.0, 0.003, 0.004, 0.05, 0.5], (8, 8, 3)).astype(np.float32)
     options = {**parse("-fail .004 -hardfail .001").options}
-    accepted = accepts_black(pixels, options)
+    accepted = tolerance_accepts_black(pixels, options)
     for y, x in np.ndindex(8, 8):
         assert accepted[y, x] == passes_black(tolerance, [image(pixels[y : y + 1, x : x + 1])], options)
 
