@@ -9,7 +9,6 @@ could not have seen a difference says "inconclusive".
 __all__ = [
     "accept",
     "comparison",
-    "defects",
     "file_pair",
     "folders",
     "html_report",
@@ -23,5 +22,4 @@ __all__ = [
     "settings_file",
     "text_reports",
     "tile_statistics",
-    "tolerance",
 ]

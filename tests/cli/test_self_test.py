@@ -53,7 +53,7 @@ def test_bad_self_tests(run, pair, tmp_path):
         ([tmp_path / "none.xml"], "none.xml"),
         ([tmp_path / "mixed"], "size or channels differ from"),
         ([tmp_path / "nan.exr"], "with finite values only"),
-        (["--allow-plugins", "evil"], "expected a scene SCENE.xml as REFERENCE"),
+        ([], "Missing argument 'REFERENCE'"),
         ([pair[0], "--allow-plugins", "evil"], "expected a scene SCENE.xml as REFERENCE"),
     ]:
         code, out, err = run("self-test", *words)
