@@ -20,7 +20,6 @@ __all__ = [
     "results_file",
     "self_test",
     "settings",
-    "settings_file",
     "text_reports",
     "tile_statistics",
     "tolerance",

@@ -9,8 +9,7 @@ from support.diff_images import image as smooth
 
 from mi_refract.image_diff import accept, folders
 from mi_refract.image_diff.methods import METHODS
-from mi_refract.image_diff.settings import Entry, Settings
-from mi_refract.image_diff.settings_file import from_words
+from mi_refract.image_diff.settings import Entry, Settings, from_words
 from mi_refract.io import image_file
 from mi_refract.io.image_file import read, read_parts
 

@@ -19,8 +19,7 @@ from support.diff_images import IDIFF
 
 from mi_refract.image_diff import folders
 from mi_refract.image_diff.results import Status
-from mi_refract.image_diff.settings import Settings
-from mi_refract.image_diff.settings_file import from_words
+from mi_refract.image_diff.settings import Settings, from_words
 
 FOUND = {"installed": shutil.which("idiff"), "wheel": shutil.which("idiff", path=str(Path(sys.executable).parent))}
 PAIRS = {"installed": 36, "wheel": 108}  # a process of Debian's takes 0.2 s of CPU, of the wheel's 0.05 s

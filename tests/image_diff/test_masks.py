@@ -7,7 +7,7 @@ import pytest
 from support.diff_images import image, samples
 
 from mi_refract.image_diff import folders as diff
-from mi_refract.image_diff import masks, methods
+from mi_refract.image_diff import file_pair, methods
 from mi_refract.image_diff.settings import Entry, Settings
 from mi_refract.io import image_file
 
@@ -73,8 +73,8 @@ def test_nan_that_is_left_out(pair):
 
 def test_a_data_window_that_does_not_begin_at_zero(pair):
     one = image_file.Image(pair[0], np.ones(SIZE), ("R", "G", "B"), origin=(100, 50))
-    assert not masks.made(one, None, [(104, 60, 4, 2)])[10:12, 4:8].any()
-    assert masks.made(one, None, [(104, 60, 4, 2)]).sum() == 32 * 48 - 8
+    assert not file_pair.mask_of(one, None, [(104, 60, 4, 2)])[10:12, 4:8].any()
+    assert file_pair.mask_of(one, None, [(104, 60, 4, 2)]).sum() == 32 * 48 - 8
 
 
 BAD = {
@@ -129,4 +129,4 @@ def test_a_new_image_of_another_size_is_not_spread_over_the_mask(pair, shape):
 @pytest.mark.parametrize("rectangle", [(0, -10, 48, 5), (-9, 0, 4, 32), (-50, -50, 10, 10), (0, 32, 9, 9)])
 def test_a_rectangle_outside_the_image_holds_none_of_its_pixels(pair, rectangle):
     with pytest.raises(ValueError, match="expected a rectangle that overlaps"):
-        masks.made(image_file.read(pair[0]), None, [rectangle])
+        file_pair.mask_of(image_file.read(pair[0]), None, [rectangle])
