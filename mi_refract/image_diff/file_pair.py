@@ -59,7 +59,7 @@ def mean_image(images: Sequence[Image]) -> Image:
 
 
 def compare(
-    result: Result, path: Path, sides: tuple[Sequence[Image], Sequence[Image]], roots: tuple[Path, Path]
+    path: Path, sides: tuple[Sequence[Image], Sequence[Image]], result: Result, roots: tuple[Path, Path]
 ) -> Result:
     """The result with the verdict on the images of both sides, as `result.how` says, and with images and maps.
 

@@ -167,7 +167,7 @@ def _judged(result: Result, roots: tuple[Path, Path], read: Read) -> Result:
                 raise one
             if isinstance(two, Exception):
                 raise two
-            judged.append(file_pair.compare(result, path, (one, two), roots))
+            judged.append(file_pair.compare(path, (one, two), result, roots))
         except (ValueError, OSError, MemoryError) as error:
             failed = failed or error  # unless another reference is equal
             continue

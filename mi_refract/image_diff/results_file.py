@@ -33,7 +33,9 @@ Digest = Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$")]
 
 def write(path: str | Path, results: Results) -> None:
     """Write `as_data` as strict JSON: NaN and the infinities become words. OSError."""
-    write_atomically(path, json.dumps(strict(as_data(results)), indent=1, allow_nan=False) + "\n")
+    data = as_data(results)
+    text = json.dumps(strict(data), indent=1, allow_nan=False)
+    write_atomically(path, text + "\n")
 
 
 def as_data(results: Results) -> dict[str, Any]:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from support.diff_images import image, samples
 
-from mi_refract.image_diff import folders as diff
 from mi_refract.image_diff import file_pair, methods
+from mi_refract.image_diff import folders as diff
 from mi_refract.image_diff.settings import Entry, Settings
 from mi_refract.io import image_file
 
