@@ -233,10 +233,8 @@ def _shown(result: Result, image_bytes: float, map_bytes: float) -> Shown:
     for role, image in result.images.items():  # RGB or gray; of other channels the first stands for all
         names = tuple("RGB") if {*"RGB"} <= {*image.channels} else image.channels[:1]
         sides[role] = side = replace(image, pixels=image.select(names), channels=names)
-        paint, note = (
-            "code" if flip.encoding(side) == "sRGB" else "light",
-            "" if len(names) > 1 else f"channel {names[0]}",
-        )
+        paint = "code" if flip.encoding(side) == "sRGB" else "light"
+        note = "" if len(names) > 1 else f"channel {names[0]}"
         makers.append(functools.partial(_pane, role, paint, None, side.pixels, image_bytes, note=note))
     maps = dict(result.comparison.maps) if result.comparison else {}
     one, two = sides.get("reference"), sides.get("test")
