@@ -19,13 +19,11 @@ import typer
 from mi_refract.image_diff import folders, pairing, text_reports
 from mi_refract.image_diff.methods import AUTO, METHODS
 from mi_refract.image_diff.results import Status
-from mi_refract.image_diff.settings import FILE, Settings
+from mi_refract.image_diff.settings import FILE, Settings, from_words, key_tables, load
 from mi_refract.io.atomic import writable
 from mi_refract.io.exit_code import MISUSE
 from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.sanitise import printable
-
-HTML = (".html", ".htm")
 
 
 class Inconclusive(enum.StrEnum):
@@ -37,16 +35,13 @@ class Inconclusive(enum.StrEnum):
 
 def _print_methods(wanted: bool) -> None:
     if wanted:
-        from mi_refract.image_diff import settings_file
-
-        text = settings_file.reference()
         if sys.stdout.isatty():
             from rich.console import Console
             from rich.markdown import Markdown
 
-            Console().print(Markdown(text))
+            Console().print(Markdown(key_tables()))
         else:
-            print(text)
+            print(key_tables())
         raise typer.Exit
 
 
@@ -121,7 +116,7 @@ def diff(
     chosen = _settings(reference, method, options or [], settings, max_values)
     if check_settings or test is None:
         raise typer.Exit(_check_settings(reference, test or reference, names or [], chosen))
-    for path, suffixes in ((report, HTML), (junit, (".xml",)), (json, (".json",))):
+    for path, suffixes in ((report, (".html", ".htm")), (junit, (".xml",)), (json, (".json",))):
         if path:
             writable(path, suffixes)
     page = None
@@ -147,14 +142,16 @@ def diff(
 
         software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
         page.write(results, software, results.command("diff", *(names or [])), str(json or ""))
-    if junit:
-        text_reports.write_junit(junit, results)
-    if json:
-        text_reports.write_json(json, results)
     if github:
         for line in text_reports.workflow_commands(results):
             print(line)
         text_reports.append_summary(results, str(report or ""), report_url)
+    if junit:
+        text_reports.write_junit(junit, results)
+    if json:
+        from mi_refract.image_diff import results_file
+
+        results_file.write(json, results)
     raise typer.Exit(results.exit_code)
 
 
@@ -230,9 +227,6 @@ def accept(
     print(f"{len(copies)} accepted")
 
 
-# Options ------------------------------------------------------------------------------------------------------------
-
-
 def require_extra(*packages: str) -> None:
     """ValueError, before anything is compared, where a package is not installed."""
     if not all(map(importlib.util.find_spec, packages)):
@@ -247,12 +241,8 @@ def _settings(reference: Path, method: str, words: Sequence[str], file: Path | N
     flags += [each for word in words for each in ("--set", word)]
     flags += ["--max-values", str(max_values)] if max_values != MAX_VALUES else []
     flags += ["--settings", str(file)] if file else []
-    if not flags and path is None:
-        return Settings()
-    from mi_refract.image_diff import settings_file
-
-    layer = settings_file.from_words(method, words)
-    settings = settings_file.load(path, layer, max_values) if path else Settings((layer,), max_values=max_values)
+    layer = from_words(method, words)
+    settings = load(path, layer, max_values) if path else Settings((layer,), max_values=max_values)
     return replace(settings, flags=tuple(flags))
 
 
@@ -267,9 +257,6 @@ def _check_settings(reference: Path, test: Path, names: Sequence[str], chosen: S
     for line in lines + errors:
         print(f"mi-refract: {printable(line)}", file=sys.stderr)
     return MISUSE if errors else 0
-
-
-# Output -------------------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager

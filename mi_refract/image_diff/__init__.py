@@ -19,7 +19,6 @@ __all__ = [
     "results_file",
     "self_test",
     "settings",
-    "settings_file",
     "text_reports",
     "tile_statistics",
 ]

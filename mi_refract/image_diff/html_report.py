@@ -24,7 +24,7 @@ from mi_refract.io import exit_code
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels, block_mean
-from mi_refract.report.embedded_images import EmbeddedImages, encoded, shown, strongest
+from mi_refract.report.embedded_images import EmbeddedImages, encoded, strongest
 from mi_refract.report.html_page import rendered
 from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.plots import histogram_svg
@@ -231,13 +231,11 @@ def _shown(result: Result, image_bytes: float, map_bytes: float) -> Shown:
     sides: dict[str, Image] = {}
     makers: list[Callable[[], Pane]] = []
     for role, image in result.images.items():  # RGB or gray; of other channels the first stands for all
-        pixels, name = shown(image.pixels, image.channels)
-        if pixels is None:
-            pixels, name = image.pixels[..., :1], image.channels[0]
-        side = replace(image, pixels=pixels, channels=tuple("RGB") if name == "RGB" else (name,))
-        paint, note = "code" if flip.encoding(side) == "sRGB" else "light", "" if name == "RGB" else f"channel {name}"
-        makers.append(functools.partial(_pane, role, paint, None, pixels, image_bytes, note=note))
-        sides[role] = side
+        names = tuple("RGB") if {*"RGB"} <= {*image.channels} else image.channels[:1]
+        sides[role] = side = replace(image, pixels=image.select(names), channels=names)
+        paint = "code" if flip.encoding(side) == "sRGB" else "light"
+        note = "" if len(names) > 1 else f"channel {names[0]}"
+        makers.append(functools.partial(_pane, role, paint, None, side.pixels, image_bytes, note=note))
     maps = dict(result.comparison.maps) if result.comparison else {}
     one, two = sides.get("reference"), sides.get("test")
     if one and two and one.pixels.shape == two.pixels.shape:

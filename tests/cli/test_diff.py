@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from support.diff_images import BROKEN, image, samples, tree
 
-from mi_refract.image_diff import methods, text_reports
+from mi_refract.image_diff import methods, results_file, text_reports
 from mi_refract.image_diff.results import Result, Results, Status
 from mi_refract.io import exit_code
 from mi_refract.io.image_file import read, write_exr
@@ -470,7 +470,7 @@ def test_strangers_words_stay_text(tmp_path):
     results = Results(tmp_path, tmp_path, (result,))
     forms = [*text_reports.workflow_commands(results), text_reports.markdown(results).partition("|---|\n")[2]]
     text_reports.write_junit(tmp_path / "out.xml", results)
-    text_reports.write_json(tmp_path / "out.json", results)
+    results_file.write(tmp_path / "out.json", results)
     forms.append(ElementTree.parse(tmp_path / "out.xml").find(".//testcase").get("name"))
     for form in forms:
         form.encode()

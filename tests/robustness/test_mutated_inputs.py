@@ -27,7 +27,7 @@ from hypothesis import strategies as st
 from support.variants import switch
 
 from mi_refract import oracle
-from mi_refract.image_diff import folders, settings_file
+from mi_refract.image_diff import folders, settings
 from mi_refract.image_diff.results import Status
 from mi_refract.io import exit_code, image_file
 from mi_refract.planar import scene_file
@@ -188,7 +188,7 @@ def of_files(folder):
     planar = [(SCENES / "planar" / f"{name}.toml").read_bytes() for name in ("lens", "nested", "prism", "doublet")]
     return {
         "planar scene, TOML": (".toml", planar, lambda path: scene_file.load(path) and None),
-        "diff settings, TOML": (".toml", [SETTINGS], lambda path: settings_file.load(path) and None),
+        "diff settings, TOML": (".toml", [SETTINGS], lambda path: settings.load(path) and None),
         "renderer, TOML": (".toml", [RENDERER], renderer),
         "rows, JSON": (".json", of("rows.json"), lambda path: run_report.read_json(path) and None),
         "rays, CSV": (".csv", of("rays.csv"), same_rays),
