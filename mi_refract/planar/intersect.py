@@ -87,9 +87,8 @@ class Hit:
 
     to_left: the ray goes on to the left of the segment.
     left, right: numbers of the vertices on the left and on the right of the ray.
-    along: the segment's direction, from its left vertex to its right one; of an arc at its left vertex.
-    into: of an arc, the same at its right vertex.
-    bend: of an arc, twice the curvature at a vertex times the cube of |along| or |into|, positive to the left.
+    along, into: the segment's direction, from its left vertex to its right one, at the left and at the right one.
+    bend: of an arc, twice the curvature at a vertex times the cube of |along| or |into|, positive to the left; else 0.
     """
 
     distance: Number
@@ -100,8 +99,8 @@ class Hit:
     left: Index
     right: Index
     along: Vector2
-    into: Vector2 = None
-    bend: Number = None
+    into: Vector2
+    bend: Number
 
 
 def bounding_box(*points: Array) -> tuple[list[float], list[float]]:
@@ -146,9 +145,9 @@ class LineSegments:
 
     def none(self) -> Hit:
         """No crossing, at distance ∞."""
-        number, index, zero = self.arrays.number, self.arrays.index, self.arrays.vector(0)
-        nowhere = index(NOWHERE)
-        return Hit(number(dr.inf), nowhere, number(0), number(0), self.arrays.mask(False), nowhere, nowhere, zero)
+        number, nowhere, way = self.arrays.number, self.arrays.index(NOWHERE), self.arrays.vector(0)
+        left = self.arrays.mask(False)
+        return Hit(number(dr.inf), nowhere, number(0), number(0), left, nowhere, nowhere, way, way, number(0))
 
     def _seen(self, ray: Ray, start: Start, vertex: Index, place: Vector2) -> Seen:
         """The way from the ray's start to a vertex, and f of it."""
@@ -159,15 +158,15 @@ class LineSegments:
             way, side = dr.select(same, its_way, way), dr.select(same, its_side, side)
         return way, side
 
-    def nearer(self, best: Hit, ray: Ray, start: Start, i: Index, active: Mask = True) -> Hit:
+    def nearer(self, best: Hit, ray: Ray, start: Start, i: Index) -> Hit:
         """The crossing of segment i, if it comes before `best`."""
-        a, b, vertices = self._of(i, active)
+        a, b, vertices = self._of(i)
         seen = self._seen(ray, start, vertices[0], a), self._seen(ray, start, vertices[1], b)
         hit, ahead = self._crossing(ray, start, i, b - a, vertices, seen)
         # Of two segments that share a vertex, the turn between them says which comes first, whatever λ rounds to.
         turn = cross(hit.along, best.along)
         first = dr.select(hit.right == best.right, turn < 0, hit.distance < best.distance)
-        first = ahead & active & dr.select(hit.left == best.left, turn > 0, first)
+        first = ahead & dr.select(hit.left == best.left, turn > 0, first)
         return dr.select(first, hit, best)
 
     def _crossing(
@@ -189,7 +188,8 @@ class LineSegments:
         s, r = (dr.select(0.5 * scale > dr.abs(f), near, 1 - near) for f in (f_b, f_a))
         distance = dr.dot(dr.fma(e, r, to_a), ray.d)  # λ; reach/scale is noise at grazing incidence
         left, right = (dr.select(a_left, vertices[j], vertices[1 - j]) for j in (0, 1))
-        return Hit(distance, i, s, r, a_left, left, right, dr.select(a_left, e, -e)), ahead
+        along = dr.select(a_left, e, -e)
+        return Hit(distance, i, s, r, a_left, left, right, along, along, self.arrays.number(0)), ahead
 
     def place(self, hit: Hit) -> tuple[Vector2, Vector2]:
         """The point of a hit, from the nearer end, and the segment's direction there."""
@@ -252,24 +252,20 @@ class ConicArcs(LineSegments):
         b_left = dr.select(wrong & negated(smaller), negated(ray.left), b_left)
         return dr.select(a_left, sizes[0], -sizes[0]), dr.select(b_left, sizes[1], -sizes[1])
 
-    def none(self) -> Hit:
-        """No crossing, at distance ∞."""
-        hit = super().none()
-        hit.into, hit.bend = hit.along, self.arrays.number(0)
-        return hit
-
-    def nearer(self, best: Hit, ray: Ray, start: Start, i: Index, active: Mask = True) -> Hit:
+    def nearer(self, best: Hit, ray: Ray, start: Start, i: Index) -> Hit:
         """The first crossing of arc i, if it comes before `best`."""
-        (a, b, vertices), (c, w, turn) = self._of(i, active), self._shape(i, active)
+        (a, b, vertices), (c, w, turn) = self._of(i), self._shape(i)
         seen = self._seen(ray, start, vertices[0], a), self._seen(ray, start, vertices[1], b)
         line, line_ahead = self._crossing(ray, start, i, b - a, vertices, seen)
-        line.into, line.bend = line.along, self.arrays.number(0)
         (to_a, f_a), (to_b, f_b) = seen
         own, straight = i == ray.own, turn == 0
         to_c = dr.select(own, start.middle, c - ray.p)
         a_left = f_a >= 0
         once = a_left != (f_b >= 0)
-        ends = *_ends(once, a_left, vertices, (a, c, b)), dr.select(a_left, turn, -turn) * dr.rcp(w * w)
+        # Left and right vertex of an arc that is crossed once, its directions there, from left to right, and its bend.
+        left, right = (dr.select(once, dr.select(a_left, vertices[j], vertices[1 - j]), UNKNOWN + j) for j in (0, 1))
+        along, into = dr.select(a_left, c - a, c - b), dr.select(a_left, b - c, a - c)
+        ends = left, right, along, into, dr.select(a_left, turn, -turn) * dr.rcp(w * w)
         (one, valid), (other, too) = _roots(f_a, w * cross(ray.d, to_c), f_b)
         single = once & too
         root = (dr.select(own, x, dr.select(single, z, y)) for x, y, z in zip(start.other, one, other, strict=True))
@@ -277,11 +273,11 @@ class ConicArcs(LineSegments):
         hit, ahead = self._hit(ray, i, ways, w, tuple(root), dr.select(own, turn < 0, a_left), ends)
         hit, ahead = dr.select(straight, line, hit), dr.select(straight, line_ahead, ahead)
         ahead = self._beyond(start, hit, ahead) & dr.select(straight, once, valid | single)
-        ahead = dr.select(own, start.again, ahead) & active
+        ahead = dr.select(own, start.again, ahead)
         best = dr.select(ahead & self._before(hit, best), hit, best)
         # Where there are two crossings, neither is at a vertex, but for rounding: their distances decide.
         hit, ahead = self._hit(ray, i, ways, w, other, negated(a_left), ends)
-        ahead &= active & too & negated(once | own | straight)
+        ahead &= too & negated(once | own | straight)
         return dr.select(ahead & (hit.distance < best.distance), hit, best)
 
     def _beyond(self, start: Start, hit: Hit, ahead: Mask) -> Mask:
@@ -356,13 +352,6 @@ def _roots(f_a: Number, f_c: Number, f_b: Number) -> tuple[tuple[Root, Mask], tu
     h = f_c + dr.mulsign(dr.sqrt(dr.maximum(rest, 0)), f_c)
     one, other = (dr.abs(h), dr.abs(f_a)), (dr.abs(f_b), dr.abs(h))
     return (one, (rest >= 0) & ((h >= 0) != (f_a >= 0))), (other, (rest >= 0) & ((h >= 0) != (f_b >= 0)))
-
-
-def _ends(once: Mask, a_left: Mask, vertices: Vertices, points: Three) -> tuple[Index, Index, Vector2, Vector2]:
-    """Left and right vertex of an arc that is crossed once (else UNKNOWN), its directions there, from left to right."""
-    a, c, b = points
-    left, right = (dr.select(once, dr.select(a_left, vertices[j], vertices[1 - j]), UNKNOWN + j) for j in (0, 1))
-    return left, right, dr.select(a_left, c - a, c - b), dr.select(a_left, b - c, a - c)
 
 
 def _total(w: Number, s: Number, r: Number) -> Number:
