@@ -16,8 +16,8 @@ from mi_refract.formulas import fresnel
 from mi_refract.plugins import refract as bsdf
 from validation import limits
 from validation.reference import closed_forms, layered_scenes, optical_systems
-from validation.reference.layered_scenes import FIBRE, LAYERS, MIRAGE, exact_path
-from validation.run import path_overlay, seeds
+from validation.reference.layered_scenes import FIBRE, MIRAGE, exact_path
+from validation.run import seeds
 from validation.run.array_settings import BUILTIN
 from validation.run.context import PROFILES, SCALAR_PROFILES, Context
 from validation.stability import derivatives, energy, layer_chains, layered_paths, optical_chains
@@ -534,12 +534,3 @@ def test_the_built_in_differs_from_both_right_formulas_in_the_telescope(llvm_var
     monkeypatch.setattr(layered_paths, "other_right_formula", lambda: "refract_decomposed")
     (row,) = layered_paths.view_rows(context, *layered_paths.VIEWS[0])
     assert row.broken.keys() == {"pixels off, control"}
-
-
-@pytest.mark.parametrize("layers", LAYERS.values(), ids=LAYERS)
-def test_points_are_projected_as_the_camera_sees_them(layers, scalar_variant):
-    view = path_overlay.View(layers.scene, "dielectric", {}, 4, 1)
-    for u, v in ((0.1, 0.2), (0.7, 0.4)):
-        ray, _ = view.scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(u, v), mi.Point2f(0.5))
-        for p, d in ((np.array(ray.o), np.array(ray.d)), view.ray(u, v)):
-            assert view.project((p + 500 * d)[None])[0] == pytest.approx([u, v], abs=1e-4)

@@ -21,10 +21,9 @@ from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.optical_systems import Array
-from validation.run import path_overlay
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND
-from validation.run.render_methods import under
+from validation.run.render_methods import save_image, under
 from validation.study import Study, Task, about
 
 from . import rainbow
@@ -152,7 +151,7 @@ def bow_row(
 def _save(folder: Path, plugin: str, images: list[Array], about: dict[str, Any]) -> str:
     """Their mean in squares of 4 pixels, 1 at its brightest."""
     mean = np.mean(images, axis=0).reshape(rainbow.SIZE // 4, 4, rainbow.SIZE // 4, 4).mean((1, 3))
-    return path_overlay.save(folder, f"rainbow {plugin}", np.repeat(mean[..., None] / mean.max(), 3, axis=2), about)
+    return save_image(folder, f"rainbow {plugin}", np.repeat(mean[..., None] / mean.max(), 3, axis=2), about)
 
 
 STUDY = Study(NAME, "Ground truth", about(__doc__), TERMS, tasks, axes=AXES)
