@@ -9,19 +9,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from flint import acb, arb, ctx, fmpq
 
 from mi_refract import FORMULAS, backend, oracle
 from mi_refract.formulas import fresnel
 from mi_refract.plugins import refract as bsdf
 from validation import limits
 from validation.reference import closed_forms, layered_scenes, optical_systems
-from validation.reference.layered_scenes import FIBRE, LAYERS, MIRAGE, exact_path
-from validation.run import path_overlay, seeds
+from validation.reference.layered_scenes import FIBRE, MIRAGE
+from validation.run import seeds
 from validation.run.array_settings import BUILTIN
 from validation.run.context import PROFILES, SCALAR_PROFILES, Context
-from validation.stability import derivatives, energy, layer_chains, layered_paths, optical_chains
-from validation.stability.layer_chains import air, carry, enter, exact_ratios, pipe
+from validation.stability import derivatives, energy, layered_paths, optical_chains
+from validation.stability.layer_chains import air, carry, enter
 
 HERE = Context(SCALAR_PROFILES["standard"], Path(), "scalar_rgb", backend.detect(), backend.usable_variants())
 SETTINGS = {setting.label: setting for setting in optical_chains.settings(HERE)}
@@ -39,43 +38,7 @@ def compiled(precision, needs_mitsuba=False):
     return setting if running else pytest.skip(f"llvm: {setting.reason or 'no variant of Mitsuba runs here'}")
 
 
-def exactly(x):
-    """A number of extended precision as a ball: two doubles hold its 64 bits."""
-    high = float(x)
-    return arb(high) + arb(float(x - np.longdouble(high)))
-
-
 # Chains: closed answers ----------------------------------------------------------------------------------------------
-
-
-def step_by_step(index, c2, s2):
-    """cos² after each layer, from one application of Snell's law per boundary; up to where none is left."""
-    found = [c2]
-    for above, below in itertools.pairwise(index):
-        s2 = s2 * (above / below) ** 2
-        if s2 > 1:
-            break
-        found.append(1 - s2)
-    return found
-
-
-@pytest.mark.parametrize("precision", [np.float32, np.float64])
-@pytest.mark.parametrize("layers", [air(1000), exact_ratios(250)], ids=["air", "exact ratios"])
-def test_layers_are_what_snells_law_makes_of_them_one_by_one(layers, precision):
-    with ctx.workprec(300):
-        top, step = arb(layer_chains.TOP), arb(layer_chains.MIRAGE) / 1000
-        index = [top / (1 + arb(2.0**-23)) ** j if layers.exact else top - j * step for j in range(layers.count + 1)]
-        rays = enter(layers, np.array(DEGREES), np.full(len(DEGREES), layers.count), ASKEW, precision)
-        n = [arb(float(x)) for x in rays.normal]
-        for ray, a in enumerate([arb(float(x)) for x in a] for a in rays.a):
-            dot = sum(x * y for x, y in zip(a, n, strict=True))
-            c2 = dot**2 / (sum(x * x for x in a) * sum(x * x for x in n))
-            cosines = step_by_step(index, c2, 1 - c2)
-            assert rays.passes[ray] == (len(cosines) == layers.count + 1)
-            assert rays.last[ray] == len(cosines) - 1
-            end = (cosines[-1] if rays.passes[ray] else c2).sqrt()
-            assert abs(float(exactly(rays.end[ray]) / end - 1)) < 1e-15
-    assert rays.passes.tolist() == [True] * 4 + [False] * 3
 
 
 def follow(index, c, tilts, errors):
@@ -120,18 +83,6 @@ def test_the_height_is_what_tilting_every_direction_makes_of_it():
     expected = float(rays.fed("contrasts", np.float64).height[0]) * nudge
     assert heights[0] == last and 100 < expected < 1000
     assert last - heights[1] == pytest.approx(expected, rel=0.03)
-
-
-def test_the_pipe_ends_where_exact_reflections_do():
-    a, chain, exact = pipe(101, 4, optical_chains.CORE, np.float32)
-    for ray in range(4):
-        b = [fmpq(*float(x).as_integer_ratio()) for x in a[ray]]
-        for normal in chain.normals[ray]:
-            n = [fmpq(*float(x).as_integer_ratio()) for x in normal]
-            c = sum(x * y for x, y in zip(n, b, strict=True))
-            assert c > 0  # normals point outward, and the ray hits the wall from within
-            b = [x - 2 * c * y / sum(z * z for z in n) for x, y in zip(b, n, strict=True)]
-        assert [float(x.p) / float(x.q) for x in b] == pytest.approx(exact[ray].astype(float).tolist(), abs=1e-15)
 
 
 def test_compiled_and_scalar_chains_are_the_same():
@@ -194,28 +145,15 @@ def test_snells_law_gives_the_closed_form_and_conditions_bound_random_errors_and
     assert 0.2 < worst.max() < 1
 
 
-def test_the_law_in_extended_precision_is_the_oracles():
-    rng = np.random.default_rng(5)
-    a, n, k = rng.normal(size=(50, 3)), rng.normal(size=(50, 3)), rng.uniform(0.3, 1.2, 50)
-    exact = oracle.refract(a, n, k, progress=False)
-    a, n, k = (x[exact.transmitted] for x in (a, n, k))
-    b = optical_systems.unit(optical_systems.snell(*(x.astype(np.longdouble) for x in (a, n)), k))
-    difference = (b - exact.direction[exact.transmitted]) - exact.direction_low[exact.transmitted]
-    assert len(a) > 20 and np.abs(difference).max() < 1e-17
-
-
 def test_rainbows_and_the_prism_stand_at_the_extreme_of_the_deflection():
     index, apex, n = np.longdouble(4) / 3, np.deg2rad(np.longdouble(60)), optical_systems.BK7
-    first = closed_forms.least_deviated(apex, n)
-    extremes = [(lambda x: -closed_forms.deviation(x, apex, n), first, -math.degrees(2 * first - apex), 1e-13)]
-    for order, bow in ((1, 180 - 42.03), (2, 180 + 50.98)):
-        deflection = lambda x, order=order: closed_forms.deflection(x, index, order)  # noqa: E731
-        extremes.append((deflection, closed_forms.rainbow_incidence(index, order), bow, 0.01))
-    for turned, at, expected, digits in extremes:
+    extremes = [(lambda x: closed_forms.deviation(x, apex, n), closed_forms.least_deviated(apex, n))]
+    for order in (1, 2):
+        turned = lambda x, order=order: closed_forms.deflection(x, index, order)  # noqa: E731
+        extremes.append((turned, closed_forms.rainbow_incidence(index, order)))
+    for turned, at in extremes:
         before, there, after = (float(turned(at + x)) for x in (-1e-3, 0, 1e-3))
-        assert math.degrees(there) == pytest.approx(expected, abs=digits)
-        assert 1e-7 < abs(before - there) < 1e-5 and 1e-7 < abs(after - there) < 1e-5
-        assert (before - there) * (after - there) > 0
+        assert 1e-7 < before - there < 1e-5 and 1e-7 < after - there < 1e-5
 
 
 # Chains and systems: planted defects ---------------------------------------------------------------------------------
@@ -298,23 +236,6 @@ def few(scalar_context):
 
 def failing(rows):
     return {(row.subject, row.case) for row in rows if row.verdict == "fail"}
-
-
-def test_the_closed_form_of_diffuse_light():
-    """Against its integral in balls, by Arb's own rigorous quadrature; and the number everybody prints."""
-    assert closed_forms.hemispherical(1.5)["outside"] == pytest.approx(0.0918, abs=5e-5)
-    for index in (1.1, 1.5, 2.42):
-        with ctx.workprec(100):
-            n = arb(index)
-
-            def integrand(x, _, n=n):
-                y = (x * x + n * n - 1).sqrt()
-                s, p = (x - y) / (x + y), (y - n * n * x) / (y + n * n * x)
-                return x * (s * s + p * p)
-
-            exact, found = acb.integral(integrand, 0, 1).real, closed_forms.hemispherical(index)
-            assert abs(float(exact - exactly(found["outside"]))) < 1e-18
-            assert found["inside"] == pytest.approx(1 - (1 - float(exact)) / index**2, rel=1e-15)
 
 
 def test_energy_holds_on_scalars_and_mitsubas_function_loses_its_digits_near_k_of_1(few):
@@ -429,14 +350,11 @@ def test_the_derivative_of_the_reflectance_keeps_its_digits_near_the_critical_an
     assert (np.abs(found - exact) <= 1e-9 * np.abs(exact)).sum() > 20
 
 
-def test_derivatives_hold_for_another_seed_and_formulas_keep_digits_that_the_common_form_loses(few):
-    setting = compiled("float64")
+def test_derivatives_hold_for_another_seed(few):
+    compiled("float64")  # the study draws rays for compiled settings only
     with seeds.shifted(1):
         rows = derivatives.drawn_rows(few)
     assert rows and [row.name for row in rows if row.verdict != "pass"] == []
-    given = derivatives.inputs(20, setting.precision)
-    curves = [derivatives.formula_rows(name, FORMULAS[name], given, setting)[1] for name in ("decomposed", "promoted")]
-    assert curves[0][0][1] > 100 * curves[1][0][1]  # near the critical angle
 
 
 @pytest.mark.parametrize(("case", "scale"), [("∂b/∂k", 0.0), ("étendue", 1e-5)])
@@ -461,47 +379,10 @@ def context(tmp_path):
     return Context(profile, tmp_path, "llvm_ad_rgb", backend.detect(), {})
 
 
-@pytest.mark.parametrize("sine", [4e-4, 8e-4, 3e-3, 9e-3])
-@pytest.mark.parametrize("offset", [layered_scenes.OFFSET, 0.0])
-def test_a_mirage_conserves_n_sin_and_turns_where_that_is_the_index(sine, offset):
-    path = exact_path(MIRAGE, [-layered_scenes.POOL, 0.005, 0], [math.sqrt(1 - sine**2), -sine, 0], 0, offset)
-    n = np.array(MIRAGE.indices)[list(path.media)]
-    assert n * path.directions[:, 0] == pytest.approx(path.directions[0, 0] * MIRAGE.indices[0], rel=1e-15)
-    deepest = max(path.media)
-    assert MIRAGE.indices[deepest + 1] < MIRAGE.indices[0] * math.sqrt(1 - sine**2) < MIRAGE.indices[deepest]
-    # Down to the boundary that reflects it, no farther, and out as it came in.
-    assert path.ends[:, 1].min() == pytest.approx(MIRAGE.boundaries[deepest], abs=1e-12)
-    assert path.directions[-1, 1] == pytest.approx(sine, rel=1e-12)
-    assert path.starts[1:, 1] - path.ends[:-1, 1] == pytest.approx(
-        np.sign(path.directions[1:, 1]) * offset * (1 + np.abs(path.ends[:-1]).max(1)), abs=1e-15
-    )
-
-
-def test_a_fibre_conserves_both_invariants_and_keeps_what_it_guides():
-    for path in layered_paths.bundle(FIBRE).exact(FIBRE, offset=0.0):
-        n = np.array(FIBRE.indices)[list(path.media)]
-        assert np.ptp(n * path.directions[:, 2]) < 1e-14
-        assert np.ptp(n * np.cross(path.starts, path.directions)[:, 2]) < 1e-12
-        radius = np.hypot(*path.ends[:-1, :2].T)
-        assert min(abs(radius[:, None] - FIBRE.boundaries).min(1), default=0) < 1e-12
-        assert path.ends[-1, 2] == pytest.approx(FIBRE.end)
-        assert min(path.media) >= 1
-
-
 def test_no_layer_is_thinner_than_the_ray_offset():
     for layers, where in ((MIRAGE, layered_scenes.POOL), (FIBRE, abs(FIBRE.end))):
         assert len(layers.boundaries) + 1 == len(layers.indices) == {"mirage": 33, "fibre": 17}[layers.scene]
         assert (-np.diff(layers.boundaries) > layered_scenes.OFFSET * (1 + where)).all()
-
-
-def test_a_deviation_is_the_one_that_was_put_in():
-    """A path at an angle that is 1 % too large, in the layer that both are in."""
-    right, wrong = (
-        exact_path(MIRAGE, [-layered_scenes.POOL, 1.0, 0], [math.sqrt(1 - c * c), -c, 0], 0) for c in (8e-4, 8.08e-4)
-    )
-    found, same = (layered_paths.deviation(MIRAGE, right, x.segments()) for x in (wrong, right))
-    assert found.direction[0] == pytest.approx(0.01, rel=1e-3) and found.boundaries == 0
-    assert same.direction.max() < 1e-12 and same.place.max() < 1e-12
 
 
 def test_only_forms_at_the_rounding_limit_keep_to_the_path_and_a_fibre_guides_every_ray(llvm_variant, context):
@@ -534,12 +415,3 @@ def test_the_built_in_differs_from_both_right_formulas_in_the_telescope(llvm_var
     monkeypatch.setattr(layered_paths, "other_right_formula", lambda: "refract_decomposed")
     (row,) = layered_paths.view_rows(context, *layered_paths.VIEWS[0])
     assert row.broken.keys() == {"pixels off, control"}
-
-
-@pytest.mark.parametrize("layers", LAYERS.values(), ids=LAYERS)
-def test_points_are_projected_as_the_camera_sees_them(layers, scalar_variant):
-    view = path_overlay.View(layers.scene, "dielectric", {}, 4, 1)
-    for u, v in ((0.1, 0.2), (0.7, 0.4)):
-        ray, _ = view.scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(u, v), mi.Point2f(0.5))
-        for p, d in ((np.array(ray.o), np.array(ray.d)), view.ray(u, v)):
-            assert view.project((p + 500 * d)[None])[0] == pytest.approx([u, v], abs=1e-4)

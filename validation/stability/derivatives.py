@@ -114,7 +114,7 @@ def only(given: Any, kept: np.ndarray) -> Any:
     """Rays, certified answers or all of `Inputs`, of a mask (N,)."""
     if isinstance(given, dict):
         return {name: only(x, kept) for name, x in given.items()}
-    return type(given)(**only(vars(given), kept)) if dataclasses.is_dataclass(given) else given[kept]
+    return type(given)(**only(vars(given), kept)) if hasattr(given, "__dict__") else given[kept]
 
 
 def forward(function: Callable[[Any], Any], x: Any, direction: Any) -> tuple[Any, Any]:
