@@ -112,11 +112,11 @@ def test_the_names_are_mitsubas():
     assert not any("/" in name or not name for name in scene_parser.known_plugins())
 
 
-@pytest.mark.parametrize("path", sorted(SCENES.glob("*.xml")), ids=lambda path: path.stem)
-def test_our_scenes_pass(path):
-    parsed = scene_parser.parse(path)
-    assert {node.props.plugin_name() for node in parsed.state.nodes} <= scene_parser.known_plugins()
-    assert parsed.xml == (path,) and all(file.is_file() for file in parsed.files().values())
+def test_our_scenes_pass():
+    for path in SCENES.glob("*.xml"):
+        parsed = scene_parser.parse(path)
+        assert {node.props.plugin_name() for node in parsed.state.nodes} <= scene_parser.known_plugins()
+        assert parsed.xml == (path,) and all(file.is_file() for file in parsed.files().values())
 
 
 def test_the_search_path_is_as_before(load):
@@ -177,17 +177,18 @@ def test_an_image_is_refused_by_its_header(element, load, tmp_path):
     scene = f'{SENSOR}<{element}><string name="filename" value="sky.exr"/></{element.split()[0]}>'
     (tmp_path / "sky.exr").write_bytes(good)
     load(scene)
-    place = good.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4 + 8
-    wide = good[:place] + (2**23).to_bytes(4, "little") + good[place + 4 :]
-    place = good.index(b"channels\0chlist\0") + len(b"channels\0chlist\0")
-    long = good[:place] + (2**29).to_bytes(4, "little") + good[place + 4 :]
-    place = good.index(b"dataWindow\0")
+    window, channels = b"dataWindow\0box2i\0", b"channels\0chlist\0"
+
+    def patched(after, offset, number):
+        place = good.index(after) + len(after) + offset
+        return good[:place] + number.to_bytes(4, "little") + good[place + 4 :]
+
+    place = good.index(window)
     cut = good[:place] + b"x\0string\0" + (2**30).to_bytes(4, "little") + good[place:]
-    large = wide.replace((2**23).to_bytes(4, "little"), (2**19).to_bytes(4, "little"))
     for content, message in (
-        (wide, "resolution"),
-        (long, "corrupt"),
-        (large, "expected up to 21116"),
+        (patched(window, 12, 2**23), "resolution"),
+        (patched(channels, 0, 2**29), "corrupt"),
+        (patched(window, 12, 2**19), "expected up to 21116"),
         (cut, "corrupt"),
     ):
         (tmp_path / "sky.exr").write_bytes(content)
@@ -211,49 +212,38 @@ def chain(count, back=1):
     return f'<bsdf type="diffuse" id="b{last}"/>{bsdfs}'
 
 
-TWICE = '<include filename="other.xml"/>' * 2
 LAUGHS = "".join(f'<default name="a{i + 1}" value="{f"$a{i}" * 10}"/>' for i in range(8))
+A_PIPE, PIPE = '<string name="filename" value="pipe"/>', "pipe: not a regular file"
+# fmt: off
 REFUSED = {
     "deep": (nested(20000), "elements nested more than 32 deep"),
     "deep, unfinished": (b"<scene>" * 20000, "elements nested more than 32 deep"),
     "deep in an include": (
         '<default name="o" value="oth"/><default name="oer" value="other"/><include filename="$oer.xml"/>',
-        "other.xml: elements nested",
-    ),
+        "other.xml: elements nested"),
     "deep by references": (chain(2000), "plugins nested"),
     "deep by references, forward": (chain(2000, -1), "plugins nested"),
     "many lobes": (chain(20), "65536 lobes of a BSDF"),
     "circle": (
         '<bsdf type="twosided" id="a"><ref id="b"/></bsdf><bsdf type="twosided" id="b"><ref id="a"/></bsdf>',
-        "circular reference",
-    ),
-    "files": ('<include filename="empty.xml"/>' * 1001, "empty.xml: more than 1000 files included"),
+        "circular reference"),
+    "files": ('<include filename="empty.xml"/>' * 1000, "empty.xml: more than 1000 files included"),
     "files in files": ('<include filename="s.xml"/>' * 20_000, "s.xml: more than 14 files, each included by the one"),
     "elements": ("<a/>" * 2**20, "more than 1048576 XML elements"),
-    "parameters": (
-        "".join(f'<default name="a{i}" value=""/>' for i in range(4097)),
-        "more than 4096 parameters",
-    ),
-    "folders": ('<path value="."/>' * 20_000, "more than 100 <path> elements"),
+    "parameters": ("".join(f'<default name="a{i}" value=""/>' for i in range(4097)), "more than 4096 parameters"),
+    "folders": ('<path value="."/>' * 101, "more than 100 <path> elements"),
     "long value": (f'<default name="a0" value="xxxxxxxxxx"/>{LAUGHS}', "<default>: a value of 10000 characters"),
     "document type": (b'<!DOCTYPE a [<!ENTITY b "c">]><scene version="3.0.0"/>', "DOCTYPE declarations"),
     "another encoding": ('<scene version="3.0.0"/>'.encode("utf-16"), "zero bytes; expected XML in UTF-8"),
-    "included pipe": ('<include filename="pipe"/>', "pipe: not a regular file"),
-    "pipe as a spectrum": (
-        '<bsdf type="diffuse"><spectrum name="reflectance" filename="pipe"/></bsdf>',
-        "pipe: not a regular file",
-    ),
-    "pipe by a parameter": ('<default name="p" value="pipe"/><include filename="$p"/>', "pipe: not a regular"),
-    "pipe as an image": (
-        '<texture type="bitmap"><string name="filename" value="pipe"/></texture>',
-        "pipe: not a regular",
-    ),
+    "included pipe": ('<include filename="pipe"/>', PIPE),
+    "pipe as a spectrum": ('<bsdf type="diffuse"><spectrum name="reflectance" filename="pipe"/></bsdf>', PIPE),
+    "pipe by a parameter": ('<default name="p" value="pipe"/><include filename="$p"/>', PIPE),
+    "pipe as an image": (f'<texture type="bitmap">{A_PIPE}</texture>', PIPE),
     "device as a mesh": (
-        '<shape type="ply"><string name="filename" value="/dev/zero"/></shape>',
-        "/dev/zero: not a regular",
-    ),
+        '<shape type="ply"><string name="filename" value="/dev/zero"/></shape>', "/dev/zero: not a regular"),
     "device": (b"", "s.xml: not a regular file"),
 }
+# fmt: on
 
 
 @pytest.mark.parametrize("case", REFUSED)
@@ -351,15 +341,6 @@ def test_files_are_those_that_mitsuba_opens(load, tmp_path):
     assert code["plugins/evil.so"] == tmp_path / "more" / "plugins" / "evil.so" and "plugins/other.so" not in code
 
 
-def test_as_many_folders_and_files_as_the_limits_say(tmp_path):
-    def check(paths, includes):
-        text = '<path value="more"/>' * paths + '<include filename="one.xml"/>' * includes
-        (tmp_path / "s.xml").write_text(f'<scene version="3.0.0">{text}</scene>')
-        return scene_limits.check_files(tmp_path / "s.xml", [], {})
-
-    (tmp_path / "one.xml").write_text('<scene version="3.0.0"/>')
-    assert len(check(100, 999).searched) == 100  # the scene itself is a file, too
-    with pytest.raises(ValueError, match="more than 100 <path> elements"):
-        check(101, 0)
-    with pytest.raises(ValueError, match="more than 1000 files included"):
-        check(0, 1000)
+def test_as_many_folders_and_files_as_the_limits_say(load, tmp_path):
+    load('<path value="."/>' * 100 + '<include filename="one.xml"/>' * 999 + SENSOR, one="")
+    assert len(scene_parser.parse(tmp_path / "s.xml").searched) == 100  # the scene itself is a file, too
