@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mi_refract import media
-from validation.media.closed_forms import _back_focal_distance
+from validation.media.closed_forms import back_focal_distance
 from validation.reference.exact_lens import crossing
 from validation.run.metrics import ERROR_OVER_BOUND
 from validation.suite import lenses
@@ -33,7 +33,7 @@ def broken(rows):
 
 def test_the_exact_trace_is_that_of_matrices_near_the_axis():
     """The rest is spherical aberration, and falls as the height's square."""
-    focus = 8.5 + _back_focal_distance(lenses.LENS.curvatures, NS, lenses.LENS.thicknesses)
+    focus = 8.5 + back_focal_distance(lenses.LENS.curvatures, NS, lenses.LENS.thicknesses)
     off = [float(crossing(lenses.LENS, NS, h, lenses.START).place) / focus - 1 for h in (1e-6, 1.0, 0.5)]
     assert abs(off[0]) < 1e-12
     assert off[1] / off[2] == pytest.approx(4, rel=1e-2)
