@@ -31,7 +31,7 @@ ROOMS = {
         *("neighbours", "random_numbers", "gradients", "rendering_passes"),
     ),
     "efficiency": ("error_against_time", "scaling", "changing_indices"),
-    "media": ("catalogs", "ray_directions", "closed_forms", "renders", "hero_wavelength"),
+    "media": ("catalogs", "ray_directions", "closed_forms", "renders"),
     "planar": ("against_retrace", "closed_paths", "joints", "extruded_scenes", "times"),
     "diff": ("planted_defects", "visible_changes", "welch_nulls", "times"),
     "ground-truth": ("traced_bodies",),
