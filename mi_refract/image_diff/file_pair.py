@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_refract.io import image_file
-from mi_refract.io.bounded_map import bounded_map
-from mi_refract.io.image_file import MAX_VALUES, Image
+from mi_refract.io.image_file import MAX_VALUES, Image, bounded_map
 
 from . import channels, idiff_flags, masks, methods, pairing, variances
 from .comparison import Comparison, Verdict

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refract.io import exit_code
+from mi_refract.io import errors
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels, block_mean
 from mi_refract.report.embedded_images import difference_thumbnail, encoded, shown, strongest, thumbnail
@@ -56,8 +56,8 @@ def of_result(result: Result, image_bytes: float, map_bytes: float, *, thumbs: b
         with _one_at_a_time:
             return _shown(result, image_bytes, map_bytes, thumbs)
     except Exception as error:  # of whatever kind: the page is for all images
-        exit_code.print_traceback(error)
-        return Shown(note=f"Cannot be shown: {exit_code.describe(error)}")
+        errors.print_traceback(error)
+        return Shown(note=f"Cannot be shown: {errors.describe(error)}")
 
 
 def _shown(result: Result, image_bytes: float, map_bytes: float, thumbs: bool) -> Shown:
