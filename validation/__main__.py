@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mi_refract.cluster.connection import ClusterTarget
-from mi_refract.io import lock
+from mi_refract.io import atomic
 from mi_refract.io.sanitise import printable
 from validation.run import command_line
 
@@ -128,7 +128,7 @@ def _command(
             rendered_images.join(system.join(folder))
     target.check()
     try:
-        with lock.held(out / LOCK, "a validation"):
+        with atomic.held(out / LOCK, "a validation"):
             return _run(names, profile, out, write_tables, goals, target)
     except KeyboardInterrupt:
         print("validation: interrupted; run the same command again to resume", file=sys.stderr)

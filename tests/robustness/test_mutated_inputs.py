@@ -29,7 +29,7 @@ from support.variants import switch
 from mi_refract import oracle
 from mi_refract.image_diff import folders, settings
 from mi_refract.image_diff.results import Status
-from mi_refract.io import exit_code, image_file
+from mi_refract.io import errors, image_file
 from mi_refract.planar import scene_file
 from mi_refract.plugins import scene_parser
 from mi_refract.ray_sets import check_answers, files, ray_set, renderer_file
@@ -277,7 +277,7 @@ def outcome(read, path):
         with limited():
             wrong = read(path)
     except Exception as error:
-        message = exit_code.describe(error)
+        message = errors.describe(error)
         assert not message.startswith("internal error"), message
         assert not isinstance(error, ValueError) or "\n" not in str(error), f"several lines: {error}"
         assert "Error while loading plugin" not in str(error), f"a plugin of the scene's own was opened: {error}"

@@ -15,7 +15,7 @@ import pytest
 from support.dask_workers import tls_settings
 
 from mi_refract import FORMULAS
-from mi_refract.cluster import worker_facts
+from mi_refract.cluster import on_worker
 from mi_refract.cluster.connection import ClusterTarget, connected
 from mi_refract.image_diff import self_test
 from mi_refract.image_diff.methods import METHODS
@@ -149,8 +149,8 @@ def test_a_worker_sends_files_and_errors_as_they_are(monkeypatch, scalar_variant
 
 
 def test_workers_with_other_sources_are_refused_by_name():
-    ours = {worker_facts.HOST: "here", "validation": "0123abcd", "other renderers": "none"}
-    assert worker_facts.differences(ours | {"validation": "fedcba98"}, ours) == ["validation fedcba98, here 0123abcd"]
+    ours = {on_worker.HOST: "here", "validation": "0123abcd", "other renderers": "none"}
+    assert on_worker.differences(ours | {"validation": "fedcba98"}, ours) == ["validation fedcba98, here 0123abcd"]
     facts = runner.facts("scalar_rgb")
     assert facts["validation"] == runner.sources()[:8] and set(runner.PACKAGES) < facts.keys()
 
