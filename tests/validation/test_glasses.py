@@ -30,7 +30,7 @@ def rays():
 
 def of_f2(rays):
     """The rays that pass through F2."""
-    pairs = glasses.media_rays.columns(rays.header, rays.ids)[:, 1].astype(int)
+    pairs = glasses.header.columns(rays.header, rays.ids)[:, 1].astype(int)
     return np.array(["SCHOTT:F2" in pair for pair in rays.header["media"]])[pairs]
 
 
@@ -67,7 +67,7 @@ def test_a_known_difference_is_a_missed_goal_as_long_as_it_is_what_it_was(off, f
     rows = judged(rays, answers, {"SCHOTT:F2": OtherIndex(1.00e-4, "another edition")})
     (row,) = (row for row in rows if row.case == "SCHOTT:F2")
     assert (row.verdict == "fail") == fails and row.reason.endswith("another edition")
-    assert row.missed == ({glasses.INDEX_OFF: glasses.media_rays.SAME} if off else {})
+    assert row.missed == ({glasses.INDEX_OFF: glasses.header.SAME} if off else {})
 
 
 PROGRAM = f"""

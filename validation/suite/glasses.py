@@ -18,7 +18,7 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from mi_refract.ray_sets import check_answers, media_rays, ray_set
+from mi_refract.ray_sets import check_answers, header, ray_set
 from mi_refract.ray_sets.check_answers import UNFIT
 from mi_refract.ray_sets.files import as_csv, parse_answers
 from mi_refract.ray_sets.ray_set import Answers, RaySet
@@ -105,7 +105,7 @@ def rows(title: str, catalogue: GlassCatalogue, rays: RaySet, answers: Answers) 
     assert answers.n_ratio is not None
     said = dict(zip(answers.ids.tolist(), answers.n_ratio.tolist(), strict=True))
     used = np.array([said.get(id_, np.nan) for id_ in rays.ids.tolist()])  # NaN where it was not answered
-    wavelength, pair = media_rays.columns(rays.header, rays.ids).T
+    wavelength, pair = header.columns(rays.header, rays.ids).T
     difference = np.abs(used / rays.rays.k - 1)
     for i, glass in enumerate(catalogue.glasses):
         of_glass = np.flatnonzero(pair // 2 == i)
@@ -117,7 +117,7 @@ def rows(title: str, catalogue: GlassCatalogue, rays: RaySet, answers: Answers) 
             continue
         factor = max(off / known.recorded, known.recorded / off) if off > 0 else np.inf if off == 0 else np.nan
         values = {INDEX_OFF: off, RECORDED: known.recorded, OFF_RECORDED: factor}
-        budgets, goals = {OFF_RECORDED: limits.OTHER_INDEX}, {INDEX_OFF: media_rays.SAME}
+        budgets, goals = {OFF_RECORDED: limits.OTHER_INDEX}, {INDEX_OFF: header.SAME}
         made.append(row(values, budgets, goals, f"{system}; {known.cause}"))
     return made
 
