@@ -178,14 +178,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture
 def scalar_context(tmp_path, scalar_variant):
     """`scalar_context(rays=800, ...)`: a run of the validation on scalar_rgb, standard but for what is given."""
-    import dataclasses
+    from dataclasses import replace
 
-    from validation.run.context import SCALAR_PROFILES, Context
+    from validation.run.context import here
 
-    standard = SCALAR_PROFILES["standard"]
-    return lambda **given: Context(
-        dataclasses.replace(standard, **given), tmp_path, "scalar_rgb", backend.detect(), USABLE
-    )
+    context = here("standard", tmp_path, "scalar_rgb")
+    return lambda **changes: replace(context, profile=replace(context.profile, **changes))
 
 
 @pytest.fixture

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_refract import backend
 from mi_refract.io.pixels import srgb_decode
 from mi_refract.media import glass_catalogs
 from mi_refract.report.row import Row
@@ -23,8 +22,9 @@ from validation import __main__ as command
 from validation import limits, repeated, runner
 from validation.ground_truth import rainbow
 from validation.run import kernel_timing, seeds, tightness
-from validation.run.context import Context, profiles
-from validation.study import Study
+from validation.run.array_settings import settings
+from validation.run.context import here, profiles
+from validation.study import Study, Task
 
 MODULES = command.modules([], "full")
 STUDIES = {name: importlib.import_module(f"validation.{name}").STUDY for name in MODULES}
@@ -37,7 +37,7 @@ RUN = (
 
 
 def context(variant, folder=Path(), profile="quick"):
-    return Context(profiles(variant)[profile], folder, variant, backend.detect(), backend.usable_variants())
+    return here(profile, folder, variant)
 
 
 # Studies and tasks ---------------------------------------------------------------------------------------------------
@@ -59,6 +59,18 @@ def test_tasks_have_different_names_and_those_that_time_something_say_so(variant
         tasks = runner.tasks(list(STUDIES.values()), context(variant, profile=profile))
         assert {task.name for task in tasks if not task.timed and reached(task.run) & CLOCKS} == set()
         assert any(task.timed for task in tasks)
+    twice = Study("s", "", "", {}, lambda context: [Task("a", list), Task("a", list)])
+    with pytest.raises(ValueError, match="two tasks are called 'a'; expected different names"):
+        runner.tasks([twice], context(variant))
+
+
+def test_why_cuda_does_not_run_says_what_it_needs():
+    machine = here("quick", Path(), "scalar_rgb")
+    absent = [setting.reason for setting in settings(machine) if setting.backend == "cuda" and not setting.vector]
+    absent += [reason for name, reason in machine.variants.items() if name.startswith("cuda") and reason]
+    rows = [Row("s", "x", "y", "cuda", reason=reason) for reason in absent]
+    assert {row.remedy for row in rows} <= {"an NVIDIA GPU with its driver"}
+    assert all(machine.variants[name] is None for name in machine.variants if name.startswith("scalar"))
 
 
 # A task that reaches one of them measures a time. What `Camera` measures is not judged by those that are not `timed`.
