@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import itertools
 import json
 import random
 import re
@@ -26,10 +27,13 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from mi_refract.report.row import Row
 from validation.limits import UNEXPLAINED
+from validation.run import command_line
 from validation.run.context import Context
 from validation.study import Study, Task, about
 
@@ -92,18 +96,17 @@ def sample(root: Path, count: int, seed: int) -> list[Mutant]:
             before[line.strip()] += 1
             key = repr((seed, name, line.strip(), before[line.strip()]))
             drawn.append((hashlib.sha256(key.encode()).hexdigest(), name, number))
-    found: list[Mutant] = []
-    for digest, name, number in sorted(drawn):
-        if len(found) == count:
-            break
+
+    def of_line(digest: str, name: str, number: int) -> Iterator[Mutant]:
         places = _places((root / name).read_text("utf-8")).get(number, [])
         kinds = sorted({operator.partition("_")[0] for operator, _ in places})
         rng = random.Random(digest)
         rng.shuffle(kinds)  # a binary operator has eleven replacements: the kind of change is drawn before the change
         chosen = (rng.choice([x for x in places if x[0].partition("_")[0] == kind]) for kind in kinds)
-        mutants = (_mutant(root, name, number, *place) for place in chosen)
-        found += [mutant for mutant in mutants if mutant][:1]
-    return found
+        yield from filter(None, (_mutant(root, name, number, *place) for place in chosen))
+
+    lines = (next(of_line(*line), None) for line in sorted(drawn))
+    return list(itertools.islice(filter(None, lines), count))
 
 
 def every(root: Path, name: str) -> list[Mutant]:
@@ -136,27 +139,27 @@ def _mutant(root: Path, name: str, number: int, operator: str, occurrence: int) 
 
     source = (root / name).read_text("utf-8")
     changed = str(mutate_code(source, OperatorProvider()[operator](), occurrence))
-    if _behaviour(changed) in (_behaviour(source), ""):
+
+    def behaviour(source: str) -> str:
+        """The module without annotations, `__all__` and imports for annotations; "" where it does not compile."""
+        try:
+            tree = ast.parse(source)
+        except SyntaxError:
+            return ""
+        for node in ast.walk(tree):
+            for field in {"annotation", "returns"} & {*node._fields}:
+                setattr(node, field, None)
+            if (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)) or (
+                isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__"
+            ):
+                node.__dict__.clear()
+        return ast.dump(tree)
+
+    if behaviour(changed) in (behaviour(source), ""):
         return None
     new = changed.splitlines() if operator != "RemoveDecorator" else [""] * number
     line, becomes = (" ".join(text[number - 1].split()) for text in (source.splitlines(), new))
     return Mutant(name, operator, occurrence, number, line, becomes)
-
-
-def _behaviour(source: str) -> str:
-    """The module without annotations, `__all__` and imports for annotations; "" where it does not compile."""
-    try:
-        tree = ast.parse(source)
-    except SyntaxError:
-        return ""
-    for node in ast.walk(tree):
-        for name in {"annotation", "returns"} & {*node._fields}:
-            setattr(node, name, None)
-        if (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)) or (
-            isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__"
-        ):
-            node.__dict__.clear()
-    return ast.dump(tree)
 
 
 def guards(root: Path, path: str) -> list[str]:
@@ -240,31 +243,31 @@ def missing(root: Path = ROOT) -> str:
     return f"{' and '.join(absent)} not installed: pip install -e '.[dev]'" if absent else ""
 
 
-def _rows(context: Context) -> list[Row]:
-    if reason := missing():
-        return [Row(STUDY.name, ALL, "mutated code", "", reason=reason)]
-    return rows(list(examine(sample(ROOT, COUNTS[context.profile.name], SEED))), SEED)
+def tasks(context: Context) -> list[Task]:
+    """All mutants in one task, which runs alone."""
+
+    def measured() -> list[Row]:
+        if reason := missing():
+            return [Row(STUDY.name, ALL, "mutated code", "", reason=reason)]
+        return rows(list(examine(sample(ROOT, COUNTS[context.profile.name], SEED))), SEED)
+
+    return [Task("code mutants", measured, timed=True)]
 
 
 MODULE = "validation.robustness.code_mutants"
-STUDY = Study(
-    "code mutants",
-    "Mutants of our own code",
-    about(__doc__),
-    TERMS,
-    lambda context: [Task("code mutants", lambda: _rows(context), timed=True)],
-)
+STUDY = Study("code mutants", "Mutants of our own code", about(__doc__), TERMS, tasks)
+app = command_line.application()
 
 
-def main(arguments: Sequence[str]) -> int:
-    """`COUNT [SEED]`; 1 where the bound is broken, 2 for other arguments."""
-    if not 1 <= len(arguments) <= 2 or not all(word.isdecimal() for word in arguments):
-        print(f"usage: python -m {MODULE} COUNT [SEED], whole numbers", file=sys.stderr)
-        return 2
+@app.command()
+def main(
+    count: Annotated[int, typer.Argument(min=1, help="Number of mutants.")],
+    seed: Annotated[int, typer.Argument(min=0, help="What chooses the lines.")] = SEED,
+) -> int:
+    """Mutate lines of the package, and run its tests; exit code 1 where more survive than may."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # removes the copy
-    count, seed = int(arguments[0]), int(arguments[1]) if arguments[1:] else SEED
     if reason := missing():
-        raise SystemExit(f"code mutants: {reason}")
+        raise ValueError(reason)
     found = []
     for mutant, killed in examine(sample(ROOT, count, seed)):
         found.append((mutant, killed))
@@ -275,4 +278,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(command_line.exit_code(app, MODULE, sys.argv[1:]))
