@@ -29,9 +29,11 @@ from validation.study import Study, Task
 MODULES = command.modules([], "full")
 STUDIES = {name: importlib.import_module(f"validation.{name}").STUDY for name in MODULES}
 RUN = (
-    *("directions.bsdf_samples", "diff.planted_defects", "planar.against_retrace", "media.catalogs"),
-    *("media.closed_forms", "stability.derivatives", "stability.energy", "stability.layered_paths"),
-    "stability.optical_chains",
+    *("directions.bsdf_samples", "directions.planted_defects", "directions.sweep", "diff.planted_defects"),
+    *("ground_truth.traced_bodies", "media.catalogs", "media.closed_forms", "planar.against_retrace"),
+    *("planar.closed_paths", "planar.extruded_scenes", "planar.joints", "renders.random_numbers"),
+    *("stability.derivatives", "stability.energy", "stability.layered_paths", "stability.optical_chains"),
+    *("suite.small_mistakes", "media.ray_directions", "renders.gradients"),
 )
 
 
@@ -192,6 +194,7 @@ def test_shares_of_bounds(value, bound, share):
 # Rows and bounds -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:.*is an extrapolation")  # wavelengths are drawn beyond the fit of a glass
 @pytest.mark.parametrize("name", RUN)
 def test_a_study_holds_its_bounds_none_of_which_is_a_hundred_times_too_wide(name, tmp_path, llvm_variant, monkeypatch):
     one = {"SCHOTT": glass_catalogs.CATALOGS["SCHOTT"]}  # each takes a second
