@@ -11,6 +11,7 @@ that kills a mutant must pass without it.
 from __future__ import annotations
 
 import ast
+import functools
 import hashlib
 import itertools
 import json
@@ -21,10 +22,9 @@ import signal
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import chdir
 from dataclasses import dataclass
-from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
@@ -116,7 +116,7 @@ def every(root: Path, name: str) -> list[Mutant]:
     return [mutant for mutant in mutants if mutant]
 
 
-@cache
+@functools.cache
 def _places(source: str) -> dict[int, list[tuple[str, int]]]:
     """Operators and occurrences by line; without the operators that take arguments."""
     from cosmic_ray.ast import ast_nodes, get_ast
@@ -171,51 +171,36 @@ def guards(root: Path, path: str) -> list[str]:
     return list(dict.fromkeys(place.relative_to(root).as_posix() for place in places if place.exists()))
 
 
-def examine(mutants: Sequence[Mutant], root: Path = ROOT) -> Iterator[tuple[Mutant, bool]]:
-    """Whether each was killed, file by file. ValueError where a test that fails does so without a mutant, too."""
-    from cosmic_ray.commands import execute
+def examine(mutants: Iterable[Mutant], root: Path = ROOT) -> Iterator[tuple[Mutant, bool]]:
+    """Whether each was killed. ValueError where a test that fails does so without a mutant, too."""
     from cosmic_ray.config import load_config
+    from cosmic_ray.mutating import mutate_and_test
     from cosmic_ray.testing import TestOutcome, run_tests
-    from cosmic_ray.work_db import use_db
-    from cosmic_ray.work_item import MutationSpec, WorkerOutcome, WorkItem
+    from cosmic_ray.work_item import MutationSpec, WorkerOutcome
 
+    config, passed = load_config(str(CONFIG)), set()
     with tempfile.TemporaryDirectory(prefix="mutants-", ignore_cleanup_errors=True) as folder:
         copy, temporary = Path(folder, "tree"), Path(folder, "tmp")
-        for made in (copy, temporary):
-            made.mkdir()
-        for entry in root.iterdir():
-            if entry.is_file():
-                shutil.copy2(entry, copy)
-            elif entry.name in COPIED:
-                shutil.copytree(entry, copy / entry.name, ignore=shutil.ignore_patterns("__pycache__"))
-        passed: set[str] = set()
-        for path in dict.fromkeys(mutant.path for mutant in mutants):
-            config = load_config(str(CONFIG))
-            words = {"tree": copy, "temporary": temporary, "python": sys.executable}
-            template = config.test_command
-            config["test-command"] = template.format(**words, tests=" ".join(guards(root, path)))
-            here = {str(i): mutant for i, mutant in enumerate(mutants) if mutant.path == path}
-            with chdir(copy), use_db(str(Path(folder, "session.sqlite"))) as database:
-                database.clear()
-                for i, mutant in here.items():
-                    place = (mutant.number, 0), (mutant.number, 1)
-                    spec = MutationSpec(path, f"core/{mutant.operator}", mutant.occurrence, *place)
-                    database.add_work_item(WorkItem.single(i, spec))
-                execute(database, config)
-                results = dict(database.results)
-                for i, result in results.items():
-                    if result.worker_outcome is not WorkerOutcome.NORMAL:
-                        raise ValueError(f"{here[i]}: not tested: {result.output[-300:]}")
-                    test = re.search(r"^(?:FAILED|ERROR) ([^\s\[]+)", result.output, re.MULTILINE)
+        temporary.mkdir()
+        others = {path.name for path in root.iterdir() if path.is_dir()} - set(COPIED)
+        shutil.copytree(root, copy, ignore=lambda at, _: others if at == str(root) else {"__pycache__"})
+        command = functools.partial(config.test_command.format, tree=copy, temporary=temporary, python=sys.executable)
+        for mutant in mutants:
+            tests, place = " ".join(guards(root, mutant.path)), ((mutant.number, 0), (mutant.number, 1))
+            spec = MutationSpec(mutant.path, f"core/{mutant.operator}", mutant.occurrence, *place)
+            with chdir(copy):
+                result = mutate_and_test([spec], command(tests=tests), config.timeout)
+                if result.worker_outcome is not WorkerOutcome.NORMAL:
+                    raise ValueError(f"{mutant}: not tested: {(result.output or '')[-300:]}")
+                if result.is_killed:
                     # Where no test is named, it hung, or pytest could not start: then all must pass without it.
-                    tests = test[1] if test else " ".join(guards(root, path))
-                    if result.is_killed and tests not in passed:
-                        outcome, _ = run_tests(template.format(**words, tests=tests), config.timeout)
-                        if outcome is not TestOutcome.SURVIVED:
+                    test = re.search(r"^(?:FAILED|ERROR) ([^\s\[]+)", result.output or "", re.MULTILINE)
+                    tests = test[1] if test else tests
+                    if tests not in passed:
+                        if run_tests(command(tests=tests), config.timeout)[0] is not TestOutcome.SURVIVED:
                             raise ValueError(f"{tests} fails without a mutant")
                         passed.add(tests)
-            for i, result in results.items():
-                yield here[i], result.is_killed
+            yield mutant, result.is_killed
 
 
 def rows(found: Sequence[tuple[Mutant, bool]], seed: int) -> list[Row]:
