@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -20,15 +20,6 @@ WHITE, GREEN, CASING = (1.0, 1.0, 1.0), (0.3, 1.0, 0.1), (0.0, 0.0, 0.03)
 MARK = 5  # half the size of a mark, in pixels of the drawing
 
 
-class Seen(Protocol):
-    """A square image and where points of space are on it, from 0 to 1, y downward."""
-
-    image: np.ndarray
-
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Where points (N × 3) are on the image, from 0 to 1, y downward; N × 2."""
-
-
 class View:
     """A scene with one plugin, rendered once with seed 0. Perspective camera, square film."""
 
@@ -39,8 +30,8 @@ class View:
         path = str(SCENES / f"{scene}.xml")
         self.scene = mi.load_file(path, **scene_files.REPRODUCIBLE, bsdf=plugin, res=size, **parameters)
         self.image = np.array(mi.render(self.scene, spp=spp, seed=0), dtype=np.float64)
-        fov = _number(mi.traverse(self.scene.sensors()[0])["x_fov"])
-        self.half = math.tan(math.radians(fov) / 2)
+        (fov,) = np.ravel(mi.traverse(self.scene.sensors()[0])["x_fov"])
+        self.half = math.tan(math.radians(float(fov)) / 2)
         self.to_world = np.array(self.scene.sensors()[0].world_transform().matrix, float).reshape(4, 4)
 
     def project(self, points: np.ndarray) -> np.ndarray:
@@ -55,11 +46,7 @@ class View:
         return self.to_world[:3, 3], d / np.linalg.norm(d)
 
 
-def _number(x: Any) -> float:
-    return float(x if isinstance(x, float) else x[0])
-
-
-def draw(view: Seen, paths: list[np.ndarray], ends: np.ndarray) -> np.ndarray:
+def draw(view: View, paths: list[np.ndarray], ends: np.ndarray) -> np.ndarray:
     """The image, enlarged; the paths (points N × 3 each) in white between two squares, `ends` as green crosses."""
     import OpenImageIO as oiio
 
