@@ -324,20 +324,3 @@ def test_garbage_is_answered_in_one_line(name, parsers, folder):
 
     try_one()
     assert outcomes["refused"] > 0
-
-
-FORBIDDEN = {
-    "plugin": ("scene, XML", b"</scene>", b'<bsdf type="checkerboard"><bsdf type="near_clip"/></bsdf></scene>'),
-    "vertex": ("mesh, PLY", b"3 0 3 4", b"3 0 3 6"),
-}
-
-
-@pytest.mark.usefixtures("scalar_variant")
-@pytest.mark.parametrize("case", FORBIDDEN)
-def test_what_a_scene_must_not_do_is_refused(case, parsers, folder):
-    name, old, new = FORBIDDEN[case]
-    suffix, good, read = parsers[name]
-    path = folder / f"mutated{suffix}"
-    assert good[-1].count(old) == 1
-    path.write_bytes(good[-1].replace(old, new))
-    assert outcome(read, path) == "refused"
