@@ -265,7 +265,6 @@ REFUSED = {
     "to_world": (MOVED, '<float name="to_world" value="1"/>'),
     "8000000000000000000 triangles where": (LIGHT, f"{AREA}{BOARD.format(1e9, 1e9)}"),
     "/dev/zero: not a regular file": (BALL, 'type="ply"><string name="filename" value="/dev/zero"/>'),
-    "nested more than 32 deep": ("</scene>", '<bsdf type="twosided">' * 20000 + "</bsdf>" * 20000 + "</scene>"),
     "coordinates beyond 1e+30": ('<translate x="3"/>', '<scale value="1e31"/>'),
     "no.ply": (BALL, 'type="ply"><string name="filename" value="no.ply"/>'),
     "no sensor": (re.search("<sensor.*</sensor>", SCENE, re.DOTALL)[0], ""),

@@ -9,7 +9,7 @@ import pytest
 from support.media_rays import answered
 
 from mi_refract import media
-from validation.media.closed_forms import _back_focal_distance
+from validation.media.closed_forms import back_focal_distance
 from validation.reference.exact_lens import crossing
 from validation.run.context import PROFILES, Context
 from validation.run.metrics import ERROR_OVER_BOUND
@@ -163,7 +163,7 @@ LENS = lenses.LENS
 
 def test_the_exact_trace_is_that_of_matrices_near_the_axis_and_its_weights_those_of_small_changes():
     """The rest is spherical aberration, and falls as the height's square. A bent surface has another curvature."""
-    focus = 8.5 + _back_focal_distance(LENS.curvatures, NS, LENS.thicknesses)
+    focus = 8.5 + back_focal_distance(LENS.curvatures, NS, LENS.thicknesses)
     off = [float(crossing(LENS, NS, h, lenses.START).place) / focus - 1 for h in (1e-6, 1.0, 0.5)]
     assert abs(off[0]) < 1e-12 and off[1] / off[2] == pytest.approx(4, rel=1e-2)
     exact, (first, *others) = crossing(LENS, NS, 10.0, lenses.START), LENS.curvatures
