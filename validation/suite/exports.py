@@ -20,10 +20,10 @@ from mi_refract.plugins import PLUGIN
 from mi_refract.rendering import scene_files
 from mi_refract.report.row import Row
 from mi_refract.scene_export import from_mitsuba, write_files
-from mi_refract.scene_export.plain_scene import Diffuse, Light, Material, Mesh, PlainScene
+from mi_refract.scene_export.plain_scene import Camera, Diffuse, Light, Material, Mesh, PlainScene
 from validation import limits
+from validation.run import render_methods
 from validation.run.context import SCENES, Context
-from validation.run.render_methods import Camera
 from validation.study import Study, Task, about
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
@@ -48,8 +48,7 @@ THEIRS = {"POV-Ray": 256, "Cycles": 512, "LuxCore": 1024, "Radiance": 512}  # sa
 def scene(diffuse: bool = True) -> PlainScene:
     """The balls of `balls`, seen from another place, with a lamp; `diffuse`: and with a patch."""
     balls = from_mitsuba.load(SCENES / "balls.xml", level=2)
-    view = {"origin": (30.0, 15.0, 240.0), "target": (3.0, -4.0, 0.0), "up": (0.3, 1.0, 0.2), "fov_x_degrees": 48.0}
-    camera = dataclasses.replace(balls.camera, **view, width=SIZE[0], height=SIZE[1])
+    camera = Camera((30.0, 15.0, 240.0), (3.0, -4.0, 0.0), (0.3, 1.0, 0.2), 48.0, *SIZE)
     extra = [_quad("lamp", (-100.0, 22.0), (-72.0, 50.0), Light((3.0, 2.0, 1.0)))]
     if diffuse:
         extra.append(_quad("patch", (70.0, -50.0), (105.0, 10.0), Diffuse((0.2, 0.5, 0.9))))
@@ -94,7 +93,7 @@ def reference(diffuse: bool) -> np.ndarray:
     """Renders by this plugin, in the present variant: renders × height × width × 3."""
     with tempfile.TemporaryDirectory() as folder:
         write_files.write(scene(diffuse), "mitsuba", Path(folder) / "scene")
-        camera = Camera(scene_files.load_scene(Path(folder) / "scene" / "scene.xml", {"bsdf": PLUGIN}))
+        camera = render_methods.Camera(scene_files.load_scene(Path(folder) / "scene" / "scene.xml", {"bsdf": PLUGIN}))
         return np.stack([camera(SPP, 1000 + i)[0] for i in range(len(SEEDS))])
 
 
