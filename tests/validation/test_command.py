@@ -293,6 +293,7 @@ def test_the_table_of_defects_is_made_of_the_rows_of_the_self_test():
     assert lines[0].startswith("noise; 1 trials each of 2 renders a side. Minimum detectable difference in a tile: ")
     assert [line.split("|")[1].strip() for line in lines[4:-1]] == list(DEFECTS)
     assert [cell.strip() for cell in lines[-1].split("|")[2:4]] == ["identical", "0 of 4"]
+    assert (lines[-2].count("not read"), lines[-1].count("identical")) == (len(METHODS), 1)
 
 
 def test_images_of_the_first_page_exist():
