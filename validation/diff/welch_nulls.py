@@ -121,9 +121,8 @@ class Form:
 
     def sides(self, drawn: Sequence[tuple[Array, Any]], counts: Sequence[int]) -> list[Side]:
         """Both sides, of their means and Σ(x − mean)²; or of stacks of images, of so many samples in all."""
-        # (Σw)²/Σw² of the filter
         weights = gaussian_filter(np.eye(1, 101, 50)[0], self.deviation) if self.deviation else np.ones(1)
-        area = float(1 / np.square(weights).sum() ** 2)
+        area = float(1 / np.square(weights).sum() ** 2)  # (Σw)²/Σw² of the filter, along both axes
         sides: list[Side] = []
         for (x, squares), n, known in zip(drawn, counts, self.known, strict=True):
             if self.kind in ("renders", "unnamed"):  # no two are the same, as no real ones are
@@ -132,8 +131,8 @@ class Form:
             elif self.kind == "samples":
                 sides.append(image(x, {SPP: n}, squares / (n - 1) if known else None))
             else:  # as `mi-refract render` writes them
-                header = {SPP: n, FREEDOM: len(x) - 1, AREA: area}
-                sides.append(image(x.mean(0), header, x.var(0, ddof=1) * n / len(x) if known else None))
+                spread = x.var(0, ddof=1) * n / len(x) if known else None
+                sides.append(image(x.mean(0), {SPP: n, FREEDOM: len(x) - 1, AREA: area}, spread))
         return sides
 
 
