@@ -15,12 +15,10 @@ __all__ = [
     "methods",
     "pairing",
     "pixelwise",
-    "report_folder",
     "results",
     "results_file",
     "self_test",
     "settings",
-    "settings_file",
     "text_reports",
     "tile_statistics",
 ]

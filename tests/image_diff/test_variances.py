@@ -10,11 +10,20 @@ import pytest
 from scipy import stats
 from support.diff_images import of
 
-from mi_refract.image_diff import accept, channels, folders, pairing, panes, self_test, settings_file, text_reports
+from mi_refract.image_diff import (
+    accept,
+    channels,
+    folders,
+    html_report,
+    pairing,
+    results_file,
+    self_test,
+    text_reports,
+)
 from mi_refract.image_diff.comparison import Verdict
 from mi_refract.image_diff.methods import METHODS, choice, compare
 from mi_refract.image_diff.results import Category, Status
-from mi_refract.image_diff.settings import Entry, Settings
+from mi_refract.image_diff.settings import Entry, Settings, load
 from mi_refract.image_diff.variances import FREEDOM, SPP
 from mi_refract.io.image_file import read, write_exr
 
@@ -380,15 +389,15 @@ def test_welch_is_chosen_and_reports_and_settings_say_so(films, tmp_path):
     """A method that the settings name is used, and nothing explains it. Those that differ are accepted whole."""
     results = folders.diff(*films, to_accept=True)
     assert {x.name: x.status for x in results.results} == {"off.exr": Status.DIFFERENT, "same.exr": Status.EQUAL}
-    assert text_reports.plain(text_reports.table(results)).count(f"welch ({BOTH})") == 2
-    entries = text_reports.as_data(results)["results"]
+    assert {result.method_in_words for result in results.results} == {f"welch ({BOTH})"}
+    entries = results_file.as_data(results)["results"]
     assert {(x["method"], x["method_why"]) for x in entries} == {("welch", BOTH)}
     how = Settings(rules=(Entry("*", BESIDE | {"channels": (("X", "a.X"), ("Y", "Y"))}),))
     shown = text_reports.settings_table(pairing.pairs(*films, how))[1][1]
     assert shown.endswith("spp_reference=64, spp_test=16, variance {stem}_var.exr, channels X=a.X,Y")
     path = tmp_path / "a.toml"
     path.write_text('[[image]]\nname = "off.exr"\nmethod = "exact"\nreason = "r"\n')
-    named = {x.name: x.comparison.method_in_words for x in folders.diff(*films, settings_file.load(path)).results}
+    named = {x.name: x.comparison.method_in_words for x in folders.diff(*films, load(path)).results}
     assert named == {"off.exr": "exact", "same.exr": f"welch ({BOTH})"}
     copies = list(accept.changes(results))
     assert [copy.reference.name for copy in copies] == ["off.exr"]
@@ -463,9 +472,9 @@ def test_a_variance_is_no_image(method):
 def test_panes_and_the_self_test_take_the_image_without_its_variance(tmp_path, names):
     for side, gain in (("old", 1.0), ("new", 1.5)):
         written(tmp_path / side / "a.exr", film(70, names=names, gain=gain))
-    shown = panes.of_result(one(tmp_path / "old", tmp_path / "new", maps=True), 1e6, 1e6, thumbs=True)
+    shown = html_report.shown_of(one(tmp_path / "old", tmp_path / "new", maps=True), 1e6, 1e6)
     assert [pane["role"] for pane in shown.panes][:4] == ["reference", "test", "difference", "flip"]
-    assert (shown.note, set(shown.thumbnails)) == ("", {"test", "difference"})
+    assert shown.note == ""
     assert "variance" not in json.dumps(shown.panes)
     image = read(tmp_path / "old/a.exr")
     np.testing.assert_array_equal(self_test.read_images(tmp_path / "old/a.exr")[0], image.select(names))

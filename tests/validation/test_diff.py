@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refract.image_diff import flip, folders, tile_statistics
+from mi_refract.image_diff import flip, folders, self_test, tile_statistics
 from mi_refract.image_diff.methods import METHODS
 from mi_refract.image_diff.settings import Settings
 from validation import limits, readme_tables
@@ -82,6 +82,16 @@ def test_what_nobody_sees_is_equal_and_what_a_person_sees_is_different():
     assert [line[0] for line in lines[2 : 2 + len(rows)]] == list(rows)
     assert (lines[2][2], lines[2][-1], lines[-1][:2]) == ("not seen", "0.0%", ["codes of 255", "never"])
     assert lines[0][3].endswith("(bound 0.5)") and lines[0][4].endswith("(bound 0.12)")
+
+
+def test_the_table_of_defects_is_made_of_the_rows_of_the_self_test():
+    rng = np.random.default_rng(1)
+    rows = self_test.examine(rng.gamma(16, 1 / 16, (4, 16, 16, 3)), "noise", trials=1, null_pairs=2)
+    lines = readme_tables.seen(rows).splitlines()
+    assert lines[0].startswith("noise; 1 trials each of 2 renders a side. Minimum detectable difference in a tile: ")
+    assert [line.split("|")[1].strip() for line in lines[4:-1]] == list(self_test.DEFECTS)
+    assert lines[-2].count("not read") == len(METHODS)
+    assert [cell.strip() for cell in lines[-1].split("|")[2:4]] == ["identical", "0 of 4"]
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from mi_refract import media
 from mi_refract.media import LINES
 from mi_refract.planar import scene_file
 from mi_refract.planar.path_tree import Branches, follow_scene
-from mi_refract.plugins import integrator_context
+from mi_refract.plugins.refract import followed_context
 from mi_refract.report.row import Row
 from validation.limits import BOW_ANGLE, FOCAL_DISTANCE, PRISM_ANGLE
 from validation.reference import closed_forms as closed
@@ -109,7 +109,7 @@ def mitsuba_row(context: Context) -> Row:
             centre = [vertex + 1 / curvature, 0.0, 0.0]
             parts[f"surface_{i}"] = {"type": "sphere", "center": centre, "radius": abs(1 / curvature), "bsdf": bsdf}
         scene: Any = mi.load_dict({"type": "scene"} | parts)
-        asked = integrator_context.context()
+        asked = followed_context()
         asked.component = 1
         wavelengths = mi.Float(plane.light.wavelengths)
         ray: Any = mi.Ray3f(mi.Point3f(-20.0, MARGIN, 0), mi.Vector3f(1, 0, 0))

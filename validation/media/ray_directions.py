@@ -19,7 +19,7 @@ from mi_refract import media, oracle
 from mi_refract.accuracy import BUDGETS, RayBounds, evaluate, judge
 from mi_refract.formulas import FORMULAS, resolve
 from mi_refract.media import Medium
-from mi_refract.plugins import integrator_context
+from mi_refract.plugins.refract import followed_context
 from mi_refract.regimes import Rays
 from mi_refract.report.row import Row
 from validation import repeated
@@ -103,7 +103,7 @@ def _sampled_row(medium: Medium, spec: str, count: int) -> Row:
     wi, wavelengths, k = _drawn(medium, count)
     with under(SPECTRAL):
         bsdf = mi.load_dict({"type": "refract", "int_ior": spec, "ext_ior": 1.0})
-        asked = integrator_context.context()
+        asked = followed_context()
         asked.component = 1
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wi = mi.Vector3f(wi.T.astype(np.float32))

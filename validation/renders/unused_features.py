@@ -17,8 +17,8 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.formulas import FORMULAS
-from mi_refract.plugins import PLUGIN, integrator_context
-from mi_refract.plugins.refract import LOBES
+from mi_refract.plugins import PLUGIN
+from mi_refract.plugins.refract import LOBES, followed_context
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing
@@ -100,7 +100,7 @@ def operations(
         params = mi.traverse(bsdf)
         dr.enable_grad(params["eta"])
         params.update()
-    asked = integrator_context.context() if followed else mi.BSDFContext()
+    asked = followed_context() if followed else mi.BSDFContext()
     asked.mode = mi.TransportMode.Importance if importance else mi.TransportMode.Radiance
     if component is not None:
         asked.component = component
