@@ -27,9 +27,9 @@ from scipy import stats
 from scipy.ndimage import gaussian_filter
 
 from mi_refract.image_diff import tile_statistics
+from mi_refract.image_diff.channels import AREA, FREEDOM, SPP
 from mi_refract.image_diff.comparison import Comparison, Verdict
 from mi_refract.image_diff.methods import METHODS, compare
-from mi_refract.image_diff.variances import AREA, FREEDOM, SPP
 from mi_refract.io.image_file import Image
 from mi_refract.report.row import Row
 from validation import limits
