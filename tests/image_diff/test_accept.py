@@ -352,7 +352,7 @@ def test_bad_words_with_from(run, compared):
     old, new, out = compared
     for words, message in [
         (["--from", out.with_name("none.json")], "none.json"),
-        ([old, "--from", out], "only one path; with --from, give both folders before any names, or no folder"),
+        ([old, "--from", out], "only one path; with --from, give both folders before the names, or none"),
         (["--from", out, "--set", "fail=1"], "--from repeats an earlier comparison"),
         ([old, new, "none*", "--from", out], "none*: matches no image; expected "),
         ([], "two paths are needed"),
