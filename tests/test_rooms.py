@@ -69,9 +69,7 @@ FILLED = {
     "PathState",
     "Progress",
     "Ray",
-    "SceneText",
     "Scatter",
-    "SearchState",
     "Start",
     "Tally",
 }

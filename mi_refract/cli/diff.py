@@ -21,7 +21,7 @@ from mi_refract.image_diff.methods import AUTO, METHODS
 from mi_refract.image_diff.results import Status
 from mi_refract.image_diff.settings import FILE, Settings, from_words, key_tables, load
 from mi_refract.io.atomic import writable
-from mi_refract.io.exit_code import MISUSE
+from mi_refract.io.errors import MISUSE
 from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.sanitise import printable
 
@@ -107,7 +107,7 @@ def diff(
         )
     text_reports.print_results(results)
     if page:
-        from mi_refract.io.provenance import provenance
+        from mi_refract.io.image_file import provenance
 
         software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
         page.write(results, software, results.command("diff", *(names or [])), str(json or ""))

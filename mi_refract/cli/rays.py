@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mi_refract.io.atomic import writable
-from mi_refract.io.provenance import provenance
+from mi_refract.io.image_file import provenance
 from mi_refract.io.sanitise import printable
 from mi_refract.ray_sets import files, ray_set, run_program, tables
 from mi_refract.ray_sets.ray_set import Answers, RaySet

@@ -9,7 +9,6 @@ could not have seen a difference says "inconclusive".
 __all__ = [
     "accept",
     "comparison",
-    "defects",
     "file_pair",
     "folders",
     "html_report",
@@ -22,5 +21,4 @@ __all__ = [
     "settings",
     "text_reports",
     "tile_statistics",
-    "tolerance",
 ]

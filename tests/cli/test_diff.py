@@ -14,7 +14,7 @@ from support.diff_images import BROKEN, image, samples, tree
 
 from mi_refract.image_diff import methods, results_file, text_reports
 from mi_refract.image_diff.results import Result, Results, Status
-from mi_refract.io import exit_code
+from mi_refract.io import errors
 from mi_refract.io.image_file import read, write_exr
 
 EVIL = 'a"b<script>alert(1)<∕script>|`*[x](y)*`,:%0A::error::.exr'
@@ -239,7 +239,7 @@ def test_whatever_one_image_does_the_report_is_written(run, pair, tmp_path, monk
     for name in outputs.values():
         text = (tmp_path / name).read_text()
         assert "out of memory" in text and "louder.exr" in text
-    monkeypatch.setenv(exit_code.TRACEBACK, "1")
+    monkeypatch.setenv(errors.TRACEBACK, "1")
     assert "Traceback" in run("diff", *pair)[2]
 
 

@@ -219,7 +219,7 @@ def test_an_entry_that_is_wrong_is_the_error_of_its_images(load, text, message):
     ("method", "words", "values"),
     [
         ("auto", [], {}),
-        ("welch", ["tile=8", "equivalence_margin=1", "correction=holm"], {"tile": 8, "correction": "holm"}),
+        ("welch", ["tile=8", "equivalence_margin=1", "pixels=no"], {"tile": 8, "pixels": "no"}),
         ("tolerance", ["fail=inf"], {"method": "tolerance", "fail": np.inf}),
         ("auto", ["channels=X, nested.Y=Y"], {"channels": (("X", "X"), ("nested.Y", "Y"))}),
         ("auto", ['channels=["X"]'], {"channels": (("X", "X"),)}),

@@ -325,7 +325,6 @@ REFUSED = {
         "8000000000000000000 triangles where",
     ),
     "pipe": (BALL, 'type="ply"><string name="filename" value="/dev/zero"/>', "/dev/zero: not a regular file"),
-    "deep": ("</scene>", '<bsdf type="twosided">' * 20000 + "</bsdf>" * 20000 + "</scene>", "nested more than 32 deep"),
     "far away": ('<translate x="3"/>', '<scale value="1e31"/>', "coordinates beyond 1e+30"),
     "missing mesh": (BALL, 'type="ply"><string name="filename" value="no.ply"/>', "no.ply"),
 }

@@ -10,20 +10,9 @@ import OpenImageIO as oiio
 from mi_refract.io.image_file import Image, write_exr
 
 SIZE = (32, 48, 3)
+
+
 # By flag of OpenImageIO's `idiff`: the option of `tolerance` that says the same, and idiff's default.
-IDIFF = {
-    "-fail": ("fail", 1e-6),
-    "-failrelative": ("fail_relative", 0.0),
-    "-failpercent": ("fail_percent", 0.0),
-    "-hardfail": ("hard_fail", np.inf),
-    "-allowfailures": ("allow_failures", 0),
-    "-warn": ("warn", 1e-6),
-    "-warnrelative": ("warn_relative", 0.0),
-    "-warnpercent": ("warn_percent", 0.0),
-    "-hardwarn": ("hard_warn", np.inf),
-}
-
-
 def of(pixels, channels=None, **rest):
     """An image in memory, of R, G, B, or of Y where there is one channel."""
     pixels = np.asarray(pixels, np.float32)
