@@ -15,7 +15,6 @@ from support.diff_images import BROKEN, image, samples, tree
 from mi_refract.image_diff import methods, results_file, text_reports
 from mi_refract.image_diff.results import Result, Results, Status
 from mi_refract.io import errors
-from mi_refract.io.image_file import read, write_exr
 
 EVIL = 'a"b<script>alert(1)<∕script>|`*[x](y)*`,:%0A::error::.exr'
 
@@ -47,21 +46,6 @@ def test_inconclusive_renders(run, tmp_path):
         assert "welch" in out
 
 
-def test_renders_that_hold_their_variance_are_compared_by_welch(run, tmp_path):
-    """Without any option; the table says why. `tolerance`, asked for, does not compare the variance."""
-    rng, header = np.random.default_rng(1), {"mi_refract:spp": 32, "mi_refract:variance_freedom": 7}
-    for name, gain in (("old", 1.0), ("new", 1.0), ("off", 1.2)):
-        passes = gain + rng.standard_normal((8, 16, 16, 3)) / 40
-        pixels = np.concatenate([passes.mean(0), 4 * passes.var(0, ddof=1)], -1)
-        write_exr(tmp_path / f"{name}.exr", pixels, (*"RGB", "R.variance", "G.variance", "B.variance"), header)
-    old, new, off = (tmp_path / f"{name}.exr" for name in ("old", "new", "off"))
-    for test, word, expected in ((new, "equal", 0), (off, "different", 1)):
-        code, out, err = run("diff", old, test)
-        assert (code, err) == (expected, "") and out.splitlines()[1].startswith(word)
-        assert " welch (the variance of both is known) " in out
-    assert run("diff", old, new, "--method", "tolerance", "--set", "fail=0.1", "--set", "fail_relative=0.1")[0] == 0
-
-
 @pytest.mark.parametrize(
     ("words", "code"),
     [
@@ -91,37 +75,6 @@ def test_the_methods_are_printed_without_images(run):
     for name, method in methods.METHODS.items():
         assert f"`{name}`: {method.summary}" in out
         assert all(f"| `{option}` |" in out for option in method.options)
-
-
-VARIANCE = ("--set", "variance={stem}_var.exr")
-
-
-def test_a_variance_beside_the_reference_and_channels(run, tmp_path):
-    """A reference of 1000 samples with its variance, and new images of 200: an equal one, and one 3 % brighter."""
-    mean, rng = np.ones((32, 32, 3)), np.random.default_rng(8)
-    old, new, out = tmp_path / "old", tmp_path / "new", tmp_path / "a.json"
-    for folder, spp, gains in ((old, 1000, (1, 1)), (new, 200, (1, 1.03))):
-        folder.mkdir()
-        for name, gain in zip(("equal", "off"), gains, strict=True):
-            write_exr(folder / f"{name}.exr", gain * rng.gamma(spp, mean / spp))
-    for name in ("equal", "off"):
-        write_exr(old / f"{name}_var.exr", mean)
-    words = (*VARIANCE, "--set", "spp_reference=1000")
-    code, said, err = run("diff", old, new, *words, "--set", "spp_test=200")
-    assert (code, err) == (1, "")
-    rows = [line.split()[:3] for line in said.splitlines()[1:3]]
-    assert rows == [["different", "off.exr", "welch"], ["equal", "equal.exr", "welch"]]
-    code, _, err = run("diff", old, new, *words)
-    assert (code, len(err.splitlines())) == (2, 2) and "expected `spp` or `spp_test`" in err
-    assert run("diff", old, new, *words, "--set", "spp_test=1")[0] == 2
-    broken = read(new / "equal.exr").pixels.copy()
-    broken[..., 2] *= 2
-    write_exr(new / "equal.exr", broken)
-    words = ("equal.exr", *VARIANCE, "--set", "spp=200", "--json", out)
-    for channels, code in (("R,G,B", 1), ("R,G", 0), ("R=G,G=R", 0), ("Q", 2)):
-        assert run("diff", old, new, *words, "--set", f"channels={channels}")[0] == code
-        (entry,) = json.loads(out.read_text())["results"]
-        assert run(*shlex.split(entry["reproduce"])[1:])[0] == code
 
 
 # A settings file --------------------------------------------------------------------------------------------------
