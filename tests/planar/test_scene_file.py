@@ -51,14 +51,14 @@ def test_scenes_load_and_all_rays_find_their_way_out(path, needs_variant):
     scene = load(path)
     if path.stem == "luneburg":
         needs_variant("llvm_ad_rgb")  # a second a ray on scalar numbers
-    assert len(scene.segments) == len(scene.colours) == len(scene.index)
+    assert len(scene.segments) == len(scene.light.names) == len(scene.index)
     assert len(scene.origins) == len(scene.directions) == len(scene.beams)
     assert np.abs(np.hypot(*scene.directions.T) - 1).max() <= 2 * ULP
     for colour, segments in enumerate(scene.segments):
         assert set(np.unique(paths(scene, colour).events)) <= {0, Event.REFRACTED, Event.REFLECTED, Event.ESCAPED}
         assert segments.start.tolist() == scene.segments[0].start.tolist()
     for region in scene.regions:
-        assert len(region.indices) == len(scene.colours)
+        assert len(region.indices) == len(scene.light.names)
         x, y = region.outline.T
         assert np.dot(x, np.roll(y, -1)) > np.dot(y, np.roll(x, -1))
 
@@ -122,7 +122,7 @@ SCENE = HEAD + SHAPES + BEAMS
 
 def test_a_scene_is_read_as_it_is_written(read):
     scene = read(SCENE)
-    assert (scene.title, scene.colours, scene.index) == ("A disc", ("red", "blue"), (1.0, 1.1))
+    assert (scene.title, scene.light.names, scene.index) == ("A disc", ("red", "blue"), (1.0, 1.1))
     assert (scene.max_depth, scene.branches, scene.view) == (5, 1, (-2.0, 2.0, -1.5, 1.5))
     assert scene.origins.tolist() == [[-5, 0], [-5, 0], [-5, 0], [-5, 0], [0, 1], [2, 3]]
     assert scene.directions.tolist() == [[0.6, 0.8], [0, -1], [1, 0], [0, 1], [-1, 0], [0, -1]]
@@ -361,7 +361,7 @@ def test_a_material_has_the_index_of_each_wavelength(read):
     expected = tuple(1.5 + 4000 / w**2 for w in (486.1327, 587.5618))
     assert scene.regions[-1].indices == pytest.approx(expected, rel=1e-15)
     assert [segments.n_left[-1] for segments in scene.segments] == pytest.approx(expected, rel=1e-15)
-    assert scene.colours == ("486.133 nm", "587.562 nm")
+    assert scene.light.names == ("486.133 nm", "587.562 nm")
     given = [read(GLASSES.replace("[1, 1.1]", "1").replace("[1.5, 1.6]", "1.5"), x).light for x in ([450.0], 36)]
     assert [x.wavelengths for x in given] == [(450.0,), tuple(np.linspace(380, 730, 36))]
     plain = read(SCENE.replace("n = 1.3", f'n = "{CAUCHY}"'))  # without wavelengths: the d line
