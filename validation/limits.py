@@ -83,7 +83,7 @@ WHITE_FURNACE = limit(2.0**-23, "an ulp of 1: the weights of both lobes add up t
 IN_AND_OUT = limit(6.0, "u: k² and 1/k², each with k rounded and squared, 3u")
 INDEX_SQUARED = limit(3.0, "u: k rounded and squared")
 
-# Over condition · u of a form at the rounding limit; derived in `validation/stability/derivative_conditions.py`.
+# Over condition · u of a form at the rounding limit; derived in `stability.derivatives.condition_of`.
 DERIVATIVE = limit(
     29.0, "error over condition · u: every product of the differentiated form rounded, each at its worst"
 )

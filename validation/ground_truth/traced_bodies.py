@@ -20,10 +20,9 @@ from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.optical_systems import Array
-from validation.run import path_overlay
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND
-from validation.run.render_methods import under
+from validation.run.render_methods import save_image, under
 from validation.study import Study, Task, about
 
 from . import rainbow
@@ -118,7 +117,7 @@ def bow_rows(context: Context) -> list[Row]:
     for plugin in PLUGINS:
         mean = np.mean(images[plugin], axis=0).reshape(size, 4, size, 4).mean((1, 3))
         grey = np.repeat(mean[..., None] / mean.max(), 3, axis=2)
-        shown[plugin] = path_overlay.save(context.out, f"rainbow {plugin}", grey, about)
+        shown[plugin] = save_image(context.out, f"rainbow {plugin}", grey, about)
     roles = {PLUGIN: {"reference": shown[BUILTIN], "test": shown[PLUGIN]}, BUILTIN: {}}
     return [bow_row(plugin, context.variant, images[plugin], about, roles[plugin]) for plugin in PLUGINS]
 
