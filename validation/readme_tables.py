@@ -26,7 +26,6 @@ from validation.directions import per_formula
 from validation.efficiency import changing_indices, error_against_time
 from validation.planar import against_retrace
 from validation.planar import times as planar_times
-from validation.reference.layered_scenes import MIRAGE
 from validation.renders import against_dielectric, colours
 from validation.run.array_settings import PLAIN
 from validation.run.context import SCENES, Context
@@ -185,7 +184,7 @@ PATHS = {
 def paths(rows: list[Row]) -> str:
     """The paths through the mirage, of every plugin and of exact arithmetic with rounded indices."""
     mine = _measured(rows, layered_paths.NAME, PATHS)
-    mine = [row for row in mine if row.replay["scene"] == f"{MIRAGE.scene}.xml"]
+    mine = [row for row in mine if row.replay["scene"] == f"{layered_paths.MIRAGE.scene}.xml"]
     names = [row.subject if row.subject.startswith("exact") else f"`{row.subject}`" for row in mine]
     cells = [[name, *(compact(row.values[m]) for m in PATHS)] for name, row in zip(names, mine, strict=True)]
     return _table(_replay(mine, "{rays} rays, {setting}."), ["", *PATHS.values()], cells, "paths were traced")
