@@ -381,7 +381,7 @@ def _path_row(layers: Layers, name: str, exact: list[Path], parts: list[Deviatio
 # Images ------------------------------------------------------------------------------------------------------
 
 
-def view_rows(context: Context, scene: str, parameters: dict[str, str], name: str) -> list[Row]:
+def view_rows(context: Context, scene: str, parameters: dict[str, Any], name: str) -> list[Row]:
     """`refract` and the built-in, image against image; and what flipped lobes alone do, as a control."""
     if context.variant.startswith("scalar"):
         return [Row(NAME, PLUGIN, f"{name}: image", context.variant, reason=SCALAR)]
