@@ -60,9 +60,9 @@ class Mutant:
 # Defects of any formula f ----------------------------------------------------------------------------------------
 
 
-def _after(change: Callable[[Any, Any, Any, Any, Any], Answer]) -> Callable[[Any, Any, Any, Any], Answer]:
+def _after(change: Callable[..., Answer]) -> Callable[[Any, Any, Any, Any], Answer]:
     """The formula, and a change of its b and `transmitted`: `change(b, transmitted, a, n, k)`."""
-    return lambda f, a, n, k: change(*f(a, n, k), a, n, k)
+    return lambda f, *ray: change(*f(*ray), *ray)
 
 
 def _one_sided(b: Any, transmitted: Any, a: Any, n: Any, k: Any) -> Answer:

@@ -69,8 +69,8 @@ def _rows(context: Context, name: str, setting: Setting) -> list[Row]:
     values = {ERROR_OVER_BOUND: max((f.share for f in chords), default=0.0), MISCLASSIFIED_FAR: float(len(far))}
     values["rays tried"] = float(generations * CHILDREN * len(herd))
     worst_lines = [f.line() for f in sorted(chords, key=lambda f: -f.share)[:3]]
-    replay = {"seed": seeds.current(SEED), "sample": sample, "generations": generations}
-    replay |= {"worst": worst_lines, "misclassified": far[:3]}
+    sizes = {"seed": seeds.current(SEED), "sample": sample, "generations": generations}
+    replay = {**sizes, "worst": worst_lines, "misclassified": far[:3]}
     return [Row(NAME, name, "all regimes", setting.label, values, BUDGETS, replay=replay)]
 
 
