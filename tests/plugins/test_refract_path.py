@@ -9,25 +9,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from scipy.stats import chi2_contingency
-from support.glass_scenes import (
-    BLACK,
-    GLASS,
-    PLACE,
-    SKY,
-    camera,
-    equal_means,
-    glass_ball,
-    parameter,
-    refusal,
-    render,
-    sky,
-)  # fmt: skip
+from support.glass_scenes import BLACK, GLASS, PLACE, SKY, camera, equal_means, glass_ball, parameter, refusal, render
 from support.variants import switch
 
 from mi_refract.image_diff import pixelwise, tile_statistics
 from mi_refract.plugins import refract_path, sampling, scene_features
 from mi_refract.rendering import scene_files
 from validation.run.context import SCENES
+
+LIT = {"type": "envmap", "bitmap": mi.Bitmap(SKY)}
 
 
 def load(name, resolution=32, **parameters):
@@ -119,7 +109,7 @@ def test_nothing_to_see_is_black(rgb_variant):
         scene = mi.load_dict({"type": "scene", "sensor": camera(4)} | parts)
         for parameters in ({}, {"split_depth": 2, "max_depth": -1}):
             assert (render(scene, 2, **parameters) == 0).all()
-    assert (render(glass_ball(sky=sky()), 2, max_depth=0) == 0).all()
+    assert (render(glass_ball(sky=LIT), 2, max_depth=0) == 0).all()
 
 
 # Splitting -----------------------------------------------------------------------------------------------------
@@ -180,7 +170,7 @@ def test_rows_and_columns_are_permuted_within_their_cells(llvm_variant):
 def test_a_deterministic_image_errs_by_what_it_says_was_truncated(llvm_variant):
     """The ball from one point: no noise but the position in the pixel, which is its centre in every sample."""
     sensor = camera() | {"sampler": {"type": "multijitter", "jitter": False}}
-    scene = glass_ball(sky=sky(), sensor=sensor)
+    scene = glass_ball(sky=LIT, sensor=sensor)
     exact, coarse = (
         render(scene, 1, deterministic=True, split_weight=weight, max_depth=64) for weight in (2.5e-4, 0.05)
     )
@@ -203,7 +193,7 @@ def test_a_deterministic_image_errs_by_what_it_says_was_truncated(llvm_variant):
     ids=lambda bsdf: bsdf["type"],
 )
 def test_what_would_be_left_to_chance_is_refused(bsdf, llvm_variant):
-    scene = glass_ball(sky=sky(), other={"type": "sphere", "bsdf": bsdf})
+    scene = glass_ball(sky=LIT, other={"type": "sphere", "bsdf": bsdf})
     assert "expected only smooth dielectrics and conductors" in refusal(render, scene, 1, deterministic=True)
 
 
@@ -291,7 +281,7 @@ NOT_BOUNDARIES = {
 def test_glass_in_a_wrapper_is_that_of_path(name, split_depth, llvm_variant):
     """Where a wrapper chooses between two glasses, or refuses a lobe. One false alarm in 10,000 for each."""
     oblique = PLACE().rotate([0, 1, 0], 70).scale(9)  # the camera sees the sheet from 20° above it
-    scene = glass_ball(sky=sky(), ball={"type": "rectangle", "to_world": oblique, "bsdf": NOT_BOUNDARIES[name]})
+    scene = glass_ball(sky=LIT, ball={"type": "rectangle", "to_world": oblique, "bsdf": NOT_BOUNDARIES[name]})
     theirs = [by_path(scene, 64, seed, rr_depth=100) for seed in range(8)]
     ours = [render(scene, 64, 100 + seed, rr_depth=100, split_depth=split_depth) for seed in range(8)]
     assert equal_means(theirs, ours)
@@ -320,7 +310,7 @@ def test_what_needs_a_tangent_has_it_in_a_scene_of_glass_only(variant, shape, bs
     front = {"type": "sphere", "center": [0, 0, 2], "radius": 0.8, "bsdf": GLASS | {"int_ior": 1.01}}
     far = {"far": {"type": "sphere", "center": [0, 0, 90], "bsdf": {"type": "diffuse"}}}
     part = {"type": shape, "to_world": PLACE().rotate([1, 2, 0], 30), "bsdf": bsdf}
-    parts = {"ball": part, "front": front, "second": second, "sky": sky()}
+    parts = {"ball": part, "front": front, "second": second, "sky": LIT}
     alone, beside = ([render(glass_ball(**parts, **x), 64, seed) for seed in range(6)] for x in ({}, far))
     assert equal_means(beside, alone)
 
