@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mi_refract.cluster.connection import LOCAL, ClusterTarget
+from mi_refract.cluster.connection import ClusterTarget
 from mi_refract.io import atomic
 from mi_refract.io.sanitise import printable
 from validation.run import command_line
@@ -31,7 +31,7 @@ ROOMS = {
         *("neighbours", "random_numbers", "gradients", "rendering_passes"),
     ),
     "efficiency": ("error_against_time", "scaling", "changing_indices"),
-    "media": ("catalogs", "ray_directions", "closed_forms", "renders", "hero_wavelength"),
+    "media": ("catalogs", "ray_directions", "closed_forms", "renders"),
     "planar": ("against_retrace", "closed_paths", "joints", "extruded_scenes", "times"),
     "diff": ("planted_defects", "visible_changes", "welch_nulls", "times"),
     "ground-truth": ("traced_bodies",),
@@ -103,52 +103,36 @@ def _command(
     """Measure the formulas and the plugin against certified answers, and write the report."""
     names, target = studies or [], ClusterTarget(scheduler, workers)
     if unknown := [name for name in names if name not in ROOMS]:
-        raise Misuse(f"unknown study {unknown[0]!r}; expected {', '.join(ROOMS)}")
+        raise ValueError(f"unknown study {unknown[0]!r}; expected {', '.join(ROOMS)}")
     if profile not in PROFILES:
-        raise Misuse(f"unknown profile {profile!r}; expected {', '.join(PROFILES)}")
+        raise ValueError(f"unknown profile {profile!r}; expected {', '.join(PROFILES)}")
     if write_tables and profile == "quick":
-        raise Misuse(
+        raise ValueError(
             "--write-tables needs more than the profile 'quick'; expected --profile standard or --profile full"
         )
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise Misuse(f"--out {out}: {error.strerror}; expected a writable folder") from None
+        raise ValueError(f"--out {out}: {error.strerror}; expected a writable folder") from None
     if not os.access(out, os.W_OK):
-        raise Misuse(f"--out {out}: not writable; expected a writable folder")
-    _join(renderers or [], names, target)
-    try:
-        target.check()
-    except (ValueError, OSError) as error:
-        raise Misuse(str(error)) from None
+        raise ValueError(f"--out {out}: not writable; expected a writable folder")
+    if renderers:
+        if names and "suite" not in names:
+            raise ValueError(f"--renderer {renderers[0]} is used by the study `suite` only; add `suite`")
+        if target.given:
+            raise ValueError(f"--renderer {renderers[0]} cannot be sent to workers; remove --workers or --scheduler")
+        from validation.suite import rendered_images
+        from validation.suite.renderers import system
+
+        for folder in renderers:
+            rendered_images.join(system.join(folder))
+    target.check()
     try:
         with atomic.held(out / LOCK, "a validation"):
             return _run(names, profile, out, write_tables, goals, target)
     except KeyboardInterrupt:
         print("validation: interrupted; run the same command again to resume", file=sys.stderr)
         raise
-
-
-class Misuse(ValueError):
-    """Wrong arguments; one line."""
-
-
-def _join(folders: list[Path], studies: list[str], target: ClusterTarget) -> None:
-    """Take renderers into the table of `suite`."""
-    if not folders:
-        return
-    if studies and "suite" not in studies:
-        raise Misuse(f"--renderer {folders[0]} is used by the study `suite` only; add `suite`")
-    if target.given:
-        raise Misuse(f"--renderer {folders[0]} cannot be sent to workers; remove --workers or --scheduler")
-    from validation.suite import rendered_images
-    from validation.suite.renderers import table
-
-    for folder in folders:
-        try:
-            rendered_images.join(table.join(folder))
-        except (ValueError, OSError) as error:
-            raise Misuse(str(error)) from None
 
 
 def modules(studies: list[str], profile: str) -> list[str]:
@@ -159,14 +143,12 @@ def modules(studies: list[str], profile: str) -> list[str]:
     return [f"{room.replace('-', '_')}.{module}" for room in rooms for module in ROOMS[room]]
 
 
-def _run(
-    names: list[str], profile: str, out: Path, write_tables: bool, goals: bool, target: ClusterTarget = LOCAL
-) -> int:
+def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: bool, target: ClusterTarget) -> int:
     from rich.console import Console
 
     from mi_refract import backend
     from mi_refract.report import run_report
-    from validation.run.context import Context, profiles
+    from validation.run.context import here
 
     from . import runner
     from .run import headline, tightness
@@ -177,14 +159,11 @@ def _run(
     if write_tables:  # imported and checked before the run
         from . import readme_tables
 
-        try:
-            readme_tables.check(names)
-        except ValueError as error:
-            raise Misuse(str(error)) from None
-    context = Context(profiles(variant)[profile], out, variant, backend.detect(), backend.usable_variants())
+        readme_tables.check(names)
+    context = here(profile, out, variant)
     chosen = modules(names, profile)
     studies: list[Study] = [import_module(f"validation.{name}").STUDY for name in chosen]
-    workers = runner.OnCluster(runner.TaskList(tuple(chosen), profile, variant), target) if target.given else None
+    workers = runner.OnCluster(tuple(chosen), profile, variant, target) if target.given else None
     rows, spent = runner.run(runner.tasks(studies, context), context, workers)
     for study in studies:
         rows = study.summarise(rows)

@@ -7,7 +7,7 @@ module is imported, not after the run.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,36 +28,17 @@ from validation.planar import against_retrace
 from validation.planar import times as planar_times
 from validation.reference.layered_scenes import MIRAGE
 from validation.renders import against_dielectric, colours
+from validation.run import metrics as m
 from validation.run.array_settings import PLAIN
 from validation.run.context import SCENES, Context
-from validation.run.metrics import (
-    CHANGED_SHARE,
-    DETECTABLE,
-    EQUAL_TIME,
-    EQUAL_TIME_DEFAULTS,
-    ERROR_OVER_BOUND,
-    MEANS_DIFFER,
-    MISCLASSIFIED,
-    SMALLEST_P,
-    TIME_OVER_BUILTIN,
-    TIME_OVER_COPY,
-    TIME_OVER_PLAIN,
-    WORST_CHORD,
-    WORST_IN_U,
-    WRONG_PATH,
-    high,
-    low,
-)
 from validation.stability import layered_paths
 from validation.suite import matrix
 
 ROOT = SCENES.parent
 GALLERY = SCENES / "gallery.png"
-GALLERY_COLUMNS = 8
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """Where a table is written, between its markers; `study` is what must be run for it, by its command-line name.
 
     `make` gives the Markdown. ValueError, one line, where the rows do not hold what the table needs.
@@ -80,7 +61,7 @@ def check(studies: list[str]) -> None:
 
 def chosen(studies: list[str]) -> dict[str, Table]:
     """The tables of these studies. Without any: all but that of other renderers, which needs them installed."""
-    return {m: t for m, t in TABLES.items() if (t.study in studies if studies else t.study != "suite")}
+    return {name: t for name, t in TABLES.items() if (t.study in studies if studies else t.study != "suite")}
 
 
 def write(rows: list[Row], context: Context, studies: list[str]) -> None:
@@ -104,16 +85,21 @@ def _table(text: str, heading: Iterable[str], lines: list[list[str]], missing: s
     """Markdown: a line of text, and a table. ValueError where it has no lines: `missing` says what was not measured."""
     if not lines:
         raise ValueError(f"README: no {missing}; its table needs them")
-    heading = list(heading)
-    markdown = [f"| {' | '.join(cells)} |" for cells in (heading, *lines)]
-    return "\n".join([text, "", markdown[0], "|---" * len(heading) + "|", *markdown[1:]])
+    heading = [*heading]
+    first, *others = (f"| {' | '.join(cells)} |" for cells in (heading, *lines))
+    return "\n".join([text, "", first, "|---" * len(heading) + "|", *others])
 
 
-def _with_interval(row: Row | None, metric: str) -> str:
-    if row is None or metric not in row.values:
-        return "–"
-    ends = [compact(row.values[end]) for end in (low(metric), high(metric)) if end in row.values]
-    return compact(row.values[metric]) + (f" ({'–'.join(ends)})" if ends else "")
+def _cells(row: Row | None, metrics: Iterable[str], intervals: bool = True) -> list[str]:
+    """The values of a row, with their 95 % intervals where it has them; – where it has no value."""
+
+    def cell(metric: str) -> str:
+        if row is None or metric not in row.values:
+            return "–"
+        ends = [compact(row.values[end]) for end in (m.low(metric), m.high(metric)) if end in row.values]
+        return compact(row.values[metric]) + (f" ({'–'.join(ends)})" if ends and intervals else "")
+
+    return [cell(metric) for metric in metrics]
 
 
 def _replay(rows: list[Row], template: str) -> str:
@@ -121,26 +107,22 @@ def _replay(rows: list[Row], template: str) -> str:
     return template.format_map({**rows[0].replay, "setting": rows[0].setting}) if rows else ""
 
 
-ACCURACY = {
-    "llvm float32": {
-        "worst chord": WORST_CHORD,
-        "in u": WORST_IN_U,
-        "TIR misclassified": MISCLASSIFIED,
-        "time / copy": TIME_OVER_COPY,
-        "time / plain": TIME_OVER_PLAIN,
-    },
-    "llvm float64": {"worst chord": WORST_CHORD, "in u": WORST_IN_U, "time / copy": TIME_OVER_COPY},
-}
-
-
 def accuracy(rows: list[Row]) -> str:
     """By formula the worst error over all regimes, misclassified rays and times, in float32 and float64."""
-    summaries = [row for row in _measured(rows, per_formula.NAME, [WORST_CHORD]) if row.case == per_formula.ALL]
-    by_name = {(row.subject, row.setting): row for row in summaries if row.setting in ACCURACY}
+    columns = {
+        "float32: worst chord": m.WORST_CHORD,
+        "in u": m.WORST_IN_U,
+        "TIR misclassified": m.MISCLASSIFIED,
+        "time / copy": m.TIME_OVER_COPY,
+        "time / plain": m.TIME_OVER_PLAIN,
+    }
+    wide = [m.WORST_CHORD, m.WORST_IN_U, m.TIME_OVER_COPY]
+    by_name = {
+        (row.subject, row.setting): row
+        for row in _measured(rows, per_formula.NAME, [m.WORST_CHORD])
+        if row.case == per_formula.ALL and row.setting in ("llvm float32", "llvm float64")
+    }
     rays = max((row.replay["rays"] for row in by_name.values()), default=0)
-    heading = ["formula", "source"]
-    for setting, metrics in ACCURACY.items():
-        heading += [(f"{setting.split()[1]}: " if i == 0 else "") + title for i, title in enumerate(metrics)]
     text = (
         f"Worst over {rays:,} rays in all regimes; u = 2⁻²⁴ or 2⁻⁵³; times are medians over copying the same bytes\n"
         f"and over `{PLAIN}`, with their 95 % intervals."
@@ -148,72 +130,63 @@ def accuracy(rows: list[Row]) -> str:
     lines = []
     for subject in dict.fromkeys(subject for subject, _ in by_name):
         cells = [f"`{subject}`", FORMULAS[subject].source if subject in FORMULAS else "Mitsuba 3"]
-        for setting, metrics in ACCURACY.items():
-            cells += [_with_interval(by_name.get((subject, setting)), metric) for metric in metrics.values()]
-        lines.append(cells)
+        cells += _cells(by_name.get((subject, "llvm float32")), columns.values())
+        lines.append(cells + _cells(by_name.get((subject, "llvm float64")), wide))
+    heading = ["formula", "source", *columns, "float64: worst chord", "in u", "time / copy"]
     return _table(text, heading, lines, "directions were measured on LLVM")
-
-
-RENDERS = {
-    CHANGED_SHARE: "pixels changed",
-    MEANS_DIFFER: "means differ by",
-    SMALLEST_P: "Welch, smallest p",
-    DETECTABLE: "minimum detectable difference",
-    against_dielectric.TIME: "time",
-}
 
 
 def renders(rows: list[Row]) -> str:
     """`refract` against `dielectric`, scene by scene."""
+    columns = {
+        m.CHANGED_SHARE: "pixels changed",
+        m.MEANS_DIFFER: "means differ by",
+        m.SMALLEST_P: "Welch, smallest p",
+        m.DETECTABLE: "minimum detectable difference",
+        m.TIME_OVER_DIELECTRIC: "time",
+    }
     mine = _measured(rows, against_dielectric.NAME, subject=PLUGIN)
     text = _replay(mine, "{resolution}² pixels, {spp} spp, {seeds} seeds, {variant}.")
-    cells = [
-        [row.case, *(compact(row.values[metric]) if metric in row.values else "–" for metric in RENDERS)]
-        for row in mine
-    ]
-    return _table(text, ["scene", *RENDERS.values()], cells, "scenes were rendered")
-
-
-PATHS = {
-    WRONG_PATH: "wrong path",
-    layered_paths.MEDIAN_DIRECTION: "direction, median",
-    layered_paths.DIRECTION: "direction, worst",
-    layered_paths.PLACE: "place, worst",
-}
+    cells = [[row.case, *_cells(row, columns, intervals=False)] for row in mine]
+    return _table(text, ["scene", *columns.values()], cells, "scenes were rendered")
 
 
 def paths(rows: list[Row]) -> str:
     """The paths through the mirage, of every plugin and of exact arithmetic with rounded indices."""
-    mine = _measured(rows, layered_paths.NAME, PATHS)
+    columns = {
+        m.WRONG_PATH: "wrong path",
+        layered_paths.MEDIAN_DIRECTION: "direction, median",
+        layered_paths.DIRECTION: "direction, worst",
+        layered_paths.PLACE: "place, worst",
+    }
+    mine = _measured(rows, layered_paths.NAME, columns)
     mine = [row for row in mine if row.replay["scene"] == f"{MIRAGE.scene}.xml"]
     names = [row.subject if row.subject.startswith("exact") else f"`{row.subject}`" for row in mine]
-    cells = [[name, *(compact(row.values[m]) for m in PATHS)] for name, row in zip(names, mine, strict=True)]
-    return _table(_replay(mine, "{rays} rays, {setting}."), ["", *PATHS.values()], cells, "paths were traced")
-
-
-EFFICIENCY = {
-    TIME_OVER_BUILTIN: "time",
-    EQUAL_TIME: "MSE at equal time",
-    EQUAL_TIME_DEFAULTS: "… over its defaults",
-}
+    cells = [[name, *_cells(row, columns)] for name, row in zip(names, mine, strict=True)]
+    return _table(_replay(mine, "{rays} rays, {setting}."), ["", *columns.values()], cells, "paths were traced")
 
 
 def efficiency(rows: list[Row]) -> str:
     """Every method on the scenes that were measured, over the built-in with the same sampler."""
-    mine = _measured(rows, error_against_time.NAME, EFFICIENCY)
+    columns = {
+        m.TIME_OVER_BUILTIN: "time",
+        m.EQUAL_TIME: "MSE at equal time",
+        m.EQUAL_TIME_DEFAULTS: "… over its defaults",
+    }
+    mine = _measured(rows, error_against_time.NAME, columns)
     cells = []
     for row in mine:
         name, default, _ = row.subject.partition(", independent")
-        sampler = "independent" if default else row.replay["sampler"]
-        cells.append([row.case, f"`{name}`", sampler, *(_with_interval(row, metric) for metric in EFFICIENCY)])
+        cells.append([row.case, f"`{name}`", "independent" if default else row.replay["sampler"]])
+        cells[-1] += _cells(row, columns)
     text = _replay(mine, "{resolution}² pixels, {spp} spp, {rounds} rounds, {setting}.")
-    return _table(text, ["scene", "method", "sampler", *EFFICIENCY.values()], cells, "efficiencies were measured")
+    return _table(text, ["scene", "method", "sampler", *columns.values()], cells, "efficiencies were measured")
 
 
 def changing(rows: list[Row]) -> str:
     """What it costs to change an index, over the built-in."""
     mine = _measured(rows, changing_indices.NAME)
-    cells = [[row.case, _with_interval(row, TIME_OVER_BUILTIN)] for row in mine]
+    cells = [[row.case, *_cells(row, [m.TIME_OVER_BUILTIN])] for row in mine]
     text = _replay(mine, "Median of {rounds} rounds, {setting}, two sides in turn.")
     return _table(text, ["", "time over the built-in's"], cells, "changes of indices were timed")
 
@@ -226,10 +199,9 @@ def planar(rows: list[Row]) -> str:
     for case in dict.fromkeys(case for case, _ in by_case):
         exact, narrow = (by_case.get((case, f"llvm {precision}")) for precision in ("float64", "float32"))
         if exact and narrow:
-            errors = [compact(row.values[study.DIFFERENCE]) for row in (exact, narrow)]
-            nearest = [compact(narrow.values[m]) for m in (study.NEAREST, study.ITS_BOUND, ERROR_OVER_BOUND)]
-            boundaries = f"{exact.values[study.BOUNDARIES]:.0f}"
-            retraced.append([f"`{case}`", str(exact.replay["rays"]), boundaries, *errors, *nearest])
+            cells = [f"`{case}`", str(exact.replay["rays"]), f"{exact.values[study.BOUNDARIES]:.0f}"]
+            cells += [compact(row.values[study.DIFFERENCE]) for row in (exact, narrow)]
+            retraced.append(cells + _cells(narrow, [study.NEAREST, study.ITS_BOUND, m.ERROR_OVER_BOUND]))
     text = (
         "Largest distance from an independent retrace, over the scene's extent, on LLVM; and in float32 the error "
         "that\ncomes nearest to its bound, at one point of one path, with the bound there."
@@ -237,58 +209,47 @@ def planar(rows: list[Row]) -> str:
     heading = ["scene", "rays", "boundaries", "float64: error", "float32: error", "nearest its bound", "bound", "ratio"]
     first = _table(text, heading, retraced, missing)
     times = {(row.subject, row.case, row.setting): row for row in _measured(rows, planar_times.NAME)}
-    columns = {
-        "float32": (planar_times.MESH, "llvm float32"),
-        "float64": (planar_times.MESH, "llvm float64"),
-        "float32, rays shuffled": (planar_times.SHUFFLED, "llvm float32"),
-        "float32, every segment tried": (planar_times.BRUTE, "llvm float32"),
-    }
-    cells = [
-        [case, *(_with_interval(times.get((s, case, x)), planar_times.PER_PATH) for s, x in columns.values())]
+    columns = {precision: (planar_times.BRUTE, f"llvm {precision}") for precision in ("float32", "float64")}
+    lines = [
+        [case, *(_cells(times.get((s, case, x)), [planar_times.PER_PATH])[0] for s, x in columns.values())]
         for subject, case, setting in times
         if (subject, setting) == columns["float32"]
     ]
     text = "µs per path of two boundaries, with 95 % intervals."
-    return "\n\n".join([first, _table(text, ["segments", *columns], cells, missing)])
+    return "\n\n".join([first, _table(text, ["segments", *columns], lines, missing)])
 
 
 def seen(rows: list[Row]) -> str:
     """In how many trials each method of comparison saw each planted defect, and its false alarms."""
-    mine, missing = _measured(rows, self_test.STUDY), "defects were planted"
+
+    def percent(shares: list[float], digits: int = 0) -> str:
+        """Of several scenes: one number where they are the same, else the smallest and the largest."""
+        return "–".join(dict.fromkeys(f"{100 * x:.{digits}f}" for x in (min(shares), max(shares)))) + " %"
+
+    def shares(method: str, trials: list[Row]) -> str:
+        if any(method not in row.values for row in trials):
+            return "not read" if all(self_test.UNREADABLE in row.values for row in trials) else "–"
+        return percent([row.values[method] for row in trials])
+
+    def false_alarms(null: list[Row]) -> str:
+        if any(row.reason == self_test.IDENTICAL for row in null):
+            return "identical"
+        alarms = sum(row.values["false alarms"] * row.values["null pairs"] for row in null)
+        return f"{alarms:.0f} of {sum(row.values['null pairs'] for row in null):.0f}"
+
     defects: dict[str, list[Row]] = {}
-    for row in _measured(mine, self_test.STUDY, ["missed"]):
+    for row in _measured(rows, self_test.STUDY, ["missed"]):
         defects.setdefault(row.subject, []).append(row)
-    cells = [[name, *(_shares(method, trials) for method in METHODS)] for name, trials in defects.items()]
-    alarms = [_measured(mine, self_test.STUDY, subject=f"null pairs, {name}") for name in METHODS]
-    if not cells or not all(alarms):
-        return _table("", [], [], missing)
-    cells.append(["nothing: other seeds, or other last bits", *map(_false_alarms, alarms)])
+    nulls = [_measured(rows, self_test.STUDY, subject=f"null pairs, {name}") for name in METHODS]
+    if not defects or not all(nulls):
+        return _table("", [], [], "defects were planted")
+    cells = [[name, *(shares(method, trials) for method in METHODS)] for name, trials in defects.items()]
+    cells.append(["nothing: other seeds, or other last bits", *map(false_alarms, nulls)])
     trials = next(iter(defects.values()))
-    detectable = _percent([row.values[self_test.DETECTABLE] for row in trials], digits=1)
-    replay, scenes = trials[0].replay, ", ".join(row.case for row in trials)
-    text = f"{scenes}; {replay['trials']} trials each of {replay['renders a side']} renders a side. "
-    text += f"Minimum detectable difference in a tile: {detectable}."
-    return _table(text, ["planted", *(f"`{name}`" for name in METHODS)], cells, missing)
-
-
-def _shares(method: str, trials: list[Row]) -> str:
-    if any(method not in row.values for row in trials):
-        return "not read" if all(self_test.UNREADABLE in row.values for row in trials) else "–"
-    return _percent([row.values[method] for row in trials])
-
-
-def _false_alarms(rows: list[Row]) -> str:
-    if any(row.reason == self_test.IDENTICAL for row in rows):
-        return "identical"
-    pairs = [row.values["null pairs"] for row in rows]
-    alarms = sum(row.values["false alarms"] * count for row, count in zip(rows, pairs, strict=True))
-    return f"{alarms:.0f} of {sum(pairs):.0f}"
-
-
-def _percent(shares: list[float], digits: int = 0) -> str:
-    """Of several scenes: one number where they are the same, else the smallest and the largest."""
-    ends = list(dict.fromkeys(f"{100 * x:.{digits}f}" for x in (min(shares), max(shares))))
-    return "–".join(ends) + " %"
+    detectable = percent([row.values[self_test.DETECTABLE] for row in trials], digits=1)
+    text = _replay(trials, "{trials} trials each of {renders a side} renders a side. ")
+    text = f"{', '.join(row.case for row in trials)}; {text}Minimum detectable difference in a tile: {detectable}."
+    return _table(text, ["planted", *(f"`{name}`" for name in METHODS)], cells, "")
 
 
 def visible(rows: list[Row]) -> str:
@@ -297,13 +258,13 @@ def visible(rows: list[Row]) -> str:
     mine = _measured(rows, study.NAME)
     kinds = [r for r in mine if r.case != study.LIMIT and r.subject in (*study.KINDS, study.EDGE)]  # not other seeds
     metrics = (study.LOCAL, study.THROUGHOUT, study.ERROR)
-    cells = []
-    for row in kinds:
-        errors = (compact(row.values[metric]) for metric in metrics)
-        cells.append([row.subject, row.reason, row.case, *errors, f"{row.values[study.ALARMS]:.1%}"])
+    cells = [
+        [row.subject, row.reason, row.case, *_cells(row, metrics), f"{row.values[study.ALARMS]:.1%}"] for row in kinds
+    ]
+    options = METHODS["flip"].options
     bounds = [
-        f"{m} (bound {compact(METHODS['flip'].options[o].default)})"
-        for m, o in zip(metrics, ("local", "patch"), strict=False)
+        f"{metric} (bound {compact(options[name].default)})"
+        for metric, name in zip(metrics[:2], ("local", "patch"), strict=True)
     ]
     heading = ["change", "", "by a person", *bounds, study.ERROR, study.ALARMS]
     first = _table(_replay(kinds, "{trials} pairs of {size}² pixels each, {setting}."), heading, cells, missing)
@@ -316,11 +277,6 @@ def visible(rows: list[Row]) -> str:
     return "\n\n".join([first, _table(text, sides, [["codes of 255", *codes]] if edge else [], missing)])
 
 
-def suite(rows: list[Row]) -> str:
-    """How far every system is off at most, check by check."""
-    return _table(*matrix.table(rows), "other renderers were run")
-
-
 TABLES = {
     "accuracy": Table("README.md", "directions", accuracy),
     "renders": Table("validation/README.md", "renders", renders),
@@ -330,7 +286,9 @@ TABLES = {
     "planar": Table("mi_refract/planar/README.md", "planar", planar),
     "defects": Table("mi_refract/image_diff/README.md", "diff", seen),
     "visible": Table("mi_refract/image_diff/README.md", "diff", visible),
-    "suite": Table("validation/README.md", "suite", suite),
+    "suite": Table(
+        "validation/README.md", "suite", lambda rows: _table(*matrix.table(rows), "other renderers were run")
+    ),
 }
 
 
@@ -342,10 +300,10 @@ def gallery(rows: list[Row], context: Context) -> bytes:
     drawn = [row for row in rows if row.subject == PLUGIN and row.images]
     paths = [r.images["test"] for study in (against_dielectric, colours) for r in drawn if r.study == study.NAME]
     tiles = [tile for path in paths if (tile := image_file.read_exr(context.out / path)[0]).std() > 1e-3]
-    side, gap = tiles[0].shape[0], 4
-    lines = -(-len(tiles) // GALLERY_COLUMNS)
-    sheet = np.ones((lines * (side + gap) - gap, GALLERY_COLUMNS * (side + gap) - gap, 3), np.float32)
+    side, gap, columns = tiles[0].shape[0], 4, 8
+    lines = -(-len(tiles) // columns)
+    sheet = np.ones((lines * (side + gap) - gap, columns * (side + gap) - gap, 3), np.float32)
     for i, tile in enumerate(tiles):
-        y, x = (place * (side + gap) for place in divmod(i, GALLERY_COLUMNS))
+        y, x = (place * (side + gap) for place in divmod(i, columns))
         sheet[y : y + side, x : x + side] = srgb_encode(tile.clip(0, 1))
     return png(np.rint(255 * sheet).astype(np.uint8))

@@ -17,7 +17,6 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
@@ -31,7 +30,7 @@ from mi_refract.io.atomic import write_atomically
 from mi_refract.io.image_file import installed_version
 from mi_refract.io.sanitise import printable
 from mi_refract.report.row import Row
-from validation.run.context import SCENES, Context, profiles
+from validation.run.context import SCENES, Context, here
 from validation.suite.renderers import SYSTEMS, environments
 
 from . import repeated
@@ -65,23 +64,29 @@ def run(
     files = [store / f"{hashlib.sha256((about + task.name).encode()).hexdigest()[:24]}.json" for task in tasks]
     finished: dict[int, Finished] = {}
 
+    def say(task: Task) -> None:
+        _say(f"task {len(finished) + 1} of {len(tasks)}: {task.name}")
+
     def keep(number: int, result: Finished) -> None:
         rows, spent = result
         write_atomically(files[number], json.dumps({"spent": spent, "rows": [row.as_dict() for row in rows]}))
         finished[number] = result
 
-    with _progress(len(tasks)) as advance:
-        work = [(i, task.name) for i, task in enumerate(tasks) if not task.timed and not _recall(files[i])]
-        if workers and work:
-            for i, result in workers.run(work, context):
-                advance(tasks[i].name)
-                keep(i, result)
-        for i, task in enumerate(tasks):
-            if i not in finished:
-                advance(task.name)
-                keep(i, _recall(files[i]) or timed(task))
+    work = [(i, task.name) for i, task in enumerate(tasks) if not task.timed and not _recall(files[i])]
+    if workers and work:
+        for i, result in workers.run(work, context):
+            say(tasks[i])
+            keep(i, result)
+    for i, task in enumerate(tasks):
+        if i not in finished:
+            say(task)
+            keep(i, _recall(files[i]) or timed(task))
     order = [finished[i] for i in range(len(tasks))]
     return [row for rows, _ in order for row in rows], [spent for _, spent in order]
+
+
+def _say(text: str) -> None:
+    print(printable(f"validation: {text}"), file=sys.stderr, flush=True)
 
 
 def timed(task: Task) -> Finished:
@@ -152,28 +157,17 @@ def facts(variant: str) -> dict[str, str]:
 
 
 @dataclass(frozen=True)
-class TaskList:
-    """What a list of tasks is made from. `modules`: names below `validation`, each with a STUDY."""
+class OnCluster:
+    """Workers of a scheduler, or worker processes of one thread each on this machine.
+
+    `modules`, names below `validation` of the modules whose STUDY is run, the profile and the variant of Mitsuba say
+    what the list of tasks is made from.
+    """
 
     modules: tuple[str, ...]
     profile: str
     variant: str
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a worker sends back: a finished task, and its files by path below the output folder."""
-
-    finished: Finished
-    files: dict[str, bytes]
-
-
-@dataclass(frozen=True)
-class OnCluster:
-    """Workers of a scheduler, or worker processes of one thread each on this machine."""
-
-    tasks: TaskList
-    target: connection.ClusterTarget
+    target: connection.ClusterTarget = connection.LOCAL
 
     def run(self, work: Sequence[tuple[int, str]], context: Context) -> Iterator[tuple[int, Finished]]:
         """The result of every task (number, name), in the order in which they end. A task's own errors pass.
@@ -183,56 +177,25 @@ class OnCluster:
         from mi_refract.cluster.workers import Workers
 
         with connection.connected(self.target.scheduler, self.target.workers) as client:
-            expected = facts(self.tasks.variant)
-            workers = Workers(client, self.tasks.variant, expected, warn=_warn, facts=__name__)
+            workers = Workers(client, self.variant, facts(self.variant), warn=_say, facts=__name__)
             workers.wait()
-            results = calls.results(workers, run_on_worker, [(self.tasks, name) for _, name in work])
-            for number, outcome, machine in results:
-                for path, content in outcome.files.items():
+            results = calls.results(workers, OnCluster.on_worker, [(self, name) for _, name in work])
+            for number, ((rows, spent), files), machine in results:
+                for path, content in files.items():
                     (context.out / path).parent.mkdir(parents=True, exist_ok=True)
                     write_atomically(context.out / path, content)
-                rows, spent = outcome.finished
                 yield work[number][0], (rows, spent | {"machine": machine})
 
+    def on_worker(self, name: str) -> tuple[Finished, dict[str, bytes]]:
+        """The task of that name, run on a worker in a folder of its own, and its files by path. Its errors pass."""
+        scratch = on_worker.scratch_folder()
 
-def _warn(text: str) -> None:
-    print(printable(f"validation: {text}"), file=sys.stderr, flush=True)
+        def run_task() -> tuple[Finished, dict[str, bytes]]:
+            with tempfile.TemporaryDirectory(dir=scratch) as folder:
+                studies = [import_module(f"validation.{module}").STUDY for module in self.modules]
+                context = here(self.profile, Path(folder), self.variant)
+                finished = timed(next(task for task in tasks(studies, context) if task.name == name))
+                paths = [path for path in context.out.rglob("*") if path.is_file()]
+                return finished, {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
-
-def run_on_worker(asked: TaskList, name: str) -> Outcome:
-    """The task of that name, in a folder of its own. Its errors pass."""
-    scratch = on_worker.scratch_folder()
-
-    def run_task() -> Outcome:
-        from mi_refract import backend
-
-        profile = profiles(asked.variant)[asked.profile]
-        with tempfile.TemporaryDirectory(dir=scratch) as folder:
-            context = Context(profile, Path(folder), asked.variant, backend.detect(), backend.usable_variants())
-            studies = [import_module(f"validation.{module}").STUDY for module in asked.modules]
-            finished = timed(next(task for task in tasks(studies, context) if task.name == name))
-            paths = [path for path in Path(folder).rglob("*") if path.is_file()]
-            return Outcome(finished, {str(path.relative_to(folder)): path.read_bytes() for path in paths})
-
-    return on_worker.in_variant(asked.variant, run_task)
-
-
-@contextmanager
-def _progress(total: int) -> Iterator[Any]:
-    """A bar on a terminal, a line per task elsewhere; `advance(name)` says what begins."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda name: console.print(name, highlight=False)
-        return
-    columns = BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}")
-    with Progress(*columns, console=console, transient=True) as progress:
-        bar, started = progress.add_task("", total=total), [0]
-
-        def advance(name: str) -> None:
-            progress.update(bar, completed=started[0], description=name)
-            started[0] += 1
-
-        yield advance
+        return on_worker.in_variant(self.variant, run_task)

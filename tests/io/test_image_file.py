@@ -99,7 +99,7 @@ def test_formats(tmp_path, name, kind, error):
 
 
 def test_windows_alpha_and_wide_numbers_are_kept(tmp_path):
-    """But not for `idiff`, which compares float32 multiplied by alpha."""
+    """And no colour is multiplied by alpha."""
     assert read(save(tmp_path / "a.exr", PIXELS, x=-3, y=5)).origin == (-3, 5)
     pixels = np.dstack([PIXELS, np.zeros((48, 40))]).astype(np.float32)
     save(tmp_path / "a.png", pixels, "uint8", unassociated=True)
@@ -107,10 +107,8 @@ def test_windows_alpha_and_wide_numbers_are_kept(tmp_path):
     wide = np.array([[[1.0]], [[1 + 2.0**-40]]])
     path = save(tmp_path / "a.tif", wide, "double")
     np.testing.assert_array_equal(read(path).pixels, wide)
-    (image,) = image_file.read_parts(path, as_idiff=True)
-    assert image.pixels.dtype == np.float32 and (image.pixels == 1).all()
     save(path, np.float32([[[1, 1, 1, 0.5]]]), unassociated=True)
-    assert (image_file.read_parts(path, as_idiff=True)[0].pixels[0, 0, 0], read(path).pixels[0, 0, 0]) == (0.5, 1)
+    assert read(path).pixels[0, 0, 0] == 1
 
 
 def multipart(path):

@@ -17,8 +17,8 @@ from support.readme import python_blocks
 from support.renders import BALL, SCENES, pixels, rendering
 
 from mi_refract.cluster import on_worker
+from mi_refract.image_diff.comparison import Verdict
 from mi_refract.image_diff.methods import compare
-from mi_refract.image_diff.results import Verdict
 from mi_refract.io.image_file import read, read_exr
 from mi_refract.rendering import checkpoint, long_render, rendered_file
 from mi_refract.rendering.end_conditions import Limits

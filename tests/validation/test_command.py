@@ -15,30 +15,29 @@ import pytest
 from support.dask_workers import tls_settings
 
 from mi_refract import FORMULAS
-from mi_refract.cluster import on_worker
 from mi_refract.cluster.connection import ClusterTarget, connected
 from mi_refract.image_diff import self_test
 from mi_refract.image_diff.methods import METHODS
-from mi_refract.image_diff.self_test import DEFECTS
 from mi_refract.report.row import Row
 from mi_refract.report.run_report import read_json
 from validation import __main__ as command
 from validation import readme_tables, runner
 from validation.diff import planted_defects, visible_changes
 from validation.run import render_methods
-from validation.run.context import SCENES, beyond_builtin
+from validation.run.context import SCENES, beyond_builtin, here
 from validation.stability import layered_paths
 from validation.study import Study, Task
 from validation.suite.renderers import SYSTEMS
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
 MODULES = ("stability.optical_chains", "stability.layered_paths")
-ASKED = runner.TaskList(MODULES, "quick", "scalar_rgb")
+THERE = runner.OnCluster(MODULES, "quick", "scalar_rgb")
+FILES = {"rows.json", "junit.xml", "report.html"}
 
 
 @pytest.fixture
-def context(scalar_context):
-    return dataclasses.replace(scalar_context(), profile=runner.profiles("scalar_rgb")["quick"])
+def context(tmp_path, scalar_variant):
+    return here("quick", tmp_path, "scalar_rgb")
 
 
 def row(**changes):
@@ -63,30 +62,29 @@ class Recorded:
 
 @pytest.mark.parametrize("elsewhere", [False, True])
 def test_an_interrupted_run_goes_on_where_it_stopped(context, elsewhere):
-    calls = []
+    calls, fails = [], ["a" if elsewhere else "b"]
 
-    def work(name, fails=False):
+    def work(name):
         calls.append(name)
-        if fails:
+        if name in fails:
             raise KeyboardInterrupt
         return [row(subject=f"{name}{i}") for i in range(2)]
 
-    names = "ab"
-    good = [Task(name, functools.partial(work, name)) for name in names]
-    bad = [Task(name, functools.partial(work, name, name == "b" if not elsewhere else name == "a")) for name in names]
+    tasks = [Task(name, functools.partial(work, name)) for name in "ab"]
+    workers = Recorded(tasks, []) if elsewhere else None
     with pytest.raises(KeyboardInterrupt):
-        runner.run(bad, context, Recorded(bad, []) if elsewhere else None)
-    rows, spent = runner.run(good, context, Recorded(good, []) if elsewhere else None)
-    assert [each.subject for each in rows] == ["a0", "a1", "b0", "b1"]  # in the order of the tasks, kept or not
-    assert [(each["task"], each["CPU seconds"] >= 0) for each in spent] == [("a", True), ("b", True)]
+        runner.run(tasks, context, workers)
+    fails.clear()
+    rows, spent = runner.run(tasks, context, workers)
+    assert [row.subject for row in rows] == ["a0", "a1", "b0", "b1"]  # in the order of the tasks, kept or not
+    assert [(task["task"], task["CPU seconds"] >= 0) for task in spent] == [("a", True), ("b", True)]
     assert calls == (["b", "a", "a"] if elsewhere else ["a", "b", "b"])
-    other = dataclasses.replace(context, profile=dataclasses.replace(context.profile, rays=17))
-    runner.run(good, other)
+    runner.run(tasks, dataclasses.replace(context, profile=dataclasses.replace(context.profile, rays=17)))
     assert len(calls) == 5
-    runner.run(good, context)
+    runner.run(tasks, context)
     assert len(calls) == 5
     runner.forget(context)
-    runner.run(good, context)
+    runner.run(tasks, context)
     assert len(calls) == 7
 
 
@@ -99,38 +97,36 @@ def test_rows_are_used_again_for_the_same_sources_only(context, tmp_path, monkey
     monkeypatch.setattr(runner, "__file__", str(tmp_path / "validation/runner.py"))
     monkeypatch.setattr(runner, "SCENES", tmp_path / "scenes")
     calls = []
-    task = Task("a task", lambda: calls.append(1) or [row()])
-    for count, name in enumerate((*names, None), 1):
-        for _ in range(2):
-            runner.run([task], context)
-        assert len(calls) == count, names[count - 2]
+    for count, name in enumerate((None, *names), 1):
         if name:
             (tmp_path / name).write_text("new")
-
-
-# On workers ----------------------------------------------------------------------------------------------------------
-
-
-def test_the_rows_of_workers_are_those_of_a_run_here(context, tmp_path):
-    work = runner.tasks([importlib.import_module(f"validation.{name}").STUDY for name in MODULES], context)
-    alone, _ = runner.run(work, dataclasses.replace(context, out=tmp_path / "alone"))
-    with connected(workers=2) as client, dask.config.set(tls_settings(client.security)):
-        there = runner.OnCluster(ASKED, ClusterTarget(client.scheduler.address))
-        rows, spent = runner.run(work, context, there)
-    assert rows == alone and len(rows) > 10
-    assert [each["task"] for each in spent] == [task.name for task in work]
-    assert all(each["machine"] == os.uname().nodename for each in spent)
-    unreachable = runner.OnCluster(ASKED, ClusterTarget("tcp://127.0.0.1:9"))
-    kept, _ = runner.run(work, context, unreachable)
-    assert [json.dumps(each.as_dict()) for each in kept] == [json.dumps(each.as_dict()) for each in alone]
+        for _ in range(2):
+            runner.run([Task("a task", lambda: calls.append(1) or [row()])], context)
+        assert len(calls) == count, name
 
 
 def test_what_is_timed_runs_here_after_the_others_have_ended(context):
     order = []
     tasks = [Task(n, lambda n=n: order.append(n) or [row(subject=n)], timed=n == "b") for n in "abc"]
     rows, _ = runner.run(tasks, context, Recorded(tasks, order))
-    assert [each.subject for each in rows] == ["a", "b", "c"]
+    assert [row.subject for row in rows] == ["a", "b", "c"]
     assert order == ["there: c", "c", "there: a", "a", "b"]
+
+
+def test_the_rows_of_workers_are_those_of_a_run_here(context, tmp_path):
+    work = runner.tasks([importlib.import_module(f"validation.{name}").STUDY for name in MODULES], context)
+    alone, _ = runner.run(work, dataclasses.replace(context, out=tmp_path / "alone"))
+    with connected(workers=2) as client, dask.config.set(tls_settings(client.security)):
+        there = dataclasses.replace(THERE, target=ClusterTarget(client.scheduler.address))
+        rows, spent = runner.run(work, context, there)
+    assert rows == alone and len(rows) > 10
+    assert [task["task"] for task in spent] == [task.name for task in work]
+    assert all(task["machine"] == os.uname().nodename for task in spent)
+    unreachable = dataclasses.replace(THERE, target=ClusterTarget("tcp://127.0.0.1:9"))
+    kept, _ = runner.run(work, context, unreachable)
+    facts = runner.facts("scalar_rgb")  # what a worker must have the same
+    assert facts["validation"] == runner.sources()[:8] and set(runner.PACKAGES) < facts.keys()
+    assert [json.dumps(row.as_dict()) for row in kept] == [json.dumps(row.as_dict()) for row in alone]
 
 
 def test_a_worker_sends_files_and_errors_as_they_are(monkeypatch, scalar_variant):
@@ -146,40 +142,32 @@ def test_a_worker_sends_files_and_errors_as_they_are(monkeypatch, scalar_variant
     monkeypatch.setattr(runner, "import_module", lambda name: types.SimpleNamespace(STUDY=study))
     monkeypatch.setattr(runner.on_worker, "scratch_folder", lambda: None)
     monkeypatch.setattr(runner.on_worker, "in_variant", lambda variant, call: call())
-    one = dataclasses.replace(ASKED, modules=("one",))
-    outcome = runner.run_on_worker(one, "writes")
-    assert outcome.files == {"images/a.exr": b"pixels"} and outcome.finished[0][0].images == {"test": "images/a.exr"}
+    there = dataclasses.replace(THERE, modules=("one",))
+    (rows, _), files = there.on_worker("writes")
+    assert files == {"images/a.exr": b"pixels"} and rows[0].images == {"test": "images/a.exr"}
     with pytest.raises(ValueError, match="a scene is wrong; expected others"):
-        runner.run_on_worker(one, "fails")
-
-
-def test_workers_with_other_sources_are_refused_by_name():
-    here = {on_worker.HOST: "here", "validation": "0123abcd", "other renderers": "none"}
-    assert on_worker.differences(here | {"validation": "fedcba98"}, here) == ["validation fedcba98, here 0123abcd"]
-    found = runner.facts("scalar_rgb")
-    assert found["validation"] == runner.sources()[:8] and set(runner.PACKAGES) < found.keys()
-
-
-def test_two_tasks_of_one_name_are_refused(context):
-    twice = Study("s", "", "", {}, lambda context: [Task("a", list), Task("a", list)])
-    with pytest.raises(ValueError, match="two tasks are called 'a'; expected different names"):
-        runner.tasks([twice], context)
+        there.on_worker("fails")
 
 
 # The command ---------------------------------------------------------------------------------------------------------
 
 
-def study(work):
-    made = Study("directions", "A study", "What it asks.", {}, lambda context: [Task("a task", work)])
-    return types.SimpleNamespace(STUDY=made)
+@pytest.fixture
+def validate(tmp_path, monkeypatch):
+    """`validate(work)`: the exit code of a validation whose only task does this work."""
+
+    def run(work):
+        study = Study("directions", "A study", "What it asks.", {}, lambda context: [Task("a task", work)])
+        monkeypatch.setattr(command, "import_module", lambda name: types.SimpleNamespace(STUDY=study))
+        return command.main(["ground-truth", "--out", str(tmp_path)])
+
+    return run
 
 
 @pytest.mark.parametrize(("budget", "code"), [(1.0, 0), (0.4, 1), (float("nan"), 1)])
-def test_the_exit_code_follows_the_budgets(tmp_path, monkeypatch, capsys, budget, code):
-    measured = row(budgets={"worst / u": budget})
-    monkeypatch.setattr(command, "import_module", lambda name: study(lambda: [measured]))
-    assert command.main(["ground-truth", "--out", str(tmp_path)]) == code
-    assert {path.name for path in tmp_path.iterdir()} == {"rows.json", "junit.xml", "report.html"}
+def test_the_exit_code_follows_the_budgets(validate, tmp_path, budget, code):
+    assert validate(lambda: [row(budgets={"worst / u": budget})]) == code
+    assert {path.name for path in tmp_path.iterdir()} == FILES
     rows, context = read_json(tmp_path / "rows.json")
     assert rows[0].verdict == ("pass" if code == 0 else "fail")
     assert context["versions"]["mitsuba"] == mi.__version__
@@ -193,12 +181,10 @@ def test_the_exit_code_follows_the_budgets(tmp_path, monkeypatch, capsys, budget
         (["--profile", "slow"], "unknown profile 'slow'; expected quick, standard, full"),
         (["--out", __file__], "File exists; expected a writable folder"),
         (["--speed", "9"], "No such option: --speed"),
-        (
-            ["--write-tables"],
-            "--write-tables needs more than the profile 'quick'; expected --profile standard or --profile full",
-        ),
+        (["--write-tables"], "--write-tables needs more than the profile 'quick'; expected --profile standard or"),
         (["--scheduler", "tcp://h:1", "--workers", "2"], "--scheduler and --workers; expected one of them"),
         (["--workers", "0"], "Invalid value for '--workers': Input should be greater than or equal to 1"),
+        (["planar", "--renderer", "x"], "--renderer x is used by the study `suite` only; add `suite`"),
         (["renderers", "--install", "blender"], "unknown system 'blender'; expected batoid, cycles"),
         (["renderers", "--list", "--install", "pyglm"], "expected one of them"),
         (["renderers", "pyglm"], "unexpected extra argument"),
@@ -211,28 +197,22 @@ def test_misuse_is_one_line_and_exit_code_2(arguments, words, capsys, tmp_path):
     assert words in printed and len(printed.splitlines()) == 1
 
 
-def test_an_interruption_is_exit_code_130_and_says_how_to_go_on(tmp_path, monkeypatch, capsys):
+def test_an_interruption_is_exit_code_130_and_says_how_to_go_on(validate, capsys):
     def interrupted():
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "import_module", lambda name: study(interrupted))
-    assert command.main(["ground-truth", "--out", str(tmp_path)]) == 130
+    assert validate(interrupted) == 130
     assert "run the same command again to resume" in capsys.readouterr().err
 
 
-def test_two_validations_do_not_share_a_folder(tmp_path, monkeypatch, capsys):
-    inside = []
-
-    def second():
-        inside.append(command.main(["ground-truth", "--out", str(tmp_path)]))
-        return [row()]
-
-    monkeypatch.setattr(command, "import_module", lambda name: study(second))
-    assert command.main(["ground-truth", "--out", str(tmp_path)]) == 0
-    assert inside == [2]
-    said = [line for line in capsys.readouterr().err.splitlines() if "is already running" in line]
-    assert len(said) == 1 and f"{tmp_path}: a validation is already running in process {os.getpid()} on " in said[0]
-    assert {path.name for path in tmp_path.iterdir()} == {"rows.json", "junit.xml", "report.html"}
+def test_two_validations_do_not_share_a_folder(validate, tmp_path, capsys):
+    codes = []
+    second = ["ground-truth", "--out", str(tmp_path)]
+    assert validate(lambda: codes.append(command.main(second)) or [row()]) == 0
+    assert codes == [2]
+    (said,) = [line for line in capsys.readouterr().err.splitlines() if "is already running" in line]
+    assert f"{tmp_path}: a validation is already running in process {os.getpid()} on " in said
+    assert {path.name for path in tmp_path.iterdir()} == FILES
 
 
 # The README ----------------------------------------------------------------------------------------------------------
@@ -251,48 +231,45 @@ def test_the_accuracy_table_holds_the_rows_and_nothing_else():
     assert [cell.strip() for cell in lines[-1].split("|")][1:-1] == expected
 
 
+def test_the_table_of_defects_is_made_of_the_rows_of_the_self_test():
+    rng = np.random.default_rng(1)
+    rows = self_test.examine(rng.gamma(16, 1 / 16, (4, 16, 16, 3)), "noise", trials=1, null_pairs=2)
+    lines = readme_tables.seen(rows).splitlines()
+    assert lines[0].startswith("noise; 1 trials each of 2 renders a side. Minimum detectable difference in a tile: ")
+    assert [line.split("|")[1].strip() for line in lines[4:-1]] == list(self_test.DEFECTS)
+    assert [cell.strip() for cell in lines[-1].split("|")[2:4]] == ["identical", "0 of 4"]
+
+
+# What each table must name.
+NAMED = {
+    "accuracy": FORMULAS,
+    "renders": [path.stem for path in SCENES.glob("*.xml") if not beyond_builtin(path)],
+    "paths": layered_paths.plugins(),
+    "efficiency": [method.name for method in render_methods.METHODS],
+    "changing": ["a new scene for each image", "an edit among 300 glasses", "a sweep of 12 indices"],
+    "planar": [path.stem for path in SCENES.glob("planar/*.toml")],
+    "defects": [*planted_defects.GLASSES, *self_test.DEFECTS, *METHODS],
+    "visible": [*visible_changes.KINDS, *map(str, visible_changes.SQUARES)],
+    "suite": [*(call.title for system in SYSTEMS.values() for call in system.calls), *IMAGE_RENDERERS],
+}
+
+
 @pytest.mark.parametrize("marker", readme_tables.TABLES)
-def test_a_readme_is_not_written_from_a_run_that_measured_too_little(marker):
-    unmeasured = [row(values={}, reason="not run")]
+def test_a_readme_holds_its_table_which_is_not_written_from_a_run_that_measured_too_little(marker):
+    table = readme_tables.TABLES[marker]
+    assert table.study in command.ROOMS
+    readme_tables.check([table.study])
+    text = (readme_tables.ROOT / table.path).read_text()
+    written = text.partition(f"<!-- begin: {marker} -->")[2].partition(f"<!-- end: {marker} -->")[0]
+    assert [word for word in NAMED[marker] if word not in written] == []
     with pytest.raises(ValueError, match=r"README: no .*"):
-        readme_tables.TABLES[marker].make(unmeasured)
-
-
-def test_the_readmes_hold_their_tables():
-    others = [call.title for system in SYSTEMS.values() for call in system.calls]
-    words_of = {
-        "accuracy": FORMULAS,
-        "renders": [path.stem for path in SCENES.glob("*.xml") if not beyond_builtin(path)],
-        "paths": layered_paths.plugins(),
-        "efficiency": [method.name for method in render_methods.METHODS],
-        "changing": ["a new scene for each image", "an edit among 300 glasses", "a sweep of 12 indices"],
-        "planar": [path.stem for path in SCENES.glob("planar/*.toml")],
-        "defects": [*planted_defects.GLASSES, *DEFECTS, *METHODS],
-        "visible": [*visible_changes.KINDS, *map(str, visible_changes.SQUARES)],
-        "suite": [*others, *IMAGE_RENDERERS],
-    }
-    assert words_of.keys() == readme_tables.TABLES.keys()
-    readme_tables.check(list(command.ROOMS))
-    for marker, words in words_of.items():
-        text = (readme_tables.ROOT / readme_tables.TABLES[marker].path).read_text()
-        table = text.partition(f"<!-- begin: {marker} -->")[2].partition(f"<!-- end: {marker} -->")[0]
-        assert [word for word in words if word not in table] == []
+        table.make([row(values={}, reason="not run")])
 
 
 def test_the_table_of_other_renderers_is_written_where_the_suite_is_named():
     assert readme_tables.chosen([]).keys() == readme_tables.TABLES.keys() - {"suite"}
     assert readme_tables.chosen(["suite"]).keys() == {"suite"}
     assert readme_tables.chosen(["planar", "diff"]).keys() == {"planar", "defects", "visible"}
-    assert {table.study for table in readme_tables.TABLES.values()} <= command.ROOMS.keys()
-
-
-def test_the_table_of_defects_is_made_of_the_rows_of_the_self_test():
-    rng = np.random.default_rng(1)
-    rows = self_test.examine(rng.gamma(16, 1 / 16, (4, 16, 16, 3)), "noise", trials=1, null_pairs=2)
-    lines = readme_tables.seen(rows).splitlines()
-    assert lines[0].startswith("noise; 1 trials each of 2 renders a side. Minimum detectable difference in a tile: ")
-    assert [line.split("|")[1].strip() for line in lines[4:-1]] == list(DEFECTS)
-    assert [cell.strip() for cell in lines[-1].split("|")[2:4]] == ["identical", "0 of 4"]
 
 
 def test_images_of_the_first_page_exist():

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mi_refract.backend import Backend
+from mi_refract import backend
+from mi_refract.report.row import Reason
 
 SCENES = Path(__file__).parents[2] / "scenes"
 QUICK_SCENES = ("diamond", "furnace", "mirage", "prism", "sphere")  # of the profile `quick`
@@ -68,7 +69,7 @@ class Context:
     profile: Profile
     out: Path
     variant: str
-    backends: dict[str, Backend]
+    backends: dict[str, backend.Backend]
     variants: dict[str, str | None]  # of the wheel: None, or why it cannot run here
 
     @property
@@ -86,6 +87,17 @@ class Context:
     def comparable(self) -> list[Path]:
         """Those of `scenes` that the built-in can render, too."""
         return [path for path in self.scenes if not beyond_builtin(path)]
+
+
+def here(profile: str, out: Path, variant: str) -> Context:
+    """A run on this machine. Why CUDA does not run is a `Reason`, which says what it needs."""
+
+    def reason(name: str, text: str) -> str:
+        return Reason(text, "an NVIDIA GPU with its driver") if name.startswith("cuda") else text
+
+    backends = {name: replace(found, reason=reason(name, found.reason)) for name, found in backend.detect().items()}
+    variants = {name: text and reason(name, text) for name, text in backend.usable_variants().items()}
+    return Context(profiles(variant)[profile], out, variant, backends, variants)
 
 
 def beyond_builtin(path: Path) -> bool:

@@ -14,9 +14,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mi_refract.report.first_page import NOT_RUN, Answer, FirstPage, ShownRow, State
+import numpy as np
+
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
+from mi_refract.report.study_page import NOT_RUN, Answer, FirstPage, ShownRow, State
 
 from . import metrics
 
@@ -26,8 +28,6 @@ GROUND_TRUTH, RENDERS, EFFICIENCY, PATHS = "ground_truth", "renders", "efficienc
 PLUGIN, BUILTIN, INTEGRATOR, METHODS = "refract", "dielectric", "refract_path", "every method"
 MIRAGE, ROUNDED = "mirage", "exact, indices in float32"
 LAYERS, SHALLOW = 1000, "89.55°"
-INDICES, CONTRASTS = (f"mirage askew, {LAYERS} layers, {given}" for given in ("indices", "contrasts"))
-GPU = "an NVIDIA GPU with its driver"
 INSTALL = "other renderers, by `python -m validation renderers --install "
 NOT_MEASURED = "Not measured in this run."
 LEAD = "`refract` is this project's drop-in replacement for Mitsuba's material of smooth glass, `dielectric`."
@@ -38,13 +38,6 @@ PLOTTED = {
     "refract_path": "refract + refract_path",
     "refract_path, split 3": "the same with split_depth 3",
 }
-QUESTIONS = {
-    "right": "Is `refract` right?",
-    "trusted": "How far can each formula be trusted?",
-    "fast": "Is it as fast as `dielectric`?",
-    "differ": "Where do the two differ, and which is right there?",
-    "missing": "What was not run, and what does it need?",
-}
 
 
 def first_page(rows: Sequence[Row], profile: str = "") -> FirstPage:
@@ -52,7 +45,7 @@ def first_page(rows: Sequence[Row], profile: str = "") -> FirstPage:
     directions, renders, paths = (select(rows, study) for study in (DIRECTIONS, RENDERS, PATHS))
     ours = select(renders, subject=PLUGIN)
     judged = [row for row in (*directions, *select(rows, GROUND_TRUTH)) if row.subject in (*OURS, PLUGIN)]
-    facts = _directions(directions) | _renders(renders, ours, select(rows, EFFICIENCY)) | _paths(rows, paths)
+    facts = _directions(directions) | _renders(ours, select(rows, EFFICIENCY)) | _paths(rows, paths)
     facts |= {
         "bodies": select(rows, GROUND_TRUTH, PLUGIN, metric=metrics.ERROR_OVER_BOUND),
         "failed": any(row.verdict == "fail" for row in judged),
@@ -60,18 +53,28 @@ def first_page(rows: Sequence[Row], profile: str = "") -> FirstPage:
         "count": len(rows),
         "quick": profile == "quick",
     }
-    evidence = {  # the rows whose verdicts determine the state of the answer, and the study to link to
-        "right": (judged, DIRECTIONS),
-        "trusted": ([row for row in directions if row.subject != BUILTIN_FORMULA], DIRECTIONS),
-        "fast": ([], EFFICIENCY if facts["equal_time"] else RENDERS),
-        "differ": (ours + select(paths, subject=PLUGIN), PATHS if facts["paths"] else RENDERS),
-        "missing": ([], NOT_RUN if facts["remedies"] else ""),
+    questions: dict[str, tuple[str, Sequence[Row], str]] = {  # the rows that decide the state, and the study to link to
+        "right": ("Is `refract` right?", judged, DIRECTIONS),
+        "trusted": (
+            "How far can each formula be trusted?",
+            [row for row in directions if row.subject != BUILTIN_FORMULA],
+            DIRECTIONS,
+        ),
+        "fast": ("Is it as fast as `dielectric`?", [], EFFICIENCY if facts["equal_time"] else RENDERS),
+        "differ": (
+            "Where do the two differ, and which is right there?",
+            ours + select(paths, subject=PLUGIN),
+            PATHS if facts["paths"] else RENDERS,
+        ),
+        "missing": ("What was not run, and what does it need?", [], NOT_RUN if facts["remedies"] else ""),
     }
-    texts = _texts(facts)
-    page: FirstPage = {
-        "lead": LEAD,
-        "answers": [_answer(question, texts[key], *evidence[key]) for key, question in QUESTIONS.items()],
-    }
+    texts, answers = _texts(facts), list[Answer]()
+    for key, (question, evidence, study) in questions.items():
+        verdicts = {row.verdict for row in evidence}
+        state: State = "no" if "fail" in verdicts else "yes" if "pass" in verdicts else "plain"
+        text, state = (texts[key], state) if texts[key] else (NOT_MEASURED, "not measured")
+        answers.append({"question": question, "text": text, "state": state, "study": study})
+    page: FirstPage = {"lead": LEAD, "answers": answers}
     if image := _image(ours):
         page["image"] = image
     if plot := _plot(rows):
@@ -88,17 +91,6 @@ def select(
     return [row for row in chosen if all(getattr(row, name) == x for name, x in asked.items())]
 
 
-def _answer(question: str, text: str, evidence: Sequence[Row], study: str) -> Answer:
-    verdicts = {row.verdict for row in evidence}
-    state: State = "no" if "fail" in verdicts else "yes" if "pass" in verdicts else "plain"
-    return {
-        "question": question,
-        "text": text or NOT_MEASURED,
-        "state": state if text else "not measured",
-        "study": study,
-    }
-
-
 def _texts(facts: dict[str, Any]) -> dict[str, str]:
     """The answer to each question; "" where nothing was measured."""
     from jinja2 import Environment, StrictUndefined
@@ -107,14 +99,15 @@ def _texts(facts: dict[str, Any]) -> dict[str, str]:
     filters: dict[str, Any] = {"degrees": degrees, "percent": percent, "span": span}
     environment.filters |= filters | {"extract": lambda name, mapping: mapping[name]}
     template = environment.from_string(Path(__file__).with_suffix(".j2").read_text("utf-8"))
-    context = template.new_context(facts | {"m": metrics, "most": most, "rays": rays, "plugin": PLUGIN})
+    names = {"plugin": PLUGIN, "builtin": BUILTIN, "integrator": INTEGRATOR, "rounded": ROUNDED, "layers": LAYERS}
+    context = template.new_context(facts | names | {"shallow": SHALLOW, "m": metrics, "most": most, "rays": rays})
     texts = {name: "".join(block(context)) for name, block in template.blocks.items()}
     return {name: re.sub(r"[ \n]+", " ", text).strip() for name, text in texts.items()}  # not the no-break space
 
 
 def most(rows: Sequence[Row], metric: str) -> float:
-    """The largest value of a metric that all rows have."""
-    return max(row.values[metric] for row in rows)
+    """The largest value of a metric that all rows have; NaN where one of them is."""
+    return float(np.max([row.values[metric] for row in rows]))
 
 
 def rays(rows: Sequence[Row]) -> int:
@@ -148,7 +141,7 @@ def _directions(rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def _renders(rows: Sequence[Row], ours: Sequence[Row], methods: Sequence[Row]) -> dict[str, Any]:
+def _renders(ours: Sequence[Row], methods: Sequence[Row]) -> dict[str, Any]:
     """Times and differences of `refract` and `dielectric`; errors at equal time of `refract_path`."""
     times = [row.values[metrics.TIME_OVER_DIELECTRIC] for row in select(ours, metric=metrics.TIME_OVER_DIELECTRIC)]
     best: dict[str, float] = {}
@@ -160,7 +153,6 @@ def _renders(rows: Sequence[Row], ours: Sequence[Row], methods: Sequence[Row]) -
         "times": times,
         "median": statistics.median(times) if times else 0.0,
         "equal_time": list(best.items())[:3],
-        "integrator": INTEGRATOR,
         "same": [row for row in compared if not row.values.get(metrics.WELCH_ALARMS)],
         "differing": [row for row in compared if row.values.get(metrics.WELCH_ALARMS)],
     }
@@ -169,23 +161,21 @@ def _renders(rows: Sequence[Row], ours: Sequence[Row], methods: Sequence[Row]) -
 def _paths(rows: Sequence[Row], traced: Sequence[Row]) -> dict[str, Any]:
     """Light paths lost in the mirage, or errors after a thousand layers of air."""
     mirage = {row.subject: row for row in select(traced, case=f"{MIRAGE}: path", metric=metrics.WRONG_PATH)}
-    shallow = {case: select(rows, case=case, metric=SHALLOW) for case in (CONTRASTS, INDICES)}
+    contrasts, indices = (
+        select(rows, case=f"mirage askew, {LAYERS} layers, {kind}", metric=SHALLOW) for kind in ("contrasts", "indices")
+    )
     return {
         "paths": [mirage[PLUGIN]] if {PLUGIN, BUILTIN} <= mirage.keys() else [],
         "lost": {ROUNDED: 0.0} | {name: row.values[metrics.WRONG_PATH] for name, row in mirage.items()},
-        "builtin": BUILTIN,
-        "rounded": ROUNDED,
-        "layers": LAYERS,
-        "shallow": SHALLOW,
-        "shallow_ours": [row.values[SHALLOW] for row in shallow[CONTRASTS] if row.subject in OURS],
-        "shallow_theirs": [row.values[SHALLOW] for row in shallow[INDICES] if row.subject == BUILTIN_FORMULA],
+        "shallow_ours": [row.values[SHALLOW] for row in contrasts if row.subject in OURS],
+        "shallow_theirs": [row.values[SHALLOW] for row in indices if row.subject == BUILTIN_FORMULA],
     }
 
 
 def remedies(rows: Sequence[Row]) -> dict[str, int]:
     """How many rows were not run, by what would make them run, most first; "" for other reasons, last."""
     missing = [row for row in rows if row.verdict == "not run"]
-    counts = Counter(row.remedy or (GPU if row.setting.startswith("cuda") else "") for row in missing)
+    counts = Counter(row.remedy for row in missing)
     installs = [name for name in counts if name.startswith(INSTALL)]
     if installs:
         names = sorted({name.removeprefix(INSTALL).rstrip("`") for name in installs})

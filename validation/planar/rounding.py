@@ -1,4 +1,4 @@
-"""How far rounding errors move a path: the error added at each boundary, carried on to first order.
+"""How far rounding errors move a path, and the rays for which rounding decides what they meet.
 
 Let a ray be displaced by h across itself (to its left) and turned by φ. Behind a boundary, and L farther on, it is
 displaced and turned by
@@ -19,8 +19,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mi_refract.planar import Segments
-from validation.reference.planar_retrace import Array, Retraced
+from mi_refract.planar import Paths, Segments
+from validation.reference.planar_retrace import Array, Curves, Retraced
 
 ROUNDINGS = 2  # of the operands, and of the result
 
@@ -30,11 +30,16 @@ def growth(path: Retraced, segments: Segments, offset: float = 0.0) -> tuple[Arr
 
     `offset`: how far rays are moved along the normal behind a boundary, over u (1 + max |p|).
     """
-    g, h_factor, phi_factor, cos = (x.astype(float) for x in _transfer(path))
+    g, h_factor, phi_factor = (x.astype(float) for x in transfer(path))
     unit, size = float(ROUNDINGS), _sizes(path, segments)
-    added_h, added_phi = _added(path, segments, g, size)
+    before, behind = path.legs[:, :-1], path.legs[:, 1:]
+    cos, cos_behind = (np.abs((d * path.normals).sum(2)) for d in (before, behind))
+    length = np.hypot(*(np.asarray(segments.end) - segments.start).T)[path.hits]
+    added_h = (size[:, 1:] * (1 + (cos_behind + np.abs(_cross(before, behind))) / cos)).astype(float)
+    added_phi = (1 + np.abs(g) + 1 / cos_behind + np.abs(1 - g) * size[:, 1:] / length).astype(float)
+    cos = cos.astype(float)
     shift = (1 + np.abs(path.points[:, 1:]).max(2)) * np.abs(_cross(path.normals, path.legs[:, 1:]))
-    shift = offset * shift.astype(float)
+    added_h = unit * added_h + offset * shift.astype(float)
     leg = np.hypot(*np.diff(path.points, axis=1).transpose(2, 0, 1)).astype(float)
     points, directions = np.full((2, *path.points.shape[:2]), np.nan)
     points[:, 0], directions[:, 0] = unit * size[:, 0], unit
@@ -48,28 +53,18 @@ def growth(path: Retraced, segments: Segments, offset: float = 0.0) -> tuple[Arr
         reach = (np.abs(h).sum(1) + unit * size[:, j + 1] * (1 + cos[:, j])) / cos[:, j]
         points[:, j + 1] = np.where(met, reach, np.nan)
         phi = g[:, j, None] * phi + phi_factor[:, j, None] * h
-        h = np.column_stack([h_factor[:, j, None] * h, unit * added_h[:, j] + shift[:, j], none])
+        h = np.column_stack([h_factor[:, j, None] * h, added_h[:, j], none])
         phi = np.column_stack([phi, none, unit * added_phi[:, j]])
         directions[:, j + 1] = np.where(met, np.abs(phi).sum(1), np.nan)
     return points, directions
 
 
-def _transfer(path: Retraced) -> tuple[Array, Array, Array, Array]:
-    """g, what h and φ take from h, and |d_n| (N × D each)."""
+def transfer(path: Retraced) -> tuple[Array, Array, Array]:
+    """g, and what h and φ take from h (N × D each)."""
     before, behind = ((legs * path.normals).sum(2) for legs in (path.legs[:, :-1], path.legs[:, 1:]))
     # A ray that ends where it is contradicted goes on as it came.
     g = np.nan_to_num(path.indices[:, :-1] * before / (path.indices[:, 1:] * behind), nan=1)
-    return g, behind / before, (g - 1) * path.curvatures / before, np.abs(before)
-
-
-def _added(path: Retraced, segments: Segments, g: Array, size: Array) -> tuple[Array, Array]:
-    """What each boundary adds to h and to φ, in units."""
-    before, behind = path.legs[:, :-1], path.legs[:, 1:]
-    cos, cos_behind = (np.abs((d * path.normals).sum(2)) for d in (before, behind))
-    length = np.hypot(*(np.asarray(segments.end) - segments.start).T)[path.hits]
-    to_h = size[:, 1:] * (1 + (cos_behind + np.abs(_cross(before, behind))) / cos)
-    to_phi = 1 + np.abs(g) + 1 / cos_behind + np.abs(1 - g) * size[:, 1:] / length
-    return to_h.astype(float), to_phi.astype(float)
+    return g, behind / before, (g - 1) * path.curvatures / before
 
 
 def _sizes(path: Retraced, segments: Segments) -> Array:
@@ -79,6 +74,37 @@ def _sizes(path: Retraced, segments: Segments) -> Array:
     own = np.abs(path.points).max(2)
     own[:, 1:] = np.maximum(own[:, 1:], np.where(path.hits >= 0, largest[path.hits], np.nan))
     return np.maximum.accumulate(own, axis=1).astype(float)
+
+
+def undecided(exact: Retraced, paths: Paths, segments: Segments, points: Array, directions: Array) -> Array:
+    """Which rays (N) may take a wrong path, by the bounds of the errors of their points and directions.
+
+    At a vertex, where they touch a curve, and at the critical angle. A ray meets a curve between h and −h from its top
+    where its cosine is less than √(2 |κ| h); by φ off, it is refracted or not where |1 − k² sin²θ| is less than 2 k φ.
+    """
+    h, kappa = points[:, 1:], np.abs(exact.curvatures)
+    cos = (exact.legs[:, :-1] * exact.normals).sum(2)
+    behind = np.where(cos > 0, *(np.asarray(n)[exact.hits] for n in (segments.n_left, segments.n_right)))
+    k, sine = exact.indices[:, :-1] / behind, np.abs(_cross(exact.normals, exact.legs[:, :-1]))
+    ends = [np.asarray(x)[exact.hits] for x in (segments.start, segments.end)]
+    clearance = np.min([np.hypot(*(exact.points[:, 1:] - end).transpose(2, 0, 1)) for end in ends], axis=0)
+    with np.errstate(invalid="ignore"):
+        at = np.where(exact.hits >= 0, clearance, np.nan) <= h
+        at |= cos**2 <= 2 * kappa * h
+        at |= np.abs(1 - (k * sine) ** 2) <= 2 * k * (directions[:, :-1] + kappa * h)
+    # Where a path first meets another boundary than it should, and only just.
+    other = paths.hits != exact.hits
+    rays = np.flatnonzero(other.any(1))
+    first = other[rays].argmax(1)
+    met = paths.hits[rays, first] >= 0
+    rays, first = rays[met], first[met]
+    place, d = paths.points[rays, first + 1], exact.legs[rays, first]
+    way = place - exact.points[rays, first]
+    normal, curvature = Curves(segments).normal(place.astype(np.longdouble), paths.hits[rays, first])
+    near = points[rays, first] + np.hypot(*way.T) * directions[rays, first]
+    touching = np.zeros(len(paths.hits), bool)
+    touching[rays] = ((d * normal).sum(1) ** 2 <= 2 * np.abs(curvature) * near) & (np.abs(_cross(d, way)) <= near)
+    return at.any(1) | touching
 
 
 def _cross(a: Array, b: Array) -> Array:
