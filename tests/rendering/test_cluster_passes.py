@@ -63,7 +63,7 @@ def rendered(scene, spp, passes=None, watch=lambda render: None):
     """The sums of a render here or by `passes`, and the header of its image."""
     output = scene.with_name("here.exr" if passes is None else "there.exr")
     render = resume(Job(scene), output, Limits(spp=spp, pass_spp=1), restart=True)
-    header = render.run(watch, passes)
+    header = render.run(watch, passes and passes.nodes)
     return render.progress.sums(), header
 
 
@@ -157,7 +157,7 @@ def test_a_worker_that_joins_late_is_used(client, scene, variant, monkeypatch):
             raise Used
 
     with joined(client), pytest.raises(Used):
-        run.run(watch, passes)
+        run.run(watch, passes.nodes)
     assert run.checkpoints.path.exists()
     until(lambda: set(client.nthreads()) == before)
 
