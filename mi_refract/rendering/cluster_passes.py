@@ -192,7 +192,7 @@ class ClusterPasses:
             self.workers.look()
             there = frozenset(self.workers.accepted)
             with cluster_errors(client):
-                # Each worker unpacks the bundle once, before all passes: Dask gives tasks to workers that have it already.
+                # Each worker unpacks the bundle once, first: Dask gives tasks to workers that have it already.
                 self._handed = {address: done for address, done in self._handed.items() if address in there}
                 for address in there - self._handed.keys():
                     options: dict[str, Any] = {"workers": [address], "pure": False, "priority": 1000}

@@ -51,7 +51,7 @@ class Job:
 
 
 # Where passes are rendered. Of first, stop, last, offset, spp: level, sums and machines ("a, b") of nodes that make up
-# the passes from `first` to `stop`, in their order. Passes up to `last` may be begun, as they will probably be asked for
+# the passes from `first` to `stop`, in their order. Passes up to `last` may be begun, which are probably asked for
 # next. `offset`: added to their numbers for their seeds. `spp`: samples per pixel of each.
 Passes: TypeAlias = Callable[[int, int, int, int, int], Iterator[tuple[int, PassSums, str]]]
 
