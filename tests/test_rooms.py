@@ -65,9 +65,7 @@ FILLED = {
     "PathState",
     "Progress",
     "Ray",
-    "SceneText",
     "Scatter",
-    "SearchState",
     "Start",
     "Tally",
 }

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mi_refract.cluster.connection import ClusterTarget
-from mi_refract.io import lock
+from mi_refract.io import atomic
 from mi_refract.io.sanitise import printable
 from validation.run import command_line
 
@@ -31,7 +31,7 @@ ROOMS = {
         *("neighbours", "random_numbers", "gradients", "rendering_passes"),
     ),
     "efficiency": ("error_against_time", "scaling", "changing_indices"),
-    "media": ("catalogs", "ray_directions", "closed_forms", "renders", "hero_wavelength"),
+    "media": ("catalogs", "ray_directions", "closed_forms", "renders"),
     "planar": ("against_retrace", "closed_paths", "joints", "extruded_scenes", "times"),
     "diff": ("planted_defects", "visible_changes", "welch_nulls", "times"),
     "ground-truth": ("traced_bodies",),
@@ -122,13 +122,13 @@ def _command(
         if target.given:
             raise ValueError(f"--renderer {renderers[0]} cannot be sent to workers; remove --workers or --scheduler")
         from validation.suite import rendered_images
-        from validation.suite.renderers import table
+        from validation.suite.renderers import system
 
         for folder in renderers:
-            rendered_images.join(table.join(folder))
+            rendered_images.join(system.join(folder))
     target.check()
     try:
-        with lock.held(out / LOCK, "a validation"):
+        with atomic.held(out / LOCK, "a validation"):
             return _run(names, profile, out, write_tables, goals, target)
     except KeyboardInterrupt:
         print("validation: interrupted; run the same command again to resume", file=sys.stderr)

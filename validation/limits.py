@@ -83,7 +83,7 @@ WHITE_FURNACE = limit(2.0**-23, "an ulp of 1: the weights of both lobes add up t
 IN_AND_OUT = limit(6.0, "u: k² and 1/k², each with k rounded and squared, 3u")
 INDEX_SQUARED = limit(3.0, "u: k rounded and squared")
 
-# Over condition · u of a form at the rounding limit; derived in `validation/stability/derivative_conditions.py`.
+# Over condition · u of a form at the rounding limit; derived in `stability.derivatives.condition_of`.
 DERIVATIVE = limit(
     29.0, "error over condition · u: every product of the differentiated form rounded, each at its worst"
 )
@@ -147,16 +147,10 @@ CHANGING = {
 
 # Planar --------------------------------------------------------------------------------------------------------
 
-GROWN = limit(1.0, "error over the bound on rounding errors, see `validation/planar/error_growth.py`")
+GROWN = limit(1.0, "error over the bound on rounding errors, see `validation/planar/rounding.py`")
 PLANAR_EQUAL = limit(1e-9, "float64: of the extent, and in radians")
 # Of the ellipse lens: a place, a normal and a direction at either boundary, each rounded once in x and in y.
 SPOT = limit(6 * math.sqrt(2), "u, of the focus of the ellipse lens: six roundings, each in x and in y")
-PLANAR_TIMES = {
-    ("llvm float32", "document 004"): {"µs per path": limit(0.1, "two cores, the lens of the original program")},
-    ("llvm float32", "M = 1000000"): {
-        "µs per path": limit(1.0, "two cores: ten times the segments take much less than ten times as long")
-    },
-}
 
 # Image comparison ----------------------------------------------------------------------------------------------
 

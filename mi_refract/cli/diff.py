@@ -8,29 +8,22 @@ from __future__ import annotations
 import contextlib
 import enum
 import importlib.util
-import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from mi_refract.image_diff import folders, pairing, text_reports
 from mi_refract.image_diff.methods import AUTO, METHODS
 from mi_refract.image_diff.results import Status
-from mi_refract.image_diff.settings import FILE, Settings
+from mi_refract.image_diff.settings import FILE, Settings, from_words, key_tables, load
 from mi_refract.io.atomic import writable
-from mi_refract.io.exit_code import MISUSE
+from mi_refract.io.errors import MISUSE
 from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.sanitise import printable
-
-if TYPE_CHECKING:
-    from mi_refract.image_diff.html_report import Page
-    from mi_refract.image_diff.report_folder import Folder
-
-HTML = (".html", ".htm")
 
 
 class Inconclusive(enum.StrEnum):
@@ -42,16 +35,13 @@ class Inconclusive(enum.StrEnum):
 
 def _print_methods(wanted: bool) -> None:
     if wanted:
-        from mi_refract.image_diff import settings_file
-
-        text = settings_file.reference()
         if sys.stdout.isatty():
             from rich.console import Console
             from rich.markdown import Markdown
 
-            Console().print(Markdown(text))
+            Console().print(Markdown(key_tables()))
         else:
-            print(text)
+            print(key_tables())
         raise typer.Exit
 
 
@@ -67,10 +57,6 @@ Set = Annotated[
         metavar="KEY=VALUE",
         help=f"Set a key of [defaults] in {FILE}, except map, for all images; see --methods.",
     ),
-]
-Idiff = Annotated[
-    str | None,
-    typer.Option("--idiff", metavar="FLAGS", help="Use --method tolerance with these flags of OpenImageIO's idiff."),
 ]
 File = Annotated[
     Path | None,
@@ -92,26 +78,19 @@ def diff(
     names: Names = None,
     method: Method = AUTO,
     options: Set = None,
-    idiff: Idiff = None,
     settings: File = None,
     max_values: MaxValues = MAX_VALUES,
     renders: Annotated[bool, typer.Option("--renders", help="Each folder holds several renders of one image.")] = False,
     inconclusive: Annotated[
         Inconclusive | None, typer.Option(help="Count an inconclusive image as pass or fail. Default: exit code 3.")
     ] = None,
-    report: Annotated[
-        str,
-        typer.Option(
-            metavar="OUT.html|FOLDER/",
-            help="Write an HTML page with the images, or a folder with one page per pair.",
-        ),
-    ] = "",
+    report: Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML page with the images.")] = None,
     report_url: Annotated[
         str,
         typer.Option(
             metavar="URL",
             envvar="MI_REFRACT_REPORT_URL",
-            help="Address of the published report, for links in the job's summary; URL/ links every page.",
+            help="Address of the published report, for a link in the job's summary.",
         ),
     ] = "",
     junit: Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")] = None,
@@ -134,49 +113,45 @@ def diff(
     require_extra("scipy", *(("jinja2", "matplotlib") if report else ()))
     if test is None and not check_settings:
         raise ValueError("two paths are needed; expected mi-refract diff REFERENCE TEST")
-    chosen = _settings(reference, method, options or [], idiff, settings, max_values)
+    chosen = _settings(reference, method, options or [], settings, max_values)
     if check_settings or test is None:
         raise typer.Exit(_check_settings(reference, test or reference, names or [], chosen))
-    for path, suffix in ((junit, ".xml"), (json, ".json")):
+    for path, suffixes in ((report, (".html", ".htm")), (junit, (".xml",)), (json, (".json",))):
         if path:
-            writable(path, (suffix,))
-    if _is_folder(report):
-        from mi_refract.image_diff import report_folder
+            writable(path, suffixes)
+    page = None
+    if report:
+        from mi_refract.image_diff.html_report import Page
 
-        report_folder.require_free(Path(report), reference, test)
-    with _report(report) as page:
-        with _progress() as progress:
-            results = folders.diff(
-                reference,
-                test,
-                chosen,
-                names=names or [],
-                renders=renders,
-                inconclusive=inconclusive or "",
-                view=page.view if page else None,
-                digests=bool(json),
-                progress=progress,
-            )
-        text_reports.print_results(results)
-        if page:
-            from mi_refract.io.provenance import provenance
+        page = Page(report)
+    with _progress() as progress:
+        results = folders.diff(
+            reference,
+            test,
+            chosen,
+            names=names or [],
+            renders=renders,
+            inconclusive=inconclusive or "",
+            view=page.view if page else None,
+            digests=bool(json),
+            progress=progress,
+        )
+    text_reports.print_results(results)
+    if page:
+        from mi_refract.io.image_file import provenance
 
-            software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
-            page.write(results, software, results.command("diff", *(names or [])), str(json or ""))
-    if junit:
-        text_reports.write_junit(junit, results)
-    if json:
-        text_reports.write_json(json, results)
+        software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
+        page.write(results, software, results.command("diff", *(names or [])), str(json or ""))
     if github:
         for line in text_reports.workflow_commands(results):
             print(line)
-        pages = None
-        if report:
-            from mi_refract.image_diff import html_report
+        text_reports.append_summary(results, str(report or ""), report_url)
+    if junit:
+        text_reports.write_junit(junit, results)
+    if json:
+        from mi_refract.image_diff import results_file
 
-            page_of = html_report.page_of if _is_folder(report) else lambda result: ""
-            pages = text_reports.Pages(report, page_of, report_url)
-        text_reports.append_summary(results, pages)
+        results_file.write(json, results)
     raise typer.Exit(results.exit_code)
 
 
@@ -191,7 +166,6 @@ def accept(
     names: Names = None,
     method: Method = AUTO,
     options: Set = None,
-    idiff: Idiff = None,
     settings: File = None,
     max_values: MaxValues = MAX_VALUES,
     source: Annotated[
@@ -220,18 +194,16 @@ def accept(
             raise ValueError(
                 f"{reference}: only one path; with --from, give both folders before any names, or no folder"
             )
-        if options or method != AUTO or idiff is not None:
-            raise ValueError("--from repeats an earlier comparison; do not combine it with --method, --set or --idiff")
+        if options or method != AUTO:
+            raise ValueError("--from repeats an earlier comparison; do not combine it with --method or --set")
         results = results_file.read(source, reference, test)
         results = replace(results, results=tuple(pairing.named(results.results, names or [])))
-        results = results_file.with_settings(
-            results, _settings(results.reference, AUTO, [], None, settings, max_values)
-        )
+        results = results_file.with_settings(results, _settings(results.reference, AUTO, [], settings, max_values))
         text_reports.print_errors(results)
     elif reference is None or test is None:
         raise ValueError("two paths are needed; expected mi-refract accept REFERENCE TEST, or --from OUT.json")
     else:
-        chosen = _settings(reference, method, options or [], idiff, settings, max_values)
+        chosen = _settings(reference, method, options or [], settings, max_values)
         with _progress() as progress:
             results = folders.diff(reference, test, chosen, names=names or [], to_accept=True, progress=progress)
         text_reports.print_results(results)
@@ -255,32 +227,22 @@ def accept(
     print(f"{len(copies)} accepted")
 
 
-# Options ------------------------------------------------------------------------------------------------------------
-
-
 def require_extra(*packages: str) -> None:
     """ValueError, before anything is compared, where a package is not installed."""
     if not all(map(importlib.util.find_spec, packages)):
         raise ValueError("comparing needs the extra `diff`: pip install 'mi-refract[diff]'")
 
 
-def _settings(
-    reference: Path, method: str, words: Sequence[str], idiff: str | None, file: Path | None, max_values: int
-) -> Settings:
+def _settings(reference: Path, method: str, words: Sequence[str], file: Path | None, max_values: int) -> Settings:
     """What the options and the settings file say. ValueError or OSError for what they cannot mean."""
     beside = (reference if reference.is_dir() else reference.parent) / FILE
     path = file or (beside if beside.exists() else None)
     flags = ["--method", method] if method != AUTO else []
-    flags += ["--idiff", idiff] if idiff is not None else []
     flags += [each for word in words for each in ("--set", word)]
     flags += ["--max-values", str(max_values)] if max_values != MAX_VALUES else []
     flags += ["--settings", str(file)] if file else []
-    if not flags and path is None:
-        return Settings()
-    from mi_refract.image_diff import settings_file
-
-    layer = settings_file.from_words(method, words, idiff)
-    settings = settings_file.load(path, layer, max_values) if path else Settings((layer,), max_values=max_values)
+    layer = from_words(method, words)
+    settings = load(path, layer, max_values) if path else Settings((layer,), max_values=max_values)
     return replace(settings, flags=tuple(flags))
 
 
@@ -295,32 +257,6 @@ def _check_settings(reference: Path, test: Path, names: Sequence[str], chosen: S
     for line in lines + errors:
         print(f"mi-refract: {printable(line)}", file=sys.stderr)
     return MISUSE if errors else 0
-
-
-# Output -------------------------------------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def _report(report: str) -> Iterator[Page | Folder | None]:
-    """The writer of the report, if any. ValueError or OSError where it cannot be written."""
-    if _is_folder(report):
-        from mi_refract.image_diff import report_folder
-
-        with report_folder.writing(Path(report)) as folder:
-            yield folder
-    elif report:
-        from mi_refract.image_diff import html_report
-
-        yield html_report.Page(writable(report, HTML))
-    else:
-        yield None
-
-
-def _is_folder(report: str) -> bool:
-    """Whether the report is a folder: it ends in /, has no ending, or is one already."""
-    path = Path(report)
-    named_so = report.endswith(("/", os.sep)) or not path.suffix
-    return bool(report) and (named_so or (path.suffix.lower() not in HTML and path.is_dir()))
 
 
 @contextlib.contextmanager

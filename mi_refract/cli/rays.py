@@ -15,9 +15,9 @@ from rich.console import Console
 from rich.table import Table
 
 from mi_refract.io.atomic import writable
-from mi_refract.io.provenance import provenance
+from mi_refract.io.image_file import provenance
 from mi_refract.io.sanitise import printable
-from mi_refract.ray_sets import files, ray_set, run_program, tables
+from mi_refract.ray_sets import files, ray_set
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.regimes import REGIMES
 
@@ -85,7 +85,7 @@ Json = Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.
 
 @app.command()
 def export(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT.csv|.npz|.exr", help="The file to write.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT.csv|.npz", help="The file to write.")],
     regime: Regime = None,
     count: Count = ray_set.COUNT,
     precision: Precision = ray_set.PRECISION,
@@ -98,7 +98,7 @@ def export(
     ] = False,
 ) -> None:
     """Write rays for another program: incident directions, normals and indices of refraction."""
-    writable(output, tables.SUFFIXES)
+    writable(output, files.SUFFIXES)
     rays = _made(regime, count, precision, seed, two_sided, medium, wavelengths)
     files.write(output, rays)
     print(printable(f"{output}: {_summary(rays)}"))
@@ -108,7 +108,7 @@ def export(
 def check(
     context: typer.Context,
     answers: Annotated[
-        Path, typer.Argument(metavar="ANSWERS.csv|.npz|.exr", help="Columns id, bx, by, bz[, transmitted][, n_ratio].")
+        Path, typer.Argument(metavar="ANSWERS.csv|.npz", help="Columns id, bx, by, bz[, transmitted][, n_ratio].")
     ],
     file: Annotated[
         Path | None,
@@ -166,7 +166,7 @@ def run(
     backward: Backward = None,
     timeout: Annotated[
         float, typer.Option(min=0, metavar="SECONDS", help="Time limit of the command, up to a week.")
-    ] = run_program.TIMEOUT,
+    ] = files.TIMEOUT,
     report: Report = None,
     junit: Junit = None,
     json: Json = None,
@@ -186,7 +186,7 @@ def run(
     def answered(words: list[str], title: str, precision: str, tir: str = "auto") -> int:
         rays = files.read(file) if file else _made(regime, count, precision, seed, two_sided, medium, wavelengths)
         with as_exceptions():
-            answers = run_program.answers_of(words, rays, timeout=timeout, cwd=renderer)
+            answers = files.answers_of(words, rays, timeout=timeout, cwd=renderer)
         return checked(rays, answers, title, tir)
 
     if not renderer:

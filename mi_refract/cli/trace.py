@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from mi_refract.io import atomic
-from mi_refract.io.sanitise import json_text, printable
+from mi_refract.io.sanitise import json_text
 from mi_refract.planar import figure, focal_points, light, scene_file
 from mi_refract.planar.path_tree import as_data, follow_scene, summary, with_rays
 
@@ -60,22 +60,16 @@ def trace(
         figure.require_matplotlib()
     screen = focal_points.plane(plane) if plane else None
     loaded = scene_file.load(scene, light.parsed(wavelengths) if wavelengths else None)
-    if branches is not None:
-        loaded = replace(loaded, branches=branches)
-    if max_depth is not None:
-        loaded = replace(loaded, max_depth=max_depth)
+    branches = loaded.branches if branches is None else branches
+    loaded = replace(loaded, branches=branches, max_depth=max_depth or loaded.max_depth)
     if rays:
         loaded = with_rays(loaded, rays)
     traced = follow_scene(loaded, formula=formula, precision=precision, backend=arrays)
+    foci = focal_points.groups(loaded, traced, screen) if table or screen else None
+    data = as_data(loaded, traced) if as_json else {}
+    lines = [f"{loaded.file}: {summary(loaded, traced)}", *([focal_points.table(foci)] if foci else [])]
     if output:
         figure.save(output, loaded, traced)
-    focal = {}
-    if table or screen:
-        focal["foci"] = focal_points.groups(loaded, traced, screen)
-    if as_json:
-        data = {name: [asdict(group) for group in groups] for name, groups in focal.items()}
-        print(json_text(as_data(loaded, traced) | data))
-    else:
-        print(printable(f"{scene.name}: {summary(loaded, traced)}"))
-        if focal.get("foci"):
-            print(focal_points.table(focal["foci"]))
+    if as_json and foci is not None:
+        data["foci"] = [asdict(group) for group in foci]
+    print(json_text(data) if as_json else "\n".join(lines))

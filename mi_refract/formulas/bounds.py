@@ -14,16 +14,8 @@ which moves b by 2 cosθ_t more, or for a tangential one: there neither is held 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from mi_refract.numerics import Values
-
-
-def _numpy() -> Any:
-    """Imported only when a bound is computed; the plugin needs no numpy."""
-    import numpy
-
-    return numpy
 
 
 @dataclass(frozen=True)
@@ -57,7 +49,8 @@ class Budget:
         cos_i: Values = 1.0,
     ) -> Values:
         """Bound of the chord error |b/|a| − exact|. The defaults are the critical angle, where it is largest."""
-        np = _numpy()
+        import numpy as np
+
         bound = self.of_terms(u, k, transmitted, unit) + self.of_root(u, k, cos_t, transmitted)
         return bound + np.where(self.side_open(u, cos_i), 2 * cos_t, 0.0)
 
@@ -67,24 +60,28 @@ class Budget:
 
     def of_terms(self, u: Values, k: Values, transmitted: Values = True, unit: Values = True) -> Values:
         """The part of the bound that is linear in u: `linear` u K."""
-        np = _numpy()
+        import numpy as np
+
         linear = np.where(unit, self.linear, self.any_length or self.linear)
         return linear * u * np.where(transmitted & (self.growth > 0), np.maximum(1.0, k), 1.0)
 
     def of_root(self, u: Values, k: Values, cos_t: Values, transmitted: Values = True) -> Values:
         """The part of the bound due to the radicand's error under the root; 0 under total internal reflection."""
-        np = _numpy()
+        import numpy as np
+
         return np.where(transmitted, root(self.radicand_error_bound(u, k), cos_t), 0.0)
 
     def radicand_error_bound(self, u: Values, k: Values) -> Values:
         """Bound of the error of the radicand, which |1 − k² sin²θ| must exceed for the decision to be right."""
-        np = _numpy()
+        import numpy as np
+
         return self.radicand * u * np.maximum(1.0, k) ** self.growth
 
 
 def root(x: Values, cos_t: Values) -> Values:
     """ρ(x, cos²θ_t): how far √ moves when its argument is off by x ≥ 0. Numbers or arrays (N,); ρ(x, 0) = √x."""
-    np = _numpy()
+    import numpy as np
+
     rest = np.sqrt(np.maximum(cos_t * cos_t - x, 0))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.fmin(np.sqrt(x), x / (cos_t + rest))
@@ -92,7 +89,8 @@ def root(x: Values, cos_t: Values) -> Values:
 
 def radicand_for(error: Values, cos_t: Values) -> Values:
     """The x with ρ(x, cos²θ_t) = `error` ≥ 0, the inverse of `root`. Numbers or arrays (N,)."""
-    np = _numpy()
+    import numpy as np
+
     return np.where(error <= cos_t, error * (2 * cos_t - error), error * error)
 
 

@@ -8,13 +8,13 @@ The entries of FORMULAS are total functions without branches on data: input that
 non-finite vector, a ratio outside 2⁻²⁰ … 2²⁰) gives NaN and False. The functions themselves leave
 that check out (NaN still gives NaN), for callers that have made it, as the plugin has. `a` and `n` are 3-vectors of
 any Dr.Jit backend and precision, `k` a number or an array of that precision; a wider `k` is rounded to it, once.
-The documented formulas take unit `a` and `n`; what those are off by, the result is off by.
+The documented formulas take unit `a` and `n`; what those are off by, the result is off by. Shapes: `a`, `n` (3,), `k`
+() to b (3,), transmitted ().
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import drjit as dr
 
@@ -22,18 +22,14 @@ from mi_refract.numerics import Mask, Number, Vector3, as_component, ieee_divide
 
 from .well_conditioned import Refracted
 
-# Shared by all formulas ----------------------------------------------------------------------------------------
-
 
 def _conclude(a: Vector3, n: Vector3, c: Number, radicand: Number, b: Vector3) -> Refracted:
-    """Choose between the transmitted direction `b` and the mirror direction."""
+    """Choose between the transmitted direction `b` and the mirror direction, for which the radicand is below 0.
+
+    Roots are `dr.safe_sqrt`, √max(radicand, 0), with a finite derivative at 0.
+    """
     transmitted = (radicand >= 0) & (c != 0)
     return dr.select(transmitted, b, a - n * ieee_divide(2 * c, dr.dot(n, n))), transmitted
-
-
-def _root(radicand: Number) -> Any:
-    """√max(radicand, 0), with a finite derivative at 0 (the mirror direction is chosen below 0)."""
-    return dr.safe_sqrt(radicand)
 
 
 # Reflection ----------------------------------------------------------------------------------------------------
@@ -77,12 +73,11 @@ def refract_wedge(a: Vector3, n: Vector3, k: Number) -> Refracted:
 
     Source: document 000, boxed form of "Refraction" (there n·a < 0), made two-sided. Unit `n`.
     Weak near the critical angle, for k near 1 at grazing incidence and for k ≫ 1: the radicand cancels.
-    Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted ().
     """
     k = as_component(a, k)
     c, bivector = dr.dot(n, a), wedge(n, a)
     radicand = dr.dot(a, a) - k * k * dr.dot(bivector, bivector)  # (n∧a)² = −|n×a|²
-    b = k * contract(n, bivector) + n * dr.mulsign(_root(radicand), c)
+    b = k * contract(n, bivector) + n * dr.mulsign(dr.safe_sqrt(radicand), c)
     return _conclude(a, n, c, radicand, b)
 
 
@@ -91,12 +86,11 @@ def refract_wedge_contrast(a: Vector3, n: Vector3, k: Number) -> Refracted:
 
     Source: document 000, last form of "Refraction", made two-sided. Unit `n`.
     Weak where k² − 1 loses digits (k near 1) and where two large terms cancel near the critical angle.
-    Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted ().
     """
     k = as_component(a, k)
     c, bivector = dr.dot(n, a), wedge(n, a)
     radicand = c * c - dr.dot(bivector, bivector) * (k * k - 1)
-    b = k * contract(n, bivector) + n * dr.mulsign(_root(radicand), c)
+    b = k * contract(n, bivector) + n * dr.mulsign(dr.safe_sqrt(radicand), c)
     return _conclude(a, n, c, radicand, b)
 
 
@@ -105,12 +99,11 @@ def refract_cross(a: Vector3, n: Vector3, k: Number) -> Refracted:
 
     Source: document 001, eq. 6; its ‖c‖ (n × ĉ) is 0/0 at normal incidence, n × c is the same and safe.
     Unit `a`, `n`. Weak near the critical angle, for k near 1 at grazing incidence and for k ≫ 1.
-    Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted ().
     """
     k = as_component(a, k)
     cos, c = dr.dot(a, n), k * dr.cross(a, n)
     radicand = 1 - dr.dot(c, c)
-    t = dr.cross(n, c) + n * dr.mulsign(_root(radicand), cos)
+    t = dr.cross(n, c) + n * dr.mulsign(dr.safe_sqrt(radicand), cos)
     return _conclude(a, n, cos, radicand, t)
 
 
@@ -120,12 +113,11 @@ def refract_decomposed(a: Vector3, n: Vector3, k: Number) -> Refracted:
     b = k a − n (k c + s √(1 − k²(1 − c²))),   c = n·a,  s = −sign(c)
     Source: document 002, eq. 1, made two-sided. Unit `a`, `n`.
     Weak near the critical angle, for k near 1 at grazing incidence and for k ≫ 1: the radicand cancels.
-    Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted ().
     """
     k = as_component(a, k)
     c = dr.dot(n, a)
     radicand = 1 - k * k * (1 - c * c)
-    b = k * a - n * (k * c - dr.mulsign(_root(radicand), c))
+    b = k * a - n * (k * c - dr.mulsign(dr.safe_sqrt(radicand), c))
     return _conclude(a, n, c, radicand, b)
 
 
@@ -147,7 +139,7 @@ def refract_2d(
     scale = (l[0] * l[0] + l[1] * l[1]) * length * k
     valid = (scale > 0) & (scale < dr.inf)
     transmitted = valid & (x <= 1) & (along_n != 0)
-    b_n = dr.select(transmitted, dr.mulsign(_root(1 - x * x) * length, along_n), -along_n)
+    b_n = dr.select(transmitted, dr.mulsign(dr.safe_sqrt(1 - x * x) * length, along_n), -along_n)
     b_l = dr.select(transmitted, dr.mulsign(x * length, along_l), along_l)
     b = [l[0] * b_l - l[1] * b_n, l[0] * b_n + l[1] * b_l]
     return [dr.select(valid, b_j, dr.nan) for b_j in b], transmitted
@@ -159,7 +151,6 @@ def refract_rotated(a: Vector3, n: Vector3, k: Number) -> Refracted:
     There the boundary is (0, 1) and i = (−n·a, |a − n (n·a)|), because B turns n into −x. At normal incidence t
     is any unit vector, times 0. Source: document 004. Unit `n`.
     Weak near the critical angle: √(1 − X²) magnifies the rounding of X.
-    Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted ().
     """
     k = as_component(a, k)
     c = dr.dot(n, a)

@@ -66,7 +66,13 @@ def selected(image: Image, names: Mapping[str, str]) -> Image:
     variances of X, Y, Z that were converted to R, G, B like a colour, as in Mitsuba's test data. (Those of R, G and B
     would not do, as they do not say how the three correlate.) ValueError for a channel that is not there.
     """
-    image = _with_xyz(image, set(names))
+    if set(names) & set(XYZ) and not set(XYZ) & set(image.channels) and set(RGB) <= set(image.channels):
+        converted = dict(image.variances)
+        if set(RGB) <= set(converted):
+            colour = np.stack([converted[name] for name in RGB], -1).astype(np.float64) @ TO_XYZ.T
+            converted |= {name: colour[..., i] for i, name in enumerate(XYZ)}
+        pixels = np.concatenate([image.pixels, image.select(RGB) @ TO_XYZ.T], -1)
+        image = replace(image, pixels=pixels, channels=(*image.channels, *XYZ), variances=converted)
     pairs = spreads(image.channels)
     missing = [name for name in names if name not in image.channels]
     if missing:
@@ -79,18 +85,6 @@ def selected(image: Image, names: Mapping[str, str]) -> Image:
             kept[spread] = f"m2_{new}" if moment else f"{new}.variance"
     variances = {new: image.variances[old] for old, new in names.items() if old in image.variances}
     return replace(image, pixels=image.select(list(kept)), channels=tuple(kept.values()), variances=variances)
-
-
-def _with_xyz(image: Image, wanted: set[str]) -> Image:
-    """The image with X, Y and Z, where one of them is wanted and it has R, G, B but none of these."""
-    if not wanted & set(XYZ) or set(XYZ) & set(image.channels) or not set(RGB) <= set(image.channels):
-        return image
-    pixels = np.concatenate([image.pixels, image.select(RGB) @ TO_XYZ.T], -1)
-    variances = dict(image.variances)
-    if set(RGB) <= set(variances):
-        colour = np.stack([variances[name] for name in RGB], -1).astype(np.float64) @ TO_XYZ.T
-        variances |= {name: colour[..., i] for i, name in enumerate(XYZ)}
-    return replace(image, pixels=pixels, channels=(*image.channels, *XYZ), variances=variances)
 
 
 def chosen(images: Sequence[Image], names: Names, side: int) -> list[Image]:
@@ -114,7 +108,7 @@ def matched(reference: Image, test: Image) -> tuple[Image, Image]:
     images = reference, test
     layers = [moment_layer(image) for image in images]
     if all(layers) or (any(layers) and set(means(reference.channels)) != set(means(test.channels))):
-        one, two = (_of_layer(x, layer) if layer else _as_xyz(x) for x, layer in zip(images, layers, strict=True))
+        one, two = (_as_xyz(x, layer) for x, layer in zip(images, layers, strict=True))
         return one, two
     if any(set(XYZ) <= set(image.variances) - set(image.channels) for image in images):
         return _as_xyz(reference), _as_xyz(test)
@@ -145,14 +139,11 @@ def _repeats(film: Pixels, nested: Pixels) -> bool:
     return False
 
 
-def _of_layer(image: Image, layer: str) -> Image:
-    """The image with the layer's channels, without its name before theirs, in place of the film's colours."""
-    others = (name for name in means(image.channels) if name not in (*RGB, *XYZ))
-    return selected(image, {name: name.removeprefix(f"{layer}.") for name in others})
-
-
-def _as_xyz(image: Image) -> Image:
-    """The image with X, Y, Z in place of R, G, B."""
+def _as_xyz(image: Image, layer: str = "") -> Image:
+    """The image with X, Y, Z in place of R, G, B: those of the layer, whose name goes, or else made of these."""
+    names = means(image.channels)
+    if layer:
+        return selected(image, {name: name.removeprefix(f"{layer}.") for name in names if name not in (*RGB, *XYZ)})
     if not set(RGB) <= set(image.channels):
         return image
-    return selected(image, {name: name for name in (*means(image.channels), *XYZ) if name not in RGB})
+    return selected(image, {name: name for name in (*names, *XYZ) if name not in RGB})

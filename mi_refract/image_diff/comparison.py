@@ -170,16 +170,13 @@ def _located(image: Image, values: Pixels, bad: NDArray[np.bool_]) -> str:
     return f"{image.path}: {counts}, the first at {place(bad, image)}"
 
 
-def _display(image: Image) -> str:
-    x, y, width, height = image.display or (*image.origin, *image.pixels.shape[1::-1])
-    return f"{width} × {height} from x = {x}, y = {y}"
-
-
 HEADER: dict[str, Callable[[Image], str]] = {  # what must be the same, in words
     "size": lambda image: f"{image.pixels.shape[1]} × {image.pixels.shape[0]}",
     "channels": lambda image: ", ".join(sorted(image.channels)),
     "data window": lambda image: "from x = {}, y = {}".format(*image.origin),
-    "display window": _display,
+    "display window": lambda image: "{2} × {3} from x = {0}, y = {1}".format(
+        *(image.display or (*image.origin, *image.pixels.shape[1::-1]))
+    ),
     "pixel aspect ratio": lambda image: str(image.metadata.get("PixelAspectRatio", 1.0)),
     "orientation": lambda image: str(image.metadata.get("Orientation", 1)),
 }

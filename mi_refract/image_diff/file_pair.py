@@ -2,54 +2,37 @@
 
 Of files with several images every part and MIP level is compared with the one of the same number. The verdict is the
 worst of them, with the place of the image that it is about. A part or level that only one of the files has is a
-difference.
+difference. What a mask leaves out is 0 in both images before a method sees them, and shares of pixels are of those that
+count.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mi_refract.io import image_file
-from mi_refract.io.bounded_map import bounded_map
-from mi_refract.io.image_file import MAX_VALUES, Image
+from mi_refract.io.image_file import MAX_VALUES, Image, bounded_map
 
-from . import channels, idiff_flags, masks, methods, pairing, variances
+from . import channels, methods, pairing, variances
 from .comparison import Comparison, Verdict
-from .results import Result
-from .settings import ComparisonSpec
+from .results import Result, Status
+from .settings import ComparisonSpec, Rectangle
 
 WORST = (Verdict.DIFFERENT, Verdict.INCONCLUSIVE, Verdict.EQUAL)
 THREADS = 8
-Part = tuple[int, int]
-
-
-@dataclass(frozen=True)
-class Judged:
-    """A comparison, the two images that it is about, and what to warn of."""
-
-    images: tuple[Image, Image]
-    comparison: Comparison
-    warning: str
-
-
-def read(path: Path, how: ComparisonSpec) -> list[Image]:
-    """Every image of a file; with flags of `idiff` in the numbers that it compares, and without -a the first alone.
-
-    Raises what `image_file.read_parts` raises.
-    """
-    if how.idiff is None:
-        return image_file.read_parts(path, how.max_values)
-    first_only = not idiff_flags.parse(how.idiff).every
-    return image_file.read_parts(path, how.max_values, first_only=first_only, as_idiff=True)
+WHITE = 0.5  # of a mask's largest colour: from there on a pixel counts
+MOST = 0.5  # share of the pixels that a mask may leave out without a warning
+Mask = NDArray[np.bool_]  # H × W; True where a pixel counts
 
 
 def read_renders(folder: Path, max_values: int = MAX_VALUES) -> list[Image]:
-    """The renders of one image in a folder. ValueError where two are the same, seed and all; otherwise as `read`."""
+    """The renders of one image in a folder. Errors: of `image_file.read`, and ValueError for equal ones."""
     paths, failed = pairing.images_in(folder)
     if failed:
         raise OSError(failed[0][1])
@@ -76,11 +59,11 @@ def mean_image(images: Sequence[Image]) -> Image:
 
 def compare(
     path: Path, sides: tuple[Sequence[Image], Sequence[Image]], result: Result, roots: tuple[Path, Path]
-) -> Judged:
-    """Compare the images of both sides as `result.how` says; `path`: of the reference, `roots`: the folders.
+) -> Result:
+    """The result with the verdict on the images of both sides, as `result.how` says, and with images and maps.
 
-    ValueError or OSError where a mask or a variance is missing or does not fit, and as `methods.compare`, with the
-    place of the image.
+    `path`: of the reference, `roots`: the folders. ValueError or OSError where a mask or a variance is missing or does
+    not fit, and as `methods.compare`, with the place of the image.
     """
     how = result.how
     bare = [channels.without_variances(images[0]) for images in sides]
@@ -94,17 +77,25 @@ def compare(
     file = pairing.beside(how.mask, result.target or path, roots[0]) if how.mask else None
     if (file or how.ignore) and reference[-1].place:
         raise ValueError(f"{path}: has several parts or MIP levels; masks are supported for single images only")
-    mask = masks.made(reference[0], file, how.ignore, how.max_values)
-    reference, test = ([masks.applied(image, mask) for image in side] for side in (reference, test))
+    mask = mask_of(reference[0], file, how.ignore, how.max_values)
+    if mask is not None:
+        reference, test = ([_masked(image, mask) for image in side] for side in (reference, test))
     if path.is_dir():
         comparison = methods.compare(how.method, reference, test, named=[one for one, _ in how.channels], **how.options)
-        images = mean_image(reference), mean_image(test)
+        one, two = mean_image(reference), mean_image(test)
     else:
-        comparison, images = _compare_parts(how, reference, test)
+        comparison, (one, two) = _compare_parts(how, reference, test)
     chosen = {name for pair in how.channels for name in pair}
     if chosen and (left := [name for name in whole if name not in chosen]):  # what was not compared is reported
         comparison = replace(comparison, reason=f"{comparison.reason}; not compared: {', '.join(left)}")
-    return Judged(images, comparison, masks.warning(mask))
+    warnings: tuple[str, ...] = ()
+    if mask is not None:
+        if mask.mean() < 1 - MOST:
+            warnings = (f"the mask leaves out {1 - float(mask.mean()):.0%} of the pixels",)
+        comparison = replace(comparison, maps=comparison.maps | {"left out": (~mask).astype(np.float32)})
+    images = {"reference": one, "test": two}
+    status = Status(str(comparison.verdict))
+    return replace(result, status=status, comparison=comparison, warnings=warnings, images=images)
 
 
 def _with_variance(images: Sequence[Image], root: Path, how: ComparisonSpec) -> Sequence[Image]:
@@ -122,21 +113,17 @@ def _compare_parts(
 ) -> tuple[Comparison, tuple[Image, Image]]:
     """The worst comparison of all parts that both files have, and the two images that it is about."""
     one, two = ({image.part: image for image in side} for side in (reference, test))
-    compared: dict[Part, Comparison] = {}
-    for part in one:
-        if part in two:
-            place = one[part].place or two[part].place
-            try:
-                named = [name for name, _ in how.channels]
-                compared[part] = methods.compare(how.method, [one[part]], [two[part]], named=named, **how.options)
-            except ValueError as error:
-                raise ValueError(f"{error} ({place})" if place else str(error)) from None
-    places = {part: one[part].place or two[part].place for part in compared}
+    compared: dict[tuple[int, int], Comparison] = {}
+    places = {part: one[part].place or two[part].place for part in one if part in two}
+    named = [name for name, _ in how.channels]
+    for part, place in places.items():
+        try:
+            compared[part] = methods.compare(how.method, [one[part]], [two[part]], named=named, **how.options)
+        except ValueError as error:
+            raise ValueError(f"{error} ({place})" if place else str(error)) from None
     shown = min(compared, key=lambda part: WORST.index(compared[part].verdict))
     worst, reason = compared[shown], compared[shown].reason
-    if places[shown] and len(compared) == 1:
-        reason += f"; of several images in the file only {places[shown]} is compared"
-    elif places[shown]:
+    if places[shown]:
         alike = sum(comparison.verdict is worst.verdict for comparison in compared.values())
         reason = f"{places[shown]}: {reason}; {worst.verdict}: {alike} of {len(compared)} parts and MIP levels"
     verdict, warning = worst.verdict, ""
@@ -151,3 +138,50 @@ def _compare_parts(
         verdict, warning = Verdict.DIFFERENT, ""
         reason = f"{(one | two)[lone[0]].place} {changed}{more}; {reason}"
     return replace(worst, verdict=verdict, reason=reason, warning=warning, part=shown), (one[shown], two[shown])
+
+
+# Masks --------------------------------------------------------------------------------------------------------------
+
+
+def mask_of(
+    reference: Image, path: Path | None, rectangles: Sequence[Rectangle], most: int = MAX_VALUES
+) -> Mask | None:
+    """The pixels of the image that count, by a mask, in which white counts, and rectangles; None where there is none.
+
+    OSError for a mask that cannot be read; ValueError for one of another size, for a rectangle without a pixel of the
+    image, and where no pixel is left.
+    """
+    if path is None and not rectangles:
+        return None
+    height, width = reference.pixels.shape[:2]
+    counts: Mask = np.ones((height, width), bool)
+    if path is not None:
+        image = image_file.read(path, most)
+        if image.pixels.shape[:2] != (height, width):
+            size = f"{image.pixels.shape[1]} × {image.pixels.shape[0]}"
+            raise ValueError(f"{path}: {size}; expected a mask of {width} × {height}")
+        colours = image.select([name for name in image.channels if name != "A"] or image.channels)
+        if not np.isfinite(colours).all():
+            raise ValueError(f"{path}: values that are not finite; expected a mask from 0 to 1")
+        counts = colours.max(-1) >= WHITE
+    for x, y, columns, rows in rectangles:
+        left, top = x - reference.origin[0], y - reference.origin[1]
+        part = counts[max(top, 0) : max(top + rows, 0), max(left, 0) : max(left + columns, 0)]
+        if not part.size:
+            ignore = [x, y, columns, rows]
+            raise ValueError(f"ignore = {ignore}; expected a rectangle that overlaps {reference.path}")
+        part[:] = False
+    if not counts.any():
+        raise ValueError(f"{path or 'ignore'}: leaves no pixel of {reference.path}; expected at least one")
+    return counts
+
+
+def _masked(image: Image, mask: Mask) -> Image:
+    """The image with 0 where the mask does not count, and with the mask; one of another size as it is.
+
+    An image of another size is refused by every method. Here a single pixel would be spread over the mask's size.
+    """
+    if image.pixels.shape[:2] != mask.shape:
+        return image
+    spread = {name: np.where(mask, variance, 0) for name, variance in image.variances.items()}
+    return replace(image, pixels=np.where(mask[..., None], image.pixels, 0), mask=mask, variances=spread)

@@ -1,14 +1,23 @@
-"""FLIP: what a person who flips between two images would see.
+"""FLIP: what a person who flips between two images would see, judged by the worst windows of its error map.
 
 Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", HPG 2020, and "Visualizing the Error in
 Rendered High Dynamic Range Images", Eurographics Short Papers 2021; computed by OpenImageIO.
+
+What a person sees of a change does not depend on what else is in the image, nor on its place: windows slide by single
+pixels. `local_error`: the largest mean in a window, for details. The smallest window is a square of 0.12 degrees of the
+viewer's field, 7 arcminutes: a letter of the line 20/30 of an eye chart, so what is read without effort; 8 × 8 pixels
+at 67 pixels per degree. Larger windows, each twice as wide, up to 7.7 degrees, are for wide and faint changes. Their
+means count more, by the fourth root of the area in units of the smallest: as the threshold of a wide stimulus falls by
+probability summation (Robson and Graham, Vision Research 21, 1981). `patch_error`: the error that fills a window of
+0.24 degrees, for surfaces. Edges that are drawn otherwise make large errors along lines, and the FLIP error spreads to
+0.07 degrees from them; they fill no such window.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,9 +26,7 @@ from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels, block_mean, srgb_decode
 
 from .comparison import Comparison, Metric, Verdict, passes_black, verdict_of
-from .local_error import WINDOW, local_error, patch_error
-from .pixelwise import require_nonnegative
-from .tolerance import tolerance
+from .pixelwise import require_nonnegative, tolerance
 
 PIXELS_PER_DEGREE = 67.0  # of the viewer's field: FLIP's default, a screen of 0.7 m and 3840 pixels at 0.7 m
 RGB = ("R", "G", "B")
@@ -33,6 +40,8 @@ CODED = re.compile(r"srgb|gamma|^g\d\d")  # colour spaces, in OpenImageIO's word
 LINEAR = re.compile(r"^lin|linear|^aces|^raw$|^data$")
 INTEGERS = ("uint8", "uint16")  # a file of these that names no colour space holds what a display is sent
 DARKER = 4.0  # two stops: where the brightest light is shown nearly white, light twice as bright is, too
+WINDOW, OCTAVES = 0.12, 7  # degrees: the side of the smallest window; how many windows, each twice as wide
+SURFACE = 0.24  # degrees: the side of the window that an error fills
 AROUND = 0.5  # degrees: where black is seen so near to the brightest window, the rest need not be looked at
 
 Options = Mapping[str, Any]  # all options of `flip`, by name
@@ -64,12 +73,28 @@ def flip(
     result = _of_colours(reference, test, options)
     others = [name for name in reference.channels if name not in _colours(reference)]
     for names in filter(None, ([n for n in others if n == ALPHA], [n for n in others if n != ALPHA])):
-        result = _with_others(result, _only(reference, names), _only(test, names), options)
+        one, two, listed = _only(reference, names), _only(test, names), ", ".join(names)
+        if np.array_equal(one.pixels, two.pixels, equal_nan=True):
+            result = replace(result, reason=f"{result.reason}; not compared by FLIP, but identical: {listed}")
+            continue
+        coverage = all(bool(((x.pixels >= 0) & (x.pixels <= 1)).all()) for x in (one, two))
+        if names == [ALPHA] and coverage:
+            one, two = (replace(image, metadata={"oiio:ColorSpace": "sRGB"}) for image in (one, two))
+            of_alpha = {**options, "hdr": "no"}
+            more, method, black = _of_colours(one, two, of_alpha), "FLIP", passes_black(flip, [one], of_alpha)
+            bounded, maps = more.metrics[:3], {f"flip of {ALPHA}": more.maps["flip"]}
+        else:
+            more, method, black = tolerance(one, two), "tolerance", passes_black(tolerance, [one], {})
+            bounded, maps = more.metrics[:1], {}
+        metrics = (*result.metrics, *(replace(metric, name=f"{metric.name}, in {listed}") for metric in bounded))
+        verdict, reason = verdict_of(metrics), f"{result.reason}; by {method} {listed}: {more.reason}"
+        if verdict is Verdict.EQUAL and black:
+            verdict, reason = Verdict.INCONCLUSIVE, f"{reason}, but black would pass as well"
+        result = replace(result, verdict=verdict, reason=reason, metrics=metrics, maps=result.maps | maps)
     return result
 
 
 def _of_colours(reference: Image, test: Image, options: Options) -> Comparison:
-    """What FLIP sees in the colours."""
     wide = is_hdr(reference, test, options["hdr"])
     error = flip_map(reference, test, wide, options["ppd"])
     (worst, around), patch = local_error(error, options["ppd"]), patch_error(error, options["ppd"])
@@ -86,27 +111,6 @@ def _of_colours(reference: Image, test: Image, options: Options) -> Comparison:
         x, y = window.x + reference.origin[0], window.y + reference.origin[1]
         reason += f"; {kind} {window.error:.3g} in {window.width} × {window.height} pixels from x = {x}, y = {y}"
     return Comparison("flip", verdict_of(metrics), reason, metrics, maps={"flip": error, "local": around})
-
-
-def _with_others(result: Comparison, reference: Image, test: Image, options: Options) -> Comparison:
-    """FLIP's comparison with that of the channels, alpha or others, that it does not look at."""
-    names = ", ".join(reference.channels)
-    if np.array_equal(reference.pixels, test.pixels, equal_nan=True):
-        return replace(result, reason=f"{result.reason}; not compared by FLIP, but identical: {names}")
-    coverage = all(bool(((x.pixels >= 0) & (x.pixels <= 1)).all()) for x in (reference, test))
-    if reference.channels == (ALPHA,) and coverage:
-        reference, test = (replace(image, metadata={"oiio:ColorSpace": "sRGB"}) for image in (reference, test))
-        options = {**options, "hdr": "no"}
-        others, method, black = _of_colours(reference, test, options), "FLIP", passes_black(flip, [reference], options)
-        bounded, maps = others.metrics[:3], {f"flip of {ALPHA}": others.maps["flip"]}
-    else:
-        others, method, black = tolerance(reference, test), "tolerance", passes_black(tolerance, [reference], {})
-        bounded, maps = others.metrics[:1], {}
-    metrics = (*result.metrics, *(replace(metric, name=f"{metric.name}, in {names}") for metric in bounded))
-    verdict, reason = verdict_of(metrics), f"{result.reason}; by {method} {names}: {others.reason}"
-    if verdict is Verdict.EQUAL and black:
-        verdict, reason = Verdict.INCONCLUSIVE, f"{reason}, but black would pass as well"
-    return replace(result, verdict=verdict, reason=reason, metrics=metrics, maps=result.maps | maps)
 
 
 def views(image: Image, options: Options) -> Iterator[Image]:
@@ -175,3 +179,64 @@ def _linear(image: Image) -> Pixels:
 def _colours(image: Image) -> tuple[str, ...]:
     """R, G, B; else every channel but alpha."""
     return RGB if set(RGB) <= set(image.channels) else tuple(n for n in image.channels if n != ALPHA) or image.channels
+
+
+# The worst window ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Window:
+    """The worst window of an error map, in pixels; `value`: what counts, `error`: its mean, or its smallest error."""
+
+    value: float
+    error: float
+    x: int
+    y: int
+    width: int
+    height: int
+
+
+def windows(height: int, width: int, ppd: float) -> Iterator[tuple[int, int, float]]:
+    """Height and width in pixels of every window in an image of this size, and its weight, at least 1.
+
+    A window is as high and as wide as the image at most: of a smaller image it is the whole.
+    """
+    for octave in range(OCTAVES):
+        side = max(1, round(WINDOW * 2**octave * ppd))
+        h, w = min(side, height), min(side, width)
+        yield h, w, max(1.0, (h * w / (WINDOW * ppd) ** 2) ** 0.25)
+        if side >= max(height, width):
+            return
+
+
+def local_error(error: Pixels, ppd: float) -> tuple[Window, Pixels]:
+    """The window with the largest weighted mean of an error map, H × W, and the largest one around every pixel.
+
+    `ppd`: pixels per degree. The weight of the smallest window is 1.
+    """
+    height, width = error.shape
+    sums = np.zeros((height + 1, width + 1))
+    np.cumsum(np.cumsum(error, 0, dtype=np.float64), 1, out=sums[1:, 1:])
+    around, worst = np.zeros(error.shape, np.float32), []
+    for h, w, weight in windows(height, width, ppd):
+        means = (sums[h:, w:] - sums[:-h, w:] - sums[h:, :-w] + sums[:-h, :-w]) / (h * w)
+        worst.append(_worst(np.maximum(means, 0), weight, w, h))  # a difference of sums may be −1e-16
+        # At the centre of each window; next to the border those of the nearest window.
+        missing = [(gap // 2, gap - gap // 2) for gap in (h - 1, w - 1)]
+        np.maximum(around, np.pad(np.float32(weight) * means.astype(np.float32), missing, mode="edge"), out=around)
+    return max(worst, key=lambda window: window.value), around
+
+
+def patch_error(error: Pixels, ppd: float) -> Window:
+    """The window with the largest error that is exceeded in all of it."""
+    from scipy.ndimage import minimum_filter
+
+    h, w = (min(max(1, round(SURFACE * ppd)), size) for size in error.shape)
+    rows, columns = (slice(k // 2, k // 2 + size - k + 1) for k, size in zip((h, w), error.shape, strict=True))
+    return _worst(minimum_filter(error, (h, w))[rows, columns], 1.0, w, h)
+
+
+def _worst(errors: Pixels, weight: float, width: int, height: int) -> Window:
+    y, x = np.unravel_index(int(errors.argmax()), errors.shape)
+    error = float(errors[y, x])
+    return Window(weight * error, error, int(x), int(y), width, height)

@@ -10,25 +10,22 @@ import functools
 import hashlib
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
-from mi_refract.io import exit_code, image_file, regular_file
-from mi_refract.io.bounded_map import bounded_map
-from mi_refract.io.image_file import Image, one_line
+from mi_refract.io import errors, image_file, regular_file
+from mi_refract.io.image_file import Image, bounded_map, one_line
 
 from . import file_pair, pairing
-from .comparison import Verdict
 from .pairing import Pair
-from .results import FAILED, STATUSES, Result, Results, Status
+from .results import FAILED, Result, Results, Status
 from .settings import ComparisonSpec, Settings
 
 AS_ASKED = Settings()
 WORKERS = min(os.cpu_count() or 1, 8)
 View = Callable[[Result, Results], None]
+Read = Callable[[Path], Sequence[Image] | Exception]
 
 
 def diff(
@@ -76,10 +73,7 @@ def diff(
         result = _compared(pair, results, keep=maps or view is not None, digests=(digests or to_accept) and not renders)
         if view and result.status in FAILED:
             view(result, results)
-        if maps or not result.images:
-            return result
-        comparison = replace(result.comparison, maps={}) if result.comparison else None
-        return replace(result, images={}, comparison=comparison)  # those of hundreds would fill the memory
+        return result if maps else _without_images(result)  # those of hundreds would fill the memory
 
     # Together, the pairs that are compared at once have no more values than one pair may have.
     most = 2 * settings.max_values
@@ -94,17 +88,20 @@ def diff(
 def _values(pair: Pair) -> int:
     """The values of its two images; 0 for what cannot be read, or is no pair of files."""
     files = [path for path in (pair.reference, pair.test) if path and path.is_file()]
-    if len(files) < 2:
-        return 0
     with contextlib.suppress(Exception):  # of whatever kind: the comparison reports it
-        return sum(image_file.count_values(path, pair.how.max_values) for path in files)
+        return sum(image_file.count_values(path, pair.how.max_values) for path in files) if len(files) == 2 else 0
     return 0
+
+
+def _without_images(result: Result) -> Result:
+    comparison = replace(result.comparison, maps={}) if result.comparison else None
+    return replace(result, images={}, comparison=comparison)
 
 
 def _compared(pair: Pair, results: Results, *, keep: bool, digests: bool) -> Result:
     """The result of comparing the two sides of a pair, where it has both; ERROR for whatever goes wrong.
 
-    `keep`: the result has its images and maps, or what can be read of them. Each file is read once.
+    `keep`: one that is not equal has its images and maps, or what can be read of them. Each file is read once.
     """
     how = pair.how
     result = Result(pair.name, Status.DIFFERENT, pair.reference, pair.test, how, target=pair.target)
@@ -117,14 +114,20 @@ def _compared(pair: Pair, results: Results, *, keep: bool, digests: bool) -> Res
     else:
         try:
             if digests:  # before the images are read: what is read later and has the same digest is what was compared
-                result = replace(result, digests=_digests(result, results.roots))
-            result = _judged(result, results.roots, read, keep)
+                paths = [result.reference, result.test, *result.variants]
+                if how.reads_variance:
+                    sides = zip((result.target, result.test), results.roots, strict=True)
+                    paths += [pairing.beside(how.variance, path, root) for path, root in sides if path]
+                result = replace(result, digests={path: digest(path) for path in paths if path})
+            result = _judged(result, results.roots, read)
         except Exception as error:  # of whatever kind: the other images are still to be compared
-            exit_code.print_traceback(error)
-            text = exit_code.describe(error)
+            errors.print_traceback(error)
+            text = errors.describe(error)
             known = isinstance(error, ValueError | OSError)
             result = replace(result, status=Status.ERROR, error=text if known else f"{result.test}: {text}")
-    if not keep or result.images or result.status not in FAILED:
+    if not keep or result.status not in FAILED:
+        return _without_images(result)
+    if result.images:
         return result
     images, unread = dict[str, Image](), []
     for role, path in (("reference", pair.reference), ("test", pair.test)):
@@ -139,23 +142,20 @@ def _compared(pair: Pair, results: Results, *, keep: bool, digests: bool) -> Res
     return replace(result, images=images, unread=" ".join(unread))
 
 
-Read = Callable[[Path], Sequence[Image] | Exception]
-
-
 def _read(path: Path, how: ComparisonSpec, renders: bool) -> Sequence[Image] | Exception:
     """All renders of a folder, or all images of a file; or why they cannot be read."""
     try:
-        return file_pair.read_renders(path, how.max_values) if renders else file_pair.read(path, how)
+        return (file_pair.read_renders if renders else image_file.read_parts)(path, how.max_values)
     except Exception as error:  # of whatever kind: it is raised where the images are compared
         return error
 
 
-def _judged(result: Result, roots: tuple[Path, Path], read: Read, keep: bool) -> Result:
+def _judged(result: Result, roots: tuple[Path, Path], read: Read) -> Result:
     """The verdict against the reference, or that of a variant to which the new image is equal."""
     reference, new = result.reference, result.test
     if not (reference and new):
         return result
-    judged: list[tuple[Path, file_pair.Judged]] = []
+    judged: list[Result] = []
     failed: Exception | None = None
     for path in (reference, *result.variants):
         try:
@@ -166,35 +166,16 @@ def _judged(result: Result, roots: tuple[Path, Path], read: Read, keep: bool) ->
                 raise one
             if isinstance(two, Exception):
                 raise two
-            judged.append((path, file_pair.compare(path, (one, two), result, roots)))
+            judged.append(file_pair.compare(path, (one, two), result, roots))
         except (ValueError, OSError, MemoryError) as error:
             failed = failed or error  # unless another reference is equal
             continue
-        if judged[-1][1].comparison.verdict is Verdict.EQUAL:
-            return replace(_with(result, judged[-1][1], False), matched=path if path != reference else None)
+        if judged[-1].status is Status.EQUAL:
+            return replace(judged[-1], matched=path if path != reference else None)
     if failed:
         raise failed
-    doubt = [pair for pair in judged if pair[1].comparison.verdict is Verdict.INCONCLUSIVE]
-    return _with(result, (doubt or judged)[0][1], keep)
-
-
-def _with(result: Result, judged: file_pair.Judged, keep: bool) -> Result:
-    comparison, (one, two), warnings = judged.comparison, judged.images, tuple(filter(None, [judged.warning]))
-    result = replace(result, status=STATUSES[comparison.verdict], warnings=warnings)
-    if not keep:
-        return replace(result, comparison=replace(comparison, maps={}))
-    left_out = {} if one.mask is None else {"left out": (~one.mask).astype(np.float32)}
-    comparison = replace(comparison, maps=comparison.maps | left_out)
-    return replace(result, comparison=comparison, images={"reference": one, "test": two})
-
-
-def _digests(result: Result, roots: tuple[Path, Path]) -> Mapping[Path, str]:
-    """Of its images, and of their variances."""
-    how, paths = result.how, [result.reference, result.test, *result.variants]
-    if how.reads_variance:
-        sides = zip((result.target, result.test), roots, strict=True)
-        paths += [pairing.beside(how.variance, path, root) for path, root in sides if path]
-    return {path: digest(path) for path in paths if path}
+    doubt = [each for each in judged if each.status is Status.INCONCLUSIVE]
+    return (doubt or judged)[0]
 
 
 def digest(path: Path | None) -> str:

@@ -6,25 +6,31 @@ are embedded until the page is full: those further down keep their numbers, and 
 
 from __future__ import annotations
 
-import hashlib
+import functools
 import math
-import re
+import os
 import shlex
 import threading
 from collections import Counter
-from collections.abc import Mapping
-from pathlib import Path, PurePosixPath
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from mi_refract.io import errors
 from mi_refract.io.atomic import write_atomically
-from mi_refract.io.sanitise import printable
-from mi_refract.report.embedded_images import EmbeddedImages
+from mi_refract.io.image_file import Image
+from mi_refract.io.pixels import Pixels, block_mean
+from mi_refract.report.embedded_images import EmbeddedImages, encoded, strongest
 from mi_refract.report.html_page import rendered
 from mi_refract.report.number_text import compact, distinguishable
+from mi_refract.report.plots import histogram_svg
 
-from . import panes
+from . import flip
 from .comparison import Metric
-from .panes import Shown
 from .results import FAILED, Result, Results, Status
 from .text_reports import WORDS, sentence
 
@@ -33,7 +39,29 @@ PAGE = 13_000_000  # bytes of its images; the rest is for text
 FULL = "Not embedded: the page is full."
 IMAGE_BYTES, MAP_BYTES = 4_600_000, 1_200_000  # two images and three maps fill a page
 ARTICLES, LINES = 1000, 5000  # failures with all their numbers, and images in a line, before the page is measured
-SHORT = 60  # characters of an image's name in the name of its page
+NAMED = 10  # images without a place on the page that the command for a page of the rest names
+MAP_WIDTH, FLIP_WIDTH, HISTOGRAM_ROWS = 960, 640, 512
+SIGNED = ("difference", "t")
+
+_one_at_a_time = threading.Lock()  # what is made of a pair takes several times its memory, and every processor
+Pane = dict[str, Any]
+
+
+# The page -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The panes of a pair for the viewer of `mi_refract.report`; `note`: why others are missing."""
+
+    panes: list[Pane] = field(default_factory=list)
+    note: str = ""
+    histogram: str = ""
+
+    @property
+    def size(self) -> int:
+        """Bytes on a page."""
+        return sum(len(pane["data"]) for pane in self.panes) + len(self.histogram)
 
 
 class Page:
@@ -49,10 +77,9 @@ class Page:
         """Keep what the page shows of the result, unless those before it on the page fill it."""
         place = _place(result)
         with self._lock:
-            wanted = sum(shown.size for other, shown in self._shown.items() if other < place) <= PAGE
-        if not wanted:
-            return
-        shown = panes.of_result(result, IMAGE_BYTES, MAP_BYTES)
+            if sum(shown.size for other, shown in self._shown.items() if other < place) > PAGE:
+                return
+        shown = shown_of(result, IMAGE_BYTES, MAP_BYTES)
         with self._lock:  # what fits on the page in its order, and one more: whatever the order in which it came
             self._shown[place] = shown
             kept, total = {}, 0
@@ -65,23 +92,35 @@ class Page:
     def write(self, results: Results, context: Mapping[str, Any], replay: str = "", source: str = "") -> None:
         """Write the page. `context` is shown on top as it is; `replay`: the command that repeats the comparison.
 
-        `source`: the JSON of the comparison, where one is written. Errors: OSError for the page itself.
+        `source`: the JSON of the comparison, where one is written: only what it compared is accepted then. Errors:
+        OSError for the page itself.
         """
-        images, failures, used, full = EmbeddedImages(), [], 0, False
+        images, failures, used, rest = EmbeddedImages(), [], 0, list[str]()
         for number, result in enumerate(results.of(*FAILED), 1):
             shown = self._shown.get(_place(result))
             # The first pair is shown, however large; after one that does not fit none is.
-            full = full or shown is None or bool(used and used + shown.size > PAGE)
-            if shown is None or full:
+            if rest or shown is None or (used and used + shown.size > PAGE):
+                rest.append(result.name)
                 shown = Shown(note=FULL)
             used += shown.size
             failures.append(item(result, results, shown, images) | {"key": f"pair-{number}"})
-        content = overview(results, context, replay, source)
-        content["folder_command"] = f"{replay} --report report/" if replay else ""
+        equal = sorted((item(result, results) for result in results.of(Status.EQUAL)), key=lambda x: not x["warning"])
+        folders = results.test.is_dir() and not results.renders  # where names mean something
+        content = {
+            "title": "mi-refract diff",
+            "sentence": sentence(results),
+            "state": {0: "pass", 3: "empty"}.get(results.exit_code, "fail"),
+            "causes": Counter(cause(result) for result in results.of(*FAILED)).most_common(),
+            "context": {"reference": str(results.reference), "test": str(results.test)} | dict(context),
+            "unused": results.unused,
+            "command": replay,
+            "rest": results.command("diff", *rest[:NAMED], flags=[*results.flags, "--report", "rest.html"]),
+            "skipped": [item(result, results) for result in results.of(Status.SKIPPED)],
+            "ticks": results.command("accept", flags=["--from", source] if source else None) if folders else "",
+        }
         articles, lines = ARTICLES, LINES
         while True:
-            cut = _cut(failures, content["equal"], articles, lines)
-            text = rendered("diff.html.j2", content | cut, images)
+            text = rendered("diff.html.j2", content | _cut(failures, equal, articles, lines), images)
             if len(text) <= LIMIT or not lines:
                 break
             articles, lines = articles // 2, lines // 2
@@ -122,40 +161,17 @@ def _cut(failures: list[dict[str, Any]], equal: list[dict[str, Any]], articles: 
     }
 
 
-# What pages say of the whole, and of an image ---------------------------------------------------------------------
-
-
-def overview(results: Results, context: Mapping[str, Any], replay: str, source: str = "") -> dict[str, Any]:
-    """The top of a page: sentence, causes, settings; the images without an article; and `ticks`.
-
-    That is the command that accepts the images whose names follow it; "" where names mean nothing. By the JSON of the
-    comparison, `source`, only what was compared is accepted.
-    """
-    folders = results.test.is_dir() and not results.renders
-    equal = [item(result, results) for result in results.of(Status.EQUAL)]
-    return {
-        "title": "mi-refract diff",
-        "sentence": sentence(results),
-        "state": {0: "pass", 3: "empty"}.get(results.exit_code, "fail"),
-        "causes": Counter(cause(result) for result in results.of(*FAILED)).most_common(),
-        "context": {"reference": str(results.reference), "test": str(results.test)} | dict(context),
-        "unused": results.unused,
-        "command": replay,
-        "equal": sorted(equal, key=lambda entry: not entry["warning"]),
-        "skipped": [item(result, results) for result in results.of(Status.SKIPPED)],
-        "ticks": results.command("accept", flags=["--from", source] if source else None) if folders else "",
-    }
-
-
 def item(
-    result: Result, results: Results, shown: Shown | None = None, images: EmbeddedImages | None = None
+    result: Result,
+    results: Results,
+    shown: Shown = Shown(),
+    images: EmbeddedImages | None = None,
 ) -> dict[str, Any]:
-    """What a page says of an image; with `shown`, whose panes go to `images`, all of it."""
-    comparison, why, href = result.comparison, cause(result), page_of(result)
-    times, worst = excess(result)
-    folder = PurePosixPath(result.name).parent.as_posix()
-    words = (result.name, result.status, result.category, why)
-    text = {
+    """What the page says of an image. The panes of `shown` go to `images`."""
+    comparison, why = result.comparison, cause(result)
+    detectable = comparison.minimum_detectable if comparison else math.nan
+    commands = {"reproduce": results.reproduce(result), "accept": results.accept(result)}
+    return {
         "name": result.name,
         "status": str(result.status),
         "category": str(result.category),
@@ -164,49 +180,15 @@ def item(
         "asked": result.how.reason,
         "warning": result.warning,
         "metrics": [_metric(metric) for metric in comparison.metrics] if comparison else [],
-        "text": " ".join(words).lower(),
-        "word": word(result),
-        "href": href,
-        "folder": "" if folder == "." else folder,
-        "excess": "" if worst is None else f"{times:.9g}" if math.isfinite(times) else "Infinity",
-        "excess_text": "" if worst is None else f"{compact(times)} ×" if math.isfinite(times) else "∞",
-        "excess_of": worst.name if worst else "",
-    }
-    if shown is None or images is None:
-        return text
-    detectable = comparison.minimum_detectable if comparison else math.nan
-    sizes = {(pane["width"], pane["height"]) for pane in shown.panes[:2]}
-    commands = {"reproduce": results.reproduce(result), "accept": results.accept(result)}
-    return text | {
+        "text": " ".join((result.name, result.status, result.category, why)).lower(),
+        "word": shlex.quote(result.name) if result.test is not None and result.status in FAILED else "",
         "minimum_detectable": detectable if math.isfinite(detectable) else None,
-        "panes": [images.add(pane) for pane in shown.panes],
-        "paired": len(sizes) == 1 and len(shown.panes) > 1,
+        "panes": [images.add(pane) for pane in shown.panes] if images else [],
+        "paired": len({(pane["width"], pane["height"]) for pane in shown.panes[:2]}) == 1 and len(shown.panes) > 1,
         "note": shown.note,
         "histogram": shown.histogram,
         "commands": [(verb, command) for verb, command in commands.items() if command],
     }
-
-
-def page_of(result: Result) -> str:
-    """The page of an image in a folder's report, relative to it: named after the image, whatever the other images."""
-    short = re.sub(r"[^A-Za-z0-9._]+", "-", result.name)[-SHORT:].lstrip(".-")
-    return f"pairs/{short}-{hashlib.sha256(result.name.encode('utf-8', 'surrogateescape')).hexdigest()[:10]}.html"
-
-
-def word(result: Result) -> str:
-    """The name as a word of a shell; "" where there is nothing to accept, or where it cannot be shown as it is."""
-    acceptable = result.test is not None and result.status in FAILED and printable(result.name) == result.name
-    return shlex.quote(result.name) if acceptable else ""
-
-
-def excess(result: Result) -> tuple[float, Metric | None]:
-    """How many times its bound the number is that is furthest beyond it; None where none is."""
-    beyond = []
-    for metric in result.comparison.metrics if result.comparison else ():
-        if not metric.holds:
-            times = metric.value / metric.bound if metric.bound else math.inf
-            beyond.append((math.inf if math.isnan(times) else times, metric))
-    return max(beyond, key=lambda pair: pair[0]) if beyond else (0.0, None)
 
 
 def cause(result: Result) -> str:
@@ -217,8 +199,10 @@ def cause(result: Result) -> str:
         return WORDS[result.status]
     if None in (result.reference, result.test):
         return str(result.category)
-    metric = excess(result)[1]
-    return metric.name if metric else str(result.status)
+    beyond = [metric for metric in result.comparison.metrics if not metric.holds] if result.comparison else []
+    # The number that is the most times its bound.
+    times = [m.value / m.bound if m.bound and not math.isnan(m.value) else math.inf for m in beyond]
+    return beyond[times.index(max(times))].name if beyond else str(result.status)
 
 
 def _metric(metric: Metric) -> dict[str, str]:
@@ -228,3 +212,78 @@ def _metric(metric: Metric) -> dict[str, str]:
     text, limit = distinguishable(value, bound)
     state, sign = ("pass", "≤") if value <= bound else ("fail", ">" if value > bound else "≰")
     return {"name": metric.name, "text": text, "limit": f"{sign} {limit}", "state": state}
+
+
+# What it shows of a pair --------------------------------------------------------------------------------------------
+
+
+def shown_of(result: Result, image_bytes: float, map_bytes: float) -> Shown:
+    """Both images, their difference, FLIP, and the maps of the method, in about so many bytes an image and a map."""
+    try:
+        with _one_at_a_time:
+            return _shown(result, image_bytes, map_bytes)
+    except Exception as error:  # of whatever kind: the page is for all images
+        errors.print_traceback(error)
+        return Shown(note=f"Cannot be shown: {errors.describe(error)}")
+
+
+def _shown(result: Result, image_bytes: float, map_bytes: float) -> Shown:
+    sides: dict[str, Image] = {}
+    makers: list[Callable[[], Pane]] = []
+    for role, image in result.images.items():  # RGB or gray; of other channels the first stands for all
+        names = tuple("RGB") if {*"RGB"} <= {*image.channels} else image.channels[:1]
+        sides[role] = side = replace(image, pixels=image.select(names), channels=names)
+        paint = "code" if flip.encoding(side) == "sRGB" else "light"
+        note = "" if len(names) > 1 else f"channel {names[0]}"
+        makers.append(functools.partial(_pane, role, paint, None, side.pixels, image_bytes, note=note))
+    maps = dict(result.comparison.maps) if result.comparison else {}
+    one, two = sides.get("reference"), sides.get("test")
+    if one and two and one.pixels.shape == two.pixels.shape:
+        with np.errstate(invalid="ignore"):
+            change = two.pixels - one.pixels
+        makers.append(functools.partial(map_pane, "difference", change, map_bytes))
+        if "flip" not in maps and all(np.isfinite(x.pixels.astype(np.float32)).all() for x in (one, two)):
+            makers.append(functools.partial(_flip, one, two, map_bytes))
+    histogram = ""
+    if "p" in maps:  # a histogram shows it better than a map
+        p_values = maps.pop("p")
+        some = p_values[:: -(-len(p_values) // HISTOGRAM_ROWS)]
+        histogram = histogram_svg(some[np.isfinite(some)], "p-value", "share of the tiles", salt=result.name)
+    if "q" in maps:
+        maps["−log₁₀ q"] = -np.log10(np.maximum(maps.pop("q"), 1e-30))
+    makers += [
+        functools.partial(map_pane, name, values, map_bytes)
+        for name, values in maps.items()
+        if name != "difference" and (name != "flags" or values.any())
+    ]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # deflating is most of the work, and lets go of Python's lock
+        return Shown(list(pool.map(lambda make: make(), makers)), result.unread, histogram)
+
+
+def _pane(
+    role: str, paint: str, gain: float | None, pixels: Pixels, most: float, scale: float = 1.0, note: str = ""
+) -> Pane:
+    embedded = encoded(pixels, most, scale)
+    notes = ", ".join(filter(None, (note, embedded["note"])))
+    return {"role": role, "paint": paint, "gain": gain, **embedded, "note": notes}
+
+
+def map_pane(name: str, values: Pixels, most: float, note: str = "") -> Pane:
+    """A pane whose colours are full at the largest value; its gain starts where the upper hundredth is full."""
+    small = strongest(values.reshape(*values.shape[:2], -1), MAP_WIDTH)
+    sizes = np.abs(small[np.isfinite(small)])
+    largest = float(sizes.max(initial=0)) or 1.0
+    upper = float(np.quantile(sizes, 0.99)) if sizes.size else 0.0
+    gain = min(round(2 * math.log10(largest / upper)) / 2, 6) if upper else 0
+    side = -(-values.shape[1] // MAP_WIDTH)
+    reduced = f"strongest of {side} × {side} pixels" if side > 1 else ""
+    paint = "signed" if name in SIGNED else "heat"
+    return _pane(name, paint, gain, small, most, largest, note or reduced)
+
+
+def _flip(reference: Image, test: Image, most: float) -> Pane:
+    """The FLIP map of the images at the size in which it is shown; at full size it would take seconds."""
+    side = -(-reference.pixels.shape[1] // FLIP_WIDTH)
+    one, two = (replace(image, pixels=block_mean(image.pixels, side)) for image in (reference, test))
+    error = flip.flip_map(one, two, flip.is_hdr(one, two), max(flip.PIXELS_PER_DEGREE / side, 1.0))
+    return map_pane("flip", error, most, f"of means of {side} × {side} pixels" if side > 1 else "")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import inspect
 import typing
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels, any_channel
 
-from . import channels, flip, pixelwise, tolerance, variances, welch
+from . import channels, flip, pixelwise, variances, welch
 from .comparison import (
     Comparison,
     Verdict,
@@ -94,16 +94,15 @@ class Method:
         return kind(value)
 
 
-def _rows(image: Image, options: Options) -> Iterator[Image]:
+def _rows(image: Image, options: Options) -> tuple[Image, Image]:
     """Where black would be seen in some of the rows, the others need not be looked at: pixels are judged alone."""
-    yield replace(image, pixels=image.pixels[::ROW_STEP])
-    yield image
+    return replace(image, pixels=image.pixels[::ROW_STEP]), image
 
 
 METHODS = {
     "exact": Method(pixelwise.exact),
-    "tolerance": Method(tolerance.tolerance, _rows, tolerance.accepts_black),
-    "paired": Method(pixelwise.paired, _rows, pixelwise.accepts_black),
+    "tolerance": Method(pixelwise.tolerance, _rows, pixelwise.tolerance_accepts_black),
+    "paired": Method(pixelwise.paired, _rows, pixelwise.paired_accepts_black),
     "welch": Method(welch.compare_renders, takes_renders=True),
     "flip": Method(flip.flip, flip.views),
 }
@@ -166,7 +165,7 @@ def compare(
     result = replace(_compare(method, sides, allow_nonfinite, named, options), chosen=why)
     if method == "tolerance" and result.is_equal and result.metrics[0].value > 0 and not options.keys() & DECIDING:
         a, b = _finite_pair(*(channels.without_variances(side[0], named) for side in sides))
-        if where := tolerance.outrageous(a, b, options.get("fail", METHODS[method].options["fail"].default)):
+        if where := pixelwise.outrageous(a, b, options.get("fail", METHODS[method].options["fail"].default)):
             return result.but(Verdict.DIFFERENT, f"one pixel is far too bright: {where}")
     return result
 
@@ -181,10 +180,13 @@ def _compare(
     if not all(sides):
         raise ValueError(f"{method}: no image on one side; expected at least one")
     bare = [[channels.without_variances(image, named) for image in side] for side in sides]
-    single = len(bare[0]) == len(bare[1]) == 1
+    single, doubt = len(bare[0]) == len(bare[1]) == 1, ""
     if chosen.takes_renders:
         result = chosen.function(*(sides if single else bare), allow_nonfinite=allow_nonfinite, **checked)
-        doubt = _untested(sides[0][0], sides[1][0], allow_nonfinite) if single and result.is_equal else ""
+        if single and result.is_equal and (untested := variances.untested(sides[0][0], sides[1][0])):
+            by_tolerance = compare("tolerance", *untested, allow_nonfinite=allow_nonfinite)
+            if not by_tolerance.is_equal:
+                doubt = f"not tested, without variance: {', '.join(untested[0].channels)}: {by_tolerance.reason}"
     elif not single:
         raise ValueError(f"{method}: {len(bare[0])} and {len(bare[1])} images; expected one per side")
     else:
@@ -200,33 +202,19 @@ def _compare(
         doubt = blind_to(chosen, a, b, checked) if result.is_equal else ""
     if doubt:
         return result.but(Verdict.INCONCLUSIVE, doubt)
-    return _with_what_is_left_out(result, bare[0][0]) if result.is_equal else result
+    if not result.is_equal or (is_finite := np.isfinite(bare[0][0].pixels)).all():
+        return result
+    names = bare[0][0].channels
+    if empty := [name for name, some in zip(names, is_finite.any((0, 1)), strict=True) if not some]:
+        return result.but(Verdict.INCONCLUSIVE, f"no value is finite, and nothing was compared, in {', '.join(empty)}")
+    count = int(is_finite.size - is_finite.sum())
+    return replace(result, reason=f"{result.reason}; not compared: {count} of {is_finite.size} values, not finite")
 
 
 def _finite_pair(reference: Image, test: Image) -> tuple[Image, Image]:
     """Both with the channels in the reference's order, and 0 for what is not finite."""
     a, b = (finite(pixels) for pixels in aligned(reference, test))
     return replace(reference, pixels=a), replace(test, pixels=b, channels=reference.channels)
-
-
-def _with_what_is_left_out(result: Comparison, reference: Image) -> Comparison:
-    """The result and how many values were not finite; INCONCLUSIVE where that is all of a channel."""
-    is_finite = np.isfinite(reference.pixels).reshape(-1, len(reference.channels))
-    if is_finite.all():
-        return result
-    if empty := [name for name, some in zip(reference.channels, is_finite.any(0), strict=True) if not some]:
-        return result.but(Verdict.INCONCLUSIVE, f"no value is finite, and nothing was compared, in {', '.join(empty)}")
-    count = int(is_finite.size - is_finite.sum())
-    return replace(result, reason=f"{result.reason}; not compared: {count} of {is_finite.size} values, not finite")
-
-
-def _untested(reference: Image, test: Image, allow_nonfinite: bool) -> str:
-    """Which channels of single images whose variance is known have none themselves, and are not equal without."""
-    if not (sides := variances.untested(reference, test)):
-        return ""
-    result = compare("tolerance", *sides, allow_nonfinite=allow_nonfinite)
-    names = ", ".join(sides[0].channels)
-    return "" if result.is_equal else f"not tested, without variance: {names}: {result.reason}"
 
 
 # Would black pass? -----------------------------------------------------------------------------------------------

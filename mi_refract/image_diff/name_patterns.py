@@ -8,7 +8,6 @@ A template is a relative path in which fields stand for parts of an image's path
 
 from __future__ import annotations
 
-import fnmatch
 import functools
 import re
 from collections.abc import Collection, Mapping
@@ -20,20 +19,18 @@ _FIELD = re.compile(r"\{([^{}]*)\}(/?)")  # with the slash behind it
 
 def matches(pattern: str, name: str) -> bool:
     """Whether the whole name matches the pattern."""
-    return fnmatch.fnmatchcase(name, _without_classes(pattern))
+    return re.fullmatch(_wild(pattern), name, re.DOTALL) is not None
 
 
-def _without_classes(pattern: str) -> str:
-    """For `fnmatch`, to which brackets mean a class of characters."""
-    return pattern.replace("[", "[[]")
+def _wild(pattern: str) -> str:
+    return re.escape(pattern).replace(r"\*", ".*").replace(r"\?", ".")
 
 
 def is_template(text: str, names: Collection[str] = FIELDS) -> bool:
     """Whether it is a relative path that stays in its folder, with no other fields than these."""
     inside = not text.startswith("/") and ".." not in text.split("/")
     rest = _FIELD.sub("", text)
-    known = all(field in names for field, _ in _FIELD.findall(text))
-    return bool(text.strip()) and inside and known and not set("{}") & set(rest)
+    return bool(text.strip()) and inside and fields_of(text) <= set(names) and not set("{}") & set(rest)
 
 
 def fields(name: str) -> dict[str, str]:
@@ -55,15 +52,9 @@ def filled(template: str, values: Mapping[str, str]) -> str:
 
 def expanded(template: str, values: Mapping[str, str], names: list[str]) -> list[str]:
     """The names that match the filled template: its `*` and `?` are wild, those in the values are not."""
-    literal = {field: re.sub(r"([*?[])", r"[\1]", value) for field, value in values.items()}
-    parts = (filled(part, literal) if part.startswith("{") else _without_classes(part) for part in _split(template))
-    pattern = "".join(parts)
-    return [name for name in names if fnmatch.fnmatchcase(name, pattern)]
-
-
-def _split(template: str) -> list[str]:
-    """Its fields, each with the slash behind it, and what is between them."""
-    return re.split(r"(\{[^{}]*\}/?)", template)
+    parts = re.split(r"(\{[^{}]*\}/?)", template)
+    pattern = "".join(re.escape(filled(part, values)) if part.startswith("{") else _wild(part) for part in parts)
+    return [name for name in names if re.fullmatch(pattern, name, re.DOTALL)]
 
 
 def parsed(template: str, name: str) -> dict[str, str] | None:
@@ -74,13 +65,12 @@ def parsed(template: str, name: str) -> dict[str, str] | None:
 
 @functools.lru_cache(64)
 def _parser(template: str) -> re.Pattern[str]:
-    text, fields = "", set[str]()
-    for part in _split(template):
-        if not (match := _FIELD.fullmatch(part)):
-            text += re.escape(part)
-            continue
+    text, at, seen = "", 0, set[str]()
+    for match in _FIELD.finditer(template):
         field, slash = match.groups()
-        group = f"(?P={field})" if field in fields else f"(?P<{field}>{FIELDS[field]})"
+        group = f"(?P={field})" if field in seen else f"(?P<{field}>{FIELDS[field]})"
+        text += re.escape(template[at : match.start()])
         text += f"(?:{group}/)?" if field == "dir" and slash else group + slash
-        fields.add(field)
-    return re.compile(text)
+        at = match.end()
+        seen.add(field)
+    return re.compile(text + re.escape(template[at:]))

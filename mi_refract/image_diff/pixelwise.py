@@ -1,4 +1,10 @@
-"""Methods that look at every pixel alone: `exact` and `paired`; `tolerance` has a module of its own."""
+"""Methods that look at every pixel alone: `exact`, `paired`, and `tolerance`, which counts as OpenImageIO's `idiff`.
+
+With `tolerance` a pixel differs where one of its channels does: by more than `fail`, and by more than `fail_relative`
+of the mean of both magnitudes. The bounds are applied in `idiff`'s order: up to `allow_failures` such pixels pass,
+whatever the others say; then `fail_percent` and `hard_fail` decide, and after them the same bounds for warnings.
+`outrageous` finds what `fail_percent` should not let pass: a pixel far brighter than all around it in the other image.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +16,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.io.image_file import Image
-from mi_refract.io.pixels import Pixels
+from mi_refract.io.pixels import Pixels, any_channel
+from mi_refract.report.number_text import compact, distinguishable
 
-from .comparison import Comparison, Metric, Verdict, counted, verdict_of
+from .comparison import Comparison, Metric, Verdict, counted, place, verdict_of
 from .tile_statistics import median_nonblack, same_shape
+
+BLOCK = 2**16  # pixels whose ratios are formed at once, in float64
+# A pixel is outrageous above both of these: a detail that moves by NEAR pixels is not, nor is any code value of a
+# display where the mean is more than a hundredth of white.
+TIMES_AROUND, TIMES_MEAN, NEAR = 10.0, 100.0, 2
+
+
+def require_nonnegative(options: Mapping[str, Any]) -> None:
+    """ValueError for a number among the options that is negative or NaN."""
+    for name, value in options.items():
+        if isinstance(value, float | int) and not value >= 0:
+            raise ValueError(f"{name} = {value}; expected a number of at least 0")
 
 
 def exact(reference: Image, test: Image) -> Comparison:
@@ -21,9 +40,9 @@ def exact(reference: Image, test: Image) -> Comparison:
     a, b = reference.pixels, test.pixels
     difference = _difference(a, b)
     changed = int((a != b).any(-1).sum())
-    verdict = Verdict.DIFFERENT if changed else Verdict.EQUAL
     reason = f"{changed} of {a[..., 0].size} pixels differ" if changed else "every value is the same"
     metrics = (Metric("changed pixels", changed, 0.0), Metric("largest difference", float(difference.max()), 0.0))
+    verdict = Verdict.DIFFERENT if changed else Verdict.EQUAL
     return Comparison("exact", verdict, reason, metrics, 0.0, {"difference": difference})
 
 
@@ -91,7 +110,7 @@ def paired(
     return Comparison("paired", verdict_of(metrics), reason, metrics, maps={"difference": _difference(a, b)})
 
 
-def accepts_black(a: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
+def paired_accepts_black(a: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
     """The pixels of the reference, H × W × C, that `paired` would take for unchanged if they were black; H × W."""
     accepted: NDArray[np.bool_] = (np.abs(a) / _scale(a, np.zeros_like(a)) <= options["threshold"]).all(-1)
     return accepted
@@ -109,8 +128,134 @@ def _mean_ratio(reference: Pixels, test: Pixels) -> float:
     return two / one if one else 1.0 + two
 
 
-def require_nonnegative(options: Mapping[str, Any]) -> None:
-    """ValueError for a number among the options that is negative or NaN."""
-    for name, value in options.items():
-        if isinstance(value, float | int) and not value >= 0:
-            raise ValueError(f"{name} = {value}; expected a number of at least 0")
+# Thresholds ----------------------------------------------------------------------------------------------------
+
+
+def tolerance(
+    reference: Image,
+    test: Image,
+    *,
+    fail: Annotated[float, "absolute difference up to which values count as equal"] = 0.004,
+    fail_relative: Annotated[
+        float, "relative difference up to which values count as equal, as a share of the mean of both"
+    ] = 0.001,
+    fail_percent: Annotated[float, "percentage of the pixels that may differ by more than both"] = 0.02,
+    hard_fail: Annotated[
+        float, "largest absolute difference of any value, where more than allow_failures pixels differ"
+    ] = np.inf,
+    allow_failures: Annotated[int, "number of pixels that may differ by any amount"] = 0,
+    warn: Annotated[float, "absolute difference above which a pixel counts for a warning"] = np.inf,
+    warn_relative: Annotated[
+        float, "relative difference above which a pixel counts for a warning, as a share of the mean"
+    ] = 0.0,
+    warn_percent: Annotated[float, "percentage of the pixels that may exceed both without a warning"] = 0.0,
+    hard_warn: Annotated[float, "absolute difference of any value above which there is a warning"] = np.inf,
+) -> Comparison:
+    """Differences within absolute and relative thresholds, except for a few pixels, as `idiff` counts them.
+
+    There are warnings as in `idiff`: where more than `allow_failures` pixels differ, and that is no failure.
+    """
+    require_nonnegative(locals())
+    a, b, pixels = reference.pixels, test.pixels, counted(reference)
+    # Not OpenImageIO's own `compare`: it rounds to float32, and what that does not hold would be equal.
+    with np.errstate(over="ignore"):
+        difference = np.abs(b - a)
+        maps = {"difference": difference.astype(np.float32, copy=False)}
+    kind, largest = difference.dtype, float(difference.max())
+    failed, warned = (_beyond(difference, a, b, *x).size for x in ((fail, fail_relative), (warn, warn_relative)))
+    few = failed <= allow_failures
+    metrics = (
+        Metric("pixels beyond the tolerance", failed, max(allow_failures, _most(fail_percent, pixels))),
+        Metric("largest difference", largest, None if few else _rounded(hard_fail, kind)),
+        Metric("mean difference", float(difference.mean(dtype=np.float64))),
+        Metric("RMS difference", float(np.sqrt(np.einsum("ijk,ijk->", *2 * [difference], dtype=float) / a.size))),
+        Metric("pixels worth a warning", warned),
+    )
+    verdict = verdict_of(metrics)
+
+    by = f"by more than fail = {fail:g}" + (f", fail_relative = {fail_relative:g}" if fail_relative else "")
+    bound = f"≤ allow_failures = {allow_failures}"
+    if not few:
+        bound = f"{'≤' if metrics[0].holds else '>'} fail_percent = {fail_percent:g}"
+        bound += f", allow_failures = {allow_failures}" if allow_failures else ""
+    counts = f"{_share(failed, pixels)} differ {by} ({bound})" if failed else f"no pixel of {pixels} differs {by}"
+    at = f" at {place(difference, reference)}" if largest else ""
+    far = f"largest difference {compact(largest)}{at}"
+    if not metrics[1].holds:
+        far = "largest difference {} > hard_fail = {}".format(*distinguishable(largest, hard_fail)) + at
+    only_far = metrics[0].holds and not metrics[1].holds
+    reason = f"{far}; {counts}" if only_far else f"{counts}; {far}"
+
+    warnings = []
+    if warned > _most(warn_percent, pixels):
+        bounds = f"warn = {warn:g} (> warn_percent = {warn_percent:g})"
+        warnings.append(f"{_share(warned, pixels)} differ by more than {bounds}")
+    if largest > _rounded(hard_warn, kind):
+        warnings.append("largest difference {} > hard_warn = {}".format(*distinguishable(largest, hard_warn)))
+    warning = "; ".join(warnings) if verdict is Verdict.EQUAL and not few else ""
+    return Comparison("tolerance", verdict, reason, metrics, maps=maps, warning=warning)
+
+
+def outrageous(reference: Image, test: Image, fail: float) -> str:
+    """Where one image is TIMES_AROUND as bright as the other is within NEAR pixels, and TIMES_MEAN its mean; or "".
+
+    Differences up to `fail` are none. Both images are finite and have the same channels in the same order.
+    """
+    for image, other in ((test, reference), (reference, test)):
+        size, bright = np.abs(other.pixels), np.abs(image.pixels)
+        candidates = bright > np.maximum(TIMES_MEAN * size.mean((0, 1), dtype=np.float64), size + fail)
+        if not candidates.any():
+            continue
+        from scipy.ndimage import maximum_filter
+
+        around = maximum_filter(size, (2 * NEAR + 1, 2 * NEAR + 1, 1), mode="nearest")
+        excess = np.where(candidates & (bright > TIMES_AROUND * around), bright, 0)
+        if excess.any():
+            y, x, _ = np.unravel_index(int(excess.argmax()), excess.shape)
+            most = f"{compact(float(excess.max()))} at {place(excess, reference)}, of {image.path}"
+            return f"{most}; the other image has at most {compact(float(around[y, x].max()))} within {NEAR} pixels"
+    return ""
+
+
+def tolerance_accepts_black(a: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
+    """The pixels of the reference, H × W × C, in which `tolerance` would take black for equal; H × W.
+
+    `hard_fail` is not among the reasons: it counts for other pixels than those within `fail` only where these fail.
+    """
+    accepted = np.ones(a.shape[:2], bool)
+    accepted.reshape(-1)[_beyond(np.abs(a), a, np.zeros_like(a), options["fail"], options["fail_relative"])] = False
+    return accepted
+
+
+def _most(percent: float, pixels: int) -> int:
+    """The largest number of pixels that is not more than this percentage."""
+    # count > percent / 100 · pixels, in float64 of a float32 percentage, is what idiff asks.
+    return int(min(_rounded(percent) / 100 * pixels, pixels))
+
+
+def _rounded(bound: float, kind: np.dtype[Any] | type[np.floating[Any]] = np.float32) -> float:
+    """A threshold in the numbers of the images: a difference of one code value may lie between it and its float32."""
+    with np.errstate(over="ignore"):
+        return float(np.asarray(bound, kind))
+
+
+def _beyond(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float) -> NDArray[np.intp]:
+    """The pixels with a channel that differs by more than `most`, and than that share of the mean of both; flat.
+
+    In idiff's precision: a mean is rounded, the ratio to it is not.
+    """
+    most, share = (_rounded(bound, difference.dtype) for bound in (most, share))
+    pixels = np.flatnonzero(any_channel(difference > most))  # few: the rest is cheaper there
+    flat = [x.reshape(-1, a.shape[2]) for x in (difference, a, b)]
+    half = np.float64(0.5)  # of this type: half of a float32 would be rounded where it is subnormal
+    differing = []
+    for block in np.array_split(pixels, pixels.size // BLOCK + 1):
+        d, one, two = (x[block] for x in flat)
+        mean = (np.abs(one) * half + np.abs(two) * half).astype(d.dtype)
+        relative = np.divide(d, mean, out=np.zeros(mean.shape), where=mean > 0, dtype=np.float64)
+        differing.append(block[any_channel((d > most) & (relative > share))])
+    return np.concatenate(differing)
+
+
+def _share(count: int, pixels: int) -> str:
+    return f"{compact(100 * count / pixels)} % of the pixels ({count} of {pixels})"

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from mi_refract.io.image_file import Image
 
-from .comparison import Comparison, Verdict
+from .comparison import Comparison
 from .settings import ComparisonSpec
 
 
@@ -34,7 +34,6 @@ class Category(enum.StrEnum):
     UNKNOWN = "unknown"
 
 
-STATUSES = {Verdict.EQUAL: Status.EQUAL, Verdict.DIFFERENT: Status.DIFFERENT, Verdict.INCONCLUSIVE: Status.INCONCLUSIVE}
 FAILED = (Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE)
 CATEGORIES = {Status.EQUAL: Category.UNCHANGED, Status.DIFFERENT: Category.CHANGED}
 INCONCLUSIVE = {"": 3, "pass": 0, "fail": 1}  # exit codes by what the user wants of it
@@ -79,7 +78,17 @@ class Result:
     @property
     def warning(self) -> str:
         """What does not change the verdict, but is to be looked at; "" for nothing."""
-        return "; ".join([*self.warnings, *filter(None, [self.comparison.warning if self.comparison else ""])])
+        return "; ".join(filter(None, [*self.warnings, self.comparison.warning if self.comparison else ""]))
+
+    @property
+    def method(self) -> str:
+        """The method that was applied, or is to be."""
+        return self.comparison.method if self.comparison else self.how.method
+
+    @property
+    def method_in_words(self) -> str:
+        """The method, and why it is this one."""
+        return self.comparison.method_in_words if self.comparison else self.how.method
 
     @property
     def reason(self) -> str:

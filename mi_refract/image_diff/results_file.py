@@ -1,12 +1,14 @@
-"""Reading the JSON that `mi-refract diff --json` wrote, for accepting what it names.
+"""The JSON of `mi-refract diff --json`: written, and read again for accepting what it names.
 
-Its paths are taken as parts of two folders, which may be others than those that were compared: a CI's JSON fits the new
-images that were downloaded from it.
+When it is read, its paths are taken as parts of two folders, which may be others than those that were compared: a CI's
+JSON fits the new images that were downloaded from it.
 """
 
 from __future__ import annotations
 
 import json
+import math
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,16 +16,77 @@ from typing import Annotated, Any
 import msgspec
 
 from mi_refract.io import regular_file
+from mi_refract.io.atomic import write_atomically
 from mi_refract.io.typed_table import convert
+from mi_refract.report.row import strict
 
 from .results import FAILED, Result, Results, Status
 from .settings import ComparisonSpec, Settings
-from .text_reports import SCHEMA
+from .text_reports import sentence
 
+SCHEMA = 1
 MOST = 2**28  # bytes of a file
 EXPECTED = "expected a file that mi-refract diff --json wrote"
 PathText = Annotated[str, msgspec.Meta(min_length=1, pattern=r"^[^\0]*$")]
 Digest = Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$")]
+
+
+def write(path: str | Path, results: Results) -> None:
+    """Write `as_data` as strict JSON: NaN and the infinities become words. OSError."""
+    data = as_data(results)
+    text = json.dumps(strict(data), indent=1, allow_nan=False)
+    write_atomically(path, text + "\n")
+
+
+def as_data(results: Results) -> dict[str, Any]:
+    """`{"schema": 1, "exit_code", "sentence", "reference", "test", "counts", "results": [...]}`."""
+    counts = Counter(result.status for result in results.results)
+    entries = []
+    for result in results.results:
+        comparison, how, digests = result.comparison, result.how, None
+        if result.digests is not None and result.status in FAILED:  # of what was compared; "" where there is no file
+            one, two = (result.digests[path] if path else "" for path in (result.reference, result.test))
+            digests = {"reference": one, "test": two, "variants": [result.digests[path] for path in result.variants]}
+        entries.append({
+            "name": result.name,
+            "status": str(result.status),
+            "category": str(result.category),
+            "reason": result.reason,
+            "warning": result.warning,
+            "error": result.error,
+            "reference": result.reference,
+            "test": result.test,
+            "target": result.target,
+            "digests": digests,
+            "method": result.method,
+            "method_why": comparison.chosen if comparison else "",
+            "options": dict(how.options),
+            "channels": how.channels,
+            "variance": how.variance if how.reads_variance else "",
+            "mask": how.mask,
+            "ignore": how.ignore,
+            "why_so": how.reason,
+            "entries": how.entries,
+            "matched": result.matched,
+            "variants": result.variants,
+            "metrics": [vars(metric) for metric in comparison.metrics] if comparison else [],
+            "minimum_detectable_difference": comparison.minimum_detectable if comparison else math.nan,
+            "reproduce": results.reproduce(result),
+            "accept": results.accept(result),
+        })  # fmt: skip
+    return {
+        "schema": SCHEMA,
+        "exit_code": results.exit_code,
+        "sentence": sentence(results),
+        "reference": results.reference,
+        "test": results.test,
+        "renders": results.renders,
+        "counts": {str(status): counts[status] for status in Status},
+        "results": entries,
+    }
+
+
+# What is read of it -------------------------------------------------------------------------------------------------
 
 
 class Digests(msgspec.Struct):
@@ -101,13 +164,10 @@ def _result(where: str, entry: Entry, before: tuple[Path, Path], now: tuple[Path
         words = zip(variants, entry.digests.variants, strict=True)
         pairs = [(reference, entry.digests.reference), (test, entry.digests.test), *words]
         digests = {path: word for path, word in pairs if path}
-    how = ComparisonSpec(
-        options={"allow_nonfinite": entry.options.get("allow_nonfinite") is True}, variance=entry.variance
-    )
-    return Result(
-        entry.name, entry.status, reference, test, how, error=entry.error, digests=digests, target=target,
-        variants=variants,
-    )  # fmt: skip
+    options = {"allow_nonfinite": entry.options.get("allow_nonfinite") is True}
+    how = ComparisonSpec(options=options, variance=entry.variance)
+    result = Result(entry.name, entry.status, reference, test, how, error=entry.error)
+    return replace(result, digests=digests, target=target, variants=variants)
 
 
 def _moved(where: str, text: str | None, before: Path, now: Path) -> Path | None:

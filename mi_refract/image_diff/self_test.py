@@ -19,18 +19,17 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from mi_refract.io import image_file
-from mi_refract.io.pixels import Pixels, block_mean
+from mi_refract.io import atomic, image_file
+from mi_refract.io.pixels import Pixels, block_mean, srgb_decode, srgb_encode
 from mi_refract.report.row import Row
 
 from . import methods
 from .channels import without_variances
 from .comparison import Verdict
-from .defects import DEFECTS, Renders, through_a_file
 from .file_pair import read_renders
 from .methods import METHODS
 
@@ -53,6 +52,67 @@ TERMS = {
     UNREADABLE: "share of the trials with a file that cannot be read, an error whatever the method",
     "bound": f"{CONFIDENCE:.0%} upper bound of a rate, exact binomial (Clopper and Pearson)",
     "noise": "standard deviation of a pixel over its mean, median over the image",
+}
+
+
+Renders: TypeAlias = Pixels | list[Pixels]  # of one image: renders × H × W × C; a list where one has another size
+
+
+@dataclass(frozen=True)
+class Defect:
+    """`plant` puts the defect into an image, H × W × C; it may raise the error of a file that cannot be read.
+
+    `always_due`: every method must see it, however noisy the images are; only the first of several renders is spoilt.
+    """
+
+    text: str
+    plant: Callable[[Pixels], Pixels]
+    always_due: bool = False
+
+    def spoil(self, renders: Pixels) -> Renders:
+        """The renders with the defect in each of them, or in the first. Errors: those of `plant`."""
+        if not self.always_due:
+            return np.stack([self.plant(image) for image in renders])
+        return [self.plant(renders[0]), *renders[1:]]
+
+
+def _with_centre(image: Pixels, value: float) -> Pixels:
+    """The image with this value in all channels of the pixel in the centre."""
+    spoilt = image.copy()
+    spoilt[image.shape[0] // 2, image.shape[1] // 2] = value
+    return spoilt
+
+
+def _blurred(image: Pixels) -> Pixels:
+    from scipy.ndimage import uniform_filter
+
+    blurred: Pixels = uniform_filter(image, (3, 3, 1), mode="nearest")
+    return blurred
+
+
+def through_a_file(image: Pixels, share: float = 1.0) -> Pixels:
+    """The image written as EXR, cut to a share of the bytes, and read again. ValueError for what cannot be read."""
+    channels = image_file.named("", image).channels
+    with atomic.temporary_folder() as folder:
+        path = folder / "image.exr"
+        image_file.write_exr(path, image, channels)
+        path.write_bytes((data := path.read_bytes())[: int(share * len(data))])
+        return image_file.read(path).select(channels)
+
+
+DEFECTS = {
+    "gain": Defect("1 % brighter", lambda x: 1.01 * x),
+    "shift": Defect("one pixel to the right", lambda x: np.roll(x, 1, axis=1)),
+    "swapped channels": Defect("the first and the last", lambda x: x[..., ::-1]),
+    "blur": Defect("mean of 3 × 3 pixels", _blurred),
+    "8 bits": Defect(  # values above 1 (white) become 1
+        "through an 8-bit sRGB file", lambda x: srgb_decode(np.round(255 * srgb_encode(np.clip(x, 0, 1))) / 255)
+    ),
+    "firefly": Defect("one pixel a thousand times as bright as the mean", lambda x: _with_centre(x, 1e3 * x.mean())),
+    "NaN": Defect("one pixel of one image", lambda x: _with_centre(x, math.nan), always_due=True),
+    "Inf": Defect("one pixel of one image", lambda x: _with_centre(x, math.inf), always_due=True),
+    "wrong size": Defect("one image lacks a column", lambda x: x[:, 1:], always_due=True),
+    "truncated": Defect("half of one image's file is missing", lambda x: through_a_file(x, 0.5), always_due=True),
 }
 
 
@@ -79,11 +139,6 @@ class Tally:
     detectable: list[float] = field(default_factory=list)
 
     @property
-    def rate(self) -> float:
-        """The share of the trials in which the method saw a difference."""
-        return self.seen / self.trials
-
-    @property
     def bound(self) -> float:
         """The upper bound of the rate where the trials are independent: exact, one-sided, at CONFIDENCE."""
         from scipy import stats
@@ -105,9 +160,6 @@ class Tally:
         self.inconclusive += comparison.verdict is Verdict.INCONCLUSIVE
         if math.isfinite(comparison.minimum_detectable):
             self.detectable.append(comparison.minimum_detectable)
-
-
-# Rows ----------------------------------------------------------------------------------------------------------
 
 
 def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, setting: str) -> Row:
@@ -135,7 +187,7 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
     size = sizes(np.array(changes), np.concatenate(cleans), tallies) if cleans else {}
     large = size.get(RATIO, 0.0) > 1
     due = [m for m in tallies if always_due or m == "exact" or (large and METHODS[m].takes_renders)]
-    values = {method: tally.rate for method, tally in tallies.items()}
+    values = {method: tally.seen / tally.trials for method, tally in tallies.items()}
     values |= {"missed": float(sum(tallies[m].trials - tallies[m].seen for m in due)), **size}
     return Row(STUDY, name, case, setting, values, {"missed": 0.0}, replay=replay | {"due": due})
 
@@ -186,7 +238,7 @@ def false_alarms(
     for method, tally in tallies.items():
         if not tally.trials:
             continue
-        values = {"false alarms": tally.rate, "null pairs": float(tally.trials)}
+        values = {"false alarms": tally.seen / tally.trials, "null pairs": float(tally.trials)}
         values["inconclusive"] = tally.inconclusive / tally.trials
         budget = "false alarms"
         if independent and method in several:
@@ -248,9 +300,10 @@ def examine(renders: Pixels, case: str, trials: int = TRIALS, null_pairs: int = 
     nulls = (halves() for _ in range(null_pairs if half else 0))
     repeats = ((renders[[i]], through_a_file(renders[i])[None]) for i in range(len(renders)))
     rows += false_alarms(nulls, repeats, case, setting, independent=False)
-    if half:
-        return [*rows, Row(STUDY, "renders", case, setting, {"noise": noise(renders)})]
-    return [*rows, Row(STUDY, "renders", case, setting, reason="of fewer than four renders the noise is not known")]
+    if not half:
+        why = "of fewer than four renders the noise is not known"
+        return [*rows, Row(STUDY, "renders", case, setting, reason=why)]
+    return [*rows, Row(STUDY, "renders", case, setting, {"noise": noise(renders)})]
 
 
 def noise(renders: Pixels) -> float:

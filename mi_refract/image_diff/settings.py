@@ -1,31 +1,48 @@
-"""How each image is compared: layers of settings, merged once.
+"""How each image is compared: layers of settings, and the file and the words that they are written in.
 
-The layers are the file's `[defaults]`, then the command line, then every `[[image]]` table whose name matches, in their
-order. Each is one mapping of the same keys. A later layer replaces the keys that it sets and inherits the others; where
-it changes the method, the options that the new method does not have are dropped.
+The layers are the `[defaults]` of `mi-refract.toml`, then the command line, then every `[[image]]` table whose name
+matches, in their order. Each is one mapping of the same keys. A later layer replaces the keys that it sets and inherits
+the others; where it changes the method, the options that the new method does not have are dropped.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import platform
 import sys
-from collections.abc import Mapping, Sequence
+import tomllib
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
 
 from mi_refract.io.image_file import MAX_VALUES
+from mi_refract.io.typed_table import convert, key_table, parse_toml
 
+from . import name_patterns
 from .channels import Names
-from .masks import Rectangle
-from .methods import AUTO, METHODS, options_of_auto
+from .methods import AUTO, METHODS, Option, options_of_auto
 from .name_patterns import matches
 
 FILE = "mi-refract.toml"
 DEFAULTS, COMMAND_LINE = "defaults", "command line"
+ACCEPTED = (AUTO, *METHODS)
 SYSTEMS = {"linux": "linux", "darwin": "macos", "win32": "windows"}  # by sys.platform
 PROCESSORS = {"x86_64": "x86_64", "amd64": "x86_64", "arm64": "arm64", "aarch64": "arm64"}  # by platform.machine()
-TOLERANCE = "tolerance"  # the method that the flags of idiff are for
+WORDS = tuple(dict.fromkeys((*SYSTEMS.values(), *PROCESSORS.values())))
+BESIDE = ("stem", "name", "suffix")  # fields of a template of a file beside the reference
+ANYWHERE = ("root", *name_patterns.FIELDS)
+
+Text = Annotated[str, Meta(min_length=1)]
+Length = Annotated[int, Meta(ge=1)]
+Rectangle = tuple[int, int, Length, Length]  # x, y, width and height, as the messages of the methods count pixels
+
+
+# Layers -------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -34,10 +51,9 @@ class ComparisonSpec:
 
     `max_values`: width × height × channels of an image, at most. `skip`: not compared at all. `accept`: templates of
     other references, each as good as the first. `mask`, `ignore`: pixels that do not count, as a template of an image
-    and as rectangles. `idiff`: the flags of `idiff` that the options come from. `variance`: a template of the image
-    that holds the variance of one sample of each pixel. `channels`: those that are compared, by their names in the
-    reference and in the new image; none: all. `entries`: the tables of the settings file that apply. `error`: why the
-    settings cannot be applied.
+    and as rectangles. `variance`: a template of the image that holds the variance of one sample of each pixel.
+    `channels`: those that are compared, by their names in the reference and in the new image; none: all. `entries`: the
+    tables of the settings file that apply. `error`: why the settings cannot be applied.
     """
 
     method: str = AUTO
@@ -48,7 +64,6 @@ class ComparisonSpec:
     accept: tuple[str, ...] = ()
     mask: str = ""
     ignore: tuple[Rectangle, ...] = ()
-    idiff: str | None = None
     variance: str = ""
     channels: Names = ()
     entries: tuple[str, ...] = ()
@@ -65,9 +80,9 @@ class Entry:
     """One layer of settings.
 
     `pattern`: of the names of its images; "" for `[defaults]` and the command line, which are for all. `values`: of
-    `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `variance`, `channels`, `idiff`, `allow_nonfinite` and the
-    options of methods. `where`: its name in messages. `when`: platforms, one of which must be this one; none: all.
-    `error`: what is wrong with it.
+    `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `variance`, `channels`, `allow_nonfinite` and the options
+    of methods. `where`: its name in messages. `when`: platforms, one of which must be this one; none: all. `error`:
+    what is wrong with it.
     """
 
     pattern: str
@@ -82,12 +97,19 @@ class Entry:
         return not self.when or any(set(words.split()) <= this_platform() for words in self.when)
 
 
-@dataclass(frozen=True)
-class Map:
+class Map(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Which reference belongs to which new image: templates of both paths, with the same fields."""
 
     reference: str
     test: str
+
+    def __post_init__(self) -> None:
+        """ValueError unless both have the same fields, and no `*`."""
+        for key in ("reference", "test"):
+            _check_template(key, getattr(self, key), name_patterns.FIELDS)
+        one, two = map(name_patterns.fields_of, (self.reference, self.test))
+        if one != two or not one or "*" in self.reference + self.test:
+            raise ValueError("expected the same fields in `reference` and `test`, and no `*`")
 
 
 @dataclass(frozen=True)
@@ -152,27 +174,206 @@ def _merged(layers: Sequence[Entry]) -> dict[str, Any]:
     method = merged["method"]
     options = {key: merged.pop(key) for key in list(merged) if key in options_of(None)}
     for name in options.keys() - options_of(method):
-        expected = ", ".join(sorted(options_of(method) - {"allow_nonfinite", "idiff"})) or "none"
+        expected = ", ".join(sorted(options_of(method) - {"allow_nonfinite"})) or "none"
         raise ValueError(f"{set_by[name]}: {name}: not an option of {method}; expected {expected}")
     merged.pop("reason", None)
-    return merged | {"idiff": options.pop("idiff", None), "options": options}
+    return merged | {"options": options}
 
 
 @functools.cache
 def options_of(method: str | None) -> frozenset[str]:
-    """The names of the options that a method takes, or of all methods, with what is set in the same way."""
-    if method is None:
-        return frozenset().union(*map(options_of, METHODS))
-    names = options_of_auto() if method == AUTO else METHODS[method].options
-    return frozenset(names) | {"allow_nonfinite"} | ({"idiff"} if method == TOLERANCE else set())
+    """The names of the options that a method takes, or for None of all methods, and `allow_nonfinite`."""
+    return frozenset(_options(method)) | {"allow_nonfinite"}
 
 
-def written(channels: Names) -> str:
-    """The channels as `--set channels=` takes them."""
-    return ",".join(one if one == two else f"{one}={two}" for one, two in channels)
+def _options(method: str | None) -> dict[str, Option]:
+    """The options of a method, of those that "auto" chooses from, or for None of all."""
+    if method == AUTO:
+        return options_of_auto()
+    several = [METHODS[method]] if method else METHODS.values()
+    return {name: option for each in several for name, option in each.options.items()}
 
 
 def this_platform() -> frozenset[str]:
     """The words that `when` may hold and that are true here: the system and the processor."""
     words = SYSTEMS.get(sys.platform), PROCESSORS.get(platform.machine().lower())
     return frozenset(word for word in words if word)
+
+
+# The file -----------------------------------------------------------------------------------------------------------
+
+
+class Keys(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+    """The keys of `[defaults]`, of `[[image]]` and of `--set`."""
+
+    method: Annotated[str, Meta(description=f"the method: {', '.join(ACCEPTED)}")] = AUTO
+    allow_nonfinite: Annotated[bool, Meta(description="allow NaN or Inf where the other image has the same")] = False
+    accept: Annotated[
+        tuple[str, ...],
+        Meta(min_length=1, description="further references beside the first: templates, `*` and `?` allowed"),
+    ] = ()
+    mask: Annotated[
+        str | None,
+        Meta(description="an image beside the reference: white pixels count, black do not; {root}: the top folder"),
+    ] = None
+    ignore: Annotated[
+        tuple[Rectangle, ...],
+        Meta(min_length=1, description="rectangles of pixels that do not count: x, y, width, height"),
+    ] = ()
+    variance: Annotated[
+        str | None,
+        Meta(description="an image with the variance of one sample of each pixel, beside the image of each side"),
+    ] = None
+    channels: Annotated[
+        list[Text] | dict[Text, Text] | None,
+        Meta(description="the channels to compare: names, or { <of the reference> = <of the new image>, … }"),
+    ] = None
+
+    def __post_init__(self) -> None:
+        """ValueError for a method, a template or channels that do not exist."""
+        if self.method not in ACCEPTED:
+            raise ValueError(f"method: {self.method!r}; expected {', '.join(ACCEPTED)}")
+        for template in self.accept:
+            _check_template("accept", template, BESIDE)
+        for key, path in (("mask", self.mask), ("variance", self.variance)):
+            if path is not None:
+                _check_template(key, path, ANYWHERE)
+        if self.channels is not None:
+            names = list(self.channels.values()) if isinstance(self.channels, dict) else self.channels
+            if not names or len(set(names)) < len(names):
+                raise ValueError(f"channels: {names}; expected distinct names")
+
+
+class DefaultsKeys(Keys, forbid_unknown_fields=True, kw_only=True):
+    """The keys of `[defaults]`."""
+
+    map: Annotated[
+        Map | list[Map] | None,
+        Meta(description="templates { reference = …, test = … } of paths; without it, both sides have the same path"),
+    ] = None
+
+
+class ImageKeys(Keys, forbid_unknown_fields=True, kw_only=True):
+    """The keys of an `[[image]]` table."""
+
+    name: Annotated[Text, Meta(description="the image's path; `*` matches anything, `/` included, `?` one character")]
+    reason: Annotated[Text, Meta(description="why this image is not compared like the others")]
+    when: Annotated[
+        str | list[str] | None, Meta(description=f"the platforms, all by default: one or two of {', '.join(WORDS)}")
+    ] = None
+    skip: Annotated[bool, Meta(description="do not compare it")] = False
+
+    def __post_init__(self) -> None:
+        """ValueError for a blank reason and a platform that cannot exist, too."""
+        super().__post_init__()
+        if not self.reason.strip():
+            raise ValueError(f"reason: {self.reason!r}; expected text")
+        for words in map(str.split, _listed(self.when)):
+            kinds = [len(set(words) & set(kind.values())) for kind in (SYSTEMS, PROCESSORS)]
+            if not words or not set(words) <= set(WORDS) or max(kinds) > 1:
+                raise ValueError(f"when: {' '.join(words)!r}; expected one or two of {', '.join(WORDS)}")
+
+
+class Document(msgspec.Struct, forbid_unknown_fields=True):
+    """The file. An `[[image]]` table is checked on its own: what is wrong with it concerns its images alone."""
+
+    defaults: dict[str, Any] = {}
+    image: list[dict[str, Any]] = []
+
+
+class NameKey(msgspec.Struct):
+    """What an `[[image]]` table must have, whatever is wrong with the rest."""
+
+    name: Text
+
+
+def load(path: str | Path, command_line: Entry | None = None, max_values: int = MAX_VALUES) -> Settings:
+    """The settings of a file, with the layer of the command line.
+
+    A table with a name that is wrong in anything else is kept with its error: its images cannot be compared, the others
+    can. ValueError names the file and the key for whatever else is wrong; OSError as the system raises it.
+    """
+    path = Path(path)
+    document = parse_toml(path.read_bytes(), Document, str(path), infinite=True)
+    defaults = _values(document.defaults, DefaultsKeys, f"{path}: {DEFAULTS}")
+    maps = tuple(_listed(defaults.pop("map", None)))
+    rules = [Entry("", defaults, DEFAULTS), *([command_line] if command_line else [])]
+    for number, table in enumerate(document.image):
+        where = f"image[{number}]"
+        name = convert({key: table[key] for key in table if key == "name"}, NameKey, f"{path}: {where}").name
+        try:
+            values = _values(table, ImageKeys, f"{path}: {where}")
+        except ValueError as error:
+            rules.append(Entry(name, {}, where, error=str(error)))
+            continue
+        del values["name"]
+        rules.append(Entry(name, values, where, tuple(_listed(values.pop("when", None)))))
+    return Settings(tuple(rules), maps, max_values)
+
+
+def from_words(method: str, words: Sequence[str]) -> Entry:
+    """The layer of the command line: `--method`, `--set KEY=VALUE`. ValueError for anything else."""
+    if method not in ACCEPTED:
+        raise ValueError(f"--method {method}; expected {', '.join(ACCEPTED)}")
+    table: dict[str, Any] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals or key in table:
+            raise ValueError(f"--set {word}; expected KEY=VALUE, each key once")
+        table[key] = _value(key, value)
+    if method != AUTO and "method" in table:
+        raise ValueError(f"--set method={table['method']} with --method; expected one of them")
+    values = _values(table, Keys, "--set", method)
+    return Entry("", values if method == AUTO else {"method": method, **values}, COMMAND_LINE)
+
+
+def _value(key: str, text: str) -> Any:
+    """A value as the command line writes it: TOML in brackets, channels between commas, a number, a flag, or text."""
+    if text[:1] in ("[", "{"):
+        with contextlib.suppress(ValueError):  # it may be a template
+            return tomllib.loads(f"value = {text}")["value"]
+    if key == "channels":
+        parts = [part.partition("=") for part in text.split(",")]
+        pairs = [(one.strip(), (two if equals else one).strip()) for one, equals, two in parts]
+        return dict(pairs) if len(dict(pairs)) == len(pairs) else [one for one, _ in pairs]
+    for number in (int, float):
+        with contextlib.suppress(ValueError):
+            return number(text)
+    return {"true": True, "false": False}.get(text, text)
+
+
+def _values(table: dict[str, Any], kind: type[Keys], where: str, method: str | None = None) -> dict[str, Any]:
+    """The checked values of the keys that are set. Options are those of the method, or of any where none is set."""
+    method = table.get("method", method)
+    checked = convert(table, _struct(kind, kind.__name__, method if method in ACCEPTED else None), where, infinite=True)
+    values = {key: getattr(checked, key) for key in table}
+    if "channels" in values:
+        named = values["channels"]
+        values["channels"] = tuple(named.items()) if isinstance(named, dict) else tuple(zip(named, named, strict=True))
+    return values
+
+
+def _struct(kind: type[msgspec.Struct], name: str, method: str | None) -> Any:
+    """The struct with the options of a method besides."""
+    fields = [(x.name, Annotated[x.type, Meta(description=x.help)], x.default) for x in _options(method).values()]
+    return msgspec.defstruct(name, fields, bases=(kind,), forbid_unknown_fields=True, kw_only=True)
+
+
+def _check_template(key: str, text: str, names: Collection[str]) -> None:
+    if not name_patterns.is_template(text, names):
+        fields = ", ".join(f"{{{name}}}" for name in names)
+        raise ValueError(f"{key}: {text!r}; expected a relative path inside the folder that may hold {fields}")
+
+
+def _listed(value: Any) -> list[Any]:
+    """A list as it is, None as an empty one, anything else as a list of it."""
+    return value if isinstance(value, list) else [] if value is None else [value]
+
+
+def key_tables() -> str:
+    """The keys of a settings file, and the options of each method, in Markdown."""
+    parts = [key_table("`[defaults]`", DefaultsKeys), key_table("`[[image]]`", ImageKeys)]
+    for name, method in METHODS.items():
+        parts.append(f"`{name}`: {method.summary}")
+        parts += [key_table("option", _struct(msgspec.Struct, name, name))] if method.options else []
+    return "\n\n".join(parts)

@@ -1,34 +1,25 @@
-"""The results of `diff` as text: printed, for scripts (JSON), test runners (JUnit) and GitHub.
+"""The results of `diff` as text: printed, for test runners (JUnit) and for GitHub.
 
 Names of files and messages of errors may hold any character: each format escapes what would be read as more than text.
 """
 
 from __future__ import annotations
 
-import json
-import math
 import os
 import re
 import sys
-import unicodedata
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 from urllib.parse import quote
 
-from mi_refract.io.atomic import write_atomically
 from mi_refract.io.sanitise import printable
 from mi_refract.report.number_text import compact, distinguishable
-from mi_refract.report.row import strict
 
-from . import idiff_flags
 from .pairing import Pair
 from .results import FAILED, Result, Results, Status
-from .settings import written
 
-SCHEMA = 1
 FEW = 20  # equal images that are listed one by one
 SUMMARY_ROWS = 500  # GitHub cuts a summary at 1 MiB
 WORDS = {
@@ -38,14 +29,8 @@ WORDS = {
     Status.EQUAL: "equal",
     Status.SKIPPED: "skipped",
 }
-STYLES = {
-    "different": "bold red",
-    "added": "bold red",
-    "removed": "bold red",
-    "inconclusive": "yellow",
-    "equal": "green",
-    "skipped": "dim",
-}  # of rich, by the first word of a row
+RED = dict.fromkeys(("different", "added", "removed"), "bold red")
+STYLES = RED | {"inconclusive": "yellow", "equal": "green", "skipped": "dim"}  # of rich, by the first word of a row
 Rows = list[tuple[str, ...]]  # of a table; the first holds the names of the columns
 
 
@@ -55,14 +40,17 @@ Rows = list[tuple[str, ...]]  # of a table; the first holds the names of the col
 def print_results(results: Results) -> None:
     """Print the table on stdout, and on stderr a line for each image that could not be compared, and for warnings."""
     print_errors(results)
-    lines = without_effect(results) + [f"{pattern}: matches no image" for pattern in results.unused]
-    for line in lines:
-        print(f"mi-refract: {printable(line)}", file=sys.stderr)
+    for pattern in results.unused:
+        print(f"mi-refract: {printable(pattern)}: matches no image", file=sys.stderr)
     if len(results.results) > len(results.of(Status.ERROR)):
-        print_table(table(results), STYLES)
-        more = len([result for result in results.of(Status.EQUAL) if not result.warning]) - FEW
-        if more > 0:
-            print(f"… and {more} more that are equal")
+        equal = [result for result in results.of(Status.EQUAL) if not result.warning]
+        failed = results.of(Status.DIFFERENT, Status.INCONCLUSIVE)
+        rows: Rows = [("verdict", "image", "method", "why")]
+        for result in [*failed, *_warned(results), *equal[:FEW], *results.of(Status.SKIPPED)]:
+            rows.append((_word(result), result.name, result.method_in_words, why(result)))
+        print_table(rows, STYLES)
+        if len(equal) > FEW:
+            print(f"… and {len(equal) - FEW} more that are equal")
         print(sentence(results))
 
 
@@ -73,35 +61,17 @@ def print_errors(results: Results) -> None:
 
 
 def print_table(rows: Rows, styles: Mapping[str, str] | None = None) -> None:
-    """Print it on stdout: by rich on a terminal, else as plain text. `styles`: of rich, by the first cell of a row."""
-    terminal = sys.stdout.isatty()
-    if len(rows) < 2 or not (terminal or os.environ.get("FORCE_COLOR")):
-        print(plain(rows))
-        return
+    """Print it on stdout, made printable. `styles`: of rich, by the first cell of a row."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     shown = Table(*rows[0], box=None, pad_edge=False)
-    for first, *others in rows[1:]:
+    for row in rows[1:]:
+        first, *others = map(printable, row)
         shown.add_row(Text(first, style=(styles or {}).get(first, "")), *map(Text, others))
     # In a file it is as wide as it must be: no line of a log is a wrapped one.
-    Console(width=None if terminal else 10_000).print(shown, highlight=False)
-
-
-def plain(rows: Rows) -> str:
-    """The rows in columns, one line each however long."""
-    widths = [max(map(_width, column)) for column in zip(*rows, strict=True)]
-    padded = ([cell + " " * (w - _width(cell)) for cell, w in zip(row, widths, strict=True)] for row in rows)
-    return "\n".join("  ".join(cells).rstrip() for cells in padded)
-
-
-def _width(text: str) -> int:
-    """The columns of a terminal that the text takes."""
-    if text.isascii():
-        return len(text)
-    wide = sum(unicodedata.east_asian_width(character) in "WF" for character in text)
-    return len(text) + wide - sum(unicodedata.combining(character) > 0 for character in text)
+    Console(width=None if sys.stdout.isatty() else 100_000).print(shown, highlight=False)
 
 
 def sentence(results: Results) -> str:
@@ -115,17 +85,6 @@ def sentence(results: Results) -> str:
     return f"{number} image{'' if number == 1 else 's'}: {counted}{warned}{also}"
 
 
-def table(results: Results) -> Rows:
-    """Failures first, then equal images with a warning, FEW others, and skipped ones."""
-    equal = [result for result in results.of(Status.EQUAL) if not result.warning]
-    failed = [*results.of(Status.DIFFERENT, Status.INCONCLUSIVE), *_warned(results)]
-    rows: Rows = [("verdict", "image", "method", "why")]
-    for result in [*failed, *equal[:FEW], *results.of(Status.SKIPPED)]:
-        cells = (_word(result), result.name, _method(result, in_words=True), why(result))
-        rows.append(tuple(map(printable, cells)))
-    return rows
-
-
 def settings_table(pairs: Sequence[Pair]) -> Rows:
     """How each image would be compared, and the tables of the settings file that say so."""
     rows: Rows = [("image", "compared by", "from", "why")]
@@ -134,19 +93,12 @@ def settings_table(pairs: Sequence[Pair]) -> Rows:
         if not how.skip:
             parts = [how.method, *(f"{name}={value}" for name, value in how.options.items())]
             variants = ", ".join(path.relative_to(pair.target.parent).as_posix() for path in pair.variants)
-            others = {"or": variants, "mask": how.mask, "variance": how.variance, "channels": written(how.channels)}
+            named = ",".join(one if one == two else f"{one}={two}" for one, two in how.channels)
+            others = {"or": variants, "mask": how.mask, "variance": how.variance, "channels": named}
             parts += [f"{name} {value}" for name, value in others.items() if value]
             parts += [f"without {list(rectangle)}" for rectangle in how.ignore]
-        cells = pair.name, ", ".join(parts), ", ".join(how.entries) or "–", how.reason
-        rows.append(tuple(map(printable, cells)))
+        rows.append((pair.name, ", ".join(parts), ", ".join(how.entries) or "–", how.reason))
     return rows
-
-
-def without_effect(results: Results) -> list[str]:
-    """A line for each set of `idiff`'s flags with some that have no effect here."""
-    texts = {result.how.idiff or "" for result in results.results}
-    ignored = (idiff_flags.parse(text).ignored for text in sorted(texts))
-    return [f"idiff {' '.join(flags)}: no effect; --report OUT.html shows the difference" for flags in ignored if flags]
 
 
 def why(result: Result) -> str:
@@ -163,75 +115,7 @@ def _word(result: Result) -> str:
     return str(result.category) if None in (result.reference, result.test) else str(result.status)
 
 
-def _method(result: Result, *, in_words: bool = False) -> str:
-    if result.comparison is None:
-        return result.how.method
-    return result.comparison.method_in_words if in_words else result.comparison.method
-
-
-# Files --------------------------------------------------------------------------------------------------------------
-
-
-def write_json(path: str | Path, results: Results) -> None:
-    """Write `as_data` as strict JSON: NaN and the infinities become words. OSError."""
-    data = as_data(results)
-    text = json.dumps(strict(data), indent=1, allow_nan=False)
-    write_atomically(path, text + "\n")
-
-
-def as_data(results: Results) -> dict[str, Any]:
-    """`{"schema": 1, "exit_code", "sentence", "reference", "test", "counts", "results": [...]}`."""
-    counts = Counter(result.status for result in results.results)
-    return {
-        "schema": SCHEMA,
-        "exit_code": results.exit_code,
-        "sentence": sentence(results),
-        "reference": results.reference,
-        "test": results.test,
-        "renders": results.renders,
-        "counts": {str(status): counts[status] for status in Status},
-        "results": [_entry(results, result) for result in results.results],
-    }
-
-
-def _entry(results: Results, result: Result) -> dict[str, Any]:
-    comparison, how, digests = result.comparison, result.how, None
-    if result.digests is not None and result.status in FAILED:  # of what was compared; "" where there is no file
-        digests = {
-            "reference": result.digests[result.reference] if result.reference else "",
-            "test": result.digests[result.test] if result.test else "",
-            "variants": [result.digests[path] for path in result.variants],
-        }
-    return {
-        "name": result.name,
-        "status": str(result.status),
-        "category": str(result.category),
-        "reason": result.reason,
-        "warning": result.warning,
-        "error": result.error,
-        "reference": result.reference,
-        "test": result.test,
-        "target": result.target,
-        "digests": digests,
-        "method": _method(result),
-        "method_why": comparison.chosen if comparison else "",
-        "options": dict(how.options),
-        "idiff": how.idiff,
-        "channels": [list(pair) for pair in how.channels],
-        "variance": how.variance if how.reads_variance else "",
-        "mask": how.mask,
-        "ignore": [list(rectangle) for rectangle in how.ignore],
-        "why_so": how.reason,
-        "entries": list(how.entries),
-        "matched": result.matched,
-        "variants": list(result.variants),
-        "metrics": [
-            {"name": m.name, "value": m.value, "bound": m.bound} for m in (comparison.metrics if comparison else ())
-        ],
-        "minimum_detectable_difference": comparison.minimum_detectable if comparison else math.nan,
-        "reproduce": results.reproduce(result),
-        "accept": results.accept(result),
-    }
+# JUnit --------------------------------------------------------------------------------------------------------------
 
 
 def write_junit(path: str | Path, results: Results) -> None:
@@ -246,17 +130,16 @@ def write_junit(path: str | Path, results: Results) -> None:
         outcome: Literal["", "failure", "error", "skipped"]
         outcome = "skipped" if result.status is Status.SKIPPED else _outcome(results, result)
         details = [f"warning: {result.warning}"] if result.warning and not outcome else []
-        if outcome in ("failure", "error"):
+        kind, message = _word(result) if outcome in ("failure", "error") else "", why(result) if outcome else ""
+        if kind:
+            commands = {"reproduce": results.reproduce(result), "accept": results.accept(result)}
+            details += [f"{verb}: {line}" for verb, line in commands.items() if line]
             for metric in result.comparison.metrics if result.comparison else ():
                 value, bound = compact(metric.value), ""
                 if metric.bound is not None:
                     value, bound = distinguishable(metric.value, metric.bound)
                 details.append(f"{metric.name} {value}" + (f" (allowed {bound})" if bound else ""))
-            commands = {"reproduce": results.reproduce(result), "accept": results.accept(result)}
-            details += [f"{verb}: {line}" for verb, line in commands.items() if line]
-        kind = _word(result) if outcome in ("failure", "error") else ""
-        message = why(result) if outcome else ""
-        cases.append(junit.Case(_method(result), result.name, outcome, message, details, kind))
+        cases.append(junit.Case(result.method, result.name, outcome, message, details, kind))
     junit.write_junit(path, "mi-refract diff", {str(results.test): cases})
 
 
@@ -279,12 +162,9 @@ def workflow_commands(results: Results) -> list[str]:
     for result in results.results:
         if result.warning or result.status in FAILED:
             level = "error" if _outcome(results, result) else "warning"
-            properties = {
-                "file": result.test or result.reference or result.name,
-                "title": f"{result.name}: {_word(result)}",
-            }
-            escaped = {k: _message(v).replace(":", "%3A").replace(",", "%2C") for k, v in properties.items()}
-            lines.append(f"::{level} file={escaped['file']},title={escaped['title']}::{_message(why(result))}")
+            file, title = result.test or result.reference or result.name, f"{result.name}: {_word(result)}"
+            file, title = (_message(x).replace(":", "%3A").replace(",", "%2C") for x in (file, title))
+            lines.append(f"::{level} file={file},title={title}::{_message(why(result))}")
     return lines
 
 
@@ -292,60 +172,40 @@ def _message(text: object) -> str:
     return printable(text).replace("%", "%25")
 
 
-@dataclass(frozen=True)
-class Pages:
-    """Where a report is, for links: `name`, and `page` of each result ("" in one file). `url`: where it is published.
-
-    Below a URL that ends in / every page has its own; another one is that of an archive, in which none has.
-    """
-
-    name: str
-    page: Callable[[Result], str]
-    url: str = ""
-
-
-def append_summary(results: Results, pages: Pages | None = None) -> None:
+def append_summary(results: Results, report: str = "", url: str = "") -> None:
     """Append the Markdown to the file that GitHub names in $GITHUB_STEP_SUMMARY, where it does. OSError."""
     if path := os.environ.get("GITHUB_STEP_SUMMARY"):
         with Path(path).open("a", encoding="utf-8") as file:
-            file.write(markdown(results, pages))
+            file.write(markdown(results, report, url))
 
 
-def markdown(results: Results, pages: Pages | None = None) -> str:
-    """A heading with the sentence, where the report is, and a table of what is not equal or has a warning."""
+def markdown(results: Results, report: str = "", url: str = "") -> str:
+    """A heading with the sentence, where the report is, and a table of what is not equal or has a warning.
+
+    No summary can show an image of an artefact, nor link into one. So a report without a `url` is only named.
+    """
     failed = [*results.of(*FAILED), *_warned(results)]
-    lines = [f"### mi-refract diff: {sentence(results)}", "", *([_where(pages), ""] if pages else [])]
-    columns = ["verdict", "image", "method", "why"]
-    if pages and any(map(pages.page, failed[:1])):
-        columns.append("page")
+    lines = [f"### mi-refract diff: {sentence(results)}", ""]
+    run = [os.environ.get(f"GITHUB_{name}", "") for name in ("SERVER_URL", "REPOSITORY", "RUN_ID")]
+    if report and url:
+        lines += [f"Report: {_link(report, url)}", ""]
+    elif report:
+        artefacts = _link("artefacts of this run", f"{run[0]}/{run[1]}/actions/runs/{run[2]}#artifacts")
+        among = f", where it is uploaded among the {artefacts}" if all(run) else ""
+        lines += [f"Report: {_literal(report)}{among}", ""]
     if failed:
-        lines += [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
+        lines += ["| verdict | image | method | why |", "|---|---|---|---|"]
     for result in failed[:SUMMARY_ROWS]:
-        words = (_word(result), result.name, _method(result, in_words=True), why(result))
-        cells = [_literal(word) for word in words]
-        if pages and "page" in columns:
-            page = pages.page(result)
-            cells.append(_link(page, pages.url + page if pages.url.endswith("/") else ""))
-        lines.append(f"| {' | '.join(cells)} |")
+        words = (_word(result), result.name, result.method_in_words, why(result))
+        lines.append(f"| {' | '.join(map(_literal, words))} |")
     if len(failed) > SUMMARY_ROWS:
         lines += ["", f"… and {len(failed) - SUMMARY_ROWS} more"]
     return "\n".join(lines) + "\n\n"
 
 
-def _where(pages: Pages) -> str:
-    """Where a reader finds the report: no summary can show an image of an artefact, nor link into one."""
-    if pages.url:
-        return "Report: " + _link(pages.name, pages.url + ("index.html" if pages.url.endswith("/") else ""))
-    run = [os.environ.get(f"GITHUB_{name}", "") for name in ("SERVER_URL", "REPOSITORY", "RUN_ID")]
-    if not all(run):
-        return f"Report: {_literal(pages.name)}"
-    link = _link("artefacts of this run", f"{run[0]}/{run[1]}/actions/runs/{run[2]}#artifacts")
-    return f"Report: {_literal(pages.name)}, where it is uploaded among the {link}"
-
-
 def _link(text: str, url: str) -> str:
-    """The text with a link to a URL, which is escaped so that it ends where the link does; without one the text."""
-    return f"[{_literal(text)}]({quote(printable(url), safe=':/?#&=%@+,;~$!*[]-._')})" if url else _literal(text)
+    """The text with a link to a URL, which is escaped so that it ends where the link does."""
+    return f"[{_literal(text)}]({quote(printable(url), safe=':/?#&=%@+,;~$!*[]-._')})"
 
 
 def _literal(text: str) -> str:

@@ -23,6 +23,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +43,6 @@ MISSED = 0.01  # the minimum detectable difference is missed with this probabili
 FAR = 10.0  # times the margin: a pixel without noise that is so far off is evidence, see `with_silent_pixels`
 UNSEEN = 1e-3  # of the margin: a tile with less noise than this decides nothing, see `Side.inflation`
 WORKERS = 2
-
-CORRECTIONS = ("sidak", "holm")
 
 Flags = NDArray[np.bool_]
 
@@ -336,16 +335,19 @@ def sidak(family_error: float, count: int) -> float:
     return float(-np.expm1(np.log1p(-family_error) / max(count, 1)))
 
 
-def holm(family_error: float, p: Array) -> float:
-    """The p at which a test is an alarm by Holm's step-down (1979): its first step, or the last one rejected.
+class Alarms(NamedTuple):
+    """Numbers of tests that differ.
 
-    Of the N tests, sorted by p, the i-th is rejected where it and all before have p ≤ family_error/(N + 1 − i).
+    `tiles`: of the means of tiles; `doubtful`: of those that are heavy-tailed, or whose noise the pixels do not show.
+    `pixels`: of the pixels of a tile. `silent`: single tiles and channels without noise whose means or pixels differ
+    beyond the margin; `silent_far`: so far beyond it, in so many pixels, that they are alarms.
     """
-    first = family_error / max(p.size, 1)
-    ordered = np.sort(p, axis=None)
-    kept = np.flatnonzero(ordered > family_error / np.arange(ordered.size, 0, -1))
-    rejected = ordered[: kept[0]] if kept.size else ordered
-    return max(first, float(rejected[-1])) if rejected.size else first
+
+    tiles: int
+    doubtful: int
+    pixels: int
+    silent_far: int
+    silent: int
 
 
 @dataclass(frozen=True)
@@ -354,7 +356,6 @@ class TileTests:
 
     levels: list[Level]
     family_error: float
-    correction: str = "sidak"
 
     @cached_property
     def p(self) -> Array:
@@ -367,45 +368,28 @@ class TileTests:
     @cached_property
     def threshold(self) -> float:
         """The p at or below which a test is an alarm."""
-        if self.correction == "holm":
-            return holm(self.family_error, self.p)
         return sidak(self.family_error, self.p.size)
 
-    def _doubtful(self, level: Level) -> Flags:
-        return level.heavy | (level.shown > self.threshold)
+    @cached_property
+    def differing(self) -> Alarms:
+        """The tests that differ."""
 
-    def _alarms(self, level: Level) -> Flags:
-        return (level.beyond <= self.threshold) & ~level.silent
+        def count(p: Array | None, among: Flags | bool = True) -> int:
+            return 0 if p is None else int(((p <= self.threshold) & among).sum())
 
-    @property
-    def differing(self) -> int:
-        """The number of tests of tiles that are alarms; heavy-tailed tiles are not among them."""
-        return sum(int((self._alarms(level) & ~self._doubtful(level)).sum()) for level in self.levels)
-
-    @property
-    def heavy_differing(self) -> int:
-        """The number of tests of heavy-tailed tiles that would be alarms."""
-        return sum(int((self._alarms(level) & self._doubtful(level)).sum()) for level in self.levels)
-
-    @property
-    def pixels_differing(self) -> int:
-        """The number of tests of the pixels of a tile that are alarms."""
-        return sum(int((p <= self.threshold).sum()) for level in self.levels if (p := level.of_pixels) is not None)
-
-    @property
-    def silent_differing(self) -> int:
-        """The number of single tiles and channels without noise whose means or pixels differ beyond the margin."""
-        return int(self.levels[0].off.sum())
-
-    @property
-    def silent_far(self) -> int:
-        """The number of those that are so far beyond it, in so many pixels, that they are alarms."""
-        return sum(int((p <= self.threshold).sum()) for level in self.levels if (p := level.of_silent) is not None)
+        tiles = doubtful = pixels = silent_far = 0
+        for level in self.levels:
+            in_doubt = level.heavy | (level.shown > self.threshold)
+            tiles += count(level.beyond, ~level.silent & ~in_doubt)
+            doubtful += count(level.beyond, ~level.silent & in_doubt)
+            pixels += count(level.of_pixels)
+            silent_far += count(level.of_silent)
+        return Alarms(tiles, doubtful, pixels, silent_far, int(self.levels[0].off.sum()))
 
     @property
     def alarms(self) -> int:
         """The number of tests that differ, whatever is known of their noise."""
-        return self.differing + self.heavy_differing + self.pixels_differing + self.silent_differing
+        return sum(self.differing) - self.differing.silent_far
 
     @property
     def smallest_p(self) -> float:

@@ -117,20 +117,34 @@ def _estimate(image: Image, side: str, spp: int, allow_nonfinite: bool) -> Estim
     names, pairs, spp = means(image.channels), spreads(image.channels), samples(image, side, spp)
     mean = image.select(names).astype(np.float64)
     variance = np.full(mean.shape, np.nan)
-    for i, name in enumerate(names):
+    for i, (name, m) in enumerate(zip(names, np.moveaxis(mean, -1, 0), strict=True)):
         if name in image.variances:
-            of_file = _not_negative(image, name)
-            variance[..., i] = _finite(image, name, mean[..., i], of_file, allow_nonfinite)
+            v = np.asarray(image.variances[name], np.float64)
+            size = np.square(image.pixels, dtype=np.float64).max(-1)
+            for other in image.variances.values():
+                size = np.maximum(size, np.abs(other))
+            if (below := v < -NEGATIVE * size).any():
+                hint = f"; of X, Y, Z that were written as colours, as Mitsuba's: channels = {list(XYZ)}"
+                raise ValueError(
+                    f"{image.path}: its variance of {name} is negative in {below.sum()} pixels, the first "
+                    f"{_at(image, below)}; expected at least 0{hint if name in 'RGB' else ''}"
+                )
         elif name in pairs:
             spread, moment = pairs[name]
-            of_channel = image.select([spread])[..., 0].astype(np.float64)
+            v = image.select([spread])[..., 0].astype(np.float64)
             if moment:  # E x² − (E x)², without bias
                 with np.errstate(invalid="ignore", over="ignore"):
-                    of_channel = (of_channel - mean[..., i] ** 2) * spp / (spp - 1)
-            variance[..., i] = _finite(image, name, mean[..., i], np.maximum(of_channel, 0), allow_nonfinite)
+                    v = (v - m**2) * spp / (spp - 1)
         elif _is_alpha(image, name):
-            # Bhatia and Davis (2000): no variance of samples from 0 to 1 is larger.
-            variance[..., i] = np.maximum(mean[..., i] * (1 - mean[..., i]), 0) * spp / (spp - 1)
+            v = m * (1 - m) * spp / (spp - 1)  # no variance of samples from 0 to 1 is larger: Bhatia and Davis (2000)
+        else:
+            continue
+        unknown = ~np.isfinite(v)
+        if (wrong := unknown & np.isfinite(m)).any() and not allow_nonfinite:
+            raise ValueError(
+                f"{image.path}: its variance of {name} is not finite {_at(image, wrong)}; expected finite values"
+            )
+        variance[..., i] = np.where(unknown, 0, np.maximum(v, 0))
     bare = replace(image, pixels=image.select(names), channels=tuple(names), variances={})
     freedom = spp - 1
     if FREEDOM in image.metadata and (image.variances or pairs):
@@ -174,31 +188,6 @@ def _shared(image: Image, of_passes: bool) -> float | None:
     if radius is None or RADIUS >= radius > 0.5:
         return None if of_passes or radius else 1.0
     return 1.0 if radius <= 0.5 else (2 * radius) ** 2
-
-
-def _not_negative(image: Image, name: str) -> Pixels:
-    """The variance from a file, with 0 for what is below by rounding. ValueError for what is negative beyond that."""
-    variance = np.asarray(image.variances[name], np.float64)
-    size = np.square(image.pixels, dtype=np.float64).max(-1)
-    for other in image.variances.values():
-        size = np.maximum(size, np.abs(other))
-    if (below := variance < -NEGATIVE * size).any():
-        hint = f"; of X, Y, Z that were written as colours, as Mitsuba's: channels = {list(XYZ)}"
-        raise ValueError(
-            f"{image.path}: its variance of {name} is negative in {below.sum()} pixels, the first {_at(image, below)}; "
-            f"expected at least 0{hint if name in 'RGB' else ''}"
-        )
-    return np.maximum(variance, 0)
-
-
-def _finite(image: Image, name: str, mean: Pixels, variance: Pixels, allow: bool) -> Pixels:
-    """The variance with 0 where the mean, or where that is allowed it, is not finite. ValueError elsewhere."""
-    unknown = ~np.isfinite(variance)
-    if (wrong := unknown & np.isfinite(mean)).any() and not allow:
-        raise ValueError(
-            f"{image.path}: its variance of {name} is not finite {_at(image, wrong)}; expected finite values"
-        )
-    return np.where(unknown, 0, variance)
 
 
 def _at(image: Image, flags: NDArray[np.bool_]) -> str:

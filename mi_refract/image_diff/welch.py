@@ -15,7 +15,6 @@ from mi_refract.io.pixels import Pixels
 from .comparison import Comparison, Maps, Metric, Verdict, aligned, finite, nonfinite_result, preconditions
 from .pixel_statistics import Inflation, inflation, rarity_exponent, sums
 from .tile_statistics import (
-    CORRECTIONS,
     Evidence,
     Level,
     OneSided,
@@ -37,7 +36,6 @@ def compare_renders(
     allow_nonfinite: bool = False,
     tile: Annotated[int, "side of a tile in pixels"] = 16,
     family_error: Annotated[float, "probability that equal images are called different"] = 0.001,
-    correction: Annotated[str, "correction for the number of tests: sidak or holm"] = "sidak",
     equivalence_margin: Annotated[float, "relative difference of a tile that counts as no difference"] = 0.001,
     resolution: Annotated[
         float, "relative difference of a tile that the noise must not hide, or the result is inconclusive"
@@ -73,7 +71,6 @@ def compare_renders(
     for name, value, valid, expected in (
         ("tile", tile, tile >= 1, "a positive whole number"),
         ("family_error", family_error, 0 < family_error < 1, "more than 0, less than 1"),
-        ("correction", correction, correction in CORRECTIONS, ", ".join(CORRECTIONS)),
         ("equivalence_margin", equivalence_margin, equivalence_margin >= 0, "at least 0"),
         ("resolution", resolution, resolution > 0, "more than 0"),
         ("hidden", hidden, 0 <= hidden <= 1, "0 to 1"),
@@ -106,13 +103,29 @@ def compare_renders(
     levels = list(replace(evidence, pixels=evidence.pixels if pixels == "yes" else None).levels(equivalence_margin))
     first, second = (finite(side[0].select(channels)) for side in (reference, test))
     levels[0] = with_silent_pixels(levels[0], first, second, equivalence_margin, tile, evidence.odds)
-    tests = TileTests(levels, family_error, correction)
+    tests = TileTests(levels, family_error)
 
     verdict, reason = _verdict(tests, resolution, hidden)
     if verdict is Verdict.INCONCLUSIVE and not tests.alarms:
-        reason += deciding(counts, unit, tests.quieter(resolution, hidden))
-    maps = _maps(levels[0], tile, reference[0].pixels.shape)
-    return Comparison("welch", verdict, reason, _metrics(tests, resolution, hidden), tests.minimum_detectable(), maps)
+        reason += _deciding(counts, unit, tests.quieter(resolution, hidden))
+    finest, differing = levels[0], tests.differing
+    share_name = f"share of the tiles whose noise hides a difference of {resolution:.2g}"
+    metrics = (
+        Metric("tests of tiles and channels that differ", differing.tiles, 0.0),
+        Metric("tests of the pixels of tiles that differ", differing.pixels, 0.0),
+        Metric("smallest p, adjusted for the number of tests", tests.smallest_p),
+        Metric("family error", family_error),
+        Metric("tiles and channels", finest.t.size),
+        Metric("tiles without noise", int(finest.silent.sum())),
+        Metric("tiles without noise that differ", differing.silent, 0.0),
+        Metric("heavy-tailed tiles", int(finest.heavy.sum())),
+        Metric("heavy-tailed tiles and blocks that differ", differing.doubtful, 0.0),
+        Metric("minimum detectable difference in a tile", tests.minimum_detectable(), resolution),
+        Metric(share_name, tests.hidden_share(resolution), hidden),
+        Metric("minimum detectable difference of the whole image", tests.minimum_detectable(-1)),
+    )
+    maps = _maps(finest, tile, reference[0].pixels.shape)
+    return Comparison("welch", verdict, reason, metrics, tests.minimum_detectable(), maps)
 
 
 # What is known of both sides -------------------------------------------------------------------------------------
@@ -197,15 +210,12 @@ def _of_estimates(a: Estimate, b: Estimate, tile: int) -> tuple[list[str], Evide
 
 
 def _verdict(tests: TileTests, resolution: float, hidden: float) -> tuple[Verdict, str]:
-    counts = {
-        "tests of tiles and channels": tests.differing,
-        "of their pixels": tests.pixels_differing,
-        "of tiles without noise": tests.silent_far,
-    }
+    tiles, doubtful, pixels, silent_far, silent = tests.differing
+    counts = {"tests of tiles and channels": tiles, "of their pixels": pixels, "of tiles without noise": silent_far}
     if differing := ", ".join(f"{count} {name}" for name, count in counts.items() if count):
         return Verdict.DIFFERENT, f"{differing} differ, of {tests.p.size} tests"
-    if tests.silent_differing or tests.heavy_differing:
-        where = f"{tests.silent_differing} without noise, {tests.heavy_differing} heavy-tailed"
+    if silent or doubtful:
+        where = f"{silent} without noise, {doubtful} heavy-tailed"
         return Verdict.INCONCLUSIVE, f"only tiles that are unsuited to a t-test differ: {where}"
     if tests.levels[0].silent.all():
         return Verdict.EQUAL, "no noise, and no tile differs beyond the margin"
@@ -217,7 +227,7 @@ def _verdict(tests: TileTests, resolution: float, hidden: float) -> tuple[Verdic
     return Verdict.EQUAL, f"no difference; one of {visible:.2g} would have been seen {where}"
 
 
-def deciding(counts: tuple[int, int], unit: str, quieter: float) -> str:
+def _deciding(counts: tuple[int, int], unit: str, quieter: float) -> str:
     """How many samples or renders divide the noise's variance by 1/`quieter`; "" where no number does.
 
     Of n₁ and n₂, `counts`, the smaller rises until 1/n₁ + 1/n₂ is `quieter` times what it was, up to the other's
@@ -230,24 +240,6 @@ def deciding(counts: tuple[int, int], unit: str, quieter: float) -> str:
     if counts[0] != counts[1] and (rest := needed - 1 / most) * most >= 1:
         count, whose = 1 / rest, "of the new image" if counts[0] > counts[1] else "of the reference"
     return f"; about {float(f'{count:.1e}'):,.0f} {unit} {whose} would decide"
-
-
-def _metrics(tests: TileTests, resolution: float, hidden: float) -> tuple[Metric, ...]:
-    finest, share = tests.levels[0], tests.hidden_share(resolution)
-    return (
-        Metric("tests of tiles and channels that differ", tests.differing, 0.0),
-        Metric("tests of the pixels of tiles that differ", tests.pixels_differing, 0.0),
-        Metric("smallest p, adjusted for the number of tests", tests.smallest_p),
-        Metric("family error", tests.family_error),
-        Metric("tiles and channels", finest.t.size),
-        Metric("tiles without noise", int(finest.silent.sum())),
-        Metric("tiles without noise that differ", tests.silent_differing, 0.0),
-        Metric("heavy-tailed tiles", int(finest.heavy.sum())),
-        Metric("heavy-tailed tiles and blocks that differ", tests.heavy_differing, 0.0),
-        Metric("minimum detectable difference in a tile", tests.minimum_detectable(), resolution),
-        Metric(f"share of the tiles whose noise hides a difference of {resolution:.2g}", share, hidden),
-        Metric("minimum detectable difference of the whole image", tests.minimum_detectable(-1)),
-    )
 
 
 def _maps(level: Level, tile: int, shape: tuple[int, ...]) -> Maps:

@@ -5,14 +5,16 @@ Pixels are arrays of H × W × C float32, row 0 at the top. A file is written co
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shlex
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, BinaryIO, TypeAlias
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +22,12 @@ from numpy.typing import ArrayLike, NDArray
 from . import atomic
 from .errors import ImageError
 
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+AHEAD = 2  # items in hand for each thread: a slow one does not leave the others idle at once
 Metadata = dict[str, Any]
 ImageInput: TypeAlias = Any  # an `OpenImageIO.ImageInput`
 ImageSpec: TypeAlias = Any  # an `OpenImageIO.ImageSpec`
@@ -122,21 +130,18 @@ def read(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> Image:
     return image
 
 
-def read_parts(
-    path: str | os.PathLike[str], max_values: int = MAX_VALUES, *, first_only: bool = False, as_idiff: bool = False
-) -> list[Image]:
+def read_parts(path: str | os.PathLike[str], max_values: int = MAX_VALUES, *, first_only: bool = False) -> list[Image]:
     """Read every image of a file, by part and MIP level; a file of any format that OpenImageIO reads, told by its name.
 
     `max_values`: width × height × channels of all together, at most; asked of each header, before memory is allocated.
-    `first_only`: of several images only the first, which has its `place` nevertheless. `as_idiff`: in the numbers that
-    `idiff` compares, float32 and colours multiplied by alpha. OSError for a file that cannot be read; ValueError for
-    one that is empty, truncated, too large, of another format than its name says, deep, or without pixels. Both are
-    one line that begins with the path.
+    `first_only`: of several images only the first, which has its `place` nevertheless. OSError for a file
+    that cannot be read; ValueError for one that is empty, truncated, too large, of another format than its name says,
+    deep, or without pixels. Both are one line that begins with the path.
     """
     path = Path(path)
-    source, kind = _checked(path, max_values, as_idiff)
+    source, kind = _checked(path, max_values)
     try:
-        return _images(path, source, kind, max_values, first_only, as_idiff)
+        return _images(path, source, kind, max_values, first_only)
     except MemoryError:
         raise ImageError(f"{path}: more pixels than fit in memory") from None
     finally:
@@ -145,7 +150,7 @@ def read_parts(
 
 def count_values(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> int:
     """Width × height × channels of all images in a file, as their headers say. Errors: those of `read_parts`."""
-    source, _ = _checked(Path(path), max_values, False)
+    source, _ = _checked(Path(path), max_values)
     try:
         specs = (source.spec() for _ in _parts(source))
         return sum(int(spec.width * spec.height * spec.nchannels) for spec in specs)
@@ -153,7 +158,7 @@ def count_values(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> 
         source.close()
 
 
-def _checked(path: Path, max_values: int, multiplied: bool) -> tuple[ImageInput, str]:
+def _checked(path: Path, max_values: int) -> tuple[ImageInput, str]:
     """OpenImageIO's reader of a file that may hold an image, and its kind for error messages."""
     kind = path.suffix[1:].upper() or "image"
     try:
@@ -169,7 +174,7 @@ def _checked(path: Path, max_values: int, multiplied: bool) -> tuple[ImageInput,
     if begin == LFS_POINTER:
         raise ImageError(f"{path}: a Git LFS pointer, not the image; run `{_lfs_pull(path)}` to fetch it")
     # Others hold 8 bytes a value or fewer, and are asked below.
-    return _opened(path, kind, max_values, max_values * (1 if begin.startswith(WHEN_OPENED) else 8), multiplied), kind
+    return _opened(path, kind, max_values, max_values * (1 if begin.startswith(WHEN_OPENED) else 8)), kind
 
 
 def _lfs_pull(path: Path) -> str:
@@ -222,15 +227,12 @@ def _text(file: BinaryIO) -> bytes:
 _opening = threading.Lock()  # OpenImageIO has one limit for all that it opens
 
 
-def _opened(
-    path: Path, kind: str, max_values: int, max_bytes: int, multiplied: bool = False, option: str = OPTION
-) -> ImageInput:
+def _opened(path: Path, kind: str, max_values: int, max_bytes: int, option: str = OPTION) -> ImageInput:
     """OpenImageIO's reader of the file, if its pixels take up to `max_bytes`. Some formats are decoded here."""
     import OpenImageIO as oiio
 
     config = oiio.ImageSpec()
-    if not multiplied:
-        config.attribute("oiio:UnassociatedAlpha", 1)  # else colours under a transparent alpha are read as black
+    config.attribute("oiio:UnassociatedAlpha", 1)  # else colours under a transparent alpha are read as black
     with _opening:
         before = oiio.get_int_attribute("limits:imagesize_MB")
         oiio.attribute("limits:imagesize_MB", min(-(-max_bytes >> 20), 2**31 - 1))
@@ -261,11 +263,11 @@ def named(name: str, pixels: ArrayLike) -> Image:
     return Image(Path(name), pixels, channels)
 
 
-def _images(path: Path, source: ImageInput, kind: str, most: int, first_only: bool, as_idiff: bool) -> list[Image]:
+def _images(path: Path, source: ImageInput, kind: str, most: int, first_only: bool) -> list[Image]:
     """The images of an open file, in the order of parts and MIP levels, with their places."""
     found: list[Image] = []
     for part in _parts(source):
-        image = _image(path, source, kind, (most, sum(each.pixels.size for each in found)), as_idiff)
+        image = _image(path, source, kind, (most, sum(each.pixels.size for each in found)))
         found.append(replace(image, part=part))
         if first_only:
             break
@@ -300,7 +302,7 @@ def _check_size(path: Path, spec: ImageSpec, max_values: int, taken: int = 0, op
         raise ImageError(f"{path}: {size}; expected up to {max_values} values{option}")
 
 
-def _image(path: Path, source: ImageInput, kind: str, values: tuple[int, int], as_idiff: bool) -> Image:
+def _image(path: Path, source: ImageInput, kind: str, values: tuple[int, int]) -> Image:
     """The part and MIP level that the source is at; `values`: how many a file may have, and has so far."""
     import OpenImageIO as oiio
 
@@ -321,7 +323,7 @@ def _image(path: Path, source: ImageInput, kind: str, values: tuple[int, int], a
         raise ImageError(f"{path}: integers of 64 bits; expected up to 32")
     if found == "tiff" and "double" in formats and spec.height == 1:  # OpenImageIO 2.4 to 3.2 reads what lay in memory
         raise ImageError(f"{path}: one row of 64-bit numbers in a TIFF file; expected several rows, or 32 bits")
-    wide = not as_idiff and formats & {"double", "uint32", "int32", "uint", "int"}
+    wide = formats & {"double", "uint32", "int32", "uint", "int"}
     at = source.current_subimage(), source.current_miplevel()
     pixels = source.read_image(*at, 0, spec.nchannels, "double" if wide else "float")
     if message := _without(path, source.geterror()) or ("" if pixels is not None else "no pixels"):
@@ -354,3 +356,48 @@ def read_exr(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> tupl
 def one_line(text: str) -> str:
     """`text` with every run of white space, line breaks among them, as one space."""
     return " ".join(text.split())
+
+
+def bounded_map(
+    work: Callable[[Item], Answer], items: Iterable[Item], takes: Callable[[Item], int], most: int, threads: int
+) -> Iterator[Answer]:
+    """Yield `work(item)` for each item, in order, from several threads. Raises what `work` raises.
+
+    Items at work, and answers that wait for their turn, take `most` together; one that takes more is alone.
+    """
+    from concurrent.futures import ThreadPoolExecutor  # not needed for one item
+
+    pending: deque[tuple[Future[Answer], int]] = deque()
+    taken = 0
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for item in items:
+                more = takes(item)
+                while pending and (taken + more > most or len(pending) >= AHEAD * threads):
+                    future, less = pending.popleft()
+                    yield future.result()
+                    taken -= less
+                pending.append((pool.submit(work, item), more))
+                taken += more
+            while pending:
+                yield pending.popleft()[0].result()
+        finally:
+            for future, _ in pending:
+                future.cancel()
+
+
+def provenance() -> dict[str, str]:
+    """Header attributes: `Software`, and `mi_refract:version:NAME` for mi_refract, mitsuba and drjit."""
+    from mi_refract import __version__
+
+    versions = {"mi_refract": __version__} | {name: installed_version(name) for name in ("mitsuba", "drjit")}
+    return {"Software": f"mi_refract {__version__}"} | {f"mi_refract:version:{n}": v for n, v in versions.items()}
+
+
+def installed_version(distribution: str) -> str:
+    """The installed version of a distribution; "unknown" where it runs without being installed."""
+    import importlib.metadata  # which takes long
+
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        return importlib.metadata.version(distribution)
+    return "unknown"

@@ -8,10 +8,7 @@ formulas, in the precision of the arrays, the second for the code that checks th
 """
 
 from . import error_free, float_expansions
-from .drjit_arrays import aligned, as_component, differentiated, from_numpy, ieee_divide, replace_grad, scale_to_unit
-from .error_free import DoubleWord, TripleWord, two_prod, two_sum
-from .float_expansions import FloatExpansion
-from .types import (
+from .drjit_arrays import (
     BSDF,
     ArrayType,
     BSDFSample,
@@ -33,7 +30,16 @@ from .types import (
     Values,
     Variant,
     Vector3,
+    aligned,
+    as_component,
+    differentiated,
+    from_numpy,
+    ieee_divide,
+    replace_grad,
+    scale_to_unit,
 )
+from .error_free import DoubleWord, TripleWord, two_prod, two_sum
+from .float_expansions import FloatExpansion
 
 __all__ = [
     "BSDF",

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from .types import Mask, Number, Vector3
+from .drjit_arrays import Mask, Number, Vector3
 
 Pair = tuple[Number, Number]
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from .drjit_arrays import Number, Vector3
 from .error_free import two_sum
-from .types import Number, Vector3
 
 FloatExpansion = list[Number]
 # Splits the 53 bits of a float64 in two halves, whose products are exact.

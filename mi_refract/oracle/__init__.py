@@ -1,8 +1,8 @@
 """Exact answers for refraction, each with a bound of what it leaves out. Needs python-flint.
 
 In: numpy arrays `a`, `n`, `k`, taken as exact numbers. Out: `Certified` directions, cosines, powers and amplitudes to
-106 bits; `residual`, whether Snell's law holds for them; `derivatives`, along a line of inputs. No formula of this
-package is imported: what judges them shares no code with them.
+106 bits; `derivatives`, along a line of inputs. No formula of this package is imported: what judges them shares no code
+with them.
 """
 
 try:
@@ -12,6 +12,5 @@ except ImportError as error:
 
 from . import derivatives
 from .ball_arithmetic import Certified, fresnel, refract, relative_radicand
-from .snell_residual import Residual, residual
 
-__all__ = ["Certified", "Residual", "derivatives", "fresnel", "refract", "relative_radicand", "residual"]
+__all__ = ["Certified", "derivatives", "fresnel", "refract", "relative_radicand"]

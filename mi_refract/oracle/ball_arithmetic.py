@@ -27,6 +27,7 @@ from flint import arb, ctx
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Table = NDArray[np.void]  # of _ROW
 Ball: TypeAlias = Any  # a `flint.arb`
 Ray = tuple[float, float, float, float, float, float, float, float | None]  # a, n, k, contrast
 Polynomials = tuple[Ball, ...]  # of the law, see `_exact`
@@ -42,10 +43,17 @@ PAIR_ERROR = 2.0**-106
 CHUNK = 256  # rays between two steps of the progress bar
 MANY = 100_000  # rays from which a progress bar is shown: about two seconds
 
-_COLUMNS = 18
-_FIRST_FRESNEL = 10
-_NO_FRESNEL = (math.nan,) * 8
-_UNDECIDED = (math.nan,) * _COLUMNS
+_UNKNOWN = complex(math.nan, math.nan)
+_NO_FRESNEL = (math.nan,) * 4 + (_UNKNOWN,) * 2
+_UNDECIDED = ((math.nan,) * 3,) * 2 + (math.nan,) * 4 + _NO_FRESNEL
+# The columns of a table of answers; of `Certified` all but `undecided`.
+_ROW = np.dtype(
+    [(name, np.float64, 3) for name in ("direction", "direction_low")]
+    + [(name, np.float64) for name in ("radius", "transmitted", "cos_i", "cos_t")]
+    + [(f"{name}{part}", np.float64) for name in ("reflectance", "transmittance") for part in ("", "_low")]
+    + [(f"amplitude_{wave}", np.complex128) for wave in "sp"]
+)
+_BLANK = np.array(_UNDECIDED, _ROW)
 
 
 @dataclass(frozen=True)
@@ -102,15 +110,20 @@ def refract(
     D = 0 is transmitted along the surface; n·a = 0 is tangential, not transmitted, b = a.
     Raises ValueError on a wrong shape or dtype; never on a value.
     """
-    a, n, k, contrast, valid = checked(a, n, k, contrast)
-    table = np.full((len(a), _COLUMNS), math.nan)
+    a, n, k, contrast, valid = _checked(a, n, k, contrast)
+    table = np.full(len(a), _BLANK)
     chunks: Iterable[int] = range(0, len(a), CHUNK)
     if progress and len(a) >= MANY and sys.stderr.isatty():
         chunks = _with_bar(chunks)
     for first in chunks:
         index = first + np.flatnonzero(valid[first : first + CHUNK])
-        _fill(table, index, (_exact(*ray) for ray in rays(a, n, k, contrast, index)), fresnel)
+        _fill(table, index, (_exact(*ray) for ray in _rays(a, n, k, contrast, index)), fresnel)
     return _certified(table, valid)
+
+
+def _certified(table: Table, valid: NDArray[np.bool_]) -> Certified:
+    columns = {name: table[name].copy() for name in _ROW.names or ()} | {"transmitted": table["transmitted"] == 1}
+    return Certified(**columns, undecided=valid & np.isnan(table["radius"]))
 
 
 def fresnel(cos_i: ArrayLike, k: ArrayLike, *, contrast: ArrayLike | None = None) -> Certified:
@@ -120,12 +133,12 @@ def fresnel(cos_i: ArrayLike, k: ArrayLike, *, contrast: ArrayLike | None = None
     """
     cos_i = _floats("cos_i", cos_i, ("N",))
     axis = np.tile([0.0, 0.0, 1.0], (len(cos_i), 1))
-    _, _, k, contrast, valid = checked(axis, axis, k, contrast)
+    _, _, k, contrast, valid = _checked(axis, axis, k, contrast)
     valid &= (cos_i >= 0) & (cos_i <= 1)
-    table, index = np.full((len(cos_i), _COLUMNS), math.nan), np.flatnonzero(valid)
+    table, index = np.full(len(cos_i), _BLANK), np.flatnonzero(valid)
     ratios = k[index].tolist(), [None] * len(index) if contrast is None else contrast[index].tolist()
     _fill(table, index, (_exact_of_cosine(*x) for x in zip(cos_i[index].tolist(), *ratios, strict=True)), True)
-    table[:, :6] = math.nan
+    table["direction"] = table["direction_low"] = math.nan
     return _certified(table, valid)
 
 
@@ -142,7 +155,7 @@ def _with_bar(chunks: Iterable[int]) -> Iterable[int]:
 # Arguments ---------------------------------------------------------------------------------------------------------
 
 
-def checked(
+def _checked(
     a: ArrayLike, n: ArrayLike, k: ArrayLike, contrast: ArrayLike | None
 ) -> tuple[Array, Array, Array, Array | None, NDArray[np.bool_]]:
     """Check shapes and dtypes; float64 arrays (it holds float32 exactly) and the mask of valid rays."""
@@ -167,7 +180,7 @@ def _floats(name: str, x: ArrayLike, *shapes: tuple[int | str, ...]) -> Array:
     return x.astype(np.float64)
 
 
-def rays(a: Array, n: Array, k: Array, contrast: Array | None, index: NDArray[np.intp]) -> Iterator[Ray]:
+def _rays(a: Array, n: Array, k: Array, contrast: Array | None, index: NDArray[np.intp]) -> Iterator[Ray]:
     """The rays with these indices, as Python floats."""
     columns = [x.tolist() for x in (*a[index].T, *n[index].T, k[index])]
     return zip(*columns, [None] * len(index) if contrast is None else contrast[index].tolist(), strict=True)
@@ -176,7 +189,7 @@ def rays(a: Array, n: Array, k: Array, contrast: Array | None, index: NDArray[np
 # The law -----------------------------------------------------------------------------------------------------------
 
 
-def _fill(table: Array, index: NDArray[np.intp], polynomials: Iterator[Polynomials], fresnel: bool) -> None:
+def _fill(table: Table, index: NDArray[np.intp], polynomials: Iterator[Polynomials], fresnel: bool) -> None:
     """Solve the rays of these polynomials, one precision after the other, into their rows of the table."""
     with ctx.workprec(EXACT_BITS):
         pending = list(zip(index, polynomials, strict=True))
@@ -185,28 +198,9 @@ def _fill(table: Array, index: NDArray[np.intp], polynomials: Iterator[Polynomia
             return
         with ctx.workprec(bits):
             solved = [_solve(exact, fresnel) for _, exact in pending]
-        table[[i for i, _ in pending]] = solved
-        pending = [p for p, row in zip(pending, solved, strict=True) if not row[6] <= MAX_RADIUS]
-    table[[i for i, _ in pending]] = math.nan
-
-
-def _certified(table: Array, valid: NDArray[np.bool_]) -> Certified:
-    fresnel = table[:, _FIRST_FRESNEL:]
-    return Certified(
-        direction=table[:, 0:3].copy(),
-        direction_low=table[:, 3:6].copy(),
-        radius=table[:, 6].copy(),
-        transmitted=table[:, 7] == 1,
-        undecided=valid & np.isnan(table[:, 6]),
-        cos_i=table[:, 8].copy(),
-        cos_t=table[:, 9].copy(),
-        reflectance=fresnel[:, 0].copy(),
-        reflectance_low=fresnel[:, 1].copy(),
-        transmittance=fresnel[:, 2].copy(),
-        transmittance_low=fresnel[:, 3].copy(),
-        amplitude_s=fresnel[:, 4] + 1j * fresnel[:, 5],
-        amplitude_p=fresnel[:, 6] + 1j * fresnel[:, 7],
-    )
+        table[[i for i, _ in pending]] = np.array(solved, _ROW)
+        pending = [p for p, row in zip(pending, solved, strict=True) if not row[2] <= MAX_RADIUS]
+    table[[i for i, _ in pending]] = _BLANK
 
 
 def _exact(ax: Ball, ay: Ball, az: Ball, nx: Ball, ny: Ball, nz: Ball, k: float, contrast: float | None) -> Polynomials:
@@ -238,7 +232,7 @@ def _exact_of_cosine(cos_i: float, k: float, contrast: float | None) -> Polynomi
     return c, arb(1), arb(1), arb(1), c2, s2, e, e + 1, c2 - e * s2, *[arb(0)] * 6
 
 
-def _solve(polynomials: Polynomials, fresnel: bool) -> tuple[float, ...]:
+def _solve(polynomials: Polynomials, fresnel: bool) -> tuple[Any, ...]:
     """One ray at the working precision: a row of the table."""
     c, aa, nn, aann, _, _, _, k2, d, tx, ty, tz, nx, ny, nz = polynomials
     tangential, total = c == 0, d < 0
@@ -263,11 +257,11 @@ def _solve(polynomials: Polynomials, fresnel: bool) -> tuple[float, ...]:
     low = float(bx - x), float(by - y), float(bz - z)
     cos_i = float(abs(c) * unit)
     terms = _fresnel(polynomials, k, root, tangential) if fresnel else _NO_FRESNEL
-    return x, y, z, *low, radius, float(transmitted), cos_i, cos_t, *terms
+    return (x, y, z), low, radius, float(transmitted), cos_i, cos_t, *terms
 
 
-def _fresnel(polynomials: Polynomials, k: Ball, root: Ball, tangential: bool) -> tuple[float, ...]:
-    """R, 1 − R as pairs, then a_s and a_p as real and imaginary part, with C = |c|, Q = √|D|.
+def _fresnel(polynomials: Polynomials, k: Ball, root: Ball, tangential: bool) -> tuple[complex, ...]:
+    """R, 1 − R as pairs, then a_s and a_p, with C = |c|, Q = √|D|.
 
     Nothing cancels that is not exact (k²C² − D = (k²−1)AN, C² − k²D = (k²−1)(|n×a|² − D)):
 
@@ -277,15 +271,15 @@ def _fresnel(polynomials: Polynomials, k: Ball, root: Ball, tangential: bool) ->
     D ≤ 0: a_s = (kC + iQ)/(kC − iQ), a_p = (C + ikQ)/(C − ikQ)
     """
     if tangential:
-        return 1.0, 0.0, 0.0, 0.0, -1.0, 0.0, -1.0, 0.0
+        return 1.0, 0.0, 0.0, 0.0, -1 + 0j, -1 + 0j
     c, _, _, aann, c2, s2, e, k2, d, *_ = polynomials
     kcq2 = 2 * (k * abs(c) * root)
     if not d > 0:
         denominator_s, k2d = e * aann, k2 * d
         denominator_p = c2 - k2d
-        s = float(1 + 2 * d / denominator_s), float(kcq2 / denominator_s)
-        p = float((c2 + k2d) / denominator_p), float(kcq2 / denominator_p)
-        return 1.0, 0.0, 0.0, 0.0, *s, *p
+        s = complex(float(1 + 2 * d / denominator_s), float(kcq2 / denominator_s))
+        p = complex(float((c2 + k2d) / denominator_p), float(kcq2 / denominator_p))
+        return 1.0, 0.0, 0.0, 0.0, s, p
     c = abs(c)
     sum_s, sum_p = k * c + root, c + k * root
     weight_s, weight_p = 1 / (sum_s * sum_s), 1 / (sum_p * sum_p)
@@ -293,7 +287,7 @@ def _fresnel(polynomials: Polynomials, k: Ball, root: Ball, tangential: bool) ->
     reflectance = (a_s * a_s + a_p * a_p) * 0.5
     transmittance = kcq2 * (weight_s + weight_p)
     r, t = float(reflectance), float(transmittance)
-    return r, float(reflectance - r), t, float(transmittance - t), float(a_s), 0.0, float(a_p), 0.0
+    return r, float(reflectance - r), t, float(transmittance - t), complex(float(a_s)), complex(float(a_p))
 
 
 def relative_radicand(a: ArrayLike, n: ArrayLike, k: ArrayLike) -> Array:
@@ -302,9 +296,9 @@ def relative_radicand(a: ArrayLike, n: ArrayLike, k: ArrayLike) -> Array:
     Exactly 0 at the critical angle, negative under total internal reflection; NaN where both terms are 0 or the ray
     is invalid. Arguments as for `refract`.
     """
-    a, n, k, _, valid = checked(a, n, k, None)
+    a, n, k, _, valid = _checked(a, n, k, None)
     index, ratio = np.flatnonzero(valid), np.full(len(a), math.nan)
-    for i, ray in zip(index, rays(a, n, k, None, index), strict=True):
+    for i, ray in zip(index, _rays(a, n, k, None, index), strict=True):
         with ctx.workprec(EXACT_BITS):
             _, _, _, _, c2, s2, e, _, d, *_ = _exact(*ray)
             larger = max(c2, abs(e) * s2)

@@ -5,7 +5,7 @@ In: directed boundaries with a refractive index on either side, straight or arcs
 an image.
 """
 
-from . import curves, figure, focal_points, light, paraxial, path_tree, scene_file, shapes
+from . import curves, figure, focal_points, light, path_tree, scene_file, shapes
 from .segments import Event, Paths, Segments
 from .tracer import Tracer, trace
 
@@ -18,7 +18,6 @@ __all__ = [
     "figure",
     "focal_points",
     "light",
-    "paraxial",
     "path_tree",
     "scene_file",
     "shapes",

@@ -31,36 +31,24 @@ class ArrayBackend:
 
     def __init__(self, backend: str, precision: str) -> None:
         """Both must be usable here: `choose_backend` checks that."""
-        self.backend, self.precision = backend, precision
-        arrays = getattr(dr, backend).ad
+        self.precision, arrays = precision, getattr(dr, backend).ad
         wide = "64" if precision == "float64" else ""
-        self.number = getattr(arrays, f"Float{wide or '32'}")
+        self._types(getattr(arrays, f"Float{wide or '32'}"), arrays, wide)
         self.index, self.mask, self.byte, self.signed = arrays.UInt32, arrays.Bool, arrays.UInt8, arrays.Int32
+
+    def _types(self, number: Any, arrays: Any, wide: str) -> None:
+        """`vector` and `vector3`: in the plane and in space; `roundoff`: u, half the distance from 1 to the next."""
+        self.number, self.roundoff = number, float(np.finfo(self.precision).eps) / 2
         self._vectors = {n: getattr(arrays, f"Array{n}f{wide}") for n in (2, 3, 4)}
-        self._indices = {1: arrays.UInt32, 2: arrays.Array2u}
-
-    @property
-    def vector(self) -> Any:
-        """The type of vectors in the plane."""
-        return self._vectors[2]
-
-    @property
-    def vector3(self) -> Any:
-        """The type of vectors in space."""
-        return self._vectors[3]
-
-    @property
-    def roundoff(self) -> float:
-        """u, half the distance from 1 to the next number."""
-        return float(np.finfo(self.precision).eps) / 2
+        self.vector, self.vector3, self._pair = self._vectors[2], self._vectors[3], arrays.Array2u
 
     def table(self, values: Any) -> Table:
         """A numpy array (N, or N × 2, or N × 4; numbers, or indices where whole) as a table of N rows to `gather`."""
         values = np.ascontiguousarray(values)
         whole = values.dtype.kind in "iu"
         columns = 1 if values.ndim == 1 else values.shape[1]
-        row = self._indices[columns] if whole else self._vectors[columns] if columns > 1 else self.number
         kind = self.index if whole else self.number
+        row = kind if columns == 1 else self._pair if whole else self._vectors[columns]
         return row, kind(aligned(values.ravel(), np.dtype(np.uint32 if whole else self.precision)))
 
     def gather(self, table: Table, i: Index, active: Mask = True) -> Any:
@@ -101,10 +89,9 @@ class ScalarBackend(ArrayBackend):
 
     def __init__(self) -> None:
         """Needs no compiler."""
-        self.backend, self.precision = "scalar", "float64"
-        self.number, self.index, self.mask, self.byte, self.signed = float, int, bool, np.uint8, np.int32
-        self._vectors = {2: dr.scalar.Array2f64, 3: dr.scalar.Array3f64, 4: dr.scalar.Array4f64}
-        self._indices = {1: int, 2: dr.scalar.Array2u}
+        self.precision = "float64"
+        self._types(float, dr.scalar, "64")
+        self.index, self.mask, self.byte, self.signed = int, bool, np.uint8, np.int32
 
     def table(self, values: Any) -> Table:
         """As a list of rows."""
@@ -112,7 +99,7 @@ class ScalarBackend(ArrayBackend):
         kind = int if values.dtype.kind in "iu" else float
         if values.ndim == 1:
             return [kind(x) for x in values]
-        row = (self._indices if kind is int else self._vectors)[values.shape[1]]
+        row = self._pair if kind is int else self._vectors[values.shape[1]]
         return [row(*map(kind, line)) for line in values]
 
     def gather(self, table: Table, i: Index, active: Mask = True) -> Any:

@@ -49,10 +49,6 @@ class Curve:
         """Which pieces are straight, M."""
         return np.asarray((self.weight == 1) & (self.control == (self.start + self.end) / 2).all(1))
 
-    def _piece(self, j: int) -> Curve:
-        vertices = np.stack([self.start[j], self.end[j]])
-        return Curve(vertices, self.control[j : j + 1], self.weight[j : j + 1], closed=False)
-
     def reversed(self) -> Curve:
         """The same curve in the opposite direction; a closed curve keeps its first vertex."""
         vertices = np.roll(self.vertices[::-1], 1, 0) if self.closed else self.vertices[::-1]
@@ -83,9 +79,10 @@ class Curve:
         if not 0 < len(arcs) <= facets:
             text = f"facets: {facets}, for {len(arcs)} arcs"
             raise ValueError(f"{text}; expected one or more arcs, and a facet or more for each")
-        steps = np.ones(len(self), int)
-        steps[arcs] = np.diff(np.arange(len(arcs) + 1) * facets // len(arcs))
-        chords = [self._piece(j).outline(int(n))[:-1] for j, n in enumerate(steps)]
+        chords = [self.start[j : j + 1] for j in range(len(self))]
+        for j, steps in zip(arcs, np.diff(np.arange(len(arcs) + 1) * facets // len(arcs)).tolist(), strict=True):
+            start, end, control, weight = (x[j : j + 1] for x in (self.start, self.end, self.control, self.weight))
+            chords[j] = _along(start, end, control, weight, steps)[0, :-1]
         return polygonal(np.concatenate(chords if self.closed else [*chords, self.vertices[-1:]]), self.closed)
 
     def outline(self, count: int = 64) -> Array:

@@ -11,20 +11,21 @@ import io
 import math
 import textwrap
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.pixels import srgb_encode
-from mi_refract.io.sanitise import printable
 
-from .figure_geometry import SHARED, Legs, around, curves, density, legs
+from .curves import points
 from .light import linear_srgb
 from .path_tree import Branches, count, summary
 from .scene_file import PlanarScene
-from .segments import Event, Segments
+from .segments import Array, Event, Segments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,10 +36,7 @@ FORMATS = (".svg", ".png", ".pdf")
 LINES, DIAGONALS = 6000, 150
 DPI = {".png": 200, ".svg": 150, ".pdf": 150}  # in the last two of raster images only
 RAY, WHITE, INK, MUTED = "#c8102e", "#55504c", "#222222", "#6b6b6b"  # WHITE: all colours together, on paper
-DENSE, THIN = (
-    (0.73, 0.85, 0.97),
-    (1.00, 0.92, 0.70),
-)  # tints of the media whose index differs most from the outermost one
+DENSE, THIN = (0.73, 0.85, 0.97), (1.00, 0.92, 0.70)  # tints of the media that differ most from the outermost one
 NIGHT, MOON = (0.06, 0.07, 0.09), "#8a93a0"  # around all shapes, and their outlines, behind rays that shine
 LINE = 0.13  # inches
 NAMED = 5  # media in the legend
@@ -48,27 +46,20 @@ MARKS = {
     Event.MEDIUM_MISMATCH: ("x", "× {} stopped: the next boundary does not border on the medium that the ray is in"),
 }
 UNDATED: dict[str, Any] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}, ".png": {}}
+TICKS = {"color": "#b5b5b5", "labelcolor": MUTED, "labelsize": 8}
 STYLE: Any = {
     "svg.hashsalt": "mi_refract",  # the same scene gives the same bytes
     "text.parse_math": False,
     "font.size": 9,
-    "axes.edgecolor": "#b5b5b5",
-    "axes.linewidth": 0.6,
-    "axes.labelcolor": MUTED,
-    "axes.titlecolor": INK,
-    "axes.titlesize": 11,
-    "axes.titlelocation": "left",
-    "axes.titlepad": 21,
-    "xtick.color": "#b5b5b5",
-    "ytick.color": "#b5b5b5",
-    "xtick.labelcolor": MUTED,
-    "ytick.labelcolor": MUTED,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-    "legend.labelcolor": INK,
+    **{"axes.edgecolor": "#b5b5b5", "axes.linewidth": 0.6, "axes.labelcolor": MUTED, "axes.titlecolor": INK},
+    **{"axes.titlesize": 11, "axes.titlelocation": "left", "axes.titlepad": 21},
+    **{f"{axis}tick.{key}": x for axis in "xy" for key, x in TICKS.items()},
+    **{"legend.frameon": False, "legend.fontsize": 8, "legend.labelcolor": INK},
 }
+MARGIN = 0.08  # around the scene, as a share of its larger side
+SHARED = -1  # the number of the colour that stands for all of them
+SAMPLES = 2**22  # pixels of lines at a time: 0.3 GB
+View = tuple[float, float, float, float]  # x0, x1, y0, y1
 
 
 def save(path: Path, scene: PlanarScene, traced: Sequence[Branches]) -> None:
@@ -97,6 +88,7 @@ def draw(scene: PlanarScene, traced: Sequence[Branches], suffix: str) -> bytes:
 
 def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> Figure:
     """The figure in matplotlib's current style; its only axes are in the scene's units."""
+    from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
     view = scene.view or around(scene, traced)
@@ -104,16 +96,37 @@ def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> 
     ratio = min(max((view[1] - view[0]) / (view[3] - view[2]), 0.25), 4)
     height = min(5.2 / ratio**0.5, 7.0)
     width, height = max(height * ratio, 3.6) + 0.6, height + 0.95
-    caption = _caption(scene, traced, int(14 * width))
+    numbers = count(traced)
+    notes = [text.format(numbers[event.name]) for event, (_, text) in MARKS.items() if numbers[event.name]]
+    lines = [f"{scene.file}: {summary(scene, traced)}", *notes]
+    caption = [part for line in lines for part in textwrap.wrap(line, int(14 * width))]
     drawn = Figure((width, height + LINE * len(caption)), dpi, layout="constrained")
     panel = drawn.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal")
-    panel.set_title("\n".join(textwrap.wrap(printable(" ".join(scene.title.split())), int(10.5 * width))))
+    panel.set_title("\n".join(textwrap.wrap(scene.heading, int(10.5 * width))))
     panel.set_xlabel("\n".join(caption), loc="left", fontsize=7.5)
     _media(panel, scene)
-    _settle(drawn)
-    _boundaries(panel, scene.segments[0], MOON if scene.light.wavelengths else INK)
+    # Fix the layout: after this an image of the density can have exactly the pixels of the panel.
+    layout = drawn.get_layout_engine()
+    assert layout is not None
+    layout.set(w_pad=0.12, h_pad=0.12)  # type: ignore[call-arg]
+    for _ in range(2):  # the first pass does not know yet where the title is
+        layout.execute(drawn)
+    panel.apply_aspect()
+    drawn.set_layout_engine("none")
+    # Boundaries, rays, and marks where a path ended without escaping.
+    many = len(scene.segments[0]) > LINES
+    outlines = curves(scene.segments[0], 5 if many else 33)
+    style: dict[str, Any] = {"colors": MOON if scene.light.wavelengths else INK, "capstyle": "round", "zorder": 1.5}
+    style["linewidths"] = 0.7 * max(min(1.0, 8 / len(outlines)), 0.15)
+    panel.add_collection(LineCollection(outlines, rasterized=many, **style), autolim=False)
+    panel.plot(0, 0, "+", color=MUTED, markersize=5, markeredgewidth=0.6, zorder=1.4, scalex=False, scaley=False)
     _rays(panel, scene, legs(traced, view))
-    _ends(panel, traced)
+    for event, (mark, _) in MARKS.items():
+        ends = np.concatenate([branches.tips[branches.end == event] for branches in traced])
+        if len(ends):
+            size = min(1.0, (40 / len(ends)) ** 0.5)
+            style = {"markersize": 1 + 4 * size, "markeredgewidth": 0.9 * size, "fillstyle": "none"}
+            panel.plot(*ends.T, mark, color=INK, zorder=3, scalex=False, scaley=False, **style)
     return drawn
 
 
@@ -121,21 +134,6 @@ def require_matplotlib() -> None:
     """ValueError, which says what to install, where matplotlib is missing."""
     if importlib.util.find_spec("matplotlib") is None:
         raise ValueError("images need the extra `plot`: pip install 'mi-refract[plot]'")
-
-
-def _settle(drawn: Figure) -> None:
-    """Fix the layout: after this an image of the density can have exactly the pixels of the panel."""
-    layout = drawn.get_layout_engine()
-    assert layout is not None
-    layout.set(w_pad=0.12, h_pad=0.12)  # type: ignore[call-arg]
-    for _ in range(2):  # the first pass does not know yet where the title is
-        layout.execute(drawn)
-    for panel in drawn.axes:
-        panel.apply_aspect()
-    drawn.set_layout_engine("none")
-
-
-# Media and boundaries ----------------------------------------------------------------------------------------------
 
 
 def _media(panel: Axes, scene: PlanarScene) -> None:
@@ -180,26 +178,26 @@ def _label(indices: Sequence[float]) -> str:
     return f"n = {low}" if low == high else f"n = {low} – {high}"
 
 
-def _boundaries(panel: Axes, segments: Segments, ink: str) -> None:
-    from matplotlib.collections import LineCollection
-
-    many = len(segments) > LINES
-    lines = curves(segments, 5 if many else 33)
-    width = 0.7 * max(min(1.0, 8 / len(lines)), 0.15)
-    style: dict[str, Any] = {"colors": ink, "linewidths": width, "capstyle": "round", "zorder": 1.5}
-    panel.add_collection(LineCollection(lines, rasterized=many, **style), autolim=False)
-    panel.plot(0, 0, "+", color=MUTED, markersize=5, markeredgewidth=0.6, zorder=1.4, scalex=False, scaley=False)
-
-
 # Rays ------------------------------------------------------------------------------------------------------------
 
 
-def strength(weight: Any) -> Any:
-    """Opacity of a ray: the square root of its share of the power, so that 4 % can be seen."""
-    return np.sqrt(weight)
+@dataclass(frozen=True)
+class Legs:
+    """L lines from `start` to `end` (L × 2), each with its share of the power and the number of its colour."""
+
+    start: Array
+    end: Array
+    weight: Array
+    colour: NDArray[np.intp]
+
+    @property
+    def strength(self) -> Array:
+        """Opacity of each: the square root of its share of the power, so that 4 % can be seen."""
+        return np.sqrt(self.weight)
 
 
 def _rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
+    from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgb
 
     if scene.light.wavelengths:  # light adds up where lines would cover each other
@@ -213,22 +211,16 @@ def _rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
             raise ValueError(f"{scene.path}: colours: {name!r}; expected a colour that matplotlib knows") from None
     x0, x1, y0, y1 = *panel.get_xlim(), *panel.get_ylim()
     crowd = np.hypot(*(lines.end - lines.start).T).sum() / math.hypot(x1 - x0, y1 - y0)
-    if len(lines) > LINES or crowd > DIAGONALS:
+    if len(lines.start) > LINES or crowd > DIAGONALS:
         _shade(panel, lines, colours, _blend)
-    elif len(lines):
-        _stroke(panel, lines, colours, min(1.0, (40 / crowd) ** 0.5))
-
-
-def _stroke(panel: Axes, lines: Legs, colours: dict[int, Any], room: float) -> None:
-    """Draw each leg as a line, thinner and fainter the less room there is; the strongest on top."""
-    from matplotlib.collections import LineCollection
-
-    order = np.argsort(lines.weight, kind="stable")
-    opacity = np.maximum(strength(lines.weight[order]) * room, 0.02)
-    rgba = np.column_stack([np.array([colours[c] for c in lines.colour[order]]), opacity])
-    strokes = np.stack([lines.start, lines.end], axis=1)[order]
-    width = 0.4 + 0.8 * room
-    panel.add_collection(LineCollection(list(strokes), colors=rgba, linewidths=width, zorder=2), autolim=False)
+    elif len(lines.start):  # thinner and fainter the less room there is; the strongest on top
+        room = min(1.0, (40 / crowd) ** 0.5)
+        order = np.argsort(lines.weight, kind="stable")
+        opacity = np.maximum(lines.strength[order] * room, 0.02)
+        rgba = np.column_stack([np.array([colours[c] for c in lines.colour[order]]), opacity])
+        strokes = list(np.stack([lines.start, lines.end], axis=1)[order])
+        style: dict[str, Any] = {"colors": rgba, "linewidths": 0.4 + 0.8 * room, "zorder": 2}
+        panel.add_collection(LineCollection(strokes, **style), autolim=False)
 
 
 def _shade(panel: Axes, lines: Legs, colours: dict[int, Any], mix: Callable[[Any, Any], Any]) -> None:
@@ -238,8 +230,8 @@ def _shade(panel: Axes, lines: Legs, colours: dict[int, Any], mix: Callable[[Any
     width, height = max(round(box.width), 1), max(round(box.height), 1)
     layers = {}
     for number in colours:
-        layer = lines.where(lines.colour == number)
-        layers[number] = density(layer, strength(layer.weight), view, width, height)
+        own = Legs(*(x[lines.colour == number] for x in vars(lines).values()))
+        layers[number] = density(own, view, width, height)
     style: dict[str, Any] = {"extent": view, "origin": "lower", "aspect": "equal", "zorder": 2}
     panel.imshow(mix(layers, colours), **style)
 
@@ -274,19 +266,95 @@ def _add_light(layers: dict[int, Any], colours: dict[int, Any]) -> Any:
     return (np.dstack([colour, strong]) * 255).round().astype(np.uint8)
 
 
-def _ends(panel: Axes, traced: Sequence[Branches]) -> None:
-    """Mark where a path ended without escaping."""
-    for event, (mark, _) in MARKS.items():
-        ends = np.concatenate([branches.tips[branches.end == event] for branches in traced])
-        if len(ends):
-            size = min(1.0, (40 / len(ends)) ** 0.5)
-            style: dict[str, Any] = {"markersize": 1 + 4 * size, "markeredgewidth": 0.9 * size, "fillstyle": "none"}
-            panel.plot(*ends.T, mark, color=INK, zorder=3, scalex=False, scaley=False, **style)
+# Geometry --------------------------------------------------------------------------------------------------------
 
 
-def _caption(scene: PlanarScene, traced: Sequence[Branches], width: int) -> list[str]:
-    """The lines below the figure, of at most `width` characters each."""
-    numbers = count(traced)
-    notes = [text.format(numbers[event.name]) for event, (_, text) in MARKS.items() if numbers[event.name]]
-    lines = [f"{printable(scene.path.name)}: {summary(scene, traced)}", *notes]
-    return [part for line in lines for part in textwrap.wrap(line, width)]
+def around(scene: PlanarScene, traced: Sequence[Branches]) -> View:
+    """The view that holds all boundaries and all places where rays meet them, with a margin."""
+    segments = scene.segments[0]
+    places = [segments.start, segments.end, *(region.outline for region in scene.regions)]
+    places += [branches.paths.points[:, 1:].reshape(-1, 2) for branches in traced]
+    points = np.concatenate(places)
+    points = points[np.isfinite(points).all(axis=1)]
+    low, high = points.min(axis=0), points.max(axis=0)
+    pad = MARGIN * (float((high - low).max()) or 1.0)
+    return float(low[0] - pad), float(high[0] + pad), float(low[1] - pad), float(high[1] + pad)
+
+
+def legs(traced: Sequence[Branches], view: View) -> Legs:
+    """The legs inside the view, each once; rays that escape end at its edge."""
+    x0, x1, y0, y1 = view
+    parts = []
+    for number, branches in enumerate(traced):
+        start, own = branches.paths.points, branches.own
+        # NaN where there is no leg, as after the last boundary of a path that stopped.
+        end = np.full_like(start, np.nan)
+        end[:, :-1] = start[:, 1:]
+        away = np.flatnonzero(branches.end == Event.ESCAPED)
+        tips = branches.tips[away]
+        reach = np.hypot(*(tips - [(x0 + x1) / 2, (y0 + y1) / 2]).T) + math.hypot(x1 - x0, y1 - y0)
+        end[away, branches.last[away]] = tips + branches.paths.directions[away] * reach[:, None]
+        colour = np.full(own.shape, number)
+        if len(traced) > 1:  # they separate at the first boundary
+            colour[:, 0] = SHARED
+            own[:, 0] &= number == 0
+        first, last, inside = clip(start[own], end[own], view)
+        parts.append([x[inside] for x in (first, last, branches.weights[own], colour[own])])
+    return Legs(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def clip(start: Array, end: Array, view: View) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Lines (L × 2) clipped to the view, and which of them are inside at all; False for NaN."""
+    first, final = np.zeros(len(start)), np.ones(len(start))
+    along = end - start
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for axis in range(2):
+            sides = (np.array([[view[2 * axis]], [view[2 * axis + 1]]]) - start[:, axis]) / along[:, axis]
+            first, final = np.maximum(first, sides.min(axis=0)), np.minimum(final, sides.max(axis=0))
+        inside = first < final
+        return start + along * first[:, None], start + along * final[:, None], inside
+
+
+def density(lines: Legs, view: View, width: int, height: int) -> Array:
+    """Σ strength × length in each pixel, over the pixel's side (height × width, row 0 at the bottom).
+
+    A line is sampled one pixel apart along its longer axis; each sample is shared by the two nearest pixels across.
+    """
+    x0, x1, y0, y1 = view
+    scale = np.array([width / (x1 - x0), height / (y1 - y0)])
+    start, end = ((p - [x0, y0]) * scale - 0.5 for p in (lines.start, lines.end))
+    value, steep = lines.strength, np.abs(end - start)[:, 1] > np.abs(end - start)[:, 0]
+    flat = _chains(start[~steep], end[~steep], value[~steep], height, width)
+    return flat + _chains(start[steep, ::-1], end[steep, ::-1], value[steep], width, height).T
+
+
+def _chains(start: Array, end: Array, value: Array, rows: int, columns: int) -> Array:
+    """The density of lines at 45° or less; ends as (column, row) from the centre of the first pixel."""
+    backward = (start[:, 0] > end[:, 0])[:, None]
+    left, right = np.where(backward, end, start), np.where(backward, start, end)
+    run, rise = (right - left).T
+    slope = np.divide(rise, run, out=np.zeros(len(run)), where=run > 0)
+    value = value * np.hypot(1, slope)
+    first = np.ceil(left[:, 0]).astype(int)
+    lengths = np.maximum(np.floor(right[:, 0]).astype(int) - first + 1, 0)
+    total = np.zeros((rows + 2) * (columns + 2))  # with a frame of one pixel
+    step = max(SAMPLES // columns, 1)
+    for i in range(0, len(value), step):
+        part = slice(i, i + step)
+        line = np.repeat(np.arange(len(value))[part], lengths[part])
+        before = np.cumsum(lengths[part]) - lengths[part]
+        column = first[line] + np.arange(len(line)) - np.repeat(before, lengths[part])
+        y = left[line, 1] + slope[line] * (column - left[line, 0])
+        row = np.floor(y).astype(int)
+        pixel = (row + 1) * (columns + 2) + column + 1
+        upper = (y - row) * value[line]
+        total += np.bincount(pixel, value[line] - upper, len(total))
+        total += np.bincount(pixel + columns + 2, upper, len(total))
+    return total.reshape(rows + 2, columns + 2)[1:-1, 1:-1]
+
+
+def curves(segments: Segments, samples: int = 33) -> list[Array]:
+    """The boundaries as polylines, joined where one starts at the end of the one before; `samples` points per arc."""
+    places = points(segments, samples - 1 if segments.curved else 1)
+    breaks = np.flatnonzero((segments.start[1:] != segments.end[:-1]).any(axis=1)) + 1
+    return [np.concatenate([run[:, :-1].reshape(-1, 2), run[-1:, -1]]) for run in np.split(places, breaks)]

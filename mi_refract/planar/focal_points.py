@@ -1,7 +1,17 @@
-"""Focal points, cardinal points and spot sizes of the rays that leave a planar scene."""
+"""Focal points, cardinal points and spot sizes of the rays that leave a planar scene.
+
+The paraxial limit along an axis is the 2 × 2 matrix of the boundaries that it meets. A ray near the axis is h to the
+left of it and turned by φ. Over a length L, and at a boundary of curvature κ,
+
+    h' = h + L φ,    φ' = φ        and        h' = h d'_n/d_n,    φ' = g φ − (1 − g) κ h/d_n,    g = n d_n/(n' d'_n)
+
+where d and d' are the axis' directions before and behind, d_n is normal to the boundary, and g = −1 for a reflection.
+At normal incidence that is the matrix of textbooks; of an oblique axis it gives the tangential focus (Coddington).
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -11,14 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .curves import unit
-from .paraxial import LOST, Cardinal, axis
 from .path_tree import Branches
 from .scene_file import PlanarScene
-from .segments import REFLECT_BITS, Array, Event
+from .segments import REFLECT_BITS, Array, Event, Paths, Segments
 from .tracer import trace
 
 Point = tuple[float, float]
 Cells = tuple[str, ...]
+LOST = 2.0**-44  # share of its terms up to which a sum is 0 but for rounding, of some hundred roundings
+GRAZING = 1e-6  # smallest cosine for which there is a limit
 PARALLEL = 1e-9  # sine of the angle between two lines that count as parallel
 SYMMETRIC = 1e-3  # sine of the angle by which two rays may differ from mirror images of each other
 STEEPEST = math.radians(89)  # largest angle to the mean direction for which there is a spot
@@ -50,6 +61,25 @@ class Spot:
     centre: Point
     rms: float
     extent: float
+
+
+@dataclass(frozen=True)
+class Cardinal:
+    """Cardinal points of a system. Lengths are in the scene's units, along the axis, negative against the ray.
+
+    `afocal`: the focal length is infinite, and there are none of the others. `focal_length`: effective, from the back
+    principal point to the back focus. `back_focal_length`: from the last boundary to the back focus, where rays
+    parallel to the axis meet. `front_focal_length`: from the first boundary to the front focus, from which rays leave
+    parallel to the axis. `principal`: the front and the back principal point, through which the principal planes go.
+    """
+
+    afocal: bool
+    focal_length: float | None = None
+    back_focal_length: float | None = None
+    front_focal_length: float | None = None
+    back_focus: Point | None = None
+    front_focus: Point | None = None
+    principal: tuple[Point, Point] | None = None
 
 
 @dataclass(frozen=True)
@@ -132,6 +162,92 @@ def _spot(origins: Array, directions: Array) -> tuple[Array, Array] | None:
     return centre + across * y.mean(), y - y.mean()
 
 
+# The paraxial limit --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A path along an axis: its boundaries' places (K × 2), its directions before, between and behind (K + 1 × 2).
+
+    matrix: from the first boundary to behind the last. size: the same sums of the magnitudes of their terms.
+    """
+
+    places: Array
+    directions: Array
+    matrix: Array
+    size: Array
+
+    def cardinal(self) -> Cardinal:
+        """The cardinal points."""
+        (a, _), (c, d) = self.matrix
+        if abs(c) <= LOST * self.size[1, 0]:
+            return Cardinal(afocal=True)
+        focal, back, front = float(-1 / c), float(-a / c), float(d / c)
+        # |matrix| = n/n' for the media before and behind: what the focal length is to the front, over that to the back.
+        principal = self._front(front + focal * np.linalg.det(self.matrix)), self._back(back - focal)
+        return Cardinal(False, focal, back, front, self._back(back), self._front(front), principal)
+
+    def image(self, h: float, phi: float) -> Point | None:
+        """Where rays (h, φ) at the first boundary, and multiples of it, meet; None where they leave parallel."""
+        pencil = np.array([h, phi])
+        height, turn = self.matrix @ pencil
+        return None if abs(turn) <= LOST * (self.size @ np.abs(pencil))[1] else self._back(-height / turn)
+
+    def _front(self, way: float) -> Point:
+        return _along(self.places[0], self.directions[0], way)
+
+    def _back(self, way: float) -> Point:
+        return _along(self.places[-1], self.directions[-1], way)
+
+
+def _along(place: Array, direction: Array, way: float) -> Point:
+    """A place on the axis; a coordinate that is 0 but for rounding is 0."""
+    x, y = np.where(np.abs(point := place + way * direction) > LOST * (np.abs(place).max() + abs(way)), point, 0.0)
+    return float(x), float(y)
+
+
+def axis(segments: Segments, paths: Paths, i: int) -> Axis | None:
+    """The i-th of some paths, with indices, as an axis; None for one that meets nothing, ends inside, or grazes."""
+    hits = paths.hits[i, paths.hits[i] >= 0]
+    if not len(hits) or paths.events[i, len(hits)] != Event.ESCAPED or paths.indices is None:
+        return None
+    points, n = paths.points[i, : len(hits) + 1], paths.indices[i]
+    legs = np.concatenate([np.diff(points, axis=0), paths.directions[i : i + 1]])
+    lengths = np.hypot(*legs.T)
+    legs = legs / np.where(lengths > 0, lengths, 1)[:, None]
+    matrix = size = np.eye(2)
+    for j, hit in enumerate(hits):
+        tangent, curvature = _tangent(segments, int(hit), points[j + 1])
+        before, behind = (float(tangent[0] * d[1] - tangent[1] * d[0]) for d in (legs[j], legs[j + 1]))
+        if min(abs(before), abs(behind)) < GRAZING:
+            return None
+        g = -1.0 if paths.events[i, j] == Event.REFLECTED else n[j] * before / (n[j + 1] * behind)
+        boundary = np.array([[behind / before, 0], [(g - 1) * curvature / before, g]])
+        way = np.array([[1, lengths[j] if j else 0], [0, 1]])
+        matrix, size = boundary @ way @ matrix, np.abs(boundary) @ way @ size
+    # A mirror turns left and right over: the image side is seen as though it were unfolded.
+    unfolded = (-1) ** int((paths.events[i, : len(hits)] == Event.REFLECTED).sum())
+    return Axis(points[1:], legs, unfolded * matrix, size)
+
+
+def _tangent(segments: Segments, hit: int, place: Array) -> tuple[Array, float]:
+    """The unit direction of a boundary at a place, and by how much it turns to the left in a unit of length."""
+    a, b = segments.start[hit], segments.end[hit]
+    middle = (a + b) / 2
+    c = middle if segments.control is None else segments.control[hit]
+    if segments.weight is None or (c == middle).all():
+        return (b - a) / math.hypot(*(b - a)), 0.0
+    w = float(segments.weight[hit])
+    turn = (c - a)[0] * (b - c)[1] - (c - a)[1] * (b - c)[0]
+    # Shares of a, c and b in the place: s², 2w s r and r², up to a factor; from the nearer end no digit is lost.
+    of_a, of_b = np.linalg.solve(np.column_stack([a - c, b - c]), place - c)
+    of_c = 1 - of_a - of_b
+    s, r = (2 * w * of_a, of_c) if of_a >= of_b else (of_c, 2 * w * of_b)
+    e = (c - a) * (w * s * s) + (b - a) * (s * r) + (b - c) * (w * r * r)
+    length = math.hypot(*e)
+    return e / length, float(w * turn * (s * s + 2 * w * s * r + r * r) ** 3 / (2 * length**3))
+
+
 # Of a scene ------------------------------------------------------------------------------------------------------
 
 
@@ -150,51 +266,48 @@ def groups(scene: PlanarScene, traced: Sequence[Branches], plane: Plane | None =
     result = []
     for colour, branches in enumerate(traced):
         escaped = (branches.end == Event.ESCAPED) & (branches.last > 0)
-        for beam in range(int(scene.beams.max()) + 1):
-            for reflect in np.unique(branches.reflect).tolist():
-                members = escaped & (scene.beams[branches.rays] == beam) & (branches.reflect == reflect)
-                if members.any():
-                    spread = _of_group(scene, colour, branches, np.flatnonzero(members), plane)
-                    result.append(Group(scene.colours[colour], beam, reflect, spread))
+        for beam, reflect in itertools.product(range(int(scene.beams.max()) + 1), np.unique(branches.reflect).tolist()):
+            own = np.flatnonzero(escaped & (scene.beams[branches.rays] == beam) & (branches.reflect == reflect))
+            if own.size:
+                result.append(
+                    Group(scene.colours[colour], beam, reflect, _of_rays(scene, colour, branches, own, plane))
+                )
     return result
 
 
-def _of_group(
-    scene: PlanarScene, colour: int, branches: Branches, members: NDArray[np.intp], plane: Plane | None
-) -> Spread:
-    origins, directions = branches.tips[members], branches.paths.directions[members]
+def _of_rays(scene: PlanarScene, colour: int, branches: Branches, own: NDArray[np.intp], plane: Plane | None) -> Spread:
+    """The focal points of the paths `own`."""
+    origins, directions = branches.tips[own], branches.paths.directions[own]
     directions = directions / np.hypot(*directions.T)[:, None]  # float32 is not unit to the last bit
     result = spread(origins, directions)
     if plane is not None:
         result = replace(result, on_plane=spot(origins, directions, plane))
-    pairs = list(_pairs(scene, branches.rays[members], directions))
+    pairs = list(_pairs(scene, branches.rays[own], directions))
     if not pairs:
         return result
     i, j = pairs[0]
     # Where the outermost pair crosses, if it does.
-    sine, marginal = _cross(directions[i], directions[j]), None
+    sine = _cross(directions[i], directions[j])
     if abs(sine) > PARALLEL:
         marginal = _point(origins[i] + directions[i] * (_cross(origins[j] - origins[i], directions[j]) / sine))
-    return replace(result, marginal=marginal, **_along_axis(scene, colour, branches, *members[list(pairs[-1])]))
-
-
-def _along_axis(scene: PlanarScene, colour: int, branches: Branches, one: int, other: int) -> dict[str, Any]:
-    """The paraxial image and the cardinal points of the axis midway between two paths, if its events are theirs."""
-    pair = branches.rays[[one, other]]
+        result = replace(result, marginal=marginal)
+    # The axis midway between the innermost pair, if its events are theirs.
+    one = own[pairs[-1][0]]
+    pair = branches.rays[own[list(pairs[-1])]]
     origin, way = scene.origins[pair].mean(axis=0), scene.directions[pair].mean(axis=0)
     if not way.any():
-        return {}
+        return result
     reflect = int(branches.reflect[one])
     paths = trace(scene.segments[colour], [origin], [way], scene.max_depth, reflect=reflect, weights=True)
     along = axis(scene.segments[colour], paths, 0)
     if along is None or (paths.events[0] != branches.paths.events[one]).any():
-        return {}
+        return result
     d, (x, y) = scene.directions[pair[0]], scene.origins[pair[0]] - along.places[0]
     u = along.directions[0]
     slope = _cross(u, d) / (u @ d)
     slope = slope if abs(slope) > LOST else 0.0
     height = _cross(u, np.array([x, y])) - slope * (u @ [x, y])
-    return {"paraxial": along.image(height, slope), "cardinal": along.cardinal()}
+    return replace(result, paraxial=along.image(height, slope), cardinal=along.cardinal())
 
 
 def _pairs(scene: PlanarScene, rays: NDArray[np.intp], directions: Array) -> Iterator[tuple[int, int]]:
@@ -211,41 +324,30 @@ def _pairs(scene: PlanarScene, rays: NDArray[np.intp], directions: Array) -> Ite
 
 def table(groups: Sequence[Group]) -> str:
     """Tables in plain text, one line per group: focal points, and where there are any cardinal points and spots."""
-    names = []
+    names = [("colour", "beam", "reflected at")]
     for group in groups:
         bits = ", ".join(str(j) for j in range(REFLECT_BITS) if group.reflect >> j & 1)
         names.append((group.colour or "–", str(group.beam), bits or "–"))
-    spreads = [group.spread for group in groups]
-    foci: list[Cells] = []
-    cardinals: list[Cells] = []
-    spots: list[Cells] = []
-    for s in spreads:
+    foci: list[Cells] = [("rays", "focus", "spot at", "rms", "largest", "marginal", "paraxial")]
+    lengths = "focal length", "back focal length", "front focal length"
+    cardinals: list[Cells] = [(*lengths, "front principal point", "back one")]
+    spots: list[Cells] = [("on the plane at", "rms", "extent")]
+    for s in (group.spread for group in groups):
         focus = _text(s.focus) + (" (virtual)" if s.virtual else "")
-        foci.append((str(s.rays), focus, *_texts(s.spot, s.rms, s.largest, s.marginal, s.paraxial)))
-        c, on_plane = s.cardinal, s.on_plane
-        if c is None or c.principal is None:
-            cardinals.append(("infinite" if c else "–", *"––––"))
-        else:
-            cardinals.append(_texts(c.focal_length, c.back_focal_length, c.front_focal_length, *c.principal))
-        spots.append(_texts(on_plane.centre, on_plane.rms, on_plane.extent) if on_plane else ("–",) * 3)
-    parts: list[tuple[Cells, list[Cells]]] = [
-        (("rays", "focus", "spot at", "rms", "largest", "marginal", "paraxial"), foci)
-    ]
-    if any(s.cardinal for s in spreads):
-        lengths = "focal length", "back focal length", "front focal length"
-        parts.append(((*lengths, "front principal point", "back one"), cardinals))
-    if any(s.on_plane for s in spreads):
-        parts.append((("on the plane at", "rms", "extent"), spots))
+        foci.append((str(s.rays), focus, *map(_text, (s.spot, s.rms, s.largest, s.marginal, s.paraxial))))
+        c, on_plane = s.cardinal or Cardinal(False), s.on_plane
+        points = c.focal_length, c.back_focal_length, c.front_focal_length, *(c.principal or (None, None))
+        cardinals.append(("infinite" if c.afocal else _text(points[0]), *map(_text, points[1:])))
+        spots.append(tuple(map(_text, (on_plane.centre, on_plane.rms, on_plane.extent) if on_plane else [None] * 3)))
+    parts = [foci]
+    parts += [cardinals] if any(group.spread.cardinal for group in groups) else []
+    parts += [spots] if any(group.spread.on_plane for group in groups) else []
     text = []
-    for heads, rows in parts:
-        lines = [("colour", "beam", "reflected at", *heads), *((*a, *b) for a, b in zip(names, rows, strict=True))]
+    for rows in parts:
+        lines = [(*a, *b) for a, b in zip(names, rows, strict=True)]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         text += ["  ".join(f"{c:{w}}" for c, w in zip(line, widths, strict=True)).rstrip() for line in lines]
     return "\n".join(text)
-
-
-def _texts(*values: Point | float | None) -> Cells:
-    return tuple(map(_text, values))
 
 
 def _text(value: Point | float | None) -> str:

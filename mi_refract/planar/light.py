@@ -15,7 +15,6 @@ from .segments import Array
 
 VISIBLE = 380.0, 730.0  # nm: where a number of wavelengths is spread over
 MOST = 256  # wavelengths
-POWERS = ("flat", "D65")
 
 
 @dataclass(frozen=True)
@@ -56,16 +55,26 @@ class Light:
         return tuple(float(x) for x in n)
 
 
-def of_names(names: Sequence[str] | None) -> Light:
-    """Colours by name, or one without."""
-    return Light(tuple(names)) if names else Light()
-
-
 def of_wavelengths(nm: Sequence[float] | int, power: str = "flat") -> Light:
-    """Colours by wavelength in nm, or so many evenly spread over the visible. power: of POWERS."""
+    """Colours by wavelength in nm, or so many evenly spread over the visible.
+
+    power: "flat", or "D65" for that of CIE's illuminant, as Mitsuba has it.
+    """
+    import mitsuba as mi
+
     spread = np.linspace(*VISIBLE, nm) if isinstance(nm, int) else np.array(nm, float)
     wavelengths = tuple(float(w) for w in spread)
-    powers = _daylight(wavelengths) if power == "D65" else (1.0,) * len(wavelengths)
+    powers = (1.0,) * len(wavelengths)
+    if power == "D65":
+        if mi.variant() is None:
+            activate()
+        with mi.util.variant_context("scalar_spectral"):
+            spectrum, si = mi.load_dict({"type": "d65"}), mi.SurfaceInteraction3f()
+            vector = type(si.wavelengths)
+            powers = ()
+            for w in wavelengths:
+                si.wavelengths = vector(w)
+                powers += (float(spectrum.eval(si)[0]),)
     return Light(tuple(f"{w:.6g} nm" for w in wavelengths), wavelengths, powers)
 
 
@@ -81,21 +90,6 @@ def parsed(text: str) -> list[float] | int:
     if len(numbers) > MOST or not all(100 <= x <= 100_000 for x in numbers):
         raise ValueError(f"--wavelengths {text}: {accepted}")
     return numbers
-
-
-def _daylight(wavelengths: Sequence[float]) -> tuple[float, ...]:
-    """The powers of CIE's illuminant D65, as Mitsuba has them."""
-    import mitsuba as mi
-
-    if mi.variant() is None:
-        activate()
-    with mi.util.variant_context("scalar_spectral"):
-        spectrum, si = mi.load_dict({"type": "d65"}), mi.SurfaceInteraction3f()
-        powers = []
-        for w in wavelengths:
-            si.wavelengths = type(si.wavelengths)(w)
-            powers.append(float(spectrum.eval(si)[0]))
-    return tuple(powers)
 
 
 def linear_srgb(light: Light) -> Array:

@@ -137,9 +137,8 @@ def with_rays(scene: PlanarScene, count: int) -> PlanarScene:
         want = np.linspace(0, have[-1], count) if len(have) > 1 else have
         angle = np.interp(want, have, np.unwrap(np.arctan2(directions[:, 1], directions[:, 0])))
         if scene.fans and (fan := scene.fans[beam]) and len(have) > 1:
-            angle = np.radians(
-                np.linspace(fan[0], fan[1], len(want))
-            )  # steps of 180° and more say nothing of the way round
+            # Steps of 180° and more say nothing of the way round.
+            angle = np.radians(np.linspace(fan[0], fan[1], len(want)))
         places = np.column_stack([np.interp(want, have, x) for x in origins.T])
         parts.append((places, np.column_stack([np.cos(angle), np.sin(angle)]), np.full(len(want), beam)))
     origins, directions, beams = (np.concatenate(columns) for columns in zip(*parts, strict=True))

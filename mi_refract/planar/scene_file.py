@@ -17,11 +17,12 @@ from msgspec import Meta, Struct, field
 from numpy.typing import NDArray
 
 from mi_refract.io import regular_file
+from mi_refract.io.sanitise import printable
 from mi_refract.io.typed_table import key_table, kind_table, parse_toml
 
 from . import shapes
 from .curves import Curve, affine, unit
-from .light import MOST, Light, of_names, of_wavelengths
+from .light import MOST, Light, of_wavelengths
 from .segments import Array, Segments
 from .shared_boundaries import Indices, Part, boundaries
 
@@ -302,11 +303,14 @@ class PlanarScene:
     `index`: of the medium around everything, per colour. `origins`, `directions`: N × 2, directions of length 1;
     `beams`: N, the number of the `[[beam]]` (from 0) that a ray belongs to. `branches`: the most partial reflections
     on a path; 0: rays are refracted wherever possible. `view`: x0, x1, y0, y1; None: all shapes. `fans`: by beam, the
-    angles in degrees of the first and of the last ray of a fan.
+    angles in degrees of the first and of the last ray of a fan. `file`, `heading`: the file's name and the title, each
+    in one line of printable characters.
     """
 
     path: Path
     title: str
+    file: str
+    heading: str
     light: Light
     segments: tuple[Segments, ...]
     regions: tuple[Region, ...]
@@ -335,8 +339,14 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; expected a scene file")
     table = parse_toml(regular_file.read_bytes(path, SIZE), SceneTable, str(path))
+    title = table.title or path.stem
+    file, heading = printable(path.name), printable(" ".join(title.split()))
+    chosen = table.wavelengths if wavelengths is None else wavelengths
     try:
-        light = _light(table, wavelengths)
+        if chosen is not None and table.colours:
+            raise ValueError("colours and wavelengths are both set; expected one of them")
+        names = Light(tuple(table.colours)) if table.colours else Light()
+        light = names if chosen is None else of_wavelengths(chosen, table.light)
         index = light.indices(table.index, "index")
         parts = _parts(table.shape, index, light)
         origins, directions, beams = _rays(table.beam)
@@ -345,7 +355,9 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
         raise ValueError(" ".join(f"{path}: {error}".split())) from None
     return PlanarScene(
         path,
-        table.title or path.stem,
+        title,
+        file,
+        heading,
         light,
         segments,
         tuple(Region(part.curve.outline(), part.left) for part in parts if part.curve.closed),
@@ -358,15 +370,6 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
         table.view,
         tuple(beam.angles if isinstance(beam, Fan) else None for beam in table.beam),
     )
-
-
-def _light(table: SceneTable, wavelengths: Sequence[float] | int | None) -> Light:
-    chosen = table.wavelengths if wavelengths is None else wavelengths
-    if chosen is None:
-        return of_names(table.colours)
-    if table.colours:
-        raise ValueError("colours and wavelengths are both set; expected one of them")
-    return of_wavelengths(chosen, table.light)
 
 
 def _parts(tables: Sequence[AnyShape], ambient: Indices, light: Light) -> list[Part]:

@@ -11,16 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-SHAPES: dict[str, tuple[int, ...]] = {
-    "start": (2,),
-    "end": (2,),
-    "n_left": (),
-    "n_right": (),
-    "control": (2,),
-    "weight": (),
-}
 REFLECT_BITS = 32  # boundaries on a path at which `reflect` can ask for reflection
-ARC_FIELDS = "control", "weight"
 
 
 def finite_array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
@@ -63,12 +54,10 @@ class Segments:
         """Convert all fields to float64 and check them."""
         if len(self.start) == 0:
             raise ValueError("segments: none; expected at least one")
-        for name, shape in SHAPES.items():
-            values = getattr(self, name)
-            if values is None and name in ARC_FIELDS:
-                continue
-            values = finite_array(f"segments.{name}", values, (len(self.start), *shape))
-            object.__setattr__(self, name, values)
+        for name in ("start", "end", "n_left", "n_right", "control", "weight"):
+            shape = (len(self.start), 2) if name in ("start", "end", "control") else (len(self.start),)
+            if (values := getattr(self, name)) is not None or name not in ("control", "weight"):
+                object.__setattr__(self, name, finite_array(f"segments.{name}", values, shape))
         if (self.control is None) != (self.weight is None):
             raise ValueError("segments: control and weight; expected both or neither")
         for name in ("n_left", "n_right", "weight"):
@@ -76,7 +65,17 @@ class Segments:
             if values is not None and not (values > 0).all():
                 i = int(np.argmin(values > 0))
                 raise ValueError(f"segments.{name}[{i}] = {values[i]}; expected more than 0")
-        self._check_distinct()
+        # Of two that coincide neither would come first on a ray.
+        ends = np.sort(self.vertices, axis=1).astype(np.uint64)
+        bulge = np.zeros((len(self), 3))
+        if self.control is not None and self.weight is not None:
+            bulge = np.column_stack([self.control, self.weight]) + 0.0
+        key = np.column_stack([ends[:, 0] << np.uint64(32) | ends[:, 1], bulge.view(np.uint64)])
+        order = np.lexsort(key.T)
+        same = (np.diff(key[order].astype(np.int64), axis=0) == 0).all(1) & (ends[order[1:], 0] != ends[order[1:], 1])
+        if same.any():
+            i, j = sorted(order[int(np.argmax(same)) :][:2].tolist())
+            raise ValueError(f"segments {i} and {j} coincide; expected one, with the media on either side of both")
 
     def __len__(self) -> int:
         """M."""
@@ -93,19 +92,6 @@ class Segments:
         places = np.concatenate([self.start, self.end]) + 0.0  # −0 is 0
         _, numbers = np.unique(places.view(complex).ravel(), return_inverse=True)
         return numbers.reshape(2, -1).T.astype(np.uint32)
-
-    def _check_distinct(self) -> None:
-        """ValueError for two segments that coincide: neither of them would come first on a ray."""
-        ends = np.sort(self.vertices, axis=1).astype(np.uint64)
-        bulge = np.zeros((len(self), 3))
-        if self.control is not None and self.weight is not None:
-            bulge = np.column_stack([self.control, self.weight]) + 0.0
-        key = np.column_stack([ends[:, 0] << np.uint64(32) | ends[:, 1], bulge.view(np.uint64)])
-        order = np.lexsort(key.T)
-        same = (np.diff(key[order].astype(np.int64), axis=0) == 0).all(1) & (ends[order[1:], 0] != ends[order[1:], 1])
-        if same.any():
-            i, j = sorted(order[int(np.argmax(same)) :][:2].tolist())
-            raise ValueError(f"segments {i} and {j} coincide; expected one, with the media on either side of both")
 
 
 class Event(IntEnum):

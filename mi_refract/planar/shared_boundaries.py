@@ -47,9 +47,8 @@ def boundaries(parts: list[Part]) -> tuple[Segments, ...]:
         if not pieces:
             size = f"beside coordinates of {np.abs(vertices).max():g}; expected above {NEAR:.0e} of that"
             raise ValueError(f"{part.where}: it shrinks to a point {size}")
-    _, original, same = np.unique(
-        _numbers(np.minimum(first, last), np.maximum(first, last), bends), return_index=True, return_inverse=True
-    )
+    places = np.stack([np.minimum(first, last), np.maximum(first, last), bends], axis=1)
+    _, original, same = np.unique(places, axis=0, return_index=True, return_inverse=True)
     original = original[same]  # of each piece, the first one that runs where it does
     for j in np.flatnonzero((original != np.arange(len(owner))) & kept):
         i, part, earlier = int(original[j]), parts[owner[j]], parts[owner[original[j]]].where
@@ -72,13 +71,5 @@ def _merged(points: Array) -> tuple[Array, Numbers]:
     for x, numbers in zip(points.T, groups.T, strict=True):  # the same number for neighbours at most `near` apart
         order = np.argsort(x)
         numbers[order] = np.cumsum(np.diff(x[order], prepend=x[order[0]]) > near)
-    _, first, ids = np.unique(_numbers(*groups.T), return_index=True, return_inverse=True)
+    _, first, ids = np.unique(groups, axis=0, return_index=True, return_inverse=True)
     return points[first[ids]], ids
-
-
-def _numbers(*columns: Numbers) -> Numbers:
-    """A number for each row, the same for equal rows."""
-    ids = columns[0]
-    for column in columns[1:]:
-        ids = np.unique(ids * (column.max() + 1) + column, return_inverse=True)[1]
-    return ids

@@ -15,22 +15,23 @@ Source: document 004, with its slips corrected (mi_refract/formulas/README.md, "
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
+import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
-from .array_backend import ArrayBackend, choose_backend
-from .intersect_arcs import ConicArcs
-from .intersect_segments import LineSegments
-from .mesh_acceleration import SHORTEST, MeshAcceleration
-from .path_loop import PathLoop
-from .segments import Array, Paths, Segments, finite_array
+from mi_refract.formulas import FORMULAS, fresnel, refract_2d
+from mi_refract.numerics import Mask, Number
 
-METHODS = "auto", "brute", "mesh"
+from .array_backend import ArrayBackend, Index, Scatter, Vector2, choose_backend, negated
+from .intersect import NOWHERE, ConicArcs, Hit, LineSegments, Ray, cross
+from .segments import REFLECT_BITS, Array, Event, Paths, Segments, finite_array
+
 FARTHEST = {"float32": 1e15, "float64": 1e100}  # of coordinates and indices: products of two do not overflow
-FEW = 48  # up to so many segments, trying all is faster than a query of the mesh
+Refraction = Callable[[Vector2, Vector2, Number], tuple[Vector2, Mask]]  # (d, line, k) → direction, transmitted
 
 
 def trace(
@@ -42,7 +43,6 @@ def trace(
     formula: str | None = None,
     precision: str = "float64",
     backend: str | None = None,
-    method: str = "auto",
     reflect: ArrayLike = 0,
     n_start: ArrayLike | None = None,
     weights: bool = False,
@@ -53,8 +53,6 @@ def trace(
     formula: a key of FORMULAS that computes the directions; None: the planar formula of document 004.
     precision: "float64" or "float32"; the latter needs a compiled backend.
     backend: "llvm", "cuda" or "scalar"; None: LLVM where it runs, else scalar.
-    method: "brute" tries every segment; "mesh" those that Mitsuba's ray tracing finds, at a cost that grows like log M.
-        Both give the same paths; "auto" takes the faster one.
     reflect: bits, one number or N: a ray whose bit j is set is reflected at the j-th boundary it meets (from 0, below
         32) also where it could be refracted.
     n_start: refractive index of the medium in which rays start, one number or N.
@@ -62,34 +60,41 @@ def trace(
 
     ValueError for any other value, and for origins or directions that are not finite or directions of length 0.
     """
-    tracer = Tracer(segments, formula=formula, precision=precision, backend=backend, method=method)
+    tracer = Tracer(segments, formula=formula, precision=precision, backend=backend)
     return tracer(origins, directions, max_depth, reflect=reflect, n_start=n_start, weights=weights)
+
+
+@dataclass
+class PathState:
+    """A ray, the index of its medium (NaN: unknown), its shares of the s and p waves, the number of boundaries met."""
+
+    ray: Ray
+    index: Number
+    power: Vector2
+    depth: Index
+    active: Mask
 
 
 class Tracer:
     """`trace` for one set of segments that is set up once; arguments and errors as there."""
 
     def __init__(
-        self,
-        segments: Segments,
-        *,
-        formula: str | None = None,
-        precision: str = "float64",
-        backend: str | None = None,
-        method: str = "auto",
+        self, segments: Segments, *, formula: str | None = None, precision: str = "float64", backend: str | None = None
     ) -> None:
-        """Copy the segments to the backend and build what finds the next boundary."""
+        """Copy the segments to the backend."""
         self.arrays = arrays = choose_backend(backend, precision)
         self.farthest = FARTHEST[precision]
         for name in ("start", "end", "n_left", "n_right"):
             _check_range(f"segments.{name}", getattr(segments, name), self.farthest)
         segments, self.middle = _centred(segments)
         ends = segments.start, segments.end, segments.vertices
-        boundaries = LineSegments(arrays, *ends)
+        self.boundaries = LineSegments(arrays, *ends)
         if segments.control is not None and segments.weight is not None:
-            boundaries = ConicArcs(arrays, *ends, segments.control, segments.weight)
-        mesh = _mesh(arrays, segments, method)
-        self.loop = PathLoop(arrays, boundaries, mesh, np.column_stack([segments.n_left, segments.n_right]), formula)
+            self.boundaries = ConicArcs(arrays, *ends, segments.control, segments.weight)
+        left, right = segments.n_left, segments.n_right
+        # With k from left to right and from right to left: ratios in float64, before anything is rounded.
+        self.media = arrays.table(np.column_stack([left, right, left / right, right / left]))
+        self.refract = _refraction(arrays, formula)
 
     def __call__(
         self,
@@ -104,21 +109,140 @@ class Tracer:
         """The paths of rays from `origins` along `directions` (N × 2)."""
         origins = finite_array("origins", origins, (*(np.shape(origins)[:1] or (0,)), 2))
         along = _scaled(finite_array("directions", directions, origins.shape))
-        count = len(origins)
+        count, arrays = len(origins), self.arrays
         if isinstance(max_depth, bool) or not isinstance(max_depth, int | np.integer) or max_depth < 1:
             raise ValueError(f"max_depth = {max_depth!r}; expected a whole number, 1 or more")
         if count * (max_depth + 1) >= 2**32:
             raise ValueError(f"{count} rays, max_depth = {max_depth}; expected a product below 2³²")
-        index = None if n_start is None else _each("n_start", n_start, count, "iuf", float)
+        index = None if n_start is None else arrays.table(_each("n_start", n_start, count, "iuf", float))
         none = np.ndim(reflect) == 0 and reflect == 0
-        mirrored = None if none else _each("reflect", reflect, count, "iu", np.uint32)
+        mirrored = None if none else arrays.table(_each("reflect", reflect, count, "iu", np.uint32))
         _check_range("origins", origins, self.farthest)
-        fields = self.loop(origins - self.middle, along, index, mirrored, max_depth, weights)
+        rays = [arrays.table(x) for x in (origins - self.middle, along)]
+
+        def work(lane: Index, scatter: Scatter) -> None:
+            p, d = (arrays.gather(table, lane) for table in rays)
+            n, bits = (None if table is None else arrays.gather(table, lane) for table in (index, mirrored))
+            scatter("points", 0, p, True)
+            state = self._start(p, d, arrays.number(dr.nan) if n is None else n)
+            most = arrays.uniform(arrays.index, max_depth)
+
+            def step(state: PathState) -> tuple[PathState]:
+                return (self._step(state, bits, most, scatter, weights),)
+
+            (end,) = dr.while_loop((state,), lambda state: state.active, step, label="planar")
+            scatter("directions", 0, _unit(end.ray.d), True)
+
+        buffers = {
+            "points": arrays.buffer(arrays.number, np.nan, (max_depth + 1, count, 2)),
+            "directions": arrays.buffer(arrays.number, np.nan, (1, count, 2)),
+            "hits": arrays.buffer(arrays.signed, -1, (max_depth, count)),
+            "events": arrays.buffer(arrays.byte, int(Event.NONE), (max_depth + 1, count)),
+        }
+        if weights:
+            buffers["indices"] = arrays.buffer(arrays.number, np.nan, (max_depth + 1, count))
+            buffers["polarised"] = arrays.buffer(arrays.number, np.nan, (max_depth + 1, count, 2))
+        fields = arrays.run(count, buffers, work)
         if self.middle.any():
             fields["points"] = (fields["points"] + self.middle).astype(fields["points"].dtype)
             fields["points"][0] = origins
         last = fields.pop("directions")[0]
         return Paths(directions=last, **{name: np.swapaxes(x, 0, 1) for name, x in fields.items()})
+
+    def _start(self, p: Vector2, d: Vector2, index: Number) -> PathState:
+        """A ray from the outside starts where it enters the box around all boundaries.
+
+        So a distant origin is rounded once, here, instead of in every difference from a vertex.
+        """
+        arrays, d = self.arrays, _unit(d)
+        low, high = (arrays.uniform(arrays.vector, *corner) for corner in self.boundaries.box)
+        inverse = dr.rcp(dr.select(d == 0, 1e-30, d))
+        a, b = (low - p) * inverse, (high - p) * inverse
+        enter, leave = dr.max(dr.minimum(a, b)), dr.min(dr.maximum(a, b))
+        p = dr.select((enter > 0) & (enter < leave), dr.fma(d, enter, p), p)
+        slack = 4 * arrays.roundoff * (dr.abs(p.x) + dr.abs(p.y))
+        half = arrays.number(0.5)
+        ray = Ray(p, d, arrays.index(NOWHERE), half, half, arrays.mask(False), slack)
+        return PathState(ray, index, arrays.vector(1, 1), arrays.index(0), arrays.mask(True))
+
+    def _step(self, state: PathState, bits: Index | None, most: Index, scatter: Scatter, weights: bool) -> PathState:
+        """Find the next boundary and cross it, or end the path; `bits`: of `reflect`, `most`: the greatest depth."""
+        arrays, boundaries, ray, j = self.arrays, self.boundaries, state.ray, state.depth
+        start = boundaries.start(ray)
+
+        def test(i: Index, best: Hit) -> tuple[Index, Hit]:
+            return i + 1, boundaries.nearer(best, ray, start, i)
+
+        def more(i: Index, best: Hit) -> Mask:
+            return state.active & (i < boundaries.count)
+
+        hit = dr.while_loop((arrays.index(0), boundaries.none()), more, test, label="boundaries")[1]
+        some = state.active & (hit.segment != NOWHERE)
+        left, right, to_right, to_left = arrays.gather(self.media, hit.segment, some)
+        near, far = dr.select(hit.to_left, right, left), dr.select(hit.to_left, left, right)
+        k = dr.select(hit.to_left, to_left, to_right)
+        index = dr.select(some & dr.isnan(state.index), near, state.index)
+        p, line = boundaries.place(hit)
+        b, through = self.refract(ray.d, line, k)
+        if bits is not None:
+            bit = (bits >> dr.minimum(j, REFLECT_BITS - 1)) & 1
+            forced = through & (j < REFLECT_BITS) & (bit == 1)
+            b, through = dr.select(forced, _mirrored(ray.d, line), b), through & negated(forced)
+        to_left = hit.to_left == through
+        # Of a ray along the boundary rounding hides from which side it comes; that was decided by the boundary's ends.
+        b = dr.select((cross(line, b) > 0) == to_left, b, _mirrored(b, line))
+        event = dr.select(through, int(Event.REFRACTED), int(Event.REFLECTED))
+        event = dr.select(near == index, event, int(Event.MEDIUM_MISMATCH))
+        met = some & (j < most)
+        event = dr.select(met, event, dr.select(some, int(Event.MAX_DEPTH), int(Event.ESCAPED)))
+        scatter("events", j, event, state.active)
+        scatter("points", j + 1, p, met)
+        scatter("hits", j, hit.segment, met)
+        power = state.power
+        if weights:
+            scatter("indices", j, index, state.active)
+            scatter("polarised", j, power, state.active)
+            power = power * _shares(ray.d, line, k, through)
+        on = met & (near == index)
+        ray = Ray(p, dr.select(on, b, ray.d), hit.segment, hit.s, hit.r, to_left, arrays.number(0))
+        return PathState(ray, dr.select(through, far, index), power, j + 1, on)
+
+
+def _unit(v: Vector2) -> Vector2:
+    return v * dr.rsqrt(dr.squared_norm(v))
+
+
+def _mirrored(d: Vector2, line: Vector2) -> Vector2:
+    c = 2 * cross(line, d)
+    return type(d)(d.x + c * line.y, d.y - c * line.x)
+
+
+def _shares(d: Vector2, line: Vector2, k: Number, through: Mask) -> Vector2:
+    """The shares of the s and the p wave that go the way of the ray: Fresnel's T where it goes through, R otherwise.
+
+    In a plane neither wave becomes the other, at any boundary.
+    """
+    cos_i = dr.minimum(dr.abs(cross(line, d)), 1)
+    cos_t, transmitted = fresnel.refracted_cosine(cos_i, k)
+    t_s, t_p, _ = fresnel.transmitted_powers(cos_i, cos_t, transmitted, k)
+    r_s, r_p = map(dr.squared_norm, fresnel.amplitudes(cos_i, k))
+    return type(d)(dr.select(through, t_s, r_s), dr.select(through, t_p, r_p))
+
+
+def _refraction(arrays: ArrayBackend, formula: str | None) -> Refraction:
+    """The planar formula of document 004, or one of FORMULAS in the plane z = 0. ValueError for an unknown name."""
+    if formula is not None and formula not in FORMULAS:
+        raise ValueError(f"formula = {formula!r}: unknown; expected {', '.join(FORMULAS)}")
+
+    def refract(d: Vector2, line: Vector2, k: Number) -> tuple[Vector2, Mask]:
+        if formula is None:
+            b, transmitted = refract_2d(d, line, k)
+            return arrays.vector(*b), transmitted  # of the length of `d`, to u
+        a, n = arrays.vector3(d.x, d.y, 0 * d.x), arrays.vector3(-line.y, line.x, 0 * d.x)
+        b, transmitted = FORMULAS[formula].unchecked(a, n, k)
+        return _unit(arrays.vector(b.x, b.y)), transmitted
+
+    return refract
 
 
 def _scaled(directions: Array) -> Array:
@@ -167,26 +291,3 @@ def _each(name: str, values: ArrayLike, count: int, kinds: str, kind: DTypeLike)
         accepted = "a whole number, 0 or more and below 2³²" if whole else "a number above 0"
         raise ValueError(f"{name}; expected {accepted}, or {count} of them")
     return np.ascontiguousarray(np.broadcast_to(array.astype(kind), count))
-
-
-def _mesh(arrays: ArrayBackend, segments: Segments, method: str) -> MeshAcceleration | None:
-    """The mesh that finds the next boundary; None where all segments are tried: faster, asked for, or the only way."""
-    if method not in METHODS:
-        raise ValueError(f"method = {method!r}; expected {', '.join(METHODS)}")
-    if method == "brute" or (method == "auto" and len(segments) <= FEW):
-        return None
-    length = np.hypot(*(segments.end - segments.start).T)
-    if not length.any():  # no boundary at all
-        return None
-    extent = np.ptp(np.concatenate([segments.start, segments.end]), axis=0).max()
-    shortest = length[length > 0].min(initial=np.inf) / (extent / 2 or 1)
-    reason = "arcs" if segments.curved else f"a segment of {shortest:.1e}" if shortest < SHORTEST else ""
-    if not reason:
-        mesh = MeshAcceleration(arrays, segments.start, segments.end, segments.vertices)
-        if not mesh.crowded:
-            return mesh
-        reason = "segments {} and {}".format(*mesh.crowded)
-    if method == "mesh":
-        limit = f"longer and farther apart than {SHORTEST:.1e} of half the extent"
-        raise ValueError(f"method = 'mesh': {reason}; expected straight segments, {limit}")
-    return None

@@ -35,6 +35,5 @@ __all__ = [
     "inspect",
     "read_ior",
     "register",
-    "scene_limits",
     "scene_parser",
 ]

@@ -29,12 +29,19 @@ from mi_refract.numerics import (
 )
 
 from .absorption import read_knots
-from .integrator_context import warn_once
 
 PLUGIN = "refract"
 DEFAULTS = {"int_ior": "bk7", "ext_ior": "air"}
 EXPECTED = "a positive finite number, or a material's name, a glass or formula (mi_refract.media), spectrum or texture"
+warned: set[str] = set()  # what `warn_once` has logged
 LOST = 1e-3  # of the colour of light of equal power at all wavelengths: the most that may lie outside a medium's range
+
+
+def warn_once(text: str) -> None:
+    """A warning in Mitsuba's log, once a process."""
+    if text not in warned:
+        warned.add(text)
+        mi.Log(mi.LogLevel.Warn, text)  # type: ignore[operator]
 
 
 def parameter_type(v: Variant) -> ArrayType:
@@ -170,10 +177,8 @@ def lost_colour(medium: Medium) -> float:
 
     wavelengths = np.arange(mi.MI_CIE_MIN, mi.MI_CIE_MAX + 1.0)
     response: Any = mi.cie1931_xyz
-    if dr.is_jit_v(mi.Float):
-        xyz = np.array(response(mi.Float(wavelengths)))
-    else:
-        xyz = np.array([[float(x) for x in response(float(w))] for w in wavelengths]).T
+    lanes = [mi.Float(wavelengths)] if dr.is_jit_v(mi.Float) else wavelengths.tolist()
+    xyz = np.concatenate([np.array(response(x), float).reshape(3, -1) for x in lanes], axis=1)
     outside = (wavelengths < medium.valid[0]) | (wavelengths > medium.valid[1])
     return float((xyz[:, outside].sum(1) / xyz.sum(1)).max())
 

@@ -11,7 +11,6 @@ thinner than that distance, 1e-4 of the largest coordinate, is refused: a path w
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import drjit as dr
@@ -91,22 +90,22 @@ class Crossings:
         rows = dict(self.tally)
         for number, row in enumerate(zip(*self.counts, strict=True)):
             rows[self.positions.get(number, -1)] = [int(count) for count in row]
-        names = {i: shape_name(self.shapes, i) if i >= 0 else "a shape" for i in rows}
-        for position, (crossed, _, _, stepped_over) in rows.items():
+        first, worst = NEVER, None  # what is wrong first is the cause
+        for position, (crossed, wrong, depth, stepped_over) in sorted(rows.items()):
+            name = shape_name(self.shapes, position) if position >= 0 else "a shape"
             if contradicts(crossed, stepped_over):
                 raise ValueError(
-                    f"refract_path: {names[position]} absorbs, and is so thin that rays miss one of its sides; "
-                    "expected a sheet thicker than 1e-4 of its largest coordinate: move the scene to the origin"
+                    f"refract_path: {name} absorbs, and is so thin that rays miss one of its sides; expected a sheet "
+                    "thicker than 1e-4 of its largest coordinate: move the scene to the origin"
                 )
-        wrong = [(first, position) for position, (n, x, first, _) in rows.items() if contradicts(n, x)]
-        if wrong:
-            first, position = min(wrong)  # what is wrong first is the cause
+            if contradicts(crossed, wrong) and (worst is None or depth < first):
+                first, worst = depth, name
+        if worst is not None:
             camera = "camera_absorption, or the sensor's medium, as the camera's surroundings absorb"
             outside = "ext_absorption (or ext_colour) as the medium around it absorbs"
             raise ValueError(
-                f"refract_path: inconsistent absorption at {names[position]}: the medium that light arrives in "
-                "differs from the one its BSDF declares; "
-                f"expected {f'{outside}; {camera}' if first else f'{camera}; {outside}'}"
+                f"refract_path: inconsistent absorption at {worst}: the medium that light arrives in differs from the "
+                f"one its BSDF declares; expected {f'{outside}; {camera}' if first else f'{camera}; {outside}'}"
             )
 
 
@@ -191,48 +190,39 @@ def absorbs_only(v: Variant, medium: MediumPlugin) -> bool:
     return True
 
 
-def check_media(v: Variant, scene: Scene) -> None:
-    """ValueError where a sensor or a shape has a medium that scatters, or where a BSDF of the scene absorbs as well."""
-    for sensor in scene.sensors():
-        if (medium := sensor.get_medium()) is not None and not absorbs_only(v, medium):
-            raise ValueError(
-                "refract_path: the sensor's medium scatters or varies; expected a homogeneous medium with an albedo "
-                "of 0"
-            )
-    shapes, absorbing = all_shapes(scene), any(_absorbing_parameters(scene))
-    for i, shape in enumerate(shapes):
-        for side, medium in (("interior", shape.interior_medium()), ("exterior", shape.exterior_medium())):
-            if medium is not None and not absorbs_only(v, medium):
-                raise ValueError(
-                    f"refract_path: the {side} medium of {shape_name(shapes, i)} scatters or varies; expected a "
-                    "homogeneous medium with an albedo of 0, or the integrator volpath"
-                )
-            if medium is not None and absorbing:
-                raise ValueError(
-                    f"refract_path: {shape_name(shapes, i)} has an {side} medium in a scene whose BSDFs absorb; "
-                    "expected either media of shapes or absorption of BSDFs, not both"
-                )
-
-
-def _absorbing_parameters(scene: Scene) -> Iterator[str]:
-    """Of every BSDF of the scene."""
-    outer = (bsdf for shape in all_shapes(scene) if (bsdf := shape.bsdf()) is not None)
-    return (absorbing_parameter(bsdf) for whole in outer for bsdf in nested(whole))
-
-
 def check_integrator(scene: Scene) -> None:
     """ValueError where a BSDF absorbs and the scene's integrator is another than `refract_path`."""
-    name = next(filter(None, _absorbing_parameters(scene)), "")
+    declared = (absorbing_parameter(bsdf) for shape in all_shapes(scene) for bsdf in nested(shape.bsdf()))
+    name = next(filter(None, declared), "")
     if name and type(scene.integrator()).__name__ != "RefractPath":
         raise ValueError(f"refract: {name}; expected the integrator refract_path, or no absorption")
 
 
-def check_wrappers(scene: Scene) -> None:
-    """ValueError where an absorbing BSDF is within another one, which does not pass on what it declares."""
+def check_media(v: Variant, scene: Scene) -> None:
+    """ValueError for what is not followed.
+
+    That is a medium of a sensor or a shape that scatters, one in a scene whose BSDFs absorb as well, and an absorbing
+    BSDF within another one, which does not pass on what it declares.
+    """
+
+    def check(owner: str, medium: MediumPlugin, otherwise: str = "") -> None:
+        if medium is not None and not absorbs_only(v, medium):
+            expected = f"a homogeneous medium with an albedo of 0{otherwise}"
+            raise ValueError(f"refract_path: {owner} scatters or varies; expected {expected}")
+
+    for sensor in scene.sensors():
+        check("the sensor's medium", sensor.get_medium())
     shapes = all_shapes(scene)
+    absorbing = [any(absorbing_parameter(bsdf) for bsdf in nested(shape.bsdf())) for shape in shapes]
     for i, shape in enumerate(shapes):
-        outer = shape.bsdf()
-        within = outer is not None and any(getattr(bsdf, "absorbing", False) for bsdf in nested(outer))
-        if within and not dr.all(outer.has_attribute(BEYOND)):
-            text = f"{shape_name(shapes, i)} has an absorbing BSDF within a {outer.class_name()}"
+        name = shape_name(shapes, i)
+        if absorbing[i] and not dr.all(shape.bsdf().has_attribute(BEYOND)):
+            text = f"{name} has an absorbing BSDF within a {shape.bsdf().class_name()}"
             raise ValueError(f"refract_path: {text}; expected absorption of the shape's own BSDF")
+        for side, medium in (("interior", shape.interior_medium()), ("exterior", shape.exterior_medium())):
+            check(f"the {side} medium of {name}", medium, ", or the integrator volpath")
+            if medium is not None and any(absorbing):
+                raise ValueError(
+                    f"refract_path: {name} has an {side} medium in a scene whose BSDFs absorb; expected either media "
+                    "of shapes or absorption of BSDFs, not both"
+                )

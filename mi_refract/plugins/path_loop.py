@@ -39,8 +39,8 @@ from mi_refract.numerics import (
 )
 
 from .absorption import absorbed
-from .integrator_context import DISPERSED, context
 from .medium_tracking import MediumTracker, ShapeMedia
+from .refract import DISPERSED, followed_context
 from .sampling import ONE, KeyedMultijitter, NonConstantEmitters, SceneEmitters, SceneSampler
 from .scene_features import BOUNDARIES, all_shapes, bsdf_name, plugin_number
 
@@ -170,7 +170,7 @@ class PathLoop:
         """`v`: the variant's module. `media`: needed where `features.absorption`."""
         self.v, self.scene, self.features, self.numbers = v, scene, features, numbers
         self.media: Any = media
-        self.vectorised, self.context = dr.is_jit_v(v.Float), context()
+        self.vectorised, self.context = dr.is_jit_v(v.Float), followed_context()
         self.emitters = (NonConstantEmitters if features.lamps_only else SceneEmitters)(v, scene)
         self.ray_flags = +(mi.RayFlags.All if features.all_of_hit else mi.RayFlags.ShadingFrame)
         # Derivatives need loops that are evaluated. The kernels of their reverse sweep may run after the scene is gone,

@@ -55,8 +55,7 @@ from mi_refract.numerics import (
 )
 
 from .absorption import BEYOND, HERE, absorbing_parameter, read_absorption
-from .index_parameter import PLUGIN, DispersiveRatio, TexturedRatio, one_number, parameter_type, read_ratio
-from .integrator_context import DISPERSED, is_followed, warn_once
+from .index_parameter import PLUGIN, DispersiveRatio, TexturedRatio, one_number, parameter_type, read_ratio, warn_once
 
 Refract: TypeAlias = Any  # an object of the class that `plugin_class` makes
 Context: TypeAlias = Any  # an `mi.BSDFContext`
@@ -66,6 +65,29 @@ FIXED_DIRECTIONS = "prb, prb_basic, prb_projective and prbvolpath do not differe
 MOVING_DIRECTIONS = "refract_path or volpath, or path, which is biased"
 VALUE_AT_LOBE = 1e-4  # of `evaluate`: with any tint that matters above 1e-8, below which prbvolpath takes 1e-8 for it
 SAME_DIRECTION = 1e-4  # a direction that was sampled comes back from world space with an error of 1e-6
+
+# A BSDF's arguments are a wavelength and a direction, and of the path it knows nothing. So the integrator says that it
+# follows wavelengths and media by a bit of `type_mask` in the context. (State beside the arguments would not do: Dr.Jit
+# samples a BSDF again for derivatives, after the integrator has returned.) The same bit of `sampled_type` in a sample:
+# the lobe is that of the first wavelength only.
+DISPERSED = 1 << 30
+if any(int(flag) & DISPERSED for flag in FLAGS):
+    raise ImportError("bit 30 of mitsuba.BSDFFlags is in use; expected a version of Mitsuba that leaves it free")
+
+
+def followed_context() -> Context:
+    """A context for sampling BSDFs, of an integrator that follows wavelengths and media along a path.
+
+    Every render of `refract_path` has it: Dr.Jit traces the BSDFs of other scenes that are in memory as well.
+    """
+    context = mi.BSDFContext()
+    context.type_mask |= DISPERSED
+    return context
+
+
+def is_followed(context: Context) -> bool:
+    """Whether a context is of an integrator that follows wavelengths and media."""
+    return bool(context.type_mask & DISPERSED)
 
 
 class Side(NamedTuple):

@@ -26,8 +26,8 @@ import mitsuba as mi
 from mi_refract.numerics import Mask, MediumPlugin, Properties, Ray, Sampler, Scene, Sensor, Spectrum, Variant
 
 from .absorption import read_absorption
-from .integrator_context import warn_once
-from .medium_tracking import Crossings, MediumTracker, ShapeMedia, check_media, check_wrappers, extinction
+from .index_parameter import warn_once
+from .medium_tracking import Crossings, MediumTracker, ShapeMedia, check_media, extinction
 from .path_loop import PathFeatures, PathLoop
 from .sampling import KeyedMultijitter, SceneSampler
 from .scene_features import SceneFeatures, inspect
@@ -201,9 +201,7 @@ def integrator_class(v: Variant) -> type:
             """
             if self.needs is None or not self.rendering:
                 self.needs = inspect(scene)
-                if self.needs.absorbing:
-                    check_wrappers(scene)
-                if self.needs.media:
+                if self.needs.absorbing or self.needs.media:
                     check_media(v, scene)
                 mi.Log(mi.LogLevel.Info, f"{INTEGRATOR}: left out: {self.left_out()}")  # type: ignore[operator]
             return self.needs

@@ -7,6 +7,8 @@ for plugins on the lists below, which are known not to need it. Any other plugin
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -16,76 +18,34 @@ import mitsuba as mi
 
 from mi_refract.numerics import BSDF, Scene, Shape, Variant
 
+# fmt: off
 WRAPPERS = {"BlendBSDF", "BumpMap", "MaskBSDF", "NormalMap", "TwoSidedBRDF"}
 DEPOLARISING = {
-    "Hair",
-    "Measured",
-    "Null",
-    "Principled",
-    "PrincipledThin",
-    "RoughDielectric",
-    "RoughPlastic",
-    "SmoothDiffuse",
-    "SmoothPlastic",
-    "ThinDielectric",
+    "Hair", "Measured", "Null", "Principled", "PrincipledThin", "RoughDielectric", "RoughPlastic", "SmoothDiffuse",
+    "SmoothPlastic", "ThinDielectric",
 }
 POLARISING = {
-    "CircularPolarizer",
-    "LinearPolarizer",
-    "LinearRetarder",
-    "MeasuredPolarized",
-    "PolarizedPlastic",
-    "Refract",
-    "RoughConductor",
-    "SmoothConductor",
-    "SmoothDielectric",
+    "CircularPolarizer", "LinearPolarizer", "LinearRetarder", "MeasuredPolarized", "PolarizedPlastic", "Refract",
+    "RoughConductor", "SmoothConductor", "SmoothDielectric",
 }
-KNOWN = WRAPPERS | DEPOLARISING | POLARISING
 KNOWN_SHAPES = {
-    "BSplineCurve",
-    "BlenderMesh",
-    "Cube",
-    "Cylinder",
-    "Disk",
-    "Ellipsoids",
-    "EllipsoidsMesh",
-    "LinearCurve",
-    "Mesh",
-    "OBJMesh",
-    "PLYMesh",
-    "Rectangle",
-    "SDFGrid",
-    "SerializedMesh",
-    "Sphere",
+    "BSplineCurve", "BlenderMesh", "Cube", "Cylinder", "Disk", "Ellipsoids", "EllipsoidsMesh", "LinearCurve", "Mesh",
+    "OBJMesh", "PLYMesh", "Rectangle", "SDFGrid", "SerializedMesh", "Sphere",
 }
+PLAIN_LAMPS = {"AreaLight", "DirectionalArea"}
+CONSTANT_TEXTURES = {
+    "BlackBodySpectrum", "D65Spectrum", "IrregularSpectrum", "RawConstantTexture", "RawConstantTextureImpl",
+    "RegularSpectrum", "SRGBReflectanceSpectrum", "UniformSpectrum",
+}
+# fmt: on
 # One reflected and one refracted direction, each sampled by a side of one threshold of `sample1`: what can be split.
 BOUNDARIES = {"Refract", "SmoothDielectric"}
 # No choice is left to chance where the lobes of `BOUNDARIES` are both followed.
 DETERMINISTIC = BOUNDARIES | {"SmoothConductor", "TwoSidedBRDF"}
 # Of a hit these need the shading normal only, which is all that `RayFlags.ShadingFrame` gives: no tangent, no (u, v).
 WITHOUT_TANGENT = DETERMINISTIC | {"BlendBSDF", "MaskBSDF", "Null", "ThinDielectric"}
-PLAIN_LAMPS = {"AreaLight", "DirectionalArea"}
-CONSTANT_TEXTURES = {
-    "BlackBodySpectrum",
-    "D65Spectrum",
-    "IrregularSpectrum",
-    "RawConstantTexture",
-    "RawConstantTextureImpl",
-    "RegularSpectrum",
-    "SRGBReflectanceSpectrum",
-    "UniformSpectrum",
-}
 # Plugins that sample with `sample1` or with `sample2`, and never with both.
-EITHER = {
-    "Null",
-    "Refract",
-    "RoughConductor",
-    "SmoothConductor",
-    "SmoothDielectric",
-    "SmoothDiffuse",
-    "ThinDielectric",
-    "TwoSidedBRDF",
-}
+EITHER = DETERMINISTIC | {"Null", "RoughConductor", "SmoothDiffuse", "ThinDielectric"}
 
 
 @dataclass(frozen=True)
@@ -137,13 +97,12 @@ def inspect(scene: Scene) -> SceneFeatures:
     """What a Mitsuba scene needs as it is now; an edit of its parameters can change that."""
     shapes, emitters, sky = all_shapes(scene), scene.emitters(), scene.environment()
     opaque = [shape.class_name() for shape in shapes if shape.class_name() not in KNOWN_SHAPES]
-    bsdfs = [bsdf for shape in shapes if (outer := shape.bsdf()) and not _black(outer) for bsdf in nested(outer)]
+    bsdfs = [bsdf for shape in shapes if not _black(shape.bsdf()) for bsdf in nested(shape.bsdf())]
     names = {bsdf_name(bsdf) for bsdf in bsdfs}
-    unknown = tuple(sorted((names - KNOWN) | {*opaque}))
+    unknown = tuple(sorted((names - WRAPPERS - DEPOLARISING - POLARISING) | {*opaque}))
     everything = bool(unknown)
-    lobes, flags = mi.BSDFFlags, 0
-    for bsdf in bsdfs:
-        flags |= bsdf.flags()
+    lobes = mi.BSDFFlags
+    flags = functools.reduce(operator.or_, (bsdf.flags() for bsdf in bsdfs), 0)
     deltas = {bsdf_name(bsdf) for bsdf in bsdfs if not bsdf.flags() & +lobes.Smooth}
     lamps = [shape.emitter() for shape in shapes if shape.is_emitter()]
     shape_media = any(shape.interior_medium() or shape.exterior_medium() for shape in shapes)
@@ -159,7 +118,12 @@ def inspect(scene: Scene) -> SceneFeatures:
         delta_emitters=any(not emitter.flags() or emitter.flags() & +mi.EmitterFlags.Delta for emitter in emitters),
         only_glass=not (everything or flags & +(lobes.Smooth | lobes.Delta1D)),
         textured=everything
-        or any(_textured(node) for node in (*bsdfs, *lamps))
+        or any(
+            hasattr(child, "is_spatially_varying")
+            and (child.is_spatially_varying() or child.class_name() not in CONSTANT_TEXTURES)
+            for node in (*bsdfs, *lamps)
+            for child in _children(node)
+        )
         or not deltas <= WITHOUT_TANGENT
         or not {lamp.class_name() for lamp in lamps} <= PLAIN_LAMPS,
         null=everything or bool(flags & +lobes.Null),
@@ -195,31 +159,24 @@ def bsdf_name(bsdf: BSDF) -> str:
 
 
 def nested(bsdf: BSDF) -> Iterator[BSDF]:
-    """A BSDF, and those that it shows within it."""
+    """A BSDF, and those that it shows within it; nothing for None."""
+    if bsdf is None:
+        return
     yield bsdf
     for child in _children(bsdf):
         if hasattr(child, "eval_null_transmission"):
             yield from nested(child)
 
 
-def _textured(node: mi.Object) -> bool:
-    return any(
-        hasattr(child, "is_spatially_varying")
-        and (child.is_spatially_varying() or child.class_name() not in CONSTANT_TEXTURES)
-        for child in _children(node)
-    )
-
-
 def _black(bsdf: BSDF) -> bool:
     # A frozen function is recorded for every value that will come.
-    if bsdf_name(bsdf) != "SmoothDiffuse" or dr.flag(dr.JitFlag.FreezingScope):
+    if bsdf is None or bsdf_name(bsdf) != "SmoothDiffuse" or dr.flag(dr.JitFlag.FreezingScope):
         return False
     (reflectance,) = _children(bsdf)
     exact = reflectance.class_name() == "UniformSpectrum" or "spectral" not in bsdf.variant_name()
-    if not exact or reflectance.is_spatially_varying() or reflectance.max() != 0:
-        return False
+    zero = exact and not reflectance.is_spatially_varying() and reflectance.max() == 0
     # The derivative of an image in a reflectance of 0 is not 0.
-    return not any(dr.grad_enabled(value) for _, value in mi.traverse(bsdf))
+    return zero and not any(dr.grad_enabled(value) for _, value in mi.traverse(bsdf))
 
 
 def _children(node: mi.Object) -> list[Any]:

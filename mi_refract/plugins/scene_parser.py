@@ -1,14 +1,17 @@
-"""Mitsuba scene files, parsed once, with their limits and their plugins checked before anything in them runs.
+"""Mitsuba scene files, parsed once by Mitsuba, with their plugins checked before anything in them runs.
 
-A scene is code: Mitsuba looks for `plugins/NAME.so` in the folder of the scene, in a `<path>`, and in the working
-folder before it takes its own plugin of that name. Here its own come first, and a plugin that is neither Mitsuba's nor
-ours is an error unless it is allowed by name.
+Trust a scene as you trust a program: it can read any file, need any amount of memory, and end the process. One thing is
+ensured, by the state of Mitsuba's own parser: it runs no code but Mitsuba's and ours. Mitsuba looks for
+`plugins/NAME.so` in the folder of the scene, in a `<path>`, and in the working folder before it takes its own plugin of
+that name. Here its own come first, and a plugin that is neither Mitsuba's nor ours is an error unless it is allowed by
+name.
 """
 
 from __future__ import annotations
 
 import contextlib
 import glob
+import sys
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
@@ -19,12 +22,11 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refract.formulas import FORMULAS
-from mi_refract.io import image_file
+from mi_refract.io import image_file, regular_file
 from mi_refract.numerics import Properties, Scene
 
 from .index_parameter import PLUGIN
 from .refract_path import INTEGRATOR
-from .scene_limits import DEPTH, check_files, refuse_special, resolved
 
 ParserState: TypeAlias = Any  # an `mi.parser.ParserState`
 OURS = (PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS), INTEGRATOR)
@@ -32,6 +34,7 @@ OURS = (PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS), INTEGRATOR)
 PYTHON = ("direct_projective", "flat_sensor", "prb", "prb_basic", "prb_projective", "prbvolpath", "volprim_rf_basic")
 BUILT_IN = ("scene",)  # its "rgb" and "spectrum" as a type end the process
 NEEDED = {"bitmap": "filename", "blendbsdf": "weight"}  # without it Mitsuba reads memory that is not there
+DEPTH = 32  # of plugins within plugins: Mitsuba instantiates them by recursion
 LOBES = 2**16  # of a BSDF if every BSDF in it were two-sided: each of two references to a BSDF doubles them
 VALUES = 2**29  # of an image that a scene names: 16384 × 8192 × 4
 # More values than these and DENSEST for each byte of the file are no picture: deflate packs up to 1032 bytes into one.
@@ -71,13 +74,13 @@ class ParsedScene:
     path: Path
     config: Any  # the `mi.parser.ParserConfig` that it was parsed with
     state: ParserState  # references resolved
-    folders: tuple[Path, ...]  # where Mitsuba looks for its files
     xml: tuple[Path, ...]  # its own file first, and those that it includes
-    named: dict[str, Path]  # other files that it names, by their names in it; they need not exist
-    searched: tuple[Path, ...]  # the folders of its <path> elements
+    text: str  # the state as XML: included files, values of parameters and spectra that are read from files in place
+    folders: tuple[Path, ...]  # where Mitsuba looks for its files, those of <path> elements first
+    named: dict[str, Path]  # the files that its plugins name, by their names in it; they need not exist
 
     def files(self, allowed: Collection[str] = ()) -> dict[str, Path]:
-        """The files beside `xml` that the scene consists of, by their names in it; with those of `allowed` plugins."""
+        """The files that its plugins read, by their names in it, and the code of `allowed` plugins."""
         code = {
             f"plugins/{file.name}": file
             for place in reversed(self.folders)  # Mitsuba takes the first that it finds
@@ -114,8 +117,8 @@ class ParsedScene:
                     (meshes if plugin == "ply" else images).add(value)
         with folders(own_folder(), *self.folders):  # Mitsuba's own folder before every <path>
             for file in meshes:
-                check_faces(resolved(file, self.folders))
-            for image in (resolved(file, self.folders) for file in images):
+                check_faces(self.named.get(file, Path(file)))
+            for image in (self.named.get(file, Path(file)) for file in images):
                 if image.is_file():  # Mitsuba believes a header that is damaged, or asks for too much memory
                     image_file.check_header(image, min(VALUES, FEW_VALUES + DENSEST * image.stat().st_size))
             return mi.parser.instantiate(self.config, self.state)
@@ -130,7 +133,7 @@ def parse(path: Path, defines: Mapping[str, str] | None = None, variant: str = "
         variant: of Mitsuba; default: the present one.
 
     Raises:
-        ValueError: for a scene beyond the limits of `scene_limits`, with circular references, or that names pipes.
+        ValueError: for circular references, plugins nested too deeply, and a pipe or a device in place of a file.
         OSError: for a file that cannot be read.
         Exception: whatever Mitsuba raises where it cannot parse the file.
     """
@@ -138,18 +141,28 @@ def parse(path: Path, defines: Mapping[str, str] | None = None, variant: str = "
     # Mitsuba orders merged meshes by address, and what it loads in parallel by thread. Emitters are in the same order,
     # so the same seed would give different images.
     config.parallel = config.merge_equivalent = config.merge_meshes = False
+    require_file(path)
     with folders(path.parent) as inside:
-        text = check_files(path, [Path(str(folder)) for folder in inside], defines or {})
         state = mi.parser.parse_file(config, str(path), **defines or {})
+        text = mi.parser.write_string(mi.parser.ParserState(state))
         seen = mi.parser.ParserState(state)  # a copy: reading a parameter marks it as used
         _check_nesting(path, seen)
-        places = tuple(Path(str(folder)) for folder in inside)  # those of <path> elements first
-        named = {value: resolved(value, places) for node in seen.nodes for _, value in _texts(node.props)}
+        names = {value for node in seen.nodes for _, value in _texts(node.props)}
+        named = {name: Path(str(inside.resolve(name))) for name in sorted(names)}
         for file in named.values():
-            refuse_special(file)
+            require_file(file)
         mi.parser.transform_all(config, state)
-    xml, searched = tuple(dict.fromkeys(text.xml)), tuple(text.searched)
-    return ParsedScene(path, config, state, places, xml, text.opened | named, searched)
+        xml, places = (tuple(Path(str(item)) for item in items) for items in (state.files, inside))
+        return ParsedScene(path, config, state, xml, text, places, named)
+
+
+def require_file(path: Path) -> None:
+    """ValueError for a pipe or a device, which may never end. A path that does not exist passes."""
+    with contextlib.suppress(OSError):
+        if not path.exists() or path.is_dir():
+            return
+    with regular_file.opened(path, sys.maxsize):
+        pass
 
 
 def _texts(props: Properties) -> list[tuple[str, str]]:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import ArrayLike, DTypeLike
 
-from . import angles, components
-from .angles import AngleAt, aimed, at
+from . import components
+from .angles import ANGLES, AngleAt, drawn, rays_at
 from .rays import Array, Build, Rays, Triple, normalised, rounded
 
 
@@ -41,14 +41,14 @@ class Regime:
 
 
 REGIMES = {
-    "generic": Regime(at(angles.generic), 1.5, "cosine uniform, k = 1.5 or 1/1.5", any_k=True),
-    "near-normal": Regime(at(angles.near_normal), 2.5, "1e-12 … 1e-2 rad from the normal, k in 0.4 … 2.5", any_k=True),
-    "grazing": Regime(at(angles.grazing), 2.5, "1e-7 … 1e-2 rad from the surface, k in 0.4 … 2.5", any_k=True),
+    "generic": Regime(drawn("generic"), 1.5, "cosine uniform, k = 1.5 or 1/1.5", any_k=True),
+    "near-normal": Regime(drawn("near-normal"), 2.5, "1e-12 … 1e-2 rad from the normal, k in 0.4 … 2.5", any_k=True),
+    "grazing": Regime(drawn("grazing"), 2.5, "1e-7 … 1e-2 rad from the surface, k in 0.4 … 2.5", any_k=True),
     "critical": Regime(
-        at(angles.critical),
+        drawn("critical"),
         2.5,
         "1e-7 … 1e-2 rad from the critical angle, both sides, k in 1.05 … 2.5",
-        angle=angles.critical_at,
+        angle=ANGLES["critical"],
         least_k=1.0,
     ),
     "critical, to the ulp": Regime(
@@ -61,18 +61,18 @@ REGIMES = {
         1e6,
         "the same for k − 1 in 1e-6 … 1e6: grazing to near-normal",
     ),
-    "matched": Regime(at(angles.matched), 1.01, "|k − 1| from an ulp to 1e-2, cosine uniform"),
+    "matched": Regime(drawn("matched"), 1.01, "|k − 1| from an ulp to 1e-2, cosine uniform"),
     "matched, grazing": Regime(
-        at(angles.matched_grazing), 1.01, "|k − 1| from an ulp to 1e-2, 1e-7 … 1e-1 rad from the surface"
+        drawn("matched, grazing"), 1.01, "|k − 1| from an ulp to 1e-2, 1e-7 … 1e-1 rad from the surface"
     ),
     "Brewster": Regime(
-        at(angles.brewster),
+        drawn("Brewster"),
         2.5,
         "an ulp to 1e-2 rad from Brewster's angle, both sides, k in 0.4 … 2.5",
-        angle=angles.brewster_at,
+        angle=ANGLES["Brewster"],
     ),
-    "k ≫ 1": Regime(at(angles.steep), 1e6, "k in 10 … 1e6, k sin θ uniform in 0 … 1.2"),
-    "k ≪ 1": Regime(at(angles.dense), 0.1, "k in 1e-6 … 0.1, cosine uniform"),
+    "k ≫ 1": Regime(drawn("k ≫ 1"), 1e6, "k in 10 … 1e6, k sin θ uniform in 0 … 1.2"),
+    "k ≪ 1": Regime(drawn("k ≪ 1"), 0.1, "k in 1e-6 … 0.1, cosine uniform"),
     "axes, signed zeros": Regime(
         components.zeros, 1e6, "n, and a of every other ray, with zeros of either sign; not tangential", any_k=True
     ),
@@ -120,11 +120,12 @@ def make_given(name: str, ratios: ArrayLike, precision: DTypeLike, seed: int = 0
         raise ValueError(f"regime {name!r}: it defines its own ratios of indices; expected one of {taking}")
     if (k < regime.least_k).any():
         raise ValueError(f"regime {name!r}: k = {k.min():.6g}; expected {regime.least_k:g} or more")
-    if not regime.angle:
+    angle = regime.angle
+    if angle is None:
         rays = make(name, len(k), precision, seed)
         return Rays(rays.a, rays.n, k.astype(precision))
     rng, n = _normals(name, len(k), seed)
-    return _rounded(aimed(regime.angle, rng, n.astype(precision), k), precision)
+    return _rounded(rays_at(lambda *given: (angle(k, *given), k), rng, n.astype(precision)), precision)
 
 
 def make(name: str, count: int, precision: DTypeLike, seed: int = 0, normal: ArrayLike | None = None) -> Rays:

@@ -18,8 +18,7 @@ from typing import Any
 
 from mi_refract.cluster import on_worker
 from mi_refract.cluster.connection import cluster_errors
-from mi_refract.cluster.spread import fetched, finished
-from mi_refract.cluster.workers import Workers
+from mi_refract.cluster.workers import Workers, fetched, finished
 
 from . import scene_bundle
 from .pass_plan import next_stop

@@ -20,18 +20,17 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refract import backend
-from mi_refract.cluster import worker_facts
-from mi_refract.io import lock
+from mi_refract.cluster import on_worker
+from mi_refract.io import atomic
 from mi_refract.io.atomic import writable
-from mi_refract.io.image_file import SUFFIXES, Metadata
-from mi_refract.io.provenance import installed_version, provenance
+from mi_refract.io.image_file import SUFFIXES, Metadata, installed_version, provenance
 from mi_refract.io.sanitise import printable
 from mi_refract.numerics import Scene
 from mi_refract.plugins.scene_parser import ParsedScene
 
-from . import checkpoint, error_estimate, rendered_file
+from . import checkpoint, rendered_file
 from .checkpoint import PASS, CheckpointWriter, Identity, Progress
-from .end_conditions import Limits, reached
+from .end_conditions import Limits, RelativeError, reached, relative_error, require_interval
 from .pass_plan import PassPlan, next_stop, plan_passes
 from .pass_sums import PassSums
 from .render_pass import PassRenderer, pass_renderer
@@ -86,7 +85,7 @@ def resume(
     if not 0 <= job.seed < 2**32:
         raise ValueError(f"seed = {job.seed}; expected a whole number from 0 to 2³² − 1")
     if limits.until is not None:
-        error_estimate.require_interval()
+        require_interval()
     parsed = parse_scene(job.scene, job.defines)
     scene = load_parsed(parsed, job.allow_plugins)
     renderer = pass_renderer(scene, job.seed)
@@ -123,8 +122,8 @@ def resume(
 
 def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> Identity:
     """Everything that the bits of a render depend on, by names for messages; but for PASS, which its plan says."""
-    digest = hashlib.sha256()
-    for name, path in [*(("", xml) for xml in parsed.xml), *parsed.files(job.allow_plugins).items()]:
+    digest = hashlib.sha256(parsed.text.encode())
+    for name, path in parsed.files(job.allow_plugins).items():
         digest.update(json.dumps([name, hashlib.sha256(path.read_bytes()).hexdigest()]).encode())
     width, height = renderer.size
     llvm = "llvm" in str(mi.variant())
@@ -135,10 +134,10 @@ def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> Identity
         "variant": str(mi.variant()),
         "film": f"{width} × {height} {', '.join(renderer.channels)}",
         "colours": renderer.colours,
-        "version of mi_refract": worker_facts.our_version(),
+        "version of mi_refract": on_worker.our_version(),
         **{f"version of {name}": installed_version(name) for name in ("mitsuba", "drjit")},
         "libLLVM": backend.llvm().library if llvm else "none",
-        "vector width": worker_facts.vector_width() if llvm else "none",
+        "vector width": on_worker.vector_width() if llvm else "none",
     }
 
 
@@ -172,7 +171,7 @@ class LongRender:
         `passes`: where they are rendered, by default in this process. On any error what is done stays in the
         checkpoint. BlockingIOError where another process renders into the same file, or did so since `resume`.
         """
-        with lock.held(lock_of(self.output), "a render", self.output, "another file"):
+        with atomic.held(lock_of(self.output), "a render", self.output, "another file"):
             if self._file_stamps() != self._files_before:
                 raise BlockingIOError(
                     f"{self.output}: written by another render in the meantime; run the command again"
@@ -251,10 +250,10 @@ class LongRender:
         """Whether it has as many samples per pixel as were asked for."""
         return self.progress.done == self.spp
 
-    def error(self) -> error_estimate.RelativeError | None:
+    def error(self) -> RelativeError | None:
         """The present error; None before the first pass."""
         sums = self.progress.sums()
-        return None if sums is None else error_estimate.relative_error(sums)
+        return None if sums is None else relative_error(sums)
 
     def image(self) -> np.ndarray | None:
         """The present image, H × W × channels; None before the first pass."""

@@ -1,7 +1,7 @@
 """A scene as one bundle, its XML and every file that it names, for a machine that does not have them.
 
-There the files lie below a folder as they lie here below the root, so that `../x` means the same. Names that would lead
-elsewhere are replaced where the scene is loaded; in XML that the parser opens itself they cannot be.
+There the files lie below a folder as they lie here below the root, so that `../x` means the same, and plugins get their
+paths. Mitsuba's parser opens XML and spectra itself: what it made of them there is compared with what it made here.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 import shutil
 import tempfile
 from collections import OrderedDict
@@ -18,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mi_refract.numerics import Scene
-from mi_refract.plugins import scene_limits, scene_parser
+from mi_refract.plugins import scene_parser
 from mi_refract.plugins.scene_parser import ParsedScene
 
 from .scene_files import load_parsed, parse_scene
@@ -26,19 +27,20 @@ from .scene_files import load_parsed, parse_scene
 MEBIBYTE = 2**20
 LIMIT = 256  # MiB
 _KEPT = 2  # bundles and scenes that a process keeps
-_EXPECTED = "a cluster needs a name relative to the scene's folder"
 
 
 @dataclass(frozen=True)
 class SceneBundle:
     """`scene` and the keys of `files` are absolute paths of the machine that made it; `digest` is of all the rest.
 
-    `moved`: of the names in the scene those that do not lead to a file of the bundle by themselves, and their paths.
-    `folders`: as the scene writes them, which must be there for a `..` that follows. `defines`: values of `<default>`s.
+    `text`: the digest of `ParsedScene.text`. `folders`: as the scene writes them, which must be there for a `..` that
+    follows. `moved`: of the names in the scene those that do not lead to a file of the bundle by themselves, and their
+    paths. `defines`: values of `<default>`s.
     """
 
     digest: str
     scene: str
+    text: str
     files: dict[str, bytes]
     folders: tuple[str, ...]
     moved: dict[str, str]
@@ -46,32 +48,29 @@ class SceneBundle:
 
 
 def pack(parsed: ParsedScene, defines: Mapping[str, str], limit: int = LIMIT) -> SceneBundle:
-    """The bundle of a scene that was parsed with these `defines`. `limit`: MiB of all files.
-
-    ValueError, one line, for a scene that is larger, or that reaches XML in a way that only works here.
-    """
-    named, xml, scene = parsed.files(), [_absolute(path) for path in parsed.xml], _absolute(parsed.path)
-    paths = {name: _absolute(path) for name, path in named.items()}
-    sizes = {path: Path(path).stat().st_size for path in (*xml, *paths.values())}
+    """The bundle of a scene that was parsed with these `defines`. `limit`: MiB of all files; ValueError for more."""
+    named = parsed.files()
+    with scene_parser.folders(*parsed.folders) as places:  # spectra are the files that Mitsuba reads as it parses
+        texts = (path.read_text("utf-8", "replace") for path in parsed.xml)
+        names = {name for text in texts for name in re.findall(r"""filename\s*=\s*["']([^"'<>$]+)["']""", text)}
+        spectra = [file for name in names if (file := Path(str(places.resolve(name)))).is_file()]
+    paths = {_absolute(path) for path in (parsed.path, *parsed.xml, *spectra, *named.values())}
+    sizes = {path: Path(path).stat().st_size for path in sorted(paths)}
     if (size := sum(sizes.values())) > limit * MEBIBYTE:  # before they are in memory
         largest = max(sizes, key=sizes.__getitem__)
         listed = f"{size / MEBIBYTE:.1f} MiB of files, the largest {largest} ({sizes[largest] / MEBIBYTE:.1f} MiB)"
         more = f"--bundle-limit {-(-size // MEBIBYTE)}, if all workers have the memory"
         raise ValueError(f"{parsed.path}: {listed}; the limit for a cluster is {limit} MiB; raise it by {more}")
-    parent = Path(scene).parent
+    scene, text = _absolute(parsed.path), hashlib.sha256(parsed.text.encode()).hexdigest()
     files = {path: Path(path).read_bytes() for path in sizes}
-    moved = {
-        name: path
-        for name, path in paths.items()
-        if os.path.normpath(parent / name) != path or Path(name).is_absolute()
-    }
-    contents = [[path, hashlib.sha256(content).hexdigest()] for path, content in sorted(files.items())]
-    digest = hashlib.sha256(json.dumps([scene, contents, moved, sorted(defines.items())]).encode()).hexdigest()
-    parents = {path.parent for path in (*parsed.xml, *named.values())} | set(parsed.searched)
-    folders = tuple(sorted(os.path.join(Path.cwd(), path) for path in parents))  # noqa: PTH118 (keeps "..")
-    bundle = SceneBundle(digest, scene, files, folders, moved, dict(defines))
-    _check_places(bundle, xml)
-    return bundle
+    contents = [[path, hashlib.sha256(content).hexdigest()] for path, content in files.items()]
+    where = {name: _absolute(path) for name, path in named.items()}
+    own = Path(scene).parent
+    moved = {n: p for n, p in where.items() if os.path.normpath(own / n) != p or Path(n).is_absolute()}
+    digest = hashlib.sha256(json.dumps([scene, text, contents, moved, sorted(defines.items())]).encode()).hexdigest()
+    folders = {path.parent for path in (*parsed.xml, *spectra, *named.values())} | set(parsed.folders)
+    written = tuple(sorted(os.path.join(Path.cwd(), path) for path in folders))  # noqa: PTH118 (keeps "..")
+    return SceneBundle(digest, scene, text, files, written, moved, dict(defines))
 
 
 def _absolute(path: Path) -> str:
@@ -80,24 +79,6 @@ def _absolute(path: Path) -> str:
     if not Path(normal).exists() or not os.path.samefile(path, normal):  # noqa: PTH121
         raise ValueError(f"{path}: '..' after a symbolic link; for a cluster, use a name without '..'")
     return normal
-
-
-def _check_places(bundle: SceneBundle, xml: list[str]) -> None:
-    """ValueError where Mitsuba's parser would not find in the bundle what it opens itself."""
-    with tempfile.TemporaryDirectory(prefix="mi_refract-") as folder:
-        contents = dict.fromkeys(bundle.files, b"") | {path: bundle.files[path] for path in xml}
-        _write(Path(folder), contents, bundle.folders)
-        scene = _below(folder, bundle.scene)
-        with scene_parser.folders(scene.parent) as inside:
-            text = scene_limits.check_files(scene, [Path(str(place)) for place in inside], bundle.defines)
-        for how, paths in (
-            ("is included", text.xml),
-            ("is opened by <spectrum>", text.opened.values()),
-            ("is the folder of a <path>", text.searched),
-        ):
-            for path in paths:
-                if path.exists() and not Path(os.path.normpath(path)).is_relative_to(folder):
-                    raise ValueError(f"{path}: {how} by an absolute name or from the working folder; {_EXPECTED}")
 
 
 def _below(root: str | Path, path: str) -> Path:
@@ -128,7 +109,11 @@ def load(bundle: SceneBundle, variant: str, folder: str) -> tuple[Scene, str]:
     if key not in _loaded:
         moved = {name: str(_below(root, path)) for name, path in bundle.moved.items()}
         with original_paths(str(root)):
-            _loaded[key] = load_parsed(parse_scene(_below(root, bundle.scene), bundle.defines), moved=moved)
+            parsed = parse_scene(_below(root, bundle.scene), bundle.defines)
+            if hashlib.sha256(parsed.text.encode()).hexdigest() != bundle.text:
+                expected = "XML and spectra that are named relative to the scene's folder"
+                raise ValueError(f"{bundle.scene}: Mitsuba reads another scene on this worker; expected {expected}")
+            _loaded[key] = load_parsed(parsed, moved=moved)
         if len(_loaded) > _KEPT:
             _loaded.popitem(last=False)
     return _loaded[key], str(root)

@@ -37,7 +37,7 @@ def parse_scene(path: str | os.PathLike[str], defines: Mapping[str, str] | None 
     """Parse a Mitsuba scene in an XML file, for the present variant; nothing of it runs.
 
     `defines`: values that replace those of its `<default>`s. FileNotFoundError for a missing file; ValueError, in one
-    line, beyond the limits of `mi_refract.plugins.scene_limits` and for what Mitsuba's parser does not accept.
+    line, for what Mitsuba's parser does not accept, circular references, and pipes.
     """
     from mi_refract.plugins import scene_parser
 

@@ -1,4 +1,4 @@
-"""The images of a page: base64 of the deflated planes of half floats, which its script reads, and thumbnails as PNG."""
+"""The images of a page: base64 of the deflated planes of half floats, which its script reads."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.io.image_file import read
-from mi_refract.io.pixels import Pixels, block_mean, srgb_encode
+from mi_refract.io.pixels import Pixels, block_mean
 
 Codes = NDArray[np.uint16]  # the bits of halves
 LARGEST = 65504.0  # of the finite halves
@@ -128,34 +128,6 @@ def _fitting(codes: Codes, limit: float) -> int | None:
     share = len(codes) / len(sample) * 4 / 3
     sizes = ((bits, share * len(_deflated(_rounded(sample, bits)))) for bits in ROUNDED)
     return next((bits for bits, size in sizes if size <= limit), None)
-
-
-# Thumbnails -----------------------------------------------------------------------------------------------------------
-
-SIDE, DIFFERENCE_SIDE = 160, 64  # pixels of the longer side, at most; of a difference one alone is to be seen
-NOT_A_NUMBER = np.array((255, 0, 255), np.uint8)  # as in the page's script
-EQUAL, LESS, MORE = np.array((247, 247, 247)), np.array((33, 102, 172)), np.array((178, 24, 43))
-
-
-def thumbnail(pixels: Pixels, coded: bool) -> bytes:
-    """H × W × (1 or 3) pixels; `coded`: they are sRGB codes, else linear light."""
-    small = block_mean(pixels, -(-max(pixels.shape[:2]) // SIDE))
-    unit = np.clip(np.nan_to_num(small), 0, 1)
-    codes = unit if coded else srgb_encode(unit)
-    rgb = np.broadcast_to(np.rint(255 * codes), (*small.shape[:2], 3)).astype(np.uint8)
-    return png(np.where(np.isnan(small).any(-1, keepdims=True), NOT_A_NUMBER, rgb))
-
-
-def difference_thumbnail(values: Pixels) -> bytes:
-    """H × W × C differences, of every block the strongest; colours are full at the upper hundredth of what is not 0."""
-    block = -(-max(values.shape[:2]) // DIFFERENCE_SIDE)
-    small = strongest(values, max(values.shape[1] // block, 1))[..., 0]
-    finite = np.where(np.isfinite(small), small, np.copysign(np.inf, small))
-    some = np.abs(finite[np.isfinite(small) & (small != 0)])
-    full = float(np.quantile(some, 0.99)) if some.size else 1.0
-    share = np.clip(np.abs(finite) / full, 0, 1)[..., None]
-    rgb = EQUAL + (np.where(finite[..., None] < 0, LESS, MORE) - EQUAL) * share
-    return png(np.where(np.isnan(small)[..., None], NOT_A_NUMBER, np.rint(rgb).astype(np.uint8)))
 
 
 def png(rgb: NDArray[np.uint8]) -> bytes:

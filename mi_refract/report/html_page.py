@@ -1,4 +1,4 @@
-"""HTML pages that need no network: a template with style, script and images inlined, or with files beside it."""
+"""HTML pages that need no network: a template with style, script and images inlined."""
 
 from __future__ import annotations
 
@@ -26,29 +26,16 @@ def write_page(path: str | Path, template: str, content: Mapping[str, Any], imag
     write_atomically(path, rendered(template, content, images))
 
 
-def rendered(
-    template: str, content: Mapping[str, Any], images: EmbeddedImages | None = None, beside: str | None = None
-) -> bytes:
-    """The page. `beside`: the folder, relative to the page, with the styles and scripts; None: they are inlined."""
+def rendered(template: str, content: Mapping[str, Any], images: EmbeddedImages) -> bytes:
+    """The page."""
     from markupsafe import Markup
 
     def part(name: str) -> Markup:
-        style = name.endswith(".css")
-        if beside is None:
-            text = (HERE / name).read_text("utf-8")
-            return Markup(f"<style>\n{text}</style>" if style else f"<script>\n{text}</script>")
-        place = beside + name
-        return Markup(f'<link rel="stylesheet" href="{place}">' if style else f'<script src="{place}"></script>')
+        text = (HERE / name).read_text("utf-8")
+        return Markup(f"<style>\n{text}</style>" if name.endswith(".css") else f"<script>\n{text}</script>")
 
-    embedded = images.embedded if images else []
-    text = _environment().get_template(template).render(**content, part=part, beside=beside, images=embedded)
+    text = _environment().get_template(template).render(**content, part=part, images=images.embedded)
     return text.encode("utf-8", "replace")
-
-
-def write_beside(folder: Path, *names: str) -> None:
-    """Write styles and scripts of the templates to a folder, for pages that are `rendered` beside them. OSError."""
-    for name in names:
-        (folder / name).write_bytes((HERE / name).read_bytes())
 
 
 @functools.cache

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.io.image_file import one_line
-from mi_refract.plugins import scene_limits, scene_parser
+from mi_refract.plugins import scene_parser
 
 from .plain_scene import Colour
 
@@ -115,7 +115,7 @@ class SceneFile:
     def __init__(self, path: Path, defines: Mapping[str, str]) -> None:
         """Parse the file; `defines` replace its `<default>`s. Nothing in it runs.
 
-        ValueError, one line, where Mitsuba cannot parse it, and beyond the limits of `plugins.scene_limits`.
+        ValueError, one line, where Mitsuba cannot parse it.
         """
         self.path = path
         try:
@@ -133,5 +133,5 @@ class SceneFile:
     def resolve(self, name: str) -> Path:
         """The path of a file that the scene names relative to its own folder. ValueError for a pipe or a device."""
         path = self.path.parent / name
-        scene_limits.refuse_special(path)
+        scene_parser.require_file(path)
         return path

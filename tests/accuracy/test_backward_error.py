@@ -10,10 +10,14 @@ from mi_refract.regimes import Rays
 EPSILON = 1e-7
 
 
-def drawn(count=300, seed=1, largest=2.5):
+def unit(v):
+    return v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+def drawn(count=300):
     """Rays at least 0.01 from the critical angle, transmitted, with the normal against them."""
-    rng = np.random.default_rng(seed)
-    cos_i, k = rng.uniform(0.02, 0.999, 8 * count), np.exp(rng.uniform(-np.log(largest), np.log(largest), 8 * count))
+    rng = np.random.default_rng(1)
+    cos_i, k = rng.uniform(0.02, 0.999, 8 * count), np.exp(rng.uniform(-np.log(2.5), np.log(2.5), 8 * count))
     kept = np.flatnonzero(1 - k * k * (1 - cos_i * cos_i) > 0.01)[:count]
     n = unit(rng.normal(size=(count, 3)))
     t = unit(np.cross(n, rng.normal(size=(count, 3))))
@@ -21,16 +25,16 @@ def drawn(count=300, seed=1, largest=2.5):
     return Rays(a, n, k[kept])
 
 
-def unit(v):
-    return v / np.linalg.norm(v, axis=1, keepdims=True)
+RAYS = drawn()
+A, N, K = RAYS.a, RAYS.n, RAYS.k
 
 
 def refracted(rays):
     return oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False).direction
 
 
-def tangent(a, n):
-    return unit(a - (a * n).sum(1, keepdims=True) * n)
+B = refracted(RAYS)
+GAMMA = ((K[:, None] * A - B) * N).sum(1)
 
 
 def turned(v, toward, angle):
@@ -39,64 +43,44 @@ def turned(v, toward, angle):
     return unit(np.cos(angle) * v + np.sin(angle) * side)
 
 
-def test_what_is_exact_for_inputs_so_far_off_has_no_larger_backward_error():
-    rays, rng = drawn(), np.random.default_rng(2)
+def found(a=A, n=N, k=K):
+    """Of the exact refraction of these inputs, as an answer to RAYS."""
+    return backward_error.of_directions(refracted(Rays(a, n, k)), RAYS)
+
+
+def test_inputs_that_were_changed_are_found_as_far_off_as_they_are():
+    rng = np.random.default_rng(2)
     for _ in range(5):
-        a, n = (turned(v, rng.normal(size=v.shape), EPSILON) for v in (rays.a, rays.n))
-        changed = Rays(a, n, rays.k * (1 + EPSILON * rng.choice([-1, 1], len(rays))))
-        found = backward_error.of_directions(refracted(changed), rays)
-        assert (found <= EPSILON * (1 + 1e-5)).all() and found.max() > 0.5 * EPSILON
+        a, n = (turned(v, rng.normal(size=v.shape), EPSILON) for v in (A, N))
+        off = found(a, n, K * (1 + EPSILON * rng.choice([-1, 1], len(K))))
+        assert (off <= EPSILON * (1 + 1e-5)).all() and off.max() > 0.5 * EPSILON
+    # The worst: along the surface, all three the same way: a forward, k up, and n as the sign of γ says, for δn×n γ and
+    # n×δa are parallel to n×t.
+    t = A - (A * N).sum(1, keepdims=True) * N
+    for step in (EPSILON, -EPSILON):
+        n = np.where(GAMMA[:, None] > 0, turned(N, t, -step), turned(N, t, step))
+        off = found(turned(A, t, step), n, K * (1 + step))
+        assert off == pytest.approx(np.full(len(K), EPSILON), rel=1e-4)
+    # Across the plane of incidence; the largest over φ is within 1 part in 1000 of that across.
+    across, gamma = np.cross(N, A), np.abs(GAMMA)
+    assert found(a=turned(A, across, EPSILON)) == pytest.approx(EPSILON * K / (K + gamma), rel=1e-3)
+    assert found(n=turned(N, across, EPSILON)) == pytest.approx(EPSILON * gamma / (K + gamma), rel=1e-3)
 
 
-@pytest.mark.parametrize("sign", [-1, 1])
-def test_inputs_off_in_the_worst_way_are_found_as_far_off_as_they_are(sign):
-    """Along the surface, all three the same way: a forward, k up, and n as the sign of γ = k cos θ_i − cos θ_t says."""
-    rays = drawn()
-    t = tangent(rays.a, rays.n)
-    gamma = ((rays.k[:, None] * rays.a - refracted(rays)) * rays.n).sum(1, keepdims=True)
-    # δn×n γ and n×δa are parallel to n×t: both add up where δn is along −γ t.
-    n = np.where(gamma > 0, turned(rays.n, t, -sign * EPSILON), turned(rays.n, t, sign * EPSILON))
-    changed = Rays(turned(rays.a, t, sign * EPSILON), n, rays.k * (1 + sign * EPSILON))
-    found = backward_error.of_directions(refracted(changed), rays)
-    assert found == pytest.approx(np.full(len(rays), EPSILON), rel=1e-4)
-
-
-@pytest.mark.parametrize("name", ["a", "n"])
-def test_inputs_off_across_the_plane_of_incidence(name):
-    rays = drawn()
-    across = np.cross(rays.n, rays.a)
-    changed = {"a": rays.a, "n": rays.n} | {name: turned(getattr(rays, name), across, EPSILON)}
-    found = backward_error.of_directions(refracted(Rays(**changed, k=rays.k)), rays)
-    gamma = np.abs(((rays.k[:, None] * rays.a - refracted(rays)) * rays.n).sum(1))
-    of = {"a": rays.k, "n": gamma}[name]
-    # The largest over φ is within 1 part in 1000 of that across.
-    assert found == pytest.approx(EPSILON * of / (rays.k + gamma), rel=1e-3)
-
-
-def test_lengths_are_not_in_it():
-    rays = drawn()
-    b = refracted(rays)
-    scaled = Rays(rays.a * 3e5, rays.n * 2e-9, rays.k)
-    assert (backward_error.of_directions(b * 7, scaled) < 2.0**-52).all()
-
-
-def test_what_is_no_direction_or_on_the_wrong_side():
-    rays = drawn(4)
-    b = refracted(rays)
-    cos_t = np.abs((b * rays.n).sum(1))
-    b[0], b[1], b[2] = 0, np.nan, b[2] - 2 * (b[2] @ rays.n[2]) * rays.n[2]
-    found = backward_error.of_directions(b, rays)
-    assert np.isinf(found[:2]).all() and found[2] >= cos_t[2] and found[3] < 2.0**-52
+def test_lengths_are_not_in_it_and_what_is_no_direction_or_on_the_wrong_side_is():
+    scaled, b = Rays(A * 3e5, N * 2e-9, K), B * 7
+    assert (backward_error.of_directions(b, scaled) < 2.0**-52).all()
+    b[0], b[1], b[2] = 0, np.nan, b[2] - 2 * (b[2] @ N[2]) * N[2]
+    off = backward_error.of_directions(b, scaled)
+    assert np.isinf(off[:2]).all() and off[2] >= abs(B[2] @ N[2]) and off[3] < 2.0**-52
 
 
 def test_mirror_directions():
-    rays = drawn()
-    mirror = rays.a - 2 * (rays.a * rays.n).sum(1, keepdims=True) * rays.n
-    every = np.ones(len(rays), bool)
-    assert (backward_error.of_directions(mirror, rays, every) < 4 * 2.0**-53).all()
-    off = backward_error.of_directions(turned(mirror, rays.a, EPSILON), rays, every)
-    assert off == pytest.approx(np.full(len(rays), EPSILON / 3), rel=1e-4)  # a alone turns b once, n twice
-    assert (backward_error.of_directions(mirror, rays) > 0.01).all()
+    mirror, every = A - 2 * (A * N).sum(1, keepdims=True) * N, np.ones(len(K), bool)
+    assert (backward_error.of_directions(mirror, RAYS, every) < 4 * 2.0**-53).all()
+    off = backward_error.of_directions(turned(mirror, A, EPSILON), RAYS, every)
+    assert off == pytest.approx(np.full(len(K), EPSILON / 3), rel=1e-4)  # a alone turns b once, n twice
+    assert (backward_error.of_directions(mirror, RAYS) > 0.01).all()
 
 
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
@@ -105,8 +89,8 @@ def test_a_rounded_exact_answer_is_off_by_no_more_than_its_rounding(name, precis
     """Rounding moves b by up to u |b|, and no input of h ≥ 1 need move farther than b does."""
     rays = regimes.make(name, 400, precision, seed=5)
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-    found = backward_error.of_directions(exact.direction.astype(precision), rays, ~exact.transmitted)
-    assert found.max() <= np.finfo(precision).eps / 2
+    off = backward_error.of_directions(exact.direction.astype(precision), rays, ~exact.transmitted)
+    assert off.max() <= np.finfo(precision).eps / 2
 
 
 @pytest.mark.parametrize("alpha", [0.0, 1e-14, 1e-9, 1e-3, 1.0])
@@ -126,23 +110,16 @@ def test_mirror_directions_off_by_any_share_along_and_across(alpha):
         assert backward_error.of_directions(b, rays, np.ones(1, bool))[0] == pytest.approx(least, rel=2e-3)
 
 
-@pytest.mark.parametrize("distance", [1e-12, 1e-9, 1e-6, 1e-3])
-@pytest.mark.parametrize("beyond", [False, True])
-def test_inputs_just_so_far_off_are_on_the_other_side_of_the_critical_angle(distance, beyond):
-    rng = np.random.default_rng(3)
-    k = rng.uniform(1.05, 3, 50)
-    angle = np.arcsin(1 / k) + (distance if beyond else -distance)
-    n = np.broadcast_to([0.0, 0, 1], (50, 3))
-    rays = Rays(np.stack([np.sin(angle), np.zeros(50), -np.cos(angle)], 1), n.copy(), k)
-    sign = -1 if beyond else 1
+@pytest.mark.parametrize("distance", [1e-12, 1e-9, 1e-6, 1e-3, -1e-12, -1e-9, -1e-6, -1e-3])
+def test_inputs_just_so_far_off_are_on_the_other_side_of_the_critical_angle(distance):
+    k = np.random.default_rng(3).uniform(1.05, 3, 50)
+    angle, beyond = np.arcsin(1 / k) + distance, distance > 0
+    n = np.tile([0.0, 0, 1], (50, 1))
+    off = backward_error.of_decisions(Rays(np.stack([np.sin(angle), 0 * k, -np.cos(angle)], 1), n, k))
     for share, flips in ((0.98, False), (1.02, True)):
-        step = sign * share * backward_error.of_decisions(rays)
-        a, turn = angle + step, step  # both turn toward, or away from, the other side
-        changed = k * (1 + step) * np.sin(a + turn)
-        assert ((changed > 1) == (beyond != flips)).all()
-
-
-def test_at_normal_incidence_vectors_must_turn_to_the_critical_angle():
+        step = (-share if beyond else share) * off  # both a and n turn toward, or away from, the other side
+        assert ((k * (1 + step) * np.sin(angle + 2 * step) > 1) == (beyond != flips)).all()
+    # At normal incidence vectors must turn to the critical angle.
     a = np.array([[0.0, 0, -1], [0, 0, -1]])
     found = backward_error.of_decisions(Rays(a, -a, np.array([1e5, 0.5])))
     assert found[0] == pytest.approx(1e-5 / 2) and np.isinf(found[1])

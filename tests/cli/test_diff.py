@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from support.diff_images import BROKEN, image, samples, tree
 
-from mi_refract.image_diff import methods, text_reports
+from mi_refract.image_diff import methods, results_file, text_reports
 from mi_refract.image_diff.results import Result, Results, Status
-from mi_refract.io import exit_code
+from mi_refract.io import errors
 from mi_refract.io.image_file import read, write_exr
 
 EVIL = 'a"b<script>alert(1)<∕script>|`*[x](y)*`,:%0A::error::.exr'
@@ -23,8 +23,9 @@ EVIL = 'a"b<script>alert(1)<∕script>|`*[x](y)*`,:%0A::error::.exr'
 # Verdicts and options ---------------------------------------------------------------------------------------------
 
 
-def test_equal_and_different(run, pair):
+def test_equal_and_different_and_nothing_is_created_or_overwritten(run, pair, tmp_path):
     old, new = pair
+    before = tree(tmp_path)
     code, out, err = run("diff", old / "equal.exr", new / "equal.exr")
     assert (code, err, out.splitlines()[-1]) == (0, "", "1 image: 1 equal")
     code, out, err = run("diff", *pair)
@@ -33,6 +34,7 @@ def test_equal_and_different(run, pair):
     assert lines[1].split()[:3] == ["different", "louder.exr", "tolerance"]
     assert lines[2].split()[:3] == ["equal", "equal.exr", "tolerance"]
     assert lines[3:] == ["2 images: 1 different, 1 equal"]
+    assert tree(tmp_path) == before
 
 
 def test_inconclusive_renders(run, tmp_path):
@@ -102,43 +104,33 @@ def test_the_methods_are_printed_without_images(run, monkeypatch):
     assert (code, err) == (0, "") and "fail_relative" in out and "|---|" not in out
 
 
-@pytest.fixture
-def noisy(tmp_path):
-    """A reference of 1000 samples with its variance, and new images of 200: an equal one, and one 3 % brighter."""
-    mean = np.ones((32, 32, 3))
-    rng = np.random.default_rng(8)
-    for folder, spp, gains in (("old", 1000, (1, 1)), ("new", 200, (1, 1.03))):
-        (tmp_path / folder).mkdir()
-        for name, gain in zip(("equal", "off"), gains, strict=True):
-            write_exr(tmp_path / folder / f"{name}.exr", gain * rng.gamma(spp, mean / spp))
-    for name in ("equal", "off"):
-        write_exr(tmp_path / f"old/{name}_var.exr", mean)
-    return tmp_path / "old", tmp_path / "new"
-
-
 VARIANCE = ("--set", "variance={stem}_var.exr")
 
 
-def test_a_variance_beside_the_reference(run, noisy):
+def test_a_variance_beside_the_reference_and_channels(run, tmp_path):
+    """A reference of 1000 samples with its variance, and new images of 200: an equal one, and one 3 % brighter."""
+    mean, rng = np.ones((32, 32, 3)), np.random.default_rng(8)
+    old, new, out = tmp_path / "old", tmp_path / "new", tmp_path / "a.json"
+    for folder, spp, gains in ((old, 1000, (1, 1)), (new, 200, (1, 1.03))):
+        folder.mkdir()
+        for name, gain in zip(("equal", "off"), gains, strict=True):
+            write_exr(folder / f"{name}.exr", gain * rng.gamma(spp, mean / spp))
+    for name in ("equal", "off"):
+        write_exr(old / f"{name}_var.exr", mean)
     words = (*VARIANCE, "--set", "spp_reference=1000")
-    code, out, err = run("diff", *noisy, *words, "--set", "spp_test=200")
+    code, said, err = run("diff", old, new, *words, "--set", "spp_test=200")
     assert (code, err) == (1, "")
-    rows = [line.split()[:3] for line in out.splitlines()[1:3]]
+    rows = [line.split()[:3] for line in said.splitlines()[1:3]]
     assert rows == [["different", "off.exr", "welch"], ["equal", "equal.exr", "welch"]]
-    code, _, err = run("diff", *noisy, *words)
+    code, _, err = run("diff", old, new, *words)
     assert (code, len(err.splitlines())) == (2, 2) and "expected `spp` or `spp_test`" in err
-    assert run("diff", *noisy, *words, "--set", "spp_test=1")[0] == 2
-
-
-def test_channels(run, noisy, tmp_path):
-    old, new = noisy
-    words = ("equal.exr", *VARIANCE, "--set", "spp=200")
+    assert run("diff", old, new, *words, "--set", "spp_test=1")[0] == 2
     broken = read(new / "equal.exr").pixels.copy()
     broken[..., 2] *= 2
     write_exr(new / "equal.exr", broken)
+    words = ("equal.exr", *VARIANCE, "--set", "spp=200", "--json", out)
     for channels, code in (("R,G,B", 1), ("R,G", 0), ("R=G,G=R", 0), ("Q", 2)):
-        out = tmp_path / "a.json"
-        assert run("diff", old, new, *words, "--set", f"channels={channels}", "--json", out)[0] == code
+        assert run("diff", old, new, *words, "--set", f"channels={channels}")[0] == code
         (entry,) = json.loads(out.read_text())["results"]
         assert run(*shlex.split(entry["reproduce"])[1:])[0] == code
 
@@ -196,12 +188,9 @@ def test_check_settings(run, settled):
     assert (code, "louder-mac.exr" in out) == (0, True)
     code, out, _ = run("diff", *settled, "equal.exr", "--check-settings")
     assert (code, "louder" in out) == (0, False)
-
-
-def test_an_entry_that_is_wrong_stops_no_other_image(run, pair):
-    (pair[0] / "mi-refract.toml").write_text('[[image]]\nname = "louder.exr"\nfale = 1\nreason = "loud"\n')
-    for words in ([], ["--check-settings"]):
-        code, out, err = run("diff", *pair, *words)
+    (settled[0] / "mi-refract.toml").write_text('[[image]]\nname = "louder.exr"\nfale = 1\nreason = "loud"\n')
+    for words in ([], ["--check-settings"]):  # an entry that is wrong stops no other image
+        code, out, err = run("diff", *settled, *words)
         assert (code, err.count("\n")) == (2, 1)
         assert "image[0]: unknown key `fale`; expected method" in err and "equal.exr" in out
 
@@ -261,7 +250,7 @@ def test_whatever_one_image_does_the_report_is_written(run, pair, tmp_path, monk
     for name in outputs.values():
         text = (tmp_path / name).read_text()
         assert "out of memory" in text and "louder.exr" in text
-    monkeypatch.setenv(exit_code.TRACEBACK, "1")
+    monkeypatch.setenv(errors.TRACEBACK, "1")
     assert "Traceback" in run("diff", *pair)[2]
 
 
@@ -275,51 +264,43 @@ def test_images_larger_than_allowed(run, pair):
     assert run("diff", *names, "--max-values", 0)[0] == 2
 
 
+BOTH = "{}/old {}/new "
 BAD = {
-    "no file": (["{}/old", "{}/none"], "none"),
-    "file and folder": (["{}/old", "{}/new/equal.exr"], "cannot compare a folder with a file"),
-    "nothing in it": (["{}/old", "{}/empty"], "empty: contains no image"),
-    "nothing to refer to": (["{}/empty", "{}/new"], "empty: contains no image"),
-    "twice the folder": (["{}/old", "{}/old"], "the same path as the reference"),
-    "twice the file": (["{}/old/equal.exr", "{}/old/../old/equal.exr"], "the same path as the reference"),
-    "within": (["{}", "{}/new"], "one path contains the other"),
-    "samples of files": (
-        ["{}/old/equal.exr", "{}/new/equal.exr", "--renders"],
-        "not a folder; --renders expects folders",
-    ),
-    "method": (["{}/old", "{}/new", "--method", "idiff"], "--method idiff; expected auto, exact"),
-    "option": (["{}/old", "{}/new", "--method", "exact", "--set", "fail=1"], "--set: unknown key `fail`"),
-    "option of neither": (["{}/old", "{}/new", "--set", "threshold=1"], "--set: unknown key `threshold`; expected"),
-    "inconclusive": (["{}/old", "{}/new", "--inconclusive", "maybe"], "maybe"),
-    "no settings": (["{}/old", "{}/new", "--settings", "{}/none.toml"], "none.toml"),
-    "bad settings": (["{}/old", "{}/new", "--settings", "{}/bad.toml"], "bad.toml: defaults: unknown key `fale`"),
-    "report's name": (["{}/old", "{}/new", "--report", "{}/out.exr"], "expected a file name that ends in .html"),
-    "report's folder": (["{}/old", "{}/new", "--report", "{}/none/out.html"], "is not a folder"),
-    "report in nothing": (["{}/old", "{}/new", "--report", "{}/none/report/"], "is not a folder"),
-    "report a file": (["{}/old", "{}/new", "--report", "{}/bad.toml/"], "a file name that ends in .html, or a folder"),
-    "report among others": (["{}/old", "{}/new", "--report", "{}"], "not part of a report; expected a new or empty"),
-    "report among images": (["{}/old", "{}/new", "--report", "{}/new/report/"], "so it would be compared"),
-    "report over images": (["{}/old", "{}/new", "--report", "{}/old"], "so it would be compared"),
-    "junit's name": (["{}/old", "{}/new", "--junit", "{}/out.json"], "expected a file name that ends in .xml"),
-    "json's name": (["{}/old", "{}/new", "--json", "{}/old/equal.exr"], "expected a file name that ends in .json"),
-    "one path": (["{}/old"], "TEST"),
-    "no path": ([], "REFERENCE"),
-    "unknown option": (["{}/old", "{}/new", "--nonesuch"], "--nonesuch"),
+    "no file": ("{}/old {}/none", "none"),
+    "file and folder": ("{}/old {}/new/equal.exr", "cannot compare a folder with a file"),
+    "nothing in it": ("{}/old {}/empty", "empty: contains no image"),
+    "nothing to refer to": ("{}/empty {}/new", "empty: contains no image"),
+    "twice the folder": ("{}/old {}/old", "the same path as the reference"),
+    "twice the file": ("{}/old/equal.exr {}/old/../old/equal.exr", "the same path as the reference"),
+    "within": ("{} {}/new", "one path contains the other"),
+    "samples of files": ("{}/old/equal.exr {}/new/equal.exr --renders", "not a folder; --renders expects folders"),
+    "method": (BOTH + "--method idiff", "--method idiff; expected auto, exact"),
+    "option": (BOTH + "--method exact --set fail=1", "--set: unknown key `fail`"),
+    "option of neither": (BOTH + "--set threshold=1", "--set: unknown key `threshold`; expected"),
+    "inconclusive": (BOTH + "--inconclusive maybe", "maybe"),
+    "no settings": (BOTH + "--settings {}/none.toml", "none.toml"),
+    "bad settings": (BOTH + "--settings {}/bad.toml", "bad.toml: defaults: unknown key `fale`"),
+    "report's name": (BOTH + "--report {}/report/", "expected a file name that ends in .html"),
+    "report's folder": (BOTH + "--report {}/none/out.html", "is not a folder"),
+    "junit's name": (BOTH + "--junit {}/out.json", "expected a file name that ends in .xml"),
+    "json's name": (BOTH + "--json {}/old/equal.exr", "expected a file name that ends in .json"),
+    "one path": ("{}/old", "TEST"),
+    "no path": ("", "REFERENCE"),
+    "unknown option": (BOTH + "--nonesuch", "--nonesuch"),
 }
 
 
 @pytest.mark.parametrize("words, message", BAD.values(), ids=BAD)
 @pytest.mark.parametrize("verb", ["diff", "accept"])
 def test_bad_words(run, pair, tmp_path, verb, words, message):
-    if verb == "accept" and {"--renders", "--inconclusive", "--report", "--junit", "--json"} & {*words}:
+    if verb == "accept" and {"--renders", "--inconclusive", "--report", "--junit", "--json"} & {*words.split()}:
         pytest.skip("not one of its options")
     (tmp_path / "empty").mkdir()
     (tmp_path / "bad.toml").write_text("[defaults]\nfale = 1")
     before = tree(tmp_path)
-    code, out, err = run(verb, *(word.format(tmp_path) for word in words))
+    code, out, err = run(verb, *(word.format(tmp_path) for word in words.split()))
     assert (code, out, err.count("\n")) == (2, "", 1)
-    assert err.startswith("mi-refract: ")
-    assert message in err
+    assert err.startswith("mi-refract: ") and message in err
     assert tree(tmp_path) == before
 
 
@@ -335,45 +316,17 @@ def test_without_the_extra(run, pair, monkeypatch, tmp_path, verb, package):
     assert err == "mi-refract: comparing needs the extra `diff`: pip install 'mi-refract[diff]'\n"
 
 
-def test_nothing_is_created_or_overwritten(run, pair, tmp_path):
-    image(pair[1] / "added.exr")
-    image(pair[0] / "removed.exr")
-    before = tree(tmp_path)
-    run("diff", *pair)
-    run("diff", tmp_path / "none", pair[1])
-    assert tree(tmp_path) == before
-
-
 # Reports ----------------------------------------------------------------------------------------------------------
 
 
 def test_report(run, pair, tmp_path):
-    page = tmp_path / "out.html"
-    code, _, err = run("diff", *pair, "--report", page, "--method", "tolerance", "--set", "fail=0.01")
+    page, out = tmp_path / "out.HTM", tmp_path / "out.json"
+    code, _, err = run("diff", *pair, "--report", page, "--method", "tolerance", "--set", "fail=0.01", "--json", out)
     assert (code, err) == (1, "")
-    text = html.unescape(page.read_text())
-    whole = f"mi-refract diff {pair[0]} {pair[1]} --method tolerance --set fail=0.01"
-    one = f"mi-refract accept {pair[0]} {pair[1]} --method tolerance --set fail=0.01 louder.exr"
-    assert whole in text
-    assert one in text
-
-
-@pytest.mark.parametrize(
-    "name, index",
-    [
-        ("out/", "out/index.html"),
-        ("out", "out/index.html"),
-        ("v1.2/", "v1.2/index.html"),
-        ("a.html/", "a.html/index.html"),
-        ("a.HTM", "a.HTM"),
-    ],
-)
-def test_a_report_is_a_folder_unless_it_is_named_as_a_page(run, pair, tmp_path, name, index):
-    for _ in range(2):
-        code, _, err = run("diff", *pair, "--report", f"{tmp_path}/{name}", "--json", tmp_path / "out.json")
-        assert (code, err) == (1, "")
-        assert f"mi-refract accept {pair[0]} {pair[1]} --from {tmp_path}/out.json" in (tmp_path / index).read_text()
-    assert run("diff", *pair, "--report", tmp_path / "v1.2")[0] == (1 if name == "v1.2/" else 2)
+    text, flags = html.unescape(page.read_text()), "--method tolerance --set fail=0.01"
+    for words in (f"diff {pair[0]} {pair[1]} {flags}", f"accept {pair[0]} {pair[1]} {flags} louder.exr"):
+        assert f"mi-refract {words}" in text
+    assert f"mi-refract accept {pair[0]} {pair[1]} --from {out}" in text
 
 
 @pytest.fixture
@@ -382,6 +335,10 @@ def strange(pair):
     image(pair[1] / "inner.exr")
     (pair[1] / "inner.exr").rename(pair[1] / EVIL)
     return pair
+
+
+KEYS = """name status category reason warning error reference test target digests method method_why options channels
+variance mask ignore why_so entries matched variants metrics minimum_detectable_difference reproduce accept"""
 
 
 def test_json(run, strange, tmp_path):
@@ -400,6 +357,7 @@ def test_json(run, strange, tmp_path):
     assert by_name[EVIL]["category"] == "added"
     assert by_name[EVIL]["reference"] is None
     changed = by_name["louder.exr"]
+    assert list(changed) == KEYS.split()
     assert (changed["status"], changed["category"]) == ("different", "changed")
     assert changed["test"] == str(new / "louder.exr")
     assert any(metric["bound"] is not None and metric["value"] > metric["bound"] for metric in changed["metrics"])
@@ -415,11 +373,8 @@ def test_junit(run, strange, tmp_path):
     root = ElementTree.parse(out).getroot()
     assert [root.get(key) for key in ("tests", "failures", "errors", "skipped")] == ["3", "3", "0", "0"]
     failures = {case.get("name"): case.find("failure") for case in root.iter("testcase")}
-    assert {name: failure.get("type") for name, failure in failures.items()} == {
-        EVIL: "added",
-        "equal.exr": "removed",
-        "louder.exr": "different",
-    }
+    kinds = {name: failure.get("type") for name, failure in failures.items()}
+    assert kinds == {EVIL: "added", "equal.exr": "removed", "louder.exr": "different"}
     assert "reproduce: mi-refract diff " in failures["louder.exr"].text
 
 
@@ -445,16 +400,67 @@ def test_github(run, strange, tmp_path, monkeypatch):
     rows = [line for line in text.splitlines() if line.startswith("| ")]
     assert len(rows) == 4
     assert all(row.count("|") == 5 for row in rows)
-
-
-def test_github_without_a_summary(run, pair, monkeypatch):
-    monkeypatch.delenv("GITHUB_STEP_SUMMARY", raising=False)
-    code, out, err = run("diff", *pair, "--github")
+    monkeypatch.delenv("GITHUB_STEP_SUMMARY")
+    (new / EVIL).unlink()
+    image(new / "equal.exr")
+    code, out, err = run("diff", old, new, "--github")
     assert (code, err) == (1, "")
     assert sum(line.startswith("::error ") for line in out.splitlines()) == 1
-    (pair[1] / "louder.exr").write_bytes((pair[0] / "louder.exr").read_bytes())
-    code, out, err = run("diff", *pair, "--github")
-    assert (code, out.splitlines()[-1]) == (0, "2 images: 2 equal")
+
+
+@pytest.mark.parametrize(
+    "url, run_id, words",
+    [
+        ("", "", "Report: out.html\n"),
+        (
+            "",
+            "7",
+            "Report: out.html, where it is uploaded among the [artefacts of this run](https://g/a/b/actions/",
+        ),
+        ("https://x.io/r (1)/a.html", "7", "Report: [out.html](https://x.io/r%20%281%29/a.html)\n"),
+    ],
+)
+def test_the_summary_names_the_report_and_links_it_where_it_is_published(tmp_path, monkeypatch, url, run_id, words):
+    for name, value in {"SERVER_URL": "https://g", "REPOSITORY": "a/b", "RUN_ID": run_id}.items():
+        monkeypatch.setenv(f"GITHUB_{name}", value)
+    assert words in text_reports.markdown(Results(tmp_path, tmp_path, ()), "out.html", url)
+
+
+WARNED = "fail=.05 fail_percent=99 warn=1e-6 warn_relative=0"
+
+
+def test_a_warning_is_in_every_report_and_no_failure(run, pair, tmp_path, monkeypatch):
+    out, data, summary, page = (tmp_path / f"out.{ending}" for ending in ("xml", "json", "md", "html"))
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(summary))
+    monkeypatch.setenv("MI_REFRACT_REPORT_URL", "https://x.io/")
+    for i in range(30):  # many equal images hide no warning
+        for side in pair:
+            image(side / f"{i:02}.exr", shape=(4, 4, 3))
+    words = [word for each in WARNED.split() for word in ("--set", each)]
+    files = ["--junit", out, "--json", data, "--github", "--report", page]
+    code, text, _ = run("diff", *pair, "--method", "tolerance", *words, *files)
+    lines = text.splitlines()
+    assert code == 0
+    assert lines[1].split()[:2] == ["equal", "louder.exr"]
+    warning = "warning: 100 % of the pixels (1536 of 1536) differ by more than warn = 1e-06 (> warn_percent = 0)"
+    assert warning in lines[1] and html.escape(warning) in out.read_text() and "warn_percent" in page.read_text()
+    counted = text_reports.FEW + 2
+    assert lines[counted:-1] == [
+        f"… and {31 - text_reports.FEW} more that are equal",
+        "32 images: 32 equal, 1 with a warning",
+    ]
+    assert lines[-1].startswith("::warning ") and warning.replace("%", "%25") in lines[-1]
+    assert not ElementTree.parse(out).findall(".//failure")
+    assert [each["name"] for each in json.loads(data.read_text())["results"] if each["warning"]] == ["louder.exr"]
+    assert summary.read_text().count("\n| equal |") == 1 and "](https://x.io/)\n" in summary.read_text()
+    words[1] = "fail=.01"
+    code, text, _ = run("diff", *pair, "--method", "tolerance", *words[:2], "--set", "fail_relative=0", *files)
+    assert code == 1
+    bound = "100 % of the pixels (1536 of 1536) differ by more than fail = 0.01 (> fail_percent = 0.02)"
+    (command,) = [line for line in text.splitlines() if line.startswith("::")]
+    assert command.startswith("::error ") and bound.replace("%", "%25") in command
+    (failure,) = ElementTree.parse(out).findall(".//failure")
+    assert bound in failure.get("message") and bound in text
 
 
 def test_strangers_words_stay_text(tmp_path):
@@ -464,7 +470,7 @@ def test_strangers_words_stay_text(tmp_path):
     results = Results(tmp_path, tmp_path, (result,))
     forms = [*text_reports.workflow_commands(results), text_reports.markdown(results).partition("|---|\n")[2]]
     text_reports.write_junit(tmp_path / "out.xml", results)
-    text_reports.write_json(tmp_path / "out.json", results)
+    results_file.write(tmp_path / "out.json", results)
     forms.append(ElementTree.parse(tmp_path / "out.xml").find(".//testcase").get("name"))
     for form in forms:
         form.encode()
@@ -473,25 +479,10 @@ def test_strangers_words_stay_text(tmp_path):
     assert json.loads((tmp_path / "out.json").read_text())["results"][0]["name"] == name
 
 
-def test_many_equal_images_are_counted_and_not_listed(tmp_path, run):
-    for i in range(text_reports.FEW + 2):
-        for side in ("old", "new"):
-            image(tmp_path / side / f"{i}.exr", shape=(4, 4, 3))
-    code, out, _ = run("diff", tmp_path / "old", tmp_path / "new")
-    lines = out.splitlines()
-    assert code == 0
-    assert len(lines) == text_reports.FEW + 3
-    assert lines[-2:] == [
-        "… and 2 more that are equal",
-        f"{text_reports.FEW + 2} images: {text_reports.FEW + 2} equal",
-    ]
-
-
-def test_columns_are_aligned_and_verdicts_coloured_where_colours_are_wanted(run, pair, monkeypatch):
-    rows = [("verdict", "image", "why"), ("ガラス", "球.exr", "x" * 300), ("e\u0301", "[b].exr", "")]
-    assert text_reports.plain(rows) == "\n".join(
-        ["verdict  image    why", f"ガラス   球.exr   {'x' * 300}", "e\u0301        [b].exr"]
-    )
+def test_columns_are_aligned_and_verdicts_coloured_where_colours_are_wanted(run, pair, monkeypatch, capfd):
+    text_reports.print_table([("verdict", "image", "why"), ("ガラス", "球.exr", "x" * 300), ("e\u0301", "[b].exr", "")])
+    lines = [line.rstrip() for line in capfd.readouterr().out.splitlines()]
+    assert lines == ["verdict  image    why", f"ガラス   球.exr   {'x' * 300}", "e\u0301        [b].exr"]
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm")
     assert "\x1b[1;31mdifferent" in run("diff", *pair)[1]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from mi_refract.cli.quantities import parse_seconds, parse_share, shown_error
-from mi_refract.rendering.error_estimate import RelativeError
+from mi_refract.cli.render_progress import parse_seconds, parse_share, shown_error
+from mi_refract.rendering.end_conditions import RelativeError
 
 
 @pytest.mark.parametrize("text, value", [("1%", 0.01), ("0.01", 0.01), ("100%", 1.0), ("1e-3", 0.001), ("0.5%", 0.005)])

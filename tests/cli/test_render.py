@@ -15,8 +15,7 @@ from support.processes import python
 
 import mi_refract
 from mi_refract import backend
-from mi_refract.io.image_file import read_exr
-from mi_refract.io.provenance import installed_version
+from mi_refract.io.image_file import installed_version, read_exr
 from mi_refract.rendering.pass_plan import scalar_seed_of
 
 SCENE = """<scene version="3.0.0">

@@ -53,7 +53,7 @@ def test_bad_self_tests(run, pair, tmp_path):
         ([tmp_path / "none.xml"], "none.xml"),
         ([tmp_path / "mixed"], "size or channels differ from"),
         ([tmp_path / "nan.exr"], "with finite values only"),
-        (["--allow-plugins", "evil"], "expected a scene SCENE.xml as REFERENCE"),
+        ([], "Missing argument 'REFERENCE'"),
         ([pair[0], "--allow-plugins", "evil"], "expected a scene SCENE.xml as REFERENCE"),
     ]:
         code, out, err = run("self-test", *words)
@@ -66,10 +66,9 @@ def test_bad_self_tests(run, pair, tmp_path):
     [
         ('<bsdf type="evil"/>', "s.xml: plugin 'evil': neither Mitsuba's nor mi_refract's; expected those"),
         ('<bsdf type="../evil"/>', "s.xml: plugin '../evil': neither"),
-        ('<bsdf type="twosided">' * 20000 + "</bsdf>" * 20000, "s.xml: elements nested more than 32 deep"),
         ("", "s.xml: not a regular file"),
     ],
-    ids=["plugin", "plugin elsewhere", "deep", "pipe"],
+    ids=["plugin", "plugin elsewhere", "pipe"],
 )
 def test_refused_in_one_line(elements, says, run, tmp_path):
     for path in (tmp_path / "plugins" / "evil.so", tmp_path / "evil.so"):

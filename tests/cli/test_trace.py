@@ -59,31 +59,24 @@ def paths_of(result):
     return [path for colour in json.loads(out, parse_constant=refuse)["colours"] for path in colour["paths"]]
 
 
-def test_without_an_output_a_line_is_printed(trace, ball):
-    assert trace() == (0, "ball.toml: 7 rays, 14 hits, 7 escaped\n", "")
-    assert list(ball.parent.iterdir()) == [ball]
-
-
-@pytest.mark.parametrize("suffix", [".png", ".pdf", ".SVG"])
-def test_an_image_of_each_kind(trace, ball, suffix):
+@pytest.mark.parametrize("suffix", ["", ".png", ".pdf", ".SVG"])
+def test_a_line_is_printed_and_a_figure_is_drawn(trace, ball, suffix):
     output = ball.with_name(f"image{suffix}")
-    assert trace("-o", output) == (0, "ball.toml: 7 rays, 14 hits, 7 escaped\n", "")
-    assert output.read_bytes().startswith(FORMATS[suffix.lower()])
-    assert sorted(ball.parent.iterdir()) == sorted([ball, output])
+    assert trace(*(["-o", output] if suffix else [])) == (0, "ball.toml: 7 rays, 14 hits, 7 escaped\n", "")
+    assert sorted(ball.parent.iterdir()) == sorted([ball, output] if suffix else [ball])
+    assert not suffix or output.read_bytes().startswith(FORMATS[suffix.lower()])
 
 
 def test_json_is_the_paths(trace, ball):
     scene = scene_file.load(ball)
     expected = tracer.trace(scene.segments[0], scene.origins, scene.directions, scene.max_depth, weights=True)
     paths = paths_of(trace("--json"))
-    assert len(paths) == 7
-    for i, path in enumerate(paths):
-        np.testing.assert_array_equal(path["points"], expected.points[i, :3])
-        np.testing.assert_array_equal(path["direction"], expected.directions[i])
-        np.testing.assert_array_equal(path["weights"], expected.weights[i, :3])
-        assert path["hits"] == expected.hits[i, :2].tolist()
-        assert path["events"] == ["refracted", "refracted", "escaped"]
-        assert path["indices"] == [1.0, 1.5, 1.0]
+    for name, values in (("points", expected.points[:, :3]), ("weights", expected.weights[:, :3])):
+        np.testing.assert_array_equal([path[name] for path in paths], values)
+    np.testing.assert_array_equal(directions(paths), expected.directions)
+    assert [path["hits"] for path in paths] == expected.hits[:, :2].tolist()
+    for path in paths:
+        assert (path["events"], path["indices"]) == (["refracted", "refracted", "escaped"], [1.0, 1.5, 1.0])
 
 
 def test_json_shows_nothing_of_a_title_but_ascii(trace, ball):
@@ -100,57 +93,52 @@ def test_the_table(trace):
     code, out, err = trace("--table")
     assert (code, err) == (0, "")
     lines = out.splitlines()
-    assert lines[0] == "ball.toml: 7 rays, 14 hits, 7 escaped"
+    assert (lines[0], len(lines)) == ("ball.toml: 7 rays, 14 hits, 7 escaped", 5)
     assert lines[1].split()[-4:] == ["rms", "largest", "marginal", "paraxial"]
-    assert len(lines) == 5
     assert lines[4].split()[3:6] == ["1.5", "0.5", "-0.5"]
     assert "1.10445, 0" in lines[2]  # sin i / sin 2(i − r) for sin i = 0.9, sin r = 0.6
-    data = json.loads(trace("--table", "--json")[1])
-    assert data["foci"][0]["spread"]["marginal"][0] == pytest.approx(1.1044455683692647, abs=1e-12)
-    assert data["foci"][0]["spread"]["paraxial"] == pytest.approx([1.5, 0], abs=1e-14)
-    assert data["foci"][0]["spread"]["cardinal"]["focal_length"] == pytest.approx(1.5, rel=1e-14)
+    spread = json.loads(trace("--table", "--json")[1])["foci"][0]["spread"]
+    assert spread["marginal"][0] == pytest.approx(1.1044455683692647, abs=1e-12)
+    assert spread["paraxial"] == pytest.approx([1.5, 0], abs=1e-14)
+    assert spread["cardinal"]["focal_length"] == pytest.approx(1.5, rel=1e-14)
     assert "foci" not in json.loads(trace("--json")[1])
 
 
 def test_a_spot_on_a_plane(trace):
     code, out, err = trace("--plane", "-2,0")
-    assert (code, err) == (0, "")
-    assert len(out.splitlines()) == 7
+    assert (code, err, len(out.splitlines())) == (0, "", 7)
     one, other = (
         json.loads(trace("--json", "--plane", at)[1])["foci"][0]["spread"]["on_plane"] for at in ("3,0", "3,5,180")
     )
     assert one.keys() == {"centre", "rms", "extent"}
     assert one["centre"] == pytest.approx([3, 0], abs=1e-12)
-    for name, value in one.items():
-        assert other[name] == pytest.approx(value, abs=1e-12)
+    assert all(other[name] == pytest.approx(value, abs=1e-12) for name, value in one.items())
 
 
-def test_branches_override_the_file(trace, ball):
-    assert {path["reflect"] for path in paths_of(trace("--json"))} == {0}
-    assert {path["reflect"] for path in paths_of(trace("--json", "--branches", 2))} == {0, 1, 2, 6}
+def test_options_override_the_file(trace, ball):
+    def reflected(*options):
+        return {path["reflect"] for path in paths_of(trace("--json", *options))}
+
+    assert (reflected(), reflected("--branches", 2)) == ({0}, {0, 1, 2, 6})
     ball.write_text(BALL.replace("branches = 0", "branches = 1"))
-    assert {path["reflect"] for path in paths_of(trace("--json"))} == {0, 1, 2}
-    assert {path["reflect"] for path in paths_of(trace("--json", "--branches", 0))} == {0}
-
-
-def test_rays_and_depth(trace):
+    assert (reflected(), reflected("--branches", 0)) == ({0, 1, 2}, {0})
+    ball.write_text(BALL)
     assert trace("--rays", 101)[1] == "ball.toml: 101 rays, 202 hits, 101 escaped\n"
     assert trace("--max-depth", 1)[1] == "ball.toml: 7 rays, 7 hits, 7 stopped at max_depth\n"
 
 
-def directions(result):
-    return np.array([path["direction"] for path in paths_of(result)])
+def directions(paths):
+    return np.array([path["direction"] for path in paths])
 
 
 def test_a_formula_a_backend_and_a_precision(trace, needs_variant):
-    default = directions(trace("--json"))
+    needs_variant("llvm_ad_rgb")  # without LLVM scalar arrays are the default
+    default = directions(paths_of(trace("--json")))
     for options in (("--formula", "promoted"), ("--backend", "scalar")):
-        if "scalar" in options:
-            needs_variant("llvm_ad_rgb")  # without LLVM it is the default
-        found = directions(trace("--json", *options))
-        np.testing.assert_allclose(found, default, atol=1e-12)
-        assert (found != default).any()
-    single = directions(trace("--json", "--precision", "float32"))
+        other = directions(paths_of(trace("--json", *options)))
+        np.testing.assert_allclose(other, default, atol=1e-12)
+        assert (other != default).any()
+    single = directions(paths_of(trace("--json", "--precision", "float32")))
     np.testing.assert_array_equal(single, single.astype(np.float32))
     np.testing.assert_allclose(single, default, atol=1e-5)
 
@@ -183,8 +171,7 @@ def test_bad_options(trace, ball, options, message):
         options = (*options, "-o", str(ball.with_name("image.svg")))
     code, out, err = trace(*(option.format(ball.parent) for option in options))
     assert (code, out, err.count("\n")) == (2, "", 1)
-    assert err.startswith("mi-refract: ")
-    assert message in err
+    assert err.startswith("mi-refract: ") and message in err
     assert {path.name for path in ball.parent.iterdir()} == {"ball.toml", "folder.svg"}
 
 
@@ -205,8 +192,8 @@ def test_a_bad_scene_leaves_the_old_image(trace, ball, old, new, message):
 def test_without_matplotlib(trace, ball, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert trace()[0] == 0
-    code, out, err = trace("-o", ball.with_name("image.svg"))
-    assert (code, out, err) == (2, "", "mi-refract: images need the extra `plot`: pip install 'mi-refract[plot]'\n")
+    message = "mi-refract: images need the extra `plot`: pip install 'mi-refract[plot]'\n"
+    assert trace("-o", ball.with_name("image.svg")) == (2, "", message)
 
 
 def test_the_keys_of_a_scene_are_printed_without_one(run):
@@ -218,28 +205,26 @@ def test_the_keys_of_a_scene_are_printed_without_one(run):
     assert all(line.count("|") == 4 for line in out.splitlines() if line)
 
 
-PYTHON = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(app.__file__).parents[2]), *filter(None, sys.path)])}
-
-
-def shell(before, *arguments):
-    """The command in a process of its own, with something done `before`."""
-    imports = "import sys\nfrom mi_refract import cli\nfrom mi_refract.io import atomic"
-    code = f"{imports}\n{before}\nsys.exit(cli.main())"
-    command = [sys.executable, "-c", code, *map(str, arguments)]
-    return subprocess.Popen(command, env=PYTHON, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-
-
 def test_ctrl_c_leaves_nothing_half_written(ball):
     """Interrupted while the temporary file is there and the renaming is still to come."""
-    more = """
-import signal, time
+    code = """
+import signal, sys, time
+from mi_refract import cli
+from mi_refract.io import atomic
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job of a script ignores it
 def slow(self, target):
     print("written", flush=True)
     time.sleep(60)
 atomic.Path.replace = slow
+sys.exit(cli.main())
 """
-    with shell(more, "trace", ball, "-o", ball.with_name("image.svg")) as process:
+    folders = [str(Path(app.__file__).parents[2]), *filter(None, sys.path)]
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, "trace", str(ball), "-o", str(ball.with_name("image.svg"))],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(folders)},
+        **{"text": True, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE},
+    )
+    with process:
         assert process.stdout.readline() == "written\n"
         assert len(list(ball.parent.iterdir())) == 2
         time.sleep(0.1)

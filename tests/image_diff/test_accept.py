@@ -13,7 +13,6 @@ from support.diff_images import BROKEN, found, image, tree
 
 from mi_refract.image_diff import accept
 from mi_refract.image_diff import folders as diff
-from mi_refract.image_diff.results import Category
 from mi_refract.image_diff.settings import Entry, Settings
 
 SETTINGS = '[defaults]\naccept = ["no-star.exr", "{stem}-?.exr", "{stem}-*.exr", "{stem}_*.exr"]\n'
@@ -49,15 +48,26 @@ def compared(run, pair, tmp_path):
 # What is copied ---------------------------------------------------------------------------------------------------
 
 
-def test_what_is_accepted(folders):
+def test_what_is_not_equal_is_copied_and_what_was_removed_is_kept(run, folders, monkeypatch):
     old, new = folders
-    before, copies = tree(old), to_accept(old, new)
-    assert [(c.new, c.reference) for c in copies] == [(new / n, old / n) for n in ("added.exr", "inner/changed.exr")]
-    assert tree(old) == before
-    accept.accept(copies)
-    assert tree(old) == before | {name: tree(new)[name] for name in ("added.exr", "inner/changed.exr")}
+    before, names = tree(old), ("added.exr", "inner/changed.exr")
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
+    code, out, err = run("accept", old, new)  # a script is not asked
+    assert (code, err.partition(" ")[2]) == (
+        2,
+        "accept asks for confirmation on a terminal; without a terminal, pass --yes\n",
+    )
+    assert "changed.exr" in out and tree(old) == before
+    code, out, err = run("accept", old, new, "--yes")
+    assert (code, err) == (0, "")
+    assert f"{new}/inner/changed.exr → {old}/inner/changed.exr\n" in out
+    assert f"{new}/added.exr → {old}/added.exr (new)\n" in out and out.splitlines()[-1] == "2 accepted"
+    assert tree(old) == before | {name: tree(new)[name] for name in names}
     statuses = found(diff.diff(old, new))
     assert [name for name, status in statuses.items() if status != ("equal", "unchanged")] == ["removed.exr"]
+    image(new / "same.exr", gain=1.1)
+    for words, said in ((["--method", "tolerance", "--set", "fail=0.2"], "nothing to accept"), ([], "1 accepted")):
+        assert run("accept", old, new, *words, "--yes")[1].splitlines()[-1] == said  # judged as by `diff`
 
 
 def test_a_reference_that_is_not_there_yet(folders, tmp_path):
@@ -66,30 +76,25 @@ def test_a_reference_that_is_not_there_yet(folders, tmp_path):
     assert diff.diff(tmp_path / "first", new).exit_code == 0
     assert not (tmp_path / "first" / "notes.txt").exists()
     one = tmp_path / "deep" / "one.exr"
-    results = diff.diff(one, new / "same.exr", to_accept=True)
-    assert results.results[0].category is Category.ADDED
-    accept.accept(list(accept.changes(results)))
+    accept.accept(to_accept(one, new / "same.exr"))
     assert one.read_bytes() == (new / "same.exr").read_bytes()
+    for name in ("ref.png", "folder"):
+        with pytest.raises(ValueError, match=r"expected a name that ends in \.exr"):
+            to_accept(tmp_path / name, new / "same.exr")
 
 
 @pytest.mark.parametrize("name", ["truncated", "empty", "text", "deep", "zero size"])
-@pytest.mark.parametrize("new", ["same.exr", "added.exr"])
-def test_a_bad_image_becomes_no_reference(folders, name, new):
-    (folders[1] / new).unlink()
-    BROKEN[name](folders[1] / new)
-    with pytest.raises(accept.UnreadableImage, match=new):
-        to_accept(*folders)
-
-
-@pytest.mark.parametrize("name", ["ref.png", "folder"])
-def test_a_reference_is_of_the_format_that_its_name_says(folders, tmp_path, name):
-    with pytest.raises(ValueError, match=r"expected a name that ends in \.exr"):
-        to_accept(tmp_path / name, folders[1] / "same.exr")
-
-
-def test_a_bad_reference_can_be_replaced(folders):
+def test_a_bad_image_becomes_no_reference_and_a_bad_reference_can_be_replaced(folders, name):
     old, new = folders
-    BROKEN["truncated"](old / "same.exr")
+    for bad in ("same.exr", "added.exr"):
+        kept = (new / bad).read_bytes()
+        (new / bad).unlink()
+        BROKEN[name](new / bad)
+        with pytest.raises(accept.UnreadableImage, match=bad):
+            to_accept(old, new)
+        (new / bad).write_bytes(kept)
+    (old / "same.exr").unlink()
+    BROKEN[name](old / "same.exr")
     assert (new / "same.exr", old / "same.exr") in [(copy.new, copy.reference) for copy in to_accept(old, new)]
 
 
@@ -98,11 +103,23 @@ def test_values_that_are_not_finite_become_no_reference(folders):
     with pytest.raises(ValueError, match="not finite; to accept them, pass --set allow_nonfinite=true"):
         to_accept(*folders)
     assert len(to_accept(*folders, Settings((Entry("same.exr", {"allow_nonfinite": True}),)))) == 3
-
-
-def test_results_without_digests_are_not_accepted(folders):
     with pytest.raises(ValueError, match=r"added\.exr: compared without digests"):
         list(accept.changes(diff.diff(*folders)))
+
+
+def test_accept_takes_all_or_nothing(run, pair, tmp_path):
+    """And says once why: each image that cannot be compared has a line, also by the JSON of a comparison."""
+    out = tmp_path / "out.json"
+    for broken in (["equal.exr"], ["equal.exr", "louder.exr"]):
+        BROKEN["truncated"](pair[1] / broken[-1])
+        before = tree(pair[0])
+        run("diff", *pair, "--json", out)
+        for words in (pair, ("--from", out)):
+            code, said, err = run("accept", *words, "--yes")
+            assert code == 2 and "→" not in said
+            lines = [line.partition(".exr:")[0] for line in err.splitlines()]
+            assert lines == [f"mi-refract: {pair[1] / name}".removesuffix(".exr") for name in broken]
+            assert tree(pair[0]) == before
 
 
 # What changes meanwhile -------------------------------------------------------------------------------------------
@@ -188,16 +205,13 @@ def test_only_the_bytes_that_were_compared_are_copied(folders, monkeypatch):
     assert tree(folders[0]) == before
 
 
-def test_no_pipe_or_device_is_read(tmp_path):
+def test_what_cannot_be_read_has_no_digest(folders, tmp_path, monkeypatch):
+    """Nobody could say whether it changed. By a planted error: who runs as root may read everything."""
     os.mkfifo(tmp_path / "a.exr")
     (tmp_path / "b.exr").symlink_to("/dev/null")
     for path in (tmp_path / "a.exr", tmp_path / "b.exr"):
         with pytest.raises(ValueError, match=r"\.exr: not a regular file"):
             diff.digest(path)
-
-
-def test_a_reference_that_cannot_be_read_is_not_replaced(folders, monkeypatch):
-    """Nobody could say whether it changed. By a planted error: who runs as root may read everything."""
     digest = diff.digest
 
     def refuse(path):
@@ -208,23 +222,6 @@ def test_a_reference_that_cannot_be_read_is_not_replaced(folders, monkeypatch):
     monkeypatch.setattr(diff, "digest", refuse)
     with pytest.raises(ValueError, match=r"same\.exr: Permission denied"):
         to_accept(*folders)
-
-
-# The command ------------------------------------------------------------------------------------------------------
-
-
-def test_accept_copies_and_keeps_what_was_removed(run, pair):
-    old, new = pair
-    image(new / "inner" / "added.exr")
-    image(old / "removed.exr")
-    kept = {name: tree(old)[name] for name in ("removed.exr", "equal.exr")}
-    code, out, err = run("accept", old, new, "--yes")
-    assert (code, err) == (0, "")
-    assert f"{new}/louder.exr → {old}/louder.exr\n" in out
-    assert f"{new}/inner/added.exr → {old}/inner/added.exr (new)\n" in out
-    assert out.splitlines()[-1] == "2 accepted"
-    assert tree(old) == tree(new) | kept
-    assert run("accept", old, new, "--yes")[1].splitlines()[-1] == "nothing to accept"
 
 
 def test_accept_asks_first(run, pair, terminal):
@@ -243,38 +240,6 @@ def test_accept_asks_first(run, pair, terminal):
     assert tree(old) == before | {"louder.exr": tree(new)["louder.exr"]}
 
 
-def test_accept_does_not_ask_a_script(run, pair, monkeypatch):
-    before = tree(pair[0])
-    monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
-    code, out, err = run("accept", *pair)
-    assert (code, err) == (
-        2,
-        "mi-refract: accept asks for confirmation on a terminal; without a terminal, pass --yes\n",
-    )
-    assert "louder.exr" in out and tree(pair[0]) == before
-
-
-def test_accept_judges_like_diff(run, pair):
-    before = tree(pair[0])
-    assert "nothing to accept" in run("accept", *pair, "--yes", "--method", "tolerance", "--set", "fail=0.2")[1]
-    assert tree(pair[0]) == before
-
-
-def test_accept_takes_all_or_nothing(run, pair, tmp_path):
-    """And says once why: each image that cannot be compared has a line, also by the JSON of a comparison."""
-    out = tmp_path / "out.json"
-    for broken in (["equal.exr"], ["equal.exr", "louder.exr"]):
-        BROKEN["truncated"](pair[1] / broken[-1])
-        before = tree(pair[0])
-        run("diff", *pair, "--json", out)
-        for words in (pair, ("--from", out)):
-            code, said, err = run("accept", *words, "--yes")
-            assert code == 2 and "→" not in said
-            lines = [line.partition(".exr:")[0] for line in err.splitlines()]
-            assert lines == [f"mi-refract: {pair[1] / name}".removesuffix(".exr") for name in broken]
-            assert tree(pair[0]) == before
-
-
 # --from -----------------------------------------------------------------------------------------------------------
 
 
@@ -288,39 +253,29 @@ def entry(data, name):
     return next(each for each in data["results"] if each["name"] == name)
 
 
-def test_the_json_holds_digests_of_what_is_not_equal(run, pair, compared, tmp_path):
-    by_name = {each["name"]: each for each in json.loads(compared[2].read_text())["results"]}
-    assert by_name["equal.exr"]["digests"] is None
-    digests = by_name["louder.exr"]["digests"]
-    assert digests["reference"] != digests["test"] and len(digests["test"]) == 64
-    assert by_name["inner/added.exr"]["digests"]["reference"] == ""
-
-
-def test_exactly_the_images_of_the_json_are_accepted(run, compared):
+def test_exactly_the_images_of_the_json_are_accepted_here_or_elsewhere(run, compared, tmp_path):
     old, new, out = compared
+    data = json.loads(out.read_text())
+    assert entry(data, "equal.exr")["digests"] is None
+    digests = entry(data, "louder.exr")["digests"]
+    assert digests["reference"] != digests["test"] and len(digests["test"]) == 64
+    assert entry(data, "inner/added.exr")["digests"]["reference"] == ""
     before = tree(old)
     image(new / "later.exr")
     assert run("accept", old, new, "equal.exr", "--from", out)[:2] == (0, "nothing to accept\n")
     assert run("accept", old, new, "inner/*", "--from", out, "--yes")[0] == 0
     assert tree(old) == before | {"inner/added.exr": tree(new)["inner/added.exr"]}
     (old / "inner" / "added.exr").unlink()
-    code, said, err = run("accept", "--from", out, "--yes")
-    assert (code, err, said.splitlines()[-1]) == (0, "", "2 accepted")
-    assert tree(old) == before | {name: tree(new)[name] for name in ("louder.exr", "inner/added.exr")}
-
-
-def test_the_json_of_another_machine_fits_the_same_bytes_elsewhere(run, compared, tmp_path):
-    old, new, out = compared
     for side in (old, new):
         side.rename(tmp_path / f"moved-{side.name}")
     moved = tmp_path / "moved-old", tmp_path / "moved-new"
     assert run("accept", "--from", out, "--yes")[0] == 2
-    assert run("accept", *moved, "--from", out, "--yes")[0] == 0
-    assert tree(moved[0])["louder.exr"] == tree(moved[1])["louder.exr"]
-
-
-def test_two_files_by_their_json(run, pair, tmp_path):
-    one, two, out = pair[0] / "louder.exr", pair[1] / "louder.exr", tmp_path / "out.json"
+    code, said, err = run("accept", *moved, "--from", out, "--yes")
+    assert (code, err, said.splitlines()[-1]) == (0, "", "2 accepted")
+    assert tree(moved[0]) == before | {name: tree(moved[1])[name] for name in ("louder.exr", "inner/added.exr")}
+    one, two = tmp_path / "1.exr", tmp_path / "2.exr"
+    for path, gain in ((one, 1), (two, 2)):
+        image(path, gain=gain)
     run("diff", one, two, "--json", out)
     assert run("accept", "--from", out, "--yes")[0] == 0
     assert one.read_bytes() == two.read_bytes()
@@ -335,7 +290,7 @@ def test_what_changed_since_the_json_is_refused(run, compared, side, name):
     assert tree(compared[0]) == before
 
 
-def test_nan_is_accepted_where_the_comparison_allowed_it(run, pair, tmp_path):
+def test_nan_is_accepted_where_the_comparison_of_the_json_allowed_it(run, pair, tmp_path):
     old, new = pair
     image(new / "louder.exr", value=float("nan"))
     out = tmp_path / "out.json"
@@ -411,29 +366,25 @@ def test_bad_words_with_from(run, compared):
 
 
 @pytest.mark.parametrize("by_json", [False, True])
-def test_a_variant_stands_beside_the_reference(run, pair, tmp_path, by_json):
+def test_a_variant_stands_beside_the_reference_and_replaces_what_was_compared(run, pair, tmp_path, terminal, by_json):
     old, new = pair
     (old / "mi-refract.toml").write_text(SETTINGS)
     before, out = tree(old), tmp_path / "out.json"
     run("diff", old, new, "--json", out)
-    code, said, err = run("accept", *(["--from", out] if by_json else pair), "--as-variant", "macos", "--yes")
+    words = [*(["--from", out] if by_json else pair), "--as-variant", "macos"]
+    code, said, err = run("accept", *words, "--yes")
     assert (code, err) == (0, "")
     assert f"{new}/louder.exr → {old}/louder-macos.exr (new)\n" in said
     assert tree(old) == before | {"louder-macos.exr": tree(new)["louder.exr"]}
     assert run("diff", old, new)[0] == 0
-
-
-def test_a_variant_is_replaced_where_it_is_what_was_compared(run, pair, tmp_path, terminal):
-    old, new = pair
-    (old / "mi-refract.toml").write_text(SETTINGS)
     image(old / "louder-macos.exr", gain=2.0)
-    out = tmp_path / "out.json"
     run("diff", old, new, "--json", out)
+    kept = (old / "louder-macos.exr").read_bytes()
     terminal(lambda question: image(old / "louder-macos.exr", gain=3.0) is not None)
-    for words in ([old, new], ["--from", out]):
-        code, _, err = run("accept", *words, "--as-variant", "macos")
-        assert code == 2 and f"louder-macos.exr: {CHANGED}" in err
-    assert run("accept", old, new, "--as-variant", "macos", "--yes")[0] == 0
+    code, _, err = run("accept", *words)
+    assert code == 2 and f"louder-macos.exr: {CHANGED}" in err
+    (old / "louder-macos.exr").write_bytes(kept)
+    assert run("accept", *words, "--yes")[0] == 0
     assert tree(old)["louder-macos.exr"] == tree(new)["louder.exr"]
 
 

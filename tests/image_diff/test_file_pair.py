@@ -1,4 +1,4 @@
-"""Files of several parts or MIP levels: each is compared, and the verdict says which of them it is about."""
+"""Two files: each of several parts or MIP levels is compared, and masks leave pixels out, in every method."""
 
 from __future__ import annotations
 
@@ -6,18 +6,26 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 from support.diff_images import image as smooth
+from support.diff_images import samples
 
-from mi_refract.image_diff import accept, folders
+from mi_refract.image_diff import accept, file_pair, folders
 from mi_refract.image_diff.methods import METHODS
-from mi_refract.image_diff.settings import Entry, Settings
-from mi_refract.image_diff.settings_file import from_words
+from mi_refract.image_diff.settings import Settings, from_words
 from mi_refract.io import image_file
-from mi_refract.io.image_file import read, read_parts
+from mi_refract.io.image_file import read, read_parts, write_exr
 
 RNG = np.random.default_rng(4)
 SMALL = [RNG.random((8, 8, 3), np.float32) for _ in range(3)]
 PYRAMID = [RNG.random((side, side, 3), np.float32) for side in (8, 4, 2, 1)]
 SINGLE = [name for name, method in METHODS.items() if not method.takes_renders]
+
+
+def compared(one, two, **how):
+    (result,) = folders.diff(one, two, Settings.for_all(**how), maps=True).results
+    return result
+
+
+# Parts and MIP levels ---------------------------------------------------------------------------------------------
 
 
 def parts(path, images):
@@ -52,44 +60,34 @@ def with_change(images, number, by=0.5):
     return [pixels + by if i == number else pixels for i, pixels in enumerate(images)]
 
 
-def compared(one, two, how=Entry("", {})):  # noqa: B008
-    (result,) = folders.diff(one, two, Settings((how,)), maps=True).results
-    return result
-
-
 @pytest.mark.parametrize("name", ["a.exr", "a.tif"])
-def test_every_part_and_level_is_read(tmp_path, name):
-    found = read_parts(parts(tmp_path / name, SMALL))
+def test_every_part_and_level_is_read_within_one_limit(tmp_path, name):
+    path, size = parts(tmp_path / name, SMALL), 8 * 8 * 3
+    found = read_parts(path, 3 * size)
     assert [image.place for image in found] == ["part 0", "part 1", "part 2"]
     assert all(np.array_equal(image.pixels, pixels) for image, pixels in zip(found, SMALL, strict=True))
-    found = read_parts(levels(tmp_path / name, PYRAMID))
-    assert [image.place for image in found] == [f"MIP level {i}" for i in range(4)]
-    assert [image.part for image in found] == [(0, i) for i in range(4)]
-    assert all(np.array_equal(image.pixels, pixels) for image, pixels in zip(found, PYRAMID, strict=True))
-    (first,) = read_parts(tmp_path / name, first_only=True)
-    assert (first.place, first.part) == ("MIP level 0", (0, 0))
-    with pytest.raises(ValueError, match=r"several parts or MIP levels in one file; expected one image"):
-        read(tmp_path / name)
-
-
-def test_the_limit_holds_for_all_together(tmp_path):
-    path = parts(tmp_path / "a.exr", SMALL)
-    size = 8 * 8 * 3
-    assert len(read_parts(path, 3 * size)) == 3
     with pytest.raises(ValueError, match=r"8 × 8 × 3 values beside 384 .*; expected up to 575 values \(max-values\)"):
         read_parts(path, 3 * size - 1)
     assert len(read_parts(path, size, first_only=True)) == 1
+    found = read_parts(levels(path, PYRAMID))
+    assert [(image.place, image.part) for image in found] == [(f"MIP level {i}", (0, i)) for i in range(4)]
+    assert all(np.array_equal(image.pixels, pixels) for image, pixels in zip(found, PYRAMID, strict=True))
+    (first,) = read_parts(path, first_only=True)
+    assert (first.place, first.part) == ("MIP level 0", (0, 0))
+    with pytest.raises(ValueError, match=r"several parts or MIP levels in one file; expected one image"):
+        read(path)
+    smooth(tmp_path / "a.exr")
+    (only,) = read_parts(tmp_path / "a.exr")
+    assert (only.place, only.part, read(tmp_path / "a.exr").place) == ("", (0, 0), "")
 
 
 @pytest.mark.parametrize("method", SINGLE)
 @pytest.mark.parametrize("write, images, place", [(parts, SMALL, "part 2"), (levels, PYRAMID, "MIP level 2")])
 def test_a_change_in_any_of_them_is_different_and_placed(tmp_path, method, write, images, place):
     one = write(tmp_path / "a.exr", images)
-    same = compared(one, write(tmp_path / "b.exr", images), Entry("", {"method": method}))
-    assert str(same.status) == "equal"
-    found = compared(one, write(tmp_path / "c.exr", with_change(images, 2)), Entry("", {"method": method}))
-    assert str(found.status) == "different"
-    assert found.reason.startswith(f"{place}: ")
+    assert compared(one, write(tmp_path / "b.exr", images), method=method).status == "equal"
+    found = compared(one, write(tmp_path / "c.exr", with_change(images, 2)), method=method)
+    assert found.status == "different" and found.reason.startswith(f"{place}: ")
     assert found.reason.endswith(f"; different: 1 of {len(images)} parts and MIP levels")
     assert [image.pixels.shape for image in found.images.values()] == [images[2].shape] * 2
 
@@ -98,37 +96,29 @@ def test_a_change_in_any_of_them_is_different_and_placed(tmp_path, method, write
 def test_a_part_that_one_side_lacks_is_a_difference(tmp_path, number, words):
     one, two = parts(tmp_path / "a.exr", SMALL), parts(tmp_path / "b.exr", SMALL[:number])
     found = compared(one, two)
-    assert (str(found.status), found.reason.partition(";")[0]) == ("different", words)
+    assert (found.status, found.reason.partition(";")[0]) == ("different", words)
     assert compared(two, one).reason.startswith(words.replace("is missing", "was added"))
 
 
-def test_without_a_the_first_is_compared_as_idiff_does_and_that_is_said(tmp_path):
-    one, two = parts(tmp_path / "a.exr", SMALL), parts(tmp_path / "b.exr", with_change(SMALL, 1))
-    found = compared(one, two, from_words("auto", [], "-fail .01"))
-    assert str(found.status) == "equal"
-    assert found.reason.endswith("; of several images in the file only part 0 is compared")
-    assert str(compared(one, two, from_words("auto", [], "-a -fail .01")).status) == "different"
-
-
 def test_a_warning_names_its_place_and_the_others_are_counted(tmp_path):
-    flags = from_words("auto", [], "-a -fail .001 -failpercent 60")
+    words = ["fail=.001", "fail_percent=60", "fail_relative=0", "warn=1e-6", "warn_relative=0", "warn_percent=0"]
+    flags = from_words("tolerance", words).values
     one = parts(tmp_path / "a.exr", SMALL)
     some = [np.where(each > 0.9, each + 0.01, each) for each in SMALL]
-    found = compared(one, parts(tmp_path / "b.exr", [SMALL[0], some[1], SMALL[2]]), flags)
-    assert str(found.status) == "equal"
+    found = compared(one, parts(tmp_path / "b.exr", [SMALL[0], some[1], SMALL[2]]), **flags)
+    assert found.status == "equal"
     assert found.warning.startswith("part 1: ") and found.warning.endswith("> warn_percent = 0)")
-    found = compared(one, parts(tmp_path / "c.exr", some), flags)
-    assert found.warning.startswith("part 0: ")
-    assert found.warning.endswith(", and in 2 more parts and MIP levels")
-    assert compared(one, parts(tmp_path / "d.exr", [some[0], SMALL[1] + 1, SMALL[2]]), flags).warning == ""
+    found = compared(one, parts(tmp_path / "c.exr", some), **flags)
+    assert found.warning.startswith("part 0: ") and found.warning.endswith(", and in 2 more parts and MIP levels")
+    assert compared(one, parts(tmp_path / "d.exr", [some[0], SMALL[1] + 1, SMALL[2]]), **flags).warning == ""
 
 
 def test_what_cannot_be_compared_is_named_with_its_place(tmp_path):
     one, two = (parts(tmp_path / f"{x}.exr", [SMALL[0], SMALL[1][..., : 3 - x]]) for x in (0, 1))
-    assert str(compared(one, two).status) == "different"  # a channel is missing
+    assert compared(one, two).status == "different"  # a channel is missing
     other = parts(tmp_path / "other.tif", [SMALL[0], SMALL[1][:4]])
     found = compared(parts(tmp_path / "one.tif", SMALL[:2]), other)
-    assert str(found.status) == "error"
+    assert found.status == "error"
     assert "size 8 × 4; expected 8 × 8" in found.error and found.error.endswith("(part 1)")
 
 
@@ -144,8 +134,104 @@ def test_a_file_of_several_parts_can_be_accepted(tmp_path):
         list(accept.changes(folders.diff(old, new, to_accept=True)))
 
 
-def test_a_file_of_one_image_has_no_place(tmp_path):
-    smooth(tmp_path / "a.exr")
-    (only,) = read_parts(tmp_path / "a.exr")
-    assert (only.place, only.part) == ("", (0, 0))
-    assert image_file.read(tmp_path / "a.exr").place == ""
+# Masks ------------------------------------------------------------------------------------------------------------
+
+SIZE = (32, 48, 3)
+WHOLE = ((4, 10, 16, 12),)  # x = 4 … 19, y = 10 … 21
+
+
+@pytest.fixture
+def sides(tmp_path):
+    """Two images that differ in that rectangle only, and a mask that is black there."""
+    smooth(tmp_path / "old/a.exr")
+    pixels, mask = smooth(tmp_path / "new/a.exr"), np.ones(SIZE)
+    pixels[10:22, 4:20] *= 3
+    mask[10:22, 4:20] = 0
+    write_exr(tmp_path / "new/a.exr", pixels)
+    write_exr(tmp_path / "old/a_mask.exr", mask)
+    return tmp_path / "old/a.exr", tmp_path / "new/a.exr"
+
+
+@pytest.mark.parametrize("method", SINGLE)
+def test_what_is_left_out_does_not_count(sides, method):
+    assert compared(*sides, method=method).status == "different"
+    assert compared(*sides, method=method, ignore=((4, 10, 4, 12),)).status == "different"
+    for left_out in ({"mask": "{stem}_mask.exr"}, {"ignore": WHOLE}, {"ignore": ((0, 10, 10, 12), (10, 0, 10, 22))}):
+        assert compared(*sides, method=method, **left_out).status == "equal"
+
+
+def test_renders_are_masked(tmp_path):
+    old, new = (samples(tmp_path / name, first=first) for name, first in (("old", 0), ("new", 100)))
+    for path in new.iterdir():
+        pixels = read(path).pixels.copy()
+        pixels[16:, :16] *= 2
+        write_exr(path, pixels)
+    assert folders.diff(old, new, renders=True).exit_code == 1
+    assert folders.diff(old, new, Settings.for_all(ignore=((0, 16, 16, 16),)), renders=True).exit_code == 0
+
+
+def test_shares_are_of_the_pixels_that_count_and_a_mask_is_shown(sides):
+    """192 of 1536 pixels differ: 12.5 %; of the 16 that count half do."""
+    only = np.zeros(SIZE)
+    only[10:12, 0:8] = 1
+    write_exr(sides[0].parent / "a_mask.exr", only)
+    how = {"method": "tolerance", "fail_percent": 20.0}
+    assert compared(*sides, **how).status == "equal"
+    found = compared(*sides, **how, mask="{stem}_mask.exr")
+    assert "50 % of the pixels (8 of 16)" in found.reason
+    assert found.warnings == ("the mask leaves out 99% of the pixels",)
+    assert found.comparison.maps["left out"].sum() == 1520
+
+
+def test_nan_and_channels_that_are_left_out(sides):
+    pixels = read(sides[1]).pixels.copy()
+    pixels[10, 5] = np.nan
+    write_exr(sides[1], pixels)
+    assert compared(*sides, method="exact", ignore=WHOLE).status == "equal"
+    found = compared(*sides, method="exact", channels=(("R", "R"),), ignore=WHOLE)
+    assert found.reason.endswith("; not compared: G, B")
+
+
+def test_rectangles_are_those_of_the_data_window(sides):
+    one = image_file.Image(sides[0], np.ones(SIZE), ("R", "G", "B"), origin=(100, 50))
+    mask = file_pair.mask_of(one, None, [(104, 60, 4, 2)])
+    assert not mask[10:12, 4:8].any() and mask.sum() == 32 * 48 - 8
+
+
+BAD = {
+    "size": ({"mask": "small.exr"}, "small.exr: 7 × 8; expected a mask of 48 × 32"),
+    "missing": ({"mask": "none.exr"}, "none.exr: No such file"),
+    "nan": ({"mask": "nan.exr"}, "values that are not finite"),
+    "nothing left": ({"ignore": ((0, 0, 48, 32),)}, "leaves no pixel"),
+    **{
+        f"outside {each}": ({"ignore": (each,)}, "expected a rectangle that overlaps")
+        for each in ((48, 0, 5, 5), (0, -10, 48, 5), (-9, 0, 4, 32), (-50, -50, 10, 10), (0, 32, 9, 9))
+    },
+}
+
+
+@pytest.mark.parametrize(("values", "message"), BAD.values(), ids=BAD)
+def test_bad_masks(sides, values, message):
+    smooth(sides[0].parent / "small.exr", shape=(8, 7, 3))
+    smooth(sides[0].parent / "nan.exr", value=np.nan)
+    found = compared(*sides, **values)
+    assert found.status == "error" and message in found.error and "\n" not in found.error
+
+
+@pytest.mark.parametrize("template", ["{stem}_mask.exr", "{root}/masks/{stem}.exr"])
+def test_a_mask_among_the_references_is_no_image(sides, template):
+    old, new = (path.parent for path in sides)
+    if "root" in template:
+        (old / "masks").mkdir()
+        (old / "a_mask.exr").rename(old / "masks/a.exr")
+    results = folders.diff(old, new, Settings.for_all(method="exact", mask=template))
+    assert ([each.name for each in results.results], results.exit_code) == (["a.exr"], 0)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (32, 1, 3), (1, 48, 3), (8, 8, 3)])
+def test_a_new_image_of_another_size_is_not_spread_over_the_mask(sides, shape):
+    smooth(sides[0], gain=0.0)  # black all over, as the new one
+    smooth(sides[1], shape=shape, gain=0.0)
+    found = compared(*sides, method="exact", ignore=((0, 0, 2, 2),))
+    assert found.status == "error"
+    assert f"size {shape[1]} × {shape[0]}; expected 48 × 32" in found.error

@@ -1,10 +1,11 @@
-"""The one page of `mi-refract diff`: failures first, true to the pixels, nothing executable, nothing fetched."""
+"""The page of `mi-refract diff`: failures first, true to the pixels, nothing executable, nothing fetched."""
 
 import base64
 import html
 import math
 import random
 import re
+import shlex
 import zlib
 from dataclasses import replace
 
@@ -12,17 +13,19 @@ import numpy as np
 import pytest
 from support.browser import browse, needs_chromium, seen
 from support.diff_images import image as smooth
+from support.diff_images import tree
 
-from mi_refract.image_diff import flip, folders, html_report, panes
+from mi_refract.image_diff import flip, folders, html_report
 from mi_refract.image_diff.comparison import Comparison, Metric, Verdict
 from mi_refract.image_diff.results import Result, Results, Status
-from mi_refract.image_diff.settings import Settings
+from mi_refract.image_diff.settings import Entry, Settings
 from mi_refract.io import image_file
 from mi_refract.io.image_file import write_exr
-from mi_refract.report.embedded_images import ROUNDED, EmbeddedImages, encoded, strongest
+from mi_refract.report.embedded_images import ROUNDED, encoded, strongest
 
 EVIL = "glass/<script>alert(1)</script>.exr"
 EQUAL = Comparison("tolerance", Verdict.EQUAL, "Within <b>bounds</b>.", (Metric("mean", 1e-5, 1e-3),))
+RNG = np.random.default_rng(5)
 
 
 def image(path, value, shape=(4, 6, 3), channels=("R", "G", "B")):
@@ -47,20 +50,15 @@ def results(folder):
     return Results(folder / "reference", folder / "test", (gone, changed, removed, same))
 
 
-def several(found, count):
-    """The results of a pair that differs, under that many names."""
-    return replace(found, results=tuple(replace(found.results[1], name=f"{i}.exr") for i in range(count)))
-
-
 def written(folder, found=None):
     html_report.write(folder / "report.html", found or results(folder), {"version": "1 & 2"}, "mi-refract diff a b")
     return (folder / "report.html").read_text("utf-8")
 
 
-def page_of(sides, place, replay="mi-refract diff old new", source="", settings=folders.AS_ASKED):
+def page_of(sides, place, source="", settings=folders.AS_ASKED):
     """The page as the command writes it: each pair while its images are in memory."""
     report = html_report.Page(place)
-    report.write(folders.diff(*sides, settings, view=report.view), {}, replay, source)
+    report.write(folders.diff(*sides, settings, view=report.view), {}, "mi-refract diff old new", source)
     return place.read_text("utf-8")
 
 
@@ -68,32 +66,67 @@ def roles(text):
     return re.findall('data-role="([^"]*)" data-paint="([^"]*)"', text)
 
 
+def decoded(data):
+    high, low = np.frombuffer(zlib.decompress(base64.b64decode(data)), "u1").reshape(2, -1).astype("<u2")
+    return (high << 8 | low).view("<f2")
+
+
 # The text ---------------------------------------------------------------------------------------------------------
 
 
-def test_failures_come_first_with_numbers_thresholds_and_commands(tmp_path):
+def test_failures_come_first_with_numbers_and_commands_and_nothing_is_fetched_or_run(tmp_path):
     text = written(tmp_path)
     places = ("<h1>4 images: ", 'id="pair-1"', 'id="pair-3"', 'id="equal"', "same.exr")
     order = [text.index(place) for place in places]
     assert order == sorted(order)
     numbers = ('<td class="fail">12</td><td class="limit">&gt; 0', "≰ 1", "1e-9", "0.013", "≤ 1e-3")
-    for words in (*numbers, "1 &amp; 2", "12 tiles differ.", "removed", "p-value", "mi-refract diff a b"):
+    causes = [f'data-filter="{cause}"><b>1</b>' for cause in ("could not be compared", "tiles that differ", "removed")]
+    for words in (*numbers, *causes, "1 &amp; 2", "12 tiles differ.", "p-value", "mi-refract diff a b"):
         assert words in text, words
     found = results(tmp_path)
     for result in found.results[:2]:
         for command in (found.reproduce(result), found.accept(result)):
             assert f"<dd><code>{html.escape(command, quote=False)}</code></dd>" in text.replace("&#39;", "'")
     assert "mi-refract accept" not in text[text.index('id="equal"') : text.index("</main>")]
-
-
-def test_the_page_requests_nothing_and_runs_no_name(tmp_path):
-    text = written(tmp_path)
     assert not re.findall(r"https?:|@import|url\((?!#)|\bsrc=|<link|<iframe", text)
     assert "default-src 'none'" in text
     assert "&lt;script&gt;alert(1)" in text and "&lt;i&gt;corrupt" in text and "Within &lt;b&gt;bounds" in text
     assert not re.findall("<script>alert|<i>corrupt|<b>bounds", text)
     ids = re.findall(r'\bid="([^"]*)"', text)
     assert len(ids) == len(set(ids))
+
+
+def test_warnings_variants_masks_and_skipped_images_are_shown(tmp_path):
+    old, new = tmp_path / "old", tmp_path / "new"
+    for name, variant in (("a", 1.5), ("b", 3), ("c", 1)):
+        smooth(old / f"{name}.exr")
+        smooth(new / f"{name}.exr", gain=1.5)
+        smooth(old / f"{name}-macos.exr", gain=variant)
+    rules = Entry("*", {"accept": ("{stem}-*.exr",), "ignore": ((0, 0, 40, 32),)}), Entry("c.exr", {"skip": True})
+    text = page_of((old, new), tmp_path / "out.html", settings=Settings(rules))
+    assert "matches a-macos.exr" in text and text.count("warning: the mask leaves out 83% of the pixels") == 2
+    assert '<section id="equal"><details open>' in text  # an equal image with a warning is not folded away
+    assert "its variant differs, too" in text and "left out" in dict(roles(text))
+    assert '<section id="skipped"><details>' in text and "skipped by the settings" in text
+
+
+@pytest.mark.parametrize(("source", "flags"), [("", ""), ("out.json", " --from out.json")])
+def test_names_that_mean_something_can_be_ticked(many, tmp_path, source, flags):
+    text = page_of(many, tmp_path / "out.html", source=source)
+    assert f'data-command="mi-refract accept {many[0]} {many[1]}{flags}"' in text
+    names = [f"{d}/{i}.exr" for d in "ab" for i in range("ab".index(d), 6, 2)]
+    assert re.findall('data-word="([^"]*)"', text) == ["z.exr", *names]
+    one = [side / "a" / "0.exr" for side in many]
+    assert 'class="tick"' not in page_of(one, tmp_path / "out.html")
+
+
+def test_a_name_that_cannot_be_shown_as_it_is_cannot_be_ticked(tmp_path):
+    bad = [Result(name, Status.DIFFERENT, None, tmp_path / "x") for name in ("a\u202eb.exr", "\u3164.exr", "it's.exr")]
+    text = written(tmp_path, Results(tmp_path / "old", tmp_path, tuple(bad)))
+    assert list(map(html.unescape, re.findall('data-word="([^"]*)"', text))) == ["'it'\"'\"'s.exr'"]
+
+
+# The images -------------------------------------------------------------------------------------------------------
 
 
 def test_panes_of_a_pair_are_in_order_and_an_equal_one_has_none(tmp_path):
@@ -129,28 +162,21 @@ def test_every_file_is_read_once_and_flip_runs_once_for_verdict_and_page(tmp_pat
     shown = [role for role, _ in roles(text)]
     assert (shown.count("reference"), shown.count("test")) == (3, 4)  # but for the broken one
     assert text.count("compare pair paired") == 1  # images of two sizes are not laid over each other
-
-
-def test_no_result_keeps_its_images(tmp_path):
     alive = []
-    sides = [image(tmp_path / side / "a.exr", value) for side, value in (("r", 0.25), ("t", 0.5))]
-    found = folders.diff(*sides, view=lambda result, _: alive.append(len(result.images)))
+    found = folders.diff(sides[0] / "a.exr", sides[1] / "a.exr", view=lambda x, _: alive.append(len(x.images)))
     assert alive == [2] and not found.results[0].images and not found.results[0].comparison.maps
 
 
-def test_an_image_that_cannot_be_shown_keeps_no_other_from_being_shown(tmp_path):
+def test_what_cannot_be_shown_keeps_no_other_image_from_being_shown(tmp_path):
     found = results(tmp_path)
     flat = replace(found.results[1].images["test"], pixels=np.float32(3))
     broken = replace(found.results[1], images={"reference": found.results[0].images["test"], "test": flat})
     text = written(tmp_path, replace(found, results=(broken, *found.results[2:])))
     assert "Cannot be shown: internal error: " in text
     assert dict(roles(text)).keys() == {"reference"}  # of the removed image
-
-
-def test_an_image_that_is_larger_than_allowed_is_not_read_for_the_page(tmp_path):
-    image(tmp_path / "old" / "same.exr", 0.5)
-    for name in ("same", "added"):
-        image(tmp_path / "new" / f"{name}.exr", 0.5)
+    for side, names in (("old", ["same"]), ("new", ["same", "added"])):  # too large images are not read for the page
+        for name in names:
+            image(tmp_path / side / f"{name}.exr", 0.5)
     text = page_of((tmp_path / "old", tmp_path / "new"), tmp_path / "out.html", settings=Settings(max_values=71))
     assert text.count("expected up to 71 values (max-values)") == 4 and roles(text) == []
 
@@ -164,6 +190,70 @@ def test_renders_in_a_folder_are_shown_as_their_mean(tmp_path):
     assert found.exit_code == 1
     images = re.findall(r'data-channels="3" data-scale="1.0">([^<]*)<', written(tmp_path, found))
     assert [decoded(data).astype(float).mean() for data in images] == pytest.approx([1, 2], abs=0.01)
+
+
+def test_the_first_channel_stands_for_those_that_are_no_colours(tmp_path):
+    pixels = RNG.random((3, 4, 2)).astype(np.float32)
+    sides = [image(tmp_path / f"{x}.exr", pixels + x, channels=("depth.Z", "id")) for x in (0, 1)]
+    (result,) = folders.diff(*sides, maps=True).results
+    first, channel = html_report.shown_of(result, np.inf, np.inf).panes[0], result.images["reference"].channels[0]
+    assert first["note"] == f"channel {channel}" and first["channels"] == 1
+    shown = decoded(first["data"]).reshape(3, 4)
+    np.testing.assert_allclose(shown, image_file.read(sides[0]).select([channel])[..., 0], rtol=1e-3)
+
+
+@pytest.mark.parametrize(("peak", "gain"), [(1.0, 0), (10.0, 1), (31.7, 1.5), (100.0, 2), (1e9, 6), (0.0, 0)])
+def test_a_map_is_full_of_colour_where_its_upper_hundredth_is(peak, gain):
+    """One pixel of 2500 is `peak` times as large as the others; the gain is in tenths of a power of ten."""
+    values = np.full((50, 50, 1), float(peak > 0), np.float32)
+    values[7, 9] = -peak
+    assert html_report.map_pane("difference", values, np.inf)["gain"] == pytest.approx(gain)
+
+
+def test_a_map_shows_how_many_of_its_pixels_became_one_and_keeps_the_strongest():
+    for shape, note in (((3, 961), "strongest of 2 × 2 pixels"), ((1, 960), ""), ((1025, 960), "")):
+        assert html_report.map_pane("difference", np.ones((*shape, 1), np.float32), np.inf)["note"] == note
+    values = np.zeros((100, 1000, 3), np.float32)
+    values[10, 501, 1], values[10, 500, 0], values[99, 999, 2] = -3, 2, np.nan
+    small = strongest(values, 100)
+    assert small.shape == (10, 100, 1) and small[1, 50] == -3 and np.isnan(small[9, 99]) and (small != 0).sum() == 2
+
+
+@pytest.mark.parametrize(("rows", "kept"), [(1, 1), (512, 512), (513, 257), (1300, 434)])
+def test_a_histogram_is_of_512_rows_at_most(rows, kept, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(html_report, "histogram_svg", lambda values, *words, salt: drawn.append(values) or "")
+    p_values = np.linspace(0, 1, 2 * rows, dtype=np.float32).reshape(rows, 2)
+    p_values[0, 1] = np.nan
+    comparison = Comparison("welch", Verdict.DIFFERENT, "", maps={"p": p_values})
+    html_report.shown_of(Result("x", Status.DIFFERENT, None, None, comparison=comparison), np.inf, np.inf)
+    assert len(drawn[0]) == 2 * kept - 1
+
+
+@pytest.mark.parametrize("share", [2, 0.75])
+def test_a_finite_value_never_becomes_infinite_and_nan_stays(share):
+    pixels = RNG.gamma(2, 1, (64, 64, 3)).astype(np.float32)
+    pixels[0, :3] = [np.nan, np.inf, -np.inf], [1e9, -1e9, 65504], [1.0, -0.0, 65503]
+    found = encoded(pixels, share * len(encoded(pixels)["data"]))
+    assert ("within" in found["note"]) == (share < 1)
+    read = decoded(found["data"])[:9].reshape(3, 3)
+    assert np.isnan(read[0, 0]) and list(read[0, 1:]) == [np.inf, -np.inf]
+    assert np.isfinite(read[1:]).all() and abs(read[1]).min() > 6e4 and read[2, 0] == 1
+
+
+def test_what_does_not_fit_is_rounded_then_made_smaller_and_the_page_says_so():
+    noise = RNG.gamma(2, 1, (256, 256, 3)).astype(np.float32)
+    whole = encoded(noise)
+    assert whole["note"] == "" and np.array_equal(decoded(whole["data"]), noise.astype(np.float16).ravel())
+    rounded = encoded(noise, 0.75 * len(whole["data"]))
+    assert len(rounded["data"]) <= 0.77 * len(whole["data"])
+    share = float(re.search("within (.*) %", rounded["note"])[1]) / 100
+    assert np.allclose(decoded(rounded["data"]), noise.ravel(), rtol=share, atol=1e-7)
+    assert not np.allclose(decoded(rounded["data"]), noise.ravel(), rtol=share / 4, atol=1e-7)
+    small = encoded(noise, 0.2 * len(whole["data"]))
+    assert (small["width"], small["height"]) == (128, 128) and small["note"].startswith("means of 2 × 2 pixels")
+    means = noise.reshape(128, 2, 128, 2, 3).mean((1, 3))
+    assert np.allclose(decoded(small["data"]).reshape(128, 128, 3), means, rtol=2.0 ** (max(ROUNDED) - 11), atol=1e-7)
 
 
 # A full page ------------------------------------------------------------------------------------------------------
@@ -184,22 +274,23 @@ def many(tmp_path):
 
 
 def size_of(result):
-    return panes.of_result(result, html_report.IMAGE_BYTES, html_report.MAP_BYTES).size
+    return html_report.shown_of(result, html_report.IMAGE_BYTES, html_report.MAP_BYTES).size
 
 
 @pytest.mark.parametrize(("share", "pairs"), [(0.1, 1), (1.9, 1), (2.1, 2)])
 def test_a_pair_that_does_not_fit_keeps_its_numbers_and_is_named(tmp_path, monkeypatch, share, pairs):
-    """The first is shown, however large."""
-    found = several(results(tmp_path), 3)
-    monkeypatch.setattr(html_report, "PAGE", share * size_of(found.results[0]))
-    text = written(tmp_path, found)
+    """The first is shown, however large; a command shows the rest."""
+    found = results(tmp_path)
+    names = [f"-{i}.exr" for i in range(3)]
+    some = tuple(replace(found.results[1], name=name) for name in names)
+    monkeypatch.setattr(html_report, "PAGE", share * size_of(found.results[1]))
+    text = written(tmp_path, replace(found, results=some, flags=("--method", "welch")))
     assert len(roles(text)) == 6 * pairs and text.count("12 tiles differ.") == 3
     assert text.count("the page is full") == 3 - pairs
-    assert (
-        f"Left out, because a page is limited to 15 MB: images of {3 - pairs} of 3 failures. "
-        "A report in a folder has no limit: "
-    ) in text
-    assert "<code>mi-refract diff a b --report report/</code>" in text
+    said = re.search("Left out, because a page is limited to 15 MB: (.*?) <code>(.*?)</code>", text)
+    assert said[1] == f"images of {3 - pairs} of 3 failures. The first of them:"
+    words = ["mi-refract", "diff", f"{found.reference}", f"{found.test}", "--method", "welch", "--report", "rest.html"]
+    assert shlex.split(said[2]) == [*words, "--", *names[pairs:]]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -221,10 +312,9 @@ def test_the_page_is_the_same_in_whatever_order_results_come(many, tmp_path, mon
 
 def test_a_page_of_thousands_is_no_larger_than_its_limit(tmp_path, monkeypatch):
     long = "a long name/" * 20
+    sides = tmp_path / "a", tmp_path / "b"
     bad = [Result(f"{long}{i}.exr", Status.ERROR, None, tmp_path / "b", error="bad " * 100) for i in range(900)]
-    equal = [
-        Result(f"{long}{i}.exr", Status.EQUAL, tmp_path / "a", tmp_path / "b", comparison=EQUAL) for i in range(300)
-    ]
+    equal = [Result(f"{long}{i}.exr", Status.EQUAL, *sides, comparison=EQUAL) for i in range(300)]
     monkeypatch.setattr(html_report, "LIMIT", 600_000)
     text = written(tmp_path, Results(tmp_path / "a", tmp_path, (*bad, *equal)))
     assert len(text.encode()) <= 600_000
@@ -236,135 +326,45 @@ def test_a_page_of_thousands_is_no_larger_than_its_limit(tmp_path, monkeypatch):
     assert listed == left
 
 
-@pytest.mark.parametrize(("source", "flags"), [("", ""), ("out.json", " --from out.json")])
-def test_names_that_mean_something_can_be_ticked(many, tmp_path, source, flags):
-    text = page_of(many, tmp_path / "out.html", source=source)
-    assert f'data-command="mi-refract accept {many[0]} {many[1]}{flags}"' in text
-    names = [f"{d}/{i}.exr" for d in "ab" for i in range("ab".index(d), 6, 2)]
-    assert re.findall('data-word="([^"]*)"', text) == ["z.exr", *names]
-    one = [side / "a" / "0.exr" for side in many]
-    assert 'class="tick"' not in page_of(one, tmp_path / "out.html")
-
-
-def test_a_name_that_cannot_be_shown_as_it_is_cannot_be_ticked(tmp_path):
-    odd = Result("a\u202eb.exr", Status.DIFFERENT, None, tmp_path / "x")
-    fine = Result("it's.exr", Status.DIFFERENT, None, tmp_path / "x")
-    text = written(tmp_path, Results(tmp_path / "old", tmp_path, (odd, fine)))
-    assert list(map(html.unescape, re.findall('data-word="([^"]*)"', text))) == ["'it'\"'\"'s.exr'"]
-
-
-# The pixels -------------------------------------------------------------------------------------------------------
-
-
-def decoded(data):
-    high, low = np.frombuffer(zlib.decompress(base64.b64decode(data)), "u1").reshape(2, -1).astype("<u2")
-    return (high << 8 | low).view("<f2")
-
-
-@pytest.mark.parametrize("share", [2, 0.75])
-def test_a_finite_value_never_becomes_infinite_and_nan_stays(share):
-    pixels = np.random.default_rng(5).gamma(2, 1, (64, 64, 3)).astype(np.float32)
-    pixels[0, :3] = [np.nan, np.inf, -np.inf], [1e9, -1e9, 65504], [1.0, -0.0, 65503]
-    found = encoded(pixels, share * len(encoded(pixels)["data"]))
-    assert ("within" in found["note"]) == (share < 1)
-    read = decoded(found["data"])[:9].reshape(3, 3)
-    assert np.isnan(read[0, 0]) and list(read[0, 1:]) == [np.inf, -np.inf]
-    assert np.isfinite(read[1:]).all() and abs(read[1]).min() > 6e4 and read[2, 0] == 1
-
-
-def test_what_does_not_fit_is_rounded_then_made_smaller_and_the_page_says_so():
-    noise = np.random.default_rng(5).gamma(2, 1, (256, 256, 3)).astype(np.float32)
-    whole = encoded(noise)
-    assert whole["note"] == "" and np.array_equal(decoded(whole["data"]), noise.astype(np.float16).ravel())
-    rounded = encoded(noise, 0.75 * len(whole["data"]))
-    assert len(rounded["data"]) <= 0.77 * len(whole["data"])
-    share = float(re.search("within (.*) %", rounded["note"])[1]) / 100
-    assert np.allclose(decoded(rounded["data"]), noise.ravel(), rtol=share, atol=1e-7)
-    assert not np.allclose(decoded(rounded["data"]), noise.ravel(), rtol=share / 4, atol=1e-7)
-    small = encoded(noise, 0.2 * len(whole["data"]))
-    assert (small["width"], small["height"]) == (128, 128) and small["note"].startswith("means of 2 × 2 pixels")
-    means = noise.reshape(128, 2, 128, 2, 3).mean((1, 3))
-    assert np.allclose(decoded(small["data"]).reshape(128, 128, 3), means, rtol=2.0 ** (max(ROUNDED) - 11), atol=1e-7)
-
-
-def test_one_pixel_and_one_nan_survive_a_smaller_map():
-    values = np.zeros((100, 1000, 3), np.float32)
-    values[10, 501, 1], values[10, 500, 0], values[99, 999, 2] = -3, 2, np.nan
-    small = strongest(values, 100)
-    assert small.shape == (10, 100, 1) and small[1, 50] == -3 and np.isnan(small[9, 99]) and (small != 0).sum() == 2
-
-
-@pytest.mark.parametrize(("peak", "gain"), [(1.0, 0), (10.0, 1), (31.7, 1.5), (100.0, 2), (1e9, 6), (0.0, 0)])
-def test_a_map_is_full_of_colour_where_its_upper_hundredth_is(peak, gain):
-    """One pixel of 2500 is `peak` times as large as the others; the gain is in tenths of a power of ten."""
-    values = np.full((50, 50, 1), float(peak > 0), np.float32)
-    values[7, 9] = -peak
-    assert panes.map_pane("difference", values, np.inf)["gain"] == pytest.approx(gain)
-
-
-@pytest.mark.parametrize(
-    ("shape", "note"), [((3, 961), "strongest of 2 × 2 pixels"), ((1, 960), ""), ((1025, 960), "")]
-)
-def test_a_map_shows_how_many_of_its_pixels_became_one(shape, note):
-    assert panes.map_pane("difference", np.ones((*shape, 1), np.float32), np.inf)["note"] == note
-
-
-def test_the_first_channel_stands_for_those_that_are_no_colours(tmp_path):
-    pixels = np.random.default_rng(2).random((3, 4, 2)).astype(np.float32)
-    sides = [image(tmp_path / f"{x}.exr", pixels + x, channels=("depth.Z", "id")) for x in (0, 1)]
-    (result,) = folders.diff(*sides, maps=True).results
-    first, channel = panes.of_result(result, np.inf, np.inf).panes[0], result.images["reference"].channels[0]
-    assert first["note"] == f"channel {channel}" and first["channels"] == 1
-    shown = decoded(first["data"]).reshape(3, 4)
-    np.testing.assert_allclose(shown, image_file.read(sides[0]).select([channel])[..., 0], rtol=1e-3)
-
-
-@pytest.mark.parametrize(("rows", "kept"), [(1, 1), (512, 512), (513, 257), (1300, 434)])
-def test_a_histogram_is_of_512_rows_at_most(rows, kept, monkeypatch, tmp_path):
-    drawn = []
-    monkeypatch.setattr(panes, "histogram_svg", lambda values, *words, salt: drawn.append(values) or "")
-    p_values = np.linspace(0, 1, 2 * rows, dtype=np.float32).reshape(rows, 2)
-    p_values[0, 1] = np.nan
-    comparison = Comparison("welch", Verdict.DIFFERENT, "", maps={"p": p_values})
-    panes.of_result(Result("x", Status.DIFFERENT, None, None, comparison=comparison), np.inf, np.inf)
-    assert len(drawn[0]) == 2 * kept - 1
-
-
-def test_images_of_a_page_have_keys_of_their_own():
-    page = EmbeddedImages()
-    keys = [page.add(encoded(np.ones((2, 2, 1))))["key"] for _ in range(3)]
-    assert keys == ["p0", "p1", "p2"]
-
-
 def test_a_noisy_full_size_pair_stays_within_its_bytes(tmp_path):
-    rng = np.random.default_rng(1)
-    sides = [image(tmp_path / f"{side}.exr", rng.standard_exponential((1080, 1920, 3), np.float32)) for side in "rt"]
+    noise = [RNG.standard_exponential((1080, 1920, 3), np.float32) for _ in "rt"]
+    sides = [image(tmp_path / f"{side}.exr", pixels) for side, pixels in zip("rt", noise, strict=True)]
     text = page_of(sides, tmp_path / "out.html")
     assert len(roles(text)) >= 4 and len(text.encode()) <= 15e6
 
 
-# In a browser
+# In a browser -----------------------------------------------------------------------------------------------------
 
+# Waits for the page's own script; what it leaves in `seen` is read.
 SCRIPT = """<script>
 const wait = setInterval(async () => {
   if (!root.dataset.ready) return;
   clearInterval(wait);
   const $ = (selector) => document.querySelector(selector);
+  const active = () => document.activeElement ?? document.body;
+  const press = (key) => active().dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
+  const set = (control, value) => {
+    control.value = value;
+    control.dispatchEvent(new Event("input", { bubbles: true }));
+  };
+  const seen = {};
+  %s
+  root.dataset.seen = JSON.stringify(seen);
+}, 20);
+</script></body>"""
+VIEWER = """
   const pixel = (role) => {
     const copy = document.createElement("canvas").getContext("2d");
     copy.drawImage($(`[data-role=${role}] canvas`), 0, 0);
     return [...copy.getImageData(0, 0, 1, 1).data].slice(0, 3);
   };
-  const press = (key) => document.body.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
   const clip = () => getComputedStyle($("[data-role=test] canvas")).clipPath;
-  const seen = { test: pixel("test"), difference: pixel("difference") };
+  seen.pixels = ["test", "difference"].map(pixel);
   press("]");
   press("]");
   seen.brighter = pixel("test");
-  const gain = $("[data-role=difference] .gain");
-  gain.value = 1;
-  gain.dispatchEvent(new Event("input", { bubbles: true }));
-  seen.full = gain.nextElementSibling.value;
+  set($("[data-role=difference] .gain"), 1);
+  seen.full = $("[data-role=difference] .gain").nextElementSibling.value;
   press("s");
   seen.clip = [clip()];
   press("ArrowRight");
@@ -378,20 +378,48 @@ const wait = setInterval(async () => {
   seen.mode = root.dataset.mode;
   seen.requests = performance.getEntriesByType("resource").length;
   seen.scripts = [...document.scripts].filter((each) => each.textContent.startsWith("alert")).length;
-  root.dataset.seen = JSON.stringify(seen);
-}, 20);
-</script></body>"""
+"""
+LIST = """
+  const visible = (selector) => all(selector).filter((each) => !each.hidden).map((each) => each.id || each.textContent);
+  press("/");
+  set(active(), "b/ DIFF");
+  seen.strip = visible("nav [data-text]");
+  seen.articles = visible("article");
+  seen.count = $(".shown-count").value;
+  press("f");
+  press("x");
+  seen.typed = [root.dataset.mode, $(".accepting").hidden];
+  press("Enter");
+  press("x");
+  seen.ticked = $(".built").textContent.split(" ").slice(4);
+  press("f");
+  seen.mode = root.dataset.mode;
+  $(".clear").click();
+  press("/");
+  set(active(), "equal.exr");
+  seen.unfolded = [visible("article").length, $("#equal details").open];
+  press("Escape");
+  seen.folded = [visible("article").length, $("#equal details").open];
+  $("[data-filter='could not be compared']").click();
+  seen.cause = [visible("article"), $("[aria-pressed=true]").textContent];
+  $("[aria-pressed=true]").click();
+  $(".tick-shown").click();
+  seen.all = $(".ticked").textContent;
+  seen.built = $(".built").textContent;
+"""
+
+
+def browsed(page, text, script, profile):
+    page.write_text(text.replace("</body>", SCRIPT % script), "utf-8")
+    return seen(page, profile)
 
 
 @needs_chromium
 def test_the_page_works_from_a_file(tmp_path):
     found = results(tmp_path)
     text = written(tmp_path, replace(found, results=found.results[1:]))
-    page = tmp_path / "report.html"
-    page.write_text(text.replace("</body>", SCRIPT), "utf-8")
-    assert seen(page, tmp_path / "profile") == {
-        "test": [188, 188, 188],  # sRGB of 0.5
-        "difference": [178, 24, 43],  # the test is brighter: red
+    assert browsed(tmp_path / "report.html", text, VIEWER, tmp_path / "profile") == {
+        "pixels": [[188, 188, 188], [178, 24, 43]],  # sRGB of 0.5; the test is brighter: red
         "brighter": [255, 255, 255],
         "full": "full at 0.025",
         "clip": ["inset(0px 0px 0px 50%)", "inset(0px 0px 0px 52%)"],
@@ -407,56 +435,32 @@ def test_the_page_works_from_a_file(tmp_path):
 def test_the_browser_sees_a_request_and_an_error(tmp_path):
     """What the test above would miss if it could not fail."""
     page = tmp_path / "report.html"
-    planted = "<script>fetch('https://example.invalid/x'); undefinedName()</script>" + SCRIPT
+    planted = "<script>fetch('https://example.invalid/x'); undefinedName()</script></body>"
     page.write_text(written(tmp_path).replace("</body>", planted), "utf-8")
     _, console = browse(page, tmp_path / "profile")
     assert any("undefinedName" in line for line in console)
     assert any("Content Security Policy" in line for line in console)
 
 
-LIST_SCRIPT = """<script>
-const wait = setInterval(() => {
-  if (!root.dataset.ready) return;
-  clearInterval(wait);
-  const $ = (selector) => document.querySelector(selector);
-  const active = () => document.activeElement ?? document.body;
-  const press = (key) => active().dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
-  const visible = (selector) => all(selector).filter((each) => !each.hidden).map((each) => each.id || each.textContent);
-  const seen = {};
-  press("/");
-  active().value = "b/";
-  active().dispatchEvent(new Event("input", { bubbles: true }));
-  seen.strip = visible("nav [data-text]");
-  seen.articles = visible("article");
-  seen.count = $(".shown-count").value;
-  press("f");
-  press("x");
-  seen.typed = [root.dataset.mode, $(".accepting").hidden];
-  press("Enter");
-  press("x");
-  seen.ticked = $(".built").textContent.split(" ").slice(4);
-  press("f");
-  seen.mode = root.dataset.mode;
-  $(".clear").click();
-  press("/");
-  press("Escape");
-  $(".tick-shown").click();
-  seen.all = $(".ticked").textContent;
-  root.dataset.seen = JSON.stringify(seen);
-}, 20);
-</script></body>"""
-
-
 @needs_chromium
-def test_the_strip_of_names_is_searched_and_the_page_builds_the_command(many, tmp_path):
-    place = tmp_path / "out.html"
-    place.write_text(page_of(many, place).replace("</body>", LIST_SCRIPT), "utf-8")
-    assert seen(place, tmp_path / "profile") == {
+def test_the_strip_of_names_is_searched_and_the_page_builds_the_command(many, tmp_path, run):
+    image(many[1] / "-dash it's.exr", 0.5)
+    text = page_of(many, tmp_path / "out.html")
+    found = browsed(tmp_path / "out.html", text, LIST, tmp_path / "profile")
+    words = shlex.split(found.pop("built"))
+    assert found == {
         "strip": ["b/1.exr", "b/3.exr", "b/5.exr"],
-        "articles": ["pair-5", "pair-6", "pair-7"],
-        "count": "3 of 8",
+        "articles": ["pair-6", "pair-7", "pair-8"],
+        "count": "3 of 9",
         "typed": ["side", True],
         "ticked": ["b/1.exr"],
         "mode": "flicker",
-        "all": "7 ticked",
+        "unfolded": [0, True],
+        "folded": [8, False],
+        "cause": [["pair-1"], "1 could not be compared"],
+        "all": "8 ticked",
     }
+    names = [name for name in words[words.index("--") + 1 :] if name != "z.exr"]  # which cannot be compared
+    before, new = tree(many[0]), tree(many[1])
+    assert len(names) == 7 and run("accept", "--yes", *words[2 : -len(names) - 1], *names)[0] == 0
+    assert tree(many[0]) == before | {name: new[name] for name in names}

@@ -1,14 +1,18 @@
-"""The self-test sees planted defects, and fails where a method is blind or alarms at everything."""
+"""The self-test plants what its defects are called, and fails where a method is blind or alarms at everything."""
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from mi_refract.image_diff import methods, self_test
 from mi_refract.image_diff.comparison import Comparison, Verdict
-from mi_refract.image_diff.defects import DEFECTS
+from mi_refract.image_diff.self_test import DEFECTS, through_a_file
 from mi_refract.io import image_file
+from mi_refract.io.pixels import srgb_encode
 
 IMAGE = 0.2 + 0.8 * np.random.default_rng(5).random((32, 32, 3))
+RAW = np.random.default_rng(3).gamma(0.5, 1.0, (6, 9, 3)).astype(np.float32)
+PADDED = np.pad(RAW, ((1, 1), (1, 1), (0, 0)), mode="edge")
 
 
 def renders(count, seed=1, spread=0.02):
@@ -17,33 +21,79 @@ def renders(count, seed=1, spread=0.02):
     return IMAGE * np.random.default_rng(seed).gamma(shape, 1 / shape, (count, *IMAGE.shape))
 
 
-def by_subject(rows):
-    return {row.subject: row for row in rows}
+def examined(pixels, **how):
+    return {row.subject: row for row in self_test.examine(pixels, "noise", **how)}
 
 
-@pytest.fixture(scope="module")
-def found():
-    return by_subject(self_test.examine(renders(12), "noise", trials=4, null_pairs=40))
+def failed(rows):
+    return {name for name, row in rows.items() if row.verdict == "fail"}
 
 
-@pytest.mark.parametrize("name", DEFECTS)
-def test_what_is_due_is_seen(found, name):
-    row = found[name]
-    assert row.verdict == "pass"
-    if name == "truncated":  # no method is asked of what cannot be read
-        assert row.values == {self_test.UNREADABLE: 1, "missed": 0} and row.reason == "not read"
-        return
-    assert row.values["exact"] == 1
-    if DEFECTS[name].always_due:
-        assert row.replay["due"] == list(methods.METHODS)
-        assert {row.values[method] for method in methods.METHODS} == {1}
+# Defects -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_size_of_a_defect_is_measured(found):
-    assert found["gain"].values["size"] == pytest.approx(0.01, rel=1e-3)
-    assert found["gain"].values[self_test.RATIO] > 1  # 0.02/√(256 × 6) a tile: due
-    assert found["gain"].values["welch"] == 1
-    assert found["renders"].values["noise"] == pytest.approx(0.02, rel=0.1)
+def one_pixel(value):
+    image = RAW.copy()
+    image[3, 4] = value
+    return image
+
+
+EXPECTED = {
+    "gain": 1.01 * RAW,
+    "shift": np.concatenate([RAW[:, -1:], RAW[:, :-1]], 1),
+    "swapped channels": np.stack([RAW[..., i] for i in (2, 1, 0)], -1),
+    "blur": sum(PADDED[y : y + 6, x : x + 9] for y in range(3) for x in range(3)) / 9,
+    "firefly": one_pixel(1e3 * RAW.mean()),
+    "NaN": one_pixel(np.nan),
+    "Inf": one_pixel(np.inf),
+    "wrong size": RAW[:, 1:],
+}
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_a_defect_is_what_it_is_called(name):
+    clean = np.stack([RAW, RAW + 1, RAW + 2])
+    spoilt = DEFECTS[name].spoil(clean)
+    np.testing.assert_allclose(spoilt[0], EXPECTED[name], rtol=1e-5, atol=1e-7)
+    once = name in ("NaN", "Inf", "wrong size")  # every method must see these, in one of several renders
+    assert (DEFECTS[name].always_due, np.array_equal(spoilt[2], clean[2])) == (once, once)
+    np.testing.assert_array_equal(clean[0], RAW)
+
+
+def test_8_bits_are_256_values_up_to_white_and_half_a_file_is_none():
+    codes = 255 * srgb_encode(DEFECTS["8 bits"].plant(RAW))
+    np.testing.assert_allclose(codes, np.rint(codes), atol=2e-4)
+    assert (np.abs(codes - 255 * srgb_encode(np.minimum(RAW, 1))) <= 0.501).all()
+    assert (np.rint(codes)[RAW > 1] == 255).all() and (RAW > 1).any()
+    np.testing.assert_array_equal(through_a_file(RAW), RAW)
+    assert DEFECTS["truncated"].always_due
+    with pytest.raises(ValueError):
+        DEFECTS["truncated"].spoil(RAW[None])
+
+
+# What is seen ------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_due_is_seen_and_equal_pairs_alarm_nowhere():
+    rows = examined(renders(12), trials=4, null_pairs=40)
+    assert not failed(rows)
+    for name, defect in DEFECTS.items():
+        values = rows[name].values
+        if name == "truncated":  # no method is asked of what cannot be read
+            assert values == {self_test.UNREADABLE: 1, "missed": 0} and rows[name].reason == "not read"
+        elif defect.always_due:
+            assert rows[name].replay["due"] == list(methods.METHODS)
+            assert {values[method] for method in methods.METHODS} == {1}
+        else:
+            assert values["exact"] == 1
+    gain = rows["gain"].values
+    assert gain["size"] == pytest.approx(0.01, rel=1e-3) and gain["welch"] == 1
+    assert gain[self_test.RATIO] > 1  # 0.02/√(256 × 6) a tile: due
+    assert rows["renders"].values["noise"] == pytest.approx(0.02, rel=0.1)
+    nulls = [rows[f"null pairs, {method}"] for method in methods.METHODS]
+    assert {row.values["false alarms"] for row in nulls} == {0}
+    assert rows["null pairs, welch"].values["null pairs"] == 40
+    assert {row.subject for row in nulls if row.reason == self_test.IDENTICAL} == {"null pairs, exact"}
 
 
 def test_a_defect_is_as_large_as_in_the_tile_where_it_stands_out():
@@ -53,23 +103,16 @@ def test_a_defect_is_as_large_as_in_the_tile_where_it_stands_out():
     clean = np.stack([mean + spread / np.sqrt(2), mean - spread / np.sqrt(2)])
     changes = np.array([[[-0.05], [0.1], [0.72], [9.0], [9.0]]])
     tally = self_test.Tally(detectable=[0.01, 0.02, 0.04])
-    found = self_test.sizes(np.stack([changes, changes]), clean, {"welch": tally, "exact": self_test.Tally()})
+    sizes = self_test.sizes(np.stack([changes, changes]), clean, {"welch": tally, "exact": self_test.Tally()})
     # 5 % in the quietest tile, 5 % in the median one, 18 % in one four times as noisy.
-    assert found["size"] == pytest.approx(0.05)
-    assert found[self_test.RATIO] == pytest.approx(0.05 / 0.02)
-    assert found[self_test.DETECTABLE] == 0.02
-    louder = changes * [[[1], [1], [2], [1], [1]]]
-    found = self_test.sizes(louder[None], clean, {"welch": tally})
-    assert (found["size"], found[self_test.RATIO]) == pytest.approx((0.36, 0.36 / (0.02 * 4)))
-    assert self_test.sizes(changes[None], clean[:1], {"welch": tally}) == {}
-    assert self_test.sizes(changes[None], clean, {"welch": self_test.Tally()}) == {}
-    assert self_test.sizes(changes[None], np.stack([mean, mean]), {"welch": tally}) == {}
-
-
-def test_the_noise_is_that_of_the_lit_pixels():
-    one, dark = np.full((1, 4, 1), 2.0), np.array([[[1.0], [1.0], [0.0], [0.0]]])
-    found = self_test.noise(np.stack([one * dark * 0.9, one * dark * 1.1]))
-    assert found == pytest.approx(0.2 * np.sqrt(2) / 2)
+    assert sizes["size"] == pytest.approx(0.05) and sizes[self_test.DETECTABLE] == 0.02
+    assert sizes[self_test.RATIO] == pytest.approx(0.05 / 0.02)
+    louder = self_test.sizes((changes * [[[1], [1], [2], [1], [1]]])[None], clean, {"welch": tally})
+    assert (louder["size"], louder[self_test.RATIO]) == pytest.approx((0.36, 0.36 / (0.02 * 4)))
+    for pixels, known in ((clean[:1], tally), (clean, self_test.Tally()), (np.stack([mean, mean]), tally)):
+        assert self_test.sizes(changes[None], pixels, {"welch": known}) == {}
+    lit = np.array([[[2.0], [2.0], [0.0], [0.0]]])  # the noise is that of the lit pixels
+    assert self_test.noise(np.stack([lit * 0.9, lit * 1.1])) == pytest.approx(0.2 * np.sqrt(2) / 2)
     assert self_test.noise(np.zeros((3, 2, 2, 3))) == 0
 
 
@@ -77,21 +120,11 @@ def test_renders_are_read_in_one_order_of_channels(tmp_path):
     pixels = renders(2).astype(np.float32)
     image_file.write_exr(tmp_path / "0.exr", pixels[0], ("R", "G", "B"))
     image_file.write_exr(tmp_path / "1.exr", pixels[1][..., [2, 0, 1]], ("B", "R", "G"))
-    found = self_test.read_images(tmp_path)
-    assert found.shape == pixels.shape
+    images = self_test.read_images(tmp_path)
+    assert images.shape == pixels.shape
     for image in pixels:  # of all renders one is this, in the order of either file
-        assert any(np.array_equal(each[..., order], image) for each in found for order in ([0, 1, 2], [1, 2, 0]))
-    assert np.ptp(found.mean((1, 2)), axis=0).max() < 1e-3  # channels differ by 9e-3, renders by a few 1e-4
-    image_file.write_exr(tmp_path / "1.exr", pixels[1], ("R", "G", "A"))
-    with pytest.raises(ValueError, match="size or channels differ from those of"):
-        self_test.read_images(tmp_path)
-
-
-def test_equal_pairs_alarm_nowhere(found):
-    rows = [found[f"null pairs, {method}"] for method in methods.METHODS]
-    assert all(row.verdict == "pass" and row.values["false alarms"] == 0 for row in rows)
-    assert found["null pairs, welch"].values["null pairs"] == 40
-    assert {row.subject for row in rows if row.reason == self_test.IDENTICAL} == {"null pairs, exact"}
+        assert any(np.array_equal(x[..., order], image) for x in images for order in ([0, 1, 2], [1, 2, 0]))
+    assert np.ptp(images.mean((1, 2)), axis=0).max() < 1e-3  # channels differ by 9e-3, renders by a few 1e-4
 
 
 def test_single_images_are_equal_but_for_their_last_bits(monkeypatch):
@@ -102,20 +135,8 @@ def test_single_images_are_equal_but_for_their_last_bits(monkeypatch):
     assert (steps == 1).all() and 0.4 < (moved > pixels).mean() < 0.6
     real = methods.compare
     monkeypatch.setattr(methods, "compare", lambda m, *sides: real("exact" if m != "welch" else m, *sides))
-    rows = by_subject(self_test.false_alarms([], [(pixels[None], pixels[None])] * 3, "noise", ""))
-    assert {name for name, row in rows.items() if row.verdict == "fail"} == {
-        f"null pairs, {method}" for method in ("tolerance", "paired", "flip")
-    }
-
-
-def test_where_only_some_files_cannot_be_read_the_methods_are_asked_of_the_others():
-    def unread():
-        raise ValueError("truncated")
-
-    clean, other = np.split(renders(8), 2)
-    trials = [self_test.Trial(clean, other, lambda: 1.5 * clean), self_test.Trial(clean, other, unread)]
-    row = self_test.detection("gain", True, trials, "noise", "")
-    assert row.values["exact"] == row.values["welch"] == 1 and row.values["missed"] == 0
+    rows = self_test.false_alarms([], [(pixels[None], pixels[None])] * 3, "noise", "")
+    assert failed({row.subject: row for row in rows}) == {f"null pairs, {x}" for x in ("tolerance", "paired", "flip")}
 
 
 @pytest.mark.parametrize("method", methods.METHODS)
@@ -124,53 +145,45 @@ def test_a_blind_method_fails(method, monkeypatch):
     real = methods.compare
     blind = Comparison(method, Verdict.EQUAL, "", minimum_detectable=1e-4)
     monkeypatch.setattr(methods, "compare", lambda m, *sides: blind if m == method else real(m, *sides))
-    rows = by_subject(self_test.examine(renders(8), "noise", trials=2, null_pairs=2))
-    failed = {name for name, row in rows.items() if row.verdict == "fail"}
+    rows = examined(renders(8), trials=2, null_pairs=2)
     always = {name for name, defect in DEFECTS.items() if defect.always_due and name != "truncated"}
     expected = {"exact": set(DEFECTS) - {"truncated"}, "welch": always | {"gain", "shift", "8 bits", "firefly"}}
-    assert failed >= expected.get(method, always)
+    assert failed(rows) >= expected.get(method, always)
     assert rows["NaN"].values["missed"] == 2
 
 
-def test_a_method_that_cries_wolf_fails(monkeypatch):
+def test_a_method_that_always_alarms_fails_and_so_does_one_that_is_never_sure(monkeypatch):
     monkeypatch.setattr(methods, "compare", lambda m, *sides: Comparison(m, Verdict.DIFFERENT, ""))
-    rows = self_test.examine(renders(8), "noise", trials=1, null_pairs=5)
-    assert {row.subject for row in rows if row.verdict == "fail"} == {f"null pairs, {m}" for m in methods.METHODS}
+    assert failed(examined(renders(8), trials=1, null_pairs=5)) == {f"null pairs, {m}" for m in methods.METHODS}
     monkeypatch.setattr(methods, "compare", lambda m, *sides: Comparison(m, Verdict.INCONCLUSIVE, ""))
-    rows = by_subject(self_test.examine(renders(8), "noise", trials=1, null_pairs=5))
+    rows = examined(renders(8), trials=1, null_pairs=5)
     assert rows["null pairs, welch"].values["inconclusive"] == 1
-    assert rows["gain"].values["exact"] == 0
-    assert rows["gain"].verdict == "fail"
+    assert rows["gain"].values["exact"] == 0 and "gain" in failed(rows)
 
 
 @pytest.mark.parametrize(("alarms", "pairs"), [(0, 640), (2, 640), (3, 640), (10, 10)])
 def test_the_bound_is_where_so_few_alarms_have_the_probability_left(alarms, pairs):
-    from scipy import stats
-
     bound = self_test.Tally(seen=alarms, trials=pairs).bound
     left = stats.binom.cdf(alarms, pairs, bound)
     assert left == pytest.approx(1 if alarms == pairs else 1 - self_test.CONFIDENCE)
     assert (bound <= self_test.FALSE_ALARMS) == (alarms <= 2)
 
 
-def test_a_defect_that_changes_nothing_is_left_out():
-    grey = np.repeat(renders(4)[..., :1], 3, axis=3)
-    rows = by_subject(self_test.examine(grey, "grey", trials=1, null_pairs=1))
-    assert rows["swapped channels"].verdict == "not run"
-    assert "changes nothing" in rows["swapped channels"].reason
-
-
-def test_four_renders_are_split_and_three_are_not(monkeypatch):
-    monkeypatch.setattr(self_test, "DEFECTS", {})
-    small = renders(4)[:, :16, :16]
-    four, three = (by_subject(self_test.examine(some, "noise", null_pairs=2)) for some in (small, small[:3]))
+def test_what_is_left_out():
+    """A defect that changes nothing, files that cannot be read, `welch` of fewer than two renders a side."""
+    grey = np.repeat(renders(4)[:, :16, :16, :1], 3, axis=3)
+    four, three = (examined(some, trials=1, null_pairs=2) for some in (grey, grey[:3]))
+    assert four["swapped channels"].verdict == "not run" and "changes nothing" in four["swapped channels"].reason
     assert four["null pairs, welch"].values["null pairs"] == 2 and "noise" in four["renders"].values
     assert "null pairs, welch" not in three and three["renders"].verdict == "not run"
-
-
-def test_a_method_that_takes_renders_is_asked_where_there_are_two_a_side():
     several = {name for name, method in methods.METHODS.items() if method.takes_renders}
+
+    def unread():
+        raise ValueError("truncated")
+
     for count, asked in ((2, methods.METHODS.keys()), (1, methods.METHODS.keys() - several)):
-        clean = renders(count)
-        trial = self_test.Trial(clean, renders(count, seed=2), lambda clean=clean: 2 * clean)
-        assert methods.METHODS.keys() & self_test.detection("gain", True, [trial], "", "").values.keys() == asked
+        clean, other = renders(count), renders(count, seed=2)
+        trials = [self_test.Trial(clean, other, plant) for plant in (lambda clean=clean: 2 * clean, unread)]
+        row = self_test.detection("gain", True, trials, "", "")
+        assert methods.METHODS.keys() & row.values.keys() == asked
+        assert row.values["exact"] == 1 and row.values["missed"] == 0

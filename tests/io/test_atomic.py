@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from mi_refract.io import atomic, lock
+from mi_refract.io import atomic
 from mi_refract.io.atomic import replacing, update_between, write_atomically
 
 
@@ -152,12 +152,12 @@ def test_what_is_no_code_travels_with_the_package():
 def test_a_lock_says_who_holds_it_and_ends_with_its_process(tmp_path):
     path = tmp_path / "it.lock"
     path.write_text("what a killed process left")
-    with lock.held(path, "a run"):
+    with atomic.held(path, "a run"):
         assert json.loads(path.read_text())["process"] == os.getpid()
         for content, holder in ((path.read_text(), rf"process {os.getpid()} on \S+ since \d"), ("{", "an unknown")):
             path.write_text(content)
             text = f"^{tmp_path}: a run is already running in {holder}.*; expected another folder$"
-            with pytest.raises(BlockingIOError, match=text), lock.held(path, "a run"):
+            with pytest.raises(BlockingIOError, match=text), atomic.held(path, "a run"):
                 pass
         assert path.exists()
     assert not path.exists()
@@ -167,7 +167,7 @@ def test_a_lock_is_not_written_through_a_link(tmp_path):
     path, victim = tmp_path / "it.lock", tmp_path / "victim"
     victim.write_text("old")
     path.symlink_to(victim)
-    with pytest.raises(OSError), lock.held(path, "a run"):
+    with pytest.raises(OSError), atomic.held(path, "a run"):
         pass
     assert victim.read_text() == "old"
 
@@ -177,6 +177,6 @@ def test_a_file_system_without_locks_keeps_nobody_out(tmp_path, monkeypatch):
         raise OSError(errno.ENOSYS, "Function not implemented")
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    with lock.held(tmp_path / "a.lock", "a run"):
+    with atomic.held(tmp_path / "a.lock", "a run"):
         assert (tmp_path / "a.lock").exists()
     assert not (tmp_path / "a.lock").exists()

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from mi_refract.io.bounded_map import AHEAD, bounded_map
+from mi_refract.io.image_file import AHEAD, bounded_map
 
 
 class Work:

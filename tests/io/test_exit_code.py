@@ -10,13 +10,13 @@ import pytest
 from support import processes
 from support.diff_images import image
 
-from mi_refract.io import exit_code as exits
+from mi_refract.io import errors
 
 ENVIRONMENT = processes.ENVIRONMENT | {"PYTHONUNBUFFERED": ""}  # what a test prints waits, as it does for most users
 
 
 def ended(body, capsys):
-    code = exits.exit_code("it", body)
+    code = errors.exit_code("it", body)
     return code, capsys.readouterr().err
 
 
@@ -76,7 +76,7 @@ def test_the_traceback_is_printed_where_it_is_asked_for(capsys, monkeypatch):
 def test_what_a_terminal_cannot_print_is_escaped(monkeypatch):
     paper = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(paper, "ascii", errors="strict"))
-    assert exits.exit_code("it", lambda: print("5 × \udcff")) == 0
+    assert errors.exit_code("it", lambda: print("5 × \udcff")) == 0
     assert paper.getvalue() == b"5 \\xd7 \\udcff\n"
 
 
@@ -116,7 +116,7 @@ def test_streams_that_are_closed_full_or_not_read(case, images):
 
 
 def test_output_that_cannot_be_written_is_not_the_exit_code_of_an_error():
-    code = "from mi_refract.io.exit_code import exit_code\nexit(exit_code('it', lambda: print('x') or int('y')))"
+    code = "from mi_refract.io.errors import exit_code\nexit(exit_code('it', lambda: print('x') or int('y')))"
     script = f'"$0" -c "{code}" >/dev/full'
     done = subprocess.run(["bash", "-c", script, sys.executable], env=ENVIRONMENT, capture_output=True, timeout=60)
     assert done.returncode == 2
@@ -124,7 +124,7 @@ def test_output_that_cannot_be_written_is_not_the_exit_code_of_an_error():
 
 
 def test_no_file_takes_the_number_of_a_closed_stream():
-    code = "import os, sys\nfrom mi_refract.io.exit_code import exit_code\n"
+    code = "import os, sys\nfrom mi_refract.io.errors import exit_code\n"
     code += "exit_code('it', lambda: os.write(int(sys.argv[1]), bytes([48 + os.open('/dev/null', os.O_RDONLY)])))"
     script = f'"$0" -c "{code}" 1 2>&- <&-'
     done = subprocess.run(["bash", "-c", script, sys.executable], env=ENVIRONMENT, capture_output=True, timeout=60)

@@ -8,7 +8,7 @@ import pytest
 from support.hostile import BIDI, CONTROLS, NAME, shows_more_than_text
 
 from mi_refract import cli
-from mi_refract.io import exit_code
+from mi_refract.io import errors
 from mi_refract.io.sanitise import MARK, json_text, printable, printable_lines
 
 EVIL = "a\nb\x1b[31m\udcff\uffff\u2028\u202e<>&\x85"
@@ -68,7 +68,7 @@ def test_errors_are_printed_by_it(capsys):
     def fails():
         raise ValueError(f"{NAME}; expected another name")
 
-    assert exit_code.exit_code("it", fails) == 2
+    assert errors.exit_code("it", fails) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and said.endswith("; expected another name\n")
     assert not shows_more_than_text(said)

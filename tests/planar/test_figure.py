@@ -1,4 +1,4 @@
-"""Images of planar scenes: read back pixel by pixel, and for what matplotlib was told to draw."""
+"""Figures of planar scenes: read back pixel by pixel, for what matplotlib was told to draw, and their geometry."""
 
 from __future__ import annotations
 
@@ -21,19 +21,17 @@ from mi_refract.planar.light import Light
 from mi_refract.planar.path_tree import follow_scene
 
 VIEW = (-2.0, 2.0, -1.5, 1.5)
-SLANTED = scene(polygon(SLAB, 1.5), [[-1.5, -0.6]], (1, 0.4), view=VIEW)
+WIDE = (-2.0, 3.0, -1.0, 1.0)
+GLASS = polygon(SLAB, 1.5)
+SLANTED = scene(GLASS, [[-1.5, -0.6]], (1, 0.4), view=VIEW)
 CROWD = scene(ball(1.4), beam(5000, 0.999), (1, 0), view=(-3, 4, -2.5, 2.5), branches=1)
 
 
 @pytest.fixture
 def drawn():
     """`drawn(scene)`: the figure."""
-
-    def draw(given, dpi=100):
-        return drawing.build_figure(given, follow_scene(given), dpi)
-
     with matplotlib.rc_context(drawing.STYLE):
-        yield draw
+        yield lambda given, dpi=100: drawing.build_figure(given, follow_scene(given), dpi)
 
 
 def pixels_of(figure):
@@ -43,81 +41,64 @@ def pixels_of(figure):
     return np.frombuffer(buffer.getvalue(), np.uint8).reshape(height, width, 4)[::-1, :, :3] / 255.0
 
 
+def pixel(figure, place):
+    return tuple(np.floor(figure.axes[0].transData.transform(place)).astype(int))
+
+
 def rays_of(figure):
     """The collection of rays, which lies over that of the boundaries."""
     return max(figure.axes[0].findobj(LineCollection), key=lambda c: c.zorder)
 
 
-def test_the_path_is_where_it_was_traced(drawn):
-    figure = drawn(SLANTED)
-    pixels, to_pixels = pixels_of(figure), figure.axes[0].transData
-    paths = follow_scene(SLANTED)[0].paths
-    tip = paths.points[0, 2] + 0.6 * paths.directions[0]
-    corners = [*paths.points[0, :3], tip]
-    across = np.array([-0.37, 0.93])
-    for a, b in itertools.pairwise(corners):
-        for t in (0.2, 0.5, 0.8):
-            x, y = np.floor(to_pixels.transform(a + t * (b - a))).astype(int)
-            patch = pixels[y - 1 : y + 2, x - 1 : x + 2].reshape(-1, 3)
-            assert np.abs(patch - to_rgb(drawing.RAY)).max(axis=1).min() < 0.15
-            x, y = np.floor(to_pixels.transform(a + t * (b - a) + 0.1 * across)).astype(int)
-            assert (pixels[y, x] > 0.7).all()
+def labels_of(figure):
+    return [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
 
 
-def test_media_are_shaded_and_named(drawn):
+def test_the_path_is_where_it_was_traced_and_media_are_tinted_and_named(drawn):
     inner = replace(SLANTED.regions[0], outline=SLAB / 2, indices=(1.25,))
-    figure = drawn(replace(SLANTED, regions=(*SLANTED.regions, inner)))
-    pixels, to_pixels = pixels_of(figure), figure.axes[0].transData
-    for place, tint in (((0.8, 1), drawing.DENSE), ((0.2, 1), None), ((-1.5, 1), (1, 1, 1))):
-        x, y = np.floor(to_pixels.transform(place)).astype(int)
-        if tint:
-            np.testing.assert_allclose(pixels[y, x], tint, atol=1 / 128)
-        else:
-            assert (np.array(drawing.DENSE) < pixels[y, x]).all() and (pixels[y, x] < 1).all()
-    labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert labels == ["n = 1", "n = 1.25", "n = 1.5"]
+    given = replace(SLANTED, regions=(*SLANTED.regions, inner))
+    figure, paths = drawn(given), follow_scene(given)[0].paths
+    pixels, across = pixels_of(figure), np.array([-0.37, 0.93])
+    corners = [*paths.points[0, :3], paths.points[0, 2] + 0.6 * paths.directions[0]]
+    for (a, b), t in itertools.product(itertools.pairwise(corners), (0.2, 0.5, 0.8)):
+        x, y = pixel(figure, a + t * (b - a))
+        patch = pixels[y - 1 : y + 2, x - 1 : x + 2].reshape(-1, 3)
+        assert np.abs(patch - to_rgb(drawing.RAY)).max(axis=1).min() < 0.15
+        x, y = pixel(figure, a + t * (b - a) + 0.1 * across)
+        assert (pixels[y, x] > 0.7).all()
+    dense, half, air = (pixels[pixel(figure, place)[::-1]] for place in ((0.8, 1), (0.2, 1), (-1.5, 1)))
+    np.testing.assert_allclose([dense, air], [drawing.DENSE, (1, 1, 1)], atol=1 / 128)
+    assert (np.array(drawing.DENSE) < half).all() and (half < 1).all()
+    assert labels_of(figure) == ["n = 1", "n = 1.25", "n = 1.5"]
 
 
 def test_of_many_media_a_few_are_named(drawn):
     layers = tuple(replace(SLANTED.regions[0], indices=(1 + i / 20, 1 + i / 25)) for i in range(1, 21))
-    given = replace(
-        SLANTED, regions=layers, index=(1.0, 1.0), light=Light(("red", "blue")), segments=SLANTED.segments * 2
-    )
-    labels = [text.get_text() for text in drawn(given).axes[0].get_legend().get_texts()]
+    light = Light(("red", "blue"))
+    labels = labels_of(drawn(replace(SLANTED, regions=layers, index=(1.0, 1.0), light=light, segments=(GLASS, GLASS))))
     assert len(labels) == drawing.NAMED
-    assert labels[0] == "n = 1"
-    assert labels[-1] == "n = 1.8 – 2"
+    assert (labels[0], labels[-1]) == ("n = 1", "n = 1.8 – 2")
 
 
 def test_opacity_is_the_root_of_the_power(drawn):
     given = replace(SLANTED, branches=1)
     weights = follow_scene(given)[0].paths.weights
     opacities = np.sort(rays_of(drawn(given)).get_colors()[:, 3])
-    expected = np.sort([*weights[0, :3], weights[1, 1], *weights[2, 2:4]]) ** 0.5
-    np.testing.assert_allclose(opacities, expected, rtol=1e-6)
+    np.testing.assert_allclose(opacities, np.sort([*weights[0, :3], weights[1, 1], *weights[2, 2:4]]) ** 0.5, rtol=1e-6)
 
 
-def test_colours_part_at_the_first_boundary(drawn):
-    given = replace(
-        SLANTED,
-        segments=(polygon(SLAB, 1.4), polygon(SLAB, 1.6)),
-        light=Light(("red", "blue")),
-        index=(1.0, 1.0),
-        regions=(replace(SLANTED.regions[0], indices=(1.4, 1.6)),),
-    )
+def test_colours_part_at_the_first_boundary_and_must_be_known(drawn):
+    segments, region = (polygon(SLAB, 1.4), polygon(SLAB, 1.6)), replace(SLANTED.regions[0], indices=(1.4, 1.6))
+    given = replace(SLANTED, segments=segments, light=Light(("red", "blue")), index=(1.0, 1.0), regions=(region,))
     collection = rays_of(drawn(given))
     colours = {tuple(rgb) for rgb in collection.get_colors()[:, :3].tolist()}
     assert colours == {to_rgb(name) for name in ("red", "blue", drawing.WHITE)}
     assert len(collection.get_segments()) == 1 + 2 + 2
-
-
-def test_a_colour_that_is_none(drawn):
-    given = replace(SLANTED, light=Light(("ultraviolent",)))
     with pytest.raises(ValueError, match=r"test\.toml: colours: 'ultraviolent'; expected a colour"):
-        drawn(given)
+        drawn(replace(SLANTED, light=Light(("ultraviolent",))))
 
 
-def test_a_crowd_is_a_density(drawn):
+def test_a_crowd_is_a_density_the_right_way_up(drawn):
     """Its darkest pixels are on the caustic, whose cusp is the paraxial focus."""
     figure = drawn(CROWD, dpi=60)
     (image,) = figure.axes[0].findobj(AxesImage)
@@ -128,30 +109,21 @@ def test_a_crowd_is_a_density(drawn):
     x0, x1, y0, y1 = image.get_extent()
     row, column = np.unravel_index(opacity.argmax(), opacity.shape)
     place = x0 + (column + 0.5) / opacity.shape[1] * (x1 - x0), y0 + (row + 0.5) / opacity.shape[0] * (y1 - y0)
-    cusp = 1.4 / (2 * 0.4)
-    assert place == pytest.approx((cusp, 0), abs=0.2)
+    assert place == pytest.approx((1.4 / (2 * 0.4), 0), abs=0.2)
     assert opacity[0, -1] < 0.2 < 0.9 < opacity.max() < 1
-
-
-def test_a_crowd_is_the_right_way_up(drawn):
     figure = drawn(replace(CROWD, origins=CROWD.origins + np.array([0, 1.5])), dpi=60)
-    y = figure.axes[0].transData.transform((-2.5, 1.5))[1], figure.axes[0].transData.transform((-2.5, -1.5))[1]
-    x = figure.axes[0].transData.transform((-2.5, 0))[0]
-    above, below = (pixels_of(figure)[int(row), int(x)] for row in y)
-    assert above[1] < 0.8
-    assert below.min() > 0.97  # one reflection inside reaches it
+    above, below = (pixels_of(figure)[pixel(figure, (-2.5, y))[::-1]] for y in (1.5, -1.5))
+    assert above[1] < 0.8 and below.min() > 0.97  # one reflection inside reaches it
 
 
 @pytest.mark.parametrize("event, mark", [(Event.MAX_DEPTH, "o"), (Event.MEDIUM_MISMATCH, "x")])
 def test_paths_that_end_otherwise_are_marked(drawn, event, mark):
-    square = polygon(np.array([(0, -1), (1, -1), (1, 1), (0, 1)], float), 1.5)
-    wrong = replace(square, n_left=np.array([1.5, 1.4, 1.5, 1.5]))
-    given = scene(wrong, [[-1.0, 0.1]], (1, 0), view=VIEW)
+    square = polygon([(0, -1), (1, -1), (1, 1), (0, 1)], 1.5)
+    given = scene(replace(square, n_left=np.array([1.5, 1.4, 1.5, 1.5])), [[-1.0, 0.1]], (1, 0), view=VIEW)
     given = given if event == Event.MEDIUM_MISMATCH else replace(given, segments=(square,), max_depth=1)
     panel = drawn(given).axes[0]
-    marks = [line for line in panel.lines if line.get_marker() == mark]
-    assert len(marks) == 1
-    np.testing.assert_allclose(marks[0].get_xydata(), [[0 if event == Event.MAX_DEPTH else 1, 0.1]], atol=1e-12)
+    (line,) = [line for line in panel.lines if line.get_marker() == mark]
+    np.testing.assert_allclose(line.get_xydata(), [[0 if event == Event.MAX_DEPTH else 1, 0.1]], atol=1e-12)
     note = drawing.MARKS[event][1].format(1)
     assert note in panel.get_xlabel().replace("\n", " ")
     clean = drawn(replace(given, segments=(square,), max_depth=5)).axes[0]
@@ -160,27 +132,18 @@ def test_paths_that_end_otherwise_are_marked(drawn, event, mark):
 
 
 @pytest.mark.parametrize("suffix, start", [(".svg", b"<?xml"), (".png", b"\x89PNG"), (".pdf", b"%PDF")])
-def test_the_same_scene_gives_the_same_bytes(suffix, start):
+def test_the_same_scene_gives_the_same_bytes_whatever_the_users_style(suffix, start):
     content = drawing.draw(SLANTED, follow_scene(SLANTED), suffix)
     assert content.startswith(start)
-    assert drawing.draw(SLANTED, follow_scene(SLANTED), suffix) == content
-
-
-def test_the_users_style_is_left_out():
-    traced = follow_scene(SLANTED)
-    plain = drawing.draw(SLANTED, traced, ".svg")
     with matplotlib.rc_context({"axes.facecolor": "black", "font.size": 30, "svg.hashsalt": "mine"}):
-        assert drawing.draw(SLANTED, traced, ".svg") == plain
+        assert drawing.draw(SLANTED, follow_scene(SLANTED), suffix) == content
         assert matplotlib.rcParams["font.size"] == 30
 
 
 def test_thousands_of_rays_are_a_small_file():
-    traced = follow_scene(CROWD)
-    content = drawing.draw(CROWD, traced, ".svg")
-    assert drawing.draw(CROWD, traced, ".svg") == content
+    content = drawing.draw(CROWD, follow_scene(CROWD), ".svg")
     assert len(content) < 2_000_000
-    assert content.count(b"<image") == 1
-    assert content.count(b"<path") < 500
+    assert content.count(b"<image") == 1 and content.count(b"<path") < 500
 
 
 @pytest.mark.parametrize("view", [(0, 1, 0, 100), (0, 1e-9, 0, 1e-9), (0, 1e6, 0, 1)])
@@ -193,3 +156,71 @@ def test_without_matplotlib(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ValueError, match=r"pip install 'mi-refract\[plot\]'"):
         drawing.draw(SLANTED, follow_scene(SLANTED), ".svg")
+
+
+# Geometry ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "start, end, expected",
+    [
+        ((-1, 0), (1, 0.5), ((-1, 0), (1, 0.5))),
+        ((-4, 0), (6, 0), ((-2, 0), (3, 0))),
+        ((0, -3), (0, 0.5), ((0, -1), (0, 0.5))),
+        ((-3, -2), (0, 1), ((-2, -1), (0, 1))),
+        *((start, end, None) for start, end in (((-4, 2), (6, 2)), ((4, 0), (6, 0)), ((-3, 0), (0, 3)))),
+        ((0, 0), (np.nan, 0), None),
+    ],
+)
+def test_lines_end_at_the_views_edge(start, end, expected):
+    a, b, inside = drawing.clip(np.array([start], float), np.array([end], float), WIDE)
+    assert inside[0] == (expected is not None)
+    if expected:
+        np.testing.assert_allclose([a[0], b[0]], expected, atol=1e-15)
+
+
+def test_every_leg_is_there_once():
+    """In a slab: the ray to it, the way through, the ray out, and the same for what is reflected. And of colours."""
+    legs = drawing.legs(follow_scene(scene(GLASS, [[-1.0, 0]], (1, 0), branches=1)), WIDE)
+    ends = {tuple(np.round([*a, *b], 12) + 0.0) for a, b in zip(legs.start, legs.end, strict=True)}
+    assert len(legs.start) == 6  # the two that come back lie on one another
+    assert ends == {(-1, 0, 0, 0), (0, 0, 1, 0), (1, 0, 3, 0), (0, 0, -2, 0), (1, 0, 0, 0)}
+    given = scene((ball(1.5), ball(1.6)), beam(4, 0.5, x=-1.5), (1, 0), colours=("red", "blue"))
+    legs = drawing.legs(follow_scene(given), WIDE)
+    numbers, counts = np.unique(legs.colour, return_counts=True)
+    assert dict(zip(numbers.tolist(), counts.tolist(), strict=True)) == {drawing.SHARED: 4, 0: 8, 1: 8}
+    assert (legs.start[legs.colour == drawing.SHARED, 0] == -1.5).all()
+
+
+def test_the_default_view_holds_everything():
+    given = scene(ball(1.5), beam(3, 0.5, x=-9), (1, 0))
+    far = 1 + 2 * drawing.MARGIN
+    np.testing.assert_allclose(drawing.around(given, follow_scene(given)), (-far, far, -far, far))
+
+
+def test_density_is_length_where_the_line_is():
+    """The length in pixels, up to the last pixel at either end; for each line alone."""
+
+    def density(start, end, *view):
+        line = drawing.Legs(np.array([start], float), np.array([end], float), np.array([4.0]), np.zeros(1, int))
+        return drawing.density(line, *view) / 2
+
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        start, end = (rng.uniform((-1.9, -0.9), (2.9, 0.9)) for _ in range(2))
+        total = density(start, end, WIDE, 500, 200).sum()
+        assert total == pytest.approx(100 * np.hypot(*(end - start)), abs=2 * 2**0.5)
+    pixels = density((-2, -1), (3, 1), WIDE, 50, 20)
+    rows, columns = np.nonzero(pixels > 0.01)
+    assert np.abs((columns + 0.5) * 20 / 50 - (rows + 0.5)).max() < 1.01
+    assert set(columns.tolist()) == set(range(50))
+    np.testing.assert_allclose(density((-1, -2), (1, 3), (-1, 1, -2, 3), 20, 50), pixels.T, atol=1e-12)
+
+
+def test_arcs_are_round_and_pieces_are_joined():
+    (circle,) = drawing.curves(ball(1.5), 9)
+    assert circle.shape == (4 * 8 + 1, 2)
+    np.testing.assert_allclose(np.hypot(*circle.T), 1, atol=1e-15)
+    np.testing.assert_array_equal(circle[0], circle[-1])
+    (square,) = drawing.curves(GLASS)
+    np.testing.assert_array_equal(square, [*SLAB, SLAB[0]])

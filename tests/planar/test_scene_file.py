@@ -1,19 +1,23 @@
-"""Scene files: the ones that ship say what their comments claim, and what a file cannot be is one line with its key."""
+"""Scene files: what a file says and cannot say, colours, shapes that touch, the scenes that ship, and the README."""
 
 import math
 import os
 import re
 from pathlib import Path
+from typing import get_args
 
 import hypothesis
 import numpy as np
 import pytest
 from hypothesis import strategies
 
-from mi_refract.planar import Event, scene_file, trace
+from mi_refract import media, planar
+from mi_refract.planar import Event, light, scene_file, trace
+from mi_refract.planar.light import Light, of_wavelengths
 from mi_refract.planar.scene_file import load
 
 SCENES = Path(__file__).parents[2] / "scenes" / "planar"
+README = Path(planar.__file__).with_name("README.md").read_text()
 ULP = 2.0**-52
 
 
@@ -21,22 +25,22 @@ def paths(scene, colour=0, **options):
     return trace(scene.segments[colour], scene.origins, scene.directions, scene.max_depth, **options)
 
 
-def last_legs(found):
+def last_legs(traced):
     """Where the last legs start."""
-    count = (found.hits >= 0).sum(1)
-    return found.points[np.arange(len(count)), count]
+    count = (traced.hits >= 0).sum(1)
+    return traced.points[np.arange(len(count)), count]
 
 
-def misses(found, point=(0.0, 0.0)):
-    """Signed distances of the last legs' lines from a point."""
-    (x, y), (u, v) = (last_legs(found) - point).T, found.directions.T
-    return x * v - y * u
+@pytest.fixture
+def read(tmp_path):
+    """`read(text)`: the scene of a file with that text."""
 
+    def read(text, *options):
+        path = tmp_path / "scene.toml"
+        path.write_text(text)
+        return load(path, *options)
 
-def written(tmp_path, text):
-    path = tmp_path / "scene.toml"
-    path.write_text(text)
-    return path
+    return read
 
 
 # The scenes that ship ---------------------------------------------------------------------------------------------
@@ -51,12 +55,7 @@ def test_scenes_load_and_all_rays_find_their_way_out(path, needs_variant):
     assert len(scene.origins) == len(scene.directions) == len(scene.beams)
     assert np.abs(np.hypot(*scene.directions.T) - 1).max() <= 2 * ULP
     for colour, segments in enumerate(scene.segments):
-        assert {Event(e) for e in np.unique(paths(scene, colour).events)} <= {
-            Event.NONE,
-            Event.REFRACTED,
-            Event.REFLECTED,
-            Event.ESCAPED,
-        }
+        assert set(np.unique(paths(scene, colour).events)) <= {0, Event.REFRACTED, Event.REFLECTED, Event.ESCAPED}
         assert segments.start.tolist() == scene.segments[0].start.tolist()
     for region in scene.regions:
         assert len(region.indices) == len(scene.colours)
@@ -77,20 +76,20 @@ def test_the_scenes_are_those_of_the_document():
     assert sorted(reflected[reflected > 0].tolist()) == [1, 4]
 
 
-def test_the_ellipse_focuses_to_rounding_in_any_medium(tmp_path):
-    assert np.abs(misses(paths(load(SCENES / "ellipse.toml")))).max() <= 8 * ULP * 4
-    wet = written(tmp_path, "index = 1.1\n" + (SCENES / "ellipse.toml").read_text())
-    assert np.abs(misses(paths(load(wet)))).max() <= 8 * ULP * 4
+@pytest.mark.parametrize("index", ["", "index = 1.1\n"])
+def test_the_ellipse_focuses_to_rounding_in_any_medium(read, index):
+    traced = paths(read(index + (SCENES / "ellipse.toml").read_text()))
+    (x, y), (u, v) = last_legs(traced).T, traced.directions.T
+    assert np.abs(x * v - y * u).max() <= 8 * ULP * 4
 
 
 def test_the_achromat_unites_three_colours():
     scene = load(SCENES / "doublet.toml")
     assert len(scene.segments[0]) == 10  # 12 pieces of two lenses, the surface between them once
-    rays = np.abs(scene.origins[:, 1]) > 1
-    foci = []
+    rays, foci = np.abs(scene.origins[:, 1]) > 1, []
     for colour in range(3):
-        found = paths(scene, colour)
-        (x, y), (u, v) = last_legs(found)[rays].T, found.directions[rays].T
+        traced = paths(scene, colour)
+        (x, y), (u, v) = last_legs(traced)[rays].T, traced.directions[rays].T
         foci.append(x - y * u / v)
     assert np.ptp(np.mean(foci, axis=1)) < 0.1  # of a lens of N-BK7 alone: 1.6
     assert np.abs(np.array(foci) - 102.75).max() < 0.15
@@ -145,19 +144,15 @@ directions = [180, [0, -1e300]]
 """
 
 
-def test_a_scene_is_read_as_it_is_written(tmp_path):
-    scene = load(written(tmp_path, SCENE))
+def test_a_scene_is_read_as_it_is_written(read):
+    scene = read(SCENE)
     assert (scene.title, scene.colours, scene.index) == ("A disc", ("red", "blue"), (1.0, 1.1))
     assert (scene.max_depth, scene.branches, scene.view) == (5, 1, (-2.0, 2.0, -1.5, 1.5))
     assert scene.origins.tolist() == [[-5, 0], [-5, 0], [-5, 0], [-5, 0], [0, 1], [2, 3]]
     assert scene.directions.tolist() == [[0.6, 0.8], [0, -1], [1, 0], [0, 1], [-1, 0], [0, -1]]
     assert scene.beams.tolist() == [0, 1, 1, 1, 2, 2]
-    assert [region.indices for region in scene.regions] == [
-        (1.5, 1.6),
-        tuple(math.sqrt(1.25) * n for n in (1.5, 1.6)),
-        tuple(math.sqrt(1.75) * n for n in (1.5, 1.6)),
-        (1.3, 1.3),
-    ]
+    layers = [tuple(math.sqrt(x) * n for n in (1.5, 1.6)) for x in (1.25, 1.75)]
+    assert [region.indices for region in scene.regions] == [(1.5, 1.6), *layers, (1.3, 1.3)]
     for colour, segments in enumerate(scene.segments):
         disc, outer, inner, ellipse = (region.indices[colour] for region in scene.regions)
         around = scene.index[colour]
@@ -167,17 +162,16 @@ def test_a_scene_is_read_as_it_is_written(tmp_path):
     assert vertex == pytest.approx([2 * math.cos(math.pi / 6), 2 * math.sin(math.pi / 6)], abs=1e-15)
 
 
-def test_what_is_not_said_of_a_scene(tmp_path):
-    text = '[[shape]]\nkind = "circle"\nradius = 1\nn = 1.5\n[[beam]]\nkind = "rays"\norigins = [[0, 3]]\n'
-    scene = load(written(tmp_path, text + "directions = [0]\n"))
+DISC = '[[shape]]\nkind = "circle"\nradius = 1\nn = 1.5\n'
+RAY = "[[beam]]\nkind = 'rays'\norigins = [[0, 3]]\ndirections = [0]\n"
+
+
+def test_what_is_not_said_of_a_scene_and_round_numbers(read):
+    scene = read(DISC + RAY)
     assert (scene.max_depth, scene.branches, scene.index, scene.view) == (16, 0, (1.0,), None)
     assert (scene.title, scene.path.name) == ("scene", "scene.toml")
-
-
-def test_rays_start_at_round_numbers_where_they_can(tmp_path):
     beam = '[[beam]]\nkind = "parallel"\nfrom = [0, 1]\nto = [{}, 1]\ndirection = 0\ncount = {}\n'
-    beams = "".join(beam.format(count - 1, count) for count in range(2, 200))
-    scene = load(written(tmp_path, f'[[shape]]\nkind = "circle"\nradius = 1\nn = 1.5\n{beams}'))
+    scene = read(DISC + "".join(beam.format(count - 1, count) for count in range(2, 200)))
     assert scene.origins.tolist() == [[j, 1] for count in range(2, 200) for j in range(count)]
 
 
@@ -233,16 +227,38 @@ BAD = {  # what is replaced, by what: the place and what was found or expected
 }
 
 
-@pytest.mark.parametrize("old, new, expected", BAD.values(), ids=BAD)
-def test_what_a_file_cannot_be_is_one_line_with_file_and_key(tmp_path, old, new, expected):
-    assert old in SCENE
-    path = written(tmp_path, SCENE.replace(old, new, 1))
+# Colours by wavelength.
+GLASS = {"n = 1.3": 'n = "cauchy(1.5, 4000)"', 'colours = ["red", "blue"]': "wavelengths = [486.1327, 587.5618]"}
+GLASSES = SCENE
+for old, new in GLASS.items():
+    GLASSES = GLASSES.replace(old, new)
+BAD_GLASSES = {
+    "unknown": ('"cauchy(1.5, 4000)"', '"glas"', "shape[2].n = 'glas': unknown material; expected vacuum"),
+    "formula": ('"cauchy(1.5, 4000)"', '"cauchy(1.5"', "shape[2].n = 'cauchy(1.5'; expected cauchy(…)"),
+    "range": ('"cauchy(1.5, 4000)"', '"table(500: 1.5, 900: 1.4)"', "shape[2].n: table(500: 1.5, 900: 1.4): no index"),
+    "one": ("[486.1327, 587.5618]", "1", "wavelengths: expected `int` >= 2"),
+    "negative": ("[486.1327, 587.5618]", "[-500]", "wavelengths[0]: expected `float` > 0.0"),
+    "many": ("[486.1327, 587.5618]", "257", "wavelengths: expected `int` <= 256"),
+    "both": (
+        "wavelengths =",
+        'colours = ["a", "b"]\nwavelengths =',
+        "colours and wavelengths are both set; expected one",
+    ),
+    "light": ("wavelengths =", 'light = "A"\nwavelengths =', "light: invalid enum value 'A'; expected D65, flat"),
+}
+
+
+@pytest.mark.parametrize(
+    "scene, old, new, expected",
+    [(SCENE, *case) for case in BAD.values()] + [(GLASSES, *case) for case in BAD_GLASSES.values()],
+    ids=[*BAD, *BAD_GLASSES],
+)
+def test_what_a_file_cannot_be_is_one_line_with_file_and_key(read, tmp_path, scene, old, new, expected):
+    assert old in scene
     with pytest.raises(ValueError) as caught:
-        load(path)
+        read(scene.replace(old, new, 1))
     message = str(caught.value)
-    assert message.startswith(f"{path}: ")
-    assert "\n" not in message
-    assert len(message) < 400
+    assert message.startswith(f"{tmp_path / 'scene.toml'}: ") and "\n" not in message and len(message) < 400
     assert expected in message
 
 
@@ -253,65 +269,58 @@ def without(table):
 
 
 @pytest.mark.parametrize("text", ["", without("shape"), without("beam"), "shape = []\n" + without("shape")])
-def test_an_empty_scene_is_refused(tmp_path, text):
+def test_an_empty_scene_is_refused(read, text):
     with pytest.raises(ValueError, match=r"^[^\n]*scene\.toml: [^\n]*(shape|beam)[^\n]*$"):
-        load(written(tmp_path, text))
+        read(text)
 
 
-def test_files_that_cannot_be_read(tmp_path, monkeypatch):
+def test_files_that_cannot_be_read(tmp_path):
     path = tmp_path / "scene.toml"
-    path.write_bytes(b"title = '\xff'")
-    with pytest.raises(ValueError, match=r"^[^\n]*scene\.toml: 'utf-8' codec [^\n]*position 9[^\n]*; expected TOML$"):
-        load(path)
+    os.mkfifo(tmp_path / "pipe.toml")
+    for content, match in (
+        (b"title = '\xff'", r"^[^\n]*scene\.toml: 'utf-8' codec [^\n]*position 9[^\n]*; expected TOML$"),
+        (b" " * (2**24 + 1), r"scene\.toml: \d+ bytes; expected up to \d+"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=match):
+            load(path)
     with pytest.raises(FileNotFoundError, match=r"^[^\n]*none\.toml[^\n]*$"):
         load(tmp_path / "none.toml")
     with pytest.raises(IsADirectoryError, match=r"^[^\n]*$"):
         load(tmp_path)
-    os.mkfifo(tmp_path / "pipe.toml")
     for path in (tmp_path / "pipe.toml", Path("/dev/zero")):
         with pytest.raises(ValueError, match=f"^{path}: not a regular file$"):
             load(path)
-    with pytest.raises(ValueError, match=r"scene\.toml: \d+ bytes; expected up to \d+"):
-        load(written(tmp_path, " " * (2**24 + 1)))
 
 
-DISC = '[[shape]]\nkind = "circle"\nradius = 1\nn = 1.5\n'
-BEAM = '[[beam]]\nkind = "fan"\nat = [0, 0]\nangles = [0, 90]\ncount = 1000000\n'
+FAN = '[[beam]]\nkind = "fan"\nat = [0, 0]\nangles = [0, 90]\ncount = 1000000\n'
 BALL = '[[shape]]\nkind = "luneburg"\nradius = 1\nlayers = 10000\nfacets = 500\n'
+SHAPE = f"[[shape]]\nn = 1.5\nkind = {{}}\n{RAY}"
 
 
 @pytest.mark.parametrize(
     "text, expected",
-    [
-        (BALL + BEAM, r"shape\[0\]: 5000000 or more pieces; expected at most 4194304"),
-        ('colours = ["red", "blue"]\n' + BALL + BEAM, r"shape\[0\]: 10000000 or more pieces"),
-        (
-            DISC + BEAM * 17,
-            r"beam\[16\]\.count: 17000000 rays in this beam and those before it; expected up to 16777216",
+    [  # what a scene asks for is counted before it is made
+        (BALL + FAN, "shape[0]: 5000000 or more pieces; expected at most 4194304"),
+        ('colours = ["red", "blue"]\n' + BALL + FAN, "shape[0]: 10000000 or more pieces"),
+        (DISC + FAN * 17, "beam[16].count: 17000000 rays in this beam and those before it; expected up to 16777216"),
+        *(
+            (SHAPE.format(shape), f"shape[0].{expected}")
+            for shape, expected in (
+                ('"lens"\ncurvature = [0.1, 0.2]\nthickness = 1', "curvature = [0.1, 0.2]: the surfaces never"),
+                ('"lens"\ncurvature = [1, -1]\nthickness = 1\nradius = 2', "radius = 2: a surface is smaller"),
+                ('"ellipse_lens"\nfocal_length = 1\nthickness = 2\nradius = 1', "n = 1.5, thickness = 2;"),
+                ('"polygon"\npoints = [[0, 0], [1, 1]]', "points: they enclose no area"),
+                ('"polygon"\npoints = [[0, 0]]', "points: 1; expected at least 2"),
+                ('"polygon"\npoints = [[0, 0], [1, 1], [0, 1]]\narcs = [9]', "arcs: 1 for 3 pieces"),
+                ('"prism"\nside = 1\napex = 180', "apex: expected `float` < 180.0"),
+            )
         ),
     ],
 )
-def test_what_a_scene_asks_for_is_counted_before_it_is_made(tmp_path, text, expected):
-    with pytest.raises(ValueError, match=expected):
-        load(written(tmp_path, text))
-
-
-@pytest.mark.parametrize(
-    "shape, expected",
-    [
-        ('kind = "lens"\ncurvature = [0.1, 0.2]\nthickness = 1', "shape[0].curvature = [0.1, 0.2]: the surfaces never"),
-        ('kind = "lens"\ncurvature = [1, -1]\nthickness = 1\nradius = 2', "shape[0].radius = 2: a surface is smaller"),
-        ('kind = "ellipse_lens"\nfocal_length = 1\nthickness = 2\nradius = 1', "shape[0].n = 1.5, thickness = 2;"),
-        ('kind = "polygon"\npoints = [[0, 0], [1, 1]]', "shape[0].points: they enclose no area"),
-        ('kind = "polygon"\npoints = [[0, 0]]', "shape[0].points: 1; expected at least 2"),
-        ('kind = "polygon"\npoints = [[0, 0], [1, 1], [0, 1]]\narcs = [9]', "shape[0].arcs: 1 for 3 pieces"),
-        ('kind = "prism"\nside = 1\napex = 180', "shape[0].apex: expected `float` < 180.0"),
-    ],
-)
-def test_what_a_shape_cannot_be_names_its_key(tmp_path, shape, expected):
-    text = f"[[shape]]\nn = 1.5\n{shape}\n[[beam]]\n{SCENE.rpartition('[[beam]]')[2]}"
+def test_what_is_too_much_or_no_shape_names_its_key(read, text, expected):
     with pytest.raises(ValueError, match=r"^[^\n]*$") as caught:
-        load(written(tmp_path, text))
+        read(text)
     assert expected in str(caught.value)
 
 
@@ -319,17 +328,8 @@ NUMBERS = [0, -1, 1, 3, 0.5, 1e-300, -1e300, 1e308, 10**400, math.inf, math.nan,
 PAIRS = [[0, 0], [1, -1], [0.1, -0.2], [1e200, 1e-200], [1e300, 1e300], [], [1]]
 VALUES = strategies.sampled_from([*NUMBERS, *PAIRS, {}, [{}], [[0, 0], [1, 0], [0, 1]], [[1e308, 0], [-1e308, 1]]])
 PLAUSIBLE = {
-    "points": [[0, 0], [1, 0], [0, 1]],
-    "curvature": [0.1, -0.2],
-    "radii": [1, 2],
-    "name": "a",
-    "n": 1.5,
-    "focal_length": 4,
-    "scale": 2,
-    "at": [1, 2],
-    "facets": 40,
-    "arcs": [0, 30, 0],
-    "conic": [0, -1],
+    **{"points": [[0, 0], [1, 0], [0, 1]], "curvature": [0.1, -0.2], "radii": [1, 2], "name": "a", "n": 1.5},
+    **{"focal_length": 4, "scale": 2, "at": [1, 2], "facets": 40, "arcs": [0, 30, 0], "conic": [0, -1]},
 }
 
 
@@ -398,59 +398,120 @@ within = "left"
 """
 
 
-def two(tmp_path, first="0.3", second="2.3", more=""):
-    """Two glasses side by side, and the indices on both sides of their boundaries."""
-    scene = load(written(tmp_path, TWO.format(first=first, second=second, more=more)))
-    segments = scene.segments[0]
-    return scene, sorted(zip(segments.n_left.tolist(), segments.n_right.tolist(), strict=True))
+def media_of(scene):
+    """The indices on both sides of its boundaries."""
+    return sorted(zip(scene.segments[0].n_left.tolist(), scene.segments[0].n_right.tolist(), strict=True))
 
 
 @pytest.mark.parametrize(
     "first, second", [("0.3", "2.3"), ("0.1", "2.1"), ("-0.7", "1.3"), ("0.3", "2.3000000000000003")]
 )
-def test_shapes_that_share_an_edge_are_cemented_there(tmp_path, first, second):
-    scene, media = two(tmp_path, first, second)
-    assert media == [(1.5, 1.1)] * 3 + [(1.5, 1.7)] + [(1.7, 1.1)] * 3
+def test_shapes_that_share_an_edge_are_cemented_there(read, first, second):
+    scene = read(TWO.format(first=first, second=second, more=""))
+    assert media_of(scene) == [(1.5, 1.1)] * 3 + [(1.5, 1.7)] + [(1.7, 1.1)] * 3
     assert paths(scene, weights=True).indices[:, :4].tolist() == [[1.1, 1.5, 1.7, 1.1]] * 5
 
 
-def test_only_what_rounding_keeps_apart_is_made_one(tmp_path):
-    scene, media = two(tmp_path, "0.3", "2.300000001")
-    assert media == [(1.5, 1.1)] * 4 + [(1.7, 1.1)] * 4
+def test_only_what_rounding_keeps_apart_is_made_one(read):
+    scene = read(TWO.format(first="0.3", second="2.300000001", more=""))
+    assert media_of(scene) == [(1.5, 1.1)] * 4 + [(1.7, 1.1)] * 4
     assert paths(scene, weights=True).indices[0, :5].tolist() == [1.1, 1.5, 1.1, 1.7, 1.1]
-
-
-def test_a_shape_may_touch_what_it_lies_in_and_what_that_is_cemented_to(tmp_path):
-    _, media = two(tmp_path, more=INNER)
-    around = [(1.3, 1.1), (1.3, 1.5), (1.3, 1.7), (1.5, 1.1), (1.5, 1.1)]
-    assert media == [*around, (1.7, 1.1), (1.7, 1.1), (1.7, 1.1)]
 
 
 AGAIN = '[[shape]]\nkind = "rectangle"\nwidth = 2\nheight = 2\nn = 1.6\nat = [0.3, 0.1]\n'
 ALONG = '[[shape]]\nkind = "boundary"\npoints = [[1.3, -0.9], [1.3, 1.1]]\nn_left = 1.5\nn_right = 1.7\n'
 
 
-@pytest.mark.parametrize(
-    "more, expected",
-    [
+def test_a_shape_may_touch_what_it_lies_in_and_must_not_contradict_it(read):
+    inner = [(1.3, 1.1), (1.3, 1.5), (1.3, 1.7), (1.5, 1.1), (1.5, 1.1), (1.7, 1.1), (1.7, 1.1), (1.7, 1.1)]
+    assert media_of(read(TWO.format(first="0.3", second="2.3", more=INNER))) == inner
+    for more, expected in (
         (INNER.replace('within = "left"', ""), r"shape\[2\]: along shape\[0\] there is index 1.5; expected 1.1"),
         (AGAIN, r"shape\[2\]: along shape\[0\] there is index 1.5; expected 1.1"),
         (ALONG, r"shape\[2\]: it runs along shape\[0\]"),
-    ],
-)
-def test_shapes_that_contradict_each_other(tmp_path, more, expected):
-    with pytest.raises(ValueError, match=expected):
-        two(tmp_path, more=more)
+    ):
+        with pytest.raises(ValueError, match=expected):
+            read(TWO.format(first="0.3", second="2.3", more=more))
 
 
-def test_what_is_merged_and_what_is_not(tmp_path):
-    """Curves with the same ends are not the same; a repeated corner is no edge."""
+def test_curves_with_the_same_ends_are_not_the_same_and_a_repeated_corner_is_no_edge(read):
     shape = '[[shape]]\nkind = "polygon"\npoints = {}\n{}\n'
     ends = "[[0, -1], [0, 1]]"
     moon, disc = shape.format(ends, "arcs = [90, -45]\nn = 1.5"), shape.format(ends, "arcs = [45, 60]\nn = 1.6")
-    beam = "[[beam]]\nkind = 'rays'\norigins = [[9, 9]]\ndirections = [0]\n"
-    segments = load(written(tmp_path, moon + disc + beam)).segments[0]
-    media = sorted(zip(segments.n_left.tolist(), segments.n_right.tolist(), strict=True))
-    assert media == [(1.5, 1.0), (1.5, 1.6), (1.6, 1.0)]
-    corner = shape.format("[[0, 0], [1, 0], [1, 1], [0, 0]]", "n = 1.5")
-    assert len(load(written(tmp_path, corner + beam)).segments[0]) == 3
+    assert media_of(read(moon + disc + RAY)) == [(1.5, 1.0), (1.5, 1.6), (1.6, 1.0)]
+    assert len(read(shape.format("[[0, 0], [1, 0], [1, 1], [0, 0]]", "n = 1.5") + RAY).segments[0]) == 3
+
+
+# Colours ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_material_has_the_index_of_each_wavelength(read):
+    scene = read(GLASSES)
+    expected = tuple(1.5 + 4000 / w**2 for w in (486.1327, 587.5618))
+    assert scene.regions[-1].indices == pytest.approx(expected, rel=1e-15)
+    assert [segments.n_left[-1] for segments in scene.segments] == pytest.approx(expected, rel=1e-15)
+    assert scene.colours == ("486.133 nm", "587.562 nm")
+    given = [read(GLASSES.replace("[1, 1.1]", "1").replace("[1.5, 1.6]", "1.5"), x).light for x in ([450.0], 36)]
+    assert [x.wavelengths for x in given] == [(450.0,), tuple(np.linspace(380, 730, 36))]
+    plain = read(SCENE.replace("n = 1.3", GLASS["n = 1.3"]))  # without wavelengths: the d line
+    assert plain.regions[-1].indices == pytest.approx((1.5 + 4000 / media.LINES["d"] ** 2,) * 2, rel=1e-15)
+
+
+def test_what_is_measured_against_vacuum_is_made_relative_to_air():
+    indices = Light(("", ""), (500.0, 600.0)).indices("MATERIAL:water", "n")
+    expected = [media.index("MATERIAL:water", w) / media.LABORATORY_AIR.index(w) for w in (500.0, 600.0)]
+    assert indices == pytest.approx(expected, rel=1e-15)
+    assert Light().indices("AIR:ciddor", "n") == (1.0,)
+
+
+def test_words_that_are_wavelengths_and_others():
+    for text, expected in {"450.5, 600": [450.5, 600.0], "450": [450.0], "32": 32, "550": [550.0]}.items():
+        assert light.parsed(text) == expected  # 550 is more than MOST: no number of them
+    for text in ("", "red", "1", "nan", "450,", "-450", "inf"):
+        with pytest.raises(ValueError, match="expected wavelengths in nm, such as"):
+            light.parsed(text)
+
+
+@pytest.mark.parametrize("power", ["flat", "D65"])
+def test_colours_are_those_of_the_standard_observer(power):
+    """CIE 1931 x̄, ȳ, z̄ at 450, 550 and 600 nm; XYZ to linear sRGB of IEC 61966-2-1; all together are white."""
+    xyz = np.array([(0.3362, 0.038, 1.77211), (0.43345, 0.99495, 0.00875), (1.0622, 0.631, 0.0008)])
+    to_rgb = [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
+    chosen = of_wavelengths([450.0, 550.0, 600.0], power)
+    expected = xyz @ np.transpose(to_rgb) * np.array(chosen.powers)[:, None]
+    assert light.linear_srgb(chosen) == pytest.approx(expected / expected.sum(0), rel=0.01, abs=0.01)
+
+
+def test_daylight_has_the_powers_of_cie():
+    """D65 at 450, 560 and 650 nm: 117.008, 100 and 80.0268."""
+    powers = of_wavelengths([450, 560, 650], "D65").powers
+    assert np.array(powers) / powers[1] == pytest.approx([1.17008, 1, 0.800268], rel=2e-5)
+
+
+# The room's README ------------------------------------------------------------------------------------------------
+
+
+def test_the_python_of_the_readme_runs_and_its_scene_is_one(read, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scenes").symlink_to(SCENES.parent)
+    python, (toml_text,) = (
+        re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL) for language in ("python", "toml")
+    )
+    for code in python:
+        exec(code, {})
+    assert "escaped" in capsys.readouterr().out
+    assert (tmp_path / "doublet.svg").stat().st_size > 1000
+    assert len(read(toml_text).origins) == 15
+
+
+def test_every_option_kind_and_event_is_in_the_readme(capfd):
+    pytest.importorskip("typer")
+    from mi_refract.cli import app
+
+    with pytest.raises(SystemExit):
+        app.app(["trace", "--help"], prog_name="mi-refract")
+    options = set(re.findall(r"(--[a-z][a-z-]+)", capfd.readouterr().out)) - {"--help", "--output"}
+    assert len(options) > 8 and all(f"| `{option}" in README or f"`{option}`" in README for option in options)
+    kinds = [*get_args(scene_file.AnyShape), *get_args(scene_file.AnyBeam)]
+    names = [kind.__struct_config__.tag for kind in kinds] + [event.name for event in planar.Event]
+    assert all(f"`{name}`" in README for name in names)

@@ -1,16 +1,19 @@
-"""The planar system: what a crossing, a vertex, a start and a medium mean, on every backend and precision."""
+"""The planar system on every backend and precision: crossings, vertices, starts, media, arcs, and bad input."""
 
 import dataclasses
 import math
 
+import drjit as dr
 import numpy as np
 import pytest
 from support.planar_scenes import SQUARE, ball, polygon, star, story, together
 
+from mi_refract.backend import Backend
 from mi_refract.formulas import FORMULAS
-from mi_refract.planar import Event, Segments
+from mi_refract.planar import Event, Segments, array_backend, trace
 
 REFRACTED, REFLECTED, ESCAPED = Event.REFRACTED, Event.REFLECTED, Event.ESCAPED
+MISMATCH, MAX_DEPTH = Event.MEDIUM_MISMATCH, Event.MAX_DEPTH
 
 
 def test_a_slab_shifts_a_ray_as_snells_law_says(follow, setting):
@@ -19,15 +22,14 @@ def test_a_slab_shifts_a_ray_as_snells_law_says(follow, setting):
     d = np.array([math.cos(angle), math.sin(angle)])
     paths = follow(slab, -3 * d, d)
     assert story(paths) == ([3, 1], [REFRACTED, REFRACTED, ESCAPED])
-    inside = math.asin(math.sin(angle) / n)
-    exact = [-3 * d, (0, 0), (width, width * math.tan(inside))]
+    exact = [-3 * d, (0, 0), (width, width * math.tan(math.asin(math.sin(angle) / n)))]
     assert paths.points[0, :3] == pytest.approx(np.array(exact), abs=16 * setting.roundoff)
     assert paths.directions[0] == pytest.approx(d, abs=8 * setting.roundoff)
     assert paths.indices[0, :3].tolist() == [1, 1.5, 1]
     assert np.isnan(paths.points[0, 3:]).all()
 
 
-def test_beyond_the_critical_angle_rays_are_reflected_and_nothing_is_lost(follow, setting):
+def test_beyond_the_critical_angle_rays_are_reflected_and_nothing_is_lost(follow):
     paths = follow(polygon([(0, 0), (60, 0), (60, 1), (0, 1)]), (-1, 0.5), (1, 0.5), max_depth=100)
     hits, events = story(paths)
     assert events.count(REFLECTED) >= 10
@@ -47,24 +49,35 @@ def test_the_formulas_agree(follow, setting):
         assert np.nanmax(np.abs(other.points - plain.points)) <= bound, name
 
 
+def test_another_scene_of_a_kind_needs_no_other_kernel(vectorised):
+    def kernels(corners, radius, rays, depth):
+        angle = np.linspace(0, 2 * np.pi, corners, endpoint=False)
+        segments = polygon(radius * np.column_stack([np.cos(angle), np.sin(angle)]))
+        origins = np.column_stack([np.full(rays, -3 * radius), np.linspace(-0.4, 0.5, rays) * radius])
+        options = {"precision": vectorised.name, "backend": vectorised.backend}
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            trace(segments, origins, np.broadcast_to([1.0, 0.0], (rays, 2)), depth, **options)
+            return {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])}
+
+    first = kernels(8, 1, 40, 4)
+    assert first
+    assert all(kernels(*other) == first for other in ((9, 2.5, 40, 4), (30, 0.3, 70, 9), (5, 40, 50, 2)))
+
+
 # Vertices ------------------------------------------------------------------------------------------------------
 
 
-def zigzag(rng, count=20):
-    """A boundary from far left to far right, air above, glass below."""
-    x = np.concatenate([[-100], np.sort(rng.uniform(-1, 1, count)), [100]])
-    points = np.column_stack([x, np.concatenate([[0], rng.uniform(-0.01, 0.01, count), [0]])])
-    return Segments(points[:-1], points[1:], np.ones(count + 1), np.full(count + 1, 1.5))
-
-
 def test_a_ray_through_a_shared_vertex_crosses_once(follow):
+    """Of a zigzag from far left to far right, air above, glass below; no figure of many tips leaks either."""
     rng = np.random.default_rng(7)
-    boundary = zigzag(rng)
+    x = np.concatenate([[-100], np.sort(rng.uniform(-1, 1, 20)), [100]])
+    places = np.column_stack([x, np.concatenate([[0], rng.uniform(-0.01, 0.01, 20), [0]])])
+    boundary = Segments(places[:-1], places[1:], np.ones(21), np.full(21, 1.5))
     vertices = boundary.end[rng.integers(0, 20, 300)]
     origins = vertices + np.column_stack([rng.uniform(-2, 2, 300), rng.uniform(1, 2, 300)])
     paths = follow(boundary, origins, vertices - origins, max_depth=4)
-    assert (paths.events[:, 0] == REFRACTED).all()
-    assert (paths.hits[:, 1:] == -1).all()
+    assert (paths.events[:, 0] == REFRACTED).all() and (paths.hits[:, 1:] == -1).all()
     assert (paths.indices[:, 1] == np.float32(1.5)).all()
 
 
@@ -73,131 +86,128 @@ def test_a_closed_outline_is_left_as_often_as_it_is_entered(follow):
     figure, rng = star(60), np.random.default_rng(3)
     origins = rng.normal(size=(200, 2)) * 0.3 + [3, 0]
     paths = follow(figure, origins, figure.start[rng.integers(0, 60, 200)] - origins, max_depth=40)
-    assert not (paths.events == Event.MEDIUM_MISMATCH).any()
+    assert not (paths.events == MISMATCH).any()
     last = (paths.events != Event.NONE).sum(1) - 1
-    ends = paths.events[np.arange(200), last]
-    assert (paths.indices[np.arange(200), last][(ends == ESCAPED) & (last > 0)] == 1).all()
-    assert ((ends == ESCAPED) & (last > 0)).sum() > 100
+    escaped = (paths.events[np.arange(200), last] == ESCAPED) & (last > 0)
+    assert (paths.indices[np.arange(200), last][escaped] == 1).all() and escaped.sum() > 100
 
 
-def test_a_ray_that_grazes_a_tip_passes_it_on_its_right(follow):
-    """Up along x = 1 at the tip (1, 0.5): displaced to the right it misses the glass on its left, down it enters."""
-    tip = polygon([(0, 0), (1, 0.5), (0, 1)])
-    assert story(follow(tip, (1, -1), (0, 1))) == ([], [ESCAPED])
-    hits, events = story(follow(tip, (1, 2), (0, -1)))
+TIP, UNIT = polygon([(0, 0), (1, 0.5), (0, 1)]), polygon(SQUARE)
+TURNED = Segments(UNIT.start, UNIT.end, [1.5, 1, 1.5, 1.5], [1, 1.5, 1, 1])  # its right side is turned round
+INNER = polygon([(0.25, 0.25), (0.75, 0.25), (0.75, 0.75), (0.25, 0.75)], 1.33, outside=1.5)
+# Below one segment with 1.0 above it, on the right, too, where the medium is 1.3: a vertex inside a segment.
+WHOLE = Segments([(-9, 0), (0, 0)], [(9, 0), (0, 9)], np.ones(2), [1.5, 1.3])
+# Three media about (0, 0): 1.5 below, 1.0 above on the left, 1.3 above on the right.
+JUNCTION = Segments(np.zeros((3, 2)), [(-9, 0), (9, 0), (0, 9)], [1.5, 1.3, 1.0], [1.0, 1.5, 1.3])
+STORIES = {  # segments, ray and options; the segments that it meets, its events, the indices of its media
+    "up along a tip it is displaced to the right, and misses": (TIP, (1, -1), (0, 1), {}, [], [ESCAPED], None),
+    "along a side on its right": (UNIT, (-1, 0), (1, 0), {}, [], [ESCAPED], None),
+    "along a side on its left": (UNIT, (2, 0), (-1, 0), {}, [1, 3], [REFRACTED, REFRACTED, ESCAPED], None),
+    "media within media": (
+        *(together(UNIT, INNER), (-1, 0.5), (1, 0.01), {}, [3, 7, 5, 1], [*[REFRACTED] * 4, ESCAPED]),
+        [1, 1.5, 1.33, 1.5, 1],
+    ),
+    "the first boundary gives the medium": (UNIT, (0.5, 0.5), (1, 0), {}, [1], [REFRACTED, ESCAPED], [1.5, 1]),
+    "or n_start": (UNIT, (0.5, 0.5), (1, 0), {"n_start": 1.5}, [1], [REFRACTED, ESCAPED], [1.5, 1]),
+    "n_start is not what lies there": (UNIT, (0.5, 0.5), (1, 0), {"n_start": 1.25}, [1], [MISMATCH], [1.25]),
+    "no boundary, no medium": (UNIT, (2, 2), (1, 0), {}, [], [ESCAPED], [math.nan]),
+    "turned round": (TURNED, (-1, 0.5), (1, 0), {}, [3, 1], [REFRACTED, MISMATCH], [1, 1.5]),
+    "a junction from straight above": (JUNCTION, (0, 2), (0, -1), {}, [0], [REFRACTED, ESCAPED], [1, 1.5]),
+    "a vertex in a segment": (WHOLE, (3, 1), (-0.1, -1), {"n_start": 1.3}, [0], [MISMATCH], [1.3]),
+    "its other side": (WHOLE, (-3, 1), (0.1, -1), {}, [0], [REFRACTED, ESCAPED], [1, 1.5]),
+    "max_depth": (UNIT, (-1, 0.5), (1, 0), {"max_depth": 1}, [3], [REFRACTED, MAX_DEPTH], [1, 1.5]),
+    "max_depth and nothing ahead": (
+        *(UNIT, (-1, 0.5), (1, 0), {"max_depth": 2}, [3, 1], [REFRACTED, REFRACTED, ESCAPED]),
+        [1, 1.5, 1],
+    ),
+    "points only are no boundary": (
+        *(together(*[polygon([(0.5, 0.5)])] * 60), (0, 0), (1, 1), {}, [], [ESCAPED]),
+        [math.nan],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", STORIES)
+def test_a_ray_meets(follow, case):
+    segments, origin, direction, options, hits, events, indices = STORIES[case]
+    paths = follow(segments, origin, direction, **options)
+    assert story(paths) == (hits, events)
+    if indices:
+        assert paths.indices[0, : len(indices)] == pytest.approx(indices, rel=1e-7, nan_ok=True)
+    if events[-1] == MISMATCH:  # it ends there, as it came
+        assert paths.directions[0] == pytest.approx(np.array(direction) / math.hypot(*direction), abs=1e-7)
+        assert np.isfinite(paths.points[0, len(hits)]).all() and not np.isfinite(paths.points[0, len(hits) + 1 :]).any()
+
+
+def test_down_along_a_tip_a_ray_enters_on_its_right(follow):
+    hits, events = story(follow(TIP, (1, 2), (0, -1)))
     assert (hits[0], events[0]) == (1, REFRACTED)
 
 
-def test_a_ray_along_a_segment_is_on_the_right_of_itself(follow):
-    square = polygon(SQUARE)
-    assert story(follow(square, (-1, 0), (1, 0))) == ([], [ESCAPED])
-    paths = follow(square, (2, 0), (-1, 0))
-    assert story(paths) == ([1, 3], [REFRACTED, REFRACTED, ESCAPED])
-    assert (paths.points[0, :3, 1] == 0).all()
-
-
 def test_a_segment_of_length_zero_is_no_boundary(follow):
-    square = polygon(SQUARE)
     dots = polygon([(0.5, 0.5)], n=9.0)
     o, d = np.array([(-1, 0.25), (0.5, -1), (-1, -0.5), (-1, 0.5)]), np.array([(1, 0.1), (0, 1), (1, 1), (1, 0)])
-    plain, dotted = (follow(segments, o, d) for segments in (square, together(square, dots)))
+    plain, dotted = (follow(segments, o, d) for segments in (UNIT, together(UNIT, dots)))
     for one, other in zip(dataclasses.astuple(plain), dataclasses.astuple(dotted), strict=True):
         assert np.array_equal(one, other, equal_nan=True)
 
 
-# Starts --------------------------------------------------------------------------------------------------------
-
-
 def test_a_ray_that_starts_on_a_segment_has_not_met_it(follow):
     square = polygon([(0, 0), (0.9, 0.1), (1, 1.1), (0.2, 0.8)])
-    for share in (0.1, 1 / 3, 0.7):
-        for i in range(4):
-            a, b = square.start[i], square.end[i]
-            inward = np.array([a[1] - b[1], b[0] - a[0]])
-            within = follow(square, a + share * (b - a), inward)
-            assert i not in story(within)[0][:1]
-            assert within.indices[0, 0] == 1.5
-            assert story(follow(square, a + share * (b - a), -inward)) == ([], [ESCAPED])
-
-
-def test_the_first_boundary_tells_the_medium_unless_it_is_told(follow):
-    square = polygon(SQUARE)
-    assert follow(square, (0.5, 0.5), (1, 0)).indices[0, :2].tolist() == [1.5, 1]
-    assert follow(square, (0.5, 0.5), (1, 0), n_start=1.5).indices[0, :2].tolist() == [1.5, 1]
-    told = follow(square, (0.5, 0.5), (1, 0), n_start=1.25)
-    assert story(told) == ([1], [Event.MEDIUM_MISMATCH])
-    assert told.points[0, 1].tolist() == [1, 0.5]
-    nowhere = follow(square, (2, 2), (1, 0))
-    assert story(nowhere) == ([], [ESCAPED])
-    assert np.isnan(nowhere.indices[0, 0])
-
-
-# Media ---------------------------------------------------------------------------------------------------------
-
-
-def test_media_may_lie_within_media(follow):
-    inner = polygon([(0.25, 0.25), (0.75, 0.25), (0.75, 0.75), (0.25, 0.75)], 1.33, outside=1.5)
-    paths = follow(together(polygon(SQUARE), inner), (-1, 0.5), (1, 0.01))
-    assert paths.indices[0, :5] == pytest.approx([1, 1.5, 1.33, 1.5, 1], rel=1e-7)
-
-
-def junction():
-    """Three media about (0, 0): 1.5 below, 1.0 above on the left, 1.3 above on the right."""
-    ends = np.array([(-9.0, 0.0), (9.0, 0.0), (0.0, 9.0)])
-    return Segments(np.zeros((3, 2)), ends, np.array([1.5, 1.3, 1.0]), np.array([1.0, 1.5, 1.3]))
+    share = np.repeat([0.1, 1 / 3, 0.7], 4)[:, None]
+    a, e = np.tile(square.start, (3, 1)), np.tile(square.end - square.start, (3, 1))
+    inward = np.column_stack([-e[:, 1], e[:, 0]])
+    within, outward = (follow(square, a + share * e, way) for way in (inward, -inward))
+    assert (within.hits[:, 0] != np.tile(np.arange(4), 3)).all() and (within.indices[:, 0] == 1.5).all()
+    assert (outward.events[:, 0] == ESCAPED).all()
 
 
 def test_at_a_junction_boundaries_are_crossed_one_after_the_other(follow):
     angle = np.linspace(0, 2 * np.pi, 41)[:-1] + 0.05
     origins = 2 * np.column_stack([np.cos(angle), np.sin(angle)])
-    paths = follow(junction(), origins, -origins, max_depth=8)
-    assert not (paths.events == Event.MEDIUM_MISMATCH).any()
+    paths = follow(JUNCTION, origins, -origins, max_depth=8)
+    assert not (paths.events == MISMATCH).any()
     assert (paths.events == ESCAPED).any(axis=1).all()
-    # From straight above the upright boundary is passed on its right, which is the left of the image.
-    hits, _ = story(follow(junction(), (0, 2), (0, -1)))
-    assert hits == [0]
-
-
-def test_a_vertex_inside_another_segment_is_no_junction(follow):
-    """The boundary below is one segment with 1.0 above it, on the right, too: who comes from 1.3 is told."""
-    whole = Segments(
-        np.array([(-9.0, 0.0), (0.0, 0.0)]), np.array([(9.0, 0.0), (0.0, 9.0)]), np.ones(2), np.array([1.5, 1.3])
-    )
-    assert story(follow(whole, (3, 1), (-0.1, -1), n_start=1.3)) == ([0], [Event.MEDIUM_MISMATCH])
-    assert story(follow(whole, (-3, 1), (0.1, -1))) == ([0], [REFRACTED, ESCAPED])
-
-
-def test_a_segment_turned_round_is_a_medium_mismatch(follow):
-    square = polygon(SQUARE)
-    square.n_left[1], square.n_right[1] = 1.0, 1.5
-    paths = follow(square, (-1, 0.5), (1, 0))
-    assert story(paths) == ([3, 1], [REFRACTED, Event.MEDIUM_MISMATCH])
-    assert paths.directions[0].tolist() == [1, 0]
-
-
-# Ends ----------------------------------------------------------------------------------------------------------
-
-
-def test_max_depth_ends_a_path_only_where_another_boundary_is_ahead(follow):
-    square = polygon(SQUARE)
-    assert story(follow(square, (-1, 0.5), (1, 0), max_depth=1)) == ([3], [REFRACTED, Event.MAX_DEPTH])
-    assert story(follow(square, (-1, 0.5), (1, 0), max_depth=2)) == ([3, 1], [REFRACTED, REFRACTED, ESCAPED])
 
 
 def test_bits_say_where_a_ray_is_reflected(follow):
-    square = polygon(SQUARE)
-    paths = follow(square, [(-1, 0.5)] * 4, [(1, 0)] * 4, max_depth=6, reflect=[0, 1, 2, 6])
+    paths = follow(UNIT, [(-1, 0.5)] * 4, [(1, 0)] * 4, max_depth=6, reflect=[0, 1, 2, 6])
     stories = [story(paths, i) for i in range(4)]
-    assert stories[0] == ([3, 1], [REFRACTED, REFRACTED, ESCAPED])
-    assert stories[1] == ([3], [REFLECTED, ESCAPED])
-    assert stories[2] == ([3, 1, 3], [REFRACTED, REFLECTED, REFRACTED, ESCAPED])
-    assert stories[3] == ([3, 1, 3, 1], [REFRACTED, REFLECTED, REFLECTED, REFRACTED, ESCAPED])
+    assert stories == [
+        ([3, 1], [REFRACTED, REFRACTED, ESCAPED]),
+        ([3], [REFLECTED, ESCAPED]),
+        ([3, 1, 3], [REFRACTED, REFLECTED, REFRACTED, ESCAPED]),
+        ([3, 1, 3, 1], [REFRACTED, REFLECTED, REFLECTED, REFRACTED, ESCAPED]),
+    ]
     r = 0.2**2
     powers = [(1 - r) ** 2, r, r * (1 - r) ** 2, r**2 * (1 - r) ** 2]
     assert [paths.weights[i, len(stories[i][0])] for i in range(4)] == pytest.approx(powers, rel=1e-6)
 
 
+def test_a_ray_along_a_side_goes_on_on_the_side_that_it_is_on(follow):
+    """Rounding hides the sign of its cosine: such rays were within by their medium and outside by their direction."""
+    square = np.array(SQUARE, float) - 0.5
+    for turn in np.radians(np.arange(0, 90, 1.1)):
+        c, s = math.cos(turn), math.sin(turn)
+        figure = polygon(square @ np.array([(c, s), (-s, c)]), 1.25)
+        along = figure.end - figure.start
+        along = np.concatenate([along, -along])
+        paths = follow(figure, np.concatenate([figure.start, figure.end]) - along, along, max_depth=1, n_start=1.0)
+        met = paths.events[:, 0] == REFRACTED
+        side, d = (figure.end - figure.start)[paths.hits[met, 0]], paths.directions[met]
+        assert (side[:, 0] * d[:, 1] - side[:, 1] * d[:, 0] > 0).all()
+
+
 # Arcs ----------------------------------------------------------------------------------------------------------
+
+
+def arcs_of_circle(turn, count=4):
+    """Arcs of a circle of glass, the first of which starts at the angle `turn`."""
+    half = math.pi / count
+    angle = turn + 2 * half * np.arange(count)
+    start, control = (np.column_stack([np.cos(x), np.sin(x)]) for x in (angle, angle + half))
+    media, weight = (np.full(count, 1.5), np.ones(count)), np.full(count, math.cos(half))
+    return Segments(start, np.roll(start, -1, axis=0), *media, control / math.cos(half), weight)
 
 
 def test_a_ball_turns_a_ray_by_twice_the_difference_of_angles(follow, setting):
@@ -205,8 +215,7 @@ def test_a_ball_turns_a_ray_by_twice_the_difference_of_angles(follow, setting):
     paths = follow(ball(), np.column_stack([-3 + 0 * height, height]), np.tile([1.0, 0.0], (6, 1)))
     assert (paths.events[:, :3] == [REFRACTED, REFRACTED, ESCAPED]).all()
     turned = np.arctan2(paths.directions[:, 1], paths.directions[:, 0])
-    exact = -2 * (np.arcsin(height) - np.arcsin(height / 1.5))
-    assert turned == pytest.approx(exact, abs=40 * setting.roundoff)
+    assert turned == pytest.approx(-2 * (np.arcsin(height) - np.arcsin(height / 1.5)), abs=40 * setting.roundoff)
     assert np.hypot(*paths.points[:, 1:3].T) == pytest.approx(1, abs=4 * setting.roundoff)
 
 
@@ -215,23 +224,17 @@ def test_inside_a_ball_a_ray_turns_by_the_same_angle_each_time(follow, setting, 
     """Chords of angle 2 α, many of them within one arc; none is skipped, none leaks at the joints."""
     count = 500
     start = np.array([math.cos(0.3), math.sin(0.3)]) * math.cos(grazing)
-    along = np.array([-math.sin(0.3), math.cos(0.3)])
-    paths = follow(ball(), start, along, max_depth=count)
-    assert story(paths)[1] == [REFLECTED] * count + [Event.MAX_DEPTH]
+    paths = follow(ball(), start, (-math.sin(0.3), math.cos(0.3)), max_depth=count)
+    assert story(paths)[1] == [REFLECTED] * count + [MAX_DEPTH]
     angle = np.unwrap(np.arctan2(*paths.points[0, 1:, ::-1].T))
-    steps = np.diff(angle.astype(float))
     # A chord's own error: u of the place over the grazing angle, and that of the angle adds up as the rays go on.
-    assert steps == pytest.approx(2 * grazing, abs=60 * count**0.5 * setting.roundoff / grazing)
+    bound = 60 * count**0.5 * setting.roundoff / grazing
+    assert np.diff(angle.astype(float)) == pytest.approx(2 * grazing, abs=bound)
 
 
 def test_an_arc_is_met_by_rays_that_miss_its_chord(follow):
     """A ray at height 0.99 over the ball's top arc crosses that arc twice and the chord never."""
-    turned = ball()
-    s = math.sqrt(0.5)
-    corner = np.array([(s, -s), (s, s), (-s, s), (-s, -s)])
-    control = np.array([(2 * s, 0), (0, 2 * s), (-2 * s, 0), (0, -2 * s)])
-    turned = Segments(corner, np.roll(corner, -1, 0), turned.n_left, turned.n_right, control, turned.weight)
-    paths = follow(turned, (-3, 0.99), (1, 0), formula="promoted")
+    paths = follow(arcs_of_circle(-math.pi / 4), (-3, 0.99), (1, 0), formula="promoted")
     assert story(paths)[0][0] == 1
     assert paths.points[0, 1] == pytest.approx([-math.sqrt(1 - 0.99**2), 0.99], abs=1e-6)
 
@@ -245,16 +248,9 @@ def test_arcs_that_meet_in_a_tip_are_met_in_order(follow):
         angle = np.linspace(0, 2 * np.pi, 61)[:-1] + 0.01
         origins = np.array([0, 1]) + 3 * np.column_stack([np.cos(angle), np.sin(angle)])
         paths = follow(lens, origins, [0, 1] - origins, max_depth=8)
-        assert not (paths.events == Event.MEDIUM_MISMATCH).any()
+        assert not (paths.events == MISMATCH).any()
         met = (paths.hits[:, 0] >= 0) & (origins[:, 1] > 1)
-        assert met.any()
-        assert (paths.indices[met, 0] == 1).all()
-
-
-def moved(segments, x, size, n_outside):
-    shift = np.array([x, 0.0])
-    start, end, control = (size * p + shift for p in (segments.start, segments.end, segments.control))
-    return dataclasses.replace(segments, start=start, end=end, control=control, n_right=np.full(4, n_outside))
+        assert met.any() and (paths.indices[met, 0] == 1).all()
 
 
 @pytest.mark.parametrize("inside", [False, True])
@@ -264,10 +260,12 @@ def test_balls_that_touch_are_met_in_order_by_a_ray_through_that_point(follow, i
 
     A figure that is turned is off by rounding, and still in order.
     """
-    one = ball()
-    other = moved(ball(1.3), 0.5, 0.5, 1.5) if inside else moved(ball(1.3), 2.0, 1.0, 1.0)
-    parts = [other, one] if swapped else [one, other]
+    one, other = ball(), ball(1.3)
+    x, size, around = (0.5, 0.5, 1.5) if inside else (2.0, 1.0, 1.0)
+    places = {name: size * getattr(other, name) + np.array([x, 0]) for name in ("start", "end", "control")}
+    other = dataclasses.replace(other, **places, n_right=np.full(4, around))
     names = [f.name for f in dataclasses.fields(Segments)]
+    parts = [other, one] if swapped else [one, other]
     both = Segments(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
     indices = [1, 1.5, 1.3, 1.5, 1] if inside else [1, 1.5, 1.0, 1.3, 1]
     for turn in np.linspace(0, 6, 21):
@@ -280,16 +278,6 @@ def test_balls_that_touch_are_met_in_order_by_a_ray_through_that_point(follow, i
             assert paths.indices[i, :5] == pytest.approx(expected)
 
 
-def arcs_of_circle(turn, count=4, n=1.5, middle=(0.0, 0.0), radius=1.0):
-    """Arcs of a circle, the first of which starts at the angle `turn`."""
-    half = math.pi / count
-    angle = turn + 2 * half * np.arange(count)
-    start, control = (np.column_stack([np.cos(x), np.sin(x)]) for x in (angle, angle + half))
-    start, control = middle + radius * start, middle + radius * control / math.cos(half)
-    end = np.roll(start, -1, axis=0)
-    return Segments(start, end, np.full(count, n), np.ones(count), control, np.full(count, math.cos(half)))
-
-
 @pytest.mark.parametrize("count", [3, 4, 8])
 def test_rays_from_joint_to_joint_of_a_circle_stay_on_it(follow, setting, count):
     """Within 1e-14 of a joint the next point was on the right arc at a wrong place, or on none."""
@@ -298,32 +286,26 @@ def test_rays_from_joint_to_joint_of_a_circle_stay_on_it(follow, setting, count)
         chord = np.radians(np.array([15, 40, 60, 75, 110, 160, 179]))
         joint = np.repeat(np.arange(count), len(chord))
         angle = turn + 2 * math.pi / count * joint - np.tile(chord, count)
-        origins = np.column_stack([np.cos(angle), np.sin(angle)])
-        origins = 0.9 * origins + 0.1 * circle.start[joint]
+        origins = 0.9 * np.column_stack([np.cos(angle), np.sin(angle)]) + 0.1 * circle.start[joint]
         # Bits that ask for reflection where it would not be total.
         paths = follow(circle, origins, circle.start[joint] - origins, max_depth=4, reflect=0xFFFF)
-        assert (paths.events == [REFLECTED] * 4 + [Event.MAX_DEPTH]).all()
-        found = np.arctan2(paths.points[:, 1:, 1], paths.points[:, 1:, 0])
+        assert (paths.events == [REFLECTED] * 4 + [MAX_DEPTH]).all()
         exact = angle[:, None] + np.tile(chord, count)[:, None] * np.arange(1, 5)
-        off = np.abs((found - exact + math.pi) % (2 * math.pi) - math.pi)
+        off = np.arctan2(paths.points[:, 1:, 1], paths.points[:, 1:, 0]) - exact
+        off = np.abs((off + math.pi) % (2 * math.pi) - math.pi)
         # 8u of each direction, which turns those behind it by twice as much: 8u (1 + 3 + 5 + 7), and the angle by twice
         # that; and 64u for angles up to 6π in double precision.
         assert (off <= 320 * setting.roundoff / np.sin(np.tile(chord, count) / 2)[:, None]).all()
 
 
-def among_arcs(figure):
-    """The figure, the first segment of which is an arc."""
-    arc = dataclasses.replace(figure, control=(figure.start + figure.end) / 2, weight=np.ones(len(figure)))
-    arc.control[0] += 1e-3 * (figure.end[0] - figure.start[0])[::-1] * [-1, 1]
-    return arc
-
-
 def test_straight_segments_among_arcs_decide_as_alone_do(follow):
-    """To the last bit: at vertices and anywhere."""
-    rng = np.random.default_rng(5)
-    origins, vertices = rng.normal(size=(100, 2)), star(30).start[rng.integers(0, 30, 50)]
+    """To the last bit: at vertices and anywhere; the first segment of the other figure is an arc."""
+    rng, plain = np.random.default_rng(5), star(30)
+    mixed = dataclasses.replace(plain, control=(plain.start + plain.end) / 2, weight=np.ones(30))
+    mixed.control[0] += 1e-3 * (plain.end[0] - plain.start[0])[::-1] * [-1, 1]
+    origins, vertices = rng.normal(size=(100, 2)), plain.start[rng.integers(0, 30, 50)]
     directions = np.concatenate([rng.normal(size=(50, 2)), vertices - origins[50:]])
-    one, other = (follow(x, origins, directions) for x in (star(30), among_arcs(star(30))))
+    one, other = (follow(x, origins, directions) for x in (plain, mixed))
     same = (one.hits != 0).all(1) & (other.hits != 0).all(1)
     assert same.sum() > len(same) / 2
     for name in ("hits", "events", "points", "directions"):
@@ -336,16 +318,88 @@ def test_a_straight_piece_may_run_along_itself_at_any_pace(follow, setting, cont
     assert follow(piece, (0.2, 1), (0, -1)).points[0, 1] == pytest.approx([0.2, 0], abs=4 * setting.roundoff)
 
 
-def test_a_ray_along_a_side_goes_on_on_the_side_that_it_is_on(follow):
-    """Rounding hides the sign of its cosine: such rays were within by their medium and outside by their direction."""
-    square = np.array(SQUARE, float) - 0.5
-    for turn in np.radians(np.arange(0, 90, 1.1)):
-        c, s = math.cos(turn), math.sin(turn)
-        figure = polygon(square @ np.array([(c, s), (-s, c)]), 1.25)
-        along = figure.end - figure.start
-        along = np.concatenate([along, -along])
-        paths = follow(figure, np.concatenate([figure.start, figure.end]) - along, along, max_depth=1, n_start=1.0)
-        met = paths.events[:, 0] == REFRACTED
-        side = (figure.end - figure.start)[paths.hits[met, 0]]
-        d = paths.directions[met]
-        assert (side[:, 0] * d[:, 1] - side[:, 1] * d[:, 0] > 0).all()
+# Input ---------------------------------------------------------------------------------------------------------
+
+
+GOOD = {"start": [(0.0, 0.0)], "end": [(1.0, 0.0)], "n_left": [1.5], "n_right": [1.0]}
+TWICE = {"start": [(0, 0), (1, 0)], "end": [(1, 0), (0, 0)], "n_left": [1.5, 1.5], "n_right": [1, 1]}
+BAD_SEGMENTS = [
+    ({"n_left": [0.0]}, "n_left[0] = 0.0; expected more than 0"),
+    ({"n_right": [math.nan]}, "n_right[0] = nan; expected finite"),
+    ({"end": [(1.0, math.inf)]}, "end[0, 1] = inf; expected finite"),
+    ({"end": [(1.0, 0.0), (2.0, 0.0)]}, "end: shape (2, 2); expected (1, 2)"),
+    ({"start": "here"}, "start: expected numbers"),
+    ({"start": [], "end": [], "n_left": [], "n_right": []}, "none; expected at least one"),
+    ({"control": [(0.0, 1.0)]}, "control and weight; expected both or neither"),
+    ({"control": [(0.0, 1.0)], "weight": [-1.0]}, "weight[0] = -1.0; expected more than 0"),
+    (TWICE, "segments 0 and 1 coincide"),
+    (TWICE | {"control": [(0.0, 0.5), (-0.0, 0.5)], "weight": [0.9, 0.9]}, "segments 0 and 1 coincide"),
+]
+BAD_ARGUMENTS = [
+    ({"max_depth": 0}, "max_depth = 0; expected a whole number, 1 or more"),
+    ({"max_depth": 2.5}, "max_depth = 2.5; expected"),
+    ({"max_depth": True}, "max_depth = True; expected a whole number, 1 or more"),
+    ({"max_depth": 2**32}, "1 rays, max_depth = 4294967296; expected a product below 2³²"),
+    ({"origins": [(0.0, math.nan)]}, "origins[0, 1] = nan; expected finite"),
+    ({"origins": [(0.0, 1e101)]}, "origins: a number beyond ±1e+100"),
+    ({"directions": [(0.0, 0.0)]}, "directions[0] = (0, 0); expected a direction"),
+    ({"directions": [(0.0, 1.0)] * 2}, "directions: shape (2, 2); expected (1, 2)"),
+    ({"formula": "sellmeier"}, "formula = 'sellmeier': unknown; expected wedge"),
+    ({"precision": "float16"}, "precision = 'float16'; expected float32, float64"),
+    ({"backend": "metal"}, "backend = 'metal'; expected scalar, llvm, cuda"),
+    *(({"reflect": bad}, "reflect; expected a whole number, 0 or more and below 2³²") for bad in (-1, 0.5, 2**32)),
+    *(({"n_start": bad}, "n_start; expected a number above 0") for bad in (math.inf, math.nan, "air", 0)),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), BAD_SEGMENTS + BAD_ARGUMENTS)
+def test_bad_input_is_named_in_one_line(change, message):
+    arguments = {"origins": [(0.5, 1.0)], "directions": [(0.0, -1.0)], "max_depth": 2}
+    names = GOOD.keys() | {"control", "weight"}
+    with pytest.raises(ValueError) as error:
+        segments = Segments(**GOOD | {key: x for key, x in change.items() if key in names})
+        trace(segments, **arguments | {key: x for key, x in change.items() if key not in names})
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_arcs_may_share_their_ends():
+    for control, weight in (([(0.5, 0.5), (0.5, -0.5)], [0.9, 0.9]), ([(0.5, 0.5)] * 2, [0.8, 0.9])):
+        assert len(Segments(**TWICE, control=control, weight=weight)) == 2
+
+
+def test_float32_has_a_range_of_its_own(needs_variant):
+    needs_variant("llvm_ad_rgb")
+    with pytest.raises(ValueError, match=r"origins: a number beyond ±1e\+15"):
+        trace(Segments(**GOOD), [(0.0, -1e16)], [(0.0, 1.0)], 2, precision="float32", backend="llvm")
+
+
+@pytest.mark.parametrize(("asked", "llvm"), [("scalar", True), ("scalar", False), (None, False)])
+def test_scalar_arrays_refuse_float32_because_they_compute_in_double(monkeypatch, asked, llvm):
+    """Asked for by name, or chosen because LLVM cannot run here."""
+    usable = {"scalar": True, "llvm": llvm, "cuda": False}
+    monkeypatch.setattr(array_backend, "detect", lambda: {name: Backend(name, u, "why") for name, u in usable.items()})
+    with pytest.raises(ValueError) as error:
+        trace(UNIT, [(0, 0)], [(0, 1)], 1, backend=asked, precision="float32")
+    message = "precision = 'float32': scalar arrays compute in double; expected float64, or a compiled backend (llvm, "
+    assert str(error.value) == f"{message}cuda){'' if llvm else '; llvm cannot run here: why'}"
+
+
+@pytest.mark.parametrize("length", [1e-300, 1e-30, 1e30, 1e300])
+def test_a_direction_may_have_any_length(follow, length):
+    assert story(follow(UNIT, (-1, 0.5), (length, 0.1 * length))) == story(follow(UNIT, (-1, 0.5), (1, 0.1)))
+
+
+def test_a_scene_may_be_small_or_far_from_0(follow, setting):
+    """Far away float32 has steps of 0.125: differences of coordinates are exact, and only they count."""
+    triangle, origin, size = np.array([(0, 0), (1, 0), (0.25, 1)]), np.array([-1, 0.125]), setting.roundoff**2
+    plain, small, far = (
+        follow(polygon(triangle * scale + x), origin * scale + x, (1, 0.17))
+        for scale, x in ((1, 0.0), (size, 0.0), (1, 2.0**20))
+    )
+    assert story(small) == story(far) == story(plain)
+    assert small.points[0, :3] / size == pytest.approx(plain.points[0, :3], abs=16 * setting.roundoff)
+    assert far.directions == pytest.approx(plain.directions, abs=16 * setting.roundoff)
+
+
+def test_no_rays_are_no_paths(follow):
+    assert follow(UNIT, np.zeros((0, 2)), np.zeros((0, 2)), max_depth=3).points.shape == (0, 4, 2)

@@ -1,7 +1,10 @@
 """Fixtures of tests of the plugins."""
 
+import mitsuba as mi
 import pytest
 from support.variants import switch
+
+from mi_refract.plugins import index_parameter
 
 
 @pytest.fixture
@@ -9,3 +12,12 @@ def llvm_spectral(needs_variant):
     """`llvm_ad_spectral` for the test; skipped where it cannot run."""
     needs_variant("llvm_ad_spectral")
     switch("llvm_ad_spectral")
+
+
+@pytest.fixture
+def logged(monkeypatch):
+    """The texts of Mitsuba's log; no warning has been said before."""
+    texts = []
+    monkeypatch.setattr(index_parameter, "warned", set())
+    monkeypatch.setattr(mi, "Log", lambda level, text: texts.append(text))
+    return texts

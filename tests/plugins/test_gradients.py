@@ -1,5 +1,11 @@
-"""Gradients of images in the parameters of `refract`: of several views, by several integrators, in a frozen step."""
+"""Gradients of images in the parameters of `refract`, and renders within `dr.freeze`.
 
+Gradients of several views, by several integrators, in a frozen step. What is replayed is what is traced anew, also
+after an edit: Dr.Jit must see every array that a BSDF in memory gathers from, of other scenes as well.
+"""
+
+import functools
+import gc
 import subprocess
 import sys
 
@@ -7,20 +13,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.glass_scenes import camera, glass_ball, sky
+from support.glass_scenes import BLACK, PLACE, attached, camera, glass_ball, parameter, sampled, sky, vector
 from support.variants import switch
-
-from mi_refract.plugins import integrator_context
 
 VIEWS = 3
 NUMBER = {"int_ior": 1.5, "specular_transmittance": 0.7, "specular_reflectance": 0.5}
 TEXTURE = {"int_ior": {"type": "checkerboard", "color0": 1.3, "color1": 1.6}}
 DISPERSIVE = {"int_ior": "cauchy(1.5, 4000)"}
-
-
-@pytest.fixture(autouse=True)
-def _said(monkeypatch):
-    monkeypatch.setattr(integrator_context, "warned", set())
 
 
 def load(integrator="refract_path", **glass):
@@ -30,19 +29,14 @@ def load(integrator="refract_path", **glass):
     return mi.load_dict({"type": "scene", "integrator": method, **views, "sky": sky(), "ball": ball})
 
 
-def parameter(params, name):
-    (key,) = [key for key in params.keys() if name in key]  # noqa: SIM118  no dictionary
-    return key
-
-
-def loss(scene, params, view, spp=16, seed=1):
+def loss(scene, params, view=0, spp=16, seed=1):
     image = mi.render(scene, params, sensor=view, spp=spp, seed=seed)
     weights = np.random.default_rng(3).random(image.shape).astype(np.float32)
     return dr.mean(image * mi.TensorXf(weights), axis=None)
 
 
-def numbers(x):
-    return np.array(x, dtype=float).ravel()
+def grad(params, key):
+    return vector(dr.grad(params[key]))[0]
 
 
 # Several views -------------------------------------------------------------------------------------------------------
@@ -80,10 +74,10 @@ def test_every_view_has_its_gradient(variant, integrator, glass, name, forward, 
             image = loss(scene, params, view)
             if forward:
                 dr.set_grad(params[key], 1)
-                found.append(numbers(dr.forward_to(image))[0])
+                found.append(vector(dr.forward_to(image))[0])
             else:
                 dr.backward(image)
-                found.append(numbers(dr.grad(params[key]))[0])
+                found.append(grad(params, key))
             dr.clear_grad(params[key])
         return found
 
@@ -99,7 +93,8 @@ def test_a_scene_that_was_differentiated_leaves_no_damage(needs_variant):
     program = f"""
 import faulthandler, sys
 faulthandler.enable()
-sys.path[:0] = {sys.path!r}
+sys.path[:0] = {[__file__.rpartition("/")[0], *sys.path]!r}
+import mi_refract
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 from test_gradients import *
@@ -110,55 +105,51 @@ for integrator in ("refract_path", "volpath", "path", *["refract_path"] * 6):
     params[parameter(params, "eta")] = 1.4
     params.update()
     dr.eval(mi.render(scene, integrator=moment, spp=4))
-    dr.enable_grad(params[parameter(params, "eta")])
-    params.update()
+    params, (key,) = attached(scene, "eta")
     for view in (0, 1, 2):
         dr.backward(loss(scene, params, view, 4))
         if integrator != "refract_path":  # Mitsuba's own trace rays in the dropped scene where nobody reads this
-            numbers(dr.grad(params[parameter(params, "eta")]))
+            grad(params, key)
     del scene, params
 """
-    command = [sys.executable, "-c", f"import sys; sys.path.insert(0, {__file__.rpartition('/')[0]!r}){program}"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
 
 
 def test_double_precision_survives_what_is_no_edit(llvm_variant):
     """`update` after `enable_grad` says that eta may have changed: what float32 rounds to the same number has not."""
     bsdf = mi.load_dict({"type": "refract", "int_ior": 1.0003 + 3e-8, "ext_ior": 1.0003})
-    si = dr.zeros(mi.SurfaceInteraction3f)
-    si.wi = mi.Vector3f((1 - 1e-8) ** 0.5, 0, 1e-4)
 
     def bent():
-        return numbers(bsdf.sample(mi.BSDFContext(), si, 1.0, [0.5, 0.5])[0].wo)[2]
+        return sampled(bsdf, ((1 - 1e-8) ** 0.5, 0, 1e-4), 1.0).wo[2]
 
-    before, params = bent(), mi.traverse(bsdf)
-    dr.enable_grad(params["eta"])
-    params.update()
+    before = bent()
+    params, (key,) = attached(bsdf, "eta")
     assert bent() == before
-    params["eta"] = mi.Float(params["eta"])
-    params.update()
-    assert bent() == before
-    params["eta"] = 1 + 2**-23
-    params.update()
-    assert bent() != before
+    for value, same in ((mi.Float(params[key]), True), (1 + 2**-23, False)):
+        params[key] = value
+        params.update()
+        assert (bent() == before) == same
 
 
 @pytest.mark.parametrize("matt", [True, False])
-def test_a_moving_edge_in_the_view_of_a_matt_point_is_a_warning(matt, llvm_variant, monkeypatch):
+def test_a_moving_edge_in_the_view_of_a_matt_point_is_a_warning(matt, llvm_variant, logged):
     """Of a lamp that is seen through glass: its derivative is missing, in Mitsuba's integrators as well."""
-    said = []
-    monkeypatch.setattr(mi, "Log", lambda level, text: said.append(text))
-    lamp = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 3]).rotate([0, 1, 0], 180)}
+    lamp = {"type": "rectangle", "to_world": PLACE().translate([0, 0, 3]).rotate([0, 1, 0], 180)}
     floor = {"floor": {"type": "rectangle", "bsdf": {"type": "diffuse"}}} if matt else {}
     scene = glass_ball(12, lamp=lamp | {"emitter": {"type": "area"}}, **floor)
-    params, method = mi.traverse(scene), mi.load_dict({"type": "refract_path", "max_depth": 3})
-    dr.enable_grad(params[parameter(params, ".eta")])
-    params.update()
+    params, (key,) = attached(scene, ".eta")
+    method = mi.load_dict({"type": "refract_path", "max_depth": 3})
     dr.backward(dr.mean(mi.render(scene, params, integrator=method, spp=1), axis=None))
-    assert np.isfinite(numbers(dr.grad(params[parameter(params, ".eta")]))).all()
-    lines = [text for text in said if "derivatives leave out edges of area lights that move" in text]
-    assert len(lines) == matt
+    assert np.isfinite(grad(params, key))
+    assert sum("derivatives leave out edges of area lights that move" in text for text in logged) == matt
+
+
+def test_an_image_without_chance_is_not_differentiated(llvm_variant):
+    scene, method = glass_ball(sky=sky()), mi.load_dict({"type": "refract_path", "deterministic": True})
+    params, _ = attached(scene, ".eta")
+    with pytest.raises(ValueError, match="such a render cannot be differentiated"):
+        dr.backward(dr.mean(mi.render(scene, params, integrator=method, spp=4), axis=None))
 
 
 # What prb and its kin can give ---------------------------------------------------------------------------------------
@@ -166,59 +157,53 @@ def test_a_moving_edge_in_the_view_of_a_matt_point_is_a_warning(matt, llvm_varia
 FIXED = ["prb", "prb_basic", "prb_projective", "prbvolpath"]
 
 
-def derivatives(integrator, names, spp=16):
-    scene = load(integrator, **NUMBER)
-    params = mi.traverse(scene)
-    keys = [parameter(params, name) for name in names]
-    for key in keys:
-        dr.enable_grad(params[key])
-    params.update()
-    dr.backward(loss(scene, params, 0, spp))
-    return [numbers(dr.grad(params[key]))[0] for key in keys]
-
-
 @pytest.mark.parametrize("others", [[], ["specular_transmittance"]], ids=["alone", "with another"])
 @pytest.mark.parametrize("integrator", [*FIXED, "volpath", "path", "refract_path"])
-def test_a_derivative_in_the_index_is_no_number_where_directions_are_fixed(
-    integrator, others, llvm_variant, monkeypatch
-):
-    said = []
-    monkeypatch.setattr(mi, "Log", lambda level, text: said.append(text))
-    (eta, *rest) = derivatives(integrator, ["eta", *others])
-    lines = [text for text in said if "derivative in the index" in text]
+def test_a_derivative_in_the_index_is_no_number_where_directions_are_fixed(integrator, others, llvm_variant, logged):
+    scene = load(integrator, **NUMBER)
+    params, keys = attached(scene, "eta", *others)
+    dr.backward(loss(scene, params))
+    eta, *rest = (grad(params, key) for key in keys)
+    lines = [text for text in logged if "derivative in the index" in text]
     assert np.isfinite(rest).all() and np.all(rest)
-    if integrator in FIXED:
-        assert not np.isfinite(eta)
-        (line,) = lines
-        assert "refract_path or volpath, or path, which is biased" in line and "\n" not in line
-    else:
-        assert np.isfinite(eta) and eta != 0
-        assert not lines
+    assert np.isfinite(eta) == (integrator not in FIXED) and eta != 0
+    assert len(lines) == (integrator in FIXED)
+    assert all("refract_path or volpath, or path, which is biased" in line and "\n" not in line for line in lines)
+
+
+@functools.cache
+def derivatives(integrator, name, first):
+    """Of eight images, one a seed."""
+    scene, found = load(integrator, **NUMBER), []
+    params, (key,) = attached(scene, name)
+    for seed in range(first, first + 8):
+        dr.backward(loss(scene, params, 0, 256, seed))
+        found.append(grad(params, key))
+        dr.clear_grad(params[key])
+    return np.array(found)
 
 
 @pytest.mark.parametrize("integrator", FIXED)
 @pytest.mark.parametrize("name", ["specular_reflectance", "specular_transmittance"])
 def test_tints_have_the_derivatives_of_refract_path(integrator, name, llvm_variant):
     """Of 12² · 256 paths each: t of 8 seeds a side, one false alarm in 10⁴ (14 degrees of freedom: 5.36)."""
-
-    def stack(kind, first):
-        scene = load(kind, **NUMBER)
-        params, found = mi.traverse(scene), []
-        key = parameter(params, name)
-        dr.enable_grad(params[key])
-        for seed in range(first, first + 8):
-            dr.backward(loss(scene, params, 0, 256, seed))
-            found.append(numbers(dr.grad(params[key]))[0])
-            dr.clear_grad(params[key])
-        return np.array(found)
-
-    ours, theirs = stack("refract_path", 100), stack(integrator, 200)
+    ours, theirs = derivatives("refract_path", name, 100), derivatives(integrator, name, 200)
     error = np.sqrt((ours.var(ddof=1) + theirs.var(ddof=1)) / 8)
     assert error < 0.02 * abs(ours.mean())
     assert abs(ours.mean() - theirs.mean()) < 5.36 * error
 
 
-# A frozen step -------------------------------------------------------------------------------------------------------
+# Frozen --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def no_collection():
+    """A scene that the garbage collector finds while Dr.Jit records ends the process, Mitsuba's own as well."""
+    gc.collect()
+    gc.disable()
+    yield
+    gc.enable()
+
 
 STEPS = [
     (NUMBER, {"eta": 1.4}),
@@ -253,9 +238,8 @@ def test_a_step_of_an_optimisation_can_be_frozen(glass, start, integrator, llvm_
         step, trace = dr.freeze(step) if freeze else step, []
         for seed in range(6):
             step(scene, adam, dr.opaque(mi.UInt32, seed))
-            trace.append([numbers(adam[key])[0] for key in adam])
-        if freeze:
-            assert step.n_recordings <= 3
+            trace.append([vector(adam[key])[0] for key in adam])
+        assert not freeze or step.n_recordings <= 3
         return np.array(trace)
 
     frozen, plain = optimise(True), optimise(False)
@@ -278,3 +262,76 @@ def test_an_index_that_is_none_is_no_image_in_a_frozen_step(llvm_variant):
     assert np.isfinite(right).all()
     middle = np.array(image(params, mi.Float(-1.0)))[6, 6]
     assert np.isnan(middle).all() or (middle == 0).all()
+
+
+# A parameter of each, and a value to set.
+GLASSES = {
+    "a number": ({"int_ior": 1.5}, ".eta", 1.3),
+    "a dispersive medium": ({"int_ior": "cauchy(1.5, 4000)"}, "int_ior_A", 1.3),
+    "a texture": (TEXTURE, "int_ior.color0.value", 1.5),
+    "absorption": ({"int_ior": 1.5, "int_absorption": 0.5}, "absorption.value", 2.0),
+    "a colour": ({"int_ior": 1.5, "int_colour": 0.5, "int_colour_distance": 1.0}, "colour.value", 0.9),
+    "a tint": ({"int_ior": 1.5, "specular_transmittance": 0.5}, "transmittance.value", 0.9),
+}
+INTEGRATORS = ("path", "refract_path")
+ABSORBING = ("absorption", "a colour")  # for which `path` refuses
+
+
+def walled(parameters, integrator):
+    tiles = {"type": "checkerboard", "to_uv": PLACE().scale([8, 4, 1])}
+    wall = {"type": "rectangle", "to_world": PLACE().translate([0, 0, -2]).scale(3)}
+    wall |= {"bsdf": {"type": "diffuse", "reflectance": tiles}}
+    glass = {"type": "sphere", "bsdf": {"type": "refract", "ext_ior": 1.0} | parameters}
+    return glass_ball(integrator={"type": integrator, "rr_depth": 100}, sky={"type": "constant"}, wall=wall, ball=glass)
+
+
+def recorded(scene):
+    @dr.freeze
+    def image(params, seed):
+        return mi.render(scene, params, spp=4, seed=seed)
+
+    return image
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("glass", GLASSES)
+def test_a_frozen_render_is_the_traced_one_and_follows_an_edit(glass, integrator, llvm_variant, no_collection):
+    """While the next glass is in memory in another scene; in one of a number, the glass that `path` refuses."""
+    (parameters, name, value), kinds = GLASSES[glass], [*GLASSES]
+    beside = GLASSES[kinds[kinds.index(glass) - 1]][0]
+    if glass in ABSORBING and integrator == "path":
+        beside, (parameters, name, value) = parameters, GLASSES["a number"]
+    scene, other = walled(parameters, integrator), walled(beside, "refract_path")
+    params, image, before = mi.traverse(scene), recorded(scene), None
+    key = parameter(params, name)
+    for seed in range(4):
+        if seed == 2:
+            params[key] = type(params[key])(value)
+            params.update()
+        replayed = np.array(image(params, dr.opaque(mi.UInt32, seed)))
+        traced = np.array(mi.render(scene, spp=4, seed=mi.UInt32(seed)))
+        assert replayed == pytest.approx(traced, abs=1e-5), seed
+        assert seed != 2 or np.abs(replayed - before).max() > 0.05
+        before = replayed
+    assert image.n_recordings <= 3  # the third knows what varies, and the integrator what the scene needs
+    del other
+
+
+@pytest.mark.parametrize("split_depth", [0, 2])
+def test_a_frozen_render_follows_the_index_and_a_lamp_that_turns_grey(split_depth, llvm_variant, no_collection):
+    """What is recorded must hold for any value: a lamp's black surface counts as one that may reflect."""
+    lamp = {"type": "rectangle", "to_world": PLACE().translate([0, 0, -2]).scale(9)}
+    method = {"type": "refract_path", "max_depth": 5, "rr_depth": 100, "split_depth": split_depth}
+    scene = glass_ball(integrator=method, sky=sky(), lamp=lamp | {"emitter": {"type": "area"}, "bsdf": BLACK})
+    params, before, image = mi.traverse(scene), None, recorded(scene)
+    for name, value in ((".eta", 1.5), (".eta", 1.3), ("reflectance.value", 0.8), (".eta", 1.7)):
+        key = parameter(params, name)
+        params[key] = type(params[key])(value)
+        params.update()
+        mean = np.mean([np.array(image(params, dr.opaque(mi.UInt32, seed))).mean() for seed in range(4)])
+        # Without the recording a black lamp needs no emitter sample: other numbers, the same mean.
+        traced = [np.array(mi.render(scene, spp=4, seed=seed)).mean() for seed in range(4)]
+        assert mean == pytest.approx(np.mean(traced), rel=0.01)
+        assert before is None or abs(mean / before - 1) > 0.002
+        before = mean
+    assert image.n_recordings <= 2

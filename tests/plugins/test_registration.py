@@ -1,49 +1,66 @@
-"""`import mi_refract` in any order with `set_variant`, and what it costs. Each case is a fresh interpreter."""
+"""`import mi_refract` in any order with `set_variant`, what it costs, and the examples of the README as printed.
 
-import os
+Each case of the import is a fresh interpreter.
+"""
+
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+from support.readme import python_blocks
 
-from mi_refract import backend
+from mi_refract import backend, plugins
 
+ROOT = Path(__file__).parents[2]
 LOAD = "mi.load_dict({'type': 'refract'})"
+SET = "mi.set_variant('scalar_rgb')"
 XML = '<scene version="3.0.0"><shape type="sphere"><bsdf type="refract"/></shape></scene>'
-CASES = {
-    "before any variant": f"import mitsuba as mi; import mi_refract; mi.set_variant('scalar_rgb'); {LOAD}",
-    "before mitsuba": f"import mi_refract; import mitsuba as mi; mi.set_variant('scalar_rgb'); {LOAD}",
+HEAVY = ("numpy", "OpenImageIO", "flint", "matplotlib", "scipy", "rich", "typer", "jinja2")
+LOADED = "[name in sys.modules for name in ('drjit', 'mitsuba')]"
+CASES = {  # code, and what it prints, or has in its error
+    "before any variant": (f"import mitsuba as mi; import mi_refract; {SET}; {LOAD}", ""),
+    "before mitsuba": (f"import mi_refract; import mitsuba as mi; {SET}; {LOAD}", ""),
     "after a search for mitsuba": (
         "import mi_refract, importlib.util as u; assert u.find_spec('mitsuba') and u.find_spec('mitsuba.detail');"
-        f"import mitsuba as mi; mi.set_variant('scalar_rgb'); {LOAD}"
+        f"import mitsuba as mi; {SET}; {LOAD}",
+        "",
     ),
-    "from a part of mitsuba": f"import mi_refract, mitsuba.detail; mi = mitsuba; mi.set_variant('scalar_rgb'); {LOAD}",
+    "from a part of mitsuba": (f"import mi_refract, mitsuba.detail; mi = mitsuba; {SET}; {LOAD}", ""),
     "after a variant, between variants and twice": (
-        f"import mitsuba as mi; mi.set_variant('scalar_rgb'); import mi_refract, importlib; {LOAD};"
-        f"mi.set_variant('scalar_spectral'); {LOAD}; mi.set_variant('scalar_rgb'); {LOAD};"
-        f"importlib.reload(mi_refract); {LOAD}"
+        f"import mitsuba as mi; {SET}; import mi_refract, importlib; {LOAD};"
+        f"mi.set_variant('scalar_spectral'); {LOAD}; {SET}; {LOAD}; importlib.reload(mi_refract); {LOAD}",
+        "",
     ),
     "parsed from XML, where Mitsuba asks scalar_rgb": (
         "import mitsuba as mi; mi.set_variant('scalar_spectral'); import mi_refract;"
         f"config, xml = mi.parser.ParserConfig('scalar_spectral'), {XML!r};"
-        "mi.parser.write_string(mi.parser.parse_string(config, xml)); mi.load_string(xml)"
+        "mi.parser.write_string(mi.parser.parse_string(config, xml)); mi.load_string(xml)",
+        "",
+    ),
+    "not at all": (f"import mitsuba as mi; {SET}; {LOAD}", "Error"),
+    "a name that is not there": ("import mi_refract; mi_refract.refelct", "'mi_refract' has no attribute 'refelct'"),
+    "no heavy package": (f"import mitsuba, mi_refract, sys; print([m for m in {HEAVY!r} if m in sys.modules])", "[]"),
+    "mitsuba and Dr.Jit when they are needed": (
+        f"import mi_refract, sys; print({LOADED}, mi_refract.reflect.__name__, {LOADED})",
+        "[False, False] reflect [True, False]",
     ),
 }
 
 
 def run(code):
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=os.environ, timeout=120)
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_plugin_is_known(case):
-    outcome = run(CASES[case])
-    assert outcome.returncode == 0, outcome.stderr
-
-
-def test_without_the_import_the_plugin_is_unknown():
-    outcome = run(f"import mitsuba as mi; mi.set_variant('scalar_rgb'); {LOAD}")
-    assert outcome.returncode == 1
+def test_the_plugin_is_known_after_the_import(case):
+    code, text = CASES[case]
+    outcome = run(code)
+    if fails := case.startswith(("not", "a name")):
+        assert text in outcome.stderr
+    else:
+        assert outcome.stdout.strip() == text
+    assert (outcome.returncode != 0) == fails, outcome.stderr
 
 
 def test_switching_to_a_vectorised_variant_and_back():
@@ -51,23 +68,33 @@ def test_switching_to_a_vectorised_variant_and_back():
     if not usable:
         pytest.skip("no LLVM or CUDA variant runs here")
     steps = [usable[0], "scalar_rgb", usable[-1], usable[0]]
-    code = "import mitsuba as mi, mi_refract;" + "".join(f"mi.set_variant('{name}'); {LOAD};" for name in steps)
-    outcome = run(code)
+    outcome = run("import mitsuba as mi, mi_refract;" + "".join(f"mi.set_variant('{x}'); {LOAD};" for x in steps))
     assert outcome.returncode == 0, outcome.stderr
 
 
-def test_the_import_brings_no_heavy_package():
-    heavy = ("numpy", "OpenImageIO", "flint", "matplotlib", "scipy", "rich", "typer", "jinja2")
-    outcome = run(f"import mitsuba, mi_refract, sys; print([m for m in {heavy!r} if m in sys.modules])")
-    assert outcome.stdout.strip() == "[]", outcome.stderr
+def example(number, **changes):
+    code = python_blocks(Path(plugins.__file__).with_name("README.md"))[number]
+    for old, new in changes.values():
+        assert old in code
+        code = code.replace(old, new)
+    names = {}
+    exec(code, names)
+    return names
 
 
-def test_the_import_waits_for_mitsuba_and_its_formulas_for_dr_jit():
-    loaded = "[name in sys.modules for name in ('drjit', 'mitsuba')]"
-    outcome = run(f"import mi_refract, sys; print({loaded}, mi_refract.reflect.__name__, {loaded})")
-    assert outcome.stdout.strip() == "[False, False] reflect [True, False]", outcome.stderr
+def test_the_readme_in_a_scene(tmp_path, monkeypatch, llvm_variant):
+    monkeypatch.chdir(ROOT)
+    example(
+        0,
+        output=('"diamond.png"', f'r"{tmp_path}/diamond.png"'),
+        size=('bsdf="refract"', 'bsdf="refract", res=8, spp=1'),
+        wait=("mi.render(scene)", "mi.render(scene), write_async=False"),
+    )
+    assert (tmp_path / "diamond.png").stat().st_size > 0
 
 
-def test_an_attribute_that_is_not_there():
-    outcome = run("import mi_refract; mi_refract.refelct")
-    assert "module 'mi_refract' has no attribute 'refelct'" in outcome.stderr
+def test_the_readme_recovers_an_index_from_an_image(capsys, llvm_variant):
+    names = example(1, pixels=('"width": 64, "height": 64', '"width": 24, "height": 24'), steps=("60", "50"))
+    (eta,) = names["adam"]["ball.bsdf.eta"]
+    assert eta == pytest.approx(1.6, abs=0.05)
+    assert capsys.readouterr().out.startswith("[1.")

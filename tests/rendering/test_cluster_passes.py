@@ -14,7 +14,7 @@ from support.processes import python
 
 from mi_refract.cluster import workers as workers_module
 from mi_refract.cluster.connection import connected
-from mi_refract.cluster.worker_facts import facts
+from mi_refract.cluster.on_worker import facts
 from mi_refract.rendering import cluster_passes, scene_bundle
 from mi_refract.rendering.cluster_passes import ClusterPasses, Part
 from mi_refract.rendering.end_conditions import Limits

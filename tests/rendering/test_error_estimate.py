@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from mi_refract.rendering import error_estimate
-from mi_refract.rendering.error_estimate import RelativeError, relative_error, worst_tile
+from mi_refract.rendering import end_conditions
+from mi_refract.rendering.end_conditions import RelativeError, relative_error, worst_tile
 from mi_refract.rendering.pass_plan import next_stop
 from mi_refract.rendering.pass_sums import PassSums, PassTree
 
@@ -158,6 +158,6 @@ def test_without_scipy_there_is_no_interval(monkeypatch):
     monkeypatch.setitem(sys.modules, "scipy.stats", None)
     found = relative_error(sums_of("normal", np.ones(SIZE), 9))
     assert found.value > 0 and math.isnan(found.high)
-    monkeypatch.setattr(error_estimate.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(end_conditions.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"pip install 'mi-refract\[diff\]'"):
-        error_estimate.require_interval()
+        end_conditions.require_interval()

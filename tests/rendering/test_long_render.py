@@ -16,9 +16,9 @@ from support.processes import python
 from support.readme import python_blocks
 from support.renders import BALL, SCENES, SMALL, pixels, rendering
 
-from mi_refract.cluster import worker_facts
+from mi_refract.cluster import on_worker
+from mi_refract.image_diff.comparison import Verdict
 from mi_refract.image_diff.methods import compare
-from mi_refract.image_diff.results import Verdict
 from mi_refract.io.image_file import read, read_exr
 from mi_refract.rendering import checkpoint, long_render, rendered_file
 from mi_refract.rendering.end_conditions import Limits
@@ -325,7 +325,7 @@ def test_a_changed_scene_variant_or_version_is_refused_by_name(tmp_path, llvm, m
     changed(tmp_path)
     for place, name, value, message in (
         (long_render, "installed_version", "0", r"version of mitsuba was \S+, is 0"),
-        (worker_facts, "vector_width", "64", r"vector width was \d+, is 64"),
+        (on_worker, "vector_width", "64", r"vector width was \d+, is 64"),
     ):
         with monkeypatch.context() as patch:
             patch.setattr(place, name, lambda *_, value=value: value)

@@ -13,7 +13,6 @@ ABSORBING = """<scene version="3.0.0"><default name="integrator" value="path"/><
 <shape type="sphere"><bsdf type="refract">PARAMETER</bsdf></shape></scene>"""
 FILM = "a film of 8193 × 8193 pixels; expected up to 67108864"
 ABSORPTION = "refract: int_absorption; expected the integrator refract_path, or no absorption"
-PAIR = "int_ior = '400:1.5'; expected a number, or "
 
 pytestmark = pytest.mark.usefixtures("scalar_variant")
 
@@ -31,7 +30,6 @@ def test_the_formulas_of_a_scene(bsdf, formulas):
         ("", {"res": "8193"}, FILM),
         ('<float name="int_absorption" value="0.5"/>', {}, ABSORPTION),
         ('<float name="int_absorption" value="0.5"/>', {"integrator": "refract_path"}, ""),
-        ('<spectrum name="int_ior" value="$pairs"/>', {"pairs": "400:1.5"}, PAIR),
     ],
 )
 def test_what_is_refused_is_named(tmp_path, parameter, defines, message):

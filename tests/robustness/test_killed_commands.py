@@ -26,7 +26,7 @@ import pytest
 from hypothesis import settings
 from support.processes import ENVIRONMENT, ROOT
 
-from mi_refract.io import exit_code, image_file
+from mi_refract.io import errors, image_file
 
 HANG = 60  # seconds
 SIGNALS = (signal.SIGINT, signal.SIGKILL, signal.SIGINT, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
@@ -42,7 +42,7 @@ import sys, time
 from pathlib import Path
 from types import SimpleNamespace
 import numpy as np
-from mi_refract.io import exit_code, image_file, lock
+from mi_refract.io import errors, image_file, atomic
 from mi_refract.report import run_report
 from mi_refract.report.row import Row
 from validation import runner
@@ -59,14 +59,14 @@ def measured(i):
     return [Row("a study", f"row {i}", "", "", {"x": float(i)})]
 
 def body():
-    with lock.held(folder / "validation.lock", "a validation"):
+    with atomic.held(folder / "validation.lock", "a validation"):
         rows, _ = runner.run([Task(f"task {i}", lambda i=i: measured(i)) for i in range(6)], context)
         run_report.write_json(folder / "rows.json", rows, {})
         run_report.write_junit(folder / "junit.xml", rows, {})
         run_report.write_html(folder / "report.html", rows, {}, folder)
         runner.forget(context)
 
-sys.exit(exit_code.exit_code("validation", body))
+sys.exit(errors.exit_code("validation", body))
 """
 
 
@@ -178,7 +178,7 @@ def test_a_killed_command_leaves_whole_files_and_ends_well_when_started_again(na
         if i % 2:
             code, said = ended(command, new, size=rng.choice((0, 100, 1000, rng.randrange(60_000))))
             lines = [line for line in said.splitlines() if not line.startswith("validation: task ")]  # the progress
-            assert code == command.code or (code == exit_code.MISUSE and len(lines) == 1), said
+            assert code == command.code or (code == errors.MISUSE and len(lines) == 1), said
         else:
             number, moment = SIGNALS[i // 2 % len(SIGNALS)], rng.uniform(0, took)
             assert ends_well(command, new, moment, number), (number, moment)

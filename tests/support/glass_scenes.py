@@ -1,5 +1,8 @@
-"""Small scenes of glass, their renders, and what tests say of these."""
+"""Small scenes of glass, their renders, samples of a boundary, and what tests say of these."""
 
+from types import SimpleNamespace
+
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ GLASS = {"type": "refract", "int_ior": 1.5, "ext_ior": 1.0}
 BLACK = {"type": "diffuse", "reflectance": 0.0}
 AROUND, DOWN = 0.6 + 0.4 * np.sin(np.arange(64) * 2 * np.pi / 64 + 0.3), np.linspace(0, 0.7, 32)
 SKY = (AROUND[None, :, None] + DOWN[:, None, None]).astype(np.float32) * np.ones(3, np.float32)
+PLACE = mi.ScalarTransform4f
 
 
 def sky():
@@ -19,7 +23,7 @@ def sky():
 def camera(size=24, fov=30, origin=(0, 0, 5), target=(0, 0, 0), kind="perspective", **film):
     """Independent pixels."""
     film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}} | film
-    place = mi.ScalarTransform4f().look_at([*origin], [*target], [0, 1, 0])
+    place = PLACE().look_at([*origin], [*target], [0, 1, 0])
     lens = {"fov": fov} if kind == "perspective" else {}
     return {"type": kind, "to_world": place, "film": film, "sampler": {"type": "independent"}} | lens
 
@@ -54,6 +58,43 @@ def refusal(call, *arguments, **parameters):
 
 
 def parameter(params, name):
-    """The key that ends so."""
-    (key,) = [key for key in [*params.keys()] if key.endswith(name)]
+    """The key that has this in it."""
+    (key,) = [key for key in [*params.keys()] if name in key]
     return key
+
+
+def attached(node, *names):
+    """The parameters of a scene or a plugin, and the keys of those with these names, which are differentiated."""
+    params = mi.traverse(node)
+    keys = [parameter(params, name) for name in names]
+    for key in keys:
+        dr.enable_grad(params[key])
+    params.update()
+    return params, keys
+
+
+# A boundary as a BSDF -------------------------------------------------------------------------------------------------
+
+
+def vector(x):
+    """The numbers of a Dr.Jit array or of a number."""
+    return np.array(x, dtype=float).ravel()
+
+
+def surface(wi=(0, 0, 1), wavelengths=(450.0, 700.0, 550.0, 600.0), u=0.5):
+    """A point of a surface; no literals, so that one kernel serves every direction."""
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi, si.uv = mi.Vector3f(*map(float, wi)), mi.Point2f(u, 0.5)
+    dr.make_opaque(si.wi)
+    if mi.is_spectral:
+        si.wavelengths = type(si.wavelengths)(*wavelengths)
+    return si
+
+
+def sampled(bsdf, wi, sample1, context=None, sample2=(0.5, 0.5), **where):
+    """A sample, its numbers as numpy has them; `weight` without polarisation, `mueller` with it. Else as `surface`."""
+    number = dr.opaque(mi.Float, sample1)
+    bs, weight = bsdf.sample(context or mi.BSDFContext(), surface(wi, **where), number, [*sample2])
+    found = {"wo": vector(bs.wo), "weight": vector(mi.unpolarized_spectrum(weight)), "mueller": np.array(weight)}
+    scalars = {"pdf": bs.pdf, "eta": bs.eta, "component": bs.sampled_component, "type": bs.sampled_type}
+    return SimpleNamespace(**found, **{name: vector(x)[0] for name, x in scalars.items()})

@@ -132,7 +132,6 @@ OTHERWISE = {
     "diff.planted_defects": "trials with seeds of their own",
     "diff.times": "times",
     "suite.rendered_images": "several seeds a side",
-    "media.hero_wavelength": "times and variances; no figure has a bound",
     "media.renders": "sixteen seeds a side in the furnace, eight by Welch's test; the rest is times and closed forms",
     "robustness.code_mutants": "each mutant is a case of its own, and the study is longer in full",
     "ground_truth.traced_bodies": "bodies are fixed; the rainbow's seeds are its sample",

@@ -1,210 +1,229 @@
-"""Glasses by other ray tracers: another index is no other direction, and each known difference has its cause."""
+"""Glasses and an achromat by other ray tracers: another index is no other direction or trace, and the reverse."""
 
 import dataclasses
-from types import SimpleNamespace
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from support.media_rays import answered
 
 from mi_refract import media
+from validation.media.closed_forms import back_focal_distance
+from validation.reference.exact_lens import crossing
+from validation.run.context import PROFILES, Context
 from validation.run.metrics import ERROR_OVER_BOUND
-from validation.suite import glasses
+from validation.suite import glasses, lenses
 from validation.suite.renderers import SYSTEMS, System, environments
 from validation.suite.renderers.glass_catalogues import CATALOGUES, GLASSES, GlassCatalogue, OtherIndex
 from validation.suite.renderers.system import SCRIPTS
 
-pytest.importorskip("opticalglass")
-STANDARD, FULL = (SimpleNamespace(profile=SimpleNamespace(name=name)) for name in ("standard", "full"))
+QUICK, FULL = (Context(PROFILES[name], Path(), "llvm_ad_rgb", {}, {}) for name in ("quick", "full"))
 SOME = ("SCHOTT:N-BK7", "SCHOTT:F2", "SUMITA:K-BK7")
-G = media.LINES["g"]
 
 
-def catalogue(others=(), script="", told="zero"):
-    return GlassCatalogue(script, SOME, told, dict(others))
+@pytest.fixture
+def rays():
+    pytest.importorskip("opticalglass")
+    return glasses.given(SOME)
 
 
-def rows(ratio=None, change=None, others=(), told="zero", **more):
-    rays = glasses.given(SOME)
-    answers = answered(rays, ratio, **more)
-    return glasses.rows("A", catalogue(others, told=told), rays, change(answers) if change else answers)
+def of_f2(rays):
+    """The rays that pass through F2."""
+    pairs = glasses.header.columns(rays.header, rays.ids)[:, 1].astype(int)
+    return np.array(["SCHOTT:F2" in pair for pair in rays.header["media"]])[pairs]
 
 
-def of(glass):
-    """The rays that pass through a glass."""
-    rays = glasses.given(SOME)
-    pairs = glasses.media_rays.columns(rays.header, rays.ids)[:, 1]
-    names = np.array(["".join(pair).replace("air", "") for pair in rays.header["media"]])
-    return names[pairs.astype(int)] == glass
+def broken(rows):
+    return {row.case: set(row.broken) for row in rows if row.broken}
 
 
-def scaled(glass, factor):
-    k = glasses.given(SOME).rays.k.copy()
-    k[of(glass)] *= factor
-    return k
+def judged(rays, answers, others=(), tir="zero"):
+    return glasses.rows("A", GlassCatalogue("", SOME, tir, dict(others)), rays, answers)
 
 
-def failing(found):
-    return {row.case: set(row.broken) for row in found if row.verdict == "fail"}
-
-
-def test_every_catalogue_is_of_a_system_with_a_script():
-    assert set(CATALOGUES) <= set(SYSTEMS)
-    for found in CATALOGUES.values():
-        assert (SCRIPTS / found.script).is_file()
-        assert set(found.others) <= set(found.glasses) <= set(GLASSES)
-
-
-def test_right_answers_pass():
-    found = rows()
-    assert [row.case for row in found] == [*glasses.REGIMES, *SOME]
-    assert {row.verdict for row in found} == {"pass"}
-
-
-def test_another_index_is_no_other_direction():
-    """Of Schott's F2 by 1e-12, which no direction in doubt would show."""
-    assert failing(rows(scaled("SCHOTT:F2", 1 + 1e-12))) == {"SCHOTT:F2": {glasses.INDEX_OFF}}
-
-
-def test_another_direction_is_no_other_index():
-    found = failing(rows(direction=1 / glasses.given(SOME).rays.k))
-    assert set(found) == set(glasses.REGIMES) and all("wrong" in broken for broken in found.values())
-    off = glasses.given(SOME).rays.k * (1 + 1e-12)
-    assert failing(rows(direction=off))["generic"] == {"wrong", ERROR_OVER_BOUND}
+def test_indices_and_directions_are_told_apart(rays):
+    """F2 is off by 1e-12, which no direction in doubt would show; a direction for another index has no other index."""
+    k, f2 = rays.rays.k, of_f2(rays)
+    right = judged(rays, answered(rays))
+    assert [(row.case, row.verdict) for row in right] == [(case, "pass") for case in (*glasses.REGIMES, *SOME)]
+    assert broken(judged(rays, answered(rays, np.where(f2, k * (1 + 1e-12), k)))) == {"SCHOTT:F2": {glasses.INDEX_OFF}}
+    inverted = broken(judged(rays, answered(rays, direction=1 / k)))
+    assert set(inverted) == set(glasses.REGIMES) and all("wrong" in x for x in inverted.values())
+    off = broken(judged(rays, answered(rays, direction=k * (1 + 1e-12))))
+    assert off["generic"] == {"wrong", ERROR_OVER_BOUND} and not set(SOME) & set(off)
+    assert broken(judged(rays, answered(rays), tir="nan")) == {"critical": {"other TIR signal"}}
+    given = answered(rays)
+    without = dataclasses.replace(given, ids=given.ids[~f2], b=given.b[~f2], n_ratio=given.n_ratio[~f2])
+    lost = broken(judged(rays, without))
+    assert lost.pop("SCHOTT:F2") == {glasses.INDEX_OFF}
+    assert set(lost) == set(glasses.REGIMES) and all("unfit" in x for x in lost.values())
 
 
 @pytest.mark.parametrize(("off", "fails"), [(1e-4, False), (1.05e-4, True), (0.9e-4, True), (0.0, True)])
-def test_a_known_difference_is_a_missed_goal_as_long_as_it_is_what_it_was(off, fails):
-    others = {"SCHOTT:F2": OtherIndex(1.00e-4, "another edition")}
-    (row,) = [row for row in rows(scaled("SCHOTT:F2", 1 + off), others=others) if row.case == "SCHOTT:F2"]
-    assert (row.verdict == "fail") == fails
-    assert row.reason.endswith("another edition")
-    if off:
-        assert row.missed == {glasses.INDEX_OFF: glasses.media_rays.SAME}
+def test_a_known_difference_is_a_missed_goal_as_long_as_it_is_what_it_was(off, fails, rays):
+    k = rays.rays.k
+    answers = answered(rays, np.where(of_f2(rays), k * (1 + off), k))
+    rows = judged(rays, answers, {"SCHOTT:F2": OtherIndex(1.00e-4, "another edition")})
+    (row,) = (row for row in rows if row.case == "SCHOTT:F2")
+    assert (row.verdict == "fail") == fails and row.reason.endswith("another edition")
+    assert row.missed == ({glasses.INDEX_OFF: glasses.header.SAME} if off else {})
 
-
-def test_a_glass_that_is_not_answered_fails():
-    def without(answers):
-        kept = ~of("SCHOTT:F2")
-        return dataclasses.replace(answers, ids=answers.ids[kept], b=answers.b[kept], n_ratio=answers.n_ratio[kept])
-
-    found = failing(rows(change=without))
-    assert found.pop("SCHOTT:F2") == {glasses.INDEX_OFF}
-    assert set(found) == set(glasses.REGIMES) and all("unfit" in broken for broken in found.values())
-
-
-def test_another_signal_of_total_reflection_is_seen():
-    assert failing(rows(told="nan")) == {"critical": {"other TIR signal"}}
-
-
-# In a process ----------------------------------------------------------------------------------------------------
 
 PROGRAM = f"""
 import sys
 sys.path.insert(0, {str(SCRIPTS)!r})
 import numpy as np, table
-rays = table.Rays("float64", lambda maker, name, w: {{index}})
+rays = table.Rays("float64", lambda maker, name, w: 1.5)
 k, a, n = rays.k[:, None], rays.a, rays.n
 c = (a * n).sum(1, keepdims=True)
 d = 1 - k * k * (1 - c * c)
-b = np.where(d < 0, 0, k * a - (k * c + np.sqrt(np.abs(d))) * n)
-{{write}}
+table.write(rays, np.where(d < 0, 0, k * a - (k * c + np.sqrt(np.abs(d))) * n), "a program 1.0")
 """
 
 
-def of_program(tmp_path, index="1.5", write="table.write(rays, b, 'a program 1.0')"):
-    path = tmp_path / "program.py"
-    path.write_text(PROGRAM.format(index=index, write=write))
-    return glasses.system_rows(System("a", "A", "none", None, 0, small=True), catalogue(script=str(path)), STANDARD)
-
-
-def test_a_program_is_judged_for_its_own_index(tmp_path):
+def test_a_program_is_judged_for_its_own_index_and_a_broken_one_fails(tmp_path, monkeypatch):
     """Every glass has n = 1.5: all directions are right, and no index is."""
-    found = of_program(tmp_path)
-    assert all(row.reason.startswith("a program 1.0") for row in found)
-    assert set(failing(found)) == set(SOME)
-    (f2,) = [row for row in found if row.case == "SCHOTT:F2"]
-    assert f2.values[glasses.INDEX_OFF] == pytest.approx(media.index("SCHOTT:F2", G) / 1.5 - 1, rel=1e-6)
-    assert f2.replay["wavelength"] == G
+    pytest.importorskip("opticalglass")
 
+    def rows_of(text):
+        (tmp_path / "program.py").write_text(text)
+        return glasses.system_rows(System("a", "A"), GlassCatalogue(str(tmp_path / "program.py"), SOME, "zero"), QUICK)
 
-@pytest.mark.parametrize(
-    ("defect", "said"),
-    [
-        ({"index": "1 / 0"}, "division by zero"),
-        ({"write": "rays.between_glasses = False; table.write(rays, b, 'a program')"}, "no column n_ratio"),
-        ({"write": "print('refracting …')"}, "A: "),
-        ({"write": "import os; os.kill(os.getpid(), 9)"}, "SIGKILL"),
-    ],
-)
-def test_a_broken_program_fails_for_its_reason(defect, said, tmp_path):
-    (row,) = of_program(tmp_path, **defect)
-    assert row.verdict == "fail" and said in row.reason and "\n" not in row.reason
-
-
-def test_what_is_absent_or_large_is_not_run(tmp_path, monkeypatch):
-    system = SYSTEMS["optiland"]
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    (row,) = glasses.system_rows(system, CATALOGUES[system.name], FULL)
-    assert (row.verdict, row.reason) == ("not run", "python -m validation renderers --install optiland")
-    monkeypatch.setattr(environments, "absent", lambda system: "")
-    (row,) = glasses.system_rows(system, CATALOGUES[system.name], STANDARD)
-    assert row.verdict == "not run" and "full profile" in row.reason
-    (row,) = of_program(tmp_path, write="print('no glass', file=sys.stderr); sys.exit(77)")
-    assert (row.verdict, row.reason) == ("not run", "cannot run here: no glass")
-
-
-def test_without_catalogues_here_the_row_is_not_run(monkeypatch):
+    rows = rows_of(PROGRAM)
+    assert all(row.reason.startswith("a program 1.0") for row in rows) and set(broken(rows)) == set(SOME)
+    (f2,) = (row for row in rows if row.case == "SCHOTT:F2")
+    assert f2.values[glasses.INDEX_OFF] == pytest.approx(media.index("SCHOTT:F2", media.LINES["g"]) / 1.5 - 1, rel=1e-6)
+    for text, verdict, said in (
+        (PROGRAM.replace("1.5)", "1 / 0)"), "fail", "division by zero"),
+        (PROGRAM.replace("table.w", "rays.between_glasses = False; table.w"), "fail", "no column n_ratio"),
+        ("import sys; sys.exit(77)", "not run", "cannot run here: "),
+    ):
+        (row,) = rows_of(text)
+        assert row.verdict == verdict and said in row.reason and "\n" not in row.reason
     monkeypatch.setattr(glasses, "find_spec", lambda name: None)
-    (row,) = glasses.system_rows(SYSTEMS["rayoptics"], CATALOGUES["rayoptics"], FULL)
-    assert row.verdict == "not run" and "pip install" in row.reason
+    assert "pip install" in rows_of(PROGRAM)[0].reason
 
 
 @pytest.mark.parametrize("name", CATALOGUES)
 def test_systems_that_are_installed_answer_for_their_indices(name):
-    system = SYSTEMS[name]
-    if reason := environments.absent(system):
+    catalogue = CATALOGUES[name]
+    assert (SCRIPTS / catalogue.script).is_file() and set(catalogue.others) <= set(catalogue.glasses) <= set(GLASSES)
+    if reason := environments.absent(SYSTEMS[name]):
         pytest.skip(reason)
-    found = glasses.system_rows(system, CATALOGUES[system.name], FULL)
-    assert len(found) > len(glasses.REGIMES) and {row.verdict for row in found} == {"pass"}
-    assert {row.case for row in found if row.missed} <= set(CATALOGUES[name].others)
+    pytest.importorskip("opticalglass")
+    rows = glasses.system_rows(SYSTEMS[name], catalogue, FULL)
+    assert len(rows) > len(glasses.REGIMES) and {row.verdict for row in rows} == {"pass"}
+    assert {row.case for row in rows if row.missed} <= set(catalogue.others)
 
 
-# Why catalogues differ: the coefficients that another catalogue has -----------------------------------------------
-
-# CDGM has published two formulas: Sellmeier's, in the catalogue for Zemax of 2022, and a power series in its
-# spreadsheet. Sumita has changed two glasses since its catalogue of 2017, whose coefficients are those of λ⁰, λ², λ⁻²,
-# …, in µm. raysect has Schott's catalogue of 2000; of N-BK7 only C1 = 6000.69867 nm² is another. Last: an index that
-# the other catalogue prints, and its line.
-OTHER_CATALOGUES = [
-    ("optiland", "CDGM:H-K9L", (0.614555251, 0.656775017, 1.02699346, 14598.7884, 2877.69588, 107653051), 1.52669, "g"),
-    ("optiland", "CDGM:H-LaF4", (0.210645313, 1.75547352, 1.28979005, 54275.9294, 11237.0777, 119852069), 1.77728, "g"),
-    (
-        "optiland",
-        "SUMITA:K-GIR79",
-        {0: 3.3195074, 2: -0.0085801253, -2: 0.039978521, -4: 0.0014465322, -6: -3.0453007e-05, -8: 7.8005005e-06},
-        1.85588,
-        "d",
-    ),
-    (
-        "optiland",
-        "SUMITA:K-SFLDn3",
-        {0: 3.2503692, 2: -0.013195714, -2: 0.049790724, -4: 0.0022430157, -6: -7.7567761e-06, -8: 2.1169316e-05},
-        1.84666,
-        "d",
-    ),
-    ("raysect", "SCHOTT:LLF1", (1.23326922, 0.116923839, 0.862645379, 8853.9681, 43687.5155, 104992168), 1.56328, "g"),
-    ("raysect", "SCHOTT:N-BK7", (1.03961212, 0.231792344, 1.01046945, 6000.6987, 20017.9144, 103560653), 1.52668, "g"),
-]
+# Why catalogues differ: coefficients of the other catalogue, and an index that it prints at a line. CDGM has published
+# two formulas: Sellmeier's, in the catalogue for Zemax of 2022, and a power series in its spreadsheet. Sumita has
+# changed two glasses since its catalogue of 2017, whose coefficients are those of λ⁰, λ², λ⁻², …, in µm. raysect has
+# Schott's catalogue of 2000; of N-BK7 only C1 = 6000.69867 nm² is another.
+K_GIR79 = {0: 3.3195074, 2: -0.0085801253, -2: 0.039978521, -4: 0.0014465322, -6: -3.0453007e-05, -8: 7.8005005e-06}
+K_SFLDN3 = {0: 3.2503692, 2: -0.013195714, -2: 0.049790724, -4: 0.0022430157, -6: -7.7567761e-06, -8: 2.1169316e-05}
+SELLMEIER = {
+    "CDGM:H-K9L": "0.614555251, 0.656775017, 1.02699346, 14598.7884, 2877.69588, 107653051",
+    "CDGM:H-LaF4": "0.210645313, 1.75547352, 1.28979005, 54275.9294, 11237.0777, 119852069",
+    "SCHOTT:LLF1": "1.23326922, 0.116923839, 0.862645379, 8853.9681, 43687.5155, 104992168",
+    "SCHOTT:N-BK7": "1.03961212, 0.231792344, 1.01046945, 6000.6987, 20017.9144, 103560653",
+}
 
 
-@pytest.mark.parametrize(("system", "glass", "coefficients", "printed", "line"), OTHER_CATALOGUES)
-def test_the_recorded_difference_is_that_of_the_other_catalogue(system, glass, coefficients, printed, line):
+@pytest.mark.parametrize(
+    ("system", "glass", "powers", "printed", "line"),
+    [
+        ("optiland", "CDGM:H-K9L", None, 1.52669, "g"),
+        ("optiland", "CDGM:H-LaF4", None, 1.77728, "g"),
+        ("optiland", "SUMITA:K-GIR79", K_GIR79, 1.85588, "d"),
+        ("optiland", "SUMITA:K-SFLDn3", K_SFLDN3, 1.84666, "d"),
+        ("raysect", "SCHOTT:LLF1", None, 1.56328, "g"),
+        ("raysect", "SCHOTT:N-BK7", None, 1.52668, "g"),
+    ],
+)
+def test_the_recorded_difference_is_that_of_the_other_catalogue(system, glass, powers, printed, line):
+    pytest.importorskip("opticalglass")
+
     def there(w):
-        if isinstance(coefficients, dict):
-            return sum(x * (w / 1000) ** power for power, x in coefficients.items()) ** 0.5
-        return media.index(f"sellmeier({', '.join(map(str, coefficients))})", w)
+        if powers:
+            return sum(x * (w / 1000) ** power for power, x in powers.items()) ** 0.5
+        return media.index(f"sellmeier({SELLMEIER[glass]})", w)
 
     off = max(abs(there(w) / media.index(glass, w) - 1) for w in glasses.WAVELENGTHS)
     assert off == pytest.approx(CATALOGUES[system].others[glass].recorded, rel=5e-3)
     assert round(there(media.LINES[line]), 5) == printed
+
+
+# The achromat --------------------------------------------------------------------------------------------------------
+
+NS = 1.0, 1.5168, 1.62, 1.0
+LENS = lenses.LENS
+
+
+def test_the_exact_trace_is_that_of_matrices_near_the_axis_and_its_weights_those_of_small_changes():
+    """The rest is spherical aberration, and falls as the height's square. A bent surface has another curvature."""
+    focus = 8.5 + back_focal_distance(LENS.curvatures, NS, LENS.thicknesses)
+    off = [float(crossing(LENS, NS, h, lenses.START).place) / focus - 1 for h in (1e-6, 1.0, 0.5)]
+    assert abs(off[0]) < 1e-12 and off[1] / off[2] == pytest.approx(4, rel=1e-2)
+    exact, (first, *others) = crossing(LENS, NS, 10.0, lenses.START), LENS.curvatures
+    bent = crossing(dataclasses.replace(LENS, curvatures=(first * (1 + 1e-9), *others)), NS, 10.0, lenses.START)
+    assert float(abs(bent.place - exact.place)) / 1e-9 == pytest.approx(exact.moves["bend"][0], rel=1e-6)
+    height, distance = exact.meetings[2].y, float(exact.place) - 8.5
+    assert exact.moves["turn"][2] == pytest.approx(distance**2 / height + height, rel=2e-2)
+
+
+def traced(given=None, own=None, indices=None):
+    """The rows of a system that traces as the planar trace, unless otherwise said."""
+    ours, known = lenses.planar()
+    given = ours if given is None else given
+    rays = {lenses.GIVEN: given, lenses.OWN: given if own is None else own}
+    return lenses.answered("A", lenses.Answer("A 1.0", known if indices is None else indices, rays))
+
+
+def test_another_trace_is_no_other_index_and_another_index_no_other_trace():
+    ours, known = lenses.planar()
+    rows = traced()
+    assert [(row.verdict, row.reason) for row in rows] == [("pass", "A 1.0")] * 4
+    assert all(row.values[lenses.FOCUS_OFF] == row.values[lenses.SHIFT_OFF] == 0 for row in rows)
+    moved, one = ours.copy(), ours.copy()
+    moved[..., 0] += 1e-10
+    one[3, :, 1] *= 1 + 1e-12  # at one wavelength
+    for rays in (moved, one, ours.astype(np.float32).astype(float)):
+        assert list(broken(traced(rays)).values()) == [{ERROR_OVER_BOUND}] * 4
+    indices = known * [[1], [1 + 1e-8]]  # F2 of another maker, traced rightly: the focus says by how much
+    places = [[crossing(LENS, (1.0, *n, 1.0), h, lenses.START).place for h in lenses.HEIGHTS] for n in indices.T]
+    own = np.array([[[float(place), 0.0, 1.0, 0.1] for place in each] for each in places])
+    rows = traced(own=own, indices=indices)
+    assert broken(rows) == {f"{lenses.OWN}, height {h:g}": {lenses.INDEX_OFF} for h in lenses.HEIGHTS}
+    assert all(row.values[lenses.FOCUS_OFF] > 1e-9 for row in rows if row.case.startswith(lenses.OWN))
+    assert set.union(*broken(traced(own=own)).values()) == {ERROR_OVER_BOUND}  # said to be those of the file's glass
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("raise RuntimeError('out of glass')", "out of glass"),
+        ("print('[]')", "no answer"),
+        ("print(json.dumps({'system': 'A', 'indices': [], 'rays': {'given': [], 'own': []}}))", "shape"),
+        (
+            "print(json.dumps({'system': 'A', 'indices': lens['indices'], "
+            "'rays': {name: [[[float('nan')] * 4] * 2] * 6 for name in ('given', 'own')}}))",
+            "not finite",
+        ),
+        ("sys.exit(77)", "cannot run here: "),
+    ],
+)
+def test_a_broken_program_fails_for_its_reason(body, said, tmp_path):
+    (tmp_path / "program.py").write_text(f"import json, sys\nlens = json.load(sys.stdin)\n{body}\n")
+    (row,) = lenses.system_rows(System("a", "A", lens=("{python}", str(tmp_path / "program.py"))), QUICK)
+    assert row.verdict == ("not run" if "77" in body else "fail") and said in row.reason and "\n" not in row.reason
+
+
+def test_the_lens_is_that_of_the_file():
+    """Its glasses by name have the indices of the file's formulas."""
+    pytest.importorskip("opticalglass")
+    for glass, n in zip(lenses.GLASSES, lenses.planar()[1], strict=True):
+        assert np.abs(media.parse(":".join(glass)).index(np.array(lenses.wavelengths())) / n - 1).max() < 1e-15
+    assert all(f"{c}" in lenses.FILE.read_text() for c in LENS.curvatures)
+    assert json.loads(json.dumps(lenses.question()))["start"] == -20

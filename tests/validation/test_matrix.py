@@ -1,79 +1,142 @@
-"""The matrix of systems and checks: what it takes from the rows of other studies."""
+"""The matrix of systems and checks: what it takes from the rows of other studies; as a table, a page and JSON."""
 
 from __future__ import annotations
+
+import json
+import math
 
 import pytest
 
 from mi_refract.report.row import Row
+from validation import __main__ as command
 from validation import limits, readme_tables
 from validation.suite import matrix, per_ray, rendered_images
-from validation.suite.renderers import SYSTEMS
-from validation.suite.renderers.system import LARGE, TOTAL
+from validation.suite.per_ray import LARGE
 
-GOAL = {per_ray.OFF_RECORDED: limits.RECORDED}
-
-
-def ray(subject="A", case="random", budget=None, **values):
-    values = {"worst rad": 1e-6, "wrong": 0.0, "TIR misclassified": 0.0} | values
-    return Row(per_ray.NAME, subject, case, "f32", values, {"wrong": 0.0}, reason="A 1.2; zero")
+REPLAY = {"version": "A 1.0", "total internal reflection": "zero", "remark": "known"}
+ONE = {"worst rad": 1e-6}
 
 
-def image(subject="B", verdict="equal", differing=0.0, **more):
-    values = {"mean difference": -0.02, "tests that differ": differing}
-    budgets = {"tests that differ": 0.0} | more
-    replay = {"verdict": verdict, "renderer": "B 3"}
-    return Row(rendered_images.NAME, subject, "prism", "64²", values, budgets, reason="why", replay=replay)
+def ray(subject="A", case="random", precision="f32", values=ONE, wrong=0.0, goals=()):
+    values, reason = values | {"wrong": wrong}, "A 1.2; zero"
+    return Row(per_ray.NAME, subject, case, precision, values, {"wrong": 0.0}, dict(goals), reason, REPLAY)
 
 
-def test_numbers_and_verdicts_are_those_of_the_rows():
-    right, wrong, equal, different = matrix.summary(
-        [ray(), ray(case="near-critical", wrong=3.0), image(), image(verdict="different", differing=2.0)]
+def image(subject="B", verdict="equal", differing=0.0, budgets=(("tests that differ", 0.0),)):
+    values, replay = {"mean difference": -0.02, "tests that differ": differing}, {"verdict": verdict, "renderer": "B 3"}
+    return Row(rendered_images.NAME, subject, "prism", "64²", values, dict(budgets), reason="why", replay=replay)
+
+
+def test_numbers_and_verdicts_are_those_of_the_rows_and_stand_before_them():
+    other = Row("directions", "x", "y", "z", {"v": 1.0})
+    of_studies = [ray(), ray(case="near-critical", wrong=3.0), image(), image(verdict="different", differing=2.0)]
+    of_studies.append(image(verdict="different", differing=2.0, budgets=()))
+    rows = matrix.with_summary([other, *of_studies])
+    assert rows[0] == other and rows[6:] == of_studies and matrix.with_summary([other]) == [other]
+    right, wrong, equal, different, known = rows[1:6]
+    assert (right.study, right.subject, right.case, right.values[matrix.OFF]) == ("matrix", "A, f32", "random", 1e-6)
+    assert [row.verdict for row in rows[1:6]] == ["pass", "fail", "pass", "fail", "pass"]
+    assert (wrong.reason, equal.subject, equal.values[matrix.OFF], equal.reason) == (
+        "A 1.2; zero",
+        "B",
+        0.02,
+        "B 3; why",
     )
-    assert (right.subject, right.case, right.values[matrix.OFF], right.verdict) == ("A, f32", "random", 1e-6, "pass")
-    assert (wrong.verdict, wrong.reason) == ("fail", "A 1.2; zero")
-    assert (equal.subject, equal.values[matrix.OFF], equal.verdict) == ("B", 0.02, "pass")
-    assert (equal.values["differs"], equal.reason) == (0.0, "B 3; why")
-    assert (different.verdict, different.values["differs"], different.reason) == ("fail", 1.0, "B 3; why")
+    assert [row.values["differs"] for row in (equal, different, known)] == [0, 1, 1]
+    assert known.missed == {"differs": 0.0}
 
 
 def test_a_missed_goal_is_shown_beside_the_number_and_fails_nothing():
-    missed = Row(per_ray.NAME, "A", "random", "f32", {"worst rad": 5e-6, "off the recorded": 3.67}, goals=GOAL)
-    reached = Row(per_ray.NAME, "B", "random", "f32", {"worst rad": 5e-6, "off the recorded": 2.9}, goals=GOAL)
-    better = {"worst rad": 2e-15, "recorded": 9e-15, "off the recorded": 4.5}
-    rows = matrix.summary([missed, reached, Row(per_ray.NAME, "C", "random", "f64", better, goals=GOAL)])
-    assert [row.verdict for row in rows] == ["pass"] * 3
-    assert [bool(row.missed) for row in rows] == [True, False, True]
-    table = readme_tables.suite(rows)
-    assert "| A, f32 | 5e-6 (3.67 × recorded) |" in table
-    assert "| B, f32 | 5e-6 |" in table
-    assert "| C, f64 | 2e-15 (recorded / 4.5) |" in table
+    goals = {per_ray.OFF_RECORDED: limits.RECORDED}
+    rows = [ray(values=ONE | {"off the recorded": 3.67}, goals=goals)]
+    rows += [ray("B", values=ONE | {"off the recorded": 2.9}, goals=goals)]
+    rows += [ray("C", precision="f64", values=ONE | {"recorded": 4.5e-6, "off the recorded": 4.5}, goals=goals)]
+    cells = matrix.summary(rows)
+    assert [(cell.verdict, bool(cell.missed)) for cell in cells] == [("pass", True), ("pass", False), ("pass", True)]
+    table = readme_tables.suite(cells)
+    for line in ("| A, f32 | 1e-6 (3.67 × recorded) |", "| B, f32 | 1e-6 |", "| C, f64 | 1e-6 (recorded / 4.5) |"):
+        assert line in table
     assert "a goal" in table and "fails nothing" in table
 
 
-def test_every_recorded_error_of_mitsuba_is_a_goal():
-    """`dielectric` on random rays missed it, and the goal was taken away."""
-    for call in SYSTEMS["mitsuba"].calls:
-        assert set(call.recorded) == set(per_ray.SETS) - {TOTAL, LARGE}, call.title
+@pytest.mark.parametrize("study", matrix.CHECKS)
+def test_what_was_not_run_is_not_run_for_every_check(study):
+    cells = matrix.summary([Row(study, "A", "every set", "f32", reason="pip install it")])
+    assert [(cell.case, cell.verdict) for cell in cells] == [(case, "not run") for case in matrix.CHECKS[study]]
 
 
-def test_a_system_that_is_known_to_differ_passes_and_is_said_to_differ():
-    row = image(verdict="different", differing=2.0)
-    known = Row(row.study, row.subject, row.case, row.setting, row.values, reason=row.reason, replay=row.replay)
-    (found,) = matrix.summary([known])
-    assert (found.verdict, found.missed, found.reason) == ("pass", {"differs": 0.0}, "B 3; why")
+# The page ----------------------------------------------------------------------------------------------------------
+
+
+def stored(case, backward, title="A", verdict="pass", **more):
+    values = {per_ray.BACKWARD: backward, "worst rad": 1e-7}
+    row = {"study": per_ray.NAME, "subject": title, "case": case, "setting": "f32", "values": values}
+    return row | {"verdict": verdict, "reason": "said", "replay": REPLAY} | more
+
+
+def seen(title, verdict, row="pass"):
+    cell = {"study": rendered_images.NAME, "subject": title, "case": "sphere", "setting": "64²"}
+    cell |= {"values": {"mean difference": 1e-4}, "replay": {"verdict": verdict}}
+    return cell | {"verdict": row, "reason": f"{verdict}: why"}
+
+
+def test_systems_are_in_the_order_of_how_far_they_are_from_right():
+    rows = [stored("random", 3.0, "far"), stored("random", 1.0, "near"), stored(LARGE, 900.0, "near")]
+    rows += [stored("random", 0.5, "wrong", "fail"), stored("random", 1.0, "both"), stored(LARGE, 2.0, "both")]
+    page = matrix.of_rows([*rows, stored("random", "inf", "none")])
+    assert [each["system"] for each in page["rays"]] == ["both", "near", "far", "none", "wrong"]
+    images = matrix.of_rows([seen("A", "equal"), seen("B", "inconclusive"), seen("C", "different", "fail")])["images"]
+    assert [(each["system"], each["wrong"]) for each in images] == [("A", False), ("B", False), ("C", True)]
+    assert [each["sentence"].partition(":")[0] for each in images][1:] == ["inconclusive", "different"]
 
 
 @pytest.mark.parametrize(
-    ("study", "cases"), [(per_ray.NAME, per_ray.SETS), (rendered_images.NAME, rendered_images.SCENES)]
+    ("rows", "said"),
+    [
+        ([stored("random", 1.0)], "right in every set; known"),
+        (
+            [stored("random", 4.5), stored(LARGE, 1.0)],
+            "exact only for inputs more than 4 roundings off: random (up to 4.5); known",
+        ),
+        ([stored("random", 1.0, verdict="fail"), stored(LARGE, 1.0)], "wrong: random; known"),
+    ],
 )
-def test_what_was_not_run_is_not_run_for_every_check(study, cases):
-    found = matrix.summary([Row(study, "A", "every set", "f32", reason="pip install it")])
-    assert [row.case for row in found] == list(cases)
-    assert {row.verdict for row in found} == {"not run"}
+def test_what_a_system_gets_wrong_is_a_sentence(rows, said):
+    (found,) = matrix.of_rows(rows)["rays"]
+    assert found["sentence"] == said and found["version"] == "A 1.0"
 
 
-def test_the_summary_stands_before_what_it_is_taken_from():
-    other = Row("directions", "x", "y", "z", {"v": 1.0})
-    rows = matrix.with_summary([other, ray(), other])
-    assert [row.study for row in rows] == ["directions", matrix.NAME, per_ray.NAME, "directions"]
-    assert matrix.with_summary([other]) == [other]
+def test_the_command_writes_the_page_and_the_data_or_says_that_there_are_no_rows(tmp_path, capsys):
+    words = [
+        "renderers",
+        "--page",
+        str(tmp_path / "p.html"),
+        "--json",
+        str(tmp_path / "p.json"),
+        "--out",
+        str(tmp_path),
+    ]
+    for content, said in (
+        (None, "no such file"),
+        ("{", "no rows of a"),
+        ('{"rows": [{"study": "x"}]}', "of other sys"),
+    ):
+        if content:
+            (tmp_path / "rows.json").write_text(content)
+        assert command.main(words) == 2
+        assert said in capsys.readouterr().err and not (tmp_path / "p.html").exists()
+    rows = [
+        stored("random", 1.0),
+        stored("random", math.nan, "<b>", "fail"),
+        seen("R", "equal"),
+        seen("I", "inconclusive"),
+    ]
+    rows.append(stored("every set", 0.0, "absent", "not run", values={}, reason="install it"))
+    (tmp_path / "rows.json").write_text(json.dumps({"rows": rows}).replace("NaN", '"nan"'))
+    assert command.main(words) == 0
+    found = json.loads((tmp_path / "p.json").read_text())
+    assert [each["system"] for each in found["rays"]] == ["A", "<b>"] and found["schema"] == 1
+    assert found["not_run"] == [{"system": "absent", "precision": "f32", "reason": "install it"}]
+    page = (tmp_path / "p.html").read_text()
+    assert "&lt;b&gt;" in page and "install it" in page and "src=" not in page
+    assert '<td class="missed">inconclusive: +0.01%</td>' in page and '<td class="pass">equal: +0.01%</td>' in page

@@ -1,165 +1,124 @@
-"""The study of images: what it says of a renderer that agrees, of one that does not, and of one that is not there."""
+"""Images by other renderers: what is said of one that agrees, of one that does not, and of one that is not there."""
 
 import dataclasses
-import functools
-import importlib.util
+import re
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_refract import media
+from mi_refract.image_diff.comparison import Verdict
 from mi_refract.io import image_file
-from mi_refract.rendering import scene_files
 from mi_refract.scene_export import write_files
 from mi_refract.scene_export.plain_scene import Glass
 from mi_refract.scene_export.targets import shared_files
-from validation import readme_tables
+from validation import limits
 from validation.run.context import PROFILES, Context
-from validation.run.render_methods import Camera
-from validation.suite import matrix, rendered_images
-from validation.suite.renderers import environments, image_renderers
-from validation.suite.renderers.image_renderers import ImageRenderer
+from validation.suite import exports, matrix, rendered_images, spectral_lines
+from validation.suite.rendered_images import INCONCLUSIVE, THREE, Size
+from validation.suite.renderers import SYSTEMS, environments, image_renderers
+from validation.suite.renderers.image_renderers import IMAGE_RENDERERS, ImageRenderer
 
-SMALL = rendered_images.Size(48, 32, 1, 0.2)
+SMALL = Size(48, 32, 1, 0.2)
 pytestmark = pytest.mark.usefixtures("llvm_variant")
 
 
 @pytest.fixture
-def judged(tmp_path, monkeypatch):
-    """The row of a painter that draws the prism."""
-    context = Context(PROFILES["full"], tmp_path, "llvm_ad_rgb", {}, {})
+def context(tmp_path, monkeypatch):
+    """Of the full profile, where everything is installed and images are small."""
+    monkeypatch.setattr(environments, "absent", lambda system: "")
     monkeypatch.setitem(rendered_images.SIZES, "full", SMALL)
-
-    def judge(draw, title="Radiance", missing=""):
-        monkeypatch.setattr(environments, "absent", lambda system: missing)
-        monkeypatch.setitem(rendered_images.IMAGE_RENDERERS, title, ImageRenderer("radiance", draw, {"prism": 32}, ()))
-        [row] = rendered_images.pair_rows(context, title, "prism")
-        assert all((tmp_path / name).is_file() for name in row.images.values())
-        return row
-
-    return judge
+    monkeypatch.setitem(spectral_lines.SIZES, "full", Size(32, 64, 4, 0.3))
+    return Context(PROFILES["full"], tmp_path, "llvm_ad_rgb", {}, {spectral_lines.VARIANT: None})
 
 
-def by_the_builtin(change, plain, folder, spp, seeds):
-    """Mitsuba's own glass in a scene that is a little different."""
-    write_files.write(change(plain), "mitsuba", folder / "scene")
-    camera = Camera(scene_files.load_scene(folder / "scene" / "scene.xml", {"bsdf": "dielectric"}))
-    return [image_file.named(f"seed {seed}", camera(spp, seed)[0].astype(np.float32)) for seed in seeds]
+def raising(error):
+    def draw(*_):
+        raise error
+
+    return draw
 
 
-def denser(plain, index=2.0):
-    def glass(mesh):
-        changed = isinstance(mesh.material, Glass)
-        return dataclasses.replace(mesh, material=Glass(index, mesh.material.ext_ior)) if changed else mesh
-
-    return dataclasses.replace(plain, meshes=tuple(map(glass, plain.meshes)))
+NOT_DRAWN = [(environments.Unable("no browser"), "not run"), (environments.Broken("exit code 1"), "fail")]
 
 
-def matched(plain):
-    """As if no glass were there."""
-    [outside] = {mesh.material.ext_ior for mesh in plain.meshes if isinstance(mesh.material, Glass)}
-    return denser(plain, outside)
+def denser(plain):
+    """Another index: Mitsuba's own glass in a scene that is a little different."""
+    glasses = [
+        dataclasses.replace(x.material, int_ior=2.0) if isinstance(x.material, Glass) else x.material
+        for x in plain.meshes
+    ]
+    meshes = (dataclasses.replace(mesh, material=glass) for mesh, glass in zip(plain.meshes, glasses, strict=True))
+    return dataclasses.replace(plain, meshes=tuple(meshes))
 
 
 def wider(plain):
     return dataclasses.replace(plain, camera=dataclasses.replace(plain.camera, fov_x_degrees=34.0))
 
 
-def test_another_renderer_of_the_same_scene_is_equal(judged):
-    row = judged(functools.partial(by_the_builtin, lambda plain: plain))
-    assert row.verdict == "pass" and row.replay["verdict"] == "equal" and not row.missed
+@pytest.fixture
+def judged(context, monkeypatch):
+    """`judged(change)`: the row of a renderer that draws the prism so changed by Mitsuba's `dielectric`."""
+
+    def judge(change=lambda plain: plain, title="Radiance", draw=None):
+        path = IMAGE_RENDERERS["Mitsuba, volpath"].draw
+        draw = draw or (lambda plain, *rest: path(change(plain), *rest))
+        monkeypatch.setitem(IMAGE_RENDERERS, title, ImageRenderer("radiance", draw, {"prism": 32}, ()))
+        [row] = rendered_images.pair_rows(context, title, "prism")
+        assert all((context.out / name).is_file() for name in row.images.values())
+        return row
+
+    return judge
+
+
+def test_the_same_scene_is_equal_and_another_one_is_not(judged):
+    row = judged()
+    assert (row.verdict, row.replay["verdict"], row.missed) == ("pass", "equal", {})
     assert row.values["RMSE / noise"] == pytest.approx(1, abs=0.1)
     assert list(row.images) == ["reference", "test", "difference"]
-
-
-@pytest.mark.parametrize("change", [denser, wider])
-def test_another_image_fails(judged, change):
-    row = judged(functools.partial(by_the_builtin, change))
-    assert row.verdict == "fail" and row.replay["verdict"] == "different"
-    assert row.values["tests that differ"] > 0
-
-
-def test_a_pair_whose_noise_hides_what_is_wanted_is_no_pass(judged, monkeypatch):
-    """In the row, in the matrix, and in the table of the README; whatever its mean says."""
-    monkeypatch.setitem(rendered_images.SIZES, "full", dataclasses.replace(SMALL, wanted=1e-3))
-    row = judged(functools.partial(by_the_builtin, lambda plain: plain))
-    assert row.replay["verdict"] == "inconclusive" and row.missed[rendered_images.INCONCLUSIVE] == 0
-    [cell] = matrix.summary([row])
-    assert rendered_images.INCONCLUSIVE in cell.missed and "inconclusive" in cell.reason
-    assert "**inconclusive**" in readme_tables.suite([cell])
-    clear = judged(functools.partial(by_the_builtin, denser))
-    assert rendered_images.INCONCLUSIVE not in clear.missed
-
-
-def test_mitsubas_own_integrators_agree_where_they_can(judged):
-    for title in ("Mitsuba, volpath", "Mitsuba, prb"):
-        row = judged(rendered_images.IMAGE_RENDERERS[title].draw, title)
-        assert row.verdict == "pass" and row.replay["verdict"] == "equal"
-    blind = judged(rendered_images.IMAGE_RENDERERS[rendered_images.PTRACER].draw)
-    assert blind.verdict == "fail", "light tracing sees nothing through the prism"
-
-
-def test_the_caustic_is_seen_without_glass(tmp_path):
-    """Every ray of the camera meets the floor; and without the ball the image is another one."""
-    given = rendered_images.SCENES["caustic"].load(16)
-    write_files.write(given, "mitsuba", tmp_path / "scene")
-    scene = scene_files.load_scene(tmp_path / "scene" / "scene.xml", {"bsdf": "dielectric"})
-    x, y = np.meshgrid(*[np.linspace(0, 1, 65)] * 2)
-    rays, _ = scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(x.ravel(), y.ravel()), mi.Point2f(0.5))
-    found = scene.ray_intersect(rays)
-    assert np.array(found.is_valid()).all() and np.abs(np.array(found.p)[1]).max() < 1e-2
-    size = rendered_images.Size(16, 32, 1, 0.3)
-    bright = np.mean([image.pixels for image in rendered_images.reference("caustic", size)], axis=0)
-    (tmp_path / "bare").mkdir()
-    [dark] = by_the_builtin(matched, given, tmp_path / "bare", 256, [1])
-    assert bright.max() > 1.2 * dark.pixels.max()
+    for change in (denser, wider):
+        row = judged(change)
+        assert (row.verdict, row.replay["verdict"]) == ("fail", "different") and row.values["tests that differ"] > 0
+    assert judged(draw=IMAGE_RENDERERS[rendered_images.PTRACER].draw).verdict == "fail"  # sees nothing through glass
 
 
 def test_who_is_known_to_differ_must_be_seen_to(judged):
-    """The same pair is a failure of the suite where it should have shown a difference, and none where it did."""
-    blind = judged(functools.partial(by_the_builtin, lambda plain: plain), rendered_images.THREE)
+    blind = judged(title=THREE)
     assert blind.verdict == "fail" and blind.broken == {"not seen to differ": 0.0}
-    seen = judged(functools.partial(by_the_builtin, denser), rendered_images.THREE)
-    assert seen.verdict == "pass" and rendered_images.WHY[rendered_images.THREE] in seen.reason
+    seen = judged(denser, THREE)
+    assert seen.verdict == "pass" and rendered_images.WHY[THREE] in seen.reason
 
 
-def test_what_does_not_render_is_never_a_pass(judged):
-    def raising(error):
-        def draw(*_):
-            raise error
-
-        return draw
-
-    absent = judged(raising(AssertionError("asked all the same")), missing="the command that brings it")
-    assert absent.verdict == "not run" and absent.reason == "the command that brings it"
-    assert judged(raising(ValueError("a diffuse surface"))).verdict == "not run"
-    assert judged(raising(environments.Unable("no browser"))).reason == "no browser"
-    broken = judged(raising(environments.Broken("exit code 1: segmentation fault")))
-    assert broken.verdict == "fail" and "segmentation fault" in broken.reason
+def test_a_pair_whose_noise_hides_what_is_wanted_is_no_pass(judged, monkeypatch):
+    """In the row, and in the matrix; whatever its mean says."""
+    monkeypatch.setitem(rendered_images.SIZES, "full", dataclasses.replace(SMALL, wanted=1e-3))
+    row = judged()
+    assert row.replay["verdict"] == "inconclusive" and row.missed[INCONCLUSIVE] == 0
+    [cell] = matrix.summary([row])
+    assert INCONCLUSIVE in cell.missed and "inconclusive" in cell.reason
+    assert INCONCLUSIVE not in judged(denser).missed
 
 
-def test_values_that_are_not_finite_fail(judged):
-    def spoilt(plain, folder, spp, seeds):
-        drawn = by_the_builtin(lambda same: same, plain, folder, spp, seeds)
+def test_what_does_not_render_or_is_not_finite_is_never_a_pass(judged, monkeypatch):
+    def spoilt(*given):
+        drawn = IMAGE_RENDERERS["Mitsuba, volpath"].draw(*given)
         drawn[0].pixels[3, 4] = np.nan
         return drawn
 
-    row = judged(spoilt)
-    assert row.verdict == "fail" and "1 NaN" not in row.reason and "NaN" in row.reason
+    row = judged(draw=spoilt)
+    assert row.verdict == "fail" and "NaN" in row.reason
+    for error, verdict in (*NOT_DRAWN, (ValueError("a diffuse surface"), "not run")):
+        row = judged(draw=raising(error))
+        assert row.verdict == verdict and str(error) in row.reason
+    monkeypatch.setattr(environments, "absent", lambda system: "the command that brings it")
+    row = judged(draw=raising(AssertionError("asked all the same")))
+    assert (row.verdict, row.reason) == ("not run", "the command that brings it")
 
 
-def test_every_scene_of_a_painter_is_one_of_the_study():
-    assert {
-        scene for painter in image_renderers.IMAGE_RENDERERS.values() for scene in painter.spp
-    } == rendered_images.SCENES.keys()
-    assert set(rendered_images.WHY) <= set(image_renderers.IMAGE_RENDERERS)
-
-
-# Environments and cameras: what the tests of exports do not show ---------------------------------------------------
-
-
-def test_three_finds_the_sky_where_it_looks(monkeypatch):
-    monkeypatch.setattr(shared_files, "FINER", 8)
+def test_scenes_and_skies_are_those_of_the_study(monkeypatch):
+    drawn = {scene for renderer in IMAGE_RENDERERS.values() for scene in renderer.spp}
+    assert drawn == rendered_images.SCENES.keys() and set(rendered_images.WHY) <= set(IMAGE_RENDERERS)
+    monkeypatch.setattr(shared_files, "FINER", 8)  # three finds the sky where it looks
     sky, directions = rendered_images.askew(), np.random.default_rng(3).normal(size=(4000, 3))
     x, y, z = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
     image = shared_files.longitude_latitude(sky, image_renderers.equirectangular)
@@ -168,24 +127,110 @@ def test_three_finds_the_sky_where_it_looks(monkeypatch):
     texel = image[np.minimum((v * rows).astype(int), rows - 1), np.minimum((u * columns).astype(int), columns - 1)]
     # Half a texel is 0.003 rad, the sky's slope below 2.
     assert np.abs(texel - shared_files.radiance(sky, directions)).max() < 0.01
-    assert np.abs(texel - shared_files.radiance(sky, directions * [1, 1, -1])).max() > 0.1
 
 
-def test_radiance_is_given_mitsubas_rays(tmp_path):
-    path = environments.SCRIPTS / "radiance_images.py"
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
-    given = rendered_images.SCENES["prism"].load(16)
-    within = np.random.default_rng(1).random((16, 16, 2))
-    view = write_files.TARGETS["radiance"](given)["camera.vf"].decode()
-    bundle = script.rays(view, within).reshape(-1, 6)
+# Exports -----------------------------------------------------------------------------------------------------------
 
-    write_files.write(given, "mitsuba", tmp_path / "scene")
-    [sensor] = scene_files.load_scene(tmp_path / "scene" / "scene.xml").sensors()
-    place = (np.stack(np.meshgrid(np.arange(16), np.arange(16)), -1) + within).reshape(-1, 2) / 16
-    ray, _ = sensor.sample_ray(0, 0.5, mi.Point2f(place.T), mi.Point2f(0.5))
-    directions = bundle[:, 3:] / np.linalg.norm(bundle[:, 3:], axis=1, keepdims=True)
-    assert np.abs(np.array(ray.d).T - directions).max() < 1e-6
-    assert np.abs(np.array(ray.d).T - directions[::-1]).max() > 0.1  # rows from the bottom would be seen
-    assert np.abs(np.array(ray.o).T - bundle[:, :3]).max() < 0.1  # Mitsuba's begin at its near plane
+DEFECTS = {
+    "nothing": ("README.txt", "$^", ""),
+    "vertical angle of view": ("camera.vf", r"-vh (\S+) -vv \S+", r"-vh \1 -vv \1"),
+    "no diffuse light": ("README.txt", r"-ab \d+", "-ab 0"),
+    "sky": ("sky.cal", r"Acos\(y\)", "Acos(-y)"),
+}
+
+
+@pytest.mark.parametrize("title", [title for title in IMAGE_RENDERERS if title not in exports.LEFT_OUT])
+def test_an_export_is_rendered_as_mitsuba_renders_the_scene(title, tmp_path):
+    if reason := environments.absent(SYSTEMS[IMAGE_RENDERERS[title].system]):
+        pytest.skip(f"{title}: {reason}")
+    (row,) = exports.rows(Context(PROFILES["full"], tmp_path, "llvm_ad_rgb", {}, {}), title)
+    assert row.verdict == "pass", (row.values, row.reason)
+
+
+@pytest.mark.parametrize("defect", DEFECTS)
+def test_a_defect_of_an_export_is_seen(defect, monkeypatch, tmp_path):
+    """Also with an eighth of the samples: noise makes the allowance larger."""
+    if reason := environments.absent(SYSTEMS["radiance"]):
+        pytest.skip(reason)
+    make, (name, pattern, new) = write_files.TARGETS["radiance"], DEFECTS[defect]
+
+    def files(plain):
+        made = make(plain)
+        return made | {name: re.sub(pattern, new, made[name].decode()).encode()}
+
+    monkeypatch.setitem(write_files.TARGETS, "radiance", files)
+    monkeypatch.setattr(exports, "THEIRS", {title: spp // 8 for title, spp in exports.THEIRS.items()})
+    (row,) = exports.rows(Context(PROFILES["full"], tmp_path, "llvm_ad_rgb", {}, {}), "Radiance")
+    assert (exports.OVER in row.broken) == (defect != "nothing"), row.values
+
+
+def renders(seed, mean=1.0, noise=0.02):
+    return mean + noise * np.random.default_rng(seed).normal(size=(4, 9, 16, 3))
+
+
+def test_what_is_allowed_is_noise_and_one_percent(context, monkeypatch):
+    over = lambda *pair: exports.compared(*pair)[exports.OVER]  # noqa: E731
+    assert max(over(renders(1), renders(2)), over(renders(1), renders(2, mean=1.008))) < 1
+    assert over(renders(1), renders(2, mean=1.06)) > 1
+    values = exports.compared(renders(1, noise=0.1), renders(2, noise=0.1))
+    assert values[exports.OVER] < 1 and values[exports.NOISE] > limits.EXPORT_NOISE
+    spoilt = renders(2)
+    spoilt[0, 3, 4] = np.nan
+    monkeypatch.setattr(exports, "reference", lambda diffuse: renders(1))
+    for draw, verdict in ((lambda title: spoilt, "fail"), *((raising(error), verdict) for error, verdict in NOT_DRAWN)):
+        monkeypatch.setattr(exports, "drawn", draw)
+        assert [row.verdict for row in exports.rows(context, "Radiance")] == [verdict]
+
+
+def test_the_scene_is_not_symmetric():
+    """Otherwise what is mirrored or upside down would look the same: differences above what is allowed."""
+    image = exports.reference(diffuse=False)
+    for other in (image[:, ::-1], image[:, :, ::-1], image[:, ::-1, ::-1]):
+        assert exports.compared(image, other)[exports.OVER] > 2
+
+
+# Spectral lines ------------------------------------------------------------------------------------------------------
+
+
+def stripe(seed, noise, shift, line):
+    """Four renders of a bright stripe, at a place of the line's own."""
+    rng, place = np.random.default_rng(seed), 9 + shift + {"C": 0, "d": 4, "F": 12}[line]
+    pixels = (0.1 + (np.abs(np.arange(32) - place) < 3)) * (1 + noise * rng.normal(size=(4, 32, 32)))
+    return [image_file.named(f"{seed} {i}", each[..., None].astype(np.float32)) for i, each in enumerate(pixels)]
+
+
+@pytest.mark.parametrize(
+    ("noise", "shifts", "verdicts"),
+    [
+        (0.01, {}, ["pass"] * 5),
+        (0.01, {"F": 2}, ["pass", "pass", "fail", "pass", "pass"]),
+        (3.0, {}, ["fail"] * 5),
+        (0.01, {"C": 4, "F": -8}, ["fail", "pass", "fail", "fail", "fail"]),  # as if dispersion were left out
+    ],
+)
+def test_the_same_at_each_line_passes_and_a_mixture_is_seen(noise, shifts, verdicts, context, monkeypatch):
+    monkeypatch.setattr(spectral_lines, "ours", lambda line, size: stripe(1, noise, 0, line))
+    monkeypatch.setattr(spectral_lines, "theirs", lambda line, size: stripe(2, noise, shifts.get(line, 0), line))
+    rows = [row for task in spectral_lines.tasks(context) for row in task.run()]
+    assert [row.verdict for row in rows] == verdicts
+    assert (INCONCLUSIVE in rows[0].missed) == (noise > 1)
+    for error, verdict in NOT_DRAWN:
+        monkeypatch.setattr(spectral_lines, "theirs", raising(error))
+        assert spectral_lines.line_rows(context, "C")[0].verdict == verdict
+
+
+def test_the_scene_is_grey_its_glass_raysects_and_the_film_sees_what_shines(needs_variant):
+    """Indices as raysect 0.9 gave them; the sky is as bright as it is, in each line; another index is another image."""
+    for line, index in {"C": 1.775987679010179, "d": 1.7847198458559292, "F": 1.8064543854708786}.items():
+        assert float(media.index(spectral_lines.INDEX, media.LINES[line])) == pytest.approx(index, rel=1e-15)
+    plain = spectral_lines.plain(16)
+    colours = [colour for mesh in plain.meshes for colour in vars(mesh.material).values() if isinstance(colour, tuple)]
+    assert len(colours) == 3 and all(len(set(colour)) == 1 for colour in (*colours, plain.sky))
+    needs_variant(spectral_lines.VARIANT)
+    size = Size(32, 256, 1, 0.3)
+    one = {line: spectral_lines.ours(line, size) for line in "CF"}
+    for images in one.values():
+        assert images[0].pixels[0, 0, 0] == pytest.approx(plain.sky[0], rel=1e-3)
+    assert spectral_lines.compared(one["C"], one["F"], size)[0].verdict is Verdict.DIFFERENT
+    with pytest.raises(ValueError, match="expected 1"):
+        spectral_lines.spectral("<scene/>", 500.0)

@@ -4,39 +4,32 @@ import ast
 import hashlib
 import json
 import re
+import shutil
 import sys
-import time
 import zipfile
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from mi_refract import oracle
-from mi_refract.ray_sets import ray_set
+from mi_refract import oracle, regimes
+from mi_refract.ray_sets import ray_set, renderer_file
+from mi_refract.ray_sets.files import parse_answers
 from mi_refract.ray_sets.renderer_file import RaysCommand
 from validation import __main__ as command
 from validation import limits
-from validation.suite import per_ray
-from validation.suite.renderers import SYSTEMS, environments
-from validation.suite.renderers import table as TABLE
+from validation.run.context import PROFILES, Context
+from validation.suite import per_ray, rendered_images
+from validation.suite.per_ray import LARGE, TOTAL
+from validation.suite.renderers import SYSTEMS, System, environments
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
-from validation.suite.renderers.system import (
-    LARGE,
-    SCRIPTS,
-    TOTAL,
-    Apt,
-    Npm,
-    Pip,
-    System,
-)
+from validation.suite.renderers.system import SCRIPTS, SYSTEMS_FOLDER, Install, join
 
+QUICK, FULL = (Context(PROFILES[name], Path(), "llvm_ad_rgb", {}, {}) for name in ("quick", "full"))
 # The figures of those who write down GLSL's formula.
 PYGLM = next(call for call in SYSTEMS["pyglm"].calls if call.precision == "f64")
-RECORDED_F64 = {name: list(PYGLM.recorded_range(name)) for name in PYGLM.recorded}
-STANDARD, FULL = (SimpleNamespace(profile=SimpleNamespace(name=name)) for name in ("standard", "full"))
-# What every program below does right unless `{defect}` says otherwise.
+RECORDED = {name: list(PYGLM.recorded_range(name)) for name in PYGLM.recorded}
+# What every program below does right unless `before` or `after` spoil it.
 PROGRAM = f"""
 import os, sys, time
 sys.path.insert(0, {str(SCRIPTS)!r})
@@ -52,31 +45,23 @@ b = np.where(d < 0, 0, k * a - (k * c + np.sqrt(np.abs(d))) * n)
 table.write(rays, b, "a program 1.0")
 """
 DEFECTS = {
-    "index inverted": ("k = 1 / k", "", "wrong"),
-    "normal flipped": ("n = -n", "", "wrong"),
-    "precision lost": ("", "b = b.astype(np.float32)", "wrong"),
-    "no direction": ("", "b[7] = np.nan", "wrong"),
-    "nothing but zeros": ("", "b[:] = 0", "wrong"),
-    "a set left out": ("", "rays.ids, b = rays.ids[:40], b[:40]", "unfit"),
-    "an id missing": ("", "rays.ids, b = rays.ids[1:], b[1:]", "unfit"),
-    "an id twice": ("", "rays.ids, b = rays.ids[:1] + rays.ids, np.vstack([b[:1], b])", "unfit"),
-    "an id of nobody": ("", "rays.ids, b = rays.ids + ('9999',), np.vstack([b, b[:1]])", "unfit"),
-    "told by NaN": ("", "b = np.where(d < 0, np.nan, b)", "other TIR signal"),
-    "exception": ("raise RuntimeError('out of glass')", "", "unanswered"),
-    "killed": ("os.kill(os.getpid(), 9)", "", "unanswered"),
-    "hangs": ("time.sleep(1000)", "", "unanswered"),
-    "no output": ("sys.exit(0)", "", "unanswered"),
-    "words": ("print('refracting …')", "", "unanswered"),
-    "bytes": ("os.write(1, bytes([0xff, 0xfe, 0x00])); os._exit(0)", "", "unanswered"),
-    "cut short": ("", "print('id,bx,by,bz'); print('0,0.5,0.'); sys.exit(0)", "unanswered"),
-}
-BY_A_DRIVER = ("glsl", "materialx", "wgsl")
-REASONS = {
-    "exception": "ended with status 1: RuntimeError: out of glass",
-    "killed": "was killed by SIGKILL",
-    "bytes": "bytes that are not text",
-    "an id missing": "id 0",
-    "hangs": "did not end within 2 s",
+    "index inverted": ("k = 1 / k", "", "wrong", ""),
+    "precision lost": ("", "b = b.astype(np.float32)", "wrong", ""),
+    "no direction": ("", "b[7] = np.nan", "wrong", ""),
+    "a set left out": ("", "rays.ids, b = rays.ids[:40], b[:40]", "unfit", ""),
+    "an id missing": ("", "rays.ids, b = rays.ids[1:], b[1:]", "unfit", "id 0"),
+    "told by NaN": ("", "b = np.where(d < 0, np.nan, b)", "other TIR signal", ""),
+    "exception": (
+        "raise RuntimeError('out of glass')",
+        "",
+        "unanswered",
+        "ended with status 1: RuntimeError: out of glass",
+    ),
+    "killed": ("os.kill(os.getpid(), 9)", "", "unanswered", "was killed by SIGKILL"),
+    "hangs": ("time.sleep(1000)", "", "unanswered", "did not end within 2 s"),
+    "words": ("print('refracting …')", "", "unanswered", "the first row is"),
+    "bytes": ("os.write(1, bytes([0xff, 0xfe, 0])); os._exit(0)", "", "unanswered", "bytes that are not text"),
+    "cut short": ("", "print('id,bx,by,bz'); print('0,0.5,0.'); sys.exit(0)", "unanswered", "expected 4 numbers"),
 }
 
 
@@ -84,11 +69,11 @@ REASONS = {
 def rows_of(few, tmp_path):
     """`rows_of(before, after)`: what the study makes of such a program."""
 
-    def run(before="", after="", recorded_error=RECORDED_F64, gives_up=0.0):
+    def run(before="", after="", recorded=RECORDED, gives_up=0.0):
         path = tmp_path / "program.py"
         path.write_text(PROGRAM.format(before=before, after=after))
-        call = RaysCommand("a program", "f64", ("{python}", str(path)), "zero", gives_up, recorded=recorded_error)
-        return per_ray.call_rows(System("a", "A", "none", None, 0, small=True), call, STANDARD)
+        call = RaysCommand("a program", "f64", ("{python}", str(path)), "zero", gives_up, recorded=recorded)
+        return per_ray.call_rows(System("a", "A"), call, QUICK)
 
     return run
 
@@ -96,149 +81,152 @@ def rows_of(few, tmp_path):
 # The study -----------------------------------------------------------------------------------------------------
 
 
-def test_right_answers_pass_and_say_who_gave_them(rows_of):
+def test_right_answers_pass_and_a_small_error_of_the_normal_misses_a_goal(rows_of):
     rows = rows_of()
     assert [(row.case, row.verdict) for row in rows] == [(name, "pass") for name in per_ray.SETS]
     assert all(row.reason == "a program 1.0; total internal reflection: zero" for row in rows)
     assert all("worst rad" in row.values for row in rows if row.case != TOTAL)
-
-
-@pytest.mark.parametrize("name", DEFECTS)
-def test_a_broken_program_fails_for_its_reason(name, rows_of, monkeypatch):
-    before, after, metric = DEFECTS[name]
-    if name == "hangs":
-        monkeypatch.setattr(environments, "TIMEOUT", 2.0)
-    rows = rows_of(before, after)
-    failing = [row for row in rows if row.verdict == "fail"]
-    assert failing and any(metric in row.broken for row in failing)
-    if metric == "unanswered":
-        assert len(rows) == 1 and rows[0].reason and "\n" not in rows[0].reason
-    if metric == "unfit":
-        assert all(row.verdict == "fail" for row in rows), "answers to other rays say nothing of any set"
-    assert REASONS.get(name, "") in rows[0].reason
-
-
-def test_what_cannot_run_here_is_not_run(rows_of):
-    (row,) = rows_of("print('no driver', file=sys.stderr); sys.exit(77)")
-    assert (row.verdict, row.reason) == ("not run", "cannot run here: no driver")
-
-
-def test_a_recorded_error_is_a_goal_on_both_sides(rows_of):
-    much, little = (dict.fromkeys(RECORDED_F64, x) for x in (1e-2, 1e-30))
-    for recorded_error in (much, little):
-        rows = [row for row in rows_of(recorded_error=recorded_error) if row.case in RECORDED_F64]
-        assert all(row.missed == {per_ray.OFF_RECORDED: limits.RECORDED} and row.verdict == "pass" for row in rows)
-    assert [per_ray.off(x, 2, 4) for x in (1, 2, 3, 4, 8)] == [2, 1, 1, 1, 2]
-    assert per_ray.off(0, 2, 4) == np.inf and np.isnan(per_ray.off(np.nan, 2, 4))
-
-
-def test_the_textbook_is_right_but_where_k_is_large(rows_of):
-    missed = {row.case for row in rows_of() if per_ray.BACKWARD in row.missed}
-    assert missed == {LARGE}
+    assert {row.case for row in rows if per_ray.BACKWARD in row.missed} == {LARGE}
     off = rows_of("n = n + 2e-15 * np.cross(n, a)")  # within the bound all the same
     assert {row.verdict for row in off} == {"pass"}
     assert {row.case for row in off if per_ray.BACKWARD in row.missed} >= {"random", "near-critical", LARGE}
 
 
-def test_what_a_system_gives_up_is_counted_and_no_more_than_that(rows_of):
+@pytest.mark.parametrize("name", DEFECTS)
+def test_a_broken_program_fails_for_its_reason(name, rows_of, monkeypatch):
+    before, after, metric, reason = DEFECTS[name]
+    if name == "hangs":
+        monkeypatch.setattr(environments, "TIMEOUT", 2.0)
+    rows = rows_of(before, after)
+    assert any(metric in row.broken for row in rows) and reason in rows[0].reason and "\n" not in rows[0].reason
+    if metric in ("unanswered", "unfit"):  # answers to other rays say nothing of any set
+        assert {row.verdict for row in rows} == {"fail"} and (len(rows) == 1) == (metric == "unanswered")
+
+
+def test_what_a_system_gives_up_is_counted_and_recorded_errors_are_goals_on_both_sides(rows_of):
     early = "", "b[np.abs(d[:, 0]) < 1e-4] = 0"
-    assert any(row.verdict == "fail" for row in rows_of(*early))
-    rows = rows_of(*early, gives_up=1.01e-4)
-    assert {row.verdict for row in rows} == {"pass"}
-    assert sum(row.values["given up"] for row in rows) > 0
     assert any(row.verdict == "fail" for row in rows_of(*early, gives_up=1e-5))
+    rows = rows_of(*early, gives_up=1.01e-4)
+    assert {row.verdict for row in rows} == {"pass"} and sum(row.values["given up"] for row in rows) > 0
+    for value in (1e-2, 1e-30):
+        rows = [row for row in rows_of(recorded=dict.fromkeys(RECORDED, value)) if row.case in RECORDED]
+        assert all(row.missed == {per_ray.OFF_RECORDED: limits.RECORDED} and row.verdict == "pass" for row in rows)
+    assert [per_ray.off(x, 2, 4) for x in (1, 2, 3, 4, 8)] == [2, 1, 1, 1, 2]
+    assert per_ray.off(0, 2, 4) == np.inf and np.isnan(per_ray.off(np.nan, 2, 4))
+
+
+def test_what_is_absent_large_or_cannot_run_here_is_not_run(rows_of, tmp_path, monkeypatch):
+    (row,) = rows_of("print('no driver', file=sys.stderr); sys.exit(77)")
+    assert (row.verdict, row.reason) == ("not run", "cannot run here: no driver")
+    with pytest.raises(environments.Unable, match="no no-such-program in PATH"):
+        environments.ask(System("a", "A"), ("no-such-program",))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    (row,) = per_ray.call_rows(SYSTEMS["pyglm"], PYGLM, FULL)
+    assert (row.verdict, row.reason) == ("not run", "python -m validation renderers --install pyglm")
+    monkeypatch.setattr(environments, "absent", lambda system: "")
+    large = SYSTEMS["optiland"]
+    (row,) = per_ray.call_rows(large, large.calls[0], QUICK)
+    assert row.verdict == "not run" and "full profile" in row.reason
 
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
-def test_the_sets_are_what_they_say(precision, few):
+def test_the_sets_are_what_they_say_and_the_random_rays_those_of_before_any_result(precision, few):
     rays = per_ray.given(precision)
     exact = oracle.refract(rays.rays.a, rays.rays.n, rays.rays.k, fresnel=False, progress=False)
     through = {name: exact.transmitted[rays.regime == name].mean() for name in per_ray.SETS}
-    assert (through["grazing"], through[TOTAL]) == (1, 0)
-    assert through["near-critical"] > 0.9, "rounding may put a ray on the other side"
+    assert (through["grazing"], through[TOTAL]) == (1, 0) and through["near-critical"] > 0.9
     assert ray_set.with_checksum(rays).header == rays.header
+    rng, dtype, count = np.random.default_rng([2040, 0]), ray_set.PRECISIONS[precision], 40
+    n = regimes.normalised(rng.normal(size=(count, 3))).astype(dtype)
+    cosine, k = rng.uniform(0, 1, count), 1.5 ** rng.choice([-1.0, 1.0], count)
+    rays = rays.rays[rays.regime == "random"]
+    behind = (rays.a * n).sum(1, keepdims=True) > 0  # there the normal is turned: all face the ray
+    np.testing.assert_array_equal(rays.n, np.where(behind, -n, n))
+    np.testing.assert_array_equal(rays.k, k.astype(dtype))
+    np.testing.assert_allclose(np.abs((rays.a * n).sum(1)), cosine, atol=8 * np.finfo(dtype).eps)
 
 
-def test_the_built_in_runs_and_is_right(few):
-    for call in SYSTEMS["mitsuba"].calls:
-        rows = per_ray.call_rows(SYSTEMS["mitsuba"], call, STANDARD)
-        assert [row.verdict for row in rows] == ["pass"] * len(per_ray.SETS), call.title
-
-
-def test_this_package_is_right_in_every_set(few, needs_variant):
-    needs_variant("llvm_ad_rgb")
-    for call in SYSTEMS["mi_refract"].calls:
-        rows = per_ray.call_rows(SYSTEMS["mi_refract"], call, STANDARD)
-        assert [(row.case, row.verdict, row.missed) for row in rows] == [(name, "pass", {}) for name in per_ray.SETS]
-        assert max(row.values[per_ray.BACKWARD] for row in rows) < 1
-
-
-@pytest.mark.parametrize("name", [name for name, system in SYSTEMS.items() if system.small and system.needs])
-def test_small_systems_that_are_installed_are_right(name, few):
+@pytest.mark.parametrize(
+    "name", [name for name, x in SYSTEMS.items() if x.calls and (not x.install or x.install.small)]
+)
+def test_small_systems_that_are_installed_are_right(name, few, needs_variant):
+    """Those of a driver may find none."""
     if reason := environments.absent(SYSTEMS[name]):
         pytest.skip(reason)
-    rows = [row for call in SYSTEMS[name].calls for row in per_ray.call_rows(SYSTEMS[name], call, STANDARD)]
-    assert {row.verdict for row in rows} <= ({"pass", "not run"} if name in BY_A_DRIVER else {"pass"})
+    if name == "mi_refract":
+        needs_variant("llvm_ad_rgb")
+    rows = [row for call in SYSTEMS[name].calls for row in per_ray.call_rows(SYSTEMS[name], call, QUICK)]
+    assert {row.verdict for row in rows} - ({"not run"} if name in ("glsl", "materialx", "wgsl") else set()) == {"pass"}
+    if name == "mi_refract":
+        assert max(row.values[per_ray.BACKWARD] for row in rows) < 1 and not any(row.missed for row in rows)
 
 
-# Environments --------------------------------------------------------------------------------------------------
+def textbook(a, n, k):
+    """k a − (k c + √(1 − k²(1 − c²))) n of vectors of any length; NaN where the radicand is negative."""
+    k, c = k[:, None], (a * n).sum(1, keepdims=True)
+    radicand = 1 - k * k * (1 - c * c)
+    return k * a - (k * c + np.sqrt(np.where(radicand < 0, np.nan, radicand))) * n
 
 
-@pytest.fixture
-def elsewhere(tmp_path, monkeypatch):
-    locks = tmp_path / "locks"
-    (locks / "thing").mkdir(parents=True)
-    for name in ("thing.txt", "pinned.txt", "thing/package.json", "thing/package-lock.json"):
-        (locks / name).write_text("{}" if "json" in name else f"mi-refract-no-such-thing==1 --hash=sha256:{'0' * 64}")
-    for lock in environments.LOCKS.glob("*.txt"):
-        (locks / lock.name).write_bytes(lock.read_bytes())
-    monkeypatch.setattr(environments, "LOCKS", locks)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    return tmp_path / "mi_refract" / "renderers"
+# What a system does, by what is said of it, of the ray a, the normal n and the two indices.
+MEANINGS = {
+    "takes vectors of any length as they are": lambda a, n, n_from, n_to: textbook(a, n, n_from / n_to),
+    "takes the index that a ray leaves from its speed 1/n, not from the medium": lambda a, n, n_from, n_to: textbook(
+        a / np.linalg.norm(a, axis=1, keepdims=True), n, n_from / np.linalg.norm(a, axis=1) / n_to
+    ),
+}
+OF_LENGTHS = [(name, call) for name, system in SYSTEMS.items() for call in system.calls if call.lengths]
 
 
-def test_an_absent_system_is_not_run_and_says_what_brings_it(elsewhere):
-    system = SYSTEMS["pyglm"]
-    assert environments.folder(system) == elsewhere / "pyglm"
-    (row,) = per_ray.call_rows(system, system.calls[0], FULL)
-    assert (row.verdict, row.reason) == ("not run", "python -m validation renderers --install pyglm")
+@pytest.mark.parametrize(("name", "call"), OF_LENGTHS)
+def test_vectors_of_other_lengths_are_treated_as_the_table_says(name, call):
+    """Answers to rays twice as long, and to normals where these count, agree with that meaning only."""
+    assert {call.lengths for _, call in OF_LENGTHS} == set(MEANINGS)
+    if reason := environments.absent(SYSTEMS[name]):
+        pytest.skip(reason)
+    a, n = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in np.random.default_rng(7).normal(size=(2, 60, 3)))
+    n = np.where((a * n).sum(1, keepdims=True) > 0, -n, n)
+    n_from = np.where(np.arange(60) % 2, 1.5, 1.0)
+    agreeing = set(MEANINGS)
+    for a_by, n_by in ((1, 1), (2, 1), (1, 2) if call.lengths.startswith("takes vectors") else (0.5, 1)):
+        given = a_by * a, n_by * n, n_from, 2.5 - n_from
+        rows = (",".join(map(repr, (i, *row))) for i, row in enumerate(np.column_stack(given).tolist()))
+        text = "\n".join(["id,ax,ay,az,nx,ny,nz,n_from,n_to", *rows])
+        try:
+            b = parse_answers(environments.ask(SYSTEMS[name], call.command, text), call.title).b
+        except environments.Unable as reason:
+            pytest.skip(f"cannot run here: {reason}")
+        for meaning in sorted(agreeing):
+            expected = MEANINGS[meaning](*given)
+            through = np.isfinite(expected[:, 0])
+            if not np.allclose(b[through], expected[through], atol=1e-4 if call.precision == "f32" else 1e-12):
+                agreeing.discard(meaning)
+    assert agreeing == {call.lengths}
 
 
-def test_large_systems_wait_for_the_full_profile(monkeypatch):
-    monkeypatch.setattr(environments, "absent", lambda system: "")
-    large = [system for system in SYSTEMS.values() if not system.small and system.calls]
-    for system in large:
-        (row,) = per_ray.call_rows(system, system.calls[0], STANDARD)
-        assert row.verdict == "not run" and "full profile" in row.reason
+# The table of systems ------------------------------------------------------------------------------------------
 
 
-def test_every_system_has_a_place_a_licence_and_scripts():
-    assert all(name == system.name and name.isidentifier() for name, system in SYSTEMS.items())
+def test_every_system_has_a_place_a_licence_scripts_and_packages_pinned_by_hashes():
     drawing = {renderer.system for renderer in IMAGE_RENDERERS.values()}
-    assert all(system.calls or name in drawing for name, system in SYSTEMS.items())
-    assert all(system.licence and system.title for system in SYSTEMS.values())
-    commands = [command for system in SYSTEMS.values() for command in (*(c.command for c in system.calls), system.lens)]
-    assert all((TABLE.SYSTEMS_FOLDER / "any" / word).resolve().is_file() for c in commands for word in c[1:2])
-    needs = [system.needs for system in SYSTEMS.values() if isinstance(system.needs, Pip)]
-    assert all(re.match(f"{each.built or '.+'}==", each.requirements[0]) for each in needs)
-
-
-def test_every_package_is_pinned_by_hashes_and_no_script_of_one_runs():
-    for system in SYSTEMS.values():
-        if isinstance(system.needs, Pip):
-            locks = [environments.locked(system), *([environments.locked_source(system)] if system.needs.built else [])]
-            text = "".join(lock.read_text() for lock in locks).replace("\\\n", "")
-            lines = [line for line in text.splitlines() if line and not line.startswith("#")]
+    for name, system in SYSTEMS.items():
+        assert name == system.name and name.isidentifier() and system.licence and system.title
+        assert system.calls or name in drawing
+        for words in (*(call.command for call in system.calls), system.lens):
+            assert all((system.folder / word).resolve().is_file() for word in words[1:2])
+        install = system.install
+        if install and install.pip:
+            lines = environments.locked(system).read_text().replace("\\\n", "").splitlines()
+            lines = [line for line in lines if line and not line.startswith("#")]
             assert all(re.match(r"[\w.-]+==[\w.]+( ; [^#]+?)?( +--hash=sha256:[0-9a-f]{64})+$", line) for line in lines)
             pinned = {line.split()[0].lower() for line in lines}
-            assert {each.lower() for each in system.needs.requirements if "==" in each} <= pinned, system.name
-            bare = {re.split("[=<]", each)[0].lower() for each in system.needs.requirements}
+            assert "==" in install.pip[0] and {each.lower() for each in install.pip if "==" in each} <= pinned
+            bare = {re.split("[=<]", each)[0].lower() for each in install.pip}
             assert bare <= {each.partition("==")[0] for each in pinned}
-        if isinstance(system.needs, Npm):
-            folder = environments.locked(system)
-            asked = json.loads((folder / "package.json").read_text())["dependencies"]
-            assert {f"{name}@{version}" for name, version in asked.items()} == {*system.needs.packages}
-            packages = json.loads((folder / "package-lock.json").read_text())["packages"]
+        if install and install.npm:
+            asked = json.loads((environments.locked(system) / "package.json").read_text())["dependencies"]
+            assert {f"{name}@{version}" for name, version in asked.items()} == {*install.npm}
+            packages = json.loads((environments.locked(system) / "package-lock.json").read_text())["packages"]
             assert packages.pop("")["dependencies"] == asked
             assert all(each["integrity"].startswith("sha512-") for each in packages.values())
 
@@ -252,7 +240,7 @@ def test_scripts_import_nothing_of_ours_and_we_nothing_of_theirs():
 
     root = SCRIPTS.parents[3]
     theirs = {"bpy", "glm", "moderngl", "optiland", "pyluxcore", "pyradiance", "rayoptics", "raysect"}
-    theirs |= {"MaterialX", "batoid", "prysm", "pyoptools", "raylib", "skia", "slangpy", "taichi", "wgpu"}
+    theirs |= {"MaterialX", "batoid", "slangpy", "wgpu"}
     scripts = {*SCRIPTS.glob("*.py"), *(root / "mi_refract" / "scene_export" / "targets").glob("render_*.py")}
     assert len(scripts) > 9
     for path in scripts - {SCRIPTS / "own_rays.py"}:  # this package is what it runs
@@ -262,58 +250,75 @@ def test_scripts_import_nothing_of_ours_and_we_nothing_of_theirs():
         assert not imported(path) & (theirs | {path.stem for path in scripts}), path.name
 
 
-# The command ---------------------------------------------------------------------------------------------------
+def test_what_scripts_share(monkeypatch):
+    """Frames are rotations onto the normal; things apart are in no row."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    import table
+
+    n = np.vstack([np.eye(3), -np.eye(3), np.random.default_rng(3).normal(size=(1000, 3))])
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    frames = table.frames(n)
+    np.testing.assert_array_equal(frames[:, :, 2], n)
+    np.testing.assert_allclose(np.swapaxes(frames, 1, 2) @ frames, np.broadcast_to(np.eye(3), frames.shape), atol=1e-15)
+    np.testing.assert_allclose(np.linalg.det(frames), 1, atol=1e-15)
+    places = table.apart(range(200))
+    assert all(len(np.unique(places[:, axis])) == len(places) for axis in range(3))
+    gaps = np.linalg.norm(places[:, None] - places, axis=2)[~np.eye(len(places), dtype=bool)]
+    assert gaps.min() > 0.5 - 1e-9
 
 
-def one_line(captured):
-    (line,) = captured.err.strip().splitlines()
-    assert not captured.out
-    return line
+# Installing ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("arguments", [["--install", "blendr"], ["--instal"], ["--list", "--install", "pyglm"]])
-def test_misuse_is_one_line(arguments, capsys):
-    try:
-        code = command.main(["renderers", *arguments])
-    except SystemExit as end:
-        code = end.code
-    assert code == 2 and one_line(capsys.readouterr()).startswith("validation renderers: ")
+@pytest.fixture
+def elsewhere(tmp_path, monkeypatch):
+    """Another cache, and other locks for the system `thing`."""
+    locks = tmp_path / "locks"
+    (locks / "thing").mkdir(parents=True)
+    for name in ("thing.txt", "thing/package.json", "thing/package-lock.json"):
+        (locks / name).write_text("{}" if "json" in name else f"mi-refract-no-such-thing==1 --hash=sha256:{'0' * 64}")
+    for lock in environments.LOCKS.glob("*.txt"):
+        (locks / lock.name).write_bytes(lock.read_bytes())
+    monkeypatch.setattr(environments, "LOCKS", locks)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
 
 
-def test_the_list_says_what_is_there(elsewhere, capsys, monkeypatch):
-    monkeypatch.setattr("shutil.which", lambda program: None)
+def thing(**needs):
+    return System("thing", "Thing", install=Install(1, **needs))
+
+
+def test_the_list_says_what_is_there_and_misuse_is_one_line(elsewhere, capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
     assert command.main(["renderers"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == list(SYSTEMS)
-    assert [line.split()[1] for line in lines] == [
-        "installed" if s.needs is None else "absent" for s in SYSTEMS.values()
-    ]
+    lines = [line.split()[:2] for line in capsys.readouterr().out.splitlines()]
+    assert lines == [[name, "absent" if system.install else "installed"] for name, system in SYSTEMS.items()]
+    for arguments in (["--install", "blendr"], ["--list", "--install", "pyglm"]):
+        assert command.main(["renderers", *arguments]) == 2
+        out, err = capsys.readouterr()
+        assert (out, err.count("\n")) == ("", 1) and err.startswith("validation renderers: ")
 
 
 @pytest.mark.parametrize(
     ("needs", "said"),
     [
-        (Pip(("mi-refract-no-such-thing==1",)), "mi-refract-no-such-thing==1"),
-        (Pip(("numpy",), python="2.7"), "needs Python 2.7; expected a python2.7 in PATH"),
-        (Npm(("mi-refract-no-such-thing@1",)), "npm"),
-        (Apt("no-such-program", ("mi-refract-no-such-thing",)), "apt-get"),
+        ({"pip": ("mi-refract-no-such-thing==1",)}, "mi-refract-no-such-thing==1"),
+        ({"pip": ("numpy",), "python": "2.7"}, "needs Python 2.7; expected a python2.7 in PATH"),
+        ({"npm": ("mi-refract-no-such-thing@1",)}, "npm"),
+        ({"apt": ("mi-refract-no-such-thing",), "program": "no-such-program"}, "apt-get"),
     ],
 )
 def test_an_installation_that_fails_is_one_line_and_leaves_the_system_absent(
     needs, said, elsewhere, monkeypatch, capsys, tmp_path
 ):
-    monkeypatch.setitem(SYSTEMS, "thing", System("thing", "Thing", "none", needs, 0))
-    monkeypatch.setenv("PIP_NO_INDEX", "1")
-    programs = tmp_path / "bin"
-    programs.mkdir()
+    monkeypatch.setitem(SYSTEMS, "thing", thing(**needs))
     for name in ("npm", "apt-get", "sudo"):
-        (programs / name).write_text("#!/bin/sh\necho working\necho nothing of that name >&2\nexit 1\n")
-        (programs / name).chmod(0o755)
-    monkeypatch.setenv("PATH", str(programs))
+        (tmp_path / name).write_text("#!/bin/sh\necho working\necho nothing of that name >&2\nexit 1\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
     assert command.main(["renderers", "--install", "thing"]) == 1
-    first, *rest = capsys.readouterr().err.strip().splitlines()
-    assert first.startswith("thing: ") and len(rest) == 1
-    assert rest[0].startswith("validation renderers: thing: ") and said in rest[0]
+    first, second = capsys.readouterr().err.strip().splitlines()
+    assert first.startswith("thing: ") and second.startswith("validation renderers: thing: ") and said in second
     assert environments.absent(SYSTEMS["thing"])
 
 
@@ -321,10 +326,10 @@ def test_another_version_of_a_distribution_is_absent_and_not_installed(elsewhere
     def program(name, text):
         (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
         (tmp_path / name).chmod(0o755)
-        environments._said_version.cache_clear()
 
     monkeypatch.setenv("PATH", f"{tmp_path}:/bin")
-    assert SYSTEMS["povray"].needs.packages == (f"povray=1:{SYSTEMS['povray'].needs.version}-*",)
+    install = SYSTEMS["povray"].install
+    assert install.apt == (f"povray=1:{install.version}-*",)
     for version, here in (("3.7.0.10.unofficial", True), ("3.7.0.8", False)):
         program("povray", f"echo POV-Ray {version} >&2")
         assert bool(environments.absent(SYSTEMS["povray"])) != here
@@ -333,30 +338,29 @@ def test_another_version_of_a_distribution_is_absent_and_not_installed(elsewhere
     program("apt-cache", "echo 'povray | 1:3.7.0.8-5 | http://deb.debian.org/debian bullseye/main amd64 Packages'")
     assert command.main(["renderers", "--install", "povray"]) == 1
     _, line = capsys.readouterr().err.strip().splitlines()
-    assert "'1:3.7.0.10-*' for 'povray' was not found" in line
-    assert line.endswith("; this distribution has povray 1:3.7.0.8-5")
+    assert "'1:3.7.0.10-*' for 'povray' was not found; this distribution has povray 1:3.7.0.8-5" in line
 
 
 def test_an_installation_is_made_once_and_anew_for_another_version(elsewhere, monkeypatch):
     done = []
     monkeypatch.setattr(environments, "run", lambda command, **options: done.append(command) or "")
-    first, second = (System("thing", "Thing", "none", Pip((f"a=={i}",)), 0) for i in (1, 2))
+    first, second = (thing(pip=(f"a=={i}",)) for i in (1, 2))
     for system, commands in ((first, 2), (first, 2), (second, 4)):
         environments.install(system)
         assert len(done) == commands and not environments.absent(system)
     assert environments.absent(first)
     assert all({"--require-hashes", "--only-binary", "--no-deps"} < {*given} for given in done[1::2])
-    assert all(given[-2:] == ["--requirement", str(environments.locked(first))] for given in done[1::2])
+    assert all(given[-2:] == ("--requirement", str(environments.locked(first))) for given in done[1::2])
     marker = environments.folder(second) / "installed.json"
+    whole = marker.read_text()
     for text in ('["no such"]', "{", ""):
-        whole = marker.read_text()
         marker.write_text(text)
         assert environments.absent(second)
-        marker.write_text(whole)
+    marker.write_text(whole)
     environments.locked(first).write_text("another lock")
     assert environments.absent(second)
-    environments.install(System("thing", "Thing", "none", Npm(("a@1",)), 0))
-    assert done[-1][:2] == ["npm", "ci"] and "--ignore-scripts" in done[-1]
+    environments.install(thing(npm=("a@1",)))
+    assert done[-1][:2] == ("npm", "ci") and "--ignore-scripts" in done[-1]
 
 
 def test_pip_refuses_a_package_without_or_with_another_hash(elsewhere, tmp_path, monkeypatch):
@@ -367,45 +371,100 @@ def test_pip_refuses_a_package_without_or_with_another_hash(elsewhere, tmp_path,
         file.writestr("thing-1.dist-info/METADATA", "Metadata-Version: 2.1\nName: thing\nVersion: 1\n")
         file.writestr("thing-1.dist-info/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
         file.writestr("thing-1.dist-info/RECORD", "")
-    monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
-    system = System("thing", "Thing", "none", Pip(("thing==1",)), 0)
-    right = hashlib.sha256(wheel.read_bytes()).hexdigest()
+    system = thing(pip=("thing==1",))
     for line in (f"thing==1 --hash=sha256:{'0' * 64}", "thing==1"):
         environments.locked(system).write_text(line)
         with pytest.raises(OSError, match="thing: "):
             environments.install(system)
         assert environments.absent(system)
+    right = hashlib.sha256(wheel.read_bytes()).hexdigest()
     environments.locked(system).write_text(f"thing==1 --hash=sha256:{right}")
     environments.install(system)
     assert not environments.absent(system)
 
 
-# Programs ------------------------------------------------------------------------------------------------------
-
-
-def test_a_program_that_hangs_takes_its_children_with_it(tmp_path):
-    where = tmp_path / "child"
-    child = f"p = subprocess.Popen(['sleep', '1000']); open({str(where)!r}, 'w').write(str(p.pid))"
-    hangs = [sys.executable, "-c", f"import subprocess, time; {child}; time.sleep(1000)"]
-    for timeout in (3, 60):  # a busy machine may not even have started it in the shorter time
-        with pytest.raises(environments.Broken, match=f"did not end within {timeout} s"):
-            environments.run(hangs, "", timeout)
-        if where.exists():
-            break
-    status = Path(f"/proc/{where.read_text()}/status")
-    until = time.monotonic() + 60
-    while status.exists() and "zombie" not in status.read_text() and time.monotonic() < until:
-        time.sleep(0.05)
-    assert not status.exists() or "zombie" in status.read_text()
-
-
-def test_programs_run_without_our_environment(monkeypatch):
+def test_programs_run_without_our_environment_and_one_that_is_not_there_is_broken(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(SCRIPTS))
     asked = "import os, sys; print(os.environ.get('PYTHONPATH'), sys.stdin.read())"
     assert environments.run([sys.executable, "-c", asked], given="rays") == "None rays\n"
-
-
-def test_a_program_that_is_not_there_is_broken():
     with pytest.raises(environments.Broken, match="no-such-program: No such file"):
         environments.run(["no-such-program"])
+
+
+# `--renderer FOLDER`: a stranger's renderer -----------------------------------------------------------------------
+
+TOML = """title = "Mine"
+[[rays]]
+title = "Mine, refract"
+precision = "f64"
+command = ["{python}", "program.py"]
+total_internal_reflection = "zero"
+"""
+IMAGES = """[images]
+export = "mitsuba"
+command = ["{python}", "render.py", "{scene}", "{spp}", "{seed}", "{image}"]
+spp = { sphere = 64 }
+"""
+RENDER = """import sys
+scene, spp, seed, image = sys.argv[1:]
+import mitsuba as mi
+mi.set_variant("scalar_rgb")
+mi.Bitmap(mi.render(mi.load_file(f"{scene}/scene.xml", bsdf="dielectric"), spp=int(spp), seed=int(seed))).write(image)
+"""
+
+
+@pytest.fixture
+def mine(tmp_path):
+    """`mine(toml, before)`: the folder of a renderer; the tables are as they were when the test ends."""
+    tables = SYSTEMS, IMAGE_RENDERERS
+    before = [dict(table) for table in tables]
+
+    def made(toml=TOML, after=""):
+        folder = tmp_path / "mine"
+        folder.mkdir(exist_ok=True)
+        (folder / renderer_file.NAME).write_text(toml)
+        (folder / "program.py").write_text(PROGRAM.format(before="", after=after))
+        (folder / "render.py").write_text(RENDER)
+        return folder
+
+    yield made
+    for now, then in zip(tables, before, strict=True):
+        now.clear()
+        now.update(then)
+
+
+def test_a_renderer_that_joins_is_judged_as_every_other_one(mine, few, monkeypatch, needs_variant, tmp_path):
+    """By its rays and images; a known deviation is shown and must be seen."""
+    needs_variant("llvm_ad_rgb")
+    deviation = '[[rays.deviation]]\nregime = "grazing"\nreason = "lies flat"\n'
+    rendered_images.join(join(mine(TOML + deviation + IMAGES)))
+    context = Context(PROFILES["quick"], tmp_path, "llvm_ad_rgb", {}, {})
+    (task,) = (task for task in per_ray.tasks(context) if "Mine" in task.name)
+    rows = {row.case: row for row in task.run()}
+    flat = rows.pop("grazing")
+    assert {row.verdict for row in rows.values()} == {"pass"} and flat.replay["version"] == "a program 1.0"
+    assert flat.broken == {"not seen to deviate": 0.0} and "known to deviate: lies flat" in flat.reason
+    mine(TOML + deviation + IMAGES, "b[np.abs(c[:, 0]) < 0.02] = a[np.abs(c[:, 0]) < 0.02]")
+    flat = {row.case: row for row in task.run()}["grazing"]
+    assert flat.verdict == "pass" and flat.values["wrong"] > 0
+    monkeypatch.setitem(rendered_images.SIZES, "quick", rendered_images.Size(16, 64, 1, 0.5))
+    (row,) = rendered_images.pair_rows(context, "Mine", "sphere")
+    assert row.verdict == "pass" and row.replay["verdict"] in ("equal", "inconclusive") and row.replay["spp"] == 64
+
+
+def test_what_cannot_join_is_misuse_in_a_line(mine, tmp_path, capsys):
+    shutil.copytree(SYSTEMS_FOLDER / "pyglm", tmp_path / "pyglm")
+    for study, toml, said in (
+        ("suite", TOML + IMAGES.replace("mitsuba", "vray"), "images.export: 'vray'; expected "),
+        ("suite", TOML + IMAGES.replace("sphere", "teapot"), "images.spp, images.deviation: 'teapot'; expected sphere"),
+        ("suite", TOML + "[install]\nmegabytes = 1\npip = ['x']\ncargo = ['x']\n", "install: unknown key `cargo`"),
+        ("suite", TOML + "[install]\nmegabytes = 1\n", "install: expected one of pip, npm and apt"),
+        ("suite", None, "'pyglm' is already the name of a renderer"),
+        ("diff", TOML, "is used by the study `suite` only"),
+    ):
+        folder = mine(toml) if toml else tmp_path / "pyglm"
+        assert command.main([study, "--renderer", str(folder), "--out", str(tmp_path / "out")]) == 2
+        err = capsys.readouterr().err
+        assert said in err and err.count("\n") == 1
+        SYSTEMS.pop("mine", None)

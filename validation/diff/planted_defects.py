@@ -18,7 +18,6 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.image_diff import self_test
-from mi_refract.image_diff.defects import DEFECTS
 from mi_refract.plugins import PLUGIN, read_ior, refract
 from mi_refract.rendering.scene_files import REPRODUCIBLE
 from mi_refract.report.row import Row
@@ -106,7 +105,7 @@ NAME = self_test.STUDY
 TERMS = (
     self_test.TERMS
     | {name: text for name, (text, _) in GLASSES.items()}
-    | {name: defect.text for name, defect in DEFECTS.items()}
+    | {name: defect.text for name, defect in self_test.DEFECTS.items()}
     | {OTHER_SAMPLER: "multijitter: other random numbers, the same image"}
 )
 
@@ -204,7 +203,7 @@ def image_defect_rows(context: Context, name: str) -> list[Row]:
 
 def _image_defects(clean: list[self_test.Trial], name: str, context: Context) -> list[Row]:
     rows = []
-    for defect, planted in DEFECTS.items():
+    for defect, planted in self_test.DEFECTS.items():
         spoilt = [replace(trial, spoil=functools.partial(planted.spoil, trial.clean)) for trial in clean]
         rows.append(self_test.detection(defect, planted.always_due, spoilt, name, context.variant))
     return rows

@@ -73,7 +73,7 @@ SEED = 2026
 def tasks(context: Context) -> list[Task]:
     """One task per backend and precision."""
     return [
-        Task(f"directions: {setting.label}", functools.partial(_setting_rows, context, setting), timed=True)
+        Task(f"directions: {setting.label}", functools.partial(setting_rows, context, setting), timed=True)
         for setting in settings(context)
     ]
 
@@ -85,15 +85,16 @@ def certified(regime: str, count: int, precision: type) -> tuple[regimes.Rays, o
     return rays, oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
 
 
-def _setting_rows(context: Context, setting: Setting) -> list[Row]:
+def setting_rows(context: Context, setting: Setting) -> list[Row]:
+    """Every formula and Mitsuba's functions, the rounded exact answers, and the copy."""
     if setting.vector is None:
         return [Row(NAME, name, ALL, setting.label, reason=setting.reason) for name in (*FORMULAS, kernel_timing.COPY)]
     count = context.profile.scalar_rays if setting.is_scalar else context.profile.rays
     times = kernel_timing.measure(context, setting)
     rows = [_floor_row(regime, setting, count) for regime in regimes.REGIMES]
     for name, subject in setting.subjects.items():
-        parts = [_regime_row(name, subject, regime, setting, count) for regime in regimes.REGIMES]
-        rows += [*parts, _summary(name, parts, setting, times[name])]
+        parts = [regime_row(name, subject, regime, setting, count) for regime in regimes.REGIMES]
+        rows += [*parts, summary(name, parts, setting, times[name])]
     copying = Row(NAME, kernel_timing.COPY, ALL, setting.label, times[kernel_timing.COPY])
     return [*rows, copying]
 
@@ -102,7 +103,7 @@ def drawn_rows(context: Context) -> list[Row]:
     """Every formula in every regime, without times, in every compiled setting."""
     running = [s for s in settings(context) if s.vector is not None and not s.is_scalar]
     return [
-        _regime_row(name, subject, regime, setting, context.profile.rays)
+        regime_row(name, subject, regime, setting, context.profile.rays)
         for setting in running
         for name, subject in setting.subjects.items()
         for regime in regimes.REGIMES
@@ -118,7 +119,8 @@ def _floor_row(regime: str, setting: Setting, count: int) -> Row:
     return _row(FLOOR, regime, setting, rays, judge(b, exact.transmitted, bounds))
 
 
-def _regime_row(name: str, subject: Subject, regime: str, setting: Setting, count: int) -> Row:
+def regime_row(name: str, subject: Subject, regime: str, setting: Setting, count: int) -> Row:
+    """A formula on `count` rays of a regime."""
     rays, exact = certified(regime, count, setting.precision)
     found = judge_formula(subject, rays, exact, setting.vector, budget_of(name))
     return _row(name, regime, setting, rays, found, setting.no_budget(budget_of(name), regime))
@@ -129,14 +131,15 @@ def _row(name: str, regime: str, setting: Setting, rays: regimes.Rays, found: Ju
     """`reason`: why there is no budget. Then nothing is said of the share of it either."""
     u, some = setting.roundoff, found.compared.any()
     chord, angle, drift = (x[found.compared] if some else np.zeros(1) for x in (found.chord, found.angle, found.drift))
+    p99 = functools.partial(np.quantile, q=0.99, method="higher")  # one of the values, which may be infinite
     values = {
         WORST_IN_U: float(chord.max()) / u,
         **({} if reason else found.values()),
         WORST_CHORD: float(chord.max()),
-        "p99 / u": _p99(chord) / u,
+        "p99 / u": float(p99(chord)) / u,
         "mean / u": float(chord.mean()) / u,
         WORST_ANGLE: float(angle.max()),
-        "p99 rad": _p99(angle),
+        "p99 rad": float(p99(angle)),
         "mean rad": float(angle.mean()),
         "length drift": float(drift.max()),
         MISCLASSIFIED: float(found.misjudged.sum()),
@@ -155,12 +158,7 @@ def _row(name: str, regime: str, setting: Setting, rays: regimes.Rays, found: Ju
     return Row(NAME, name, regime, setting.label, values, budgets, reason=reason, replay=replay)
 
 
-def _p99(x: np.ndarray) -> float:
-    """What 99 of 100 stay below; one of the values, which may be infinite."""
-    return float(np.quantile(x, 0.99, method="higher"))
-
-
-def _summary(name: str, parts: list[Row], setting: Setting, times: dict[str, float]) -> Row:
+def summary(name: str, parts: list[Row], setting: Setting, times: dict[str, float]) -> Row:
     """The worst error over all regimes with a budget, and the time: a point in the plot of error against time."""
     parts = [row for row in parts if row.budgets]
     metrics = WORST_IN_U, ERROR_OVER_BOUND, WORST_CHORD, WORST_ANGLE, "length drift"
@@ -168,18 +166,14 @@ def _summary(name: str, parts: list[Row], setting: Setting, times: dict[str, flo
     values |= {m: sum(row.values[m] for row in parts) for m in (MISCLASSIFIED, MISCLASSIFIED_FAR, "other side")}
     budgets = {}
     if min(row.replay["count"] for row in parts) >= limits.SLACK_FROM_RAYS:
-        slack = _slack(name, parts)
+        # Each constant of the bound over the smallest one that these rays allow, with the other one unchanged.
+        constants = {"linear": budget_of(name).linear, "radicand": budget_of(name).radicand}
+        needed = {c: max(row.replay["needed"][c] for row in parts) for c in constants}
+        slack = {f"slack, {c}": x / max(needed[c], 1e-3 * x) for c, x in constants.items() if x}
         values, budgets = values | slack, dict.fromkeys(slack, limits.SLACK)
     replay = {"rays": sum(row.replay["count"] for row in parts), "seed": seeds.current(SEED)}
     goals = kernel_timing.goals(name, setting)
     return Row(NAME, name, ALL, setting.label, values | times, budgets, goals, replay=replay)
-
-
-def _slack(name: str, parts: list[Row]) -> dict[str, float]:
-    """Each constant of the bound over the smallest one that these rays allow, with the other one unchanged."""
-    constants = {"linear": budget_of(name).linear, "radicand": budget_of(name).radicand}
-    needed = {c: max(row.replay["needed"][c] for row in parts) for c in constants}
-    return {f"slack, {c}": x / max(needed[c], 1e-3 * x) for c, x in constants.items() if x}
 
 
 STUDY = Study(NAME, "Directions", about(__doc__), TERMS, tasks, scatter=SCATTER, again=drawn_rows)

@@ -32,26 +32,7 @@ import drjit as dr
 import numpy as np
 
 from validation.reference import closed_forms, optical_systems
-from validation.reference.optical_systems import (
-    ASKEW,
-    BK7,
-    BUBBLE,
-    NUDGE,
-    RADIUS,
-    THICKNESS,
-    WATER,
-    Answers,
-    Array,
-    Ball,
-    Boundary,
-    Path,
-    System,
-    degrees,
-    dot,
-    length,
-    nudged,
-    unit,
-)
+from validation.reference.optical_systems import ASKEW, BK7, Answers, Array, Boundary, Path, System, dot, length, unit
 from validation.run.context import SCENES
 
 U = 2.0**-24
@@ -87,9 +68,9 @@ class Bench:
         totals = {name: np.full(x.shape[:2], system.printed.get(name, 0), np.longdouble) for name, x in exact.items()}
         for (boundary, what), size in self.roundings().items():
             for way in range(3 if what == "place" else 2):
-                moved = system.off(system.path(moved=nudged(boundary, what, way)))
+                moved = system.off(system.path(moved=optical_systems.nudged(boundary, what, way)))
                 for name, total in totals.items():
-                    total += size / NUDGE * length(moved[name] - exact[name])[..., 0]
+                    total += size / optical_systems.NUDGE * length(moved[name] - exact[name])[..., 0]
         return totals
 
     @property
@@ -99,10 +80,12 @@ class Bench:
         def denser(j: int, what: str, x: Any, axis: Any) -> Any:
             if what != "index" or x == 1:
                 return x
-            return x * (1 + NUDGE) if x > 1 else x / (1 + NUDGE)
+            return x * (1 + optical_systems.NUDGE) if x > 1 else x / (1 + optical_systems.NUDGE)
 
         exact, wrong = self.system.off(self.system.path()), self.system.off(self.system.path(moved=denser))
-        ratios = [length(x - exact[name])[..., 0] / NUDGE / self.bounds[name] for name, x in wrong.items()]
+        ratios = [
+            length(x - exact[name])[..., 0] / optical_systems.NUDGE / self.bounds[name] for name, x in wrong.items()
+        ]
         return 1 / max(float(ratio.max()) for ratio in ratios)
 
     def traced(self, plugin: str, spawned: bool = False) -> Path:
@@ -165,24 +148,11 @@ def _placed(scale: Any = 1.0) -> Any:
     return mi.ScalarTransform4f(matrix.tolist())
 
 
-def _slab(plugin: str) -> list[dict[str, Any]]:
-    return [{"block": {"type": "cube", "to_world": _placed([60, 60, THICKNESS / 2]), "bsdf": glass(plugin, BK7)}}]
-
-
-def _prism(plugin: str) -> list[dict[str, Any]]:
-    file = {"type": "ply", "filename": str(SCENES / "meshes" / "prism.ply"), "face_normals": True}
-    return [{"prism": {**file, "to_world": _placed(), "bsdf": glass(plugin, BK7)}}]
-
-
-def _ball(index: Any, plugin: str) -> list[dict[str, Any]]:
-    return [{"ball": {"type": "sphere", "radius": RADIUS, "bsdf": glass(plugin, index)}}]
-
-
 def _ellipsoid(plugin: str) -> list[dict[str, Any]]:
     front, bubble = (boundary.surface for boundary in optical_systems.ellipsoid().boundaries)
-    assert isinstance(front, Ball) and isinstance(bubble, Ball)
+    assert isinstance(front, optical_systems.Ball) and isinstance(bubble, optical_systems.Ball)
     centre = (bubble.centre[0] @ ASKEW).astype(float).tolist()
-    inner = {"type": "sphere", "center": centre, "radius": BUBBLE, "bsdf": glass(plugin, 1, BK7)}
+    inner = {"type": "sphere", "center": centre, "radius": optical_systems.BUBBLE, "bsdf": glass(plugin, 1, BK7)}
     group = {"type": "shapegroup", "shape": {"type": "sphere", "bsdf": glass(plugin, BK7)}}
     stretched = {"type": "instance", "group": {"type": "ref", "id": "ball"}, "to_world": _placed(front.axes[0])}
     return [{"ball": group, "front": stretched, "bubble": inner}]
@@ -210,16 +180,29 @@ def _double_gauss(plugin: str) -> list[dict[str, Any]]:
 def benches() -> dict[str, Bench]:
     """All of them, by name."""
     down = np.linspace(0.3, 0.6, optical_systems.RAYS)
-    least = optical_systems.prism(APEX, closed_forms.least_deviated(APEX, BK7) + 0 * degrees(0, 1), down)
-    drops = {order: optical_systems.drop(order, degrees(2, 80)) for order in (1, 2)}
-    ball, water = functools.partial(_ball, BK7), functools.partial(_ball, WATER)
+    least = optical_systems.prism(
+        APEX, closed_forms.least_deviated(APEX, BK7) + 0 * optical_systems.degrees(0, 1), down
+    )
+    mesh = {"type": "ply", "filename": str(SCENES / "meshes" / "prism.ply"), "face_normals": True}
+
+    def slab(plugin: str) -> list[dict[str, Any]]:
+        block = {"type": "cube", "to_world": _placed([60, 60, optical_systems.THICKNESS / 2])}
+        return [{"block": block | {"bsdf": glass(plugin, BK7)}}]
+
+    def prism(plugin: str) -> list[dict[str, Any]]:
+        return [{"prism": mesh | {"to_world": _placed(), "bsdf": glass(plugin, BK7)}}]
+
+    def ball(plugin: str, index: Any = BK7) -> list[dict[str, Any]]:
+        return [{"ball": {"type": "sphere", "radius": optical_systems.RADIUS, "bsdf": glass(plugin, index)}}]
+
+    drop = functools.partial(ball, index=optical_systems.WATER)
     return {
-        "slab": Bench(optical_systems.slab(85), _slab),
-        "prism, least deviation": Bench(least, _prism),
-        "prism, 32 … 85°": Bench(optical_systems.prism(APEX, degrees(32, 85)), _prism),
+        "slab": Bench(optical_systems.slab(85), slab),
+        "prism, least deviation": Bench(least, prism),
+        "prism, 32 … 85°": Bench(optical_systems.prism(APEX, optical_systems.degrees(32, 85)), prism),
         "aplanatic ball": Bench(optical_systems.aplanatic(), ball),
         "ellipsoid lens": Bench(optical_systems.ellipsoid(80), _ellipsoid),
-        "drop, one reflection": Bench(drops[1], water),
-        "drop, two reflections": Bench(drops[2], water),
+        "drop, one reflection": Bench(optical_systems.drop(1, optical_systems.degrees(2, 80)), drop),
+        "drop, two reflections": Bench(optical_systems.drop(2, optical_systems.degrees(2, 80)), drop),
         "double Gauss": Bench(optical_systems.double_gauss(), _double_gauss),
     }

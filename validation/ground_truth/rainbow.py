@@ -37,48 +37,28 @@ def angle(index: Any = INDEX) -> float:
     return float(np.rad2deg(closed_forms.deflection(closed_forms.rainbow_incidence(index, 1), index, 1)))
 
 
-def scene(glass: dict[str, Any]) -> Any:
-    """The drop of a glass plugin's dictionary, its sun, the screen and the camera."""
+def images(glass: dict[str, Any], seeds: int) -> list[Array]:
+    """SIZE × SIZE, of a light path per pixel and seed: a drop of a glass plugin's dictionary, its sun, the screen."""
     import mitsuba as mi
 
     move = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "pixel_format": "luminance"}
     film |= {"component_format": "float32", "rfilter": {"type": "box"}}
     view = move().look_at(origin=[0, 0, 2], target=[0, 0, -1], up=[0, 1, 0])
-    return mi.load_dict(
+    sun = {"type": "disk", "to_world": move().translate([0, 0, -2]), "light": {"type": "directionalarea"}}
+    far = move().translate([0, 0, -SCREEN]).scale(2 * SCREEN)
+    camera = {"type": "perspective", "fov": 90, "near_clip": 1, "far_clip": 10 * SCREEN, "to_world": view, "film": film}
+    scene: Any = mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "ptracer", "max_depth": 5, "rr_depth": 5},  # in, within, out, and the screen
             "drop": {"type": "sphere", "bsdf": glass},
-            "sun": {
-                "type": "disk",
-                "to_world": move().translate([0, 0, -2]),
-                "bsdf": {"type": "diffuse", "reflectance": 0.0},
-                "light": {"type": "directionalarea"},
-            },
-            "screen": {
-                "type": "rectangle",
-                "to_world": move().translate([0, 0, -SCREEN]).scale(2 * SCREEN),
-                "bsdf": {"type": "diffuse"},
-            },
-            "camera": {
-                "type": "perspective",
-                "fov": 90,
-                "near_clip": 1,
-                "far_clip": 10 * SCREEN,
-                "to_world": view,
-                "film": film,
-            },
+            "sun": sun | {"bsdf": {"type": "diffuse", "reflectance": 0.0}},
+            "screen": {"type": "rectangle", "to_world": far, "bsdf": {"type": "diffuse"}},
+            "camera": camera,
         }
     )
-
-
-def images(glass: dict[str, Any], seeds: int) -> list[Array]:
-    """SIZE × SIZE, of a light path per pixel and seed."""
-    import mitsuba as mi
-
-    drop = scene(glass)
-    return [np.array(mi.render(drop, spp=1, seed=seed), float)[..., 0] for seed in range(seeds)]
+    return [np.array(mi.render(scene, spp=1, seed=seed), float)[..., 0] for seed in range(seeds)]
 
 
 @functools.cache

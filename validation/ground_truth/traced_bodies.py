@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import functools
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,10 +20,9 @@ from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.optical_systems import Array
-from validation.run import path_overlay
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND
-from validation.run.render_methods import under
+from validation.run.render_methods import save_image, under
 from validation.study import Study, Task, about
 
 from . import rainbow
@@ -58,23 +56,21 @@ AXES = {"x": "surface", "y": "mm, or tangent", "x_scale": "linear", "y_scale": "
 NAME = "ground_truth"
 VARIANTS = "scalar_rgb", "llvm_ad_rgb", "cuda_ad_rgb"
 RENDERS = {"standard": 10, "full": 40}
-LABELS = {name: f"{name} / mm" for name in ("shift", "place", "miss")} | {
-    "direction": "direction / °",
-    "tangent": "tangent",
-}
+LABELS = {"direction": "direction / °", "tangent": "tangent"}
+LABELS |= {name: f"{name} / mm" for name in ("shift", "place", "miss")}
 UNITS = {"direction": math.degrees(1)}
 
 
 def tasks(context: Context) -> list[Task]:
     """One task per variant, and one for the rainbow; in the profile `quick` the variant of the run."""
+    variants = (context.variant,) if context.profile.quick else VARIANTS
+    rays = [Task(f"ground truth: {name}", functools.partial(variant_rows, context, name)) for name in variants]
     if context.profile.quick:
-        variant = context.variant
-        return [Task(f"ground truth: {variant}", functools.partial(variant_rows, context, variant))]
-    found = [
-        Task(f"ground truth: {variant}", functools.partial(variant_rows, context, variant)) for variant in VARIANTS
-    ]
-    double = Task("ground truth: double precision", lambda: [double_row()])
-    return [*found, double, Task("ground truth: rainbow", functools.partial(bow_rows, context))]
+        return rays
+    reason = "Mitsuba's wheel has no variant in double precision; of formulas in float64 see Stability"
+    double = Row(NAME, PLUGIN, "every body", "double precision", reason=reason)
+    bow = Task("ground truth: rainbow", functools.partial(bow_rows, context))
+    return [*rays, Task("ground truth: double precision", lambda: [double]), bow]
 
 
 # Rays ----------------------------------------------------------------------------------------------------------
@@ -89,25 +85,18 @@ def variant_rows(context: Context, variant: str) -> list[Row]:
         return [bench_row(name, bench, plugin, variant) for name, bench in benches().items() for plugin in PLUGINS]
 
 
-def double_row() -> Row:
-    """Why double precision is not measured."""
-    reason = "Mitsuba's wheel has no variant in double precision; of formulas in float64 see Stability"
-    return Row(NAME, PLUGIN, "every body", "double precision", reason=reason)
-
-
 def bench_row(name: str, bench: Bench, plugin: str, setting: str) -> Row:
     """A plugin through a body: deviations of each answer, over their bounds."""
-    found = bench.deviations(bench.traced(plugin))
-    spawned = bench.deviations(bench.traced(plugin, spawned=True))
-    values = {LABELS[answer]: float(x.max()) * UNITS.get(answer, 1) for answer, x in found.items()}
-    values[ERROR_OVER_BOUND] = max(float((x / bench.bounds[answer]).max()) for answer, x in found.items())
+    off, spawned = (bench.deviations(bench.traced(plugin, spawned=spawned)) for spawned in (False, True))
+    values = {LABELS[answer]: float(x.max()) * UNITS.get(answer, 1) for answer, x in off.items()}
+    values[ERROR_OVER_BOUND] = max(float((x / bench.bounds[answer]).max()) for answer, x in off.items())
     values["index seen"] = bench.index_seen
     values |= {f"{LABELS[answer]}, spawned": float(x.max()) * UNITS.get(answer, 1) for answer, x in spawned.items()}
     budgets = {ERROR_OVER_BOUND: limits.BODY, "index seen": limits.INDEX_SEEN} if plugin == PLUGIN else {}
     replay = {"definition": name, "rays": len(bench.system.origins), "boundaries": len(bench.system.boundaries)}
     curves = {}
     if bench.system.printed:  # the worst ray's deviation and the least bound, surface by surface
-        lines = {LABELS[answer]: x.max(0) for answer, x in found.items()}
+        lines = {LABELS[answer]: x.max(0) for answer, x in off.items()}
         lines |= {f"{LABELS[answer]}, bound": x.min(0) for answer, x in bench.bounds.items()}
         curves = {name: [(j + 1.0, float(y)) for j, y in enumerate(line)] for name, line in lines.items()}
     return Row(NAME, plugin, name, setting, values, budgets, replay=replay, curves=curves)
@@ -122,11 +111,15 @@ def bow_rows(context: Context) -> list[Row]:
         reason = "takes millions of light paths: needs a compiled variant"
         return [Row(NAME, PLUGIN, "rainbow", context.variant, reason=reason)]
     seeds = RENDERS[context.profile.name]
-    found = {plugin: rainbow.images(glass(plugin, rainbow.INDEX), seeds) for plugin in PLUGINS}
-    about = {"index": float(rainbow.INDEX), "seeds": seeds, "resolution": rainbow.SIZE}
-    shown = {plugin: _save(context.out, plugin, images, about) for plugin, images in found.items()}
+    about, size = {"index": float(rainbow.INDEX), "seeds": seeds, "resolution": rainbow.SIZE}, rainbow.SIZE // 4
+    images = {plugin: rainbow.images(glass(plugin, rainbow.INDEX), seeds) for plugin in PLUGINS}
+    shown = {}  # their mean in squares of 4 pixels, 1 at its brightest
+    for plugin in PLUGINS:
+        mean = np.mean(images[plugin], axis=0).reshape(size, 4, size, 4).mean((1, 3))
+        grey = np.repeat(mean[..., None] / mean.max(), 3, axis=2)
+        shown[plugin] = save_image(context.out, f"rainbow {plugin}", grey, about)
     roles = {PLUGIN: {"reference": shown[BUILTIN], "test": shown[PLUGIN]}, BUILTIN: {}}
-    return [bow_row(plugin, context.variant, found[plugin], about, roles[plugin]) for plugin in PLUGINS]
+    return [bow_row(plugin, context.variant, images[plugin], about, roles[plugin]) for plugin in PLUGINS]
 
 
 def bow_row(
@@ -147,12 +140,6 @@ def bow_row(
     }
     budgets = {ERROR_OVER_BOUND: limits.BODY, "standard error / °": limits.RAINBOW_RESOLVED} if plugin == PLUGIN else {}
     return Row(NAME, plugin, "rainbow", setting, values, budgets, replay=replay, images=shown or {})
-
-
-def _save(folder: Path, plugin: str, images: list[Array], about: dict[str, Any]) -> str:
-    """Their mean in squares of 4 pixels, 1 at its brightest."""
-    mean = np.mean(images, axis=0).reshape(rainbow.SIZE // 4, 4, rainbow.SIZE // 4, 4).mean((1, 3))
-    return path_overlay.save(folder, f"rainbow {plugin}", np.repeat(mean[..., None] / mean.max(), 3, axis=2), about)
 
 
 STUDY = Study(NAME, "Ground truth", about(__doc__), TERMS, tasks, axes=AXES)

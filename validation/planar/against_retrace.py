@@ -4,7 +4,7 @@ The retrace follows each path again in extended precision, by other formulas (im
 path meets other boundaries, or ends in another way, takes a "wrong path". For the others every point and the last
 direction are compared, and their errors divided by a bound on rounding: at each boundary a few roundings of the largest
 coordinate so far and of the angle, the turn of a facet by its rounded ends, and 1/cos behind the boundary, all carried
-on to first order (`validation/planar/error_growth.py`). Rays are those of the file, in each of its colours, and random
+on to first order (`validation/planar/rounding.py`). Rays are those of the file, in each of its colours, and random
 ones near them; the profile `quick` takes at most 100 of the file's, in the first colour.
 `clutter` are random scenes of bodies of every kind, nested and turned. At the end the formulas are compared by name.
 """
@@ -21,8 +21,9 @@ from typing import Any
 import numpy as np
 
 from mi_refract.formulas import FORMULAS
-from mi_refract.planar import Paths, Segments, trace
-from mi_refract.planar.scene_file import PlanarScene, load
+from mi_refract.planar import Paths, Segments, Tracer, shapes
+from mi_refract.planar.curves import Curve, affine
+from mi_refract.planar.scene_file import load
 from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.planar_retrace import Array, Retraced, retrace
@@ -32,9 +33,7 @@ from validation.run.context import SCENES, Context
 from validation.run.metrics import ERROR_OVER_BOUND, WRONG_PATH, WRONG_PATH_FAR
 from validation.study import Study, Task, about
 
-from . import random_scenes
-from .error_growth import growth
-from .rounding_ambiguity import undecided
+from .rounding import growth, undecided
 
 DIFFERENCE, BOUNDARIES = "difference", "boundaries"
 NEAREST, ITS_BOUND = "error nearest its bound", "that bound"
@@ -53,6 +52,7 @@ FOLDER = SCENES / "planar"
 SEED = 2031
 RAYS = {"quick": 100, "standard": 250, "full": 2000}  # scattered around the file's own
 SCALAR_RAYS = 2
+SIDE, DEPTH = 3, 30  # of clutter: bodies in a row, boundaries on a path
 CLUTTER = {"standard": (12, 100), "full": (100, 500)}  # scenes, and rays in each
 SPREAD = 1e-2  # of the extent, and in radians
 GROWN = {ERROR_OVER_BOUND: limits.GROWN, WRONG_PATH_FAR: 0.0}
@@ -62,7 +62,7 @@ SHOWN = "lens"  # the scene of the formulas
 
 @dataclass(frozen=True)
 class Case:
-    """Rays to follow through `segments`. `exact`: their paths; `extent`: the diagonal around the segments."""
+    """Rays to follow through `segments`. `known`: their paths, in place of the independent retrace."""
 
     name: str
     segments: Segments
@@ -70,11 +70,13 @@ class Case:
     directions: Array
     max_depth: int
     reflect: Array
+    known: Retraced | None = None
 
     @functools.cached_property
     def exact(self) -> Retraced:
-        """The paths by the independent retrace."""
-        return retrace(self.segments, self.origins, self.directions, self.max_depth, reflect=self.reflect)
+        """The paths, by the independent retrace where they are not known."""
+        rays = self.segments, self.origins, self.directions, self.max_depth
+        return self.known or retrace(*rays, reflect=self.reflect)
 
     @functools.cached_property
     def bounds(self) -> tuple[Array, Array]:
@@ -88,16 +90,12 @@ class Case:
 
     def trace(self, setting: Setting, formula: str | None = None) -> Paths:
         """The paths by `planar.trace` in a setting, by the default formula or another one."""
-        return trace(
-            self.segments,
-            self.origins,
-            self.directions,
-            self.max_depth,
-            reflect=self.reflect,
-            formula=formula,
-            precision=np.dtype(setting.precision).name,
-            backend=setting.backend,
-        )
+        tracer = Tracer(self.segments, formula=formula, precision=setting.name, backend=setting.backend)
+        return tracer(self.origins, self.directions, self.max_depth, reflect=self.reflect)
+
+
+def _extent(segments: Segments) -> float:
+    return float(np.hypot(*np.ptp(np.concatenate([segments.start, segments.end]), axis=0)))
 
 
 def tasks(context: Context) -> list[Task]:
@@ -123,16 +121,19 @@ def by_setting(
 
 
 def setting_rows(context: Context, setting: Setting) -> list[Row]:
-    """Of every scene in a setting."""
+    """Of every scene in a setting: in every colour of a file, or three of its wavelengths; on scalar arrays in one."""
     rays = SCALAR_RAYS if setting.is_scalar else RAYS[context.profile.name]
     if context.profile.quick:
-        return [file_row(FOLDER / f"{SHOWN}.toml", setting, rays)]
-    follow = file_row if setting.is_scalar else colours_row
-    rows = [follow(path, setting, rays) for path in sorted(FOLDER.glob("*.toml"))]
-    rows.append(clutter_row(setting, *((2, 5) if setting.is_scalar else CLUTTER[context.profile.name])))
+        return [row([case_of(FOLDER / f"{SHOWN}.toml", rays)], setting)]
+    rows = []
+    for path in sorted(FOLDER.glob("*.toml")):
+        light = load(path).light
+        count = len(light)
+        colours = {0, count // 2, count - 1} if light.wavelengths else range(count)
+        rows.append(row([case_of(path, rays, j) for j in ([None] if setting.is_scalar else sorted(colours))], setting))
+    rows.append(row(clutter(*((2, 5) if setting.is_scalar else CLUTTER[context.profile.name])), setting))
     if setting.precision is np.float32:
-        shown = case_of(FOLDER / f"{SHOWN}.toml", rays)
-        rows += [row_of(shown, setting, formula) for formula in FORMULAS]
+        rows += [row([case_of(FOLDER / f"{SHOWN}.toml", rays)], setting, formula) for formula in FORMULAS]
     return rows
 
 
@@ -141,44 +142,26 @@ def drawn_rows(context: Context) -> list[Row]:
     rows, (scenes, rays) = [], CLUTTER["standard"]
     for setting in settings(context):
         if setting.vector is not None and not setting.is_scalar:
-            rows += [file_row(path, setting, RAYS["quick"]) for path in sorted(FOLDER.glob("*.toml"))]
-            rows.append(clutter_row(setting, scenes // 3, rays))
+            rows += [row([case_of(path, RAYS["quick"])], setting) for path in sorted(FOLDER.glob("*.toml"))]
+            rows.append(row(clutter(scenes // 3, rays), setting))
     return rows
 
 
-def file_row(path: Path, setting: Setting, rays: int) -> Row:
-    """At most `rays` rays of a file in its first colour, and as many scattered around them."""
-    return row_of(case_of(path, rays), setting)
+def row(cases: list[Case], setting: Setting, formula: str | None = None) -> Row:
+    """Cases of one scene in a setting: sums of the counts, and the worst of the other metrics.
 
-
-def colours_row(path: Path, setting: Setting, rays: int) -> Row:
-    """Every ray of a file in every colour, or in three of its wavelengths, and `rays` scattered around them."""
-    light = load(path).light
-    colours = range(len(light)) if not light.wavelengths else sorted({0, len(light) // 2, len(light) - 1})
-    cases = [case_of(path, rays, colour) for colour in colours]
-    values = together([judge(case.trace(setting), case, setting.roundoff) for case in cases])
-    replay = {
-        "scene": path.name,
-        "rays": sum(len(case.origins) for case in cases),
-        "colours": len(cases),
-        "seed": seeds.current(SEED),
-    }
-    return Row(NAME, TRACE, path.stem, setting.label, values, budgets(setting), replay=replay)
-
-
-def together(parts: list[dict[str, float]]) -> dict[str, float]:
-    """Sums of the counts, and the worst of the other metrics; NaN stays: no ray of a part kept to its path."""
-    counts = (WRONG_PATH, WRONG_PATH_FAR)
-    values = {name: float((sum if name in counts else np.max)([part[name] for part in parts])) for name in parts[0]}
+    NaN stays: no ray of a case kept to its path.
+    """
+    name, counts = cases[0].name, (WRONG_PATH, WRONG_PATH_FAR)
+    parts = [judge(case.trace(setting, formula), case, setting.roundoff) for case in cases]
+    values = {key: float((sum if key in counts else np.max)([part[key] for part in parts])) for key in parts[0]}
     nearest = max(parts, key=lambda part: part[ERROR_OVER_BOUND])
-    return values | {name: nearest[name] for name in (NEAREST, ITS_BOUND)}
-
-
-def row_of(case: Case, setting: Setting, formula: str | None = None) -> Row:
-    """A scene in a setting, by the default formula or another one."""
-    values = judge(case.trace(setting, formula), case, setting.roundoff)
-    replay = {"scene": f"{case.name}.toml", "rays": len(case.origins), "seed": seeds.current(SEED)}
-    return Row(NAME, formula or TRACE, case.name, setting.label, values, budgets(setting), replay=replay)
+    values |= {key: nearest[key] for key in (NEAREST, ITS_BOUND)}
+    replay = {"scene": name, "cases": len(cases), "rays": sum(len(case.origins) for case in cases)}
+    # Among so many bodies as in clutter errors may grow beyond any fixed bound: their own one counts.
+    bounds = GROWN if name == "clutter" else budgets(setting)
+    replay["seed"] = seeds.current(SEED)
+    return Row(NAME, formula or TRACE, name, setting.label, values, bounds, replay=replay)
 
 
 def budgets(setting: Setting) -> dict[str, float]:
@@ -187,54 +170,71 @@ def budgets(setting: Setting) -> dict[str, float]:
     return GROWN | exact
 
 
-def clutter_row(setting: Setting, scenes: int, rays: int) -> Row:
-    """Random scenes: sums of the counts, and the worst of the other metrics."""
-    values = together([judge(case.trace(setting), case, setting.roundoff) for case in _clutter(scenes, rays)])
-    replay = {"scenes": scenes, "rays": scenes * rays, "seed": seeds.current(SEED)}
-    # Among so many bodies errors may grow beyond any fixed bound: their own one counts.
-    return Row(NAME, TRACE, "clutter", setting.label, values, GROWN, replay=replay)
-
-
 @seeds.cached
-def _clutter(scenes: int, rays: int) -> list[Case]:
-    rngs = [np.random.default_rng((seeds.current(SEED), number)) for number in range(scenes)]
-    described = [(random_scenes.bodies(rng), *random_scenes.rays(rng, rays)) for rng in rngs]
-    return [Case("clutter", s, o, d, random_scenes.DEPTH, reflect) for s, o, d, reflect in described]
-
-
-@seeds.cached
-def case_of(path: Path, rays: int, colour: int | None = None) -> Case:
+def case_of(path: Path, count: int, colour: int | None = None) -> Case:
     """A colour of a scene file: refracted wherever possible, and reflected once where the file has branches.
 
-    None: the first colour with at most `rays` of the file's rays; else all of them. `rays` are scattered around them.
+    None: the first colour with at most `count` of the file's rays; else all of them. `count` are scattered around them.
     """
-    scene = load(path)
-    origins, directions = rays_of(scene, rays, colour is not None)
-    masks = [0] + [1 << j for j in range(min(2, scene.max_depth))] * bool(scene.branches)
-    reflect = np.repeat(masks, len(origins))
-    origins, directions = (np.tile(x, (len(masks), 1)) for x in (origins, directions))
-    return Case(path.stem, scene.segments[colour or 0], origins, directions, scene.max_depth, reflect)
-
-
-def rays_of(scene: PlanarScene, count: int, every: bool) -> tuple[Array, Array]:
-    """All of the file's rays, or at most `count` of them, and `count` scattered around any of them."""
-    rng, extent = np.random.default_rng(seeds.current(SEED)), _extent(scene.segments[0])
-    most = len(scene.origins) if every else min(count, len(scene.origins))
-    own = np.linspace(0, len(scene.origins) - 1, most).round().astype(int)
-    chosen = rng.integers(0, len(scene.origins), count)
-    shift, turn = SPREAD * extent * rng.uniform(-1, 1, (count, 2)), SPREAD * rng.uniform(-1, 1, count)
+    scene, rng = load(path), np.random.default_rng(seeds.current(SEED))
+    segments, total = scene.segments[colour or 0], len(scene.origins)
+    own = np.linspace(0, total - 1, min(count, total) if colour is None else total).round().astype(int)
+    chosen = rng.integers(0, total, count)
+    shift, turn = SPREAD * _extent(segments) * rng.uniform(-1, 1, (count, 2)), SPREAD * rng.uniform(-1, 1, count)
     x, y = scene.directions[chosen].T
     turned = np.stack([x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn)], 1)
-    origins, directions = (
-        np.concatenate(parts)
-        for parts in ((scene.origins[own], scene.origins[chosen] + shift), (scene.directions[own], turned))
+    rays = np.concatenate(
+        [np.hstack([scene.origins, scene.directions])[own], np.hstack([scene.origins[chosen] + shift, turned])]
     )
-    return origins, directions
+    masks = [0] + [1 << j for j in range(min(2, scene.max_depth))] * bool(scene.branches)
+    origins, directions = np.hsplit(np.tile(rays, (len(masks), 1)), 2)
+    return Case(path.stem, segments, origins, directions, scene.max_depth, np.repeat(masks, len(rays)))
 
 
-def _extent(segments: Segments) -> float:
-    """The diagonal around them."""
-    return float(np.hypot(*np.ptp(np.concatenate([segments.start, segments.end]), axis=0)))
+# Random scenes -------------------------------------------------------------------------------------------------
+
+
+@seeds.cached
+def clutter(scenes: int, rays: int) -> list[Case]:
+    """Bodies of every kind, nested and turned, and rays through them; a third are reflected at some of the first three.
+
+    A square of bodies, 1 apart, in air; every second one holds another.
+    """
+    cases = []
+    for rng in (np.random.default_rng((seeds.current(SEED), number)) for number in range(scenes)):
+        parts: list[tuple[Curve, float, float]] = []
+        for place in np.ndindex(SIDE, SIDE):
+            size, n, inner = rng.uniform(0.2, 0.45), *rng.uniform(1.1, 2.5, 2)
+            nest = affine(rng.uniform(0, 360))
+            parts.append((_outline(rng, size).mapped(nest, place), n, 1.0))
+            if rng.random() < 0.5:
+                # Any of the outlines holds a circle of a tenth of its size around its origin.
+                parts.append((shapes.circle(0.1 * size).mapped(nest, place), inner, n))
+        names = ("start", "end", "control", "weight")
+        start, end, control, weight = (np.concatenate([getattr(c, name) for c, _, _ in parts]) for name in names)
+        left, right = (np.concatenate([np.full(len(part[0]), part[side]) for part in parts]) for side in (1, 2))
+        turn = rng.uniform(0, 2 * np.pi, rays)
+        directions = np.stack([np.cos(turn), np.sin(turn)], 1)
+        origins = rng.uniform(-0.3, SIDE - 0.7, (rays, 2)) - 5 * directions
+        reflect = rng.integers(0, 8, rays) * (rng.random(rays) < 1 / 3)
+        cases.append(
+            Case("clutter", Segments(start, end, left, right, control, weight), origins, directions, DEPTH, reflect)
+        )
+    return cases
+
+
+def _outline(rng: np.random.Generator, size: float) -> Curve:
+    makers = (
+        lambda: shapes.circle(size),
+        lambda: shapes.ellipse(size, size * rng.uniform(0.3, 1)),
+        lambda: shapes.circle(size).faceted(int(rng.integers(5, 40))),
+        lambda: shapes.prism(rng.uniform(30, 100), 1.2 * size),
+        lambda: shapes.lens((1 / size, -1 / size), 0.5 * size, conic=(-2.0, 0.0), vertex=-size / 4, radius=size / 2),
+    )
+    return makers[rng.integers(len(makers))]()
+
+
+# Judged --------------------------------------------------------------------------------------------------------
 
 
 def judge(paths: Paths, case: Case, u: float, offset: float = 0.0) -> dict[str, float]:
@@ -249,22 +249,22 @@ def judge(paths: Paths, case: Case, u: float, offset: float = 0.0) -> dict[str, 
     off = np.where(np.isnan(exact.points[..., 0]), 0, np.nan_to_num(off, nan=np.inf))
     turned = np.nan_to_num(np.hypot(*(unit(paths.directions) - exact.directions).T).astype(float), nan=np.inf)
     ends = exact.last(directions)
-    ratio = np.maximum(np.nanmax(off / points, axis=1), turned / ends)
+    ratios = np.column_stack([off / points, turned / ends])
+    ratio = np.nanmax(ratios, axis=1)
     same = paths.hits == exact.hits
     # Of two segments that share a vertex either is right there, if it does the same to the ray.
     touching = 2.0**-50 * np.abs([case.segments.start, case.segments.end]).max()
     same |= at_shared_vertex(paths.hits, exact, case.segments, touching) & (ratio <= 1)[:, None]
     wrong = ~same.all(1) | (paths.events != exact.events).any(1)
     near = undecided(exact, paths, case.segments, points, directions)
-    worst = np.maximum(off.max(1) / case.extent, turned)
-    return {
-        ERROR_OVER_BOUND: _largest(ratio[~wrong]),
-        **_nearest(*(x[~wrong] for x in (off / case.extent, points / case.extent, turned, ends))),
-        DIFFERENCE: _largest(worst[~wrong]),
-        WRONG_PATH: float(wrong.sum()),
-        WRONG_PATH_FAR: float((wrong & ~near).sum()),
-        BOUNDARIES: float(exact.met.max()),
-    }
+    values = dict.fromkeys([ERROR_OVER_BOUND, NEAREST, ITS_BOUND, DIFFERENCE], float("nan"))
+    if not wrong.all():
+        errors, bounds = (np.column_stack([x / case.extent, y])[~wrong] for x, y in ((off, turned), (points, ends)))
+        at = np.unravel_index(np.nanargmax(errors / bounds), errors.shape)
+        values |= {NEAREST: float(errors[at]), ITS_BOUND: float(bounds[at])}
+        values |= {ERROR_OVER_BOUND: float(ratio[~wrong].max()), DIFFERENCE: float(errors.max())}
+    values |= {WRONG_PATH: float(wrong.sum()), WRONG_PATH_FAR: float((wrong & ~near).sum())}
+    return values | {BOUNDARIES: float(exact.met.max())}
 
 
 def at_shared_vertex(hits: Array, exact: Retraced, segments: Segments, near: Any) -> Array:
@@ -274,19 +274,6 @@ def at_shared_vertex(hits: Array, exact: Retraced, segments: Segments, near: Any
     for vertex, own in itertools.product(theirs, ours):
         there |= (vertex == own).all(2) & (np.hypot(*(exact.points[:, 1:] - vertex).transpose(2, 0, 1)) <= near)
     return there & (hits >= 0) & (exact.hits >= 0)
-
-
-def _nearest(off: Array, points: Array, turned: Array, ends: Array) -> dict[str, float]:
-    """The error nearest to its bound, and that bound: of points (N × D) or of last directions (N)."""
-    errors, bounds = np.column_stack([off, turned]), np.column_stack([points, ends])
-    if not len(errors):
-        return {NEAREST: float("nan"), ITS_BOUND: float("nan")}
-    at = np.unravel_index(np.nanargmax(errors / bounds), errors.shape)
-    return {NEAREST: float(errors[at]), ITS_BOUND: float(bounds[at])}
-
-
-def _largest(x: Array) -> float:
-    return float(x.max()) if len(x) else float("nan")
 
 
 def unit(d: Any) -> Array:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,19 +78,22 @@ def tasks(context: Context) -> list[Task]:
 def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     few = setting.is_scalar
     counts = REFLECTIONS[:2] if context.profile.quick else REFLECTIONS
-    rows = [_box_row(setting, count, 4 if few else 16) for count in counts]
-    rows += [_row(setting, name, make(8 if few else 500)) for name, make in CLOSED.items()]
-    return rows
+    rows = [row(setting, f"box, {count}", box(count, 4 if few else 16)) for count in counts]
+    return rows + [row(setting, name, make(8 if few else 500)) for name, make in CLOSED.items()]
 
 
-def _row(setting: Setting, name: str, closed: Closed) -> Row:
-    paths = closed.case.trace(setting)
-    errors = np.nan_to_num(closed.error(paths).astype(float), nan=np.inf) / setting.roundoff
-    values = judge(paths, closed.case, setting.roundoff)
-    values |= {"error": float(errors.max() * setting.roundoff), "error / u": float(errors.max())}
-    values[ERROR_OVER_BOUND] = max(values[ERROR_OVER_BOUND], float((errors / closed.bound).max()))
-    bounds = budgets(setting) | ({"error / u": limits.SPOT} if name == "ellipse lens" else {})
-    return Row(NAME, "trace", name, setting.label, values, bounds, replay={"rays": len(paths.hits)})
+def row(setting: Setting, name: str, answer: Closed | Case) -> Row:
+    """A case against its exact paths, and against the closed answer where that is not the path itself."""
+    case = answer if isinstance(answer, Case) else answer.case
+    paths, bounds = case.trace(setting), budgets(setting)
+    values = judge(paths, case, setting.roundoff)
+    if isinstance(answer, Closed):
+        errors = np.nan_to_num(answer.error(paths).astype(float), nan=np.inf) / setting.roundoff
+        values |= {"error": float(errors.max() * setting.roundoff), "error / u": float(errors.max())}
+        values[ERROR_OVER_BOUND] = max(values[ERROR_OVER_BOUND], float((errors / answer.bound).max()))
+        bounds |= {"error / u": limits.SPOT} if name == "ellipse lens" else {}
+    replay = {"rays": len(case.origins), "seed": seeds.current(SEED)}
+    return Row(NAME, "trace", name, setting.label, values, bounds, replay=replay)
 
 
 # The box -------------------------------------------------------------------------------------------------------
@@ -107,16 +111,8 @@ def box(count: int, rays: int) -> Case:
     angle = math.atan2(8, 6) + np.deg2rad(45 + rng.uniform(-2, 2, rays) + 90 * rng.integers(0, 4, rays))
     origins = (rng.uniform(0.1, 0.9, (rays, 2)) @ SIDES).astype(np.float32).astype(float)
     directions = np.stack([np.cos(angle), np.sin(angle)], 1).astype(np.float32).astype(float)
-    return Billiard("box", segments, origins, directions, count, np.zeros(rays, int))
-
-
-class Billiard(Case):
-    """Its exact paths are those of mirror images."""
-
-    @functools.cached_property
-    def exact(self) -> Retraced:
-        """The paths by mirror images."""
-        return unfold(self.origins, self.directions, self.max_depth)
+    known = unfold(origins, directions, count)
+    return Case("box", segments, origins, directions, count, np.zeros(rays, int), known)
 
 
 def unfold(origins: Array, directions: Array, count: int) -> Retraced:
@@ -148,70 +144,59 @@ def unfold(origins: Array, directions: Array, count: int) -> Retraced:
     )
 
 
-def _box_row(setting: Setting, count: int, rays: int) -> Row:
-    case = box(count, rays)
-    values = judge(case.trace(setting), case, setting.roundoff)
-    replay = {"rays": rays, "seed": seeds.current(SEED), "reflections": count}
-    return Row(NAME, "trace", f"box, {count}", setting.label, values, budgets(setting), replay=replay)
-
-
 # Lenses and prisms ---------------------------------------------------------------------------------------------
 
 
-def _case(
-    name: str, curve: Curve, index: float, origins: Array, directions: Array, depth: int, reflect: int = 0
-) -> Case:
+def _case(curve: Curve, index: float, origins: Array, directions: Array, depth: int, reflect: int = 0) -> Case:
     """Rays to follow through a body of an index in air."""
-    segments, mask = curve.between(index, 1.0), np.full(len(origins), reflect)
-    return Case(name, segments, origins, directions, depth, mask)
+    return Case("", curve.between(index, 1.0), origins, directions, depth, np.full(len(origins), reflect))
 
 
 def _along_x(height: Array) -> tuple[Array, Array]:
     return np.stack([np.full(len(height), -10.0), height], 1), np.tile([1.0, 0.0], (len(height), 1))
 
 
-@functools.cache
-def ellipse_lens(rays: int) -> Closed:
-    """Index 3/2, focal length 9, aperture 3."""
-    curve = shapes.ellipse_lens(INDEX, FOCAL_LENGTH, thickness=4.0, radius=3.0)
-    height = 2.9 * np.linspace(-1, 1, 2 * (rays // 2))
-    return Closed(_case("ellipse lens", curve, INDEX, *_along_x(height), depth=2), reach=FOCAL_LENGTH)
-
-
-@functools.cache
-def ball(rays: int) -> Closed:
-    """Radius 1, from the point 1/n left of the centre to the right; the virtual image is n left of it."""
-    turn = np.deg2rad(np.linspace(-50, 50, 2 * (rays // 2)))
-    origins, directions = np.tile([-1 / INDEX, 0.0], (len(turn), 1)), np.stack([np.cos(turn), np.sin(turn)], 1)
-    case = _case("aplanatic ball", shapes.circle(1.0), INDEX, origins, directions, depth=1)
-    return Closed(case, point=(-INDEX, 0.0), reach=1 + INDEX)
-
-
-@functools.cache
-def rainbow(rays: int) -> Closed:
-    """A drop of index 4/3, its rays reflected once within."""
-    n, b = 4 / 3, 0.98 * np.linspace(-1, 1, 2 * (rays // 2))
-    case = _case("rainbow", shapes.circle(1.0), n, *_along_x(b), depth=3, reflect=2)
-    return Closed(case, _unit_at(-closed.deflection(np.arcsin(b.astype(np.longdouble)), n, 1)))
-
-
-@functools.cache
-def prism(rays: int) -> Closed:
-    """Apex 60°, from 32° of incidence (nearly total reflection within) to 85°; the least deviation is at 48.6°."""
-    curve, apex = shapes.prism(60.0, 2.0), closed.HALF_TURN / 3
-    i = np.deg2rad(np.linspace(32, 85, rays)).astype(np.longdouble)
-    deviation = closed.deviation(i, apex, INDEX)
-    directions = _unit_at(i - apex / 2).astype(float)
-    # Through a place on the left side, high enough that all leave by the right one.
-    origins = 0.75 * curve.vertices[2] + 0.25 * curve.vertices[0] - directions
-    return Closed(_case("prism", curve, INDEX, origins, directions, depth=2), _unit_at(i - apex / 2 - deviation))
-
-
 def _unit_at(angle: Array) -> Array:
     return np.stack([np.cos(angle), np.sin(angle)], 1)
 
 
-CLOSED = {"ellipse lens": ellipse_lens, "aplanatic ball": ball, "rainbow": rainbow, "prism": prism}
+def ellipse_lens(rays: int) -> Closed:
+    """Index 3/2, focal length 9, aperture 3."""
+    curve = shapes.ellipse_lens(INDEX, FOCAL_LENGTH, thickness=4.0, radius=3.0)
+    height = 2.9 * np.linspace(-1, 1, 2 * (rays // 2))
+    return Closed(_case(curve, INDEX, *_along_x(height), depth=2), reach=FOCAL_LENGTH)
+
+
+def ball(rays: int) -> Closed:
+    """Radius 1, from the point 1/n left of the centre to the right; the virtual image is n left of it."""
+    turn = np.deg2rad(np.linspace(-50, 50, 2 * (rays // 2)))
+    origins = np.tile([-1 / INDEX, 0.0], (len(turn), 1))
+    case = _case(shapes.circle(1.0), INDEX, origins, _unit_at(turn), depth=1)
+    return Closed(case, point=(-INDEX, 0.0), reach=1 + INDEX)
+
+
+def rainbow(rays: int) -> Closed:
+    """A drop of index 4/3, its rays reflected once within."""
+    n, b = 4 / 3, 0.98 * np.linspace(-1, 1, 2 * (rays // 2))
+    case = _case(shapes.circle(1.0), n, *_along_x(b), depth=3, reflect=2)
+    return Closed(case, _unit_at(-closed.deflection(np.arcsin(b.astype(np.longdouble)), n, 1)))
+
+
+def prism(rays: int) -> Closed:
+    """Apex 60°, from 32° of incidence (nearly total reflection within) to 85°; the least deviation is at 48.6°."""
+    curve, apex = shapes.prism(60.0, 2.0), closed.HALF_TURN / 3
+    i = np.deg2rad(np.linspace(32, 85, rays)).astype(np.longdouble)
+    directions = _unit_at(i - apex / 2).astype(float)
+    # Through a place on the left side, high enough that all leave by the right one.
+    origins = 0.75 * curve.vertices[2] + 0.25 * curve.vertices[0] - directions
+    exact = _unit_at(i - apex / 2 - closed.deviation(i, apex, INDEX))
+    return Closed(_case(curve, INDEX, origins, directions, depth=2), exact)
+
+
+CLOSED: dict[str, Callable[[int], Closed]] = {
+    name: functools.cache(make)
+    for name, make in (("ellipse lens", ellipse_lens), ("aplanatic ball", ball), ("rainbow", rainbow), ("prism", prism))
+}
 
 
 STUDY = Study(NAME, "Planar, closed answers", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))

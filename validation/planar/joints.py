@@ -28,7 +28,7 @@ from validation.study import Study, Task, about
 
 from .against_retrace import at_shared_vertex, by_setting
 from .against_retrace import unit as of_length_1
-from .error_growth import ROUNDINGS, growth
+from .rounding import ROUNDINGS, growth
 
 TERMS = {
     ERROR_OVER_BOUND: "largest error of any point or last direction over its bound on rounding errors",

@@ -5,7 +5,6 @@ In: rays, scenes or parameters. Out: directions, paths and powers to compare wit
 
 __all__ = [
     "closed_forms",
-    "diffuse_fresnel",
     "exact_lens",
     "fast_reference",
     "layered_scenes",

@@ -1,6 +1,5 @@
 """Nested media: the layers of `scenes/mirage.xml` and `scenes/fibre.xml`, and the exact path of a ray through them.
 
-`python -m validation.reference.layered_scenes` writes the layers into both scene files, between two marker comments.
 Every solid lies inside the one before it, so each boundary separates two absolute indices. The layers cannot be much
 thinner: after each boundary Mitsuba moves a ray along the normal by OFFSET (1 + max |p|), and would skip thinner ones.
 """
@@ -8,15 +7,14 @@ thinner: after each boundary Mitsuba moves a ray along the normal by OFFSET (1 +
 from __future__ import annotations
 
 import math
+import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 
 import numpy as np
 
-from mi_refract.io.atomic import update_between
 from validation.run.context import SCENES
 
 OFFSET = 1500 * 2.0**-24  # Mitsuba's RayEpsilon in float32
-MARKER = "layers"
 
 
 @dataclass(frozen=True)
@@ -110,83 +108,31 @@ def exact_path(layers: Layers, p: np.ndarray, d: np.ndarray, medium: int, offset
     return Path(*points, (points[1] - points[0]) / np.linalg.norm(points[1] - points[0], axis=1)[:, None], tuple(media))
 
 
-# The mirage ----------------------------------------------------------------------------------------------------
+# The scenes ----------------------------------------------------------------------------------------------------
 
-AIR = 1.000277
 POOL = 100.0  # half the length of the warm air
 STEP = 0.02  # by which a solid is smaller than the one around it, where no light passes
 
 
-def _mirage() -> Layers:
-    """32 layers, each 1.11 ray offsets thick; the first step of the index 1e-7, the sum of all 5.2e-5."""
-    drops = np.cumsum(1e-7 * 1.145 ** np.arange(32))
-    thickness = round(OFFSET * (1 + POOL) / 0.9, 4)
-    indices = (AIR, *(round(AIR - float(drop), 10) for drop in drops))
-    boundaries = tuple(round(-thickness * j, 4) for j in range(len(drops)))
-    return Layers("mirage", indices, boundaries, False, 0, POOL - STEP * (len(drops) + 1))
+def _read(scene: str) -> Layers:
+    """The layers that a scene file holds: BSDFs to_1, to_2, …, and boxes layer_i from the top, or cylinders shell_i."""
+    root = ET.parse(SCENES / f"{scene}.xml").getroot()
 
+    def values(path: str, name: str = "value") -> list[float]:
+        """Of every element within those of the layers, by its path from the root."""
+        named = [x for x in root.iterfind(path.partition("/")[0]) if (x.get("id") or "").startswith(prefixes)]
+        return [float(y.attrib[name]) for x in named for y in x.iterfind(path.partition("/")[2])]
 
-def _fibre() -> Layers:
-    """16 shells of equal thickness, n² falling by (r/R)² from 1.53² on the axis to 1.4585² at R = 8; in air."""
-    count, radius, core, clad = 16, 8.0, 1.53, 1.4585
-    radii = radius * (1 - np.arange(count) / count)
-    middle2 = (radii**2 + np.append(radii[1:], 0) ** 2) / 2 / radius**2
-    indices = (AIR, *(round(math.sqrt(core**2 - (core**2 - clad**2) * float(x)), 6) for x in middle2))
-    # Half the pitch of the smooth profile: light from a point at one end is gathered at the other.
-    length = math.pi * radius / math.sqrt(1 - (clad / core) ** 2)
-    return Layers("fibre", indices, tuple(round(float(r), 6) for r in radii), True, 2, -round(length / 2 - 1, 3))
-
-
-MIRAGE, FIBRE = _mirage(), _fibre()
-LAYERS = {layers.scene: layers for layers in (MIRAGE, FIBRE)}
-
-
-def block(layers: Layers) -> str:
-    """The XML of all media but the outermost, from the outside in."""
-    shapes = _rods if layers.round else _boxes
-    media = [_medium(k, *layers.indices[k - 1 : k + 1]) + shapes(layers, k) for k in range(1, len(layers.indices))]
-    return "\n".join(media)
-
-
-def _medium(k: int, ext: float, int_: float) -> str:
-    return (
-        f'    <bsdf type="$bsdf" id="to_{k}">\n'
-        f'        <float name="int_ior" value="{int_!r}"/>\n'
-        f'        <float name="ext_ior" value="{ext!r}"/>\n'
-        "    </bsdf>\n"
+    prefixes = ("to_", "layer_", "shell_")
+    indices = (values("bsdf/*[@name='ext_ior']")[0], *values("bsdf/*[@name='int_ior']"))
+    if radii := values("shape/float[@name='radius']"):
+        (first, *_) = root.iterfind("shape/point[@name='p1']")
+        return Layers(scene, indices, tuple(radii), True, 2, round(1 - float(first.attrib["value"].split(",")[2]), 3))
+    heights = zip(values("shape/*/translate", "y"), values("shape/*/scale", "y"), strict=True)
+    return Layers(
+        scene, indices, tuple(round(y + half, 4) for y, half in heights), False, 0, POOL - STEP * len(indices)
     )
 
 
-def _boxes(layers: Layers, k: int) -> str:
-    """Down to below the road: the lower faces are never seen."""
-    top, bottom = layers.boundaries[k - 1], layers.boundaries[-1] - 1 + STEP * k
-    inset = STEP * (k - 1)
-    scale = f'x="{POOL - inset:.2f}" y="{(top - bottom) / 2:.5f}" z="{6 - inset:.2f}"'
-    moves = [f"<scale {scale}/>", f'<translate y="{(top + bottom) / 2:.5f}"/>']
-    return _shape("cube", f"layer_{k}", k, _transform(*moves))
-
-
-def _rods(layers: Layers, k: int) -> str:
-    """A cylinder with both its ends."""
-    radius, half = layers.boundaries[k - 1], 1 - layers.end - STEP * (k - 1)
-    lines = [f'<point name="p{i}" value="0, 0, {z:.3f}"/>' for i, z in enumerate((-half, half))]
-    lines.append(f'<float name="radius" value="{radius}"/>')
-    parts = [_shape("cylinder", f"shell_{k}", k, "".join(f"        {line}\n" for line in lines))]
-    for name, turn in (("near", 0), ("far", 180)):
-        moves = [f'<scale value="{radius}"/>', f'<translate z="{half:.3f}"/>', f'<rotate y="1" angle="{turn}"/>']
-        parts.append(_shape("disk", f"{name}_{k}", k, _transform(*moves)))
-    return "".join(parts)
-
-
-def _transform(*moves: str) -> str:
-    lines = "".join(f"            {move}\n" for move in moves)
-    return f'        <transform name="to_world">\n{lines}        </transform>\n'
-
-
-def _shape(kind: str, name: str, k: int, text: str) -> str:
-    return f'    <shape type="{kind}" id="{name}">\n{text}        <ref id="to_{k}"/>\n    </shape>\n'
-
-
-if __name__ == "__main__":
-    for layers in LAYERS.values():
-        update_between(SCENES / f"{layers.scene}.xml", MARKER, block(layers))
+LAYERS = {scene: _read(scene) for scene in ("mirage", "fibre")}
+MIRAGE, FIBRE = LAYERS.values()

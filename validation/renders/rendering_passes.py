@@ -25,7 +25,7 @@ import numpy as np
 
 from mi_refract.io.image_file import write_exr
 from mi_refract.plugins import PLUGIN
-from mi_refract.rendering import error_estimate
+from mi_refract.rendering import end_conditions
 from mi_refract.rendering.end_conditions import Limits
 from mi_refract.rendering.long_render import Job, LongRender, resume
 from mi_refract.report.row import Row
@@ -124,7 +124,7 @@ def _most(count: int) -> float:
     """Of so many renders the largest number that may be beyond."""
     from scipy.stats import binom
 
-    return float(binom.ppf(1 - limits.STOPPED_WRONGLY, count, 1 - error_estimate.LEVEL))
+    return float(binom.ppf(1 - limits.STOPPED_WRONGLY, count, 1 - end_conditions.LEVEL))
 
 
 def time_rows(context: Context, spp: int) -> list[Row]:

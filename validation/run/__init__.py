@@ -13,6 +13,5 @@ __all__ = [
     "headline",
     "kernel_timing",
     "metrics",
-    "path_overlay",
     "render_methods",
 ]

@@ -13,6 +13,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from mi_refract.io import image_file
 from mi_refract.plugins import PLUGIN
 from mi_refract.rendering import scene_files
 
@@ -98,3 +99,11 @@ def camera(path: Path, method: Method, resolution: int, **parameters: Any) -> Ca
     depth = int((defaults | parameters)["max_depth"])
     scene = opened(path, method.bsdf, resolution, **parameters)
     return Camera(scene, mi.load_dict(method.plugin(depth)))
+
+
+def save_image(folder: Path, name: str, image: np.ndarray, about: dict[str, Any]) -> str:
+    """Write an EXR under `folder`; its path relative to that."""
+    target = Path("images") / f"{name}.exr"
+    (folder / target).parent.mkdir(parents=True, exist_ok=True)
+    image_file.write_exr(folder / target, image.astype(np.float32), metadata=about)
+    return str(target)

@@ -5,7 +5,7 @@ Measured are ∂b/∂a along two unit vectors perpendicular to `a`, in the plane
 critical angle the derivatives diverge as 1/cosθt. The condition of ∂b, 1 + k² sinθi (sinθi + 2 cosθi)/cos²θt, is the
 change of the derivative, in u and to first order, that inputs off by u may cause; the étendue's has 1/12 cosθi more.
 That of ∂R/∂η is the sum of the magnitudes of its terms, over the larger of their sum and R, which rounds to u of it.
-`validation/stability/derivative_conditions.py` derives the limits.
+`condition_of` derives the limits.
 """
 
 from __future__ import annotations
@@ -32,8 +32,6 @@ from validation.run.array_settings import Setting, settings
 from validation.run.context import Context
 from validation.study import Study, Task, about
 
-from .derivative_conditions import condition_of, condition_of_etendue, size_of_powers
-
 NAME = "derivatives"
 AXES = {"x": "cos²θt, transmitted", "y": "largest error of k ∂b/∂k", "x_scale": "log", "y_scale": "log"}
 TERMS = {
@@ -48,8 +46,6 @@ TERMS = {
 }
 SEED = 2029
 BINS = np.geomspace(1e-9, 1, 19)
-
-
 Array = np.ndarray
 
 
@@ -58,11 +54,11 @@ class Inputs:
     """Rays, two directions at right angles to each, and the certified answers."""
 
     rays: regimes.Rays
-    along: dict[str, np.ndarray]  # by derivative: (N, 3), in the precision of the rays
-    exact: dict[str, np.ndarray]
+    along: dict[str, Array]  # by derivative: (N, 3), in the precision of the rays
+    exact: dict[str, Array]
     certified: oracle.Certified
-    condition: np.ndarray
-    regime: np.ndarray
+    condition: Array
+    regime: Array
 
 
 def tasks(context: Context) -> list[Task]:
@@ -87,16 +83,9 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
 
 
 def drawn_rows(context: Context) -> list[Row]:
-    """Of the forms at the rounding limit, which have budgets, and of the reflectance, in every compiled setting."""
-    rows = []
-    for setting in settings(context):
-        if setting.is_scalar or setting.vector is None:
-            continue
-        given = inputs(context.profile.rays // 40, setting.precision)
-        limited = {name: formula for name, formula in FORMULAS.items() if formula.budget.at_the_limit}
-        rows += [row for name, formula in limited.items() for row in formula_rows(name, formula, given, setting)[0]]
-        rows.append(reflectance_row(given, setting))
-    return rows
+    """Those with budgets, in every compiled setting."""
+    running = [s for s in settings(context) if s.vector is not None and not s.is_scalar]
+    return [row for setting in running for row in setting_rows(context, setting) if row.budgets]
 
 
 @seeds.cached
@@ -105,7 +94,6 @@ def inputs(count: int, precision: type) -> Inputs:
     names = [name for name, regime in regimes.REGIMES.items() if regime.unit and not regime.rests_on_denormals]
     parts = [regimes.make(name, count, precision, seeds.current(SEED)) for name in names]
     a, n, k = (np.concatenate([getattr(part, x) for part in parts]) for x in ("a", "n", "k"))
-    regime = np.repeat(names, count)
     certified = oracle.refract(a, n, k, progress=False, fresnel=False)
     wide = regimes.normalised(a)
     across = np.cross(n.astype(np.longdouble), wide)
@@ -118,15 +106,15 @@ def inputs(count: int, precision: type) -> Inputs:
     along = {"∂b/∂a in the plane": within.astype(precision), "∂b/∂a across it": across.astype(precision)}
     exact = {name: derivatives.derivative(a, n, k, e, 0.0) for name, e in along.items()}
     exact["∂b/∂k"] = derivatives.derivative(a, n, k, np.zeros_like(a), k)
-    kept = np.isfinite(exact["∂b/∂k"]).all(1)
-    along, exact = ({name: x[kept] for name, x in found.items()} for found in (along, exact))
-    condition = condition_of(certified, k)[kept]
-    return Inputs(regimes.Rays(a[kept], n[kept], k[kept]), along, exact, pick(certified, kept), condition, regime[kept])
+    every = Inputs(regimes.Rays(a, n, k), along, exact, certified, condition_of(certified, k), np.repeat(names, count))
+    return only(every, np.isfinite(exact["∂b/∂k"]).all(1))
 
 
-def pick(certified: oracle.Certified, kept: np.ndarray) -> oracle.Certified:
-    """The certified answers of a mask (N,)."""
-    return oracle.Certified(**{name: x[kept] for name, x in vars(certified).items()})
+def only(given: Any, kept: np.ndarray) -> Any:
+    """Rays, certified answers or all of `Inputs`, of a mask (N,)."""
+    if isinstance(given, dict):
+        return {name: only(x, kept) for name, x in given.items()}
+    return type(given)(**only(vars(given), kept)) if hasattr(given, "__dict__") else given[kept]
 
 
 def forward(function: Callable[[Any], Any], x: Any, direction: Any) -> tuple[Any, Any]:
@@ -172,7 +160,8 @@ def formula_rows(
     through, along_b = right & given.certified.transmitted, (area * given.certified.direction).sum(1)
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.abs(np.abs(along_b) * cos_t / (k * k * given.certified.cos_i) - 1)
-    steep = dataclasses.replace(given, condition=condition_of_etendue(given.condition, given.certified.cos_i))
+    # At grazing incidence what crosses the surface is known to u/cosθi.
+    steep = dataclasses.replace(given, condition=given.condition + 1 / (12 * given.certified.cos_i))
     rows.append(row(name, "étendue", error, steep, setting, through, of_area))
     return rows, curve
 
@@ -229,6 +218,78 @@ def reflectance_row(given: Inputs, setting: Setting) -> Row:
     budgets = {"error / condition": limits.REFLECTANCE[setting.name], "not finite": 0.0}
     given = dataclasses.replace(given, condition=condition)  # that of the rounded cosines
     return row("powers", "∂R/∂η", error, given, setting, exists, budgets)
+
+
+# Conditions -------------------------------------------------------------------------------------------------------
+
+
+def condition_of(certified: oracle.Certified, k: np.ndarray) -> np.ndarray:
+    """C = 1 + k² sinθi (sinθi + 2 cosθi)/cos²θt: what k and both directions, off by u, change log cosθt by.
+
+    How far rounding may move a derivative, and so the constants in `limits` that go with this condition, with that of
+    the étendue, C + 1/12 cosθi, and with `size_of_powers`:
+
+    Notation: c = cosθi, s = sinθi, y = cosθt, D = y² = c² − κ s², e the input's direction, a prime d/dε. Forward
+    differentiation evaluates a sum of products with rounded factors. Sums of two words stay free of errors, as their
+    derivatives pass the same steps; a product costs u of its size. In units of u, for a form at the rounding limit,
+    whose values D, y and b are right to u:
+
+        c′ = n·e                  δc′ ≤ 1 + 4|c′|                       Σ|nᵢeᵢ| ≤ 1
+        w′ = n × e                δw′ ≤ √2 + 2|w′|                      Σ(|nⱼeₖ| + |nₖeⱼ|)² ≤ 2
+        D′ = 2cc′ − 2κ w·w′       δD′ ≤ 2c δc′ + 4c|c′| + |κ|(2s δw′ + 8s|w′|) + 2|D′|
+        r′ = D′/2y                δr′ ≤ (δD′ + 6|D′|)/2y                rsqrt, its derivative, one correction
+        b′ along the surface      k δw′ + 2k|w′|
+        b′, corrected and rounded 4|b′|                                  three products a component, and the last sum
+
+    **∂b/∂a in the plane**: c′ = −s, |w′| = c, D′ = −2k²sc, |b′| = kc/y.
+
+        δb′ ≤ [c(1 + 6s) + |κ|s(1.42 + 6c) + 8k²sc]/y + k(√2 + 4c) + 4|b′|
+
+    With C = 1 + k²s(s + 2c)/y² ≥ 1/y² + 2k²sc/y² ≥ 1 and M = max(1, |b′|): k ≥ 1: kc/y ≤ M; |κ|s ≤ k as ks ≤ 1, so
+    |κ|s/y ≤ 2M for c ≥ 1/2, and k ≤ 1.155, |κ| ≤ 1/3 else; k²sc/y ≤ C/2; so 7 + 2.83 + 3 + 4 + (2.83 + 4) + 4 = 27.7.
+    k < 1: c ≤ y, s/y ≤ C: 7 + 1.42 + 6 + 4 + 5.42 + 4 = 27.9. **Across it**: c′ = w·w′ = D′ = 0, |w′| = 1:
+    (c + 7.4|κ|s)/y + 5.42k + 4k ≤ 17.9 CM. **∂b/∂k**: no δc′, no δw′, less. The certified derivative is a double, 1
+    more: DERIVATIVE = 29 ≥ error/(C M u).
+
+    **Étendue**, (v × w)·b = k²c/y of v = ∂b/∂a in the plane and w = k across it. Errors along the surface, τ relative,
+    and ν along n, in units of u, move its logarithm by y²(τ_v + τ_w) + k²s²τ_w + (s y/c) ν_v; ν_w moves it by none.
+    With τ_v ≤ √2/c + 4 + 4/y, τ_w ≤ √2 + 8, ν_v ≤ δr′ + 4kc/y:
+
+        (√2 y² + 1.42|κ|s²)/c + 4y² + 4y + 9.42 + s(1 + 6s) + 6|κ|s² + 8k²s² + 4ks
+
+    y² + k²s² = 1 and |κ|s² ≤ 1, so at most 2.84/c + 8 + 4√2 + 9.42 + 7 + 6 = 2.84/c + 36.1. Both e are off unit by √3/2
+    each; cosines and b are doubles, 3 more: 40.8 + 2.84/c ≤ 41 (C + 1/12c). Here a small k does not hide in M.
+
+    **The promoted form in float32** computes all of this with 2⁻⁵³ and rounds v and w once: |δb′| ≤ u|b′|, 1.01 with
+    what is left of float64; the étendue 2 + √3 of it.
+
+    **∂R/∂η** of R = A/(A + B), A = κ²(p² + q²), B = 2kp(d_s² + d_p²), p = cy, q = ks², where log y changes with log k
+    by Y = −k²s²/y². k ∂R/∂k = RT(α − β), and the sum of its terms' magnitudes is
+
+        S = RT [4k²/|κ| + (2p²|Y| + 2q²)/(p² + q²) + 1 + |Y| + 2(d_s(kc + y|Y|) + d_p ky(1 + |Y|))/(d_s² + d_p²)].
+
+    In float64: Y by D′ (6 roundings) and √ (13); five steps of double words to A′ or B′, 13; T A′ − R B′ over A + B, 8;
+    and the rounded y, which enters p, d_s, d_p, R, T with powers of 8.2 at most: 48.2 u S. In float32 all but y, y′ and
+    the result is exact to 2⁻²⁹: 8.2 + 1 + 1, and less than 0.3 for what 1/T ≤ 1e6 makes of 2⁻⁵³.
+    """
+    sin_i = np.sqrt((1 - certified.cos_i) * (1 + certified.cos_i))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moved = k.astype(float) ** 2 * sin_i * (sin_i + 2 * certified.cos_i) / certified.cos_t**2
+    return 1 + np.where(certified.transmitted, moved, 0)
+
+
+def size_of_powers(certified: oracle.Certified, cos_i: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """S of `condition_of`, (N,); 0 under total internal reflection and at k = 1, where the derivative is exactly 0."""
+    wide: Any = np.longdouble
+    c, k, y = cos_i.astype(wide), k.astype(wide), certified.cos_t.astype(wide)
+    r, t = (getattr(certified, name).astype(wide) for name in ("reflectance", "transmittance"))
+    s2, kappa = (1 - c) * (1 + c), (k - 1) * (k + 1)
+    p, q, d_s, d_p = c * y, k * s2, k * c + y, c + k * y
+    with np.errstate(divide="ignore", invalid="ignore"):
+        turn = k * k * s2 / (y * y)
+        reflected = 4 * k * k / np.abs(kappa) + 2 * (p * p * turn + q * q) / (p * p + q * q)
+        through = 1 + turn + 2 * (d_s * (k * c + y * turn) + d_p * k * y * (1 + turn)) / (d_s * d_s + d_p * d_p)
+        return np.where(certified.transmitted & (kappa != 0), r * t * (reflected + through), 0)
 
 
 STUDY = Study(NAME, "Derivatives", about(__doc__), TERMS, tasks, axes=AXES, again=drawn_rows)

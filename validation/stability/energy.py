@@ -19,7 +19,7 @@ from mi_refract.accuracy import lengths
 from mi_refract.formulas import fresnel, resolve
 from mi_refract.report.row import Row
 from validation import limits, repeated
-from validation.reference.diffuse_fresnel import GRADE, hemispherical, nodes
+from validation.reference.closed_forms import GRADE, hemispherical, nodes
 from validation.run import seeds
 from validation.run.array_settings import Setting, settings
 from validation.run.bsdf_sampling import sample_all

@@ -3,8 +3,7 @@
 A ray is traced through Mitsuba's scene with the plugin's own samples, transmitted wherever possible, and compared with
 a path of straight segments and Snell's law in double precision. Both include Mitsuba's ray offset: in the mirage it
 moves rays by more than any other error, but it turns none. The images show the mirage through a telescope and to the
-naked eye, and the fibre, with exact paths drawn over them (white, between squares) and the ends of the traced ones
-(green crosses).
+naked eye, and the fibre.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ from mi_refract.report.row import Row
 from validation import limits
 from validation.reference import layered_scenes
 from validation.reference.layered_scenes import FIBRE, MIRAGE, Layers, Path
-from validation.run import path_overlay, seeds
+from validation.run import seeds
 from validation.run.context import SCENES, Context
 from validation.run.metrics import WRONG_PATH
-from validation.run.path_overlay import View
+from validation.run.render_methods import save_image
 from validation.study import Study, Task, about
 
 INDICES, RATIOS = "exact, indices in float32", "exact, ratios in float32"
@@ -199,19 +198,15 @@ def path_rows(context: Context, layers: Layers) -> list[Row]:
         others = rays.exact(dataclasses.replace(layers, indices=tuple(x.tolist())))
         found[name] = [deviation(layers, p, q.segments()) for p, q in zip(exact, others, strict=True)]
     replay = {"scene": f"{layers.scene}.xml", "rays": RAYS, "seed": seeds.current(SEED), "shown": rays.shown}
-    case, rows = f"{layers.scene}: path", []
-    for plugin, parts in found.items():
-        values, budgets = _values(exact, parts), _budgets(layers, plugin, exact)
-        rows.append(Row(NAME, plugin, case, context.variant, values, budgets, replay=replay | {"plugin": plugin}))
+    rows = [
+        _path_row(layers, name, exact, parts, setting=context.variant, replay=replay | {"plugin": name})
+        for name, parts in found.items()
+    ]
     # How far the ray offset moves the exact paths; the median, as some turn elsewhere without it.
     plain = zip(rays.exact(layers, offset=0.0), exact, strict=True)
     offset = {"ray offset": float(np.median([deviation(layers, p, q.segments()).place.max() for p, q in plain]))}
-    for name, curves in _curves(rays, found).items():
-        row = Row(
-            NAME, "every plugin", f"{layers.scene}: {name}", context.variant, offset, replay=replay, curves=curves
-        )
-        rows.append(row)
-    return rows
+    row = functools.partial(Row, NAME, "every plugin", setting=context.variant, values=offset, replay=replay)
+    return rows + [row(case=f"{layers.scene}: {case}", curves=x) for case, x in _curves(rays, found).items()]
 
 
 def _curves(rays: Bundle, found: dict[str, list[Deviation]]) -> dict[str, dict[str, list[tuple[float, float]]]]:
@@ -229,53 +224,55 @@ def _curves(rays: Bundle, found: dict[str, list[Deviation]]) -> dict[str, dict[s
     return curves
 
 
-def _values(exact: list[Path], parts: list[Deviation]) -> dict[str, float]:
-    directions, places = ([getattr(part, name).max() for part in parts] for name in ("direction", "place"))
-    wrong = [part.boundaries != len(path.media) - 1 for path, part in zip(exact, parts, strict=True)]
-    return {
-        DIRECTION: float(max(directions)),
-        "direction / condition": float(max(part.conditioned.max() for part in parts)),
-        MEDIAN_DIRECTION: float(np.median(directions)),
-        PLACE: float(max(places)),
-        "median place": float(np.median(places)),
-        WRONG_PATH: float(sum(wrong)),
-    }
-
-
-def _budgets(layers: Layers, plugin: str, exact: list[Path]) -> dict[str, float]:
+def _path_row(layers: Layers, name: str, exact: list[Path], parts: list[Deviation], **row: Any) -> Row:
     """Of the forms at the rounding limit: no ray takes a wrong path; in the mirage the direction is bounded a priori.
 
     A boundary rounds the cosine twice (b, and to world coordinates), u each; κ is off by u, and all of them together
     are no more than sin² α: (2 m + 1) u after m boundaries. A curved boundary adds the rounding of the intersection.
     """
-    name = plugin.removeprefix(f"{PLUGIN}_")
-    if plugin != PLUGIN and (name not in FORMULAS or not FORMULAS[name].budget.at_the_limit):
-        return {}
-    most = max(len(path.media) - 1 for path in exact)
-    direction = {} if layers.round else {"direction / condition": (2 * most + 1) * limits.PATH_BOUNDARY}
-    return {WRONG_PATH: 0.0} | direction
+    directions, places = ([float(getattr(part, x).max()) for part in parts] for x in ("direction", "place"))
+    met = [len(path.media) - 1 for path in exact]
+    values = {
+        DIRECTION: max(directions),
+        "direction / condition": float(max(part.conditioned.max() for part in parts)),
+        MEDIAN_DIRECTION: float(np.median(directions)),
+        PLACE: max(places),
+        "median place": float(np.median(places)),
+        WRONG_PATH: float(sum(part.boundaries != m for part, m in zip(parts, met, strict=True))),
+    }
+    formula = FORMULAS.get(name.removeprefix(f"{PLUGIN}_"))
+    budgets: dict[str, float] = {}
+    if name == PLUGIN or (formula and formula.budget.at_the_limit):
+        budgets = {WRONG_PATH: 0.0}
+        budgets |= {} if layers.round else {"direction / condition": (2 * max(met) + 1) * limits.PATH_BOUNDARY}
+    return Row(NAME, name, f"{layers.scene}: path", values=values, budgets=budgets, **row)
 
 
 # Images ------------------------------------------------------------------------------------------------------
 
 
-def view_rows(context: Context, scene: str, parameters: dict[str, str], name: str) -> list[Row]:
+def view_rows(context: Context, scene: str, parameters: dict[str, Any], name: str) -> list[Row]:
     """`refract` and the built-in, image against image; and what flipped lobes alone do, as a control."""
     if context.variant.startswith("scalar"):
         return [Row(NAME, PLUGIN, f"{name}: image", context.variant, reason=SCALAR)]
     profile, right = context.profile, other_right_formula()
     spp = max(1, profile.spp // 4)
-    views = {p: View(scene, p, parameters, profile.resolution, spp) for p in (BUILTIN, PLUGIN, right)}
-    reference, test, control = (view.image for view in views.values())
+
+    def render(plugin: str) -> np.ndarray:
+        import mitsuba as mi
+
+        path = str(SCENES / f"{scene}.xml")
+        loaded = mi.load_file(path, **scene_files.REPRODUCIBLE, bsdf=plugin, res=profile.resolution, **parameters)
+        return np.array(mi.render(loaded, spp=spp, seed=0), dtype=np.float64)
+
+    reference, test, control = map(render, (BUILTIN, PLUGIN, right))
     values = {
         "pixels off": pixelwise.changes(reference, test, VISIBLE).share,
         "pixels off, control": pixelwise.changes(control, test, VISIBLE).share,
     }
     about = {"scene": f"{scene}.xml", "resolution": profile.resolution, "spp": spp, "seed": 0, **parameters}
-    images = {
-        role: path_overlay.save(context.out, f"{name} {plugin} with paths", _with_paths(views[plugin], scene), about)
-        for role, plugin in (("reference", BUILTIN), ("test", PLUGIN))
-    }
+    shown = {"reference": (BUILTIN, reference), "test": (PLUGIN, test)}
+    images = {role: save_image(context.out, f"{name} {plugin}", x, about) for role, (plugin, x) in shown.items()}
     replay, budgets = about | {"control": right}, {"pixels off, control": limits.FLIPPED}
     return [Row(NAME, PLUGIN, f"{name}: image", context.variant, values, budgets, replay=replay, images=images)]
 
@@ -286,27 +283,6 @@ def other_right_formula() -> str:
 
     default = automatic(dr.backend_v(mi.Float))
     return next(f"{PLUGIN}_{k}" for k, f in FORMULAS.items() if f.budget.at_the_limit and k != default)
-
-
-def _with_paths(view: View, scene: str) -> np.ndarray:
-    """Seven exact paths over the image, and where the view's own plugin takes the same rays."""
-    layers = layered_scenes.LAYERS[scene]
-    if layers is MIRAGE:
-        places = zip(np.linspace(0.08, 0.92, 7), (0.70, 0.91, 0.60, 0.79, 0.88, 0.74, 0.93), strict=True)
-        origins, directions = np.stack([view.ray(u, v) for u, v in places], 1)
-        rays = Bundle(origins.astype(np.float32), directions.astype(np.float32), np.zeros(7, int), 0)
-    else:
-        every = bundle(layers)
-        rays = Bundle(every.origins[:7], every.directions[:7], every.media[:7], 0)
-    exact = rays.exact(layers)
-    segments = trace(view.scene, layers, rays, 4 * max(len(path.media) for path in exact))
-    ends = np.array([x[np.isfinite(x).all((1, 2))][-1, 2] for x in np.moveaxis(segments, 2, 0)])
-    lines = []
-    for path, end in zip(exact, ends, strict=True):  # the last segment ends where the plugin's does along the axis
-        p, d = path.starts[-1], path.directions[-1]
-        last = p + d * (end[layers.axis] - p[layers.axis]) / d[layers.axis]
-        lines.append(np.concatenate([np.stack([path.starts, path.ends], 1).reshape(-1, 3)[:-1], [last]]))
-    return path_overlay.draw(view, lines, ends)
 
 
 STUDY = Study(NAME, "Paths", about(__doc__), TERMS, tasks, axes=AXES, again=drawn_rows)

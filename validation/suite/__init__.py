@@ -8,7 +8,6 @@ __all__ = [
     "glasses",
     "lenses",
     "matrix",
-    "matrix_page",
     "per_ray",
     "rendered_images",
     "small_mistakes",

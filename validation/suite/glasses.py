@@ -18,11 +18,11 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from mi_refract.ray_sets import check_answers, media_rays, ray_set
-from mi_refract.ray_sets.check_answers import UNFIT, Findings, RegimeErrors
+from mi_refract.ray_sets import check_answers, header, ray_set
+from mi_refract.ray_sets.check_answers import UNFIT
 from mi_refract.ray_sets.files import as_csv, parse_answers
 from mi_refract.ray_sets.ray_set import Answers, RaySet
-from mi_refract.report.row import Reason, Row
+from mi_refract.report.row import Row
 from validation import limits, repeated
 from validation.run import seeds
 from validation.run.context import Context
@@ -61,29 +61,20 @@ def tasks(context: Context) -> list[Task]:
 
 def system_rows(system: System, catalogue: GlassCatalogue, context: Context) -> list[Row]:
     """A row per regime and one per glass, or one that says why there are none."""
-    if reason := _why_not(system, context):
-        return [Row(NAME, system.title, "every glass", "f64", reason=reason)]
+    row = functools.partial(Row, NAME, system.title, "every glass", "f64")
+    if find_spec("opticalglass") is None:
+        return [row(reason="opticalglass is not installed: pip install 'mi-refract[glass]'")]
     rays = given(catalogue.glasses)
-    try:
+
+    def answer() -> Answers:
         text = environments.run(environments.script(system, catalogue.script, "glasses"), as_csv(rays))
         answers = parse_answers(text, system.title)
         if answers.n_ratio is None:
             raise ValueError("no column n_ratio; expected the ratio of indices that was used")
-    except environments.Unable as why:
-        return [Row(NAME, system.title, "every glass", "f64", reason=f"cannot run here: {why}")]
-    except (environments.Broken, ValueError) as defect:
-        values, text = {"unanswered": float(len(rays))}, " ".join(str(defect).split())
-        return [Row(NAME, system.title, "every glass", "f64", values, {"unanswered": 0.0}, reason=text)]
-    return rows(system.title, catalogue, rays, answers)
+        return answers
 
-
-def _why_not(system: System, context: Context) -> str:
-    if find_spec("opticalglass") is None:
-        return "opticalglass is not installed: pip install 'mi-refract[glass]'"
-    large = not system.small and context.profile.name != "full"
-    return environments.absent(system) or (
-        Reason(f"{system.megabytes} MB: in the full profile only", "`--profile full`") if large else ""
-    )
+    answers, nothing = environments.attempt(row, system, context.profile.name, float(len(rays)), answer)
+    return nothing if answers is None else rows(system.title, catalogue, rays, answers)
 
 
 @seeds.cached
@@ -96,52 +87,39 @@ def rows(title: str, catalogue: GlassCatalogue, rays: RaySet, answers: Answers) 
     """Directions by regime, then indices by glass."""
     findings = check_answers.check(rays, answers)
     system = str(answers.header.get("system", ""))
-    errors = {regime.regime: regime for regime in findings.regimes}
-    made = [_direction_row(title, name, errors.get(name), findings, catalogue.tir, system) for name in REGIMES]
-    used = _in_order(rays, answers)
-    wavelength, pair = media_rays.columns(rays.header, rays.ids).T
-    off = np.abs(used / rays.rays.k - 1)
-    for i, glass in enumerate(catalogue.glasses):
-        of_glass = np.flatnonzero(pair // 2 == i)
-        # argmax takes the first NaN for the largest.
-        worst = of_glass[np.argmax(off[of_glass])]
-        made.append(_index_row(title, glass, float(off[worst]), float(wavelength[worst]), catalogue, system))
-    return made
-
-
-def _in_order(rays: RaySet, answers: Answers) -> np.ndarray:
-    """(N,) the ratio used for each ray; NaN where it was not answered."""
+    made = []
+    answered = {regime.regime: regime for regime in findings.regimes}
+    for name in REGIMES:
+        values, budgets = {"unfit": float(findings.problem_count(*UNFIT))}, {"unfit": 0.0, "wrong": 0.0}
+        if not (errors := answered.get(name)):
+            made.append(Row(NAME, title, name, "f64", values | {"wrong": np.nan}, budgets, reason=system))
+            continue
+        values |= {WORST_ANGLE: errors.worst, "p99 rad": errors.p99, ERROR_OVER_BOUND: errors.error_over_bound}
+        values |= {MISCLASSIFIED: float(errors.tir_misclassified), "wrong": float(errors.wrong)}
+        budgets |= {ERROR_OVER_BOUND: 1.0}
+        if name == "critical":
+            values["other TIR signal"] = float(findings.tir != catalogue.tir)
+            budgets["other TIR signal"] = 0.0
+        text, worst_ray = f"{system}; total internal reflection: {findings.tir}", {"worst": errors.replay}
+        made.append(Row(NAME, title, name, "f64", values, budgets, reason=text, replay=worst_ray))
     assert answers.n_ratio is not None
     said = dict(zip(answers.ids.tolist(), answers.n_ratio.tolist(), strict=True))
-    return np.array([said.get(id_, np.nan) for id_ in rays.ids.tolist()])
-
-
-def _direction_row(
-    title: str, regime: str, errors: RegimeErrors | None, findings: Findings, tir: str, system: str
-) -> Row:
-    values = {"unfit": float(findings.problem_count(*UNFIT))}
-    budgets = {"unfit": 0.0, "wrong": 0.0}
-    if errors is None:
-        return Row(NAME, title, regime, "f64", values | {"wrong": np.nan}, budgets, reason=system)
-    values |= {WORST_ANGLE: errors.worst, "p99 rad": errors.p99, ERROR_OVER_BOUND: errors.error_over_bound}
-    values |= {MISCLASSIFIED: float(errors.tir_misclassified), "wrong": float(errors.wrong)}
-    budgets |= {ERROR_OVER_BOUND: 1.0}
-    if regime == "critical":
-        values["other TIR signal"], budgets["other TIR signal"] = float(findings.tir != tir), 0.0
-    text = f"{system}; total internal reflection: {findings.tir}"
-    return Row(NAME, title, regime, "f64", values, budgets, reason=text, replay={"worst": errors.replay})
-
-
-def _index_row(title: str, glass: str, off: float, wavelength: float, catalogue: GlassCatalogue, system: str) -> Row:
-    known = catalogue.others.get(glass)
-    replay = {"wavelength": wavelength, "glass": glass}
-    if not known:
-        budgets = {INDEX_OFF: limits.CATALOG_FORMULA}
-        return Row(NAME, title, glass, "f64", {INDEX_OFF: off}, budgets, reason=system, replay=replay)
-    factor = max(off / known.recorded, known.recorded / off) if off > 0 else float(np.where(off == 0, np.inf, np.nan))
-    values = {INDEX_OFF: off, RECORDED: known.recorded, OFF_RECORDED: factor}
-    budgets, goals = {OFF_RECORDED: limits.OTHER_INDEX}, {INDEX_OFF: media_rays.SAME}
-    return Row(NAME, title, glass, "f64", values, budgets, goals, f"{system}; {known.cause}", replay)
+    used = np.array([said.get(id_, np.nan) for id_ in rays.ids.tolist()])  # NaN where it was not answered
+    wavelength, pair = header.columns(rays.header, rays.ids).T
+    difference = np.abs(used / rays.rays.k - 1)
+    for i, glass in enumerate(catalogue.glasses):
+        of_glass = np.flatnonzero(pair // 2 == i)
+        worst = of_glass[np.argmax(difference[of_glass])]  # argmax takes the first NaN for the largest
+        off, replay = float(difference[worst]), {"wavelength": float(wavelength[worst]), "glass": glass}
+        row = functools.partial(Row, NAME, title, glass, "f64", replay=replay)
+        if not (known := catalogue.others.get(glass)):
+            made.append(row({INDEX_OFF: off}, {INDEX_OFF: limits.CATALOG_FORMULA}, reason=system))
+            continue
+        factor = max(off / known.recorded, known.recorded / off) if off > 0 else np.inf if off == 0 else np.nan
+        values = {INDEX_OFF: off, RECORDED: known.recorded, OFF_RECORDED: factor}
+        budgets, goals = {OFF_RECORDED: limits.OTHER_INDEX}, {INDEX_OFF: header.SAME}
+        made.append(row(values, budgets, goals, f"{system}; {known.cause}"))
+    return made
 
 
 STUDY = Study(NAME, "Glasses by others", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))

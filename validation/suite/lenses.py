@@ -21,7 +21,7 @@ import numpy as np
 from mi_refract.media import LINES
 from mi_refract.planar import scene_file
 from mi_refract.planar.path_tree import follow_scene
-from mi_refract.report.row import Reason, Row
+from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.exact_lens import Crossing, Lens, crossing
 from validation.run.context import SCENES, Context
@@ -101,19 +101,13 @@ def planar_rows() -> list[Row]:
 
 def system_rows(system: System, context: Context) -> list[Row]:
     """Two rows per case, or one that says why there are none."""
-    reason = environments.absent(system)
-    if not reason and not system.small and context.profile.name != "full":
-        reason = Reason(f"{system.megabytes} MB: in the full profile only", "`--profile full`")
-    if reason:
-        return [Row(NAME, system.title, "every ray", "float64", reason=reason)]
-    try:
-        answer = parsed(environments.ask(system, system.lens, json.dumps(question())))
-    except environments.Unable as why:
-        return [Row(NAME, system.title, "every ray", "float64", reason=f"cannot run here: {why}")]
-    except (environments.Broken, ValueError) as defect:
-        values, text = {"unanswered": 1.0}, " ".join(str(defect).split())
-        return [Row(NAME, system.title, "every ray", "float64", values, {"unanswered": 0.0}, reason=text)]
-    return answered(system.title, answer)
+    row = functools.partial(Row, NAME, system.title, "every ray", "float64")
+
+    def answer() -> Answer:
+        return parsed(environments.ask(system, system.lens, json.dumps(question())))
+
+    given, nothing = environments.attempt(row, system, context.profile.name, 1.0, answer)
+    return nothing if given is None else answered(system.title, given)
 
 
 def answered(title: str, answer: Answer) -> list[Row]:

@@ -7,18 +7,25 @@ does not do what it should, or what `refract` does.
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
 
+from mi_refract.io.atomic import write_atomically
 from mi_refract.ray_sets.judged_answers import RIGHT
+from mi_refract.report.embedded_images import EmbeddedImages
+from mi_refract.report.html_page import write_page
 from mi_refract.report.number_text import compact
-from mi_refract.report.row import Row
+from mi_refract.report.row import Row, strict
 from validation import limits
 from validation.run.context import Context
-from validation.run.metrics import MEAN_DIFFERENCE, WORST_ANGLE
+from validation.run.metrics import DETECTABLE, MEAN_DIFFERENCE, WORST_ANGLE
 from validation.study import Study, Task, about
 
 from . import per_ray, rendered_images
-from .per_ray import BACKWARD, OFF_RECORDED, RECORDED
+from .per_ray import BACKWARD, LARGE, OFF_RECORDED, RECORDED
 from .rendered_images import INCONCLUSIVE
 
 NAME = "matrix"
@@ -109,6 +116,156 @@ def _text(row: Row | None) -> str:
         factor, less = compact(row.values[OFF_RECORDED]), row.values[OFF] < row.values.get(RECORDED, 0)
         text += f" (recorded / {factor})" if less else f" ({factor} × recorded)"
     return text + (" ✗" if row.broken else "")
+
+
+# The page ----------------------------------------------------------------------------------------------------------
+#
+# Every system against every check, and what it gets wrong in a sentence, from the `rows.json` of a validation. Systems
+# are in the order of how far they are from right: those with a wrong answer last, and otherwise by their largest
+# backward error, where k is large last of all: few are right there.
+
+MADE_BY = "python -m validation suite"
+Stored = dict[str, Any]  # a row of rows.json, or what is made of some
+PAGE_TERMS = {
+    "number": "the largest backward error of the set, in roundings u: each answer is the exact refraction of inputs a, "
+    f"n and k off by no more. Up to {RIGHT:g} the answers are right; above, they are as good as a textbook's formula, "
+    "unless the cell says wrong",
+    "images": "the image's mean relative to that of the reference; and the smallest difference that a tile could show",
+    "not run": "the system was not installed where this page was made; the command installs it",
+} | {name: rays.text for name, rays in per_ray.SETS.items()}
+PAGE_TERMS[LARGE] += (
+    ". A formula with 1 − k² (1 − c²) is not right here: near the normal the difference 1 − c² has few digits left of "
+    "sin²θ_i, and its error counts k² times; |n × a|² keeps them"
+)
+
+
+def read(folder: Path) -> Stored:
+    """The matrix of the validation whose report is in a folder. ValueError or OSError where there is none."""
+    path, expected = folder / "rows.json", f"expected the folder of {MADE_BY} --out {folder}"
+    try:
+        rows = [row for row in json.loads(path.read_text("utf-8"))["rows"] if row["study"] in CHECKS]
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path}: no such file; {expected}") from None
+    except (ValueError, KeyError, TypeError):
+        raise ValueError(f"{path}: no rows of a validation; {expected}") from None
+    if not rows:
+        raise ValueError(f"{path}: no rows of other systems; {expected}")
+    return of_rows(rows)
+
+
+def of_rows(rows: Iterable[Stored]) -> Stored:
+    """`{"schema": 1, "rays": [...], "images": [...], "not_run": [...]}` of the rows of both studies."""
+    systems: dict[tuple[str, ...], list[Stored]] = {}
+    for row in rows:
+        precision = row["setting"] if row["study"] == per_ray.NAME else ""
+        systems.setdefault((row["study"], row["subject"], precision), []).append(row)
+    rays, images, not_run = list[Stored](), list[Stored](), list[Stored]()
+    for (study, title, precision), cells in systems.items():
+        about = {"system": title} | ({"precision": precision} if precision else {})
+        if not (ran := [cell for cell in cells if cell["values"]]):
+            not_run.append(about | {"reason": cells[0]["reason"]})
+        elif study == per_ray.NAME:
+            rays.append(about | _of_rays(ran))
+        else:
+            images.append(about | _of_images(ran))
+    rays.sort(key=_distance)
+    images.sort(key=lambda image: (image["wrong"], image["system"]))
+    return {"schema": 1, "rays": rays, "images": images, "not_run": not_run}
+
+
+def _of_rays(cells: list[Stored]) -> Stored:
+    """What a function of refraction got wrong, and its numbers by set."""
+    sets = {}
+    for cell in cells:
+        backward, worst = cell["values"].get(BACKWARD), cell["values"].get(WORST_ANGLE)
+        right = isinstance(backward, (int, float)) and backward <= RIGHT
+        verdict = "wrong" if cell["verdict"] == "fail" else "right" if right else "within bound"
+        sets[cell["case"]] = {"verdict": verdict, "backward_error": backward, "worst_angle": worst}
+    about = {name: cells[0]["replay"].get(name, "") for name in ("version", "total internal reflection", "remark")}
+    wrong = [name for name, x in sets.items() if x["verdict"] == "wrong"]
+    off = [
+        f"{name} (up to {_shown(x['backward_error'])})" for name, x in sets.items() if x["verdict"] == "within bound"
+    ]
+    parts = [f"wrong: {', '.join(wrong)}"] if wrong else []
+    parts += [f"exact only for inputs more than {RIGHT:g} roundings off: {', '.join(off)}"] if off else []
+    sentence = "; ".join([*(parts or ["right in every set"]), *filter(None, [about["remark"]])])
+    return about | {"wrong": bool(wrong), "sentence": sentence, "sets": sets}
+
+
+def _of_images(cells: list[Stored]) -> Stored:
+    """What differs in the images of a renderer, and its numbers by scene."""
+    scenes = {
+        cell["case"]: {
+            "verdict": cell["replay"].get("verdict", "not rendered"),
+            "mean_difference": cell["values"].get(MEAN_DIFFERENCE),
+            "detectable": cell["values"].get(DETECTABLE),
+        }
+        for cell in cells
+    }
+    reasons = dict.fromkeys(cell["reason"] for cell in cells if scenes[cell["case"]]["verdict"] != "equal")
+    wrong = any(cell["verdict"] == "fail" for cell in cells)
+    return {"wrong": wrong, "sentence": "; ".join(reasons) or "equal to within noise in every scene", "scenes": scenes}
+
+
+def _distance(system: Stored) -> tuple[bool, float, float, str]:
+    backward = {name: x["backward_error"] for name, x in system["sets"].items()}
+    errors = {name: x if isinstance(x, (int, float)) else math.inf for name, x in backward.items()}
+    large = errors.pop(LARGE, 0.0)
+    return system["wrong"], max(errors.values(), default=0.0), large, system["system"]
+
+
+def _shown(value: Any) -> str:
+    return compact(value) if isinstance(value, (int, float)) else str(value or "–")
+
+
+def write_json(path: Path, stored: Stored) -> None:
+    """Strict JSON. OSError."""
+    write_atomically(path, json.dumps(strict(stored), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def write_html(path: Path, stored: Stored) -> None:
+    """One page that needs no network. OSError."""
+    rays, images = stored["rays"], stored["images"]
+    right = sum(not system["wrong"] for system in rays)
+    by_images = f", {len(images)} renderers by images" if images else ""
+    content = {
+        "title": "Refraction by other systems",
+        "sentence": f"Which systems refract right: {len(rays)} functions by rays{by_images}",
+        "counts": [
+            ("pass", "functions without a wrong answer", right),
+            ("fail", "with wrong answers", len(rays) - right),
+            ("info", "not run", len(stored["not_run"])),
+        ],
+        "sets": list(per_ray.SETS),
+        "rays": [x | {"cells": [_set_cell(x["sets"].get(name)) for name in per_ray.SETS]} for x in rays],
+        "scenes": list(rendered_images.SCENES),
+        "renderers": [
+            x | {"cells": [_scene_cell(x["scenes"].get(name)) for name in rendered_images.SCENES]} for x in images
+        ],
+        "not_run": stored["not_run"],
+        "terms": PAGE_TERMS,
+        "command": f"{MADE_BY}; python -m validation renderers --page {path.name}",
+    }
+    write_page(path, "matrix.html.j2", content, EmbeddedImages())
+
+
+def _set_cell(cell: Stored | None) -> tuple[str, str]:
+    """The text of a cell and its class, of a set of rays."""
+    if not cell:
+        return "–", ""
+    states = {"right": "pass", "within bound": "missed", "wrong": "fail"}
+    return "wrong, " * (cell["verdict"] == "wrong") + _shown(cell["backward_error"]), states[cell["verdict"]]
+
+
+def _scene_cell(cell: Stored | None) -> tuple[str, str]:
+    """The text of a cell and its class, of a scene."""
+    if not cell:
+        return "–", ""
+    state = {"equal": "pass", "different": "fail"}.get(cell["verdict"], "missed")
+    if not isinstance(cell["mean_difference"], (int, float)):
+        return cell["verdict"], state
+    visible = f", visible from {cell['detectable']:.2%}" if isinstance(cell["detectable"], (int, float)) else ""
+    return f"{cell['verdict']}: {cell['mean_difference']:+.2%}{visible}", state
 
 
 STUDY = Study(NAME, "Suite", about(__doc__), TERMS, tasks, summarise=with_summary)

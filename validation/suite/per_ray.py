@@ -22,37 +22,28 @@ import numpy as np
 from mi_refract import regimes
 from mi_refract.accuracy import absolute_radicand
 from mi_refract.ray_sets import check_answers, ray_set
-from mi_refract.ray_sets.check_answers import UNFIT, Findings, RegimeErrors
+from mi_refract.ray_sets.check_answers import UNFIT
 from mi_refract.ray_sets.files import as_csv, parse_answers
 from mi_refract.ray_sets.header import PRECISIONS
 from mi_refract.ray_sets.judged_answers import RIGHT
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.ray_sets.renderer_file import RaysCommand
-from mi_refract.report.row import Reason, Row
+from mi_refract.report.row import Row
 from validation import limits, repeated
 from validation.run import seeds
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED, WORST_ANGLE
 from validation.study import Study, Task, about
-from validation.suite.renderers.system import (
-    APART,
-    CRITICAL,
-    GRAZING,
-    LARGE,
-    MATCHED,
-    RANDOM,
-    TOTAL,
-    System,
-)
 
-from .renderers import SYSTEMS, environments
+from .renderers import SYSTEMS, System, environments
 
-Numbers = dict[str, float]
 NAME = "per_ray"
 SEED = 2040
 RECORDED, OFF_RECORDED = "recorded", "off the recorded"
 BACKWARD = "backward error / u"
 OTHER_SIGNAL = "other TIR signal"
+RANDOM, APART, CRITICAL, GRAZING = "random", "random, apart", "near-critical", "grazing"
+MATCHED, TOTAL, LARGE = "η ≈ 1", "total reflection", "k ≫ 1"
 LEFT_OUT = 4e-4  # cos²θ_t in size, up to which rays are not in the set APART
 
 
@@ -146,22 +137,14 @@ def tasks(context: Context) -> list[Task]:
 
 def call_rows(system: System, call: RaysCommand, context: Context) -> list[Row]:
     """A row per set of rays, or one with the reason why there is none."""
-
-    def only(reason: str, values: Numbers | None = None, budgets: Numbers | None = None) -> list[Row]:
-        return [Row(NAME, call.title, "every set", call.precision, values or {}, budgets or {}, reason=reason)]
-
-    if reason := environments.absent(system):
-        return only(reason)
-    if not system.small and context.profile.name != "full":
-        return only(Reason(f"{system.megabytes} MB: in the full profile only", "`--profile full`"))
     rays = given(call.precision)
-    try:
-        answers = parse_answers(environments.ask(system, call.command, as_csv(rays)), call.title)
-    except environments.Unable as cause:
-        return only(f"cannot run here: {cause}")
-    except (environments.Broken, ValueError) as defect:
-        return only(str(defect), {"unanswered": float(len(rays))}, {"unanswered": 0.0})
-    return rows(call, rays, answers)
+    row = functools.partial(Row, NAME, call.title, "every set", call.precision)
+
+    def answer() -> Answers:
+        return parse_answers(environments.ask(system, call.command, as_csv(rays)), call.title)
+
+    answers, nothing = environments.attempt(row, system, context.profile.name, float(len(rays)), answer)
+    return nothing if answers is None else rows(call, rays, answers)
 
 
 @seeds.cached
@@ -181,11 +164,8 @@ def given(precision: str) -> RaySet:
     return ray_set.with_checksum(RaySet(regimes.Rays.joined(parts), np.arange(first), header))
 
 
-# Judged ------------------------------------------------------------------------------------------------------------
-
-
 def rows(call: RaysCommand, rays: RaySet, answers: Answers) -> list[Row]:
-    """One per set."""
+    """One per set. Where no ray of it was answered, all that can be said is that it was not."""
     left_out = absolute_radicand(rays.rays) < call.gives_up
     findings = check_answers.check(rays[~left_out], answers[~np.isin(answers.ids, rays.ids[left_out])])
     version = str(answers.header.get("system", ""))
@@ -193,54 +173,48 @@ def rows(call: RaysCommand, rays: RaySet, answers: Answers) -> list[Row]:
     mistake = [findings.diagnosis.text] if findings.diagnosis else []
     signal = f"total internal reflection: {findings.tir}"
     remark = "; ".join(filter(None, (version, signal, call.lengths, call.remark, *problems, *mistake)))
-    errors = {regime.regime: regime for regime in findings.regimes}
+    answered = {regime.regime: regime for regime in findings.regimes}
     made = []
-    for name in SETS:
-        values, budgets, goals = _measured(name, call, findings, errors.get(name))
+    for name, kind in SETS.items():
+        errors = answered.get(name)
+        values = {"unfit": float(findings.problem_count(*UNFIT))}
+        budgets, goals = {"unfit": 0.0, "wrong": 0.0}, {}
+        if errors is None:
+            values["wrong"] = math.nan
+        else:
+            if errors.compared:
+                values |= {WORST_ANGLE: errors.worst, "p99 rad": errors.p99, "mean rad": errors.mean}
+            values |= {
+                ERROR_OVER_BOUND: errors.error_over_bound,
+                MISCLASSIFIED: float(errors.tir_misclassified),
+                "wrong": float(errors.wrong),
+                "median backward error / u": errors.backward_median,
+                "p99 backward error / u": errors.backward_p99,
+                BACKWARD: errors.backward_worst,
+            }
+            budgets[ERROR_OVER_BOUND], goals[BACKWARD] = 1.0, RIGHT
+            if name == TOTAL:
+                values[OTHER_SIGNAL], budgets[OTHER_SIGNAL] = float(findings.tir != call.tir), 0.0
+            if recorded := call.recorded_range(name):
+                values |= {RECORDED: recorded[1], OFF_RECORDED: off(errors.worst, *recorded)}
+                goals[OFF_RECORDED] = limits.RECORDED
+            if name in call.deviations:
+                values["not seen to deviate"] = float(errors.wrong == 0)
+                budgets = {"unfit": 0.0, "not seen to deviate": 0.0}
         deviates = f"; known to deviate: {call.deviations[name]}" if name in call.deviations else ""
         if call.gives_up:
             values["given up"] = float(left_out[rays.regime == name].sum())
         replay = {
-            "set": SETS[name].text,
+            "set": kind.text,
             "seed": seeds.current(SEED),
             "command": " ".join(call.command),
-            "worst": errors[name].replay if name in errors else None,
+            "worst": errors.replay if errors else None,
             "version": version,
             "total internal reflection": findings.tir,
             "remark": call.remark,
         }
         made.append(Row(NAME, call.title, name, call.precision, values, budgets, goals, remark + deviates, replay))
     return made
-
-
-def _measured(
-    name: str, call: RaysCommand, findings: Findings, errors: RegimeErrors | None
-) -> tuple[Numbers, Numbers, Numbers]:
-    """Values, budgets and goals. Where no ray of the set was answered, all that can be said is that it was not."""
-    values = {"unfit": float(findings.problem_count(*UNFIT))}
-    budgets, goals = {"unfit": 0.0, "wrong": 0.0}, {BACKWARD: RIGHT}
-    if errors is None:
-        return values | {"wrong": math.nan}, budgets, {}
-    if errors.compared:
-        values |= {WORST_ANGLE: errors.worst, "p99 rad": errors.p99, "mean rad": errors.mean}
-    values |= {
-        ERROR_OVER_BOUND: errors.error_over_bound,
-        MISCLASSIFIED: float(errors.tir_misclassified),
-        "wrong": float(errors.wrong),
-        "median backward error / u": errors.backward_median,
-        "p99 backward error / u": errors.backward_p99,
-        BACKWARD: errors.backward_worst,
-    }
-    budgets[ERROR_OVER_BOUND] = 1.0
-    if name == TOTAL:
-        values[OTHER_SIGNAL], budgets[OTHER_SIGNAL] = float(findings.tir != call.tir), 0.0
-    if recorded := call.recorded_range(name):
-        values |= {RECORDED: recorded[1], OFF_RECORDED: off(errors.worst, *recorded)}
-        goals[OFF_RECORDED] = limits.RECORDED
-    if name in call.deviations:
-        values["not seen to deviate"] = float(errors.wrong == 0)
-        budgets = {"unfit": 0.0, "not seen to deviate": 0.0}
-    return values, budgets, goals
 
 
 def off(worst: float, low: float, high: float) -> float:

@@ -26,7 +26,7 @@ from mi_refract.io import image_file
 from mi_refract.io.image_file import Image
 from mi_refract.plugins import PLUGIN
 from mi_refract.rendering import scene_files
-from mi_refract.report.row import Reason, Row
+from mi_refract.report.row import Row
 from mi_refract.scene_export import from_mitsuba, write_files
 from mi_refract.scene_export.plain_scene import Diffuse, Environment, Glass, Light, Mesh, PlainScene
 from validation import limits
@@ -159,8 +159,8 @@ def join(system: System) -> None:
         raise ValueError(
             f"{system.folder}: title: {system.title!r} is the title of another renderer; expected a unique title"
         )
-    assumed = images.assumed or ("not said.",)
-    IMAGE_RENDERERS[system.title] = ImageRenderer(system.name, by_command(system), images.spp, assumed)
+    assumed, draw = images.assumed or ("not said.",), functools.partial(by_command, system)
+    IMAGE_RENDERERS[system.title] = ImageRenderer(system.name, draw, images.spp, assumed)
     TERMS[f"{system.title}, assumed"] = " ".join(assumed)
 
 
@@ -181,11 +181,8 @@ def tasks(context: Context) -> list[Task]:
 
 def why_not(system: System, context: Context) -> str:
     """Why the images of a renderer are not compared in this run; "" where they are."""
-    if reason := environments.absent(system):
-        return reason
-    if not system.small and context.profile.name != "full":
-        return Reason(f"{system.megabytes} MB: in the full profile only", "`--profile full`")
-    return COMPILED if context.variant.startswith("scalar") else ""
+    compiled = not context.variant.startswith("scalar")
+    return environments.why_not(system, context.profile.name) or ("" if compiled else COMPILED)
 
 
 def no_images(row: Callable[..., Row], error: Exception) -> Row:

@@ -38,9 +38,8 @@ from validation.run.render_methods import Camera, under
 from validation.study import Study, Task, about
 
 from .rendered_images import DETECTABLE_IMAGE, INCONCLUSIVE, OURS, RENDERS, TERMS, Size, measured, no_images, why_not
-from .renderers import environments
+from .renderers import SYSTEMS, environments
 from .renderers.image_renderers import IMAGE_RENDERERS
-from .renderers.table import SYSTEMS
 
 NAME = "spectral lines"
 OTHER, SCENE, VARIANT = "raysect", "dispersive_prism.xml", "llvm_ad_spectral"
@@ -77,7 +76,7 @@ def line_rows(context: Context, line: str) -> list[Row]:
     if reason := _why_not(context):
         return [row(reason=reason)]
     try:
-        found, values = _compared(ours(line, size), theirs(line, size), size)
+        found, values = compared(ours(line, size), theirs(line, size), size)
     except (environments.Unable, environments.Broken, OSError) as error:
         return [no_images(row, error)]
     values[DIFFERENT] = float(found.verdict is Verdict.DIFFERENT)
@@ -102,7 +101,7 @@ def mixed_rows(context: Context) -> list[Row]:
     rows = []
     for line, other in (("C", "d"), ("F", "d")):
         try:
-            found, _ = _compared(ours(other, size), theirs(line, size), size)
+            found, _ = compared(ours(other, size), theirs(line, size), size)
         except (environments.Unable, environments.Broken, OSError) as why:
             rows.append(row(case=line, reason=" ".join(str(why).split())))
             continue
@@ -111,7 +110,8 @@ def mixed_rows(context: Context) -> list[Row]:
     return rows
 
 
-def _compared(one: list[Image], two: list[Image], size: Size) -> tuple[Comparison, dict[str, float]]:
+def compared(one: list[Image], two: list[Image], size: Size) -> tuple[Comparison, dict[str, float]]:
+    """By Welch's t-test, and the numbers of the row."""
     found = compare("welch", one, two, family_error=limits.SUITE_ERROR, resolution=size.wanted, pixels=PIXELS)
     return found, measured(found, *(np.stack([image.pixels for image in side]) for side in (one, two)))
 

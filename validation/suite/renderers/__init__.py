@@ -4,7 +4,6 @@ In: rays as CSV, or a plain scene. Out: directions, or images. What runs there i
 nothing of this project; a script that cannot run on this machine says why in a line on stderr and exits with 77.
 """
 
-from .system import System
-from .table import SYSTEMS
+from .system import SYSTEMS, System
 
 __all__ = ["SYSTEMS", "System", "command", "environments", "glass_catalogues", "image_renderers"]

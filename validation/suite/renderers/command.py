@@ -16,8 +16,7 @@ from validation.run import command_line
 
 from . import environments
 from .image_renderers import IMAGE_RENDERERS
-from .system import System
-from .table import SYSTEMS
+from .system import SYSTEMS, System
 
 NAME = "validation renderers"
 app = command_line.application()
@@ -54,17 +53,17 @@ def _command(
 
 
 def _write(page: Path | None, data: Path | None, out: Path) -> int:
-    from validation.suite import matrix_page
+    from validation.suite import matrix
 
     try:
         for path, suffixes in ((page, (".html", ".htm")), (data, (".json",))):
             if path:
                 writable(path, suffixes)
-        found = matrix_page.read(out)
+        found = matrix.read(out)
         if page:
-            matrix_page.write_html(page, found)
+            matrix.write_html(page, found)
         if data:
-            matrix_page.write_json(data, found)
+            matrix.write_json(data, found)
     except (ValueError, OSError) as error:
         return command_line.misuse(NAME, str(error))
     return 0
@@ -85,4 +84,5 @@ def _line(system: System) -> str:
     able = {"rays": system.calls, "images": draws, "lenses": system.lens}
     does = " and ".join(word for word, can in able.items() if can)
     state = "absent" if environments.absent(system) else "installed"
-    return f"{system.name:10} {state:9} {does:16} {system.megabytes:5} MB  {system.source}  [{system.licence}]"
+    size = system.install.megabytes if system.install else 0
+    return f"{system.name:10} {state:9} {does:16} {size:5} MB  {system.source}  [{system.licence}]"

@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 import os
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from mi_refract.io import process_group
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.errors import TooMuchOutputError
 from mi_refract.ray_sets import renderer_file
+from mi_refract.report.row import Reason, Row
 
-from .system import LOCKS, SCRIPTS, Apt, Npm, Pip, System
+from .system import LOCKS, SCRIPTS, System
 
 COMMAND = "python -m validation renderers --install"
 CANNOT = 77  # the exit code of a script that cannot run on this machine
 TIMEOUT = 600.0  # seconds; a busy machine is slow, a program that hangs is slower
-_INSTALLING = 3600.0
-_ASKING = 60.0
+_INSTALLING, _ASKING = 3600.0, 60.0
 _FOREIGN = ("PYTHONPATH", "PYTHONHOME", "PYTHONSTARTUP", "VIRTUAL_ENV")
+T = TypeVar("T")
 
 
 class Unable(Exception):
@@ -44,53 +45,45 @@ def folder(system: System) -> Path:
 
 def absent(system: System) -> str:
     """ "" where the system is installed in its pinned version; otherwise the command that installs it."""
-    if isinstance(system.needs, Apt):
-        program, version = shutil.which(system.needs.program), system.needs.version
-        present = program is not None and (not version or version in _said_version(program))
-    else:
-        try:
-            present = system.needs is None or json.loads(_marker(system).read_text()) == _mark(system)
-        except (OSError, ValueError):
-            present = False
+    install, present = system.install, True
+    try:
+        if install and install.apt:
+            ended = process_group.run([install.program, "--version"], b"", _ASKING, keep_stderr=True)
+            present = install.version in (ended.out + ended.said).decode(errors="replace")
+        elif install:
+            present = json.loads((folder(system) / "installed.json").read_text()) == _mark(system)
+    except (OSError, ValueError, TimeoutError, TooMuchOutputError):
+        present = False
     return "" if present else f"{COMMAND} {system.name}"
 
 
-@functools.cache
-def _said_version(program: str) -> str:
-    """What a program says to --version; "" where it does not say it in time."""
-    try:
-        ended = process_group.run([program, "--version"], b"", _ASKING, keep_stderr=True)
-    except (OSError, TimeoutError, TooMuchOutputError):
-        return ""
-    return (ended.out + ended.said).decode(errors="replace")
-
-
-def _marker(system: System) -> Path:
-    """Written once an installation is complete."""
-    return folder(system) / "installed.json"
+def why_not(system: System, profile: str) -> str:
+    """Why the system is not run in this profile: it is absent, or too large; "" where it is run."""
+    if reason := absent(system):
+        return reason
+    if system.install and not system.install.small and profile != "full":
+        return Reason(f"{system.install.megabytes} MB: in the full profile only", "`--profile full`")
+    return ""
 
 
 def _mark(system: System) -> list[str]:
     """What is installed: another version of the table or of the lock is another mark."""
-    locks = [locked(system) / "package-lock.json" if isinstance(system.needs, Npm) else locked(system)]
-    if isinstance(system.needs, Pip) and system.needs.built:
-        locks.append(locked_source(system))
-    return [repr(system.needs), *(hashlib.sha256(lock.read_bytes()).hexdigest() for lock in locks)]
+    assert system.install
+    if system.install.npm:
+        words, lock = f"Npm(packages={system.install.npm!r})", locked(system) / "package-lock.json"
+    else:
+        words, lock = f"Pip(requirements={system.install.pip!r}, python={system.install.python!r})", locked(system)
+    return [words, hashlib.sha256(lock.read_bytes()).hexdigest()]
 
 
 def locked(system: System) -> Path:
     """The packages with their hashes, of all that may be installed: a file for pip, a folder for npm."""
-    return LOCKS / (system.name if isinstance(system.needs, Npm) else f"{system.name}.txt")
-
-
-def locked_source(system: System) -> Path:
-    """The source of the one package that there is no wheel of, with its hash."""
-    return LOCKS / f"{system.name}.source.txt"
+    return LOCKS / (system.name if system.install and system.install.npm else f"{system.name}.txt")
 
 
 def python(system: System) -> str:
     """The interpreter that the system's scripts are for."""
-    return str(folder(system) / "bin" / "python") if isinstance(system.needs, Pip) else sys.executable
+    return str(folder(system) / "bin" / "python") if system.install and system.install.pip else sys.executable
 
 
 # Making them -----------------------------------------------------------------------------------------------------
@@ -98,55 +91,51 @@ def python(system: System) -> str:
 
 def install(system: System) -> None:
     """Make the environment anew, unless it is there. OSError, one line, where that fails."""
-    needs = system.needs
     if not absent(system):
         return
-    if isinstance(needs, Apt):
+    needs, where = system.install, folder(system)
+    assert needs
+
+    def do(*command: str) -> None:
+        try:
+            run(command, timeout=_INSTALLING)
+        except (Broken, Unable) as error:
+            raise OSError(f"{system.name}: {' '.join(command)}: {error}") from None
+
+    if needs.apt:
         root = [] if os.geteuid() == 0 else ["sudo", "-n"]
         try:
-            _do(system, [*root, "apt-get", "install", "-y", "-qq", "--no-install-recommends", *needs.packages])
+            do(*root, "apt-get", "install", "-y", "-qq", "--no-install-recommends", *needs.apt)
         except OSError as error:
             try:
-                names = [package.partition("=")[0] for package in needs.packages]
+                names = [package.partition("=")[0] for package in needs.apt]
                 listed = run(["apt-cache", "madison", *names], timeout=_ASKING).splitlines()
             except (Broken, Unable):
                 listed = []
             versions = sorted({" ".join("".join(line.split("|")[:2]).split()) for line in listed})
             raise OSError(f"{error}; this distribution has {', '.join(versions) or 'none'}") from None
-        _said_version.cache_clear()
         return
     if not locked(system).exists():
         raise OSError(f"{system.name}: its packages have no lock; expected {locked(system)}")
-    shutil.rmtree(folder(system), ignore_errors=True)
-    folder(system).mkdir(parents=True)
-    if isinstance(needs, Npm):
+    shutil.rmtree(where, ignore_errors=True)
+    where.mkdir(parents=True)
+    if needs.npm:
         for name in ("package.json", "package-lock.json"):
-            shutil.copy(locked(system) / name, folder(system))
-        options = ["--ignore-scripts", "--silent", "--no-audit", "--no-fund"]
-        _do(system, ["npm", "ci", *options, "--prefix", str(folder(system))])
-    elif isinstance(needs, Pip):
+            shutil.copy(locked(system) / name, where)
+        do("npm", "ci", "--ignore-scripts", "--silent", "--no-audit", "--no-fund", "--prefix", str(where))
+    else:
         # This environment's pip for the other one: to make one there costs more than most of what it would install.
         own = f"{sys.version_info[0]}.{sys.version_info[1]}"
         interpreter = sys.executable if needs.python in ("", own) else shutil.which(f"python{needs.python}")
         if interpreter is None:
             raise OSError(f"{system.name}: needs Python {needs.python}; expected a python{needs.python} in PATH")
-        _do(system, [interpreter, "-m", "venv", "--without-pip", str(folder(system))])
+        do(interpreter, "-m", "venv", "--without-pip", str(where))
         pip = [sys.executable, "-m", "pip", "--python", python(system), "install"]
         options = ["--quiet", "--disable-pip-version-check", "--no-input", "--no-compile", "--no-deps"]
-        # To build a package would run, and fetch, code without a hash; not so without isolation, by locked tools.
+        # To build a package would run, and fetch, code without a hash.
         safe = ["--require-hashes", "--only-binary", ":all:"]
-        _do(system, [*pip, *options, *safe, "--requirement", str(locked(system))])
-        if needs.built:
-            safe = ["--require-hashes", "--no-binary", ":all:", "--no-build-isolation"]
-            _do(system, [*pip, *options, *safe, "--requirement", str(locked_source(system))])
-    write_atomically(_marker(system), json.dumps(_mark(system)))
-
-
-def _do(system: System, command: Sequence[str]) -> None:
-    try:
-        run(command, timeout=_INSTALLING)
-    except (Broken, Unable) as error:
-        raise OSError(f"{system.name}: {' '.join(command)}: {error}") from None
+        do(*pip, *options, *safe, "--requirement", str(locked(system)))
+    write_atomically(where / "installed.json", json.dumps(_mark(system)))
 
 
 # Running in them ---------------------------------------------------------------------------------------------------
@@ -189,17 +178,32 @@ def run(command: Sequence[str], given: str = "", timeout: float | None = None, w
         raise Broken(str(error)) from None
     except OSError as error:
         raise Broken(f"{command[0]}: {error.strerror}") from None
+    lines = [line.strip() for line in ended.said.decode(errors="replace").splitlines() if line.strip()]
+    last = lines[-1] if lines else "no word on stderr"  # which names the error
     if ended.status == CANNOT:
-        raise Unable(_last_word(ended.said))
+        raise Unable(last)
     if ended.status:
-        raise Broken(f"{ended.describe}: {_last_word(ended.said)}")
+        raise Broken(f"{ended.describe}: {last}")
     try:
         return ended.out.decode()
     except UnicodeDecodeError:
         raise Broken(f"wrote {len(ended.out)} bytes that are not text") from None
 
 
-def _last_word(said: bytes) -> str:
-    """The last line on stderr, which names the error."""
-    lines = [line.strip() for line in said.decode(errors="replace").splitlines() if line.strip()]
-    return lines[-1] if lines else "no word on stderr"
+def attempt(
+    row: Callable[..., Row], system: System, profile: str, lost: float, answer: Callable[[], T]
+) -> tuple[T | None, list[Row]]:
+    """What `answer` returns, and no row; or None, and the one row that says why the system gives no answer.
+
+    That row fails, with `lost` answers, where the program is broken or what it says is none (ValueError); it is not
+    run where the system is absent, too large for the profile, or cannot run here.
+    """
+    if reason := why_not(system, profile):
+        return None, [row(reason=reason)]
+    try:
+        return answer(), []
+    except Unable as cause:
+        return None, [row(reason=f"cannot run here: {cause}")]
+    except (Broken, ValueError) as defect:
+        text = " ".join(str(defect).split())
+        return None, [row(values={"unanswered": lost}, budgets={"unanswered": 0.0}, reason=text)]

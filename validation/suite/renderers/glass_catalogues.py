@@ -73,7 +73,7 @@ _RAYSECT = {
         2.97e-5, "Schott's catalogue of 2000 had other coefficients, n_g = 1.56328; today's print 1.56333"
     ),
 }
-# By the name of a system in `table`.
+# By the name of a system.
 CATALOGUES = {
     "rayoptics": GlassCatalogue("rayoptics_rays.py", GLASSES, "nan"),
     "optiland": GlassCatalogue("optiland_rays.py", GLASSES, "nan", _OPTILAND),

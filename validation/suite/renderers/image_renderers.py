@@ -6,6 +6,7 @@ An image is height × width × 3, linear, row 0 at the top.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -23,8 +24,7 @@ from mi_refract.scene_export.targets import luxcore, povray, radiance, scene_jso
 from validation.run.render_methods import Camera
 
 from . import environments
-from .system import System
-from .table import SYSTEMS
+from .system import SYSTEMS, System
 
 HOURS = 4 * 3600.0  # after which a renderer hangs
 PASS = 2048  # samples a pixel
@@ -45,34 +45,40 @@ class ImageRenderer:
     assumed: Sequence[str]
 
 
-def _by_script(target: str, ending: str = "exr") -> Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]:
+def by_script(
+    target: str,
+    ending: str,
+    plain: PlainScene,
+    folder: Path,
+    spp: int,
+    seeds: Sequence[int],
+    edit: Callable[[Path], None] = lambda folder: None,
+    more: Sequence[str] = (),
+) -> list[Image]:
     """By the script that is exported with the scene, after `edit(folder)` of its files, with `more` options."""
+    write_files.write(plain, target, folder / "scene")
+    edit(folder / "scene")
+    program = [environments.python(SYSTEMS[target]), "render.py", "--spp", str(spp), "--out", str(folder)]
+    environments.run([*program, *more, "--seeds", *map(str, seeds)], timeout=HOURS, where=folder / "scene")
+    return [_rgb(image_file.read(folder / f"seed{seed}.{ending}")) for seed in seeds]
 
-    def draw(
-        plain: PlainScene,
-        folder: Path,
-        spp: int,
-        seeds: Sequence[int],
-        edit: Callable[[Path], None] | None = None,
-        more: Sequence[str] = (),
-    ) -> list[Image]:
-        write_files.write(plain, target, folder / "scene")
-        if edit:
-            edit(folder / "scene")
-        program = [environments.python(SYSTEMS[target]), "render.py", "--spp", str(spp), "--out", str(folder)]
-        environments.run([*program, *more, "--seeds", *map(str, seeds)], timeout=HOURS, where=folder / "scene")
-        return [_rgb(image_file.read(folder / f"seed{seed}.{ending}")) for seed in seeds]
 
-    return draw
+def by_command(system: System, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+    """By the command of the system's own file."""
+    if system.images is None:
+        raise ValueError(f"{system.name}: no [images]; expected a system that renders by a command")
+    write_files.write(plain, system.images.export, folder / "scene")
+    for seed in seeds:
+        at = {"scene": folder / "scene", "image": folder / f"seed{seed}.exr", "spp": spp, "seed": seed}
+        environments.ask(system, system.images.command, timeout=HOURS, values=at)
+    return [_rgb(image_file.read(folder / f"seed{seed}.exr")) for seed in seeds]
 
 
 def _radiance(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
     write_files.write(plain, "radiance", folder / "scene")
-    camera = plain.camera
-    sizes = map(str, (camera.width, camera.height, spp, *seeds))
-    places = str(folder / "scene"), str(folder)
-    script = environments.script(SYSTEMS["radiance"], "radiance_images.py", *places, *sizes)
-    environments.run(script, timeout=HOURS)
+    sizes = map(str, (plain.camera.width, plain.camera.height, spp, *seeds))
+    words = str(folder / "scene"), str(folder), *sizes
+    environments.run(environments.script(SYSTEMS["radiance"], "radiance_images.py", *words), timeout=HOURS)
     return [_raw(folder / f"seed{seed}.f32", plain) for seed in seeds]
 
 
@@ -93,35 +99,41 @@ def _povray(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> 
     return [image_file.named(f"seed {seed}", coarse.astype(np.float32)) for seed in seeds]
 
 
-def browser() -> str | None:
-    """The path of a Chromium; None where there is none."""
-    return next(filter(None, map(shutil.which, BROWSERS)), None)
-
-
-def _three(mis: str) -> Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]:
+def _three(mis: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
     """With multiple importance sampling of the sky ("1"), as the library comes, or without ("0")."""
-
-    def draw(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-        chromium, node = browser(), shutil.which("node")
-        if not (chromium and node):
-            raise environments.Unable("no node or no Chromium in PATH")
-        (folder / "scene").mkdir()
-        files = shared_files.json_and_ply(plain) | shared_files.sky_exr(plain, equirectangular)
-        for name, content in files.items():
-            (folder / "scene" / name).write_bytes(content)
-        script = environments.SCRIPTS / "three_images.mjs"
-        places = [str(script), str(environments.folder(SYSTEMS["three"])), chromium, str(folder / "scene"), str(folder)]
-        sizes = map(str, (plain.camera.width, plain.camera.height, spp, mis, *seeds))
-        environments.run([node, *places, *sizes], timeout=HOURS)
-        return [_raw(folder / f"seed{seed}.f32", plain) for seed in seeds]
-
-    return draw
+    chromium, node = next(filter(None, map(shutil.which, BROWSERS)), None), shutil.which("node")
+    if not (chromium and node):
+        raise environments.Unable("no node or no Chromium in PATH")
+    (folder / "scene").mkdir()
+    files = shared_files.json_and_ply(plain) | shared_files.sky_exr(plain, equirectangular)
+    for name, content in files.items():
+        (folder / "scene" / name).write_bytes(content)
+    script, home = environments.SCRIPTS / "three_images.mjs", environments.folder(SYSTEMS["three"])
+    sizes = (plain.camera.width, plain.camera.height, spp, mis, *seeds)
+    words = [node, *map(str, (script, home, chromium, folder / "scene", folder, *sizes))]
+    environments.run(words, timeout=HOURS)
+    return [_raw(folder / f"seed{seed}.f32", plain) for seed in seeds]
 
 
 def equirectangular(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """The direction whose radiance three finds at (u, v), v from the top."""
     phi, theta = 2 * np.pi * (u - 0.5), np.pi * v
     return np.stack([np.cos(phi) * np.sin(theta), np.cos(theta), np.sin(phi) * np.sin(theta)], axis=-1)
+
+
+def _mitsuba(integrator: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+    """By another integrator of Mitsuba's, with Mitsuba's `dielectric`, in this process and the present variant."""
+    write_files.write(plain, "mitsuba", folder / "scene")
+    parameters = {"bsdf": "dielectric", "integrator": integrator}
+    camera = Camera(scene_files.load_scene(folder / "scene" / "scene.xml", parameters))
+    return [image_file.named(f"seed {seed}", mean(camera, spp, seed)) for seed in seeds]
+
+
+def mean(camera: Camera, spp: int, seed: int) -> np.ndarray:
+    """An image of so many samples, at most PASS of them at a time: more would need gigabytes."""
+    passes = -(-spp // PASS)
+    images = [camera(-(-spp // passes), 1000 * seed + i)[0][..., :3] for i in range(passes)]
+    return np.mean(images, axis=0).astype(np.float32)
 
 
 def _raw(path: Path, plain: PlainScene) -> Image:
@@ -133,41 +145,6 @@ def _rgb(image: Image) -> Image:
     return image_file.named(image.path.name, image.select(("R", "G", "B")))
 
 
-def by_command(system: System) -> Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]:
-    """By the command of the system's own file."""
-    images = system.images
-    if images is None:
-        raise ValueError(f"{system.name}: no [images]; expected a system that renders by a command")
-
-    def draw(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-        write_files.write(plain, images.export, folder / "scene")
-        for seed in seeds:
-            at = {"scene": folder / "scene", "image": folder / f"seed{seed}.exr", "spp": spp, "seed": seed}
-            environments.ask(system, images.command, timeout=HOURS, values=at)
-        return [_rgb(image_file.read(folder / f"seed{seed}.exr")) for seed in seeds]
-
-    return draw
-
-
-def _mitsuba(integrator: str) -> Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]:
-    """By another integrator of Mitsuba's, with Mitsuba's `dielectric`, in this process and the present variant."""
-
-    def draw(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-        write_files.write(plain, "mitsuba", folder / "scene")
-        parameters = {"bsdf": "dielectric", "integrator": integrator}
-        camera = Camera(scene_files.load_scene(folder / "scene" / "scene.xml", parameters))
-        return [image_file.named(f"seed {seed}", mean(camera, spp, seed)) for seed in seeds]
-
-    return draw
-
-
-def mean(camera: Camera, spp: int, seed: int) -> np.ndarray:
-    """An image of so many samples, at most PASS of them at a time: more would need gigabytes."""
-    passes = -(-spp // PASS)
-    images = [camera(-(-spp // passes), 1000 * seed + i)[0][..., :3] for i in range(passes)]
-    return np.mean(images, axis=0).astype(np.float32)
-
-
 THREE = (
     "A glass has one index, the quotient of the two; radiance is not scaled by the square of the index.",
     "The tent filter of its pixels is replaced by a box.",
@@ -177,30 +154,35 @@ THREE = (
     "and a black back.",
     "bounces and transmissiveBounces are Mitsuba's max_depth.",
 )
-
-
-def _spp(sphere: int, prism: int, environment: int) -> dict[str, int]:
-    return {"sphere": sphere, "prism": prism, "environment": environment}
-
-
-RAYSECT_SPP = _spp(2048, 768, 256) | {"furnace": 128}  # which samples no lamp
 MITSUBA = ("Mitsuba's `dielectric` in the same variant and scene file; no Russian roulette.",)
 PTRACER = (
     *MITSUBA,
     "Paths begin at lamps, and their last vertex is joined with the camera: what is seen in or through smooth glass "
     "stays black. A caustic on a diffuse surface that is seen directly is there.",
 )
-MITSUBA_SPP = _spp(1024, 768, 256) | {"furnace": 128, "caustic": 8192}
 POVRAY = ("Each pixel is the mean of a grid of 8 × 8 samples, without noise.", *povray.ASSUMPTIONS)
+
+
+def _renderer(
+    system: str, draw: Callable[..., list[Image]], assumed: Sequence[str], *spp: int, **more: int
+) -> ImageRenderer:
+    """`spp`: of the scenes sphere, prism and environment; `more`: of others."""
+    return ImageRenderer(system, draw, dict(zip(("sphere", "prism", "environment"), spp, strict=False)) | more, assumed)
+
+
+_volpath, _prb, _ptracer = (functools.partial(_mitsuba, name) for name in ("volpath", "prb", "ptracer"))
+_cycles, _luxcore = (functools.partial(by_script, target, "exr") for target in ("cycles", "luxcore"))
+_raysect = functools.partial(by_script, "raysect", "pfm")
 IMAGE_RENDERERS: dict[str, ImageRenderer] = {
-    "Mitsuba, volpath": ImageRenderer("mitsuba", _mitsuba("volpath"), MITSUBA_SPP, MITSUBA),
-    "Mitsuba, prb": ImageRenderer("mitsuba", _mitsuba("prb"), MITSUBA_SPP, MITSUBA),
-    "Mitsuba, ptracer": ImageRenderer("mitsuba", _mitsuba("ptracer"), {"caustic": 32768, "sphere": 512}, PTRACER),
-    "Radiance": ImageRenderer("radiance", _radiance, _spp(960, 448, 24), radiance.ASSUMPTIONS),
-    "Cycles": ImageRenderer("cycles", _by_script("cycles"), _spp(512, 128, 32), scene_json.CYCLES_ASSUMPTIONS),
-    "raysect": ImageRenderer("raysect", _by_script("raysect", "pfm"), RAYSECT_SPP, scene_json.RAYSECT_ASSUMPTIONS),
-    "LuxCore": ImageRenderer("luxcore", _by_script("luxcore"), _spp(1280, 1024, 576), luxcore.ASSUMPTIONS),
-    "POV-Ray": ImageRenderer("povray", _povray, _spp(64, 64, 64), POVRAY),
-    "three-gpu-pathtracer": ImageRenderer("three", _three("1"), {"prism": 8, "furnace": 8}, THREE),
-    "three-gpu-pathtracer, no MIS": ImageRenderer("three", _three("0"), {"prism": 8, "furnace": 8}, THREE),
+    "Mitsuba, volpath": _renderer("mitsuba", _volpath, MITSUBA, 1024, 768, 256, furnace=128, caustic=8192),
+    "Mitsuba, prb": _renderer("mitsuba", _prb, MITSUBA, 1024, 768, 256, furnace=128, caustic=8192),
+    "Mitsuba, ptracer": _renderer("mitsuba", _ptracer, PTRACER, caustic=32768, sphere=512),
+    "Radiance": _renderer("radiance", _radiance, radiance.ASSUMPTIONS, 960, 448, 24),
+    "Cycles": _renderer("cycles", _cycles, scene_json.CYCLES_ASSUMPTIONS, 512, 128, 32),
+    # furnace: a scene without lamps, which raysect meets by chance
+    "raysect": _renderer("raysect", _raysect, scene_json.RAYSECT_ASSUMPTIONS, 2048, 768, 256, furnace=128),
+    "LuxCore": _renderer("luxcore", _luxcore, luxcore.ASSUMPTIONS, 1280, 1024, 576),
+    "POV-Ray": _renderer("povray", _povray, POVRAY, 64, 64, 64),
+    "three-gpu-pathtracer": _renderer("three", functools.partial(_three, "1"), THREE, prism=8, furnace=8),
+    "three-gpu-pathtracer, no MIS": _renderer("three", functools.partial(_three, "0"), THREE, prism=8, furnace=8),
 }

@@ -1,8 +1,14 @@
-"""What is known of another renderer: what it can do, how to install it, and how it behaved."""
+"""The table of other renderers and libraries: one folder of systems/ for each, with its `mi-refract-renderer.toml`.
+
+The file says how to install the system, how its functions are run, and how it behaved; README.md in
+`mi_refract.ray_sets` explains its keys. A script that it names is in scripts/, a lock of its packages in locks/, and
+what renders images, where that takes more than a command, in `image_renderers`. Programs under the GPL are run, never
+imported nor redistributed.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -13,85 +19,18 @@ from mi_refract.io.typed_table import convert
 from mi_refract.ray_sets import renderer_file
 from mi_refract.ray_sets.renderer_file import ImagesCommand, RaysCommand, Text
 
-SCRIPTS = Path(__file__).parent / "scripts"
-LOCKS = Path(__file__).parent / "locks"
-
-# The sets of rays of `validation.suite.per_ray`, by name.
-RANDOM, APART, CRITICAL, GRAZING = "random", "random, apart", "near-critical", "grazing"
-MATCHED, TOTAL, LARGE = "η ≈ 1", "total reflection", "k ≫ 1"
-
-
-@dataclass(frozen=True)
-class Pip:
-    """A virtual environment of its own. What these packages need, as far as it is needed, is in the lock."""
-
-    requirements: tuple[str, ...]
-    python: str = ""  # the one version that there are wheels for, as "3.11"
-    # The one of them that has no wheel: built from NAME.source.txt, by tools that are in the lock.
-    built: str = field(default="", repr=False)  # its lock is in the mark of what is installed
-
-
-@dataclass(frozen=True)
-class Npm:
-    """A folder of its own with `node_modules`."""
-
-    packages: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Apt:
-    """A program of the whole machine, found wherever it is in PATH.
-
-    `packages`: each as PACKAGE=VERSION, with * for the distribution's part. `version`: what the program says of itself.
-    """
-
-    program: str
-    packages: tuple[str, ...]
-    version: str = ""
-
-
-@dataclass(frozen=True)
-class System:
-    """Another renderer or library. `needs` is None where nothing must be installed.
-
-    `folder`: where its commands run. `small`: fit for every run. `calls`: its functions of refraction. `images`: how it
-    renders, where a command does. `lens`: the command that traces a lens with it.
-    """
-
-    name: str
-    title: str
-    licence: str
-    needs: Pip | Npm | Apt | None
-    megabytes: int  # on disk
-    small: bool = False
-    calls: tuple[RaysCommand, ...] = ()
-    lens: tuple[str, ...] = ()
-    images: ImagesCommand | None = None
-    folder: Path | None = None
-
-    @property
-    def source(self) -> str:
-        """How to install it, in its pinned version."""
-        match self.needs:
-            case Pip(requirements=given):
-                return f"pip install {' '.join(given)}"
-            case Npm(packages=given):
-                return f"npm install {' '.join(given)}"
-            case Apt(packages=given):
-                return f"apt-get install {' '.join(given)}"
-        return "with this package" if self.folder is None or self.folder.parent.name == "systems" else str(self.folder)
+SCRIPTS, LOCKS, SYSTEMS_FOLDER = (Path(__file__).parent / name for name in ("scripts", "locks", "systems"))
 
 
 class Install(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [install]: one of pip, npm and apt."""
 
     megabytes: Annotated[int, Meta(ge=1, le=100_000)]  # on disk
-    pip: tuple[Text, ...] = ()  # packages of PyPI, in an environment of their own
-    python: str = ""  # the one version of Python that they are for
-    built: str = ""  # the one of them that has no wheel
-    npm: tuple[Text, ...] = ()  # packages of npm, in a folder of their own
-    apt: tuple[Text, ...] = ()  # packages of the distribution, as PACKAGE=VERSION
-    program: str = ""  # of apt: the program that is found in PATH
+    pip: tuple[Text, ...] = ()  # packages of PyPI, in an environment of their own; what they need is in the lock
+    python: str = ""  # the one version of Python that there are wheels for, as "3.11"
+    npm: tuple[Text, ...] = ()  # packages of npm, in a folder of their own with `node_modules`
+    apt: tuple[Text, ...] = ()  # packages of the distribution, as PACKAGE=VERSION, with * for the distribution's part
+    program: str = ""  # of apt: the program, found wherever it is in PATH
     version: str = ""  # of apt: what the program says of itself
     small: bool = False  # fit for every run
 
@@ -101,13 +40,35 @@ class Install(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError("expected one of pip, npm and apt")
 
     @property
-    def needs(self) -> Pip | Npm | Apt:
-        """What is to be installed."""
-        if self.npm:
-            return Npm(self.npm)
-        if self.apt:
-            return Apt(self.program, self.apt, self.version)
-        return Pip(self.pip, self.python, self.built)
+    def source(self) -> str:
+        """The command that installs it, in its pinned version."""
+        tool = "pip" if self.pip else "npm" if self.npm else "apt-get"
+        return f"{tool} install {' '.join(self.pip or self.npm or self.apt)}"
+
+
+@dataclass(frozen=True)
+class System:
+    """Another renderer or library. `install` is None where nothing must be installed.
+
+    `folder`: where its commands run. `calls`: its functions of refraction. `images`: how it renders, where a command
+    does. `lens`: the command that traces a lens with it.
+    """
+
+    name: str
+    title: str
+    licence: str = ""
+    install: Install | None = None
+    calls: tuple[RaysCommand, ...] = ()
+    lens: tuple[str, ...] = ()
+    images: ImagesCommand | None = None
+    folder: Path = SYSTEMS_FOLDER
+
+    @property
+    def source(self) -> str:
+        """How to install it."""
+        if self.install:
+            return self.install.source
+        return "with this package" if SYSTEMS_FOLDER in (self.folder, self.folder.parent) else str(self.folder)
 
 
 def load(folder: Path) -> System:
@@ -115,15 +76,19 @@ def load(folder: Path) -> System:
     known = renderer_file.load(folder)
     where = f"{folder / renderer_file.NAME}: install"
     install = None if known.install is None else convert(known.install, Install, where)
-    return System(
-        folder.resolve().name,
-        known.title,
-        known.licence,
-        install.needs if install else None,
-        megabytes=install.megabytes if install else 0,
-        small=install is None or install.small,
-        calls=known.rays,
-        lens=known.lens,
-        images=known.images,
-        folder=folder,
-    )
+    name = folder.resolve().name
+    return System(name, known.title, known.licence, install, known.rays, known.lens, known.images, folder)
+
+
+SYSTEMS: dict[str, System] = {
+    path.parent.name: load(path.parent) for path in sorted(SYSTEMS_FOLDER.glob(f"*/{renderer_file.NAME}"))
+}
+
+
+def join(folder: Path) -> System:
+    """Take the renderer of a folder into the table. ValueError where one has its name; other errors as of `load`."""
+    system = load(folder)
+    if system.name in SYSTEMS:
+        raise ValueError(f"{folder}: {system.name!r} is already the name of a renderer; rename the folder")
+    SYSTEMS[system.name] = system
+    return system

@@ -1,0 +1,369 @@
+"""Where a ray in the plane meets directed segments and arcs of conics: first by signs, then by distances. No optics.
+
+Of a ray p + λd and a segment from A to B, f(V) = d × (V − p) says on which side of the ray a vertex V lies; 0 counts
+as its left. If A and B lie on different sides, the ray's line crosses the segment once, at μ = f(A)/(f(A) − f(B)) and
+
+    λ = ((A − p) × (B − A)) / (d × (B − A))
+
+which is document 004's solution (its μ has the sign of that denominator wrong). All segments that share a vertex use
+the same f of it, so no ray slips through between them. For a ray that starts on a segment, the differences V − p to the
+ends of that segment are computed along it, and their signs are those of the side to which the ray goes. So the rounding
+of p does not carry the ray across a neighbour, however near.
+
+An arc from A to B with control point C and weight w is ((1−t)² A + 2w t(1−t) C + t² B) / ((1−t)² + 2w t(1−t) + t²).
+With s : r = 1−t : t the ray's line meets it where f(A) s² + 2 w f(C) s r + f(B) r² = 0. The signs of f(A) and f(B) say
+here, too, how many crossings there are, except for a ray that may touch the arc between its ends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract.numerics import Mask, Number, ieee_divide
+
+from .array_backend import ArrayBackend, Index, Vector2, Vertices, negated
+from .segments import Array
+
+NOWHERE = 0xFFFFFFFF  # the number of no segment
+# Of a start on its own segment: the least distance of its ends from the ray, in units of the segment's length.
+SIGN = 1e-22
+UNKNOWN = NOWHERE - 2  # from here on a number is no vertex
+Root = tuple[Number, Number]  # s and r, up to a common factor
+Three = tuple[Any, Any, Any]  # of the start, the control point and the end
+Ends = tuple[Index, Index, Vector2, Vector2, Number]  # the last five fields of `Hit`
+
+
+def cross(a: Vector2, b: Vector2) -> Number:
+    """a × b = a.x b.y − a.y b.x."""
+    return dr.fma(a.x, b.y, -(a.y * b.x))
+
+
+@dataclass
+class Ray:
+    """A ray from `p` along the unit vector `d`.
+
+    own: the segment that it starts on, at start + r (end − start) with r = 1 − s; NOWHERE for none.
+    left: whether it leaves to the left of that segment.
+    slack: a boundary no farther from `p` than that is not ahead; 0 for a ray that starts on a segment.
+    """
+
+    p: Vector2
+    d: Vector2
+    own: Index
+    s: Number
+    r: Number
+    left: Mask
+    slack: Number
+
+
+@dataclass
+class Start:
+    """The segment that a ray starts on: numbers of its vertices, the ways from p to them, their sides of the ray.
+
+    Of an arc also the way to its control point, s and r (up to a common factor) of where the ray's line meets it once
+    more, whether that is ahead, between the arc's ends, and as of a `Hit` the directions and `bend` from its vertices.
+    """
+
+    vertices: Vertices
+    ways: tuple[Vector2, Vector2]
+    sides: tuple[Number, Number]
+    middle: Vector2 = None
+    other: tuple[Number, Number] = None, None
+    again: Mask = False
+    aways: tuple[Vector2, Vector2] = None, None
+    bends: tuple[Number, Number] = None, None
+
+
+Seen = tuple[Vector2, Number]  # the way from the ray's start to a vertex, and f of it
+
+
+@dataclass
+class Hit:
+    """A crossing. `segment` is NOWHERE where there is none; `s`, `r`: the place on it, as in `Ray`.
+
+    to_left: the ray goes on to the left of the segment.
+    left, right: numbers of the vertices on the left and on the right of the ray.
+    along, into: the segment's direction, from its left vertex to its right one, at the left and at the right one.
+    bend: of an arc, twice the curvature at a vertex times the cube of |along| or |into|, positive to the left; else 0.
+    """
+
+    distance: Number
+    segment: Index
+    s: Number
+    r: Number
+    to_left: Mask
+    left: Index
+    right: Index
+    along: Vector2
+    into: Vector2
+    bend: Number
+
+
+def bounding_box(*points: Array) -> tuple[list[float], list[float]]:
+    """Lower and upper corner of a box around the points (each N × 2), with a quarter of its size added on each side."""
+    places = np.concatenate(points)
+    low, high = places.min(axis=0), places.max(axis=0)
+    margin = (high - low).max() / 4
+    return (low - margin).tolist(), (high + margin).tolist()
+
+
+class LineSegments:
+    """M straight segments from `start` to `end` (M × 2); `vertices` (M × 2) are equal numbers for equal ends."""
+
+    def __init__(self, arrays: ArrayBackend, start: Array, end: Array, vertices: Vertices) -> None:
+        """Copy them to the backend."""
+        self.arrays, self.count = arrays, arrays.uniform(arrays.index, len(start))
+        self.box = bounding_box(start, end)
+        self.ends = arrays.table(np.concatenate([start, end], 1))
+        self.vertices = arrays.table(vertices.astype(np.uint32))
+        e = end - start
+        self.directions = arrays.table(e / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), np.finfo(float).tiny))
+
+    def _of(self, i: Index, active: Mask = True) -> tuple[Vector2, Vector2, Vertices]:
+        """Start, end and vertices of segment i."""
+        ends, vector = self.arrays.gather(self.ends, i, active), self.arrays.vector
+        return vector(ends[0], ends[1]), vector(ends[2], ends[3]), self.arrays.gather(self.vertices, i, active)
+
+    def start(self, ray: Ray) -> Start:
+        """Quantities of the ray's start, computed once per ray, not per segment."""
+        a, b, vertices = self._of(ray.own, ray.own != NOWHERE)
+        (s, r), e = self._shares(ray), b - a
+        own = type(vertices)(*(dr.select(ray.own != NOWHERE, v, NOWHERE) for v in vertices))
+        # f of both ends: of a ray that leaves to the left, the segment starts on the left and ends on the right.
+        size = dr.maximum(dr.abs(cross(ray.d, e)), SIGN * (dr.abs(e.x) + dr.abs(e.y)))
+        size = dr.select(ray.left, size, -size)
+        return Start(own, (-e * r, e * s), (size * r, -size * s))
+
+    def _shares(self, ray: Ray) -> tuple[Number, Number]:
+        """s and r of the ray's start, kept off both ends of the segment by u² of it: signs stay, no number changes."""
+        least = self.arrays.roundoff**2
+        return dr.maximum(ray.s, least), dr.maximum(ray.r, least)
+
+    def none(self) -> Hit:
+        """No crossing, at distance ∞."""
+        number, nowhere, way = self.arrays.number, self.arrays.index(NOWHERE), self.arrays.vector(0)
+        left = self.arrays.mask(False)
+        return Hit(number(dr.inf), nowhere, number(0), number(0), left, nowhere, nowhere, way, way, number(0))
+
+    def _seen(self, ray: Ray, start: Start, vertex: Index, place: Vector2) -> Seen:
+        """The way from the ray's start to a vertex, and f of it."""
+        way = place - ray.p
+        side = cross(ray.d, way)
+        for own, its_way, its_side in zip(start.vertices, start.ways, start.sides, strict=True):
+            same = vertex == own
+            way, side = dr.select(same, its_way, way), dr.select(same, its_side, side)
+        return way, side
+
+    def nearer(self, best: Hit, ray: Ray, start: Start, i: Index) -> Hit:
+        """The crossing of segment i, if it comes before `best`."""
+        a, b, vertices = self._of(i)
+        seen = self._seen(ray, start, vertices[0], a), self._seen(ray, start, vertices[1], b)
+        hit, ahead = self._crossing(ray, start, i, b - a, vertices, seen)
+        # Of two segments that share a vertex, the turn between them says which comes first, whatever λ rounds to.
+        turn = cross(hit.along, best.along)
+        first = dr.select(hit.right == best.right, turn < 0, hit.distance < best.distance)
+        first = ahead & dr.select(hit.left == best.left, turn > 0, first)
+        return dr.select(first, hit, best)
+
+    def _crossing(
+        self, ray: Ray, start: Start, i: Index, e: Vector2, vertices: Vertices, seen: tuple[Seen, Seen]
+    ) -> tuple[Hit, Mask]:
+        """The crossing of segment i, which goes along e, and whether it is ahead."""
+        (to_a, f_a), (to_b, f_b) = seen
+        a_left, b_left = f_a >= 0, f_b >= 0
+        way = dr.select((vertices[1] == start.vertices[0]) | (vertices[1] == start.vertices[1]), to_b, to_a)
+        # |d × e| = |f_a| + |f_b| without cancellation. `reach` is λ times that: its sign is right where λ's is lost.
+        scale: Number = dr.abs(f_a) + dr.abs(f_b)
+        reach = dr.select(a_left, -1, 1) * cross(way, e)
+        # The crossing lies between the ends: ahead where both ends are, behind where both are. That decides for a ray
+        # along the segment, where the sign of `reach` is noise.
+        t_a, t_b = dr.dot(to_a, ray.d), dr.dot(to_b, ray.d)
+        beyond = (dr.maximum(t_a, t_b) > 0) & (reach > ray.slack * (dr.abs(e.x) + dr.abs(e.y)))
+        ahead = (a_left != b_left) & ((dr.minimum(t_a, t_b) > ray.slack) | beyond) & (i != ray.own)
+        near = ieee_divide(dr.minimum(dr.abs(f_a), dr.abs(f_b)), scale)
+        s, r = (dr.select(0.5 * scale > dr.abs(f), near, 1 - near) for f in (f_b, f_a))
+        distance = dr.dot(dr.fma(e, r, to_a), ray.d)  # λ; reach/scale is noise at grazing incidence
+        left, right = (dr.select(a_left, vertices[j], vertices[1 - j]) for j in (0, 1))
+        along = dr.select(a_left, e, -e)
+        return Hit(distance, i, s, r, a_left, left, right, along, along, self.arrays.number(0)), ahead
+
+    def place(self, hit: Hit) -> tuple[Vector2, Vector2]:
+        """The point of a hit, from the nearer end, and the segment's direction there."""
+        there = hit.segment != NOWHERE
+        a, b, _ = self._of(hit.segment, there)
+        e = b - a
+        point = dr.select(hit.r < hit.s, dr.fma(e, hit.r, a), dr.fma(e, -hit.s, b))
+        return point, self.arrays.gather(self.directions, hit.segment, there)
+
+
+class ConicArcs(LineSegments):
+    """M arcs as in `planar.Segments`: as `LineSegments`, with `control` (M × 2) and `weight` (M)."""
+
+    def __init__(
+        self, arrays: ArrayBackend, start: Array, end: Array, vertices: Vertices, control: Array, weight: Array
+    ) -> None:
+        """Copy them to the backend."""
+        super().__init__(arrays, start, end, vertices)
+        self.box = bounding_box(start, end, control)
+        (ax, ay), (bx, by) = (control - start).T, (end - control).T
+        middle = (start + end) / 2
+        turn = np.where((control == middle).all(1), 0.0, ax * by - ay * bx)
+        # A straight one has r in equal steps along it, whatever control and weight it was given.
+        control, weight = np.where(turn[:, None] == 0, middle, control), np.where(turn == 0, 1.0, weight)
+        self.shapes = arrays.table(np.column_stack([control, weight, turn]))
+
+    def _shape(self, i: Index, active: Mask = True) -> tuple[Vector2, Number, Number]:
+        """Control point, weight and turn; the turn of a straight segment is 0."""
+        shape = self.arrays.gather(self.shapes, i, active)
+        return self.arrays.vector(shape[0], shape[1]), shape[2], shape[3]
+
+    def start(self, ray: Ray) -> Start:
+        """Quantities of the ray's start, computed once per ray, not per arc."""
+        there = ray.own != NOWHERE
+        (a, b, _), (c, w, turn) = self._of(ray.own, there), self._shape(ray.own, there)
+        s, r = self._shares(ray)
+        chords = _chord(a, c, b, w, s, r), _chord(b, c, a, w, r, s)
+        to_c = ((c - a) * (s * s) + (c - b) * (r * r)) * dr.rcp(_total(w, s, r))
+        # The sides of the ends are those of the chords: their product also says where the line meets the arc again.
+        g_a, g_b = self._chord_sides(ray, chords)
+        again = there & (turn != 0) & ((g_a >= 0) == (g_b >= 0)) & (ray.left == (turn > 0))
+        line, straight = super().start(ray), turn == 0
+        ways = (dr.select(straight, x, -way * y) for x, way, y in zip(line.ways, chords, (r, s), strict=True))
+        sides = dr.select(straight, line.sides[0], g_a * r), dr.select(straight, line.sides[1], g_b * s)
+        bend = turn * dr.rcp(w * w)
+        others = to_c, (dr.abs(g_b), dr.abs(g_a)), again, (c - a, c - b), (bend, -bend)
+        return Start(line.vertices, tuple(ways), sides, *others)
+
+    def _chord_sides(self, ray: Ray, chords: tuple[Vector2, Vector2]) -> tuple[Number, Number]:
+        """−d × chord for both ends of the arc on which the ray starts.
+
+        Where the ends are on either side of a ray that leaves to the left, the arc starts on the left. Rounding that
+        says otherwise is mended in the smaller of both.
+        """
+        sizes = [dr.maximum(dr.abs(cross(ray.d, way)), SIGN * (dr.abs(way.x) + dr.abs(way.y))) for way in chords]
+        a_left, b_left = (cross(ray.d, way) <= 0 for way in chords)
+        wrong = (a_left != b_left) & (a_left != ray.left)
+        smaller = sizes[0] < sizes[1]
+        a_left = dr.select(wrong & smaller, ray.left, a_left)
+        b_left = dr.select(wrong & negated(smaller), negated(ray.left), b_left)
+        return dr.select(a_left, sizes[0], -sizes[0]), dr.select(b_left, sizes[1], -sizes[1])
+
+    def nearer(self, best: Hit, ray: Ray, start: Start, i: Index) -> Hit:
+        """The first crossing of arc i, if it comes before `best`."""
+        (a, b, vertices), (c, w, turn) = self._of(i), self._shape(i)
+        seen = self._seen(ray, start, vertices[0], a), self._seen(ray, start, vertices[1], b)
+        line, line_ahead = self._crossing(ray, start, i, b - a, vertices, seen)
+        (to_a, f_a), (to_b, f_b) = seen
+        own, straight = i == ray.own, turn == 0
+        to_c = dr.select(own, start.middle, c - ray.p)
+        a_left = f_a >= 0
+        once = a_left != (f_b >= 0)
+        # Left and right vertex of an arc that is crossed once, its directions there, from left to right, and its bend.
+        left, right = (dr.select(once, dr.select(a_left, vertices[j], vertices[1 - j]), UNKNOWN + j) for j in (0, 1))
+        along, into = dr.select(a_left, c - a, c - b), dr.select(a_left, b - c, a - c)
+        ends = left, right, along, into, dr.select(a_left, turn, -turn) * dr.rcp(w * w)
+        (one, valid), (other, too) = _roots(f_a, w * cross(ray.d, to_c), f_b)
+        single = once & too
+        root = (dr.select(own, x, dr.select(single, z, y)) for x, y, z in zip(start.other, one, other, strict=True))
+        ways = to_a, to_c, to_b
+        hit, ahead = self._hit(ray, i, ways, w, tuple(root), dr.select(own, turn < 0, a_left), ends)
+        hit, ahead = dr.select(straight, line, hit), dr.select(straight, line_ahead, ahead)
+        ahead = self._beyond(start, hit, ahead) & dr.select(straight, once, valid | single)
+        ahead = dr.select(own, start.again, ahead)
+        best = dr.select(ahead & self._before(hit, best), hit, best)
+        # Where there are two crossings, neither is at a vertex, but for rounding: their distances decide.
+        hit, ahead = self._hit(ray, i, ways, w, other, negated(a_left), ends)
+        ahead &= too & negated(once | own | straight)
+        return dr.select(ahead & (hit.distance < best.distance), hit, best)
+
+    def _beyond(self, start: Start, hit: Hit, ahead: Mask) -> Mask:
+        """Whether a hit is ahead of the ray's start, which may be at a vertex that both curves share.
+
+        Where rounding hides the distance, that is decided there as in `_before`.
+        """
+        lefts = [side >= 0 for side in start.sides]
+        ons = [v == dr.select(left, hit.left, hit.right) for v, left in zip(start.vertices, lefts, strict=True)]
+
+        def there(pair: tuple[Any, Any]) -> Any:
+            return dr.select(ons[0], *pair)
+
+        left, way, away, bend = there(tuple(lefts)), there(start.ways), there(start.aways), there(start.bends)
+        own, other = dr.select(left, away, -away), dr.select(left, hit.along, hit.into)
+        near = dr.abs(hit.distance) <= 64 * self.arrays.roundoff * (dr.abs(way.x) + dr.abs(way.y))
+        near &= (ons[0] | ons[1]) & (dr.dot(own, other) > 0) & ((bend != 0) | (hit.bend != 0))
+        first = self._turned(other, own, (hit.bend, dr.select(left, bend, -bend)), dr.select(left, -1, 1))
+        return dr.select(near, negated(first), ahead)
+
+    def _hit(
+        self, ray: Ray, i: Index, ways: Three, w: Number, root: Root, to_left: Mask, ends: Ends
+    ) -> tuple[Hit, Mask]:
+        """A root as a hit, and whether it is ahead."""
+        s, r = root
+        size = s + r
+        s, r = ieee_divide(s, size), ieee_divide(r, size)
+        to_a, to_c, to_b = ways
+        way = (to_a * (s * s) + to_c * (2 * w * s * r) + to_b * (r * r)) * dr.rcp(_total(w, s, r))
+        e = _tangent(to_a, to_c, to_b, w, s, r)
+        distance = dr.dot(way, ray.d)
+        ahead = distance * dr.abs(cross(ray.d, e)) > ray.slack * (dr.abs(e.x) + dr.abs(e.y))
+        return Hit(distance, i, s, r, to_left, *ends), ahead & (distance > 0)
+
+    def _before(self, hit: Hit, best: Hit) -> Mask:
+        """Whether `hit` comes before `best`: by distance, but by direction at a vertex that both share.
+
+        Where the arcs touch in that vertex, their curvatures decide: the one farther to the left, seen from the left
+        vertex to the right one, comes later.
+        """
+        first, second = hit.distance, best.distance
+        tie = dr.abs(first - second) <= 16 * self.arrays.roundoff * dr.abs(first)
+        lines = (hit.bend == 0) & (best.bend == 0)
+        tie = (tie | lines) & (hit.left < UNKNOWN)
+        right = self._turned(hit.into, best.into, (hit.bend, best.bend), 1)
+        left = self._turned(hit.along, best.along, (hit.bend, best.bend), -1)
+        before = dr.select(tie & (hit.right == best.right), right, first < second)
+        return dr.select(tie & (hit.left == best.left), left, before)
+
+    def _turned(self, e: Vector2, other: Vector2, bends: tuple[Number, Number], sign: Any) -> Mask:
+        """Whether sign · e × other < 0; where that is 0 up to rounding, whether e has the smaller curvature."""
+        sine, x, y = sign * cross(e, other), dr.norm(e), dr.norm(other)
+        touching = dr.abs(sine) <= 64 * self.arrays.roundoff * x * y
+        touching &= (bends[0] != 0) | (bends[1] != 0)
+        return dr.select(touching, bends[0] * y * y * y < bends[1] * x * x * x, sine < 0)
+
+    def place(self, hit: Hit) -> tuple[Vector2, Vector2]:
+        """The point of a hit, from the nearer end, and the arc's unit direction there."""
+        there = hit.segment != NOWHERE
+        (a, b, _), (c, w, turn) = self._of(hit.segment, there), self._shape(hit.segment, there)
+        s, r = hit.s, hit.r
+        point = dr.select(r < s, dr.fma(_chord(a, c, b, w, s, r), r, a), dr.fma(_chord(b, c, a, w, r, s), s, b))
+        e = _tangent(a, c, b, w, s, r)
+        line = super().place(hit)
+        return dr.select(turn == 0, line[0], point), dr.select(turn == 0, line[1], e * ieee_divide(1, dr.norm(e)))
+
+
+def _roots(f_a: Number, f_c: Number, f_b: Number) -> tuple[tuple[Root, Mask], tuple[Root, Mask]]:
+    """Both roots of the quadratic, f_c with the weight in it, and whether each is on the arc."""
+    # The roots r/s are −f_a/h and −h/f_b, the smaller one first: |h|² ≥ |f_a f_b|.
+    rest = dr.fma(f_c, f_c, -f_a * f_b)
+    h = f_c + dr.mulsign(dr.sqrt(dr.maximum(rest, 0)), f_c)
+    one, other = (dr.abs(h), dr.abs(f_a)), (dr.abs(f_b), dr.abs(h))
+    return (one, (rest >= 0) & ((h >= 0) != (f_a >= 0))), (other, (rest >= 0) & ((h >= 0) != (f_b >= 0)))
+
+
+def _total(w: Number, s: Number, r: Number) -> Number:
+    """s² + 2 w s r + r²."""
+    return dr.fma(2 * w * s, r, dr.fma(s, s, r * r))
+
+
+def _chord(a: Vector2, c: Vector2, b: Vector2, w: Number, s: Number, r: Number) -> Vector2:
+    """The vector from the end `a` to the place on the arc, over r."""
+    return ((c - a) * (2 * w * s) + (b - a) * r) * dr.rcp(_total(w, s, r))
+
+
+def _tangent(a: Vector2, c: Vector2, b: Vector2, w: Number, s: Number, r: Number) -> Vector2:
+    """The arc's direction at a place, from `a` to `b`, of any length."""
+    return (c - a) * (w * s * s) + (b - a) * (s * r) + (b - c) * (w * r * r)

@@ -1,0 +1,167 @@
+"""Arithmetic on every backend and in both precisions, against rational arithmetic, and helpers around Dr.Jit arrays."""
+
+from fractions import Fraction
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from mi_refract.numerics import (
+    DoubleWord,
+    TripleWord,
+    aligned,
+    error_free,
+    float_expansions,
+    from_numpy,
+    ieee_divide,
+    scale_to_unit,
+)
+
+TRIALS = 10
+
+
+def exact(x):
+    return Fraction(float(np.array(x).ravel()[0]))
+
+
+def value(x):
+    if isinstance(x, TripleWord):
+        return sum(map(exact, (x.hi, *x.first, x.second)))
+    hi, lo = (x.hi, x.lo) if isinstance(x, DoubleWord) else x
+    return exact(hi) + exact(lo)
+
+
+@pytest.fixture
+def number(setting):
+    return float if setting.is_scalar else dr.value_t(setting.vector)
+
+
+@pytest.fixture
+def drawn(setting):
+    """Triples of numbers over many magnitudes, representable in the precision; the second pairs cancel in a dot."""
+    rng, found = np.random.default_rng(11), []
+    for _ in range(TRIALS):
+        x, y = ((rng.normal(size=3) * 2.0 ** rng.integers(-20, 20, 3)).astype(setting.precision) for _ in range(2))
+        x, y = x.tolist(), y.tolist()
+        y[2] = float(setting.precision(-(x[0] * y[0] + x[1] * y[1]) / x[2]))
+        found.append((x, y))
+    return found
+
+
+# Error-free transforms -----------------------------------------------------------------------------------------------
+
+
+def test_sums_and_products_lose_nothing_and_dot_and_cross_survive_cancellation(setting, number, drawn):
+    third = Fraction(setting.roundoff) ** 3
+    for x, y in drawn:
+        (a, b), u, v = x[:2], list(map(number, x)), list(map(number, y))
+        assert value(error_free.two_sum(u[0], u[1])) == Fraction(a) + Fraction(b)
+        assert value(error_free.two_prod(u[0], u[1])) == Fraction(a) * Fraction(b)
+        big, small = sorted((a, b), key=abs, reverse=True)
+        assert value(error_free.fast_two_sum(number(big), number(small))) == Fraction(a) + Fraction(b)
+        fx, fy = list(map(Fraction, x)), list(map(Fraction, y))
+        terms = [p * q for p, q in zip(fx, fy, strict=True)]
+        assert abs(value(error_free.dot(u, v)) - sum(terms)) <= 8 * third * sum(map(abs, terms))
+        for i, component in enumerate(error_free.cross(u, v)):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            expected = fx[j] * fy[k] - fx[k] * fy[j]
+            assert abs(value(component) - expected) <= 6 * third * abs(expected)
+    tiny = float(setting.precision(setting.roundoff**2))
+    for last in (0.0, tiny):
+        ones, signs = ([number(x) for x in v] for v in ((1.0, 1.0, 1.0), (1.0, -1.0, last)))
+        assert exact(error_free.dot(ones, signs).hi) == Fraction(last)
+
+
+def test_double_and_triple_words_keep_their_order(setting, number, drawn):
+    second, third = (n * Fraction(setting.roundoff) ** n_th for n, n_th in ((5, 2), (100, 3)))
+    for (a, b, c), _ in drawn:
+        x, y = DoubleWord.product(number(a), number(b)), DoubleWord.product(number(c), number(a))
+        fx, fy = Fraction(a) * Fraction(b), Fraction(c) * Fraction(a)
+        results = (x + y, fx + fy), (x - y, fx - fy), (x * y, fx * fy), (x * number(c), fx * Fraction(c))
+        assert all(abs(value(found) - expected) <= second * abs(expected) for found, expected in results)
+        square = x * x
+        assert abs(value(square.sqrt()) ** 2 - value(square)) <= 4 * second * value(square)
+    rng = np.random.default_rng(12)
+    for _ in range(TRIALS):
+        u, v = ([number(float(setting.precision(x))) for x in rng.normal(size=3)] for _ in range(2))
+        x, y, *_ = error_free.cross(u, v)
+        k, x2, y2, fx, fy = DoubleWord.product(u[0], u[0]) - 1, x.squared(), y.squared(), value(x), value(y)
+        results = (x2, fx * fx), (x2 + y2, fx * fx + fy * fy), (x2.collected(), fx * fx)
+        results += (x2.times(k), fx * fx * value(k)), (x2.times(DoubleWord(u[1])), fx * fx * value((u[1], 0)))
+        assert all(abs(value(found) - expected) <= third * abs(expected) for found, expected in results)
+        larger, left = max(fx * fx, fy * fy), abs(fx * fx - fy * fy)
+        off = abs(value((x2 - y2).double()) - (fx * fx - fy * fy))
+        assert off <= third * larger + Fraction(setting.roundoff) ** 2 * left
+        assert value(TripleWord(u[0]).squared()) == value((u[0], 0)) ** 2
+    root = DoubleWord(number(0.0), number(0.0)).sqrt()
+    assert exact(root.hi) == exact(root.lo) == 0
+
+
+def test_a_defect_that_is_small_keeps_its_digits(setting, number, drawn):
+    u1 = Fraction(setting.roundoff)
+    for x, y in drawn:
+        u, v = list(map(number, x)), list(map(number, y))
+        target = error_free.dot(u, v).pair
+        scale = sum(abs(Fraction(a) * Fraction(b)) for a, b in zip(x, y, strict=True))
+        for share, expected in ((1.0, 0), (0.5, -value(target) / 2)):
+            part = DoubleWord(target.hi * share, target.lo * share)
+            found = exact(error_free.defect(part, *zip(u, v, strict=True)))
+            assert abs(found - expected) <= 2 * u1 * abs(expected) + 20 * u1**2 * scale
+
+
+def test_float_expansions_multiply_exactly_divide_and_regain_what_cancels():
+    rng = np.random.default_rng(3)
+    x, y = rng.normal(size=(2, 200)) * np.exp2(rng.integers(-30, 30, (2, 200)))
+    p, e = float_expansions.two_prod(x, y)
+    q = float_expansions.quotient([x], [y], 3)
+    for i in range(200):
+        fx, fy = Fraction(float(x[i])), Fraction(float(y[i]))
+        assert Fraction(float(p[i])) + Fraction(float(e[i])) == fx * fy
+        assert abs(sum(Fraction(float(digit[i])) for digit in q) - fx / fy) <= 2**-150 * abs(fx / fy)
+    terms = [1.0, 2.0**-60, -1.0, 2.0**-80, -(2.0**-60), 2.0**-140]
+    assert float_expansions.distil(terms) == [2.0**-80, 2.0**-140, 0]
+    assert float_expansions.distil([0.5, -0.5, 0.0]) == [0, 0, 0]
+
+
+# Dr.Jit arrays -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("offset", range(0, 64, 8))
+def test_numbers_start_where_they_can_be_read_at_once(offset):
+    values = np.arange(100.0)[offset // 8 :]
+    copy = aligned(values, np.dtype(np.float32))
+    assert copy.ctypes.data % 64 == 0 and copy.dtype == np.float32 and (copy == values).all()
+
+
+def test_a_kernel_serves_vectors_of_any_number_and_place(vectorised):
+    number, seen = dr.value_t(vectorised.vector), set()
+    for count in (30, 31, 100):
+        v = np.random.default_rng(count).normal(size=(count + 1, 3)).astype(vectorised.precision)[1:]
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            found = 2 * from_numpy(vectorised.vector, v) + from_numpy(number, v[:, 0])
+            dr.eval(found)
+            seen.add(dr.kernel_history([dr.KernelType.JIT])[0]["hash"])
+        assert (2 * v + v[:, :1] == np.array(found).T).all()
+    assert len(seen) == 1
+
+
+def test_quotient_by_zero_raises_on_no_backend(number):
+    assert np.isinf(np.array(ieee_divide(number(1.0), number(0.0)))).all()
+    assert np.isnan(np.array(ieee_divide(number(0.0), number(0.0)))).all()
+
+
+@pytest.mark.parametrize("length", [1e-18, 3e-7, 1.0, 1.9999999, 2.0, 5e9, 1e18, 0.0, np.nan, np.inf, -np.inf])
+def test_lengths_are_brought_near_one_by_a_power_of_two_and_what_has_none_is_not_given_one(length, vectorised):
+    v = vectorised.vector(0.6 * length, -0.7 * length, 0.1 * length)
+    dr.make_opaque(v)
+    scaled, power = scale_to_unit(v)
+    if not length or not np.isfinite(length):
+        assert not np.array(scaled).any() if length == 0 else not np.isfinite(np.array(scaled)).all()
+        return
+    assert (np.array(scaled * power) == np.array(v)).all()
+    if vectorised.name == "float32":
+        assert 1 <= np.abs(np.array(scaled)).max() < 2
+        assert np.frexp(float(np.array(power).ravel()[0]))[0] == 0.5
+    else:
+        assert power == 1
