@@ -70,8 +70,8 @@ class Shape:
         cos, sin = np.cos(self.angle), np.sin(self.angle)
         u, v = (x - self.x) * cos + (y - self.y) * sin, (y - self.y) * cos - (x - self.x) * sin
         if self.kind == 0:
-            return u * u + v * v < self.radius**2
-        return (np.abs(u) < self.radius) & (np.abs(v) < (0.7 * self.radius if self.kind == 1 else 0.5))
+            return np.asarray(u * u + v * v < self.radius**2)
+        return np.asarray((np.abs(u) < self.radius) & (np.abs(v) < (0.7 * self.radius if self.kind == 1 else 0.5)))
 
 
 def scene(rng: np.random.Generator) -> list[Shape]:
@@ -93,7 +93,7 @@ def drawn(shapes: list[Shape], samples: int = SAMPLES, turn: float = 0.0, shift:
     codes = np.zeros((*x.shape, 3))
     for shape in shapes:
         codes[shape.holds(x, y)] = shape.colour
-    return codes.mean(2)
+    return np.asarray(codes.mean(2))
 
 
 def shown(codes: Pixels, rounded: bool = True) -> Image:

@@ -163,7 +163,7 @@ def _scores(name: str, subject: Subject, screen: Screen, decision: np.ndarray) -
 
 
 def _unit_only(herd: Herd) -> np.ndarray:
-    return np.array([REGIMES[name].unit for name in herd.names])[herd.regime]
+    return np.asarray(np.array([REGIMES[name].unit for name in herd.names])[herd.regime])
 
 
 def _stepped(rng: Generator, rays: Rays, decision: np.ndarray) -> Rays:
@@ -220,7 +220,7 @@ def _inside(rays: Rays, herd: Herd, parents: np.ndarray) -> np.ndarray:
         wide = v.astype(np.longdouble)
         length = np.sqrt((wide * wide).sum(1))
         inside &= np.where(unit, np.abs(length - 1) <= slack, (length > 1e-18) & (length < 1e18))
-    return inside
+    return np.asarray(inside)
 
 
 # What was found ------------------------------------------------------------------------------------------------
