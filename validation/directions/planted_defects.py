@@ -78,7 +78,8 @@ def _slipped_cross(b: Any, transmitted: Any, a: Any, n: Any, k: Any) -> Answer:
 def _patched(owner: Any, name: str, replacement: Any) -> Callable[[Any, Any, Any, Any], Answer]:
     def answer(f: Any, a: Any, n: Any, k: Any) -> Answer:
         with mock.patch.object(owner, name, replacement):
-            return f(a, n, k)
+            answer: tuple[Any, Any] = f(a, n, k)
+            return answer
 
     return answer
 

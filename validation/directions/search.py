@@ -205,7 +205,7 @@ def _inside(rays: Rays, herd: Herd, parents: np.ndarray) -> np.ndarray:
         wide = v.astype(np.longdouble)
         length = np.sqrt((wide * wide).sum(1))
         inside &= np.where(unit, np.abs(length - 1) <= slack, (length > 1e-18) & (length < 1e18))
-    return inside
+    return np.asarray(inside)
 
 
 # What was found ------------------------------------------------------------------------------------------------
