@@ -60,8 +60,8 @@ def test_the_help_has_a_line_for_each_command_and_each_command_its_own(name, cap
 
 
 HEAVY = ("mitsuba", "drjit", "numpy", "OpenImageIO", "matplotlib", "scipy")
-# What a comparison of two images needs none of, but for its report, a terminal, or another method.
-UNUSED = ("mitsuba", "drjit", "scipy", "matplotlib", "jinja2", "rich", "xml", "asyncio")
+# What a comparison of two images needs none of, but for its report or another method.
+UNUSED = ("mitsuba", "drjit", "scipy", "matplotlib", "jinja2", "xml", "asyncio")
 SET = ("diff", "--method", "tolerance", "--set", "fail=0.5", "--json", "out.json")
 
 
