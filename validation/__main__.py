@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mi_refract.cluster.connection import ClusterTarget
-from mi_refract.io import lock
+from mi_refract.io import atomic
 from mi_refract.io.sanitise import printable
 from validation.run import command_line
 
@@ -27,11 +27,11 @@ ROOMS = {
     "directions": ("per_formula", "planted_defects", "bsdf_samples", "sweep", "search"),
     "stability": ("optical_chains", "energy", "derivatives", "layered_paths"),
     "renders": (
-        *("scene_needs", "against_dielectric", "colours", "unused_features", "invisible_changes"),
+        *("against_dielectric", "colours", "unused_features", "invisible_changes"),
         *("neighbours", "random_numbers", "gradients", "rendering_passes"),
     ),
     "efficiency": ("error_against_time", "scaling", "changing_indices"),
-    "media": ("catalogs", "ray_directions", "closed_forms", "renders", "hero_wavelength"),
+    "media": ("catalogs", "ray_directions", "closed_forms", "renders"),
     "planar": ("against_retrace", "closed_paths", "joints", "extruded_scenes", "times"),
     "diff": ("planted_defects", "visible_changes", "welch_nulls", "times"),
     "ground-truth": ("traced_bodies",),
@@ -128,7 +128,7 @@ def _command(
             rendered_images.join(system.join(folder))
     target.check()
     try:
-        with lock.held(out / LOCK, "a validation"):
+        with atomic.held(out / LOCK, "a validation"):
             return _run(names, profile, out, write_tables, goals, target)
     except KeyboardInterrupt:
         print("validation: interrupted; run the same command again to resume", file=sys.stderr)

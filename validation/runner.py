@@ -24,10 +24,10 @@ from pathlib import Path
 from typing import Any
 
 import mi_refract
-from mi_refract.cluster import connection, on_worker, worker_facts
-from mi_refract.cluster import spread as calls
+from mi_refract.cluster import connection, on_worker
+from mi_refract.cluster import workers as calls
 from mi_refract.io.atomic import write_atomically
-from mi_refract.io.provenance import installed_version
+from mi_refract.io.image_file import installed_version
 from mi_refract.io.sanitise import printable
 from mi_refract.report.row import Row
 from validation.run.context import SCENES, Context, here
@@ -148,8 +148,8 @@ def sources() -> str:
 
 
 def facts(variant: str) -> dict[str, str]:
-    """What rows depend on, of this process, by name: `worker_facts.facts` and the sources of the validation."""
-    known = worker_facts.facts(variant) | {name: installed_version(name) for name in PACKAGES}
+    """What rows depend on, of this process, by name: `on_worker.facts` and the sources of the validation."""
+    known = on_worker.facts(variant) | {name: installed_version(name) for name in PACKAGES}
     return known | {"validation": sources()[:8], "other renderers": ", ".join(installed()) or "none"}
 
 

@@ -19,7 +19,7 @@ def main(arguments: list[str] | None = None) -> int:
         # Mitsuba heeds SIGINT also where it is ignored, so a rendering in the background ends, too.
         rendering = arguments[:1] == ["render"]
         end_at_once(even_if_ignored=rendering)
-    from mi_refract.io.exit_code import exit_code
+    from mi_refract.io.errors import exit_code
 
     return exit_code("mi-refract", lambda: _run(arguments))
 

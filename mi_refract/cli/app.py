@@ -22,7 +22,7 @@ except ModuleNotFoundError as missing:
     sys.exit(2)
 
 from mi_refract import __version__
-from mi_refract.io.exit_code import exit_code
+from mi_refract.io.errors import exit_code
 from mi_refract.io.sanitise import printable
 
 

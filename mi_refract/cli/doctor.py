@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from mi_refract import __version__, backend
-from mi_refract.io.provenance import installed_version
+from mi_refract.io.image_file import installed_version
 from mi_refract.io.sanitise import json_text, printable_lines
 
 from .interrupts import as_exceptions

@@ -5,23 +5,28 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.text import Text
 
 from mi_refract import backend
-from mi_refract.cluster.connection import ClusterTarget
+from mi_refract.cluster import on_worker
+from mi_refract.cluster.connection import ClusterTarget, connected
+from mi_refract.cluster.workers import Workers
+from mi_refract.io.errors import UsageError
 from mi_refract.io.sanitise import printable
 from mi_refract.rendering import scene_files
 
 from . import interrupts
 from .doctor import activate
-from .quantities import parse_seconds, parse_share, shown_error
-from .render_cluster import ClusterOptions, cluster_passes
-from .render_progress import shown
+from .render_progress import parse_seconds, parse_share, shown, shown_error
+
+if TYPE_CHECKING:  # they import Mitsuba
+    from mi_refract.rendering.long_render import LongRender, Passes
 
 
 def render(
@@ -93,8 +98,13 @@ def render(
     from mi_refract.io.atomic import writable
 
     defines = scene_files.parse_defines(define or [])
-    cluster = ClusterOptions(ClusterTarget(scheduler, workers), bundle_limit, mixed_workers=mixed_workers)
-    cluster.check(allow_plugins or ())
+    cluster = ClusterTarget(scheduler, workers)
+    if mixed_workers and not cluster.given:
+        raise UsageError("--mixed-workers requires --scheduler ADDRESS or --workers N")
+    cluster.check()
+    if cluster.given and allow_plugins:
+        text = f"--allow-plugins {min(allow_plugins)}: native code is not sent to workers"
+        raise UsageError(f"{text}; remove --scheduler or --workers")
     share = None if until is None else parse_share(until, "--until")
     tile_share = None if until_tile is None else parse_share(until_tile, "--until-tile")
     seconds = None if duration is None else parse_seconds(duration, "--time")
@@ -113,7 +123,7 @@ def render(
     if rendering.progress.passes:
         print(printable(f"{output}: resuming from {rendering.progress.done} spp"), file=sys.stderr)
     with (
-        cluster_passes(cluster, rendering, str(chosen)) as passes,
+        cluster_passes(cluster, rendering, str(chosen), bundle_limit, mixed=mixed_workers) as passes,
         interrupts.last_act(rendering.give_up),
         shown(console, rendering, preview) as watch,
     ):
@@ -128,3 +138,32 @@ def render(
         print(printable(f"mi-refract: {output}: {bad} pixels are not finite"), file=sys.stderr)
     if variant is None and not backend.llvm().usable:
         print(printable(f"mi-refract: {chosen} is slow; {backend.summary()}"), file=sys.stderr)
+
+
+@contextlib.contextmanager
+def cluster_passes(
+    target: ClusterTarget, rendering: LongRender, variant: str, bundle_limit: int, *, mixed: bool
+) -> Iterator[Passes | None]:
+    """Where passes are rendered; None for this process. Workers that are refused are named on stderr.
+
+    ValueError for a scene that cannot be sent; ConnectionError where no scheduler answers or no worker may render.
+    """
+    if not target.given or rendering.end():
+        yield None
+        return
+    from mi_refract.rendering import scene_bundle
+    from mi_refract.rendering.cluster_passes import ClusterPasses
+
+    def warn(text: str) -> None:
+        print(printable(f"mi-refract: {text}"), file=sys.stderr, flush=True)
+
+    bundle = scene_bundle.pack(rendering.parsed, rendering.job.defines, bundle_limit)
+    with connected(target.scheduler, target.workers) as client:
+        tolerated: frozenset[str] = on_worker.MIXED if mixed else frozenset()
+        workers = Workers(client, variant, on_worker.facts(variant), tolerated, warn, task="render")
+        workers.wait()
+        passes = ClusterPasses(workers, bundle, variant, rendering.job.seed, rendering.warnings.append)
+        try:
+            yield passes.nodes
+        finally:
+            passes.close()

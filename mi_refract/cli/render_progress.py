@@ -1,9 +1,13 @@
-"""Progress of `mi-refract render`: a bar on a terminal, else a line every 30 s; warnings, and a preview."""
+"""What `mi-refract render` reads and shows: quantities such as 1%, 10m, 1h30m; progress, warnings, and a preview.
+
+Progress is a bar on a terminal, else a line every 30 s.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import math
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -17,13 +21,14 @@ from rich.progress import BarColumn, Progress, TextColumn
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.pixels import srgb_encode
 from mi_refract.io.sanitise import printable
+from mi_refract.rendering.end_conditions import RelativeError
 from mi_refract.report.embedded_images import png
-
-from .quantities import shown_error
 
 if TYPE_CHECKING:  # it imports Mitsuba
     from mi_refract.rendering.long_render import LongRender
 
+PLAIN = 0.1  # the largest share that is understood without a percent sign
+_SECONDS = {"d": 86400.0, "h": 3600.0, "m": 60.0, "s": 1.0}
 BAR = 12  # characters: of a terminal of 80 the text takes the others
 BETWEEN_LINES = 30.0  # seconds, where there is no terminal
 BETWEEN_LOOKS = 2.0  # seconds between two estimates of the error for the bar, at least
@@ -98,3 +103,36 @@ def write_preview(path: Path, rendering: LongRender) -> None:
         write_atomically(path, png(rgb))
     except OSError as error:
         rendering.warnings.append(f"{path}: no preview: {error.strerror or error}")
+
+
+def parse_share(text: str, option: str) -> float:
+    """`1%` or `0.01`, of 100 % at most. ValueError for anything else, also for `1` and `0.5`: is that 0.5 % or 50 %?"""
+    number, percent = (text[:-1], True) if text.endswith("%") else (text, False)
+    try:
+        value = float(number) / (100 if percent else 1)
+    except ValueError:
+        value = 0.0
+    if not 0 < value <= (1 if percent else PLAIN):
+        raise ValueError(
+            f"{option} {text}; expected more than 0 %, up to 100 %, such as 1% or 0.01 (up to {PLAIN} without %)"
+        )
+    return value
+
+
+def parse_seconds(text: str, option: str) -> float:
+    """`90`, `90s`, `10m`, `1h30m` or `2d` in seconds, more than 0. ValueError for anything else."""
+    parts = re.fullmatch(
+        r"(?=.)" + "".join(rf"(?:(\d{{1,9}}(?:\.\d{{1,9}})?){unit}{'?' if unit == 's' else ''})?" for unit in _SECONDS),
+        text,
+    )
+    given = zip(parts.groups(), _SECONDS.values(), strict=True) if parts else ()
+    seconds = sum(float(number) * unit for number, unit in given if number)
+    if not seconds > 0:
+        raise ValueError(f"{option} {text}; expected a time of more than 0, such as 90s, 10m or 1h30m")
+    return seconds
+
+
+def shown_error(error: RelativeError) -> str:
+    """`0.42 % (0.40 to 0.44 %)`: an estimate and its interval, where there is one; or `at most 0.42 %`."""
+    interval = f" ({100 * error.low:.2g} to {100 * error.high:.2g} %)" if math.isfinite(error.high) else ""
+    return f"{'at most ' * error.at_most}{100 * error.value:.2g} %{interval}"

@@ -5,4 +5,4 @@ which of the workers may have work; a worker that differs is refused by name, wi
 retries and spilling are Dask's. Importing this room does not import Dask.
 """
 
-__all__ = ["connection", "local_cluster", "on_worker", "spread", "worker_facts", "workers"]
+__all__ = ["connection", "local_cluster", "on_worker", "workers"]

@@ -73,8 +73,7 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
     with contextlib.ExitStack() as stack:
         stack.enter_context(warnings.catch_warnings())
         warnings.simplefilter("ignore")  # of versions, large graphs: versions that matter are compared by `workers`
-        logging.disable(logging.CRITICAL)  # Dask's own messages: what matters of them is raised here
-        stack.callback(logging.disable, logging.NOTSET)
+        stack.enter_context(_silent())
         if workers is not None:
             address, security = stack.enter_context(local_cluster.started(workers))
         else:
@@ -89,14 +88,33 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
                 client.close(timeout=2.0)
 
 
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Within, Dask logs nothing: what matters of it is raised here. Other loggers stay as they are."""
+    loggers = [logging.getLogger(name) for name in list(logging.root.manager.loggerDict)]
+    loud = [x for x in loggers if x.name.partition(".")[0] in ("distributed", "tornado", "asyncio") and not x.disabled]
+    for logger in loud:
+        logger.disabled = True
+    try:
+        yield
+    finally:
+        for logger in loud:
+            logger.disabled = False
+
+
 def _client(address: str, security: Security) -> Client:
     import distributed
 
+    async def kind() -> str:
+        """What answers at the address, as it says."""
+        options = {"timeout": PATIENCE / 2, "connection_args": security.get_connection_args("client")}
+        async with asyncio.timeout(PATIENCE), distributed.rpc(address, **options) as there:
+            return str((await there.identity()).get("type"))
+
     try:
         # First, as a client that found nobody would take 16 s to give up.
-        kind = asyncio.run(_kind(address, security))
-        if kind != "Scheduler":
-            raise ValueError(f"a Dask {kind} answers there")
+        if (answering := asyncio.run(kind())) != "Scheduler":
+            raise ValueError(f"a Dask {answering} answers there")
         # Results come from the workers themselves where these can be reached, else through the scheduler.
         return distributed.Client(
             address, security=security, timeout=PATIENCE, set_as_default=False, direct_to_workers=True
@@ -105,15 +123,6 @@ def _client(address: str, security: Security) -> Client:
         texts = [" ".join(str(cause).split()) for cause in (error.__cause__, error) if cause is not None]
         text = re.sub(r"in <[^>]*>: ", "", next(filter(None, texts), f"not within {PATIENCE:.0f} s"))
         raise ConnectionError(f"--scheduler {address}: no Dask scheduler answers: {text[:200]}; {_EXPECTED}") from None
-
-
-async def _kind(address: str, security: Security) -> str:
-    """What answers at an address, as it says."""
-    from distributed import rpc
-
-    arguments = security.get_connection_args("client")
-    async with asyncio.timeout(PATIENCE), rpc(address, timeout=PATIENCE / 2, connection_args=arguments) as there:
-        return str((await there.identity()).get("type"))
 
 
 @contextlib.contextmanager

@@ -27,6 +27,8 @@ SETTINGS = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.system-monitor.interval": "10s",
     "distributed.admin.tick.interval": "1s",
+    # As long as a worker tries to reach one that has gone, when that is told before it tries; 30 s by default.
+    "distributed.comm.timeouts.connect": "4s",
 }
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from mi_refract.io import image_file, regular_file
 from mi_refract.io.atomic import replacing
-from mi_refract.io.exit_code import describe
+from mi_refract.io.errors import describe
 
 from . import pairing
 from .folders import digest

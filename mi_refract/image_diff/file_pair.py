@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.io import image_file
-from mi_refract.io.bounded_map import bounded_map
-from mi_refract.io.image_file import MAX_VALUES, Image
+from mi_refract.io.image_file import MAX_VALUES, Image, bounded_map
 
 from . import channels, methods, pairing
 from .comparison import Comparison, Verdict

@@ -14,9 +14,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from mi_refract.io import exit_code, image_file, regular_file
-from mi_refract.io.bounded_map import bounded_map
-from mi_refract.io.image_file import Image, one_line
+from mi_refract.io import errors, image_file, regular_file
+from mi_refract.io.image_file import Image, bounded_map, one_line
 
 from . import file_pair, pairing
 from .pairing import Pair
@@ -122,8 +121,8 @@ def _compared(pair: Pair, results: Results, *, keep: bool, digests: bool) -> Res
                 result = replace(result, digests={path: digest(path) for path in paths if path})
             result = _judged(result, results.roots, read)
         except Exception as error:  # of whatever kind: the other images are still to be compared
-            exit_code.print_traceback(error)
-            text = exit_code.describe(error)
+            errors.print_traceback(error)
+            text = errors.describe(error)
             known = isinstance(error, ValueError | OSError)
             result = replace(result, status=Status.ERROR, error=text if known else f"{result.test}: {text}")
     if not keep or result.status not in FAILED:

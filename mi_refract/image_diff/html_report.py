@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refract.io import exit_code
+from mi_refract.io import errors
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels, block_mean
@@ -223,8 +223,8 @@ def shown_of(result: Result, image_bytes: float, map_bytes: float) -> Shown:
         with _one_at_a_time:
             return _shown(result, image_bytes, map_bytes)
     except Exception as error:  # of whatever kind: the page is for all images
-        exit_code.print_traceback(error)
-        return Shown(note=f"Cannot be shown: {exit_code.describe(error)}")
+        errors.print_traceback(error)
+        return Shown(note=f"Cannot be shown: {errors.describe(error)}")
 
 
 def _shown(result: Result, image_bytes: float, map_bytes: float) -> Shown:

@@ -6,14 +6,10 @@ output of other programs, checked values; errors are one line that says what, wh
 
 __all__ = [
     "atomic",
-    "bounded_map",
     "errors",
-    "exit_code",
     "image_file",
-    "lock",
     "pixels",
     "process_group",
-    "provenance",
     "regular_file",
     "sanitise",
     "typed_table",

@@ -1,12 +1,16 @@
-"""Files and folders that are either the old version or the new one, never half of it.
+"""Files and folders that are either the old version or the new one, never half of it; and locks of them.
 
 They are written under a temporary name in the same folder and renamed at the end. An exception or Ctrl-C removes the
 temporary one; a process that SIGKILL ends leaves it behind, hidden (`.NAME.….part`).
+A lock is the operating system's (`flock`), so it ends with the process that holds it, however that ends.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
+import json
 import os
 import secrets
 import shutil
@@ -22,6 +26,7 @@ _KEPT = 40  # characters of the file's own name: a name of 255 bytes has no room
 _KINDS = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 _LONGEST_CHANGE = 5.0  # seconds that creating or renaming may take on a slow file system
 _unfinished: set[Path] = set()
+_NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
 _changing = threading.Lock()  # held where `_unfinished` changes, or a file in it is created or renamed
 
 
@@ -155,3 +160,48 @@ def update_between(path: str | Path, marker: str, text: str) -> None:
     newline = "\r\n" if "\r\n" in document else "\n"
     body = "\n".join((begin, text.strip("\n"), end)).replace("\n", newline)
     write_atomically(path, head + body + tail)
+
+
+@contextlib.contextmanager
+def held(path: Path, what: str, place: Path | None = None, expected: str = "another folder") -> Iterator[None]:
+    """Hold the lock file `path` within a `with` block, and remove it at the end.
+
+    BlockingIOError, at once and in one line, where another process holds it: `what` runs at `place` (by default the
+    folder of the lock file), in which process, and since when. OSError where the file cannot be made. A file system
+    without locks, as some networks', keeps nobody out.
+    """
+    while True:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(path.lstat(), os.fstat(file)):
+                    break
+            os.close(file)  # its holder removed it meanwhile
+        except BlockingIOError:
+            os.close(file)
+            where = f"{place or path.parent}: {what} is already running {_holder(path)}"
+            raise BlockingIOError(f"{where}; expected {expected}") from None
+        except OSError as error:
+            if error.errno in _NO_LOCKS:
+                break
+            os.close(file)
+            raise
+    try:
+        since = time.strftime("%Y-%m-%d %H:%M:%S %z")
+        os.ftruncate(file, 0)
+        os.write(file, json.dumps({"process": os.getpid(), "host": os.uname().nodename, "since": since}).encode())
+        yield
+    finally:
+        path.unlink(missing_ok=True)  # while it is held: nobody else's file is removed
+        os.close(file)
+
+
+def _holder(path: Path) -> str:
+    """Which process holds the lock, as its file says; nobody waits for the file to be complete."""
+    try:
+        with path.open("rb") as file:
+            said = json.loads(file.read(1000))
+        return f"in process {said['process']} on {said['host']} since {said['since']}"
+    except (OSError, ValueError, KeyError, TypeError):
+        return "in an unknown process"

@@ -5,14 +5,14 @@ Pixels are arrays of H × W × C float32, row 0 at the top. A file is written co
 
 from __future__ import annotations
 
+import contextlib
 import os
-import re
-import shlex
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, BinaryIO, TypeAlias
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +20,12 @@ from numpy.typing import ArrayLike, NDArray
 from . import atomic
 from .errors import ImageError
 
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+AHEAD = 2  # items in hand for each thread: a slow one does not leave the others idle at once
 Metadata = dict[str, Any]
 ImageInput: TypeAlias = Any  # an `OpenImageIO.ImageInput`
 ImageSpec: TypeAlias = Any  # an `OpenImageIO.ImageSpec`
@@ -164,17 +170,9 @@ def _checked(path: Path, max_values: int) -> tuple[ImageInput, str]:
     if not begin:
         raise ImageError(f"{path}: corrupt {kind} file: it is empty")
     if begin == LFS_POINTER:
-        raise ImageError(f"{path}: a Git LFS pointer, not the image; run `{_lfs_pull(path)}` to fetch it")
+        raise ImageError(f"{path}: a Git LFS pointer, not the image; run `git lfs pull` to fetch it")
     # Others hold 8 bytes a value or fewer, and are asked below.
     return _opened(path, kind, max_values, max_values * (1 if begin.startswith(WHEN_OPENED) else 8)), kind
-
-
-def _lfs_pull(path: Path) -> str:
-    """The command that fetches a file from Git LFS; its pattern begins at the repository's root."""
-    full = path.absolute()
-    root = next((folder for folder in full.parents if (folder / ".git").exists()), None)
-    pattern = re.sub(r"[][*?,\\]", "?", (full.relative_to(root) if root else path).as_posix())
-    return shlex.join(["git", "lfs", "pull", f"--include={pattern}"])
 
 
 def check_header(path: str | os.PathLike[str], max_values: int) -> None:
@@ -348,3 +346,48 @@ def read_exr(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> tupl
 def one_line(text: str) -> str:
     """`text` with every run of white space, line breaks among them, as one space."""
     return " ".join(text.split())
+
+
+def bounded_map(
+    work: Callable[[Item], Answer], items: Iterable[Item], takes: Callable[[Item], int], most: int, threads: int
+) -> Iterator[Answer]:
+    """Yield `work(item)` for each item, in order, from several threads. Raises what `work` raises.
+
+    Items at work, and answers that wait for their turn, take `most` together; one that takes more is alone.
+    """
+    from concurrent.futures import ThreadPoolExecutor  # not needed for one item
+
+    pending: deque[tuple[Future[Answer], int]] = deque()
+    taken = 0
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for item in items:
+                more = takes(item)
+                while pending and (taken + more > most or len(pending) >= AHEAD * threads):
+                    future, less = pending.popleft()
+                    yield future.result()
+                    taken -= less
+                pending.append((pool.submit(work, item), more))
+                taken += more
+            while pending:
+                yield pending.popleft()[0].result()
+        finally:
+            for future, _ in pending:
+                future.cancel()
+
+
+def provenance() -> dict[str, str]:
+    """Header attributes: `Software`, and `mi_refract:version:NAME` for mi_refract, mitsuba and drjit."""
+    from mi_refract import __version__
+
+    versions = {"mi_refract": __version__} | {name: installed_version(name) for name in ("mitsuba", "drjit")}
+    return {"Software": f"mi_refract {__version__}"} | {f"mi_refract:version:{n}": v for n, v in versions.items()}
+
+
+def installed_version(distribution: str) -> str:
+    """The installed version of a distribution; "unknown" where it runs without being installed."""
+    import importlib.metadata  # which takes long
+
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        return importlib.metadata.version(distribution)
+    return "unknown"

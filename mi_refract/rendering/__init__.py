@@ -10,7 +10,6 @@ __all__ = [
     "checkpoint",
     "cluster_passes",
     "end_conditions",
-    "error_estimate",
     "long_render",
     "pass_plan",
     "pass_sums",

@@ -1,14 +1,118 @@
-"""What ends a render: its number of samples, its estimated error, its time, or a scene without noise."""
+"""What ends a render: its number of samples, its time, a scene without noise, or its error as its own passes tell it.
+
+The error is the RMSE over all pixels, relative to the image's mean.
+
+    relative error = √(s²/n) / |mean|,    s²: variance of one sample, averaged over pixels and colours; n: spp
+
+s² is the mean of m independent contrasts between passes (`PassSums.contrasts`), and the squared error of this image is
+one more quantity of their distribution. So with 95 % probability it lies within  s² ± t s_c √(1 + 1/m),  s_c their
+standard deviation, as far as passes are normally distributed: what no sample has met yet is in no estimate.
+
+Of a single pass there is no contrast, and s² is that of its samples, as if they were independent. Where the sampler
+stratifies them their mean varies less, Var(x̄) ≤ s²/n for strata of equal probability (Cochran, Sampling Techniques,
+1977, 5.6), so this is an upper bound.
+"""
 
 from __future__ import annotations
 
+import importlib.util
+import math
 from dataclasses import dataclass
 
-from . import error_estimate
+import numpy as np
+
 from .pass_plan import FEW
-from .pass_sums import PassSums
+from .pass_sums import Doubles, PassSums
 
 NO_NOISE = "no noise: the samples of every pixel agree"
+LEVEL = 0.95
+TILE = 16  # pixels
+ENOUGH_FOR_NO_NOISE = 64  # samples per pixel
+SAME = 5e-13  # of a pixel's mean, the standard deviation of samples that are equal but for the rounding of sums
+LEFT_OUT = 0.01  # share of the tiles that may be worse
+DARK = 0.01  # of the image's mean: a darker tile is judged as if it were so bright
+
+
+@dataclass(frozen=True)
+class RelativeError:
+    """The estimate, and where the error of this image lies with probability LEVEL; NaN where too little is known.
+
+    `at_most`: it is that of independent samples, an upper bound for stratified ones.
+    """
+
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+    at_most: bool = False
+
+
+def relative_error(sums: PassSums) -> RelativeError:
+    """The error of an image over all its pixels that are finite."""
+    colours = sums.mean[..., : sums.colours]
+    known = np.isfinite(colours)
+    mean = abs(float(colours[known].mean())) if known.any() else math.nan
+    found = np.asarray([each for each in sums.contrasts if math.isfinite(each)])
+    if not mean > 0 or not sums.freedom:
+        return RelativeError(math.nan)
+    squared, spread = float(found.mean()) if found.size else math.nan, math.nan
+    if at_most := not found.size and (variance := sums.variance) is not None:
+        known = np.isfinite(variance := variance[..., : sums.colours])
+        squared = float(variance[known].mean())
+    if found.size > 1:
+        spread = _quantile(found.size - 1) * float(found.std(ddof=1)) * math.sqrt(1 + 1 / found.size)
+    value, low, high = (math.sqrt(max(x, 0) / sums.spp) / mean for x in (squared, squared - spread, squared + spread))
+    return RelativeError(value, low, high, at_most)
+
+
+def without_noise(sums: PassSums) -> bool:
+    """Whether all samples of each pixel are the same, and none is black: there light may be that is seldom met.
+
+    Sums in float64 differ from equal ones by less than SAME; one sample of n ≤ 2³², by float32's 6e-8/√n ≥ 9e-13.
+    """
+    if sums.spp < ENOUGH_FOR_NO_NOISE or (variance := sums.variance) is None:
+        return False
+    mean = sums.mean
+    return bool((np.isfinite(mean) & (mean != 0) & (variance <= np.square(SAME * mean))).all())
+
+
+def require_interval() -> None:
+    """ImportError, in one line, where the interval cannot be had."""
+    if importlib.util.find_spec("scipy") is None:
+        raise ImportError("--until needs SciPy; expected pip install 'mi-refract[diff]', or --until-tile")
+
+
+def _quantile(freedom: int) -> float:
+    """Of Student's distribution; NaN without SciPy, which is an extra."""
+    try:
+        from scipy.stats import t  # takes a second
+    except ImportError:
+        return math.nan
+    return float(t.ppf((1 + LEVEL) / 2, freedom))
+
+
+def worst_tile(sums: PassSums) -> float:
+    """The relative error of the worst tile of TILE² pixels but LEFT_OUT of them; NaN where too little is known."""
+    variance = sums.variance
+    if variance is None:
+        return math.nan
+    squared = _tile_means(variance[..., : sums.colours] / sums.spp)
+    means = np.abs(_tile_means(sums.mean[..., : sums.colours]))
+    if not (size := float(np.nanmean(means)) if np.isfinite(means).any() else 0.0) > 0:
+        return math.nan
+    return float(np.nanquantile(np.sqrt(squared) / np.maximum(means, DARK * size), 1 - LEFT_OUT, method="higher"))
+
+
+def _tile_means(values: Doubles) -> Doubles:
+    """Means over tiles and channels, of what is finite; NaN for a tile where nothing is."""
+    known = np.isfinite(values)
+    rows, columns = (np.arange(0, n, TILE) for n in values.shape[:2])
+
+    def over_tiles(each: Doubles) -> Doubles:
+        return np.asarray(np.add.reduceat(np.add.reduceat(each.sum(-1), rows, 0), columns, 1))
+
+    counts = over_tiles(known.astype(np.float64))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(over_tiles(np.where(known, values, 0)) / counts)
 
 
 @dataclass(frozen=True)
@@ -44,14 +148,14 @@ class Limits:
 
 def reached(limits: Limits, sums: PassSums) -> str:
     """Why an image is good enough: no noise, or an error that was asked for; "" where it is not."""
-    if error_estimate.without_noise(sums):
+    if without_noise(sums):
         return NO_NOISE
     if sums.passes < FEW:  # their spread says too little
         return ""
-    if limits.until and (error := error_estimate.relative_error(sums)).high <= limits.until:
+    if limits.until and (error := relative_error(sums)).high <= limits.until:
         until, value, high = (f"{100 * share:.3g} %" for share in (limits.until, error.value, error.high))
         return f"--until {until}: the error is {value}, at most {high}"
-    if limits.until_tile and (worst := error_estimate.worst_tile(sums)) <= limits.until_tile:
+    if limits.until_tile and (worst := worst_tile(sums)) <= limits.until_tile:
         until, value = (f"{100 * share:.3g} %" for share in (limits.until_tile, worst))
         return f"--until-tile {until}: the error of the worst tile is {value}"
     return ""

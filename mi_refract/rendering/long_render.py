@@ -14,24 +14,23 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import TypeAlias
 
 import mitsuba as mi
 import numpy as np
 
 from mi_refract import backend
-from mi_refract.cluster import worker_facts
-from mi_refract.io import lock
+from mi_refract.cluster import on_worker
+from mi_refract.io import atomic
 from mi_refract.io.atomic import writable
-from mi_refract.io.image_file import SUFFIXES, Metadata
-from mi_refract.io.provenance import installed_version, provenance
+from mi_refract.io.image_file import SUFFIXES, Metadata, installed_version, provenance
 from mi_refract.io.sanitise import printable
 from mi_refract.numerics import Scene
 from mi_refract.plugins.scene_parser import ParsedScene
 
-from . import checkpoint, error_estimate, rendered_file
+from . import checkpoint, rendered_file
 from .checkpoint import PASS, CheckpointWriter, Identity, Progress
-from .end_conditions import Limits, reached
+from .end_conditions import Limits, RelativeError, reached, relative_error, require_interval
 from .pass_plan import PassPlan, next_stop, plan_passes
 from .pass_sums import PassSums
 from .render_pass import PassRenderer, pass_renderer
@@ -51,28 +50,10 @@ class Job:
     allow_plugins: Collection[str] = ()
 
 
-class Passes(Protocol):
-    """Where passes are rendered."""
-
-    def nodes(self, first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
-        """Level, sums and machines ("a, b") of nodes that make up the passes from `first` to `stop`, in their order.
-
-        Passes up to `last` may be begun, as they will probably be asked for next. `offset`: added to their numbers for
-        their seeds. `spp`: samples per pixel of each.
-        """
-        ...
-
-
-@dataclass(frozen=True)
-class ThisProcess:
-    """Renders passes here, one after the other."""
-
-    renderer: PassRenderer
-
-    def nodes(self, first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
-        """Each pass by itself."""
-        for number in range(first, stop):
-            yield 0, self.renderer.render(offset + number, spp), os.uname().nodename
+# Where passes are rendered. Of first, stop, last, offset, spp: level, sums and machines ("a, b") of nodes that make up
+# the passes from `first` to `stop`, in their order. Passes up to `last` may be begun, which are probably asked for
+# next. `offset`: added to their numbers for their seeds. `spp`: samples per pixel of each.
+Passes: TypeAlias = Callable[[int, int, int, int, int], Iterator[tuple[int, PassSums, str]]]
 
 
 def resume(
@@ -86,7 +67,7 @@ def resume(
     if not 0 <= job.seed < 2**32:
         raise ValueError(f"seed = {job.seed}; expected a whole number from 0 to 2³² − 1")
     if limits.until is not None:
-        error_estimate.require_interval()
+        require_interval()
     parsed = parse_scene(job.scene, job.defines)
     scene = load_parsed(parsed, job.allow_plugins)
     renderer = pass_renderer(scene, job.seed)
@@ -135,10 +116,10 @@ def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> Identity
         "variant": str(mi.variant()),
         "film": f"{width} × {height} {', '.join(renderer.channels)}",
         "colours": renderer.colours,
-        "version of mi_refract": worker_facts.our_version(),
+        "version of mi_refract": on_worker.our_version(),
         **{f"version of {name}": installed_version(name) for name in ("mitsuba", "drjit")},
         "libLLVM": backend.llvm().library if llvm else "none",
-        "vector width": worker_facts.vector_width() if llvm else "none",
+        "vector width": on_worker.vector_width() if llvm else "none",
     }
 
 
@@ -172,14 +153,14 @@ class LongRender:
         `passes`: where they are rendered, by default in this process. On any error what is done stays in the
         checkpoint. BlockingIOError where another process renders into the same file, or did so since `resume`.
         """
-        with lock.held(lock_of(self.output), "a render", self.output, "another file"):
+        with atomic.held(lock_of(self.output), "a render", self.output, "another file"):
             if self._file_stamps() != self._files_before:
                 raise BlockingIOError(
                     f"{self.output}: written by another render in the meantime; run the command again"
                 )
             self.checkpoints.active = True
             try:
-                return self._run(passes or ThisProcess(self.renderer), watch)
+                return self._run(passes or self._here, watch)
             except BaseException as error:
                 self.checkpoints.write()
                 if isinstance(error, RuntimeError):  # Mitsuba's own
@@ -188,7 +169,12 @@ class LongRender:
             finally:
                 self.checkpoints.active = False
 
-    def _run(self, source: Passes, watch: Callable[[LongRender], None]) -> Metadata:
+    def _here(self, first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
+        """As `Passes`: one after the other in this process."""
+        for number in range(first, stop):
+            yield 0, self.renderer.render(offset + number, spp), os.uname().nodename
+
+    def _run(self, nodes: Passes, watch: Callable[[LongRender], None]) -> Metadata:
         progress, tree, plan, first = self.progress, self.progress.tree, self.plan, self.progress.first
         deadline = math.inf if self.limits.seconds is None else time.monotonic() + self.limits.seconds
         nothing_new = bool(self.end()) and progress.passes == first
@@ -201,7 +187,7 @@ class LongRender:
                 last = done + 1 if rest else plan.full_passes
             before = time.monotonic()
             spp = plan.rest if rest else plan.spp
-            for level, sums, machines in source.nodes(done, min(look, last), last, first, spp):
+            for level, sums, machines in nodes(done, min(look, last), last, first, spp):
                 took = time.monotonic() - before
                 progress.add(level, sums, machines, took, rest=rest)
                 before = time.monotonic()
@@ -251,10 +237,10 @@ class LongRender:
         """Whether it has as many samples per pixel as were asked for."""
         return self.progress.done == self.spp
 
-    def error(self) -> error_estimate.RelativeError | None:
+    def error(self) -> RelativeError | None:
         """The present error; None before the first pass."""
         sums = self.progress.sums()
-        return None if sums is None else error_estimate.relative_error(sums)
+        return None if sums is None else relative_error(sums)
 
     def image(self) -> np.ndarray | None:
         """The present image, H × W × channels; None before the first pass."""

@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import dask
 import numpy as np
@@ -17,7 +18,7 @@ from distributed import Security
 from support.dask_workers import program, tls_settings, until
 from support.processes import ENVIRONMENT
 
-from mi_refract.cluster import worker_facts
+from mi_refract.cluster import on_worker
 from mi_refract.io.image_file import read_exr
 
 SCENE = """<scene version="3.0.0">
@@ -62,54 +63,38 @@ def refused(outcome, *messages):
         (("--mixed-workers",), "--mixed-workers requires --scheduler ADDRESS or --workers N"),
         (("--workers", 1, "--allow-plugins", "evil"), "--allow-plugins evil: native code is not sent to workers"),
         (("--scheduler", "nonsense"), "--scheduler nonsense: no Dask scheduler answers: missing port number"),
-        (("--scheduler", "tcp://127.0.0.1:9"), "--scheduler tcp://127.0.0.1:9: no Dask scheduler answers: "),
+        (("--scheduler", "tcp://127.0.0.1:9"), "; expected the address of a Dask scheduler"),
+        (("--workers", 1, "--bundle-limit", 1), "the limit for a cluster is 1 MiB; raise it by --bundle-limit 2"),
+        (("--workers", 1), "pip install 'mi-refract[cluster]'"),
     ],
 )
-def test_misuse(render, scene, options, message):
+def test_misuse(render, scene, options, message, monkeypatch):
+    if "--bundle-limit" in options:
+        scene.write_text(SCENE + f"<!-- {'x' * 2**20} -->")
+    if options == ("--workers", 1):
+        monkeypatch.setitem(sys.modules, "distributed", None)
     refused(render(*options), message)
     assert list(scene.parent.iterdir()) == [scene]
-
-
-def test_too_large_for_a_cluster(render, scene):
-    scene.write_text(SCENE + f"<!-- {'x' * 2**20} -->")
-    found = render("--workers", 1, "--bundle-limit", 1)
-    refused(found, f"{scene}: 1.0 MiB of files", "the limit for a cluster is 1 MiB; raise it by --bundle-limit 2")
-
-
-def test_another_libllvm_is_refused_unless_mixed_workers_are_accepted(render, monkeypatch):
-    own = worker_facts.facts
-    monkeypatch.setattr(worker_facts, "facts", lambda variant: own(variant) | {worker_facts.LLVM: "99.0"})
-    code, _, err = render("--workers", 1)
-    assert code == 2 and "is refused: libLLVM unknown, here 99.0" in err
-    assert render("--workers", 1, "--mixed-workers")[0] == 0
-
-
-def test_without_dask(render, monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    refused(render("--workers", 1), "pip install 'mi-refract[cluster]'")
 
 
 # Ended from outside ---------------------------------------------------------------------------------------------------
 
 
-def leader_of_workers(process):
-    """The process of the local cluster that `process` started."""
-    children = psutil.Process(process.pid).children()
-    return next(child.pid for child in children if os.getpgid(child.pid) == child.pid)
-
-
-def ended(leader):
-    """Whether no process of the group is left."""
+def group(leader):
+    """The processes of a process group that have not ended."""
+    members = []
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.NoSuchProcess, ProcessLookupError):
             if os.getpgid(process.pid) == leader and process.status() != psutil.STATUS_ZOMBIE:
-                return False
-    return True
+                members.append(process.pid)
+    return members
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_the_scheduler_ends_and_the_render_resumes_here(render, scene, number):
-    """Ctrl-C ends the render and its local cluster, a lost scheduler is an error: both leave a checkpoint."""
+@pytest.mark.parametrize(
+    ("number", "victim"), [(signal.SIGINT, "render"), (signal.SIGKILL, "render"), (signal.SIGKILL, "cluster")]
+)
+def test_what_ends_a_render_ends_its_workers_and_leaves_a_checkpoint(render, scene, number, victim):
+    """Ctrl-C and a lost scheduler do; a kill leaves what was written before. The workers block no signal."""
     preview, checkpoint = scene.with_name("so-far.png"), scene.with_name("out.exr.checkpoint")
     words = ("--variant", "scalar_rgb", "--pass-spp", 1, "--workers", 1, "--spp", 100_000, "--preview", preview)
     command = [sys.executable, "-m", "mi_refract.cli", "render", scene, "-o", scene.with_name("out.exr"), *words]
@@ -118,18 +103,22 @@ def test_the_scheduler_ends_and_the_render_resumes_here(render, scene, number):
         try:
             until(lambda: preview.exists() or process.poll() is not None)  # some passes are done
             assert process.poll() is None, process.communicate()
-            leader = leader_of_workers(process)
-            if number == signal.SIGINT:
-                process.send_signal(number)
-            else:
-                os.killpg(leader, number)
+            children = psutil.Process(process.pid).children()
+            leader = next(child.pid for child in children if os.getpgid(child.pid) == child.pid)
+            assert len(group(leader)) >= 2  # the scheduler's process, and a worker's
+            for status in (Path(f"/proc/{pid}/status") for pid in group(leader)):
+                blocked = status.read_text().partition("SigBlk:")[2].split() if status.exists() else ["0"]
+                assert not int(blocked[0], 16) >> (signal.SIGTERM - 1) & 1
+            process.send_signal(number) if victim == "render" else os.killpg(leader, number)
             _, err = process.communicate(timeout=60)
         finally:
             process.kill()
-    until(lambda: ended(leader))
-    assert process.returncode == (130 if number == signal.SIGINT else 2)
-    if number == signal.SIGKILL:
+    until(lambda: not group(leader), 15)
+    assert process.returncode == {"cluster": 2, "render": 130 if number == signal.SIGINT else -number}[victim]
+    if victim == "cluster":
         assert err.count("\n") == 1 and "the Dask scheduler has ended or cancelled the tasks; run the same" in err
+    if process.returncode == -signal.SIGKILL:
+        return
     with np.load(checkpoint) as file:
         done = json.loads(bytes(file["header"]))["passes"]
     code, _, err = render("--spp", done + 3, "--pass-spp", 1)
@@ -161,13 +150,21 @@ def scheduler(tmp_path_factory):
         yield json.loads(file.read_text())["address"]
 
 
-def test_the_bits_by_tls_are_those_of_a_render_here(render, scheduler, scene):
+def test_the_bits_by_tls_are_those_of_a_render_here(render, scheduler, scene, monkeypatch):
+    """Also of workers with another libLLVM, which are refused unless mixed workers are accepted."""
     assert scheduler.startswith("tls://")
     passes = ("--spp", 20, "--pass-spp", 1)
+    assert render(*passes, output="here.exr")[0] == 0
+    expected = read_exr(scene.with_name("here.exr"))[0]
+    own = on_worker.facts
     with dask.config.set(tls_settings(OWN)):
-        assert render("--scheduler", scheduler, *passes)[0] == render(*passes, output="here.exr")[0] == 0
-    found, expected = (read_exr(scene.with_name(name))[0] for name in ("out.exr", "here.exr"))
-    np.testing.assert_array_equal(found, expected)
+        assert render("--scheduler", scheduler, *passes)[0] == 0
+        np.testing.assert_array_equal(read_exr(scene.with_name("out.exr"))[0], expected)
+        monkeypatch.setattr(on_worker, "facts", lambda variant: own(variant) | {on_worker.LLVM: "99.0"})
+        code, _, err = render("--scheduler", scheduler, *passes, "--restart")
+        assert code == 2 and "is refused: libLLVM unknown, here 99.0" in err
+        assert render("--scheduler", scheduler, *passes, "--mixed-workers", "--restart")[0] == 0
+    np.testing.assert_array_equal(read_exr(scene.with_name("out.exr"))[0], expected)
 
 
 @pytest.mark.parametrize("security, protocol", [(MIXED, "tls"), (DOUBTING, "tls"), (Security(), "tls"), (OWN, "tcp")])

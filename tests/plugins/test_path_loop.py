@@ -8,10 +8,9 @@ import math
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.glass_scenes import GLASS
+from support.glass_scenes import GLASS, PLACE
 
-from mi_refract.plugins import path_loop, sampling
-from mi_refract.rendering.scene_files import REPRODUCIBLE
+from mi_refract.plugins import path_loop
 
 pytestmark = pytest.mark.usefixtures("scalar_variant")
 
@@ -20,16 +19,22 @@ ALBEDO, RADIANCE = 0.5, 3.0
 
 
 class Given:
-    """Random numbers: at each vertex the next of `points`, whose x chooses the lobe; 1/2 for all else."""
+    """Random numbers: at each vertex the next of `points`, whose x chooses the lobe; 1/2 for all else.
+
+    Keeps the keys of the numbers that choose lobes, as unsigned numbers have them elsewhere.
+    """
 
     def __init__(self, *points):
-        self.points = [*points]
+        self.points, self.keys = [*points], []
 
     def next(self):
         return self.points.pop(0) if self.points else UPWARD
 
     def next_1d(self, sampler, key):
-        return self.next()[0] if key % 4 == 1 else 0.5
+        if key % 4 != 1:
+            return 0.5
+        self.keys.append(key % 2**32)
+        return self.next()[0]
 
     def next_2d(self, sampler, key):
         return mi.Point2f(*self.next()) if key % 4 == 2 else mi.Point2f(0.5)
@@ -37,7 +42,7 @@ class Given:
 
 def sheet(z, size=10.0, x=0.0, turn=0, **parts):
     """A square across the z axis, which faces upward."""
-    place = mi.ScalarTransform4f().translate([x, 0, z]).rotate([1, 0, 0], turn).scale(size)
+    place = PLACE().translate([x, 0, z]).rotate([1, 0, 0], turn).scale(size)
     return {"type": "rectangle", "to_world": place} | parts
 
 
@@ -93,22 +98,9 @@ def test_a_popped_branch_splits_again_where_its_share_is_large_enough(weight, sp
     assert found == pytest.approx(expected, rel=1e-5)
 
 
-class Recorded(Given):
-    """Keeps the keys of the numbers that choose lobes."""
-
-    def __init__(self):
-        super().__init__()
-        self.keys = []
-
-    def next_1d(self, sampler, key):
-        if key % 4 == 1:
-            self.keys.append(key % 2**32)  # as unsigned numbers have it elsewhere
-        return super().next_1d(sampler, key)
-
-
 def test_no_two_vertices_of_branches_have_the_same_random_number():
     """Four sheets of glass, of which each splits, two of them on either side."""
-    numbers, parts = Recorded(), {f"sheet {z}": sheet(z, bsdf=GLASS) for z in range(4)}
+    numbers, parts = Given(), {f"sheet {z}": sheet(z, bsdf=GLASS) for z in range(4)}
     follow(parts, numbers, (0, 0, 1.5), split_depth=4, split_weight=1e-3, max_depth=7)
     assert len(numbers.keys) > 10
     assert len(set(numbers.keys)) == len(numbers.keys)
@@ -151,32 +143,6 @@ def test_a_pixel_is_transparent_where_light_goes_straight_through(bsdf, point, a
 def test_samples_are_weighted_by_their_densities(a, b, weight):
     """An infinite density has no weight, as in Mitsuba's `path`."""
     assert path_loop.power_heuristic(float(a), float(b)) == pytest.approx(weight)
-
-
-@pytest.mark.parametrize("weights", [(1.0,), (1.0, 3.0), (0.0, 2.0, 2.0)])
-def test_lamps_are_sampled_as_if_there_were_no_sky(weights):
-    """By their weights: as Mitsuba samples the same lamps without the sky."""
-    lamps = {
-        f"lamp{i}": lamp(2, 3.0 * i) | {"emitter": {"type": "area", "radiance": 1.0 + i, "sampling_weight": weight}}
-        for i, weight in enumerate(weights)
-    }
-    skies = {}, {"sky": {"type": "constant"}}
-    # Mitsuba orders merged meshes by address: of two scenes, the lamps would not always be in the same order.
-    dark, lit = (mi.load_dict({"type": "scene"} | lamps | sky, **REPRODUCIBLE) for sky in skies)
-    ours = sampling.NonConstantEmitters(mi.scalar_rgb, lit)
-    si = dark.ray_intersect(mi.Ray3f([0.1, 0, -2], [0, 0, 1]))
-    si.p = mi.Point3f(0.1, 0.2, -1)
-    for x in (0.1, 0.3, 0.6, 0.9):
-        (found, radiance), (expected, light) = (
-            each(si, mi.Point2f(x, 0.4), True)
-            for each in (ours.sample, lambda *given: dark.sample_emitter_direction(*given[:2], False, True))
-        )
-        assert np.allclose(found.p, expected.p, atol=1e-5)
-        assert (found.pdf, list(radiance)) == (pytest.approx(expected.pdf), pytest.approx(list(light)))
-        assert ours.pdf(si, found, True) == pytest.approx(found.pdf)
-        assert ours.pdf(si, found, False) == 0
-    sky = lit.environment().sample_direction(si, mi.Point2f(0.1, 0.2), True)[0]
-    assert sky.pdf > 0 and ours.pdf(si, sky, True) == 0
 
 
 @pytest.mark.parametrize(("max_depth", "lit"), [(-1, True), (800, False), (900, True)])

@@ -111,11 +111,11 @@ def test_the_names_are_mitsubas():
     assert not any("/" in name or not name for name in scene_parser.known_plugins())
 
 
-@pytest.mark.parametrize("path", sorted(SCENES.glob("*.xml")), ids=lambda path: path.stem)
-def test_our_scenes_pass(path):
-    parsed = scene_parser.parse(path)
-    assert {node.props.plugin_name() for node in parsed.state.nodes} <= scene_parser.known_plugins()
-    assert parsed.xml == (path,) and all(file.is_file() for file in parsed.files().values())
+def test_our_scenes_pass():
+    for path in SCENES.glob("*.xml"):
+        parsed = scene_parser.parse(path)
+        assert {node.props.plugin_name() for node in parsed.state.nodes} <= scene_parser.known_plugins()
+        assert parsed.xml == (path,) and all(file.is_file() for file in parsed.files().values())
 
 
 def test_the_search_path_is_as_before(load):
@@ -176,17 +176,18 @@ def test_an_image_is_refused_by_its_header(element, load, tmp_path):
     scene = f'{SENSOR}<{element}><string name="filename" value="sky.exr"/></{element.split()[0]}>'
     (tmp_path / "sky.exr").write_bytes(good)
     load(scene)
-    place = good.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4 + 8
-    wide = good[:place] + (2**23).to_bytes(4, "little") + good[place + 4 :]
-    place = good.index(b"channels\0chlist\0") + len(b"channels\0chlist\0")
-    long = good[:place] + (2**29).to_bytes(4, "little") + good[place + 4 :]
-    place = good.index(b"dataWindow\0")
+    window, channels = b"dataWindow\0box2i\0", b"channels\0chlist\0"
+
+    def patched(after, offset, number):
+        place = good.index(after) + len(after) + offset
+        return good[:place] + number.to_bytes(4, "little") + good[place + 4 :]
+
+    place = good.index(window)
     cut = good[:place] + b"x\0string\0" + (2**30).to_bytes(4, "little") + good[place:]
-    large = wide.replace((2**23).to_bytes(4, "little"), (2**19).to_bytes(4, "little"))
     for content, message in (
-        (wide, "resolution"),
-        (long, "corrupt"),
-        (large, "expected up to 21116"),
+        (patched(window, 12, 2**23), "resolution"),
+        (patched(channels, 0, 2**29), "corrupt"),
+        (patched(window, 12, 2**19), "expected up to 21116"),
         (cut, "corrupt"),
     ):
         (tmp_path / "sky.exr").write_bytes(content)

@@ -13,7 +13,7 @@ from typing import Any
 
 from support.processes import ENVIRONMENT
 
-from mi_refract.cluster.worker_facts import facts
+from mi_refract.cluster.on_worker import facts
 from mi_refract.cluster.workers import Workers
 
 

@@ -66,7 +66,7 @@ def _sampling(change: Callable[..., tuple[Any, Any]]) -> Make:
     """`change(sample, ctx, si, sample1, sample2, active)`, `sample` being the plugin's own."""
 
     def make(props: Any, plugin: type) -> Any:
-        class Spoilt(plugin):
+        class Spoilt(plugin):  # type: ignore[misc]
             def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
                 return change(super().sample, ctx, si, sample1, sample2, active)
 

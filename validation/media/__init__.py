@@ -4,4 +4,4 @@ In: the makers' catalogues of glass, closed forms, the certified oracle, and ren
 integrator. Out: rows with errors of indices, of directions and of images, each beside its bound.
 """
 
-__all__ = ["catalogs", "closed_forms", "hero_wavelength", "ray_directions", "renders"]
+__all__ = ["catalogs", "closed_forms", "ray_directions", "renders"]

@@ -8,9 +8,10 @@ decimal: the row says of how many glasses, and by how much. V_d is compared with
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from importlib.util import find_spec
 from typing import Any
+
+import numpy as np
 
 from mi_refract import media
 from mi_refract.media import LINES, glass_catalogs
@@ -29,57 +30,47 @@ TERMS = {
 }
 
 
-def _rows(context: Context) -> list[Row]:
+def rows(context: Context) -> list[Row]:
+    """One per catalogue."""
     absent = [name for name in ("opticalglass", "pandas") if find_spec(name) is None]
     if absent:
         reason = f"{absent[0]} is not installed: pip install 'mi-refract[glass]'"
         return [Row(STUDY.name, "catalogues", "printed lines", "", reason=reason)]
-    return [_row(catalog) for catalog in glass_catalogs.CATALOGS]
+    return [catalog_row(catalog) for catalog in glass_catalogs.CATALOGS]
 
 
-def _row(catalog: str) -> Row:
-    glasses = {name: glass for name, glass in glass_catalogs.read(catalog).items() if glass.coefficients}
-    misses = {name: max(_misses(f"{catalog}:{name}", glass.printed), default=0.0) for name, glass in glasses.items()}
-    found = {
-        "glasses": len(glasses),
-        "formula error": max(_formula_errors(catalog, glasses)),
-        "largest miss": max(misses.values()),
-        "missing": sum(miss > PRINTED_INDEX for miss in misses.values()),
-        "V_d off": max(abs(_v_d(f"{catalog}:{name}") - glass.v_d) for name, glass in glasses.items()),
-    }
-    budgets = {"formula error": CATALOG_FORMULA}
-    if catalog in CONSISTENT:
-        budgets |= {"largest miss": PRINTED_INDEX}
-    worst = max(misses, key=lambda name: misses[name])
-    values = {name: float(x) for name, x in found.items()}
-    return Row(STUDY.name, catalog, "printed lines", "float64", values, budgets, replay={"glass": f"{catalog}:{worst}"})
-
-
-def _misses(glass: str, printed: dict[str, float]) -> Iterator[float]:
-    medium = media.parse(glass)
-    return (abs(medium.index(LINES[line]) - n) for line, n in printed.items())
-
-
-def _formula_errors(catalog: str, glasses: dict[str, Any]) -> Iterator[float]:
+def catalog_row(catalog: str) -> Row:
+    """Every glass that has a formula, at every line that is printed."""
     from opticalglass.glass import glass_catalog_factory
 
+    glasses = glass_catalogs.read(catalog)  # first: the package warns while it reads
     table: Any = glass_catalog_factory(catalog if catalog == "CDGM" else catalog.capitalize())
-    names = {str(name).strip(): name for name in table.df.index}
+    others, misses, errors, v_d = (
+        {str(name).strip(): name for name in table.df.index},
+        dict[str, float](),
+        list[float](),
+        list[float](),
+    )
     for name, glass in glasses.items():
-        medium, other = media.parse(f"{catalog}:{name}"), table.create_glass(names[name], catalog)
-        for line in glass.printed:
-            yield abs(medium.index(LINES[line]) / float(other.calc_rindex(LINES[line])) - 1)
+        if glass.coefficients:
+            medium, other = media.parse(f"{catalog}:{name}"), table.create_glass(others[name], catalog)
+            n: dict[str, Any] = {line: medium.index(LINES[line]) for line in {*glass.printed, *"dFC"}}
+            errors += [abs(n[line] / float(other.calc_rindex(LINES[line])) - 1) for line in glass.printed]
+            misses[name] = max((abs(n[line] - printed) for line, printed in glass.printed.items()), default=0.0)
+            v_d.append(abs((n["d"] - 1) / (n["F"] - n["C"]) - glass.v_d))
+    missing = sum(miss > PRINTED_INDEX for miss in misses.values())
+    values = {"glasses": len(misses), "formula error": np.max(errors), "largest miss": np.max([*misses.values()])}
+    values |= {"missing": missing, "V_d off": np.max(v_d)}
+    budgets = {"formula error": CATALOG_FORMULA}
+    budgets |= {"largest miss": PRINTED_INDEX} if catalog in CONSISTENT else {}
+    numbers, worst = {name: float(x) for name, x in values.items()}, max(misses, key=lambda name: misses[name])
+    replay = {"glass": f"{catalog}:{worst}"}
+    return Row(STUDY.name, catalog, "printed lines", "float64", numbers, budgets, replay=replay)
 
 
-def _v_d(glass: str) -> float:
-    n = {line: media.index(glass, LINES[line]) for line in "dFC"}
-    return float((n["d"] - 1) / (n["F"] - n["C"]))
+def tasks(context: Context) -> list[Task]:
+    """One."""
+    return [Task("catalogues of glass", lambda: rows(context))]
 
 
-STUDY = Study(
-    "media",
-    "Indices of glass catalogues",
-    about(__doc__),
-    TERMS,
-    lambda context: [Task("catalogues of glass", lambda: _rows(context))],
-)
+STUDY = Study("media", "Indices of glass catalogues", about(__doc__), TERMS, tasks)

@@ -33,6 +33,7 @@ NAME = "dispersive optics"
 FOLDER = SCENES / "planar"
 BOWS = (450.0, 520.0, 580.0, 650.0)  # nm
 HEIGHT, MARGIN = 1e-3, 10.0  # of the ray near the axis, and of one at the edge
+CURVATURES, THICKNESSES = (0.02154, -0.02322, -0.00199), (6.0, 2.5)  # of the achromat
 SPECTRAL = "llvm_ad_spectral"
 TERMS = {
     "error": "radians between the direction traced and the closed one, the largest of all wavelengths",
@@ -42,48 +43,72 @@ TERMS = {
 }
 
 
+def traced(scene: scene_file.PlanarScene, origin: Any, direction: Any) -> Branches:
+    """One ray, and what it splits into."""
+    o, d = np.array([origin], float), np.array([direction], float)
+    (branches,) = follow_scene(replace(scene, origins=o, directions=d, beams=np.zeros(1, int)))
+    return branches
+
+
+def angle(branches: Branches, turn: float, bits: int = 0) -> float:
+    """Radians from the path with these partial reflections to a direction, `turn` clockwise from the x axis."""
+    (number,) = np.flatnonzero(branches.reflect == bits)
+    (x, y), (a, b) = branches.paths.directions[number], (math.cos(turn), -math.sin(turn))
+    return abs(math.atan2(x * b - y * a, x * a + y * b))
+
+
+def crossing(branches: Branches) -> float:
+    """Where the ray crosses the axis."""
+    (x, y), (dx, dy) = branches.tips[0], branches.paths.directions[0]
+    return float(x - y * dx / dy)
+
+
 def prism_row() -> Row:
     """A ray for each line, at its own angle of minimum deviation: at 0 it goes along the base inside."""
     apex, errors = math.radians(60.0), []
     for line in "CdF":
         scene = scene_file.load(FOLDER / "spectrum.toml", [LINES[line]])
-        n = scene.regions[0].indices[0]
-        deviation = 2 * float(closed.least_deviated(apex, n)) - apex
-        along = np.array([math.cos(deviation / 2), math.sin(deviation / 2)])
+        half = float(closed.least_deviated(apex, scene.regions[0].indices[0])) - apex / 2
+        along = np.array([math.cos(half), math.sin(half)])
         face = np.array([-15.0, 34.64101615137755 * 2 / 3 - 15.0 * math.sqrt(3)])  # on the left face
-        traced = _traced(scene, [face - 20 * along], [along])
-        errors.append(_angle(traced, np.array([along[0], -along[1]])))
+        errors.append(angle(traced(scene, face - 20 * along, along), half))
     return Row(NAME, "prism", "minimum deviation", "float64", {"error": max(errors)}, {"error": PRISM_ANGLE})
 
 
 def bow_row(reflections: int) -> Row:
     """A ray for each wavelength, at the height from which the bow comes."""
-    errors = []
+    case, bits, errors = *{1: ("primary bow", 2), 2: ("secondary bow", 6)}[reflections], []
     for wavelength in BOWS:
         scene = scene_file.load(FOLDER / "double_rainbow.toml", [wavelength])
         n = media.index("MATERIAL:water", wavelength) / media.LABORATORY_AIR.index(wavelength)
         incidence = closed.rainbow_incidence(n, reflections)
         turn = float(closed.deflection(incidence, n, reflections))  # clockwise, of a ray above the axis
-        traced = _traced(scene, [[-16.0, math.sin(incidence)]], [[1.0, 0.0]])
-        bits = {1: 2, 2: 6}[reflections]
-        errors.append(_angle(traced, np.array([math.cos(turn), -math.sin(turn)]), bits))
-    case = {1: "primary bow", 2: "secondary bow"}[reflections]
+        errors.append(angle(traced(scene, [-16.0, math.sin(incidence)], [1.0, 0.0]), turn, bits))
     return Row(NAME, "drop", case, "float64", {"error": max(errors)}, {"error": BOW_ANGLE})
 
 
 def achromat_row() -> Row:
     """A ray HEIGHT above the axis, against the paraxial back focal distance."""
-    scene = scene_file.load(FOLDER / "achromat.toml")
-    errors, focal = [], {}
+    scene, errors, focal = scene_file.load(FOLDER / "achromat.toml"), [], {}
     for i, wavelength in enumerate(scene.light.wavelengths):
         n = [region.indices[i] for region in scene.regions]
-        expected = 8.5 + _back_focal_distance((0.02154, -0.02322, -0.00199), (1.0, *n, 1.0), (6.0, 2.5))
-        traced = _traced(replace(scene, segments=scene.segments[i : i + 1]), [[-20.0, HEIGHT]], [[1.0, 0.0]])
-        focal[wavelength] = _axis(traced)
+        expected = 8.5 + back_focal_distance(CURVATURES, (1.0, *n, 1.0), THICKNESSES)
+        one = replace(scene, segments=scene.segments[i : i + 1])
+        focal[wavelength] = crossing(traced(one, [-20.0, HEIGHT], [1.0, 0.0]))
         errors.append(abs(focal[wavelength] / expected - 1))
     values = {"distance": max(errors), f"at {LINES['d']:g} nm": focal[LINES["d"]]}
     values |= {f"shift at {w:g} nm": x - focal[LINES["d"]] for w, x in focal.items() if w != LINES["d"]}
     return Row(NAME, "achromat", "focal distance", "float64", values, {"distance": FOCAL_DISTANCE})
+
+
+def back_focal_distance(curvatures: Sequence[float], n: Sequence[float], thickness: Sequence[float]) -> float:
+    """From the last surface: a ray at height 1 along the axis, refracted by n' u' = n u − y c (n' − n)."""
+    y, u = 1.0, 0.0
+    for i, c in enumerate(curvatures):
+        u = (n[i] * u - y * c * (n[i + 1] - n[i])) / n[i + 1]
+        if i < len(thickness):
+            y += thickness[i] * u
+    return -y / u
 
 
 def mitsuba_row(context: Context) -> Row:
@@ -95,15 +120,12 @@ def mitsuba_row(context: Context) -> Row:
     if reason := context.variants.get(SPECTRAL, "not in this wheel"):
         return Row(NAME, "achromat", case, SPECTRAL, reason=reason)
     plane = scene_file.load(FOLDER / "achromat.toml")
-    expected = [
-        _axis(_traced(replace(plane, segments=(segments,)), [[-20.0, MARGIN]], [[1.0, 0.0]]))
-        for segments in plane.segments
-    ]
+    each = [replace(plane, segments=(segments,)) for segments in plane.segments]
+    expected = [crossing(traced(one, [-20.0, MARGIN], [1.0, 0.0])) for one in each]
     table = tomllib.loads((FOLDER / "achromat.toml").read_text())
-    glasses = [1.0, *(shape["n"] for shape in table["shape"]), 1.0]
+    glasses, parts = [1.0, *(shape["n"] for shape in table["shape"]), 1.0], {}
     with under(SPECTRAL):
-        parts = {}
-        for i, (curvature, vertex) in enumerate(zip((0.02154, -0.02322, -0.00199), (0.0, 6.0, 8.5), strict=True)):
+        for i, (curvature, vertex) in enumerate(zip(CURVATURES, (0.0, 6.0, 8.5), strict=True)):
             sides = glasses[i : i + 2] if curvature < 0 else glasses[i : i + 2][::-1]
             bsdf = {"type": "refract", "int_ior": sides[0], "ext_ior": sides[1]}
             centre = [vertex + 1 / curvature, 0.0, 0.0]
@@ -111,52 +133,21 @@ def mitsuba_row(context: Context) -> Row:
         scene: Any = mi.load_dict({"type": "scene"} | parts)
         asked = followed_context()
         asked.component = 1
-        wavelengths = mi.Float(plane.light.wavelengths)
         ray: Any = mi.Ray3f(mi.Point3f(-20.0, MARGIN, 0), mi.Vector3f(1, 0, 0))
-        ray.wavelengths = type(ray.wavelengths)(wavelengths)
+        ray.wavelengths = type(ray.wavelengths)(mi.Float(plane.light.wavelengths))
         for _ in parts:
             si = scene.ray_intersect(ray)
             bs, _ = si.bsdf().sample(asked, si, 0.5, [0.5, 0.5])
             ray = si.spawn_ray(si.to_world(bs.wo))
         dr.eval(ray)
-        found = np.array(si.p.x - si.p.y * ray.d.x / ray.d.y, float)
-    off = np.abs(found - expected)
+        off = np.abs(np.array(si.p.x - si.p.y * ray.d.x / ray.d.y, float) - expected)
     values = {"off": float(off.max()), "off / chromatic shift": float(off.max() / np.ptp(expected))}
     return Row(NAME, "achromat", case, SPECTRAL, values, replay={"height": MARGIN})
 
 
-def _axis(traced: Branches) -> float:
-    """Where the ray crosses the axis."""
-    (x, y), (dx, dy) = traced.tips[0], traced.paths.directions[0]
-    return float(x - y * dx / dy)
+def tasks(context: Context) -> list[Task]:
+    """One."""
+    return [Task(NAME, lambda: [prism_row(), bow_row(1), bow_row(2), achromat_row(), mitsuba_row(context)])]
 
 
-def _back_focal_distance(curvatures: Sequence[float], n: Sequence[float], thickness: Sequence[float]) -> float:
-    """From the last surface: a ray at height 1 along the axis, refracted by n' u' = n u − y c (n' − n)."""
-    y, u = 1.0, 0.0
-    for i, c in enumerate(curvatures):
-        u = (n[i] * u - y * c * (n[i + 1] - n[i])) / n[i + 1]
-        if i < len(thickness):
-            y += thickness[i] * u
-    return -y / u
-
-
-def _traced(scene: scene_file.PlanarScene, origins: object, directions: object) -> Branches:
-    o, d = np.array(origins, float), np.array(directions, float)
-    asked = replace(scene, origins=o, directions=d, beams=np.zeros(len(o), int))
-    (found,) = follow_scene(asked)
-    return found
-
-
-def _angle(traced: Branches, expected: np.ndarray, bits: int = 0) -> float:
-    """Radians from the direction of the path with these partial reflections to `expected`."""
-    (number,) = np.flatnonzero(traced.reflect == bits)
-    x, y = traced.paths.directions[number]
-    return abs(math.atan2(x * expected[1] - y * expected[0], x * expected[0] + y * expected[1]))
-
-
-def _rows(context: Context) -> list[Row]:
-    return [prism_row(), bow_row(1), bow_row(2), achromat_row(), mitsuba_row(context)]
-
-
-STUDY = Study(NAME, "Dispersive optics", about(__doc__), TERMS, lambda context: [Task(NAME, lambda: _rows(context))])
+STUDY = Study(NAME, "Dispersive optics", about(__doc__), TERMS, tasks)

@@ -53,96 +53,88 @@ TERMS = {
 }
 
 
+SUBJECTS = {N_SF11: "sellmeier(…), N-SF11", MATERIALS[3]: "table(…)"}  # of texts that are long
+
+
 def tasks(context: Context) -> list[Task]:
     """One per material."""
-    return [Task(f"{NAME}: {spec}", functools.partial(_rows, context, spec)) for spec in MATERIALS]
+    return [Task(f"{NAME}: {spec}", functools.partial(rows, context, spec)) for spec in MATERIALS]
 
 
-def _rows(context: Context, spec: str) -> list[Row]:
+def rows(context: Context, spec: str) -> list[Row]:
+    """Of the index, of the BSDF, and of a formula in each setting with float64."""
+    row = functools.partial(Row, NAME, SUBJECTS.get(spec, spec))
     if spec.startswith("SCHOTT") and not CATALOGUES:
-        reason = "opticalglass is not installed: pip install 'mi-refract[glass]'"
-        return [Row(NAME, _subject(spec), "all", "", reason=reason)]
+        return [row("all", "", reason="opticalglass is not installed: pip install 'mi-refract[glass]'")]
     medium, count = media.parse(spec), context.profile.rays
-    rows = [_index_row(medium, spec)]
     missing = context.variants.get(SPECTRAL, "not in this wheel")
-    rows.append(
-        Row(NAME, _subject(spec), "refract", SPECTRAL, reason=missing) if missing else _sampled_row(medium, spec, count)
-    )
+    table = [index_row(medium, spec)]
+    table.append(row("refract", SPECTRAL, reason=missing) if missing else sampled_row(medium, spec, count))
+    setting: Any
     for setting in settings(context):
         if setting.label.endswith("float64") and setting.vector is not None:
-            rows.append(_formula_row(medium, spec, setting, count if not setting.is_scalar else 100))
-    return rows
+            rays = Drawn(medium, 100 if setting.is_scalar else count)
+            name, formula = "compensated", FORMULAS["compensated"]
+            values = judged(*evaluate(formula, rays.rays, setting.vector), rays.rays, name, 2.0**-53)
+            table.append(row(name, setting.label, values, dict(BUDGETS), replay=rays.replay | {"medium": spec}))
+    return table
 
 
-def _subject(spec: str) -> str:
-    """The material's text, or its name where that is long."""
-    return {N_SF11: "sellmeier(…), N-SF11", MATERIALS[3]: "table(…)"}.get(spec, spec)
+class Drawn:
+    """Rays of a medium at random wavelengths in nm: unit wi (count, 3), from both sides; exactly float32 both."""
+
+    def __init__(self, medium: Medium, count: int) -> None:
+        """`rays`: the same, with k = n_from/n_to in float64."""
+        rng = np.random.default_rng(seeds.current(SEED))
+        wi = rng.normal(size=(count, 3))
+        self.wi = (wi / np.linalg.norm(wi, axis=1, keepdims=True)).astype(np.float32).astype(float)
+        low, high = max(medium.valid[0], 360.0), min(medium.valid[1], 830.0)
+        self.wavelengths = rng.uniform(low + 0.01, high - 0.01, count).astype(np.float32).astype(float)
+        eta = medium.index(self.wavelengths)
+        k = np.where(self.wi[:, 2] >= 0, 1 / eta, eta)
+        self.rays = Rays(-self.wi, np.tile([0.0, 0.0, 1.0], (count, 1)), k)
+        self.replay = {"seed": seeds.current(SEED), "rays": count}
 
 
-def _drawn(medium: Medium, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit wi (count, 3), from both sides, wavelengths in nm, exactly float32 both, and k = n_from/n_to in float64."""
-    rng = np.random.default_rng(seeds.current(SEED))
-    wi = rng.normal(size=(count, 3))
-    wi = (wi / np.linalg.norm(wi, axis=1, keepdims=True)).astype(np.float32).astype(float)
-    low, high = max(medium.valid[0], 360.0), min(medium.valid[1], 830.0)
-    wavelengths = rng.uniform(low + 0.01, high - 0.01, count).astype(np.float32).astype(float)
-    eta = medium.index(wavelengths)
-    return wi, wavelengths, np.where(wi[:, 2] >= 0, 1 / eta, eta)
-
-
-def _judged(b: np.ndarray, transmitted: np.ndarray, rays: Rays, formula: str, u: float) -> dict[str, float]:
+def judged(b: np.ndarray, transmitted: np.ndarray, rays: Rays, formula: str, u: float) -> dict[str, float]:
+    """The values of a row."""
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-    found = judge(b, transmitted, RayBounds(rays, exact, FORMULAS[formula].budget, u), exact.transmitted)
-    compared = found.compared & exact.transmitted
-    return {"worst / u": float(found.chord[compared].max() / u)} | found.values()
+    verdict = judge(b, transmitted, RayBounds(rays, exact, FORMULAS[formula].budget, u), exact.transmitted)
+    compared = verdict.compared & exact.transmitted
+    return {"worst / u": float(verdict.chord[compared].max() / u)} | verdict.values()
 
 
-def _sampled_row(medium: Medium, spec: str, count: int) -> Row:
+def sampled_row(medium: Medium, spec: str, count: int) -> Row:
+    """`refract` as `refract_path` samples it, in float32."""
     import mitsuba as mi
 
-    wi, wavelengths, k = _drawn(medium, count)
+    drawn = Drawn(medium, count)
     with under(SPECTRAL):
         bsdf = mi.load_dict({"type": "refract", "int_ior": spec, "ext_ior": 1.0})
         asked = followed_context()
         asked.component = 1
         si = dr.zeros(mi.SurfaceInteraction3f)
-        si.wi = mi.Vector3f(wi.T.astype(np.float32))
-        si.wavelengths = type(si.wavelengths)(mi.Float(wavelengths.astype(np.float32)))
+        si.wi = mi.Vector3f(drawn.wi.T.astype(np.float32))
+        si.wavelengths = type(si.wavelengths)(mi.Float(drawn.wavelengths.astype(np.float32)))
         bs, weight = bsdf.sample(asked, si, 0.5, [0.5, 0.5])
-        b, transmitted = np.array(bs.wo, float).T, np.array(weight, float)[0] > 0
+        b, transmitted = np.array(bs.wo, float).T.astype(np.longdouble), np.array(weight, float)[0] > 0
         formula, _ = resolve("auto", dr.backend_v(mi.Float))
-    rays = Rays(-wi, np.tile([0.0, 0.0, 1.0], (count, 1)), k)
-    rounding = (k.astype(np.float32).astype(float) - k)[:, None] * -wi * [1, 1, 0]
-    values = _judged(b.astype(np.longdouble) - rounding, transmitted, rays, formula, 2.0**-24)
-    whole = _judged(b.astype(np.longdouble), transmitted, rays, formula, 2.0**-24)
-    values["with the ratio in float32"] = whole["worst / u"]
-    replay = {"seed": seeds.current(SEED), "rays": count, "int_ior": spec}
-    return Row(NAME, _subject(spec), "refract", SPECTRAL, values, dict(BUDGETS), replay=replay)
+    k = drawn.rays.k
+    rounding = (k.astype(np.float32).astype(float) - k)[:, None] * drawn.rays.a * [1, 1, 0]
+    values = judged(b - rounding, transmitted, drawn.rays, formula, 2.0**-24)
+    values["with the ratio in float32"] = judged(b, transmitted, drawn.rays, formula, 2.0**-24)["worst / u"]
+    replay = drawn.replay | {"int_ior": spec}
+    return Row(NAME, SUBJECTS.get(spec, spec), "refract", SPECTRAL, values, dict(BUDGETS), replay=replay)
 
 
-def _formula_row(medium: Medium, spec: str, setting: Any, count: int) -> Row:
-    wi, _, k = _drawn(medium, count)
-    rays = Rays(-wi, np.tile([0.0, 0.0, 1.0], (count, 1)), k)
-    name, formula = resolve("compensated", setting.backend)
-    values = _judged(*evaluate(formula, rays, setting.vector), rays, name, 2.0**-53)
-    replay = {"seed": seeds.current(SEED), "rays": count, "medium": spec}
-    return Row(NAME, _subject(spec), name, setting.label, values, dict(BUDGETS), replay=replay)
-
-
-# The index ------------------------------------------------------------------------------------------------------
-
-
-def _index_row(medium: Medium, spec: str) -> Row:
-    _, wavelengths, _ = _drawn(medium, 200)
-    errors = [abs(float(exact_index(medium, w) / _ball(medium.index(w)) - 1)) for w in wavelengths.tolist()]
-    values = {"index error / u": max(errors) / 2.0**-53}
-    return Row(NAME, _subject(spec), "index", "float64", values, {"index error / u": INDEX_ROUNDING})
-
-
-def _ball(x: float) -> Any:
+def index_row(medium: Medium, spec: str) -> Row:
+    """The formula of dispersion against the same one in ball arithmetic."""
     from flint import arb
 
-    return arb(x)
+    wavelengths = Drawn(medium, 200).wavelengths.tolist()
+    errors = [abs(float(exact_index(medium, w) / arb(medium.index(w)) - 1)) for w in wavelengths]
+    values = {"index error / u": max(errors) / 2.0**-53}
+    return Row(NAME, SUBJECTS.get(spec, spec), "index", "float64", values, {"index error / u": INDEX_ROUNDING})
 
 
 def exact_index(medium: Medium, wavelength: float) -> Any:

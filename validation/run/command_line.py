@@ -7,7 +7,7 @@ import sys
 
 import typer
 
-from mi_refract.io import exit_code as exits
+from mi_refract.io import errors
 from mi_refract.io.sanitise import printable
 
 
@@ -19,7 +19,7 @@ def application() -> typer.Typer:
 def exit_code(app: typer.Typer, name: str, arguments: list[str]) -> int:
     """Run the command; its exit code, 2 after an error, 130 after an interruption."""
     run = functools.partial(app, arguments, prog_name=f"python -m {name}", standalone_mode=False)
-    return exits.exit_code(name, run, (KeyboardInterrupt, typer.Abort))
+    return errors.exit_code(name, run, (KeyboardInterrupt, typer.Abort))
 
 
 def misuse(name: str, message: str) -> int:

@@ -1,0 +1,299 @@
+"""Local clusters, their workers and calls on them: who is accepted, what is lost, and what an error says."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import dask
+import pytest
+from distributed import CancelledError
+from distributed.comm import CommClosedError, connect
+from support.dask_workers import accepted, kill, tls_settings, until
+from support.processes import ENVIRONMENT, python
+
+from mi_refract.cluster import on_worker
+from mi_refract.cluster import workers as workers_module
+from mi_refract.cluster.connection import cluster_errors, connected
+from mi_refract.cluster.on_worker import HOST, LLVM, MIXED, UNUSABLE, WIDTH, differences, machine
+from mi_refract.cluster.workers import AHEAD, Workers, fetched, results
+from mi_refract.io.errors import LostSchedulerError, NoWorkersError
+
+VARIANT = "scalar_rgb"
+HERE = {"mitsuba": "3.9.1", LLVM: "19.1", WIDTH: "8", UNUSABLE: "", HOST: "here"}
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory):
+    """Two workers; the modules of the folder that they are started from must not be taken for those that they need."""
+    folder, before = tmp_path_factory.mktemp("start"), Path.cwd()
+    for name in ("dask", "distributed", "mi_refract", "pickle"):
+        (folder / f"{name}.py").write_text("raise SystemExit")
+    os.chdir(folder)
+    try:
+        with connected(workers=2) as client:
+            os.chdir(before)
+            yield client
+    finally:
+        os.chdir(before)
+
+
+# Connections ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"scheduler": "tcp://h:1", "workers": 1}, "expected either --scheduler ADDRESS or --workers N"),
+        ({"workers": 0}, "--workers 0; expected a whole number from 1 to 1024"),
+        ({"scheduler": "tls://h:1"}, "and the files of `distributed.comm.tls` in Dask's configuration"),
+        ({"workers": 1}, "--workers 1: the local cluster did not start: ended with status 1; try fewer workers"),
+    ],
+)
+def test_misuse(options, message, monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with pytest.raises((ConnectionError, ValueError)) as caught, connected(**options):
+        pass
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_connection_that_is_not_encrypted_is_refused(client):
+    """Of local workers, and where the scheduler speaks TLS: Dask would take a worker's results over any connection."""
+
+    def refuses(client):
+        with pytest.raises(RuntimeError, match="encryption required"):
+            client.sync(connect, "tcp://127.0.0.1:9", **client.connection_args)
+
+    refuses(client)
+    assert client.run_on_scheduler(lambda dask_scheduler: dask_scheduler.security.require_encryption)
+    with dask.config.set(tls_settings(client.security)), connected(client.scheduler.address) as other:
+        refuses(other)
+
+
+LOST = "tcp://h:1: the Dask scheduler has ended or cancelled the tasks; run the same command again to resume"
+
+
+@pytest.mark.parametrize(
+    "status, then, raised, message",
+    [
+        ("running", "running", CommClosedError("x"), LOST),
+        ("running", "running", CancelledError("x"), LOST),
+        ("closed", "closed", None, LOST),
+        ("running", "connecting", RuntimeError("cannot schedule"), LOST),
+        ("running", "running", OSError("of the scene"), "of the scene"),
+        ("running", "running", ValueError("of the scene"), "of the scene"),
+    ],
+)
+def test_a_lost_scheduler_is_one_line(status, then, raised, message):
+    client = SimpleNamespace(status=status, scheduler=SimpleNamespace(address="tcp://h:1"))
+    expected = LostSchedulerError if message == LOST else type(raised)
+    with pytest.raises(expected) as caught, cluster_errors(client):
+        client.status = then
+        raise raised
+    assert str(caught.value) == message
+
+
+def test_dask_is_not_imported_before_it_is_needed():
+    code = """import sys, mi_refract.cli.app, mi_refract.cli.render
+mi_refract.cli.app.main(["--help"])
+sys.exit(str([name for name in sys.modules if name.partition(".")[0] in ("dask", "distributed")]))"""
+    with python(code) as process:
+        assert process.communicate()[1].splitlines()[-1] == "[]"
+
+
+# Who is accepted ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "change, tolerated, different",
+    [
+        ({HOST: "there"}, (), []),
+        ({"mitsuba": "3.9.0"}, (), ["mitsuba 3.9.0, here 3.9.1"]),
+        ({"mitsuba": "3.9.0", WIDTH: "16"}, MIXED, ["mitsuba 3.9.0, here 3.9.1"]),
+        ({WIDTH: "16", LLVM: "18.1"}, (), ["libLLVM 18.1, here 19.1", "vector width 16, here 8"]),
+        ({WIDTH: "16", LLVM: "18.1"}, MIXED, []),
+        ({UNUSABLE: "llvm_ad_rgb: no libLLVM found", "mitsuba": "3"}, MIXED, ["llvm_ad_rgb: no libLLVM found"]),
+    ],
+)
+def test_what_differs(change, tolerated, different):
+    assert differences(HERE | change, HERE, tolerated) == different
+    assert differences({HOST: "there"}, {"drjit": "1.5.0"}) == ["drjit unknown, here 1.5.0"]
+
+
+def test_facts_of_this_process_and_the_name_of_a_machine(variant):
+    found = on_worker.facts(variant)
+    assert found[UNUSABLE] == "" and found[HOST] == os.uname().nodename and found["Python"].startswith("3.")
+    if variant.startswith("llvm"):
+        assert found[WIDTH] in ("4", "8", "16") and re.fullmatch(r"[\d.]+", found[LLVM])
+    assert machine(HERE | {HOST: "there"}, HERE) == "there"
+    assert machine(HERE | {HOST: "there", WIDTH: "16", LLVM: "18.1"}, HERE) == "there (libLLVM 18.1; vector width 16)"
+
+
+def test_the_version_has_a_digest_of_the_sources(tmp_path):
+    """Of names and contents: two installations of the same version may differ in a line."""
+    copy = tmp_path / "mi_refract"
+    shutil.copytree(Path(on_worker.__file__).parents[1], copy, ignore=shutil.ignore_patterns("__pycache__"))
+    environment = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
+    versions = []
+    for path, text in ((None, ""), (copy / "formulas" / "__init__.py", "# a comment"), (copy / "new.py", "")):
+        if path:
+            path.write_text(text + (path.read_text() if path.exists() else ""))
+        command = [sys.executable, "-c", "from mi_refract.cluster import on_worker; print(on_worker.our_version())"]
+        versions.append(subprocess.check_output(command, env=environment, cwd=tmp_path, text=True).strip())
+    assert versions[0] == on_worker.our_version() and len(set(versions)) == 3
+
+
+MODULE = "mi_refract.cluster.on_worker"
+
+
+@pytest.mark.parametrize(
+    "lie, honest_again, different",
+    [
+        (
+            f"import {MODULE} as w; own = w.facts; w.facts = lambda v: own(v) | {{'mitsuba': '3.0.0'}}",
+            f"import {MODULE} as w; w.facts = own",
+            f" on {os.uname().nodename} is refused: mitsuba 3.0.0, here ",
+        ),
+        (
+            f"import sys; own = sys.modules.pop('{MODULE}', None); sys.modules['{MODULE}'] = None",
+            f"import sys; sys.modules['{MODULE}'] = own",
+            f" is refused: ModuleNotFoundError: import of {MODULE} halted",
+        ),
+    ],
+    ids=["another version", "no package"],
+)
+def test_a_worker_that_differs_is_refused_by_name(client, lie, honest_again, different):
+    liar, honest = sorted(client.nthreads())
+    said = []
+    client.run(exec, f"import {MODULE}; global own\n{lie}", workers=[liar])
+    try:
+        found = accepted(client, VARIANT, warn=said.append)
+    finally:
+        client.run(exec, honest_again, workers=[liar])
+    assert (list(found.accepted), list(found.refused), said) == ([honest], [liar], [found.refused[liar]])
+    assert said[0].startswith(f"worker {liar}{different}") and "\n" not in said[0]
+    assert list(found.machines.values()) == [os.uname().nodename]
+
+
+def test_without_a_worker_it_ends_in_one_line(client, monkeypatch):
+    with pytest.raises(NoWorkersError) as caught:
+        Workers(client, VARIANT, on_worker.facts(VARIANT) | {"drjit": "9"}).wait()
+    text = str(caught.value)
+    assert "\n" not in text and text.count("is refused: drjit") == 2
+    assert "no worker that may work: worker tls://" in text
+    assert text.endswith("expected at least one with the software and hardware of this process")
+    monkeypatch.setattr(client, "nthreads", dict)
+    with pytest.raises(NoWorkersError, match="no worker that may render: no workers; expected"):
+        Workers(client, VARIANT, HERE, task="render").wait(nobody=0.1)
+
+
+def test_a_worker_whose_answer_is_lost_is_asked_again(client, monkeypatch):
+    lost = []
+    monkeypatch.setattr(
+        workers_module, "fetched", lambda client, future: fetched(client, future) if lost else lost.append(future) or ()
+    )
+    found = accepted(client, VARIANT)
+    until(lambda: found.look(at_once=True) or len(found.accepted) == 2)
+    assert lost and not found.refused
+
+
+# Calls ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def workers(client):
+    until(lambda: len(client.nthreads()) == 2)
+    return accepted(client, VARIANT)
+
+
+def process_of(seconds):
+    time.sleep(seconds)
+    return os.getpid()
+
+
+def half(x):
+    return 1 / (x - 3)
+
+
+def late():
+    raise TimeoutError("of the call")
+
+
+class Slow:
+    """Takes its time to be sent."""
+
+    def __reduce__(self):
+        time.sleep(3 * workers_module.BETWEEN_LOOKS / 4)
+        return Slow, ()
+
+
+def test_each_call_has_its_number_and_only_a_few_are_begun(workers):
+    begun = []
+
+    def calls():
+        for i in range(20):
+            begun.append(i)
+            yield (i + 10,)
+
+    found = results(workers, half, calls())
+    first = next(found)
+    assert len(begun) <= 2 * AHEAD + 1
+    values = {number: value for number, value, machine in [first, *found] if machine == os.uname().nodename}
+    assert values == {i: 1 / (i + 7) for i in range(20)}
+
+
+def test_an_error_of_a_call_is_its_own(workers):
+    """Also one that Dask raises, too."""
+    with pytest.raises(ZeroDivisionError, match="division by zero"):
+        list(results(workers, half, [(i,) for i in range(6)]))
+    with pytest.raises(TimeoutError, match="of the call"):
+        list(results(workers, late, [()]))
+    assert len(list(results(workers, half, [(1,)]))) == 1  # the workers are as before
+
+
+def test_who_is_refused_gets_no_call(workers):
+    refused = sorted(workers.accepted)[0]
+    workers.accepted.pop(refused)
+    workers.refused[refused] = "made up"
+    own = workers.client.run(os.getpid, workers=[refused])[refused]
+    found = list(results(workers, process_of, [(0.1,)] * 6))
+    assert len(found) == 6 and own not in [pid for _, pid, _ in found]
+
+
+def test_what_is_not_finished_is_cancelled(workers):
+    found = results(workers, process_of, [(0.0,), (30.0,), (30.0,), (30.0,)])
+    next(found)
+    found.close()
+    until(lambda: not any(workers.client.processing().values()), seconds=10)
+    for address in workers.accepted:  # which still sleep
+        kill(workers.client, address)
+    until(lambda: not {*workers.accepted} & {*workers.client.nthreads()})
+
+
+def test_a_slow_result_is_waited_for_and_a_lost_one_is_not(workers):
+    """Dask itself would wait until somebody has computed a lost one again: nobody does."""
+    client, address = workers.client, sorted(workers.accepted)[0]
+    slow, lost = (client.submit(make, workers=[address], pure=False) for make in (Slow, os.getpid))
+    until(lambda: slow.done() and lost.done())
+    assert isinstance(fetched(client, slow)[0], Slow)
+    kill(client, address)
+    began = time.monotonic()
+    assert fetched(client, lost) == () and time.monotonic() - began < 5
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_calls_of_lost_workers_are_made_again(workers, count):
+    """By another one, or where all have gone by those that come."""
+    found = results(workers, process_of, [(0.2,), (2.0,), (2.0,)])
+    next(found)
+    victims = sorted(workers.client.nthreads())[:count]
+    for address in victims:
+        kill(workers.client, address)
+    assert sorted(number for number, _, _ in found) == [1, 2]
+    until(lambda: workers.look(at_once=True) or not {*victims} & {*workers.accepted})

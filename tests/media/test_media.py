@@ -1,0 +1,307 @@
+"""Indices of materials: formulas against the same ones for single numbers, catalogues and materials against what was
+printed elsewhere, and the one line that a scene gets for anything else."""
+
+import math
+import sys
+from importlib.util import find_spec
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from mi_refract import media
+from mi_refract.media import LINES, glass_catalogs
+
+# N-BK7 by Schott: coefficients printed for micrometres.
+B = 1.03961212, 0.231792344, 1.01046945
+C = 0.00600069867, 0.0200179144, 103.560653
+SELLMEIER = f"sellmeier({B[0]}, {B[1]}, {B[2]}, {C[0] * 1e6}, {C[1] * 1e6}, {C[2] * 1e6})"
+RESONANCES = f"sellmeier_nm({B[0]}, {B[1]}, {B[2]}, {', '.join(repr(1e3 * math.sqrt(c)) for c in C)})"
+TABLE = "table(400: 1.53, 500: 1.52, 900: 1.5)"
+
+
+def bk7(w):
+    square = (w / 1000) ** 2
+    return math.sqrt(1 + sum(b * square / (square - c) for b, c in zip(B, C, strict=True)))
+
+
+def abbe(w):
+    return 1.5168 + 0.5168 / 64.17 * (w**-2 - LINES["d"] ** -2) / (LINES["F"] ** -2 - LINES["C"] ** -2)
+
+
+CLOSED = {
+    "1.5": lambda w: 1.5,
+    "cauchy(1.458, 3540, 1e7)": lambda w: 1.458 + 3540 / w**2 + 1e7 / w**4,
+    SELLMEIER: bk7,
+    RESONANCES: bk7,
+    "abbe(1.5168, 64.17)": abbe,
+    TABLE: lambda w: float(np.interp(w, [400, 500, 900], [1.53, 1.52, 1.5])),
+}
+
+
+def medium(spec):
+    return media.parse(float(spec) if spec[0].isdigit() else spec)
+
+
+@pytest.fixture(params=list(CLOSED), ids=lambda spec: spec.partition("(")[0])
+def spec(request):
+    return request.param
+
+
+# Formulas --------------------------------------------------------------------------------------------------------
+
+
+def test_the_index_is_that_of_the_formula(spec):
+    """Of floats, and of arrays of numpy, which keep their shape."""
+    wavelengths = np.array([[410.0, 500.0, 505.0], [587.5618, 700.0, 899.0]])
+    expected = np.array([[CLOSED[spec](w) for w in row] for row in wavelengths])
+    np.testing.assert_allclose(medium(spec).index(wavelengths), expected, rtol=4e-16)
+    for w, n in zip(wavelengths.ravel().tolist(), expected.ravel(), strict=True):
+        assert medium(spec).index(w) == pytest.approx(n, rel=4e-16)
+        assert type(medium(spec).index(w)) is float
+    assert medium(spec).dispersive == (spec != "1.5")
+
+
+def test_arrays_of_drjit_are_evaluated_in_double_precision(spec, setting):
+    number, wavelengths = dr.value_t(setting.vector), (410.0, 500.0, 700.0)
+    n = medium(spec).index(number(*wavelengths) if dr.is_jit_v(number) else number(wavelengths[0]))
+    assert dr.type_v(n) == dr.VarType.Float64 or not dr.is_array_v(n)
+    n = np.atleast_1d(np.array(n, dtype=float)).ravel()
+    np.testing.assert_allclose(n, [CLOSED[spec](w) for w in wavelengths][: len(n)], rtol=4e-16)
+
+
+def test_drjit_differentiates_in_the_wavelength_and_the_coefficients(spec, vectorised):
+    """Against central differences, between the knots of the table."""
+    found = medium(spec)
+    wide = dr.float64_array_t(dr.diff_array_t(dr.value_t(vectorised.vector)))
+    for at in (450.0, 620.0):
+        w, c = wide(at), {name: wide(value) for name, value in found.coefficients.items()}
+        dr.enable_grad(w, *c.values())
+        dr.backward(found.index(w, c))
+        slope = (CLOSED[spec](at + 1e-3) - CLOSED[spec](at - 1e-3)) / 2e-3
+        assert dr.grad(w)[0] == pytest.approx(slope, rel=1e-6, abs=1e-12)
+        for name, value in found.coefficients.items():
+            step = 1e-5 * abs(value)
+            ends = [found.index(at, {name: value + sign * step}) for sign in (1, -1)]
+            assert dr.grad(c[name])[0] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-5, abs=1e-10), name
+
+
+def test_of_a_table_each_knot_is_its_own_value():
+    """Also of knots that agree to nine digits."""
+    assert [media.index(TABLE, w) for w in (400.0, 500.0, 900.0)] == [1.53, 1.52, 1.5]
+    close = math.nextafter(500.0, 600)
+    found = media.parse(f"table(400: 1.5, 500: 1.5, {close!r}: 1.6, 600: 1.7)")
+    assert [found.index(w) for w in (400.0, 450.0, 500.0, close, 600.0)] == [1.5, 1.5, 1.5, 1.6, 1.7]
+    assert len(found.coefficients) == 4
+
+
+@pytest.mark.parametrize("wavelength", [399.0, 901.0, math.nan, math.inf, -500.0, 0.0])
+def test_outside_its_range_a_medium_has_no_index(wavelength, vectorised):
+    found = media.parse("table(400: 1.53, 900: 1.5)")
+    for asked in (wavelength, np.array([500.0, wavelength])):
+        with pytest.raises(ValueError, match=r"no index at .* nm; expected a wavelength from 400 to 900 nm") as error:
+            found.index(asked)
+        assert "\n" not in str(error.value)
+    lanes = np.array(found.index(dr.value_t(vectorised.vector)(500.0, wavelength)))
+    assert np.isfinite(lanes[0]) and np.isnan(lanes[1])
+    assert math.isnan(found.index_or_nan(wavelength))
+    assert found.index(400.0) == 1.53 and found.index(900.0) == 1.5
+
+
+# What a scene may say --------------------------------------------------------------------------------------------
+
+BAD = {
+    "cauchy(1.5, nan)": r"expected cauchy\(A, B, …\), λ in nm, up to 8, finite numbers",
+    "cauchy()": r"expected cauchy\(A, B, …\)",
+    "cauchy(1,2,3,4,5,6,7,8,9)": "up to 8",
+    "cauchy(1, -1e6)": "n is not positive at 360 nm; expected a positive index everywhere in 360 … 830 nm",
+    "cauchy(1, 2": r"expected cauchy\(…\), sellmeier\(…\), sellmeier_nm\(…\), abbe\(…\), table\(…\)",
+    "sine(1, 2)": r"expected cauchy\(…\)",
+    "sellmeier(1)": "as many C in nm² as B",
+    "sellmeier(1, 0.01)": "C1 = 0.01; expected nm²; from µm² multiply by 1e6",
+    "sellmeier(1, -0.01)": "C1 = -0.01; expected nm²",
+    "sellmeier(1, 1, 10000, 250000)": "C2: n is infinite at 500 nm; expected no pole in 360 … 830 nm",
+    "sellmeier(-1.5, 10000)": "n is not positive at 360 nm",
+    "sellmeier_nm(1, 0.1)": "L1 = 0.1; expected nm; from µm multiply by 1e3",
+    "sellmeier_nm(1, -100)": "L1 = -100; expected nm",
+    "sellmeier_nm(1, 500)": "L1: n is infinite at 500 nm",
+    "abbe(1.5)": r"expected abbe\(n_d, V_d\)",
+    "abbe(1.5, 0)": "V_d = 0; expected",
+    "table(500: 1.5)": "two or more, wavelengths in nm, increasing",
+    "table(500: 1.5, 400: 1.5)": "increasing",
+    "table(500: 1.5, 500: 1.6)": "increasing",
+    "table(0: 1.5, 500: 1.6)": "increasing",
+    "table(400: 1.5, inf: 1.6)": "increasing",
+    "table(400, 500)": "expected table",
+    "table(400: 1.5, 500: 0)": "n = 0 at 500 nm; expected a positive finite index",
+    "table(400: 1.5, 500: nan)": "n = nan at 500 nm",
+    "MATERIAL:wader": "unknown material; nearest: MATERIAL:water, ",
+    "FOO:BAR": "expected these, or CDGM:…, HIKARI:…",
+    0: "expected a positive finite number, or a material's name",
+    -1.5: "expected a positive finite number",
+    math.inf: "expected a positive finite number",
+    math.nan: "expected a positive finite number",
+    None: "expected a positive finite number",
+    True: "expected a positive finite number",
+}
+
+
+@pytest.mark.parametrize(("spec", "said"), BAD.items(), ids=map(repr, BAD))
+def test_what_is_refused_is_said_in_one_line_with_the_parameter(spec, said):
+    with pytest.raises(ValueError, match=said) as error:
+        media.parse(spec, "refract: int_ior")
+    assert str(error.value).startswith(f"refract: int_ior = {spec!r}") and "\n" not in str(error.value)
+
+
+def test_poles_outside_the_visible_end_the_range():
+    assert media.parse("sellmeier_nm(1, 0.01, 200, 9000)").valid == pytest.approx((200, 9000))
+    assert math.isnan(media.parse("cauchy(1, 2000)").index_or_nan(500.0, {"A": -1.0}))
+
+
+@pytest.fixture
+def named(scalar_variant):
+    """Names of Mitsuba's table are its numbers."""
+    assert media.index("bk7", 500.0) == media.index("bk7", 600.0) == 1.5046
+    assert media.index("air", 500.0) == 1.000277
+    assert not media.parse("diamond").dispersive
+    return media.parse
+
+
+# Air and vacuum --------------------------------------------------------------------------------------------------
+
+ratio = media.relative_index
+
+
+def in_air(n):
+    return media.Medium("glass", media.parse(n).dispersion, {"n": n}, relative_to="air")
+
+
+def test_beside_a_glass_of_a_catalogue_air_has_the_index_1(named):
+    glass, ciddor = in_air(1.5), media.parse("AIR:ciddor")
+    pairs = (glass, named("air")), (named("air"), glass), (glass, ciddor)
+    assert [ratio(*pair, 500.0) for pair in pairs] == [1.5, 1 / 1.5, 1.5]
+    assert ratio(in_air(1.6), glass, 500.0) == ratio(media.parse(1.6), glass, 500.0) == 1.6 / 1.5
+    assert math.isnan(ratio(glass, ciddor, 2000.0))  # where no air is known
+
+
+def test_beside_vacuum_a_glass_of_a_catalogue_has_its_index_in_vacuum(named):
+    """Air at 20 °C and 101325 Pa: n − 1 = 2.71800e-4 at 633 nm, between the lines of Ciddor's table."""
+    glass, water, expected = in_air(1.5), media.parse("MATERIAL:water"), 1.5 * 1.00027180
+    assert ratio(glass, named("vacuum"), 633.0) == pytest.approx(expected, rel=2e-8)
+    assert ratio(named("vacuum"), glass, 633.0) == pytest.approx(1 / expected, rel=2e-8)
+    assert ratio(glass, water, 633.0) == pytest.approx(expected / water.index(633.0), rel=2e-8)
+
+
+def test_where_a_medium_has_no_index_the_ratio_is_nan():
+    table, one = media.parse(TABLE), media.parse(1.0)
+    for pair in ((table, one), (one, table), (table, media.parse("AIR:ciddor"))):
+        assert math.isnan(ratio(*pair, 300.0))
+
+
+def test_coefficients_of_a_ratio_may_be_arrays(vectorised):
+    pair, number = (media.parse("cauchy(1.5, 3000)"), media.parse("cauchy(1.3, 0)")), dr.value_t(vectorised.vector)
+    wide = dr.float64_array_t(number)
+    k = ratio(*pair, number(500.0), {"A": wide(1.6)}, {"A": wide(1.2)})
+    assert np.array(k)[0] == pytest.approx((1.6 + 3000 / 500**2) / 1.2, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("name", "wavelength", "n", "bound"),
+    [
+        ("AIR:ciddor", 633.0, 1.0002765, 6e-8),
+        ("AIR:edlen", 632.9908, 1.00027652, 6e-9),
+        ("MATERIAL:fused-silica", LINES["d"], 1.45846, 5e-6),  # Malitson's table
+        ("MATERIAL:fused-silica", LINES["C"], 1.45637, 5e-6),
+        ("MATERIAL:fused-silica", LINES["F"], 1.46313, 5e-6),
+        ("MATERIAL:water", LINES["D"], 1.33299 * 1.00027, 2e-5),  # relative to air 1.33299 at 20 °C
+        ("MATERIAL:diamond", LINES["D"], 2.4173, 3e-4),
+    ],
+)
+def test_materials_have_the_index_that_was_printed_elsewhere(name, wavelength, n, bound):
+    assert media.index(name, wavelength) == pytest.approx(n, abs=bound)
+    assert media.parse(name.title()) is media.parse(name)
+
+
+# Catalogues of glass ---------------------------------------------------------------------------------------------
+
+READS = pytest.mark.skipif(
+    not all(find_spec(name) for name in ("opticalglass", "pandas")),
+    reason="opticalglass is not installed: pip install 'mi-refract[glass]'",
+)
+
+
+@READS
+@pytest.mark.parametrize(
+    ("glass", "n_d", "v_d"),
+    [
+        ("SCHOTT:N-BK7", 1.51680, 64.17),
+        ("SCHOTT:N-SF11", 1.78472, 25.68),
+        ("SCHOTT:F2", 1.62004, 36.37),
+        ("OHARA:S-BSL 7", 1.51633, 64.14),
+        ("HOYA:FCD1", 1.49700, 81.61),
+        ("HIKARI:J-BK7A", 1.51680, 64.14),
+        ("CDGM:H-K9L", 1.51680, 64.20),
+        ("SUMITA:K-BK7", 1.51633, 64.1),
+        ("abbe(1.5168, 64.17)", 1.51680, 64.17),
+    ],
+)
+def test_n_d_and_v_d_are_those_of_the_maker(glass, n_d, v_d):
+    """Within half a unit of the fifth decimal, and 1e-6."""
+    n = {line: media.index(glass, LINES[line]) for line in "dFC"}
+    assert n["d"] == pytest.approx(n_d, abs=6e-6)
+    assert (n["d"] - 1) / (n["F"] - n["C"]) == pytest.approx(v_d, abs=0.06 if ":" in glass else 1e-10)
+
+
+@READS
+@pytest.mark.parametrize(
+    ("glass", "low", "high"),
+    [("SCHOTT:N-BK7", 290, 2500), ("SCHOTT:F2", 320, 2500), ("HOYA:FCD515", 320, 2500)],
+)
+def test_a_glass_has_an_index_where_its_maker_prints_one_or_a_transmittance_above_0(glass, low, high):
+    """Of F2 the transmittance of 10 mm at 310 nm is printed, as 0."""
+    assert media.parse(glass).valid == (low, high)
+    for beyond in (low - 10.0, high + 500.0):
+        said = f"{glass}: no index at {beyond:g} nm; expected a wavelength from {low} to"
+        with pytest.raises(ValueError, match=said):
+            media.index(glass, beyond)
+
+
+@READS
+@pytest.mark.parametrize(
+    ("glass", "valid", "fitted", "beyond"),
+    [
+        ("CDGM:D-ZF93", (400, 2400), (404, 1014), 2325.0),  # where its index is 1.9250 and the formula gives 1.9150
+        ("HOYA:BSC7", (280, 1550), (365, 1014), 1530.0),
+        ("SCHOTT:N-BK7", (290, 2500), (365, 2326), 334.1),
+        ("OHARA:S-BSL 7", (290, 2400), (365, 2325), 2400.0),
+    ],
+)
+def test_beyond_the_makers_fit_an_index_is_a_warning(glass, valid, fitted, beyond):
+    found = media.parse(glass)
+    assert (found.valid, found.fitted, found.relative_to) == (valid, fitted, "air")
+    for inside in fitted:
+        found.index(inside)
+    said = f"{glass}: the index at {beyond:g} nm is an extrapolation; .* {fitted[0]} to {fitted[1]} nm"
+    for asked in (beyond, [fitted[0], beyond]):
+        with pytest.warns(UserWarning, match=said):
+            found.index(asked)
+
+
+@READS
+def test_glasses_are_named_in_any_case_and_errors_say_what_there_is():
+    assert media.parse("schott:n-bk7").name == "SCHOTT:N-BK7"
+    assert media.parse("OHARA:S-BSL7").name == media.parse("ohara: s-bsl 7").name == "OHARA:S-BSL 7"
+    text = "^int_ior = 'SCHOTT:N-BK8': unknown glass; expected one of the .*nearest: SCHOTT:N-BK7, SCHOTT:[^,]+, SCHO"
+    with pytest.raises(ValueError, match=text):
+        media.parse("SCHOTT:N-BK8", "int_ior")
+    with pytest.raises(ValueError, match="its catalogue has no formula for this glass; use another glass, or table"):
+        media.parse("HIKARI:J-PSKH8")
+
+
+def test_without_the_package_a_glass_says_which_command_brings_it(monkeypatch):
+    for name in ["opticalglass", *(name for name in sys.modules if name.startswith("opticalglass."))]:
+        monkeypatch.setitem(sys.modules, name, None)
+    glass_catalogs.read.cache_clear()
+    with pytest.raises(ValueError, match=r"^int_ior = 'SCHOTT:N-BK7': .*pip install 'mi-refract\[glass\]'$") as error:
+        media.parse("SCHOTT:N-BK7", "int_ior")
+    assert "\n" not in str(error.value)
