@@ -83,7 +83,7 @@ def drawn(shapes: list[Shape], samples: int = SAMPLES, turn: float = 0.0, shift:
         u, v = (x - left) * cos + (y - top) * sin, (y - top) * cos - (x - left) * sin
         box = (np.abs(u) < radius) & (np.abs(v) < (0.7 * radius if kind == BOX else 0.5))
         codes[u * u + v * v < radius**2 if kind == DISK else box] = colour
-    return codes.mean(2)
+    return np.asarray(codes.mean(2))
 
 
 def shown(codes: Pixels, rounded: bool = True) -> Image:

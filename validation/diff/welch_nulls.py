@@ -79,7 +79,7 @@ def drawn(rng: Rng, n: int, law: Callable[[Rng, tuple[int, ...]], Array]) -> tup
 
 def lognormal(rng: Rng, shape: tuple[int, ...]) -> Array:
     """Of σ = 1.5."""
-    return np.exp(1.5 * rng.standard_normal(shape, np.float32), dtype=np.float64)
+    return np.asarray(np.exp(1.5 * rng.standard_normal(shape, np.float32), dtype=np.float64))
 
 
 LIGHT: dict[str, Draw] = {

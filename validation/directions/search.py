@@ -93,7 +93,7 @@ class Herd:
 
     def of_regime(self, name: str) -> np.ndarray:
         """An attribute of each family's regime."""
-        return np.array([getattr(REGIMES[regime], name) for regime in self.names])[self.regime]
+        return np.asarray(np.array([getattr(REGIMES[regime], name) for regime in self.names])[self.regime])
 
 
 def climb(
