@@ -162,10 +162,7 @@ def _cut(failures: list[dict[str, Any]], equal: list[dict[str, Any]], articles: 
 
 
 def item(
-    result: Result,
-    results: Results,
-    shown: Shown = Shown(),
-    images: EmbeddedImages | None = None,
+    result: Result, results: Results, shown: Shown = Shown(), images: EmbeddedImages | None = None
 ) -> dict[str, Any]:
     """What the page says of an image. The panes of `shown` go to `images`."""
     comparison, why = result.comparison, cause(result)

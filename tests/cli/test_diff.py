@@ -361,11 +361,7 @@ def test_github(run, strange, tmp_path, monkeypatch):
     "url, run_id, words",
     [
         ("", "", "Report: out.html\n"),
-        (
-            "",
-            "7",
-            "Report: out.html, where it is uploaded among the [artefacts of this run](https://g/a/b/actions/",
-        ),
+        ("", "7", "Report: out.html, where it is uploaded among the [artefacts of this run](https://g/a/b/actions/"),
         ("https://x.io/r (1)/a.html", "7", "Report: [out.html](https://x.io/r%20%281%29/a.html)\n"),
     ],
 )
