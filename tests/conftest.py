@@ -60,12 +60,6 @@ def variant(request: pytest.FixtureRequest) -> str:
     return wanted
 
 
-@pytest.fixture(scope="module")
-def each_variant(request: pytest.FixtureRequest) -> str:
-    """Every variant of the wheel; tests are in the order of variants, because a switch takes a tenth of a second."""
-    return request.param
-
-
 @pytest.fixture
 def scalar_variant() -> None:
     """`scalar_rgb` for the test, which `variant` sets."""
@@ -77,57 +71,47 @@ def llvm_variant(needs_variant: Callable[[str], None]) -> None:
     needs_variant("llvm_ad_rgb")
 
 
+# Subsets of the variants, by the fixture that asks for them.
+SUBSETS = {
+    # One a family and the one that differs most from it: for what no variant does by itself.
+    "typical_variant": [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb", "_ad_spectral_polarized"))],
+    # One a family: for what does not ask whether light is polarised.
+    "rgb_variant": [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb"))],
+    "spectral_variant": [name for name in USABLE if "_spectral" in name],  # light has wavelengths
+    "polarized_variant": [name for name in USABLE if name.endswith("_polarized")],  # Mueller matrices
+}
+# Scalar arrays compute in double whatever they store: float32 is judged on the vectorised backends.
+SETTINGS = [("scalar", "float64")] + [(b, p) for b in ("llvm", "cuda") for p in ("float32", "float64")]
+CASES: dict[str, Any] = {
+    "each_variant": list(USABLE),
+    "setting": SETTINGS,  # every backend and precision
+    "float32": [case for case in SETTINGS if case[1] == "float32"],  # for what takes long in any precision
+    "vectorised": SETTINGS[1:],  # those that carry derivatives
+}
+
+
+@pytest.fixture(scope="module")
+def each_variant(request: pytest.FixtureRequest) -> str:
+    """Every variant of the wheel; tests are in the order of variants, because a switch takes a tenth of a second."""
+    return request.param
+
+
 @pytest.fixture(scope="module")
 def typical_variant(each_variant: str) -> str:
-    """One variant a family and the one that differs most from it: for what no variant does by itself."""
+    """The variants of `SUBSETS`, by the name of the fixture."""
     return each_variant
 
 
 @pytest.fixture(scope="module")
-def rgb_variant(each_variant: str) -> str:
-    """One variant a family: for what does not ask whether light is polarised."""
-    return each_variant
-
-
-@pytest.fixture(scope="module")
-def spectral_variant(each_variant: str) -> str:
-    """Every variant whose light has wavelengths."""
-    return each_variant
-
-
-@pytest.fixture(scope="module")
-def polarized_variant(each_variant: str) -> str:
-    """Every variant with Mueller matrices."""
-    return each_variant
-
-
-def setting_of(request: pytest.FixtureRequest) -> Any:
-    """The `Setting` of a backend and a precision; it imports Dr.Jit."""
+def setting(request: pytest.FixtureRequest) -> Any:
+    """The `Setting` of each backend and precision in `CASES` that runs here; it imports Dr.Jit."""
     from validation.run.array_settings import Setting
 
     return Setting.of(*request.param)
 
 
-# Scalar arrays compute in double whatever they store: float32 is judged on the vectorised backends.
-SETTINGS = [("scalar", "float64")] + [(b, p) for b in ("llvm", "cuda") for p in ("float32", "float64")]
-
-
-@pytest.fixture(scope="module")
-def setting(request: pytest.FixtureRequest) -> Any:
-    """Every backend and precision that runs here; see `pytest_generate_tests`."""
-    return setting_of(request)
-
-
-@pytest.fixture(scope="module")
-def float32(request: pytest.FixtureRequest) -> Any:
-    """Those in float32: for what takes long and depends on the precision in nothing but numbers."""
-    return setting_of(request)
-
-
-@pytest.fixture(scope="module")
-def vectorised(request: pytest.FixtureRequest) -> Any:
-    """Those that carry derivatives."""
-    return setting_of(request)
+rgb_variant = spectral_variant = polarized_variant = typical_variant
+float32 = vectorised = setting
 
 
 def _case(case: str | tuple[str, str]) -> tuple[str, str, str | None]:
@@ -136,17 +120,6 @@ def _case(case: str | tuple[str, str]) -> tuple[str, str, str | None]:
         return case, case.partition("_")[0], USABLE[case]
     entry = backend.detect()[case[0]]
     return "-".join(case), case[0], None if entry.usable else entry.reason
-
-
-# Subsets of the variants, by the fixture that asks for them.
-SUBSETS = {
-    "typical_variant": [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb", "_ad_spectral_polarized"))],
-    "rgb_variant": [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb"))],
-    "spectral_variant": [name for name in USABLE if "_spectral" in name],
-    "polarized_variant": [name for name in USABLE if name.endswith("_polarized")],
-}
-CASES: dict[str, Any] = {"each_variant": list(USABLE), "setting": SETTINGS, "vectorised": SETTINGS[1:]}
-CASES["float32"] = [case for case in SETTINGS if case[1] == "float32"]
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -178,14 +151,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture
 def scalar_context(tmp_path, scalar_variant):
     """`scalar_context(rays=800, ...)`: a run of the validation on scalar_rgb, standard but for what is given."""
-    import dataclasses
+    from dataclasses import replace
 
-    from validation.run.context import SCALAR_PROFILES, Context
+    from validation.run.context import here
 
-    standard = SCALAR_PROFILES["standard"]
-    return lambda **given: Context(
-        dataclasses.replace(standard, **given), tmp_path, "scalar_rgb", backend.detect(), USABLE
-    )
+    context = here("standard", tmp_path, "scalar_rgb")
+    return lambda **changes: replace(context, profile=replace(context.profile, **changes))
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ All rays, their answers and certified answers are arrays. Whatever takes more me
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,9 +21,9 @@ from mi_refract import oracle
 from mi_refract.formulas import FORMULAS
 from mi_refract.regimes import Array, Rays
 
-from . import diagnosis, media_rays, tir_signal
+from . import diagnosis, tir_signal
 from .diagnosis import Explanation
-from .header import AUTO, FLAG, PRECISIONS, TIR, Header, Ids, shown
+from .header import AUTO, FLAG, PRECISIONS, SAME, TIR, Header, Ids, described, has_media, shown
 from .judged_answers import Flags, JudgedAnswers, Table, certified, judge_answers, see
 from .ray_set import Answers, RaySet, in_regime
 from .tir_signal import LOOSEST, UNCLEAR
@@ -140,70 +140,15 @@ class Findings:
         return int(self.wrong > 0 or self.tir == UNCLEAR or bool(self.problems) or not self.total("judged"))
 
 
-# Which answer belongs to which ray ---------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Piece:
-    """Rays (N), their ids (N,), the answers b (N, 3), and the columns `transmitted` and `n_ratio` (N,), if given."""
-
-    rays: Rays
-    ids: Ids
-    b: Array
-    transmitted: Flags | None
-    n_ratio: Array | None
-
-    @property
-    def used(self) -> Rays:
-        """The rays as the program took them: with the ratio of the indices that it used, where it reports it."""
-        if self.n_ratio is None:
-            return self.rays
-        return Rays(self.rays.a.astype(np.float64), self.rays.n.astype(np.float64), self.n_ratio)
-
-
-class _Matched:
-    """The rays that have an answer, by their rows (N,) in the set, with the first answer to each."""
-
-    def __init__(self, rays: RaySet, answers: Answers) -> None:
-        """`mismatches`: "missing", "duplicate" and "unknown" ids, each once, in order."""
-        ids, first, counts = np.unique(answers.ids, return_index=True, return_counts=True)
-        place = np.searchsorted(ids, rays.ids).clip(max=max(len(ids) - 1, 0))
-        answered = ids[place] == rays.ids if len(ids) else np.zeros(len(rays), bool)
-        self._rays, self._answers = rays, answers
-        self.rows = np.flatnonzero(answered)
-        self._answer_rows = first[place[self.rows]]
-        self.ids = rays.ids[self.rows]
-        self.mismatches: dict[str, Ids] = {
-            "missing": np.sort(rays.ids[~answered]),
-            "duplicate": ids[counts > 1],
-            "unknown": np.setdiff1d(ids, rays.ids, assume_unique=True),
-        }
-
-    def take(self, index: NDArray[np.intp] | slice) -> _Piece:
-        """Some of them."""
-        some, rows, answers = self.rows[index], self._answer_rows[index], self._answers
-        transmitted = None if answers.transmitted is None else answers.transmitted[rows]
-        ratios = None if answers.n_ratio is None else answers.n_ratio[rows]
-        return _Piece(self._rays.rays[some], self._rays.ids[some], answers.b[rows], transmitted, ratios)
-
-    def pieces(self, size: int) -> Iterator[_Piece]:
-        """All of them, `size` at a time."""
-        for start in range(0, len(self.rows), size):
-            yield self.take(slice(start, start + size))
-
-
 # The check ---------------------------------------------------------------------------------------------------------
 
 
 def check_options(tir: str, error_bound: str, most_backward: float) -> None:
     """ValueError, one line, for an unknown name, or a limit of backward errors that is not above 0."""
-    names: tuple[tuple[str, str, Collection[str]], ...] = (
-        ("TIR signal", tir, (AUTO, *TIR)),
-        ("error bound", error_bound, FORMULAS),
-    )
-    for name, value, expected in names:
-        if value not in expected:
-            raise ValueError(f"{name} {value!r}: unknown; expected {', '.join(expected)}")
+    if tir not in (AUTO, *TIR):
+        raise ValueError(f"TIR signal {tir!r}: unknown; expected {', '.join((AUTO, *TIR))}")
+    if error_bound not in FORMULAS:
+        raise ValueError(f"error bound {error_bound!r}: unknown; expected {', '.join(FORMULAS)}")
     if not most_backward > 0:
         raise ValueError(f"backward error {most_backward:g}; expected a positive number of roundings")
 
@@ -217,7 +162,7 @@ def check(
     most_backward: float = np.inf,
     piece: int = PIECE,
 ) -> Findings:
-    """Compare every answer with the certified direction.
+    """Compare every answer with the certified direction; of several answers to a ray, the first.
 
     `tir`: how the answers signal total internal reflection, one of TIR; detected where it is AUTO. `error_bound`: the
     formula of FORMULAS whose a-priori bound the errors must keep. `most_backward`: the largest backward error, in u, of
@@ -228,60 +173,80 @@ def check(
     check_options(tir, error_bound, most_backward)
     if tir == FLAG and answers.transmitted is None:
         raise ValueError("TIR signal 'flag': the answers have no column `transmitted`")
-    if (checksum := answers.header.get("checksum")) not in (None, rays.header["checksum"]):
-        raise ValueError(
-            f"the answers are to rays with the checksum {shown(checksum)}; expected {rays.header['checksum']}"
-        )
-    matched, precision = _Matched(rays, answers), rays.precision
-    exact = [certified(part.used) for part in matched.pieces(piece)]
+    header, precision = rays.header, rays.precision
+    if (checksum := answers.header.get("checksum")) not in (None, header["checksum"]):
+        raise ValueError(f"the answers are to rays with the checksum {shown(checksum)}; expected {header['checksum']}")
+    rays, answers, problems = _matched(rays, answers)
+
+    def judge(rows: NDArray[np.intp] | slice, exact: oracle.Certified | None = None) -> JudgedAnswers:
+        some, budget = answers[rows], FORMULAS[error_bound].budget
+        columns = some.b, some.transmitted, used(rays[rows], some), precision, budget, signal
+        return judge_answers(*columns, exact=exact, most_backward=most_backward)
+
+    pieces = [slice(start, start + piece) for start in range(0, len(rays), piece)]
+    exact = [certified(used(rays[rows], answers[rows])) for rows in pieces]
     if tir != AUTO:
         signal = tir
     elif answers.transmitted is not None:
         signal = FLAG
     else:
-        seen = (see(x.b, x.used, precision, y) for x, y in zip(matched.pieces(piece), exact, strict=True))
+        parts = zip(pieces, exact, strict=True)
+        seen = (see(answers[x].b, used(rays[x], answers[x]), precision, certain) for x, certain in parts)
         signal = tir_signal.detect(seen)
-
-    def judge(part: _Piece, exact: oracle.Certified | None = None) -> JudgedAnswers:
-        columns = part.b, part.transmitted, part.used, precision, FORMULAS[error_bound].budget, signal
-        return judge_answers(*columns, exact=exact, most_backward=most_backward)
-
-    tables = [judge(matched.take(slice(0))).table]
-    tables += [judge(part, exact.pop(0)).table for part in matched.pieces(piece)]
+    tables = [judge(slice(0)).table] + [judge(rows, exact.pop(0)).table for rows in pieces]
     table = np.concatenate(tables)
     explanations: list[Explanation] = []
     if table["beyond_bound"].any():
-        sample, printed = diagnosis.sample(table), matched.take(diagnosis.evenly(table["compared"])).b
-        explanations = diagnosis.explain(judge(matched.take(sample)), table, printed)
+        printed = answers.b[diagnosis.evenly(table["compared"])]
+        explanations = diagnosis.explain(judge(diagnosis.sample(table)), table, printed)
     ulp = float(np.finfo(PRECISIONS[precision]).eps)
-    ratio, other_ratio = _ratio_difference(matched, rays.header, ulp)
+    ratio, other_ratio = _ratio_difference(rays, answers, ulp)
     masks = {kind: table[kind] for kind in ("non-finite", "zero", "impossible")} | {"index": other_ratio}
-    problems = matched.mismatches | {kind: matched.ids[mask] for kind, mask in masks.items()}
+    problems |= {kind: rays.ids[mask] for kind, mask in masks.items()}
     return Findings(
         precision=precision,
         ulp=ulp,
         error_bound=error_bound,
         tir=signal,
         tir_given=tir != AUTO,
-        regimes=tuple(_by_regime(matched, rays.header, table)),
+        regimes=tuple(_by_regime(rays, answers, table)),
         problems=tuple(Problem(kind, len(ids), _listed(ids)) for kind, ids in problems.items() if len(ids)),
         explanations=tuple(explanations),
-        header=rays.header,
+        header=header,
         ratio=ratio,
     )
 
 
-def _ratio_difference(matched: _Matched, header: Header, ulp: float) -> tuple[RatioDifference | None, Flags]:
+def _matched(rays: RaySet, answers: Answers) -> tuple[RaySet, Answers, dict[str, Ids]]:
+    """The rays that have an answer, the first answer to each, in order; ids by kind of UNFIT, each once, in order."""
+    ids, first, counts = np.unique(answers.ids, return_index=True, return_counts=True)
+    place = np.searchsorted(ids, rays.ids).clip(max=max(len(ids) - 1, 0))
+    answered = ids[place] == rays.ids if len(ids) else np.zeros(len(rays), bool)
+    problems = {
+        "missing": np.sort(rays.ids[~answered]),
+        "duplicate": ids[counts > 1],
+        "unknown": np.setdiff1d(ids, rays.ids, assume_unique=True),
+    }
+    return rays[answered], answers[first[place[answered]]], problems
+
+
+def used(rays: RaySet, answers: Answers) -> Rays:
+    """The rays as the program took them: with the ratio of the indices that it used, where it reports it."""
+    if answers.n_ratio is None:
+        return rays.rays
+    return Rays(rays.rays.a.astype(np.float64), rays.rays.n.astype(np.float64), answers.n_ratio)
+
+
+def _ratio_difference(rays: RaySet, answers: Answers, ulp: float) -> tuple[RatioDifference | None, Flags]:
     """The largest, and (N,) where the ratio is another than that of the ray; nothing where the answers have none."""
-    every = matched.take(slice(None))
-    if every.n_ratio is None or not len(every.ids):
-        return None, np.zeros(len(every.ids), bool)
-    k = every.rays.k.astype(np.float64)
-    differences = np.abs(every.n_ratio - k) / k
-    tolerance = media_rays.SAME if media_rays.has_media(header) else SAME_ULPS * ulp
+    if answers.n_ratio is None or not len(rays):
+        return None, np.zeros(len(rays), bool)
+    k = rays.rays.k.astype(np.float64)
+    differences = np.abs(answers.n_ratio - k) / k
+    tolerance = SAME if has_media(rays.header) else SAME_ULPS * ulp
     row = int(np.argmax(differences))
-    id_ = int(every.ids[row])
-    largest = RatioDifference(float(differences[row]), id_, media_rays.described(header, id_), tolerance)
+    id_ = int(rays.ids[row])
+    largest = RatioDifference(float(differences[row]), id_, described(rays.header, id_), tolerance)
     return largest, differences > tolerance
 
 
@@ -290,15 +255,17 @@ def _listed(ids: Ids) -> str:
     return f"id{'' if len(ids) == 1 else 's'} {first}{more}"
 
 
-def _by_regime(matched: _Matched, header: Header, table: Table) -> Iterator[RegimeErrors]:
-    for name in header["regimes"]:
-        rows = np.flatnonzero(in_regime(header, name, matched.ids))
+def _by_regime(rays: RaySet, answers: Answers, table: Table) -> Iterator[RegimeErrors]:
+    for name in rays.header["regimes"]:
+        rows = np.flatnonzero(in_regime(rays.header, name, rays.ids))
         if not len(rows):
             continue
         part = table[rows]
         compared = part[part["compared"]]
         angles, backward = compared["angle"], part["backward"]
-        worst = np.lexsort([part[key] for key in ("share", "impossible", "tir_beyond_bound", "blank")])[-1]
+        worst = rows[np.lexsort([part[key] for key in ("share", "impossible", "tir_beyond_bound", "blank")])[-1:]]
+        ray = used(rays[worst], answers[worst])
+        exact = certified(ray)
         yield RegimeErrors(
             name,
             rays=len(part),
@@ -311,7 +278,13 @@ def _by_regime(matched: _Matched, header: Header, table: Table) -> Iterator[Regi
             backward_median=_quantile(backward, 0.5),
             backward_p99=_quantile(backward, 0.99),
             backward_worst=_quantile(backward, 1),
-            replay=_replay(matched.take(rows[worst : worst + 1])),
+            replay={
+                "id": int(rays.ids[worst[0]]),
+                **ray.hexed(0),
+                "answer": [float(x).hex() for x in answers.b[worst[0]]],
+                "exact": [float(x).hex() for x in exact.direction[0]],
+                "transmitted": bool(exact.transmitted[0]),
+            },
             **{count: int(part[count].sum()) for count in COUNTS},
         )
 
@@ -323,15 +296,3 @@ def _quantile(errors: Array, share: float) -> float:
     with np.errstate(invalid="ignore"):
         value = float(np.quantile(errors, share))
     return float(np.quantile(errors, share, method="higher")) if np.isnan(value) else value
-
-
-def _replay(one: _Piece) -> dict[str, Any]:
-    """A ray with its answer in hexadecimal floats."""
-    exact = certified(one.used)
-    return {
-        "id": int(one.ids[0]),
-        **one.used.hexed(0),
-        "answer": [float(x).hex() for x in one.b[0]],
-        "exact": [float(x).hex() for x in exact.direction[0]],
-        "transmitted": bool(exact.transmitted[0]),
-    }

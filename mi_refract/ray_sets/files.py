@@ -1,9 +1,10 @@
-"""Files of rays and of answers: CSV, NumPy's .npz, EXR.
+"""Files of rays and of answers, in CSV and in NumPy's .npz; and programs that read the one and print the other.
 
-    rays      .csv: id, ax, ay, az, nx, ny, nz, n_from, n_to   .npz: id, a, n, n_from, n_to   .exr: one pixel per ray
-    answers   .csv: id, bx, by, bz[, transmitted][, n_ratio]   .npz: id, b[, …]               .exr: channels as in .csv
+    rays      .csv: id, ax, ay, az, nx, ny, nz, n_from, n_to   .npz: id, a, n, n_from, n_to
+    answers   .csv: id, bx, by, bz[, transmitted][, n_ratio]   .npz: id, b[, …]
 
-Rays with media have two columns, arrays or channels more: wavelength, medium.
+Rays with media have two columns or arrays more: wavelength, medium. The header is in lines `# key: value` on top of a
+CSV file, and JSON text in the array `header` of an .npz file.
 
 A number in CSV is the shortest decimal that reads back, in float64, as exactly that number; a float32 number also reads
 back exactly in float32.
@@ -13,59 +14,82 @@ from __future__ import annotations
 
 import io
 import json
+import re
+import shlex
+import tokenize
+import warnings
 import zipfile
-from collections.abc import Sized
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
 from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mi_refract.io import image_file
+from mi_refract.io import process_group, regular_file
 from mi_refract.io.atomic import writable, write_atomically
+from mi_refract.io.errors import TooMuchOutputError
 from mi_refract.io.image_file import one_line
-from mi_refract.regimes import Rays
+from mi_refract.regimes import Array, Rays
 
 from . import header as headers
-from . import media_rays, tables
 from .header import FORMAT, PRECISIONS, Header
 from .ray_set import Answers, RaySet, checksum, indices
-from .tables import SUFFIXES, Table
 
+SUFFIXES = (".csv", ".npz")
 COLUMNS = ("id", "ax", "ay", "az", "nx", "ny", "nz", "n_from", "n_to")
-RAY_LAYOUTS = (COLUMNS, (*COLUMNS, *media_rays.COLUMNS))
+RAY_LAYOUTS = (COLUMNS, (*COLUMNS, *headers.COLUMNS))
 ANSWER_COLUMNS = ("id", "bx", "by", "bz")
 TRANSMITTED, N_RATIO = "transmitted", "n_ratio"
 ANSWER_LAYOUTS = tuple((*ANSWER_COLUMNS, *more) for more in ((), (TRANSMITTED,), (N_RATIO,), (TRANSMITTED, N_RATIO)))
 LEAST_RATIO = 1e-9  # of answers: a thousandth of the least in any set
 MOST_RAYS = 2**28 // len(COLUMNS)  # 3e7: their numbers take 2 GiB, and checking them takes 8 GB
-MOST_EXR_RAYS = 2**24  # float32 holds all ids up to this one
-_EXR_WIDTH = 1024
+TIMEOUT = 300.0  # seconds, of a program
+# The names of the columns, in order. In an .npz file, `ax`, `ay`, `az` are one array, `a`, of the shape (N, 3).
+Layout = tuple[str, ...]
+T = TypeVar("T")
+
+# Visual C++ and others print a NaN as nan(ind) or the like; C has letters, digits and _ between the brackets.
+_NAN = re.compile(r"nan\([A-Za-z0-9_]{0,32}\)", re.IGNORECASE)
+_LONGEST_LINE = 2**20  # characters
+_ROW_BYTES, _TOP_BYTES = 1024, 2**20  # of CSV: five times what the digits of a row need; the header
+_TEXT_BYTES = 2**32  # of CSV in memory
+_NUMBER_BYTES = 16  # a `longdouble`
+_ARRAY_TOP_BYTES = 2**14  # NumPy describes an array in 10,000 at most
+_NPZ_HEADER_BYTES = 2**20
+_NPZ_MORE_BYTES = 2**24  # of a file beside its numbers
+_BROKEN_NPZ = (
+    *(zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError),
+    *(RuntimeError, TypeError, ValueError, OverflowError, MemoryError),
+    *(SyntaxError, tokenize.TokenError),  # of NumPy's parser
+)
+
+
+# Rays --------------------------------------------------------------------------------------------------------------
 
 
 def write(path: str | Path, rays: RaySet) -> Path:
-    """Write .csv, .npz or .exr, completely or not at all.
-
-    ValueError for another file ending, or for a set that the format cannot hold: EXR has float32, and ids up to 2²⁴.
-    OSError where the file cannot be written.
-    """
+    """Write .csv or .npz, completely or not at all. ValueError for another file ending; OSError where that fails."""
     path = writable(path, SUFFIXES)
-    if path.suffix.lower() == ".exr":
-        _write_exr(path, rays)
-    else:
-        write_atomically(path, as_csv(rays) if path.suffix.lower() == ".csv" else _as_npz(rays))
+    write_atomically(path, as_csv(rays) if path.suffix.lower() == ".csv" else _as_npz(rays))
     return path
 
 
 def as_csv(rays: RaySet) -> str:
     """The text of the CSV file."""
-    columns = RAY_LAYOUTS[media_rays.has_media(rays.header)]
-    return tables.csv_text(rays.header, columns, rays.numbers, whole=media_rays.WHOLE)
+    columns, header = RAY_LAYOUTS[headers.has_media(rays.header)], rays.header
+    top = [f"# {key}: {value if value == _value(value) else json.dumps(value)}" for key, value in header.items()]
+    row = ",".join("%d" if name in ("id", "medium") else "%r" for name in columns)
+    return "\n".join([*top, ",".join(columns), *(row % tuple(x) for x in rays.numbers.tolist()), ""])
 
 
 def _as_npz(rays: RaySet) -> bytes:
     n_from, n_to = indices(rays.rays.k)
     arrays = {"id": rays.ids, "a": rays.rays.a, "n": rays.rays.n, "n_from": n_from, "n_to": n_to}
-    if media_rays.has_media(rays.header):
-        wavelength, medium = media_rays.columns(rays.header, rays.ids).T
+    if headers.has_media(rays.header):
+        wavelength, medium = headers.columns(rays.header, rays.ids).T
         arrays |= {"wavelength": wavelength.astype(rays.rays.k.dtype), "medium": medium.astype(np.int64)}
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
@@ -76,34 +100,13 @@ def _as_npz(rays: RaySet) -> bytes:
     return buffer.getvalue()
 
 
-def _write_exr(path: Path, rays: RaySet) -> None:
-    """One pixel per ray, row by row, at most 1024 pixels wide."""
-    if rays.precision != "f32" or len(rays) > MOST_EXR_RAYS:
-        raise ValueError(
-            f"{path}: {len(rays)} rays in {rays.precision}; EXR holds f32 only, and up to {MOST_EXR_RAYS} rays"
-        )
-    width = min(len(rays), _EXR_WIDTH)
-    height = -(-len(rays) // width)
-    columns = RAY_LAYOUTS[media_rays.has_media(rays.header)]
-    pixels = np.zeros((height * width, len(columns)), np.float32)
-    pixels[len(rays) :, 0] = tables.EXR_UNUSED
-    pixels[: len(rays)] = rays.numbers
-    metadata = {tables.EXR_HEADER: json.dumps(rays.header), **image_file.NO_DATE}
-    image_file.write_exr(path, pixels.reshape(height, width, -1), columns, metadata)
-
-
 def read(path: str | Path) -> RaySet:
     """The rays of a file that is as `write` left it.
 
     ValueError, one line, for another format, more than MOST_RAYS, a missing header, a cell that is not a number, or a
     checksum that does not match (a file that was edited or cut short). OSError where the file cannot be read.
     """
-    path = Path(path)
-    table = tables.read(path, RAY_LAYOUTS, MOST_RAYS)
-    try:
-        return _rays(table)
-    except ValueError as error:
-        raise ValueError(f"{path}: {one_line(str(error))}") from None
+    return _read(Path(path), RAY_LAYOUTS, MOST_RAYS, _rays)
 
 
 def _rays(table: Table) -> RaySet:
@@ -111,7 +114,6 @@ def _rays(table: Table) -> RaySet:
     if header.get("format") != FORMAT:
         raise ValueError(f"not a file of rays; expected what `mi-refract rays export` writes ({FORMAT})")
     headers.check(header, len(numbers))
-    media_rays.check(header)
     with np.errstate(all="ignore"):
         parts = numbers[:, 1:4], numbers[:, 4:7], numbers[:, 7] / numbers[:, 8]
         a, n, k = (x.astype(PRECISIONS[header["precision"]]) for x in parts)
@@ -122,8 +124,11 @@ def _rays(table: Table) -> RaySet:
     valid = np.isfinite(a).all(1) & np.isfinite(n).all(1) & a.any(1) & n.any(1) & np.isfinite(k) & (k > 0)
     if not valid.all():
         raise ValueError(f"ray {np.argmin(valid)} is invalid: zero or non-finite vector, or index ≤ 0")
-    media_rays.check_ratios(header, k)
+    headers.check_ratios(header, k)
     return rays
+
+
+# Answers -----------------------------------------------------------------------------------------------------------
 
 
 def read_answers(path: str | Path, *, most: int = MOST_RAYS) -> Answers:
@@ -131,13 +136,16 @@ def read_answers(path: str | Path, *, most: int = MOST_RAYS) -> Answers:
 
     ValueError, one line, where it holds none, or more. OSError where it cannot be read.
     """
-    return _answers(str(path), tables.read(Path(path), ANSWER_LAYOUTS, most))
+    return _read(Path(path), ANSWER_LAYOUTS, most, _answers)
 
 
 def parse_answers(text: str | bytes, name: str = "answers") -> Answers:
     """The answers in the text of a CSV file. ValueError, one line that begins with `name`, where it holds none."""
     stream = io.BytesIO(text.encode() if isinstance(text, str) else text)
-    return _answers(name, tables.read_csv(name, stream, ANSWER_LAYOUTS, MOST_RAYS))
+    try:
+        return _answers(_read_csv(stream, ANSWER_LAYOUTS, MOST_RAYS))
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
 
 
 def most_answers(rays: Sized) -> int:
@@ -145,16 +153,197 @@ def most_answers(rays: Sized) -> int:
     return 2 * len(rays) + 100
 
 
-def _answers(name: str, table: Table) -> Answers:
-    header: Header = table.header
+def _answers(table: Table) -> Answers:
     columns = dict(zip(table.columns, table.numbers.T, strict=True))
     ids, transmitted, ratios = columns["id"], columns.get(TRANSMITTED), columns.get(N_RATIO)
     if len(wrong := ids[~(np.abs(ids) < 2**53) | (np.rint(ids) != ids)]):
-        found = f"{len(wrong)} ids are not whole numbers below 2^53, the first is {wrong[0]:g}"
-        raise ValueError(f"{name}: {found}; expected the ids of the rays")
+        text = f"{len(wrong)} ids are not whole numbers below 2^53, the first is {wrong[0]:g}"
+        raise ValueError(f"{text}; expected the ids of the rays")
     if transmitted is not None and len(wrong := transmitted[~np.isin(transmitted, (0, 1))]):
-        raise ValueError(f"{name}: {TRANSMITTED} is {wrong[0]} for {len(wrong)} rays; expected 0 or 1")
+        raise ValueError(f"{TRANSMITTED} is {wrong[0]} for {len(wrong)} rays; expected 0 or 1")
     if ratios is not None and len(wrong := ratios[~((ratios >= LEAST_RATIO) & (ratios <= 1 / LEAST_RATIO))]):
-        found = f"{N_RATIO} is {wrong[0]:g} for {len(wrong)} rays"
-        raise ValueError(f"{name}: {found}; expected n_from / n_to, {LEAST_RATIO:g} … {1 / LEAST_RATIO:g}")
-    return Answers(ids.astype(np.int64), table.numbers[:, 1:4], transmitted, header, ratios)
+        text = f"{N_RATIO} is {wrong[0]:g} for {len(wrong)} rays"
+        raise ValueError(f"{text}; expected n_from / n_to, {LEAST_RATIO:g} … {1 / LEAST_RATIO:g}")
+    return Answers(ids.astype(np.int64), table.numbers[:, 1:4], transmitted, table.header, ratios)
+
+
+def answers_of(
+    command: Sequence[str],
+    rays: RaySet,
+    *,
+    timeout: float = TIMEOUT,
+    cwd: str | Path | None = None,
+    env: Mapping[str, str] | None = None,
+) -> Answers:
+    """The answers of a program, which reads rays on stdin and writes answers to stdout, in `timeout` seconds.
+
+    Its stderr is passed through. Every process of its group is ended with it. ValueError, one line that begins with the
+    command, where it ends with another status than 0, answers too late, prints no answers, or more than two for each
+    ray need. OSError where it cannot be started.
+    """
+    if not command:
+        raise ValueError("no command; expected mi-refract rays run [OPTIONS] -- COMMAND")
+    name = shlex.join(command)
+    if not 0 <= timeout <= process_group.LONGEST:
+        raise ValueError(f"--timeout {timeout:g}; expected 0 … {process_group.LONGEST:g} seconds")
+    most = min(most_answers(rays) * _ROW_BYTES + _TOP_BYTES, _TEXT_BYTES)
+    try:
+        ended = process_group.run(command, as_csv(rays).encode(), timeout, cwd=cwd, env=env, most=most)
+    except TooMuchOutputError as error:
+        raise ValueError(f"{name}: {error}; expected one answer a ray") from None
+    except TimeoutError:
+        raise ValueError(f"{name}: did not finish within {timeout:g} s; set a longer --timeout") from None
+    except OSError as error:
+        raise type(error)(f"{name}: cannot be started: {error.strerror or error}") from None
+    if ended.status:
+        raise ValueError(f"{name}: {ended.describe}; expected status 0")
+    return parse_answers(ended.out, name)
+
+
+# Tables of numbers that others wrote -------------------------------------------------------------------------------
+
+
+class Table(NamedTuple):
+    """A header, empty where there is none; the names of the columns; their numbers (N, columns), float64."""
+
+    header: Header
+    columns: Layout
+    numbers: Array
+
+
+def _read(path: Path, layouts: Sequence[Layout], most: int, made: Callable[[Table], T]) -> T:
+    """What is made of the table in a file, which has `most` rows at most, in one of the layouts.
+
+    ValueError, one line that begins with the path, for another format, or what is no such table. OSError where the file
+    cannot be read.
+    """
+    if (suffix := path.suffix.lower()) not in SUFFIXES:
+        raise ValueError(f"{path}: expected a file name that ends in {' or '.join(SUFFIXES)}")
+    numbers = most * _NUMBER_BYTES * max(map(len, layouts))
+    largest = numbers + _NPZ_MORE_BYTES if suffix == ".npz" else most * _ROW_BYTES + _TOP_BYTES
+    with regular_file.opened(path, largest) as stream:
+        try:
+            return made(_READERS[suffix](stream, layouts, most))
+        except ValueError as error:
+            raise ValueError(f"{path}: {one_line(str(error))}") from None
+
+
+class _TooLongError(ValueError):
+    """A line, or a table."""
+
+
+def _read_csv(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
+    """The table in CSV text, whose names of columns are one of the layouts, in order.
+
+    ValueError, one line: bytes that are not text, other columns, a row that is too short, too long, or not of numbers,
+    or more than `most` rows.
+    """
+    number, line, rows_left = 0, "", most + 1  # with the names of the columns
+
+    def lines(text: io.TextIOWrapper) -> Iterator[str]:
+        nonlocal number, line, rows_left
+        for line in iter(lambda: text.readline(_LONGEST_LINE + 1), ""):
+            number += 1
+            if len(line) > _LONGEST_LINE:
+                raise _TooLongError(f"line {number} is longer than {_LONGEST_LINE} characters")
+            if line.strip():
+                rows_left -= not line.startswith("#")
+                if rows_left < 0:
+                    raise _TooLongError(f"more than {most} rows; expected up to {most}")
+                yield _NAN.sub("nan", line) if "(" in line else line
+
+    try:
+        with io.TextIOWrapper(stream, "utf-8-sig") as text:
+            rows, header, columns = lines(text), Header(), tuple[str, ...]()
+            for top in rows:
+                key, colon, value = top.partition(":")
+                if not key.startswith("#"):
+                    columns = tuple(column.strip() for column in top.split(","))
+                    break
+                header[key[1:].strip()] = _value(value.strip()) if colon else ""
+            if columns not in layouts:
+                found = f"the first row is {','.join(columns)[:60]!r}" if columns else "the table is empty"
+                raise ValueError(f"{found}; expected, in this order: {' or '.join(map(','.join, layouts))}")
+            with warnings.catch_warnings(action="ignore", category=UserWarning):  # of a table without rows
+                try:
+                    numbers = np.loadtxt(rows, delimiter=",", ndmin=2)  # `max_rows` would be allocated
+                except (_TooLongError, UnicodeDecodeError):
+                    raise
+                except ValueError:
+                    numbers = np.empty((1, 0))
+    except UnicodeDecodeError:
+        raise ValueError("not text; expected CSV in UTF-8") from None
+    if len(numbers) and numbers.shape[1] != len(columns):
+        raise ValueError(f"line {number} is {line.rstrip()[:60]!r}; expected {len(columns)} numbers")
+    return Table(header, columns, numbers.reshape(-1, len(columns)))
+
+
+def _value(text: Any) -> Any:
+    """The value of JSON text, any other text unchanged, None for anything but text."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):  # of text that is nested too deep for the parser
+        return text
+    except TypeError:
+        return None
+
+
+def _read_npz(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
+    """The table in an archive, in the largest layout that is there; no other array is unpacked.
+
+    ValueError, one line, for what is no such archive, and for arrays that are too large, before they are unpacked.
+    """
+
+    def array_name(column: str) -> str:
+        return column[0] if len(column) == 2 and column[1] in "xyz" else column
+
+    try:
+        with zipfile.ZipFile(stream) as archive:
+            members = {name.removesuffix(".npy") for name in archive.namelist()}
+            whole = [layout for layout in layouts if all(array_name(column) in members for column in layout)]
+            columns = max(whole, key=len, default=layouts[0])
+            widths = Counter(map(array_name, columns))
+            arrays = {name: _numbers(archive, name, width, most) for name, width in widths.items()}
+            if len({len(array) for array in arrays.values()}) > 1:
+                raise ValueError(", ".join(f"{name} has {len(array)} rows" for name, array in arrays.items()))
+            text = _array(archive, "header", _NPZ_HEADER_BYTES) if "header" in members else np.array("")
+            if text.shape or text.dtype.kind != "U":
+                raise ValueError(f"header is {text.dtype} of the shape {text.shape}, not text")
+    except _BROKEN_NPZ as error:
+        found, expected = one_line(str(error)) or type(error).__name__, dict.fromkeys(map(array_name, layouts[0]))
+        raise ValueError(f"{found}; expected an .npz file with {', '.join(expected)}") from None
+    header = _value(str(text))
+    return Table(header if isinstance(header, dict) else {}, columns, np.hstack(list(arrays.values())))
+
+
+def _numbers(archive: zipfile.ZipFile, name: str, width: int, most: int) -> Array:
+    """An array of numbers as (N, width) float64."""
+    array = _array(archive, name, most * _NUMBER_BYTES * width)
+    if not array.ndim or array.shape[1:] not in ((width,), ()) or array.size != len(array) * width:
+        raise ValueError(f"{name} has the shape {array.shape}, not (rows, {width})")
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"{name} holds {array.dtype}, not real numbers")
+    if len(array) > most:
+        raise ValueError(f"{len(array)} rows, more than {most}")
+    with np.errstate(over="ignore"):
+        return array.reshape(len(array), width).astype(np.float64)
+
+
+def _array(archive: zipfile.ZipFile, name: str, most: int) -> NDArray[Any]:
+    """A member of up to `most` bytes, read to its end: only there zipfile compares its checksum."""
+    try:
+        info = archive.getinfo(f"{name}.npy")
+    except KeyError:
+        raise ValueError(f"there is no {name}") from None
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{name} is compressed by method {info.compress_type}")
+    if info.file_size > most + _ARRAY_TOP_BYTES:
+        raise ValueError(f"{name} has {info.file_size} bytes, more than {most + _ARRAY_TOP_BYTES}")
+    with archive.open(info) as stream:
+        array = np.lib.format.read_array(stream, allow_pickle=False)
+        if stream.read(1):
+            raise ValueError(f"{name} is longer than its shape, {array.shape}")
+    return array
+
+
+_READERS = {".csv": _read_csv, ".npz": _read_npz}

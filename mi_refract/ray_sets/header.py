@@ -1,9 +1,16 @@
-"""The header of a file of rays: its keys, and what each of them may be."""
+"""The header of a file of rays: its keys, what each may be, and the media and the wavelength of each ray.
+
+In a set with media, the ratios of indices are those of media at wavelengths. Each ray has a wavelength and a pair of
+media, [from, to]: one of them is a medium of `mi_refract.media`, the other is air, whose index is 1. Both follow from
+the header and from the ray's place in its regime, so they are never stored: media take turns first, then wavelengths,
+then from and to. Where a regime needs k ≥ 1, the pair is turned to give it.
+"""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+import dataclasses
+import functools
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -11,7 +18,9 @@ import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 from numpy.typing import NDArray
 
+from mi_refract import media
 from mi_refract.io.typed_table import convert
+from mi_refract.regimes import REGIMES, Array
 
 Ids = NDArray[np.int64]
 Header = dict[str, Any]  # the `# key: value` lines of a file
@@ -22,10 +31,22 @@ AUTO, FLAG = "auto", "flag"  # detect the signal of total internal reflection; t
 TIR = ("zero", "nan", "reflected", "tangent", FLAG)  # the signals
 LARGEST_WAVELENGTH = 1e9  # nm
 MOST_MEDIA = 64  # media of a set, and wavelengths
+AIR = "air"
+COLUMNS = ("wavelength", "medium")  # of rays with media
+CONVENTION = (
+    "wavelength in nm; medium: the number, from 0, of the pair [from, to] in `media`; n_from / n_to is the ratio of "
+    "their indices at that wavelength, where air has the index 1"
+)
+SMALLEST, LARGEST = 1e-6, 1e6  # of ratios
+# The relative difference of indices that a maker's five decimals, or another formula of a glass, leave open.
+SAME = 1e-5
+TAKE_RATIOS = tuple(name for name, regime in REGIMES.items() if regime.takes_k)  # the regimes that media can be in
+_AIR = dataclasses.replace(media.parse(1.0), name=AIR, relative_to="air")
 
 Text = Annotated[str, Meta(min_length=1, max_length=200)]
 MediumName = Annotated[str, Meta(min_length=1, max_length=512)]
 Wavelength = Annotated[float, Meta(gt=0, lt=LARGEST_WAVELENGTH)]
+Pairs = Annotated[list[tuple[MediumName, MediumName]], Meta(min_length=2, max_length=2 * MOST_MEDIA)]
 
 
 class RaysHeader(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -44,9 +65,7 @@ class RaysHeader(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     regimes: dict[Text, tuple[int, int]]  # first and last id
     checksum: Annotated[str, Meta(pattern="^sha256:[0-9a-f]{64}$")]
     columns_of_media: MediumName | UnsetType = msgspec.field(name="wavelength, medium", default=UNSET)
-    media: Annotated[list[tuple[MediumName, MediumName]], Meta(min_length=2, max_length=2 * MOST_MEDIA)] | UnsetType = (
-        UNSET
-    )
+    media: Pairs | UnsetType = UNSET
     wavelengths: Annotated[list[Wavelength], Meta(min_length=1, max_length=MOST_MEDIA)] | UnsetType = UNSET
 
     def __post_init__(self) -> None:
@@ -57,28 +76,26 @@ class RaysHeader(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"no key `{missing[0]}`; expected all of {', '.join(f'`{key}`' for key in keys)}, or none")
 
 
-def check(header: Mapping[str, Any], rays: int) -> None:
+def check(header: Header, rays: int) -> None:
     """ValueError, one line, for a header that `ray_set.make` does not write for so many rays.
 
     Each regime has `count` rays, one after the other: no ray is without a regime, and none is in two.
     """
-    convert(dict(header), RaysHeader, "header")
+    convert(header, RaysHeader, "header")
     count, regimes = header["count"], header["regimes"]
     if count * len(regimes) != rays or not rays:
-        found = f"the header declares {len(regimes)} × {count} rays, the file has {rays}"
-        raise ValueError(f"{found}; expected `count` rays of each regime")
+        text = f"the header declares {len(regimes)} × {count} rays, the file has {rays}"
+        raise ValueError(f"{text}; expected `count` rays of each regime")
     for i, (name, ends) in enumerate(regimes.items()):
         if ends != [i * count, (i + 1) * count - 1]:
-            found = f"header: regimes: {shown(name)} has the ids {shown(ends)}"
-            raise ValueError(f"{found}; expected {[i * count, (i + 1) * count - 1]}")
-
-
-def as_json(text: str) -> Any:
-    """The value of JSON text. ValueError for any other text, also where it is nested too deep for the parser."""
-    try:
-        return json.loads(text)
-    except RecursionError:
-        raise ValueError("nested too deeply; expected JSON") from None
+            text = f"header: regimes: {shown(name)} has the ids {shown(ends)}"
+            raise ValueError(f"{text}; expected {[i * count, (i + 1) * count - 1]}")
+    if has_media(header):
+        names = [pair[0] for pair in header["media"][::2]]
+        made = of_media(names, header["wavelengths"], header["precision"])
+        if header["media"] != made["media"]:
+            raise ValueError(f"header: media: {shown(header['media'])}; expected {shown(made['media'])}")
+        check_regimes(header)
 
 
 def shown(value: Any) -> str:
@@ -88,3 +105,128 @@ def shown(value: Any) -> str:
     except (RecursionError, ValueError):  # a number of thousands of digits
         text = type(value).__name__
     return text if len(text) <= 60 else f"{text[:60]}…"
+
+
+# Media -------------------------------------------------------------------------------------------------------------
+
+
+def has_media(header: Mapping[str, Any]) -> bool:
+    """Whether the set with this header has wavelengths and media."""
+    return "media" in header
+
+
+def of_media(specs: Sequence[str], wavelengths: Sequence[float], precision: str) -> Header:
+    """The keys of a header for these media, and wavelengths in nm.
+
+    ValueError, one line, for none of either, too many, duplicates in the set's precision, an unknown medium, or one
+    without an index at one of the wavelengths.
+    """
+    text = f"{len(specs)} media and {len(wavelengths)} wavelengths"
+    if not len(specs) or not len(wavelengths):
+        raise ValueError(f"{text}; expected neither, or at least one of each")
+    if max(len(specs), len(wavelengths)) > MOST_MEDIA:
+        raise ValueError(f"{text}; expected up to {MOST_MEDIA} of each")
+    if wrong := [x for x in wavelengths if not 0 < x < LARGEST_WAVELENGTH]:
+        raise ValueError(f"wavelength {wrong[0]:g}; expected nm, a number above 0")
+    rounded = _rounded(wavelengths, precision)
+    if len(np.unique(rounded)) < len(rounded) or not rounded.all():
+        text = f"the wavelengths {shown(wavelengths)} are not all different in {precision}"
+        raise ValueError(f"{text}; expected each once")
+    names = [_parsed(spec).name for spec in specs]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"medium {shown(twice[0])}: {names.count(twice[0])} times; expected each once")
+    in_nm = [float(x) for x in wavelengths]
+    _ratios(tuple(names), tuple(in_nm), precision)
+    pairs = [pair for name in names for pair in ([name, AIR], [AIR, name])]
+    return {"wavelength, medium": CONVENTION, "media": pairs, "wavelengths": in_nm}
+
+
+def check_regimes(header: Header) -> None:
+    """ValueError, one line, for a regime whose ratios are its own, or for fewer rays than there are combinations."""
+    if refused := [name for name in header["regimes"] if name in REGIMES and name not in TAKE_RATIOS]:
+        text = f"regime {refused[0]!r} defines its own ratios of indices"
+        raise ValueError(f"{text}; with media, expected one of {', '.join(map(repr, TAKE_RATIOS))}")
+    if header["count"] < (least := len(header["media"]) * len(header["wavelengths"])):
+        text = f"{header['count']} rays of each regime"
+        raise ValueError(f"{text}; expected {least} or more, one for each medium, wavelength and side of the surface")
+
+
+def columns(header: Header, ids: Ids) -> Array:
+    """(N, 2) float64 of the rays with these ids (N,): wavelength in nm, number of the pair; (N, 0) without media."""
+    if not has_media(header):
+        return np.empty((len(ids), 0))
+    pair, at = _combination(header, ids)
+    return np.column_stack([_rounded(header["wavelengths"], header["precision"])[at], pair])
+
+
+def ratios(header: Header, ids: Ids) -> Array:
+    """(N,) n_from / n_to of the rays with these ids, in the set's precision, as float64. Precondition: `has_media`."""
+    return _table(header)[_combination(header, ids)]
+
+
+def described(header: Header, id_: int) -> str:
+    """The media and the wavelength of a ray, as in "SCHOTT:N-BK7 to air at 486.133 nm"; "" without media."""
+    if not has_media(header):
+        return ""
+    ((wavelength, pair),) = columns(header, np.array([id_]))
+    left, entered = header["media"][int(pair)]
+    return f"{left} to {entered} at {wavelength:.9g} nm"
+
+
+def check_ratios(header: Header, k: Array) -> None:
+    """ValueError, one line, where `k` (N,) of all rays is not the ratio of their media."""
+    if has_media(header):
+        expected = ratios(header, np.arange(len(k)))
+        other = np.flatnonzero(~(np.abs(k.astype(np.float64) - expected) <= SAME * expected))
+        if len(other):
+            text = f"ray {other[0]} has n_from / n_to = {float(k[other[0]]):.9g}"
+            raise ValueError(f"{text}; expected {expected[other[0]]:.9g}, {described(header, int(other[0]))}")
+
+
+def _combination(header: Header, ids: Ids) -> tuple[Ids, Ids]:
+    """The number of the pair and that of the wavelength of each ray, (N,) both."""
+    count, total = header["count"], len(header["media"]) // 2
+    place = ids % count
+    medium, rest = place % total, place // total
+    at, turned = rest % len(header["wavelengths"]), rest // len(header["wavelengths"]) % 2
+    least = np.array([REGIMES[name].least_k if name in REGIMES else 0.0 for name in header["regimes"]])[ids // count]
+    turned = np.where(least > 0, _table(header)[2 * medium, at] < least, turned)
+    return 2 * medium + turned, at
+
+
+def _table(header: Header) -> Array:
+    names = tuple(pair[0] for pair in header["media"][::2])
+    return _ratios(names, tuple(header["wavelengths"]), header["precision"])
+
+
+@functools.lru_cache(maxsize=8)
+def _ratios(names: tuple[str, ...], wavelengths: tuple[float, ...], precision: str) -> Array:
+    """(pairs, wavelengths) n_from / n_to in the set's precision, as float64."""
+    at, rows = _rounded(wavelengths, precision), []
+    for medium in map(_parsed, names):
+        for wavelength in at.tolist():  # an error names the first that is wrong
+            medium.index(wavelength)
+        rows += [media.relative_index(*pair, at) for pair in ((medium, _AIR), (_AIR, medium))]
+    k = _rounded(np.array(rows), precision)
+    if len(wrong := np.argwhere(~((k >= SMALLEST) & (k <= LARGEST)))):
+        pair, i = wrong[0]
+        text = f"{names[pair // 2]}: n = {float(rows[pair - pair % 2][i]):.6g} beside air at {at[i]:.9g} nm"
+        raise ValueError(f"{text}; expected {SMALLEST:g} … {LARGEST:g}")
+    return k
+
+
+def _parsed(spec: str) -> media.Medium:
+    """The medium of a text. ValueError, one line, where it is none, or one of Mitsuba's table."""
+    try:
+        return media.parse(float(spec))
+    except ValueError:
+        pass
+    if ":" not in spec and "(" not in spec:
+        expected = "a number, cauchy(A, B, …) or another formula, SCHOTT:N-BK7 or another glass"
+        raise ValueError(f"medium {shown(spec)}; expected {expected}")
+    return media.parse(spec, "medium")
+
+
+def _rounded(numbers: Iterable[float] | Array, precision: str) -> Array:
+    with np.errstate(over="ignore"):
+        return np.asarray(numbers, np.float64).astype(PRECISIONS[precision]).astype(np.float64)

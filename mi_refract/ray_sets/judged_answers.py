@@ -1,4 +1,15 @@
-"""Errors of the answers to a ray set, for one signal of total internal reflection."""
+"""Errors of the answers to a ray set, for one signal of total internal reflection.
+
+Where the error bound is too wide to judge a direction, rounding of a documented formula still gives only some: it is
+off by L = linear u K in any direction, and by its root along the normal (see `mi_refract.formulas.bounds`). With t the
+direction of `a` along the surface, m the normal on the side that the transmitted ray goes to, D = cos²θ_t, it answers,
+at any length s > 0,
+
+    b = s (k sinθ t + r m + δ),   |δ| ≤ L,   r ≥ 0,   |r² − D| ≤ x
+
+So b is in the plane of incidence, forward, and not on the side that the ray came from, whatever x is. A vector along
+the surface that signals total internal reflection is in that plane and forward; a mirror direction is known entirely.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract import oracle
-from mi_refract.accuracy import Judgement, RayBounds, absolute_radicand, backward_error, judge
+from mi_refract.accuracy import Judgement, RayBounds, absolute_radicand, backward_error, judge, lengths
 from mi_refract.formulas import FORMULAS, ROUNDING, Budget
 from mi_refract.regimes import Array, Rays
 
-from . import possible_directions, tir_signal
+from . import tir_signal
 from .header import PRECISIONS
 from .tir_signal import LOOSEST, SeenAnswers
 
 Flags = NDArray[np.bool_]
+Index = NDArray[np.intp]
 Table = NDArray[np.void]  # a row for each ray, of named columns
 
+UNDECIDABLE = 0.1  # radians: a direction is not judged where its bound is larger
 WIDEST_BOUND = 1e-3  # radians: under a wider bound an answer is no evidence of a mistake
 RIGHT = 4.0  # in u: what rounding a, n and k, and a few operations on them, leaves of an answer's backward error
 F32 = 2.0**-24
@@ -48,9 +61,15 @@ class JudgedAnswers:
 
     @property
     def table(self) -> Table:
-        """What is kept of each ray: errors as of `Judgement`, and which of these an answer is."""
-        verdict, zero, wrong = self.verdict, ~self.b.any(axis=1), self.wrong
-        undecidable = verdict.bounds.chord > possible_directions.UNDECIDABLE
+        """What is kept of each ray: errors as of `Judgement`, which of these an answer is, and which of them a loss of
+        precision could have left: of vectors not unit, of float32, of numbers of up to `digits` digits.
+        """
+        verdict, bounds, zero, wrong = self.verdict, self.verdict.bounds, ~self.b.any(axis=1), self.wrong
+        undecidable = bounds.chord > UNDECIDABLE
+        u, k, exact = 2 * F32, bounds.k, bounds.exact  # u of the inputs, u of the formula
+        single = bounds.budget.chord(u, k, exact.cos_t, exact.transmitted, cos_i=exact.cos_i)
+        lost = verdict.misjudged & (absolute_radicand(bounds.rays) <= bounds.budget.radicand_error_bound(u, k))
+        printed = verdict.compared & (verdict.error <= bounds.chord + 10.0 ** -np.arange(1, MOST_DIGITS + 1)[:, None])
         columns: dict[str, NDArray[Any]] = {
             "angle": verdict.angle,
             "drift": verdict.drift,
@@ -65,31 +84,19 @@ class JudgedAnswers:
             "tir_beyond_bound": verdict.far,
             "undecidable": undecidable,
             "judged": verdict.compared & ~undecidable,
-            "evidence": verdict.bounds.decided & (verdict.bounds.chord <= WIDEST_BOUND),
+            "evidence": bounds.decided & (bounds.chord <= WIDEST_BOUND),
             "beyond_bound": verdict.wrong,
             "wrong": wrong,
             "right": ~wrong & (self.backward <= RIGHT),
             "exact": verdict.meets(ROUNDING),
-            **_losses(verdict),
+            "digits": printed.sum(0, dtype=np.int8),
+            "float32": verdict.compared & (verdict.error <= single) | lost,
+            "lengths": verdict.compared & (verdict.angle <= bounds.chord),
         }
         table = np.empty(len(self.b), [(name, column.dtype) for name, column in columns.items()])
         for name, column in columns.items():
             table[name] = column
         return table
-
-
-def _losses(verdict: Judgement) -> dict[str, NDArray[Any]]:
-    """Which errors a loss of precision could have left: vectors not unit, float32, numbers of up to `digits` digits."""
-    bounds, u = verdict.bounds, 2 * F32  # u of the inputs, u of the formula
-    k, exact = bounds.k, bounds.exact
-    float32 = bounds.budget.chord(u, k, exact.cos_t, exact.transmitted, cos_i=exact.cos_i)
-    lost = verdict.misjudged & (absolute_radicand(bounds.rays) <= bounds.budget.radicand_error_bound(u, k))
-    printed = verdict.compared & (verdict.error <= bounds.chord + 10.0 ** -np.arange(1, MOST_DIGITS + 1)[:, None])
-    return {
-        "digits": printed.sum(0, dtype=np.int8),
-        "float32": verdict.compared & (verdict.error <= float32) | lost,
-        "lengths": verdict.compared & (verdict.angle <= bounds.chord),
-    }
 
 
 def certified(rays: Rays) -> oracle.Certified:
@@ -124,38 +131,71 @@ def judge_answers(
     backward error of an answer that is not wrong.
     """
     seen = see(b, rays, precision, exact or certified(rays))
+    transmits = seen.exact.transmitted
     bounds = RayBounds(rays, seen.exact, budget, seen.u, normalised=True)
     reflected = tir_signal.reflected(seen, transmitted, tir, bounds.decided)
     # Zeros and NaN are no answer, unless they signal total internal reflection.
     blank = ~seen.is_direction & (~reflected | (tir in ("reflected", "tangent")))
-    verdict = judge(seen.b, ~reflected, bounds, seen.exact.transmitted | (tir == "reflected"), blank)
-    backward = _backward(seen, reflected, tir, verdict)
-    return JudgedAnswers(seen.b, verdict, _impossible(seen, reflected, tir, verdict), backward, most_backward)
+    verdict = judge(seen.b, ~reflected, bounds, transmits | (tir == "reflected"), blank)
 
-
-def _backward(seen: SeenAnswers, reflected: Flags, tir: str, verdict: Judgement) -> Array:
-    transmitted, rays = seen.exact.transmitted, seen.rays
-    mirror = reflected & (tir == "reflected")
-    error = np.zeros(len(seen.b))
-    directed = ~reflected | (mirror & ~transmitted)
+    mirror, lost = reflected & (tir == "reflected"), reflected & transmits
+    error, directed = np.zeros(len(seen.b)), ~reflected | (mirror & ~transmits)
     error[directed] = backward_error.of_directions(seen.b[directed], rays[directed], mirror[directed])
-    lost = reflected & transmitted
     error[lost] = backward_error.of_decisions(rays[lost])
     with np.errstate(over="ignore"):
-        return np.where(verdict.blank, np.inf, error / seen.u)
+        backward = np.where(blank, np.inf, error / seen.u)
+
+    # Of the directions that `verdict` does not compare, or under a wide bound only.
+    candidates = seen.is_direction & (~verdict.compared | (bounds.chord > UNDECIDABLE))
+    loosest, impossible = replace(bounds, budget=FORMULAS[LOOSEST].budget), np.zeros(len(candidates), bool)
+    for mask, signal in ((~reflected, ""), (reflected & (tir == "tangent"), tir), (mirror, tir)):
+        some = np.flatnonzero(candidates & mask)
+        impossible[some] = ~possible(seen.b, loosest, some, signal)
+    return JudgedAnswers(seen.b, verdict, impossible, backward, most_backward)
 
 
-def _impossible(seen: SeenAnswers, reflected: Flags, tir: str, verdict: Judgement) -> Flags:
-    """(N,) of the directions that `verdict` does not compare, or under a wide bound only, those that cannot be."""
-    excused = ~verdict.compared | (verdict.bounds.chord > possible_directions.UNDECIDABLE)
-    candidates = seen.is_direction & excused
-    bounds = replace(verdict.bounds, budget=FORMULAS[LOOSEST].budget)
-    impossible = np.zeros(len(candidates), bool)
-    for mask, test in (
-        (candidates & ~reflected, possible_directions.possible),
-        (candidates & reflected & (tir == "tangent"), possible_directions.possible_tangent),
-        (candidates & reflected & (tir == "reflected"), possible_directions.possible_mirror),
-    ):
-        some = np.flatnonzero(mask)
-        impossible[some] = ~test(seen.b, bounds, some)
-    return impossible
+def possible(b: Array, bounds: RayBounds, some: Index, signal: str = "") -> Flags:
+    """(M,) the answers of `b` (N, 3) to the rays `some` (M indices) that rounding of a formula may give.
+
+    `signal`: how they signal total internal reflection, "tangent" or "reflected"; of transmitted directions "".
+    """
+    # The parts of b and of `a` along t, along m, and across both, in extended precision.
+    a, n, b = (_unit(v[some]) for v in (bounds.rays.a, bounds.rays.n, b))
+    c = (a * n).sum(1, keepdims=True)
+    m, tangent = np.where(c < 0, -n, n), a - c * n
+    sine, cosine = lengths(tangent), np.abs(c[:, 0])
+    t = tangent / np.where(sine > 0, sine, 1)[:, None]
+    onward = (b * m).sum(1)
+    rest = b - onward[:, None] * m  # first: next to the normal, t is not orthogonal to m to the last digit
+    along = (rest * t).sum(1)
+    across = lengths(rest - along[:, None] * t)
+
+    u, k, exact = bounds.u[some], bounds.k[some], bounds.exact
+    slack = np.asarray(bounds.budget.of_terms(u, np.minimum(k, 1.0) if signal == "reflected" else k))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if signal == "tangent":
+            e = size = k * sine
+            off, forward = e * across / np.hypot(along, across), along
+        elif signal == "reflected":
+            size = np.ones(len(some))
+            off = np.sqrt(across**2 + (sine * onward + cosine * along) ** 2)
+            forward = sine * along - cosine * onward
+        else:
+            e = k * sine
+            root2 = np.where(exact.transmitted[some], exact.cos_t[some] ** 2, 1 - e * e)
+            x = bounds.budget.radicand_error_bound(u, k)
+            low, high = (np.sqrt(np.maximum(root2 + sign * x, 0)) for sign in (-1, 1))
+            onward = np.where(bounds.budget.side_open(u, exact.cos_i[some]), np.abs(onward), onward)
+            plane = along**2 + across**2
+            nearest = np.where(plane > 0, e * onward * along / plane, low).clip(low, high)
+            off = np.sqrt((nearest**2 + e * e) * across**2 + (e * onward - nearest * along) ** 2)
+            forward, size = e * along + nearest * onward, np.hypot(e, nearest)
+        # A vector of this size is within `slack` of the line of b, and b does not point away from it.
+        return np.asarray((size <= slack) | (off <= slack) & (forward > 0))
+
+
+def _unit(v: Array) -> Array:
+    """Any vectors (M, 3), made unit in extended precision. Precondition: finite, not zero."""
+    wide: Array = v.astype(np.longdouble)
+    wide = wide / np.abs(wide).max(1, keepdims=True, initial=0)  # squares of the least numbers would be 0
+    return np.asarray(wide / lengths(wide)[:, None])

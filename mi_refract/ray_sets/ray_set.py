@@ -3,7 +3,7 @@
 A set holds one or several regimes of `mi_refract.regimes`, rounded to float32 or float64. The same regimes, count,
 precision and seed give the same set, bit for bit. The ratio n_from / n_to is exact: n_to is a power of two, 1 where it
 can be, and no index is below 1. So a program that divides them, in either precision, gets exactly the k of the ray.
-With media and wavelengths (see `media_rays`), their ratios take the place of the regimes' own.
+With media and wavelengths (see `header`), their ratios take the place of the regimes' own.
 """
 
 from __future__ import annotations
@@ -22,8 +22,10 @@ from mi_refract import regimes
 from mi_refract.numerics import float_expansions
 from mi_refract.regimes import Array, Rays
 
-from . import media_rays
+from . import header as headers
 from .header import FORMAT, PRECISIONS, Header, Ids
+
+Rows = NDArray[np.bool_] | NDArray[np.intp] | slice  # a mask (N,), indices, or a range
 
 # Their vectors are unit up to the rounding of each component, as the documented formulas require.
 DEFAULT = tuple(name for name, regime in regimes.REGIMES.items() if regime.unit and not regime.rests_on_denormals)
@@ -49,9 +51,9 @@ class RaySet:
         """The number of rays."""
         return len(self.ids)
 
-    def __getitem__(self, mask: NDArray[np.bool_]) -> RaySet:
-        """The rays of a mask (N,), under the same header."""
-        return RaySet(self.rays[mask], self.ids[mask], self.header)
+    def __getitem__(self, rows: Rows) -> RaySet:
+        """Some of the rays, under the same header."""
+        return RaySet(self.rays[rows], self.ids[rows], self.header)
 
     @property
     def precision(self) -> str:
@@ -74,7 +76,7 @@ class RaySet:
     @property
     def numbers(self) -> Array:
         """(N, 9) float64: id, a, n, n_from, n_to; with media (N, 11): wavelength, medium."""
-        rays, of_media = self.rays, media_rays.columns(self.header, self.ids).T
+        rays, of_media = self.rays, headers.columns(self.header, self.ids).T
         return np.column_stack([self.ids, rays.a, rays.n, *indices(rays.k), *of_media]).astype(np.float64, copy=False)
 
 
@@ -109,15 +111,15 @@ class Answers:
                 raise ValueError(f"answers: transmitted is {wrong[0]}; expected 0 or 1")
             object.__setattr__(self, "transmitted", self.transmitted.astype(bool))  # `~` of an integer is another one
 
-    def __getitem__(self, mask: NDArray[np.bool_]) -> Answers:
-        """The answers of a mask (N,), under the same header."""
-        columns = [None if column is None else column[mask] for column in (self.transmitted, self.n_ratio)]
-        return Answers(self.ids[mask], self.b[mask], columns[0], self.header, columns[1])
+    def __getitem__(self, rows: Rows) -> Answers:
+        """Some of the answers, under the same header."""
+        columns = [None if column is None else column[rows] for column in (self.transmitted, self.n_ratio)]
+        return Answers(self.ids[rows], self.b[rows], columns[0], self.header, columns[1])
 
 
 def default(media: Sequence[str] = ()) -> tuple[str, ...]:
     """The names of DEFAULT; with media those whose ratios are not their own."""
-    return tuple(name for name in DEFAULT if not len(media) or name in media_rays.NAMES)
+    return tuple(name for name in DEFAULT if not len(media) or name in headers.TAKE_RATIOS)
 
 
 def make(
@@ -134,7 +136,7 @@ def make(
 
     `media`: what `mi_refract.media` parses; each ray passes between one of them and air, at one of the `wavelengths` in
     nm. ValueError, one line, for an unknown regime or precision, a duplicate regime, no ray at all; of media see
-    `media_rays.header_of` and `media_rays.check_regimes`.
+    `header.of_media` and `header.check_regimes`.
     """
     from mi_refract import __version__
 
@@ -162,12 +164,12 @@ def make(
         "regimes": {name: [i * count, (i + 1) * count - 1] for i, name in enumerate(names)},
     }
     if len(media) or len(wavelengths):
-        header |= media_rays.header_of(media, wavelengths, precision)
-        media_rays.check_regimes(header)
+        header |= headers.of_media(media, wavelengths, precision)
+        headers.check_regimes(header)
     parts = []
     for name, (first, last) in header["regimes"].items():
-        if media_rays.has_media(header):
-            k = media_rays.ratios(header, np.arange(first, last + 1))
+        if headers.has_media(header):
+            k = headers.ratios(header, np.arange(first, last + 1))
             parts.append(regimes.make_given(name, k, PRECISIONS[precision], seed))
         else:
             parts.append(regimes.make(name, count, PRECISIONS[precision], seed))

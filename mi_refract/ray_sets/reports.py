@@ -28,22 +28,6 @@ if TYPE_CHECKING:
 
 SCHEMA = 1
 STYLES = {"wrong": "bold red", "within bound": "yellow", "right": "", "exact": "green"}
-TERMS = {
-    "ulp": "the spacing of numbers at 1: 2⁻²³ in f32, 2⁻⁵² in f64",
-    "worst, p99, mean": "angles to the certified direction, over the rays whose total internal reflection was "
-    "classified correctly; rounding the exact answer costs up to 0.43 ulp",
-    "undecidable": "rays whose error bound is above 0.1 rad, where a direction within it shows little: only the plane "
-    "of incidence, the side of the surface, and forward or backward are judged",
-    "TIR misclassified": "rays called transmitted that are totally reflected, or the reverse",
-    "TIR beyond bound": "those of them that are farther from the critical angle than rounding can explain",
-    "length error": "the difference between the length of an answer and 1, or the length of a where that is nearer",
-    "error / bound": "the largest ratio of an error to the a-priori bound of the chosen formula for that ray",
-    "m": "backward error of all answers: each is the exact refraction of inputs a, n and k that are off by m u, "
-    "relative to their lengths; u is half an ulp. Of a wrong decision on TIR: of inputs beyond the critical angle",
-    "right": f"answers that are not wrong, with m up to {RIGHT:g}; the others are only as good as the error bound",
-    "exact": "answers that are the certified direction, rounded: no formula can do better",
-    "wrong": "answers whose error exceeds the bound, whose TIR is misclassified beyond it, or that are not a direction",
-}
 MEANING = f"right: backward error m ≤ {RIGHT:g} u (exact for inputs perturbed by at most {RIGHT:g} roundings)"
 _SIGNALLED = "total internal reflection is signalled by"
 SIGNALS = {
@@ -270,7 +254,7 @@ def write_html(path: str | Path, findings: Findings, context: Mapping[str, Any],
         "explanations": findings.explanations,
         "head": list(cells(findings.regimes[0], findings.ulp)) if findings.regimes else [],
         "rows": rows,
-        "terms": TERMS,
+        "most_right": f"{RIGHT:g}",
         "pi": math.pi,
         "command": replay,
     }

@@ -8,11 +8,11 @@ numbers, `junit` the XML of test results). Nothing is measured or judged here.
 
 __all__ = [
     "embedded_images",
-    "first_page",
     "html_page",
     "junit",
     "number_text",
     "plots",
     "row",
     "run_report",
+    "study_page",
 ]

@@ -144,10 +144,8 @@ def scatter_svg(panels: Mapping[str, Scatter], axes: Axes, *, floor: str, front:
     The points of a subject are joined, so that its spread over the cases is one vertical stroke.
     Points without a place on the axes are left out. "" where nothing can be drawn.
     """
-    drawn = {
-        setting: {s: p for s, points in panel.points.items() if (p := sorted(drawable(points, axes)))}
-        for setting, panel in panels.items()
-    }
+    places = ((x, {s: sorted(drawable(p, axes)) for s, p in panel.points.items()}) for x, panel in panels.items())
+    drawn = {setting: {s: p for s, p in subjects.items() if p} for setting, subjects in places}
     drawn = {setting: subjects for setting, subjects in drawn.items() if subjects}
     if not drawn:
         return ""
@@ -160,14 +158,20 @@ def scatter_svg(panels: Mapping[str, Scatter], axes: Axes, *, floor: str, front:
         grid = figure.subplots(lines, columns, sharey=True, squeeze=False).flatten()
         for panel, (setting, subjects) in zip(grid, drawn.items(), strict=False):
             panel.set(xscale=axes.x_scale, yscale=axes.y_scale, title=setting, xlabel=axes.x)
-            _strokes(panel, subjects, panels[setting], colours)
+            for subject, points in subjects.items():
+                x, y = zip(*points, strict=True)
+                panel.plot(x, y, color=colours[subject], marker="o", markersize=4.5, linewidth=1)
+            for subject, low, high, height in panels[setting].intervals:
+                if subject in subjects:
+                    panel.plot([low, high], [height, height], color=colours[subject], linewidth=1)
+            panel.margins(x=0.3, y=0.1)
             every = [point for points in subjects.values() for point in points]
             if axes.x_scale == "linear" and min(every)[0] >= 0:
                 panel.set_xlim(left=0)
-            if math.isfinite(x := panels[setting].floor):
-                panel.axvline(x, color=MUTED, linewidth=1, linestyle=(0, (1, 2)))
+            if math.isfinite(least := panels[setting].floor):
+                panel.axvline(least, color=MUTED, linewidth=1, linestyle=(0, (1, 2)))
                 place = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "fontsize": 9.5}
-                panel.annotate(floor, (x, 0), (-4, 6), color=MUTED, ha="right", **place)
+                panel.annotate(floor, (least, 0), (-4, 6), color=MUTED, ha="right", **place)
             if front:  # steps along the front, on to the panel's edges
                 best, (_, right), (_, top) = pareto(every), panel.get_xlim(), panel.get_ylim()
                 xs, ys = zip((best[0][0], top), *best, (right, best[-1][1]), strict=True)
@@ -191,16 +195,6 @@ def pareto(points: Points) -> list[tuple[float, float]]:
         if not front or y < front[-1][1]:
             front.append((x, y))
     return front
-
-
-def _strokes(panel: Panel, subjects: Mapping[str, Points], given: Scatter, colours: Mapping[str, str]) -> None:
-    for subject, points in subjects.items():
-        x, y = zip(*points, strict=True)
-        panel.plot(x, y, color=colours[subject], marker="o", markersize=4.5, linewidth=1)
-    for subject, low, high, height in given.intervals:
-        if subject in subjects:
-            panel.plot([low, high], [height, height], color=colours[subject], linewidth=1)
-    panel.margins(x=0.3, y=0.1)
 
 
 @contextmanager

@@ -8,14 +8,14 @@ Everything here lays out what the rows already say; nothing is measured, average
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.sanitise import printable
 
-from . import first_page, junit, study_page
+from . import junit, study_page
 from .embedded_images import EmbeddedImages
 from .html_page import write_page
 from .number_text import distinguishable
@@ -33,38 +33,6 @@ def write_json(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]
     document = {"schema": SCHEMA, "context": context, "rows": [row.as_dict() for row in rows]}
     text = json.dumps(strict(document), indent=1, allow_nan=False)
     write_atomically(path, text + "\n")
-
-
-def read_json(path: str | Path) -> tuple[list[Row], dict[str, Any]]:
-    """Read what `write_json` wrote. In `replay` and the context, non-finite numbers stay words.
-
-    Errors: a one-line ValueError naming the file for another schema, a malformed document, or a verdict that
-    does not follow from its row; OSError.
-    """
-    import msgspec
-
-    try:
-        document = msgspec.json.decode(Path(path).read_bytes(), type=dict[str, Any])
-        if document.get("schema") != SCHEMA:
-            raise ValueError(f"schema {document.get('schema')!r}; expected {SCHEMA}")
-        rows = [_row(f"$.rows[{number}]", data) for number, data in enumerate(document["rows"])]
-        return rows, dict(document["context"])
-    except RecursionError:
-        raise ValueError(f"{path}: brackets nested too deeply; expected JSON as `write_json` writes it") from None
-    except KeyError as error:
-        raise ValueError(f"{path}: {error} is missing") from error
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
-
-
-def _row(where: str, data: Any) -> Row:
-    try:
-        row = Row.from_dict(data)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from error
-    if data.get("verdict") != row.verdict:
-        raise ValueError(f"{where}: verdict {data.get('verdict')!r}; expected {row.verdict!r}, as the values say")
-    return row
 
 
 def verdict(rows: Sequence[Row]) -> str:
@@ -86,37 +54,41 @@ def write_junit(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any
 
     Rows without a budget are left out: a case that cannot fail is no test. Errors: OSError.
     """
-    suites = {study: [case for row in members for case in _cases(row)] for study, members in by_study(rows).items()}
+
+    def cases(row: Row) -> Iterator[junit.Case]:
+        name = " / ".join((row.subject, row.case, row.setting))
+        if not row.values:
+            yield junit.Case(row.study, name, "skipped", row.reason)
+            return
+        for metric, budget in row.budgets.items():
+            if metric in row.broken:
+                text, limit = distinguishable(row.values[metric], budget)
+                details = f"value {row.values[metric]!r}, budget {budget!r}\n{row.reason}\n{row.replay_text}"
+                lines = [line for line in details.splitlines() if line]
+                message = f"{metric} {text}, budget {limit}"
+                yield junit.Case(row.study, f"{name}: {metric}", "failure", message, lines)
+            else:
+                yield junit.Case(row.study, f"{name}: {metric}")
+
+    suites = {study: [case for row in members for case in cases(row)] for study, members in by_study(rows).items()}
     junit.write_junit(path, context.get("title", "mi_refract"), suites)
-
-
-def _cases(row: Row) -> list[junit.Case]:
-    name = " / ".join((row.subject, row.case, row.setting))
-    if not row.values:
-        return [junit.Case(row.study, name, "skipped", row.reason)]
-    cases = []
-    for metric, budget in row.budgets.items():
-        case = junit.Case(row.study, f"{name}: {metric}")
-        if metric in row.broken:
-            text, limit = distinguishable(row.values[metric], budget)
-            details = f"value {row.values[metric]!r}, budget {budget!r}\n{row.reason}\n{row.replay_text}"
-            lines = [line for line in details.splitlines() if line]
-            case = junit.Case(case.group, case.name, "failure", f"{metric} {text}, budget {limit}", lines)
-        cases.append(case)
-    return cases
 
 
 def summary(rows: Sequence[Row], context: Mapping[str, Any] | None = None) -> RenderableType:
     """For rich's console: broken budgets, the answers of the context's `first_page`, then the verdict."""
     from rich.console import Group
+    from rich.padding import Padding
     from rich.text import Text
 
-    page = (context or {}).get("first_page")
     broken = [(row, metric) for row in rows for metric in row.broken]
     parts: list[RenderableType] = []
     if broken:
         parts += [_bounds_table("broken budget", "budget", broken, "bold red"), Text()]
-    parts += first_page.terminal(page) if page else []
+    styles = {"yes": "bold green", "no": "bold red", "plain": "bold", "not measured": "bold yellow"}
+    for answer in (context or {}).get("first_page", {}).get("answers", ()):
+        text = Text.assemble(*((part, "cyan" if i % 2 else "") for i, part in enumerate(answer["text"].split("`"))))
+        parts.append(Text(answer["question"].replace("`", ""), style=styles[answer["state"]]))
+        parts.append(Padding(text, (0, 0, 1, 2)))
     return Group(*parts, Text(verdict(rows), style="bold red" if broken else "bold"))
 
 

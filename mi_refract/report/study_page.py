@@ -1,8 +1,9 @@
-"""The content of the page, laid out from the rows: panels, tables, plots, images. Nothing is measured or judged here.
+"""The content of the page, laid out from the rows: the first screen, panels, tables, plots and images.
 
-`context` is what all rows share. Every entry is shown as it is, except five that steer the page:
+Nothing is measured or judged here. `context` is what all rows share. Every entry is shown as it is, except five that
+steer the page:
 
-- `first_page`: questions and answers on top (`first_page.FirstPage`);
+- `first_page`: questions and answers on top (`FirstPage`); words between backticks are code;
 - `title`: the page's name;
 - `studies`: {study: {"title", "text", "terms", "axes"}}, all optional: heading, introduction and glossary of a study,
   and the fields of `plots.Axes`, which say how the curves of its rows are drawn;
@@ -17,9 +18,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal, NotRequired, TypedDict, get_args
 
-from . import first_page
 from .embedded_images import EmbeddedImages, packed
 from .number_text import compact, distinguishable
 from .plots import Axes, Points, Scatter, curves_svg, drawable, scatter_svg
@@ -28,36 +28,142 @@ from .row import Row, as_json, by_study
 STEERING = ("first_page", "title", "studies", "scatter", "replay")
 ROLES = ("reference", "test", "overlay", "difference")
 LABELS = ("subject", "case", "setting")
+NOT_RUN = "not run"
+State = Literal["yes", "no", "plain", "not measured"]
+STATES: tuple[State, ...] = get_args(State)
+
+
+class Answer(TypedDict):
+    """A question, and the answer that the rows give.
+
+    `state`: "yes" where every budget behind the answer held, "no" where one did not, "plain" where there is none, "not
+    measured" where no row answers. `study`: the section to link to; NOT_RUN for the list of what was not run; or "".
+    """
+
+    question: str
+    text: str
+    state: State
+    study: str
+
+
+class ShownRow(TypedDict):
+    """Images or curves of one row, by the row's name: their labels by role or by curve, and the caption."""
+
+    row: str
+    labels: Mapping[str, str]
+    caption: str
+    axes: NotRequired[Mapping[str, Any]]
+
+
+class FirstPage(TypedDict):
+    """All of the first screen: an introduction, answers, an image, a plot; all but the answers are optional."""
+
+    lead: NotRequired[str]
+    answers: Sequence[Answer]
+    image: NotRequired[ShownRow]
+    plot: NotRequired[ShownRow]
 
 
 def prepare(rows: Sequence[Row], context: Mapping[str, Any], images: EmbeddedImages) -> dict[str, Any]:
-    """The values for the template `report.html.j2`. Errors: those of `EmbeddedImages.embed`."""
+    """The values for the template `report.html.j2`.
+
+    Errors: ValueError where the first page has an unknown state or row; those of `EmbeddedImages.embed`.
+    """
     verdicts = Counter(row.verdict for row in rows)
     studies = by_study(rows)
     keys = {name: f"study-{number}" for number, name in enumerate(studies, 1)}
-    first, anchors = context.get("first_page"), keys | {first_page.NOT_RUN: "missing"}
-    failures = [
-        {
-            "row": row,
-            "broken": [(m, _cell(row, m)) for m in row.broken],
-            "others": [_phrase(row, m) for m in row.values if m not in row.broken],
-            "replay": row.replay_text,
-        }
-        for row in rows
-        if row.broken
-    ]
+    first: FirstPage | None = context.get("first_page")
     return {
-        "first": first_page.prepare(rows, first, anchors, images) if first else None,
+        "first": first and _first_screen(rows, first, keys | {NOT_RUN: "missing"}, images),
         "title": context.get("title", "mi_refract"),
         "state": "fail" if verdicts["fail"] else "pass" if verdicts["pass"] else "empty",
-        "counts": [(word, verdicts[word]) for word in ("pass", "fail", "not run", "info")],
+        "counts": [(word, verdicts[word]) for word in ("pass", "fail", NOT_RUN, "info")],
         "context": {key: value for key, value in context.items() if key not in STEERING},
         "command": context.get("replay", ""),
-        "failures": failures,
-        "missing": first_page.not_run(rows),
-        "absent": verdicts["not run"],
+        "failures": [row for row in rows if row.broken],
+        "missing": not_run(rows),
+        "absent": verdicts[NOT_RUN],
         "studies": [_study(name, members, context, images, keys[name]) for name, members in studies.items()],
+        "cell": cell,
+        "phrase": phrase,
     }
+
+
+def not_run(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """The rows that were not run by their reason, the most frequent first."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        if row.verdict == NOT_RUN:
+            groups.setdefault(row.reason, []).append(row)
+    return dict(sorted(groups.items(), key=lambda item: -len(item[1])))
+
+
+def _first_screen(
+    rows: Sequence[Row], page: FirstPage, anchors: Mapping[str, str], images: EmbeddedImages
+) -> dict[str, Any]:
+    """Answers with links (`anchors` by study), panes and SVG."""
+    by_name = {row.name: row for row in rows}
+    for answer in page["answers"]:
+        if answer["state"] not in STATES:
+            raise ValueError(f"first page: state {answer['state']!r}; expected {', '.join(STATES)}")
+    for shown in filter(None, (page.get("image"), page.get("plot"))):
+        if shown["row"] not in by_name:
+            raise ValueError(f"first page: there is no row {shown['row']!r}")
+    screen: dict[str, Any] = {"lead": page.get("lead", ""), "image": None, "plot": None}
+    screen["answers"] = [{**answer, "link": anchors.get(answer["study"], "")} for answer in page["answers"]]
+    if image := page.get("image"):
+        files = by_name[image["row"]].images
+        panes = [images.embed(files[role]) | {"role": role, "label": x} for role, x in image["labels"].items()]
+        screen["image"] = {"panes": panes, "caption": image["caption"]}
+    if plot := page.get("plot"):
+        curves = {label: by_name[plot["row"]].curves[name] for name, label in plot["labels"].items()}
+        svg = curves_svg(curves, Axes(**plot.get("axes", {})), salt="first", size=(6.2, 2.3))
+        screen["plot"] = {"svg": svg, "caption": plot["caption"]}
+    return screen
+
+
+# Cells ----------------------------------------------------------------------------------------------------------------
+
+
+def cell(row: Row, metric: str) -> dict[str, str] | None:
+    """Text, state and bound of a value; the bound with how the value compares: NaN is neither above nor below."""
+    if metric not in row.values:
+        return None
+    value = row.values[metric]
+    if metric not in row.bounds:
+        return {"state": "info", "text": compact(value), "budget": ""}
+    bound = row.bounds[metric]
+    text, limit = distinguishable(value, bound)
+    state = "fail" if metric in row.broken else "missed" if metric in row.missed else "pass"
+    sign = "≤" if value <= bound else ">" if value > bound else "≰"
+    return {"state": state, "text": text, "budget": f"{sign} {limit}"}
+
+
+def phrase(row: Row, metric: str) -> str:
+    """A metric, its value and its bound in a line."""
+    shown = cell(row, metric)
+    return " ".join(filter(None, (metric, shown["text"], shown["budget"]))) if shown else metric
+
+
+def _shade(row: Row | None, metric: str, scale: tuple[float, float]) -> dict[str, Any]:
+    """A cell of the matrix: its number, how deep its colour is on the logarithmic scale, what it broke or missed."""
+    if row is None or not row.values:
+        text, state, hint = ("not run", "not-run", row.reason) if row else ("·", "none", "")
+        return {"text": text, "state": state, "depth": 0, "hint": hint, "broken": []}
+    low, high = map(math.log, scale)
+    value, shown = row.values.get(metric, 0), cell(row, metric)
+    place = (math.log(value) - low) / (high - low) if 0 < value < math.inf and high > low else 0
+    beyond = (*row.broken, *row.missed)
+    return {
+        "text": shown["text"] if shown else "·",
+        "state": row.verdict,
+        "depth": round(place, 3) if value < math.inf else 1,  # NaN is no small error
+        "hint": "\n".join(phrase(row, m) for m in row.values),
+        "broken": [shown["budget"] if shown and m == metric else phrase(row, m) for m in beyond],
+    }
+
+
+# Studies --------------------------------------------------------------------------------------------------------------
 
 
 def _study(name: str, rows: list[Row], context: Mapping[str, Any], images: EmbeddedImages, key: str) -> dict[str, Any]:
@@ -81,7 +187,7 @@ def _study(name: str, rows: list[Row], context: Mapping[str, Any], images: Embed
         "failures": sum(row.verdict == "fail" for row in rows),
         "scale": scale,
         "panels": _panels(rows, metrics, scale),
-        "missing": first_page.not_run(rows),
+        "missing": not_run(rows),
         "data": packed(as_json(rows)),
         "count": len(rows),
         "scatters": [scatter for scatter in drawn if scatter],
@@ -98,8 +204,9 @@ def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | No
     """
     run = {(row.setting, label) for row in rows if row.values for label in (("s", row.subject), ("c", row.case))}
     rows = [row for row in rows if {(row.setting, ("s", row.subject)), (row.setting, ("c", row.case))} <= run]
-    settings = dict.fromkeys(row.setting for row in rows)
-    parts = {setting: [row for row in rows if row.setting == setting] for setting in settings}
+    parts: dict[str, list[Row]] = {}
+    for row in rows:
+        parts.setdefault(row.setting, []).append(row)
     matrices = {setting: _matrix(part, metrics, scale) for setting, part in parts.items()}
     if any(matrices.values()):
         return [{"heading": s, "matrix": matrices[s], "table": _table(part, metrics, s)} for s, part in parts.items()]
@@ -118,53 +225,12 @@ def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | No
 
 def _matrix(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> dict[str, Any] | None:
     telling = [row for row in rows if metrics[0] in row.values or row.broken]
-    subjects = list(dict.fromkeys(row.subject for row in telling))
-    cases = list(dict.fromkeys(row.case for row in telling))
+    subjects, cases = ({getattr(row, label): None for row in telling} for label in ("subject", "case"))
     cells = {(row.subject, row.case): row for row in rows}
     if len(subjects) < 3 or len(cases) < 3 or len(cells) < len(rows) or scale is None:
         return None
     lines = [(s, [_shade(cells.get((s, c)), metrics[0], scale) for c in cases]) for s in subjects]
-    return {"metric": metrics[0], "cases": cases, "lines": lines}
-
-
-def _shade(row: Row | None, metric: str, scale: tuple[float, float]) -> dict[str, Any]:
-    """A cell of the matrix: its number, how deep its colour is on the logarithmic scale, what it broke or missed."""
-    if row is None or not row.values:
-        text, state, hint = ("not run", "not-run", row.reason) if row else ("·", "none", "")
-        return {"text": text, "state": state, "depth": 0, "hint": hint, "broken": []}
-    low, high = map(math.log, scale)
-    value = row.values.get(metric, 0)
-    place = (math.log(value) - low) / (high - low) if 0 < value < math.inf and high > low else 0
-    cell = _cell(row, metric)
-    return {
-        "text": cell["text"] if cell else "·",
-        "state": row.verdict,
-        "depth": round(place, 3) if value < math.inf else 1,  # NaN is no small error
-        "hint": "\n".join(_phrase(row, m) for m in row.values),
-        "broken": [_bound(row, m) if m == metric else _phrase(row, m) for m in (*row.broken, *row.missed)],
-    }
-
-
-def _cell(row: Row, metric: str) -> dict[str, str] | None:
-    if metric not in row.values:
-        return None
-    if metric not in row.bounds:
-        return {"state": "info", "text": compact(row.values[metric]), "budget": ""}
-    text = distinguishable(row.values[metric], row.bounds[metric])[0]
-    state = "fail" if metric in row.broken else "missed" if metric in row.missed else "pass"
-    return {"state": state, "text": text, "budget": _bound(row, metric)}
-
-
-def _phrase(row: Row, metric: str) -> str:
-    cell = _cell(row, metric)
-    return " ".join(filter(None, (metric, cell["text"], cell["budget"]))) if cell else metric
-
-
-def _bound(row: Row, metric: str) -> str:
-    """The budget or goal with how the value compares with it; NaN is neither above nor below."""
-    value, budget = row.values[metric], row.bounds[metric]
-    sign = "≤" if value <= budget else ">" if value > budget else "≰"
-    return f"{sign} {distinguishable(value, budget)[1]}"
+    return {"metric": metrics[0], "cases": list(cases), "lines": lines}
 
 
 def _table(rows: list[Row], metrics: list[str], heading: str = "") -> dict[str, Any]:
@@ -175,10 +241,7 @@ def _table(rows: list[Row], metrics: list[str], heading: str = "") -> dict[str, 
     lines, above = [], [""] * len(keys)
     for row in rows:
         labels = [getattr(row, key) for key in keys]
-        again = [labels[: i + 1] == above[: i + 1] for i in range(len(keys))]
-        cells = [_cell(row, metric) for metric in used]
-        marked = list(zip(labels, again, strict=True))
-        lines.append({"row": row, "labels": marked, "cells": cells, "replay": row.replay_text})
+        lines.append((row, [(label, labels[: i + 1] == above[: i + 1]) for i, label in enumerate(labels)]))
         above = labels
     shared = [label for k in LABELS if k not in keys and (label := getattr(rows[0], k)) and label != heading]
     return {"keys": keys, "metrics": used, "lines": lines, "shared": " · ".join(shared)}
@@ -189,7 +252,7 @@ def _undrawn(lines: Iterable[Points], axes: Axes) -> int:
 
 
 def _scatter(scatter: Mapping[str, Any], rows: list[Row], salt: str) -> dict[str, Any] | None:
-    x, y = scatter["x"], scatter["y"]
+    x, y, floor = scatter["x"], scatter["y"], scatter.get("floor", "")
     panels: dict[str, Scatter] = {}
     for row in rows:
         panel = panels.setdefault(row.setting, Scatter())
@@ -197,18 +260,25 @@ def _scatter(scatter: Mapping[str, Any], rows: list[Row], salt: str) -> dict[str
             panel.points.setdefault(row.subject, []).append((row.values[x], row.values[y]))
             low, high = (row.values.get(metric, math.nan) for metric in scatter.get("interval", (x, x)))
             panel.intervals.append((row.subject, low, high, row.values[y]))
-        elif x in row.values and row.subject == scatter.get("floor"):
+        elif x in row.values and row.subject == floor:
             panel.floor = row.values[x]
     lines = [points for panel in panels.values() for points in panel.points.values()]
     if not lines:
         return None
     axes = Axes(x, y, x_scale="linear")
-    svg = scatter_svg(panels, axes, floor=scatter.get("floor", ""), front=scatter.get("front", False), salt=salt)
+    svg = scatter_svg(panels, axes, floor=floor, front=scatter.get("front", False), salt=salt)
     return {"title": scatter.get("title", f"{y} against {x}"), "svg": svg, "omitted": _undrawn(lines, axes)}
 
 
 def _figure(row: Row, images: EmbeddedImages) -> dict[str, Any]:
     roles = sorted(row.images, key=lambda role: ROLES.index(role) if role in ROLES else len(ROLES))
-    paints = {role: ("signed", 3) if role == "difference" else ("light", None) for role in roles}
-    panes = [{"role": r, "paint": p, "gain": gain} | images.embed(row.images[r]) for r, (p, gain) in paints.items()]
+    panes = [
+        {
+            "role": role,
+            "paint": "signed" if role == "difference" else "light",
+            "gain": 3 if role == "difference" else None,
+        }
+        | images.embed(row.images[role])
+        for role in roles
+    ]
     return {"row": row, "panes": panes, "paired": roles[:2] == ["reference", "test"]}

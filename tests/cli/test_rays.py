@@ -15,7 +15,7 @@ import pytest
 from support.media_rays import CROWN, FLINT
 from support.ray_programs import glsl
 
-from mi_refract.ray_sets import files, ray_set, run_program
+from mi_refract.ray_sets import files, ray_set
 
 # A renderer's side of it, with nothing of ours: the comment on stderr must get through.
 PROGRAM = """
@@ -50,10 +50,10 @@ def call(tmp_path, monkeypatch, run):
     return lambda *arguments: run("rays", *arguments)
 
 
-def answer(path, to, program=glsl, lines=()):
-    b = program(to.rays.a, to.rays.n, to.rays.k).astype(float)
+def answer(to, lines=()):
+    b = glsl(to.rays.a, to.rays.n, to.rays.k).astype(float)
     rows = [f"{i},{x!r},{y!r},{z!r}" for i, (x, y, z) in zip(to.ids, b.tolist(), strict=True)]
-    Path(path).write_text("\n".join([*lines, "id,bx,by,bz", *rows, ""]))
+    Path("answers.csv").write_text("\n".join([*lines, "id,bx,by,bz", *rows, ""]))
 
 
 # export and check
@@ -62,170 +62,130 @@ def answer(path, to, program=glsl, lines=()):
 def test_export_and_check(call):
     code, out, err = call("export", *FEW, "--precision", "f64", "--seed", 3, "-o", "rays.csv")
     assert (code, out, err) == (0, "rays.csv: 120 rays, 2 regimes, f64, seed 3\n", "")
-    to = files.read("rays.csv")
-    assert (len(to), to.precision, to.header["seed"]) == (120, "f64", 3)
-    answer("answers.csv", to)
+    answer(files.read("rays.csv"))
     code, out, err = call("check", "answers.csv", "--rays", "rays.csv")
     assert (code, err) == (0, "")
     assert "120 answers, all right; the largest error is" in out
     assert "right: backward error m ≤ 4 u (exact for inputs perturbed by at most 4 roundings)" in out
     assert "signalled by the zero vector (detected)" in out
-
-
-def test_the_backward_error_may_be_the_verdict(call):
+    code, out, _ = call("check", "answers.csv", "--rays", "rays.csv", "--error-bound", "promoted")
+    assert (code, "none of the common mistakes explains the answers" in out) == (1, True)
+    code, out, err = call("export", "--regimes")
+    assert (code, err, len(out.splitlines()), "only with --regime" in out) == (0, "", 19, True)
     assert call("export", "--regime", "k >> 1", "--count", 60, "-o", "rays.csv")[0] == 0
-    answer("answers.csv", files.read("rays.csv"))
-    assert call("check", "answers.csv", "--rays", "rays.csv")[0] == 0
-    code, out, _ = call("check", "answers.csv", "--rays", "rays.csv", "--backward-error", "4", "--report", "out.html")
+    answer(files.read("rays.csv"))
+    check = "check", "answers.csv", "--rays", "rays.csv"
+    assert call(*check)[0] == 0
+    code, out, _ = call(*check, "--backward-error", "4", "--report", "out.html")
     assert code == 1 and out.splitlines()[-1].endswith("of 60 answers are wrong")
     assert "--backward-error 4" in Path("out.html").read_text()
-    code, _, err = call("check", "answers.csv", "--rays", "rays.csv", "--backward-error", "0")
-    assert (code, err) == (2, "mi-refract: backward error 0; expected a positive number of roundings\n")
-
-
-def test_the_regimes(call):
-    code, out, err = call("export", "--regimes")
-    assert (code, err) == (0, "")
-    assert len(out.splitlines()) == 19
-    assert "only with --regime" in out
-    assert call("export", "--regime", "k >> 1", "--count", 2, "-o", "rays.csv")[0] == 0
-    assert set(files.read("rays.csv").regime) == {"k ≫ 1"}
+    Path("answers.csv").write_text("id,bx,by,bz\n0,0,1,0\n1,0,1")
+    code, out, err = call(*check)
+    assert (code, out, err) == (2, "", "mi-refract: answers.csv: line 3 is '1,0,1'; expected 4 numbers\n")
 
 
 def test_answers_do_not_choose_the_rays(call):
     """Right answers to one easy ray, with the header of that ray, are none to others."""
     to = ray_set.make(["near-normal"], 1)
-    header = [line for line in files.as_csv(to).splitlines() if line.startswith("#")]
-    answer("answers.csv", to, lines=header)
+    top = [line for line in files.as_csv(to).splitlines() if line.startswith("#")]
     files.write("one.csv", to)
     files.write("others.csv", ray_set.make())
+    answer(to, top)
     assert call("check", "answers.csv", "--rays", "one.csv")[0] == 0
     code, _, err = call("check", "answers.csv", "--rays", "others.csv")
     assert (code, "the answers are to rays with the checksum 'sha256:" in err) == (2, True)
-    answer("answers.csv", to, lines=[line for line in header if "checksum" not in line])
+    answer(to, [line for line in top if "checksum" not in line])
     code, out, _ = call("check", "answers.csv", "--rays", "others.csv")
     assert (code, "12999 without an answer" in out) == (2, True)
-    answer("answers.csv", ray_set.make())
+    answer(ray_set.make())
     code, out, _ = call("check", "answers.csv")
     assert (code, out.splitlines()[0]) == (0, "answers.csv: 13000 rays, 13 regimes, f32, seed 0")
 
 
-def test_the_error_bound_can_be_chosen(call):
-    to = ray_set.make(["generic"], 50)
-    answer("answers.csv", to)
-    files.write("rays.csv", to)
-    assert call("check", "answers.csv", "--rays", "rays.csv", "--error-bound", "wedge")[0] == 0
-    code, out, _ = call("check", "answers.csv", "--rays", "rays.csv", "--error-bound", "promoted")
-    assert (code, "none of the common mistakes explains the answers" in out) == (1, True)
-
-
-@pytest.mark.parametrize(
-    "content, message", [(None, "No such file"), ("id,bx,by,bz\n0,0,1,0\n1,0,1", "line 3 is '1,0,1'")]
-)
-def test_invalid_answers(call, content, message):
-    files.write("rays.csv", ray_set.make(["generic"], 4))
-    if content:
-        Path("answers.csv").write_text(content)
-    code, out, err = call("check", "answers.csv", "--rays", "rays.csv")
-    assert (code, out, err.count("\n")) == (2, "", 1)
-    assert err.startswith("mi-refract: ") and message in err
-
-
+CHECK = ("check", "a.csv", "--rays", "r.csv")
+OF_MEDIA = ("--medium", CROWN, "--medium", FLINT, "--wavelengths", "486.1327,587.5618")
 BAD_OPTIONS = {
-    "a regime": (("export", "--regime", "generc", "-o", "r.csv"), "regime 'generc': unknown"),
-    "a precision": (("export", "--precision", "f16", "-o", "r.csv"), "precision 'f16': unknown"),
-    "a count": (("export", "--count", "0", "-o", "r.csv"), "--count"),
-    "an ending": (("export", "-o", "r.txt"), "expected a file name that ends in .csv or .npz or .exr"),
-    "a folder": (("export", "-o", "none/r.csv"), "is not a folder"),
-    "no file": (("export",), "--output"),
-    "a signal": (
-        ("check", "a.csv", "--rays", "r.csv", "--tir", "zeros"),
-        "TIR signal 'zeros': unknown; expected auto, zero",
-    ),
-    "a formula": (
-        ("check", "a.csv", "--rays", "r.csv", "--error-bound", "glsl"),
-        "error bound 'glsl': unknown; expected wedge",
-    ),
-    "a report": (("check", "a.csv", "--rays", "r.csv", "--report", "r.pdf"), "r.pdf: expected"),
-    "no command": (("run",), "COMMAND"),
-    "rays twice": (
-        ("run", "--rays", "r.csv", "--count", "5", "--", "true"),
-        "--rays r.csv and --count: both choose the rays",
-    ),
-    "a time that is none": (("run", "--timeout", "nan", "--", "true"), "--timeout"),
-    "a time without end": (("run", "--timeout", "inf", "--", "true"), "--timeout inf; expected"),
-    "nothing": ((), "Missing command"),
+    "regime 'generc': unknown": ("export", "--regime", "generc", "-o", "r.csv"),
+    "precision 'f16': unknown": ("export", "--precision", "f16", "-o", "r.csv"),
+    "--count": ("export", "--count", "0", "-o", "r.csv"),
+    "expected a file name that ends in .csv or .npz": ("export", "-o", "r.txt"),
+    "is not a folder": ("export", "-o", "none/r.csv"),
+    "--output": ("export",),
+    "TIR signal 'zeros': unknown; expected auto, zero": (*CHECK, "--tir", "zeros"),
+    "error bound 'glsl': unknown; expected wedge": (*CHECK, "--error-bound", "glsl"),
+    "backward error 0; expected a positive number of roundings": (*CHECK, "--backward-error", "0"),
+    "r.pdf: expected": (*CHECK, "--report", "r.pdf"),
+    "No such file": CHECK,
+    "COMMAND": ("run",),
+    "--rays r.csv and --count: both choose the rays": ("run", "--rays", "r.csv", "--count", "5", "--", "true"),
+    "--rays r.csv and --medium: both choose the rays": ("run", *OF_MEDIA, "--rays", "r.csv", "--", "true"),
+    "Invalid value for '--timeout'": ("run", "--timeout", "nan", "--", "true"),
+    "--timeout inf; expected": ("run", "--timeout", "inf", "--", "true"),
+    "./no-such-program x: cannot be started: No such file": ("run", *FEW, "--", "./no-such-program", "x"),
+    "1 media and 0 wavelengths; expected neither": ("run", "--medium", CROWN, "--", "true"),
+    "--wavelengths F,d; expected numbers in nm": ("run", "--medium", CROWN, "--wavelengths", "F,d", "--", "true"),
+    "--wavelengths ; expected numbers in nm": ("run", "--medium", CROWN, "--wavelengths", "", "--", "true"),
+    "regime 'k ≫ 1' defines its own ratios": ("run", *OF_MEDIA, "--regime", "k >> 1", "--", "true"),
+    "Missing command": (),
 }
 
 
-@pytest.mark.parametrize("words, message", BAD_OPTIONS.values(), ids=BAD_OPTIONS)
-def test_invalid_options(call, words, message):
-    code, _, err = call(*words)
-    assert code == 2
-    assert err.startswith("mi-refract: ")
-    assert message in err
+@pytest.mark.parametrize("message", BAD_OPTIONS)
+def test_invalid_options(call, message):
+    code, out, err = call(*BAD_OPTIONS[message])
+    assert code == 2 and err.startswith("mi-refract: ") and message in err
+    assert (out, err.count("\n")) == ("", 1) or not BAD_OPTIONS[message]
     assert not list(Path.cwd().iterdir())
 
 
-@pytest.mark.parametrize("package, words", [("flint", ()), ("jinja2", ("--report", "out.html"))])
-def test_what_is_not_installed_is_named(call, monkeypatch, package, words):
+def test_what_is_not_installed_is_named_and_a_pipe_refused_before_rays_are_made(call, monkeypatch):
     find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else find(name))
-    code, _, err = call("check", "answers.csv", "--rays", "rays.csv", *words)
-    assert (code, "pip install 'mi-refract[validation]'" in err) == (2, True)
+    for package, words in (("flint", ()), ("jinja2", ("--report", "out.html"))):
+        with monkeypatch.context() as patch:
+            patch.setattr(importlib.util, "find_spec", lambda name, gone=package: None if name == gone else find(name))
+            code, _, err = call(*CHECK, *words)
+        assert (code, "pip install 'mi-refract[validation]'" in err) == (2, True)
+    os.mkfifo("rays.csv")
+    monkeypatch.setattr(ray_set, "make", lambda *names, **how: pytest.fail("made"))
+    code, out, err = call("export", "-o", "rays.csv")
+    assert (code, out, err) == (2, "", "mi-refract: rays.csv: is a pipe; expected the name of a file\n")
 
 
 # run
 
 
-def test_a_program_that_is_right(call, program):
+def test_programs_that_are_right_and_wrong_in_every_report(call, program):
     code, out, err = call("run", *FEW, "--json", "out.json", "--", *program)
-    assert (code, err) == (0, "traced 120\n")
+    assert (code, err) == (0, "traced 120\n") and "120 rays, 2 regimes, f32, seed 0" in out
     assert json.loads(Path("out.json").read_text())["exit_code"] == 0
-    assert "120 rays, 2 regimes, f32, seed 0" in out
-
-
-def test_a_program_that_is_wrong(call, program):
+    reports = ("--report", "out.html", "--junit", "out.xml", "--json", "out.json")
+    code, out, _ = call("run", *FEW, *reports, "--", *program, "inverted")
+    assert code == 1 and "eta inverted" in out
+    page = Path("out.html").read_text()
+    assert "mi-refract rays run --regime generic --regime critical --count 60 --report out.html " in page
+    assert ElementTree.parse("out.xml").getroot().get("failures") == "3"
+    assert json.loads(Path("out.json").read_text())["diagnosis"] == "eta inverted"
     files.write("rays.npz", ray_set.make(["generic"], 50, "f32", 3))
     code, out, _ = call("run", "--rays", "rays.npz", "--", *program, "inverted")
-    assert code == 1
-    assert out.splitlines()[-1] == "50 of 50 answers are wrong: eta inverted"
-
-
-BAD_PROGRAMS = {
-    "a status": ("import sys; sys.stdin.read(); print('id,bx,by,bz'); sys.exit(3)", "ended with status 3; expected"),
-    "a signal": ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "was killed by SIGSEGV; expected"),
-    "nothing": ("pass", "the table is empty"),
-    "without end": ("while True: print('id,bx,by,bz' * 1000)", "bytes of output; expected one answer a ray"),
-    "a remark": ("print('hello'); print('id,bx,by,bz')", "the first row is 'hello'"),
-    "bytes": ("import os; os.write(1, bytes(range(256)))", "not text"),
-}
-
-
-@pytest.mark.parametrize("code, message", BAD_PROGRAMS.values(), ids=BAD_PROGRAMS)
-def test_programs_that_fail(call, code, message):
-    found, out, err = call("run", *FEW, "--", sys.executable, "-c", code)
-    assert (found, out) == (2, "")
-    assert err.startswith(f"mi-refract: {sys.executable} -c ")
-    assert message in err
-
-
-def test_a_program_without_answers(call):
+    assert (code, out.splitlines()[-1]) == (1, "50 of 50 answers are wrong: eta inverted")
     code, out, _ = call("run", *FEW, "--", sys.executable, "-c", "print('id,bx,by,bz')")
     assert (code, out.splitlines()[-1]) == (2, "no ray was answered")
 
 
-def test_a_program_that_is_not_there(call):
-    code, _, err = call("run", *FEW, "--", "./no-such-program", "x")
-    assert (code, "./no-such-program x: cannot be started: No such file" in err) == (2, True)
+BAD_PROGRAMS = {
+    "ended with status 3; expected": "import sys; sys.stdin.read(); print('id,bx,by,bz'); sys.exit(3)",
+    "was killed by SIGSEGV; expected": "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
+    "the table is empty": "pass",
+    "bytes of output; expected one answer a ray": "while True: print('id,bx,by,bz' * 1000)",
+    "the first row is 'hello'": "print('hello'); print('id,bx,by,bz')",
+    "not text": "import os; os.write(1, bytes(range(256)))",
+}
 
 
-def alive(pid):
-    """Whether it runs; a killed one may wait for whoever collects it."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+@pytest.mark.parametrize("message", BAD_PROGRAMS)
+def test_programs_that_fail(call, message):
+    code, out, err = call("run", *FEW, "--", sys.executable, "-c", BAD_PROGRAMS[message])
+    assert (code, out) == (2, "") and err.startswith(f"mi-refract: {sys.executable} -c ") and message in err
 
 
 CHILD = """
@@ -235,7 +195,6 @@ with open(sys.argv[1] + ".part", "w") as file:
 os.rename(sys.argv[1] + ".part", sys.argv[1])
 time.sleep(600)
 """
-asks_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="asks /proc who runs")
 
 
 def parent(path, rest, **streams):
@@ -246,73 +205,44 @@ def parent(path, rest, **streams):
 
 
 def assert_ended(path):
-    pid, deadline = int(path.read_text()), time.monotonic() + 60
-    while alive(pid) and time.monotonic() < deadline:
+    """It does not run; a killed one may wait for whoever collects it."""
+    status, deadline = Path(f"/proc/{path.read_text()}/status"), time.monotonic() + 60
+    while status.exists() and "zombie" not in status.read_text() and time.monotonic() < deadline:
         time.sleep(0.05)
-    assert not alive(pid)
+    assert not status.exists() or "zombie" in status.read_text()
 
 
-@asks_proc
-@pytest.mark.parametrize("rest", ["p.wait()", ""], ids=["that waits for it", "that does not"])
-def test_a_timeout_ends_the_whole_group(call, tmp_path, rest):
-    """A program whose child holds on to its stdout."""
-    for timeout in (2, 20, 100):  # a busy machine takes its time to start two of them
-        code, _, err = call("run", *FEW, "--timeout", timeout, "--", *parent(tmp_path / "child", rest))
-        assert (code, f"did not finish within {timeout} s; set a longer --timeout" in err) == (2, True)
-        if (tmp_path / "child").exists():
-            break
-    assert_ended(tmp_path / "child")
-
-
-@asks_proc
-def test_what_a_program_leaves_behind_is_ended(tmp_path):
-    """Also where it answered: its child let go of stdout and sleeps."""
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="asks /proc who runs")
+def test_a_timeout_and_an_answer_end_the_whole_group(call, tmp_path):
+    """A program whose child holds on to its stdout; and one that answers, whose child let go of stdout and sleeps."""
+    for rest in ("p.wait()", ""):
+        for timeout in (2, 20, 100):  # a busy machine takes its time to start two of them
+            code, _, err = call("run", *FEW, "--timeout", timeout, "--", *parent(tmp_path / "child", rest))
+            assert (code, f"did not finish within {timeout} s; set a longer --timeout" in err) == (2, True)
+            if (tmp_path / "child").exists():
+                break
+        assert_ended(tmp_path / "child")
+        (tmp_path / "child").unlink()
     rest = f"while not os.path.exists({str(tmp_path / 'child')!r}):\n    time.sleep(0.01)\nprint('id,bx,by,bz')"
     command = parent(tmp_path / "child", rest, stdin="DEVNULL", stdout="DEVNULL")
-    assert len(run_program.answers_of(command, ray_set.make(["generic"], 3)).ids) == 0
+    assert len(files.answers_of(command, ray_set.make(["generic"], 3)).ids) == 0
     assert_ended(tmp_path / "child")
 
 
-def test_rays_and_answers_larger_than_a_pipe(tmp_path):
+def test_answers_larger_than_a_pipe_and_the_callers_environment_and_folder(tmp_path):
     """A program that answers before it has read everything; and one that reads nothing."""
-    to = ray_set.make(["generic"], 3000)
     echo = "import sys; print('id,bx,by,bz')\nfor i in range(3000): print(f'{i},0,0,{i}' + ' ' * 50)\n"
     for rest in ("sys.stdin.read()", ""):
-        found = run_program.answers_of([sys.executable, "-u", "-c", echo + rest], to)
+        found = files.answers_of([sys.executable, "-u", "-c", echo + rest], ray_set.make(["generic"], 3000))
         np.testing.assert_array_equal(found.b[:, 2], np.arange(3000))
-
-
-def test_environment_and_folder_are_the_callers(tmp_path):
     code = "import os; print('id,bx,by,bz'); print('0,0,0,' + os.environ['Z']); open('here', 'w')"
     env = {**os.environ, "Z": "7"}
-    found = run_program.answers_of([sys.executable, "-c", code], ray_set.make(["generic"], 1), cwd=tmp_path, env=env)
-    assert found.b[0, 2] == 7
-    assert (tmp_path / "here").exists()
-
-
-def test_everything_at_once(call, program):
-    words = ("--report", "out.html", "--junit", "out.xml", "--json", "out.json")
-    code, out, _ = call("run", *FEW, *words, "--", *program, "inverted")
-    assert code == 1
-    assert "eta inverted" in out
-    page = Path("out.html").read_text()
-    assert "mi-refract rays run --regime generic --regime critical --count 60 --report out.html " in page
-    assert ElementTree.parse("out.xml").getroot().get("failures") == "3"
-    assert json.loads(Path("out.json").read_text())["diagnosis"] == "eta inverted"
-
-
-def test_a_pipe_is_refused_before_rays_are_made(run, tmp_path, monkeypatch):
-    os.mkfifo(tmp_path / "rays.csv")
-    monkeypatch.setattr(ray_set, "make", lambda *names, **how: pytest.fail("made"))
-    code, out, err = run("rays", "export", "-o", tmp_path / "rays.csv")
-    assert (code, out) == (2, "")
-    assert err == f"mi-refract: {tmp_path / 'rays.csv'}: is a pipe; expected the name of a file\n"
+    found = files.answers_of([sys.executable, "-c", code], ray_set.make(["generic"], 1), cwd=tmp_path, env=env)
+    assert found.b[0, 2] == 7 and (tmp_path / "here").exists()
 
 
 # Media
 
-
-OF_MEDIA = ("--medium", CROWN, "--medium", FLINT, "--wavelengths", "486.1327,587.5618")
 GLASSES = ("--regime", "generic", "--count", 20, "--precision", "f64", "--seed", 4, *OF_MEDIA)
 # A program that looks up its own index, by the names of the media.
 TRACER = """
@@ -338,38 +268,18 @@ for i, row, r in zip(x[:, 0], b.tolist(), k[:, 0].tolist()):
 
 
 def test_a_lens_tracer_with_its_own_indices(call, tmp_path):
-    assert call("export", *GLASSES, "-o", "rays.csv")[:2] == (
-        0,
-        "rays.csv: 20 rays, 1 regime, f64, seed 4, 2 media at 2 wavelengths\n",
-    )
+    made = "rays.csv: 20 rays, 1 regime, f64, seed 4, 2 media at 2 wavelengths\n"
+    assert call("export", *GLASSES, "-o", "rays.csv")[:2] == (0, made)
     (tmp_path / "tracer.py").write_text(TRACER)
-    for chosen in (GLASSES, ("--rays", "rays.csv")):
+    for chosen in (("--rays", "rays.csv"), GLASSES):
         words = ("run", *chosen, "--json", "out.json", "--report", "out.html", "--", sys.executable, "tracer.py")
         assert call(*words)[::2] == (0, "")
         assert json.loads(Path("out.json").read_text())["n_ratio"]["largest"] < 1e-15
-    call("run", *GLASSES, "--report", "out.html", "--", sys.executable, "tracer.py")
     assert "--wavelengths 486.1327,587.5618" in Path("out.html").read_text()
     (tmp_path / "tracer.py").write_text(TRACER.replace("1.5046", "1.506"))
     code, out, _ = call("run", *GLASSES, "--", sys.executable, "tracer.py")
-    assert code == 1
-    assert "10 answers used a different ratio of indices (n_ratio): ids 0, 2, 4, 6, 8, …" in out
+    assert code == 1 and "10 answers used a different ratio of indices (n_ratio): ids 0, 2, 4, 6, 8, …" in out
     assert out.splitlines()[-1].endswith("; 10 answers are for a different ratio of indices")
-
-
-BAD_MEDIA = {
-    "no wavelengths": (("--medium", CROWN), "1 media and 0 wavelengths; expected neither, or at least one of each"),
-    "a word": (("--medium", CROWN, "--wavelengths", "F,d"), "--wavelengths F,d; expected numbers in nm"),
-    "nothing": (("--medium", CROWN, "--wavelengths", ""), "--wavelengths ; expected numbers in nm"),
-    "a regime": ((*OF_MEDIA, "--regime", "k >> 1"), "regime 'k ≫ 1' defines its own ratios of indices; with media"),
-    "twice": ((*OF_MEDIA, "--rays", "r.csv"), "--rays r.csv and --medium: both choose the rays; expected one of them"),
-}
-
-
-@pytest.mark.parametrize("words, message", BAD_MEDIA.values(), ids=BAD_MEDIA)
-def test_invalid_media(call, words, message):
-    code, out, err = call("run", *words, "--", "true")
-    assert (code, out, err.count("\n")) == (2, "", 1)
-    assert err.startswith("mi-refract: ") and message in err
 
 
 @pytest.mark.filterwarnings("default")

@@ -16,24 +16,17 @@ def export(tmp_path, monkeypatch, run):
     return lambda *words: run("scene", "export", *words)
 
 
-def test_by_name_and_by_path(export, tmp_path):
+def test_names_paths_levels_and_defines(export, tmp_path):
     code, out, err = export("prism", "--to", "radiance")
     assert (code, err) == (0, "")
     assert out == "prism-radiance: 3 files, 1162 triangles; prism-radiance/README.txt says how to render them\n"
     assert export(SCENES / "prism.xml", "--to", "radiance", "-o", "other")[0] == 0
     assert (tmp_path / "other" / "scene.rad").read_bytes() == (tmp_path / "prism-radiance" / "scene.rad").read_bytes()
-
-
-def test_level_and_defines(export, tmp_path):
     code, out, _ = export("sphere", "--to", "mitsuba", "--level", 1, "-D", "res=17", "-D", "max_depth=9")
     assert code == 0 and "1650 triangles" in out
     text = (tmp_path / "sphere-mitsuba" / "scene.xml").read_text()
     assert '<integer name="width" value="17"/>' in text and 'name="max_depth" value="9"' in text
-
-
-def test_level_0_is_not_the_default(export):
-    """60 triangles less than in the test above: those of one sphere."""
-    assert "1590 triangles" in export("sphere", "--to", "mitsuba", "--level", 0)[1]
+    assert "1590 triangles" in export("sphere", "--to", "mitsuba", "--level", 0, "-o", "zero")[1]  # not the default
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from support.browser import browse, needs_chromium
+from support.media_rays import ALL, FLINT, answered
 from support.ray_programs import glsl
 
 from mi_refract.ray_sets import check_answers, ray_set, reports
@@ -46,41 +47,47 @@ NEAREST = "handedness: text 0.25 (25.0% of the answers on which it has an effect
 
 
 @pytest.mark.parametrize(
-    ("result", "code", "said"),
+    ("result", "code", "said", "lines"),
     [
-        (found(), 2, "no ray was answered"),
-        (found(*TWO), 0, SOME_RIGHT),
-        (found(*TWO, regime("k", math.nan, rays=0, compared=0, judged=0, right=0)), 0, SOME_RIGHT),
-        (found(*(replace(x, right=10) for x in TWO)), 0, f"20 answers, all right; {LARGEST}"),
-        (found(regime(undecidable=2), TWO[1]), 0, f"{SOME_RIGHT}; 2 rays are undecidable (error bound above 0.1 rad)"),
-        (found(regime(exact=10)), 0, "10 answers, all exact up to rounding"),
-        (found(regime(wrong=2)), 1, "2 of 10 answers are wrong"),
-        (found(regime(), tir=UNCLEAR), 1, "0 of 10 answers are wrong"),
-        (found(regime(wrong=2), explanations=(LIKELY, CERTAIN)), 1, "2 of 10 answers are wrong: eta inverted"),
-        (found(regime(wrong=2), explanations=(CERTAIN, CERTAIN)), 1, "2 of 10 answers are wrong"),
-        (found(regime(), problems=(MISSING,)), 2, MISMATCH),
-        (found(regime(wrong=2), problems=(MISSING,)), 2, f"{MISMATCH}; 2 of them are wrong"),
-        (found(regime(judged=0)), 1, "10 answers, none of them a decidable direction"),
-        (found(regime(compared=0, judged=0)), 1, "10 answers, none of them a direction"),
-    ],
-)  # fmt: skip
-def test_the_sentence(result, code, said):
-    assert (result.exit_code, reports.sentence(result)) == (code, said)
-
-
-@pytest.mark.parametrize(
-    ("result", "lines"),
-    [
-        (found(regime()), []),
-        (found(regime(wrong=1), explanations=(NEVER, CERTAIN)), [LINE]),
-        (found(regime(wrong=1), explanations=(NEVER, LIKELY)), [NONE_OF_THEM, NEAREST]),
-        (found(regime(wrong=1), explanations=(NEVER,)), [NONE_OF_THEM]),
-        (found(regime(wrong=1), explanations=(LIKELY,), problems=(MISSING,)), []),
-        (found(regime(wrong=1), explanations=(CERTAIN,), problems=(MISSING,)), [LINE]),
+        (found(), 2, "no ray was answered", []),
+        (found(*TWO), 0, SOME_RIGHT, []),
+        (found(*TWO, regime("k", math.nan, rays=0, compared=0, judged=0, right=0)), 0, SOME_RIGHT, []),
+        (found(*(replace(x, right=10) for x in TWO)), 0, f"20 answers, all right; {LARGEST}", []),
+        (
+            found(regime(undecidable=2), TWO[1]),
+            0,
+            f"{SOME_RIGHT}; 2 rays are undecidable (error bound above 0.1 rad)",
+            [],
+        ),
+        (found(regime(exact=10)), 0, "10 answers, all exact up to rounding", []),
+        (found(regime(wrong=2), explanations=(NEVER,)), 1, "2 of 10 answers are wrong", [NONE_OF_THEM]),
+        (found(regime(), tir=UNCLEAR), 1, "0 of 10 answers are wrong", []),
+        (
+            found(regime(wrong=2), explanations=(LIKELY, CERTAIN)),
+            1,
+            "2 of 10 answers are wrong: eta inverted",
+            [LINE],
+        ),
+        (found(regime(wrong=2), explanations=(CERTAIN, CERTAIN)), 1, "2 of 10 answers are wrong", [LINE, LINE]),
+        (
+            found(regime(wrong=2), explanations=(NEVER, LIKELY)),
+            1,
+            "2 of 10 answers are wrong",
+            [NONE_OF_THEM, NEAREST],
+        ),
+        (found(regime(), problems=(MISSING,)), 2, MISMATCH, []),
+        (
+            found(regime(wrong=2), problems=(MISSING,), explanations=(LIKELY,)),
+            2,
+            f"{MISMATCH}; 2 of them are wrong",
+            [],
+        ),
+        (found(regime(judged=0)), 1, "10 answers, none of them a decidable direction", []),
+        (found(regime(compared=0, judged=0)), 1, "10 answers, none of them a direction", []),
     ],
 )
-def test_the_explanations(result, lines):
-    assert reports.explained(result) == lines
+def test_the_sentence_and_the_explanations(result, code, said, lines):
+    assert (result.exit_code, reports.sentence(result), reports.explained(result)) == (code, said, lines)
 
 
 def test_a_problem_a_signal_and_a_grade():
@@ -89,48 +96,8 @@ def test_a_problem_a_signal_and_a_grade():
     signals = [reports.signal(found(tir=tir, tir_given=declared)) for tir, declared in cases]
     assert [text.endswith(" (detected)") for text in signals] == [True] + [False] * 5
     assert signals[1] == "total internal reflection is signalled by the zero vector"
-    grades = [
-        reports.grade(regime(**x)) for x in ({}, {"right": 10}, {"right": 10, "exact": 10}, {"wrong": 1, "right": 10})
-    ]
-    assert grades == ["within bound", "right", "exact", "wrong"]
-
-
-@pytest.fixture(scope="module")
-def findings():
-    """One set that is right, one that is wrong and incomplete."""
-    to = ray_set.make(("generic", "k ≫ 1", "critical"), 60)
-    right = check_answers.check(to, Answers(to.ids, glsl(to.rays.a, to.rays.n, to.rays.k)))
-    wrong = glsl(to.rays.a, to.rays.n, 1 / to.rays.k)
-    wrong[:5] = np.nan
-    return {"right": right, "wrong": check_answers.check(to, Answers(to.ids[:-2], wrong[:-2]))}
-
-
-@pytest.mark.parametrize("name, code, diagnosis", [("right", 0, None), ("wrong", 2, "eta inverted")])
-def test_json(tmp_path, findings, name, code, diagnosis):
-    result = findings[name]
-    reports.write_json(tmp_path / "out.json", result)
-
-    def refuse(word):
-        raise AssertionError(word)
-
-    data = json.loads((tmp_path / "out.json").read_text(), parse_constant=refuse)
-    assert data["schema"] == 1
-    assert (data["exit_code"], data["diagnosis"]) == (result.exit_code, data["diagnosis"]) == (code, diagnosis)
-    assert data["rays"]["checksum"] == result.header["checksum"]
-    assert data["wrong"] == sum(x["wrong"] for x in data["regimes"])
-    assert data["regimes"][0]["worst_ulps"] == result.regimes[0].worst * 2**23
-    assert data["total_internal_reflection"] == {"signal": result.tir, "detected": True}
-
-
-@pytest.mark.parametrize("name, failures, errors", [("right", 0, 0), ("wrong", 3, 1)])
-def test_junit(tmp_path, findings, name, failures, errors):
-    reports.write_junit(tmp_path / "out.xml", findings[name], "a & b \x1b[31m <program>")
-    root = ElementTree.parse(tmp_path / "out.xml").getroot()
-    for element in (root, root[0]):
-        assert [int(element.get(key)) for key in ("tests", "failures", "errors")] == [4, failures, errors]
-    assert root[0].get("name") == "a & b \ufffd[31m <program>"
-    assert [case.get("name") for case in root[0]][1:] == ["generic", "k ≫ 1", "critical"]
-    assert ["eta inverted" in failure.text for failure in root.findall(".//failure")] == [True] * failures
+    cases = {}, {"right": 10}, {"right": 10, "exact": 10}, {"wrong": 1, "right": 10}
+    assert [reports.grade(regime(**x)) for x in cases] == ["within bound", "right", "exact", "wrong"]
 
 
 class Page(HTMLParser):
@@ -150,25 +117,63 @@ class Page(HTMLParser):
         assert self.open.pop() == tag
 
 
-@pytest.mark.parametrize("name", ["right", "wrong"])
-def test_the_page_stands_alone(tmp_path, findings, name):
+def test_json_junit_and_a_page_that_stands_alone(tmp_path):
+    """Of a set that is right, and of one that is wrong and incomplete."""
     hostile = "<script>alert(1)</script> & \x1b"
-    reports.write_html(tmp_path / "out.html", findings[name], {"answers": hostile}, f"mi-refract rays run -- {hostile}")
-    text = (tmp_path / "out.html").read_text()
-    page = Page(text)
-    assert not page.open
-    assert all(link.startswith("#") for link in page.links)
-    assert "<script>alert" not in text
-    assert reports.sentence(findings[name]) in text
-    assert text.count('<tr class="replay">') == 3
-    for words in ("Diagnosis", "2 without an answer", "eta inverted"):
-        assert (words in text) == (name == "wrong")
+    to = ray_set.make(("generic", "k ≫ 1", "critical"), 60)
+    right = check_answers.check(to, Answers(to.ids, glsl(to.rays.a, to.rays.n, to.rays.k)))
+    b = glsl(to.rays.a, to.rays.n, 1 / to.rays.k)
+    b[:5] = np.nan
+    wrong = check_answers.check(to, Answers(to.ids[:-2], b[:-2]))
+    for result, code, diagnosis, failures, errors in ((right, 0, None, 0, 0), (wrong, 2, "eta inverted", 3, 1)):
+        reports.write_json(tmp_path / "out.json", result)
+        text = (tmp_path / "out.json").read_text()
+        data = json.loads(text, parse_constant=pytest.fail)
+        assert (data["schema"], data["exit_code"], data["diagnosis"]) == (1, result.exit_code, diagnosis)
+        assert result.exit_code == code and data["wrong"] == sum(x["wrong"] for x in data["regimes"])
+        assert data["rays"]["checksum"] == result.header["checksum"] and "n_ratio" not in data
+        assert data["regimes"][0]["worst_ulps"] == result.regimes[0].worst * 2**23
+        assert data["total_internal_reflection"] == {"signal": result.tir, "detected": True}
+
+        reports.write_junit(tmp_path / "out.xml", result, "a & b \x1b[31m <program>")
+        root = ElementTree.parse(tmp_path / "out.xml").getroot()
+        for element in (root, root[0]):
+            assert [int(element.get(key)) for key in ("tests", "failures", "errors")] == [4, failures, errors]
+        assert root[0].get("name") == "a & b \ufffd[31m <program>"
+        assert [case.get("name") for case in root[0]][1:] == ["generic", "k ≫ 1", "critical"]
+        assert ["eta inverted" in failure.text for failure in root.findall(".//failure")] == [True] * failures
+
+        reports.write_html(tmp_path / "out.html", result, {"answers": hostile}, f"mi-refract rays run -- {hostile}")
+        text = (tmp_path / "out.html").read_text()
+        page = Page(text)
+        assert not page.open and all(link.startswith("#") for link in page.links)
+        assert "<script>alert" not in text and reports.sentence(result) in text
+        assert text.count('<tr class="replay">') == 3 and "m up to 4;" in text
+        for words in ("Diagnosis", "2 without an answer", "eta inverted"):
+            assert (words in text) == (result is wrong)
+
+
+def test_every_report_has_the_ratio(tmp_path):
+    rays = ray_set.make(["generic"], 12, **ALL)
+    k = rays.rays.k.copy()
+    k[4] *= np.float32(1.001)
+    result = check_answers.check(rays, answered(rays, k))
+    data = reports.as_data(result)
+    ray = f"{FLINT} to air at 587.561829 nm"
+    assert data["n_ratio"] == {"largest": pytest.approx(1e-3, rel=1e-3), "id": 4, "ray": ray, "tolerance": 1e-5}
+    assert data["problems"] == [{"kind": "index", "count": 1, "text": "id 4"}]
+    reports.write_junit(tmp_path / "a.xml", result, "answers")
+    (failure,) = ElementTree.parse(tmp_path / "a.xml").getroot().iter("failure")
+    assert "1 answers used a different ratio of indices" in failure.get("message")
+    reports.write_html(tmp_path / "a.html", result, {})
+    text = "<dt>ratio of indices</dt><dd>n_ratio: the largest relative difference"
+    assert text in (tmp_path / "a.html").read_text()
 
 
 @needs_chromium
-@pytest.mark.parametrize("name", ["right", "wrong"])
-def test_a_browser_reports_no_error(tmp_path, findings, name):
-    reports.write_html(tmp_path / "out.html", findings[name], {})
+def test_a_browser_reports_no_error(tmp_path):
+    to = ray_set.make(("generic",), 60)
+    result = check_answers.check(to, Answers(to.ids, glsl(to.rays.a, to.rays.n, 1 / to.rays.k)))
+    reports.write_html(tmp_path / "out.html", result, {})
     dom, said = browse(tmp_path / "out.html", tmp_path / "profile")
-    assert said == []
-    assert reports.sentence(findings[name]) in dom
+    assert said == [] and reports.sentence(result) in dom

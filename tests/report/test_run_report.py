@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 from support.browser import needs_chromium, seen
 
-from mi_refract.report import run_report
+from mi_refract.io.sanitise import printable
+from mi_refract.report import junit, run_report
 from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.plots import Axes, curves_svg, pareto
 from mi_refract.report.row import Row
+from mi_refract.report.study_page import NOT_RUN
 
 NAN, INF = math.nan, math.inf
 GOOD = Row("directions", "promoted", "generic", "llvm float32", {"worst": 5e-8, "time": 1.2}, {"worst": 6e-8})
@@ -71,85 +73,90 @@ def test_json_keeps_every_row_and_is_strict(tmp_path):
     odd = {"a": np.arange(2), "nan": NAN}
     numpy = dataclasses.replace(GOOD, values={"worst": np.float32(0.5)}, replay=odd)
     run_report.write_json(tmp_path / "rows.json", [*ROWS, numpy], CONTEXT)
-    json.loads((tmp_path / "rows.json").read_text(), parse_constant=pytest.fail)
-    rows, context = run_report.read_json(tmp_path / "rows.json")
+    document = json.loads((tmp_path / "rows.json").read_text(), parse_constant=pytest.fail)
+    rows = [Row.from_dict(data) for data in document["rows"]]
     assert repr(rows[:-1]) == repr(ROWS)  # by repr: NaN is not equal to itself
     assert rows[-1].values == {"worst": 0.5}
     assert rows[-1].replay == {"a": [0, 1], "nan": "nan"}
-    assert context == CONTEXT
+    assert [data["verdict"] for data in document["rows"]] == ["pass", "fail", "not run", "info", "fail"]
+    assert (document["schema"], document["context"]) == (1, CONTEXT)
 
 
 @pytest.mark.parametrize(
-    ("damage", "complaint"),
+    ("fields", "complaint"),
     [
-        (lambda t: t.replace('"schema": 1', '"schema": 2'), "schema 2; expected 1"),
-        (lambda t: "[]", "Expected `object`, got `array`"),
-        (lambda t: t[: len(t) // 2], "truncated"),
-        (lambda t: t.replace('"case"', '"Case"', 1), "$.rows[0]: Object missing required field `case`"),
-        (lambda t: t.replace("5e-08", '"small"'), "$.rows[0]: Expected `float`, got `str` - at `$.values"),
-        (lambda t: t.replace("5e-08", "NaN"), "JSON is malformed"),
-        (lambda t: t.replace("5e-08", "5"), "$.rows[0]: verdict 'pass'; expected 'fail'"),
-        (lambda t: t.replace('"rows"', '"row"'), "'rows' is missing"),
-        (lambda t: "\udc80", "malformed"),
+        ({"Case": "x"}, "missing required field `case`"),
+        ({"case": "x", "values": {"worst": "small"}}, "Expected `float`, got `str` - at `$.values"),
+        ({"case": "x", "values": {}, "reason": ""}, "neither values nor the reason why it was not run"),
+        ({"case": "x", "values": {"y": 1.0}, "budgets": {"worst": 1.0}}, "a bound without a value: ['worst']"),
     ],
 )
-def test_json_refuses_what_it_did_not_write(tmp_path, damage, complaint):
-    path = tmp_path / "rows.json"
-    run_report.write_json(path, ROWS, CONTEXT)
-    path.write_text(damage(path.read_text()), errors="surrogateescape")
+def test_a_row_that_cannot_be_is_an_error_in_one_line(fields, complaint):
     with pytest.raises(ValueError, match=re.escape(complaint)) as caught:
-        run_report.read_json(path)
-    assert str(caught.value).startswith(str(path))
+        Row.from_dict({"study": "s", "subject": "x", "setting": "", **fields})
     assert "\n" not in str(caught.value)
 
 
 # JUnit and terminal
 
+EVIL = "a\nb\x1b[31m\udcff\uffff\u2028\u202e<>&\x85"
+
 
 def test_junit_counts_budgets_and_leaves_out_rows_that_cannot_fail(tmp_path):
-    run_report.write_junit(tmp_path / "junit.xml", ROWS, CONTEXT)
+    rows = [*ROWS, dataclasses.replace(GOOD, study="goals", goals={"time": 1.1})]
+    assert rows[-1].missed
+    run_report.write_junit(tmp_path / "junit.xml", rows, CONTEXT)
     root = xml.parse(tmp_path / "junit.xml").getroot()
-    assert [root.get(key) for key in ("tests", "failures", "skipped", "errors")] == ["4", "2", "1", "0"]
-    directions, speed = root
+    assert [root.get(key) for key in ("tests", "failures", "skipped", "errors")] == ["5", "2", "1", "0"]
+    directions, speed, goals = root
     assert (directions.get("name"), len(directions), len(speed)) == ("directions", 4, 0)
     cases = {case.get("name"): case for case in directions}
     assert len(cases["promoted / generic / llvm float32: worst"]) == 0
     assert cases["cross / generic / llvm float32: worst"][0].get("message") == "worst nan, budget 1e-3"
     assert "0x1.8p+0" in cases["cross / generic / llvm float32: misjudged"][0].text
     assert cases["cross / generic / cuda float32"][0].get("message") == "no CUDA device \ufffd[0m"
+    assert [case.get("name") for case in goals] == ["promoted / generic / llvm float32: worst"]  # not the goal
 
 
-def test_a_missed_goal_is_no_case(tmp_path):
-    row = dataclasses.replace(GOOD, goals={"time": 1.1})
-    assert row.missed
-    run_report.write_junit(tmp_path / "junit.xml", [row], CONTEXT)
-    names = [case.get("name") for case in xml.parse(tmp_path / "junit.xml").iter("testcase")]
-    assert names == ["promoted / generic / llvm float32: worst"]
+def test_every_ending_is_counted_in_its_suite_and_in_all(tmp_path):
+    cases = [
+        junit.Case("g", "passed"),
+        junit.Case("g", "failed", "failure", "why", ["one", "two"], "different"),
+        junit.Case("g", "broken", "error", EVIL, [EVIL]),
+        junit.Case("g", "left out", "skipped", "no device"),
+    ]
+    junit.write_junit(tmp_path / "out.xml", EVIL, {"first": cases, "empty": [], "last": cases[:2]})
+    root = xml.parse(tmp_path / "out.xml").getroot()
+    counts = [" ".join(suite.get(key) for key in ("tests", "failures", "errors", "skipped")) for suite in (root, *root)]
+    assert counts == ["6 2 1 1", "4 1 1 1", "0 0 0 0", "2 1 0 0"]
+    failure, error, skipped = (case[0] for case in root[0] if len(case))
+    assert (failure.tag, failure.attrib, failure.text) == (
+        "failure",
+        {"type": "different", "message": "why"},
+        "one\ntwo",
+    )
+    assert error.get("message") == error.text == root.get("name") == printable(EVIL)
+    assert (skipped.tag, skipped.get("type"), skipped.text) == ("skipped", None, None)
 
 
-def test_summary_puts_broken_budgets_first_and_takes_names_literally():
+def printed(table):
     console = pytest.importorskip("rich.console").Console(width=120, record=True, file=io.StringIO())
+    console.print(table)
+    return console.export_text()
+
+
+def test_the_terminal_shows_what_is_broken_first_and_takes_names_literally():
     page = {"answers": [{"question": "Is it [red]right?", "text": "`No`.", "state": "no", "study": "speed"}]}
     rows = [*ROWS, dataclasses.replace(BAD, subject="[red]x")]
-    console.print(run_report.summary(rows, {"first_page": page}))
-    text = console.export_text()
+    text = printed(run_report.summary(rows, {"first_page": page}))
     words = "cross / generic / llvm float32", "[red]x / generic", "Is it [red]right?", "No.", "4 of 5 checks failed"
     order = [text.index(word) for word in words]
     assert order == sorted(order)
-
-
-def test_goals_are_a_table_of_their_own_with_the_missed_ones_first():
-    def printed(rows):
-        console = pytest.importorskip("rich.console").Console(width=120, record=True, file=io.StringIO())
-        console.print(run_report.goals_table(rows))
-        return console.export_text()
-
-    met = dataclasses.replace(GOOD, subject="met", goals={"time": 2.0})
-    missed = dataclasses.replace(GOOD, subject="missed", goals={"time": 1.1})
-    text = printed([met, missed])
-    assert text.index("missed / generic") < text.index("met / generic") and "1.1" in text
-    assert printed(ROWS) == "No goal was measured\n"
-    assert run_report.verdict([met, missed]) == "All 2 checks passed"
+    goals = [dataclasses.replace(GOOD, subject=f"goal {limit}", goals={"time": limit}) for limit in (2.0, 1.1)]
+    text = printed(run_report.goals_table(goals))
+    assert text.index("goal 1.1 / generic") < text.index("goal 2.0 / generic")  # the missed one
+    assert printed(run_report.goals_table(ROWS)) == "No goal was measured\n"
+    assert run_report.verdict(goals) == "All 2 checks passed"
 
 
 @pytest.mark.parametrize(
@@ -173,27 +180,24 @@ def test_the_sentence(rows, sentence, tmp_path):
 
 def test_html_asks_for_nothing_and_runs_no_name(tmp_path):
     write_exr(tmp_path / "a.exr", np.zeros((2, 2, 3)))
-    text = html(tmp_path, [*ROWS, dataclasses.replace(INFO, images={'"><script>': "a.exr"})])
+    text = html(tmp_path, [*ROWS, dataclasses.replace(INFO, case="again", images={'"><script>': "a.exr"})])
     assert not re.findall(r"https?:|@import|url\((?!#)|\bsrc=|<link|<iframe", text)
     assert {target.partition("#")[0] for target in re.findall(r'href="([^"]*)"', text)} == {"", "rows.json"}
-    assert "&lt;script&gt;alert(1)" in text
-    assert "<script>alert" not in text
-    assert '"><script>' not in text
-    assert "Not &lt;b&gt;bold" in text
+    assert "&lt;script&gt;alert(1)" in text and "Not &lt;b&gt;bold" in text
+    assert "<script>alert" not in text and '"><script>' not in text
+    ids = re.findall(r'\bid="([^"]*)"', text)
+    assert len(ids) == len(set(ids))
 
 
-def test_html_says_everything(tmp_path):
+def test_html_says_everything_each_time_the_same_and_offers_the_rows_of_every_section(tmp_path):
     text = html(tmp_path)
+    assert text == html(tmp_path)
     order = [text.index(f'id="{section}"') for section in ("failures", "study-1", "missing")]
     assert order == sorted(order)
     numbers = "≰ 1e-3", "&gt; 0", "≤ 6e-8", "-inf", "0x1.8p+0"
     for words in (*numbers, "no CUDA device", "mitsuba 3.9.1", "$k$ &amp;"):
         assert words in text, words
     assert "Not drawn: 2 points" in text  # of curve b
-
-
-def test_every_section_offers_its_rows(tmp_path):
-    text = html(tmp_path)
     run_report.write_json(tmp_path / "rows.json", ROWS, CONTEXT)
     written = json.loads((tmp_path / "rows.json").read_text())["rows"]
     for key, rows in (("study-1", written[:3]), ("study-2", written[3:])):
@@ -202,12 +206,14 @@ def test_every_section_offers_its_rows(tmp_path):
         assert json.loads(zlib.decompress(base64.b64decode(data))) == rows
 
 
-def test_html_is_reproducible_with_unique_ids(tmp_path):
-    twice = [*ROWS, dataclasses.replace(INFO, case="again")]
-    text = html(tmp_path, twice)
-    assert text == html(tmp_path, twice)
-    ids = re.findall(r'\bid="([^"]*)"', text)
-    assert len(ids) == len(set(ids))
+def test_rows_that_share_no_metric_have_tables_of_their_own(tmp_path):
+    """`c` shares one with `a` and one with `d`; nobody does with `b`; `e` was not run."""
+    values = {"a": {"x": 1.0}, "b": {"y": 2.0}, "c": {"x": 3.0, "z": 4.0}, "d": {"z": 5.0}, "e": {}}
+    rows = [Row("study", name, "case", "here", x, reason="" if x else "lost") for name, x in values.items()]
+    text = html(tmp_path, [*rows, Row("study", "e", "other case", "here", {"y": 6.0})], {})
+    tables = [table.partition("<tbody>") for table in re.findall(r'<table class="rows">.*?</table>', text, re.S)]
+    assert [re.findall(r">\s*([xyz])\s*<", head) for head, _, _ in tables] == [["x", "z"], ["y"]]
+    assert ["".join(re.findall(r">([a-e])<", body)) for _, _, body in tables] == ["acd", "be"]
 
 
 def test_matrix_marks_a_row_whose_other_metric_broke(tmp_path):
@@ -261,6 +267,9 @@ def test_curves_keep_the_guide_and_literal_names():
     assert "slope −1" in svg and ">$x$</text>" in svg and "var(--c0)" in svg
     assert ">seconds</text>" in svg and ">relMSE</text>" in svg
     assert curves_svg({"x": [(1, 0), (NAN, 1)]}, axes, salt="s") == ""
+    for wrong in ({"x_scale": "cubic"}, {"slope": 2, "y_scale": "linear"}):
+        with pytest.raises(ValueError, match="axes: "):
+            Axes(**wrong)
 
 
 @pytest.mark.parametrize(
@@ -274,12 +283,6 @@ def test_what_has_no_place_depends_on_the_scales_a_study_asks_for(scales, left_o
     assert ">height</text>" in text and ">turn</text>" in text
     assert [int(n) for n in re.findall(r"Not drawn: (\d+) point", text)] == [left_out] * bool(left_out)
     assert "slope" not in text
-
-
-def test_the_front_are_the_points_that_nothing_beats():
-    points = [(2.0, 5.0), (1.0, 9.0), (3.0, 5.0), (1.0, 8.0), (4.0, 1.0), (5.0, 2.0)]
-    assert pareto(points) == [(1.0, 8.0), (2.0, 5.0), (4.0, 1.0)]
-    assert pareto([]) == []
 
 
 def test_a_scatter_shows_front_floor_and_intervals_where_asked(tmp_path):
@@ -297,16 +300,11 @@ def test_a_scatter_shows_front_floor_and_intervals_where_asked(tmp_path):
     plain, text = paths()
     assert ">copy</text>" not in text
     assert paths(front=True)[0] == plain + 1
+    assert pareto([(2, 5), (1, 9), (3, 5), (1, 8), (4, 1), (5, 2)]) == [(1, 8), (2, 5), (4, 1)]  # not beaten by any
     floored, text = paths(floor="copy")
     assert floored == plain + 1 and ">copy</text>" in text
     wide = paths(interval=["low", "high"])[1]
     assert wide.count("<path") == plain and wide != text
-
-
-@pytest.mark.parametrize("axes", [{"x_scale": "cubic"}, {"slope": 2, "y_scale": "linear"}])
-def test_axes_that_cannot_be_drawn_are_an_error(axes):
-    with pytest.raises(ValueError, match="axes: "):
-        Axes(**axes)
 
 
 def test_an_overlay_stands_beside_the_other_images_in_a_fixed_order(tmp_path):
@@ -342,6 +340,49 @@ def test_a_broken_budget_never_looks_kept():
     assert distinguishable(1.3001e-5, 1.3e-5) == ("1.3001e-5", "1.3e-5")
     value, budget = distinguishable(math.nextafter(1.0, 2), 1.0)
     assert value != budget
+
+
+# The first screen
+
+ANSWER = {"question": "Is `it` right?", "text": "Up to <2> `ulp`.", "state": "yes", "study": "directions"}
+CURVES = Row("speed", "all", "balls", "llvm", {"time": 1.0}, curves={"a": [(1.0, 0.1), (2.0, 0.05)], "b": [(1.0, 1.0)]})
+IMAGES = Row("renders", "refract", "mirage", "llvm", {"changed": 0.1}, images={"reference": "a.exr", "test": "a.exr"})
+AXES = {"x": "seconds", "slope": -0.5}
+PAGE = {
+    "lead": "`refract` is glass.",
+    "answers": [ANSWER, {**ANSWER, "state": "not measured", "study": NOT_RUN}],
+    "image": {"row": IMAGES.name, "labels": {"test": "ours"}, "caption": "The `mirage`."},
+    "plot": {"row": CURVES.name, "labels": {"a": "first"}, "axes": AXES, "caption": "Speed."},
+}
+
+
+def test_what_is_broken_comes_before_the_answers_and_they_before_the_studies_and_what_was_not_run(tmp_path):
+    write_exr(tmp_path / "a.exr", np.full((4, 4, 3), 0.5))
+    broken = [dataclasses.replace(GOOD, values={"worst": 1.0}, case=str(i)) for i in range(5)]
+    absent = [Row("speed", name, "", "cuda", reason="no GPU" if name < "d" else "no time") for name in "dabc"]
+    text = html(tmp_path, [GOOD, CURVES, IMAGES, *broken, *absent], {"first_page": PAGE})
+    parts = "5 of 6 checks failed", 'class="broken"', "and 2 more", 'class="answers"', 'id="study-1"', 'id="missing"'
+    order = [text.index(words) for words in parts]
+    assert order == sorted(order)
+    assert "Is <code>it</code> right?" in text and "Up to &lt;2&gt; <code>ulp</code>." in text
+    assert '<a href="#study-1">More</a>' in text and '<a href="#missing">More</a>' in text
+    assert re.findall(r'class="(yes|not-measured)"', text) == ["yes", "not-measured"]
+    first, missing = text[: text.index("<nav")], text[order[-1] :]
+    assert first.count("<canvas") == 1 and ">first</text>" in first and ">b</text>" not in first
+    assert "first_page" not in text
+    assert re.findall(r"<b>(\d)</b> not run: (no \w+)", missing) == [("3", "no GPU"), ("1", "no time")]
+
+
+@pytest.mark.parametrize(
+    ("page", "complaint"),
+    [
+        ({"answers": [{**ANSWER, "state": "maybe"}]}, "state 'maybe'; expected yes, no, plain, not measured"),
+        ({"answers": [], "plot": {**PAGE["plot"], "row": "none"}}, "there is no row 'none'"),
+    ],
+)
+def test_a_first_page_that_cannot_be_shown_is_an_error(tmp_path, page, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        html(tmp_path, [CURVES], {"first_page": page})
 
 
 # In a browser
@@ -390,9 +431,3 @@ def test_the_page_works_from_a_file(tmp_path):
         "mode": "flicker",
         "read": "0.25  0.25  0.25",
     }
-
-
-def test_json_that_is_nested_too_deeply_is_one_line(tmp_path):
-    (tmp_path / "rows.json").write_text('{"rows": ' + "[" * 100_000)
-    with pytest.raises(ValueError, match="nested too deeply"):
-        run_report.read_json(tmp_path / "rows.json")

@@ -50,6 +50,7 @@ from validation.run.context import PROFILES, Context
 from validation.study import Task
 
 folder = Path(sys.argv[1])
+folder.mkdir(exist_ok=True)
 context = Context(PROFILES["quick"], folder, "scalar_rgb", {"llvm": SimpleNamespace(library=None)}, {})
 
 def measured(i):
@@ -71,9 +72,8 @@ sys.exit(errors.exit_code("validation", body))
 
 @dataclass(frozen=True)
 class Command:
-    """`prepare(folder)` makes its inputs; `words` for Python, FOLDER is the folder; `outputs`: its files, by glob."""
+    """`words` for Python, FOLDER is the folder; `outputs`: its files, by glob."""
 
-    prepare: Callable[[Path], Any]
     words: tuple[str, ...]
     outputs: str
     code: int
@@ -84,16 +84,14 @@ def image(path, seed):
     image_file.write_exr(path, np.random.default_rng(seed).random((64, 64, 3)), metadata=image_file.NO_DATE)
 
 
-def images(folder):
+def prepare(folder):
+    """Old outputs of the commands, and what they read: two folders of six images."""
     for side, first in (("old", 0), ("new", 100)):
-        (folder / side).mkdir()
+        (folder / side).mkdir(parents=True)
         for i in range(6):
             image(folder / side / f"{i}.exr", first + i)
-
-
-def images_and_page(folder):
-    images(folder)
     (folder / "out.html").write_text(OLD)
+    image(folder / "out.exr", 0)
 
 
 def whole_page(path):
@@ -102,20 +100,16 @@ def whole_page(path):
     return text if text == OLD else "new" if text.rstrip().endswith("</html>") else "torn"
 
 
-def pixels(path):
-    return image_file.read_exr(path)[0].tobytes()
-
-
 OURS = ("-m", "mi_refract.cli")
 RENDER = ("render", str(ROOT / "scenes" / "sphere.xml"), "-o", "FOLDER/out.exr", "-D", "res=16", "--spp", "2")
 DIFF = ("diff", "FOLDER/old", "FOLDER/new", "--report", "FOLDER/out.html")
 COMMANDS = {
-    "accept": Command(images, (*OURS, "accept", "FOLDER/old", "FOLDER/new", "--yes"), "old/*", 0),
-    "diff --report": Command(images_and_page, (*OURS, *DIFF), "out.html", 1, whole_page),
-    "validation": Command(lambda folder: None, ("-c", VALIDATION, "FOLDER"), "*.*", 0),
+    "accept": Command((*OURS, "accept", "FOLDER/old", "FOLDER/new", "--yes"), "old/*", 0),
+    "diff --report": Command((*OURS, *DIFF), "out.html", 1, whole_page),
+    "validation": Command(("-c", VALIDATION, "FOLDER/report"), "report/*.*", 0),
     "render": Command(
-        lambda folder: image(folder / "out.exr", 0), (*OURS, *RENDER, "--pass-spp", "1", "--restart"), "out.exr", 0,
-        pixels,
+        (*OURS, *RENDER, "--pass-spp", "1", "--restart"), "out.exr", 0,
+        lambda path: image_file.read_exr(path)[0].tobytes(),
     ),
 }  # fmt: skip
 
@@ -144,19 +138,19 @@ def temporary(folder):
 
 
 def state(command, folder):
-    found = {}
-    for path in folder.glob(command.outputs):
-        if path.is_file() and not path.name.startswith(".") and path.name != "validation.lock":
-            try:
-                found[path.name] = command.content(path)
-            except (OSError, ValueError) as error:
-                found[path.name] = error
-    return found
+    """The contents of its outputs, or why they cannot be read, by name."""
+    contents = {}
+    for path in set(folder.glob(command.outputs)) - temporary(folder):
+        try:
+            contents[path.name] = command.content(path)
+        except (OSError, ValueError) as error:
+            contents[path.name] = error
+    return contents
 
 
-def torn(found, *known):
+def torn(contents, *known):
     """Names of the files that are in none of the known states."""
-    return [name for name, content in found.items() if not any(content == each.get(name) for each in known)]
+    return [name for name, content in contents.items() if not any(content == files.get(name) for files in known)]
 
 
 def ends_well(command, folder, after, number):
@@ -176,15 +170,14 @@ def test_a_killed_command_leaves_whole_files_and_ends_well_when_started_again(na
     command, rng = COMMANDS[name], random.Random(0)
     old, new = tmp_path / "undisturbed", tmp_path / "killed"
     for folder in (old, new):
-        folder.mkdir()
-        command.prepare(folder)
+        prepare(folder)
     before, start = state(command, old), time.perf_counter()
     assert ended(command, old)[0] == command.code
     took, after = time.perf_counter() - start, state(command, old)
     for i in range(max(4, settings.default.max_examples // 50)):
         if i % 2:
             code, said = ended(command, new, size=rng.choice((0, 100, 1000, rng.randrange(60_000))))
-            lines = [line for line in said.splitlines() if not line.startswith("task ")]  # which tell the progress
+            lines = [line for line in said.splitlines() if not line.startswith("validation: task ")]  # the progress
             assert code == command.code or (code == errors.MISUSE and len(lines) == 1), said
         else:
             number, moment = SIGNALS[i // 2 % len(SIGNALS)], rng.uniform(0, took)
@@ -192,7 +185,7 @@ def test_a_killed_command_leaves_whole_files_and_ends_well_when_started_again(na
             for left in temporary(new):  # by SIGKILL, or by a signal before the first line of ours
                 left.unlink() if left.is_file() else shutil.rmtree(left)
         assert not torn(state(command, new), before, after)
-    if command.content is Path.read_bytes and before:  # so that something is left to do
+    if name == "accept":  # so that something is left to do
         first = next(path for path in new.glob(command.outputs) if path.name in before)
         first.write_bytes(before[first.name])
     assert ended(command, new)[0] == command.code

@@ -1,12 +1,22 @@
-"""Exports are written completely or not at all; where this can be checked here, they are the same scene."""
+"""Exports are written completely or not at all; read as the renderers would read them, they are the same scene.
 
+The film is not square, the camera's `up` is not at right angles to where it looks, and the sky's map has no symmetry.
+"""
+
+import json
 import os
 import re
+import runpy
+import sys
+import types
 from pathlib import Path
+from unittest import mock
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from support import fake_bpy, fake_raysect
+from support.scene_readers import READERS
 
 from mi_refract.image_diff import methods
 from mi_refract.image_diff.comparison import Verdict
@@ -16,16 +26,13 @@ from mi_refract.scene_export.plain_scene import Camera, Diffuse, Environment, Gl
 
 SCENES = Path(__file__).parents[2] / "scenes"
 CAMERA = Camera((0.0, 0.0, 9.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, 8, 4)
-GLASS = Glass(1.5, 1.000277)
+BALL = tessellation.sphere(0)
+GLASS, GREY, LAMP = Glass(1.5, 1.25), Diffuse((0.1, 0.2, 0.3)), Light((1.0, 2.0, 3.0))
 
 
-def meshes(*materials):
-    return tuple(Mesh(f"ball_{i}", *tessellation.sphere(0), material) for i, material in enumerate(materials))
-
-
-@pytest.fixture
-def small():
-    return PlainScene("small", meshes(GLASS, Light((1.0, 2.0, 3.0))), (0.5, 0.25, 1.0), CAMERA, 12)
+def plain(*materials, sky=(0.5, 0.25, 1.0), depth=12):
+    meshes = tuple(Mesh(f"ball_{i}", *BALL, material) for i, material in enumerate(materials))
+    return PlainScene("a scene", meshes, sky, CAMERA, depth)
 
 
 @pytest.fixture
@@ -39,49 +46,50 @@ def sky():
 
 
 @pytest.mark.parametrize("target", write_files.TARGETS)
-@pytest.mark.parametrize("empty", [False, True])
-def test_every_target_writes_its_folder(target, empty, small, sky, tmp_path):
-    for i, shown in enumerate((small.sky, sky)):
-        scene = PlainScene("a scene", () if empty else small.meshes, shown, CAMERA, 12)
+def test_every_target_writes_its_folder(target, sky, tmp_path):
+    """With a sky of one colour, with a map, and without any mesh."""
+    scenes = [plain(GLASS, LAMP), plain(GLASS, LAMP, sky=sky), plain(sky=sky)]
+    for i, scene in enumerate(scenes):
         written = write_files.write(scene, target, tmp_path / f"{i}")
         assert sorted(written) == sorted((tmp_path / f"{i}").iterdir()) and (
-            empty or all(map(os.path.getsize, written))
+            i == 2 or all(map(os.path.getsize, written))
         )
         text = (tmp_path / f"{i}" / "README.txt").read_text()
         assert scene.name in text and all(len(line) <= 140 for line in text.splitlines())
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["0", "1"]
+        if (tmp_path / f"{i}" / "sky.exr").exists():  # without a date: the same scene gives the same bytes
+            assert image_file.read(tmp_path / f"{i}" / "sky.exr").metadata["DateTime"] == "1970:01:01 00:00:00"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0", "1", "2"]
+    readme = Path(write_files.__file__).with_name("README.md").read_text()
+    assert target in re.findall(r"^\| `(.*?)` \|", readme, re.MULTILINE)
 
 
-def test_an_empty_folder_is_taken(small, tmp_path):
-    (tmp_path / "there").mkdir()
-    (tmp_path / "link").symlink_to(tmp_path / "there")
-    write_files.write(small, "radiance", tmp_path / "link")
-    assert (tmp_path / "there" / "scene.rad").is_file() and (tmp_path / "link").is_symlink()
-
-
-def test_what_is_there_stays(small, tmp_path):
-    (tmp_path / "full").mkdir()
+def test_what_is_there_stays_and_an_empty_folder_is_taken(tmp_path):
+    for name in ("full", "there"):
+        (tmp_path / name).mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
     (tmp_path / "file").write_text("mine")
-    cases = [
+    before = sorted(tmp_path.rglob("*"))
+    for name, words in (
         ("full", "already contains files"),
         ("file", "not a folder"),
         ("none/below", "not a folder"),
         ("file/below", "not a f"),
-    ]
-    for name, words in cases:
+    ):
         with pytest.raises(OSError, match=words):
-            write_files.write(small, "obj+json", tmp_path / name)
-    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == ["file", "full", "full/mine.txt"]
+            write_files.write(plain(GLASS), "obj+json", tmp_path / name)
+    with pytest.raises(ValueError, match=r"'blender': unknown; expected cycles, luxcore, .*, mitsuba, obj\+json"):
+        write_files.write(plain(GLASS), "blender", tmp_path / "new")
+    assert sorted(tmp_path.rglob("*")) == before
+    (tmp_path / "link").symlink_to(tmp_path / "there")
+    write_files.write(plain(GLASS), "radiance", tmp_path / "link")
+    assert (tmp_path / "there" / "scene.rad").is_file() and (tmp_path / "link").is_symlink()
 
 
-def test_unwritable_folder(small, tmp_path, monkeypatch):
-    monkeypatch.setattr(os, "access", lambda path, mode: False)
-    with pytest.raises(PermissionError, match="not writable"):
-        write_files.write(small, "mitsuba", tmp_path / "new")
-
-
-def test_nothing_stays_of_half_an_export(small, tmp_path, monkeypatch):
+def test_nothing_stays_of_half_an_export(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "access", lambda path, mode: False)
+        with pytest.raises(PermissionError, match="not writable"):
+            write_files.write(plain(GLASS), "mitsuba", tmp_path / "new")
     written, write_bytes = [], Path.write_bytes
 
     def full(path, data):
@@ -92,32 +100,102 @@ def test_nothing_stays_of_half_an_export(small, tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OSError, match="No space"):
-        write_files.write(small, "mitsuba", tmp_path / "new")
+        write_files.write(plain(GLASS, LAMP), "mitsuba", tmp_path / "new")
     assert len(written) == 3 and not list(tmp_path.iterdir())
 
 
-def test_unknown_target(small, tmp_path):
-    with pytest.raises(
-        ValueError,
-        match=r"'blender': unknown; expected cycles, luxcore, radiance, raysect, povray, mitsuba, obj\+json",
-    ):
-        write_files.write(small, "blender", tmp_path / "new")
+# --- read as the renderers read it ------------------------------------------------------------------------
+
+SINGLE = 2.0**-24
+MAP = np.random.default_rng(8).random((5, 8, 3)).astype(np.float32)
+COLOUR = '<emitter type="constant"><rgb name="radiance" value="0.5, 0.25, 1"/></emitter>'
+TURNED = """<emitter type="envmap"><string name="filename" value="map.exr"/><float name="scale" value="0.5"/>
+  <transform name="to_world"><rotate x="0.6" y="0.8" angle="70"/></transform></emitter>"""
+PATCH = """<shape type="cube" id="patch"><transform name="to_world"><translate x="-7"/></transform>
+  <bsdf type="diffuse"><rgb name="reflectance" value="0.1, 0.2, 0.3"/></bsdf></shape>"""
+SCENE = """<scene version="3.0.0">
+  <integrator type="path"><integer name="max_depth" value="7"/></integrator>
+  <sensor type="perspective">
+    <transform name="to_world"><lookat origin="3,-20,5" target="1,2,-1" up="0.3,0.2,1"/></transform>
+    <float name="fov" value="40"/><string name="fov_axis" value="y"/>
+    <film type="hdrfilm">
+      <integer name="width" value="16"/><integer name="height" value="9"/><rfilter type="box"/>
+    </film>
+  </sensor>
+  <shape type="sphere" id="ball">
+    <bsdf type="dielectric"><float name="int_ior" value="1.8"/><float name="ext_ior" value="1.2"/></bsdf>
+  </shape>
+  <shape type="sphere" id="pearl"><point name="center" x="4" y="0" z="1"/>
+    <bsdf type="dielectric"><float name="int_ior" value="1.1"/><float name="ext_ior" value="1.2"/></bsdf>
+  </shape>
+  <shape type="cube" id="lamp"><transform name="to_world"><translate z="6"/></transform>
+    <emitter type="area"><rgb name="radiance" value="1, 2, 3"/></emitter></shape>
+  %s
+</scene>"""
 
 
-# --- What the round trip of test_round_trip.py does not show -----------------------------------------------------
+@pytest.mark.parametrize("target", READERS)
+@pytest.mark.parametrize("sky", [COLOUR, TURNED], ids=["colour", "map"])
+def test_the_export_has_mitsubas_rays_surfaces_indices_lights_and_sky(
+    target, sky, tmp_path, monkeypatch, scalar_variant
+):
+    """Mitsuba's rays are in float32: an error of a few roundoffs in each of its transforms.
 
+    Triangles are counterclockwise from outside; an index is that inside over the one outside. A map of the sky is
+    resampled to cells of 1/16: where it bends by at most 2 per texel, linear cells err by 1/32 an axis.
+    """
+    image_file.write_exr(tmp_path / "map.exr", MAP)
+    path = tmp_path / "scene.xml"
+    path.write_text(SCENE % (sky if target == "povray" else sky + PATCH))
+    given = from_mitsuba.load(path, level=1)
+    write_files.write(given, target, tmp_path / "export")
+    original = mi.load_file(str(path), parallel=False, optimize=False)
+    found = READERS[target](tmp_path / "export", monkeypatch)
 
-def renders(path, first, **defines):
-    scene = mi.load_file(str(path), optimize=False, parallel=False, **defines)
-    seeds = range(first, first + 8)
-    return [image_file.named(f"seed {seed}", np.array(mi.render(scene, spp=64, seed=seed))) for seed in seeds]
+    assert found.size == (16, 9) and found.depth == 7
+    places = [(0, 0), (1, 0), (0, 1), (1, 1), *np.random.default_rng(3).random((12, 2))]
+    for x, y in (np.clip(place, 1e-6, 1 - 1e-6) for place in places):
+        ray, _ = original.sensors()[0].sample_ray(0, 0.5, mi.Point2f(x, y), mi.Point2f(0.5))
+        origin, direction = found.ray(x, y)
+        np.testing.assert_allclose(direction / np.linalg.norm(direction), ray.d, atol=64 * SINGLE)
+        # Mitsuba's rays start at the near clip plane.
+        assert np.linalg.norm(np.cross(np.subtract(ray.o, origin), ray.d)) < 64 * SINGLE * np.linalg.norm(origin)
+
+    assert sorted(found.triangles) == sorted(mesh.name for mesh in given.meshes)
+    for mesh in given.meshes:
+        np.testing.assert_allclose(found.triangles[mesh.name], mesh.triangles(), atol=8 * SINGLE)
+    for name in ("ball", "pearl"):
+        (bsdf,) = (shape.bsdf() for shape in original.shapes() if shape.id() == name)
+        centre = np.mean(found.triangles[name], axis=(0, 1))
+        assert (np.linalg.det(np.subtract(found.triangles[name], centre)) > 0).all()
+        assert found.indices[name] == pytest.approx(float(re.search(r"eta = ([\d.]+)", str(bsdf))[1]), rel=1e-5)
+    assert found.indices.keys() == {"ball", "pearl"} and found.lights.keys() == {"lamp"}
+    assert list(found.lights["lamp"]) == [1, 2, 3]
+    colours = {name: list(colour) for name, colour in found.colours.items()}
+    assert colours == ({} if target == "povray" else {"patch": [0.1, 0.2, 0.3]})
+
+    directions = np.random.default_rng(5).normal(size=(200, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    expected = []
+    for direction in directions:
+        si = mi.SurfaceInteraction3f()
+        si.wi = -mi.Vector3f(direction)
+        expected.append(list(original.environment().eval(si)))
+    tolerance = 1e-5 if sky == COLOUR else 0.5 * np.ptp(MAP) / 16
+    np.testing.assert_allclose(found.sky(directions), expected, atol=tolerance)
 
 
 def test_the_plain_scene_renders_equal_and_another_index_would_be_seen(tmp_path):
     """False alarms: 0.001 by the family error of `welch`; the seeds are fixed."""
-    original, path = SCENES / "prism.xml", tmp_path / "plain" / "scene.xml"
-    write_files.write(from_mitsuba.load(original, level=0, res="32"), "mitsuba", path.parent)
-    first = renders(original, 0, res="32")
+
+    def renders(path, first, **defines):
+        scene = mi.load_file(str(path), optimize=False, parallel=False, **defines)
+        seeds = range(first, first + 8)
+        return [image_file.named(f"seed {seed}", np.array(mi.render(scene, spp=64, seed=seed))) for seed in seeds]
+
+    path = tmp_path / "plain" / "scene.xml"
+    write_files.write(from_mitsuba.load(SCENES / "prism.xml", level=0, res="32"), "mitsuba", path.parent)
+    first = renders(SCENES / "prism.xml", 0, res="32")
     assert methods.compare("welch", first, renders(path, 100), tile=16).verdict == Verdict.EQUAL
     text, material = path.read_text(), '<float name="int_ior" value="1.5046"/>'
     assert material in text
@@ -125,36 +203,112 @@ def test_the_plain_scene_renders_equal_and_another_index_would_be_seen(tmp_path)
     assert methods.compare("welch", first, renders(path, 100), tile=16).verdict == Verdict.DIFFERENT
 
 
-def test_povray_refuses_what_it_does_not_follow(small, tmp_path):
-    pane, (ball,) = Mesh("pane", *tessellation.rectangle(), GLASS), meshes(Diffuse((0.5, 0.0, 0.0)))
-    for mesh, words in ((pane, "pane: glass with an open"), (ball, "ball_0: a diffuse surface")):
+def test_povray(tmp_path):
+    """What it does not follow is refused; black surfaces; indices relative to what is outside."""
+    pane = Mesh("pane", *tessellation.rectangle(), GLASS)
+    (grey,) = plain(Diffuse((0.5, 0.0, 0.0))).meshes
+    for mesh, words in ((pane, "pane: glass with an open"), (grey, "ball_0: a diffuse surface")):
         with pytest.raises(ValueError, match=words):
             write_files.write(PlainScene("bad", (mesh,), (1.0, 1.0, 1.0), CAMERA, 8), "povray", tmp_path / "new")
     assert not list(tmp_path.iterdir())
-
-
-def test_povray_surfaces_that_are_black():
-    scene = PlainScene("lit", meshes(Light((1.0, 2.0, 3.0)), Diffuse((0.0, 0.0, 0.0))), (1.0, 1.0, 1.0), CAMERA, 8)
-    text = write_files.TARGETS["povray"](scene)["scene.pov"].decode()
+    make = write_files.TARGETS["povray"]
+    text = make(plain(LAMP, Diffuse((0.0, 0.0, 0.0))))["scene.pov"].decode()
     front = "texture { pigment { rgb <%s> } finish { ambient 0 diffuse 0 emission 1 } }"
     assert text.count(front % "1.0, 2.0, 3.0") == text.count(front % "0.0, 0.0, 0.0") == 1
     assert text.count("interior_texture { pigment { rgb 0 } finish { ambient 0 diffuse 0 } }") == 2
-
-
-def test_povray_indices_are_relative_to_what_is_outside():
-    inner, (vertices, faces) = Mesh("in", *tessellation.sphere(0), Glass(1.2, 1.6)), tessellation.sphere(0)
-    outer = Mesh("out", 2 * vertices, faces, Glass(1.6, 1.25))
-    text = write_files.TARGETS["povray"](PlainScene("two", (inner, outer), (1.0, 1.0, 1.0), CAMERA, 300))["scene.pov"]
+    two = Mesh("in", *BALL, Glass(1.2, 1.6)), Mesh("out", 2 * BALL[0], BALL[1], Glass(1.6, 1.25))
+    text = make(PlainScene("two", two, (1.0, 1.0, 1.0), CAMERA, 300))["scene.pov"]
     assert [float(part.split()[0]) for part in text.split(b"interior { ior ")[1:]] == [1.2 / 1.25, 1.6 / 1.25]
     assert b"max_trace_level 256" in text
 
 
-def test_the_map_has_no_date(small, sky, tmp_path):
-    """So that the same scene gives the same bytes."""
-    write_files.write(PlainScene("turned", small.meshes, sky, CAMERA, 12), "mitsuba", tmp_path / "new")
-    assert image_file.read(tmp_path / "new" / "sky.exr").metadata["DateTime"] == "1970:01:01 00:00:00"
+# --- the scripts of exports: each seed once, and a plain path tracer -----------------------------------------
 
 
-def test_the_readme_lists_every_target():
-    readme = Path(write_files.__file__).with_name("README.md").read_text()
-    assert set(write_files.TARGETS) <= set(re.findall(r"^\| `(.*?)` \|", readme, re.MULTILINE))
+def written(target, folder, depth=12):
+    write_files.write(plain(GLASS, GREY, LAMP, depth=depth), target, folder)
+    return folder
+
+
+@pytest.mark.parametrize("words, seeds", [((), [1]), (("--seeds", "4", "2", "--threads", "2"), [4, 2])])
+def test_cycles_is_a_plain_path_tracer_of_each_seed(words, seeds, tmp_path, monkeypatch, capsys):
+    bpy = fake_bpy.run(written("cycles", tmp_path / "new"), monkeypatch, *words)
+    files = [str(tmp_path / "new" / f"seed{seed}.exr") for seed in seeds]
+    assert bpy.rendered == list(zip(seeds, files, strict=True)) and capsys.readouterr().out.split() == files
+    bpy.ops.wm.read_factory_settings.assert_called_once_with(use_empty=True)
+    render, cycles = bpy.context.scene.render, bpy.context.scene.cycles
+    assert (render.engine, cycles.device, cycles.samples) == ("CYCLES", "CPU", 3)
+    assert (render.resolution_x, render.resolution_y, render.resolution_percentage) == (8, 4, 100)
+    assert ((render.threads_mode, render.threads) == ("FIXED", 2)) == bool(words)
+    file = render.image_settings
+    assert (file.file_format, file.color_mode, file.color_depth) == ("OPEN_EXR", "RGB", "32")
+    assert (cycles.pixel_filter_type, cycles.filter_width) == ("BOX", 1)
+    for biased in ("blur_glossy", "sample_clamp_direct", "sample_clamp_indirect", "light_sampling_threshold"):
+        assert getattr(cycles, biased) == 0
+    assert (cycles.caustics_reflective, cycles.caustics_refractive) == (True, True)
+    assert (cycles.use_adaptive_sampling, cycles.use_denoising) == (False, False)
+    assert (render.use_compositing, render.use_sequencer) == (False, False)
+    assert cycles.min_light_bounces == cycles.max_bounces == 10
+    lens = bpy.data.cameras.made["camera"]
+    assert 0 < lens.clip_start <= 1e-3 and lens.clip_end >= 1e6
+    deep = fake_bpy.run(written("cycles", tmp_path / "deep", depth=5000), monkeypatch).context.scene.cycles
+    assert deep.max_bounces == deep.transmission_bounces == 1024  # its limit
+
+
+@pytest.mark.parametrize("words, seeds", [((), [1]), (("--seeds", "4", "2", "--threads", "3", "--spp", "9"), [4, 2])])
+def test_luxcore_renders_each_seed_into_a_file_of_its_own(words, seeds, tmp_path, monkeypatch, capsys):
+    folder, sessions, waits = written("luxcore", tmp_path / "new"), [], []
+
+    class Properties(dict):
+        def __init__(self, name):
+            super().__init__(name=name)
+
+        def Set(self, pair):
+            self.update([pair])
+
+    class Session:
+        """A render that has ended when it was asked three times."""
+
+        def __init__(self, config):
+            self.config, self.calls = config, []
+            sessions.append(self)
+
+        def __getattr__(self, name):
+            return lambda: self.calls.append(name) or (self.calls.count("HasDone") > 2 if name == "HasDone" else self)
+
+    lux = mock.MagicMock(Properties=Properties, Property=lambda key, value: (key, value), RenderSession=Session)
+    lux.RenderConfig = lambda config, scene: config
+    monkeypatch.setitem(sys.modules, "pyluxcore", lux)
+    monkeypatch.setattr("time.sleep", waits.append)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["render.py", "--out", "out", *words])
+    runpy.run_path(str(folder / "render.py"))["main"]()
+    files = [str(tmp_path / "out" / f"seed{seed}.exr") for seed in seeds]
+    assert capsys.readouterr().out.split() == files and 0 < max(waits) < 1
+    for session, seed, file in zip(sessions, seeds, files, strict=True):
+        own = {"batch.haltspp": 9 if words else 256, "renderengine.seed": seed, "film.outputs.0.filename": file}
+        assert session.config == {"name": "scene.cfg"} | own | ({"native.threads.count": 3} if words else {})
+        done = ["HasDone", "UpdateStats"] * 2
+        assert session.calls == ["Start", *done, "HasDone", "Stop", "GetFilm", "Save"]
+    assert lux.Scene.return_value.Parse.call_args.args == ({"name": "scene.scn"},)
+
+
+def test_raysect_weighs_no_ray_and_takes_a_band_and_a_dispersion(tmp_path, monkeypatch):
+    """Its image has rows from the lowest; its lamps are black from behind."""
+    folder = written("raysect", tmp_path / "new")
+    _, script = fake_raysect.run(folder, monkeypatch)
+    pixels = np.arange(2 * 3 * 3, dtype=np.float32).reshape(2, 3, 3)
+    (tmp_path / "image.pfm").write_bytes(script["pfm"](pixels))
+    assert (image_file.read(tmp_path / "image.pfm").pixels == pixels).all()
+    assert script["Camera"]((2, 1))._generate_rays(0, 0) == [("ray", 1.0)]
+    lamp, ray = script["Light"]("bright"), types.SimpleNamespace(new_spectrum=lambda: "black")
+    seen = [lamp.evaluate_surface("world", ray, "lamp", "place", exiting, "more") for exiting in (False, True)]
+    assert seen == ["bright", "black"]
+    scene = json.loads((folder / "scene.json").read_text())
+    for band, bins in ((None, 3), ([656.0, 656.5], 1)):
+        made = script["camera"]("world", scene, types.SimpleNamespace(spp=5, band=band), "pipeline")
+        assert (made.spectral_rays, made.spectral_bins, made.pixel_samples) == (1, bins, 5)
+        assert [made.min_wavelength, made.max_wavelength] == (band or [400, 700])
+    entry = {"int_ior": 1.5, "ext_ior": 1.25}
+    assert script["glass"](entry) == ("glass", 1.5, 1, 1.25)
+    assert script["glass"](entry | {"schott": "SF11"})[1] == "of SF11"

@@ -11,7 +11,6 @@ from mi_refract.io.image_file import Image, write_exr
 SIZE = (32, 48, 3)
 
 
-# By flag of OpenImageIO's `idiff`: the option of `tolerance` that says the same, and idiff's default.
 def of(pixels, channels=None, **rest):
     """An image in memory, of R, G, B, or of Y where there is one channel."""
     pixels = np.asarray(pixels, np.float32)

@@ -53,18 +53,18 @@ def test_a_mutant_is_killed_where_a_test_sees_it_and_survives_where_none_does(tr
     assert (tree / PATH).read_text() == CODE
 
 
-def test_tests_that_fail_without_a_mutant_are_an_error(tree):
+@pytest.mark.parametrize(
+    ("path", "text", "tests"),
+    [
+        (PATH, CODE.replace("a > b", "a < b"), r"test_tiny.py::test_larger"),
+        ("tests/conftest.py", "raise ImportError\n", r"test_tiny.py.*"),  # then pytest names no test that failed
+    ],
+)
+def test_tests_that_fail_or_cannot_start_without_a_mutant_are_an_error(tree, path, text, tests):
     mutant = planted(tree, "return 2 + 3")
-    (tree / PATH).write_text(CODE.replace("a > b", "a < b"))
-    with pytest.raises(ValueError, match=r"tests/accuracy/test_tiny.py::test_larger fails without a mutant"):
+    (tree / path).write_text(text)
+    with pytest.raises(ValueError, match=f"tests/accuracy/{tests} fails without a mutant"):
         list(code_mutants.examine([mutant], tree))
-
-
-def test_tests_that_cannot_start_without_a_mutant_are_an_error(tree):
-    """pytest then names no test that failed, and every mutant would count as killed."""
-    (tree / "tests/conftest.py").write_text("raise ImportError\n")
-    with pytest.raises(ValueError, match=r"tests/accuracy/test_tiny.py.* fails without a mutant"):
-        list(code_mutants.examine([planted(tree, "return 2 + 3")], tree))
 
 
 def test_what_cannot_change_behaviour_is_no_mutant(tree):
@@ -75,9 +75,6 @@ def test_what_cannot_change_behaviour_is_no_mutant(tree):
         "return 2 * 3",
     }
     assert {mutant.becomes.count("|") for mutant in mutants if mutant.line.startswith("def")} == {2}
-
-
-def test_a_decorator_that_is_removed_is_named(tree):
     (tree / PATH).write_text("import functools\n\n\n@functools.cache\ndef f():\n    pass\n")
     (mutant,) = code_mutants.every(tree, PATH)
     assert str(mutant) == f"{PATH}:4: RemoveDecorator: @functools.cache → "
@@ -114,19 +111,8 @@ def test_explanations_say_why_a_mutant_cannot_be_observed():
         assert entry["line"] != entry["becomes"]
 
 
-def test_the_tests_of_a_module_come_first():
-    files = code_mutants.guards(code_mutants.ROOT, "mi_refract/report/junit.py")
-    assert files == ["tests/report/test_junit.py", "tests/report", "tests/test_rooms.py"]
+def test_the_tests_of_a_module_come_first_and_without_any_nothing_is_run(tmp_path):
+    files = code_mutants.guards(code_mutants.ROOT, "mi_refract/io/sanitise.py")
+    assert files == ["tests/io/test_sanitise.py", "tests/report/test_sanitise.py", "tests/io", "tests/test_rooms.py"]
     assert "tests/cli/test_diff.py" in code_mutants.guards(code_mutants.ROOT, "mi_refract/image_diff/pairing.py")
-
-
-def test_without_a_checkout_it_is_not_run(tmp_path):
     assert code_mutants.missing(tmp_path) == "no folder of tests beside the package: run it in a checkout"
-
-
-@pytest.mark.parametrize("arguments", [[], ["--help"], ["3", "4", "5"], ["-1"], ["many"]], ids=str)
-def test_other_arguments_are_one_line(capsys, arguments):
-    assert code_mutants.main(arguments) == 2
-    assert capsys.readouterr().err.splitlines() == [
-        "usage: python -m validation.robustness.code_mutants COUNT [SEED], whole numbers"
-    ]

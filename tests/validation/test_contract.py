@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_refract import backend
 from mi_refract.io.pixels import srgb_decode
 from mi_refract.media import glass_catalogs
 from mi_refract.report.row import Row
@@ -23,21 +22,19 @@ from validation import __main__ as command
 from validation import limits, repeated, runner
 from validation.ground_truth import rainbow
 from validation.run import kernel_timing, seeds, tightness
-from validation.run.context import Context, profiles
-from validation.study import Study
+from validation.run.array_settings import settings
+from validation.run.context import here, profiles
+from validation.study import Study, Task
 
 MODULES = command.modules([], "full")
 STUDIES = {name: importlib.import_module(f"validation.{name}").STUDY for name in MODULES}
-VARIANTS = ("scalar_rgb", "llvm_ad_rgb")
 RUN = (
-    *("directions.bsdf_samples", "diff.planted_defects", "planar.against_retrace", "media.catalogs"),
-    *("media.closed_forms", "stability.derivatives", "stability.energy", "stability.layered_paths"),
-    "stability.optical_chains",
+    *("directions.bsdf_samples", "directions.planted_defects", "directions.sweep", "diff.planted_defects"),
+    *("ground_truth.traced_bodies", "media.catalogs", "media.closed_forms", "planar.against_retrace"),
+    *("planar.closed_paths", "planar.extruded_scenes", "planar.joints", "renders.random_numbers"),
+    *("stability.derivatives", "stability.energy", "stability.layered_paths", "stability.optical_chains"),
+    *("suite.small_mistakes", "media.ray_directions", "renders.gradients"),
 )
-
-
-def context(variant, folder=Path(), profile="quick"):
-    return Context(profiles(variant)[profile], folder, variant, backend.detect(), backend.usable_variants())
 
 
 # Studies and tasks ---------------------------------------------------------------------------------------------------
@@ -52,18 +49,21 @@ def test_every_study_is_in_a_room_and_described():
     assert all(study.title and study.text and study.terms for study in STUDIES.values())
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_tasks_have_different_names_and_those_that_time_something_say_so(variant, needs_variant):
-    needs_variant(variant)
-    for profile in profiles(variant):
-        tasks = runner.tasks(list(STUDIES.values()), context(variant, profile=profile))
-        assert {task.name for task in tasks if not task.timed and reached(task.run) & CLOCKS} == set()
-        assert any(task.timed for task in tasks)
-
-
 # A task that reaches one of them measures a time. What `Camera` measures is not judged by those that are not `timed`.
 CLOCKS = {"perf_counter", "process_time", "kernel_timing.interval", "scaling.run"}
 NOT_JUDGED = "render_methods.Camera.__call__"
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+def test_tasks_have_different_names_and_those_that_time_something_say_so(variant, needs_variant):
+    needs_variant(variant)
+    for profile in profiles(variant):
+        tasks = runner.tasks(list(STUDIES.values()), here(profile, Path(), variant))
+        assert {task.name for task in tasks if not task.timed and reached(task.run) & CLOCKS} == set()
+        assert any(task.timed for task in tasks)
+    twice = Study("s", "", "", {}, lambda context: [Task("a", list), Task("a", list)])
+    with pytest.raises(ValueError, match="two tasks are called 'a'; expected different names"):
+        runner.tasks([twice], here("quick", Path(), variant))
 
 
 def reached(start):
@@ -82,15 +82,11 @@ def reached(start):
             if this.__module__.startswith(("validation", __name__)) and name not in found | {NOT_JUDGED}:
                 names = names_in(this.__code__)
                 found |= {name} | names & CLOCKS
-                scopes = [this.__globals__, *(x for x in this.__globals__.values() if inspect.ismodule(x))]
-                scopes = [vars(x) if inspect.ismodule(x) else x for x in scopes if is_ours(x)]
+                modules = [x for x in this.__globals__.values() if inspect.ismodule(x)]
+                scopes = [this.__globals__, *(vars(x) for x in modules if x.__name__.startswith("validation"))]
                 left += [scope[name] for scope in scopes for name in names & scope.keys()]
                 left += [cell.cell_contents for cell in this.__closure__ or ()]
     return found
-
-
-def is_ours(scope):
-    return not inspect.ismodule(scope) or scope.__name__.startswith("validation")
 
 
 def names_in(code):
@@ -111,6 +107,15 @@ def test_a_task_that_times_something_is_found():
     again = Study("s", "", "", {}, lambda c: [], again=lambda c: [direct() for _ in range(1)])
     assert all(reached(work) & CLOCKS for work in (direct, by_hand, functools.partial(through_a_study, again)))
     assert not reached(through_a_study) & CLOCKS
+
+
+def test_why_cuda_does_not_run_says_what_it_needs():
+    machine = here("quick", Path(), "scalar_rgb")
+    absent = [setting.reason for setting in settings(machine) if setting.backend == "cuda" and not setting.vector]
+    absent += [reason for name, reason in machine.variants.items() if name.startswith("cuda") and reason]
+    rows = [Row("s", "x", "y", "cuda", reason=reason) for reason in absent]
+    assert {row.remedy for row in rows} <= {"an NVIDIA GPU with its driver"}
+    assert all(machine.variants[name] is None for name in machine.variants if name.startswith("scalar"))
 
 
 # Seeds ---------------------------------------------------------------------------------------------------------------
@@ -150,9 +155,9 @@ def drawn(context):
 
 @pytest.mark.parametrize(("profile", "count"), [("quick", 0), ("standard", 3), ("full", 10)])
 def test_a_bound_that_only_its_own_seed_holds_fails(profile, count, tmp_path):
-    here = context("scalar_rgb", tmp_path, profile)
-    assert drawn(here)[0].verdict == "pass"
-    tasks = repeated.tasks(Study("s", "S", "", {}, lambda context: [], again=drawn), here)
+    context = here(profile, tmp_path, "scalar_rgb")
+    assert drawn(context)[0].verdict == "pass"
+    tasks = repeated.tasks(Study("s", "S", "", {}, lambda context: [], again=drawn), context)
     assert len(tasks) == count
     for task in tasks:
         summary, broken = task.run()
@@ -161,14 +166,13 @@ def test_a_bound_that_only_its_own_seed_holds_fails(profile, count, tmp_path):
     assert seeds.current(5) == 5
 
 
-def test_a_repetition_that_checks_nothing_fails():
-    nothing = Study("s", "S", "", {}, lambda c: [], again=lambda c: [Row("s", "x", "y", "", {"error": 1.0})])
-    assert repeated.rows_of(nothing, context("scalar_rgb"), 1)[0].broken == {"nothing checked": 0.0}
+def test_a_repetition_that_checks_nothing_fails_and_one_of_what_cannot_be_run_is_not_run():
+    def again(**row):
+        study = Study("s", "S", "", {}, lambda c: [], again=lambda c: [Row("s", "x", "y", "", **row)])
+        return repeated.rows_of(study, here("quick", Path(), "scalar_rgb"), 1)
 
-
-def test_a_repetition_of_what_cannot_be_run_is_not_run():
-    absent = Study("s", "S", "", {}, lambda c: [], again=lambda c: [Row("s", "x", "y", "", reason="install x")])
-    (row,) = repeated.rows_of(absent, context("scalar_rgb"), 1)
+    assert again(values={"error": 1.0})[0].broken == {"nothing checked": 0.0}
+    (row,) = again(reason="install x")
     assert (row.verdict, row.case, row.reason) == ("not run", "other seed 1", "install x")
 
 
@@ -189,22 +193,13 @@ def test_shares_of_bounds(value, bound, share):
 # Rows and bounds -----------------------------------------------------------------------------------------------------
 
 
-@functools.cache
-def rows_of(name, folder):
-    tasks = STUDIES[name].tasks(context("llvm_ad_rgb", folder))
-    return STUDIES[name].summarise([row for task in tasks for row in task.run()])
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("contract")
-
-
+@pytest.mark.filterwarnings("ignore:.*is an extrapolation")  # wavelengths are drawn beyond the fit of a glass
 @pytest.mark.parametrize("name", RUN)
-def test_a_study_holds_its_bounds_none_of_which_is_a_hundred_times_too_wide(name, folder, llvm_variant, monkeypatch):
+def test_a_study_holds_its_bounds_none_of_which_is_a_hundred_times_too_wide(name, tmp_path, llvm_variant, monkeypatch):
     one = {"SCHOTT": glass_catalogs.CATALOGS["SCHOTT"]}  # each takes a second
     monkeypatch.setattr(glass_catalogs, "CATALOGS", one)
-    rows = rows_of(name, folder)
+    tasks = STUDIES[name].tasks(here("quick", tmp_path, "llvm_ad_rgb"))
+    rows = STUDIES[name].summarise([row for task in tasks for row in task.run()])
     assert {row.study for row in rows} <= {STUDIES[name].name, "self-test"}
     assert [name for name, count in Counter(row.name for row in rows).items() if count > 1] == []
     assert [(row.name, row.broken) for row in rows if row.verdict == "fail"] == []

@@ -9,7 +9,7 @@ import pytest
 from support.media_rays import answered
 
 from mi_refract import media
-from validation.media.closed_forms import _back_focal_distance
+from validation.media.closed_forms import back_focal_distance
 from validation.reference.exact_lens import crossing
 from validation.run.context import PROFILES, Context
 from validation.run.metrics import ERROR_OVER_BOUND
@@ -30,7 +30,7 @@ def rays():
 
 def of_f2(rays):
     """The rays that pass through F2."""
-    pairs = glasses.media_rays.columns(rays.header, rays.ids)[:, 1].astype(int)
+    pairs = glasses.header.columns(rays.header, rays.ids)[:, 1].astype(int)
     return np.array(["SCHOTT:F2" in pair for pair in rays.header["media"]])[pairs]
 
 
@@ -67,7 +67,7 @@ def test_a_known_difference_is_a_missed_goal_as_long_as_it_is_what_it_was(off, f
     rows = judged(rays, answers, {"SCHOTT:F2": OtherIndex(1.00e-4, "another edition")})
     (row,) = (row for row in rows if row.case == "SCHOTT:F2")
     assert (row.verdict == "fail") == fails and row.reason.endswith("another edition")
-    assert row.missed == ({glasses.INDEX_OFF: glasses.media_rays.SAME} if off else {})
+    assert row.missed == ({glasses.INDEX_OFF: glasses.header.SAME} if off else {})
 
 
 PROGRAM = f"""
@@ -117,44 +117,6 @@ def test_systems_that_are_installed_answer_for_their_indices(name):
     assert {row.case for row in rows if row.missed} <= set(catalogue.others)
 
 
-# Why catalogues differ: coefficients of the other catalogue, and an index that it prints at a line. CDGM has published
-# two formulas: Sellmeier's, in the catalogue for Zemax of 2022, and a power series in its spreadsheet. Sumita has
-# changed two glasses since its catalogue of 2017, whose coefficients are those of λ⁰, λ², λ⁻², …, in µm. raysect has
-# Schott's catalogue of 2000; of N-BK7 only C1 = 6000.69867 nm² is another.
-K_GIR79 = {0: 3.3195074, 2: -0.0085801253, -2: 0.039978521, -4: 0.0014465322, -6: -3.0453007e-05, -8: 7.8005005e-06}
-K_SFLDN3 = {0: 3.2503692, 2: -0.013195714, -2: 0.049790724, -4: 0.0022430157, -6: -7.7567761e-06, -8: 2.1169316e-05}
-SELLMEIER = {
-    "CDGM:H-K9L": "0.614555251, 0.656775017, 1.02699346, 14598.7884, 2877.69588, 107653051",
-    "CDGM:H-LaF4": "0.210645313, 1.75547352, 1.28979005, 54275.9294, 11237.0777, 119852069",
-    "SCHOTT:LLF1": "1.23326922, 0.116923839, 0.862645379, 8853.9681, 43687.5155, 104992168",
-    "SCHOTT:N-BK7": "1.03961212, 0.231792344, 1.01046945, 6000.6987, 20017.9144, 103560653",
-}
-
-
-@pytest.mark.parametrize(
-    ("system", "glass", "powers", "printed", "line"),
-    [
-        ("optiland", "CDGM:H-K9L", None, 1.52669, "g"),
-        ("optiland", "CDGM:H-LaF4", None, 1.77728, "g"),
-        ("optiland", "SUMITA:K-GIR79", K_GIR79, 1.85588, "d"),
-        ("optiland", "SUMITA:K-SFLDn3", K_SFLDN3, 1.84666, "d"),
-        ("raysect", "SCHOTT:LLF1", None, 1.56328, "g"),
-        ("raysect", "SCHOTT:N-BK7", None, 1.52668, "g"),
-    ],
-)
-def test_the_recorded_difference_is_that_of_the_other_catalogue(system, glass, powers, printed, line):
-    pytest.importorskip("opticalglass")
-
-    def there(w):
-        if powers:
-            return sum(x * (w / 1000) ** power for power, x in powers.items()) ** 0.5
-        return media.index(f"sellmeier({SELLMEIER[glass]})", w)
-
-    off = max(abs(there(w) / media.index(glass, w) - 1) for w in glasses.WAVELENGTHS)
-    assert off == pytest.approx(CATALOGUES[system].others[glass].recorded, rel=5e-3)
-    assert round(there(media.LINES[line]), 5) == printed
-
-
 # The achromat --------------------------------------------------------------------------------------------------------
 
 NS = 1.0, 1.5168, 1.62, 1.0
@@ -163,7 +125,7 @@ LENS = lenses.LENS
 
 def test_the_exact_trace_is_that_of_matrices_near_the_axis_and_its_weights_those_of_small_changes():
     """The rest is spherical aberration, and falls as the height's square. A bent surface has another curvature."""
-    focus = 8.5 + _back_focal_distance(LENS.curvatures, NS, LENS.thicknesses)
+    focus = 8.5 + back_focal_distance(LENS.curvatures, NS, LENS.thicknesses)
     off = [float(crossing(LENS, NS, h, lenses.START).place) / focus - 1 for h in (1e-6, 1.0, 0.5)]
     assert abs(off[0]) < 1e-12 and off[1] / off[2] == pytest.approx(4, rel=1e-2)
     exact, (first, *others) = crossing(LENS, NS, 10.0, lenses.START), LENS.curvatures

@@ -6,8 +6,8 @@ import re
 
 import pytest
 
-from mi_refract.report.first_page import STATES
 from mi_refract.report.row import Reason, Row
+from mi_refract.report.study_page import STATES
 from validation.directions import per_formula
 from validation.efficiency import error_against_time
 from validation.ground_truth import traced_bodies
@@ -25,7 +25,7 @@ RENDER = {"changed share": 0.01, "|mean ratio − 1|": 1e-6, "Welch alarms": 0.0
 SPHERE = Row("renders", "refract", "sphere", "llvm_ad_rgb", RENDER, {"Welch alarms": 0.0})
 MIRAGE = dataclasses.replace(SPHERE, case="mirage", values={**RENDER, "Welch alarms": 7.0}, budgets={})
 FAST = Row("efficiency", "refract_path, split 3", "balls", "llvm_ad_rgb", {"equal-time MSE": 0.055})
-ABSENT = Row("directions", "promoted", "all", "cuda float32", reason="no NVIDIA driver: libcuda.so.1 not found")
+ABSENT = Row("directions", "promoted", "all", "cuda float32", reason=Reason("no libcuda.so.1", "an NVIDIA GPU"))
 INSTALL = "python -m validation renderers --install pyglm"
 RENDERER = Row("per_ray", "PyGLM", "every set", "f32", reason=Reason(INSTALL, f"other renderers, by `{INSTALL}`"))
 TRACED = [
@@ -81,6 +81,7 @@ BODY = Row("ground_truth", "refract", "prism", "llvm_ad_rgb", {"error / bound": 
         ([dataclasses.replace(OURS, values=WORST | {"worst / u": 2.0})], 0, "yes", ["Yes."], ["no more than rounding"]),
         ([BODY], 0, "yes", ["Yes.", "Through 1 bodies", "all its rays stay within"], ["direction"]),
         ([dataclasses.replace(BODY, values={"error / bound": 2.0})], 0, "no", ["No:", "some of its rays leave"], []),
+        ([BODY, dataclasses.replace(BODY, values={"error / bound": math.nan})], 0, "no", ["of its rays leave"], []),
         ([SCALAR, SLOW], 1, "yes", ["in double precision"], ["single"]),
         ([SCALAR, SLOW], 2, "plain", ["67 times as long", "use a compiled variant"], ["%"]),
         ([SPHERE, FAST], 2, "plain", ["10 % slower", "5.5 % (`balls`)"], []),
@@ -100,7 +101,7 @@ def test_what_is_said_and_what_is_not(rows, question, state, present, absent):
 
 
 def test_what_was_not_run_is_counted_by_what_would_make_it_run():
-    other = dataclasses.replace(ABSENT, setting="llvm float32", reason="Dr.Jit cannot")
+    other = dataclasses.replace(ABSENT, reason="Dr.Jit cannot", remedy="")
     text = answers(OURS, ABSENT, ABSENT, RENDERER, other)[4]["text"]
     assert text.startswith("4 of 5 measurements: 2 need an NVIDIA GPU")
     assert f"1 needs other renderers, by `{INSTALL}`;" in text and text.endswith("1 has other reasons.")

@@ -109,15 +109,17 @@ def absorbing_parts(name: str, absorbing: bool) -> Nodes:
         return {"type": "homogeneous", "albedo": 0.0, "sigma_t": rgb([x / most for x in sigma]), "scale": most}
 
     ball = {"type": "sphere"} | shape(SIGMA)
-    inner = {"type": "sphere", "radius": 0.5} | shape(CORE, SIGMA, 1.33)
-    matt = {"type": "sphere", "radius": 0.4, "bsdf": {"type": "diffuse", "reflectance": 0.6}}
+    inner: dict[str, Any] = {"type": "sphere", "radius": 0.5} | shape(CORE, SIGMA, 1.33)
+    matt: dict[str, Any] = {"type": "sphere", "radius": 0.4, "bsdf": {"type": "diffuse", "reflectance": 0.6}}
     matt |= {} if absorbing else {"exterior": medium(SIGMA)}
-    parts = {
+    scenes: dict[str, Nodes] = {
         "sphere": {"ball": ball},
         "nested": {"ball": ball, "inner": inner},
         "matt inside": {"box": {"type": "cube"} | shape(SIGMA), "matt": matt},
-    }[name]
-    return parts | {"wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(3)}}
+    }
+    return scenes[name] | {
+        "wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(3)}
+    }
 
 
 def volpath_rows(context: Context, name: str) -> list[Row]:

@@ -11,7 +11,9 @@ that kills a mutant must pass without it.
 from __future__ import annotations
 
 import ast
+import functools
 import hashlib
+import itertools
 import json
 import random
 import re
@@ -20,16 +22,18 @@ import signal
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import chdir
 from dataclasses import dataclass
-from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from mi_refract.report.row import Row
 from validation.limits import UNEXPLAINED
+from validation.run import command_line
 from validation.run.context import Context
 from validation.study import Study, Task, about
 
@@ -92,18 +96,17 @@ def sample(root: Path, count: int, seed: int) -> list[Mutant]:
             before[line.strip()] += 1
             key = repr((seed, name, line.strip(), before[line.strip()]))
             drawn.append((hashlib.sha256(key.encode()).hexdigest(), name, number))
-    found: list[Mutant] = []
-    for digest, name, number in sorted(drawn):
-        if len(found) == count:
-            break
+
+    def of_line(digest: str, name: str, number: int) -> Iterator[Mutant]:
         places = _places((root / name).read_text("utf-8")).get(number, [])
         kinds = sorted({operator.partition("_")[0] for operator, _ in places})
         rng = random.Random(digest)
         rng.shuffle(kinds)  # a binary operator has eleven replacements: the kind of change is drawn before the change
         chosen = (rng.choice([x for x in places if x[0].partition("_")[0] == kind]) for kind in kinds)
-        mutants = (_mutant(root, name, number, *place) for place in chosen)
-        found += [mutant for mutant in mutants if mutant][:1]
-    return found
+        yield from filter(None, (_mutant(root, name, number, *place) for place in chosen))
+
+    lines = (next(of_line(*line), None) for line in sorted(drawn))
+    return list(itertools.islice(filter(None, lines), count))
 
 
 def every(root: Path, name: str) -> list[Mutant]:
@@ -113,7 +116,7 @@ def every(root: Path, name: str) -> list[Mutant]:
     return [mutant for mutant in mutants if mutant]
 
 
-@cache
+@functools.cache
 def _places(source: str) -> dict[int, list[tuple[str, int]]]:
     """Operators and occurrences by line; without the operators that take arguments."""
     from cosmic_ray.ast import ast_nodes, get_ast
@@ -136,27 +139,27 @@ def _mutant(root: Path, name: str, number: int, operator: str, occurrence: int) 
 
     source = (root / name).read_text("utf-8")
     changed = str(mutate_code(source, OperatorProvider()[operator](), occurrence))
-    if _behaviour(changed) in (_behaviour(source), ""):
+
+    def behaviour(source: str) -> str:
+        """The module without annotations, `__all__` and imports for annotations; "" where it does not compile."""
+        try:
+            tree = ast.parse(source)
+        except SyntaxError:
+            return ""
+        for node in ast.walk(tree):
+            for field in {"annotation", "returns"} & {*node._fields}:
+                setattr(node, field, None)
+            if (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)) or (
+                isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__"
+            ):
+                node.__dict__.clear()
+        return ast.dump(tree)
+
+    if behaviour(changed) in (behaviour(source), ""):
         return None
     new = changed.splitlines() if operator != "RemoveDecorator" else [""] * number
     line, becomes = (" ".join(text[number - 1].split()) for text in (source.splitlines(), new))
     return Mutant(name, operator, occurrence, number, line, becomes)
-
-
-def _behaviour(source: str) -> str:
-    """The module without annotations, `__all__` and imports for annotations; "" where it does not compile."""
-    try:
-        tree = ast.parse(source)
-    except SyntaxError:
-        return ""
-    for node in ast.walk(tree):
-        for name in {"annotation", "returns"} & {*node._fields}:
-            setattr(node, name, None)
-        if (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)) or (
-            isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__"
-        ):
-            node.__dict__.clear()
-    return ast.dump(tree)
 
 
 def guards(root: Path, path: str) -> list[str]:
@@ -168,51 +171,36 @@ def guards(root: Path, path: str) -> list[str]:
     return list(dict.fromkeys(place.relative_to(root).as_posix() for place in places if place.exists()))
 
 
-def examine(mutants: Sequence[Mutant], root: Path = ROOT) -> Iterator[tuple[Mutant, bool]]:
-    """Whether each was killed, file by file. ValueError where a test that fails does so without a mutant, too."""
-    from cosmic_ray.commands import execute
+def examine(mutants: Iterable[Mutant], root: Path = ROOT) -> Iterator[tuple[Mutant, bool]]:
+    """Whether each was killed. ValueError where a test that fails does so without a mutant, too."""
     from cosmic_ray.config import load_config
+    from cosmic_ray.mutating import mutate_and_test
     from cosmic_ray.testing import TestOutcome, run_tests
-    from cosmic_ray.work_db import use_db
-    from cosmic_ray.work_item import MutationSpec, WorkerOutcome, WorkItem
+    from cosmic_ray.work_item import MutationSpec, WorkerOutcome
 
+    config, passed = load_config(str(CONFIG)), set()
     with tempfile.TemporaryDirectory(prefix="mutants-", ignore_cleanup_errors=True) as folder:
         copy, temporary = Path(folder, "tree"), Path(folder, "tmp")
-        for made in (copy, temporary):
-            made.mkdir()
-        for entry in root.iterdir():
-            if entry.is_file():
-                shutil.copy2(entry, copy)
-            elif entry.name in COPIED:
-                shutil.copytree(entry, copy / entry.name, ignore=shutil.ignore_patterns("__pycache__"))
-        passed: set[str] = set()
-        for path in dict.fromkeys(mutant.path for mutant in mutants):
-            config = load_config(str(CONFIG))
-            words = {"tree": copy, "temporary": temporary, "python": sys.executable}
-            template = config.test_command
-            config["test-command"] = template.format(**words, tests=" ".join(guards(root, path)))
-            here = {str(i): mutant for i, mutant in enumerate(mutants) if mutant.path == path}
-            with chdir(copy), use_db(str(Path(folder, "session.sqlite"))) as database:
-                database.clear()
-                for i, mutant in here.items():
-                    place = (mutant.number, 0), (mutant.number, 1)
-                    spec = MutationSpec(path, f"core/{mutant.operator}", mutant.occurrence, *place)
-                    database.add_work_item(WorkItem.single(i, spec))
-                execute(database, config)
-                results = dict(database.results)
-                for i, result in results.items():
-                    if result.worker_outcome is not WorkerOutcome.NORMAL:
-                        raise ValueError(f"{here[i]}: not tested: {result.output[-300:]}")
-                    test = re.search(r"^(?:FAILED|ERROR) ([^\s\[]+)", result.output, re.MULTILINE)
+        temporary.mkdir()
+        others = {path.name for path in root.iterdir() if path.is_dir()} - set(COPIED)
+        shutil.copytree(root, copy, ignore=lambda at, _: others if at == str(root) else {"__pycache__"})
+        command = functools.partial(config.test_command.format, tree=copy, temporary=temporary, python=sys.executable)
+        for mutant in mutants:
+            tests, place = " ".join(guards(root, mutant.path)), ((mutant.number, 0), (mutant.number, 1))
+            spec = MutationSpec(mutant.path, f"core/{mutant.operator}", mutant.occurrence, *place)
+            with chdir(copy):
+                result = mutate_and_test([spec], command(tests=tests), config.timeout)
+                if result.worker_outcome is not WorkerOutcome.NORMAL:
+                    raise ValueError(f"{mutant}: not tested: {(result.output or '')[-300:]}")
+                if result.is_killed:
                     # Where no test is named, it hung, or pytest could not start: then all must pass without it.
-                    tests = test[1] if test else " ".join(guards(root, path))
-                    if result.is_killed and tests not in passed:
-                        outcome, _ = run_tests(template.format(**words, tests=tests), config.timeout)
-                        if outcome is not TestOutcome.SURVIVED:
+                    test = re.search(r"^(?:FAILED|ERROR) ([^\s\[]+)", result.output or "", re.MULTILINE)
+                    tests = test[1] if test else tests
+                    if tests not in passed:
+                        if run_tests(command(tests=tests), config.timeout)[0] is not TestOutcome.SURVIVED:
                             raise ValueError(f"{tests} fails without a mutant")
                         passed.add(tests)
-            for i, result in results.items():
-                yield here[i], result.is_killed
+            yield mutant, result.is_killed
 
 
 def rows(found: Sequence[tuple[Mutant, bool]], seed: int) -> list[Row]:
@@ -240,31 +228,31 @@ def missing(root: Path = ROOT) -> str:
     return f"{' and '.join(absent)} not installed: pip install -e '.[dev]'" if absent else ""
 
 
-def _rows(context: Context) -> list[Row]:
-    if reason := missing():
-        return [Row(STUDY.name, ALL, "mutated code", "", reason=reason)]
-    return rows(list(examine(sample(ROOT, COUNTS[context.profile.name], SEED))), SEED)
+def tasks(context: Context) -> list[Task]:
+    """All mutants in one task, which runs alone."""
+
+    def measured() -> list[Row]:
+        if reason := missing():
+            return [Row(STUDY.name, ALL, "mutated code", "", reason=reason)]
+        return rows(list(examine(sample(ROOT, COUNTS[context.profile.name], SEED))), SEED)
+
+    return [Task("code mutants", measured, timed=True)]
 
 
 MODULE = "validation.robustness.code_mutants"
-STUDY = Study(
-    "code mutants",
-    "Mutants of our own code",
-    about(__doc__),
-    TERMS,
-    lambda context: [Task("code mutants", lambda: _rows(context), timed=True)],
-)
+STUDY = Study("code mutants", "Mutants of our own code", about(__doc__), TERMS, tasks)
+app = command_line.application()
 
 
-def main(arguments: Sequence[str]) -> int:
-    """`COUNT [SEED]`; 1 where the bound is broken, 2 for other arguments."""
-    if not 1 <= len(arguments) <= 2 or not all(word.isdecimal() for word in arguments):
-        print(f"usage: python -m {MODULE} COUNT [SEED], whole numbers", file=sys.stderr)
-        return 2
+@app.command()
+def main(
+    count: Annotated[int, typer.Argument(min=1, help="Number of mutants.")],
+    seed: Annotated[int, typer.Argument(min=0, help="What chooses the lines.")] = SEED,
+) -> int:
+    """Mutate lines of the package, and run its tests; exit code 1 where more survive than may."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # removes the copy
-    count, seed = int(arguments[0]), int(arguments[1]) if arguments[1:] else SEED
     if reason := missing():
-        raise SystemExit(f"code mutants: {reason}")
+        raise ValueError(reason)
     found = []
     for mutant, killed in examine(sample(ROOT, count, seed)):
         found.append((mutant, killed))
@@ -275,4 +263,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(command_line.exit_code(app, MODULE, sys.argv[1:]))

@@ -18,7 +18,7 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from mi_refract.ray_sets import check_answers, media_rays, ray_set
+from mi_refract.ray_sets import check_answers, header, ray_set
 from mi_refract.ray_sets.check_answers import UNFIT
 from mi_refract.ray_sets.files import as_csv, parse_answers
 from mi_refract.ray_sets.ray_set import Answers, RaySet
@@ -64,7 +64,7 @@ def system_rows(system: System, catalogue: GlassCatalogue, context: Context) -> 
     row = functools.partial(Row, NAME, system.title, "every glass", "f64")
     if find_spec("opticalglass") is None:
         return [row(reason="opticalglass is not installed: pip install 'mi-refract[glass]'")]
-    rays = given(catalogue.glasses)
+    rays, reason = given(catalogue.glasses), environments.why_not(system, context.profile.name)
 
     def answer() -> Answers:
         text = environments.run(environments.script(system, catalogue.script, "glasses"), as_csv(rays))
@@ -73,7 +73,7 @@ def system_rows(system: System, catalogue: GlassCatalogue, context: Context) -> 
             raise ValueError("no column n_ratio; expected the ratio of indices that was used")
         return answers
 
-    answers, nothing = environments.attempt(row, system, context.profile.name, float(len(rays)), answer)
+    answers, nothing = environments.attempt(row, reason, ("unanswered", len(rays)), answer)
     return nothing if answers is None else rows(system.title, catalogue, rays, answers)
 
 
@@ -105,7 +105,7 @@ def rows(title: str, catalogue: GlassCatalogue, rays: RaySet, answers: Answers) 
     assert answers.n_ratio is not None
     said = dict(zip(answers.ids.tolist(), answers.n_ratio.tolist(), strict=True))
     used = np.array([said.get(id_, np.nan) for id_ in rays.ids.tolist()])  # NaN where it was not answered
-    wavelength, pair = media_rays.columns(rays.header, rays.ids).T
+    wavelength, pair = header.columns(rays.header, rays.ids).T
     difference = np.abs(used / rays.rays.k - 1)
     for i, glass in enumerate(catalogue.glasses):
         of_glass = np.flatnonzero(pair // 2 == i)
@@ -117,7 +117,7 @@ def rows(title: str, catalogue: GlassCatalogue, rays: RaySet, answers: Answers) 
             continue
         factor = max(off / known.recorded, known.recorded / off) if off > 0 else np.inf if off == 0 else np.nan
         values = {INDEX_OFF: off, RECORDED: known.recorded, OFF_RECORDED: factor}
-        budgets, goals = {OFF_RECORDED: limits.OTHER_INDEX}, {INDEX_OFF: media_rays.SAME}
+        budgets, goals = {OFF_RECORDED: limits.OTHER_INDEX}, {INDEX_OFF: header.SAME}
         made.append(row(values, budgets, goals, f"{system}; {known.cause}"))
     return made
 
