@@ -106,6 +106,7 @@ class Page:
             failures.append(item(result, results, shown, images) | {"key": f"pair-{number}"})
         equal = sorted((item(result, results) for result in results.of(Status.EQUAL)), key=lambda x: not x["warning"])
         folders = results.test.is_dir() and not results.renders  # where names mean something
+        more = [*results.flags, "--report", "rest.html"]
         content = {
             "title": "mi-refract diff",
             "sentence": sentence(results),
@@ -114,7 +115,7 @@ class Page:
             "context": {"reference": str(results.reference), "test": str(results.test)} | dict(context),
             "unused": results.unused,
             "command": replay,
-            "rest": results.command("diff", *rest[:NAMED], flags=[*results.flags, "--report", "rest.html"]),
+            "rest": results.command("diff", *rest[:NAMED], flags=more) if rest and folders else "",
             "skipped": [item(result, results) for result in results.of(Status.SKIPPED)],
             "ticks": results.command("accept", flags=["--from", source] if source else None) if folders else "",
         }
