@@ -172,8 +172,8 @@ def _formula(text: str, label: str) -> Medium:
             raise ValueError(f"{label}: {expected}")
         if bad := [f"{n:g} at {w:g} nm" for w, n in knots if not 0 < n < math.inf]:
             raise ValueError(f"{label}: n = {bad[0]}; expected a positive finite index")
-        form, low, high = Table(wavelengths), wavelengths[0], wavelengths[-1]
-        coefficients = dict(zip(form.names, (n for _, n in knots), strict=True))
+        form, low, high = (table := Table(wavelengths)), wavelengths[0], wavelengths[-1]
+        coefficients = dict(zip(table.names, (n for _, n in knots), strict=True))
     else:
         squared = name == "sellmeier_nm"
         letter, unit, factor = ("L", "nm", "1e3") if squared else ("C", "nm²", "1e6")
@@ -191,9 +191,9 @@ def _formula(text: str, label: str) -> Medium:
     import numpy as np
 
     low, high = max(low, VISIBLE[0]), min(high, VISIBLE[1])
-    wavelengths = np.linspace(low, high, 471)
-    if low <= high and (missing := np.isnan(medium.index_or_nan(wavelengths))).any():
-        at = wavelengths[missing][0]
+    visible = np.linspace(low, high, 471)
+    if low <= high and (missing := np.isnan(medium.index_or_nan(visible))).any():
+        at = visible[missing][0]
         raise ValueError(
             f"{label}: n is not positive at {at:.6g} nm; expected a positive index everywhere in 360 … 830 nm"
         )
