@@ -39,7 +39,7 @@ class Retraced:
     @property
     def met(self) -> Array:
         """How many boundaries (N)."""
-        return (self.hits >= 0).sum(1)
+        return np.asarray((self.hits >= 0).sum(1))
 
     def last(self, x: Array) -> Array:
         """Of N × (D+1) values, those of the last legs."""
@@ -123,7 +123,7 @@ def _bend(d: Array, normal: Array, near: Array, far: Array, forced: Array) -> tu
 
 
 def _cross(a: Array, b: Array) -> Array:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
 class Curves:
@@ -193,7 +193,7 @@ class Curves:
         # The ends' sides tell how often an arc is crossed: once, at the better root; or never or twice.
         on = np.where(parted, branch == branch.max(0), (branch.sum(0) > 0) & (square > 0))
         on = np.where(own, branch > 0, on)
-        return np.where(on & (roots > 0), roots, np.inf).min(0)
+        return np.asarray(np.where(on & (roots > 0), roots, np.inf).min(0))
 
     def normal(self, p: Array, hit: Array) -> tuple[Array, Array]:
         """Unit normals to the left of the segments `hit` at `p`, and the curvatures there."""
