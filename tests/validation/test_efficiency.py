@@ -16,8 +16,7 @@ from validation.run.render_methods import BUILTIN, METHODS, Method
 
 SMALL = Extent((4, 9), 6, 8, resolution=32)
 SHORT = Method("short paths", "path", "refract", {"max_depth": 3, "rr_depth": 3})
-ABSENT = Method("absent", "integrator_of_nobody", "refract")
-GIVEN = (BUILTIN, METHODS[1], SHORT, ABSENT)
+GIVEN = (BUILTIN, METHODS[1], SHORT)
 
 
 @pytest.fixture
@@ -58,8 +57,6 @@ def test_efficiency_is_not_bought_with_bias_and_more_samples_have_less_error(con
     assert rows[METHODS[1].name].verdict == "pass"
     assert rows[SHORT.name].verdict == "fail"
     assert set(rows[SHORT.name].broken) == {"Welch alarms"}
-    assert rows[ABSENT.name].verdict == "not run"
-    assert "integrator_of_nobody is not registered" in rows[ABSENT.name].reason
     the_same_image_has_the_same_error_and_more_samples_less(rows)
 
 
