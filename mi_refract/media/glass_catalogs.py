@@ -19,17 +19,9 @@ import warnings
 from dataclasses import dataclass
 from typing import Any
 
-from .dispersion import LINES, polynomial, sellmeier
-from .medium import ANY, Medium
+from .dispersion import ANY, LINES, Dispersion, Medium, Terms, sellmeier
 
-CATALOGS = {
-    "CDGM": "cdgm",
-    "HIKARI": "hikari",
-    "HOYA": "hoya",
-    "OHARA": "ohara",
-    "SCHOTT": "schott",
-    "SUMITA": "sumita",
-}
+CATALOGS = {name: name.lower() for name in ("CDGM", "HIKARI", "HOYA", "OHARA", "SCHOTT", "SUMITA")}
 # Powers of λ of the coefficients in the makers' order; the others are Sellmeier's. λ is in µm there.
 _TO_12TH = (0, 2, 4, -2, -4, -6, -8, -10, -12)
 _TO_8TH = (0, 2, -2, -4, -6, -8)
@@ -70,9 +62,11 @@ def load(catalog: str, glass: str, label: str) -> Medium:
     row = glasses[name := known[_plain(glass)]]
     if not row.coefficients:
         raise ValueError(f"{label}: its catalogue has no formula for this glass; use another glass, or table(…)")
-    if catalog in POWERS:
-        powers = zip(POWERS[catalog], row.coefficients, strict=True)
-        form, coefficients = polynomial({p: x / NANOMETRES**p for p, x in powers})
+    form: Dispersion
+    if catalog in POWERS:  # n² = Σ a_p λ^p, Schott's formula of before 1992
+        names = {p: f"a{p}" if p >= 0 else f"a_{-p}" for p in POWERS[catalog]}
+        form = Terms(2, powers=tuple((names[p], p) for p in names))
+        coefficients = {names[p]: x / NANOMETRES**p for p, x in zip(names, row.coefficients, strict=True)}
     else:
         form, coefficients = sellmeier([x * (1 if i < 3 else NANOMETRES**2) for i, x in enumerate(row.coefficients)])
     return Medium(f"{catalog}:{name}", form, coefficients, row.range, "air", fitted=row.fitted)

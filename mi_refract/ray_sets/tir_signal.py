@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -88,21 +87,17 @@ def detect(pieces: Iterable[SeenAnswers]) -> str:
 
     Where some rays are far beyond the critical angle, they decide alone.
     """
-    votes = {"total": Counter[str](), "certain": Counter[str]()}
-    rays = Counter[str]()
+    counts = np.zeros((2, 1 + len(DETECTORS)), int)  # rays, and those that use each signal: of all, of those far beyond
     for seen in pieces:
         reflects = ~seen.exact.transmitted & (seen.exact.cos_i > 0)
         bound = FORMULAS[LOOSEST].budget.radicand_error_bound(seen.u, seen.rays.k.astype(float))
         far = reflects & (absolute_radicand(seen.rays) > np.maximum(CERTAIN, bound))
-        signals = {name: detector(seen) for name, detector in DETECTORS.items()}
-        for group, mask in (("total", reflects), ("certain", far)):
-            rays[group] += int(mask.sum())
-            votes[group].update({name: int((mask & signal).sum()) for name, signal in signals.items()})
-    group = "certain" if rays["certain"] else "total"
-    if not rays[group]:
+        signals = np.array([np.ones(len(far), bool), *(detector(seen) for detector in DETECTORS.values())])
+        counts += [(mask & signals).sum(1) for mask in (reflects, far)]
+    rays, *votes = counts[1 if counts[1, 0] else 0].tolist()
+    if not rays:
         return NONE
-    ((best, most),) = votes[group].most_common(1)
-    return best if most >= AGREEING * rays[group] else UNCLEAR
+    return list(DETECTORS)[int(np.argmax(votes))] if max(votes) >= AGREEING * rays else UNCLEAR
 
 
 def reflected(seen: SeenAnswers, transmitted: Flags | None, tir: str, decided: Flags) -> Flags:

@@ -86,10 +86,7 @@ def test_the_image_is_mitsubas_and_the_header_says_how_it_was_made(render, scene
     assert header["mi_refract:render_seconds"] > 0 and header["Software"] == f"mi_refract {mi_refract.__version__}"
     # As OpenImageIO sorts them.
     assert header["channels"] == ("R", "G", "B", "B.variance", "G.variance", "R.variance")
-
-
-def test_a_define_swaps_the_plugin(render, scene):
-    assert render("--spp", 2, "-D", "bsdf=diffuse")[0] == 0
+    assert render("--spp", 2, "-D", "bsdf=diffuse")[0] == 0  # a define swaps the plugin
     pixels, metadata = read_exr(scene.with_name("out.exr"))
     assert metadata["mi_refract:formulas"] == "none"
     np.testing.assert_array_equal(pixels[..., :3], passes_by_mitsuba(scene, 2, bsdf="diffuse")[0])
@@ -163,26 +160,19 @@ def test_a_plugin_of_the_scenes_own_runs_only_where_it_is_allowed(render, scene)
     assert (code, err.count("\n")) == (2, 1) and "Error while loading plugin" in err and "plugins/evil.so" in err
 
 
-def test_a_pipe_is_no_scene(render, scene):
+def test_what_fails_keeps_the_old_image(render, scene):
+    """A plugin that is not there, a rendering that is cut short, and a pipe in place of the scene."""
+    output = scene.with_name("out.exr")
+    output.write_text("old")
+    assert render("-D", "bsdf=nonesuch")[0] == 2
+    scene.write_text(SCENE.replace('value="5"/>', 'value="5"/><float name="timeout" value="0.01"/>'))
+    code, _, err = render("--spp", 100000)
+    assert code == 2 and "stopped before its last sample" in err.splitlines()[-1]
     scene.unlink()
     os.mkfifo(scene)
     code, _, err = render()
     assert (code, err) == (2, f"mi-refract: {scene}: not a regular file\n")
-
-
-def test_a_failed_rendering_keeps_the_old_image(render, scene):
-    scene.with_name("out.exr").write_text("old")
-    assert render("-D", "bsdf=nonesuch")[0] == 2
-    assert scene.with_name("out.exr").read_text() == "old"
-
-
-def test_a_rendering_cut_short_is_not_an_image(render, scene):
-    text = SCENE.replace('value="5"/>', 'value="5"/><float name="timeout" value="0.01"/>')
-    scene.write_text(text)
-    code, _, err = render("--spp", 100000)
-    assert code == 2
-    assert "stopped before its last sample" in err.splitlines()[-1]
-    assert list(scene.parent.iterdir()) == [scene]
+    assert output.read_text() == "old" and {*scene.parent.iterdir()} == {scene, output}
 
 
 # What the shell ignores in a background job, Mitsuba does not: it would return an image of the samples so far.

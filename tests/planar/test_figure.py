@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import itertools
-import sys
 from dataclasses import replace
 
 import matplotlib
@@ -150,12 +149,6 @@ def test_thousands_of_rays_are_a_small_file():
 def test_views_of_any_shape(view):
     given = replace(SLANTED, view=view)
     assert drawing.draw(given, follow_scene(given), ".png")
-
-
-def test_without_matplotlib(monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(ValueError, match=r"pip install 'mi-refract\[plot\]'"):
-        drawing.draw(SLANTED, follow_scene(SLANTED), ".svg")
 
 
 # Geometry ------------------------------------------------------------------------------------------------------

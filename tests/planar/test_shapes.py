@@ -114,18 +114,6 @@ def test_arcs_turn_by_what_they_are_told():
         assert np.abs(np.hypot(*(along - centre).T) - radius).max() <= 1e-14 * radius * 10
 
 
-def test_smooth_curves_have_one_tangent_at_their_joints():
-    lens = shapes.lens((0.02, -0.03), 5, radius=9, conic=(-1.5, 0.4))
-    smooth = [(shapes.circle(3), range(4)), (shapes.ellipse(5, 0.1), range(4)), (lens, (1, 4))]
-    bend = shapes.polyline([(0, 0), (4, 0), (7, 3), (7, 9)], [0, 90, 0])
-    for curve, joints in (*smooth, (bend, (1, 2))):
-        before, after = curve.end - curve.control, curve.control - curve.start
-        for j in joints:
-            (ax, ay), (bx, by) = before[j - 1], after[j]
-            assert abs(ax * by - ay * bx) <= 2 * ULP * math.hypot(ax, ay) * math.hypot(bx, by)
-            assert ax * bx + ay * by > 0
-
-
 def test_a_map_of_a_curve_is_a_map_of_its_points():
     lens = shapes.lens((0.02, -0.3), 5, radius=2.5, conic=(-1.5, 0.4))
     for matrix, at in MAPS.values():

@@ -14,7 +14,6 @@ import pytest
 
 from mi_refract import oracle, regimes
 from mi_refract.ray_sets import ray_set, renderer_file
-from mi_refract.ray_sets.files import parse_answers
 from mi_refract.ray_sets.renderer_file import RaysCommand
 from validation import __main__ as command
 from validation import limits
@@ -159,49 +158,6 @@ def test_small_systems_that_are_installed_are_right(name, few, needs_variant):
     assert {row.verdict for row in rows} - ({"not run"} if name in ("glsl", "materialx", "wgsl") else set()) == {"pass"}
     if name == "mi_refract":
         assert max(row.values[per_ray.BACKWARD] for row in rows) < 1 and not any(row.missed for row in rows)
-
-
-def textbook(a, n, k):
-    """k a − (k c + √(1 − k²(1 − c²))) n of vectors of any length; NaN where the radicand is negative."""
-    k, c = k[:, None], (a * n).sum(1, keepdims=True)
-    radicand = 1 - k * k * (1 - c * c)
-    return k * a - (k * c + np.sqrt(np.where(radicand < 0, np.nan, radicand))) * n
-
-
-# What a system does, by what is said of it, of the ray a, the normal n and the two indices.
-MEANINGS = {
-    "takes vectors of any length as they are": lambda a, n, n_from, n_to: textbook(a, n, n_from / n_to),
-    "takes the index that a ray leaves from its speed 1/n, not from the medium": lambda a, n, n_from, n_to: textbook(
-        a / np.linalg.norm(a, axis=1, keepdims=True), n, n_from / np.linalg.norm(a, axis=1) / n_to
-    ),
-}
-OF_LENGTHS = [(name, call) for name, system in SYSTEMS.items() for call in system.calls if call.lengths]
-
-
-@pytest.mark.parametrize(("name", "call"), OF_LENGTHS)
-def test_vectors_of_other_lengths_are_treated_as_the_table_says(name, call):
-    """Answers to rays twice as long, and to normals where these count, agree with that meaning only."""
-    assert {call.lengths for _, call in OF_LENGTHS} == set(MEANINGS)
-    if reason := environments.absent(SYSTEMS[name]):
-        pytest.skip(reason)
-    a, n = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in np.random.default_rng(7).normal(size=(2, 60, 3)))
-    n = np.where((a * n).sum(1, keepdims=True) > 0, -n, n)
-    n_from = np.where(np.arange(60) % 2, 1.5, 1.0)
-    agreeing = set(MEANINGS)
-    for a_by, n_by in ((1, 1), (2, 1), (1, 2) if call.lengths.startswith("takes vectors") else (0.5, 1)):
-        given = a_by * a, n_by * n, n_from, 2.5 - n_from
-        rows = (",".join(map(repr, (i, *row))) for i, row in enumerate(np.column_stack(given).tolist()))
-        text = "\n".join(["id,ax,ay,az,nx,ny,nz,n_from,n_to", *rows])
-        try:
-            b = parse_answers(environments.ask(SYSTEMS[name], call.command, text), call.title).b
-        except environments.Unable as reason:
-            pytest.skip(f"cannot run here: {reason}")
-        for meaning in sorted(agreeing):
-            expected = MEANINGS[meaning](*given)
-            through = np.isfinite(expected[:, 0])
-            if not np.allclose(b[through], expected[through], atol=1e-4 if call.precision == "f32" else 1e-12):
-                agreeing.discard(meaning)
-    assert agreeing == {call.lengths}
 
 
 # The table of systems ------------------------------------------------------------------------------------------

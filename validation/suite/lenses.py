@@ -106,7 +106,8 @@ def system_rows(system: System, context: Context) -> list[Row]:
     def answer() -> Answer:
         return parsed(environments.ask(system, system.lens, json.dumps(question())))
 
-    given, nothing = environments.attempt(row, system, context.profile.name, 1.0, answer)
+    reason = environments.why_not(system, context.profile.name)
+    given, nothing = environments.attempt(row, reason, ("unanswered", 1), answer)
     return nothing if given is None else answered(system.title, given)
 
 
