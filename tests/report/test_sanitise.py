@@ -1,6 +1,8 @@
 """What others wrote, in every form of a report: no character that is not seen, and markup is text."""
 
+import contextlib
 import dataclasses
+import io
 from xml.etree import ElementTree
 
 import pytest
@@ -28,6 +30,12 @@ def printed(table):
     return capture.get()
 
 
+def said(results):
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(out):
+        text_reports.print_results(results)
+    return out.getvalue()
+
+
 @pytest.fixture
 def results(tmp_path):
     how = ComparisonSpec("exact", {}, NAME)
@@ -48,7 +56,7 @@ def findings():
 
 
 FORMS = {
-    "terminal": lambda results, path: text_reports.plain(text_reports.table(results)),
+    "terminal": lambda results, path: said(results),
     "GitHub": lambda results, path: "\n".join(
         line.replace("::", "", 1) for line in text_reports.workflow_commands(results)
     ),

@@ -53,7 +53,7 @@ def test_a_missed_goal_is_shown_beside_the_number_and_fails_nothing():
     rows += [ray("C", precision="f64", values=ONE | {"recorded": 4.5e-6, "off the recorded": 4.5}, goals=goals)]
     cells = matrix.summary(rows)
     assert [(cell.verdict, bool(cell.missed)) for cell in cells] == [("pass", True), ("pass", False), ("pass", True)]
-    table = readme_tables.suite(cells)
+    table = readme_tables.TABLES["suite"].make(cells)
     for line in ("| A, f32 | 1e-6 (3.67 × recorded) |", "| B, f32 | 1e-6 |", "| C, f64 | 1e-6 (recorded / 4.5) |"):
         assert line in table
     assert "a goal" in table and "fails nothing" in table
