@@ -58,11 +58,11 @@ def assert_image_unbiased() -> Callable[..., Comparison]:
         from mi_refract.image_diff.file_pair import read_renders
 
         first = seed + REFERENCE_SEED
-        known = {f"reference {i}": reference(i) for i in range(first, first + runs)} if callable(reference) else {}
+        known = {f"reference {i}": reference(i) for i in range(first, first + runs)} if callable(reference) else None
         rendered = {f"test {i}": render(i) for i in range(seed, seed + runs)}
 
         def sides() -> tuple[list[ReadImage], list[ReadImage]]:
-            references = [_image(*pair) for pair in known.items()] or read_renders(Path(reference))
+            references = [_image(*x) for x in known.items()] if known else read_renders(Path(str(reference)))
             return references, [_image(*pair) for pair in rendered.items()]
 
         return _require_equal("welch", sides, options)
