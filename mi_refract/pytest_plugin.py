@@ -58,12 +58,15 @@ def assert_image_unbiased() -> Callable[..., Comparison]:
         from mi_refract.image_diff.file_pair import read_renders
 
         first = seed + REFERENCE_SEED
-        known = {f"reference {i}": reference(i) for i in range(first, first + runs)} if callable(reference) else None
-        rendered = {f"test {i}": render(i) for i in range(seed, seed + runs)}
+        known = [reference(i) for i in range(first, first + runs)] if callable(reference) else Path(reference)
+        rendered = [render(i) for i in range(seed, seed + runs)]
 
         def sides() -> tuple[list[ReadImage], list[ReadImage]]:
-            references = [_image(*x) for x in known.items()] if known else read_renders(Path(str(reference)))
-            return references, [_image(*pair) for pair in rendered.items()]
+            if isinstance(known, Path):
+                references = read_renders(known)
+            else:
+                references = [_image(f"reference {first + i}", image) for i, image in enumerate(known)]
+            return references, [_image(f"test {seed + i}", image) for i, image in enumerate(rendered)]
 
         return _require_equal("welch", sides, options)
 
