@@ -164,6 +164,6 @@ def cluster_passes(
         workers.wait()
         passes = ClusterPasses(workers, bundle, variant, rendering.job.seed, rendering.warnings.append)
         try:
-            yield passes
+            yield passes.nodes
         finally:
             passes.close()

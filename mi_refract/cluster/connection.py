@@ -105,11 +105,16 @@ def _silent() -> Iterator[None]:
 def _client(address: str, security: Security) -> Client:
     import distributed
 
+    async def kind() -> str:
+        """What answers at the address, as it says."""
+        options = {"timeout": PATIENCE / 2, "connection_args": security.get_connection_args("client")}
+        async with asyncio.timeout(PATIENCE), distributed.rpc(address, **options) as there:
+            return str((await there.identity()).get("type"))
+
     try:
         # First, as a client that found nobody would take 16 s to give up.
-        kind = asyncio.run(_kind(address, security))
-        if kind != "Scheduler":
-            raise ValueError(f"a Dask {kind} answers there")
+        if (answering := asyncio.run(kind())) != "Scheduler":
+            raise ValueError(f"a Dask {answering} answers there")
         # Results come from the workers themselves where these can be reached, else through the scheduler.
         return distributed.Client(
             address, security=security, timeout=PATIENCE, set_as_default=False, direct_to_workers=True
@@ -118,15 +123,6 @@ def _client(address: str, security: Security) -> Client:
         texts = [" ".join(str(cause).split()) for cause in (error.__cause__, error) if cause is not None]
         text = re.sub(r"in <[^>]*>: ", "", next(filter(None, texts), f"not within {PATIENCE:.0f} s"))
         raise ConnectionError(f"--scheduler {address}: no Dask scheduler answers: {text[:200]}; {_EXPECTED}") from None
-
-
-async def _kind(address: str, security: Security) -> str:
-    """What answers at an address, as it says."""
-    from distributed import rpc
-
-    arguments = security.get_connection_args("client")
-    async with asyncio.timeout(PATIENCE), rpc(address, timeout=PATIENCE / 2, connection_args=arguments) as there:
-        return str((await there.identity()).get("type"))
 
 
 @contextlib.contextmanager

@@ -69,12 +69,8 @@ class Workers:
             time.sleep(0.05)
         if not self.accepted:
             reason = "; ".join(self.refused.values()) or ("workers do not answer" if self._asked else "no workers")
-            text = f"{self._address}: no worker that may {self.task}: {reason}"
+            text = f"{self.client.scheduler.address}: no worker that may {self.task}: {reason}"
             raise NoWorkersError(f"{text}; expected at least one with the software and hardware of this process")
-
-    @property
-    def _address(self) -> str:
-        return str(self.client.scheduler.address)
 
     def look(self, *, at_once: bool = False) -> None:
         """Ask those that are new, note what they answered and who has gone; seldom while some are there, or `at_once`.
@@ -83,25 +79,23 @@ class Workers:
         """
         with cluster_errors(self.client):
             if at_once or not self.accepted or time.monotonic() - self._looked >= BETWEEN_LOOKS:
-                self._looked = time.monotonic()
-                self._ask(self.client.nthreads())
+                self._looked, present = time.monotonic(), self.client.nthreads()
+                for known in (self.accepted, self.refused, self._asked):
+                    for address in known.keys() - present.keys():
+                        del known[address]
+                for address, threads in present.items():
+                    if address in self._asked and self._asked[address].done():
+                        self._judge(address, threads, self._asked.pop(address))
+                    elif not any(address in known for known in (self._asked, self.accepted, self.refused)):
+                        options: dict[str, Any] = {"workers": [address], "pure": False, "priority": 1000}
+                        self._asked[address] = self.client.submit(eval, self._question, **options)
         if self.accepted or not self.machines:
             self._alone_since = None
         elif self._alone_since is None:
             self._alone_since = time.monotonic()
         elif time.monotonic() - self._alone_since > ALONE:
-            raise NoWorkersError(f"{self._address}: all workers have gone; expected new ones within {ALONE:.0f} s")
-
-    def _ask(self, present: Mapping[str, int]) -> None:
-        for known in (self.accepted, self.refused, self._asked):
-            for address in known.keys() - present.keys():
-                del known[address]
-        for address, threads in present.items():
-            if address in self._asked and self._asked[address].done():
-                self._judge(address, threads, self._asked.pop(address))
-            elif address not in self._asked and address not in self.accepted and address not in self.refused:
-                options: dict[str, Any] = {"workers": [address], "pure": False, "priority": 1000}
-                self._asked[address] = self.client.submit(eval, self._question, **options)
+            text = f"{self.client.scheduler.address}: all workers have gone"
+            raise NoWorkersError(f"{text}; expected new ones within {ALONE:.0f} s")
 
     def _judge(self, address: str, threads: int, answer: Future) -> None:
         there: dict[str, str] = {}

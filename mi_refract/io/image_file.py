@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
-import shlex
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -172,17 +170,9 @@ def _checked(path: Path, max_values: int) -> tuple[ImageInput, str]:
     if not begin:
         raise ImageError(f"{path}: corrupt {kind} file: it is empty")
     if begin == LFS_POINTER:
-        raise ImageError(f"{path}: a Git LFS pointer, not the image; run `{_lfs_pull(path)}` to fetch it")
+        raise ImageError(f"{path}: a Git LFS pointer, not the image; run `git lfs pull` to fetch it")
     # Others hold 8 bytes a value or fewer, and are asked below.
     return _opened(path, kind, max_values, max_values * (1 if begin.startswith(WHEN_OPENED) else 8)), kind
-
-
-def _lfs_pull(path: Path) -> str:
-    """The command that fetches a file from Git LFS; its pattern begins at the repository's root."""
-    full = path.absolute()
-    root = next((folder for folder in full.parents if (folder / ".git").exists()), None)
-    pattern = re.sub(r"[][*?,\\]", "?", (full.relative_to(root) if root else path).as_posix())
-    return shlex.join(["git", "lfs", "pull", f"--include={pattern}"])
 
 
 def check_header(path: str | os.PathLike[str], max_values: int) -> None:

@@ -190,9 +190,20 @@ class ClusterPasses:
         client = self.workers.client
         while True:
             self.workers.look()
+            there = frozenset(self.workers.accepted)
             with cluster_errors(client):
-                self._hand_out()
-                self._begin_again()
+                # Each worker unpacks the bundle once, first: Dask gives tasks to workers that have it already.
+                self._handed = {address: done for address, done in self._handed.items() if address in there}
+                for address in there - self._handed.keys():
+                    options: dict[str, Any] = {"workers": [address], "pure": False, "priority": 1000}
+                    self._handed[address] = client.submit(unpack, self._bundle(there), **options)
+                # Nodes whose workers have all gone are submitted to others: Dask would wait for these to come back.
+                for i, node in enumerate(self._begun):
+                    if there and node.needed.isdisjoint(there) and node.result.status != "error":
+                        self._give_up(node)
+                        again = self._submitted(node.level, node.first, 0)
+                        assert again is not None
+                        self._begun[i] = again
                 self._begin(first, stop, last)
             if not self._begun:
                 time.sleep(0.5)
@@ -218,24 +229,20 @@ class ClusterPasses:
 
     def _begin(self, first: int, stop: int, last: int) -> None:
         """Begin nodes until each thread has AHEAD tasks; at least the one that is asked for."""
+        most = AHEAD * sum(self.workers.accepted.values())
         while True:
-            begin = self._begun[-1].stop if self._begun else first
-            if begin >= last or (self._begun and self._enough()):
+            for node in self._begun:
+                node.tasks[:] = [task for task in node.tasks if not task.done()]  # what is done need not be kept for us
+            begin, tasks = self._begun[-1].stop if self._begun else first, sum(len(node.tasks) for node in self._begun)
+            if begin >= last or (self._begun and (tasks >= most or len(self._begun) >= max(NODES, most))):
                 return
             while stop <= begin:
                 stop = min(next_stop(stop + self._series[0]) - self._series[0], last)
             task, largest = self.levels()
             level, begin = aligned_nodes(begin, stop, largest)[0]
-            if not (node := self._submitted(level, begin, min(task, level))):
+            if not (begun := self._submitted(level, begin, min(task, level))):
                 return
-            self._begun.append(node)
-
-    def _enough(self) -> bool:
-        threads, tasks = sum(self.workers.accepted.values()), 0
-        for node in self._begun:
-            node.tasks[:] = [task for task in node.tasks if not task.done()]  # what is done need not be kept for us
-            tasks += len(node.tasks)
-        return tasks >= AHEAD * threads or len(self._begun) >= max(NODES, AHEAD * threads)
+            self._begun.append(begun)
 
     def _submitted(self, level: int, first: int, task: int) -> _Node | None:
         """A node, submitted to the workers that are accepted now; None where there are none."""
@@ -258,21 +265,3 @@ class ClusterPasses:
             future = self.workers.client.submit(keep, self.bundle, workers=sorted(allowed), pure=False)
             self._kept = future, allowed
         return self._kept[0]
-
-    def _hand_out(self) -> None:
-        """Have each worker unpack the bundle once. Dask gives tasks to workers that have it already."""
-        there = frozenset(self.workers.accepted)
-        self._handed = {address: done for address, done in self._handed.items() if address in there}
-        for address in there - self._handed.keys():
-            options: dict[str, Any] = {"workers": [address], "pure": False, "priority": 1000}  # before all passes
-            self._handed[address] = self.workers.client.submit(unpack, self._bundle(there), **options)
-
-    def _begin_again(self) -> None:
-        """Submit nodes whose workers have all gone to others: Dask would wait for these to come back."""
-        there = self.workers.accepted.keys()
-        for i, node in enumerate(self._begun):
-            if there and node.needed.isdisjoint(there) and node.result.status != "error":
-                self._give_up(node)
-                again = self._submitted(node.level, node.first, 0)
-                assert again is not None
-                self._begun[i] = again

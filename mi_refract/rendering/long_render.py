@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import TypeAlias
 
 import mitsuba as mi
 import numpy as np
@@ -50,28 +50,10 @@ class Job:
     allow_plugins: Collection[str] = ()
 
 
-class Passes(Protocol):
-    """Where passes are rendered."""
-
-    def nodes(self, first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
-        """Level, sums and machines ("a, b") of nodes that make up the passes from `first` to `stop`, in their order.
-
-        Passes up to `last` may be begun, as they will probably be asked for next. `offset`: added to their numbers for
-        their seeds. `spp`: samples per pixel of each.
-        """
-        ...
-
-
-@dataclass(frozen=True)
-class ThisProcess:
-    """Renders passes here, one after the other."""
-
-    renderer: PassRenderer
-
-    def nodes(self, first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
-        """Each pass by itself."""
-        for number in range(first, stop):
-            yield 0, self.renderer.render(offset + number, spp), os.uname().nodename
+# Where passes are rendered. Of first, stop, last, offset, spp: level, sums and machines ("a, b") of nodes that make up
+# the passes from `first` to `stop`, in their order. Passes up to `last` may be begun, which are probably asked for
+# next. `offset`: added to their numbers for their seeds. `spp`: samples per pixel of each.
+Passes: TypeAlias = Callable[[int, int, int, int, int], Iterator[tuple[int, PassSums, str]]]
 
 
 def resume(
@@ -178,7 +160,7 @@ class LongRender:
                 )
             self.checkpoints.active = True
             try:
-                return self._run(passes or ThisProcess(self.renderer), watch)
+                return self._run(passes or self._here, watch)
             except BaseException as error:
                 self.checkpoints.write()
                 if isinstance(error, RuntimeError):  # Mitsuba's own
@@ -187,7 +169,12 @@ class LongRender:
             finally:
                 self.checkpoints.active = False
 
-    def _run(self, source: Passes, watch: Callable[[LongRender], None]) -> Metadata:
+    def _here(self, first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
+        """As `Passes`: one after the other in this process."""
+        for number in range(first, stop):
+            yield 0, self.renderer.render(offset + number, spp), os.uname().nodename
+
+    def _run(self, nodes: Passes, watch: Callable[[LongRender], None]) -> Metadata:
         progress, tree, plan, first = self.progress, self.progress.tree, self.plan, self.progress.first
         deadline = math.inf if self.limits.seconds is None else time.monotonic() + self.limits.seconds
         nothing_new = bool(self.end()) and progress.passes == first
@@ -200,7 +187,7 @@ class LongRender:
                 last = done + 1 if rest else plan.full_passes
             before = time.monotonic()
             spp = plan.rest if rest else plan.spp
-            for level, sums, machines in source.nodes(done, min(look, last), last, first, spp):
+            for level, sums, machines in nodes(done, min(look, last), last, first, spp):
                 took = time.monotonic() - before
                 progress.add(level, sums, machines, took, rest=rest)
                 before = time.monotonic()

@@ -81,15 +81,21 @@ class PassRenderer:
         within, film = None, self.scene.sensors()[0].film()
         with _quiet():
             if self.moments:
-                squares = number < FEW - 1  # more passes say it better
-                seed = seed_of(self.seed, number)
-                total, weights, within = _sums(self.scene, self.channels, spp, seed, squares=squares)
+                if dr.thread_count() < LEAST_THREADS:
+                    dr.set_thread_count(LEAST_THREADS)
+                pixels = Film(*self.size, spp, None if film.rfilter().is_box_filter() else film.rfilter())
+                with dr.suspend_grad():
+                    samples = _samples(self.scene, self.channels, spp, seed_of(self.seed, number))
+                    # More passes say the variance better.
+                    total, weights, within = image_sums(*samples, pixels, squares=number < FEW - 1)
+                if hasattr(self.scene.integrator(), "end_render"):
+                    self.scene.integrator().end_render()
             elif dr.is_jit_v(mi.Float):
                 total, weights = _rendered(self.scene, spp, seed_of(self.seed, number))
             else:
                 border = 2 * film.rfilter().border_size() if film.sample_border() else 0
-                pixels = (self.size[0] + border) * (self.size[1] + border)
-                total, weights = _rendered(self.scene, spp, scalar_seed_of(self.seed, number, pixels))
+                count = (self.size[0] + border) * (self.size[1] + border)
+                total, weights = _rendered(self.scene, spp, scalar_seed_of(self.seed, number, count))
         if self.expected is None or weights is None:
             return PassSums(spp, 1, total, np.zeros_like(total), within, colours=self.colours)
         total, weights = total / self.expected, weights / self.expected
@@ -180,22 +186,6 @@ def _set_threads(count: int) -> None:
 
 
 # Samples ------------------------------------------------------------------------------------------------------------
-
-
-def _sums(
-    scene: Scene, channels: tuple[str, ...], spp: int, seed: int, *, squares: bool
-) -> tuple[Doubles, Doubles | None, Doubles | None]:
-    """`image_sums` of samples with this seed."""
-    rfilter = scene.sensors()[0].film().rfilter()
-    width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
-    film = Film(width, height, spp, None if rfilter.is_box_filter() else rfilter)
-    if dr.thread_count() < LEAST_THREADS:
-        dr.set_thread_count(LEAST_THREADS)
-    with dr.suspend_grad():
-        found = image_sums(*_samples(scene, channels, spp, seed), film, squares=squares)
-    if hasattr(scene.integrator(), "end_render"):
-        scene.integrator().end_render()
-    return found
 
 
 def _samples(scene: Scene, channels: tuple[str, ...], spp: int, seed: int) -> tuple[list[Any], Any]:

@@ -67,7 +67,7 @@ def pack(parsed: ParsedScene, defines: Mapping[str, str], limit: int = LIMIT) ->
     where = {name: _absolute(path) for name, path in named.items()}
     own = Path(scene).parent
     moved = {n: p for n, p in where.items() if os.path.normpath(own / n) != p or Path(n).is_absolute()}
-    digest = hashlib.sha256(json.dumps([scene, text, contents, moved, sorted(defines.items())]).encode()).hexdigest()
+    digest = hashlib.sha256(json.dumps([scene, text, contents, moved]).encode()).hexdigest()
     folders = {path.parent for path in (*parsed.xml, *spectra, *named.values())} | set(parsed.folders)
     written = tuple(sorted(os.path.join(Path.cwd(), path) for path in folders))  # noqa: PTH118 (keeps "..")
     return SceneBundle(digest, scene, text, files, written, moved, dict(defines))

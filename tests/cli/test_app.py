@@ -1,33 +1,31 @@
-"""The command line itself: help, version, errors, exit codes, and what it does not import."""
+"""The command line itself: help, version, errors, exit codes, what it does not import; and `mi-refract doctor`."""
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 
+import mitsuba as mi
 import pytest
 from support.processes import ENVIRONMENT, python
 
-from mi_refract import cli
+import mi_refract
+from mi_refract import backend, cli
 from mi_refract.cli import app
 
 
-@pytest.mark.parametrize("arguments", [["nonesuch"], ["render"], ["doctor", "extra"]])
-def test_bad_command(arguments, capfd):
-    assert app.main(arguments) == 2
-    out, err = capfd.readouterr()
-    assert out == ""
-    assert err.startswith("mi-refract: ")
-    assert err.count("\n") == 1
-
-
-def test_an_error_of_several_lines_is_printed_in_one(capfd, monkeypatch):
+@pytest.mark.parametrize("arguments", [["nonesuch"], ["render"], ["doctor", "extra"], ["several lines"]])
+def test_an_error_is_one_line(arguments, capfd, monkeypatch):
     def fails(*arguments, **options):
         raise ValueError("first\n  second\n")
 
-    monkeypatch.setattr(app, "app", fails)
-    assert app.main(["doctor"]) == 2
-    assert capfd.readouterr() == ("", "mi-refract: first second\n")
+    if arguments == ["several lines"]:
+        monkeypatch.setattr(app, "app", fails)
+    assert app.main(arguments) == 2
+    out, err = capfd.readouterr()
+    assert out == "" and err.startswith("mi-refract: ") and err.count("\n") == 1
+    assert arguments != ["several lines"] or err == "mi-refract: first second\n"
 
 
 def test_without_a_command_the_help_is_printed_and_with_version_the_version(capfd):
@@ -39,8 +37,7 @@ def test_without_a_command_the_help_is_printed_and_with_version_the_version(capf
 
 
 def test_without_the_extra():
-    code = "import sys; sys.modules['typer'] = None; import mi_refract.cli.app"
-    with python(code) as process:
+    with python("import sys; sys.modules['typer'] = None; import mi_refract.cli.app") as process:
         out, err = process.communicate(timeout=60)
     assert (process.returncode, out) == (2, "")
     assert err.splitlines()[-1] == "mi-refract needs the extra `cli`: pip install 'mi-refract[cli]'"
@@ -50,20 +47,7 @@ def test_diff_in_a_process_of_its_own(pair):
     """The exit code arrives, and no line of a log is wrapped."""
     command = [sys.executable, "-m", "mi_refract.cli", "diff", *map(str, pair)]
     done = subprocess.run(command, env=ENVIRONMENT | {"COLUMNS": "40"}, capture_output=True, text=True, timeout=300)
-    assert (done.returncode, done.stderr) == (1, "")
-    assert len(done.stdout.splitlines()) == 4
-
-
-HEAVY = ("mitsuba", "drjit", "numpy", "OpenImageIO", "matplotlib", "scipy")
-
-
-@pytest.mark.parametrize("option", ["--help", "--version"])
-def test_help_and_version_wait_for_no_heavy_package(option):
-    code = "import sys\nfrom mi_refract.cli import main\nmain(sys.argv[1:])\nprint([*sys.modules], file=sys.stderr)"
-    with python(code, option) as process:
-        out, err = process.communicate(timeout=60)
-    assert out
-    assert not [name for name in HEAVY if f"'{name}'" in err]
+    assert (done.returncode, done.stderr, len(done.stdout.splitlines())) == (1, "", 4)
 
 
 @pytest.mark.parametrize("name", app.COMMANDS)
@@ -75,17 +59,48 @@ def test_the_help_has_a_line_for_each_command_and_each_command_its_own(name, cap
     assert capfd.readouterr().out.startswith(f"Usage: mi-refract {name} ")
 
 
-# What a comparison of two images needs none of, but for its report, a terminal, or another method.
-UNUSED = ("mitsuba", "drjit", "scipy", "matplotlib", "jinja2", "rich", "xml", "asyncio")
+HEAVY = ("mitsuba", "drjit", "numpy", "OpenImageIO", "matplotlib", "scipy")
+# What a comparison of two images needs none of, but for its report or another method.
+UNUSED = ("mitsuba", "drjit", "scipy", "matplotlib", "jinja2", "xml", "asyncio")
+SET = ("diff", "--method", "tolerance", "--set", "fail=0.5", "--json", "out.json")
 
 
-@pytest.mark.parametrize("options", [[], ["--method", "tolerance", "--set", "fail=0.5", "--json", "out.json"]])
-def test_a_comparison_imports_what_it_needs(pair, tmp_path, options):
+@pytest.mark.parametrize(
+    ("words", "unused"), [(("--help",), HEAVY), (("--version",), HEAVY), (("diff",), UNUSED), (SET, UNUSED)]
+)
+def test_a_command_imports_what_it_needs(pair, tmp_path, words, unused):
     code = "import sys\nfrom mi_refract.cli import main\nmain(sys.argv[1:])\nprint([*sys.modules], file=sys.stderr)"
-    options = [str(tmp_path / word) if word == "out.json" else word for word in options]
-    with python(code, "diff", *pair, *options) as process:
+    files = pair if words[0] == "diff" else ()
+    with python(code, *(tmp_path / x if x == "out.json" else x for x in words), *files) as process:
         out, err = process.communicate(timeout=60)
-    assert "2 images: " in out
-    assert "'OpenImageIO'" in err
-    assert ("'msgspec'" in err) == bool(options)  # which reads settings
-    assert not [name for name in UNUSED if f"'{name}'" in err]
+    assert out and not [name for name in unused if f"'{name}'" in err]
+    if files:
+        assert "2 images: " in out and "'OpenImageIO'" in err
+
+
+# doctor ---------------------------------------------------------------------------------------------------------------
+
+
+def test_doctor(capfd, monkeypatch):
+    assert app.main(["doctor"]) == 0
+    out, _ = capfd.readouterr()
+    assert all(variant in out for variant in mi.variants()) and mi.__version__ in out
+    assert app.main(["doctor", "--json"]) == 0
+    facts = json.loads(capfd.readouterr().out)
+    assert facts["variants"] == backend.usable_variants()
+    assert facts["libllvm"] == {library.path: library.defect or "works" for library in backend.libraries()}
+    assert facts["versions"]["mi_refract"] == mi_refract.__version__
+    assert out.rstrip().endswith(facts["advice"])
+    monkeypatch.setattr(backend, "usable_variants", lambda: {"scalar_rgb": "made up"})
+    assert app.main(["doctor"]) == 2
+    assert capfd.readouterr().err == "mi-refract: no Mitsuba variant can run on this machine\n"
+
+
+def test_doctor_without_llvm():
+    environment = {backend.CHOICE: "/nonexistent", backend.OWN_CHOICE: ""}
+    with python("import sys; from mi_refract.cli import main; sys.exit(main(['doctor']))", **environment) as process:
+        out, err = process.communicate(timeout=120)
+    assert process.returncode == 0 and "Traceback" not in err, err
+    advice = out.splitlines()[-1]
+    assert advice.startswith("the llvm_* variants are missing: DRJIT_LIBLLVM_PATH=/nonexistent: no such file")
+    assert "apt-get install libllvm19" in advice or "LLVM 17" in advice

@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 import os
-import re
-import signal
-import time
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.processes import python
 
 import mi_refract
 from mi_refract import backend
@@ -86,10 +81,7 @@ def test_the_image_is_mitsubas_and_the_header_says_how_it_was_made(render, scene
     assert header["mi_refract:render_seconds"] > 0 and header["Software"] == f"mi_refract {mi_refract.__version__}"
     # As OpenImageIO sorts them.
     assert header["channels"] == ("R", "G", "B", "B.variance", "G.variance", "R.variance")
-
-
-def test_a_define_swaps_the_plugin(render, scene):
-    assert render("--spp", 2, "-D", "bsdf=diffuse")[0] == 0
+    assert render("--spp", 2, "-D", "bsdf=diffuse")[0] == 0  # a define swaps the plugin
     pixels, metadata = read_exr(scene.with_name("out.exr"))
     assert metadata["mi_refract:formulas"] == "none"
     np.testing.assert_array_equal(pixels[..., :3], passes_by_mitsuba(scene, 2, bsdf="diffuse")[0])
@@ -163,75 +155,16 @@ def test_a_plugin_of_the_scenes_own_runs_only_where_it_is_allowed(render, scene)
     assert (code, err.count("\n")) == (2, 1) and "Error while loading plugin" in err and "plugins/evil.so" in err
 
 
-def test_a_pipe_is_no_scene(render, scene):
+def test_what_fails_keeps_the_old_image(render, scene):
+    """A plugin that is not there, a rendering that is cut short, and a pipe in place of the scene."""
+    output = scene.with_name("out.exr")
+    output.write_text("old")
+    assert render("-D", "bsdf=nonesuch")[0] == 2
+    scene.write_text(SCENE.replace('value="5"/>', 'value="5"/><float name="timeout" value="0.01"/>'))
+    code, _, err = render("--spp", 100000)
+    assert code == 2 and "stopped before its last sample" in err.splitlines()[-1]
     scene.unlink()
     os.mkfifo(scene)
     code, _, err = render()
     assert (code, err) == (2, f"mi-refract: {scene}: not a regular file\n")
-
-
-def test_a_failed_rendering_keeps_the_old_image(render, scene):
-    scene.with_name("out.exr").write_text("old")
-    assert render("-D", "bsdf=nonesuch")[0] == 2
-    assert scene.with_name("out.exr").read_text() == "old"
-
-
-def test_a_rendering_cut_short_is_not_an_image(render, scene):
-    text = SCENE.replace('value="5"/>', 'value="5"/><float name="timeout" value="0.01"/>')
-    scene.write_text(text)
-    code, _, err = render("--spp", 100000)
-    assert code == 2
-    assert "stopped before its last sample" in err.splitlines()[-1]
-    assert list(scene.parent.iterdir()) == [scene]
-
-
-# What the shell ignores in a background job, Mitsuba does not: it would return an image of the samples so far.
-INTERRUPTED = """
-import signal, sys
-if sys.argv[1] == "ignored":
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-from mi_refract import cli
-run = cli._run
-def run_and_tell(arguments):
-    from mi_refract.rendering import scene_files  # numpy's threads start here
-    load = scene_files.load_parsed
-    def load_and_tell(*arguments):
-        scene = load(*arguments)
-        print("loaded", flush=True)
-        return scene
-    scene_files.load_parsed = load_and_tell
-    return run(arguments)
-cli._run = run_and_tell
-sys.argv[1:] = ["render", sys.argv[2], "-o", sys.argv[3], "--spp", "20000000", "--variant", sys.argv[4]]
-sys.exit(cli.main())
-"""
-
-
-def handling_threads(process):
-    """The number of threads that do not block SIGINT. Where several are, Mitsuba's own handler may run in one."""
-    tasks = Path(f"/proc/{process.pid}/task")
-    if not tasks.exists():
-        return 1
-    blocked = [re.search(r"^SigBlk:\s*(\w+)", path.read_text(), re.MULTILINE)[1] for path in tasks.glob("*/status")]
-    assert len(blocked) > 2
-    return sum(not int(bits, 16) >> (signal.SIGINT - 1) & 1 for bits in blocked)
-
-
-# Neither needs the other: a signal that is ignored is one of the process, what runs on after it is of the variant.
-@pytest.mark.parametrize(("handler", "variant"), [("ignored", "scalar_rgb"), ("default", "llvm_ad_rgb")])
-def test_ctrl_c(scene, handler, variant, needs_variant):
-    needs_variant(variant)
-    output = scene.with_name("out.exr")
-    with python(INTERRUPTED, handler, scene, output, variant) as process:
-        try:
-            assert process.stdout.readline() == "loaded\n"
-            time.sleep(0.5)  # into the rendering
-            assert process.poll() is None
-            assert handling_threads(process) == 1
-            process.send_signal(signal.SIGINT)
-            assert process.wait(timeout=30) == 130, process.stderr.read()
-        finally:
-            process.kill()  # or a failure would wait for it without end
-    # Where a pass had ended by then, there is what the same command goes on from.
-    left = {path.name for path in scene.parent.iterdir()}
-    assert left in ({scene.name}, {scene.name, f"{output.name}.checkpoint"})
+    assert output.read_text() == "old" and {*scene.parent.iterdir()} == {scene, output}

@@ -1,90 +1,96 @@
-"""What `mi-refract render` shows meanwhile: lines without a terminal, a bar on one, previews, warnings."""
+"""What `mi-refract render` reads and shows: quantities in the units that people write, lines, a bar, previews."""
 
 from __future__ import annotations
 
 import io
 import re
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from rich.console import Console
+from support.renders import rendering
 
 from mi_refract.cli import render_progress
+from mi_refract.cli.render_progress import parse_seconds, parse_share, shown_error
 from mi_refract.io.image_file import read
-from mi_refract.rendering.end_conditions import Limits
-from mi_refract.rendering.long_render import Job, resume
+from mi_refract.rendering.end_conditions import RelativeError
 
-BALL = Path(__file__).parents[2] / "scenes" / "sphere.xml"
+
+@pytest.mark.parametrize("text, value", [("1%", 0.01), ("0.01", 0.01), ("100%", 1.0), ("1e-3", 0.001), ("0.5%", 0.005)])
+def test_shares(text, value):
+    assert parse_share(text, "--until") == pytest.approx(value, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    "text, value",
+    [("90", 90), ("90s", 90), ("10m", 600), ("1h30m", 5400), ("2d", 172800), ("0.5h", 1800), ("1m1s", 61)],
+)
+def test_times(text, value):
+    assert parse_seconds(text, "--time") == value
+
+
+NO_SHARE = ["0", "0%", "-1%", "100.1%", "1.5", "nan", "inf", "%", "", "1 %%", "1", "0.5"]
+NO_TIME = ["0", "0s", "-1", "1x", "", "m", "1m1h", "1e9", "nan", "inf", "10 m", "9" * 12]
+
+
+@pytest.mark.parametrize(
+    ("parse", "texts", "expected"),
+    [(parse_share, NO_SHARE, "more than 0 %, up to 100 %"), (parse_seconds, NO_TIME, "a time of more than 0")],
+)
+def test_what_is_none(parse, texts, expected):
+    for text in texts:
+        with pytest.raises(ValueError, match=rf"^--option .*; expected {expected}"):
+            parse(text, "--option")
+
+
+def test_an_error_has_its_interval_where_there_is_one():
+    assert shown_error(RelativeError(0.0042, 0.004, 0.0044)) == "0.42 % (0.4 to 0.44 %)"
+    assert shown_error(RelativeError(0.0042)) == "0.42 %"
+    assert shown_error(RelativeError(0.0042, at_most=True)) == "at most 0.42 %"
 
 
 @pytest.fixture
-def rendering(tmp_path, needs_variant):
+def run(tmp_path, needs_variant):
+    """`run(spp=64)`: the render, and what was printed on the console's terminal, of a kind."""
     needs_variant("llvm_ad_rgb")
     mi.set_variant("llvm_ad_rgb")
 
-    def make(**limits):
-        return resume(Job(BALL, {"res": "8"}), tmp_path / "a.exr", Limits(**limits))
+    def make(preview=None, terminal="", **limits):
+        render, text = rendering(tmp_path / "a.exr", restart=True, **limits), io.StringIO()
+        console = Console(file=text, force_terminal=bool(terminal), width=80, _environ={"TERM": terminal})
+        with render_progress.shown(console, render, preview) as watch:
+            render.run(watch)
+        return render, text.getvalue()
 
     return make
 
 
-def run(render, preview=None, terminal=""):
-    """What was printed on the console's terminal, of a kind."""
-    text = io.StringIO()
-    console = Console(file=text, force_terminal=bool(terminal), width=80, _environ={"TERM": terminal})
-    with render_progress.shown(console, render, preview) as watch:
-        render.run(watch)
-    return text.getvalue()
-
-
-def test_lines_where_there_is_no_terminal(rendering, monkeypatch, capsys):
-    monkeypatch.setattr(render_progress, "BETWEEN_LINES", 0.0)
-    monkeypatch.setattr(render_progress, "LOOK_COST", 0.0)
-    assert run(rendering(spp=64, pass_spp=8)) == ""
+def test_a_line_now_and_then_or_a_bar(run, monkeypatch, capsys):
+    run(spp=64, pass_spp=8)  # one every 30 s, so that a log stays short: none for a render of a second
+    assert capsys.readouterr().err == ""
+    for name in ("BETWEEN_LINES", "BETWEEN_LOOKS", "LOOK_COST"):
+        monkeypatch.setattr(render_progress, name, 0.0)
+    assert run(spp=64, pass_spp=8)[1] == ""
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 9  # after every pass, and at the end
     number = r"[\d.e+-]+"
     error = rf"error {number} % \({number} to {number} %\)"
     form = rf"\S+a\.exr: pass 6 of 8, \d+ s left, {error}, {number} M samples/s, 48 spp"
-    assert re.fullmatch(form, lines[5]), lines[5]
-
-
-def test_few_lines(rendering, capsys):
-    """One every 30 s, so that a log stays short: none for a render of a second."""
-    run(rendering(spp=64, pass_spp=8))
+    assert len(lines) == 9 and re.fullmatch(form, lines[5]), lines  # after every pass, and at the end
+    _, bar = run(until=0.2, pass_spp=4, terminal="xterm")
+    assert all(said in bar for said in ("━", "passes", "s left", "error", "M samples/s"))
     assert capsys.readouterr().err == ""
-
-
-def test_a_bar_on_a_terminal(rendering, monkeypatch, capsys):
-    monkeypatch.setattr(render_progress, "BETWEEN_LOOKS", 0.0)
-    monkeypatch.setattr(render_progress, "LOOK_COST", 0.0)
-    shown = run(rendering(until=0.2, pass_spp=4), terminal="xterm")
-    for said in ("━", "passes", "s left", "error", "M samples/s"):
-        assert said in shown
-    assert capsys.readouterr().err == ""
-
-
-def test_lines_on_a_terminal_that_cannot_move_its_cursor(rendering, monkeypatch, capsys):
-    monkeypatch.setattr(render_progress, "BETWEEN_LINES", 0.0)
-    monkeypatch.setattr(render_progress, "LOOK_COST", 0.0)
-    run(rendering(spp=16, pass_spp=8), terminal="dumb")
+    run(spp=16, pass_spp=8, terminal="dumb")  # which cannot move its cursor
     assert len(capsys.readouterr().err.splitlines()) == 3
 
 
-def test_the_preview_is_the_image(rendering, tmp_path, monkeypatch):
+def test_the_preview_is_the_image_or_a_warning(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(render_progress, "BETWEEN_PREVIEWS", 0.0)
-    render = rendering(spp=64, pass_spp=8)
-    run(render, tmp_path / "a.png")
+    render, _ = run(tmp_path / "a.png", spp=64, pass_spp=8)
     linear = np.clip(render.image(), 0, 1)
     expected = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     # Half a step of 8 bits, and a little for the coding of sRGB.
     np.testing.assert_allclose(read(tmp_path / "a.png").pixels, expected, atol=0.51 / 255)
-
-
-def test_a_preview_that_cannot_be_written_is_a_warning(rendering, tmp_path, capsys):
-    run(rendering(spp=8), tmp_path / "none" / "a.png")
+    run(tmp_path / "none" / "a.png", spp=8)
     err = capsys.readouterr().err
-    assert "no preview" in err and err.startswith("mi-refract: ")
-    assert (tmp_path / "a.exr").exists()
+    assert "no preview" in err and err.startswith("mi-refract: ") and (tmp_path / "a.exr").exists()

@@ -1,4 +1,4 @@
-"""Files and folders are replaced whole or not at all; a lock says who holds it."""
+"""Files and folders are replaced whole or not at all, read only as far as they go; a lock says who holds it."""
 
 import errno
 import fcntl
@@ -8,12 +8,14 @@ import shutil
 import socket
 import stat
 import tomllib
+import tracemalloc
 from pathlib import Path
 
 import pytest
 
-from mi_refract.io import atomic
+from mi_refract.io import atomic, regular_file
 from mi_refract.io.atomic import replacing, update_between, write_atomically
+from mi_refract.ray_sets import files, ray_set
 
 
 @pytest.mark.parametrize("step", ["write_bytes", "replace"])
@@ -32,32 +34,25 @@ def test_a_failed_write_leaves_the_old_file_alone(step, tmp_path, monkeypatch):
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("kind", ["pipe", "socket", "device", "stream", "stream of a process", "folder", "linked pipe"])
+KINDS = {
+    "pipe": os.mkfifo,
+    "socket": lambda path: socket.socket(socket.AF_UNIX).bind(path.name),  # a socket's name is short
+    "device": lambda path: path.symlink_to("/dev/null"),
+    "stream": lambda path: path.symlink_to("/proc/self/fd/0"),  # to a regular file
+    "folder": Path.mkdir,
+    "linked pipe": lambda path: (os.mkfifo(path.with_name("pipe")), path.symlink_to(path.with_name("pipe"))),
+}
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.parametrize("kind", [*KINDS, "stream of a process"])
 def test_what_is_not_a_file_is_not_replaced(kind, tmp_path, monkeypatch):
-    path = tmp_path / "out.x"
-    match kind:
-        case "pipe":
-            os.mkfifo(path)
-        case "socket":
-            monkeypatch.chdir(tmp_path)  # a socket's name is short
-            with socket.socket(socket.AF_UNIX) as made:
-                made.bind(path.name)
-        case "device":
-            path.symlink_to("/dev/null")
-        case "stream":  # to a regular file
-            path.symlink_to("/proc/self/fd/0")
-        case "stream of a process":
-            path = Path("/dev/fd/1")
-        case "folder":
-            path.mkdir()
-        case "linked pipe":
-            os.mkfifo(tmp_path / "pipe")
-            path.symlink_to(tmp_path / "pipe")
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "out.x" if kind in KINDS else Path("/dev/fd/1")
+    KINDS.get(kind, lambda path: None)(path)
     before = {each: each.lstat() for each in tmp_path.iterdir()}
     for write in (lambda: atomic.writable(path, (path.suffix,)), lambda: write_atomically(path, "new")):
-        with pytest.raises(
-            OSError, match=rf"{path}: is a {kind.split()[-1 if 'linked' in kind else 0]}.*; expected the"
-        ):
+        with pytest.raises(OSError, match=rf"{path}: is a {kind.replace('linked ', '').split()[0]}.*; expected the"):
             write()
     assert {each: each.lstat() for each in tmp_path.iterdir()} == before
 
@@ -101,15 +96,13 @@ def test_a_temporary_is_new_unguessable_and_beside_its_target(folder, tmp_path, 
     with pytest.raises(FileExistsError), replacing(tmp_path / "a.x", folder=folder):
         pass
     assert (tmp_path / "link").is_symlink() and not [*victim.iterdir()]
+    monkeypatch.undo()
+    for name in ("n" * 251 + ".txt", "é" * 120 + ".txt"):  # which leave no room for more
+        write_atomically(tmp_path / name, "x")
+        assert (tmp_path / name).read_text() == "x"
 
 
-@pytest.mark.parametrize("name", ["n" * 251 + ".txt", "é" * 120 + ".txt"], ids=["ascii", "utf-8"])
-def test_a_long_name_leaves_room_for_the_temporary_one(name, tmp_path):
-    write_atomically(tmp_path / name, "x")
-    assert (tmp_path / name).read_text() == "x"
-
-
-# A text between markers -------------------------------------------------------------------------------------------
+# A text between markers, and what is packed ---------------------------------------------------------------------------
 
 BEGIN, END = "<!-- begin: t -->", "<!-- end: t -->"
 
@@ -141,12 +134,11 @@ def test_what_is_no_code_travels_with_the_package():
     data = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
     folders = {name: root / name.replace(".", "/") for name in data}
     taken = {path for name, globs in data.items() for glob in globs for path in folders[name].glob(glob)}
-    files = {path for path in (root / "mi_refract").rglob("*.*") if path.suffix not in (".py", ".pyc", ".md")}
-    assert {path.suffix for path in files} >= {".j2", ".css", ".js", ".typed"}
-    assert files <= taken
+    others = {path for path in (root / "mi_refract").rglob("*.*") if path.suffix not in (".py", ".pyc", ".md")}
+    assert {path.suffix for path in others} >= {".j2", ".css", ".js", ".typed"} and others <= taken
 
 
-# The lock ---------------------------------------------------------------------------------------------------------
+# The lock -------------------------------------------------------------------------------------------------------------
 
 
 def test_a_lock_says_who_holds_it_and_ends_with_its_process(tmp_path):
@@ -163,7 +155,7 @@ def test_a_lock_says_who_holds_it_and_ends_with_its_process(tmp_path):
     assert not path.exists()
 
 
-def test_a_lock_is_not_written_through_a_link(tmp_path):
+def test_a_lock_is_not_written_through_a_link_and_keeps_nobody_out_without_locks(tmp_path, monkeypatch):
     path, victim = tmp_path / "it.lock", tmp_path / "victim"
     victim.write_text("old")
     path.symlink_to(victim)
@@ -171,12 +163,51 @@ def test_a_lock_is_not_written_through_a_link(tmp_path):
         pass
     assert victim.read_text() == "old"
 
-
-def test_a_file_system_without_locks_keeps_nobody_out(tmp_path, monkeypatch):
     def flock(*_):
-        raise OSError(errno.ENOSYS, "Function not implemented")
+        raise OSError(errno.ENOSYS, "Function not implemented")  # as some file systems of networks
 
     monkeypatch.setattr(fcntl, "flock", flock)
     with atomic.held(tmp_path / "a.lock", "a run"):
         assert (tmp_path / "a.lock").exists()
     assert not (tmp_path / "a.lock").exists()
+
+
+# Reading --------------------------------------------------------------------------------------------------------------
+
+
+def peak(work):
+    """The most bytes that were allocated at once."""
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_memory_is_that_of_the_file(tmp_path):
+    path, rays = tmp_path / "file", tmp_path / "rays.csv"
+    path.write_bytes(b"x" * 10**6)
+    assert regular_file.read_bytes(path, 2**40) == path.read_bytes()
+    assert 10**6 < peak(lambda: regular_file.read_bytes(path, 2**40)) < 1.1e6
+    files.write(rays, ray_set.make(count=10))
+    assert peak(lambda: files.read(rays)) < 2e7
+    if Path("/proc/self/status").exists():  # a file without a size
+        assert regular_file.read_bytes("/proc/self/status", 10**6).startswith(b"Name:")
+
+
+@pytest.mark.parametrize("size", [0, 1, 2**20, 2**20 + 1])
+def test_a_file_that_grows_meanwhile_is_read_up_to_the_limit(size, tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    path.write_bytes(bytes(size))
+    small = path.stat()
+
+    def grow(file):
+        with path.open("ab") as more:
+            more.write(b"x" * 2**21)
+        return small
+
+    monkeypatch.setattr(regular_file.os, "fstat", grow)
+    assert regular_file.read_bytes(path, 2**23).rstrip(b"x") == bytes(size)
+    with pytest.raises(ValueError, match=f"{path}: more than {size + 5} bytes"):
+        regular_file.read_bytes(path, size + 5)

@@ -1,14 +1,12 @@
-"""Images in files: EXR round trips, every format that is read, and bad files, each of which is one line."""
+"""Images in files: EXR round trips, every format that is read, and bad files, each of which is one line; pixels."""
 
 from __future__ import annotations
 
 import os
-import re
 import resource
-import shlex
-import shutil
 import struct
-import subprocess
+import threading
+import time
 
 import numpy as np
 import OpenImageIO as oiio
@@ -16,7 +14,8 @@ import pytest
 from support.diff_images import cut
 
 from mi_refract.io import image_file
-from mi_refract.io.image_file import read, read_exr, write_exr
+from mi_refract.io.image_file import AHEAD, bounded_map, read, read_exr, write_exr
+from mi_refract.io.pixels import any_channel, block_area, block_mean, block_sum, srgb_decode, srgb_encode
 
 PIXELS = np.random.default_rng(1).random((48, 40, 3)).astype(np.float32)
 # Values that a detour over half floats, clamping or a colour transform would change.
@@ -32,31 +31,24 @@ def save(path, pixels, kind="float", unassociated=False, **attributes):
         setattr(spec, name, value)
     output = oiio.ImageOutput.create(str(path))
     assert output.open(str(path), spec), output.geterror()
-    assert output.write_image(pixels)
-    assert output.close()
+    assert output.write_image(pixels) and output.close()
     return path
 
 
-# EXR files that we write --------------------------------------------------------------------------------------------
+# EXR files that we write ----------------------------------------------------------------------------------------------
 
 
 def test_what_is_written_is_read(tmp_path):
     metadata = {"mi_refract:scene": "a b/ü.xml", "mi_refract:spp": 7, "mi_refract:seconds": 0.25, "Software": "us"}
     write_exr(tmp_path / "a.exr", HARD, metadata=metadata | {"mi_refract:seed": 2**32 - 1})
     pixels, header = read_exr(tmp_path / "a.exr")
-    assert pixels.dtype == np.float32
+    assert pixels.dtype == np.float32 and header["channels"] == ("R", "G", "B")
     np.testing.assert_array_equal(pixels, HARD.astype(np.float32))
-    assert header["channels"] == ("R", "G", "B")
-    assert {name: header[name] for name in metadata} == metadata
-    assert header["mi_refract:seed"] == str(2**32 - 1)
-    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
-
-
-def test_channels_by_name(tmp_path):
+    assert {name: header[name] for name in metadata} == metadata and header["mi_refract:seed"] == str(2**32 - 1)
     names = ("S0.R", "A", "B", "G", "R")
     write_exr(tmp_path / "a.exr", np.arange(30.0).reshape(3, 2, 5), names)
     image = read(tmp_path / "a.exr")
-    assert sorted(image.channels) == sorted(names)
+    assert sorted(image.channels) == sorted(names) and [path.name for path in tmp_path.iterdir()] == ["a.exr"]
     np.testing.assert_array_equal(image.select(names), np.arange(30.0).reshape(3, 2, 5))
     with pytest.raises(ValueError, match=r"a\.exr: no channel 'Z'; expected .*S0\.R"):
         image.select(["Z"])
@@ -106,14 +98,12 @@ def test_formats(tmp_path, name, kind, error):
     assert image_file.count_values(tmp_path / name) == PIXELS.size
 
 
-def test_the_window_and_colour_under_a_transparent_alpha_are_kept(tmp_path):
+def test_windows_alpha_and_wide_numbers_are_kept(tmp_path):
+    """And no colour is multiplied by alpha."""
     assert read(save(tmp_path / "a.exr", PIXELS, x=-3, y=5)).origin == (-3, 5)
     pixels = np.dstack([PIXELS, np.zeros((48, 40))]).astype(np.float32)
     save(tmp_path / "a.png", pixels, "uint8", unassociated=True)
     np.testing.assert_allclose(read(tmp_path / "a.png").pixels, pixels, atol=1 / 509)
-
-
-def test_float64_is_kept_and_no_colour_is_multiplied_by_alpha(tmp_path):
     wide = np.array([[[1.0]], [[1 + 2.0**-40]]])
     path = save(tmp_path / "a.tif", wide, "double")
     np.testing.assert_array_equal(read(path).pixels, wide)
@@ -124,11 +114,8 @@ def test_float64_is_kept_and_no_colour_is_multiplied_by_alpha(tmp_path):
 def multipart(path):
     spec = oiio.ImageSpec(40, 48, 3, "float")
     output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), [spec, spec])
-    assert output.write_image(PIXELS)
-    assert output.open(str(path), spec, "AppendSubimage")
-    assert output.write_image(PIXELS)
-    assert output.close()
+    assert output.open(str(path), [spec, spec]) and output.write_image(PIXELS)
+    assert output.open(str(path), spec, "AppendSubimage") and output.write_image(PIXELS) and output.close()
 
 
 def deep(path):
@@ -148,11 +135,13 @@ def window(path, x, y):
     path.write_bytes(data)
 
 
+POINTER = f"version https://git-lfs.github.com/spec/v1\noid sha256:{64 * '4'}\nsize 12345\n"
 BAD = {
     "empty.exr": lambda path: path.write_bytes(b""),
     "empty.png": lambda path: path.write_bytes(b""),
     "text.exr": lambda path: path.write_text("<scene/>"),
     "text.png": lambda path: path.write_text("<scene/>"),
+    "pointer.tif": lambda path: path.write_text(POINTER),
     "noise.hdr": lambda path: path.write_bytes(bytes(range(256)) * 9),
     "wrong.exr": lambda path: save(path.with_suffix(".png"), PIXELS, "uint8").rename(path),
     "wrong.png": lambda path: save(path.with_suffix(".exr"), PIXELS).rename(path),
@@ -186,6 +175,7 @@ def test_bad_files_are_one_line_that_names_them(tmp_path, name):
         text = str(error.value)
         assert text.startswith(f"{path}: ") and text.count(str(tmp_path)) == 1 and "\n" not in text
         assert not name.startswith("truncated") or "corrupt" in text or "not an EXR file" in text
+        assert ("run `git lfs pull` to fetch it" in text) is (name == "pointer.tif")
     assert oiio.get_int_attribute("limits:imagesize_MB") == before
 
 
@@ -219,63 +209,78 @@ def test_what_the_system_does_not_give(tmp_path):
             reader(tmp_path / "none.exr")
         with pytest.raises(OSError, match=str(tmp_path)):
             reader(tmp_path)
-    path = save(tmp_path / "a.exr", PIXELS)
-    path.chmod(0)
-    if os.access(path, os.R_OK):
-        pytest.skip("this user may read everything")
-    with pytest.raises(PermissionError, match=r"a\.exr"):
-        read(path)
 
 
-# Git LFS ----------------------------------------------------------------------------------------------------------
-
-POINTER = f"""version https://git-lfs.github.com/spec/v1
-oid sha256:{64 * "4"}
-size 12345
-"""
+# Work in threads: in order, several at a time, and never more together than the bound -------------------------------
 
 
-def command_in(error):
-    return re.fullmatch(r".*: a Git LFS pointer, not the image; run `(.*)` to fetch it", str(error.value))[1]
+@pytest.mark.parametrize(
+    ("items", "most"), [*(([1, 5, 2, 2, 0, 7, 3, 1, 1, 1, 4, 0, 0, 6] * 3, n) for n in (5, 12, 100)), ([1, 9, 1, 9], 3)]
+)
+def test_the_bound_holds_and_the_order_too(items, most):
+    """Held from the start of the work until the answer is taken; what takes more than all is alone."""
+    lock, held, largest = threading.Lock(), 0, 0
+
+    def work(item):
+        nonlocal held, largest
+        with lock:
+            held += item
+            largest = max(largest, held)
+        time.sleep(0.002)
+        return item
+
+    for item, answer in zip(items, bounded_map(work, items, lambda item: item, most, 4), strict=True):
+        assert answer == item
+        with lock:
+            held -= answer
+    assert largest <= max(most, *items) and (largest > max(items) or most < 12)
 
 
-@pytest.mark.parametrize("name", ["a.exr", "a.png", "in a folder/a[1],*.tif"])
-def test_a_pointer_of_git_lfs_is_named_with_the_command_that_brings_the_image(tmp_path, name):
-    path = tmp_path / "repository" / name
-    path.parent.mkdir(parents=True)
-    path.write_text(POINTER)
-    with pytest.raises(ValueError, match=r"^/.*: a Git LFS pointer") as outside:
-        read(path)
-    assert shlex.split(command_in(outside))[3].startswith("--include=/")
-    (tmp_path / "repository" / ".git").mkdir()
-    with pytest.raises(ValueError, match=r"^[^\n]*$") as inside:
-        read(path)
-    pattern = {"in a folder/a[1],*.tif": "in a folder/a?1???.tif"}.get(name, name)
-    assert shlex.split(command_in(inside)) == ["git", "lfs", "pull", f"--include={pattern}"]
+@pytest.mark.parametrize("takes", [0, 1])
+def test_threads_work_at_the_same_time_to_the_end(takes):
+    gate = threading.Barrier(4, timeout=10)
+    assert list(bounded_map(lambda item: gate.wait() >= 0, range(20), lambda item: takes, 4, 4)) == [True] * 20
 
 
-@pytest.mark.skipif(shutil.which("git-lfs") is None, reason="no git-lfs (apt-get install git-lfs)")
-def test_that_command_brings_it(tmp_path):
-    """A repository with two images, and a clone of it that did not ask for them."""
-    home = {"HOME": str(tmp_path), "GIT_CONFIG_NOSYSTEM": "1", "GIT_LFS_SKIP_SMUDGE": "1"}
-    home |= {f"GIT_{role}_{what}": "a@b" for role in ("AUTHOR", "COMMITTER") for what in ("NAME", "EMAIL")}
+def test_an_error_is_raised_in_its_turn_and_what_has_not_begun_is_left():
+    answers = bounded_map(lambda item: 6 // item, [1, 2, 0, 3], lambda item: item, 9, 2)
+    assert [next(answers), next(answers)] == [6, 3]
+    with pytest.raises(ZeroDivisionError):
+        next(answers)
+    begun = []
 
-    def git(folder, *words):
-        subprocess.run(["git", *words], cwd=folder, env=os.environ | home, check=True, capture_output=True, timeout=60)
+    def takes(item):
+        if item == AHEAD:
+            raise KeyboardInterrupt
+        return 0
 
-    origin, clone = tmp_path / "origin", tmp_path / "clone"
-    git(tmp_path, "init", str(origin))
-    (origin / "ref").mkdir()
-    save(origin / "ref" / "a[1].exr", PIXELS)
-    save(origin / "b.exr", PIXELS)
-    for words in (["install"], ["track", "*.exr"]):
-        git(origin, "lfs", *words)
-    git(origin, "add", ".")
-    git(origin, "commit", "-m", "images")
-    git(tmp_path, "clone", origin.as_uri(), str(clone))
-    with pytest.raises(ValueError, match="Git LFS pointer") as error:
-        read(clone / "ref" / "a[1].exr")
-    git(clone, *shlex.split(command_in(error))[1:])
-    assert np.array_equal(read(clone / "ref" / "a[1].exr").pixels, PIXELS)
-    with pytest.raises(ValueError, match="Git LFS pointer"):
-        read(clone / "b.exr")
+    with pytest.raises(KeyboardInterrupt):
+        list(bounded_map(lambda item: begun.append(item) or time.sleep(0.3), range(10), takes, 1, 1))
+    assert begun in ([], [0])
+
+
+# Pixels ---------------------------------------------------------------------------------------------------------------
+
+
+def test_the_srgb_curve_is_that_of_the_standard():
+    linear = np.array([0.0, 0.001, 0.0031308, 0.214, 0.5, 1.0])
+    assert srgb_encode(linear) == pytest.approx([0.0, 0.01292, 0.04045, 0.5, 0.735357, 1.0], abs=1e-4)
+    assert srgb_decode(srgb_encode(linear)) == pytest.approx(linear, rel=1e-6)
+
+
+def test_blocks_at_the_edge_are_of_what_is_left():
+    pixels = np.random.default_rng(3).random((2, 7, 5, 3))
+    sums, means = block_sum(pixels, 4), block_mean(pixels[0], 4)
+    assert sums.shape == (2, 2, 2, 3)
+    assert sums[1, 1, 0] == pytest.approx(pixels[1, 4:, :4].sum((0, 1)))
+    assert means[1, 1] == pytest.approx(pixels[0, 4:, 4:].mean((0, 1)))
+    assert block_area(7, 5, 4)[..., 0].tolist() == [[16, 4], [12, 3]]
+    assert block_mean(pixels[0].astype(np.float32), 4).dtype == np.float32
+
+
+@pytest.mark.parametrize("channels", [0, 1, 2, 3, 4, 8, 9, 40])
+@pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
+def test_any_channel(channels, share):
+    flags = np.random.default_rng(channels).random((6, 7, channels)) < share
+    assert np.array_equal(any_channel(flags), flags.any(-1))
+    assert any_channel(flags[0]).shape == (7,)

@@ -14,7 +14,7 @@ from support.processes import python
 
 from mi_refract.cluster import workers as workers_module
 from mi_refract.cluster.connection import connected
-from mi_refract.cluster.on_worker import facts
+from mi_refract.cluster.on_worker import LLVM, MIXED, facts
 from mi_refract.rendering import cluster_passes, scene_bundle
 from mi_refract.rendering.cluster_passes import ClusterPasses, Part
 from mi_refract.rendering.end_conditions import Limits
@@ -63,7 +63,7 @@ def rendered(scene, spp, passes=None, watch=lambda render: None):
     """The sums of a render here or by `passes`, and the header of its image."""
     output = scene.with_name("here.exr" if passes is None else "there.exr")
     render = resume(Job(scene), output, Limits(spp=spp, pass_spp=1), restart=True)
-    header = render.run(watch, passes)
+    header = render.run(watch, passes and passes.nodes)
     return render.progress.sums(), header
 
 
@@ -81,11 +81,17 @@ def busy(client):
     return [key for keys in client.processing().values() for key in keys]
 
 
-def test_two_workers(client, scene, variant):
-    found = rendered(scene, 200, source(client, scene, variant))
-    same(found, rendered(scene, 200))
+def test_two_workers_and_a_machine_with_another_llvm(client, scene, variant):
+    """Which says so in the header."""
+    found, expected = rendered(scene, 200, source(client, scene, variant)), rendered(scene, 200)
+    same(found, expected)
     assert found[1]["mi_refract:machines"] == os.uname().nodename
     until(lambda: not busy(client), 10)
+    if variant.startswith("llvm"):
+        passes, own = source(client, scene, variant), facts(variant)
+        passes.workers = workers_module.Workers(client, variant, own | {LLVM: "99.0"}, MIXED)
+        passes.workers.wait()
+        assert rendered(scene, 16, passes)[1]["mi_refract:machines"] == f"{os.uname().nodename} (libLLVM {own[LLVM]})"
 
 
 @pytest.mark.usefixtures("small_tasks")
@@ -146,17 +152,14 @@ def test_a_worker_that_joins_late_is_used(client, scene, variant, monkeypatch):
 
     def watch(render):
         assert time.monotonic() < deadline
-        if (set(passes.workers.accepted) - before) & set(busy_workers(client)):
+        busy = (a for a, keys in client.processing().items() if any("render_node" in str(key) for key in keys))
+        if (set(passes.workers.accepted) - before) & set(busy):
             raise Used
 
     with joined(client), pytest.raises(Used):
-        run.run(watch, passes)
+        run.run(watch, passes.nodes)
     assert run.checkpoints.path.exists()
     until(lambda: set(client.nthreads()) == before)
-
-
-def busy_workers(client):
-    return [address for address, keys in client.processing().items() if any("render_node" in str(key) for key in keys)]
 
 
 def test_what_is_begun_is_given_up_with_the_iterator(client, scene, variant, monkeypatch):
@@ -200,36 +203,20 @@ def test_what_is_folded_stays_as_it_is():
     assert (folded.sums.total[0, 0, 0], folded.nonfinite, folded.seconds) == (28, {"a": 7, "b": 1}, 4.0)
 
 
-def test_a_machine_whose_pixels_are_not_finite_is_named(client, scene, variant):
+def test_what_is_wrong_with_the_scene_is_said_as_by_a_local_render(client, scene, variant):
+    """An error that is raised when it is rendered: the scene scatters; and pixels that are not finite, by machine."""
     scene.write_text(SCENE.replace("RADIANCE", '<rgb name="radiance" value="nan"/>'))
-    warnings = []
-    found = rendered(scene, 4, source(client, scene, variant, warnings.append))
+    said, errors = [], []
+    found = rendered(scene, 4, source(client, scene, variant, said.append))
     assert found[1]["mi_refract:nonfinite_pixels"] == rendered(scene, 4)[1]["mi_refract:nonfinite_pixels"] > 0
-    assert len(warnings) == 1
-    assert re.fullmatch(rf"{os.uname().nodename}: \d+ pixels of a pass are not finite", warnings[0])
-
-
-def test_an_error_of_the_scene_is_that_of_a_local_render(client, scene, variant):
-    """Which is raised when it is rendered: the scene scatters, so that nothing of it is deterministic."""
-    text = scene.read_text().replace('type="path">', 'type="refract_path"><boolean name="deterministic" value="true"/>')
-    scene.write_text(text)
-    errors = []
+    assert len(said) == 1 and re.fullmatch(rf"{os.uname().nodename}: \d+ pixels of a pass are not finite", said[0])
+    deterministic = 'type="refract_path"><boolean name="deterministic" value="true"/>'
+    scene.write_text(SCENE.replace("RADIANCE", "").replace('type="path">', deterministic))
     for passes in (None, source(client, scene, variant)):
         with pytest.raises(ValueError, match="deterministic") as caught:
             rendered(scene, 4, passes)
         errors.append(str(caught.value))
     assert errors[0] == errors[1]
-
-
-def test_machines_with_another_llvm_say_so_in_the_header(client, scene, variant):
-    if not variant.startswith("llvm"):
-        pytest.skip("needs LLVM")
-    passes = source(client, scene, variant)
-    expected = facts(variant) | {"libLLVM": "99.0"}
-    passes.workers = workers_module.Workers(client, variant, expected, {"libLLVM", "vector width"})
-    passes.workers.wait()
-    found = rendered(scene, 16, passes)
-    assert found[1]["mi_refract:machines"] == f"{os.uname().nodename} (libLLVM {facts(variant)['libLLVM']})"
 
 
 @pytest.mark.parametrize(

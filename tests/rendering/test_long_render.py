@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from support.processes import python
 from support.readme import python_blocks
-from support.renders import BALL, SCENES, SMALL, pixels, rendering
+from support.renders import BALL, SCENES, pixels, rendering
 
 from mi_refract.cluster import on_worker
 from mi_refract.image_diff.comparison import Verdict
@@ -63,15 +63,21 @@ def same_as_fresh(output, scene=BALL, **limits):
 # The image and its header -------------------------------------------------------------------------------------------
 
 
-def test_the_header_renders_the_same_image_again(tmp_path):
-    first = render_to_exr(SCENE, tmp_path / "a.exr", defines=SMALL, spp=2, seed=5)
-    again = {"spp": first["mi_refract:spp"], "seed": first["mi_refract:seed"]}
-    render_to_exr(first["mi_refract:scene"], tmp_path / "b.exr", defines=SMALL, **again)
-    (image, header), (same, _) = (read_exr(tmp_path / name) for name in ("a.exr", "b.exr"))
-    np.testing.assert_array_equal(image, same)
-    assert image.shape[:2] == (8, 8)
+def test_the_header_of_the_readmes_example_renders_the_same_image_again(tmp_path, monkeypatch):
+    *_, code = python_blocks(Path(long_render.__file__).with_name("README.md"))
+    monkeypatch.chdir(SCENES.parent)
+    for old, new in {'"nested.exr"': f'r"{tmp_path}/a.exr"', "spp=256": "spp=2", '{"': '{"res": "8", "'}.items():
+        assert old in code
+        code = code.replace(old, new)
+    exec(code, names := {})
+    image, header = read_exr(tmp_path / "a.exr")
     times = ("mi_refract:render_seconds", "mi_refract:scene")  # float32 and UTF-8 in the file
-    assert all(header[name] == value for name, value in first.items() if name not in times)
+    assert all(header[name] == value for name, value in names["header"].items() if name not in times)
+    assert image.shape[:2] == (8, 8) and header["mi_refract:seed"] == json.loads(header["mi_refract:identity"])["seed"]
+    again = {"spp": header["mi_refract:spp"], "seed": header["mi_refract:seed"]}
+    defines = json.loads(header["mi_refract:defines"])
+    render_to_exr(header["mi_refract:scene"], tmp_path / "b.exr", defines=defines, **again)
+    np.testing.assert_array_equal(image, pixels(tmp_path / "b.exr"))
 
 
 def test_the_variance_is_that_of_the_passes(tmp_path, llvm):
@@ -94,28 +100,24 @@ def test_few_passes_have_the_variance_of_their_samples(tmp_path, llvm):
     few, many = (read(tmp_path / name).select(["R.variance"]).mean() for name in ("a.exr", "b.exr"))
     # 64 pixels of 29 degrees of freedom, of samples with kurtosis up to 20 or so: a standard error of about 10 %.
     assert few == pytest.approx(many, rel=0.5)
+    header = rendering(tmp_path / "one.exr", spp=1).run()
+    assert read(tmp_path / "one.exr").channels == ("R", "G", "B") and header["mi_refract:variance_from"] == "nothing"
 
 
 @pytest.mark.parametrize(("spp", "pass_spp"), [(64, 64), (16, 1)])
 def test_renders_under_a_wide_filter_are_equal_to_their_like(tmp_path, llvm, spp, pass_spp):
     """Neighbours share samples there, also in files whose variance has as many degrees of freedom as samples.
 
-    At a family error of 20 % more than 13 of 30 pairs are different once in 1100 runs, where 20 % is what comes up.
+    At a family error of 20 % more than 8 of 15 pairs are different once in 1270 runs, where 20 % is what comes up.
     """
     scene, images = changed(tmp_path, ('"box"', '"gaussian"')), []
-    for seed in range(60):
+    for seed in range(30):
         output = tmp_path / "a.exr"
         rendering(output, seed, scene, {"res": "64"}, spp=spp, pass_spp=pass_spp, restart=True).run()
         images.append(read(output))
     pairs = zip(images[::2], images[1::2], strict=True)
     verdicts = [compare("auto", a, b, family_error=0.2, resolution=9.0).verdict for a, b in pairs]
-    assert verdicts.count(Verdict.DIFFERENT) <= 13
-
-
-def test_one_sample_has_no_variance(tmp_path, llvm):
-    header = rendering(tmp_path / "a.exr", spp=1).run()
-    assert read(tmp_path / "a.exr").channels == ("R", "G", "B")
-    assert header["mi_refract:variance_from"] == "nothing"
+    assert verdicts.count(Verdict.DIFFERENT) <= 8
 
 
 def test_pixels_that_are_not_finite_are_counted(tmp_path, llvm, monkeypatch):
@@ -132,44 +134,21 @@ def test_pixels_that_are_not_finite_are_counted(tmp_path, llvm, monkeypatch):
     assert np.isnan(pixels(tmp_path / "a.exr")).any(-1).sum() == 1
 
 
-def test_the_example_of_the_readme(tmp_path, monkeypatch):
-    *_, code = python_blocks(Path(long_render.__file__).with_name("README.md"))
-    monkeypatch.chdir(SCENES.parent)
-    for old, new in {'"nested.exr"': f'r"{tmp_path}/nested.exr"', "spp=256": "spp=1", '{"': '{"res": "8", "'}.items():
-        assert old in code
-        code = code.replace(old, new)
-    exec(code, {})
-    header = read_exr(tmp_path / "nested.exr")[1]
-    assert header["mi_refract:seed"] == 1
-    assert json.loads(header["mi_refract:identity"])["seed"] == 1
-
-
 # What ends it -------------------------------------------------------------------------------------------------------
 
 WRONG = [{"spp": 0}, {"spp": -1}, {"pass_spp": 0}, {"until": 0.0}, {"until": -0.1}, {"until": 1.01}]
 WRONG += [{"until": float("nan")}, {"until_tile": 2.0}, {"seconds": 0.0}, {"seconds": float("inf")}]
 
 
-@pytest.mark.parametrize("wrong", WRONG, ids=str)
-def test_wrong_limits(wrong):
-    with pytest.raises(ValueError, match="expected ") as error:
-        Limits(**wrong)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("output", "wrong"),
-    [("a.exr", {"seed": -1}), ("a.exr", {"seed": 2**32}), ("a.exr", {"defines": {"config": "x"}}), ("none/a.exr", {})],
-)
-def test_what_is_wrong_is_refused_before_the_rendering(tmp_path, monkeypatch, output, wrong):
+@pytest.mark.parametrize("wrong", [*WRONG, {"seed": -1}, {"seed": 2**32}, {"defines": {"config": "x"}}, None], ids=str)
+def test_what_is_wrong_is_refused_before_the_rendering(tmp_path, monkeypatch, wrong):
     monkeypatch.setattr(mi, "render", lambda *arguments, **named: pytest.fail("rendered"))
     with pytest.raises((ValueError, NotADirectoryError), match="expected ") as error:
-        render_to_exr(SCENE, tmp_path / output, **wrong)
-    assert "\n" not in str(error.value)
-    assert not list(tmp_path.iterdir())
+        rendering(tmp_path / ("a.exr" if wrong else "none/a.exr"), **wrong or {})
+    assert "\n" not in str(error.value) and not list(tmp_path.iterdir())
 
 
-def test_a_scene_without_noise_needs_one_pass(tmp_path, llvm):
+def test_a_scene_without_noise_needs_one_pass_and_a_black_one_is_warned_of(tmp_path, llvm):
     for name, emitter in (("light", '<emitter type="constant"/>'), ("dark", "")):
         (tmp_path / f"{name}.xml").write_text(SKY.format(emitter))
     ended = "no noise: the samples of every pixel agree"
@@ -186,28 +165,27 @@ def test_a_scene_without_noise_needs_one_pass(tmp_path, llvm):
             if spp == 256 or reason == ended:  # a finished image without noise is not refined
                 assert (header["mi_refract:passes"], render.ended_by) == (passes, reason)
         (tmp_path / "a.exr").unlink()
+    render = resume(Job(tmp_path / "dark.xml"), tmp_path / "a.exr", Limits(until=0.1, pass_spp=1))
+    stopped_after(render, 13)
+    assert len(render.warnings) == 1 and "the image is still black" in render.warnings[0]
 
 
-def test_it_ends_at_the_error_that_was_asked_for_and_only_at_a_look(tmp_path, llvm):
+def test_it_ends_at_the_limit_that_is_reached_first(tmp_path, llvm):
     for _ in range(2):  # the second time from the finished image
         render = rendering(tmp_path / "a.exr", until=0.1, pass_spp=2)
-        assert render.run()["mi_refract:passes"] in (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
+        assert render.run()["mi_refract:passes"] in (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)  # only at a look
         assert render.error().high <= 0.1 and "--until 10 %" in render.ended_by
     assert rendering(tmp_path / "b.exr", until=0.1, spp=8, pass_spp=2).run()["mi_refract:spp"] == 8
-
-
-def test_it_ends_at_the_error_of_the_worst_tile(tmp_path, llvm):
-    render = rendering(tmp_path / "a.exr", until_tile=0.2, pass_spp=2)
+    render = rendering(tmp_path / "c.exr", until_tile=0.2, pass_spp=2)
     render.run()
     assert "--until-tile 20 %" in render.ended_by
-
-
-def test_it_ends_after_its_time(tmp_path, llvm):
-    render = rendering(tmp_path / "a.exr", seconds=0.2, pass_spp=1)
-    start = time.monotonic()
+    render, start = rendering(tmp_path / "d.exr", seconds=0.2, pass_spp=1), time.monotonic()
     header = render.run()
     assert time.monotonic() - start >= 0.2 and render.ended_by == "--time 0.2 s"
-    same_as_fresh(tmp_path / "a.exr", spp=header["mi_refract:spp"], pass_spp=1)
+    same_as_fresh(tmp_path / "d.exr", spp=header["mi_refract:spp"], pass_spp=1)
+    timeout = '<integrator type="$integrator"><float name="timeout" value="0.01"/>'  # does not count
+    scene = changed(tmp_path, ('<integrator type="$integrator">', timeout))
+    assert rendering(tmp_path / "e.exr", scene=scene, spp=8, pass_spp=4).run()["mi_refract:spp"] == 8
 
 
 def test_looks_are_few_also_where_it_resumes(tmp_path, llvm, monkeypatch):
@@ -217,19 +195,6 @@ def test_looks_are_few_also_where_it_resumes(tmp_path, llvm, monkeypatch):
     monkeypatch.setattr(long_render, "reached", lambda limits, sums: looks.append(sums.passes) or "")
     stopped_after(rendering(tmp_path / "a.exr", until=1e-3, pass_spp=2), 25)
     assert sorted(set(looks)) == [12, 16, 24]
-
-
-def test_a_black_image_is_warned_of(tmp_path, llvm):
-    (tmp_path / "dark.xml").write_text(SKY.format(""))
-    render = resume(Job(tmp_path / "dark.xml"), tmp_path / "a.exr", Limits(until=0.1, pass_spp=1))
-    stopped_after(render, 13)
-    assert len(render.warnings) == 1 and "the image is still black" in render.warnings[0]
-
-
-def test_the_timeout_of_an_integrator_does_not_count(tmp_path, llvm):
-    timeout = '<integrator type="$integrator"><float name="timeout" value="0.01"/>'
-    scene = changed(tmp_path, ('<integrator type="$integrator">', timeout))
-    assert rendering(tmp_path / "a.exr", scene=scene, spp=8, pass_spp=4).run()["mi_refract:spp"] == 8
 
 
 # What it resumes from -------------------------------------------------------------------------------------------------
@@ -247,9 +212,13 @@ def test_a_checkpoint_resumes_with_the_same_bits(tmp_path, llvm, passes):
     same_as_fresh(output, spp=90, pass_spp=4)
 
 
-def test_a_finished_image_is_refined(tmp_path, llvm):
+def test_a_finished_image_is_refined_if_it_is_of_the_same_render(tmp_path, llvm):
     output, seen = tmp_path / "a.exr", []
+    output.write_bytes(b"no EXR")
+    assert rendering(output, spp=8).progress.done == 0
     rendering(output, spp=32, pass_spp=4).run()
+    for other in ({"seed": 1}, {"spp": 16}, {"restart": True}):
+        assert rendering(output, **{"spp": 64, "pass_spp": 4} | other).progress.done == 0
     render = rendering(output, spp=64, pass_spp=4)
     assert render.progress.done == 32
     header = render.run(lambda render: seen.append(render.progress.passes))
@@ -257,72 +226,48 @@ def test_a_finished_image_is_refined(tmp_path, llvm):
     rendering(tmp_path / "b.exr", spp=64, pass_spp=4).run()
     # The same samples, but the first half by way of float32.
     np.testing.assert_allclose(pixels(output)[..., :3], pixels(tmp_path / "b.exr")[..., :3], rtol=3e-7)
+    rendering(output, spp=12, pass_spp=4, restart=True).run()  # few passes: their variance stays what it is
+    variance = rendering(output, spp=16, pass_spp=4).progress.sums().variance
+    np.testing.assert_allclose(variance, read(output).select([f"{name}.variance" for name in "RGB"]))
+    scene = changed(tmp_path, ('value="independent"', 'value="stratified"'))  # which rounds up
+    assert rendering(output, scene=scene, spp=10).run()["mi_refract:spp"] == 16
+    assert rendering(output, scene=scene, spp=10).progress.done == 16
 
 
 @pytest.mark.parametrize("spp", [6, 32, 40])
 def test_the_same_command_again_renders_nothing_and_changes_nothing(tmp_path, llvm, spp, monkeypatch):
     output = tmp_path / "a.exr"
     rendering(output, spp=spp, pass_spp=4).run()
-    content = output.read_bytes()
-    render = rendering(output, spp=spp, pass_spp=4)
+    content, render = output.read_bytes(), rendering(output, spp=spp, pass_spp=4)
     monkeypatch.setattr(type(render.renderer), "render", lambda *arguments: pytest.fail("rendered"))
     render.run()
     assert output.read_bytes() == content
 
 
-@pytest.mark.parametrize("other", [{"seed": 1}, {"spp": 16}, {"restart": True}], ids=str)
-def test_another_image_is_replaced(tmp_path, llvm, other):
-    rendering(tmp_path / "a.exr", spp=32, pass_spp=4).run()
-    assert rendering(tmp_path / "a.exr", **{"spp": 64, "pass_spp": 4} | other).progress.done == 0
+def test_a_checkpoint_of_another_render_is_refused_by_name(tmp_path, llvm, monkeypatch):
+    """A file that the scene names is part of it."""
+    texture = '<bsdf type="diffuse"><texture type="bitmap" name="reflectance"><string name="filename" value="a.ppm"/>'
+    more = ("</scene>", f'<shape type="sphere">{texture}</texture></bsdf></shape></scene>')
+    (tmp_path / "a.ppm").write_bytes(b"P6 1 1 255 123")
+    scene = changed(tmp_path, more)
 
+    def refused(message, **other):
+        limits = {"spp": 64, "pass_spp": 4} | other
+        with pytest.raises(ValueError, match=message) as error:
+            rendering(tmp_path / "a.exr", scene=scene, **limits)
+        assert "--restart" in str(error.value) and "\n" not in str(error.value)
+        assert rendering(tmp_path / "a.exr", scene=scene, restart=True, **limits).progress.passes == 0
 
-def test_the_variance_of_few_passes_stays_what_it_is(tmp_path, llvm):
-    output = tmp_path / "a.exr"
-    rendering(output, spp=12, pass_spp=4).run()
-    variance = rendering(output, spp=16, pass_spp=4).progress.sums().variance
-    np.testing.assert_allclose(variance, read(output).select([f"{name}.variance" for name in "RGB"]))
-
-
-def test_a_sampler_that_rounds_up_has_nothing_left(tmp_path, llvm):
-    scene = changed(tmp_path, ('value="independent"', 'value="stratified"'))
-    assert rendering(tmp_path / "a.exr", scene=scene, spp=10).run()["mi_refract:spp"] == 16
-    assert rendering(tmp_path / "a.exr", scene=scene, spp=10).progress.done == 16
-
-
-def test_a_file_of_somebody_else_is_not_resumed_from(tmp_path, llvm):
-    (tmp_path / "a.exr").write_bytes(b"no EXR")
-    assert rendering(tmp_path / "a.exr", spp=8).progress.done == 0
-    assert rendered_file.read(tmp_path / "a.exr", ("R", "G", "B"), {}) is None
-
-
-@pytest.mark.parametrize(
-    ("other", "message"),
-    [
-        ({"seed": 1}, "seed was 0, is 1"),
-        ({"pass_spp": 8}, "passes of 4 samples per pixel"),
-        ({"spp": 8}, "already holds 12 samples per pixel; expected --spp 12 or more, or --restart"),
-    ],
-)
-def test_a_checkpoint_of_another_render_is_refused_by_name(tmp_path, llvm, other, message):
-    stopped_after(rendering(tmp_path / "a.exr", spp=64, pass_spp=4), 3)
-    again = {"spp": 64, "pass_spp": 4} | other
-    with pytest.raises(ValueError, match=message) as error:
-        rendering(tmp_path / "a.exr", **again)
-    assert "--restart" in str(error.value) and "\n" not in str(error.value)
-    assert rendering(tmp_path / "a.exr", restart=True, **again).progress.passes == 0
-
-
-def test_a_changed_scene_variant_or_version_is_refused_by_name(tmp_path, llvm, monkeypatch):
-    scene = changed(tmp_path)
     stopped_after(rendering(tmp_path / "a.exr", scene=scene, spp=64, pass_spp=4), 3)
-
-    def refused(message):
-        with pytest.raises(ValueError, match=message):
-            rendering(tmp_path / "a.exr", scene=scene, spp=64)
-
-    changed(tmp_path, ("30.5", "30.6"))
+    refused("seed was 0, is 1", seed=1)
+    refused("passes of 4 samples per pixel", pass_spp=8)
+    refused("already holds 12 samples per pixel; expected --spp 12 or more, or --restart", spp=8)
+    changed(tmp_path, more, ("30.5", "30.6"))
     refused("the scene has changed")
-    changed(tmp_path)
+    changed(tmp_path, more)
+    (tmp_path / "a.ppm").write_bytes(b"P6 1 1 255 124")
+    refused("the scene has changed")
+    (tmp_path / "a.ppm").write_bytes(b"P6 1 1 255 123")
     for place, name, value, message in (
         (long_render, "installed_version", "0", r"version of mitsuba was \S+, is 0"),
         (on_worker, "vector_width", "64", r"vector width was \d+, is 64"),
@@ -334,18 +279,6 @@ def test_a_changed_scene_variant_or_version_is_refused_by_name(tmp_path, llvm, m
     refused("variant was llvm_ad_rgb, is scalar_rgb")
 
 
-def test_a_file_that_the_scene_names_is_part_of_it(tmp_path, llvm):
-    (tmp_path / "meshes").mkdir()
-    for path in (SCENE.parent / "meshes").iterdir():
-        (tmp_path / "meshes" / path.name).write_bytes(path.read_bytes())
-    (tmp_path / "scene.xml").write_text(SCENE.read_text())
-    stopped_after(rendering(tmp_path / "a.exr", scene=tmp_path / "scene.xml", spp=64, pass_spp=4), 1)
-    mesh = tmp_path / "meshes" / "tumbler_air.ply"
-    mesh.write_bytes(mesh.read_bytes().replace(b"comment", b"comment ", 1) + b"\n")
-    with pytest.raises(ValueError, match="the scene has changed"):
-        rendering(tmp_path / "a.exr", scene=tmp_path / "scene.xml", spp=64)
-
-
 DAMAGE = {
     "truncated": lambda content: content[:-100],
     "flipped": lambda content: content[:1500] + bytes([content[1500] ^ 1]) + content[1501:],
@@ -355,13 +288,14 @@ DAMAGE = {
 }
 
 
-@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
-def test_a_damaged_checkpoint_is_refused(tmp_path, llvm, damage):
+def test_a_damaged_checkpoint_is_refused(tmp_path, llvm):
     stopped_after(rendering(tmp_path / "a.exr", spp=64, pass_spp=4), 3)
     path = checkpoint.path_of(tmp_path / "a.exr")
-    path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(ValueError, match=r"^\S+a\.exr\.checkpoint: damaged checkpoint [^\n]*--restart[^\n]*$"):
-        rendering(tmp_path / "a.exr", spp=64, pass_spp=4)
+    whole = path.read_bytes()
+    for damage in DAMAGE.values():
+        path.write_bytes(damage(whole))
+        with pytest.raises(ValueError, match=r"^\S+a\.exr\.checkpoint: damaged checkpoint [^\n]*--restart[^\n]*$"):
+            rendering(tmp_path / "a.exr", spp=64, pass_spp=4)
 
 
 # What may go wrong ----------------------------------------------------------------------------------------------------
@@ -384,40 +318,30 @@ def test_a_last_pass_is_kept_where_its_image_cannot_be_written(tmp_path, llvm, m
 
 
 def test_a_full_disk_at_a_checkpoint_is_a_warning(tmp_path, llvm, monkeypatch, capfd):
-    write, failures, written = checkpoint.write, [], []
-
-    def twice_full(path, progress):
-        if len(failures) < 2:
-            failures.append(path)
-            full()
-        write(path, progress)
-
-    monkeypatch.setattr(checkpoint, "write", twice_full)
-    render = rendering(tmp_path / "a.exr", spp=32, pass_spp=4)
+    render, write, written = rendering(tmp_path / "a.exr", spp=32, pass_spp=4), checkpoint.write, []
     render.checkpoints.interval = 0.0
+    monkeypatch.setattr(checkpoint, "write", full)
 
     def watch(render):
         written.append(render.checkpoints.path.exists())
-        if render.progress.passes == 8:
-            monkeypatch.setattr(checkpoint, "write", full)
+        if render.progress.passes == 3:
+            render.checkpoints.wait()
             render.give_up()
             (tmp_path / ".a.exr.lock").touch()
             monkeypatch.setattr(checkpoint, "write", write)
 
     render.run(watch)
     assert len(render.warnings) >= 2 and "No space left on device; will be tried again" in render.warnings[0]
-    assert any(written) and (tmp_path / "a.exr").exists()
+    assert not any(written[:3]) and any(written) and (tmp_path / "a.exr").exists()
     assert "checkpoint not written: No space left" in capfd.readouterr().err
 
 
 def test_two_renders_into_one_file(tmp_path, llvm):
     first, second = (rendering(tmp_path / "a.exr", spp=16, pass_spp=4) for _ in range(2))
-    refused = []
+    message, refused = r"a\.exr: a render is already running in process \d+ .* file", []
 
     def watch(_):
-        with pytest.raises(
-            BlockingIOError, match=r"a\.exr: a render is already running in process \d+ .* file"
-        ) as error:
+        with pytest.raises(BlockingIOError, match=message) as error:
             second.run()
         refused.append(error)
         second.give_up()  # it must neither write a checkpoint nor remove the lock
@@ -430,7 +354,7 @@ def test_two_renders_into_one_file(tmp_path, llvm):
         second.run()
 
 
-@pytest.mark.parametrize("took", [1, 8, 12, 19, 24, 40])
+@pytest.mark.parametrize("took", [1, 12, 24, 40])
 def test_a_kill_loses_25_s_or_one_pass(tmp_path, llvm, monkeypatch, took):
     """A clock that only passes move, each by as many seconds."""
     clock, kept = [0.0], [0.0]
@@ -451,8 +375,11 @@ def test_a_kill_loses_25_s_or_one_pass(tmp_path, llvm, monkeypatch, took):
 
 # Killed by a signal, at random times ----------------------------------------------------------------------------------
 
+# What the shell ignores in a background job, Mitsuba does not: it would return an image of the samples so far.
 KILLED = """
-import sys
+import signal, sys
+if sys.argv.pop(1) == "ignored":
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 from mi_refract import cli
 run = cli._run
 def run_with_checkpoints(arguments):
@@ -465,42 +392,53 @@ sys.exit(cli.main())
 """
 
 
-def ended_by(number, output, spp):
+def ended_by(number, output, spp, variant="llvm_ad_rgb", handler="default"):
     """The exit code and stderr of a render that a signal ends after its first checkpoint."""
-    path, words = checkpoint.path_of(output), ("-D", "res=32", "--pass-spp", "4", "--spp", spp)
-    with python(KILLED, BALL, "-o", output, "--variant", "llvm_ad_rgb", *words) as process:
-        deadline = time.monotonic() + 120
-        before = path.stat().st_mtime_ns if path.exists() else 0
-        while process.poll() is None and time.monotonic() < deadline:
-            if path.exists() and path.stat().st_mtime_ns != before:
-                break
-            time.sleep(0.01)
-        time.sleep(random.uniform(0, 0.3))
-        process.send_signal(number)
-        _, err = process.communicate(timeout=60)
-        return process.returncode, err
+    path, words = checkpoint.path_of(output), ("-D", "res=32", "--pass-spp", "4", "--spp", spp, "--variant", variant)
+    with python(KILLED, handler, BALL, "-o", output, *words) as process:
+        try:
+            deadline, before = time.monotonic() + 120, path.stat().st_mtime_ns if path.exists() else 0
+            while process.poll() is None and time.monotonic() < deadline:
+                if path.exists() and path.stat().st_mtime_ns != before:
+                    break
+                time.sleep(0.01)
+            # In which threads a signal is not blocked. Where there are several, Mitsuba's own handler may run in one.
+            status = [path.read_text() for path in Path(f"/proc/{process.pid}/task").glob("*/status")]
+            blocked = [int(text.partition("SigBlk:")[2].split()[0], 16) for text in status]
+            assert sum(not bits >> (signal.SIGINT - 1) & 1 for bits in blocked) <= 1
+            time.sleep(random.uniform(0, 0.3))
+            process.send_signal(number)
+            _, err = process.communicate(timeout=60)
+            return process.returncode, err
+        finally:
+            process.kill()  # or a failure would wait for it without end
 
 
 def test_sigkill_at_random_times_leaves_a_checkpoint_and_the_same_bits(tmp_path, llvm):
-    output, spp = tmp_path / "a.exr", 1600
-    assert ended_by(signal.SIGKILL, output, spp)[0] == -signal.SIGKILL
-    for _ in range(3):
-        if ended_by(signal.SIGKILL, output, spp)[0] == 0:
+    output, limits = tmp_path / "a.exr", {"spp": 800, "pass_spp": 4}
+    assert ended_by(signal.SIGKILL, output, 800)[0] == -signal.SIGKILL
+    for _ in range(2):
+        if ended_by(signal.SIGKILL, output, 800)[0] == 0:
             break
     if not output.exists():
-        render = resume(Job(BALL, {"res": "32"}), output, Limits(spp=spp, pass_spp=4))
+        render = rendering(output, defines={"res": "32"}, **limits)
         assert render.progress.passes
         render.run()
     assert [path.name for path in tmp_path.iterdir() if not path.name.endswith(".part")] == ["a.exr"]
-    resume(Job(BALL, {"res": "32"}), tmp_path / "b.exr", Limits(spp=spp, pass_spp=4)).run()
-    np.testing.assert_array_equal(pixels(output), pixels(tmp_path / "b.exr"))
+    same_as_fresh(output, defines={"res": "32"}, **limits)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_keeps_what_is_done(tmp_path, llvm, number):
-    output = tmp_path / "a.exr"
-    code, err = ended_by(number, output, 4800)
+@pytest.mark.parametrize(
+    ("number", "variant", "handler"),
+    [(number, "llvm_ad_rgb", "default") for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    + [(signal.SIGINT, "scalar_rgb", "ignored")],
+)
+def test_a_signal_keeps_what_is_done(tmp_path, needs_variant, number, variant, handler):
+    needs_variant(variant)
+    mi.set_variant(variant)
+    output, spp = tmp_path / "a.exr", 4800 if variant.startswith("llvm") else 100_000
+    code, err = ended_by(number, output, spp, variant, handler)
     assert code == 128 + number, err
     assert "spp; run the same command again to resume" in err
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr.checkpoint"]
-    assert resume(Job(BALL, {"res": "32"}), output, Limits(spp=4800, pass_spp=4)).progress.passes > 0
+    assert rendering(output, defines={"res": "32"}, spp=spp, pass_spp=4).progress.passes > 0

@@ -1,14 +1,15 @@
-"""The bundle of a scene: complete, unpacked elsewhere, refused where it would not work there."""
+"""Scene files and their bundles: what is loaded, complete elsewhere, and refused before the rendering."""
 
 from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.renders import SCENES
 
 from mi_refract.rendering import scene_bundle
 from mi_refract.rendering.render_pass import pass_renderer
-from mi_refract.rendering.scene_files import load_scene, parse_scene
+from mi_refract.rendering.scene_files import formulas_in, load_scene, parse_scene
 
 SCENE = """<scene version="3.0.0">
   <default name="tint" value="none"/>
@@ -23,7 +24,7 @@ SCENE = """<scene version="3.0.0">
     <texture type="bitmap" name="reflectance"><string name="filename" value="{texture}"/></texture>
   </bsdf></shape>
 </scene>"""
-SKY = '<include filename="../common/gone/../sky.xml"/>'
+BRIGHT, SKY = "../common/bright.exr", '<include filename="../common/gone/../sky.xml"/>'
 
 pytestmark = pytest.mark.usefixtures("scalar_variant")
 
@@ -31,15 +32,23 @@ pytestmark = pytest.mark.usefixtures("scalar_variant")
 @pytest.fixture
 def folder(tmp_path):
     """scenes/, common/sky.xml, and two textures: common/bright.exr, and far/dark.exr."""
-    for name in ("scenes", "common/gone", "far"):
+    for name in ("scenes/empty", "common/gone", "far"):
         (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "scenes" / "link").symlink_to(tmp_path / "far")
     (tmp_path / "common" / "sky.xml").write_text('<scene version="3.0.0"><emitter type="constant"/></scene>')
+    (tmp_path / "common" / "glass.spd").write_text("400 1\n700 1\n")
     for name, value in (("common/bright.exr", 0.8), ("far/dark.exr", 0.1)):
         mi.Bitmap(np.full((4, 4, 3), value, np.float32)).write(str(tmp_path / name))
     return tmp_path
 
 
-def written(folder, texture="../common/bright.exr", more=SKY):
+@pytest.fixture
+def there(tmp_path_factory):
+    """The folder of another machine."""
+    return tmp_path_factory.mktemp("there")
+
+
+def written(folder, texture=BRIGHT, more=SKY):
     path = folder / "scenes" / "scene.xml"
     path.write_text(SCENE.format(texture=texture, more=more))
     return path
@@ -49,61 +58,59 @@ def pack(scene, defines=None):
     return scene_bundle.pack(parse_scene(scene, defines), defines or {})
 
 
-def image(scene):
-    return pass_renderer(scene, 0).render(0, 2).total
-
-
-def elsewhere(folder, bundle):
+def elsewhere(folder, there, bundle):
     """The scene of a bundle, loaded after all that it was made of has gone."""
-    target = folder.parent / f"{folder.name}-there"
-    target.mkdir()
     for name in ("scenes", "common", "far"):
         (folder / name).rename(folder / f"{name}-gone")
-    return scene_bundle.load(bundle, str(mi.variant()), str(target))[0]
+    return scene_bundle.load(bundle, str(mi.variant()), str(there))[0]
+
+
+def image(scene):
+    return pass_renderer(scene, 0).render(0, 2).total
 
 
 @pytest.mark.parametrize(
     ("name", "more", "defines"),
     [
-        ("../common/bright.exr", SKY, {}),
+        (BRIGHT, SKY, {}),
         ("{far}/dark.exr", SKY, {}),
         ("dark.exr", f'{SKY}<path value="../far"/>', {}),
         ("$tint", SKY, {"tint": "{far}/dark.exr"}),
+        (BRIGHT, '<path value="../common"/><include filename="sky.xml"/>', {}),
+        (BRIGHT, f'{SKY}<path value="empty"/>', {}),  # Mitsuba refuses a <path> to a folder that is not there
     ],
 )
-def test_the_same_image_elsewhere(folder, name, more, defines):
-    """Named by `../`, by an absolute path, through a <path>, by a define; XML through a folder that is empty."""
+def test_the_same_image_elsewhere(folder, there, name, more, defines):
+    """Named by `../`, absolutely, through a <path>, by a define."""
     defines = {key: value.format(far=folder / "far") for key, value in defines.items()}
     scene = written(folder, name.format(far=folder / "far"), more)
     expected = image(load_scene(scene, defines))
     bundle = pack(scene, defines)
     assert len(bundle.files) == 3
-    np.testing.assert_array_equal(image(elsewhere(folder, bundle)), expected)
+    np.testing.assert_array_equal(image(elsewhere(folder, there, bundle)), expected)
     assert expected.std() > 0
 
 
-def test_unpacked_and_loaded_once_for_each_set_of_defines(folder, tmp_path_factory):
+def test_unpacked_and_loaded_once_for_each_set_of_defines(folder, there):
     """The same files with another value are another scene."""
-
-    target = tmp_path_factory.mktemp("there")
     more = '<emitter type="constant"><float name="radiance" value="$light"/></emitter>'
     scene = written(folder, more=f'<default name="light" value="1"/>{more}')
     bundles = [pack(scene, {"light": light}) for light in ("1", "1", "3")]
-    one, same, other = (scene_bundle.load(bundle, "scalar_rgb", str(target))[0] for bundle in bundles)
-    assert one is same and len([*target.iterdir()]) == 2
+    one, same, other = (scene_bundle.load(bundle, "scalar_rgb", str(there))[0] for bundle in bundles)
+    assert one is same and len([*there.iterdir()]) == 2
     np.testing.assert_allclose(image(other), 3 * image(one), rtol=1e-6)
 
 
-def test_what_was_unpacked_in_part_is_unpacked_again(folder, tmp_path_factory, monkeypatch):
-    bundle, target = pack(written(folder)), str(tmp_path_factory.mktemp("there"))
+def test_what_was_unpacked_in_part_is_unpacked_again(folder, there, monkeypatch):
+    bundle = pack(written(folder))
 
     def full(*_):
         raise OSError("No space left on device")
 
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
         patch.setattr(scene_bundle.Path, "write_bytes", full)
-        scene_bundle.unpack(bundle, target)
-    root = scene_bundle.unpack(bundle, target)
+        scene_bundle.unpack(bundle, str(there))
+    root = scene_bundle.unpack(bundle, str(there))
     assert {"/" + str(path.relative_to(root)) for path in root.rglob("*") if path.is_file()} == {*bundle.files}
 
 
@@ -127,7 +134,6 @@ def test_too_large(folder, monkeypatch):
         scene_bundle.pack(parsed, {}, 1)
 
 
-BRIGHT = "../common/bright.exr"
 SPECTRUM = '<emitter type="constant"><spectrum name="radiance" filename="{common}/glass.spd"/></emitter>'
 
 
@@ -141,39 +147,63 @@ SPECTRUM = '<emitter type="constant"><spectrum name="radiance" filename="{common
         (SPECTRUM.replace("{common}", "here"), "Mitsuba reads another scene on this worker; expected"),
     ],
 )
-def test_what_the_parser_finds_only_here_is_an_error_there(folder, more, message, monkeypatch):
+def test_what_the_parser_finds_only_here_is_an_error_there(folder, there, more, message, monkeypatch):
     """By absolute names, by names from the working folder: nothing there, or something else."""
     common = folder / "common"
     monkeypatch.chdir(folder)
-    for name in (common / "glass.spd", folder / "here" / "glass.spd"):
-        name.parent.mkdir(exist_ok=True)
-        name.write_text("400 1\n700 1\n")
+    (folder / "here").mkdir()
+    (folder / "here" / "glass.spd").write_text("400 1\n700 1\n")
     bundle = pack(written(folder, more=more.format(common=common)))
     (folder / "here" / "glass.spd").write_text("400 2\n700 2\n")
     with pytest.raises(ValueError, match=message) as caught:
-        elsewhere(folder, bundle)
+        elsewhere(folder, there, bundle)
     assert "\n" not in str(caught.value)
 
 
 def test_a_link_that_leads_elsewhere_is_refused(folder):
-    (folder / "scenes" / "link").symlink_to(folder / "far")
     with pytest.raises(ValueError, match=r"link/\.\./common/bright\.exr: '\.\.' after a symbolic link; for"):
         pack(written(folder, "link/../common/bright.exr"))
 
 
-@pytest.mark.parametrize(
-    "more", ['<path value="../common"/><include filename="sky.xml"/>', f'{SKY}<path value="empty"/>']
-)
-def test_a_relative_path_is_there_as_well(folder, more):
-    """Also one to an empty folder: Mitsuba refuses a <path> to a folder that is not there."""
-    (folder / "scenes" / "empty").mkdir()
-    assert image(elsewhere(folder, pack(written(folder, more=more)))).std() > 0
-
-
-def test_errors_name_the_files_as_they_are_here(folder, tmp_path_factory):
-    scene, there = written(folder), str(tmp_path_factory.mktemp("there"))
+def test_errors_name_the_files_as_they_are_here(folder, there):
+    scene = written(folder)
     bundle = pack(scene)
     bundle.defines["nonesuch"] = "1"
     with pytest.raises(ValueError, match=f"^{scene}: ") as caught:
-        scene_bundle.load(bundle, "scalar_rgb", there)
-    assert there not in str(caught.value)
+        scene_bundle.load(bundle, "scalar_rgb", str(there))
+    assert str(there) not in str(caught.value)
+
+
+# Scene files ----------------------------------------------------------------------------------------------------------
+
+NESTED = SCENES / "nested.xml"
+ABSORBING = """<scene version="3.0.0"><default name="integrator" value="path"/><integrator type="$integrator"/>
+<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/></film></sensor>
+<shape type="sphere"><bsdf type="refract">PARAMETER</bsdf></shape></scene>"""
+ABSORPTION = '<float name="int_absorption" value="0.5"/>'
+
+
+@pytest.mark.parametrize(
+    "bsdf, formulas", [("refract", ["promoted (auto)"]), ("refract_cross", ["cross"]), ("dielectric", [])]
+)
+def test_the_formulas_of_a_scene(bsdf, formulas):
+    assert formulas_in(load_scene(NESTED, {"res": "8", "bsdf": bsdf})) == formulas
+
+
+@pytest.mark.parametrize(
+    ("parameter", "defines", "message"),
+    [
+        ("", {"res": "8193"}, "a film of 8193 × 8193 pixels; expected up to 67108864"),
+        (ABSORPTION, {}, "refract: int_absorption; expected the integrator refract_path, or no absorption"),
+        (ABSORPTION, {"integrator": "refract_path"}, ""),
+    ],
+)
+def test_what_is_refused_is_named(tmp_path, parameter, defines, message):
+    path = NESTED if "res" in defines else tmp_path / "a.xml"
+    (tmp_path / "a.xml").write_text(ABSORBING.replace("PARAMETER", parameter))
+    if not message:
+        load_scene(path, defines)
+        return
+    with pytest.raises(ValueError) as error:
+        load_scene(path, defines)
+    assert str(error.value).startswith(f"{path}: {message}")

@@ -1,23 +1,26 @@
-"""Efficiency and scaling: figures of known errors, and every planted defect seen. Renders need a compiled variant."""
+"""Efficiency, scaling and times: figures of known errors, intervals, and every planted defect seen."""
 
 import dataclasses
 import math
+import time
 
+import drjit as dr
 import numpy as np
 import pytest
+from scipy.stats import binom
 
-from mi_refract import backend
+from mi_refract import FORMULAS, backend
 from validation import limits
 from validation.efficiency import error_against_time, scaling
 from validation.efficiency.error_against_time import Extent
-from validation.run import render_methods
-from validation.run.context import PROFILES, SCENES, Context
+from validation.run import kernel_timing, render_methods
+from validation.run.array_settings import BUILTIN as BUILTIN_KERNEL
+from validation.run.array_settings import Setting, settings
+from validation.run.context import PROFILES, SCALAR_PROFILES, SCENES, Context
 from validation.run.render_methods import BUILTIN, METHODS, Method
 
 SMALL = Extent((4, 9), 6, 8, resolution=32)
 SHORT = Method("short paths", "path", "refract", {"max_depth": 3, "rr_depth": 3})
-ABSENT = Method("absent", "integrator_of_nobody", "refract")
-GIVEN = (BUILTIN, METHODS[1], SHORT, ABSENT)
 
 
 @pytest.fixture
@@ -26,54 +29,38 @@ def context(tmp_path, llvm_variant, monkeypatch):
     return Context(PROFILES["standard"], tmp_path, "llvm_ad_rgb", backend.detect(), backend.usable_variants())
 
 
-# Figures -------------------------------------------------------------------------------------------------------
+# The error against time ---------------------------------------------------------------------------------------------
 
 
 def test_errors_are_those_that_were_put_in():
+    """The variance of the reference is not the method's error: both are 1, that of a mean of 4 is 1/4."""
     mean = np.full((40, 50, 3), 2.0)
     image = mean + 0.1
     image[0, 0] += 100  # one pixel of 2000, all of the worst 0.1 % but one
     found = error_against_time.errors(image, mean, np.zeros_like(mean))
     assert found["MSE"] == pytest.approx(0.01 + (100.1**2 - 0.01) / 2000)
-    assert found["MSE, trimmed"] == pytest.approx(0.01)
-    assert found["relMSE, trimmed"] == pytest.approx(0.01 / 4.01)
-
-
-def test_the_variance_of_the_reference_is_not_the_methods_error():
-    """Both have the variance 1, the mean of 4 references 1/4: the estimate is 1 within 5 of its standard errors."""
+    assert (found["MSE, trimmed"], found["relMSE, trimmed"]) == pytest.approx((0.01, 0.01 / 4.01))
     rng = np.random.default_rng(5)
     references, image = rng.normal(size=(4, 100, 100, 3)), rng.normal(size=(100, 100, 3))
     own = references.var(0, ddof=1) / 4
-    found = error_against_time.errors(image, references.mean(0), own)["MSE"]
+    found = error_against_time.errors(image, references.mean(0), own)["MSE"]  # 1 within 5 of its standard errors
     assert found == pytest.approx(1, abs=5 * math.sqrt((2 * 1.25**2 + 2 / 16 / 3) / 30000))
     assert error_against_time.errors(image, references.mean(0), 0 * own)["MSE"] > 1.2
 
 
-# The study -----------------------------------------------------------------------------------------------------
-
-
 def test_efficiency_is_not_bought_with_bias_and_more_samples_have_less_error(context):
     """Same seeds as the built-in, so agreement does not depend on the run; shorter paths are biased, and found."""
-    rows = {row.subject: row for row in error_against_time.scene_rows(context, SCENES / "balls.xml", GIVEN)}
-    assert rows[METHODS[1].name].verdict == "pass"
-    assert rows[SHORT.name].verdict == "fail"
+    methods = (BUILTIN, METHODS[1], SHORT)
+    rows = {row.subject: row for row in error_against_time.scene_rows(context, SCENES / "balls.xml", methods)}
+    assert (rows[METHODS[1].name].verdict, rows[SHORT.name].verdict) == ("pass", "fail")
     assert set(rows[SHORT.name].broken) == {"Welch alarms"}
-    assert rows[ABSENT.name].verdict == "not run"
-    assert "integrator_of_nobody is not registered" in rows[ABSENT.name].reason
-    the_same_image_has_the_same_error_and_more_samples_less(rows)
-
-
-def the_same_image_has_the_same_error_and_more_samples_less(rows):
     ours, builtin = rows[METHODS[1].name].values, rows[BUILTIN.name].values
     for metric in error_against_time.METRICS:
         assert ours[metric] == pytest.approx(builtin[metric], rel=1e-2)
-    curve = rows["every method"].curves[BUILTIN.name]
-    assert len(curve) == len(SMALL.spp)
-    assert curve[1][1] < curve[0][1]
-    control = rows[f"{BUILTIN.name}, independent"].values
+    curve, control = rows["every method"].curves[BUILTIN.name], rows[f"{BUILTIN.name}, independent"].values
+    assert len(curve) == len(SMALL.spp) and curve[1][1] < curve[0][1]
     assert control["equal-time MSE / independent"] == builtin["equal-time MSE"] == 1
-    assert builtin["equal-time MSE / independent"] < 1
-    assert control["Welch alarms"] == 0
+    assert builtin["equal-time MSE / independent"] < 1 and control["Welch alarms"] == 0
 
 
 @pytest.mark.parametrize(("noise", "seconds", "best"), [(2.0, 1.0, 1), (0.5, 1.0, 0), (0.5, 5.0, 1)])
@@ -103,40 +90,28 @@ def test_images_grow_until_their_time_can_be_told(context, monkeypatch):
 def test_what_is_left_out_has_its_reason(context, monkeypatch, scene, words):
     measured = ("balls",) if scene == "slab" else ()
     monkeypatch.setitem(error_against_time.EXTENTS, "standard", dataclasses.replace(SMALL, scenes=measured))
-    (row,) = error_against_time.scene_rows(context, SCENES / f"{scene}.xml", GIVEN)
-    assert row.verdict == "not run"
-    assert row.reason.startswith("left out: ") and words in row.reason
+    (row,) = error_against_time.scene_rows(context, SCENES / f"{scene}.xml")
+    assert row.verdict == "not run" and row.reason.startswith("left out: ") and words in row.reason
 
 
 def test_goals_go_to_the_best_that_splits_on_glass_and_to_the_best_elsewhere():
-    def measured(cost):
-        return {4: error_against_time.Measured([1.0], {"MSE": [cost]}, [])}
-
     subjects = [error_against_time.Subject(method, "multijitter") for method in METHODS]
-    costs = dict(zip((s.name for s in subjects), (1.0, 1.0, 0.1, 0.5, 0.3, 0.4), strict=True))
-    found = {name: measured(cost) for name, cost in costs.items()}
+    costs = zip((s.name for s in subjects), (1.0, 1.0, 0.1, 0.5, 0.3, 0.4), strict=True)
+    found = {name: {4: error_against_time.Measured([1.0], {"MSE": [cost]}, [])} for name, cost in costs}
     glass = error_against_time.goals_of(subjects, found, only_glass=True)
-    assert glass[subjects[4].name] == limits.ONLY_GLASS
-    assert glass[subjects[2].name] == {"time / built-in": 0.8}
+    assert glass[subjects[4].name] == limits.ONLY_GLASS and glass[subjects[2].name] == {"time / built-in": 0.8}
     assert subjects[1].name not in glass and glass[subjects[3].name] == {}
     mixed = error_against_time.goals_of(subjects, found, only_glass=False)
-    assert mixed[subjects[2].name] == limits.MIXED
-    assert not any(mixed[s.name] for s in subjects[3:])
-
-
-def test_scalar_variants_are_not_run(scalar_context):
-    context = scalar_context()
-    found = error_against_time.scene_rows(context, SCENES / "balls.xml") + scaling.knob_rows(context, "glasses")
-    assert {row.verdict for row in found} == {"not run"}
+    assert mixed[subjects[2].name] == limits.MIXED and not any(mixed[s.name] for s in subjects[3:])
 
 
 def test_a_method_renders_to_the_depth_of_the_scene_or_to_another(scalar_variant):
-    path = SCENES / "nested.xml"
-    assert "max_depth = 48" in str(render_methods.camera(path, BUILTIN, 4).integrator)
-    assert "max_depth = 7" in str(render_methods.camera(path, BUILTIN, 4, max_depth=7).integrator)
+    for depth, options in ((48, {}), (7, {"max_depth": 7})):
+        camera = render_methods.camera(SCENES / "nested.xml", BUILTIN, 4, **options)
+        assert f"max_depth = {depth}" in str(camera.integrator)
 
 
-# Scaling -------------------------------------------------------------------------------------------------------
+# Scaling --------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("size", [8, 1000, 30_000])
@@ -154,23 +129,74 @@ def test_a_ball_is_closed_convex_and_of_its_size(size):
 def test_every_knob_makes_an_image(knob, scalar_variant):
     size = {"pixels": 16, "glasses": 5}.get(knob, 8)
     image, _ = scaling.KNOBS[knob].make(BUILTIN, size, 4)(1, seed=0)
-    assert image.shape == (4, 4, 3)
-    assert np.isfinite(image).all() and image.any()
+    assert image.shape == (4, 4, 3) and np.isfinite(image).all() and image.any()
 
 
-def test_kernels_that_were_there_give_no_first_image_and_the_peak_of_a_process_is_its_own(context, tmp_path):
-    """Three hundred megabytes here are none of the process that is measured."""
+def test_a_process_is_measured_by_itself_or_says_why_not(context, tmp_path):
+    """Kernels that were there give no first image; three hundred megabytes here are none of its own."""
     job = scaling.Job("llvm_ad_rgb", "glasses", 2, METHODS[1].name, 8, 1, 2)
     ballast = np.ones(300_000_000, np.uint8)
     cold, warm = (scaling.run(job, str(tmp_path)) for _ in range(2))
-    assert cold["first image"] > 0
-    assert math.isnan(warm["first image"])
-    assert 0 < cold["arrays MB"] < 1
-    assert ballast.all()
-    assert math.isnan(cold["process MB"]) or cold["process MB"] < 300
-
-
-def test_a_process_that_fails_says_why(tmp_path):
-    job = scaling.Job("scalar_rgb", "glasses", 2, METHODS[1].name, -8, 1, 2)
+    assert cold["first image"] > 0 and math.isnan(warm["first image"]) and 0 < cold["arrays MB"] < 1
+    assert ballast.all() and (math.isnan(cold["process MB"]) or cold["process MB"] < 300)
     with pytest.raises(RuntimeError, match=r"glasses = 2: exit code 1: .*"):
-        scaling.run(job, str(tmp_path))
+        scaling.run(dataclasses.replace(job, variant="scalar_rgb", resolution=-8), str(tmp_path))
+
+
+# Times ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [9, 11, 21])
+def test_the_interval_of_a_median_covers_it_19_times_in_20(count):
+    """The exact coverage of the ranks that it takes; one rank further in it would be less than 95 %."""
+    found = kernel_timing.interval("t", list(map(float, range(1, count + 1))))
+    rank = int(found["t, low"])
+    assert (found["t"], found["t, high"]) == ((count + 1) / 2, count + 1 - rank)
+    assert 1 - 2 * binom.cdf(rank - 1, count, 0.5) >= 0.95 > 1 - 2 * binom.cdf(rank, count, 0.5)
+
+
+def test_a_ratio_is_that_of_one_round_and_every_second_round_runs_backwards():
+    """A machine that is twice as slow in some rounds does not move a ratio; the first round is thrown away."""
+    load, calls = [1.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 1.0], []
+    assert set(kernel_timing.ratio("t", [3.0 * x for x in load], load).values()) == {3.0}
+
+    def clock(subject):
+        calls.append(subject)
+        return float(len(calls))
+
+    seconds = kernel_timing.rounds({"a": "a", "b": "b"}, clock, 3)
+    assert "".join(calls) == "abbaabba" and seconds == {"a": [4, 5, 8], "b": [3, 6, 7]}
+
+
+def test_a_slow_subject_is_seen_on_every_backend_that_runs_and_goals_are_those_of_the_table(
+    tmp_path, variant, monkeypatch
+):
+    def slow(a, n, k):
+        if not dr.is_jit_v(a):
+            time.sleep(2e-3)
+        b, transmitted = FORMULAS["decomposed"](a, n, k)
+        for _ in range(20):
+            b = dr.sin(b)
+        return b, transmitted
+
+    profile = dataclasses.replace(SCALAR_PROFILES["standard"], scalar_rays=20, streamed_rays=2000, repeats=9)
+    context = Context(profile, tmp_path, variant, backend.detect(), backend.usable_variants())
+    monkeypatch.setattr(Setting, "subjects", {"decomposed": FORMULAS["decomposed"], "slow": slow})
+    single, double, scalar = (
+        next(x for x in settings(context) if x.label == label)
+        for label in ("llvm float32", "llvm float64", "scalar float64")
+    )
+    assert kernel_timing.goals("promoted", single) == {"time / plain": FORMULAS["promoted"].time_goal}
+    assert kernel_timing.goals("wedge", double) == {"time / copy": 1 / 0.9}
+    for subject, setting in (("promoted", double), ("wedge", scalar), (BUILTIN_KERNEL, single)):
+        assert kernel_timing.goals(subject, setting) == {}
+    for setting in settings(context):
+        if setting.vector is None:
+            continue
+        found = kernel_timing.measure(context, setting)
+        assert set(found) == {"copy", "decomposed", "slow"} and found["slow"]["time / plain, low"] > 1.5
+        assert found["decomposed"]["time / plain"] == found["copy"]["time / copy"] == 1
+        assert ("ns per ray" in found["slow"]) == (setting.backend == "cuda")
+        if not setting.is_scalar:
+            assert found["slow"]["operations"] > found["decomposed"]["operations"]
+            assert found["slow"]["compile ms"] > 1  # NaN where a cache had the kernel

@@ -22,7 +22,6 @@ from mi_refract.planar.curves import points
 from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation import repeated
-from validation.reference.layered_scenes import OFFSET
 from validation.run import seeds
 from validation.run.array_settings import Setting
 from validation.run.context import Context
@@ -40,6 +39,7 @@ TERMS = against_retrace.TERMS | {
 NAME = "extrusion"
 SCALAR = "needs a compiled variant: a loop over rays in Python would take hours"
 U = 2.0**-24
+OFFSET = 1500 * U  # Mitsuba's RayEpsilon in float32
 FACETS = 64  # of an arc, at most
 LARGEST = 1500  # walls; arcs have fewer facets where there are more of them
 RAYS = 100  # of the file's, and as many scattered
