@@ -83,22 +83,22 @@ def read(catalog: str) -> dict[str, Glass]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         (name,) = [name for name in vars(module) if name.lower() == f"{CATALOGS[catalog]}catalog"]
-        table = getattr(module, name)()
-        return {str(glass).strip(): _glass(table, glass, FITTED.get(catalog, ANY)) for glass in table.df.index}
-
-
-def _glass(table: Any, name: str, most: tuple[float, float]) -> Glass:
-    row = table.df.loc[name]
-    printed = _finite(row["refractive indices"])
-    transmitting = _finite(row["internal transmission mm, 10"])
-    lines = [float(LINES.get(line, line)) for line in printed if line in LINES or isinstance(line, float)]
-    wavelengths = lines + [float(w) for w, share in transmitting.items() if share > 0]
-    coefficients: tuple[float, ...] = ()
-    if len(_finite(row["dispersion coefficients"])) == len(row["dispersion coefficients"]):
-        coefficients = tuple(map(float, table.glass_coefs(name)))
-    fitted = max(math.floor(min(lines)), most[0]), min(math.ceil(max(lines)), most[1])
-    printed = {line: n for line, n in printed.items() if line in LINES}
-    return Glass(coefficients, printed, float(row["abbe number"]["vd"]), (min(wavelengths), max(wavelengths)), fitted)
+        table, most, glasses = getattr(module, name)(), FITTED.get(catalog, ANY), {}
+        for name, row in table.df.iterrows():
+            printed, transmitting = _finite(row["refractive indices"]), _finite(row["internal transmission mm, 10"])
+            lines = [float(LINES.get(line, line)) for line in printed if line in LINES or isinstance(line, float)]
+            wavelengths = lines + [float(w) for w, share in transmitting.items() if share > 0]
+            coefficients: tuple[float, ...] = ()
+            if len(_finite(row["dispersion coefficients"])) == len(row["dispersion coefficients"]):
+                coefficients = tuple(map(float, table.glass_coefs(name)))
+            glasses[str(name).strip()] = Glass(
+                coefficients,
+                {line: n for line, n in printed.items() if line in LINES},
+                float(row["abbe number"]["vd"]),
+                (min(wavelengths), max(wavelengths)),
+                (max(math.floor(min(lines)), most[0]), min(math.ceil(max(lines)), most[1])),
+            )
+        return glasses
 
 
 def _finite(series: Any) -> dict[Any, float]:

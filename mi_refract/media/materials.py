@@ -119,7 +119,15 @@ def parse(spec: float | str, name: str = "") -> Medium:
     if isinstance(spec, str):
         text = spec.strip()
         if ":" in text.partition("(")[0]:
-            return _catalogued(text, label)
+            known = {name.lower(): medium for name, medium in MATERIALS.items()}
+            if medium := known.get(text.lower()):
+                return medium
+            catalog, _, glass = (part.strip() for part in text.partition(":"))
+            if catalog.upper() in glass_catalogs.CATALOGS:
+                return glass_catalogs.load(catalog.upper(), glass, label)
+            near = ", ".join(difflib.get_close_matches(text, MATERIALS, 3, 0.0))
+            catalogs = ", ".join(f"{name}:…" for name in glass_catalogs.CATALOGS)
+            raise ValueError(f"{label}: unknown material; nearest: {near}; expected these, or {catalogs}")
         return _formula(text, label) if "(" in text else _of_mitsuba(text, label)
     if isinstance(spec, bool) or not isinstance(spec, (int, float)) or not 0 < spec < math.inf:
         raise ValueError(f"{label}; expected a positive finite number, or a material's name")
@@ -153,7 +161,19 @@ def _formula(text: str, label: str) -> Medium:
             raise ValueError(f"{label}: V_d = 0; expected (n_d − 1)/(n_F − n_C), which is not 0")
         form, coefficients = Abbe(), {"n_d": n_d, "V_d": v_d}
     elif name == "table":
-        form, coefficients, (low, high) = _table(arguments, label)
+        expected = "expected table(400: 1.53, 500: 1.52, …), two or more, wavelengths in nm, increasing"
+        try:
+            knots = [(float(w), float(n)) for w, n in (pair.split(":") for pair in arguments.split(","))]
+        except ValueError:
+            raise ValueError(f"{label}: {expected}") from None
+        wavelengths = tuple(w for w, _ in knots)
+        increasing = all(a < b for a, b in itertools.pairwise(wavelengths))
+        if len(knots) < 2 or not increasing or not 0 < wavelengths[0] < wavelengths[-1] < math.inf:
+            raise ValueError(f"{label}: {expected}")
+        if bad := [f"{n:g} at {w:g} nm" for w, n in knots if not 0 < n < math.inf]:
+            raise ValueError(f"{label}: n = {bad[0]}; expected a positive finite index")
+        form, low, high = (table := Table(wavelengths)), wavelengths[0], wavelengths[-1]
+        coefficients = dict(zip(table.names, (n for _, n in knots), strict=True))
     else:
         squared = name == "sellmeier_nm"
         letter, unit, factor = ("L", "nm", "1e3") if squared else ("C", "nm²", "1e6")
@@ -171,42 +191,13 @@ def _formula(text: str, label: str) -> Medium:
     import numpy as np
 
     low, high = max(low, VISIBLE[0]), min(high, VISIBLE[1])
-    wavelengths = np.linspace(low, high, 471)
-    if low <= high and (missing := np.isnan(medium.index_or_nan(wavelengths))).any():
-        at = wavelengths[missing][0]
+    visible = np.linspace(low, high, 471)
+    if low <= high and (missing := np.isnan(medium.index_or_nan(visible))).any():
+        at = visible[missing][0]
         raise ValueError(
             f"{label}: n is not positive at {at:.6g} nm; expected a positive index everywhere in 360 … 830 nm"
         )
     return medium
-
-
-def _table(arguments: str, label: str) -> tuple[Table, dict[str, float], tuple[float, float]]:
-    """Of `wavelength: n, …`."""
-    accepted = "expected table(400: 1.53, 500: 1.52, …), two or more, wavelengths in nm, increasing"
-    try:
-        knots = [(float(w), float(n)) for w, n in (pair.split(":") for pair in arguments.split(","))]
-    except ValueError:
-        raise ValueError(f"{label}: {accepted}") from None
-    wavelengths = tuple(w for w, _ in knots)
-    increasing = all(a < b for a, b in itertools.pairwise(wavelengths))
-    if len(knots) < 2 or not increasing or not 0 < wavelengths[0] < wavelengths[-1] < math.inf:
-        raise ValueError(f"{label}: {accepted}")
-    if bad := [f"{n:g} at {w:g} nm" for w, n in knots if not 0 < n < math.inf]:
-        raise ValueError(f"{label}: n = {bad[0]}; expected a positive finite index")
-    form = Table(wavelengths)
-    return form, dict(zip(form.names, (n for _, n in knots), strict=True)), (wavelengths[0], wavelengths[-1])
-
-
-def _catalogued(text: str, label: str) -> Medium:
-    known = {name.lower(): medium for name, medium in MATERIALS.items()}
-    if medium := known.get(text.lower()):
-        return medium
-    catalog, _, glass = (part.strip() for part in text.partition(":"))
-    if catalog.upper() in glass_catalogs.CATALOGS:
-        return glass_catalogs.load(catalog.upper(), glass, label)
-    near = difflib.get_close_matches(text, MATERIALS, 3, 0.0)
-    catalogs = ", ".join(f"{name}:…" for name in glass_catalogs.CATALOGS)
-    raise ValueError(f"{label}: unknown material; nearest: {', '.join(near)}; expected these, or {catalogs}")
 
 
 def _of_mitsuba(material: str, label: str) -> Medium:

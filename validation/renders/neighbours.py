@@ -182,56 +182,38 @@ def cases(context: Context) -> Iterator[Case]:
         masked = ("null", "dielectric", "diffuse")
         settings += [(rgb, wrapper, masked, ((0, 4), (1, 4)), "alpha") for wrapper in ("alone", "mask")]
     for setting in settings:
-        yield Case(f"{setting[0]} {titled(setting[1], setting[-1])}", setting[0], functools.partial(rows, *setting))
-
-
-def titled(wrapper: str, way: str) -> str:
-    """A wrapper and a way, as rows are called."""
-    return f"{wrapper}, {way}" if way else wrapper
-
-
-def groups(variant: str, wrapper: str, names: Iterable[str]) -> tuple[list[dict[str, Nodes]], dict[str, str]]:
-    """The BSDFs whose scenes have the same features, in groups; by name, why Mitsuba does not load the others."""
-    together: dict[Any, dict[str, Nodes]] = {}
-    refused = {}
-    for name in names:
-        bsdf = WRAPPERS[wrapper](BSDFS[name] | {"type": name})
-        try:
-            together.setdefault(inspect(scene([bsdf], variant)), {})[name] = bsdf
-        except RuntimeError as error:
-            refused[name] = str(error).rpartition("[")[2].partition("] ")[2].partition("\n")[0]
-    return list(together.values()), refused
+        title = " ".join(setting[:2]) + (f", {setting[-1]}" if setting[-1] else "")
+        yield Case(title, setting[0], functools.partial(rows, *setting))
 
 
 def rows(variant: str, wrapper: str, names: tuple[str, ...], settings: Settings, way: str = "") -> list[Row]:
     """A row for each BSDF, and one for each setting; those that Mitsuba refuses in its own words."""
-    together, refused = groups(variant, wrapper, names)
-    parts = zip(*(images(list(group.values()), variant, settings, way) for group in together), strict=True)
-    test, noise, expected, uncertain = (np.concatenate(part, -2) for part in parts)
-    cases: dict[str, Any] = {name: np.s_[:, [i]] for i, name in enumerate(itertools.chain(*together))}
+    groups: dict[Any, dict[str, Nodes]] = {}  # of BSDFs whose scenes have the same features
+    title, seed, (parameters, samples) = f"{wrapper}, {way}" if way else wrapper, current(SEED), WAYS[way]
+    row, table = functools.partial(Row, NAME, OURS), list[Row]()
+    for name in names:
+        bsdf = WRAPPERS[wrapper](BSDFS[name] | {"type": name})
+        try:
+            groups.setdefault(inspect(scene([bsdf], variant)), {})[name] = bsdf
+        except RuntimeError as error:
+            reason = str(error).rpartition("[")[2].partition("] ")[2].partition("\n")[0]
+            table.append(row(f"{title}: {name}", variant, reason=f"Mitsuba: {reason}"))
+    parts = []
+    for group in groups.values():
+        gc.collect()  # Dr.Jit compiles every BSDF that is alive
+        measure = functools.partial(measured, scene(group.values(), variant), len(group))
+        expected = measure({"type": "path"} | parameters, 64, samples, seed + 5000)
+        ours = [
+            measure({"type": OURS, "split_depth": depth} | parameters, spp, samples / len(settings), seed + 2 * i)
+            for i, (depth, spp) in enumerate(settings)
+        ]
+        parts.append((*np.stack(ours, 1), *expected))
+    test, noise, means, uncertain = (np.concatenate(part, -2) for part in zip(*parts, strict=True))
+    cases: dict[str, Any] = {name: np.s_[:, [i]] for i, name in enumerate(itertools.chain(*groups.values()))}
     cases |= {f"split {depth}, {spp} spp": np.s_[[i], :] for i, (depth, spp) in enumerate(settings)}
-    budgets, replay = {"alarms": 0.0, "detectable": limits.NEIGHBOUR}, {"seed": current(SEED), "samples": WAYS[way][1]}
-    title, table = titled(wrapper, way), []
-    for case, part in cases.items():
-        values = judged(test[part], noise[part], expected[part[1]], uncertain[part[1]])
-        table.append(Row(NAME, OURS, f"{title}: {case}", variant, values, budgets, replay=replay))
-    why = {name: f"Mitsuba: {reason}" for name, reason in refused.items()}
-    return table + [Row(NAME, OURS, f"{title}: {name}", variant, reason=reason) for name, reason in why.items()]
-
-
-def images(bsdfs: list[Nodes], variant: str, settings: Settings, way: str) -> tuple[Any, Any, Any, Any]:
-    """Means and squared standard errors of all cells: in each setting by `refract_path`, then by `path`."""
-    gc.collect()  # Dr.Jit compiles every BSDF that is alive
-    seed, (parameters, samples) = current(SEED), WAYS[way]
-    measure = functools.partial(measured, scene(bsdfs, variant), len(bsdfs))
-    expected, uncertain = measure({"type": "path"} | parameters, 64, samples, seed + 5000)
-    ours = {"type": OURS} | parameters
-    renders = [
-        measure(ours | {"split_depth": depth}, spp, samples / len(settings), seed + 2 * i)
-        for i, (depth, spp) in enumerate(settings)
-    ]
-    test, noise = np.stack(renders, 1)
-    return test, noise, expected, uncertain
+    budgets, replay = {"alarms": 0.0, "detectable": limits.NEIGHBOUR}, {"seed": seed, "samples": samples}
+    judge = {case: judged(test[x], noise[x], means[x[1]], uncertain[x[1]]) for case, x in cases.items()}
+    return [row(f"{title}: {case}", variant, values, budgets, replay=replay) for case, values in judge.items()] + table
 
 
 def judged(test: Any, noise: Any, expected: Any, uncertain: Any) -> dict[str, float]:
