@@ -73,19 +73,9 @@ _BROKEN_NPZ = (
 def write(path: str | Path, rays: RaySet) -> Path:
     """Write .csv or .npz, completely or not at all. ValueError for another file ending; OSError where that fails."""
     path = writable(path, SUFFIXES)
-    write_atomically(path, as_csv(rays) if path.suffix.lower() == ".csv" else _as_npz(rays))
-    return path
-
-
-def as_csv(rays: RaySet) -> str:
-    """The text of the CSV file."""
-    columns, header = RAY_LAYOUTS[headers.has_media(rays.header)], rays.header
-    top = [f"# {key}: {value if value == _value(value) else json.dumps(value)}" for key, value in header.items()]
-    row = ",".join("%d" if name in ("id", "medium") else "%r" for name in columns)
-    return "\n".join([*top, ",".join(columns), *(row % tuple(x) for x in rays.numbers.tolist()), ""])
-
-
-def _as_npz(rays: RaySet) -> bytes:
+    if path.suffix.lower() == ".csv":
+        write_atomically(path, as_csv(rays))
+        return path
     n_from, n_to = indices(rays.rays.k)
     arrays = {"id": rays.ids, "a": rays.rays.a, "n": rays.rays.n, "n_from": n_from, "n_to": n_to}
     if headers.has_media(rays.header):
@@ -97,7 +87,16 @@ def _as_npz(rays: RaySet) -> bytes:
             # A ZipInfo made here has a fixed date: the same set gives the same bytes.
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as file:
                 np.lib.format.write_array(file, np.asanyarray(array), allow_pickle=False)
-    return buffer.getvalue()
+    write_atomically(path, buffer.getvalue())
+    return path
+
+
+def as_csv(rays: RaySet) -> str:
+    """The text of the CSV file."""
+    columns, header = RAY_LAYOUTS[headers.has_media(rays.header)], rays.header
+    top = [f"# {key}: {value if value == _value(value) else json.dumps(value)}" for key, value in header.items()]
+    row = ",".join("%d" if name in ("id", "medium") else "%r" for name in columns)
+    return "\n".join([*top, ",".join(columns), *(row % tuple(x) for x in rays.numbers.tolist()), ""])
 
 
 def read(path: str | Path) -> RaySet:

@@ -8,13 +8,11 @@ import json
 import shlex
 from xml.etree import ElementTree
 
-import numpy as np
 import pytest
 from support.diff_images import BROKEN, image, samples, tree
 
 from mi_refract.image_diff import methods, results_file, text_reports
 from mi_refract.image_diff.results import Result, Results, Status
-from mi_refract.io import errors
 
 EVIL = 'a"b<script>alert(1)<∕script>|`*[x](y)*`,:%0A::error::.exr'
 
@@ -58,15 +56,6 @@ def test_inconclusive_renders(run, tmp_path):
 )
 def test_methods_and_settings_in_words(run, pair, words, code):
     assert run("diff", *pair, *words.split())[0] == code
-
-
-def test_nan_has_to_be_allowed(run, pair):
-    for folder in pair:
-        image(folder / "louder.exr", value=np.nan)
-    assert run("diff", *pair)[0] == 1
-    assert run("diff", *pair, "--set", "allow_nonfinite=true")[0] == 0
-    image(pair[1] / "louder.exr", value=np.inf)
-    assert run("diff", *pair, "--set", "allow_nonfinite=true")[0] == 1
 
 
 def test_the_methods_are_printed_without_images(run):
@@ -137,14 +126,6 @@ def test_check_settings(run, settled):
         assert "image[0]: unknown key `fale`; expected method" in err and "equal.exr" in out
 
 
-def test_the_variant_is_named(run, settled):
-    code, out, _ = run("diff", *settled, "louder.exr", "--set", "fail=0")
-    assert (code, "; matches louder-mac.exr" in out) == (0, False)  # its own entry already accepts it
-    (settled[0] / "mi-refract.toml").write_text(GOOD.replace("fail = 0.15", "fail = 0.001"))
-    code, out, _ = run("diff", *settled, "louder.exr")
-    assert (code, "; matches louder-mac.exr" in out) == (0, True)
-
-
 def test_skipped_is_reported_everywhere(run, pair, tmp_path):
     (pair[0] / "mi-refract.toml").write_text('[[image]]\nname = "louder.exr"\nskip = true\nreason = "loud"')
     files = ["--report", tmp_path / "out.html", "--junit", tmp_path / "out.xml", "--json", tmp_path / "out.json"]
@@ -173,27 +154,6 @@ def test_bad_images(run, pair, tmp_path, name, side):
     assert [each.get("type") for each in ElementTree.parse(files[1]).findall(".//error")] == ["error"]
     alone = run("diff", pair[0] / "equal.exr", pair[1] / "equal.exr")
     assert (alone[0], alone[1], alone[2].count("\n")) == (2, "", 1)
-
-
-def test_whatever_one_image_does_the_report_is_written(run, pair, tmp_path, monkeypatch):
-    compare = methods.compare
-
-    def fail(method, one, two, **options):
-        if one[0].path.name == "equal.exr":
-            raise MemoryError("Unable to allocate 9 GiB")
-        return compare(method, one, two, **options)
-
-    monkeypatch.setattr(methods, "compare", fail)
-    outputs = {"--report": "out.html", "--junit": "out.xml", "--json": "out.json"}
-    words = [word for option, name in outputs.items() for word in (option, tmp_path / name)]
-    code, out, err = run("diff", *pair, *words, "--github")
-    assert (code, err) == (2, f"mi-refract: {pair[1]}/equal.exr: out of memory: Unable to allocate 9 GiB\n")
-    assert "2 images: 1 could not be compared, 1 different" in out.splitlines()
-    for name in outputs.values():
-        text = (tmp_path / name).read_text()
-        assert "out of memory" in text and "louder.exr" in text
-    monkeypatch.setenv(errors.TRACEBACK, "1")
-    assert "Traceback" in run("diff", *pair)[2]
 
 
 def test_images_larger_than_allowed(run, pair):
@@ -361,11 +321,7 @@ def test_github(run, strange, tmp_path, monkeypatch):
     "url, run_id, words",
     [
         ("", "", "Report: out.html\n"),
-        (
-            "",
-            "7",
-            "Report: out.html, where it is uploaded among the [artefacts of this run](https://g/a/b/actions/",
-        ),
+        ("", "7", "Report: out.html, where it is uploaded among the [artefacts of this run](https://g/a/b/actions/"),
         ("https://x.io/r (1)/a.html", "7", "Report: [out.html](https://x.io/r%20%281%29/a.html)\n"),
     ],
 )

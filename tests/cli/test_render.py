@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 import os
-import re
-import signal
-import time
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.processes import python
 
 import mi_refract
 from mi_refract import backend
@@ -173,55 +168,3 @@ def test_what_fails_keeps_the_old_image(render, scene):
     code, _, err = render()
     assert (code, err) == (2, f"mi-refract: {scene}: not a regular file\n")
     assert output.read_text() == "old" and {*scene.parent.iterdir()} == {scene, output}
-
-
-# What the shell ignores in a background job, Mitsuba does not: it would return an image of the samples so far.
-INTERRUPTED = """
-import signal, sys
-if sys.argv[1] == "ignored":
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-from mi_refract import cli
-run = cli._run
-def run_and_tell(arguments):
-    from mi_refract.rendering import scene_files  # numpy's threads start here
-    load = scene_files.load_parsed
-    def load_and_tell(*arguments):
-        scene = load(*arguments)
-        print("loaded", flush=True)
-        return scene
-    scene_files.load_parsed = load_and_tell
-    return run(arguments)
-cli._run = run_and_tell
-sys.argv[1:] = ["render", sys.argv[2], "-o", sys.argv[3], "--spp", "20000000", "--variant", sys.argv[4]]
-sys.exit(cli.main())
-"""
-
-
-def handling_threads(process):
-    """The number of threads that do not block SIGINT. Where several are, Mitsuba's own handler may run in one."""
-    tasks = Path(f"/proc/{process.pid}/task")
-    if not tasks.exists():
-        return 1
-    blocked = [re.search(r"^SigBlk:\s*(\w+)", path.read_text(), re.MULTILINE)[1] for path in tasks.glob("*/status")]
-    assert len(blocked) > 2
-    return sum(not int(bits, 16) >> (signal.SIGINT - 1) & 1 for bits in blocked)
-
-
-# Neither needs the other: a signal that is ignored is one of the process, what runs on after it is of the variant.
-@pytest.mark.parametrize(("handler", "variant"), [("ignored", "scalar_rgb"), ("default", "llvm_ad_rgb")])
-def test_ctrl_c(scene, handler, variant, needs_variant):
-    needs_variant(variant)
-    output = scene.with_name("out.exr")
-    with python(INTERRUPTED, handler, scene, output, variant) as process:
-        try:
-            assert process.stdout.readline() == "loaded\n"
-            time.sleep(0.5)  # into the rendering
-            assert process.poll() is None
-            assert handling_threads(process) == 1
-            process.send_signal(signal.SIGINT)
-            assert process.wait(timeout=30) == 130, process.stderr.read()
-        finally:
-            process.kill()  # or a failure would wait for it without end
-    # Where a pass had ended by then, there is what the same command goes on from.
-    left = {path.name for path in scene.parent.iterdir()}
-    assert left in ({scene.name}, {scene.name, f"{output.name}.checkpoint"})

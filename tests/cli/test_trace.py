@@ -156,9 +156,7 @@ BAD = {
     "branches": (("--branches", "-1"), "--branches"),
     "no rays": (("--rays", "0"), "--rays"),
     "no depth": (("--max-depth", "0"), "--max-depth"),
-    "precision": (("--precision", "half"), "precision = 'half'; expected float32, float64"),
     "formula": (("--formula", "snell"), "formula = 'snell': unknown; expected wedge"),
-    "backend": (("--backend", "metal"), "backend = 'metal'; expected scalar"),
     "no float32": (
         ("--backend", "scalar", "--precision", "float32"),
         "scalar arrays compute in double; expected float64",

@@ -16,8 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.diff_images import found, image, samples
 
-from mi_refract.image_diff import file_pair, methods, name_patterns, pairing, text_reports
 from mi_refract.image_diff import folders as diff
+from mi_refract.image_diff import methods, name_patterns, pairing, text_reports
 from mi_refract.image_diff.comparison import Comparison, Verdict
 from mi_refract.image_diff.results import Result, Results, Status
 from mi_refract.image_diff.settings import ComparisonSpec, Entry, Map, Settings
@@ -418,12 +418,3 @@ def test_bad_renders(tmp_path):
     assert results.results[0].images.keys() == {"reference"} and results.results[0].unread
     with pytest.raises(NotADirectoryError, match=r"0\.exr: not a folder; --renders expects folders"):
         diff.diff(good, twice / "0.exr", renders=True)
-
-
-def test_the_mean_of_renders_is_that_of_all_and_one_stays_as_it_is():
-    pixels = np.arange(36, dtype=np.float32).reshape(3, 2, 2, 3) ** 2
-    several = [image_file.Image(Path(f"{i}.exr"), each, ("R", "G", "B")) for i, each in enumerate(pixels)]
-    mean = file_pair.mean_image(several)
-    np.testing.assert_allclose(mean.pixels, pixels.mean(0), rtol=1e-6)
-    assert (mean.path, mean.pixels.dtype) == (Path("0.exr"), np.float32)
-    assert file_pair.mean_image(several[1:2]) is several[1]

@@ -308,6 +308,7 @@ def test_a_page_of_thousands_is_no_larger_than_its_limit(tmp_path, monkeypatch):
     articles, lines = text.count("<article"), len(re.findall("<tr data-text", text))
     more = [int(each) for each in re.findall(r"… and (\d+) more", text)]
     assert articles >= 20 and lines >= articles and articles + lines + sum(more) == 1200
+    assert "rest.html" not in text  # no image has a pane
     left = f"all but a line of {900 - articles - more[0]} failures, {more[0]} failures, {more[1]} equal images"
     assert listed == left
 

@@ -140,6 +140,9 @@ def test_the_readme_names_every_method_and_key_and_its_settings_are_accepted(loa
     text = README.read_text("utf-8")
     assert all(table in text for table in settings.key_tables().split("\n\n")[:2])
     assert all(f"| `{name}` |" in text for name in methods.METHODS)
+    flags = dict(re.findall(r"^\| `-(\w+)` \| `(\w+)` \|", text, re.MULTILINE))  # of idiff
+    assert {flag: name.replace("_", "") for flag, name in flags.items()} == {flag: flag for flag in flags}
+    assert set(flags.values()) == methods.METHODS["tolerance"].options.keys()
     examples = [load(each) for each in re.findall("```toml\n(.*?)```", text, re.DOTALL)]
     assert [rule.error for chosen in examples for rule in chosen.rules if rule.error] == []
     assert examples[0].of("glass/caustic1.exr").method == "tolerance"

@@ -134,8 +134,9 @@ def test_a_scene_is_read_as_it_is_written(read):
         around = scene.index[colour]
         assert segments.n_left.tolist() == [disc] * 4 + [outer] * 4 + [inner] * 4 + [ellipse] * 20
         assert segments.n_right.tolist() == [around] * 4 + [disc] * 4 + [outer] * 4 + [around] * 20
-    vertex = scene.segments[0].start[0] - (1, 2)
-    assert vertex == pytest.approx([2 * math.cos(math.pi / 6), 2 * math.sin(math.pi / 6)], abs=1e-15)
+    disc, outer, inner = scene.segments[0].start[:12:4] - (1, 2)
+    assert disc == pytest.approx([2 * math.cos(math.pi / 6), 2 * math.sin(math.pi / 6)], abs=1e-15)
+    assert [*outer, *inner] == pytest.approx([0.2, 0, 0.2 * math.sqrt(0.5), 0], abs=1e-15)
 
 
 DISC = '[[shape]]\nkind = "circle"\nradius = 1\nn = 1.5\n'

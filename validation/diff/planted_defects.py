@@ -178,7 +178,7 @@ def defect_rows(context: Context, name: str) -> list[Row]:
         return self_test.detection(defect, False, spoilt, name, context.variant)
 
     rows = [row(defect, opened(name, f"{GLASS} {defect}")) for defect in GLASSES]
-    rows += _image_defects(clean, name, context)
+    rows += image_defect_rows(context, name, clean)
     other = row(OTHER_SAMPLER, opened(name, sampler="multijitter"))
     if other.values:
         budgets = other.budgets | {"welch": ONE_ALARM}
@@ -189,13 +189,9 @@ def defect_rows(context: Context, name: str) -> list[Row]:
     return [*rows, other, noise]
 
 
-def image_defect_rows(context: Context, name: str) -> list[Row]:
-    """The defects that are planted in finished images, in a few trials: no other glass is compiled."""
-    size = (32, 4) if context.scalar else (RESOLUTION, SPP)
-    return _image_defects(trials(name, QUICK_TRIALS, *size), name, context)
-
-
-def _image_defects(clean: dict[int, self_test.Trial], name: str, context: Context) -> list[Row]:
+def image_defect_rows(context: Context, name: str, clean: dict[int, self_test.Trial] | None = None) -> list[Row]:
+    """The defects that are planted in finished images; without renders in a few trials: no other glass is compiled."""
+    clean = clean or trials(name, QUICK_TRIALS, *((32, 4) if context.scalar else (RESOLUTION, SPP)))
     rows = []
     for defect, planted in self_test.DEFECTS.items():
         spoilt = [replace(trial, spoil=functools.partial(planted.spoil, trial.clean)) for trial in clean.values()]

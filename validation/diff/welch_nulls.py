@@ -206,14 +206,19 @@ def at_most(count: int, probability: float) -> float:
     return float(stats.binom.ppf(1 - limits.NULL_ALARM, count, probability))
 
 
-def scene() -> dict[str, Any]:
-    """A ball of glass on a floor below a small lamp, which paths through the ball meet by chance only."""
+def scene_rows(context: Context, pairs: int) -> list[Row]:
+    """A ball of glass on a floor below a small lamp, which paths through the ball meet by chance only.
+
+    The same passes as films with variances on both sides or on one, and as renders.
+    """
+    if context.scalar:
+        return [Row(NAME, "every form", "scene", context.variant, reason="scalar variants would render for long")]
     import mitsuba as mi
 
     place = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": 32, "height": 32, "pixel_format": "rgb", "rfilter": {"type": "box"}}
     view = place().look_at([0, 2, 6], [0, 0, 0], [0, 1, 0])
-    return {
+    scene: Any = {
         "type": "scene",
         "integrator": {"type": "refract_path", "max_depth": 6},
         "sensor": {"type": "perspective", "fov": 40, "to_world": view, "film": film, "s": {"type": "independent"}},
@@ -221,30 +226,18 @@ def scene() -> dict[str, Any]:
         "ball": {"type": "sphere", "bsdf": {"type": "refract"}},
         "lamp": {"type": "sphere", "center": [1, 3, 0], "radius": 0.1, "e": {"type": "area", "radiance": 50.0}},
     }
-
-
-def scene_rows(context: Context, pairs: int) -> list[Row]:
-    """The same passes as films with variances on both sides or on one, and as renders."""
-    if context.scalar:
-        return [Row(NAME, "every form", "scene", context.variant, reason="scalar variants would render for long")]
-    import mitsuba as mi
-
-    loaded: Any = mi.load_dict(scene())
-    forms = {
-        "passes": Form("passes"),
-        "reference": Form("passes", known=(True, False)),
-        "new image": Form("passes", known=(False, True)),
-        "renders": Form("renders"),
-    }
+    loaded: Any = mi.load_dict(scene)
+    known = {"passes": (True, True), "reference": (True, False), "new image": (False, True)}
+    forms = {name: Form("passes", known=sides) for name, sides in known.items()} | {"renders": Form("renders")}
     results: dict[str, list[Comparison]] = {name: [] for name in forms}
     seeds = iter(range(current(SEED), current(SEED) + 10_000))
     for counts in ((64, 64), (1024, 16), (16, 1024)) * pairs:
         stacks = [
-            np.array([mi.render(loaded, spp=n // PASSES, seed=next(seeds)) for _ in range(PASSES)], float)
+            (np.array([mi.render(loaded, spp=n // PASSES, seed=next(seeds)) for _ in range(PASSES)], float), 0.0)
             for n in counts
         ]
         for name, form in forms.items():
-            results[name].append(compare("welch", *form.sides([(stack, 0.0) for stack in stacks], counts)))
+            results[name].append(compare("welch", *form.sides(stacks, counts)))
     return [null_row(name, "lamp through glass", compared, context.variant) for name, compared in results.items()]
 
 

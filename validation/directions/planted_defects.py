@@ -175,10 +175,11 @@ def tasks(context: Context) -> list[Task]:
     """On single precision where it is compiled, else on what there is."""
     running = [setting for setting in settings(context) if setting.vector is not None]
     setting = next((s for s in running if s.precision is np.float32), running[0])
-    return [Task(f"planted defects: {setting.label}", functools.partial(_rows, setting))]
+    return [Task(f"planted defects: {setting.label}", functools.partial(rows, setting))]
 
 
-def _rows(setting: Setting) -> list[Row]:
+def rows(setting: Setting) -> list[Row]:
+    """Every mutant of every formula."""
     sample = draw(SCALAR_COUNT if setting.is_scalar else COUNT, setting.precision)
     return [row(name, formula, setting, sample) for name in MUTANTS for formula in MUTANTS[name].of]
 
@@ -232,19 +233,16 @@ def draw(count: int, precision: type) -> Sample:
     """`count` rays of every regime that is one on every backend, and normal incidence along the axes."""
     entries = {name: entry for name, entry in regimes.REGIMES.items() if not entry.rests_on_denormals}
     parts = {name: regimes.make(name, count, precision, seeds.current(SEED)) for name in entries}
-    parts["along an axis"] = _along_axes(precision)
+    # From either side, into the denser and the thinner medium.
+    n: np.ndarray = np.tile(np.eye(3, dtype=precision), (4, 1))
+    side = np.repeat([[1.0], [-1.0]], 6, axis=0)
+    k = np.tile(np.repeat([0.75, 1.5], 3), 2)
+    parts["along an axis"] = Rays((n * side).astype(precision), n, k.astype(precision))
     units = [*(entry.unit for entry in entries.values()), True]
     rays = Rays.joined(list(parts.values()))
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
     lengths = list(map(len, parts.values()))
     return Sample(rays, exact, np.repeat(list(parts), lengths), np.repeat(units, lengths))
-
-
-def _along_axes(precision: type) -> Rays:
-    """From either side, into the denser and the thinner medium."""
-    n: np.ndarray = np.tile(np.eye(3, dtype=precision), (4, 1))
-    side, k = np.repeat([[1.0], [-1.0]], 6, axis=0), np.tile(np.repeat([0.75, 1.5], 3), 2)
-    return Rays((n * side).astype(precision), n, k.astype(precision))
 
 
 STUDY = Study(NAME, "Planted defects", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))
