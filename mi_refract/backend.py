@@ -264,7 +264,12 @@ def _try(path: str) -> Library:
         if "/" in path:
             return Library(path, (error.strerror or "cannot be read").lower())
         state = None
-    known = _recall()
+    # The remembered defects by key; a file that is missing or not ours is an empty memory.
+    try:
+        known = json.loads(_cache_file().read_text())
+    except (OSError, ValueError, RuntimeError):
+        known = None
+    known = {key: x for key, x in known.items() if isinstance(x, str)} if isinstance(known, dict) else {}
     key = state and f"{os.path.realpath(path)}, {state.st_mtime_ns}, {state.st_size}, {_circumstances()}"
     if key in known:
         return Library(path, known[key])
@@ -346,12 +351,3 @@ def _circumstances() -> str:
 def _cache_file() -> Path:
     """RuntimeError where the user has no home directory."""
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "mi_refract" / "backend.json"
-
-
-def _recall() -> dict[str | None, str]:
-    """The remembered defects by key; a file that is missing or not ours is an empty memory."""
-    try:
-        known = json.loads(_cache_file().read_text())
-    except (OSError, ValueError, RuntimeError):
-        known = None
-    return {key: x for key, x in known.items() if isinstance(x, str)} if isinstance(known, dict) else {}

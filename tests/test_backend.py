@@ -192,20 +192,6 @@ def test_the_verdict_is_the_fate_of_an_image(path, tmp_path, monkeypatch):
     assert library.works == drawn, done.stderr[-500:]
 
 
-def test_llvm_15_does_not_end_this_process(monkeypatch):
-    path = "/usr/lib/x86_64-linux-gnu/libLLVM-15.so.1"
-    if not Path(path).exists():
-        pytest.skip(f"no {path}")
-    monkeypatch.setenv(backend.CHOICE, path)
-    here = backend.llvm()
-    if here.usable:
-        pytest.skip("LLVM 15 works on this CPU")
-    assert "SIGABRT" in here.reason
-    assert path in here.reason
-    code = "from mi_refract import backend; print(backend.activate(may_restart=True))"
-    assert run(code, **{backend.CHOICE: path}).stdout == "scalar_rgb\n"
-
-
 def test_every_variant_has_an_answer(usable_variants, monkeypatch):
     import mitsuba as mi
 

@@ -27,7 +27,7 @@ ROOMS = {
     "directions": ("per_formula", "planted_defects", "bsdf_samples", "sweep", "search"),
     "stability": ("optical_chains", "energy", "derivatives", "layered_paths"),
     "renders": (
-        *("scene_needs", "against_dielectric", "colours", "unused_features", "invisible_changes"),
+        *("against_dielectric", "colours", "unused_features", "invisible_changes"),
         *("neighbours", "random_numbers", "gradients", "rendering_passes"),
     ),
     "efficiency": ("error_against_time", "scaling", "changing_indices"),

@@ -26,7 +26,6 @@ from validation.directions import per_formula
 from validation.efficiency import changing_indices, error_against_time
 from validation.planar import against_retrace
 from validation.planar import times as planar_times
-from validation.reference.layered_scenes import MIRAGE
 from validation.renders import against_dielectric, colours
 from validation.run import metrics as m
 from validation.run.array_settings import PLAIN
@@ -160,7 +159,7 @@ def paths(rows: list[Row]) -> str:
         layered_paths.PLACE: "place, worst",
     }
     mine = _measured(rows, layered_paths.NAME, columns)
-    mine = [row for row in mine if row.replay["scene"] == f"{MIRAGE.scene}.xml"]
+    mine = [row for row in mine if row.replay["scene"] == f"{layered_paths.MIRAGE.scene}.xml"]
     names = [row.subject if row.subject.startswith("exact") else f"`{row.subject}`" for row in mine]
     cells = [[name, *_cells(row, columns)] for name, row in zip(names, mine, strict=True)]
     return _table(_replay(mine, "{rays} rays, {setting}."), ["", *columns.values()], cells, "paths were traced")

@@ -51,26 +51,16 @@ def of_directions(b: Array, rays: Rays, reflected: NDArray[np.bool_] | None = No
     `reflected`: (N,) whose b is a mirror direction: there k = 1, and b is on the side that the ray comes from.
     """
     reflected = np.zeros(len(rays), bool) if reflected is None else reflected
-    a, n, b = _unit(rays.a), _unit(rays.n), _unit(b)
-    cosine = (n * a).sum(1)
-    found = np.empty(len(rays))
-    for mask, measure in ((reflected, _of_mirrored), (~reflected, _of_refracted)):
-        found[mask] = measure(a[mask], n[mask], b[mask], cosine[mask], rays.k[mask].astype(np.longdouble))
+    a, n, b, k = _unit(rays.a), _unit(rays.n), _unit(b), rays.k.astype(np.longdouble)
+    cosine, axis, one = (n * a).sum(1), np.cross(n, a), np.ones_like(k)
+    w, mirror = k[:, None] * a - b, a - 2 * cosine[:, None] * n
+    gamma = (n * w).sum(1)
+    of_refracted = _least(np.cross(n, w), axis, (k * cosine, k), (gamma, gamma), k * lengths(axis))
+    of_mirrored = _least(b - mirror, np.cross(axis, mirror), (one, one), (2 * one, 2 * cosine), 0 * one)
+    found = np.where(reflected, of_mirrored, of_refracted)
     onward = (n * b).sum(1) * np.sign(cosine) * np.where(reflected, -1, 1)
     found = np.maximum(found, -onward.astype(float))  # on the wrong side: n must turn by so much
     return np.where(np.isfinite(b).all(1), found, np.inf)
-
-
-def _of_refracted(a: Array, n: Array, b: Array, cosine: Array, k: Array) -> Array:
-    w, axis = k[:, None] * a - b, np.cross(n, a)
-    gamma = (n * w).sum(1)
-    return _least(np.cross(n, w), axis, (k * cosine, k), (gamma, gamma), k * lengths(axis))
-
-
-def _of_mirrored(a: Array, n: Array, b: Array, cosine: Array, k: Array) -> Array:
-    mirror = a - 2 * cosine[:, None] * n
-    one = np.ones_like(k)
-    return _least(b - mirror, np.cross(np.cross(n, a), mirror), (one, one), (2 * one, 2 * cosine), 0 * one)
 
 
 def _least(defect: Array, axis: Array, ellipse: tuple[Array, Array], other: tuple[Array, Array], along: Array) -> Array:

@@ -25,44 +25,25 @@ from mi_refract.io.errors import MISUSE
 from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.sanitise import printable
 
-
-class Inconclusive(enum.StrEnum):
-    """What an inconclusive image counts as."""
-
-    PASS = "pass"
-    FAIL = "fail"
+Inconclusive = enum.StrEnum("Inconclusive", {"PASS": "pass", "FAIL": "fail"})  # what such an image counts as
 
 
 def _print_methods(wanted: bool) -> None:
     if wanted:
-        if sys.stdout.isatty():
-            from rich.console import Console
-            from rich.markdown import Markdown
-
-            Console().print(Markdown(key_tables()))
-        else:
-            print(key_tables())
+        print(key_tables())
         raise typer.Exit
 
 
 Names = Annotated[
-    list[str] | None,
-    typer.Argument(metavar="NAME", help="Only these images: paths in the folders (wildcards: * and ?)."),
+    list[str] | None, typer.Argument(metavar="NAME", help="Only these images: paths in the folders (wildcards: * ?).")
 ]
 Method = Annotated[str, typer.Option(help=f"Comparison method: {'|'.join((AUTO, *METHODS))}; see --methods.")]
 Set = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help=f"Set a key of [defaults] in {FILE}, except map, for all images; see --methods.",
-    ),
+    typer.Option("--set", metavar="KEY=VALUE", help="Set a key of [defaults], except map, for all images."),
 ]
 File = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE.toml", help=f"File with settings of images. Default: {FILE} in the folder of the references."
-    ),
+    Path | None, typer.Option(metavar="FILE.toml", help=f"Settings of images. Default: {FILE} beside the references.")
 ]
 MaxValues = Annotated[
     int, typer.Option("--max-values", metavar="N", min=1, help="Largest image to read: width × height × channels.")
@@ -72,8 +53,7 @@ MaxValues = Annotated[
 def diff(
     reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")],
     test: Annotated[
-        Path | None,
-        typer.Argument(metavar="TEST", help="The image or folder to compare with it; optional with --check-settings."),
+        Path | None, typer.Argument(metavar="TEST", help="What to compare with it; optional with --check-settings.")
     ] = None,
     names: Names = None,
     method: Method = AUTO,
@@ -86,27 +66,16 @@ def diff(
     ] = None,
     report: Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML page with the images.")] = None,
     report_url: Annotated[
-        str,
-        typer.Option(
-            metavar="URL",
-            envvar="MI_REFRACT_REPORT_URL",
-            help="Address of the published report, for a link in the job's summary.",
-        ),
+        str, typer.Option(metavar="URL", envvar="MI_REFRACT_REPORT_URL", help="Address of the report, for the summary.")
     ] = "",
     junit: Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")] = None,
     json: Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")] = None,
-    github: Annotated[
-        bool, typer.Option("--github", help="Print GitHub annotations and write the job's summary.")
-    ] = False,
+    github: Annotated[bool, typer.Option("--github", help="Print annotations, write the job's summary.")] = False,
     methods: Annotated[
-        bool,
-        typer.Option(
-            "--methods", is_eager=True, callback=_print_methods, help="Print the methods, their options and all keys."
-        ),
+        bool, typer.Option("--methods", is_eager=True, callback=_print_methods, help="Print the methods and all keys.")
     ] = False,
     check_settings: Annotated[
-        bool,
-        typer.Option("--check-settings", help="Print how each image would be compared, and which settings say so."),
+        bool, typer.Option("--check-settings", help="Print how each image would be compared, and by which settings.")
     ] = False,
 ) -> None:
     """Compare images with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
@@ -157,29 +126,19 @@ def diff(
 
 def accept(
     reference: Annotated[
-        Path | None,
-        typer.Argument(metavar="REFERENCE", help="As for diff. Optional with --from; default: the compared paths."),
+        Path | None, typer.Argument(metavar="REFERENCE", help="As for diff; optional with --from, like TEST.")
     ] = None,
-    test: Annotated[
-        Path | None, typer.Argument(metavar="TEST", help="As for diff. Optional with --from, like REFERENCE.")
-    ] = None,
+    test: Annotated[Path | None, typer.Argument(metavar="TEST", help="As for diff.")] = None,
     names: Names = None,
     method: Method = AUTO,
     options: Set = None,
     settings: File = None,
     max_values: MaxValues = MAX_VALUES,
     source: Annotated[
-        Path | None,
-        typer.Option(
-            "--from", metavar="OUT.json", help="Accept exactly the images that diff --json OUT.json compared."
-        ),
+        Path | None, typer.Option("--from", metavar="OUT.json", help="Accept the images that diff --json compared.")
     ] = None,
     as_variant: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="Keep the references; add the new images as further ones, named by `accept` in the settings.",
-        ),
+        str, typer.Option(metavar="NAME", help="Add the new images as further references, named by key `accept`.")
     ] = "",
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
 ) -> None:
@@ -191,9 +150,7 @@ def accept(
         from mi_refract.image_diff import results_file
 
         if (reference is None) != (test is None):
-            raise ValueError(
-                f"{reference}: only one path; with --from, give both folders before any names, or no folder"
-            )
+            raise ValueError(f"{reference}: only one path; with --from, give both folders before the names, or none")
         if options or method != AUTO:
             raise ValueError("--from repeats an earlier comparison; do not combine it with --method or --set")
         results = results_file.read(source, reference, test)

@@ -177,36 +177,33 @@ def run(
     its time limit. With --renderer, the largest exit code of its functions.
     """
     checked = _checker(context, tir, formula, backward, report, junit, json)
-    choosing = (*CHOOSING, *([] if renderer else ["precision"]))
-    for name in choosing if file else ():
+    for name in (*CHOOSING, *([] if renderer else ["precision"])) if file else ():
         if getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE":
             option = f"--{name.replace('_', '-')}"
             raise ValueError(f"--rays {file} and {option}: both choose the rays; expected one of them")
+    calls: list[tuple[list[str], str, str, str, dict[str, str]]]
+    if renderer:
+        from mi_refract.ray_sets import renderer_file
 
-    def answered(words: list[str], title: str, precision: str, tir: str = "auto") -> int:
-        rays = files.read(file) if file else _made(regime, count, precision, seed, two_sided, medium, wavelengths)
+        if command:
+            raise ValueError(f"--renderer {renderer} and {command[0]}; expected one of them")
+        functions = [x for x in renderer_file.load(renderer).rays if precision in (None, x.precision)]
+        if not functions:
+            raise ValueError(f"{renderer}: no function{f' in {precision}' if precision else ''}; expected [[rays]]")
+        if len(functions) > 1 and (report or junit or json):
+            text = f"{renderer}: {len(functions)} functions, but one report"
+            raise ValueError(f"{text}; select a function with --precision")
+        calls = [(renderer_file.filled(x.command), x.title, x.precision, x.tir, x.deviations) for x in functions]
+    else:
+        calls = [(command or [], shlex.join(command or []), precision or ray_set.PRECISION, "auto", {})]
+    codes = []
+    for words, title, kind, declared, deviations in calls:
+        rays = files.read(file) if file else _made(regime, count, kind, seed, two_sided, medium, wavelengths)
         with as_exceptions():
             answers = files.answers_of(words, rays, timeout=timeout, cwd=renderer)
-        return checked(rays, answers, title, tir)
-
-    if not renderer:
-        raise typer.Exit(answered(command or [], shlex.join(command or []), precision or ray_set.PRECISION))
-
-    from mi_refract.ray_sets import renderer_file
-
-    if command:
-        raise ValueError(f"--renderer {renderer} and {command[0]}; expected one of them")
-    functions = [x for x in renderer_file.load(renderer).rays if precision in (None, x.precision)]
-    if not functions:
-        raise ValueError(f"{renderer}: no function{f' in {precision}' if precision else ''}; expected [[rays]]")
-    if len(functions) > 1 and (report or junit or json):
-        raise ValueError(f"{renderer}: {len(functions)} functions, but one report; select a function with --precision")
-    codes = []
-    for function in functions:
-        words = renderer_file.filled(function.command)
-        codes.append(answered(words, function.title, function.precision, function.tir))
-        for name, reason in function.deviations.items():
-            print(printable(f"known deviation of {function.title}: {name}: {reason}"))
+        codes.append(checked(rays, answers, title, declared))
+        for name, reason in deviations.items():
+            print(printable(f"known deviation of {title}: {name}: {reason}"))
     raise typer.Exit(max(codes))
 
 
@@ -230,8 +227,7 @@ def _checker(
     from mi_refract.ray_sets import check_answers, reports
     from mi_refract.ray_sets.tir_signal import LOOSEST
 
-    error_bound = formula or LOOSEST
-    most_backward = math.inf if backward is None else backward
+    error_bound, most_backward = formula or LOOSEST, math.inf if backward is None else backward
     check_answers.check_options(tir, error_bound, most_backward)
     for path, suffixes in ((report, (".html", ".htm")), (junit, (".xml",)), (json, (".json",))):
         if path:
@@ -269,10 +265,8 @@ def _made(
         in_nm = tuple(map(float, wavelengths.split(","))) if wavelengths is not None else ()
     except ValueError:
         raise ValueError(f"--wavelengths {wavelengths}; expected numbers in nm, such as 486.1327,587.5618") from None
-    names = [name.replace(">>", "≫").replace("<<", "≪") for name in regime or []]
-    return ray_set.make(
-        names or None, count, precision, seed, two_sided=two_sided, media=medium or (), wavelengths=in_nm
-    )
+    names = [name.replace(">>", "≫").replace("<<", "≪") for name in regime or []] or None
+    return ray_set.make(names, count, precision, seed, two_sided=two_sided, media=medium or (), wavelengths=in_nm)
 
 
 def _summary(rays: RaySet) -> str:

@@ -70,16 +70,35 @@ def powers(cos_i: Number, cos_t: Number, transmitted: Mask, k: Number, contrast:
     gives them; numbers of one type, and so are R and T. `contrast`: κ where it is known better than k. Error: R 3.12u,
     T 2u, relative.
     """
+    # What is left is the rounding of cₜ, and of the result: |∂ log R/∂ log cₜ| ≤ 2.12 and |∂ log T/∂ log cₜ| ≤ 1. For
+    # this the denominator of R is a sum (the square it is equal to would make it 4), and that of T the square (the sum:
+    # 3, and sin²θᵢ would count, which a cosine near 1 does not know).
     lift = _wide if _is_single(cos_i) else DoubleWord
-    c, ratio = lift(cos_i), lift(k)
+    number, c, ratio = type(cos_i), lift(cos_i), lift(k)
     kappa = ratio * ratio - 1 if contrast is None else lift(contrast)
-    number = type(cos_i)
     y = lift(dr.select(transmitted, cos_t, 0 * cos_t))  # NaN stays
     wide: Any = dr.float64_array_t(number)
-    # Of float32 the 1e-300 leaves nothing: R ≤ 1e-300/16c⁴ at k = 1. It is there for a cos_t that underflowed to 0.
+    # 1 where nothing is transmitted, y being 0 there: so R is 1 and T is 0 at k = 1 and c = 0, too. Of float32 the
+    # 1e-300 leaves nothing: R ≤ 1e-300/16c⁴ at k = 1. It is there for a cos_t that underflowed to 0.
     mirror = dr.select(transmitted, wide(1e-300), wide(1))
-    r, t = _powers(c, y, mirror, _fma(-c, c, 1), ratio, kappa)
-    return number(r), number(t)
+    sin2 = _fma(-c, c, 1)
+    if isinstance(c, DoubleWord):
+        # Of float64 cosines below 1e-75 have fourth powers that underflow. Where κ = 0 they do not matter.
+        c, y = (DoubleWord(dr.select((kappa.hi == 0) & (x.hi > 0), 1, x.hi), x.lo) for x in (c, y))
+    p, q = c * y, ratio * sin2
+    d_s, d_p = _fma(ratio, c, y), _fma(ratio, y, c)
+    r = _fma(kappa * kappa, _fma(q, q, p * p), mirror)
+    kp = ratio * p
+    t = (kp + kp) * _fma(d_s, d_s, d_p * d_p)
+    root = _fma(d_s, d_p, mirror)
+    whole, square = r + t, root * root
+    if isinstance(r, DoubleWord):
+        powers = _with_slope(_divide(r, whole), _divide(t, square), r.hi, t.hi, whole.hi)
+    else:
+        # One division for both: it takes as long as eight other operations. Cosines of 1e-38 leave the product 1e-302.
+        inverse = ieee_divide(1, whole * square)
+        powers = _with_slope((r * square) * inverse, (t * whole) * inverse, r, t, whole)
+    return number(powers[0]), number(powers[1])
 
 
 def local_powers(a: Vector3, transmitted: Mask, k: Number, contrast: Number) -> tuple[Any, Any]:
@@ -104,32 +123,6 @@ def local_odds(ray: LocalCosines, transmitted: Mask, k: Number, contrast: Number
     # κ = 0 is always transmitted, or tangential: without the 1 that would be 0 : 0.
     mirror, power = (dr.select(transmitted, *x) for x in ((0 * p, 1), (2 * ratio * p, 0)))
     return dr.fma(kappa * kappa, dr.fma(q, q, p * p), mirror), power * dr.fma(d_s, d_s, d_p * d_p)
-
-
-def _powers(c: Number, y: Number, mirror: Number, sin2: Number, k: Number, kappa: Number) -> tuple[Any, Any]:
-    """R and T from cos_i = `c` and cos_t = `y`, in twice the precision wanted.
-
-    `mirror` is 1 where nothing is transmitted, `y` being 0 there: so R is 1 and T is 0 at k = 1 and c = 0, too.
-
-    What is left is the rounding of cₜ, and of the result: |∂ log R/∂ log cₜ| ≤ 2.12 and |∂ log T/∂ log cₜ| ≤ 1, so R is
-    right to 3.12u and T to 2u. For this the denominator of R is a sum (the square it is equal to would make it 4),
-    and that of T the square (the sum: 3, and sin²θᵢ would count, which a cosine near 1 does not know).
-    """
-    if isinstance(c, DoubleWord):
-        # Of float64 cosines below 1e-75 have fourth powers that underflow. Where κ = 0 they do not matter.
-        c, y = (DoubleWord(dr.select((kappa.hi == 0) & (x.hi > 0), 1, x.hi), x.lo) for x in (c, y))
-    p, q = c * y, k * sin2
-    d_s, d_p = _fma(k, c, y), _fma(k, y, c)
-    r = _fma(kappa * kappa, _fma(q, q, p * p), mirror)
-    kp = k * p
-    t = (kp + kp) * _fma(d_s, d_s, d_p * d_p)
-    root = _fma(d_s, d_p, mirror)
-    whole, square = r + t, root * root
-    if isinstance(r, DoubleWord):
-        return _with_slope(_divide(r, whole), _divide(t, square), r.hi, t.hi, whole.hi)
-    # One division for both: it takes as long as eight other operations. Cosines of 1e-38 leave the product 1e-302.
-    inverse = ieee_divide(1, whole * square)
-    return _with_slope((r * square) * inverse, (t * whole) * inverse, r, t, whole)
 
 
 def _with_slope(reflected: Number, through: Number, r: Number, t: Number, whole: Number) -> tuple[Any, Any]:

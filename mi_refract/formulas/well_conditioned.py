@@ -110,10 +110,18 @@ def refract_promoted(
     """
     if dr.type_v(a) != dr.VarType.Float32:
         return refract_compensated(a, n, k, contrast)
-    if axis := _axis(n):
-        return _promoted_along(a, axis, k, contrast, local)
     wide: Any = dr.float64_array_t(type(a))
     number = dr.value_t(wide)
+    if axis := _axis(n):  # only the radicand and its root need float64
+        index, sign = axis
+        k, along = as_component(a, k), a[index] if sign > 0 else -a[index]
+        if local is None:
+            kappa = dr.fma(number(k), number(k), -1) if contrast is None else number(contrast)
+            x, y = (a[i] for i in range(3) if i != index)
+            local = local_cosines(x, y, along, kappa)
+        transmitted = (local.radicand >= 0) & (along != 0)
+        onward = dr.select(transmitted, dr.mulsign(as_component(a, local.cos_t), along), -along)
+        return _along_axis(a, axis, dr.select(transmitted, k, 1), onward), transmitted
     d, m, k2 = wide(a), wide(n), number(as_component(a, k))
     # k² has 48 bits: the difference is rounded at most once.
     kappa = dr.fma(k2, k2, -1) if contrast is None else number(contrast)
@@ -130,31 +138,6 @@ def refract_promoted(
     return type(a)(dr.fma(m, ieee_divide(dr.fma(-scale, c, along), dr.dot(m, m)), d * scale)), transmitted
 
 
-def _promoted_along(
-    a: Vector3, axis: tuple[int, int], k: Number, contrast: Number, local: LocalCosines | None
-) -> Refracted:
-    """`refract_promoted` for a literal axis: only the radicand and its root need float64."""
-    index, sign = axis
-    wide: Any = dr.float64_array_t(dr.value_t(type(a)))
-    k, along = as_component(a, k), a[index] if sign > 0 else -a[index]
-    if local is None:
-        kappa = dr.fma(wide(k), wide(k), -1) if contrast is None else wide(contrast)
-        x, y = (a[i] for i in range(3) if i != index)
-        local = local_cosines(x, y, along, kappa)
-    transmitted = (local.radicand >= 0) & (along != 0)
-    onward = dr.select(transmitted, dr.mulsign(as_component(a, local.cos_t), along), -along)
-    return _along_axis(a, axis, dr.select(transmitted, k, 1), onward), transmitted
-
-
-def _radicand(c: TripleWord, w: list[TripleWord], kappa: DoubleWord) -> DoubleWord:
-    """c² − κ w²; its error ε over the larger term, in u³.
-
-    c is off by 3/cosθ and κ by none for 1 ≤ k < 2²³. Each w is off by 6, each square by 100 at most, their sums,
-    the product with κ and the difference by as much: 500 where cosθ > 0.1. At grazing incidence 12/cosθ more.
-    """
-    return (c.squared() - functools.reduce(operator.add, (w_i.squared() for w_i in w)).times(kappa)).double()
-
-
 def refract_compensated(a: Vector3, n: Vector3, k: Number, contrast: Number = None) -> Refracted:
     """The well-conditioned form above with error-free transforms, in the arrays' own precision.
 
@@ -166,13 +149,21 @@ def refract_compensated(a: Vector3, n: Vector3, k: Number, contrast: Number = No
     (`numerics.scale_to_unit` sees to it, in the entries of FORMULAS).
     """
     k, axis = as_component(a, k), _axis(n)
-    kappa = DoubleWord.product(k, k) - 1 if contrast is None else _split(a, contrast)
+    kappa = DoubleWord.product(k, k) - 1 if contrast is None else DoubleWord(as_component(a, contrast))
+    if contrast is not None and not (dr.is_array_v(contrast) and type(contrast) is type(kappa.hi)):
+        # Of a wider precision: a pair in that of `a`.
+        wide: Any = dr.float64_array_t(dr.value_t(type(a)))
+        kappa = DoubleWord(kappa.hi, as_component(a, wide(contrast) - wide(kappa.hi)))
     if axis:
         index, sign = axis
         c, w = TripleWord(a[index] if sign > 0 else -a[index]), [TripleWord(a[i]) for i in range(3) if i != index]
     else:
         c, w = error_free.dot(n, a), error_free.cross(n, a)
-    radicand = _radicand(c, w, kappa)
+    # c² − κ w²; its error ε over the larger term, in u³: c is off by 3/cosθ and κ by none for 1 ≤ k < 2²³. Each w is
+    # off by 6, each square by 100 at most, their sums, the product with κ and the difference by as much: 500 where
+    # cosθ > 0.1. At grazing incidence 12/cosθ more.
+    w2 = functools.reduce(operator.add, (w_i.squared() for w_i in w))
+    radicand = (c.squared() - w2.times(kappa)).double()
     transmitted = (radicand.hi >= 0) & (c.hi != 0)
     root, scale = radicand.sqrt(), dr.select(transmitted, k, 1)
     if axis:
@@ -205,12 +196,3 @@ def _correct(vector: type, n: Vector3, around: list[DoubleWord], along: DoubleWo
         error_free.defect(around[m], (n[i], b[j]), (-n[j], b[i])) for i, j, m in ((1, 2, 0), (2, 0, 1), (0, 1, 2))
     ]
     return b + solve(missing, error_free.defect(along, *zip(n, b, strict=True)))
-
-
-def _split(a: Vector3, x: Number) -> DoubleWord:
-    """A number of any precision as a pair in the precision of the components of `a`."""
-    hi = as_component(a, x)
-    if dr.is_array_v(x) and type(x) is type(hi):
-        return DoubleWord(hi)
-    wide: Any = dr.float64_array_t(dr.value_t(type(a)))
-    return DoubleWord(hi, as_component(a, wide(x) - wide(hi)))

@@ -33,10 +33,7 @@ class UnreadableImage(ValueError):
 
 @dataclass(frozen=True)
 class Copy:
-    """A new image that is to become the reference.
-
-    `compared`, `replaced`: the digests of the new image and of the reference when they were compared.
-    """
+    """A new image that is to become the reference, and the digests of both when they were compared."""
 
     new: Path
     reference: Path
@@ -53,16 +50,16 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
     """
     taken = {result.target for result in results.results} if variant else set()
     for result in results.of(*FAILED):
-        if result.test is None or result.digests is None:
-            if result.error:
-                raise UnreadableImage(result, result.error)
-            if result.test:
-                raise ValueError(f"{result.test}: compared without digests; expected results of diff(to_accept=True)")
+        if result.error and (result.test is None or result.digests is None):
+            raise UnreadableImage(result, result.error)
+        if result.test is None:
             continue
+        if result.digests is None:
+            raise ValueError(f"{result.test}: compared without digests; expected results of diff(to_accept=True)")
         target = result.target or results.reference
-        if variant and result.reference is None:
-            raise ValueError(f"{result.test}: has no reference yet; accept it without --as-variant first")
         if variant:
+            if result.reference is None:
+                raise ValueError(f"{result.test}: has no reference yet; accept it without --as-variant first")
             target = pairing.variant(target, result.how, variant)
         if target in taken or (variant and target.exists() and target not in result.variants):
             raise ValueError(f"{target}: also the reference of another image; expected a reference of its own")
@@ -86,10 +83,7 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
             if source.exists():
                 yield Copy(source, to, result.digests.get(source, ""), result.digests.get(to, ""))
             elif to.exists():
-                raise ValueError(
-                    f"{source}: no such file, and {to} belongs to a different render; expected a variance of "
-                    f"{result.test}"
-                )
+                raise ValueError(f"{source}: no such file, and {to} belongs to a different render; expected a variance")
 
 
 def accept(copies: Sequence[Copy]) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mi_refract.io import image_file
 from mi_refract.io.image_file import MAX_VALUES, Image, bounded_map
 
-from . import channels, methods, pairing, variances
+from . import channels, methods, pairing
 from .comparison import Comparison, Verdict
 from .results import Result, Status
 from .settings import ComparisonSpec, Rectangle
@@ -72,7 +72,7 @@ def compare(
         channels.chosen(_with_variance(images, root, how), how.channels, side)
         for side, (images, root) in enumerate(zip(sides, roots, strict=True))
     )
-    if how.reads_variance and not (len(reference) > 1 or variances.has_variance(reference[0])):
+    if how.reads_variance and not (len(reference) > 1 or channels.has_variance(reference[0])):
         raise FileNotFoundError(f"{pairing.beside(how.variance, path, roots[0])}: no such file; expected a variance")
     file = pairing.beside(how.mask, result.target or path, roots[0]) if how.mask else None
     if (file or how.ignore) and reference[-1].place:
@@ -105,7 +105,7 @@ def _with_variance(images: Sequence[Image], root: Path, how: ComparisonSpec) -> 
     file = pairing.beside(how.variance, images[0].path, root)
     if file == images[0].path:
         raise ValueError(f"variance = {how.variance!r}: names {file} itself; expected another image")
-    return [variances.with_file(images[0], file, how.max_values)] if file.exists() else images
+    return [channels.with_file(images[0], file, how.max_values)] if file.exists() else images
 
 
 def _compare_parts(

@@ -106,6 +106,7 @@ class Page:
             failures.append(item(result, results, shown, images) | {"key": f"pair-{number}"})
         equal = sorted((item(result, results) for result in results.of(Status.EQUAL)), key=lambda x: not x["warning"])
         folders = results.test.is_dir() and not results.renders  # where names mean something
+        more = [*results.flags, "--report", "rest.html"]
         content = {
             "title": "mi-refract diff",
             "sentence": sentence(results),
@@ -114,7 +115,7 @@ class Page:
             "context": {"reference": str(results.reference), "test": str(results.test)} | dict(context),
             "unused": results.unused,
             "command": replay,
-            "rest": results.command("diff", *rest[:NAMED], flags=[*results.flags, "--report", "rest.html"]),
+            "rest": results.command("diff", *rest[:NAMED], flags=more) if rest and folders else "",
             "skipped": [item(result, results) for result in results.of(Status.SKIPPED)],
             "ticks": results.command("accept", flags=["--from", source] if source else None) if folders else "",
         }
@@ -162,10 +163,7 @@ def _cut(failures: list[dict[str, Any]], equal: list[dict[str, Any]], articles: 
 
 
 def item(
-    result: Result,
-    results: Results,
-    shown: Shown = Shown(),
-    images: EmbeddedImages | None = None,
+    result: Result, results: Results, shown: Shown = Shown(), images: EmbeddedImages | None = None
 ) -> dict[str, Any]:
     """What the page says of an image. The panes of `shown` go to `images`."""
     comparison, why = result.comparison, cause(result)
@@ -221,43 +219,39 @@ def shown_of(result: Result, image_bytes: float, map_bytes: float) -> Shown:
     """Both images, their difference, FLIP, and the maps of the method, in about so many bytes an image and a map."""
     try:
         with _one_at_a_time:
-            return _shown(result, image_bytes, map_bytes)
+            sides: dict[str, Image] = {}
+            makers: list[Callable[[], Pane]] = []
+            for role, image in result.images.items():  # RGB or gray; of other channels the first stands for all
+                names = tuple("RGB") if {*"RGB"} <= {*image.channels} else image.channels[:1]
+                sides[role] = side = replace(image, pixels=image.select(names), channels=names)
+                paint = "code" if flip.encoding(side) == "sRGB" else "light"
+                note = "" if len(names) > 1 else f"channel {names[0]}"
+                makers.append(functools.partial(_pane, role, paint, None, side.pixels, image_bytes, note=note))
+            maps = dict(result.comparison.maps) if result.comparison else {}
+            one, two = sides.get("reference"), sides.get("test")
+            if one and two and one.pixels.shape == two.pixels.shape:
+                with np.errstate(invalid="ignore"):
+                    change = two.pixels - one.pixels
+                makers.append(functools.partial(map_pane, "difference", change, map_bytes))
+                if "flip" not in maps and all(np.isfinite(x.pixels.astype(np.float32)).all() for x in (one, two)):
+                    makers.append(functools.partial(_flip, one, two, map_bytes))
+            histogram = ""
+            if "p" in maps:  # a histogram shows it better than a map
+                p_values = maps.pop("p")
+                some = p_values[:: -(-len(p_values) // HISTOGRAM_ROWS)]
+                histogram = histogram_svg(some[np.isfinite(some)], "p-value", "share of the tiles", salt=result.name)
+            if "q" in maps:
+                maps["−log₁₀ q"] = -np.log10(np.maximum(maps.pop("q"), 1e-30))
+            makers += [
+                functools.partial(map_pane, name, values, map_bytes)
+                for name, values in maps.items()
+                if name != "difference" and (name != "flags" or values.any())
+            ]
+            with ThreadPoolExecutor(os.cpu_count()) as pool:  # deflating is most of the work, without Python's lock
+                return Shown(list(pool.map(lambda make: make(), makers)), result.unread, histogram)
     except Exception as error:  # of whatever kind: the page is for all images
         errors.print_traceback(error)
         return Shown(note=f"Cannot be shown: {errors.describe(error)}")
-
-
-def _shown(result: Result, image_bytes: float, map_bytes: float) -> Shown:
-    sides: dict[str, Image] = {}
-    makers: list[Callable[[], Pane]] = []
-    for role, image in result.images.items():  # RGB or gray; of other channels the first stands for all
-        names = tuple("RGB") if {*"RGB"} <= {*image.channels} else image.channels[:1]
-        sides[role] = side = replace(image, pixels=image.select(names), channels=names)
-        paint = "code" if flip.encoding(side) == "sRGB" else "light"
-        note = "" if len(names) > 1 else f"channel {names[0]}"
-        makers.append(functools.partial(_pane, role, paint, None, side.pixels, image_bytes, note=note))
-    maps = dict(result.comparison.maps) if result.comparison else {}
-    one, two = sides.get("reference"), sides.get("test")
-    if one and two and one.pixels.shape == two.pixels.shape:
-        with np.errstate(invalid="ignore"):
-            change = two.pixels - one.pixels
-        makers.append(functools.partial(map_pane, "difference", change, map_bytes))
-        if "flip" not in maps and all(np.isfinite(x.pixels.astype(np.float32)).all() for x in (one, two)):
-            makers.append(functools.partial(_flip, one, two, map_bytes))
-    histogram = ""
-    if "p" in maps:  # a histogram shows it better than a map
-        p_values = maps.pop("p")
-        some = p_values[:: -(-len(p_values) // HISTOGRAM_ROWS)]
-        histogram = histogram_svg(some[np.isfinite(some)], "p-value", "share of the tiles", salt=result.name)
-    if "q" in maps:
-        maps["−log₁₀ q"] = -np.log10(np.maximum(maps.pop("q"), 1e-30))
-    makers += [
-        functools.partial(map_pane, name, values, map_bytes)
-        for name, values in maps.items()
-        if name != "difference" and (name != "flags" or values.any())
-    ]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # deflating is most of the work, and lets go of Python's lock
-        return Shown(list(pool.map(lambda make: make(), makers)), result.unread, histogram)
 
 
 def _pane(

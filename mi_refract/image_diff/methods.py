@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels, any_channel
 
-from . import channels, flip, pixelwise, variances, welch
+from . import channels, flip, pixelwise, welch
 from .comparison import (
     Comparison,
     Verdict,
@@ -122,13 +122,13 @@ def choice(reference: Sequence[Image], test: Sequence[Image], *, spp: bool = Fal
     """
     if max(len(reference), len(test)) > 1:
         return "welch", "several renders"
-    known = [any(map(variances.has_variance, side)) for side in (reference, test)]
+    known = [any(map(channels.has_variance, side)) for side in (reference, test)]
     if all(known):
         return "welch", "the variance of both is known"
     if any(known):
         (one,), (two,) = (reference, test) if known[0] else (test, reference)
         name, other = ("reference", "new image") if known[0] else ("new image", "reference")
-        if not one.variances and variances.SPP in one.metadata and not spp and variances.SPP not in two.metadata:
+        if not one.variances and channels.SPP in one.metadata and not spp and channels.SPP not in two.metadata:
             return "tolerance", f"of the {other} neither variance nor samples per pixel are known"
         return "welch", f"the variance of the {name} is known"
     return "tolerance", ""
@@ -183,7 +183,7 @@ def _compare(
     single, doubt = len(bare[0]) == len(bare[1]) == 1, ""
     if chosen.takes_renders:
         result = chosen.function(*(sides if single else bare), allow_nonfinite=allow_nonfinite, **checked)
-        if single and result.is_equal and (untested := variances.untested(sides[0][0], sides[1][0])):
+        if single and result.is_equal and (untested := channels.untested(sides[0][0], sides[1][0])):
             by_tolerance = compare("tolerance", *untested, allow_nonfinite=allow_nonfinite)
             if not by_tolerance.is_equal:
                 doubt = f"not tested, without variance: {', '.join(untested[0].channels)}: {by_tolerance.reason}"

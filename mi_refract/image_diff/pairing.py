@@ -38,6 +38,9 @@ class Pair:
     error: str = ""
 
 
+Named = TypeVar("Named", Pair, Result)
+
+
 def require_apart(reference: Path, test: Path, maps: Sequence[Map] = (), new: bool = False) -> None:
     """ValueError where one path is the other or lies within it, OSError where one does not exist.
 
@@ -62,31 +65,41 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Pair]:
     if known and reference.is_dir() != test.is_dir():
         raise ValueError(f"{reference}, {test}: cannot compare a folder with a file")
     if not test.is_dir():
-        return [_pair_of_files(reference, test, settings)]
+        name = reference.name
+        pair = Pair(name, reference if known else None, test, reference, settings.of(name))
+        if not pair.how.accept:
+            return [pair]
+        deep = any("/" in template for template in pair.how.accept)
+        beside_it = reference.parent.rglob("*") if deep else reference.parent.iterdir()
+        others = sorted(path for path in beside_it if path.is_file() and path != reference)
+        return [_with_variants(pair, [path for path in others if not path.samefile(test)])]
     (old, lost), (new, missed) = images_in(reference) if known else ({}, []), images_in(test)
     for folder, nothing in ((reference, known and not old and not lost), (test, not new and not missed)):
         if nothing:
             raise ValueError(f"{folder}: contains no image; expected at least one")
     if settings.maps:
-        pairs = _mapped(old, new, settings.maps)
+        found = _mapped(old, new, settings.maps)
     else:
-        pairs = [Pair(name, old.get(name), new.get(name), Path(name)) for name in sorted(old | new)]
-    pairs = [replace(pair, target=reference / pair.target, how=settings.of(pair.name)) for pair in pairs]
+        found = [Pair(name, old.get(name), new.get(name), Path(name)) for name in sorted(old | new)]
+    found = [replace(pair, target=reference / pair.target, how=settings.of(pair.name)) for pair in found]
     own: set[Path] = set()  # masks and variances that the settings name for a pair: they are no images to compare
-    for pair in pairs:
+    for pair in found:
         sides = [(path, root) for path, root in ((pair.reference, reference), (pair.test, test)) if path]
         files = {mask} if (mask := _mask_of(pair, reference)) else set()
         if pair.how.reads_variance:
             files |= {beside(pair.how.variance, path, root) for path, root in sides}
         own |= files - {pair.reference, pair.test}
-    pairs = [pair for pair in pairs if not {pair.reference, pair.test} - {None} <= own]
-    pairs = _with_all_variants(pairs, [path for path in old.values() if path not in own])
-    if not pairs and not lost and not missed:
+    found = [pair for pair in found if not {pair.reference, pair.test} - {None} <= own]
+    # A reference that is a variant, and has no new image, is not one that was removed. In a tree of both no image is
+    # its own reference.
+    with_new, tests = {pair.target for pair in found if pair.test}, {x.test.resolve() for x in found if x.test}
+    others = [path for path in old.values() if path not in own | with_new and path.resolve() not in tests]
+    found = [_with_variants(pair, others) for pair in found]
+    taken = {path for pair in found for path in pair.variants}
+    found = [pair for pair in found if pair.test or pair.target not in taken]
+    if not found and not lost and not missed:
         raise ValueError(f"defaults.map fits no image in {reference} and {test}; expected templates of their paths")
-    return [*pairs, *(Pair(name, None, None, reference / name, error=error) for name, error in lost + missed)]
-
-
-Named = TypeVar("Named", Pair, Result)
+    return [*found, *(Pair(name, None, None, reference / name, error=error) for name, error in lost + missed)]
 
 
 def named(items: Sequence[Named], patterns: Sequence[str]) -> list[Named]:
@@ -97,9 +110,7 @@ def named(items: Sequence[Named], patterns: Sequence[str]) -> list[Named]:
     names = {item.name for item in items}
     chosen: set[str] = set()
     for pattern in patterns:
-        matched = {
-            name for name in names if name == pattern or (pattern not in names and name_patterns.matches(pattern, name))
-        }
+        matched = {pattern} if pattern in names else {name for name in names if name_patterns.matches(pattern, name)}
         if not matched:
             raise ValueError(
                 f"{pattern}: matches no image; expected the path of an image in its folder (wildcards: * and ?)"
@@ -122,16 +133,6 @@ def error_of(pair: Pair, reference: Path) -> str:
     return pair.error or pair.how.error or missing
 
 
-def _pair_of_files(reference: Path, test: Path, settings: Settings) -> Pair:
-    pair = Pair(reference.name, reference if reference.exists() else None, test, reference, settings.of(reference.name))
-    if not pair.how.accept:
-        return pair
-    deep = any("/" in template for template in pair.how.accept)
-    beside = reference.parent.rglob("*") if deep else reference.parent.iterdir()
-    others = sorted(path for path in beside if path.is_file() and path != reference)
-    return _with_variants(pair, [path for path in others if not path.samefile(test)])
-
-
 def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> list[Pair]:
     """Pairs by the first map that fits. What no map calls a reference is none; a reference is no new image."""
     pairs: dict[str, Pair] = {}
@@ -145,12 +146,11 @@ def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> 
             pairs[name] = replace(before, error=error)
     references = {pair.reference.resolve() for pair in pairs.values() if pair.reference}
     for name, file in new.items():
-        if name in pairs or file.resolve() in references:
-            continue
-        fitting = ((rule, name_patterns.parsed(rule.test, name)) for rule in maps)
-        targets = (name_patterns.filled(rule.reference, values) for rule, values in fitting if values is not None)
-        if target := next(targets, None):
-            pairs[name] = Pair(name, None, file, Path(target))
+        if name not in pairs and file.resolve() not in references:
+            fitting = ((rule, name_patterns.parsed(rule.test, name)) for rule in maps)
+            targets = (name_patterns.filled(rule.reference, values) for rule, values in fitting if values is not None)
+            if target := next(targets, None):
+                pairs[name] = Pair(name, None, file, Path(target))
     return [pairs[name] for name in sorted(pairs)]
 
 
@@ -160,16 +160,6 @@ def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> 
 def _mask_of(pair: Pair, root: Path) -> Path | None:
     """The mask that the settings name for a pair; `root`: the folder of the references."""
     return beside(pair.how.mask, pair.target, root) if pair.how.mask else None
-
-
-def _with_all_variants(pairs: list[Pair], references: list[Path]) -> list[Pair]:
-    """The pairs with their variants. A reference that is one, and has no new image, is not one that was removed."""
-    with_new = {pair.target for pair in pairs if pair.test}
-    tests = {pair.test.resolve() for pair in pairs if pair.test}  # in a tree of both no image is its own reference
-    others = [path for path in references if path not in with_new and path.resolve() not in tests]
-    pairs = [_with_variants(pair, others) for pair in pairs]
-    taken = {path for pair in pairs for path in pair.variants}
-    return [pair for pair in pairs if pair.test or pair.target not in taken]
 
 
 def _with_variants(pair: Pair, others: Sequence[Path]) -> Pair:
@@ -193,14 +183,11 @@ def variant(target: Path, how: ComparisonSpec, name: str) -> Path:
     """
     if not name.strip() or name.startswith(".") or set(name) & set("/\\*?\0"):
         raise ValueError(f"--as-variant {name!r}; expected part of a file name, such as macos")
-    fields = name_patterns.fields(target.name)
-    for template in how.accept:
-        if not set(template) & set("*?") and name in template:
-            return target.parent / name_patterns.filled(template, fields)
-    for template in how.accept:
-        if template.count("*") == 1 and "?" not in template:
-            filled = name_patterns.filled(template.replace("*", "{*}"), fields | {"*": name})
-            return target.parent / filled
+    with_name = [template for template in how.accept if not set(template) & set("*?") and name in template]
+    with_star = [template for template in how.accept if template.count("*") == 1 and "?" not in template]
+    for template in with_name + with_star:
+        fields = name_patterns.fields(target.name) | {"*": name}
+        return target.parent / name_patterns.filled(template.replace("*", "{*}"), fields)
     raise ValueError(
         f"{target}: no template in `accept` contains {name} or exactly one *; add to [defaults] in mi-refract.toml: "
         f'accept = ["{{stem}}-{name}{{suffix}}"]'

@@ -94,13 +94,10 @@ class Result:
     def reason(self) -> str:
         """The reason for the status in one sentence."""
         if self.comparison:
-            variants = ""
-            if self.matched:
-                variants = f"; matches {self.matched.name}"
-            elif self.variants and self.status is not Status.EQUAL:
-                count = len(self.variants)
-                variants = f"; {'its variant differs' if count == 1 else f'its {count} variants differ'}, too"
-            return self.comparison.reason + variants
+            count = len(self.variants)
+            differ = "its variant differs" if count == 1 else f"its {count} variants differ"
+            also = f"; {differ}, too" if count and self.status is not Status.EQUAL else ""
+            return self.comparison.reason + (f"; matches {self.matched.name}" if self.matched else also)
         if self.status is Status.SKIPPED:
             return "skipped by the settings"
         sides = {Category.ADDED: "only among the new images", Category.REMOVED: "only among the references"}
@@ -145,7 +142,8 @@ class Results:
 
     def command(self, verb: str, *names: str, flags: Sequence[str] | None = None) -> str:
         """The command line of `diff` or `accept` for the whole comparison, or for the images of these names alone."""
-        words = [as_word(path) for path in (self.reference, self.test)]
+        # A name that begins with a dash would be read as an option.
+        words = [f"./{path}" if str(path).startswith("-") else str(path) for path in (self.reference, self.test)]
         words += self.flags if flags is None else flags
         words += ["--renders"] * (self.renders and verb == "diff")
         return shlex.join(["mi-refract", verb, *words, *["--"] * any(x.startswith("-") for x in names), *names])
@@ -164,8 +162,3 @@ class Results:
 
     def _names(self, result: Result) -> list[str]:
         return [result.name] if self.test.is_dir() and not self.renders else []
-
-
-def as_word(path: Path) -> str:
-    """The path as a word of a command line, with ./ before a name that would be read as an option."""
-    return f"./{path}" if str(path).startswith("-") else str(path)

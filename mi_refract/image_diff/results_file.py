@@ -72,7 +72,7 @@ def as_data(results: Results) -> dict[str, Any]:
             "metrics": [vars(metric) for metric in comparison.metrics] if comparison else [],
             "minimum_detectable_difference": comparison.minimum_detectable if comparison else math.nan,
             "reproduce": results.reproduce(result),
-            "accept": results.accept(result),
+            "accept": results.accept(result)
         })  # fmt: skip
     return {
         "schema": SCHEMA,

@@ -81,20 +81,13 @@ class Entry:
 
     `pattern`: of the names of its images; "" for `[defaults]` and the command line, which are for all. `values`: of
     `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `variance`, `channels`, `allow_nonfinite` and the options
-    of methods. `where`: its name in messages. `when`: platforms, one of which must be this one; none: all. `error`:
-    what is wrong with it.
+    of methods. `where`: its name in messages. `error`: what is wrong with it.
     """
 
     pattern: str
     values: Mapping[str, Any]
     where: str = "image[0]"
-    when: tuple[str, ...] = ()
     error: str = ""
-
-    @property
-    def here(self) -> bool:
-        """Whether it is for this platform."""
-        return not self.when or any(set(words.split()) <= this_platform() for words in self.when)
 
 
 class Map(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -132,7 +125,7 @@ class Settings:
 
     def of(self, name: str) -> ComparisonSpec:
         """How the image of this name is compared; what is wrong with the settings is the `error`."""
-        layers = [rule for rule in self.rules if rule.here and (not rule.pattern or matches(rule.pattern, name))]
+        layers = [rule for rule in self.rules if not rule.pattern or matches(rule.pattern, name)]
         reasons = dict.fromkeys(layer.values["reason"] for layer in layers if "reason" in layer.values)
         entries = tuple(x.where for x in layers if x.where != COMMAND_LINE and (x.values or x.error))
         spec = ComparisonSpec(reason="; ".join(reasons), max_values=self.max_values, entries=entries)
@@ -142,8 +135,8 @@ class Settings:
             return replace(spec, error=str(error))
 
     def unused(self, names: Sequence[str]) -> list[str]:
-        """The patterns for this platform that match none of these names."""
-        patterns = [rule.pattern for rule in self.rules if rule.here and rule.pattern]
+        """The patterns that match none of these names."""
+        patterns = [rule.pattern for rule in self.rules if rule.pattern]
         return [pattern for pattern in patterns if not any(matches(pattern, name) for name in names)]
 
 
@@ -288,7 +281,7 @@ class NameKey(msgspec.Struct):
 
 
 def load(path: str | Path, command_line: Entry | None = None, max_values: int = MAX_VALUES) -> Settings:
-    """The settings of a file, with the layer of the command line.
+    """The settings of a file for this platform, with the layer of the command line.
 
     A table with a name that is wrong in anything else is kept with its error: its images cannot be compared, the others
     can. ValueError names the file and the key for whatever else is wrong; OSError as the system raises it.
@@ -307,7 +300,9 @@ def load(path: str | Path, command_line: Entry | None = None, max_values: int = 
             rules.append(Entry(name, {}, where, error=str(error)))
             continue
         del values["name"]
-        rules.append(Entry(name, values, where, tuple(_listed(values.pop("when", None)))))
+        platforms = _listed(values.pop("when", None))
+        if not platforms or any(set(words.split()) <= this_platform() for words in platforms):
+            rules.append(Entry(name, values, where))
     return Settings(tuple(rules), maps, max_values)
 
 

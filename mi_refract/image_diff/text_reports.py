@@ -71,7 +71,10 @@ def print_table(rows: Rows, styles: Mapping[str, str] | None = None) -> None:
         first, *others = map(printable, row)
         shown.add_row(Text(first, style=(styles or {}).get(first, "")), *map(Text, others))
     # In a file it is as wide as it must be: no line of a log is a wrapped one.
-    Console(width=None if sys.stdout.isatty() else 100_000).print(shown, highlight=False)
+    console = Console(width=None if sys.stdout.isatty() else 100_000)
+    with console.capture() as capture:
+        console.print(shown, highlight=False)
+    print("\n".join(map(str.rstrip, capture.get().splitlines())))
 
 
 def sentence(results: Results) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels
 
+from .channels import SPP, Estimate, estimates, has_variance, samples, spreads
 from .comparison import Comparison, Maps, Metric, Verdict, aligned, finite, nonfinite_result, preconditions
 from .pixel_statistics import Inflation, inflation, rarity_exponent, sums
 from .tile_statistics import (
@@ -23,7 +24,6 @@ from .tile_statistics import (
     from_variances,
     with_silent_pixels,
 )
-from .variances import SPP, Estimate, estimates, has_variance, same_noise, samples
 
 WELL_KNOWN = 16  # times as many samples: a variance of 11 of their rare events is known to 1/√(16 · 11), 8 %
 IDENTICAL = Metric("values that differ", 0.0, 0.0)
@@ -50,7 +50,7 @@ def compare_renders(
 ) -> Comparison:
     """Independent renders: Welch's t-test on the means of tiles and channels.
 
-    It takes two or more renders a side, or one a side whose variance is known (module `variances`); then pixels are
+    It takes two or more renders a side, or one a side whose variance is known (module `channels`); then pixels are
     assumed to be independent, as under a box filter. A wider filter does not change the means of tiles, and hides
     differences of pixels. Where the variance is that of filtered pixels, the header says how wide the filter is, or
     `pixel_statistics.inflation` estimates it. The tests are of the mean of single tiles, of blocks of tiles and of the
@@ -79,7 +79,9 @@ def compare_renders(
         if not valid:
             raise ValueError(f"{name} = {value!r}; expected {expected}")
     single = len(reference) == len(test) == 1 and (has_variance(reference[0]) or has_variance(test[0]))
-    same = single and same_noise(reference[0], test[0])
+    one, two = reference[0], test[0]
+    same = single and bool(spreads(one.channels)) and set(one.channels) == set(two.channels)
+    same = same and np.array_equal(one.pixels, two.select(one.channels), equal_nan=True)
     set_spp = spp_reference or spp, spp_test or spp
     if single:
         known = estimates(reference[0], test[0], set_spp, allow_nonfinite)

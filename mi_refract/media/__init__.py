@@ -5,9 +5,7 @@ Dr.Jit arrays. Out: indices in double precision; Dr.Jit differentiates those of 
 """
 
 from . import glass_catalogs
-from .dispersion import LINES
-from .materials import LABORATORY_AIR, relative_index
-from .medium import Medium
-from .specification import index, parse
+from .dispersion import LINES, Medium
+from .materials import LABORATORY_AIR, index, parse, relative_index
 
 __all__ = ["LABORATORY_AIR", "LINES", "Medium", "glass_catalogs", "index", "parse", "relative_index"]

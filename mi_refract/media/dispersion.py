@@ -1,4 +1,4 @@
-"""Formulas of dispersion: n as a function of the wavelength λ in nm and of coefficients.
+"""A material as an index of refraction by wavelength, and formulas of dispersion: n by λ in nm and by coefficients.
 
 A formula takes floats, numpy arrays or Dr.Jit arrays alike, in double precision; Dr.Jit differentiates it.
 """
@@ -7,31 +7,24 @@ from __future__ import annotations
 
 import itertools
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any
 
 import drjit as dr
 
 from mi_refract.numerics import Mask, Number
 
 # Spectral lines by their letters, in nm, as catalogues of glass print them.
+# fmt: off
 LINES = {
-    "i": 365.0146,
-    "h": 404.6561,
-    "g": 435.8343,
-    "F'": 479.9914,
-    "F": 486.1327,
-    "e": 546.0740,
-    "d": 587.5618,
-    "D": 589.2938,
-    "C'": 643.8469,
-    "C": 656.2725,
-    "r": 706.5188,
-    "s": 852.1101,
-    "t": 1013.98,
+    "i": 365.0146, "h": 404.6561, "g": 435.8343, "F'": 479.9914, "F": 486.1327, "e": 546.0740, "d": 587.5618,
+    "D": 589.2938, "C'": 643.8469, "C": 656.2725, "r": 706.5188, "s": 852.1101, "t": 1013.98,
 }
+# fmt: on
 Coefficients = Mapping[str, Number]
+ANY = (0.0, math.inf)
 
 
 def where(condition: Mask, x: Number, y: Number) -> Number:
@@ -43,28 +36,23 @@ def where(condition: Mask, x: Number, y: Number) -> Number:
     return np.where(condition, x, y)
 
 
-def root(x: Number) -> Number:
-    """√x, NaN below 0; of any kind of number."""
-    if dr.is_array_v(x):
-        return dr.sqrt(x)
-    import numpy as np
-
-    with np.errstate(invalid="ignore"):
-        return np.sqrt(x)
-
-
-class Dispersion(Protocol):
+class Dispersion:
     """n(λ) with named coefficients."""
 
     def index(self, wavelength: Number, c: Coefficients) -> Number:
-        """N, dimensionless."""
+        """N, dimensionless; here the same at all wavelengths."""
+        return c["n"] + 0 * wavelength
 
     def poles(self, c: Coefficients) -> dict[str, float]:
-        """Wavelengths at which n is infinite, in nm, by the coefficient that puts them there."""
+        """Wavelengths at which n is infinite, in nm, by the coefficient that puts them there; here none."""
+        return {}
+
+
+CONSTANT = Dispersion()
 
 
 @dataclass(frozen=True)
-class Terms:
+class Terms(Dispersion):
     """n or n² as `constant` + Σ a λ^p + Σ B λ²/(λ² − C): Cauchy's, Sellmeier's and Schott's formulas.
 
     Powers: pairs of a coefficient's name and p. Resonances: pairs of the names of B and C, C in nm², or in nm where
@@ -78,7 +66,7 @@ class Terms:
     squared: bool = False
 
     def index(self, wavelength: Number, c: Coefficients) -> Number:
-        """See `Dispersion`."""
+        """NaN where n² is negative."""
         square = wavelength * wavelength
         total = self.constant + 0 * wavelength
         for name, p in self.powers:
@@ -88,34 +76,36 @@ class Terms:
             total = total + c[name] * (1 / power if p < 0 else power)
         for b, r in self.resonances:
             total = total + c[b] * (square / (square - (c[r] * c[r] if self.squared else c[r])))
-        return total if self.power == 1 else root(total)
+        if self.power == 1:
+            return total
+        if dr.is_array_v(total):
+            return dr.sqrt(total)
+        import numpy as np
+
+        with np.errstate(invalid="ignore"):
+            return np.sqrt(total)
 
     def poles(self, c: Coefficients) -> dict[str, float]:
-        """See `Dispersion`."""
+        """Of resonances."""
         squares = {r: float(c[r] ** 2 if self.squared else c[r]) for _, r in self.resonances}
         return {name: math.sqrt(square) for name, square in squares.items() if square > 0}
 
 
-@dataclass(frozen=True)
-class Abbe:
+class Abbe(Dispersion):
     """A glass of which n_d and V_d are known: n = n_d + (n_d − 1)/V_d g, g = (λ⁻² − λ_d⁻²)/(λ_F⁻² − λ_C⁻²).
 
     That is Cauchy's formula with two terms, through n_d, with V_d = (n_d − 1)/(n_F − n_C).
     """
 
     def index(self, wavelength: Number, c: Coefficients) -> Number:
-        """See `Dispersion`."""
+        """Infinite at λ = 0 only."""
         d, f, line_c = (LINES[line] ** -2 for line in "dFC")
         g = (1 / (wavelength * wavelength) - d) / (f - line_c)
         return c["n_d"] + (c["n_d"] - 1) / c["V_d"] * g
 
-    def poles(self, c: Coefficients) -> dict[str, float]:
-        """None: n is infinite at λ = 0 only."""
-        return {}
-
 
 @dataclass(frozen=True)
-class Table:
+class Table(Dispersion):
     """n at given wavelengths, increasing, and between two of them linear. The coefficients are the values of n."""
 
     knots: tuple[float, ...]
@@ -127,9 +117,8 @@ class Table:
         return tuple("n_" + f"{knot:.{digits}g}".replace(".", "_") for knot in self.knots)
 
     def index(self, wavelength: Number, c: Coefficients) -> Number:
-        """See `Dispersion`; 0 beyond the first knot and the last."""
-        total = 0 * wavelength
-        values = [c[name] for name in self.names]
+        """0 beyond the first knot and the last."""
+        total, values = 0 * wavelength, [c[name] for name in self.names]
         for i, (start, end) in enumerate(itertools.pairwise(self.knots)):
             after = wavelength >= start if i == 0 else wavelength > start
             share = (wavelength - start) / (end - start)  # 0 at `start`, 1 at `end`: there the value is the knot's own
@@ -137,43 +126,69 @@ class Table:
             total = total + where(after & (wavelength <= end), between, 0)
         return total
 
-    def poles(self, c: Coefficients) -> dict[str, float]:
-        """None."""
-        return {}
-
-
-@dataclass(frozen=True)
-class Constant:
-    """The same n at all wavelengths."""
-
-    def index(self, wavelength: Number, c: Coefficients) -> Number:
-        """See `Dispersion`."""
-        return c["n"] + 0 * wavelength
-
-    def poles(self, c: Coefficients) -> dict[str, float]:
-        """None."""
-        return {}
-
-
-CONSTANT = Constant()
-CAUCHY_NAMES = "ABCDEFGH"
-
-
-def cauchy(values: Sequence[float]) -> tuple[Terms, dict[str, float]]:
-    """n = A + B/λ² + C/λ⁴ + …, B in nm², C in nm⁴ (A.-L. Cauchy)."""
-    names = CAUCHY_NAMES[: len(values)]
-    return Terms(1, powers=tuple((name, -2 * i) for i, name in enumerate(names))), dict(zip(names, values, strict=True))
-
 
 def sellmeier(values: Sequence[float], squared: bool = False) -> tuple[Terms, dict[str, float]]:
     """n² = 1 + Σ B_i λ²/(λ² − C_i), first all B, then all C in nm²; where `squared`, C_i = λ_i², and λ_i is given."""
-    count, letter = len(values) // 2, "L" if squared else "C"
-    pairs = tuple((f"B{i}", f"{letter}{i}") for i in range(1, count + 1))
+    letter = "L" if squared else "C"
+    pairs = tuple((f"B{i}", f"{letter}{i}") for i in range(1, len(values) // 2 + 1))
     names = [b for b, _ in pairs] + [r for _, r in pairs]
     return Terms(2, 1.0, resonances=pairs, squared=squared), dict(zip(names, values, strict=True))
 
 
-def polynomial(values: Mapping[int, float]) -> tuple[Terms, dict[str, float]]:
-    """n² = Σ a_p λ^p for even p, λ in nm (Schott's formula of before 1992). Keys: p."""
-    names = {p: f"a{p}" if p >= 0 else f"a_{-p}" for p in values}
-    return Terms(2, powers=tuple((names[p], p) for p in values)), {names[p]: x for p, x in values.items()}
+@dataclass(frozen=True)
+class Medium:
+    """n(λ) of a material. λ is in nm; indices are in double precision, whatever the type of λ."""
+
+    name: str
+    dispersion: Dispersion
+    coefficients: dict[str, float]
+    valid: tuple[float, float] = ANY  # nm; outside there is no index
+    relative_to: str = ""  # "air" (20 °C, 101325 Pa, dry) or "vacuum"; "" where the source does not say
+    is_air: bool = False
+    fitted: tuple[float, float] = ANY  # nm; outside, but within `valid`, the formula extrapolates
+
+    @property
+    def dispersive(self) -> bool:
+        """Whether n depends on λ."""
+        return self.dispersion is not CONSTANT
+
+    def index(self, wavelength: Number, coefficients: Coefficients | None = None) -> Number:
+        """n at a wavelength.
+
+        Args:
+            wavelength: in nm; float, numpy array of any shape, or Dr.Jit array.
+            coefficients: other values of some of the medium's own, for derivatives.
+
+        Returns:
+            Of the shape of `wavelength`. Dr.Jit arrays: NaN outside `valid`, or where n is not a positive number.
+
+        Raises:
+            ValueError: for the same, of floats and numpy arrays. Outside `fitted` these give a warning.
+        """
+        n = self.index_or_nan(wavelength, coefficients)
+        if not dr.is_array_v(wavelength):
+            import numpy as np
+
+            wavelengths, (low, high) = np.atleast_1d(wavelength), self.valid
+            if (missing := np.isnan(np.atleast_1d(n))).any():
+                text = f"{self.name}: no index at {wavelengths[missing][0]:g} nm"
+                raise ValueError(f"{text}; expected a wavelength from {low:g} to {high:g} nm")
+            low, high = self.fitted
+            if (beyond := wavelengths[(wavelengths < low) | (wavelengths > high)]).size:
+                text = f"{self.name}: the index at {beyond[0]:g} nm is an extrapolation"
+                warnings.warn(f"{text}; its formula is fitted from {low:g} to {high:g} nm", stacklevel=2)
+        return n
+
+    def index_or_nan(self, wavelength: Number, coefficients: Coefficients | None = None) -> Number:
+        """As `index`, with NaN for every type instead of an error."""
+        if compiled := dr.is_array_v(wavelength):
+            wide: Any = dr.float64_array_t(type(wavelength))
+            x = wide(wavelength)
+        else:
+            import numpy as np
+
+            x = np.asarray(wavelength, np.float64)  # a float, too: operations of numpy give NaN and do not raise
+        valid = (x > 0) & (x >= self.valid[0]) & (x <= self.valid[1])
+        n = self.dispersion.index(where(valid, x, math.nan), {**self.coefficients, **(coefficients or {})})
+        n = where((n > 0) & (n < math.inf), n, math.nan)
+        return n if compiled or dr.is_array_v(n) or n.ndim else float(n)

@@ -19,17 +19,9 @@ import warnings
 from dataclasses import dataclass
 from typing import Any
 
-from .dispersion import LINES, polynomial, sellmeier
-from .medium import ANY, Medium
+from .dispersion import ANY, LINES, Dispersion, Medium, Terms, sellmeier
 
-CATALOGS = {
-    "CDGM": "cdgm",
-    "HIKARI": "hikari",
-    "HOYA": "hoya",
-    "OHARA": "ohara",
-    "SCHOTT": "schott",
-    "SUMITA": "sumita",
-}
+CATALOGS = {name: name.lower() for name in ("CDGM", "HIKARI", "HOYA", "OHARA", "SCHOTT", "SUMITA")}
 # Powers of λ of the coefficients in the makers' order; the others are Sellmeier's. λ is in µm there.
 _TO_12TH = (0, 2, 4, -2, -4, -6, -8, -10, -12)
 _TO_8TH = (0, 2, -2, -4, -6, -8)
@@ -70,9 +62,11 @@ def load(catalog: str, glass: str, label: str) -> Medium:
     row = glasses[name := known[_plain(glass)]]
     if not row.coefficients:
         raise ValueError(f"{label}: its catalogue has no formula for this glass; use another glass, or table(…)")
-    if catalog in POWERS:
-        powers = zip(POWERS[catalog], row.coefficients, strict=True)
-        form, coefficients = polynomial({p: x / NANOMETRES**p for p, x in powers})
+    form: Dispersion
+    if catalog in POWERS:  # n² = Σ a_p λ^p, Schott's formula of before 1992
+        names = {p: f"a{p}" if p >= 0 else f"a_{-p}" for p in POWERS[catalog]}
+        form = Terms(2, powers=tuple((names[p], p) for p in names))
+        coefficients = {names[p]: x / NANOMETRES**p for p, x in zip(names, row.coefficients, strict=True)}
     else:
         form, coefficients = sellmeier([x * (1 if i < 3 else NANOMETRES**2) for i, x in enumerate(row.coefficients)])
     return Medium(f"{catalog}:{name}", form, coefficients, row.range, "air", fitted=row.fitted)
@@ -89,22 +83,22 @@ def read(catalog: str) -> dict[str, Glass]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         (name,) = [name for name in vars(module) if name.lower() == f"{CATALOGS[catalog]}catalog"]
-        table = getattr(module, name)()
-        return {str(glass).strip(): _glass(table, glass, FITTED.get(catalog, ANY)) for glass in table.df.index}
-
-
-def _glass(table: Any, name: str, most: tuple[float, float]) -> Glass:
-    row = table.df.loc[name]
-    printed = _finite(row["refractive indices"])
-    transmitting = _finite(row["internal transmission mm, 10"])
-    lines = [float(LINES.get(line, line)) for line in printed if line in LINES or isinstance(line, float)]
-    wavelengths = lines + [float(w) for w, share in transmitting.items() if share > 0]
-    coefficients: tuple[float, ...] = ()
-    if len(_finite(row["dispersion coefficients"])) == len(row["dispersion coefficients"]):
-        coefficients = tuple(map(float, table.glass_coefs(name)))
-    fitted = max(math.floor(min(lines)), most[0]), min(math.ceil(max(lines)), most[1])
-    printed = {line: n for line, n in printed.items() if line in LINES}
-    return Glass(coefficients, printed, float(row["abbe number"]["vd"]), (min(wavelengths), max(wavelengths)), fitted)
+        table, most, glasses = getattr(module, name)(), FITTED.get(catalog, ANY), {}
+        for name, row in table.df.iterrows():
+            printed, transmitting = _finite(row["refractive indices"]), _finite(row["internal transmission mm, 10"])
+            lines = [float(LINES.get(line, line)) for line in printed if line in LINES or isinstance(line, float)]
+            wavelengths = lines + [float(w) for w, share in transmitting.items() if share > 0]
+            coefficients: tuple[float, ...] = ()
+            if len(_finite(row["dispersion coefficients"])) == len(row["dispersion coefficients"]):
+                coefficients = tuple(map(float, table.glass_coefs(name)))
+            glasses[str(name).strip()] = Glass(
+                coefficients,
+                {line: n for line, n in printed.items() if line in LINES},
+                float(row["abbe number"]["vd"]),
+                (min(wavelengths), max(wavelengths)),
+                (max(math.floor(min(lines)), most[0]), min(math.ceil(max(lines)), most[1])),
+            )
+        return glasses
 
 
 def _finite(series: Any) -> dict[Any, float]:

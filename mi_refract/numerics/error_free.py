@@ -198,23 +198,20 @@ def dot(x: Vector3, y: Vector3) -> TripleWord:
 
 
 def cross(x: Vector3, y: Vector3) -> list[TripleWord]:
-    """x × y of two 3-vectors, each component with relative error ≤ 6u³."""
-    return [_exact_difference(x[i], y[j], x[j], y[i]) for i, j in ((1, 2), (2, 0), (0, 1))]
-
-
-def _exact_difference(x: Number, y: Number, z: Number, w: Number) -> TripleWord:
-    """x y − z w, relative error ≤ 6u³: its four exact terms are d, d_lo, e, e_lo.
+    """x × y of two 3-vectors, each component with relative error ≤ 6u³: its four exact terms are d, d_lo, e, e_lo.
 
     Where p and q cancel, d is exact, and a multiple of the last place of e; elsewhere |d| ≥ max(|p|, |q|)/2, so that
     |d_lo + e| ≤ 4u |d|. Either way `fast_two_sum` is exact.
     """
-    p, p_lo = two_prod(x, y)
-    q, q_lo = two_prod(z, w)
-    d, d_lo = two_sum(p, -q)
-    e, e_lo = two_sum(p_lo, -q_lo)
-    mid, lo = two_sum(d_lo, e)
-    hi, mid = fast_two_sum(d, mid)
-    return TripleWord(hi, (mid,), lo + e_lo)
+    components = []
+    for i, j in ((1, 2), (2, 0), (0, 1)):
+        (p, p_lo), (q, q_lo) = two_prod(x[i], y[j]), two_prod(x[j], y[i])
+        d, d_lo = two_sum(p, -q)
+        e, e_lo = two_sum(p_lo, -q_lo)
+        mid, lo = two_sum(d_lo, e)
+        hi, mid = fast_two_sum(d, mid)
+        components.append(TripleWord(hi, (mid,), lo + e_lo))
+    return components
 
 
 def defect(target: DoubleWord, *products: Pair) -> Number:

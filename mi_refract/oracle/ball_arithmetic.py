@@ -16,6 +16,7 @@ Arithmetic: F. Johansson, "Arb: efficient arbitrary-precision midpoint-radius in
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sys
 from collections.abc import Iterable, Iterator
@@ -114,7 +115,11 @@ def refract(
     table = np.full(len(a), _BLANK)
     chunks: Iterable[int] = range(0, len(a), CHUNK)
     if progress and len(a) >= MANY and sys.stderr.isatty():
-        chunks = _with_bar(chunks)
+        with contextlib.suppress(ImportError):  # a bar, where rich is installed
+            from rich.console import Console
+            from rich.progress import track
+
+            chunks = track(chunks, "oracle", console=Console(stderr=True), transient=True)
     for first in chunks:
         index = first + np.flatnonzero(valid[first : first + CHUNK])
         _fill(table, index, (_exact(*ray) for ray in _rays(a, n, k, contrast, index)), fresnel)
@@ -140,16 +145,6 @@ def fresnel(cos_i: ArrayLike, k: ArrayLike, *, contrast: ArrayLike | None = None
     _fill(table, index, (_exact_of_cosine(*x) for x in zip(cos_i[index].tolist(), *ratios, strict=True)), True)
     table["direction"] = table["direction_low"] = math.nan
     return _certified(table, valid)
-
-
-def _with_bar(chunks: Iterable[int]) -> Iterable[int]:
-    """The same, with a progress bar on stderr, where rich is installed."""
-    try:
-        from rich.console import Console
-        from rich.progress import track
-    except ImportError:
-        return chunks
-    return track(chunks, "oracle", console=Console(stderr=True), transient=True)
 
 
 # Arguments ---------------------------------------------------------------------------------------------------------

@@ -16,13 +16,11 @@ import numpy as np
 from mi_refract.backend import detect
 from mi_refract.numerics import Mask, aligned
 
-PRECISIONS = ("float32", "float64")
-
 Index = Any  # a Python int, or a Dr.Jit array of uint32
 Vector2 = Any  # x and y, two Numbers
 Vertices = Any  # the numbers of a start and an end, Indices
 Table = Any  # rows to gather from; see `ArrayBackend.table`
-Buffer = tuple[Any, tuple[int, ...]]  # values and their shape
+Buffer = tuple[Any, Any, tuple[int, ...]]  # type, value that fills it, and shape; vectors where that ends in 2
 Scatter = Callable[[str, Index, Any, Mask], None]  # name of a buffer, row, value, where
 
 
@@ -56,10 +54,6 @@ class ArrayBackend:
         row, values = table
         return dr.gather(row, values, i, active)
 
-    def buffer(self, kind: Any, value: Any, shape: tuple[int, ...]) -> Buffer:
-        """Memory for results, filled with `value`: numbers of type `kind`, or vectors where the shape ends in 2."""
-        return dr.full(kind, value, math.prod(shape)), shape
-
     def uniform(self, kind: Any, *values: Any) -> Any:
         """A number or vector of type `kind` that is the same for all rays, but no part of the code of a kernel."""
         return dr.opaque(kind, values[0]) if len(values) == 1 else kind(*(dr.opaque(self.number, x) for x in values))
@@ -71,17 +65,17 @@ class ArrayBackend:
 
         `scatter(name, j, x, active)` sets buffers[name][j, i] = x where `active`.
         """
+        filled = {name: dr.full(kind, value, math.prod(shape)) for name, (kind, value, shape) in buffers.items()}
         lane, stride = dr.arange(self.index, count), self.uniform(self.index, count)
 
         def scatter(name: str, j: Index, x: Any, active: Mask) -> None:
-            values, _ = buffers[name]
-            x = x if isinstance(x, self.vector) else type(values)(x)
-            dr.scatter(values, x, j * stride + lane, active, mode=dr.ReduceMode.NoConflicts)
+            x = x if isinstance(x, self.vector) else type(filled[name])(x)
+            dr.scatter(filled[name], x, j * stride + lane, active, mode=dr.ReduceMode.NoConflicts)
 
         if count:  # Dr.Jit refuses an empty array
             work(lane, scatter)
-        dr.eval(*(values for values, _ in buffers.values()))
-        return {name: values.numpy().reshape(shape) for name, (values, shape) in buffers.items()}
+        dr.eval(*filled.values())
+        return {name: values.numpy().reshape(buffers[name][2]) for name, values in filled.items()}
 
 
 class ScalarBackend(ArrayBackend):
@@ -106,10 +100,6 @@ class ScalarBackend(ArrayBackend):
         """Row i, or the first one where there is no row i: then it is not `active`."""
         return table[i if i < len(table) else 0]
 
-    def buffer(self, kind: Any, value: Any, shape: tuple[int, ...]) -> Buffer:
-        """A numpy array."""
-        return np.full(shape, value, kind), shape
-
     def uniform(self, kind: Any, *values: Any) -> Any:
         """The number or vector itself."""
         return kind(*values)
@@ -118,14 +108,15 @@ class ScalarBackend(ArrayBackend):
         self, count: int, buffers: dict[str, Buffer], work: Callable[[Index, Scatter], None]
     ) -> dict[str, np.ndarray]:
         """One i after the other."""
+        filled = {name: np.full(shape, value, kind) for name, (kind, value, shape) in buffers.items()}
         for lane in range(count):
 
             def scatter(name: str, j: Index, x: Any, active: Mask, lane: int = lane) -> None:
                 if active:
-                    buffers[name][0][j, lane] = x
+                    filled[name][j, lane] = x
 
             work(lane, scatter)
-        return {name: values for name, (values, _) in buffers.items()}
+        return filled
 
 
 def choose_backend(name: str | None, precision: str) -> ArrayBackend:
@@ -134,8 +125,8 @@ def choose_backend(name: str | None, precision: str) -> ArrayBackend:
     ValueError for an unknown name or precision, a backend that cannot run here, and float32 on the scalar backend,
     which computes in double.
     """
-    if precision not in PRECISIONS:
-        raise ValueError(f"precision = {precision!r}; expected {', '.join(PRECISIONS)}")
+    if precision not in ("float32", "float64"):
+        raise ValueError(f"precision = {precision!r}; expected float32, float64")
     backends = detect()
     llvm = backends["llvm"]
     name = name or ("llvm" if llvm.usable else "scalar")

@@ -236,6 +236,13 @@ def _shade(panel: Axes, lines: Legs, colours: dict[int, Any], mix: Callable[[Any
     panel.imshow(mix(layers, colours), **style)
 
 
+def _typical(density: Array) -> Array:
+    """The density over what is typical of it, times TYPICAL."""
+    lit = density[density > 0]
+    # The median alone would make a beam black beside faint reflections all over the view; the mean, those white.
+    return density * TYPICAL / math.sqrt(lit.mean() * np.median(lit)) if lit.size else density
+
+
 def _blend(layers: dict[int, Any], colours: dict[int, Any]) -> Any:
     """Densities by colour → RGBA in bytes. What all colours have in common gets the colour of SHARED."""
     shared = layers.pop(SHARED)
@@ -246,9 +253,7 @@ def _blend(layers: dict[int, Any], colours: dict[int, Any]) -> Any:
     mixed = shared[..., None] * colours[SHARED]
     for part, number in zip(parts - common, layers, strict=True):
         mixed += part[..., None] * colours[number]
-    lit = total[total > 0]
-    # The median alone would make a beam black beside faint reflections all over the view; the mean, those white.
-    dense = total * TYPICAL / math.sqrt(lit.mean() * np.median(lit)) if lit.size else total
+    dense = _typical(total)
     colour = np.divide(mixed, total[..., None], out=np.ones_like(mixed), where=total[..., None] > 0)
     pixels = np.dstack([colour, dense / (1 + dense)])  # saturates later than 1 − exp(−dense)
     return (pixels * 255).round().astype(np.uint8)
@@ -259,8 +264,7 @@ def _add_light(layers: dict[int, Any], colours: dict[int, Any]) -> Any:
     light = sum(layers[number][..., None] * np.asarray(colours[number]) for number in layers)
     light = np.clip(light, 0, None)
     peak = light.max(axis=2)
-    lit = peak[peak > 0]
-    dense = peak * TYPICAL / math.sqrt(lit.mean() * np.median(lit)) if lit.size else peak
+    dense = _typical(peak)
     strong = srgb_encode(dense / (1 + dense))
     colour = srgb_encode(np.divide(light, peak[..., None], out=np.ones_like(light), where=peak[..., None] > 0))
     return (np.dstack([colour, strong]) * 255).round().astype(np.uint8)

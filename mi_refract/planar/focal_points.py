@@ -184,20 +184,17 @@ class Axis:
             return Cardinal(afocal=True)
         focal, back, front = float(-1 / c), float(-a / c), float(d / c)
         # |matrix| = n/n' for the media before and behind: what the focal length is to the front, over that to the back.
-        principal = self._front(front + focal * np.linalg.det(self.matrix)), self._back(back - focal)
-        return Cardinal(False, focal, back, front, self._back(back), self._front(front), principal)
+        before, behind = front + focal * np.linalg.det(self.matrix), back - focal
+        back_focus, second = (_along(self.places[-1], self.directions[-1], way) for way in (back, behind))
+        front_focus, first = (_along(self.places[0], self.directions[0], way) for way in (front, before))
+        return Cardinal(False, focal, back, front, back_focus, front_focus, (first, second))
 
     def image(self, h: float, phi: float) -> Point | None:
         """Where rays (h, φ) at the first boundary, and multiples of it, meet; None where they leave parallel."""
         pencil = np.array([h, phi])
         height, turn = self.matrix @ pencil
-        return None if abs(turn) <= LOST * (self.size @ np.abs(pencil))[1] else self._back(-height / turn)
-
-    def _front(self, way: float) -> Point:
-        return _along(self.places[0], self.directions[0], way)
-
-    def _back(self, way: float) -> Point:
-        return _along(self.places[-1], self.directions[-1], way)
+        lost = abs(turn) <= LOST * (self.size @ np.abs(pencil))[1]
+        return None if lost else _along(self.places[-1], self.directions[-1], -height / turn)
 
 
 def _along(place: Array, direction: Array, way: float) -> Point:
@@ -269,9 +266,8 @@ def groups(scene: PlanarScene, traced: Sequence[Branches], plane: Plane | None =
         for beam, reflect in itertools.product(range(int(scene.beams.max()) + 1), np.unique(branches.reflect).tolist()):
             own = np.flatnonzero(escaped & (scene.beams[branches.rays] == beam) & (branches.reflect == reflect))
             if own.size:
-                result.append(
-                    Group(scene.colours[colour], beam, reflect, _of_rays(scene, colour, branches, own, plane))
-                )
+                spread = _of_rays(scene, colour, branches, own, plane)
+                result.append(Group(scene.light.names[colour], beam, reflect, spread))
     return result
 
 

@@ -60,12 +60,12 @@ def of_wavelengths(nm: Sequence[float] | int, power: str = "flat") -> Light:
 
     power: "flat", or "D65" for that of CIE's illuminant, as Mitsuba has it.
     """
-    import mitsuba as mi
-
     spread = np.linspace(*VISIBLE, nm) if isinstance(nm, int) else np.array(nm, float)
     wavelengths = tuple(float(w) for w in spread)
     powers = (1.0,) * len(wavelengths)
     if power == "D65":
+        import mitsuba as mi
+
         if mi.variant() is None:
             activate()
         with mi.util.variant_context("scalar_spectral"):

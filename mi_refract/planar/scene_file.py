@@ -149,33 +149,23 @@ class Boundary(Shape, tag="boundary", kw_only=True):
 def _curves(shape: AnyShape, n: dict[str, Indices]) -> list[tuple[Curve, Indices, Indices]]:
     """Curves around the shape's origin, with the indices on their left and right; `n`: indices by key.
 
-    A closed curve runs counter-clockwise: its inside is on the left.
+    A closed curve runs counter-clockwise: its inside is on the left. The own keys of most kinds are the arguments of
+    the function in `shapes` of their name.
     """
-    outside = n["outside"]
+    outside, tag = n["outside"], type(shape).__struct_config__.tag
+    own = {key: getattr(shape, key) for key in type(shape).__annotations__}
     match shape:
         case Boundary():
             return [(shapes.polyline(shape.points, shape.arcs), n["n_left"], n["n_right"])]
         case Luneburg():
-            layers = shapes.luneburg(shape.radius, shape.layers)
+            layers = shapes.luneburg(**own)
             media = [outside, *(tuple(x * ratio for x in outside) for _, ratio in layers)]
             return [(curve, media[j + 1], media[j]) for j, (curve, _) in enumerate(layers)]
-        case Polygon():
-            curve = shapes.polygon(shape.points, shape.arcs)
-        case Rectangle():
-            curve = shapes.rectangle(shape.width, shape.height)
-        case Prism():
-            curve = shapes.prism(shape.apex, shape.side)
-        case Circle():
-            curve = shapes.circle(shape.radius)
         case Ellipse():
-            curve = shapes.ellipse(*shape.radii)
-        case Lens():
-            curve = shapes.lens(
-                shape.curvature, shape.thickness, radius=shape.radius, conic=shape.conic, vertex=shape.vertex
-            )
+            own = {"rx": shape.radii[0], "ry": shape.radii[1]}
         case EllipseLens():
-            curve = shapes.ellipse_lens(n["n"][0] / outside[0], shape.focal_length, shape.thickness, shape.radius)
-    return [(curve, n["n"], outside)]
+            own["n"] = n["n"][0] / outside[0]
+    return [(getattr(shapes, str(tag))(**own), n["n"], outside)]
 
 
 AnyShape = Polygon | Rectangle | Prism | Circle | Ellipse | Lens | EllipseLens | Luneburg | Boundary
@@ -217,21 +207,6 @@ class Rays(Beam, tag="rays", kw_only=True):
 
 
 AnyBeam = Parallel | Fan | Rays
-
-
-def _rays_of(beam: AnyBeam) -> tuple[Array, Array]:
-    """Origins and directions of length 1, N × 2."""
-    match beam:
-        case Parallel():
-            origins = _spread(np.array(beam.start), np.array(beam.to), beam.count)
-            return origins, np.broadcast_to(_unit_vector("direction", beam.direction), origins.shape)
-        case Fan():
-            angles = _spread(*beam.angles, beam.count)
-            if not np.isfinite(angles).all():
-                raise ValueError(f"angles: {list(beam.angles)}; expected a finite difference")
-            return np.broadcast_to(beam.at, (beam.count, 2)), np.array([unit(angle) for angle in angles])
-        case Rays():
-            return np.array(beam.origins), np.array([_unit_vector("directions", value) for value in beam.directions])
 
 
 def _spread(first: Array | float, last: Array | float, count: int) -> Array:
@@ -323,11 +298,6 @@ class PlanarScene:
     view: Box | None
     fans: tuple[tuple[float, float] | None, ...] = ()
 
-    @property
-    def colours(self) -> tuple[str, ...]:
-        """Names of the colours; ("",) where there is no dispersion."""
-        return self.light.names
-
 
 def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> PlanarScene:
     """Read a scene file. `wavelengths`: in place of those that it names, in nm, or how many.
@@ -340,36 +310,21 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
         raise IsADirectoryError(f"{path}: is a folder; expected a scene file")
     table = parse_toml(regular_file.read_bytes(path, SIZE), SceneTable, str(path))
     title = table.title or path.stem
-    file, heading = printable(path.name), printable(" ".join(title.split()))
+    texts = title, printable(path.name), printable(" ".join(title.split()))
     chosen = table.wavelengths if wavelengths is None else wavelengths
     try:
         if chosen is not None and table.colours:
             raise ValueError("colours and wavelengths are both set; expected one of them")
-        names = Light(tuple(table.colours)) if table.colours else Light()
-        light = names if chosen is None else of_wavelengths(chosen, table.light)
+        light = Light(tuple(table.colours or [""])) if chosen is None else of_wavelengths(chosen, table.light)
         index = light.indices(table.index, "index")
         parts = _parts(table.shape, index, light)
-        origins, directions, beams = _rays(table.beam)
-        segments = boundaries(parts)
+        rays, segments = _rays(table.beam), boundaries(parts)
     except ValueError as error:
         raise ValueError(" ".join(f"{path}: {error}".split())) from None
-    return PlanarScene(
-        path,
-        title,
-        file,
-        heading,
-        light,
-        segments,
-        tuple(Region(part.curve.outline(), part.left) for part in parts if part.curve.closed),
-        index,
-        origins,
-        directions,
-        beams,
-        table.max_depth,
-        table.branches,
-        table.view,
-        tuple(beam.angles if isinstance(beam, Fan) else None for beam in table.beam),
-    )
+    regions = tuple(Region(part.curve.outline(), part.left) for part in parts if part.curve.closed)
+    fans = tuple(beam.angles if isinstance(beam, Fan) else None for beam in table.beam)
+    limits = table.max_depth, table.branches, table.view
+    return PlanarScene(path, *texts, light, segments, regions, index, *rays, *limits, fans)
 
 
 def _parts(tables: Sequence[AnyShape], ambient: Indices, light: Light) -> list[Part]:
@@ -417,6 +372,7 @@ def _check_range(where: str, *points: Array) -> None:
 
 
 def _rays(tables: Sequence[AnyBeam]) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Origins and directions of length 1, N × 2, and the number of each ray's beam."""
     sizes = list(itertools.accumulate(len(b.origins) if isinstance(b, Rays) else b.count for b in tables))
     for j, count in enumerate(sizes):
         if count > RAYS:
@@ -425,9 +381,21 @@ def _rays(tables: Sequence[AnyBeam]) -> tuple[Array, Array, NDArray[np.intp]]:
     for j, beam in enumerate(tables):
         try:
             with np.errstate(all="ignore"):
-                rays.append(_rays_of(beam))
+                match beam:
+                    case Parallel():
+                        origins = _spread(np.array(beam.start), np.array(beam.to), beam.count)
+                        directions = np.broadcast_to(_unit_vector("direction", beam.direction), origins.shape)
+                    case Fan():
+                        origins, angles = np.broadcast_to(beam.at, (beam.count, 2)), _spread(*beam.angles, beam.count)
+                        if not np.isfinite(angles).all():
+                            raise ValueError(f"angles: {list(beam.angles)}; expected a finite difference")
+                        directions = np.array([unit(angle) for angle in angles])
+                    case Rays():
+                        origins = np.array(beam.origins)
+                        directions = np.array([_unit_vector("directions", value) for value in beam.directions])
         except ValueError as error:
             raise ValueError(f"beam[{j}].{error}") from None
-        _check_range(f"beam[{j}]", rays[-1][0])
+        _check_range(f"beam[{j}]", origins)
+        rays.append((origins, directions))
     beams = np.repeat(np.arange(len(rays)), np.diff(sizes, prepend=0))
     return np.concatenate([o for o, _ in rays]), np.concatenate([d for _, d in rays]), beams

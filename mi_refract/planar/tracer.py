@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, DTypeLike
 from mi_refract.formulas import FORMULAS, fresnel, refract_2d
 from mi_refract.numerics import Mask, Number
 
-from .array_backend import ArrayBackend, Index, Scatter, Vector2, choose_backend, negated
+from .array_backend import ArrayBackend, Buffer, Index, Scatter, Vector2, choose_backend, negated
 from .intersect import NOWHERE, ConicArcs, Hit, LineSegments, Ray, cross
 from .segments import REFLECT_BITS, Array, Event, Paths, Segments, finite_array
 
@@ -133,15 +133,15 @@ class Tracer:
             (end,) = dr.while_loop((state,), lambda state: state.active, step, label="planar")
             scatter("directions", 0, _unit(end.ray.d), True)
 
-        buffers = {
-            "points": arrays.buffer(arrays.number, np.nan, (max_depth + 1, count, 2)),
-            "directions": arrays.buffer(arrays.number, np.nan, (1, count, 2)),
-            "hits": arrays.buffer(arrays.signed, -1, (max_depth, count)),
-            "events": arrays.buffer(arrays.byte, int(Event.NONE), (max_depth + 1, count)),
+        buffers: dict[str, Buffer] = {
+            "points": (arrays.number, np.nan, (max_depth + 1, count, 2)),
+            "directions": (arrays.number, np.nan, (1, count, 2)),
+            "hits": (arrays.signed, -1, (max_depth, count)),
+            "events": (arrays.byte, int(Event.NONE), (max_depth + 1, count)),
         }
         if weights:
-            buffers["indices"] = arrays.buffer(arrays.number, np.nan, (max_depth + 1, count))
-            buffers["polarised"] = arrays.buffer(arrays.number, np.nan, (max_depth + 1, count, 2))
+            buffers["indices"] = arrays.number, np.nan, (max_depth + 1, count)
+            buffers["polarised"] = arrays.number, np.nan, (max_depth + 1, count, 2)
         fields = arrays.run(count, buffers, work)
         if self.middle.any():
             fields["points"] = (fields["points"] + self.middle).astype(fields["points"].dtype)

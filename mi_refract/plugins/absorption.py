@@ -7,7 +7,7 @@ is left of white light after the distance `int_colour_distance`: σ = −log(col
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -73,7 +73,7 @@ def read_absorption(plugin: str, props: Properties, side: str) -> Absorption | N
     elif rgb:
         values = tuple(float(x) for x in value)
     elif knots := read_knots(value):
-        values = knots.values
+        values = knots[1]
     if values is None or not all(0 < x <= 1 if length else 0 <= x < math.inf for x in values):
         text = " ".join(str(value).split())
         expected = "a number or a spectrum " + ("above 0 and up to 1" if length else "≥ 0, and finite")
@@ -91,32 +91,27 @@ def read_absorption(plugin: str, props: Properties, side: str) -> Absorption | N
     return Absorption(name, scaled.get_unbounded_texture(name), factor, 0.0)
 
 
-class Knots(NamedTuple):
-    """A piecewise linear function of the wavelength in nm; one knot is a constant."""
+def read_knots(value: Any) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    """The knots of a `<spectrum>` or of a plugin `uniform`, `regular` or `irregular`; None for anything else.
 
-    wavelengths: tuple[float, ...]  # increasing; empty for a constant
-    values: tuple[float, ...]
+    A piecewise linear function: increasing wavelengths in nm, none for a constant, and the values.
+    """
 
+    import numpy as np
 
-def read_knots(value: Any) -> Knots | None:
-    """The knots of a `<spectrum>` or of a plugin `uniform`, `regular` or `irregular`; None for anything else."""
+    def numbers(value: Any) -> tuple[float, ...]:
+        return tuple(np.array(value, float).ravel().tolist())
+
     if type(value).__name__ == "Spectrum":  # `mi.Spectrum` is another class in every variant
-        return Knots(() if value.is_uniform() else _numbers(value.wavelengths), _numbers(value.values))
+        return (() if value.is_uniform() else numbers(value.wavelengths), numbers(value.values))
     kind = value.class_name() if isinstance(value, mi.Object) else ""
     if kind not in ("UniformSpectrum", "RegularSpectrum", "IrregularSpectrum"):
         return None
     shown = mi.traverse(value)
     if kind == "UniformSpectrum":
-        return Knots((), _numbers(shown["value"]))
-    values = _numbers(shown["values"])
+        return (), numbers(shown["value"])
+    values = numbers(shown["values"])
     if kind == "IrregularSpectrum":
-        return Knots(_numbers(shown["wavelengths"]), values)
-    first, last = _numbers(shown["range"])
-    steps = len(values) - 1
-    return Knots(tuple(first + (last - first) * (i / steps) for i in range(len(values))), values)
-
-
-def _numbers(value: Any) -> tuple[float, ...]:
-    import numpy as np
-
-    return tuple(float(x) for x in np.atleast_1d(np.array(value)).ravel())
+        return numbers(shown["wavelengths"]), values
+    (first, last), steps = numbers(shown["range"]), len(values) - 1
+    return tuple(first + (last - first) * (i / steps) for i in range(len(values))), values

@@ -105,10 +105,6 @@ class DispersiveRatio:
             self.exact[key] = self.wide(dr.detach(self.shown[key]) if dr.is_jit_v(self.shown[key]) else number)
         dr.make_opaque(*self.shown.values(), *self.exact.values())
 
-    def lines(self) -> list[str]:
-        """For the plugin's text."""
-        return [f"{side} = {medium.name}" for side, medium in self.sides.items()]
-
 
 class TexturedRatio:
     """n_int/n_ext where one of them, or both, is a texture of numbers."""
@@ -135,10 +131,6 @@ class TexturedRatio:
 
     def changed(self, keys: Collection[str]) -> None:
         """Nothing: textures take over what is set."""
-
-    def lines(self) -> list[str]:
-        """For the plugin's text."""
-        return [f"{side} = {index}" for side, index in self.sides.items()]
 
 
 def read_ratio(v: Variant, props: Properties) -> tuple[DispersiveRatio | TexturedRatio | None, float]:
@@ -196,18 +188,16 @@ def read_index(v: Variant, props: Properties, name: str, default: str) -> Medium
 
     ValueError with plugin, parameter, value and what is expected.
     """
-    value = props.get(name, default)
-    label = f"{PLUGIN}: {name}"
+    value, label = props.get(name, default), f"{PLUGIN}: {name}"
     if isinstance(value, (str, int, float)) and not isinstance(value, bool):
         return media.parse(value, name=label)
-    knots = read_knots(value)
-    if knots is None:
-        if isinstance(value, mi.Object) and hasattr(value, "is_spatially_varying"):
-            return value
-        raise ValueError(f"{label} = {value!r}; expected {EXPECTED}")
-    if not knots.wavelengths:
-        return media.parse(knots.values[0], name=label)
-    table = "table(" + ", ".join(f"{w!r}: {n!r}" for w, n in zip(*knots, strict=True)) + ")"
-    if not v.is_spectral:
-        raise ValueError(f"{label}: this variant makes a spectrum a colour; use the string {name} = {table!r}")
-    return media.parse(table, name=label)
+    if knots := read_knots(value):
+        if not knots[0]:
+            return media.parse(knots[1][0], name=label)
+        table = "table(" + ", ".join(f"{w!r}: {n!r}" for w, n in zip(*knots, strict=True)) + ")"
+        if not v.is_spectral:
+            raise ValueError(f"{label}: this variant makes a spectrum a colour; use the string {name} = {table!r}")
+        return media.parse(table, name=label)
+    if isinstance(value, mi.Object) and hasattr(value, "is_spatially_varying"):
+        return value
+    raise ValueError(f"{label} = {value!r}; expected {EXPECTED}")

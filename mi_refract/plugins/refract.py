@@ -38,7 +38,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refract.formulas import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, fresnel, local_cosines, resolve
-from mi_refract.media import LINES
+from mi_refract.media import LINES, Medium
 from mi_refract.numerics import (
     BSDFSample,
     Interaction,
@@ -414,7 +414,8 @@ def eval_attribute_1(self: Refract, name: str, si: Interaction, active: Mask = T
 def to_string(self: Refract) -> str:
     """The parameters, one a line."""
     chosen = f"{self.formula_name} (auto)" if self.requested == "auto" else self.formula_name
-    lines = self.varying.lines() if self.varying else [f"eta = {self.eta[0]}"]
+    sides = self.varying.sides.items() if self.varying else [("eta", self.eta[0])]
+    lines = [f"{side} = {index.name if isinstance(index, Medium) else index}" for side, index in sides]
     lines += [f"formula = {chosen}", *(f"{name} = {texture}" for name, texture in self.textures.items())]
     lines += [f"{side.name} = {side.texture}" for side in self.absorptions.values() if side]
     return "Refract[\n" + "".join("  " + line.replace("\n", "\n  ") + ",\n" for line in lines) + "]"

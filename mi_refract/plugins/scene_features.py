@@ -19,14 +19,11 @@ import mitsuba as mi
 from mi_refract.numerics import BSDF, Scene, Shape, Variant
 
 # fmt: off
-WRAPPERS = {"BlendBSDF", "BumpMap", "MaskBSDF", "NormalMap", "TwoSidedBRDF"}
-DEPOLARISING = {
-    "Hair", "Measured", "Null", "Principled", "PrincipledThin", "RoughDielectric", "RoughPlastic", "SmoothDiffuse",
-    "SmoothPlastic", "ThinDielectric",
-}
-POLARISING = {
-    "CircularPolarizer", "LinearPolarizer", "LinearRetarder", "MeasuredPolarized", "PolarizedPlastic", "Refract",
-    "RoughConductor", "SmoothConductor", "SmoothDielectric",
+KNOWN = {
+    "BlendBSDF", "BumpMap", "MaskBSDF", "NormalMap", "TwoSidedBRDF",
+    "CircularPolarizer", "Hair", "LinearPolarizer", "LinearRetarder", "Measured", "MeasuredPolarized", "Null",
+    "PolarizedPlastic", "Principled", "PrincipledThin", "Refract", "RoughConductor", "RoughDielectric", "RoughPlastic",
+    "SmoothConductor", "SmoothDielectric", "SmoothDiffuse", "SmoothPlastic", "ThinDielectric",
 }
 KNOWN_SHAPES = {
     "BSplineCurve", "BlenderMesh", "Cube", "Cylinder", "Disk", "Ellipsoids", "EllipsoidsMesh", "LinearCurve", "Mesh",
@@ -58,12 +55,10 @@ class SceneFeatures:
     area: bool  # some shape emits
     environment: bool
     plain_environment: bool  # it has the same radiance in all directions
-    delta_emitters: bool  # some emitter can be found only by sampling it
     both_numbers: bool  # some BSDF samples with `sample1` and with `sample2`, too
     only_glass: bool  # every BSDF has delta lobes only
     textured: bool  # a BSDF or a light may vary over its surface, or with its tangent
     null: bool  # some BSDF has a null lobe
-    polarising: bool  # some BSDF acts on the state of polarisation
     dispersive: bool  # some BSDF refracts by wavelength
     absorbing: bool  # some BSDF has an absorbing medium on one side
     media: bool  # some shape, sensor or emitter has a medium of Mitsuba's
@@ -86,7 +81,6 @@ class SceneFeatures:
             "media": (not self.media, "neither a shape, a sensor nor an emitter has a medium"),
             "null lobes": (not self.null, "no BSDF has one"),
             "textures": (not self.textured, "no BSDF and no area light varies over its surface"),
-            "polarisation": (not self.polarising, "no BSDF acts on it"),
             "dispersion": (not self.dispersive, "no BSDF refracts by wavelength"),
             "absorption": (not self.absorbing, "no BSDF has an absorbing medium on a side"),
         }
@@ -99,7 +93,7 @@ def inspect(scene: Scene) -> SceneFeatures:
     opaque = [shape.class_name() for shape in shapes if shape.class_name() not in KNOWN_SHAPES]
     bsdfs = [bsdf for shape in shapes if not _black(shape.bsdf()) for bsdf in nested(shape.bsdf())]
     names = {bsdf_name(bsdf) for bsdf in bsdfs}
-    unknown = tuple(sorted((names - WRAPPERS - DEPOLARISING - POLARISING) | {*opaque}))
+    unknown = tuple(sorted((names - KNOWN) | {*opaque}))
     everything = bool(unknown)
     lobes = mi.BSDFFlags
     flags = functools.reduce(operator.or_, (bsdf.flags() for bsdf in bsdfs), 0)
@@ -114,8 +108,6 @@ def inspect(scene: Scene) -> SceneFeatures:
         environment=sky is not None,
         plain_environment=sky is not None and sky.class_name() == "ConstantBackgroundEmitter",
         both_numbers=everything or bool(names - EITHER),
-        # An emitter that declares nothing may be anything.
-        delta_emitters=any(not emitter.flags() or emitter.flags() & +mi.EmitterFlags.Delta for emitter in emitters),
         only_glass=not (everything or flags & +(lobes.Smooth | lobes.Delta1D)),
         textured=everything
         or any(
@@ -127,7 +119,6 @@ def inspect(scene: Scene) -> SceneFeatures:
         or not deltas <= WITHOUT_TANGENT
         or not {lamp.class_name() for lamp in lamps} <= PLAIN_LAMPS,
         null=everything or bool(flags & +lobes.Null),
-        polarising=everything or bool(names - WRAPPERS - DEPOLARISING),
         dispersive=everything or any(getattr(bsdf, "dispersive", False) for bsdf in bsdfs),  # no plugin of Mitsuba's is
         absorbing=everything or any(getattr(bsdf, "absorbing", False) for bsdf in bsdfs),
         media=shape_media or any(end.get_medium() for end in (*emitters, *scene.sensors())),

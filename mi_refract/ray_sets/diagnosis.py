@@ -21,6 +21,7 @@ from mi_refract.regimes import Array, Rays
 
 from .judged_answers import F32, Flags, JudgedAnswers, Table
 from .ray_set import indices
+from .tir_signal import unit
 
 Index = NDArray[np.intp]
 
@@ -55,11 +56,6 @@ def refract(a: Array, n: Array, k: Array) -> Array:
     return b
 
 
-def _unit(v: Array) -> Array:
-    unit: Array = v / lengths(v).astype(float)[:, None]
-    return unit
-
-
 # What each mistake answers -----------------------------------------------------------------------------------------
 
 
@@ -68,7 +64,7 @@ def predictions(rays: Rays, exact: oracle.Certified) -> Iterator[tuple[str, str,
 
     NaN where the mistake gives no direction, or programs differ.
     """
-    a, n, k = _unit(rays.a.astype(float)), _unit(rays.n.astype(float)), rays.k.astype(float)
+    a, n, k = unit(rays.a.astype(float)), unit(rays.n.astype(float)), rays.k.astype(float)
     c = (a * n).sum(1, keepdims=True)
     refracted = np.where(exact.transmitted[:, None], exact.direction, np.nan)
 
@@ -113,7 +109,7 @@ def predictions(rays: Rays, exact: oracle.Certified) -> Iterator[tuple[str, str,
     for names, x, y in (("a and n were", given_a, given_n), ("a was", given_a, n), ("n was", a, given_n)):
         radicand, along = 1 - k[:, None] ** 2 * (1 - (x * y).sum(1, keepdims=True) ** 2), (x * y).sum(1, keepdims=True)
         b = k[:, None] * x + y * (np.copysign(np.sqrt(radicand), along) - k[:, None] * along)
-        yield LENGTHS, f"{names} taken for {'unit vectors' if ' and ' in names else 'a unit vector'}", _unit(b)
+        yield LENGTHS, f"{names} taken for {'unit vectors' if ' and ' in names else 'a unit vector'}", unit(b)
 
 
 def _axes() -> Iterator[tuple[str, Array]]:

@@ -21,9 +21,9 @@ import warnings
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence, Sized
+from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,7 @@ MOST_RAYS = 2**28 // len(COLUMNS)  # 3e7: their numbers take 2 GiB, and checking
 TIMEOUT = 300.0  # seconds, of a program
 # The names of the columns, in order. In an .npz file, `ax`, `ay`, `az` are one array, `a`, of the shape (N, 3).
 Layout = tuple[str, ...]
+T = TypeVar("T")
 
 # Visual C++ and others print a NaN as nan(ind) or the like; C has letters, digits and _ between the brackets.
 _NAN = re.compile(r"nan\([A-Za-z0-9_]{0,32}\)", re.IGNORECASE)
@@ -72,19 +73,9 @@ _BROKEN_NPZ = (
 def write(path: str | Path, rays: RaySet) -> Path:
     """Write .csv or .npz, completely or not at all. ValueError for another file ending; OSError where that fails."""
     path = writable(path, SUFFIXES)
-    write_atomically(path, as_csv(rays) if path.suffix.lower() == ".csv" else _as_npz(rays))
-    return path
-
-
-def as_csv(rays: RaySet) -> str:
-    """The text of the CSV file."""
-    columns, header = RAY_LAYOUTS[headers.has_media(rays.header)], rays.header
-    top = [f"# {key}: {value if value == _value(value) else json.dumps(value)}" for key, value in header.items()]
-    row = ",".join("%d" if name in ("id", "medium") else "%r" for name in columns)
-    return "\n".join([*top, ",".join(columns), *(row % tuple(x) for x in rays.numbers.tolist()), ""])
-
-
-def _as_npz(rays: RaySet) -> bytes:
+    if path.suffix.lower() == ".csv":
+        write_atomically(path, as_csv(rays))
+        return path
     n_from, n_to = indices(rays.rays.k)
     arrays = {"id": rays.ids, "a": rays.rays.a, "n": rays.rays.n, "n_from": n_from, "n_to": n_to}
     if headers.has_media(rays.header):
@@ -96,7 +87,16 @@ def _as_npz(rays: RaySet) -> bytes:
             # A ZipInfo made here has a fixed date: the same set gives the same bytes.
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as file:
                 np.lib.format.write_array(file, np.asanyarray(array), allow_pickle=False)
-    return buffer.getvalue()
+    write_atomically(path, buffer.getvalue())
+    return path
+
+
+def as_csv(rays: RaySet) -> str:
+    """The text of the CSV file."""
+    columns, header = RAY_LAYOUTS[headers.has_media(rays.header)], rays.header
+    top = [f"# {key}: {value if value == _value(value) else json.dumps(value)}" for key, value in header.items()]
+    row = ",".join("%d" if name in ("id", "medium") else "%r" for name in columns)
+    return "\n".join([*top, ",".join(columns), *(row % tuple(x) for x in rays.numbers.tolist()), ""])
 
 
 def read(path: str | Path) -> RaySet:
@@ -105,11 +105,7 @@ def read(path: str | Path) -> RaySet:
     ValueError, one line, for another format, more than MOST_RAYS, a missing header, a cell that is not a number, or a
     checksum that does not match (a file that was edited or cut short). OSError where the file cannot be read.
     """
-    table = _read_table(Path(path), RAY_LAYOUTS, MOST_RAYS)
-    try:
-        return _rays(table)
-    except ValueError as error:
-        raise ValueError(f"{path}: {one_line(str(error))}") from None
+    return _read(Path(path), RAY_LAYOUTS, MOST_RAYS, _rays)
 
 
 def _rays(table: Table) -> RaySet:
@@ -139,13 +135,16 @@ def read_answers(path: str | Path, *, most: int = MOST_RAYS) -> Answers:
 
     ValueError, one line, where it holds none, or more. OSError where it cannot be read.
     """
-    return _answers(str(path), _read_table(Path(path), ANSWER_LAYOUTS, most))
+    return _read(Path(path), ANSWER_LAYOUTS, most, _answers)
 
 
 def parse_answers(text: str | bytes, name: str = "answers") -> Answers:
     """The answers in the text of a CSV file. ValueError, one line that begins with `name`, where it holds none."""
     stream = io.BytesIO(text.encode() if isinstance(text, str) else text)
-    return _answers(name, _read_csv(name, stream, ANSWER_LAYOUTS, MOST_RAYS))
+    try:
+        return _answers(_read_csv(stream, ANSWER_LAYOUTS, MOST_RAYS))
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
 
 
 def most_answers(rays: Sized) -> int:
@@ -153,17 +152,17 @@ def most_answers(rays: Sized) -> int:
     return 2 * len(rays) + 100
 
 
-def _answers(name: str, table: Table) -> Answers:
+def _answers(table: Table) -> Answers:
     columns = dict(zip(table.columns, table.numbers.T, strict=True))
     ids, transmitted, ratios = columns["id"], columns.get(TRANSMITTED), columns.get(N_RATIO)
     if len(wrong := ids[~(np.abs(ids) < 2**53) | (np.rint(ids) != ids)]):
         text = f"{len(wrong)} ids are not whole numbers below 2^53, the first is {wrong[0]:g}"
-        raise ValueError(f"{name}: {text}; expected the ids of the rays")
+        raise ValueError(f"{text}; expected the ids of the rays")
     if transmitted is not None and len(wrong := transmitted[~np.isin(transmitted, (0, 1))]):
-        raise ValueError(f"{name}: {TRANSMITTED} is {wrong[0]} for {len(wrong)} rays; expected 0 or 1")
+        raise ValueError(f"{TRANSMITTED} is {wrong[0]} for {len(wrong)} rays; expected 0 or 1")
     if ratios is not None and len(wrong := ratios[~((ratios >= LEAST_RATIO) & (ratios <= 1 / LEAST_RATIO))]):
         text = f"{N_RATIO} is {wrong[0]:g} for {len(wrong)} rays"
-        raise ValueError(f"{name}: {text}; expected n_from / n_to, {LEAST_RATIO:g} … {1 / LEAST_RATIO:g}")
+        raise ValueError(f"{text}; expected n_from / n_to, {LEAST_RATIO:g} … {1 / LEAST_RATIO:g}")
     return Answers(ids.astype(np.int64), table.numbers[:, 1:4], transmitted, table.header, ratios)
 
 
@@ -211,29 +210,32 @@ class Table(NamedTuple):
     numbers: Array
 
 
-def _read_table(path: Path, layouts: Sequence[Layout], most: int) -> Table:
-    """The table in a file, with `most` rows at most, in one of the layouts: of .npz in the largest one that is there.
+def _read(path: Path, layouts: Sequence[Layout], most: int, made: Callable[[Table], T]) -> T:
+    """What is made of the table in a file, which has `most` rows at most, in one of the layouts.
 
     ValueError, one line that begins with the path, for another format, or what is no such table. OSError where the file
     cannot be read.
     """
-    if path.suffix.lower() not in SUFFIXES:
+    if (suffix := path.suffix.lower()) not in SUFFIXES:
         raise ValueError(f"{path}: expected a file name that ends in {' or '.join(SUFFIXES)}")
-    if path.suffix.lower() == ".npz":
-        return _read_npz(path, layouts, most)
-    with regular_file.opened(path, most * _ROW_BYTES + _TOP_BYTES) as stream:
-        return _read_csv(str(path), stream, layouts, most)
+    numbers = most * _NUMBER_BYTES * max(map(len, layouts))
+    largest = numbers + _NPZ_MORE_BYTES if suffix == ".npz" else most * _ROW_BYTES + _TOP_BYTES
+    with regular_file.opened(path, largest) as stream:
+        try:
+            return made(_READERS[suffix](stream, layouts, most))
+        except ValueError as error:
+            raise ValueError(f"{path}: {one_line(str(error))}") from None
 
 
 class _TooLongError(ValueError):
     """A line, or a table."""
 
 
-def _read_csv(name: str, stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
+def _read_csv(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
     """The table in CSV text, whose names of columns are one of the layouts, in order.
 
-    ValueError, one line that begins with `name`: bytes that are not text, other columns, a row that is too short, too
-    long, or not of numbers, or more than `most` rows.
+    ValueError, one line: bytes that are not text, other columns, a row that is too short, too long, or not of numbers,
+    or more than `most` rows.
     """
     number, line, rows_left = 0, "", most + 1  # with the names of the columns
 
@@ -269,11 +271,9 @@ def _read_csv(name: str, stream: BinaryIO, layouts: Sequence[Layout], most: int)
                 except ValueError:
                     numbers = np.empty((1, 0))
     except UnicodeDecodeError:
-        raise ValueError(f"{name}: not text; expected CSV in UTF-8") from None
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from None
+        raise ValueError("not text; expected CSV in UTF-8") from None
     if len(numbers) and numbers.shape[1] != len(columns):
-        raise ValueError(f"{name}: line {number} is {line.rstrip()[:60]!r}; expected {len(columns)} numbers")
+        raise ValueError(f"line {number} is {line.rstrip()[:60]!r}; expected {len(columns)} numbers")
     return Table(header, columns, numbers.reshape(-1, len(columns)))
 
 
@@ -287,29 +287,30 @@ def _value(text: Any) -> Any:
         return None
 
 
-def _read_npz(path: Path, layouts: Sequence[Layout], most: int) -> Table:
-    """Other arrays, and those that are too large, are not unpacked."""
+def _read_npz(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
+    """The table in an archive, in the largest layout that is there; no other array is unpacked.
+
+    ValueError, one line, for what is no such archive, and for arrays that are too large, before they are unpacked.
+    """
 
     def array_name(column: str) -> str:
         return column[0] if len(column) == 2 and column[1] in "xyz" else column
 
-    largest = most * _NUMBER_BYTES * max(map(len, layouts)) + _NPZ_MORE_BYTES
-    with regular_file.opened(path, largest) as stream:
-        try:
-            with zipfile.ZipFile(stream) as archive:
-                members = {name.removesuffix(".npy") for name in archive.namelist()}
-                whole = [layout for layout in layouts if all(array_name(column) in members for column in layout)]
-                columns = max(whole, key=len, default=layouts[0])
-                widths = Counter(map(array_name, columns))
-                arrays = {name: _numbers(archive, name, width, most) for name, width in widths.items()}
-                if len({len(array) for array in arrays.values()}) > 1:
-                    raise ValueError(", ".join(f"{name} has {len(array)} rows" for name, array in arrays.items()))
-                text = _array(archive, "header", _NPZ_HEADER_BYTES) if "header" in members else np.array("")
-                if text.shape or text.dtype.kind != "U":
-                    raise ValueError(f"header is {text.dtype} of the shape {text.shape}, not text")
-        except _BROKEN_NPZ as error:
-            found, expected = one_line(str(error)) or type(error).__name__, dict.fromkeys(map(array_name, layouts[0]))
-            raise ValueError(f"{path}: {found}; expected an .npz file with {', '.join(expected)}") from None
+    try:
+        with zipfile.ZipFile(stream) as archive:
+            members = {name.removesuffix(".npy") for name in archive.namelist()}
+            whole = [layout for layout in layouts if all(array_name(column) in members for column in layout)]
+            columns = max(whole, key=len, default=layouts[0])
+            widths = Counter(map(array_name, columns))
+            arrays = {name: _numbers(archive, name, width, most) for name, width in widths.items()}
+            if len({len(array) for array in arrays.values()}) > 1:
+                raise ValueError(", ".join(f"{name} has {len(array)} rows" for name, array in arrays.items()))
+            text = _array(archive, "header", _NPZ_HEADER_BYTES) if "header" in members else np.array("")
+            if text.shape or text.dtype.kind != "U":
+                raise ValueError(f"header is {text.dtype} of the shape {text.shape}, not text")
+    except _BROKEN_NPZ as error:
+        found, expected = one_line(str(error)) or type(error).__name__, dict.fromkeys(map(array_name, layouts[0]))
+        raise ValueError(f"{found}; expected an .npz file with {', '.join(expected)}") from None
     header = _value(str(text))
     return Table(header if isinstance(header, dict) else {}, columns, np.hstack(list(arrays.values())))
 
@@ -342,3 +343,6 @@ def _array(archive: zipfile.ZipFile, name: str, most: int) -> NDArray[Any]:
         if stream.read(1):
             raise ValueError(f"{name} is longer than its shape, {array.shape}")
     return array
+
+
+_READERS = {".csv": _read_csv, ".npz": _read_npz}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -49,19 +48,19 @@ class SeenAnswers:
         return np.asarray(ALONG * self.u * np.maximum(1.0, self.rays.k.astype(float)))
 
 
-def _unit(v: Array) -> Array:
-    unit: Array = v.astype(float) / lengths(v).astype(float)[:, None]
-    return unit
+def unit(v: Array) -> Array:
+    """Vectors (N, 3) of length 1, in float64."""
+    return np.asarray(v.astype(float) / lengths(v).astype(float)[:, None])
 
 
 def _is_mirrored(seen: SeenAnswers) -> Flags:
     """(N,) whether b is nearer to the mirror direction than to the transmitted one, or to the surface where nothing is
     transmitted. Where these two directions are one, the exact answer decides.
     """
-    a, n, transmitted = _unit(seen.rays.a), _unit(seen.rays.n), seen.exact.transmitted
+    a, n, transmitted = unit(seen.rays.a), unit(seen.rays.n), seen.exact.transmitted
     normal = (a * n).sum(1, keepdims=True) * n
     with np.errstate(all="ignore"):
-        onward = np.where(transmitted[:, None], seen.exact.direction, _unit(a - normal))
+        onward = np.where(transmitted[:, None], seen.exact.direction, unit(a - normal))
         b = seen.b / np.sqrt((seen.b * seen.b).sum(1, keepdims=True))
         to_mirror, to_onward = (np.sqrt(((b - end) ** 2).sum(1)) for end in (a - 2 * normal, onward))
         return np.where(np.abs(to_mirror - to_onward) <= seen.tolerance, ~transmitted, to_mirror < to_onward)
@@ -70,7 +69,7 @@ def _is_mirrored(seen: SeenAnswers) -> Flags:
 def _is_tangent(seen: SeenAnswers) -> Flags:
     """(N,) whether b is along the surface, at any length, and the exact direction is not a transmitted one like it."""
     with np.errstate(all="ignore"):
-        cosine = np.abs((_unit(seen.rays.n) * seen.b).sum(1))
+        cosine = np.abs((unit(seen.rays.n) * seen.b).sum(1))
         along = cosine <= seen.tolerance * np.maximum(1, lengths(seen.b).astype(float))
     return np.asarray(along & seen.is_direction & ~(seen.exact.transmitted & (seen.exact.cos_t <= 2 * seen.tolerance)))
 
@@ -88,21 +87,17 @@ def detect(pieces: Iterable[SeenAnswers]) -> str:
 
     Where some rays are far beyond the critical angle, they decide alone.
     """
-    votes = {"total": Counter[str](), "certain": Counter[str]()}
-    rays = Counter[str]()
+    counts = np.zeros((2, 1 + len(DETECTORS)), int)  # rays, and those that use each signal: of all, of those far beyond
     for seen in pieces:
         reflects = ~seen.exact.transmitted & (seen.exact.cos_i > 0)
         bound = FORMULAS[LOOSEST].budget.radicand_error_bound(seen.u, seen.rays.k.astype(float))
         far = reflects & (absolute_radicand(seen.rays) > np.maximum(CERTAIN, bound))
-        signals = {name: detector(seen) for name, detector in DETECTORS.items()}
-        for group, mask in (("total", reflects), ("certain", far)):
-            rays[group] += int(mask.sum())
-            votes[group].update({name: int((mask & signal).sum()) for name, signal in signals.items()})
-    group = "certain" if rays["certain"] else "total"
-    if not rays[group]:
+        signals = np.array([np.ones(len(far), bool), *(detector(seen) for detector in DETECTORS.values())])
+        counts += [(mask & signals).sum(1) for mask in (reflects, far)]
+    rays, *votes = counts[1 if counts[1, 0] else 0].tolist()
+    if not rays:
         return NONE
-    ((best, most),) = votes[group].most_common(1)
-    return best if most >= AGREEING * rays[group] else UNCLEAR
+    return list(DETECTORS)[int(np.argmax(votes))] if max(votes) >= AGREEING * rays else UNCLEAR
 
 
 def reflected(seen: SeenAnswers, transmitted: Flags | None, tir: str, decided: Flags) -> Flags:

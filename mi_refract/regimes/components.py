@@ -117,22 +117,18 @@ def exactly_critical(rng: Generator, n: Array) -> Triple:
     x, y, z, k = _solutions()[rng.integers(0, len(_solutions()), count)].T
     small = rng.integers(-7, 8, (4, count)).astype(float)
     small[0][~small.any(axis=0)] = 1
-    rotation = _rotation(*small)
+    w, x_, y_, z_ = small
+    ww, xx, yy, zz = small * small
+    rotation = np.array(
+        [
+            [ww + xx - yy - zz, 2 * (x_ * y_ - w * z_), 2 * (x_ * z_ + w * y_)],
+            [2 * (x_ * y_ + w * z_), ww - xx + yy - zz, 2 * (y_ * z_ - w * x_)],
+            [2 * (x_ * z_ - w * y_), 2 * (y_ * z_ + w * x_), ww - xx - yy + zz],
+        ]
+    )
     local = np.stack([x * either(rng, count), y * either(rng, count), z * either(rng, count)], axis=1)
     a = np.einsum("ijn,nj->ni", rotation, local)
     return a * power_of_two(rng, count), rotation[:, 2].T * power_of_two(rng, count), k
-
-
-def _rotation(w: Array, x: Array, y: Array, z: Array) -> Array:
-    """(3, 3, N): the rotation of the quaternion times w² + x² + y² + z²."""
-    ww, xx, yy, zz = w * w, x * x, y * y, z * z
-    return np.array(
-        [
-            [ww + xx - yy - zz, 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), ww - xx + yy - zz, 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), ww - xx - yy + zz],
-        ]
-    )
 
 
 # As near to the critical angle as the precision allows ----------------------------------------------------------------

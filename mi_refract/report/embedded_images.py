@@ -30,11 +30,6 @@ class EmbeddedImages:
         self.embedded: list[dict[str, Any]] = []
         self._files: dict[str, dict[str, Any]] = {}
 
-    @property
-    def size(self) -> int:
-        """Bytes on the page."""
-        return sum(len(image["data"]) for image in self.embedded)
-
     def embed(self, path: str) -> dict[str, Any]:
         """Key, width, height and data of an image, whole, by its path relative to the folder.
 

@@ -35,36 +35,6 @@ def write_json(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]
     write_atomically(path, text + "\n")
 
 
-def read_json(path: str | Path) -> tuple[list[Row], dict[str, Any]]:
-    """Read what `write_json` wrote. In `replay` and the context, non-finite numbers stay words.
-
-    Errors: a one-line ValueError naming the file for another schema, a malformed document, or a verdict that
-    does not follow from its row; OSError.
-    """
-    import msgspec
-
-    try:
-        document = msgspec.json.decode(Path(path).read_bytes(), type=dict[str, Any])
-        if document.get("schema") != SCHEMA:
-            raise ValueError(f"schema {document.get('schema')!r}; expected {SCHEMA}")
-        rows = []
-        for number, data in enumerate(document["rows"]):
-            try:
-                rows.append(row := Row.from_dict(data))
-            except ValueError as error:
-                raise ValueError(f"$.rows[{number}]: {error}") from error
-            if data.get("verdict") != row.verdict:
-                said = f"verdict {data.get('verdict')!r}; expected {row.verdict!r}, as the values say"
-                raise ValueError(f"$.rows[{number}]: {said}")
-        return rows, dict(document["context"])
-    except RecursionError:
-        raise ValueError(f"{path}: brackets nested too deeply; expected JSON as `write_json` writes it") from None
-    except KeyError as error:
-        raise ValueError(f"{path}: {error} is missing") from error
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
-
-
 def verdict(rows: Sequence[Row]) -> str:
     """One sentence: how many checks (budgets that were measured) passed or failed, how many rows were not run."""
     measured = sum(len(row.budgets) for row in rows if row.values)

@@ -177,6 +177,16 @@ def _study(name: str, rows: list[Row], context: Mapping[str, Any], images: Embed
     ]
     scatters = [scatter for scatter in context.get("scatter", ()) if scatter["study"] == name]
     drawn = [_scatter(scatter, rows, f"{key}-scatter-{i}") for i, scatter in enumerate(scatters)]
+    figures = []
+    for row in rows:
+        if row.images:
+            roles = sorted(row.images, key=lambda role: ROLES.index(role) if role in ROLES else len(ROLES))
+            paints = {role: ("signed", 3) if role == "difference" else ("light", None) for role in roles}
+            panes = [
+                {"role": role, "paint": paint, "gain": gain} | images.embed(row.images[role])
+                for role, (paint, gain) in paints.items()
+            ]
+            figures.append({"row": row, "panes": panes, "paired": roles[:2] == ["reference", "test"]})
     positive = [x for row in rows if 0 < (x := row.values.get(metrics[0], 0)) < math.inf] if metrics else []
     scale = (min(positive), max(positive)) if positive else None
     return {
@@ -192,7 +202,7 @@ def _study(name: str, rows: list[Row], context: Mapping[str, Any], images: Embed
         "count": len(rows),
         "scatters": [scatter for scatter in drawn if scatter],
         "plots": plots,
-        "figures": [_figure(row, images) for row in rows if row.images],
+        "figures": figures,
     }
 
 
@@ -268,17 +278,3 @@ def _scatter(scatter: Mapping[str, Any], rows: list[Row], salt: str) -> dict[str
     axes = Axes(x, y, x_scale="linear")
     svg = scatter_svg(panels, axes, floor=floor, front=scatter.get("front", False), salt=salt)
     return {"title": scatter.get("title", f"{y} against {x}"), "svg": svg, "omitted": _undrawn(lines, axes)}
-
-
-def _figure(row: Row, images: EmbeddedImages) -> dict[str, Any]:
-    roles = sorted(row.images, key=lambda role: ROLES.index(role) if role in ROLES else len(ROLES))
-    panes = [
-        {
-            "role": role,
-            "paint": "signed" if role == "difference" else "light",
-            "gain": 3 if role == "difference" else None,
-        }
-        | images.embed(row.images[role])
-        for role in roles
-    ]
-    return {"row": row, "panes": panes, "paired": roles[:2] == ["reference", "test"]}

@@ -42,7 +42,15 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) ->
         elif child.kind == "Sensor" and camera is None:
             camera = _camera(child)
         elif child.kind == "Integrator" and max_depth is None:
-            max_depth = _max_depth(child)
+            if child.type not in INTEGRATORS:
+                raise child.error("this integrator is not supported", ", ".join(INTEGRATORS))
+            max_depth = child.value(int, "max_depth", -1)
+            if max_depth < 1:
+                raise child.error(f"max_depth = {max_depth}", "a positive whole number")
+            if child.value(bool, "hide_emitters", False):
+                raise child.error("hide_emitters", "false")
+            child.ignore("rr_depth")
+            child.finish()
         elif child.kind == "Emitter" and sky is None:
             sky = _sky(child)
         elif child.kind != "BSDF":  # a named BSDF is read with the shapes that use it
@@ -55,19 +63,6 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) ->
     return PlainScene(path.stem, with_unique_names(shapes), sky or (0.0, 0.0, 0.0), camera, max_depth)
 
 
-def _max_depth(integrator: Node) -> int:
-    if integrator.type not in INTEGRATORS:
-        raise integrator.error("this integrator is not supported", ", ".join(INTEGRATORS))
-    depth = integrator.value(int, "max_depth", -1)
-    if depth < 1:
-        raise integrator.error(f"max_depth = {depth}", "a positive whole number")
-    if integrator.value(bool, "hide_emitters", False):
-        raise integrator.error("hide_emitters", "false")
-    integrator.ignore("rr_depth")
-    integrator.finish()
-    return depth
-
-
 def _camera(sensor: Node) -> Camera:
     """A perspective sensor. Clip planes are ignored: they are assumed to cut nothing away."""
     if sensor.type != "perspective":
@@ -76,19 +71,18 @@ def _camera(sensor: Node) -> Camera:
     width = height = 0
     for child in sensor.children():
         if child.kind == "Film":
-            width, height = _film(child)
+            if filters := [kernel for kernel in child.children() if kernel.type != "box"]:
+                raise filters[0].error("a reconstruction filter", "box")
+            child.ignore("pixel_format", "component_format", "file_format")
+            width, height = child.value(int, "width", 768), child.value(int, "height", 576)
+            if min(width, height) < 1:
+                raise child.error(f"{width} × {height} pixels", "at least one")
+            child.finish()
         elif child.kind != "Sampler":
             raise child.error(f"a {child.kind.lower()} of a sensor", "a film and a sampler")
     sensor.ignore("near_clip", "far_clip", "focus_distance")
     axes, origin = frame[:3, :3] / np.linalg.norm(frame[:3, :3], axis=0), frame[:3, 3]
     (x, y, z), (to_x, to_y, to_z), (up_x, up_y, up_z) = np.stack([origin, origin + axes[:, 2], axes[:, 1]]).tolist()
-    fov = _fov_x(sensor, width, height)
-    sensor.finish()
-    return Camera((x, y, z), (to_x, to_y, to_z), (up_x, up_y, up_z), fov, width, height)
-
-
-def _fov_x(sensor: Node, width: int, height: int) -> float:
-    """The angle between the left and the right border of the image, in degrees."""
     fov, axis = sensor.value(float, "fov"), sensor.value(str, "fov_axis", "x")
     if not 0 < fov < 180:
         raise sensor.error(f"fov = {fov}", "an angle of 0 to 180 degrees")
@@ -96,19 +90,9 @@ def _fov_x(sensor: Node, width: int, height: int) -> float:
     lengths |= {"smaller": min(width, height), "larger": max(width, height)}
     if axis not in lengths:
         raise sensor.error(f"fov_axis = {axis!r}", ", ".join(lengths))
-    return math.degrees(2 * math.atan(math.tan(math.radians(fov) / 2) * width / lengths[axis]))
-
-
-def _film(film: Node) -> tuple[int, int]:
-    for child in film.children():
-        if child.type != "box":
-            raise child.error("a reconstruction filter", "box")
-    film.ignore("pixel_format", "component_format", "file_format")
-    width, height = film.value(int, "width", 768), film.value(int, "height", 576)
-    if min(width, height) < 1:
-        raise film.error(f"{width} × {height} pixels", "at least one")
-    film.finish()
-    return width, height
+    fov_x = math.degrees(2 * math.atan(math.tan(math.radians(fov) / 2) * width / lengths[axis]))
+    sensor.finish()
+    return Camera((x, y, z), (to_x, to_y, to_z), (up_x, up_y, up_z), fov_x, width, height)
 
 
 def _sky(emitter: Node) -> Colour | Environment:

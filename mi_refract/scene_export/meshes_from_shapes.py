@@ -115,32 +115,29 @@ def _parts(shape: Node, surface: Surface, level: int) -> tuple[Triangles, ...]:
 
 def _frame(shape: Node) -> Vertices:
     """(4, 4): from the coordinates of `_parts` to the scene's."""
+
+    def positive(name: str, value: float) -> float:
+        if value <= 0:
+            raise shape.error(f"{name} = {value}", "a positive number")
+        return value
+
     frame, local = shape.transform(), np.eye(4)
     if shape.type == "sphere":
         local[:3, 3] = shape.point("center", (0, 0, 0))
-        local[:3, :3] *= _positive(shape, "radius", shape.value(float, "radius", 1.0))
+        local[:3, :3] *= positive("radius", shape.value(float, "radius", 1.0))
     elif shape.type == "cylinder":
         start, end = (shape.point(name, (0, 0, z)) for name, z in (("p0", 0), ("p1", 1)))
-        radius = _positive(shape, "radius", shape.value(float, "radius", 1.0))
-        length = _positive(shape, "length", float(np.linalg.norm(end - start)))
+        radius = positive("radius", shape.value(float, "radius", 1.0))
+        length = positive("length", float(np.linalg.norm(end - start)))
+        # An orthonormal, right-handed basis; the identity for an axis (0, 0, 1). Duff et al. 2017.
+        x, y, z = axis = (end - start) / length
+        sign = np.copysign(1.0, z)
+        a = -1 / (sign + z)
+        b = x * y * a
+        basis = np.stack([[1 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y], axis], axis=1)
         local[:3, 3] = start
-        local[:3, :3] = _basis((end - start) / length) * [radius, radius, length]
+        local[:3, :3] = basis * [radius, radius, length]
     return frame @ local
-
-
-def _positive(shape: Node, name: str, value: float) -> float:
-    if value <= 0:
-        raise shape.error(f"{name} = {value}", "a positive number")
-    return value
-
-
-def _basis(z: Vertices) -> Vertices:
-    """(3, 3): an orthonormal, right-handed basis with last column z; the identity for (0, 0, 1). Duff et al. 2017."""
-    x, y, _ = z
-    sign = np.copysign(1.0, z[2])
-    a = -1 / (sign + z[2])
-    b = x * y * a
-    return np.stack([[1 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y], z], axis=1)
 
 
 def _surface(shape: Node) -> Surface:

@@ -6,17 +6,13 @@ import html
 import importlib.util
 import json
 import shlex
-import sys
 from xml.etree import ElementTree
 
-import numpy as np
 import pytest
 from support.diff_images import BROKEN, image, samples, tree
 
 from mi_refract.image_diff import methods, results_file, text_reports
 from mi_refract.image_diff.results import Result, Results, Status
-from mi_refract.io import errors
-from mi_refract.io.image_file import read, write_exr
 
 EVIL = 'a"b<script>alert(1)<∕script>|`*[x](y)*`,:%0A::error::.exr'
 
@@ -45,94 +41,29 @@ def test_inconclusive_renders(run, tmp_path):
         assert (code, err, out.splitlines()[-1]) == (expected, "", "1 image: 1 inconclusive")
         failures = ElementTree.parse(junit).findall(".//failure")
         assert [each.get("type") for each in failures] == ([] if word == "pass" else ["inconclusive"])
-
-
-def test_renders_that_hold_their_variance_are_compared_by_welch(run, tmp_path):
-    """Without any option; the table says why. `tolerance`, asked for, does not compare the variance."""
-    rng, header = np.random.default_rng(1), {"mi_refract:spp": 32, "mi_refract:variance_freedom": 7}
-    for name, gain in (("old", 1.0), ("new", 1.0), ("off", 1.2)):
-        passes = gain + rng.standard_normal((8, 16, 16, 3)) / 40
-        pixels = np.concatenate([passes.mean(0), 4 * passes.var(0, ddof=1)], -1)
-        write_exr(tmp_path / f"{name}.exr", pixels, (*"RGB", "R.variance", "G.variance", "B.variance"), header)
-    old, new, off = (tmp_path / f"{name}.exr" for name in ("old", "new", "off"))
-    for test, word, expected in ((new, "equal", 0), (off, "different", 1)):
-        code, out, err = run("diff", old, test)
-        assert (code, err) == (expected, "") and out.splitlines()[1].startswith(word)
-        assert " welch (the variance of both is known) " in out
-    assert run("diff", old, new, "--method", "tolerance", "--set", "fail=0.1", "--set", "fail_relative=0.1")[0] == 0
-
-
-@pytest.mark.parametrize("method", methods.METHODS)
-def test_every_method(run, pair, tmp_path, method):
-    (old, new), more, out = pair, [], tmp_path / "out.json"
-    if methods.METHODS[method].takes_renders:
-        old, new, more = samples(tmp_path / "s"), samples(tmp_path / "t", first=100, gain=2.0), ["--renders"]
-    assert run("diff", old, new, "--method", method, "--json", out, *more)[0] == 1
-    assert json.loads(out.read_text())["results"][0]["method"] == method
+        assert "welch" in out
 
 
 @pytest.mark.parametrize(
     ("words", "code"),
     [
+        *((f"--method {method}", 1) for method, one in methods.METHODS.items() if not one.takes_renders),
         ("--method tolerance --set fail=0.2 --set hard_fail=1", 0),
         ("--method tolerance --set fail_percent=100 --set hard_fail=0.01", 1),
         ("--set spp=16", 1),  # counts where `welch` is chosen: one setting serves a folder of both
         ("--set ignore=[[0,0,48,31]] --set fail=0.01", 1),
     ],
 )
-def test_settings_in_words(run, pair, words, code):
+def test_methods_and_settings_in_words(run, pair, words, code):
     assert run("diff", *pair, *words.split())[0] == code
 
 
-def test_nan_has_to_be_allowed(run, pair):
-    for folder in pair:
-        image(folder / "louder.exr", value=np.nan)
-    assert run("diff", *pair)[0] == 1
-    assert run("diff", *pair, "--set", "allow_nonfinite=true")[0] == 0
-    image(pair[1] / "louder.exr", value=np.inf)
-    assert run("diff", *pair, "--set", "allow_nonfinite=true")[0] == 1
-
-
-def test_the_methods_are_printed_without_images(run, monkeypatch):
+def test_the_methods_are_printed_without_images(run):
     code, out, err = run("diff", "--methods")
     assert (code, err) == (0, "")
     for name, method in methods.METHODS.items():
         assert f"`{name}`: {method.summary}" in out
         assert all(f"| `{option}` |" in out for option in method.options)
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
-    code, out, err = run("diff", "--methods")  # as tables
-    assert (code, err) == (0, "") and "fail_relative" in out and "|---|" not in out
-
-
-VARIANCE = ("--set", "variance={stem}_var.exr")
-
-
-def test_a_variance_beside_the_reference_and_channels(run, tmp_path):
-    """A reference of 1000 samples with its variance, and new images of 200: an equal one, and one 3 % brighter."""
-    mean, rng = np.ones((32, 32, 3)), np.random.default_rng(8)
-    old, new, out = tmp_path / "old", tmp_path / "new", tmp_path / "a.json"
-    for folder, spp, gains in ((old, 1000, (1, 1)), (new, 200, (1, 1.03))):
-        folder.mkdir()
-        for name, gain in zip(("equal", "off"), gains, strict=True):
-            write_exr(folder / f"{name}.exr", gain * rng.gamma(spp, mean / spp))
-    for name in ("equal", "off"):
-        write_exr(old / f"{name}_var.exr", mean)
-    words = (*VARIANCE, "--set", "spp_reference=1000")
-    code, said, err = run("diff", old, new, *words, "--set", "spp_test=200")
-    assert (code, err) == (1, "")
-    rows = [line.split()[:3] for line in said.splitlines()[1:3]]
-    assert rows == [["different", "off.exr", "welch"], ["equal", "equal.exr", "welch"]]
-    code, _, err = run("diff", old, new, *words)
-    assert (code, len(err.splitlines())) == (2, 2) and "expected `spp` or `spp_test`" in err
-    assert run("diff", old, new, *words, "--set", "spp_test=1")[0] == 2
-    broken = read(new / "equal.exr").pixels.copy()
-    broken[..., 2] *= 2
-    write_exr(new / "equal.exr", broken)
-    words = ("equal.exr", *VARIANCE, "--set", "spp=200", "--json", out)
-    for channels, code in (("R,G,B", 1), ("R,G", 0), ("R=G,G=R", 0), ("Q", 2)):
-        assert run("diff", old, new, *words, "--set", f"channels={channels}")[0] == code
-        (entry,) = json.loads(out.read_text())["results"]
-        assert run(*shlex.split(entry["reproduce"])[1:])[0] == code
 
 
 # A settings file --------------------------------------------------------------------------------------------------
@@ -195,14 +126,6 @@ def test_check_settings(run, settled):
         assert "image[0]: unknown key `fale`; expected method" in err and "equal.exr" in out
 
 
-def test_the_variant_is_named(run, settled):
-    code, out, _ = run("diff", *settled, "louder.exr", "--set", "fail=0")
-    assert (code, "; matches louder-mac.exr" in out) == (0, False)  # its own entry already accepts it
-    (settled[0] / "mi-refract.toml").write_text(GOOD.replace("fail = 0.15", "fail = 0.001"))
-    code, out, _ = run("diff", *settled, "louder.exr")
-    assert (code, "; matches louder-mac.exr" in out) == (0, True)
-
-
 def test_skipped_is_reported_everywhere(run, pair, tmp_path):
     (pair[0] / "mi-refract.toml").write_text('[[image]]\nname = "louder.exr"\nskip = true\nreason = "loud"')
     files = ["--report", tmp_path / "out.html", "--junit", tmp_path / "out.xml", "--json", tmp_path / "out.json"]
@@ -233,27 +156,6 @@ def test_bad_images(run, pair, tmp_path, name, side):
     assert (alone[0], alone[1], alone[2].count("\n")) == (2, "", 1)
 
 
-def test_whatever_one_image_does_the_report_is_written(run, pair, tmp_path, monkeypatch):
-    compare = methods.compare
-
-    def fail(method, one, two, **options):
-        if one[0].path.name == "equal.exr":
-            raise MemoryError("Unable to allocate 9 GiB")
-        return compare(method, one, two, **options)
-
-    monkeypatch.setattr(methods, "compare", fail)
-    outputs = {"--report": "out.html", "--junit": "out.xml", "--json": "out.json"}
-    words = [word for option, name in outputs.items() for word in (option, tmp_path / name)]
-    code, out, err = run("diff", *pair, *words, "--github")
-    assert (code, err) == (2, f"mi-refract: {pair[1]}/equal.exr: out of memory: Unable to allocate 9 GiB\n")
-    assert "2 images: 1 could not be compared, 1 different" in out.splitlines()
-    for name in outputs.values():
-        text = (tmp_path / name).read_text()
-        assert "out of memory" in text and "louder.exr" in text
-    monkeypatch.setenv(errors.TRACEBACK, "1")
-    assert "Traceback" in run("diff", *pair)[2]
-
-
 def test_images_larger_than_allowed(run, pair):
     names = [pair[0] / "louder.exr", pair[1] / "louder.exr"]
     for words in (["diff", *names], ["accept", *names, "--yes"], ["self-test", names[0]]):
@@ -266,13 +168,17 @@ def test_images_larger_than_allowed(run, pair):
 
 BOTH = "{}/old {}/new "
 BAD = {
-    "no file": ("{}/old {}/none", "none"),
+    "no file": ("{}/old {}/none", "none: no such test file"),
+    "no reference": ("{}/none {}/new --inconclusive fail", "none: no such reference file"),
     "file and folder": ("{}/old {}/new/equal.exr", "cannot compare a folder with a file"),
     "nothing in it": ("{}/old {}/empty", "empty: contains no image"),
     "nothing to refer to": ("{}/empty {}/new", "empty: contains no image"),
     "twice the folder": ("{}/old {}/old", "the same path as the reference"),
     "twice the file": ("{}/old/equal.exr {}/old/../old/equal.exr", "the same path as the reference"),
+    "twice the folder by a link": ("{}/old {}/link", "the same path as the reference"),
     "within": ("{} {}/new", "one path contains the other"),
+    "within the other": ("{}/old {}/old/inner", "one path contains the other"),
+    "map": (BOTH + "--settings {}/map.toml", "defaults.map fits no image in"),
     "samples of files": ("{}/old/equal.exr {}/new/equal.exr --renders", "not a folder; --renders expects folders"),
     "method": (BOTH + "--method idiff", "--method idiff; expected auto, exact"),
     "option": (BOTH + "--method exact --set fail=1", "--set: unknown key `fail`"),
@@ -296,7 +202,10 @@ def test_bad_words(run, pair, tmp_path, verb, words, message):
     if verb == "accept" and {"--renders", "--inconclusive", "--report", "--junit", "--json"} & {*words.split()}:
         pytest.skip("not one of its options")
     (tmp_path / "empty").mkdir()
+    (tmp_path / "old" / "inner").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "old")
     (tmp_path / "bad.toml").write_text("[defaults]\nfale = 1")
+    (tmp_path / "map.toml").write_text('[defaults]\nmap = { reference = "no/{name}", test = "{name}/no" }')
     before = tree(tmp_path)
     code, out, err = run(verb, *(word.format(tmp_path) for word in words.split()))
     assert (code, out, err.count("\n")) == (2, "", 1)
@@ -412,11 +321,7 @@ def test_github(run, strange, tmp_path, monkeypatch):
     "url, run_id, words",
     [
         ("", "", "Report: out.html\n"),
-        (
-            "",
-            "7",
-            "Report: out.html, where it is uploaded among the [artefacts of this run](https://g/a/b/actions/",
-        ),
+        ("", "7", "Report: out.html, where it is uploaded among the [artefacts of this run](https://g/a/b/actions/"),
         ("https://x.io/r (1)/a.html", "7", "Report: [out.html](https://x.io/r%20%281%29/a.html)\n"),
     ],
 )

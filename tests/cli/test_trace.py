@@ -77,6 +77,11 @@ def test_json_is_the_paths(trace, ball):
     assert [path["hits"] for path in paths] == expected.hits[:, :2].tolist()
     for path in paths:
         assert (path["events"], path["indices"]) == (["refracted", "refracted", "escaped"], [1.0, 1.5, 1.0])
+        assert (path["beam"], path["reflect"], path["polarised"].keys()) == (0, 0, {"s", "p"})
+    ball.write_text(BALL.replace("n = 1.5", "n = [1.5, 1.6]").replace("branches = 0", 'colours = ["red", "blue"]'))
+    data = json.loads(trace("--json")[1])
+    assert [entry["colour"] for entry in data["colours"]] == ["red", "blue"] and data["counts"]["escaped"] == 14
+    assert data["colours"][1]["paths"][0]["indices"] == [1.0, 1.6, 1.0]
 
 
 def test_json_shows_nothing_of_a_title_but_ascii(trace, ball):
@@ -151,9 +156,7 @@ BAD = {
     "branches": (("--branches", "-1"), "--branches"),
     "no rays": (("--rays", "0"), "--rays"),
     "no depth": (("--max-depth", "0"), "--max-depth"),
-    "precision": (("--precision", "half"), "precision = 'half'; expected float32, float64"),
     "formula": (("--formula", "snell"), "formula = 'snell': unknown; expected wedge"),
-    "backend": (("--backend", "metal"), "backend = 'metal'; expected scalar"),
     "no float32": (
         ("--backend", "scalar", "--precision", "float32"),
         "scalar arrays compute in double; expected float64",

@@ -112,6 +112,19 @@ def test_a_matched_boundary_returns_the_same_bits(name, setting):
         assert transmitted.all() and (b.astype(setting.precision) == a).all()
 
 
+@pytest.mark.parametrize("name", FORMULAS)
+def test_the_side_of_the_normal_changes_no_bit_and_powers_of_two_scale_the_answer_of_any_length(name, setting):
+    names = [regime for regime, entry in REGIMES.items() if entry.unit and "denormal" not in regime]
+    rays = Rays.joined([make(regime, COUNTS[setting.backend] // 4, setting.precision, seed=21) for regime in names])
+    b, transmitted = evaluate(FORMULAS[name], rays, setting.vector)
+    i, j = np.random.default_rng(22).integers(-12, 12, (2, len(rays), 1), endpoint=True)
+    others = [(0, Rays(rays.a, -rays.n, rays.k))]
+    others += [(i, Rays(np.ldexp(rays.a, i), np.ldexp(rays.n, j), rays.k))] if name in EXACT else []
+    for scale, other in others:
+        b2, same = evaluate(FORMULAS[name], other, setting.vector)
+        assert np.count_nonzero(transmitted != same) == np.count_nonzero(np.ldexp(b, scale) != b2) == 0
+
+
 @pytest.mark.parametrize("name", EXACT)
 def test_a_known_contrast_is_used_where_the_ratio_has_lost_it(name, setting):
     contrast = 1e-9 if setting.precision is np.float32 else 1e-17

@@ -11,6 +11,8 @@ from flint import acb, arb, ctx
 from mi_refract import oracle
 from mi_refract.formulas import FORMULAS, fresnel
 from mi_refract.numerics import from_numpy
+from validation.stability import energy
+from validation.stability.energy import evaluated, to_numpy, worst
 
 # Cosines of incidence and ratios k, near every edge ------------------------------------------------------------------
 
@@ -80,12 +82,6 @@ def certified(name, setting):
     return cos_i, k, oracle.fresnel(cos_i, k)
 
 
-def plain(x):
-    if dr.is_complex_v(x):
-        return np.array(x.real, np.longdouble) + 1j * np.array(x.imag, np.longdouble)
-    return np.array(x) if np.array(x).dtype == bool else np.array(x).astype(np.longdouble)
-
-
 def number_of(setting):
     return float if setting.is_scalar else dr.value_t(setting.vector)
 
@@ -95,20 +91,13 @@ def evaluate(setting, cos_i, k):
 
     def ask(c, k):
         cos_t, transmitted = fresnel.refracted_cosine(c, k)
-        found = *fresnel.powers(c, cos_t, transmitted, k), *fresnel.amplitudes(c, k), transmitted
-        dr.eval(found)  # in one kernel
-        return [plain(x) for x in found]
+        return *fresnel.powers(c, cos_t, transmitted, k), *fresnel.amplitudes(c, k), transmitted
 
-    if setting.is_scalar:
-        each = [ask(float(c), float(x)) for c, x in zip(cos_i, k, strict=True)]
-        return [np.array(column) for column in zip(*each, strict=True)]
-    found = ask(*(from_numpy(number_of(setting), x) for x in (cos_i, k)))
-    return [np.broadcast_to(x, len(k)) for x in found]
+    return evaluated(ask, setting, cos_i, k)
 
 
 def relative(x, exact, low, setting):
-    error = np.abs((x - exact) - low) / np.maximum(np.abs(exact), np.finfo(setting.precision).tiny)
-    return np.nan_to_num(error.astype(float), nan=np.inf).max(initial=0) / setting.roundoff
+    return worst(energy.relative(x, exact, low, setting)) / setting.roundoff
 
 
 def errors(setting, cos_i, k, exact):
@@ -184,7 +173,7 @@ def test_nothing_reflects_where_nothing_differs_and_a_tangential_ray_is_reflecte
     number = number_of(setting)
     for c in (0.02, 0.5):
         r, t = fresnel.powers(number(c), number(0.0), number(1.0) > 0, number(1.0))
-        assert (plain(r) == 1).all() and (plain(t) == 0).all()
+        assert (to_numpy(r) == 1).all() and (to_numpy(t) == 0).all()
 
 
 def test_between_two_cosines_the_critical_angle_is_found(setting):
@@ -202,12 +191,12 @@ def test_contrast_counts_where_k_has_lost_it(setting):
     """Δn = 3e-8: float32 sees k = 1."""
     c, k, contrast = map(number_of(setting), (0.001, 1.0, 6e-8))
     cos_t, transmitted = fresnel.refracted_cosine(c, k, contrast)
-    given = [np.array([float(plain(x).ravel()[0])]) for x in (c, contrast)]
+    given = [np.array([float(to_numpy(x).ravel()[0])]) for x in (c, contrast)]
     exact = oracle.fresnel(given[0], np.ones(1), contrast=given[1])
     for found, expected in zip(
         fresnel.powers(c, cos_t, transmitted, k, contrast), (exact.reflectance, exact.transmittance), strict=True
     ):
-        assert float(plain(found).ravel()[0]) == pytest.approx(expected[0], rel=1e-6)
+        assert float(to_numpy(found).ravel()[0]) == pytest.approx(expected[0], rel=1e-6)
     assert exact.reflectance[0] > 1e-5
 
 
@@ -217,7 +206,7 @@ def test_nan_is_neither_a_mirror_nor_a_window(setting):
         for transmitted in (False, True):
             assert all(np.isnan(np.array(x, float)).all() for x in fresnel.powers(cos_i, cos_t, transmitted, ratio))
     for cos_i, ratio in ((nan, k), (half, nan)):
-        assert all(np.isnan(plain(x)).all() for x in fresnel.amplitudes(cos_i, ratio))
+        assert all(np.isnan(to_numpy(x)).all() for x in fresnel.amplitudes(cos_i, ratio))
 
 
 def test_derivatives_are_finite_wherever_they_exist_and_at_the_edges(vectorised):
@@ -238,7 +227,7 @@ def test_derivatives_are_finite_wherever_they_exist_and_at_the_edges(vectorised)
 def matrices(c, ratio):
     cos_t, transmitted = fresnel.refracted_cosine(c, ratio)
     found = fresnel.mueller_reflection(c, ratio), fresnel.mueller_transmission(c, cos_t, transmitted, ratio)
-    return [np.array([[plain(x).ravel()[0] for x in row] for row in m], float) for m in found]
+    return [np.array([[to_numpy(x).ravel()[0] for x in row] for row in m], float) for m in found]
 
 
 @pytest.mark.parametrize("name", ["generic", "critical", "matched"])
@@ -275,7 +264,7 @@ def test_powers_of_rays_that_are_unit_only_up_to_rounding(name, formula, float32
     _, transmitted = FORMULAS[formula].unchecked(ray, float32.vector(0, 0, 1), wide, contrast)
     powers = fresnel.local_powers(ray, transmitted, wide, contrast)
     dr.eval(powers, transmitted)
-    r, t = map(plain, powers)
+    r, t = map(to_numpy, powers)
     # Off by ε ≤ 10·2⁻⁵³ of its larger term, a radicand moves T by ε/2ρ: nearer to the critical angle by more than u/2.
     scale = np.maximum(cos_i.astype(float) ** 2, np.abs(k.astype(float) ** 2 - 1) * sine**2)
     far = (exact.cos_t**2 > 10 * 2.0**-53 / float32.roundoff * scale) | ~exact.transmitted
@@ -292,5 +281,5 @@ def test_length_of_the_ray_cancels(float32):
     for length in (1.0, 1.001):
         a = float32.vector(0.28 * length, 0, 0.96 * length)
         _, transmitted = FORMULAS["promoted"](a, float32.vector(0, 0, 1), k, contrast)
-        found.append([float(plain(x).ravel()[0]) for x in fresnel.local_powers(a, transmitted, k, contrast)])
+        found.append([float(to_numpy(x).ravel()[0]) for x in fresnel.local_powers(a, transmitted, k, contrast)])
     assert found[1] == pytest.approx(found[0], rel=8 * float32.roundoff)

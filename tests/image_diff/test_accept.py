@@ -83,7 +83,7 @@ def test_a_reference_that_is_not_there_yet(folders, tmp_path):
             to_accept(tmp_path / name, new / "same.exr")
 
 
-@pytest.mark.parametrize("name", ["truncated", "empty", "text", "deep", "zero size"])
+@pytest.mark.parametrize("name", ["truncated", "empty", "text"])
 def test_a_bad_image_becomes_no_reference_and_a_bad_reference_can_be_replaced(folders, name):
     old, new = folders
     for bad in ("same.exr", "added.exr"):
@@ -98,11 +98,15 @@ def test_a_bad_image_becomes_no_reference_and_a_bad_reference_can_be_replaced(fo
     assert (new / "same.exr", old / "same.exr") in [(copy.new, copy.reference) for copy in to_accept(old, new)]
 
 
-def test_values_that_are_not_finite_become_no_reference(folders):
+def test_values_that_are_not_finite_become_no_reference(run, folders, tmp_path):
     image(folders[1] / "same.exr", value=np.inf)
     with pytest.raises(ValueError, match="not finite; to accept them, pass --set allow_nonfinite=true"):
         to_accept(*folders)
     assert len(to_accept(*folders, Settings((Entry("same.exr", {"allow_nonfinite": True}),)))) == 3
+    for allowed, code in (([], 2), (["--set", "allow_nonfinite=true"], 0)):
+        run("diff", *folders, "--json", tmp_path / "out.json", *allowed)
+        assert run("accept", "--from", tmp_path / "out.json", "--yes")[0] == code
+    image(folders[1] / "added.exr", gain=2)
     with pytest.raises(ValueError, match=r"added\.exr: compared without digests"):
         list(accept.changes(diff.diff(*folders)))
 
@@ -290,34 +294,17 @@ def test_what_changed_since_the_json_is_refused(run, compared, side, name):
     assert tree(compared[0]) == before
 
 
-def test_nan_is_accepted_where_the_comparison_of_the_json_allowed_it(run, pair, tmp_path):
-    old, new = pair
-    image(new / "louder.exr", value=float("nan"))
-    out = tmp_path / "out.json"
-    for allowed, code in (([], 2), (["--set", "allow_nonfinite=true"], 0)):
-        run("diff", old, new, "--json", out, *allowed)
-        assert run("accept", "--from", out, "--yes")[0] == code
-
-
 OURS = "expected a file that mi-refract diff --json wrote"
 SPOILED = {
     "no JSON": (b"{", "not JSON ("),
     "too deep": (b"[" * 100_000, OURS),
     "a list": (b"[]", f"schema None; expected 1: {OURS}"),
-    "no UTF-8": (b"\xff\xfe{", "not JSON ("),
-    "another": (b'{"schema": 1, "results": [3]}', OURS),
     "schema": (lambda d: d.update(schema=99), "schema 99; expected 1"),
-    "no results": (lambda d: d.update(results={}), f"results: expected `array`, got `object`; {OURS}"),
-    "result": (lambda d: d["results"].insert(0, 3), f"results[0]: expected `object`, got `int`; {OURS}"),
     "status": (lambda d: d["results"][0].update(status="fine"), "results[0].status: invalid enum value 'fine'"),
-    "status of a type": (lambda d: d["results"][0].update(status=[]), "results[0].status: expected `str`"),
-    "name": (lambda d: d["results"][0].update(name=None), "results[0].name: expected `str`"),
     "renders": (lambda d: d.update(renders=True), "written with --renders; expected "),
-    "path": (lambda d: d["results"][0].update(test=7), "results[0].test: expected "),
     "NUL": (lambda d: d["results"][0].update(test="a\0b"), "results[0].test: expected "),
     "outside": (lambda d: entry(d, "louder.exr").update(target="/etc/x.exr"), "expected a path in "),
     "no digests": (lambda d: entry(d, "louder.exr").update(digests=None), "compared without digests"),
-    "digests": (lambda d: entry(d, "louder.exr").update(digests={"test": "a"}), "digests"),
     "digest": (lambda d: entry(d, "louder.exr")["digests"].update(test="g" * 64), "digests.test: expected"),
     "variants": (lambda d: entry(d, "louder.exr")["digests"]["variants"].append(""), "digests: 1 of 0 variants"),
 }
@@ -352,7 +339,7 @@ def test_bad_words_with_from(run, compared):
     old, new, out = compared
     for words, message in [
         (["--from", out.with_name("none.json")], "none.json"),
-        ([old, "--from", out], "only one path; with --from, give both folders before any names, or no folder"),
+        ([old, "--from", out], "only one path; with --from, give both folders before the names, or none"),
         (["--from", out, "--set", "fail=1"], "--from repeats an earlier comparison"),
         ([old, new, "none*", "--from", out], "none*: matches no image; expected "),
         ([], "two paths are needed"),

@@ -95,56 +95,42 @@ def test_options_without_a_method_are_those_that_auto_may_use(load):
     [("linux", True), ("macos", False), ("linux x86_64", True), ("linux arm64", False), (["macos", "linux"], True)],
 )
 def test_entries_for_platforms(load, monkeypatch, when, here):
+    assert settings.this_platform() & set(settings.WORDS)
     monkeypatch.setattr(settings, "this_platform", lambda: frozenset({"linux", "x86_64"}))
     chosen = load(f"{A}when = {when!r}\nfail = 1".replace("'", '"'))
     assert bool(chosen.of("a").options) == here
     assert chosen.unused(["b"]) == (["a"] if here else [])
 
 
-def test_this_platform_has_a_name():
-    assert settings.this_platform() & set(settings.WORDS)
-
-
 # What is compared by them -----------------------------------------------------------------------------------------
 
 
 def test_what_is_set_is_what_is_compared_by(folders, load):
-    by_name = {result.name: result for result in diff.diff(*folders, load(RULES)).results}
+    for side in folders:
+        image(side / "nan.exr", value=np.nan)
+        image(side / "nan2.exr", value=np.nan)
+    rules = RULES + '[[image]]\nname = "nan.exr"\nallow_nonfinite = true\nreason = "r"\n'
+    by_name = {result.name: result for result in diff.diff(*folders, load(rules)).results}
+    assert (by_name["nan.exr"].status, by_name["nan2.exr"].status) == ("equal", "different")
     assert by_name["inner/changed.exr"].status is Status.EQUAL
     assert by_name["inner/changed.exr"].how.reason == "glass; more glass"
-    tight = load(RULES.replace("fail = 0.2", "fail = 0.05"))
-    assert diff.diff(*folders, tight).results[1].status is Status.DIFFERENT
-    stale = load(RULES + '[[image]]\nname = "gone.exr"\nreason = "was noisy"\n')
-    assert diff.diff(*folders, stale).unused == ("gone.exr",)
+    stale = load(RULES.replace("fail = 0.2", "fail = 0.05") + '[[image]]\nname = "gone.exr"\nreason = "was noisy"\n')
+    results = diff.diff(*folders, stale)
+    assert found(results)["inner/changed.exr"][0] == "different" and results.unused == ("gone.exr",)
+    results = diff.diff(*folders, Settings.for_all(method="tolerance", fail=-1.0))  # out of its range
+    assert found(results)["same.exr"][0] == found(results)["inner/changed.exr"][0] == "error"
 
 
-def test_nan_is_allowed_where_it_is_named(tmp_path):
-    for side in ("old", "new"):
-        image(tmp_path / side / "a.exr", value=np.nan)
-        image(tmp_path / side / "b.exr", value=np.nan)
-    chosen = Settings((Entry("a.exr", {"allow_nonfinite": True}),))
-    statuses = found(diff.diff(tmp_path / "old", tmp_path / "new", chosen))
-    assert statuses == {"a.exr": ("equal", "unchanged"), "b.exr": ("different", "changed")}
-
-
-def test_skipped_images_are_reported_and_count_as_nothing(folders):
+def test_skipped_images_and_wrong_entries_that_match_nothing_are_reported(folders):
     rules = tuple(Entry(name, {"skip": True, "reason": "moved"}) for name in ("added.exr", "removed.exr", "inner/*"))
     results = diff.diff(*folders, Settings(rules))
     assert found(results)["added.exr"] == ("skipped", "unknown")
     assert (results.exit_code, len(results.of(Status.SKIPPED))) == (0, 3)
     assert diff.diff(*folders, Settings.for_all(skip=True)).exit_code == 2
-
-
-def test_a_wrong_entry_that_matches_nothing_is_reported(folders):
     results = diff.diff(*folders, Settings((Entry("gone", {}, error="rules.toml: image[0]: unknown key"),)))
     (wrong,) = results.of(Status.ERROR)
     assert (wrong.name, wrong.error) == ("the settings, image[0]", "rules.toml: image[0]: unknown key")
     assert (results.exit_code, len(results.results)) == (2, 5)
-
-
-def test_an_option_out_of_its_range_is_no_verdict(folders):
-    results = diff.diff(*folders, Settings.for_all(method="tolerance", fail=-1.0))
-    assert {result.status for result in results.results if None not in (result.reference, result.test)} == {"error"}
 
 
 # The file ---------------------------------------------------------------------------------------------------------
@@ -154,6 +140,9 @@ def test_the_readme_names_every_method_and_key_and_its_settings_are_accepted(loa
     text = README.read_text("utf-8")
     assert all(table in text for table in settings.key_tables().split("\n\n")[:2])
     assert all(f"| `{name}` |" in text for name in methods.METHODS)
+    flags = dict(re.findall(r"^\| `-(\w+)` \| `(\w+)` \|", text, re.MULTILINE))  # of idiff
+    assert {flag: name.replace("_", "") for flag, name in flags.items()} == {flag: flag for flag in flags}
+    assert set(flags.values()) == methods.METHODS["tolerance"].options.keys()
     examples = [load(each) for each in re.findall("```toml\n(.*?)```", text, re.DOTALL)]
     assert [rule.error for chosen in examples for rule in chosen.rules if rule.error] == []
     assert examples[0].of("glass/caustic1.exr").method == "tolerance"
@@ -180,9 +169,6 @@ BAD = {
     "absolute": ('[defaults]\nmask = "/a.exr"', "mask: '/a.exr'; expected a relative path"),
     "field": ('[defaults]\nvariance = "{stm}.exr"', "variance: '{stm}.exr'; expected a relative path"),
     "skip everything": ("[defaults]\nskip = true", "defaults: unknown key `skip`"),
-    "table": ("[images]", "unknown key `images`; expected defaults, image"),
-    "no list": ('[image]\nname = "a"', "image: expected `array`"),
-    "no TOML": ("[[", "expected TOML"),
     "nan": ("[defaults]\nfail = nan", "defaults.fail: expected a finite number, got nan"),
     "no text": (b"\xff\xfe", "expected TOML"),
     "nested": ("a = " + "[" * 5000, "expected TOML"),
@@ -211,12 +197,10 @@ BAD_ENTRIES = {
     "method": (f'{A}method = "idiff"', "image[0]: method: 'idiff'; expected auto, "),
     "type of method": (f"{A}method = 3", "image[0]: method: expected `str`"),
     "type": (f'{A}fail = "0.2"', "image[0]: fail: expected `float`"),
-    "bool for number": (f"{A}fail = true", "image[0]: fail: expected `float`"),
     "flag": (f"{A}allow_nonfinite = 1", "image[0]: allow_nonfinite: expected `bool`"),
     "platform": (f'{A}when = "mcos"', "image[0]: when: 'mcos'; expected one or two of linux, macos, windows"),
     "two systems": (f'{A}when = "linux macos"', "image[0]: when: 'linux macos'; expected"),
     "rectangle": (f"{A}ignore = [[0, 0, 3]]", "image[0]: ignore[...]: expected `array` of length 4"),
-    "empty rectangle": (f"{A}ignore = [[0, 0, 0, 3]]", "expected `int` >= 1"),
     "flat rectangle": (f"{A}ignore = [[3, 0, 5, 0]]", "expected `int` >= 1"),
     "option of neither": (f"{A}changed = 1", "image[0]: changed: not an option of auto; expected "),
     "conflict": (f"{A}fail = 1\n{A}fail = 2", "image[1]: fail: 2.0, but 1.0 in image[0] for the same name 'a'"),

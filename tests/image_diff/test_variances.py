@@ -20,11 +20,11 @@ from mi_refract.image_diff import (
     self_test,
     text_reports,
 )
+from mi_refract.image_diff.channels import FREEDOM, SPP
 from mi_refract.image_diff.comparison import Verdict
 from mi_refract.image_diff.methods import METHODS, choice, compare
 from mi_refract.image_diff.results import Category, Status
 from mi_refract.image_diff.settings import Entry, Settings, load
-from mi_refract.image_diff.variances import FREEDOM, SPP
 from mi_refract.io.image_file import read, write_exr
 
 EQUAL, DIFFERENT, INCONCLUSIVE = Verdict.EQUAL, Verdict.DIFFERENT, Verdict.INCONCLUSIVE

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 
@@ -12,7 +11,7 @@ from support.planar_scenes import SLAB, SQUARE, ball, beam, polygon, scene
 
 from mi_refract.planar import Event, Segments, path_tree, trace
 from mi_refract.planar.light import Light
-from mi_refract.planar.path_tree import as_data, count, follow, follow_scene, summary, with_rays
+from mi_refract.planar.path_tree import count, follow, follow_scene, summary, with_rays
 from mi_refract.planar.segments import REFLECT_BITS
 
 OBLIQUE = math.cos(0.6), math.sin(0.6)
@@ -103,20 +102,6 @@ def test_more_legs_than_fit_in_memory_are_refused():
     ):
         with pytest.raises(ValueError, match=match):
             call()
-
-
-def test_the_data_is_strict_json():
-    given = scene((GLASS, DENSER), beam(2, 1.0), OBLIQUE, branches=1, colours=("red", "blue"))
-    traced = follow_scene(given)
-    data = json.loads(json.dumps(as_data(given, traced), allow_nan=False))
-    assert [entry["colour"] for entry in data["colours"]] == ["red", "blue"]
-    assert data["counts"]["escaped"] == 12
-    path = data["colours"][1]["paths"][0]
-    assert (path["ray"], path["beam"], path["reflect"]) == (0, 0, 0)
-    assert path["events"] == ["refracted", "refracted", "escaped"]
-    assert path["indices"] == [1.0, 1.6, 1.0] and len(path["hits"]) == 2
-    assert path["points"] == traced[1].paths.points[0, :3].tolist()
-    assert path["weights"][0] == 1.0 > path["weights"][1] > path["weights"][2] > 0.8
 
 
 def fan(angles):

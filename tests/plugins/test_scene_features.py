@@ -32,12 +32,11 @@ def sphere(bsdf, **parts):
     return {"type": "sphere", "bsdf": {"type": bsdf} | parts}
 
 
-def test_a_ball_alone_needs_nothing_but_polarisation(typical_variant):
-    assert facts() == {"only_glass", "polarising"}
-    assert facts(ball={"type": "sphere", "bsdf": BLACK}) == {"only_glass"}
+def test_a_ball_alone_needs_nothing(typical_variant):
+    assert facts() == facts(ball={"type": "sphere", "bsdf": BLACK}) == {"only_glass"}
 
 
-SUN = {"sampleable", "lamps", "delta_emitters"}
+SUN = {"sampleable", "lamps"}
 LIT = {"sampleable", "lamps", "area"}
 
 
@@ -65,12 +64,12 @@ LIT = {"sampleable", "lamps", "area"}
     ],
 )
 def test_each_part_adds_what_it_needs_and_no_more(part, seen, scalar_variant):
-    assert facts(part=part) == {"polarising"} | seen | (set() if "smooth" in seen else {"only_glass"})
+    assert facts(part=part) == seen | (set() if "smooth" in seen else {"only_glass"})
 
 
 def test_a_lamp_with_the_weight_0_is_never_sampled(scalar_variant):
     """Beside a constant sky, which is not sampled either, it is met by the BSDFs' own samples only."""
-    expected = {"only_glass", "polarising", "sampleable", "area", "environment", "plain_environment"}
+    expected = {"only_glass", "sampleable", "area", "environment", "plain_environment"}
     for weight, more in ((0.0, set()), (1.0, {"lamps"})):
         lamp = LAMP | {"emitter": {"type": "area", "sampling_weight": weight}}
         assert facts(sky={"type": "constant"}, lamp=lamp) == expected | more
@@ -113,7 +112,7 @@ def test_plugins_that_take_either_number_have_been_tried(name, bsdf, scalar_vari
     assert ("both_numbers" in facts(part={"type": "sphere", "bsdf": bsdf})) == both
 
 
-EVERYTHING = {"both_numbers", "smooth", "null", "textured", "polarising", "dispersive", "absorbing"}
+EVERYTHING = {"both_numbers", "smooth", "null", "textured", "dispersive", "absorbing"}
 
 
 def test_what_is_not_known_needs_everything(scalar_variant):
@@ -123,10 +122,6 @@ def test_what_is_not_known_needs_everything(scalar_variant):
             super().__init__(props)
             self.m_flags = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.FrontSide
 
-        def traverse(self, callback):
-            pass
-
-    class Silent(mi.Emitter):
         def traverse(self, callback):
             pass
 
@@ -140,8 +135,6 @@ def test_what_is_not_known_needs_everything(scalar_variant):
     assert facts(group=group, instance=instance) == EVERYTHING | {"area"}
     group["a"]["interior"] = MEDIUM
     assert facts(group=group, instance=instance) == EVERYTHING | {"area", "media"}
-    mi.register_emitter("silent", Silent)  # an emitter that declares nothing may be a delta
-    assert facts(part={"type": "silent"}) == {"only_glass", "polarising"} | SUN
 
 
 @pytest.mark.parametrize(("reflectance", "black"), [(0.0, True), ({"type": "rgb", "value": 1e-9}, False)])
@@ -158,7 +151,7 @@ def test_the_scenes(variant, needs_variant):
     scenes = {path.stem: inspect(mi.load_file(str(path), res=4)) for path in SCENES.glob("*.xml")}
     assert {name for name, scene in scenes.items() if scene.only_glass} == GLASS_ONLY
     assert {name for name, scene in scenes.items() if not scene.environment} == {"fibre", "mirage"}
-    assert all(scene.polarising and not scene.unknown for scene in scenes.values())
+    assert not any(scene.unknown for scene in scenes.values())
     reasons = scenes["slab"].left_out
     assert reasons["emitter sampling"] == "every BSDF has delta lobes only"
     assert set(reasons) == {"emitter sampling", "a random number", "media", "null lobes", "dispersion", "absorption"}
@@ -170,7 +163,7 @@ def test_what_is_left_out_has_its_reason_and_an_edit_can_bring_it_back(scalar_va
     assert "met" in needs(a=matt, sky={"type": "constant"}).left_out["sampling the environment"]
     dark = needs(a=matt).left_out
     assert dark["emitter sampling"] == "no emitter can be sampled"
-    assert {"area lights", "environment", "polarisation"} <= set(dark)
+    assert {"area lights", "environment"} <= set(dark)
     scene = mi.load_dict({"type": "scene", "lamp": LAMP})
     assert not inspect(scene).smooth
     params = mi.traverse(scene)

@@ -34,8 +34,6 @@ from mi_refract.planar import scene_file
 from mi_refract.plugins import scene_parser
 from mi_refract.ray_sets import check_answers, files, ray_set, renderer_file
 from mi_refract.rendering import scene_files
-from mi_refract.report import run_report
-from mi_refract.report.row import Row
 from mi_refract.scene_export import from_mitsuba, write_files
 
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -141,7 +139,7 @@ SMALL = {"res": "4", "bsdf": "dielectric", "max_depth": "8"}
 
 def of_files(folder):
     rays = ray_set.make(("generic",), 6)
-    for name in ("rays.csv", "rays.npz", "rays.exr"):
+    for name in ("rays.csv", "rays.npz"):
         files.write(folder / name, rays)
     a, n, k = rays.rays.a, rays.rays.n, rays.rays.k
     b = oracle.refract(a, n, k, fresnel=False, progress=False).direction.astype(np.float32).astype(np.float64)
@@ -151,8 +149,6 @@ def of_files(folder):
     np.savez(folder / "answers.npz", id=rays.ids, b=b)
     image = folder / "image.exr"
     image_file.write_exr(image, np.linspace(0.1, 1, 12 * 8 * 3).reshape(8, 12, 3), metadata={"mi_refract:spp": 16})
-    row = Row("directions", "promoted", "generic", "scalar", {"worst": 0.5}, budgets={"worst": 1.0}, replay={"seed": 1})
-    run_report.write_json(folder / "rows.json", [row], {"title": "x"})
     reference = image_file.read(image)
     (folder / "renderer").mkdir()
 
@@ -190,10 +186,8 @@ def of_files(folder):
         "planar scene, TOML": (".toml", planar, lambda path: scene_file.load(path) and None),
         "diff settings, TOML": (".toml", [SETTINGS], lambda path: settings.load(path) and None),
         "renderer, TOML": (".toml", [RENDERER], renderer),
-        "rows, JSON": (".json", of("rows.json"), lambda path: run_report.read_json(path) and None),
         "rays, CSV": (".csv", of("rays.csv"), same_rays),
         "rays, NPZ": (".npz", of("rays.npz"), same_rays),
-        "rays, EXR": (".exr", of("rays.exr"), same_rays),
         "answers, CSV": (".csv", of("answers.csv"), answers),
         "answers, NPZ": (".npz", of("answers.npz"), answers),
         "image, EXR": (".exr", of("image.exr"), equal),
@@ -302,8 +296,8 @@ def parsers(folder):
 
 
 KINDS = (
-    *(f"{name}, TOML" for name in ("planar scene", "diff settings", "renderer")), "rows, JSON",
-    *(f"rays, {kind}" for kind in ("CSV", "NPZ", "EXR")), "answers, CSV", "answers, NPZ", "image, EXR",
+    *(f"{name}, TOML" for name in ("planar scene", "diff settings", "renderer")),
+    *(f"rays, {kind}" for kind in ("CSV", "NPZ")), "answers, CSV", "answers, NPZ", "image, EXR",
     "scene, XML", "scene to export, XML", "sky, EXR", "mesh, PLY",
 )  # fmt: skip
 

@@ -1,14 +1,15 @@
 """Enough of Blender's Python to run the script of a Cycles export, and to see what it would have rendered."""
 
+import runpy
 import sys
-import types
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
 
 
 class Vector(np.ndarray):
-    """mathutils.Vector."""
+    """mathutils.Vector, and mathutils.Matrix of rows."""
 
     def __new__(cls, values):
         return np.array(values, float).view(cls)
@@ -19,17 +20,11 @@ class Vector(np.ndarray):
     def cross(self, other):
         return Vector(np.cross(self, other))
 
-
-class Matrix(Vector):
-    """mathutils.Matrix, of rows."""
-
     def transposed(self):
         return self.T
 
     def to_4x4(self):
-        matrix = np.eye(4)
-        matrix[:3, :3] = self
-        return matrix
+        return np.block([[np.asarray(self), np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
 
     @staticmethod
     def Translation(offset):
@@ -46,7 +41,7 @@ class Sockets(dict):
         self.node = node
 
     def __missing__(self, key):
-        self[key] = types.SimpleNamespace(node=self.node, key=key, default_value=None)
+        self[key] = SimpleNamespace(node=self.node, key=key, default_value=None)
         return self[key]
 
 
@@ -55,17 +50,14 @@ class Tree:
 
     def __init__(self):
         self.made, self.sources = [], {}
-        self.nodes = types.SimpleNamespace(new=self._new, clear=self.made.clear)
-        self.links = types.SimpleNamespace(new=self._link)
+        self.nodes = SimpleNamespace(new=self._new, clear=self.made.clear)
+        self.links = SimpleNamespace(new=lambda source, to: self.sources.update({(id(to.node), to.key): source}))
 
     def _new(self, kind):
-        node = types.SimpleNamespace(kind=kind)
+        node = SimpleNamespace(kind=kind)
         node.inputs, node.outputs = Sockets(node), Sockets(node)
         self.made.append(node)
         return node
-
-    def _link(self, source, target):
-        self.sources[id(target.node), target.key] = source
 
     def source(self, node, key):
         """The node, and its output, that feeds an input."""
@@ -83,26 +75,22 @@ def named(**attributes):
     made = {}
 
     def new(name, *arguments):
-        made[name] = types.SimpleNamespace(**{key: make(*arguments) for key, make in attributes.items()})
+        made[name] = SimpleNamespace(**{key: make(*arguments) for key, make in attributes.items()})
         return made[name]
 
-    return types.SimpleNamespace(new=new, made=made)
+    return SimpleNamespace(new=new, made=made)
 
 
 def run(folder, monkeypatch, *words):
     """Run the script with these options; Blender's `bpy` as the script leaves it, and `rendered`: seeds and files."""
-    bpy = mock.MagicMock()
-    scene, bpy.rendered = bpy.context.scene, []
+    bpy = mock.MagicMock(rendered=[])
+    scene = bpy.context.scene
     bpy.ops.render.render = lambda write_still: bpy.rendered.append((scene.cycles.seed, scene.render.filepath))
     bpy.data.materials, bpy.data.worlds = named(node_tree=Tree), named(node_tree=Tree)
     bpy.data.meshes, bpy.data.cameras = named(materials=list, from_pydata=mock.Mock), named()
     bpy.data.objects = named(data=lambda data: data)
-    bpy.context.scene.render.resolution_x = None
     monkeypatch.setitem(sys.modules, "bpy", bpy)
-    monkeypatch.setitem(sys.modules, "mathutils", types.SimpleNamespace(Vector=Vector, Matrix=Matrix))
+    monkeypatch.setitem(sys.modules, "mathutils", SimpleNamespace(Vector=Vector, Matrix=Vector))
     monkeypatch.setattr(sys, "argv", ["render.py", "--spp", "3", "--out", str(folder), *words])
-    script = folder / "render.py"
-    space = {"__file__": str(script), "__name__": "script"}
-    exec(compile(script.read_text(), str(script), "exec"), space)
-    space["main"]()
+    runpy.run_path(str(folder / "render.py"))["main"]()
     return bpy

@@ -3,6 +3,7 @@
 import runpy
 import sys
 import types
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -26,8 +27,7 @@ def rotate_basis(forward, up):
     """raysect.core.rotate_basis: +z becomes forward, +y the part of up at right angles to it."""
     forward = np.array(forward) / np.linalg.norm(forward)
     side = np.cross(up, forward)
-    side /= np.linalg.norm(side)
-    made = np.eye(4)
+    made, side = np.eye(4), side / np.linalg.norm(side)
     made[:3, :3] = np.transpose([side, np.cross(forward, side), forward])
     return made.view(Affine)
 
@@ -38,7 +38,7 @@ class Emitter:
     def __init__(self, spectrum):
         self.spectrum = spectrum
 
-    def evaluate_surface(self, world, ray, primitive, hit_point, exiting, *others):
+    def evaluate_surface(self, *where):
         """What it emits, everywhere and on both sides."""
         return self.spectrum
 
@@ -53,42 +53,37 @@ class Pinhole:
         return [("ray", 0.5)]
 
 
-def run(folder, monkeypatch, *words):
+def run(folder, monkeypatch):
     """The script's names, with raysect's as far as it uses them; `made`: meshes and the sky."""
-    made = types.SimpleNamespace(meshes={}, sky=None, seeds=[])
+    made = SimpleNamespace(meshes={}, sky=None, seeds=[])
 
     def mesh(vertices, faces, smoothing, closed, parent, name):
         assert not smoothing and not closed
-        made.meshes[name] = types.SimpleNamespace(triangles=np.asarray(vertices)[faces])
+        made.meshes[name] = SimpleNamespace(triangles=np.asarray(vertices)[faces])
         return made.meshes[name]
 
-    def sphere(radius, parent, material):
-        made.sky = material
-
     parts = {
-        "core": {"Vector3D": lambda *v: np.array(v), "rotate_basis": rotate_basis, "translate": translate},
-        "core.math": {"random": types.SimpleNamespace(seed=made.seeds.append)},
-        "core.workflow": {"SerialEngine": mock.Mock()},
-        "optical": {
+        "": {},
+        ".core": {"Vector3D": lambda *v: np.array(v), "rotate_basis": rotate_basis, "translate": translate},
+        ".core.math": {"random": SimpleNamespace(seed=made.seeds.append)},
+        ".core.workflow": {"SerialEngine": mock.Mock()},
+        ".optical": {
             "ConstantSF": float,
             "InterpolatedSF": lambda x, y: dict(zip(x, y, strict=True)),
             "World": mock.Mock(),
         },
-        "optical.library": {"schott": lambda name: types.SimpleNamespace(index=f"of {name}")},
-        "optical.material": {
+        ".optical.library": {"schott": lambda name: SimpleNamespace(index=f"of {name}")},
+        ".optical.material": {
             "Dielectric": lambda index, transmission, outside: ("glass", index, transmission, outside),
             "Lambert": lambda colour: ("diffuse", colour),
             "UniformSurfaceEmitter": Emitter,
         },
-        "optical.observer": {
-            "FullFrameSampler2D": mock.Mock(),
-            "PinholeCamera": Pinhole,
-            "SpectralRadiancePipeline2D": mock.Mock(),
-        },
-        "primitive": {"Mesh": mesh, "Sphere": sphere},
+        ".optical.observer": {"PinholeCamera": Pinhole}
+        | dict.fromkeys(("FullFrameSampler2D", "SpectralRadiancePipeline2D"), mock.Mock()),
+        ".primitive": {"Mesh": mesh, "Sphere": lambda radius, parent, material: setattr(made, "sky", material)},
     }
-    for name, content in ({"": {}} | parts).items():
-        module = types.ModuleType(f"raysect.{name}".rstrip("."))
+    for name, content in parts.items():
+        module = types.ModuleType(f"raysect{name}")
         vars(module).update(content)
         monkeypatch.setitem(sys.modules, module.__name__, module)
     return made, runpy.run_path(str(folder / "render.py"))

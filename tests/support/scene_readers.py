@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 from support import fake_bpy, fake_raysect
 
 from mi_refract.io.image_file import read_exr
@@ -18,7 +19,7 @@ from mi_refract.io.image_file import read_exr
 
 @dataclass
 class Scene:
-    """A scene that was read. By mesh: its triangles, index inside over outside, and radiance."""
+    """A scene that was read. By mesh: its triangles, index inside over outside, radiance or reflectance."""
 
     size: tuple[int, int]
     depth: int
@@ -36,25 +37,24 @@ def unit(vector):
 
 def pinhole(origin, ahead, up, wide, high):
     """Rays of a camera; `wide`, `high`: tangents of half the angles of view."""
-    ahead = unit(ahead)
-    right = unit(np.cross(ahead, up))
-    upward = np.cross(right, ahead)
-    return lambda x, y: (np.asarray(origin), ahead + (2 * x - 1) * wide * right + (1 - 2 * y) * high * upward)
+    right = unit(np.cross(unit(ahead), up))
+    upward = np.cross(right, unit(ahead))
+    return lambda x, y: (np.asarray(origin), unit(ahead) + (2 * x - 1) * wide * right + (1 - 2 * y) * high * upward)
+
+
+def linear(table, rows, columns):
+    """Between the numbers of a table (H, W)."""
+    return map_coordinates(table, [rows, columns], order=1, mode="nearest")
 
 
 def on_map(path, place):
     """The sky of a map whose pixel in direction d is at `place(d)`: from the left and from the top, 0 to 1."""
-    pixels = read_exr(path)[0].astype(float)
-    height, width = pixels.shape[:2]
+    pixels = np.pad(read_exr(path)[0].astype(float), [(0, 0), (1, 1), (0, 0)], mode="wrap")
+    height, width = pixels.shape[0], pixels.shape[1] - 2
 
     def sky(directions):
         u, v = place(*directions.T)
-        column, row = u % 1 * width - 0.5, np.clip(v * height - 0.5, 0, height - 1)
-        i, j = np.floor(row).astype(int), np.floor(column).astype(int)
-        a, b = (row - i)[:, None], (column - j)[:, None]
-        below, right = np.minimum(i + 1, height - 1), (j + 1) % width
-        upper = (1 - b) * pixels[i, j % width] + b * pixels[i, right]
-        return (1 - a) * upper + a * ((1 - b) * pixels[below, j % width] + b * pixels[below, right])
+        return np.stack([linear(x, v * height - 0.5, u % 1 * width + 0.5) for x in np.moveaxis(pixels, -1, 0)], -1)
 
     return sky
 
@@ -74,27 +74,17 @@ def readme(folder, pattern):
     return [int(number) for number in re.search(pattern, (folder / "README.txt").read_text()).groups()]
 
 
-# Radiance ---------------------------------------------------------------------------------------------------------
-
-
 def radiance(folder, monkeypatch):
     """An interface's first medium is the one behind its normal; a view's angles are those of both directions."""
     words = (folder / "camera.vf").read_text().split()
     assert words[:2] == ["VIEW=", "-vtv"]
-
-    def value(name, count=3):
-        place = words.index(name) + 1
-        return np.array(words[place : place + count], float)
-
-    wide, high = (np.tan(np.radians(value(name, 1)[0]) / 2) for name in ("-vh", "-vv"))
-    ray = pinhole(value("-vp"), value("-vd"), value("-vu"), wide, high)
+    view = {name: np.array(words[words.index(name) + 1 :][:3], float) for name in ("-vp", "-vd", "-vu")}
+    wide, high = (np.tan(np.radians(float(words[words.index(name) + 1])) / 2) for name in ("-vh", "-vv"))
     width, height, *depths = readme(folder, r"-x (\d+) -y (\d+) -pa 0 [^$]*?-ab (\d+) [^$]*?-lr -(\d+) ")
     assert depths[0] == depths[1]
-    found = Scene((width, height), depths[0], ray, plain_sky((0, 0, 0)))
+    found = Scene((width, height), depths[0], pinhole(*view.values(), wide, high), plain_sky((0, 0, 0)))
     surfaces = {}
-    for line in (folder / "scene.rad").read_text().splitlines():
-        if not line:
-            continue
+    for line in filter(None, (folder / "scene.rad").read_text().splitlines()):
         modifier, kind, name, *rest = line.split()
         numbers = [float(x) for x in rest[3 + int(rest[0]) :]]
         if kind == "polygon":
@@ -106,11 +96,9 @@ def radiance(folder, monkeypatch):
             else:
                 {"glow": found.lights, "plastic": found.colours}[kind][mesh] = numbers[:3]
         elif kind == "source":
-            assert modifier == name == "sky" or modifier == "sky"
-            assert numbers[3] == 360
-            found.sky = (
-                _radiance_sky(folder, surfaces["sky"][1]) if "map" in surfaces else plain_sky(surfaces["sky"][1][:3])
-            )
+            assert modifier == "sky" and numbers[3] == 360
+            glow = surfaces["sky"][1]
+            found.sky = _radiance_sky(folder, glow) if "map" in surfaces else plain_sky(glow[:3])
         else:
             surfaces[name] = kind, numbers
     return found
@@ -119,41 +107,27 @@ def radiance(folder, monkeypatch):
 def _radiance_sky(folder, glow):
     """`sky.cal` gives the place in the tables, which are linear between their entries."""
     assert glow == [1, 1, 1, 0]
-    code = (folder / "sky.cal").read_text().replace(";", "")
-    tables = []
+    code, tables = (folder / "sky.cal").read_text().replace(";", ""), []
     for colour in "rgb":
-        lines = (folder / f"sky_{colour}.dat").read_text().splitlines()
-        assert lines[0] == "2"
-        table = np.array([line.split() for line in lines[3:]], float)
-        assert [line.split()[2] for line in lines[1:3]] == [str(count) for count in table.shape]
-        tables.append(table)
+        dimensions, *sizes = (folder / f"sky_{colour}.dat").read_text().splitlines()
+        tables.append(np.array([line.split() for line in sizes[2:]], float))
+        assert dimensions == "2" and [line.split()[2] for line in sizes[:2]] == [str(x) for x in tables[-1].shape]
 
     def sky(directions):
-        found = []
-        for x, y, z in directions:
-            names = {"Dx": x, "Dy": y, "Dz": z, "PI": np.pi, "Acos": np.arccos, "atan2": np.arctan2, "floor": np.floor}
-            exec(code, names)
-            i, j = int(names["row"]), int(names["column"])
-            a, b = names["row"] - i, names["column"] - j
-            i = min(i, tables[0].shape[0] - 2)
-            values = [t[i : i + 2, j : j + 2] for t in tables]
-            found.append([np.array([1 - a, a]) @ value @ np.array([1 - b, b]) for value in values])
-        return np.array(found)
+        names = dict(zip(("Dx", "Dy", "Dz"), directions.T, strict=True))
+        names |= {"PI": np.pi, "Acos": np.arccos, "atan2": np.arctan2, "floor": np.floor}
+        exec(code, names)
+        return np.stack([linear(table, names["row"], names["column"]) for table in tables], -1)
 
     return sky
-
-
-# LuxCore ----------------------------------------------------------------------------------------------------------
 
 
 def luxcore(folder, monkeypatch):
     """The image shows the screen window, whose ±1 is half the field of view; LuxCore's film is one row off."""
     properties = {}
-    for name in ("scene.scn", "scene.cfg"):
-        for line in (folder / name).read_text().splitlines():
-            key, _, text = line.partition(" = ")
-            properties[key] = text.strip('"') if '"' in text else [float(x) for x in text.split()]
-
+    for line in ((folder / "scene.scn").read_text() + (folder / "scene.cfg").read_text()).splitlines():
+        key, _, text = line.partition(" = ")
+        properties[key] = text.strip('"') if '"' in text else [float(x) for x in text.split()]
     camera = {key.removeprefix("scene.camera."): value for key, value in properties.items()}
     tangent = np.tan(np.radians(camera["fieldofview"][0]) / 2)
     left, right, bottom, top = camera["screenwindow"]
@@ -161,15 +135,12 @@ def luxcore(folder, monkeypatch):
     origin = np.array(camera["lookat.orig"])
     ahead = unit(np.array(camera["lookat.target"]) - origin)
     sideways = unit(np.cross(ahead, camera["up"]))
-    upward = np.cross(sideways, ahead)
 
     def ray(x, y):
-        across = left + x * (right - left)
-        above = top - (y - 1 / height) * (top - bottom)
-        return origin, ahead + tangent * (across * sideways + above * upward)
+        across, above = left + x * (right - left), top - (y - 1 / height) * (top - bottom)
+        return origin, ahead + tangent * (across * sideways + above * np.cross(sideways, ahead))
 
-    depths = {properties[f"path.pathdepth.{name}"][0] for name in ("total", "diffuse", "glossy", "specular")}
-    (depth,) = depths
+    (depth,) = {properties[f"path.pathdepth.{name}"][0] for name in ("total", "diffuse", "glossy", "specular")}
     found = Scene((width, height), int(depth), ray, plain_sky((0, 0, 0)))
     if properties.get("scene.lights.sky.type") == "infinite":
         assert properties["scene.lights.sky.wrap"] == "clamp"
@@ -183,8 +154,9 @@ def luxcore(folder, monkeypatch):
             material = f"scene.materials.{properties[f'scene.objects.{name}.material']}"
             found.triangles[name] = ply(folder / file)
             if properties[f"{material}.type"] == "glass":
-                inner, outer = (properties[f"{material}.{side}ior"][0] for side in ("interior", "exterior"))
-                found.indices[name] = inner / outer
+                found.indices[name] = (
+                    properties[f"{material}.interiorior"][0] / properties[f"{material}.exteriorior"][0]
+                )
             elif f"{material}.emission" in properties:
                 found.lights[name] = properties[f"{material}.emission"]
             else:
@@ -192,13 +164,9 @@ def luxcore(folder, monkeypatch):
     return found
 
 
-# POV-Ray ----------------------------------------------------------------------------------------------------------
-
-
 def povray(folder, monkeypatch):
     """A ray goes along direction + (x − ½) right + (½ − y) up; `dx`, `dy` choose the place in the pixel."""
     text = (folder / "scene.pov").read_text()
-    number = r"[-+.\de]+"
     vectors = lambda part: [np.array(v.split(","), float) for v in re.findall(r"<([^<>]*)>", part)]  # noqa: E731
     (right,), (up,) = (vectors(re.search(rf"#declare {name} = (.*);", text)[1]) for name in ("Right", "Up"))
     origin, ahead = vectors(re.search(r"location[^#]*?direction <[^>]*>", text)[0])
@@ -222,10 +190,9 @@ def povray(folder, monkeypatch):
     for part in text.split("mesh2 { // ")[1:]:
         name = part.split()[0]
         places, faces, surface = re.split(r"face_indices|(?=texture \{ pigment)", part, maxsplit=2)
-        corners = np.array(vectors(places))
         # Clockwise in POV-Ray's left-handed coordinates is counterclockwise in ours.
-        found.triangles[name] = corners[np.array(vectors(faces), int)[:, ::-1]]
-        if match := re.search(rf"interior \{{ ior ({number}) }}", surface):
+        found.triangles[name] = np.array(vectors(places))[np.array(vectors(faces), int)[:, ::-1]]
+        if match := re.search(r"interior \{ ior ([-+.\de]+) }", surface):
             found.indices[name] = float(match[1])
         else:
             front, back = surface.split("interior_texture")
@@ -234,24 +201,22 @@ def povray(folder, monkeypatch):
     return found
 
 
-# Cycles -----------------------------------------------------------------------------------------------------------
-
-
 def cycles(folder, monkeypatch):
-    """What the script makes of Blender. A camera looks along −z, and +y is up in its image."""
+    """What the script makes of Blender. A camera looks along −z, and +y is up in its image.
+
+    A lamp is a mix by whether the ray meets the back: of nothing but light in front, and black behind.
+    """
     bpy = fake_bpy.run(folder, monkeypatch)
     scene, data = bpy.context.scene, bpy.data
     matrix, lens = scene.camera.matrix_world, scene.camera.data
     assert lens is data.cameras.made["camera"] and lens.sensor_fit == "HORIZONTAL"
-    size = scene.render.resolution_x, scene.render.resolution_y
-    wide = np.tan(lens.angle / 2)
+    size, wide = (scene.render.resolution_x, scene.render.resolution_y), np.tan(lens.angle / 2)
 
     def ray(x, y):
         local = np.array([(2 * x - 1) * wide, (1 - 2 * y) * wide * size[1] / size[0], -1])
         return matrix[:3, 3], np.asarray(matrix[:3, :3] @ local)
 
-    bounces = {getattr(scene.cycles, f"{name}_bounces") for name in ("max", "diffuse", "glossy", "transmission")}
-    (depth,) = bounces
+    (depth,) = {getattr(scene.cycles, f"{name}_bounces") for name in ("max", "diffuse", "glossy", "transmission")}
     found = Scene(size, depth + 2, ray, None)
     world = scene.world.node_tree
     background, _ = world.source(world.only("ShaderNodeOutputWorld"), "Surface")
@@ -268,27 +233,21 @@ def cycles(folder, monkeypatch):
         (material,) = mesh.materials
         tree = material.node_tree
         surface, _ = tree.source(tree.only("ShaderNodeOutputMaterial"), "Surface")
+        value = {key: socket.default_value for key, socket in surface.inputs.items()}
         if surface.kind == "ShaderNodeBsdfGlass":
-            assert surface.inputs["Roughness"].default_value == 0
-            assert surface.inputs["Color"].default_value == (1, 1, 1, 1)
-            found.indices[name] = surface.inputs["IOR"].default_value
+            assert (value["Roughness"], value["Color"]) == (0, (1, 1, 1, 1))
+            found.indices[name] = value["IOR"]
         elif surface.kind == "ShaderNodeBsdfDiffuse":
-            assert surface.inputs["Roughness"].default_value == 0
-            found.colours[name] = surface.inputs["Color"].default_value[:3]
+            assert value["Roughness"] == 0
+            found.colours[name] = value["Color"][:3]
         else:
-            found.lights[name] = _cycles_light(tree, surface)
+            assert tree.source(surface, 0)[1] == "Backfacing"
+            (front, _), (back, _) = (tree.source(surface, i) for i in (1, 2))
+            assert (front.kind, back.inputs["Color"].default_value[:3]) == ("ShaderNodeEmission", (0, 0, 0))
+            found.lights[name] = (
+                np.array(front.inputs["Color"].default_value[:3]) * front.inputs["Strength"].default_value
+            )
     return found
-
-
-def _cycles_light(tree, mix):
-    """A mix by whether the ray meets the back: of nothing but light in front, and black behind."""
-    assert tree.source(mix, 0)[1] == "Backfacing"
-    (front, _), (back, _) = (tree.source(mix, i) for i in (1, 2))
-    assert (front.kind, back.inputs["Color"].default_value[:3]) == ("ShaderNodeEmission", (0, 0, 0))
-    return np.array(front.inputs["Color"].default_value[:3]) * front.inputs["Strength"].default_value
-
-
-# raysect ----------------------------------------------------------------------------------------------------------
 
 
 def raysect(folder, monkeypatch):
@@ -297,62 +256,49 @@ def raysect(folder, monkeypatch):
     plain = json.loads((folder / "scene.json").read_text())
     script["build"](plain, folder)
     unit = script["scale"](plain, folder)
-    options = types.SimpleNamespace(spp=3, band=None)
-    camera = script["camera"]("world", plain, options, "pipeline")
+    camera = script["camera"]("world", plain, types.SimpleNamespace(spp=3, band=None), "pipeline")
     assert camera.ray_extinction_prob == 0 and camera.ray_importance_sampling is False
     width, height = camera.pixels
-    half = np.tan(np.radians(camera.fov) / 2) / max(width, height)
-    place = np.asarray(camera.transform)
+    half, place = np.tan(np.radians(camera.fov) / 2) / max(width, height), np.asarray(camera.transform)
 
     def ray(x, y):
         local = np.array([(1 - 2 * x) * half * width, (1 - 2 * y) * half * height, 1])
         return place[:3, 3] / unit, place[:3, :3] @ local
 
-    found = Scene((width, height), camera.ray_max_depth, ray, None)
-    found.sky = _raysect_sky(made.sky, script)
-    for name, mesh in made.meshes.items():
-        found.triangles[name] = mesh.triangles / unit
-        if isinstance(mesh.material, fake_raysect.Emitter):
-            found.lights[name] = _bins(mesh.material.spectrum)
-        elif mesh.material[0] == "glass":
-            _, inside, transmission, outside = mesh.material
-            assert transmission == 1
-            found.indices[name] = inside / outside
-        else:
-            found.colours[name] = _bins(mesh.material[1])
-    return found
-
-
-def _bins(spectrum):
-    """Red, green and blue, each constant between two places."""
-    values = list(spectrum.values())
-    assert values[::2] == values[1::2] and min(np.diff(list(spectrum))) > 0
-    return values[::2]
-
-
-def _raysect_sky(sky, script):
-    if not isinstance(sky, script["Map"]):
-        return plain_sky(_bins(sky.spectrum))
+    def bins(spectrum):
+        """Red, green and blue, each constant between two places."""
+        values = list(spectrum.values())
+        assert values[::2] == values[1::2] and min(np.diff(list(spectrum))) > 0
+        return values[::2]
 
     def seen(direction):
         vector = types.SimpleNamespace(**dict(zip("xyz", direction, strict=True)))
         vector.normalise = lambda: vector
         spectrum = types.SimpleNamespace(samples=np.zeros(3))
         ray = types.SimpleNamespace(direction=vector, new_spectrum=lambda: spectrum)
-        return sky.evaluate_surface("world", ray).samples
+        return made.sky.evaluate_surface("world", ray).samples
 
-    return lambda directions: np.array([seen(direction) for direction in directions])
-
-
-# A program of one's own -------------------------------------------------------------------------------------------
+    a_map = isinstance(made.sky, script["Map"])
+    sky = (lambda directions: np.array(list(map(seen, directions)))) if a_map else plain_sky(bins(made.sky.spectrum))
+    found = Scene((width, height), camera.ray_max_depth, ray, sky)
+    for name, mesh in made.meshes.items():
+        found.triangles[name] = mesh.triangles / unit
+        if isinstance(mesh.material, fake_raysect.Emitter):
+            found.lights[name] = bins(mesh.material.spectrum)
+        elif mesh.material[0] == "glass":
+            _, inside, transmission, outside = mesh.material
+            assert transmission == 1
+            found.indices[name] = inside / outside
+        else:
+            found.colours[name] = bins(mesh.material[1])
+    return found
 
 
 def obj(folder, monkeypatch):
     """As README.txt says it."""
     document = json.loads((folder / "scene.json").read_text())
     camera = document["camera"]
-    size = camera["width"], camera["height"]
-    wide = np.tan(np.radians(camera["fov_x_degrees"]) / 2)
+    size, wide = (camera["width"], camera["height"]), np.tan(np.radians(camera["fov_x_degrees"]) / 2)
     ahead = np.subtract(camera["target"], camera["origin"])
     ray = pinhole(camera["origin"], ahead, camera["up"], wide, wide * size[1] / size[0])
     found = Scene(size, document["max_depth"], ray, None)
@@ -361,7 +307,10 @@ def obj(folder, monkeypatch):
         found.sky = on_map(folder / document["sky"]["environment"], place)
     else:
         found.sky = plain_sky(document["sky"]["radiance"])
-    library, vertices = _mtl(folder / "scene.mtl"), []
+    library, vertices = {}, []
+    for part in (folder / "scene.mtl").read_text().split("newmtl ")[1:]:
+        name, *lines = part.splitlines()
+        library[name] = {word: [float(x) for x in rest] for word, *rest in map(str.split, lines)}
     for line in (folder / "scene.obj").read_text().splitlines():
         word, *rest = line.split()
         if word == "o":
@@ -383,22 +332,5 @@ def obj(folder, monkeypatch):
     return found
 
 
-def _mtl(path):
-    found = {}
-    for line in path.read_text().splitlines():
-        word, *rest = line.split()
-        if word == "newmtl":
-            entry = found[rest[0]] = {}
-        else:
-            entry[word] = [float(x) for x in rest]
-    return found
-
-
-READERS = {
-    "radiance": radiance,
-    "luxcore": luxcore,
-    "povray": povray,
-    "cycles": cycles,
-    "raysect": raysect,
-    "obj+json": obj,
-}
+READERS = {"radiance": radiance, "luxcore": luxcore, "povray": povray, "cycles": cycles, "raysect": raysect}
+READERS["obj+json"] = obj

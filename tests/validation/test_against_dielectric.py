@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mi_refract.plugins import refract as bsdf
-from validation.renders import against_dielectric, colours, scene_needs
+from validation.renders import against_dielectric, colours
 from validation.run import render_methods
 from validation.run.context import SCENES
 
@@ -58,14 +58,6 @@ def test_what_is_the_same_is_not_tested_by_chance_and_still_compared(context):
     assert "bit for bit" in against_dielectric.no_question(noisy, noisy)
     assert "independent seeds" in against_dielectric.no_question(quiet + 1e-7, quiet)
     assert against_dielectric.no_question(quiet * np.nan, quiet) == against_dielectric.no_question(noisy, quiet) == ""
-
-
-def test_scenes_say_what_they_need_and_what_is_left_out(context):
-    (row,) = scene_needs.scene_rows(context, SCENES / "slab.xml")
-    needs = "sampleable, lamps, area, environment, plain environment, only glass, textured, polarising, refracting"
-    assert {name for name, value in row.values.items() if value} == {*needs.split(", "), "deterministic"}
-    assert row.reason == "left out: emitter sampling, a random number, media, null lobes, dispersion, absorption"
-    assert "wavelength" in row.replay["left out"]["dispersion"]
 
 
 def test_an_image_of_colours_is_of_as_many_renders_as_its_noise_asks_for():

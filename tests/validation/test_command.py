@@ -19,7 +19,6 @@ from mi_refract.cluster.connection import ClusterTarget, connected
 from mi_refract.image_diff import self_test
 from mi_refract.image_diff.methods import METHODS
 from mi_refract.report.row import Row
-from mi_refract.report.run_report import read_json
 from validation import __main__ as command
 from validation import readme_tables, runner
 from validation.diff import planted_defects, visible_changes
@@ -168,8 +167,9 @@ def validate(tmp_path, monkeypatch):
 def test_the_exit_code_follows_the_budgets(validate, tmp_path, budget, code):
     assert validate(lambda: [row(budgets={"worst / u": budget})]) == code
     assert {path.name for path in tmp_path.iterdir()} == FILES
-    rows, context = read_json(tmp_path / "rows.json")
-    assert rows[0].verdict == ("pass" if code == 0 else "fail")
+    written = json.loads((tmp_path / "rows.json").read_text())
+    context = written["context"]
+    assert written["rows"][0]["verdict"] == ("pass" if code == 0 else "fail")
     assert context["versions"]["mitsuba"] == mi.__version__
     assert context["replay"] == "python -m validation ground-truth --profile quick"
 

@@ -9,7 +9,7 @@ import pytest
 
 from mi_refract.report.row import Row
 from validation import __main__ as command
-from validation import limits, readme_tables
+from validation import limits
 from validation.suite import matrix, per_ray, rendered_images
 from validation.suite.per_ray import LARGE
 
@@ -53,10 +53,12 @@ def test_a_missed_goal_is_shown_beside_the_number_and_fails_nothing():
     rows += [ray("C", precision="f64", values=ONE | {"recorded": 4.5e-6, "off the recorded": 4.5}, goals=goals)]
     cells = matrix.summary(rows)
     assert [(cell.verdict, bool(cell.missed)) for cell in cells] == [("pass", True), ("pass", False), ("pass", True)]
-    table = readme_tables.suite(cells)
-    for line in ("| A, f32 | 1e-6 (3.67 × recorded) |", "| B, f32 | 1e-6 |", "| C, f64 | 1e-6 (recorded / 4.5) |"):
-        assert line in table
-    assert "a goal" in table and "fails nothing" in table
+    text, head, lines = matrix.table(cells)
+    shown = {line[0]: line[1 + list(per_ray.SETS).index("random")] for line in lines}
+    assert shown == {"A, f32": "1e-6 (3.67 × recorded)", "B, f32": "1e-6", "C, f64": "1e-6 (recorded / 4.5)"}
+    assert head[1] == "random" and "a goal" in text and "fails nothing" in text
+    with pytest.raises(ValueError, match="no other renderer was run"):
+        matrix.table([])
 
 
 @pytest.mark.parametrize("study", matrix.CHECKS)

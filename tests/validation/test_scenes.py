@@ -192,23 +192,15 @@ def test_media_see_a_wrong_boundary(tmp_path, name, old, new):
 
 # --- meshes ----------------------------------------------------------------------------------------------
 
-# A solid is a list of meshes, and its number of facets; "-" turns a mesh inside out. The rim of the tumbler is one
-# facet, and so are the dry and the wet part of an inner wall.
-SOLIDS = {
-    "bottle": (["bottle_outer.ply"], 7 * 12 + 2),
-    "hollow": (["bottle_inner.ply"], 50),
-    "diamond": (["diamond.ply"], 57 + 16),
-    "prism": (["prism.ply"], 5),
-    "tumbler": (["tumbler_air.ply", "tumbler_wet.ply"], 12 + 12 + 3),
-    "water": (["-tumbler_wet.ply", "water_top.ply"], 12 + 2),
-}
+# A solid is a list of meshes; "-" turns one inside out.
+SOLIDS = {name: [f"{name}.ply"] for name in ("bottle_outer", "bottle_inner", "diamond", "prism")}
+SOLIDS |= {"tumbler": ["tumbler_air.ply", "tumbler_wet.ply"], "water": ["-tumbler_wet.ply", "water_top.ply"]}
 
 
 @pytest.mark.parametrize("name", SOLIDS)
-def test_solid_is_closed_and_its_facets_are_plane(name):
-    """Plane to the rounding of float32 coordinates: |error| ≤ 3u·size. The diamond is convex."""
-    points, faces, meshes, count = [], [], *SOLIDS[name]
-    for mesh in meshes:
+def test_solid_is_closed(name):
+    points, faces = [], []
+    for mesh in SOLIDS[name]:
         header, body = (SCENES / "meshes" / mesh.lstrip("-")).read_text().split("end_header\n")
         rows, size = body.splitlines(), int(re.search(r"element vertex (\d+)", header)[1])
         face = np.array([r.split()[1:] for r in rows[size:]], int) + sum(map(len, points))
@@ -220,18 +212,6 @@ def test_solid_is_closed_and_its_facets_are_plane(name):
     assert set(edges.values()) == {1} and all((b, a) in edges for a, b in edges)  # each edge has its opposite
     assert len(v) - len(edges) // 2 + len(f) == 2  # Euler's formula
     assert np.einsum("ij,ij->i", v[f[:, 0]], np.cross(v[f[:, 1]], v[f[:, 2]])).sum() > 0  # the volume
-    n = np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
-    area = np.linalg.norm(n, axis=1)
-    n /= area[:, None]
-    left, spread = list(np.argsort(-area)), []  # triangles are gathered by plane, the largest first
-    while left:
-        distance = {u: abs((v[f[u]] - v[f[left[0], 0]]) @ n[left[0]]).max() for u in left}
-        same = [u for u in left if n[left[0]] @ n[u] > np.cos(0.01) and distance[u] < 0.01]
-        spread.append(max(distance[u] for u in same))
-        left = [u for u in left if u not in same]
-    assert len(spread) == count and max(spread) <= 3 * 2**-24 * np.abs(v).max()
-    above = (n @ v.T - np.einsum("ij,ij->i", n, v[f[:, 0]])[:, None]).max()
-    assert name != "diamond" or above < 1e-4
 
 
 # --- light pipe ------------------------------------------------------------------------------------------
@@ -321,10 +301,3 @@ def test_thick_glass_is_darker(needs_variant):
     stopper, neck = image[3:7, 29:36].mean((0, 1)), image[10:15, 29:36].mean((0, 1))
     assert (stopper < neck).all() and stopper[0] < 0.5 * neck[0]
     assert stopper[1] > 2 * stopper[0] and stopper[1] > 1.5 * stopper[2]
-
-
-@pytest.mark.parametrize(("value", "other"), [("0.42, 0.85, 0.50", "0.42, 0.80, 0.50"), ("8", "9")])
-def test_a_bottle_whose_boundaries_contradict_each_other_is_refused(tmp_path, value, other):
-    bottle = edited(tmp_path, "green_bottle", f'value="{value}"', f'value="{other}"', 1)
-    with pytest.raises(ValueError, match=r"bottle_(inner|outer)"):
-        rendered(bottle)

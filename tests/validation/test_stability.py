@@ -14,13 +14,13 @@ from mi_refract import FORMULAS, backend, oracle
 from mi_refract.formulas import fresnel
 from mi_refract.plugins import refract as bsdf
 from validation import limits
-from validation.reference import closed_forms, layered_scenes, optical_systems
-from validation.reference.layered_scenes import FIBRE, MIRAGE
+from validation.reference import closed_forms, optical_systems
 from validation.run import seeds
 from validation.run.array_settings import BUILTIN
 from validation.run.context import PROFILES, SCALAR_PROFILES, Context
 from validation.stability import derivatives, energy, layered_paths, optical_chains
 from validation.stability.layer_chains import air, carry, enter
+from validation.stability.layered_paths import FIBRE, MIRAGE
 
 HERE = Context(SCALAR_PROFILES["standard"], Path(), "scalar_rgb", backend.detect(), backend.usable_variants())
 SETTINGS = {setting.label: setting for setting in optical_chains.settings(HERE)}
@@ -380,9 +380,12 @@ def context(tmp_path):
 
 
 def test_no_layer_is_thinner_than_the_ray_offset():
-    for layers, where in ((MIRAGE, layered_scenes.POOL), (FIBRE, abs(FIBRE.end))):
+    for layers, where in (
+        (layered_paths.MIRAGE, layered_paths.POOL),
+        (layered_paths.FIBRE, abs(layered_paths.FIBRE.end)),
+    ):
         assert len(layers.boundaries) + 1 == len(layers.indices) == {"mirage": 33, "fibre": 17}[layers.scene]
-        assert (-np.diff(layers.boundaries) > layered_scenes.OFFSET * (1 + where)).all()
+        assert (-np.diff(layers.boundaries) > layered_paths.OFFSET * (1 + where)).all()
 
 
 def test_only_forms_at_the_rounding_limit_keep_to_the_path_and_a_fibre_guides_every_ray(llvm_variant, context):

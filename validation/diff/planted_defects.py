@@ -55,8 +55,8 @@ def _with_indices(change: Callable[[float, float], tuple[float, float]]) -> Make
     """Other indices inside and outside."""
 
     def make(props: Any, plugin: type) -> Any:
-        inner, outer = read_ior(props, "int_ior", "bk7"), read_ior(props, "ext_ior", "air")
-        props["int_ior"], props["ext_ior"] = change(inner, outer)
+        indices = change(read_ior(props, "int_ior", "bk7"), read_ior(props, "ext_ior", "air"))
+        props["int_ior"], props["ext_ior"] = indices
         return plugin(props)
 
     return make
@@ -66,7 +66,7 @@ def _sampling(change: Callable[..., tuple[Any, Any]]) -> Make:
     """`change(sample, ctx, si, sample1, sample2, active)`, `sample` being the plugin's own."""
 
     def make(props: Any, plugin: type) -> Any:
-        class Spoilt(plugin):
+        class Spoilt(plugin):  # type: ignore[misc]
             def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
                 return change(super().sample, ctx, si, sample1, sample2, active)
 
@@ -85,10 +85,10 @@ def _black_inside(sample: Any, *args: Any) -> tuple[Any, Any]:
     return bs, dr.select((bs.sampled_component == 0) & (bs.pdf >= 1), 0, weight)  # no other reflection is certain
 
 
-def _swapped_lobes(sample: Any, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any) -> tuple[Any, Any]:
+def _swapped_lobes(sample: Any, ctx: Any, si: Any, sample1: Any, *args: Any) -> tuple[Any, Any]:
     """Each lobe as often as the other should be, but where total reflection leaves one only."""
-    reflected, r = sample(ctx, si, 0 * sample1, sample2, active)
-    transmitted, t = sample(ctx, si, 0 * sample1 + (1 - 2.0**-24), sample2, active)
+    reflected, r = sample(ctx, si, 0 * sample1, *args)
+    transmitted, t = sample(ctx, si, 0 * sample1 + (1 - 2.0**-24), *args)
     choice = sample1 < reflected.pdf
     return dr.select(choice, transmitted, reflected), dr.select(choice, t, r)
 
@@ -139,16 +139,14 @@ def _renders(camera: Camera, first: int, spp: int = SPP) -> np.ndarray:
     return np.stack([camera(spp, seed)[0] for seed in range(first, first + RENDERS)])
 
 
-def trials(name: str, count: int, resolution: int = RESOLUTION, spp: int = SPP) -> list[self_test.Trial]:
-    """Clean renders, nothing planted: no seed is used twice."""
+def trials(name: str, count: int, resolution: int = RESOLUTION, spp: int = SPP) -> dict[int, self_test.Trial]:
+    """Clean renders, nothing planted, by their first seed: no seed is used twice."""
     camera = opened(name, resolution=resolution)
-    sides = [[_renders(camera, seed, spp) for seed in (first, first + RENDERS)] for first in _seeds(count)]
-    return [self_test.Trial(clean, other, functools.partial(np.copy, clean)) for clean, other in sides]
-
-
-def _seeds(count: int) -> range:
-    """The first seed of each trial."""
-    return range(0, 2 * RENDERS * count, 2 * RENDERS)
+    sides = {
+        i: [_renders(camera, seed, spp) for seed in (i, i + RENDERS)]
+        for i in range(0, 2 * RENDERS * count, 2 * RENDERS)
+    }
+    return {i: self_test.Trial(clean, other, functools.partial(np.copy, clean)) for i, (clean, other) in sides.items()}
 
 
 # Judged --------------------------------------------------------------------------------------------------------
@@ -176,35 +174,27 @@ def defect_rows(context: Context, name: str) -> list[Row]:
 
     def row(defect: str, camera: Camera) -> Row:
         """Of renders with the seeds of the clean ones."""
-        spoilt = [
-            replace(trial, spoil=functools.partial(_renders, camera, seed))
-            for trial, seed in zip(clean, _seeds(len(clean)), strict=True)
-        ]
+        spoilt = [replace(x, spoil=functools.partial(_renders, camera, seed)) for seed, x in clean.items()]
         return self_test.detection(defect, False, spoilt, name, context.variant)
 
     rows = [row(defect, opened(name, f"{GLASS} {defect}")) for defect in GLASSES]
-    rows += _image_defects(clean, name, context)
+    rows += image_defect_rows(context, name, clean)
     other = row(OTHER_SAMPLER, opened(name, sampler="multijitter"))
     if other.values:
-        other = replace(
-            other, budgets=other.budgets | {"welch": ONE_ALARM}, reason="no defect: `welch` must not see it"
-        )
-    every = np.concatenate([trial.clean for trial in clean])
+        budgets = other.budgets | {"welch": ONE_ALARM}
+        other = replace(other, budgets=budgets, reason="no defect: `welch` must not see it")
+    every = np.concatenate([trial.clean for trial in clean.values()])
     replay = {"resolution": RESOLUTION, "spp": SPP, "renders": len(every)}
     noise = Row(NAME, "renders", name, context.variant, {"noise": self_test.noise(every)}, replay=replay)
     return [*rows, other, noise]
 
 
-def image_defect_rows(context: Context, name: str) -> list[Row]:
-    """The defects that are planted in finished images, in a few trials: no other glass is compiled."""
-    size = (32, 4) if context.scalar else (RESOLUTION, SPP)
-    return _image_defects(trials(name, QUICK_TRIALS, *size), name, context)
-
-
-def _image_defects(clean: list[self_test.Trial], name: str, context: Context) -> list[Row]:
+def image_defect_rows(context: Context, name: str, clean: dict[int, self_test.Trial] | None = None) -> list[Row]:
+    """The defects that are planted in finished images; without renders in a few trials: no other glass is compiled."""
+    clean = clean or trials(name, QUICK_TRIALS, *((32, 4) if context.scalar else (RESOLUTION, SPP)))
     rows = []
     for defect, planted in self_test.DEFECTS.items():
-        spoilt = [replace(trial, spoil=functools.partial(planted.spoil, trial.clean)) for trial in clean]
+        spoilt = [replace(trial, spoil=functools.partial(planted.spoil, trial.clean)) for trial in clean.values()]
         rows.append(self_test.detection(defect, planted.always_due, spoilt, name, context.variant))
     return rows
 

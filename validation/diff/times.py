@@ -45,8 +45,7 @@ SHELL, LIBRARIES = "from the shell", "import the libraries"
 NAME = "diff_times"
 SEED = 2034
 SPP, GAIN = 16, 1.05  # the noise of the renders; how much brighter a quarter of the other image is
-SMALL = 256
-RENDERS = 8  # a side
+SMALL, RENDERS = 256, 8  # pixels a side of the small images; renders a side
 MEGABYTE = 1e6
 
 
@@ -61,7 +60,6 @@ class Size:
 
 
 SIZES = {"quick": Size(135, 240, 5, 6), "standard": Size(270, 480, 20, 7), "full": Size(1080, 1920, 1000, 7)}
-GOAL_SIZE = SIZES["full"]
 PROCESS = """
 import sys
 from mi_refract.cli import main
@@ -86,7 +84,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def measure(size: Size, setting: str) -> list[Row]:
-    """A row per subject."""
+    """A row per subject, one of the size of the page, and one of the memory of the process with the most."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         write(root, size)
@@ -98,13 +96,19 @@ def measure(size: Size, setting: str) -> list[Row]:
             values = kernel_timing.interval("seconds", seconds[name])
             if subject.beside:
                 values |= kernel_timing.ratio(subject.ratio, seconds[name], seconds[subject.beside])
-            goals = {"seconds": limits.DIFF_SECONDS[name]} if size == GOAL_SIZE and name in limits.DIFF_SECONDS else {}
+            limited = size == SIZES["full"] and name in limits.DIFF_SECONDS
+            goals = {"seconds": limits.DIFF_SECONDS[name]} if limited else {}
             replay = {"seed": SEED, "rounds": size.rounds}
             rows.append(Row(NAME, name, subject.case, setting, values, goals=goals, replay=replay))
-        values = {"MB of page": (root / "page.html").stat().st_size / MEGABYTE}
+        page = {"MB of page": (root / "page.html").stat().st_size / MEGABYTE}
         budgets = {"MB of page": limits.PAGE_MEGABYTES}
-        rows.append(Row(NAME, "size of the page", subjects["page"].case, setting, values, budgets))
-        return [*rows, _memory_row(root, subjects["welch"].case, setting)]
+        rows.append(Row(NAME, "size of the page", subjects["page"].case, setting, page, budgets))
+        case = subjects["welch"].case
+        if not Path("/proc/self/status").exists():
+            return [*rows, Row(NAME, "memory", case, setting, reason="this system does not say a process's peak")]
+        words = ["diff", str(root / "a"), str(root / "b"), "--renders", "--report", str(root / "welch.html")]
+        memory = {"MB of memory": 1024 * json.loads(python("-c", PROCESS, *words).split()[-1]) / MEGABYTE}
+        return [*rows, Row(NAME, "memory", case, setting, memory, {"MB of memory": limits.MEMORY_MEGABYTES})]
 
 
 def write(root: Path, size: Size) -> None:
@@ -139,7 +143,7 @@ def subjects_of(root: Path, size: Size) -> dict[str, Subject]:
             for pair in zip(*sides, strict=True):
                 list(pool.map(image_file.read, pair))
 
-    found = {
+    subjects = {
         "read the pair": Subject(one, functools.partial(read, [side[:1] for side in files[0]])),
         "read the renders": Subject(several, functools.partial(read, files[0])),
         "read the folder": Subject(many, functools.partial(read, files[1])),
@@ -149,14 +153,14 @@ def subjects_of(root: Path, size: Size) -> dict[str, Subject]:
         sides = (a, b) if method.takes_renders else (a / "0.exr", b / "0.exr")
         compare = functools.partial(folders.diff, *sides, Settings.for_all(method=name), renders=method.takes_renders)
         beside = "read the renders" if method.takes_renders else "read the pair"
-        found[name] = Subject(several if method.takes_renders else one, compare, beside)
-    found[AUTO] = Subject(many, functools.partial(folders.diff, root / "many_a", root / "many_b"), "read the folder")
+        subjects[name] = Subject(several if method.takes_renders else one, compare, beside)
+    subjects[AUTO] = Subject(many, functools.partial(folders.diff, root / "many_a", root / "many_b"), "read the folder")
     small = [str(root / side / "0000.exr") for side in ("many_a", "many_b")]
     shell = functools.partial(python, "-m", "mi_refract.cli", "diff", *small)
-    found[SHELL] = Subject(f"a pair of {SMALL}²", shell, LIBRARIES, "time / libraries")
+    subjects[SHELL] = Subject(f"a pair of {SMALL}²", shell, LIBRARIES, "time / libraries")
     judged = folders.diff(a / "0.exr", b / "0.exr", Settings.for_all(method="tolerance"), maps=True)
-    found["page"] = Subject(one, functools.partial(html_report.write, root / "page.html", judged))
-    return found
+    subjects["page"] = Subject(one, functools.partial(html_report.write, root / "page.html", judged))
+    return subjects
 
 
 def python(*words: str) -> str:
@@ -172,15 +176,6 @@ def _clock(run: Callable[[], object]) -> float:
     start = time.perf_counter()
     run()
     return time.perf_counter() - start
-
-
-def _memory_row(root: Path, case: str, setting: str) -> Row:
-    """Of the process with the most: Welch's test of all renders, with its page."""
-    if not Path("/proc/self/status").exists():
-        return Row(NAME, "memory", case, setting, reason="this system does not say a process's peak")
-    words = ["diff", str(root / "a"), str(root / "b"), "--renders", "--report", str(root / "welch.html")]
-    values = {"MB of memory": 1024 * json.loads(python("-c", PROCESS, *words).split()[-1]) / MEGABYTE}
-    return Row(NAME, "memory", case, setting, values, {"MB of memory": limits.MEMORY_MEGABYTES})
 
 
 STUDY = Study(NAME, "Diff, times", about(__doc__), TERMS, tasks)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,35 +51,22 @@ TERMS = {
 }
 
 
+Rng = np.random.Generator
+Pair = tuple[Image, Image]
+Change = Callable[[Rng], Pair]
+Shape = tuple[int, float, float, float, float, Pixels]  # kind, x, y, radius, angle, colour in codes
+DISK, BOX, BAR = range(3)  # a bar is one pixel wide
+
+
 # Images --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Shape:
-    """A disk, a box, or a bar one pixel wide, in codes."""
-
-    kind: int
-    x: float
-    y: float
-    radius: float
-    angle: float
-    colour: Pixels
-
-    def holds(self, x: Pixels, y: Pixels) -> Pixels:
-        """Which points lie in it."""
-        cos, sin = np.cos(self.angle), np.sin(self.angle)
-        u, v = (x - self.x) * cos + (y - self.y) * sin, (y - self.y) * cos - (x - self.x) * sin
-        if self.kind == 0:
-            return u * u + v * v < self.radius**2
-        return (np.abs(u) < self.radius) & (np.abs(v) < (0.7 * self.radius if self.kind == 1 else 0.5))
-
-
-def scene(rng: np.random.Generator) -> list[Shape]:
+def scene(rng: Rng) -> list[Shape]:
     """The shapes of an image; the first one covers it."""
-    shapes = [Shape(1, SIZE / 2, SIZE / 2, 2.0 * SIZE, 0.0, rng.uniform(0, 255, 3))]
+    shapes: list[Shape] = [(BOX, SIZE / 2, SIZE / 2, 2.0 * SIZE, 0.0, rng.uniform(0, 255, 3))]
     for _ in range(SHAPES):
         x, y, radius = rng.uniform(0, SIZE), rng.uniform(0, SIZE), 8 * np.exp(rng.normal(0, 0.6))
-        shapes.append(Shape(int(rng.integers(3)), x, y, radius, rng.uniform(0, np.pi), rng.uniform(0, 255, 3)))
+        shapes.append((int(rng.integers(3)), x, y, radius, rng.uniform(0, np.pi), rng.uniform(0, 255, 3)))
     return shapes
 
 
@@ -91,9 +78,12 @@ def drawn(shapes: list[Shape], samples: int = SAMPLES, turn: float = 0.0, shift:
     rows, columns = np.mgrid[:SIZE, :SIZE]
     x, y = columns[..., None] + dx, rows[..., None] + dy
     codes = np.zeros((*x.shape, 3))
-    for shape in shapes:
-        codes[shape.holds(x, y)] = shape.colour
-    return codes.mean(2)
+    for kind, left, top, radius, angle, colour in shapes:
+        cos, sin = np.cos(angle), np.sin(angle)
+        u, v = (x - left) * cos + (y - top) * sin, (y - top) * cos - (x - left) * sin
+        box = (np.abs(u) < radius) & (np.abs(v) < (0.7 * radius if kind == BOX else 0.5))
+        codes[u * u + v * v < radius**2 if kind == DISK else box] = colour
+    return np.asarray(codes.mean(2))
 
 
 def shown(codes: Pixels, rounded: bool = True) -> Image:
@@ -107,21 +97,14 @@ def light(codes: Pixels) -> Image:
     return Image(Path("light.exr"), np.exp2(codes / 255 * 6 - 3).astype(np.float32), ("R", "G", "B"))
 
 
-Rng = np.random.Generator
-Pair = tuple[Image, Image]
-Change = Callable[[Rng], Pair]
-
-
 # Changes that nobody sees ------------------------------------------------------------------------------------------
 
 
-def of_codes(
-    change: Callable[[Rng, Pixels], Pixels], least: float = 0, most: float = 255, rounded: bool = True
-) -> Change:
-    """The codes of a scene, from `least` to `most`, and what they are changed to."""
+def of_codes(change: Callable[[Rng, Pixels], Pixels], most: float = 255, rounded: bool = True) -> Change:
+    """The codes of a scene, up to `most`, and what they are changed to."""
 
     def make(rng: Rng) -> Pair:
-        codes = np.clip(drawn(scene(rng)), least, most)
+        codes = np.clip(drawn(scene(rng)), 0, most)
         return shown(codes, rounded), shown(change(rng, codes), rounded)
 
     return make
@@ -221,52 +204,42 @@ def _lit_surface(rng: Rng) -> Pair:
     return one, two
 
 
-@dataclass(frozen=True)
-class Kind:
-    """A kind of change: `make(rng)` gives a reference and a test image.
-
-    `due`: whether a person sees it; None where that depends, and nothing is demanded.
-    """
-
-    text: str
-    make: Change
-    due: bool | None = False
-
-
-KINDS = {
-    "last bits": Kind(
-        "relative 2⁻²³", of_codes(lambda rng, x: x * (1 + rng.choice([-1, 1], x.shape) * 2.0**-23), rounded=False)
+KINDS: dict[str, tuple[str, Change, bool | None]] = {  # a pair of each, and whether a person sees it; None: in part
+    "last bits": (
+        "relative 2⁻²³",
+        of_codes(lambda rng, x: x * (1 + rng.choice([-1, 1], x.shape) * 2.0**-23), rounded=False),
+        False,
     ),
-    "one code": Kind("everywhere one more of 255", of_codes(lambda rng, x: np.round(x) + 1, most=254)),
-    "dithering": Kind(
-        "rounded with and without noise of half a code", of_codes(lambda rng, x: x + rng.uniform(-0.5, 0.5, x.shape))
+    "one code": ("everywhere one more of 255", of_codes(lambda rng, x: np.round(x) + 1, most=254), False),
+    "dithering": (
+        "rounded with and without noise of half a code",
+        of_codes(lambda rng, x: x + rng.uniform(-0.5, 0.5, x.shape)),
+        False,
     ),
-    "other antialiasing": Kind("the 16 samples on a grid that is turned", redrawn(turn=0.46)),
-    "less antialiasing": Kind("4 samples instead of 16", redrawn(samples=2)),
-    "a quarter pixel": Kind("the camera moved by this distance", redrawn(shift=0.25)),
-    "JPEG": Kind("quality 98, without subsampling of the colours", _jpeg),
-    "half floats": Kind("an HDR image of 6 stops, rounded to 11 bits", _half_floats),
-    "no antialiasing": Kind("1 sample instead of 16; seen in some images", redrawn(samples=1), due=None),
-    "colour of an object": Kind(
+    "other antialiasing": ("the 16 samples on a grid that is turned", redrawn(turn=0.46), False),
+    "less antialiasing": ("4 samples instead of 16", redrawn(samples=2), False),
+    "a quarter pixel": ("the camera moved by this distance", redrawn(shift=0.25), False),
+    "JPEG": ("quality 98, without subsampling of the colours", _jpeg, False),
+    "half floats": ("an HDR image of 6 stops, rounded to 11 bits", _half_floats, False),
+    "no antialiasing": ("1 sample instead of 16; seen in some images", redrawn(samples=1), None),
+    "colour of an object": (
         "A box of 0.12 to 0.18 degrees, 140 codes more of red or green, with or without another primary, or of all.",
         _recoloured,
-        due=True,
+        True,
     ),
-    "highlight": Kind(
+    "highlight": (
         "Of a standard deviation of 0.05 to 0.07 degrees and 140 to 180 codes, on dark gray; gone.",
         _highlight,
-        due=True,
+        True,
     ),
-    "moved object": Kind(
-        "A box of 0.12 to 0.24 degrees and a contrast of 180 codes, by three pixels.", _moved, due=True
-    ),
-    "line": Kind("A line of one pixel and 0.3 degrees, of a contrast of 225 to 255 codes; gone.", _line, due=True),
-    "brighter surface": Kind("A surface of 0.3 to 0.6 degrees, 14 to 20 codes brighter.", _surface, due=True),
-    "light on a surface": Kind("HDR: a surface of 0.3 to 0.6 degrees in a quarter more light.", _lit_surface, due=True),
-    "blue of an object": Kind(
+    "moved object": ("A box of 0.12 to 0.24 degrees and a contrast of 180 codes, by three pixels.", _moved, True),
+    "line": ("A line of one pixel and 0.3 degrees, of a contrast of 225 to 255 codes; gone.", _line, True),
+    "brighter surface": ("A surface of 0.3 to 0.6 degrees, 14 to 20 codes brighter.", _surface, True),
+    "light on a surface": ("HDR: a surface of 0.3 to 0.6 degrees in a quarter more light.", _lit_surface, True),
+    "blue of an object": (
         "A box of 0.12 to 0.18 degrees, 140 codes more of blue alone, for which the eye is the least sharp.",
         functools.partial(_recoloured, blue=True),
-        due=None,
+        None,
     ),
 }
 CASES = {False: "not seen", True: "seen", None: "seen in part"}
@@ -292,52 +265,47 @@ def errors(pair: Pair) -> tuple[float, float, float]:
 
 def kind_row(name: str, count: int) -> Row:
     """What `flip` finds in pairs of one kind."""
-    kind = KINDS[name]
+    text, make, due = KINDS[name]
     own = np.random.SeedSequence((seeds.current(SEED), list(KINDS).index(name))).spawn(count)
-    local, throughout, error = np.array([errors(kind.make(np.random.default_rng(seed))) for seed in own]).T
+    local, throughout, error = np.array([errors(make(np.random.default_rng(seed))) for seed in own]).T
     different = int((error > 1).sum())
     values = {LOCAL: float(np.median(local)), THROUGHOUT: float(np.median(throughout)), ALARMS: different / count}
-    if kind.due is True:
+    budgets: dict[str, float] = {}
+    if due:
         values |= {ERROR: float(error.min()), MISSED: float(count - different)}
         budgets = {MISSED: 0.0}
     else:
-        values[ERROR] = float(error.max())
-        values[BOUND] = Tally(seen=different, trials=count).bound
+        values |= {ERROR: float(error.max()), BOUND: Tally(seen=different, trials=count).bound}
+    if due is False:
         budgets = {ALARMS: FALSE_ALARMS} | ({BOUND: FALSE_ALARMS} if count >= TRIALS["standard"] else {})
-    budgets = {} if kind.due is None else budgets
     replay = {"seed": seeds.current(SEED), "trials": count, "size": SIZE}
-    return Row(NAME, name, CASES[kind.due], SETTING, values, budgets, reason=kind.text, replay=replay)
+    return Row(NAME, name, CASES[due], SETTING, values, budgets, reason=text, replay=replay)
 
 
 def limit_rows() -> list[Row]:
     """The smallest changes that are called different: of gray squares by their side, and of an edge."""
-    rows = [
-        Row(NAME, f"square of {side} pixels", LIMIT, SETTING, {CODES: _smallest(functools.partial(_square, side), 155)})
-        for side in SQUARES
-    ]
-    return [*rows, Row(NAME, EDGE, LIMIT, SETTING, {PIXELS: _smallest(_edge, 40) / 4})]
+    plain, white = np.full((WIDE, WIDE, 3), float(GRAY)), (BOX, SIZE / 2, SIZE / 2, 4.0 * SIZE, 0.0, np.full(3, 255.0))
 
+    def square(side: int, codes: int) -> Pair:
+        return shown(plain), shown(patched(plain, WIDE / 2, WIDE / 2, side, GRAY + codes))
 
-def _smallest(make: Callable[[int], Pair], most: int) -> float:
-    """The smallest number up to `most` for which the pair is different; NaN where there is none."""
-    low, high = 0, most + 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if errors(make(middle))[2] > 1 else (middle, high)
-    return float(high) if high <= most else float("nan")
+    def edge(quarters: int) -> Pair:
+        """A black half-plane on white, at the angle where a move by a pixel makes the largest error of those tried."""
+        places = (SIZE / 2 - 2 * SIZE + x for x in (0.0, quarters / 4))
+        one, two = (shown(drawn([white, (BOX, x, SIZE / 2, 2.0 * SIZE, 0.4, np.zeros(3))])) for x in places)
+        return one, two
 
+    def smallest(make: Callable[[int], Pair], most: int) -> float:
+        """The smallest number up to `most` for which the pair is different; NaN where there is none."""
+        low, high = 0, most + 1
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if errors(make(middle))[2] > 1 else (middle, high)
+        return float(high) if high <= most else float("nan")
 
-def _square(side: int, codes: int) -> Pair:
-    plain = np.full((WIDE, WIDE, 3), float(GRAY))
-    return shown(plain), shown(patched(plain, WIDE / 2, WIDE / 2, side, GRAY + codes))
-
-
-def _edge(quarters: int) -> Pair:
-    """A black half-plane on white, at the angle where a move by one pixel makes the largest error of those tried."""
-    shapes = [Shape(1, SIZE / 2, SIZE / 2, 4.0 * SIZE, 0.0, np.full(3, 255.0))]
-    moved = [Shape(1, SIZE / 2 - 2 * SIZE + x, SIZE / 2, 2.0 * SIZE, 0.4, np.zeros(3)) for x in (0.0, quarters / 4)]
-    one, two = (shown(drawn([*shapes, shape])) for shape in moved)
-    return one, two
+    codes = {side: {CODES: smallest(functools.partial(square, side), 155)} for side in SQUARES}
+    rows = [Row(NAME, f"square of {side} pixels", LIMIT, SETTING, values) for side, values in codes.items()]
+    return [*rows, Row(NAME, EDGE, LIMIT, SETTING, {PIXELS: smallest(edge, 40) / 4})]
 
 
 STUDY = Study(

@@ -27,6 +27,7 @@ from scipy import stats
 from scipy.ndimage import gaussian_filter
 
 from mi_refract.image_diff import tile_statistics
+from mi_refract.image_diff.channels import AREA, FREEDOM, SPP
 from mi_refract.image_diff.comparison import Comparison, Verdict
 from mi_refract.image_diff.methods import METHODS, compare
 from mi_refract.io.image_file import Image
@@ -55,51 +56,39 @@ Side = Image | list[Image]
 Draw = Callable[[Rng, int], tuple[Array, Array]]  # of each pixel: the mean of n samples x, and Σ(x − mean)²
 
 
-def rare(probability: float, base: float = 1.0) -> Draw:
+def rare(rng: Rng, n: int, probability: float, base: float = 1.0) -> tuple[Array, Array]:
     """Normal noise of σ = base/2, and `probability` of 200 more.
 
     Drawn by the samples with and without: their means, and Σ(x − mean)² of either, which is χ².
     """
-
-    def draw(rng: Rng, n: int) -> tuple[Array, Array]:
-        hits = rng.binomial(n, probability, (64, 64, 1))
-        groups = []
-        for count, mean in ((hits, base + 200.0), (n - hits, base)):
-            of_group = mean + base / 2 * rng.standard_normal(hits.shape) / np.sqrt(np.maximum(count, 1))
-            groups.append((count, of_group, base**2 / 4 * 2 * rng.standard_gamma(np.maximum(count - 1, 0) / 2)))
-        (k, a, one), (rest, b, two) = groups
-        return (k * a + rest * b) / n, one + two + k * rest / n * np.square(a - b)
-
-    return draw
+    hits = rng.binomial(n, probability, (64, 64, 1))
+    groups = []
+    for count, mean in ((hits, base + 200.0), (n - hits, base)):
+        of_group = mean + base / 2 * rng.standard_normal(hits.shape) / np.sqrt(np.maximum(count, 1))
+        groups.append((count, of_group, base**2 / 4 * 2 * rng.standard_gamma(np.maximum(count - 1, 0) / 2)))
+    (k, a, one), (rest, b, two) = groups
+    return (k * a + rest * b) / n, one + two + k * rest / n * np.square(a - b)
 
 
-def sampled(law: Callable[[Rng, tuple[int, ...]], Array]) -> Draw:
+def drawn(rng: Rng, n: int, law: Callable[[Rng, tuple[int, ...]], Array]) -> tuple[Array, Array]:
     """Samples that are drawn one by one."""
+    x = law(rng, (n, 32, 32, 1))
+    mean = x.mean(0)
+    return mean, np.square(np.subtract(x, mean, out=x), out=x).sum(0)
 
-    def draw(rng: Rng, n: int) -> tuple[Array, Array]:
-        x = law(rng, (n, 32, 32, 1))
-        mean = x.mean(0)
-        return mean, np.square(np.subtract(x, mean, out=x), out=x).sum(0)
 
-    return draw
+def lognormal(rng: Rng, shape: tuple[int, ...]) -> Array:
+    """Of σ = 1.5."""
+    return np.asarray(np.exp(1.5 * rng.standard_normal(shape, np.float32), dtype=np.float64))
 
 
 LIGHT: dict[str, Draw] = {
-    "normal": rare(0.0),
-    "lognormal": sampled(lambda rng, shape: np.exp(1.5 * rng.standard_normal(shape, np.float32), dtype=np.float64)),
-    "Pareto": sampled(lambda rng, shape: rng.pareto(2.2, shape)),
-    **{f"fireflies {p:g}": rare(p) for p in (1e-2, 3e-3, 1e-3, 1e-4, 1e-5)},
-    "lamp 0.001": rare(1e-3, 0.0),
+    "normal": functools.partial(rare, probability=0.0),
+    "lognormal": functools.partial(drawn, law=lognormal),
+    "Pareto": functools.partial(drawn, law=lambda rng, shape: rng.pareto(2.2, shape)),
+    **{f"fireflies {p:g}": functools.partial(rare, probability=p) for p in (1e-2, 3e-3, 1e-3, 1e-4, 1e-5)},
+    "lamp 0.001": functools.partial(rare, probability=1e-3, base=0.0),
 }
-
-
-def image(mean: Array, variance: Array | None, **header: float) -> Image:
-    """An image, with its variance where that is known."""
-    names = tuple("RGB"[: mean.shape[-1]])
-    if variance is not None:
-        names, mean = (*names, *(f"{name}.variance" for name in names)), np.concatenate([mean, variance], -1)
-    metadata = {f"mi_refract:{name}": value for name, value in header.items()}
-    return Image(Path("drawn.exr"), mean.astype(np.float32), names, metadata=metadata)
 
 
 @dataclass(frozen=True)
@@ -119,33 +108,40 @@ class Form:
         """Both sides, of so many samples each."""
         if self.kind == "unnamed":
             counts = tuple(np.clip(counts, 16, 256))
-        return self.sides([self._drawn(draw, rng, n) for n in counts], counts)
-
-    def _drawn(self, draw: Draw, rng: Rng, n: int) -> tuple[Array, Array | float]:
-        """The mean and Σ(x − mean)² of samples; or images of n samples in all, and (Σw)²/Σw² of their filter."""
         if self.kind == "samples":
-            return draw(rng, n)
-        count = {"passes": PASSES, "renders": min(n // 4, PASSES), "unnamed": n // 8}[self.kind]
-        stack = np.stack([draw(rng, n // count)[0] for _ in range(count)])
-        if not self.deviation:
-            return stack, 1.0
-        weights = gaussian_filter(np.eye(1, 101, 50)[0], self.deviation)
-        stack = gaussian_filter(stack, (0, self.deviation, self.deviation, 0), mode="wrap")
-        return stack, float(1 / np.square(weights).sum() ** 2)
+            return self.sides([draw(rng, n) for n in counts], counts)
+        stacks = []
+        for n in counts:
+            count = {"passes": PASSES, "renders": min(n // 4, PASSES), "unnamed": n // 8}[self.kind]
+            stack = np.stack([draw(rng, n // count)[0] for _ in range(count)])
+            if self.deviation:
+                stack = gaussian_filter(stack, (0, self.deviation, self.deviation, 0), mode="wrap")
+            stacks.append(stack)
+        return self.sides([(stack, 0.0) for stack in stacks], counts)
 
     def sides(self, drawn: Sequence[tuple[Array, Any]], counts: Sequence[int]) -> list[Side]:
-        """Both sides, of what `_drawn` gives."""
+        """Both sides, of their means and Σ(x − mean)²; or of stacks of images, of so many samples in all."""
+        weights = gaussian_filter(np.eye(1, 101, 50)[0], self.deviation) if self.deviation else np.ones(1)
+        area = float(1 / np.square(weights).sum() ** 2)  # (Σw)²/Σw² of the filter, along both axes
         sides: list[Side] = []
-        for (x, other), n, known in zip(drawn, counts, self.known, strict=True):
-            if self.kind == "samples":
-                sides.append(image(x, other / (n - 1) if known else None, spp=n))
-            elif self.kind == "passes":  # as `mi-refract render` writes them
+        for (x, squares), n, known in zip(drawn, counts, self.known, strict=True):
+            if self.kind in ("renders", "unnamed"):  # no two are the same, as no real ones are
+                header = {SPP: n // len(x)} if self.kind == "renders" else {}
+                sides.append([image(render * (1 + 1e-6 * i), header) for i, render in enumerate(x)])
+            elif self.kind == "samples":
+                sides.append(image(x, {SPP: n}, squares / (n - 1) if known else None))
+            else:  # as `mi-refract render` writes them
                 spread = x.var(0, ddof=1) * n / len(x) if known else None
-                sides.append(image(x.mean(0), spread, spp=n, variance_freedom=len(x) - 1, filter_area=other))
-            else:  # no two are the same, as no real ones are
-                header = {"spp": n // len(x)} if self.kind == "renders" else {}
-                sides.append([image(render * (1 + 1e-6 * i), None, **header) for i, render in enumerate(x)])
+                sides.append(image(x.mean(0), {SPP: n, FREEDOM: len(x) - 1, AREA: area}, spread))
         return sides
+
+
+def image(mean: Array, header: dict[str, Any], variance: Array | None = None) -> Image:
+    """An image, with its variance where that is known."""
+    names = tuple("RGB"[: mean.shape[-1]])
+    if variance is not None:
+        names, mean = (*names, *(f"{name}.variance" for name in names)), np.concatenate([mean, variance], -1)
+    return Image(Path("drawn.exr"), mean.astype(np.float32), names, metadata=header)
 
 
 FORMS = {
@@ -210,14 +206,19 @@ def at_most(count: int, probability: float) -> float:
     return float(stats.binom.ppf(1 - limits.NULL_ALARM, count, probability))
 
 
-def scene() -> dict[str, Any]:
-    """A ball of glass on a floor below a small lamp, which paths through the ball meet by chance only."""
+def scene_rows(context: Context, pairs: int) -> list[Row]:
+    """A ball of glass on a floor below a small lamp, which paths through the ball meet by chance only.
+
+    The same passes as films with variances on both sides or on one, and as renders.
+    """
+    if context.scalar:
+        return [Row(NAME, "every form", "scene", context.variant, reason="scalar variants would render for long")]
     import mitsuba as mi
 
     place = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": 32, "height": 32, "pixel_format": "rgb", "rfilter": {"type": "box"}}
     view = place().look_at([0, 2, 6], [0, 0, 0], [0, 1, 0])
-    return {
+    scene: Any = {
         "type": "scene",
         "integrator": {"type": "refract_path", "max_depth": 6},
         "sensor": {"type": "perspective", "fov": 40, "to_world": view, "film": film, "s": {"type": "independent"}},
@@ -225,31 +226,19 @@ def scene() -> dict[str, Any]:
         "ball": {"type": "sphere", "bsdf": {"type": "refract"}},
         "lamp": {"type": "sphere", "center": [1, 3, 0], "radius": 0.1, "e": {"type": "area", "radiance": 50.0}},
     }
-
-
-def scene_rows(context: Context, pairs: int) -> list[Row]:
-    """The same passes as films with variances on both sides or on one, and as renders."""
-    if context.scalar:
-        return [Row(NAME, "every form", "scene", context.variant, reason="scalar variants would render for long")]
-    import mitsuba as mi
-
-    loaded: Any = mi.load_dict(scene())
-    forms = {
-        "passes": Form("passes"),
-        "reference": Form("passes", known=(True, False)),
-        "new image": Form("passes", known=(False, True)),
-        "renders": Form("renders"),
-    }
+    loaded: Any = mi.load_dict(scene)
+    known = {"passes": (True, True), "reference": (True, False), "new image": (False, True)}
+    forms = {name: Form("passes", known=sides) for name, sides in known.items()} | {"renders": Form("renders")}
     results: dict[str, list[Comparison]] = {name: [] for name in forms}
     seeds = iter(range(current(SEED), current(SEED) + 10_000))
     for counts in ((64, 64), (1024, 16), (16, 1024)) * pairs:
         stacks = [
-            np.array([mi.render(loaded, spp=n // PASSES, seed=next(seeds)) for _ in range(PASSES)], float)
+            (np.array([mi.render(loaded, spp=n // PASSES, seed=next(seeds)) for _ in range(PASSES)], float), 0.0)
             for n in counts
         ]
         for name, form in forms.items():
-            results[name].append(compare("welch", *form.sides([(stack, 1.0) for stack in stacks], counts)))
-    return [null_row(name, "lamp through glass", found, context.variant) for name, found in results.items()]
+            results[name].append(compare("welch", *form.sides(stacks, counts)))
+    return [null_row(name, "lamp through glass", compared, context.variant) for name, compared in results.items()]
 
 
 def power_rows(pairs: int) -> list[Row]:

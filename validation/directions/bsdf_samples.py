@@ -7,11 +7,11 @@ plugins chose the same lobe, their directions, densities, weights and relative i
 from __future__ import annotations
 
 import functools
-import math
 from typing import Any
 
 import drjit as dr
 import numpy as np
+from scipy import stats
 
 from mi_refract.formulas import ROUNDING, cancelling
 from mi_refract.report.row import Row
@@ -54,18 +54,12 @@ def _variant_rows(context: Context, variant: str, reason: str | None) -> list[Ro
     mi.set_variant(variant)
     try:
         count = context.profile.rays if dr.is_jit_v(mi.Float) else context.profile.scalar_rays
-        return [_mode_row(mode, name, count, variant) for mode, name in _modes()]
+        return [_mode_row(getattr(mi.TransportMode, name), count, variant) for name in ("Radiance", "Importance")]
     finally:
         mi.set_variant(context.variant)
 
 
-def _modes() -> list[tuple[Any, str]]:
-    import mitsuba as mi
-
-    return [(mi.TransportMode.Radiance, "radiance"), (mi.TransportMode.Importance, "importance")]
-
-
-def _mode_row(mode: Any, mode_name: str, count: int, variant: str) -> Row:
+def _mode_row(mode: Any, count: int, variant: str) -> Row:
     import mitsuba as mi
 
     description = {"int_ior": INT_IOR, "ext_ior": EXT_IOR, "specular_reflectance": 0.9, "specular_transmittance": 0.8}
@@ -104,7 +98,7 @@ def _mode_row(mode: Any, mode_name: str, count: int, variant: str) -> Row:
     if polarised:  # a radicand on either side of the boundary, and its error in three factors of the weight
         budgets["weight worst"] = limits.SAMPLE_MUELLER * float(cancelling(2).radicand_error_bound(U, INT_IOR))
     replay = {"count": 3 * count, "seed": seeds.current(SEED), **description}
-    return Row(NAME, "refract − dielectric", mode_name, variant, values, budgets, replay=replay)
+    return Row(NAME, "refract − dielectric", mode.name.lower(), variant, values, budgets, replay=replay)
 
 
 def bounds(wi: np.ndarray) -> dict[str, np.ndarray]:
@@ -141,13 +135,7 @@ def most_flips(expected: float) -> float:
     A ray flips where its random number is between the two densities: with probability |δR|, `expected` in all. A sum
     of independent rare events exceeds a number no more often than Poisson's with its mean does (Hoeffding 1956).
     """
-    term = total = math.exp(-expected)
-    most = 0
-    while 1 - total > limits.SAMPLE_FLIPS:
-        most += 1
-        term *= expected / most
-        total += term
-    return float(most)
+    return float(stats.poisson.isf(limits.SAMPLE_FLIPS, expected))
 
 
 STUDY = Study(NAME, "Samples", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))

@@ -60,48 +60,26 @@ class Mutant:
 # Defects of any formula f ----------------------------------------------------------------------------------------
 
 
-def _flipped_normal(f: Any, a: Any, n: Any, k: Any) -> Answer:
-    b, transmitted = f(a, n, k)
-    return dr.select(transmitted, b - n * (2 * dr.dot(n, b)), b), transmitted
+def _after(change: Callable[..., Answer]) -> Callable[[Any, Any, Any, Any], Answer]:
+    """The formula, and a change of its b and `transmitted`: `change(b, transmitted, a, n, k)`."""
+    return lambda f, *ray: change(*f(*ray), *ray)
 
 
-def _one_sided(f: Any, a: Any, n: Any, k: Any) -> Answer:
-    b, transmitted = f(a, n, k)
+def _one_sided(b: Any, transmitted: Any, a: Any, n: Any, k: Any) -> Answer:
     along = dr.dot(n, b)
     return dr.select(transmitted, b - n * (along + dr.abs(along)), b), transmitted
 
 
-def _slipped_cross(f: Any, a: Any, n: Any, k: Any) -> Answer:
-    b, transmitted = f(a, n, k)
+def _slipped_cross(b: Any, transmitted: Any, a: Any, n: Any, k: Any) -> Answer:
     x, y, z = wedge(n, a)
     return b + contract(n, type(a)(0 * x, -2 * y, 0 * z)) * dr.select(transmitted, k, 1), transmitted
-
-
-def _never_reflected(f: Any, a: Any, n: Any, k: Any) -> Answer:
-    b, transmitted = f(a, n, k)
-    return dr.select(transmitted, b, a), transmitted
-
-
-def _decided(change: Callable[[Any], Any]) -> Callable[[Any, Any, Any, Any], Answer]:
-    def answer(f: Any, a: Any, n: Any, k: Any) -> Answer:
-        b, transmitted = f(a, n, k)
-        return b, change(transmitted)
-
-    return answer
-
-
-def _scaled(factor: Callable[[Any], Any]) -> Callable[[Any, Any, Any, Any], Answer]:
-    def answer(f: Any, a: Any, n: Any, k: Any) -> Answer:
-        b, transmitted = f(a, n, k)
-        return b * factor(n), transmitted
-
-    return answer
 
 
 def _patched(owner: Any, name: str, replacement: Any) -> Callable[[Any, Any, Any, Any], Answer]:
     def answer(f: Any, a: Any, n: Any, k: Any) -> Answer:
         with mock.patch.object(owner, name, replacement):
-            return f(a, n, k)
+            answer: tuple[Any, Any] = f(a, n, k)
+            return answer
 
     return answer
 
@@ -144,22 +122,27 @@ MUTANTS = {
     "control": Mutant("the formula as it is", lambda f, a, n, k: f(a, n, k)),
     "swapped k": Mutant("n_to / n_from for n_from / n_to", lambda f, a, n, k: f(a, n, 1 / k)),
     "k off": Mutant("a ratio that is off by 2⁻¹⁰", lambda f, a, n, k: f(a, n, k * (1 + 2.0**-10))),
-    "flipped normal": Mutant("the root with the wrong sign: the refracted ray comes back", _flipped_normal),
-    "one-sided": Mutant("the root without the sign of n·a", _one_sided),
-    "slipped cross product": Mutant("n × a with a wrong sign in one component", _slipped_cross),
-    "no mirror": Mutant("total internal reflection lets the ray pass", _never_reflected),
-    "always transmitted": Mutant(
-        "`transmitted` is True for every ray", _decided(lambda transmitted: transmitted | True)
+    "flipped normal": Mutant(
+        "the root with the wrong sign: the refracted ray comes back",
+        _after(lambda b, t, a, n, k: (dr.select(t, b - n * (2 * dr.dot(n, b)), b), t)),
     ),
-    "never transmitted": Mutant(
-        "`transmitted` is False for every ray", _decided(lambda transmitted: transmitted & False)
+    "one-sided": Mutant("the root without the sign of n·a", _after(_one_sided)),
+    "slipped cross product": Mutant("n × a with a wrong sign in one component", _after(_slipped_cross)),
+    "no mirror": Mutant(
+        "total internal reflection lets the ray pass", _after(lambda b, t, a, n, k: (dr.select(t, b, a), t))
     ),
+    "always transmitted": Mutant("`transmitted` is True for every ray", _after(lambda b, t, *_: (b, t | True))),
+    "never transmitted": Mutant("`transmitted` is False for every ray", _after(lambda b, t, *_: (b, t & False))),
     "000 as printed": Mutant("n·a < 0 assumed", _printed_000, ("wedge",)),
     "001 as printed": Mutant("‖c‖ (n × ĉ), with ĉ = 0/0 at normal incidence", _printed_001, ("cross",)),
     "002 as printed": Mutant("N·L < 0 assumed", _printed_002, ("decomposed",)),
     "004 as printed": Mutant("X = k R/(1 + R²)", _printed_004, ("rotated",)),
-    "one ulp": Mutant("the result times 1 + 2u", _scaled(lambda n: 1 + 2 * dr.epsilon(type(n))), EXACT),
-    "unit normal assumed": Mutant("the division by n² left out", _scaled(lambda n: dr.dot(n, n)), EXACT),
+    "one ulp": Mutant(
+        "the result times 1 + 2u", _after(lambda b, t, *_: (b * (1 + 2 * dr.epsilon(type(b))), t)), EXACT
+    ),
+    "unit normal assumed": Mutant(
+        "the division by n² left out", _after(lambda b, t, a, n, k: (b * dr.dot(n, n), t)), EXACT
+    ),
     "plain radicand": Mutant(
         "(n·a)² − κ w² in working precision", lambda f, a, n, k: FORMULAS["wedge_contrast"](a, n, k), EXACT
     ),
@@ -192,10 +175,11 @@ def tasks(context: Context) -> list[Task]:
     """On single precision where it is compiled, else on what there is."""
     running = [setting for setting in settings(context) if setting.vector is not None]
     setting = next((s for s in running if s.precision is np.float32), running[0])
-    return [Task(f"planted defects: {setting.label}", functools.partial(_rows, setting))]
+    return [Task(f"planted defects: {setting.label}", functools.partial(rows, setting))]
 
 
-def _rows(setting: Setting) -> list[Row]:
+def rows(setting: Setting) -> list[Row]:
+    """Every mutant of every formula."""
     sample = draw(SCALAR_COUNT if setting.is_scalar else COUNT, setting.precision)
     return [row(name, formula, setting, sample) for name in MUTANTS for formula in MUTANTS[name].of]
 
@@ -249,19 +233,16 @@ def draw(count: int, precision: type) -> Sample:
     """`count` rays of every regime that is one on every backend, and normal incidence along the axes."""
     entries = {name: entry for name, entry in regimes.REGIMES.items() if not entry.rests_on_denormals}
     parts = {name: regimes.make(name, count, precision, seeds.current(SEED)) for name in entries}
-    parts["along an axis"] = _along_axes(precision)
+    # From either side, into the denser and the thinner medium.
+    n: np.ndarray = np.tile(np.eye(3, dtype=precision), (4, 1))
+    side = np.repeat([[1.0], [-1.0]], 6, axis=0)
+    k = np.tile(np.repeat([0.75, 1.5], 3), 2)
+    parts["along an axis"] = Rays((n * side).astype(precision), n, k.astype(precision))
     units = [*(entry.unit for entry in entries.values()), True]
     rays = Rays.joined(list(parts.values()))
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
     lengths = list(map(len, parts.values()))
     return Sample(rays, exact, np.repeat(list(parts), lengths), np.repeat(units, lengths))
-
-
-def _along_axes(precision: type) -> Rays:
-    """From either side, into the denser and the thinner medium."""
-    n: np.ndarray = np.tile(np.eye(3, dtype=precision), (4, 1))
-    side, k = np.repeat([[1.0], [-1.0]], 6, axis=0), np.tile(np.repeat([0.75, 1.5], 3), 2)
-    return Rays((n * side).astype(precision), n, k.astype(precision))
 
 
 STUDY = Study(NAME, "Planted defects", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))

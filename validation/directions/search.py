@@ -61,20 +61,16 @@ def _rows(context: Context, name: str, setting: Setting) -> list[Row]:
     if setting.vector is None:
         return [Row(NAME, name, "all regimes", setting.label, reason=setting.reason)]
     generations, sample = context.profile.generations, min(context.profile.sweep_rays // 10, LARGEST_SAMPLE)
-    herd = climb(name, FORMULAS[name], domain(name, setting), setting, generations, seeds.current(SEED), sample)
+    names = [regime for regime in REGIMES if not setting.no_budget(budget_of(name), regime)]  # where it has a budget
+    herd = climb(name, FORMULAS[name], names, setting, generations, seeds.current(SEED), sample)
     found = certify(name, FORMULAS[name], herd, setting)
     chords = [f for f in found if f.objective == "chord"]
     far = [f.line() for f in found if f.objective == "decision" and f.share > 0]
     values = {ERROR_OVER_BOUND: max((f.share for f in chords), default=0.0), MISCLASSIFIED_FAR: float(len(far))}
     values["rays tried"] = float(generations * CHILDREN * len(herd))
     worst_lines = [f.line() for f in sorted(chords, key=lambda f: -f.share)[:3]]
-    replay = {
-        "seed": seeds.current(SEED),
-        "sample": sample,
-        "generations": generations,
-        "worst": worst_lines,
-        "misclassified": far[:3],
-    }
+    sizes = {"seed": seeds.current(SEED), "sample": sample, "generations": generations}
+    replay = {**sizes, "worst": worst_lines, "misclassified": far[:3]}
     return [Row(NAME, name, "all regimes", setting.label, values, BUDGETS, replay=replay)]
 
 
@@ -95,10 +91,9 @@ class Herd:
         """How many families there are."""
         return len(self.score)
 
-
-def domain(name: str, setting: Setting) -> tuple[str, ...]:
-    """The regimes in which `name` has a budget on that backend."""
-    return tuple(regime for regime in REGIMES if not setting.no_budget(budget_of(name), regime))
+    def of_regime(self, name: str) -> np.ndarray:
+        """An attribute of each family's regime."""
+        return np.asarray(np.array([getattr(REGIMES[regime], name) for regime in self.names])[self.regime])
 
 
 def climb(
@@ -116,8 +111,12 @@ def climb(
     rows = np.arange(len(herd))
     for _ in range(generations):
         parents = np.repeat(rows, CHILDREN)
-        children = _mutated(rng, herd.rays[parents], _unit_only(herd)[parents])
-        children = _stepped(rng, children, herd.decision[parents])
+        children = _mutated(rng, herd.rays[parents], herd.of_regime("unit")[parents])
+        # One in four of those that climb the decision steps to the critical angle, and one in sixteen of the others.
+        some = np.flatnonzero(rng.random(len(parents)) < np.where(herd.decision[parents], 1 / 4, 1 / 16))
+        order = np.arange(len(parents))
+        order[some] = len(parents) + np.arange(len(some))
+        children = Rays.joined([children, _to_critical(rng, children[some])])[order]
         inside = _inside(children, herd, parents)
         score = _scores(name, subject, Screen(children, setting.vector), herd.decision[parents])
         score = np.where(inside, score, -np.inf)
@@ -162,18 +161,6 @@ def _scores(name: str, subject: Subject, screen: Screen, decision: np.ndarray) -
     return np.where(screen.doubtful | np.isnan(score), -np.inf, score)
 
 
-def _unit_only(herd: Herd) -> np.ndarray:
-    return np.array([REGIMES[name].unit for name in herd.names])[herd.regime]
-
-
-def _stepped(rng: Generator, rays: Rays, decision: np.ndarray) -> Rays:
-    """One in four of those that climb the decision steps to the critical angle, and one in sixteen of the others."""
-    some = np.flatnonzero(rng.random(len(rays)) < np.where(decision, 1 / 4, 1 / 16))
-    order = np.arange(len(rays))
-    order[some] = len(rays) + np.arange(len(some))
-    return Rays.joined([rays, _to_critical(rng, rays[some])])[order]
-
-
 @np.errstate(over="ignore", invalid="ignore")  # a step may lead out of the domain
 def _to_critical(rng: Generator, rays: Rays) -> Rays:
     """A Newton step to radicand 0 in one number, then the best of TRIALS combinations of ulps, by its linear part."""
@@ -210,9 +197,7 @@ def _mutated(rng: Generator, rays: Rays, unit: np.ndarray) -> Rays:
 
 def _inside(rays: Rays, herd: Herd, parents: np.ndarray) -> np.ndarray:
     """Which children stay in the domain of their regime."""
-    entries = [REGIMES[name] for name in herd.names]
-    unit = _unit_only(herd)[parents]
-    largest_k = np.array([entry.largest_k for entry in entries])[herd.regime][parents]
+    unit, largest_k = (herd.of_regime(name)[parents] for name in ("unit", "largest_k"))
     # Rounding its components moves a length by √3/2 u at most.
     slack = 3**0.5 / 4 * float(np.finfo(rays.k.dtype).eps)
     inside = (rays.k >= 1e-6) & (rays.k <= largest_k)
@@ -220,7 +205,7 @@ def _inside(rays: Rays, herd: Herd, parents: np.ndarray) -> np.ndarray:
         wide = v.astype(np.longdouble)
         length = np.sqrt((wide * wide).sum(1))
         inside &= np.where(unit, np.abs(length - 1) <= slack, (length > 1e-18) & (length < 1e18))
-    return inside
+    return np.asarray(inside)
 
 
 # What was found ------------------------------------------------------------------------------------------------

@@ -8,13 +8,14 @@ to the critical angle for the screen. Only certified errors are shown.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from mi_refract import oracle, regimes
 from mi_refract.accuracy import BUDGETS, judge_formula
-from mi_refract.formulas import FORMULAS, Budget
+from mi_refract.formulas import FORMULAS
 from mi_refract.regimes import Rays
 from mi_refract.report.row import Row
 from validation import limits, repeated
@@ -59,54 +60,40 @@ def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     rows = [row for regime in regimes.REGIMES for row in regime_rows(regime, setting, *sizes)]
     documented = [name for name in FORMULAS if not budget_of(name).at_the_limit]
     kept = [row for row in rows if row.subject not in documented]
-    return kept + [_worst_of([row for row in rows if row.subject == name]) for name in documented]
-
-
-def _worst_of(rows: list[Row]) -> Row:
-    """One row for a documented formula, over all regimes it was swept in."""
-    worst = max(rows, key=lambda row: row.values[ERROR_OVER_BOUND])
-    values = {m: max(row.values[m] for row in rows) for m in (WORST_IN_U, ERROR_OVER_BOUND, "screen off")}
-    values |= {m: sum(row.values[m] for row in rows) for m in (MISCLASSIFIED, MISCLASSIFIED_FAR, "rays", "certified")}
-    case = "all regimes of unit vectors"
-    return Row(NAME, worst.subject, case, worst.setting, values, worst.budgets, replay=worst.replay)
+    for name in documented:  # one row, over all regimes it was swept in
+        mine = [row for row in rows if row.subject == name]
+        worst = max(mine, key=lambda row: row.values[ERROR_OVER_BOUND])
+        values = {m: max(row.values[m] for row in mine) for m in (WORST_IN_U, ERROR_OVER_BOUND, "screen off")}
+        counts = (MISCLASSIFIED, MISCLASSIFIED_FAR, "rays", "certified")
+        values |= {m: sum(row.values[m] for row in mine) for m in counts}
+        case = "all regimes of unit vectors"
+        kept.append(Row(NAME, name, case, worst.setting, values, worst.budgets, replay=worst.replay))
+    return kept
 
 
 # One regime ----------------------------------------------------------------------------------------------------
 
 
+@dataclass
 class Best:
     """The rays with the highest scores so far, at most `size`, with their chords, and how many were offered."""
 
-    def __init__(self, size: int) -> None:
-        """None yet; at most `size` are kept."""
-        self.size, self.offered = size, 0
-        self.score: np.ndarray = np.empty(0)
-        self.chord: np.ndarray = np.empty(0)
-        self._rays: list[Rays] = []
+    size: int
+    rays: Rays | None = None
+    score: np.ndarray = field(default_factory=lambda: np.empty(0))
+    chord: np.ndarray = field(default_factory=lambda: np.empty(0))
+    offered: int = 0
 
     def add(self, rays: Rays, score: np.ndarray, mask: np.ndarray, chord: np.ndarray) -> None:
         """Offer the rays of a mask (N,), with their scores and chord errors (N,)."""
-        index = np.flatnonzero(mask)
-        self.offered += len(index)
-        index = index[_largest(score[index], self.size)]
-        score = np.concatenate([self.score, score[index]])
-        best = _largest(score, self.size)
-        self.score, self._rays = score[best], [Rays.joined([*self._rays, rays[index]])[best]]
-        self.chord = np.concatenate([self.chord, chord[index]])[best]
-
-    @property
-    def rays(self) -> Rays:
-        """The rays that were kept."""
-        return self._rays[0]
+        self.offered += int(mask.sum())
+        score, chord = (np.concatenate([old, x[mask]]) for old, x in ((self.score, score), (self.chord, chord)))
+        best = np.argpartition(-score, self.size)[: self.size] if len(score) > self.size else np.arange(len(score))
+        self.score, self.chord = score[best], chord[best]
+        self.rays = Rays.joined([*([self.rays] if self.rays else []), rays[mask]])[best]
 
 
-def _largest(x: np.ndarray, count: int) -> np.ndarray:
-    """Indices of the `count` largest numbers, or of all."""
-    return np.argpartition(-x, count)[:count] if len(x) > count else np.arange(len(x))
-
-
-@dataclass(frozen=True)
-class Gathered:
+class Gathered(NamedTuple):
     """The results of one formula in one regime.
 
     `worst`: of the rays that the screen is certain of and that were decided rightly, those nearest to their bounds.
@@ -118,36 +105,27 @@ class Gathered:
     misclassified: Best
     unresolved: Best
 
-    def add(self, screen: Screen, budget: Budget, chord: np.ndarray, wrong: np.ndarray) -> None:
-        """Offer the rays of a screen, with a formula's chord errors and wrong decisions (N,)."""
-        rays, certain = screen.rays, ~screen.doubtful
-        self.worst.add(rays, chord / screen.bound(budget), certain & ~wrong, chord)
-        self.misclassified.add(rays, np.abs(screen.relative_radicand), certain & wrong, chord)
-        self.unresolved.add(rays, wrong.astype(float), ~certain, chord)
 
-
-def gather(regime: str, setting: Setting, count: int, kept: int) -> dict[str, Gathered]:
-    """Screen `count` rays of a regime in chunks; chunk i has the seed SEED + i. By formula that has a budget there."""
+def regime_rows(regime: str, setting: Setting, count: int, kept: int) -> list[Row]:
+    """A row per formula that has a budget in the regime: `count` rays are screened in chunks, of seeds SEED + i."""
     budgets = {name: formula.budget for name, formula in FORMULAS.items()}
     names = [name for name, b in budgets.items() if b.at_the_limit or not setting.no_budget(b, regime)]
     found = {name: Gathered(Best(kept), Best(kept), Best(UNRESOLVED_SHARE * kept)) for name in names}
     for i, start in enumerate(range(0, count, CHUNK)):
         rays = regimes.make(regime, min(CHUNK, count - start), setting.precision, seeds.current(SEED) + i)
         screen = Screen(rays, setting.vector)
-        for name in names:
-            found[name].add(screen, budgets[name], *screen.judge(FORMULAS[name]))
-    return found
-
-
-def regime_rows(regime: str, setting: Setting, count: int, kept: int) -> list[Row]:
-    """A row per formula that has a budget in the regime."""
-    found = gather(regime, setting, count, kept)
+        certain = ~screen.doubtful
+        for name, (worst, misclassified, unresolved) in found.items():
+            chord, wrong = screen.judge(FORMULAS[name])
+            worst.add(rays, chord / screen.bound(budgets[name]), certain & ~wrong, chord)
+            misclassified.add(rays, np.abs(screen.relative_radicand), certain & wrong, chord)
+            unresolved.add(rays, wrong.astype(float), ~certain, chord)
     return [_certified_row(name, regime, setting, gathered, count) for name, gathered in found.items()]
 
 
 def _certified_row(name: str, regime: str, setting: Setting, found: Gathered, count: int) -> Row:
-    rays = Rays.joined([found.worst.rays, found.misclassified.rays, found.unresolved.rays])
-    certain = np.arange(len(rays)) < len(rays) - len(found.unresolved.rays)
+    rays = Rays.joined([best.rays for best in found if best.rays is not None])
+    certain = np.arange(len(rays)) < len(rays) - len(found.unresolved.score)
     entry, reason = regimes.REGIMES[regime], setting.no_budget(budget_of(name), regime)
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
     seen = judge_formula(FORMULAS[name], rays, exact, setting.vector, budget_of(name))

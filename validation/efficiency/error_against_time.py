@@ -135,12 +135,11 @@ def scene_rows(context: Context, path: Path, methods: tuple[Method, ...] = METHO
 
 
 def _measured_rows(context: Context, path: Path, extent: Extent, methods: tuple[Method, ...]) -> list[Row]:
-    absent = {method.name: reason for method in methods if (reason := method.missing)}
-    rows = [Row(NAME, name, path.stem, context.variant, reason=reason) for name, reason in absent.items()]
+    rows = []
     resolution = resolution_of(path, extent)
     sampler = best_sampler(path, resolution, extent)
     builtins = [Subject(BUILTIN, INDEPENDENT), Subject(BUILTIN, sampler)]
-    subjects = builtins + [Subject(m, sampler) for m in methods if m != BUILTIN and m.name not in absent]
+    subjects = builtins + [Subject(m, sampler) for m in methods if m != BUILTIN]
     spp = extent.spp[-1]
     cameras = {s.name: camera(path, s.method, resolution, sampler=s.sampler, spp=spp) for s in subjects}
     look = cameras[builtins[1].name]

@@ -216,23 +216,20 @@ def knob_rows(context: Context, knob: str, methods: tuple[Method, ...] = METHODS
         return [Row(NAME, "every method", knob, context.variant, reason=SCALAR)]
     if not KNOBS[knob].every:
         methods = tuple(method for method in methods if not method.parameters)
-    absent = {method.name: reason for method in methods if (reason := method.missing)}
-    rows = [Row(NAME, name, knob, context.variant, reason=reason) for name, reason in absent.items()]
-    present = [method for method in methods if method.name not in absent]
     sizes = KNOBS[knob].full if context.profile.name == "full" else KNOBS[knob].quick
-    by_size = {size: _size_rows(context, knob, size, present) for size in sizes}
-    rows += [row for found in by_size.values() for row in found]
+    by_size = {size: _size_rows(context, knob, size, methods) for size in sizes}
+    rows = [row for found in by_size.values() for row in found]
     for metric in TIMES[:2] if len(sizes) > 1 else ():
         curves = {
             method.name: [(float(size), found[i].values[metric]) for size, found in by_size.items()]
-            for i, method in enumerate(present)
+            for i, method in enumerate(methods)
         }
         processes = {"processes": float(_processes(context))}
         rows.append(Row(NAME, "every method", f"{knob}: {metric}", context.variant, processes, curves=curves))
     return rows
 
 
-def _size_rows(context: Context, knob: str, size: int, methods: list[Method]) -> list[Row]:
+def _size_rows(context: Context, knob: str, size: int, methods: tuple[Method, ...]) -> list[Row]:
     """In the order of the methods, of which the first is the built-in; medians over processes that take turns."""
     full = context.profile.name == "full"
     resolution, renders = (128, 5) if full else (64, 3)

@@ -70,6 +70,7 @@ def rows(context: Context, spec: str) -> list[Row]:
     missing = context.variants.get(SPECTRAL, "not in this wheel")
     table = [index_row(medium, spec)]
     table.append(row("refract", SPECTRAL, reason=missing) if missing else sampled_row(medium, spec, count))
+    setting: Any
     for setting in settings(context):
         if setting.label.endswith("float64") and setting.vector is not None:
             rays = Drawn(medium, 100 if setting.is_scalar else count)

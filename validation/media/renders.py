@@ -112,12 +112,14 @@ def absorbing_parts(name: str, absorbing: bool) -> Nodes:
     inner: dict[str, Any] = {"type": "sphere", "radius": 0.5} | shape(CORE, SIGMA, 1.33)
     matt: dict[str, Any] = {"type": "sphere", "radius": 0.4, "bsdf": {"type": "diffuse", "reflectance": 0.6}}
     matt |= {} if absorbing else {"exterior": medium(SIGMA)}
-    parts = {
+    scenes: dict[str, Nodes] = {
         "sphere": {"ball": ball},
         "nested": {"ball": ball, "inner": inner},
         "matt inside": {"box": {"type": "cube"} | shape(SIGMA), "matt": matt},
-    }[name]
-    return parts | {"wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(3)}}
+    }
+    return scenes[name] | {
+        "wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(3)}
+    }
 
 
 def volpath_rows(context: Context, name: str) -> list[Row]:

@@ -279,7 +279,7 @@ def at_shared_vertex(hits: Array, exact: Retraced, segments: Segments, near: Any
 def unit(d: Any) -> Array:
     """Directions (N × 2) in extended precision, of length 1."""
     d = np.asarray(d, np.longdouble)
-    return d / np.hypot(*d.T)[:, None]
+    return np.asarray(d / np.hypot(*d.T)[:, None])
 
 
 STUDY = Study(NAME, "Planar", about(__doc__), TERMS, tasks, again=drawn_rows)

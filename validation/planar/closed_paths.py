@@ -59,9 +59,9 @@ class Closed:
         """|d − exact| (N), or the distance of the last line from the point, over `reach`."""
         d = unit(paths.directions)
         if self.directions is not None:
-            return np.hypot(*(d - self.directions).T)
+            return np.asarray(np.hypot(*(d - self.directions).T))
         to = np.array(self.point) - self.case.exact.last(paths.points).astype(np.longdouble)
-        return np.abs(d[:, 0] * to[:, 1] - d[:, 1] * to[:, 0]) / self.reach
+        return np.asarray(np.abs(d[:, 0] * to[:, 1] - d[:, 1] * to[:, 0]) / self.reach)
 
     @property
     def bound(self) -> Array:

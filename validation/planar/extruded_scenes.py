@@ -22,8 +22,6 @@ from mi_refract.planar.curves import points
 from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation import repeated
-from validation.reference.layered_scenes import OFFSET
-from validation.reference.planar_retrace import Array
 from validation.run import seeds
 from validation.run.array_settings import Setting
 from validation.run.context import Context
@@ -41,19 +39,16 @@ TERMS = against_retrace.TERMS | {
 NAME = "extrusion"
 SCALAR = "needs a compiled variant: a loop over rays in Python would take hours"
 U = 2.0**-24
+OFFSET = 1500 * U  # Mitsuba's RayEpsilon in float32
 FACETS = 64  # of an arc, at most
-Spawn = Callable[[Any, Any], Any]
 LARGEST = 1500  # walls; arcs have fewer facets where there are more of them
 RAYS = 100  # of the file's, and as many scattered
 
 
 def tasks(context: Context) -> list[Task]:
     """One task per scene file; in the profile `quick` that of the lens."""
-    shown = f"{against_retrace.SHOWN}.toml" if context.profile.quick else "*.toml"
-    return [
-        Task(f"extruded: {path.stem}", functools.partial(scene_rows, context, path))
-        for path in sorted(FOLDER.glob(shown))
-    ]
+    paths = sorted(FOLDER.glob(f"{against_retrace.SHOWN}.toml" if context.profile.quick else "*.toml"))
+    return [Task(f"extruded: {path.stem}", functools.partial(scene_rows, context, path)) for path in paths]
 
 
 def scene_rows(context: Context, path: Path) -> list[Row]:
@@ -61,51 +56,41 @@ def scene_rows(context: Context, path: Path) -> list[Row]:
     if context.variant.startswith("scalar"):
         return [Row(NAME, PLUGIN, path.stem, context.variant, reason=SCALAR)]
     case = faceted(against_retrace.case_of(path, RAYS))
-    scene, rows = extrude(case.segments), []
-    planar_paths = {
-        name: case.trace(Setting(context.variant.split("_")[0], np.dtype(name).type)) for name in ("float32", "float64")
-    }
+    scene, backend, rows = extrude(case.segments), context.variant.split("_")[0], []
+    precisions = {"float32": np.float32, "float64": np.float64}
+    planar = {f"from planar {name}": case.trace(Setting(backend, kind)) for name, kind in precisions.items()}
+    replay = {"scene": path.name, "walls": len(case.segments), "rays": len(case.origins)}
+    replay["seed"] = seeds.current(against_retrace.SEED)
     for name, (spawn, offset) in SPAWNS.items():
         paths = trace(scene, case, spawn)
         values = judge(paths, case, U, offset)
-        values |= {f"from planar {p}": apart(paths, other) / case.extent for p, other in planar_paths.items()}
-        replay = {"scene": path.name, "walls": len(case.segments), "rays": len(case.origins)}
-        replay["seed"] = seeds.current(against_retrace.SEED)
+        for key, others in planar.items():  # NaN where no ray meets the same boundaries
+            same = (paths.hits == others.hits).all(1)
+            distance = np.hypot(*(paths.points - others.points)[same].transpose(2, 0, 1)) / case.extent
+            values[key] = float(np.nanmax(distance)) if same.any() else float("nan")
         subject, bounds = f"{PLUGIN}, {name}", against_retrace.GROWN
         rows.append(Row(NAME, subject, path.stem, context.variant, values, bounds, replay=replay))
     return rows
 
 
-def apart(some: Paths, others: Paths) -> float:
-    """Largest distance of points, of rays that meet the same boundaries; NaN where there are none."""
-    same = (some.hits == others.hits).all(1)
-    distance = np.hypot(*(some.points - others.points)[same].transpose(2, 0, 1))
-    return float(np.nanmax(distance)) if same.any() else float("nan")
-
-
 def faceted(case: Case) -> Case:
-    """The same with facets for arcs, refracted wherever possible."""
-    facets = max(1, min(FACETS, LARGEST // len(case.segments)))
-    segments, every = chords(case.segments, facets), case.reflect == 0
-    origins, directions = case.origins[every], case.directions[every]
-    return Case(case.name, segments, origins, directions, case.max_depth, case.reflect[every])
+    """The same with chords for arcs, refracted wherever possible."""
+    segments, every = case.segments, case.reflect == 0
+    rays = case.origins[every], case.directions[every], case.max_depth, case.reflect[every]
+    if segments.control is None:
+        return Case(case.name, segments, *rays)
+    count = max(1, min(FACETS, LARGEST // len(segments)))
+    straight = (segments.control == (segments.start + segments.end) / 2).all(1)
+    along = points(segments, count)[~straight]
+    pieces = (segments.start[straight], along[:, :-1]), (segments.end[straight], along[:, 1:])
+    start, end = (np.concatenate([x, y.reshape(-1, 2)]) for x, y in pieces)
+    left, right = (np.append(n[straight], np.repeat(n[~straight], count)) for n in (segments.n_left, segments.n_right))
+    return Case(case.name, Segments(start, end, left, right), *rays)
 
 
 # The walls -----------------------------------------------------------------------------------------------------
 
 Z = -1.0, 2.0  # a ray at z = 0 does not meet the triangles' common edge in the middle of a wall
-
-
-def chords(segments: Segments, count: int) -> Segments:
-    """Each arc as `count` chords; straight segments as they are."""
-    if segments.control is None:
-        return segments
-    straight = (segments.control == (segments.start + segments.end) / 2).all(1)
-    along = points(segments, count)[~straight]
-    pieces = (segments.start[straight], along[:, :-1]), (segments.end[straight], along[:, 1:])
-    start, end = (np.concatenate([x, y.reshape(-1, 2)]) for x, y in pieces)
-    media = [np.append(n[straight], np.repeat(n[~straight], count)) for n in (segments.n_left, segments.n_right)]
-    return Segments(start, end, *media)
 
 
 def extrude(segments: Segments) -> Any:
@@ -114,31 +99,27 @@ def extrude(segments: Segments) -> Any:
 
     media = np.stack([segments.n_left, segments.n_right], 1)
     pairs, which = np.unique(media, axis=0, return_inverse=True)
-    meshes = {f"walls_{k}": _mesh(segments, np.flatnonzero(which.ravel() == k)) for k in range(len(pairs))}
+    meshes = {}
+    for k, (left, right) in enumerate(pairs.tolist()):
+        chosen = np.flatnonzero(which.ravel() == k)
+        count = len(chosen)
+        corners = [
+            np.column_stack([end[chosen], np.full(count, z)]) for z in Z for end in (segments.start, segments.end)
+        ]
+        # Start, end, start above, end above; seen from the left of the segment, counter-clockwise.
+        faces = 4 * np.arange(count)[:, None, None] + np.array([[0, 3, 1], [0, 2, 3]])
+        properties = mi.Properties()
+        properties["face_normals"] = True
+        properties["glass"] = mi.load_dict({"type": PLUGIN, "ext_ior": left, "int_ior": right})
+        mesh = mi.Mesh("walls", 4 * count, 2 * count, props=properties)
+        parameters = mi.traverse(mesh)
+        for key, values in (("positions", np.stack(corners, 1).astype(np.float32)), ("faces", faces.astype(np.uint32))):
+            name = next(name for name in parameters.keys() if name.endswith(key))  # noqa: SIM118  no dictionary
+            parameters[name] = type(parameters[name])(values.ravel())
+        mesh.add_attribute("face_segment", 1, np.repeat(chosen, 2).astype(float).tolist())
+        parameters.update()
+        meshes[f"walls_{k}"] = mesh
     return mi.load_dict({"type": "scene", **meshes})
-
-
-def _mesh(segments: Segments, chosen: Array) -> Any:
-    """Of the segments `chosen`, which part the same two media."""
-    import mitsuba as mi
-
-    count = len(chosen)
-    ends = [np.asarray(x)[chosen] for x in (segments.start, segments.end)]
-    corners = [np.column_stack([end, np.full(count, z)]) for z in Z for end in ends]
-    # Start, end, start above, end above; seen from the left of the segment, counter-clockwise.
-    faces = 4 * np.arange(count)[:, None, None] + np.array([[0, 3, 1], [0, 2, 3]])
-    ior = {"ext_ior": float(segments.n_left[chosen[0]]), "int_ior": float(segments.n_right[chosen[0]])}
-    properties = mi.Properties()
-    properties["face_normals"] = True
-    properties["glass"] = mi.load_dict({"type": PLUGIN, **ior})
-    mesh = mi.Mesh("walls", 4 * count, 2 * count, props=properties)
-    parameters = mi.traverse(mesh)
-    for key, values in (("positions", np.stack(corners, 1).astype(np.float32)), ("faces", faces.astype(np.uint32))):
-        name = next(name for name in parameters.keys() if name.endswith(key))  # noqa: SIM118  no dictionary
-        parameters[name] = type(parameters[name])(values.ravel())
-    mesh.add_attribute("face_segment", 1, np.repeat(chosen, 2).astype(float).tolist())
-    parameters.update()
-    return mesh
 
 
 # The rays ------------------------------------------------------------------------------------------------------
@@ -154,13 +135,13 @@ def along_the_ray(si: Any, d: Any) -> Any:
 
 
 # How a ray goes on from an interaction along a direction, and by how much that moves it along the normal, over u.
-SPAWNS: dict[str, tuple[Spawn, float]] = {
+SPAWNS: dict[str, tuple[Callable[[Any, Any], Any], float]] = {
     "along the ray": (along_the_ray, 0.0),
     "spawn_ray": (lambda si, d: si.spawn_ray(d), OFFSET / U),
 }
 
 
-def trace(scene: Any, case: Case, spawn: Spawn) -> Paths:
+def trace(scene: Any, case: Case, spawn: Callable[[Any, Any], Any]) -> Paths:
     """As `planar.trace`, by Mitsuba; the sample 1 − 2⁻²⁴ reflects only where the reflectance is 1."""
     import mitsuba as mi
 

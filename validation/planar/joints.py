@@ -12,7 +12,6 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND, WRONG_PATH, WRONG_PATH_FAR
 from validation.study import Study, Task, about
 
-from .against_retrace import at_shared_vertex, by_setting
+from .against_retrace import Case, at_shared_vertex, by_setting
 from .against_retrace import unit as of_length_1
 from .rounding import ROUNDINGS, growth
 
@@ -48,16 +47,6 @@ SCALAR_SHARE = 100  # one ray in so many
 INDEX = 1.25  # sine of the critical angle 4/5
 
 
-class Aimed(NamedTuple):
-    """Rays that are aimed exactly (N × 2); `reflect` as for `planar.trace`."""
-
-    segments: Segments
-    origins: Array
-    directions: Array
-    depth: int
-    reflect: int = 0
-
-
 def tasks(context: Context) -> list[Task]:
     """One task per backend and precision."""
     aims = (TURNS[1:2], ULPS[:3]) if context.profile.quick else (TURNS, ULPS)
@@ -75,7 +64,7 @@ def row(name: str, setting: Setting, turns: tuple[float, ...] = TURNS, ulps: tup
         directions = np.concatenate([d + steps * ulp for steps in ulps])
         rays = np.tile(origins, (len(ulps), 1)).astype(float), directions.astype(float)
         tracer = Tracer(aimed.segments, backend=setting.backend, precision=setting.name)
-        found = nearest(tracer(*rays, aimed.depth, reflect=aimed.reflect), aimed, rays, setting.roundoff)
+        found = nearest(tracer(*rays, aimed.max_depth, reflect=aimed.reflect), aimed, rays, setting.roundoff)
         ratios.append(found.min(0))
         changed += int(np.isinf(found[0]).sum())
     ratio = np.concatenate(ratios)
@@ -86,7 +75,7 @@ def row(name: str, setting: Setting, turns: tuple[float, ...] = TURNS, ulps: tup
     return Row(NAME, "trace", name, setting.label, values, budgets, replay={"rays": len(ratio)})
 
 
-def nearest(paths: Paths, aimed: Aimed, rays: tuple[Array, Array], u: float) -> Array:
+def nearest(paths: Paths, aimed: Case, rays: tuple[Array, Array], u: float) -> Array:
     """K × N: largest error over its bound, against the ray itself and, where that is > 1, against those beside it."""
     p, d = (x.astype(np.longdouble) for x in rays)
     d = of_length_1(d)
@@ -99,7 +88,7 @@ def nearest(paths: Paths, aimed: Aimed, rays: tuple[Array, Array], u: float) -> 
             break
         step = unit[:, left] * across[left]
         moved = p[left] + shift * step[0], d[left] + turn * step[1]
-        exact = retrace(aimed.segments, *moved, aimed.depth, reflect=aimed.reflect | grazing)
+        exact = retrace(aimed.segments, *moved, aimed.max_depth, reflect=aimed.reflect | grazing)
         # The bound holds as much of the ray's own rounding as of one beside it.
         found[k, left] = _ratios(paths, left, exact, aimed.segments, u, grazing) / (1 + max(abs(shift), abs(turn)))
     return found
@@ -127,42 +116,45 @@ def _ratios(paths: Paths, chosen: Array, exact: Retraced, segments: Segments, u:
 # What is aimed at ----------------------------------------------------------------------------------------------
 
 
-def _to_vertices(curves: Sequence[Curve], reflections: int, turn: float) -> Iterator[Aimed]:
+def _case(curve: Curve, origins: Array, directions: Array, depth: int, reflect: int = 0) -> Case:
+    """Rays aimed exactly at places of a body in air."""
+    return Case("", curve.between(INDEX, 1.0), origins, directions, depth, np.array(reflect))
+
+
+def _to_vertices(curves: Sequence[Curve], reflections: int, turn: float) -> Iterator[Case]:
     """From places near an outline to each vertex: from within, reflected so often, and from outside."""
     for curve in (curve.mapped(affine(turn)) for curve in curves):
         middle = curve.vertices.mean(0)
         places = curve.outline(5) - middle
         for far, depth, reflect in ((0.75, reflections, 2**reflections - 1), (0.75, 2, 0), (1.5, 3, 0)):
             origins = np.repeat(middle + far * places, len(curve.vertices), axis=0)
-            targets = np.tile(curve.vertices, (len(places), 1))
-            yield Aimed(curve.between(INDEX, 1.0), origins, targets - origins, depth, reflect)
+            yield _case(curve, origins, np.tile(curve.vertices, (len(places), 1)) - origins, depth, reflect)
 
 
-def _tangents(turn: float) -> Iterator[Aimed]:
+def _tangents(turn: float) -> Iterator[Case]:
     touched, along = (np.array([unit(turn + x + degrees) for degrees in range(0, 360, 30)]) for x in (0, 90))
     along, touched = np.concatenate([along, -along]), np.tile(touched, (2, 1))
-    yield Aimed(shapes.circle(1.0).mapped(affine(turn)).between(INDEX, 1.0), touched - 2 * along, along, 1)
+    yield _case(shapes.circle(1.0).mapped(affine(turn)), touched - 2 * along, along, 1)
     curve = shapes.rectangle(2.0, 1.0).mapped(affine(turn))
     sides = np.concatenate([curve.end - curve.start, curve.start - curve.end])
-    yield Aimed(curve.between(INDEX, 1.0), np.concatenate([curve.start, curve.end]) - sides, sides, 1)
+    yield _case(curve, np.concatenate([curve.start, curve.end]) - sides, sides, 1)
 
 
-def _critical(turn: float) -> Iterator[Aimed]:
+def _critical(turn: float) -> Iterator[Case]:
     corners, right, places = [(-1, -1), (1, -1), (1, 1), (-1, 1)], affine(turn), np.linspace(-0.5, 0.75, 11)
     for curve in (shapes.polygon(corners), shapes.polygon(corners, [0, 0, 30, 0])):
         for side in (1.0, -1.0):  # of the normal
             origins = np.stack([np.full(11, 0.25), side * places], 1) @ right.T
-            directions = np.tile([0.6, -0.8 * side], (11, 1)) @ right.T
-            yield Aimed(curve.mapped(right).between(INDEX, 1.0), origins, directions, 1)
+            yield _case(curve.mapped(right), origins, np.tile([0.6, -0.8 * side], (11, 1)) @ right.T, 1)
     circle = shapes.circle(1.0).mapped(right)
     ways = np.array([(x * 0.6 - y * s * 0.8, y * 0.6 + x * s * 0.8) for x, y in circle.vertices for s in (1, -1)])
-    yield Aimed(circle.between(INDEX, 1.0), np.repeat(circle.vertices, 2, 0) - 0.5 * ways, ways, 1)
+    yield _case(circle, np.repeat(circle.vertices, 2, 0) - 0.5 * ways, ways, 1)
 
 
 BEND = shapes.polygon([(-3, -1), (0, -1), (1, 0), (0, 1), (-3, 1)], [0, 90, 90, 0, 0])
 JOINED = shapes.circle(1.0), shapes.ellipse(1.0, 0.5), BEND
 POINTED = shapes.rectangle(2.0, 1.0), shapes.prism(60.0, 1.0), shapes.lens((0.5, -0.5), 0.75, radius=0.5)
-AIMS: dict[str, Callable[[float], Iterator[Aimed]]] = {
+AIMS: dict[str, Callable[[float], Iterator[Case]]] = {
     "joints": functools.partial(_to_vertices, JOINED, 4),
     "vertices": functools.partial(_to_vertices, POINTED, 2),
     "tangents": _tangents,

@@ -108,4 +108,4 @@ def undecided(exact: Retraced, paths: Paths, segments: Segments, points: Array, 
 
 
 def _cross(a: Array, b: Array) -> Array:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

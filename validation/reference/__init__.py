@@ -7,7 +7,6 @@ __all__ = [
     "closed_forms",
     "exact_lens",
     "fast_reference",
-    "layered_scenes",
     "optical_systems",
     "planar_retrace",
 ]

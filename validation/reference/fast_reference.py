@@ -64,7 +64,7 @@ class Screen:
     def bound(self, budget: Budget) -> np.ndarray:
         """In u, the bound of every ray's chord, as if it were unit to the last bit."""
         k, transmitted = self.rays.k.astype(np.float64), np.array(self._transmitted)
-        return budget.chord(self.roundoff, k, self.cos_t, transmitted, cos_i=self.cos_i) / self.roundoff
+        return np.asarray(budget.chord(self.roundoff, k, self.cos_t, transmitted, cos_i=self.cos_i) / self.roundoff)
 
 
 def _solve(a: Any, n: Any, k: Any) -> tuple[Any, ...]:

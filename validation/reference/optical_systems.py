@@ -44,7 +44,7 @@ NUDGE = 1e-8  # mm, radians, and share of an index
 
 def dot(x: Array, y: Array) -> Array:
     """Of vectors (… × 3), as … × 1."""
-    return (x * y).sum(-1, keepdims=True)
+    return np.asarray((x * y).sum(-1, keepdims=True))
 
 
 def length(x: Array) -> Array:
@@ -72,7 +72,7 @@ def snell(a: Array, n: Array, k: Any) -> Array:
     k = np.asarray(k, np.longdouble).reshape(-1, 1)
     c, w = dot(n, a), np.cross(n, a)
     along = np.copysign(np.sqrt(c * c - (k - 1) * (k + 1) * dot(w, w)), c)
-    return (k * np.cross(w, n) + along * n) / dot(n, n)
+    return np.asarray((k * np.cross(w, n) + along * n) / dot(n, n))
 
 
 def across(x: Array, way: int) -> Array:
@@ -347,7 +347,8 @@ def rainbow(order: int) -> System:
 @functools.cache
 def double_gauss_data() -> dict[str, Any]:
     """A double Gauss and nine rays through it, as CODE V prints them; lengths in mm."""
-    return json.loads(PRINT.read_text())
+    data: dict[str, Any] = json.loads(PRINT.read_text())
+    return data
 
 
 def double_gauss(prescription: Any = None) -> System:

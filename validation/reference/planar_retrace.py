@@ -39,7 +39,7 @@ class Retraced:
     @property
     def met(self) -> Array:
         """How many boundaries (N)."""
-        return (self.hits >= 0).sum(1)
+        return np.asarray((self.hits >= 0).sum(1))
 
     def last(self, x: Array) -> Array:
         """Of N × (D+1) values, those of the last legs."""
@@ -69,7 +69,11 @@ def retrace(
 
 
 def _follow(curves: Curves, p: Array, d: Array, max_depth: int, bits: Array, n: Array) -> Retraced:
-    count, found = len(p), _empty(len(p), max_depth)
+    count, depth = len(p), max_depth
+    shapes = [(depth + 1,), (depth + 1, 2), (depth, 2), (depth,)]
+    indices, legs, normals, curvatures = (np.full((count, *shape), np.nan, np.longdouble) for shape in shapes)
+    hits, events = np.full((count, depth), -1, np.int32), np.zeros((count, depth + 1), np.uint8)
+    found = Retraced(legs.copy(), hits, events, indices, legs, normals, curvatures)
     alive, last = np.arange(count), np.full(count, -1)
     d, n = d / np.hypot(*d.T)[:, None], n.copy()
     found.points[:, 0], found.legs[:, 0], found.indices[:, 0] = p, d, n
@@ -102,14 +106,6 @@ def _follow(curves: Curves, p: Array, d: Array, max_depth: int, bits: Array, n: 
     return found
 
 
-def _empty(count: int, depth: int) -> Retraced:
-    def nan(*shape: int) -> Array:
-        return np.full((count, *shape), np.nan, np.longdouble)
-
-    hits, events = np.full((count, depth), -1, np.int32), np.zeros((count, depth + 1), np.uint8)
-    return Retraced(nan(depth + 1, 2), hits, events, nan(depth + 1), nan(depth + 1, 2), nan(depth, 2), nan(depth))
-
-
 def _bend(d: Array, normal: Array, near: Array, far: Array, forced: Array) -> tuple[Array, Array]:
     """(unit direction, whether refracted). A ray along the boundary goes on as it came."""
     momentum = near[:, None] * d
@@ -123,7 +119,7 @@ def _bend(d: Array, normal: Array, near: Array, far: Array, forced: Array) -> tu
 
 
 def _cross(a: Array, b: Array) -> Array:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
 class Curves:
@@ -173,14 +169,11 @@ class Curves:
         nearest = distance[np.arange(len(hit)), hit]
         return nearest, np.where(np.isfinite(nearest), hit, -1)
 
-    def _tau(self, p: Array) -> Array:
-        """τ of points (… × arcs or 1 × 2) in the triangle of each arc: 3 × … × arcs."""
-        t1, t2 = ((self.slopes[i] * (p - self.start[self.arcs])).sum(-1) for i in (1, 2))
-        return np.stack([1 - t1 - t2, t1, t2])
-
     def _arc_distance(self, p: Array, d: Array, own: Array, parted: Array) -> Array:
         """Of the nearer root ahead, of those on the arc."""
-        a, b = self._tau(p), np.stack([(slope * d).sum(-1) for slope in self.slopes])
+        # τ of the points in the triangle of each arc, and its change along the rays.
+        t1, t2 = ((self.slopes[i] * (p - self.start[self.arcs])).sum(-1) for i in (1, 2))
+        a, b = np.stack([1 - t1 - t2, t1, t2]), np.stack([(slope * d).sum(-1) for slope in self.slopes])
         two = b[1] ** 2 - self.w4 * b[0] * b[2]
         one = 2 * a[1] * b[1] - self.w4 * (a[0] * b[2] + a[2] * b[0])
         none = np.where(own, 0, a[1] ** 2 - self.w4 * a[0] * a[2])
@@ -193,7 +186,7 @@ class Curves:
         # The ends' sides tell how often an arc is crossed: once, at the better root; or never or twice.
         on = np.where(parted, branch == branch.max(0), (branch.sum(0) > 0) & (square > 0))
         on = np.where(own, branch > 0, on)
-        return np.where(on & (roots > 0), roots, np.inf).min(0)
+        return np.asarray(np.where(on & (roots > 0), roots, np.inf).min(0))
 
     def normal(self, p: Array, hit: Array) -> tuple[Array, Array]:
         """Unit normals to the left of the segments `hit` at `p`, and the curvatures there."""

@@ -12,6 +12,5 @@ __all__ = [
     "neighbours",
     "random_numbers",
     "rendering_passes",
-    "scene_needs",
     "unused_features",
 ]

@@ -12,6 +12,7 @@ trace a plugin written in Python would matter.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import statistics
 from pathlib import Path
@@ -27,7 +28,7 @@ from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing
-from validation.run.context import NO_REFERENCE, Context, Profile
+from validation.run.context import NO_REFERENCE, Context
 from validation.run.metrics import (
     CHANGED_SHARE,
     DETECTABLE,
@@ -53,7 +54,6 @@ TERMS = {
 AXES = {"x": "seconds", "y": "relMSE", "slope": -1}  # relMSE is a variance
 # Paths in these scenes are short: a difference in the last bit stays one, unless it flips the choice of a lobe.
 SHORT_PATHS = {"sphere", "slab", "prism", "furnace"}
-Curves = dict[str, list[tuple[float, float]]]
 CHANGED = 1e-5
 TILE = 16
 CURVE_SEEDS = 2
@@ -73,13 +73,21 @@ def tasks(context: Context) -> list[Task]:
 def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
     profile, scene = context.profile, path.stem
     cameras = {name: Camera(opened(path, name, profile.resolution)) for name in (plugin, BUILTIN)}
-    test, reference = _images(profile, *cameras.values())
-    half = profile.pairs // 2
-    values, left_out = _paired(test, reference), no_question(test, reference)
+    test, reference = (
+        np.stack([camera(profile.spp, seed)[0] for seed in range(profile.pairs)]) for camera in cameras.values()
+    )
+    half, left_out = profile.pairs // 2, no_question(test, reference)
+    # Same seeds, image by image; then independent ones.
+    pairs = pixelwise.changes(reference.reshape(-1, *reference.shape[2:]), test.reshape(-1, *test.shape[2:]), CHANGED)
+    values = {CHANGED_SHARE: pairs.share, "largest change": pairs.largest, "RMSE": pairs.rms}
+    values |= {MEANS_DIFFER: abs(pairs.mean_ratio - 1)}
     if not left_out:
-        values |= _independent(test[:half], reference[half:])
+        welch = test[:half], reference[half:]
+        tiles = tile_statistics.compare_stacks(*welch[::-1], TILE, limits.WELCH_ERROR, limits.WELCH_MARGIN)
+        values |= {WELCH_ALARMS: float(tiles.alarms), SMALLEST_P: tiles.smallest_p}
+        values |= {DETECTABLE: tiles.minimum_detectable()}
     times, goals = _timed(context, path, plugin, cameras)
-    replay = {
+    replay: dict[str, Any] = {
         "scene": path.name,
         "plugin": plugin,
         "variant": context.variant,
@@ -87,25 +95,22 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
         "spp": profile.spp,
         "seeds": profile.pairs,
     }
-    images = _save(context, replay, test.mean(0), reference.mean(0))
-    remark = NO_REFERENCE.get(scene, left_out)
-    noisy = reference.std(0).max() >= CHANGED
-    curves = _curves(context, cameras, reference) if plugin == PLUGIN and noisy and scene not in NO_REFERENCE else {}
-    return [
-        Row(
-            NAME,
-            plugin,
-            scene,
-            context.variant,
-            values | times,
-            _budgets(scene, left_out),
-            goals,
-            remark,
-            replay,
-            images,
-            curves,
-        ),
-    ]
+    images, folder, means = {}, Path("images") / scene, (test.mean(0), reference.mean(0))
+    (context.out / folder).mkdir(parents=True, exist_ok=True)
+    for role, image in (("reference", means[1]), ("test", means[0]), ("difference", means[0] - means[1])):
+        images[role] = str(folder / (f"{BUILTIN}.exr" if role == "reference" else f"{plugin} {role}.exr"))
+        pixels = image.astype(np.float32)
+        image_file.write_exr(context.out / images[role], pixels, metadata=replay | {"role": role})
+    curves: dict[str, list[tuple[float, float]]] = {}
+    if plugin == PLUGIN and reference.std(0).max() >= CHANGED and scene not in NO_REFERENCE:
+        # relMSE against seconds at growing samples per pixel, both in turn; seeds the reference has not seen.
+        for spp, name in itertools.product(profile.curve_spp, cameras):
+            points = [cameras[name](spp, seed=profile.pairs + i) for i in range(CURVE_SEEDS)]
+            error = statistics.fmean(tile_statistics.relative_mse(image, reference) for image, _ in points)
+            curves.setdefault(name, []).append((statistics.median(seconds for _, seconds in points), error))
+    budgets, remark = _budgets(scene, left_out), NO_REFERENCE.get(scene, left_out)
+    row = functools.partial(Row, NAME, plugin, scene, context.variant)
+    return [row(values | times, budgets, goals, remark, replay, images, curves)]
 
 
 def _budgets(scene: str, left_out: str) -> dict[str, float]:
@@ -113,11 +118,6 @@ def _budgets(scene: str, left_out: str) -> dict[str, float]:
         return {}
     budgets = {MEANS_DIFFER: limits.MEANS} | ({} if left_out else {WELCH_ALARMS: 0.0})
     return budgets | ({CHANGED_SHARE: limits.CHANGED} if left_out or scene in SHORT_PATHS else {})
-
-
-def _images(profile: Profile, *cameras: Camera) -> list[np.ndarray]:
-    """Of each camera, one image a seed."""
-    return [np.stack([camera(profile.spp, seed)[0] for seed in range(profile.pairs)]) for camera in cameras]
 
 
 def _timed(
@@ -147,17 +147,6 @@ def _timed(
     return values, dict.fromkeys(demanded, limits.RENDER_TIME)
 
 
-def _paired(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Same seeds, image by image."""
-    found = pixelwise.changes(reference.reshape(-1, *reference.shape[2:]), test.reshape(-1, *test.shape[2:]), CHANGED)
-    return {
-        CHANGED_SHARE: found.share,
-        "largest change": found.largest,
-        "RMSE": found.rms,
-        MEANS_DIFFER: abs(found.mean_ratio - 1),
-    }
-
-
 def no_question(test: np.ndarray, reference: np.ndarray) -> str:
     """Why Welch's test is not applied, because the images are the same without statistics; "" where it is."""
     if np.array_equal(test, reference):
@@ -165,37 +154,6 @@ def no_question(test: np.ndarray, reference: np.ndarray) -> str:
     if reference.std(0).max() < CHANGED and test.std(0).max() < CHANGED:  # two conditions: NaN is below nothing
         return "left out: Welch's test and error against time, because independent seeds give the same image"
     return ""
-
-
-def _independent(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    found = tile_statistics.compare_stacks(reference, test, TILE, limits.WELCH_ERROR, limits.WELCH_MARGIN)
-    return {
-        WELCH_ALARMS: float(found.alarms),
-        SMALLEST_P: found.smallest_p,
-        DETECTABLE: found.minimum_detectable(),
-    }
-
-
-def _curves(context: Context, cameras: dict[str, Camera], reference: np.ndarray) -> Curves:
-    """relMSE against seconds at growing samples per pixel, both plugins in turn; seeds the reference has not seen."""
-    curves: Curves = {name: [] for name in cameras}
-    for spp in context.profile.curve_spp:
-        for name, camera in cameras.items():
-            points = [camera(spp, seed=context.profile.pairs + i) for i in range(CURVE_SEEDS)]
-            error = statistics.fmean(tile_statistics.relative_mse(image, reference) for image, _ in points)
-            curves[name].append((statistics.median(seconds for _, seconds in points), error))
-    return curves
-
-
-def _save(context: Context, settings: dict[str, Any], test: np.ndarray, reference: np.ndarray) -> dict[str, str]:
-    folder = Path("images") / Path(settings["scene"]).stem
-    (context.out / folder).mkdir(parents=True, exist_ok=True)
-    saved = {}
-    for role, image in (("reference", reference), ("test", test), ("difference", test - reference)):
-        name = f"{BUILTIN}.exr" if role == "reference" else f"{settings['plugin']} {role}.exr"
-        image_file.write_exr(context.out / folder / name, image.astype(np.float32), metadata=settings | {"role": role})
-        saved[role] = str(folder / name)
-    return saved
 
 
 STUDY = Study(NAME, "Renders", about(__doc__), TERMS, tasks, axes=AXES)

@@ -37,7 +37,6 @@ TERMS = {
 NAME, SEED = "invisible changes", 2031
 SIZE, TILE, RENDERS = 16, 8, 8
 SPP = {"matt": 256, "dispersive": 64}  # caustics and colours are noise; 16 for the others
-Change = Callable[[Nodes], None]
 
 
 def scenes(spectral: bool) -> dict[str, Nodes]:
@@ -69,47 +68,45 @@ def scenes(spectral: bool) -> dict[str, Nodes]:
     return {name: {"type": "scene", "sensor": sensor} | nodes for name, nodes in parts.items()}
 
 
-def _wrap(wrapper: Callable[[], Nodes]) -> Change:
-    def change(scene: Nodes) -> None:
-        scene["ball"]["bsdf"] = wrapper() | {"b": scene["ball"]["bsdf"]}
-
-    return change
-
-
-def _set(name: str, value: Callable[[], Any]) -> Change:
-    return lambda scene: scene["ball"]["bsdf"].update({name: value()})
-
-
-def _add(**far: Any) -> Change:
-    return lambda scene: scene.update(far=far)
-
-
-def _blend(scene: Nodes) -> None:
-    inner = scene["ball"]["bsdf"]
-    scene["ball"]["bsdf"] = {"type": "blendbsdf", "weight": 0.3, "a": inner, "b": inner}
-
-
-def _instance(scene: Nodes) -> None:
-    scene["group"] = {"type": "shapegroup", "part": scene.pop("ball")}
-    scene["ball"] = {"type": "instance", "group": {"type": "ref", "id": "group"}}
-
-
 BEHIND, DARK = [0, 0, 90], {"type": "area", "radiance": 1e-20}
-# Changes of the scene. `refract` itself must be the BSDF of the ball for those of its parameters and for absorption.
-CHANGES: dict[str, Change] = {
-    "matt ball far away": _add(type="sphere", center=BEHIND),
-    "dark lamp": _add(type="sphere", center=BEHIND, bsdf={"type": "null"}, emitter=DARK),
-    "dark point lamp": _add(type="point", position=BEHIND, intensity=1e-20),
-    "instance": _instance,
-    "other order": lambda scene: scene.update(ball=scene.pop("ball")),
-    "mask of opacity 1": _wrap(lambda: {"type": "mask", "opacity": 1.0}),
-    "blend of itself": _blend,
-    "flat normal map": _wrap(lambda: {"type": "normalmap", "normalmap": flat([0.5, 0.5, 1.0])}),
-    "flat bump map": _wrap(lambda: {"type": "bumpmap", "arbitrary": flat(0.5, 4)}),
-    "texture as tint": _set("specular_reflectance", lambda: flat(1.0)),
-    "texture as index": _set("int_ior", lambda: flat(1.5)),
-    "absorption 1e-30": _set("int_absorption", lambda: 1e-30),
-}
+
+
+def changed(scene: Nodes, change: str) -> Nodes:
+    """The scene with a change of `changes`."""
+    ball = scene["ball"]
+    added, wrapper, parameter = changes()[change]
+    if added:
+        return scene | {"far": added}
+    if change == "instance":
+        group = {"type": "shapegroup", "part": scene.pop("ball")}
+        return scene | {"group": group, "ball": {"type": "instance", "group": {"type": "ref", "id": "group"}}}
+    if change == "other order":
+        return {name: scene[name] for name in scene if name != "ball"} | {"ball": ball}
+    inner = ball["bsdf"]
+    if wrapper:
+        nested = {"a": inner, "b": inner} if change == "blend of itself" else {"b": inner}
+        return scene | {"ball": ball | {"bsdf": wrapper | nested}}
+    return scene | {"ball": ball | {"bsdf": inner | parameter}}
+
+
+def changes() -> dict[str, tuple[Nodes, Nodes, Nodes]]:
+    """What is far away, a wrapper of the ball's BSDF, and its parameters, which `refract` itself must have."""
+    return {
+        "matt ball far away": ({"type": "sphere", "center": BEHIND}, {}, {}),
+        "dark lamp": ({"type": "sphere", "center": BEHIND, "bsdf": {"type": "null"}, "emitter": DARK}, {}, {}),
+        "dark point lamp": ({"type": "point", "position": BEHIND, "intensity": 1e-20}, {}, {}),
+        "instance": ({}, {}, {}),
+        "other order": ({}, {}, {}),
+        "mask of opacity 1": ({}, {"type": "mask", "opacity": 1.0}, {}),
+        "blend of itself": ({}, {"type": "blendbsdf", "weight": 0.3}, {}),
+        "flat normal map": ({}, {"type": "normalmap", "normalmap": flat([0.5, 0.5, 1.0])}, {}),
+        "flat bump map": ({}, {"type": "bumpmap", "arbitrary": flat(0.5, 4)}, {}),
+        "texture as tint": ({}, {}, {"specular_reflectance": flat(1.0)}),
+        "texture as index": ({}, {}, {"int_ior": flat(1.5)}),
+        "absorption 1e-30": ({}, {}, {"int_absorption": 1e-30}),
+    }
+
+
 # Other ways to render the same scene: what is around the integrator, and its parameters.
 WAYS: dict[str, tuple[Nodes | None, Nodes]] = {
     "moment": ({"type": "moment"}, {}),
@@ -152,11 +149,10 @@ def rows(variant: str, name: str, depth: int) -> list[Row]:
     left_out = IMPOSSIBLE.get(name, set()) | (IMPOSSIBLE["spectral"] if spectral else set())
     unchanged = mi.load_dict(scenes(spectral)[name], parallel=False, optimize=False)
     expected = images(unchanged, None, seed)
-    for change in (change for change in (*CHANGES, *WAYS) if change not in left_out):
+    for change in (change for change in (*changes(), *WAYS) if change not in left_out):
         scene, (around, parameters) = unchanged, WAYS.get(change, (None, {}))
-        if change in CHANGES:
-            CHANGES[change](other := scenes(spectral)[name])
-            scene = mi.load_dict(other, parallel=False, optimize=False)
+        if change not in WAYS:
+            scene = mi.load_dict(changed(scenes(spectral)[name], change), parallel=False, optimize=False)
         values = compared(expected, functools.partial(images, scene, around, **parameters), seed)
         budgets = {"alarms": 0.0, "detectable": limits.INVISIBLE}
         budgets |= {"noise": limits.INVISIBLE_NOISE} if change in WAYS and not values["same bits"] else {}

@@ -32,8 +32,7 @@ from validation.run.context import Context
 from validation.run.render_methods import OURS
 from validation.run.seeds import current
 
-from .cases import GLASS, TURNED, Case, Nodes, flat, study, variants
-from .glass_cells import CELLS, WIDE, scene, uneven
+from .cases import BLACK, GLASS, TURNED, Case, Nodes, bitmap, flat, study, variants
 
 TERMS = {
     "alarms": "means that differ by more than noise does but once in 10⁸ tests: of all, of one setting, of one cell",
@@ -78,6 +77,79 @@ WAYS = {"": (LONG, 320_000), "every count": (LONG, 4_000_000), "alpha": (SHORT, 
 QUICK = {"alone": ("diffuse", "dielectric"), "blendbsdf": ("dielectric",), "normalmap": ("refract",)}
 
 
+# Scenes of one BSDF with glass, as cells of one scene. Bars, a grille before the lamp and a sky of hard blocks give
+# structure in every random number.
+WIDE = 6  # cells beside each other
+
+
+def uneven(shape: tuple[int, int], low: float, high: float, grain: int = 1) -> Nodes:
+    """A bitmap of two values in blocks without an order: hard edges at every scale."""
+    blocks = np.random.default_rng(3).random(shape) < 0.5
+    return bitmap(np.kron(np.where(blocks, high, low), np.ones((grain, grain)))[..., None] * np.ones(3))
+
+
+def bars(place: Any, spans: Iterable[tuple[float, float]], name: str) -> Nodes:
+    """Black bars across the square [-1, 1]² of `place`, each from and to a place in x."""
+    parts = [mi.ScalarTransform4f().translate([(a + b) / 2, 0, 0]).scale([(b - a) / 2, 1, 1]) for a, b in spans]
+    bar = {"type": "rectangle", "bsdf": BLACK}
+    return {f"{name}{i}": bar | {"to_world": place @ part} for i, part in enumerate(parts)}
+
+
+def lights(variant: str) -> Nodes:
+    """A lamp behind a grille, and a sky: in spectral variants without polarisation the same in all directions."""
+    place = mi.ScalarTransform4f
+    down = place().translate([0, 0, 12]).rotate([1, 0, 0], 180).scale(8)
+    spans = [(-1, -0.5), (0, 0.25), (0.5, 0.625), (0.75, 0.8125), (0.9375, 0.96875)]  # edges at every scale
+    found = {"lamp": {"type": "rectangle", "to_world": down, "emitter": {"type": "area", "radiance": 0.8}}}
+    found |= bars(place().translate([0, 0, -0.1]) @ down, spans, "down")
+    found |= bars(place().translate([0, 0, -0.2]) @ down @ place().rotate([0, 0, 1], 90), spans, "across")
+    if variant.endswith("spectral"):
+        return found | {"sky": {"type": "constant", "radiance": 0.4}}
+    sky = {"type": "envmap", "bitmap": uneven((64, 128), 0.3, 0.8, grain=4)["bitmap"]}
+    return found | {"sky": sky | {"to_world": place().rotate([1, 0.3, 0.2], 70)}}
+
+
+def _ball(bsdf: Nodes, radius: float, *center: float) -> Nodes:
+    return {"type": "sphere", "center": center, "radius": radius, "bsdf": bsdf}
+
+
+def _plate(bsdf: Nodes, angle: float, width: float, x: float, y: float) -> Nodes:
+    turned = mi.ScalarTransform4f().translate([x, y, 0]).rotate([0, 1, 0], angle)
+    return {"type": "rectangle", "to_world": turned.scale([width, 0.48, 1]), "bsdf": bsdf}
+
+
+def beside(bsdf: Nodes, x: float, y: float) -> Nodes:
+    """A plate seen from its side, as a turned normal then refuses a lobe; a ball of glass; bars before both."""
+    over = mi.ScalarTransform4f().translate([x, y, 1.2]).scale(0.48)
+    found = bars(over, [(-0.8, -0.6), (0.1, 0.2), (0.7, 0.9)], "bar")
+    return found | {"plate": _plate(bsdf, 65, 1.1, x, y), "ball": _ball(GLASS, 0.2, x + 0.1, y, 0.5)}
+
+
+def around(bsdf: Nodes, x: float, y: float) -> Nodes:
+    """A ball around one of glass."""
+    return {"outer": _ball(bsdf, 0.46, x, y, 0), "inner": _ball(GLASS, 0.22, x, y, 0.1)}
+
+
+def within(bsdf: Nodes, x: float, y: float) -> Nodes:
+    """A plate in a block of glass: all its light has come through the boundary."""
+    block = mi.ScalarTransform4f().translate([x, y, 0]).scale([0.49, 0.49, 0.3])
+    return {"block": {"type": "cube", "to_world": block, "bsdf": GLASS}, "plate": _plate(bsdf, 10, 0.48, x, y)}
+
+
+CELLS = (beside, around, within)
+
+
+def scene(bsdfs: Iterable[Nodes], variant: str) -> Any:
+    """The cells of all BSDFs, one after the other in rows of `WIDE`."""
+    found: Nodes = {"type": "scene"} | lights(variant)
+    for i, bsdf in enumerate(bsdfs):
+        found[f"bsdf{i}"] = bsdf | {"id": f"bsdf{i}"}
+        for j, cell in enumerate(CELLS, len(CELLS) * i):
+            parts = cell({"type": "ref", "id": f"bsdf{i}"}, j % WIDE + 0.5, j // WIDE + 0.5)
+            found |= {f"{name} {j}": part for name, part in parts.items()}
+    return mi.load_dict(found, parallel=False, optimize=False)
+
+
 def measured(view: Any, bsdfs: int, method: Nodes, spp: int, samples: float, seed: int) -> Any:
     """By BSDF and cell, the mean and its squared standard error, of two renders with as many pixels as needed."""
     tall, pixels = -(-bsdfs * len(CELLS) // WIDE), max(8, round((samples / 2 / spp) ** 0.5))
@@ -110,56 +182,38 @@ def cases(context: Context) -> Iterator[Case]:
         masked = ("null", "dielectric", "diffuse")
         settings += [(rgb, wrapper, masked, ((0, 4), (1, 4)), "alpha") for wrapper in ("alone", "mask")]
     for setting in settings:
-        yield Case(f"{setting[0]} {titled(setting[1], setting[-1])}", setting[0], functools.partial(rows, *setting))
-
-
-def titled(wrapper: str, way: str) -> str:
-    """A wrapper and a way, as rows are called."""
-    return f"{wrapper}, {way}" if way else wrapper
-
-
-def groups(variant: str, wrapper: str, names: Iterable[str]) -> tuple[list[dict[str, Nodes]], dict[str, str]]:
-    """The BSDFs whose scenes have the same features, in groups; by name, why Mitsuba does not load the others."""
-    together: dict[Any, dict[str, Nodes]] = {}
-    refused = {}
-    for name in names:
-        bsdf = WRAPPERS[wrapper](BSDFS[name] | {"type": name})
-        try:
-            together.setdefault(inspect(scene([bsdf], variant)), {})[name] = bsdf
-        except RuntimeError as error:
-            refused[name] = str(error).rpartition("[")[2].partition("] ")[2].partition("\n")[0]
-    return list(together.values()), refused
+        title = " ".join(setting[:2]) + (f", {setting[-1]}" if setting[-1] else "")
+        yield Case(title, setting[0], functools.partial(rows, *setting))
 
 
 def rows(variant: str, wrapper: str, names: tuple[str, ...], settings: Settings, way: str = "") -> list[Row]:
     """A row for each BSDF, and one for each setting; those that Mitsuba refuses in its own words."""
-    together, refused = groups(variant, wrapper, names)
-    parts = zip(*(images(list(group.values()), variant, settings, way) for group in together), strict=True)
-    test, noise, expected, uncertain = (np.concatenate(part, -2) for part in parts)
-    cases: dict[str, Any] = {name: np.s_[:, [i]] for i, name in enumerate(itertools.chain(*together))}
+    groups: dict[Any, dict[str, Nodes]] = {}  # of BSDFs whose scenes have the same features
+    title, seed, (parameters, samples) = f"{wrapper}, {way}" if way else wrapper, current(SEED), WAYS[way]
+    row, table = functools.partial(Row, NAME, OURS), list[Row]()
+    for name in names:
+        bsdf = WRAPPERS[wrapper](BSDFS[name] | {"type": name})
+        try:
+            groups.setdefault(inspect(scene([bsdf], variant)), {})[name] = bsdf
+        except RuntimeError as error:
+            reason = str(error).rpartition("[")[2].partition("] ")[2].partition("\n")[0]
+            table.append(row(f"{title}: {name}", variant, reason=f"Mitsuba: {reason}"))
+    parts = []
+    for group in groups.values():
+        gc.collect()  # Dr.Jit compiles every BSDF that is alive
+        measure = functools.partial(measured, scene(group.values(), variant), len(group))
+        expected = measure({"type": "path"} | parameters, 64, samples, seed + 5000)
+        ours = [
+            measure({"type": OURS, "split_depth": depth} | parameters, spp, samples / len(settings), seed + 2 * i)
+            for i, (depth, spp) in enumerate(settings)
+        ]
+        parts.append((*np.stack(ours, 1), *expected))
+    test, noise, means, uncertain = (np.concatenate(part, -2) for part in zip(*parts, strict=True))
+    cases: dict[str, Any] = {name: np.s_[:, [i]] for i, name in enumerate(itertools.chain(*groups.values()))}
     cases |= {f"split {depth}, {spp} spp": np.s_[[i], :] for i, (depth, spp) in enumerate(settings)}
-    budgets, replay = {"alarms": 0.0, "detectable": limits.NEIGHBOUR}, {"seed": current(SEED), "samples": WAYS[way][1]}
-    title, table = titled(wrapper, way), []
-    for case, part in cases.items():
-        values = judged(test[part], noise[part], expected[part[1]], uncertain[part[1]])
-        table.append(Row(NAME, OURS, f"{title}: {case}", variant, values, budgets, replay=replay))
-    why = {name: f"Mitsuba: {reason}" for name, reason in refused.items()}
-    return table + [Row(NAME, OURS, f"{title}: {name}", variant, reason=reason) for name, reason in why.items()]
-
-
-def images(bsdfs: list[Nodes], variant: str, settings: Settings, way: str) -> tuple[Any, Any, Any, Any]:
-    """Means and squared standard errors of all cells: in each setting by `refract_path`, then by `path`."""
-    gc.collect()  # Dr.Jit compiles every BSDF that is alive
-    seed, (parameters, samples) = current(SEED), WAYS[way]
-    measure = functools.partial(measured, scene(bsdfs, variant), len(bsdfs))
-    expected, uncertain = measure({"type": "path"} | parameters, 64, samples, seed + 5000)
-    ours = {"type": OURS} | parameters
-    renders = [
-        measure(ours | {"split_depth": depth}, spp, samples / len(settings), seed + 2 * i)
-        for i, (depth, spp) in enumerate(settings)
-    ]
-    test, noise = np.stack(renders, 1)
-    return test, noise, expected, uncertain
+    budgets, replay = {"alarms": 0.0, "detectable": limits.NEIGHBOUR}, {"seed": seed, "samples": samples}
+    judge = {case: judged(test[x], noise[x], means[x[1]], uncertain[x[1]]) for case, x in cases.items()}
+    return [row(f"{title}: {case}", variant, values, budgets, replay=replay) for case, values in judge.items()] + table
 
 
 def judged(test: Any, noise: Any, expected: Any, uncertain: Any) -> dict[str, float]:

@@ -10,6 +10,7 @@ draws says nothing of what the next one draws. Numbers of 20 keys are pooled.
 from __future__ import annotations
 
 import functools
+import itertools
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -53,7 +54,7 @@ def rows(variant: str, counts: Sequence[int], seeds: int, source: Any = KeyedMul
     from scipy.stats import chi2
 
     p, unstratified = defaultdict[str, list[float]](list), Counter[str]()
-    for count, seed in ((count, seed) for count in counts for seed in range(seeds)):
+    for count, seed in itertools.product(counts, range(seeds)):
         pooled: dict[str, Any] = {}
         for kind, histogram, broken in histograms(source, count, current(SEED) + seed):
             pooled[kind] = pooled.get(kind, 0) + histogram
@@ -62,13 +63,12 @@ def rows(variant: str, counts: Sequence[int], seeds: int, source: Any = KeyedMul
             expected = seen.sum() / seen.size
             p[kind].append(float(chi2.sf(((seen - expected) ** 2).sum() / expected, seen.size - 1)))
     budgets, replay = {"alarms": 0.0, "not stratified": 0.0}, {"seed": current(SEED), "keys": KEYS}
-    table = []
+    row, table = functools.partial(Row, NAME, OURS), list[Row]()
     for kind, tests in p.items():
-        alarms = sum(x < limits.NUMBERS_ALARM / TESTS for x in tests)
+        alarms = sum(not x >= limits.NUMBERS_ALARM / TESTS for x in tests)
         values = {"alarms": alarms, "tests": len(tests), "least p": min(tests) * len(tests)}
         numbers = {name: float(x) for name, x in (values | {"not stratified": unstratified[kind]}).items()}
-        case = f"{kind}, {counts[0]} to {counts[-1]} samples"
-        table.append(Row(NAME, OURS, case, variant, numbers, budgets, replay=replay))
+        table.append(row(f"{kind}, {counts[0]} to {counts[-1]} samples", variant, numbers, budgets, replay=replay))
     return table
 
 

@@ -15,9 +15,7 @@ import functools
 import math
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +23,8 @@ import numpy as np
 
 from mi_refract.io.image_file import write_exr
 from mi_refract.plugins import PLUGIN
-from mi_refract.rendering import end_conditions
-from mi_refract.rendering.end_conditions import Limits
-from mi_refract.rendering.long_render import Job, LongRender, resume
+from mi_refract.rendering.end_conditions import LEVEL, Limits
+from mi_refract.rendering.long_render import Job, resume
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run.context import SCENES, Context
@@ -65,40 +62,30 @@ def tasks(context: Context) -> list[Task]:
     ]
 
 
-@dataclass(frozen=True)
-class _Still:
-    """A small scene, loaded once for all its renders."""
-
-    job: Job
-    folder: Path
-
-    def render(self, seed: int, given: Limits) -> LongRender:
-        """One render of it from its first pass to its end."""
-        job = Job(self.job.scene, self.job.defines, seed)
-        found = resume(job, self.folder / "image.exr", given, restart=True)
-        found.run()
-        return found
-
-
-@contextmanager
-def _still(context: Context, name: str) -> Iterator[_Still]:
-    with under(context.variant), tempfile.TemporaryDirectory() as folder:
-        defines = {"res": str(RESOLUTION), "bsdf": PLUGIN}
-        yield _Still(Job(SCENES / f"{name}.xml", defines), Path(folder))
-
-
 def error_rows(context: Context, name: str, seed: int = 0) -> list[Row]:
     """One row: how often the errors of many renders are what they say."""
-    count = COUNTS[context.profile.name]
-    with _still(context, name) as still:
-        reference = still.render(2**31 + seed, Limits(spp=12 * PASS_SPP * REFERENCE, pass_spp=64)).image()
-        assert reference is not None
-        twelve = still.render(2**31 + seed + 1, Limits(spp=96 * PASS_SPP, pass_spp=PASS_SPP)).error()
-        assert twelve is not None
+    from scipy.stats import binom
+
+    count, table = COUNTS[context.profile.name], []
+    defines = {"res": str(RESOLUTION), "bsdf": PLUGIN}
+    with under(context.variant), tempfile.TemporaryDirectory() as folder:
+
+        def render(seed: int, **ends: Any) -> Any:
+            """One render of it from its first pass to its end."""
+            job = Job(SCENES / f"{name}.xml", defines, seed)
+            whole: Any = resume(job, Path(folder) / "image.exr", Limits(**ends), restart=True)
+            whole.run()
+            return whole
+
+        reference = render(2**31 + seed, spp=12 * PASS_SPP * REFERENCE, pass_spp=64).image()
+        twelve = render(2**31 + seed + 1, spp=96 * PASS_SPP, pass_spp=PASS_SPP).error()
         asked = twelve.value * math.sqrt(96 / 12)
         seeds = range(seed * count + 1, (seed + 1) * count + 1)
-        found = np.array([_errors(still.render(s, Limits(until=asked, pass_spp=PASS_SPP)), reference) for s in seeds])
-    true, stated, low, high, passes = found.T
+        for one in (render(seed, until=asked, pass_spp=PASS_SPP) for seed in seeds):
+            stated = one.error()
+            true = math.sqrt(np.mean((one.image() - reference) ** 2)) / abs(reference.mean())
+            table.append((true, stated.value, stated.low, stated.high, one.progress.passes))
+    true, stated, low, high, passes = np.array(table).T
     values = {
         "renders": float(count),
         "beyond": float((true > asked).sum()),
@@ -106,40 +93,33 @@ def error_rows(context: Context, name: str, seed: int = 0) -> list[Row]:
         "stated / true": float((stated**2).mean() / (true**2).mean()),
         "passes": float(passes.mean()),
     }
-    most = _most(count)
+    # Of so many renders the largest number that may be beyond.
+    most = float(binom.ppf(1 - limits.STOPPED_WRONGLY, count, 1 - LEVEL))
     replay = {"scene": name, "resolution": RESOLUTION, "asked": asked, "seeds": [seeds[0], seeds[-1]]}
     budgets = {"beyond": most, "outside": most}
     return [Row(NAME, "--until", name, context.variant, values, budgets, replay=replay)]
-
-
-def _errors(render: LongRender, reference: np.ndarray) -> tuple[float, float, float, float, int]:
-    """True error, stated error with its interval, and passes."""
-    image, stated = render.image(), render.error()
-    assert image is not None and stated is not None
-    true = math.sqrt(np.mean((image - reference) ** 2)) / abs(reference.mean())
-    return true, stated.value, stated.low, stated.high, render.progress.passes
-
-
-def _most(count: int) -> float:
-    """Of so many renders the largest number that may be beyond."""
-    from scipy.stats import binom
-
-    return float(binom.ppf(1 - limits.STOPPED_WRONGLY, count, 1 - end_conditions.LEVEL))
 
 
 def time_rows(context: Context, spp: int) -> list[Row]:
     """One row: processor time of a render in passes over that of one call."""
     import mitsuba as mi
 
+    def timed(work: Callable[..., Any], *arguments: Any, **named: Any) -> tuple[float, Any]:
+        start = time.process_time()
+        made = work(*arguments, **named)
+        return time.process_time() - start, made
+
+    def image_of(scene: Any) -> np.ndarray:
+        return np.array(mi.render(scene, spp=spp))
+
     ratios = []
     with under(context.variant), tempfile.TemporaryDirectory() as folder:
         job, output = Job(SCENES / "sphere.xml", {"res": "512", "bsdf": PLUGIN}), Path(folder) / "passes.exr"
-        one = Path(folder) / "one.exr"
         for _ in range(PAIRS[context.profile.name] + 1):
             passes = resume(job, output, Limits(spp=spp), restart=True)
-            called, image = _timed(lambda scene=passes.scene: np.array(mi.render(scene, spp=spp)))
-            written, _ = _timed(lambda image=image: write_exr(one, image))
-            in_passes, _ = _timed(passes.run)
+            called, image = timed(image_of, passes.scene)
+            written, _ = timed(write_exr, Path(folder) / "one.exr", image)
+            in_passes, _ = timed(passes.run)
             ratios.append((in_passes / called, in_passes / (called + written)))
     low, middle, high = np.quantile(ratios[1:], (0, 0.5, 1), axis=0)  # the first pair compiles
     values = {ONE_CALL: middle[0], "low": low[0], "high": high[0], WRITTEN: middle[1]}
@@ -147,12 +127,6 @@ def time_rows(context: Context, spp: int) -> list[Row]:
     values = {name: float(value) for name, value in values.items()}
     goals = {ONE_CALL: limits.PASSES_TIME}
     return [Row(NAME, f"{spp} spp", "sphere", context.variant, values, goals=goals, replay=replay)]
-
-
-def _timed(work: Any) -> tuple[float, Any]:
-    start = time.process_time()
-    found = work()
-    return time.process_time() - start, found
 
 
 STUDY = Study(NAME, "Passes", about(__doc__), TERMS, tasks)

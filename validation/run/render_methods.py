@@ -34,14 +34,6 @@ class Method:
         """For `mi.load_dict`; without Russian roulette, as in the scene files."""
         return {"type": self.integrator, "max_depth": max_depth, "rr_depth": max_depth, **self.parameters}
 
-    @property
-    def missing(self) -> str:
-        """Why this cannot be run: an integrator that is not registered; "" where it can."""
-        import mitsuba as mi
-
-        known = mi.PluginManager.instance().plugin_type(self.integrator) == mi.ObjectType.Integrator
-        return "" if known else f"the integrator {self.integrator} is not registered"
-
 
 BUILTIN = Method("path + dielectric", "path", DIELECTRIC)
 METHODS = (

@@ -55,31 +55,26 @@ def rows(found: Iterable[Row]) -> list[Row]:
             for metric, bound in row.budgets.items() if row.values else ():
                 if bound > 0 and math.isfinite(row.values[metric]):
                     shares.setdefault((row.subject, metric), []).append(row.values[metric] / bound)
+        checks = sum(map(len, shares.values()))
+        far = {key: count for key, used in shares.items() if (count := sum(LOOSE * x < 1 for x in used))}
+        loose = {key for key, count in far.items() if count == len(shares[key])}
+        said = []
+        for key in sorted(far, key=lambda key: max(shares[key])):
+            text = f"{', '.join(key)}: {far[key]} of {len(shares[key])} rows"
+            if key in loose:
+                said.append(f"{text}; excludes: {EXCLUDES.get((study, key[1]), 'not stated')}")
+            else:
+                said.append(f"{text}, others use up to {compact(max(shares[key]), 2)} of it")
+        more = [f"and {len(said) - SHOWN} more subjects and metrics, listed in `replay`"] if len(said) > SHOWN else []
+        values = {
+            "checks": float(checks),
+            "far from the bound": float(sum(far.values())),
+            "share": sum(far.values()) / max(checks, 1),
+            "loose in every case": float(len(loose)),
+            "unexplained": float(sum((study, metric) not in EXCLUDES for _, metric in loose)),
+        }
+        case, budgets = f"more than {LOOSE:g} times the largest error", {"unexplained": 0.0}
+        reason, replay = "; ".join(said[:SHOWN] + more), {"far from their bounds": said}
         if shares:
-            made.append(_row(study, shares))
+            made.append(Row(NAME, study, case, "", values, budgets, reason=reason, replay=replay))
     return made
-
-
-def _row(study: str, shares: dict[tuple[str, str], list[float]]) -> Row:
-    checks = sum(map(len, shares.values()))
-    far = {key: count for key, used in shares.items() if (count := sum(LOOSE * x < 1 for x in used))}
-    loose = {key for key, count in far.items() if count == len(shares[key])}
-    unexplained = [key for key in loose if (study, key[1]) not in EXCLUDES]
-    values = {
-        "checks": float(checks),
-        "far from the bound": float(sum(far.values())),
-        "share": sum(far.values()) / checks,
-        "loose in every case": float(len(loose)),
-        "unexplained": float(len(unexplained)),
-    }
-    said = []
-    for key in sorted(far, key=lambda key: max(shares[key])):
-        text = f"{', '.join(key)}: {far[key]} of {len(shares[key])} rows"
-        if key in loose:
-            said.append(f"{text}; excludes: {EXCLUDES.get((study, key[1]), 'not stated')}")
-        else:
-            said.append(f"{text}, others use up to {compact(max(shares[key]), 2)} of it")
-    more = [f"and {len(said) - SHOWN} more subjects and metrics, listed in `replay`"] if len(said) > SHOWN else []
-    reason, replay = "; ".join(said[:SHOWN] + more), {"far from their bounds": said}
-    case = f"more than {LOOSE:g} times the largest error"
-    return Row(NAME, study, case, "", values, {"unexplained": 0.0}, reason=reason, replay=replay)

@@ -107,7 +107,8 @@ def inputs(count: int, precision: type) -> Inputs:
     exact = {name: derivatives.derivative(a, n, k, e, 0.0) for name, e in along.items()}
     exact["∂b/∂k"] = derivatives.derivative(a, n, k, np.zeros_like(a), k)
     every = Inputs(regimes.Rays(a, n, k), along, exact, certified, condition_of(certified, k), np.repeat(names, count))
-    return only(every, np.isfinite(exact["∂b/∂k"]).all(1))
+    measured: Inputs = only(every, np.isfinite(exact["∂b/∂k"]).all(1))
+    return measured
 
 
 def only(given: Any, kept: np.ndarray) -> Any:

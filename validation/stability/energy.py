@@ -87,7 +87,7 @@ def regime_rays(regime: str, count: int, precision: type) -> tuple[np.ndarray, n
     return cos_i, rays.k, oracle.fresnel(cos_i, rays.k)
 
 
-def evaluated(function: Callable[..., tuple], setting: Setting, *numbers: np.ndarray) -> list[np.ndarray]:
+def evaluated(function: Callable[..., tuple[Any, ...]], setting: Setting, *numbers: np.ndarray) -> list[np.ndarray]:
     """`function` of every lane of the numbers, as numpy arrays: real or complex in extended precision, or masks."""
     if setting.is_scalar:
         lanes = [[to_numpy(x) for x in function(*map(float, lane))] for lane in zip(*numbers, strict=True)]
@@ -106,19 +106,19 @@ def to_numpy(x: Any) -> Any:
     return array if array.dtype == bool else array.astype(np.longdouble)
 
 
-def formula_powers(cos_i: Any, k: Any) -> tuple:
+def formula_powers(cos_i: Any, k: Any) -> tuple[Any, ...]:
     """R, T and the decision of `mi_refract.formulas`, of a cosine and k."""
     cos_t, transmitted = fresnel.refracted_cosine(cos_i, k)
     return *fresnel.powers(cos_i, cos_t, transmitted, k), transmitted
 
 
-def mitsuba_powers(variant: str | None) -> Callable[[Any, Any], tuple]:
+def mitsuba_powers(variant: str | None) -> Callable[[Any, Any], tuple[Any, ...]]:
     """The same of Mitsuba's function in a variant."""
     import mitsuba
 
     mi: Any = getattr(mitsuba, variant) if variant else mitsuba
 
-    def powers(cos_i: Any, k: Any) -> tuple:
+    def powers(cos_i: Any, k: Any) -> tuple[Any, ...]:
         # From the inside, where the index is k and needs no reciprocal.
         r, cos_t, _, _ = mi.fresnel(-mi.Float(cos_i), mi.Float(k))
         return r, 1 - r, cos_t != 0
@@ -176,7 +176,7 @@ def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray
 
     widened: Any = dr.float64_array_t(dr.value_t(setting.vector))
 
-    def powers(x: Any, y: Any, z: Any, ratio: Any) -> tuple:
+    def powers(x: Any, y: Any, z: Any, ratio: Any) -> tuple[Any, ...]:
         ray, wide = setting.vector(x, y, z), widened(ratio)
         contrast = dr.fma(wide, wide, -1)
         _, transmitted = formula.unchecked(ray, setting.vector(0, 0, 1), wide, contrast)
@@ -211,7 +211,7 @@ def reciprocity_row(setting: Setting, count: int) -> Row:
     1/k, which T feels once at most: 3u."""
     back_error = 0.0
 
-    def both(cos_i: Any, k: Any) -> tuple:
+    def both(cos_i: Any, k: Any) -> tuple[Any, ...]:
         cos_t, transmitted = fresnel.refracted_cosine(cos_i, k)
         _, back = fresnel.powers(cos_t, cos_i, transmitted, 1 / k)
         return fresnel.powers(cos_i, cos_t, transmitted, k)[1], back, transmitted

@@ -78,7 +78,7 @@ def carry(subject: Subject, chain: Chain, a: Array, stop: Array, setting: Settin
     k = chain.k.astype(setting.precision).tolist()
     contrasts = None if chain.contrasts is None else chain.contrasts.astype(np.float64).tolist()
 
-    def boundary(mine: list[Any], place: int, way: int) -> tuple:
+    def boundary(mine: list[Any], place: int, way: int) -> tuple[Any, ...]:
         here = place if way > 0 else place + chain.count
         known = () if contrasts is None else (contrasts[here],)
         return mine[place if len(mine) > 1 else 0], k[here], *known
@@ -93,13 +93,15 @@ def carry(subject: Subject, chain: Chain, a: Array, stop: Array, setting: Settin
     return Carried(np.array(b, np.longdouble), np.array(place), np.array(passed))
 
 
-def _follow(subject: Subject, boundary: Callable[..., tuple], turns: Any, stop: Any, start: tuple) -> tuple:
+def _follow(
+    subject: Subject, boundary: Callable[..., tuple[Any, ...]], turns: Any, stop: Any, start: tuple[Any, ...]
+) -> tuple[Any, ...]:
     """The loop both kinds of arrays share: (a, place, way ±1, passed, steps left) until the ray is out or at `stop`."""
 
     def inside(a: Any, place: Any, way: Any, passed: Any, left: Any) -> Any:
         return (place >= 0) & (place < stop) & (left > 0)
 
-    def step(a: Any, place: Any, way: Any, passed: Any, left: Any) -> tuple:
+    def step(a: Any, place: Any, way: Any, passed: Any, left: Any) -> tuple[Any, ...]:
         b, transmitted = subject(a, *boundary(place, way))
         way = dr.select(turns, dr.select(transmitted, way, -way), way)
         return type(a)(b), place + way, way, passed + dr.select(transmitted, 1, 0), left - 1
@@ -123,12 +125,12 @@ def _compiled(subject: Subject, chain: Chain, a: Array, stop: Array, setting: Se
     first, end = (integer(x.astype(np.int32)) + start[1] for x in (rays * columns, stop))
     dr.eval(start, first, end)
 
-    def boundary(place: Any, way: Any) -> tuple:
+    def boundary(place: Any, way: Any) -> tuple[Any, ...]:
         here = dr.select(way > 0, place, place + count)
         known = () if contrasts is None else (dr.gather(wide, contrasts, here),)
         return dr.gather(vector, normals, first + stride * place), dr.gather(number, k, here), *known
 
-    def detached(*given: Any) -> tuple:
+    def detached(*given: Any) -> tuple[Any, ...]:
         # Mitsuba's functions return arrays that carry derivatives, and the state of the loop must keep its type.
         return dr.detach(subject(*given), preserve_type=False)
 
@@ -169,7 +171,7 @@ class Layers:
 
     def cosine(self, c2: Array, s2: Array, layer: Array) -> Array:
         """cos θ of rays with cos²θ₀ = c2 in `layer`; 0 where they do not arrive."""
-        return np.sqrt(np.maximum(c2 - self.kappa[layer] * s2, 0))
+        return np.asarray(np.sqrt(np.maximum(c2 - self.kappa[layer] * s2, 0)))
 
     def turning(self, c2: Array, s2: Array) -> Array:
         """The layer in which a ray turns; `count` where it passes through all of them."""
@@ -239,13 +241,13 @@ def enter(layers: Layers, degrees: Array, stop: Array, plane: Array, precision: 
 def cosine(b: Array, normal: Array) -> Array:
     """|cos| of the angle between each b (N, 3) and the normal, whatever their lengths."""
     b, normal = b.astype(np.longdouble), normal.astype(np.longdouble)
-    return np.abs(b @ normal) / np.sqrt((b * b).sum(1) * (normal @ normal))
+    return np.asarray(np.abs(b @ normal) / np.sqrt((b * b).sum(1) * (normal @ normal)))
 
 
 def sine2(b: Array, normal: Array) -> Array:
     """sin² of the same angle."""
     b, normal = b.astype(np.longdouble), normal.astype(np.longdouble)
-    return (np.cross(normal, b) ** 2).sum(1) / ((b * b).sum(1) * (normal @ normal))
+    return np.asarray((np.cross(normal, b) ** 2).sum(1) / ((b * b).sum(1) * (normal @ normal)))
 
 
 @functools.cache

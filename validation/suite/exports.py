@@ -20,47 +20,35 @@ from mi_refract.plugins import PLUGIN
 from mi_refract.rendering import scene_files
 from mi_refract.report.row import Row
 from mi_refract.scene_export import from_mitsuba, write_files
-from mi_refract.scene_export.plain_scene import Diffuse, Light, Material, Mesh, PlainScene
+from mi_refract.scene_export.plain_scene import Camera, Diffuse, Light, Material, Mesh, PlainScene
 from validation import limits
+from validation.run import render_methods
 from validation.run.context import SCENES, Context
-from validation.run.render_methods import Camera
 from validation.study import Study, Task, about
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
-from .rendered_images import THREE, askew, no_images, why_not
+from .rendered_images import THREE, askew, why_not
 from .renderers import SYSTEMS, environments
 
 NAME = "exports"
-RENDERS = 4  # a side
-SPP = 512
-SIZE = (16, 9)
-OVER = "RMSE / allowed"
-NOISE = "noise / mean"
+SEEDS = range(1, 5)  # of the renders of a side
+SPP, SIZE = 512, (16, 9)
+OVER, NOISE = "RMSE / allowed", "noise / mean"
 TERMS = {
     OVER: "of the two means by pixel and channel; allowed: twice the noise that the spread between renders predicts, "
     "and 1 % of the mean",
     NOISE: "the predicted noise of the difference of the two means",
 }
-LEVEL = 2  # of the spheres
 LEFT_OUT = {THREE: "it counts the light of the sky twice, see the study of images; without MIS it is here"} | {
     title: "it is the reference" for title, renderer in IMAGE_RENDERERS.items() if renderer.system == "mitsuba"
 }
-THEIRS = {"POV-Ray": 256, "Cycles": 512, "LuxCore": 1024, "Radiance": 512}  # samples a pixel and render
+THEIRS = {"POV-Ray": 256, "Cycles": 512, "LuxCore": 1024, "Radiance": 512}  # samples a pixel and render; others 256
 
 
 def scene(diffuse: bool = True) -> PlainScene:
     """The balls of `balls`, seen from another place, with a lamp; `diffuse`: and with a patch."""
-    balls = from_mitsuba.load(SCENES / "balls.xml", level=LEVEL)
-    width, height = SIZE
-    camera = dataclasses.replace(
-        balls.camera,
-        origin=(30.0, 15.0, 240.0),
-        target=(3.0, -4.0, 0.0),
-        up=(0.3, 1.0, 0.2),
-        fov_x_degrees=48.0,
-        width=width,
-        height=height,
-    )
+    balls = from_mitsuba.load(SCENES / "balls.xml", level=2)
+    camera = Camera((30.0, 15.0, 240.0), (3.0, -4.0, 0.0), (0.3, 1.0, 0.2), 48.0, *SIZE)
     extra = [_quad("lamp", (-100.0, 22.0), (-72.0, 50.0), Light((3.0, 2.0, 1.0)))]
     if diffuse:
         extra.append(_quad("patch", (70.0, -50.0), (105.0, 10.0), Diffuse((0.2, 0.5, 0.9))))
@@ -75,39 +63,28 @@ def _quad(name: str, low: tuple[float, float], high: tuple[float, float], materi
 
 def tasks(context: Context) -> list[Task]:
     """One per renderer."""
-    return [
-        Task(f"exports: {title}", functools.partial(rows, context, title))
-        for title in IMAGE_RENDERERS
-        if title not in LEFT_OUT
-    ]
+    titles = [title for title in IMAGE_RENDERERS if title not in LEFT_OUT]
+    return [Task(f"exports: {title}", functools.partial(rows, context, title)) for title in titles]
 
 
 def rows(context: Context, title: str) -> list[Row]:
     """A renderer against `refract`: one row."""
     system = SYSTEMS[IMAGE_RENDERERS[title].system]
     row = functools.partial(Row, NAME, title, "balls", f"{SIZE[0]} × {SIZE[1]}")
-    if reason := why_not(system, context):
-        return [row(reason=reason)]
-    try:
-        theirs = drawn(title)
-    except (environments.Unable, environments.Broken, OSError, ValueError) as error:
-        return [no_images(row, error)]
-    values = compared(reference(diffuse=title != "POV-Ray"), theirs)
-    budgets = {OVER: 1.0, NOISE: float(limits.EXPORT_NOISE)}
-    replay = {"renderer": system.source, "spp": spp(title), "reference spp": SPP, "seeds": [*range(1, RENDERS + 1)]}
+    lost = "not rendered", float(len(SEEDS))
+    theirs, nothing = environments.attempt(row, why_not(system, context), lost, lambda: drawn(title))
+    if theirs is None:
+        return nothing
+    values, budgets = compared(reference(diffuse=title != "POV-Ray"), theirs), {OVER: 1.0, NOISE: limits.EXPORT_NOISE}
+    replay = {"renderer": system.source, "spp": THEIRS.get(title, 256), "reference spp": SPP, "seeds": [*SEEDS]}
     return [row(values, budgets, replay=replay)]
-
-
-def spp(title: str) -> int:
-    """Samples a pixel of each render of theirs."""
-    return THEIRS.get(title, 256)
 
 
 def drawn(title: str) -> np.ndarray:
     """Renders by another renderer: renders × height × width × 3."""
-    plain, seeds = scene(diffuse=title != "POV-Ray"), range(1, RENDERS + 1)
     with tempfile.TemporaryDirectory() as folder:
-        images = IMAGE_RENDERERS[title].draw(plain, Path(folder), spp(title), seeds)
+        plain = scene(diffuse=title != "POV-Ray")
+        images = IMAGE_RENDERERS[title].draw(plain, Path(folder), THEIRS.get(title, 256), SEEDS)
     return np.stack([image.pixels for image in images]).astype(np.float64)
 
 
@@ -116,8 +93,8 @@ def reference(diffuse: bool) -> np.ndarray:
     """Renders by this plugin, in the present variant: renders × height × width × 3."""
     with tempfile.TemporaryDirectory() as folder:
         write_files.write(scene(diffuse), "mitsuba", Path(folder) / "scene")
-        camera = Camera(scene_files.load_scene(Path(folder) / "scene" / "scene.xml", {"bsdf": PLUGIN}))
-        return np.stack([camera(SPP, 1000 + i)[0] for i in range(RENDERS)])
+        camera = render_methods.Camera(scene_files.load_scene(Path(folder) / "scene" / "scene.xml", {"bsdf": PLUGIN}))
+        return np.stack([camera(SPP, 1000 + i)[0] for i in range(len(SEEDS))])
 
 
 def compared(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:

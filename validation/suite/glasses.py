@@ -64,7 +64,7 @@ def system_rows(system: System, catalogue: GlassCatalogue, context: Context) -> 
     row = functools.partial(Row, NAME, system.title, "every glass", "f64")
     if find_spec("opticalglass") is None:
         return [row(reason="opticalglass is not installed: pip install 'mi-refract[glass]'")]
-    rays = given(catalogue.glasses)
+    rays, reason = given(catalogue.glasses), environments.why_not(system, context.profile.name)
 
     def answer() -> Answers:
         text = environments.run(environments.script(system, catalogue.script, "glasses"), as_csv(rays))
@@ -73,7 +73,7 @@ def system_rows(system: System, catalogue: GlassCatalogue, context: Context) -> 
             raise ValueError("no column n_ratio; expected the ratio of indices that was used")
         return answers
 
-    answers, nothing = environments.attempt(row, system, context.profile.name, float(len(rays)), answer)
+    answers, nothing = environments.attempt(row, reason, ("unanswered", len(rays)), answer)
     return nothing if answers is None else rows(system.title, catalogue, rays, answers)
 
 

@@ -68,13 +68,10 @@ class Rounding:
 THEIRS = Rounding(8.0, 8.0, 0.0, (1.0, 1.0, 1.0))
 
 
-def _ours() -> Rounding:
-    """An arc is kept by its ends and its control point, each of them rounded: a curvature as its sag is.
-
-    The gradient of its conic has the axis where rounding puts it, so a normal may turn by a few u on the axis, too.
-    """
-    sags = [abs(c) * RADIUS**2 / 2 for c in LENS.curvatures]
-    return Rounding(0.0, 0.0, 16.0, [4 * (v + sag) / sag for v, sag in zip(LENS.vertices, sags, strict=True)])
+# An arc is kept by its ends and its control point, each of them rounded: a curvature as its sag is. The gradient of its
+# conic has the axis where rounding puts it, so a normal may turn by a few u on the axis, too.
+SAGS = [abs(c) * RADIUS**2 / 2 for c in LENS.curvatures]
+OURS = Rounding(0.0, 0.0, 16.0, [4 * (v + sag) / sag for v, sag in zip(LENS.vertices, SAGS, strict=True)])
 
 
 @dataclass(frozen=True)
@@ -96,7 +93,7 @@ def tasks(context: Context) -> list[Task]:
 def planar_rows() -> list[Row]:
     """How far this package's own trace is from the exact one."""
     rays, indices = planar()
-    return [_row("planar trace", GIVEN, i, rays, indices, _ours()) for i in range(len(HEIGHTS))]
+    return [_row("planar trace", GIVEN, i, rays, indices, OURS) for i in range(len(HEIGHTS))]
 
 
 def system_rows(system: System, context: Context) -> list[Row]:
@@ -106,7 +103,8 @@ def system_rows(system: System, context: Context) -> list[Row]:
     def answer() -> Answer:
         return parsed(environments.ask(system, system.lens, json.dumps(question())))
 
-    given, nothing = environments.attempt(row, system, context.profile.name, 1.0, answer)
+    reason = environments.why_not(system, context.profile.name)
+    given, nothing = environments.attempt(row, reason, ("unanswered", 1), answer)
     return nothing if given is None else answered(system.title, given)
 
 
@@ -120,7 +118,9 @@ def answered(title: str, answer: Answer) -> list[Row]:
             used = indices if case == GIVEN else answer.indices
             found, own = _axis(answer.rays[case][:, i]), _axis(ours[:, i])
             row = _row(title, case, i, answer.rays[case], used, THEIRS)
-            values = {FOCUS_OFF: float(np.abs(found / own - 1).max()), SHIFT_OFF: _shift_off(found, own)}
+            shifts, expected = (x - x[wavelengths().index(LINES["d"])] for x in (found, own))
+            values = {FOCUS_OFF: float(np.abs(found / own - 1).max())}
+            values[SHIFT_OFF] = float(np.abs(shifts - expected).max() / np.abs(expected).max())
             budgets = {}
             if case == OWN:
                 values[INDEX_OFF], budgets[INDEX_OFF] = index_off, limits.CATALOG_FORMULA
@@ -210,7 +210,7 @@ def parsed(text: str) -> Answer:
         system = str(data["system"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"no answer: {error!r}; expected system, indices and rays in JSON") from None
-    shapes = [indices.shape, *(each.shape for each in rays.values())]
+    shapes = [x.shape for x in (indices, *rays.values())]
     if shapes != [indices_shape, rays_shape, rays_shape]:
         raise ValueError(f"numbers of shape {shapes}; expected {indices_shape}, and {rays_shape} twice")
     if not all(np.isfinite(each).all() for each in (indices, *rays.values())):
@@ -222,12 +222,6 @@ def _axis(rays: np.ndarray) -> np.ndarray:
     """z where the rays (N, 4) cross the axis."""
     z, y, dz, dy = rays.T
     return np.asarray(z - y * dz / dy)
-
-
-def _shift_off(found: np.ndarray, own: np.ndarray) -> float:
-    middle = wavelengths().index(LINES["d"])
-    shifts, expected = found - found[middle], own - own[middle]
-    return float(np.abs(shifts - expected).max() / np.abs(expected).max())
 
 
 STUDY = Study(NAME, "An achromat by others", about(__doc__), TERMS, tasks)

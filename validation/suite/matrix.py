@@ -126,17 +126,6 @@ def _text(row: Row | None) -> str:
 
 MADE_BY = "python -m validation suite"
 Stored = dict[str, Any]  # a row of rows.json, or what is made of some
-PAGE_TERMS = {
-    "number": "the largest backward error of the set, in roundings u: each answer is the exact refraction of inputs a, "
-    f"n and k off by no more. Up to {RIGHT:g} the answers are right; above, they are as good as a textbook's formula, "
-    "unless the cell says wrong",
-    "images": "the image's mean relative to that of the reference; and the smallest difference that a tile could show",
-    "not run": "the system was not installed where this page was made; the command installs it",
-} | {name: rays.text for name, rays in per_ray.SETS.items()}
-PAGE_TERMS[LARGE] += (
-    ". A formula with 1 − k² (1 − c²) is not right here: near the normal the difference 1 − c² has few digits left of "
-    "sin²θ_i, and its error counts k² times; |n × a|² keeps them"
-)
 
 
 def read(folder: Path) -> Stored:
@@ -183,9 +172,8 @@ def _of_rays(cells: list[Stored]) -> Stored:
         sets[cell["case"]] = {"verdict": verdict, "backward_error": backward, "worst_angle": worst}
     about = {name: cells[0]["replay"].get(name, "") for name in ("version", "total internal reflection", "remark")}
     wrong = [name for name, x in sets.items() if x["verdict"] == "wrong"]
-    off = [
-        f"{name} (up to {_shown(x['backward_error'])})" for name, x in sets.items() if x["verdict"] == "within bound"
-    ]
+    within = {name: x["backward_error"] for name, x in sets.items() if x["verdict"] == "within bound"}
+    off = [f"{name} (up to {compact(m) if isinstance(m, (int, float)) else m or '–'})" for name, m in within.items()]
     parts = [f"wrong: {', '.join(wrong)}"] if wrong else []
     parts += [f"exact only for inputs more than {RIGHT:g} roundings off: {', '.join(off)}"] if off else []
     sentence = "; ".join([*(parts or ["right in every set"]), *filter(None, [about["remark"]])])
@@ -214,10 +202,6 @@ def _distance(system: Stored) -> tuple[bool, float, float, str]:
     return system["wrong"], max(errors.values(), default=0.0), large, system["system"]
 
 
-def _shown(value: Any) -> str:
-    return compact(value) if isinstance(value, (int, float)) else str(value or "–")
-
-
 def write_json(path: Path, stored: Stored) -> None:
     """Strict JSON. OSError."""
     write_atomically(path, json.dumps(strict(stored), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
@@ -225,47 +209,20 @@ def write_json(path: Path, stored: Stored) -> None:
 
 def write_html(path: Path, stored: Stored) -> None:
     """One page that needs no network. OSError."""
-    rays, images = stored["rays"], stored["images"]
-    right = sum(not system["wrong"] for system in rays)
-    by_images = f", {len(images)} renderers by images" if images else ""
+    images = f", {len(stored['images'])} renderers by images" if stored["images"] else ""
     content = {
         "title": "Refraction by other systems",
-        "sentence": f"Which systems refract right: {len(rays)} functions by rays{by_images}",
-        "counts": [
-            ("pass", "functions without a wrong answer", right),
-            ("fail", "with wrong answers", len(rays) - right),
-            ("info", "not run", len(stored["not_run"])),
-        ],
-        "sets": list(per_ray.SETS),
-        "rays": [x | {"cells": [_set_cell(x["sets"].get(name)) for name in per_ray.SETS]} for x in rays],
-        "scenes": list(rendered_images.SCENES),
-        "renderers": [
-            x | {"cells": [_scene_cell(x["scenes"].get(name)) for name in rendered_images.SCENES]} for x in images
-        ],
+        "sentence": f"Which systems refract right: {len(stored['rays'])} functions by rays{images}",
+        "rays": stored["rays"],
+        "renderers": stored["images"],
         "not_run": stored["not_run"],
-        "terms": PAGE_TERMS,
+        "sets": {name: kind.text for name, kind in per_ray.SETS.items()},
+        "scenes": list(rendered_images.SCENES),
+        "most_right": f"{RIGHT:g}",
+        "large": LARGE,
         "command": f"{MADE_BY}; python -m validation renderers --page {path.name}",
     }
     write_page(path, "matrix.html.j2", content, EmbeddedImages())
-
-
-def _set_cell(cell: Stored | None) -> tuple[str, str]:
-    """The text of a cell and its class, of a set of rays."""
-    if not cell:
-        return "–", ""
-    states = {"right": "pass", "within bound": "missed", "wrong": "fail"}
-    return "wrong, " * (cell["verdict"] == "wrong") + _shown(cell["backward_error"]), states[cell["verdict"]]
-
-
-def _scene_cell(cell: Stored | None) -> tuple[str, str]:
-    """The text of a cell and its class, of a scene."""
-    if not cell:
-        return "–", ""
-    state = {"equal": "pass", "different": "fail"}.get(cell["verdict"], "missed")
-    if not isinstance(cell["mean_difference"], (int, float)):
-        return cell["verdict"], state
-    visible = f", visible from {cell['detectable']:.2%}" if isinstance(cell["detectable"], (int, float)) else ""
-    return f"{cell['verdict']}: {cell['mean_difference']:+.2%}{visible}", state
 
 
 STUDY = Study(NAME, "Suite", about(__doc__), TERMS, tasks, summarise=with_summary)

@@ -137,13 +137,13 @@ def tasks(context: Context) -> list[Task]:
 
 def call_rows(system: System, call: RaysCommand, context: Context) -> list[Row]:
     """A row per set of rays, or one with the reason why there is none."""
-    rays = given(call.precision)
+    rays, reason = given(call.precision), environments.why_not(system, context.profile.name)
     row = functools.partial(Row, NAME, call.title, "every set", call.precision)
 
     def answer() -> Answers:
         return parse_answers(environments.ask(system, call.command, as_csv(rays)), call.title)
 
-    answers, nothing = environments.attempt(row, system, context.profile.name, float(len(rays)), answer)
+    answers, nothing = environments.attempt(row, reason, ("unanswered", len(rays)), answer)
     return nothing if answers is None else rows(call, rays, answers)
 
 

@@ -56,6 +56,7 @@ TERMS = {
 RENDERS = 4  # a side
 OURS = 1000  # the first seed of the reference's
 LEVEL = 4  # of the spheres: facets that can be seen, so that both sides must shade them flat
+LOST = "not rendered", float(RENDERS)
 COMPILED = "needs a compiled variant: millions of samples"
 
 
@@ -185,28 +186,22 @@ def why_not(system: System, context: Context) -> str:
     return environments.why_not(system, context.profile.name) or ("" if compiled else COMPILED)
 
 
-def no_images(row: Callable[..., Row], error: Exception) -> Row:
-    """The row of a renderer that raised: not run where it cannot run here, failed where it broke."""
-    if isinstance(error, environments.Unable):
-        return row(reason=" ".join(str(error).split()))
-    return row({"not rendered": float(RENDERS)}, {"not rendered": 0.0}, reason=str(error))
-
-
 def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
     """A renderer against `refract` in a scene: one row."""
     renderer, size = IMAGE_RENDERERS[title], SIZES[context.profile.name]
     row = functools.partial(Row, NAME, title, scene, f"{size.resolution}²")
-    if reason := why_not(SYSTEMS[renderer.system], context):
-        return [row(reason=reason)]
-    plain, seeds = SCENES[scene].load(size.resolution), range(1, RENDERS + 1)
-    spp = max(renderer.spp[scene] // size.less, 1)
-    try:
+    seeds, spp = range(1, RENDERS + 1), max(renderer.spp[scene] // size.less, 1)
+
+    def draw() -> list[Image]:
         with tempfile.TemporaryDirectory() as folder:
-            theirs = renderer.draw(plain, Path(folder), spp, seeds)
-    except ValueError as why:  # a scene that the renderer's format cannot hold
-        return [row(reason=" ".join(str(why).split()))]
-    except (environments.Unable, environments.Broken, OSError) as error:
-        return [no_images(row, error)]
+            try:
+                return renderer.draw(SCENES[scene].load(size.resolution), Path(folder), spp, seeds)
+            except ValueError as why:  # a scene that the renderer's format cannot hold
+                raise environments.Unable(str(why)) from None
+
+    theirs, nothing = environments.attempt(row, why_not(SYSTEMS[renderer.system], context), LOST, draw)
+    if theirs is None:
+        return nothing
     ours, known = reference(scene, size), known_to_differ(title, scene)
     # Not their pixels: some of the renderers sample every pixel on one grid, whatever the seed.
     comparison = compare("welch", ours, theirs, family_error=limits.SUITE_ERROR, resolution=size.wanted, pixels="no")

@@ -72,7 +72,7 @@ def rounded_contrast(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
 
 
 def _dot(x: Vectors, y: Vectors) -> Vectors:
-    return (x * y).sum(1, keepdims=True)
+    return np.asarray((x * y).sum(1, keepdims=True))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ import json
 import re
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,7 +28,7 @@ from mi_refract.media import LINES
 from mi_refract.rendering import scene_files
 from mi_refract.report.row import Row
 from mi_refract.scene_export import from_mitsuba, write_files
-from mi_refract.scene_export.plain_scene import Diffuse, Glass, Light, PlainScene
+from mi_refract.scene_export.plain_scene import Diffuse, Glass, Light, Mesh, PlainScene
 from validation import limits
 from validation.run.context import SCENES as FOLDER
 from validation.run.context import Context
@@ -37,7 +36,7 @@ from validation.run.metrics import DETECTABLE
 from validation.run.render_methods import Camera, under
 from validation.study import Study, Task, about
 
-from .rendered_images import DETECTABLE_IMAGE, INCONCLUSIVE, OURS, RENDERS, TERMS, Size, measured, no_images, why_not
+from .rendered_images import DETECTABLE_IMAGE, INCONCLUSIVE, LOST, OURS, RENDERS, TERMS, Size, measured, why_not
 from .renderers import SYSTEMS, environments
 from .renderers.image_renderers import IMAGE_RENDERERS
 
@@ -49,7 +48,6 @@ WANTED = "C", "d", "F"
 HALF, EDGE = 0.5, 0.01  # nm: half of the band, and how far its response falls to 0
 SIZES = {"quick": Size(64, 128, 4, 0.1), "standard": Size(64, 128, 4, 0.1), "full": Size(128, 2048, 1, 0.01)}
 THEIR_SPP = 1024  # divided by a size's `less`; with 768 noise hid 1 % in 6 to 9 % of the tiles, and 10 % is too much
-PIXELS = "yes"  # those of both are independent
 DIMMED = 0.1  # lamps: what raysect finds of them by chance on the table is noise
 MIXED = "lines mixed up"
 NOT_SEEN, DIFFERENT = "not seen to differ", "different"
@@ -73,22 +71,16 @@ def line_rows(context: Context, line: str) -> list[Row]:
     """Equal within the noise, which hides at most 1 % of the image's mean."""
     size = SIZES[context.profile.name]
     row = functools.partial(Row, NAME, OTHER, line, f"{size.resolution}²")
-    if reason := _why_not(context):
-        return [row(reason=reason)]
-    try:
-        found, values = compared(ours(line, size), theirs(line, size), size)
-    except (environments.Unable, environments.Broken, OSError) as error:
-        return [no_images(row, error)]
+    images, nothing = environments.attempt(row, _why_not(context), LOST, lambda: (ours(line, size), theirs(line, size)))
+    if images is None:
+        return nothing
+    found, values = compared(*images, size)
     values[DIFFERENT] = float(found.verdict is Verdict.DIFFERENT)
     budgets = {DIFFERENT: 0.0, "tests that differ": 0.0, "tiles that differ without noise": 0.0}
     budgets |= {DETECTABLE_IMAGE: float(limits.LINE_DETECTABLE)}
     goals = {INCONCLUSIVE: 0.0, DETECTABLE: size.wanted}
-    replay = {
-        "verdict": str(found.verdict),
-        "nm": LINES[line],
-        "reference spp": size.spp,
-        "spp": THEIR_SPP // size.less,
-    }
+    replay = {"verdict": str(found.verdict), "nm": LINES[line], "reference spp": size.spp}
+    replay |= {"spp": THEIR_SPP // size.less}
     return [row(values, budgets, goals, f"{found.verdict}: {found.reason}", replay)]
 
 
@@ -111,8 +103,8 @@ def mixed_rows(context: Context) -> list[Row]:
 
 
 def compared(one: list[Image], two: list[Image], size: Size) -> tuple[Comparison, dict[str, float]]:
-    """By Welch's t-test, and the numbers of the row."""
-    found = compare("welch", one, two, family_error=limits.SUITE_ERROR, resolution=size.wanted, pixels=PIXELS)
+    """By Welch's t-test, also of pixels, for those of both are independent; and the numbers of the row."""
+    found = compare("welch", one, two, family_error=limits.SUITE_ERROR, resolution=size.wanted, pixels="yes")
     return found, measured(found, *(np.stack([image.pixels for image in side]) for side in (one, two)))
 
 
@@ -122,23 +114,22 @@ def compared(one: list[Image], two: list[Image], size: Size) -> tuple[Comparison
 def plain(resolution: int) -> PlainScene:
     """The scene without colours, in the vacuum, with dimmer lamps. The prism's index is set by each renderer."""
 
-    def grey(material: Any) -> Any:
-        match material:
+    def grey(mesh: Mesh) -> Mesh:
+        match mesh.material:
             case Glass():
-                return dataclasses.replace(material, ext_ior=1.0)
-            case Diffuse(reflectance=colour):
-                return Diffuse((colour[1],) * 3)
-            case Light(radiance=colour):
-                return Light((DIMMED * colour[1],) * 3)
+                return dataclasses.replace(mesh, material=dataclasses.replace(mesh.material, ext_ior=1.0))
+            case Diffuse(reflectance=(_, green, _)):
+                return dataclasses.replace(mesh, material=Diffuse((green,) * 3))
+            case Light(radiance=(_, green, _)):
+                return dataclasses.replace(mesh, material=Light((DIMMED * green,) * 3))
 
     text = (FOLDER / SCENE).read_text().replace('"meshes/', f'"{FOLDER}/meshes/')
     text = re.sub(r'<string name="int_ior" [^>]*/>', '<float name="int_ior" value="1.5"/>', text)
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / SCENE).write_text(text)
         given = from_mitsuba.load(Path(folder) / SCENE, res=str(resolution))
-    meshes = tuple(dataclasses.replace(mesh, material=grey(mesh.material)) for mesh in given.meshes)
     assert isinstance(given.sky, tuple)
-    return dataclasses.replace(given, meshes=meshes, sky=(given.sky[1],) * 3)
+    return dataclasses.replace(given, meshes=tuple(map(grey, given.meshes)), sky=(given.sky[1],) * 3)
 
 
 @functools.cache
@@ -146,11 +137,10 @@ def theirs(line: str, size: Size) -> list[Image]:
     """Raysect's renders at a line."""
 
     def dispersive(folder: Path) -> None:
-        file = folder / "scene.json"
-        document = json.loads(file.read_text())
+        document = json.loads((folder / "scene.json").read_text())
         (glass,) = [entry for entry in document["materials"].values() if entry["type"] == "glass"]
         glass["schott"] = GLASS
-        file.write_text(json.dumps(document))
+        (folder / "scene.json").write_text(json.dumps(document))
 
     band = ["--band", *(str(LINES[line] + side) for side in (-HALF, HALF))]
     with tempfile.TemporaryDirectory() as folder:
@@ -163,8 +153,8 @@ def theirs(line: str, size: Size) -> list[Image]:
 def ours(line: str, size: Size) -> list[Image]:
     """Renders by `refract_path` at a line."""
     with tempfile.TemporaryDirectory() as folder, under(VARIANT):
-        write_files.write(plain(size.resolution), "mitsuba", Path(folder) / "scene")
         file = Path(folder) / "scene" / "scene.xml"
+        write_files.write(plain(size.resolution), "mitsuba", file.parent)
         file.write_text(spectral(file.read_text(), LINES[line]))
         camera = Camera(scene_files.load_scene(file, {"bsdf": "refract"}))
         # The film adds up what it sees over its band.

@@ -43,25 +43,6 @@ batch.haltspp = 256
 
 def files(plain: PlainScene) -> Files:
     """The files of the export, by name."""
-    return (
-        ply_files(plain)
-        | sky_exr(plain, direction_at)
-        | {
-            "scene.scn": _scene(plain).encode(),
-            "scene.cfg": CONFIG.format(camera=plain.camera, depth=plain.max_depth).encode(),
-            "render.py": resources(__package__).joinpath("render_luxcore.py").read_bytes(),
-            "README.txt": readme(plain, "LuxCore", COMMANDS, ASSUMPTIONS),
-        }
-    )
-
-
-def direction_at(u: Array, v: Array) -> Array:
-    """(…, 3): the direction in which LuxCore shows the pixel at (u, v) of the map, v from the top."""
-    phi, theta = 2 * np.pi * u, np.pi * v
-    return np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], axis=-1)
-
-
-def _scene(plain: PlainScene) -> str:
     camera, names = plain.camera, material_names(plain)
     height, row = camera.height / camera.width, 2 / camera.width  # of the screen window, which is 2 wide
     view = {
@@ -88,7 +69,19 @@ def _scene(plain: PlainScene) -> str:
     for mesh in plain.meshes:
         lines.append(f'scene.objects.{mesh.name}.ply = "{mesh.name}.ply"')
         lines.append(f'scene.objects.{mesh.name}.material = "{names[mesh.material]}"')
-    return "\n".join(lines) + "\n"
+    own = {
+        "scene.scn": ("\n".join(lines) + "\n").encode(),
+        "scene.cfg": CONFIG.format(camera=plain.camera, depth=plain.max_depth).encode(),
+        "render.py": resources(__package__).joinpath("render_luxcore.py").read_bytes(),
+        "README.txt": readme(plain, "LuxCore", COMMANDS, ASSUMPTIONS),
+    }
+    return ply_files(plain) | sky_exr(plain, direction_at) | own
+
+
+def direction_at(u: Array, v: Array) -> Array:
+    """(…, 3): the direction in which LuxCore shows the pixel at (u, v) of the map, v from the top."""
+    phi, theta = 2 * np.pi * u, np.pi * v
+    return np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], axis=-1)
 
 
 def _material(material: Material) -> list[str]:

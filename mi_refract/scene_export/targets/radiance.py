@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ..plain_scene import Camera, Colour, Diffuse, Environment, Glass, Material, PlainScene
+from ..plain_scene import Colour, Diffuse, Environment, Glass, Material, PlainScene
 from .shared_files import Files, material_names, numbers, readme
 
 COMMANDS = """
@@ -39,10 +39,13 @@ def files(plain: PlainScene) -> Files:
         )
         for mesh in plain.meshes
     ]
+    ahead, wide = np.subtract(camera.target, camera.origin), math.tan(math.radians(camera.fov_x_degrees) / 2)
+    fov_y = math.degrees(2 * math.atan(wide * camera.height / camera.width))
+    where = f"-vp {numbers(camera.origin)} -vd {numbers(ahead)} -vu {numbers(camera.up)}"
     materials = "".join(f"void {_material(material, name)}" for material, name in names.items())
     return maps | {
         "scene.rad": "\n".join([materials, *meshes, sky]).encode(),
-        "camera.vf": _view(camera).encode(),
+        "camera.vf": f"VIEW= -vtv {where} -vh {camera.fov_x_degrees!r} -vv {fov_y!r}\n".encode(),
         "README.txt": readme(plain, "Radiance", commands, ASSUMPTIONS),
     }
 
@@ -53,14 +56,6 @@ def _material(material: Material, name: str) -> str:
     if isinstance(material, Diffuse):
         return f"plastic {name} 0 0 5 {numbers(material.reflectance)} 0 0\n"
     return f"glow {name} 0 0 4 {numbers(material.radiance)} 0\n"
-
-
-def _view(camera: Camera) -> str:
-    ahead = np.subtract(camera.target, camera.origin)
-    wide = math.tan(math.radians(camera.fov_x_degrees) / 2)
-    fov_y = math.degrees(2 * math.atan(wide * camera.height / camera.width))
-    where = f"-vp {numbers(camera.origin)} -vd {numbers(ahead)} -vu {numbers(camera.up)}"
-    return f"VIEW= -vtv {where} -vh {camera.fov_x_degrees!r} -vv {fov_y!r}\n"
 
 
 def _sky(sky: Colour | Environment) -> tuple[str, Files]:

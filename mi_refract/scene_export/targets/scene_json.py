@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
 from importlib.resources import files as resources
 
 import numpy as np
@@ -115,9 +114,14 @@ OBJ_ASSUMPTIONS = (
 
 def obj_files(plain: PlainScene) -> Files:
     """The files of the export, by name."""
-    names = material_names(plain)
+    names, lines, first = material_names(plain), ["mtllib scene.mtl\n"], 1  # OBJ counts vertices through all objects
+    for mesh in plain.meshes:
+        lines.append(f"o {mesh.name}\nusemtl {names[mesh.material]}\n")
+        lines += [f"v {numbers(vertex)}\n" for vertex in mesh.vertices.tolist()]
+        lines += [f"f {a} {b} {c}\n" for a, b, c in (mesh.faces + first).tolist()]
+        first += len(mesh.vertices)
     return sky_exr(plain, own_direction_at) | {
-        "scene.obj": "".join(_objects(plain, names)).encode(),
+        "scene.obj": "".join(lines).encode(),
         "scene.mtl": "".join(f"newmtl {name}\n{_mtl(material)}" for material, name in names.items()).encode(),
         "scene.json": scene_json(plain, {mesh.name: {"object": mesh.name} for mesh in plain.meshes}),
         "README.txt": readme(plain, "a program of your own", OBJ_COMMANDS, OBJ_ASSUMPTIONS),
@@ -128,17 +132,6 @@ def own_direction_at(u: Array, v: Array) -> Array:
     """(…, 3): as in Mitsuba, but with the pixels of all rows at their centres."""
     phi, theta = 2 * np.pi * u, np.pi * v
     return np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], axis=-1)
-
-
-def _objects(plain: PlainScene, names: dict[Material, str]) -> Iterator[str]:
-    """The text of the OBJ file. It counts vertices from 1, through all objects."""
-    first = 1
-    yield "mtllib scene.mtl\n"
-    for mesh in plain.meshes:
-        yield f"o {mesh.name}\nusemtl {names[mesh.material]}\n"
-        yield "".join(f"v {numbers(vertex)}\n" for vertex in mesh.vertices.tolist())
-        yield "".join(f"f {a} {b} {c}\n" for a, b, c in (mesh.faces + first).tolist())
-        first += len(mesh.vertices)
 
 
 def _mtl(material: Material) -> str:

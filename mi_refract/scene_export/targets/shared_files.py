@@ -14,7 +14,7 @@ from mi_refract import __version__
 from mi_refract.io.atomic import temporary_folder
 from mi_refract.io.image_file import NO_DATE, write_exr
 
-from ..plain_scene import Environment, Material, Mesh, PlainScene
+from ..plain_scene import Environment, Material, PlainScene
 
 Files = dict[str, bytes]  # contents by name
 Array = NDArray[np.float64]
@@ -63,18 +63,17 @@ def material_names(plain: PlainScene) -> dict[Material, str]:
 
 def ply_files(plain: PlainScene) -> Files:
     """A PLY file per mesh: binary, little-endian, float32, without normals."""
-    return {f"{mesh.name}.ply": _ply(mesh) for mesh in plain.meshes}
-
-
-def _ply(mesh: Mesh) -> bytes:
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(mesh.vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    faces = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", 3)])
-    faces["count"], faces["index"] = 3, mesh.faces
-    return header.encode() + mesh.vertices.astype("<f4").tobytes() + faces.tobytes()
+    files = {}
+    for mesh in plain.meshes:
+        header = (
+            "ply\nformat binary_little_endian 1.0\n"
+            f"element vertex {len(mesh.vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+            f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        )
+        faces = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", 3)])
+        faces["count"], faces["index"] = 3, mesh.faces
+        files[f"{mesh.name}.ply"] = header.encode() + mesh.vertices.astype("<f4").tobytes() + faces.tobytes()
+    return files
 
 
 def scene_json(plain: PlainScene, where: Mapping[str, Mapping[str, str]], sky_file: str = "sky.exr") -> bytes:

@@ -191,19 +191,19 @@ def run(command: Sequence[str], given: str = "", timeout: float | None = None, w
 
 
 def attempt(
-    row: Callable[..., Row], system: System, profile: str, lost: float, answer: Callable[[], T]
+    row: Callable[..., Row], reason: str, lost: tuple[str, float], answer: Callable[[], T]
 ) -> tuple[T | None, list[Row]]:
     """What `answer` returns, and no row; or None, and the one row that says why the system gives no answer.
 
-    That row fails, with `lost` answers, where the program is broken or what it says is none (ValueError); it is not
-    run where the system is absent, too large for the profile, or cannot run here.
+    That row fails, with the metric and the number `lost`, where the program is broken or what it says is none
+    (ValueError, OSError); it is not run for a `reason` that is not "" (see `why_not`), or where it cannot run here.
     """
-    if reason := why_not(system, profile):
+    if reason:
         return None, [row(reason=reason)]
     try:
         return answer(), []
     except Unable as cause:
-        return None, [row(reason=f"cannot run here: {cause}")]
-    except (Broken, ValueError) as defect:
-        text = " ".join(str(defect).split())
-        return None, [row(values={"unanswered": lost}, budgets={"unanswered": 0.0}, reason=text)]
+        return None, [row(reason=f"cannot run here: {' '.join(str(cause).split())}")]
+    except (Broken, ValueError, OSError) as defect:
+        metric, text = lost[0], " ".join(str(defect).split())
+        return None, [row(values={metric: float(lost[1])}, budgets={metric: 0.0}, reason=text)]

@@ -24,7 +24,7 @@ from mi_refract.scene_export.targets import luxcore, povray, radiance, scene_jso
 from validation.run.render_methods import Camera
 
 from . import environments
-from .system import SYSTEMS, System
+from .system import SCRIPTS, SYSTEMS, System
 
 HOURS = 4 * 3600.0  # after which a renderer hangs
 PASS = 2048  # samples a pixel
@@ -108,7 +108,7 @@ def _three(mis: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[
     files = shared_files.json_and_ply(plain) | shared_files.sky_exr(plain, equirectangular)
     for name, content in files.items():
         (folder / "scene" / name).write_bytes(content)
-    script, home = environments.SCRIPTS / "three_images.mjs", environments.folder(SYSTEMS["three"])
+    script, home = SCRIPTS / "three_images.mjs", environments.folder(SYSTEMS["three"])
     sizes = (plain.camera.width, plain.camera.height, spp, mis, *seeds)
     words = [node, *map(str, (script, home, chromium, folder / "scene", folder, *sizes))]
     environments.run(words, timeout=HOURS)
@@ -133,7 +133,7 @@ def mean(camera: Camera, spp: int, seed: int) -> np.ndarray:
     """An image of so many samples, at most PASS of them at a time: more would need gigabytes."""
     passes = -(-spp // PASS)
     images = [camera(-(-spp // passes), 1000 * seed + i)[0][..., :3] for i in range(passes)]
-    return np.mean(images, axis=0).astype(np.float32)
+    return np.asarray(np.mean(images, axis=0).astype(np.float32))
 
 
 def _raw(path: Path, plain: PlainScene) -> Image:
