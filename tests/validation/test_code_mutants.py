@@ -112,7 +112,7 @@ def test_explanations_say_why_a_mutant_cannot_be_observed():
 
 
 def test_the_tests_of_a_module_come_first_and_without_any_nothing_is_run(tmp_path):
-    files = code_mutants.guards(code_mutants.ROOT, "mi_refract/io/sanitise.py")
-    assert files == ["tests/io/test_sanitise.py", "tests/report/test_sanitise.py", "tests/io", "tests/test_rooms.py"]
+    files = code_mutants.guards(code_mutants.ROOT, "mi_refract/io/image_file.py")
+    assert files == ["tests/io/test_image_file.py", "tests/io", "tests/test_rooms.py"]
     assert "tests/cli/test_diff.py" in code_mutants.guards(code_mutants.ROOT, "mi_refract/image_diff/pairing.py")
     assert code_mutants.missing(tmp_path) == "no folder of tests beside the package: run it in a checkout"

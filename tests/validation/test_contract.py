@@ -131,6 +131,7 @@ OTHERWISE = {
     "planar.times": "times",
     "diff.planted_defects": "trials with seeds of their own",
     "diff.times": "times",
+    "suite.exports": "several seeds a side",
     "suite.rendered_images": "several seeds a side",
     "media.renders": "sixteen seeds a side in the furnace, eight by Welch's test; the rest is times and closed forms",
     "robustness.code_mutants": "each mutant is a case of its own, and the study is longer in full",
