@@ -52,9 +52,7 @@ class NoWorkersError(MiRefractError, ConnectionError):
 
 
 def exit_code(
-    name: str,
-    body: Callable[[], int | None],
-    interruptions: tuple[type[BaseException], ...] = (KeyboardInterrupt,),
+    name: str, body: Callable[[], int | None], interruptions: tuple[type[BaseException], ...] = (KeyboardInterrupt,)
 ) -> int:
     """What `body()` returns, None as 0; 2 after any exception, and 130 after Ctrl-C or one of `interruptions`.
 
