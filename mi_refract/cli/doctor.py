@@ -9,7 +9,7 @@ import typer
 
 from mi_refract import __version__, backend
 from mi_refract.io.image_file import installed_version
-from mi_refract.io.sanitise import json_text, printable_lines
+from mi_refract.io.text import json_text, printable_lines
 
 from .interrupts import as_exceptions
 

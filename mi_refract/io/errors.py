@@ -13,7 +13,7 @@ import sys
 import traceback
 from collections.abc import Callable
 
-from .sanitise import printable
+from .text import printable
 
 MISUSE, INTERRUPTED = 2, 130
 TRACEBACK = "MI_REFRACT_TRACEBACK"  # environment variable: with "1" the traceback is printed as well

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import atomic
+from . import safe_files
 from .errors import ImageError
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def write_exr(
     """
     import OpenImageIO as oiio
 
-    path = atomic.writable(path, SUFFIXES)
+    path = safe_files.writable(path, SUFFIXES)
     pixels = np.ascontiguousarray(pixels, dtype=np.float32)
     if pixels.ndim != 3 or pixels.size == 0 or pixels.shape[2] != len(channels):
         raise ValueError(f"{path}: pixels of shape {pixels.shape}; expected H × W × {len(channels)} {tuple(channels)}")
@@ -67,7 +67,7 @@ def write_exr(
             raise ValueError(f"{path}: attribute {name} = {value!r}; expected str, int, float")
         spec.attribute(name, str(value) if isinstance(value, int) and not -(2**31) <= value < 2**31 else value)
     try:
-        with atomic.replacing(path, suffix=".exr") as temporary:  # OpenImageIO tells the format by the name
+        with safe_files.replacing(path, suffix=".exr") as temporary:  # OpenImageIO tells the format by the name
             output = oiio.ImageOutput.create(str(temporary))
             if output is None:
                 raise OSError(one_line(oiio.geterror()))
