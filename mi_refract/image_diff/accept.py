@@ -56,7 +56,7 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
             continue
         if result.digests is None:
             raise ValueError(f"{result.test}: compared without digests; expected results of diff(to_accept=True)")
-        target = result.target or results.reference
+        target = result.target
         if variant:
             if result.reference is None:
                 raise ValueError(f"{result.test}: has no reference yet; accept it without --as-variant first")

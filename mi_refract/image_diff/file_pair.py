@@ -74,7 +74,7 @@ def compare(
     )
     if how.reads_variance and not (len(reference) > 1 or channels.has_variance(reference[0])):
         raise FileNotFoundError(f"{pairing.beside(how.variance, path, roots[0])}: no such file; expected a variance")
-    file = pairing.beside(how.mask, result.target or path, roots[0]) if how.mask else None
+    file = pairing.beside(how.mask, result.target, roots[0]) if how.mask else None
     if (file or how.ignore) and reference[-1].place:
         raise ValueError(f"{path}: has several parts or MIP levels; masks are supported for single images only")
     mask = mask_of(reference[0], file, how.ignore, how.max_values)

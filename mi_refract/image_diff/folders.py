@@ -18,7 +18,6 @@ from mi_refract.io import errors, image_file, regular_file
 from mi_refract.io.image_file import Image, bounded_map, one_line
 
 from . import file_pair, pairing
-from .pairing import Pair
 from .results import FAILED, Result, Results, Status
 from .settings import ComparisonSpec, Settings
 
@@ -60,7 +59,7 @@ def diff(
         every = pairing.pairs(reference, test, settings)
     elif reference.is_dir() and test.is_dir():
         name = reference.resolve().name
-        every = [Pair(name, reference, test, reference, settings.of(name))]
+        every = [Result(name, Status.DIFFERENT, reference, test, settings.of(name), target=reference)]
     else:
         raise NotADirectoryError(
             f"{test if reference.is_dir() else reference}: not a folder; --renders expects folders"
@@ -69,7 +68,7 @@ def diff(
     pairs = [*pairing.named(every, names), *pairing.wrong_entries(settings, every)]
     results = Results(reference, test, (), renders, inconclusive, tuple(unused), settings.flags)
 
-    def compare(pair: Pair) -> Result:
+    def compare(pair: Result) -> Result:
         result = _compared(pair, results, keep=maps or view is not None, digests=(digests or to_accept) and not renders)
         if view and result.status in FAILED:
             view(result, results)
@@ -85,7 +84,7 @@ def diff(
     return replace(results, results=tuple(sorted(done, key=lambda result: list(Status).index(result.status))))
 
 
-def _values(pair: Pair) -> int:
+def _values(pair: Result) -> int:
     """The values of its two images; 0 for what cannot be read, or is no pair of files."""
     files = [path for path in (pair.reference, pair.test) if path and path.is_file()]
     with contextlib.suppress(Exception):  # of whatever kind: the comparison reports it
@@ -98,14 +97,13 @@ def _without_images(result: Result) -> Result:
     return replace(result, images={}, comparison=comparison)
 
 
-def _compared(pair: Pair, results: Results, *, keep: bool, digests: bool) -> Result:
+def _compared(result: Result, results: Results, *, keep: bool, digests: bool) -> Result:
     """The result of comparing the two sides of a pair, where it has both; ERROR for whatever goes wrong.
 
     `keep`: one that is not equal has its images and maps, or what can be read of them. Each file is read once.
     """
-    how = pair.how
-    result = Result(pair.name, Status.DIFFERENT, pair.reference, pair.test, how, target=pair.target)
-    result = replace(result, variants=pair.variants, error=pair.error or how.error)
+    how = result.how
+    result = replace(result, error=result.error or how.error)
     read = functools.cache(functools.partial(_read, how=how, renders=results.renders))
     if result.error:
         result = replace(result, status=Status.ERROR)
@@ -130,7 +128,7 @@ def _compared(pair: Pair, results: Results, *, keep: bool, digests: bool) -> Res
     if result.images:
         return result
     images, unread = dict[str, Image](), []
-    for role, path in (("reference", pair.reference), ("test", pair.test)):
+    for role, path in (("reference", result.reference), ("test", result.test)):
         side = read(path) if path else ()
         try:
             if isinstance(side, Exception):

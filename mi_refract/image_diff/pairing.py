@@ -1,7 +1,7 @@
 """Which image of one folder is compared with which of the other: by their paths, or as the settings map them.
 
-In: two paths and the settings. Out: pairs with names, the other references that each may match, and what cannot be
-read. No image is read here.
+In: two paths and the settings. Out: a result for each pair, which is still to be compared, with the other references
+that it may match; and what cannot be read. No image is read here.
 """
 
 from __future__ import annotations
@@ -10,35 +10,14 @@ import functools
 import itertools
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
 from . import name_patterns
-from .results import Result
+from .results import Result, Status
 from .settings import ComparisonSpec, Map, Settings
 
 ROOT = "{root}/"  # before a template of a path that is not beside the reference
-
-
-@dataclass(frozen=True)
-class Pair:
-    """The two sides of an image; None where that side has none.
-
-    `name`: the path of the new image in its folder, or what it would be. `target`: where the reference is, or would be.
-    `variants`: other references that it may match. `error`: why it cannot be compared.
-    """
-
-    name: str
-    reference: Path | None
-    test: Path | None
-    target: Path
-    how: ComparisonSpec = field(default_factory=ComparisonSpec)
-    variants: tuple[Path, ...] = ()
-    error: str = ""
-
-
-Named = TypeVar("Named", Pair, Result)
 
 
 def require_apart(reference: Path, test: Path, maps: Sequence[Map] = (), new: bool = False) -> None:
@@ -59,14 +38,14 @@ def require_apart(reference: Path, test: Path, maps: Sequence[Map] = (), new: bo
         raise ValueError(f"{test}: one path contains the other, {reference}; use separate folders")
 
 
-def pairs(reference: Path, test: Path, settings: Settings) -> list[Pair]:
+def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
     """The images of both sides by name, each with how it is compared. ValueError where a folder holds no image."""
     known = reference.exists()
     if known and reference.is_dir() != test.is_dir():
         raise ValueError(f"{reference}, {test}: cannot compare a folder with a file")
     if not test.is_dir():
-        name = reference.name
-        pair = Pair(name, reference if known else None, test, reference, settings.of(name))
+        pair = _pair(reference.name, reference if known else None, test, reference)
+        pair = replace(pair, how=settings.of(pair.name))
         if not pair.how.accept:
             return [pair]
         deep = any("/" in template for template in pair.how.accept)
@@ -80,7 +59,7 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Pair]:
     if settings.maps:
         found = _mapped(old, new, settings.maps)
     else:
-        found = [Pair(name, old.get(name), new.get(name), Path(name)) for name in sorted(old | new)]
+        found = [_pair(name, old.get(name), new.get(name), Path(name)) for name in sorted(old | new)]
     found = [replace(pair, target=reference / pair.target, how=settings.of(pair.name)) for pair in found]
     own: set[Path] = set()  # masks and variances that the settings name for a pair: they are no images to compare
     for pair in found:
@@ -99,11 +78,15 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Pair]:
     found = [pair for pair in found if pair.test or pair.target not in taken]
     if not found and not lost and not missed:
         raise ValueError(f"defaults.map fits no image in {reference} and {test}; expected templates of their paths")
-    return [*found, *(Pair(name, None, None, reference / name, error=error) for name, error in lost + missed)]
+    return [*found, *(_pair(name, None, None, reference / name, error) for name, error in lost + missed)]
 
 
-def named(items: Sequence[Named], patterns: Sequence[str]) -> list[Named]:
-    """The pairs, or results, whose names match one of the patterns; all without patterns.
+def _pair(name: str, reference: Path | None, test: Path | None, target: Path, error: str = "") -> Result:
+    return Result(name, Status.DIFFERENT, reference, test, target=target, error=error)
+
+
+def named(items: Sequence[Result], patterns: Sequence[str]) -> list[Result]:
+    """The results whose names match one of the patterns; all without patterns.
 
     A pattern that is the name of an image, such as "a*.exr", is that image alone. ValueError for one that matches none.
     """
@@ -119,28 +102,28 @@ def named(items: Sequence[Named], patterns: Sequence[str]) -> list[Named]:
     return [item for item in items if not patterns or item.name in chosen]
 
 
-def wrong_entries(settings: Settings, pairs: Sequence[Pair]) -> list[Pair]:
-    """A pair without sides for each entry that is wrong and matches no image: where it does, that image says so."""
+def wrong_entries(settings: Settings, pairs: Sequence[Result]) -> list[Result]:
+    """A result without sides for each entry that is wrong and matches no image: where it does, that image says so."""
     used = {pair.how.error for pair in pairs}
     wrong = [rule for rule in settings.rules if rule.error and rule.error not in used]
-    return [Pair(f"the settings, {rule.where}", None, None, Path(), error=rule.error) for rule in wrong]
+    return [_pair(f"the settings, {rule.where}", None, None, Path(), rule.error) for rule in wrong]
 
 
-def error_of(pair: Pair, reference: Path) -> str:
+def error_of(pair: Result, reference: Path) -> str:
     """Why the pair cannot be compared, as far as that is known before it is; "" for nothing."""
     mask = _mask_of(pair, reference if reference.is_dir() else reference.parent)
     missing = f"{mask}: no such file; expected a mask" if mask and pair.reference and not mask.exists() else ""
     return pair.error or pair.how.error or missing
 
 
-def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> list[Pair]:
+def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> list[Result]:
     """Pairs by the first map that fits. What no map calls a reference is none; a reference is no new image."""
-    pairs: dict[str, Pair] = {}
+    pairs: dict[str, Result] = {}
     for rule, (path, file) in itertools.product(maps, old.items()):
         if (values := name_patterns.parsed(rule.reference, path)) is None:
             continue
         name = name_patterns.filled(rule.test, values)
-        before = pairs.setdefault(name, Pair(name, file, new.get(name), Path(path)))
+        before = pairs.setdefault(name, _pair(name, file, new.get(name), Path(path)))
         if before.reference != file:
             error = f"{file}: a second reference, beside {before.reference}; expected one for {name}"
             pairs[name] = replace(before, error=error)
@@ -150,19 +133,19 @@ def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> 
             fitting = ((rule, name_patterns.parsed(rule.test, name)) for rule in maps)
             targets = (name_patterns.filled(rule.reference, values) for rule, values in fitting if values is not None)
             if target := next(targets, None):
-                pairs[name] = Pair(name, None, file, Path(target))
+                pairs[name] = _pair(name, None, file, Path(target))
     return [pairs[name] for name in sorted(pairs)]
 
 
 # Files beside a reference -------------------------------------------------------------------------------------------
 
 
-def _mask_of(pair: Pair, root: Path) -> Path | None:
+def _mask_of(pair: Result, root: Path) -> Path | None:
     """The mask that the settings name for a pair; `root`: the folder of the references."""
     return beside(pair.how.mask, pair.target, root) if pair.how.mask else None
 
 
-def _with_variants(pair: Pair, others: Sequence[Path]) -> Pair:
+def _with_variants(pair: Result, others: Sequence[Path]) -> Result:
     """The pair with those of the other references that its settings accept as well."""
     folder, own = pair.target.parent, pair.target.name
     values = name_patterns.fields(own)

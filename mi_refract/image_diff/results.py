@@ -41,14 +41,14 @@ INCONCLUSIVE = {"": 3, "pass": 0, "fail": 1}  # exit codes by what the user want
 
 @dataclass(frozen=True)
 class Result:
-    """One image: its name, and the outcome. `error` is the line that says why there is no verdict.
+    """One image, and the outcome: DIFFERENT until it is compared. `error`: why there is no verdict.
 
-    `reference`, `test`: its files, or with renders its folders; None where that side has none. `how`: the settings.
-    `images`: the sides that the comparison is about, or that could be read, by role, of several renders the mean; empty
-    where they were not kept; `unread`: why others are missing. `digests`: of its files, variants too, when they were
-    compared; None where that was not asked, or a file is unreadable. `target`: where the reference is, or would be.
-    `variants`: other references that the settings accept; `matched`: the one of them that the new image is equal to.
-    `warnings`: of its mask.
+    `name`: the path of the new image in its folder, or what it would be. `reference`, `test`: its files, or with
+    renders its folders; None where that side has none. `how`: the settings. `images`: the sides that the comparison is
+    about, or that could be read, by role, of several renders the mean; empty where they were not kept; `unread`: why
+    others are missing. `digests`: of its files, variants too, when they were compared; None where that was not asked,
+    or a file is unreadable. `target`: where the reference is, or would be. `variants`: other references that the
+    settings accept; `matched`: the one of them that the new image is equal to. `warnings`: of its mask.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Result:
     images: Mapping[str, Image] = field(default_factory=dict)
     unread: str = ""
     digests: Mapping[Path, str] | None = None
-    target: Path | None = None
+    target: Path = Path()
     variants: tuple[Path, ...] = ()
     matched: Path | None = None
     warnings: tuple[str, ...] = ()

@@ -102,10 +102,10 @@ class Entry(msgspec.Struct):
 
     name: str
     status: Status
+    target: PathText
     error: str = ""
     reference: PathText | None = None
     test: PathText | None = None
-    target: PathText | None = None
     variants: list[PathText] = []
     digests: Digests | None = None
     options: dict[str, Any] = {}
@@ -151,12 +151,12 @@ def read(path: str | Path, reference: Path | None = None, test: Path | None = No
 def _result(where: str, entry: Entry, before: tuple[Path, Path], now: tuple[Path, Path]) -> Result:
     if entry.status not in FAILED:
         return Result(entry.name, entry.status, None, None)
-    reference = _moved(f"{where}.reference", entry.reference, before[0], now[0])
-    test = _moved(f"{where}.test", entry.test, before[1], now[1])
+    reference = _moved(f"{where}.reference", entry.reference, before[0], now[0]) if entry.reference else None
+    test = _moved(f"{where}.test", entry.test, before[1], now[1]) if entry.test else None
     target = _moved(f"{where}.target", entry.target, before[0], now[0])
     # Of single files, the variants lie beside the reference.
     roots = (before[0].parent, now[0].parent) if entry.target == str(before[0]) else (before[0], now[0])
-    variants = tuple(filter(None, (_moved(f"{where}.variants", each, *roots) for each in entry.variants)))
+    variants = tuple(_moved(f"{where}.variants", each, *roots) for each in entry.variants)
     digests = None
     if entry.digests is not None:
         if len(entry.digests.variants) != len(variants):
@@ -170,10 +170,8 @@ def _result(where: str, entry: Entry, before: tuple[Path, Path], now: tuple[Path
     return replace(result, digests=digests, target=target, variants=variants)
 
 
-def _moved(where: str, text: str | None, before: Path, now: Path) -> Path | None:
+def _moved(where: str, text: str, before: Path, now: Path) -> Path:
     """The path of the file as one in `now`. ValueError where it leads out of it, by `..` or by a link to a folder."""
-    if text is None:
-        return None
     path = Path(text)
     moved = now / path.relative_to(before) if path.is_relative_to(before) else None
     if moved is None or not (moved == now or moved.parent.resolve().is_relative_to(now.resolve())):

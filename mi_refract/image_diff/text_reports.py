@@ -17,7 +17,6 @@ from urllib.parse import quote
 from mi_refract.io.sanitise import printable
 from mi_refract.report.number_text import compact, distinguishable
 
-from .pairing import Pair
 from .results import FAILED, Result, Results, Status
 
 FEW = 20  # equal images that are listed one by one
@@ -88,7 +87,7 @@ def sentence(results: Results) -> str:
     return f"{number} image{'' if number == 1 else 's'}: {counted}{warned}{also}"
 
 
-def settings_table(pairs: Sequence[Pair]) -> Rows:
+def settings_table(pairs: Sequence[Result]) -> Rows:
     """How each image would be compared, and the tables of the settings file that say so."""
     rows: Rows = [("image", "compared by", "from", "why")]
     for pair in pairs:

@@ -18,18 +18,14 @@ def opened(path: str | os.PathLike[str], most: int) -> Iterator[BufferedReader]:
     ValueError for a larger one, or for what is no file: a pipe or a device may never end. OSError where it cannot be
     read.
     """
-    with open(path, "rb", opener=_without_waiting) as file:
+    # A pipe without a writer would block when it is opened.
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0))) as file:
         found = os.fstat(file.fileno())
         if not stat.S_ISREG(found.st_mode):
             raise ValueError(f"{path}: not a regular file")
         if found.st_size > most:
             raise ValueError(f"{path}: {found.st_size} bytes; expected up to {most}")
         yield file
-
-
-def _without_waiting(path: str, flags: int) -> int:
-    """A pipe without a writer would block when it is opened."""
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def read_bytes(path: str | os.PathLike[str], most: int) -> bytes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import struct
 import zlib
 from pathlib import Path
 from typing import Any
@@ -131,11 +130,9 @@ def _fitting(codes: Codes, limit: float) -> int | None:
 
 
 def png(rgb: NDArray[np.uint8]) -> bytes:
-    """H × W × 3 bytes as a PNG file (ISO/IEC 15948)."""
-    height, width, _ = rgb.shape
-    lines = np.concatenate([np.zeros((height, 1), np.uint8), rgb.reshape(height, -1)], 1)  # each with filter 0
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    content = b"\x89PNG\r\n\x1a\n"
-    for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 6)), (b"IEND", b"")):
-        content += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-    return content
+    """H × W × 3 bytes as a PNG file, by the Mitsuba variant that is set."""
+    import mitsuba as mi
+
+    stream = mi.MemoryStream()
+    mi.Bitmap(np.ascontiguousarray(rgb)).write(stream, mi.Bitmap.FileFormat.PNG)
+    return bytes(stream.raw_buffer())

@@ -85,7 +85,7 @@ def summary(rows: Sequence[Row], context: Mapping[str, Any] | None = None) -> Re
     if broken:
         parts += [_bounds_table("broken budget", "budget", broken, "bold red"), Text()]
     styles = {"yes": "bold green", "no": "bold red", "plain": "bold", "not measured": "bold yellow"}
-    for answer in (context or {}).get("first_page", {}).get("answers", ()):
+    for answer in ((context or {}).get("first_page") or {}).get("answers", ()):
         text = Text.assemble(*((part, "cyan" if i % 2 else "") for i, part in enumerate(answer["text"].split("`"))))
         parts.append(Text(answer["question"].replace("`", ""), style=styles[answer["state"]]))
         parts.append(Padding(text, (0, 0, 1, 2)))

@@ -205,6 +205,7 @@ MAPS = {
     "4 × 4 × 4; expected finite RGB": np.ones((4, 4, 4)),
     "2 × 2 × 3; expected finite RGB": np.full((2, 2, 3), np.nan),
     "3 × 3 × 3; expected finite RGB": np.full((3, 3, 3), -1e-3),
+    "5 × 5 × 3; expected finite RGB": np.full((5, 5, 3), np.inf),
     "expected an OpenEXR file": b"no image",
     "; expected an OpenEXR file": None,
 }

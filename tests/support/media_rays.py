@@ -1,6 +1,7 @@
 """Media that need no catalogue, and answers of a program to rays that pass between them and air."""
 
 import numpy as np
+from support.ray_programs import glsl
 
 from mi_refract.ray_sets.ray_set import Answers
 
@@ -9,18 +10,11 @@ MEDIA, WAVELENGTHS = (CROWN, FLINT, WATER), (486.1327, 587.5618)
 ALL = {"media": MEDIA, "wavelengths": WAVELENGTHS}
 
 
-def textbook(a, n, k):
-    """b (N, 3) for normals that face the ray; zeros under total internal reflection."""
-    c, k = (n * a).sum(1, keepdims=True), k[:, None]
-    radicand = 1 - k * k * (1 - c * c)
-    return np.where(radicand < 0, 0, k * a - (k * c + np.sqrt(np.maximum(radicand, 0))) * n)
-
-
 def answered(to, ratio=None, direction=None, said=True):
     """Answers of a program that uses `ratio` (N,), by default that of the rays, and says so.
 
     `direction`: the ratio that its directions are for, if another.
     """
     k = to.rays.k if ratio is None else ratio
-    b = textbook(to.rays.a, to.rays.n, (k if direction is None else direction).astype(to.rays.k.dtype))
+    b = glsl(to.rays.a, to.rays.n, (k if direction is None else direction).astype(to.rays.k.dtype))
     return Answers(to.ids, b.astype(np.float64), n_ratio=k.astype(np.float64) if said else None)

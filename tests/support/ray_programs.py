@@ -76,12 +76,7 @@ def mirror_x(v):
     return v * np.array([-1, 1, 1], v.dtype)
 
 
-GOOD = {
-    "zero": glsl,
-    "nan": with_nan,
-    "reflected": with_mirror,
-    "tangent": with_tangent,
-}
+GOOD = {"zero": glsl, "nan": with_nan, "reflected": with_mirror, "tangent": with_tangent}
 # By the name of the mistake.
 BAD = {
     "eta inverted": [
