@@ -312,3 +312,17 @@ def test_raysect_weighs_no_ray_and_takes_a_band_and_a_dispersion(tmp_path, monke
     entry = {"int_ior": 1.5, "ext_ior": 1.25}
     assert script["glass"](entry) == ("glass", 1.5, 1, 1.25)
     assert script["glass"](entry | {"schott": "SF11"})[1] == "of SF11"
+
+
+@pytest.mark.parametrize("size", [1.0, 100.0])
+def test_raysect_gets_a_scene_whose_largest_coordinate_is_a_half(size, tmp_path, monkeypatch):
+    """That of the camera, or of a mesh: both are scaled."""
+    mesh = Mesh("ball", size * BALL[0], BALL[1], GLASS)
+    targets.write(PlainScene("scaled", (mesh,), (1.0, 1.0, 1.0), CAMERA, 8), "raysect", tmp_path / "new")
+    made, script = fake_raysect.run(tmp_path / "new", monkeypatch)
+    scene = json.loads((tmp_path / "new" / "scene.json").read_text())
+    script["build"](scene, tmp_path / "new")
+    place = script["camera"]("world", scene, types.SimpleNamespace(spp=1, band=None), "pipeline").transform[:3, 3]
+    unit = 0.5 / max(9.0, np.abs(mesh.vertices).max())
+    np.testing.assert_allclose(place, np.multiply(unit, CAMERA.origin), rtol=4 * SINGLE)
+    np.testing.assert_allclose(made.meshes["ball"].triangles, unit * mesh.triangles(), rtol=4 * SINGLE)
