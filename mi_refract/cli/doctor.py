@@ -25,19 +25,18 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] 
         "versions": {"mi_refract": __version__, "python": sys.version.split()[0]} | versions,
         "advice": backend.advice(),
     }
-    print(json_text(facts, indent=2) if as_json else printable_lines(_as_text(facts)))
+    if as_json:
+        print(json_text(facts, indent=2))
+    else:
+        variants = {name: "usable" if reason is None else f"no: {reason}" for name, reason in facts["variants"].items()}
+        tables = {"variants": variants, "libLLVM": libraries or {"none found": ""}, "versions": facts["versions"]}
+        lines = []
+        for title, table in tables.items():
+            width = max(map(len, table))
+            lines += [title, *(f"  {name:{width}}  {text}".rstrip() for name, text in table.items()), ""]
+        print(printable_lines("\n".join([*lines, facts["advice"]])))
     if None not in facts["variants"].values():
         raise ValueError("no Mitsuba variant can run on this machine")
-
-
-def _as_text(facts: dict[str, Any]) -> str:
-    variants = {name: "usable" if reason is None else f"no: {reason}" for name, reason in facts["variants"].items()}
-    tables = {"variants": variants, "libLLVM": facts["libllvm"] or {"none found": ""}, "versions": facts["versions"]}
-    lines = []
-    for title, table in tables.items():
-        width = max(map(len, table))
-        lines += [title, *(f"  {name:{width}}  {text}".rstrip() for name, text in table.items()), ""]
-    return "\n".join([*lines, facts["advice"]])
 
 
 def probe(*, every_backend: bool = True) -> None:
