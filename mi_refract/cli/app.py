@@ -10,6 +10,7 @@ import functools
 import importlib
 import sys
 import warnings
+from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
 try:
@@ -88,6 +89,17 @@ def _root(
     elif context.invoked_subcommand is None:
         print(context.get_help())
         raise typer.Exit(2)
+
+
+def shows(text: Callable[[], str]) -> Callable[[bool], None]:
+    """The callback of an eager flag that prints a text in place of what the command does."""
+
+    def callback(wanted: bool) -> None:
+        if wanted:
+            print(text())
+            raise typer.Exit
+
+    return callback
 
 
 def main(arguments: list[str] | None = None) -> int:

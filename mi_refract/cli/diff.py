@@ -25,13 +25,9 @@ from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.safe_files import writable
 from mi_refract.io.text import printable
 
+from .app import shows
+
 Inconclusive = enum.StrEnum("Inconclusive", {"PASS": "pass", "FAIL": "fail"})  # what such an image counts as
-
-
-def _print_methods(wanted: bool) -> None:
-    if wanted:
-        print(key_tables())
-        raise typer.Exit
 
 
 Names = Annotated[
@@ -72,7 +68,8 @@ def diff(
     json: Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")] = None,
     github: Annotated[bool, typer.Option("--github", help="Print annotations, write the job's summary.")] = False,
     methods: Annotated[
-        bool, typer.Option("--methods", is_eager=True, callback=_print_methods, help="Print the methods and all keys.")
+        bool,
+        typer.Option("--methods", is_eager=True, callback=shows(key_tables), help="Print the methods and all keys."),
     ] = False,
     check_settings: Annotated[
         bool, typer.Option("--check-settings", help="Print how each image would be compared, and by which settings.")

@@ -25,13 +25,16 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] 
         "versions": {"mi_refract": __version__, "python": sys.version.split()[0]} | versions,
         "advice": backend.advice(),
     }
-    shown = {name: "usable" if reason is None else f"no: {reason}" for name, reason in facts["variants"].items()}
-    tables = {"variants": shown, "libLLVM": libraries or {"none found": ""}, "versions": facts["versions"]}
-    lines = []
-    for title, table in tables.items():
-        width = max(map(len, table))
-        lines += [title, *(f"  {name:{width}}  {text}".rstrip() for name, text in table.items()), ""]
-    print(json_text(facts, indent=2) if as_json else printable_lines("\n".join([*lines, facts["advice"]])))
+    if as_json:
+        print(json_text(facts, indent=2))
+    else:
+        variants = {name: "usable" if reason is None else f"no: {reason}" for name, reason in facts["variants"].items()}
+        tables = {"variants": variants, "libLLVM": libraries or {"none found": ""}, "versions": facts["versions"]}
+        lines = []
+        for title, table in tables.items():
+            width = max(map(len, table))
+            lines += [title, *(f"  {name:{width}}  {text}".rstrip() for name, text in table.items()), ""]
+        print(printable_lines("\n".join([*lines, facts["advice"]])))
     if None not in facts["variants"].values():
         raise ValueError("no Mitsuba variant can run on this machine")
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Collection, Iterator
 from typing import NoReturn
@@ -35,7 +36,9 @@ def end_at_once(*, even_if_ignored: bool) -> None:
 
     if waited := _blocked - (set() if even_if_ignored else ignored):
         for number in waited:  # macOS does not queue what is ignored
-            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else _exit)
+            signal.signal(
+                number, signal.default_int_handler if number == signal.SIGINT else lambda x, _: sys.exit(128 + x)
+            )
         threading.Thread(target=_watch, args=(safe_files.end_process, waited), name="Ctrl-C", daemon=True).start()
 
 
@@ -66,10 +69,6 @@ def as_exceptions() -> Iterator[None]:
     finally:
         _unblocked.clear()
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _exit(number: int, frame: object) -> NoReturn:
-    raise SystemExit(128 + number)
 
 
 def _watch(end_process: Callable[[int], NoReturn], signals: Collection[signal.Signals]) -> None:

@@ -32,9 +32,9 @@ def self_test(reference: Images, max_values: MaxValues = MAX_VALUES, allow_plugi
     Exit code 0: every defect that had to be detected was detected, 1: one was missed, or equal images were reported as
     different, 2: REFERENCE cannot be read.
     """
+    require_extra("scipy")
     from mi_refract.image_diff import self_test as self_tests
 
-    require_extra("scipy")
     if reference.suffix == SCENE:
         from mi_refract.rendering.scene_files import load_scene
 

@@ -13,13 +13,8 @@ from mi_refract.io.text import json_text
 from mi_refract.planar import figure, focal_points, light, scene_file
 from mi_refract.planar.path_tree import as_data, follow_scene, summary, with_rays
 
+from .app import shows
 from .doctor import probe
-
-
-def _print_keys(wanted: bool) -> None:
-    if wanted:
-        print(scene_file.reference())
-        raise typer.Exit
 
 
 def trace(
@@ -50,7 +45,10 @@ def trace(
     formula: Annotated[str | None, typer.Option(help="Formula of refraction. Default: the planar formula.")] = None,
     arrays: Annotated[str | None, typer.Option("--backend", help="llvm, cuda or scalar; see `doctor`.")] = None,
     keys: Annotated[
-        bool, typer.Option("--keys", is_eager=True, callback=_print_keys, help="Print all keys of a scene file.")
+        bool,
+        typer.Option(
+            "--keys", is_eager=True, callback=shows(scene_file.reference), help="Print all keys of a scene file."
+        ),
     ] = False,
 ) -> None:
     """Trace the rays of a planar scene; draw them, print their paths, or print focal points."""

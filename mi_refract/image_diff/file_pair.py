@@ -68,10 +68,15 @@ def compare(
     how = result.how
     bare = [channels.without_variances(images[0]) for images in sides]
     whole = dict.fromkeys(name for image in bare for name in image.channels)
-    reference, test = (
-        channels.chosen(_with_variance(images, root, how), how.channels, side)
-        for side, (images, root) in enumerate(zip(sides, roots, strict=True))
-    )
+    selected = []
+    for side, (renders, root) in enumerate(zip(sides, roots, strict=True)):
+        if how.reads_variance and len(renders) == 1:
+            beside = pairing.beside(how.variance, renders[0].path, root)
+            if beside == renders[0].path:
+                raise ValueError(f"variance = {how.variance!r}: names {beside} itself; expected another image")
+            renders = [channels.with_file(renders[0], beside, how.max_values)] if beside.exists() else renders
+        selected.append(channels.chosen(renders, how.channels, side))
+    reference, test = selected
     if how.reads_variance and not (len(reference) > 1 or channels.has_variance(reference[0])):
         raise FileNotFoundError(f"{pairing.beside(how.variance, path, roots[0])}: no such file; expected a variance")
     file = pairing.beside(how.mask, result.target, roots[0]) if how.mask else None
@@ -79,7 +84,12 @@ def compare(
         raise ValueError(f"{path}: has several parts or MIP levels; masks are supported for single images only")
     mask = mask_of(reference[0], file, how.ignore, how.max_values)
     if mask is not None:
-        reference, test = ([_masked(image, mask) for image in side] for side in (reference, test))
+        for several in selected:
+            for place, image in enumerate(several):
+                if image.pixels.shape[:2] == mask.shape:  # else every method refuses it; one pixel would be spread here
+                    kept = np.where(mask[..., None], image.pixels, 0)
+                    spread = {name: np.where(mask, variance, 0) for name, variance in image.variances.items()}
+                    several[place] = replace(image, pixels=kept, mask=mask, variances=spread)
     if path.is_dir():
         comparison = methods.compare(how.method, reference, test, named=[one for one, _ in how.channels], **how.options)
         one, two = mean_image(reference), mean_image(test)
@@ -96,16 +106,6 @@ def compare(
     images = {"reference": one, "test": two}
     status = Status(str(comparison.verdict))
     return replace(result, status=status, comparison=comparison, warnings=warnings, images=images)
-
-
-def _with_variance(images: Sequence[Image], root: Path, how: ComparisonSpec) -> Sequence[Image]:
-    """A single image with the variance that lies beside it, where the settings name one and it is there."""
-    if not how.reads_variance or len(images) > 1:
-        return images
-    file = pairing.beside(how.variance, images[0].path, root)
-    if file == images[0].path:
-        raise ValueError(f"variance = {how.variance!r}: names {file} itself; expected another image")
-    return [channels.with_file(images[0], file, how.max_values)] if file.exists() else images
 
 
 def _compare_parts(
@@ -174,14 +174,3 @@ def mask_of(
     if not counts.any():
         raise ValueError(f"{path or 'ignore'}: leaves no pixel of {reference.path}; expected at least one")
     return counts
-
-
-def _masked(image: Image, mask: Mask) -> Image:
-    """The image with 0 where the mask does not count, and with the mask; one of another size as it is.
-
-    An image of another size is refused by every method. Here a single pixel would be spread over the mask's size.
-    """
-    if image.pixels.shape[:2] != mask.shape:
-        return image
-    spread = {name: np.where(mask, variance, 0) for name, variance in image.variances.items()}
-    return replace(image, pixels=np.where(mask[..., None], image.pixels, 0), mask=mask, variances=spread)

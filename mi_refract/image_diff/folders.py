@@ -19,7 +19,7 @@ from mi_refract.io.image_file import Image, bounded_map, one_line
 
 from . import file_pair, pairing
 from .results import FAILED, Result, Results, Status
-from .settings import ComparisonSpec, Settings
+from .settings import Settings
 
 AS_ASKED = Settings()
 WORKERS = min(os.cpu_count() or 1, 8)
@@ -104,7 +104,15 @@ def _compared(result: Result, results: Results, *, keep: bool, digests: bool) ->
     """
     how = result.how
     result = replace(result, error=result.error or how.error)
-    read = functools.cache(functools.partial(_read, how=how, renders=results.renders))
+
+    @functools.cache
+    def read(path: Path) -> Sequence[Image] | Exception:
+        """All renders of a folder, or all images of a file; or why they cannot be read."""
+        try:
+            return (file_pair.read_renders if results.renders else image_file.read_parts)(path, how.max_values)
+        except Exception as error:  # of whatever kind: it is raised where the images are compared
+            return error
+
     if result.error:
         result = replace(result, status=Status.ERROR)
     elif how.skip:
@@ -138,14 +146,6 @@ def _compared(result: Result, results: Results, *, keep: bool, digests: bool) ->
         except Exception as error:  # the page says why it lacks the image
             unread.append(one_line(str(error)))
     return replace(result, images=images, unread=" ".join(unread))
-
-
-def _read(path: Path, how: ComparisonSpec, renders: bool) -> Sequence[Image] | Exception:
-    """All renders of a folder, or all images of a file; or why they cannot be read."""
-    try:
-        return (file_pair.read_renders if renders else image_file.read_parts)(path, how.max_values)
-    except Exception as error:  # of whatever kind: it is raised where the images are compared
-        return error
 
 
 def _judged(result: Result, roots: tuple[Path, Path], read: Read) -> Result:

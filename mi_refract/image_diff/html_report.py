@@ -24,13 +24,12 @@ from mi_refract.io import errors
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels, block_mean
 from mi_refract.io.safe_files import write_atomically
-from mi_refract.io.text import compact, distinguishable
+from mi_refract.io.text import beside_bound, compact
 from mi_refract.report.documents import rendered
 from mi_refract.report.embedded_images import EmbeddedImages, encoded, strongest
 from mi_refract.report.plots import histogram_svg
 
 from . import flip
-from .comparison import Metric
 from .results import FAILED, Result, Results, Status
 from .text_reports import WORDS, sentence
 
@@ -169,6 +168,13 @@ def item(
     comparison, why = result.comparison, cause(result)
     detectable = comparison.minimum_detectable if comparison else math.nan
     commands = {"reproduce": results.reproduce(result), "accept": results.accept(result)}
+    metrics = []
+    for metric in comparison.metrics if comparison else ():
+        text, limit, state = compact(metric.value), "", "info"
+        if metric.bound is not None and not metric.value <= metric.bound == math.inf:
+            text, limit = beside_bound(metric.value, metric.bound)
+            state = "pass" if metric.value <= metric.bound else "fail"
+        metrics.append({"name": metric.name, "text": text, "limit": limit, "state": state})
     return {
         "name": result.name,
         "status": str(result.status),
@@ -177,7 +183,7 @@ def item(
         "reason": result.reason,
         "asked": result.how.reason,
         "warning": result.warning,
-        "metrics": [_metric(metric) for metric in comparison.metrics] if comparison else [],
+        "metrics": metrics,
         "text": " ".join((result.name, result.status, result.category, why)).lower(),
         "word": shlex.quote(result.name) if result.test is not None and result.status in FAILED else "",
         "minimum_detectable": detectable if math.isfinite(detectable) else None,
@@ -201,15 +207,6 @@ def cause(result: Result) -> str:
     # The number that is the most times its bound.
     times = [m.value / m.bound if m.bound and not math.isnan(m.value) else math.inf for m in beyond]
     return beyond[times.index(max(times))].name if beyond else str(result.status)
-
-
-def _metric(metric: Metric) -> dict[str, str]:
-    value, bound = metric.value, metric.bound
-    if bound is None or value <= bound == math.inf:
-        return {"name": metric.name, "text": compact(value), "limit": "", "state": "info"}
-    text, limit = distinguishable(value, bound)
-    state, sign = ("pass", "≤") if value <= bound else ("fail", ">" if value > bound else "≰")
-    return {"name": metric.name, "text": text, "limit": f"{sign} {limit}", "state": state}
 
 
 # What it shows of a pair --------------------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ A template is a relative path in which fields stand for parts of an image's path
 
 from __future__ import annotations
 
-import functools
 import re
 from collections.abc import Collection, Mapping
 from pathlib import PurePosixPath
@@ -59,18 +58,13 @@ def expanded(template: str, values: Mapping[str, str], names: list[str]) -> list
 
 def parsed(template: str, name: str) -> dict[str, str] | None:
     """The values of the template's fields for which it is `name`; None where there are none."""
-    match = _parser(template).fullmatch(name)
-    return match and {field: value or "" for field, value in match.groupdict().items()}
-
-
-@functools.lru_cache(64)
-def _parser(template: str) -> re.Pattern[str]:
     text, at, seen = "", 0, set[str]()
-    for match in _FIELD.finditer(template):
-        field, slash = match.groups()
+    for part in _FIELD.finditer(template):
+        field, slash = part.groups()
         group = f"(?P={field})" if field in seen else f"(?P<{field}>{FIELDS[field]})"
-        text += re.escape(template[at : match.start()])
+        text += re.escape(template[at : part.start()])
         text += f"(?:{group}/)?" if field == "dir" and slash else group + slash
-        at = match.end()
+        at = part.end()
         seen.add(field)
-    return re.compile(text + re.escape(template[at:]))
+    match = re.fullmatch(text + re.escape(template[at:]), name)
+    return match and {field: value or "" for field, value in match.groupdict().items()}

@@ -6,7 +6,6 @@ that it may match; and what cannot be read. No image is read here.
 
 from __future__ import annotations
 
-import functools
 import itertools
 import os
 from collections.abc import Sequence
@@ -187,11 +186,16 @@ def beside(template: str, target: Path, root: Path) -> Path:
 
 
 def images_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
-    """The files whose names end as an image's, by their path inside; (name, error) of folders that cannot be read.
+    """The files with an image's ending, by their path inside; (name, error) of folders that cannot be read.
 
     Names that begin with a dot are left out. Links to folders are not followed, and an error: what is in them would
     not be compared.
     """
+    import OpenImageIO as oiio
+
+    formats = (each.split(":") for each in oiio.get_string_attribute("extension_list").split(";") if each)
+    readable = (endings for name, endings in formats if name not in ("null", "term", "zfile"))
+    endings = {ending for listed in readable for ending in listed.split(",")}  # lower case
     images: dict[str, Path] = {}
     failed: list[tuple[str, str]] = []
 
@@ -204,15 +208,6 @@ def images_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
             if path.is_symlink():
                 failed.append((path.relative_to(folder).as_posix(), f"{path}: a link to a folder; expected a folder"))
         for path in (Path(parent, name) for name in names if not name.startswith(".")):
-            if path.suffix[1:].lower() in _endings():
+            if path.suffix[1:].lower() in endings:
                 images[path.relative_to(folder).as_posix()] = path
     return images, failed
-
-
-@functools.cache
-def _endings() -> frozenset[str]:
-    """The file name endings, lower case without the dot, of the images that OpenImageIO reads."""
-    import OpenImageIO as oiio
-
-    formats = (each.split(":") for each in oiio.get_string_attribute("extension_list").split(";") if each)
-    return frozenset(e for name, listed in formats if name not in ("null", "term", "zfile") for e in listed.split(","))

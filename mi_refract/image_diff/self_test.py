@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+from scipy import ndimage, stats
 
 from mi_refract.io import image_file, safe_files
 from mi_refract.io.pixels import Pixels, block_mean, srgb_decode, srgb_encode
@@ -83,13 +84,6 @@ def _with_centre(image: Pixels, value: float) -> Pixels:
     return spoilt
 
 
-def _blurred(image: Pixels) -> Pixels:
-    from scipy.ndimage import uniform_filter
-
-    blurred: Pixels = uniform_filter(image, (3, 3, 1), mode="nearest")
-    return blurred
-
-
 def through_a_file(image: Pixels, share: float = 1.0) -> Pixels:
     """The image written as EXR, cut to a share of the bytes, and read again. ValueError for what cannot be read."""
     channels = image_file.named("", image).channels
@@ -104,7 +98,7 @@ DEFECTS = {
     "gain": Defect("1 % brighter", lambda x: 1.01 * x),
     "shift": Defect("one pixel to the right", lambda x: np.roll(x, 1, axis=1)),
     "swapped channels": Defect("the first and the last", lambda x: x[..., ::-1]),
-    "blur": Defect("mean of 3 × 3 pixels", _blurred),
+    "blur": Defect("mean of 3 × 3 pixels", lambda x: ndimage.uniform_filter(x, (3, 3, 1), mode="nearest")),
     "8 bits": Defect(  # values above 1 (white) become 1
         "through an 8-bit sRGB file", lambda x: srgb_decode(np.round(255 * srgb_encode(np.clip(x, 0, 1))) / 255)
     ),
@@ -141,8 +135,6 @@ class Tally:
     @property
     def bound(self) -> float:
         """The upper bound of the rate where the trials are independent: exact, one-sided, at CONFIDENCE."""
-        from scipy import stats
-
         test = stats.binomtest(self.seen, self.trials, alternative="less")
         return float(test.proportion_ci(CONFIDENCE, method="exact").high)
 

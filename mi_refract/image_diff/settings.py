@@ -124,53 +124,47 @@ class Settings:
         return cls((Entry("", values, COMMAND_LINE),))
 
     def of(self, name: str) -> ComparisonSpec:
-        """How the image of this name is compared; what is wrong with the settings is the `error`."""
+        """How the image of this name is compared, by all layers that match it; a later one wins.
+
+        Its `error` is that of a layer, or says that two tables of the same pattern contradict each other, or that the
+        method does not have an option.
+        """
         layers = [rule for rule in self.rules if not rule.pattern or matches(rule.pattern, name)]
         reasons = dict.fromkeys(layer.values["reason"] for layer in layers if "reason" in layer.values)
         entries = tuple(x.where for x in layers if x.where != COMMAND_LINE and (x.values or x.error))
         spec = ComparisonSpec(reason="; ".join(reasons), max_values=self.max_values, entries=entries)
-        try:
-            return replace(spec, **_merged(layers))
-        except ValueError as error:
-            return replace(spec, error=str(error))
+        merged: dict[str, Any] = {"method": AUTO}
+        set_by: dict[str, str] = {}
+        tables: dict[tuple[str, str], Entry] = {}
+        for layer in layers:
+            if layer.error:
+                return replace(spec, error=layer.error)
+            for key, value in layer.values.items():
+                other = tables.setdefault((layer.pattern, key), layer)
+                if layer.pattern and key != "reason" and other.values[key] != value:
+                    return replace(
+                        spec,
+                        error=f"{layer.where}: {key}: {value!r}, but {other.values[key]!r} in {other.where} for the "
+                        f"same name {layer.pattern!r}; expected one of them",
+                    )
+                set_by[key] = layer.where
+            method = layer.values.get("method", merged["method"])
+            if method != merged["method"]:
+                merged = {k: v for k, v in merged.items() if k not in options_of(None) or k in options_of(method)}
+            merged |= layer.values
+        method = merged["method"]
+        options = {key: merged.pop(key) for key in list(merged) if key in options_of(None)}
+        for name in options.keys() - options_of(method):
+            expected = ", ".join(sorted(options_of(method) - {"allow_nonfinite"})) or "none"
+            error = f"{set_by[name]}: {name}: not an option of {method}; expected {expected}"
+            return replace(spec, error=error)
+        merged.pop("reason", None)
+        return replace(spec, **merged, options=options)
 
     def unused(self, names: Sequence[str]) -> list[str]:
         """The patterns that match none of these names."""
         patterns = [rule.pattern for rule in self.rules if rule.pattern]
         return [pattern for pattern in patterns if not any(matches(pattern, name) for name in names)]
-
-
-def _merged(layers: Sequence[Entry]) -> dict[str, Any]:
-    """The fields of `ComparisonSpec` that the layers set.
-
-    ValueError for a layer with an error, for two tables of the same pattern that contradict each other, and for an
-    option that the method does not have.
-    """
-    merged: dict[str, Any] = {"method": AUTO}
-    set_by: dict[str, str] = {}
-    tables: dict[tuple[str, str], Entry] = {}
-    for layer in layers:
-        if layer.error:
-            raise ValueError(layer.error)
-        for key, value in layer.values.items():
-            other = tables.setdefault((layer.pattern, key), layer)
-            if layer.pattern and key != "reason" and other.values[key] != value:
-                raise ValueError(
-                    f"{layer.where}: {key}: {value!r}, but {other.values[key]!r} in {other.where} for the same name "
-                    f"{layer.pattern!r}; expected one of them"
-                )
-            set_by[key] = layer.where
-        method = layer.values.get("method", merged["method"])
-        if method != merged["method"]:
-            merged = {k: v for k, v in merged.items() if k not in options_of(None) or k in options_of(method)}
-        merged |= layer.values
-    method = merged["method"]
-    options = {key: merged.pop(key) for key in list(merged) if key in options_of(None)}
-    for name in options.keys() - options_of(method):
-        expected = ", ".join(sorted(options_of(method) - {"allow_nonfinite"})) or "none"
-        raise ValueError(f"{set_by[name]}: {name}: not an option of {method}; expected {expected}")
-    merged.pop("reason", None)
-    return merged | {"options": options}
 
 
 @functools.cache

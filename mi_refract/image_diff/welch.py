@@ -13,11 +13,10 @@ from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels
 
 from .channels import SPP, Estimate, estimates, has_variance, samples, spreads
-from .comparison import Comparison, Maps, Metric, Verdict, aligned, finite, nonfinite_result, preconditions
+from .comparison import Comparison, Metric, Verdict, aligned, finite, nonfinite_result, preconditions
 from .pixel_statistics import Inflation, inflation, rarity_exponent, sums
 from .tile_statistics import (
     Evidence,
-    Level,
     OneSided,
     TileTests,
     from_renders,
@@ -61,6 +60,10 @@ def compare_renders(
 
     The side with fewer samples is never assumed to have less noise per sample than the other: it may have missed rare
     light. Each render counts as one sample, unless the samples per pixel of all of them are known.
+
+    Maps, in every tile. `t`: signed, by channels. `p`: of no difference at all, by channels; uniform for equal images.
+    `q`: p adjusted for the false discovery rate after Benjamini and Hochberg (1995), p₍ᵢ₎ N/i made monotonic, the
+    smallest of the channels. `flags`: 1 heavy-tailed, 2 no noise.
 
     EQUAL, however noisy, where both hold their variance and are identical in every value of every channel.
     INCONCLUSIVE where the only tiles that differ are unsuited to a t-test (with the noise of a few pixels, or without
@@ -126,7 +129,17 @@ def compare_renders(
         Metric(share_name, tests.hidden_share(resolution), hidden),
         Metric("minimum detectable difference of the whole image", tests.minimum_detectable(-1)),
     )
-    maps = _maps(finest, tile, reference[0].pixels.shape)
+    from scipy import stats
+
+    q = np.ones(finest.p.shape)
+    if not finest.silent.all():
+        q[~finest.silent] = stats.false_discovery_control(finest.p[~finest.silent])
+    flags = (2 * finest.silent + finest.heavy).max(-1)
+    height, width = reference[0].pixels.shape[:2]
+    maps = {
+        name: values.astype(np.float32).repeat(tile, 0)[:height].repeat(tile, 1)[:, :width]
+        for name, values in {"t": finest.t, "p": finest.p, "q": q.min(-1), "flags": flags}.items()
+    }
     return Comparison("welch", verdict, reason, metrics, tests.minimum_detectable(), maps)
 
 
@@ -242,19 +255,3 @@ def _deciding(counts: tuple[int, int], unit: str, quieter: float) -> str:
     if counts[0] != counts[1] and (rest := needed - 1 / most) * most >= 1:
         count, whose = 1 / rest, "of the new image" if counts[0] > counts[1] else "of the reference"
     return f"; about {float(f'{count:.1e}'):,.0f} {unit} {whose} would decide"
-
-
-def _maps(level: Level, tile: int, shape: tuple[int, ...]) -> Maps:
-    """In every tile. `t`: signed, by channels. `p`: of no difference at all, by channels; uniform for equal images.
-
-    `q`: p adjusted for the false discovery rate after Benjamini and Hochberg (1995), p₍ᵢ₎ N/i made monotonic, the
-    smallest of the channels. `flags`: 1 heavy-tailed, 2 no noise.
-    """
-    from scipy import stats
-
-    q = np.ones(level.p.shape)
-    if not level.silent.all():
-        q[~level.silent] = stats.false_discovery_control(level.p[~level.silent])
-    tiles = {"t": level.t, "p": level.p, "q": q.min(-1), "flags": (2 * level.silent + level.heavy).max(-1)}
-    height, width = shape[:2]
-    return {name: x.astype(np.float32).repeat(tile, 0)[:height].repeat(tile, 1)[:, :width] for name, x in tiles.items()}

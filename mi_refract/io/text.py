@@ -76,3 +76,9 @@ def distinguishable(value: float, budget: float) -> tuple[str, str]:
         if texts[0] != texts[1] or value == budget:
             return texts
     return repr(value), repr(budget)
+
+
+def beside_bound(value: float, bound: float) -> tuple[str, str]:
+    """Both as text, told apart, the bound with how the value compares: NaN is neither above nor below."""
+    text, limit = distinguishable(value, bound)
+    return text, f"{'≤' if value <= bound else '>' if value > bound else '≰'} {limit}"

@@ -51,10 +51,16 @@ class EmbeddedImages:
 def encoded(pixels: Pixels, limit: float = np.inf, scale: float = 1.0) -> dict[str, Any]:
     """H × W × (1 or 3) pixels / `scale` as base64 of about `limit` bytes; `note` says what it took.
 
-    Where they do not fit, values are rounded, then blocks of pixels averaged.
+    Where they do not fit, by the size of some of their lines, values are rounded, then blocks of pixels averaged.
     """
-    side, codes = 1, _halves(pixels, scale)
-    while (bits := _fitting(codes, limit)) is None and min(pixels.shape[:2]) > side:
+    side, codes, bits = 1, _halves(pixels, scale), None
+    while codes.nbytes * 4 / 3 > limit:  # of base64
+        sample = codes[::16]
+        share = len(codes) / len(sample) * 4 / 3
+        sizes = ((bits, share * len(_deflated(_rounded(sample, bits)))) for bits in ROUNDED)
+        bits = next((bits for bits, size in sizes if size <= limit), None)
+        if bits is not None or min(pixels.shape[:2]) <= side:
+            break
         side *= 2
         codes = _halves(block_mean(pixels, side), scale)
     notes = [f"means of {side} × {side} pixels"] if side > 1 else []
@@ -117,16 +123,6 @@ def _deflated(codes: Codes) -> bytes:
     """
     planes = np.ascontiguousarray(codes).view("u1").reshape(-1, 2)[:, ::-1].T.tobytes()
     return zlib.compress(planes, 4)
-
-
-def _fitting(codes: Codes, limit: float) -> int | None:
-    """The fewest bits to round away for base64 of about `limit` bytes, by some of its lines; None if none do."""
-    if codes.nbytes * 4 / 3 <= limit:
-        return 0
-    sample = codes[::16]
-    share = len(codes) / len(sample) * 4 / 3
-    sizes = ((bits, share * len(_deflated(_rounded(sample, bits)))) for bits in ROUNDED)
-    return next((bits for bits, size in sizes if size <= limit), None)
 
 
 def png(rgb: NDArray[np.uint8]) -> bytes:

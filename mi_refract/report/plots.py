@@ -178,7 +178,17 @@ def scatter_svg(panels: Mapping[str, Scatter], axes: Axes, *, floor: str, front:
         _printable(figure)
         figure.canvas.draw()  # settles the layout that the labels' places depend on
         for panel, subjects in zip(grid, drawn.values(), strict=False):
-            _labels(panel, subjects, colours)
+            # Every subject's name stands beside its highest point, moved down where another name is in the way.
+            heads = {s: max(points, key=lambda p: p[1]) for s, points in subjects.items()}
+            placed: list[tuple[float, float]] = []
+            for subject, head in sorted(heads.items(), key=lambda item: -item[1][1]):
+                x, y = panel.transData.transform(head)
+                lowered = y
+                while any(abs(x - px) < 95 and abs(lowered - py) < 13 for px, py in placed):
+                    lowered -= 1
+                placed.append((x, lowered))
+                text = {"fontsize": 9.5, "color": colours[subject], "va": "center", "textcoords": "offset pixels"}
+                panel.annotate(subject, head, (7, lowered - y), **text)
         for panel in grid[len(drawn) :]:
             panel.set_visible(False)
         for panel in figure.axes[::columns]:
@@ -216,21 +226,6 @@ def _ticks(panel: Panel, which: str) -> None:
         axis.set_major_locator(LogLocator(subs=(1,) if high / low > 50 else (1, 2, 5), numticks=9))
         axis.set_minor_locator(NullLocator())
         axis.set_major_formatter(FuncFormatter(lambda v, _: compact(v)))
-
-
-def _labels(panel: Panel, subjects: Mapping[str, Points], colours: Mapping[str, str]) -> None:
-    """Name every subject beside its highest point, moved down where another name is in the way."""
-    heads = {s: max(points, key=lambda p: p[1]) for s, points in subjects.items()}
-    placed: list[tuple[float, float]] = []
-    for subject, head in sorted(heads.items(), key=lambda item: -item[1][1]):
-        x, y = panel.transData.transform(head)
-        lowered = y
-        while any(abs(x - px) < 95 and abs(lowered - py) < 13 for px, py in placed):
-            lowered -= 1
-        placed.append((x, lowered))
-        offset = (7, lowered - y)
-        text = {"fontsize": 9.5, "color": colours[subject], "va": "center", "textcoords": "offset pixels"}
-        panel.annotate(subject, head, offset, **text)  # type: ignore[arg-type]
 
 
 def _printable(figure: Figure) -> None:

@@ -20,7 +20,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, NotRequired, TypedDict, get_args
 
-from mi_refract.io.text import compact, distinguishable
+from mi_refract.io.text import beside_bound, compact
 
 from .embedded_images import EmbeddedImages, packed
 from .plots import Axes, Points, Scatter, curves_svg, drawable, scatter_svg
@@ -73,9 +73,29 @@ def prepare(rows: Sequence[Row], context: Mapping[str, Any], images: EmbeddedIma
     verdicts = Counter(row.verdict for row in rows)
     studies = by_study(rows)
     keys = {name: f"study-{number}" for number, name in enumerate(studies, 1)}
+    screen: dict[str, Any] = {}
     first: FirstPage | None = context.get("first_page")
+    if first:  # answers with links to the studies, panes of the image, SVG of the plot
+        screen = {"lead": first.get("lead", ""), "answers": [], "image": None, "plot": None}
+        for answer in first["answers"]:
+            if answer["state"] not in STATES:
+                raise ValueError(f"first page: state {answer['state']!r}; expected {', '.join(STATES)}")
+            link = "missing" if answer["study"] == NOT_RUN else keys.get(answer["study"], "")
+            screen["answers"].append({**answer, "link": link})
+        by_name = {row.name: row for row in rows}
+        for shown in filter(None, (first.get("image"), first.get("plot"))):
+            if shown["row"] not in by_name:
+                raise ValueError(f"first page: there is no row {shown['row']!r}")
+        if image := first.get("image"):
+            files = by_name[image["row"]].images
+            panes = [images.embed(files[role]) | {"role": role, "label": x} for role, x in image["labels"].items()]
+            screen["image"] = {"panes": panes, "caption": image["caption"]}
+        if plot := first.get("plot"):
+            curves = {label: by_name[plot["row"]].curves[name] for name, label in plot["labels"].items()}
+            svg = curves_svg(curves, Axes(**plot.get("axes", {})), salt="first", size=(6.2, 2.3))
+            screen["plot"] = {"svg": svg, "caption": plot["caption"]}
     return {
-        "first": first and _first_screen(rows, first, keys | {NOT_RUN: "missing"}, images),
+        "first": screen,
         "title": context.get("title", "mi_refract"),
         "state": "fail" if verdicts["fail"] else "pass" if verdicts["pass"] else "empty",
         "counts": [(word, verdicts[word]) for word in ("pass", "fail", NOT_RUN, "info")],
@@ -99,45 +119,18 @@ def not_run(rows: Sequence[Row]) -> dict[str, list[Row]]:
     return dict(sorted(groups.items(), key=lambda item: -len(item[1])))
 
 
-def _first_screen(
-    rows: Sequence[Row], page: FirstPage, anchors: Mapping[str, str], images: EmbeddedImages
-) -> dict[str, Any]:
-    """Answers with links (`anchors` by study), panes and SVG."""
-    by_name = {row.name: row for row in rows}
-    for answer in page["answers"]:
-        if answer["state"] not in STATES:
-            raise ValueError(f"first page: state {answer['state']!r}; expected {', '.join(STATES)}")
-    for shown in filter(None, (page.get("image"), page.get("plot"))):
-        if shown["row"] not in by_name:
-            raise ValueError(f"first page: there is no row {shown['row']!r}")
-    screen: dict[str, Any] = {"lead": page.get("lead", ""), "image": None, "plot": None}
-    screen["answers"] = [{**answer, "link": anchors.get(answer["study"], "")} for answer in page["answers"]]
-    if image := page.get("image"):
-        files = by_name[image["row"]].images
-        panes = [images.embed(files[role]) | {"role": role, "label": x} for role, x in image["labels"].items()]
-        screen["image"] = {"panes": panes, "caption": image["caption"]}
-    if plot := page.get("plot"):
-        curves = {label: by_name[plot["row"]].curves[name] for name, label in plot["labels"].items()}
-        svg = curves_svg(curves, Axes(**plot.get("axes", {})), salt="first", size=(6.2, 2.3))
-        screen["plot"] = {"svg": svg, "caption": plot["caption"]}
-    return screen
-
-
 # Cells ----------------------------------------------------------------------------------------------------------------
 
 
 def cell(row: Row, metric: str) -> dict[str, str] | None:
-    """Text, state and bound of a value; the bound with how the value compares: NaN is neither above nor below."""
+    """Text, state and bound of a value; the bound with how the value compares."""
     if metric not in row.values:
         return None
-    value = row.values[metric]
     if metric not in row.bounds:
-        return {"state": "info", "text": compact(value), "budget": ""}
-    bound = row.bounds[metric]
-    text, limit = distinguishable(value, bound)
+        return {"state": "info", "text": compact(row.values[metric]), "budget": ""}
+    text, budget = beside_bound(row.values[metric], row.bounds[metric])
     state = "fail" if metric in row.broken else "missed" if metric in row.missed else "pass"
-    sign = "≤" if value <= bound else ">" if value > bound else "≰"
-    return {"state": state, "text": text, "budget": f"{sign} {limit}"}
+    return {"state": state, "text": text, "budget": budget}
 
 
 def phrase(row: Row, metric: str) -> str:
@@ -218,7 +211,14 @@ def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | No
     parts: dict[str, list[Row]] = {}
     for row in rows:
         parts.setdefault(row.setting, []).append(row)
-    matrices = {setting: _matrix(part, metrics, scale) for setting, part in parts.items()}
+    matrices: dict[str, dict[str, Any] | None] = dict.fromkeys(parts)
+    for setting, part in parts.items():
+        telling = [row for row in part if metrics[0] in row.values or row.broken]
+        subjects, cases = (dict.fromkeys(getattr(row, label) for row in telling) for label in ("subject", "case"))
+        cells = {(row.subject, row.case): row for row in part}
+        if len(subjects) >= 3 and len(cases) >= 3 and len(cells) == len(part) and scale is not None:
+            lines = [(s, [_shade(cells.get((s, c)), metrics[0], scale) for c in cases]) for s in subjects]
+            matrices[setting] = {"metric": metrics[0], "cases": list(cases), "lines": lines}
     if any(matrices.values()):
         return [{"heading": s, "matrix": matrices[s], "table": _table(part, metrics, s)} for s, part in parts.items()]
     groups: list[tuple[set[str], list[int]]] = []  # metrics, and the places of the rows that have any of them
@@ -232,16 +232,6 @@ def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | No
     groups.sort(key=lambda group: group[1])
     tables = [_table([rows[place] for place in places], metrics) for _, places in groups]
     return [{"heading": "", "matrix": None, "table": table} for table in tables]
-
-
-def _matrix(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> dict[str, Any] | None:
-    telling = [row for row in rows if metrics[0] in row.values or row.broken]
-    subjects, cases = ({getattr(row, label): None for row in telling} for label in ("subject", "case"))
-    cells = {(row.subject, row.case): row for row in rows}
-    if len(subjects) < 3 or len(cases) < 3 or len(cells) < len(rows) or scale is None:
-        return None
-    lines = [(s, [_shade(cells.get((s, c)), metrics[0], scale) for c in cases]) for s in subjects]
-    return {"metric": metrics[0], "cases": list(cases), "lines": lines}
 
 
 def _table(rows: list[Row], metrics: list[str], heading: str = "") -> dict[str, Any]:
