@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mi_refract.cluster.connection import ClusterTarget
-from mi_refract.io import atomic
-from mi_refract.io.sanitise import printable
+from mi_refract.io import safe_files
+from mi_refract.io.text import printable
 from validation.run import command_line
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def _command(
             rendered_images.join(system.join(folder))
     target.check()
     try:
-        with atomic.held(out / LOCK, "a validation"):
+        with safe_files.held(out / LOCK, "a validation"):
             return _run(names, profile, out, write_tables, goals, target)
     except KeyboardInterrupt:
         print("validation: interrupted; run the same command again to resume", file=sys.stderr)

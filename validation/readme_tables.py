@@ -15,11 +15,11 @@ from mi_refract.formulas import FORMULAS
 from mi_refract.image_diff import self_test
 from mi_refract.image_diff.methods import METHODS
 from mi_refract.io import image_file
-from mi_refract.io.atomic import update_between, write_atomically
 from mi_refract.io.pixels import srgb_encode
+from mi_refract.io.safe_files import update_between, write_atomically
+from mi_refract.io.text import compact
 from mi_refract.plugins import PLUGIN
 from mi_refract.report.embedded_images import png
-from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
 from validation.diff import visible_changes
 from validation.directions import per_formula

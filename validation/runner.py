@@ -26,9 +26,9 @@ from typing import Any
 import mi_refract
 from mi_refract.cluster import connection, on_worker
 from mi_refract.cluster import workers as calls
-from mi_refract.io.atomic import write_atomically
 from mi_refract.io.image_file import installed_version
-from mi_refract.io.sanitise import printable
+from mi_refract.io.safe_files import write_atomically
+from mi_refract.io.text import printable
 from mi_refract.report.row import Row
 from validation.run.context import SCENES, Context, here
 from validation.suite.renderers import SYSTEMS, environments

@@ -23,7 +23,7 @@ except ModuleNotFoundError as missing:
 
 from mi_refract import __version__
 from mi_refract.io.errors import exit_code
-from mi_refract.io.sanitise import printable
+from mi_refract.io.text import printable
 
 
 class Command(NamedTuple):

@@ -20,10 +20,10 @@ from mi_refract.image_diff import folders, pairing, text_reports
 from mi_refract.image_diff.methods import AUTO, METHODS
 from mi_refract.image_diff.results import Status
 from mi_refract.image_diff.settings import FILE, Settings, from_words, key_tables, load
-from mi_refract.io.atomic import writable
 from mi_refract.io.errors import MISUSE
 from mi_refract.io.image_file import MAX_VALUES
-from mi_refract.io.sanitise import printable
+from mi_refract.io.safe_files import writable
+from mi_refract.io.text import printable
 
 Inconclusive = enum.StrEnum("Inconclusive", {"PASS": "pass", "FAIL": "fail"})  # what such an image counts as
 

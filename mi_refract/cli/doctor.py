@@ -9,7 +9,7 @@ import typer
 
 from mi_refract import __version__, backend
 from mi_refract.io.image_file import installed_version
-from mi_refract.io.sanitise import json_text, printable_lines
+from mi_refract.io.text import json_text, printable_lines
 
 from .interrupts import as_exceptions
 
@@ -25,19 +25,15 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] 
         "versions": {"mi_refract": __version__, "python": sys.version.split()[0]} | versions,
         "advice": backend.advice(),
     }
-    print(json_text(facts, indent=2) if as_json else printable_lines(_as_text(facts)))
-    if None not in facts["variants"].values():
-        raise ValueError("no Mitsuba variant can run on this machine")
-
-
-def _as_text(facts: dict[str, Any]) -> str:
-    variants = {name: "usable" if reason is None else f"no: {reason}" for name, reason in facts["variants"].items()}
-    tables = {"variants": variants, "libLLVM": facts["libllvm"] or {"none found": ""}, "versions": facts["versions"]}
+    shown = {name: "usable" if reason is None else f"no: {reason}" for name, reason in facts["variants"].items()}
+    tables = {"variants": shown, "libLLVM": libraries or {"none found": ""}, "versions": facts["versions"]}
     lines = []
     for title, table in tables.items():
         width = max(map(len, table))
         lines += [title, *(f"  {name:{width}}  {text}".rstrip() for name, text in table.items()), ""]
-    return "\n".join([*lines, facts["advice"]])
+    print(json_text(facts, indent=2) if as_json else printable_lines("\n".join([*lines, facts["advice"]])))
+    if None not in facts["variants"].values():
+        raise ValueError("no Mitsuba variant can run on this machine")
 
 
 def probe(*, every_backend: bool = True) -> None:

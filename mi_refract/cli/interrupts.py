@@ -31,12 +31,12 @@ def end_at_once(*, even_if_ignored: bool) -> None:
     ignored = {number for number in _ENDING if signal.getsignal(number) is signal.SIG_IGN}
     _blocked.update(_ENDING - ignored | {signal.SIGINT})  # Mitsuba's handler would take it even where it is ignored
     signal.pthread_sigmask(signal.SIG_BLOCK, _blocked)
-    from mi_refract.io import atomic  # it takes longer than all before it
+    from mi_refract.io import safe_files  # it takes longer than all before it
 
     if waited := _blocked - (set() if even_if_ignored else ignored):
         for number in waited:  # macOS does not queue what is ignored
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else _exit)
-        threading.Thread(target=_watch, args=(atomic.end_process, waited), name="Ctrl-C", daemon=True).start()
+        threading.Thread(target=_watch, args=(safe_files.end_process, waited), name="Ctrl-C", daemon=True).start()
 
 
 @contextlib.contextmanager

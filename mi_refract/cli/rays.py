@@ -14,9 +14,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from mi_refract.io.atomic import writable
 from mi_refract.io.image_file import provenance
-from mi_refract.io.sanitise import printable
+from mi_refract.io.safe_files import writable
+from mi_refract.io.text import printable
 from mi_refract.ray_sets import files, ray_set
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.regimes import REGIMES

@@ -18,7 +18,7 @@ from mi_refract.cluster import on_worker
 from mi_refract.cluster.connection import ClusterTarget, connected
 from mi_refract.cluster.workers import Workers
 from mi_refract.io.errors import UsageError
-from mi_refract.io.sanitise import printable
+from mi_refract.io.text import printable
 from mi_refract.rendering import scene_files
 
 from . import interrupts
@@ -95,7 +95,7 @@ def render(
     An interrupted render resumes from its checkpoint; a finished image with fewer samples is refined. The scene may
     use the plugins `refract` and `refract_path`, which Mitsuba's own executable does not know.
     """
-    from mi_refract.io.atomic import writable
+    from mi_refract.io.safe_files import writable
 
     defines = scene_files.parse_defines(define or [])
     cluster = ClusterTarget(scheduler, workers)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from mi_refract.io.sanitise import printable
+from mi_refract.io.text import printable
 from mi_refract.rendering import scene_files
 
 from .doctor import activate

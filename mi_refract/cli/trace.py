@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from mi_refract.io import atomic
-from mi_refract.io.sanitise import json_text
+from mi_refract.io import safe_files
+from mi_refract.io.text import json_text
 from mi_refract.planar import figure, focal_points, light, scene_file
 from mi_refract.planar.path_tree import as_data, follow_scene, summary, with_rays
 
@@ -56,7 +56,7 @@ def trace(
     """Trace the rays of a planar scene; draw them, print their paths, or print focal points."""
     probe()
     if output:
-        atomic.writable(output, figure.FORMATS)
+        safe_files.writable(output, figure.FORMATS)
         figure.require_matplotlib()
     screen = focal_points.plane(plane) if plane else None
     loaded = scene_file.load(scene, light.parsed(wavelengths) if wavelengths else None)

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refract.io import image_file, regular_file
-from mi_refract.io.atomic import replacing
+from mi_refract.io import image_file, safe_files
 from mi_refract.io.errors import describe
+from mi_refract.io.safe_files import replacing
 
 from . import pairing
 from .folders import digest
@@ -97,7 +97,7 @@ def accept(copies: Sequence[Copy]) -> None:
         for copy in copies:
             copy.reference.parent.mkdir(parents=True, exist_ok=True)
             temporary, copied = unfinished.enter_context(replacing(copy.reference)), hashlib.sha256()
-            with regular_file.opened(copy.new, sys.maxsize) as file, temporary.open("wb") as target:
+            with safe_files.opened(copy.new, sys.maxsize) as file, temporary.open("wb") as target:
                 while block := file.read(BLOCK):
                     copied.update(block)
                     target.write(block)

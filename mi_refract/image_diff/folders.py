@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from mi_refract.io import errors, image_file, regular_file
+from mi_refract.io import errors, image_file, safe_files
 from mi_refract.io.image_file import Image, bounded_map, one_line
 
 from . import file_pair, pairing
@@ -177,8 +177,8 @@ def _judged(result: Result, roots: tuple[Path, Path], read: Read) -> Result:
 
 
 def digest(path: Path | None) -> str:
-    """The SHA-256 of a file's bytes; "" where there is none. OSError, and ValueError, as `regular_file.opened`."""
+    """The SHA-256 of a file's bytes; "" where there is none. OSError, and ValueError, as `safe_files.opened`."""
     if path is None or not path.exists():
         return ""
-    with regular_file.opened(path, sys.maxsize) as file:
+    with safe_files.opened(path, sys.maxsize) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 
 from mi_refract.io import errors
-from mi_refract.io.atomic import write_atomically
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels, block_mean
+from mi_refract.io.safe_files import write_atomically
+from mi_refract.io.text import compact, distinguishable
+from mi_refract.report.documents import rendered
 from mi_refract.report.embedded_images import EmbeddedImages, encoded, strongest
-from mi_refract.report.html_page import rendered
-from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.plots import histogram_svg
 
 from . import flip

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels, any_channel
-from mi_refract.report.number_text import compact, distinguishable
+from mi_refract.io.text import compact, distinguishable
 
 from .comparison import Comparison, Metric, Verdict, counted, place, verdict_of
 from .tile_statistics import median_nonblack, same_shape

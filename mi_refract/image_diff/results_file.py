@@ -15,8 +15,8 @@ from typing import Annotated, Any
 
 import msgspec
 
-from mi_refract.io import regular_file
-from mi_refract.io.atomic import write_atomically
+from mi_refract.io import safe_files
+from mi_refract.io.safe_files import write_atomically
 from mi_refract.io.typed_table import convert
 from mi_refract.report.row import strict
 
@@ -128,7 +128,7 @@ def read(path: str | Path, reference: Path | None = None, test: Path | None = No
     two; OSError where it cannot be read.
     """
     try:
-        data = json.loads(regular_file.read_bytes(path, MOST))
+        data = json.loads(safe_files.read_bytes(path, MOST))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not JSON ({error}); {EXPECTED}") from None
     schema = data.get("schema") if isinstance(data, dict) else None

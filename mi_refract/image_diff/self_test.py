@@ -23,7 +23,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from mi_refract.io import atomic, image_file
+from mi_refract.io import image_file, safe_files
 from mi_refract.io.pixels import Pixels, block_mean, srgb_decode, srgb_encode
 from mi_refract.report.row import Row
 
@@ -93,7 +93,7 @@ def _blurred(image: Pixels) -> Pixels:
 def through_a_file(image: Pixels, share: float = 1.0) -> Pixels:
     """The image written as EXR, cut to a share of the bytes, and read again. ValueError for what cannot be read."""
     channels = image_file.named("", image).channels
-    with atomic.temporary_folder() as folder:
+    with safe_files.temporary_folder() as folder:
         path = folder / "image.exr"
         image_file.write_exr(path, image, channels)
         path.write_bytes((data := path.read_bytes())[: int(share * len(data))])

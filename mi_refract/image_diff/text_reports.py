@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Literal
 from urllib.parse import quote
 
-from mi_refract.io.sanitise import printable
-from mi_refract.report.number_text import compact, distinguishable
+from mi_refract.io.text import compact, distinguishable, printable
 
 from .results import FAILED, Result, Results, Status
 
@@ -125,7 +124,7 @@ def write_junit(path: str | Path, results: Results) -> None:
 
     Errors: OSError.
     """
-    from mi_refract.report import junit
+    from mi_refract.report import documents
 
     cases = []
     for result in results.results:
@@ -141,8 +140,8 @@ def write_junit(path: str | Path, results: Results) -> None:
                 if metric.bound is not None:
                     value, bound = distinguishable(metric.value, metric.bound)
                 details.append(f"{metric.name} {value}" + (f" (allowed {bound})" if bound else ""))
-        cases.append(junit.Case(result.method, result.name, outcome, message, details, kind))
-    junit.write_junit(path, "mi-refract diff", {str(results.test): cases})
+        cases.append(documents.Case(result.method, result.name, outcome, message, details, kind))
+    documents.write_junit(path, "mi-refract diff", {str(results.test): cases})
 
 
 def _outcome(results: Results, result: Result) -> Literal["", "failure", "error"]:

@@ -13,7 +13,7 @@ import sys
 import traceback
 from collections.abc import Callable
 
-from .sanitise import printable
+from .text import printable
 
 MISUSE, INTERRUPTED = 2, 130
 TRACEBACK = "MI_REFRACT_TRACEBACK"  # environment variable: with "1" the traceback is printed as well
@@ -52,9 +52,7 @@ class NoWorkersError(MiRefractError, ConnectionError):
 
 
 def exit_code(
-    name: str,
-    body: Callable[[], int | None],
-    interruptions: tuple[type[BaseException], ...] = (KeyboardInterrupt,),
+    name: str, body: Callable[[], int | None], interruptions: tuple[type[BaseException], ...] = (KeyboardInterrupt,)
 ) -> int:
     """What `body()` returns, None as 0; 2 after any exception, and 130 after Ctrl-C or one of `interruptions`.
 
@@ -62,7 +60,18 @@ def exit_code(
     that cannot be written is an exception as well. A standard stream that is closed is replaced by the null device, so
     that no file of ours takes its number.
     """
-    _open_streams()
+    for number, (stream, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        if getattr(sys, stream) is None:
+            try:
+                os.fstat(number)
+            except OSError:
+                if (null := os.open(os.devnull, os.O_RDWR)) != number:
+                    os.dup2(null, number)
+                    os.close(null)
+            setattr(sys, stream, open(number, mode, closefd=False))  # noqa: SIM115 (it lasts as long as the process)
+    for output in (sys.stdout, sys.stderr):  # no character is one that they cannot print
+        if hasattr(output, "reconfigure") and output.errors in ("strict", "surrogateescape"):
+            output.reconfigure(errors="backslashreplace")
     try:
         code = body() or 0
         sys.stdout.flush()
@@ -115,24 +124,3 @@ def _failed(name: str, error: BaseException) -> int:
             with contextlib.suppress(OSError, ValueError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())
     return MISUSE
-
-
-def _open_streams() -> None:
-    """Open what is closed of stdin, stdout and stderr, and let no character be one that stdout cannot print."""
-    for number, (stream, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
-        if getattr(sys, stream) is None:
-            _occupy(number)
-            setattr(sys, stream, open(number, mode, closefd=False))  # noqa: SIM115 (it lasts as long as the process)
-    for output in (sys.stdout, sys.stderr):
-        if hasattr(output, "reconfigure") and output.errors in ("strict", "surrogateescape"):
-            output.reconfigure(errors="backslashreplace")
-
-
-def _occupy(number: int) -> None:
-    try:
-        os.fstat(number)
-    except OSError:
-        null = os.open(os.devnull, os.O_RDWR)
-        if null != number:
-            os.dup2(null, number)
-            os.close(null)

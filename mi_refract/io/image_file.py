@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import atomic
+from . import safe_files
 from .errors import ImageError
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def write_exr(
     """
     import OpenImageIO as oiio
 
-    path = atomic.writable(path, SUFFIXES)
+    path = safe_files.writable(path, SUFFIXES)
     pixels = np.ascontiguousarray(pixels, dtype=np.float32)
     if pixels.ndim != 3 or pixels.size == 0 or pixels.shape[2] != len(channels):
         raise ValueError(f"{path}: pixels of shape {pixels.shape}; expected H × W × {len(channels)} {tuple(channels)}")
@@ -67,7 +67,7 @@ def write_exr(
             raise ValueError(f"{path}: attribute {name} = {value!r}; expected str, int, float")
         spec.attribute(name, str(value) if isinstance(value, int) and not -(2**31) <= value < 2**31 else value)
     try:
-        with atomic.replacing(path, suffix=".exr") as temporary:  # OpenImageIO tells the format by the name
+        with safe_files.replacing(path, suffix=".exr") as temporary:  # OpenImageIO tells the format by the name
             output = oiio.ImageOutput.create(str(temporary))
             if output is None:
                 raise OSError(one_line(oiio.geterror()))
@@ -138,8 +138,23 @@ def read_parts(path: str | os.PathLike[str], max_values: int = MAX_VALUES, *, fi
     """
     path = Path(path)
     source, kind = _checked(path, max_values)
+    found: list[Image] = []
     try:
-        return _images(path, source, kind, max_values, first_only)
+        for part in _parts(source):
+            image = _image(path, source, kind, (max_values, sum(each.pixels.size for each in found)))
+            found.append(replace(image, part=part))
+            if first_only:
+                break
+        if not found:
+            raise ImageError(f"{path}: corrupt {kind} file: {_without(path, source.geterror()) or 'no image'}")
+        several = found[-1].part[0] > 0 or (first_only and source.seek_subimage(1, 0))
+        levelled = {image.part[0] for image in found if image.part[1]}
+        levelled |= {0} if first_only and source.seek_subimage(0, 1) else set()
+        for number, image in enumerate(found):
+            words = [f"part {image.part[0]}"] * several
+            words += [f"MIP level {image.part[1]}"] * (image.part[0] in levelled)
+            found[number] = replace(image, place=", ".join(words))
+        return found
     except MemoryError:
         raise ImageError(f"{path}: more pixels than fit in memory") from None
     finally:
@@ -251,26 +266,6 @@ def named(name: str, pixels: ArrayLike) -> Image:
     count = pixels.shape[2]
     channels = tuple("RGBA"[:count]) if 3 <= count <= 4 else tuple(f"channel{i}" for i in range(count))
     return Image(Path(name), pixels, channels)
-
-
-def _images(path: Path, source: ImageInput, kind: str, most: int, first_only: bool) -> list[Image]:
-    """The images of an open file, in the order of parts and MIP levels, with their places."""
-    found: list[Image] = []
-    for part in _parts(source):
-        image = _image(path, source, kind, (most, sum(each.pixels.size for each in found)))
-        found.append(replace(image, part=part))
-        if first_only:
-            break
-    if not found:
-        raise ImageError(f"{path}: corrupt {kind} file: {_without(path, source.geterror()) or 'no image'}")
-    several = found[-1].part[0] > 0 or (first_only and source.seek_subimage(1, 0))
-    levelled = {image.part[0] for image in found if image.part[1]}
-    levelled |= {0} if first_only and source.seek_subimage(0, 1) else set()
-    places = [
-        ", ".join([f"part {part}"] * several + [f"MIP level {level}"] * (part in levelled))
-        for part, level in (image.part for image in found)
-    ]
-    return [replace(image, place=place) for image, place in zip(found, places, strict=True)]
 
 
 def _parts(source: ImageInput) -> Iterator[tuple[int, int]]:

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_refract.io.atomic import write_atomically
 from mi_refract.io.pixels import srgb_encode
+from mi_refract.io.safe_files import write_atomically
 
 from .curves import points
 from .light import linear_srgb

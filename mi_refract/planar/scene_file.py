@@ -16,8 +16,8 @@ import numpy as np
 from msgspec import Meta, Struct, field
 from numpy.typing import NDArray
 
-from mi_refract.io import regular_file
-from mi_refract.io.sanitise import printable
+from mi_refract.io import safe_files
+from mi_refract.io.text import printable
 from mi_refract.io.typed_table import key_table, kind_table, parse_toml
 
 from . import shapes
@@ -308,7 +308,7 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; expected a scene file")
-    table = parse_toml(regular_file.read_bytes(path, SIZE), SceneTable, str(path))
+    table = parse_toml(safe_files.read_bytes(path, SIZE), SceneTable, str(path))
     title = table.title or path.stem
     texts = title, printable(path.name), printable(" ".join(title.split()))
     chosen = table.wavelengths if wavelengths is None else wavelengths

@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refract.formulas import FORMULAS
-from mi_refract.io import image_file, regular_file
+from mi_refract.io import image_file, safe_files
 from mi_refract.numerics import Properties, Scene
 
 from .index_parameter import PLUGIN
@@ -161,7 +161,7 @@ def require_file(path: Path) -> None:
     with contextlib.suppress(OSError):
         if not path.exists() or path.is_dir():
             return
-    with regular_file.opened(path, sys.maxsize):
+    with safe_files.opened(path, sys.maxsize):
         pass
 
 

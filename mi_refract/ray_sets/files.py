@@ -28,10 +28,10 @@ from typing import Any, BinaryIO, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_refract.io import process_group, regular_file
-from mi_refract.io.atomic import writable, write_atomically
+from mi_refract.io import process_group, safe_files
 from mi_refract.io.errors import TooMuchOutputError
 from mi_refract.io.image_file import one_line
+from mi_refract.io.safe_files import writable, write_atomically
 from mi_refract.regimes import Array, Rays
 
 from . import header as headers
@@ -220,7 +220,7 @@ def _read(path: Path, layouts: Sequence[Layout], most: int, made: Callable[[Tabl
         raise ValueError(f"{path}: expected a file name that ends in {' or '.join(SUFFIXES)}")
     numbers = most * _NUMBER_BYTES * max(map(len, layouts))
     largest = numbers + _NPZ_MORE_BYTES if suffix == ".npz" else most * _ROW_BYTES + _TOP_BYTES
-    with regular_file.opened(path, largest) as stream:
+    with safe_files.opened(path, largest) as stream:
         try:
             return made(_READERS[suffix](stream, layouts, most))
         except ValueError as error:

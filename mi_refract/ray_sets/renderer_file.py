@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from mi_refract.io import regular_file
+from mi_refract.io import safe_files
 from mi_refract.io.typed_table import key_table, parse_toml
 
 NAME = "mi-refract-renderer.toml"
@@ -121,7 +121,7 @@ class RendererFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def load(folder: str | Path) -> RendererFile:
     """The renderer of a folder. ValueError, one line that names file and key; OSError where there is no such file."""
     path = Path(folder) / NAME
-    return parse_toml(regular_file.read_bytes(path, SIZE), RendererFile, str(path))
+    return parse_toml(safe_files.read_bytes(path, SIZE), RendererFile, str(path))
 
 
 def filled(command: tuple[str, ...], **values: object) -> list[str]:

@@ -9,13 +9,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mi_refract.io.atomic import write_atomically
-from mi_refract.io.sanitise import printable
+from mi_refract.io.safe_files import write_atomically
+from mi_refract.io.text import compact, printable
 from mi_refract.regimes import REGIMES
-from mi_refract.report import junit
+from mi_refract.report import documents
+from mi_refract.report.documents import write_page
 from mi_refract.report.embedded_images import EmbeddedImages
-from mi_refract.report.html_page import write_page
-from mi_refract.report.number_text import compact
 from mi_refract.report.row import strict
 
 from .check_answers import Findings, Problem, RegimeErrors
@@ -202,21 +201,21 @@ def write_json(path: str | Path, findings: Findings) -> None:
 
 def write_junit(path: str | Path, findings: Findings, name: str) -> None:
     """One test case per regime, and one for the set of answers: an error where they do not match the rays."""
-    answers = junit.Case("answers", "complete and understood")
+    answers = documents.Case("answers", "complete and understood")
     if not findings.answered or findings.problems or findings.tir == UNCLEAR:
         lines = [*map(problem_text, findings.problems), *ratio(findings), signal(findings)]
         outcome: Literal["error", "failure"] = "error" if findings.exit_code == 2 else "failure"
-        answers = junit.Case(answers.group, answers.name, outcome, lines[0], lines)
+        answers = documents.Case(answers.group, answers.name, outcome, lines[0], lines)
     cases = [answers]
     for errors in findings.regimes:
-        case = junit.Case("rays", errors.regime)
+        case = documents.Case("rays", errors.regime)
         if errors.wrong:
             wrong = f"{errors.wrong} of {errors.rays} answers are wrong"
             numbers = [f"{key} {text}" for key, text in cells(errors, findings.ulp).items()]
             lines = [wrong, *explained(findings), *numbers, json.dumps(strict(errors.replay))]
-            case = junit.Case("rays", errors.regime, "failure", wrong, lines)
+            case = documents.Case("rays", errors.regime, "failure", wrong, lines)
         cases.append(case)
-    junit.write_junit(path, "mi-refract rays", {name: cases})
+    documents.write_junit(path, "mi-refract rays", {name: cases})
 
 
 def write_html(path: str | Path, findings: Findings, context: Mapping[str, Any], replay: str = "") -> None:

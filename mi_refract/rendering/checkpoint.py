@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from mi_refract.io.atomic import replacing
 from mi_refract.io.errors import CheckpointError
+from mi_refract.io.safe_files import replacing
 
 from .pass_sums import ARRAYS, PassSums, PassTree
 

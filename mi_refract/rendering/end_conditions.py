@@ -15,11 +15,14 @@ stratifies them their mean varies less, Var(x̄) ≤ s²/n for strata of equal p
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import math
 from dataclasses import dataclass
 
 import numpy as np
+
+from mi_refract.io.pixels import block_sum
 
 from .pass_plan import FEW
 from .pass_sums import Doubles, PassSums
@@ -59,7 +62,11 @@ def relative_error(sums: PassSums) -> RelativeError:
         known = np.isfinite(variance := variance[..., : sums.colours])
         squared = float(variance[known].mean())
     if found.size > 1:
-        spread = _quantile(found.size - 1) * float(found.std(ddof=1)) * math.sqrt(1 + 1 / found.size)
+        with contextlib.suppress(ImportError):  # without SciPy, which is an extra, there is no interval
+            from scipy.stats import t  # takes a second
+
+            quantile = float(t.ppf((1 + LEVEL) / 2, found.size - 1))
+            spread = quantile * float(found.std(ddof=1)) * math.sqrt(1 + 1 / found.size)
     value, low, high = (math.sqrt(max(x, 0) / sums.spp) / mean for x in (squared, squared - spread, squared + spread))
     return RelativeError(value, low, high, at_most)
 
@@ -81,15 +88,6 @@ def require_interval() -> None:
         raise ImportError("--until needs SciPy; expected pip install 'mi-refract[diff]', or --until-tile")
 
 
-def _quantile(freedom: int) -> float:
-    """Of Student's distribution; NaN without SciPy, which is an extra."""
-    try:
-        from scipy.stats import t  # takes a second
-    except ImportError:
-        return math.nan
-    return float(t.ppf((1 + LEVEL) / 2, freedom))
-
-
 def worst_tile(sums: PassSums) -> float:
     """The relative error of the worst tile of TILE² pixels but LEFT_OUT of them; NaN where too little is known."""
     variance = sums.variance
@@ -105,14 +103,11 @@ def worst_tile(sums: PassSums) -> float:
 def _tile_means(values: Doubles) -> Doubles:
     """Means over tiles and channels, of what is finite; NaN for a tile where nothing is."""
     known = np.isfinite(values)
-    rows, columns = (np.arange(0, n, TILE) for n in values.shape[:2])
-
-    def over_tiles(each: Doubles) -> Doubles:
-        return np.asarray(np.add.reduceat(np.add.reduceat(each.sum(-1), rows, 0), columns, 1))
-
-    counts = over_tiles(known.astype(np.float64))
+    sums, counts = (
+        block_sum(each.sum(-1, keepdims=True), TILE)[..., 0] for each in (np.where(known, values, 0), known)
+    )
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(over_tiles(np.where(known, values, 0)) / counts)
+        return np.asarray(sums / counts, np.float64)
 
 
 @dataclass(frozen=True)

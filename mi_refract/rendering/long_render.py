@@ -21,10 +21,10 @@ import numpy as np
 
 from mi_refract import backend
 from mi_refract.cluster import on_worker
-from mi_refract.io import atomic
-from mi_refract.io.atomic import writable
+from mi_refract.io import safe_files
 from mi_refract.io.image_file import SUFFIXES, Metadata, installed_version, provenance
-from mi_refract.io.sanitise import printable
+from mi_refract.io.safe_files import writable
+from mi_refract.io.text import printable
 from mi_refract.numerics import Scene
 from mi_refract.plugins.scene_parser import ParsedScene
 
@@ -153,7 +153,7 @@ class LongRender:
         `passes`: where they are rendered, by default in this process. On any error what is done stays in the
         checkpoint. BlockingIOError where another process renders into the same file, or did so since `resume`.
         """
-        with atomic.held(lock_of(self.output), "a render", self.output, "another file"):
+        with safe_files.held(lock_of(self.output), "a render", self.output, "another file"):
             if self._file_stamps() != self._files_before:
                 raise BlockingIOError(
                     f"{self.output}: written by another render in the meantime; run the command again"

@@ -10,9 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from mi_refract.io.sanitise import printable_lines
-
-from .number_text import compact
+from mi_refract.io.text import compact, printable_lines
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Panel

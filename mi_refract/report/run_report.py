@@ -12,13 +12,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mi_refract.io.atomic import write_atomically
-from mi_refract.io.sanitise import printable
+from mi_refract.io.safe_files import write_atomically
+from mi_refract.io.text import distinguishable, printable
 
-from . import junit, study_page
+from . import documents, study_page
+from .documents import write_page
 from .embedded_images import EmbeddedImages
-from .html_page import write_page
-from .number_text import distinguishable
 from .row import SCHEMA, Row, by_study, strict
 
 if TYPE_CHECKING:
@@ -55,10 +54,10 @@ def write_junit(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any
     Rows without a budget are left out: a case that cannot fail is no test. Errors: OSError.
     """
 
-    def cases(row: Row) -> Iterator[junit.Case]:
+    def cases(row: Row) -> Iterator[documents.Case]:
         name = " / ".join((row.subject, row.case, row.setting))
         if not row.values:
-            yield junit.Case(row.study, name, "skipped", row.reason)
+            yield documents.Case(row.study, name, "skipped", row.reason)
             return
         for metric, budget in row.budgets.items():
             if metric in row.broken:
@@ -66,12 +65,12 @@ def write_junit(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any
                 details = f"value {row.values[metric]!r}, budget {budget!r}\n{row.reason}\n{row.replay_text}"
                 lines = [line for line in details.splitlines() if line]
                 message = f"{metric} {text}, budget {limit}"
-                yield junit.Case(row.study, f"{name}: {metric}", "failure", message, lines)
+                yield documents.Case(row.study, f"{name}: {metric}", "failure", message, lines)
             else:
-                yield junit.Case(row.study, f"{name}: {metric}")
+                yield documents.Case(row.study, f"{name}: {metric}")
 
     suites = {study: [case for row in members for case in cases(row)] for study, members in by_study(rows).items()}
-    junit.write_junit(path, context.get("title", "mi_refract"), suites)
+    documents.write_junit(path, context.get("title", "mi_refract"), suites)
 
 
 def summary(rows: Sequence[Row], context: Mapping[str, Any] | None = None) -> RenderableType:

@@ -20,8 +20,9 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, NotRequired, TypedDict, get_args
 
+from mi_refract.io.text import compact, distinguishable
+
 from .embedded_images import EmbeddedImages, packed
-from .number_text import compact, distinguishable
 from .plots import Axes, Points, Scatter, curves_svg, drawable, scatter_svg
 from .row import Row, as_json, by_study
 

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from mi_refract.io import atomic
+from mi_refract.io import safe_files
 
 from .plain_scene import PlainScene
 from .targets import luxcore, mitsuba, povray, radiance, scene_json
@@ -37,9 +37,9 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
             raise FileExistsError(f"{folder}: already contains files; expected a new folder or an empty one")
     elif place.exists():
         raise NotADirectoryError(f"{folder}: is not a folder; expected a new folder or an empty one")
-    atomic.check_parent(place)
+    safe_files.check_parent(place)
     files = TARGETS[target](plain)
-    with atomic.replacing(place, folder=True) as temporary:
+    with safe_files.replacing(place, folder=True) as temporary:
         for name, content in files.items():
             (temporary / name).write_bytes(content)
     return [Path(folder) / name for name in sorted(files)]

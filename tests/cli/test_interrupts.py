@@ -80,14 +80,14 @@ import sys, time
 from pathlib import Path
 from mi_refract import cli
 from mi_refract.cli import app
-from mi_refract.io import atomic
-remove = atomic._remove
+from mi_refract.io import safe_files
+remove = safe_files._remove
 def remove_slowly(temporary):
     remove(temporary)
     time.sleep(0.05)
-atomic._remove = remove_slowly
+safe_files._remove = remove_slowly
 def command(arguments):
-    with atomic.temporary_folder() as folder, atomic.replacing(Path(sys.argv[1], "file")) as file:
+    with safe_files.temporary_folder() as folder, safe_files.replacing(Path(sys.argv[1], "file")) as file:
         (folder / "half").touch()
         print("there", flush=True)
         while file.exists():

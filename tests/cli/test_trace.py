@@ -213,12 +213,12 @@ def test_ctrl_c_leaves_nothing_half_written(ball):
     code = """
 import signal, sys, time
 from mi_refract import cli
-from mi_refract.io import atomic
+from mi_refract.io import safe_files
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job of a script ignores it
 def slow(self, target):
     print("written", flush=True)
     time.sleep(60)
-atomic.Path.replace = slow
+safe_files.Path.replace = slow
 sys.exit(cli.main())
 """
     folders = [str(Path(app.__file__).parents[2]), *filter(None, sys.path)]

@@ -16,7 +16,7 @@ from support.hostile import BIDI, CONTROLS, NAME, shows_more_than_text
 
 from mi_refract import cli
 from mi_refract.io.errors import exit_code
-from mi_refract.io.sanitise import MARK, json_text, printable, printable_lines
+from mi_refract.io.text import MARK, json_text, printable, printable_lines
 
 ENVIRONMENT = processes.ENVIRONMENT | {"PYTHONUNBUFFERED": ""}  # what a test prints waits, as it does for most users
 

@@ -156,12 +156,20 @@ def test_an_integrator_that_does_not_ask_and_colours_have_the_index_of_the_d_lin
     assert not int(bent.type) & DISPERSED
 
 
+SPECTRUM = '<spectrum name="int_ior" value="360:1.5, 600:1.5, 600.00000001:1.6, 830:1.6"/>'
+JUMP = f'<bsdf type="refract" version="3.0.0">{SPECTRUM}<float name="ext_ior" value="1"/></bsdf>'
+
+
 def test_a_spectrum_may_jump_between_knots_that_agree_to_nine_digits(spectral_variant):
-    spectrum = '<spectrum name="int_ior" value="360:1.5, 600:1.5, 600.00000001:1.6, 830:1.6"/>'
-    bsdf = mi.load_string(f'<bsdf type="refract" version="3.0.0">{spectrum}<float name="ext_ior" value="1"/></bsdf>')
+    bsdf = mi.load_string(JUMP)
     for wavelength, index in ((500.0, 1.5), (700.0, 1.6)):
         bent = sample(bsdf, tilted(0.5), REFRACTED, (wavelength, 500.0, 600.0, 700.0))
         assert bent.wo[0] == pytest.approx(-math.sin(0.5) / index, rel=1e-6)
+
+
+def test_a_spectrum_is_no_index_where_it_becomes_a_colour(scalar_variant):
+    with pytest.raises(RuntimeError, match=r"int_ior: this variant makes a spectrum a colour; .*'table\(360.0: 1.5, "):
+        mi.load_string(JUMP)
 
 
 def test_a_medium_whose_range_leaves_out_colour_is_refused(spectral_variant):

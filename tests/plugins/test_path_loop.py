@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from support.glass_scenes import GLASS, PLACE
 
-from mi_refract.plugins import path_loop
+from mi_refract.plugins import path_loop, sampling
+from mi_refract.rendering.scene_files import REPRODUCIBLE
 
 pytestmark = pytest.mark.usefixtures("scalar_variant")
 
@@ -143,6 +144,28 @@ def test_a_pixel_is_transparent_where_light_goes_straight_through(bsdf, point, a
 def test_samples_are_weighted_by_their_densities(a, b, weight):
     """An infinite density has no weight, as in Mitsuba's `path`."""
     assert path_loop.power_heuristic(float(a), float(b)) == pytest.approx(weight)
+
+
+@pytest.mark.parametrize("weights", [(1.0,), (1.0, 3.0), (0.0, 2.0, 2.0)])
+def test_lamps_are_sampled_as_if_there_were_no_sky(weights):
+    """By their weights: as Mitsuba samples the same lamps without the sky."""
+    emitters = ({"type": "area", "radiance": 1.0 + i, "sampling_weight": x} for i, x in enumerate(weights))
+    lamps = {f"lamp{i}": lamp(2, 3.0 * i) | {"emitter": emitter} for i, emitter in enumerate(emitters)}
+    # Mitsuba orders merged meshes by address: of two scenes, the lamps would not always be in the same order.
+    dark, lit = (
+        mi.load_dict({"type": "scene"} | lamps | x, **REPRODUCIBLE) for x in ({}, {"sky": {"type": "constant"}})
+    )
+    ours = sampling.NonConstantEmitters(mi.scalar_rgb, lit)
+    si = dark.ray_intersect(mi.Ray3f([0.1, 0, -2], [0, 0, 1]))
+    si.p = mi.Point3f(0.1, 0.2, -1)
+    for x in (0.1, 0.3, 0.6, 0.9):
+        ds, radiance = ours.sample(si, mi.Point2f(x, 0.4), True)
+        expected, light = dark.sample_emitter_direction(si, mi.Point2f(x, 0.4), False, True)
+        assert np.allclose(ds.p, expected.p, atol=1e-5)
+        assert (ds.pdf, [*radiance]) == (pytest.approx(expected.pdf), pytest.approx([*light]))
+        assert ours.pdf(si, ds, True) == pytest.approx(ds.pdf) and ours.pdf(si, ds, False) == 0
+    sky = lit.environment().sample_direction(si, mi.Point2f(0.1, 0.2), True)[0]
+    assert sky.pdf > 0 and ours.pdf(si, sky, True) == 0
 
 
 @pytest.mark.parametrize(("max_depth", "lit"), [(-1, True), (800, False), (900, True)])

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 from support.browser import needs_chromium, seen
 
-from mi_refract.io.sanitise import printable
-from mi_refract.report import junit, run_report
-from mi_refract.report.number_text import compact, distinguishable
+from mi_refract.io.text import compact, distinguishable, printable
+from mi_refract.report import documents, run_report
 from mi_refract.report.plots import Axes, curves_svg, pareto
 from mi_refract.report.row import Row
 from mi_refract.report.study_page import NOT_RUN
@@ -120,12 +119,12 @@ def test_junit_counts_budgets_and_leaves_out_rows_that_cannot_fail(tmp_path):
 
 def test_every_ending_is_counted_in_its_suite_and_in_all(tmp_path):
     cases = [
-        junit.Case("g", "passed"),
-        junit.Case("g", "failed", "failure", "why", ["one", "two"], "different"),
-        junit.Case("g", "broken", "error", EVIL, [EVIL]),
-        junit.Case("g", "left out", "skipped", "no device"),
+        documents.Case("g", "passed"),
+        documents.Case("g", "failed", "failure", "why", ["one", "two"], "different"),
+        documents.Case("g", "broken", "error", EVIL, [EVIL]),
+        documents.Case("g", "left out", "skipped", "no device"),
     ]
-    junit.write_junit(tmp_path / "out.xml", EVIL, {"first": cases, "empty": [], "last": cases[:2]})
+    documents.write_junit(tmp_path / "out.xml", EVIL, {"first": cases, "empty": [], "last": cases[:2]})
     root = xml.parse(tmp_path / "out.xml").getroot()
     counts = [" ".join(suite.get(key) for key in ("tests", "failures", "errors", "skipped")) for suite in (root, *root)]
     assert counts == ["6 2 1 1", "4 1 1 1", "0 0 0 0", "2 1 0 0"]

@@ -42,7 +42,7 @@ import sys, time
 from pathlib import Path
 from types import SimpleNamespace
 import numpy as np
-from mi_refract.io import errors, image_file, atomic
+from mi_refract.io import errors, image_file, safe_files
 from mi_refract.report import run_report
 from mi_refract.report.row import Row
 from validation import runner
@@ -59,7 +59,7 @@ def measured(i):
     return [Row("a study", f"row {i}", "", "", {"x": float(i)})]
 
 def body():
-    with atomic.held(folder / "validation.lock", "a validation"):
+    with safe_files.held(folder / "validation.lock", "a validation"):
         rows, _ = runner.run([Task(f"task {i}", lambda i=i: measured(i)) for i in range(6)], context)
         run_report.write_json(folder / "rows.json", rows, {})
         run_report.write_junit(folder / "junit.xml", rows, {})

@@ -20,9 +20,9 @@ import numpy as np
 from mi_refract import oracle, regimes
 from mi_refract.accuracy import Judgement, Subject, judge_formula
 from mi_refract.formulas import FORMULAS, contract, wedge
+from mi_refract.io.text import compact
 from mi_refract.numerics import error_free
 from mi_refract.regimes import Rays
-from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
 from validation import repeated
 from validation.run import seeds

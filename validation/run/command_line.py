@@ -8,7 +8,7 @@ import sys
 import typer
 
 from mi_refract.io import errors
-from mi_refract.io.sanitise import printable
+from mi_refract.io.text import printable
 
 
 def application() -> typer.Typer:

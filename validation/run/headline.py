@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refract.report.number_text import compact
+from mi_refract.io.text import compact
 from mi_refract.report.row import Row
 from mi_refract.report.study_page import NOT_RUN, Answer, FirstPage, ShownRow, State
 

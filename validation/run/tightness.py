@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from mi_refract.report.number_text import compact
+from mi_refract.io.text import compact
 from mi_refract.report.row import Row, by_study
 
 NAME = "bounds"

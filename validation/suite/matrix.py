@@ -13,11 +13,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from mi_refract.io.atomic import write_atomically
+from mi_refract.io.safe_files import write_atomically
+from mi_refract.io.text import compact
 from mi_refract.ray_sets.judged_answers import RIGHT
+from mi_refract.report.documents import write_page
 from mi_refract.report.embedded_images import EmbeddedImages
-from mi_refract.report.html_page import write_page
-from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row, strict
 from validation import limits
 from validation.run.context import Context

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract import __version__
-from mi_refract.io.atomic import temporary_folder
 from mi_refract.io.image_file import NO_DATE, write_exr
+from mi_refract.io.safe_files import temporary_folder
 
 from ..plain_scene import Environment, Material, PlainScene
 

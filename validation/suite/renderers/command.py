@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from mi_refract.io.atomic import writable
+from mi_refract.io.safe_files import writable
 from validation.run import command_line
 
 from . import environments

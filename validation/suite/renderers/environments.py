@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from mi_refract.io import process_group
-from mi_refract.io.atomic import write_atomically
 from mi_refract.io.errors import TooMuchOutputError
+from mi_refract.io.safe_files import write_atomically
 from mi_refract.ray_sets import renderer_file
 from mi_refract.report.row import Reason, Row
 

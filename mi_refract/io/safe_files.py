@@ -1,4 +1,4 @@
-"""Files and folders that are either the old version or the new one, never half of it; and locks of them.
+"""Files: only regular ones are read; they are either the old version or the new one, never half of it; and locks.
 
 They are written under a temporary name in the same folder and renamed at the end. An exception or Ctrl-C removes the
 temporary one; a process that SIGKILL ends leaves it behind, hidden (`.NAME.….part`).
@@ -19,9 +19,11 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from io import BufferedReader
 from pathlib import Path
 from typing import NoReturn
 
+_PIECE = 2**20  # bytes
 _KEPT = 40  # characters of the file's own name: a name of 255 bytes has no room for more
 _KINDS = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 _LONGEST_CHANGE = 5.0  # seconds that creating or renaming may take on a slow file system
@@ -205,3 +207,36 @@ def _holder(path: Path) -> str:
         return f"in process {said['process']} on {said['host']} since {said['since']}"
     except (OSError, ValueError, KeyError, TypeError):
         return "in an unknown process"
+
+
+# Reading -------------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def opened(path: str | os.PathLike[str], most: int) -> Iterator[BufferedReader]:
+    """The file, open for reading, of `most` bytes at most.
+
+    ValueError for a larger one, or for what is no file: a pipe or a device may never end. OSError where it cannot be
+    read.
+    """
+    # A pipe without a writer would block when it is opened.
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0))) as file:
+        found = os.fstat(file.fileno())
+        if not stat.S_ISREG(found.st_mode):
+            raise ValueError(f"{path}: not a regular file")
+        if found.st_size > most:
+            raise ValueError(f"{path}: {found.st_size} bytes; expected up to {most}")
+        yield file
+
+
+def read_bytes(path: str | os.PathLike[str], most: int) -> bytes:
+    """The bytes of the file. Errors as of `opened`; ValueError also where it grew meanwhile."""
+    with opened(path, most) as file:
+        # `read(n)` asks for n bytes of memory before it reads: not for `most`, which may be all there are.
+        size = os.fstat(file.fileno()).st_size
+        content = file.read(size + 1)
+        while size < len(content) <= most and (more := file.read(_PIECE)):  # it grew meanwhile
+            content += more
+    if len(content) > most:
+        raise ValueError(f"{path}: more than {most} bytes")
+    return content

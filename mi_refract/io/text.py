@@ -1,12 +1,14 @@
-"""Text that somebody else wrote: names of files, channels and regimes, titles, reasons, messages of other programs.
+"""Text for people: what somebody else wrote, made printable; numbers in few digits.
 
-All of it passes through `printable` on its way to a terminal, a log, HTML, XML, SVG or Markdown, each of which then
-escapes what is markup there. U+FFFD stands where something was taken out. JSON that is printed is made by `json_text`.
+Names of files, channels and regimes, titles, reasons and messages of other programs pass through `printable` on their
+way to a terminal, a log, HTML, XML, SVG or Markdown, each of which then escapes what is markup there. U+FFFD stands
+where something was taken out. JSON that is printed is made by `json_text`.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import re
 
 MARK = "\ufffd"
@@ -51,3 +53,26 @@ def json_text(value: object, indent: int | None = None) -> str:
     """
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, indent=indent)
     return text.replace("##", "#\\u0023")  # which only strings hold
+
+
+def compact(value: float, digits: int = 3) -> str:
+    """`value` in at most `digits` significant digits, whole numbers below 10⁵ in full: 1.23e-7, 8056."""
+    if not math.isfinite(value):
+        return str(float(value))
+    if value == int(value) and abs(value) < 1e5:
+        return str(int(value))
+    if 1e3 <= abs(value) < 1e5:
+        return f"{value:.{max(digits - 4, 0)}f}"
+    if 1e-2 <= abs(value) < 1e3:
+        return f"{value:.{digits}g}"
+    mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
+    return f"{mantissa.rstrip('0').rstrip('.') if '.' in mantissa else mantissa}e{int(exponent)}"
+
+
+def distinguishable(value: float, budget: float) -> tuple[str, str]:
+    """Both as text, with as many digits as it takes to tell them apart when they differ."""
+    for digits in range(3, 18):
+        texts = compact(value, digits), compact(budget, digits)
+        if texts[0] != texts[1] or value == budget:
+            return texts
+    return repr(value), repr(budget)

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from mi_refract.io import atomic, regular_file
-from mi_refract.io.atomic import replacing, update_between, write_atomically
+from mi_refract.io import safe_files
+from mi_refract.io.safe_files import replacing, update_between, write_atomically
 from mi_refract.ray_sets import files, ray_set
 
 
@@ -51,7 +51,7 @@ def test_what_is_not_a_file_is_not_replaced(kind, tmp_path, monkeypatch):
     path = tmp_path / "out.x" if kind in KINDS else Path("/dev/fd/1")
     KINDS.get(kind, lambda path: None)(path)
     before = {each: each.lstat() for each in tmp_path.iterdir()}
-    for write in (lambda: atomic.writable(path, (path.suffix,)), lambda: write_atomically(path, "new")):
+    for write in (lambda: safe_files.writable(path, (path.suffix,)), lambda: write_atomically(path, "new")):
         with pytest.raises(OSError, match=rf"{path}: is a {kind.replace('linked ', '').split()[0]}.*; expected the"):
             write()
     assert {each: each.lstat() for each in tmp_path.iterdir()} == before
@@ -62,7 +62,7 @@ def test_a_link_to_a_file_or_to_nothing_is_replaced(tmp_path):
         (tmp_path / "target").write_text("old")
         path = tmp_path / f"to {target.name}"
         path.symlink_to(target)
-        write_atomically(atomic.writable(path, ("",)), "new")
+        write_atomically(safe_files.writable(path, ("",)), "new")
         assert path.read_text() == "new" and not path.is_symlink()
         assert (tmp_path / "target").read_text() == "old"
 
@@ -92,7 +92,7 @@ def test_a_temporary_is_new_unguessable_and_beside_its_target(folder, tmp_path, 
     victim = tmp_path / "victim"
     victim.mkdir()
     (tmp_path / "link").symlink_to(victim)
-    monkeypatch.setattr(atomic, "temporary_name", lambda *_: tmp_path / "link")
+    monkeypatch.setattr(safe_files, "temporary_name", lambda *_: tmp_path / "link")
     with pytest.raises(FileExistsError), replacing(tmp_path / "a.x", folder=folder):
         pass
     assert (tmp_path / "link").is_symlink() and not [*victim.iterdir()]
@@ -144,12 +144,12 @@ def test_what_is_no_code_travels_with_the_package():
 def test_a_lock_says_who_holds_it_and_ends_with_its_process(tmp_path):
     path = tmp_path / "it.lock"
     path.write_text("what a killed process left")
-    with atomic.held(path, "a run"):
+    with safe_files.held(path, "a run"):
         assert json.loads(path.read_text())["process"] == os.getpid()
         for content, holder in ((path.read_text(), rf"process {os.getpid()} on \S+ since \d"), ("{", "an unknown")):
             path.write_text(content)
             text = f"^{tmp_path}: a run is already running in {holder}.*; expected another folder$"
-            with pytest.raises(BlockingIOError, match=text), atomic.held(path, "a run"):
+            with pytest.raises(BlockingIOError, match=text), safe_files.held(path, "a run"):
                 pass
         assert path.exists()
     assert not path.exists()
@@ -159,7 +159,7 @@ def test_a_lock_is_not_written_through_a_link_and_keeps_nobody_out_without_locks
     path, victim = tmp_path / "it.lock", tmp_path / "victim"
     victim.write_text("old")
     path.symlink_to(victim)
-    with pytest.raises(OSError), atomic.held(path, "a run"):
+    with pytest.raises(OSError), safe_files.held(path, "a run"):
         pass
     assert victim.read_text() == "old"
 
@@ -167,7 +167,7 @@ def test_a_lock_is_not_written_through_a_link_and_keeps_nobody_out_without_locks
         raise OSError(errno.ENOSYS, "Function not implemented")  # as some file systems of networks
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    with atomic.held(tmp_path / "a.lock", "a run"):
+    with safe_files.held(tmp_path / "a.lock", "a run"):
         assert (tmp_path / "a.lock").exists()
     assert not (tmp_path / "a.lock").exists()
 
@@ -188,12 +188,12 @@ def peak(work):
 def test_the_memory_is_that_of_the_file(tmp_path):
     path, rays = tmp_path / "file", tmp_path / "rays.csv"
     path.write_bytes(b"x" * 10**6)
-    assert regular_file.read_bytes(path, 2**40) == path.read_bytes()
-    assert 10**6 < peak(lambda: regular_file.read_bytes(path, 2**40)) < 1.1e6
+    assert safe_files.read_bytes(path, 2**40) == path.read_bytes()
+    assert 10**6 < peak(lambda: safe_files.read_bytes(path, 2**40)) < 1.1e6
     files.write(rays, ray_set.make(count=10))
     assert peak(lambda: files.read(rays)) < 2e7
     if Path("/proc/self/status").exists():  # a file without a size
-        assert regular_file.read_bytes("/proc/self/status", 10**6).startswith(b"Name:")
+        assert safe_files.read_bytes("/proc/self/status", 10**6).startswith(b"Name:")
 
 
 @pytest.mark.parametrize("size", [0, 1, 2**20, 2**20 + 1])
@@ -207,7 +207,7 @@ def test_a_file_that_grows_meanwhile_is_read_up_to_the_limit(size, tmp_path, mon
             more.write(b"x" * 2**21)
         return small
 
-    monkeypatch.setattr(regular_file.os, "fstat", grow)
-    assert regular_file.read_bytes(path, 2**23).rstrip(b"x") == bytes(size)
+    monkeypatch.setattr(safe_files.os, "fstat", grow)
+    assert safe_files.read_bytes(path, 2**23).rstrip(b"x") == bytes(size)
     with pytest.raises(ValueError, match=f"{path}: more than {size + 5} bytes"):
-        regular_file.read_bytes(path, size + 5)
+        safe_files.read_bytes(path, size + 5)

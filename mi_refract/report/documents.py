@@ -1,0 +1,117 @@
+"""Documents: HTML pages that need no network, with style, script and images inlined; and JUnit's XML.
+
+Names of files and messages of errors may hold any character: `printable` makes them fit for both.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+from xml.etree import ElementTree as xml
+
+from mi_refract.io.safe_files import write_atomically
+from mi_refract.io.text import compact, printable, printable_lines
+
+from .embedded_images import EmbeddedImages
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+    from markupsafe import Markup
+
+HERE = Path(__file__).parent / "templates"
+
+
+def write_page(path: str | Path, template: str, content: Mapping[str, Any], images: EmbeddedImages) -> None:
+    """Write `template`, one of this package's, filled with `content`, made printable and escaped. Errors: OSError."""
+    write_atomically(path, rendered(template, content, images))
+
+
+def rendered(template: str, content: Mapping[str, Any], images: EmbeddedImages) -> bytes:
+    """The page."""
+    from markupsafe import Markup
+
+    def part(name: str) -> Markup:
+        text = (HERE / name).read_text("utf-8")
+        return Markup(f"<style>\n{text}</style>" if name.endswith(".css") else f"<script>\n{text}</script>")
+
+    text = _environment().get_template(template).render(**content, part=part, images=images.embedded)
+    return text.encode("utf-8", "replace")
+
+
+@functools.cache
+def _environment() -> Environment:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+
+    options: Any = {"autoescape": True, "undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    options["finalize"] = lambda x: printable_lines(x) if isinstance(x, str) and not isinstance(x, Markup) else x
+    environment = Environment(loader=FileSystemLoader(HERE), **options)
+    filters: dict[str, Any] = {"compact": compact, "words": words, "code": code}
+    environment.filters |= filters
+    return environment
+
+
+def code(text: str) -> Markup:
+    """Escaped HTML in which words between backticks are `<code>`."""
+    from markupsafe import Markup, escape
+
+    return Markup(re.sub("`([^`]*)`", r"<code>\1</code>", str(escape(printable_lines(text)))))
+
+
+def words(value: object) -> str:
+    """A value of the context as text: mappings and lists separated by commas."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {words(item)}" for key, item in value.items())
+    return ", ".join(map(words, value)) if isinstance(value, list | tuple) else str(value)
+
+
+# JUnit ---------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Case:
+    """One test case; `outcome` "" means that it passed.
+
+    `group`: what JUnit calls its class. `kind`: the type of a failure or an error. `message` is one line; `details`
+    are the lines below it, of a case that passed its output.
+    """
+
+    group: str
+    name: str
+    outcome: Literal["", "failure", "error", "skipped"] = ""
+    message: str = ""
+    details: Sequence[str] = ()
+    kind: str = ""
+
+
+def write_junit(path: str | Path, name: str, suites: Mapping[str, Sequence[Case]]) -> None:
+    """Write the suites, by name, each with the number of its cases and how they ended; `name` is that of the whole.
+
+    Errors: OSError.
+    """
+    root = xml.Element("testsuites", name=printable(name))
+    for title, cases in suites.items():
+        suite = xml.SubElement(root, "testsuite", {"name": printable(title)} | _counts(cases))
+        for case in cases:
+            element = xml.SubElement(suite, "testcase", classname=printable(case.group), name=printable(case.name))
+            details = "\n".join(map(printable, case.details)) or None
+            if case.outcome:
+                kind = {"type": printable(case.kind)} if case.kind else {}
+                xml.SubElement(element, case.outcome, kind | {"message": printable(case.message)}).text = details
+            elif details:
+                xml.SubElement(element, "system-out").text = details
+    root.attrib |= _counts([case for cases in suites.values() for case in cases])
+    xml.indent(root)
+    document: bytes = xml.tostring(root, encoding="utf-8", xml_declaration=True)
+    write_atomically(path, document + b"\n")
+
+
+def _counts(cases: Sequence[Case]) -> dict[str, str]:
+    ends = Counter(case.outcome for case in cases)
+    counts = {"failures": ends["failure"], "errors": ends["error"], "skipped": ends["skipped"]}
+    return {key: str(count) for key, count in ({"tests": len(cases)} | counts).items()}
