@@ -1,6 +1,7 @@
 """Other systems: what is wrong with one of them never passes, and what is absent says what would bring it."""
 
 import ast
+import dataclasses
 import json
 import re
 import shutil
@@ -58,6 +59,16 @@ DEFECTS = {
     "bytes": ("os.write(1, bytes([0xff, 0xfe, 0])); os._exit(0)", "", "unanswered", "bytes that are not text"),
     "cut short": ("", "print('id,bx,by,bz'); print('0,0.5,0.'); sys.exit(0)", "unanswered", "expected 4 numbers"),
 }
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Sets of forty rays, of those that other systems are asked."""
+    smaller = {name: dataclasses.replace(kind, count=40) for name, kind in per_ray.SETS.items()}
+    monkeypatch.setattr(per_ray, "SETS", smaller)
+    per_ray.given.cache_clear()
+    yield
+    per_ray.given.cache_clear()
 
 
 @pytest.fixture
