@@ -10,7 +10,6 @@ import types
 
 import dask
 import mitsuba as mi
-import numpy as np
 import pytest
 from support.dask_workers import tls_settings
 
@@ -60,7 +59,7 @@ class Recorded:
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
-def test_an_interrupted_run_goes_on_where_it_stopped(context, elsewhere):
+def test_an_interrupted_run_goes_on_where_it_stopped_and_what_is_timed_runs_here_in_the_end(context, elsewhere):
     calls, fails = [], ["a" if elsewhere else "b"]
 
     def work(name):
@@ -85,6 +84,11 @@ def test_an_interrupted_run_goes_on_where_it_stopped(context, elsewhere):
     runner.forget(context)
     runner.run(tasks, context)
     assert len(calls) == 7
+    order = []
+    tasks = [Task(n, lambda n=n: order.append(n) or [row(subject=n)], timed=n == "y") for n in "xyz"]
+    rows, _ = runner.run(tasks, context, Recorded(tasks, order))
+    assert [row.subject for row in rows] == ["x", "y", "z"]
+    assert order == ["there: z", "z", "there: x", "x", "y"]
 
 
 def test_rows_are_used_again_for_the_same_sources_only(context, tmp_path, monkeypatch):
@@ -104,14 +108,6 @@ def test_rows_are_used_again_for_the_same_sources_only(context, tmp_path, monkey
         assert len(calls) == count, name
 
 
-def test_what_is_timed_runs_here_after_the_others_have_ended(context):
-    order = []
-    tasks = [Task(n, lambda n=n: order.append(n) or [row(subject=n)], timed=n == "b") for n in "abc"]
-    rows, _ = runner.run(tasks, context, Recorded(tasks, order))
-    assert [row.subject for row in rows] == ["a", "b", "c"]
-    assert order == ["there: c", "c", "there: a", "a", "b"]
-
-
 def test_the_rows_of_workers_are_those_of_a_run_here(context, tmp_path):
     work = runner.tasks([importlib.import_module(f"validation.{name}").STUDY for name in MODULES], context)
     alone, _ = runner.run(work, dataclasses.replace(context, out=tmp_path / "alone"))
@@ -128,24 +124,18 @@ def test_the_rows_of_workers_are_those_of_a_run_here(context, tmp_path):
     assert [json.dumps(row.as_dict()) for row in kept] == [json.dumps(row.as_dict()) for row in alone]
 
 
-def test_a_worker_sends_files_and_errors_as_they_are(monkeypatch, scalar_variant):
+def test_a_worker_sends_files_as_they_are(monkeypatch, scalar_variant):
     def writes(context):
         (context.out / "images").mkdir()
         (context.out / "images/a.exr").write_bytes(b"pixels")
         return [row(images={"test": "images/a.exr"})]
 
-    def fails(context):
-        raise ValueError("a scene is wrong; expected others")
-
-    study = Study("s", "", "", {}, lambda c: [Task(f.__name__, functools.partial(f, c)) for f in (writes, fails)])
+    study = Study("s", "", "", {}, lambda context: [Task("writes", lambda: writes(context))])
     monkeypatch.setattr(runner, "import_module", lambda name: types.SimpleNamespace(STUDY=study))
     monkeypatch.setattr(runner.on_worker, "scratch_folder", lambda: None)
     monkeypatch.setattr(runner.on_worker, "in_variant", lambda variant, call: call())
-    there = dataclasses.replace(THERE, modules=("one",))
-    (rows, _), files = there.on_worker("writes")
+    (rows, _), files = dataclasses.replace(THERE, modules=("one",)).on_worker("writes")
     assert files == {"images/a.exr": b"pixels"} and rows[0].images == {"test": "images/a.exr"}
-    with pytest.raises(ValueError, match="a scene is wrong; expected others"):
-        there.on_worker("fails")
 
 
 # The command ---------------------------------------------------------------------------------------------------------
@@ -174,6 +164,20 @@ def test_the_exit_code_follows_the_budgets(validate, tmp_path, budget, code):
     assert context["replay"] == "python -m validation ground-truth --profile quick"
 
 
+def test_an_interruption_says_how_to_go_on_and_two_validations_do_not_share_a_folder(validate, tmp_path, capsys):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    assert validate(interrupted) == 130
+    assert "run the same command again to resume" in capsys.readouterr().err
+    codes = []
+    second = ["ground-truth", "--out", str(tmp_path)]
+    assert validate(lambda: codes.append(command.main(second)) or [row()]) == 0
+    assert codes == [2] and {path.name for path in tmp_path.iterdir()} == FILES
+    (said,) = [line for line in capsys.readouterr().err.splitlines() if "is already running" in line]
+    assert f"{tmp_path}: a validation is already running in process {os.getpid()} on " in said
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -197,24 +201,6 @@ def test_misuse_is_one_line_and_exit_code_2(arguments, words, capsys, tmp_path):
     assert words in printed and len(printed.splitlines()) == 1
 
 
-def test_an_interruption_is_exit_code_130_and_says_how_to_go_on(validate, capsys):
-    def interrupted():
-        raise KeyboardInterrupt
-
-    assert validate(interrupted) == 130
-    assert "run the same command again to resume" in capsys.readouterr().err
-
-
-def test_two_validations_do_not_share_a_folder(validate, tmp_path, capsys):
-    codes = []
-    second = ["ground-truth", "--out", str(tmp_path)]
-    assert validate(lambda: codes.append(command.main(second)) or [row()]) == 0
-    assert codes == [2]
-    (said,) = [line for line in capsys.readouterr().err.splitlines() if "is already running" in line]
-    assert f"{tmp_path}: a validation is already running in process {os.getpid()} on " in said
-    assert {path.name for path in tmp_path.iterdir()} == FILES
-
-
 # The README ----------------------------------------------------------------------------------------------------------
 
 
@@ -229,15 +215,6 @@ def test_the_accuracy_table_holds_the_rows_and_nothing_else():
     single = ["4.97e-8", "0.834", "3", "1.01 (0.98–1.2)", "1.05"]
     expected = ["`promoted`", "this project", *single, "4.97e-8", "0.834", "1.01 (0.98–1.2)"]
     assert [cell.strip() for cell in lines[-1].split("|")][1:-1] == expected
-
-
-def test_the_table_of_defects_is_made_of_the_rows_of_the_self_test():
-    rng = np.random.default_rng(1)
-    rows = self_test.examine(rng.gamma(16, 1 / 16, (4, 16, 16, 3)), "noise", trials=1, null_pairs=2)
-    lines = readme_tables.seen(rows).splitlines()
-    assert lines[0].startswith("noise; 1 trials each of 2 renders a side. Minimum detectable difference in a tile: ")
-    assert [line.split("|")[1].strip() for line in lines[4:-1]] == list(self_test.DEFECTS)
-    assert [cell.strip() for cell in lines[-1].split("|")[2:4]] == ["identical", "0 of 4"]
 
 
 # What each table must name.
@@ -262,18 +239,9 @@ def test_a_readme_holds_its_table_which_is_not_written_from_a_run_that_measured_
     text = (readme_tables.ROOT / table.path).read_text()
     written = text.partition(f"<!-- begin: {marker} -->")[2].partition(f"<!-- end: {marker} -->")[0]
     assert [word for word in NAMED[marker] if word not in written] == []
+    images = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)
+    assert all(((readme_tables.ROOT / table.path).parent / name).is_file() for name in images)
     with pytest.raises(ValueError, match=r"README: no .*"):
         table.make([row(values={}, reason="not run")])
-
-
-def test_the_table_of_other_renderers_is_written_where_the_suite_is_named():
-    assert readme_tables.chosen([]).keys() == readme_tables.TABLES.keys() - {"suite"}
-    assert readme_tables.chosen(["suite"]).keys() == {"suite"}
-    assert readme_tables.chosen(["planar", "diff"]).keys() == {"planar", "defects", "visible"}
-
-
-def test_images_of_the_first_page_exist():
-    text = (readme_tables.ROOT / "README.md").read_text()
-    images = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)
-    assert images and all((readme_tables.ROOT / path).is_file() for path in images)
-    assert len(text.splitlines()) <= 200
+    assert (marker in readme_tables.chosen([])) == (marker != "suite")
+    assert marker in readme_tables.chosen([table.study])

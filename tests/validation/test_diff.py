@@ -47,10 +47,6 @@ def test_spoilt_glass_is_spoilt_as_it_says(scalar_context):
         assert sampled(name, cos_i, sample1) == (component, pytest.approx(weight)), name
     for name, eta in (("IOR + 0.5 %", 1.5075), ("IOR + 1e-3", 1.501), ("flipped normal", 1 / 1.5)):
         assert mi.traverse(glass(name))["eta"][0] == pytest.approx(eta)
-    images = np.split(planted_defects.opened("prism", resolution=8, count=3)(4, 0)[0], 3, axis=1)  # side by side
-    mean = np.mean([planted_defects.opened("prism", resolution=8)(16, seed)[0] for seed in range(8)], 0)
-    assert all(np.corrcoef(image.ravel(), mean.ravel())[0, 1] > 0.6 for image in images)
-    assert abs(np.corrcoef(*((image - mean).ravel() for image in images[:2]))[0, 1]) < 0.5  # they are independent
 
 
 def test_the_defects_are_seen_and_no_other_sampler(llvm_variant, monkeypatch):
@@ -138,7 +134,6 @@ def test_what_is_timed(tmp_path):
     rows = {row.subject: row for row in times.measure(small, "any")}
     assert rows.keys() >= {"welch", "tolerance", "auto", "page", "memory", "size of the page"}
     assert {name for name, row in rows.items() if "time / reading" in row.values} == {*METHODS, "auto"}
-    assert "time / libraries" in rows["from the shell"].values
     assert not [row for row in rows.values() if row.goals]  # they are those of another size
     assert rows["memory"].values["MB of memory"] > 10
     assert 0.02 < rows["size of the page"].values["MB of page"] < limits.PAGE_MEGABYTES

@@ -13,7 +13,7 @@ from mi_refract import FORMULAS, backend
 from validation import limits
 from validation.efficiency import error_against_time, scaling
 from validation.efficiency.error_against_time import Extent
-from validation.run import kernel_timing, render_methods
+from validation.run import kernel_timing
 from validation.run.array_settings import BUILTIN as BUILTIN_KERNEL
 from validation.run.array_settings import Setting, settings
 from validation.run.context import PROFILES, SCALAR_PROFILES, SCENES, Context
@@ -77,13 +77,6 @@ def test_the_best_sampler_has_the_least_variance_and_time(monkeypatch, noise, se
     assert error_against_time.best_sampler(SCENES / "balls.xml", 8, SMALL) == error_against_time.STRATIFIED[best]
 
 
-def test_images_grow_until_their_time_can_be_told(context, monkeypatch):
-    monkeypatch.setattr(error_against_time, "LARGEST", 64)
-    path = SCENES / "furnace.xml"
-    sizes = [error_against_time.resolution_of(path, dataclasses.replace(SMALL, seconds=s)) for s in (0.0, 1e-9, 1e9)]
-    assert sizes == [32, 32, 64]
-
-
 @pytest.mark.parametrize(
     ("scene", "words"), [("furnace", "no noise"), ("mirage", "stairs"), ("slab", "the profile standard measures balls")]
 )
@@ -105,24 +98,7 @@ def test_goals_go_to_the_best_that_splits_on_glass_and_to_the_best_elsewhere():
     assert mixed[subjects[2].name] == limits.MIXED and not any(mixed[s.name] for s in subjects[3:])
 
 
-def test_a_method_renders_to_the_depth_of_the_scene_or_to_another(scalar_variant):
-    for depth, options in ((48, {}), (7, {"max_depth": 7})):
-        camera = render_methods.camera(SCENES / "nested.xml", BUILTIN, 4, **options)
-        assert f"max_depth = {depth}" in str(camera.integrator)
-
-
 # Scaling --------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("size", [8, 1000, 30_000])
-def test_a_ball_is_closed_convex_and_of_its_size(size):
-    v, f = scaling.ball_mesh(size)
-    assert len(f) == pytest.approx(size, rel=0.1)
-    edges = {(int(a), int(b)) for t in f for a, b in zip(t, np.roll(t, -1), strict=True)}
-    assert len(edges) == 3 * len(f) and all((b, a) in edges for a, b in edges)
-    assert len(v) - len(edges) // 2 + len(f) == 2
-    corners = v[f].astype(float)
-    assert (np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) > 0).all()
 
 
 @pytest.mark.parametrize("knob", scaling.KNOBS)

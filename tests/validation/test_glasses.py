@@ -1,7 +1,6 @@
 """Glasses and an achromat by other ray tracers: another index is no other direction or trace, and the reverse."""
 
 import dataclasses
-import json
 from pathlib import Path
 
 import numpy as np
@@ -82,7 +81,7 @@ table.write(rays, np.where(d < 0, 0, k * a - (k * c + np.sqrt(np.abs(d))) * n), 
 """
 
 
-def test_a_program_is_judged_for_its_own_index_and_a_broken_one_fails(tmp_path, monkeypatch):
+def test_a_program_is_judged_for_its_own_index_and_a_broken_one_fails(tmp_path):
     """Every glass has n = 1.5: all directions are right, and no index is."""
     pytest.importorskip("opticalglass")
 
@@ -101,8 +100,6 @@ def test_a_program_is_judged_for_its_own_index_and_a_broken_one_fails(tmp_path, 
     ):
         (row,) = rows_of(text)
         assert row.verdict == verdict and said in row.reason and "\n" not in row.reason
-    monkeypatch.setattr(glasses, "find_spec", lambda name: None)
-    assert "pip install" in rows_of(PROGRAM)[0].reason
 
 
 @pytest.mark.parametrize("name", CATALOGUES)
@@ -128,6 +125,7 @@ def test_the_exact_trace_is_that_of_matrices_near_the_axis_and_its_weights_those
     focus = 8.5 + back_focal_distance(LENS.curvatures, NS, LENS.thicknesses)
     off = [float(crossing(LENS, NS, h, lenses.START).place) / focus - 1 for h in (1e-6, 1.0, 0.5)]
     assert abs(off[0]) < 1e-12 and off[1] / off[2] == pytest.approx(4, rel=1e-2)
+    assert all(f"{c}" in lenses.FILE.read_text() for c in LENS.curvatures)
     exact, (first, *others) = crossing(LENS, NS, 10.0, lenses.START), LENS.curvatures
     bent = crossing(dataclasses.replace(LENS, curvatures=(first * (1 + 1e-9), *others)), NS, 10.0, lenses.START)
     assert float(abs(bent.place - exact.place)) / 1e-9 == pytest.approx(exact.moves["bend"][0], rel=1e-6)
@@ -166,7 +164,6 @@ def test_another_trace_is_no_other_index_and_another_index_no_other_trace():
     ("body", "said"),
     [
         ("raise RuntimeError('out of glass')", "out of glass"),
-        ("print('[]')", "no answer"),
         ("print(json.dumps({'system': 'A', 'indices': [], 'rays': {'given': [], 'own': []}}))", "shape"),
         (
             "print(json.dumps({'system': 'A', 'indices': lens['indices'], "
@@ -180,12 +177,3 @@ def test_a_broken_program_fails_for_its_reason(body, said, tmp_path):
     (tmp_path / "program.py").write_text(f"import json, sys\nlens = json.load(sys.stdin)\n{body}\n")
     (row,) = lenses.system_rows(System("a", "A", lens=("{python}", str(tmp_path / "program.py"))), QUICK)
     assert row.verdict == ("not run" if "77" in body else "fail") and said in row.reason and "\n" not in row.reason
-
-
-def test_the_lens_is_that_of_the_file():
-    """Its glasses by name have the indices of the file's formulas."""
-    pytest.importorskip("opticalglass")
-    for glass, n in zip(lenses.GLASSES, lenses.planar()[1], strict=True):
-        assert np.abs(media.parse(":".join(glass)).index(np.array(lenses.wavelengths())) / n - 1).max() < 1e-15
-    assert all(f"{c}" in lenses.FILE.read_text() for c in LENS.curvatures)
-    assert json.loads(json.dumps(lenses.question()))["start"] == -20

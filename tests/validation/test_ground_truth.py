@@ -7,7 +7,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.variants import switch
 
 from mi_refract import FORMULAS
 from validation import limits
@@ -62,16 +61,6 @@ def test_a_bound_that_would_hold_whatever_comes_fails(scalar_context, monkeypatc
     slab = BENCHES["slab"]
     monkeypatch.setitem(vars(slab), "bounds", {name: 100 * x for name, x in slab.bounds.items()})
     assert bench_row("slab").broken == {"index seen": limits.INDEX_SEEN}
-
-
-def test_compiled_rays_are_those_of_the_scalar_variant(needs_variant, scalar_context):
-    """To roundings: a mistake in the order of rays or components would be of the size of the bodies."""
-    needs_variant("llvm_ad_rgb")
-    one = BENCHES["slab"].traced("refract")
-    switch("llvm_ad_rgb")
-    other = BENCHES["slab"].traced("refract")
-    assert np.abs(one.places - other.places).max() < 1e-4
-    assert np.abs(one.directions - other.directions).max() < 1e-5
 
 
 # The double Gauss, traced exactly by CODE V --------------------------------------------------------------------
@@ -134,13 +123,3 @@ def test_the_rainbow_of_a_noisy_bow_sees_an_index_off_by_1e_4(defect):
     first = exact[(beyond > 0) & (beyond < 0.1)].sum()
     noisy = [rng.poisson(exact * 9e3 / first) for _ in range(traced_bodies.RENDERS["standard"])]
     assert bow_row(noisy).broken == ({"error / bound": 1.0} if defect else {})
-
-
-def test_a_rendered_rainbow_stands_where_it_should_and_not_at_the_angle_of_another_index(llvm_variant, monkeypatch):
-    """Four renders: with 3 degrees of freedom chance may take 22 standard errors."""
-    monkeypatch.setattr(limits, "RAINBOW_RESOLVED", 0.005)
-    images = rainbow.images(bench.glass("refract", rainbow.INDEX), 4)
-    assert bow_row(images).verdict == "pass"
-    off = rainbow.angle(rainbow.INDEX - 1e-3)
-    monkeypatch.setattr(rainbow, "angle", lambda: off)
-    assert bow_row(images).broken.keys() == {"error / bound"}
