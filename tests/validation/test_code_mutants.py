@@ -109,7 +109,8 @@ def test_explanations_say_why_a_mutant_cannot_be_observed():
     for entry in entries:
         assert entry["reason"].startswith(("equivalent: ", "unobservable: ")) and "\n" not in entry["reason"]
         assert entry["line"] != entry["becomes"]
-        source = (code_mutants.ROOT / entry["file"]).read_text("utf-8")  # an entry whose line has changed explains nothing
+        # An entry whose line has changed explains nothing.
+        source = (code_mutants.ROOT / entry["file"]).read_text("utf-8")
         assert entry["line"] in {" ".join(line.split()) for line in source.splitlines()}
 
 
