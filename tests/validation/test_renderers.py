@@ -208,7 +208,8 @@ def test_frames_are_rotations_onto_the_normal(monkeypatch):
     monkeypatch.syspath_prepend(str(SCRIPTS))
     import table
 
-    n = np.vstack([np.eye(3), -np.eye(3), np.random.default_rng(3).normal(size=(1000, 3))])
+    axes = np.vstack([np.eye(3), -np.eye(3)])
+    n = np.vstack([axes, axes - 1e-9, np.random.default_rng(3).normal(size=(1000, 3))])
     frames = table.frames(n := n / np.linalg.norm(n, axis=1, keepdims=True))
     np.testing.assert_array_equal(frames[:, :, 2], n)
     np.testing.assert_allclose(np.swapaxes(frames, 1, 2) @ frames, np.broadcast_to(np.eye(3), frames.shape), atol=1e-15)
