@@ -113,6 +113,12 @@ def test_what_a_system_gives_up_is_counted_and_recorded_errors_are_goals_on_both
     assert per_ray.off(0, 2, 4) == np.inf and np.isnan(per_ray.off(np.nan, 2, 4))
 
 
+def test_every_recorded_error_of_mitsuba_is_a_goal():
+    """`dielectric` on random rays missed it, and the goal was taken away."""
+    for call in SYSTEMS["mitsuba"].calls:
+        assert set(call.recorded) == set(per_ray.SETS) - {TOTAL, LARGE}, call.title
+
+
 def test_what_is_absent_large_or_cannot_run_here_is_not_run(rows_of, tmp_path, monkeypatch):
     (row,) = rows_of("print('no driver', file=sys.stderr); sys.exit(77)")
     assert (row.verdict, row.reason) == ("not run", "cannot run here: no driver")
