@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import contextlib
 import glob
+import hashlib
+import json
 import sys
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -78,6 +80,12 @@ class ParsedScene:
     text: str  # the state as XML: included files, values of parameters and spectra that are read from files in place
     folders: tuple[Path, ...]  # where Mitsuba looks for its files, those of <path> elements first
     named: dict[str, Path]  # the files that its plugins name, by their names in it; they need not exist
+
+    @property
+    def digest(self) -> str:
+        """Of the XML and of `text`, in which matrices that are nearly the same are the same."""
+        contents = [hashlib.sha256(path.read_bytes()).hexdigest() for path in self.xml]
+        return hashlib.sha256(json.dumps([self.text, contents]).encode()).hexdigest()
 
     def files(self, allowed: Collection[str] = ()) -> dict[str, Path]:
         """The files that its plugins read, by their names in it, and the code of `allowed` plugins."""

@@ -16,6 +16,7 @@ import tempfile
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from html import unescape
 from pathlib import Path
 
 from mi_refract.numerics import Scene
@@ -27,13 +28,15 @@ from .scene_files import load_parsed, parse_scene
 MEBIBYTE = 2**20
 LIMIT = 256  # MiB
 _KEPT = 2  # bundles and scenes that a process keeps
+_ELEMENT = re.compile(r"""<(\w++)((?:[^"'>]++|"[^"]*+"|'[^']*+')*+)>""")
+_ATTRIBUTE = re.compile(r"""([\w:.-]++)\s*+=\s*+("[^"]*+"|'[^']*+')""")
 
 
 @dataclass(frozen=True)
 class SceneBundle:
     """`scene` and the keys of `files` are absolute paths of the machine that made it; `digest` is of all the rest.
 
-    `text`: the digest of `ParsedScene.text`. `folders`: as the scene writes them, which must be there for a `..` that
+    `text`: `ParsedScene.digest`. `folders`: as the scene writes them, which must be there for a `..` that
     follows. `moved`: of the names in the scene those that do not lead to a file of the bundle by themselves, and their
     paths. `defines`: values of `<default>`s.
     """
@@ -49,11 +52,7 @@ class SceneBundle:
 
 def pack(parsed: ParsedScene, defines: Mapping[str, str], limit: int = LIMIT) -> SceneBundle:
     """The bundle of a scene that was parsed with these `defines`. `limit`: MiB of all files; ValueError for more."""
-    named = parsed.files()
-    with scene_parser.folders(*parsed.folders) as places:  # spectra are the files that Mitsuba reads as it parses
-        texts = (path.read_text("utf-8", "replace") for path in parsed.xml)
-        names = {name for text in texts for name in re.findall(r"""filename\s*=\s*["']([^"'<>$]+)["']""", text)}
-        spectra = [file for name in names if (file := Path(str(places.resolve(name)))).is_file()]
+    named, spectra = parsed.files(), _spectra(parsed, defines)
     paths = {_absolute(path) for path in (parsed.path, *parsed.xml, *spectra, *named.values())}
     sizes = {path: Path(path).stat().st_size for path in sorted(paths)}
     if (size := sum(sizes.values())) > limit * MEBIBYTE:  # before they are in memory
@@ -61,16 +60,33 @@ def pack(parsed: ParsedScene, defines: Mapping[str, str], limit: int = LIMIT) ->
         listed = f"{size / MEBIBYTE:.1f} MiB of files, the largest {largest} ({sizes[largest] / MEBIBYTE:.1f} MiB)"
         more = f"--bundle-limit {-(-size // MEBIBYTE)}, if all workers have the memory"
         raise ValueError(f"{parsed.path}: {listed}; the limit for a cluster is {limit} MiB; raise it by {more}")
-    scene, text = _absolute(parsed.path), hashlib.sha256(parsed.text.encode()).hexdigest()
+    scene, text = _absolute(parsed.path), parsed.digest
     files = {path: Path(path).read_bytes() for path in sizes}
     contents = [[path, hashlib.sha256(content).hexdigest()] for path, content in files.items()]
     where = {name: _absolute(path) for name, path in named.items()}
     own = Path(scene).parent
     moved = {n: p for n, p in where.items() if os.path.normpath(own / n) != p or Path(n).is_absolute()}
-    digest = hashlib.sha256(json.dumps([scene, text, contents, moved]).encode()).hexdigest()
+    digest = hashlib.sha256(json.dumps([scene, text, contents, moved, sorted(defines.items())]).encode()).hexdigest()
     folders = {path.parent for path in (*parsed.xml, *spectra, *named.values())} | set(parsed.folders)
     written = tuple(sorted(os.path.join(Path.cwd(), path) for path in folders))  # noqa: PTH118 (keeps "..")
     return SceneBundle(digest, scene, text, files, written, moved, dict(defines))
+
+
+def _spectra(parsed: ParsedScene, defines: Mapping[str, str]) -> list[Path]:
+    """The files that `<spectrum>` elements name: Mitsuba reads them as it parses, and does not say which."""
+    texts = (re.sub("<!--.*?-->", "", path.read_text("utf-8", "replace"), flags=re.DOTALL) for path in parsed.xml)
+    elements = [(name, dict(_ATTRIBUTE.findall(rest))) for text in texts for name, rest in _ELEMENT.findall(text)]
+    values = dict(defines)
+    for found in (found for element, found in elements if element == "default" and "name" in found):
+        values.setdefault(found["name"][1:-1], unescape(found.get("value", '""')[1:-1]))  # the first one counts
+    files = []
+    with scene_parser.folders(*parsed.folders) as places:
+        for quoted in {found["filename"] for x, found in elements if x == "spectrum" and "filename" in found}:
+            name = unescape(quoted[1:-1])
+            for parameter in sorted(values, key=len, reverse=True):
+                name = name.replace(f"${parameter}", values[parameter])
+            files += [file for file in [Path(str(places.resolve(name)))] if file.is_file()]
+    return files
 
 
 def _absolute(path: Path) -> str:
@@ -110,7 +126,7 @@ def load(bundle: SceneBundle, variant: str, folder: str) -> tuple[Scene, str]:
         moved = {name: str(_below(root, path)) for name, path in bundle.moved.items()}
         with original_paths(str(root)):
             parsed = parse_scene(_below(root, bundle.scene), bundle.defines)
-            if hashlib.sha256(parsed.text.encode()).hexdigest() != bundle.text:
+            if parsed.digest != bundle.text:
                 expected = "XML and spectra that are named relative to the scene's folder"
                 raise ValueError(f"{bundle.scene}: Mitsuba reads another scene on this worker; expected {expected}")
             _loaded[key] = load_parsed(parsed, moved=moved)

@@ -108,16 +108,16 @@ def test_few_passes_have_the_variance_of_their_samples(tmp_path, llvm):
 def test_renders_under_a_wide_filter_are_equal_to_their_like(tmp_path, llvm, spp, pass_spp):
     """Neighbours share samples there, also in files whose variance has as many degrees of freedom as samples.
 
-    At a family error of 20 % more than 8 of 15 pairs are different once in 1270 runs, where 20 % is what comes up.
+    At a family error of 20 % more than 13 of 30 pairs are different once in 1100 runs, where 20 % is what comes up.
     """
     scene, images = changed(tmp_path, ('"box"', '"gaussian"')), []
-    for seed in range(30):
+    for seed in range(60):
         output = tmp_path / "a.exr"
         rendering(output, seed, scene, {"res": "64"}, spp=spp, pass_spp=pass_spp, restart=True).run()
         images.append(read(output))
     pairs = zip(images[::2], images[1::2], strict=True)
     verdicts = [compare("auto", a, b, family_error=0.2, resolution=9.0).verdict for a, b in pairs]
-    assert verdicts.count(Verdict.DIFFERENT) <= 8
+    assert verdicts.count(Verdict.DIFFERENT) <= 13
 
 
 def test_pixels_that_are_not_finite_are_counted(tmp_path, llvm, monkeypatch):
@@ -247,7 +247,8 @@ def test_the_same_command_again_renders_nothing_and_changes_nothing(tmp_path, ll
 def test_a_checkpoint_of_another_render_is_refused_by_name(tmp_path, llvm, monkeypatch):
     """A file that the scene names is part of it."""
     texture = '<bsdf type="diffuse"><texture type="bitmap" name="reflectance"><string name="filename" value="a.ppm"/>'
-    more = ("</scene>", f'<shape type="sphere">{texture}</texture></bsdf></shape></scene>')
+    size = '<transform name="to_world"><scale value="1"/></transform>'
+    more = ("</scene>", f'<shape type="sphere">{texture}</texture></bsdf>{size}</shape></scene>')
     (tmp_path / "a.ppm").write_bytes(b"P6 1 1 255 123")
     scene = changed(tmp_path, more)
 
@@ -262,8 +263,9 @@ def test_a_checkpoint_of_another_render_is_refused_by_name(tmp_path, llvm, monke
     refused("seed was 0, is 1", seed=1)
     refused("passes of 4 samples per pixel", pass_spp=8)
     refused("already holds 12 samples per pixel; expected --spp 12 or more, or --restart", spp=8)
-    changed(tmp_path, more, ("30.5", "30.6"))
-    refused("the scene has changed")
+    for change in (("30.5", "30.6"), ('<scale value="1"/>', '<scale value="1.0000002"/>')):
+        changed(tmp_path, more, change)
+        refused("the scene has changed")
     changed(tmp_path, more)
     (tmp_path / "a.ppm").write_bytes(b"P6 1 1 255 124")
     refused("the scene has changed")
@@ -354,7 +356,7 @@ def test_two_renders_into_one_file(tmp_path, llvm):
         second.run()
 
 
-@pytest.mark.parametrize("took", [1, 12, 24, 40])
+@pytest.mark.parametrize("took", [1, 8, 12, 19, 24, 40])
 def test_a_kill_loses_25_s_or_one_pass(tmp_path, llvm, monkeypatch, took):
     """A clock that only passes move, each by as many seconds."""
     clock, kept = [0.0], [0.0]

@@ -25,6 +25,7 @@ SCENE = """<scene version="3.0.0">
   </bsdf></shape>
 </scene>"""
 BRIGHT, SKY = "../common/bright.exr", '<include filename="../common/gone/../sky.xml"/>'
+LAMP = '<emitter type="constant"><spectrum name="radiance" filename="$spd"/></emitter>'
 
 pytestmark = pytest.mark.usefixtures("scalar_variant")
 
@@ -36,7 +37,8 @@ def folder(tmp_path):
         (tmp_path / name).mkdir(parents=True)
     (tmp_path / "scenes" / "link").symlink_to(tmp_path / "far")
     (tmp_path / "common" / "sky.xml").write_text('<scene version="3.0.0"><emitter type="constant"/></scene>')
-    (tmp_path / "common" / "glass.spd").write_text("400 1\n700 1\n")
+    for name in ("glass", "a&b"):
+        (tmp_path / "common" / f"{name}.spd").write_text("400 1\n700 1\n")
     for name, value in (("common/bright.exr", 0.8), ("far/dark.exr", 0.1)):
         mi.Bitmap(np.full((4, 4, 3), value, np.float32)).write(str(tmp_path / name))
     return tmp_path
@@ -77,11 +79,13 @@ def image(scene):
         ("dark.exr", f'{SKY}<path value="../far"/>', {}),
         ("$tint", SKY, {"tint": "{far}/dark.exr"}),
         (BRIGHT, '<path value="../common"/><include filename="sky.xml"/>', {}),
+        (BRIGHT, f'<default name="spd" value="../common/a&amp;b.spd"/>{LAMP}', {}),
+        (BRIGHT, f'{LAMP}<!-- it\'s <spectrum filename="{BRIGHT}"/> -->', {"spd": "../common/glass.spd"}),
         (BRIGHT, f'{SKY}<path value="empty"/>', {}),  # Mitsuba refuses a <path> to a folder that is not there
     ],
 )
 def test_the_same_image_elsewhere(folder, there, name, more, defines):
-    """Named by `../`, absolutely, through a <path>, by a define."""
+    """Named by `../`, absolutely, through a <path>, by a define; a spectrum by a parameter, too."""
     defines = {key: value.format(far=folder / "far") for key, value in defines.items()}
     scene = written(folder, name.format(far=folder / "far"), more)
     expected = image(load_scene(scene, defines))
@@ -92,9 +96,12 @@ def test_the_same_image_elsewhere(folder, there, name, more, defines):
 
 
 def test_unpacked_and_loaded_once_for_each_set_of_defines(folder, there):
-    """The same files with another value are another scene."""
-    more = '<emitter type="constant"><float name="radiance" value="$light"/></emitter>'
-    scene = written(folder, more=f'<default name="light" value="1"/>{more}')
+    """The same files with another value are another scene, also where Mitsuba would write the same text."""
+    more = '<default name="light" value="1"/><default name="size" value="1"/>'
+    more += '<emitter type="constant"><float name="radiance" value="$light"/></emitter>'
+    more += '<shape type="sphere"><transform name="to_world"><scale value="$size"/></transform></shape>'
+    scene = written(folder, more=more)
+    assert len({pack(scene, {"size": size}).digest for size in ("1", "1.0000002")}) == 2
     bundles = [pack(scene, {"light": light}) for light in ("1", "1", "3")]
     one, same, other = (scene_bundle.load(bundle, "scalar_rgb", str(there))[0] for bundle in bundles)
     assert one is same and len([*there.iterdir()]) == 2

@@ -96,6 +96,17 @@ def test_too_many_survivors_fail_and_explained_ones_do_not():
     assert code_mutants.rows([(mutant, False), *survivors, *[(mutant, True)] * 14], seed=0)[0].verdict == "fail"
 
 
+def test_explanations_say_why_a_mutant_cannot_be_observed():
+    entries = json.loads((code_mutants.CONFIG.parent / "explained_mutants.json").read_text())
+    assert entries
+    for entry in entries:
+        assert entry["reason"].startswith(("equivalent: ", "unobservable: ")) and "\n" not in entry["reason"]
+        assert entry["line"] != entry["becomes"]
+        # An entry whose line has changed explains nothing.
+        source = (code_mutants.ROOT / entry["file"]).read_text("utf-8")
+        assert entry["line"] in {" ".join(line.split()) for line in source.splitlines()}
+
+
 def test_the_tests_of_a_module_come_first_and_without_any_nothing_is_run(tmp_path):
     files = code_mutants.guards(code_mutants.ROOT, "mi_refract/io/image_file.py")
     assert files == ["tests/io/test_image_file.py", "tests/io", "tests/test_rooms.py"]

@@ -98,6 +98,15 @@ def test_goals_go_to_the_best_that_splits_on_glass_and_to_the_best_elsewhere():
     assert mixed[subjects[2].name] == limits.MIXED and not any(mixed[s.name] for s in subjects[3:])
 
 
+def test_scalar_variants_are_not_run(scalar_context):
+    context = scalar_context()
+    rows = error_against_time.scene_rows(context, SCENES / "balls.xml") + scaling.knob_rows(context, "glasses")
+    assert [(row.verdict, row.reason) for row in rows] == [
+        ("not run", error_against_time.SCALAR),
+        ("not run", scaling.SCALAR),
+    ]
+
+
 # Scaling --------------------------------------------------------------------------------------------------------------
 
 

@@ -114,6 +114,36 @@ def test_systems_that_are_installed_answer_for_their_indices(name):
     assert {row.case for row in rows if row.missed} <= set(catalogue.others)
 
 
+# CDGM has published two formulas: Sellmeier's, in the catalogue for Zemax of 2022, and a power series in its
+# spreadsheet. Sumita has changed two glasses since its catalogue of 2017, whose coefficients are those of λ⁰, λ², λ⁻²,
+# …, in µm. raysect has Schott's catalogue of 2000; of N-BK7 only C1 = 6000.69867 nm² is another. Last: an index that
+# the other catalogue prints, and its line.
+GIR79 = {0: 3.3195074, 2: -0.0085801253, -2: 0.039978521, -4: 0.0014465322, -6: -3.0453007e-05, -8: 7.8005005e-06}
+SFLDN3 = {0: 3.2503692, 2: -0.013195714, -2: 0.049790724, -4: 0.0022430157, -6: -7.7567761e-06, -8: 2.1169316e-05}
+OTHER_CATALOGUES = [
+    ("optiland", "CDGM:H-K9L", (0.614555251, 0.656775017, 1.02699346, 14598.7884, 2877.69588, 107653051), 1.52669, "g"),
+    ("optiland", "CDGM:H-LaF4", (0.210645313, 1.75547352, 1.28979005, 54275.9294, 11237.0777, 119852069), 1.77728, "g"),
+    ("optiland", "SUMITA:K-GIR79", GIR79, 1.85588, "d"),
+    ("optiland", "SUMITA:K-SFLDn3", SFLDN3, 1.84666, "d"),
+    ("raysect", "SCHOTT:LLF1", (1.23326922, 0.116923839, 0.862645379, 8853.9681, 43687.5155, 104992168), 1.56328, "g"),
+    ("raysect", "SCHOTT:N-BK7", (1.03961212, 0.231792344, 1.01046945, 6000.6987, 20017.9144, 103560653), 1.52668, "g"),
+]
+
+
+@pytest.mark.parametrize(("system", "glass", "coefficients", "printed", "line"), OTHER_CATALOGUES)
+def test_the_recorded_difference_is_that_of_the_other_catalogue(system, glass, coefficients, printed, line):
+    pytest.importorskip("opticalglass")
+
+    def there(w):
+        if isinstance(coefficients, dict):
+            return sum(x * (w / 1000) ** power for power, x in coefficients.items()) ** 0.5
+        return media.index(f"sellmeier({', '.join(map(str, coefficients))})", w)
+
+    off = max(abs(there(w) / media.index(glass, w) - 1) for w in glasses.WAVELENGTHS)
+    assert off == pytest.approx(CATALOGUES[system].others[glass].recorded, rel=5e-3)
+    assert round(there(media.LINES[line]), 5) == printed
+
+
 # The achromat --------------------------------------------------------------------------------------------------------
 
 NS = 1.0, 1.5168, 1.62, 1.0

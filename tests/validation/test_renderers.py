@@ -164,6 +164,44 @@ def test_small_systems_that_are_installed_are_right(name, few, needs_variant):
         assert max(row.values[per_ray.BACKWARD] for row in rows) < 1 and not any(row.missed for row in rows)
 
 
+def unscaled(a, n, k):
+    """k a − (k c + √(1 − k²(1 − c²))) n of vectors of any length."""
+    k, c = k[:, None], (a * n).sum(1, keepdims=True)
+    return k * a - (k * c + np.sqrt(1 - k * k * (1 - c * c))) * n
+
+
+# What is said of vectors of other lengths, as the answer to a ray `a` of the length l, and to a normal of that length.
+LENGTHS = {
+    "takes vectors of any length as they are": (
+        lambda a, n, k, length: unscaled(length * a, n, k),
+        lambda a, n, k, length: unscaled(a, length * n, k),
+    ),
+    "takes the index that a ray leaves from its speed 1/n, not from the medium": (
+        lambda a, n, k, length: unscaled(a, n, k / length),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", [name for name, system in SYSTEMS.items() if any(x.lengths for x in system.calls)])
+def test_vectors_of_other_lengths_are_treated_as_the_table_says(name):
+    assert all(call.lengths in LENGTHS for call in SYSTEMS[name].calls if call.lengths)
+    if reason := environments.absent(SYSTEMS[name]):
+        pytest.skip(reason)
+    a, n = (regimes.normalised(v).astype(float) for v in np.random.default_rng(7).normal(size=(2, 40, 3)))
+    n = np.where((a * n).sum(1, keepdims=True) > 0, -n, n)
+    k, length = np.full(40, 1 / 1.5), 1.1
+    for call in (call for call in SYSTEMS[name].calls if call.lengths):
+        for place, meaning in enumerate(LENGTHS[call.lengths]):
+            given = (length * a, n) if place == 0 else (a, length * n)
+            rows = np.c_[np.arange(40), *given, np.ones(40), np.full(40, 1.5)].tolist()
+            text = "\n".join(["id,ax,ay,az,nx,ny,nz,n_from,n_to", *(f"{i:.0f},{str(x)[1:-1]}" for i, *x in rows)])
+            try:
+                found = parse_answers(environments.ask(SYSTEMS[name], call.command, text), call.title).b
+            except environments.Unable as why:
+                pytest.skip(f"cannot run here: {why}")
+            np.testing.assert_allclose(found, meaning(a, n, k, length), atol=1e-5 if call.precision == "f32" else 1e-12)
+
+
 # The table of systems ------------------------------------------------------------------------------------------
 
 
