@@ -10,6 +10,7 @@ name.
 from __future__ import annotations
 
 import contextlib
+import errno
 import glob
 import hashlib
 import json
@@ -89,13 +90,13 @@ class ParsedScene:
 
     def files(self, allowed: Collection[str] = ()) -> dict[str, Path]:
         """The files that its plugins read, by their names in it, and the code of `allowed` plugins."""
-        code = {
-            f"plugins/{file.name}": file
-            for place in reversed(self.folders)  # Mitsuba takes the first that it finds
-            for name in allowed
-            for file in (place / "plugins").glob(f"{glob.escape(name)}.*")
-        }
+        code = {f"plugins/{file.name}": file for name in allowed for file in self._code(name)}
         return {name: file for name, file in sorted((self.named | code).items()) if name and file.is_file()}
+
+    def _code(self, name: str) -> list[Path]:
+        """The files of a plugin of the scene's own; of those of one name Mitsuba takes the last."""
+        places = (place / "plugins" for place in reversed(self.folders))
+        return [file for place in places for file in place.glob(f"{glob.escape(name)}.*")]
 
     def load(self, allowed: Collection[str] = (), moved: Mapping[str, str] | None = None) -> Scene:
         """The scene itself, in the variant that it was parsed for; once, as Mitsuba takes the state apart.
@@ -109,7 +110,9 @@ class ParsedScene:
             RuntimeError: of Mitsuba, where it cannot make a plugin.
         """
         path, nodes = self.path, self.state.nodes
-        if unknown := sorted({node.props.plugin_name() for node in nodes} - known_plugins() - {*allowed}):
+        # Where a plugin in Python is not registered in the variant, Mitsuba looks for a file of its name.
+        known = known_plugins() - {name for name in (*PYTHON, *OURS) if self._code(name)}
+        if unknown := sorted({node.props.plugin_name() for node in nodes} - known - {*allowed}):
             expected = f"those; to load native code shipped with a scene, pass --allow-plugins {unknown[0]}"
             raise ValueError(f"{path}: plugin {unknown[0]!r}: neither Mitsuba's nor mi_refract's; expected {expected}")
         images, meshes = set[str](), set[str]()
@@ -156,11 +159,11 @@ def parse(path: Path, defines: Mapping[str, str] | None = None, variant: str = "
         seen = mi.parser.ParserState(state)  # a copy: reading a parameter marks it as used
         _check_nesting(path, seen)
         names = {value for node in seen.nodes for _, value in _texts(node.props)}
-        named = {name: Path(str(inside.resolve(name))) for name in sorted(names)}
+        named = {name: _file(str(inside.resolve(name))) for name in sorted(names)}
         for file in named.values():
             require_file(file)
         mi.parser.transform_all(config, state)
-        xml, places = (tuple(Path(str(item)) for item in items) for items in (state.files, inside))
+        xml, places = (tuple(dict.fromkeys(Path(str(x)) for x in items)) for items in (state.files, inside))
         return ParsedScene(path, config, state, xml, text, places, named)
 
 
@@ -171,6 +174,15 @@ def require_file(path: Path) -> None:
             return
     with safe_files.opened(path, sys.maxsize):
         pass
+
+
+def _file(name: str) -> Path:
+    """The path; that of the working folder for a text that no file can have as its name."""
+    try:
+        Path(name).exists()
+    except OSError as error:
+        return Path() if error.errno == errno.ENAMETOOLONG else Path(name)
+    return Path(name)
 
 
 def _texts(props: Properties) -> list[tuple[str, str]]:

@@ -60,6 +60,15 @@ def test_a_plugin_of_the_scenes_own_is_refused_by_name(elements, load, bait):
         load(elements.replace("%s", str(bait)), other='<bsdf type="evil"/>')
 
 
+def test_a_file_named_as_a_plugin_in_python_is_refused(load, tmp_path):
+    """In scalar variants Mitsuba registers none of its own, and looks for a file."""
+    (tmp_path / "more" / "plugins").mkdir(parents=True)
+    for name in (*scene_parser.PYTHON, "refract"):
+        (tmp_path / "more" / "plugins" / f"{name}.so").write_text("native code")
+        with pytest.raises(ValueError, match=f"plugin '{name}': neither Mitsuba's"):
+            load(f'<path value="more"/><bsdf type="{name}"/>')
+
+
 def test_an_allowed_plugin_is_loaded(load, bait):
     """Mitsuba says that the file is no native code: it tried."""
     with pytest.raises(RuntimeError, match=r"Error while loading plugin .*plugins/evil\.so"):
@@ -236,6 +245,11 @@ def test_what_would_end_the_process_is_refused(case, load, tmp_path, monkeypatch
     assert "\n" not in str(caught.value)
 
 
+def test_a_text_too_long_for_the_name_of_a_file_is_none(load):
+    table = ", ".join(f"{360 + 5 * i}: 1.5" for i in range(95))
+    load(f'{SENSOR}<bsdf type="refract"><string name="int_ior" value="table({table})"/></bsdf>')
+
+
 def test_a_scene_that_is_a_pipe_is_refused(tmp_path):
     os.mkfifo(tmp_path / "s.xml")
     with pytest.raises(ValueError, match=r"s\.xml: not a regular file"):
@@ -256,10 +270,10 @@ def test_files_are_those_that_mitsuba_opens(load, tmp_path):
         (folder / "n.spd").write_text(f"300 {0.2 + 0.2 * i}\n900 {0.2 + 0.2 * i}")
     sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
     n = '<bsdf type="diffuse"><spectrum name="reflectance" filename="n.spd"/></bsdf>'
-    elements = f'{SENSOR}<path value="more"/><include filename="inner.xml"/>{sky}'
+    elements = f'{SENSOR}<path value="more"/><include filename="inner.xml"/><include filename="inner.xml"/>{sky}'
     scene = load(elements + n)
     parsed = scene_parser.parse(tmp_path / "s.xml")
-    assert len(scene.shapes()) == 1 and parsed.xml == (tmp_path / "s.xml", tmp_path / "inner.xml")
+    assert len(scene.shapes()) == 2 and parsed.xml == (tmp_path / "s.xml", tmp_path / "inner.xml")
     params = mi.traverse(scene)
     assert np.array(params[next(key for key in [*params.keys()] if key.endswith(".data"))]).max() == 1
     values = np.concatenate([np.ravel(np.array(params[key])) for key in [*params.keys()] if "reflectance" in key])
