@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_refract import oracle
+from mi_refract import oracle, regimes
 from mi_refract.ray_sets import renderer_file
+from mi_refract.ray_sets.files import parse_answers
 from mi_refract.ray_sets.renderer_file import RaysCommand
 from validation import __main__ as command
 from validation import limits
