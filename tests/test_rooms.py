@@ -66,6 +66,7 @@ FILLED = {
     "Progress",
     "Ray",
     "Scatter",
+    "SearchState",
     "Start",
     "Tally",
 }

@@ -151,6 +151,12 @@ GROWN = limit(1.0, "error over the bound on rounding errors, see `validation/pla
 PLANAR_EQUAL = limit(1e-9, "float64: of the extent, and in radians")
 # Of the ellipse lens: a place, a normal and a direction at either boundary, each rounded once in x and in y.
 SPOT = limit(6 * math.sqrt(2), "u, of the focus of the ellipse lens: six roundings, each in x and in y")
+PLANAR_TIMES = {
+    ("llvm float32", "document 004"): {"µs per path": limit(0.1, "two cores, the lens of the original program")},
+    ("llvm float32", "M = 1000000"): {
+        "µs per path": limit(1.0, "two cores: ten times the segments take much less than ten times as long")
+    },
+}
 
 # Image comparison ----------------------------------------------------------------------------------------------
 

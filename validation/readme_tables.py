@@ -208,7 +208,12 @@ def planar(rows: list[Row]) -> str:
     heading = ["scene", "rays", "boundaries", "float64: error", "float32: error", "nearest its bound", "bound", "ratio"]
     first = _table(text, heading, retraced, missing)
     times = {(row.subject, row.case, row.setting): row for row in _measured(rows, planar_times.NAME)}
-    columns = {precision: (planar_times.BRUTE, f"llvm {precision}") for precision in ("float32", "float64")}
+    columns = {
+        "float32": (planar_times.MESH, "llvm float32"),
+        "float64": (planar_times.MESH, "llvm float64"),
+        "float32, rays shuffled": (planar_times.SHUFFLED, "llvm float32"),
+        "float32, every segment tried": (planar_times.BRUTE, "llvm float32"),
+    }
     lines = [
         [case, *(_cells(times.get((s, case, x)), [planar_times.PER_PATH])[0] for s, x in columns.values())]
         for subject, case, setting in times

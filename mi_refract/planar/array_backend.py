@@ -29,7 +29,7 @@ class ArrayBackend:
 
     def __init__(self, backend: str, precision: str) -> None:
         """Both must be usable here: `choose_backend` checks that."""
-        self.precision, arrays = precision, getattr(dr, backend).ad
+        self.name, self.precision, arrays = backend, precision, getattr(dr, backend).ad
         wide = "64" if precision == "float64" else ""
         self._types(getattr(arrays, f"Float{wide or '32'}"), arrays, wide)
         self.index, self.mask, self.byte, self.signed = arrays.UInt32, arrays.Bool, arrays.UInt8, arrays.Int32
@@ -83,7 +83,7 @@ class ScalarBackend(ArrayBackend):
 
     def __init__(self) -> None:
         """Needs no compiler."""
-        self.precision = "float64"
+        self.name, self.precision = "scalar", "float64"
         self._types(float, dr.scalar, "64")
         self.index, self.mask, self.byte, self.signed = int, bool, np.uint8, np.int32
 

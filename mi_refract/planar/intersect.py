@@ -158,15 +158,15 @@ class LineSegments:
             way, side = dr.select(same, its_way, way), dr.select(same, its_side, side)
         return way, side
 
-    def nearer(self, best: Hit, ray: Ray, start: Start, i: Index) -> Hit:
+    def nearer(self, best: Hit, ray: Ray, start: Start, i: Index, active: Mask = True) -> Hit:
         """The crossing of segment i, if it comes before `best`."""
-        a, b, vertices = self._of(i)
+        a, b, vertices = self._of(i, active)
         seen = self._seen(ray, start, vertices[0], a), self._seen(ray, start, vertices[1], b)
         hit, ahead = self._crossing(ray, start, i, b - a, vertices, seen)
         # Of two segments that share a vertex, the turn between them says which comes first, whatever λ rounds to.
         turn = cross(hit.along, best.along)
         first = dr.select(hit.right == best.right, turn < 0, hit.distance < best.distance)
-        first = ahead & dr.select(hit.left == best.left, turn > 0, first)
+        first = ahead & active & dr.select(hit.left == best.left, turn > 0, first)
         return dr.select(first, hit, best)
 
     def _crossing(
@@ -252,9 +252,9 @@ class ConicArcs(LineSegments):
         b_left = dr.select(wrong & negated(smaller), negated(ray.left), b_left)
         return dr.select(a_left, sizes[0], -sizes[0]), dr.select(b_left, sizes[1], -sizes[1])
 
-    def nearer(self, best: Hit, ray: Ray, start: Start, i: Index) -> Hit:
+    def nearer(self, best: Hit, ray: Ray, start: Start, i: Index, active: Mask = True) -> Hit:
         """The first crossing of arc i, if it comes before `best`."""
-        (a, b, vertices), (c, w, turn) = self._of(i), self._shape(i)
+        (a, b, vertices), (c, w, turn) = self._of(i, active), self._shape(i, active)
         seen = self._seen(ray, start, vertices[0], a), self._seen(ray, start, vertices[1], b)
         line, line_ahead = self._crossing(ray, start, i, b - a, vertices, seen)
         (to_a, f_a), (to_b, f_b) = seen
@@ -273,11 +273,11 @@ class ConicArcs(LineSegments):
         hit, ahead = self._hit(ray, i, ways, w, tuple(root), dr.select(own, turn < 0, a_left), ends)
         hit, ahead = dr.select(straight, line, hit), dr.select(straight, line_ahead, ahead)
         ahead = self._beyond(start, hit, ahead) & dr.select(straight, once, valid | single)
-        ahead = dr.select(own, start.again, ahead)
+        ahead = dr.select(own, start.again, ahead) & active
         best = dr.select(ahead & self._before(hit, best), hit, best)
         # Where there are two crossings, neither is at a vertex, but for rounding: their distances decide.
         hit, ahead = self._hit(ray, i, ways, w, other, negated(a_left), ends)
-        ahead &= too & negated(once | own | straight)
+        ahead &= active & too & negated(once | own | straight)
         return dr.select(ahead & (hit.distance < best.distance), hit, best)
 
     def _beyond(self, start: Start, hit: Hit, ahead: Mask) -> Mask:

@@ -28,8 +28,11 @@ from mi_refract.numerics import Mask, Number
 
 from .array_backend import ArrayBackend, Buffer, Index, Scatter, Vector2, choose_backend, negated
 from .intersect import NOWHERE, ConicArcs, Hit, LineSegments, Ray, cross
+from .mesh_acceleration import BACK, SHORTEST, MeshAcceleration, SearchState
 from .segments import REFLECT_BITS, Array, Event, Paths, Segments, finite_array
 
+METHODS = "auto", "brute", "mesh"
+FEW = 48  # up to so many segments, trying all is faster than a query of the mesh
 FARTHEST = {"float32": 1e15, "float64": 1e100}  # of coordinates and indices: products of two do not overflow
 Refraction = Callable[[Vector2, Vector2, Number], tuple[Vector2, Mask]]  # (d, line, k) → direction, transmitted
 
@@ -43,6 +46,7 @@ def trace(
     formula: str | None = None,
     precision: str = "float64",
     backend: str | None = None,
+    method: str = "auto",
     reflect: ArrayLike = 0,
     n_start: ArrayLike | None = None,
     weights: bool = False,
@@ -53,6 +57,8 @@ def trace(
     formula: a key of FORMULAS that computes the directions; None: the planar formula of document 004.
     precision: "float64" or "float32"; the latter needs a compiled backend.
     backend: "llvm", "cuda" or "scalar"; None: LLVM where it runs, else scalar.
+    method: "brute" tries every segment; "mesh" those that Mitsuba's ray tracing finds, at a cost that grows like log M.
+        Both give the same paths; "auto" takes the faster one.
     reflect: bits, one number or N: a ray whose bit j is set is reflected at the j-th boundary it meets (from 0, below
         32) also where it could be refracted.
     n_start: refractive index of the medium in which rays start, one number or N.
@@ -60,18 +66,22 @@ def trace(
 
     ValueError for any other value, and for origins or directions that are not finite or directions of length 0.
     """
-    tracer = Tracer(segments, formula=formula, precision=precision, backend=backend)
+    tracer = Tracer(segments, formula=formula, precision=precision, backend=backend, method=method)
     return tracer(origins, directions, max_depth, reflect=reflect, n_start=n_start, weights=weights)
 
 
 @dataclass
 class PathState:
-    """A ray, the index of its medium (NaN: unknown), its shares of the s and p waves, the number of boundaries met."""
+    """A ray, the index of its medium (NaN: unknown), its shares of the s and p waves, the number of boundaries met.
+
+    search: how far it has been searched for the next boundary.
+    """
 
     ray: Ray
     index: Number
     power: Vector2
     depth: Index
+    search: SearchState
     active: Mask
 
 
@@ -79,9 +89,15 @@ class Tracer:
     """`trace` for one set of segments that is set up once; arguments and errors as there."""
 
     def __init__(
-        self, segments: Segments, *, formula: str | None = None, precision: str = "float64", backend: str | None = None
+        self,
+        segments: Segments,
+        *,
+        formula: str | None = None,
+        precision: str = "float64",
+        backend: str | None = None,
+        method: str = "auto",
     ) -> None:
-        """Copy the segments to the backend."""
+        """Copy the segments to the backend and build what finds the next boundary."""
         self.arrays = arrays = choose_backend(backend, precision)
         self.farthest = FARTHEST[precision]
         for name in ("start", "end", "n_left", "n_right"):
@@ -91,6 +107,7 @@ class Tracer:
         self.boundaries = LineSegments(arrays, *ends)
         if segments.control is not None and segments.weight is not None:
             self.boundaries = ConicArcs(arrays, *ends, segments.control, segments.weight)
+        self.mesh = _mesh(arrays, segments, method)
         left, right = segments.n_left, segments.n_right
         # With k from left to right and from right to left: ratios in float64, before anything is rounded.
         self.media = arrays.table(np.column_stack([left, right, left / right, right / left]))
@@ -118,6 +135,8 @@ class Tracer:
         none = np.ndim(reflect) == 0 and reflect == 0
         mirrored = None if none else arrays.table(_each("reflect", reflect, count, "iu", np.uint32))
         _check_range("origins", origins, self.farthest)
+        if self.mesh:
+            self.mesh.expect(origins - self.middle, along)
         rays = [arrays.table(x) for x in (origins - self.middle, along)]
 
         def work(lane: Index, scatter: Scatter) -> None:
@@ -163,49 +182,70 @@ class Tracer:
         slack = 4 * arrays.roundoff * (dr.abs(p.x) + dr.abs(p.y))
         half = arrays.number(0.5)
         ray = Ray(p, d, arrays.index(NOWHERE), half, half, arrays.mask(False), slack)
-        return PathState(ray, index, arrays.vector(1, 1), arrays.index(0), arrays.mask(True))
+        return PathState(ray, index, arrays.vector(1, 1), arrays.index(0), self._search(-BACK), arrays.mask(True))
 
-    def _step(self, state: PathState, bits: Index | None, most: Index, scatter: Scatter, weights: bool) -> PathState:
-        """Find the next boundary and cross it, or end the path; `bits`: of `reflect`, `most`: the greatest depth."""
-        arrays, boundaries, ray, j = self.arrays, self.boundaries, state.ray, state.depth
-        start = boundaries.start(ray)
+    def _search(self, gone: float) -> SearchState:
+        return SearchState(self.arrays.number(gone), self.arrays.index(NOWHERE))
+
+    def _nearest(self, ray: Ray, search: SearchState, active: Mask) -> tuple[Hit, SearchState, Mask]:
+        """The first boundary ahead, and whether that is settled or the search must go on."""
+        boundaries, start = self.boundaries, self.boundaries.start(ray)
+        if self.mesh:
+            return self.mesh.nearest(boundaries, ray, start, search, active)
 
         def test(i: Index, best: Hit) -> tuple[Index, Hit]:
             return i + 1, boundaries.nearer(best, ray, start, i)
 
         def more(i: Index, best: Hit) -> Mask:
-            return state.active & (i < boundaries.count)
+            return active & (i < boundaries.count)
 
-        hit = dr.while_loop((arrays.index(0), boundaries.none()), more, test, label="boundaries")[1]
-        some = state.active & (hit.segment != NOWHERE)
-        left, right, to_right, to_left = arrays.gather(self.media, hit.segment, some)
-        near, far = dr.select(hit.to_left, right, left), dr.select(hit.to_left, left, right)
-        k = dr.select(hit.to_left, to_left, to_right)
-        index = dr.select(some & dr.isnan(state.index), near, state.index)
-        p, line = boundaries.place(hit)
-        b, through = self.refract(ray.d, line, k)
-        if bits is not None:
-            bit = (bits >> dr.minimum(j, REFLECT_BITS - 1)) & 1
-            forced = through & (j < REFLECT_BITS) & (bit == 1)
-            b, through = dr.select(forced, _mirrored(ray.d, line), b), through & negated(forced)
-        to_left = hit.to_left == through
-        # Of a ray along the boundary rounding hides from which side it comes; that was decided by the boundary's ends.
-        b = dr.select((cross(line, b) > 0) == to_left, b, _mirrored(b, line))
-        event = dr.select(through, int(Event.REFRACTED), int(Event.REFLECTED))
-        event = dr.select(near == index, event, int(Event.MEDIUM_MISMATCH))
-        met = some & (j < most)
-        event = dr.select(met, event, dr.select(some, int(Event.MAX_DEPTH), int(Event.ESCAPED)))
-        scatter("events", j, event, state.active)
-        scatter("points", j + 1, p, met)
-        scatter("hits", j, hit.segment, met)
-        power = state.power
-        if weights:
-            scatter("indices", j, index, state.active)
-            scatter("polarised", j, power, state.active)
-            power = power * _shares(ray.d, line, k, through)
-        on = met & (near == index)
-        ray = Ray(p, dr.select(on, b, ray.d), hit.segment, hit.s, hit.r, to_left, arrays.number(0))
-        return PathState(ray, dr.select(through, far, index), power, j + 1, on)
+        hit = dr.while_loop((self.arrays.index(0), boundaries.none()), more, test, label="boundaries")[1]
+        return hit, search, self.arrays.mask(True)
+
+    def _step(self, state: PathState, bits: Index | None, most: Index, scatter: Scatter, weights: bool) -> PathState:
+        """Search once for the next boundary, and cross it if it is found, or end the path.
+
+        bits: of `reflect`; most: the greatest depth.
+        """
+        hit, search, settled = self._nearest(state.ray, state.search, state.active)
+        some = state.active & settled & (hit.segment != NOWHERE)
+
+        def leg(state: PathState, event: Any, index: Number, active: Mask) -> None:
+            scatter("events", state.depth, event, active)
+            if weights:
+                scatter("indices", state.depth, index, active)
+                scatter("polarised", state.depth, state.power, active)
+
+        def cross_it(state: PathState, hit: Hit, rest: PathState) -> PathState:
+            arrays, d, j = self.arrays, state.ray.d, state.depth
+            left, right, to_right, to_left = arrays.gather(self.media, hit.segment)
+            near, far = dr.select(hit.to_left, right, left), dr.select(hit.to_left, left, right)
+            k = dr.select(hit.to_left, to_left, to_right)
+            index = dr.select(dr.isnan(state.index), near, state.index)
+            p, line = self.boundaries.place(hit)
+            b, through = self.refract(d, line, k)
+            if bits is not None:
+                bit = (bits >> dr.minimum(j, REFLECT_BITS - 1)) & 1
+                forced = through & (j < REFLECT_BITS) & (bit == 1)
+                b, through = dr.select(forced, _mirrored(d, line), b), through & negated(forced)
+            to_left = hit.to_left == through
+            # Of a ray along the boundary rounding hides from which side it comes; its ends decided that.
+            b = dr.select((cross(line, b) > 0) == to_left, b, _mirrored(b, line))
+            event = dr.select(through, int(Event.REFRACTED), int(Event.REFLECTED))
+            event = dr.select(near == index, event, int(Event.MEDIUM_MISMATCH))
+            met = j < most
+            leg(state, dr.select(met, event, int(Event.MAX_DEPTH)), index, True)
+            scatter("points", j + 1, p, met)
+            scatter("hits", j, hit.segment, met)
+            on = met & (near == index)
+            ray = Ray(p, dr.select(on, b, d), hit.segment, hit.s, hit.r, to_left, arrays.number(0))
+            power = state.power * _shares(d, line, k, through) if weights else state.power
+            return PathState(ray, dr.select(through, far, index), power, j + 1, self._search(0), on)
+
+        leg(state, int(Event.ESCAPED), state.index, state.active & settled & negated(some))
+        rest = replace(state, search=search, active=state.active & negated(settled))
+        # A branch, not a select: neighbouring rays mostly find their boundaries in the same step.
+        return dr.if_stmt((state, hit, rest), some, cross_it, lambda state, hit, rest: rest, label="boundary")
 
 
 def _unit(v: Vector2) -> Vector2:
@@ -291,3 +331,26 @@ def _each(name: str, values: ArrayLike, count: int, kinds: str, kind: DTypeLike)
         accepted = "a whole number, 0 or more and below 2³²" if whole else "a number above 0"
         raise ValueError(f"{name}; expected {accepted}, or {count} of them")
     return np.ascontiguousarray(np.broadcast_to(array.astype(kind), count))
+
+
+def _mesh(arrays: ArrayBackend, segments: Segments, method: str) -> MeshAcceleration | None:
+    """The mesh that finds the next boundary; None where all segments are tried: faster, asked for, or the only way."""
+    if method not in METHODS:
+        raise ValueError(f"method = {method!r}; expected {', '.join(METHODS)}")
+    if method == "brute" or (method == "auto" and len(segments) <= FEW):
+        return None
+    length = np.hypot(*(segments.end - segments.start).T)
+    if not length.any():  # no boundary at all
+        return None
+    extent = np.ptp(np.concatenate([segments.start, segments.end]), axis=0).max()
+    shortest = length[length > 0].min(initial=np.inf) / (extent / 2 or 1)
+    reason = "arcs" if segments.curved else f"a segment of {shortest:.1e}" if shortest < SHORTEST else ""
+    if not reason:
+        mesh = MeshAcceleration(arrays, segments.start, segments.end, segments.vertices)
+        if not mesh.crowded:
+            return mesh
+        reason = "segments {} and {}".format(*mesh.crowded)
+    if method == "mesh":
+        limit = f"longer and farther apart than {SHORTEST:.1e} of half the extent"
+        raise ValueError(f"method = 'mesh': {reason}; expected straight segments, {limit}")
+    return None

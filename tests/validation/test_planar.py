@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mi_refract.backend import detect
-from mi_refract.planar import Paths, Segments, shapes
+from mi_refract.planar import Event, Paths, Segments, shapes
 from mi_refract.planar import tracer as planar_tracer
 from validation.planar import against_retrace, closed_paths, extruded_scenes, joints, times
 from validation.planar.rounding import growth, transfer
@@ -208,6 +208,41 @@ def test_walls_do_what_segments_do_and_wrong_walls_are_seen(llvm_variant):
     assert extruded(segments=fewer)[WRONG_PATH_FAR] > 0
 
 
+# Times ---------------------------------------------------------------------------------------------------------
+
+
+def test_methods_that_differ_in_a_bit_are_seen(scalar_context, monkeypatch):
+    context = scalar_context(scalar_rays=4)
+
+    def verdicts():
+        return {row.case: row.verdict for row in times.measure(context, SCALAR, (10,)) if row.budgets}
+
+    assert verdicts() == {"document 004": "pass", "M = 10": "pass"}
+
+    class Nudged(planar_tracer.Tracer):
+        def __call__(self, *rays, **options):
+            paths = super().__call__(*rays, **options)
+            if self.mesh:
+                paths.points[0, 1] = np.nextafter(paths.points[0, 1], 9)
+            return paths
+
+    monkeypatch.setattr(times, "Tracer", Nudged)
+    assert set(verdicts().values()) == {"fail"}
+
+
+@pytest.mark.parametrize(("size", "side"), [(0, 1), (100, 1), (9000, 3)])
+def test_a_field_of_lenses_is_met_twice_by_every_ray(size, side):
+    field = times.field(size)
+    assert field.side == side
+    rays = field.beam(40, shuffled=False)
+    path = retrace(field.segments, *rays, 2)
+    assert (path.met == 2).all() and (path.events[:, :2] == Event.REFRACTED).all()
+    lens = np.round(path.points[:, 1] / field.pitch)
+    assert (np.diff(lens[:, 1] * side + lens[:, 0]) >= 0).all()
+    again = field.beam(40, shuffled=True)[0]
+    assert (np.sort(again, 0) == np.sort(rays[0], 0)).all() and (again != rays[0]).any()
+
+
 # The studies ---------------------------------------------------------------------------------------------------
 
 
@@ -218,7 +253,6 @@ def test_every_scene_file_is_in_the_study_and_what_cannot_run_says_so(scalar_con
     assert {row.verdict for row in rows} == {"pass"}
     assert {row.case for row in rows} == {path.stem for path in against_retrace.FOLDER.glob("*.toml")} | {"clutter"}
     assert closed_paths.row(SCALAR, "box, 20", closed_paths.box(20, 3)).verdict == "pass"
-    assert {row.case for row in times.measure(context, SCALAR)} == {"document 004", "M = 10"}
     off = {name: dataclasses.replace(b, usable=False, reason="off") for name, b in detect().items()}
     context = dataclasses.replace(context, backends=off)
     for study in (against_retrace, closed_paths, extruded_scenes, joints, times):
