@@ -15,7 +15,7 @@ from mi_refract.formulas import FORMULAS
 from mi_refract.image_diff import self_test
 from mi_refract.image_diff.methods import METHODS
 from mi_refract.io import image_file
-from mi_refract.io.pixels import srgb_encode
+from mi_refract.io.image_file import srgb_encode
 from mi_refract.io.safe_files import update_between, write_atomically
 from mi_refract.io.text import compact
 from mi_refract.plugins import PLUGIN

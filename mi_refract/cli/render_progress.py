@@ -18,7 +18,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from mi_refract.io.pixels import srgb_encode
+from mi_refract.io.image_file import srgb_encode
 from mi_refract.io.safe_files import write_atomically
 from mi_refract.io.text import printable
 from mi_refract.rendering.end_conditions import RelativeError

@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.io import image_file
-from mi_refract.io.image_file import MAX_VALUES, Image
-from mi_refract.io.pixels import Pixels
+from mi_refract.io.image_file import MAX_VALUES, Image, Pixels
 
 from .pixel_statistics import RADIUS
 

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_refract.io.image_file import Image
-from mi_refract.io.pixels import Pixels
+from mi_refract.io.image_file import Image, Pixels
 
 Maps = dict[str, Pixels]
 

@@ -22,8 +22,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from mi_refract.io.image_file import Image
-from mi_refract.io.pixels import Pixels, block_mean, srgb_decode
+from mi_refract.io.image_file import Image, Pixels, block_mean, srgb_decode
 
 from .comparison import Comparison, Metric, Verdict, passes_black, verdict_of
 from .pixelwise import require_nonnegative, tolerance

@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 
 from mi_refract.io import errors
-from mi_refract.io.image_file import Image
-from mi_refract.io.pixels import Pixels, block_mean
+from mi_refract.io.image_file import Image, Pixels, block_mean
 from mi_refract.io.safe_files import write_atomically
 from mi_refract.io.text import beside_bound, compact
 from mi_refract.report.documents import rendered

@@ -17,8 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_refract.io.image_file import Image
-from mi_refract.io.pixels import Pixels, any_channel
+from mi_refract.io.image_file import Image, Pixels, any_channel
 
 from . import channels, flip, pixelwise, welch
 from .comparison import (

@@ -35,8 +35,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mi_refract.io.pixels import Pixels as Array
-from mi_refract.io.pixels import block_mean, block_sum
+from mi_refract.io.image_file import Pixels as Array
+from mi_refract.io.image_file import block_mean, block_sum
 
 ROUNDING = 1e-12  # of m²: more than that of u in float64, which is some 1e-16 (m² + u)
 RADIUS = 2  # pixels: of a Gaussian filter of σ = 0.5, Mitsuba's default, ρ is 0.0003 at 2√2 and 1e-4 at 3

@@ -25,7 +25,7 @@ import numpy as np
 from scipy import ndimage, stats
 
 from mi_refract.io import image_file, safe_files
-from mi_refract.io.pixels import Pixels, block_mean, srgb_decode, srgb_encode
+from mi_refract.io.image_file import Pixels, block_mean, srgb_decode, srgb_encode
 from mi_refract.report.row import Row
 
 from . import methods

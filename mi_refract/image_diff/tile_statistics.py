@@ -28,8 +28,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_refract.io.pixels import Pixels as Array
-from mi_refract.io.pixels import block_area, block_sum
+from mi_refract.io.image_file import Pixels as Array
+from mi_refract.io.image_file import block_area, block_sum
 
 from .pixel_statistics import Inflation, PixelSums, sums
 

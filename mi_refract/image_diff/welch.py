@@ -9,8 +9,7 @@ from typing import Annotated
 
 import numpy as np
 
-from mi_refract.io.image_file import Image
-from mi_refract.io.pixels import Pixels
+from mi_refract.io.image_file import Image, Pixels
 
 from .channels import SPP, Estimate, estimates, has_variance, samples, spreads
 from .comparison import Comparison, Metric, Verdict, aligned, finite, nonfinite_result, preconditions

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_refract.io.pixels import srgb_encode
+from mi_refract.io.image_file import srgb_encode
 from mi_refract.io.safe_files import write_atomically
 
 from .curves import points

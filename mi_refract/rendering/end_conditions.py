@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mi_refract.io.pixels import block_sum
+from mi_refract.io.image_file import block_sum
 
 from .pass_plan import FEW
 from .pass_sums import Doubles, PassSums

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_refract.io.image_file import read
-from mi_refract.io.pixels import Pixels, block_mean
+from mi_refract.io.image_file import Pixels, block_mean, read
 
 Codes = NDArray[np.uint16]  # the bits of halves
 LARGEST = 65504.0  # of the finite halves

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes as Panel
     from matplotlib.figure import Figure
 
-    from mi_refract.io.pixels import Pixels
+    from mi_refract.io.image_file import Pixels
 
 Points = Sequence[tuple[float, float]]
 

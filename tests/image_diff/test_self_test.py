@@ -8,7 +8,7 @@ from mi_refract.image_diff import methods, self_test
 from mi_refract.image_diff.comparison import Comparison, Verdict
 from mi_refract.image_diff.self_test import DEFECTS, through_a_file
 from mi_refract.io import image_file
-from mi_refract.io.pixels import srgb_encode
+from mi_refract.io.image_file import srgb_encode
 
 IMAGE = 0.2 + 0.8 * np.random.default_rng(5).random((32, 32, 3))
 RAW = np.random.default_rng(3).gamma(0.5, 1.0, (6, 9, 3)).astype(np.float32)

@@ -14,8 +14,19 @@ import pytest
 from support.diff_images import cut
 
 from mi_refract.io import image_file
-from mi_refract.io.image_file import AHEAD, bounded_map, read, read_exr, write_exr
-from mi_refract.io.pixels import any_channel, block_area, block_mean, block_sum, srgb_decode, srgb_encode
+from mi_refract.io.image_file import (
+    AHEAD,
+    any_channel,
+    block_area,
+    block_mean,
+    block_sum,
+    bounded_map,
+    read,
+    read_exr,
+    srgb_decode,
+    srgb_encode,
+    write_exr,
+)
 
 PIXELS = np.random.default_rng(1).random((48, 40, 3)).astype(np.float32)
 # Values that a detour over half floats, clamping or a colour transform would change.

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_refract.io.pixels import srgb_decode
+from mi_refract.io.image_file import srgb_decode
 from mi_refract.media import glass_catalogs
 from mi_refract.report.row import Row
 from validation import __main__ as command

@@ -24,8 +24,7 @@ import numpy as np
 from mi_refract.image_diff import flip
 from mi_refract.image_diff.self_test import CONFIDENCE, FALSE_ALARMS, Tally
 from mi_refract.io import image_file
-from mi_refract.io.image_file import Image
-from mi_refract.io.pixels import Pixels
+from mi_refract.io.image_file import Image, Pixels
 from mi_refract.report.row import Row
 from validation.run import seeds
 from validation.run.context import Context
