@@ -153,7 +153,8 @@ def _result(where: str, entry: Entry, before: tuple[Path, Path], now: tuple[Path
         return Result(entry.name, entry.status, None, None)
     reference = _moved(f"{where}.reference", entry.reference, before[0], now[0]) if entry.reference else None
     test = _moved(f"{where}.test", entry.test, before[1], now[1]) if entry.test else None
-    target = _moved(f"{where}.target", entry.target, before[0], now[0])
+    none = entry.target == "."  # of what is wrong in the settings and matches no image
+    target = Path() if none else _moved(f"{where}.target", entry.target, before[0], now[0])
     # Of single files, the variants lie beside the reference.
     roots = (before[0].parent, now[0].parent) if entry.target == str(before[0]) else (before[0], now[0])
     variants = tuple(_moved(f"{where}.variants", each, *roots) for each in entry.variants)
