@@ -142,32 +142,33 @@ def read(path: str | Path, reference: Path | None = None, test: Path | None = No
         raise ValueError(f"{path}: written with --renders; expected the JSON of a comparison of single images")
     before = Path(document.reference), Path(document.test)
     now = reference or before[0], test or before[1]
-    results: list[Result] = []
-    for number, entry in enumerate(document.results):
-        where = f"{path}: results[{number}]"
-        if entry.status not in FAILED:
-            results.append(Result(entry.name, entry.status, None, None))
-            continue
-        old = _moved(f"{where}.reference", entry.reference, before[0], now[0]) if entry.reference else None
-        new = _moved(f"{where}.test", entry.test, before[1], now[1]) if entry.test else None
-        target = _moved(f"{where}.target", entry.target, before[0], now[0])
-        # Of single files, the variants lie beside the reference.
-        roots = (before[0].parent, now[0].parent) if entry.target == str(before[0]) else (before[0], now[0])
-        variants = tuple(_moved(f"{where}.variants", each, *roots) for each in entry.variants)
-        digests = None
-        if entry.digests is not None:
-            if len(entry.digests.variants) != len(variants):
-                raise ValueError(
-                    f"{where}.digests: {len(entry.digests.variants)} of {len(variants)} variants; {EXPECTED}"
-                )
-            words = zip(variants, entry.digests.variants, strict=True)
-            pairs = [(old, entry.digests.reference), (new, entry.digests.test), *words]
-            digests = {path: word for path, word in pairs if path}
-        options = {"allow_nonfinite": entry.options.get("allow_nonfinite") is True}
-        how = ComparisonSpec(options=options, variance=entry.variance)
-        result = Result(entry.name, entry.status, old, new, how, error=entry.error)
-        results.append(replace(result, digests=digests, target=target, variants=variants))
-    return Results(*now, tuple(results))
+    results = tuple(
+        _result(f"{path}: results[{number}]", entry, before, now) for number, entry in enumerate(document.results)
+    )
+    return Results(*now, results)
+
+
+def _result(where: str, entry: Entry, before: tuple[Path, Path], now: tuple[Path, Path]) -> Result:
+    if entry.status not in FAILED:
+        return Result(entry.name, entry.status, None, None)
+    reference = _moved(f"{where}.reference", entry.reference, before[0], now[0]) if entry.reference else None
+    test = _moved(f"{where}.test", entry.test, before[1], now[1]) if entry.test else None
+    none = entry.target == "."  # of what is wrong in the settings and matches no image
+    target = Path() if none else _moved(f"{where}.target", entry.target, before[0], now[0])
+    # Of single files, the variants lie beside the reference.
+    roots = (before[0].parent, now[0].parent) if entry.target == str(before[0]) else (before[0], now[0])
+    variants = tuple(_moved(f"{where}.variants", each, *roots) for each in entry.variants)
+    digests = None
+    if entry.digests is not None:
+        if len(entry.digests.variants) != len(variants):
+            raise ValueError(f"{where}.digests: {len(entry.digests.variants)} of {len(variants)} variants; {EXPECTED}")
+        words = zip(variants, entry.digests.variants, strict=True)
+        pairs = [(reference, entry.digests.reference), (test, entry.digests.test), *words]
+        digests = {path: word for path, word in pairs if path}
+    options = {"allow_nonfinite": entry.options.get("allow_nonfinite") is True}
+    how = ComparisonSpec(options=options, variance=entry.variance)
+    result = Result(entry.name, entry.status, reference, test, how, error=entry.error)
+    return replace(result, digests=digests, target=target, variants=variants)
 
 
 def _moved(where: str, text: str, before: Path, now: Path) -> Path:

@@ -391,7 +391,7 @@ def installed_version(distribution: str) -> str:
     return "unknown"
 
 
-# Arithmetic on pixels: the sRGB curve, and sums and means over blocks ----------------------------------------------------
+# Arithmetic on pixels -------------------------------------------------------------------------------------------------
 
 
 def srgb_encode(linear: Pixels) -> Pixels:

@@ -13,6 +13,7 @@ from support.diff_images import BROKEN, image, samples, tree
 
 from mi_refract.image_diff import methods, results_file, text_reports
 from mi_refract.image_diff.results import Result, Results, Status
+from mi_refract.io import errors
 
 EVIL = 'a"b<script>alert(1)<∕script>|`*[x](y)*`,:%0A::error::.exr'
 
@@ -154,6 +155,28 @@ def test_bad_images(run, pair, tmp_path, name, side):
     assert [each.get("type") for each in ElementTree.parse(files[1]).findall(".//error")] == ["error"]
     alone = run("diff", pair[0] / "equal.exr", pair[1] / "equal.exr")
     assert (alone[0], alone[1], alone[2].count("\n")) == (2, "", 1)
+
+
+def test_whatever_one_image_does_the_reports_are_written(run, pair, tmp_path, monkeypatch):
+    compare = methods.compare
+
+    def fail(method, one, two, **options):
+        if one[0].path.name == "equal.exr":
+            raise MemoryError("Unable to allocate 9 GiB")
+        return compare(method, one, two, **options)
+
+    monkeypatch.setattr(methods, "compare", fail)
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(tmp_path / "none" / "summary.md"))  # cannot be written
+    files = [tmp_path / name for name in ("out.html", "out.xml", "out.json")]
+    words = [word for pair in zip(("--report", "--junit", "--json"), files, strict=True) for word in pair]
+    code, out, err = run("diff", *pair, *words, "--github")
+    said = f"mi-refract: {pair[1]}/equal.exr: out of memory: Unable to allocate 9 GiB\n"
+    assert (code, err) == (2, f"{said}mi-refract: {tmp_path}/none/summary.md: No such file or directory\n")
+    assert "2 images: 1 could not be compared, 1 different" in out.splitlines()
+    for text in (file.read_text() for file in files):
+        assert "out of memory" in text and "louder.exr" in text
+    monkeypatch.setenv(errors.TRACEBACK, "1")
+    assert "Traceback" in run("diff", *pair)[2]
 
 
 def test_images_larger_than_allowed(run, pair):

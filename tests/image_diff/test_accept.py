@@ -277,6 +277,13 @@ def test_exactly_the_images_of_the_json_are_accepted_here_or_elsewhere(run, comp
     code, said, err = run("accept", *moved, "--from", out, "--yes")
     assert (code, err, said.splitlines()[-1]) == (0, "", "2 accepted")
     assert tree(moved[0]) == before | {name: tree(moved[1])[name] for name in ("louder.exr", "inner/added.exr")}
+    # What is wrong in the settings, and matches no image, keeps no image that is named from being accepted.
+    (moved[0] / "mi-refract.toml").write_text('[[image]]\nname = "none.exr"\nfale = 1\nreason = "none"\n')
+    image(moved[1] / "louder.exr", gain=3)
+    assert run("diff", *moved, "--json", out)[0] == 2
+    code, said, err = run("accept", "--from", out, "--yes")
+    assert (code, said) == (2, "") and "image[0]: unknown key `fale`" in err
+    assert run("accept", "--from", out, *moved, "louder.exr", "--yes")[0] == 0
     one, two = tmp_path / "1.exr", tmp_path / "2.exr"
     for path, gain in ((one, 1), (two, 2)):
         image(path, gain=gain)

@@ -216,6 +216,32 @@ def test_a_map_is_full_of_colour_where_its_upper_hundredth_is_and_keeps_the_stro
     assert small.shape == (10, 100, 1) and small[1, 50] == -3 and np.isnan(small[9, 99]) and (small != 0).sum() == 2
 
 
+@pytest.mark.parametrize(("rows", "kept"), [(1, 1), (512, 512), (513, 257), (1300, 434)])
+def test_a_histogram_is_of_512_rows_at_most(rows, kept, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(html_report, "histogram_svg", lambda values, *words, salt: drawn.append(values) or "")
+    p = np.linspace(0, 1, 2 * rows, dtype=np.float32).reshape(rows, 2)
+    p[0, 1] = np.nan
+    comparison = Comparison("welch", Verdict.DIFFERENT, "", maps={"p": p})
+    html_report.shown_of(Result("x", Status.DIFFERENT, None, None, comparison=comparison), np.inf, np.inf)
+    assert len(drawn[0]) == 2 * kept - 1
+
+
+@pytest.mark.parametrize(
+    ("metrics", "cause"),
+    [
+        ([("a", 3, 2), ("b", 4, 3), ("c", 9, 9)], "a"),
+        ([("a", 9, 1), ("b", 1, 0)], "b"),
+        ([("a", 9, 1), ("b", math.nan, 1)], "b"),
+        ([("a", 1, 1), ("b", 9, None)], "different"),
+    ],
+)
+def test_the_cause_is_the_number_that_is_furthest_beyond_its_bound(tmp_path, metrics, cause):
+    comparison = Comparison("x", Verdict.DIFFERENT, "", tuple(Metric(*each) for each in metrics))
+    result = Result("x", Status.DIFFERENT, tmp_path, tmp_path, comparison=comparison)
+    assert html_report.cause(result) == cause
+
+
 @pytest.mark.parametrize("share", [2, 0.75])
 def test_a_finite_value_never_becomes_infinite_and_nan_stays(share):
     pixels = RNG.gamma(2, 1, (64, 64, 3)).astype(np.float32)
@@ -270,13 +296,14 @@ def test_a_pair_that_does_not_fit_keeps_its_numbers_and_is_named(tmp_path, monke
     names = [f"-{i}.exr" for i in range(3)]
     some = tuple(replace(found.results[1], name=name) for name in names)
     monkeypatch.setattr(html_report, "PAGE", share * size_of(found.results[1]))
+    monkeypatch.setattr(html_report, "NAMED", 1)
     text = written(tmp_path, replace(found, results=some, flags=("--method", "welch")))
     assert len(roles(text)) == 6 * pairs and text.count("12 tiles differ.") == 3
     assert text.count("the page is full") == 3 - pairs
     said = re.search("Left out, because a page is limited to 15 MB: (.*?) <code>(.*?)</code>", text)
     assert said[1] == f"images of {3 - pairs} of 3 failures. The first of them:"
     words = ["mi-refract", "diff", f"{found.reference}", f"{found.test}", "--method", "welch", "--report", "rest.html"]
-    assert shlex.split(said[2]) == [*words, "--", *names[pairs:]]
+    assert shlex.split(said[2]) == [*words, "--", names[pairs]]
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -568,6 +568,15 @@ def test_rare_events_are_no_evidence_against_a_side_that_does_not_know_its_noise
     assert welch(beside(far, np.full_like(mean, 1e-9)), beside(mean, variance), **how).verdict is DIFFERENT
 
 
+@pytest.mark.parametrize(("samples", "verdict"), [(15_000, INCONCLUSIVE), (16_000, DIFFERENT)])
+def test_the_noise_of_a_side_is_well_known_by_16_times_the_samples_of_the_other(samples, verdict):
+    """Here 16 pixels are brighter by 0.7 σ of the tile each."""
+    mean, variance = full(1.0, 256 * 1000 * 0.25**2, shape=(16, 16, 1))
+    far = mean.copy()
+    far.flat[::16] += 2.75 * 16
+    assert welch(beside(mean, variance), beside(far), spp_reference=samples, spp_test=1000).verdict is verdict
+
+
 # Stacks ------------------------------------------------------------------------------------------------------------
 
 
