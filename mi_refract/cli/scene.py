@@ -45,8 +45,7 @@ def export(
     """Write a Mitsuba scene as triangles for another renderer, with a README.txt that says how to render it."""
     defines = scene_files.parse_defines(define or [])
     activate("scalar_rgb")
-    from mi_refract.scene_export import from_mitsuba
-    from mi_refract.scene_export.write_files import write
+    from mi_refract.scene_export import from_mitsuba, targets
 
     path = next((path for path in (Path(scene), SCENES / f"{scene}.xml") if path.is_file()), None)
     if path is None:
@@ -54,7 +53,7 @@ def export(
         raise FileNotFoundError(f"{scene}: no such scene; expected {', '.join(['a file', *names])}")
     folder = output or Path(f"{path.stem}-{to}")
     plain = from_mitsuba.load(path, level=from_mitsuba.LEVEL if level is None else level, **defines)
-    written = write(plain, to, folder)
+    written = targets.write(plain, to, folder)
     triangles = sum(len(mesh.faces) for mesh in plain.meshes)
     done = f"{len(written)} files, {triangles} triangles; {folder / 'README.txt'} says how to render them"
     print(printable(f"{folder}: {done}"))

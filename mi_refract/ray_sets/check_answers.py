@@ -24,7 +24,7 @@ from mi_refract.regimes import Array, Rays
 from . import diagnosis, tir_signal
 from .diagnosis import Explanation
 from .header import AUTO, FLAG, PRECISIONS, SAME, TIR, Header, Ids, described, has_media, shown
-from .judged_answers import Flags, JudgedAnswers, Table, certified, judge_answers, see
+from .judged_answers import JudgedAnswers, Table, certified, judge_answers, see
 from .ray_set import Answers, RaySet, in_regime
 from .tir_signal import LOOSEST, UNCLEAR
 
@@ -200,9 +200,21 @@ def check(
         printed = answers.b[diagnosis.evenly(table["compared"])]
         explanations = diagnosis.explain(judge(diagnosis.sample(table)), table, printed)
     ulp = float(np.finfo(PRECISIONS[precision]).eps)
-    ratio, other_ratio = _ratio_difference(rays, answers, ulp)
+    ratio, other_ratio = None, np.zeros(len(rays), bool)
+    if answers.n_ratio is not None and len(rays):
+        k = rays.rays.k.astype(np.float64)
+        differences = np.abs(answers.n_ratio - k) / k
+        row = int(np.argmax(differences))
+        id_, tolerance = int(rays.ids[row]), SAME if has_media(header) else SAME_ULPS * ulp
+        ratio = RatioDifference(float(differences[row]), id_, described(header, id_), tolerance)
+        other_ratio = differences > tolerance
     masks = {kind: table[kind] for kind in ("non-finite", "zero", "impossible")} | {"index": other_ratio}
     problems |= {kind: rays.ids[mask] for kind, mask in masks.items()}
+    defects = []
+    for kind, ids in problems.items():
+        if len(ids):
+            first, more = ", ".join(map(str, ids[:LISTED_IDS])), ", …" if len(ids) > LISTED_IDS else ""
+            defects.append(Problem(kind, len(ids), f"id{'' if len(ids) == 1 else 's'} {first}{more}"))
     return Findings(
         precision=precision,
         ulp=ulp,
@@ -210,7 +222,7 @@ def check(
         tir=signal,
         tir_given=tir != AUTO,
         regimes=tuple(_by_regime(rays, answers, table)),
-        problems=tuple(Problem(kind, len(ids), _listed(ids)) for kind, ids in problems.items() if len(ids)),
+        problems=tuple(defects),
         explanations=tuple(explanations),
         header=header,
         ratio=ratio,
@@ -235,24 +247,6 @@ def used(rays: RaySet, answers: Answers) -> Rays:
     if answers.n_ratio is None:
         return rays.rays
     return Rays(rays.rays.a.astype(np.float64), rays.rays.n.astype(np.float64), answers.n_ratio)
-
-
-def _ratio_difference(rays: RaySet, answers: Answers, ulp: float) -> tuple[RatioDifference | None, Flags]:
-    """The largest, and (N,) where the ratio is another than that of the ray; nothing where the answers have none."""
-    if answers.n_ratio is None or not len(rays):
-        return None, np.zeros(len(rays), bool)
-    k = rays.rays.k.astype(np.float64)
-    differences = np.abs(answers.n_ratio - k) / k
-    tolerance = SAME if has_media(rays.header) else SAME_ULPS * ulp
-    row = int(np.argmax(differences))
-    id_ = int(rays.ids[row])
-    largest = RatioDifference(float(differences[row]), id_, described(rays.header, id_), tolerance)
-    return largest, differences > tolerance
-
-
-def _listed(ids: Ids) -> str:
-    first, more = ", ".join(map(str, ids[:LISTED_IDS])), ", …" if len(ids) > LISTED_IDS else ""
-    return f"id{'' if len(ids) == 1 else 's'} {first}{more}"
 
 
 def _by_regime(rays: RaySet, answers: Answers, table: Table) -> Iterator[RegimeErrors]:

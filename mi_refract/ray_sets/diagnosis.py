@@ -97,7 +97,13 @@ def predictions(rays: Rays, exact: oracle.Certified) -> Iterator[tuple[str, str,
             b = np.cos(angle) * np.sign(c) * n + np.sin(angle) * tangent / np.where(length > 0, length, 1)
             yield "degrees and radians", variant, b
 
-    for name, matrix in _axes():
+    # Signed permutations of the axes, without the identity and −1: to reverse all three is another mistake.
+    for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)):
+        if order == (0, 1, 2) and len(set(signs)) == 1:
+            continue
+        matrix = np.zeros((3, 3))
+        matrix[range(3), order] = signs
+        name = ", ".join(f"{'-' if s < 0 else ''}{'xyz'[i]}" for i, s in zip(order, signs, strict=True))
         yield "handedness", f"the answer's x, y, z are the right answer's {name}", refracted @ matrix.T
         for vector, (read_a, read_n) in {"a": (a @ matrix.T, n), "n": (a, n @ matrix.T)}.items():
             # Where the normal changes sides, programs differ.
@@ -110,15 +116,6 @@ def predictions(rays: Rays, exact: oracle.Certified) -> Iterator[tuple[str, str,
         radicand, along = 1 - k[:, None] ** 2 * (1 - (x * y).sum(1, keepdims=True) ** 2), (x * y).sum(1, keepdims=True)
         b = k[:, None] * x + y * (np.copysign(np.sqrt(radicand), along) - k[:, None] * along)
         yield LENGTHS, f"{names} taken for {'unit vectors' if ' and ' in names else 'a unit vector'}", unit(b)
-
-
-def _axes() -> Iterator[tuple[str, Array]]:
-    """Signed permutations of the axes, without the identity and −1: to reverse all three is another mistake."""
-    for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)):
-        if order != (0, 1, 2) or len(set(signs)) > 1:
-            matrix = np.zeros((3, 3))
-            matrix[range(3), order] = signs
-            yield ", ".join(f"{'-' if s < 0 else ''}{'xyz'[i]}" for i, s in zip(order, signs, strict=True)), matrix
 
 
 # Comparison with the answers ---------------------------------------------------------------------------------------
@@ -157,7 +154,15 @@ def explain(judged: JudgedAnswers, table: Table, printed: Array) -> list[Explana
     # float32 where float64 was claimed: errors of float32's size nearly everywhere, and none that is larger.
     everywhere = roundoff < F32 and _median_angle(table, table["compared"]) > F32 / 50
     float32 = _loss(FLOAT32, "errors are those of float32", table, "float32", everywhere)
-    digits = _few_digits(table, printed, roundoff)
+    # Too few digits: all numbers but the whole ones are equal to themselves so rounded.
+    digits = Explanation(FEW_DIGITS, "numbers have all their digits", 0.0, math.nan, False)
+    values = printed.ravel()
+    values = values[np.rint(values) != values].tolist()
+    candidates = range(1, MOST_TELLING[roundoff] + 1) if len(values) >= FEWEST else range(0)
+    for count, (form, word) in itertools.product(candidates, (("f", "decimals"), ("g", "significant digits"))):
+        if all(float(f"{x:.{count}{form}}") == x for x in values):
+            digits = _loss(FEW_DIGITS, f"numbers are rounded to {count} {word}", table, "digits", least=count)
+            break
     # Numbers of few digits may keep the bound of float32, too.
     return [*best.values(), replace(float32, explains=float32.explains and not digits.explains), digits]
 
@@ -184,14 +189,3 @@ def _median_angle(table: Table, mask: Flags) -> float:
     """Of the directions compared in the mask; NaN where there is none."""
     angles = table["angle"][table["compared"] & mask]
     return float(np.median(angles)) if len(angles) else math.nan
-
-
-def _few_digits(table: Table, printed: Array, roundoff: float) -> Explanation:
-    """Numbers that were printed with too few digits."""
-    values = printed.ravel()
-    values = values[np.rint(values) != values].tolist()
-    candidates = range(1, MOST_TELLING[roundoff] + 1) if len(values) >= FEWEST else range(0)
-    for digits, (form, word) in itertools.product(candidates, (("f", "decimals"), ("g", "significant digits"))):
-        if all(float(f"{x:.{digits}{form}}") == x for x in values):
-            return _loss(FEW_DIGITS, f"numbers are rounded to {digits} {word}", table, "digits", least=digits)
-    return Explanation(FEW_DIGITS, "numbers have all their digits", 0.0, math.nan, False)

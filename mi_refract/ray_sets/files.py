@@ -302,7 +302,17 @@ def _read_npz(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
             whole = [layout for layout in layouts if all(array_name(column) in members for column in layout)]
             columns = max(whole, key=len, default=layouts[0])
             widths = Counter(map(array_name, columns))
-            arrays = {name: _numbers(archive, name, width, most) for name, width in widths.items()}
+            arrays = {}
+            for name, width in widths.items():
+                array = _array(archive, name, most * _NUMBER_BYTES * width)
+                if not array.ndim or array.shape[1:] not in ((width,), ()) or array.size != len(array) * width:
+                    raise ValueError(f"{name} has the shape {array.shape}, not (rows, {width})")
+                if array.dtype.kind not in "biuf":
+                    raise ValueError(f"{name} holds {array.dtype}, not real numbers")
+                if len(array) > most:
+                    raise ValueError(f"{len(array)} rows, more than {most}")
+                with np.errstate(over="ignore"):
+                    arrays[name] = array.reshape(len(array), width).astype(np.float64)
             if len({len(array) for array in arrays.values()}) > 1:
                 raise ValueError(", ".join(f"{name} has {len(array)} rows" for name, array in arrays.items()))
             text = _array(archive, "header", _NPZ_HEADER_BYTES) if "header" in members else np.array("")
@@ -313,19 +323,6 @@ def _read_npz(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
         raise ValueError(f"{found}; expected an .npz file with {', '.join(expected)}") from None
     header = _value(str(text))
     return Table(header if isinstance(header, dict) else {}, columns, np.hstack(list(arrays.values())))
-
-
-def _numbers(archive: zipfile.ZipFile, name: str, width: int, most: int) -> Array:
-    """An array of numbers as (N, width) float64."""
-    array = _array(archive, name, most * _NUMBER_BYTES * width)
-    if not array.ndim or array.shape[1:] not in ((width,), ()) or array.size != len(array) * width:
-        raise ValueError(f"{name} has the shape {array.shape}, not (rows, {width})")
-    if array.dtype.kind not in "biuf":
-        raise ValueError(f"{name} holds {array.dtype}, not real numbers")
-    if len(array) > most:
-        raise ValueError(f"{len(array)} rows, more than {most}")
-    with np.errstate(over="ignore"):
-        return array.reshape(len(array), width).astype(np.float64)
 
 
 def _array(archive: zipfile.ZipFile, name: str, most: int) -> NDArray[Any]:

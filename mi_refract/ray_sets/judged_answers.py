@@ -160,7 +160,10 @@ def possible(b: Array, bounds: RayBounds, some: Index, signal: str = "") -> Flag
     `signal`: how they signal total internal reflection, "tangent" or "reflected"; of transmitted directions "".
     """
     # The parts of b and of `a` along t, along m, and across both, in extended precision.
-    a, n, b = (_unit(v[some]) for v in (bounds.rays.a, bounds.rays.n, b))
+    # Divided first by the largest component: squares of the least numbers would be 0.
+    vectors = (v[some].astype(np.longdouble) for v in (bounds.rays.a, bounds.rays.n, b))
+    vectors = (v / np.abs(v).max(1, keepdims=True, initial=0) for v in vectors)
+    a, n, b = (v / lengths(v)[:, None] for v in vectors)
     c = (a * n).sum(1, keepdims=True)
     m, tangent = np.where(c < 0, -n, n), a - c * n
     sine, cosine = lengths(tangent), np.abs(c[:, 0])
@@ -192,10 +195,3 @@ def possible(b: Array, bounds: RayBounds, some: Index, signal: str = "") -> Flag
             forward, size = e * along + nearest * onward, np.hypot(e, nearest)
         # A vector of this size is within `slack` of the line of b, and b does not point away from it.
         return np.asarray((size <= slack) | (off <= slack) & (forward > 0))
-
-
-def _unit(v: Array) -> Array:
-    """Any vectors (M, 3), made unit in extended precision. Precondition: finite, not zero."""
-    wide: Array = v.astype(np.longdouble)
-    wide = wide / np.abs(wide).max(1, keepdims=True, initial=0)  # squares of the least numbers would be 0
-    return np.asarray(wide / lengths(wide)[:, None])

@@ -53,33 +53,32 @@ PROBLEM_TEXTS = {
 
 def sentence(findings: Findings) -> str:
     """The result in one line, such as "200 of 13000 answers are wrong: eta inverted"."""
-    others = findings.problem_count("index")
-    return _directions(findings) + (f"; {others} answers are for a different ratio of indices" if others else "")
-
-
-def _directions(findings: Findings) -> str:
-    if not findings.answered:
-        return "no ray was answered"
     answers = f"{findings.answered} answers"
-    if findings.diagnosis:
-        return f"{findings.wrong} of {answers} are wrong: {findings.diagnosis.mistake}"
-    if findings.exit_code > 1:
+    if not findings.answered:
+        text = "no ray was answered"
+    elif findings.diagnosis:
+        text = f"{findings.wrong} of {answers} are wrong: {findings.diagnosis.mistake}"
+    elif findings.exit_code > 1:
         wrong = f"; {findings.wrong} of them are wrong" if findings.wrong else ""
-        return f"{answers}, but they do not match the rays{wrong}"
-    if findings.wrong or findings.tir == UNCLEAR:
-        return f"{findings.wrong} of {answers} are wrong"
-    if not findings.total("judged"):
-        return f"{answers}, none of them a {'decidable ' if findings.total('compared') else ''}direction"
-    if findings.total("exact") == findings.answered:
-        return f"{answers}, all exact up to rounding"
-    farthest = max(findings.regimes, key=lambda x: (x.compared > 0, x.worst))
-    worst = f"the largest error is {compact(farthest.worst)} rad ({farthest.regime})"
-    wide = findings.total("undecidable")
-    undecidable = f"; {wide} rays are undecidable (error bound above 0.1 rad)" if wide else ""
-    if findings.right == findings.answered:
-        return f"{answers}, all right; {worst}"
-    others = f"the others are within the error bound of the formula {findings.error_bound}"
-    return f"{findings.right} of {answers} are right, {others}; {worst}{undecidable}"
+        text = f"{answers}, but they do not match the rays{wrong}"
+    elif findings.wrong or findings.tir == UNCLEAR:
+        text = f"{findings.wrong} of {answers} are wrong"
+    elif not findings.total("judged"):
+        text = f"{answers}, none of them a {'decidable ' if findings.total('compared') else ''}direction"
+    elif findings.total("exact") == findings.answered:
+        text = f"{answers}, all exact up to rounding"
+    else:
+        farthest = max(findings.regimes, key=lambda x: (x.compared > 0, x.worst))
+        worst = f"the largest error is {compact(farthest.worst)} rad ({farthest.regime})"
+        if findings.right == findings.answered:
+            text = f"{answers}, all right; {worst}"
+        else:
+            within = f"the others are within the error bound of the formula {findings.error_bound}"
+            text = f"{findings.right} of {answers} are right, {within}; {worst}"
+            if wide := findings.total("undecidable"):
+                text += f"; {wide} rays are undecidable (error bound above 0.1 rad)"
+    others = findings.problem_count("index")
+    return text + (f"; {others} answers are for a different ratio of indices" if others else "")
 
 
 def problem_text(problem: Problem) -> str:

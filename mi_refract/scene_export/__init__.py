@@ -4,4 +4,4 @@ In: a Mitsuba XML file of glass, diffuse surfaces and lights. Out: a folder with
 and a README.txt with the command that renders it. The command is `mi-refract scene export`; see README.md.
 """
 
-__all__ = ["from_mitsuba", "plain_scene", "targets", "write_files"]
+__all__ = ["from_mitsuba", "plain_scene", "targets"]

@@ -34,7 +34,7 @@ from mi_refract.planar import scene_file
 from mi_refract.plugins import scene_parser
 from mi_refract.ray_sets import check_answers, files, ray_set, renderer_file
 from mi_refract.rendering import scene_files
-from mi_refract.scene_export import from_mitsuba, write_files
+from mi_refract.scene_export import from_mitsuba, targets
 
 SCENES = Path(__file__).parents[2] / "scenes"
 LONGEST, HANG = 10.0, 60.0  # CPU seconds of one input; seconds after which the process ends
@@ -241,8 +241,8 @@ def rendered(path, defines):
 def exported(path):
     """The scene is written for one of the targets, by turns."""
     plain = from_mitsuba.load(path, level=1)
-    targets = [name for name in write_files.TARGETS if name != "povray"]  # which has glass and lights only
-    write_files.TARGETS[targets[path.stat().st_size % len(targets)]](plain)
+    names = [name for name in targets.TARGETS if name != "povray"]  # which has glass and lights only
+    targets.TARGETS[names[path.stat().st_size % len(names)]](plain)
     numbers = [*dataclasses.astuple(plain.camera), *(x for m in plain.materials for x in dataclasses.astuple(m))]
     return None if np.isfinite(np.hstack(numbers)).all() else "a number that is not finite"
 

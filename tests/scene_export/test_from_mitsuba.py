@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mi_refract.io import image_file
-from mi_refract.scene_export import from_mitsuba, meshes_from_shapes, tessellation, write_files
+from mi_refract.scene_export import from_mitsuba, meshes_from_shapes, targets, tessellation
 from mi_refract.scene_export.mitsuba_nodes import SceneFile
 from mi_refract.scene_export.plain_scene import Diffuse, Glass, Light
 
@@ -88,7 +88,7 @@ def test_what_is_read(scene):
 
 def again(found, folder):
     """The plain scene, loaded by Mitsuba."""
-    write_files.write(found, "mitsuba", folder)
+    targets.write(found, "mitsuba", folder)
     return original(folder / "scene.xml")
 
 

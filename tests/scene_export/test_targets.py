@@ -21,7 +21,7 @@ from support.scene_readers import READERS
 from mi_refract.image_diff import methods
 from mi_refract.image_diff.comparison import Verdict
 from mi_refract.io import image_file
-from mi_refract.scene_export import from_mitsuba, tessellation, write_files
+from mi_refract.scene_export import from_mitsuba, targets, tessellation
 from mi_refract.scene_export.plain_scene import Camera, Diffuse, Environment, Glass, Light, Mesh, PlainScene
 
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -45,12 +45,12 @@ def sky():
 # --- the folder ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("target", write_files.TARGETS)
+@pytest.mark.parametrize("target", targets.TARGETS)
 def test_every_target_writes_its_folder(target, sky, tmp_path):
     """With a sky of one colour, with a map, and without any mesh."""
     scenes = [plain(GLASS, LAMP), plain(GLASS, LAMP, sky=sky), plain(sky=sky)]
     for i, scene in enumerate(scenes):
-        written = write_files.write(scene, target, tmp_path / f"{i}")
+        written = targets.write(scene, target, tmp_path / f"{i}")
         assert sorted(written) == sorted((tmp_path / f"{i}").iterdir()) and (
             i == 2 or all(map(os.path.getsize, written))
         )
@@ -59,7 +59,7 @@ def test_every_target_writes_its_folder(target, sky, tmp_path):
         if (tmp_path / f"{i}" / "sky.exr").exists():  # without a date: the same scene gives the same bytes
             assert image_file.read(tmp_path / f"{i}" / "sky.exr").metadata["DateTime"] == "1970:01:01 00:00:00"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0", "1", "2"]
-    readme = Path(write_files.__file__).with_name("README.md").read_text()
+    readme = Path(from_mitsuba.__file__).with_name("README.md").read_text()
     assert target in re.findall(r"^\| `(.*?)` \|", readme, re.MULTILINE)
 
 
@@ -76,12 +76,12 @@ def test_what_is_there_stays_and_an_empty_folder_is_taken(tmp_path):
         ("file/below", "not a f"),
     ):
         with pytest.raises(OSError, match=words):
-            write_files.write(plain(GLASS), "obj+json", tmp_path / name)
+            targets.write(plain(GLASS), "obj+json", tmp_path / name)
     with pytest.raises(ValueError, match=r"'blender': unknown; expected cycles, luxcore, .*, mitsuba, obj\+json"):
-        write_files.write(plain(GLASS), "blender", tmp_path / "new")
+        targets.write(plain(GLASS), "blender", tmp_path / "new")
     assert sorted(tmp_path.rglob("*")) == before
     (tmp_path / "link").symlink_to(tmp_path / "there")
-    write_files.write(plain(GLASS), "radiance", tmp_path / "link")
+    targets.write(plain(GLASS), "radiance", tmp_path / "link")
     assert (tmp_path / "there" / "scene.rad").is_file() and (tmp_path / "link").is_symlink()
 
 
@@ -89,7 +89,7 @@ def test_nothing_stays_of_half_an_export(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(os, "access", lambda path, mode: False)
         with pytest.raises(PermissionError, match="not writable"):
-            write_files.write(plain(GLASS), "mitsuba", tmp_path / "new")
+            targets.write(plain(GLASS), "mitsuba", tmp_path / "new")
     written, write_bytes = [], Path.write_bytes
 
     def full(path, data):
@@ -100,7 +100,7 @@ def test_nothing_stays_of_half_an_export(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OSError, match="No space"):
-        write_files.write(plain(GLASS, LAMP), "mitsuba", tmp_path / "new")
+        targets.write(plain(GLASS, LAMP), "mitsuba", tmp_path / "new")
     assert len(written) == 3 and not list(tmp_path.iterdir())
 
 
@@ -148,7 +148,7 @@ def test_the_export_has_mitsubas_rays_surfaces_indices_lights_and_sky(
     path = tmp_path / "scene.xml"
     path.write_text(SCENE % (sky if target == "povray" else sky + PATCH))
     given = from_mitsuba.load(path, level=1)
-    write_files.write(given, target, tmp_path / "export")
+    targets.write(given, target, tmp_path / "export")
     original = mi.load_file(str(path), parallel=False, optimize=False)
     found = READERS[target](tmp_path / "export", monkeypatch)
 
@@ -194,7 +194,7 @@ def test_the_plain_scene_renders_equal_and_another_index_would_be_seen(tmp_path)
         return [image_file.named(f"seed {seed}", np.array(mi.render(scene, spp=64, seed=seed))) for seed in seeds]
 
     path = tmp_path / "plain" / "scene.xml"
-    write_files.write(from_mitsuba.load(SCENES / "prism.xml", level=0, res="32"), "mitsuba", path.parent)
+    targets.write(from_mitsuba.load(SCENES / "prism.xml", level=0, res="32"), "mitsuba", path.parent)
     first = renders(SCENES / "prism.xml", 0, res="32")
     assert methods.compare("welch", first, renders(path, 100), tile=16).verdict == Verdict.EQUAL
     text, material = path.read_text(), '<float name="int_ior" value="1.5046"/>'
@@ -209,9 +209,9 @@ def test_povray(tmp_path):
     (grey,) = plain(Diffuse((0.5, 0.0, 0.0))).meshes
     for mesh, words in ((pane, "pane: glass with an open"), (grey, "ball_0: a diffuse surface")):
         with pytest.raises(ValueError, match=words):
-            write_files.write(PlainScene("bad", (mesh,), (1.0, 1.0, 1.0), CAMERA, 8), "povray", tmp_path / "new")
+            targets.write(PlainScene("bad", (mesh,), (1.0, 1.0, 1.0), CAMERA, 8), "povray", tmp_path / "new")
     assert not list(tmp_path.iterdir())
-    make = write_files.TARGETS["povray"]
+    make = targets.TARGETS["povray"]
     text = make(plain(LAMP, Diffuse((0.0, 0.0, 0.0))))["scene.pov"].decode()
     front = "texture { pigment { rgb <%s> } finish { ambient 0 diffuse 0 emission 1 } }"
     assert text.count(front % "1.0, 2.0, 3.0") == text.count(front % "0.0, 0.0, 0.0") == 1
@@ -226,7 +226,7 @@ def test_povray(tmp_path):
 
 
 def written(target, folder, depth=12):
-    write_files.write(plain(GLASS, GREY, LAMP, depth=depth), target, folder)
+    targets.write(plain(GLASS, GREY, LAMP, depth=depth), target, folder)
     return folder
 
 
@@ -312,3 +312,17 @@ def test_raysect_weighs_no_ray_and_takes_a_band_and_a_dispersion(tmp_path, monke
     entry = {"int_ior": 1.5, "ext_ior": 1.25}
     assert script["glass"](entry) == ("glass", 1.5, 1, 1.25)
     assert script["glass"](entry | {"schott": "SF11"})[1] == "of SF11"
+
+
+@pytest.mark.parametrize("size", [1.0, 100.0])
+def test_raysect_gets_a_scene_whose_largest_coordinate_is_a_half(size, tmp_path, monkeypatch):
+    """That of the camera, or of a mesh: both are scaled."""
+    mesh = Mesh("ball", size * BALL[0], BALL[1], GLASS)
+    targets.write(PlainScene("scaled", (mesh,), (1.0, 1.0, 1.0), CAMERA, 8), "raysect", tmp_path / "new")
+    made, script = fake_raysect.run(tmp_path / "new", monkeypatch)
+    scene = json.loads((tmp_path / "new" / "scene.json").read_text())
+    script["build"](scene, tmp_path / "new")
+    place = script["camera"]("world", scene, types.SimpleNamespace(spp=1, band=None), "pipeline").transform[:3, 3]
+    unit = 0.5 / max(9.0, np.abs(mesh.vertices).max())
+    np.testing.assert_allclose(place, np.multiply(unit, CAMERA.origin), rtol=4 * SINGLE)
+    np.testing.assert_allclose(made.meshes["ball"].triangles, unit * mesh.triangles(), rtol=4 * SINGLE)

@@ -9,7 +9,7 @@ import pytest
 from mi_refract import media
 from mi_refract.image_diff.comparison import Verdict
 from mi_refract.io import image_file
-from mi_refract.scene_export import write_files
+from mi_refract.scene_export import targets
 from mi_refract.scene_export.plain_scene import Glass
 from validation import limits
 from validation.run.context import PROFILES, Context
@@ -129,13 +129,13 @@ def test_a_defect_of_an_export_is_seen(defect, monkeypatch, tmp_path):
     """Also with an eighth of the samples: noise makes the allowance larger."""
     if reason := environments.absent(SYSTEMS["radiance"]):
         pytest.skip(reason)
-    make, (name, pattern, new) = write_files.TARGETS["radiance"], DEFECTS[defect]
+    make, (name, pattern, new) = targets.TARGETS["radiance"], DEFECTS[defect]
 
     def files(plain):
         made = make(plain)
         return made | {name: re.sub(pattern, new, made[name].decode()).encode()}
 
-    monkeypatch.setitem(write_files.TARGETS, "radiance", files)
+    monkeypatch.setitem(targets.TARGETS, "radiance", files)
     monkeypatch.setattr(exports, "THEIRS", {title: spp // 8 for title, spp in exports.THEIRS.items()})
     (row,) = exports.rows(Context(PROFILES["full"], tmp_path, "llvm_ad_rgb", {}, {}), "Radiance")
     assert (exports.OVER in row.broken) == (defect != "nothing"), row.values

@@ -125,6 +125,12 @@ def test_what_a_system_gives_up_is_counted_and_recorded_errors_are_goals_on_both
     assert per_ray.off(0, 2, 4) == np.inf and np.isnan(per_ray.off(np.nan, 2, 4))
 
 
+def test_every_recorded_error_of_mitsuba_is_a_goal():
+    """So a goal that is missed cannot be taken away."""
+    for call in SYSTEMS["mitsuba"].calls:
+        assert set(call.recorded) == set(per_ray.SETS) - {TOTAL, LARGE}, call.title
+
+
 def test_what_is_absent_large_or_cannot_run_here_is_not_run_and_programs_run_without_our_environment(
     rows_of, tmp_path, monkeypatch
 ):

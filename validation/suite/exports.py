@@ -19,7 +19,7 @@ import numpy as np
 from mi_refract.plugins import PLUGIN
 from mi_refract.rendering import scene_files
 from mi_refract.report.row import Row
-from mi_refract.scene_export import from_mitsuba, write_files
+from mi_refract.scene_export import from_mitsuba, targets
 from mi_refract.scene_export.plain_scene import Camera, Diffuse, Light, Material, Mesh, PlainScene
 from validation import limits
 from validation.run import render_methods
@@ -92,7 +92,7 @@ def drawn(title: str) -> np.ndarray:
 def reference(diffuse: bool) -> np.ndarray:
     """Renders by this plugin, in the present variant: renders × height × width × 3."""
     with tempfile.TemporaryDirectory() as folder:
-        write_files.write(scene(diffuse), "mitsuba", Path(folder) / "scene")
+        targets.write(scene(diffuse), "mitsuba", Path(folder) / "scene")
         camera = render_methods.Camera(scene_files.load_scene(Path(folder) / "scene" / "scene.xml", {"bsdf": PLUGIN}))
         return np.stack([camera(SPP, 1000 + i)[0] for i in range(len(SEEDS))])
 

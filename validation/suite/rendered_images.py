@@ -27,7 +27,7 @@ from mi_refract.io.image_file import Image
 from mi_refract.plugins import PLUGIN
 from mi_refract.rendering import scene_files
 from mi_refract.report.row import Row
-from mi_refract.scene_export import from_mitsuba, write_files
+from mi_refract.scene_export import from_mitsuba, targets
 from mi_refract.scene_export.plain_scene import Diffuse, Environment, Glass, Light, Mesh, PlainScene
 from validation import limits
 from validation.run.context import SCENES as FOLDER
@@ -151,8 +151,8 @@ def join(system: System) -> None:
     images, where = system.images, f"{system.folder}: images."
     if images is None:
         return
-    if images.export not in write_files.TARGETS:
-        raise ValueError(f"{where}export: {images.export!r}; expected {', '.join(write_files.TARGETS)}")
+    if images.export not in targets.TARGETS:
+        raise ValueError(f"{where}export: {images.export!r}; expected {', '.join(targets.TARGETS)}")
     for scene in (*images.spp, *images.deviations):
         if scene not in SCENES:
             raise ValueError(f"{where}spp, images.deviation: {scene!r}; expected {', '.join(SCENES)}")
@@ -224,7 +224,7 @@ def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
 def reference(scene: str, size: Size) -> list[Image]:
     """Of this plugin, in the present variant."""
     with tempfile.TemporaryDirectory() as folder:
-        write_files.write(SCENES[scene].load(size.resolution), "mitsuba", Path(folder) / "scene")
+        targets.write(SCENES[scene].load(size.resolution), "mitsuba", Path(folder) / "scene")
         camera = Camera(scene_files.load_scene(Path(folder) / "scene" / "scene.xml", {"bsdf": PLUGIN}))
         renders = [mean(camera, SCENES[scene].more * size.spp, OURS + i) for i in range(RENDERS)]
     return [image_file.named(f"{PLUGIN} {scene} {i}", pixels) for i, pixels in enumerate(renders)]

@@ -27,7 +27,7 @@ from mi_refract.io.image_file import Image
 from mi_refract.media import LINES
 from mi_refract.rendering import scene_files
 from mi_refract.report.row import Row
-from mi_refract.scene_export import from_mitsuba, write_files
+from mi_refract.scene_export import from_mitsuba, targets
 from mi_refract.scene_export.plain_scene import Diffuse, Glass, Light, Mesh, PlainScene
 from validation import limits
 from validation.run.context import SCENES as FOLDER
@@ -154,7 +154,7 @@ def ours(line: str, size: Size) -> list[Image]:
     """Renders by `refract_path` at a line."""
     with tempfile.TemporaryDirectory() as folder, under(VARIANT):
         file = Path(folder) / "scene" / "scene.xml"
-        write_files.write(plain(size.resolution), "mitsuba", file.parent)
+        targets.write(plain(size.resolution), "mitsuba", file.parent)
         file.write_text(spectral(file.read_text(), LINES[line]))
         camera = Camera(scene_files.load_scene(file, {"bsdf": "refract"}))
         # The film adds up what it sees over its band.

@@ -1,6 +1,51 @@
-"""The formats that a plain scene is written in. Each has a function that returns the export's files by name.
+"""The formats that a plain scene is written in: `write(plain, "radiance", folder)`.
 
-`COMMANDS` is the text that says how to render; `ASSUMPTIONS` says where the renderer's model differs from Mitsuba's.
+Each format has a function that returns the export's files by name. `COMMANDS` is the text that says how to render;
+`ASSUMPTIONS` says where the renderer's model differs from Mitsuba's.
 """
 
-__all__ = ["luxcore", "mitsuba", "povray", "radiance", "scene_json", "shared_files"]
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from mi_refract.io import safe_files
+
+from ..plain_scene import PlainScene
+from . import luxcore, mitsuba, povray, radiance, scene_json, shared_files
+from .shared_files import Files
+
+__all__ = ["TARGETS", "luxcore", "mitsuba", "povray", "radiance", "scene_json", "shared_files", "write"]
+
+TARGETS: dict[str, Callable[[PlainScene], Files]] = {
+    "cycles": scene_json.cycles_files,
+    "luxcore": luxcore.files,
+    "radiance": radiance.files,
+    "raysect": scene_json.raysect_files,
+    "povray": povray.files,
+    "mitsuba": mitsuba.files,
+    "obj+json": scene_json.obj_files,
+}
+
+
+def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> list[Path]:
+    """Write the files of a target into a new or an empty folder, all of them or none. Returns their paths, sorted.
+
+    ValueError for an unknown target, or a scene that the target's format cannot hold. OSError for a folder that holds
+    files, or cannot be written.
+    """
+    if target not in TARGETS:
+        raise ValueError(f"target {target!r}: unknown; expected {', '.join(TARGETS)}")
+    place = Path(folder).resolve()
+    if place.is_dir():
+        if any(place.iterdir()):
+            raise FileExistsError(f"{folder}: already contains files; expected a new folder or an empty one")
+    elif place.exists():
+        raise NotADirectoryError(f"{folder}: is not a folder; expected a new folder or an empty one")
+    safe_files.check_parent(place)
+    files = TARGETS[target](plain)
+    with safe_files.replacing(place, folder=True) as temporary:
+        for name, content in files.items():
+            (temporary / name).write_bytes(content)
+    return [Path(folder) / name for name in sorted(files)]

@@ -6,7 +6,7 @@ from importlib.resources import files as resources
 
 import numpy as np
 
-from ..plain_scene import Environment, Glass, Light, Material, PlainScene
+from ..plain_scene import Environment, Glass, Light, PlainScene
 from .shared_files import Array, Files, material_names, numbers, ply_files, readme, sky_exr
 
 COMMANDS = """
@@ -65,7 +65,14 @@ def files(plain: PlainScene) -> Files:
         sky = {}
     lines += [f"scene.lights.sky.{key} = {value}" for key, value in sky.items()]
     for material, name in names.items():
-        lines += [f"scene.materials.{name}.{line}" for line in _material(material)]
+        if isinstance(material, Glass):
+            inside, outside = numbers([material.int_ior]), numbers([material.ext_ior])
+            look = ['type = "glass"', "kr = 1 1 1", "kt = 1 1 1", f"interiorior = {inside}", f"exteriorior = {outside}"]
+        elif isinstance(material, Light):
+            look = ['type = "matte"', "kd = 0 0 0", f"emission = {numbers(material.radiance)}"]
+        else:
+            look = ['type = "matte"', f"kd = {numbers(material.reflectance)}"]
+        lines += [f"scene.materials.{name}.{line}" for line in look]
     for mesh in plain.meshes:
         lines.append(f'scene.objects.{mesh.name}.ply = "{mesh.name}.ply"')
         lines.append(f'scene.objects.{mesh.name}.material = "{names[mesh.material]}"')
@@ -82,12 +89,3 @@ def direction_at(u: Array, v: Array) -> Array:
     """(…, 3): the direction in which LuxCore shows the pixel at (u, v) of the map, v from the top."""
     phi, theta = 2 * np.pi * u, np.pi * v
     return np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], axis=-1)
-
-
-def _material(material: Material) -> list[str]:
-    if isinstance(material, Glass):
-        inside, outside = numbers([material.int_ior]), numbers([material.ext_ior])
-        return ['type = "glass"', "kr = 1 1 1", "kt = 1 1 1", f"interiorior = {inside}", f"exteriorior = {outside}"]
-    if isinstance(material, Light):
-        return ['type = "matte"', "kd = 0 0 0", f"emission = {numbers(material.radiance)}"]
-    return ['type = "matte"', f"kd = {numbers(material.reflectance)}"]

@@ -6,7 +6,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from ..plain_scene import Colour, Diffuse, Environment, Glass, Material, PlainScene
+from ..plain_scene import Colour, Diffuse, Environment, Glass, PlainScene
 from .shared_files import Files, exr, numbers, ply_files, readme
 
 COMMANDS = "mi-refract render scene.xml -o image.exr --spp 1024        (-D bsdf=dielectric for Mitsuba's own glass)"
@@ -44,45 +44,41 @@ SCENE = """<scene version="3.0.0">
 {sky}
 </scene>
 """
+SHAPE = """
+    <shape type="ply" id={name}>
+        <string name="filename" value={file}/>
+        <boolean name="face_normals" value="true"/>
+        {plugin}
+    </shape>"""
 
 
 def files(plain: PlainScene) -> Files:
     """The files of the export, by name."""
     camera = plain.camera
     vectors = {name: numbers(getattr(camera, name), ", ") for name in ("origin", "target", "up")}
-    shapes = "\n".join(
-        f"""
-    <shape type="ply" id={quoteattr(mesh.name)}>
-        <string name="filename" value={quoteattr(mesh.name + ".ply")}/>
-        <boolean name="face_normals" value="true"/>
-        {_material(mesh.material)}
-    </shape>"""
-        for mesh in plain.meshes
-    )
-    text = SCENE.format(camera=camera, max_depth=plain.max_depth, shapes=shapes, sky=_sky(plain.sky), **vectors)
-    sky = {"sky.exr": exr(plain.sky.pixels)} if isinstance(plain.sky, Environment) else {}
-    own = {"scene.xml": text.encode(), "README.txt": readme(plain, "Mitsuba", COMMANDS, ())}
-    return ply_files(plain) | sky | own
-
-
-def _material(material: Material) -> str:
-    if isinstance(material, Glass):
-        return (
-            f'<bsdf type="$bsdf"><float name="int_ior" value="{material.int_ior!r}"/>'
-            f'<float name="ext_ior" value="{material.ext_ior!r}"/></bsdf>'
-        )
-    if isinstance(material, Diffuse):
-        return f'<bsdf type="twosided"><bsdf type="diffuse">{_rgb("reflectance", material.reflectance)}</bsdf></bsdf>'
-    return f'<emitter type="area">{_rgb("radiance", material.radiance)}</emitter>'
-
-
-def _sky(sky: Colour | Environment) -> str:
-    if isinstance(sky, Environment):
+    shapes = []
+    for mesh in plain.meshes:
+        if isinstance(material := mesh.material, Glass):
+            indices = (f'<float name="{key}" value="{getattr(material, key)!r}"/>' for key in ("int_ior", "ext_ior"))
+            plugin = f'<bsdf type="$bsdf">{"".join(indices)}</bsdf>'
+        elif isinstance(material, Diffuse):
+            diffuse = f'<bsdf type="diffuse">{_rgb("reflectance", material.reflectance)}</bsdf>'
+            plugin = f'<bsdf type="twosided">{diffuse}</bsdf>'
+        else:
+            plugin = f'<emitter type="area">{_rgb("radiance", material.radiance)}</emitter>'
+        shapes.append(SHAPE.format(name=quoteattr(mesh.name), file=quoteattr(f"{mesh.name}.ply"), plugin=plugin))
+    sky, own = "", {}
+    if isinstance(plain.sky, Environment):
         matrix = np.eye(4)
-        matrix[:3, :3] = sky.rotation
+        matrix[:3, :3] = plain.sky.rotation
         turn = f'<transform name="to_world"><matrix value="{numbers(matrix.ravel())}"/></transform>'
-        return f'\n    <emitter type="envmap"><string name="filename" value="sky.exr"/>{turn}</emitter>'
-    return f'\n    <emitter type="constant">{_rgb("radiance", sky)}</emitter>' if any(sky) else ""
+        sky = f'\n    <emitter type="envmap"><string name="filename" value="sky.exr"/>{turn}</emitter>'
+        own = {"sky.exr": exr(plain.sky.pixels)}
+    elif any(plain.sky):
+        sky = f'\n    <emitter type="constant">{_rgb("radiance", plain.sky)}</emitter>'
+    text = SCENE.format(camera=camera, max_depth=plain.max_depth, shapes="\n".join(shapes), sky=sky, **vectors)
+    own |= {"scene.xml": text.encode(), "README.txt": readme(plain, "Mitsuba", COMMANDS, ())}
+    return ply_files(plain) | own
 
 
 def _rgb(name: str, colour: Colour) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ..plain_scene import Camera, Diffuse, Environment, Glass, Light, Material, Mesh, PlainScene
+from ..plain_scene import Diffuse, Environment, Glass, Light, Mesh, PlainScene
 from ..tessellation import is_closed
 from .shared_files import LIGHT_INSIDE, Array, Files, numbers, readme, sky_exr
 
@@ -47,10 +47,22 @@ def files(plain: PlainScene) -> Files:
         "#version 3.7;\n"
         f"global_settings {{ assumed_gamma 1.0 max_trace_level {min(plain.max_depth, 256)} adc_bailout {BAILOUT} }}\n"
     )
+    # Right-handed: Right points right in the image. Shifted by (dx − ½, dy − ½) pixels.
     camera = plain.camera
+    ahead = np.subtract(camera.target, camera.origin)
+    ahead = ahead / np.linalg.norm(ahead)
+    right = np.cross(ahead, camera.up)
+    right *= 2 * math.tan(math.radians(camera.fov_x_degrees) / 2) / np.linalg.norm(right)
+    up = np.cross(right, ahead) * camera.height / camera.width
+    view = (
+        "#ifndef (dx) #declare dx = 0.5; #end\n#ifndef (dy) #declare dy = 0.5; #end\n"
+        f"#declare Right = {_vector(right)};\n#declare Up = {_vector(up)};\n"
+        f"camera {{ perspective location {_vector(camera.origin)} right Right up Up\n"
+        f"  direction {_vector(ahead)} + Right*(dx - 0.5)/{camera.width} - Up*(dy - 0.5)/{camera.height} }}\n"
+    )
     commands = COMMANDS.format(width=camera.width, height=camera.height)
     return sky_exr(plain, direction_at) | {
-        "scene.pov": "\n".join([settings, _camera(camera), sky, *(_mesh(m, outside) for m in plain.meshes)]).encode(),
+        "scene.pov": "\n".join([settings, view, sky, *(_mesh(mesh, outside) for mesh in plain.meshes)]).encode(),
         "README.txt": readme(plain, "POV-Ray 3.7", commands, ASSUMPTIONS),
     }
 
@@ -65,36 +77,19 @@ def _vector(values: Iterable[float]) -> str:
     return f"<{numbers(values, ', ')}>"
 
 
-def _camera(camera: Camera) -> str:
-    """Right-handed: `right` points right in the image. Shifted by (dx − ½, dy − ½) pixels."""
-    ahead = np.subtract(camera.target, camera.origin)
-    ahead = ahead / np.linalg.norm(ahead)
-    right = np.cross(ahead, camera.up)
-    right *= 2 * math.tan(math.radians(camera.fov_x_degrees) / 2) / np.linalg.norm(right)
-    up = np.cross(right, ahead) * camera.height / camera.width
-    return (
-        "#ifndef (dx) #declare dx = 0.5; #end\n#ifndef (dy) #declare dy = 0.5; #end\n"
-        f"#declare Right = {_vector(right)};\n#declare Up = {_vector(up)};\n"
-        f"camera {{ perspective location {_vector(camera.origin)} right Right up Up\n"
-        f"  direction {_vector(ahead)} + Right*(dx - 0.5)/{camera.width} - Up*(dy - 0.5)/{camera.height} }}\n"
-    )
-
-
 def _mesh(mesh: Mesh, outside: float) -> str:
     vertices = ",\n".join(map(_vector, mesh.vertices))
     # Counterclockwise in these right-handed coordinates is clockwise in POV-Ray's.
     faces = ",\n".join(f"<{c}, {b}, {a}>" for a, b, c in mesh.faces.tolist())
-    return (
-        f"mesh2 {{ // {mesh.name}\n  vertex_vectors {{ {len(mesh.vertices)},\n{vertices} }}\n"
-        f"  face_indices {{ {len(mesh.faces)},\n{faces} }}\n  {_material(mesh.material, outside)}\n}}\n"
-    )
-
-
-def _material(material: Material, outside: float) -> str:
-    dark = "ambient 0 diffuse 0"
+    dark, material = "ambient 0 diffuse 0", mesh.material
     if isinstance(material, Glass):
         finish = f"finish {{ {dark} reflection {{ 0, 1 fresnel on }} conserve_energy }}"
-        return f"texture {{ pigment {{ rgbt 1 }} {finish} }} interior {{ ior {material.int_ior / outside!r} }}"
-    colour = material.radiance if isinstance(material, Light) else (0.0, 0.0, 0.0)
-    front = f"texture {{ pigment {{ rgb {_vector(colour)} }} finish {{ {dark} emission 1 }} }}"
-    return f"{front} interior_texture {{ pigment {{ rgb 0 }} finish {{ {dark} }} }}"
+        look = f"texture {{ pigment {{ rgbt 1 }} {finish} }} interior {{ ior {material.int_ior / outside!r} }}"
+    else:
+        colour = material.radiance if isinstance(material, Light) else (0.0, 0.0, 0.0)
+        front = f"texture {{ pigment {{ rgb {_vector(colour)} }} finish {{ {dark} emission 1 }} }}"
+        look = f"{front} interior_texture {{ pigment {{ rgb 0 }} finish {{ {dark} }} }}"
+    return (
+        f"mesh2 {{ // {mesh.name}\n  vertex_vectors {{ {len(mesh.vertices)},\n{vertices} }}\n"
+        f"  face_indices {{ {len(mesh.faces)},\n{faces} }}\n  {look}\n}}\n"
+    )

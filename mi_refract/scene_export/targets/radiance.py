@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ..plain_scene import Colour, Diffuse, Environment, Glass, Material, PlainScene
+from ..plain_scene import Colour, Diffuse, Environment, Glass, PlainScene
 from .shared_files import Files, material_names, numbers, readme
 
 COMMANDS = """
@@ -42,20 +42,19 @@ def files(plain: PlainScene) -> Files:
     ahead, wide = np.subtract(camera.target, camera.origin), math.tan(math.radians(camera.fov_x_degrees) / 2)
     fov_y = math.degrees(2 * math.atan(wide * camera.height / camera.width))
     where = f"-vp {numbers(camera.origin)} -vd {numbers(ahead)} -vu {numbers(camera.up)}"
-    materials = "".join(f"void {_material(material, name)}" for material, name in names.items())
+    materials = ""
+    for material, name in names.items():
+        if isinstance(material, Glass):  # an interface names the medium behind the normal first
+            materials += f"void interface {name} 0 0 8 1 1 1 {material.int_ior!r} 1 1 1 {material.ext_ior!r}\n"
+        elif isinstance(material, Diffuse):
+            materials += f"void plastic {name} 0 0 5 {numbers(material.reflectance)} 0 0\n"
+        else:
+            materials += f"void glow {name} 0 0 4 {numbers(material.radiance)} 0\n"
     return maps | {
         "scene.rad": "\n".join([materials, *meshes, sky]).encode(),
         "camera.vf": f"VIEW= -vtv {where} -vh {camera.fov_x_degrees!r} -vv {fov_y!r}\n".encode(),
         "README.txt": readme(plain, "Radiance", commands, ASSUMPTIONS),
     }
-
-
-def _material(material: Material, name: str) -> str:
-    if isinstance(material, Glass):  # an interface names the medium behind the normal first
-        return f"interface {name} 0 0 8 1 1 1 {material.int_ior!r} 1 1 1 {material.ext_ior!r}\n"
-    if isinstance(material, Diffuse):
-        return f"plastic {name} 0 0 5 {numbers(material.reflectance)} 0 0\n"
-    return f"glow {name} 0 0 4 {numbers(material.radiance)} 0\n"
 
 
 def _sky(sky: Colour | Environment) -> tuple[str, Files]:

@@ -7,7 +7,7 @@ from importlib.resources import files as resources
 
 import numpy as np
 
-from ..plain_scene import Diffuse, Environment, Glass, Material, PlainScene
+from ..plain_scene import Diffuse, Environment, Glass, PlainScene
 from .shared_files import (
     LIGHT_INSIDE,
     Array,
@@ -120,9 +120,18 @@ def obj_files(plain: PlainScene) -> Files:
         lines += [f"v {numbers(vertex)}\n" for vertex in mesh.vertices.tolist()]
         lines += [f"f {a} {b} {c}\n" for a, b, c in (mesh.faces + first).tolist()]
         first += len(mesh.vertices)
+    mtl = ""
+    for material, name in names.items():
+        mtl += f"newmtl {name}\n"
+        if isinstance(material, Glass):
+            mtl += f"illum 7\nKd 0 0 0\nKs 1 1 1\nTf 1 1 1\nNi {material.int_ior / material.ext_ior!r}\n"
+        elif isinstance(material, Diffuse):
+            mtl += f"illum 1\nKd {numbers(material.reflectance)}\n"
+        else:
+            mtl += f"illum 1\nKd 0 0 0\nKe {numbers(material.radiance)}\n"
     return sky_exr(plain, own_direction_at) | {
         "scene.obj": "".join(lines).encode(),
-        "scene.mtl": "".join(f"newmtl {name}\n{_mtl(material)}" for material, name in names.items()).encode(),
+        "scene.mtl": mtl.encode(),
         "scene.json": scene_json(plain, {mesh.name: {"object": mesh.name} for mesh in plain.meshes}),
         "README.txt": readme(plain, "a program of your own", OBJ_COMMANDS, OBJ_ASSUMPTIONS),
     }
@@ -132,11 +141,3 @@ def own_direction_at(u: Array, v: Array) -> Array:
     """(…, 3): as in Mitsuba, but with the pixels of all rows at their centres."""
     phi, theta = 2 * np.pi * u, np.pi * v
     return np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], axis=-1)
-
-
-def _mtl(material: Material) -> str:
-    if isinstance(material, Glass):
-        return f"illum 7\nKd 0 0 0\nKs 1 1 1\nTf 1 1 1\nNi {material.int_ior / material.ext_ior!r}\n"
-    if isinstance(material, Diffuse):
-        return f"illum 1\nKd {numbers(material.reflectance)}\n"
-    return f"illum 1\nKd 0 0 0\nKe {numbers(material.radiance)}\n"

@@ -18,7 +18,7 @@ import numpy as np
 from mi_refract.io import image_file
 from mi_refract.io.image_file import Image
 from mi_refract.rendering import scene_files
-from mi_refract.scene_export import write_files
+from mi_refract.scene_export import targets
 from mi_refract.scene_export.plain_scene import PlainScene
 from mi_refract.scene_export.targets import luxcore, povray, radiance, scene_json, shared_files
 from validation.run.render_methods import Camera
@@ -56,7 +56,7 @@ def by_script(
     more: Sequence[str] = (),
 ) -> list[Image]:
     """By the script that is exported with the scene, after `edit(folder)` of its files, with `more` options."""
-    write_files.write(plain, target, folder / "scene")
+    targets.write(plain, target, folder / "scene")
     edit(folder / "scene")
     program = [environments.python(SYSTEMS[target]), "render.py", "--spp", str(spp), "--out", str(folder)]
     environments.run([*program, *more, "--seeds", *map(str, seeds)], timeout=HOURS, where=folder / "scene")
@@ -67,7 +67,7 @@ def by_command(system: System, plain: PlainScene, folder: Path, spp: int, seeds:
     """By the command of the system's own file."""
     if system.images is None:
         raise ValueError(f"{system.name}: no [images]; expected a system that renders by a command")
-    write_files.write(plain, system.images.export, folder / "scene")
+    targets.write(plain, system.images.export, folder / "scene")
     for seed in seeds:
         at = {"scene": folder / "scene", "image": folder / f"seed{seed}.exr", "spp": spp, "seed": seed}
         environments.ask(system, system.images.command, timeout=HOURS, values=at)
@@ -75,7 +75,7 @@ def by_command(system: System, plain: PlainScene, folder: Path, spp: int, seeds:
 
 
 def _radiance(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-    write_files.write(plain, "radiance", folder / "scene")
+    targets.write(plain, "radiance", folder / "scene")
     sizes = map(str, (plain.camera.width, plain.camera.height, spp, *seeds))
     words = str(folder / "scene"), str(folder), *sizes
     environments.run(environments.script(SYSTEMS["radiance"], "radiance_images.py", *words), timeout=HOURS)
@@ -90,7 +90,7 @@ def _povray(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> 
     side, camera = math.isqrt(spp), plain.camera
     width, height = side * camera.width, side * camera.height
     finer = dataclasses.replace(plain, camera=dataclasses.replace(camera, width=width, height=height))
-    write_files.write(finer, "povray", folder / "scene")
+    targets.write(finer, "povray", folder / "scene")
     lines = (folder / "scene" / "README.txt").read_text().splitlines()
     command = next(line.split() for line in lines if line.split()[:1] == ["povray"])
     environments.run(command, timeout=HOURS, where=folder / "scene")
@@ -123,7 +123,7 @@ def equirectangular(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 def _mitsuba(integrator: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
     """By another integrator of Mitsuba's, with Mitsuba's `dielectric`, in this process and the present variant."""
-    write_files.write(plain, "mitsuba", folder / "scene")
+    targets.write(plain, "mitsuba", folder / "scene")
     parameters = {"bsdf": "dielectric", "integrator": integrator}
     camera = Camera(scene_files.load_scene(folder / "scene" / "scene.xml", parameters))
     return [image_file.named(f"seed {seed}", mean(camera, spp, seed)) for seed in seeds]
