@@ -125,7 +125,16 @@ class Tracer:
     ) -> Paths:
         """The paths of rays from `origins` along `directions` (N × 2)."""
         origins = finite_array("origins", origins, (*(np.shape(origins)[:1] or (0,)), 2))
-        along = _scaled(finite_array("directions", directions, origins.shape))
+        along = finite_array("directions", directions, origins.shape)
+        with np.errstate(over="ignore", under="ignore"):
+            length2 = np.einsum("ij,ij->i", along, along)
+        if not (
+            length2.min(initial=1) > 1e-30 and length2.max(initial=1) < 1e30
+        ):  # squares could leave float32's range
+            size = np.maximum(*np.abs(along).T)
+            if not size.all():
+                raise ValueError(f"directions[{int(np.argmin(size))}] = (0, 0); expected a direction")
+            along = np.ldexp(along, 1 - np.frexp(size)[1][:, None])
         count, arrays = len(origins), self.arrays
         if isinstance(max_depth, bool) or not isinstance(max_depth, int | np.integer) or max_depth < 1:
             raise ValueError(f"max_depth = {max_depth!r}; expected a whole number, 1 or more")
@@ -283,18 +292,6 @@ def _refraction(arrays: ArrayBackend, formula: str | None) -> Refraction:
         return _unit(arrays.vector(b.x, b.y)), transmitted
 
     return refract
-
-
-def _scaled(directions: Array) -> Array:
-    """The directions, scaled by powers of 2 where squares could leave float32's range. ValueError for (0, 0)."""
-    with np.errstate(over="ignore", under="ignore"):
-        length2 = np.einsum("ij,ij->i", directions, directions)
-    if length2.min(initial=1) > 1e-30 and length2.max(initial=1) < 1e30:
-        return directions
-    size = np.maximum(*np.abs(directions).T)
-    if not size.all():
-        raise ValueError(f"directions[{int(np.argmin(size))}] = (0, 0); expected a direction")
-    return np.asarray(np.ldexp(directions, 1 - np.frexp(size)[1][:, None]))
 
 
 def _check_range(name: str, values: Array, largest: float) -> None:
