@@ -144,7 +144,8 @@ def parse(path: Path, defines: Mapping[str, str] | None = None, variant: str = "
         variant: of Mitsuba; default: the present one.
 
     Raises:
-        ValueError: for circular references, plugins nested too deeply, and a pipe or a device in place of a file.
+        ValueError: for circular references, plugins nested too deeply, and a pipe or a device in place of the
+            scene or of a file that a plugin names; Mitsuba waits for one that is included or read as a spectrum.
         OSError: for a file that cannot be read.
         Exception: whatever Mitsuba raises where it cannot parse the file.
     """
