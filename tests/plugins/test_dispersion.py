@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.glass_scenes import PLACE, attached, camera, parameter, render, sampled, sky, surface
+from support.glass_scenes import PLACE, attached, camera, render, sampled, sky, surface
 
 from mi_refract import media
 from mi_refract.image_diff import pixelwise
@@ -280,34 +280,6 @@ def test_the_image_is_that_of_one_render_per_wavelength(llvm_spectral):
     error = np.sqrt((one.var(ddof=1) + two.var(ddof=1)) / 6)
     assert error < 0.05 * two.mean()
     assert abs(one.mean() - two.mean()) < 5 * error
-
-
-@pytest.mark.parametrize("name", ["int_ior_B", "int_absorption.value"])
-def test_the_derivative_of_an_image_is_that_of_differences(name, llvm_spectral):
-    """Σ weight · pixel: within 2 %. No edge is inside the image. Differences follow both lobes: they have no noise of
-    the choice, which jumps with the reflectance; derivatives have a deviation of about 0.6 %.
-    """
-    glass = ball(int_ior="cauchy(1.5, 4000)", int_absorption=0.1) | {"radius": 3}
-    made = scene(16, sky(), ball=glass)
-    params, weights = mi.traverse(made), np.random.default_rng(3).random((16, 16, 3)).astype(np.float32)
-    key = parameter(params, name)
-    start, kind, found = dr.detach(params[key]), type(params[key]), []
-
-    def total(value, spp, seed, **method):
-        params[key] = value
-        params.update()
-        integrator = mi.load_dict({"type": "refract_path", "max_depth": 3, "rr_depth": 100} | method)
-        image = mi.render(made, params, integrator=integrator, spp=spp, seed=seed)[..., :3]
-        return dr.sum(image * mi.TensorXf(weights), axis=None)
-
-    step, both = (400.0 if "ior" in name else 5e-3), {"deterministic": True, "split_weight": 1 / 4096}
-    ends = [float(total(kind(start + sign * step), 1024, 7, **both).array[0]) for sign in (1, -1)]
-    for seed in range(4):
-        value = kind(start)
-        dr.enable_grad(value)
-        dr.backward(total(value, 8192, seed))
-        found.append(float(np.ravel(np.array(dr.grad(value)))[0]))
-    assert np.mean(found) == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.02)
 
 
 def test_path_has_the_d_line_and_is_warned_once(llvm_spectral, logged):
