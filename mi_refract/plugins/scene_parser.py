@@ -95,7 +95,7 @@ class ParsedScene:
 
     def _code(self, name: str) -> list[Path]:
         """The files of a plugin of the scene's own; of those of one name Mitsuba takes the last."""
-        places = (place / "plugins" for place in reversed(self.folders))
+        places = (place / "plugins" for place in (Path(), *reversed(self.folders)))  # at last in the working folder
         return [file for place in places for file in place.glob(f"{glob.escape(name)}.*")]
 
     def load(self, allowed: Collection[str] = (), moved: Mapping[str, str] | None = None) -> Scene:

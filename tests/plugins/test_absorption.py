@@ -59,6 +59,13 @@ def test_three_colours_become_a_spectrum_in_proportion(scale, spectral_variant):
     assert (sigma(int_absorption={"type": "rgb", "value": 0.0}) < 1e-6).all()
 
 
+def test_where_nothing_is_left_of_a_colour_absorption_is_finite(spectral_variant):
+    """A spectrum is 0 outside its range."""
+    part = {"type": "irregular", "wavelengths": "450, 650", "values": "0.5, 0.5"}
+    found, half, most = sigma(int_colour=part, int_colour_distance=1.0), math.log(2), 30 * math.log(10)
+    assert found == pytest.approx([most, half, half, most], rel=1e-5)
+
+
 def test_parameters_are_differentiable(llvm_variant):
     bsdf = load(int_colour=0.25, int_colour_distance=2.0)
     params, (key,) = attached(bsdf, "int_colour.value")

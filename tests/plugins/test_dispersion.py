@@ -268,6 +268,20 @@ def test_wavelengths_end_where_light_goes_through_dispersive_glass_only(llvm_spe
     assert end(scene(ball=ball(int_ior=1.5)))[0] is None
 
 
+def test_the_image_is_that_of_one_render_per_wavelength(llvm_spectral):
+    """Light of a narrow band, 5 nm, and the index there as a number. One image in 10⁶ by chance."""
+    band = {"type": "irregular", "wavelengths": "447, 447.1, 452.9, 453", "values": "0, 1, 1, 0"}
+    place = PLACE().translate([0.5, 0.3, -4]).scale(0.8)
+    lamp = {"type": "sphere", "to_world": place, "emitter": {"type": "area", "radiance": band}}
+    indices = GLASS, float(media.index(GLASS, 450.0))
+    one, two = (means(scene(light=lamp, ball=ball(int_ior=x)), 4096, 6, max_depth=16) for x in indices)
+    strongest = two.mean(0).argmax()
+    one, two = one[:, strongest], two[:, strongest]
+    error = np.sqrt((one.var(ddof=1) + two.var(ddof=1)) / 6)
+    assert error < 0.05 * two.mean()
+    assert abs(one.mean() - two.mean()) < 5 * error
+
+
 def test_path_has_the_d_line_and_is_warned_once(llvm_spectral, logged):
     number = float(media.index(GLASS, D_LINE))
     made, expected = scene(light=sky(), ball=ball()), scene(light=sky(), ball=ball(int_ior=number))

@@ -193,6 +193,10 @@ UNFOLLOWED = "the interior medium of 'slab' scatters or varies"
 CLASH = "'slab' has an interior medium in a scene whose BSDFs absorb"
 
 
+def rgb(*value):
+    return {"type": "rgb", "value": [*value]}
+
+
 def with_medium(medium, **parameters):
     return {"slab": box(matched(**parameters), interior=medium, id="slab")}
 
@@ -204,6 +208,13 @@ REFUSED = {
     ),
     "a neighbour that says something else": (
         {"outer": box(matched(int_absorption=0.2), id="outer"), "inner": box(matched(), 0.5, id="inner")},
+        (HERE.format("'inner'"), f"expected {AROUND}; {CAMERA}"),
+    ),
+    "a neighbour that says another green": (
+        {
+            "outer": box(matched(int_absorption=rgb(0.1, 0.2, 0.3)), id="outer"),
+            "inner": box(matched(ext_absorption=rgb(0.1, 0.22, 0.3)), 0.5, id="inner"),
+        },
         (HERE.format("'inner'"), f"expected {AROUND}; {CAMERA}"),
     ),
     "a sensor's medium that scatters": (

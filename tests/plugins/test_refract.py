@@ -155,6 +155,18 @@ def test_attributes_are_those_of_rough_glass(typical_variant, name, tints):
     assert answers(load(**tints)) == answers(load("roughdielectric", **tints))
 
 
+def test_an_attribute_is_asked_of_all_bsdfs_of_a_scene(llvm_variant):
+    """As scripts that write feature buffers do: of glass that lacks it, beside a plaster that has it."""
+    plaster = {"type": "plastic", "specular_reflectance": 0.5}
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3), "bsdf": plaster}
+    scene = mi.load_dict({"type": "scene", "wall": wall, "glass": {"type": "sphere", "bsdf": {"type": "refract"}}})
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(mi.Float(0, 2), 0, 5), mi.Vector3f(0, 0, -1)))
+    has = si.bsdf().has_attribute("specular_reflectance")
+    assert vector(has).tolist() == [0, 1]
+    for evaluate in (si.bsdf().eval_attribute_3, si.bsdf().eval_attribute):
+        assert np.array(evaluate("specular_reflectance", si, active=has)).T.tolist() == [[0] * 3, [0.5] * 3]
+
+
 def test_a_sample_that_is_not_asked_for_has_no_weight(scalar_variant):
     for bsdf, sample1 in itertools.product((load(), load(**TINTED)), (0.0, 0.9)):
         weights = [bsdf.sample(context(), surface(), sample1, [0, 0], active)[1] for active in (False, True)]

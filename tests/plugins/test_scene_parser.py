@@ -60,13 +60,17 @@ def test_a_plugin_of_the_scenes_own_is_refused_by_name(elements, load, bait):
         load(elements.replace("%s", str(bait)), other='<bsdf type="evil"/>')
 
 
-def test_a_file_named_as_a_plugin_in_python_is_refused(load, tmp_path):
+@pytest.mark.parametrize("place", ["scene", "path", "working folder"])
+def test_a_file_named_as_a_plugin_in_python_is_refused(place, load, tmp_path, monkeypatch):
     """In scalar variants Mitsuba registers none of its own, and looks for a file."""
-    (tmp_path / "more" / "plugins").mkdir(parents=True)
+    folder, searched = tmp_path if place == "scene" else tmp_path / "more", '<path value="more"/>' * (place == "path")
+    (folder / "plugins").mkdir(parents=True)
+    if place == "working folder":
+        monkeypatch.chdir(folder)
     for name in (*scene_parser.PYTHON, "refract"):
-        (tmp_path / "more" / "plugins" / f"{name}.so").write_text("native code")
+        (folder / "plugins" / f"{name}.so").write_text("native code")
         with pytest.raises(ValueError, match=f"plugin '{name}': neither Mitsuba's"):
-            load(f'<path value="more"/><bsdf type="{name}"/>')
+            load(f'{searched}<bsdf type="{name}"/>')
 
 
 def test_an_allowed_plugin_is_loaded(load, bait):

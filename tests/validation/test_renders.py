@@ -222,6 +222,12 @@ def test_a_direction_that_stays_attached_is_seen(context, monkeypatch):
     assert through.verdict == "pass"
 
 
+@pytest.mark.parametrize("case", ["`int_ior_B`", "`int_absorption`"])
+def test_derivatives_in_what_only_refract_path_renders_are_those_of_differences(case, context):
+    (row,) = gradients.rows(context, case)
+    assert row.verdict == "pass" and row.values["detectable"] < 0.01
+
+
 class OneSeed(KeyedMultijitter):
     """Rows and columns are permuted by the seed of the cells, changed by constants: as this package once did."""
 

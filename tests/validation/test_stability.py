@@ -330,6 +330,41 @@ def context(tmp_path):
     return Context(profile, tmp_path, "llvm_ad_rgb", backend.detect(), {})
 
 
+def test_no_layer_is_thinner_than_the_ray_offset():
+    for layers, where in (
+        (layered_paths.MIRAGE, layered_paths.POOL),
+        (layered_paths.FIBRE, abs(layered_paths.FIBRE.end)),
+    ):
+        assert len(layers.boundaries) + 1 == len(layers.indices) == {"mirage": 33, "fibre": 17}[layers.scene]
+        assert (-np.diff(layers.boundaries) > layered_paths.OFFSET * (1 + where)).all()
+
+
+def test_exact_paths_conserve_their_invariants_and_a_deviation_is_the_one_that_was_put_in():
+    """n sin θ of the mirage, n d_z and the skew n (x × d)_z of the fibre; a path at an angle 1 % too large."""
+
+    def into_the_mirage(sine, height):
+        start, d = [-layered_paths.POOL, height, 0], [math.sqrt(1 - sine**2), -sine, 0]
+        return layered_paths.exact_path(MIRAGE, start, d, 0)
+
+    def kept(layers, path, values):
+        return np.ptp(np.array(layers.indices)[list(path.media)] * values)
+
+    for sine in (4e-4, 9e-3):
+        path = into_the_mirage(sine, 0.005)
+        assert kept(MIRAGE, path, path.directions[:, 0]) < 1e-14
+        assert path.directions[-1, 1] == pytest.approx(sine, rel=1e-12)  # out as it came in
+    for path in layered_paths.bundle(FIBRE).exact(FIBRE, offset=0.0):
+        assert kept(FIBRE, path, path.directions[:, 2]) < 1e-14
+        assert kept(FIBRE, path, np.cross(path.starts, path.directions)[:, 2]) < 1e-12
+        radius = np.hypot(*path.ends[:-1, :2].T)
+        assert min(abs(radius[:, None] - FIBRE.boundaries).min(1), default=0) < 1e-12
+    right, wrong = (into_the_mirage(sine, 1.0) for sine in (8e-4, 8.08e-4))
+    found = layered_paths.deviation(MIRAGE, right, wrong.segments())
+    assert found.direction[0] == pytest.approx(0.01, rel=1e-3) and found.boundaries == 0
+    same = layered_paths.deviation(MIRAGE, right, right.segments())
+    assert same.direction.max() < 1e-12 and same.place.max() < 1e-12
+
+
 def test_only_forms_at_the_rounding_limit_keep_to_the_path_and_a_fibre_guides_every_ray(llvm_variant, context):
     rows = {row.subject: row for row in layered_paths.path_rows(context, MIRAGE) if row.case == "mirage: path"}
     assert list(rows) == [*layered_paths.plugins(), layered_paths.INDICES, layered_paths.RATIOS]
