@@ -23,7 +23,7 @@ import numpy as np
 from mi_refract.io import errors
 from mi_refract.io.image_file import Image, Pixels, block_mean
 from mi_refract.io.safe_files import write_atomically
-from mi_refract.io.text import beside_bound, compact
+from mi_refract.io.text import beside_bound, compact, printable
 from mi_refract.report.documents import rendered
 from mi_refract.report.embedded_images import EmbeddedImages, encoded, strongest
 from mi_refract.report.plots import histogram_svg
@@ -93,18 +93,20 @@ class Page:
         `source`: the JSON of the comparison, where one is written: only what it compared is accepted then. Errors:
         OSError for the page itself.
         """
-        images, failures, used, rest = EmbeddedImages(), [], 0, list[str]()
+        images, failures, used, rest = EmbeddedImages(), [], 0, list[Result]()
         for number, result in enumerate(results.of(*FAILED), 1):
             shown = self._shown.get(_place(result))
             # The first pair is shown, however large; after one that does not fit none is.
             if rest or shown is None or (used and used + shown.size > PAGE):
-                rest.append(result.name)
+                rest.append(result)
                 shown = Shown(note=FULL)
             used += shown.size
             failures.append(item(result, results, shown, images) | {"key": f"pair-{number}"})
         equal = sorted((item(result, results) for result in results.of(Status.EQUAL)), key=lambda x: not x["warning"])
         folders = results.test.is_dir() and not results.renders  # where names mean something
         more = [*results.flags, "--report", "rest.html"]
+        # Without what is no image, and without names that cannot be shown as they are.
+        named = [x.name for x in rest if (x.reference or x.test) and printable(x.name) == x.name][:NAMED]
         content = {
             "title": "mi-refract diff",
             "sentence": sentence(results),
@@ -113,7 +115,7 @@ class Page:
             "context": {"reference": str(results.reference), "test": str(results.test)} | dict(context),
             "unused": results.unused,
             "command": replay,
-            "rest": results.command("diff", *rest[:NAMED], flags=more) if rest and folders else "",
+            "rest": results.command("diff", *named, flags=more) if named and folders else "",
             "skipped": [item(result, results) for result in results.of(Status.SKIPPED)],
             "ticks": results.command("accept", flags=["--from", source] if source else None) if folders else "",
         }
