@@ -40,7 +40,7 @@ COMMANDS = {
     "trace": Command("trace", "trace", "Trace rays through a planar scene; draw them, print focal points."),
     "diff": Command("diff", "diff", "Compare images with their references: equal or different?"),
     "accept": Command("diff", "accept", "Make the images that differ the new references."),
-    "self-test": Command("self_test", "self_test", "Show which defects a comparison of images would detect."),
+    "self-test": Command("diff", "self_test", "Show which defects a comparison of images would detect."),
     "rays": Command("rays", "app", "Check another program's refraction, ray by ray."),
     "scene": Command("scene", "app", "Export a Mitsuba scene for another renderer."),
     "doctor": Command("doctor", "doctor", "Show which Mitsuba variants run here, and what is missing."),

@@ -1,4 +1,5 @@
-"""The commands `mi-refract diff` and `mi-refract accept`: compare images with references, and replace references.
+"""The commands `mi-refract diff`, `accept` and `self-test`: compare images with references, replace references, and
+show which defects a comparison detects.
 
 What only some calls need is imported there: of a comparison that takes a third of a second the imports are the most.
 """
@@ -27,6 +28,8 @@ from mi_refract.io.text import printable
 
 from .app import shows
 
+RENDERS, SPP = 16, 16  # of a scene, for the self-test
+SCENE = ".xml"
 Inconclusive = enum.StrEnum("Inconclusive", {"PASS": "pass", "FAIL": "fail"})  # what such an image counts as
 
 
@@ -225,3 +228,42 @@ def _progress() -> Iterator[Callable[[int, int], None]]:
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("comparing", total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+Images = Annotated[
+    Path, typer.Argument(metavar="REFERENCE", help="An image, a folder of renders of one image, or a scene.")
+]
+AllowPlugins = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME", help="Also allow this plugin, which ships with the scene; may be repeated."),
+]
+
+
+def self_test(reference: Images, max_values: MaxValues = MAX_VALUES, allow_plugins: AllowPlugins = None) -> None:
+    """Inject synthetic defects into REFERENCE and report which methods detect them.
+
+    Exit code 0: every defect that had to be detected was detected, 1: one was missed, or equal images were reported as
+    different, 2: REFERENCE cannot be read.
+    """
+    require_extra("scipy")
+    from mi_refract.image_diff import self_test as self_tests
+
+    if reference.suffix == SCENE:
+        from mi_refract.rendering.scene_files import load_scene
+
+        from .doctor import activate
+
+        activate()
+        import mitsuba as mi
+        import numpy as np
+
+        scene = load_scene(reference, allow_plugins=allow_plugins or ())
+        renders = np.stack([np.array(mi.render(scene, spp=SPP, seed=seed)) for seed in range(RENDERS)])
+    elif allow_plugins:
+        raise ValueError("--allow-plugins applies to scenes only; expected a scene SCENE.xml as REFERENCE")
+    else:
+        renders = self_tests.read_images(reference, max_values)
+    rows = self_tests.examine(renders, str(reference))
+    text_reports.print_table(self_tests.table(rows))
+    print("\n".join(self_tests.summary(rows)))
+    raise typer.Exit(int(any(row.verdict == "fail" for row in rows)))

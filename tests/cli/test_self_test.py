@@ -8,7 +8,7 @@ import pytest
 from support.diff_images import image, samples
 
 from mi_refract import backend
-from mi_refract.cli import self_test as command
+from mi_refract.cli import diff as command
 from mi_refract.image_diff import methods, self_test
 from mi_refract.image_diff.comparison import Comparison, Verdict
 
