@@ -124,18 +124,24 @@ def test_the_rows_of_workers_are_those_of_a_run_here(context, tmp_path):
     assert [json.dumps(row.as_dict()) for row in kept] == [json.dumps(row.as_dict()) for row in alone]
 
 
-def test_a_worker_sends_files_as_they_are(monkeypatch, scalar_variant):
+def test_a_worker_sends_files_and_errors_as_they_are(monkeypatch, scalar_variant):
     def writes(context):
         (context.out / "images").mkdir()
         (context.out / "images/a.exr").write_bytes(b"pixels")
         return [row(images={"test": "images/a.exr"})]
 
-    study = Study("s", "", "", {}, lambda context: [Task("writes", lambda: writes(context))])
+    def fails(context):
+        raise ValueError("a scene is wrong; expected others")
+
+    study = Study("s", "", "", {}, lambda c: [Task(f.__name__, functools.partial(f, c)) for f in (writes, fails)])
     monkeypatch.setattr(runner, "import_module", lambda name: types.SimpleNamespace(STUDY=study))
     monkeypatch.setattr(runner.on_worker, "scratch_folder", lambda: None)
     monkeypatch.setattr(runner.on_worker, "in_variant", lambda variant, call: call())
-    (rows, _), files = dataclasses.replace(THERE, modules=("one",)).on_worker("writes")
+    there = dataclasses.replace(THERE, modules=("one",))
+    (rows, _), files = there.on_worker("writes")
     assert files == {"images/a.exr": b"pixels"} and rows[0].images == {"test": "images/a.exr"}
+    with pytest.raises(ValueError, match="a scene is wrong; expected others"):
+        there.on_worker("fails")
 
 
 # The command ---------------------------------------------------------------------------------------------------------
@@ -243,5 +249,6 @@ def test_a_readme_holds_its_table_which_is_not_written_from_a_run_that_measured_
     assert all(((readme_tables.ROOT / table.path).parent / name).is_file() for name in images)
     with pytest.raises(ValueError, match=r"README: no .*"):
         table.make([row(values={}, reason="not run")])
+    assert len((readme_tables.ROOT / "README.md").read_text().splitlines()) <= 200  # the first page
     assert (marker in readme_tables.chosen([])) == (marker != "suite")
     assert marker in readme_tables.chosen([table.study])

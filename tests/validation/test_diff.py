@@ -47,6 +47,10 @@ def test_spoilt_glass_is_spoilt_as_it_says(scalar_context):
         assert sampled(name, cos_i, sample1) == (component, pytest.approx(weight)), name
     for name, eta in (("IOR + 0.5 %", 1.5075), ("IOR + 1e-3", 1.501), ("flipped normal", 1 / 1.5)):
         assert mi.traverse(glass(name))["eta"][0] == pytest.approx(eta)
+    images = np.split(planted_defects.opened("prism", resolution=8, count=3)(4, 0)[0], 3, axis=1)  # side by side
+    mean = np.mean([planted_defects.opened("prism", resolution=8)(16, seed)[0] for seed in range(8)], 0)
+    assert all(np.corrcoef(image.ravel(), mean.ravel())[0, 1] > 0.6 for image in images)
+    assert abs(np.corrcoef(*((image - mean).ravel() for image in images[:2]))[0, 1]) < 0.5  # they are independent
 
 
 def test_the_defects_are_seen_and_no_other_sampler(llvm_variant, monkeypatch):

@@ -13,7 +13,7 @@ from mi_refract import FORMULAS, backend
 from validation import limits
 from validation.efficiency import error_against_time, scaling
 from validation.efficiency.error_against_time import Extent
-from validation.run import kernel_timing
+from validation.run import kernel_timing, render_methods
 from validation.run.array_settings import BUILTIN as BUILTIN_KERNEL
 from validation.run.array_settings import Setting, settings
 from validation.run.context import PROFILES, SCALAR_PROFILES, SCENES, Context
@@ -75,6 +75,19 @@ def test_the_best_sampler_has_the_least_variance_and_time(monkeypatch, noise, se
 
     monkeypatch.setattr(error_against_time, "builtin_camera", look)
     assert error_against_time.best_sampler(SCENES / "balls.xml", 8, SMALL) == error_against_time.STRATIFIED[best]
+
+
+def test_images_grow_until_their_time_can_be_told(context, monkeypatch):
+    monkeypatch.setattr(error_against_time, "LARGEST", 64)
+    path = SCENES / "furnace.xml"
+    sizes = [error_against_time.resolution_of(path, dataclasses.replace(SMALL, seconds=s)) for s in (0.0, 1e-9, 1e9)]
+    assert sizes == [32, 32, 64]
+
+
+def test_a_method_renders_to_the_depth_of_the_scene_or_to_another(scalar_variant):
+    for depth, options in ((48, {}), (7, {"max_depth": 7})):
+        camera = render_methods.camera(SCENES / "nested.xml", BUILTIN, 4, **options)
+        assert f"max_depth = {depth}" in str(camera.integrator)
 
 
 @pytest.mark.parametrize(

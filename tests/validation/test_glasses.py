@@ -102,6 +102,12 @@ def test_a_program_is_judged_for_its_own_index_and_a_broken_one_fails(tmp_path):
         assert row.verdict == verdict and said in row.reason and "\n" not in row.reason
 
 
+def test_without_catalogues_here_the_row_is_not_run(monkeypatch):
+    monkeypatch.setattr(glasses, "find_spec", lambda name: None)
+    (row,) = glasses.system_rows(SYSTEMS["rayoptics"], CATALOGUES["rayoptics"], FULL)
+    assert row.verdict == "not run" and "pip install" in row.reason
+
+
 @pytest.mark.parametrize("name", CATALOGUES)
 def test_systems_that_are_installed_answer_for_their_indices(name):
     catalogue = CATALOGUES[name]
@@ -194,6 +200,7 @@ def test_another_trace_is_no_other_index_and_another_index_no_other_trace():
     ("body", "said"),
     [
         ("raise RuntimeError('out of glass')", "out of glass"),
+        ("print('[]')", "no answer"),
         ("print(json.dumps({'system': 'A', 'indices': [], 'rays': {'given': [], 'own': []}}))", "shape"),
         (
             "print(json.dumps({'system': 'A', 'indices': lens['indices'], "

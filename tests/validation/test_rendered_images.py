@@ -10,12 +10,13 @@ from mi_refract import media
 from mi_refract.image_diff.comparison import Verdict
 from mi_refract.io import image_file
 from mi_refract.scene_export import targets
-from mi_refract.scene_export.plain_scene import Glass
+from mi_refract.scene_export.plain_scene import Diffuse, Glass, Light
+from mi_refract.scene_export.targets import shared_files
 from validation import limits
 from validation.run.context import PROFILES, Context
 from validation.suite import exports, matrix, rendered_images, spectral_lines
 from validation.suite.rendered_images import INCONCLUSIVE, THREE, Size
-from validation.suite.renderers import SYSTEMS, environments
+from validation.suite.renderers import SYSTEMS, environments, image_renderers
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS, ImageRenderer
 
 SMALL = Size(48, 32, 1, 0.2)
@@ -104,6 +105,19 @@ def test_what_does_not_render_or_is_not_finite_is_never_a_pass(judged, monkeypat
     monkeypatch.setattr(environments, "absent", lambda system: "the command that brings it")
     row = judged(draw=raising(AssertionError("asked all the same")))
     assert (row.verdict, row.reason) == ("not run", "the command that brings it")
+
+
+def test_three_finds_the_sky_where_it_looks(monkeypatch):
+    monkeypatch.setattr(shared_files, "FINER", 8)
+    sky, directions = rendered_images.askew(), np.random.default_rng(3).normal(size=(4000, 3))
+    x, y, z = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
+    image = shared_files.longitude_latitude(sky, image_renderers.equirectangular)
+    u, v = 0.5 + np.arctan2(z, x) / (2 * np.pi), np.arccos(y) / np.pi
+    rows, columns = image.shape[:2]
+    texel = image[np.minimum((v * rows).astype(int), rows - 1), np.minimum((u * columns).astype(int), columns - 1)]
+    # Half a texel is 0.003 rad, the sky's slope below 2.
+    assert np.abs(texel - shared_files.radiance(sky, directions)).max() < 0.01
+    assert np.abs(texel - shared_files.radiance(sky, directions * [1, 1, -1])).max() > 0.1
 
 
 # Exports -----------------------------------------------------------------------------------------------------------
@@ -196,11 +210,17 @@ def test_the_same_at_each_line_passes_and_a_mixture_is_seen(noise, shifts, verdi
         assert spectral_lines.line_rows(context, "C")[0].verdict == verdict
 
 
-def test_the_glass_is_raysects_and_another_index_is_seen(needs_variant):
-    """Indices as raysect 0.9 gave them; another index is another image."""
+def test_the_scene_is_grey_its_glass_raysects_and_another_index_is_seen(needs_variant):
+    """Indices as raysect 0.9 gave them; another index is another image. The sky is as bright as it is in each line."""
+    plain = spectral_lines.plain(16)
+    colours = [mesh.material.reflectance for mesh in plain.meshes if isinstance(mesh.material, Diffuse)]
+    colours += [mesh.material.radiance for mesh in plain.meshes if isinstance(mesh.material, Light)]
+    assert len(colours) == 3 and all(len(set(colour)) == 1 for colour in (*colours, plain.sky))
     for line, index in {"C": 1.775987679010179, "d": 1.7847198458559292, "F": 1.8064543854708786}.items():
         assert float(media.index(spectral_lines.INDEX, media.LINES[line])) == pytest.approx(index, rel=1e-15)
     needs_variant(spectral_lines.VARIANT)
     size = Size(32, 256, 1, 0.3)
     one = {line: spectral_lines.ours(line, size) for line in "CF"}
+    for images in one.values():
+        assert images[0].pixels[0, 0, 0] == pytest.approx(plain.sky[0], rel=1e-3)
     assert spectral_lines.compared(one["C"], one["F"], size)[0].verdict is Verdict.DIFFERENT

@@ -14,6 +14,7 @@ import pytest
 from mi_refract import oracle, regimes
 from mi_refract.ray_sets import renderer_file
 from mi_refract.ray_sets.files import parse_answers
+from mi_refract.ray_sets.header import PRECISIONS
 from mi_refract.ray_sets.renderer_file import RaysCommand
 from validation import __main__ as command
 from validation import limits
@@ -101,6 +102,39 @@ def test_right_answers_pass_and_a_small_error_of_the_normal_misses_a_goal(rows_o
     off = rows_of("n = n + 2e-15 * np.cross(n, a)")  # within the bound all the same
     assert {row.verdict for row in off} == {"pass"}
     assert {row.case for row in off if per_ray.BACKWARD in row.missed} >= {"random", "near-critical", LARGE}
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_the_random_rays_are_those_of_before_any_result(precision):
+    """None is left out: rays near the critical angle stay where they were drawn."""
+    count, dtype = 10_000, PRECISIONS[precision]
+    rng = np.random.default_rng([2040, 0])
+    n = regimes.normalised(rng.normal(size=(count, 3))).astype(dtype)
+    cosine, k = rng.uniform(0, 1, count), 1.5 ** rng.choice([-1.0, 1.0], count)
+    across = np.cross(n.astype(float), rng.normal(size=n.shape))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    rays = per_ray.given(precision)
+    rays = rays.rays[rays.regime == per_ray.RANDOM]
+    behind = (rays.a * n).sum(1, keepdims=True) > 0  # there the normal is turned: all face the ray
+    np.testing.assert_array_equal(rays.n, np.where(behind, -n, n))
+    np.testing.assert_array_equal(rays.k, k.astype(dtype))
+    tolerance, sine = 8 * np.finfo(dtype).eps, np.sqrt(1 - cosine**2)
+    np.testing.assert_allclose(np.abs((rays.a * n).sum(1)), cosine, atol=tolerance)
+    np.testing.assert_allclose((rays.a * across).sum(1), sine, atol=tolerance)
+    assert (np.abs(1 - k**2 * sine**2) < per_ray.LEFT_OUT).any()
+
+
+def test_frames_are_rotations_onto_the_normal(monkeypatch):
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    import table
+
+    axes = np.vstack([np.eye(3), -np.eye(3)])
+    n = np.vstack([np.random.default_rng(3).normal(size=(1000, 3)), axes, axes - 1e-9])
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    frames = table.frames(n)
+    np.testing.assert_array_equal(frames[:, :, 2], n)
+    np.testing.assert_allclose(np.swapaxes(frames, 1, 2) @ frames, np.broadcast_to(np.eye(3), frames.shape), atol=1e-15)
+    np.testing.assert_allclose(np.linalg.det(frames), 1, atol=1e-15)
 
 
 @pytest.mark.parametrize("name", DEFECTS)

@@ -8,6 +8,7 @@ Seeds are fixed, so a test that passes once passes until the scene, Mitsuba or t
 
 import re
 import xml.etree.ElementTree as ET
+from collections import Counter
 from pathlib import Path
 
 import mitsuba as mi
@@ -110,6 +111,13 @@ def test_loads_at_the_size_of_the_notes_and_renders_and_media_nest(name):
     assert medium_faults(SCENES / f"{name}.xml") == 0
 
 
+def test_parameters_reach_the_scene():
+    scene = load("sphere", res=8, spp=9, max_depth=3, integrator="volpath")
+    sensor, integrator = scene.sensors()[0], str(scene.integrator())
+    assert tuple(sensor.film().size()) == (8, 8) and sensor.sampler().sample_count() == 9
+    assert "max_depth = 3" in integrator and "Volumetric" in integrator
+
+
 def test_furnace_is_white_and_shows_a_loss(tmp_path):
     """Each path's weight is 1 up to the rounding of η² in and 1/η² out, so this is no estimate with a variance.
 
@@ -175,6 +183,80 @@ def test_a_wrong_boundary_is_seen_and_indices_are_what_the_scenes_are_named_afte
     assert media["near"][0] - media["near"][1] == pytest.approx(1e-3, rel=1e-3)
 
 
+# --- meshes ----------------------------------------------------------------------------------------------
+
+# A solid is a list of meshes; "-" turns one inside out.
+SOLIDS = {
+    "bottle": ["bottle_outer.ply"],
+    "hollow": ["bottle_inner.ply"],
+    "diamond": ["diamond.ply"],
+    "prism": ["prism.ply"],
+    "tumbler": ["tumbler_air.ply", "tumbler_wet.ply"],
+    "water": ["-tumbler_wet.ply", "water_top.ply"],
+}
+
+
+def read_ply(path):
+    header, body = path.read_text().split("end_header\n")
+    count = int(re.search(r"element vertex (\d+)", header)[1])
+    rows = body.splitlines()
+    vertices = np.array([r.split() for r in rows[:count]], np.float32).astype(float)
+    return vertices, np.array([r.split()[1:] for r in rows[count:]], int)
+
+
+def solid(name):
+    """Vertices and triangles of a solid; vertices with bitwise equal coordinates are one vertex."""
+    parts = [(m[0] == "-", *read_ply(SCENES / "meshes" / m.lstrip("-"))) for m in SOLIDS[name]]
+    points = np.concatenate([v for _, v, _ in parts])
+    starts = np.cumsum([0] + [len(v) for _, v, _ in parts[:-1]])
+    faces = [o + (f[:, ::-1] if turn else f) for o, (turn, _, f) in zip(starts, parts, strict=True)]
+    vertices, index = np.unique(points, axis=0, return_inverse=True)
+    return vertices, index.reshape(-1)[np.concatenate(faces)]
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_solid_is_closed(name):
+    v, f = solid(name)
+    edges = Counter((int(a), int(b)) for t in f for a, b in zip(t, np.roll(t, -1), strict=True))
+    assert set(edges.values()) == {1} and all((b, a) in edges for a, b in edges)  # each edge has its opposite
+    assert len(v) - len(edges) // 2 + len(f) == 2  # Euler's formula
+    assert np.einsum("ij,ij->i", v[f[:, 0]], np.cross(v[f[:, 1]], v[f[:, 2]])).sum() > 0  # the volume
+
+
+# --- light pipe ------------------------------------------------------------------------------------------
+
+
+def internal_reflections(path, rays=40):
+    """Total internal reflections of camera rays that enter a pipe's end, until they leave the pipes."""
+    scene, counts = load(path), []
+    rng = np.random.default_rng(5)
+    eta = iors(path)[0]["glass"]
+    for u in rng.random((40 * rays, 2)):
+        if len(counts) == rays:
+            break
+        ray, _ = scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(u), mi.Point2f(0.5))
+        si = scene.ray_intersect(ray)
+        if not (si.is_valid() and si.shape.id().startswith("pipe") and si.n.z > 0.5):
+            continue
+        count = 0
+        while si.is_valid() and si.shape.id().startswith("pipe") and count < 500:
+            reflectance, cos_t, _, eta_ti = mi.fresnel(si.wi.z, eta[0] / eta[1])
+            total = reflectance == 1
+            count += total
+            wo = mi.reflect(si.wi) if total else mi.refract(si.wi, cos_t, eta_ti)
+            si = scene.ray_intersect(si.spawn_ray(si.to_world(wo)))
+        counts.append(count)
+    assert len(counts) == rays
+    return np.array(counts)
+
+
+def test_light_pipe_reflects_fifty_times(tmp_path):
+    counts = internal_reflections(SCENES / "lightpipe.xml")
+    assert counts.min() >= 50
+    assert counts.max() < 160 / 2  # so that what the far end reflects comes back within max_depth
+    assert internal_reflections(edited(tmp_path, "lightpipe", 'z="70"/>', 'z="62"/>')).min() < 50
+
+
 # --- dispersion and absorption ---------------------------------------------------------------------------
 
 
@@ -209,6 +291,19 @@ def test_colours_are_in_spectral_variants_only(name, colours):
     bright = image[image.max(2) > 0.3]  # lamps are white, the sky is dark
     colourful = (bright.max(-1) - bright.min(-1)).sum() / bright.sum()
     assert colourful > 0.3 if colours else colourful < 0.15
+
+
+def test_the_rainbow_is_red_at_its_borders_and_blue_between(needs_variant):
+    needs_variant("llvm_ad_spectral")
+    mi.set_variant("llvm_ad_spectral")
+    image = rendered("rainbow_drop", res=96, spp=256)
+    y, x = np.mgrid[:96, :96] + 0.5 - 48
+    ring = (np.hypot(x, y) / 1.5).astype(int)
+    red, blue = (np.bincount(ring.ravel(), image[..., c].ravel()) / np.bincount(ring.ravel()) for c in (0, 2))
+    middle = int(blue[12:28].argmax()) + 12
+    assert red[middle - 3 : middle + 4].argmax() != 3
+    assert blue[middle] > 2 * red[middle]
+    assert (red > blue)[middle + 1 : middle + 4].any() and (red > blue)[middle - 4 : middle].any()
 
 
 def test_thick_glass_is_darker(needs_variant):

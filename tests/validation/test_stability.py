@@ -84,6 +84,22 @@ def test_the_height_is_what_tilting_every_direction_makes_of_it():
     assert last - heights[1] == pytest.approx(expected, rel=0.03)
 
 
+def test_single_precision_stays_within_its_budgets_and_shows_what_ratios_cost():
+    setting = compiled("float32")
+    how = optical_chains.Extent((1000,), ("upright",), 1000, DEGREES, False)
+    rows = optical_chains.mirage_rows(FORMULAS, "mirage", air(1000), UPRIGHT, setting, how)
+    assert {row.verdict for row in rows} == {"pass", "info"}
+    at = {(row.subject, row.case.partition(", ")[2]): row.values for row in rows}
+    for name in FORMULAS:
+        assert at[name, "ratios"]["89.0°"] == pytest.approx(0.116, abs=0.005)  # the layers are not there at all
+        assert at[name, "reciprocals"]["89.0°"] == pytest.approx(0.48, abs=0.005)
+        assert at[name, "reciprocals"]["89.4°"] == 1
+    assert at["promoted", "contrasts"]["89.55°"] < 1e-3 < at["promoted", "indices"]["89.55°"]
+    rounded = {"promoted": lambda a, n, k, contrast=None: promoted(a, n, k, None if contrast is None else k * k - 1)}
+    rows = optical_chains.mirage_rows(rounded, "mirage", air(1000), UPRIGHT, setting, how)
+    assert [row.case for row in rows if row.verdict == "fail"] == ["mirage, contrasts"]
+
+
 def test_a_budget_that_no_answer_could_break_is_none():
     """100 000 ratios, each off by u in float32: condition · u is above 1 for every ray, in float64 for none."""
 
@@ -252,6 +268,12 @@ def test_defects_in_the_powers_are_seen(function, defect, seen, few, monkeypatch
     monkeypatch.setattr(fresnel, function, defect)
     monkeypatch.setattr(energy, "CASES", ["generic", "matched, grazing"])
     assert seen <= failing(energy.setting_rows(few, compiled("float32", True)))
+
+
+def test_mitsubas_function_loses_its_digits_near_k_of_1(few):
+    rows = {(row.subject, row.case): row for row in energy.setting_rows(few, compiled("float32", True))}
+    assert rows[energy.BUILTIN, "matched, grazing"].values["R / u"] > 1000
+    assert set(rows[NEAR_ONE].curves) == {"powers", energy.BUILTIN}
 
 
 @pytest.mark.parametrize(("case", "weight"), [("white furnace", 1.000001), ("basic radiance", 1.00001)])
