@@ -110,8 +110,8 @@ class ParsedScene:
             RuntimeError: of Mitsuba, where it cannot make a plugin.
         """
         path, nodes = self.path, self.state.nodes
-        # Where a plugin in Python is not registered in the variant, Mitsuba looks for a file of its name.
-        known = known_plugins() - {name for name in (*PYTHON, *OURS) if self._code(name)}
+        # Where a Python plugin of Mitsuba is not registered in the variant, it looks for a file of that name.
+        known = known_plugins() - {name for name in PYTHON if self._code(name)}
         if unknown := sorted({node.props.plugin_name() for node in nodes} - known - {*allowed}):
             expected = f"those; to load native code shipped with a scene, pass --allow-plugins {unknown[0]}"
             raise ValueError(f"{path}: plugin {unknown[0]!r}: neither Mitsuba's nor mi_refract's; expected {expected}")

@@ -70,8 +70,7 @@ FOLLOWED += [(name, {"split_depth": depth, "rr_depth": 100}) for name in WRAPPED
 SPP = 16, 64  # the latter in a wrapper
 
 
-@functools.cache
-def made(name):
+def made(name):  # not kept: Mitsuba traces calls of every texture that is alive
     if name not in WRAPPED:
         return load(name)
     oblique = PLACE().rotate([0, 1, 0], 70).scale(9)  # the camera sees the sheet from 20° above it

@@ -62,15 +62,17 @@ def test_a_plugin_of_the_scenes_own_is_refused_by_name(elements, load, bait):
 
 @pytest.mark.parametrize("place", ["scene", "path", "working folder"])
 def test_a_file_named_as_a_plugin_in_python_is_refused(place, load, tmp_path, monkeypatch):
-    """In scalar variants Mitsuba registers none of its own, and looks for a file."""
+    """In scalar variants Mitsuba registers none of its own, and looks for a file; ours are registered everywhere."""
     folder, searched = tmp_path if place == "scene" else tmp_path / "more", '<path value="more"/>' * (place == "path")
     (folder / "plugins").mkdir(parents=True)
     if place == "working folder":
         monkeypatch.chdir(folder)
     for name in (*scene_parser.PYTHON, "refract"):
         (folder / "plugins" / f"{name}.so").write_text("native code")
-        with pytest.raises(ValueError, match=f"plugin '{name}': neither Mitsuba's"):
-            load(f'{searched}<bsdf type="{name}"/>')
+        if name != "refract":
+            with pytest.raises(ValueError, match=f"plugin '{name}': neither Mitsuba's"):
+                load(f'{searched}<bsdf type="{name}"/>')
+    assert load(f'{SENSOR}{searched}<shape type="sphere"><bsdf type="refract"/></shape>').shapes()[0].bsdf().eta[0] > 1
 
 
 def test_an_allowed_plugin_is_loaded(load, bait):
