@@ -79,43 +79,41 @@ class Curve:
         if not 0 < len(arcs) <= facets:
             text = f"facets: {facets}, for {len(arcs)} arcs"
             raise ValueError(f"{text}; expected one or more arcs, and a facet or more for each")
-        chords = [self.start[j : j + 1] for j in range(len(self))]
-        for j, steps in zip(arcs, np.diff(np.arange(len(arcs) + 1) * facets // len(arcs)).tolist(), strict=True):
-            start, end, control, weight = (x[j : j + 1] for x in (self.start, self.end, self.control, self.weight))
-            chords[j] = _along(start, end, control, weight, steps)[0, :-1]
-        return polygonal(np.concatenate(chords if self.closed else [*chords, self.vertices[-1:]]), self.closed)
+        steps = np.ones(len(self), int)
+        steps[arcs] = np.diff(np.arange(len(arcs) + 1) * facets // len(arcs))
+        return polygonal(self._chords(steps), self.closed)
 
     def outline(self, count: int = 64) -> Array:
         """Points along the curve, K × 2: its vertices, and `count` − 1 more on each arc."""
-        bent = ~self.straight
-        if not bent.any():
-            return self.vertices
-        arcs = iter(_along(self.start[bent], self.end[bent], self.control[bent], self.weight[bent], count)[:, :-1])
-        pieces = [next(arcs) if arc else start[None] for start, arc in zip(self.start, bent, strict=True)]
-        return np.concatenate(pieces if self.closed else [*pieces, self.vertices[-1:]])
+        return self._chords(np.where(self.straight, 1, count))
+
+    def _chords(self, steps: NDArray[np.intp]) -> Array:
+        """The vertices of `steps` (M) chords along each piece, K × 2."""
+        chords = [self.start] * len(self)
+        for count in np.unique(steps).tolist():
+            own = np.flatnonzero(steps == count)
+            for j, along in zip(own.tolist(), points(self, count, own), strict=True):
+                chords[j] = along[:-1]
+        return np.concatenate(chords if self.closed else [*chords, self.vertices[-1:]])
 
     def between(self, n_left: float, n_right: float) -> Segments:
         """The curve as boundaries between two media."""
         left, right = np.full(len(self), float(n_left)), np.full(len(self), float(n_right))
-        arcs = () if self.straight.all() else (self.control, self.weight)
-        return Segments(self.start, self.end, left, right, *arcs)
+        return Segments(self.start, self.end, left, right, self.control, self.weight)
 
 
-def points(segments: Segments, count: int) -> Array:
-    """M × (count + 1) × 2: points along each segment, its ends exact; at equal angles on an arc of a circle."""
-    control, weight = segments.control, segments.weight
-    if control is None or weight is None:
-        control, weight = (segments.start + segments.end) / 2, np.ones(len(segments))
-    return _along(segments.start, segments.end, control, weight, count)
+def points(pieces: Curve | Segments, count: int, own: NDArray[np.intp] | slice = slice(None)) -> Array:
+    """M × (count + 1) × 2: points along each piece, its ends exact; at equal angles on an arc of a circle.
 
-
-def _along(start: Array, end: Array, control: Array, weight: Array, count: int) -> Array:
-    w, s = weight[:, None, None], np.linspace(0, 1, count + 1)[:, None]
+    own: of these pieces only.
+    """
+    start, end, control, weight = (x[own, None] for x in (pieces.start, pieces.end, pieces.control, pieces.weight))
+    w, s = weight[..., None], np.linspace(0, 1, count + 1)[:, None]
     angle = np.emath.arccos(w) / np.pi
     # sin(φx)/sin φ for w = cos φ, which becomes x where w = 1 and is sinh of the imaginary φ where w > 1.
     b, a = (np.real(x * np.sinc(angle * x) / np.sinc(angle)) for x in (s, 1 - s))
     middle = 2 * w * a * b
-    sums = a * a * start[:, None] + middle * control[:, None] + b * b * end[:, None]
+    sums = a * a * start + middle * control + b * b * end
     return sums / (a * a + middle + b * b)
 
 

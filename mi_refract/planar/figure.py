@@ -359,6 +359,6 @@ def _chains(start: Array, end: Array, value: Array, rows: int, columns: int) -> 
 
 def curves(segments: Segments, samples: int = 33) -> list[Array]:
     """The boundaries as polylines, joined where one starts at the end of the one before; `samples` points per arc."""
-    places = points(segments, samples - 1 if segments.curved else 1)
+    places = points(segments, samples - 1 if segments.turn.any() else 1)
     breaks = np.flatnonzero((segments.start[1:] != segments.end[:-1]).any(axis=1)) + 1
     return [np.concatenate([run[:, :-1].reshape(-1, 2), run[-1:, -1]]) for run in np.split(places, breaks)]

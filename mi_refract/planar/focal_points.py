@@ -229,13 +229,10 @@ def axis(segments: Segments, paths: Paths, i: int) -> Axis | None:
 
 def _tangent(segments: Segments, hit: int, place: Array) -> tuple[Array, float]:
     """The unit direction of a boundary at a place, and by how much it turns to the left in a unit of length."""
-    a, b = segments.start[hit], segments.end[hit]
-    middle = (a + b) / 2
-    c = middle if segments.control is None else segments.control[hit]
-    if segments.weight is None or (c == middle).all():
+    a, c, b = segments.start[hit], segments.control[hit], segments.end[hit]
+    w, turn = float(segments.weight[hit]), segments.turn[hit]
+    if turn == 0:
         return (b - a) / math.hypot(*(b - a)), 0.0
-    w = float(segments.weight[hit])
-    turn = (c - a)[0] * (b - c)[1] - (c - a)[1] * (b - c)[0]
     # Shares of a, c and b in the place: s², 2w s r and r², up to a factor; from the nearer end no digit is lost.
     of_a, of_b = np.linalg.solve(np.column_stack([a - c, b - c]), place - c)
     of_c = 1 - of_a - of_b

@@ -26,7 +26,7 @@ import numpy as np
 from mi_refract.numerics import Mask, Number, ieee_divide
 
 from .array_backend import ArrayBackend, Index, Vector2, Vertices, negated
-from .segments import Array
+from .segments import Array, Segments
 
 NOWHERE = 0xFFFFFFFF  # the number of no segment
 # Of a start on its own segment: the least distance of its ends from the ray, in units of the segment's length.
@@ -112,15 +112,15 @@ def bounding_box(*points: Array) -> tuple[list[float], list[float]]:
 
 
 class LineSegments:
-    """M straight segments from `start` to `end` (M × 2); `vertices` (M × 2) are equal numbers for equal ends."""
+    """M segments, all of them straight."""
 
-    def __init__(self, arrays: ArrayBackend, start: Array, end: Array, vertices: Vertices) -> None:
+    def __init__(self, arrays: ArrayBackend, segments: Segments) -> None:
         """Copy them to the backend."""
-        self.arrays, self.count = arrays, arrays.uniform(arrays.index, len(start))
-        self.box = bounding_box(start, end)
-        self.ends = arrays.table(np.concatenate([start, end], 1))
-        self.vertices = arrays.table(vertices.astype(np.uint32))
-        e = end - start
+        self.arrays, self.count = arrays, arrays.uniform(arrays.index, len(segments))
+        self.box = bounding_box(segments.start, segments.end, segments.control)
+        self.ends = arrays.table(np.concatenate([segments.start, segments.end], 1))
+        self.vertices = arrays.table(segments.vertices)
+        e = segments.end - segments.start
         self.directions = arrays.table(e / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), np.finfo(float).tiny))
 
     def _of(self, i: Index, active: Mask = True) -> tuple[Vector2, Vector2, Vertices]:
@@ -201,20 +201,15 @@ class LineSegments:
 
 
 class ConicArcs(LineSegments):
-    """M arcs as in `planar.Segments`: as `LineSegments`, with `control` (M × 2) and `weight` (M)."""
+    """M segments, some of them arcs."""
 
-    def __init__(
-        self, arrays: ArrayBackend, start: Array, end: Array, vertices: Vertices, control: Array, weight: Array
-    ) -> None:
+    def __init__(self, arrays: ArrayBackend, segments: Segments) -> None:
         """Copy them to the backend."""
-        super().__init__(arrays, start, end, vertices)
-        self.box = bounding_box(start, end, control)
-        (ax, ay), (bx, by) = (control - start).T, (end - control).T
-        middle = (start + end) / 2
-        turn = np.where((control == middle).all(1), 0.0, ax * by - ay * bx)
+        super().__init__(arrays, segments)
+        straight, middle = segments.turn == 0, (segments.start + segments.end) / 2
         # A straight one has r in equal steps along it, whatever control and weight it was given.
-        control, weight = np.where(turn[:, None] == 0, middle, control), np.where(turn == 0, 1.0, weight)
-        self.shapes = arrays.table(np.column_stack([control, weight, turn]))
+        control, weight = np.where(straight[:, None], middle, segments.control), np.where(straight, 1, segments.weight)
+        self.shapes = arrays.table(np.column_stack([control, weight, segments.turn]))
 
     def _shape(self, i: Index, active: Mask = True) -> tuple[Vector2, Number, Number]:
         """Control point, weight and turn; the turn of a straight segment is 0."""

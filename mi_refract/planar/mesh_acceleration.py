@@ -29,7 +29,7 @@ from mi_refract.numerics import Mask, Number
 
 from .array_backend import ArrayBackend, Index, Scatter, Table, Vector2, Vertices, negated
 from .intersect import NOWHERE, Hit, LineSegments, Ray, Start
-from .segments import Array
+from .segments import Array, Segments
 
 MARGIN = 2.0**-19
 OFFSET = 2.0**-21
@@ -53,22 +53,23 @@ class SearchState:
 
 
 class MeshAcceleration:
-    """Strokes of M straight segments (`start`, `end`, M × 2, and `vertices`), and the segments that each one names.
+    """Strokes of M straight segments, and the segments that each one names.
 
     crowded: two segments that share no vertex and are too close to each other; None where none were seen.
     """
 
-    def __init__(self, arrays: ArrayBackend, start: Array, end: Array, vertices: Vertices) -> None:
+    def __init__(self, arrays: ArrayBackend, segments: Segments) -> None:
         """Build the mesh and the lists of neighbours, and look for segments that are too close."""
         import mitsuba
 
         self.arrays, self.coherent = arrays, True
         variant = "scalar_rgb" if arrays.name == "scalar" else f"{arrays.name}_ad_rgb"
         self.mi: Any = getattr(mitsuba, variant)
-        low, high = (f(np.concatenate([start, end]), axis=0) for f in (np.min, np.max))
+        both, vertices = (segments.start, segments.end), segments.vertices
+        low, high = (f(np.concatenate(both), axis=0) for f in (np.min, np.max))
         centre, self.half = (low + high) / 2, float((high - low).max() / 2)
         self.centre, self.scale = arrays.uniform(arrays.vector, *centre), arrays.uniform(arrays.number, 1 / self.half)
-        a, b = ((x - centre) / self.half for x in (start, end))
+        a, b = ((x - centre) / self.half for x in both)
         starts, ends = _strokes(a, b, vertices)
         self.scene = _upright(variant, starts, ends)
         self.crowded = self._crowded(a, b, vertices)

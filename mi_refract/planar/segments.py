@@ -32,13 +32,13 @@ def finite_array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
 class Segments:
     """M directed boundaries from `start` to `end` (M × 2), between media of index `n_left` and `n_right` (M).
 
-    Left and right are as seen along the segment. All segments are straight where `control` and `weight` are None.
-    Otherwise they are arcs of conics, written as rational quadratic Bézier curves
+    Left and right are as seen along the segment. A segment is an arc of a conic, as a rational quadratic Bézier curve
 
         ((1−t)² start + 2w t(1−t) control + t² end) / ((1−t)² + 2w t(1−t) + t²),   0 ≤ t ≤ 1
 
     with `control` (M × 2), where the tangents at both ends meet, and `weight` (M): w < 1 is an ellipse, w = 1 a
-    parabola, w > 1 a hyperbola. Each arc turns by less than 180°.
+    parabola, w > 1 a hyperbola. Each arc turns by less than 180°. A segment is straight where its control is on its
+    chord: in the middle, with weight 1, of segments that are made without both.
 
     ValueError for shapes that do not fit, NaN or Inf, an index ≤ 0, a weight ≤ 0, and two segments that coincide.
     """
@@ -47,32 +47,28 @@ class Segments:
     end: Array
     n_left: Array
     n_right: Array
-    control: Array | None = None
-    weight: Array | None = None
+    control: Array = None  # type: ignore[assignment]  # an array once it is made
+    weight: Array = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         """Convert all fields to float64 and check them."""
-        if len(self.start) == 0:
+        if not len(self.start):
             raise ValueError("segments: none; expected at least one")
-        for name in ("start", "end", "n_left", "n_right", "control", "weight"):
-            shape = (len(self.start), 2) if name in ("start", "end", "control") else (len(self.start),)
-            if (values := getattr(self, name)) is not None or name not in ("control", "weight"):
-                object.__setattr__(self, name, finite_array(f"segments.{name}", values, shape))
         if (self.control is None) != (self.weight is None):
             raise ValueError("segments: control and weight; expected both or neither")
-        for name in ("n_left", "n_right", "weight"):
-            values = getattr(self, name)
-            if values is not None and not (values > 0).all():
+        for name in ("start", "end", "n_left", "n_right", "control", "weight"):
+            shape = (len(self.start), 2) if name in ("start", "end", "control") else (len(self.start),)
+            if (values := getattr(self, name)) is None:
+                values = (self.start + self.end) / 2 if name == "control" else np.ones(shape)
+            values = finite_array(f"segments.{name}", values, shape)
+            object.__setattr__(self, name, values)
+            if len(shape) == 1 and not (values > 0).all():
                 i = int(np.argmin(values > 0))
                 raise ValueError(f"segments.{name}[{i}] = {values[i]}; expected more than 0")
         # Of two that coincide neither would come first on a ray.
-        ends = np.sort(self.vertices, axis=1).astype(np.uint64)
-        bulge = np.zeros((len(self), 3))
-        if self.control is not None and self.weight is not None:
-            bulge = np.column_stack([self.control, self.weight]) + 0.0
-        key = np.column_stack([ends[:, 0] << np.uint64(32) | ends[:, 1], bulge.view(np.uint64)])
+        key = np.column_stack([np.sort(self.vertices, axis=1), self.control, self.weight])
         order = np.lexsort(key.T)
-        same = (np.diff(key[order].astype(np.int64), axis=0) == 0).all(1) & (ends[order[1:], 0] != ends[order[1:], 1])
+        same = (key[order[1:]] == key[order[:-1]]).all(1) & (key[order[1:], 0] != key[order[1:], 1])
         if same.any():
             i, j = sorted(order[int(np.argmax(same)) :][:2].tolist())
             raise ValueError(f"segments {i} and {j} coincide; expected one, with the media on either side of both")
@@ -81,10 +77,12 @@ class Segments:
         """M."""
         return len(self.start)
 
-    @property
-    def curved(self) -> bool:
-        """Whether the segments are given as arcs; some of them may be straight all the same."""
-        return self.control is not None
+    @functools.cached_property
+    def turn(self) -> Array:
+        """M: (control − start) × (end − control), positive for an arc that turns left; 0 where it is straight."""
+        (ax, ay), (bx, by) = (self.control - self.start).T, (self.end - self.control).T
+        middle = (self.control == (self.start + self.end) / 2).all(1)
+        return np.where(middle, 0.0, ax * by - ay * bx)
 
     @functools.cached_property
     def vertices(self) -> NDArray[np.uint32]:

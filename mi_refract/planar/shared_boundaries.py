@@ -39,7 +39,8 @@ def boundaries(parts: list[Part]) -> tuple[Segments, ...]:
     (start, end), (first, last) = vertices.reshape(2, -1, 2), ids.reshape(2, -1)
     straight = np.concatenate([c.straight for c in curves])
     control = np.where(straight[:, None], (start + end) / 2, np.concatenate([c.control for c in curves]))
-    control, bends = _merged(control)
+    merged, bends = _merged(control)
+    control = np.where(straight[:, None], control, merged)
     weight = np.concatenate([c.weight for c in curves])
     media = np.array([(part.left, part.right) for part in parts])[owner]
     kept = first != last
@@ -60,9 +61,8 @@ def boundaries(parts: list[Part]) -> tuple[Segments, ...]:
             text = f"along {earlier} there is index {there}; expected {outside}, what it lies in"
             raise ValueError(f"{part.where}: {text}")
         media[i, side], kept[j] = part.left, False
-    arcs = () if straight[kept].all() else (control[kept], weight[kept])
-    left, right = media[kept].transpose(1, 2, 0)
-    return tuple(Segments(start[kept], end[kept], *n, *arcs) for n in zip(left, right, strict=True))
+    start, end, control, weight, media = (x[kept] for x in (start, end, control, weight, media))
+    return tuple(Segments(start, end, left, right, control, weight) for left, right in media.transpose(2, 1, 0))
 
 
 def _merged(points: Array) -> tuple[Array, Numbers]:

@@ -100,13 +100,10 @@ class Tracer:
         """Copy the segments to the backend and build what finds the next boundary."""
         self.arrays = arrays = choose_backend(backend, precision)
         self.farthest = FARTHEST[precision]
-        for name in ("start", "end", "n_left", "n_right"):
+        for name in ("start", "end", "control", "n_left", "n_right"):
             _check_range(f"segments.{name}", getattr(segments, name), self.farthest)
         segments, self.middle = _centred(segments)
-        ends = segments.start, segments.end, segments.vertices
-        self.boundaries = LineSegments(arrays, *ends)
-        if segments.control is not None and segments.weight is not None:
-            self.boundaries = ConicArcs(arrays, *ends, segments.control, segments.weight)
+        self.boundaries = (ConicArcs if segments.turn.any() else LineSegments)(arrays, segments)
         self.mesh = _mesh(arrays, segments, method)
         left, right = segments.n_left, segments.n_right
         # With k from left to right and from right to left: ratios in float64, before anything is rounded.
@@ -306,16 +303,15 @@ def _centred(segments: Segments) -> tuple[Segments, Array]:
     Far is where |middle| exceeds twice the extent. Then |x − middle| < |middle|/2: the differences are exact, and
     float32 keeps all its digits for them.
     """
-    places = [segments.start, segments.end] + ([] if segments.control is None else [segments.control])
-    low, high = (f([f(x, axis=0) for x in places], axis=0) for f in (np.min, np.max))
+    start, end, control = segments.start, segments.end, segments.control
+    low, high = (f([f(x, axis=0) for x in (start, end, control)], axis=0) for f in (np.min, np.max))
     middle = low / 2 + high / 2
     middle = np.where(np.abs(middle) > 2 * (high - low).max(), middle, 0.0)
     if not middle.any():
         return segments, middle
-    start, end, control = segments.start - middle, segments.end - middle, segments.control
-    if control is not None:  # a straight segment stays straight to the last bit
-        straight = (control == (segments.start + segments.end) / 2).all(1)[:, None]
-        control = np.where(straight, (start + end) / 2, control - middle)
+    start, end = start - middle, end - middle
+    # A straight segment stays straight to the last bit.
+    control = np.where(segments.turn[:, None] == 0, (start + end) / 2, control - middle)
     return replace(segments, start=start, end=end, control=control), middle
 
 
@@ -341,9 +337,9 @@ def _mesh(arrays: ArrayBackend, segments: Segments, method: str) -> MeshAccelera
         return None
     extent = np.ptp(np.concatenate([segments.start, segments.end]), axis=0).max()
     shortest = length[length > 0].min(initial=np.inf) / (extent / 2 or 1)
-    reason = "arcs" if segments.curved else f"a segment of {shortest:.1e}" if shortest < SHORTEST else ""
+    reason = "arcs" if segments.turn.any() else f"a segment of {shortest:.1e}" if shortest < SHORTEST else ""
     if not reason:
-        mesh = MeshAcceleration(arrays, segments.start, segments.end, segments.vertices)
+        mesh = MeshAcceleration(arrays, segments)
         if not mesh.crowded:
             return mesh
         reason = "segments {} and {}".format(*mesh.crowded)

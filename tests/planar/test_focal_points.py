@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.planar_scenes import SLAB, ball, beam, polygon, scene
+from support.planar_scenes import SLAB, ball, beam, polygon, scene, together
 
 from mi_refract.planar import Segments, focal_points, shapes
 from mi_refract.planar.curves import affine
@@ -118,18 +118,9 @@ def test_a_slab_only_moves_a_beam():
 # The paraxial limit --------------------------------------------------------------------------------------------
 
 
-def joined(*parts):
-    """Segments and arcs of several bodies; straight ones as arcs."""
-    fields = []
-    for part in parts:
-        arcs = (part.control, part.weight) if part.curved else ((part.start + part.end) / 2, np.ones(len(part)))
-        fields.append((part.start, part.end, part.n_left, part.n_right, *arcs))
-    return Segments(*map(np.concatenate, zip(*fields, strict=True)))
-
-
 def cardinal(segments, half, turn=0.0, at=(0.0, 0.0)):
     """The points of a system along x, which is turned by `turn` degrees and moved, and the spread of its first beam."""
-    rotation, segments = affine(turn), joined(segments)
+    rotation = affine(turn)
     start, end, control = (x @ rotation.T + at for x in (segments.start, segments.end, segments.control))
     segments = Segments(start, end, segments.n_left, segments.n_right, control, segments.weight)
     spread = groups(scene(segments, beam(4, half, -30.0) @ rotation.T + at, rotation[:, 0]))[0].spread
@@ -171,7 +162,7 @@ def test_an_afocal_system_says_so(turn):
     apart = one.back_focus[0] - one.front_focus[0]
 
     def telescope(apart):
-        return joined(lens.between(1.5, 1.0), lens.mapped(affine(), (apart, 0.0)).between(1.5, 1.0))
+        return together(lens.between(1.5, 1.0), lens.mapped(affine(), (apart, 0.0)).between(1.5, 1.0))
 
     points, spread = cardinal(telescope(apart), 0.5, turn=turn)
     assert points == Cardinal(afocal=True) and spread.paraxial is None
@@ -201,7 +192,7 @@ def test_the_double_gauss_has_the_image_distance_that_code_v_printed():
             parts.append(shapes.polyline([(x, -20.0), (x, 20.0)], [turn]).between(n, index))
         u = (n * u - y * curvature * (index - n)) / index
         place, n, y = place + thickness, index, y + thickness * u
-    points, spread = cardinal(joined(*parts), 5.0)
+    points, spread = cardinal(together(*parts), 5.0)
     assert points.back_focal_length == pytest.approx(surfaces[-1][1], rel=1e-12)
     assert spread.paraxial[0] == pytest.approx(place, rel=1e-12)
     assert points.focal_length == pytest.approx(-1 / u, rel=1e-12) == pytest.approx(100.00375702793, rel=1e-12)

@@ -270,9 +270,7 @@ def test_balls_that_touch_are_met_in_order_by_a_ray_through_that_point(follow, i
     x, size, around = (0.5, 0.5, 1.5) if inside else (2.0, 1.0, 1.0)
     places = {name: size * getattr(other, name) + np.array([x, 0]) for name in ("start", "end", "control")}
     other = dataclasses.replace(other, **places, n_right=np.full(4, around))
-    names = [f.name for f in dataclasses.fields(Segments)]
-    parts = [other, one] if swapped else [one, other]
-    both = Segments(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    both = together(other, one) if swapped else together(one, other)
     indices = [1, 1.5, 1.3, 1.5, 1] if inside else [1, 1.5, 1.0, 1.3, 1]
     for turn in np.linspace(0, 6, 21):
         d = np.array([math.cos(turn), math.sin(turn)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ def polygon(points, n=1.5, outside=1.0):
 
 
 def together(*parts):
-    names = ("start", "end", "n_left", "n_right")
+    names = [field.name for field in fields(Segments)]
     return Segments(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
@@ -51,7 +52,7 @@ def scene(segments, origins, directions, **given):
     origins = np.array(origins, float)
     directions = np.broadcast_to(np.array(directions, float), origins.shape)
     directions = directions / np.hypot(*directions.T)[:, None]
-    outline = segments[0].start if segments[0].control is None else CORNERS
+    outline = CORNERS if segments[0].turn.any() else segments[0].start
     default = {
         "path": Path("test.toml"),
         "title": "A test",

@@ -77,10 +77,8 @@ def faceted(case: Case) -> Case:
     """The same with chords for arcs, refracted wherever possible."""
     segments, every = case.segments, case.reflect == 0
     rays = case.origins[every], case.directions[every], case.max_depth, case.reflect[every]
-    if segments.control is None:
-        return Case(case.name, segments, *rays)
+    straight = segments.turn == 0
     count = max(1, min(FACETS, LARGEST // len(segments)))
-    straight = (segments.control == (segments.start + segments.end) / 2).all(1)
     along = points(segments, count)[~straight]
     pieces = (segments.start[straight], along[:, :-1]), (segments.end[straight], along[:, 1:])
     start, end = (np.concatenate([x, y.reshape(-1, 2)]) for x, y in pieces)

@@ -69,8 +69,7 @@ def transfer(path: Retraced) -> tuple[Array, Array, Array]:
 
 def _sizes(path: Retraced, segments: Segments) -> Array:
     """The largest coordinate so far, N × (D+1); of the path and of the segments it met."""
-    corners = [np.abs(x).max(1) for x in (segments.start, segments.end, segments.control) if x is not None]
-    largest = np.max([np.nan_to_num(x) for x in corners], axis=0)
+    largest = np.max([np.abs(x).max(1) for x in (segments.start, segments.end, segments.control)], axis=0)
     own = np.abs(path.points).max(2)
     own[:, 1:] = np.maximum(own[:, 1:], np.where(path.hits >= 0, largest[path.hits], np.nan))
     return np.maximum.accumulate(own, axis=1).astype(float)

@@ -134,14 +134,13 @@ class Curves:
         self.touching = 64 * np.finfo(np.longdouble).eps * np.abs([self.start, self.end]).max(initial=0)
         # By definition a segment is straight where its control is, in double precision, the middle of its ends.
         middle = (np.asarray(segments.start) + np.asarray(segments.end)) / 2
-        control = middle if segments.control is None else np.asarray(segments.control)
+        control = np.asarray(segments.control)
         self.arcs = np.flatnonzero((control != middle).any(1))
         self.place = np.full(len(chord), -1)  # in `arcs`
         self.place[self.arcs] = np.arange(len(self.arcs))
         self.control = control[self.arcs].astype(np.longdouble)
         area = _cross(chord[self.arcs], self.control - self.start[self.arcs])  # twice; > 0 with the control on the left
-        w = np.ones(len(chord)) if segments.weight is None else np.asarray(segments.weight)
-        self.w4 = 4 * w[self.arcs].astype(np.longdouble) ** 2
+        self.w4 = 4 * np.asarray(segments.weight)[self.arcs].astype(np.longdouble) ** 2
         # ∇τ₀, ∇τ₁, ∇τ₂ (3 × arcs × 2); each is the opposite edge, turned.
         corners = self.start[self.arcs], self.control, self.end[self.arcs]
         edges = [corners[(i + 1) % 3] - corners[(i + 2) % 3] for i in range(3)]
