@@ -44,6 +44,7 @@ def convert(value: Any, kind: type[T], where: str, *, infinite: bool = False) ->
         path = path.removesuffix("`")
         key = re.sub(r"^(key` in `)?\$\.?", "", path)
         message = f"{message[0].lower()}{message[1:]}".replace("object contains unknown field", "unknown key")
+        message = message.replace(r"matching regex '\\S'", "that is not blank")
         if message.startswith(("unknown key", "invalid ")) and (names := _names(kind, value, path)):
             message = f"{message}; expected {', '.join(names)}"
         raise ValueError(" ".join(f"{where}: {f'{key}: ' if key else ''}{message}".split())) from None

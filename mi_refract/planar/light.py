@@ -14,6 +14,7 @@ from mi_refract.backend import activate
 from .segments import Array
 
 VISIBLE = 380.0, 730.0  # nm: where a number of wavelengths is spread over
+SHORTEST, LONGEST = 100.0, 100_000.0  # nm
 MOST = 256  # wavelengths
 
 
@@ -87,7 +88,7 @@ def parsed(text: str) -> list[float] | int:
         raise ValueError(f"--wavelengths {text}: {accepted}") from None
     if len(numbers) == 1 and text.strip().isdigit() and 2 <= numbers[0] <= MOST:
         return int(numbers[0])
-    if len(numbers) > MOST or not all(100 <= x <= 100_000 for x in numbers):
+    if len(numbers) > MOST or not all(SHORTEST <= x <= LONGEST for x in numbers):
         raise ValueError(f"--wavelengths {text}: {accepted}")
     return numbers
 
@@ -95,7 +96,7 @@ def parsed(text: str) -> list[float] | int:
 def linear_srgb(light: Light) -> Array:
     """What the eye makes of each colour (C × 3, linear sRGB; negative where a screen cannot show it).
 
-    All of them together are (1, 1, 1): white.
+    All of them together are (1, 1, 1): white. ValueError where none is visible.
     """
     import mitsuba as mi
 
@@ -106,4 +107,8 @@ def linear_srgb(light: Light) -> Array:
     seen = np.array([variant.cie1931_xyz(float(w)) for w in light.wavelengths], float)
     rgb: Array = (seen * np.array(light.powers)[:, None]) @ matrix
     total = rgb.sum(0)
+    if not total.any():
+        raise ValueError(
+            f"wavelengths: none of {', '.join(light.names[:3])} is visible; expected some from 360 to 830 nm"
+        )
     return rgb / np.where(total > 0, total, np.abs(total).max() or 1)

@@ -22,7 +22,7 @@ from mi_refract.io.typed_table import key_table, kind_table, parse_toml
 
 from . import shapes
 from .curves import Curve, affine, unit
-from .light import MOST, Light, of_wavelengths
+from .light import LONGEST, MOST, SHORTEST, Light, of_wavelengths
 from .segments import Array, Segments
 from .shared_boundaries import Indices, Part, boundaries
 
@@ -33,7 +33,7 @@ RAYS = 2**24  # of all beams
 FARTHEST = 1e100  # of all coordinates: products of two do not overflow
 
 Positive = Annotated[float, Meta(gt=0)]
-Text = Annotated[str, Meta(min_length=1)]
+Text = Annotated[str, Meta(pattern=r"\S")]
 Names = Annotated[list[Text], Meta(min_length=1)]
 Point = tuple[float, float]
 Points = Annotated[list[Point], Meta(min_length=1)]
@@ -41,7 +41,7 @@ Box = tuple[float, float, float, float]
 Direction = float | Point
 Count = Annotated[int, Meta(ge=1, le=1_000_000)]
 Arcs = Annotated[list[float] | None, Meta(description="degrees by which each piece turns left, an arc; 0: straight")]
-Index = Positive | Annotated[list[Positive], Meta(min_length=1)] | Text
+Index = Positive | Annotated[list[Positive], Meta(min_length=1)] | Annotated[str, Meta(min_length=1)]
 
 
 def _doc(meaning: str) -> Meta:
@@ -231,7 +231,8 @@ def _unit_vector(key: str, value: Direction) -> tuple[float, float]:
 
 # Scenes -----------------------------------------------------------------------------------------------------------
 
-Wavelengths = Annotated[int, Meta(ge=2, le=MOST)] | Annotated[list[Positive], Meta(min_length=1, max_length=MOST)]
+Nanometres = Annotated[float, Meta(ge=SHORTEST, le=LONGEST)]
+Wavelengths = Annotated[int, Meta(ge=2, le=MOST)] | Annotated[list[Nanometres], Meta(min_length=1, max_length=MOST)]
 
 
 class SceneTable(Struct, kw_only=True, forbid_unknown_fields=True):
@@ -315,6 +316,8 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
     try:
         if chosen is not None and table.colours:
             raise ValueError("colours and wavelengths are both set; expected one of them")
+        if chosen is None and table.light != "flat":
+            raise ValueError(f"light: {table.light!r} without wavelengths; expected `wavelengths` that it weights")
         light = Light(tuple(table.colours or [""])) if chosen is None else of_wavelengths(chosen, table.light)
         index = light.indices(table.index, "index")
         parts = _parts(table.shape, index, light)

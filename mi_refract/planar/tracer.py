@@ -102,8 +102,15 @@ class Tracer:
         self.farthest = FARTHEST[precision]
         for name in ("start", "end", "control", "n_left", "n_right"):
             _check_range(f"segments.{name}", getattr(segments, name), self.farthest)
+        if min(segments.n_left.min(), segments.n_right.min()) < 1 / self.farthest:
+            raise ValueError(f"segments: an index below {1 / self.farthest:g}")
         segments, self.middle = _centred(segments)
         self.boundaries = (ConicArcs if segments.turn.any() else LineSegments)(arrays, segments)
+        size = float(np.subtract(*self.boundaries.box[::-1]).max())
+        if 0 < size < 1 / self.farthest:
+            raise ValueError(f"segments: within {size:g} of each other; expected {1 / self.farthest:g} or more")
+        # Rounding of an origin that is farther away would be larger than the margin of the box.
+        self.reach = min(self.farthest, size / (12 * arrays.roundoff) or self.farthest)
         self.mesh = _mesh(arrays, segments, method)
         left, right = segments.n_left, segments.n_right
         # With k from left to right and from right to left: ratios in float64, before anything is rounded.
@@ -140,7 +147,7 @@ class Tracer:
         index = None if n_start is None else arrays.table(_each("n_start", n_start, count, "iuf", float))
         none = np.ndim(reflect) == 0 and reflect == 0
         mirrored = None if none else arrays.table(_each("reflect", reflect, count, "iu", np.uint32))
-        _check_range("origins", origins, self.farthest)
+        _check_range("origins", origins - self.middle, self.reach)
         if self.mesh:
             self.mesh.expect(origins - self.middle, along)
         rays = [arrays.table(x) for x in (origins - self.middle, along)]

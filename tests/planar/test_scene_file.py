@@ -157,6 +157,9 @@ BAD = [  # what is replaced, by what: the place and what was found or expected
     ("radius = 2,", "radius = nan,", "shape[0].radius: expected a finite number, got nan"),
     ("n = 1.3", "n = 0", "shape[2].n: expected `float` > 0.0"),
     ("index = [1, 1.1]", "index = [1, -1.1]", "index[1]: expected `float` > 0.0"),
+    ('title = "A disc"', 'title = " "', "title: expected `str` that is not blank"),
+    ('name = "disc"', 'name = ""', "shape[0].name: expected `str` that is not blank"),
+    ("view = ", 'light = "D65"\nview = ', "light: 'D65' without wavelengths; expected"),
     ("n = 1.3", "n = [1, 2, 3]", "shape[2].n: 3 numbers; expected 1, or one for each of 2"),
     ('colours = ["red", "blue"]', "", "index: 2 numbers; expected 1, or one for each of 1"),
     ('["red", "blue"]', "[]", "colours: expected `array` of length >= 1"),
@@ -189,7 +192,7 @@ BAD_GLASSES = [
     (CAUCHY, "cauchy(1.5", "shape[2].n = 'cauchy(1.5'; expected cauchy(…)"),
     (CAUCHY, "table(500: 1.5, 900: 1.4)", "shape[2].n: table(500: 1.5, 900: 1.4): no index"),
     (TWO_LINES, "wavelengths = 1", "wavelengths: expected `int` >= 2"),
-    (TWO_LINES, "wavelengths = [-500]", "wavelengths[0]: expected `float` > 0.0"),
+    (TWO_LINES, "wavelengths = [-500]", "wavelengths[0]: expected `float` >= 100.0"),
     (TWO_LINES, "wavelengths = 257", "wavelengths: expected `int` <= 256"),
     ("title", 'colours = ["a", "b"]\ntitle', "colours and wavelengths are both set; expected one"),
     ("title", 'light = "A"\ntitle', "light: invalid enum value 'A'; expected D65, flat"),
@@ -366,6 +369,11 @@ def test_words_that_are_wavelengths_and_others():
     for text in ("", "red", "1", "nan", "450,", "-450", "inf"):
         with pytest.raises(ValueError, match="expected wavelengths in nm, such as"):
             light.parsed(text)
+
+
+def test_a_figure_of_wavelengths_that_nobody_sees_would_be_black():
+    with pytest.raises(ValueError, match="wavelengths: none of 1000 nm is visible; expected some from 360 to 830 nm"):
+        light.linear_srgb(of_wavelengths([1000.0]))
 
 
 @pytest.mark.parametrize("power", ["flat", "D65"])
