@@ -36,9 +36,10 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) ->
     camera: Camera | None = None
     max_depth: int | None = None
     sky: Colour | Environment | None = None
-    for child in root.children():
+    for child in sorted(root.children(), key=lambda child: child.kind == "Shape"):  # the camera before the shapes
         if child.kind == "Shape":
-            shapes += meshes_of_shape(child, level, MOST - sum(len(mesh.faces) for mesh in shapes))
+            eye = np.array(camera.origin) if camera else None
+            shapes += meshes_of_shape(child, level, MOST - sum(len(mesh.faces) for mesh in shapes), eye)
         elif child.kind == "Sensor" and camera is None:
             camera = _camera(child)
         elif child.kind == "Integrator" and max_depth is None:

@@ -43,10 +43,11 @@ class Surface:
     one_sided: bool = False
 
 
-def meshes_of_shape(shape: Node, level: int, most: int = MOST) -> Iterator[Mesh]:
+def meshes_of_shape(shape: Node, level: int, most: int = MOST, eye: Vertices | None = None) -> Iterator[Mesh]:
     """The shape's meshes: two for a checkerboard, otherwise one.
 
-    ValueError for parameters that a mesh cannot have, and, before they are made, for more than `most` triangles.
+    ValueError for parameters that a mesh cannot have, for a surface that would be black from the camera's place `eye`
+    (3), and, before they are made, for more than `most` triangles.
     """
     surface, frame = _surface(shape), _frame(shape)
     flipped = shape.value(bool, "flip_normals", False)
@@ -66,6 +67,8 @@ def meshes_of_shape(shape: Node, level: int, most: int = MOST) -> Iterator[Mesh]
         placed = vertices @ frame[:3, :3].T + frame[:3, 3]
         if not (np.abs(placed) <= FARTHEST).all():
             raise shape.error(f"coordinates beyond {FARTHEST:g}", "finite ones, up to that")
+        if surface.one_sided and eye is not None and tessellation.encloses(placed[faces], eye):
+            raise shape.error("diffuse on the outside only, around the camera", "its BSDF in a `twosided`")
         yield Mesh(f"{name}_{i}" if i else name, placed, faces[:, ::-1] if flipped else faces, material)
 
 
@@ -122,6 +125,11 @@ def _frame(shape: Node) -> Vertices:
         return value
 
     frame, local = shape.transform(), np.eye(4)
+    if shape.type in ("sphere", "cylinder"):  # Mitsuba stretches the second along its axis only
+        squares = frame[:3, :3].T @ frame[:3, :3]
+        round_one = squares[0, 0] * np.diag([1, 1, squares[2, 2] / squares[0, 0] if shape.type == "cylinder" else 1])
+        if not np.allclose(squares, round_one, rtol=1e-5, atol=1e-5 * squares.max()):
+            raise shape.error(f"to_world makes another shape of the {shape.type}", "one scale, turns and shifts")
     if shape.type == "sphere":
         local[:3, 3] = shape.point("center", (0, 0, 0))
         local[:3, :3] *= positive("radius", shape.value(float, "radius", 1.0))

@@ -228,6 +228,7 @@ BALL = 'type="sphere" id="ball">'
 MOVED = '<transform name="to_world"><translate x="3"/></transform>'
 AREA = '<shape type="rectangle"><emitter type="area">'
 LIGHT = f'{AREA}<rgb name="radiance" value="2"/>'
+LAMP = '<emitter type="area"><rgb name="radiance" value="2"/></emitter>'
 BOARD = (
     '<texture type="checkerboard" name="radiance"><transform name="to_uv"><scale x="{}" y="{}"/></transform></texture>'
 )
@@ -246,6 +247,12 @@ REFUSED = {
     "sdfgrid": ('type="cube"', 'type="sdfgrid"'),
     "mirrors": ('<translate x="3"/>', '<scale x="-1"/>'),
     "mirrors or flattens": ('<translate x="3"/>', '<scale x="0"/>'),
+    "another shape of the sphere": (BALL, f'{BALL}<transform name="to_world"><scale x="2" y="1" z="1"/></transform>'),
+    "another shape of the cylinder": (
+        'type="cube" id="box"><transform name="to_world"><translate x="3"/></transform>',
+        f'type="cylinder"><transform name="to_world"><scale x="2" y="1" z="3"/></transform>{LAMP}',
+    ),
+    "around the camera": ('<translate x="3"/>', '<scale value="99"/>'),
     "one side of an open surface": ('type="cube"', 'type="rectangle"'),
     "bitmap": (LIGHT, f'{AREA}<texture type="bitmap" name="radiance"/>'),
     "a checkerboard": (LIGHT, f"{AREA.replace('rectangle', 'disk')}{BOARD.format(1, 1)}"),
@@ -315,7 +322,6 @@ def test_a_face_without_its_vertices_is_refused(last, smooth, scene, tmp_path):
 
 # --- triangles -------------------------------------------------------------------------------------------
 
-LAMP = '<emitter type="area"><rgb name="radiance" value="2"/></emitter>'
 COUNTED = {f'type="{name}">{LAMP}': count for name, count in (("sphere", 320), ("cylinder", 64), ("disk", 32))}
 COUNTED |= {f'type="{name}">{LAMP}': count for name, count in (("cube", 12), ("rectangle", 2))}
 COUNTED |= {

@@ -207,9 +207,15 @@ def test_povray(tmp_path):
     """What it does not follow is refused; black surfaces; indices relative to what is outside."""
     pane = Mesh("pane", *tessellation.rectangle(), GLASS)
     (grey,) = plain(Diffuse((0.5, 0.0, 0.0))).meshes
-    for mesh, words in ((pane, "pane: glass with an open"), (grey, "ball_0: a diffuse surface")):
+    apart = Mesh("apart", BALL[0] - 9, BALL[1], Glass(1.5, 1.33))
+    for mesh, words in (
+        (pane, "pane: glass with an open"),
+        (grey, "ball_0: a diffuse surface"),
+        (apart, "apart: ext_ior = 1.33; no medium"),
+    ):
+        meshes = mesh, Mesh("ball", *BALL, GLASS)
         with pytest.raises(ValueError, match=words):
-            targets.write(PlainScene("bad", (mesh,), (1.0, 1.0, 1.0), CAMERA, 8), "povray", tmp_path / "new")
+            targets.write(PlainScene("bad", meshes, (1.0, 1.0, 1.0), CAMERA, 8), "povray", tmp_path / "new")
     assert not list(tmp_path.iterdir())
     make = targets.TARGETS["povray"]
     text = make(plain(LAMP, Diffuse((0.0, 0.0, 0.0))))["scene.pov"].decode()

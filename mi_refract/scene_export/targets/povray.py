@@ -39,6 +39,10 @@ def files(plain: PlainScene) -> Files:
     # POV-Ray assumes that the outermost medium has index 1: indices are relative to that one.
     glasses = [(mesh.vertices[:, 0].max(), mesh.material) for mesh in plain.meshes if isinstance(mesh.material, Glass)]
     outside = max(glasses, key=lambda glass: glass[0])[1].ext_ior if glasses else 1.0
+    media = {outside, *(glass.int_ior for _, glass in glasses)}
+    for mesh in plain.meshes:  # POV-Ray has one index per body
+        if isinstance(mesh.material, Glass) and mesh.material.ext_ior not in media:
+            raise ValueError(f"{plain.name}: {mesh.name}: ext_ior = {mesh.material.ext_ior}; no medium has that index")
     if isinstance(plain.sky, Environment):
         sky = 'sky_sphere { pigment { image_map { exr "sky.exr" gamma 1.0 map_type 1 interpolate 2 } } }\n'
     else:
