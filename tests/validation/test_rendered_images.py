@@ -111,7 +111,7 @@ def test_three_finds_the_sky_where_it_looks(monkeypatch):
     monkeypatch.setattr(shared_files, "FINER", 8)
     sky, directions = rendered_images.askew(), np.random.default_rng(3).normal(size=(4000, 3))
     x, y, z = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
-    image = shared_files.longitude_latitude(sky, image_renderers.equirectangular)
+    image = shared_files.longitude_latitude(sky, image_renderers.THREE_AXES)
     u, v = 0.5 + np.arctan2(z, x) / (2 * np.pi), np.arccos(y) / np.pi
     rows, columns = image.shape[:2]
     texel = image[np.minimum((v * rows).astype(int), rows - 1), np.minimum((u * columns).astype(int), columns - 1)]

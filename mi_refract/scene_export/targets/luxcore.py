@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from importlib.resources import files as resources
 
-import numpy as np
-
 from ..plain_scene import Environment, Glass, Light, PlainScene
-from .shared_files import Array, Files, material_names, numbers, ply_files, readme, sky_exr
+from .shared_files import Files, material_names, numbers, ply_files, readme, sky_exr
 
 COMMANDS = """
 pip install pyluxcore==2.11.2
@@ -82,10 +80,4 @@ def files(plain: PlainScene) -> Files:
         "render.py": resources(__package__).joinpath("render_luxcore.py").read_bytes(),
         "README.txt": readme(plain, "LuxCore", COMMANDS, ASSUMPTIONS),
     }
-    return ply_files(plain) | sky_exr(plain, direction_at) | own
-
-
-def direction_at(u: Array, v: Array) -> Array:
-    """(…, 3): the direction in which LuxCore shows the pixel at (u, v) of the map, v from the top."""
-    phi, theta = 2 * np.pi * u, np.pi * v
-    return np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], axis=-1)
+    return ply_files(plain) | sky_exr(plain, ((1, 0, 0), (0, 1, 0), (0, 0, 1))) | own

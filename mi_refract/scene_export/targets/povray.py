@@ -9,7 +9,7 @@ import numpy as np
 
 from ..plain_scene import Diffuse, Environment, Glass, Light, Mesh, PlainScene
 from ..tessellation import is_closed
-from .shared_files import LIGHT_INSIDE, Array, Files, numbers, readme, sky_exr
+from .shared_files import LIGHT_INSIDE, Files, numbers, readme, sky_exr
 
 COMMANDS = """
 povray +Iscene.pov +Oimage.exr +FE +W{width} +H{height} -A -D File_Gamma=1.0 Declare=dx=0.5 Declare=dy=0.5
@@ -65,16 +65,10 @@ def files(plain: PlainScene) -> Files:
         f"  direction {_vector(ahead)} + Right*(dx - 0.5)/{camera.width} - Up*(dy - 0.5)/{camera.height} }}\n"
     )
     commands = COMMANDS.format(width=camera.width, height=camera.height)
-    return sky_exr(plain, direction_at) | {
+    return sky_exr(plain, ((1, 0, 0), (0, 0, 1), (0, 1, 0))) | {
         "scene.pov": "\n".join([settings, view, sky, *(_mesh(mesh, outside) for mesh in plain.meshes)]).encode(),
         "README.txt": readme(plain, "POV-Ray 3.7", commands, ASSUMPTIONS),
     }
-
-
-def direction_at(u: Array, v: Array) -> Array:
-    """(…, 3): the direction in which POV-Ray shows the pixel at (u, v) of the map, v from the top."""
-    phi, theta = 2 * np.pi * u, np.pi * v
-    return np.stack([np.cos(phi) * np.sin(theta), np.cos(theta), np.sin(phi) * np.sin(theta)], axis=-1)
 
 
 def _vector(values: Iterable[float]) -> str:

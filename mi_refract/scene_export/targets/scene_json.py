@@ -10,7 +10,7 @@ import numpy as np
 from ..plain_scene import Diffuse, Environment, Glass, PlainScene
 from .shared_files import (
     LIGHT_INSIDE,
-    Array,
+    OWN_AXES,
     Files,
     json_and_ply,
     longitude_latitude,
@@ -42,18 +42,12 @@ def cycles_files(plain: PlainScene) -> Files:
     """The files of the export, by name."""
     return (
         json_and_ply(plain)
-        | sky_exr(plain, cycles_direction_at)
+        | sky_exr(plain, ((-1, 0, 0), (0, 1, 0), (0, 0, 1)))
         | {
             "render.py": resources(__package__).joinpath("render_cycles.py").read_bytes(),
             "README.txt": readme(plain, "Cycles", CYCLES_COMMANDS, CYCLES_ASSUMPTIONS),
         }
     )
-
-
-def cycles_direction_at(u: Array, v: Array) -> Array:
-    """(…, 3): the direction in which Cycles shows the pixel at (u, v) of the map, v from the top."""
-    phi, theta = np.pi * (1 - 2 * u), np.pi * v
-    return np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], axis=-1)
 
 
 # raysect -----------------------------------------------------------------------------------------------------------
@@ -83,7 +77,7 @@ def raysect_files(plain: PlainScene) -> Files:
     files = json_and_ply(plain, sky_file="sky.npy")
     if isinstance(plain.sky, Environment):
         file = io.BytesIO()
-        np.save(file, longitude_latitude(plain.sky, own_direction_at))
+        np.save(file, longitude_latitude(plain.sky, OWN_AXES))
         files["sky.npy"] = file.getvalue()
     return files | {
         "render.py": resources(__package__).joinpath("render_raysect.py").read_bytes(),
@@ -129,15 +123,9 @@ def obj_files(plain: PlainScene) -> Files:
             mtl += f"illum 1\nKd {numbers(material.reflectance)}\n"
         else:
             mtl += f"illum 1\nKd 0 0 0\nKe {numbers(material.radiance)}\n"
-    return sky_exr(plain, own_direction_at) | {
+    return sky_exr(plain, OWN_AXES) | {
         "scene.obj": "".join(lines).encode(),
         "scene.mtl": mtl.encode(),
         "scene.json": scene_json(plain, {mesh.name: {"object": mesh.name} for mesh in plain.meshes}),
         "README.txt": readme(plain, "a program of your own", OBJ_COMMANDS, OBJ_ASSUMPTIONS),
     }
-
-
-def own_direction_at(u: Array, v: Array) -> Array:
-    """(…, 3): as in Mitsuba, but with the pixels of all rows at their centres."""
-    phi, theta = 2 * np.pi * u, np.pi * v
-    return np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], axis=-1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,10 @@ from ..plain_scene import Environment, Material, PlainScene
 
 Files = dict[str, bytes]  # contents by name
 Array = NDArray[np.float64]
-# Where a renderer shows the pixel at (u, v) of its map of the sky: (u, v) in [0, 1]², v from the top row down,
-# to directions (…, 3).
-Lookup = Callable[[Array, Array], Array]
+# Of a map of the sky by longitude and latitude: the direction that a renderer shows at the left edge and half way down,
+# that a quarter of the width to the right, and that in the top row.
+Axes = tuple[tuple[int, int, int], tuple[int, int, int], tuple[int, int, int]]
+OWN_AXES: Axes = (0, 0, -1), (1, 0, 0), (0, 1, 0)  # Mitsuba's
 # Other renderers place texels at their centres, Mitsuba places its first and last row at the poles. Between its texels
 # a map is linear. A finer map reproduces that, except in those of its cells that a texel of the first map divides.
 FINER = 16
@@ -110,19 +111,21 @@ def exr(pixels: NDArray[np.floating]) -> bytes:
         return path.read_bytes()
 
 
-def sky_exr(plain: PlainScene, direction_at: Lookup) -> Files:
-    """`sky.exr` where the sky is a map, resampled for a renderer with this `direction_at`."""
+def sky_exr(plain: PlainScene, axes: Axes) -> Files:
+    """`sky.exr` where the sky is a map, resampled for a renderer with these axes."""
     if not isinstance(plain.sky, Environment):
         return {}
-    return {"sky.exr": exr(longitude_latitude(plain.sky, direction_at))}
+    return {"sky.exr": exr(longitude_latitude(plain.sky, axes))}
 
 
-def longitude_latitude(environment: Environment, direction_at: Lookup) -> NDArray[np.float32]:
-    """(H, W, 3): the map for a renderer that shows its pixel at (u, v) in direction `direction_at(u, v)`."""
+def longitude_latitude(environment: Environment, axes: Axes) -> NDArray[np.float32]:
+    """(H, W, 3): the map for a renderer with these axes, and all its pixels at their centres."""
     height = FINER * (environment.pixels.shape[0] - 1)
     width = FINER * environment.pixels.shape[1]
-    v, u = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
-    return radiance(environment, direction_at(u, v)).astype(np.float32)
+    v, u = ((np.arange(count) + 0.5) / count for count in (height, width))
+    theta, phi = np.pi * v[:, None], 2 * np.pi * u
+    along = np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta) + 0 * phi
+    return radiance(environment, np.stack(along, axis=-1) @ np.array(axes, float)).astype(np.float32)
 
 
 def radiance(environment: Environment, directions: Array) -> Array:

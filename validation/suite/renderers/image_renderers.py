@@ -28,6 +28,7 @@ from .system import SCRIPTS, SYSTEMS, System
 
 HOURS = 4 * 3600.0  # after which a renderer hangs
 PASS = 2048  # samples a pixel
+THREE_AXES = (-1, 0, 0), (0, 0, -1), (0, 1, 0)  # of its maps of the sky
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -105,7 +106,7 @@ def _three(mis: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[
     if not (chromium and node):
         raise environments.Unable("no node or no Chromium in PATH")
     (folder / "scene").mkdir()
-    files = shared_files.json_and_ply(plain) | shared_files.sky_exr(plain, equirectangular)
+    files = shared_files.json_and_ply(plain) | shared_files.sky_exr(plain, THREE_AXES)
     for name, content in files.items():
         (folder / "scene" / name).write_bytes(content)
     script, home = SCRIPTS / "three_images.mjs", environments.folder(SYSTEMS["three"])
@@ -113,12 +114,6 @@ def _three(mis: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[
     words = [node, *map(str, (script, home, chromium, folder / "scene", folder, *sizes))]
     environments.run(words, timeout=HOURS)
     return [_raw(folder / f"seed{seed}.f32", plain) for seed in seeds]
-
-
-def equirectangular(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """The direction whose radiance three finds at (u, v), v from the top."""
-    phi, theta = 2 * np.pi * (u - 0.5), np.pi * v
-    return np.stack([np.cos(phi) * np.sin(theta), np.cos(theta), np.sin(phi) * np.sin(theta)], axis=-1)
 
 
 def _mitsuba(integrator: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
