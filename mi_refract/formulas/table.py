@@ -67,11 +67,7 @@ class Formula:
 
         `local`: the cosines of a float32 ray, where `n` is the literal z axis and somebody needs them anyhow.
         """
-        if self.takes_local and local is not None:
-            return self.function(a, n, k, contrast, local)
-        if self.takes_contrast:
-            return self.function(a, n, k, contrast)
-        return self.function(a, n, k)
+        return self.function(a, n, k, *(contrast, local)[: self.takes_contrast + self.takes_local])
 
 
 FORMULAS = {

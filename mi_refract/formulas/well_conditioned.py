@@ -58,12 +58,8 @@ def _axis(n: Vector3) -> tuple[int, int] | None:
         if differentiated(n) or not all(x.state == dr.VarState.Literal for x in n):
             return None
         n = [x[0] for x in n]
-    x, y, z = n
-    if not x and not y and abs(z) == 1:
-        return 2, int(z)
-    if sorted(map(abs, (x, y, z))) != [0, 0, 1]:
-        return None
-    return (0, int(x)) if x else (1, int(y))
+    sizes = [abs(x) for x in n]
+    return (sizes.index(1), int(n[sizes.index(1)])) if sorted(sizes) == [0, 0, 1] else None
 
 
 def _along_axis(a: Vector3, axis: tuple[int, int], scale: Number, along: Number) -> Any:

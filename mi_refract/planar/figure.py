@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from mi_refract.io.image_file import srgb_encode
 from mi_refract.io.safe_files import write_atomically
+from mi_refract.io.text import printable
 
 from .curves import points
 from .light import linear_srgb
@@ -102,7 +103,7 @@ def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> 
     caption = [part for line in lines for part in textwrap.wrap(line, int(14 * width))]
     drawn = Figure((width, height + LINE * len(caption)), dpi, layout="constrained")
     panel = drawn.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal")
-    panel.set_title("\n".join(textwrap.wrap(scene.heading, int(10.5 * width))))
+    panel.set_title("\n".join(textwrap.wrap(printable(" ".join(scene.title.split())), int(10.5 * width))))
     panel.set_xlabel("\n".join(caption), loc="left", fontsize=7.5)
     _media(panel, scene)
     # Fix the layout: after this an image of the density can have exactly the pixels of the panel.
@@ -201,7 +202,7 @@ def _rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
     from matplotlib.colors import to_rgb
 
     if scene.light.wavelengths:  # light adds up where lines would cover each other
-        _shade(panel, lines, {SHARED: np.ones(3)} | dict(enumerate(linear_srgb(scene.light))), _add_light)
+        _shade(panel, lines, {SHARED: np.ones(3)} | dict(enumerate(linear_srgb(scene.light))), _add_light, srgb_encode)
         return
     colours = {}
     for number, name in [(SHARED, WHITE), *enumerate(scene.light.names)]:
@@ -223,8 +224,17 @@ def _rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
         panel.add_collection(LineCollection(strokes, **style), autolim=False)
 
 
-def _shade(panel: Axes, lines: Legs, colours: dict[int, Any], mix: Callable[[Any, Any], Any]) -> None:
-    """Draw the density of the legs as an image, with as many pixels as the panel has."""
+def _shade(
+    panel: Axes,
+    lines: Legs,
+    colours: dict[int, Array],
+    mix: Callable[[Any, Any], tuple[Array, Array]],
+    encode: Callable[[Any], Any] = np.asarray,
+) -> None:
+    """Draw the density of the legs as an image, with as many pixels as the panel has.
+
+    mix: of densities and colours by number, the sum (… × 3) and its size, by which it is divided to get the colour.
+    """
     box = panel.get_window_extent()
     view = *panel.get_xlim(), *panel.get_ylim()
     width, height = max(round(box.width), 1), max(round(box.height), 1)
@@ -232,19 +242,19 @@ def _shade(panel: Axes, lines: Legs, colours: dict[int, Any], mix: Callable[[Any
     for number in colours:
         own = Legs(*(x[lines.colour == number] for x in vars(lines).values()))
         layers[number] = density(own, view, width, height)
-    style: dict[str, Any] = {"extent": view, "origin": "lower", "aspect": "equal", "zorder": 2}
-    panel.imshow(mix(layers, colours), **style)
-
-
-def _typical(density: Array) -> Array:
-    """The density over what is typical of it, times TYPICAL."""
-    lit = density[density > 0]
+    mixed, size = mix(layers, colours)
+    colour = np.divide(mixed, size[..., None], out=np.ones_like(mixed), where=size[..., None] > 0)
+    lit = size[size > 0]
     # The median alone would make a beam black beside faint reflections all over the view; the mean, those white.
-    return density * TYPICAL / math.sqrt(lit.mean() * np.median(lit)) if lit.size else density
+    dense = size * TYPICAL / math.sqrt(lit.mean() * np.median(lit)) if lit.size else size
+    opacity = dense / (1 + dense)  # saturates later than 1 − exp(−dense)
+    pixels = (np.dstack([encode(colour), encode(opacity)]) * 255).round().astype(np.uint8)
+    style: dict[str, Any] = {"extent": view, "origin": "lower", "aspect": "equal", "zorder": 2}
+    panel.imshow(pixels, **style)
 
 
-def _blend(layers: dict[int, Any], colours: dict[int, Any]) -> Any:
-    """Densities by colour → RGBA in bytes. What all colours have in common gets the colour of SHARED."""
+def _blend(layers: dict[int, Any], colours: dict[int, Any]) -> tuple[Array, Array]:
+    """Densities by colour. What all colours have in common gets the colour of SHARED."""
     shared = layers.pop(SHARED)
     parts = np.stack(list(layers.values())) / len(layers)
     common = parts.min(axis=0) * (len(layers) > 1)
@@ -253,21 +263,13 @@ def _blend(layers: dict[int, Any], colours: dict[int, Any]) -> Any:
     mixed = shared[..., None] * colours[SHARED]
     for part, number in zip(parts - common, layers, strict=True):
         mixed += part[..., None] * colours[number]
-    dense = _typical(total)
-    colour = np.divide(mixed, total[..., None], out=np.ones_like(mixed), where=total[..., None] > 0)
-    pixels = np.dstack([colour, dense / (1 + dense)])  # saturates later than 1 − exp(−dense)
-    return (pixels * 255).round().astype(np.uint8)
+    return mixed, total
 
 
-def _add_light(layers: dict[int, Any], colours: dict[int, Any]) -> Any:
-    """Densities by wavelength → RGBA in bytes. Light adds up, and is as bright as its typical density is shown."""
-    light = sum(layers[number][..., None] * np.asarray(colours[number]) for number in layers)
-    light = np.clip(light, 0, None)
-    peak = light.max(axis=2)
-    dense = _typical(peak)
-    strong = srgb_encode(dense / (1 + dense))
-    colour = srgb_encode(np.divide(light, peak[..., None], out=np.ones_like(light), where=peak[..., None] > 0))
-    return (np.dstack([colour, strong]) * 255).round().astype(np.uint8)
+def _add_light(layers: dict[int, Any], colours: dict[int, Any]) -> tuple[Array, Array]:
+    """Densities by wavelength. Light adds up, and is as bright as its typical density is shown."""
+    light = np.clip(sum(layers[number][..., None] * colours[number] for number in layers), 0, None)
+    return light, light.max(axis=2)
 
 
 # Geometry --------------------------------------------------------------------------------------------------------

@@ -279,14 +279,11 @@ class PlanarScene:
     `index`: of the medium around everything, per colour. `origins`, `directions`: N × 2, directions of length 1;
     `beams`: N, the number of the `[[beam]]` (from 0) that a ray belongs to. `branches`: the most partial reflections
     on a path; 0: rays are refracted wherever possible. `view`: x0, x1, y0, y1; None: all shapes. `fans`: by beam, the
-    angles in degrees of the first and of the last ray of a fan. `file`, `heading`: the file's name and the title, each
-    in one line of printable characters.
+    angles in degrees of the first and of the last ray of a fan.
     """
 
     path: Path
     title: str
-    file: str
-    heading: str
     light: Light
     segments: tuple[Segments, ...]
     regions: tuple[Region, ...]
@@ -299,6 +296,11 @@ class PlanarScene:
     view: Box | None
     fans: tuple[tuple[float, float] | None, ...] = ()
 
+    @property
+    def file(self) -> str:
+        """The file's name, of printable characters."""
+        return printable(self.path.name)
+
 
 def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> PlanarScene:
     """Read a scene file. `wavelengths`: in place of those that it names, in nm, or how many.
@@ -310,8 +312,6 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; expected a scene file")
     table = parse_toml(safe_files.read_bytes(path, SIZE), SceneTable, str(path))
-    title = table.title or path.stem
-    texts = title, printable(path.name), printable(" ".join(title.split()))
     chosen = table.wavelengths if wavelengths is None else wavelengths
     try:
         if chosen is not None and table.colours:
@@ -327,7 +327,7 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
     regions = tuple(Region(part.curve.outline(), part.left) for part in parts if part.curve.closed)
     fans = tuple(beam.angles if isinstance(beam, Fan) else None for beam in table.beam)
     limits = table.max_depth, table.branches, table.view
-    return PlanarScene(path, *texts, light, segments, regions, index, *rays, *limits, fans)
+    return PlanarScene(path, table.title or path.stem, light, segments, regions, index, *rays, *limits, fans)
 
 
 def _parts(tables: Sequence[AnyShape], ambient: Indices, light: Light) -> list[Part]:

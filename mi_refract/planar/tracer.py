@@ -15,7 +15,6 @@ Source: document 004, with its slips corrected (mi_refract/formulas/README.md, "
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -34,7 +33,6 @@ from .segments import REFLECT_BITS, Array, Event, Paths, Segments, finite_array
 METHODS = "auto", "brute", "mesh"
 FEW = 48  # up to so many segments, trying all is faster than a query of the mesh
 FARTHEST = {"float32": 1e15, "float64": 1e100}  # of coordinates and indices: products of two do not overflow
-Refraction = Callable[[Vector2, Vector2, Number], tuple[Vector2, Mask]]  # (d, line, k) → direction, transmitted
 
 
 def trace(
@@ -115,7 +113,9 @@ class Tracer:
         left, right = segments.n_left, segments.n_right
         # With k from left to right and from right to left: ratios in float64, before anything is rounded.
         self.media = arrays.table(np.column_stack([left, right, left / right, right / left]))
-        self.refract = _refraction(arrays, formula)
+        if formula is not None and formula not in FORMULAS:
+            raise ValueError(f"formula = {formula!r}: unknown; expected {', '.join(FORMULAS)}")
+        self.formula = formula
 
     def __call__(
         self,
@@ -197,6 +197,16 @@ class Tracer:
         ray = Ray(p, d, arrays.index(NOWHERE), half, half, arrays.mask(False), slack)
         return PathState(ray, index, arrays.vector(1, 1), arrays.index(0), self._search(-BACK), arrays.mask(True))
 
+    def _refract(self, d: Vector2, line: Vector2, k: Number) -> tuple[Vector2, Mask]:
+        """By the planar formula of document 004, or one of FORMULAS in the plane z = 0."""
+        arrays = self.arrays
+        if self.formula is None:
+            b, transmitted = refract_2d(d, line, k)
+            return arrays.vector(*b), transmitted  # of the length of `d`, to u
+        a, n = arrays.vector3(d.x, d.y, 0 * d.x), arrays.vector3(-line.y, line.x, 0 * d.x)
+        b, transmitted = FORMULAS[self.formula].unchecked(a, n, k)
+        return _unit(arrays.vector(b.x, b.y)), transmitted
+
     def _search(self, gone: float) -> SearchState:
         return SearchState(self.arrays.number(gone), self.arrays.index(NOWHERE))
 
@@ -236,7 +246,7 @@ class Tracer:
             k = dr.select(hit.to_left, to_left, to_right)
             index = dr.select(dr.isnan(state.index), near, state.index)
             p, line = self.boundaries.place(hit)
-            b, through = self.refract(d, line, k)
+            b, through = self._refract(d, line, k)
             if bits is not None:
                 bit = (bits >> dr.minimum(j, REFLECT_BITS - 1)) & 1
                 forced = through & (j < REFLECT_BITS) & (bit == 1)
@@ -280,22 +290,6 @@ def _shares(d: Vector2, line: Vector2, k: Number, through: Mask) -> Vector2:
     t_s, t_p, _ = fresnel.transmitted_powers(cos_i, cos_t, transmitted, k)
     r_s, r_p = map(dr.squared_norm, fresnel.amplitudes(cos_i, k))
     return type(d)(dr.select(through, t_s, r_s), dr.select(through, t_p, r_p))
-
-
-def _refraction(arrays: ArrayBackend, formula: str | None) -> Refraction:
-    """The planar formula of document 004, or one of FORMULAS in the plane z = 0. ValueError for an unknown name."""
-    if formula is not None and formula not in FORMULAS:
-        raise ValueError(f"formula = {formula!r}: unknown; expected {', '.join(FORMULAS)}")
-
-    def refract(d: Vector2, line: Vector2, k: Number) -> tuple[Vector2, Mask]:
-        if formula is None:
-            b, transmitted = refract_2d(d, line, k)
-            return arrays.vector(*b), transmitted  # of the length of `d`, to u
-        a, n = arrays.vector3(d.x, d.y, 0 * d.x), arrays.vector3(-line.y, line.x, 0 * d.x)
-        b, transmitted = FORMULAS[formula].unchecked(a, n, k)
-        return _unit(arrays.vector(b.x, b.y)), transmitted
-
-    return refract
 
 
 def _check_range(name: str, values: Array, largest: float) -> None:

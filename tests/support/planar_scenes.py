@@ -56,8 +56,6 @@ def scene(segments, origins, directions, **given):
     default = {
         "path": Path("test.toml"),
         "title": "A test",
-        "file": "test.toml",
-        "heading": "A test",
         "light": Light(given.pop("colours", ("",) * len(segments))),
         "regions": (Region(outline, tuple(s.n_left[0] for s in segments)),),
         "index": (1.0,) * len(segments),
