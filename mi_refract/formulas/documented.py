@@ -1,15 +1,11 @@
 """One pure Dr.Jit function per documented formula of refraction.
 
-Every formula is `f(a, n, k) -> (b, transmitted)` in the conventions of the package docstring: `a` travels toward
-the surface, `n` is a normal on either side, k = n_from / n_to, and `b` leaves the boundary with the length of `a`.
-Where `transmitted` is False (total internal reflection, or a tangential ray) `b` is the mirror direction.
-
-The entries of FORMULAS are total functions without branches on data: input that is not a refraction (a zero or
-non-finite vector, a ratio outside 2⁻²⁰ … 2²⁰) gives NaN and False. The functions themselves leave
-that check out (NaN still gives NaN), for callers that have made it, as the plugin has. `a` and `n` are 3-vectors of
-any Dr.Jit backend and precision, `k` a number or an array of that precision; a wider `k` is rounded to it, once.
-The documented formulas take unit `a` and `n`; what those are off by, the result is off by. Shapes: `a`, `n` (3,), `k`
-() to b (3,), transmitted ().
+Every formula is `f(a, n, k) -> (b, transmitted)` in the conventions of the package docstring. The entries of FORMULAS
+are total functions without branches on data: input that is not a refraction (a zero or non-finite vector, a ratio
+outside 2⁻²⁰ … 2²⁰) gives NaN and False. The functions themselves leave that check out (NaN still gives NaN), for
+callers that have made it, as the plugin has. `a` and `n` are 3-vectors of any Dr.Jit backend and precision, `k` a
+number or an array of that precision; a wider `k` is rounded to it, once. The documented formulas take unit `a` and `n`;
+what those are off by, the result is off by. Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted ().
 """
 
 from __future__ import annotations

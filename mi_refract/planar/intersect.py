@@ -26,7 +26,7 @@ import numpy as np
 from mi_refract.numerics import Mask, Number, ieee_divide
 
 from .array_backend import ArrayBackend, Index, Vector2, Vertices, negated
-from .segments import Array, Segments
+from .segments import Segments
 
 NOWHERE = 0xFFFFFFFF  # the number of no segment
 # Of a start on its own segment: the least distance of its ends from the ray, in units of the segment's length.
@@ -103,21 +103,19 @@ class Hit:
     bend: Number
 
 
-def bounding_box(*points: Array) -> tuple[list[float], list[float]]:
-    """Lower and upper corner of a box around the points (each N × 2), with a quarter of its size added on each side."""
-    places = np.concatenate(points)
-    low, high = places.min(axis=0), places.max(axis=0)
-    margin = (high - low).max() / 4
-    return (low - margin).tolist(), (high + margin).tolist()
-
-
 class LineSegments:
-    """M segments, all of them straight."""
+    """M segments, all of them straight.
+
+    box: the lower and the upper corner of a box around them, with a quarter of its size added on each side.
+    """
 
     def __init__(self, arrays: ArrayBackend, segments: Segments) -> None:
         """Copy them to the backend."""
         self.arrays, self.count = arrays, arrays.uniform(arrays.index, len(segments))
-        self.box = bounding_box(segments.start, segments.end, segments.control)
+        places = np.concatenate([segments.start, segments.end, segments.control])
+        low, high = places.min(axis=0), places.max(axis=0)
+        margin = (high - low).max() / 4
+        self.box = (low - margin).tolist(), (high + margin).tolist()
         self.ends = arrays.table(np.concatenate([segments.start, segments.end], 1))
         self.vertices = arrays.table(segments.vertices)
         e = segments.end - segments.start

@@ -88,7 +88,12 @@ class MeshAcceleration:
         self, boundaries: LineSegments, ray: Ray, start: Start, search: SearchState, active: Mask
     ) -> tuple[Hit, SearchState, Mask]:
         """The first boundary found so far, from where to search on, and whether no other can come before it."""
-        hit, t, stroke = self._stroke(dr.fma(ray.d, search.gone, self._beside(ray, start)), ray.d, active)
+        # From the ray's start, moved off its own segment, to the side to which the ray goes.
+        x, y = (self.mi.Float(e) for e in start.ways[1] - start.ways[0])
+        size = dr.select(ray.left, OFFSET, -OFFSET) * dr.rsqrt(dr.fma(x, x, y * y))
+        q, number = (ray.p - self.centre) * self.scale, self.arrays.number
+        q = dr.select(ray.own != NOWHERE, type(q)(q.x - number(y * size), q.y + number(x * size)), q)
+        hit, t, stroke = self._stroke(dr.fma(ray.d, search.gone, q), ray.d, active)
         own = active & (ray.own != NOWHERE)
         corner = own & self._near_end(ray.own, ray, own)
 
@@ -133,15 +138,6 @@ class MeshAcceleration:
             if apart.any():
                 return int(seen[apart][0]), int(other[apart][0])
         return None
-
-    def _beside(self, ray: Ray, start: Start) -> Vector2:
-        """Where to trace from: the ray's start, moved off its own segment, to the side to which the ray goes."""
-        q = (ray.p - self.centre) * self.scale
-        a, b = start.ways
-        x, y = (self.mi.Float(e) for e in b - a)
-        size = dr.select(ray.left, OFFSET, -OFFSET) * dr.rsqrt(dr.fma(x, x, y * y))
-        number = self.arrays.number
-        return dr.select(ray.own != NOWHERE, type(q)(q.x - number(y * size), q.y + number(x * size)), q)
 
     def _stroke(self, q: Vector2, d: Vector2, active: Mask) -> tuple[Mask, Number, Index]:
         """Whether a stroke is ahead of a ray, its distance, and its number."""

@@ -210,11 +210,11 @@ class Tracer:
     def _search(self, gone: float) -> SearchState:
         return SearchState(self.arrays.number(gone), self.arrays.index(NOWHERE))
 
-    def _nearest(self, ray: Ray, search: SearchState, active: Mask) -> tuple[Hit, SearchState, Mask]:
+    def _nearest(self, state: PathState) -> tuple[Hit, SearchState, Mask]:
         """The first boundary ahead, and whether that is settled or the search must go on."""
-        boundaries, start = self.boundaries, self.boundaries.start(ray)
+        boundaries, ray, active, start = self.boundaries, state.ray, state.active, self.boundaries.start(state.ray)
         if self.mesh:
-            return self.mesh.nearest(boundaries, ray, start, search, active)
+            return self.mesh.nearest(boundaries, ray, start, state.search, active)
 
         def test(i: Index, best: Hit) -> tuple[Index, Hit]:
             return i + 1, boundaries.nearer(best, ray, start, i)
@@ -223,14 +223,14 @@ class Tracer:
             return active & (i < boundaries.count)
 
         hit = dr.while_loop((self.arrays.index(0), boundaries.none()), more, test, label="boundaries")[1]
-        return hit, search, self.arrays.mask(True)
+        return hit, state.search, self.arrays.mask(True)
 
     def _step(self, state: PathState, bits: Index | None, most: Index, scatter: Scatter, weights: bool) -> PathState:
         """Search once for the next boundary, and cross it if it is found, or end the path.
 
         bits: of `reflect`; most: the greatest depth.
         """
-        hit, search, settled = self._nearest(state.ray, state.search, state.active)
+        hit, search, settled = self._nearest(state)
         some = state.active & settled & (hit.segment != NOWHERE)
 
         def leg(state: PathState, event: Any, index: Number, active: Mask) -> None:

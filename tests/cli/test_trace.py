@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
 import sys
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 from support.hostile import shows_more_than_text
 
-from mi_refract.cli import app
 from mi_refract.planar import scene_file, tracer
 
 BALL = """
@@ -206,31 +200,3 @@ def test_the_keys_of_a_scene_are_printed_without_one(run):
     keys = "`title`", "`wavelengths`", "`luneburg`", "`focal_length` (number > 0) from the front", "`from`", "`scale`"
     assert all(key in out for key in keys)
     assert all(line.count("|") == 4 for line in out.splitlines() if line)
-
-
-def test_ctrl_c_leaves_nothing_half_written(ball):
-    """Interrupted while the temporary file is there and the renaming is still to come."""
-    code = """
-import signal, sys, time
-from mi_refract import cli
-from mi_refract.io import safe_files
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job of a script ignores it
-def slow(self, target):
-    print("written", flush=True)
-    time.sleep(60)
-safe_files.Path.replace = slow
-sys.exit(cli.main())
-"""
-    folders = [str(Path(app.__file__).parents[2]), *filter(None, sys.path)]
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, "trace", str(ball), "-o", str(ball.with_name("image.svg"))],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(folders)},
-        **{"text": True, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE},
-    )
-    with process:
-        assert process.stdout.readline() == "written\n"
-        assert len(list(ball.parent.iterdir())) == 2
-        time.sleep(0.1)
-        process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=30) == 130, process.stderr.read()
-    assert list(ball.parent.iterdir()) == [ball]
