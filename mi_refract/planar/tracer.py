@@ -147,10 +147,11 @@ class Tracer:
         index = None if n_start is None else arrays.table(_each("n_start", n_start, count, "iuf", float))
         none = np.ndim(reflect) == 0 and reflect == 0
         mirrored = None if none else arrays.table(_each("reflect", reflect, count, "iu", np.uint32))
-        _check_range("origins", origins - self.middle, self.reach)
+        places = origins - self.middle
+        _check_range("origins", places, self.reach)
         if self.mesh:
-            self.mesh.expect(origins - self.middle, along)
-        rays = [arrays.table(x) for x in (origins - self.middle, along)]
+            self.mesh.expect(places, along)
+        rays = [arrays.table(x) for x in (places, along)]
 
         def work(lane: Index, scatter: Scatter) -> None:
             p, d = (arrays.gather(table, lane) for table in rays)

@@ -125,11 +125,6 @@ def _frame(shape: Node) -> Vertices:
         return value
 
     frame, local = shape.transform(), np.eye(4)
-    if shape.type in ("sphere", "cylinder"):  # Mitsuba stretches the second along its axis only
-        squares = frame[:3, :3].T @ frame[:3, :3]
-        round_one = squares[0, 0] * np.diag([1, 1, squares[2, 2] / squares[0, 0] if shape.type == "cylinder" else 1])
-        if not np.allclose(squares, round_one, rtol=1e-5, atol=1e-5 * squares.max()):
-            raise shape.error(f"to_world makes another shape of the {shape.type}", "one scale, turns and shifts")
     if shape.type == "sphere":
         local[:3, 3] = shape.point("center", (0, 0, 0))
         local[:3, :3] *= positive("radius", shape.value(float, "radius", 1.0))
@@ -145,7 +140,13 @@ def _frame(shape: Node) -> Vertices:
         basis = np.stack([[1 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y], axis], axis=1)
         local[:3, 3] = start
         local[:3, :3] = basis * [radius, radius, length]
-    return frame @ local
+    placed = frame @ local
+    if shape.type in ("sphere", "cylinder"):  # Mitsuba stretches neither, but the second along its axis
+        squares = placed[:3, :3].T @ placed[:3, :3]
+        kept = squares.diagonal()[[0, 0, 0 if shape.type == "sphere" else 2]]
+        if not np.allclose(squares, np.diag(kept), rtol=1e-5, atol=1e-5 * squares.max()):
+            raise shape.error(f"to_world makes another shape of the {shape.type}", "one scale, turns and shifts")
+    return placed
 
 
 def _surface(shape: Node) -> Surface:
