@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -111,11 +111,24 @@ def spread(origins: Array, directions: Array) -> Spread:
     focus = closest_point(origins, directions)
     behind = focus is not None and bool(np.median(((focus - origins) * directions).sum(axis=1)) < 0)
     result = Spread(len(origins), _point(focus), behind)
-    if len(origins) > 1 and (spot := _spot(origins, directions)):
-        place, offsets = spot
-        rms, largest = float(np.sqrt(np.mean(offsets**2))), float(np.abs(offsets).max())
-        return replace(result, spot=_point(place), rms=rms, largest=largest)
-    return result
+    mean = directions.mean(axis=0)
+    length = math.hypot(*mean)
+    if len(origins) < 2 or length == 0 or (forward := directions @ mean / length).min() < math.cos(STEEPEST):
+        return result
+    # The centre of the smallest RMS spot, and each ray's signed distance from it in the plane of the spot.
+    axis, across = mean / length, _turned(mean / length)
+    slopes = directions @ across / forward
+    lean = slopes - slopes.mean()
+    centre = origins.mean(axis=0)
+    for last in (False, False, True):  # again from near the spot, where differences lose no digits
+        arms = origins - centre
+        y = arms @ across - slopes * (arms @ axis)
+        if not last and np.ptp(slopes) > PARALLEL:
+            # var(y + s slope) is least at s = −cov(y, slope)/var(slope)
+            centre = centre + across * y.mean() - axis * (y @ lean / (lean @ lean))
+    place, offsets = centre + across * y.mean(), y - y.mean()
+    rms, largest = float(np.sqrt(np.mean(offsets**2))), float(np.abs(offsets).max())
+    return replace(result, spot=_point(place), rms=rms, largest=largest)
 
 
 def closest_point(origins: Array, directions: Array) -> Array | None:
@@ -141,25 +154,6 @@ def spot(origins: Array, directions: Array, plane: Plane) -> Spot | None:
     heights = (places - plane.point) @ _turned(normal)
     x, y = places.mean(axis=0).tolist()
     return Spot((x, y), float(heights.std()), float(np.ptp(heights)))
-
-
-def _spot(origins: Array, directions: Array) -> tuple[Array, Array] | None:
-    """The centre of the smallest RMS spot, and each ray's signed distance from it in the plane of the spot."""
-    mean = directions.mean(axis=0)
-    length = math.hypot(*mean)
-    if length == 0 or (forward := directions @ mean / length).min() < math.cos(STEEPEST):
-        return None
-    axis, across = mean / length, _turned(mean / length)
-    slopes = directions @ across / forward
-    lean = slopes - slopes.mean()
-    centre = origins.mean(axis=0)
-    for last in (False, False, True):  # again from near the spot, where differences lose no digits
-        arms = origins - centre
-        y = arms @ across - slopes * (arms @ axis)
-        if not last and np.ptp(slopes) > PARALLEL:
-            # var(y + s slope) is least at s = −cov(y, slope)/var(slope)
-            centre = centre + across * y.mean() - axis * (y @ lean / (lean @ lean))
-    return centre + across * y.mean(), y - y.mean()
 
 
 # The paraxial limit --------------------------------------------------------------------------------------------
@@ -275,7 +269,14 @@ def _of_rays(scene: PlanarScene, colour: int, branches: Branches, own: NDArray[n
     result = spread(origins, directions)
     if plane is not None:
         result = replace(result, on_plane=spot(origins, directions, plane))
-    pairs = list(_pairs(scene, branches.rays[own], directions))
+    # Pairs of mirror images, from the outermost inward: equally far from the beam's ends, oppositely deflected.
+    rays = branches.rays[own]
+    beam = np.flatnonzero(scene.beams == scene.beams[rays[0]]).tolist()
+    known = {ray: i for i, ray in enumerate(rays.tolist())}
+    deflection = _cross(scene.directions[rays], directions)
+    ends = zip(beam[: len(beam) // 2], beam[::-1], strict=False)
+    pairs = [(known[a], known[b]) for a, b in ends if a in known and b in known]
+    pairs = [(i, j) for i, j in pairs if abs(deflection[i] + deflection[j]) < SYMMETRIC]
     if not pairs:
         return result
     i, j = pairs[0]
@@ -286,7 +287,7 @@ def _of_rays(scene: PlanarScene, colour: int, branches: Branches, own: NDArray[n
         result = replace(result, marginal=marginal)
     # The axis midway between the innermost pair, if its events are theirs.
     one = own[pairs[-1][0]]
-    pair = branches.rays[own[list(pairs[-1])]]
+    pair = rays[list(pairs[-1])]
     origin, way = scene.origins[pair].mean(axis=0), scene.directions[pair].mean(axis=0)
     if not way.any():
         return result
@@ -295,24 +296,11 @@ def _of_rays(scene: PlanarScene, colour: int, branches: Branches, own: NDArray[n
     along = axis(scene.segments[colour], paths, 0)
     if along is None or (paths.events[0] != branches.paths.events[one]).any():
         return result
-    d, (x, y) = scene.directions[pair[0]], scene.origins[pair[0]] - along.places[0]
-    u = along.directions[0]
+    d, apart, u = scene.directions[pair[0]], scene.origins[pair[0]] - along.places[0], along.directions[0]
     slope = _cross(u, d) / (u @ d)
     slope = slope if abs(slope) > LOST else 0.0
-    height = _cross(u, np.array([x, y])) - slope * (u @ [x, y])
+    height = _cross(u, apart) - slope * (u @ apart)
     return replace(result, paraxial=along.image(height, slope), cardinal=along.cardinal())
-
-
-def _pairs(scene: PlanarScene, rays: NDArray[np.intp], directions: Array) -> Iterator[tuple[int, int]]:
-    """Pairs of mirror images, from the outermost inward: equally far from the beam's ends, oppositely deflected."""
-    beam = np.flatnonzero(scene.beams == scene.beams[rays[0]])
-    known = {ray: i for i, ray in enumerate(rays.tolist())}
-    deflection = _cross(scene.directions[rays], directions)
-    for one, other in zip(beam[: len(beam) // 2].tolist(), beam[::-1].tolist(), strict=False):
-        if one in known and other in known:
-            i, j = known[one], known[other]
-            if abs(deflection[i] + deflection[j]) < SYMMETRIC:
-                yield i, j
 
 
 def table(groups: Sequence[Group]) -> str:

@@ -23,7 +23,7 @@ from mi_refract.io.typed_table import key_table, kind_table, parse_toml
 from . import shapes
 from .curves import Curve, affine, unit
 from .light import LONGEST, MOST, SHORTEST, Light, of_wavelengths
-from .segments import Array, Segments
+from .segments import Array, Segments, check_range
 from .shared_boundaries import Indices, Part, boundaries
 
 # Limits of what a file may ask for, checked before memory is allocated.
@@ -365,13 +365,8 @@ def _parts(tables: Sequence[AnyShape], ambient: Indices, light: Light) -> list[P
         except ValueError as error:
             raise ValueError(f"{where}.{error}") from None
         for part in parts[first:]:
-            _check_range(where, part.curve.vertices, part.curve.control)
+            check_range(where, np.concatenate([part.curve.vertices, part.curve.control]), FARTHEST)
     return parts
-
-
-def _check_range(where: str, *points: Array) -> None:
-    if not all(np.abs(p).max() <= FARTHEST for p in points):
-        raise ValueError(f"{where}: coordinates beyond {FARTHEST:g}")
 
 
 def _rays(tables: Sequence[AnyBeam]) -> tuple[Array, Array, NDArray[np.intp]]:
@@ -398,7 +393,7 @@ def _rays(tables: Sequence[AnyBeam]) -> tuple[Array, Array, NDArray[np.intp]]:
                         directions = np.array([_unit_vector("directions", value) for value in beam.directions])
         except ValueError as error:
             raise ValueError(f"beam[{j}].{error}") from None
-        _check_range(f"beam[{j}]", origins)
+        check_range(f"beam[{j}]", origins, FARTHEST)
         rays.append((origins, directions))
     beams = np.repeat(np.arange(len(rays)), np.diff(sizes, prepend=0))
     return np.concatenate([o for o, _ in rays]), np.concatenate([d for _, d in rays]), beams

@@ -28,6 +28,12 @@ def finite_array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     return array
 
 
+def check_range(name: str, values: Array, largest: float) -> None:
+    """ValueError for numbers of which a product of two would overflow, and NaN."""
+    if values.size and not (values.max() <= largest and values.min() >= -largest):
+        raise ValueError(f"{name}: a number beyond ±{largest:g}")
+
+
 @dataclass(frozen=True)
 class Segments:
     """M directed boundaries from `start` to `end` (M × 2), between media of index `n_left` and `n_right` (M).

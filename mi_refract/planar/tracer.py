@@ -28,7 +28,7 @@ from mi_refract.numerics import Mask, Number
 from .array_backend import ArrayBackend, Buffer, Index, Scatter, Vector2, choose_backend, negated
 from .intersect import NOWHERE, ConicArcs, Hit, LineSegments, Ray, cross
 from .mesh_acceleration import BACK, SHORTEST, MeshAcceleration, SearchState
-from .segments import REFLECT_BITS, Array, Event, Paths, Segments, finite_array
+from .segments import REFLECT_BITS, Array, Event, Paths, Segments, check_range, finite_array
 
 METHODS = "auto", "brute", "mesh"
 FEW = 48  # up to so many segments, trying all is faster than a query of the mesh
@@ -99,7 +99,7 @@ class Tracer:
         self.arrays = arrays = choose_backend(backend, precision)
         self.farthest = FARTHEST[precision]
         for name in ("start", "end", "control", "n_left", "n_right"):
-            _check_range(f"segments.{name}", getattr(segments, name), self.farthest)
+            check_range(f"segments.{name}", getattr(segments, name), self.farthest)
         if min(segments.n_left.min(), segments.n_right.min()) < 1 / self.farthest:
             raise ValueError(f"segments: an index below {1 / self.farthest:g}")
         segments, self.middle = _centred(segments)
@@ -148,7 +148,7 @@ class Tracer:
         none = np.ndim(reflect) == 0 and reflect == 0
         mirrored = None if none else arrays.table(_each("reflect", reflect, count, "iu", np.uint32))
         places = origins - self.middle
-        _check_range("origins", places, self.reach)
+        check_range("origins", places, self.reach)
         if self.mesh:
             self.mesh.expect(places, along)
         rays = [arrays.table(x) for x in (places, along)]
@@ -291,12 +291,6 @@ def _shares(d: Vector2, line: Vector2, k: Number, through: Mask) -> Vector2:
     t_s, t_p, _ = fresnel.transmitted_powers(cos_i, cos_t, transmitted, k)
     r_s, r_p = map(dr.squared_norm, fresnel.amplitudes(cos_i, k))
     return type(d)(dr.select(through, t_s, r_s), dr.select(through, t_p, r_p))
-
-
-def _check_range(name: str, values: Array, largest: float) -> None:
-    """ValueError for numbers of which a product of two would overflow."""
-    if values.size and not (values.max() <= largest and values.min() >= -largest):
-        raise ValueError(f"{name}: a number beyond ±{largest:g}")
 
 
 def _centred(segments: Segments) -> tuple[Segments, Array]:
