@@ -132,9 +132,8 @@ class Tracer:
         along = finite_array("directions", directions, origins.shape)
         with np.errstate(over="ignore", under="ignore"):
             length2 = np.einsum("ij,ij->i", along, along)
-        if not (
-            length2.min(initial=1) > 1e-30 and length2.max(initial=1) < 1e30
-        ):  # squares could leave float32's range
+        # Squares could leave float32's range.
+        if not (length2.min(initial=1) > 1e-30 and length2.max(initial=1) < 1e30):
             size = np.maximum(*np.abs(along).T)
             if not size.all():
                 raise ValueError(f"directions[{int(np.argmin(size))}] = (0, 0); expected a direction")
