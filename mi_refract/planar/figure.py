@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from mi_refract.io.image_file import srgb_encode
 from mi_refract.io.safe_files import write_atomically
-from mi_refract.io.text import printable
 
 from .curves import points
 from .light import linear_srgb
@@ -103,7 +102,7 @@ def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> 
     caption = [part for line in lines for part in textwrap.wrap(line, int(14 * width))]
     drawn = Figure((width, height + LINE * len(caption)), dpi, layout="constrained")
     panel = drawn.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal")
-    panel.set_title("\n".join(textwrap.wrap(printable(" ".join(scene.title.split())), int(10.5 * width))))
+    panel.set_title("\n".join(textwrap.wrap(scene.heading, int(10.5 * width))))
     panel.set_xlabel("\n".join(caption), loc="left", fontsize=7.5)
     _media(panel, scene)
     # Fix the layout: after this an image of the density can have exactly the pixels of the panel.

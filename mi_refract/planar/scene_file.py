@@ -301,6 +301,11 @@ class PlanarScene:
         """The file's name, of printable characters."""
         return printable(self.path.name)
 
+    @property
+    def heading(self) -> str:
+        """The title on one line, of printable characters."""
+        return printable(" ".join(self.title.split()))
+
 
 def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> PlanarScene:
     """Read a scene file. `wavelengths`: in place of those that it names, in nm, or how many.
