@@ -55,7 +55,7 @@ def test_scenes_load_and_all_rays_find_their_way_out(path, needs_variant, varian
     assert len(scene.segments) == len(scene.light.names) == len(scene.index)
     assert len(scene.origins) == len(scene.directions) == len(scene.beams)
     assert np.abs(np.hypot(*scene.directions.T) - 1).max() <= 2 * ULP
-    for colour, segments in enumerate(scene.segments):
+    for segments in scene.segments:
         assert segments.start.tolist() == scene.segments[0].start.tolist()
     for colour in colours:
         assert set(np.unique(paths(scene, colour).events)) <= {0, Event.REFRACTED, Event.REFLECTED, Event.ESCAPED}
