@@ -41,8 +41,9 @@ def needs_variant() -> Callable[[str], None]:
     return check
 
 
-# The variant of a test, by the fixture that asks for it.
-FIXED = {"llvm_variant": "llvm_ad_rgb", "scalar_variant": "scalar_rgb", "scalar_context": "scalar_rgb"}
+# The variant of a test, by the fixture that asks for it; the first of several.
+FIXED = {"llvm": "llvm_ad_rgb", "llvm_variant": "llvm_ad_rgb", "llvm_spectral": "llvm_ad_spectral"}
+FIXED |= {"scalar_variant": "scalar_rgb", "scalar_context": "scalar_rgb"}
 
 
 @pytest.fixture(autouse=True)

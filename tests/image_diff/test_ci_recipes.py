@@ -198,7 +198,7 @@ def test_no_input_is_a_command(act, project, name):
     job = act(**{name: '"; touch planted; $(touch planted) `touch planted` #'})
     assert not list(project.rglob("planted"))
     assert (job.code == 0) is (name == "artifact")
-    for word in ("--methods", "--version") if name in ("references", "test", "settings") else ():
+    if word := {"references": "--methods", "test": "--version", "settings": "--methods"}.get(name):
         job = act(**{name: word})
         assert job.code == 2
         assert re.search(f"mi-refract: {word}: no such", job.log, re.IGNORECASE)

@@ -46,16 +46,19 @@ def read(tmp_path):
 
 
 @pytest.mark.parametrize("path", sorted(SCENES.glob("*.toml")), ids=lambda path: path.stem)
-def test_scenes_load_and_all_rays_find_their_way_out(path, needs_variant):
+def test_scenes_load_and_all_rays_find_their_way_out(path, needs_variant, variant):
+    """On scalar numbers, which take a minute for a double rainbow, rays of the first and of the last colour."""
     scene = load(path)
+    colours = range(len(scene.segments)) if variant == "llvm_ad_rgb" else {0, len(scene.segments) - 1}
     if path.stem == "luneburg":
         needs_variant("llvm_ad_rgb")  # a second a ray on scalar numbers
     assert len(scene.segments) == len(scene.light.names) == len(scene.index)
     assert len(scene.origins) == len(scene.directions) == len(scene.beams)
     assert np.abs(np.hypot(*scene.directions.T) - 1).max() <= 2 * ULP
-    for colour, segments in enumerate(scene.segments):
-        assert set(np.unique(paths(scene, colour).events)) <= {0, Event.REFRACTED, Event.REFLECTED, Event.ESCAPED}
+    for segments in scene.segments:
         assert segments.start.tolist() == scene.segments[0].start.tolist()
+    for colour in colours:
+        assert set(np.unique(paths(scene, colour).events)) <= {0, Event.REFRACTED, Event.REFLECTED, Event.ESCAPED}
     for region in scene.regions:
         assert len(region.indices) == len(scene.light.names)
         x, y = region.outline.T

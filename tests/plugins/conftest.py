@@ -2,16 +2,14 @@
 
 import mitsuba as mi
 import pytest
-from support.variants import switch
 
 from mi_refract.plugins import index_parameter
 
 
 @pytest.fixture
 def llvm_spectral(needs_variant):
-    """`llvm_ad_spectral` for the test; skipped where it cannot run."""
+    """`llvm_ad_spectral` for the test, which `variant` sets; skipped where it cannot run."""
     needs_variant("llvm_ad_spectral")
-    switch("llvm_ad_spectral")
 
 
 @pytest.fixture

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import mitsuba as mi
+from collections.abc import Callable
+
 import pytest
 
 
 @pytest.fixture
-def llvm(needs_variant):
-    """In the variant llvm_ad_rgb."""
+def llvm(needs_variant: Callable[[str], None]) -> None:
+    """`llvm_ad_rgb` for the test, also in a file of `scalar_variant`."""
     needs_variant("llvm_ad_rgb")
-    mi.set_variant("llvm_ad_rgb")
