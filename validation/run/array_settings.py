@@ -16,6 +16,7 @@ from mi_refract.regimes import REGIMES
 from .context import Context
 
 BUILTIN = "mi.fresnel + mi.refract"
+DOCUMENTED = tuple(name for name, formula in FORMULAS.items() if not formula.budget.at_the_limit)
 PLAIN = "decomposed"  # the common form, which the built-in shares: its radicand cancels as the built-in's does
 
 

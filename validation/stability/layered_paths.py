@@ -27,6 +27,8 @@ from mi_refract.rendering import scene_files
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import seeds
+from validation.run.array_settings import DOCUMENTED
+from validation.run.bsdf_sampling import OFFSET
 from validation.run.context import SCENES, Context
 from validation.run.metrics import WRONG_PATH
 from validation.run.render_methods import save_image
@@ -61,8 +63,6 @@ VIEWS: tuple[tuple[str, dict[str, str], str], ...] = (
 
 
 # Layers and exact paths ------------------------------------------------------------------------------------------
-
-OFFSET = 1500 * 2.0**-24  # Mitsuba's RayEpsilon in float32
 
 
 @dataclass(frozen=True)
@@ -415,4 +415,5 @@ def other_right_formula() -> str:
     return next(f"{PLUGIN}_{k}" for k, f in FORMULAS.items() if f.budget.at_the_limit and k != default)
 
 
-STUDY = Study(NAME, "Paths", about(__doc__), TERMS, tasks, axes=AXES, again=drawn_rows)
+RECORDS = (BUILTIN, *(f"{PLUGIN}_{name}" for name in DOCUMENTED), INDICES, RATIOS, "every plugin")
+STUDY = Study(NAME, "Paths", about(__doc__), TERMS, tasks, axes=AXES, again=drawn_rows, records=RECORDS)
