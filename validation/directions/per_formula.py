@@ -19,7 +19,7 @@ from mi_refract.formulas import FORMULAS, ROUNDING
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing, seeds
-from validation.run.array_settings import Setting, budget_of, settings
+from validation.run.array_settings import Setting, budget_of, running, settings
 from validation.run.context import Context
 from validation.run.metrics import (
     ERROR_OVER_BOUND,
@@ -108,8 +108,7 @@ def drawn_rows(context: Context) -> list[Row]:
     """Every formula in every regime, without times."""
     return [
         regime_row(name, subject, regime, setting, rays_of(context, setting))
-        for setting in settings(context)
-        if setting.vector is not None
+        for setting in running(context)
         for name, subject in setting.subjects.items()
         for regime in regimes.REGIMES
     ]

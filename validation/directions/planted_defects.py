@@ -26,7 +26,7 @@ from mi_refract.regimes import Rays
 from mi_refract.report.row import Row
 from validation import repeated
 from validation.run import seeds
-from validation.run.array_settings import DOCUMENTED, Setting, settings
+from validation.run.array_settings import DOCUMENTED, Setting, running
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED_FAR
 from validation.study import Study, Task, about
@@ -174,8 +174,8 @@ TERMS = {name: mutant.text for name, mutant in MUTANTS.items()} | {
 
 def tasks(context: Context) -> list[Task]:
     """On single precision where it is compiled, else on what there is."""
-    running = [setting for setting in settings(context) if setting.vector is not None]
-    setting = next((s for s in running if s.precision is np.float32), running[0])
+    every = running(context)
+    setting = next((s for s in every if s.precision is np.float32), every[0])
     return [Task(f"planted defects: {setting.label}", functools.partial(rows, setting))]
 
 

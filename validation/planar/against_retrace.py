@@ -28,7 +28,7 @@ from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.planar_retrace import Array, Retraced, retrace
 from validation.run import seeds
-from validation.run.array_settings import Setting, settings
+from validation.run.array_settings import Setting, running, settings
 from validation.run.context import SCENES, Context
 from validation.run.metrics import ERROR_OVER_BOUND, WRONG_PATH, WRONG_PATH_FAR
 from validation.study import Study, Task, about
@@ -141,11 +141,10 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
 def drawn_rows(context: Context) -> list[Row]:
     """Every scene and a third of the random ones."""
     rows, (scenes, rays) = [], CLUTTER["standard"]
-    for setting in settings(context):
-        if setting.vector is not None:
-            count, random = (SCALAR_RAYS, SCALAR_CLUTTER) if setting.is_scalar else (RAYS["quick"], (scenes // 3, rays))
-            rows += [row([case_of(path, count)], setting) for path in sorted(FOLDER.glob("*.toml"))]
-            rows.append(row(clutter(*random), setting))
+    for setting in running(context):
+        count, random = (SCALAR_RAYS, SCALAR_CLUTTER) if setting.is_scalar else (RAYS["quick"], (scenes // 3, rays))
+        rows += [row([case_of(path, count)], setting) for path in sorted(FOLDER.glob("*.toml"))]
+        rows.append(row(clutter(*random), setting))
     return rows
 
 

@@ -23,7 +23,7 @@ from validation import limits
 from validation.reference import closed_forms as closed
 from validation.reference.planar_retrace import Array, Retraced
 from validation.run import seeds
-from validation.run.array_settings import Setting, settings
+from validation.run.array_settings import Setting, running
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND
 from validation.study import Study, Task, about
@@ -87,8 +87,7 @@ def _box_rows(context: Context, setting: Setting) -> list[Row]:
 
 def drawn_rows(context: Context) -> list[Row]:
     """The boxes: only their rays are random."""
-    running = [setting for setting in settings(context) if setting.vector is not None]
-    return [row for setting in running for row in _box_rows(context, setting)]
+    return [row for setting in running(context) for row in _box_rows(context, setting)]
 
 
 def row(setting: Setting, name: str, answer: Closed | Case) -> Row:

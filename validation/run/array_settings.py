@@ -96,6 +96,11 @@ def settings(context: Context) -> list[Setting]:
     return found
 
 
+def running(context: Context) -> list[Setting]:
+    """Those that run here."""
+    return [setting for setting in settings(context) if setting.vector is not None]
+
+
 def budget_of(subject: str) -> Budget:
     """The budget of a subject: its own, or that of the common form."""
     return FORMULAS[subject if subject in FORMULAS else PLAIN].budget

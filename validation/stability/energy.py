@@ -21,7 +21,7 @@ from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.closed_forms import GRADE, hemispherical, nodes
 from validation.run import seeds
-from validation.run.array_settings import Setting, settings
+from validation.run.array_settings import Setting, running, settings
 from validation.run.bsdf_sampling import sample_all
 from validation.run.context import Context
 from validation.run.metrics import MISCLASSIFIED
@@ -81,9 +81,8 @@ def random_rows(context: Context, setting: Setting, cases: Sequence[str]) -> lis
 
 def drawn_rows(context: Context) -> list[Row]:
     """Those that depend on the seed: in two regimes the cosine and k do not."""
-    running = [setting for setting in settings(context) if setting.vector is not None]
     cases = [case for case in CASES if case not in ("tangential", "exactly critical")]
-    rows = [row for setting in running for row in random_rows(context, setting, cases)]
+    rows = [row for setting in running(context) for row in random_rows(context, setting, cases)]
     return [*rows, furnace_row(context, "refract")]
 
 

@@ -112,8 +112,7 @@ def drawn_rows(context: Context) -> list[Row]:
     """The light pipes: only their rays are random."""
     return [
         pipe_row(name, subject, setting, extent(context, setting))
-        for setting in settings(context)
-        if setting.vector is not None
+        for setting in backends.running(context)
         for name, subject in subjects(context, setting).items()
         if at_limit(name)
     ]
