@@ -24,7 +24,7 @@ from validation.limits import ABSORPTION_SEEN, ABSORPTION_TIME, DISPERSION_TIME,
 from validation.run import kernel_timing
 from validation.run.context import Context
 from validation.run.metrics import DETECTABLE, SMALLEST_P, WELCH_ALARMS
-from validation.run.render_methods import OURS, Camera, under
+from validation.run.render_methods import OURS, Camera, sensor, under
 from validation.study import Study, Task, about
 
 from .ray_directions import N_SF11
@@ -50,13 +50,8 @@ Nodes = dict[str, Any]
 
 def scene(resolution: int, parts: Nodes, integrator: Nodes) -> Any:
     """Parts around the origin, seen from 5 units away, in light from everywhere."""
-    film = {"type": "hdrfilm", "width": resolution, "height": resolution, "pixel_format": "rgb"}
-    film |= {"rfilter": {"type": "box"}, "component_format": "float32"}
-    place = mi.ScalarTransform4f().look_at([0, 1, 5], [0, 0, 0], [0, 1, 0])
-    eye = {"type": "perspective", "fov": 30, "to_world": place, "film": film}
-    return mi.load_dict(
-        {"type": "scene", "sensor": eye, "integrator": integrator, "light": {"type": "constant"}} | parts
-    )
+    eye, light = sensor(resolution, 30, [0, 1, 5]), {"type": "constant"}
+    return mi.load_dict({"type": "scene", "sensor": eye, "integrator": integrator, "light": light} | parts)
 
 
 def ours(**parameters: Any) -> Nodes:

@@ -10,7 +10,8 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.accuracy import Subject
-from mi_refract.formulas import FORMULAS, Budget
+from mi_refract.formulas import FORMULAS, Budget, automatic
+from mi_refract.plugins import PLUGIN
 from mi_refract.regimes import REGIMES
 
 from .context import Context
@@ -99,6 +100,13 @@ def settings(context: Context) -> list[Setting]:
 def running(context: Context) -> list[Setting]:
     """Those that run here."""
     return [setting for setting in settings(context) if setting.vector is not None]
+
+
+def right_plugins() -> list[str]:
+    """The plugins at the rounding limit whose formula is not the default's in the present variant."""
+    import mitsuba as mi
+
+    return [f"{PLUGIN}_{name}" for name in FORMULAS if name not in (*DOCUMENTED, automatic(dr.backend_v(mi.Float)))]
 
 
 def budget_of(subject: str) -> Budget:

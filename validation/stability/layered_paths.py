@@ -20,14 +20,14 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.formulas import FORMULAS, automatic
+from mi_refract.formulas import FORMULAS
 from mi_refract.image_diff import pixelwise
 from mi_refract.plugins import PLUGIN
 from mi_refract.rendering import scene_files
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import seeds
-from validation.run.array_settings import DOCUMENTED
+from validation.run.array_settings import DOCUMENTED, right_plugins
 from validation.run.bsdf_sampling import OFFSET
 from validation.run.context import SCENES, Context
 from validation.run.metrics import WRONG_PATH
@@ -385,7 +385,7 @@ def view_rows(context: Context, scene: str, parameters: dict[str, Any], name: st
     """`refract` and the built-in, image against image; and what flipped lobes alone do, as a control."""
     if context.variant.startswith("scalar"):
         return [Row(NAME, PLUGIN, f"{name}: image", context.variant, reason=SCALAR)]
-    profile, right = context.profile, other_right_formula()
+    profile, right = context.profile, right_plugins()[0]
     spp = max(1, profile.spp // 4)
 
     def render(plugin: str) -> np.ndarray:
@@ -405,14 +405,6 @@ def view_rows(context: Context, scene: str, parameters: dict[str, Any], name: st
     images = {role: save_image(context.out, f"{name} {plugin}", x, about) for role, (plugin, x) in shown.items()}
     replay, budgets = about | {"control": right}, {"pixels off, control": limits.FLIPPED}
     return [Row(NAME, PLUGIN, f"{name}: image", context.variant, values, budgets, replay=replay, images=images)]
-
-
-def other_right_formula() -> str:
-    """A plugin at the rounding limit whose formula is not the default's."""
-    import mitsuba as mi
-
-    default = automatic(dr.backend_v(mi.Float))
-    return next(f"{PLUGIN}_{k}" for k, f in FORMULAS.items() if f.budget.at_the_limit and k != default)
 
 
 RECORDS = (BUILTIN, *(f"{PLUGIN}_{name}" for name in DOCUMENTED), INDICES, RATIOS, "every plugin")
