@@ -244,4 +244,4 @@ def frozen_rows(context: Context) -> list[Row]:
     return [_row(case, context.variant, values, budgets, replay={"glasses": count})]
 
 
-STUDY = Study(NAME, "What a scene does not use", about(__doc__), TERMS, tasks)
+STUDY = Study(NAME, "What a scene does not use", about(__doc__), TERMS, tasks, records=(BUILTIN,))
