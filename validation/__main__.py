@@ -52,7 +52,7 @@ QUICK = (
     "diff.planted_defects",
 )
 LOCK = "validation.lock"  # in the folder of the report, while it is being made
-PROFILES = {"quick": "seconds", "standard": "minutes", "full": "hours"}
+PROFILES = {"quick": "about a minute", "standard": "minutes", "full": "hours"}
 
 app = command_line.application()
 
@@ -174,10 +174,9 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
         "replay": " ".join(["python -m validation", *names, f"--profile {profile}"]),
         "studies": {study.name: study.described for study in studies} | {tightness.NAME: tightness.ABOUT},
         "scatter": [scatter for study in studies for scatter in study.scatter],
-        "tasks": spent,
         "first_page": headline.first_page(rows, profile),
     }
-    run_report.write_json(out / "rows.json", rows, described)
+    run_report.write_json(out / "rows.json", rows, described | {"tasks": spent})
     run_report.write_junit(out / "junit.xml", rows, described)
     run_report.write_html(out / "report.html", rows, described, out)
     if write_tables:

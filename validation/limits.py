@@ -46,6 +46,7 @@ PRISM_ANGLE = limit(
 BOW_ANGLE = limit(160 * 2.0**-53, "radians: four boundaries of 8u, each turned on by those after it, and their points")
 FOCAL_DISTANCE = limit(5.4e-10, "relative: (h/R)² at h = 1e-3 and the steepest R = 43; aberration is tenths of that")
 FURNACE_CHANNEL = limit(3e-3, "relative: what a colour of the furnace would be seen at, in each channel")
+ABSORPTION_SEEN = limit(0.01, "relative: a difference of an image's mean from `volpath` that must be seen")
 SLAB_ABSORPTION = limit(2e-6, "relative: σ d up to 8 in float32, with a way that is off by 2u: 16u and the exponential")
 DISPERSION_TIME = limit(1.25, "over the same scene with the index of the d line, with as many samples")
 ABSORPTION_TIME = limit(1.5, "over the same scene without absorption: one exponential a colour and leg")
@@ -188,7 +189,7 @@ UNEXPLAINED = limit(0.05, "of the mutants of our code: no test notices them, and
 # Other renderers -----------------------------------------------------------------------------------------------
 
 RECORDED = limit(3.0, "factor between the worst error and the recorded one: the numbers of those rays were not kept")
-LENS_TRACE = limit(1.0, "the bound adds up every rounding at its worst, see `validation/suite/lenses.py`")
+LENS_TRACE = limit(1.0, "the bound adds up every rounding at its worst, see `validation/reference/exact_lens.py`")
 OTHER_INDEX = limit(
     1.02, "factor between the largest difference of an index and the recorded one, of three digits; the data are locked"
 )

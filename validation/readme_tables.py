@@ -13,7 +13,7 @@ import numpy as np
 
 from mi_refract.formulas import FORMULAS
 from mi_refract.image_diff import self_test
-from mi_refract.image_diff.methods import METHODS
+from mi_refract.image_diff.methods import METHODS as COMPARISONS
 from mi_refract.io import image_file
 from mi_refract.io.image_file import srgb_encode
 from mi_refract.io.safe_files import update_between, write_atomically
@@ -27,9 +27,11 @@ from validation.efficiency import changing_indices, error_against_time
 from validation.planar import against_retrace
 from validation.planar import times as planar_times
 from validation.renders import against_dielectric, colours
+from validation.run import headline
 from validation.run import metrics as m
 from validation.run.array_settings import PLAIN
 from validation.run.context import SCENES, Context
+from validation.run.render_methods import BUILTIN, METHODS
 from validation.stability import layered_paths
 from validation.suite import matrix
 
@@ -166,20 +168,27 @@ def paths(rows: list[Row]) -> str:
 
 
 def efficiency(rows: list[Row]) -> str:
-    """Every method on the scenes that were measured, over the built-in with the same sampler."""
-    columns = {
-        m.TIME_OVER_BUILTIN: "time",
-        m.EQUAL_TIME: "MSE at equal time",
-        m.EQUAL_TIME_DEFAULTS: "… over its defaults",
-    }
-    mine = _measured(rows, error_against_time.NAME, columns)
-    cells = []
+    """By scene MSE × time of every method, over the built-in with the same sampler; and what all scenes say of it."""
+    mine = _measured(rows, error_against_time.NAME, [m.EQUAL_TIME, m.EQUAL_TIME_DEFAULTS])
+    scenes: dict[str, dict[str, Row]] = {}
     for row in mine:
-        name, default, _ = row.subject.partition(", independent")
-        cells.append([row.case, f"`{name}`", "independent" if default else row.replay["sampler"]])
-        cells[-1] += _cells(row, columns)
+        scenes.setdefault(row.case, {})[row.subject] = row
+    methods = [method.name for method in METHODS if method != BUILTIN]
+    cells = [
+        [
+            scene,
+            by_name[BUILTIN.name].replay["sampler"],
+            *_cells(by_name[BUILTIN.name], [m.EQUAL_TIME_DEFAULTS]),
+            *(_cells(by_name.get(name), [m.EQUAL_TIME])[0] for name in methods),
+        ]
+        for scene, by_name in scenes.items()
+    ]
     text = _replay(mine, "{resolution}² pixels, {spp} spp, {rounds} rounds, {setting}.")
-    return _table(text, ["scene", "method", "sampler", *columns.values()], cells, "efficiencies were measured")
+    text += "".join(f"\n{sentence}" for sentence in headline.equal_time(mine))
+    left_out = [row.case for row in rows if row.study == error_against_time.NAME and not row.values]
+    text += f"\nNot measured: {', '.join(left_out)}." if left_out else ""
+    heading = ["scene", "sampler", f"`{BUILTIN.name}`, over `independent`", *(f"`{name}`" for name in methods)]
+    return _table(text, heading, cells, "efficiencies were measured")
 
 
 def changing(rows: list[Row]) -> str:
@@ -244,16 +253,16 @@ def seen(rows: list[Row]) -> str:
     defects: dict[str, list[Row]] = {}
     for row in _measured(rows, self_test.STUDY, ["missed"]):
         defects.setdefault(row.subject, []).append(row)
-    nulls = [_measured(rows, self_test.STUDY, subject=f"null pairs, {name}") for name in METHODS]
+    nulls = [_measured(rows, self_test.STUDY, subject=f"null pairs, {name}") for name in COMPARISONS]
     if not defects or not all(nulls):
         return _table("", [], [], "defects were planted")
-    cells = [[name, *(shares(method, trials) for method in METHODS)] for name, trials in defects.items()]
+    cells = [[name, *(shares(method, trials) for method in COMPARISONS)] for name, trials in defects.items()]
     cells.append(["nothing: other seeds, or other last bits", *map(false_alarms, nulls)])
     trials = next(iter(defects.values()))
     detectable = percent([row.values[self_test.DETECTABLE] for row in trials], digits=1)
     text = _replay(trials, "{trials} trials each of {renders a side} renders a side. ")
     text = f"{', '.join(row.case for row in trials)}; {text}Minimum detectable difference in a tile: {detectable}."
-    return _table(text, ["planted", *(f"`{name}`" for name in METHODS)], cells, "")
+    return _table(text, ["planted", *(f"`{name}`" for name in COMPARISONS)], cells, "")
 
 
 def visible(rows: list[Row]) -> str:
@@ -265,7 +274,7 @@ def visible(rows: list[Row]) -> str:
     cells = [
         [row.subject, row.reason, row.case, *_cells(row, metrics), f"{row.values[study.ALARMS]:.1%}"] for row in kinds
     ]
-    options = METHODS["flip"].options
+    options = COMPARISONS["flip"].options
     bounds = [
         f"{metric} (bound {compact(options[name].default)})"
         for metric, name in zip(metrics[:2], ("local", "patch"), strict=True)

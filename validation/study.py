@@ -34,7 +34,8 @@ class Study:
     `tasks(context)` lists what is to be run. `axes` says what the curves of its rows are drawn over, `scatter` which
     metric is plotted against which (both as `mi_refract.report.study_page` describes them). `summarise(rows)` returns
     all rows of a run with the summary of this study among them. `again(context)`, of a study whose answer rests on
-    random draws, gives the rows that they decide (no times, no images), for `validation.repeated` to repeat.
+    random draws, gives the rows that they decide (no times, no images), for `validation.repeated` to repeat. `records`:
+    subjects that are measured for comparison. Only they, and what is timed, have rows with neither bound nor remark.
     """
 
     name: str
@@ -46,11 +47,14 @@ class Study:
     scatter: tuple[Mapping[str, Any], ...] = ()
     summarise: Callable[[list[Row]], list[Row]] = list
     again: Callable[[Context], list[Row]] | None = None
+    records: tuple[str, ...] = ()
 
     @property
     def described(self) -> dict[str, Any]:
         """What the report shows of the study: title, introduction, glossary and axes."""
-        about: dict[str, Any] = {"title": self.title, "text": " ".join(self.text.split()), "terms": dict(self.terms)}
+        text = " ".join(self.text.split())
+        text += f" Recorded without a bound: {', '.join(f'`{name}`' for name in self.records)}." if self.records else ""
+        about: dict[str, Any] = {"title": self.title, "text": text, "terms": dict(self.terms)}
         return about | ({"axes": dict(self.axes)} if self.axes else {})
 
 

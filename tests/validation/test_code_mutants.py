@@ -83,7 +83,6 @@ def test_the_same_seed_gives_the_same_sample_and_an_edit_changes_it_where_it_is(
 def test_too_many_survivors_fail_and_explained_ones_do_not():
     mutant = Mutant(PATH, "AddNot", 0, 1, "if a:", "if not a:")
     entries = json.loads((code_mutants.CONFIG.parent / "explained_mutants.json").read_text())
-    assert all(entry["reason"].startswith(("equivalent: ", "unobservable: ")) for entry in entries)
     entry = entries[0]
     unobservable = Mutant(entry["file"], entry["operator"], 0, 1, entry["line"], entry["becomes"])
     survivors = [(mutant, False)] + [(unobservable, False)] * 4

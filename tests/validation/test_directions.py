@@ -19,6 +19,7 @@ from validation.directions import bsdf_samples, per_formula, planted_defects, se
 from validation.directions.planted_defects import MUTANTS
 from validation.directions.search import Found
 from validation.reference.fast_reference import Screen
+from validation.run import seeds
 from validation.run.array_settings import budget_of, settings
 from validation.suite import small_mistakes
 
@@ -187,6 +188,14 @@ def test_every_formula_is_spoilt_and_what_escapes_or_is_seen_in_vain_fails(monke
     assert rows["control"].broken == {"rays that see it": 0.0}
     assert rows["control"].reason.startswith("caught by ")
     assert f": {planted_defects.MISCLASSIFIED_FAR} " in rows["control"].reason
+
+
+def test_a_rare_defect_is_seen_by_many_rays_with_any_seed(vectorised):
+    """Of as many rays of each regime one to six see it; with this seed none did."""
+    with seeds.shifted(12):
+        sample = planted_defects.draw(planted_defects.COUNT, vectorised.precision)
+        row = planted_defects.row("radicand of second order", "compensated", vectorised, sample)
+    assert row.verdict == "pass" and row.values["rays that see it"] > 10
 
 
 @pytest.mark.parametrize("precision", ray_set.PRECISIONS)

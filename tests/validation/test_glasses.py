@@ -9,6 +9,7 @@ from support.media_rays import answered
 
 from mi_refract import media
 from validation.media.closed_forms import back_focal_distance
+from validation.reference import exact_lens
 from validation.reference.exact_lens import crossing
 from validation.run.context import PROFILES, Context
 from validation.run.metrics import ERROR_OVER_BOUND
@@ -153,17 +154,17 @@ def test_the_recorded_difference_is_that_of_the_other_catalogue(system, glass, c
 # The achromat --------------------------------------------------------------------------------------------------------
 
 NS = 1.0, 1.5168, 1.62, 1.0
-LENS = lenses.LENS
+LENS = exact_lens.ACHROMAT
 
 
 def test_the_exact_trace_is_that_of_matrices_near_the_axis_and_its_weights_those_of_small_changes():
     """The rest is spherical aberration, and falls as the height's square. A bent surface has another curvature."""
-    focus = 8.5 + back_focal_distance(LENS.curvatures, NS, LENS.thicknesses)
-    off = [float(crossing(LENS, NS, h, lenses.START).place) / focus - 1 for h in (1e-6, 1.0, 0.5)]
+    focus = 8.5 + back_focal_distance(LENS, NS)
+    off = [float(crossing(LENS, NS, h, exact_lens.START).place) / focus - 1 for h in (1e-6, 1.0, 0.5)]
     assert abs(off[0]) < 1e-12 and off[1] / off[2] == pytest.approx(4, rel=1e-2)
     assert all(f"{c}" in lenses.FILE.read_text() for c in LENS.curvatures)
-    exact, (first, *others) = crossing(LENS, NS, 10.0, lenses.START), LENS.curvatures
-    bent = crossing(dataclasses.replace(LENS, curvatures=(first * (1 + 1e-9), *others)), NS, 10.0, lenses.START)
+    exact, (first, *others) = crossing(LENS, NS, 10.0, exact_lens.START), LENS.curvatures
+    bent = crossing(dataclasses.replace(LENS, curvatures=(first * (1 + 1e-9), *others)), NS, 10.0, exact_lens.START)
     assert float(abs(bent.place - exact.place)) / 1e-9 == pytest.approx(exact.moves["bend"][0], rel=1e-6)
     height, distance = exact.meetings[2].y, float(exact.place) - 8.5
     assert exact.moves["turn"][2] == pytest.approx(distance**2 / height + height, rel=2e-2)
@@ -188,7 +189,7 @@ def test_another_trace_is_no_other_index_and_another_index_no_other_trace():
     for rays in (moved, one, ours.astype(np.float32).astype(float)):
         assert list(broken(traced(rays)).values()) == [{ERROR_OVER_BOUND}] * 4
     indices = known * [[1], [1 + 1e-8]]  # F2 of another maker, traced rightly: the focus says by how much
-    places = [[crossing(LENS, (1.0, *n, 1.0), h, lenses.START).place for h in lenses.HEIGHTS] for n in indices.T]
+    places = [[crossing(LENS, (1.0, *n, 1.0), h, exact_lens.START).place for h in lenses.HEIGHTS] for n in indices.T]
     own = np.array([[[float(place), 0.0, 1.0, 0.1] for place in each] for each in places])
     rows = traced(own=own, indices=indices)
     assert broken(rows) == {f"{lenses.OWN}, height {h:g}": {lenses.INDEX_OFF} for h in lenses.HEIGHTS}

@@ -24,7 +24,11 @@ DOUBLE = dataclasses.replace(OURS, setting="llvm float64", values={**WORST, "wor
 RENDER = {"changed share": 0.01, "|mean ratio − 1|": 1e-6, "Welch alarms": 0.0, "time / dielectric": 1.1}
 SPHERE = Row("renders", "refract", "sphere", "llvm_ad_rgb", RENDER, {"Welch alarms": 0.0})
 MIRAGE = dataclasses.replace(SPHERE, case="mirage", values={**RENDER, "Welch alarms": 7.0}, budgets={})
-FAST = Row("efficiency", "refract_path, split 3", "balls", "llvm_ad_rgb", {"equal-time MSE": 0.055})
+FAST = [
+    Row("efficiency", f"refract_path{split}", scene, "llvm_ad_rgb", {"equal-time MSE": value})
+    for split, *values in (("", 0.7, 0.9, 1.1), (", split 1", 0.9, 0.8, 1.3), (", split 3", 0.055, 1.0, 1.2))
+    for scene, value in zip(("balls", "nested", "slab"), values, strict=True)
+]
 ABSENT = Row("directions", "promoted", "all", "cuda float32", reason=Reason("no libcuda.so.1", "an NVIDIA GPU"))
 INSTALL = "python -m validation renderers --install pyglm"
 RENDERER = Row("per_ray", "PyGLM", "every set", "f32", reason=Reason(INSTALL, f"other renderers, by `{INSTALL}`"))
@@ -77,7 +81,9 @@ BODY = Row("ground_truth", "refract", "prism", "llvm_ad_rgb", {"error / bound": 
         ([BODY, dataclasses.replace(BODY, values={"error / bound": math.nan})], 0, "no", ["of its rays leave"], []),
         ([SCALAR, SLOW], 1, "yes", ["in double precision"], ["single"]),
         ([SCALAR, SLOW], 2, "plain", ["67 times as long", "use a compiled variant"], ["%"]),
-        ([SPHERE, FAST], 2, "plain", ["10 % slower", "5.5 % (`balls`)"], []),
+        ([SPHERE, *FAST], 2, "plain", ["10 % slower", "splitting is 0.70 to 1.10 of", "3 scenes: 0.90)"], []),
+        ([SPHERE, *FAST], 2, "plain", ["each scene is 0.06 to 1.20 of that of `path`", "3 scenes: 0.80)"], []),
+        ([SPHERE, *FAST[:1]], 2, "plain", ["splitting is 0.70 of that of `path`."], ["`split_depth`"]),
         ([SPHERE, MIRAGE, *TRACED], 3, "yes", ["1 of 2 scenes they do not differ", "In `mirage`, 1.0 % of"], []),
         ([SPHERE, MIRAGE, *TRACED], 3, "yes", ["follows all 64 exact", "`dielectric` loses 11", "even exact"], []),
         ([MIRAGE, *LAYERS], 3, "plain", ["In `mirage`", "0.010 %, Mitsuba's by 50 %"], ["do not differ"]),
@@ -114,6 +120,7 @@ def test_the_image_is_of_the_scene_that_differs_and_the_plot_of_methods_in_turn(
     page = headline.first_page(rows)
     assert page["image"]["row"] == rows[1].name and page["plot"]["row"] == rows[0].name
     drawn = {"path + refract": [(1.0, 1.0)]}
-    methods = Row("efficiency", "every method", "balls", "llvm_ad_rgb", {"x": 1.0}, curves=drawn)
-    assert headline.first_page([*rows, methods])["plot"]["labels"] == {"path + refract": "refract"}
+    methods = [Row("efficiency", "every method", row.case, "llvm_ad_rgb", {"x": 1.0}, curves=drawn) for row in FAST[:3]]
+    plot = headline.first_page([*rows, *methods, *FAST])["plot"]
+    assert plot["labels"] == {"path + refract": "refract"} and plot["row"] == methods[1].name  # of median gain
     assert {answer["state"] for answer in page["answers"]} <= set(STATES)

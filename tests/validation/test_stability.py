@@ -407,6 +407,6 @@ def test_the_built_in_differs_from_both_right_formulas_in_the_telescope(llvm_var
     (row,) = layered_paths.view_rows(context, *layered_paths.VIEWS[0])
     assert row.verdict == "pass" and row.values["pixels off"] > 5e-3
     assert all((context.out / path).is_file() for path in row.images.values())
-    monkeypatch.setattr(layered_paths, "other_right_formula", lambda: "refract_decomposed")
+    monkeypatch.setattr(layered_paths, "right_plugins", lambda: ["refract_decomposed"])
     (row,) = layered_paths.view_rows(context, *layered_paths.VIEWS[0])
     assert row.broken.keys() == {"pixels off, control"}

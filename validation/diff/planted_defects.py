@@ -218,4 +218,5 @@ def null_rows(context: Context, name: str) -> list[Row]:
     return self_test.false_alarms(pairs, repeats, name, context.variant)
 
 
-STUDY = Study(NAME, "Image comparison, planted defects", f"{about(__doc__)} {about(self_test.__doc__)}", TERMS, tasks)
+TEXT = f"{about(__doc__)} {about(self_test.__doc__)}"
+STUDY = Study(NAME, "Image comparison, planted defects", TEXT, TERMS, tasks, records=("renders",))

@@ -314,4 +314,5 @@ STUDY = Study(
     TERMS,
     tasks,
     again=lambda context: tasks(context)[0].run(),
+    records=(EDGE, *(f"square of {side} pixels" for side in SQUARES)),
 )

@@ -35,6 +35,7 @@ from mi_refract.report.row import Row
 from validation import limits
 from validation.repeated import by_tasks
 from validation.run.context import Context
+from validation.run.render_methods import sensor
 from validation.run.seeds import current
 from validation.study import Study, Task, about
 
@@ -216,12 +217,10 @@ def scene_rows(context: Context, pairs: int) -> list[Row]:
     import mitsuba as mi
 
     place = mi.ScalarTransform4f
-    film = {"type": "hdrfilm", "width": 32, "height": 32, "pixel_format": "rgb", "rfilter": {"type": "box"}}
-    view = place().look_at([0, 2, 6], [0, 0, 0], [0, 1, 0])
     scene: Any = {
         "type": "scene",
         "integrator": {"type": "refract_path", "max_depth": 6},
-        "sensor": {"type": "perspective", "fov": 40, "to_world": view, "film": film, "s": {"type": "independent"}},
+        "sensor": sensor(32, 40, [0, 2, 6]),
         "floor": {"type": "rectangle", "to_world": place().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(5)},
         "ball": {"type": "sphere", "bsdf": {"type": "refract"}},
         "lamp": {"type": "sphere", "center": [1, 3, 0], "radius": 0.1, "e": {"type": "area", "radiance": 50.0}},

@@ -19,7 +19,7 @@ from mi_refract.formulas import FORMULAS, ROUNDING
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing, seeds
-from validation.run.array_settings import Setting, budget_of, settings
+from validation.run.array_settings import Setting, budget_of, running, settings
 from validation.run.context import Context
 from validation.run.metrics import (
     ERROR_OVER_BOUND,
@@ -89,7 +89,7 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
     """Every formula and Mitsuba's functions, the rounded exact answers, and the copy."""
     if setting.vector is None:
         return [Row(NAME, name, ALL, setting.label, reason=setting.reason) for name in (*FORMULAS, kernel_timing.COPY)]
-    count = context.profile.scalar_rays if setting.is_scalar else context.profile.rays
+    count = rays_of(context, setting)
     times = kernel_timing.measure(context, setting)
     rows = [_floor_row(regime, setting, count) for regime in regimes.REGIMES]
     for name, subject in setting.subjects.items():
@@ -99,12 +99,16 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
     return [*rows, copying]
 
 
+def rays_of(context: Context, setting: Setting) -> int:
+    """Rays per regime in a setting."""
+    return context.profile.scalar_rays if setting.is_scalar else context.profile.rays
+
+
 def drawn_rows(context: Context) -> list[Row]:
-    """Every formula in every regime, without times, in every compiled setting."""
-    running = [s for s in settings(context) if s.vector is not None and not s.is_scalar]
+    """Every formula in every regime, without times."""
     return [
-        regime_row(name, subject, regime, setting, context.profile.rays)
-        for setting in running
+        regime_row(name, subject, regime, setting, rays_of(context, setting))
+        for setting in running(context)
         for name, subject in setting.subjects.items()
         for regime in regimes.REGIMES
     ]

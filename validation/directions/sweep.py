@@ -21,7 +21,7 @@ from mi_refract.report.row import Row
 from validation import limits, repeated
 from validation.reference.fast_reference import Screen
 from validation.run import seeds
-from validation.run.array_settings import Setting, budget_of, settings
+from validation.run.array_settings import DOCUMENTED, Setting, budget_of, settings
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED, MISCLASSIFIED_FAR, WORST_IN_U
 from validation.study import Study, Task, about
@@ -58,9 +58,8 @@ def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     profile = context.profile
     sizes = profile.sweep_rays, profile.certified
     rows = [row for regime in regimes.REGIMES for row in regime_rows(regime, setting, *sizes)]
-    documented = [name for name in FORMULAS if not budget_of(name).at_the_limit]
-    kept = [row for row in rows if row.subject not in documented]
-    for name in documented:  # one row, over all regimes it was swept in
+    kept = [row for row in rows if row.subject not in DOCUMENTED]
+    for name in DOCUMENTED:  # one row, over all regimes it was swept in
         mine = [row for row in rows if row.subject == name]
         worst = max(mine, key=lambda row: row.values[ERROR_OVER_BOUND])
         values = {m: max(row.values[m] for row in mine) for m in (WORST_IN_U, ERROR_OVER_BOUND, "screen off")}

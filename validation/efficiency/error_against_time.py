@@ -70,7 +70,7 @@ class Extent:
 
 EXTENTS = {
     "quick": Extent((4, 9), 6, 12, resolution=64, scenes=("sphere",)),
-    "standard": Extent((4, 25), 6, 12, scenes=("balls", "furnace", "mirage", "sphere")),
+    "standard": Extent((4, 25), 6, 12, resolution=96),
     "full": Extent((4, 9, 25), 8, 16, seconds=0.25),
 }
 LARGEST = 512

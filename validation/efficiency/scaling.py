@@ -29,7 +29,7 @@ from scipy.spatial import ConvexHull
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run.context import SCENES, Context
-from validation.run.render_methods import BUILTIN, METHODS, Camera, Method, camera
+from validation.run.render_methods import BUILTIN, METHODS, Camera, Method, camera, sensor
 from validation.study import Study, Task, about
 
 TERMS = {
@@ -121,10 +121,8 @@ def ball_mesh(size: int) -> tuple[np.ndarray, np.ndarray]:
 def _in_memory(method: Method, parts: dict[str, Any], extent: float, resolution: int) -> Camera:
     import mitsuba as mi
 
-    film = {"type": "hdrfilm", "width": resolution, "height": resolution, "rfilter": {"type": "box"}}
-    look = mi.ScalarTransform4f().look_at([0, 0, 3 * extent], [0, 0, 0], [0, 1, 0])
-    sensor = {"type": "perspective", "fov": 20, "to_world": look, "film": film, "sampler": {"type": "independent"}}
-    scene = mi.load_dict({"type": "scene", "sensor": sensor, "sky": {"type": "constant"}, **parts})
+    view = sensor(resolution, 20, [0, 0, 3 * extent])
+    scene = mi.load_dict({"type": "scene", "sensor": view, "sky": {"type": "constant"}, **parts})
     return Camera(scene, mi.load_dict(method.plugin(24)))
 
 

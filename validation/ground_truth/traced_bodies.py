@@ -142,4 +142,4 @@ def bow_row(
     return Row(NAME, plugin, "rainbow", setting, values, budgets, replay=replay, images=shown or {})
 
 
-STUDY = Study(NAME, "Ground truth", about(__doc__), TERMS, tasks, axes=AXES)
+STUDY = Study(NAME, "Ground truth", about(__doc__), TERMS, tasks, axes=AXES, records=(BUILTIN,))

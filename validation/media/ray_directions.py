@@ -25,7 +25,7 @@ from mi_refract.report.row import Row
 from validation import repeated
 from validation.limits import INDEX_ROUNDING
 from validation.run import seeds
-from validation.run.array_settings import settings
+from validation.run.array_settings import running
 from validation.run.context import Context
 from validation.run.render_methods import under
 from validation.study import Study, Task, about
@@ -71,8 +71,8 @@ def rows(context: Context, spec: str) -> list[Row]:
     table = [index_row(medium, spec)]
     table.append(row("refract", SPECTRAL, reason=missing) if missing else sampled_row(medium, spec, count))
     setting: Any
-    for setting in settings(context):
-        if setting.label.endswith("float64") and setting.vector is not None:
+    for setting in running(context):
+        if setting.precision is np.float64:
             rays = Drawn(medium, 100 if setting.is_scalar else count)
             name, formula = "compensated", FORMULAS["compensated"]
             values = judged(*evaluate(formula, rays.rays, setting.vector), rays.rays, name, 2.0**-53)

@@ -28,7 +28,7 @@ from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.planar_retrace import Array, Retraced, retrace
 from validation.run import seeds
-from validation.run.array_settings import Setting, settings
+from validation.run.array_settings import Setting, running, settings
 from validation.run.context import SCENES, Context
 from validation.run.metrics import ERROR_OVER_BOUND, WRONG_PATH, WRONG_PATH_FAR
 from validation.study import Study, Task, about
@@ -54,6 +54,7 @@ RAYS = {"quick": 100, "standard": 250, "full": 2000}  # scattered around the fil
 SCALAR_RAYS = 2
 SIDE, DEPTH = 3, 30  # of clutter: bodies in a row, boundaries on a path
 CLUTTER = {"standard": (12, 100), "full": (100, 500)}  # scenes, and rays in each
+SCALAR_CLUTTER = (2, 5)
 SPREAD = 1e-2  # of the extent, and in radians
 GROWN = {ERROR_OVER_BOUND: limits.GROWN, WRONG_PATH_FAR: 0.0}
 TRACE = "trace"  # the subject of its rows: `planar.trace` with the default formula
@@ -131,19 +132,19 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
         count = len(light)
         colours = {0, count // 2, count - 1} if light.wavelengths else range(count)
         rows.append(row([case_of(path, rays, j) for j in ([None] if setting.is_scalar else sorted(colours))], setting))
-    rows.append(row(clutter(*((2, 5) if setting.is_scalar else CLUTTER[context.profile.name])), setting))
+    rows.append(row(clutter(*(SCALAR_CLUTTER if setting.is_scalar else CLUTTER[context.profile.name])), setting))
     if setting.precision is np.float32:
         rows += [row([case_of(FOLDER / f"{SHOWN}.toml", rays)], setting, formula) for formula in FORMULAS]
     return rows
 
 
 def drawn_rows(context: Context) -> list[Row]:
-    """Every scene and a third of the random ones, in every compiled setting."""
+    """Every scene and a third of the random ones."""
     rows, (scenes, rays) = [], CLUTTER["standard"]
-    for setting in settings(context):
-        if setting.vector is not None and not setting.is_scalar:
-            rows += [row([case_of(path, RAYS["quick"])], setting) for path in sorted(FOLDER.glob("*.toml"))]
-            rows.append(row(clutter(scenes // 3, rays), setting))
+    for setting in running(context):
+        count, random = (SCALAR_RAYS, SCALAR_CLUTTER) if setting.is_scalar else (RAYS["quick"], (scenes // 3, rays))
+        rows += [row([case_of(path, count)], setting) for path in sorted(FOLDER.glob("*.toml"))]
+        rows.append(row(clutter(*random), setting))
     return rows
 
 

@@ -19,11 +19,11 @@ import numpy as np
 from mi_refract.planar import Event, Paths, Segments, shapes
 from mi_refract.planar.curves import Curve
 from mi_refract.report.row import Row
-from validation import limits, repeated
+from validation import limits
 from validation.reference import closed_forms as closed
 from validation.reference.planar_retrace import Array, Retraced
 from validation.run import seeds
-from validation.run.array_settings import Setting
+from validation.run.array_settings import Setting, running
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND
 from validation.study import Study, Task, about
@@ -76,10 +76,18 @@ def tasks(context: Context) -> list[Task]:
 
 
 def _setting_rows(context: Context, setting: Setting) -> list[Row]:
-    few = setting.is_scalar
+    rays = 8 if setting.is_scalar else 500
+    return _box_rows(context, setting) + [row(setting, name, make(rays)) for name, make in CLOSED.items()]
+
+
+def _box_rows(context: Context, setting: Setting) -> list[Row]:
     counts = REFLECTIONS[:2] if context.profile.quick else REFLECTIONS
-    rows = [row(setting, f"box, {count}", box(count, 4 if few else 16)) for count in counts]
-    return rows + [row(setting, name, make(8 if few else 500)) for name, make in CLOSED.items()]
+    return [row(setting, f"box, {count}", box(count, 4 if setting.is_scalar else 16)) for count in counts]
+
+
+def drawn_rows(context: Context) -> list[Row]:
+    """The boxes: only their rays are random."""
+    return [row for setting in running(context) for row in _box_rows(context, setting)]
 
 
 def row(setting: Setting, name: str, answer: Closed | Case) -> Row:
@@ -199,4 +207,4 @@ CLOSED: dict[str, Callable[[int], Closed]] = {
 }
 
 
-STUDY = Study(NAME, "Planar, closed answers", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))
+STUDY = Study(NAME, "Planar, closed answers", about(__doc__), TERMS, tasks, again=drawn_rows)

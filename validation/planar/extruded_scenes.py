@@ -24,6 +24,7 @@ from mi_refract.report.row import Row
 from validation import repeated
 from validation.run import seeds
 from validation.run.array_settings import Setting
+from validation.run.bsdf_sampling import OFFSET, along_the_ray
 from validation.run.context import Context
 from validation.study import Study, Task, about
 
@@ -39,7 +40,6 @@ TERMS = against_retrace.TERMS | {
 NAME = "extrusion"
 SCALAR = "needs a compiled variant: a loop over rays in Python would take hours"
 U = 2.0**-24
-OFFSET = 1500 * U  # Mitsuba's RayEpsilon in float32
 FACETS = 64  # of an arc, at most
 LARGEST = 1500  # walls; arcs have fewer facets where there are more of them
 RAYS = 100  # of the file's, and as many scattered
@@ -121,15 +121,6 @@ def extrude(segments: Segments) -> Any:
 
 
 # The rays ------------------------------------------------------------------------------------------------------
-
-
-def along_the_ray(si: Any, d: Any) -> Any:
-    """A ray from the interaction along `d`, moved along itself by Mitsuba's offset."""
-    import mitsuba as mi
-
-    ray = mi.Ray3f(si.p, d)
-    ray.o = dr.fma(d, OFFSET * (1 + dr.max(dr.abs(si.p))), ray.o)
-    return ray
 
 
 # How a ray goes on from an interaction along a direction, and by how much that moves it along the normal, over u.

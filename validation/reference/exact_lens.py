@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
 
+import numpy as np
+
 DIGITS, TINY = 80, Decimal("1e-40")  # what is of second order is lost in the digits that do not count
 KINDS = "turn", "slide", "height", "depth", "bend"
 
@@ -29,6 +31,10 @@ class Lens:
     def vertices(self) -> list[float]:
         """Places of the surfaces on the axis."""
         return [sum(self.thicknesses[:i]) for i in range(len(self.curvatures))]
+
+
+ACHROMAT = Lens((0.02154, -0.02322, -0.00199), (6.0, 2.5))  # of `scenes/planar/achromat.toml`
+START = -20.0  # where its rays begin
 
 
 @dataclass(frozen=True)
@@ -62,6 +68,49 @@ def crossing(lens: Lens, indices: Sequence[float], height: float, start: float) 
             for kind in KINDS
         }
         return Crossing(place, tuple(Meeting(*map(float, each)) for each in meetings), moves)
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """How far a way to trace may round, in u. `sine`, `normal`: of a direction, times these of the ray and the normal.
+
+    `turn`: of a direction, whatever it is. `bend`: of each curvature, relative. `height`: of a height, relative.
+    `depth`: of a place along the axis, over the farthest one; where points are computed from the `centres` of the
+    spheres, over radius and centre.
+    """
+
+    sine: float
+    normal: float
+    turn: float
+    bend: Sequence[float]
+    height: float = 2.0
+    depth: float = 2.0
+    centres: bool = False
+
+
+def bound(lens: Lens, exact: Crossing, rounding: Rounding, u: float) -> float:
+    """Of the error of a crossing: each error at its worst, times how far it moves the crossing, and the last formula.
+
+    A distance to a sphere is off by 8u of what it is computed from, up to the radius.
+    """
+    total = 4.0 * abs(float(exact.place))
+    for i, (met, curvature) in enumerate(zip(exact.meetings, lens.curvatures, strict=True)):
+        reach, radius = max(-START, *lens.vertices), 1 / abs(curvature)
+        worst = {
+            "turn": rounding.turn + rounding.sine * abs(met.sine) + rounding.normal * abs(met.normal),
+            "slide": 8 * max(radius, reach),
+            "height": rounding.height * abs(met.y),
+            "depth": rounding.depth * (radius + abs(lens.vertices[i] + 1 / curvature) if rounding.centres else reach),
+            "bend": rounding.bend[i],
+        }
+        total += sum(exact.moves[kind][i] * size for kind, size in worst.items())
+    return total * u
+
+
+def on_axis(rays: np.ndarray) -> np.ndarray:
+    """z where rays [z, y, dz, dy] (N, 4) cross the axis."""
+    z, y, dz, dy = rays.T
+    return np.asarray(z - y * dz / dy)
 
 
 def _traced(

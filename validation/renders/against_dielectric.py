@@ -21,13 +21,14 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.formulas import FORMULAS, automatic
+from mi_refract.formulas import FORMULAS
 from mi_refract.image_diff import pixelwise, tile_statistics
 from mi_refract.io import image_file
 from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing
+from validation.run.array_settings import right_plugins
 from validation.run.context import NO_REFERENCE, Context
 from validation.run.metrics import (
     CHANGED_SHARE,
@@ -126,12 +127,9 @@ def _timed(
     """Values "time / dielectric" of the plugin, and by name of others; and the goals for those that have one."""
     import mitsuba as mi
 
-    profile, others = context.profile, list[str]()
-    if plugin == PLUGIN and not profile.quick:  # which saves kernels
-        # Both forms at the rounding limit are timed, whichever of them is the default.
-        default = automatic(dr.backend_v(mi.Float))
-        others = [name for name, formula in FORMULAS.items() if formula.budget.at_the_limit and name != default]
-        others = [f"{PLUGIN}_{name}" for name in others]
+    # Both forms at the rounding limit are timed, whichever of them is the default; `quick` saves kernels.
+    profile = context.profile
+    others = right_plugins() if plugin == PLUGIN and not profile.quick else []
     cameras = cameras | {name: Camera(opened(path, name, profile.resolution)) for name in others}
     _, seconds = cameras[BUILTIN](profile.spp, seed=0)
     spp = profile.spp

@@ -59,13 +59,6 @@ def variants(context: Context) -> tuple[str, str, str]:
     return context.variant, f"{family}spectral", f"{family}spectral_polarized"
 
 
-def camera(size: int, fov: float, origin: list[float], target: tuple[float, float, float] = (0, 0, 0)) -> Nodes:
-    """Of `size`² independent pixels."""
-    film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}}
-    view = mi.ScalarTransform4f().look_at(origin, [*target], [0, 1, 0])
-    return {"type": "perspective", "fov": fov, "to_world": view, "film": film, "sampler": {"type": "independent"}}
-
-
 def bitmap(pixels: Any, **parameters: Any) -> Nodes:
     """A texture of numbers, height × width (× channels)."""
     pixels = np.asarray(pixels, np.float32)

@@ -23,10 +23,10 @@ from mi_refract.image_diff import tile_statistics
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run.context import Context
-from validation.run.render_methods import OURS
+from validation.run.render_methods import OURS, sensor
 from validation.run.seeds import current
 
-from .cases import BLACK, GLASS, TURNED, Case, Nodes, bitmap, camera, environment, flat, study, variants
+from .cases import BLACK, GLASS, TURNED, Case, Nodes, bitmap, environment, flat, study, variants
 
 TERMS = {
     "alarms": "tiles, and the whole image, that Welch's test calls different",
@@ -64,8 +64,8 @@ def scenes(spectral: bool) -> dict[str, Nodes]:
     }
     if spectral:
         parts["dispersive"] = {"ball": ball | {"bsdf": GLASS | {"int_ior": "cauchy(1.7, 13000)"}}, "sky": sky}
-    sensor = camera(SIZE, 30, [0.3, 0.5, 5])
-    return {name: {"type": "scene", "sensor": sensor} | nodes for name, nodes in parts.items()}
+    view = sensor(SIZE, 30, [0.3, 0.5, 5])
+    return {name: {"type": "scene", "sensor": view} | nodes for name, nodes in parts.items()}
 
 
 BEHIND, DARK = [0, 0, 90], {"type": "area", "radiance": 1e-20}

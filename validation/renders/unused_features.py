@@ -46,6 +46,7 @@ CALLS = 2000
 STEPS = 4  # of an optimisation
 SPECTRAL, DISPERSIVE = "llvm_ad_spectral", "cauchy(1.5, 4000)"
 SCALAR = "scalar variants have no kernels"
+RECORDED = "recorded: what a feature costs that is used"
 BOTH = ((PLUGIN, ""), (BUILTIN, f", {BUILTIN}"))  # and what is added to the names of its values
 
 _row = functools.partial(Row, NAME, PLUGIN)
@@ -111,6 +112,7 @@ def wavelength_rows(context: Context) -> list[Row]:
             SPECTRAL,
             {"operations": count, "added": count - plain},
             {} if case == "dispersion" else {"added": 0.0},
+            reason=RECORDED if case == "dispersion" else "",
             replay={"rays": RAYS} | dispersive,
         )
         for case, count in counts.items()
@@ -154,7 +156,8 @@ def operation_rows(context: Context) -> list[Row]:
         budgets = {"added": values[f"added, {BUILTIN}"]} if less else {}
         goals = {"operations": plain[BUILTIN]} if case == "plain" else {}
         replay = {"rays": RAYS} | {key: str(value) for key, value in asked.items()}
-        return _row(case, variant, values, budgets, goals, replay=replay)
+        remark = "" if budgets or goals else RECORDED
+        return _row(case, variant, values, budgets, goals, remark, replay)
 
     contexts = {name: mi.BSDFContext() for name in ("reflection only", "transmission only", "importance mode")}
     contexts["reflection only"].component, contexts["transmission only"].component = 0, 1
@@ -241,4 +244,4 @@ def frozen_rows(context: Context) -> list[Row]:
     return [_row(case, context.variant, values, budgets, replay={"glasses": count})]
 
 
-STUDY = Study(NAME, "What a scene does not use", about(__doc__), TERMS, tasks)
+STUDY = Study(NAME, "What a scene does not use", about(__doc__), TERMS, tasks, records=(BUILTIN,))

@@ -1,4 +1,4 @@
-"""`bsdf.sample` of many rays at once, in any variant of Mitsuba, as numpy arrays."""
+"""`bsdf.sample` of many rays at once, in any variant of Mitsuba; and rays that go on from where they meet a surface."""
 
 from __future__ import annotations
 
@@ -25,6 +25,18 @@ def sample_all(bsdf: Any, context: Any, wi: np.ndarray, sample1: np.ndarray) -> 
         each = [ask(w, float(s), 1) for w, s in zip(wi, sample1, strict=True)]
         found = {name: np.concatenate([x[name] for x in each]) for name in each[0]}
     return found | {"type": found["type"][:, 0]}
+
+
+OFFSET = 1500 * 2.0**-24  # Mitsuba's RayEpsilon in float32
+
+
+def along_the_ray(si: Any, d: Any) -> Any:
+    """A ray from the interaction along `d`, moved along itself by as much as `spawn_ray` moves it along the normal."""
+    import mitsuba as mi
+
+    ray: Any = mi.Ray3f(si.p, d)
+    ray.o = dr.fma(d, OFFSET * (1 + dr.max(dr.abs(si.p))), ray.o)
+    return ray
 
 
 def _lanes(x: np.ndarray, count: int) -> np.ndarray:

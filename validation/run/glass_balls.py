@@ -12,6 +12,7 @@ import drjit as dr
 import numpy as np
 
 from validation.run.kernel_timing import kernels
+from validation.run.render_methods import sensor
 
 RESOLUTION = 32
 SEED = 2026
@@ -32,12 +33,10 @@ class Balls:
         side = int(np.ceil(np.sqrt(count)))
         sky = np.random.default_rng(SEED).random((8, 16, 3)).astype(np.float32)  # a constant one shows no index
         fresh = int(np.random.default_rng().integers(1 << 20, 1 << 30))
-        film = {"type": "hdrfilm", "width": RESOLUTION, "height": RESOLUTION, "rfilter": {"type": "box"}}
-        view = mi.ScalarTransform4f().look_at([0, 0, 4 * side], [0, 0, 0], [0, 1, 0])
         scene: dict[str, Any] = {
             "type": "scene",
             "integrator": {"type": integrator, "max_depth": max_depth or fresh},
-            "sensor": {"type": "perspective", "fov": 30, "to_world": view, "film": film},
+            "sensor": sensor(RESOLUTION, 30, [0, 0, 4 * side]),
             "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky)},
         }
         for i in range(count):

@@ -141,18 +141,33 @@ def _directions(rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
+def by_scene(methods: Sequence[Row], splits: bool) -> dict[str, float]:
+    """MSE × time of `refract_path` over the built-in's: as it is, or at the best `split_depth` of each scene."""
+    best: dict[str, float] = {}
+    for row in select(methods, metric=metrics.EQUAL_TIME):
+        if row.subject.startswith(f"{INTEGRATOR}, split") if splits else row.subject == INTEGRATOR:
+            best[row.case] = min(best.get(row.case, math.inf), row.values[metrics.EQUAL_TIME])
+    return best
+
+
+def equal_time(methods: Sequence[Row]) -> list[str]:
+    """Sentences about all scenes: the smallest, the median and the largest of `by_scene`."""
+    sentences = []
+    for splits, how in ((False, "without splitting"), (True, "with the best `split_depth` of each scene")):
+        if values := [*by_scene(methods, splits).values()]:
+            middle = f" (median of {len(values)} scenes: {statistics.median(values):.2f})" if len(values) > 1 else ""
+            sentences.append(f"MSE × time of `{INTEGRATOR}` {how} is {span(values, 2)} of that of `path`{middle}.")
+    return sentences
+
+
 def _renders(ours: Sequence[Row], methods: Sequence[Row]) -> dict[str, Any]:
     """Times and differences of `refract` and `dielectric`; errors at equal time of `refract_path`."""
     times = [row.values[metrics.TIME_OVER_DIELECTRIC] for row in select(ours, metric=metrics.TIME_OVER_DIELECTRIC)]
-    best: dict[str, float] = {}
-    for row in select(methods, metric=metrics.EQUAL_TIME):
-        if row.subject.startswith(INTEGRATOR):
-            best[row.case] = min(best.get(row.case, math.inf), row.values[metrics.EQUAL_TIME])
     compared = select(ours, metric=metrics.CHANGED_SHARE)
     return {
         "times": times,
         "median": statistics.median(times) if times else 0.0,
-        "equal_time": list(best.items())[:3],
+        "equal_time": equal_time(methods),
         "same": [row for row in compared if not row.values.get(metrics.WELCH_ALARMS)],
         "differing": [row for row in compared if row.values.get(metrics.WELCH_ALARMS)],
     }
@@ -198,10 +213,12 @@ def _image(ours: Sequence[Row]) -> ShownRow | None:
 
 
 def _plot(rows: Sequence[Row]) -> ShownRow | None:
-    """Error against time of the methods, else of the two plugins, in the first scene that has it."""
+    """Error against time of the methods, in the scene of median gain; else of the two plugins, in the first scene."""
+    gains = by_scene(select(rows, EFFICIENCY), splits=True)
+    median = sorted(gains, key=lambda scene: gains[scene])[len(gains) // 2] if gains else ""
     choices = ((EFFICIENCY, METHODS, PLOTTED, False), (RENDERS, PLUGIN, {BUILTIN: BUILTIN, PLUGIN: PLUGIN}, True))
     for study, subject, labels, both in choices:
-        for row in select(rows, study, subject):
+        for row in select(rows, study, subject, "" if both else median):
             shown = {name: label for name, label in labels.items() if name in row.curves}
             if row.curves if not both else len(shown) == len(labels):
                 caption = f"Error against time, scene `{row.case}`: lower and further left is better."

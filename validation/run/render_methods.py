@@ -93,6 +93,17 @@ def camera(path: Path, method: Method, resolution: int, **parameters: Any) -> Ca
     return Camera(scene, mi.load_dict(method.plugin(depth)))
 
 
+def sensor(
+    size: int, fov: float, origin: list[float], target: tuple[float, float, float] = (0, 0, 0)
+) -> dict[str, Any]:
+    """A perspective camera of `size`² independent pixels, for `mi.load_dict`."""
+    import mitsuba as mi
+
+    film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}}
+    view = mi.ScalarTransform4f().look_at(origin, [*target], [0, 1, 0])
+    return {"type": "perspective", "fov": fov, "to_world": view, "film": film, "sampler": {"type": "independent"}}
+
+
 def save_image(folder: Path, name: str, image: np.ndarray, about: dict[str, Any]) -> str:
     """Write an EXR under `folder`; its path relative to that."""
     target = Path("images") / f"{name}.exr"

@@ -28,7 +28,7 @@ from mi_refract.oracle import derivatives
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import seeds
-from validation.run.array_settings import Setting, settings
+from validation.run.array_settings import DOCUMENTED, Setting, settings
 from validation.run.context import Context
 from validation.study import Study, Task, about
 
@@ -83,9 +83,9 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
 
 
 def drawn_rows(context: Context) -> list[Row]:
-    """Those with budgets, in every compiled setting."""
-    running = [s for s in settings(context) if s.vector is not None and not s.is_scalar]
-    return [row for setting in running for row in setting_rows(context, setting) if row.budgets]
+    """Those with budgets, and those that are not run."""
+    every = [row for setting in settings(context) for row in setting_rows(context, setting)]
+    return [row for row in every if row.budgets or not row.values]
 
 
 @seeds.cached
@@ -293,4 +293,5 @@ def size_of_powers(certified: oracle.Certified, cos_i: np.ndarray, k: np.ndarray
         return np.where(certified.transmitted & (kappa != 0), r * t * (reflected + through), 0)
 
 
-STUDY = Study(NAME, "Derivatives", about(__doc__), TERMS, tasks, axes=AXES, again=drawn_rows)
+RECORDS = (*DOCUMENTED, "the problem")
+STUDY = Study(NAME, "Derivatives", about(__doc__), TERMS, tasks, axes=AXES, again=drawn_rows, records=RECORDS)

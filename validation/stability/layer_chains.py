@@ -32,6 +32,7 @@ Array = NDArray[Any]
 
 TOP = 1.0003  # the index of the coldest air, at the top
 MIRAGE = 3e-5  # decrease of the index down to the road
+SEED = 7  # of the rays in the light pipe
 EXACT_RATIO = 2.0**-23  # 1 + this is the first float32 after 1
 FEEDS = {
     "ratios": "each k rounded once; in float32, neighbours 3e-8 apart have k = 1, and the ray is not refracted",
@@ -280,7 +281,7 @@ def pipe(reflections: int, rays: int, index: float, precision: type) -> tuple[Ar
     Unfolded, the ray is straight and meets the walls of either pair at equal distances: each meeting changes the
     sign of one component, and nothing else.
     """
-    rng, axes = np.random.default_rng(seeds.current(7)), frame(precision)
+    rng, axes = np.random.default_rng(seeds.current(SEED)), frame(precision)
     across = rng.uniform(0.05, 0.6, (rays, 2)) * rng.choice([-1, 1], (rays, 2))
     local = np.column_stack([across, np.sqrt(1 - (across**2).sum(1))])
     a: Array = (local @ axes).astype(precision)

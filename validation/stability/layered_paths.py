@@ -20,13 +20,15 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.formulas import FORMULAS, automatic
+from mi_refract.formulas import FORMULAS
 from mi_refract.image_diff import pixelwise
 from mi_refract.plugins import PLUGIN
 from mi_refract.rendering import scene_files
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import seeds
+from validation.run.array_settings import DOCUMENTED, right_plugins
+from validation.run.bsdf_sampling import OFFSET
 from validation.run.context import SCENES, Context
 from validation.run.metrics import WRONG_PATH
 from validation.run.render_methods import save_image
@@ -61,8 +63,6 @@ VIEWS: tuple[tuple[str, dict[str, str], str], ...] = (
 
 
 # Layers and exact paths ------------------------------------------------------------------------------------------
-
-OFFSET = 1500 * 2.0**-24  # Mitsuba's RayEpsilon in float32
 
 
 @dataclass(frozen=True)
@@ -385,7 +385,7 @@ def view_rows(context: Context, scene: str, parameters: dict[str, Any], name: st
     """`refract` and the built-in, image against image; and what flipped lobes alone do, as a control."""
     if context.variant.startswith("scalar"):
         return [Row(NAME, PLUGIN, f"{name}: image", context.variant, reason=SCALAR)]
-    profile, right = context.profile, other_right_formula()
+    profile, right = context.profile, right_plugins()[0]
     spp = max(1, profile.spp // 4)
 
     def render(plugin: str) -> np.ndarray:
@@ -407,12 +407,5 @@ def view_rows(context: Context, scene: str, parameters: dict[str, Any], name: st
     return [Row(NAME, PLUGIN, f"{name}: image", context.variant, values, budgets, replay=replay, images=images)]
 
 
-def other_right_formula() -> str:
-    """A plugin at the rounding limit whose formula is not the default's."""
-    import mitsuba as mi
-
-    default = automatic(dr.backend_v(mi.Float))
-    return next(f"{PLUGIN}_{k}" for k, f in FORMULAS.items() if f.budget.at_the_limit and k != default)
-
-
-STUDY = Study(NAME, "Paths", about(__doc__), TERMS, tasks, axes=AXES, again=drawn_rows)
+RECORDS = (BUILTIN, *(f"{PLUGIN}_{name}" for name in DOCUMENTED), INDICES, RATIOS, "every plugin")
+STUDY = Study(NAME, "Paths", about(__doc__), TERMS, tasks, axes=AXES, again=drawn_rows, records=RECORDS)

@@ -20,16 +20,17 @@ from mi_refract import regimes
 from mi_refract.accuracy import Subject, evaluate
 from mi_refract.formulas import FORMULAS
 from mi_refract.report.row import Row
-from validation import limits, repeated
+from validation import limits
 from validation.reference import optical_systems
 from validation.run import array_settings as backends
+from validation.run import seeds
 from validation.run.array_settings import Setting
 from validation.run.context import Context
 from validation.run.metrics import MISCLASSIFIED
 from validation.study import Study, Task, about
 
 from .energy import worst
-from .layer_chains import FEEDS, Array, Fed, Layers, air, carry, cosine, enter, exact_ratios, frame, pipe
+from .layer_chains import FEEDS, SEED, Array, Fed, Layers, air, carry, cosine, enter, exact_ratios, frame, pipe
 
 NAME = "stability"
 AXES = {"x": "layers passed", "y": "relative error of the cosine", "x_scale": "log", "y_scale": "log"}
@@ -104,6 +105,16 @@ def tasks(context: Context) -> list[Task]:
         for setting in every
         for name, rows in both.items()
         if setting.vector is not None or name == "chains"
+    ]
+
+
+def drawn_rows(context: Context) -> list[Row]:
+    """The light pipes: only their rays are random."""
+    return [
+        pipe_row(name, subject, setting, extent(context, setting))
+        for setting in backends.running(context)
+        for name, subject in subjects(context, setting).items()
+        if at_limit(name)
     ]
 
 
@@ -236,7 +247,7 @@ def pipe_row(name: str, subject: Subject, setting: Setting, how: Extent) -> Row:
     }
     budgets = {"error / condition": limits.LIGHT_PIPE, MISCLASSIFIED: 0.0} if at_limit(name) else {}
     case, axis = f"light pipe, {how.reflections} reflections", [float(x).hex() for x in frame(setting.precision)[2]]
-    replay = {"reflections": how.reflections, "rays": rays, "axis": axis}
+    replay = {"reflections": how.reflections, "rays": rays, "axis": axis, "seed": seeds.current(SEED)}
     return Row(NAME, name, case, setting.label, values, budgets, reason=how.remark, replay=replay)
 
 
@@ -285,4 +296,5 @@ def system_row(name: str, subject: Subject, case: str, setting: Setting) -> Row:
     return Row(NAME, name, case, setting.label, values, budgets, replay=replay)
 
 
-STUDY = Study(NAME, "Stability", about(__doc__), TERMS, tasks, axes=AXES, again=repeated.by_tasks(tasks))
+RECORDS = (*backends.DOCUMENTED, backends.BUILTIN, PROBLEM)
+STUDY = Study(NAME, "Stability", about(__doc__), TERMS, tasks, axes=AXES, again=drawn_rows, records=RECORDS)

@@ -16,22 +16,19 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refract.plugins import PLUGIN
-from mi_refract.rendering import scene_files
 from mi_refract.report.row import Row
-from mi_refract.scene_export import from_mitsuba, targets
+from mi_refract.scene_export import from_mitsuba
 from mi_refract.scene_export.plain_scene import Camera, Diffuse, Light, Material, Mesh, PlainScene
 from validation import limits
-from validation.run import render_methods
 from validation.run.context import SCENES, Context
 from validation.study import Study, Task, about
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
-from .rendered_images import THREE, askew, why_not
+from .rendered_images import RENDERS, THREE, askew, by_plugin, why_not
 from .renderers import SYSTEMS, environments
 
 NAME = "exports"
-SEEDS = range(1, 5)  # of the renders of a side
+SEEDS = range(1, RENDERS + 1)  # of the other renderer's
 SPP, SIZE = 512, (16, 9)
 OVER, NOISE = "RMSE / allowed", "noise / mean"
 TERMS = {
@@ -91,10 +88,7 @@ def drawn(title: str) -> np.ndarray:
 @functools.cache
 def reference(diffuse: bool) -> np.ndarray:
     """Renders by this plugin, in the present variant: renders × height × width × 3."""
-    with tempfile.TemporaryDirectory() as folder:
-        targets.write(scene(diffuse), "mitsuba", Path(folder) / "scene")
-        camera = render_methods.Camera(scene_files.load_scene(Path(folder) / "scene" / "scene.xml", {"bsdf": PLUGIN}))
-        return np.stack([camera(SPP, 1000 + i)[0] for i in range(len(SEEDS))])
+    return np.stack(by_plugin(scene(diffuse), SPP)).astype(np.float64)
 
 
 def compared(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 
@@ -23,7 +22,7 @@ from mi_refract.planar import scene_file
 from mi_refract.planar.path_tree import follow_scene
 from mi_refract.report.row import Row
 from validation import limits
-from validation.reference.exact_lens import Crossing, Lens, crossing
+from validation.reference.exact_lens import ACHROMAT, START, Rounding, bound, crossing, on_axis
 from validation.run.context import SCENES, Context
 from validation.run.metrics import ERROR_OVER_BOUND
 from validation.study import Study, Task, about
@@ -32,9 +31,8 @@ from .renderers import SYSTEMS, System, environments
 
 NAME = "achromat by others"
 FILE = SCENES / "planar" / "achromat.toml"
-LENS = Lens((0.02154, -0.02322, -0.00199), (6.0, 2.5))
 GLASSES = ("SCHOTT", "N-BK7"), ("SCHOTT", "F2")
-START, RADIUS = -20.0, 12.5  # where rays begin, and the rim of the lens in the file
+RADIUS = 12.5  # the rim of the lens in the file
 HEIGHTS = (1e-3, 10.0)  # close to the axis, and at the edge
 GIVEN, OWN = "same indices", "own glasses"
 U = 2.0**-53
@@ -51,27 +49,14 @@ TERMS = {
 }
 
 
-@dataclass(frozen=True)
-class Rounding:
-    """How far a way to trace may round, in u. `sine`, `normal`: of a direction, times these of the ray and the normal.
-
-    `turn`: of a direction, whatever it is. `bend`: of each curvature, relative.
-    """
-
-    sine: float
-    normal: float
-    turn: float
-    bend: Sequence[float]
-
-
 # The sine after a surface is k sin + γ sin_n: γ = k cos − cos_t is off by up to 7u and a normal's sine by 1u of itself.
 THEIRS = Rounding(8.0, 8.0, 0.0, (1.0, 1.0, 1.0))
 
 
 # An arc is kept by its ends and its control point, each of them rounded: a curvature as its sag is. The gradient of its
 # conic has the axis where rounding puts it, so a normal may turn by a few u on the axis, too.
-SAGS = [abs(c) * RADIUS**2 / 2 for c in LENS.curvatures]
-OURS = Rounding(0.0, 0.0, 16.0, [4 * (v + sag) / sag for v, sag in zip(LENS.vertices, SAGS, strict=True)])
+SAGS = [abs(c) * RADIUS**2 / 2 for c in ACHROMAT.curvatures]
+OURS = Rounding(0.0, 0.0, 16.0, [4 * (v + sag) / sag for v, sag in zip(ACHROMAT.vertices, SAGS, strict=True)])
 
 
 @dataclass(frozen=True)
@@ -116,7 +101,7 @@ def answered(title: str, answer: Answer) -> list[Row]:
     for i in range(len(HEIGHTS)):
         for case in (GIVEN, OWN):
             used = indices if case == GIVEN else answer.indices
-            found, own = _axis(answer.rays[case][:, i]), _axis(ours[:, i])
+            found, own = on_axis(answer.rays[case][:, i]), on_axis(ours[:, i])
             row = _row(title, case, i, answer.rays[case], used, THEIRS)
             shifts, expected = (x - x[wavelengths().index(LINES["d"])] for x in (found, own))
             values = {FOCUS_OFF: float(np.abs(found / own - 1).max())}
@@ -131,38 +116,19 @@ def answered(title: str, answer: Answer) -> list[Row]:
 
 def _row(title: str, case: str, i: int, rays: np.ndarray, indices: np.ndarray, rounding: Rounding) -> Row:
     """Rays at the height number `i` against the exact trace for these indices; the focal shifts of each wavelength."""
-    height, found = HEIGHTS[i], _axis(rays[:, i])
-    exact = [crossing(LENS, (1.0, *n, 1.0), height, START) for n in indices.T.tolist()]
+    height, found = HEIGHTS[i], on_axis(rays[:, i])
+    exact = [crossing(ACHROMAT, (1.0, *n, 1.0), height, START) for n in indices.T.tolist()]
     off = [float(abs(Decimal(x) - e.place)) for x, e in zip(found.tolist(), exact, strict=True)]
     at = dict(zip(wavelengths(), found.tolist(), strict=True))
     values = {
         OFF: max(x / float(e.place) for x, e in zip(off, exact, strict=True)),
-        ERROR_OVER_BOUND: max(x / bound(e, rounding) for x, e in zip(off, exact, strict=True)),
+        ERROR_OVER_BOUND: max(x / bound(ACHROMAT, e, rounding, U) for x, e in zip(off, exact, strict=True)),
         f"at {LINES['d']:g} nm": at[LINES["d"]],
     }
     values |= {f"shift at {w:g} nm": x - at[LINES["d"]] for w, x in at.items() if w != LINES["d"]}
     replay = {"height": height, "glasses": [":".join(glass) for glass in GLASSES], "indices": indices.tolist()}
     budgets = {ERROR_OVER_BOUND: limits.LENS_TRACE}
     return Row(NAME, title, f"{case}, height {height:g}", "float64", values, budgets, replay=replay)
-
-
-def bound(exact: Crossing, rounding: Rounding) -> float:
-    """Of the error of a crossing: each error at its worst, times how far it moves the crossing, and the last formula.
-
-    A distance to a sphere is off by 8u of what it is computed from, up to the radius; coordinates by 2u of themselves.
-    """
-    total = 4.0 * abs(float(exact.place))
-    reach = max(-START, *LENS.vertices)
-    for i, (met, curvature) in enumerate(zip(exact.meetings, LENS.curvatures, strict=True)):
-        worst = {
-            "turn": rounding.turn + rounding.sine * abs(met.sine) + rounding.normal * abs(met.normal),
-            "slide": 8 * max(1 / abs(curvature), reach),
-            "height": 2 * abs(met.y),
-            "depth": 2 * reach,
-            "bend": rounding.bend[i],
-        }
-        total += sum(exact.moves[kind][i] * size for kind, size in worst.items())
-    return total * U
 
 
 @functools.cache
@@ -190,8 +156,8 @@ def wavelengths() -> tuple[float, ...]:
 def question() -> dict[str, object]:
     """What a script of a system reads."""
     return {
-        "curvatures": LENS.curvatures,
-        "thicknesses": LENS.thicknesses,
+        "curvatures": ACHROMAT.curvatures,
+        "thicknesses": ACHROMAT.thicknesses,
         "start": START,
         "heights": HEIGHTS,
         "wavelengths": wavelengths(),
@@ -216,12 +182,6 @@ def parsed(text: str) -> Answer:
     if not all(np.isfinite(each).all() for each in (indices, *rays.values())):
         raise ValueError("a number that is not finite; expected the rays after the lens")
     return Answer(system, indices, rays)
-
-
-def _axis(rays: np.ndarray) -> np.ndarray:
-    """z where the rays (N, 4) cross the axis."""
-    z, y, dz, dy = rays.T
-    return np.asarray(z - y * dz / dy)
 
 
 STUDY = Study(NAME, "An achromat by others", about(__doc__), TERMS, tasks)

@@ -223,11 +223,16 @@ def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
 @functools.cache
 def reference(scene: str, size: Size) -> list[Image]:
     """Of this plugin, in the present variant."""
-    with tempfile.TemporaryDirectory() as folder:
-        targets.write(SCENES[scene].load(size.resolution), "mitsuba", Path(folder) / "scene")
-        camera = Camera(scene_files.load_scene(Path(folder) / "scene" / "scene.xml", {"bsdf": PLUGIN}))
-        renders = [mean(camera, SCENES[scene].more * size.spp, OURS + i) for i in range(RENDERS)]
+    renders = by_plugin(SCENES[scene].load(size.resolution), SCENES[scene].more * size.spp)
     return [image_file.named(f"{PLUGIN} {scene} {i}", pixels) for i, pixels in enumerate(renders)]
+
+
+def by_plugin(plain: PlainScene, spp: int) -> list[np.ndarray]:
+    """RENDERS images, each height × width × 3, of a scene by this plugin as it is exported for Mitsuba."""
+    with tempfile.TemporaryDirectory() as folder:
+        targets.write(plain, "mitsuba", Path(folder) / "scene")
+        camera = Camera(scene_files.load_scene(Path(folder) / "scene" / "scene.xml", {"bsdf": PLUGIN}))
+        return [mean(camera, spp, OURS + i) for i in range(RENDERS)]
 
 
 def measured(comparison: Comparison, ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
