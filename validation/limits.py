@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 
+from mi_refract.formulas import bounds
 from validation.run.metrics import EQUAL_TIME, EQUAL_TIME_DEFAULTS
 
 
@@ -193,10 +194,7 @@ LENS_TRACE = limit(1.0, "the bound adds up every rounding at its worst, see `val
 OTHER_INDEX = limit(
     1.02, "factor between the largest difference of an index and the recorded one, of three digits; the data are locked"
 )
-# In u, with c = cos θ_i, e = k sin θ_i, q = k c − √R: the radicand R = 1 − k² (1 − c²) is off by
-# ΔR = k² (6c + 5c² + sin² θ_i) + 2e² + 1, the vectors' own lengths included, and a direction by
-# (k + |q| + 1 + e + e (ΔR/2 + 2√R (k c + |q| + 1))) / (k c + |q| + e); a decision by ΔR / (2 (2k c + 1)).
-TEXTBOOK_BACKWARD = limit(8.0, "u: 7.8 for directions and 5.8 for decisions, the largest of all angles at k up to 2.5")
+TEXTBOOK_BACKWARD = limit(bounds.TEXTBOOK_BACKWARD, "u: derived there, for k up to 2.5")
 SUITE_ERROR = limit(1e-4, "probability of any alarm in a pair of equal images")
 LINE_DETECTABLE = limit(0.01, "of the image's mean: with more noise a dispersive image could be wrong and pass")
 

@@ -28,6 +28,11 @@ A decision on total internal reflection is exact for inputs on the other side of
 
 or |θ_i − asin(1/k)| / 2, where that is less: by turning a and n alone.
 
+The length of an answer has a backward error of its own. Its parts along the surface, e, and across it, √(1 − e²), may
+be those of different inputs, each within ε. Then e is off by ε (2 k cos θ_i + e) in either, so that
+
+    | |b|² − 1 | ≤ 4 ε e (2 k cos θ_i + e) ≤ 4 ε (2 k + 1)     with k = 1 of a mirror direction
+
 Source: Higham, Accuracy and Stability of Numerical Algorithms, 2002, 1.5. In extended precision: n × w, of terms up to
 k, is off by 8·2⁻⁶⁴ k, and h ≥ k; b − m by as much, and h ≥ 1. So a backward error is right to 2⁻⁶¹, 2⁻⁸ u of float64.
 """
@@ -78,6 +83,18 @@ def _least(defect: Array, axis: Array, ellipse: tuple[Array, Array], other: tupl
         cos, sin = np.cos(turn), np.sin(turn)
         h = np.sqrt((a * cos) ** 2 + (b * sin) ** 2) + np.sqrt((c * cos) ** 2 + (d * sin) ** 2) + segment * cos
         np.fmax(found, (x * cos + y * sin) / h, out=found)
+    return found
+
+
+@np.errstate(all="ignore")
+def of_lengths(b: Array, rays: Rays, reflected: NDArray[np.bool_]) -> Array:
+    """(N,) the backward errors of the lengths of `b` (N, 3), which are to be 1 or |a|: the smaller one counts.
+
+    `reflected`: (N,) whose b is a mirror direction. NaN where b is not finite.
+    """
+    k, length = np.where(reflected, 1, rays.k.astype(np.longdouble)), lengths(b)
+    off = np.fmin(np.abs(length**2 - 1), np.abs((length / lengths(rays.a)) ** 2 - 1))
+    found: Array = (off / (4 * (2 * k + 1))).astype(float)
     return found
 
 

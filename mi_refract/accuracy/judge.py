@@ -141,6 +141,16 @@ class RayBounds:
         return np.asarray(self.budget.chord(self.u, self.k, exact.cos_t, exact.transmitted, self.unit, exact.cos_i))
 
     @functools.cached_property
+    def length(self) -> Array:
+        """Bound of the error of the length, relative.
+
+        The square of the part across the surface is off by the radicand's error, x; all else by what is linear in u.
+        """
+        x = np.where(self.exact.transmitted, self.budget.radicand_error_bound(self.u, self.k), 0.0)
+        shorter = np.where(x < 1, x / (1 + np.sqrt(np.maximum(1 - x, 0))), 1.0)
+        return np.asarray(self.of_terms + np.maximum(shorter, np.sqrt(1 + x) - 1))
+
+    @functools.cached_property
     def decided(self) -> Flags:
         """Where total internal reflection must be decided rightly: the radicand exceeds the error the bound allows."""
         return self.decided_of(np.ones(len(self.rays), bool))
@@ -169,16 +179,21 @@ class Judgement:
     chord: Array  # |b/|a| − exact|; infinite where b is NaN
     angle: Array  # radians
     drift: Array  # of the length of b, relative
-    error: Array  # what the bound is of: the chord; of normalised answers the larger of angle and drift
+    error: (
+        Array  # what `bounds.chord` is of: the chord; of normalised answers the angle, and drift has a bound of its own
+    )
     compared: Flags
     misjudged: Flags  # transmitted where all is reflected, or the reverse
     blank: Flags  # neither a direction nor a sign of total internal reflection
 
     @functools.cached_property
-    @np.errstate(over="ignore")
+    @np.errstate(over="ignore", invalid="ignore")
     def share(self) -> Array:
-        """Error over bound of the rays compared, 0 elsewhere."""
-        return np.where(self.compared, self.error / self.bounds.chord, 0.0)
+        """Error over bound of the rays compared, 0 elsewhere; of normalised answers also that of the length."""
+        share = self.error / self.bounds.chord
+        if self.bounds.normalised:
+            share = np.maximum(share, self.drift / self.bounds.length)
+        return np.where(self.compared, share, 0.0)
 
     @functools.cached_property
     def far(self) -> Flags:
@@ -242,7 +257,7 @@ def judge(
     return Judgement(
         bounds,
         *found,
-        error=np.maximum(found.angle, found.drift) if bounds.normalised else found.chord,
+        error=found.angle if bounds.normalised else found.chord,
         compared=~misjudged & known & directed,
         misjudged=misjudged,
         blank=np.broadcast_to(blank, len(exact)),

@@ -14,6 +14,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from mi_refract.formulas import TEXTBOOK_BACKWARD
 from mi_refract.io.image_file import provenance
 from mi_refract.io.safe_files import writable
 from mi_refract.io.text import printable
@@ -75,7 +76,8 @@ Backward = Annotated[
     typer.Option(
         "--backward-error",
         metavar="M",
-        help="Also require each answer to be exact for inputs perturbed by at most M roundings (a sound program: 4).",
+        help="Also require each answer, and its length, to be exact for inputs perturbed by at most M roundings "
+        f"(a sound program: {TEXTBOOK_BACKWARD:g}, for ratios of indices up to 2.5).",
     ),
 ]
 Report = Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML page.")]
@@ -123,7 +125,8 @@ def check(
 ) -> None:
     """Check a file of answers against certified ones.
 
-    Exit code 0: no answer is wrong; 1: some are; 2: the answers do not match the rays.
+    Exit code 0: every answer is within the error bound, though not all may be right; 1: some are wrong; 2: the answers
+    do not match the rays.
     """
     checked = _checker(context, tir, formula, backward, report, junit, json)
     rays = files.read(file) if file else ray_set.make()
@@ -173,8 +176,9 @@ def run(
 ) -> None:
     """Run a command on rays and check its answers.
 
-    Exit code 0: no answer is wrong; 1: some are; 2: the answers do not match the rays, or the command fails or exceeds
-    its time limit. With --renderer, the largest exit code of its functions.
+    Exit code 0: every answer is within the error bound, though not all may be right; 1: some are wrong; 2: the answers
+    do not match the rays, or the command fails or exceeds its time limit. With --renderer, the largest exit code of its
+    functions.
     """
     checked = _checker(context, tir, formula, backward, report, junit, json)
     for name in (*CHOOSING, *([] if renderer else ["precision"])) if file else ():

@@ -6,7 +6,7 @@ answer may be from the exact one. Nothing here imports Mitsuba.
 """
 
 from . import fresnel
-from .bounds import NEGLIGIBLE, ROUNDING, UNIT, Budget, cancelling, radicand_for
+from .bounds import NEGLIGIBLE, ROUNDING, TEXTBOOK_BACKWARD, UNIT, Budget, cancelling, radicand_for
 from .documented import contract, reflect, reflect_sandwich, refract_2d, wedge
 from .table import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, Formula, automatic, resolve
 from .well_conditioned import LocalCosines, Refracted, local_cosines
@@ -17,6 +17,7 @@ __all__ = [
     "NEGLIGIBLE",
     "ROUNDING",
     "SMALLEST_RATIO",
+    "TEXTBOOK_BACKWARD",
     "UNIT",
     "Budget",
     "Formula",

@@ -121,3 +121,11 @@ def cancelling(growth: int) -> Budget:
 # (n·a)² − κ w²: at the critical angle c² = 1 − 1/k² is off by 2c (2 + c) u + c² u, κ w² by 2κw (1 + w) u + 3κw² u + u.
 # Their sum is 6.7uK at k = 1.5, 7.3uK at k = 2.5, 4.8uK at k = 5. Both terms scale alike with |a| and |n|.
 CONTRASTING = Budget(10, 8, 1, side=SIDE)
+
+# In u: what rounding leaves of the backward error of `decomposed` (see `mi_refract.accuracy.backward_error`) at k up to
+# 2.5. With c = cos θ_i, e = k sin θ_i, q = k c − √R: the radicand R = 1 − k² (1 − c²) is off by
+# ΔR = k² (6c + 5c² + sin² θ_i) + 2e² + 1, the vectors' own lengths included; what is linear, by k + |q| + 1 + e. So are
+#   directions  (k + |q| + 1 + e + e (ΔR/2 + 2√R (k c + |q| + 1))) / (k c + |q| + e)   7.8 at most
+#   decisions   ΔR / (2 (2k c + 1)), at e = 1                                          5.8
+#   lengths     (ΔR + 2 (k + |q| + 1 + e)) / (4 (2k + 1))                              3.4
+TEXTBOOK_BACKWARD = 8.0

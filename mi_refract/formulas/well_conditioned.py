@@ -102,7 +102,7 @@ def refract_promoted(
     itself still scales the tangent. `local`: `local_cosines`, where `n` is an axis and they are known already.
     Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted (). `a`, `n` of any length from 1e-18 to 1e18.
     Source: this project.
-    Weak nowhere for k ≤ 2²⁰; slow where float64 is (consumer GPUs).
+    Weak nowhere for k ≤ 2²⁰, if denormal numbers are not taken for 0; slow where float64 is (consumer GPUs).
     """
     if dr.type_v(a) != dr.VarType.Float32:
         return refract_compensated(a, n, k, contrast)
@@ -140,7 +140,7 @@ def refract_compensated(a: Vector3, n: Vector3, k: Number, contrast: Number = No
     A plain evaluation b₀ (a few u off) is corrected by its exact defect in the two equations that define b, so the
     sum b₀ + δ is rounded once. `contrast`: κ where it is known better than k, for the radicand; `k` itself still
     scales the tangent. Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted (). Source: this project.
-    Weak nowhere.
+    Weak nowhere, if denormal numbers are not taken for 0.
     Precondition in float32: lengths of 1e-3 to 1e3, so that no product of four over- or underflows
     (`numerics.scale_to_unit` sees to it, in the entries of FORMULAS).
     """

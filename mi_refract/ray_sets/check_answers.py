@@ -54,10 +54,11 @@ class RegimeErrors:
     judged: int  # rays compared that are not undecidable
     wrong: int  # rays beyond their bound: angle, length or TIR; without a direction, or with an impossible one
     exact: int  # answers that are the certified ones, rounded
-    right: int  # answers that are the exact ones of inputs within RIGHT u, and not wrong
-    backward_median: float  # of the backward errors, in u
+    right: int  # answers that are the exact ones of inputs within RIGHT u, their lengths too, and not wrong
+    backward_median: float  # of the backward errors of directions and decisions, in u
     backward_p99: float
     backward_worst: float
+    backward_length: float  # the largest backward error of a length, in u
     replay: dict[str, Any]  # the ray with the largest ratio, in hexadecimal floats
 
 
@@ -131,7 +132,7 @@ class Findings:
 
     @property
     def exit_code(self) -> int:
-        """0: all answers are within the bound. 1: some are wrong. 2: missing, duplicate, or answers to other rays.
+        """0: all answers are within the error bound, right or not. 1: some are wrong. 2: they do not match the rays.
 
         1 also where no direction was judged: a program that answers only undecidable rays has shown nothing.
         """
@@ -166,9 +167,9 @@ def check(
 
     `tir`: how the answers signal total internal reflection, one of TIR; detected where it is AUTO. `error_bound`: the
     formula of FORMULAS whose a-priori bound the errors must keep. `most_backward`: the largest backward error, in u, of
-    an answer that is not wrong. `piece`: rays certified or judged at once; the findings do not depend on it. ValueError
-    as of `check_options`, for tir = FLAG without the column `transmitted`, or answers whose header is that of other
-    rays.
+    the direction and of the length of an answer that is not wrong. `piece`: rays certified or judged at once; the
+    findings do not depend on it. ValueError as of `check_options`, for tir = FLAG without the column `transmitted`, or
+    answers whose header is that of other rays.
     """
     check_options(tir, error_bound, most_backward)
     if tir == FLAG and answers.transmitted is None:
@@ -272,6 +273,7 @@ def _by_regime(rays: RaySet, answers: Answers, table: Table) -> Iterator[RegimeE
             backward_median=_quantile(backward, 0.5),
             backward_p99=_quantile(backward, 0.99),
             backward_worst=_quantile(backward, 1),
+            backward_length=float(part["backward_length"].max()),
             replay={
                 "id": int(rays.ids[worst[0]]),
                 **ray.hexed(0),

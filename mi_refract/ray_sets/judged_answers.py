@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract import oracle
-from mi_refract.accuracy import Judgement, RayBounds, absolute_radicand, backward_error, judge, lengths
-from mi_refract.formulas import FORMULAS, ROUNDING, Budget
+from mi_refract.accuracy import Judgement, RayBounds, backward_error, judge, lengths
+from mi_refract.formulas import FORMULAS, ROUNDING, TEXTBOOK_BACKWARD, Budget
 from mi_refract.regimes import Array, Rays
 
 from . import tir_signal
@@ -34,7 +34,7 @@ Table = NDArray[np.void]  # a row for each ray, of named columns
 
 UNDECIDABLE = 0.1  # radians: a direction is not judged where its bound is larger
 WIDEST_BOUND = 1e-3  # radians: under a wider bound an answer is no evidence of a mistake
-RIGHT = 4.0  # in u: what rounding a, n and k, and a few operations on them, leaves of an answer's backward error
+RIGHT = TEXTBOOK_BACKWARD  # in u: the largest backward error of a right answer
 F32 = 2.0**-24
 MOST_DIGITS = 15
 
@@ -45,19 +45,26 @@ class JudgedAnswers:
 
     `impossible`: the error bound excuses the direction, and no documented formula gives it all the same. `backward`:
     backward errors in u, of the direction; of the decision, where a transmitted ray is called reflected.
-    `most_backward`: in u, beyond which an answer is wrong.
+    `backward_length`: those of the length, 0 where none is judged. `most_backward`: in u, beyond which an answer is
+    wrong.
     """
 
     b: Array
     verdict: Judgement
     impossible: Flags
     backward: Array
+    backward_length: Array
     most_backward: float = np.inf
+
+    def backward_within(self, most: float) -> Flags:
+        """Whether the backward errors of direction, or decision, and length are at most this, in u."""
+        within: Flags = np.maximum(self.backward, self.backward_length) <= most
+        return within
 
     @property
     def wrong(self) -> Flags:
         """The wrong answers."""
-        return self.verdict.wrong | self.impossible | ~(self.backward <= self.most_backward)
+        return self.verdict.wrong | self.impossible | ~self.backward_within(self.most_backward)
 
     @property
     def table(self) -> Table:
@@ -66,15 +73,15 @@ class JudgedAnswers:
         """
         verdict, bounds, zero, wrong = self.verdict, self.verdict.bounds, ~self.b.any(axis=1), self.wrong
         undecidable = bounds.chord > UNDECIDABLE
-        u, k, exact = 2 * F32, bounds.k, bounds.exact  # u of the inputs, u of the formula
-        single = bounds.budget.chord(u, k, exact.cos_t, exact.transmitted, cos_i=exact.cos_i)
-        lost = verdict.misjudged & (absolute_radicand(bounds.rays) <= bounds.budget.radicand_error_bound(u, k))
-        printed = verdict.compared & (verdict.error <= bounds.chord + 10.0 ** -np.arange(1, MOST_DIGITS + 1)[:, None])
+        single = replace(verdict, bounds=replace(bounds, roundoff=2 * F32))  # u of the inputs, u of the formula
+        rest = np.maximum(verdict.error - bounds.chord, verdict.drift - bounds.length)
+        printed = verdict.compared & (rest <= 10.0 ** -np.arange(1, MOST_DIGITS + 1)[:, None])
         columns: dict[str, NDArray[Any]] = {
             "angle": verdict.angle,
             "drift": verdict.drift,
             "share": verdict.share,
             "backward": self.backward,
+            "backward_length": self.backward_length,
             "compared": verdict.compared,
             "blank": verdict.blank,
             "non-finite": verdict.blank & ~zero,
@@ -87,10 +94,10 @@ class JudgedAnswers:
             "evidence": bounds.decided & (bounds.chord <= WIDEST_BOUND),
             "beyond_bound": verdict.wrong,
             "wrong": wrong,
-            "right": ~wrong & (self.backward <= RIGHT),
+            "right": ~wrong & self.backward_within(RIGHT),
             "exact": verdict.meets(ROUNDING),
             "digits": printed.sum(0, dtype=np.int8),
-            "float32": verdict.compared & (verdict.error <= single) | lost,
+            "float32": ~single.wrong,
             "lengths": verdict.compared & (verdict.angle <= bounds.chord),
         }
         table = np.empty(len(self.b), [(name, column.dtype) for name, column in columns.items()])
@@ -139,19 +146,22 @@ def judge_answers(
     verdict = judge(seen.b, ~reflected, bounds, transmits | (tir == "reflected"), blank)
 
     mirror, lost = reflected & (tir == "reflected"), reflected & transmits
-    error, directed = np.zeros(len(seen.b)), ~reflected | (mirror & ~transmits)
-    error[directed] = backward_error.of_directions(seen.b[directed], rays[directed], mirror[directed])
+    error, length = np.zeros((2, len(seen.b)))
+    directed = (~reflected | (mirror & ~transmits)) & ~blank
+    of_directed = seen.b[directed], rays[directed], mirror[directed]
+    error[directed], length[directed] = (
+        backward_error.of_directions(*of_directed),
+        backward_error.of_lengths(*of_directed),
+    )
     error[lost] = backward_error.of_decisions(rays[lost])
     with np.errstate(over="ignore"):
-        backward = np.where(blank, np.inf, error / seen.u)
+        backward, backward_length = np.where(blank, np.inf, error / seen.u), length / seen.u
 
-    # Of the directions that `verdict` does not compare, or under a wide bound only.
-    candidates = seen.is_direction & (~verdict.compared | (bounds.chord > UNDECIDABLE))
-    loosest, impossible = replace(bounds, budget=FORMULAS[LOOSEST].budget), np.zeros(len(candidates), bool)
+    loosest, impossible = replace(bounds, budget=FORMULAS[LOOSEST].budget), np.zeros(len(error), bool)
     for mask, signal in ((~reflected, ""), (reflected & (tir == "tangent"), tir), (mirror, tir)):
-        some = np.flatnonzero(candidates & mask)
+        some = np.flatnonzero(seen.is_direction & mask)
         impossible[some] = ~possible(seen.b, loosest, some, signal)
-    return JudgedAnswers(seen.b, verdict, impossible, backward, most_backward)
+    return JudgedAnswers(seen.b, verdict, impossible, backward, backward_length, most_backward)
 
 
 def possible(b: Array, bounds: RayBounds, some: Index, signal: str = "") -> Flags:

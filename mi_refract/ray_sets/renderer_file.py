@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from string import Formatter
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -127,14 +128,20 @@ def load(folder: str | Path) -> RendererFile:
 def filled(command: tuple[str, ...], **values: object) -> list[str]:
     """A command with its placeholders filled in; {python} is this interpreter and {environment} "." unless given.
 
-    ValueError for a placeholder that is unknown.
+    ValueError for a placeholder that is unknown, or has more to it than its name.
     """
     known = {"python": sys.executable, "environment": "."} | values
-    try:
-        return [word.format_map({name: str(value) for name, value in known.items()}) for word in command]
-    except (KeyError, IndexError, ValueError, AttributeError) as error:
-        expected = ", ".join(f"{{{name}}}" for name in known)
-        raise ValueError(f"command: {' '.join(command)}: {error}; expected {expected}") from None
+    words = []
+    for word in command:
+        try:
+            parts = [(text, field, more or conversion) for text, field, more, conversion in Formatter().parse(word)]
+            if wrong := [field for _, field, more in parts if field is not None and (more or field not in known)]:
+                raise ValueError(repr(wrong[0]))
+        except ValueError as error:
+            expected = ", ".join(f"{{{name}}}" for name in known)
+            raise ValueError(f"command: {' '.join(command)}: {error}; expected {expected}") from None
+        words.append("".join(text + (str(known[field]) if field is not None else "") for text, field, _ in parts))
+    return words
 
 
 def reference() -> str:

@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 
 SCHEMA = 1
 STYLES = {"wrong": "bold red", "within bound": "yellow", "right": "", "exact": "green"}
-MEANING = f"right: backward error m ≤ {RIGHT:g} u (exact for inputs perturbed by at most {RIGHT:g} roundings)"
+MEANING = (
+    f"right: backward error m ≤ {RIGHT:g} u (direction and length are exact for inputs perturbed by at most {RIGHT:g} "
+    "roundings)"
+)
 _SIGNALLED = "total internal reflection is signalled by"
 SIGNALS = {
     "zero": f"{_SIGNALLED} the zero vector",
@@ -35,7 +38,7 @@ SIGNALS = {
     "reflected": f"{_SIGNALLED} the mirror direction",
     "tangent": f"{_SIGNALLED} a vector along the surface",
     "flag": f"{_SIGNALLED} transmitted = 0",
-    NONE: "no ray is totally reflected",
+    NONE: "no answer signals total internal reflection",
     UNCLEAR: "the signal of total internal reflection is unknown or inconsistent; expected the zero vector, NaN, the "
     "mirror direction, a vector along the surface, or a column `transmitted`",
 }
@@ -45,8 +48,8 @@ PROBLEM_TEXTS = {
     "unknown": "{} answers to rays that are not in the set",
     "non-finite": "{} answers are NaN or infinite, which is not the signal of total internal reflection",
     "zero": "{} answers are the zero vector, which is not the signal of total internal reflection",
-    "impossible": "{} answers are outside the plane of incidence, or on the wrong side of the surface, by more than "
-    "the rounding of any documented formula explains",
+    "impossible": "{} answers are directions that the rounding of no documented formula explains, such as outside the "
+    "plane of incidence, or on the wrong side of the surface",
     "index": "{} answers used a different ratio of indices (n_ratio)",
 }
 
@@ -73,8 +76,8 @@ def sentence(findings: Findings) -> str:
         if findings.right == findings.answered:
             text = f"{answers}, all right; {worst}"
         else:
-            within = f"the others are within the error bound of the formula {findings.error_bound}"
-            text = f"{findings.right} of {answers} are right, {within}; {worst}"
+            text = f"{findings.right} of {answers} are right, {findings.answered - findings.right} only within the "
+            text += f"error bound of the formula {findings.error_bound}; {worst}"
             if wide := findings.total("undecidable"):
                 text += f"; {wide} rays are undecidable (error bound above 0.1 rad)"
     others = findings.problem_count("index")
@@ -139,7 +142,7 @@ def cells(errors: RegimeErrors, ulp: float) -> dict[str, str]:
         "TIR beyond bound": str(errors.tir_beyond_bound),
         "length error": of_directions(errors.length_error),
         "error / bound": compact(errors.error_over_bound),
-        **{f"m, {name}": compact(getattr(errors, f"backward_{name}")) for name in ("median", "p99", "worst")},
+        **{f"m, {name}": compact(getattr(errors, f"backward_{name}")) for name in ("median", "p99", "worst", "length")},
         "right": f"{errors.right / errors.rays:.1%}",
         "exact": f"{errors.exact / errors.rays:.1%}",
         "wrong": str(errors.wrong),

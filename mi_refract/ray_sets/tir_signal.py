@@ -18,7 +18,7 @@ from .header import FLAG
 
 Flags = NDArray[np.bool_]
 
-# Results of `detect` beside the signals: no ray is totally reflected; the answers use no known signal.
+# Results of `detect` beside the signals: no answer need be one; the answers use no known signal, or several.
 NONE, UNCLEAR = "none", "unclear"
 # The documented formula with the largest error bound.
 LOOSEST = max(FORMULAS, key=lambda name: (FORMULAS[name].budget.growth, FORMULAS[name].budget.radicand))
@@ -55,7 +55,7 @@ def unit(v: Array) -> Array:
 
 def _is_mirrored(seen: SeenAnswers) -> Flags:
     """(N,) whether b is nearer to the mirror direction than to the transmitted one, or to the surface where nothing is
-    transmitted. Where these two directions are one, the exact answer decides.
+    transmitted. Where these two directions are one, the exact answer decides, for an answer along them.
     """
     a, n, transmitted = unit(seen.rays.a), unit(seen.rays.n), seen.exact.transmitted
     normal = (a * n).sum(1, keepdims=True) * n
@@ -63,7 +63,8 @@ def _is_mirrored(seen: SeenAnswers) -> Flags:
         onward = np.where(transmitted[:, None], seen.exact.direction, unit(a - normal))
         b = seen.b / np.sqrt((seen.b * seen.b).sum(1, keepdims=True))
         to_mirror, to_onward = (np.sqrt(((b - end) ** 2).sum(1)) for end in (a - 2 * normal, onward))
-        return np.where(np.abs(to_mirror - to_onward) <= seen.tolerance, ~transmitted, to_mirror < to_onward)
+        alike, along = np.abs(to_mirror - to_onward) <= seen.tolerance, to_mirror <= 2 * seen.tolerance
+        return np.asarray(np.where(alike, ~transmitted & along, to_mirror < to_onward))
 
 
 def _is_tangent(seen: SeenAnswers) -> Flags:
@@ -85,16 +86,20 @@ DETECTORS: dict[str, Callable[[SeenAnswers], Flags]] = {
 def detect(pieces: Iterable[SeenAnswers]) -> str:
     """The signal that the answers to totally reflected rays agree on, or NONE, or UNCLEAR. `pieces`: of one set.
 
-    Where some rays are far beyond the critical angle, they decide alone.
+    Rays far beyond the critical angle decide alone. Where there is none, rays near it on either side do, and a program
+    may transmit any of them, nearly along the surface: only the other signals count, unless nothing else is there.
     """
     counts = np.zeros((2, 1 + len(DETECTORS)), int)  # rays, and those that use each signal: of all, of those far beyond
     for seen in pieces:
-        reflects = ~seen.exact.transmitted & (seen.exact.cos_i > 0)
         bound = FORMULAS[LOOSEST].budget.radicand_error_bound(seen.u, seen.rays.k.astype(float))
-        far = reflects & (absolute_radicand(seen.rays) > np.maximum(CERTAIN, bound))
+        radicand, reflects = absolute_radicand(seen.rays), ~seen.exact.transmitted
+        far = reflects & (radicand > np.maximum(CERTAIN, bound))
         signals = np.array([np.ones(len(far), bool), *(detector(seen) for detector in DETECTORS.values())])
-        counts += [(mask & signals).sum(1) for mask in (reflects, far)]
-    rays, *votes = counts[1 if counts[1, 0] else 0].tolist()
+        counts += [(mask & (seen.exact.cos_i > 0) & signals).sum(1) for mask in (reflects | (radicand <= bound), far)]
+    (_, *near), (rays, *votes) = counts.tolist()
+    if not rays:
+        votes = near[:-1] if any(near[:-1]) else near
+        rays = sum(votes)
     if not rays:
         return NONE
     return list(DETECTORS)[int(np.argmax(votes))] if max(votes) >= AGREEING * rays else UNCLEAR

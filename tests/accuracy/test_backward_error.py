@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from mi_refract import oracle, regimes
-from mi_refract.accuracy import backward_error
+from mi_refract.accuracy import backward_error, lengths
+from mi_refract.formulas import TEXTBOOK_BACKWARD
 from mi_refract.regimes import Rays
 
 EPSILON = 1e-7
@@ -123,3 +124,34 @@ def test_inputs_just_so_far_off_are_on_the_other_side_of_the_critical_angle(dist
     a = np.array([[0.0, 0, -1], [0, 0, -1]])
     found = backward_error.of_decisions(Rays(a, -a, np.array([1e5, 0.5])))
     assert found[0] == pytest.approx(1e-5 / 2) and np.isinf(found[1])
+
+
+def test_what_rounding_leaves_of_the_textbook_s_formula_is_the_largest_of_all_angles():
+    """The bounds at TEXTBOOK_BACKWARD, at k up to 2.5; of decisions at the critical angle."""
+    k, c = np.linspace(1e-3, 2.5, 800)[:, None], np.linspace(1e-6, 1, 2000)
+    e, root2 = k * np.sqrt(1 - c * c), 1 - k * k * (1 - c * c)
+    root = np.sqrt(np.maximum(root2, 0))
+    q, radicand = np.abs(k * c - root), k * k * (6 * c + 5 * c * c + 1 - c * c) + 2 * e * e + 1
+    linear = k + q + 1 + e
+    directions = (linear + e * (radicand / 2 + 2 * root * (k * c + q + 1))) / (k * c + q + e)
+    lengths, decisions = (radicand + 2 * linear) / (4 * (2 * k + 1)), radicand / (2 * (2 * k * c + 1))
+    worst = directions[root2 >= 0].max(), decisions[np.abs(root2) < 1e-3].max(), lengths[root2 >= 0].max()
+    assert worst == pytest.approx((7.8, 5.8, 3.4), abs=0.1) and max(worst) < TEXTBOOK_BACKWARD
+
+
+def test_the_length_of_an_answer_whose_parts_are_those_of_inputs_so_far_off():
+    """The part along the surface of one input, that across it of another."""
+    rng = np.random.default_rng(4)
+    e, found = K * np.sqrt(1 - (A * N).sum(1) ** 2), 0
+    for signs in ((1, 1), (1, -1), (-1, 1)):
+        parts = [np.sin(np.arcsin(e / K) + 2 * s * EPSILON) * K * (1 + s * EPSILON) for s in signs]
+        b = np.stack([parts[0], np.sqrt(1 - parts[1] ** 2), 0 * K], 1) * rng.choice([1.0, 3.0])
+        off = backward_error.of_lengths(
+            b, Rays(A * lengths(b)[:, None].round().astype(float), N, K), np.zeros(len(K), bool)
+        )
+        assert (off <= EPSILON * (1 + 1e-5)).all()
+        found = max(found, off.max())
+    assert found > 0.3 * EPSILON
+    mirror = backward_error.of_lengths(B * (1 + 6 * EPSILON), RAYS, np.ones(len(K), bool))
+    assert mirror == pytest.approx(np.full(len(K), EPSILON), rel=1e-5)
+    assert (backward_error.of_lengths(0 * B, RAYS, np.zeros(len(K), bool)) > 0.01).all()

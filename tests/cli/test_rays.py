@@ -66,7 +66,10 @@ def test_export_and_check(call):
     code, out, err = call("check", "answers.csv", "--rays", "rays.csv")
     assert (code, err) == (0, "")
     assert "120 answers, all right; the largest error is" in out
-    assert "right: backward error m ≤ 4 u (exact for inputs perturbed by at most 4 roundings)" in out
+    assert (
+        "right: backward error m ≤ 8 u (direction and length are exact for inputs perturbed by at most 8 roundings)"
+        in out
+    )
     assert "signalled by the zero vector (detected)" in out
     code, out, _ = call("check", "answers.csv", "--rays", "rays.csv", "--error-bound", "promoted")
     assert (code, "none of the common mistakes explains the answers" in out) == (1, True)
@@ -76,9 +79,9 @@ def test_export_and_check(call):
     answer(files.read("rays.csv"))
     check = "check", "answers.csv", "--rays", "rays.csv"
     assert call(*check)[0] == 0
-    code, out, _ = call(*check, "--backward-error", "4", "--report", "out.html")
+    code, out, _ = call(*check, "--backward-error", "8", "--report", "out.html")
     assert code == 1 and out.splitlines()[-1].endswith("of 60 answers are wrong")
-    assert "--backward-error 4" in Path("out.html").read_text()
+    assert "--backward-error 8" in Path("out.html").read_text()
     Path("answers.csv").write_text("id,bx,by,bz\n0,0,1,0\n1,0,1")
     code, out, err = call(*check)
     assert (code, out, err) == (2, "", "mi-refract: answers.csv: line 3 is '1,0,1'; expected 4 numbers\n")

@@ -108,3 +108,45 @@ BAD = {
     ],
     "missing normalisation": [lambda a, n, k: 1.5 * glsl(a, n, k), lambda a, n, k: glsl(a, n, k) / k[:, None]],
 }
+
+
+def _with_root(radicand, tangent):
+    """b = k t − √R n of a radicand and a tangent t, both functions of (a, n, k, n·a, n × a)."""
+
+    def refract(a, n, k):
+        terms = a, n, k[:, None], dot(n, a), np.cross(n, a)
+        r = radicand(*terms)
+        return np.where(r < 0, 0, k[:, None] * tangent(*terms) - np.sqrt(np.maximum(r, 0)) * n).astype(a.dtype)
+
+    return refract
+
+
+def made_unit(program):
+    def refract(a, n, k):
+        b = program(a, n, k)
+        return np.where(b.any(1, keepdims=True), unit(np.where(b.any(1, keepdims=True), b, 1)), 0).astype(a.dtype)
+
+    return refract
+
+
+def rotated(a, n, k):
+    c = dot(n, a)
+    tangent = a - c * n
+    sine = np.sqrt(dot(tangent, tangent))
+    with np.errstate(all="ignore"):
+        ratio = sine / np.abs(c)
+        x = k[:, None] * ratio / np.sqrt(1 + ratio * ratio)
+        b = x * tangent / np.maximum(sine, np.finfo(a.dtype).tiny) - np.cos(np.arcsin(x)) * n
+    return np.where(x <= 1, b, 0).astype(a.dtype)
+
+
+# The documented formulas in numpy.
+FORMULAS = {
+    "wedge": _with_root(lambda a, n, k, c, w: dot(a, a) - k * k * dot(w, w), lambda a, n, k, c, w: np.cross(w, n)),
+    "wedge_contrast": _with_root(
+        lambda a, n, k, c, w: c * c - (k * k - 1) * dot(w, w), lambda a, n, k, c, w: np.cross(w, n)
+    ),
+    "cross": _with_root(lambda a, n, k, c, w: 1 - dot(k * w, k * w), lambda a, n, k, c, w: np.cross(w, n)),
+    "decomposed": glsl,
+    "rotated": rotated,
+}

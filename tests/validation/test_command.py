@@ -221,11 +221,17 @@ def test_the_accuracy_table_holds_the_rows_and_nothing_else():
     single = ["4.97e-8", "0.834", "3", "1.01 (0.98–1.2)", "1.05"]
     expected = ["`promoted`", "this project", *single, "4.97e-8", "0.834", "1.01 (0.98–1.2)"]
     assert [cell.strip() for cell in lines[-1].split("|")][1:-1] == expected
+    values |= {"TIR misclassified": 1469.0}  # without a budget
+    of = {"case": "on a denormal", "values": values, "budgets": {}, "replay": {"count": 4000}}
+    denormal = [dataclasses.replace(r, **of) for r in rows]
+    lines = readme_tables.accuracy([*rows, *denormal]).splitlines()
+    assert len(lines) == 7 and "in 17 of the 18 regimes" in lines[0] and "1469 of 4000" in lines[-1]
+    assert lines[-1].startswith("| every one, `on a denormal` | denormal numbers are taken for 0 |")
 
 
 # What each table must name.
 NAMED = {
-    "accuracy": FORMULAS,
+    "accuracy": [*FORMULAS, "on a denormal"],
     "renders": [path.stem for path in SCENES.glob("*.xml") if not beyond_builtin(path)],
     "paths": layered_paths.plugins(),
     "efficiency": [method.name for method in render_methods.METHODS],

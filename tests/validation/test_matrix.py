@@ -82,7 +82,7 @@ def test_systems_are_in_the_order_of_how_far_they_are_from_right():
     assert [each["system"] for each in page["rays"]] == ["both", "near", "far", "none", "wrong"]
     said = {each["system"]: each["sentence"] for each in page["rays"]}
     assert said["far"] == "right in every set; known" and said["wrong"] == "wrong: random; known"
-    assert said["near"] == f"exact only for inputs more than 4 roundings off: {LARGE} (up to 900); known"
+    assert said["near"] == f"exact only for inputs more than 8 roundings off: {LARGE} (up to 900); known"
     images = matrix.of_rows([seen("A", "equal"), seen("B", "inconclusive"), seen("C", "different", "fail")])["images"]
     assert [(each["system"], each["wrong"]) for each in images] == [("A", False), ("B", False), ("C", True)]
     assert [each["sentence"].partition(":")[0] for each in images][1:] == ["inconclusive", "different"]
