@@ -104,7 +104,7 @@ def resume(
 
 def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> Identity:
     """Everything that the bits of a render depend on, by names for messages; but for PASS, which its plan says."""
-    digest = hashlib.sha256(parsed.digest.encode())
+    digest = hashlib.sha256(json.dumps(parsed.nodes).encode())
     for name, path in parsed.files(job.allow_plugins).items():
         digest.update(json.dumps([name, hashlib.sha256(path.read_bytes()).hexdigest()]).encode())
     width, height = renderer.size

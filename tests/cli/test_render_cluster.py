@@ -68,9 +68,12 @@ def refused(outcome, *messages):
         (("--workers", 1), "pip install 'mi-refract[cluster]'"),
     ],
 )
-def test_misuse(render, scene, options, message, monkeypatch):
+def test_misuse(render, scene, options, message, monkeypatch, tmp_path_factory):
     if "--bundle-limit" in options:
-        scene.write_text(SCENE + f"<!-- {'x' * 2**20} -->")
+        sky = tmp_path_factory.mktemp("sky") / "a.ppm"
+        sky.write_bytes(b"P6 600 600 255 " + bytes(3 * 600**2))
+        named = f'<emitter type="envmap"><string name="filename" value="{sky}"/></emitter>'
+        scene.write_text(SCENE.replace('<emitter type="constant"/>', named))
     if options == ("--workers", 1):
         monkeypatch.setitem(sys.modules, "distributed", None)
     refused(render(*options), message)

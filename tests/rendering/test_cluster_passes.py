@@ -55,7 +55,7 @@ def small_tasks(monkeypatch):
 
 
 def source(client, scene, variant, warn=lambda text: None, **options):
-    bundle = scene_bundle.pack(parse_scene(scene), {})
+    bundle = scene_bundle.pack(parse_scene(scene))
     return ClusterPasses(accepted(client, variant, **options), bundle, variant, 0, warn)
 
 
