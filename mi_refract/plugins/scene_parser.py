@@ -158,7 +158,8 @@ def parse(path: Path, defines: Mapping[str, str] | None = None, variant: str = "
             require_file(file)
         mi.parser.transform_all(config, state)
         places = tuple(dict.fromkeys(Path(str(x)) for x in inside))
-        return ParsedScene(path, config, state, _nodes(state), places, named)
+        nodes = _nodes(mi.parser.ParserState(state))  # a copy, as above
+        return ParsedScene(path, config, state, nodes, places, named)
 
 
 def restore(path: Path, nodes: Sequence[Node]) -> ParsedScene:
