@@ -123,8 +123,8 @@ def parse(spec: float | str, name: str = "") -> Medium:
             known = {name.lower(): medium for name, medium in MATERIALS.items()}
             if medium := known.get(text.lower()):
                 return medium
-            catalog, _, glass = (part.strip() for part in text.partition(":"))
-            if catalog.upper() in glass_catalogs.CATALOGS:
+            if glass_catalogs.names_glass(text):
+                catalog, _, glass = (part.strip() for part in text.partition(":"))
                 return glass_catalogs.load(catalog.upper(), glass, label)
             near = ", ".join(difflib.get_close_matches(text, MATERIALS, 3, 0.0))
             catalogs = ", ".join(f"{name}:…" for name in glass_catalogs.CATALOGS)

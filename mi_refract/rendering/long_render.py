@@ -25,6 +25,7 @@ from mi_refract.io import safe_files
 from mi_refract.io.image_file import SUFFIXES, Metadata, installed_version, provenance
 from mi_refract.io.safe_files import writable
 from mi_refract.io.text import printable
+from mi_refract.media.glass_catalogs import names_glass
 from mi_refract.numerics import Scene
 from mi_refract.plugins.scene_parser import ParsedScene
 
@@ -32,7 +33,7 @@ from . import checkpoint, rendered_file
 from .checkpoint import PASS, CheckpointWriter, Identity, Progress
 from .end_conditions import Limits, RelativeError, needed_spp, reached, relative_error, require_interval
 from .pass_plan import FIRST_LANES, LANES, PassPlan, next_stop, plan_passes
-from .pass_sums import PassSums
+from .pass_sums import ARITY, PassSums
 from .render_pass import PassRenderer, pass_renderer
 from .scene_files import formulas_in, load_parsed, naming, parse_scene
 
@@ -74,6 +75,8 @@ def resume(
     spp = limits.spp
     if spp is None and not limits.open_ended:
         spp = int(scene.sensors()[0].sampler().sample_count())
+        if spp < 1:
+            raise ValueError(f"{job.scene}: the sampler's sample_count = {spp}; expected 1 or more, or --spp")
 
     progress, saved = Progress(_identity(job, parsed, renderer)), checkpoint.path_of(path)
     if saved.exists() and not restart:
@@ -125,9 +128,15 @@ def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> Identity
         "colours": renderer.colours,
         "version of mi_refract": on_worker.our_version(),
         **{f"version of {name}": installed_version(name) for name in ("mitsuba", "drjit")},
+        on_worker.GLASSES: on_worker.glass_catalogues() if _names_glass(parsed) else "none",
         "libLLVM": backend.llvm().library if llvm else "none",
         "vector width": on_worker.vector_width() if llvm else "none",
     }
+
+
+def _names_glass(parsed: ParsedScene) -> bool:
+    """Whether the scene has a glass of a catalogue."""
+    return any(map(names_glass, parsed.named))
 
 
 @dataclass
@@ -197,6 +206,7 @@ class LongRender:
             spp = plan.rest if rest else plan.spp
             for level, sums, machines in nodes(done, min(look, last), last, first, spp):
                 took = time.monotonic() - before
+                sums.check((*self.renderer.size[::-1], len(self.renderer.channels)), ARITY**level, spp)
                 progress.add(level, sums, machines, took, rest=rest)
                 before = time.monotonic()
                 watch(self)
@@ -261,6 +271,11 @@ class LongRender:
         if plan.spp != self.plan.spp:
             self.plan = plan
             self.progress.rebase(plan.spp)
+
+    @property
+    def tolerated_facts(self) -> frozenset[str]:
+        """Facts of workers that the bits of this render do not depend on."""
+        return frozenset() if _names_glass(self.parsed) else frozenset({on_worker.GLASSES})
 
     @property
     def has_all_samples(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 
 import mitsuba as mi
 import numpy as np
@@ -126,6 +127,17 @@ BAD = {
     "unknown parameter": (SCENE.replace("max_depth", "max_dept"), (), "max_dept"),
     "a BSDF": ('<bsdf version="3.0.0" type="dielectric"/>', (), "holds a BSDF; expected a <scene>"),
     "no sensor": ('<scene version="3.0.0"/>', (), "the scene has no sensor"),
+    "no integrator": (re.sub("<integrator.*/integrator>", "", SCENE), (), "scene.xml: the scene has no integrator"),
+    "a film without pixels": (
+        SCENE.replace("<rfilter", '<integer name="crop_width" value="0"/><rfilter'),
+        (),
+        "scene.xml: a film of 0 × 6 pixels; expected 1 to",
+    ),
+    "a scene without samples": (
+        SCENE.replace('name="sample_count" value="4"', 'name="sample_count" value="0"'),
+        (),
+        "scene.xml: the sampler's sample_count = 0; expected 1 or more, or --spp",
+    ),
     "empty": ("", (), "scene.xml"),
 }
 

@@ -199,7 +199,7 @@ def test_the_formulas_of_a_scene(bsdf, formulas):
 @pytest.mark.parametrize(
     ("parameter", "defines", "message"),
     [
-        ("", {"res": "8193"}, "a film of 8193 × 8193 pixels; expected up to 67108864"),
+        ("", {"res": "8193"}, "a film of 8193 × 8193 pixels; expected 1 to 67108864"),
         (ABSORPTION, {}, "refract: int_absorption; expected the integrator refract_path, or no absorption"),
         (ABSORPTION, {"integrator": "refract_path"}, ""),
     ],
