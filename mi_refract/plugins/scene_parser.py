@@ -170,7 +170,7 @@ def restore(path: Path, nodes: Sequence[Node]) -> ParsedScene:
         node.type, node.props = getattr(mi.ObjectType, kind), _parsed.Properties(plugin)
         node.props.set_id(identifier)
         for name, value_kind, value in parameters:
-            node.props[name] = _READ[value_kind](value) if value_kind in _READ else value
+            node.props[name] = _CONVERSIONS[value_kind][1](value) if value_kind in _CONVERSIONS else value
         state.nodes.append(node)
     state.files = [str(path)]
     return ParsedScene(path, config, state, list(nodes))
@@ -191,9 +191,14 @@ def _nodes(state: ParserState) -> list[Node]:
         props, parameters = node.props, []
         for name in props.keys():  # noqa: SIM118 (no dict)
             kind, value = props.type(name).name, props[name]
-            parameters.append((name, kind, _WRITTEN[kind](value) if kind in _WRITTEN else value))
+            parameters.append((name, kind, _CONVERSIONS[kind][0](value) if kind in _CONVERSIONS else value))
         found.append((node.type.name, props.plugin_name(), props.id(), parameters))
     return found
+
+
+def _spectrum(knots: Any) -> Any:
+    wavelengths, values = knots
+    return _parsed.Spectrum(wavelengths, values) if wavelengths else _parsed.Spectrum(*values)
 
 
 def _transform(matrices: Any) -> Any:
@@ -203,19 +208,12 @@ def _transform(matrices: Any) -> Any:
 
 
 # Parameters that are no numbers or texts, by their type: as such, and back.
-_WRITTEN: dict[str, Callable[[Any], Any]] = {
-    "ResolvedReference": lambda reference: reference.index(),
-    "Spectrum": lambda spectrum: (list(spectrum.wavelengths), list(spectrum.values)),
-    "Transform": lambda x: (np.array(x.matrix).tolist(), np.array(x.inverse_transpose).tolist()),
-    "Color": list,
-    "Vector": list,
-}
-_READ: dict[str, Callable[[Any], Any]] = {
-    "ResolvedReference": _parsed.Properties.ResolvedReference,
-    "Spectrum": lambda x: _parsed.Spectrum(*x) if x[0] else _parsed.Spectrum(*x[1]),  # a single value
-    "Transform": _transform,
-    "Color": lambda values: _untyped.ScalarColor3d(values),
-    "Vector": lambda values: _untyped.ScalarVector3d(values),
+_CONVERSIONS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
+    "ResolvedReference": (lambda reference: reference.index(), _parsed.Properties.ResolvedReference),
+    "Spectrum": (lambda x: (list(x.wavelengths), list(x.values)), _spectrum),
+    "Transform": (lambda x: (np.array(x.matrix).tolist(), np.array(x.inverse_transpose).tolist()), _transform),
+    "Color": (list, lambda values: _untyped.ScalarColor3d(values)),
+    "Vector": (list, lambda values: _untyped.ScalarVector3d(values)),
 }
 
 

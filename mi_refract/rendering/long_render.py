@@ -128,15 +128,10 @@ def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> Identity
         "colours": renderer.colours,
         "version of mi_refract": on_worker.our_version(),
         **{f"version of {name}": installed_version(name) for name in ("mitsuba", "drjit")},
-        on_worker.GLASSES: on_worker.glass_catalogues() if _names_glass(parsed) else "none",
+        on_worker.GLASSES: on_worker.glass_catalogues() if any(map(names_glass, parsed.named)) else "none",
         "libLLVM": backend.llvm().library if llvm else "none",
         "vector width": on_worker.vector_width() if llvm else "none",
     }
-
-
-def _names_glass(parsed: ParsedScene) -> bool:
-    """Whether the scene has a glass of a catalogue."""
-    return any(map(names_glass, parsed.named))
 
 
 @dataclass
@@ -275,7 +270,7 @@ class LongRender:
     @property
     def tolerated_facts(self) -> frozenset[str]:
         """Facts of workers that the bits of this render do not depend on."""
-        return frozenset() if _names_glass(self.parsed) else frozenset({on_worker.GLASSES})
+        return frozenset({on_worker.GLASSES} if self.progress.identity[on_worker.GLASSES] == "none" else ())
 
     @property
     def has_all_samples(self) -> bool:

@@ -8,27 +8,15 @@ import re
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.renders import GLASS
 
 import mi_refract
 from mi_refract import backend
 from mi_refract.io.image_file import installed_version, read_exr
 from mi_refract.rendering.pass_plan import scalar_seed_of
 
-SCENE = """<scene version="3.0.0">
-  <default name="bsdf" value="refract"/>
-  <integrator type="path"><integer name="max_depth" value="5"/></integrator>
-  <sensor type="perspective">
-    <transform name="to_world"><lookat origin="0,1,-4" target="0,0,0" up="0,1,0"/></transform>
-    <film type="hdrfilm">
-      <integer name="width" value="8"/><integer name="height" value="6"/>
-      <rfilter type="box"/>  <!-- with a wider one, the order in which threads finish shows in the last bits -->
-    </film>
-    <sampler type="independent"><integer name="sample_count" value="4"/></sampler>
-  </sensor>
-  <emitter type="constant"/>
-  <shape type="sphere"><bsdf type="$bsdf"/></shape>
-  <shape type="cube"><transform name="to_world"><translate x="1" y="1.5"/></transform></shape>
-</scene>"""
+# With a wider filter, the order in which threads finish shows in the last bits.
+SCENE = GLASS.replace("</film>", '<rfilter type="box"/></film>')
 
 
 @pytest.fixture

@@ -18,26 +18,16 @@ import pytest
 from distributed import Security
 from support.dask_workers import program, tls_settings, until
 from support.processes import ENVIRONMENT
+from support.renders import GLASS
 
 from mi_refract.cluster import on_worker
 from mi_refract.io.image_file import read_exr
-
-SCENE = """<scene version="3.0.0">
-  <integrator type="path"/>
-  <sensor type="perspective">
-    <transform name="to_world"><lookat origin="0,1,-4" target="0,0,0" up="0,1,0"/></transform>
-    <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="6"/></film>
-    <sampler type="independent"><integer name="sample_count" value="4"/></sampler>
-  </sensor>
-  <emitter type="constant"/>
-  <shape type="sphere"><bsdf type="refract"/></shape>
-</scene>"""
 
 
 @pytest.fixture
 def scene(tmp_path):
     path = tmp_path / "scene.xml"
-    path.write_text(SCENE)
+    path.write_text(GLASS)
     return path
 
 
@@ -74,7 +64,7 @@ def test_misuse(render, scene, options, message, monkeypatch, tmp_path_factory):
         sky = tmp_path_factory.mktemp("sky") / "a.ppm"
         sky.write_bytes(b"P6 600 600 255 " + bytes(3 * 600**2))
         named = f'<emitter type="envmap"><string name="filename" value="{sky}"/></emitter>'
-        scene.write_text(SCENE.replace('<emitter type="constant"/>', named))
+        scene.write_text(GLASS.replace('<emitter type="constant"/>', named))
     if options == ("--workers", 1):
         monkeypatch.setitem(sys.modules, "distributed", None)
     refused(render(*options), message)
