@@ -24,7 +24,7 @@ LINES = {
 # fmt: on
 Coefficients = Mapping[str, Number]
 ANY = (0.0, math.inf)
-VALUES = "values"  # among the coefficients of a table: all of them, in one array
+TABLE_VALUES = "values"  # among the coefficients of a table: all of them, in one array
 
 
 def where(condition: Mask, x: Number, y: Number) -> Number:
@@ -117,7 +117,7 @@ class Table(Dispersion):
         return tuple("n_" + f"{knot:.{digits}g}".replace(".", "_") for knot in self.knots)
 
     def index(self, wavelength: Number, c: Coefficients) -> Number:
-        """0 beyond the first knot and the last. `c[VALUES]`: all values in one array, which kernels need."""
+        """0 beyond the first knot and the last. `c[TABLE_VALUES]`: all values in one array, which kernels need."""
         last, names = len(self.knots) - 2, self.names
         segment: Any  # by number, in which the wavelength lies
         values: Any
@@ -135,7 +135,7 @@ class Table(Dispersion):
             return type(wavelength)([self.index(component, c) for component in wavelength])
         else:
             wide: Any = type(wavelength)
-            knots, values = wide(self.knots), c.get(VALUES)
+            knots, values = wide(self.knots), c.get(TABLE_VALUES)
             if values is None:
                 values = wide([dr.detach(c[name])[0] if dr.is_array_v(c[name]) else c[name] for name in names])
             segment = dr.zeros(dr.uint32_array_t(wide))

@@ -15,8 +15,7 @@ import mitsuba as mi
 
 from mi_refract import media
 from mi_refract.formulas import LARGEST_RATIO, SMALLEST_RATIO
-from mi_refract.media import Medium
-from mi_refract.media.dispersion import VALUES, Table
+from mi_refract.media import TABLE_VALUES, Medium, Table
 from mi_refract.numerics import (
     ArrayType,
     Interaction,
@@ -78,7 +77,7 @@ class DispersiveRatio:
         self.places: dict[str, tuple[str, int]] = {}
         for side, medium in self.sides.items():
             if isinstance(medium.dispersion, Table) and dr.is_jit_v(wide):
-                values = f"{side}_{VALUES}"
+                values = f"{side}_{TABLE_VALUES}"
                 self.exact[values] = wide([*medium.coefficients.values()])
                 self.places |= {f"{side}_{key}": (values, i) for i, key in enumerate(medium.coefficients)}
         # Opaque: an edit changes the data of a kernel and not its code.
