@@ -208,17 +208,16 @@ class CheckpointWriter:
         """A checkpoint that cannot be written is a warning."""
         self.path, self.progress, self.warnings = path_of(output), progress, warnings
         self.active, self.interval = False, INTERVAL
-        self._last, self._passes = time.monotonic(), progress.passes
+        self._last, self._passes_before = time.monotonic(), progress.passes
         self._thread: threading.Thread | None = None
 
     def write(self) -> None:
         """Write what is new, if anything is."""
         with self.progress.lock:
-            if not self.active or self.progress.passes == self._passes:
+            if not self.active or self.progress.passes == self._passes_before:
                 return
             try:
                 write(self.path, self.progress)
-                self._passes = self.progress.passes
             except OSError as error:
                 reason = error.strerror or error
                 self.warnings.append(f"{self.path}: checkpoint not written: {reason}; will be tried again")
