@@ -157,9 +157,9 @@ def cluster_passes(
     def warn(text: str) -> None:
         print(printable(f"mi-refract: {text}"), file=sys.stderr, flush=True)
 
-    bundle = scene_bundle.pack(rendering.parsed, rendering.job.defines, bundle_limit)
+    bundle = scene_bundle.pack(rendering.parsed, bundle_limit)
     with connected(target.scheduler, target.workers) as client:
-        tolerated: frozenset[str] = on_worker.MIXED if mixed else frozenset()
+        tolerated = rendering.tolerated_facts | (on_worker.MIXED if mixed else frozenset())
         workers = Workers(client, variant, on_worker.facts(variant), tolerated, warn, task="render")
         workers.wait()
         passes = ClusterPasses(workers, bundle, variant, rendering.job.seed, rendering.warnings.append)

@@ -20,7 +20,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from mi_refract.io.image_file import srgb_encode
 from mi_refract.io.safe_files import write_atomically
-from mi_refract.io.text import printable
+from mi_refract.io.text import parse_number, printable
 from mi_refract.rendering.end_conditions import RelativeError
 from mi_refract.report.embedded_images import png
 
@@ -109,7 +109,7 @@ def parse_share(text: str, option: str) -> float:
     """`1%` or `0.01`, of 100 % at most. ValueError for anything else, also for `1` and `0.5`: is that 0.5 % or 50 %?"""
     number, percent = (text[:-1], True) if text.endswith("%") else (text, False)
     try:
-        value = float(number) / (100 if percent else 1)
+        value = parse_number(number) / (100 if percent else 1)
     except ValueError:
         value = 0.0
     if not 0 < value <= (1 if percent else PLAIN):

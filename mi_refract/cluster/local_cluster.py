@@ -27,6 +27,9 @@ SETTINGS = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.system-monitor.interval": "10s",
     "distributed.admin.tick.interval": "1s",
+    # Dask's HTTP servers do not use TLS: pages of the scheduler and of workers would be for all users of this machine.
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
     # As long as a worker tries to reach one that has gone, when that is told before it tries; 30 s by default.
     "distributed.comm.timeouts.connect": "4s",
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
+import importlib.util
 import os
 import platform
 import sys
@@ -18,6 +19,7 @@ from mi_refract.io.image_file import installed_version
 
 LLVM, WIDTH = "libLLVM", "vector width"
 MIXED = frozenset({LLVM, WIDTH})  # with other ones the same work is possible, but not the same bits
+GLASSES = "glass catalogues"
 UNUSABLE = "cannot run"
 HOST = "host"
 _WIDTH_SYMBOL = "_Z21jit_llvm_vector_widthv"  # Dr.Jit does not show it to Python
@@ -33,7 +35,7 @@ def facts(variant: str) -> dict[str, str]:
     family = variant.partition("_")[0]
     here = backend.detect()[family]
     found = {name: installed_version(name) for name in ("mitsuba", "drjit")}
-    found |= {"mi_refract": our_version()}
+    found |= {"mi_refract": our_version(), GLASSES: glass_catalogues()}
     found |= {"Python": ".".join(platform.python_version_tuple()[:2]), "processor": platform.machine()}
     found[UNUSABLE] = "" if here.usable else f"{variant}: {here.reason}"
     if family == "llvm" and here.usable:
@@ -58,10 +60,23 @@ def vector_width() -> str:
 @functools.cache
 def our_version() -> str:
     """With a short digest of the package's source: between two releases the version stays the same."""
-    package, digest = Path(__file__).parents[1], hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
-    return f"{installed_version('mi-refract')} ({digest.hexdigest()[:8]})"
+    return f"{installed_version('mi-refract')} ({_digest(Path(__file__).parents[1], '*.py')})"
+
+
+@functools.cache
+def glass_catalogues() -> str:
+    """A short digest of the files of the package `opticalglass`; "none" where it is not installed."""
+    spec = importlib.util.find_spec("opticalglass")
+    return _digest(Path(spec.origin).parent, "*") if spec and spec.origin else "none"
+
+
+def _digest(package: Path, pattern: str) -> str:
+    """Of the names and contents of files, but for what Python compiles."""
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob(pattern)):
+        if path.is_file() and path.suffix != ".pyc":
+            digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:8]
 
 
 def differences(there: Mapping[str, str], here: Mapping[str, str], tolerated: Collection[str] = ()) -> list[str]:

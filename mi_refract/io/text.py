@@ -55,6 +55,13 @@ def json_text(value: object, indent: int | None = None) -> str:
     return text.replace("##", "#\\u0023")  # which only strings hold
 
 
+def parse_number(text: str) -> float:
+    """The number that a text says. ValueError for anything else, also for `1_0`, which Python reads as 10."""
+    if "_" in text:
+        raise ValueError(f"{text}; expected a number")
+    return float(text)
+
+
 def compact(value: float, digits: int = 3) -> str:
     """`value` in at most `digits` significant digits, whole numbers below 10⁵ in full: 1.23e-7, 8056."""
     if not math.isfinite(value):

@@ -5,7 +5,17 @@ Dr.Jit arrays. Out: indices in double precision; Dr.Jit differentiates those of 
 """
 
 from . import glass_catalogs
-from .dispersion import LINES, Medium
+from .dispersion import LINES, TABLE_VALUES, Medium, Table
 from .materials import LABORATORY_AIR, index, parse, relative_index
 
-__all__ = ["LABORATORY_AIR", "LINES", "Medium", "glass_catalogs", "index", "parse", "relative_index"]
+__all__ = [
+    "LABORATORY_AIR",
+    "LINES",
+    "TABLE_VALUES",
+    "Medium",
+    "Table",
+    "glass_catalogs",
+    "index",
+    "parse",
+    "relative_index",
+]

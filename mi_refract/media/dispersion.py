@@ -5,7 +5,6 @@ A formula takes floats, numpy arrays or Dr.Jit arrays alike, in double precision
 
 from __future__ import annotations
 
-import itertools
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -14,7 +13,7 @@ from typing import Any
 
 import drjit as dr
 
-from mi_refract.numerics import Mask, Number
+from mi_refract.numerics import Mask, Number, differentiated
 
 # Spectral lines by their letters, in nm, as catalogues of glass print them.
 # fmt: off
@@ -25,6 +24,7 @@ LINES = {
 # fmt: on
 Coefficients = Mapping[str, Number]
 ANY = (0.0, math.inf)
+TABLE_VALUES = "values"  # among the coefficients of a table: all of them, in one array
 
 
 def where(condition: Mask, x: Number, y: Number) -> Number:
@@ -117,14 +117,41 @@ class Table(Dispersion):
         return tuple("n_" + f"{knot:.{digits}g}".replace(".", "_") for knot in self.knots)
 
     def index(self, wavelength: Number, c: Coefficients) -> Number:
-        """0 beyond the first knot and the last."""
-        total, values = 0 * wavelength, [c[name] for name in self.names]
-        for i, (start, end) in enumerate(itertools.pairwise(self.knots)):
-            after = wavelength >= start if i == 0 else wavelength > start
-            share = (wavelength - start) / (end - start)  # 0 at `start`, 1 at `end`: there the value is the knot's own
-            between = values[i] * (1 - share) + values[i + 1] * share
-            total = total + where(after & (wavelength <= end), between, 0)
-        return total
+        """0 beyond the first knot and the last. `c[TABLE_VALUES]`: all values in one array, which kernels need."""
+        last, names = len(self.knots) - 2, self.names
+        segment: Any  # by number, in which the wavelength lies
+        values: Any
+        if not dr.is_array_v(wavelength):
+            import numpy as np
+
+            segment = np.searchsorted(self.knots[1:-1], wavelength)  # a knot is the end of one
+            if np.ndim(segment):
+                values = np.array([c[name] for name in names])
+                start, end = values[segment], values[segment + 1]
+            else:
+                start, end = c[names[segment]], c[names[segment + 1]]
+            left, right = np.array(self.knots)[segment], np.array(self.knots)[segment + 1]
+        elif not dr.is_jit_v(wavelength) or dr.depth_v(wavelength) > 1:
+            return type(wavelength)([self.index(component, c) for component in wavelength])
+        else:
+            wide: Any = type(wavelength)
+            knots, values = wide(self.knots), c.get(TABLE_VALUES)
+            if values is None:
+                values = wide([dr.detach(c[name])[0] if dr.is_array_v(c[name]) else c[name] for name in names])
+            segment = dr.zeros(dr.uint32_array_t(wide))
+            for bit in reversed(range(last.bit_length())):  # the last that begins below the wavelength, or 0
+                later = dr.minimum(segment + (1 << bit), last)
+                segment = dr.select(dr.gather(wide, knots, later) < wavelength, later, segment)
+            left, right = (dr.gather(wide, knots, segment + i) for i in (0, 1))
+            start, end = (dr.gather(wide, values, segment + i) for i in (0, 1))
+        share = (wavelength - left) / (right - left)  # 0 at `left`, 1 at `right`: there the value is the knot's own
+        between = start * (1 - share) + end * share
+        if dr.is_array_v(wavelength):
+            for i, name in enumerate(names):
+                if differentiated(c[name]):
+                    weight = dr.select(segment == i, 1 - share, dr.select(segment + 1 == i, share, 0))
+                    between += dr.detach(weight) * (c[name] - dr.detach(c[name]))
+        return where((wavelength >= self.knots[0]) & (wavelength <= self.knots[-1]), between, 0 * wavelength)
 
 
 def sellmeier(values: Sequence[float], squared: bool = False) -> tuple[Terms, dict[str, float]]:

@@ -43,6 +43,11 @@ class Glass:
     fitted: tuple[float, float]  # nm, where its maker's formula is meant to be right
 
 
+def names_glass(text: str) -> bool:
+    """Whether a text names a glass of a catalogue, such as `SCHOTT:N-BK7`."""
+    return ":" in text and text.partition(":")[0].strip().upper() in CATALOGS
+
+
 def load(catalog: str, glass: str, label: str) -> Medium:
     """A glass by its name, in any case, with or without spaces.
 

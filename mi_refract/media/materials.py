@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from mi_refract.io.text import parse_number
 from mi_refract.numerics import Number
 
 from . import glass_catalogs
@@ -122,8 +123,8 @@ def parse(spec: float | str, name: str = "") -> Medium:
             known = {name.lower(): medium for name, medium in MATERIALS.items()}
             if medium := known.get(text.lower()):
                 return medium
-            catalog, _, glass = (part.strip() for part in text.partition(":"))
-            if catalog.upper() in glass_catalogs.CATALOGS:
+            if glass_catalogs.names_glass(text):
+                catalog, _, glass = (part.strip() for part in text.partition(":"))
                 return glass_catalogs.load(catalog.upper(), glass, label)
             near = ", ".join(difflib.get_close_matches(text, MATERIALS, 3, 0.0))
             catalogs = ", ".join(f"{name}:…" for name in glass_catalogs.CATALOGS)
@@ -143,7 +144,7 @@ def _formula(text: str, label: str) -> Medium:
 
     def numbers(counts: Sequence[int], says: str) -> list[float]:
         try:
-            values = [float(x) for x in arguments.split(",")]
+            values = [parse_number(x) for x in arguments.split(",")]
         except ValueError:
             values = []
         if len(values) not in counts or not all(map(math.isfinite, values)):
@@ -163,7 +164,7 @@ def _formula(text: str, label: str) -> Medium:
     elif name == "table":
         expected = "expected table(400: 1.53, 500: 1.52, …), two or more, wavelengths in nm, increasing"
         try:
-            knots = [(float(w), float(n)) for w, n in (pair.split(":") for pair in arguments.split(","))]
+            knots = [(parse_number(w), parse_number(n)) for w, n in (pair.split(":") for pair in arguments.split(","))]
         except ValueError:
             raise ValueError(f"{label}: {expected}") from None
         wavelengths = tuple(w for w, _ in knots)

@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from mi_refract import media
 from mi_refract.formulas import LARGEST_RATIO, SMALLEST_RATIO
-from mi_refract.media import Medium
+from mi_refract.media import TABLE_VALUES, Medium, Table
 from mi_refract.numerics import (
     ArrayType,
     Interaction,
@@ -34,6 +34,7 @@ PLUGIN = "refract"
 DEFAULTS = {"int_ior": "bk7", "ext_ior": "air"}
 EXPECTED = "a positive finite number, or a material's name, a glass or formula (mi_refract.media), spectrum or texture"
 warned: set[str] = set()  # what `warn_once` has logged
+LUMINANCE = 0.212671, 0.715160, 0.072169  # of linear sRGB, as Mitsuba's
 LOST = 1e-3  # of the colour of light of equal power at all wavelengths: the most that may lie outside a medium's range
 
 
@@ -72,6 +73,13 @@ class DispersiveRatio:
         wide: Any = self.wide
         self.shown: dict[str, Number] = {name: number(value) for name, value in shown}
         self.exact: dict[str, Number] = {name: wide(value) for name, value in shown}
+        # Where in the array of a table's values a coefficient is: by its name, the array's name and the place.
+        self.places: dict[str, tuple[str, int]] = {}
+        for side, medium in self.sides.items():
+            if isinstance(medium.dispersion, Table) and dr.is_jit_v(wide):
+                values = f"{side}_{TABLE_VALUES}"
+                self.exact[values] = wide([*medium.coefficients.values()])
+                self.places |= {f"{side}_{key}": (values, i) for i, key in enumerate(medium.coefficients)}
         # Opaque: an edit changes the data of a kernel and not its code.
         dr.make_opaque(*self.shown.values(), *self.exact.values())
 
@@ -103,6 +111,9 @@ class DispersiveRatio:
         for key in [key for key in self.shown if not keys or key in keys]:
             number = one_number(key, self.shown[key])
             self.exact[key] = self.wide(dr.detach(self.shown[key]) if dr.is_jit_v(self.shown[key]) else number)
+            if key in self.places:
+                values, place = self.places[key]
+                dr.scatter(self.exact[values], self.exact[key], place)
         dr.make_opaque(*self.shown.values(), *self.exact.values())
 
 
@@ -199,5 +210,28 @@ def read_index(v: Variant, props: Properties, name: str, default: str) -> Medium
             raise ValueError(f"{label}: this variant makes a spectrum a colour; use the string {name} = {table!r}")
         return media.parse(table, name=label)
     if isinstance(value, mi.Object) and hasattr(value, "is_spatially_varying"):
+        _check_texture(v, label, value)
         return value
     raise ValueError(f"{label} = {value!r}; expected {EXPECTED}")
+
+
+def _check_texture(v: Variant, label: str, texture: Texture) -> None:
+    """ValueError for a texture that holds what is no index, as far as `mi.traverse` shows its values.
+
+    Of three colours the index is their luminance; in spectral variants they are coefficients, which say nothing.
+    """
+    import numpy as np
+
+    parameters = mi.traverse(texture)
+    for name in parameters.keys():  # noqa: SIM118 (no dict)
+        if name.rpartition(".")[2] not in ("data", "value"):
+            continue
+        values = np.array(parameters[name], np.float64)
+        values = values.reshape(-1, 3) if values.size == 3 and name.endswith("value") else values  # one colour
+        if values.shape[-1:] == (3,):
+            if v.is_spectral:
+                continue
+            values = values @ LUMINANCE
+        if (bad := values[~((values >= SMALLEST_RATIO) & (values <= LARGEST_RATIO))]).size:
+            expected = f"indices from {SMALLEST_RATIO:.2g} to {LARGEST_RATIO:.2g}"
+            raise ValueError(f"{label}: its texture holds {bad[0]:g}; expected {expected} everywhere")

@@ -12,16 +12,15 @@ from __future__ import annotations
 import contextlib
 import errno
 import glob
-import hashlib
-import json
 import sys
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import mitsuba as mi
+import mitsuba.mitsuba_ext
 import numpy as np
 
 from mi_refract.formulas import FORMULAS
@@ -32,6 +31,9 @@ from .index_parameter import PLUGIN
 from .refract_path import INTEGRATOR
 
 ParserState: TypeAlias = Any  # an `mi.parser.ParserState`
+Node: TypeAlias = tuple[
+    Any, ...
+]  # of a state: type, plugin, id, and parameters as name, type, value; numbers and texts
 OURS = (PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS), INTEGRATOR)
 # Registered by Mitsuba's own Python modules, or known to its parser.
 PYTHON = ("direct_projective", "flat_sensor", "prb", "prb_basic", "prb_projective", "prbvolpath", "volprim_rf_basic")
@@ -43,6 +45,7 @@ VALUES = 2**29  # of an image that a scene names: 16384 × 8192 × 4
 # More values than these and DENSEST for each byte of the file are no picture: deflate packs up to 1032 bytes into one.
 FEW_VALUES, DENSEST = 2**24, 1032
 _untyped: Any = mi  # its stubs have no types for file resolvers
+_parsed: Any = mitsuba.mitsuba_ext  # types that do not depend on the variant
 
 
 def own_folder() -> Path:
@@ -77,16 +80,10 @@ class ParsedScene:
     path: Path
     config: Any  # the `mi.parser.ParserConfig` that it was parsed with
     state: ParserState  # references resolved
-    xml: tuple[Path, ...]  # its own file first, and those that it includes
-    text: str  # the state as XML: included files, values of parameters and spectra that are read from files in place
-    folders: tuple[Path, ...]  # where Mitsuba looks for its files, those of <path> elements first
-    named: dict[str, Path]  # the files that its plugins name, by their names in it; they need not exist
-
-    @property
-    def digest(self) -> str:
-        """Of the XML and of `text`, in which matrices that are nearly the same are the same."""
-        contents = [hashlib.sha256(path.read_bytes()).hexdigest() for path in self.xml]
-        return hashlib.sha256(json.dumps([self.text, contents]).encode()).hexdigest()
+    nodes: list[Node]  # all of the state: included files, values of parameters and spectra from files are in place
+    folders: tuple[Path, ...] = ()  # where Mitsuba looks for its files, those of <path> elements first
+    # The files that its plugins name, by their names in it; they need not exist.
+    named: dict[str, Path] = field(default_factory=dict)
 
     def files(self, allowed: Collection[str] = ()) -> dict[str, Path]:
         """The files that its plugins read, by their names in it, and the code of `allowed` plugins."""
@@ -149,14 +146,10 @@ def parse(path: Path, defines: Mapping[str, str] | None = None, variant: str = "
         OSError: for a file that cannot be read.
         Exception: whatever Mitsuba raises where it cannot parse the file.
     """
-    config = mi.parser.ParserConfig(variant or str(mi.variant()))
-    # Mitsuba orders merged meshes by address, and what it loads in parallel by thread. Emitters are in the same order,
-    # so the same seed would give different images.
-    config.parallel = config.merge_equivalent = config.merge_meshes = False
+    config = _config(variant)
     require_file(path)
     with folders(path.parent) as inside:
         state = mi.parser.parse_file(config, str(path), **defines or {})
-        text = mi.parser.write_string(mi.parser.ParserState(state))
         seen = mi.parser.ParserState(state)  # a copy: reading a parameter marks it as used
         _check_nesting(path, seen)
         names = {value for node in seen.nodes for _, value in _texts(node.props)}
@@ -164,8 +157,64 @@ def parse(path: Path, defines: Mapping[str, str] | None = None, variant: str = "
         for file in named.values():
             require_file(file)
         mi.parser.transform_all(config, state)
-        xml, places = (tuple(dict.fromkeys(Path(str(x)) for x in items)) for items in (state.files, inside))
-        return ParsedScene(path, config, state, xml, text, places, named)
+        places = tuple(dict.fromkeys(Path(str(x)) for x in inside))
+        nodes = _nodes(mi.parser.ParserState(state))  # a copy, as above
+        return ParsedScene(path, config, state, nodes, places, named)
+
+
+def restore(path: Path, nodes: Sequence[Node]) -> ParsedScene:
+    """The scene of these `ParsedScene.nodes`, for the present variant; `path` is for messages."""
+    config, state = _config(""), mi.parser.ParserState()
+    for kind, plugin, identifier, parameters in nodes:
+        node = mi.parser.SceneNode()
+        node.type, node.props = getattr(mi.ObjectType, kind), _parsed.Properties(plugin)
+        node.props.set_id(identifier)
+        for name, value_kind, value in parameters:
+            node.props[name] = _CONVERSIONS[value_kind][1](value) if value_kind in _CONVERSIONS else value
+        state.nodes.append(node)
+    state.files = [str(path)]
+    return ParsedScene(path, config, state, list(nodes))
+
+
+def _config(variant: str) -> Any:
+    """The `mi.parser.ParserConfig` of a variant; "": of the present one."""
+    config = mi.parser.ParserConfig(variant or str(mi.variant()))
+    # Mitsuba orders merged meshes by address, and what it loads in parallel by thread. Emitters are in the same order,
+    # so the same seed would give different images.
+    config.parallel = config.merge_equivalent = config.merge_meshes = False
+    return config
+
+
+def _nodes(state: ParserState) -> list[Node]:
+    found = []
+    for node in state.nodes:
+        props, parameters = node.props, []
+        for name in props.keys():  # noqa: SIM118 (no dict)
+            kind, value = props.type(name).name, props[name]
+            parameters.append((name, kind, _CONVERSIONS[kind][0](value) if kind in _CONVERSIONS else value))
+        found.append((node.type.name, props.plugin_name(), props.id(), parameters))
+    return found
+
+
+def _spectrum(knots: Any) -> Any:
+    wavelengths, values = knots
+    return _parsed.Spectrum(wavelengths, values) if wavelengths else _parsed.Spectrum(*values)
+
+
+def _transform(matrices: Any) -> Any:
+    transform = _untyped.ScalarAffineTransform4d()  # whose constructor would compute the inverse by itself
+    transform.matrix, transform.inverse_transpose = matrices
+    return transform
+
+
+# Parameters that are no numbers or texts, by their type: as such, and back.
+_CONVERSIONS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
+    "ResolvedReference": (lambda reference: reference.index(), _parsed.Properties.ResolvedReference),
+    "Spectrum": (lambda x: (list(x.wavelengths), list(x.values)), _spectrum),
+    "Transform": (lambda x: (np.array(x.matrix).tolist(), np.array(x.inverse_transpose).tolist()), _transform),
+    "Color": (list, lambda values: _untyped.ScalarColor3d(values)),
+    "Vector": (list, lambda values: _untyped.ScalarVector3d(values)),
+}
 
 
 def require_file(path: Path) -> None:

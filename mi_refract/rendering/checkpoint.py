@@ -1,39 +1,39 @@
 """The progress of a render, and its checkpoint: a file beside the output from which the same command resumes.
 
-The file is an uncompressed `.npz`, whose checksums reveal truncation and damage. It holds the sums of every level of
-the tree of passes, and as JSON what is rendered. A resumed render has the same bits as one without interruption.
+The file begins with a SHA-256 of all the rest, which is written last and checked first. The rest is a line of JSON,
+what is rendered and how far, and the sums of every level of the tree of passes as float64. A resumed render has the
+same bits as one without interruption.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
-import struct
+import math
+import os
+import sys
 import threading
 import time
-import zipfile
-import zlib
 from dataclasses import dataclass, field
+from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mi_refract.io.errors import CheckpointError
-from mi_refract.io.safe_files import replacing
+from mi_refract.io.safe_files import opened, replacing
 
-from .pass_sums import ARRAYS, PassSums, PassTree
+from .pass_sums import ARITY, ARRAYS, Doubles, PassSums, PassTree
 
 Identity = dict[str, Any]  # everything that the bits of a render depend on, by name
-FORMAT = 2
+FORMAT = 3
+_DIGEST = hashlib.sha256().digest_size  # at the start of the file, of all that follows
+_HEADER = 2**24  # bytes of its line, at most
 # Seconds from the state of one checkpoint to that of the next, unless a pass takes longer. A kill loses as many, and
 # those in which the next one is written.
 INTERVAL = 25.0
 PASS = "samples of a pass"  # in an identity: a finished image may be refined with passes of another size
-# What NumPy, zipfile and json raise for a file with wrong bits; OSError: a seek beyond its end.
-_DAMAGE = (
-    *(ValueError, LookupError, TypeError, AttributeError, RuntimeError, EOFError, OSError),
-    *(zipfile.BadZipFile, zlib.error, struct.error),
-)
 
 
 @dataclass
@@ -77,6 +77,13 @@ class Progress:
             self.seconds += seconds
             self.machines.update(machines.split(", "))
 
+    def rebase(self, pass_spp: int) -> None:
+        """Make all passes the base; those that follow have so many samples per pixel."""
+        base = self.sums()
+        with self.lock:
+            self.base, self.tree, self.rest = base, PassTree(), None
+            self.identity[PASS] = pass_spp
+
     def sums(self) -> PassSums | None:
         """The sums of all passes, in memory of their own; None before the first pass."""
         with self.lock:
@@ -99,50 +106,88 @@ def write(path: Path, progress: Progress) -> None:
     named = {"base": progress.base, "rest": progress.rest}
     named |= {f"level{i}": sums for i, sums in enumerate(progress.tree.levels)}
     nodes = {name: sums for name, sums in named.items() if sums is not None}
-    scalars = ("spp", "passes", "contrasts", "colours")
     header = {
         "format": FORMAT,
         "identity": progress.identity,
-        "passes": progress.tree.passes,
         "counts": progress.tree.counts,
         "seconds": progress.seconds,
         "machines": sorted(progress.machines),
-        "nodes": {name: {key: getattr(sums, key) for key in scalars} for name, sums in nodes.items()},
+        "nodes": {
+            name: [sums.spp, sums.passes, [kind for kind in ARRAYS if getattr(sums, kind) is not None]]
+            for name, sums in nodes.items()
+        },
     }
-    arrays: dict[str, Any] = {"header": np.frombuffer(json.dumps(header).encode(), np.uint8)}
-    for name, sums in nodes.items():
-        arrays |= {f"{name}.{kind}": array for kind in ARRAYS if (array := getattr(sums, kind)) is not None}
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, **arrays)
+    with replacing(path) as temporary, temporary.open("w+b") as file:
+        file.write(bytes(_DIGEST) + json.dumps(header).encode() + b"\n")
+        for sums in nodes.values():
+            for array in (*(getattr(sums, kind) for kind in ARRAYS), sums.contrasts):
+                if array is not None:
+                    file.write(np.ascontiguousarray(array, np.float64).data)
+        file.seek(_DIGEST)
+        digest = hashlib.file_digest(file, "sha256").digest()
+        file.seek(0)
+        file.write(digest)
 
 
-def read(path: Path, identity: Identity) -> Progress:
-    """The progress that a file holds. CheckpointError for a damaged file, and for one of a render of another identity.
+def read(path: Path, identity: Identity, shape: tuple[int, int, int]) -> Progress:
+    """The progress that a file holds, of an image of H × W × C.
 
-    OSError where the file cannot be opened.
+    CheckpointError for a damaged file, for one of a render of another identity, and for what is no file. OSError where
+    the file cannot be opened.
     """
-    path.stat()
+    different = ""
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            header = json.loads(bytes(file["header"]))
+        with opened(path, sys.maxsize) as file:
+            digest = file.read(_DIGEST)
+            if hashlib.file_digest(file, "sha256").digest() != digest:
+                raise ValueError("its digest is another")
+            file.seek(_DIGEST)
+            header = json.loads(file.readline(_HEADER))
             if header["format"] != FORMAT:
                 raise ValueError(f"format {header['format']}")
             different = changes(header["identity"], identity)
-            nodes = {
-                name: PassSums(**scalars, **{k: file[f"{name}.{k}"] for k in ARRAYS if f"{name}.{k}" in file})
-                for name, scalars in header["nodes"].items()
-            }
-            tree = PassTree()
-            tree.passes, tree.counts = header["passes"], header["counts"]
-            tree.levels = [nodes.get(f"level{i}") for i in range(len(tree.counts))]
-            progress = Progress(header["identity"], tree, nodes.get("base"), nodes.get("rest"))
-            progress.seconds, progress.machines = float(header["seconds"]), {str(m) for m in header["machines"]}
-    except _DAMAGE as error:
-        raise CheckpointError(
-            f"{path}: damaged checkpoint ({type(error).__name__}); pass --restart to start over"
-        ) from None
-    if different:
-        raise CheckpointError(f"{path}: belongs to a different render: {different}; pass --restart to start over")
+            if not different:
+                return _progress(file, header, shape)
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        text = f"{path}: damaged checkpoint ({type(error).__name__}: {error})"
+        raise CheckpointError(f"{text}; pass --restart to start over") from None
+    raise CheckpointError(f"{path}: belongs to a different render: {different}; pass --restart to start over")
+
+
+def _progress(file: BufferedReader, header: dict[str, Any], shape: tuple[int, int, int]) -> Progress:
+    """What follows the header. ValueError where it is not what the header and the shape of the image say."""
+    identity, counts, nodes = header["identity"], header["counts"], header["nodes"]
+    progress = Progress(identity, seconds=float(header["seconds"]), machines={str(name) for name in header["machines"]})
+    size, pass_spp = os.fstat(file.fileno()).st_size, identity[PASS]
+    expected = {f"level{i}": count * ARITY**i for i, count in enumerate(counts) if count}
+    if set(nodes) - {"base", "rest"} != set(expected) or not all(0 <= count < ARITY for count in counts):
+        raise ValueError(f"sums of {', '.join(nodes)}; expected {', '.join(expected)}")
+
+    def doubles(*shape: int) -> Doubles:
+        if 8 * math.prod(shape) > size - file.tell():
+            raise ValueError(f"{size} bytes; expected more")
+        array = np.empty(shape)
+        file.readinto(array.data.cast("B"))
+        return array
+
+    found: dict[str, PassSums] = {}
+    for name, (spp, passes, kinds) in nodes.items():
+        right = all(type(count) is int for count in (passes, spp, pass_spp)) and 1 <= passes <= spp
+        if name in expected:
+            right = passes == expected[name] and spp == passes * pass_spp
+        elif name == "rest":
+            right = passes == 1 <= spp < pass_spp
+        if not right:
+            raise ValueError(f"{name}: {passes} passes of {spp} samples per pixel")
+        arrays = {kind: doubles(*shape[:2], 1 if kind == "weights" else shape[2]) for kind in ARRAYS if kind in kinds}
+        contrasts = doubles(passes - 1).tolist()
+        found[name] = PassSums(spp, passes, **arrays, contrasts=contrasts, colours=identity["colours"])
+    if file.tell() != size:
+        raise ValueError(f"{size} bytes; expected {file.tell()}")
+    progress.base, progress.rest = found.get("base"), found.get("rest")
+    tree = progress.tree
+    tree.counts, tree.passes = counts, sum(expected.values())
+    tree.levels = [found.get(f"level{i}") for i in range(len(counts))]
     return progress
 
 
@@ -163,13 +208,13 @@ class CheckpointWriter:
         """A checkpoint that cannot be written is a warning."""
         self.path, self.progress, self.warnings = path_of(output), progress, warnings
         self.active, self.interval = False, INTERVAL
-        self._last = time.monotonic()
+        self._last, self._passes_before = time.monotonic(), progress.passes
         self._thread: threading.Thread | None = None
 
     def write(self) -> None:
         """Write what is new, if anything is."""
         with self.progress.lock:
-            if not self.active or not (self.progress.tree.passes or self.progress.rest):
+            if not self.active or self.progress.passes == self._passes_before:
                 return
             try:
                 write(self.path, self.progress)

@@ -62,14 +62,14 @@ def unpack(bundle: SceneBundle) -> None:
 def render_node(bundle: SceneBundle, variant: str, seed: int, level: int, first: int, spp: int) -> Part:
     """Render ARITY**level passes of `spp` samples per pixel each, from number `first` on, and sum them.
 
-    `seed`: of the render. Errors: those of `load_scene` and of the scene itself, with the paths of the machine that
+    `seed`: of the render. Errors: those of `load_scene` and of the scene itself, with the names of the machine that
     made the bundle.
     """
     address, folder = on_worker.address(), on_worker.scratch_folder()
 
     def rendered() -> Part:
         began, bad = time.monotonic(), [0]
-        scene, root = scene_bundle.load(bundle, variant, folder)
+        scene, moved = scene_bundle.load(bundle, variant, folder)
         renderer = pass_renderer(scene, seed)
 
         def made(level: int, first: int) -> PassSums:
@@ -83,7 +83,7 @@ def render_node(bundle: SceneBundle, variant: str, seed: int, level: int, first:
             bad.append(nonfinite_pixels(sums))
             return sums
 
-        with scene_bundle.original_paths(root):
+        with scene_bundle.original_names(moved):
             sums = made(level, first)
         return Part(sums, {address: max(bad)}, time.monotonic() - began)
 

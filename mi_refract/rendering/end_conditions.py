@@ -138,7 +138,12 @@ class Limits:
     @property
     def open_ended(self) -> bool:
         """Whether something else than a number of samples ends the render."""
-        return any(limit is not None for limit in (self.until, self.until_tile, self.seconds))
+        return self.by_error or self.seconds is not None
+
+    @property
+    def by_error(self) -> bool:
+        """Whether an error ends the render."""
+        return self.until is not None or self.until_tile is not None
 
 
 def reached(limits: Limits, sums: PassSums) -> str:
@@ -154,3 +159,10 @@ def reached(limits: Limits, sums: PassSums) -> str:
         until, value = (f"{100 * share:.3g} %" for share in (limits.until_tile, worst))
         return f"--until-tile {until}: the error of the worst tile is {value}"
     return ""
+
+
+def needed_spp(limits: Limits, sums: PassSums) -> float:
+    """The samples per pixel with which an image will reach an error that was asked for, by its present estimate."""
+    ratios = [relative_error(sums).value / limits.until] if limits.until else []
+    ratios += [worst_tile(sums) / limits.until_tile] if limits.until_tile else []
+    return sums.spp * min((ratio for ratio in ratios if math.isfinite(ratio)), default=math.inf) ** 2

@@ -25,14 +25,15 @@ from mi_refract.io import safe_files
 from mi_refract.io.image_file import SUFFIXES, Metadata, installed_version, provenance
 from mi_refract.io.safe_files import writable
 from mi_refract.io.text import printable
+from mi_refract.media.glass_catalogs import names_glass
 from mi_refract.numerics import Scene
 from mi_refract.plugins.scene_parser import ParsedScene
 
 from . import checkpoint, rendered_file
 from .checkpoint import PASS, CheckpointWriter, Identity, Progress
-from .end_conditions import Limits, RelativeError, reached, relative_error, require_interval
-from .pass_plan import PassPlan, next_stop, plan_passes
-from .pass_sums import PassSums
+from .end_conditions import Limits, RelativeError, needed_spp, reached, relative_error, require_interval
+from .pass_plan import FIRST_LANES, LANES, PassPlan, next_stop, plan_passes
+from .pass_sums import ARITY, PassSums
 from .render_pass import PassRenderer, pass_renderer
 from .scene_files import formulas_in, load_parsed, naming, parse_scene
 
@@ -74,15 +75,12 @@ def resume(
     spp = limits.spp
     if spp is None and not limits.open_ended:
         spp = int(scene.sensors()[0].sampler().sample_count())
-
-    def plan(pass_spp: int | None, done: int = 0) -> PassPlan:
-        width, height = renderer.size
-        left = None if spp is None else max(0, spp - done)
-        return plan_passes(width * height, left, pass_spp, renderer.accepted, moments=renderer.moments)
+        if spp < 1:
+            raise ValueError(f"{job.scene}: the sampler's sample_count = {spp}; expected 1 or more, or --spp")
 
     progress, saved = Progress(_identity(job, parsed, renderer)), checkpoint.path_of(path)
     if saved.exists() and not restart:
-        progress = checkpoint.read(saved, progress.identity)
+        progress = checkpoint.read(saved, progress.identity, (*renderer.size[::-1], len(renderer.channels)))
         if spp is not None and progress.done > spp:
             raise ValueError(
                 f"{saved}: already holds {progress.done} samples per pixel; expected --spp {progress.done} or more, or "
@@ -92,19 +90,31 @@ def resume(
             progress.rest = None  # it was the last pass, of fewer samples: a whole one takes its place
     elif not restart:
         image = rendered_file.read(path, renderer.channels, progress.identity)
-        if image is not None and (spp is None or image.done <= (plan(None).total or 0)):
+        if image is not None and (spp is None or image.done <= (_plan(renderer, spp, limits).total or 0)):
             progress = image
     begun = progress.identity.get(PASS) if progress.tree.passes else None
     if begun and limits.pass_spp not in (None, begun):
         raise ValueError(f"{saved}: has passes of {begun} samples per pixel; expected --pass-spp {begun}, or --restart")
-    chosen = plan(begun or limits.pass_spp, progress.base.spp if progress.base else 0)
-    progress.identity[PASS] = chosen.spp
-    return LongRender(job, path, limits, parsed, scene, renderer, spp, chosen, progress)
+    left = None if spp is None else max(0, spp - (progress.base.spp if progress.base else 0))
+    plan = _plan(renderer, left, limits, begun)
+    progress.identity[PASS] = plan.spp
+    return LongRender(job, path, limits, parsed, scene, renderer, spp, plan, progress)
+
+
+def _plan(
+    renderer: PassRenderer, total: int | None, limits: Limits, begun: int | None = None, most: int | None = None
+) -> PassPlan:
+    """The passes of `total` samples per pixel. `begun`: of each, where there are some already; `most`: else at most."""
+    pixels = math.prod(renderer.size)
+    if most is None:
+        most = FIRST_LANES // pixels if limits.by_error else LANES
+    asked = begun or limits.pass_spp
+    return plan_passes(pixels, total, asked, renderer.accepted, moments=renderer.moments, most=most)
 
 
 def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> Identity:
     """Everything that the bits of a render depend on, by names for messages; but for PASS, which its plan says."""
-    digest = hashlib.sha256(parsed.digest.encode())
+    digest = hashlib.sha256(json.dumps(parsed.nodes).encode())
     for name, path in parsed.files(job.allow_plugins).items():
         digest.update(json.dumps([name, hashlib.sha256(path.read_bytes()).hexdigest()]).encode())
     width, height = renderer.size
@@ -118,6 +128,7 @@ def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> Identity
         "colours": renderer.colours,
         "version of mi_refract": on_worker.our_version(),
         **{f"version of {name}": installed_version(name) for name in ("mitsuba", "drjit")},
+        on_worker.GLASSES: on_worker.glass_catalogues() if any(map(names_glass, parsed.named)) else "none",
         "libLLVM": backend.llvm().library if llvm else "none",
         "vector width": on_worker.vector_width() if llvm else "none",
     }
@@ -175,10 +186,11 @@ class LongRender:
             yield 0, self.renderer.render(offset + number, spp), os.uname().nodename
 
     def _run(self, nodes: Passes, watch: Callable[[LongRender], None]) -> Metadata:
-        progress, tree, plan, first = self.progress, self.progress.tree, self.plan, self.progress.first
+        progress, done_before = self.progress, self.progress.passes
         deadline = math.inf if self.limits.seconds is None else time.monotonic() + self.limits.seconds
-        nothing_new = bool(self.end()) and progress.passes == first
         while not (end := self.end()):
+            self._fit_passes()
+            tree, plan, first = progress.tree, self.plan, progress.first
             # Passes up to the next look at the error; those up to the look after it may be begun meanwhile.
             done, rest = tree.passes, tree.passes == plan.full_passes
             look = 1 if progress.passes == 0 and self.renderer.moments else next_stop(first + done) - first
@@ -189,6 +201,7 @@ class LongRender:
             spp = plan.rest if rest else plan.spp
             for level, sums, machines in nodes(done, min(look, last), last, first, spp):
                 took = time.monotonic() - before
+                sums.check((*self.renderer.size[::-1], len(self.renderer.channels)), ARITY**level, spp)
                 progress.add(level, sums, machines, took, rest=rest)
                 before = time.monotonic()
                 watch(self)
@@ -212,7 +225,7 @@ class LongRender:
         }
         metadata |= provenance() | self.renderer.filter_header
         header = rendered_file.header(progress, total, metadata, self.ended_by)
-        if not nothing_new:
+        if progress.passes > done_before or self.checkpoints.path.exists():
             rendered_file.write(self.output, self.renderer.channels, total, header)
         self.checkpoints.path.unlink(missing_ok=True)
         return header
@@ -221,16 +234,43 @@ class LongRender:
         """What ends the render with what it has; "" where passes are left to render."""
         progress, full = self.progress, self.plan.full_passes
         passes = progress.passes
-        if passes == 1 or (passes and next_stop(passes - 1) == passes):
+        if passes == 1 or _looked(passes):
             sums = progress.sums()
             assert sums is not None
             if reason := reached(self.limits, sums):
                 return reason
-            black = f"{self.output}: the image is still black; --until cannot be evaluated"
-            if passes > 1 and self.spp is None and not np.any(sums.total[..., : sums.colours] > 0):
-                self.warnings += [] if black in self.warnings else [black]
+            colours = sums.total[..., : sums.colours]
+            if passes > 1 and self.spp is None and self.limits.by_error and not np.any(colours > 0):
+                finite = np.isfinite(colours).any()
+                problem = "the image is still black" if finite else "no pixel of the image is finite"
+                text = f"{self.output}: {problem}; --until cannot be evaluated"
+                if not finite and self.limits.seconds is None:  # and no pixel will be
+                    raise ValueError(f"{text}; expected --spp or --time")
+                self.warnings += [] if text in self.warnings else [text]
         missing = full is None or progress.tree.passes < full or (self.plan.rest and progress.rest is None)
         return "" if missing else f"{progress.done} spp"
+
+    def _fit_passes(self) -> None:
+        """Where the error ends the render, have the passes up to the next look make as many samples as it needs.
+
+        At least a third more than there are, else an estimate would be looked at often.
+        """
+        passes = self.progress.passes
+        if self.limits.pass_spp or not self.limits.by_error or not _looked(passes):
+            return
+        sums = self.progress.sums()
+        assert sums is not None
+        more = max(needed_spp(self.limits, sums) - sums.spp, sums.spp / 3) / (next_stop(passes) - passes)
+        left = None if self.spp is None else max(0, self.spp - sums.spp)
+        plan = _plan(self.renderer, left, self.limits, most=int(min(more, LANES)))
+        if plan.spp != self.plan.spp:
+            self.plan = plan
+            self.progress.rebase(plan.spp)
+
+    @property
+    def tolerated_facts(self) -> frozenset[str]:
+        """Facts of workers that the bits of this render do not depend on."""
+        return frozenset({on_worker.GLASSES} if self.progress.identity[on_worker.GLASSES] == "none" else ())
 
     @property
     def has_all_samples(self) -> bool:
@@ -264,6 +304,11 @@ class LongRender:
         """What changes when another render writes the image or the checkpoint."""
         paths = (self.output, self.checkpoints.path)
         return [(s.st_ino, s.st_mtime_ns) if path.exists() and (s := path.stat()) else None for path in paths]
+
+
+def _looked(passes: int) -> bool:
+    """Whether the error is looked at after so many passes."""
+    return passes > 0 and next_stop(passes - 1) == passes
 
 
 def render_to_exr(

@@ -20,6 +20,8 @@ LANES = 2**24  # samples of a pass, at most, unless one sample per pixel is more
 # every pixel. A render of many samples has fewer and larger passes, but at least MANY.
 LEAST_LANES, LEAST_SPP = 2**21, 4
 LARGE_LANES, MANY = 2**23, 16
+# Of the first passes where the error ends a render: a pass takes twice the 12 ms then, and eight are soon there.
+FIRST_LANES = 2**15
 FEW = 8  # passes: with fewer the spread between them says little
 MASK = 2**32 - 1
 
@@ -45,13 +47,13 @@ def _mix(x: int) -> int:
     return x ^ x >> 16
 
 
-def usual_spp(pixels: int, total: int | None = None) -> int:
+def usual_spp(pixels: int, total: int | None = None, most: int = LANES) -> int:
     """Samples per pixel of a pass over so many pixels: a power of two, and no more than LANES samples in all.
 
-    `total`: those of the render, where that is known.
+    `total`: those of the render, where that is known. `most`: of the pass.
     """
     large = min((total or 0) // MANY, LARGE_LANES // pixels)
-    wanted = min(max(LEAST_SPP, LEAST_LANES // pixels, large), LANES // pixels)
+    wanted = min(max(LEAST_SPP, LEAST_LANES // pixels, large), LANES // pixels, most)
     return 1 << max(0, wanted.bit_length() - 1)
 
 
@@ -82,15 +84,22 @@ class PassPlan:
 
 
 def plan_passes(
-    pixels: int, total: int | None, asked: int | None, accepted: Callable[[int], int], *, moments: bool
+    pixels: int,
+    total: int | None,
+    asked: int | None,
+    accepted: Callable[[int], int],
+    *,
+    moments: bool,
+    most: int = LANES,
 ) -> PassPlan:
     """The passes of a render.
 
-    `asked`: samples per pixel of a pass, where the user says. `accepted`: what a sampler makes of a number of samples,
-    which it may round up. `moments`: whether second moments within a pass are known. Where they are not, a render of
-    few samples is cut into FEW passes, for their spread. ValueError for a pass that the sampler does not take.
+    `asked`: samples per pixel of a pass, where the user says; `most`: at most, where nobody does. `accepted`: what a
+    sampler makes of a number of samples, which it may round up. `moments`: whether second moments within a pass are
+    known. Where they are not, a render of few samples is cut into FEW passes, for their spread. ValueError for a pass
+    that the sampler does not take.
     """
-    spp = asked or usual_spp(pixels, total)
+    spp = asked or usual_spp(pixels, total, most)
     if min(spp, total or spp) * pixels > MASK:
         raise ValueError(f"{spp} samples per pixel in a pass of {pixels} pixels; expected up to 2³² − 1 samples in all")
     if asked and accepted(asked) != asked:

@@ -46,6 +46,21 @@ class PassSums:
         arrays = {name: None if array is None else array.copy() for name, array in arrays.items()}
         return replace(self, contrasts=list(self.contrasts), **arrays)
 
+    def check(self, shape: tuple[int, ...], passes: int, spp: int) -> None:
+        """ValueError unless these are sums of so many passes, of `spp` samples per pixel each, over H × W × C."""
+        counts, expected = (self.passes, self.spp, len(self.contrasts)), (passes, passes * spp, passes - 1)
+        shapes = {name: np.shape(array) for name in ARRAYS if (array := getattr(self, name)) is not None}
+        wanted = {name: (*shape[:2], 1) if name == "weights" else shape for name in shapes}
+        if counts != expected or shapes != wanted:
+            text = f"{self.passes} passes of {self.spp} samples per pixel in all over {shapes.get('total')}"
+            raise ValueError(f"sums of {text}; expected {passes} of {passes * spp} over {shape}")
+        known = np.isfinite(self.total)
+        for squares in (x for x in (self.between, self.within) if x is not None):
+            if not ((squares >= 0) & (squares < np.inf) | ~known).all():
+                raise ValueError("sums of squares that are negative or not finite")
+        if self.weights is not None and not np.isfinite(self.weights).all():
+            raise ValueError("weights that are not finite")
+
     @property
     def mean(self) -> Doubles:
         """The image; 0 where no sample has reached a pixel."""

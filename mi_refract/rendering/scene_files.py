@@ -57,7 +57,7 @@ def load_parsed(
 
     A scene may bring plugins, which are code: only those in `allow_plugins`, Mitsuba's own and ours are loaded.
     `moved`: where files are now, by their names in the scene. ValueError, in one line, for other plugins, what Mitsuba
-    does not accept, a scene without a sensor, and a film that is too large.
+    does not accept, a scene without a sensor or an integrator, and a film that is empty or too large.
     """
     import mitsuba as mi
 
@@ -70,10 +70,12 @@ def load_parsed(
             raise ValueError(f"{path}: holds a {type(scene).__name__}; expected a <scene>")
         if not scene.sensors():
             raise ValueError(f"{path}: the scene has no sensor; expected at least one")
+        if scene.integrator() is None:
+            raise ValueError(f"{path}: the scene has no integrator; expected one")
         check_integrator(scene)
         width, height = scene.sensors()[0].film().crop_size()
-        if width * height > PIXELS:
-            raise ValueError(f"{path}: a film of {width} × {height} pixels; expected up to {PIXELS}")
+        if not 1 <= width * height <= PIXELS:
+            raise ValueError(f"{path}: a film of {width} × {height} pixels; expected 1 to {PIXELS}")
     return scene
 
 

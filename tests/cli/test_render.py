@@ -3,31 +3,20 @@
 from __future__ import annotations
 
 import os
+import re
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.renders import GLASS
 
 import mi_refract
 from mi_refract import backend
 from mi_refract.io.image_file import installed_version, read_exr
 from mi_refract.rendering.pass_plan import scalar_seed_of
 
-SCENE = """<scene version="3.0.0">
-  <default name="bsdf" value="refract"/>
-  <integrator type="path"><integer name="max_depth" value="5"/></integrator>
-  <sensor type="perspective">
-    <transform name="to_world"><lookat origin="0,1,-4" target="0,0,0" up="0,1,0"/></transform>
-    <film type="hdrfilm">
-      <integer name="width" value="8"/><integer name="height" value="6"/>
-      <rfilter type="box"/>  <!-- with a wider one, the order in which threads finish shows in the last bits -->
-    </film>
-    <sampler type="independent"><integer name="sample_count" value="4"/></sampler>
-  </sensor>
-  <emitter type="constant"/>
-  <shape type="sphere"><bsdf type="$bsdf"/></shape>
-  <shape type="cube"><transform name="to_world"><translate x="1" y="1.5"/></transform></shape>
-</scene>"""
+# With a wider filter, the order in which threads finish shows in the last bits.
+SCENE = GLASS.replace("</film>", '<rfilter type="box"/></film>')
 
 
 @pytest.fixture
@@ -126,6 +115,17 @@ BAD = {
     "unknown parameter": (SCENE.replace("max_depth", "max_dept"), (), "max_dept"),
     "a BSDF": ('<bsdf version="3.0.0" type="dielectric"/>', (), "holds a BSDF; expected a <scene>"),
     "no sensor": ('<scene version="3.0.0"/>', (), "the scene has no sensor"),
+    "no integrator": (re.sub("<integrator.*/integrator>", "", SCENE), (), "scene.xml: the scene has no integrator"),
+    "a film without pixels": (
+        SCENE.replace("<rfilter", '<integer name="crop_width" value="0"/><rfilter'),
+        (),
+        "scene.xml: a film of 0 × 6 pixels; expected 1 to",
+    ),
+    "a scene without samples": (
+        SCENE.replace('name="sample_count" value="4"', 'name="sample_count" value="0"'),
+        (),
+        "scene.xml: the sampler's sample_count = 0; expected 1 or more, or --spp",
+    ),
     "empty": ("", (), "scene.xml"),
 }
 

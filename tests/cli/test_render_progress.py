@@ -30,7 +30,7 @@ def test_times(text, value):
     assert parse_seconds(text, "--time") == value
 
 
-NO_SHARE = ["0", "0%", "-1%", "100.1%", "1.5", "nan", "inf", "%", "", "1 %%", "1", "0.5"]
+NO_SHARE = ["0", "1_0%", "0%", "-1%", "100.1%", "1.5", "nan", "inf", "%", "", "1 %%", "1", "0.5"]
 NO_TIME = ["0", "0s", "-1", "1x", "", "m", "1m1h", "1e9", "nan", "inf", "10 m", "9" * 12]
 
 

@@ -8,6 +8,8 @@ import shutil
 import subprocess
 import sys
 import time
+import urllib.error
+import urllib.request
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,7 +23,7 @@ from support.processes import ENVIRONMENT, python
 from mi_refract.cluster import on_worker
 from mi_refract.cluster import workers as workers_module
 from mi_refract.cluster.connection import cluster_errors, connected
-from mi_refract.cluster.on_worker import HOST, LLVM, MIXED, UNUSABLE, WIDTH, differences, machine
+from mi_refract.cluster.on_worker import GLASSES, HOST, LLVM, MIXED, UNUSABLE, WIDTH, differences, machine
 from mi_refract.cluster.workers import AHEAD, Workers, fetched, results
 from mi_refract.io.errors import LostSchedulerError, NoWorkersError
 
@@ -74,6 +76,17 @@ def test_a_connection_that_is_not_encrypted_is_refused(client):
     assert client.run_on_scheduler(lambda dask_scheduler: dask_scheduler.security.require_encryption)
     with dask.config.set(tls_settings(client.security)), connected(client.scheduler.address) as other:
         refuses(other)
+
+
+def test_no_page_of_dask_is_shown(client):
+    """Its HTTP servers do not use TLS: other users of this machine could read them."""
+    ports = [client.run_on_scheduler(lambda dask_scheduler: dask_scheduler.http_server.port)]
+    ports += client.run(lambda dask_worker: dask_worker.http_server.port).values()
+    for port in ports:
+        for page in ("json/identity.json", "info/main/workers.html", "metrics", "health", "status"):
+            with pytest.raises(urllib.error.HTTPError, match="404"):
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/{page}", timeout=30)
+    assert len(ports) == 3
 
 
 LOST = "tcp://h:1: the Dask scheduler has ended or cancelled the tasks; run the same command again to resume"
@@ -135,18 +148,28 @@ def test_facts_of_this_process_and_the_name_of_a_machine(variant):
     assert machine(HERE | {HOST: "there", WIDTH: "16", LLVM: "18.1"}, HERE) == "there (libLLVM 18.1; vector width 16)"
 
 
-def test_the_version_has_a_digest_of_the_sources(tmp_path):
-    """Of names and contents: two installations of the same version may differ in a line."""
+def test_versions_have_a_digest_of_the_sources_and_of_the_glass_catalogues(tmp_path):
+    """Of names and contents: two installations of the same version may differ in a line, or in a glass."""
     copy = tmp_path / "mi_refract"
     shutil.copytree(Path(on_worker.__file__).parents[1], copy, ignore=shutil.ignore_patterns("__pycache__"))
     environment = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
-    versions = []
-    for path, text in ((None, ""), (copy / "formulas" / "__init__.py", "# a comment"), (copy / "new.py", "")):
+    glasses = tmp_path / "opticalglass"
+    glasses.mkdir()
+    (glasses / "__init__.py").touch()
+    versions, catalogues = [], []
+    changes = [(None, ""), (copy / "formulas" / "__init__.py", "# a comment"), (copy / "new.py", "")]
+    changes += [(glasses / "SCHOTT.xls", "1.5"), (glasses / "SCHOTT.xls", "2")]
+    for path, text in changes:
         if path:
             path.write_text(text + (path.read_text() if path.exists() else ""))
-        command = [sys.executable, "-c", "from mi_refract.cluster import on_worker; print(on_worker.our_version())"]
-        versions.append(subprocess.check_output(command, env=environment, cwd=tmp_path, text=True).strip())
-    assert versions[0] == on_worker.our_version() and len(set(versions)) == 3
+        code = "from mi_refract.cluster import on_worker as w; print(w.our_version()); print(w.glass_catalogues())"
+        command = [sys.executable, "-c", code]
+        version, catalogue = subprocess.check_output(command, env=environment, cwd=tmp_path, text=True).splitlines()
+        versions.append(version)
+        catalogues.append(catalogue)
+    assert versions[0] == on_worker.our_version() and [len(set(versions[:i])) for i in (1, 2, 3, 5)] == [1, 2, 3, 3]
+    assert [len(set(catalogues[:i])) for i in (3, 4, 5)] == [1, 2, 3]
+    assert on_worker.facts("scalar_rgb")[GLASSES] == on_worker.glass_catalogues()
 
 
 MODULE = "mi_refract.cluster.on_worker"

@@ -95,6 +95,25 @@ def test_of_a_table_each_knot_is_its_own_value():
     assert len(found.coefficients) == 4
 
 
+def test_a_table_of_many_knots_is_searched_in_a_small_kernel(vectorised):
+    """Exactly: 1000 knots take 10 steps, not 1000."""
+    number, counts = dr.value_t(vectorised.vector), []
+    for count in (4, 1000):
+        knots = np.linspace(400, 800, count)
+        indices = 1.5 + np.sin(knots) / 9
+        pairs = zip(knots.tolist(), indices.tolist(), strict=True)
+        found = media.parse("table(" + ", ".join(f"{w!r}: {n!r}" for w, n in pairs) + ")")
+        at = np.linspace(400, 800, 5000).astype(np.float32)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            n = found.index(number(at))
+            dr.eval(n)
+            counts.append(max(kernel.get("operation_count", 0) for kernel in dr.kernel_history()))
+        expected = np.interp(at.astype(np.float64), knots, indices)
+        np.testing.assert_allclose(np.array(n), expected, rtol=4e-16)
+        np.testing.assert_allclose(found.index(at), expected, rtol=4e-16)
+    assert counts[1] < 5 * counts[0]
+
+
 @pytest.mark.parametrize("wavelength", [399.0, 901.0, math.nan, math.inf, -500.0, 0.0])
 def test_outside_its_range_a_medium_has_no_index(wavelength, vectorised):
     found = media.parse("table(400: 1.53, 900: 1.5)")
@@ -112,6 +131,8 @@ def test_outside_its_range_a_medium_has_no_index(wavelength, vectorised):
 
 BAD = {
     "cauchy(1.5, nan)": r"expected cauchy\(A, B, …\), λ in nm, up to 8, finite numbers",
+    "cauchy(1_5, 0)": r"expected cauchy\(A, B, …\), λ in nm, up to 8, finite numbers",
+    "table(4_00: 1.5, 500: 1.5)": "expected table",
     "cauchy()": r"expected cauchy\(A, B, …\)",
     "cauchy(1,2,3,4,5,6,7,8,9)": "up to 8",
     "cauchy(1, -1e6)": "n is not positive at 360 nm; expected a positive index everywhere in 360 … 830 nm",

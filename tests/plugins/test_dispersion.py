@@ -167,6 +167,16 @@ def test_a_spectrum_may_jump_between_knots_that_agree_to_nine_digits(spectral_va
         assert bent.wo[0] == pytest.approx(-math.sin(0.5) / index, rel=1e-6)
 
 
+def test_an_edited_knot_of_a_table_is_that_of_a_table_with_it(spectral_variant):
+    edited, other = load("table(360: 1.5, 500: 1.6, 830: 1.7)"), load("table(360: 1.5, 500: 1.55, 830: 1.7)")
+    parameters = mi.traverse(edited)
+    parameters["int_ior_n_500"] = type(parameters["int_ior_n_500"])(1.55)
+    parameters.update()
+    for wavelength in (400.0, 500.0, 600.0):
+        a, b = (sample(x, tilted(0.5), REFRACTED, (wavelength, 500.0, 600.0, 700.0)) for x in (edited, other))
+        assert a.wo[0] == pytest.approx(b.wo[0], rel=1e-6)  # 1.55 is set in float32
+
+
 def test_a_spectrum_is_no_index_where_it_becomes_a_colour(scalar_variant):
     with pytest.raises(RuntimeError, match=r"int_ior: this variant makes a spectrum a colour; .*'table\(360.0: 1.5, "):
         mi.load_string(JUMP)

@@ -236,12 +236,27 @@ def test_each_point_has_its_own_index(each_variant):
     assert sampled(bsdf, (0.6, 0, 0.8), 0.999999, u=0.25).wo[0] == pytest.approx(-0.6 / 1.6, rel=1e-6)
 
 
-@pytest.mark.parametrize("index", [0.0, -1.5, math.nan, math.inf, 1e10, 1e-10])
-def test_where_the_texture_holds_no_index_light_is_lost(typical_variant, index):
-    bsdf = load(int_ior=texture(1.5, index), ext_ior=1.0)
-    assert (sampled(bsdf, (0.6, 0, 0.8), 0.999999, u=0.25).weight > 0).all()
+@pytest.mark.parametrize("index", [0.0, -1.5, math.nan, math.inf, 1e30, 1e-10])
+def test_a_texture_that_holds_no_index_is_refused_and_an_edit_loses_its_light(typical_variant, index):
+    checkers = {"type": "checkerboard", "color0": 1.5, "color1": texture(1.5, index)}
+    for name, bad in (("int_ior", texture(1.5, index)), ("ext_ior", checkers)):
+        message = f"refract: {name}: its texture holds {index:g}; expected indices from"
+        assert message in refusal(load, **{name: bad})
+    bsdf = load(int_ior=texture(1.5, 1.5), ext_ior=1.0)
+    parameters = mi.traverse(bsdf)
+    parameters["int_ior.data"][:] = index
+    parameters.update()
     for number in (0.0, 0.999999):
         assert (sampled(bsdf, (0.6, 0, 0.8), number, u=0.75).weight == 0).all()
+
+
+def test_of_a_coloured_texture_the_luminance_is_the_index(needs_variant):
+    needs_variant("llvm_ad_rgb")
+    mi.set_variant("llvm_ad_rgb")
+    for colour, said in (([0.0, 2.0, 0.0], ""), ([0.0, 0.0, 0.0], "its texture holds 0;")):
+        pixels = mi.Bitmap(np.full((1, 1, 3), colour, np.float32))
+        index = {"type": "bitmap", "bitmap": pixels, "raw": True}
+        assert said in refusal(load, int_ior=index) if said else load(int_ior=index)
 
 
 # What is refused -----------------------------------------------------------------------------------------------

@@ -130,7 +130,7 @@ def test_our_scenes_pass():
     for path in SCENES.glob("*.xml"):
         parsed = scene_parser.parse(path)
         assert {node.props.plugin_name() for node in parsed.state.nodes} <= scene_parser.known_plugins()
-        assert parsed.xml == (path,) and all(file.is_file() for file in parsed.files().values())
+        assert all(file.is_file() for file in parsed.files().values())
 
 
 def test_the_search_path_is_as_before(load):
@@ -279,13 +279,13 @@ def test_files_are_those_that_mitsuba_opens(load, tmp_path):
     elements = f'{SENSOR}<path value="more"/><include filename="inner.xml"/><include filename="inner.xml"/>{sky}'
     scene = load(elements + n)
     parsed = scene_parser.parse(tmp_path / "s.xml")
-    assert len(scene.shapes()) == 2 and parsed.xml == (tmp_path / "s.xml", tmp_path / "inner.xml")
+    assert len(scene.shapes()) == 2
     params = mi.traverse(scene)
     assert np.array(params[next(key for key in [*params.keys()] if key.endswith(".data"))]).max() == 1
     values = np.concatenate([np.ravel(np.array(params[key])) for key in [*params.keys()] if "reflectance" in key])
     assert {0.4} <= {*values.round(1).tolist()} <= {0.4, 0.5}  # 0.5: of the sphere
-    assert parsed.files() == {"sky.exr": tmp_path / "more" / "sky.exr"} and "400:0.4" not in parsed.text
-    assert f"300:{0.4}" in parsed.text
+    assert parsed.files() == {"sky.exr": tmp_path / "more" / "sky.exr"}
+    assert ("reflectance", "Spectrum", ([300.0, 900.0], [0.4, 0.4])) in [x for node in parsed.nodes for x in node[3]]
     with pytest.raises(RuntimeError, match=rf"Error while loading plugin .*{tmp_path}/more/plugins/evil\.so"):
         load(elements + '<bsdf type="evil"/>', "evil")
     code = scene_parser.parse(tmp_path / "s.xml").files(("evil",))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support.dask_workers import accepted, joined, kill, until
 from support.processes import python
+from support.renders import GLASS
 
 from mi_refract.cluster import workers as workers_module
 from mi_refract.cluster.connection import connected
@@ -22,18 +23,6 @@ from mi_refract.rendering.long_render import Job, resume
 from mi_refract.rendering.pass_sums import PassSums
 from mi_refract.rendering.scene_files import parse_scene
 
-SCENE = """<scene version="3.0.0">
-  <integrator type="path"><integer name="max_depth" value="5"/></integrator>
-  <sensor type="perspective">
-    <transform name="to_world"><lookat origin="0,1,-4" target="0,0,0" up="0,1,0"/></transform>
-    <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="6"/></film>
-    <sampler type="independent"/>
-  </sensor>
-  <emitter type="constant">RADIANCE</emitter>
-  <shape type="sphere"><bsdf type="refract"/></shape>
-  <shape type="cube"><transform name="to_world"><translate x="1" y="1.5"/></transform></shape>
-</scene>"""
-
 
 @pytest.fixture(scope="module")
 def client():
@@ -44,7 +33,7 @@ def client():
 @pytest.fixture
 def scene(tmp_path):
     path = tmp_path / "scene.xml"
-    path.write_text(SCENE.replace("RADIANCE", ""))
+    path.write_text(GLASS)
     return path
 
 
@@ -55,7 +44,7 @@ def small_tasks(monkeypatch):
 
 
 def source(client, scene, variant, warn=lambda text: None, **options):
-    bundle = scene_bundle.pack(parse_scene(scene), {})
+    bundle = scene_bundle.pack(parse_scene(scene))
     return ClusterPasses(accepted(client, variant, **options), bundle, variant, 0, warn)
 
 
@@ -205,13 +194,14 @@ def test_what_is_folded_stays_as_it_is():
 
 def test_what_is_wrong_with_the_scene_is_said_as_by_a_local_render(client, scene, variant):
     """An error that is raised when it is rendered: the scene scatters; and pixels that are not finite, by machine."""
-    scene.write_text(SCENE.replace("RADIANCE", '<rgb name="radiance" value="nan"/>'))
+    nan = 'type="constant"><rgb name="radiance" value="nan"/></emitter>'
+    scene.write_text(GLASS.replace('type="constant"/>', nan))
     said, errors = [], []
     found = rendered(scene, 4, source(client, scene, variant, said.append))
     assert found[1]["mi_refract:nonfinite_pixels"] == rendered(scene, 4)[1]["mi_refract:nonfinite_pixels"] > 0
     assert len(said) == 1 and re.fullmatch(rf"{os.uname().nodename}: \d+ pixels of a pass are not finite", said[0])
     deterministic = 'type="refract_path"><boolean name="deterministic" value="true"/>'
-    scene.write_text(SCENE.replace("RADIANCE", "").replace('type="path">', deterministic))
+    scene.write_text(GLASS.replace('type="path">', deterministic))
     for passes in (None, source(client, scene, variant)):
         with pytest.raises(ValueError, match="deterministic") as caught:
             rendered(scene, 4, passes)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
+import os
 import random
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -188,6 +191,39 @@ def test_it_ends_at_the_limit_that_is_reached_first(tmp_path, llvm):
     assert rendering(tmp_path / "e.exr", scene=scene, spp=8, pass_spp=4).run()["mi_refract:spp"] == 8
 
 
+def test_passes_grow_by_no_more_than_the_error_needs(tmp_path, llvm):
+    """The error that is reached is at least 2/3 of the one asked for, and a resumed render has the same bits."""
+    limits, sizes = {"until": 0.02}, []
+    options = {"defines": {"res": "64"}, "restart": True}
+    rendering(tmp_path / "a.exr", **options, **limits).run(lambda render: sizes.append(render.plan.spp))
+    render = rendering(tmp_path / "b.exr", **options, **limits)
+    for passes in (8, 9, 13):  # after the passes of one size, and among those of others
+        stopped_after(render, passes)
+        render = rendering(tmp_path / "b.exr", defines={"res": "64"}, **limits)
+        assert render.progress.passes == passes
+    render.run()
+    np.testing.assert_array_equal(pixels(tmp_path / "a.exr"), pixels(tmp_path / "b.exr"))
+    error = render.error()
+    assert 2 / 3 * 0.02 < error.value < error.high <= 0.02
+    assert sizes[0] < max(sizes) and sizes[-1] < max(sizes)
+    # A checkpoint that is good enough for another error is the image.
+    stopped_after(rendering(tmp_path / "c.exr", **options, **limits), 8)
+    rendering(tmp_path / "c.exr", defines={"res": "64"}, until=0.2).run()
+    assert read(tmp_path / "c.exr").metadata["mi_refract:passes"] == 8
+    assert not checkpoint.path_of(tmp_path / "c.exr").exists()
+
+
+def test_an_image_without_a_finite_pixel_ends_in_one_line(tmp_path, llvm):
+    nan = '<emitter type="constant"><rgb name="radiance" value="nan"/></emitter>'
+    (tmp_path / "a.xml").write_text(SKY.format(nan))
+    for limits in ({"until": 0.1}, {"until_tile": 0.1, "pass_spp": 4}):
+        render = resume(Job(tmp_path / "a.xml"), tmp_path / "a.exr", Limits(**limits), restart=True)
+        with pytest.raises(ValueError, match=r"a\.exr: no pixel of the image is finite; --until cannot be evaluated"):
+            render.run()
+    header = resume(Job(tmp_path / "a.xml"), tmp_path / "a.exr", Limits(until=0.1, spp=40), restart=True).run()
+    assert header["mi_refract:nonfinite_pixels"] == 64 and header["mi_refract:spp"] == 40
+
+
 def test_looks_are_few_also_where_it_resumes(tmp_path, llvm, monkeypatch):
     """After 9 passes the next look is at 12: an estimate that is looked at often is too small at some time."""
     rendering(tmp_path / "a.exr", spp=18, pass_spp=2).run()
@@ -281,12 +317,72 @@ def test_a_checkpoint_of_another_render_is_refused_by_name(tmp_path, llvm, monke
     refused("variant was llvm_ad_rgb, is scalar_rgb")
 
 
+def forged(header=None, nodes=None, more=b""):
+    """A change of a checkpoint's content, under the digest that it then has."""
+
+    def change(content):
+        line, rest = content[32:].split(b"\n", 1)
+        found = json.loads(line) | (header or {})
+        found["nodes"] |= nodes or {}
+        content = json.dumps(found).encode() + b"\n" + (rest + more if more is not None else rest[:24])
+        return hashlib.sha256(content).digest() + content
+
+    return change
+
+
+KINDS = ["total", "between", "within"]
+
+
+def test_the_catalogue_of_a_glass_is_part_of_the_render(tmp_path, llvm, monkeypatch):
+    """Here and on workers; where no glass of a catalogue is named, catalogues do not count."""
+    pytest.importorskip("opticalglass")
+    for name, index in (("glass", "SCHOTT:N-BK7"), ("number", "water")):
+        bsdf = f'<bsdf type="refract"><string name="int_ior" value="{index}"/></bsdf>'
+        (tmp_path / f"{name}.xml").write_text(SKY.format(f'<shape type="sphere">{bsdf}</shape>'))
+
+    def begun(name):
+        return resume(Job(tmp_path / f"{name}.xml"), tmp_path / f"{name}.exr", Limits(spp=16, pass_spp=4))
+
+    for name in ("glass", "number"):
+        render = begun(name)
+        assert (on_worker.GLASSES in render.tolerated_facts) == (name == "number")
+        stopped_after(render, 2)
+    monkeypatch.setattr(on_worker, "glass_catalogues", lambda: "another")
+    assert begun("number").progress.passes == 2
+    with pytest.raises(ValueError, match=r"glass catalogues was \w+, is another; pass --restart"):
+        begun("glass")
+
+
+def test_sums_from_elsewhere_are_checked(tmp_path, llvm):
+    render = rendering(tmp_path / "a.exr", spp=16, pass_spp=4)
+
+    def elsewhere(first, stop, last, offset, spp):
+        sums = render.renderer.render(first, spp)
+        yield 0, replace(sums, spp=2 * sums.spp), "there"
+
+    with pytest.raises(ValueError, match=r"sums of 1 passes of 8 .* expected 1 of 4 over \(8, 8, 3\)"):
+        render.run(passes=elsewhere)
+
+
 DAMAGE = {
     "truncated": lambda content: content[:-100],
-    "flipped": lambda content: content[:1500] + bytes([content[1500] ^ 1]) + content[1501:],
+    "longer": lambda content: content + b"x",
     "empty": lambda content: b"",
     "text": lambda content: b"hello",
-    "another format": lambda content: content.replace(b'"format": %d' % checkpoint.FORMAT, b'"format": 99'),
+    "another format": forged({"format": 99}),
+    "no header": forged({"nodes": {}}),
+    "without its sums": forged({"nodes": {}, "counts": []}),
+    "sums of another pass": forged({"counts": [2]}),
+    "a level of ten": forged({"counts": [10]}, {"level0": [40, 10, KINDS]}),
+    "no samples": forged(nodes={"level0": [0, 3, KINDS]}),
+    "negative samples": forged(nodes={"level0": [-64, 3, KINDS]}),
+    "samples that passes do not have": forged(nodes={"level0": [13, 3, KINDS]}),
+    "sums that are missing": forged(nodes={"base": [64, 8, KINDS]}),
+    "an older image of no samples": forged(nodes={"base": [0, 0, []]}),
+    "more sums than a machine has memory": forged(nodes={"base": [2**60, 2**60, []]}),
+    "sums of one pixel": forged(more=None),
+    "sums of more pixels": forged(more=bytes(8)),
+    "fractions of passes": forged({"counts": [3.0]}, {"level0": [12.0, 3.0, KINDS]}),
 }
 
 
@@ -294,10 +390,34 @@ def test_a_damaged_checkpoint_is_refused(tmp_path, llvm):
     stopped_after(rendering(tmp_path / "a.exr", spp=64, pass_spp=4), 3)
     path = checkpoint.path_of(tmp_path / "a.exr")
     whole = path.read_bytes()
-    for damage in DAMAGE.values():
-        path.write_bytes(damage(whole))
+
+    def refused():
         with pytest.raises(ValueError, match=r"^\S+a\.exr\.checkpoint: damaged checkpoint [^\n]*--restart[^\n]*$"):
             rendering(tmp_path / "a.exr", spp=64, pass_spp=4)
+
+    for name, damage in DAMAGE.items():
+        path.write_bytes(damage(whole))
+        assert path.read_bytes() != whole, name
+        refused()
+    path.write_bytes(forged()(whole))  # or the others would be refused for something else
+    assert rendering(tmp_path / "a.exr", spp=64, pass_spp=4).progress.passes == 3
+    path.unlink()
+    os.mkfifo(path)
+    refused()
+
+
+def test_every_flipped_bit_of_a_checkpoint_is_noticed(tmp_path, llvm):
+    render = rendering(tmp_path / "a.exr", spp=64, pass_spp=4)
+    stopped_after(render, 3)
+    path, shape = render.checkpoints.path, (8, 8, 3)
+    whole = path.read_bytes()
+    assert checkpoint.read(path, render.progress.identity, shape).done == 12
+    for bit in random.Random(0).sample(range(8 * len(whole)), 500):
+        content = bytearray(whole)
+        content[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="damaged checkpoint"):
+            checkpoint.read(path, render.progress.identity, shape)
 
 
 # What may go wrong ----------------------------------------------------------------------------------------------------

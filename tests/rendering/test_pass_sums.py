@@ -222,3 +222,27 @@ def test_what_is_not_finite_stays_so_and_spoils_no_estimate():
     sums = tree_of(images).sums()
     assert np.isnan(sums.mean[0, 0, 0]) and not np.isfinite(sums.mean[1, 1, 1])
     assert np.isfinite(sums.mean).sum() == 46 and np.isfinite(sums.contrasts).all()
+
+
+ONES = np.ones((2, 3, 3))
+WRONG = [
+    {"spp": 8},
+    {"spp": -64},
+    {"passes": 2},
+    {"contrasts": [1.0]},
+    {"total": np.ones((1, 1, 3))},
+    {"total": np.ones((2, 3, 4)), "between": np.ones((2, 3, 4))},
+    {"between": -ONES},
+    {"within": np.nan * ONES},
+    {"weights": ONES},
+    {"weights": np.inf * np.ones((2, 3, 1))},
+]
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=lambda wrong: next(iter(wrong)))
+def test_sums_of_another_image_are_refused(wrong):
+    right = {"spp": 4, "passes": 1, "total": ONES, "between": 0 * ONES}
+    PassSums(**right).check((2, 3, 3), 1, 4)
+    PassSums(**right | {"total": np.nan * ONES, "between": np.nan * ONES}).check((2, 3, 3), 1, 4)  # of such a scene
+    with pytest.raises(ValueError, match=r"^(sums of|weights that)"):
+        PassSums(**right | wrong).check((2, 3, 3), 1, 4)

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.processes import python
 from support.renders import SCENES
 
 from mi_refract.rendering.pass_plan import FEW, scalar_seed_of, seed_of
@@ -143,6 +144,31 @@ def test_the_number_of_threads_does_not_show(tmp_path, llvm, rfilter, spp):
     for sums in found[1:]:
         np.testing.assert_array_equal(sums.total, found[0].total)
         np.testing.assert_array_equal(sums.within, found[0].within)
+
+
+DIM = """
+import sys
+import drjit as dr, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+dr.set_thread_count(int(sys.argv[1]))
+from mi_refract.rendering.render_pass import pass_renderer
+dim = {"type": "rgb", "value": 1e-20}
+film = {"type": "hdrfilm", "width": 8, "height": 8, "filter": {"type": "box"}}
+wall = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": dim}}
+wall["to_world"] = mi.ScalarTransform4f().translate([0, 0, 5]).scale(9).rotate([0, 1, 0], 180)
+sensor, sky = {"type": "perspective", "film": film}, {"type": "constant", "radiance": dim}
+scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "sensor": sensor, "sky": sky, "wall": wall})
+print(pass_renderer(scene, 0).render(0, 4).total.sum())
+"""
+
+
+def test_one_thread_takes_denormals_for_0_as_several_do(llvm):
+    """The caller's own thread keeps them, in a process that has rendered nothing before."""
+    found = []
+    for count in (1, 3):
+        with python(DIM, count) as process:
+            found.append(process.communicate(timeout=120)[0].splitlines()[-1])
+    assert found[0] == found[1]
 
 
 def test_an_integrator_with_a_render_of_its_own_runs_in_one_thread(tmp_path, llvm, monkeypatch):
