@@ -156,8 +156,9 @@ def compare(
     NAME.variance are what `welch` reads of single images, and otherwise left out, but for those that are `named`.
 
     INCONCLUSIVE where a method calls the images equal but would call a black one equal, too, or one with some of its
-    channels black; where channels whose variance `welch` does not know differ by more than `tolerance` allows; and
-    where no value of a channel is finite. DIFFERENT where one of two images has channels besides.
+    channels black, or passes many pixels that change by half; where channels whose variance `welch` does not know
+    differ by more than `tolerance` allows; and where no value of a channel is finite. DIFFERENT where one of two images
+    has channels besides.
 
     ValueError for an unknown method or option, an option of another type or out of its range, several renders for a
     method that takes one, and images that cannot be compared.
