@@ -38,6 +38,7 @@ CODED = re.compile(r"srgb|gamma|^g\d\d")  # colour spaces, in OpenImageIO's word
 LINEAR = re.compile(r"^lin|linear|^aces|^raw$|^data$")
 INTEGERS = ("uint8", "uint16")  # a file of these that names no colour space holds what a display is sent
 DARKER = 4.0  # two stops: where the brightest light is shown nearly white, light twice as bright is, too
+DUST = 2.0**-24  # where the other median is so many times as bright, this one is of rounding errors
 WINDOW, OCTAVES = 0.12, 7  # degrees: the side of the smallest window; how many windows, each twice as wide
 SURFACE = 0.24  # degrees: the side of the window that an error fills
 AROUND = 0.5  # degrees: where black is seen so near to the brightest window, the rest need not be looked at
@@ -123,7 +124,8 @@ def flip_map(reference: Image, test: Image, hdr: bool, ppd: float = PIXELS_PER_D
 
     linear = [_linear(image) for image in (reference, test)]
     light = [pixels @ LUMINANCE for pixels in linear]
-    median = min((float(np.median(x[x > 0])) for x in light if (x > 0).any()), default=0.18)
+    medians = [float(np.median(x[x > 0])) for x in light if (x > 0).any()]
+    median = min((x for x in medians if x > DUST * max(medians)), default=0.18)
     brightest = max(map(_brightest, light)) or 2.0
     one, two = (oiio.ImageBuf(pixels) for pixels in linear)
     result = oiio.ImageBufAlgo.FLIP_diff(one, two, int(hdr), DARKER * brightest, median, ppd)
