@@ -8,7 +8,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +18,27 @@ from mi_refract.io.image_file import Image, Pixels
 Maps = dict[str, Pixels]
 
 
-class Verdict(enum.StrEnum):
-    """The verdict of a method on two images."""
+class Range(NamedTuple):
+    """The values of an option: whether one is among them, and all of them in words."""
 
-    EQUAL = "equal"
+    contains: Callable[[Any], bool]
+    words: str
+
+
+NONNEGATIVE = Range(lambda x: x >= 0, "a number of at least 0")
+
+
+def one_of(*words: str) -> Range:
+    """The range of these words."""
+    return Range(words.__contains__, ", ".join(words))
+
+
+class Verdict(enum.StrEnum):
+    """The verdict of a method on two images; the worst first."""
+
     DIFFERENT = "different"
     INCONCLUSIVE = "inconclusive"
+    EQUAL = "equal"
 
 
 @dataclass(frozen=True)
@@ -128,8 +143,12 @@ def shared_channels(reference: Image, test: Image) -> tuple[Image, Image, str]:
     first = float(pixels.flat[0])
     opaque = "opaque: " if first == 1 and all(name.rpartition(".")[2] == "A" for name in names) else ""
     value = f" ({opaque}{first:g} everywhere)" if (pixels == first).all() else ""
-    one, two = (replace(x, pixels=x.select(shared), channels=tuple(shared)) for x in (reference, test))
-    return one, two, f"channels {word}: {', '.join(names)}{value}"
+    return only(reference, shared), only(test, shared), f"channels {word}: {', '.join(names)}{value}"
+
+
+def only(image: Image, names: Sequence[str]) -> Image:
+    """The image with these channels only."""
+    return replace(image, pixels=image.select(names), channels=tuple(names))
 
 
 def finite(pixels: Pixels) -> Pixels:

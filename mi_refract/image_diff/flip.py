@@ -16,7 +16,7 @@ probability summation (Robson and Graham, Vision Research 21, 1981). `patch_erro
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -24,8 +24,7 @@ import numpy as np
 
 from mi_refract.io.image_file import Image, Pixels, block_mean, srgb_decode
 
-from .comparison import Comparison, Metric, Verdict, passes_black, verdict_of
-from .pixelwise import require_nonnegative, tolerance
+from .comparison import Comparison, Metric, Range, one_of, only, verdict_of
 
 PIXELS_PER_DEGREE = 67.0  # of the viewer's field: FLIP's default, a screen of 0.7 m and 3840 pixels at 0.7 m
 RGB = ("R", "G", "B")
@@ -39,6 +38,7 @@ CODED = re.compile(r"srgb|gamma|^g\d\d")  # colour spaces, in OpenImageIO's word
 LINEAR = re.compile(r"^lin|linear|^aces|^raw$|^data$")
 INTEGERS = ("uint8", "uint16")  # a file of these that names no colour space holds what a display is sent
 DARKER = 4.0  # two stops: where the brightest light is shown nearly white, light twice as bright is, too
+DUST = 2.0**-24  # where the other median is so many times as bright, this one is of rounding errors
 WINDOW, OCTAVES = 0.12, 7  # degrees: the side of the smallest window; how many windows, each twice as wide
 SURFACE = 0.24  # degrees: the side of the window that an error fills
 AROUND = 0.5  # degrees: where black is seen so near to the brightest window, the rest need not be looked at
@@ -55,58 +55,33 @@ def flip(
     ] = LOCAL,
     patch: Annotated[float, "FLIP error that may fill a square of 0.24 degrees, 0 to 1"] = PATCH,
     largest: Annotated[float, "FLIP error that no pixel may exceed, 0 to 1"] = 1.0,
-    hdr: Annotated[str, "auto (by the file's format), yes or no"] = "auto",
-    ppd: Annotated[float, "pixels per degree of the viewer's field"] = PIXELS_PER_DEGREE,
+    hdr: Annotated[str, "auto (by the file's format), yes or no", one_of("auto", "yes", "no")] = "auto",
+    # Below 1 its filters see nothing; above 1000 they are larger than any image.
+    ppd: Annotated[
+        float, "pixels per degree of the viewer's field", Range(lambda x: 1 <= x <= 1000, "1 to 1000")
+    ] = PIXELS_PER_DEGREE,
 ) -> Comparison:
     """The differences that a person flipping between the images would see: FLIP, for LDR and HDR images.
 
-    The verdict is that of the worst window, see `local_error`. Alpha is looked at as a gray image; any other channels
-    than R, G, B are compared by `tolerance` with its defaults.
+    The verdict is that of the worst window, see `local_error`. Both have the channels R, G, B, or one that is alone:
+    an alpha from 0 to 1 is looked at as the gray codes of a display. ValueError for other channels.
     """
-    options: Options = {"local": local, "patch": patch, "largest": largest, "hdr": hdr, "ppd": ppd}
-    require_nonnegative(options)
-    if hdr not in ("auto", "yes", "no"):
-        raise ValueError(f"hdr = {hdr!r}; expected auto, yes, no")
-    if not 1 <= ppd <= 1000:  # below, its filters see nothing; above, they are larger than any image
-        raise ValueError(f"ppd = {ppd}; expected 1 to 1000")
-    result = _of_colours(reference, test, options)
-    others = [name for name in reference.channels if name not in _colours(reference)]
-    for names in filter(None, ([n for n in others if n == ALPHA], [n for n in others if n != ALPHA])):
-        one, two, listed = _only(reference, names), _only(test, names), ", ".join(names)
-        if np.array_equal(one.pixels, two.pixels, equal_nan=True):
-            result = replace(result, reason=f"{result.reason}; not compared by FLIP, but identical: {listed}")
-            continue
-        coverage = all(bool(((x.pixels >= 0) & (x.pixels <= 1)).all()) for x in (one, two))
-        if names == [ALPHA] and coverage:
-            one, two = (replace(image, metadata={"oiio:ColorSpace": "sRGB"}) for image in (one, two))
-            of_alpha = {**options, "hdr": "no"}
-            more, method, black = _of_colours(one, two, of_alpha), "FLIP", passes_black(flip, [one], of_alpha)
-            bounded, maps = more.metrics[:3], {f"flip of {ALPHA}": more.maps["flip"]}
-        else:
-            more, method, black = tolerance(one, two), "tolerance", passes_black(tolerance, [one], {})
-            bounded, maps = more.metrics[:1], {}
-        metrics = (*result.metrics, *(replace(metric, name=f"{metric.name}, in {listed}") for metric in bounded))
-        verdict, reason = verdict_of(metrics), f"{result.reason}; by {method} {listed}: {more.reason}"
-        if verdict is Verdict.EQUAL and black:
-            verdict, reason = Verdict.INCONCLUSIVE, f"{reason}, but black would pass as well"
-        result = replace(result, verdict=verdict, reason=reason, metrics=metrics, maps=result.maps | maps)
-    return result
-
-
-def _of_colours(reference: Image, test: Image, options: Options) -> Comparison:
-    wide = is_hdr(reference, test, options["hdr"])
-    error = flip_map(reference, test, wide, options["ppd"])
-    (worst, around), patch = local_error(error, options["ppd"]), patch_error(error, options["ppd"])
+    if reference.channels == (ALPHA,) and _is_coverage(reference, test):
+        hdr = "no"
+        reference, test = (replace(image, metadata={"oiio:ColorSpace": "sRGB"}) for image in (reference, test))
+    wide = is_hdr(reference, test, hdr)
+    error = flip_map(reference, test, wide, ppd)
+    (worst, around), patched = local_error(error, ppd), patch_error(error, ppd)
     metrics = (
-        Metric("local FLIP error", worst.value, options["local"]),
-        Metric("FLIP error throughout a patch", patch.value, options["patch"]),
-        Metric("largest FLIP error", float(error.max()), options["largest"]),
+        Metric("local FLIP error", worst.value, local),
+        Metric("FLIP error throughout a patch", patched.value, patch),
+        Metric("largest FLIP error", float(error.max()), largest),
         Metric("mean FLIP error", float(error.mean())),
         Metric("99th percentile of the FLIP error", float(np.percentile(error, 99))),
     )
     reason = f"local FLIP error {worst.value:.3g}, largest {error.max():.3g} ({'HDR' if wide else 'LDR'})"
     if worst.value:
-        kind, window = ("mean", worst) if metrics[1].holds or not metrics[0].holds else ("at least", patch)
+        kind, window = ("mean", worst) if metrics[1].holds or not metrics[0].holds else ("at least", patched)
         x, y = window.x + reference.origin[0], window.y + reference.origin[1]
         reason += f"; {kind} {window.error:.3g} in {window.width} × {window.height} pixels from x = {x}, y = {y}"
     return Comparison("flip", verdict_of(metrics), reason, metrics, maps={"flip": error, "local": around})
@@ -114,7 +89,6 @@ def _of_colours(reference: Image, test: Image, options: Options) -> Comparison:
 
 def views(image: Image, options: Options) -> Iterator[Image]:
     """The colours around the brightest window, where black is seen first, and all of them."""
-    image = _only(image, _colours(image))
     side, around = max(1, round(WINDOW * options["ppd"])), max(1, round(AROUND * options["ppd"]))
     light = block_mean(_linear(image), side).sum(-1)
     y, x = (side * int(i) for i in np.unravel_index(int(light.argmax()), light.shape))
@@ -123,8 +97,16 @@ def views(image: Image, options: Options) -> Iterator[Image]:
     yield image
 
 
-def _only(image: Image, channels: Sequence[str]) -> Image:
-    return replace(image, pixels=image.select(channels), channels=tuple(channels))
+def looks_at(reference: Image, test: Image) -> list[list[str]]:
+    """The colours; beside them an alpha from 0 to 1."""
+    colours = list(_colours(reference))
+    alpha = ALPHA in reference.channels and ALPHA not in colours
+    coverage = alpha and _is_coverage(only(reference, [ALPHA]), only(test, [ALPHA]))
+    return [colours, *([[ALPHA]] if coverage else [])]
+
+
+def _is_coverage(*images: Image) -> bool:
+    return all(bool(((image.pixels >= 0) & (image.pixels <= 1)).all()) for image in images)
 
 
 def is_hdr(reference: Image, test: Image, hdr: str = "auto") -> bool:
@@ -135,22 +117,34 @@ def is_hdr(reference: Image, test: Image, hdr: str = "auto") -> bool:
 def flip_map(reference: Image, test: Image, hdr: bool, ppd: float = PIXELS_PER_DEGREE) -> Pixels:
     """FLIP error of every pixel, H × W float32 from 0 to 1, of the channels R, G, B, or of one that is alone.
 
-    HDR looks at the image at the exposures between the reference's median luminance, without black pixels, and DARKER
-    times that of its brightest thousandth, one FLIP for each. ValueError for images without these channels.
+    HDR looks at both images at the exposures between the smaller one of their median luminances, without black pixels,
+    and DARKER times the larger one of their brightest, one FLIP for each. ValueError for images without these channels.
     """
     import OpenImageIO as oiio
 
     linear = [_linear(image) for image in (reference, test)]
-    light = linear[0] @ LUMINANCE
-    lit = light[light > 0]
-    # Not the very largest: one firefly would need many exposures at which all else is black.
-    median, brightest = map(float, np.quantile(lit, (0.5, 0.999))) if lit.size else (0.18, 2.0)
+    light = [pixels @ LUMINANCE for pixels in linear]
+    medians = [float(np.median(x[x > 0])) for x in light if (x > 0).any()]
+    median = min((x for x in medians if x > DUST * max(medians)), default=0.18)
+    brightest = max(map(_brightest, light)) or 2.0
     one, two = (oiio.ImageBuf(pixels) for pixels in linear)
     result = oiio.ImageBufAlgo.FLIP_diff(one, two, int(hdr), DARKER * brightest, median, ppd)
     if result.has_error:
         raise ValueError(f"{test.path}: FLIP: {result.geterror()}")
     error: Pixels = np.asarray(result.get_pixels(), np.float32)[..., 0]
     return error
+
+
+def _brightest(light: Pixels) -> float:
+    """The luminance of a thousandth of the pixels that are not black, or of the brightest line of three pixels.
+
+    Not the very largest: one firefly would need many exposures at which all else is black.
+    """
+    from scipy.ndimage import rank_filter
+
+    lit = light[light > 0]
+    of_lines = rank_filter(light, -3, 3, mode="constant")
+    return max(float(of_lines.max()), float(np.quantile(lit, 0.999)) if lit.size else 0.0)
 
 
 def encoding(image: Image) -> str:

@@ -21,11 +21,14 @@ from mi_refract.io.image_file import Image, Pixels, any_channel
 
 from . import channels, flip, pixelwise, welch
 from .comparison import (
+    NONNEGATIVE,
     Comparison,
+    Range,
     Verdict,
     aligned,
     finite,
     nonfinite_result,
+    only,
     passes_black,
     preconditions,
     shared_channels,
@@ -36,6 +39,7 @@ CHOSEN_BY_AUTO = ("welch", "tolerance")
 DECIDING = {"hard_fail", "allow_failures"}  # options that say by how much a single pixel may differ
 UNSEEN = 0.1  # share of the lit pixels that may differ so that black would be accepted there, too
 CLOSER = 100.0  # where the test image is so many times closer to the reference than black is, it is no black
+LOST = 0.5  # a pixel that changes by more than this share of the brighter one may as well be black
 ROW_STEP = 16  # every so many rows show whether a method would see that an image is black
 
 Side = Image | Sequence[Image]
@@ -44,12 +48,21 @@ Options = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Option:
-    """A keyword argument of a method."""
+    """A keyword argument of a method; without a `range` numbers are at least 0."""
 
     name: str
     type: type
     default: Any
     help: str
+    range: Range = NONNEGATIVE
+
+    def checked(self, method: str, value: Any) -> Any:
+        """The value of the option; ValueError for one of another type or out of its range."""
+        if isinstance(value, bool) or not isinstance(value, (int, float) if self.type is float else self.type):
+            raise ValueError(f"{method}: {self.name} = {value!r}; expected a value of type {self.type.__name__}")
+        if not self.range.contains(value):
+            raise ValueError(f"{method}: {self.name} = {value!r}; expected {self.range.words}")
+        return self.type(value)
 
 
 @dataclass(frozen=True)
@@ -58,14 +71,17 @@ class Method:
 
     `function(reference, test, **options)` takes one image a side, of the same channels in the same order, with finite
     values; where `takes_renders`, a sequence of independent renders, as they are. `views(image, options)`: of an image
-    those parts, the last the whole, that are compared with black; None where black never passes. `accepts_black(pixels,
-    options)`: in which pixels black passes; None where pixels are not judged alone, nor channels in groups.
+    those parts, the last the whole, that are compared with black; None where black never passes. `accepts(pixels,
+    others, options)`: in which pixels the others pass; None where pixels are not judged alone, nor channels in groups.
+    `looks_at(reference, test)`: groups of channels, of which it compares one at a time; None for all of them at once.
+    Other channels are compared by `tolerance`.
     """
 
     function: Callable[..., Comparison]
     views: Callable[[Image, Options], Iterable[Image]] | None = None
-    accepts_black: Callable[[Pixels, Options], NDArray[np.bool_]] | None = None
+    accepts: Callable[[Pixels, Pixels, Options], NDArray[np.bool_]] | None = None
     takes_renders: bool = False
+    looks_at: Callable[[Image, Image], list[list[str]]] | None = None
 
     @property
     def summary(self) -> str:
@@ -78,19 +94,10 @@ class Method:
         hints = typing.get_type_hints(self.function, include_extras=True)
         parameters = inspect.signature(self.function).parameters
         return {
-            name: Option(name, typing.get_args(hint)[0], parameters[name].default, hint.__metadata__[0])
+            name: Option(name, typing.get_args(hint)[0], parameters[name].default, *hint.__metadata__)
             for name, hint in hints.items()
             if typing.get_origin(hint) is Annotated
         }
-
-    def checked(self, method: str, name: str, value: Any) -> Any:
-        """The value of an option; ValueError for an unknown name or a value of another type."""
-        if name not in self.options:
-            raise ValueError(f"{method} has no option {name!r}; expected {', '.join(self.options) or 'none'}")
-        kind = self.options[name].type
-        if isinstance(value, bool) or not isinstance(value, (int, float) if kind is float else kind):
-            raise ValueError(f"{method}: {name} = {value!r}; expected a value of type {kind.__name__}")
-        return kind(value)
 
 
 def _rows(image: Image, options: Options) -> tuple[Image, Image]:
@@ -100,10 +107,10 @@ def _rows(image: Image, options: Options) -> tuple[Image, Image]:
 
 METHODS = {
     "exact": Method(pixelwise.exact),
-    "tolerance": Method(pixelwise.tolerance, _rows, pixelwise.tolerance_accepts_black),
-    "paired": Method(pixelwise.paired, _rows, pixelwise.paired_accepts_black),
+    "tolerance": Method(pixelwise.tolerance, _rows, pixelwise.tolerance_accepts),
+    "paired": Method(pixelwise.paired, _rows, pixelwise.paired_accepts),
     "welch": Method(welch.compare_renders, takes_renders=True),
-    "flip": Method(flip.flip, flip.views),
+    "flip": Method(flip.flip, flip.views, looks_at=flip.looks_at),
 }
 
 
@@ -149,18 +156,27 @@ def compare(
     NAME.variance are what `welch` reads of single images, and otherwise left out, but for those that are `named`.
 
     INCONCLUSIVE where a method calls the images equal but would call a black one equal, too, or one with some of its
-    channels black; where channels whose variance `welch` does not know differ by more than `tolerance` allows; and
-    where no value of a channel is finite. DIFFERENT where one of two images has channels besides.
+    channels black, or passes many pixels that change by half; where channels whose variance `welch` does not know
+    differ by more than `tolerance` allows; and where no value of a channel is finite. DIFFERENT where one of two images
+    has channels besides.
 
     ValueError for an unknown method or option, an option of another type or out of its range, several renders for a
     method that takes one, and images that cannot be compared.
     """
+    if method != AUTO and method not in METHODS:
+        raise ValueError(f"method {method!r}; expected {AUTO}, {', '.join(METHODS)}")
+    known = options_of_auto() if method == AUTO else METHODS[method].options
+    if unknown := options.keys() - known.keys():
+        raise ValueError(f"{method} has no option {min(unknown)!r}; expected {', '.join(known) or 'none'}")
+    options = {name: known[name].checked(method, value) for name, value in options.items()}
     sides = [[side] if isinstance(side, Image) else list(side) for side in (reference, test)]
+    for image in (*sides[0], *sides[1]):
+        if len(set(image.channels)) < len(image.channels):
+            raise ValueError(f"{image.path}: channels {', '.join(image.channels)}; expected each name once")
     if method != AUTO:
         return _compare(method, sides, allow_nonfinite, named, options)
     method, why = choice(*sides, spp=any(options.get(name) for name in ("spp", "spp_reference", "spp_test")))
-    unused = options_of_auto().keys() - METHODS[method].options.keys()
-    options = {name: value for name, value in options.items() if name not in unused}
+    options = {name: value for name, value in options.items() if name in METHODS[method].options}
     result = replace(_compare(method, sides, allow_nonfinite, named, options), chosen=why)
     if method == "tolerance" and result.is_equal and result.metrics[0].value > 0 and not options.keys() & DECIDING:
         a, b = _finite_pair(*(channels.without_variances(side[0], named) for side in sides))
@@ -172,20 +188,18 @@ def compare(
 def _compare(
     method: str, sides: list[list[Image]], allow_nonfinite: bool, named: Collection[str], options: Options
 ) -> Comparison:
-    if method not in METHODS:
-        raise ValueError(f"method {method!r}; expected {AUTO}, {', '.join(METHODS)}")
     chosen = METHODS[method]
-    checked = {name: chosen.checked(method, name, value) for name, value in options.items()}
     if not all(sides):
         raise ValueError(f"{method}: no image on one side; expected at least one")
     bare = [[channels.without_variances(image, named) for image in side] for side in sides]
-    single, doubt = len(bare[0]) == len(bare[1]) == 1, ""
+    single = len(bare[0]) == len(bare[1]) == 1
     if chosen.takes_renders:
-        result = chosen.function(*(sides if single else bare), allow_nonfinite=allow_nonfinite, **checked)
+        result = chosen.function(*(sides if single else bare), allow_nonfinite=allow_nonfinite, **options)
         if single and result.is_equal and (untested := channels.untested(sides[0][0], sides[1][0])):
             by_tolerance = compare("tolerance", *untested, allow_nonfinite=allow_nonfinite)
             if not by_tolerance.is_equal:
                 doubt = f"not tested, without variance: {', '.join(untested[0].channels)}: {by_tolerance.reason}"
+                return result.but(Verdict.INCONCLUSIVE, doubt)
     elif not single:
         raise ValueError(f"{method}: {len(bare[0])} and {len(bare[1])} images; expected one per side")
     else:
@@ -193,14 +207,10 @@ def _compare(
         if reason := preconditions(a, b, allow_nonfinite):
             result = nonfinite_result(method, reason, *aligned(a, b))
         else:
-            a, b = _finite_pair(a, b)
-            result = chosen.function(a, b, **checked)
+            result = _of_finite(method, *_finite_pair(a, b), options)
         if besides:
             reason = f"{besides}; the other channels: {result.reason}"
             return replace(result, verdict=Verdict.DIFFERENT, reason=reason, warning="")
-        doubt = blind_to(chosen, a, b, checked) if result.is_equal else ""
-    if doubt:
-        return result.but(Verdict.INCONCLUSIVE, doubt)
     if not result.is_equal or (is_finite := np.isfinite(bare[0][0].pixels)).all():
         return result
     names = bare[0][0].channels
@@ -216,42 +226,83 @@ def _finite_pair(reference: Image, test: Image) -> tuple[Image, Image]:
     return replace(reference, pixels=a), replace(test, pixels=b, channels=reference.channels)
 
 
+def _of_finite(method: str, a: Image, b: Image, options: Options) -> Comparison:
+    """The result of a method, and of `tolerance` for the channels that the method does not look at.
+
+    INCONCLUSIVE where black would pass. Both images are finite and have the same channels in the same order.
+    """
+    looks_at = METHODS[method].looks_at
+    parts = looks_at(a, b) if looks_at else [list(a.channels)]
+    others = [name for name in a.channels if not any(name in part for part in parts)]
+    result: Comparison | None = None
+    for by, names in [*((method, part) for part in parts), *([("tolerance", others)] if others else [])]:
+        one, two = only(a, names), only(b, names)
+        how = options if by == method else {}
+        if result and np.array_equal(one.pixels, two.pixels):
+            found = Comparison(by, Verdict.EQUAL, "identical")
+        else:
+            found = METHODS[by].function(one, two, **how)
+        if found.is_equal and (doubt := blind_to(METHODS[by], one, two, how)):
+            found = found.but(Verdict.INCONCLUSIVE, doubt)
+        if result is None:
+            result = found
+            continue
+        listed = ", ".join(names)
+        bounded = (replace(each, name=f"{each.name}, in {listed}") for each in found.metrics if each.bound is not None)
+        result = replace(
+            result,
+            verdict=min(result.verdict, found.verdict, key=[*Verdict].index),
+            reason=f"{result.reason}; by {by} {listed}: {found.reason}",
+            metrics=(*result.metrics, *bounded),
+            maps=result.maps | {f"{name} of {listed}": values for name, values in found.maps.items() if name == by},
+        )
+    assert result is not None  # an image has channels
+    return result
+
+
 # Would black pass? -----------------------------------------------------------------------------------------------
 
 
 def groups(names: Sequence[str]) -> dict[str, list[str]]:
-    """Channels by what they are part of: the colours, and the alpha and the depth, of each layer."""
+    """Channels that are judged together: the colours of each layer; every other channel alone."""
     parts: dict[str, list[str]] = {}
     for name in names:
         layer, dot, last = name.rpartition(".")
-        alone = last == "A" or (last == "Z" and not dot)  # a layer's X, Y, Z are a vector
-        parts.setdefault(name if alone else layer + dot, []).append(name)
+        together = last in ("R", "G", "B", "X", "Y") or (last == "Z" and dot)  # a layer's X, Y, Z are a vector
+        parts.setdefault(layer + dot if together else name, []).append(name)
     return parts
 
 
 def blind_to(method: Method, a: Image, b: Image, options: Options) -> str:
     """What black would pass in, in place of the test image `b`; "" where a difference would have been seen.
 
-    Nothing is said of what is the same in both images, or black in the reference. Both are finite and have the same
-    channels in the same order.
+    Of channels that are black in the reference: in place of that. Nothing is said of channels that are the same in both
+    images. Both are finite and have the same channels in the same order.
     """
     if method.views is None:
         return ""
     options = {name: option.default for name, option in method.options.items()} | dict(options)
-    parts = list(groups(a.channels).values()) if method.accepts_black else [list(a.channels)]
+    parts = list(groups(a.channels).values()) if method.accepts else [list(a.channels)]
     for names in parts:
-        one, two = (replace(x, pixels=x.select(names), channels=tuple(names)) for x in (a, b))
-        if not one.pixels.any() or np.array_equal(one.pixels, two.pixels):
+        one, two = only(a, names), only(b, names)
+        if not one.pixels.any():
+            one, two = two, one
+        if np.array_equal(one.pixels, two.pixels):
             continue
         of = f" in {', '.join(names)}," if len(parts) > 1 else ""
         if passes_black(method.function, method.views(one, options), options):
             return f"an all-black image would pass, too,{of} with these options"
-        if method.accepts_black:
-            y, x = np.nonzero(method.accepts_black(one.pixels, options))
-            dim, other = one.pixels[y, x], two.pixels[y, x]
-            unseen = any_channel(np.abs(dim - other) > np.abs(dim) / CLOSER) & any_channel(dim != 0)
-            share = float(unseen.sum() / max(any_channel(one.pixels != 0).sum(), 1))
+        if method.accepts is None:
+            continue
+        size, other, change = np.abs(one.pixels), np.abs(two.pixels), np.abs(two.pixels - one.pixels)
+        lit = any_channel(size > 0)
+        far = lit & any_channel(change > size / CLOSER)
+        if far.sum() > UNSEEN * lit.sum():  # or else too few are unseen
+            lost = change.max(-1) > LOST * np.maximum(size, other).max(-1)
+            lost &= method.accepts(one.pixels, two.pixels, options)
+            black = method.accepts(one.pixels, np.zeros_like(size), options)
+            share = float((far & (black | lost)).sum() / lit.sum())
             if share > UNSEEN:
                 where = f"in {share:.0%} of the pixels that are not black,"
-                return f"black would pass, too,{of} {where} with these options"
+                return f"black or a change by half would pass, too,{of} {where} with these options"
     return ""

@@ -27,13 +27,6 @@ BLOCK = 2**16  # pixels whose ratios are formed at once, in float64
 TIMES_AROUND, TIMES_MEAN, NEAR = 10.0, 100.0, 2
 
 
-def require_nonnegative(options: Mapping[str, Any]) -> None:
-    """ValueError for a number among the options that is negative or NaN."""
-    for name, value in options.items():
-        if isinstance(value, float | int) and not value >= 0:
-            raise ValueError(f"{name} = {value}; expected a number of at least 0")
-
-
 def exact(reference: Image, test: Image) -> Comparison:
     """Every value is the same."""
     a, b = reference.pixels, test.pixels
@@ -94,7 +87,6 @@ def paired(
     A change is relative to the reference's value, or to the median of its channel without black pixels where that is
     larger.
     """
-    require_nonnegative(locals())
     a, b = reference.pixels, test.pixels
     scale = _scale(a, b)
     measured = changes(a / scale, b / scale, threshold)
@@ -109,9 +101,9 @@ def paired(
     return Comparison("paired", verdict_of(metrics), reason, metrics, maps={"difference": _difference(a, b)})
 
 
-def paired_accepts_black(a: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
-    """The pixels of the reference, H × W × C, that `paired` would take for unchanged if they were black; H × W."""
-    accepted: NDArray[np.bool_] = (np.abs(a) / _scale(a, np.zeros_like(a)) <= options["threshold"]).all(-1)
+def paired_accepts(a: Pixels, b: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
+    """The pixels, H × W, of two images, H × W × C, that `paired` takes for unchanged."""
+    accepted: NDArray[np.bool_] = (np.abs(b - a) / _scale(a, b) <= options["threshold"]).all(-1)
     return accepted
 
 
@@ -154,7 +146,6 @@ def tolerance(
 
     There are warnings as in `idiff`: where more than `allow_failures` pixels differ, and that is no failure.
     """
-    require_nonnegative(locals())
     a, b, pixels = reference.pixels, test.pixels, counted(reference)
     # Not OpenImageIO's own `compare`: it rounds to float32, and what that does not hold would be equal.
     with np.errstate(over="ignore"):
@@ -216,13 +207,13 @@ def outrageous(reference: Image, test: Image, fail: float) -> str:
     return ""
 
 
-def tolerance_accepts_black(a: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
-    """The pixels of the reference, H × W × C, in which `tolerance` would take black for equal; H × W.
+def tolerance_accepts(a: Pixels, b: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
+    """The pixels, H × W, in which `tolerance` takes two images, H × W × C, for equal.
 
     `hard_fail` is not among the reasons: it counts for other pixels than those within `fail` only where these fail.
     """
     accepted = np.ones(a.shape[:2], bool)
-    accepted.reshape(-1)[_beyond(np.abs(a), a, np.zeros_like(a), options["fail"], options["fail_relative"])] = False
+    accepted.reshape(-1)[_beyond(np.abs(b - a), a, b, options["fail"], options["fail_relative"])] = False
     return accepted
 
 

@@ -40,6 +40,7 @@ SINGLE = 0.3  # of a tile's standard error: a pixel that moves its mean by more 
 POOLED = 30  # blocks of tiles from which the correlation of pixels is estimated again, at least
 FEW_STEPS = 8  # of a fixed point, each of which halves its error at least
 MISSED = 0.01  # the minimum detectable difference is missed with this probability
+HOLLOW = 0.01  # of the variance that is claimed: pixels that scatter by less show none of that noise
 FAR = 10.0  # times the margin: a pixel without noise that is so far off is evidence, see `with_silent_pixels`
 UNSEEN = 1e-3  # of the margin: a tile with less noise than this decides nothing, see `Side.inflation`
 WORKERS = 2
@@ -168,7 +169,8 @@ class Evidence:
             level = compare_tiles(one, two, margin, inflations)
             if pixels:
                 p = pixels.p(one.area, np.square(level.allowed), max(inflations))
-                level = replace(level, of_pixels=np.where(level.silent, 1.0, np.nan_to_num(p, nan=0.0)))
+                hollow = self._by_scatter(level, one, two, pixels, max(inflations).factor)
+                level = replace(level, of_pixels=np.where(level.silent, 1.0, np.nan_to_num(p, nan=0.0)), hollow=hollow)
             if self.one_sided:
                 level = replace(level, shown=self.one_sided.p(level, one.area, tile))
             yield level
@@ -177,6 +179,23 @@ class Evidence:
             tile, one, two, pixels = GROWTH * tile, one.coarser(), two.coarser(), pixels and pixels.coarser(GROWTH)
             if one.area.size >= POOLED:
                 inflations = max(inflations[0], one.inflation(margin)), max(inflations[1], two.inflation(margin))
+
+    @staticmethod
+    def _by_scatter(level: Level, one: Side, two: Side, pixels: PixelSums, factor: float) -> Array:
+        """p of no difference of a tile beyond the margin, by the scatter of the differences d of its pixels.
+
+        1 where Σd² is at least HOLLOW times the sum of the variances: the pixels show the noise that is claimed.
+        """
+        from scipy import special
+
+        claimed, area = one.variance + two.variance, one.area
+        squares = pixels.total[0] + claimed
+        total = two.mean - one.mean
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scatter = np.maximum(squares - total**2 / area, 0) / (area - 1)
+            t = (np.abs(total) / area - level.allowed) / np.sqrt(factor * scatter / area)
+            p = 2 * special.stdtr(area - 1, -np.maximum(t, 0))
+        return np.where((squares < HOLLOW * claimed) & (area > 1), np.nan_to_num(p, nan=1.0), 1.0)
 
 
 def from_renders(
@@ -220,8 +239,9 @@ class Level:
     `t`: positive where the test is brighter. `p`: of no difference; `beyond`: of none beyond the margin; both 0 where a
     value is not finite. `silent`: no noise on either side, of which a t-test knows nothing: p is 1 there, and `off`
     where the means differ beyond the margin. `heavy`: noise from a few pixels only. `shown`: p of none beyond the
-    margin by the noise that the pixels show; 0 where that is not tested. `of_pixels`: p of no pixel beyond the margin;
-    `of_silent`: the same of tiles without noise; None where that is not tested.
+    margin by the noise that the pixels show; 0 where that is not tested. `hollow`: the same of noise that the pixels do
+    not show; 1 where they do. `of_pixels`: p of no pixel beyond the margin; `of_silent`: the same of tiles without
+    noise; None where that is not tested.
     """
 
     t: Array
@@ -235,6 +255,7 @@ class Level:
     error: Array
     freedom: Array
     shown: Array | float = 0.0
+    hollow: Array | float = 1.0
     of_pixels: Array | None = None
     of_silent: Array | None = None
 
@@ -267,7 +288,7 @@ def compare_tiles(
 ) -> Level:
     """Welch's t-test of every tile; differences up to `margin` × the tile's mean count as none.
 
-    That mean is the one of the side with more samples.
+    That mean is the larger one of both sides: light that one of them has must be seen.
     """
     from scipy import special
 
@@ -288,7 +309,7 @@ def compare_tiles(
         own, exchanged = noise(1.0), noise(ratio)
         larger = exchanged[0] > own[0]
         variance, squares, few = (np.where(larger, y, x) for x, y in zip(own, exchanged, strict=True))
-        mean = np.abs(np.where(ratio >= 1, m1, m2))
+        mean = np.maximum(np.abs(m1), np.abs(m2))
         allowed = margin * np.maximum(mean, DARK * median_nonblack(mean))
         silent, error, difference = variance == 0, np.sqrt(variance), m2 - m1
         freedom = np.where(silent, 1.0, variance**2 / squares)
@@ -338,7 +359,8 @@ def sidak(family_error: float, count: int) -> float:
 class Alarms(NamedTuple):
     """Numbers of tests that differ.
 
-    `tiles`: of the means of tiles; `doubtful`: of those that are heavy-tailed, or whose noise the pixels do not show.
+    `tiles`: of the means of tiles; `doubtful`: of those that are heavy-tailed, or whose noise the pixels do not show;
+    also where they show less of it, and so a difference.
     `pixels`: of the pixels of a tile. `silent`: single tiles and channels without noise whose means or pixels differ
     beyond the margin; `silent_far`: so far beyond it, in so many pixels, that they are alarms.
     """
@@ -381,7 +403,7 @@ class TileTests:
         for level in self.levels:
             in_doubt = level.heavy | (level.shown > self.threshold)
             tiles += count(level.beyond, ~level.silent & ~in_doubt)
-            doubtful += count(level.beyond, ~level.silent & in_doubt)
+            doubtful += count(np.where(in_doubt, level.beyond, level.hollow), ~level.silent)
             pixels += count(level.of_pixels)
             silent_far += count(level.of_silent)
         return Alarms(tiles, doubtful, pixels, silent_far, int(self.levels[0].off.sum()))

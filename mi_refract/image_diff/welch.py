@@ -12,7 +12,17 @@ import numpy as np
 from mi_refract.io.image_file import Image, Pixels
 
 from .channels import SPP, Estimate, estimates, has_variance, samples, spreads
-from .comparison import Comparison, Metric, Verdict, aligned, finite, nonfinite_result, preconditions
+from .comparison import (
+    Comparison,
+    Metric,
+    Range,
+    Verdict,
+    aligned,
+    finite,
+    nonfinite_result,
+    one_of,
+    preconditions,
+)
 from .pixel_statistics import Inflation, inflation, rarity_exponent, sums
 from .tile_statistics import (
     Evidence,
@@ -32,15 +42,25 @@ def compare_renders(
     test: Sequence[Image],
     *,
     allow_nonfinite: bool = False,
-    tile: Annotated[int, "side of a tile in pixels"] = 16,
-    family_error: Annotated[float, "probability that equal images are called different"] = 0.001,
+    tile: Annotated[int, "side of a tile in pixels", Range(lambda x: x >= 1, "a positive whole number")] = 16,
+    family_error: Annotated[
+        float,
+        "probability that equal images are called different",
+        Range(lambda x: 0 < x < 1, "more than 0, less than 1"),
+    ] = 0.001,
     equivalence_margin: Annotated[float, "relative difference of a tile that counts as no difference"] = 0.001,
     resolution: Annotated[
-        float, "relative difference of a tile that the noise must not hide, or the result is inconclusive"
+        float,
+        "relative difference of a tile that the noise must not hide, or the result is inconclusive",
+        Range(lambda x: x > 0, "more than 0"),
     ] = 0.05,
-    hidden: Annotated[float, "share of the tiles, in any channel, whose noise may hide such a difference"] = 0.1,
+    hidden: Annotated[
+        float,
+        "share of the tiles, in any channel, whose noise may hide such a difference",
+        Range(lambda x: 0 <= x <= 1, "0 to 1"),
+    ] = 0.1,
     pixels: Annotated[
-        str, "test single pixels as well: yes; no for renders that share a fixed grid of samples"
+        str, "test single pixels as well: yes; no for renders that share a fixed grid of samples", one_of("yes", "no")
     ] = "yes",
     spp: Annotated[int, "samples per pixel of each image; 0: the number in its header"] = 0,
     spp_reference: Annotated[int, "samples per pixel of the reference, where the sides differ; 0: `spp`"] = 0,
@@ -67,19 +87,8 @@ def compare_renders(
     EQUAL, however noisy, where both hold their variance and are identical in every value of every channel.
     INCONCLUSIVE where the only tiles that differ are unsuited to a t-test (with the noise of a few pixels, or without
     noise, and by little or in a few pixels), and where the noise hides differences of `resolution`, with the number of
-    samples that would show them. ValueError for fewer renders, the same render twice, options out of range, images that
-    cannot be compared.
+    samples that would show them. ValueError for fewer renders, the same render twice, images that cannot be compared.
     """
-    for name, value, valid, expected in (
-        ("tile", tile, tile >= 1, "a positive whole number"),
-        ("family_error", family_error, 0 < family_error < 1, "more than 0, less than 1"),
-        ("equivalence_margin", equivalence_margin, equivalence_margin >= 0, "at least 0"),
-        ("resolution", resolution, resolution > 0, "more than 0"),
-        ("hidden", hidden, 0 <= hidden <= 1, "0 to 1"),
-        ("pixels", pixels, pixels in ("yes", "no"), "yes, no"),
-    ):
-        if not valid:
-            raise ValueError(f"{name} = {value!r}; expected {expected}")
     single = len(reference) == len(test) == 1 and (has_variance(reference[0]) or has_variance(test[0]))
     one, two = reference[0], test[0]
     same = single and bool(spreads(one.channels)) and set(one.channels) == set(two.channels)
@@ -229,7 +238,7 @@ def _verdict(tests: TileTests, resolution: float, hidden: float) -> tuple[Verdic
     if differing := ", ".join(f"{count} {name}" for name, count in counts.items() if count):
         return Verdict.DIFFERENT, f"{differing} differ, of {tests.p.size} tests"
     if silent or doubtful:
-        where = f"{silent} without noise, {doubtful} heavy-tailed"
+        where = f"{silent} without noise, {doubtful} heavy-tailed or of more noise than their pixels show"
         return Verdict.INCONCLUSIVE, f"only tiles that are unsuited to a t-test differ: {where}"
     if tests.levels[0].silent.all():
         return Verdict.EQUAL, "no noise, and no tile differs beyond the margin"

@@ -104,6 +104,9 @@ def test_what_cannot_be_compared_is_an_error_and_channels_are_matched_by_name(me
             with pytest.raises(ValueError, match=f"{what} .*; expected ") as error:
                 judge(method, *pair)
             assert "\n" not in str(error.value)
+    twice = of(SMOOTH, ("R", "G", "G"))
+    with pytest.raises(ValueError, match=r"a\.exr: channels R, G, G; expected each name once"):
+        judge(method, twice, twice)
     assert verdict(method, SMOOTH, of(SMOOTH[..., ::-1], ("B", "G", "R"))) is EQUAL
     assert method == "welch" or verdict(method, SMOOTH, SMOOTH[..., ::-1]) is DIFFERENT
 
@@ -269,9 +272,9 @@ def test_light_between_the_rows_that_are_looked_at_first_counts(rng):
     assert verdict("tolerance", reference, reference + 1e-5) is EQUAL
 
 
-def test_channels_are_grouped_by_what_they_are_part_of():
-    names = ("R", "G", "B", "A", "Z", "n.X", "n.Y", "n.Z", "s.R", "s.G", "s.B", "s.A")
-    expected = [["R", "G", "B"], ["A"], ["Z"], ["n.X", "n.Y", "n.Z"], ["s.R", "s.G", "s.B"], ["s.A"]]
+def test_colours_of_a_layer_are_judged_together_and_others_alone():
+    names = ("R", "G", "B", "A", "Z", "ao", "n.X", "n.Y", "n.Z", "s.R", "s.G", "s.B", "s.A", "s.id")
+    expected = [["R", "G", "B"], ["A"], ["Z"], ["ao"], ["n.X", "n.Y", "n.Z"], ["s.R", "s.G", "s.B"], ["s.A"], ["s.id"]]
     assert list(groups(names).values()) == expected
 
 
@@ -298,11 +301,15 @@ def test_channels_are_grouped_by_what_they_are_part_of():
         ("welch", {"resolution": 0.0}, "more than 0"),
         ("welch", {"hidden": float("nan")}, "0 to 1"),
         ("welch", {"pixels": "perhaps"}, "yes, no"),
+        ("auto", {"family_error": 1.0}, "less than 1"),  # of the other method, too
+        ("auto", {"threshold": 0.1}, "has no option 'threshold'"),
     ],
 )
 def test_options_that_do_not_fit(method, options, match):
-    with pytest.raises(ValueError, match=match):
-        judge(method, of(SMOOTH), of(SMOOTH), **options)
+    """Whatever the images are."""
+    for image in (of(SMOOTH), altered(np.nan)):
+        with pytest.raises(ValueError, match=match):
+            judge(method, image, image, **options)
 
 
 def test_the_number_of_images_must_fit_the_method():

@@ -228,7 +228,7 @@ def test_an_image_in_which_black_would_not_be_seen_knows_nothing():
 
 def test_what_it_does_not_look_at():
     four = of(np.dstack([SMOOTH, SMOOTH[..., :1]]))
-    assert compare("flip", four, four).reason.endswith("not compared by FLIP, but identical: A")
+    assert compare("flip", four, four).reason.endswith("; by flip A: identical")
     xyz = of(SMOOTH, ("X", "Y", "Z"))
     with pytest.raises(ValueError, match="FLIP needs R, G, B, or a single channel"):
         compare("flip", xyz, xyz)
@@ -259,7 +259,7 @@ def test_another_channel_that_changes(change, by_flip, by_tolerance, names):
     one, two = (of(np.insert(SMOOTH, [where], each, axis=2), names) for each in sides)
     result = compare("flip", one, two)
     assert (result.verdict, result.metrics[0].value) == (verdict, 0)
-    method = "FLIP" if "A" in names and max(map(np.max, sides)) <= 1 else "tolerance"
+    method = "flip" if "A" in names and max(map(np.max, sides)) <= 1 else "tolerance"
     assert f"; by {method} {names[where]}: " in result.reason
     assert compare("flip", two, one).verdict is verdict
 

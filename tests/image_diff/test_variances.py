@@ -191,7 +191,7 @@ BAD = [  # what is changed, the settings, and what is said
     (lambda old: (old / "a_var.exr").write_bytes(b"xy"), {}, "a_var.exr: corrupt EXR file"),
     (lambda old: None, {"variance": "{name}"}, "itself; expected another image"),
     (lambda old: None, {"spp_test": 1}, "samples per pixel: 1; expected `spp` or `spp_test`, 2 to 10¹⁵"),
-    (lambda old: None, {"spp_reference": -3}, "samples per pixel: -3; expected `spp` or `spp_reference`"),
+    (lambda old: None, {"spp_reference": -3}, "spp_reference = -3; expected a number of at least 0"),
     (lambda old: None, {"spp_test": 0}, "names 'no samples per pixel'; expected `spp` or `spp_test`"),
     (lambda old: None, {"channels": (("Q", "Q"),)}, "no channel 'Q'; in `channels` expected R, G"),
     *(
