@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mi_refract.io.image_file import Image, Pixels, any_channel
 
-from . import channels, flip, pixelwise, welch
+from . import channels, flip, metadata, pixelwise, welch
 from .comparison import (
     Comparison,
     Verdict,
@@ -139,6 +139,7 @@ def compare(
     test: Side,
     *,
     allow_nonfinite: bool = False,
+    ignore_metadata: Sequence[str] = (),
     named: Collection[str] = (),
     **options: Any,
 ) -> Comparison:
@@ -150,12 +151,22 @@ def compare(
 
     INCONCLUSIVE where a method calls the images equal but would call a black one equal, too, or one with some of its
     channels black; where channels whose variance `welch` does not know differ by more than `tolerance` allows; and
-    where no value of a channel is finite. DIFFERENT where one of two images has channels besides.
+    where no value of a channel is finite. DIFFERENT where one of two images has channels besides, and where the files
+    say that their numbers mean something else; `ignore_metadata`: patterns of names of metadata that do not count.
 
     ValueError for an unknown method or option, an option of another type or out of its range, several renders for a
     method that takes one, and images that cannot be compared.
     """
     sides = [[side] if isinstance(side, Image) else list(side) for side in (reference, test)]
+    result = _compare_pixels(method, sides, allow_nonfinite, named, options)
+    if meant := metadata.difference([*sides[0], *sides[1]], ignore_metadata):
+        return replace(result.but(Verdict.DIFFERENT, meant), warning="")
+    return result
+
+
+def _compare_pixels(
+    method: str, sides: list[list[Image]], allow_nonfinite: bool, named: Collection[str], options: Options
+) -> Comparison:
     if method != AUTO:
         return _compare(method, sides, allow_nonfinite, named, options)
     method, why = choice(*sides, spp=any(options.get(name) for name in ("spp", "spp_reference", "spp_test")))
