@@ -20,7 +20,7 @@ SPACE, ALPHA = "oiio:ColorSpace", "oiio:UnassociatedAlpha"
 CODED = ("uint8", "uint16")  # types of numbers that are sRGB codes where no colour space is named; others are linear
 SPACES = {"srgb": "srgb_rec709_scene", "linear": "lin_rec709_scene", "rec709": ""}  # OpenImageIO says that of any PNM
 # What says the same as nothing.
-USUAL = {"screenWindowCenter": "(0.0, 0.0)", "screenWindowWidth": "1.0", ALPHA: "0"}
+USUAL = {"screenWindowCenter": "(0.0, 0.0)", "screenWindowWidth": "1.0", "Exif:ColorSpace": "1"}
 SHOWN = 60  # characters of a value
 
 # Patterns of names, which the README lists: by whom, when and how fast a file was made, how its numbers are packed,
@@ -48,6 +48,8 @@ def difference(images: Sequence[Image], ignored: Sequence[str] = ()) -> str:
     said = [_said(image, tuple(ignored)) for image in images if image.stored]
     for other in said[1:]:
         names = [name for name in sorted(said[0].keys() | other.keys()) if said[0].get(name) != other.get(name)]
+        if ALPHA in names and None in (said[0].get(ALPHA), other.get(ALPHA)):  # one has no alpha of which it would be
+            names.remove(ALPHA)
         if names:
             one, two = (side.get(names[0], "not there") for side in (said[0], other))
             more = f", and {', '.join(names[1:])}" if len(names) > 1 else ""
@@ -60,8 +62,8 @@ def _said(image: Image, ignored: tuple[str, ...]) -> dict[str, str]:
     space = str(image.metadata.get(SPACE, "")).lower()
     space = SPACES.get(space, space) or ("srgb_rec709_scene" if image.stored in CODED else "lin_rec709_scene")
     said = {name: _text(value) for name, value in image.metadata.items()} | {SPACE: space}
-    if not any(name.rpartition(".")[2] == "A" for name in image.channels):
-        said.pop(ALPHA, None)
+    if any(name.rpartition(".")[2] == "A" for name in image.channels):
+        said.setdefault(ALPHA, "0")
     return {name: text for name, text in said.items() if text != USUAL.get(name) and not _is_ignored(name, ignored)}
 
 

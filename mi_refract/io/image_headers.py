@@ -16,7 +16,9 @@ EXR, PNG, JPEG = b"\x76\x2f\x31\x01", b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 ATTRIBUTES = 4096  # of an EXR file
 LONG = 64  # bytes of a value; of a longer one the digest is kept
 # Chunks of a PNG file that OpenImageIO reads, or that do not concern the numbers.
-CHUNKS = b"IHDR PLTE IDAT IEND tRNS gAMA sRGB cICP iCCP tEXt zTXt iTXt tIME pHYs oFFs eXIf bKGD hIST sPLT mDCV".split()
+CHUNKS = (
+    b"IHDR PLTE IDAT IEND tRNS gAMA sRGB cICP iCCP tEXt zTXt iTXt tIME pHYs oFFs eXIf bKGD hIST sBIT sPLT mDCV".split()
+)
 SRGB = struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000)  # cHRM: the same as none
 # Tags of a TIFF file that OpenImageIO reads, or that say where the pixels are.
 TAGS = {*range(254, 290), 292, 293, 296, 297, 305, 306, *range(315, 318), 320, *range(322, 326), 330, 332, 333, 334}

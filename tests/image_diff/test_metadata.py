@@ -165,7 +165,7 @@ def test_every_cell_of_the_table_is_tested_and_what_is_ignored_is_listed():
     assert f"```\n{metadata.WITHOUT_MEANING.strip()}\n```" in README
 
 
-@pytest.mark.parametrize(("row", "name"), CASES, ids="-".join)
+@pytest.mark.parametrize(("row", "name"), CASES, ids=map(" ".join, CASES))
 def test_the_table_holds(tmp_path, row, name):
     write, *arguments = CASES[row, name]
     paths = [tmp_path / f"{side}.{ENDINGS.get(name, name.lower())}" for side in "ab"]
@@ -201,3 +201,11 @@ def test_what_a_format_says_in_other_words_is_no_difference(tmp_path, ending):
         assert output.open(str(path), spec) and output.write_image(np.full((8, 8, 3), 255, np.uint8)) and output.close()
     (result,) = folders.diff(*paths, Settings.for_all(method="exact", channels=tuple((x, x) for x in "RGB"))).results
     assert result.status == "equal", result.reason
+
+
+def test_an_alpha_that_one_image_lacks_is_a_channel_and_no_metadata(tmp_path):
+    paths = [tmp_path / "a.png", tmp_path / "b.png"]
+    for path, mode in zip(paths, ("RGB", "RGBA"), strict=True):
+        Pillow.fromarray(CODES).convert(mode).save(path)
+    (result,) = folders.diff(*paths).results
+    assert result.reason.startswith("channels added: A (opaque")
