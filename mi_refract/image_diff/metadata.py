@@ -68,9 +68,12 @@ def _said(image: Image, ignored: tuple[str, ...]) -> dict[str, str]:
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, np.ndarray):
-        return f"{value.nbytes} bytes of SHA-256 {hashlib.sha256(value.tobytes()).hexdigest()}"
-    return str(value)
+    value = value.tobytes() if isinstance(value, np.ndarray) else value
+    if not isinstance(value, bytes):
+        return str(value)
+    if value.isascii() and (text := value.decode("ascii")).isprintable():
+        return text
+    return f"{len(value)} bytes of SHA-256 {hashlib.sha256(value).hexdigest()}"
 
 
 @functools.cache

@@ -74,7 +74,7 @@ class Method:
 
     @functools.cached_property
     def options(self) -> dict[str, Option]:
-        """The keyword arguments by name, without `allow_nonfinite`, which is of every method."""
+        """The keyword arguments by name, without those of every method."""
         hints = typing.get_type_hints(self.function, include_extras=True)
         parameters = inspect.signature(self.function).parameters
         return {

@@ -82,8 +82,8 @@ class Entry:
     """One layer of settings.
 
     `pattern`: of the names of its images; "" for `[defaults]` and the command line, which are for all. `values`: of
-    `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `variance`, `channels`, `allow_nonfinite` and the options
-    of methods. `where`: its name in messages. `error`: what is wrong with it.
+    `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `variance`, `channels`, and the options of methods and of
+    every method. `where`: its name in messages. `error`: what is wrong with it.
     """
 
     pattern: str

@@ -30,8 +30,7 @@ SUFFIXES = (".exr",)
 MAX_VALUES = 2**28  # width × height × channels of an image: 1 GiB as float32
 # What is read in another type than float32. OpenImageIO rounds integers to float32 on the way to any other type.
 WIDE = {"double": "double", "uint": "uint", "int": "int"}
-COLOURS = ("tiff:ColorSpace", "jpeg:ColorSpace", "psd:ColorSpace")
-CONVERTED = ("CMYK", "YCbCrK", "CIELAB", "ICCLAB", "ITULAB", "LOGL", "LOGLUV", "multichannel", "duotone")
+CONVERTED = ("CMYK", "YCbCrK", "CIELAB", "ICCLAB", "ITULAB", "LOGL", "LOGLUV")  # to R, G, B
 OPTION = " (max-values)"  # for errors: where the limit can be changed
 # How files begin that OpenImageIO decodes when it opens them: GIF, JPEG 2000, JPEG XL.
 WHEN_OPENED = (b"GIF", b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51", b"\0\0\0\x0cJXL ", b"\xff\x0a")
@@ -315,7 +314,7 @@ def _misread(found: str, kinds: set[str], metadata: Metadata, rows: int) -> str:
         return "one row of 64-bit numbers in a TIFF file; expected several rows, or 32 bits"
     if metadata.get("tiff:PhotometricInterpretation") == 0 and not kinds <= {"uint8", "uint16"}:
         return "0 is white in a TIFF file of more than 16 bits; expected 0 as black"  # with 8 or 16 it is read so
-    space = next((metadata[name] for name in COLOURS if name in metadata), "")
+    space = metadata.get("tiff:ColorSpace", metadata.get("jpeg:ColorSpace"))
     return f"colours in {space}, which OpenImageIO converts with loss; expected R, G, B" if space in CONVERTED else ""
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import struct
 from collections.abc import Iterator
@@ -14,7 +13,6 @@ from .errors import ImageError
 
 EXR, PNG, JPEG = b"\x76\x2f\x31\x01", b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 ATTRIBUTES = 4096  # of an EXR file
-LONG = 64  # bytes of a value; of a longer one the digest is kept
 # Chunks of a PNG file that OpenImageIO reads, or that do not concern the numbers.
 CHUNKS = (
     b"IHDR PLTE IDAT IEND tRNS gAMA sRGB cICP iCCP tEXt zTXt iTXt tIME pHYs oFFs eXIf bKGD hIST sBIT sPLT mDCV".split()
@@ -25,8 +23,12 @@ TAGS = {*range(254, 290), 292, 293, 296, 297, 305, 306, *range(315, 318), 320, *
 TAGS |= {338, 339, 347, *range(512, 522), 529, 530, 531, 700, *range(33300, 33307), 33432, 33723, 34377, 34665, 34675}
 TAGS |= {32995, 32997, 34853}
 SIZES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}  # bytes by type; others: 1
-PSD = {4: b"CMYK", 7: b"multichannel", 8: b"duotone"}  # the colours that OpenImageIO converts
-SEVERAL = {"png:acTL": "an animated PNG", "jpeg:MPF": "a JPEG of several images (MPO)"}  # of which the first is read
+PSD = (4, 7, 8)  # of Photoshop's colour modes CMYK, multichannel, duotone
+REFUSED = {
+    "png:acTL": "an animated PNG; expected a single image",
+    "jpeg:MPF": "a JPEG of several images (MPO); expected a single image",
+    "psd:ColorSpace": "a Photoshop file in CMYK or other inks; expected R, G, B",
+}
 
 
 def check_attributes(path: Path) -> None:
@@ -54,25 +56,23 @@ def _text(file: BinaryIO) -> bytes:
     return text
 
 
-def hidden_metadata(path: Path) -> dict[str, str | float]:
+def hidden_metadata(path: Path) -> dict[str, bytes | float]:
     """What the file says of its numbers and OpenImageIO does not hand over: "png:cHRM", "tiff:301", "hdr:COLORCORR".
 
-    Values are text, or hexadecimal numbers. Radiance's PIXASPECT is "PixelAspectRatio", as in other formats. ValueError
-    for a file of several images of which OpenImageIO reads the first alone.
+    Values are as they are in the file. Radiance's PIXASPECT is "PixelAspectRatio", as in other formats. ValueError for
+    a file of several images of which OpenImageIO reads the first alone, and for colours that it converts with loss.
     """
     size = path.stat().st_size
-    said: dict[str, list[str]] = {}
+    said: dict[str, list[bytes]] = {}
     # A file that ends too early, or leads beyond its end, is an error of OpenImageIO's.
     with path.open("rb") as file, contextlib.suppress(struct.error, OverflowError, OSError):
         begin = file.read(8)
         for magic, read in READERS.items():
             for name, value in read(file, size) if begin.startswith(magic) else ():
-                text = value.decode("ascii") if value.isascii() and value.decode("ascii").isprintable() else value.hex()
-                digest = f"{len(value)} bytes of SHA-256 {hashlib.sha256(value).hexdigest()}"
-                said.setdefault(name, []).append(text if len(value) <= LONG else digest)
-    for name in said.keys() & SEVERAL.keys():
-        raise ImageError(f"{path}: {SEVERAL[name]}; expected a single image")
-    found: dict[str, str | float] = {name: " ".join(texts) for name, texts in said.items()}
+                said.setdefault(name, []).append(value)
+    for name in said.keys() & REFUSED.keys():
+        raise ImageError(f"{path}: {REFUSED[name]}")
+    found: dict[str, bytes | float] = {name: b" ".join(values) for name, values in said.items()}
     with contextlib.suppress(KeyError, ValueError, ZeroDivisionError):
         found["PixelAspectRatio"] = 1 / float(found["hdr:PIXASPECT"])  # there it is height over width
         del found["hdr:PIXASPECT"]
@@ -147,7 +147,7 @@ def _psd(file: BinaryIO, size: int) -> Iterator[tuple[str, bytes]]:
     file.seek(24)
     (mode,) = struct.unpack(">H", file.read(2))
     if mode in PSD:
-        yield "psd:ColorSpace", PSD[mode]
+        yield "psd:ColorSpace", b""
 
 
 READERS = {PNG: _png, JPEG: _jpeg, b"#?": _hdr, b"II*\0": _tiff, b"MM\0*": _tiff, b"II+\0": _tiff, b"MM\0+": _tiff}

@@ -36,10 +36,11 @@ def exr(path, *parts):
     specs = []
     for said in parts:
         spec = oiio.ImageSpec(8, 8, 3, "float")
-        spec.x = said.get("x", 0)
-        for name, value in ((name, value) for name, value in said.items() if name not in ("x", "add")):
-            kind = f"{'string' if value[0] == 'a' else 'float'}[{len(value)}]" if isinstance(value, tuple) else ""
-            spec.attribute(name, *([kind] if kind else []), value)
+        for name, value in said.items():
+            if hasattr(spec, name):
+                setattr(spec, name, value)
+            elif name != "add":
+                spec.attribute(name, *([f"float[{len(value)}]"] if isinstance(value, tuple) else []), value)
         specs.append(spec)
     output = oiio.ImageOutput.create(str(path))
     assert output.open(str(path), tuple(specs)), output.geterror()
@@ -120,6 +121,8 @@ CASES = {
     ("data window", "EXR"): (exr, [{}], [{"x": 1}]),
     ("data window", "PNG"): (png, [], [(b"oFFs", struct.pack(">iiB", 1, 0, 0))]),
     ("data window", "TIFF"): (tiff, [{}], [{282: (12, [1]), 283: (12, [1]), 286: (12, [1]), 287: (12, [0])}]),
+    ("display window", "EXR"): (exr, [{}], [{"full_width": 9}]),
+    ("display window", "TIFF"): (tiff, [{}], [{33300: (4, [9]), 33301: (4, [8])}]),
     ("alpha is associated or not", "TIFF"): (tiff, *([{338: (3, [kind])}, FOUR] for kind in (1, 2))),
     ("white is 0, up to 16 bits", "TIFF"): (tiff, *([{262: (3, [kind])}, GRAY] for kind in (0, 1))),
     ("white is 0, more bits", "TIFF"): (tiff, *([{262: (3, [kind])}, np.float32(GRAY)] for kind in (0, 1))),
