@@ -197,7 +197,6 @@ def folders(tmp_path):
         (folder / "notes.txt").write_text(folder.name)
     image(old / "removed.exr")
     image(new / "added.exr")
-    image(new / ".hidden.exr")
     return old, new
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.io import image_file
-from mi_refract.io.image_file import MAX_VALUES, Image, bounded_map
+from mi_refract.io.image_file import MAX_VALUES, Image
 
 from . import channels, methods, pairing
 from .comparison import Comparison, Verdict
@@ -33,13 +33,16 @@ Mask = NDArray[np.bool_]  # H × W; True where a pixel counts
 
 def read_renders(folder: Path, max_values: int = MAX_VALUES) -> list[Image]:
     """The renders of one image in a folder. Errors: of `image_file.read`, and ValueError for equal ones."""
-    paths, failed = pairing.images_in(folder)
+    from concurrent.futures import ThreadPoolExecutor  # not needed for files
+
+    paths, failed, _ = pairing.images_in(folder)
     if failed:
         raise OSError(failed[0][1])
     if not paths:
         raise ValueError(f"{folder}: contains no image; expected several renders of one image")
     read = functools.partial(image_file.read, max_values=max_values)
-    images = list(bounded_map(read, paths.values(), lambda path: 0, max_values, THREADS))  # all are needed at once
+    with ThreadPoolExecutor(THREADS) as pool:
+        images = list(pool.map(read, paths.values()))
     sums: dict[float, Image] = {}
     for image in images:
         other = sums.setdefault(float(image.pixels.sum(dtype=np.float64)), image)

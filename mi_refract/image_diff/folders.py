@@ -10,19 +10,27 @@ import functools
 import hashlib
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
 from mi_refract.io import errors, image_file, safe_files
-from mi_refract.io.image_file import Image, bounded_map, one_line
+from mi_refract.io.image_file import Image, one_line
 
 from . import file_pair, pairing
 from .results import FAILED, Result, Results, Status
 from .settings import Settings
 
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
 AS_ASKED = Settings()
 WORKERS = min(os.cpu_count() or 1, 8)
+AHEAD = 2  # pairs in hand for each thread: a slow one does not leave the others idle at once
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
 View = Callable[[Result, Results], None]
 Read = Callable[[Path], Sequence[Image] | Exception]
 
@@ -82,6 +90,34 @@ def diff(
         done.append(result)
         progress(len(done), len(pairs))
     return replace(results, results=tuple(sorted(done, key=lambda result: list(Status).index(result.status))))
+
+
+def bounded_map(
+    work: Callable[[Item], Answer], items: Iterable[Item], takes: Callable[[Item], int], most: int, threads: int
+) -> Iterator[Answer]:
+    """Yield `work(item)` for each item, in order, from several threads. Raises what `work` raises.
+
+    Items at work, and answers that wait for their turn, take `most` together; one that takes more is alone.
+    """
+    from concurrent.futures import ThreadPoolExecutor  # not needed for one item
+
+    pending: deque[tuple[Future[Answer], int]] = deque()
+    taken = 0
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for item in items:
+                more = takes(item)
+                while pending and (taken + more > most or len(pending) >= AHEAD * threads):
+                    future, less = pending.popleft()
+                    yield future.result()
+                    taken -= less
+                pending.append((pool.submit(work, item), more))
+                taken += more
+            while pending:
+                yield pending.popleft()[0].result()
+        finally:
+            for future, _ in pending:
+                future.cancel()
 
 
 def _values(pair: Result) -> int:

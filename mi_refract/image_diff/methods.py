@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mi_refract.io.image_file import Image, Pixels, any_channel
 
-from . import channels, flip, pixelwise, welch
+from . import channels, flip, metadata, pixelwise, welch
 from .comparison import (
     NONNEGATIVE,
     Comparison,
@@ -90,7 +90,7 @@ class Method:
 
     @functools.cached_property
     def options(self) -> dict[str, Option]:
-        """The keyword arguments by name, without `allow_nonfinite`, which is of every method."""
+        """The keyword arguments by name, without those of every method."""
         hints = typing.get_type_hints(self.function, include_extras=True)
         parameters = inspect.signature(self.function).parameters
         return {
@@ -146,6 +146,7 @@ def compare(
     test: Side,
     *,
     allow_nonfinite: bool = False,
+    ignore_metadata: Sequence[str] = (),
     named: Collection[str] = (),
     **options: Any,
 ) -> Comparison:
@@ -158,7 +159,8 @@ def compare(
     INCONCLUSIVE where a method calls the images equal but would call a black one equal, too, or one with some of its
     channels black, or passes many pixels that change by half; where channels whose variance `welch` does not know
     differ by more than `tolerance` allows; and where no value of a channel is finite. DIFFERENT where one of two images
-    has channels besides.
+    has channels besides, and where the files say that their numbers mean something else; `ignore_metadata`: patterns of
+    names of metadata that do not count.
 
     ValueError for an unknown method or option, an option of another type or out of its range, several renders for a
     method that takes one, and images that cannot be compared.
@@ -173,6 +175,15 @@ def compare(
     for image in (*sides[0], *sides[1]):
         if len(set(image.channels)) < len(image.channels):
             raise ValueError(f"{image.path}: channels {', '.join(image.channels)}; expected each name once")
+    result = _compare_pixels(method, sides, allow_nonfinite, named, options)
+    if meant := metadata.difference([*sides[0], *sides[1]], ignore_metadata):
+        return replace(result.but(Verdict.DIFFERENT, meant), warning="")
+    return result
+
+
+def _compare_pixels(
+    method: str, sides: list[list[Image]], allow_nonfinite: bool, named: Collection[str], options: Options
+) -> Comparison:
     if method != AUTO:
         return _compare(method, sides, allow_nonfinite, named, options)
     method, why = choice(*sides, spp=any(options.get(name) for name in ("spp", "spp_reference", "spp_test")))

@@ -18,16 +18,26 @@ _FIELD = re.compile(r"\{([^{}]*)\}(/?)")  # with the slash behind it
 
 def matches(pattern: str, name: str) -> bool:
     """Whether the whole name matches the pattern."""
-    return re.fullmatch(_wild(pattern), name, re.DOTALL) is not None
+    return _fits(_wild(pattern), name)
+
+
+STAR = "\0"  # any characters, in a regular expression that is not finished; no name holds it
 
 
 def _wild(pattern: str) -> str:
-    return re.escape(pattern).replace(r"\*", ".*").replace(r"\?", ".")
+    return re.escape(pattern).replace(r"\*", STAR).replace(r"\?", ".")
+
+
+def _fits(wild: str, name: str) -> bool:
+    """Whether the whole name matches; each star but the last takes the shortest text, once and for all: no search."""
+    first, *rest = wild.split(STAR)
+    text = first + "".join(f"(?>.*?{part})" for part in rest[:-1]) + "".join(f".*{part}" for part in rest[-1:])
+    return re.fullmatch(text, name, re.DOTALL) is not None
 
 
 def is_template(text: str, names: Collection[str] = FIELDS) -> bool:
     """Whether it is a relative path that stays in its folder, with no other fields than these."""
-    inside = not text.startswith("/") and ".." not in text.split("/")
+    inside = not {"", ".."} & set(text.split("/"))  # an empty part would begin a path at the root
     rest = _FIELD.sub("", text)
     return bool(text.strip()) and inside and fields_of(text) <= set(names) and not set("{}") & set(rest)
 
@@ -53,7 +63,7 @@ def expanded(template: str, values: Mapping[str, str], names: list[str]) -> list
     """The names that match the filled template: its `*` and `?` are wild, those in the values are not."""
     parts = re.split(r"(\{[^{}]*\}/?)", template)
     pattern = "".join(re.escape(filled(part, values)) if part.startswith("{") else _wild(part) for part in parts)
-    return [name for name in names if re.fullmatch(pattern, name, re.DOTALL)]
+    return [name for name in names if _fits(pattern, name)]
 
 
 def parsed(template: str, name: str) -> dict[str, str] | None:

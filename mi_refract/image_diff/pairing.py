@@ -10,12 +10,17 @@ import itertools
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from os.path import realpath  # `Path.resolve` raises RuntimeError for links in a circle
 from pathlib import Path
 
 from . import name_patterns
 from .results import Result, Status
 from .settings import ComparisonSpec, Map, Settings
 
+HIDDEN = ComparisonSpec(skip=True, reason="hidden: a name in its path begins with a dot")
+# Endings of images that OpenImageIO, as it is on PyPI, cannot read.
+UNREADABLE = {"arw", "astc", "avif", "cr2", "cr3", "dcm", "dng", "flif", "heic", "heif", "hif", "jxr", "ktx", "ktx2"}
+UNREADABLE |= {"nef", "pcx", "qoi", "raf", "svg", "xcf"}
 ROOT = "{root}/"  # before a template of a path that is not beside the reference
 
 
@@ -51,7 +56,7 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
         beside_it = reference.parent.rglob("*") if deep else reference.parent.iterdir()
         others = sorted(path for path in beside_it if path.is_file() and path != reference)
         return [_with_variants(pair, [path for path in others if not path.samefile(test)])]
-    (old, lost), (new, missed) = images_in(reference) if known else ({}, []), images_in(test)
+    (old, lost, concealed), (new, missed, hidden) = images_in(reference) if known else ({}, [], []), images_in(test)
     for folder, nothing in ((reference, known and not old and not lost), (test, not new and not missed)):
         if nothing:
             raise ValueError(f"{folder}: contains no image; expected at least one")
@@ -70,14 +75,16 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
     found = [pair for pair in found if not {pair.reference, pair.test} - {None} <= own]
     # A reference that is a variant, and has no new image, is not one that was removed. In a tree of both no image is
     # its own reference.
-    with_new, tests = {pair.target for pair in found if pair.test}, {x.test.resolve() for x in found if x.test}
-    others = [path for path in old.values() if path not in own | with_new and path.resolve() not in tests]
+    with_new, tests = {pair.target for pair in found if pair.test}, {realpath(x.test) for x in found if x.test}
+    others = [path for path in old.values() if path not in own | with_new and realpath(path) not in tests]
     found = [_with_variants(pair, others) for pair in found]
     taken = {path for pair in found for path in pair.variants}
     found = [pair for pair in found if pair.test or pair.target not in taken]
     if not found and not lost and not missed:
         raise ValueError(f"defaults.map fits no image in {reference} and {test}; expected templates of their paths")
-    return [*found, *(_pair(name, None, None, reference / name, error) for name, error in lost + missed)]
+    found += [_pair(name, None, None, reference / name, error) for name, error in lost + missed]
+    skipped = (_pair(name, None, None, reference / name) for name in sorted({*concealed, *hidden}))
+    return [*found, *(replace(pair, how=HIDDEN) for pair in skipped)]
 
 
 def _pair(name: str, reference: Path | None, test: Path | None, target: Path, error: str = "") -> Result:
@@ -126,9 +133,9 @@ def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> 
         if before.reference != file:
             error = f"{file}: a second reference, beside {before.reference}; expected one for {name}"
             pairs[name] = replace(before, error=error)
-    references = {pair.reference.resolve() for pair in pairs.values() if pair.reference}
+    references = {realpath(pair.reference) for pair in pairs.values() if pair.reference}
     for name, file in new.items():
-        if name not in pairs and file.resolve() not in references:
+        if name not in pairs and realpath(file) not in references:
             fitting = ((rule, name_patterns.parsed(rule.test, name)) for rule in maps)
             targets = (name_patterns.filled(rule.reference, values) for rule, values in fitting if values is not None)
             if target := next(targets, None):
@@ -185,11 +192,12 @@ def beside(template: str, target: Path, root: Path) -> Path:
 # Folders ------------------------------------------------------------------------------------------------------------
 
 
-def images_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
-    """The files with an image's ending, by their path inside; (name, error) of folders that cannot be read.
+def images_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]], list[str]]:
+    """The files with an image's ending, by their path inside; (name, error) of what cannot be read; hidden images.
 
-    Names that begin with a dot are left out. Links to folders are not followed, and an error: what is in them would
-    not be compared.
+    What cannot be read: folders without permission, links to folders, which are not followed, and images of formats
+    that OpenImageIO does not read. What is in them would not be compared. A path is hidden if a name in it begins with
+    a dot.
     """
     import OpenImageIO as oiio
 
@@ -198,16 +206,23 @@ def images_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
     endings = {ending for listed in readable for ending in listed.split(",")}  # lower case
     images: dict[str, Path] = {}
     failed: list[tuple[str, str]] = []
+    hidden: list[str] = []
 
-    def note(error: OSError) -> None:
-        failed.append((Path(error.filename).relative_to(folder).as_posix(), str(error)))
+    def note(path: Path, error: str) -> None:
+        name = path.relative_to(folder).as_posix()
+        if "/." not in f"/{name}":
+            failed.append((name, error))
 
-    for parent, folders, names in os.walk(folder, onerror=note):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        for path in (Path(parent, name) for name in folders):
+    for parent, folders, names in os.walk(folder, onerror=lambda error: note(Path(error.filename), str(error))):
+        for path in (Path(parent, name) for name in sorted(folders)):
             if path.is_symlink():
-                failed.append((path.relative_to(folder).as_posix(), f"{path}: a link to a folder; expected a folder"))
-        for path in (Path(parent, name) for name in names if not name.startswith(".")):
-            if path.suffix[1:].lower() in endings:
-                images[path.relative_to(folder).as_posix()] = path
-    return images, failed
+                note(path, f"{path}: a link to a folder; expected a folder")
+        for path in (Path(parent, name) for name in names):
+            name, ending = path.relative_to(folder).as_posix(), path.suffix[1:].lower()
+            if ending in UNREADABLE:
+                note(path, f"{path}: OpenImageIO does not read {ending.upper()}; expected a format that it reads")
+            elif ending in endings and "/." in f"/{name}":
+                hidden.append(name)
+            elif ending in endings:
+                images[name] = path
+    return images, failed, hidden

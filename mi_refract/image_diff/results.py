@@ -99,7 +99,7 @@ class Result:
             also = f"; {differ}, too" if count and self.status is not Status.EQUAL else ""
             return self.comparison.reason + (f"; matches {self.matched.name}" if self.matched else also)
         if self.status is Status.SKIPPED:
-            return "skipped by the settings"
+            return "skipped by the settings" if self.how.entries else "skipped"
         sides = {Category.ADDED: "only among the new images", Category.REMOVED: "only among the references"}
         return self.error or sides[self.category]
 

@@ -37,6 +37,8 @@ WORDS = tuple(dict.fromkeys((*SYSTEMS.values(), *PROCESSORS.values())))
 BESIDE = ("stem", "name", "suffix")  # fields of a template of a file beside the reference
 ANYWHERE = ("root", *name_patterns.FIELDS)
 
+EVERY = frozenset(("allow_nonfinite", "ignore_metadata"))  # options of every method
+
 Text = Annotated[str, Meta(min_length=1)]
 Length = Annotated[int, Meta(ge=1)]
 Rectangle = tuple[int, int, Length, Length]  # x, y, width and height, as the messages of the methods count pixels
@@ -80,8 +82,8 @@ class Entry:
     """One layer of settings.
 
     `pattern`: of the names of its images; "" for `[defaults]` and the command line, which are for all. `values`: of
-    `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `variance`, `channels`, `allow_nonfinite` and the options
-    of methods. `where`: its name in messages. `error`: what is wrong with it.
+    `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `variance`, `channels`, and the options of methods and of
+    every method. `where`: its name in messages. `error`: what is wrong with it.
     """
 
     pattern: str
@@ -155,7 +157,7 @@ class Settings:
         method = merged["method"]
         options = {key: merged.pop(key) for key in list(merged) if key in options_of(None)}
         for name in options.keys() - options_of(method):
-            expected = ", ".join(sorted(options_of(method) - {"allow_nonfinite"})) or "none"
+            expected = ", ".join(sorted(options_of(method) - EVERY)) or "none"
             error = f"{set_by[name]}: {name}: not an option of {method}; expected {expected}"
             return replace(spec, error=error)
         merged.pop("reason", None)
@@ -169,8 +171,8 @@ class Settings:
 
 @functools.cache
 def options_of(method: str | None) -> frozenset[str]:
-    """The names of the options that a method takes, or for None of all methods, and `allow_nonfinite`."""
-    return frozenset(_options(method)) | {"allow_nonfinite"}
+    """The names of the options that a method takes, or for None of all methods."""
+    return frozenset(_options(method)) | EVERY
 
 
 def _options(method: str | None) -> dict[str, Option]:
@@ -195,6 +197,9 @@ class Keys(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
 
     method: Annotated[str, Meta(description=f"the method: {', '.join(ACCEPTED)}")] = AUTO
     allow_nonfinite: Annotated[bool, Meta(description="allow NaN or Inf where the other image has the same")] = False
+    ignore_metadata: Annotated[
+        tuple[Text, ...], Meta(description="names of metadata that may differ, such as view; `*` and `?` allowed")
+    ] = ()
     accept: Annotated[
         tuple[str, ...],
         Meta(min_length=1, description="further references beside the first: templates, `*` and `?` allowed"),

@@ -7,34 +7,30 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 import os
 import threading
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import safe_files
+from . import image_headers, safe_files
 from .errors import ImageError
-
-if TYPE_CHECKING:
-    from concurrent.futures import Future
 
 Pixels = NDArray[np.floating[Any]]
 FEW_CHANNELS = 8
-Item = TypeVar("Item")
-Answer = TypeVar("Answer")
-AHEAD = 2  # items in hand for each thread: a slow one does not leave the others idle at once
 Metadata = dict[str, Any]
 ImageInput: TypeAlias = Any  # an `OpenImageIO.ImageInput`
 ImageSpec: TypeAlias = Any  # an `OpenImageIO.ImageSpec`
 SUFFIXES = (".exr",)
 MAX_VALUES = 2**28  # width × height × channels of an image: 1 GiB as float32
-ATTRIBUTES = 4096  # of an EXR file
+# What is read in another type than float32. OpenImageIO rounds integers to float32 on the way to any other type.
+WIDE = {"double": "double", "uint": "uint", "int": "int"}
+CONVERTED = ("CMYK", "YCbCrK", "CIELAB", "ICCLAB", "ITULAB", "LOGL", "LOGLUV")  # to R, G, B
 OPTION = " (max-values)"  # for errors: where the limit can be changed
 # How files begin that OpenImageIO decodes when it opens them: GIF, JPEG 2000, JPEG XL.
 WHEN_OPENED = (b"GIF", b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51", b"\0\0\0\x0cJXL ", b"\xff\x0a")
@@ -93,7 +89,8 @@ class Image:
     """An image as a file holds it.
 
     `pixels`: H × W × C, float32, or float64 where the file holds numbers that float32 cannot; integers of a file are
-    mapped to 0 … 1. `channels`: C names. `origin`: (x, y) where the data window begins. `metadata`: the header.
+    mapped to 0 … 1, but for those of an EXR file. `channels`: C names. `origin`: (x, y) where the data window begins.
+    `metadata`: the header, by OpenImageIO's names, and what `image_headers` reads besides.
     `display`: x, y, width and height of the display window; None where it is the data window. `stored`: the type of
     the file's numbers, in OpenImageIO's word (uint8, half, float …); "" without a file. `mask`: H × W, the pixels that
     count; None where all do. The others are 0. `part`: its number and that of its MIP level, from 0 on as OpenImageIO
@@ -142,10 +139,12 @@ def read_parts(path: str | os.PathLike[str], max_values: int = MAX_VALUES, *, fi
     path = Path(path)
     source, kind = _checked(path, max_values)
     found: list[Image] = []
+    taken = 0
     try:
+        besides = image_headers.hidden_metadata(path)
         for part in _parts(source):
-            image = _image(path, source, kind, (max_values, sum(each.pixels.size for each in found)))
-            found.append(replace(image, part=part))
+            found.append(_image(path, source, kind, part, (max_values, taken), besides))
+            taken += found[-1].pixels.size
             if first_only:
                 break
         if not found:
@@ -199,37 +198,12 @@ def check_header(path: str | os.PathLike[str], max_values: int) -> None:
     For readers that believe a header and allocate what it says.
     """
     path = Path(path)
-    _check_attributes(path)
+    image_headers.check_attributes(path)
     source = _opened(path, path.suffix[1:].upper() or "image", max_values, max_values * 8, option="")
     try:
         _check_size(path, source.spec(), max_values, option="")
     finally:
         source.close()
-
-
-def _check_attributes(path: Path) -> None:
-    """ValueError where an attribute of an OpenEXR file is larger than the file. OpenImageIO may not look."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        if file.read(8)[:4] != b"\x76\x2f\x31\x01":
-            return
-        for _ in range(ATTRIBUTES):
-            if not _text(file):  # the name; behind the last attribute it is empty
-                return
-            _text(file)  # the type
-            length = int.from_bytes(file.read(4), "little")
-            if file.tell() + length > size:
-                raise ImageError(f"{path}: corrupt EXR file: an attribute of {length} bytes")
-            file.seek(length, os.SEEK_CUR)
-    raise ImageError(f"{path}: more than {ATTRIBUTES} attributes")
-
-
-def _text(file: BinaryIO) -> bytes:
-    """The bytes up to a zero, which is read, too; EXR's names have up to 255."""
-    begin = file.read(256)
-    text, zero, _ = begin.partition(b"\0")
-    file.seek(len(text) + len(zero) - len(begin), os.SEEK_CUR)
-    return text
 
 
 _opening = threading.Lock()  # OpenImageIO has one limit for all that it opens
@@ -290,36 +264,58 @@ def _check_size(path: Path, spec: ImageSpec, max_values: int, taken: int = 0, op
         raise ImageError(f"{path}: {size}; expected up to {max_values} values{option}")
 
 
-def _image(path: Path, source: ImageInput, kind: str, values: tuple[int, int]) -> Image:
-    """The part and MIP level that the source is at; `values`: how many a file may have, and has so far."""
-    import OpenImageIO as oiio
-
-    spec = source.spec()
-    found = source.format_name()
-    # OpenImageIO's own list: "openexr:exr,sxr;png:png;…".
-    known = dict(pair.split(":") for pair in oiio.get_string_attribute("extension_list").split(";") if pair)
-    endings = known.get(found, found).split(",")
-    if path.suffix[1:].lower() not in endings or found == "null":  # which is black, whatever the file holds
+def _image(
+    path: Path, source: ImageInput, kind: str, part: tuple[int, int], values: tuple[int, int], besides: Metadata
+) -> Image:
+    """The part that the source is at. `values`: how many a file may have, and has so far; `besides`: more metadata."""
+    spec, found = source.spec(), source.format_name()
+    if path.suffix[1:].lower() not in _endings(found) or found == "null":  # which is black, whatever the file holds
         raise ImageError(f"{path}: holds an image of format {found}; expected the format that its file name indicates")
     if spec.deep:
         raise ImageError(f"{path}: expected an image without deep samples")
     if min(spec.width, spec.height, spec.nchannels) < 1 or spec.depth > 1:
         raise ImageError(f"{path}: {spec.width} × {spec.height} × {spec.depth} pixels; expected a plane with pixels")
     _check_size(path, spec, *values)
-    formats = {str(each) for each in (spec.channelformats or [spec.format])}
-    if formats & {"uint64", "int64"}:
-        raise ImageError(f"{path}: integers of 64 bits; expected up to 32")
-    if found == "tiff" and "double" in formats and spec.height == 1:  # OpenImageIO 2.4 to 3.2 reads what lay in memory
-        raise ImageError(f"{path}: one row of 64-bit numbers in a TIFF file; expected several rows, or 32 bits")
-    wide = formats & {"double", "uint32", "int32", "uint", "int"}
-    at = source.current_subimage(), source.current_miplevel()
-    pixels = source.read_image(*at, 0, spec.nchannels, "double" if wide else "float")
-    if message := _without(path, source.geterror()) or ("" if pixels is not None else "no pixels"):
-        raise ImageError(f"{path}: corrupt {kind} file: {message}")
-    pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
-    metadata = {attribute.name: attribute.value for attribute in spec.extra_attribs}
+    metadata = {attribute.name: attribute.value for attribute in spec.extra_attribs} | besides
+    kinds = [str(each) for each in (spec.channelformats or [spec.format] * spec.nchannels)]
+    if reason := _misread(found, set(kinds), metadata, spec.height):
+        raise ImageError(f"{path}: {reason}")
+    runs = []
+    for kind_read, run in itertools.groupby(range(spec.nchannels), lambda channel: WIDE.get(kinds[channel], "float")):
+        first, *others = run
+        pixels = source.read_image(*part, first, first + 1 + len(others), kind_read)
+        if message := _without(path, source.geterror()) or ("" if pixels is not None else "no pixels"):
+            raise ImageError(f"{path}: corrupt {kind} file: {message}")
+        pixels = np.asarray(pixels).reshape(spec.height, spec.width, -1)
+        if pixels.dtype.kind in "iu":  # those of EXR files are names and counts of things
+            pixels = pixels.astype(float) if found == "openexr" else pixels / np.iinfo(pixels.dtype).max
+        runs.append(pixels)
+    pixels = runs[0] if len(runs) == 1 else np.concatenate(runs, -1)
     display = (spec.full_x, spec.full_y, spec.full_width, spec.full_height)
-    return Image(path, pixels, tuple(spec.channelnames), (spec.x, spec.y), metadata, display, str(spec.format))
+    channels, origin = tuple(spec.channelnames), (spec.x, spec.y)
+    return Image(path, pixels, channels, origin, metadata, display, str(spec.format), part=part)
+
+
+@functools.cache
+def _endings(name: str) -> tuple[str, ...]:
+    """The endings of the names of files of a format, in lower case."""
+    import OpenImageIO as oiio
+
+    # OpenImageIO's own list: "openexr:exr,sxr;png:png;…".
+    known = dict(pair.split(":") for pair in oiio.get_string_attribute("extension_list").split(";") if pair)
+    return tuple(known.get(name, name).split(","))
+
+
+def _misread(found: str, kinds: set[str], metadata: Metadata, rows: int) -> str:
+    """Why OpenImageIO gives other numbers than those of the file; "" where it does not."""
+    if kinds & {"uint64", "int64"}:
+        return "integers of 64 bits; expected up to 32"
+    if found == "tiff" and "double" in kinds and rows == 1:  # OpenImageIO 2.4 to 3.2 reads what lay in memory
+        return "one row of 64-bit numbers in a TIFF file; expected several rows, or 32 bits"
+    if metadata.get("tiff:PhotometricInterpretation") == 0 and not kinds <= {"uint8", "uint16"}:
+        return "0 is white in a TIFF file of more than 16 bits; expected 0 as black"  # with 8 or 16 it is read so
+    space = metadata.get("tiff:ColorSpace", metadata.get("jpeg:ColorSpace"))
+    return f"colours in {space}, which OpenImageIO converts with loss; expected R, G, B" if space in CONVERTED else ""
 
 
 def _without(path: Path, message: str) -> str:
@@ -344,34 +340,6 @@ def read_exr(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> tupl
 def one_line(text: str) -> str:
     """`text` with every run of white space, line breaks among them, as one space."""
     return " ".join(text.split())
-
-
-def bounded_map(
-    work: Callable[[Item], Answer], items: Iterable[Item], takes: Callable[[Item], int], most: int, threads: int
-) -> Iterator[Answer]:
-    """Yield `work(item)` for each item, in order, from several threads. Raises what `work` raises.
-
-    Items at work, and answers that wait for their turn, take `most` together; one that takes more is alone.
-    """
-    from concurrent.futures import ThreadPoolExecutor  # not needed for one item
-
-    pending: deque[tuple[Future[Answer], int]] = deque()
-    taken = 0
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            for item in items:
-                more = takes(item)
-                while pending and (taken + more > most or len(pending) >= AHEAD * threads):
-                    future, less = pending.popleft()
-                    yield future.result()
-                    taken -= less
-                pending.append((pool.submit(work, item), more))
-                taken += more
-            while pending:
-                yield pending.popleft()[0].result()
-        finally:
-            for future, _ in pending:
-                future.cancel()
 
 
 def provenance() -> dict[str, str]:

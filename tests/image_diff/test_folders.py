@@ -20,7 +20,7 @@ from mi_refract.image_diff import folders as diff
 from mi_refract.image_diff import methods, name_patterns, pairing, text_reports
 from mi_refract.image_diff.comparison import Comparison, Verdict
 from mi_refract.image_diff.results import Result, Results, Status
-from mi_refract.image_diff.settings import ComparisonSpec, Entry, Map, Settings
+from mi_refract.image_diff.settings import ComparisonSpec, Entry, Map, Settings, from_words
 from mi_refract.io import image_file
 
 OSL = Settings(maps=(Map("{dir}/ref/{name}", "{dir}/{name}"),))
@@ -129,6 +129,48 @@ def test_folders_inside_that_cannot_be_read_are_not_passed_over(folders, monkeyp
     assert (results.exit_code, len(results.results)) == (2, 8)
 
 
+def test_images_that_are_not_compared_are_named(folders):
+    """Hidden ones are skipped, and of formats that cannot be read an error; what is no image has another ending."""
+    old, new = folders
+    for name in (
+        ".hidden.exr",
+        ".cache/a.exr",
+        "inner/.b.PNG",
+        "inner/photo.HEIC",
+        "a.avif",
+        ".a.qoi",
+        "a.txt",
+        ".exr",
+    ):
+        (new / name).parent.mkdir(exist_ok=True)
+        (new / name).write_bytes(b"")
+    (new / ".cache/link").symlink_to(old)
+    results = diff.diff(old, new)
+    skipped = {result.name: text_reports.why(result) for result in results.of(Status.SKIPPED)}
+    assert skipped == dict.fromkeys(
+        [".cache/a.exr", ".hidden.exr", "inner/.b.PNG"], "skipped [hidden: a name in its path begins with a dot]"
+    )
+    errors = {result.name: result.error for result in results.of(Status.ERROR)}
+    assert errors == {
+        name: f"{new / name}: OpenImageIO does not read {kind}; expected a format that it reads"
+        for name, kind in (("inner/photo.HEIC", "HEIC"), ("a.avif", "AVIF"))
+    }
+    assert (len(results.results), results.exit_code) == (9, 2)
+
+
+def test_links_in_a_circle_do_not_end_the_comparison(folders):
+    old, new = folders
+    (old / "a.exr").symlink_to("b.exr")
+    (old / "b.exr").symlink_to("a.exr")
+    (new / "same-2.exr").symlink_to("same-2.exr")
+    for settings in (Settings(), VARIANTS, Settings(maps=(Map("{name}", "{name}"),))):
+        statuses = {result.name: str(result.status) for result in diff.diff(old, new, settings).results}
+        assert statuses["same.exr"] == "equal" and statuses["a.exr"] == statuses["b.exr"] == "different"
+    image(new / "a.exr")
+    check = {result.name: result.reason for result in diff.diff(old, new).of(Status.ERROR)}
+    assert check == {"a.exr": f"{old / 'a.exr'}: Too many levels of symbolic links"}
+
+
 @pytest.mark.parametrize("spp", [float("nan"), (4, 5, 6), (1.0, 2.0, 3.0), "many", -4, 1, 1e30, 2.5])
 def test_a_header_may_say_anything_of_its_samples(tmp_path, spp):
     for side in ("old", "new"):
@@ -176,6 +218,54 @@ def test_pairs_that_are_compared_at_once_have_no_more_values_than_one_may(tmp_pa
         assert least <= most[0] <= largest
 
 
+# Work in threads: in order, several at a time, and never more together than the bound -------------------------------
+
+
+@pytest.mark.parametrize(
+    ("items", "most"), [*(([1, 5, 2, 2, 0, 7, 3, 1, 1, 1, 4, 0, 0, 6] * 3, n) for n in (5, 12, 100)), ([1, 9, 1, 9], 3)]
+)
+def test_the_bound_holds_and_the_order_too(items, most):
+    """Held from the start of the work until the answer is taken; what takes more than all is alone."""
+    lock, held, largest = threading.Lock(), 0, 0
+
+    def work(item):
+        nonlocal held, largest
+        with lock:
+            held += item
+            largest = max(largest, held)
+        time.sleep(0.002)
+        return item
+
+    for item, answer in zip(items, diff.bounded_map(work, items, lambda item: item, most, 4), strict=True):
+        assert answer == item
+        with lock:
+            held -= answer
+    assert largest <= max(most, *items) and (largest > max(items) or most < 12)
+
+
+@pytest.mark.parametrize("takes", [0, 1])
+def test_threads_work_at_the_same_time_to_the_end(takes):
+    gate = threading.Barrier(4, timeout=10)
+    assert list(diff.bounded_map(lambda item: gate.wait() >= 0, range(20), lambda item: takes, 4, 4)) == [True] * 20
+
+
+def test_an_error_is_raised_in_its_turn_and_what_has_not_begun_is_left():
+    answers = diff.bounded_map(lambda item: 6 // item, [1, 2, 0, 3], lambda item: item, 9, 2)
+    assert [next(answers), next(answers)] == [6, 3]
+    with pytest.raises(ZeroDivisionError):
+        next(answers)
+    begun = []
+
+    def takes(item):
+        if item == diff.AHEAD:
+            raise KeyboardInterrupt
+        return 0
+
+    with pytest.raises(KeyboardInterrupt):
+        list(diff.bounded_map(lambda item: begun.append(item) or time.sleep(0.3), range(10), takes, 1, 1))
+    assert begun in ([], [0])
+
+
 # Names ------------------------------------------------------------------------------------------------------------
 
 
@@ -190,6 +280,10 @@ def test_pairs_that_are_compared_at_once_have_no_more_values_than_one_may(tmp_pa
         ("*.exr", "a.exr.png", False),
         ("a.exr", "aaexr", False),
         ("*", "line\nbreak.exr", True),
+        ("a*ab*b", "aabb", True),
+        ("a*ab*b", "aab", False),
+        ("*a" * 20 + "b", "a" * 60, False),  # at once, whatever the number of stars
+        (20 * "*a", "a" * 60, True),
     ],
 )
 def test_patterns(pattern, name, same):
@@ -219,6 +313,12 @@ def test_a_template_and_the_names_it_makes(template, name, values):
     assert name_patterns.parsed(template, name) == values
     if values is not None:
         assert name_patterns.filled(template, values) == name
+
+
+@pytest.mark.parametrize("template", ["{root}//etc/x.png", "/etc/x.png", "{stem}//x", "../x", "{root}/../x", "", "a/"])
+def test_no_template_leaves_its_folder(template):
+    with pytest.raises(ValueError, match=r"mask: .*; expected a relative path inside the folder"):
+        from_words("auto", [f"mask={template}"])
 
 
 def test_files_beside_a_reference(tmp_path):

@@ -5,22 +5,18 @@ from __future__ import annotations
 import os
 import resource
 import struct
-import threading
-import time
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from support.diff_images import cut
+from support.diff_images import cut, exr_of_integers, tiff
 
 from mi_refract.io import image_file
 from mi_refract.io.image_file import (
-    AHEAD,
     any_channel,
     block_area,
     block_mean,
     block_sum,
-    bounded_map,
     read,
     read_exr,
     srgb_decode,
@@ -115,6 +111,9 @@ def test_windows_alpha_and_wide_numbers_are_kept(tmp_path):
     pixels = np.dstack([PIXELS, np.zeros((48, 40))]).astype(np.float32)
     save(tmp_path / "a.png", pixels, "uint8", unassociated=True)
     np.testing.assert_allclose(read(tmp_path / "a.png").pixels, pixels, atol=1 / 509)
+    ids = np.uint32([[[2**24, 5]], [[2**24 + 1, 2**32 - 1]]])
+    np.testing.assert_array_equal(read(exr_of_integers(tmp_path / "a.exr", ids, ["id1", "id2"])).pixels, ids)
+    np.testing.assert_array_equal(read(tiff(tmp_path / "a.tif", ids)).pixels, ids / (2**32 - 1))
     wide = np.array([[[1.0]], [[1 + 2.0**-40]]])
     path = save(tmp_path / "a.tif", wide, "double")
     np.testing.assert_array_equal(read(path).pixels, wide)
@@ -165,6 +164,7 @@ BAD = {
     "pipe.exr": os.mkfifo,
     "header.tif": lambda path: path.write_bytes(b"II*\0\x08\0\0\0"),
     "one row.tif": lambda path: save(path, np.ones((1, 4, 3)), "double"),  # OpenImageIO reads what lay in memory
+    "cmyk.psd": lambda path: path.write_bytes(struct.pack(">4sH6xHIIHH14x", b"8BPS", 1, 4, 1, 1, 8, 4) + bytes(4)),
     "a\udcff.exr": lambda path: save(path.with_name("a.exr"), PIXELS).rename(path),
 }
 BAD |= {
@@ -220,54 +220,6 @@ def test_what_the_system_does_not_give(tmp_path):
             reader(tmp_path / "none.exr")
         with pytest.raises(OSError, match=str(tmp_path)):
             reader(tmp_path)
-
-
-# Work in threads: in order, several at a time, and never more together than the bound -------------------------------
-
-
-@pytest.mark.parametrize(
-    ("items", "most"), [*(([1, 5, 2, 2, 0, 7, 3, 1, 1, 1, 4, 0, 0, 6] * 3, n) for n in (5, 12, 100)), ([1, 9, 1, 9], 3)]
-)
-def test_the_bound_holds_and_the_order_too(items, most):
-    """Held from the start of the work until the answer is taken; what takes more than all is alone."""
-    lock, held, largest = threading.Lock(), 0, 0
-
-    def work(item):
-        nonlocal held, largest
-        with lock:
-            held += item
-            largest = max(largest, held)
-        time.sleep(0.002)
-        return item
-
-    for item, answer in zip(items, bounded_map(work, items, lambda item: item, most, 4), strict=True):
-        assert answer == item
-        with lock:
-            held -= answer
-    assert largest <= max(most, *items) and (largest > max(items) or most < 12)
-
-
-@pytest.mark.parametrize("takes", [0, 1])
-def test_threads_work_at_the_same_time_to_the_end(takes):
-    gate = threading.Barrier(4, timeout=10)
-    assert list(bounded_map(lambda item: gate.wait() >= 0, range(20), lambda item: takes, 4, 4)) == [True] * 20
-
-
-def test_an_error_is_raised_in_its_turn_and_what_has_not_begun_is_left():
-    answers = bounded_map(lambda item: 6 // item, [1, 2, 0, 3], lambda item: item, 9, 2)
-    assert [next(answers), next(answers)] == [6, 3]
-    with pytest.raises(ZeroDivisionError):
-        next(answers)
-    begun = []
-
-    def takes(item):
-        if item == AHEAD:
-            raise KeyboardInterrupt
-        return 0
-
-    with pytest.raises(KeyboardInterrupt):
-        list(bounded_map(lambda item: begun.append(item) or time.sleep(0.3), range(10), takes, 1, 1))
-    assert begun in ([], [0])
 
 
 # Pixels ---------------------------------------------------------------------------------------------------------------

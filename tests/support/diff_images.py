@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 
 from mi_refract.io.image_file import Image, write_exr
 
@@ -71,3 +73,45 @@ def tree(folder):
 def found(results):
     """Status and category by name."""
     return {result.name: (str(result.status), str(result.category)) for result in results.results}
+
+
+# Files that OpenImageIO does not write --------------------------------------------------------------------------------
+
+
+TIFF_TYPES = {1: "B", 2: "B", 3: "H", 4: "I", 7: "B", 12: "d"}
+
+
+def tiff(path, pixels, tags=None):
+    """An uncompressed TIFF of H × W × C pixels of any type; `tags`: more of them, or others, as (type, values)."""
+    height, width, count = pixels.shape
+    kind, data = {"u": 1, "i": 2, "f": 3}[pixels.dtype.kind], pixels.tobytes()
+    entries = {256: (4, [width]), 257: (4, [height]), 258: (3, [8 * pixels.itemsize] * count), 259: (3, [1])}
+    entries |= {262: (3, [2 if count > 2 else 1]), 273: (4, [0]), 277: (3, [count]), 278: (4, [height])}
+    entries |= {279: (4, [len(data)]), 339: (3, [kind] * count)} | (tags or {})
+    values = {tag: struct.pack(f"<{len(x)}{TIFF_TYPES[t]}", *x) for tag, (t, x) in entries.items()}
+    at = 8 + 2 + 12 * len(entries) + 4
+    values[273] = struct.pack("<I", at + sum(len(value) for value in values.values() if len(value) > 4))
+    directory, behind = struct.pack("<H", len(entries)), b""
+    for tag in sorted(entries):
+        long = len(values[tag]) > 4
+        value = struct.pack("<I", at + len(behind)) if long else values[tag].ljust(4, b"\0")
+        behind += values[tag] if long else b""
+        directory += struct.pack("<HHI", tag, entries[tag][0], len(entries[tag][1])) + value
+    path.write_bytes(b"II*\0" + struct.pack("<I", 8) + directory + bytes(4) + behind + data)
+    return path
+
+
+def exr_of_integers(path, pixels, channels):
+    """An EXR of uint32: one of float32 whose header is changed."""
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "float")
+    spec.channelnames = channels
+    spec.attribute("compression", "none")
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec) and output.write_image(pixels.astype(np.uint32).view(np.float32))
+    assert output.close()
+    data = path.read_bytes()
+    for name in channels:
+        entry = name.encode() + b"\0" + struct.pack("<i", 2)
+        data = data.replace(entry, entry.replace(b"\2", b"\0"))
+    path.write_bytes(data)
+    return path

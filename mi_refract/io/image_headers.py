@@ -1,0 +1,154 @@
+"""Headers of image files, byte by byte: what OpenImageIO does not check, and what it does not hand over."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from .errors import ImageError
+
+EXR, PNG, JPEG = b"\x76\x2f\x31\x01", b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+ATTRIBUTES = 4096  # of an EXR file
+# Chunks of a PNG file that OpenImageIO reads, or that do not concern the numbers.
+CHUNKS = (
+    b"IHDR PLTE IDAT IEND tRNS gAMA sRGB cICP iCCP tEXt zTXt iTXt tIME pHYs oFFs eXIf bKGD hIST sBIT sPLT mDCV".split()
+)
+SRGB = struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000)  # cHRM: the same as none
+# Tags of a TIFF file that OpenImageIO reads, or that say where the pixels are.
+TAGS = {*range(254, 290), 292, 293, 296, 297, 305, 306, *range(315, 318), 320, *range(322, 326), 330, 332, 333, 334}
+TAGS |= {338, 339, 347, *range(512, 522), 529, 530, 531, 700, *range(33300, 33307), 33432, 33723, 34377, 34665, 34675}
+TAGS |= {32995, 32997, 34853}
+SIZES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}  # bytes by type; others: 1
+PSD = (4, 7, 8)  # of Photoshop's colour modes CMYK, multichannel, duotone
+REFUSED = {
+    "png:acTL": "an animated PNG; expected a single image",
+    "jpeg:MPF": "a JPEG of several images (MPO); expected a single image",
+    "psd:ColorSpace": "a Photoshop file in CMYK or other inks; expected R, G, B",
+}
+
+
+def check_attributes(path: Path) -> None:
+    """ValueError where an attribute of an OpenEXR file is larger than the file. OpenImageIO may not look."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        if file.read(8)[:4] != EXR:
+            return
+        for _ in range(ATTRIBUTES):
+            if not _text(file):  # the name; behind the last attribute it is empty
+                return
+            _text(file)  # the type
+            length = int.from_bytes(file.read(4), "little")
+            if file.tell() + length > size:
+                raise ImageError(f"{path}: corrupt EXR file: an attribute of {length} bytes")
+            file.seek(length, os.SEEK_CUR)
+    raise ImageError(f"{path}: more than {ATTRIBUTES} attributes")
+
+
+def _text(file: BinaryIO) -> bytes:
+    """The bytes up to a zero, which is read, too; EXR's names have up to 255."""
+    begin = file.read(256)
+    text, zero, _ = begin.partition(b"\0")
+    file.seek(len(text) + len(zero) - len(begin), os.SEEK_CUR)
+    return text
+
+
+def hidden_metadata(path: Path) -> dict[str, bytes | float]:
+    """What the file says of its numbers and OpenImageIO does not hand over: "png:cHRM", "tiff:301", "hdr:COLORCORR".
+
+    Values are as they are in the file. Radiance's PIXASPECT is "PixelAspectRatio", as in other formats. ValueError for
+    a file of several images of which OpenImageIO reads the first alone, and for colours that it converts with loss.
+    """
+    size = path.stat().st_size
+    said: dict[str, list[bytes]] = {}
+    # A file that ends too early, or leads beyond its end, is an error of OpenImageIO's.
+    with path.open("rb") as file, contextlib.suppress(struct.error, OverflowError, OSError):
+        begin = file.read(8)
+        for magic, read in READERS.items():
+            for name, value in read(file, size) if begin.startswith(magic) else ():
+                said.setdefault(name, []).append(value)
+    for name in said.keys() & REFUSED.keys():
+        raise ImageError(f"{path}: {REFUSED[name]}")
+    found: dict[str, bytes | float] = {name: b" ".join(values) for name, values in said.items()}
+    with contextlib.suppress(KeyError, ValueError, ZeroDivisionError):
+        found["PixelAspectRatio"] = 1 / float(found["hdr:PIXASPECT"])  # there it is height over width
+        del found["hdr:PIXASPECT"]
+    return found
+
+
+# Each of these gives names and values. `size`: of the file, which no value exceeds.
+
+
+def _png(file: BinaryIO, size: int) -> Iterator[tuple[str, bytes]]:
+    file.seek(len(PNG))
+    while True:
+        length, chunk = struct.unpack(">I4s", file.read(8))
+        after = file.tell() + length + 4
+        if chunk not in CHUNKS and (data := file.read(min(length, size))) != SRGB:
+            yield f"png:{chunk.decode('latin-1')}", data
+        file.seek(after)
+
+
+def _jpeg(file: BinaryIO, size: int) -> Iterator[tuple[str, bytes]]:
+    file.seek(len(JPEG))
+    while True:
+        marker, length = struct.unpack(">HH", file.read(4))
+        after = file.tell() + length - 2
+        if marker == 0xFFDA or marker < 0xFF00:  # the pixels begin
+            return
+        if marker == 0xFFFF:  # the first byte only fills
+            after = file.tell() - 3
+        elif marker == 0xFFE2 and file.read(4) == b"MPF\0":
+            yield "jpeg:MPF", b""
+        file.seek(after)
+
+
+def _hdr(file: BinaryIO, size: int) -> Iterator[tuple[str, bytes]]:
+    file.seek(0)
+    while line := file.readline(size).strip():
+        name, equals, value = line.partition(b"=")
+        if equals and name.strip() != b"FORMAT":
+            yield f"hdr:{name.strip().decode('latin-1')}", value.strip()
+
+
+def _tiff(file: BinaryIO, size: int) -> Iterator[tuple[str, bytes]]:
+    file.seek(0)
+    order = "<" if file.read(2) == b"II" else ">"
+    big = struct.unpack(f"{order}H", file.read(2))[0] == 43
+    offset, count, inline = (f"{order}Q", f"{order}Q", 8) if big else (f"{order}I", f"{order}H", 4)
+
+    def unpack(kind: str) -> tuple[int, ...]:
+        return struct.unpack(kind, file.read(struct.calcsize(kind)))
+
+    file.seek(inline)
+    seen = {0}
+    while (at := unpack(offset)[0]) not in seen:
+        place = f" of part {len(seen) - 1}" if len(seen) > 1 else ""
+        seen.add(at)
+        file.seek(at)
+        first = at + struct.calcsize(count)
+        entries = min(unpack(count)[0], size // 12)
+        entry = struct.calcsize(f"{order}HH{offset[1]}") + inline
+        for i in range(entries):
+            file.seek(first + i * entry)
+            tag, kind, number = unpack(f"{order}HH{offset[1]}")
+            length = min(number * SIZES.get(kind, 1), size)
+            if tag not in TAGS:
+                if length > inline:
+                    file.seek(unpack(offset)[0])
+                yield f"tiff:{tag}{place}", file.read(length)
+        file.seek(first + entries * entry)
+
+
+def _psd(file: BinaryIO, size: int) -> Iterator[tuple[str, bytes]]:
+    file.seek(24)
+    (mode,) = struct.unpack(">H", file.read(2))
+    if mode in PSD:
+        yield "psd:ColorSpace", b""
+
+
+READERS = {PNG: _png, JPEG: _jpeg, b"#?": _hdr, b"II*\0": _tiff, b"MM\0*": _tiff, b"II+\0": _tiff, b"MM\0+": _tiff}
+READERS[b"8BPS"] = _psd

@@ -1,0 +1,214 @@
+"""What files say besides their numbers: the table of the README, cell by cell, in two files of the same codes."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from PIL import Image as Pillow
+from PIL import ImageCms
+from support.diff_images import exr_of_integers
+from support.diff_images import tiff as write_tiff
+
+from mi_refract.image_diff import folders, metadata
+from mi_refract.image_diff.methods import METHODS
+from mi_refract.image_diff.settings import Settings
+
+README = Path(metadata.__file__).with_name("README.md").read_text("utf-8")
+SINGLE = [name for name, method in METHODS.items() if not method.takes_renders]
+CODES = np.random.default_rng(1).integers(0, 256, (8, 8, 3), np.uint8)
+GRAY, FOUR = CODES[..., :1], np.dstack([CODES, CODES[..., :1]])
+IDS = np.full((8, 8, 1), 2**24, np.uint32)
+ICC = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+OTHER_ICC = ICC[:64] + b"\0\0\0\1" + ICC[68:]  # with another rendering intent
+WHITE, D65 = (0.3, 0.3), (0.3127, 0.329)
+ENDINGS = {"JPEG": "jpg", "TIFF": "tif"}
+
+
+# How they are written: the same codes, and what is said of them -------------------------------------------------------
+
+
+def exr(path, *parts):
+    specs = []
+    for said in parts:
+        spec = oiio.ImageSpec(8, 8, 3, "float")
+        for name, value in said.items():
+            if hasattr(spec, name):
+                setattr(spec, name, value)
+            elif name != "add":
+                spec.attribute(name, *([f"float[{len(value)}]"] if isinstance(value, tuple) else []), value)
+        specs.append(spec)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), tuple(specs)), output.geterror()
+    for number, spec in enumerate(specs):
+        assert not number or output.open(str(path), spec, "AppendSubimage")
+        assert output.write_image(CODES.astype(np.float32) + np.float32(parts[number].get("add", 0)))
+    assert output.close()
+
+
+def png(path, *chunks):
+    Pillow.fromarray(CODES).save(path)
+    data = path.read_bytes()
+    more = [struct.pack(">I", len(x)) + kind + x + struct.pack(">I", zlib.crc32(kind + x)) for kind, x in chunks]
+    path.write_bytes(data[:33] + b"".join(more) + data[33:])
+
+
+def tiff(path, tags, pixels=CODES):
+    write_tiff(path, pixels, tags)
+
+
+def jpeg(path, **options):
+    Pillow.fromarray(CODES).convert(options.pop("mode", "RGB")).save(path, options.pop("format", "JPEG"), **options)
+
+
+def hdr(path, *lines):
+    size = [line for line in lines if "Y" in line[:2]] or ["-Y 8 +X 8"]
+    lines = ["#?RADIANCE", *(line for line in lines if line not in size), "FORMAT=32-bit_rle_rgbe", "", *size, ""]
+    path.write_bytes("\n".join(lines).encode() + bytes(range(64)) * 4)
+
+
+def frames(path, add):
+    first, second = (Pillow.fromarray(CODES + np.uint8(x)) for x in (0, add))
+    first.save(path, save_all=True, append_images=[second])
+
+
+def integers(path, pixels):
+    exr_of_integers(path, pixels, ["id"])
+
+
+def per_100000(*values):
+    return b"".join(struct.pack(">I", round(1e5 * value)) for value in values)
+
+
+def exif(tag, value, inner=False):
+    said = Pillow.Exif()
+    (said.get_ifd(0x8769) if inner else said)[tag] = value
+    return said.tobytes()
+
+
+# By row and column of the table: a function, and its arguments for the two files.
+CASES = {
+    ("transfer curve", "EXR"): (exr, [{}], [{"oiio:ColorSpace": "srgb_rec709_scene"}]),
+    ("transfer curve", "PNG"): (png, [(b"sRGB", b"\0")], [(b"gAMA", per_100000(1))]),
+    ("transfer curve", "TIFF"): (tiff, [{}], [{301: (3, [1] * 256)}]),
+    ("transfer curve", "JPEG"): (jpeg, {"exif": exif(0xA001, 1, True)}, {"exif": exif(0xA001, 65535, True)}),
+    ("transfer curve", "HDR"): (hdr, [], ["GAMMA=2.2"]),
+    ("primaries", "EXR"): (exr, [{}], [{"chromaticities": (0.7, 0.3, 0.2, 0.7, 0.1, 0.05, *WHITE)}]),
+    ("primaries", "PNG"): (png, [], [(b"cHRM", per_100000(*WHITE, 0.7, 0.3, 0.2, 0.7, 0.1, 0.05))]),
+    ("primaries", "TIFF"): (tiff, [{}], [{318: (12, WHITE)}]),
+    ("primaries", "HDR"): (hdr, [], ["PRIMARIES=.7 .3 .1 .8 .1 .1 .3 .3"]),
+    ("ICC profile", "PNG"): (png, *([(b"iCCP", b"a\0\0" + zlib.compress(icc))] for icc in (ICC, OTHER_ICC))),
+    ("ICC profile", "TIFF"): (tiff, *([{34675: (7, icc)}] for icc in (ICC, OTHER_ICC))),
+    ("ICC profile", "JPEG"): (jpeg, *({"icc_profile": icc} for icc in (ICC, OTHER_ICC))),
+    ("exposure, luminance of white", "EXR"): (exr, [{"whiteLuminance": 80.0}], [{"whiteLuminance": 100.0}]),
+    ("exposure, luminance of white", "PNG"): (png, [], [(b"cLLI", bytes(8))]),
+    ("exposure, luminance of white", "TIFF"): (tiff, [{}], [{341: (3, [99] * 3)}]),
+    ("exposure, luminance of white", "HDR"): (hdr, ["EXPOSURE=2"], ["EXPOSURE=2", "EXPOSURE=3"]),
+    ("colour correction", "HDR"): (hdr, [], ["COLORCORR=1 2 1"]),
+    ("pixel aspect ratio", "EXR"): (exr, [{}], [{"PixelAspectRatio": 2.0}]),
+    ("pixel aspect ratio", "PNG"): (png, [], [(b"pHYs", struct.pack(">IIB", 100, 200, 0))]),
+    ("pixel aspect ratio", "TIFF"): (tiff, [{}], [{282: (12, [1]), 283: (12, [2])}]),
+    ("pixel aspect ratio", "JPEG"): (jpeg, {}, {"dpi": (100, 200)}),
+    ("pixel aspect ratio", "HDR"): (hdr, [], ["PIXASPECT=2"]),
+    ("orientation", "PNG"): (png, [], [(b"eXIf", exif(0x112, 3).removeprefix(b"Exif\0\0"))]),
+    ("orientation", "TIFF"): (tiff, [{}], [{274: (3, [3])}]),
+    ("orientation", "JPEG"): (jpeg, {}, {"exif": exif(0x112, 3)}),
+    ("orientation", "HDR"): (hdr, [], ["+Y 8 +X 8"]),
+    ("data window", "EXR"): (exr, [{}], [{"x": 1}]),
+    ("data window", "PNG"): (png, [], [(b"oFFs", struct.pack(">iiB", 1, 0, 0))]),
+    ("data window", "TIFF"): (tiff, [{}], [{282: (12, [1]), 283: (12, [1]), 286: (12, [1]), 287: (12, [0])}]),
+    ("display window", "EXR"): (exr, [{}], [{"full_width": 9}]),
+    ("display window", "TIFF"): (tiff, [{}], [{33300: (4, [9]), 33301: (4, [8])}]),
+    ("alpha is associated or not", "TIFF"): (tiff, *([{338: (3, [kind])}, FOUR] for kind in (1, 2))),
+    ("white is 0, up to 16 bits", "TIFF"): (tiff, *([{262: (3, [kind])}, GRAY] for kind in (0, 1))),
+    ("white is 0, more bits", "TIFF"): (tiff, *([{262: (3, [kind])}, np.float32(GRAY)] for kind in (0, 1))),
+    ("CMYK", "TIFF"): (tiff, *([{262: (3, [5])}, FOUR],) * 2),
+    ("CMYK", "JPEG"): (jpeg, *({"mode": "CMYK"},) * 2),
+    ("CIE L\\*a\\*b\\*", "TIFF"): (tiff, *([{262: (3, [8])}],) * 2),
+    ("integers of 32 bits", "EXR"): (integers, [IDS], [IDS + 1]),
+    ("integers of 32 bits", "TIFF"): (tiff, [{}, IDS], [{}, IDS + 1]),
+    ("name of a part", "EXR"): (exr, *([{"oiio:subimagename": name} for name in names] for names in ("ab", "ba"))),
+    ("name of a part", "TIFF"): (tiff, *([{285: (2, name)}] for name in (b"a\0", b"b\0"))),
+    ("view, left or right", "EXR"): (exr, *(
+        [{"oiio:subimagename": name, "view": name} for name in names] for names in ("ab", "ba")
+    )),
+    ("environment map", "EXR"): (exr, [{}], [{"envmap": "latlong", "textureformat": "LatLong Environment"}]),
+    ("second image", "EXR"): (exr, *([{"oiio:subimagename": y, "add": x * (y == "b")} for y in "ab"] for x in (0, 1))),
+    ("second image", "PNG"): (frames, [0], [1]),
+    ("second image", "TIFF"): (frames, [0], [1]),
+    ("second image", "JPEG"): (jpeg, *(
+        {"format": "MPO", "save_all": True, "append_images": [Pillow.fromarray(CODES + np.uint8(x))]} for x in (0, 1)
+    )),
+    ("second image", "GIF"): (frames, [0], [1]),
+    ("what is not known here", "EXR"): (exr, [{"a:b": 1}], [{"a:b": 2}]),
+    ("what is not known here", "PNG"): (png, [], [(b"prVt", b"a")]),
+    ("what is not known here", "TIFF"): (tiff, [{}], [{65000: (4, [1])}]),
+    ("what is not known here", "HDR"): (hdr, [], ["PURPOSE=a"]),
+    ("software, time, compression", "EXR"): (exr, [{"Software": "a", "compression": "none"}], [{"Software": "b"}]),
+    ("software, time, compression", "PNG"): (png, [], [(b"tEXt", b"Software\0a"), (b"tIME", b"\7\xea" + 5 * b"\1")]),
+    ("software, time, compression", "TIFF"): (tiff, [{}], [{305: (2, b"a\0"), 306: (2, b"2026:01:01 00:00:00\0")}]),
+    ("software, time, compression", "JPEG"): (jpeg, {}, {"exif": exif(305, "a")}),
+    ("software, time, compression", "HDR"): (hdr, [], ["SOFTWARE=a", "CAPDATE=2026:01:01 00:00:00"]),
+}  # fmt: skip
+
+
+def table():
+    """What the README says of each cell."""
+    text = README.partition("<!-- begin: metadata -->\n")[2].partition("<!-- end: metadata -->")[0]
+    (_, *names), _, *rows = (line.strip("| ").split(" | ") for line in text.splitlines())
+    return {(row, name): word for row, *words in rows for name, word in zip(names, words, strict=True) if word != "–"}
+
+
+def test_every_cell_of_the_table_is_tested_and_what_is_ignored_is_listed():
+    assert table().keys() == CASES.keys()
+    assert f"```\n{metadata.WITHOUT_MEANING.strip()}\n```" in README
+
+
+@pytest.mark.parametrize(("row", "name"), CASES, ids=map(" ".join, CASES))
+def test_the_table_holds(tmp_path, row, name):
+    write, *arguments = CASES[row, name]
+    paths = [tmp_path / f"{side}.{ENDINGS.get(name, name.lower())}" for side in "ab"]
+    for path, given in zip(paths, arguments, strict=True):
+        write(path, **given) if isinstance(given, dict) else write(path, *given)
+    word = table()[row, name]
+    for method in ["exact"] if word == "in the numbers" else SINGLE:
+        (result,) = folders.diff(*paths, Settings.for_all(method=method)).results
+        expected = {"refused": "error", "ignored": "equal"}.get(word, "different")
+        assert (result.status, "different metadata: " in result.reason) == (expected, word == "compared"), result.reason
+
+
+def test_what_a_user_ignores_does_not_count_and_the_rest_is_named(tmp_path):
+    paths = [tmp_path / "a.exr", tmp_path / "b.exr"]
+    for path, view in zip(paths, ("left", "right"), strict=True):
+        exr(path, {"view": view, "a:c": view, "a:b": view, "chromaticities": (0.7, 0.3, 0.2, 0.7, 0.1, 0.05, *D65)})
+    for ignored, reason in (
+        ((), "different metadata: a:b (left → right), and a:c, view; every value is the same"),
+        (("a:*",), "different metadata: view (left → right); every value is the same"),
+        (("a:?", "view"), "every value is the same"),
+    ):
+        (result,) = folders.diff(*paths, Settings.for_all(method="exact", ignore_metadata=ignored)).results
+        assert (result.status, result.reason) == ("equal" if "view" in ignored else "different", reason)
+
+
+@pytest.mark.parametrize("ending", ["bmp", "jpg", "ppm", "sgi", "tga", "tif", "webp"])
+def test_what_a_format_says_in_other_words_is_no_difference(tmp_path, ending):
+    """Of the same codes, beside a PNG file."""
+    paths = [tmp_path / "a.png", tmp_path / f"b.{ending}"]
+    for path in paths:
+        spec = oiio.ImageSpec(8, 8, 3, "uint8")
+        output = oiio.ImageOutput.create(str(path))
+        assert output.open(str(path), spec) and output.write_image(np.full((8, 8, 3), 255, np.uint8)) and output.close()
+    (result,) = folders.diff(*paths, Settings.for_all(method="exact", channels=tuple((x, x) for x in "RGB"))).results
+    assert result.status == "equal", result.reason
+
+
+def test_an_alpha_that_one_image_lacks_is_a_channel_and_no_metadata(tmp_path):
+    paths = [tmp_path / "a.png", tmp_path / "b.png"]
+    for path, mode in zip(paths, ("RGB", "RGBA"), strict=True):
+        Pillow.fromarray(CODES).convert(mode).save(path)
+    (result,) = folders.diff(*paths).results
+    assert result.reason.startswith("channels added: A (opaque")
