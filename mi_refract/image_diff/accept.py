@@ -17,7 +17,6 @@ from . import pairing
 from .folders import digest
 from .results import FAILED, Result, Results
 
-
 FEW = 10  # names in a message
 
 
@@ -100,7 +99,7 @@ def accept(copies: Sequence[Copy]) -> None:
 
 
 class Acceptance:
-    """Copies new images over their references: exactly the bytes that were compared, over those they were compared with.
+    """Copies new images over their references: exactly the bytes that were compared, if the references are those, too.
 
     Every copy is complete, in a hidden file, before the first of them takes its name. Then they do so in their order.
     """

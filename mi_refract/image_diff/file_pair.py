@@ -67,7 +67,8 @@ def compare(
 ) -> Result:
     """The result with the verdict on the images of both sides, as `result.how` says, and with images and maps.
 
-    `path`: of the reference, `roots`: the folders, `read`: for variances. ValueError or OSError where a mask or a variance is missing or does
+    `path`: of the reference, `roots`: the folders, `read`: for variances.
+    ValueError or OSError where a mask or a variance is missing or does
     not fit, and as `methods.compare`, with the place of the image.
     """
     how = result.how

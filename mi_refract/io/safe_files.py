@@ -278,7 +278,7 @@ def read_bytes(path: str | os.PathLike[str], most: int) -> bytes:
 
 
 def copy(source: str | os.PathLike[str], target: Path, most: int = sys.maxsize) -> str:
-    """Copy the bytes of a regular file, `most` of them, into the file `target`; their SHA-256. Errors as of `opened`."""
+    """Copy a regular file of up to `most` bytes into the file `target`; its SHA-256. Errors as of `opened`."""
     digest = hashlib.sha256()
     with opened(source, most) as file, full_disk_names(target), target.open("wb") as copied:
         while piece := file.read(_PIECE):
