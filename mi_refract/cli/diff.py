@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import enum
 import importlib.util
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -27,6 +28,7 @@ from mi_refract.io.safe_files import writable
 from mi_refract.io.text import printable
 
 from .app import shows
+from .interrupts import last_act
 
 RENDERS, SPP = 16, 16  # of a scene, for the self-test
 SCENE = ".xml"
@@ -180,7 +182,9 @@ def accept(
     if not yes and not typer.confirm(f"Accept {len(copies)} as the reference{'' if len(copies) == 1 else 's'}?"):
         print("nothing accepted")
         raise typer.Exit(1)
-    accepting.accept(copies)
+    acceptance = accepting.Acceptance(copies)
+    with last_act(lambda: print(f"mi-refract: interrupted; {printable(acceptance.stop())}", file=sys.stderr)):
+        acceptance.run()
     print(f"{len(copies)} accepted")
 
 
@@ -193,7 +197,7 @@ def require_extra(*packages: str) -> None:
 def _settings(reference: Path, method: str, words: Sequence[str], file: Path | None, max_values: int) -> Settings:
     """What the options and the settings file say. ValueError or OSError for what they cannot mean."""
     beside = (reference if reference.is_dir() else reference.parent) / FILE
-    path = file or (beside if beside.exists() else None)
+    path = file or (beside if os.path.lexists(beside) else None)
     flags = ["--method", method] if method != AUTO else []
     flags += [each for word in words for each in ("--set", word)]
     flags += ["--max-values", str(max_values)] if max_values != MAX_VALUES else []

@@ -16,13 +16,11 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_refract.io import image_file
-from mi_refract.io.image_file import MAX_VALUES, Image, Pixels
+from mi_refract.io.image_file import Image, Pixels
 
 from .pixel_statistics import RADIUS
 
@@ -195,17 +193,16 @@ def has_variance(image: Image) -> bool:
     return bool(image.variances or spreads(image.channels))
 
 
-def with_file(image: Image, path: Path, most: int = MAX_VALUES) -> Image:
+def with_file(image: Image, file: Image) -> Image:
     """The image with the variances that another file holds for its channels, by their names.
 
     A file of one channel is for an image of one, whatever the names. Where its header names degrees of freedom they go
-    before those of the image's. OSError for a file that cannot be read; ValueError for one of another size, for one
-    that has none of the channels, and for degrees of freedom that are none.
+    before those of the image's. ValueError for a file of another size, for one that has none of the channels, and for
+    degrees of freedom that are none.
     """
-    file = image_file.read(path, most)
     if file.pixels.shape[:2] != image.pixels.shape[:2]:
         (height, width), wrong = image.pixels.shape[:2], file.pixels.shape[:2]
-        raise ValueError(f"{path}: {wrong[1]} × {wrong[0]}; expected a variance image of {width} × {height}")
+        raise ValueError(f"{file.path}: {wrong[1]} × {wrong[0]}; expected a variance image of {width} × {height}")
     if FREEDOM in file.metadata:
         said = {FREEDOM: _freedom(file), **{name: file.metadata.get(name, "") for name in (FILTER, AREA)}}
         image = replace(image, metadata=image.metadata | said)
@@ -216,7 +213,7 @@ def with_file(image: Image, path: Path, most: int = MAX_VALUES) -> Image:
         names += XYZ
     if not names:
         has, needed = ", ".join(file.channels), ", ".join(image.channels)
-        raise ValueError(f"{path}: variances of channels {has}; expected channels of {image.path}: {needed}")
+        raise ValueError(f"{file.path}: variances of channels {has}; expected channels of {image.path}: {needed}")
     return replace(image, variances={name: file.select([name])[..., 0] for name in names})
 
 

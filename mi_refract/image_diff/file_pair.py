@@ -9,7 +9,7 @@ count.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,6 +28,7 @@ WORST = (Verdict.DIFFERENT, Verdict.INCONCLUSIVE, Verdict.EQUAL)
 THREADS = 8
 WHITE = 0.5  # of a mask's largest colour: from there on a pixel counts
 MOST = 0.5  # share of the pixels that a mask may leave out without a warning
+ReadOne = Callable[[Path, int], Image]
 Mask = NDArray[np.bool_]  # H × W; True where a pixel counts
 
 
@@ -61,11 +62,16 @@ def mean_image(images: Sequence[Image]) -> Image:
 
 
 def compare(
-    path: Path, sides: tuple[Sequence[Image], Sequence[Image]], result: Result, roots: tuple[Path, Path]
+    path: Path,
+    sides: tuple[Sequence[Image], Sequence[Image]],
+    result: Result,
+    roots: tuple[Path, Path],
+    read: ReadOne = image_file.read,
 ) -> Result:
     """The result with the verdict on the images of both sides, as `result.how` says, and with images and maps.
 
-    `path`: of the reference, `roots`: the folders. ValueError or OSError where a mask or a variance is missing or does
+    `path`: of the reference, `roots`: the folders, `read`: for variances.
+    ValueError or OSError where a mask or a variance is missing or does
     not fit, and as `methods.compare`, with the place of the image.
     """
     how = result.how
@@ -77,7 +83,7 @@ def compare(
             beside = pairing.beside(how.variance, renders[0].path, root)
             if beside == renders[0].path:
                 raise ValueError(f"variance = {how.variance!r}: names {beside} itself; expected another image")
-            renders = [channels.with_file(renders[0], beside, how.max_values)] if beside.exists() else renders
+            renders = [channels.with_file(renders[0], read(beside, how.max_values))] if beside.exists() else renders
         selected.append(channels.chosen(renders, how.channels, side))
     reference, test = selected
     if how.reads_variance and not (len(reference) > 1 or channels.has_variance(reference[0])):

@@ -11,7 +11,7 @@ import hashlib
 import os
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -141,11 +141,15 @@ def _compared(result: Result, results: Results, *, keep: bool, digests: bool) ->
     how = result.how
     result = replace(result, error=result.error or how.error)
 
+    decoded: dict[Path, str] | None = {} if digests else None  # the digests of what was read
+
     @functools.cache
     def read(path: Path) -> Sequence[Image] | Exception:
         """All renders of a folder, or all images of a file; or why they cannot be read."""
         try:
-            return (file_pair.read_renders if results.renders else image_file.read_parts)(path, how.max_values)
+            if results.renders:
+                return file_pair.read_renders(path, how.max_values)
+            return image_file.read_parts(path, how.max_values, decoded)
         except Exception as error:  # of whatever kind: it is raised where the images are compared
             return error
 
@@ -155,18 +159,17 @@ def _compared(result: Result, results: Results, *, keep: bool, digests: bool) ->
         return replace(result, status=Status.SKIPPED)
     else:
         try:
-            if digests:  # before the images are read: what is read later and has the same digest is what was compared
-                paths = [result.reference, result.test, *result.variants]
-                if how.reads_variance:
-                    sides = zip((result.target, result.test), results.roots, strict=True)
-                    paths += [pairing.beside(how.variance, path, root) for path, root in sides if path]
-                result = replace(result, digests={path: digest(path) for path in paths if path})
-            result = _judged(result, results.roots, read)
+            result = _judged(result, results.roots, read, functools.partial(image_file.read, digests=decoded))
+            if decoded is not None:
+                result = replace(result, digests=_digests(result, results.roots, decoded))
         except Exception as error:  # of whatever kind: the other images are still to be compared
             errors.print_traceback(error)
             text = errors.describe(error)
             known = isinstance(error, ValueError | OSError)
             result = replace(result, status=Status.ERROR, error=text if known else f"{result.test}: {text}")
+            if decoded is not None:
+                with contextlib.suppress(ValueError, OSError):  # without digests it is not accepted
+                    result = replace(result, digests=_digests(result, results.roots, decoded))
     if not keep or result.status not in FAILED:
         return _without_images(result)
     if result.images:
@@ -184,7 +187,16 @@ def _compared(result: Result, results: Results, *, keep: bool, digests: bool) ->
     return replace(result, images=images, unread=" ".join(unread))
 
 
-def _judged(result: Result, roots: tuple[Path, Path], read: Read) -> Result:
+def _digests(result: Result, roots: tuple[Path, Path], decoded: Mapping[Path, str]) -> dict[Path, str]:
+    """The digests of all files of a result: of what was decoded, and of what there was no need to decode."""
+    paths = [result.reference, result.test, *result.variants]
+    if result.how.reads_variance:
+        sides = zip((result.target, result.test), roots, strict=True)
+        paths += [pairing.beside(result.how.variance, path, root) for path, root in sides if path]
+    return {path: decoded.get(path) or digest(path) for path in paths if path}
+
+
+def _judged(result: Result, roots: tuple[Path, Path], read: Read, read_one: file_pair.ReadOne) -> Result:
     """The verdict against the reference, or that of a variant to which the new image is equal."""
     reference, new = result.reference, result.test
     if not (reference and new):
@@ -200,7 +212,7 @@ def _judged(result: Result, roots: tuple[Path, Path], read: Read) -> Result:
                 raise one
             if isinstance(two, Exception):
                 raise two
-            judged.append(file_pair.compare(path, (one, two), result, roots))
+            judged.append(file_pair.compare(path, (one, two), result, roots, read_one))
         except (ValueError, OSError, MemoryError) as error:
             failed = failed or error  # unless another reference is equal
             continue

@@ -29,6 +29,7 @@ from mi_refract.report.embedded_images import EmbeddedImages, encoded, strongest
 from mi_refract.report.plots import histogram_svg
 
 from . import flip
+from .name_patterns import literal
 from .results import FAILED, Result, Results, Status
 from .text_reports import WORDS, sentence
 
@@ -106,7 +107,7 @@ class Page:
         folders = results.test.is_dir() and not results.renders  # where names mean something
         more = [*results.flags, "--report", "rest.html"]
         # Without what is no image, and without names that cannot be shown as they are.
-        named = [x.name for x in rest if (x.reference or x.test) and printable(x.name) == x.name][:NAMED]
+        named = [literal(x.name) for x in rest if (x.reference or x.test) and printable(x.name) == x.name][:NAMED]
         content = {
             "title": "mi-refract diff",
             "sentence": sentence(results),
@@ -186,7 +187,7 @@ def item(
         "warning": result.warning,
         "metrics": metrics,
         "text": " ".join((result.name, result.status, result.category, why)).lower(),
-        "word": shlex.quote(result.name) if result.test is not None and result.status in FAILED else "",
+        "word": shlex.quote(literal(result.name)) if result.test is not None and result.status in FAILED else "",
         "minimum_detectable": detectable if math.isfinite(detectable) else None,
         "panes": [images.add(pane) for pane in shown.panes] if images else [],
         "paired": len({(pane["width"], pane["height"]) for pane in shown.panes[:2]}) == 1 and len(shown.panes) > 1,

@@ -1,6 +1,7 @@
 """Names of images: patterns that match them, and templates that make the name of one file from another's.
 
-In a pattern `*` stands for any characters, `/` included, and `?` for one; all else is itself, brackets too.
+In a pattern `*` stands for any characters, `/` included, and `?` for one; all else is itself, brackets too. A backslash
+before `*`, `?` or another backslash makes it stand for itself.
 
 A template is a relative path in which fields stand for parts of an image's path: of "glass/ball.exr" {dir} is "glass",
 {name} "ball.exr", {stem} "ball" and {suffix} ".exr".
@@ -25,7 +26,8 @@ STAR = "\0"  # any characters, in a regular expression that is not finished; no 
 
 
 def _wild(pattern: str) -> str:
-    return re.escape(pattern).replace(r"\*", STAR).replace(r"\?", ".")
+    parts = re.findall(r"\\[*?\\]|.", pattern, re.DOTALL)
+    return "".join({"*": STAR, "?": "."}.get(part, re.escape(part[-1])) for part in parts)
 
 
 def _fits(wild: str, name: str) -> bool:
@@ -33,6 +35,11 @@ def _fits(wild: str, name: str) -> bool:
     first, *rest = wild.split(STAR)
     text = first + "".join(f"(?>.*?{part})" for part in rest[:-1]) + "".join(f".*{part}" for part in rest[-1:])
     return re.fullmatch(text, name, re.DOTALL) is not None
+
+
+def literal(name: str) -> str:
+    """The pattern that matches this name alone."""
+    return re.sub(r"[*?\\]", r"\\\g<0>", name)
 
 
 def is_template(text: str, names: Collection[str] = FIELDS) -> bool:

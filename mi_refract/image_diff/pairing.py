@@ -94,12 +94,14 @@ def _pair(name: str, reference: Path | None, test: Path | None, target: Path, er
 def named(items: Sequence[Result], patterns: Sequence[str]) -> list[Result]:
     """The results whose names match one of the patterns; all without patterns.
 
-    A pattern that is the name of an image, such as "a*.exr", is that image alone. ValueError for one that matches none.
+    A pattern that is the name of an image, such as "a*.exr", is that image alone, unless a backslash says how it is to
+    be read. ValueError for one that matches none.
     """
     names = {item.name for item in items}
     chosen: set[str] = set()
     for pattern in patterns:
-        matched = {pattern} if pattern in names else {name for name in names if name_patterns.matches(pattern, name)}
+        alone = pattern in names and "\\" not in pattern
+        matched = {pattern} if alone else {name for name in names if name_patterns.matches(pattern, name)}
         if not matched:
             raise ValueError(
                 f"{pattern}: matches no image; expected the path of an image in its folder (wildcards: * and ?)"
@@ -181,6 +183,11 @@ def variant(target: Path, how: ComparisonSpec, name: str) -> Path:
         f"{target}: no template in `accept` contains {name} or exactly one *; add to [defaults] in mi-refract.toml: "
         f'accept = ["{{stem}}-{name}{{suffix}}"]'
     )
+
+
+def is_inside(path: Path, folder: Path) -> bool:
+    """Whether the path stays in the folder: no `..` and no link to another folder leads out of it."""
+    return path.parent.resolve().is_relative_to(folder.resolve())
 
 
 def beside(template: str, target: Path, root: Path) -> Path:

@@ -11,6 +11,7 @@ from pathlib import Path
 from mi_refract.io.image_file import Image
 
 from .comparison import Comparison
+from .name_patterns import literal
 from .settings import ComparisonSpec
 
 
@@ -124,8 +125,8 @@ class Results:
     @property
     def roots(self) -> tuple[Path, Path]:
         """The folders of both sides."""
-        one, two = (path if path.is_dir() else path.parent for path in (self.reference, self.test))
-        return one, two
+        folders = self.test.is_dir()  # then the reference is one, if only later
+        return (self.reference, self.test) if folders else (self.reference.parent, self.test.parent)
 
     def of(self, *statuses: Status) -> list[Result]:
         """The results with one of these statuses."""
@@ -161,4 +162,4 @@ class Results:
         return self.command("accept", *self._names(result), flags=[] if self.renders else None)
 
     def _names(self, result: Result) -> list[str]:
-        return [result.name] if self.test.is_dir() and not self.renders else []
+        return [literal(result.name)] if self.test.is_dir() and not self.renders else []

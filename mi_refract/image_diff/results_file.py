@@ -20,6 +20,7 @@ from mi_refract.io.safe_files import write_atomically
 from mi_refract.io.typed_table import convert
 from mi_refract.report.row import strict
 
+from . import pairing
 from .results import FAILED, Result, Results, Status
 from .settings import ComparisonSpec, Settings
 from .text_reports import sentence
@@ -175,7 +176,7 @@ def _moved(where: str, text: str, before: Path, now: Path) -> Path:
     """The path of the file as one in `now`. ValueError where it leads out of it, by `..` or by a link to a folder."""
     path = Path(text)
     moved = now / path.relative_to(before) if path.is_relative_to(before) else None
-    if moved is None or not (moved == now or moved.parent.resolve().is_relative_to(now.resolve())):
+    if moved is None or not (moved == now or pairing.is_inside(moved, now)):
         raise ValueError(f"{where}: {path}; expected a path in {before}")
     return moved
 

@@ -21,6 +21,7 @@ import msgspec
 from msgspec import Meta
 
 from mi_refract.io.image_file import MAX_VALUES
+from mi_refract.io.safe_files import read_bytes
 from mi_refract.io.typed_table import convert, key_table, parse_toml
 
 from . import name_patterns
@@ -29,6 +30,7 @@ from .methods import AUTO, METHODS, Option, options_of_auto
 from .name_patterns import matches
 
 FILE = "mi-refract.toml"
+MOST = 2**22  # bytes of it
 DEFAULTS, COMMAND_LINE = "defaults", "command line"
 ACCEPTED = (AUTO, *METHODS)
 SYSTEMS = {"linux": "linux", "darwin": "macos", "win32": "windows"}  # by sys.platform
@@ -286,7 +288,7 @@ def load(path: str | Path, command_line: Entry | None = None, max_values: int = 
     can. ValueError names the file and the key for whatever else is wrong; OSError as the system raises it.
     """
     path = Path(path)
-    document = parse_toml(path.read_bytes(), Document, str(path), infinite=True)
+    document = parse_toml(read_bytes(path, MOST), Document, str(path), infinite=True)
     defaults = _values(document.defaults, DefaultsKeys, f"{path}: {DEFAULTS}")
     maps = tuple(_listed(defaults.pop("map", None)))
     rules = [Entry("", defaults, DEFAULTS), *([command_line] if command_line else [])]

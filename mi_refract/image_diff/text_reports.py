@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Literal
 from urllib.parse import quote
 
+from mi_refract.io.safe_files import full_disk_names
 from mi_refract.io.text import compact, distinguishable, printable
 
 from .results import FAILED, Result, Results, Status
@@ -176,7 +177,7 @@ def _message(text: object) -> str:
 def append_summary(results: Results, report: str = "", url: str = "") -> None:
     """Append the Markdown to the file that GitHub names in $GITHUB_STEP_SUMMARY, where it does. OSError."""
     if path := os.environ.get("GITHUB_STEP_SUMMARY"):
-        with Path(path).open("a", encoding="utf-8") as file:
+        with full_disk_names(path), Path(path).open("a", encoding="utf-8") as file:
             file.write(markdown(results, report, url))
 
 

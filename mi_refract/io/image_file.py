@@ -31,6 +31,7 @@ MAX_VALUES = 2**28  # width × height × channels of an image: 1 GiB as float32
 # What is read in another type than float32. OpenImageIO rounds integers to float32 on the way to any other type.
 WIDE = {"double": "double", "uint": "uint", "int": "int"}
 CONVERTED = ("CMYK", "YCbCrK", "CIELAB", "ICCLAB", "ITULAB", "LOGL", "LOGLUV")  # to R, G, B
+MOST_HEADERS = 2**28  # bytes of a file beside 8 for each value
 OPTION = " (max-values)"  # for errors: where the limit can be changed
 # How files begin that OpenImageIO decodes when it opens them: GIF, JPEG 2000, JPEG XL.
 WHEN_OPENED = (b"GIF", b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51", b"\0\0\0\x0cJXL ", b"\xff\x0a")
@@ -117,26 +118,41 @@ class Image:
         return self.pixels[..., [self.channels.index(name) for name in channels]]
 
 
-def read(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> Image:
+def read(path: str | os.PathLike[str], max_values: int = MAX_VALUES, digests: dict[Path, str] | None = None) -> Image:
     """Read a file that holds one image, of any format that OpenImageIO reads; the name's ending tells which.
 
-    Raises what `read_parts` raises, and ValueError for a file of several parts or MIP levels.
+    `digests`: as of `read_parts`. Raises what that raises, and ValueError for a file of several parts or MIP levels.
     """
-    image = read_parts(path, max_values, first_only=True)[0]
+    image = read_parts(path, max_values, digests, first_only=True)[0]
     if image.place:
         raise ImageError(f"{path}: several parts or MIP levels in one file; expected one image")
     return image
 
 
-def read_parts(path: str | os.PathLike[str], max_values: int = MAX_VALUES, *, first_only: bool = False) -> list[Image]:
+def read_parts(
+    path: str | os.PathLike[str],
+    max_values: int = MAX_VALUES,
+    digests: dict[Path, str] | None = None,
+    *,
+    first_only: bool = False,
+) -> list[Image]:
     """Read every image of a file, by part and MIP level; a file of any format that OpenImageIO reads, told by its name.
 
     `max_values`: width × height × channels of all together, at most; asked of each header, before memory is allocated.
+    `digests`: gets the SHA-256 of the bytes that are decoded; those of a private copy, which nobody changes meanwhile.
     `first_only`: of several images only the first, which has its `place` nevertheless. OSError for a file
     that cannot be read; ValueError for one that is empty, truncated, too large, of another format than its name says,
     deep, or without pixels. Both are one line that begins with the path.
     """
     path = Path(path)
+    if digests is not None:
+        with safe_files.temporary_folder() as folder:
+            copy = folder / path.name
+            digests[path] = safe_files.copy(path, copy, 8 * max_values + MOST_HEADERS)
+            try:
+                return [replace(image, path=path) for image in read_parts(copy, max_values, first_only=first_only)]
+            except ImageError as error:
+                raise ImageError(str(error).replace(str(copy), str(path))) from None
     source, kind = _checked(path, max_values)
     found: list[Image] = []
     taken = 0

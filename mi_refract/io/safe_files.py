@@ -10,11 +10,14 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import hashlib
 import json
 import os
+import re
 import secrets
 import shutil
 import stat
+import sys
 import tempfile
 import threading
 import time
@@ -28,6 +31,8 @@ _KEPT = 40  # characters of the file's own name: a name of 255 bytes has no room
 _KINDS = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 _LONGEST_CHANGE = 5.0  # seconds that creating or renaming may take on a slow file system
 _unfinished: set[Path] = set()
+_TEMPORARY = re.compile(r"\.[0-9a-f]{32}\.part")
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
 _changing = threading.Lock()  # held where `_unfinished` changes, or a file in it is created or renamed
 
@@ -78,28 +83,57 @@ def replacing(path: str | os.PathLike[str], suffix: str = "", *, folder: bool = 
     It lies beside `path`, its name ends in `suffix`, and it has the permissions of an existing `path`. On any exception
     it is removed, and `path` stays as it was. OSError from the system, or where `path` is not a regular file.
     """
+    with beside(path, suffix, folder=folder) as temporary:
+        yield temporary
+        if not folder:
+            sync(temporary)
+        replace(temporary, path)
+
+
+@contextlib.contextmanager
+def beside(path: str | os.PathLike[str], suffix: str = "", *, folder: bool = False) -> Iterator[Path]:
+    """As `replacing`, but what `replace` has not renamed is removed at the end."""
     path = Path(path)
     if not folder:
         _require_file(path)
     mode = stat.S_IMODE(path.stat().st_mode) if path.exists() else None
     temporary = temporary_name(path, suffix)
-    with _changing:
+    with _changing, full_disk_names(path):
         temporary.mkdir() if folder else temporary.touch(exist_ok=False)  # O_EXCL: an existing name or link is an error
         _unfinished.add(temporary)
         if mode is not None:
             temporary.chmod(mode | (stat.S_IRWXU if folder else stat.S_IRUSR | stat.S_IWUSR))
     try:
-        yield temporary
-        with _changing:
-            if not folder:
-                with temporary.open("rb") as file:
-                    os.fsync(file)
-            if mode is not None:
-                temporary.chmod(mode)
-            temporary.replace(path)
-            _unfinished.discard(temporary)
-    except BaseException:
+        with full_disk_names(path):
+            yield temporary
+    finally:
         _discard(temporary)
+
+
+def replace(temporary: Path, path: str | os.PathLike[str]) -> None:
+    """Rename what `beside` made to `path`, whose permissions it takes."""
+    path = Path(path)
+    with _changing:
+        if path.exists():
+            temporary.chmod(stat.S_IMODE(path.stat().st_mode))
+        temporary.replace(path)
+        _unfinished.discard(temporary)
+
+
+def sync(path: Path) -> None:
+    """Wait until the file is on the disk. OSError where there is no room for it."""
+    with path.open("rb") as file, full_disk_names(path):
+        os.fsync(file)
+
+
+@contextlib.contextmanager
+def full_disk_names(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Within, the error of a full disk, of a quota or of a limit on the size of files names this file."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _FULL and (not error.filename or _TEMPORARY.search(str(error.filename))):
+            error.filename = str(path)
         raise
 
 
@@ -117,8 +151,9 @@ def temporary_folder() -> Iterator[Path]:
 
 def _discard(temporary: Path) -> None:
     with _changing:
-        _remove(temporary)
-        _unfinished.discard(temporary)
+        if temporary in _unfinished:
+            _remove(temporary)
+            _unfinished.discard(temporary)
 
 
 def _remove(temporary: Path) -> None:
@@ -240,3 +275,13 @@ def read_bytes(path: str | os.PathLike[str], most: int) -> bytes:
     if len(content) > most:
         raise ValueError(f"{path}: more than {most} bytes")
     return content
+
+
+def copy(source: str | os.PathLike[str], target: Path, most: int = sys.maxsize) -> str:
+    """Copy a regular file of up to `most` bytes into the file `target`; its SHA-256. Errors as of `opened`."""
+    digest = hashlib.sha256()
+    with opened(source, most) as file, full_disk_names(target), target.open("wb") as copied:
+        while piece := file.read(_PIECE):
+            digest.update(piece)
+            copied.write(piece)
+    return digest.hexdigest()

@@ -58,7 +58,7 @@ def encoded(pixels: Pixels, limit: float = np.inf, scale: float = 1.0) -> dict[s
         share = len(codes) / len(sample) * 4 / 3
         sizes = ((bits, share * len(_deflated(_rounded(sample, bits)))) for bits in ROUNDED)
         bits = next((bits for bits, size in sizes if size <= limit), None)
-        if bits is not None or min(pixels.shape[:2]) <= side:
+        if bits is not None or max(pixels.shape[:2]) <= side:
             break
         side *= 2
         codes = _halves(block_mean(pixels, side), scale)
@@ -87,10 +87,11 @@ def strongest(values: Pixels, width: int) -> Pixels:
     A mean would let two errors cancel and one pixel drown. NaN is stronger than any number.
     """
     side = -(-values.shape[1] // width)
-    pad = [(0, -size % side) for size in values.shape[:2]] + [(0, 0)]
+    rows = min(side, len(values))  # an image of few rows is not filled up to a block of as many as columns
+    pad = [(0, -len(values) % rows), (0, -values.shape[1] % side), (0, 0)]
     height, width, channels = (values := np.pad(values, pad)).shape
-    blocks = values.reshape(height // side, side, width // side, side, channels).swapaxes(1, 2)
-    blocks = blocks.reshape(height // side, width // side, -1)
+    blocks = values.reshape(height // rows, rows, width // side, side, channels).swapaxes(1, 2)
+    blocks = blocks.reshape(height // rows, width // side, -1)
     place = np.where(np.isnan(blocks), np.inf, np.abs(blocks)).argmax(-1, keepdims=True)
     return np.take_along_axis(blocks, place, -1)
 

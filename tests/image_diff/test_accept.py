@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
+import signal
 import sys
+from types import SimpleNamespace
 
 import numpy as np
+import OpenImageIO
 import pytest
 import typer
 from support.diff_images import BROKEN, found, image, tree
+from support.processes import python
 
 from mi_refract.image_diff import accept
 from mi_refract.image_diff import folders as diff
+from mi_refract.image_diff.results import Status
 from mi_refract.image_diff.settings import Entry, Settings
+from mi_refract.io import safe_files
 
 SETTINGS = '[defaults]\naccept = ["no-star.exr", "{stem}-?.exr", "{stem}-*.exr", "{stem}_*.exr"]\n'
 CHANGED = "changed since it was compared"
@@ -100,7 +107,7 @@ def test_a_bad_image_becomes_no_reference_and_a_bad_reference_can_be_replaced(fo
 
 def test_values_that_are_not_finite_become_no_reference(run, folders, tmp_path):
     image(folders[1] / "same.exr", value=np.inf)
-    with pytest.raises(ValueError, match="not finite; to accept them, pass --set allow_nonfinite=true"):
+    with pytest.raises(ValueError, match="not finite; to accept them, compare with --set allow_nonfinite=true"):
         to_accept(*folders)
     assert len(to_accept(*folders, Settings((Entry("same.exr", {"allow_nonfinite": True}),)))) == 3
     for allowed, code in (([], 2), (["--set", "allow_nonfinite=true"], 0)):
@@ -181,15 +188,15 @@ WHILE = {
 @pytest.mark.parametrize("after", [1, 2])
 def test_what_goes_wrong_while_it_is_copied_replaces_nothing(folders, monkeypatch, change, after):
     """After so many of the two copies were begun."""
-    copies, opened, begun = to_accept(*folders), accept.replacing, []
+    copies, copy, begun = to_accept(*folders), safe_files.copy, []
 
-    def late(path):
-        begun.append(path)
+    def late(*paths):
+        begun.append(paths)
         if len(begun) == after:
             change(*folders)
-        return opened(path)
+        return copy(*paths)
 
-    monkeypatch.setattr(accept, "replacing", late)
+    monkeypatch.setattr(safe_files, "copy", late)
     names = tree(folders[0]).keys()
     with pytest.raises(OSError, match=rf"changed\.exr: {CHANGED}|No space"):
         accept.accept(copies)
@@ -209,6 +216,92 @@ def test_only_the_bytes_that_were_compared_are_copied(folders, monkeypatch):
     assert tree(folders[0]) == before
 
 
+def test_what_is_decoded_is_what_has_the_digest(folders, monkeypatch):
+    """Even where the file is another one only while it is decoded."""
+    path = folders[1] / "same.exr"
+    image(folders[1] / "other.exr", gain=3.0)
+    same, other, opened = path.read_bytes(), (folders[1] / "other.exr").read_bytes(), OpenImageIO.ImageInput.open
+
+    def swapped(*words):
+        path.write_bytes(other)
+        source = opened(*words)
+        path.write_bytes(same)
+        return source
+
+    monkeypatch.setattr(OpenImageIO, "ImageInput", SimpleNamespace(open=swapped))
+    (result,) = diff.diff(*folders, to_accept=True, names=["same.exr"]).results
+    assert result.status is Status.EQUAL
+
+
+def test_no_reference_is_written_through_a_link_to_a_folder(run, folders, tmp_path):
+    """A walk does not follow such a link; neither does a name, nor the name of a variant."""
+    old, new = folders
+    image(new / "deep" / "added.exr")
+    (tmp_path / "outside").mkdir()
+    (old / "deep").symlink_to(tmp_path / "outside")
+    (old / "mi-refract.toml").write_text('[defaults]\naccept = ["deep/{stem}-*.exr"]\n')
+    image(new / "same.exr", gain=1.5)
+    for words in (["deep/added.exr"], ["same.exr", "--as-variant", "macos"]):
+        code, said, err = run("accept", old, new, *words, "--yes")
+        assert (code, said.count("→"), err.count("\n")) == (2, 0, 1) and f"outside of {old}, by a link" in err
+    assert not tree(tmp_path / "outside")
+
+
+@pytest.mark.parametrize("count", [2, 12])
+@pytest.mark.parametrize("by_json", [False, True])
+def test_an_error_in_the_middle_says_what_is_replaced_and_the_same_call_finishes(
+    run, tmp_path, monkeypatch, count, by_json
+):
+    old, new, out = tmp_path / "old", tmp_path / "new", tmp_path / "out.json"
+    for i in range(count):
+        image(old / f"{i:02}.exr")
+        image(new / f"{i:02}.exr", gain=2)
+    before, after, replace = tree(old), tree(new), safe_files.replace
+    run("diff", old, new, "--json", out)
+    words = ["accept", *(["--from", out] if by_json else [old, new]), "--yes"]
+
+    def fail(temporary, path):
+        if path.name == "01.exr":
+            raise OSError(30, "Read-only file system", str(path))
+        replace(temporary, path)
+
+    monkeypatch.setattr(safe_files, "replace", fail)
+    code, _, err = run(*words)
+    left = f"{old}/01.exr" if count == 2 else f"{old}/01.exr … {old}/11.exr (11 in the order above)"
+    said = f"replaced: {old}/00.exr; not replaced: {left}; the same command again accepts these"
+    assert (code, err) == (2, f"mi-refract: {old}/01.exr: Read-only file system; {said}\n")
+    assert tree(old) == before | {"00.exr": after["00.exr"]}  # and nothing hidden
+    monkeypatch.undo()
+    assert run(*words)[::2] == (0, "") and tree(old) == after
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_in_the_middle_says_what_is_replaced_and_the_same_call_finishes(tmp_path, number):
+    old, new, count = tmp_path / "old", tmp_path / "new", 60
+    for side, gain in ((old, 1), (new, 2)):
+        image(side / "000.exr", gain=gain, shape=(4, 4, 3))
+        for i in range(1, count):
+            shutil.copy(side / "000.exr", side / f"{i:03}.exr")
+    before, after = tree(old), tree(new)
+    begun = (old / "000.exr").stat().st_ino
+    code = "import sys; from mi_refract.cli import main; sys.exit(main())"
+    with python(code, "accept", old, new, "--yes") as process:
+        while process.poll() is None and (old / "000.exr").stat().st_ino == begun:
+            pass
+        process.send_signal(number)
+        _, said = process.communicate()
+    left = tree(old)
+    done = [name for name in left if left[name] == after[name]]
+    assert left.keys() == before.keys()  # nothing hidden
+    if process.returncode:  # else it was done before the signal came
+        assert process.returncode == 128 + number and said.startswith("mi-refract: interrupted; ")
+        rest = count - len(done)
+        assert said.count("reference") == 1 if rest in (0, count) else f"not replaced: {old}/{len(done):03}.exr" in said
+    with python(code, "accept", old, new, "--yes") as process:
+        process.communicate()
+    assert process.returncode == 0 and tree(old) == after
+
+
 def test_what_cannot_be_read_has_no_digest(folders, tmp_path, monkeypatch):
     """Nobody could say whether it changed. By a planted error: who runs as root may read everything."""
     os.mkfifo(tmp_path / "a.exr")
@@ -216,16 +309,16 @@ def test_what_cannot_be_read_has_no_digest(folders, tmp_path, monkeypatch):
     for path in (tmp_path / "a.exr", tmp_path / "b.exr"):
         with pytest.raises(ValueError, match=r"\.exr: not a regular file"):
             diff.digest(path)
-    digest = diff.digest
+    copy = safe_files.copy
 
-    def refuse(path):
+    def refuse(path, *rest):
         if path == folders[0] / "same.exr":
             raise PermissionError(13, "Permission denied", str(path))
-        return digest(path)
+        return copy(path, *rest)
 
-    monkeypatch.setattr(diff, "digest", refuse)
-    with pytest.raises(ValueError, match=r"same\.exr: Permission denied"):
-        to_accept(*folders)
+    monkeypatch.setattr(safe_files, "copy", refuse)
+    (refused,) = diff.diff(*folders, to_accept=True, names=["same.exr"]).results
+    assert refused.error.endswith("same.exr: Permission denied")
 
 
 def test_accept_asks_first(run, pair, terminal):
@@ -295,7 +388,7 @@ def test_exactly_the_images_of_the_json_are_accepted_here_or_elsewhere(run, comp
 @pytest.mark.parametrize(("side", "name"), [(0, "louder.exr"), (1, "louder.exr"), (0, "inner/added.exr")])
 def test_what_changed_since_the_json_is_refused(run, compared, side, name):
     path = compared[side] / name
-    rewritten(path) if path.exists() else image(path)
+    rewritten(path) if path.exists() else image(path, gain=3.0)
     before = tree(compared[0])
     assert run("accept", "--from", compared[2], "--yes")[::2] == (2, f"mi-refract: {path}: {CHANGED}\n")
     assert tree(compared[0]) == before

@@ -6,6 +6,7 @@ import math
 import random
 import re
 import shlex
+import tracemalloc
 import zlib
 from dataclasses import replace
 
@@ -266,6 +267,17 @@ def test_what_does_not_fit_is_rounded_then_made_smaller_and_the_page_says_so():
     assert (small["width"], small["height"]) == (128, 128) and small["note"].startswith("means of 2 × 2 pixels")
     means = noise.reshape(128, 2, 128, 2, 3).mean((1, 3))
     assert np.allclose(decoded(small["data"]).reshape(128, 128, 3), means, rtol=2.0 ** (max(ROUNDED) - 11), atol=1e-7)
+
+
+@pytest.mark.parametrize("shape", [(1, 2**18, 3), (2**18, 1, 3)])
+def test_a_thin_image_takes_no_more_memory_than_another(shape):
+    noise = RNG.random(shape).astype(np.float32)
+    tracemalloc.start()
+    small = strongest(noise, 960)
+    data = encoded(noise, 100_000)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert small.shape[1] <= 960 and len(data["data"]) <= 105_000 and peak < 12 * noise.nbytes
 
 
 # A full page ------------------------------------------------------------------------------------------------------

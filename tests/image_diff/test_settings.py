@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import tomllib
 from pathlib import Path
@@ -187,6 +188,21 @@ def test_bad_settings(tmp_path, text, message):
     with pytest.raises(ValueError, match=r"^[^\n]*rules\.toml: ") as error:
         settings.load(path)
     assert message in str(error.value)
+
+
+NO_FILES = {
+    "link to nothing": (lambda path: path.symlink_to("nothing"), "No such file or directory"),
+    "pipe": (os.mkfifo, "not a regular file"),
+    "device": (lambda path: path.symlink_to("/dev/zero"), "not a regular file"),
+    "too large": (lambda path: (path.touch(), os.truncate(path, 2**29)), "bytes; expected up to"),
+}
+
+
+@pytest.mark.parametrize(("make", "message"), NO_FILES.values(), ids=NO_FILES)
+def test_settings_that_cannot_be_read_are_one_line(run, pair, make, message):
+    make(pair[0] / "mi-refract.toml")
+    code, out, err = run("diff", *pair)
+    assert (code, out, err.count("\n")) == (2, "", 1) and message in err and "mi-refract.toml: " in err
 
 
 B = '[[image]]\nname = "b"\nreason = "r"\nmethod = "exact"'

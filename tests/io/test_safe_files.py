@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from mi_refract.io import safe_files
+from mi_refract.io.errors import describe
 from mi_refract.io.safe_files import replacing, update_between, write_atomically
 from mi_refract.ray_sets import files, ray_set
 
@@ -32,6 +33,17 @@ def test_a_failed_write_leaves_the_old_file_alone(step, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="disk full"):
         write_atomically(path, "new")
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
+def test_the_error_of_a_full_disk_names_the_file_that_did_not_fit(number, tmp_path, monkeypatch):
+    def full(self, content):
+        raise OSError(number, "full")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError) as error, replacing(tmp_path / "outer"):
+        write_atomically(tmp_path / "file", "new")
+    assert describe(error.value) == f"{tmp_path / 'file'}: full"
 
 
 KINDS = {
