@@ -38,7 +38,8 @@ CODED = re.compile(r"srgb|gamma|^g\d\d")  # colour spaces, in OpenImageIO's word
 LINEAR = re.compile(r"^lin|linear|^aces|^raw$|^data$")
 INTEGERS = ("uint8", "uint16")  # a file of these that names no colour space holds what a display is sent
 DARKER = 4.0  # two stops: where the brightest light is shown nearly white, light twice as bright is, too
-DUST = 2.0**-24  # where the other median is so many times as bright, this one is of rounding errors
+DUST = 2.0**-24  # of the bright light of both images, fireflies apart: what is darker is black with rounding errors
+BRIGHT = 0.999  # the share of pixels that are darker than what counts as bright
 WINDOW, OCTAVES = 0.12, 7  # degrees: the side of the smallest window; how many windows, each twice as wide
 SURFACE = 0.24  # degrees: the side of the window that an error fills
 AROUND = 0.5  # degrees: where black is seen so near to the brightest window, the rest need not be looked at
@@ -124,8 +125,8 @@ def flip_map(reference: Image, test: Image, hdr: bool, ppd: float = PIXELS_PER_D
 
     linear = [_linear(image) for image in (reference, test)]
     light = [pixels @ LUMINANCE for pixels in linear]
-    medians = [float(np.median(x[x > 0])) for x in light if (x > 0).any()]
-    median = min((x for x in medians if x > DUST * max(medians)), default=0.18)
+    black = DUST * max(max(_brightest_line(x), float(np.quantile(x, BRIGHT))) for x in light)
+    median = min((float(np.median(x[x > black])) for x in light if (x > black).any()), default=0.18)
     brightest = max(map(_brightest, light)) or 2.0
     one, two = (oiio.ImageBuf(pixels) for pixels in linear)
     result = oiio.ImageBufAlgo.FLIP_diff(one, two, int(hdr), DARKER * brightest, median, ppd)
@@ -140,11 +141,14 @@ def _brightest(light: Pixels) -> float:
 
     Not the very largest: one firefly would need many exposures at which all else is black.
     """
+    lit = light[light > 0]
+    return max(_brightest_line(light), float(np.quantile(lit, BRIGHT)) if lit.size else 0.0)
+
+
+def _brightest_line(light: Pixels) -> float:
     from scipy.ndimage import rank_filter
 
-    lit = light[light > 0]
-    of_lines = rank_filter(light, -3, 3, mode="constant")
-    return max(float(of_lines.max()), float(np.quantile(lit, 0.999)) if lit.size else 0.0)
+    return float(rank_filter(light, -3, 3, mode="constant").max())
 
 
 def encoding(image: Image) -> str:

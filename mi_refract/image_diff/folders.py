@@ -163,6 +163,8 @@ def _compared(result: Result, results: Results, *, keep: bool, digests: bool) ->
             if decoded is not None:
                 result = replace(result, digests=_digests(result, results.roots, decoded))
         except Exception as error:  # of whatever kind: the other images are still to be compared
+            if safe_files.is_full_disk(error):  # which no image could be copied to
+                raise
             errors.print_traceback(error)
             text = errors.describe(error)
             known = isinstance(error, ValueError | OSError)

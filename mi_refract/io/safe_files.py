@@ -126,13 +126,18 @@ def sync(path: Path) -> None:
         os.fsync(file)
 
 
+def is_full_disk(error: BaseException) -> bool:
+    """Whether this is the error of a full disk, of a quota or of a limit on the size of files."""
+    return isinstance(error, OSError) and error.errno in _FULL
+
+
 @contextlib.contextmanager
 def full_disk_names(path: str | os.PathLike[str]) -> Iterator[None]:
     """Within, the error of a full disk, of a quota or of a limit on the size of files names this file."""
     try:
         yield
     except OSError as error:
-        if error.errno in _FULL and (not error.filename or _TEMPORARY.search(str(error.filename))):
+        if is_full_disk(error) and (not error.filename or _TEMPORARY.search(str(error.filename))):
             error.filename = str(path)
         raise
 

@@ -89,7 +89,7 @@ def rows_of(few, tmp_path):
 # The study -----------------------------------------------------------------------------------------------------
 
 
-def test_right_answers_pass_and_a_small_error_of_the_normal_misses_a_goal(rows_of):
+def test_right_answers_pass_and_a_small_error_of_the_normal_fails(rows_of):
     rows = rows_of()
     assert [(row.case, row.verdict) for row in rows] == [(name, "pass") for name in per_ray.SETS]
     assert all(row.reason == "a program 1.0; total internal reflection: zero" for row in rows)
@@ -99,9 +99,8 @@ def test_right_answers_pass_and_a_small_error_of_the_normal_misses_a_goal(rows_o
     through = {name: exact.transmitted[rays.regime == name].mean() for name in per_ray.SETS}
     assert (through["grazing"], through[TOTAL]) == (1, 0) and through["near-critical"] > 0.9
     assert {row.case for row in rows if per_ray.BACKWARD in row.missed} == {LARGE}
-    off = rows_of("n = n + 2e-15 * np.cross(n, a)")  # within the bound all the same
-    assert {row.verdict for row in off} == {"pass"}
-    assert {row.case for row in off if per_ray.BACKWARD in row.missed} >= {"random", "near-critical", LARGE}
+    off = rows_of("n = n + 2e-15 * np.cross(n, a)")  # within the bound, but out of the plane of incidence
+    assert {row.case for row in off if row.verdict == "fail"} >= {"random", "grazing"}
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
