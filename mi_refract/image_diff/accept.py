@@ -129,7 +129,7 @@ class Acceptance:
             try:
                 for copy, part in zip(self.copies, parts, strict=True):
                     with self._replacing:
-                        safe_files.replace(part, copy.reference)
+                        safe_files.move_into_place(part, copy.reference)
                         self._replaced += 1
             except OSError as error:
                 raise OSError(f"{describe(error)}; {self._state()}") from error

@@ -16,9 +16,8 @@ from typing import Annotated, Any
 import msgspec
 
 from mi_refract.io import safe_files
-from mi_refract.io.safe_files import write_atomically
 from mi_refract.io.typed_table import convert
-from mi_refract.report.row import strict
+from mi_refract.report import documents
 
 from . import pairing
 from .results import FAILED, Result, Results, Status
@@ -35,8 +34,7 @@ Digest = Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$")]
 def write(path: str | Path, results: Results) -> None:
     """Write `as_data` as strict JSON: NaN and the infinities become words. OSError."""
     data = as_data(results)
-    text = json.dumps(strict(data), indent=1, allow_nan=False)
-    write_atomically(path, text + "\n")
+    documents.write_json(path, data)
 
 
 def as_data(results: Results) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from typing import Literal
 from urllib.parse import quote
 
 from mi_refract.io.safe_files import full_disk_names
-from mi_refract.io.text import compact, distinguishable, printable
+from mi_refract.io.text import printable
 
 from .results import FAILED, Result, Results, Status
 
@@ -133,15 +133,13 @@ def write_junit(path: str | Path, results: Results) -> None:
         outcome = "skipped" if result.status is Status.SKIPPED else _outcome(results, result)
         details = [f"warning: {result.warning}"] if result.warning and not outcome else []
         kind, message = _word(result) if outcome in ("failure", "error") else "", why(result) if outcome else ""
+        metrics = []
         if kind:
             commands = {"reproduce": results.reproduce(result), "accept": results.accept(result)}
             details += [f"{verb}: {line}" for verb, line in commands.items() if line]
-            for metric in result.comparison.metrics if result.comparison else ():
-                value, bound = compact(metric.value), ""
-                if metric.bound is not None:
-                    value, bound = distinguishable(metric.value, metric.bound)
-                details.append(f"{metric.name} {value}" + (f" (allowed {bound})" if bound else ""))
-        cases.append(documents.Case(result.method, result.name, outcome, message, details, kind))
+            measured = result.comparison.metrics if result.comparison else ()
+            metrics = [(metric.name, metric.value, metric.bound) for metric in measured]
+        cases.append(documents.Case(result.method, result.name, outcome, message, details, kind, metrics))
     documents.write_junit(path, "mi-refract diff", {str(results.test): cases})
 
 

@@ -87,7 +87,7 @@ def replacing(path: str | os.PathLike[str], suffix: str = "", *, folder: bool = 
         yield temporary
         if not folder:
             sync(temporary)
-        replace(temporary, path)
+        move_into_place(temporary, path)
 
 
 @contextlib.contextmanager
@@ -110,7 +110,7 @@ def beside(path: str | os.PathLike[str], suffix: str = "", *, folder: bool = Fal
         _discard(temporary)
 
 
-def replace(temporary: Path, path: str | os.PathLike[str]) -> None:
+def move_into_place(temporary: Path, path: str | os.PathLike[str]) -> None:
     """Rename what `beside` made to `path`, whose permissions it takes."""
     path = Path(path)
     with _changing:

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mi_refract.io.safe_files import write_atomically
 from mi_refract.io.text import compact, printable
 from mi_refract.regimes import REGIMES
 from mi_refract.report import documents
@@ -198,7 +197,7 @@ def as_data(findings: Findings) -> dict[str, Any]:
 
 def write_json(path: str | Path, findings: Findings) -> None:
     """Write `as_data` as strict JSON: NaN and the infinities become words. OSError where that fails."""
-    write_atomically(path, json.dumps(strict(as_data(findings)), indent=1, allow_nan=False) + "\n")
+    documents.write_json(path, as_data(findings))
 
 
 def write_junit(path: str | Path, findings: Findings, name: str) -> None:

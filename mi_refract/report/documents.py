@@ -1,4 +1,4 @@
-"""Documents: HTML pages that need no network, with style, script and images inlined; and JUnit's XML.
+"""Documents: HTML pages that need no network, with style, script and images inlined; JUnit's XML; and JSON.
 
 Names of files and messages of errors may hold any character: `printable` makes them fit for both.
 """
@@ -6,6 +6,7 @@ Names of files and messages of errors may hold any character: `printable` makes 
 from __future__ import annotations
 
 import functools
+import json
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -15,9 +16,10 @@ from typing import TYPE_CHECKING, Any, Literal
 from xml.etree import ElementTree as xml
 
 from mi_refract.io.safe_files import write_atomically
-from mi_refract.io.text import compact, printable, printable_lines
+from mi_refract.io.text import compact, distinguishable, printable, printable_lines
 
 from .embedded_images import EmbeddedImages
+from .row import strict
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -78,7 +80,8 @@ class Case:
     """One test case; `outcome` "" means that it passed.
 
     `group`: what JUnit calls its class. `kind`: the type of a failure or an error. `message` is one line; `details`
-    are the lines below it, of a case that passed its output.
+    and `metrics`, each a name, a value and the bound that it may reach, are the lines below it, of a case that passed
+    its output.
     """
 
     group: str
@@ -87,6 +90,7 @@ class Case:
     message: str = ""
     details: Sequence[str] = ()
     kind: str = ""
+    metrics: Sequence[tuple[str, float, float | None]] = ()
 
 
 def write_junit(path: str | Path, name: str, suites: Mapping[str, Sequence[Case]]) -> None:
@@ -99,7 +103,9 @@ def write_junit(path: str | Path, name: str, suites: Mapping[str, Sequence[Case]
         suite = xml.SubElement(root, "testsuite", {"name": printable(title)} | _counts(cases))
         for case in cases:
             element = xml.SubElement(suite, "testcase", classname=printable(case.group), name=printable(case.name))
-            details = "\n".join(map(printable, case.details)) or None
+            details = (
+                "\n".join(map(printable, (*case.details, *(_measured(*metric) for metric in case.metrics)))) or None
+            )
             if case.outcome:
                 kind = {"type": printable(case.kind)} if case.kind else {}
                 xml.SubElement(element, case.outcome, kind | {"message": printable(case.message)}).text = details
@@ -111,7 +117,26 @@ def write_junit(path: str | Path, name: str, suites: Mapping[str, Sequence[Case]
     write_atomically(path, document + b"\n")
 
 
+def _measured(name: str, value: float, bound: float | None) -> str:
+    if bound is None:
+        return f"{name} {compact(value)}"
+    text, allowed = distinguishable(value, bound)
+    return f"{name} {text} (allowed {allowed})"
+
+
 def _counts(cases: Sequence[Case]) -> dict[str, str]:
     ends = Counter(case.outcome for case in cases)
     counts = {"failures": ends["failure"], "errors": ends["error"], "skipped": ends["skipped"]}
     return {key: str(count) for key, count in ({"tests": len(cases)} | counts).items()}
+
+
+# JSON ----------------------------------------------------------------------------------------------------------------
+
+
+def write_json(path: str | Path, document: object) -> None:
+    """Write the document as strict JSON: NaN and the infinities become words.
+
+    Errors: TypeError for a value JSON has no form for; OSError.
+    """
+    text = json.dumps(strict(document), indent=1, allow_nan=False)
+    write_atomically(path, text + "\n")

@@ -7,18 +7,16 @@ Everything here lays out what the rows already say; nothing is measured, average
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mi_refract.io.safe_files import write_atomically
 from mi_refract.io.text import distinguishable, printable
 
 from . import documents, study_page
 from .documents import write_page
 from .embedded_images import EmbeddedImages
-from .row import SCHEMA, Row, by_study, strict
+from .row import SCHEMA, Row, by_study
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -29,9 +27,7 @@ def write_json(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]
 
     Errors: TypeError for a value JSON has no form for; OSError.
     """
-    document = {"schema": SCHEMA, "context": context, "rows": [row.as_dict() for row in rows]}
-    text = json.dumps(strict(document), indent=1, allow_nan=False)
-    write_atomically(path, text + "\n")
+    documents.write_json(path, {"schema": SCHEMA, "context": context, "rows": [row.as_dict() for row in rows]})
 
 
 def verdict(rows: Sequence[Row]) -> str:

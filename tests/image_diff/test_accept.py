@@ -256,16 +256,16 @@ def test_an_error_in_the_middle_says_what_is_replaced_and_the_same_call_finishes
     for i in range(count):
         image(old / f"{i:02}.exr")
         image(new / f"{i:02}.exr", gain=2)
-    before, after, replace = tree(old), tree(new), safe_files.replace
+    before, after, rename = tree(old), tree(new), safe_files.move_into_place
     run("diff", old, new, "--json", out)
     words = ["accept", *(["--from", out] if by_json else [old, new]), "--yes"]
 
     def fail(temporary, path):
         if path.name == "01.exr":
             raise OSError(30, "Read-only file system", str(path))
-        replace(temporary, path)
+        rename(temporary, path)
 
-    monkeypatch.setattr(safe_files, "replace", fail)
+    monkeypatch.setattr(safe_files, "move_into_place", fail)
     code, _, err = run(*words)
     left = f"{old}/01.exr" if count == 2 else f"{old}/01.exr … {old}/11.exr (11 in the order above)"
     said = f"replaced: {old}/00.exr; not replaced: {left}; the same command again accepts these"
