@@ -14,6 +14,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import dask
+import distributed
 import pytest
 from distributed import CancelledError
 from distributed.comm import CommClosedError, connect
@@ -63,6 +64,12 @@ def test_misuse(options, message, monkeypatch):
     with pytest.raises((ConnectionError, ValueError)) as caught, connected(**options):
         pass
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_client_is_nobody_elses_default(client):
+    """A program that uses this package and Dask keeps its own."""
+    with pytest.raises(ValueError, match="No clients"):
+        distributed.default_client()
 
 
 def test_a_connection_that_is_not_encrypted_is_refused(client):
