@@ -17,7 +17,7 @@ import msgspec
 
 from mi_refract.io import safe_files
 from mi_refract.io.typed_table import convert
-from mi_refract.report import documents
+from mi_refract.report.row import write_strict_json
 
 from . import pairing
 from .results import FAILED, Result, Results, Status
@@ -34,7 +34,7 @@ Digest = Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$")]
 def write(path: str | Path, results: Results) -> None:
     """Write `as_data` as strict JSON: NaN and the infinities become words. OSError."""
     data = as_data(results)
-    documents.write_json(path, data)
+    write_strict_json(path, data)
 
 
 def as_data(results: Results) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from mi_refract.regimes import REGIMES
 from mi_refract.report import documents
 from mi_refract.report.documents import write_page
 from mi_refract.report.embedded_images import EmbeddedImages
-from mi_refract.report.row import strict
+from mi_refract.report.row import strict, write_strict_json
 
 from .check_answers import Findings, Problem, RegimeErrors
 from .diagnosis import Explanation
@@ -197,7 +197,7 @@ def as_data(findings: Findings) -> dict[str, Any]:
 
 def write_json(path: str | Path, findings: Findings) -> None:
     """Write `as_data` as strict JSON: NaN and the infinities become words. OSError where that fails."""
-    documents.write_json(path, as_data(findings))
+    write_strict_json(path, as_data(findings))
 
 
 def write_junit(path: str | Path, findings: Findings, name: str) -> None:

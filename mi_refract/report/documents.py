@@ -1,4 +1,4 @@
-"""Documents: HTML pages that need no network, with style, script and images inlined; JUnit's XML; and JSON.
+"""Documents: HTML pages that need no network, with style, script and images inlined; and JUnit's XML.
 
 Names of files and messages of errors may hold any character: `printable` makes them fit for both.
 """
@@ -6,7 +6,6 @@ Names of files and messages of errors may hold any character: `printable` makes 
 from __future__ import annotations
 
 import functools
-import json
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -19,7 +18,6 @@ from mi_refract.io.safe_files import write_atomically
 from mi_refract.io.text import compact, distinguishable, printable, printable_lines
 
 from .embedded_images import EmbeddedImages
-from .row import strict
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -128,15 +126,3 @@ def _counts(cases: Sequence[Case]) -> dict[str, str]:
     ends = Counter(case.outcome for case in cases)
     counts = {"failures": ends["failure"], "errors": ends["error"], "skipped": ends["skipped"]}
     return {key: str(count) for key, count in ({"tests": len(cases)} | counts).items()}
-
-
-# JSON ----------------------------------------------------------------------------------------------------------------
-
-
-def write_json(path: str | Path, document: object) -> None:
-    """Write the document as strict JSON: NaN and the infinities become words.
-
-    Errors: TypeError for a value JSON has no form for; OSError.
-    """
-    text = json.dumps(strict(document), indent=1, allow_nan=False)
-    write_atomically(path, text + "\n")

@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mi_refract.io.safe_files import write_atomically
+
 SCHEMA = 1
 
 
@@ -131,6 +133,15 @@ def by_study(rows: Iterable[Row]) -> dict[str, list[Row]]:
 def as_json(rows: Iterable[Row]) -> str:
     """The rows as strict JSON, a list. Errors: TypeError for a value JSON has no form for."""
     return json.dumps(strict([row.as_dict() for row in rows]), indent=1, allow_nan=False)
+
+
+def write_strict_json(path: str | Path, document: object) -> None:
+    """Write the document as JSON: NaN and the infinities become words.
+
+    Errors: TypeError for a value JSON has no form for; OSError.
+    """
+    text = json.dumps(strict(document), indent=1, allow_nan=False)
+    write_atomically(path, text + "\n")
 
 
 def strict(value: object) -> Any:

@@ -16,7 +16,7 @@ from mi_refract.io.text import distinguishable, printable
 from . import documents, study_page
 from .documents import write_page
 from .embedded_images import EmbeddedImages
-from .row import SCHEMA, Row, by_study
+from .row import SCHEMA, Row, by_study, write_strict_json
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -27,7 +27,7 @@ def write_json(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]
 
     Errors: TypeError for a value JSON has no form for; OSError.
     """
-    documents.write_json(path, {"schema": SCHEMA, "context": context, "rows": [row.as_dict() for row in rows]})
+    write_strict_json(path, {"schema": SCHEMA, "context": context, "rows": [row.as_dict() for row in rows]})
 
 
 def verdict(rows: Sequence[Row]) -> str:
