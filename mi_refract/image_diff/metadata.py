@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from mi_refract.io import image_headers
 from mi_refract.io.image_file import Image
 
 from .name_patterns import matches
@@ -19,8 +20,25 @@ from .name_patterns import matches
 SPACE, ALPHA = "oiio:ColorSpace", "oiio:UnassociatedAlpha"
 CODED = ("uint8", "uint16")  # types of numbers that are sRGB codes where no colour space is named; others are linear
 SPACES = {"srgb": "srgb_rec709_scene", "linear": "lin_rec709_scene", "rec709": ""}  # OpenImageIO says that of any PNM
+SPACES["g22_rec709_scene"] = "srgb_rec709_scene"  # a gAMA of 45455, by which PNG writers mean sRGB
+REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06)
 # What says the same as nothing.
-USUAL = {"screenWindowCenter": "(0.0, 0.0)", "screenWindowWidth": "1.0", "Exif:ColorSpace": "1"}
+USUAL = {
+    "screenWindowCenter": ["(0.0, 0.0)"],
+    "screenWindowWidth": ["1.0"],
+    "Exif:ColorSpace": ["1"],
+    "CICP": ["(1, 13, 0, 1)"],
+    "oiio:Gamma": [str(float(np.float32(2.2)))],
+    "chromaticities": [str(tuple(np.float32((*REC709, 0.3127, 0.329)).tolist()))],
+    "hdr:EXPOSURE": ["1.0"],
+    "hdr:GAMMA": ["1.0"],
+    "hdr:COLORCORR": ["1.0 1.0 1.0"],
+    "hdr:NCOMP": ["3.0"],
+    # Radiance's own, and what Photoshop writes.
+    "hdr:PRIMARIES": ["0.64 0.33 0.29 0.6 0.15 0.06 0.333 0.333", "0.0 0.0 0.0 0.0 0.0 0.0 0.0 0.0"],
+    "tiff:318": ["0.3127 0.329"],
+    "tiff:319": [" ".join(map(str, REC709))],
+}
 SHOWN = 60  # characters of a value
 
 # Patterns of names, which the README lists: by whom, when and how fast a file was made, how its numbers are packed,
@@ -29,12 +47,13 @@ WITHOUT_MEANING = """
 Artist Copyright Date DateTime DocumentName Exif:* File GPS:* HostComputer Hostname IPTC:* ImageDescription Make Memory
 Model RenderTime Software Time cycles.* dc:* generatedBy hdr:CAPDATE hdr:GMT hdr:SOFTWARE mi_refract:* photoshop:*
 thumbnail_* tiff:XMLPacket xmp:* xmpMM:*
+BlenderMultiChannel Camera Frame FrameRange Lens Marker Note Scene Strip aux:* crs:* png:text:*
 CompressionQuality bmp:version compression gif:Interlacing jpeg:subsampling oiio:BitsPerSample oiio:RowsPerChunk
 openexr:chunkCount openexr:dwaCompressionLevel openexr:levelmode openexr:lineOrder openexr:roundingmode planarconfig
 png:iDOT pnm:bigendian pnm:binary targa:version tiff:BitsPerSample tiff:Compression tiff:PlanarConfiguration
 tiff:Predictor tiff:RowsPerStrip tiff:zipquality
 ICCProfile:* hdr:exposure name oiio:AverageColor oiio:ConstantColor oiio:SHA-1 oiio:subimages tiff:ColorSpace
-tiff:PageNumber tiff:PhotometricInterpretation tiff:UnassociatedAlpha tiff:subfiletype
+colorInteropID tiff:PageNumber tiff:PhotometricInterpretation tiff:UnassociatedAlpha tiff:subfiletype
 Orientation PixelAspectRatio ResolutionUnit XResolution YResolution
 """
 COMPARED = ("Exif:ColorSpace", "Exif:Gamma")  # of those
@@ -61,10 +80,13 @@ def _said(image: Image, ignored: tuple[str, ...]) -> dict[str, str]:
     """What the file says, as text by name, without what says the same as nothing."""
     space = str(image.metadata.get(SPACE, "")).lower()
     space = SPACES.get(space, space) or ("srgb_rec709_scene" if image.stored in CODED else "lin_rec709_scene")
-    said = {name: _text(value) for name, value in image.metadata.items()} | {SPACE: space}
+    texts = {name.removeprefix(image_headers.TEXT) for name in image.metadata if name.startswith(image_headers.TEXT)}
+    said = {name: _text(value) for name, value in image.metadata.items() if name not in texts} | {SPACE: space}
     if any(name.rpartition(".")[2] == "A" for name in image.channels):
         said.setdefault(ALPHA, "0")
-    return {name: text for name, text in said.items() if text != USUAL.get(name) and not _is_ignored(name, ignored)}
+    return {
+        name: text for name, text in said.items() if text not in USUAL.get(name, ()) and not _is_ignored(name, ignored)
+    }
 
 
 def _text(value: Any) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import struct
 from collections.abc import Iterator
@@ -14,15 +15,15 @@ from .errors import ImageError
 EXR, PNG, JPEG = b"\x76\x2f\x31\x01", b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 ATTRIBUTES = 4096  # of an EXR file
 # Chunks of a PNG file that OpenImageIO reads, or that do not concern the numbers.
-CHUNKS = (
-    b"IHDR PLTE IDAT IEND tRNS gAMA sRGB cICP iCCP tEXt zTXt iTXt tIME pHYs oFFs eXIf bKGD hIST sBIT sPLT mDCV".split()
-)
+CHUNKS = b"IHDR PLTE IDAT IEND tRNS gAMA sRGB cICP iCCP tIME pHYs oFFs eXIf bKGD hIST sBIT sPLT mDCV".split()
+TEXTS, TEXT = (b"tEXt", b"zTXt", b"iTXt"), "png:text:"
 SRGB = struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000)  # cHRM: the same as none
 # Tags of a TIFF file that OpenImageIO reads, or that say where the pixels are.
 TAGS = {*range(254, 290), 292, 293, 296, 297, 305, 306, *range(315, 318), 320, *range(322, 326), 330, 332, 333, 334}
 TAGS |= {338, 339, 347, *range(512, 522), 529, 530, 531, 700, *range(33300, 33307), 33432, 33723, 34377, 34665, 34675}
 TAGS |= {32995, 32997, 34853}
 SIZES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}  # bytes by type; others: 1
+FRACTION = 5
 PSD = (4, 7, 8)  # of Photoshop's colour modes CMYK, multichannel, duotone
 REFUSED = {
     "png:acTL": "an animated PNG; expected a single image",
@@ -59,8 +60,10 @@ def _text(file: BinaryIO) -> bytes:
 def hidden_metadata(path: Path) -> dict[str, bytes | float]:
     """What the file says of its numbers and OpenImageIO does not hand over: "png:cHRM", "tiff:301", "hdr:COLORCORR".
 
-    Values are as they are in the file. Radiance's PIXASPECT is "PixelAspectRatio", as in other formats. ValueError for
-    a file of several images of which OpenImageIO reads the first alone, and for colours that it converts with loss.
+    Values are as they are in the file, but for numbers of HDR files and fractions of TIFF files: "1.0 0.3127". That
+    OpenImageIO hands over the text "Comment" of a PNG file is "png:text:Comment", without a value. Radiance's PIXASPECT
+    is "PixelAspectRatio", as in other formats. ValueError for a file of several images of which OpenImageIO reads the
+    first alone, and for colours that it converts with loss.
     """
     size = path.stat().st_size
     said: dict[str, list[bytes]] = {}
@@ -87,7 +90,9 @@ def _png(file: BinaryIO, size: int) -> Iterator[tuple[str, bytes]]:
     while True:
         length, chunk = struct.unpack(">I4s", file.read(8))
         after = file.tell() + length + 4
-        if chunk not in CHUNKS and (data := file.read(min(length, size))) != SRGB:
+        if chunk in TEXTS:
+            yield TEXT + file.read(min(length, 80)).partition(b"\0")[0].decode("latin-1"), b""
+        elif chunk not in CHUNKS and (data := file.read(min(length, size))) != SRGB:
             yield f"png:{chunk.decode('latin-1')}", data
         file.seek(after)
 
@@ -108,10 +113,13 @@ def _jpeg(file: BinaryIO, size: int) -> Iterator[tuple[str, bytes]]:
 
 def _hdr(file: BinaryIO, size: int) -> Iterator[tuple[str, bytes]]:
     file.seek(0)
-    while line := file.readline(size).strip():
+    while (line := file.readline(size)).strip():
         name, equals, value = line.partition(b"=")
-        if equals and name.strip() != b"FORMAT":
-            yield f"hdr:{name.strip().decode('latin-1')}", value.strip()
+        # All else is a comment, or a command that made the file, of this image or of one that went into it.
+        if equals and name.isalnum() and name != b"FORMAT":
+            with contextlib.suppress(ValueError):
+                value = b" ".join(str(float(word)).encode() for word in value.split())
+            yield f"hdr:{name.decode('latin-1')}", value.strip()
 
 
 def _tiff(file: BinaryIO, size: int) -> Iterator[tuple[str, bytes]]:
@@ -139,7 +147,11 @@ def _tiff(file: BinaryIO, size: int) -> Iterator[tuple[str, bytes]]:
             if tag not in TAGS:
                 if length > inline:
                     file.seek(unpack(offset)[0])
-                yield f"tiff:{tag}{place}", file.read(length)
+                value = file.read(length)
+                if kind == FRACTION:
+                    pairs = struct.iter_unpack(f"{order}II", value)
+                    value = " ".join(f"{x / (y or math.nan):.6g}" for x, y in pairs).encode()
+                yield f"tiff:{tag}{place}", value
         file.seek(first + entries * entry)
 
 

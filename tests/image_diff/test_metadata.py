@@ -206,6 +206,36 @@ def test_what_a_format_says_in_other_words_is_no_difference(tmp_path, ending):
     assert result.status == "equal", result.reason
 
 
+SRGB = (*D65, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06)
+SAME = {  # as nothing, or as the first of two
+    "ImageMagick.png": (png, [(b"gAMA", per_100000(1 / 2.2)), (b"cHRM", per_100000(*SRGB))]),
+    "CICP.png": (png, [(b"cICP", bytes([1, 13, 0, 1]))]),
+    "texts.png": (png, [(b"tEXt", b"generated_by\0Mitsuba"), (b"zTXt", b"date:create\0\0" + zlib.compress(b"now"))]),
+    "Blender.exr": (exr, [{"Frame": "001", "Camera": "Camera", "BlenderMultiChannel": "Blender V2.55.1 and newer"}]),
+    "OpenImageIO.exr": (exr, [{"oiio:ColorSpace": "lin_rec709_scene", "chromaticities": (*SRGB[2:], *D65)}]),
+    "Photoshop.hdr": (hdr, ["# a=b", "GAMMA=1", "PRIMARIES=0 0 0 0 0 0 0 0"]),
+    "stb.hdr": (hdr, ["EXPOSURE=          1.0000000000000"]),
+    "Radiance.hdr": (hdr, ["pcomb -e 'ro=ri(1)'", "\tEXPOSURE=2", "COLORCORR= 1 1 1", "NCOMP=3"]),
+    "exposure.hdr": (hdr, ["EXPOSURE=2"], ["EXPOSURE=2.0"]),
+    "ImageMagick.tif": (
+        tiff,
+        [{318: (5, [3127, 10000, 329, 1000]), 319: (5, [16, 25, 33, 100, 3, 10, 3, 5, 3, 20, 3, 50])}],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SAME)
+def test_what_programs_say_of_usual_images_is_no_difference(tmp_path, name):
+    write, *said = SAME[name]
+    if len(said) == 1:
+        said.insert(0, [{}] if write in (exr, tiff) else [])
+    paths = [tmp_path / f"{side}{name}" for side in "ab"]
+    for path, given in zip(paths, said, strict=True):
+        write(path, *given)
+    (result,) = folders.diff(*paths, Settings.for_all(method="exact")).results
+    assert result.status == "equal", result.reason
+
+
 def test_an_alpha_that_one_image_lacks_is_a_channel_and_no_metadata(tmp_path):
     paths = [tmp_path / "a.png", tmp_path / "b.png"]
     for path, mode in zip(paths, ("RGB", "RGBA"), strict=True):

@@ -78,7 +78,7 @@ def found(results):
 # Files that OpenImageIO does not write --------------------------------------------------------------------------------
 
 
-TIFF_TYPES = {1: "B", 2: "B", 3: "H", 4: "I", 7: "B", 12: "d"}
+TIFF_TYPES = {1: "B", 2: "B", 3: "H", 4: "I", 5: "I", 7: "B", 12: "d"}
 
 
 def tiff(path, pixels, tags=None):
@@ -96,7 +96,9 @@ def tiff(path, pixels, tags=None):
         long = len(values[tag]) > 4
         value = struct.pack("<I", at + len(behind)) if long else values[tag].ljust(4, b"\0")
         behind += values[tag] if long else b""
-        directory += struct.pack("<HHI", tag, entries[tag][0], len(entries[tag][1])) + value
+        directory += (
+            struct.pack("<HHI", tag, entries[tag][0], len(entries[tag][1]) // (1 + (entries[tag][0] == 5))) + value
+        )
     path.write_bytes(b"II*\0" + struct.pack("<I", 8) + directory + bytes(4) + behind + data)
     return path
 
