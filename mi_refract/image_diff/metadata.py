@@ -29,7 +29,7 @@ USUAL = {
     "Exif:ColorSpace": ["1"],
     "CICP": ["(1, 13, 0, 1)"],
     "oiio:Gamma": [str(float(np.float32(2.2)))],
-    "chromaticities": [str(tuple(np.float32((*REC709, 0.3127, 0.329)).tolist()))],
+    "chromaticities": [str(tuple(float(np.float32(x)) for x in (*REC709, 0.3127, 0.329)))],
     "hdr:EXPOSURE": ["1.0"],
     "hdr:GAMMA": ["1.0"],
     "hdr:COLORCORR": ["1.0 1.0 1.0"],
