@@ -16,7 +16,7 @@ probability summation (Robson and Graham, Vision Research 21, 1981). `patch_erro
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -124,11 +124,8 @@ def flip_map(reference: Image, test: Image, hdr: bool, ppd: float = PIXELS_PER_D
     import OpenImageIO as oiio
 
     linear = [_linear(image) for image in (reference, test)]
-    light = [pixels @ LUMINANCE for pixels in linear]
-    black = DUST * max(max(_brightest_line(x), float(np.quantile(x, BRIGHT))) for x in light)
-    median = min((float(np.median(x[x > black])) for x in light if (x > black).any()), default=0.18)
-    brightest = max(map(_brightest, light)) or 2.0
     one, two = (oiio.ImageBuf(pixels) for pixels in linear)
+    brightest, median = _luminances(linear) if hdr else (0.0, 0.0)
     result = oiio.ImageBufAlgo.FLIP_diff(one, two, int(hdr), DARKER * brightest, median, ppd)
     if result.has_error:
         raise ValueError(f"{test.path}: FLIP: {result.geterror()}")
@@ -136,19 +133,20 @@ def flip_map(reference: Image, test: Image, hdr: bool, ppd: float = PIXELS_PER_D
     return error
 
 
-def _brightest(light: Pixels) -> float:
-    """The luminance of a thousandth of the pixels that are not black, or of the brightest line of three pixels.
+def _luminances(images: Sequence[Pixels]) -> tuple[float, float]:
+    """The brightest and the median luminance of two images.
 
+    The brightest is that of a thousandth of the pixels that are not black, or of the brightest line of three pixels.
     Not the very largest: one firefly would need many exposures at which all else is black.
     """
-    lit = light[light > 0]
-    return max(_brightest_line(light), float(np.quantile(lit, BRIGHT)) if lit.size else 0.0)
-
-
-def _brightest_line(light: Pixels) -> float:
     from scipy.ndimage import rank_filter
 
-    return float(rank_filter(light, -3, 3, mode="constant").max())
+    light = [pixels @ LUMINANCE for pixels in images]
+    line = max(float(rank_filter(x, -3, 3, mode="constant").max()) for x in light)
+    black = DUST * max(line, *(float(np.quantile(x, BRIGHT)) for x in light))
+    median = min((float(np.median(x[x > black])) for x in light if (x > black).any()), default=0.18)
+    lit = [x[x > 0] for x in light if (x > 0).any()]
+    return max(line, *(float(np.quantile(x, BRIGHT)) for x in lit), 0.0) or 2.0, median
 
 
 def encoding(image: Image) -> str:
