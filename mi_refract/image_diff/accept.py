@@ -93,11 +93,6 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
                 yield copy
 
 
-def accept(copies: Sequence[Copy]) -> None:
-    """As `Acceptance.run`."""
-    Acceptance(copies).run()
-
-
 class Acceptance:
     """Copies new images over their references: exactly the bytes that were compared, if the references are those, too.
 

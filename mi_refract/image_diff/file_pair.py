@@ -24,7 +24,6 @@ from .comparison import Comparison, Verdict
 from .results import Result, Status
 from .settings import ComparisonSpec, Rectangle
 
-WORST = (Verdict.DIFFERENT, Verdict.INCONCLUSIVE, Verdict.EQUAL)
 THREADS = 8
 WHITE = 0.5  # of a mask's largest colour: from there on a pixel counts
 MOST = 0.5  # share of the pixels that a mask may leave out without a warning
@@ -70,9 +69,8 @@ def compare(
 ) -> Result:
     """The result with the verdict on the images of both sides, as `result.how` says, and with images and maps.
 
-    `path`: of the reference, `roots`: the folders, `read`: for variances.
-    ValueError or OSError where a mask or a variance is missing or does
-    not fit, and as `methods.compare`, with the place of the image.
+    `path`: of the reference, `roots`: the folders, `read`: for variances. ValueError or OSError where a mask or a
+    variance is missing or does not fit, and as `methods.compare`, with the place of the image.
     """
     how = result.how
     bare = [channels.without_variances(images[0]) for images in sides]
@@ -130,7 +128,7 @@ def _compare_parts(
             compared[part] = methods.compare(how.method, [one[part]], [two[part]], named=named, **how.options)
         except ValueError as error:
             raise ValueError(f"{error} ({place})" if place else str(error)) from None
-    shown = min(compared, key=lambda part: WORST.index(compared[part].verdict))
+    shown = min(compared, key=lambda part: [*Verdict].index(compared[part].verdict))
     worst, reason = compared[shown], compared[shown].reason
     if places[shown]:
         alike = sum(comparison.verdict is worst.verdict for comparison in compared.values())

@@ -47,14 +47,14 @@ WITHOUT_MEANING = """
 Artist Copyright Date DateTime DocumentName Exif:* File GPS:* HostComputer Hostname IPTC:* ImageDescription Make Memory
 Model RenderTime Software Time cycles.* dc:* generatedBy hdr:CAPDATE hdr:GMT hdr:SOFTWARE mi_refract:* photoshop:*
 thumbnail_* tiff:XMLPacket xmp:* xmpMM:*
-BlenderMultiChannel Camera Frame FrameRange Lens Marker Note Scene Strip aux:* crs:* png:text:*
-CompressionQuality bmp:version compression gif:Interlacing jpeg:subsampling oiio:BitsPerSample oiio:RowsPerChunk
+BlenderMultiChannel Camera ExposureTime FNumber Frame FrameRange Lens Marker Note Scene Strip aux:* crs:* png:text:*
+CompressionQuality FramesPerSecond bmp:version compression gif:* jpeg:subsampling oiio:BitsPerSample oiio:RowsPerChunk
 openexr:chunkCount openexr:dwaCompressionLevel openexr:levelmode openexr:lineOrder openexr:roundingmode planarconfig
 png:iDOT pnm:bigendian pnm:binary targa:version tiff:BitsPerSample tiff:Compression tiff:PlanarConfiguration
 tiff:Predictor tiff:RowsPerStrip tiff:zipquality
-ICCProfile:* hdr:exposure name oiio:AverageColor oiio:ConstantColor oiio:SHA-1 oiio:subimages tiff:ColorSpace
-colorInteropID tiff:PageNumber tiff:PhotometricInterpretation tiff:UnassociatedAlpha tiff:subfiletype
-Orientation PixelAspectRatio ResolutionUnit XResolution YResolution
+ICCProfile:* hdr:exposure name oiio:AverageColor oiio:ConstantColor oiio:LoopCount oiio:Movie oiio:SHA-1
+oiio:subimages tiff:ColorSpace colorInteropID tiff:PageNumber tiff:PhotometricInterpretation tiff:UnassociatedAlpha
+tiff:subfiletype Orientation PixelAspectRatio ResolutionUnit XResolution YResolution
 """
 COMPARED = ("Exif:ColorSpace", "Exif:Gamma")  # of those
 

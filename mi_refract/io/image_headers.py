@@ -21,7 +21,7 @@ SRGB = struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000)
 # Tags of a TIFF file that OpenImageIO reads, or that say where the pixels are.
 TAGS = {*range(254, 290), 292, 293, 296, 297, 305, 306, *range(315, 318), 320, *range(322, 326), 330, 332, 333, 334}
 TAGS |= {338, 339, 347, *range(512, 522), 529, 530, 531, 700, *range(33300, 33307), 33432, 33723, 34377, 34665, 34675}
-TAGS |= {32995, 32997, 34853}
+TAGS |= {18246, 18249, 32995, 32997, 34853, 37724, *range(40091, 40096)}
 SIZES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}  # bytes by type; others: 1
 FRACTION = 5
 PSD = (4, 7, 8)  # of Photoshop's colour modes CMYK, multichannel, duotone

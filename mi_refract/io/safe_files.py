@@ -92,7 +92,7 @@ def replacing(path: str | os.PathLike[str], suffix: str = "", *, folder: bool = 
 
 @contextlib.contextmanager
 def beside(path: str | os.PathLike[str], suffix: str = "", *, folder: bool = False) -> Iterator[Path]:
-    """As `replacing`, but what `replace` has not renamed is removed at the end."""
+    """As `replacing`, but only `move_into_place` renames it, and what it has not renamed is removed at the end."""
     path = Path(path)
     if not folder:
         _require_file(path)

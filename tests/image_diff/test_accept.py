@@ -79,11 +79,11 @@ def test_what_is_not_equal_is_copied_and_what_was_removed_is_kept(run, folders, 
 
 def test_a_reference_that_is_not_there_yet(folders, tmp_path):
     new = folders[1]
-    accept.accept(to_accept(tmp_path / "first", new))
+    accept.Acceptance(to_accept(tmp_path / "first", new)).run()
     assert diff.diff(tmp_path / "first", new).exit_code == 0
     assert not (tmp_path / "first" / "notes.txt").exists()
     one = tmp_path / "deep" / "one.exr"
-    accept.accept(to_accept(one, new / "same.exr"))
+    accept.Acceptance(to_accept(one, new / "same.exr")).run()
     assert one.read_bytes() == (new / "same.exr").read_bytes()
     for name in ("ref.png", "folder"):
         with pytest.raises(ValueError, match=r"expected a name that ends in \.exr"):
@@ -173,7 +173,7 @@ def test_what_changed_since_it_was_compared_is_not_accepted(folders, tmp_path, n
     change(old, new)
     before, all_before = tree(old), sorted(old.rglob("*"))
     with pytest.raises((OSError, ValueError), match=f"{name}('?$|: {CHANGED}|: not a regular file)"):
-        accept.accept(copies)
+        accept.Acceptance(copies).run()
     assert (tree(old), sorted(old.rglob("*"))) == (before, all_before)
 
 
@@ -199,7 +199,7 @@ def test_what_goes_wrong_while_it_is_copied_replaces_nothing(folders, monkeypatc
     monkeypatch.setattr(safe_files, "copy", late)
     names = tree(folders[0]).keys()
     with pytest.raises(OSError, match=rf"changed\.exr: {CHANGED}|No space"):
-        accept.accept(copies)
+        accept.Acceptance(copies).run()
     after_it = tree(folders[0])
     assert after_it.keys() == names
     assert after_it["inner/changed.exr"] != tree(folders[1])["inner/changed.exr"]
@@ -212,7 +212,7 @@ def test_only_the_bytes_that_were_compared_are_copied(folders, monkeypatch):
     monkeypatch.setattr(accept, "digest", lambda path: kept.get(path) or digest(path))
     rewritten(folders[1] / "inner/changed.exr")
     with pytest.raises(OSError, match=rf"changed\.exr: {CHANGED}"):
-        accept.accept(copies)
+        accept.Acceptance(copies).run()
     assert tree(folders[0]) == before
 
 

@@ -127,7 +127,7 @@ def test_a_file_of_several_parts_can_be_accepted(tmp_path):
     for side, images in ((old, SMALL), (new, with_change(SMALL, 2))):
         side.mkdir()
         parts(side / "a.exr", images)
-    accept.accept(list(accept.changes(folders.diff(old, new, to_accept=True))))
+    accept.Acceptance(list(accept.changes(folders.diff(old, new, to_accept=True)))).run()
     assert folders.diff(old, new).exit_code == 0
     parts(new / "a.exr", with_change(SMALL, 2, np.nan))
     with pytest.raises(ValueError, match="values that are not finite"):

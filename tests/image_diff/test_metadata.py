@@ -11,6 +11,7 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image as Pillow
 from PIL import ImageCms
+from PIL.TiffImagePlugin import IFDRational
 from support.diff_images import exr_of_integers
 from support.diff_images import tiff as write_tiff
 
@@ -211,6 +212,7 @@ SAME = {  # as nothing, or as the first of two
     "ImageMagick.png": (png, [(b"gAMA", per_100000(1 / 2.2)), (b"cHRM", per_100000(*SRGB))]),
     "CICP.png": (png, [(b"cICP", bytes([1, 13, 0, 1]))]),
     "texts.png": (png, [(b"tEXt", b"generated_by\0Mitsuba"), (b"zTXt", b"date:create\0\0" + zlib.compress(b"now"))]),
+    "camera.jpg": (jpeg, {}, {"exif": exif(33434, IFDRational(1, 100), True)}),
     "Blender.exr": (exr, [{"Frame": "001", "Camera": "Camera", "BlenderMultiChannel": "Blender V2.55.1 and newer"}]),
     "OpenImageIO.exr": (exr, [{"oiio:ColorSpace": "lin_rec709_scene", "chromaticities": (*SRGB[2:], *D65)}]),
     "Photoshop.hdr": (hdr, ["# a=b", "GAMMA=1", "PRIMARIES=0 0 0 0 0 0 0 0"]),
@@ -231,7 +233,7 @@ def test_what_programs_say_of_usual_images_is_no_difference(tmp_path, name):
         said.insert(0, [{}] if write in (exr, tiff) else [])
     paths = [tmp_path / f"{side}{name}" for side in "ab"]
     for path, given in zip(paths, said, strict=True):
-        write(path, *given)
+        write(path, **given) if isinstance(given, dict) else write(path, *given)
     (result,) = folders.diff(*paths, Settings.for_all(method="exact")).results
     assert result.status == "equal", result.reason
 

@@ -166,8 +166,8 @@ def test_a_variance_is_accepted_with_its_image(pair):
     written(new / "a.exr", beside(drawn))
     (new / "a.exr").write_bytes(before)  # a header holds the time
     with pytest.raises(OSError, match=r"new/a_var\.exr: changed since it was compared"):  # nobody has compared it
-        accept.accept(list(accept.changes(compared)))
-    accept.accept(list(accept.changes(folders.diff(old, new, how, to_accept=True))))
+        accept.Acceptance(list(accept.changes(compared))).run()
+    accept.Acceptance(list(accept.changes(folders.diff(old, new, how, to_accept=True)))).run()
     for name in ("a.exr", "a_var.exr"):
         assert (old / name).read_bytes() == (new / name).read_bytes()
 
@@ -403,7 +403,7 @@ def test_welch_is_chosen_and_reports_and_settings_say_so(films, tmp_path):
     assert named == {"off.exr": "exact", "same.exr": f"welch ({BOTH})"}
     copies = list(accept.changes(results))
     assert [copy.reference.name for copy in copies] == ["off.exr"]
-    accept.accept(copies)
+    accept.Acceptance(copies).run()
     assert {x.status for x in folders.diff(*films).results} == {Status.EQUAL}
 
 
