@@ -48,6 +48,7 @@ Artist Copyright Date DateTime DocumentName Exif:* File GPS:* HostComputer Hostn
 Model RenderTime Software Time cycles.* dc:* generatedBy hdr:CAPDATE hdr:GMT hdr:SOFTWARE mi_refract:* photoshop:*
 thumbnail_* tiff:XMLPacket xmp:* xmpMM:*
 BlenderMultiChannel Camera ExposureTime FNumber Frame FrameRange Lens Marker Note Scene Strip aux:* crs:* png:text:*
+MSE estimatedVariance husk:* renderTimeSeconds samplesPerPixel vrayInfo/*
 CompressionQuality FramesPerSecond bmp:version compression gif:* jpeg:subsampling oiio:BitsPerSample oiio:RowsPerChunk
 openexr:chunkCount openexr:dwaCompressionLevel openexr:levelmode openexr:lineOrder openexr:roundingmode planarconfig
 png:iDOT pnm:bigendian pnm:binary targa:version tiff:BitsPerSample tiff:Compression tiff:PlanarConfiguration

@@ -214,6 +214,7 @@ SAME = {  # as nothing, or as the first of two
     "texts.png": (png, [(b"tEXt", b"generated_by\0Mitsuba"), (b"zTXt", b"date:create\0\0" + zlib.compress(b"now"))]),
     "camera.jpg": (jpeg, {}, {"exif": exif(33434, IFDRational(1, 100), True)}),
     "Blender.exr": (exr, [{"Frame": "001", "Camera": "Camera", "BlenderMultiChannel": "Blender V2.55.1 and newer"}]),
+    "pbrt.exr": (exr, *([{"renderTimeSeconds": time, "samplesPerPixel": 16}] for time in (1.5, 1.6))),
     "OpenImageIO.exr": (exr, [{"oiio:ColorSpace": "lin_rec709_scene", "chromaticities": (*SRGB[2:], *D65)}]),
     "Photoshop.hdr": (hdr, ["# a=b", "GAMMA=1", "PRIMARIES=0 0 0 0 0 0 0 0"]),
     "stb.hdr": (hdr, ["EXPOSURE=          1.0000000000000"]),
