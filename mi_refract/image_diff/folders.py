@@ -153,10 +153,10 @@ def _compared(result: Result, results: Results, *, keep: bool, digests: bool) ->
         except Exception as error:  # of whatever kind: it is raised where the images are compared
             return error
 
+    if how.skip and not how.error:
+        return replace(result, error="", status=Status.SKIPPED)
     if result.error:
         result = replace(result, status=Status.ERROR)
-    elif how.skip:
-        return replace(result, status=Status.SKIPPED)
     else:
         try:
             result = _judged(result, results.roots, read, functools.partial(image_file.read, digests=decoded))

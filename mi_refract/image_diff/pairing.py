@@ -20,7 +20,7 @@ from .settings import ComparisonSpec, Map, Settings
 HIDDEN = ComparisonSpec(skip=True, reason="hidden: a name in its path begins with a dot")
 # Endings of images that OpenImageIO, as it is on PyPI, cannot read.
 UNREADABLE = {"arw", "astc", "avif", "cr2", "cr3", "dcm", "dng", "flif", "heic", "heif", "hif", "jxr", "ktx", "ktx2"}
-UNREADABLE |= {"nef", "pcx", "qoi", "raf", "svg", "xcf"}
+UNREADABLE |= {"nef", "pcx", "qoi", "raf", "xcf"}
 ROOT = "{root}/"  # before a template of a path that is not beside the reference
 
 
@@ -82,7 +82,8 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
     found = [pair for pair in found if pair.test or pair.target not in taken]
     if not found and not lost and not missed:
         raise ValueError(f"defaults.map fits no image in {reference} and {test}; expected templates of their paths")
-    found += [_pair(name, None, None, reference / name, error) for name, error in lost + missed]
+    unread = (_pair(name, None, None, reference / name, error) for name, error in lost + missed)
+    found += [replace(pair, how=settings.of(pair.name)) for pair in unread]
     skipped = (_pair(name, None, None, reference / name) for name in sorted({*concealed, *hidden}))
     return [*found, *(replace(pair, how=HIDDEN) for pair in skipped)]
 
