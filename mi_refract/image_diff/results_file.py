@@ -33,8 +33,7 @@ Digest = Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$")]
 
 def write(path: str | Path, results: Results) -> None:
     """Write `as_data` as strict JSON: NaN and the infinities become words. OSError."""
-    data = as_data(results)
-    write_strict_json(path, data)
+    write_strict_json(path, as_data(results))
 
 
 def as_data(results: Results) -> dict[str, Any]:

@@ -101,9 +101,8 @@ def write_junit(path: str | Path, name: str, suites: Mapping[str, Sequence[Case]
         suite = xml.SubElement(root, "testsuite", {"name": printable(title)} | _counts(cases))
         for case in cases:
             element = xml.SubElement(suite, "testcase", classname=printable(case.group), name=printable(case.name))
-            details = (
-                "\n".join(map(printable, (*case.details, *(_measured(*metric) for metric in case.metrics)))) or None
-            )
+            lines = [*case.details, *(_measured(*metric) for metric in case.metrics)]
+            details = "\n".join(map(printable, lines)) or None
             if case.outcome:
                 kind = {"type": printable(case.kind)} if case.kind else {}
                 xml.SubElement(element, case.outcome, kind | {"message": printable(case.message)}).text = details
