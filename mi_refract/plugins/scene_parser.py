@@ -119,9 +119,11 @@ class ParsedScene:
             if (name := NEEDED.get(plugin)) and name not in props:
                 raise ValueError(f"{path}: plugin {plugin!r} lacks its parameter {name!r}")
             for name, value in _texts(read):
+                if name != "filename":  # the one parameter of Mitsuba's plugins that names a file
+                    continue
                 if moved and value in moved:
                     props[name] = value = moved[value]
-                if name == "filename" and plugin in ("ply", "bitmap", "envmap"):
+                if plugin in ("ply", "bitmap", "envmap"):
                     (meshes if plugin == "ply" else images).add(value)
         with folders(own_folder(), *self.folders):  # Mitsuba's own folder before every <path>
             for file in meshes:
