@@ -31,9 +31,7 @@ from .index_parameter import PLUGIN
 from .refract_path import INTEGRATOR
 
 ParserState: TypeAlias = Any  # an `mi.parser.ParserState`
-Node: TypeAlias = tuple[
-    Any, ...
-]  # of a state: type, plugin, id, and parameters as name, type, value; numbers and texts
+Node: TypeAlias = tuple[Any, ...]  # of a state: type, plugin, id, and its parameters: name, type, numbers or text
 OURS = (PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS), INTEGRATOR)
 # Registered by Mitsuba's own Python modules, or known to its parser.
 PYTHON = ("direct_projective", "flat_sensor", "prb", "prb_basic", "prb_projective", "prbvolpath", "volprim_rf_basic")
