@@ -179,9 +179,7 @@ class Judgement:
     chord: Array  # |b/|a| − exact|; infinite where b is NaN
     angle: Array  # radians
     drift: Array  # of the length of b, relative
-    error: (
-        Array  # what `bounds.chord` is of: the chord; of normalised answers the angle, and drift has a bound of its own
-    )
+    error: Array  # what `bounds.chord` is of: the chord; of normalised answers the angle
     compared: Flags
     misjudged: Flags  # transmitted where all is reflected, or the reverse
     blank: Flags  # neither a direction nor a sign of total internal reflection

@@ -148,9 +148,9 @@ class Table(Dispersion):
         between = start * (1 - share) + end * share
         if dr.is_array_v(wavelength):
             for i, name in enumerate(names):
-                if differentiated(c[name]):
+                if differentiated(value := c[name]) or dr.width(value) > 1:
                     weight = dr.select(segment == i, 1 - share, dr.select(segment + 1 == i, share, 0))
-                    between += dr.detach(weight) * (c[name] - dr.detach(c[name]))
+                    between += weight * (value - (dr.detach(value) if dr.width(value) == 1 else dr.detach(value)[0]))
         return where((wavelength >= self.knots[0]) & (wavelength <= self.knots[-1]), between, 0 * wavelength)
 
 

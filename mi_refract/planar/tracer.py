@@ -147,7 +147,7 @@ class Tracer:
         none = np.ndim(reflect) == 0 and reflect == 0
         mirrored = None if none else arrays.table(_each("reflect", reflect, count, "iu", np.uint32))
         places = origins - self.middle
-        check_range("origins", places, self.reach)
+        check_range("origins, relative to the segments", places, self.reach)
         if self.mesh:
             self.mesh.expect(places, along)
         rays = [arrays.table(x) for x in (places, along)]

@@ -31,9 +31,7 @@ from .index_parameter import PLUGIN
 from .refract_path import INTEGRATOR
 
 ParserState: TypeAlias = Any  # an `mi.parser.ParserState`
-Node: TypeAlias = tuple[
-    Any, ...
-]  # of a state: type, plugin, id, and parameters as name, type, value; numbers and texts
+Node: TypeAlias = tuple[Any, ...]  # of a state: type, plugin, id, and its parameters: name, type, numbers or text
 OURS = (PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS), INTEGRATOR)
 # Registered by Mitsuba's own Python modules, or known to its parser.
 PYTHON = ("direct_projective", "flat_sensor", "prb", "prb_basic", "prb_projective", "prbvolpath", "volprim_rf_basic")
@@ -119,9 +117,11 @@ class ParsedScene:
             if (name := NEEDED.get(plugin)) and name not in props:
                 raise ValueError(f"{path}: plugin {plugin!r} lacks its parameter {name!r}")
             for name, value in _texts(read):
+                if name != "filename":  # the one parameter of Mitsuba's plugins that names a file
+                    continue
                 if moved and value in moved:
                     props[name] = value = moved[value]
-                if name == "filename" and plugin in ("ply", "bitmap", "envmap"):
+                if plugin in ("ply", "bitmap", "envmap"):
                     (meshes if plugin == "ply" else images).add(value)
         with folders(own_folder(), *self.folders):  # Mitsuba's own folder before every <path>
             for file in meshes:

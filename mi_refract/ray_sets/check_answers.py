@@ -197,7 +197,7 @@ def check(
     tables = [judge(slice(0)).table] + [judge(rows, exact.pop(0)).table for rows in pieces]
     table = np.concatenate(tables)
     explanations: list[Explanation] = []
-    if table["beyond_bound"].any():
+    if table["wrong"].any():
         printed = answers.b[diagnosis.evenly(table["compared"])]
         explanations = diagnosis.explain(judge(diagnosis.sample(table)), table, printed)
     ulp = float(np.finfo(PRECISIONS[precision]).eps)

@@ -179,7 +179,7 @@ def _angle(u: Array, v: Array) -> Array:
 
 def _loss(name: str, text: str, table: Table, column: str, possible: bool = True, least: int = 1) -> Explanation:
     """A loss of precision: it explains the wrong answers whose number in the column is `least` or more."""
-    wrong = table["beyond_bound"]
+    wrong = table["wrong"]
     count, total = int((table[column][wrong] >= least).sum()), int(wrong.sum())
     explains = bool(possible and count >= ALL * total and total >= FEWEST)
     return Explanation(name, text, count / total, _median_angle(table, wrong), explains)

@@ -96,9 +96,9 @@ class JudgedAnswers:
             "wrong": wrong,
             "right": ~wrong & self.backward_within(RIGHT),
             "exact": verdict.meets(ROUNDING),
-            "digits": printed.sum(0, dtype=np.int8),
+            "digits": np.where(verdict.wrong, printed.sum(0), MOST_DIGITS).astype(np.int8),
             "float32": ~single.wrong,
-            "lengths": verdict.compared & (verdict.angle <= bounds.chord),
+            "lengths": verdict.wrong & verdict.compared & (verdict.angle <= bounds.chord),
         }
         table = np.empty(len(self.b), [(name, column.dtype) for name, column in columns.items()])
         for name, column in columns.items():

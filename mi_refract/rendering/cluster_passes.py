@@ -148,6 +148,8 @@ class ClusterPasses:
         """
         if self._series != (offset, spp) or (self._begun and self._begun[0].first != first):
             self.close()
+        if self._series[1] != spp:
+            self._pass_seconds.clear()
         self._series = offset, spp
         try:
             while first < stop:

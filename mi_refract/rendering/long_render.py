@@ -79,14 +79,9 @@ def resume(
             raise ValueError(f"{job.scene}: the sampler's sample_count = {spp}; expected 1 or more, or --spp")
 
     progress, saved = Progress(_identity(job, parsed, renderer)), checkpoint.path_of(path)
-    if saved.exists() and not restart:
+    if kept := saved.exists() and not restart:
         progress = checkpoint.read(saved, progress.identity, (*renderer.size[::-1], len(renderer.channels)))
-        if spp is not None and progress.done > spp:
-            raise ValueError(
-                f"{saved}: already holds {progress.done} samples per pixel; expected --spp {progress.done} or more, or "
-                "--restart"
-            )
-        if progress.rest is not None and progress.done != spp:
+        if progress.rest is not None and (spp is None or progress.done < spp):
             progress.rest = None  # it was the last pass, of fewer samples: a whole one takes its place
     elif not restart:
         image = rendered_file.read(path, renderer.channels, progress.identity)
@@ -95,8 +90,12 @@ def resume(
     begun = progress.identity.get(PASS) if progress.tree.passes else None
     if begun and limits.pass_spp not in (None, begun):
         raise ValueError(f"{saved}: has passes of {begun} samples per pixel; expected --pass-spp {begun}, or --restart")
-    left = None if spp is None else max(0, spp - (progress.base.spp if progress.base else 0))
-    plan = _plan(renderer, left, limits, begun)
+    base = progress.base.spp if progress.base else 0
+    plan = _plan(renderer, None if spp is None else max(0, spp - base), limits, begun)
+    # A sampler may have rounded the last pass up.
+    if kept and spp is not None and progress.done > (base + (plan.total or 0) if base < spp else spp):
+        more = f"expected --spp {progress.done} or more, or --restart"
+        raise ValueError(f"{saved}: already holds {progress.done} samples per pixel; {more}")
     progress.identity[PASS] = plan.spp
     return LongRender(job, path, limits, parsed, scene, renderer, spp, plan, progress)
 

@@ -53,12 +53,12 @@ def is_closed(faces: Faces) -> bool:
 
 
 def encloses(triangles: NDArray[np.float64], point: Vertices) -> bool:
-    """Whether triangles (F, 3, 3) that are closed lie around a point (3): by the sum of the solid angles."""
+    """Whether closed triangles (F, 3, 3) that face outward lie around a point (3): by the sum of the solid angles."""
     a, b, c = np.moveaxis(triangles - point, 1, 0)
     x, y, z = (np.linalg.norm(p, axis=1) for p in (a, b, c))
     ab, bc, ca = ((p * q).sum(1) for p, q in ((a, b), (b, c), (c, a)))
     halves = np.arctan2(np.linalg.det(np.stack([a, b, c], 1)), x * y * z + ab * z + bc * x + ca * y)
-    return bool(abs(halves.sum()) > np.pi)
+    return bool(halves.sum() > np.pi)
 
 
 def grid(u: NDArray[np.float64], v: NDArray[np.float64], chosen: NDArray[np.bool_]) -> Triangles:

@@ -114,6 +114,13 @@ def test_a_table_of_many_knots_is_searched_in_a_small_kernel(vectorised):
     assert counts[1] < 5 * counts[0]
 
 
+def test_a_value_of_a_table_may_differ_from_lane_to_lane(vectorised):
+    number = dr.float64_array_t(dr.value_t(vectorised.vector))
+    values = {"n_500": number(1.52, 1.6, 1.7)}
+    found = media.parse(TABLE).index(number(500, 500, 450), values)
+    np.testing.assert_allclose(found, [1.52, 1.6, (1.53 + 1.7) / 2], rtol=4e-16)
+
+
 @pytest.mark.parametrize("wavelength", [399.0, 901.0, math.nan, math.inf, -500.0, 0.0])
 def test_outside_its_range_a_medium_has_no_index(wavelength, vectorised):
     found = media.parse("table(400: 1.53, 900: 1.5)")

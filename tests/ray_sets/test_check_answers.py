@@ -239,10 +239,10 @@ def test_float32_where_float64_was_claimed():
         assert (diagnosis and diagnosis.mistake) == mistake
 
 
-@pytest.mark.parametrize("precision, digits", [("f32", 4), ("f64", 6), ("f64", 12)])
+@pytest.mark.parametrize("precision, digits", [("f32", 4), ("f32", 6), ("f64", 6), ("f64", 12)])
 @pytest.mark.parametrize("form, word", [("f", "decimals"), ("g", "significant digits")])
 def test_too_few_digits(precision, digits, form, word):
-    to = some(precision)
+    to = some(precision, count=150)
     printed = np.array([[float(f"{x:.{digits}{form}}") for x in row] for row in answered(to, glsl).b.tolist()])
     found = check(to, Answers(to.ids, printed))
     assert (found.exit_code, found.diagnosis.mistake) == (1, "too few digits")

@@ -170,6 +170,9 @@ def test_each_call_continues_the_last_one_and_an_offset_changes_the_seeds(client
     [(_, other, _)] = passes.nodes(8, 9, 9, 5, 1)
     [(_, expected, _)] = passes.nodes(13, 14, 14, 0, 1)
     np.testing.assert_array_equal(other.total, expected.total)
+    assert len(passes._pass_seconds) > 1
+    next(passes.nodes(0, 1, 1, 0, 2))  # passes of another size take another time
+    assert len(passes._pass_seconds) == 1
     passes.close()
 
 

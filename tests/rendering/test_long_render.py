@@ -280,6 +280,13 @@ def test_the_same_command_again_renders_nothing_and_changes_nothing(tmp_path, ll
     assert output.read_bytes() == content
 
 
+def test_a_last_pass_that_the_sampler_has_rounded_up_is_kept(tmp_path, llvm):
+    scene = changed(tmp_path, ('value="independent"', 'value="stratified"'))
+    stopped_after(rendering(tmp_path / "a.exr", scene=scene, spp=6, pass_spp=4), 2)
+    rendering(tmp_path / "a.exr", scene=scene, spp=6, pass_spp=4).run()
+    assert same_as_fresh(tmp_path / "a.exr", scene, spp=6, pass_spp=4) is None
+
+
 def test_a_checkpoint_of_another_render_is_refused_by_name(tmp_path, llvm, monkeypatch):
     """A file that the scene names is part of it."""
     texture = '<bsdf type="diffuse"><texture type="bitmap" name="reflectance"><string name="filename" value="a.ppm"/>'

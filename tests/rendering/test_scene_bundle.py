@@ -31,6 +31,8 @@ SCENE = """<scene version="3.0.0">
 BRIGHT, SKY = "../common/bright.exr", '<include filename="../common/gone/../sky.xml"/>'
 LAMP = '<emitter type="constant"><spectrum name="radiance" filename="$spd"/></emitter>'
 
+GLASS = '<shape type="cube"><bsdf type="refract"><string name="int_ior" value="diamond"/></bsdf></shape></scene>'
+
 pytestmark = pytest.mark.usefixtures("scalar_variant")
 
 
@@ -104,6 +106,14 @@ def test_the_same_image_elsewhere(folder, there, name, more, defines, monkeypatc
     assert len(bundle.files) == 1
     np.testing.assert_array_equal(image(elsewhere(folder, there, bundle)), expected)
     assert expected.std() > 0
+
+
+def test_a_file_that_is_called_as_a_material_changes_nothing_elsewhere(folder, there):
+    scene = written(folder)
+    scene.write_text(scene.read_text().replace("</scene>", GLASS))
+    (scene.parent / "diamond").write_text("no material")
+    expected = image(load_scene(scene))
+    np.testing.assert_array_equal(image(elsewhere(folder, there, pack(scene))), expected)
 
 
 PARAMETERS = """<scene version="3.0.0"><medium type="homogeneous" id="m"><rgb name="albedo" value="1 2 3"/></medium>

@@ -306,6 +306,18 @@ def test_smooth_normals_are_refused(scene, tmp_path):
     assert len(from_mitsuba.load(scene(BALL, flat)).meshes[0].faces) == 8
 
 
+def test_a_room_that_is_diffuse_inside_may_be_around_the_camera(scene, tmp_path):
+    vertices, faces = tessellation.cube()
+    for name, order in (("room", (2, 1, 0)), ("block", (0, 1, 2))):
+        lines = [f"v {x} {y} {z}" for x, y, z in 99 * vertices] + [f"f {a} {b} {c}" for a, b, c in faces[:, order] + 1]
+        (tmp_path / f"{name}.obj").write_text("\n".join(lines))
+    box, flat = 'type="cube" id="box">' + MOVED, '<boolean name="face_normals" value="true"/>'
+    room = f'type="obj" id="box"><string name="filename" value="room.obj"/>{flat}'
+    assert from_mitsuba.load(scene(box, room), level=0).meshes[1].vertices.max() == 99
+    with pytest.raises(ValueError, match="around the camera"):
+        from_mitsuba.load(scene(box, room.replace("room", "block")))
+
+
 @pytest.mark.parametrize("last, smooth", [(3, False), (10**9, False), (2**32 - 1, False), (10**9, True)])
 def test_a_face_without_its_vertices_is_refused(last, smooth, scene, tmp_path):
     """Also where Mitsuba writes a normal for each vertex of a face."""

@@ -211,7 +211,7 @@ def test_povray(tmp_path):
     for mesh, words in (
         (pane, "pane: glass with an open"),
         (grey, "ball_0: a diffuse surface"),
-        (apart, "apart: ext_ior = 1.33; no medium"),
+        (apart, "apart: ext_ior = 1.33; no medium has that index; expected 1"),
     ):
         meshes = mesh, Mesh("ball", *BALL, GLASS)
         with pytest.raises(ValueError, match=words):

@@ -42,7 +42,8 @@ def files(plain: PlainScene) -> Files:
     media = {outside, *(glass.int_ior for _, glass in glasses)}
     for mesh in plain.meshes:  # POV-Ray has one index per body
         if isinstance(mesh.material, Glass) and mesh.material.ext_ior not in media:
-            raise ValueError(f"{plain.name}: {mesh.name}: ext_ior = {mesh.material.ext_ior}; no medium has that index")
+            text = f"{plain.name}: {mesh.name}: ext_ior = {mesh.material.ext_ior}; no medium has that index"
+            raise ValueError(f"{text}; expected {' or '.join(map(str, sorted(media)))}")
     if isinstance(plain.sky, Environment):
         sky = 'sky_sphere { pigment { image_map { exr "sky.exr" gamma 1.0 map_type 1 interpolate 2 } } }\n'
     else:
