@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refract.io import image_headers
-from mi_refract.io.image_file import Image
+from mi_refract.io.image_file import TEXT, Image
 
 from .name_patterns import matches
 
@@ -81,7 +80,7 @@ def _said(image: Image, ignored: tuple[str, ...]) -> dict[str, str]:
     """What the file says, as text by name, without what says the same as nothing."""
     space = str(image.metadata.get(SPACE, "")).lower()
     space = SPACES.get(space, space) or ("srgb_rec709_scene" if image.stored in CODED else "lin_rec709_scene")
-    texts = {name.removeprefix(image_headers.TEXT) for name in image.metadata if name.startswith(image_headers.TEXT)}
+    texts = {name.removeprefix(TEXT) for name in image.metadata if name.startswith(TEXT)}
     said = {name: _text(value) for name, value in image.metadata.items() if name not in texts} | {SPACE: space}
     if any(name.rpartition(".")[2] == "A" for name in image.channels):
         said.setdefault(ALPHA, "0")

@@ -27,6 +27,7 @@ Metadata = dict[str, Any]
 ImageInput: TypeAlias = Any  # an `OpenImageIO.ImageInput`
 ImageSpec: TypeAlias = Any  # an `OpenImageIO.ImageSpec`
 SUFFIXES = (".exr",)
+TEXT = image_headers.TEXT  # begins the names of metadata that are texts of a PNG file
 MAX_VALUES = 2**28  # width × height × channels of an image: 1 GiB as float32
 # What is read in another type than float32. OpenImageIO rounds integers to float32 on the way to any other type.
 WIDE = {"double": "double", "uint": "uint", "int": "int"}
