@@ -17,7 +17,6 @@ from mi_refract.image_diff import (
     html_report,
     pairing,
     results_file,
-    results_file,
     self_test,
     text_reports,
 )
