@@ -100,8 +100,8 @@ class Tracer:
         self.farthest = FARTHEST[precision]
         for name in ("start", "end", "control", "n_left", "n_right"):
             check_range(f"segments.{name}", getattr(segments, name), self.farthest)
-        if min(segments.n_left.min(), segments.n_right.min()) < 1 / self.farthest:
-            raise ValueError(f"segments: an index below {1 / self.farthest:g}")
+        if (least := min(segments.n_left.min(), segments.n_right.min())) < 1 / self.farthest:
+            raise ValueError(f"segments: the index {least:g}; expected at least {1 / self.farthest:g}")
         segments, self.middle = _centred(segments)
         self.boundaries = (ConicArcs if segments.turn.any() else LineSegments)(arrays, segments)
         size = float(np.subtract(*self.boundaries.box[::-1]).max())
