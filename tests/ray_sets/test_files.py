@@ -284,7 +284,11 @@ EDITS = {
     "wavelengths turned": (MEDIA_TEXT, replaced(("[486.1327, 587.5618]", "[587.5618, 486.1327]")), "the checksum does"),
     "no media": (MEDIA_TEXT, without("# media", "# wavel"), "expected"),
     "one column": (MEDIA_TEXT, replaced((",medium\n", "\n")), "in this order: id,ax,ay,az,nx,ny,nz,n_from,n_to or id,"),
-    "deep JSON": (PLAIN_TEXT, replaced(('{"generic"', "[" * 100_000 + '{"generic"')), "regimes: text; expected a table"),
+    "deep JSON": (
+        PLAIN_TEXT,
+        replaced(('{"generic"', "[" * 100_000 + '{"generic"')),
+        "regimes: text; expected a table",
+    ),
 }
 
 

@@ -2,13 +2,13 @@
 
 A program reads rays as CSV and answers with directions, as for `mi-refract rays run`. Each answer should be the exact
 refraction, in direction and in length, of inputs within 8 roundings of those given (a goal), and must be within the
-bound of the textbook formula for that ray, in the program's precision. A second goal: the worst error is within a factor of 3 of the one recorded
-earlier, on rays of the same kinds, or for later programs on these very rays at the default seed. A missed goal is shown
-and fails no run: the worst of some thousand rays depends on which they are. The set "random" was fixed before any
-result. After the first results its rays near the critical angle were left out, for chance decides how near they come,
-and it was made twice as large: that is the set "random, apart". The goal is the same for both. The set "near-critical"
-was never changed. An installed program fails if it crashes, hangs, or answers rays of no set. One that is
-not installed, or reports that it cannot run on this machine, is not run.
+bound of the textbook formula for that ray, in the program's precision. A second goal: the worst error is within a
+factor of 3 of the one recorded earlier, on rays of the same kinds, or for later programs on these very rays at the
+default seed. A missed goal is shown and fails no run: the worst of some thousand rays depends on which they are. The
+set "random" was fixed before any result. After the first results its rays near the critical angle were left out, for
+chance decides how near they come, and it was made twice as large: that is the set "random, apart". The goal is the same
+for both. The set "near-critical" was never changed. An installed program fails if it crashes, hangs, or answers rays of
+no set. One that is not installed, or reports that it cannot run on this machine, is not run.
 """
 
 from __future__ import annotations
