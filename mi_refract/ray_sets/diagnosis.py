@@ -27,6 +27,7 @@ Index = NDArray[np.intp]
 
 VISIBLE, SAME = 0.1, 5e-3  # radians
 MOST, ALL = 0.9, 0.99  # the share of the answers that a mistake, or a loss of precision, must explain
+HALF = 0.5  # the share of the wrong answers that are what a mistake gives, also where its effect is not visible
 FEWEST = 10  # answers: fewer are no evidence
 SAMPLE = 150  # wrong answers, and as many right ones
 MOST_TELLING = {2.0**-24: 7, 2.0**-53: 15}  # by roundoff: digits, fewer than distinguish its numbers
@@ -77,6 +78,9 @@ def predictions(rays: Rays, exact: oracle.Certified) -> Iterator[tuple[str, str,
     yield "eta inverted", "k = n_to / n_from was used, or the normal's side chose it", inverted
     yield "an index ignored", "n_to was taken for 1", refract(a, n, n_from)
     yield "an index ignored", "n_from was taken for 1", refract(a, n, 1 / n_to)
+    root = np.sqrt(1 - k[:, None] * (1 - c * c))
+    squared = np.where(exact.transmitted[:, None], k[:, None] * (a - c * n) + np.copysign(root, c) * n, np.nan)
+    yield "eta not squared", "the radicand has k in place of k²", squared
     yield "normal flipped", "the answer goes back to the side that the ray comes from", flipped(refracted)
     one_sided = np.where(c < 0, refracted, flipped(refracted))
     yield "normal flipped", "n was taken to face the ray, where it does not", one_sided
@@ -143,10 +147,13 @@ def explain(judged: JudgedAnswers, table: Table, printed: Array) -> list[Explana
     with np.errstate(all="ignore"):
         for name, text, predicted in predictions(bounds.rays, bounds.exact):
             visible = _angle(predicted, bounds.exact.direction) > VISIBLE
-            angle = np.nan_to_num(_angle(judged.b, predicted)[visible], nan=np.inf)
+            every = np.nan_to_num(_angle(judged.b, predicted), nan=np.inf)
+            angle = every[visible]
             share = float(np.mean(angle <= SAME)) if len(angle) else 0.0
+            told = every[wrong & np.isfinite(predicted).all(1)]
+            most = share >= MOST and (told <= SAME).sum() >= HALF * len(told)
             median = float(np.median(angle)) if len(angle) else math.nan
-            explains = bool((visible & wrong).sum() >= FEWEST and share >= MOST)
+            explains = bool((visible & wrong).sum() >= FEWEST and most)
             variant = Explanation(name, text, share, median, explains)
             best[name] = max(best.get(name, variant), variant, key=_strength)
     lengths_only = _loss(LENGTHS, "directions are right, but not of length 1", table, "lengths")
@@ -164,7 +171,8 @@ def explain(judged: JudgedAnswers, table: Table, printed: Array) -> list[Explana
             digits = _loss(FEW_DIGITS, f"numbers are rounded to {count} {word}", table, "digits", least=count)
             break
     # Numbers of few digits may keep the bound of float32, too.
-    return [*best.values(), replace(float32, explains=float32.explains and not digits.explains), digits]
+    float32 = replace(float32, explains=float32.explains and not digits.explains)
+    return [*best.values(), *([float32] if roundoff < F32 else []), digits]
 
 
 def _strength(explanation: Explanation) -> tuple[bool, float]:

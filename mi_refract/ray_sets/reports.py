@@ -103,7 +103,7 @@ def ratio(findings: Findings) -> list[str]:
 
 
 def explained(findings: Findings) -> list[str]:
-    """The mistakes that explain the answers, a line each; where none does, a line that says so, and the nearest one."""
+    """The mistakes that explain the answers, a line each; where none does, the nearest one, or a line that says so."""
 
     def line(mistake: Explanation) -> str:
         share = f"{mistake.share:.1%} of the answers on which it has an effect"
@@ -114,7 +114,8 @@ def explained(findings: Findings) -> list[str]:
     if certain or not findings.explanations or findings.exit_code > 1:
         return certain
     nearest = max(findings.explanations, key=lambda mistake: mistake.share)
-    return ["none of the common mistakes explains the answers", *([line(nearest)] if nearest.share > 0 else [])]
+    none = "none of the common mistakes explains the answers"
+    return [f"nearest of the common mistakes, no explanation: {line(nearest)}" if nearest.share > 0 else none]
 
 
 def grade(errors: RegimeErrors) -> str:

@@ -77,7 +77,15 @@ def mirror_x(v):
 
 
 GOOD = {"zero": glsl, "nan": with_nan, "reflected": with_mirror, "tangent": with_tangent}
+
+
 # By the name of the mistake.
+def not_squared(a, n, k):
+    k, c = k[:, None], dot(n, a)
+    radicand = 1 - k * (1 - c * c)
+    return np.where(radicand < 0, 0, k * a - (k * c + np.sqrt(np.abs(radicand))) * n)
+
+
 BAD = {
     "eta inverted": [
         lambda a, n, k: glsl(a, n, 1 / k),
@@ -85,6 +93,7 @@ BAD = {
         lambda a, n, k: with_nan(a, n, 1 / k),
     ],
     "an index ignored": [lambda a, n, k: glsl(a, n, indices(k)[0]), lambda a, n, k: glsl(a, n, 1 / indices(k)[1])],
+    "eta not squared": [not_squared],
     "normal flipped": [lambda a, n, k: glsl(a, -n, k), lambda a, n, k: with_mirror(a, -n, k)],
     "direction reversed": [
         lambda a, n, k: glsl(-a, n, k),
