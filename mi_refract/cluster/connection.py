@@ -73,7 +73,11 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
     with contextlib.ExitStack() as stack:
         stack.enter_context(warnings.catch_warnings())
         warnings.simplefilter("ignore")  # of versions, large graphs: versions that matter are compared by `workers`
-        stack.enter_context(_silent())
+        # Dask logs nothing: what matters of it is raised here. Other loggers stay as they are.
+        for logger in map(logging.getLogger, list(logging.root.manager.loggerDict)):
+            if logger.name.partition(".")[0] in ("distributed", "tornado", "asyncio") and not logger.disabled:
+                logger.disabled = True
+                stack.callback(setattr, logger, "disabled", False)
         if workers is not None:
             address, security = stack.enter_context(local_cluster.started(workers))
         else:
@@ -86,20 +90,6 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
         finally:
             with contextlib.suppress(Exception):  # a scheduler that is gone
                 client.close(timeout=2.0)
-
-
-@contextlib.contextmanager
-def _silent() -> Iterator[None]:
-    """Within, Dask logs nothing: what matters of it is raised here. Other loggers stay as they are."""
-    loggers = [logging.getLogger(name) for name in list(logging.root.manager.loggerDict)]
-    loud = [x for x in loggers if x.name.partition(".")[0] in ("distributed", "tornado", "asyncio") and not x.disabled]
-    for logger in loud:
-        logger.disabled = True
-    try:
-        yield
-    finally:
-        for logger in loud:
-            logger.disabled = False
 
 
 def _client(address: str, security: Security) -> Client:

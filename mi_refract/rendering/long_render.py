@@ -163,6 +163,11 @@ class LongRender:
         `passes`: where they are rendered, by default in this process. On any error what is done stays in the
         checkpoint. BlockingIOError where another process renders into the same file, or did so since `resume`.
         """
+
+        def here(first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
+            for number in range(first, stop):
+                yield 0, self.renderer.render(offset + number, spp), os.uname().nodename
+
         with safe_files.held(lock_of(self.output), "a render", self.output, "another file"):
             if self._file_stamps() != self._files_before:
                 raise BlockingIOError(
@@ -170,7 +175,7 @@ class LongRender:
                 )
             self.checkpoints.active = True
             try:
-                return self._run(passes or self._here, watch)
+                return self._run(passes or here, watch)
             except BaseException as error:
                 self.checkpoints.write()
                 if isinstance(error, RuntimeError):  # Mitsuba's own
@@ -178,11 +183,6 @@ class LongRender:
                 raise
             finally:
                 self.checkpoints.active = False
-
-    def _here(self, first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
-        """As `Passes`: one after the other in this process."""
-        for number in range(first, stop):
-            yield 0, self.renderer.render(offset + number, spp), os.uname().nodename
 
     def _run(self, nodes: Passes, watch: Callable[[LongRender], None]) -> Metadata:
         progress, done_before = self.progress, self.progress.passes
