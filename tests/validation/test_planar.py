@@ -172,7 +172,8 @@ def test_either_segment_is_right_at_their_vertex():
 
 
 def test_a_wrong_arc_and_a_wrong_place_behind_a_joint_are_seen(monkeypatch):
-    aimed = "joints", SCALAR, (20.0,), (0,)
+    aimed, cases = ("joints", SCALAR, (20.0,), (0,)), list(joints.AIMS["joints"](20.0))
+    monkeypatch.setitem(joints.AIMS, "joints", lambda turn: cases)  # each with its exact paths
     monkeypatch.setattr(joints, "SCALAR_SHARE", 10)
     assert joints.row(*aimed).verdict == "pass"
 
