@@ -111,16 +111,16 @@ def test_few_passes_have_the_variance_of_their_samples(tmp_path, llvm):
 def test_renders_under_a_wide_filter_are_equal_to_their_like(tmp_path, llvm, spp, pass_spp):
     """Neighbours share samples there, also in files whose variance has as many degrees of freedom as samples.
 
-    At a family error of 20 % more than 8 of 15 pairs are different once in 1270 runs, where 20 % is what comes up.
+    At a family error of 20 % more than 6 of 10 pairs are different once in 1157 runs, where 20 % is what comes up.
     """
     scene, images = changed(tmp_path, ('"box"', '"gaussian"')), []
-    for seed in range(30):
+    for seed in range(20):
         output = tmp_path / "a.exr"
         rendering(output, seed, scene, {"res": "64"}, spp=spp, pass_spp=pass_spp, restart=True).run()
         images.append(read(output))
     pairs = zip(images[::2], images[1::2], strict=True)
     verdicts = [compare("auto", a, b, family_error=0.2, resolution=9.0).verdict for a, b in pairs]
-    assert verdicts.count(Verdict.DIFFERENT) <= 8
+    assert verdicts.count(Verdict.DIFFERENT) <= 6
 
 
 def test_pixels_that_are_not_finite_are_counted(tmp_path, llvm, monkeypatch):
@@ -546,9 +546,7 @@ def ended_by(number, output, spp, variant="llvm_ad_rgb", handler="default"):
 def test_sigkill_at_random_times_leaves_a_checkpoint_and_the_same_bits(tmp_path, llvm):
     output, limits = tmp_path / "a.exr", {"spp": 800, "pass_spp": 4}
     assert ended_by(signal.SIGKILL, output, 800)[0] == -signal.SIGKILL
-    for _ in range(2):
-        if ended_by(signal.SIGKILL, output, 800)[0] == 0:
-            break
+    ended_by(signal.SIGKILL, output, 800)  # or to its end
     if not output.exists():
         render = rendering(output, defines={"res": "32"}, **limits)
         assert render.progress.passes
