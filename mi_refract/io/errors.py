@@ -8,10 +8,13 @@ wrong, where, and what was expected.
 from __future__ import annotations
 
 import contextlib
+import functools
+import io
 import os
 import sys
 import traceback
 from collections.abc import Callable
+from typing import Any
 
 from .text import printable
 
@@ -69,6 +72,9 @@ def exit_code(
                     os.dup2(null, number)
                     os.close(null)
             setattr(sys, stream, open(number, mode, closefd=False))  # noqa: SIM115 (it lasts as long as the process)
+    buffer = getattr(sys.stdout, "buffer", None)
+    if isinstance(raw := getattr(buffer, "raw", buffer), io.FileIO):
+        setattr(raw, "write", functools.partial(_write_named, type(raw).write, raw))  # noqa: B010 (a method, for mypy)
     for output in (sys.stdout, sys.stderr):  # no character is one that they cannot print
         if hasattr(output, "reconfigure") and output.errors in ("strict", "surrogateescape"):
             output.reconfigure(errors="backslashreplace")
@@ -110,6 +116,15 @@ def print_traceback(error: BaseException) -> None:
     if os.environ.get(TRACEBACK) == "1":
         with contextlib.suppress(OSError, ValueError):
             traceback.print_exception(error)
+
+
+def _write_named(write: Callable[[Any, Any], int | None], stdout: Any, content: Any) -> int | None:
+    """`write`, whose errors name what could not be written."""
+    try:
+        return write(stdout, content)
+    except OSError as error:
+        error.filename = "stdout"
+        raise
 
 
 def _failed(name: str, error: BaseException) -> int:

@@ -16,6 +16,16 @@ from typing import Any, TypeVar
 import msgspec
 
 T = TypeVar("T")
+_PLAIN = {  # msgspec's types, for readers
+    "str": "text",
+    "float": "a number",
+    "int": "a whole number",
+    "bool": "true or false",
+    "array": "a list [ … ]",
+    "object": "a table { … }",
+    "null": "nothing",
+}
+_TYPES = "`((?:{0})(?: [|] (?:{0}))*)`".format("|".join(_PLAIN))
 
 
 def parse_toml(text: str | bytes, kind: type[T], where: str, *, infinite: bool = False) -> T:
@@ -44,7 +54,10 @@ def convert(value: Any, kind: type[T], where: str, *, infinite: bool = False) ->
         path = path.removesuffix("`")
         key = re.sub(r"^(key` in `)?\$\.?", "", path)
         message = f"{message[0].lower()}{message[1:]}".replace("object contains unknown field", "unknown key")
-        message = message.replace(r"matching regex '\\S'", "that is not blank")
+        message = message.replace(r"matching regex '\\S'", "that is not blank").replace(" | null`", "`")
+        if message.startswith("expected "):
+            message = re.sub(_TYPES, lambda types: " or ".join(map(_PLAIN.__getitem__, types[1].split(" | "))), message)
+            message = re.sub(r"(.*), got (\D+)", r"\2; \1", message)
         if message.startswith(("unknown key", "invalid ")) and (names := _names(kind, value, path)):
             message = f"{message}; expected {', '.join(names)}"
         raise ValueError(" ".join(f"{where}: {f'{key}: ' if key else ''}{message}".split())) from None
@@ -86,7 +99,7 @@ def _structs(kinds: list[Any], value: Any) -> list[Any]:
 
 def _check_finite(value: Any, path: str, infinite: bool) -> None:
     if isinstance(value, float) and not math.isfinite(value) and not (infinite and math.isinf(value)):
-        raise msgspec.ValidationError(f"Expected a finite number, got {value} - at `{path}`")
+        raise msgspec.ValidationError(f"Expected a {'' if infinite else 'finite '}number, got {value} - at `{path}`")
     if isinstance(value, dict | list):
         items = value.items() if isinstance(value, dict) else enumerate(value)
         for key, item in items:

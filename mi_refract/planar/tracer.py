@@ -100,8 +100,8 @@ class Tracer:
         self.farthest = FARTHEST[precision]
         for name in ("start", "end", "control", "n_left", "n_right"):
             check_range(f"segments.{name}", getattr(segments, name), self.farthest)
-        if min(segments.n_left.min(), segments.n_right.min()) < 1 / self.farthest:
-            raise ValueError(f"segments: an index below {1 / self.farthest:g}")
+        if (least := min(segments.n_left.min(), segments.n_right.min())) < 1 / self.farthest:
+            raise ValueError(f"segments: the index {least:g}; expected at least {1 / self.farthest:g}")
         # Seen from a new origin in the middle of boundaries whose |middle| exceeds twice their extent: there
         # |x − middle| < |middle|/2, so the differences are exact, and float32 keeps all its digits for them.
         start, end, control = segments.start, segments.end, segments.control

@@ -81,9 +81,12 @@ CASES = {
     "equal, stdout closed": ("ab", ">&-", 0, "", ""),
     "different, stdout closed": ("ac", ">&-", 1, "", ""),
     "different, all closed": ("ac", "<&- >&- 2>&-", 1, "", ""),
-    "equal, nobody reads": ("ab", "| sleep 0", 2, "", "mi-refract: Broken pipe"),
-    "equal, disk full": ("ab", ">/dev/full", 2, "", "mi-refract: No space left on device"),
+    "equal, nobody reads": ("ab", "| sleep 0", 2, "", "mi-refract: stdout: Broken pipe"),
+    "equal, disk full": ("ab", ">/dev/full", 2, "", "mi-refract: stdout: No space left on device"),
+    "different, disk full": ("ac", "--github >/dev/full", 2, "", "mi-refract: stdout: No space left on device"),
+    "unbuffered, disk full": ("ab", ">/dev/full", 2, "", "mi-refract: stdout: No space left on device"),
     "misuse, disk full": ("aa", "--method nope 2>/dev/full", 2, "", ""),
+    "much, disk full": (OWN.format("print('x' * 2**20)"), ">/dev/full", 2, "", "it: stdout: No space left on device"),
     "error, disk full": (OWN.format("print('x') or [][1]"), ">/dev/full", 2, "", INDEX),
     "closed numbers": (f"import os\n{NUMBER}", "2>&- <&-", 0, "3", ""),
 }
@@ -104,7 +107,8 @@ def test_streams_that_are_closed_full_or_not_read(case, images):
     words = ["-c", chosen] if len(chosen) > 2 else ["-m", "mi_refract.cli", "diff", *(images[x] for x in chosen)]
     # The reader of the pipe has gone before the command prints.
     command = ["bash", "-c", f'set -o pipefail; "$@" {connected}', "bash", sys.executable, *map(str, words)]
-    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
+    environment = ENVIRONMENT | {"PYTHONUNBUFFERED": "1"} if case.startswith("unbuffered") else ENVIRONMENT
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout, done.stderr.strip()) == (code, out, said)
 
 
