@@ -51,6 +51,9 @@ def absorbed(sigma: Spectrum, length: Number) -> Spectrum:
 def read_absorption(plugin: str, props: Properties, side: str) -> Absorption | None:
     """Of `int`, `ext` or `camera`; None where the scene does not say. ValueError with the parameter."""
     sigma, colour, distance = f"{side}_absorption", f"{side}_colour", f"{side}_colour_distance"
+    for known in (colour, distance):
+        if (unknown := known.replace("colour", "color")) in props:
+            raise ValueError(f"{plugin}: unknown parameter {unknown}; expected {known}")
     if sigma in props:
         if colour in props or distance in props:
             raise ValueError(f"{plugin}: {sigma} and {colour} are both set; expected one of them")
@@ -65,30 +68,39 @@ def read_absorption(plugin: str, props: Properties, side: str) -> Absorption | N
         if isinstance(length, bool) or not isinstance(length, (int, float)) or not 0 < length < math.inf:
             raise ValueError(f"{plugin}: {distance} = {length!r}; expected a positive finite length")
 
-    value = props[name]
-    values: tuple[float, ...] | None = None  # None where it varies over a surface
-    rgb = type(value).__name__.endswith("Color3d")
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        values = (float(value),)
-    elif rgb:
-        values = tuple(float(x) for x in value)
-    elif knots := read_knots(value):
-        values = knots[1]
-    if values is None or not all(0 < x <= 1 if length else 0 <= x < math.inf for x in values):
-        text = " ".join(str(value).split())
-        expected = "a number or a spectrum " + ("above 0 and up to 1" if length else "≥ 0, and finite")
-        texture = "; no texture" if values is None else ""
-        raise ValueError(
-            f"{plugin}: {name} = {text if len(text) <= 80 else f'{text[:77]}…'}; expected {expected}{texture}"
-        )
-
-    if not rgb or length or not any(values):
+    expected = "a number or a spectrum " + ("above 0 and up to 1" if length else "≥ 0, and finite")
+    values = read_values(plugin, props, name, expected, bool(length), textures=False)
+    if not type(props[name]).__name__.endswith("Color3d") or length or not any(values):
         return Absorption(name, props.get_unbounded_texture(name), 1.0, float(length))
     # Mitsuba makes a spectrum of an RGB colour up to 1 only, and a smooth one of 1/2; of the others, in proportion.
     factor, scaled = 2 * max(values), mi.Properties()
-    scaled[name] = value / factor
+    scaled[name] = props[name] / factor
     props.mark_queried(name)
     return Absorption(name, scaled.get_unbounded_texture(name), factor, 0.0)
+
+
+def read_values(
+    plugin: str, props: Properties, name: str, expected: str, share: bool = False, textures: bool = True
+) -> tuple[float, ...]:
+    """The values of a number, of three colours or of a spectrum; none of a texture, where `textures` may be.
+
+    ValueError with the parameter where one is negative or not finite, or, of a `share`, 0 or above 1.
+    """
+    value = props[name]
+    values: tuple[float, ...] = ()
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        values = (float(value),)
+    elif type(value).__name__.endswith("Color3d"):
+        values = tuple(float(x) for x in value)
+    elif knots := read_knots(value):
+        values = knots[1]
+    if not (values or textures) or not all(0 < x <= 1 if share else 0 <= x < math.inf for x in values):
+        text = " ".join(str(value).split())
+        texture = "" if values else "; no texture"
+        raise ValueError(
+            f"{plugin}: {name} = {text if len(text) <= 80 else f'{text[:77]}…'}; expected {expected}{texture}"
+        )
+    return values
 
 
 def read_knots(value: Any) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
