@@ -214,7 +214,7 @@ class Medium:
             wavelengths, (low, high) = np.atleast_1d(wavelength), self.valid
             if (missing := np.isnan(np.atleast_1d(n))).any():
                 text = f"{self.name}: no index at {wavelengths[missing][0]:g} nm"
-                raise ValueError(f"{text}; expected a wavelength from {low:g} to {high:g} nm")
+                raise ValueError(f"{text}; expected a wavelength from {low:g} to {high:g} nm, or hold(…) around it")
             if self.hold and (held := wavelengths[(wavelengths < low) | (wavelengths > high)]).size:
                 text = f"{self.name}: the index at {held[0]:g} nm is that of the end of its range"
                 warnings.warn(f"{text}, {low:g} to {high:g} nm", stacklevel=2)
