@@ -136,6 +136,8 @@ def parse(spec: float | str, name: str = "", find: Callable[[str], Path] = Path)
         return _of_text(spec.strip(), label, find)
     if isinstance(spec, bool) or not isinstance(spec, (int, float)) or not 0 < spec < math.inf:
         raise ValueError(f"{label}; expected a positive finite number, or a material's name")
+    if 100_000 <= spec < 1_000_000 and spec == int(spec):
+        raise ValueError(f"{label}; expected an index; the code of a glass is a text: '{spec:.0f}'")
     return Medium(str(spec), CONSTANT, {"n": float(spec)})
 
 

@@ -183,6 +183,7 @@ BAD = {
     "table(400: 1.5, 500: nan)": "n = nan at 500 nm",
     "MATERIAL:wader": "unknown material; nearest: MATERIAL:water, ",
     "FOO:BAR": "expected these, or CDGM:…, HIKARI:…",
+    517642: "expected an index; the code of a glass is a text: '517642'",
     0: "expected a positive finite number, or a material's name",
     -1.5: "expected a positive finite number",
     math.inf: "expected a positive finite number",
