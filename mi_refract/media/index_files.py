@@ -114,7 +114,8 @@ def _refractiveindex_info(text: str) -> Medium:
         page: Any = yaml.safe_load(text)
         entries = [(str(entry["type"]).split(), entry) for entry in page["DATA"]]
         found = [_entry(kind, entry) for kind, entry in entries]
-        absolute = (page.get("SPECS") or page.get("CONDITIONS") or {}).get("n_is_absolute")
+        said: dict[str, Any] = (page.get("SPECS") or {}) | (page.get("CONDITIONS") or {})
+        absolute = said.get("n_is_absolute", said.get("n_absolute"))
     except (yaml.YAMLError, KeyError, TypeError, IndexError, AttributeError, ZeroDivisionError):
         raise ValueError("expected a page of refractiveindex.info, with DATA of one formula or table") from None
     with_n = [medium for medium in found if medium.coefficients]

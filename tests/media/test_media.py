@@ -390,9 +390,9 @@ FILES = {
 
 @pytest.mark.parametrize("name", FILES)
 def test_an_index_is_read_from_a_file(name, tmp_path, vectorised):
-    """Also where the name of the folder has a colon, and in Dr.Jit arrays."""
+    """Also where the name of the folder has a colon, of UTF-16 as Zemax writes, and in Dr.Jit arrays."""
     (folder := tmp_path / "a:b (c)").mkdir()
-    (folder / name.partition(":")[0]).write_text(FILES[name][0], "utf-8")
+    (folder / name.partition(":")[0]).write_text(FILES[name][0], "utf-16" if name.startswith("11.agf") else "utf-8")
     found = media.parse(f"file:{folder}/{name}")
     wavelengths = [410.0, 505.0, 700.0]
     expected = [FILES[name][1](w) for w in wavelengths]
@@ -403,10 +403,13 @@ def test_an_index_is_read_from_a_file(name, tmp_path, vectorised):
     assert media.file_in(f"hold( file:{folder}/{name})") == f"{folder}/{name.partition(':')[0]}"
 
 
-@pytest.mark.parametrize(("absolute", "relative"), [("true", "vacuum"), ("false", "air")])
-def test_k_and_the_reference_of_an_index_are_read(absolute, relative, tmp_path):
+@pytest.mark.parametrize(
+    ("said", "relative"),
+    [("SPECS:\n    n_absolute: false\n", "air"), ("CONDITIONS:\n    n_is_absolute: true\n", "vacuum"), ("", "")],
+)
+def test_k_and_the_reference_of_an_index_are_read(said, relative, tmp_path):
     table = "  - type: tabulated k\n    data: |\n        0.4 1e-8\n        0.8 2e-8\n"
-    page = PAGE.format("formula 2", SELLMEIER_2) + table + f"SPECS:\n    n_is_absolute: {absolute}\n"
+    page = PAGE.format("formula 2", SELLMEIER_2) + table + said
     (tmp_path / "glass.yml").write_text(page)
     found = media.parse("file:glass.yml", find=lambda name: tmp_path / name)
     assert (found.relative_to, found.k, found.valid) == (relative, ((400, 800), (1e-8, 2e-8)), (300, 2500))
