@@ -159,7 +159,7 @@ def cluster_passes(
 
     bundle = scene_bundle.pack(rendering.parsed, bundle_limit)
     with connected(target.scheduler, target.workers) as client:
-        tolerated = rendering.tolerated_facts | (on_worker.MIXED if mixed else frozenset())
+        tolerated = on_worker.MIXED if mixed else ()
         workers = Workers(client, variant, on_worker.facts(variant), tolerated, warn, task="render")
         workers.wait()
         passes = ClusterPasses(workers, bundle, variant, rendering.job.seed, rendering.warnings.append)

@@ -5,6 +5,7 @@ A formula takes floats, numpy arrays or Dr.Jit arrays alike, in double precision
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -61,7 +62,7 @@ class Terms(Dispersion):
 
     power: int  # 1: the sum is n, 2: it is n²
     constant: float = 0.0
-    powers: tuple[tuple[str, int], ...] = ()
+    powers: tuple[tuple[str, float], ...] = ()
     resonances: tuple[tuple[str, str], ...] = ()
     squared: bool = False
 
@@ -70,8 +71,8 @@ class Terms(Dispersion):
         square = wavelength * wavelength
         total = self.constant + 0 * wavelength
         for name, p in self.powers:
-            power = 1 + 0 * square
-            for _ in range(abs(p) // 2):
+            power = wavelength ** abs(p) if p % 2 else 1 + 0 * square
+            for _ in range(0 if p % 2 else int(abs(p)) // 2):
                 power = power * square
             total = total + c[name] * (1 / power if p < 0 else power)
         for b, r in self.resonances:
@@ -154,6 +155,17 @@ class Table(Dispersion):
         return where((wavelength >= self.knots[0]) & (wavelength <= self.knots[-1]), between, 0 * wavelength)
 
 
+def table(pairs: Sequence[tuple[float, float]]) -> tuple[Table, dict[str, float]]:
+    """n linear between pairs of λ in nm and n. ValueError, without saying where, for what is no table of an index."""
+    knots = tuple(w for w, _ in pairs)
+    if len(knots) < 2 or not all(0 < a < b < math.inf for a, b in itertools.pairwise(knots)):
+        raise ValueError("expected two or more wavelengths, increasing")
+    if bad := [f"{n:g} at {w:g} nm" for w, n in pairs if not 0 < n < math.inf]:
+        raise ValueError(f"n = {bad[0]}; expected a positive finite index")
+    form = Table(knots)
+    return form, dict(zip(form.names, (n for _, n in pairs), strict=True))
+
+
 def sellmeier(values: Sequence[float], squared: bool = False) -> tuple[Terms, dict[str, float]]:
     """n² = 1 + Σ B_i λ²/(λ² − C_i), first all B, then all C in nm²; where `squared`, C_i = λ_i², and λ_i is given."""
     letter = "L" if squared else "C"
@@ -173,6 +185,8 @@ class Medium:
     relative_to: str = ""  # "air" (20 °C, 101325 Pa, dry) or "vacuum"; "" where the source does not say
     is_air: bool = False
     fitted: tuple[float, float] = ANY  # nm; outside, but within `valid`, the formula extrapolates
+    hold: bool = False  # outside `valid` the index is that of its end
+    k: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # λ in nm, and there the imaginary part of the index
 
     @property
     def dispersive(self) -> bool:
@@ -187,10 +201,11 @@ class Medium:
             coefficients: other values of some of the medium's own, for derivatives.
 
         Returns:
-            Of the shape of `wavelength`. Dr.Jit arrays: NaN outside `valid`, or where n is not a positive number.
+            Of the shape of `wavelength`. Dr.Jit arrays: NaN outside `valid` without `hold`, or where n is not a
+            positive number.
 
         Raises:
-            ValueError: for the same, of floats and numpy arrays. Outside `fitted` these give a warning.
+            ValueError: for the same, of floats and numpy arrays. Outside `fitted` and `valid` these give a warning.
         """
         n = self.index_or_nan(wavelength, coefficients)
         if not dr.is_array_v(wavelength):
@@ -199,7 +214,10 @@ class Medium:
             wavelengths, (low, high) = np.atleast_1d(wavelength), self.valid
             if (missing := np.isnan(np.atleast_1d(n))).any():
                 text = f"{self.name}: no index at {wavelengths[missing][0]:g} nm"
-                raise ValueError(f"{text}; expected a wavelength from {low:g} to {high:g} nm")
+                raise ValueError(f"{text}; expected a wavelength from {low:g} to {high:g} nm, or hold(…) around it")
+            if self.hold and (held := wavelengths[(wavelengths < low) | (wavelengths > high)]).size:
+                text = f"{self.name}: the index at {held[0]:g} nm is that of the end of its range"
+                warnings.warn(f"{text}, {low:g} to {high:g} nm", stacklevel=2)
             low, high = self.fitted
             if (beyond := wavelengths[(wavelengths < low) | (wavelengths > high)]).size:
                 text = f"{self.name}: the index at {beyond[0]:g} nm is an extrapolation"
@@ -215,7 +233,10 @@ class Medium:
             import numpy as np
 
             x = np.asarray(wavelength, np.float64)  # a float, too: operations of numpy give NaN and do not raise
-        valid = (x > 0) & (x >= self.valid[0]) & (x <= self.valid[1])
+        valid = x > 0
+        if self.hold:
+            x = dr.clip(x, *self.valid) if compiled else np.clip(x, *self.valid)
+        valid &= (x >= self.valid[0]) & (x <= self.valid[1])
         n = self.dispersion.index(where(valid, x, math.nan), {**self.coefficients, **(coefficients or {})})
         n = where((n > 0) & (n < math.inf), n, math.nan)
         return n if compiled or dr.is_array_v(n) or n.ndim else float(n)

@@ -5,9 +5,10 @@ Each kind of `[[shape]]` and `[[beam]]` is a struct whose fields are the keys.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -324,8 +325,9 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
         if chosen is None and table.light != "flat":
             raise ValueError(f"light: {table.light!r} without wavelengths; expected `wavelengths` that it weights")
         light = Light(tuple(table.colours or [""])) if chosen is None else of_wavelengths(chosen, table.light)
-        index = light.indices(table.index, "index")
-        parts = _parts(table.shape, index, light)
+        indices = functools.partial(light.indices, find=path.parent.joinpath)
+        index = indices(table.index, "index")
+        parts = _parts(table.shape, index, indices)
         rays, segments = _rays(table.beam), boundaries(parts)
     except ValueError as error:
         raise ValueError(" ".join(f"{path}: {error}".split())) from None
@@ -335,7 +337,7 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
     return PlanarScene(path, table.title or path.stem, light, segments, regions, index, *rays, *limits, fans)
 
 
-def _parts(tables: Sequence[AnyShape], ambient: Indices, light: Light) -> list[Part]:
+def _parts(tables: Sequence[AnyShape], ambient: Indices, indices: Callable[..., Indices]) -> list[Part]:
     """The curves of all shapes, in their places."""
     parts: list[Part] = []
     media: dict[str, Indices] = {}
@@ -343,7 +345,7 @@ def _parts(tables: Sequence[AnyShape], ambient: Indices, light: Light) -> list[P
     for j, shape in enumerate(tables):
         where = f"shape[{j}]"
         values = {key: getattr(shape, key, None) for key in ("n", "outside", "n_left", "n_right")}
-        n = {key: light.indices(x, f"{where}.{key}") for key, x in values.items() if x is not None}
+        n = {key: indices(x, f"{where}.{key}") for key, x in values.items() if x is not None}
         if isinstance(shape, Inside) and shape.within is not None:
             if shape.outside is not None:
                 raise ValueError(f"{where}.within: {shape.within!r}, but `outside` is set too; expected one of them")
@@ -357,7 +359,7 @@ def _parts(tables: Sequence[AnyShape], ambient: Indices, light: Light) -> list[P
                 raise ValueError(f"{where}.name: {shape.name!r} is the name of another shape; expected a unique name")
             media[shape.name] = n["n"]
         curves = shape.layers if isinstance(shape, Luneburg) else 1
-        pieces += curves * max(shape.facets or 4, len(getattr(shape, "points", ()))) * len(light)
+        pieces += curves * max(shape.facets or 4, len(getattr(shape, "points", ()))) * len(ambient)
         if pieces > PIECES:
             most = f"at most {PIECES} pieces of curves in all shapes together, once for each colour"
             raise ValueError(f"{where}: {pieces} or more pieces; expected {most}")

@@ -10,6 +10,7 @@
 | `int_absorption`, `ext_absorption` | number, spectrum | σ of the medium on that side (0) | spectrum | yes |
 | `int_colour`, `ext_colour` | number, spectrum | what white light keeps after the distance below | spectrum | yes |
 | `int_colour_distance`, `ext_colour_distance` | number | with the former; no default | no | no |
+| `int_absorption_unit`, `ext_…` | number | unit of the scene in metres, for k from a file | no | no |
 | `formula` | string | a key of `FORMULAS`, or `auto` (default) | no | no |
 
 A plugin class belongs to one variant: `plugin_class` makes it of the functions below, `register` makes it known. In

@@ -25,7 +25,6 @@ from mi_refract.io import safe_files
 from mi_refract.io.image_file import SUFFIXES, Metadata, installed_version, provenance
 from mi_refract.io.safe_files import writable
 from mi_refract.io.text import printable
-from mi_refract.media.glass_catalogs import names_glass
 from mi_refract.numerics import Scene
 from mi_refract.plugins.scene_parser import ParsedScene
 
@@ -127,7 +126,6 @@ def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> Identity
         "colours": renderer.colours,
         "version of mi_refract": on_worker.our_version(),
         **{f"version of {name}": installed_version(name) for name in ("mitsuba", "drjit")},
-        on_worker.GLASSES: on_worker.glass_catalogues() if any(map(names_glass, parsed.named)) else "none",
         "libLLVM": backend.llvm().library if llvm else "none",
         "vector width": on_worker.vector_width() if llvm else "none",
     }
@@ -265,11 +263,6 @@ class LongRender:
         if plan.spp != self.plan.spp:
             self.plan = plan
             self.progress.rebase(plan.spp)
-
-    @property
-    def tolerated_facts(self) -> frozenset[str]:
-        """Facts of workers that the bits of this render do not depend on."""
-        return frozenset({on_worker.GLASSES} if self.progress.identity[on_worker.GLASSES] == "none" else ())
 
     @property
     def has_all_samples(self) -> bool:

@@ -359,6 +359,13 @@ def test_a_material_has_the_index_of_each_wavelength(read):
     assert plain.regions[-1].indices == pytest.approx((1.5 + 4000 / media.LINES["d"] ** 2,) * 2, rel=1e-15)
 
 
+def test_a_file_of_an_index_is_looked_for_beside_the_scene(read, tmp_path):
+    (tmp_path / "glass.csv").write_text("nm,n\n480,1.6\n580,1.5\n")
+    with pytest.warns(UserWarning, match="587.562 nm is that of the end of its range"):
+        scene = read(GLASSES.replace(CAUCHY, "hold(file:glass.csv)"))
+    assert scene.regions[-1].indices == pytest.approx((1.6 - 6.1327e-3, 1.5), rel=1e-9)
+
+
 def test_what_is_measured_against_vacuum_is_made_relative_to_air():
     indices = Light(("", ""), (500.0, 600.0)).indices("MATERIAL:water", "n")
     expected = [media.index("MATERIAL:water", w) / media.LABORATORY_AIR.index(w) for w in (500.0, 600.0)]

@@ -49,6 +49,15 @@ def test_of_three_colours_and_of_a_spectrum(each_variant):
     assert sigma(int_colour=colour, int_colour_distance=unit) == pytest.approx(expected, rel=1e-5, abs=1e-12)
 
 
+def test_absorption_of_a_file_is_4_pi_k_over_the_wavelength_in_the_unit_of_the_scene(each_variant, tmp_path, logged):
+    """Beyond the table's ends that of the ends, with a warning."""
+    (tmp_path / "k.csv").write_text("nm,n,k\n400,1.5,4e-6\n600,1.5,6e-6\n700,1.5,7e-6\n")
+    found = sigma(int_absorption=f"hold(file:{tmp_path}/k.csv)", int_absorption_unit=1e-3)
+    assert found == pytest.approx(4 * math.pi * 1e-8 * 1e6, rel=1e-5 if mi.is_spectral else 0.3)
+    (text,) = [text for text in logged if "int_absorption" in text]
+    assert "k from 400 to 700 nm; other light (0.5% of the colour) has the absorption of the range's end" in text
+
+
 @pytest.mark.parametrize("scale", [0.1, 1.0, 20.0])
 def test_three_colours_become_a_spectrum_in_proportion(scale, spectral_variant):
     """As Mitsuba's emitters have it: twice the largest colour, times the spectrum of a colour whose largest is 1/2."""
@@ -94,6 +103,18 @@ def rgb(*value):
         ({"ext_colour_distance": 0.5}, "ext_colour is not given; expected both, or neither"),
         ({"int_colour": 0.5, "int_colour_distance": 0.0}, "int_colour_distance = 0.0; expected a positive finite"),
         ({"int_colour": 0.5, "int_colour_distance": math.inf}, "int_colour_distance = inf; expected"),
+        ({"int_absorption": "file:no.csv"}, "int_absorption = 'file:no.csv': no.csv: No such file"),
+        (
+            {"int_absorption": "hold(file:{nk})"},
+            "int_absorption_unit = 0.0; expected the scene's unit in metres: 0.001",
+        ),
+        ({"int_absorption": "hold(file:{nk})", "int_absorption_unit": -1.0}, "int_absorption_unit = -1.0; expected"),
+        ({"int_absorption": 1.0, "int_absorption_unit": 1.0}, "int_absorption = 1.0; expected .* a file with k"),
+        (
+            {"int_absorption": "SCHOTT:F2", "int_absorption_unit": 1.0},
+            "int_absorption = 'SCHOTT:F2'; expected .* with k",
+        ),
+        ({"int_absorption": "file:{nk}", "int_absorption_unit": 1.0}, "has k from 400 to 700 nm: 0.5% .* hold"),
         ({"int_colour": 0.5, "int_absorption": 1.0}, "int_absorption and int_colour are both set; expected one"),
         ({"int_color": 0.5, "int_color_distance": 1.0}, "unknown parameter int_color; expected int_colour"),
         ({"ext_color_distance": 1.0}, "unknown parameter ext_color_distance; expected ext_colour_distance"),
@@ -105,7 +126,9 @@ def rgb(*value):
         ({"specular_reflectance": rgb(1, -1, 1)}, "specular_reflectance = .*; expected .* ≥ 0 and finite"),
     ],
 )
-def test_what_is_refused_is_named(typical_variant, parameters, said):
+def test_what_is_refused_is_named(typical_variant, parameters, said, tmp_path):
+    (tmp_path / "nk.csv").write_text("nm,n,k\n400,1.5,0\n700,1.5,0\n")
+    parameters = {k: x.format(nk=tmp_path / "nk.csv") if isinstance(x, str) else x for k, x in parameters.items()}
     assert re.search(said, refusal(load, **parameters))
 
 

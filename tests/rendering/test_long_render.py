@@ -340,26 +340,6 @@ def forged(header=None, nodes=None, more=b""):
 KINDS = ["total", "between", "within"]
 
 
-def test_the_catalogue_of_a_glass_is_part_of_the_render(tmp_path, llvm, monkeypatch):
-    """Here and on workers; where no glass of a catalogue is named, catalogues do not count."""
-    pytest.importorskip("opticalglass")
-    for name, index in (("glass", "SCHOTT:N-BK7"), ("number", "water")):
-        bsdf = f'<bsdf type="refract"><string name="int_ior" value="{index}"/></bsdf>'
-        (tmp_path / f"{name}.xml").write_text(SKY.format(f'<shape type="sphere">{bsdf}</shape>'))
-
-    def begun(name):
-        return resume(Job(tmp_path / f"{name}.xml"), tmp_path / f"{name}.exr", Limits(spp=16, pass_spp=4))
-
-    for name in ("glass", "number"):
-        render = begun(name)
-        assert (on_worker.GLASSES in render.tolerated_facts) == (name == "number")
-        stopped_after(render, 2)
-    monkeypatch.setattr(on_worker, "glass_catalogues", lambda: "another")
-    assert begun("number").progress.passes == 2
-    with pytest.raises(ValueError, match=r"glass catalogues was \w+, is another; pass --restart"):
-        begun("glass")
-
-
 def test_sums_from_elsewhere_are_checked(tmp_path, llvm):
     render = rendering(tmp_path / "a.exr", spp=16, pass_spp=4)
 

@@ -269,7 +269,7 @@ def test_numbers_that_do_not_fill_the_square_are_seen(llvm_variant, source, coun
 
 
 READS = pytest.mark.skipif(
-    find_spec("opticalglass") is None, reason="opticalglass is not installed: pip install 'mi-refract[glass]'"
+    any(find_spec(name) is None for name in catalogs.READERS), reason="no opticalglass: bash .ci/setup dev"
 )
 HERE = Context(PROFILES["quick"], Path(), "llvm_ad_rgb", backend.detect(), backend.usable_variants())
 GLASS = "cauchy(1.5046, 4200)"
@@ -294,13 +294,19 @@ def test_indices_are_those_of_the_catalogue_and_another_unit_is_found(catalog, m
 
 @READS
 def test_a_glass_with_the_numbers_of_another_is_found(monkeypatch):
-    glasses = dict(glass_catalogs.read("SCHOTT"))
-    glasses["N-BK7"] = replace(glasses["N-BK7"], printed=glasses["F2"].printed, v_d=glasses["F2"].v_d)
-    monkeypatch.setattr(glass_catalogs, "read", lambda catalog: glasses)
+    table, glasses = catalogs.tables("SCHOTT")
+    glasses["N-BK7"] = replace(glasses["N-BK7"], lines=glasses["F2"].lines, v_d=glasses["F2"].v_d)
+    monkeypatch.setattr(catalogs, "tables", lambda catalog: (table, glasses))
     assert set(catalogs.catalog_row("SCHOTT").broken) == {"largest miss"}
     monkeypatch.setattr(catalogs, "find_spec", lambda name: None)
     (row,) = catalogs.rows(None)
-    assert row.verdict == "not run" and "pip install" in row.reason
+    assert row.verdict == "not run" and row.reason.endswith("bash .ci/setup validation")
+
+
+@READS
+def test_the_packages_file_is_what_is_written_of_the_makers_tables(tmp_path):
+    catalogs.write(tmp_path / "glasses.json")
+    assert (tmp_path / "glasses.json").read_bytes() == glass_catalogs.FILE.read_bytes()
 
 
 def test_a_wrong_index_is_found_in_directions(spectral, monkeypatch):
