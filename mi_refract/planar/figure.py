@@ -23,7 +23,7 @@ from mi_refract.io.safe_files import write_atomically
 
 from .curves import points
 from .light import linear_srgb
-from .path_tree import Branches, count, summary
+from .path_tree import Branches, count, mismatches, summary
 from .scene_file import PlanarScene
 from .segments import Array, Event, Segments
 
@@ -41,10 +41,7 @@ NIGHT, MOON = (0.06, 0.07, 0.09), "#8a93a0"  # around all shapes, and their outl
 LINE = 0.13  # inches
 NAMED = 5  # media in the legend
 TYPICAL = 0.35  # opacity/(1 − opacity) of a typical density, where that is drawn
-MARKS = {
-    Event.MAX_DEPTH: ("o", "○ {} stopped after `max_depth` boundaries, with another one ahead"),
-    Event.MEDIUM_MISMATCH: ("x", "× {} stopped: the next boundary does not border on the medium that the ray is in"),
-}
+MARKS = {Event.MAX_DEPTH: "o", Event.MEDIUM_MISMATCH: "x"}
 UNDATED: dict[str, Any] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}, ".png": {}}
 TICKS = {"color": "#b5b5b5", "labelcolor": MUTED, "labelsize": 8}
 STYLE: Any = {
@@ -96,9 +93,9 @@ def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> 
     ratio = min(max((view[1] - view[0]) / (view[3] - view[2]), 0.25), 4)
     height = min(5.2 / ratio**0.5, 7.0)
     width, height = max(height * ratio, 3.6) + 0.6, height + 0.95
-    numbers = count(traced)
-    notes = [text.format(numbers[event.name]) for event, (_, text) in MARKS.items() if numbers[event.name]]
-    lines = [f"{scene.file}: {summary(scene, traced)}", *notes]
+    lines = [f"{scene.file}: {summary(scene, traced)}", *(f"× {line}" for line in mismatches(scene, traced))]
+    if number := count(traced)["MAX_DEPTH"]:
+        lines.append(f"○ {number} stopped after `max_depth` boundaries, with another one ahead")
     caption = [part for line in lines for part in textwrap.wrap(line, int(14 * width))]
     drawn = Figure((width, height + LINE * len(caption)), dpi, layout="constrained")
     panel = drawn.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal")
@@ -121,7 +118,7 @@ def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> 
     panel.add_collection(LineCollection(outlines, rasterized=many, **style), autolim=False)
     panel.plot(0, 0, "+", color=MUTED, markersize=5, markeredgewidth=0.6, zorder=1.4, scalex=False, scaley=False)
     _rays(panel, scene, legs(traced, view))
-    for event, (mark, _) in MARKS.items():
+    for event, mark in MARKS.items():
         ends = np.concatenate([branches.tips[branches.end == event] for branches in traced])
         if len(ends):
             size = min(1.0, (40 / len(ends)) ** 0.5)
@@ -137,14 +134,17 @@ def require_matplotlib() -> None:
 
 
 def _media(panel: Axes, scene: PlanarScene) -> None:
-    """Tint regions by index, paler the closer it is to the outermost medium's; a legend of up to NAMED media."""
+    """Tint regions by the rank of their index, paler towards the outermost medium's; a legend of up to NAMED media."""
     from matplotlib.patches import Patch, Polygon
 
     around = float(np.mean(scene.index))
     means = [float(np.mean(region.indices)) for region in scene.regions]
-    most = max((abs(n - around) for n in means), default=0)
     dark = bool(scene.light.wavelengths)
-    tints = {n: _tint((n - around) / (most or 1), dark) for n in (around, *means)}
+    # By rank, not by index: of 1, 1.45 and 1.48 the last two would look alike.
+    ranked = sorted({around, *means})
+    own = ranked.index(around)
+    most = max(own, len(ranked) - 1 - own, 1)
+    tints = {n: _tint((rank - own) / most, dark) for rank, n in enumerate(ranked)}
     panel.set_facecolor(tints[around])
     for region, n in zip(scene.regions, means, strict=True):
         style: dict[str, Any] = {"facecolor": tints[n], "edgecolor": "none", "zorder": 0.5}
@@ -158,17 +158,17 @@ def _media(panel: Axes, scene: PlanarScene) -> None:
     panel.legend(handles=patches, ncols=len(patches), handlelength=1.2, columnspacing=1.2, **place)
 
 
-def _tint(contrast: float, dark: bool) -> tuple[float, float, float]:
-    """A medium's colour by its contrast to the outermost one, −1 … 1. Denser media are blue, thinner ones yellow.
+def _tint(rank: float, dark: bool) -> tuple[float, float, float]:
+    """A medium's colour by its rank above the outermost one, −1 … 1. Denser media are blue, thinner ones yellow.
 
     dark: behind rays that shine in their own colours.
     """
-    hue = np.array(DENSE if contrast > 0 else THIN)
+    hue = np.array(DENSE if rank > 0 else THIN)
     if dark:
-        share = abs(contrast) and 0.3 + 0.7 * abs(contrast)
+        share = abs(rank) and 0.3 + 0.7 * abs(rank)
         red, green, blue = np.array(NIGHT) + 0.2 * share * hue
     else:
-        share = abs(contrast) and 0.15 + 0.85 * abs(contrast) ** 1.5
+        share = abs(rank) and 0.15 + 0.85 * abs(rank) ** 1.5
         red, green, blue = 1 - share * (1 - hue)
     return float(red), float(green), float(blue)
 

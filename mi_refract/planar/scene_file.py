@@ -275,7 +275,8 @@ class PlanarScene:
     """The content of a scene file, ready for `planar.trace` (once per colour) and for a figure.
 
     `light`: its colours, one where there is no dispersion.
-    `segments`: one per colour, the same geometry with other indices. `regions`: in drawing order, inner ones last.
+    `segments`: one per colour, the same geometry with other indices. `shape_names`: of the shape of each segment, as
+    "shape[0] 'name'". `regions`: in drawing order, inner ones last.
     `index`: of the medium around everything, per colour. `origins`, `directions`: N × 2, directions of length 1;
     `beams`: N, the number of the `[[beam]]` (from 0) that a ray belongs to. `branches`: the most partial reflections
     on a path; 0: rays are refracted wherever possible. `view`: x0, x1, y0, y1; None: all shapes. `fans`: by beam, the
@@ -286,6 +287,7 @@ class PlanarScene:
     title: str
     light: Light
     segments: tuple[Segments, ...]
+    shape_names: tuple[str, ...]
     regions: tuple[Region, ...]
     index: Indices
     origins: Array
@@ -326,13 +328,13 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
         light = Light(tuple(table.colours or [""])) if chosen is None else of_wavelengths(chosen, table.light)
         index = light.indices(table.index, "index")
         parts = _parts(table.shape, index, light)
-        rays, segments = _rays(table.beam), boundaries(parts)
+        rays, (segments, shapes) = _rays(table.beam), boundaries(parts)
     except ValueError as error:
         raise ValueError(" ".join(f"{path}: {error}".split())) from None
     regions = tuple(Region(part.curve.outline(), part.left) for part in parts if part.curve.closed)
     fans = tuple(beam.angles if isinstance(beam, Fan) else None for beam in table.beam)
     limits = table.max_depth, table.branches, table.view
-    return PlanarScene(path, table.title or path.stem, light, segments, regions, index, *rays, *limits, fans)
+    return PlanarScene(path, table.title or path.stem, light, segments, shapes, regions, index, *rays, *limits, fans)
 
 
 def _parts(tables: Sequence[AnyShape], ambient: Indices, light: Light) -> list[Part]:
@@ -362,11 +364,12 @@ def _parts(tables: Sequence[AnyShape], ambient: Indices, light: Light) -> list[P
             most = f"at most {PIECES} pieces of curves in all shapes together, once for each colour"
             raise ValueError(f"{where}: {pieces} or more pieces; expected {most}")
         first = len(parts)
+        named = f"{where} '{printable(shape.name)}'" if isinstance(shape, Solid) and shape.name else where
         try:
             with np.errstate(all="ignore"):
                 for curve, left, right in _curves(shape, n):
                     chords = curve.faceted(shape.facets) if shape.facets else curve
-                    parts.append(Part(where, chords.mapped(affine(shape.rotate, shape.scale), shape.at), left, right))
+                    parts.append(Part(named, chords.mapped(affine(shape.rotate, shape.scale), shape.at), left, right))
         except ValueError as error:
             raise ValueError(f"{where}.{error}") from None
         for part in parts[first:]:

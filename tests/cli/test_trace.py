@@ -126,6 +126,19 @@ def test_options_override_the_file(trace, ball):
     assert trace("--max-depth", 1)[1] == "ball.toml: 7 rays, 7 hits, 7 stopped at max_depth\n"
 
 
+@pytest.mark.parametrize(
+    "first, second, where",
+    [("", "", "shape[0] and shape[1]"), ('name = "crown"', 'name = "flint"', "shape[0] 'crown' and shape[1] 'flint'")],
+)
+def test_shapes_that_do_not_fit_are_named_and_the_exit_code_is_1(trace, ball, first, second, where):
+    other = BALL.partition("[[shape]]")[2].partition("[[beam]]")[0].replace("1.5", "1.6")
+    ball.write_text(BALL.replace("n = 1.5", f"n = 1.5\n{first}") + f"[[shape]]{other}at = [1.2, 0]\n{second}")
+    code, out, err = trace()
+    assert (code, out) == (1, "ball.toml: 7 rays, 14 hits, 7 stopped by a medium mismatch\n")
+    fault = "overlap, leave a gap, or are turned round: 7 paths in index 1.5 met a boundary between 1.6 and 1"
+    assert err.startswith(f"mi-refract: {ball}: {where} {fault}; expected ") and err.count("\n") == 1
+
+
 def directions(paths):
     return np.array([path["direction"] for path in paths])
 

@@ -328,9 +328,9 @@ def test_a_shape_may_touch_what_it_lies_in_and_must_not_contradict_it(read):
     inner = [(1.3, 1.1), (1.3, 1.5), (1.3, 1.7), (1.5, 1.1), (1.5, 1.1), (1.7, 1.1), (1.7, 1.1), (1.7, 1.1)]
     assert media_of(read(TWO.format(first="0.3", second="2.3", more=INNER))) == inner
     for more, expected in (
-        (INNER.replace(', within = "left"', ""), r"shape\[2\]: along shape\[0\] there is index 1.5; expected 1.1"),
-        (AGAIN, r"shape\[2\]: along shape\[0\] there is index 1.5; expected 1.1"),
-        (ALONG, r"shape\[2\]: it runs along shape\[0\]"),
+        (INNER.replace(', within = "left"', ""), r"shape\[2\]: along shape\[0\] 'left' there is index 1.5; expected 1.1"),
+        (AGAIN, r"shape\[2\]: along shape\[0\] 'left' there is index 1.5; expected 1.1"),
+        (ALONG, r"shape\[2\]: it runs along shape\[0\] 'left'"),
     ):
         with pytest.raises(ValueError, match=expected):
             read(TWO.format(first="0.3", second="2.3", more=more))
