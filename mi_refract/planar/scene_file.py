@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mi_refract.io import safe_files
 from mi_refract.io.text import printable
-from mi_refract.io.typed_table import key_table, kind_table, parse_toml
+from mi_refract.io.typed_table import key_list, parse_toml
 
 from . import shapes
 from .curves import Curve, affine, unit
@@ -115,11 +115,19 @@ class Ellipse(Solid, tag="ellipse", kw_only=True):
 class Lens(Solid, tag="lens", kw_only=True):
     """Two conic surfaces z = c r² / (1 + √(1 − (1 + K) c² r²)) on the x axis, with a rim between them."""
 
-    curvature: Annotated[Point, _doc("c of the front and of the back, positive where the centre lies toward +x")]
+    curvature: Annotated[Point | None, _doc("c of both surfaces, positive where the centre lies toward +x")] = None
+    R1: Annotated[float | None, _doc("radius of curvature of the front, 1/c; 0 where it is flat")] = None
+    R2: Annotated[float | None, _doc("of the back; R1 and R2 are in place of `curvature`")] = None
     conic: Annotated[Point, _doc("K of each")] = (0.0, 0.0)
     thickness: Annotated[Positive, _doc("on the axis")]
     radius: Annotated[Positive | None, _doc("half the aperture; up to where the surfaces meet by default")] = None
     vertex: Annotated[float, _doc("where the front meets the axis")] = 0.0
+
+    def __post_init__(self) -> None:
+        """ValueError unless the curvatures are said once."""
+        super().__post_init__()
+        if (self.R1 is None, self.R2 is None) != (self.curvature is not None,) * 2:
+            raise ValueError("curvature, R1, R2; expected either `curvature`, or both R1 and R2")
 
 
 class EllipseLens(Solid, tag="ellipse_lens", kw_only=True):
@@ -163,6 +171,9 @@ def _curves(shape: AnyShape, n: dict[str, Indices]) -> list[tuple[Curve, Indices
             return [(curve, media[j + 1], media[j]) for j, (curve, _) in enumerate(layers)]
         case Ellipse():
             own = {"rx": shape.radii[0], "ry": shape.radii[1]}
+        case Lens():
+            pair = [1 / r if r else 0.0 for r in (own.pop("R1"), own.pop("R2"))]
+            own["curvature"] = shape.curvature or pair
         case EllipseLens():
             own["n"] = n["n"][0] / outside[0]
     return [(getattr(shapes, str(tag))(**own), n["n"], outside)]
@@ -256,10 +267,13 @@ class SceneTable(Struct, kw_only=True, forbid_unknown_fields=True):
 
 
 def reference() -> str:
-    """All kinds and keys as tables in Markdown: what `mi-refract trace --keys` prints."""
-    tables = key_table("key of the scene", SceneTable), key_table("key of a shape", Solid)
-    kinds = kind_table("kind of shape", get_args(AnyShape), Solid), kind_table("kind of beam", get_args(AnyBeam))
-    return "\n\n".join([*tables, *kinds])
+    """All kinds and keys: what `mi-refract trace --keys` prints."""
+    lists = [key_list("A scene:", SceneTable), key_list("Every [[shape]], which has a kind and its keys:", Solid)]
+    for table, kinds in (("[[shape]]", AnyShape), ("[[beam]]", AnyBeam)):
+        for kind in get_args(kinds):
+            about = (kind.__doc__ or "").partition("\n")[0]
+            lists.append(key_list(f'{table} kind = "{kind.__struct_config__.tag}": {about}', kind, Solid))
+    return "\n\n".join(lists)
 
 
 @dataclass(frozen=True)
