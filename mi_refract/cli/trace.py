@@ -69,6 +69,7 @@ def trace(
     lines = [f"{loaded.file}: {summary(loaded, traced)}", *([focal_points.table(foci)] if foci else [])]
     if output:
         figure.save(output, loaded, traced)
+        lines.append(printable(f"{output}: written"))
     if as_json and foci is not None:
         data["foci"] = [asdict(group) for group in foci]
     print(json_text(data) if as_json else "\n".join(lines))

@@ -58,9 +58,9 @@ def exit_code(
     """What `body()` returns, None as 0; 2 after any exception, and 130 after Ctrl-C or one of `interruptions`.
 
     The exception is one line on stderr, `name: …`. What the body printed is on its way when this returns: a stdout
-    that cannot be written is an exception as well. Where it is a pipe that nobody reads any more, as before `| head`,
-    that is no error and no verdict: the exit code is 141 without a line. A standard stream that is closed is replaced by the null device, so
-    that no file of ours takes its number.
+    that cannot be written is an exception as well. A pipe that nobody reads any more, as before `| head`, is no error
+    and no verdict: 141, without a line. A standard stream that is closed is replaced by the null device, so that no
+    file of ours takes its number.
     """
     for number, (stream, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         if getattr(sys, stream) is None:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mi_refract.io.image_file import srgb_encode
 from mi_refract.io.safe_files import write_atomically
 
+from . import focal_points
 from .curves import points
 from .light import linear_srgb
 from .path_tree import Branches, count, mismatches, summary
@@ -54,6 +55,7 @@ STYLE: Any = {
     **{"legend.frameon": False, "legend.fontsize": 8, "legend.labelcolor": INK},
 }
 MARGIN = 0.08  # around the scene, as a share of its larger side
+FAR = 8
 SHARED = -1  # the number of the colour that stands for all of them
 SAMPLES = 2**22  # pixels of lines at a time: 0.3 GB
 View = tuple[float, float, float, float]  # x0, x1, y0, y1
@@ -88,14 +90,18 @@ def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> 
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
-    view = scene.view or around(scene, traced)
-    # Without its caption, in inches: of about the same area for every view.
-    ratio = min(max((view[1] - view[0]) / (view[3] - view[2]), 0.25), 4)
-    height = min(5.2 / ratio**0.5, 7.0)
-    width, height = max(height * ratio, 3.6) + 0.6, height + 0.95
+    foci = focal_points.foci(scene, traced)
+    view = scene.view or around(scene, traced, foci)
+    # Without its caption, in inches: of about the same area for every view, but not wider than a page.
+    ratio = max((view[1] - view[0]) / (view[3] - view[2]), 0.25)
+    height = max(min(5.2 / ratio**0.5, 10.4 / ratio, 7.0), 0.6)
+    width, height = min(max(height * ratio, 3.6), 10.4) + 0.6, height + 0.95
     lines = [f"{scene.file}: {summary(scene, traced)}", *(f"× {line}" for line in mismatches(scene, traced))]
     if number := count(traced)["MAX_DEPTH"]:
         lines.append(f"○ {number} stopped after `max_depth` boundaries, with another one ahead")
+    inside = ((foci >= view[::2]) & (foci <= view[1::2])).all(axis=1)
+    if inside.any():
+        lines.append("◇ focus: the point nearest to all rays of a beam")
     caption = [part for line in lines for part in textwrap.wrap(line, int(14 * width))]
     drawn = Figure((width, height + LINE * len(caption)), dpi, layout="constrained")
     panel = drawn.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal")
@@ -113,17 +119,18 @@ def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> 
     # Boundaries, rays, and marks where a path ended without escaping.
     many = len(scene.segments[0]) > LINES
     outlines = curves(scene.segments[0], 5 if many else 33)
-    style: dict[str, Any] = {"colors": MOON if scene.light.wavelengths else INK, "capstyle": "round", "zorder": 1.5}
+    ink = MOON if scene.light.wavelengths else INK
+    style: dict[str, Any] = {"colors": ink, "capstyle": "round", "zorder": 1.5}
     style["linewidths"] = 0.7 * max(min(1.0, 8 / len(outlines)), 0.15)
     panel.add_collection(LineCollection(outlines, rasterized=many, **style), autolim=False)
     panel.plot(0, 0, "+", color=MUTED, markersize=5, markeredgewidth=0.6, zorder=1.4, scalex=False, scaley=False)
     _rays(panel, scene, legs(traced, view))
-    for event, mark in MARKS.items():
-        ends = np.concatenate([branches.tips[branches.end == event] for branches in traced])
+    marked = {mark: np.concatenate([x.tips[x.end == event] for x in traced]) for event, mark in MARKS.items()}
+    for mark, ends in (marked | {"D": foci[inside]}).items():
         if len(ends):
             size = min(1.0, (40 / len(ends)) ** 0.5)
             style = {"markersize": 1 + 4 * size, "markeredgewidth": 0.9 * size, "fillstyle": "none"}
-            panel.plot(*ends.T, mark, color=INK, zorder=3, scalex=False, scaley=False, **style)
+            panel.plot(*ends.T, mark, color=ink, zorder=3, scalex=False, scaley=False, **style)
     return drawn
 
 
@@ -274,14 +281,22 @@ def _add_light(layers: dict[int, Any], colours: dict[int, Any]) -> tuple[Array, 
 # Geometry --------------------------------------------------------------------------------------------------------
 
 
-def around(scene: PlanarScene, traced: Sequence[Branches]) -> View:
-    """The view that holds all boundaries and all places where rays meet them, with a margin."""
+def around(scene: PlanarScene, traced: Sequence[Branches], foci: Array) -> View:
+    """The view that holds all boundaries, all places where rays meet them, and near foci (F × 2), with a margin.
+
+    A focus is near where the view is at most FAR times as long with it.
+    """
     segments = scene.segments[0]
     places = [segments.start, segments.end, *(region.outline for region in scene.regions)]
     places += [branches.paths.points[:, 1:].reshape(-1, 2) for branches in traced]
     points = np.concatenate(places)
     points = points[np.isfinite(points).all(axis=1)]
     low, high = points.min(axis=0), points.max(axis=0)
+    most = FAR * float((high - low).max())
+    for focus in foci:
+        lower, upper = np.minimum(low, focus), np.maximum(high, focus)
+        if (upper - lower).max() <= most:
+            low, high = lower, upper
     pad = MARGIN * (float((high - low).max()) or 1.0)
     return float(low[0] - pad), float(high[0] + pad), float(low[1] - pad), float(high[1] + pad)
 

@@ -179,7 +179,11 @@ def mismatches(scene: PlanarScene, traced: Sequence[Branches], most: int = 3) ->
     found: Counter[tuple[str, ...]] = Counter()
     examples: dict[tuple[str, ...], str] = {}
     for segments, branches in zip(scene.segments, traced, strict=True):
-        ends, last, indices = np.flatnonzero(branches.end == Event.MEDIUM_MISMATCH), branches.last, branches.paths.indices
+        ends, last, indices = (
+            np.flatnonzero(branches.end == Event.MEDIUM_MISMATCH),
+            branches.last,
+            branches.paths.indices,
+        )
         assert indices is not None
         met = np.stack([branches.paths.hits[ends, last[ends] - j] for j in (1, 0)], axis=1)  # none begins with one
         for (before, at), j, number in zip(*np.unique(met, axis=0, return_index=True, return_counts=True), strict=True):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import shlex
 import subprocess
 import sys
 
 import mitsuba as mi
 import pytest
+import typer
 from support.processes import ENVIRONMENT, python
 
 import mi_refract
@@ -57,6 +59,29 @@ def test_the_help_has_a_line_for_each_command_and_each_command_its_own(name, cap
     assert [line.split(None, 1)[1] for line in lines if line.startswith(f"  {name} ")] == [app.COMMANDS[name].help]
     assert app.main([name, "--help"]) == 0
     assert capfd.readouterr().out.startswith(f"Usage: mi-refract {name} ")
+
+
+def commands_of(command, name=""):
+    """The names of a command and of all commands below it."""
+    below = command.list_commands(None) if hasattr(command, "list_commands") else ()
+    return [name, *(y for x in below for y in commands_of(command.get_command(None, x), f"{name} {x}".strip()))]
+
+
+COMMANDS = commands_of(typer.main.get_command(app.app))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_help_ends_with_two_or_three_examples_that_are_parsed(name, capfd, monkeypatch):
+    assert app.main([*name.split(), "--help"]) == 0
+    *_, head, examples = capfd.readouterr().out.partition("\n  Examples:\n")
+    examples = [line.strip() for line in examples.splitlines()]
+    assert head and len(examples) in (2, 3)
+    parsed = []
+    monkeypatch.setattr(typer.core.TyperCommand, "invoke", lambda self, context: parsed.append(context.command_path))
+    for line in examples:
+        program, *words = shlex.split(line)
+        assert (program, app.main(words)) == ("mi-refract", 0)
+    assert parsed and all(command.startswith(f"mi-refract {name}".strip()) for command in parsed)
 
 
 HEAVY = ("mitsuba", "drjit", "numpy", "OpenImageIO", "matplotlib", "scipy")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 
 import numpy as np
@@ -56,7 +57,8 @@ def paths_of(result):
 @pytest.mark.parametrize("suffix", ["", ".png", ".pdf", ".SVG"])
 def test_a_line_is_printed_and_a_figure_is_drawn(trace, ball, suffix):
     output = ball.with_name(f"image{suffix}")
-    assert trace(*(["-o", output] if suffix else [])) == (0, "ball.toml: 7 rays, 14 hits, 7 escaped\n", "")
+    written = f"{output}: written\n" if suffix else ""
+    assert trace(*(["-o", output] if suffix else [])) == (0, f"ball.toml: 7 rays, 14 hits, 7 escaped\n{written}", "")
     assert sorted(ball.parent.iterdir()) == sorted([ball, output] if suffix else [ball])
     assert not suffix or output.read_bytes().startswith(FORMATS[suffix.lower()])
 
@@ -93,13 +95,15 @@ def test_the_table(trace):
     assert (code, err) == (0, "")
     lines = out.splitlines()
     assert (lines[0], len(lines)) == ("ball.toml: 7 rays, 14 hits, 7 escaped", 5)
-    assert lines[1].split()[-4:] == ["rms", "largest", "marginal", "paraxial"]
+    assert lines[1].split()[-5:] == ["rms", "largest", "marginal", "paraxial", "NA"]
+    assert lines[2].split()[-1] == "0.814889"  # sin 2(i − r)
     assert lines[4].split()[3:6] == ["1.5", "0.5", "-0.5"]
     assert "1.10445, 0" in lines[2]  # sin i / sin 2(i − r) for sin i = 0.9, sin r = 0.6
     spread = json.loads(trace("--table", "--json")[1])["foci"][0]["spread"]
     assert spread["marginal"][0] == pytest.approx(1.1044455683692647, abs=1e-12)
     assert spread["paraxial"] == pytest.approx([1.5, 0], abs=1e-14)
     assert spread["cardinal"]["focal_length"] == pytest.approx(1.5, rel=1e-14)
+    assert spread["aperture"] == pytest.approx(math.sin(2 * (math.asin(0.9) - math.asin(0.6))), rel=1e-14)
     assert "foci" not in json.loads(trace("--json")[1])
 
 

@@ -185,7 +185,11 @@ BAD = [  # what is replaced, by what: the place and what was found or expected
     ("shape = [", "shape = 3 # [", "expected TOML"),
     ("max_depth = 5", "max_depth = .5", "max_depth = .5: numbers have a digit on either side of the point, as 0.8"),
     ("max_depth = 5", "index = [ 1., 2]", "index = [ 1., 2]: numbers have a digit on either side of the point"),
-    ('title = "A disc"', "title = Disc", "line 1, column 9): title = Disc: text is in quotes; true and false are in lower"),
+    (
+        'title = "A disc"',
+        "title = Disc",
+        "line 1, column 9): title = Disc: text is in quotes; true and false are in lower",
+    ),
     (SHAPES, "", "object missing required field `shape`"),
     (SHAPES, "shape = []\n", "shape: expected `array` of length >= 1"),
     (BEAMS, "", "object missing required field `beam`"),
@@ -244,7 +248,10 @@ LENS = DISC.replace('"circle"', '"lens"') + "thickness = 1\ncurvature = [1, -1]\
         (DISC + FAN * 17, "beam[16].count: 17000000 rays in this beam and those before it; expected up to 16777216"),
         (LENS.replace("radius = 1", "radius = 2"), "shape[0].radius = 2: a surface is smaller"),
         (LENS.replace("radius = 1\n", "").replace("-1", "2"), "shape[0].curvature = [1.0, 2.0]: the surfaces never"),
-        (LENS.replace("curvature", "R1 = 1\ncurvature"), "shape[0]: curvature, R1, R2; expected either `curvature`, or"),
+        (
+            LENS.replace("curvature", "R1 = 1\ncurvature"),
+            "shape[0]: curvature, R1, R2; expected either `curvature`, or",
+        ),
         (LENS.replace("curvature = [1, -1]", "R1 = 1"), "shape[0]: curvature, R1, R2; expected either `curvature`, or"),
     ],
 )
@@ -287,7 +294,9 @@ def toml(value):
     changes=strategies.lists(strategies.tuples(strategies.integers(0, 20), VALUES), max_size=2),
 )
 def test_whatever_the_values_a_file_is_a_scene_or_one_line(tmp_path_factory, kind, changes):
-    fields = [name for name in kind.__struct_fields__ if name not in ("within", "outside", "facets", "arcs", "R1", "R2")]
+    fields = [
+        name for name in kind.__struct_fields__ if name not in ("within", "outside", "facets", "arcs", "R1", "R2")
+    ]
     table = {"kind": kind.__struct_config__.tag} | {name: PLAUSIBLE.get(name, 1) for name in fields}
     table |= {kind.__struct_fields__[j % len(kind.__struct_fields__)]: value for j, value in changes}
     path = tmp_path_factory.getbasetemp() / "any.toml"
@@ -341,7 +350,10 @@ def test_a_shape_may_touch_what_it_lies_in_and_must_not_contradict_it(read):
     inner = [(1.3, 1.1), (1.3, 1.5), (1.3, 1.7), (1.5, 1.1), (1.5, 1.1), (1.7, 1.1), (1.7, 1.1), (1.7, 1.1)]
     assert media_of(read(TWO.format(first="0.3", second="2.3", more=INNER))) == inner
     for more, expected in (
-        (INNER.replace(', within = "left"', ""), r"shape\[2\]: along shape\[0\] 'left' there is index 1.5; expected 1.1"),
+        (
+            INNER.replace(', within = "left"', ""),
+            r"shape\[2\]: along shape\[0\] 'left' there is index 1.5; expected 1.1",
+        ),
         (AGAIN, r"shape\[2\]: along shape\[0\] 'left' there is index 1.5; expected 1.1"),
         (ALONG, r"shape\[2\]: it runs along shape\[0\] 'left'"),
     ):
