@@ -12,9 +12,7 @@ from mi_refract.rendering import scene_files
 
 from .doctor import activate
 
-app = typer.Typer(
-    help="Write scenes for other renderers.", no_args_is_help=True, add_completion=False, rich_markup_mode=None
-)
+app = typer.Typer(help="Write scenes for other renderers.", add_completion=False, rich_markup_mode=None)
 
 SCENES = Path(__file__).parents[2] / "scenes"  # of a checkout; an installed package has none
 

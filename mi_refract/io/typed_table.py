@@ -57,7 +57,10 @@ def convert(value: Any, kind: type[T], where: str, *, infinite: bool = False) ->
         key = re.sub(r"^(key` in `)?\$\.?", "", path)
         message = f"{message[0].lower()}{message[1:]}".replace("object contains unknown field", "unknown key")
         message = message.replace(r"matching regex '\\S'", "that is not blank")
-        if message.startswith(("unknown key", "invalid ")) and (names := _names(kind, value, path)):
+        message = re.sub("(expected `array`.*), got `object`", r"\1 of tables, [[…]] in TOML, got one table", message)
+        if missing := re.fullmatch(r"object missing required field `(\w+)`", message):
+            path = f"{path or '$'}.{missing[1]}"
+        if (missing or message.startswith(("unknown key", "invalid "))) and (names := _names(kind, value, path)):
             message = f"{message}; expected {', '.join(names)}"
         raise ValueError(" ".join(f"{where}: {f'{key}: ' if key else ''}{message}".split())) from None
 

@@ -17,7 +17,7 @@ from mi_refract import backend, cli
 from mi_refract.cli import app
 
 
-@pytest.mark.parametrize("arguments", [["nonesuch"], ["render"], ["doctor", "extra"], ["several lines"]])
+@pytest.mark.parametrize("arguments", [["nonesuch"], ["render"], ["scene"], ["doctor", "extra"], ["several lines"]])
 def test_an_error_is_one_line(arguments, capfd, monkeypatch):
     def fails(*arguments, **options):
         raise ValueError("first\n  second\n")

@@ -191,6 +191,13 @@ BAD = [  # what is replaced, by what: the place and what was found or expected
         "line 1, column 9): title = Disc: text is in quotes; true and false are in lower",
     ),
     (SHAPES, "", "object missing required field `shape`"),
+    (SHAPES, "[shape]\nradius = 1\n", "shape: expected `array` of tables, [[…]] in TOML, got one table"),
+    (
+        'kind = "circle", ',
+        "",
+        "shape[0]: object missing required field `kind`; expected polygon, rectangle, prism, circle",
+    ),
+    ("radius = 2,", "", "shape[0]: object missing required field `radius`"),
     (SHAPES, "shape = []\n", "shape: expected `array` of length >= 1"),
     (BEAMS, "", "object missing required field `beam`"),
 ]
