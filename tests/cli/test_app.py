@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import mitsuba as mi
 import pytest
 import typer
 from support.processes import ENVIRONMENT, python
+from support.readme import blocks
 
 import mi_refract
 from mi_refract import backend, cli
@@ -68,20 +71,42 @@ def commands_of(command, name=""):
 
 
 COMMANDS = commands_of(typer.main.get_command(app.app))
+ROOT = Path(mi_refract.__file__).parents[1]
+READMES = [ROOT / "README.md", *ROOT.glob("mi_refract/*/README.md"), ROOT / "validation/README.md"]
+
+
+@pytest.fixture
+def parsed(monkeypatch, capfd):
+    """`parsed("mi-refract rays check a.csv")`: the command that it would run, after its options were checked."""
+    called = []
+    monkeypatch.setattr(typer.core.TyperCommand, "invoke", lambda self, context: called.append(context.command_path))
+
+    def parse(line):
+        called[:] = []
+        program, *words = shlex.split(line, comments=True)
+        assert (program, app.main(words)) == ("mi-refract", 0), (line, capfd.readouterr().err)
+        return called[0] if called else line  # `--keys` and the like print and end before that
+
+    return parse
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_help_ends_with_two_or_three_examples_that_are_parsed(name, capfd, monkeypatch):
+def test_every_help_ends_with_two_or_three_examples_that_are_parsed(name, capfd, parsed):
     assert app.main([*name.split(), "--help"]) == 0
     *_, head, examples = capfd.readouterr().out.partition("\n  Examples:\n")
     examples = [line.strip() for line in examples.splitlines()]
     assert head and len(examples) in (2, 3)
-    parsed = []
-    monkeypatch.setattr(typer.core.TyperCommand, "invoke", lambda self, context: parsed.append(context.command_path))
     for line in examples:
-        program, *words = shlex.split(line)
-        assert (program, app.main(words)) == ("mi-refract", 0)
-    assert parsed and all(command.startswith(f"mi-refract {name}".strip()) for command in parsed)
+        assert parsed(line).startswith(f"mi-refract {name}".strip())
+
+
+@pytest.mark.parametrize("path", READMES, ids=lambda path: path.parent.name)
+def test_the_command_lines_of_a_readme_are_parsed(path, parsed):
+    lines = [line for block in blocks(path, "bash") for line in block.replace("\\\n", " ").splitlines()]
+    lines = [line for line in lines if line.startswith("mi-refract ")]
+    assert lines or path.parent.name in ("formulas", "media", "plugins", "validation")
+    for line in lines:
+        parsed(re.sub(r"[>|;&].*|\[[^]]*\]", "", line))
 
 
 HEAVY = ("mitsuba", "drjit", "numpy", "OpenImageIO", "matplotlib", "scipy")
