@@ -352,8 +352,9 @@ def table(groups: Sequence[Group]) -> str:
     for rows in parts:
         lines = [(*a, *b) for a, b in zip(names, rows, strict=True)]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        text += ["  ".join(f"{c:{w}}" for c, w in zip(line, widths, strict=True)).rstrip() for line in lines]
-    return "\n".join(text)
+        cells = ["  ".join(f"{c:{w}}" for c, w in zip(line, widths, strict=True)).rstrip() for line in lines]
+        text.append("\n".join(cells))
+    return "\n\n".join(text)
 
 
 def _text(value: Point | float | None) -> str:

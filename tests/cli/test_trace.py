@@ -94,10 +94,10 @@ def test_the_table(trace):
     code, out, err = trace("--table")
     assert (code, err) == (0, "")
     lines = out.splitlines()
-    assert (lines[0], len(lines)) == ("ball.toml: 7 rays, 14 hits, 7 escaped", 5)
+    assert (lines[0], len(lines)) == ("ball.toml: 7 rays, 14 hits, 7 escaped", 6)
     assert lines[1].split()[-5:] == ["rms", "largest", "marginal", "paraxial", "NA"]
     assert lines[2].split()[-1] == "0.814889"  # sin 2(i − r)
-    assert lines[4].split()[3:6] == ["1.5", "0.5", "-0.5"]
+    assert lines[5].split()[3:6] == ["1.5", "0.5", "-0.5"]
     assert "1.10445, 0" in lines[2]  # sin i / sin 2(i − r) for sin i = 0.9, sin r = 0.6
     spread = json.loads(trace("--table", "--json")[1])["foci"][0]["spread"]
     assert spread["marginal"][0] == pytest.approx(1.1044455683692647, abs=1e-12)
@@ -109,7 +109,7 @@ def test_the_table(trace):
 
 def test_a_spot_on_a_plane(trace):
     code, out, err = trace("--plane", "-2,0")
-    assert (code, err, len(out.splitlines())) == (0, "", 7)
+    assert (code, err, len(out.splitlines())) == (0, "", 9)
     one, other = (
         json.loads(trace("--json", "--plane", at)[1])["foci"][0]["spread"]["on_plane"] for at in ("3,0", "3,5,180")
     )
