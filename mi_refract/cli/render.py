@@ -121,7 +121,8 @@ def render(
     with spinner or contextlib.nullcontext():
         rendering = resume(job, output, limits, restart=restart)
     if rendering.progress.passes:
-        print(printable(f"{output}: resuming from {rendering.progress.done} spp"), file=sys.stderr)
+        state = "complete with" if rendering.end() else "resuming from"
+        print(printable(f"{output}: {state} {rendering.progress.done} spp"), file=sys.stderr)
     with (
         cluster_passes(cluster, rendering, str(chosen), bundle_limit, mixed=mixed_workers) as passes,
         interrupts.last_act(rendering.give_up),

@@ -13,9 +13,7 @@ from mi_refract.rendering import scene_files
 
 from .doctor import activate
 
-app = typer.Typer(
-    help="Write scenes for other renderers.", no_args_is_help=True, add_completion=False, rich_markup_mode=None
-)
+app = typer.Typer(help="Write scenes for other renderers.", add_completion=False, rich_markup_mode=None)
 
 # `mi_refract/scenes` of an installed package; of a checkout, `scenes` beside the package.
 SCENES = next((x for x in (Path(__file__).parents[i] / "scenes" for i in (1, 2)) if x.is_dir()), Path("scenes"))
