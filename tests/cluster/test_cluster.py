@@ -18,8 +18,8 @@ import distributed
 import pytest
 from distributed import CancelledError
 from distributed.comm import CommClosedError, connect
-from support.dask_workers import accepted, kill, tls_settings, until
-from support.processes import ENVIRONMENT, python
+from support.dask_workers import accepted, kill, tls_settings
+from support.processes import ENVIRONMENT, python, until
 
 from mi_refract.cluster import on_worker
 from mi_refract.cluster import workers as workers_module
@@ -240,11 +240,6 @@ def process_of(seconds):
     return os.getpid()
 
 
-def wait_for(path):
-    while not path.exists():
-        time.sleep(0.05)
-
-
 def half(x):
     return 1 / (x - 3)
 
@@ -295,7 +290,7 @@ def test_who_is_refused_gets_no_call(workers):
 
 
 def test_what_is_not_finished_is_cancelled(workers, tmp_path):
-    found = results(workers, wait_for, [(tmp_path,), *[(tmp_path / "end",)] * 3])
+    found = results(workers, until, [(tmp_path.exists,), *[((tmp_path / "end").exists,)] * 3])
     next(found)
     found.close()
     until(lambda: not any(workers.client.processing().values()), seconds=10)

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from support.dask_workers import accepted, joined, kill, until
-from support.processes import python
+from support.dask_workers import accepted, joined, kill
+from support.processes import python, until
 from support.renders import GLASS
 
 from mi_refract.cluster import workers as workers_module
