@@ -21,10 +21,11 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+
+from .io.safe_files import temporary_folder
 
 CHOICE = "DRJIT_LIBLLVM_PATH"  # where Dr.Jit looks first
 OWN_CHOICE = "MI_REFRACT_LIBLLVM"  # set to the same value where the choice was ours, not the user's
@@ -286,9 +287,9 @@ def _try(path: str) -> Library:
 
 def _probe(name: str, environment: dict[str, str]) -> tuple[str, bool]:
     """(defect, lasting) of a backend, tried in a process of its own. A lasting defect would be found again."""
-    with tempfile.TemporaryDirectory(prefix="mi_refract-", ignore_cleanup_errors=True) as folder:
+    with temporary_folder() as folder:
         # An empty kernel cache: a kernel on disk would not be compiled.
-        own = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "DRJIT_CACHE_DIR": folder}
+        own = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "DRJIT_CACHE_DIR": str(folder)}
         command = [sys.executable, "-c", _PROBE, name]
         try:
             done = subprocess.run(

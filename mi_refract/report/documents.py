@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
-from xml.etree import ElementTree as xml
 
 from mi_refract.io.safe_files import write_atomically
 from mi_refract.io.text import compact, distinguishable, printable, printable_lines
@@ -87,6 +86,8 @@ def write_junit(path: str | Path, name: str, suites: Mapping[str, Sequence[Case]
 
     Errors: OSError.
     """
+    from xml.etree import ElementTree as xml  # not needed for pages
+
     root = xml.Element("testsuites", name=printable(name))
     for title, cases in suites.items():
         suite = xml.SubElement(root, "testsuite", {"name": printable(title)} | _counts(cases))
