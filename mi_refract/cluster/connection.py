@@ -68,7 +68,13 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
     if (scheduler is None) == (workers is None):
         raise UsageError("expected either --scheduler ADDRESS or --workers N")
     _require_dask()
-    from distributed import security as dask_security
+    import distributed
+
+    async def kind() -> str:
+        """What answers at the address, as it says."""
+        options = {"timeout": PATIENCE / 2, "connection_args": security.get_connection_args("client")}
+        async with asyncio.timeout(PATIENCE), distributed.rpc(address, **options) as there:
+            return str((await there.identity()).get("type"))
 
     with contextlib.ExitStack() as stack:
         stack.enter_context(warnings.catch_warnings())
@@ -83,36 +89,24 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
         else:
             address = str(scheduler)
             # None: as Dask's configuration says.
-            security = dask_security.Security(require_encryption=address.startswith("tls://") or None)
-        client = _client(address, security)
+            security = distributed.Security(require_encryption=address.startswith("tls://") or None)
+        try:
+            # First, as a client that found nobody would take 16 s to give up.
+            if (answering := asyncio.run(kind())) != "Scheduler":
+                raise ValueError(f"a Dask {answering} answers there")
+            # Results come from the workers themselves where these can be reached, else through the scheduler.
+            options: dict[str, Any] = {"timeout": PATIENCE, "set_as_default": False, "direct_to_workers": True}
+            client = distributed.Client(address, security=security, **options)
+        except Exception as error:
+            texts = [" ".join(str(cause).split()) for cause in (error.__cause__, error) if cause is not None]
+            text = re.sub(r"in <[^>]*>: ", "", next(filter(None, texts), f"not within {PATIENCE:.0f} s"))
+            reason = f"no Dask scheduler answers: {text[:200]}; {_EXPECTED}"
+            raise ConnectionError(f"--scheduler {address}: {reason}") from None
         try:
             yield client
         finally:
             with contextlib.suppress(Exception):  # a scheduler that is gone
                 client.close(timeout=2.0)
-
-
-def _client(address: str, security: Security) -> Client:
-    import distributed
-
-    async def kind() -> str:
-        """What answers at the address, as it says."""
-        options = {"timeout": PATIENCE / 2, "connection_args": security.get_connection_args("client")}
-        async with asyncio.timeout(PATIENCE), distributed.rpc(address, **options) as there:
-            return str((await there.identity()).get("type"))
-
-    try:
-        # First, as a client that found nobody would take 16 s to give up.
-        if (answering := asyncio.run(kind())) != "Scheduler":
-            raise ValueError(f"a Dask {answering} answers there")
-        # Results come from the workers themselves where these can be reached, else through the scheduler.
-        return distributed.Client(
-            address, security=security, timeout=PATIENCE, set_as_default=False, direct_to_workers=True
-        )
-    except Exception as error:
-        texts = [" ".join(str(cause).split()) for cause in (error.__cause__, error) if cause is not None]
-        text = re.sub(r"in <[^>]*>: ", "", next(filter(None, texts), f"not within {PATIENCE:.0f} s"))
-        raise ConnectionError(f"--scheduler {address}: no Dask scheduler answers: {text[:200]}; {_EXPECTED}") from None
 
 
 @contextlib.contextmanager

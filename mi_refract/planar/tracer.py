@@ -210,27 +210,24 @@ class Tracer:
     def _search(self, gone: float) -> SearchState:
         return SearchState(self.arrays.number(gone), self.arrays.index(NOWHERE))
 
-    def _nearest(self, state: PathState) -> tuple[Hit, SearchState, Mask]:
-        """The first boundary ahead, and whether that is settled or the search must go on."""
-        boundaries, ray, active, start = self.boundaries, state.ray, state.active, self.boundaries.start(state.ray)
-        if self.mesh:
-            return self.mesh.nearest(boundaries, ray, start, state.search, active)
-
-        def test(i: Index, best: Hit) -> tuple[Index, Hit]:
-            return i + 1, boundaries.nearer(best, ray, start, i)
-
-        def more(i: Index, best: Hit) -> Mask:
-            return active & (i < boundaries.count)
-
-        hit = dr.while_loop((self.arrays.index(0), boundaries.none()), more, test, label="boundaries")[1]
-        return hit, state.search, self.arrays.mask(True)
-
     def _step(self, state: PathState, bits: Index | None, most: Index, scatter: Scatter, weights: bool) -> PathState:
         """Search once for the next boundary, and cross it if it is found, or end the path.
 
         bits: of `reflect`; most: the greatest depth.
         """
-        hit, search, settled = self._nearest(state)
+        boundaries, ray, start = self.boundaries, state.ray, self.boundaries.start(state.ray)
+
+        def test(i: Index, best: Hit) -> tuple[Index, Hit]:
+            return i + 1, boundaries.nearer(best, ray, start, i)
+
+        def more(i: Index, best: Hit) -> Mask:
+            return state.active & (i < boundaries.count)
+
+        if self.mesh:  # the first boundary ahead may not be settled: then the search goes on
+            hit, search, settled = self.mesh.nearest(boundaries, ray, start, state.search, state.active)
+        else:
+            hit = dr.while_loop((self.arrays.index(0), boundaries.none()), more, test, label="boundaries")[1]
+            search, settled = state.search, self.arrays.mask(True)
         some = state.active & settled & (hit.segment != NOWHERE)
 
         def leg(state: PathState, event: Any, index: Number, active: Mask) -> None:

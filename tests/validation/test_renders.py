@@ -72,6 +72,7 @@ def test_what_is_the_same_is_not_tested_by_chance_and_still_compared(small):
     )
     assert right.verdict == "pass" and right.reason.startswith("left out: Welch's test")
     assert "Welch alarms" not in right.values and not right.curves
+    assert not right.images and wrong.images  # of one colour there is nothing to see
     assert {"|mean ratio − 1|", "changed share"} <= set(wrong.broken)
     quiet, noisy = np.ones((4, 8, 8, 3)), np.random.default_rng(1).random((4, 8, 8, 3))
     assert against_dielectric._budgets("nested", "").keys() == {"|mean ratio − 1|", "Welch alarms"}
