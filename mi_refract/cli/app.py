@@ -79,7 +79,8 @@ EXAMPLES = {
         "rays run --medium SCHOTT:N-BK7 --wavelengths 450,550,650 -- ./my_tracer",
         "rays run --renderer my_renderer/ --junit out.xml",
     ),
-    "scene": ("scene export sphere --to cycles", "scene export my_scene.xml --to obj+json"),
+    "scene": ("scene list", "scene export sphere --to cycles", "scene export my_scene.xml --to obj+json"),
+    "scene list": ("scene list", "scene export prism --to mitsuba"),
     "scene export": (
         "scene export sphere --to cycles",
         "scene export my_scene.xml --to povray -o povray/ --level 6 -D bsdf=refract",
