@@ -435,10 +435,8 @@ class UnfollowedLight:
 
     def report(self, bsdf: Refract, active: Mask) -> None:
         """RuntimeError, or a warning when the image is computed, where a lane is `active`; once a BSDF."""
-        v, text = (
-            self.v,
-            f"{PLUGIN}: {absorbing_parameter(bsdf)}; expected the integrator refract_path, or no absorption",
-        )
+        v, parameter = self.v, absorbing_parameter(bsdf)
+        text = f"{PLUGIN}: {parameter}; expected the integrator refract_path, or no absorption"
 
         def warn(_: str) -> None:
             bsdf.reported = True
@@ -446,15 +444,15 @@ class UnfollowedLight:
                 self.logged = True
                 mi.Log(mi.LogLevel.Warn, f"{text}; where light meets it, the image is not finite")  # type: ignore[operator]
 
-        if bsdf.reported:
-            return
-        self.logged = False
-        if dr.flag(dr.JitFlag.FreezingScope):  # nothing can be read
-            warn("")
-        elif not dr.flag(dr.JitFlag.SymbolicScope):
+        frozen = dr.flag(dr.JitFlag.FreezingScope)  # there nothing can be read
+        if not frozen and not dr.flag(dr.JitFlag.SymbolicScope):
             if dr.any(active):
                 raise RuntimeError(text)
-        else:
+        elif not bsdf.reported:
+            self.logged = False
+            if frozen:
+                warn("")
+                return
             order = dr.scatter_inc(dr.opaque(v.UInt32, 0), v.UInt32(0), active)
             dr.print("", order=order, active=active & (order == 0), file=SimpleNamespace(write=warn))
 

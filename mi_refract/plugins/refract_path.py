@@ -171,8 +171,8 @@ def integrator_class(v: Variant) -> type:
             # Local memory has no derivatives, and the evaluated loops that derivatives need have no local memory.
             symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
             if self.deterministic and needs.chance:
-                text = f"{INTEGRATOR}: deterministic = true, and {needs.chance}"
-                raise ValueError(f"{text}; expected only smooth dielectrics and conductors")
+                expected = "expected only smooth dielectrics and conductors"
+                raise ValueError(f"{INTEGRATOR}: deterministic = true: {needs.chance}; {expected}")
             if self.deterministic and not symbolic:
                 raise ValueError(f"{INTEGRATOR}: deterministic = true; such a render cannot be differentiated")
             if not symbolic and needs.refracting and needs.smooth and needs.area:

@@ -64,7 +64,7 @@ class SceneFeatures:
     media: bool  # some shape, sensor or emitter has a medium of Mitsuba's
     shape_media: bool  # some shape has one
     refracting: bool  # some BSDF has a refracted direction
-    chance: str  # a shape whose BSDF is not of `DETERMINISTIC`, in words; "" where there is none
+    chance: str  # the first plugin that is not of `DETERMINISTIC`, and its shape; "" where there is none
     unknown: tuple[str, ...] = ()
 
     @property
@@ -91,9 +91,17 @@ def inspect(scene: Scene) -> SceneFeatures:
     """What a Mitsuba scene needs as it is now; an edit of its parameters can change that."""
     shapes, emitters, sky = all_shapes(scene), scene.emitters(), scene.environment()
     opaque = [shape.class_name() for shape in shapes if shape.class_name() not in KNOWN_SHAPES]
-    bsdfs = [bsdf for shape in shapes if not _black(shape.bsdf()) for bsdf in nested(shape.bsdf())]
+    within = [[] if _black(shape.bsdf()) else [*nested(shape.bsdf())] for shape in shapes]
+    bsdfs = [bsdf for each in within for bsdf in each]
     names = {bsdf_name(bsdf) for bsdf in bsdfs}
     unknown = tuple(sorted((names - KNOWN) | {*opaque}))
+    random = {*opaque, *(names - DETERMINISTIC)}
+    chance = (
+        f"{kind} at {shape_name(shapes, i)}"
+        for i in (range(len(shapes)) if random else ())
+        for kind in (shapes[i].class_name(), *map(bsdf_name, within[i]))
+        if kind in random
+    )
     everything = bool(unknown)
     lobes = mi.BSDFFlags
     flags = functools.reduce(operator.or_, (bsdf.flags() for bsdf in bsdfs), 0)
@@ -124,18 +132,9 @@ def inspect(scene: Scene) -> SceneFeatures:
         media=shape_media or any(end.get_medium() for end in (*emitters, *scene.sensors())),
         shape_media=shape_media,
         refracting=everything or bool(flags & +lobes.Transmission),
-        chance=next(filter(None, (_chance(shapes, i) for i in range(len(shapes)))), ""),
+        chance=next(chance, ""),
         unknown=unknown,
     )
-
-
-def _chance(shapes: list[Shape], position: int) -> str:
-    shape, name = shapes[position], shape_name(shapes, position)
-    bsdfs = [] if _black(shape.bsdf()) else [bsdf_name(bsdf) for bsdf in nested(shape.bsdf())]
-    kinds = [kind for kind in bsdfs if kind not in DETERMINISTIC]
-    if shape.class_name() not in KNOWN_SHAPES:
-        return f"{name} is of the class {shape.class_name()}"
-    return f"{name} has a BSDF of the class {kinds[0]}" if kinds else ""
 
 
 def all_shapes(scene: Scene) -> list[Shape]:

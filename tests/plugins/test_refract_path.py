@@ -196,18 +196,18 @@ BLEND = {"type": "blendbsdf", "weight": 0.5, "a": {"type": "refract"}, "b": {"ty
 
 
 @pytest.mark.parametrize(
-    ("other", "said"),
+    ("other", "kind"),
     [
-        ({"bsdf": {"type": "diffuse"}}, "'other' has a BSDF of the class SmoothDiffuse"),
-        ({"bsdf": {"type": "thindielectric"}}, "'other' has a BSDF of the class ThinDielectric"),
-        ({"bsdf": BLEND}, "'other' has a BSDF of the class BlendBSDF"),
-        ({"type": "instance", "group": {"type": "ref", "id": "group"}}, "'other' is of the class Instance"),
+        ({"bsdf": {"type": "diffuse"}}, "SmoothDiffuse"),
+        ({"bsdf": {"type": "thindielectric"}}, "ThinDielectric"),
+        ({"bsdf": BLEND}, "BlendBSDF"),
+        ({"type": "instance", "group": {"type": "ref", "id": "group"}}, "Instance"),
     ],
 )
-def test_what_would_be_left_to_chance_is_refused_by_name(other, said, llvm_variant):
+def test_what_would_be_left_to_chance_is_refused_by_name(other, kind, llvm_variant):
     group = {"type": "shapegroup", "id": "group", "ball": {"type": "sphere", "bsdf": BLACK}}
     scene = glass_ball(sky=LIT, group=group, other={"type": "sphere"} | other)
-    text = f"refract_path: deterministic = true, and {said}; expected only smooth dielectrics and conductors"
+    text = f"refract_path: deterministic = true: {kind} at 'other'; expected only smooth dielectrics and conductors"
     assert refusal(render, scene, 1, deterministic=True) == text
 
 
