@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +25,7 @@ LINES = {
 # fmt: on
 Coefficients = Mapping[str, Number]
 ANY = (0.0, math.inf)
+NANOMETRES = 1000  # in a µm
 TABLE_VALUES = "values"  # among the coefficients of a table: all of them, in one array
 
 
@@ -172,6 +173,16 @@ def sellmeier(values: Sequence[float], squared: bool = False) -> tuple[Terms, di
     pairs = tuple((f"B{i}", f"{letter}{i}") for i in range(1, len(values) // 2 + 1))
     names = [b for b, _ in pairs] + [r for _, r in pairs]
     return Terms(2, 1.0, resonances=pairs, squared=squared), dict(zip(names, values, strict=True))
+
+
+def power_series(power: int, terms: Iterable[tuple[float, float]]) -> tuple[Terms, dict[str, float]]:
+    """n or n² (`power` 1 or 2) = Σ a λ^p, of pairs of a and p for λ in µm. The coefficients, a0, a2, a_2, …: in nm."""
+    totals: dict[float, float] = {}
+    for a, p in terms:
+        totals[p] = totals.get(p, 0.0) + a
+    names = {p: f"a{p:g}".replace("-", "_").replace(".", "_") for p in totals}
+    form = Terms(power, powers=tuple((name, p) for p, name in names.items()))
+    return form, {names[p]: a / NANOMETRES**p for p, a in totals.items()}
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import json
 from pathlib import Path
 from typing import NamedTuple
 
-from .dispersion import Dispersion, Medium, Terms, sellmeier
+from .dispersion import NANOMETRES, Dispersion, Medium, power_series, sellmeier
 
 FILE = Path(__file__).with_name("glasses.json")
 CATALOGS = ("CDGM", "HIKARI", "HOYA", "OHARA", "SCHOTT", "SUMITA")
@@ -25,7 +25,6 @@ CATALOGS = ("CDGM", "HIKARI", "HOYA", "OHARA", "SCHOTT", "SUMITA")
 _TO_12TH = (0, 2, 4, -2, -4, -6, -8, -10, -12)
 _TO_8TH = (0, 2, -2, -4, -6, -8)
 POWERS = {"CDGM": _TO_8TH, "HIKARI": _TO_12TH, "HOYA": _TO_8TH, "SUMITA": _TO_8TH}
-NANOMETRES = 1000  # in a µm
 
 
 class Glass(NamedTuple):
@@ -58,9 +57,7 @@ def load(catalog: str, glass: str, label: str) -> Medium:
         raise ValueError(f"{label}: its catalogue has no formula for this glass; use another glass, or table(…)")
     form: Dispersion
     if catalog in POWERS:  # n² = Σ a_p λ^p, Schott's formula of before 1992
-        names = {p: f"a{p}" if p >= 0 else f"a_{-p}" for p in POWERS[catalog]}
-        form = Terms(2, powers=tuple((names[p], p) for p in names))
-        coefficients = {names[p]: x / NANOMETRES**p for p, x in zip(names, entry.coefficients, strict=True)}
+        form, coefficients = power_series(2, zip(entry.coefficients, POWERS[catalog], strict=True))
     else:
         form, coefficients = sellmeier([x * (1 if i < 3 else NANOMETRES**2) for i, x in enumerate(entry.coefficients)])
     return Medium(f"{catalog}:{name}", form, coefficients, entry.range, "air", fitted=entry.fitted)

@@ -17,11 +17,10 @@ from typing import Any
 from mi_refract.io import safe_files
 from mi_refract.io.text import parse_number
 
-from .dispersion import Medium, Terms, table
+from .dispersion import NANOMETRES, Medium, Terms, power_series, table
 
 LARGEST = 2**24  # bytes of a file
 PREFIX = "file:"
-NANOMETRES = 1000  # in a µm
 UNIT = re.compile(r"(?<![a-z])(?:(nm)|[uµμ]m)(?![a-z])")  # in the header of a CSV
 EXPECTED = "a .csv, a .yml of refractiveindex.info, or a glass of a Zemax catalogue as file:NAME.agf:GLASS"
 # Powers of λ of the coefficients of AGF's formulas of n²; of Conrady's, 5, of n.
@@ -136,20 +135,13 @@ def _entry(kind: list[str], entry: dict[str, Any]) -> Medium:
         raise ValueError(f"{len(c)} coefficients; expected an odd number of them")
     first, number, pairs = c[0], kind[1], list(zip(c[1::2], c[2::2], strict=True))
     if number in ("3", "5"):
-        return _powers(2 if number == "3" else 1, [(first, 0), *pairs], (low, high))
+        return Medium("", *power_series(2 if number == "3" else 1, [(first, 0), *pairs]), (low, high))
     if number not in ("1", "2", "6"):
         raise ValueError(f"formula {number}; expected formula 1, 2, 3, 5 or 6, or a table")
     if number == "6":  # n − 1 = C1 + Σ k/(k₀ − λ⁻²), and k/(k₀ − λ⁻²) = (k/k₀) λ²/(λ² − 1/k₀)
         pairs = [(k / k_0, 1 / k_0) for k, k_0 in pairs]
     pairs = [(b, x * x) for b, x in pairs] if number == "1" else pairs
     return _resonances(1 if number == "6" else 2, first, pairs, (low, high))
-
-
-def _powers(power: int, terms: Sequence[tuple[float, float]], valid: tuple[float, float]) -> Medium:
-    """n or n² = Σ a λ^p, λ in µm."""
-    names = [f"C{i}" for i in range(1, len(terms) + 1)]
-    form = Terms(power, powers=tuple((name, p) for name, (_, p) in zip(names, terms, strict=True)))
-    return Medium("", form, {name: a / NANOMETRES**p for name, (a, p) in zip(names, terms, strict=True)}, valid)
 
 
 def _resonances(power: int, first: float, pairs: Sequence[tuple[float, float]], valid: tuple[float, float]) -> Medium:
@@ -183,7 +175,8 @@ def _zemax(text: str, glass: str) -> Medium:
         pairs = [*zip(c[::2], c[1::2], strict=False)][: AGF_SELLMEIER[number]]
         medium = _resonances(2, 0.0, pairs, (low, high))
     elif number in AGF_POWERS:
-        medium = _powers(1 if number == 5 else 2, [*zip(c, AGF_POWERS[number], strict=False)], (low, high))
+        terms = zip(c, AGF_POWERS[number], strict=False)
+        medium = Medium("", *power_series(1 if number == 5 else 2, terms), (low, high))
     else:
         known = ", ".join(map(str, sorted([*AGF_POWERS, *AGF_SELLMEIER])))
         raise ValueError(f"glass {glass}: formula {number}; expected one of {known}")

@@ -134,11 +134,15 @@ def parse(spec: float | str, name: str = "", find: Callable[[str], Path] = Path)
     label = f"{name} = {spec!r}" if name else repr(spec)
     if isinstance(spec, str):
         return _of_text(spec.strip(), label, find)
-    if isinstance(spec, bool) or not isinstance(spec, (int, float)) or not 0 < spec < math.inf:
+    return _of_number(spec, label)
+
+
+def _of_number(n: float, label: str) -> Medium:
+    if isinstance(n, bool) or not isinstance(n, (int, float)) or not 0 < n < math.inf:
         raise ValueError(f"{label}; expected a positive finite number, or a material's name")
-    if 100_000 <= spec < 1_000_000 and spec == int(spec):
-        raise ValueError(f"{label}; expected an index; the code of a glass is a text: '{spec:.0f}'")
-    return Medium(str(spec), CONSTANT, {"n": float(spec)})
+    if 100_000 <= n < 1_000_000 and n == int(n):
+        raise ValueError(f"{label}; expected an index; the code of a glass is a text: '{n:.0f}'")
+    return Medium(str(n), CONSTANT, {"n": float(n)})
 
 
 def file_in(text: str) -> str:
@@ -156,11 +160,9 @@ def _of_text(text: str, label: str, find: Callable[[str], Path]) -> Medium:
     try:
         number = parse_number(text)
     except ValueError:
-        number = None
-    if number is not None:
-        if not 0 < number < math.inf:
-            raise ValueError(f"{label}; expected a positive finite number, or a material's name")
-        return Medium(text, CONSTANT, {"n": number})
+        pass
+    else:
+        return _of_number(number, label)
     if index_files.split(text)[0]:
         return _checked(replace(index_files.read(text, label, find), name=text), label)
     if ":" in text.partition("(")[0]:

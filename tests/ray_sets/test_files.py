@@ -187,6 +187,8 @@ def test_a_glass_is_the_same_in_any_case_and_an_unknown_one_has_nearest_names():
     assert lower.header == upper.header
     assert lower.header["media"] == [["SCHOTT:N-BK7", "air"], ["air", "SCHOTT:N-BK7"]]
     assert lower.rays.k[0] == pytest.approx(1.5168, abs=1e-5)
+    code = ray_set.make(["generic"], 4, media=("517642",), wavelengths=(587.5618,))
+    assert code.rays.k[0] == pytest.approx(1.517, rel=1e-6) and code.header["media"][0] == ["517642", "air"]
     with pytest.raises(ValueError, match=r"unknown glass; .*nearest: SCHOTT:N-BK7, \S+, \S+$"):
         ray_set.make(["generic"], media=("SCHOTT:N-BK8",), wavelengths=(500.0,))
 
