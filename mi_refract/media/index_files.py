@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_refract.io import safe_files
+from mi_refract.io.errors import MissingExtraError
 from mi_refract.io.text import parse_number
 
 from .dispersion import NANOMETRES, Medium, Terms, power_series, table
@@ -49,7 +50,7 @@ def split(text: str) -> tuple[str, str]:
 def read(text: str, label: str, find: Callable[[str], Path]) -> Medium:
     """The medium that `text` names, as `split` reads it.
 
-    ValueError, in one line, for a file that cannot be read, or holds no index.
+    ValueError, in one line, for a file that cannot be read, or holds no index. MissingExtraError without PyYAML.
 
     label: the parameter and its value, for the message. find: where a file is.
     """
@@ -107,8 +108,10 @@ def _tabulated(kind: str, rows: Sequence[Sequence[float]]) -> Medium:
 
 def _refractiveindex_info(text: str) -> Medium:
     """Formulas 1, 2, 3, 5 and 6 and tables; see "Dispersion formulas" there. Of several entries the first with n."""
-    import yaml
-
+    try:
+        import yaml
+    except ModuleNotFoundError:
+        raise MissingExtraError("YAML needs PyYAML: pip install 'mi-refract[yaml]'") from None
     try:
         page: Any = yaml.safe_load(text)
         entries = [(str(entry["type"]).split(), entry) for entry in page["DATA"]]

@@ -2,6 +2,7 @@
 printed elsewhere, and the one line that a scene gets for anything else."""
 
 import math
+import sys
 
 import drjit as dr
 import numpy as np
@@ -416,6 +417,13 @@ def test_k_and_the_reference_of_an_index_are_read(said, relative, tmp_path):
     (tmp_path / "nk.yml").write_text(NK)
     held = media.parse(f"hold(file:{tmp_path}/nk.yml)")
     assert (held.k, held.hold) == (((400, 500, 900), (1e-7, 2e-7, 3e-7)), True)
+
+
+def test_yaml_is_an_extra_that_the_error_names(tmp_path, monkeypatch):
+    (tmp_path / "glass.yml").write_text(NK)
+    monkeypatch.setitem(sys.modules, "yaml", None)
+    with pytest.raises(ImportError, match=r"YAML needs PyYAML: pip install 'mi-refract\[yaml\]'"):
+        media.parse(f"file:{tmp_path}/glass.yml")
 
 
 def test_held_beyond_its_range_an_index_is_that_of_its_end_and_a_warning(vectorised):
