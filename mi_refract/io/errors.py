@@ -11,6 +11,7 @@ import contextlib
 import functools
 import io
 import os
+import select
 import sys
 import traceback
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from typing import Any
 
 from .text import printable
 
-MISUSE, INTERRUPTED = 2, 130
+MISUSE, INTERRUPTED, UNREAD = 2, 130, 141
 TRACEBACK = "MI_REFRACT_TRACEBACK"  # environment variable: with "1" the traceback is printed as well
 
 
@@ -60,8 +61,9 @@ def exit_code(
     """What `body()` returns, None as 0; 2 after any exception, and 130 after Ctrl-C or one of `interruptions`.
 
     The exception is one line on stderr, `name: …`. What the body printed is on its way when this returns: a stdout
-    that cannot be written is an exception as well. A standard stream that is closed is replaced by the null device, so
-    that no file of ours takes its number.
+    that cannot be written is an exception as well. A pipe that nobody reads any more, as before `| head`, is no error
+    and no verdict: 141, without a line. A standard stream that is closed is replaced by the null device, so that no
+    file of ours takes its number.
     """
     for number, (stream, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         if getattr(sys, stream) is None:
@@ -128,9 +130,16 @@ def _write_named(write: Callable[[Any, Any], int | None], stdout: Any, content: 
 
 
 def _failed(name: str, error: BaseException) -> int:
+    unread = False
     with contextlib.suppress(OSError, ValueError):  # a stderr that cannot be written says nothing
+        if isinstance(error, BrokenPipeError):
+            pipe = select.poll()
+            pipe.register(sys.stdout, 0)
+            unread = bool(pipe.poll(0))  # POLLERR: its reader has gone; else another pipe broke
+    with contextlib.suppress(OSError, ValueError):
         print_traceback(error)
-        print(f"{name}: {describe(error)}", file=sys.stderr, flush=True)
+        if not unread:
+            print(f"{name}: {describe(error)}", file=sys.stderr, flush=True)
     for output in (sys.stdout, sys.stderr):
         try:
             output.flush()
@@ -138,4 +147,4 @@ def _failed(name: str, error: BaseException) -> int:
             # What is left would be tried again when Python ends, and change the exit code to 120.
             with contextlib.suppress(OSError, ValueError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())
-    return MISUSE
+    return UNREAD if unread else MISUSE

@@ -10,7 +10,7 @@ import importlib.util
 import io
 import math
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from mi_refract.io.image_file import srgb_encode
 from mi_refract.io.safe_files import write_atomically
 
+from . import focal_points
 from .curves import points
 from .light import linear_srgb
-from .path_tree import Branches, count, summary
+from .path_tree import Branches, count, mismatches, summary
 from .scene_file import PlanarScene
 from .segments import Array, Event, Segments
 
@@ -41,10 +42,7 @@ NIGHT, MOON = (0.06, 0.07, 0.09), "#8a93a0"  # around all shapes, and their outl
 LINE = 0.13  # inches
 NAMED = 5  # media in the legend
 TYPICAL = 0.35  # opacity/(1 − opacity) of a typical density, where that is drawn
-MARKS = {
-    Event.MAX_DEPTH: ("o", "○ {} stopped after `max_depth` boundaries, with another one ahead"),
-    Event.MEDIUM_MISMATCH: ("x", "× {} stopped: the next boundary does not border on the medium that the ray is in"),
-}
+MARKS = {Event.MAX_DEPTH: "o", Event.MEDIUM_MISMATCH: "x"}
 UNDATED: dict[str, Any] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}, ".png": {}}
 TICKS = {"color": "#b5b5b5", "labelcolor": MUTED, "labelsize": 8}
 STYLE: Any = {
@@ -57,6 +55,7 @@ STYLE: Any = {
     **{"legend.frameon": False, "legend.fontsize": 8, "legend.labelcolor": INK},
 }
 MARGIN = 0.08  # around the scene, as a share of its larger side
+FAR = 8
 SHARED = -1  # the number of the colour that stands for all of them
 SAMPLES = 2**22  # pixels of lines at a time: 0.3 GB
 View = tuple[float, float, float, float]  # x0, x1, y0, y1
@@ -91,14 +90,18 @@ def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> 
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
-    view = scene.view or around(scene, traced)
-    # Without its caption, in inches: of about the same area for every view.
-    ratio = min(max((view[1] - view[0]) / (view[3] - view[2]), 0.25), 4)
-    height = min(5.2 / ratio**0.5, 7.0)
-    width, height = max(height * ratio, 3.6) + 0.6, height + 0.95
-    numbers = count(traced)
-    notes = [text.format(numbers[event.name]) for event, (_, text) in MARKS.items() if numbers[event.name]]
-    lines = [f"{scene.file}: {summary(scene, traced)}", *notes]
+    foci = focal_points.foci(scene, traced)
+    view = scene.view or around(scene, traced, foci)
+    # Without its caption, in inches: of about the same area for every view, but not wider than a page.
+    ratio = max((view[1] - view[0]) / (view[3] - view[2]), 0.25)
+    height = max(min(5.2 / ratio**0.5, 10.4 / ratio, 7.0), 0.6)
+    width, height = min(max(height * ratio, 3.6), 10.4) + 0.6, height + 0.95
+    lines = [f"{scene.file}: {summary(scene, traced)}", *(f"× {line}" for line in mismatches(scene, traced))]
+    if number := count(traced)["MAX_DEPTH"]:
+        lines.append(f"○ {number} stopped after `max_depth` boundaries, with another one ahead")
+    inside = ((foci >= view[::2]) & (foci <= view[1::2])).all(axis=1)
+    if inside.any():
+        lines.append("◇ focus: the point nearest to all rays of a beam")
     caption = [part for line in lines for part in textwrap.wrap(line, int(14 * width))]
     drawn = Figure((width, height + LINE * len(caption)), dpi, layout="constrained")
     panel = drawn.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal")
@@ -116,17 +119,18 @@ def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> 
     # Boundaries, rays, and marks where a path ended without escaping.
     many = len(scene.segments[0]) > LINES
     outlines = curves(scene.segments[0], 5 if many else 33)
-    style: dict[str, Any] = {"colors": MOON if scene.light.wavelengths else INK, "capstyle": "round", "zorder": 1.5}
+    ink = MOON if scene.light.wavelengths else INK
+    style: dict[str, Any] = {"colors": ink, "capstyle": "round", "zorder": 1.5}
     style["linewidths"] = 0.7 * max(min(1.0, 8 / len(outlines)), 0.15)
     panel.add_collection(LineCollection(outlines, rasterized=many, **style), autolim=False)
     panel.plot(0, 0, "+", color=MUTED, markersize=5, markeredgewidth=0.6, zorder=1.4, scalex=False, scaley=False)
     _rays(panel, scene, legs(traced, view))
-    for event, (mark, _) in MARKS.items():
-        ends = np.concatenate([branches.tips[branches.end == event] for branches in traced])
+    marked = {mark: np.concatenate([x.tips[x.end == event] for x in traced]) for event, mark in MARKS.items()}
+    for mark, ends in (marked | {"D": foci[inside]}).items():
         if len(ends):
             size = min(1.0, (40 / len(ends)) ** 0.5)
             style = {"markersize": 1 + 4 * size, "markeredgewidth": 0.9 * size, "fillstyle": "none"}
-            panel.plot(*ends.T, mark, color=INK, zorder=3, scalex=False, scaley=False, **style)
+            panel.plot(*ends.T, mark, color=ink, zorder=3, scalex=False, scaley=False, **style)
     return drawn
 
 
@@ -137,14 +141,17 @@ def require_matplotlib() -> None:
 
 
 def _media(panel: Axes, scene: PlanarScene) -> None:
-    """Tint regions by index, paler the closer it is to the outermost medium's; a legend of up to NAMED media."""
+    """Tint regions by the rank of their index, paler towards the outermost medium's; a legend of up to NAMED media."""
     from matplotlib.patches import Patch, Polygon
 
     around = float(np.mean(scene.index))
     means = [float(np.mean(region.indices)) for region in scene.regions]
-    most = max((abs(n - around) for n in means), default=0)
     dark = bool(scene.light.wavelengths)
-    tints = {n: _tint((n - around) / (most or 1), dark) for n in (around, *means)}
+    # By rank, not by index: of 1, 1.45 and 1.48 the last two would look alike.
+    ranked = sorted({around, *means})
+    own = ranked.index(around)
+    most = max(own, len(ranked) - 1 - own, 1)
+    tints = {n: _tint((rank - own) / most, dark) for rank, n in enumerate(ranked)}
     panel.set_facecolor(tints[around])
     for region, n in zip(scene.regions, means, strict=True):
         style: dict[str, Any] = {"facecolor": tints[n], "edgecolor": "none", "zorder": 0.5}
@@ -158,17 +165,17 @@ def _media(panel: Axes, scene: PlanarScene) -> None:
     panel.legend(handles=patches, ncols=len(patches), handlelength=1.2, columnspacing=1.2, **place)
 
 
-def _tint(contrast: float, dark: bool) -> tuple[float, float, float]:
-    """A medium's colour by its contrast to the outermost one, −1 … 1. Denser media are blue, thinner ones yellow.
+def _tint(rank: float, dark: bool) -> tuple[float, float, float]:
+    """A medium's colour by its rank above the outermost one, −1 … 1. Denser media are blue, thinner ones yellow.
 
     dark: behind rays that shine in their own colours.
     """
-    hue = np.array(DENSE if contrast > 0 else THIN)
+    hue = np.array(DENSE if rank > 0 else THIN)
     if dark:
-        share = abs(contrast) and 0.3 + 0.7 * abs(contrast)
+        share = abs(rank) and 0.3 + 0.7 * abs(rank)
         red, green, blue = np.array(NIGHT) + 0.2 * share * hue
     else:
-        share = abs(contrast) and 0.15 + 0.85 * abs(contrast) ** 1.5
+        share = abs(rank) and 0.15 + 0.85 * abs(rank) ** 1.5
         red, green, blue = 1 - share * (1 - hue)
     return float(red), float(green), float(blue)
 
@@ -201,7 +208,7 @@ def _rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
     from matplotlib.colors import to_rgb
 
     if scene.light.wavelengths:  # light adds up where lines would cover each other
-        _shade(panel, lines, {SHARED: np.ones(3)} | dict(enumerate(linear_srgb(scene.light))), _add_light, srgb_encode)
+        _shade(panel, lines, {SHARED: np.ones(3)} | dict(enumerate(linear_srgb(scene.light))), light=True)
         return
     colours = {}
     for number, name in [(SHARED, WHITE), *enumerate(scene.light.names)]:
@@ -212,7 +219,7 @@ def _rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
     x0, x1, y0, y1 = *panel.get_xlim(), *panel.get_ylim()
     crowd = np.hypot(*(lines.end - lines.start).T).sum() / math.hypot(x1 - x0, y1 - y0)
     if len(lines.start) > LINES or crowd > DIAGONALS:
-        _shade(panel, lines, colours, _blend)
+        _shade(panel, lines, colours, light=False)
     elif len(lines.start):  # thinner and fainter the less room there is; the strongest on top
         room = min(1.0, (40 / crowd) ** 0.5)
         order = np.argsort(lines.weight, kind="stable")
@@ -223,17 +230,8 @@ def _rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
         panel.add_collection(LineCollection(strokes, **style), autolim=False)
 
 
-def _shade(
-    panel: Axes,
-    lines: Legs,
-    colours: dict[int, Array],
-    mix: Callable[[Any, Any], tuple[Array, Array]],
-    encode: Callable[[Any], Any] = np.asarray,
-) -> None:
-    """Draw the density of the legs as an image, with as many pixels as the panel has.
-
-    mix: of densities and colours by number, the sum (… × 3) and its size, by which it is divided to get the colour.
-    """
+def _shade(panel: Axes, lines: Legs, colours: dict[int, Array], *, light: bool) -> None:
+    """Draw the density of the legs as an image, with as many pixels as the panel has: as light, or as ink."""
     box = panel.get_window_extent()
     view = *panel.get_xlim(), *panel.get_ylim()
     width, height = max(round(box.width), 1), max(round(box.height), 1)
@@ -241,47 +239,49 @@ def _shade(
     for number in colours:
         own = Legs(*(x[lines.colour == number] for x in vars(lines).values()))
         layers[number] = density(own, view, width, height)
-    mixed, size = mix(layers, colours)
+    # The sum of the layers (… × 3), and its size, by which it is divided to get the colour.
+    if light:  # adds up, and is as bright as its typical density is shown
+        mixed = np.clip(sum(layers[number][..., None] * colours[number] for number in layers), 0, None)
+        size = mixed.max(axis=2)
+    else:  # what all colours have in common gets the colour of SHARED
+        shared = layers.pop(SHARED)
+        parts = np.stack(list(layers.values())) / len(layers)
+        common = parts.min(axis=0) * (len(layers) > 1)
+        shared = shared + common * len(layers)
+        size = shared + (parts - common).sum(axis=0)
+        mixed = shared[..., None] * colours[SHARED]
+        for part, number in zip(parts - common, layers, strict=True):
+            mixed += part[..., None] * colours[number]
     colour = np.divide(mixed, size[..., None], out=np.ones_like(mixed), where=size[..., None] > 0)
     lit = size[size > 0]
     # The median alone would make a beam black beside faint reflections all over the view; the mean, those white.
     dense = size * TYPICAL / math.sqrt(lit.mean() * np.median(lit)) if lit.size else size
     opacity = dense / (1 + dense)  # saturates later than 1 − exp(−dense)
-    pixels = (np.dstack([encode(colour), encode(opacity)]) * 255).round().astype(np.uint8)
+    rgba = np.dstack([colour, opacity])
+    pixels = ((srgb_encode(rgba) if light else rgba) * 255).round().astype(np.uint8)
     style: dict[str, Any] = {"extent": view, "origin": "lower", "aspect": "equal", "zorder": 2}
     panel.imshow(pixels, **style)
-
-
-def _blend(layers: dict[int, Any], colours: dict[int, Any]) -> tuple[Array, Array]:
-    """Densities by colour. What all colours have in common gets the colour of SHARED."""
-    shared = layers.pop(SHARED)
-    parts = np.stack(list(layers.values())) / len(layers)
-    common = parts.min(axis=0) * (len(layers) > 1)
-    shared = shared + common * len(layers)
-    total = shared + (parts - common).sum(axis=0)
-    mixed = shared[..., None] * colours[SHARED]
-    for part, number in zip(parts - common, layers, strict=True):
-        mixed += part[..., None] * colours[number]
-    return mixed, total
-
-
-def _add_light(layers: dict[int, Any], colours: dict[int, Any]) -> tuple[Array, Array]:
-    """Densities by wavelength. Light adds up, and is as bright as its typical density is shown."""
-    light = np.clip(sum(layers[number][..., None] * colours[number] for number in layers), 0, None)
-    return light, light.max(axis=2)
 
 
 # Geometry --------------------------------------------------------------------------------------------------------
 
 
-def around(scene: PlanarScene, traced: Sequence[Branches]) -> View:
-    """The view that holds all boundaries and all places where rays meet them, with a margin."""
+def around(scene: PlanarScene, traced: Sequence[Branches], foci: Array) -> View:
+    """The view that holds all boundaries, all places where rays meet them, and near foci (F × 2), with a margin.
+
+    A focus is near where the view is at most FAR times as long with it.
+    """
     segments = scene.segments[0]
     places = [segments.start, segments.end, *(region.outline for region in scene.regions)]
     places += [branches.paths.points[:, 1:].reshape(-1, 2) for branches in traced]
     points = np.concatenate(places)
     points = points[np.isfinite(points).all(axis=1)]
     low, high = points.min(axis=0), points.max(axis=0)
+    most = FAR * float((high - low).max())
+    for focus in foci:
+        lower, upper = np.minimum(low, focus), np.maximum(high, focus)
+        if (upper - lower).max() <= most:
+            low, high = lower, upper
     pad = MARGIN * (float((high - low).max()) or 1.0)
     return float(low[0] - pad), float(high[0] + pad), float(low[1] - pad), float(high[1] + pad)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -174,6 +174,29 @@ def summary(scene: PlanarScene, traced: Sequence[Branches]) -> str:
     return ", ".join([_plural(rays, "ray") + colours, *split, hits, *said])
 
 
+def mismatches(scene: PlanarScene, traced: Sequence[Branches], most: int = 3) -> list[str]:
+    """A line for each pair of shapes between which paths ended with MEDIUM_MISMATCH, for the `most` frequent pairs."""
+    found: Counter[tuple[str, ...]] = Counter()
+    examples: dict[tuple[str, ...], str] = {}
+    for segments, branches in zip(scene.segments, traced, strict=True):
+        ends, last, indices = (
+            np.flatnonzero(branches.end == Event.MEDIUM_MISMATCH),
+            branches.last,
+            branches.paths.indices,
+        )
+        assert indices is not None
+        met = np.stack([branches.paths.hits[ends, last[ends] - j] for j in (1, 0)], axis=1)  # none begins with one
+        for (before, at), j, number in zip(*np.unique(met, axis=0, return_index=True, return_counts=True), strict=True):
+            pair = tuple(sorted({scene.shape_names[before], scene.shape_names[at]}))
+            found[pair] += int(number)
+            media = f"between {segments.n_left[at]:.6g} and {segments.n_right[at]:.6g}"
+            examples.setdefault(pair, f"in index {indices[ends[j], last[ends[j]]]:.6g} met a boundary {media}")
+    return [
+        f"{' and '.join(pair)} overlap, leave a gap, or are turned round: {_plural(number, 'path')} {examples[pair]}"
+        for pair, number in found.most_common(most)
+    ]
+
+
 def _plural(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
@@ -181,37 +204,34 @@ def _plural(number: int, what: str) -> str:
 def as_data(scene: PlanarScene, traced: Sequence[Branches]) -> dict[str, Any]:
     """What `mi-refract trace --json` prints: the paths per colour, without padding; null for unknown numbers."""
     names, wavelengths = scene.light.names, scene.light.wavelengths or (None,) * len(scene.light)
+    colours = []
+    for name, wavelength, branches in zip(names, wavelengths, traced, strict=True):
+        paths, indices, polarised = branches.paths, branches.paths.indices, branches.paths.polarised
+        assert indices is not None and polarised is not None
+        listed: list[dict[str, Any]] = [
+            {
+                "ray": int(ray),
+                "beam": int(scene.beams[ray]),
+                "reflect": int(branches.reflect[i]),
+                "points": paths.points[i][np.isfinite(paths.points[i][:, 0])].tolist(),
+                "direction": paths.directions[i].tolist(),
+                "hits": paths.hits[i, paths.hits[i] >= 0].tolist(),
+                "events": [Event(event).name.lower() for event in paths.events[i, : last + 1]],
+                "indices": _nullable(indices[i, : last + 1]),
+                "weights": _nullable(branches.weights[i, : last + 1]),
+                "polarised": {wave: _nullable(polarised[i, : last + 1, j]) for j, wave in enumerate(("s", "p"))},
+            }
+            for i, (ray, last) in enumerate(zip(branches.rays, branches.last, strict=True))
+        ]
+        colours.append({"colour": name or None, "wavelength": wavelength, "paths": listed})
     return {
         "scene": str(scene.path),
         "title": scene.title,
         "max_depth": scene.max_depth,
         "branches": scene.branches,
         "counts": {name.lower(): number for name, number in count(traced).items() if name != "NONE"},
-        "colours": [
-            {"colour": name or None, "wavelength": wavelength, "paths": list(_paths(scene, branches))}
-            for name, wavelength, branches in zip(names, wavelengths, traced, strict=True)
-        ],
+        "colours": colours,
     }
-
-
-def _paths(scene: PlanarScene, branches: Branches) -> Iterator[dict[str, Any]]:
-    paths, weights, indices = branches.paths, branches.weights, branches.paths.indices
-    polarised = paths.polarised
-    assert indices is not None and polarised is not None
-    for i, last in enumerate(branches.last):
-        ray, points = int(branches.rays[i]), paths.points[i]
-        yield {
-            "ray": ray,
-            "beam": int(scene.beams[ray]),
-            "reflect": int(branches.reflect[i]),
-            "points": points[np.isfinite(points[:, 0])].tolist(),
-            "direction": paths.directions[i].tolist(),
-            "hits": paths.hits[i, paths.hits[i] >= 0].tolist(),
-            "events": [Event(event).name.lower() for event in paths.events[i, : last + 1]],
-            "indices": _nullable(indices[i, : last + 1]),
-            "weights": _nullable(weights[i, : last + 1]),
-            "polarised": {wave: _nullable(polarised[i, : last + 1, j]) for j, wave in enumerate(("s", "p"))},
-        }
 
 
 def _nullable(numbers: Array) -> list[float | None]:

@@ -40,6 +40,7 @@ def deep():
         (raises(ValueError("size = 0;\n  expected 1 or more")), 2, "it: size = 0; expected 1 or more"),
         (raises(OSError("folder: not writable")), 2, "it: folder: not writable"),
         (raises(FileNotFoundError(2, "No such file or directory", "a.exr")), 2, "it: a.exr: No such file or directory"),
+        (raises(BrokenPipeError(32, "Broken pipe")), 2, "it: Broken pipe"),  # of another pipe than stdout
         (raises(OSError(28, "No space left on device")), 2, "it: No space left on device"),
         (raises(ModuleNotFoundError("No module named 'scipy'")), 2, "it: No module named 'scipy'"),
         (raises(MemoryError()), 2, "it: out of memory"),
@@ -81,7 +82,7 @@ CASES = {
     "equal, stdout closed": ("ab", ">&-", 0, "", ""),
     "different, stdout closed": ("ac", ">&-", 1, "", ""),
     "different, all closed": ("ac", "<&- >&- 2>&-", 1, "", ""),
-    "equal, nobody reads": ("ab", "| sleep 0", 2, "", "mi-refract: stdout: Broken pipe"),
+    "equal, nobody reads": ("ab", "| sleep 0", 141, "", ""),
     "equal, disk full": ("ab", ">/dev/full", 2, "", "mi-refract: stdout: No space left on device"),
     "different, disk full": ("ac", "--github >/dev/full", 2, "", "mi-refract: stdout: No space left on device"),
     "unbuffered, disk full": ("ab", ">/dev/full", 2, "", "mi-refract: stdout: No space left on device"),
