@@ -211,7 +211,8 @@ def _check_settings(reference: Path, test: Path, names: Sequence[str], chosen: S
     """Print how each image would be compared, and which entries say so; 2 where that is wrong for one."""
     every = pairing.pairs(reference, test, chosen)
     pairs = pairing.named(every, names)
-    lines = [f"{pattern}: matches no image" for pattern in chosen.unused([pair.name for pair in pairs])]
+    unused = chosen.unused([pair.name for pair in pairs]) + pairing.unused_templates(every)
+    lines = [f"{pattern}: matches no image" for pattern in unused]
     checked = ((pair, pairing.error_of(pair, reference)) for pair in (*pairs, *pairing.wrong_entries(chosen, every)))
     errors = [f"{pair.name}: {error}" for pair, error in checked if error]
     text_reports.print_table(text_reports.settings_table(pairs))

@@ -119,8 +119,8 @@ def test_headers_that_say_the_same_in_other_words_are_equal():
 @pytest.mark.parametrize("method", ["auto", *SINGLE])
 def test_a_channel_that_one_image_has_besides_is_a_difference_with_a_name(method):
     ramp = np.arange(40 * 48.0).reshape(40, 48)
-    cases = (("A", 1, "A (opaque: 1 everywhere)"), ("Z", ramp, "Z"), ("Z", 0, "Z (0 everywhere)"))
-    for name, values, words in (*cases, ("l.A", 0.5, "l.A (0.5 everywhere)")):
+    cases = (("l.A", 1, "l.A (opaque: 1 everywhere)"), ("Z", ramp, "Z"), ("Z", 0, "Z (0 everywhere)"))
+    for name, values, words in (*cases, ("A", 0.5, "A (0.5 everywhere)")):
         plain, more = of(SMOOTH), of(np.dstack([SMOOTH, np.broadcast_to(values, (40, 48))]), (*"RGB", name))
         for sides, word in (((plain, more), "added"), ((more, plain), "missing")):
             result = compare(method, *sides)
