@@ -190,9 +190,10 @@ def _linear(image: Image) -> Pixels:
 
 def _codes(image: Image) -> Pixels:
     """Codes of sRGB, H × W × C, from 0 to 255; of alpha to half of that, its part on average over black and white."""
+    white = 127.5 if image.channels == (ALPHA,) else 255.0
     if encoding(image) == "sRGB":
-        return (255 if image.channels != (ALPHA,) else 127.5) * np.nan_to_num(image.select(_colours(image)))
-    return 255 * srgb_encode(np.clip(_linear(image), 0, 1))
+        return np.multiply(white, np.nan_to_num(image.select(_colours(image))))
+    return np.multiply(white, srgb_encode(np.clip(_linear(image), 0, 1)))
 
 
 def _colours(image: Image) -> tuple[str, ...]:

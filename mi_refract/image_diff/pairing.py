@@ -193,7 +193,7 @@ def _with_variants(pair: Result, others: Sequence[Path]) -> Result:
 def _matched(pair: Result, template: str, paths: Sequence[Path]) -> list[Path]:
     """Those of the paths that a template of `accept` means for the reference of a pair, by their names."""
     names = {path.relative_to(pair.target.parent).as_posix(): path for path in paths}
-    values = name_patterns.fields(pair.target.name) | pair.how.fields
+    values = {**name_patterns.fields(pair.target.name), **pair.how.fields}
     return [names[name] for name in name_patterns.expanded(template, values, sorted(names))]
 
 
@@ -207,7 +207,7 @@ def variant(target: Path, how: ComparisonSpec, name: str) -> Path:
     with_name = [template for template in how.accept if not set(template) & set("*?") and name in template]
     with_star = [template for template in how.accept if template.count("*") == 1 and "?" not in template]
     for template in with_name + with_star:
-        fields = name_patterns.fields(target.name) | how.fields | {"*": name}
+        fields = {**name_patterns.fields(target.name), **how.fields, "*": name}
         return target.parent / name_patterns.filled(template.replace("*", "{*}"), fields)
     raise ValueError(
         f"{target}: no template in `accept` contains {name} or exactly one *; add to [defaults] in mi-refract.toml: "
