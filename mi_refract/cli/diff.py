@@ -113,16 +113,10 @@ def diff(
 
         software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
         page.write(results, software, results.command("diff", *(names or [])), str(json or ""))
-    if junit:
-        text_reports.write_junit(junit, results)
-    if json:
+    if junit or json or github:
         from mi_refract.image_diff import results_file
 
-        results_file.write(json, results)
-    if github:  # last: a summary that cannot be written leaves the files
-        for line in text_reports.workflow_commands(results):
-            print(line)
-        text_reports.append_summary(results, str(report or ""), report_url)
+        results_file.write(results, junit, json, github, str(report or ""), report_url)
     raise typer.Exit(results.exit_code)
 
 

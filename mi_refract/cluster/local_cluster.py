@@ -11,15 +11,14 @@ import contextlib
 import logging
 import os
 import pickle
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from typing import Any
 
 from mi_refract.io.errors import NoWorkersError, UsageError
+from mi_refract.io.safe_files import temporary_folder
 
 MOST = 1024  # workers
 # Dask watches itself: its profiler and monitors would take 5 % of the workers' time from kernels.
@@ -76,29 +75,28 @@ def main() -> None:
     """Start, print the address, wait, and end with all workers."""
     signal.pthread_sigmask(signal.SIG_UNBLOCK, signal.valid_signals())
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is for who started us
-    folder = tempfile.mkdtemp(prefix="mi_refract-workers-")
     try:
         import dask
         from distributed import LocalCluster
 
         workers, security = pickle.load(sys.stdin.buffer)
         dask.config.set(SETTINGS)
-        cluster = LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            host="127.0.0.1",
-            protocol="tls://",
-            security=security,
-            dashboard_address=None,
-            local_directory=folder,
-            silence_logs=logging.CRITICAL,
-        )
-        print(cluster.scheduler_address, flush=True)
-        sys.stdin.buffer.read()
+        with temporary_folder() as folder:
+            cluster = LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                host="127.0.0.1",
+                protocol="tls://",
+                security=security,
+                dashboard_address=None,
+                local_directory=str(folder),
+                silence_logs=logging.CRITICAL,
+            )
+            print(cluster.scheduler_address, flush=True)
+            sys.stdin.buffer.read()
     except Exception as error:
         print(f"{type(error).__name__}: {' '.join(str(error).split())}", flush=True)
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
         if os.getpgrp() == os.getpid():  # workers are of our group: at once, whatever they render
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(os.getpid(), signal.SIGKILL)

@@ -177,24 +177,18 @@ def compare(
     for image in (*sides[0], *sides[1]):
         if len(set(image.channels)) < len(image.channels):
             raise ValueError(f"{image.path}: channels {', '.join(image.channels)}; expected each name once")
-    result = _compare_pixels(method, sides, allow_nonfinite, named, options)
-    if meant := metadata.difference([*sides[0], *sides[1]], ignore_metadata):
-        return replace(result.but(Verdict.DIFFERENT, meant), warning="")
-    return result
-
-
-def _compare_pixels(
-    method: str, sides: list[list[Image]], allow_nonfinite: bool, named: Collection[str], options: Options
-) -> Comparison:
-    if method != AUTO:
-        return _compare(method, sides, allow_nonfinite, named, options)
-    method, why = choice(*sides, spp=any(options.get(name) for name in ("spp", "spp_reference", "spp_test")))
-    options = {name: value for name, value in options.items() if name in METHODS[method].options}
+    why = ""
+    if by_auto := method == AUTO:
+        method, why = choice(*sides, spp=any(options.get(name) for name in ("spp", "spp_reference", "spp_test")))
+        options = {name: value for name, value in options.items() if name in METHODS[method].options}
     result = replace(_compare(method, sides, allow_nonfinite, named, options), chosen=why)
-    if method == "tolerance" and result.is_equal and result.metrics[0].value > 0 and not options.keys() & DECIDING:
+    changed = by_auto and method == "tolerance" and result.is_equal and result.metrics[0].value > 0
+    if changed and not options.keys() & DECIDING:
         a, b = _finite_pair(*(channels.without_variances(side[0], named) for side in sides))
         if where := pixelwise.outrageous(a, b, options.get("fail", METHODS[method].options["fail"].default)):
-            return result.but(Verdict.DIFFERENT, f"one pixel is far too bright: {where}")
+            result = result.but(Verdict.DIFFERENT, f"one pixel is far too bright: {where}")
+    if meant := metadata.difference([*sides[0], *sides[1]], ignore_metadata):
+        return replace(result.but(Verdict.DIFFERENT, meant), warning="")
     return result
 
 

@@ -77,6 +77,11 @@ class Result:
         return CATEGORIES.get(self.status, Category.UNKNOWN)
 
     @property
+    def word(self) -> str:
+        """The verdict in a word: of an image that only one side has, what happened to it."""
+        return str(self.category if None in (self.reference, self.test) else self.status)
+
+    @property
     def warning(self) -> str:
         """What does not change the verdict, but is to be looked at; "" for nothing."""
         return "; ".join(filter(None, [*self.warnings, self.comparison.warning if self.comparison else ""]))

@@ -1,87 +1,155 @@
-"""The JSON of `mi-refract diff --json`: written, and read again for accepting what it names.
+"""What programs read of a comparison: JUnit, GitHub's commands, JSON; and that JSON, read for accepting what it names.
 
-When it is read, its paths are taken as parts of two folders, which may be others than those that were compared: a CI's
-JSON fits the new images that were downloaded from it.
+When the JSON is read, its paths are taken as parts of two folders, which may be others than those that were compared:
+a CI's JSON fits the new images that were downloaded from it.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections import Counter
+import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 
 from mi_refract.io import safe_files
+from mi_refract.io.text import printable
 from mi_refract.io.typed_table import convert
 from mi_refract.report.row import write_strict_json
 
-from . import pairing
+from . import pairing, text_reports
 from .results import FAILED, Result, Results, Status
 from .settings import ComparisonSpec, Settings
-from .text_reports import sentence
+
+if TYPE_CHECKING:
+    from mi_refract.report import documents
 
 SCHEMA = 1
 MOST = 2**28  # bytes of a file
+OUTCOMES: dict[Status, Literal["", "failure", "error", "skipped"]] = {  # of JUnit
+    Status.ERROR: "error",
+    Status.DIFFERENT: "failure",
+    Status.INCONCLUSIVE: "failure",
+    Status.EQUAL: "",
+    Status.SKIPPED: "skipped",
+}
 EXPECTED = "expected a file that mi-refract diff --json wrote"
 PathText = Annotated[str, msgspec.Meta(min_length=1, pattern=r"^[^\0]*$")]
 Digest = Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$")]
 
 
-def write(path: str | Path, results: Results) -> None:
-    """Write `as_data` as strict JSON: NaN and the infinities become words. OSError."""
-    write_strict_json(path, as_data(results))
+def write(
+    results: Results,
+    junit: Path | None = None,
+    data: Path | None = None,
+    github: bool = False,
+    report: str = "",
+    url: str = "",
+) -> None:
+    """Write what programs read of the results: JUnit's XML, the JSON in `data`, and what GitHub shows of a job.
+
+    JUnit has a case for each image: "different" is a failure, "inconclusive" too unless it is to pass, no verdict an
+    error. JSON: `{"schema": 1, "exit_code", "sentence", "reference", "test", "counts", "results": [...]}`, in which NaN
+    and the infinities are words. For GitHub a workflow command is printed for each image that is not equal or has a
+    warning, and `text_reports.markdown` with `report` and `url` is appended to the file that $GITHUB_STEP_SUMMARY
+    names. Errors: OSError; a summary that cannot be written leaves the files.
+    """
+    from mi_refract.report import documents
+
+    if junit:
+        cases = [_junit_case(result, results) for result in results.results]
+        documents.write_junit(junit, "mi-refract diff", {str(results.test): cases})
+    if data:
+        document = {
+            "schema": SCHEMA,
+            "exit_code": results.exit_code,
+            "sentence": text_reports.sentence(results),
+            "reference": results.reference,
+            "test": results.test,
+            "renders": results.renders,
+            "counts": {str(status): len(results.of(status)) for status in Status},
+            "results": [_json_entry(result, results) for result in results.results],
+        }
+        write_strict_json(data, document)
+    if github:
+        for result in results.results:
+            if result.warning or result.status in FAILED:
+                print(_github_command(result, _outcome(result, results)))
+        if path := os.environ.get("GITHUB_STEP_SUMMARY"):
+            with safe_files.full_disk_names(path), Path(path).open("a", encoding="utf-8") as stream:
+                stream.write(text_reports.markdown(results, report, url))
 
 
-def as_data(results: Results) -> dict[str, Any]:
-    """`{"schema": 1, "exit_code", "sentence", "reference", "test", "counts", "results": [...]}`."""
-    counts = Counter(result.status for result in results.results)
-    entries = []
-    for result in results.results:
-        comparison, how, digests = result.comparison, result.how, None
-        if result.digests is not None and result.status in FAILED:  # of what was compared; "" where there is no file
-            one, two = (result.digests[path] if path else "" for path in (result.reference, result.test))
-            digests = {"reference": one, "test": two, "variants": [result.digests[path] for path in result.variants]}
-        entries.append({
-            "name": result.name,
-            "status": str(result.status),
-            "category": str(result.category),
-            "reason": result.reason,
-            "warning": result.warning,
-            "error": result.error,
-            "reference": result.reference,
-            "test": result.test,
-            "target": result.target,
-            "digests": digests,
-            "method": result.method,
-            "method_why": comparison.chosen if comparison else "",
-            "options": dict(how.options),
-            "channels": how.channels,
-            "variance": how.variance if how.reads_variance else "",
-            "mask": how.mask,
-            "ignore": how.ignore,
-            "why_so": how.reason,
-            "entries": how.entries,
-            "matched": result.matched,
-            "variants": result.variants,
-            "metrics": [vars(metric) for metric in comparison.metrics] if comparison else [],
-            "minimum_detectable_difference": comparison.minimum_detectable if comparison else math.nan,
-            "reproduce": results.reproduce(result),
-            "accept": results.accept(result)
-        })  # fmt: skip
+def _outcome(result: Result, results: Results) -> Literal["", "failure", "error", "skipped"]:
+    """What the image is for a test runner; "" where it passes."""
+    if result.status is Status.INCONCLUSIVE and results.inconclusive == "pass":
+        return ""
+    return OUTCOMES[result.status]
+
+
+def _junit_case(result: Result, results: Results) -> documents.Case:
+    from mi_refract.report import documents
+
+    outcome, reason, details, metrics = _outcome(result, results), text_reports.why(result), [], []
+    if result.warning and not outcome:
+        details.append(f"warning: {result.warning}")
+    if failed := outcome in ("failure", "error"):
+        commands = {"reproduce": results.reproduce(result), "accept": results.accept(result)}
+        details += [f"{verb}: {line}" for verb, line in commands.items() if line]
+        measured = result.comparison.metrics if result.comparison else ()
+        metrics = [(metric.name, metric.value, metric.bound) for metric in measured]
+    kind, message = result.word if failed else "", reason if outcome else ""
+    return documents.Case(result.method, result.name, outcome, message, details, kind, metrics)
+
+
+def _json_entry(result: Result, results: Results) -> dict[str, Any]:
+    comparison, how, digests = result.comparison, result.how, None
+    if result.digests is not None and result.status in FAILED:  # of what was compared; "" where there is no file
+        one, two = (result.digests[path] if path else "" for path in (result.reference, result.test))
+        digests = {"reference": one, "test": two, "variants": [result.digests[path] for path in result.variants]}
     return {
-        "schema": SCHEMA,
-        "exit_code": results.exit_code,
-        "sentence": sentence(results),
-        "reference": results.reference,
-        "test": results.test,
-        "renders": results.renders,
-        "counts": {str(status): counts[status] for status in Status},
-        "results": entries,
+        "name": result.name,
+        "status": str(result.status),
+        "category": str(result.category),
+        "reason": result.reason,
+        "warning": result.warning,
+        "error": result.error,
+        "reference": result.reference,
+        "test": result.test,
+        "target": result.target,
+        "digests": digests,
+        "method": result.method,
+        "method_why": comparison.chosen if comparison else "",
+        "options": dict(how.options),
+        "channels": how.channels,
+        "variance": how.variance if how.reads_variance else "",
+        "mask": how.mask,
+        "ignore": how.ignore,
+        "why_so": how.reason,
+        "entries": how.entries,
+        "matched": result.matched,
+        "variants": result.variants,
+        "metrics": [vars(metric) for metric in comparison.metrics] if comparison else [],
+        "minimum_detectable_difference": comparison.minimum_detectable if comparison else math.nan,
+        "reproduce": results.reproduce(result),
+        "accept": results.accept(result),
     }
+
+
+def _github_command(result: Result, outcome: str) -> str:
+    """The workflow command that shows the image beside the changes of a pull request."""
+    file, title = result.test or result.reference or result.name, f"{result.name}: {result.word}"
+    file, title = (_escaped(x).replace(":", "%3A").replace(",", "%2C") for x in (file, title))
+    level = "error" if outcome in ("failure", "error") else "warning"
+    return f"::{level} file={file},title={title}::{_escaped(text_reports.why(result))}"
+
+
+def _escaped(text: object) -> str:
+    """Text of a workflow command."""
+    return printable(text).replace("%", "%25")
 
 
 # What is read of it -------------------------------------------------------------------------------------------------
@@ -140,33 +208,32 @@ def read(path: str | Path, reference: Path | None = None, test: Path | None = No
         raise ValueError(f"{path}: written with --renders; expected the JSON of a comparison of single images")
     before = Path(document.reference), Path(document.test)
     now = reference or before[0], test or before[1]
-    results = tuple(
-        _result(f"{path}: results[{number}]", entry, before, now) for number, entry in enumerate(document.results)
-    )
-    return Results(*now, results)
-
-
-def _result(where: str, entry: Entry, before: tuple[Path, Path], now: tuple[Path, Path]) -> Result:
-    if entry.status not in FAILED:
-        return Result(entry.name, entry.status, None, None)
-    reference = _moved(f"{where}.reference", entry.reference, before[0], now[0]) if entry.reference else None
-    test = _moved(f"{where}.test", entry.test, before[1], now[1]) if entry.test else None
-    none = entry.target == "."  # of what is wrong in the settings and matches no image
-    target = Path() if none else _moved(f"{where}.target", entry.target, before[0], now[0])
-    # Of single files, the variants lie beside the reference.
-    roots = (before[0].parent, now[0].parent) if entry.target == str(before[0]) else (before[0], now[0])
-    variants = tuple(_moved(f"{where}.variants", each, *roots) for each in entry.variants)
-    digests = None
-    if entry.digests is not None:
-        if len(entry.digests.variants) != len(variants):
-            raise ValueError(f"{where}.digests: {len(entry.digests.variants)} of {len(variants)} variants; {EXPECTED}")
-        words = zip(variants, entry.digests.variants, strict=True)
-        pairs = [(reference, entry.digests.reference), (test, entry.digests.test), *words]
-        digests = {path: word for path, word in pairs if path}
-    options = {"allow_nonfinite": entry.options.get("allow_nonfinite") is True}
-    how = ComparisonSpec(options=options, variance=entry.variance)
-    result = Result(entry.name, entry.status, reference, test, how, error=entry.error)
-    return replace(result, digests=digests, target=target, variants=variants)
+    results = []
+    for number, entry in enumerate(document.results):
+        where = f"{path}: results[{number}]"
+        if entry.status not in FAILED:
+            results.append(Result(entry.name, entry.status, None, None))
+            continue
+        one = _moved(f"{where}.reference", entry.reference, before[0], now[0]) if entry.reference else None
+        two = _moved(f"{where}.test", entry.test, before[1], now[1]) if entry.test else None
+        none = entry.target == "."  # of what is wrong in the settings and matches no image
+        target = Path() if none else _moved(f"{where}.target", entry.target, before[0], now[0])
+        # Of single files, the variants lie beside the reference.
+        roots = (before[0].parent, now[0].parent) if entry.target == str(before[0]) else (before[0], now[0])
+        variants = tuple(_moved(f"{where}.variants", each, *roots) for each in entry.variants)
+        digests = None
+        if entry.digests is not None:
+            if len(entry.digests.variants) != len(variants):
+                count = f"{len(entry.digests.variants)} of {len(variants)} variants"
+                raise ValueError(f"{where}.digests: {count}; {EXPECTED}")
+            words = zip(variants, entry.digests.variants, strict=True)
+            pairs = [(one, entry.digests.reference), (two, entry.digests.test), *words]
+            digests = {file: word for file, word in pairs if file}
+        options = {"allow_nonfinite": entry.options.get("allow_nonfinite") is True}
+        how = ComparisonSpec(options=options, variance=entry.variance)
+        result = Result(entry.name, entry.status, one, two, how, error=entry.error)
+        results.append(replace(result, digests=digests, target=target, variants=variants))
+    return Results(*now, tuple(results))
 
 
 def _moved(where: str, text: str, before: Path, now: Path) -> Path:

@@ -269,7 +269,8 @@ def read_images(path: Path, max_values: int = image_file.MAX_VALUES) -> Pixels:
 def examine(renders: Pixels, case: str, trials: int = TRIALS, null_pairs: int = NULL_PAIRS) -> list[Row]:
     """The rows of every defect and of the null pairs on given renders of one image, number × H × W × C.
 
-    RENDERS or more, of independent seeds, are split in halves at random; of fewer, single images are compared.
+    RENDERS or more, of independent seeds, are split in halves at random, `trials` times for each defect; of fewer, each
+    image is compared once: more trials would repeat it.
     ValueError for values that are not finite: a planted NaN could not be distinguished from one that was there.
     """
     if not len(renders) or not np.isfinite(renders).all():
@@ -279,14 +280,12 @@ def examine(renders: Pixels, case: str, trials: int = TRIALS, null_pairs: int = 
     setting = f"{len(renders)} renders" if len(renders) > 1 else "1 render"
 
     def halves() -> tuple[Pixels, Pixels]:
-        if not half:
-            return renders[[rng.integers(len(renders))]], renders[:0]
         order = rng.permutation(len(renders))
         return renders[order[:half]], renders[order[half : 2 * half]]
 
     rows = []
     for name, defect in DEFECTS.items():
-        splits = [halves() for _ in range(trials)]
+        splits = [halves() for _ in range(trials)] if half else [(image[None], renders[:0]) for image in renders]
         planted = [Trial(clean, other, functools.partial(defect.spoil, clean)) for clean, other in splits]
         rows.append(detection(name, defect.always_due, planted, case, setting))
     nulls = (halves() for _ in range(null_pairs if half else 0))

@@ -1,4 +1,4 @@
-"""The results of `diff` as text: printed, for test runners (JUnit) and for GitHub.
+"""The results of `diff` as text for people: printed, and in Markdown for the summary of a GitHub job.
 
 Names of files and messages of errors may hold any character: each format escapes what would be read as more than text.
 """
@@ -10,11 +10,8 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Literal
 from urllib.parse import quote
 
-from mi_refract.io.safe_files import full_disk_names
 from mi_refract.io.text import printable
 
 from .results import FAILED, Result, Results, Status
@@ -46,7 +43,7 @@ def print_results(results: Results) -> None:
         failed = results.of(Status.DIFFERENT, Status.INCONCLUSIVE)
         rows: Rows = [("verdict", "image", "method", "why")]
         for result in [*failed, *_warned(results), *equal[:FEW], *results.of(Status.SKIPPED)]:
-            rows.append((_word(result), result.name, result.method_in_words, why(result)))
+            rows.append((result.word, result.name, result.method_in_words, why(result)))
         print_table(rows, STYLES)
         if len(equal) > FEW:
             print(f"… and {len(equal) - FEW} more that are equal")
@@ -113,70 +110,7 @@ def _warned(results: Results) -> list[Result]:
     return [result for result in results.of(Status.EQUAL) if result.warning]
 
 
-def _word(result: Result) -> str:
-    return str(result.category) if None in (result.reference, result.test) else str(result.status)
-
-
-# JUnit --------------------------------------------------------------------------------------------------------------
-
-
-def write_junit(path: str | Path, results: Results) -> None:
-    """One case for each image: "different" is a failure, "inconclusive" too unless it is to pass, no verdict an error.
-
-    Errors: OSError.
-    """
-    from mi_refract.report import documents
-
-    cases = []
-    for result in results.results:
-        outcome: Literal["", "failure", "error", "skipped"]
-        outcome = "skipped" if result.status is Status.SKIPPED else _outcome(results, result)
-        details = [f"warning: {result.warning}"] if result.warning and not outcome else []
-        kind, message = _word(result) if outcome in ("failure", "error") else "", why(result) if outcome else ""
-        metrics = []
-        if kind:
-            commands = {"reproduce": results.reproduce(result), "accept": results.accept(result)}
-            details += [f"{verb}: {line}" for verb, line in commands.items() if line]
-            measured = result.comparison.metrics if result.comparison else ()
-            metrics = [(metric.name, metric.value, metric.bound) for metric in measured]
-        cases.append(documents.Case(result.method, result.name, outcome, message, details, kind, metrics))
-    documents.write_junit(path, "mi-refract diff", {str(results.test): cases})
-
-
-def _outcome(results: Results, result: Result) -> Literal["", "failure", "error"]:
-    """Whether the image fails the run."""
-    if result.status is Status.ERROR:
-        return "error"
-    passes = result.status in (Status.EQUAL, Status.SKIPPED) or (
-        result.status is Status.INCONCLUSIVE and results.inconclusive == "pass"
-    )
-    return "" if passes else "failure"
-
-
-# GitHub -------------------------------------------------------------------------------------------------------------
-
-
-def workflow_commands(results: Results) -> list[str]:
-    """A workflow command for each image that is not equal, or has a warning."""
-    lines = []
-    for result in results.results:
-        if result.warning or result.status in FAILED:
-            level = "error" if _outcome(results, result) else "warning"
-            file, title = result.test or result.reference or result.name, f"{result.name}: {_word(result)}"
-            file, title = (_message(x).replace(":", "%3A").replace(",", "%2C") for x in (file, title))
-            lines.append(f"::{level} file={file},title={title}::{_message(why(result))}")
-    return lines
-
-
-def _message(text: object) -> str:
-    return printable(text).replace("%", "%25")
-
-
-def append_summary(results: Results, report: str = "", url: str = "") -> None:
-    """Append the Markdown to the file that GitHub names in $GITHUB_STEP_SUMMARY, where it does. OSError."""
-    if path := os.environ.get("GITHUB_STEP_SUMMARY"):
-        with full_disk_names(path), Path(path).open("a", encoding="utf-8") as file:
-            file.write(markdown(results, report, url))
+# GitHub's summary --------------------------------------------------------------------------------------------------
 
 
 def markdown(results: Results, report: str = "", url: str = "") -> str:
@@ -196,7 +130,7 @@ def markdown(results: Results, report: str = "", url: str = "") -> str:
     if failed:
         lines += ["| verdict | image | method | why |", "|---|---|---|---|"]
     for result in failed[:SUMMARY_ROWS]:
-        words = (_word(result), result.name, result.method_in_words, why(result))
+        words = (result.word, result.name, result.method_in_words, why(result))
         lines.append(f"| {' | '.join(map(_literal, words))} |")
     if len(failed) > SUMMARY_ROWS:
         lines += ["", f"… and {len(failed) - SUMMARY_ROWS} more"]

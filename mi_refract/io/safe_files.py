@@ -1,7 +1,8 @@
 """Files: only regular ones are read; they are either the old version or the new one, never half of it; and locks.
 
 They are written under a temporary name in the same folder and renamed at the end. An exception or Ctrl-C removes the
-temporary one; a process that SIGKILL ends leaves it behind, hidden (`.NAME.….part`).
+temporary one; a process that SIGKILL ends leaves it behind, hidden (`.NAME.….part`). A temporary folder that is left
+behind is removed by the next process that makes one.
 A lock is the operating system's (`flock`), so it ends with the process that holds it, however that ends.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import functools
 import hashlib
 import json
 import os
@@ -31,7 +33,9 @@ _KEPT = 40  # characters of the file's own name: a name of 255 bytes has no room
 _KINDS = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 _LONGEST_CHANGE = 5.0  # seconds that creating or renaming may take on a slow file system
 _unfinished: set[Path] = set()
+_PREFIX = "mi_refract_"  # of temporary folders
 _TEMPORARY = re.compile(r"\.[0-9a-f]{32}\.part")
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
 _changing = threading.Lock()  # held where `_unfinished` changes, or a file in it is created or renamed
@@ -144,14 +148,41 @@ def full_disk_names(path: str | os.PathLike[str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """A new folder for temporary files, removed at the end, also by `end_process`."""
-    with _changing:
-        folder = Path(tempfile.mkdtemp(prefix="mi_refract-"))
-        _unfinished.add(folder)
+    """A new folder for temporary files, removed at the end, also by `end_process`.
+
+    Folders whose processes were killed are removed first: as long as a process lives, it holds a lock on its folder.
+    """
+    parent = Path(tempfile.gettempdir())
+    _remove_abandoned(parent)
+    while True:
+        with _changing:
+            folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
+            _unfinished.add(folder)
+        with contextlib.suppress(FileNotFoundError):  # another process found it before it was locked
+            lock = os.open(folder, _FOLDER)
+            with contextlib.suppress(OSError):  # a file system without locks: nobody gets one
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            if folder.is_dir():
+                break
+            os.close(lock)
     try:
         yield folder
     finally:
         _discard(folder)
+        os.close(lock)
+
+
+@functools.cache  # once in a process
+def _remove_abandoned(parent: Path) -> None:
+    for folder in parent.glob(f"{_PREFIX}*"):
+        with contextlib.suppress(OSError):  # locked, another user's, or gone meanwhile
+            lock = os.open(folder, _FOLDER)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if os.fstat(lock).st_uid == os.getuid():
+                    shutil.rmtree(folder, ignore_errors=True)
+            finally:
+                os.close(lock)
 
 
 def _discard(temporary: Path) -> None:
@@ -222,7 +253,11 @@ def held(path: Path, what: str, place: Path | None = None, expected: str = "anot
             os.close(file)  # its holder removed it meanwhile
         except BlockingIOError:
             os.close(file)
-            where = f"{place or path.parent}: {what} is already running {_holder(path)}"
+            holder = "in an unknown process"
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError), path.open("rb") as text:
+                said = json.loads(text.read(1000))  # it need not be complete: nobody waits for that
+                holder = f"in process {said['process']} on {said['host']} since {said['since']}"
+            where = f"{place or path.parent}: {what} is already running {holder}"
             raise BlockingIOError(f"{where}; expected {expected}") from None
         except OSError as error:
             if error.errno in _NO_LOCKS:
@@ -237,16 +272,6 @@ def held(path: Path, what: str, place: Path | None = None, expected: str = "anot
     finally:
         path.unlink(missing_ok=True)  # while it is held: nobody else's file is removed
         os.close(file)
-
-
-def _holder(path: Path) -> str:
-    """Which process holds the lock, as its file says; nobody waits for the file to be complete."""
-    try:
-        with path.open("rb") as file:
-            said = json.loads(file.read(1000))
-        return f"in process {said['process']} on {said['host']} since {said['since']}"
-    except (OSError, ValueError, KeyError, TypeError):
-        return "in an unknown process"
 
 
 # Reading -------------------------------------------------------------------------------------------------------------

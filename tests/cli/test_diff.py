@@ -391,14 +391,13 @@ def test_a_warning_is_in_every_report_and_no_failure(run, pair, tmp_path, monkey
     assert bound in failure.get("message") and bound in text
 
 
-def test_strangers_words_stay_text(tmp_path):
+def test_strangers_words_stay_text(tmp_path, capfd):
     """Line ends and terminal escapes in names, surrogates of names that are no UTF-8, characters XML lacks."""
     name = "a\n::error::b\x1b[31m\udcff\uffff\u2028\u202e.exr"
     result = Result(name, Status.ERROR, tmp_path, tmp_path, error=name)
     results = Results(tmp_path, tmp_path, (result,))
-    forms = [*text_reports.workflow_commands(results), text_reports.markdown(results).partition("|---|\n")[2]]
-    text_reports.write_junit(tmp_path / "out.xml", results)
-    results_file.write(tmp_path / "out.json", results)
+    results_file.write(results, tmp_path / "out.xml", tmp_path / "out.json", github=True)
+    forms = [capfd.readouterr().out, text_reports.markdown(results).partition("|---|\n")[2]]
     forms.append(ElementTree.parse(tmp_path / "out.xml").find(".//testcase").get("name"))
     for form in forms:
         form.encode()

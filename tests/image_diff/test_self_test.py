@@ -176,6 +176,8 @@ def test_what_is_left_out():
     assert four["swapped channels"].verdict == "not run" and "changes nothing" in four["swapped channels"].reason
     assert four["null pairs, welch"].values["null pairs"] == 2 and "noise" in four["renders"].values
     assert "null pairs, welch" not in three and three["renders"].verdict == "not run"
+    # Of three images there are no more trials than three, however many are wanted.
+    assert examined(grey[:3])["gain"].replay["trials"] == 3
     several = {name for name, method in methods.METHODS.items() if method.takes_renders}
 
     def unread():

@@ -392,7 +392,8 @@ def test_welch_is_chosen_and_reports_and_settings_say_so(films, tmp_path):
     results = folders.diff(*films, to_accept=True)
     assert {x.name: x.status for x in results.results} == {"off.exr": Status.DIFFERENT, "same.exr": Status.EQUAL}
     assert {result.method_in_words for result in results.results} == {f"welch ({BOTH})"}
-    entries = results_file.as_data(results)["results"]
+    results_file.write(results, data=tmp_path / "out.json")
+    entries = json.loads((tmp_path / "out.json").read_text())["results"]
     assert {(x["method"], x["method_why"]) for x in entries} == {("welch", BOTH)}
     how = Settings(rules=(Entry("*", BESIDE | {"channels": (("X", "a.X"), ("Y", "Y"))}),))
     shown = text_reports.settings_table(pairing.pairs(*films, how))[1][1]

@@ -7,11 +7,13 @@ import os
 import shutil
 import socket
 import stat
+import tempfile
 import tomllib
 import tracemalloc
 from pathlib import Path
 
 import pytest
+from support.processes import python
 
 from mi_refract.io import safe_files
 from mi_refract.io.errors import describe
@@ -33,6 +35,48 @@ def test_a_failed_write_leaves_the_old_file_alone(step, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="disk full"):
         write_atomically(path, "new")
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+HOLDING = """
+import time
+from mi_refract.io.safe_files import temporary_folder
+with temporary_folder() as folder:
+    (folder / "half").touch()
+    print(folder, flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_temporary_folder_whose_process_was_killed_is_removed_by_the_next_one(tmp_path, monkeypatch):
+    """That of a living process stays, and so does what only looks like one."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    (tmp_path / "mi_refract_link").symlink_to(tmp_path)
+    (tmp_path / "mi_refract_file").touch()
+    with python(HOLDING, TMPDIR=str(tmp_path)) as living, python(HOLDING, TMPDIR=str(tmp_path)) as killed:
+        kept, left = (Path(process.stdout.readline().strip()) for process in (living, killed))
+        killed.kill()
+        killed.wait()
+        assert (left / "half").exists()
+        with safe_files.temporary_folder() as folder:
+            assert {*tmp_path.iterdir()} == {kept, folder, tmp_path / "mi_refract_link", tmp_path / "mi_refract_file"}
+        living.kill()
+    assert not folder.exists()
+
+
+def test_a_folder_that_another_process_removes_before_it_is_locked_is_made_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    real, removed = fcntl.flock, []
+
+    def flock(file, how):
+        if not removed:
+            removed.extend(tmp_path.iterdir())
+            removed[0].rmdir()
+        real(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with safe_files.temporary_folder() as folder:
+        assert folder.is_dir() and removed and folder not in removed
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])

@@ -10,7 +10,7 @@ from rich.console import Console
 from support import processes
 from support.hostile import NAME, shows_more_than_text
 
-from mi_refract.image_diff import html_report, text_reports
+from mi_refract.image_diff import html_report, results_file, text_reports
 from mi_refract.image_diff.comparison import Comparison, Metric, Verdict
 from mi_refract.image_diff.results import Result, Results, Status
 from mi_refract.image_diff.settings import ComparisonSpec
@@ -30,9 +30,9 @@ def printed(table):
     return capture.get()
 
 
-def said(results):
+def said(write, *arguments, **options):
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(out):
-        text_reports.print_results(results)
+        write(*arguments, **options)
     return out.getvalue()
 
 
@@ -56,12 +56,10 @@ def findings():
 
 
 FORMS = {
-    "terminal": lambda results, path: said(results),
-    "GitHub": lambda results, path: "\n".join(
-        line.replace("::", "", 1) for line in text_reports.workflow_commands(results)
-    ),
+    "terminal": lambda results, path: said(text_reports.print_results, results),
+    "GitHub": lambda results, path: said(results_file.write, results, github=True).replace("::", ""),
     "Markdown": lambda results, path: text_reports.markdown(results),
-    "JUnit": lambda results, path: text_reports.write_junit(path, results) or path.read_text(),
+    "JUnit": lambda results, path: results_file.write(results, path) or path.read_text(),
     "HTML": lambda results, path: html_report.write(path, results, {NAME: [NAME]}, NAME) or path.read_text(),
     "terminal, rays": lambda results, path: printed(reports.table(findings())),
     "JUnit, rays": lambda results, path: reports.write_junit(path, findings(), NAME) or path.read_text(),
