@@ -191,9 +191,10 @@ def _linear(image: Image) -> Pixels:
 def _codes(image: Image) -> Pixels:
     """Codes of sRGB, H × W × C, from 0 to 255; of alpha to half of that, its part on average over black and white."""
     white = 127.5 if image.channels == (ALPHA,) else 255.0
-    if encoding(image) == "sRGB":
-        return np.multiply(white, np.nan_to_num(image.select(_colours(image))))
-    return np.multiply(white, srgb_encode(np.clip(_linear(image), 0, 1)))
+    is_coded = encoding(image) == "sRGB"
+    codes: Pixels = np.nan_to_num(image.select(_colours(image))) if is_coded else srgb_encode(_linear(image).clip(0, 1))
+    codes = white * codes
+    return codes
 
 
 def _colours(image: Image) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -138,6 +139,11 @@ def test_exact_sees_the_last_bit():
     result = judge("exact", of(SMOOTH), altered(np.nextafter(SMOOTH[3, 5, 1], np.float32(1))))
     assert (result.verdict, result.metrics[0].value) == (DIFFERENT, 1)
     assert result.reason.startswith("1 of ") and np.count_nonzero(result.maps["difference"]) == 1
+    codes = np.round(255 * SMOOTH) / 255
+    for stored, most in (("uint8", "51 of 255 codes"), ("uint16", "13107 of 65535 codes"), ("float", "0.2")):
+        sides = (replace(each, stored=stored) for each in (of(codes), altered(codes[3, 5, 1] + 0.2, codes)))
+        reason = f"1 of 1920 pixels differ; largest difference {most} at x = 5, y = 3, channel G"
+        assert compare("exact", *sides).reason == reason
 
 
 def test_paired_sees_many_small_changes_at_any_brightness(rng):
