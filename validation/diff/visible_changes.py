@@ -264,9 +264,9 @@ KINDS: dict[str, tuple[str, Change, bool | None]] = {  # a pair of each, and whe
     "a quarter pixel": ("the camera moved by this distance", redrawn(shift=0.25), False),
     "JPEG": ("quality 98, without subsampling of the colours", _jpeg, False),
     "JPEG, subsampled": (
-        "quality 95, with the colours of 2 × 2 pixels",
+        "quality 95, with the colours of 2 × 2 pixels; seen at some saturated lines",
         functools.partial(_jpeg, quality=95, subsampling="4:2:0"),
-        False,
+        None,
     ),
     "half a pixel": (
         "an edge from black to white, blurred by 0.3 to 3 pixels, moved by this distance",
