@@ -290,14 +290,14 @@ def visible(rows: list[Row]) -> str:
     study, missing = visible_changes, "visible changes were planted"
     mine = _measured(rows, study.NAME)
     kinds = [r for r in mine if r.case != study.LIMIT and r.subject in (*study.KINDS, study.EDGE)]  # not other seeds
-    metrics = (study.LOCAL, study.THROUGHOUT, study.ERROR)
+    metrics = (*study.MEASURED, study.ERROR)
     cells = [
         [row.subject, row.reason, row.case, *_cells(row, metrics), f"{row.values[study.ALARMS]:.1%}"] for row in kinds
     ]
     options = COMPARISONS["flip"].options
     bounds = [
         f"{metric} (bound {compact(options[name].default)})"
-        for metric, name in zip(metrics[:2], ("local", "patch"), strict=True)
+        for metric, name in zip(study.MEASURED, ("local", "patch", "one_way"), strict=True)
     ]
     heading = ["change", "", "by a person", *bounds, study.ERROR, study.ALARMS]
     first = _table(_replay(kinds, "{trials} pairs of {size}² pixels each, {setting}."), heading, cells, missing)

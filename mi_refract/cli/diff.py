@@ -89,7 +89,9 @@ def diff(
         test = test or reference
         every = pairing.pairs(reference, test, chosen)
         pairs = pairing.named(every, names or [])
-        lines = [f"{pattern}: matches no image" for pattern in chosen.unused([pair.name for pair in pairs])]
+        unused = chosen.unused([pair.name for pair in pairs])
+        unused += [] if test is reference else pairing.unused_templates(every)  # a variant would be its own new image
+        lines = [f"{pattern}: matches no image" for pattern in unused]
         checked = (*pairs, *pairing.wrong_entries(chosen, every))
         errors = [f"{pair.name}: {error}" for pair in checked if (error := pairing.error_of(pair, reference))]
         text_reports.print_table(text_reports.settings_table(pairs))

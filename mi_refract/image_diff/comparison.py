@@ -6,7 +6,8 @@ What cannot be compared is an error, and a value that is not finite equals nothi
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import math
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -16,6 +17,8 @@ from numpy.typing import NDArray
 from mi_refract.io.image_file import Image, Pixels
 
 Maps = dict[str, Pixels]
+# 4/3 as 1.333, or as whole pixels per metre at 72 dpi: 2835, so that half of one on each axis is 1/2835.
+ASPECT = 5e-4
 
 
 class Range(NamedTuple):
@@ -122,11 +125,38 @@ def aligned(reference: Image, test: Image) -> tuple[Pixels, Pixels]:
     pixels elsewhere, in another shape, or turned.
     """
     for name, of in HEADER.items():
-        if of(reference) != of(test):
+        if of(reference) != of(test) and not (name == "pixel aspect ratio" and _same_aspect(reference, test)):
             hint = "; or `channels`: those to compare" if name == "channels" else ""
             raise ValueError(f"{test.path}: {name} {of(test)}; expected {of(reference)}, as in {reference.path}{hint}")
     same_order = reference.channels == test.channels
     return reference.pixels, test.pixels if same_order else test.select(reference.channels)
+
+
+def as_shown(image: Image, names: Collection[str]) -> Image:
+    """The image with those of the channels `names` that need not be stored: an alpha of 1, R = G = B for a gray Y.
+
+    Where a mask leaves pixels out, alpha is 0, as all channels are.
+    """
+    values = dict(zip(image.channels, np.moveaxis(image.pixels, -1, 0), strict=True))
+    if values.keys() - {"A", *names} == {"Y"} and {*"RGB"} <= set(names) - values.keys():
+        values = dict.fromkeys("RGB", values.pop("Y")) | values
+    if "A" in names:
+        values.setdefault("A", np.ones(image.pixels.shape[:2]) if image.mask is None else image.mask)
+    if values.keys() == set(image.channels):
+        return image
+    pixels = np.stack([*values.values()], -1).astype(image.pixels.dtype, copy=False)
+    return replace(image, pixels=pixels, channels=tuple(values))
+
+
+def identical_as_shown(reference: Image, test: Image) -> str:
+    """How the channels that only one image has are read, if every pixel is identical then; else ""."""
+    one, two = as_shown(reference, test.channels), as_shown(test, reference.channels)
+    same = one.pixels.shape == two.pixels.shape and set(one.channels) == set(two.channels)
+    if not same or not np.array_equal(one.pixels, two.select(one.channels), equal_nan=True):
+        return ""
+    readings = {"A": "a missing alpha is read as 1", "Y": "gray is read as R = G = B"}
+    lone = set(reference.channels) ^ set(test.channels)
+    return "; ".join(words for name, words in readings.items() if name in lone)
 
 
 def shared_channels(reference: Image, test: Image) -> tuple[Image, Image, str]:
@@ -178,6 +208,11 @@ def place(at: NDArray[np.bool_] | Pixels, image: Image) -> str:
     """The pixel and channel of the first largest value of `at`, H × W × C: "x = 3, y = 5, channel R"."""
     y, x, c = np.unravel_index(int(at.argmax()), at.shape)
     return f"x = {x + image.origin[0]}, y = {y + image.origin[1]}, channel {image.channels[c]}"
+
+
+def _same_aspect(*images: Image) -> bool:
+    ratios = [image.metadata.get("PixelAspectRatio", 1.0) for image in images]
+    return all(isinstance(ratio, float | int) for ratio in ratios) and math.isclose(*ratios, rel_tol=ASPECT)
 
 
 def _located(image: Image, values: Pixels, bad: NDArray[np.bool_]) -> str:

@@ -11,6 +11,8 @@ means count more, by the fourth root of the area in units of the smallest: as th
 probability summation (Robson and Graham, Vision Research 21, 1981). `patch_error`: the error that fills a window of
 0.24 degrees, for surfaces. Edges that are drawn otherwise make large errors along lines, and the FLIP error spreads to
 0.07 degrees from them; they fill no such window.
+
+`one_way_change`: FLIP blurs what is smaller than a letter, so images for a display are compared once more without it.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from mi_refract.io.image_file import Image, Pixels, block_mean, srgb_decode
+from mi_refract.io.image_file import Image, Pixels, block_mean, srgb_decode, srgb_encode
 
 from .comparison import Comparison, Metric, Range, one_of, only, verdict_of
 
@@ -34,6 +36,10 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear Rec. 709
 # a white line one pixel wide on black that vanishes (0.65). `validation.diff.visible_changes` measures these and more.
 LOCAL = 0.5
 PATCH = 0.12  # 7 to 10 of 255 codes of gray; no antialiasing that was tried fills a patch with two thirds of it
+# An edge from black to white, blurred by a Gaussian of σ pixels, that moves by half a pixel changes all pixels of a
+# 3 × 3 square by at most 255 (Φ(1.25) − Φ(0.75)) = 30.9 codes one way: at σ = 1.
+ONE_WAY, SIDE = 31.0, 3
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # of codes, as in JPEG (BT.601)
 CODED = re.compile(r"srgb|gamma|^g\d\d")  # colour spaces, in OpenImageIO's words, of what a display is sent
 LINEAR = re.compile(r"^lin|linear|^aces|^raw$|^data$")
 INTEGERS = ("uint8", "uint16")  # a file of these that names no colour space holds what a display is sent
@@ -55,6 +61,11 @@ def flip(
         float, "mean FLIP error allowed in any square of 0.12 degrees, 0 to 1; less in wider squares"
     ] = LOCAL,
     patch: Annotated[float, "FLIP error that may fill a square of 0.24 degrees, 0 to 1"] = PATCH,
+    one_way: Annotated[
+        float,
+        "codes of 255 by which all of a 3 × 3 square may change one way, in luma; a single channel by twice as much, "
+        "larger squares by less; for LDR images",
+    ] = ONE_WAY,
     largest: Annotated[float, "FLIP error that no pixel may exceed, 0 to 1"] = 1.0,
     hdr: Annotated[str, "auto (by the file's format), yes or no", one_of("auto", "yes", "no")] = "auto",
     # Below 1 its filters see nothing; above 1000 they are larger than any image.
@@ -73,18 +84,24 @@ def flip(
     wide = is_hdr(reference, test, hdr)
     error = flip_map(reference, test, wide, ppd)
     (worst, around), patched = local_error(error, ppd), patch_error(error, ppd)
+    changed = one_way_change(_codes(reference), _codes(test), ppd) if not wide else NOWHERE
     metrics = (
         Metric("local FLIP error", worst.value, local),
         Metric("FLIP error throughout a patch", patched.value, patch),
+        *([] if wide else [Metric("change one way, in codes", changed.value, one_way)]),
         Metric("largest FLIP error", float(error.max()), largest),
         Metric("mean FLIP error", float(error.mean())),
         Metric("99th percentile of the FLIP error", float(np.percentile(error, 99))),
     )
     reason = f"local FLIP error {worst.value:.3g}, largest {error.max():.3g} ({'HDR' if wide else 'LDR'})"
     if worst.value:
-        kind, window = ("mean", worst) if metrics[1].holds or not metrics[0].holds else ("at least", patched)
+        said, window = f"mean {worst.error:.3g}", worst
+        if metrics[0].holds and not metrics[1].holds:
+            said, window = f"at least {patched.error:.3g}", patched
+        elif metrics[0].holds and changed.value > one_way:
+            said, window = f"at least {changed.error:.0f} codes brighter or darker", changed
         x, y = window.x + reference.origin[0], window.y + reference.origin[1]
-        reason += f"; {kind} {window.error:.3g} in {window.width} × {window.height} pixels from x = {x}, y = {y}"
+        reason += f"; {said} in {window.width} × {window.height} pixels from x = {x}, y = {y}"
     return Comparison("flip", verdict_of(metrics), reason, metrics, maps={"flip": error, "local": around})
 
 
@@ -171,6 +188,15 @@ def _linear(image: Image) -> Pixels:
     return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3)))
 
 
+def _codes(image: Image) -> Pixels:
+    """Codes of sRGB, H × W × C, from 0 to 255; of alpha to half of that, its part on average over black and white."""
+    white = 127.5 if image.channels == (ALPHA,) else 255.0
+    is_coded = encoding(image) == "sRGB"
+    codes: Pixels = np.nan_to_num(image.select(_colours(image))) if is_coded else srgb_encode(_linear(image).clip(0, 1))
+    codes = white * codes
+    return codes
+
+
 def _colours(image: Image) -> tuple[str, ...]:
     """R, G, B; else every channel but alpha."""
     return RGB if set(RGB) <= set(image.channels) else tuple(n for n in image.channels if n != ALPHA) or image.channels
@@ -189,6 +215,9 @@ class Window:
     y: int
     width: int
     height: int
+
+
+NOWHERE = Window(0.0, 0.0, 0, 0, 0, 0)
 
 
 def windows(height: int, width: int, ppd: float) -> Iterator[tuple[int, int, float]]:
@@ -229,6 +258,29 @@ def patch_error(error: Pixels, ppd: float) -> Window:
     h, w = (min(max(1, round(SURFACE * ppd)), size) for size in error.shape)
     rows, columns = (slice(k // 2, k // 2 + size - k + 1) for k, size in zip((h, w), error.shape, strict=True))
     return _worst(minimum_filter(error, (h, w))[rows, columns], 1.0, w, h)
+
+
+def one_way_change(reference: Pixels, test: Pixels, ppd: float) -> Window:
+    """The square in which all pixels change the most one way, all brighter or all darker.
+
+    `reference`, `test`: codes, H × W × C. A change is that of luma, or half of that of one channel, as eyes and
+    subsampled JPEG files resolve colours half as well. `value`: the smallest change in a square of w = 3 … 8 pixels a
+    side, times (w − 1)/2, as an edge that moves by half a pixel changes it by up to 255 φ(1)/(w − 1), at a blur of
+    (w − 1)/2 pixels. With more than 67 pixels per degree, w is counted in pixels of that size.
+    """
+    change = (test - reference).astype(np.float32, copy=False)
+    kinds = [change[..., 0]] if change.shape[2] == 1 else [change @ LUMA, *np.moveaxis(change / 2, -1, 0)]
+    scale, most, worst = max(1.0, ppd / PIXELS_PER_DEGREE), max(SIDE, round(WINDOW * ppd)), NOWHERE
+    for least in (np.multiply(kind, sign, order="C") for kind in kinds for sign in (1, -1)):
+        for side in range(2, most + 1):
+            if min(least.shape) < 2 or least.max() * (most / scale - 1) / 2 <= worst.value:
+                break
+            least = np.minimum(least[1:], least[:-1])
+            least = np.minimum(least[:, 1:], least[:, :-1])
+            if side >= SIDE * scale:
+                window = _worst(least, (side / scale - 1) / 2, side, side)
+                worst = max(worst, window, key=lambda window: window.value)
+    return worst
 
 
 def _worst(errors: Pixels, weight: float, width: int, height: int) -> Window:

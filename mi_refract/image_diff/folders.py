@@ -72,7 +72,10 @@ def diff(
         raise NotADirectoryError(
             f"{test if reference.is_dir() else reference}: not a folder; --renders expects folders"
         )
-    unused = settings.unused([pair.name for pair in every]) if reference.is_dir() and not renders else []
+    unused: list[str] = []
+    if reference.is_dir() and not renders:
+        unused = settings.unused([pair.name for pair in every])
+        unused += [] if to_accept else pairing.unused_templates(every)  # what is accepted may be the first
     pairs = [*pairing.named(every, names), *pairing.wrong_entries(settings, every)]
     results = Results(reference, test, (), renders, inconclusive, tuple(unused), settings.flags)
 

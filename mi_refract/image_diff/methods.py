@@ -26,7 +26,9 @@ from .comparison import (
     Range,
     Verdict,
     aligned,
+    as_shown,
     finite,
+    identical_as_shown,
     nonfinite_result,
     only,
     passes_black,
@@ -198,8 +200,13 @@ def _compare(
         raise ValueError(f"{method}: no image on one side; expected at least one")
     bare = [[channels.without_variances(image, named) for image in side] for side in sides]
     single = len(bare[0]) == len(bare[1]) == 1
+    whole = sides if chosen.takes_renders else bare
+    if single and (reading := identical_as_shown(one := whole[0][0], two := whole[1][0])):
+        alike = [[as_shown(one, two.channels)], [as_shown(two, one.channels)]]
+        result = _compare(method, alike, allow_nonfinite, named, options)
+        return replace(result, reason=f"{result.reason}; {reading}")
     if chosen.takes_renders:
-        result = chosen.function(*(sides if single else bare), allow_nonfinite=allow_nonfinite, **options)
+        result = chosen.function(*(whole if single else bare), allow_nonfinite=allow_nonfinite, **options)
         if single and result.is_equal and (untested := channels.untested(sides[0][0], sides[1][0])):
             by_tolerance = compare("tolerance", *untested, allow_nonfinite=allow_nonfinite)
             if not by_tolerance.is_equal:

@@ -64,7 +64,8 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
         found = _mapped(old, new, settings.maps)
     else:
         found = [_pair(name, old.get(name), new.get(name), Path(name)) for name in sorted(old | new)]
-    found = [replace(pair, target=reference / pair.target, how=settings.of(pair.name)) for pair in found]
+    found = [replace(pair, how=how_of(settings, pair.name, pair.target)) for pair in found]
+    found = [replace(pair, target=reference / pair.target) for pair in found]
     own: set[Path] = set()  # masks and variances that the settings name for a pair: they are no images to compare
     for pair in found:
         sides = [(path, root) for path, root in ((pair.reference, reference), (pair.test, test)) if path]
@@ -90,6 +91,29 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
 
 def _pair(name: str, reference: Path | None, test: Path | None, target: Path, error: str = "") -> Result:
     return Result(name, Status.DIFFERENT, reference, test, target=target, error=error)
+
+
+def how_of(settings: Settings, name: str, target: Path) -> ComparisonSpec:
+    """How the image is compared with its reference; `name`, `target`: their paths in the folders.
+
+    The fields of its `accept` are those of the map that pairs the two: those of the map's {name}, if it has one.
+    """
+    for rule in settings.maps:
+        values = name_patterns.parsed(rule.reference, target.as_posix())
+        if values is not None and name_patterns.filled(rule.test, values) == name:
+            own = name_patterns.fields(values["name"]) if "name" in values else {}
+            return replace(settings.of(name), fields=own | values)
+    return settings.of(name)
+
+
+def unused_templates(pairs: Sequence[Result]) -> list[str]:
+    """The templates of `accept` that match no file."""
+    templates = dict.fromkeys(template for pair in pairs for template in pair.how.accept)
+    for pair in pairs:
+        for template in pair.how.accept:
+            if pair.error or _matched(pair, template, pair.variants):
+                templates.pop(template, None)
+    return [f"accept = {template!r}" for template in templates]
 
 
 def named(items: Sequence[Result], patterns: Sequence[str]) -> list[Result]:
@@ -156,16 +180,21 @@ def _mask_of(pair: Result, root: Path) -> Path | None:
 
 def _with_variants(pair: Result, others: Sequence[Path]) -> Result:
     """The pair with those of the other references that its settings accept as well."""
-    folder, own = pair.target.parent, pair.target.name
-    values = name_patterns.fields(own)
-    names = {path.relative_to(folder).as_posix(): path for path in others if path.is_relative_to(folder)}
-    matched: dict[str, Path] = {}
+    variants: dict[Path, None] = {}
+    others = [path for path in others if path.is_relative_to(pair.target.parent)]
     for template in pair.how.accept:
-        if name_patterns.expanded(template, values, [own]):
+        if _matched(pair, template, [pair.target]):
             error = f"accept = {template!r} matches the reference {pair.target} itself; expected names of others"
             return replace(pair, error=error)
-        matched |= {name: names[name] for name in name_patterns.expanded(template, values, sorted(names))}
-    return replace(pair, variants=tuple(matched.values()))
+        variants |= dict.fromkeys(_matched(pair, template, others))
+    return replace(pair, variants=tuple(variants))
+
+
+def _matched(pair: Result, template: str, paths: Sequence[Path]) -> list[Path]:
+    """Those of the paths that a template of `accept` means for the reference of a pair, by their names."""
+    names = {path.relative_to(pair.target.parent).as_posix(): path for path in paths}
+    values = {**name_patterns.fields(pair.target.name), **pair.how.fields}
+    return [names[name] for name in name_patterns.expanded(template, values, sorted(names))]
 
 
 def variant(target: Path, how: ComparisonSpec, name: str) -> Path:
@@ -178,7 +207,7 @@ def variant(target: Path, how: ComparisonSpec, name: str) -> Path:
     with_name = [template for template in how.accept if not set(template) & set("*?") and name in template]
     with_star = [template for template in how.accept if template.count("*") == 1 and "?" not in template]
     for template in with_name + with_star:
-        fields = name_patterns.fields(target.name) | {"*": name}
+        fields = {**name_patterns.fields(target.name), **how.fields, "*": name}
         return target.parent / name_patterns.filled(template.replace("*", "{*}"), fields)
     raise ValueError(
         f"{target}: no template in `accept` contains {name} or exactly one *; add to [defaults] in mi-refract.toml: "

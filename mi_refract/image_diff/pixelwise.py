@@ -21,6 +21,7 @@ from mi_refract.io.text import compact, distinguishable
 from .comparison import Comparison, Metric, Verdict, counted, place, verdict_of
 from .tile_statistics import median_nonblack, same_shape
 
+CODES = {"uint8": 255, "uint16": 65535}  # of a file's integers, by their type, at 1
 BLOCK = 2**16  # pixels whose ratios are formed at once, in float64
 # A pixel is outrageous above both of these: a detail that moves by NEAR pixels is not, nor is any code value of a
 # display where the mean is more than a hundredth of white.
@@ -32,7 +33,12 @@ def exact(reference: Image, test: Image) -> Comparison:
     a, b = reference.pixels, test.pixels
     difference = _difference(a, b)
     changed = int((a != b).any(-1).sum())
-    reason = f"{changed} of {a[..., 0].size} pixels differ" if changed else "every value is the same"
+    reason = "every value is the same"
+    if changed:
+        codes = CODES.get(reference.stored if reference.stored == test.stored else "", 0)
+        most = f"{difference.max() * codes:.0f} of {codes} codes" if codes else compact(float(difference.max()))
+        at = place(difference, reference)
+        reason = f"{changed} of {a[..., 0].size} pixels differ; largest difference {most} at {at}"
     metrics = (Metric("changed pixels", changed, 0.0), Metric("largest difference", float(difference.max()), 0.0))
     verdict = Verdict.DIFFERENT if changed else Verdict.EQUAL
     return Comparison("exact", verdict, reason, metrics, 0.0, {"difference": difference})

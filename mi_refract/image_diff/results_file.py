@@ -252,7 +252,9 @@ def with_settings(results: Results, settings: Settings) -> Results:
     """
     changed = []
     for result in results.results:
-        how = settings.of(result.name)
+        inside = result.target.is_relative_to(results.reference)
+        target = result.target.relative_to(results.reference) if inside else Path()
+        how = pairing.how_of(settings, result.name, target)
         if result.status in FAILED and (result.how.variance or how.reads_variance):
             raise ValueError(f"{result.name}: its variance is in a separate file; accept it without --from")
         changed.append(replace(result, how=replace(how, options=result.how.options)))

@@ -56,8 +56,9 @@ class ComparisonSpec:
     `max_values`: width × height × channels of an image, at most. `skip`: not compared at all. `accept`: templates of
     other references, each as good as the first. `mask`, `ignore`: pixels that do not count, as a template of an image
     and as rectangles. `variance`: a template of the image that holds the variance of one sample of each pixel.
-    `channels`: those that are compared, by their names in the reference and in the new image; none: all. `entries`: the
-    tables of the settings file that apply. `error`: why the settings cannot be applied.
+    `channels`: those that are compared, by their names in the reference and in the new image; none: all. `fields`: of
+    the map that pairs the image with its reference, for `accept`. `entries`: the tables of the settings file that
+    apply. `error`: why the settings cannot be applied.
     """
 
     method: str = AUTO
@@ -70,6 +71,7 @@ class ComparisonSpec:
     ignore: tuple[Rectangle, ...] = ()
     variance: str = ""
     channels: Names = ()
+    fields: Mapping[str, str] = field(default_factory=dict)
     entries: tuple[str, ...] = ()
     error: str = ""
 

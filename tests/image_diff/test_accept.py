@@ -475,6 +475,21 @@ def test_a_variant_stands_beside_the_reference_and_replaces_what_was_compared(ru
     assert tree(old)["louder-macos.exr"] == tree(new)["louder.exr"]
 
 
+@pytest.mark.parametrize("by_json", [False, True])
+def test_a_variant_has_the_name_that_the_map_and_accept_make(run, tmp_path, by_json):
+    old, new, out = tmp_path / "old", tmp_path / "new", tmp_path / "out.json"
+    image(old / "ball.ref.exr")
+    image(new / "ball.exr", gain=1.2)
+    settings = 'accept = ["{stem}-*.ref.exr"]\nmap = { reference = "{stem}.ref.exr", test = "{stem}.exr" }'
+    (old / "mi-refract.toml").write_text(f"[defaults]\n{settings}")
+    code, _, err = run("diff", old, new, "--json", out)
+    assert (code, err) == (1, "mi-refract: accept = '{stem}-*.ref.exr': matches no image\n")
+    words = ["--from", out] if by_json else [old, new]
+    assert run("accept", *words, "--as-variant", "macos", "--yes")[::2] == (0, "")
+    assert tree(old)["ball-macos.ref.exr"] == tree(new)["ball.exr"]
+    assert run("diff", old, new)[::2] == (0, "")
+
+
 NO_ACCEPT = "no template in `accept` contains macos or exactly one *; add to [defaults] in mi-refract.toml"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -119,8 +120,8 @@ def test_headers_that_say_the_same_in_other_words_are_equal():
 @pytest.mark.parametrize("method", ["auto", *SINGLE])
 def test_a_channel_that_one_image_has_besides_is_a_difference_with_a_name(method):
     ramp = np.arange(40 * 48.0).reshape(40, 48)
-    cases = (("A", 1, "A (opaque: 1 everywhere)"), ("Z", ramp, "Z"), ("Z", 0, "Z (0 everywhere)"))
-    for name, values, words in (*cases, ("l.A", 0.5, "l.A (0.5 everywhere)")):
+    cases = (("l.A", 1, "l.A (opaque: 1 everywhere)"), ("Z", ramp, "Z"), ("Z", 0, "Z (0 everywhere)"))
+    for name, values, words in (*cases, ("A", 0.5, "A (0.5 everywhere)")):
         plain, more = of(SMOOTH), of(np.dstack([SMOOTH, np.broadcast_to(values, (40, 48))]), (*"RGB", name))
         for sides, word in (((plain, more), "added"), ((more, plain), "missing")):
             result = compare(method, *sides)
@@ -138,6 +139,11 @@ def test_exact_sees_the_last_bit():
     result = judge("exact", of(SMOOTH), altered(np.nextafter(SMOOTH[3, 5, 1], np.float32(1))))
     assert (result.verdict, result.metrics[0].value) == (DIFFERENT, 1)
     assert result.reason.startswith("1 of ") and np.count_nonzero(result.maps["difference"]) == 1
+    codes = np.round(255 * SMOOTH) / 255
+    for stored, most in (("uint8", "51 of 255 codes"), ("uint16", "13107 of 65535 codes"), ("float", "0.2")):
+        sides = (replace(each, stored=stored) for each in (of(codes), altered(codes[3, 5, 1] + 0.2, codes)))
+        reason = f"1 of 1920 pixels differ; largest difference {most} at x = 5, y = 3, channel G"
+        assert compare("exact", *sides).reason == reason
 
 
 def test_paired_sees_many_small_changes_at_any_brightness(rng):

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from scipy.special import ndtr
 from support.diff_images import of
 
 from mi_refract.image_diff.comparison import Verdict
-from mi_refract.image_diff.flip import encoding, flip, local_error, patch_error, windows
+from mi_refract.image_diff.flip import encoding, flip, local_error, one_way_change, patch_error, windows
 from mi_refract.image_diff.methods import compare
 from mi_refract.io import image_file
 
@@ -46,6 +47,7 @@ def line(code, at=256):
     return codes
 
 
+PLAIN = np.full((SIZE, SIZE), GRAY)
 CUBE = with_square(200, 100, 20, (128, 128, 128))
 ROW = np.where((Y // 12 == 20) & (X // 12 % 4 == 0), 200, GRAY)
 HIGHLIGHT = 90 + 150 * np.exp(-((X - 300) ** 2 + (Y - 90) ** 2) / (2 * 5.0**2))
@@ -58,12 +60,24 @@ VISIBLE = {
     "a cube is 16 codes brighter": (CUBE, with_square(200, 100, 20, (144, 144, 144))),
     "half of the image is 10 codes brighter": (np.full((SIZE, SIZE), GRAY), GRAY + 10 * (X > 255)),
     "a cube of 4 pixels is gone": (with_square(200, 100, 4, 255), with_square(200, 100, 0, 0)),
+    "a dot of 3 pixels": (PLAIN, with_square(200, 100, 3, GRAY + 32)),
+    "a dot of 5 pixels": (PLAIN, with_square(200, 100, 5, GRAY - 16)),
+    "a blue dot of 3 pixels": (PLAIN, with_square(200, 100, 3, (GRAY, GRAY, GRAY + 64))),
+    "a facet": (CUBE, with_square(204, 104, 6, (141, 141, 141), CUBE)),
 }
 CLOSE = {
     "one code": (np.full((SIZE, SIZE), GRAY), np.full((SIZE, SIZE), GRAY + 1)),
     "an edge without antialiasing": (edge(0), edge(0, samples=1)),
     "another antialiasing": (edge(0), edge(0, samples=2)),
     "an edge moved by half a pixel": (edge(0), edge(0.5)),
+    "a fainter dot of 3 pixels": (PLAIN, with_square(200, 100, 3, GRAY + 31)),
+    "a fainter blue dot of 3 pixels": (PLAIN, with_square(200, 100, 3, (GRAY, GRAY, GRAY + 62))),
+    "a blurred edge moved by half a pixel": (255 * ndtr(X - 256.25), 255 * ndtr(X - 255.75)),
+    "a faint edge blurred otherwise": (30 * ndtr((X - 256) / 2), 30 * ndtr((X - 256) / 3)),
+    "a square of noise": tuple(
+        GRAY + np.where((abs(X - 99) < 9) & (abs(Y - 77) < 9), np.random.default_rng(i).normal(0, 30, X.shape), 0)
+        for i in range(2)
+    ),
     "codes at random off by one": (HIGHLIGHT, HIGHLIGHT + np.random.default_rng(1).integers(-1, 2, (SIZE, SIZE))),
 }
 
@@ -129,6 +143,8 @@ def test_the_worst_window_is_named():
     assert patch_error(error, 67).value == 0
     result = compare("flip", *map(shown, VISIBLE["a cube is 16 codes brighter"]))
     assert "at least 0.2" in result.reason and "in 16 × 16 pixels from x = 20" in result.reason
+    result = compare("flip", *map(shown, VISIBLE["a dot of 5 pixels"]))
+    assert result.reason.endswith("; at least 16 codes brighter or darker in 5 × 5 pixels from x = 200, y = 100")
 
 
 def test_every_window_against_its_definition():
@@ -148,6 +164,36 @@ def test_every_window_against_its_definition():
     assert patch.value == pytest.approx(max(smallest.values())) == smallest[patch.x, patch.y]
 
 
+def test_every_change_one_way_against_its_definition():
+    rng = np.random.default_rng(5)
+    one, two = (rng.integers(0, 256, (17, 14, 3)).astype(np.float32) for _ in range(2))
+    two[3:9, 4:11] = one[3:9, 4:11] + rng.uniform(8, 30, (6, 7, 3))
+    luma = (two - one) @ np.float32([0.299, 0.587, 0.114])
+    for ppd, sides in ((67, range(3, 9)), (20, range(3, 4)), (100, range(5, 13))):
+        scale = max(1, ppd / 67)
+        value = max(
+            (sign * kind[y : y + side, x : x + side]).min() * (side / scale - 1) / 2
+            for kind in (luma, *np.moveaxis((two - one) / 2, -1, 0))
+            for sign in (1, -1)
+            for side in sides
+            for y in range(18 - side)
+            for x in range(15 - side)
+        )
+        assert one_way_change(one, two, ppd).value == pytest.approx(value, rel=1e-5)
+
+
+def test_an_edge_that_moves_by_half_a_pixel_is_within_the_bound_however_wide_it_is_blurred():
+    """The bound is that of a width of (side − 1)/2 pixels, in squares of every side."""
+    steps = np.arange(64.0)[None]
+    for width in (0.3, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 5.0):
+        for place in (31.5, 31.75, 32.0):
+            one, two = (np.repeat(255 * ndtr((steps - place - x) / width), 9, 0)[..., None] for x in (0.25, -0.25))
+            value = one_way_change(one, two, 67.0).value
+            assert value < 30.9
+            if width in (1.0, 1.5, 2.0, 2.5, 3.0, 3.5) and place == (32.0 if 2 * width % 2 == 0 else 31.5):
+                assert value > 30.8
+
+
 def test_images_smaller_than_a_window():
     for shape in ((1, 1), (1, 64), (64, 1), (3, 5), (8, 8), (17, 9)):
         black, nearly, white = (shown(np.full(shape, code)) for code in (0, 254, 255))
@@ -161,7 +207,7 @@ def test_the_bounds_are_options():
     one, two = (shown(codes[80:144, 180:244]) for codes in (CUBE, with_square(200, 100, 20, (133, 133, 133))))
     result = flip(one, two)
     assert result.verdict is EQUAL
-    for name, metric in zip(("local", "patch", "largest"), result.metrics, strict=False):
+    for name, metric in zip(("local", "patch", "one_way", "largest"), result.metrics, strict=False):
         assert flip(one, two, **{name: 1.1 * metric.value}).verdict is EQUAL
         assert flip(one, two, **{name: 0.9 * metric.value}).verdict is DIFFERENT
     one, two = (shown(codes[192:320, 192:320]) for codes in VISIBLE_LINES)

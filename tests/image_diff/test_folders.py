@@ -378,6 +378,25 @@ def test_any_variant_passes_and_is_named(variants):
         assert old / "a/mac/ball.exr" in [result.matched for result in results]
 
 
+INFIX = [
+    ("{stem}.ref{suffix}", "{stem}{suffix}", "{stem}-*.ref{suffix}", "ball.ref.exr", "ball-arm.ref.exr"),
+    ("ref-{name}", "{name}", "ref-{stem}-*{suffix}", "ref-ball.exr", "ref-ball-arm.exr"),
+    ("ref-{name}", "{name}", "ref-*/{name}", "ref-ball.exr", "ref-arm/ball.exr"),
+]
+
+
+@pytest.mark.parametrize(("reference", "test", "template", "first", "variant"), INFIX)
+def test_the_fields_of_accept_are_those_of_the_map(tmp_path, reference, test, template, first, variant):
+    images(tmp_path, {f"old/a/{first}": 1, f"old/a/{variant}": 1.4, "new/a/ball.exr": 1.4})
+    rules = Settings.for_all(accept=("{stem}.gone{suffix}", template)).rules
+    settings = Settings(rules, (Map("gone/{name}", "{name}"), Map(f"{{dir}}/{reference}", f"{{dir}}/{test}")))
+    results = diff.diff(tmp_path / "old", tmp_path / "new", settings)
+    (ball,) = results.results
+    assert (ball.name, ball.status, ball.matched) == ("a/ball.exr", "equal", tmp_path / "old/a" / variant)
+    assert pairing.variant(ball.target, ball.how, "arm") == ball.matched
+    assert results.unused == ("accept = '{stem}.gone{suffix}'",)
+
+
 def test_what_is_no_variant(variants):
     old, new = variants
     results = diff.diff(old, new, Settings.for_all(accept=("{stem}*",)))

@@ -15,9 +15,10 @@ from PIL.TiffImagePlugin import IFDRational
 from support.diff_images import exr_of_integers
 from support.diff_images import tiff as write_tiff
 
-from mi_refract.image_diff import folders, metadata
+from mi_refract.image_diff import comparison, folders, metadata
 from mi_refract.image_diff.methods import METHODS
 from mi_refract.image_diff.settings import Settings
+from mi_refract.io import image_file
 
 README = Path(metadata.__file__).with_name("README.md").read_text("utf-8")
 SINGLE = [name for name, method in METHODS.items() if not method.takes_renders]
@@ -248,9 +249,46 @@ def test_what_programs_say_of_usual_images_is_no_difference(tmp_path, name):
     assert result.status == "equal", result.reason
 
 
-def test_an_alpha_that_one_image_lacks_is_a_channel_and_no_metadata(tmp_path):
-    paths = [tmp_path / "a.png", tmp_path / "b.png"]
-    for path, mode in zip(paths, ("RGB", "RGBA"), strict=True):
-        Pillow.fromarray(CODES).convert(mode).save(path)
-    (result,) = folders.diff(*paths).results
-    assert result.reason.startswith("channels added: A (opaque")
+READ_AS = {"A": "a missing alpha is read as 1", "Y": "gray is read as R = G = B"}
+
+
+@pytest.mark.parametrize("method", ["auto", *SINGLE])
+@pytest.mark.parametrize(
+    ("one", "two", "said"),
+    [
+        ("RGB", "RGBA", "A"),
+        ("L", "LA", "A"),
+        ("L", "RGB", "Y"),
+        ("LA", "RGB", "AY"),
+        ("L", "RGBA", "AY"),
+        ("P", "L", "Y"),
+    ],
+)
+def test_files_of_the_same_pixels_are_equal_however_they_are_encoded(tmp_path, method, one, two, said):
+    gray = Pillow.fromarray(GRAY[..., 0])
+    for path, mode in ((tmp_path / "a.png", one), (tmp_path / "b.png", two)):
+        (gray if "L" in one + two else Pillow.fromarray(CODES)).convert(mode).save(path)
+    for sides in (("a.png", "b.png"), ("b.png", "a.png")):
+        (result,) = folders.diff(*(tmp_path / name for name in sides), Settings.for_all(method=method)).results
+        assert result.status == "equal", result.reason
+        assert result.reason.endswith("; ".join(["", *(READ_AS[name] for name in said)]))
+    for channel in (0, -1):  # another colour; a hole, where there is an alpha
+        pixels = np.asarray(Pillow.open(tmp_path / "b.png")).copy().reshape(8, 8, -1)
+        pixels[:6, :6, channel] ^= 128
+        Pillow.fromarray(pixels.squeeze()).save(tmp_path / "c.png")
+        (result,) = folders.diff(tmp_path / "a.png", tmp_path / "c.png", Settings.for_all(method=method)).results
+        assert result.status in ("different", "error") and "read as" not in result.reason
+
+
+def test_ratios_of_pixels_are_the_same_to_the_digits_that_files_hold(tmp_path):
+    """4/3 with three decimals, and as whole pixels per metre; 12/11 and 59/54 of video are two."""
+    metre = tmp_path / "metre.png"
+    png(metre, (b"pHYs", struct.pack(">IIB", 2835, 3780, 1)))
+    images = {0: image_file.read(metre)}
+    for ratio in (4 / 3, 1.333, 12 / 11, 59 / 54):
+        exr(tmp_path / f"{ratio}.exr", {"PixelAspectRatio": ratio})
+        images[ratio] = image_file.read(tmp_path / f"{ratio}.exr")
+    for one, two in ((4 / 3, 1.333), (4 / 3, 0), (0, 1.333)):
+        comparison.aligned(images[one], images[two])
+    with pytest.raises(ValueError, match="pixel aspect ratio"):
+        comparison.aligned(images[12 / 11], images[59 / 54])

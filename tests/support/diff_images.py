@@ -58,7 +58,7 @@ BROKEN = {
     "truncated": truncated,
     "empty": lambda path: path.write_bytes(b""),
     "text": lambda path: path.write_text("no image at all\n"),
-    "one channel": lambda path: image(path, shape=(32, 48, 1), channels=("Y",)),
+    "one channel": lambda path: image(path, shape=(32, 48, 1), channels=("Y",), gain=0.9),
     "other size": lambda path: image(path, shape=(32, 47, 3)),
     "other channels": lambda path: image(path, channels=("X", "Y", "Z")),
     "link to nothing": lambda path: path.symlink_to("nowhere.exr"),

@@ -81,7 +81,7 @@ def test_what_nobody_sees_is_equal_and_what_a_person_sees_is_different():
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
     assert [line[0] for line in lines[2 : 2 + len(rows)]] == list(rows)
     assert (lines[2][2], lines[2][-1], lines[-1][:2]) == ("not seen", "0.0%", ["codes of 255", "never"])
-    assert lines[0][3].endswith("(bound 0.5)") and lines[0][4].endswith("(bound 0.12)")
+    assert [lines[0][i].split("(")[1] for i in (3, 4, 5)] == ["bound 0.5)", "bound 0.12)", "bound 31)"]
 
 
 def test_the_table_of_defects_is_made_of_the_rows_of_the_self_test():
@@ -95,18 +95,19 @@ def test_the_table_of_defects_is_made_of_the_rows_of_the_self_test():
 
 
 @pytest.mark.parametrize(
-    "local, patch, failed",
+    "local, patch, one_way, failed",
     [
-        (0.1, 0.12, {"one code", "a quarter pixel"}),
-        (0.5, 0.03, {"one code"}),
-        (1.0, 1.0, {"line", "moved object", "brighter surface", "light on a surface"}),
-        (9.0, 0.12, {"line", "moved object", "colour of an object"}),
-        (0.5, 1.0, {"brighter surface", "light on a surface"}),
+        (0.1, 0.12, 31, {"one code", "a quarter pixel"}),
+        (0.5, 0.03, 31, {"one code"}),
+        (0.5, 0.12, 10, {"half a pixel"}),
+        (1.0, 1.0, 31, {"line", "light on a surface"}),
+        (9.0, 0.12, 999, {"line", "moved object", "colour of an object", "dot", "facet"}),
+        (0.5, 1.0, 999, {"light on a surface", "dot", "facet"}),
     ],
 )
-def test_bounds_elsewhere_fail(monkeypatch, local, patch, failed):
+def test_bounds_elsewhere_fail(monkeypatch, local, patch, one_way, failed):
     real = flip.flip
-    monkeypatch.setattr(flip, "flip", lambda *pair: real(*pair, local=local, patch=patch))
+    monkeypatch.setattr(flip, "flip", lambda *pair: real(*pair, local=local, patch=patch, one_way=one_way))
     assert {visible_changes.kind_row(name, 2).verdict for name in failed} == {"fail"}
 
 

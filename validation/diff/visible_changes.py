@@ -2,9 +2,10 @@
 
 The images are shapes of random colours, some of them a pixel wide, drawn with 16 samples a pixel and rounded to 8-bit
 sRGB. Changes that nobody sees are what other machines, formats and samplers do to an image; changes that a person sees
-are small and faint ones of their kind. "error / bound" is the larger of the local FLIP error over its bound and of the
-error throughout a patch over its bound: `flip` calls images equal up to 1. The bounds stand where the largest of the
-first and the smallest of the second leave room on both sides.
+are small and faint ones of their kind. "error / bound" is the largest of the local FLIP error, of the error throughout
+a patch and of the change one way, each over its bound: `flip` calls images equal up to 1. The bounds of FLIP errors
+stand where the largest of the first and the smallest of the second leave room on both sides; that of the change one
+way is computed.
 
 The last rows state what `flip` does not see: how many of 255 codes a gray square must change by, and how far a black
 edge on white must move, to be different. These are records of what the bounds mean, not measurements of people.
@@ -20,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtr
 
 from mi_refract.image_diff import flip
 from mi_refract.image_diff.self_test import CONFIDENCE, FALSE_ALARMS, Tally
@@ -34,7 +36,8 @@ NAME = "visible_changes"
 SEED = 2027
 TRIALS = {"quick": 20, "standard": 300, "full": 2000}  # of 300, none may be called different: the bound is 0.99 %
 SIZE, SHAPES, SAMPLES = 96, 14, 4  # pixels a side; shapes; the square root of the samples a pixel
-ERROR, LOCAL, THROUGHOUT = "error / bound", "local FLIP error", "FLIP error throughout a patch"
+MEASURED = LOCAL, THROUGHOUT, ONE_WAY = "local FLIP error", "FLIP error throughout a patch", "change one way, in codes"
+ERROR = "error / bound"
 ALARMS, MISSED, BOUND = "called different", "missed", "bound"
 CODES, PIXELS = "codes of 255", "pixels"
 SETTING, LIMIT, EDGE = "67 pixels per degree", "limit", "edge"
@@ -44,6 +47,7 @@ TERMS = {
     ERROR: "largest of the changes that nobody sees, smallest of those that a person sees",
     LOCAL: "mean in the worst window, its median over the trials",
     THROUGHOUT: "exceeded in all of 0.24 degrees, its median over the trials",
+    ONE_WAY: "of a 3 × 3 square, or its like of a wider one, its median over the trials",
     BOUND: f"{CONFIDENCE:.0%} upper bound of the share that is called different, exact binomial (Clopper and Pearson)",
     CODES: "the smallest change of a gray square that is called different; none where even white is not",
     PIXELS: "the smallest move of a black edge on white that is called different, in quarters of a pixel",
@@ -124,15 +128,35 @@ def _half_floats(rng: Rng) -> Pair:
     return image, replace(image, pixels=image.pixels.astype(np.float16).astype(np.float32))
 
 
-def _jpeg(rng: Rng) -> Pair:
+def _soft_edge(rng: Rng) -> Pair:
+    """A black half-plane on white, blurred by up to three pixels, and moved by half a pixel in any direction."""
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    angle, width = rng.uniform(0, np.pi), 0.3 * 10 ** rng.uniform(0, 1)
+    distance = columns * np.cos(angle) + rows * np.sin(angle) - rng.uniform(0.3, 0.7) * SIZE
+    one, two = (shown(255 * ndtr((distance - x) / width)[..., None] * np.ones(3)) for x in (0.0, 0.5))
+    return one, two
+
+
+def _noise(rng: Rng) -> Pair:
+    """A quarter of the image with gray noise."""
+    codes, x, y = somewhere(rng)
+    noisy = []
+    for _ in range(2):
+        more = rng.normal(0, 25, (SIZE // 4, SIZE // 4, 1))
+        noisy.append(codes.copy())
+        noisy[-1][int(y) - SIZE // 8 :, int(x) - SIZE // 8 :][: SIZE // 4, : SIZE // 4] += more
+    return shown(noisy[0]), shown(noisy[1])
+
+
+def _jpeg(rng: Rng, quality: int = 98, subsampling: str = "4:4:4") -> Pair:
     import OpenImageIO as oiio
 
     image = shown(drawn(scene(rng)))
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder) / "a.jpg")
         buffer = oiio.ImageBuf(image.pixels)
-        buffer.specmod().attribute("Compression", "jpeg:98")
-        buffer.specmod().attribute("jpeg:subsampling", "4:4:4")
+        buffer.specmod().attribute("Compression", f"jpeg:{quality}")
+        buffer.specmod().attribute("jpeg:subsampling", subsampling)
         if not buffer.write(path):
             raise OSError(f"{path}: {buffer.geterror()}")
         return image, image_file.read(path)
@@ -195,6 +219,26 @@ def _surface(rng: Rng) -> Pair:
     return shown(patched(*at, side, gray)), shown(patched(*at, side, gray + more))
 
 
+def _dot(rng: Rng) -> Pair:
+    radius, more, gray = rng.uniform(2.3, 3.5), rng.uniform(45, 80), rng.uniform(60, 140)
+    image, x, y = somewhere(rng)
+    plain = patched(image, x, y, 40, gray)
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    cover = np.clip(radius + 0.5 - np.hypot(columns - int(x), rows - int(y)), 0, 1)
+    return shown(plain), shown(plain + rng.choice([-1, 1]) * more * cover[..., None])
+
+
+def _facet(rng: Rng) -> Pair:
+    more = rng.uniform(25, 40)
+    image, x, y = somewhere(rng)
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    inside = np.ones((SIZE, SIZE), bool)
+    for angle in rng.uniform(0, 2 * np.pi) + np.array([0, 2, 4]) * np.pi / 3:
+        inside &= (columns - x) * np.cos(angle) + (rows - y) * np.sin(angle) < 3.5
+    plain = np.clip(image, 0, 215)
+    return shown(plain), shown(plain + more * inside[..., None])
+
+
 def _lit_surface(rng: Rng) -> Pair:
     side = int(rng.integers(20, 41))
     stops, x, y = somewhere(rng)
@@ -219,6 +263,17 @@ KINDS: dict[str, tuple[str, Change, bool | None]] = {  # a pair of each, and whe
     "less antialiasing": ("4 samples instead of 16", redrawn(samples=2), False),
     "a quarter pixel": ("the camera moved by this distance", redrawn(shift=0.25), False),
     "JPEG": ("quality 98, without subsampling of the colours", _jpeg, False),
+    "JPEG, subsampled": (
+        "quality 95, with the colours of 2 × 2 pixels; seen at some saturated lines",
+        functools.partial(_jpeg, quality=95, subsampling="4:2:0"),
+        None,
+    ),
+    "half a pixel": (
+        "an edge from black to white, blurred by 0.3 to 3 pixels, moved by this distance",
+        _soft_edge,
+        False,
+    ),
+    "noise": ("of 25 codes in a quarter of the width and height, of other seeds", _noise, False),
     "half floats": ("an HDR image of 6 stops, rounded to 11 bits", _half_floats, False),
     "no antialiasing": ("1 sample instead of 16; seen in some images", redrawn(samples=1), None),
     "colour of an object": (
@@ -233,6 +288,8 @@ KINDS: dict[str, tuple[str, Change, bool | None]] = {  # a pair of each, and whe
     ),
     "moved object": ("A box of 0.12 to 0.24 degrees and a contrast of 180 codes, by three pixels.", _moved, True),
     "line": ("A line of one pixel and 0.3 degrees, of a contrast of 225 to 255 codes; gone.", _line, True),
+    "dot": ("5 to 7 pixels wide, of a contrast of 45 to 80 codes of gray; added.", _dot, True),
+    "facet": ("A triangle of 12 pixels a side, 25 to 40 codes brighter, among shapes.", _facet, True),
     "brighter surface": ("A surface of 0.3 to 0.6 degrees, 14 to 20 codes brighter.", _surface, True),
     "light on a surface": ("HDR: a surface of 0.3 to 0.6 degrees in a quarter more light.", _lit_surface, True),
     "blue of an object": (
@@ -256,19 +313,21 @@ def tasks(context: Context) -> list[Task]:
     ]
 
 
-def errors(pair: Pair) -> tuple[float, float, float]:
-    """The local FLIP error, the error throughout a patch, and the larger of both over their bounds."""
-    local, patch = flip.flip(*pair).metrics[:2]
-    return local.value, patch.value, max(metric.value / (metric.bound or np.nan) for metric in (local, patch))
+def errors(pair: Pair) -> tuple[float, ...]:
+    """The local FLIP error, the error throughout a patch, the change one way, and the largest over their bounds."""
+    metrics = {metric.name: metric for metric in flip.flip(*pair).metrics if metric.name in MEASURED}
+    values = [metrics[name].value if name in metrics else 0.0 for name in MEASURED]  # HDR: none one way
+    return *values, max(metric.value / (metric.bound or np.nan) for metric in metrics.values())
 
 
 def kind_row(name: str, count: int) -> Row:
     """What `flip` finds in pairs of one kind."""
     text, make, due = KINDS[name]
     own = np.random.SeedSequence((seeds.current(SEED), list(KINDS).index(name))).spawn(count)
-    local, throughout, error = np.array([errors(make(np.random.default_rng(seed))) for seed in own]).T
+    *measured, error = np.array([errors(make(np.random.default_rng(seed))) for seed in own]).T
     different = int((error > 1).sum())
-    values = {LOCAL: float(np.median(local)), THROUGHOUT: float(np.median(throughout)), ALARMS: different / count}
+    values = {name: float(np.median(each)) for name, each in zip(MEASURED, measured, strict=True)}
+    values[ALARMS] = different / count
     budgets: dict[str, float] = {}
     if due:
         values |= {ERROR: float(error.min()), MISSED: float(count - different)}
@@ -299,7 +358,7 @@ def limit_rows() -> list[Row]:
         low, high = 0, most + 1
         while high - low > 1:
             middle = (low + high) // 2
-            low, high = (low, middle) if errors(make(middle))[2] > 1 else (middle, high)
+            low, high = (low, middle) if errors(make(middle))[-1] > 1 else (middle, high)
         return float(high) if high <= most else float("nan")
 
     codes = {side: {CODES: smallest(functools.partial(square, side), 155)} for side in SQUARES}
