@@ -22,7 +22,6 @@ import signal
 import subprocess
 import sys
 import zlib
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -157,23 +156,20 @@ def libraries() -> list[Library]:
 
 def candidates() -> list[str]:
     """Every libLLVM on this machine, the highest version first; before all others the one that is loaded, if any."""
-    paths = {os.path.realpath(path) for path in _search()}
-    loaded = _loaded() or set()
-    versioned = [(path in loaded, version, path) for path in paths if (version := _version(path)) is not None]
-    return [path for _, _, path in sorted(versioned, reverse=True)]
-
-
-def _search() -> Iterable[str]:
+    found: list[str] = []
     ldconfig = shutil.which("ldconfig", path=os.pathsep.join([os.environ.get("PATH", ""), "/sbin", "/usr/sbin"]))
     if ldconfig:
         listing = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, check=False).stdout
-        yield from re.findall(r"=> (\S*/libLLVM\S*)$", listing, re.MULTILINE)
+        found += re.findall(r"=> (\S*/libLLVM\S*)$", listing, re.MULTILINE)
     folders = [*os.environ.get("LD_LIBRARY_PATH", "").split(":"), f"{sys.prefix}/lib", "/usr/lib", "/usr/lib64"]
     folders += ["/usr/lib/*-linux-gnu", "/usr/lib/llvm*/lib*", "/usr/lib/llvm/*/lib*", "/usr/local/lib*"]
     folders += ["/usr/local/llvm*/lib*", "/opt/homebrew/opt/llvm*/lib", "/usr/local/opt/llvm*/lib"]
     for folder in folders:
         if folder.startswith("/"):
-            yield from map(str, Path("/").glob(f"{folder[1:]}/libLLVM*"))
+            found += map(str, Path("/").glob(f"{folder[1:]}/libLLVM*"))
+    loaded, paths = _loaded() or set(), set(map(os.path.realpath, found))
+    versioned = [(path in loaded, version, path) for path in paths if (version := _version(path)) is not None]
+    return [path for _, _, path in sorted(versioned, reverse=True)]
 
 
 def _version(path: str) -> tuple[int, ...] | None:
@@ -317,20 +313,16 @@ def _probe(name: str, environment: dict[str, str]) -> tuple[str, bool]:
         return f"ends the process in Dr.Jit's kernels ({name})", lasting
     if done.returncode == 0 and done.stdout.endswith("works\n"):
         return "", True
-    return _complaint(name, done.stderr), True
-
-
-def _complaint(name: str, stderr: str) -> str:
-    """The one line of the probe's messages that says most: Dr.Jit's own if it refused the library, else the last."""
-    lines = [line.strip() for line in stderr.splitlines() if line.strip()] or ["no answer"]
+    # The line that says most: Dr.Jit's own if it refused the library, else the last.
+    lines = [line.strip() for line in done.stderr.splitlines() if line.strip()] or ["no answer"]
     if "libcuda.so.1: cannot open" in lines[-1]:
-        return "no NVIDIA driver: libcuda.so.1 not found"
+        return "no NVIDIA driver: libcuda.so.1 not found", True
     if lines[-1] != "refused":
-        return lines[-1][:200]
+        return lines[-1][:200], True
     # "jit_find_library(): Unable to load "x": x: invalid ELF header!", "jit_llvm_init(): ... too old. The Dr.Jit ..."
     said = next((line for line in lines[:-1] if name in line or name == "llvm"), "no message")
     said = re.sub(r'^(\w+\(\): )?(Unable to load "[^"]*": [^:]*: )?', "", said)
-    return f"refused by Dr.Jit: {said.split('. ')[0].rstrip('.! ')[:200]}"
+    return f"refused by Dr.Jit: {said.split('. ')[0].rstrip('.! ')[:200]}", True
 
 
 # Remembering ---------------------------------------------------------------------------------------------------

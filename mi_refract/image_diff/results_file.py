@@ -11,7 +11,7 @@ import math
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 
@@ -23,6 +23,9 @@ from mi_refract.report.row import write_strict_json
 from . import pairing, text_reports
 from .results import FAILED, Result, Results, Status
 from .settings import ComparisonSpec, Settings
+
+if TYPE_CHECKING:
+    from mi_refract.report import documents
 
 SCHEMA = 1
 MOST = 2**28  # bytes of a file
@@ -56,75 +59,92 @@ def write(
     """
     from mi_refract.report import documents
 
-    cases, entries, commands = [], [], []
-    for result in results.results:
-        comparison, how, reason = result.comparison, result.how, text_reports.why(result)
-        metrics = comparison.metrics if comparison else ()
-        again = {"reproduce": results.reproduce(result), "accept": results.accept(result)}
-        outcome = OUTCOMES[result.status]
-        if result.status is Status.INCONCLUSIVE and results.inconclusive == "pass":
-            outcome = ""
-        kind = result.word if outcome in ("failure", "error") else ""
-        details = [f"warning: {result.warning}"] if result.warning and not outcome else []
-        details += [f"{verb}: {line}" for verb, line in again.items() if line and kind]
-        measured = [(metric.name, metric.value, metric.bound) for metric in metrics if kind]
-        message = reason if outcome else ""
-        cases.append(documents.Case(result.method, result.name, outcome, message, details, kind, measured))
-        if result.warning or result.status in FAILED:
-            file, title = result.test or result.reference or result.name, f"{result.name}: {result.word}"
-            file, title = (_escaped(x).replace(":", "%3A").replace(",", "%2C") for x in (file, title))
-            commands.append(f"::{'error' if kind else 'warning'} file={file},title={title}::{_escaped(reason)}")
-        digests = None
-        if result.digests is not None and result.status in FAILED:  # of what was compared; "" where there is no file
-            one, two = (result.digests[path] if path else "" for path in (result.reference, result.test))
-            digests = {"reference": one, "test": two, "variants": [result.digests[path] for path in result.variants]}
-        entries.append({
-            "name": result.name,
-            "status": str(result.status),
-            "category": str(result.category),
-            "reason": result.reason,
-            "warning": result.warning,
-            "error": result.error,
-            "reference": result.reference,
-            "test": result.test,
-            "target": result.target,
-            "digests": digests,
-            "method": result.method,
-            "method_why": comparison.chosen if comparison else "",
-            "options": dict(how.options),
-            "channels": how.channels,
-            "variance": how.variance if how.reads_variance else "",
-            "mask": how.mask,
-            "ignore": how.ignore,
-            "why_so": how.reason,
-            "entries": how.entries,
-            "matched": result.matched,
-            "variants": result.variants,
-            "metrics": list(map(vars, metrics)),
-            "minimum_detectable_difference": comparison.minimum_detectable if comparison else math.nan,
-            **again,
-        })  # fmt: skip
-    document = {
-        "schema": SCHEMA,
-        "exit_code": results.exit_code,
-        "sentence": text_reports.sentence(results),
-        "reference": results.reference,
-        "test": results.test,
-        "renders": results.renders,
-        "counts": {str(status): len(results.of(status)) for status in Status},
-        "results": entries,
-    }
-    summary = text_reports.markdown(results, report, url)
     if junit:
+        cases = [_junit_case(result, results) for result in results.results]
         documents.write_junit(junit, "mi-refract diff", {str(results.test): cases})
     if data:
+        document = {
+            "schema": SCHEMA,
+            "exit_code": results.exit_code,
+            "sentence": text_reports.sentence(results),
+            "reference": results.reference,
+            "test": results.test,
+            "renders": results.renders,
+            "counts": {str(status): len(results.of(status)) for status in Status},
+            "results": [_json_entry(result, results) for result in results.results],
+        }
         write_strict_json(data, document)
     if github:
-        for line in commands:
-            print(line)
+        for result in results.results:
+            if result.warning or result.status in FAILED:
+                print(_github_command(result, _outcome(result, results)))
         if path := os.environ.get("GITHUB_STEP_SUMMARY"):
             with safe_files.full_disk_names(path), Path(path).open("a", encoding="utf-8") as stream:
-                stream.write(summary)
+                stream.write(text_reports.markdown(results, report, url))
+
+
+def _outcome(result: Result, results: Results) -> Literal["", "failure", "error", "skipped"]:
+    """What the image is for a test runner; "" where it passes."""
+    if result.status is Status.INCONCLUSIVE and results.inconclusive == "pass":
+        return ""
+    return OUTCOMES[result.status]
+
+
+def _junit_case(result: Result, results: Results) -> documents.Case:
+    from mi_refract.report import documents
+
+    outcome, reason, details, metrics = _outcome(result, results), text_reports.why(result), [], []
+    if result.warning and not outcome:
+        details.append(f"warning: {result.warning}")
+    if failed := outcome in ("failure", "error"):
+        commands = {"reproduce": results.reproduce(result), "accept": results.accept(result)}
+        details += [f"{verb}: {line}" for verb, line in commands.items() if line]
+        measured = result.comparison.metrics if result.comparison else ()
+        metrics = [(metric.name, metric.value, metric.bound) for metric in measured]
+    kind, message = result.word if failed else "", reason if outcome else ""
+    return documents.Case(result.method, result.name, outcome, message, details, kind, metrics)
+
+
+def _json_entry(result: Result, results: Results) -> dict[str, Any]:
+    comparison, how, digests = result.comparison, result.how, None
+    if result.digests is not None and result.status in FAILED:  # of what was compared; "" where there is no file
+        one, two = (result.digests[path] if path else "" for path in (result.reference, result.test))
+        digests = {"reference": one, "test": two, "variants": [result.digests[path] for path in result.variants]}
+    return {
+        "name": result.name,
+        "status": str(result.status),
+        "category": str(result.category),
+        "reason": result.reason,
+        "warning": result.warning,
+        "error": result.error,
+        "reference": result.reference,
+        "test": result.test,
+        "target": result.target,
+        "digests": digests,
+        "method": result.method,
+        "method_why": comparison.chosen if comparison else "",
+        "options": dict(how.options),
+        "channels": how.channels,
+        "variance": how.variance if how.reads_variance else "",
+        "mask": how.mask,
+        "ignore": how.ignore,
+        "why_so": how.reason,
+        "entries": how.entries,
+        "matched": result.matched,
+        "variants": result.variants,
+        "metrics": [vars(metric) for metric in comparison.metrics] if comparison else [],
+        "minimum_detectable_difference": comparison.minimum_detectable if comparison else math.nan,
+        "reproduce": results.reproduce(result),
+        "accept": results.accept(result),
+    }
+
+
+def _github_command(result: Result, outcome: str) -> str:
+    """The workflow command that shows the image beside the changes of a pull request."""
+    file, title = result.test or result.reference or result.name, f"{result.name}: {result.word}"
+    file, title = (_escaped(x).replace(":", "%3A").replace(",", "%2C") for x in (file, title))
+    level = "error" if outcome in ("failure", "error") else "warning"
+    return f"::{level} file={file},title={title}::{_escaped(text_reports.why(result))}"
 
 
 def _escaped(text: object) -> str:

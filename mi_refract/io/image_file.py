@@ -285,8 +285,13 @@ def _image(
     path: Path, source: ImageInput, kind: str, part: tuple[int, int], values: tuple[int, int], besides: Metadata
 ) -> Image:
     """The part that the source is at. `values`: how many a file may have, and has so far; `besides`: more metadata."""
+    import OpenImageIO as oiio
+
     spec, found = source.spec(), source.format_name()
-    if path.suffix[1:].lower() not in _endings(found) or found == "null":  # which is black, whatever the file holds
+    # File endings by format: "openexr:exr,sxr;png:png;…".
+    endings = dict(pair.split(":") for pair in oiio.get_string_attribute("extension_list").split(";") if pair)
+    # The format "null" is black, whatever the file holds.
+    if path.suffix[1:].lower() not in endings.get(found, found).split(",") or found == "null":
         raise ImageError(f"{path}: holds an image of format {found}; expected the format that its file name indicates")
     if spec.deep:
         raise ImageError(f"{path}: expected an image without deep samples")
@@ -311,16 +316,6 @@ def _image(
     display = (spec.full_x, spec.full_y, spec.full_width, spec.full_height)
     channels, origin = tuple(spec.channelnames), (spec.x, spec.y)
     return Image(path, pixels, channels, origin, metadata, display, str(spec.format), part=part)
-
-
-@functools.cache
-def _endings(name: str) -> tuple[str, ...]:
-    """The endings of the names of files of a format, in lower case."""
-    import OpenImageIO as oiio
-
-    # OpenImageIO's own list: "openexr:exr,sxr;png:png;…".
-    known = dict(pair.split(":") for pair in oiio.get_string_attribute("extension_list").split(";") if pair)
-    return tuple(known.get(name, name).split(","))
 
 
 def _misread(found: str, kinds: set[str], metadata: Metadata, rows: int) -> str:

@@ -60,9 +60,19 @@ def run(
         process = subprocess.Popen(
             list(command), bufsize=0, stdin=pipe, stdout=pipe, stderr=errors, cwd=cwd, env=env, start_new_session=True
         )
+
+        def feed() -> None:
+            assert process.stdin
+            rest = memoryview(given)
+            with contextlib.suppress(OSError):  # nobody reads it
+                while rest:
+                    rest = rest[process.stdin.write(rest) :]  # Linux writes up to 2 GiB at a time
+            with contextlib.suppress(OSError):
+                process.stdin.close()
+
         try:
             begin()
-            threading.Thread(target=_feed, args=(process, given), daemon=True).start()
+            threading.Thread(target=feed, daemon=True).start()
             out, said = _read(process, deadline, most)
             process.wait(max(0, deadline - time.monotonic()))
         except subprocess.TimeoutExpired:
@@ -74,16 +84,6 @@ def run(
             for output in filter(None, (process.stdout, process.stderr)):
                 output.close()
     return Ended(process.returncode, out, said)
-
-
-def _feed(process: subprocess.Popen[bytes], given: bytes) -> None:
-    assert process.stdin
-    rest = memoryview(given)
-    with contextlib.suppress(OSError):  # nobody reads it
-        while rest:
-            rest = rest[process.stdin.write(rest) :]  # Linux writes up to 2 GiB at a time
-    with contextlib.suppress(OSError):
-        process.stdin.close()
 
 
 def _read(process: subprocess.Popen[bytes], deadline: float, most: int) -> tuple[bytes, bytes]:

@@ -253,7 +253,11 @@ def held(path: Path, what: str, place: Path | None = None, expected: str = "anot
             os.close(file)  # its holder removed it meanwhile
         except BlockingIOError:
             os.close(file)
-            where = f"{place or path.parent}: {what} is already running {_holder(path)}"
+            holder = "in an unknown process"
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError), path.open("rb") as text:
+                said = json.loads(text.read(1000))  # it need not be complete: nobody waits for that
+                holder = f"in process {said['process']} on {said['host']} since {said['since']}"
+            where = f"{place or path.parent}: {what} is already running {holder}"
             raise BlockingIOError(f"{where}; expected {expected}") from None
         except OSError as error:
             if error.errno in _NO_LOCKS:
@@ -268,16 +272,6 @@ def held(path: Path, what: str, place: Path | None = None, expected: str = "anot
     finally:
         path.unlink(missing_ok=True)  # while it is held: nobody else's file is removed
         os.close(file)
-
-
-def _holder(path: Path) -> str:
-    """Which process holds the lock, as its file says; nobody waits for the file to be complete."""
-    try:
-        with path.open("rb") as file:
-            said = json.loads(file.read(1000))
-        return f"in process {said['process']} on {said['host']} since {said['since']}"
-    except (OSError, ValueError, KeyError, TypeError):
-        return "in an unknown process"
 
 
 # Reading -------------------------------------------------------------------------------------------------------------

@@ -129,7 +129,22 @@ def parse(spec: float | str, name: str = "") -> Medium:
             near = ", ".join(difflib.get_close_matches(text, MATERIALS, 3, 0.0))
             catalogs = ", ".join(f"{name}:…" for name in glass_catalogs.CATALOGS)
             raise ValueError(f"{label}: unknown material; nearest: {near}; expected these, or {catalogs}")
-        return _formula(text, label) if "(" in text else _of_mitsuba(text, label)
+        if "(" in text:
+            return _formula(text, label)
+        # Mitsuba's table holds decimal numbers of at most seven digits in float32: the shortest gives them back.
+        import mitsuba as mi
+        from mitsuba.mitsuba_ext import Properties
+
+        variant: Any = mi.scalar_rgb  # the table is the same in all of them, and this one need not be set
+        query = Properties()
+        query["ior"] = text
+        try:
+            single = variant.lookup_ior(query, "ior", text)
+        except RuntimeError as error:
+            expected = str(error).partition("choices are:")[2] or "the names of Mitsuba's table"
+            raise ValueError(f"{label}: unknown material; expected {expected.strip()}") from None
+        absolute = "vacuum" if text in ("air", "vacuum") else ""
+        return Medium(text, CONSTANT, {"n": float(f"{single:.7g}")}, relative_to=absolute, is_air=text == "air")
     if isinstance(spec, bool) or not isinstance(spec, (int, float)) or not 0 < spec < math.inf:
         raise ValueError(f"{label}; expected a positive finite number, or a material's name")
     return Medium(str(spec), CONSTANT, {"n": float(spec)})
@@ -199,22 +214,3 @@ def _formula(text: str, label: str) -> Medium:
             f"{label}: n is not positive at {at:.6g} nm; expected a positive index everywhere in 360 … 830 nm"
         )
     return medium
-
-
-def _of_mitsuba(material: str, label: str) -> Medium:
-    """A name of Mitsuba's table. It holds decimal numbers of at most seven digits in float32: the shortest gives them
-    back.
-    """
-    import mitsuba as mi
-    from mitsuba.mitsuba_ext import Properties
-
-    variant: Any = mi.scalar_rgb  # the table is the same in all of them, and this one need not be set
-    query = Properties()
-    query["ior"] = material
-    try:
-        single = variant.lookup_ior(query, "ior", material)
-    except RuntimeError as error:
-        known = str(error).partition("choices are:")[2] or "the names of Mitsuba's table"
-        raise ValueError(f"{label}: unknown material; expected {known.strip()}") from None
-    absolute = "vacuum" if material in ("air", "vacuum") else ""
-    return Medium(material, CONSTANT, {"n": float(f"{single:.7g}")}, relative_to=absolute, is_air=material == "air")

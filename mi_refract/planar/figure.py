@@ -10,7 +10,7 @@ import importlib.util
 import io
 import math
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -201,7 +201,7 @@ def _rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
     from matplotlib.colors import to_rgb
 
     if scene.light.wavelengths:  # light adds up where lines would cover each other
-        _shade(panel, lines, {SHARED: np.ones(3)} | dict(enumerate(linear_srgb(scene.light))), _add_light, srgb_encode)
+        _shade(panel, lines, {SHARED: np.ones(3)} | dict(enumerate(linear_srgb(scene.light))), light=True)
         return
     colours = {}
     for number, name in [(SHARED, WHITE), *enumerate(scene.light.names)]:
@@ -212,7 +212,7 @@ def _rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
     x0, x1, y0, y1 = *panel.get_xlim(), *panel.get_ylim()
     crowd = np.hypot(*(lines.end - lines.start).T).sum() / math.hypot(x1 - x0, y1 - y0)
     if len(lines.start) > LINES or crowd > DIAGONALS:
-        _shade(panel, lines, colours, _blend)
+        _shade(panel, lines, colours, light=False)
     elif len(lines.start):  # thinner and fainter the less room there is; the strongest on top
         room = min(1.0, (40 / crowd) ** 0.5)
         order = np.argsort(lines.weight, kind="stable")
@@ -223,17 +223,8 @@ def _rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
         panel.add_collection(LineCollection(strokes, **style), autolim=False)
 
 
-def _shade(
-    panel: Axes,
-    lines: Legs,
-    colours: dict[int, Array],
-    mix: Callable[[Any, Any], tuple[Array, Array]],
-    encode: Callable[[Any], Any] = np.asarray,
-) -> None:
-    """Draw the density of the legs as an image, with as many pixels as the panel has.
-
-    mix: of densities and colours by number, the sum (… × 3) and its size, by which it is divided to get the colour.
-    """
+def _shade(panel: Axes, lines: Legs, colours: dict[int, Array], *, light: bool) -> None:
+    """Draw the density of the legs as an image, with as many pixels as the panel has: as light, or as ink."""
     box = panel.get_window_extent()
     view = *panel.get_xlim(), *panel.get_ylim()
     width, height = max(round(box.width), 1), max(round(box.height), 1)
@@ -241,34 +232,28 @@ def _shade(
     for number in colours:
         own = Legs(*(x[lines.colour == number] for x in vars(lines).values()))
         layers[number] = density(own, view, width, height)
-    mixed, size = mix(layers, colours)
+    # The sum of the layers (… × 3), and its size, by which it is divided to get the colour.
+    if light:  # adds up, and is as bright as its typical density is shown
+        mixed = np.clip(sum(layers[number][..., None] * colours[number] for number in layers), 0, None)
+        size = mixed.max(axis=2)
+    else:  # what all colours have in common gets the colour of SHARED
+        shared = layers.pop(SHARED)
+        parts = np.stack(list(layers.values())) / len(layers)
+        common = parts.min(axis=0) * (len(layers) > 1)
+        shared = shared + common * len(layers)
+        size = shared + (parts - common).sum(axis=0)
+        mixed = shared[..., None] * colours[SHARED]
+        for part, number in zip(parts - common, layers, strict=True):
+            mixed += part[..., None] * colours[number]
     colour = np.divide(mixed, size[..., None], out=np.ones_like(mixed), where=size[..., None] > 0)
     lit = size[size > 0]
     # The median alone would make a beam black beside faint reflections all over the view; the mean, those white.
     dense = size * TYPICAL / math.sqrt(lit.mean() * np.median(lit)) if lit.size else size
     opacity = dense / (1 + dense)  # saturates later than 1 − exp(−dense)
-    pixels = (np.dstack([encode(colour), encode(opacity)]) * 255).round().astype(np.uint8)
+    rgba = np.dstack([colour, opacity])
+    pixels = ((srgb_encode(rgba) if light else rgba) * 255).round().astype(np.uint8)
     style: dict[str, Any] = {"extent": view, "origin": "lower", "aspect": "equal", "zorder": 2}
     panel.imshow(pixels, **style)
-
-
-def _blend(layers: dict[int, Any], colours: dict[int, Any]) -> tuple[Array, Array]:
-    """Densities by colour. What all colours have in common gets the colour of SHARED."""
-    shared = layers.pop(SHARED)
-    parts = np.stack(list(layers.values())) / len(layers)
-    common = parts.min(axis=0) * (len(layers) > 1)
-    shared = shared + common * len(layers)
-    total = shared + (parts - common).sum(axis=0)
-    mixed = shared[..., None] * colours[SHARED]
-    for part, number in zip(parts - common, layers, strict=True):
-        mixed += part[..., None] * colours[number]
-    return mixed, total
-
-
-def _add_light(layers: dict[int, Any], colours: dict[int, Any]) -> tuple[Array, Array]:
-    """Densities by wavelength. Light adds up, and is as bright as its typical density is shown."""
-    light = np.clip(sum(layers[number][..., None] * colours[number] for number in layers), 0, None)
-    return light, light.max(axis=2)
 
 
 # Geometry --------------------------------------------------------------------------------------------------------

@@ -259,7 +259,12 @@ class ConicArcs(LineSegments):
         left, right = (dr.select(once, dr.select(a_left, vertices[j], vertices[1 - j]), UNKNOWN + j) for j in (0, 1))
         along, into = dr.select(a_left, c - a, c - b), dr.select(a_left, b - c, a - c)
         ends = left, right, along, into, dr.select(a_left, turn, -turn) * dr.rcp(w * w)
-        (one, valid), (other, too) = _roots(f_a, w * cross(ray.d, to_c), f_b)
+        # Both roots r/s of the quadratic, −f_a/h and −h/f_b, the smaller one first: |h|² ≥ |f_a f_b|.
+        f_c = w * cross(ray.d, to_c)
+        rest = dr.fma(f_c, f_c, -f_a * f_b)
+        h = f_c + dr.mulsign(dr.sqrt(dr.maximum(rest, 0)), f_c)
+        one, other = (dr.abs(h), dr.abs(f_a)), (dr.abs(f_b), dr.abs(h))
+        valid, too = (rest >= 0) & ((h >= 0) != a_left), (rest >= 0) & ((h >= 0) != (f_b >= 0))
         single = once & too
         root = (dr.select(own, x, dr.select(single, z, y)) for x, y, z in zip(start.other, one, other, strict=True))
         ways = to_a, to_c, to_b
@@ -336,15 +341,6 @@ class ConicArcs(LineSegments):
         e = _tangent(a, c, b, w, s, r)
         line = super().place(hit)
         return dr.select(turn == 0, line[0], point), dr.select(turn == 0, line[1], e * ieee_divide(1, dr.norm(e)))
-
-
-def _roots(f_a: Number, f_c: Number, f_b: Number) -> tuple[tuple[Root, Mask], tuple[Root, Mask]]:
-    """Both roots of the quadratic, f_c with the weight in it, and whether each is on the arc."""
-    # The roots r/s are −f_a/h and −h/f_b, the smaller one first: |h|² ≥ |f_a f_b|.
-    rest = dr.fma(f_c, f_c, -f_a * f_b)
-    h = f_c + dr.mulsign(dr.sqrt(dr.maximum(rest, 0)), f_c)
-    one, other = (dr.abs(h), dr.abs(f_a)), (dr.abs(f_b), dr.abs(h))
-    return (one, (rest >= 0) & ((h >= 0) != (f_a >= 0))), (other, (rest >= 0) & ((h >= 0) != (f_b >= 0)))
 
 
 def _total(w: Number, s: Number, r: Number) -> Number:

@@ -70,11 +70,10 @@ class MeshAcceleration:
         centre, self.half = (low + high) / 2, float((high - low).max() / 2)
         self.centre, self.scale = arrays.uniform(arrays.vector, *centre), arrays.uniform(arrays.number, 1 / self.half)
         a, b = ((x - centre) / self.half for x in both)
-        starts, ends = _strokes(a, b, vertices)
-        self.scene = _upright(variant, starts, ends)
+        self.scene = _strokes(variant, a, b, vertices)
         self.crowded = self._crowded(a, b, vertices)
         self.wedges = arrays.table(_wedge_shares(a, b, vertices))
-        first, around = _around(vertices, len(starts) - len(a))
+        first, around = _around(vertices)
         self.first, self.around = arrays.table(first), arrays.table(around)
 
     def expect(self, origins: Array, directions: Array) -> None:
@@ -168,8 +167,13 @@ class MeshAcceleration:
         return dr.while_loop(state, lambda i, stroke, best, going: going, test, label="also")[2]
 
 
-def _strokes(a: Array, b: Array, vertices: Vertices) -> tuple[Array, Array]:
-    """Both ends of every stroke: those of the segments from `a` to `b` (M × 2), then those of the vertices."""
+def _strokes(of: str, a: Array, b: Array, vertices: Vertices) -> Any:
+    """A scene of the Mitsuba variant `of`: one triangle per stroke, which cuts the plane z = 0 along it.
+
+    First the strokes of the segments from `a` to `b` (M × 2), then those of the vertices.
+    """
+    import mitsuba as mi
+
     e = b - a
     length = np.linalg.norm(e, axis=1, keepdims=True)
     e = np.divide(e, length, out=np.zeros_like(e), where=length > 0)
@@ -180,7 +184,25 @@ def _strokes(a: Array, b: Array, vertices: Vertices) -> tuple[Array, Array]:
     across = MARGIN * np.column_stack([-np.sin(angle), np.cos(angle)])
     place = np.empty((len(across), 2))
     place[number] = np.stack([a, b], 1).reshape(-1, 2)
-    return np.concatenate([a - MARGIN * e, place - across]), np.concatenate([b + MARGIN * e, place + across])
+    starts = np.concatenate([a - MARGIN * e, place - across])
+    ends = np.concatenate([b + MARGIN * e, place + across])
+    if mi.variant() is None:
+        activate()
+    variant: Any = getattr(mi, of)
+    count, middle = len(starts), (starts + ends) / 2
+    corners = (middle, -1), (2 * starts - middle, 1), (2 * ends - middle, 1)
+    mesh = variant.Mesh("strokes", 3 * count, count)
+    parameters = mi.traverse(mesh)
+    places = np.concatenate([np.insert(corner, 2, z, axis=1) for corner, z in corners])
+    faces = np.arange(3 * count, dtype=np.uint32).reshape(3, count).T
+    for name, values in (("vertex_positions", places.astype(np.float32)), ("faces", faces)):
+        parameters[name] = type(parameters[name])(values.ravel())
+    parameters.update()
+    # mi.load_dict would build for the variant that is set now.
+    config = mi.parser.ParserConfig(of)
+    state = mi.parser.parse_dict(config, {"type": "scene", "strokes": mesh})
+    mi.parser.transform_all(config, state)
+    return mi.parser.instantiate(config, state)
 
 
 def _wedge_shares(a: Array, b: Array, vertices: Vertices) -> Array:
@@ -203,36 +225,11 @@ def _wedge_shares(a: Array, b: Array, vertices: Vertices) -> Array:
         return np.asarray(reach.reshape(-1, 2) / np.linalg.norm(b - a, axis=1, keepdims=True))
 
 
-def _upright(of: str, a: Array, b: Array) -> Any:
-    """A scene of the Mitsuba variant `of`: one triangle per stroke, which cuts the plane z = 0 from `a` to `b`."""
-    import mitsuba as mi
-
-    if mi.variant() is None:
-        activate()
-    variant: Any = getattr(mi, of)
-    count, middle, below, above = len(a), (a + b) / 2, -np.ones(len(a)), np.ones(len(a))
-    corners = (middle, below), (2 * a - middle, above), (2 * b - middle, above)
-    mesh = variant.Mesh("strokes", 3 * count, count)
-    parameters = mi.traverse(mesh)
-    places = np.concatenate([np.column_stack(corner) for corner in corners])
-    faces = np.arange(3 * count, dtype=np.uint32).reshape(3, count).T
-    for name, values in (("vertex_positions", places.astype(np.float32)), ("faces", faces)):
-        parameters[name] = type(parameters[name])(values.ravel())
-    parameters.update()
-    # mi.load_dict would build for the variant that is set now.
-    config = mi.parser.ParserConfig(of)
-    state = mi.parser.parse_dict(config, {"type": "scene", "strokes": mesh})
-    mi.parser.transform_all(config, state)
-    return mi.parser.instantiate(config, state)
-
-
-def _around(vertices: Vertices, count: int) -> tuple[Any, Any]:
-    """(first, around): stroke i names the segments in `around` from first[i] to the next NOWHERE, but not its own.
-
-    count: the number of vertices.
-    """
+def _around(vertices: Vertices) -> tuple[Any, Any]:
+    """(first, around): stroke i names the segments in `around` from first[i] to the next NOWHERE, but not its own."""
     order = np.argsort(vertices.ravel(), kind="stable")
-    degree = np.bincount(vertices.ravel(), minlength=count)
+    degree = np.bincount(vertices.ravel())
+    count = len(degree)
     begin = np.cumsum(degree) - degree
     # A stroke names all segments at its vertex, or at its two vertices.
     segments = np.arange(len(vertices))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -181,37 +181,34 @@ def _plural(number: int, what: str) -> str:
 def as_data(scene: PlanarScene, traced: Sequence[Branches]) -> dict[str, Any]:
     """What `mi-refract trace --json` prints: the paths per colour, without padding; null for unknown numbers."""
     names, wavelengths = scene.light.names, scene.light.wavelengths or (None,) * len(scene.light)
+    colours = []
+    for name, wavelength, branches in zip(names, wavelengths, traced, strict=True):
+        paths, indices, polarised = branches.paths, branches.paths.indices, branches.paths.polarised
+        assert indices is not None and polarised is not None
+        listed: list[dict[str, Any]] = [
+            {
+                "ray": int(ray),
+                "beam": int(scene.beams[ray]),
+                "reflect": int(branches.reflect[i]),
+                "points": paths.points[i][np.isfinite(paths.points[i][:, 0])].tolist(),
+                "direction": paths.directions[i].tolist(),
+                "hits": paths.hits[i, paths.hits[i] >= 0].tolist(),
+                "events": [Event(event).name.lower() for event in paths.events[i, : last + 1]],
+                "indices": _nullable(indices[i, : last + 1]),
+                "weights": _nullable(branches.weights[i, : last + 1]),
+                "polarised": {wave: _nullable(polarised[i, : last + 1, j]) for j, wave in enumerate(("s", "p"))},
+            }
+            for i, (ray, last) in enumerate(zip(branches.rays, branches.last, strict=True))
+        ]
+        colours.append({"colour": name or None, "wavelength": wavelength, "paths": listed})
     return {
         "scene": str(scene.path),
         "title": scene.title,
         "max_depth": scene.max_depth,
         "branches": scene.branches,
         "counts": {name.lower(): number for name, number in count(traced).items() if name != "NONE"},
-        "colours": [
-            {"colour": name or None, "wavelength": wavelength, "paths": list(_paths(scene, branches))}
-            for name, wavelength, branches in zip(names, wavelengths, traced, strict=True)
-        ],
+        "colours": colours,
     }
-
-
-def _paths(scene: PlanarScene, branches: Branches) -> Iterator[dict[str, Any]]:
-    paths, weights, indices = branches.paths, branches.weights, branches.paths.indices
-    polarised = paths.polarised
-    assert indices is not None and polarised is not None
-    for i, last in enumerate(branches.last):
-        ray, points = int(branches.rays[i]), paths.points[i]
-        yield {
-            "ray": ray,
-            "beam": int(scene.beams[ray]),
-            "reflect": int(branches.reflect[i]),
-            "points": points[np.isfinite(points[:, 0])].tolist(),
-            "direction": paths.directions[i].tolist(),
-            "hits": paths.hits[i, paths.hits[i] >= 0].tolist(),
-            "events": [Event(event).name.lower() for event in paths.events[i, : last + 1]],
-            "indices": _nullable(indices[i, : last + 1]),
-            "weights": _nullable(weights[i, : last + 1]),
-            "polarised": {wave: _nullable(polarised[i, : last + 1, j]) for j, wave in enumerate(("s", "p"))},
-        }
 
 
 def _nullable(numbers: Array) -> list[float | None]:

@@ -28,7 +28,7 @@ from mi_refract.numerics import Mask, Number
 from .array_backend import ArrayBackend, Buffer, Index, Scatter, Vector2, choose_backend, negated
 from .intersect import NOWHERE, ConicArcs, Hit, LineSegments, Ray, cross
 from .mesh_acceleration import BACK, SHORTEST, MeshAcceleration, SearchState
-from .segments import REFLECT_BITS, Array, Event, Paths, Segments, check_range, finite_array
+from .segments import REFLECT_BITS, Event, Paths, Segments, check_range, finite_array
 
 METHODS = "auto", "brute", "mesh"
 FEW = 48  # up to so many segments, trying all is faster than a query of the mesh
@@ -102,7 +102,17 @@ class Tracer:
             check_range(f"segments.{name}", getattr(segments, name), self.farthest)
         if min(segments.n_left.min(), segments.n_right.min()) < 1 / self.farthest:
             raise ValueError(f"segments: an index below {1 / self.farthest:g}")
-        segments, self.middle = _centred(segments)
+        # Seen from a new origin in the middle of boundaries whose |middle| exceeds twice their extent: there
+        # |x − middle| < |middle|/2, so the differences are exact, and float32 keeps all its digits for them.
+        start, end, control = segments.start, segments.end, segments.control
+        low, high = (f([f(x, axis=0) for x in (start, end, control)], axis=0) for f in (np.min, np.max))
+        middle = low / 2 + high / 2
+        self.middle = middle = np.where(np.abs(middle) > 2 * (high - low).max(), middle, 0.0)
+        if middle.any():
+            start, end = start - middle, end - middle
+            # A straight segment stays straight to the last bit.
+            control = np.where(segments.turn[:, None] == 0, (start + end) / 2, control - middle)
+            segments = replace(segments, start=start, end=end, control=control)
         self.boundaries = (ConicArcs if segments.turn.any() else LineSegments)(arrays, segments)
         size = float(np.subtract(*self.boundaries.box[::-1]).max())
         if 0 < size < 1 / self.farthest:
@@ -197,16 +207,6 @@ class Tracer:
         ray = Ray(p, d, arrays.index(NOWHERE), half, half, arrays.mask(False), slack)
         return PathState(ray, index, arrays.vector(1, 1), arrays.index(0), self._search(-BACK), arrays.mask(True))
 
-    def _refract(self, d: Vector2, line: Vector2, k: Number) -> tuple[Vector2, Mask]:
-        """By the planar formula of document 004, or one of FORMULAS in the plane z = 0."""
-        arrays = self.arrays
-        if self.formula is None:
-            b, transmitted = refract_2d(d, line, k)
-            return arrays.vector(*b), transmitted  # of the length of `d`, to u
-        a, n = arrays.vector3(d.x, d.y, 0 * d.x), arrays.vector3(-line.y, line.x, 0 * d.x)
-        b, transmitted = FORMULAS[self.formula].unchecked(a, n, k)
-        return _unit(arrays.vector(b.x, b.y)), transmitted
-
     def _search(self, gone: float) -> SearchState:
         return SearchState(self.arrays.number(gone), self.arrays.index(NOWHERE))
 
@@ -246,7 +246,13 @@ class Tracer:
             k = dr.select(hit.to_left, to_left, to_right)
             index = dr.select(dr.isnan(state.index), near, state.index)
             p, line = self.boundaries.place(hit)
-            b, through = self._refract(d, line, k)
+            if self.formula is None:  # the planar one of document 004
+                (b_x, b_y), through = refract_2d(d, line, k)
+                b = arrays.vector(b_x, b_y)  # of the length of `d`, to u
+            else:
+                a, n = arrays.vector3(d.x, d.y, 0 * d.x), arrays.vector3(-line.y, line.x, 0 * d.x)
+                b, through = FORMULAS[self.formula].unchecked(a, n, k)
+                b = _unit(arrays.vector(b.x, b.y))
             if bits is not None:
                 bit = (bits >> dr.minimum(j, REFLECT_BITS - 1)) & 1
                 forced = through & (j < REFLECT_BITS) & (bit == 1)
@@ -290,24 +296,6 @@ def _shares(d: Vector2, line: Vector2, k: Number, through: Mask) -> Vector2:
     t_s, t_p, _ = fresnel.transmitted_powers(cos_i, cos_t, transmitted, k)
     r_s, r_p = map(dr.squared_norm, fresnel.amplitudes(cos_i, k))
     return type(d)(dr.select(through, t_s, r_s), dr.select(through, t_p, r_p))
-
-
-def _centred(segments: Segments) -> tuple[Segments, Array]:
-    """The segments as seen from a new origin, and that: 0, or per axis the middle of boundaries that are far from 0.
-
-    Far is where |middle| exceeds twice the extent. Then |x − middle| < |middle|/2: the differences are exact, and
-    float32 keeps all its digits for them.
-    """
-    start, end, control = segments.start, segments.end, segments.control
-    low, high = (f([f(x, axis=0) for x in (start, end, control)], axis=0) for f in (np.min, np.max))
-    middle = low / 2 + high / 2
-    middle = np.where(np.abs(middle) > 2 * (high - low).max(), middle, 0.0)
-    if not middle.any():
-        return segments, middle
-    start, end = start - middle, end - middle
-    # A straight segment stays straight to the last bit.
-    control = np.where(segments.turn[:, None] == 0, (start + end) / 2, control - middle)
-    return replace(segments, start=start, end=end, control=control), middle
 
 
 def _each(name: str, values: ArrayLike, count: int, kinds: str, kind: DTypeLike) -> Any:

@@ -23,7 +23,7 @@ from mi_refract.regimes import Array, Rays
 
 from . import diagnosis, tir_signal
 from .diagnosis import Explanation
-from .header import AUTO, FLAG, PRECISIONS, SAME, TIR, Header, Ids, described, has_media, shown
+from .header import AUTO, FLAG, PRECISIONS, SAME, TIR, Header, described, has_media, shown
 from .judged_answers import JudgedAnswers, Table, certified, judge_answers, see
 from .ray_set import Answers, RaySet, in_regime
 from .tir_signal import LOOSEST, UNCLEAR
@@ -177,7 +177,13 @@ def check(
     header, precision = rays.header, rays.precision
     if (checksum := answers.header.get("checksum")) not in (None, header["checksum"]):
         raise ValueError(f"the answers are to rays with the checksum {shown(checksum)}; expected {header['checksum']}")
-    rays, answers, problems = _matched(rays, answers)
+    # The rays that have an answer, and the first answer to each, in order.
+    ids, first, counts = np.unique(answers.ids, return_index=True, return_counts=True)
+    place = np.searchsorted(ids, rays.ids).clip(max=max(len(ids) - 1, 0))
+    answered = ids[place] == rays.ids if len(ids) else np.zeros(len(rays), bool)
+    unknown = np.setdiff1d(ids, rays.ids, assume_unique=True)
+    problems = {"missing": np.sort(rays.ids[~answered]), "duplicate": ids[counts > 1], "unknown": unknown}
+    rays, answers = rays[answered], answers[first[place[answered]]]
 
     def judge(rows: NDArray[np.intp] | slice, exact: oracle.Certified | None = None) -> JudgedAnswers:
         some, budget = answers[rows], FORMULAS[error_bound].budget
@@ -214,8 +220,8 @@ def check(
     defects = []
     for kind, ids in problems.items():
         if len(ids):
-            first, more = ", ".join(map(str, ids[:LISTED_IDS])), ", …" if len(ids) > LISTED_IDS else ""
-            defects.append(Problem(kind, len(ids), f"id{'' if len(ids) == 1 else 's'} {first}{more}"))
+            listed, more = ", ".join(map(str, ids[:LISTED_IDS])), ", …" if len(ids) > LISTED_IDS else ""
+            defects.append(Problem(kind, len(ids), f"id{'' if len(ids) == 1 else 's'} {listed}{more}"))
     return Findings(
         precision=precision,
         ulp=ulp,
@@ -228,19 +234,6 @@ def check(
         header=header,
         ratio=ratio,
     )
-
-
-def _matched(rays: RaySet, answers: Answers) -> tuple[RaySet, Answers, dict[str, Ids]]:
-    """The rays that have an answer, the first answer to each, in order; ids by kind of UNFIT, each once, in order."""
-    ids, first, counts = np.unique(answers.ids, return_index=True, return_counts=True)
-    place = np.searchsorted(ids, rays.ids).clip(max=max(len(ids) - 1, 0))
-    answered = ids[place] == rays.ids if len(ids) else np.zeros(len(rays), bool)
-    problems = {
-        "missing": np.sort(rays.ids[~answered]),
-        "duplicate": ids[counts > 1],
-        "unknown": np.setdiff1d(ids, rays.ids, assume_unique=True),
-    }
-    return rays[answered], answers[first[place[answered]]], problems
 
 
 def used(rays: RaySet, answers: Answers) -> Rays:

@@ -5,7 +5,6 @@ Names of files and messages of errors may hold any character: `printable` makes 
 
 from __future__ import annotations
 
-import functools
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -19,7 +18,6 @@ from mi_refract.io.text import compact, distinguishable, printable, printable_li
 from .embedded_images import EmbeddedImages
 
 if TYPE_CHECKING:
-    from jinja2 import Environment
     from markupsafe import Markup
 
 HERE = Path(__file__).parent / "templates"
@@ -32,27 +30,20 @@ def write_page(path: str | Path, template: str, content: Mapping[str, Any], imag
 
 def rendered(template: str, content: Mapping[str, Any], images: EmbeddedImages) -> bytes:
     """The page."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
     def part(name: str) -> Markup:
         text = (HERE / name).read_text("utf-8")
         return Markup(f"<style>\n{text}</style>" if name.endswith(".css") else f"<script>\n{text}</script>")
 
-    text = _environment().get_template(template).render(**content, part=part, images=images.embedded)
-    return text.encode("utf-8", "replace")
-
-
-@functools.cache
-def _environment() -> Environment:
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
-
     options: Any = {"autoescape": True, "undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     options["finalize"] = lambda x: printable_lines(x) if isinstance(x, str) and not isinstance(x, Markup) else x
     environment = Environment(loader=FileSystemLoader(HERE), **options)
     filters: dict[str, Any] = {"compact": compact, "words": words, "code": code}
     environment.filters |= filters
-    return environment
+    text = environment.get_template(template).render(**content, part=part, images=images.embedded)
+    return text.encode("utf-8", "replace")
 
 
 def code(text: str) -> Markup:
@@ -102,7 +93,10 @@ def write_junit(path: str | Path, name: str, suites: Mapping[str, Sequence[Case]
         suite = xml.SubElement(root, "testsuite", {"name": printable(title)} | _counts(cases))
         for case in cases:
             element = xml.SubElement(suite, "testcase", classname=printable(case.group), name=printable(case.name))
-            lines = [*case.details, *(_measured(*metric) for metric in case.metrics)]
+            lines = list(case.details)
+            for metric, value, bound in case.metrics:
+                text, allowed = (compact(value), "") if bound is None else distinguishable(value, bound)
+                lines.append(f"{metric} {text}" + (f" (allowed {allowed})" if allowed else ""))
             details = "\n".join(map(printable, lines)) or None
             if case.outcome:
                 kind = {"type": printable(case.kind)} if case.kind else {}
@@ -113,13 +107,6 @@ def write_junit(path: str | Path, name: str, suites: Mapping[str, Sequence[Case]
     xml.indent(root)
     document: bytes = xml.tostring(root, encoding="utf-8", xml_declaration=True)
     write_atomically(path, document + b"\n")
-
-
-def _measured(name: str, value: float, bound: float | None) -> str:
-    if bound is None:
-        return f"{name} {compact(value)}"
-    text, allowed = distinguishable(value, bound)
-    return f"{name} {text} (allowed {allowed})"
 
 
 def _counts(cases: Sequence[Case]) -> dict[str, str]:
