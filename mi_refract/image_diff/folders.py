@@ -89,7 +89,7 @@ def diff(
     for result in compared:
         done.append(result)
         progress(len(done), len(pairs))
-    return replace(results, results=tuple(sorted(done, key=lambda result: list(Status).index(result.status))))
+    return replace(results, results=tuple(sorted(done, key=lambda result: result.order)))
 
 
 def bounded_map(
