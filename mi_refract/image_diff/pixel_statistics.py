@@ -112,6 +112,8 @@ def differ_like_noise(a: Array, b: Array) -> bool:
     It is a hint: what is smaller than a tile of signs, or weaker than the noise, is not seen beside noise.
     """
     changed = (a != b).any((0, 1))
+    if not changed.any():  # the numbers are the same, but not what they mean
+        return False
     a, b = a[..., changed].astype(np.float32), b[..., changed].astype(np.float32)
     both, size = a + b, np.abs(a) + np.abs(b)
     share = np.divide(b - a, size, out=np.zeros_like(size), where=size > 0)
