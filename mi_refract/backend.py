@@ -267,7 +267,17 @@ def _try(path: str) -> Library:
     except (OSError, ValueError, RuntimeError):
         known = None
     known = {key: x for key, x in known.items() if isinstance(x, str)} if isinstance(known, dict) else {}
-    key = state and f"{os.path.realpath(path)}, {state.st_mtime_ns}, {state.st_size}, {_circumstances()}"
+    # What decides, besides the library: Dr.Jit, the CPU's instruction sets, and the probe itself.
+    try:
+        drjit = importlib.metadata.version("drjit")
+    except importlib.metadata.PackageNotFoundError:
+        drjit = "unknown"
+    try:
+        flags = re.search(r"^(?:flags|Features)\s*:.*$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    except OSError:
+        flags = None
+    machine = f"drjit {drjit}, {zlib.crc32((_PROBE + (flags[0] if flags else '')).encode()):08x}"
+    key = state and f"{os.path.realpath(path)}, {state.st_mtime_ns}, {state.st_size}, {machine}"
     if key in known:
         return Library(path, known[key])
     defect, lasting = _probe("llvm", {CHOICE: path})
@@ -326,19 +336,6 @@ def _probe(name: str, environment: dict[str, str]) -> tuple[str, bool]:
 
 
 # Remembering ---------------------------------------------------------------------------------------------------
-
-
-def _circumstances() -> str:
-    """What decides, besides the library: Dr.Jit, the CPU's instruction sets, and the probe itself."""
-    try:
-        drjit = importlib.metadata.version("drjit")
-    except importlib.metadata.PackageNotFoundError:
-        drjit = "unknown"
-    try:
-        flags = re.search(r"^(?:flags|Features)\s*:.*$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    except OSError:
-        flags = None
-    return f"drjit {drjit}, {zlib.crc32((_PROBE + (flags[0] if flags else '')).encode()):08x}"
 
 
 def _cache_file() -> Path:

@@ -52,7 +52,7 @@ QUICK = (
     "diff.planted_defects",
 )
 LOCK = "validation.lock"  # in the folder of the report, while it is being made
-PROFILES = {"quick": "about a minute", "standard": "minutes", "full": "hours"}
+PROFILES = {"quick": "about a minute", "standard": "about an hour", "full": "hours"}
 
 app = command_line.application()
 

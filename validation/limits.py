@@ -102,6 +102,7 @@ REFLECTANCE = {
 }
 
 PATH_BOUNDARY = limit(2.0**-24, "of the direction, (2 m + 1) times after m boundaries: the cosine is rounded twice")
+OFF_EXACT = limit(1.0, "of the built-in's pixels: where the two images differ, `refract` is the one that is right")
 FLIPPED = limit(1e-3, "of the pixels: those of which a last bit changes the choice between reflection and refraction")
 
 # Renders -------------------------------------------------------------------------------------------------------

@@ -32,10 +32,11 @@ class Study:
 
     `name` is the `study` of its rows; `title`, `text` and `terms` (metric or case → meaning) are shown by the report.
     `tasks(context)` lists what is to be run. `axes` says what the curves of its rows are drawn over, `scatter` which
-    metric is plotted against which (both as `mi_refract.report.study_page` describes them). `summarise(rows)` returns
-    all rows of a run with the summary of this study among them. `again(context)`, of a study whose answer rests on
-    random draws, gives the rows that they decide (no times, no images), for `validation.repeated` to repeat. `records`:
-    subjects that are measured for comparison. Only they, and what is timed, have rows with neither bound nor remark.
+    metric is plotted against which, `scale` between which numbers its matrices have colours (all three as
+    `mi_refract.report.study_page` describes them). `summarise(rows)` returns all rows of a run with the summary of this
+    study among them. `again(context)`, of a study whose answer rests on random draws, gives the rows that they decide
+    (no times, no images), for `validation.repeated` to repeat. `records`: subjects that are measured for comparison.
+    Only they, and what is timed, have rows with neither bound nor remark.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Study:
     terms: Mapping[str, str]
     tasks: Callable[[Context], list[Task]]
     axes: Mapping[str, Any] = field(default_factory=dict)
+    scale: tuple[float, float] | None = None
     scatter: tuple[Mapping[str, Any], ...] = ()
     summarise: Callable[[list[Row]], list[Row]] = list
     again: Callable[[Context], list[Row]] | None = None
@@ -55,7 +57,7 @@ class Study:
         text = " ".join(self.text.split())
         text += f" Recorded without a bound: {', '.join(f'`{name}`' for name in self.records)}." if self.records else ""
         about: dict[str, Any] = {"title": self.title, "text": text, "terms": dict(self.terms)}
-        return about | ({"axes": dict(self.axes)} if self.axes else {})
+        return about | ({"axes": dict(self.axes)} if self.axes else {}) | ({"scale": self.scale} if self.scale else {})
 
 
 def about(docstring: str | None) -> str:

@@ -47,6 +47,61 @@ COMMANDS = {
 }
 
 
+# Where the help of a command ends, by its name.
+EXAMPLES = {
+    "": ("doctor", "render scene.xml -o image.exr --spp 256", "diff references/ new/ --report out.html"),
+    "render": (
+        "render scene.xml -o image.exr --spp 256",
+        "render scene.xml -o image.exr --until 0.5% --preview image.png",
+        "render scene.xml -o reference.exr --time 1h30m -D bsdf=dielectric",
+    ),
+    "trace": (
+        "trace lens.toml --rays 2000 -o lens.svg",
+        "trace lens.toml --table --wavelengths 486.1,587.6,656.3",
+        "trace --keys",
+    ),
+    "diff": (
+        "diff reference.exr new.exr",
+        "diff references/ new/ --report out.html --junit out.xml",
+        "diff references/ new/ --method tolerance --set fail=0.01",
+    ),
+    "accept": ("accept references/ new/", "accept --from out.json --yes"),
+    "self-test": ("self-test reference.exr", "self-test scene.xml"),
+    "rays": ("rays run --report out.html -- ./my_tracer", "rays export -o rays.csv"),
+    "rays export": (
+        "rays export -o rays.csv",
+        "rays export -o rays.npz --regime critical --count 100000 --precision f64",
+        "rays export --regimes",
+    ),
+    "rays check": ("rays check answers.csv", "rays check answers.csv --rays rays.csv --report out.html"),
+    "rays run": (
+        "rays run -- ./my_tracer",
+        "rays run --medium SCHOTT:N-BK7 --wavelengths 450,550,650 -- ./my_tracer",
+        "rays run --renderer my_renderer/ --junit out.xml",
+    ),
+    "scene": ("scene list", "scene export sphere --to cycles", "scene export my_scene.xml --to obj+json"),
+    "scene list": ("scene list", "scene export prism --to mitsuba"),
+    "scene export": (
+        "scene export sphere --to cycles",
+        "scene export my_scene.xml --to povray -o povray/ --level 6 -D bsdf=refract",
+    ),
+    "doctor": ("doctor", "doctor --json"),
+}
+
+
+def examples(name: str) -> str:
+    """The EXAMPLES of a command, in lines that are not wrapped."""
+    return "\n".join(["\b", "Examples:", *(f"  mi-refract {words}" for words in EXAMPLES.get(name, ()))])
+
+
+def with_examples(command: Any, name: str) -> Any:
+    """The command, which is called `name`, and those below it, with their examples where their help ends."""
+    command.epilog = examples(name)
+    for below, one in getattr(command, "commands", {}).items():
+        with_examples(one, f"{name} {below}")
+    return command
+
+
 class Commands(TyperGroup):
     """The commands of COMMANDS, each imported when it is called."""
 
@@ -64,7 +119,7 @@ class Commands(TyperGroup):
             single = typer.Typer(add_completion=False, rich_markup_mode=None)
             single.command(cmd_name)(command)
             command = single
-        return typer.main.get_command(command)
+        return with_examples(typer.main.get_command(command), cmd_name)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write a line for each command, without importing it."""
@@ -75,7 +130,7 @@ class Commands(TyperGroup):
 app = typer.Typer(cls=Commands, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
-@app.callback(invoke_without_command=True)
+@app.callback(invoke_without_command=True, epilog=examples(""))
 def _root(
     context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Print the version.", is_eager=True)] = False,

@@ -86,7 +86,16 @@ def diff(
         raise ValueError("two paths are needed; expected mi-refract diff REFERENCE TEST")
     chosen = _settings(reference, method, options or [], settings, max_values)
     if check_settings or test is None:
-        raise typer.Exit(_check_settings(reference, test or reference, names or [], chosen))
+        test = test or reference
+        every = pairing.pairs(reference, test, chosen)
+        pairs = pairing.named(every, names or [])
+        lines = [f"{pattern}: matches no image" for pattern in chosen.unused([pair.name for pair in pairs])]
+        checked = (*pairs, *pairing.wrong_entries(chosen, every))
+        errors = [f"{pair.name}: {error}" for pair in checked if (error := pairing.error_of(pair, reference))]
+        text_reports.print_table(text_reports.settings_table(pairs))
+        for line in lines + errors:
+            print(f"mi-refract: {printable(line)}", file=sys.stderr)
+        raise typer.Exit(MISUSE if errors else 0)
     for path, suffixes in ((report, (".html", ".htm")), (junit, (".xml",)), (json, (".json",))):
         if path:
             writable(path, suffixes)
@@ -202,19 +211,6 @@ def _settings(reference: Path, method: str, words: Sequence[str], file: Path | N
     if path and above.parts and settings.maps:
         raise ValueError(f"{path}: `map` is for whole folders; expected {path.parent} as REFERENCE, or --settings")
     return replace(settings, flags=tuple(flags), above=above)
-
-
-def _check_settings(reference: Path, test: Path, names: Sequence[str], chosen: Settings) -> int:
-    """Print how each image would be compared, and which entries say so; 2 where that is wrong for one."""
-    every = pairing.pairs(reference, test, chosen)
-    pairs = pairing.named(every, names)
-    lines = [f"{pattern}: matches no image" for pattern in chosen.unused([pair.name for pair in pairs])]
-    checked = ((pair, pairing.error_of(pair, reference)) for pair in (*pairs, *pairing.wrong_entries(chosen, every)))
-    errors = [f"{pair.name}: {error}" for pair, error in checked if error]
-    text_reports.print_table(text_reports.settings_table(pairs))
-    for line in lines + errors:
-        print(f"mi-refract: {printable(line)}", file=sys.stderr)
-    return MISUSE if errors else 0
 
 
 @contextlib.contextmanager

@@ -12,8 +12,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterator
-from typing import NoReturn
+from collections.abc import Callable, Iterator
 
 SHOW_CURSOR = b"\x1b[?25h"  # which a spinner hides
 _ENDING = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
@@ -34,12 +33,26 @@ def end_at_once(*, even_if_ignored: bool) -> None:
     signal.pthread_sigmask(signal.SIG_BLOCK, _blocked)
     from mi_refract.io import safe_files  # it takes longer than all before it
 
+    def watch() -> None:
+        caught = signal.sigwait(waited)
+        while _unblocked.is_set():  # the system has the main thread take the signal, as a rule
+            signal.pthread_kill(threading.main_thread().ident or 0, caught)
+            caught = signal.sigwait(waited)
+        if _last_acts:
+            acting = threading.Thread(target=_last_acts[-1], name="last act", daemon=True)
+            acting.start()
+            while acting.is_alive() and signal.sigtimedwait(waited, 0.05) is None:
+                pass
+        if os.isatty(2):
+            os.write(2, SHOW_CURSOR)
+        safe_files.end_process(128 + caught)
+
     if waited := _blocked - (set() if even_if_ignored else ignored):
         for number in waited:  # macOS does not queue what is ignored
             signal.signal(
                 number, signal.default_int_handler if number == signal.SIGINT else lambda x, _: sys.exit(128 + x)
             )
-        threading.Thread(target=_watch, args=(safe_files.end_process, waited), name="Ctrl-C", daemon=True).start()
+        threading.Thread(target=watch, name="Ctrl-C", daemon=True).start()
 
 
 @contextlib.contextmanager
@@ -69,18 +82,3 @@ def as_exceptions() -> Iterator[None]:
     finally:
         _unblocked.clear()
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _watch(end_process: Callable[[int], NoReturn], signals: Collection[signal.Signals]) -> None:
-    caught = signal.sigwait(signals)
-    while _unblocked.is_set():  # the system has the main thread take the signal, as a rule
-        signal.pthread_kill(threading.main_thread().ident or 0, caught)
-        caught = signal.sigwait(signals)
-    if _last_acts:
-        acting = threading.Thread(target=_last_acts[-1], name="last act", daemon=True)
-        acting.start()
-        while acting.is_alive() and signal.sigtimedwait(signals, 0.05) is None:
-            pass
-    if os.isatty(2):
-        os.write(2, SHOW_CURSOR)
-    end_process(128 + caught)

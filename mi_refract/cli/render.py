@@ -121,7 +121,8 @@ def render(
     with spinner or contextlib.nullcontext():
         rendering = resume(job, output, limits, restart=restart)
     if rendering.progress.passes:
-        print(printable(f"{output}: resuming from {rendering.progress.done} spp"), file=sys.stderr)
+        state = "complete with" if rendering.end() else "resuming from"
+        print(printable(f"{output}: {state} {rendering.progress.done} spp"), file=sys.stderr)
     with (
         cluster_passes(cluster, rendering, str(chosen), bundle_limit, mixed=mixed_workers) as passes,
         interrupts.last_act(rendering.give_up),
@@ -159,7 +160,7 @@ def cluster_passes(
 
     bundle = scene_bundle.pack(rendering.parsed, bundle_limit)
     with connected(target.scheduler, target.workers) as client:
-        tolerated = rendering.tolerated_facts | (on_worker.MIXED if mixed else frozenset())
+        tolerated = on_worker.MIXED if mixed else ()
         workers = Workers(client, variant, on_worker.facts(variant), tolerated, warn, task="render")
         workers.wait()
         passes = ClusterPasses(workers, bundle, variant, rendering.job.seed, rendering.warnings.append)

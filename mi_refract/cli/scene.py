@@ -1,7 +1,8 @@
-"""The command `mi-refract scene export`."""
+"""The commands `mi-refract scene export` and `mi-refract scene list`."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -12,21 +13,27 @@ from mi_refract.rendering import scene_files
 
 from .doctor import activate
 
-app = typer.Typer(
-    help="Write scenes for other renderers.", no_args_is_help=True, add_completion=False, rich_markup_mode=None
-)
+app = typer.Typer(help="Write scenes for other renderers.", add_completion=False, rich_markup_mode=None)
 
-SCENES = Path(__file__).parents[2] / "scenes"  # of a checkout; an installed package has none
+# `mi_refract/scenes` of an installed package; of a checkout, `scenes` beside the package.
+SCENES = next((x for x in (Path(__file__).parents[i] / "scenes" for i in (1, 2)) if x.is_dir()), Path("scenes"))
 
 
-@app.callback()
-def _scene() -> None:
-    """Without this callback typer would drop the word `export`."""
+@app.command("list")
+def list_scenes() -> None:
+    """List the scenes of the package: those that `export` knows by their names, and files for `mi-refract trace`."""
+    print(printable(f"in {SCENES}:"))
+    paths = [*sorted(SCENES.glob("*.xml")), *sorted(SCENES.glob("planar/*.toml"))]
+    names = [path.stem if path.suffix == ".xml" else str(path.relative_to(SCENES)) for path in paths]
+    for name, path in zip(names, paths, strict=True):
+        pattern = r"<!--(.*?[.:])\s" if path.suffix == ".xml" else r'title = "(.*?)"'
+        said = re.search(pattern, path.read_text("utf-8"), re.DOTALL)
+        print(printable(f"{name:{max(map(len, names))}}  {' '.join(said[1].split()).rstrip('.:') if said else ''}"))
 
 
 @app.command()
 def export(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="A Mitsuba scene, or the name of one in scenes/.")],
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="A Mitsuba scene, or the name of one of `scene list`.")],
     to: Annotated[
         str, typer.Option(metavar="TARGET", help="Renderer: cycles|luxcore|radiance|raysect|povray|mitsuba|obj+json.")
     ],

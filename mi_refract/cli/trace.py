@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
@@ -9,9 +10,9 @@ from typing import Annotated
 import typer
 
 from mi_refract.io import safe_files
-from mi_refract.io.text import json_text
+from mi_refract.io.text import json_text, printable
 from mi_refract.planar import figure, focal_points, light, scene_file
-from mi_refract.planar.path_tree import as_data, follow_scene, summary, with_rays
+from mi_refract.planar.path_tree import as_data, follow_scene, mismatches, summary, with_rays
 
 from .app import shows
 from .doctor import probe
@@ -68,6 +69,11 @@ def trace(
     lines = [f"{loaded.file}: {summary(loaded, traced)}", *([focal_points.table(foci)] if foci else [])]
     if output:
         figure.save(output, loaded, traced)
+        lines.append(printable(f"{output}: written"))
     if as_json and foci is not None:
         data["foci"] = [asdict(group) for group in foci]
     print(json_text(data) if as_json else "\n".join(lines))
+    if wrong := mismatches(loaded, traced):
+        expected = "expected shapes that touch, lie in one another by `within`, or are apart"
+        print(printable(f"mi-refract: {scene}: {'; '.join(wrong)}; {expected}"), file=sys.stderr)
+        raise typer.Exit(1)

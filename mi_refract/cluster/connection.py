@@ -68,41 +68,6 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
     if (scheduler is None) == (workers is None):
         raise UsageError("expected either --scheduler ADDRESS or --workers N")
     _require_dask()
-    from distributed import security as dask_security
-
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(warnings.catch_warnings())
-        warnings.simplefilter("ignore")  # of versions, large graphs: versions that matter are compared by `workers`
-        stack.enter_context(_silent())
-        if workers is not None:
-            address, security = stack.enter_context(local_cluster.started(workers))
-        else:
-            address = str(scheduler)
-            # None: as Dask's configuration says.
-            security = dask_security.Security(require_encryption=address.startswith("tls://") or None)
-        client = _client(address, security)
-        try:
-            yield client
-        finally:
-            with contextlib.suppress(Exception):  # a scheduler that is gone
-                client.close(timeout=2.0)
-
-
-@contextlib.contextmanager
-def _silent() -> Iterator[None]:
-    """Within, Dask logs nothing: what matters of it is raised here. Other loggers stay as they are."""
-    loggers = [logging.getLogger(name) for name in list(logging.root.manager.loggerDict)]
-    loud = [x for x in loggers if x.name.partition(".")[0] in ("distributed", "tornado", "asyncio") and not x.disabled]
-    for logger in loud:
-        logger.disabled = True
-    try:
-        yield
-    finally:
-        for logger in loud:
-            logger.disabled = False
-
-
-def _client(address: str, security: Security) -> Client:
     import distributed
 
     async def kind() -> str:
@@ -111,18 +76,37 @@ def _client(address: str, security: Security) -> Client:
         async with asyncio.timeout(PATIENCE), distributed.rpc(address, **options) as there:
             return str((await there.identity()).get("type"))
 
-    try:
-        # First, as a client that found nobody would take 16 s to give up.
-        if (answering := asyncio.run(kind())) != "Scheduler":
-            raise ValueError(f"a Dask {answering} answers there")
-        # Results come from the workers themselves where these can be reached, else through the scheduler.
-        return distributed.Client(
-            address, security=security, timeout=PATIENCE, set_as_default=False, direct_to_workers=True
-        )
-    except Exception as error:
-        texts = [" ".join(str(cause).split()) for cause in (error.__cause__, error) if cause is not None]
-        text = re.sub(r"in <[^>]*>: ", "", next(filter(None, texts), f"not within {PATIENCE:.0f} s"))
-        raise ConnectionError(f"--scheduler {address}: no Dask scheduler answers: {text[:200]}; {_EXPECTED}") from None
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(warnings.catch_warnings())
+        warnings.simplefilter("ignore")  # of versions, large graphs: versions that matter are compared by `workers`
+        # Dask logs nothing: what matters of it is raised here. Other loggers stay as they are.
+        for logger in map(logging.getLogger, list(logging.root.manager.loggerDict)):
+            if logger.name.partition(".")[0] in ("distributed", "tornado", "asyncio") and not logger.disabled:
+                logger.disabled = True
+                stack.callback(setattr, logger, "disabled", False)
+        if workers is not None:
+            address, security = stack.enter_context(local_cluster.started(workers))
+        else:
+            address = str(scheduler)
+            # None: as Dask's configuration says.
+            security = distributed.Security(require_encryption=address.startswith("tls://") or None)
+        try:
+            # First, as a client that found nobody would take 16 s to give up.
+            if (answering := asyncio.run(kind())) != "Scheduler":
+                raise ValueError(f"a Dask {answering} answers there")
+            # Results come from the workers themselves where these can be reached, else through the scheduler.
+            options: dict[str, Any] = {"timeout": PATIENCE, "set_as_default": False, "direct_to_workers": True}
+            client = distributed.Client(address, security=security, **options)
+        except Exception as error:
+            texts = [" ".join(str(cause).split()) for cause in (error.__cause__, error) if cause is not None]
+            text = re.sub(r"in <[^>]*>: ", "", next(filter(None, texts), f"not within {PATIENCE:.0f} s"))
+            reason = f"no Dask scheduler answers: {text[:200]}; {_EXPECTED}"
+            raise ConnectionError(f"--scheduler {address}: {reason}") from None
+        try:
+            yield client
+        finally:
+            with contextlib.suppress(Exception):  # a scheduler that is gone
+                client.close(timeout=2.0)
 
 
 @contextlib.contextmanager

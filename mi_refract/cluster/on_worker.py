@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
-import importlib.util
 import os
 import platform
 import sys
@@ -19,7 +18,6 @@ from mi_refract.io.image_file import installed_version
 
 LLVM, WIDTH = "libLLVM", "vector width"
 MIXED = frozenset({LLVM, WIDTH})  # with other ones the same work is possible, but not the same bits
-GLASSES = "glass catalogues"
 UNUSABLE = "cannot run"
 HOST = "host"
 _WIDTH_SYMBOL = "_Z21jit_llvm_vector_widthv"  # Dr.Jit does not show it to Python
@@ -35,8 +33,8 @@ def facts(variant: str) -> dict[str, str]:
     family = variant.partition("_")[0]
     here = backend.detect()[family]
     found = {name: installed_version(name) for name in ("mitsuba", "drjit")}
-    found |= {"mi_refract": our_version(), GLASSES: glass_catalogues()}
-    found |= {"Python": ".".join(platform.python_version_tuple()[:2]), "processor": platform.machine()}
+    found |= {"mi_refract": our_version(), "processor": platform.machine()}
+    found["Python"] = ".".join(platform.python_version_tuple()[:2])
     found[UNUSABLE] = "" if here.usable else f"{variant}: {here.reason}"
     if family == "llvm" and here.usable:
         found |= {LLVM: here.reason.removeprefix("libLLVM "), WIDTH: vector_width()}
@@ -59,24 +57,14 @@ def vector_width() -> str:
 
 @functools.cache
 def our_version() -> str:
-    """With a short digest of the package's source: between two releases the version stays the same."""
-    return f"{installed_version('mi-refract')} ({_digest(Path(__file__).parents[1], '*.py')})"
+    """With a short digest of the package's source and of its glasses: between two releases the version stays the same.
 
-
-@functools.cache
-def glass_catalogues() -> str:
-    """A short digest of the files of the package `opticalglass`; "none" where it is not installed."""
-    spec = importlib.util.find_spec("opticalglass")
-    return _digest(Path(spec.origin).parent, "*") if spec and spec.origin else "none"
-
-
-def _digest(package: Path, pattern: str) -> str:
-    """Of the names and contents of files, but for what Python compiles."""
-    digest = hashlib.sha256()
-    for path in sorted(package.rglob(pattern)):
-        if path.is_file() and path.suffix != ".pyc":
-            digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:8]
+    Of the names and contents of files.
+    """
+    package, digest = Path(__file__).parents[1], hashlib.sha256()
+    for path in sorted({*package.rglob("*.py"), *package.rglob("*.json")}):
+        digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
+    return f"{installed_version('mi-refract')} ({digest.hexdigest()[:8]})"
 
 
 def differences(there: Mapping[str, str], here: Mapping[str, str], tolerated: Collection[str] = ()) -> list[str]:

@@ -8,14 +8,18 @@ wrong, where, and what was expected.
 from __future__ import annotations
 
 import contextlib
+import functools
+import io
 import os
+import select
 import sys
 import traceback
 from collections.abc import Callable
+from typing import Any
 
 from .text import printable
 
-MISUSE, INTERRUPTED = 2, 130
+MISUSE, INTERRUPTED, UNREAD = 2, 130, 141
 TRACEBACK = "MI_REFRACT_TRACEBACK"  # environment variable: with "1" the traceback is printed as well
 
 
@@ -57,8 +61,9 @@ def exit_code(
     """What `body()` returns, None as 0; 2 after any exception, and 130 after Ctrl-C or one of `interruptions`.
 
     The exception is one line on stderr, `name: …`. What the body printed is on its way when this returns: a stdout
-    that cannot be written is an exception as well. A standard stream that is closed is replaced by the null device, so
-    that no file of ours takes its number.
+    that cannot be written is an exception as well. A pipe that nobody reads any more, as before `| head`, is no error
+    and no verdict: 141, without a line. A standard stream that is closed is replaced by the null device, so that no
+    file of ours takes its number.
     """
     for number, (stream, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         if getattr(sys, stream) is None:
@@ -69,6 +74,9 @@ def exit_code(
                     os.dup2(null, number)
                     os.close(null)
             setattr(sys, stream, open(number, mode, closefd=False))  # noqa: SIM115 (it lasts as long as the process)
+    buffer = getattr(sys.stdout, "buffer", None)
+    if isinstance(raw := getattr(buffer, "raw", buffer), io.FileIO):
+        setattr(raw, "write", functools.partial(_write_named, type(raw).write, raw))  # noqa: B010 (a method, for mypy)
     for output in (sys.stdout, sys.stderr):  # no character is one that they cannot print
         if hasattr(output, "reconfigure") and output.errors in ("strict", "surrogateescape"):
             output.reconfigure(errors="backslashreplace")
@@ -112,10 +120,26 @@ def print_traceback(error: BaseException) -> None:
             traceback.print_exception(error)
 
 
+def _write_named(write: Callable[[Any, Any], int | None], stdout: Any, content: Any) -> int | None:
+    """`write`, whose errors name what could not be written."""
+    try:
+        return write(stdout, content)
+    except OSError as error:
+        error.filename = "stdout"
+        raise
+
+
 def _failed(name: str, error: BaseException) -> int:
+    unread = False
     with contextlib.suppress(OSError, ValueError):  # a stderr that cannot be written says nothing
+        if isinstance(error, BrokenPipeError):
+            pipe = select.poll()
+            pipe.register(sys.stdout, 0)
+            unread = bool(pipe.poll(0))  # POLLERR: its reader has gone; else another pipe broke
+    with contextlib.suppress(OSError, ValueError):
         print_traceback(error)
-        print(f"{name}: {describe(error)}", file=sys.stderr, flush=True)
+        if not unread:
+            print(f"{name}: {describe(error)}", file=sys.stderr, flush=True)
     for output in (sys.stdout, sys.stderr):
         try:
             output.flush()
@@ -123,4 +147,4 @@ def _failed(name: str, error: BaseException) -> int:
             # What is left would be tried again when Python ends, and change the exit code to 120.
             with contextlib.suppress(OSError, ValueError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())
-    return MISUSE
+    return UNREAD if unread else MISUSE

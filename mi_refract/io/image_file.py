@@ -27,6 +27,7 @@ Metadata = dict[str, Any]
 ImageInput: TypeAlias = Any  # an `OpenImageIO.ImageInput`
 ImageSpec: TypeAlias = Any  # an `OpenImageIO.ImageSpec`
 SUFFIXES = (".exr",)
+PNG_PROFILE = "png:iCCP"
 TEXT = image_headers.TEXT  # begins the names of metadata that are texts of a PNG file
 MAX_VALUES = 2**28  # width × height × channels of an image: 1 GiB as float32
 # What is read in another type than float32. OpenImageIO rounds integers to float32 on the way to any other type.
@@ -299,6 +300,8 @@ def _image(
         raise ImageError(f"{path}: {spec.width} × {spec.height} × {spec.depth} pixels; expected a plane with pixels")
     _check_size(path, spec, *values)
     metadata = {attribute.name: attribute.value for attribute in spec.extra_attribs} | besides
+    if "ICCProfile" in metadata:
+        metadata.pop(PNG_PROFILE, None)  # left where OpenImageIO drops the profile, as it does one with errors
     kinds = [str(each) for each in (spec.channelformats or [spec.format] * spec.nchannels)]
     if reason := _misread(found, set(kinds), metadata, spec.height):
         raise ImageError(f"{path}: {reason}")

@@ -15,7 +15,7 @@ from .errors import ImageError
 EXR, PNG, JPEG = b"\x76\x2f\x31\x01", b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 ATTRIBUTES = 4096  # of an EXR file
 # Chunks of a PNG file that OpenImageIO reads, or that do not concern the numbers.
-CHUNKS = b"IHDR PLTE IDAT IEND tRNS gAMA sRGB cICP iCCP tIME pHYs oFFs eXIf bKGD hIST sBIT sPLT mDCV".split()
+CHUNKS = b"IHDR PLTE IDAT IEND tRNS gAMA sRGB cICP tIME pHYs oFFs eXIf bKGD hIST sBIT sPLT mDCV".split()
 TEXTS, TEXT = (b"tEXt", b"zTXt", b"iTXt"), "png:text:"
 SRGB = struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000)  # cHRM: the same as none
 # Tags of a TIFF file that OpenImageIO reads, or that say where the pixels are.

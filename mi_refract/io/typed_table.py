@@ -9,13 +9,23 @@ from __future__ import annotations
 
 import math
 import re
+import textwrap
 import tomllib
-from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import msgspec
 
 T = TypeVar("T")
+_PLAIN = {  # msgspec's types, for readers
+    "str": "text",
+    "float": "a number",
+    "int": "a whole number",
+    "bool": "true or false",
+    "array": "a list [ … ]",
+    "object": "a table { … }",
+    "null": "nothing",
+}
+_TYPES = "`((?:{0})(?: [|] (?:{0}))*)`".format("|".join(_PLAIN))
 
 
 def parse_toml(text: str | bytes, kind: type[T], where: str, *, infinite: bool = False) -> T:
@@ -25,8 +35,20 @@ def parse_toml(text: str | bytes, kind: type[T], where: str, *, infinite: bool =
     except RecursionError:
         raise ValueError(f"{where}: brackets nested too deeply; expected TOML") from None
     except ValueError as error:
-        raise ValueError(f"{where}: {error}; expected TOML") from None
+        raise ValueError(f"{where}: {error}{_line_in_doubt(text, str(error))}; expected TOML") from None
     return convert(document, kind, where, infinite=infinite)
+
+
+def _line_in_doubt(text: str | bytes, error: str) -> str:
+    """The line that the error of `tomllib` names, and what is often forgotten there."""
+    if not (place := re.search(r"at line (\d+)", error)):
+        return ""
+    line = (text if isinstance(text, str) else text.decode()).split("\n")[int(place[1]) - 1].strip()
+    slips = {
+        r"(?<![\w.])\.\d|\d\.(?!\d)": "numbers have a digit on either side of the point, as 0.8 and 1.0",
+        r"=\s*[A-Za-z_]": "text is in quotes; true and false are in lower case",
+    }
+    return ": ".join(["", line[:80], *(hint for slip, hint in slips.items() if re.search(slip, line))][:3])
 
 
 def convert(value: Any, kind: type[T], where: str, *, infinite: bool = False) -> T:
@@ -44,8 +66,14 @@ def convert(value: Any, kind: type[T], where: str, *, infinite: bool = False) ->
         path = path.removesuffix("`")
         key = re.sub(r"^(key` in `)?\$\.?", "", path)
         message = f"{message[0].lower()}{message[1:]}".replace("object contains unknown field", "unknown key")
-        message = message.replace(r"matching regex '\\S'", "that is not blank")
-        if message.startswith(("unknown key", "invalid ")) and (names := _names(kind, value, path)):
+        message = message.replace(r"matching regex '\\S'", "that is not blank").replace(" | null`", "`")
+        if message.startswith("expected "):
+            message = re.sub(_TYPES, lambda types: " or ".join(map(_PLAIN.__getitem__, types[1].split(" | "))), message)
+            message = re.sub(r"(.*), got (\D+)", r"\2; \1", message)
+            message = re.sub(r"^(a table .*a list \[ … \])", r"\1 of tables, [[…]] in TOML", message)
+        if missing := re.fullmatch(r"object missing required field `(\w+)`", message):
+            path = f"{path or '$'}.{missing[1]}"
+        if (missing or message.startswith(("unknown key", "invalid "))) and (names := _names(kind, value, path)):
             message = f"{message}; expected {', '.join(names)}"
         raise ValueError(" ".join(f"{where}: {f'{key}: ' if key else ''}{message}".split())) from None
 
@@ -86,7 +114,7 @@ def _structs(kinds: list[Any], value: Any) -> list[Any]:
 
 def _check_finite(value: Any, path: str, infinite: bool) -> None:
     if isinstance(value, float) and not math.isfinite(value) and not (infinite and math.isinf(value)):
-        raise msgspec.ValidationError(f"Expected a finite number, got {value} - at `{path}`")
+        raise msgspec.ValidationError(f"Expected a {'' if infinite else 'finite '}number, got {value} - at `{path}`")
     if isinstance(value, dict | list):
         items = value.items() if isinstance(value, dict) else enumerate(value)
         for key, item in items:
@@ -99,14 +127,13 @@ def key_table(title: str, kind: type[msgspec.Struct]) -> str:
     return "\n".join([f"| {title} | type | meaning |", "|---|---|---|", *rows])
 
 
-def kind_table(title: str, kinds: Iterable[type[msgspec.Struct]], shared: type[msgspec.Struct] = msgspec.Struct) -> str:
-    """A Markdown table of tagged structs: tag, first line of the docstring, and keys that `shared` lacks."""
-    rows = []
-    for kind in kinds:
-        own = [f"`{key[0]}` ({key[1]}) {key[2]}" for key in _keys(kind) if key not in _keys(shared)]
-        meaning = (kind.__doc__ or "").partition("\n")[0].rstrip(".")
-        rows.append(f"| `{kind.__struct_config__.tag}` | {meaning} | {'; '.join(own)} |")
-    return "\n".join([f"| {title} | what it is | its keys |", "|---|---|---|", *rows])
+def key_list(title: str, kind: type[msgspec.Struct], shared: type[msgspec.Struct] = msgspec.Struct) -> str:
+    """The same in lines of up to 80 columns, for a terminal, without the keys that `shared` has."""
+    lines = textwrap.wrap(title, 80)
+    for key, accepted, meaning in _keys(kind):
+        if (key, accepted, meaning) not in _keys(shared):
+            lines += textwrap.wrap(f"  {key:14}{meaning} ({accepted})", 80, subsequent_indent=" " * 16)
+    return "\n".join(lines)
 
 
 def _keys(kind: type[msgspec.Struct]) -> list[tuple[str, str, str]]:
@@ -116,11 +143,8 @@ def _keys(kind: type[msgspec.Struct]) -> list[tuple[str, str, str]]:
         described = isinstance(field.type, msgspec.inspect.Metadata)
         schema = field.type.extra_json_schema or {} if described else {}
         bare = field.type.type if described else field.type
-        default = (
-            ""
-            if field.required or field.default in (None, "", (), msgspec.NODEFAULT)
-            else f"; default {field.default!r}"
-        )
+        value = list(field.default) if isinstance(field.default, tuple) else field.default
+        default = "" if field.required or value in (None, "", [], msgspec.NODEFAULT) else f"; default {value!r}"
         keys.append((field.encode_name, _type_text(bare), f"{schema.get('description', '')}{default}"))
     return keys
 

@@ -6,7 +6,7 @@ Dr.Jit arrays. Out: indices in double precision; Dr.Jit differentiates those of 
 
 from . import glass_catalogs
 from .dispersion import LINES, TABLE_VALUES, Medium, Table
-from .materials import LABORATORY_AIR, index, parse, relative_index
+from .materials import LABORATORY_AIR, file_in, index, parse, relative_index
 
 __all__ = [
     "LABORATORY_AIR",
@@ -14,6 +14,7 @@ __all__ = [
     "TABLE_VALUES",
     "Medium",
     "Table",
+    "file_in",
     "glass_catalogs",
     "index",
     "parse",

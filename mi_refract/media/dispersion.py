@@ -5,9 +5,10 @@ A formula takes floats, numpy arrays or Dr.Jit arrays alike, in double precision
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +25,7 @@ LINES = {
 # fmt: on
 Coefficients = Mapping[str, Number]
 ANY = (0.0, math.inf)
+NANOMETRES = 1000  # in a µm
 TABLE_VALUES = "values"  # among the coefficients of a table: all of them, in one array
 
 
@@ -61,7 +63,7 @@ class Terms(Dispersion):
 
     power: int  # 1: the sum is n, 2: it is n²
     constant: float = 0.0
-    powers: tuple[tuple[str, int], ...] = ()
+    powers: tuple[tuple[str, float], ...] = ()
     resonances: tuple[tuple[str, str], ...] = ()
     squared: bool = False
 
@@ -70,8 +72,8 @@ class Terms(Dispersion):
         square = wavelength * wavelength
         total = self.constant + 0 * wavelength
         for name, p in self.powers:
-            power = 1 + 0 * square
-            for _ in range(abs(p) // 2):
+            power = wavelength ** abs(p) if p % 2 else 1 + 0 * square
+            for _ in range(0 if p % 2 else int(abs(p)) // 2):
                 power = power * square
             total = total + c[name] * (1 / power if p < 0 else power)
         for b, r in self.resonances:
@@ -154,12 +156,33 @@ class Table(Dispersion):
         return where((wavelength >= self.knots[0]) & (wavelength <= self.knots[-1]), between, 0 * wavelength)
 
 
+def table(pairs: Sequence[tuple[float, float]]) -> tuple[Table, dict[str, float]]:
+    """n linear between pairs of λ in nm and n. ValueError, without saying where, for what is no table of an index."""
+    knots = tuple(w for w, _ in pairs)
+    if len(knots) < 2 or not all(0 < a < b < math.inf for a, b in itertools.pairwise(knots)):
+        raise ValueError("expected two or more wavelengths, increasing")
+    if bad := [f"{n:g} at {w:g} nm" for w, n in pairs if not 0 < n < math.inf]:
+        raise ValueError(f"n = {bad[0]}; expected a positive finite index")
+    form = Table(knots)
+    return form, dict(zip(form.names, (n for _, n in pairs), strict=True))
+
+
 def sellmeier(values: Sequence[float], squared: bool = False) -> tuple[Terms, dict[str, float]]:
     """n² = 1 + Σ B_i λ²/(λ² − C_i), first all B, then all C in nm²; where `squared`, C_i = λ_i², and λ_i is given."""
     letter = "L" if squared else "C"
     pairs = tuple((f"B{i}", f"{letter}{i}") for i in range(1, len(values) // 2 + 1))
     names = [b for b, _ in pairs] + [r for _, r in pairs]
     return Terms(2, 1.0, resonances=pairs, squared=squared), dict(zip(names, values, strict=True))
+
+
+def power_series(power: int, terms: Iterable[tuple[float, float]]) -> tuple[Terms, dict[str, float]]:
+    """n or n² (`power` 1 or 2) = Σ a λ^p, of pairs of a and p for λ in µm. The coefficients, a0, a2, a_2, …: in nm."""
+    totals: dict[float, float] = {}
+    for a, p in terms:
+        totals[p] = totals.get(p, 0.0) + a
+    names = {p: f"a{p:g}".replace("-", "_").replace(".", "_") for p in totals}
+    form = Terms(power, powers=tuple((name, p) for p, name in names.items()))
+    return form, {names[p]: a / NANOMETRES**p for p, a in totals.items()}
 
 
 @dataclass(frozen=True)
@@ -173,6 +196,8 @@ class Medium:
     relative_to: str = ""  # "air" (20 °C, 101325 Pa, dry) or "vacuum"; "" where the source does not say
     is_air: bool = False
     fitted: tuple[float, float] = ANY  # nm; outside, but within `valid`, the formula extrapolates
+    hold: bool = False  # outside `valid` the index is that of its end
+    k: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # λ in nm, and there the imaginary part of the index
 
     @property
     def dispersive(self) -> bool:
@@ -187,10 +212,11 @@ class Medium:
             coefficients: other values of some of the medium's own, for derivatives.
 
         Returns:
-            Of the shape of `wavelength`. Dr.Jit arrays: NaN outside `valid`, or where n is not a positive number.
+            Of the shape of `wavelength`. Dr.Jit arrays: NaN outside `valid` without `hold`, or where n is not a
+            positive number.
 
         Raises:
-            ValueError: for the same, of floats and numpy arrays. Outside `fitted` these give a warning.
+            ValueError: for the same, of floats and numpy arrays. Outside `fitted` and `valid` these give a warning.
         """
         n = self.index_or_nan(wavelength, coefficients)
         if not dr.is_array_v(wavelength):
@@ -199,7 +225,10 @@ class Medium:
             wavelengths, (low, high) = np.atleast_1d(wavelength), self.valid
             if (missing := np.isnan(np.atleast_1d(n))).any():
                 text = f"{self.name}: no index at {wavelengths[missing][0]:g} nm"
-                raise ValueError(f"{text}; expected a wavelength from {low:g} to {high:g} nm")
+                raise ValueError(f"{text}; expected a wavelength from {low:g} to {high:g} nm, or hold(…) around it")
+            if self.hold and (held := wavelengths[(wavelengths < low) | (wavelengths > high)]).size:
+                text = f"{self.name}: the index at {held[0]:g} nm is that of the end of its range"
+                warnings.warn(f"{text}, {low:g} to {high:g} nm", stacklevel=2)
             low, high = self.fitted
             if (beyond := wavelengths[(wavelengths < low) | (wavelengths > high)]).size:
                 text = f"{self.name}: the index at {beyond[0]:g} nm is an extrapolation"
@@ -215,7 +244,10 @@ class Medium:
             import numpy as np
 
             x = np.asarray(wavelength, np.float64)  # a float, too: operations of numpy give NaN and do not raise
-        valid = (x > 0) & (x >= self.valid[0]) & (x <= self.valid[1])
+        valid = x > 0
+        if self.hold:
+            x = dr.clip(x, *self.valid) if compiled else np.clip(x, *self.valid)
+        valid &= (x >= self.valid[0]) & (x <= self.valid[1])
         n = self.dispersion.index(where(valid, x, math.nan), {**self.coefficients, **(coefficients or {})})
         n = where((n > 0) & (n < math.inf), n, math.nan)
         return n if compiled or dr.is_array_v(n) or n.ndim else float(n)

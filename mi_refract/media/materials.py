@@ -6,23 +6,32 @@ The materials that no catalogue of glass has: air, water, fused silica, diamond;
 from __future__ import annotations
 
 import difflib
-import itertools
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from mi_refract.io.text import parse_number
 from mi_refract.numerics import Number
 
-from . import glass_catalogs
-from .dispersion import ANY, CONSTANT, Abbe, Coefficients, Dispersion, Medium, Table, Terms, sellmeier
+from . import glass_catalogs, index_files
+from .dispersion import ANY, CONSTANT, Abbe, Coefficients, Dispersion, Medium, Terms, sellmeier, table
 
 VISIBLE = 360.0, 830.0  # nm: where the eye, and Mitsuba, have a response to light
-MICROMETRES = 1.0  # nm²: a resonance below is a number of square micrometres, as catalogues print it
+MICROMETRES = 1.0  # nm², …: a coefficient below is one of square micrometres, …, as catalogues print it
 CAUCHY_NAMES = "ABCDEFGH"
+POWERS_OF_UNITS = "", "²", "⁴", "⁶", "⁸", "¹⁰", "¹²", "¹⁴"
 FORMULAS_OF_N = ("cauchy", "sellmeier", "sellmeier_nm", "abbe", "table")
+IN_MICROMETRES = ("cauchy", "sellmeier", "table")  # each with a twin NAME_um
+HOLD = re.compile(r"hold\s*\((.*)\)")
+GLASS_CODE = re.compile(r"(\d{3})[-/]?(\d{3})(?:\.\d{3})?")  # 517642, and as Schott prints it 517642.251
+LEAST_CODE = 0.3  # a code of 003283 is n_d = 2.003: no glass has 1.3
+LARGEST_N = 10.0  # of formulas, in the visible: silicon has 6.9
+ABBE_NUMBERS = 5.0, 200.0  # glasses have 17 to 101
+SHORTEST, LONGEST = 30.0, 1e5  # nm: a table that ends below, or begins beyond, is in another unit
+LONGEST_POLE = 1000.0  # µm²: Sellmeier's formula of a glass has one in the ultraviolet
 
 
 def _air(name: str, constant: float, terms: tuple[tuple[float, float], ...], valid: tuple[float, float]) -> Medium:
@@ -101,61 +110,100 @@ def index(spec: float | str, wavelength: Number) -> Number:
     return parse(spec).index(wavelength)
 
 
-def parse(spec: float | str, name: str = "") -> Medium:
+def parse(spec: float | str, name: str = "", find: Callable[[str], Path] = Path) -> Medium:
     """The material that `spec` says, λ in nm:
 
     - a number, or a name of Mitsuba's table of materials: the same n at all λ
     - `cauchy(A, B, …)`: n = A + B/λ² + C/λ⁴ + …
     - `sellmeier(B1, …, C1, …)`: n² = 1 + Σ B λ²/(λ² − C), C in nm²
     - `sellmeier_nm(B1, …, L1, …)`: the same with C = L², L in nm
-    - `abbe(n_d, V_d)`: Cauchy's formula with two terms through both
     - `table(400: 1.53, 500: 1.52, …)`: linear between its wavelengths
-    - `SCHOTT:N-BK7` and others of the catalogues CDGM, Hikari, Hoya, Ohara, Schott, Sumita (extra `[glass]`)
+    - `cauchy_um(…)`, `sellmeier_um(…)`, `table_um(…)`: the same as without `_um`, λ in µm (and B, C in µm², …)
+    - `abbe(n_d, V_d)`: Cauchy's formula with two terms through both
+    - `517642`, the six-digit code of a glass: `abbe(1.517, 64.2)`
+    - `SCHOTT:N-BK7` and others of the catalogues CDGM, Hikari, Hoya, Ohara, Schott, Sumita
     - `MATERIAL:water`, `MATERIAL:fused-silica`, `MATERIAL:diamond`, `AIR:ciddor`, `AIR:edlen`
+    - `file:glass.csv`, `file:glass.yml`, `file:catalogue.agf:GLASS`: see `index_files`
+    - `hold(…)` around one of these: outside its range the index is that at the range's end
 
     ValueError, with `name` (that of the parameter) and what would be accepted, for anything else; for n that is not
-    positive, or infinite, at a wavelength from 360 to 830 nm; and for numbers that are not finite.
+    positive, or above 10, at a wavelength from 360 to 830 nm; and for numbers that are not finite.
+
+    find: where a file is that a text names, by its name.
     """
     label = f"{name} = {spec!r}" if name else repr(spec)
     if isinstance(spec, str):
-        text = spec.strip()
-        if ":" in text.partition("(")[0]:
-            known = {name.lower(): medium for name, medium in MATERIALS.items()}
-            if medium := known.get(text.lower()):
-                return medium
-            if glass_catalogs.names_glass(text):
-                catalog, _, glass = (part.strip() for part in text.partition(":"))
-                return glass_catalogs.load(catalog.upper(), glass, label)
-            near = ", ".join(difflib.get_close_matches(text, MATERIALS, 3, 0.0))
-            catalogs = ", ".join(f"{name}:…" for name in glass_catalogs.CATALOGS)
-            raise ValueError(f"{label}: unknown material; nearest: {near}; expected these, or {catalogs}")
-        if "(" in text:
-            return _formula(text, label)
-        # Mitsuba's table holds decimal numbers of at most seven digits in float32: the shortest gives them back.
-        import mitsuba as mi
-        from mitsuba.mitsuba_ext import Properties
+        return _of_text(spec.strip(), label, find)
+    return _of_number(spec, label)
 
-        variant: Any = mi.scalar_rgb  # the table is the same in all of them, and this one need not be set
-        query = Properties()
-        query["ior"] = text
-        try:
-            single = variant.lookup_ior(query, "ior", text)
-        except RuntimeError as error:
-            expected = str(error).partition("choices are:")[2] or "the names of Mitsuba's table"
-            raise ValueError(f"{label}: unknown material; expected {expected.strip()}") from None
-        absolute = "vacuum" if text in ("air", "vacuum") else ""
-        return Medium(text, CONSTANT, {"n": float(f"{single:.7g}")}, relative_to=absolute, is_air=text == "air")
-    if isinstance(spec, bool) or not isinstance(spec, (int, float)) or not 0 < spec < math.inf:
+
+def _of_number(n: float, label: str) -> Medium:
+    if isinstance(n, bool) or not isinstance(n, (int, float)) or not 0 < n < math.inf:
         raise ValueError(f"{label}; expected a positive finite number, or a material's name")
-    return Medium(str(spec), CONSTANT, {"n": float(spec)})
+    if 100_000 <= n < 1_000_000 and n == int(n):
+        raise ValueError(f"{label}; expected an index; the code of a glass is a text: '{n:.0f}'")
+    return Medium(str(n), CONSTANT, {"n": float(n)})
+
+
+def file_in(text: str) -> str:
+    """The name of the file that a text names: "glass.yml" of `hold(file:glass.yml)`; "" where it names none."""
+    held = HOLD.fullmatch(text.strip())
+    return index_files.split((held[1] if held else text).strip())[0]
+
+
+def _of_text(text: str, label: str, find: Callable[[str], Path]) -> Medium:
+    if held := HOLD.fullmatch(text):
+        return replace(_of_text(held[1].strip(), label, find), name=text, hold=True)
+    if code := GLASS_CODE.fullmatch(text):  # n_d − 1, of which 1000 is left out, and V_d
+        n_d, v_d = int(code[1]) / 1000, int(code[2]) / 10
+        return replace(_formula(f"abbe({n_d + (1 if n_d >= LEAST_CODE else 2):g}, {v_d:g})", label), name=text)
+    try:
+        number = parse_number(text)
+    except ValueError:
+        pass
+    else:
+        return _of_number(number, label)
+    if index_files.split(text)[0]:
+        return _checked(replace(index_files.read(text, label, find), name=text), label)
+    if ":" in text.partition("(")[0]:
+        known = {name.lower(): medium for name, medium in MATERIALS.items()}
+        if medium := known.get(text.lower()):
+            return medium
+        catalog, _, glass = (part.strip() for part in text.partition(":"))
+        if catalog.upper() in glass_catalogs.CATALOGS:
+            return glass_catalogs.load(catalog.upper(), glass, label)
+        near = ", ".join(difflib.get_close_matches(text, MATERIALS, 3, 0.0))
+        catalogs = ", ".join(f"{name}:…" for name in glass_catalogs.CATALOGS)
+        raise ValueError(f"{label}: unknown material; nearest: {near}; expected these, or {catalogs}, file:…")
+    if "(" in text:
+        return _formula(text, label)
+    # Mitsuba's table holds decimal numbers of at most seven digits in float32: the shortest gives them back.
+    import mitsuba as mi
+    from mitsuba.mitsuba_ext import Properties
+
+    variant: Any = mi.scalar_rgb  # the table is the same in all of them, and this one need not be set
+    query = Properties()
+    query["ior"] = text
+    try:
+        single = variant.lookup_ior(query, "ior", text)
+    except RuntimeError as error:
+        if glasses := glass_catalogs.called(text):
+            raise ValueError(f"{label}: unknown material; a glass has its maker's name: {', '.join(glasses)}") from None
+        expected = str(error).partition("choices are:")[2] or "the names of Mitsuba's table"
+        raise ValueError(f"{label}: unknown material; expected {expected.strip()}") from None
+    absolute = "vacuum" if text in ("air", "vacuum") else ""
+    return Medium(text, CONSTANT, {"n": float(f"{single:.7g}")}, relative_to=absolute, is_air=text == "air")
 
 
 def _formula(text: str, label: str) -> Medium:
-    """A medium that is valid up to the resonances on both sides of the visible, and has an index at all of it."""
-    call = re.fullmatch(r"(\w+)\s*\((.*)\)", text)
-    if not call or call[1] not in FORMULAS_OF_N:
-        raise ValueError(f"{label}; expected {', '.join(f'{known}(…)' for known in FORMULAS_OF_N)}")
-    name, arguments, (low, high) = call[1], call[2], ANY
+    """The medium of a formula with its numbers. ValueError with the likely slip: another unit, or another order."""
+    call = re.fullmatch(r"(\w+?)(_um)?\s*\((.*)\)", text)
+    if not call or call[1] not in FORMULAS_OF_N or (call[2] and call[1] not in IN_MICROMETRES):
+        raise ValueError(
+            f"{label}; expected {', '.join(f'{known}(…)' for known in FORMULAS_OF_N)}, or with _um, such as table_um(…)"
+        )
+    name, arguments = call[1], call[3]
+    unit, nanometres = ("µm", 1000.0) if call[2] else ("nm", 1.0)
 
     def numbers(counts: Sequence[int], says: str) -> list[float]:
         try:
@@ -166,51 +214,78 @@ def _formula(text: str, label: str) -> Medium:
             raise ValueError(f"{label}; expected {says}, finite numbers")
         return values
 
+    def slip(what: str, value: float, of: str = "", factor: str = "") -> ValueError:
+        other, instead = ("nm", name) if call[2] else ("µm", f"{name}_um")
+        ways = [f"multiply by {factor}"] * bool(factor) + [f"write {instead}(…)"] * (name in IN_MICROMETRES)
+        return ValueError(f"{label}: {what} = {value:g}; expected {unit}{of}; from {other}{of} {', or '.join(ways)}")
+
     form: Dispersion
+    valid = ANY
     if name == "cauchy":  # n = A + B/λ² + C/λ⁴ + …, B in nm², C in nm⁴ (A.-L. Cauchy)
-        values = numbers(range(1, len(CAUCHY_NAMES) + 1), "cauchy(A, B, …), λ in nm, up to 8")
-        coefficients = dict(zip(CAUCHY_NAMES, values, strict=False))
+        values = numbers(range(1, len(CAUCHY_NAMES) + 1), f"{name}(A, B, …), λ in {unit}, up to 8")
+        for i, x in enumerate(values[1:], 1):
+            if not call[2] and 0 < abs(x) < MICROMETRES:
+                raise slip(CAUCHY_NAMES[i], x, POWERS_OF_UNITS[i], f"1e{6 * i}")
+        coefficients = {CAUCHY_NAMES[i]: x * nanometres ** (2 * i) for i, x in enumerate(values)}
         form = Terms(1, powers=tuple((letter, -2 * i) for i, letter in enumerate(coefficients)))
     elif name == "abbe":
         n_d, v_d = numbers([2], "abbe(n_d, V_d)")
-        if v_d == 0:
-            raise ValueError(f"{label}: V_d = 0; expected (n_d − 1)/(n_F − n_C), which is not 0")
+        if n_d > v_d > 0:
+            raise ValueError(f"{label}: n_d = {n_d:g}, V_d = {v_d:g}; expected n_d first: abbe({v_d:g}, {n_d:g})")
+        if not 1 < n_d <= LARGEST_N:
+            raise ValueError(f"{label}: n_d = {n_d:g}; expected an index above 1, up to {LARGEST_N:g}")
+        if not ABBE_NUMBERS[0] <= v_d <= ABBE_NUMBERS[1]:
+            low, high = ABBE_NUMBERS
+            raise ValueError(f"{label}: V_d = {v_d:g}; expected (n_d − 1)/(n_F − n_C), from {low:g} to {high:g}")
         form, coefficients = Abbe(), {"n_d": n_d, "V_d": v_d}
     elif name == "table":
-        expected = "expected table(400: 1.53, 500: 1.52, …), two or more, wavelengths in nm, increasing"
         try:
-            knots = [(parse_number(w), parse_number(n)) for w, n in (pair.split(":") for pair in arguments.split(","))]
+            pairs = [(parse_number(w), parse_number(n)) for w, n in (pair.split(":") for pair in arguments.split(","))]
         except ValueError:
-            raise ValueError(f"{label}: {expected}") from None
-        wavelengths = tuple(w for w, _ in knots)
-        increasing = all(a < b for a, b in itertools.pairwise(wavelengths))
-        if len(knots) < 2 or not increasing or not 0 < wavelengths[0] < wavelengths[-1] < math.inf:
-            raise ValueError(f"{label}: {expected}")
-        if bad := [f"{n:g} at {w:g} nm" for w, n in knots if not 0 < n < math.inf]:
-            raise ValueError(f"{label}: n = {bad[0]}; expected a positive finite index")
-        form, low, high = (table := Table(wavelengths)), wavelengths[0], wavelengths[-1]
-        coefficients = dict(zip(table.names, (n for _, n in knots), strict=True))
+            raise ValueError(f"{label}; expected table(400: 1.53, 500: 1.52, …), wavelengths in nm") from None
+        try:
+            form, coefficients = table([(w * nanometres, n) for w, n in pairs])
+        except ValueError as error:
+            raise ValueError(f"{label}: {error}") from None
+        valid = form.knots[0], form.knots[-1]
+        if valid[1] < SHORTEST or valid[0] > LONGEST:
+            raise slip("the first wavelength", pairs[0][0])
     else:
         squared = name == "sellmeier_nm"
-        letter, unit, factor = ("L", "nm", "1e3") if squared else ("C", "nm²", "1e6")
-        values = numbers(range(2, 14, 2), f"{name}(B1, …, {letter}1, …), as many {letter} in {unit} as B, up to 6")
-        for i, x in enumerate(values[len(values) // 2 :], 1):
-            if 0 < abs(x) < MICROMETRES or (squared and x < 0):
-                expected = f"expected {unit}; from {unit.replace('n', 'µ')} multiply by {factor}"
-                raise ValueError(f"{label}: {letter}{i} = {x:g}; {expected}")
-        form, coefficients = sellmeier(values, squared)
-    for resonance, pole in form.poles(coefficients).items():
-        if VISIBLE[0] <= pole <= VISIBLE[1]:
-            raise ValueError(f"{label}: {resonance}: n is infinite at {pole:.6g} nm; expected no pole in 360 … 830 nm")
-        low, high = (max(low, pole), high) if pole < VISIBLE[0] else (low, min(high, pole))
-    medium = Medium(text, form, coefficients, (low, high))
+        letter, of, factor = ("L", "", "1e3") if squared else ("C", "²", "1e6")
+        values = numbers(range(2, 14, 2), f"{name}(B1, …, {letter}1, …), as many {letter} in {unit}{of} as B, up to 6")
+        poles = values[len(values) // 2 :]
+        for i, x in enumerate(poles, 1):
+            if not call[2] and (0 < abs(x) < MICROMETRES or (squared and x < 0)):
+                raise slip(f"{letter}{i}", x, of, factor)
+        if call[2] and min(poles) > LONGEST_POLE:
+            raise slip("C1", poles[0], of)
+        form, coefficients = sellmeier([*values[: len(poles)], *(x * nanometres**2 for x in poles)], squared)
+    return _checked(Medium(text, form, coefficients, valid), label)
+
+
+def _checked(medium: Medium, label: str) -> Medium:
+    """The medium, valid up to the resonances on both sides of the visible. ValueError where it has no index there."""
     import numpy as np
 
-    low, high = max(low, VISIBLE[0]), min(high, VISIBLE[1])
-    visible = np.linspace(low, high, 471)
-    if low <= high and (missing := np.isnan(medium.index_or_nan(visible))).any():
-        at = visible[missing][0]
-        raise ValueError(
-            f"{label}: n is not positive at {at:.6g} nm; expected a positive index everywhere in 360 … 830 nm"
-        )
+    (low, high), (first, last) = medium.valid, VISIBLE
+    first, last = max(first, low), min(last, high)
+    for resonance, pole in medium.dispersion.poles(medium.coefficients).items():
+        if first <= pole <= last:
+            raise ValueError(f"{label}: {resonance}: n is infinite at {pole:.6g} nm; expected no pole in 360 … 830 nm")
+        low, high = (max(low, pole), high) if pole < first else (low, min(high, pole))
+    medium = replace(medium, valid=(low, high))
+    if first <= last:
+        visible = np.linspace(first, last, 471)
+        n = medium.index_or_nan(visible)
+        if (missing := np.isnan(n)).any():
+            at = visible[missing][0]
+            raise ValueError(
+                f"{label}: n is not positive at {at:.6g} nm; expected a positive index everywhere in 360 … 830 nm"
+            )
+        if (large := n > LARGEST_N).any():
+            at = f"n = {n[large][0]:g} at {visible[large][0]:.6g} nm"
+            raise ValueError(
+                f"{label}: {at}; expected up to {LARGEST_N:g} in 360 … 830 nm; coefficients in another unit?"
+            )
     return medium

@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from mi_refract.io.image_file import srgb_encode
 from mi_refract.io.safe_files import write_atomically
 
+from . import focal_points
 from .curves import points
 from .light import linear_srgb
-from .path_tree import Branches, count, summary
+from .path_tree import Branches, count, mismatches, summary
 from .scene_file import PlanarScene
 from .segments import Array, Event, Segments
 
@@ -41,10 +42,7 @@ NIGHT, MOON = (0.06, 0.07, 0.09), "#8a93a0"  # around all shapes, and their outl
 LINE = 0.13  # inches
 NAMED = 5  # media in the legend
 TYPICAL = 0.35  # opacity/(1 − opacity) of a typical density, where that is drawn
-MARKS = {
-    Event.MAX_DEPTH: ("o", "○ {} stopped after `max_depth` boundaries, with another one ahead"),
-    Event.MEDIUM_MISMATCH: ("x", "× {} stopped: the next boundary does not border on the medium that the ray is in"),
-}
+MARKS = {Event.MAX_DEPTH: "o", Event.MEDIUM_MISMATCH: "x"}
 UNDATED: dict[str, Any] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}, ".png": {}}
 TICKS = {"color": "#b5b5b5", "labelcolor": MUTED, "labelsize": 8}
 STYLE: Any = {
@@ -57,6 +55,7 @@ STYLE: Any = {
     **{"legend.frameon": False, "legend.fontsize": 8, "legend.labelcolor": INK},
 }
 MARGIN = 0.08  # around the scene, as a share of its larger side
+FAR = 8
 SHARED = -1  # the number of the colour that stands for all of them
 SAMPLES = 2**22  # pixels of lines at a time: 0.3 GB
 View = tuple[float, float, float, float]  # x0, x1, y0, y1
@@ -91,14 +90,18 @@ def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> 
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
-    view = scene.view or around(scene, traced)
-    # Without its caption, in inches: of about the same area for every view.
-    ratio = min(max((view[1] - view[0]) / (view[3] - view[2]), 0.25), 4)
-    height = min(5.2 / ratio**0.5, 7.0)
-    width, height = max(height * ratio, 3.6) + 0.6, height + 0.95
-    numbers = count(traced)
-    notes = [text.format(numbers[event.name]) for event, (_, text) in MARKS.items() if numbers[event.name]]
-    lines = [f"{scene.file}: {summary(scene, traced)}", *notes]
+    foci = focal_points.foci(scene, traced)
+    view = scene.view or around(scene, traced, foci)
+    # Without its caption, in inches: of about the same area for every view, but not wider than a page.
+    ratio = max((view[1] - view[0]) / (view[3] - view[2]), 0.25)
+    height = max(min(5.2 / ratio**0.5, 10.4 / ratio, 7.0), 0.6)
+    width, height = min(max(height * ratio, 3.6), 10.4) + 0.6, height + 0.95
+    lines = [f"{scene.file}: {summary(scene, traced)}", *(f"× {line}" for line in mismatches(scene, traced))]
+    if number := count(traced)["MAX_DEPTH"]:
+        lines.append(f"○ {number} stopped after `max_depth` boundaries, with another one ahead")
+    inside = ((foci >= view[::2]) & (foci <= view[1::2])).all(axis=1)
+    if inside.any():
+        lines.append("◇ focus: the point nearest to all rays of a beam")
     caption = [part for line in lines for part in textwrap.wrap(line, int(14 * width))]
     drawn = Figure((width, height + LINE * len(caption)), dpi, layout="constrained")
     panel = drawn.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal")
@@ -116,17 +119,18 @@ def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> 
     # Boundaries, rays, and marks where a path ended without escaping.
     many = len(scene.segments[0]) > LINES
     outlines = curves(scene.segments[0], 5 if many else 33)
-    style: dict[str, Any] = {"colors": MOON if scene.light.wavelengths else INK, "capstyle": "round", "zorder": 1.5}
+    ink = MOON if scene.light.wavelengths else INK
+    style: dict[str, Any] = {"colors": ink, "capstyle": "round", "zorder": 1.5}
     style["linewidths"] = 0.7 * max(min(1.0, 8 / len(outlines)), 0.15)
     panel.add_collection(LineCollection(outlines, rasterized=many, **style), autolim=False)
     panel.plot(0, 0, "+", color=MUTED, markersize=5, markeredgewidth=0.6, zorder=1.4, scalex=False, scaley=False)
     _rays(panel, scene, legs(traced, view))
-    for event, (mark, _) in MARKS.items():
-        ends = np.concatenate([branches.tips[branches.end == event] for branches in traced])
+    marked = {mark: np.concatenate([x.tips[x.end == event] for x in traced]) for event, mark in MARKS.items()}
+    for mark, ends in (marked | {"D": foci[inside]}).items():
         if len(ends):
             size = min(1.0, (40 / len(ends)) ** 0.5)
             style = {"markersize": 1 + 4 * size, "markeredgewidth": 0.9 * size, "fillstyle": "none"}
-            panel.plot(*ends.T, mark, color=INK, zorder=3, scalex=False, scaley=False, **style)
+            panel.plot(*ends.T, mark, color=ink, zorder=3, scalex=False, scaley=False, **style)
     return drawn
 
 
@@ -137,14 +141,17 @@ def require_matplotlib() -> None:
 
 
 def _media(panel: Axes, scene: PlanarScene) -> None:
-    """Tint regions by index, paler the closer it is to the outermost medium's; a legend of up to NAMED media."""
+    """Tint regions by the rank of their index, paler towards the outermost medium's; a legend of up to NAMED media."""
     from matplotlib.patches import Patch, Polygon
 
     around = float(np.mean(scene.index))
     means = [float(np.mean(region.indices)) for region in scene.regions]
-    most = max((abs(n - around) for n in means), default=0)
     dark = bool(scene.light.wavelengths)
-    tints = {n: _tint((n - around) / (most or 1), dark) for n in (around, *means)}
+    # By rank, not by index: of 1, 1.45 and 1.48 the last two would look alike.
+    ranked = sorted({around, *means})
+    own = ranked.index(around)
+    most = max(own, len(ranked) - 1 - own, 1)
+    tints = {n: _tint((rank - own) / most, dark) for rank, n in enumerate(ranked)}
     panel.set_facecolor(tints[around])
     for region, n in zip(scene.regions, means, strict=True):
         style: dict[str, Any] = {"facecolor": tints[n], "edgecolor": "none", "zorder": 0.5}
@@ -158,17 +165,17 @@ def _media(panel: Axes, scene: PlanarScene) -> None:
     panel.legend(handles=patches, ncols=len(patches), handlelength=1.2, columnspacing=1.2, **place)
 
 
-def _tint(contrast: float, dark: bool) -> tuple[float, float, float]:
-    """A medium's colour by its contrast to the outermost one, −1 … 1. Denser media are blue, thinner ones yellow.
+def _tint(rank: float, dark: bool) -> tuple[float, float, float]:
+    """A medium's colour by its rank above the outermost one, −1 … 1. Denser media are blue, thinner ones yellow.
 
     dark: behind rays that shine in their own colours.
     """
-    hue = np.array(DENSE if contrast > 0 else THIN)
+    hue = np.array(DENSE if rank > 0 else THIN)
     if dark:
-        share = abs(contrast) and 0.3 + 0.7 * abs(contrast)
+        share = abs(rank) and 0.3 + 0.7 * abs(rank)
         red, green, blue = np.array(NIGHT) + 0.2 * share * hue
     else:
-        share = abs(contrast) and 0.15 + 0.85 * abs(contrast) ** 1.5
+        share = abs(rank) and 0.15 + 0.85 * abs(rank) ** 1.5
         red, green, blue = 1 - share * (1 - hue)
     return float(red), float(green), float(blue)
 
@@ -259,14 +266,22 @@ def _shade(panel: Axes, lines: Legs, colours: dict[int, Array], *, light: bool) 
 # Geometry --------------------------------------------------------------------------------------------------------
 
 
-def around(scene: PlanarScene, traced: Sequence[Branches]) -> View:
-    """The view that holds all boundaries and all places where rays meet them, with a margin."""
+def around(scene: PlanarScene, traced: Sequence[Branches], foci: Array) -> View:
+    """The view that holds all boundaries, all places where rays meet them, and near foci (F × 2), with a margin.
+
+    A focus is near where the view is at most FAR times as long with it.
+    """
     segments = scene.segments[0]
     places = [segments.start, segments.end, *(region.outline for region in scene.regions)]
     places += [branches.paths.points[:, 1:].reshape(-1, 2) for branches in traced]
     points = np.concatenate(places)
     points = points[np.isfinite(points).all(axis=1)]
     low, high = points.min(axis=0), points.max(axis=0)
+    most = FAR * float((high - low).max())
+    for focus in foci:
+        lower, upper = np.minimum(low, focus), np.maximum(high, focus)
+        if (upper - lower).max() <= most:
+            low, high = lower, upper
     pad = MARGIN * (float((high - low).max()) or 1.0)
     return float(low[0] - pad), float(high[0] + pad), float(low[1] - pad), float(high[1] + pad)
 

@@ -32,6 +32,7 @@ LOST = 2.0**-44  # share of its terms up to which a sum is 0 but for rounding, o
 GRAZING = 1e-6  # smallest cosine for which there is a limit
 PARALLEL = 1e-9  # sine of the angle between two lines that count as parallel
 SYMMETRIC = 1e-3  # sine of the angle by which two rays may differ from mirror images of each other
+SHARP = 0.25
 STEEPEST = math.radians(89)  # largest angle to the mean direction for which there is a spot
 
 
@@ -91,6 +92,7 @@ class Spread:
     smallest; `largest` is the largest such distance. None where a ray is more than 89° off the mean direction.
     `marginal`: where the outermost pair of rays crosses whose paths are mirror images. `paraxial`: where rays of this
     beam would meet that are ever nearer to the axis between these; `cardinal`: the points of the system along it.
+    `aperture`: the numerical aperture behind, n sin θ of the outermost of these pairs to either side of the axis.
     `on_plane`: on a chosen plane; None where there is none, or a ray is more than 89° off its normal.
     """
 
@@ -103,6 +105,7 @@ class Spread:
     marginal: Point | None = None
     paraxial: Point | None = None
     cardinal: Cardinal | None = None
+    aperture: float | None = None
     on_plane: Spot | None = None
 
 
@@ -249,6 +252,25 @@ class Group:
     spread: Spread
 
 
+def foci(scene: PlanarScene, traced: Sequence[Branches]) -> Array:
+    """Where rays that are refracted wherever possible come together (F × 2): real foci, by colour and beam.
+
+    The RMS distance from their centre is there less than SHARP times what it is at their first boundary.
+    """
+    points = []
+    for branches in traced:
+        away = (branches.end == Event.ESCAPED) & (branches.last > 0) & (branches.reflect == 0)
+        for beam in range(int(scene.beams.max()) + 1):
+            own = away & (scene.beams[branches.rays] == beam)
+            if own.any():
+                origins, directions = branches.tips[own], branches.paths.directions[own]
+                found = spread(origins, directions / np.hypot(*directions.T)[:, None])
+                wide = math.hypot(*branches.paths.points[own, 1].std(axis=0))
+                if found.focus and not found.virtual and found.rms is not None and found.rms < SHARP * wide:
+                    points.append(found.focus)
+    return np.array(points).reshape(-1, 2)
+
+
 def groups(scene: PlanarScene, traced: Sequence[Branches], plane: Plane | None = None) -> list[Group]:
     """The escaped rays, grouped by colour, beam and partial reflections, on whatever side of a shape they leave."""
     result = []
@@ -280,6 +302,9 @@ def _of_rays(scene: PlanarScene, colour: int, branches: Branches, own: NDArray[n
     if not pairs:
         return result
     i, j = pairs[0]
+    assert branches.paths.indices is not None
+    n = float(branches.paths.indices[own[i], branches.last[own[i]]])
+    result = replace(result, aperture=n * math.hypot(*(directions[i] - directions[j])) / 2)
     # Where the outermost pair crosses, if it does.
     sine = _cross(directions[i], directions[j])
     if abs(sine) > PARALLEL:
@@ -309,13 +334,13 @@ def table(groups: Sequence[Group]) -> str:
     for group in groups:
         bits = ", ".join(str(j) for j in range(REFLECT_BITS) if group.reflect >> j & 1)
         names.append((group.colour or "–", str(group.beam), bits or "–"))
-    foci: list[Cells] = [("rays", "focus", "spot at", "rms", "largest", "marginal", "paraxial")]
+    foci: list[Cells] = [("rays", "focus", "spot at", "rms", "largest", "marginal", "paraxial", "NA")]
     lengths = "focal length", "back focal length", "front focal length"
     cardinals: list[Cells] = [(*lengths, "front principal point", "back one")]
     spots: list[Cells] = [("on the plane at", "rms", "extent")]
     for s in (group.spread for group in groups):
         focus = _text(s.focus) + (" (virtual)" if s.virtual else "")
-        foci.append((str(s.rays), focus, *map(_text, (s.spot, s.rms, s.largest, s.marginal, s.paraxial))))
+        foci.append((str(s.rays), focus, *map(_text, (s.spot, s.rms, s.largest, s.marginal, s.paraxial, s.aperture))))
         c, on_plane = s.cardinal or Cardinal(False), s.on_plane
         points = c.focal_length, c.back_focal_length, c.front_focal_length, *(c.principal or (None, None))
         cardinals.append(("infinite" if c.afocal else _text(points[0]), *map(_text, points[1:])))
@@ -327,8 +352,9 @@ def table(groups: Sequence[Group]) -> str:
     for rows in parts:
         lines = [(*a, *b) for a, b in zip(names, rows, strict=True)]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        text += ["  ".join(f"{c:{w}}" for c, w in zip(line, widths, strict=True)).rstrip() for line in lines]
-    return "\n".join(text)
+        cells = ["  ".join(f"{c:{w}}" for c, w in zip(line, widths, strict=True)).rstrip() for line in lines]
+        text.append("\n".join(cells))
+    return "\n\n".join(text)
 
 
 def _text(value: Point | float | None) -> str:

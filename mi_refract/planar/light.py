@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,10 +35,13 @@ class Light:
         """The number of colours."""
         return len(self.names)
 
-    def indices(self, spec: str | float | Sequence[float], where: str) -> tuple[float, ...]:
+    def indices(
+        self, spec: str | float | Sequence[float], where: str, find: Callable[[str], Path] = Path
+    ) -> tuple[float, ...]:
         """The index of a medium for each colour: one number for all, one for each, or a material.
 
         A material's index is relative to air; it is that of the d line where colours have no wavelengths.
+        `find`: where a file is that `spec` names.
         ValueError for another count of numbers, as of `media.parse`, and for a wavelength out of the material's range.
         """
         if not isinstance(spec, str):
@@ -45,7 +49,7 @@ class Light:
             if len(numbers) not in (1, len(self)):
                 raise ValueError(f"{where}: {len(numbers)} numbers; expected 1, or one for each of {len(self)} colours")
             return numbers * (len(self) // len(numbers))
-        medium = media.parse(spec, where)
+        medium = media.parse(spec, where, find)
         wavelengths = np.array(self.wavelengths or (media.LINES["d"],) * len(self))
         try:
             n = medium.index(wavelengths)

@@ -174,6 +174,29 @@ def summary(scene: PlanarScene, traced: Sequence[Branches]) -> str:
     return ", ".join([_plural(rays, "ray") + colours, *split, hits, *said])
 
 
+def mismatches(scene: PlanarScene, traced: Sequence[Branches], most: int = 3) -> list[str]:
+    """A line for each pair of shapes between which paths ended with MEDIUM_MISMATCH, for the `most` frequent pairs."""
+    found: Counter[tuple[str, ...]] = Counter()
+    examples: dict[tuple[str, ...], str] = {}
+    for segments, branches in zip(scene.segments, traced, strict=True):
+        ends, last, indices = (
+            np.flatnonzero(branches.end == Event.MEDIUM_MISMATCH),
+            branches.last,
+            branches.paths.indices,
+        )
+        assert indices is not None
+        met = np.stack([branches.paths.hits[ends, last[ends] - j] for j in (1, 0)], axis=1)  # none begins with one
+        for (before, at), j, number in zip(*np.unique(met, axis=0, return_index=True, return_counts=True), strict=True):
+            pair = tuple(sorted({scene.shape_names[before], scene.shape_names[at]}))
+            found[pair] += int(number)
+            media = f"between {segments.n_left[at]:.6g} and {segments.n_right[at]:.6g}"
+            examples.setdefault(pair, f"in index {indices[ends[j], last[ends[j]]]:.6g} met a boundary {media}")
+    return [
+        f"{' and '.join(pair)} overlap, leave a gap, or are turned round: {_plural(number, 'path')} {examples[pair]}"
+        for pair, number in found.most_common(most)
+    ]
+
+
 def _plural(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 

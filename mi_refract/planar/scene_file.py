@@ -5,9 +5,10 @@ Each kind of `[[shape]]` and `[[beam]]` is a struct whose fields are the keys.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from mi_refract.io import safe_files
 from mi_refract.io.text import printable
-from mi_refract.io.typed_table import key_table, kind_table, parse_toml
+from mi_refract.io.typed_table import key_list, parse_toml
 
 from . import shapes
 from .curves import Curve, affine, unit
@@ -115,11 +116,19 @@ class Ellipse(Solid, tag="ellipse", kw_only=True):
 class Lens(Solid, tag="lens", kw_only=True):
     """Two conic surfaces z = c r² / (1 + √(1 − (1 + K) c² r²)) on the x axis, with a rim between them."""
 
-    curvature: Annotated[Point, _doc("c of the front and of the back, positive where the centre lies toward +x")]
+    curvature: Annotated[Point | None, _doc("c of both surfaces, positive where the centre lies toward +x")] = None
+    R1: Annotated[float | None, _doc("radius of curvature of the front, 1/c; 0 where it is flat")] = None
+    R2: Annotated[float | None, _doc("of the back; R1 and R2 are in place of `curvature`")] = None
     conic: Annotated[Point, _doc("K of each")] = (0.0, 0.0)
     thickness: Annotated[Positive, _doc("on the axis")]
     radius: Annotated[Positive | None, _doc("half the aperture; up to where the surfaces meet by default")] = None
     vertex: Annotated[float, _doc("where the front meets the axis")] = 0.0
+
+    def __post_init__(self) -> None:
+        """ValueError unless the curvatures are said once."""
+        super().__post_init__()
+        if (self.R1 is None, self.R2 is None) != (self.curvature is not None,) * 2:
+            raise ValueError("curvature, R1, R2; expected either `curvature`, or both R1 and R2")
 
 
 class EllipseLens(Solid, tag="ellipse_lens", kw_only=True):
@@ -163,6 +172,9 @@ def _curves(shape: AnyShape, n: dict[str, Indices]) -> list[tuple[Curve, Indices
             return [(curve, media[j + 1], media[j]) for j, (curve, _) in enumerate(layers)]
         case Ellipse():
             own = {"rx": shape.radii[0], "ry": shape.radii[1]}
+        case Lens():
+            pair = [1 / r if r else 0.0 for r in (own.pop("R1"), own.pop("R2"))]
+            own["curvature"] = shape.curvature or pair
         case EllipseLens():
             own["n"] = n["n"][0] / outside[0]
     return [(getattr(shapes, str(tag))(**own), n["n"], outside)]
@@ -256,10 +268,13 @@ class SceneTable(Struct, kw_only=True, forbid_unknown_fields=True):
 
 
 def reference() -> str:
-    """All kinds and keys as tables in Markdown: what `mi-refract trace --keys` prints."""
-    tables = key_table("key of the scene", SceneTable), key_table("key of a shape", Solid)
-    kinds = kind_table("kind of shape", get_args(AnyShape), Solid), kind_table("kind of beam", get_args(AnyBeam))
-    return "\n\n".join([*tables, *kinds])
+    """All kinds and keys: what `mi-refract trace --keys` prints."""
+    lists = [key_list("A scene:", SceneTable), key_list("Every [[shape]], which has a kind and its keys:", Solid)]
+    for table, kinds in (("[[shape]]", AnyShape), ("[[beam]]", AnyBeam)):
+        for kind in get_args(kinds):
+            about = (kind.__doc__ or "").partition("\n")[0]
+            lists.append(key_list(f'{table} kind = "{kind.__struct_config__.tag}": {about}', kind, Solid))
+    return "\n\n".join(lists)
 
 
 @dataclass(frozen=True)
@@ -275,7 +290,8 @@ class PlanarScene:
     """The content of a scene file, ready for `planar.trace` (once per colour) and for a figure.
 
     `light`: its colours, one where there is no dispersion.
-    `segments`: one per colour, the same geometry with other indices. `regions`: in drawing order, inner ones last.
+    `segments`: one per colour, the same geometry with other indices. `shape_names`: of the shape of each segment, as
+    "shape[0] 'name'". `regions`: in drawing order, inner ones last.
     `index`: of the medium around everything, per colour. `origins`, `directions`: N × 2, directions of length 1;
     `beams`: N, the number of the `[[beam]]` (from 0) that a ray belongs to. `branches`: the most partial reflections
     on a path; 0: rays are refracted wherever possible. `view`: x0, x1, y0, y1; None: all shapes. `fans`: by beam, the
@@ -286,6 +302,7 @@ class PlanarScene:
     title: str
     light: Light
     segments: tuple[Segments, ...]
+    shape_names: tuple[str, ...]
     regions: tuple[Region, ...]
     index: Indices
     origins: Array
@@ -324,18 +341,19 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
         if chosen is None and table.light != "flat":
             raise ValueError(f"light: {table.light!r} without wavelengths; expected `wavelengths` that it weights")
         light = Light(tuple(table.colours or [""])) if chosen is None else of_wavelengths(chosen, table.light)
-        index = light.indices(table.index, "index")
-        parts = _parts(table.shape, index, light)
-        rays, segments = _rays(table.beam), boundaries(parts)
+        indices = functools.partial(light.indices, find=path.parent.joinpath)
+        index = indices(table.index, "index")
+        parts = _parts(table.shape, index, indices)
+        rays, (segments, shapes) = _rays(table.beam), boundaries(parts)
     except ValueError as error:
         raise ValueError(" ".join(f"{path}: {error}".split())) from None
     regions = tuple(Region(part.curve.outline(), part.left) for part in parts if part.curve.closed)
     fans = tuple(beam.angles if isinstance(beam, Fan) else None for beam in table.beam)
     limits = table.max_depth, table.branches, table.view
-    return PlanarScene(path, table.title or path.stem, light, segments, regions, index, *rays, *limits, fans)
+    return PlanarScene(path, table.title or path.stem, light, segments, shapes, regions, index, *rays, *limits, fans)
 
 
-def _parts(tables: Sequence[AnyShape], ambient: Indices, light: Light) -> list[Part]:
+def _parts(tables: Sequence[AnyShape], ambient: Indices, indices: Callable[..., Indices]) -> list[Part]:
     """The curves of all shapes, in their places."""
     parts: list[Part] = []
     media: dict[str, Indices] = {}
@@ -343,7 +361,7 @@ def _parts(tables: Sequence[AnyShape], ambient: Indices, light: Light) -> list[P
     for j, shape in enumerate(tables):
         where = f"shape[{j}]"
         values = {key: getattr(shape, key, None) for key in ("n", "outside", "n_left", "n_right")}
-        n = {key: light.indices(x, f"{where}.{key}") for key, x in values.items() if x is not None}
+        n = {key: indices(x, f"{where}.{key}") for key, x in values.items() if x is not None}
         if isinstance(shape, Inside) and shape.within is not None:
             if shape.outside is not None:
                 raise ValueError(f"{where}.within: {shape.within!r}, but `outside` is set too; expected one of them")
@@ -357,16 +375,17 @@ def _parts(tables: Sequence[AnyShape], ambient: Indices, light: Light) -> list[P
                 raise ValueError(f"{where}.name: {shape.name!r} is the name of another shape; expected a unique name")
             media[shape.name] = n["n"]
         curves = shape.layers if isinstance(shape, Luneburg) else 1
-        pieces += curves * max(shape.facets or 4, len(getattr(shape, "points", ()))) * len(light)
+        pieces += curves * max(shape.facets or 4, len(getattr(shape, "points", ()))) * len(ambient)
         if pieces > PIECES:
             most = f"at most {PIECES} pieces of curves in all shapes together, once for each colour"
             raise ValueError(f"{where}: {pieces} or more pieces; expected {most}")
         first = len(parts)
+        named = f"{where} '{printable(shape.name)}'" if isinstance(shape, Solid) and shape.name else where
         try:
             with np.errstate(all="ignore"):
                 for curve, left, right in _curves(shape, n):
                     chords = curve.faceted(shape.facets) if shape.facets else curve
-                    parts.append(Part(where, chords.mapped(affine(shape.rotate, shape.scale), shape.at), left, right))
+                    parts.append(Part(named, chords.mapped(affine(shape.rotate, shape.scale), shape.at), left, right))
         except ValueError as error:
             raise ValueError(f"{where}.{error}") from None
         for part in parts[first:]:

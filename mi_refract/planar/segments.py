@@ -31,7 +31,7 @@ def finite_array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
 def check_range(name: str, values: Array, largest: float) -> None:
     """ValueError for numbers of which a product of two would overflow, and NaN."""
     if values.size and not (values.max() <= largest and values.min() >= -largest):
-        raise ValueError(f"{name}: a number beyond ±{largest:g}")
+        raise ValueError(f"{name}: {values[~(np.abs(values) <= largest)][0]:g}; expected up to ±{largest:g}")
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ class Part(NamedTuple):
     right: Indices
 
 
-def boundaries(parts: list[Part]) -> tuple[Segments, ...]:
-    """All parts as boundaries, one set per colour; vertices that differ by rounding only are merged.
+def boundaries(parts: list[Part]) -> tuple[tuple[Segments, ...], tuple[str, ...]]:
+    """All parts as boundaries, one set per colour, and the `where` of each; vertices apart by rounding only are merged.
 
     Where a closed part runs along an earlier one, they share one boundary, with the inside of the later part on the
     side where its outside was. So shapes can be cemented, and can touch the shape they lie in from within.
@@ -62,7 +62,8 @@ def boundaries(parts: list[Part]) -> tuple[Segments, ...]:
             raise ValueError(f"{part.where}: {text}")
         media[i, side], kept[j] = part.left, False
     start, end, control, weight, media = (x[kept] for x in (start, end, control, weight, media))
-    return tuple(Segments(start, end, left, right, control, weight) for left, right in media.transpose(2, 1, 0))
+    colours = tuple(Segments(start, end, left, right, control, weight) for left, right in media.transpose(2, 1, 0))
+    return colours, tuple(parts[i].where for i in owner[kept])
 
 
 def _merged(points: Array) -> tuple[Array, Numbers]:

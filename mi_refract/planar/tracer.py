@@ -100,8 +100,8 @@ class Tracer:
         self.farthest = FARTHEST[precision]
         for name in ("start", "end", "control", "n_left", "n_right"):
             check_range(f"segments.{name}", getattr(segments, name), self.farthest)
-        if min(segments.n_left.min(), segments.n_right.min()) < 1 / self.farthest:
-            raise ValueError(f"segments: an index below {1 / self.farthest:g}")
+        if (least := min(segments.n_left.min(), segments.n_right.min())) < 1 / self.farthest:
+            raise ValueError(f"segments: the index {least:g}; expected at least {1 / self.farthest:g}")
         # Seen from a new origin in the middle of boundaries whose |middle| exceeds twice their extent: there
         # |x − middle| < |middle|/2, so the differences are exact, and float32 keeps all its digits for them.
         start, end, control = segments.start, segments.end, segments.control
@@ -210,27 +210,24 @@ class Tracer:
     def _search(self, gone: float) -> SearchState:
         return SearchState(self.arrays.number(gone), self.arrays.index(NOWHERE))
 
-    def _nearest(self, state: PathState) -> tuple[Hit, SearchState, Mask]:
-        """The first boundary ahead, and whether that is settled or the search must go on."""
-        boundaries, ray, active, start = self.boundaries, state.ray, state.active, self.boundaries.start(state.ray)
-        if self.mesh:
-            return self.mesh.nearest(boundaries, ray, start, state.search, active)
-
-        def test(i: Index, best: Hit) -> tuple[Index, Hit]:
-            return i + 1, boundaries.nearer(best, ray, start, i)
-
-        def more(i: Index, best: Hit) -> Mask:
-            return active & (i < boundaries.count)
-
-        hit = dr.while_loop((self.arrays.index(0), boundaries.none()), more, test, label="boundaries")[1]
-        return hit, state.search, self.arrays.mask(True)
-
     def _step(self, state: PathState, bits: Index | None, most: Index, scatter: Scatter, weights: bool) -> PathState:
         """Search once for the next boundary, and cross it if it is found, or end the path.
 
         bits: of `reflect`; most: the greatest depth.
         """
-        hit, search, settled = self._nearest(state)
+        boundaries, ray, start = self.boundaries, state.ray, self.boundaries.start(state.ray)
+
+        def test(i: Index, best: Hit) -> tuple[Index, Hit]:
+            return i + 1, boundaries.nearer(best, ray, start, i)
+
+        def more(i: Index, best: Hit) -> Mask:
+            return state.active & (i < boundaries.count)
+
+        if self.mesh:  # the first boundary ahead may not be settled: then the search goes on
+            hit, search, settled = self.mesh.nearest(boundaries, ray, start, state.search, state.active)
+        else:
+            hit = dr.while_loop((self.arrays.index(0), boundaries.none()), more, test, label="boundaries")[1]
+            search, settled = state.search, self.arrays.mask(True)
         some = state.active & settled & (hit.segment != NOWHERE)
 
         def leg(state: PathState, event: Any, index: Number, active: Mask) -> None:

@@ -2,6 +2,7 @@
 
 `int_absorption`, `ext_absorption`: σ, a number or a spectrum, per unit of the scene. Or `int_colour`, in (0, 1], what
 is left of white light after the distance `int_colour_distance`: σ = −log(colour)/distance; `ext_colour` likewise.
+Or a file with k, the imaginary part of the index: σ = 4πk/λ, by `int_absorption_unit`, the scene's unit in metres.
 """
 
 from __future__ import annotations
@@ -11,12 +12,17 @@ from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
+import mitsuba.mitsuba_ext
 
+from mi_refract import media
 from mi_refract.numerics import BSDF, Interaction, Mask, Number, Properties, Spectrum, Texture
+
+from .index_parameter import find_file, lost_colour, read_knots, warn_once
 
 # Attributes of a boundary: σ on the side from which light comes along `si.wi`, and on the other.
 HERE, BEYOND = "absorption here", "absorption beyond"
 ENDLESS = 1e30  # σ times this distance is finite in float32, and its exponential is 0
+_parsed: Any = mitsuba.mitsuba_ext  # types that do not depend on the variant
 LEAST_COLOUR = 1e-30  # its logarithm is finite; a spectrum that Mitsuba makes of an RGB colour may end at 0
 
 
@@ -51,6 +57,9 @@ def absorbed(sigma: Spectrum, length: Number) -> Spectrum:
 def read_absorption(plugin: str, props: Properties, side: str) -> Absorption | None:
     """Of `int`, `ext` or `camera`; None where the scene does not say. ValueError with the parameter."""
     sigma, colour, distance = f"{side}_absorption", f"{side}_colour", f"{side}_colour_distance"
+    for known in (colour, distance):
+        if (unknown := known.replace("colour", "color")) in props:
+            raise ValueError(f"{plugin}: unknown parameter {unknown}; expected {known}")
     if sigma in props:
         if colour in props or distance in props:
             raise ValueError(f"{plugin}: {sigma} and {colour} are both set; expected one of them")
@@ -66,52 +75,58 @@ def read_absorption(plugin: str, props: Properties, side: str) -> Absorption | N
             raise ValueError(f"{plugin}: {distance} = {length!r}; expected a positive finite length")
 
     value = props[name]
-    values: tuple[float, ...] | None = None  # None where it varies over a surface
-    rgb = type(value).__name__.endswith("Color3d")
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        values = (float(value),)
-    elif rgb:
-        values = tuple(float(x) for x in value)
-    elif knots := read_knots(value):
-        values = knots[1]
-    if values is None or not all(0 < x <= 1 if length else 0 <= x < math.inf for x in values):
-        text = " ".join(str(value).split())
-        expected = "a number or a spectrum " + ("above 0 and up to 1" if length else "≥ 0, and finite")
-        texture = "; no texture" if values is None else ""
-        raise ValueError(
-            f"{plugin}: {name} = {text if len(text) <= 80 else f'{text[:77]}…'}; expected {expected}{texture}"
-        )
-
-    if not rgb or length or not any(values):
+    if not length and ((isinstance(value, str) and media.file_in(value)) or f"{sigma}_unit" in props):
+        return _from_k(plugin, name, value, props.get(f"{sigma}_unit", 0.0))
+    expected = "a number or a spectrum " + ("above 0 and up to 1" if length else "≥ 0, and finite")
+    values = read_values(plugin, props, name, expected, bool(length), textures=False)
+    if not type(value).__name__.endswith("Color3d") or length or not any(values):
         return Absorption(name, props.get_unbounded_texture(name), 1.0, float(length))
     # Mitsuba makes a spectrum of an RGB colour up to 1 only, and a smooth one of 1/2; of the others, in proportion.
     factor, scaled = 2 * max(values), mi.Properties()
-    scaled[name] = value / factor
+    scaled[name] = props[name] / factor
     props.mark_queried(name)
     return Absorption(name, scaled.get_unbounded_texture(name), factor, 0.0)
 
 
-def read_knots(value: Any) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-    """The knots of a `<spectrum>` or of a plugin `uniform`, `regular` or `irregular`; None for anything else.
+def read_values(
+    plugin: str, props: Properties, name: str, expected: str, share: bool = False, textures: bool = True
+) -> tuple[float, ...]:
+    """The values of a number, of three colours or of a spectrum; none of a texture, where `textures` may be.
 
-    A piecewise linear function: increasing wavelengths in nm, none for a constant, and the values.
+    ValueError with the parameter where one is negative or not finite, or, of a `share`, 0 or above 1.
     """
+    value = props[name]
+    values: tuple[float, ...] = ()
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        values = (float(value),)
+    elif type(value).__name__.endswith("Color3d"):
+        values = tuple(float(x) for x in value)
+    elif knots := read_knots(value):
+        values = knots[1]
+    if not (values or textures) or not all(0 < x <= 1 if share else 0 <= x < math.inf for x in values):
+        text = " ".join(str(value).split())
+        texture = "" if values else "; no texture"
+        raise ValueError(
+            f"{plugin}: {name} = {text if len(text) <= 80 else f'{text[:77]}…'}; expected {expected}{texture}"
+        )
+    return values
 
-    import numpy as np
 
-    def numbers(value: Any) -> tuple[float, ...]:
-        return tuple(np.array(value, float).ravel().tolist())
-
-    if type(value).__name__ == "Spectrum":  # `mi.Spectrum` is another class in every variant
-        return (() if value.is_uniform() else numbers(value.wavelengths), numbers(value.values))
-    kind = value.class_name() if isinstance(value, mi.Object) else ""
-    if kind not in ("UniformSpectrum", "RegularSpectrum", "IrregularSpectrum"):
-        return None
-    shown = mi.traverse(value)
-    if kind == "UniformSpectrum":
-        return (), numbers(shown["value"])
-    values = numbers(shown["values"])
-    if kind == "IrregularSpectrum":
-        return numbers(shown["wavelengths"]), values
-    (first, last), steps = numbers(shown["range"]), len(values) - 1
-    return tuple(first + (last - first) * (i / steps) for i in range(len(values))), values
+def _from_k(plugin: str, name: str, text: Any, unit: Any) -> Absorption:
+    """σ = 4πk/λ of a file with k. ValueError with the parameter."""
+    label = f"{plugin}: {name}"
+    medium = media.parse(text, label, find_file) if isinstance(text, str) else None
+    if not medium or not medium.k:
+        raise ValueError(f"{label} = {text!r}; expected a number, a spectrum, or with {name}_unit a file with k")
+    if isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < math.inf:
+        raise ValueError(f"{plugin}: {name}_unit = {unit!r}; expected the scene's unit in metres: 0.001 for mm")
+    knots, k = medium.k
+    if lost := lost_colour(f"{label} = {text!r} has k", (knots[0], knots[-1]), medium.hold):
+        text = f"{label} = {text!r} has k from {knots[0]:g} to {knots[-1]:g} nm"
+        warn_once(f"{text}; other light ({100 * lost:.2g}% of the colour) has the absorption of the range's end")
+    ends = min(knots[0], mi.MI_CIE_MIN), max(knots[-1], mi.MI_CIE_MAX)  # beyond, the values at the ends go on
+    pairs = [*zip(knots, k, strict=True)]
+    pairs = [(ends[0], k[0])] * (ends[0] < knots[0]) + pairs + [(ends[1], k[-1])] * (ends[1] > knots[-1])
+    made = mi.Properties()
+    made[name] = _parsed.Spectrum([w for w, _ in pairs], [4e9 * math.pi * x / w * unit for w, x in pairs])
+    return Absorption(name, made.get_unbounded_texture(name), 1.0, 0.0)

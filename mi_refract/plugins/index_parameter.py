@@ -8,6 +8,7 @@ it is NaN: such light is lost.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -27,8 +28,6 @@ from mi_refract.numerics import (
     differentiated,
     replace_grad,
 )
-
-from .absorption import read_knots
 
 PLUGIN = "refract"
 DEFAULTS = {"int_ior": "bk7", "ext_ior": "air"}
@@ -165,25 +164,41 @@ def read_ratio(v: Variant, props: Properties) -> tuple[DispersiveRatio | Texture
         label, medium = f"{PLUGIN}: {name}: {indices[name].name}", indices[name]
         if not v.is_spectral:
             warn_once(f"{label}: all light has the index of the d line, 587.6 nm, here")
-        elif lost := lost_colour(medium):
+        elif lost := lost_colour(f"{label} has an index", medium.valid, medium.hold):
             text = f"{label} has an index from {medium.valid[0]:g} to {medium.valid[1]:g} nm"
-            if lost > LOST:
-                expected = f"at most {LOST:.1%}"
-                raise ValueError(f"{text}: {lost:.1%} of the colour lies outside; expected {expected}")
-            warn_once(f"{text}; other light ({lost:.1e} of the colour) is lost there")
+            held = "has the index of the range's end" if medium.hold else "is lost there"
+            warn_once(f"{text}; other light ({100 * lost:.2g}% of the colour) {held}")
     return DispersiveRatio(v, inside, outside) if dispersive else None, number
 
 
-def lost_colour(medium: Medium) -> float:
-    """The largest share of X, Y and Z, of light of equal power at all wavelengths, outside a medium's range."""
+def lost_colour(label: str, valid: tuple[float, float], hold: bool) -> float:
+    """The largest share of X, Y and Z, of light of equal power at all wavelengths, outside a range in nm.
+
+    ValueError, without `hold`, where it is above LOST. `label`: what has the range, for the message.
+    """
     import numpy as np
 
     wavelengths = np.arange(mi.MI_CIE_MIN, mi.MI_CIE_MAX + 1.0)
     response: Any = mi.cie1931_xyz
     lanes = [mi.Float(wavelengths)] if dr.is_jit_v(mi.Float) else wavelengths.tolist()
     xyz = np.concatenate([np.array(response(x), float).reshape(3, -1) for x in lanes], axis=1)
-    outside = (wavelengths < medium.valid[0]) | (wavelengths > medium.valid[1])
-    return float((xyz[:, outside].sum(1) / xyz.sum(1)).max())
+    shares = xyz / xyz.sum(1, keepdims=True)
+    lost = shares[:, (wavelengths < valid[0]) | (wavelengths > valid[1])].sum(1).max()
+    if lost > LOST and not hold:
+        below = np.cumsum(shares, axis=1)
+        low = wavelengths[np.argmax(below.max(0) > LOST / 2)]  # half of it on either side
+        high = wavelengths[np.argmax(below.min(0) >= 1 - LOST / 2)]
+        raise ValueError(
+            f"{label} from {valid[0]:g} to {valid[1]:g} nm: {100 * lost:.2g}% of the colour lies outside; expected at "
+            f"least {low:g} … {high:g} nm, or hold(…) around the text, by which the values at its ends go on"
+        )
+    return float(lost)
+
+
+def find_file(name: str) -> Path:
+    """Where Mitsuba looks for a file: in the folder of the scene first."""
+    untyped: Any = mi  # its stubs have no types for file resolvers
+    return Path(str(untyped.file_resolver().resolve(name)))
 
 
 def read_ior(props: Properties, name: str, default: str) -> float:
@@ -201,7 +216,7 @@ def read_index(v: Variant, props: Properties, name: str, default: str) -> Medium
     """
     value, label = props.get(name, default), f"{PLUGIN}: {name}"
     if isinstance(value, (str, int, float)) and not isinstance(value, bool):
-        return media.parse(value, name=label)
+        return media.parse(value, label, find_file)
     if knots := read_knots(value):
         if not knots[0]:
             return media.parse(knots[1][0], name=label)
@@ -235,3 +250,29 @@ def _check_texture(v: Variant, label: str, texture: Texture) -> None:
         if (bad := values[~((values >= SMALLEST_RATIO) & (values <= LARGEST_RATIO))]).size:
             expected = f"indices from {SMALLEST_RATIO:.2g} to {LARGEST_RATIO:.2g}"
             raise ValueError(f"{label}: its texture holds {bad[0]:g}; expected {expected} everywhere")
+
+
+def read_knots(value: Any) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    """The knots of a `<spectrum>` or of a plugin `uniform`, `regular` or `irregular`; None for anything else.
+
+    A piecewise linear function: increasing wavelengths in nm, none for a constant, and the values.
+    """
+
+    import numpy as np
+
+    def numbers(value: Any) -> tuple[float, ...]:
+        return tuple(np.array(value, float).ravel().tolist())
+
+    if type(value).__name__ == "Spectrum":  # `mi.Spectrum` is another class in every variant
+        return (() if value.is_uniform() else numbers(value.wavelengths), numbers(value.values))
+    kind = value.class_name() if isinstance(value, mi.Object) else ""
+    if kind not in ("UniformSpectrum", "RegularSpectrum", "IrregularSpectrum"):
+        return None
+    shown = mi.traverse(value)
+    if kind == "UniformSpectrum":
+        return (), numbers(shown["value"])
+    values = numbers(shown["values"])
+    if kind == "IrregularSpectrum":
+        return numbers(shown["wavelengths"]), values
+    (first, last), steps = numbers(shown["range"]), len(values) - 1
+    return tuple(first + (last - first) * (i / steps) for i in range(len(values))), values

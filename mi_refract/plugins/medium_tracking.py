@@ -32,7 +32,7 @@ from mi_refract.numerics import (
 )
 
 from .absorption import BEYOND, HERE, absorbing_parameter
-from .scene_features import all_shapes, nested, plugin_number
+from .scene_features import all_shapes, children, nested, plugin_number, shape_name
 
 TOLERANCE = 1e-3  # relative: σ may have been given as a number here and as a colour there
 STRAY = 0.01  # of the crossings of a shape: more are a contradiction
@@ -87,11 +87,10 @@ class Crossings:
         def contradicts(crossed: int, wrong: int) -> bool:
             return wrong > STRAY * crossed and (wrong > FEW or 2 * wrong >= crossed)
 
-        rows = dict(self.tally)
-        for number, row in enumerate(zip(*self.counts, strict=True)):
-            rows[self.positions.get(number, -1)] = [int(count) for count in row]
+        counted = enumerate(zip(*self.counts, strict=True))
+        rows = [(self.positions.get(number, -1), [int(count) for count in row]) for number, row in counted]
         first, worst = NEVER, None  # what is wrong first is the cause
-        for position, (crossed, wrong, depth, stepped_over) in sorted(rows.items()):
+        for position, (crossed, wrong, depth, stepped_over) in sorted([*rows, *self.tally.items()]):
             name = shape_name(self.shapes, position) if position >= 0 else "a shape"
             if contradicts(crossed, stepped_over):
                 raise ValueError(
@@ -109,19 +108,13 @@ class Crossings:
             )
 
 
-def shape_name(shapes: list[Shape], position: int) -> str:
-    """The shape's name in quotes, or its class and its position in the scene where it has no name."""
-    shape = shapes[position]
-    return repr(str(shape.id())) if shape.id() else f"shape {position + 1} of {len(shapes)} ({shape.class_name()})"
-
-
 class MediumTracker:
     """Absorption that the BSDFs declare, for one render."""
 
-    def __init__(self, v: Variant, scene: Scene, start: Spectrum, way: Number, crossings: Crossings) -> None:
-        """`v`: the variant's module. `start`: σ at the camera. `way`: from there to the origin of the first ray."""
-        self.v, self.scene, self.crossings, self.vectorised = v, scene, crossings, dr.is_jit_v(v.Float)
-        self.start, self.way = start, way
+    def __init__(self, v: Variant, scene: Scene) -> None:
+        """`v`: the variant's module."""
+        self.v, self.scene, self.vectorised = v, scene, dr.is_jit_v(v.Float)
+        self.crossings = Crossings(v, scene)
 
     def cross(
         self, sigma: Spectrum, depth: Count, si: Interaction, bs: BSDFSample, bsdf: BSDF, ray: Ray, active: Mask
@@ -151,9 +144,9 @@ class MediumTracker:
 class ShapeMedia:
     """Absorption by the media of the shapes (`interior`, `exterior`), as `volpath` follows them."""
 
-    def __init__(self, v: Variant, start: Spectrum, way: Number) -> None:
-        """`v`: the variant's module. `start`: σ at the camera. `way`: from there to the origin of the first ray."""
-        self.v, self.start, self.way, self.vectorised = v, start, way, dr.is_jit_v(v.Float)
+    def __init__(self, v: Variant) -> None:
+        """`v`: the variant's module."""
+        self.v, self.vectorised = v, dr.is_jit_v(v.Float)
 
     def cross(
         self, sigma: Spectrum, depth: Count, si: Interaction, bs: BSDFSample, bsdf: BSDF, ray: Ray, active: Mask
@@ -191,10 +184,15 @@ def absorbs_only(v: Variant, medium: MediumPlugin) -> bool:
 
 
 def check_integrator(scene: Scene) -> None:
-    """ValueError where a BSDF absorbs and the scene's integrator is another than `refract_path`."""
+    """ValueError where a BSDF absorbs and the scene's integrator is neither `refract_path` nor calls only that."""
+
+    def follows(integrator: Any) -> bool:
+        called = [child for child in children(integrator) if hasattr(child, "aov_names")]
+        return type(integrator).__name__ == "RefractPath" or (bool(called) and all(map(follows, called)))
+
     declared = (absorbing_parameter(bsdf) for shape in all_shapes(scene) for bsdf in nested(shape.bsdf()))
     name = next(filter(None, declared), "")
-    if name and type(scene.integrator()).__name__ != "RefractPath":
+    if name and not follows(scene.integrator()):
         raise ValueError(f"refract: {name}; expected the integrator refract_path, or no absorption")
 
 

@@ -14,6 +14,7 @@ In scalar variants a pointer may be None and needs an `if`; in the others lanes 
 
 from __future__ import annotations
 
+import functools
 import operator
 from dataclasses import dataclass, make_dataclass
 from typing import Any
@@ -112,6 +113,16 @@ class LoopState:
     skipped: Number = None  # distance from the last vertex to the origin of the ray, which is beside the surface
 
 
+@functools.cache
+def branch_type(v: Variant, dispersion: bool, absorption: bool) -> type:
+    """The type of what is on the stack: of a branch, the part of `LoopState` that it has to itself."""
+    branch = {"o": v.Point3f, "d": v.Vector3f, "throughput": v.Spectrum, "depth": v.UInt32, "eta": v.Float}
+    branch |= {"share": v.Float, "node": v.UInt32}
+    branch |= {"wavelength_count": v.Float} if dispersion else {}
+    branch |= {"sigma": v.UnpolarizedSpectrum, "skipped": v.Float} if absorption else {}
+    return make_dataclass("Branch", branch.items())
+
+
 class ScalarStack:
     """`dr.alloc_local` for scalar variants, which have no local memory."""
 
@@ -157,7 +168,7 @@ def at_fixed_direction(
 
 
 class PathLoop:
-    """The loop for one call of the integrator's `sample`."""
+    """The loop over the vertices of a path, and of all that it splits into."""
 
     def __init__(
         self,
@@ -167,7 +178,7 @@ class PathLoop:
         numbers: SceneSampler | KeyedMultijitter,
         media: MediumTracker | ShapeMedia | None = None,
     ) -> None:
-        """`v`: the variant's module. `media`: needed where `features.absorption`."""
+        """`v`: the variant's module. `numbers`: those of all paths. `media`: needed where `features.absorption`."""
         self.v, self.scene, self.features, self.numbers = v, scene, features, numbers
         self.media: Any = media
         self.vectorised, self.context = dr.is_jit_v(v.Float), followed_context()
@@ -176,18 +187,20 @@ class PathLoop:
         # Derivatives need loops that are evaluated. The kernels of their reverse sweep may run after the scene is gone,
         # so they must not trace rays: what a ray meets is evaluated at once.
         self.evaluated = self.vectorised and not dr.flag(dr.JitFlag.SymbolicLoops)
-        # Local memory needs a type for its entries: of a branch, the part of `LoopState` that it has to itself.
-        branch = {"o": v.Point3f, "d": v.Vector3f, "throughput": v.Spectrum, "depth": v.UInt32, "eta": v.Float}
-        branch |= {"share": v.Float, "node": v.UInt32}
-        branch |= {"wavelength_count": v.Float} if features.dispersion else {}
-        branch |= {"sigma": v.UnpolarizedSpectrum, "skipped": v.Float} if features.absorption else {}
-        self.branch = make_dataclass("Branch", branch.items())
+        self.branch = branch_type(v, features.dispersion, features.absorption)
         self.boundaries = self._boundaries() if features.split_depth and self.vectorised else []
 
-    def run(self, ray: Ray, sampler: Sampler, active: Mask) -> LoopState:
-        """Follow `ray` and everything that it splits into. `result` of the state at the end is the radiance."""
-        v, features = self.v, self.features
-        skipped = self.media.way if features.absorption else 0
+    def refuse(self) -> None:
+        """ValueError where the absorption that the paths met was contradictory."""
+        if isinstance(self.media, MediumTracker):
+            self.media.crossings.refuse()
+
+    def run(self, ray: Ray, sampler: Sampler, active: Mask, sigma: Spectrum = 0, way: Number = 0) -> LoopState:
+        """Follow `ray` and everything that it splits into. `result` of the state at the end is the radiance.
+
+        `sigma`: absorption at the camera. `way`: from there to the origin of the ray.
+        """
+        v, features, skipped = self.v, self.features, way
 
         # ---------------------- Hide area emitters ----------------------
         if features.hide_emitters and features.area:
@@ -209,7 +222,7 @@ class PathLoop:
         if features.dispersion:
             s.wavelength_count = v.Float(dr.size_v(v.UnpolarizedSpectrum))
         if features.absorption:
-            s.sigma, s.skipped = v.UnpolarizedSpectrum(self.media.start), v.Float(skipped)
+            s.sigma, s.skipped = v.UnpolarizedSpectrum(sigma), v.Float(skipped)
 
         (s,) = dr.while_loop((s,), lambda s: s.active, self._vertex, label="refract_path")
 

@@ -10,6 +10,7 @@
 | `int_absorption`, `ext_absorption` | number, spectrum | σ of the medium on that side (0) | spectrum | yes |
 | `int_colour`, `ext_colour` | number, spectrum | what white light keeps after the distance below | spectrum | yes |
 | `int_colour_distance`, `ext_colour_distance` | number | with the former; no default | no | no |
+| `int_absorption_unit`, `ext_…` | number | unit of the scene in metres, for k from a file | no | no |
 | `formula` | string | a key of `FORMULAS`, or `auto` (default) | no | no |
 
 A plugin class belongs to one variant: `plugin_class` makes it of the functions below, `register` makes it known. In
@@ -32,6 +33,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Collection
+from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeAlias
 
 import drjit as dr
@@ -54,7 +56,7 @@ from mi_refract.numerics import (
     replace_grad,
 )
 
-from .absorption import BEYOND, HERE, absorbing_parameter, read_absorption
+from .absorption import BEYOND, HERE, absorbing_parameter, read_absorption, read_values
 from .index_parameter import PLUGIN, DispersiveRatio, TexturedRatio, one_number, parameter_type, read_ratio, warn_once
 
 Refract: TypeAlias = Any  # an object of the class that `plugin_class` makes
@@ -133,8 +135,12 @@ def read_parameters(self: Refract, props: Properties, formula: str = "auto") -> 
         self.formula_name, self.formula = resolve(self.requested, dr.backend_v(v.Float))
     except ValueError as error:
         raise ValueError(f"{PLUGIN}: {error}") from None
-    self.textures = {name: props.get_texture(name, 1.0) for name in LOBES if name in props}
+    tints = [name for name in LOBES if name in props]
+    for name in tints:
+        read_values(PLUGIN, props, name, "a number, a spectrum or a texture, ≥ 0 and finite")
+    self.textures = {name: props.get_texture(name, 1.0) for name in tints}
     self.absorptions = {side: read_absorption(PLUGIN, props, side) for side in ("int", "ext")}
+    self.reported = False  # of `UnfollowedLight`
     self.eta = parameter_type(v)(eta)
     set_ratio(self, checked("int_ior / ext_ior", eta))
     both_sides = FLAGS.FrontSide | FLAGS.BackSide
@@ -271,13 +277,8 @@ def sample(
         tint = dr.select(selected, texture.eval(si, selected), v.UnpolarizedSpectrum(1))
         weight = weight @ v.mueller.absorber(tint) if v.is_polarized else weight * tint
     if self.absorbing and not followed:
-        # An infinite weight, where only `refract_path` can be right; in scalar variants an error. Dr.Jit calls the
-        # BSDFs of all scenes in memory, also where no light meets them: an error would be one of scenes that do not
-        # absorb. (Not NaN: some integrators drop such a sample.)
-        text = f"{PLUGIN}: {absorbing_parameter(self)}; expected the integrator refract_path, or no absorption"
-        if not dr.is_jit_v(v.Float):
-            raise RuntimeError(text)
-        warn_once(f"{text}; where light meets it, the image is infinite")
+        # Infinite, as only `refract_path` can be right. (Not NaN: some integrators drop such a sample.)
+        self.unfollowed.report(self, active)
         weight = v.Spectrum(dr.inf)
     return bs, dr.select(active, weight, 0)
 
@@ -421,6 +422,41 @@ def to_string(self: Refract) -> str:
     return "Refract[\n" + "".join("  " + line.replace("\n", "\n  ") + ",\n" for line in lines) + "]"
 
 
+class UnfollowedLight:
+    """Light that meets absorption under an integrator that does not follow it: an error where one can be raised.
+
+    A symbolic call has the BSDFs of all scenes in memory, and does not know which of them light will meet. `dr.print`
+    does once the image is computed: one warning for all BSDFs that light met for the first time.
+    """
+
+    def __init__(self, v: Variant) -> None:
+        """`v`: the variant's module."""
+        self.v, self.logged = v, False  # in the image that was traced last
+
+    def report(self, bsdf: Refract, active: Mask) -> None:
+        """RuntimeError, or a warning when the image is computed, where a lane is `active`; once a BSDF."""
+        v, parameter = self.v, absorbing_parameter(bsdf)
+        text = f"{PLUGIN}: {parameter}; expected the integrator refract_path, or no absorption"
+
+        def warn(_: str) -> None:
+            bsdf.reported = True
+            if not self.logged:
+                self.logged = True
+                mi.Log(mi.LogLevel.Warn, f"{text}; where light meets it, the image is not finite")  # type: ignore[operator]
+
+        frozen = dr.flag(dr.JitFlag.FreezingScope)  # there nothing can be read
+        if not frozen and not dr.flag(dr.JitFlag.SymbolicScope):
+            if dr.any(active):
+                raise RuntimeError(text)
+        elif not bsdf.reported:
+            self.logged = False
+            if frozen:
+                warn("")
+                return
+            order = dr.scatter_inc(dr.opaque(v.UInt32, 0), v.UInt32(0), active)
+            dr.print("", order=order, active=active & (order == 0), file=SimpleNamespace(write=warn))
+
+
 # The class -----------------------------------------------------------------------------------------------------------
 
 
@@ -439,6 +475,7 @@ def plugin_class(v: Variant) -> type:
         "__doc__": "Smooth dielectric boundary; see the module docstring.",
         "v": v,
         "wide": dr.float64_array_t(v.Float),
+        "unfollowed": UnfollowedLight(v),
         "__init__": read_parameters,
         "eval": evaluate,
         "dispersive": property(dispersive),

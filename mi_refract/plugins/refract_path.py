@@ -23,11 +23,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refract.numerics import Mask, MediumPlugin, Properties, Ray, Sampler, Scene, Sensor, Spectrum, Variant
+from mi_refract.numerics import Mask, MediumPlugin, Number, Properties, Ray, Sampler, Scene, Sensor, Spectrum, Variant
 
 from .absorption import read_absorption
 from .index_parameter import warn_once
-from .medium_tracking import Crossings, MediumTracker, ShapeMedia, check_media, extinction
+from .medium_tracking import MediumTracker, ShapeMedia, check_media, extinction
 from .path_loop import PathFeatures, PathLoop
 from .sampling import KeyedMultijitter, SceneSampler
 from .scene_features import SceneFeatures, inspect
@@ -95,26 +95,26 @@ def integrator_class(v: Variant) -> type:
             self.needs: SceneFeatures | None = None  # of the scene rendered last
             self.rendering = False  # between `begin_render` and `end_render`
             self.near: Any = None  # `to_camera` of the sensor of this render
-            self.crossings: list[Crossings] = []  # one a pass; in scalar variants one in all
+            self.loops: list[PathLoop] = []  # of this render: one a pass; in scalar variants one in all
 
         def begin_render(self, sensor: Sensor) -> None:
             """To be called before `sample` where `render` is not; else each sample inspects the scene anew."""
-            self.needs, self.rendering, self.crossings = None, True, []
+            self.needs, self.loops, self.rendering = None, [], True
             self.near = to_camera(sensor)
 
         def end_render(self) -> None:
             """To be called after the samples were evaluated. ValueError where absorption was contradictory."""
-            self.rendering = False
-            for crossings in self.crossings:
-                crossings.refuse()
+            loops, self.loops, self.rendering = self.loops, [], False
+            for loop in loops:
+                loop.refuse()
 
         def render(self, scene: Scene, sensor: Sensor | int = 0, *more: Any, **named: Any) -> Any:
             self.begin_render(scene.sensors()[sensor] if isinstance(sensor, int) else sensor)
             try:
                 image = super().render(scene, sensor, *more, **named)
+                self.end_render()
             finally:
-                self.rendering = False
-            self.end_render()
+                self.loops, self.rendering = [], False
             return image
 
         def aov_names(self) -> list[str]:
@@ -125,22 +125,30 @@ def integrator_class(v: Variant) -> type:
         ) -> tuple[Spectrum, Mask, list[Any]]:
             if self.max_depth == 0:
                 return v.Spectrum(0), v.Bool(False), [v.Float(0)] * len(self.aov_names())
+            loop = self.path_loop(scene, sampler)
+            camera = self.camera_medium(scene, ray, medium) if loop.features.absorption else ()
+            end = loop.run(v.Ray3f(ray), sampler, v.Bool(active), *camera)
+            if loop.features.absorption and not self.rendering:  # another integrator evaluates the image
+                dr.eval(end.result)
+                loop.refuse()
+            return dr.select(end.valid_ray, end.result, 0), end.valid_ray, [end.truncated][: len(self.aov_names())]
+
+        def path_loop(self, scene: Scene, sampler: Sampler) -> PathLoop:
+            """Of a pass of a render, or of one sample of it in a scalar variant."""
+            if self.loops and not vectorised:
+                return self.loops[0]
             needs = self.scene_features(scene)
             features = self.path_features(needs)
             count = min(self.samples_per_pass, sampler.sample_count()) if vectorised else 1
             numbers = KeyedMultijitter(v, sampler, count) if vectorised and features.split_depth else SceneSampler()
-            media = self.media(scene, needs, ray, medium) if features.absorption else None
-            end = PathLoop(v, scene, features, numbers, media).run(v.Ray3f(ray), sampler, v.Bool(active))
-            if features.absorption and not self.rendering:  # another integrator evaluates the image
-                dr.eval(end.result)
-                self.end_render()
-                self.crossings = []
-            return dr.select(end.valid_ray, end.result, 0), end.valid_ray, [end.truncated][: len(self.aov_names())]
+            media = (ShapeMedia(v) if needs.shape_media else MediumTracker(v, scene)) if features.absorption else None
+            loop = PathLoop(v, scene, features, numbers, media)
+            if self.rendering:
+                self.loops.append(loop)
+            return loop
 
-        def media(
-            self, scene: Scene, needs: SceneFeatures, ray: Ray, medium: MediumPlugin
-        ) -> MediumTracker | ShapeMedia:
-            """The medium at the camera, and what follows the media along a path."""
+        def camera_medium(self, scene: Scene, ray: Ray, medium: MediumPlugin) -> tuple[Spectrum, Number]:
+            """σ at the camera, and the way from there to the origin of the ray."""
             sigma, way = 0, v.Float(0)
             if self.camera:
                 si = dr.zeros(v.SurfaceInteraction3f)
@@ -156,18 +164,15 @@ def integrator_class(v: Variant) -> type:
                     )
                 if (place := self.near if self.rendering else to_camera(sensors[0])) is not None:
                     way = (place @ ray.o).z / (place @ ray.d).z
-            if needs.shape_media:
-                return ShapeMedia(v, sigma, way)
-            if vectorised or not self.crossings:
-                self.crossings.append(Crossings(v, scene))
-            return MediumTracker(v, scene, sigma, way, self.crossings[-1])
+            return sigma, way
 
         def path_features(self, needs: SceneFeatures) -> PathFeatures:
             """The features that are traced for a scene. ValueError where `deterministic` is set and impossible."""
             # Local memory has no derivatives, and the evaluated loops that derivatives need have no local memory.
             symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
-            if self.deterministic and not needs.deterministic:
-                raise ValueError(f"{INTEGRATOR}: deterministic = true; expected only smooth dielectrics and conductors")
+            if self.deterministic and needs.chance:
+                expected = "expected only smooth dielectrics and conductors"
+                raise ValueError(f"{INTEGRATOR}: deterministic = true: {needs.chance}; {expected}")
             if self.deterministic and not symbolic:
                 raise ValueError(f"{INTEGRATOR}: deterministic = true; such a render cannot be differentiated")
             if not symbolic and needs.refracting and needs.smooth and needs.area:

@@ -64,7 +64,7 @@ class SceneFeatures:
     media: bool  # some shape, sensor or emitter has a medium of Mitsuba's
     shape_media: bool  # some shape has one
     refracting: bool  # some BSDF has a refracted direction
-    deterministic: bool  # every BSDF is of `DETERMINISTIC`
+    chance: str  # the first plugin that is not of `DETERMINISTIC`, and its shape; "" where there is none
     unknown: tuple[str, ...] = ()
 
     @property
@@ -91,9 +91,17 @@ def inspect(scene: Scene) -> SceneFeatures:
     """What a Mitsuba scene needs as it is now; an edit of its parameters can change that."""
     shapes, emitters, sky = all_shapes(scene), scene.emitters(), scene.environment()
     opaque = [shape.class_name() for shape in shapes if shape.class_name() not in KNOWN_SHAPES]
-    bsdfs = [bsdf for shape in shapes if not _black(shape.bsdf()) for bsdf in nested(shape.bsdf())]
+    within = [[] if _black(shape.bsdf()) else [*nested(shape.bsdf())] for shape in shapes]
+    bsdfs = [bsdf for each in within for bsdf in each]
     names = {bsdf_name(bsdf) for bsdf in bsdfs}
     unknown = tuple(sorted((names - KNOWN) | {*opaque}))
+    random = {*opaque, *(names - DETERMINISTIC)}
+    chance = (
+        f"{kind} at {shape_name(shapes, i)}"
+        for i in (range(len(shapes)) if random else ())
+        for kind in (shapes[i].class_name(), *map(bsdf_name, within[i]))
+        if kind in random
+    )
     everything = bool(unknown)
     lobes = mi.BSDFFlags
     flags = functools.reduce(operator.or_, (bsdf.flags() for bsdf in bsdfs), 0)
@@ -114,7 +122,7 @@ def inspect(scene: Scene) -> SceneFeatures:
             hasattr(child, "is_spatially_varying")
             and (child.is_spatially_varying() or child.class_name() not in CONSTANT_TEXTURES)
             for node in (*bsdfs, *lamps)
-            for child in _children(node)
+            for child in children(node)
         )
         or not deltas <= WITHOUT_TANGENT
         or not {lamp.class_name() for lamp in lamps} <= PLAIN_LAMPS,
@@ -124,15 +132,21 @@ def inspect(scene: Scene) -> SceneFeatures:
         media=shape_media or any(end.get_medium() for end in (*emitters, *scene.sensors())),
         shape_media=shape_media,
         refracting=everything or bool(flags & +lobes.Transmission),
-        deterministic=not everything and names <= DETERMINISTIC,
+        chance=next(chance, ""),
         unknown=unknown,
     )
 
 
 def all_shapes(scene: Scene) -> list[Shape]:
     """The shapes of a scene, and those within its shape groups, which `scene.shapes()` leaves out."""
-    groups = [child for child in _children(scene) if child.class_name() == "ShapeGroupPlugin"]
-    return [*scene.shapes(), *(part for group in groups for part in _children(group) if hasattr(part, "bsdf"))]
+    groups = [child for child in children(scene) if child.class_name() == "ShapeGroupPlugin"]
+    return [*scene.shapes(), *(part for group in groups for part in children(group) if hasattr(part, "bsdf"))]
+
+
+def shape_name(shapes: list[Shape], position: int) -> str:
+    """The shape's name in quotes, or its class and its position in the scene where it has no name."""
+    shape = shapes[position]
+    return repr(str(shape.id())) if shape.id() else f"shape {position + 1} of {len(shapes)} ({shape.class_name()})"
 
 
 def plugin_number(v: Variant, pointer: Any) -> int:
@@ -154,7 +168,7 @@ def nested(bsdf: BSDF) -> Iterator[BSDF]:
     if bsdf is None:
         return
     yield bsdf
-    for child in _children(bsdf):
+    for child in children(bsdf):
         if hasattr(child, "eval_null_transmission"):
             yield from nested(child)
 
@@ -163,14 +177,14 @@ def _black(bsdf: BSDF) -> bool:
     # A frozen function is recorded for every value that will come.
     if bsdf is None or bsdf_name(bsdf) != "SmoothDiffuse" or dr.flag(dr.JitFlag.FreezingScope):
         return False
-    (reflectance,) = _children(bsdf)
+    (reflectance,) = children(bsdf)
     exact = reflectance.class_name() == "UniformSpectrum" or "spectral" not in bsdf.variant_name()
     zero = exact and not reflectance.is_spatially_varying() and reflectance.max() == 0
     # The derivative of an image in a reflectance of 0 is not 0.
     return zero and not any(dr.grad_enabled(value) for _, value in mi.traverse(bsdf))
 
 
-def _children(node: mi.Object) -> list[Any]:
+def children(node: mi.Object) -> list[Any]:
     """The Mitsuba objects that a plugin shows of itself."""
 
     class Children(mi.TraversalCallback):

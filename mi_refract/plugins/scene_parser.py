@@ -23,6 +23,7 @@ import mitsuba as mi
 import mitsuba.mitsuba_ext
 import numpy as np
 
+from mi_refract import media
 from mi_refract.formulas import FORMULAS
 from mi_refract.io import image_file, safe_files
 from mi_refract.numerics import Properties, Scene
@@ -117,6 +118,8 @@ class ParsedScene:
             if (name := NEEDED.get(plugin)) and name not in props:
                 raise ValueError(f"{path}: plugin {plugin!r} lacks its parameter {name!r}")
             for name, value in _texts(read):
+                if (file := media.file_in(value)) and moved and value in moved:
+                    props[name] = value.replace(file, moved[value])
                 if name != "filename":  # the one parameter of Mitsuba's plugins that names a file
                     continue
                 if moved and value in moved:
@@ -153,7 +156,7 @@ def parse(path: Path, defines: Mapping[str, str] | None = None, variant: str = "
         seen = mi.parser.ParserState(state)  # a copy: reading a parameter marks it as used
         _check_nesting(path, seen)
         names = {value for node in seen.nodes for _, value in _texts(node.props)}
-        named = {name: _file(str(inside.resolve(name))) for name in sorted(names)}
+        named = {name: _file(str(inside.resolve(media.file_in(name) or name))) for name in sorted(names)}
         for file in named.values():
             require_file(file)
         mi.parser.transform_all(config, state)

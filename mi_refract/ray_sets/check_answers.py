@@ -173,7 +173,7 @@ def check(
     """
     check_options(tir, error_bound, most_backward)
     if tir == FLAG and answers.transmitted is None:
-        raise ValueError("TIR signal 'flag': the answers have no column `transmitted`")
+        raise ValueError("TIR signal 'flag': expected answers with a column `transmitted`")
     header, precision = rays.header, rays.precision
     if (checksum := answers.header.get("checksum")) not in (None, header["checksum"]):
         raise ValueError(f"the answers are to rays with the checksum {shown(checksum)}; expected {header['checksum']}")

@@ -8,6 +8,7 @@ then from and to. Where a regime needs k ≥ 1, the pair is turned to give it.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,6 +20,7 @@ from msgspec import UNSET, Meta, UnsetType
 from numpy.typing import NDArray
 
 from mi_refract import media
+from mi_refract.io.text import parse_number
 from mi_refract.io.typed_table import convert
 from mi_refract.regimes import REGIMES, Array
 
@@ -217,10 +219,9 @@ def _ratios(names: tuple[str, ...], wavelengths: tuple[float, ...], precision: s
 
 def _parsed(spec: str) -> media.Medium:
     """The medium of a text. ValueError, one line, where it is none, or one of Mitsuba's table."""
-    try:
-        return media.parse(float(spec))
-    except ValueError:
-        pass
+    with contextlib.suppress(ValueError):
+        parse_number(spec.replace("-", ""))  # the index, or the code of a glass
+        return media.parse(spec)
     if ":" not in spec and "(" not in spec:
         expected = "a number, cauchy(A, B, …) or another formula, SCHOTT:N-BK7 or another glass"
         raise ValueError(f"medium {shown(spec)}; expected {expected}")

@@ -25,7 +25,6 @@ from mi_refract.io import safe_files
 from mi_refract.io.image_file import SUFFIXES, Metadata, installed_version, provenance
 from mi_refract.io.safe_files import writable
 from mi_refract.io.text import printable
-from mi_refract.media.glass_catalogs import names_glass
 from mi_refract.numerics import Scene
 from mi_refract.plugins.scene_parser import ParsedScene
 
@@ -127,7 +126,6 @@ def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> Identity
         "colours": renderer.colours,
         "version of mi_refract": on_worker.our_version(),
         **{f"version of {name}": installed_version(name) for name in ("mitsuba", "drjit")},
-        on_worker.GLASSES: on_worker.glass_catalogues() if any(map(names_glass, parsed.named)) else "none",
         "libLLVM": backend.llvm().library if llvm else "none",
         "vector width": on_worker.vector_width() if llvm else "none",
     }
@@ -163,6 +161,11 @@ class LongRender:
         `passes`: where they are rendered, by default in this process. On any error what is done stays in the
         checkpoint. BlockingIOError where another process renders into the same file, or did so since `resume`.
         """
+
+        def here(first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
+            for number in range(first, stop):
+                yield 0, self.renderer.render(offset + number, spp), os.uname().nodename
+
         with safe_files.held(lock_of(self.output), "a render", self.output, "another file"):
             if self._file_stamps() != self._files_before:
                 raise BlockingIOError(
@@ -170,7 +173,7 @@ class LongRender:
                 )
             self.checkpoints.active = True
             try:
-                return self._run(passes or self._here, watch)
+                return self._run(passes or here, watch)
             except BaseException as error:
                 self.checkpoints.write()
                 if isinstance(error, RuntimeError):  # Mitsuba's own
@@ -178,11 +181,6 @@ class LongRender:
                 raise
             finally:
                 self.checkpoints.active = False
-
-    def _here(self, first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
-        """As `Passes`: one after the other in this process."""
-        for number in range(first, stop):
-            yield 0, self.renderer.render(offset + number, spp), os.uname().nodename
 
     def _run(self, nodes: Passes, watch: Callable[[LongRender], None]) -> Metadata:
         progress, done_before = self.progress, self.progress.passes
@@ -265,11 +263,6 @@ class LongRender:
         if plan.spp != self.plan.spp:
             self.plan = plan
             self.progress.rebase(plan.spp)
-
-    @property
-    def tolerated_facts(self) -> frozenset[str]:
-        """Facts of workers that the bits of this render do not depend on."""
-        return frozenset({on_worker.GLASSES} if self.progress.identity[on_worker.GLASSES] == "none" else ())
 
     @property
     def has_all_samples(self) -> bool:

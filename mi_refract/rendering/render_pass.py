@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refract.io.image_file import Metadata
-from mi_refract.numerics import Scene, Spectrum
+from mi_refract.numerics import Scene
 
 from .pass_plan import FEW, scalar_seed_of, seed_of
 from .pass_sums import Doubles, PassSums
@@ -199,24 +199,18 @@ def _samples(scene: Scene, channels: tuple[str, ...], spp: int, seed: int) -> tu
     ray, weight, place = ADIntegrator.sample_rays(None, scene, sensor, sampler)
     ray.scale_differential(1 / math.sqrt(spp))
     radiance, valid, others = integrator.sample(scene, sampler, ray, sensor.get_medium(), mi.Bool(True))
-    values = _colours(channels, mi.unpolarized_spectrum(weight * radiance), ray.wavelengths)
+    # What the film makes of a sample's spectrum: R, G, B, or X, Y, Z, or Y.
+    spectrum = mi.unpolarized_spectrum(weight * radiance)
+    if mi.is_spectral:
+        colour = mi.spectrum_to_srgb(spectrum, ray.wavelengths)
+    else:
+        colour = mi.Color3f(spectrum.x) if mi.is_monochromatic else mi.Color3f(spectrum)
+    if channels[0] == "X":
+        colour = mi.srgb_to_xyz(colour)
+    values = list(colour) if channels[0] in ("R", "X") else [mi.luminance(colour)]
     if "A" in channels[: len(values) + 1]:
         values.append(dr.select(valid, mi.Float(1), mi.Float(0)))
     values += list(others)
     if len(values) != len(channels):
         raise ValueError(f"{len(values)} values in a sample; expected {len(channels)}, those of the film")
     return values, mi.Point2f(place) - mi.Point2f(sensor.film().crop_offset())
-
-
-def _colours(channels: tuple[str, ...], radiance: Spectrum, wavelengths: Spectrum) -> list[Any]:
-    """What the film makes of a sample's spectrum: R, G, B, or X, Y, Z, or Y."""
-    if mi.is_spectral:
-        rgb = mi.spectrum_to_srgb(radiance, wavelengths)
-    else:
-        rgb = mi.Color3f(radiance.x) if mi.is_monochromatic else mi.Color3f(radiance)
-    if channels[0] == "R":
-        return [rgb.x, rgb.y, rgb.z]
-    if channels[0] == "X":
-        xyz = mi.srgb_to_xyz(rgb)
-        return [xyz.x, xyz.y, xyz.z]
-    return [mi.luminance(rgb)]

@@ -62,7 +62,8 @@ def image_sums(
     """
     if film.rfilter is None:
         dr.eval(values)
-        (totals, within), weights = _box_sums(values, film, squares=squares), []
+        totals, within = _box_sums(values, film, squares)
+        weights = []
     else:
         dr.eval(values, place)
         *totals, weight = _weighted_sums(values, place, film)
@@ -78,45 +79,31 @@ def image_sums(
     return total, others[0], others[1]
 
 
-def _box_sums(values: list[Number], film: Film, *, squares: bool) -> tuple[list[Any], list[Any]]:
+@dr.syntax
+def _box_sums(values: list[Number], film: Film, squares: bool) -> tuple[list[Any], list[Any]]:
     """Of every pixel Σ v by channels; and for `squares` Σ (v − mean)², else nothing.
 
     Σ (v − mean)² = Σ d² − (Σ d)²/n of n samples, where d is the difference from the pixel's first: 0 if all are equal.
     """
-    start = dr.arange(mi.UInt32, film.width * film.height) * dr.opaque(mi.UInt32, film.spp)
-    first = [mi.Float64(dr.gather(mi.Float, each, start)) for each in values]
-    totals, squared = _box_loop(values, first, film, math.gcd(film.spp, 8), squares)
-    if not squares:
-        return totals, []
-    n = dr.opaque(mi.Float64, film.spp)
-    return totals, [dr.maximum(q - dr.square(t - n * f) / n, 0) for q, t, f in zip(squared, totals, first, strict=True)]
-
-
-@dr.syntax
-def _box_loop(
-    values: list[Number], first: list[Number], film: Film, step: int, squares: bool
-) -> tuple[list[Any], list[Any]]:
-    """Σ v and Σ d² by channels. Where `step` samples in a row are read at once, it takes half the time."""
-    pixels, steps = film.width * film.height, dr.opaque(mi.UInt32, film.spp // step)
+    block: Any = mi.ArrayXf
+    step = math.gcd(film.spp, 8)  # where so many samples are read at once, it takes half the time
+    pixels, steps, n = film.width * film.height, dr.opaque(mi.UInt32, film.spp // step), dr.opaque(mi.Float64, film.spp)
     start = dr.arange(mi.UInt32, pixels) * steps
+    first = [mi.Float64(dr.gather(mi.Float, each, start * step)) for each in values]
     totals = [mi.Float64(0) for _ in values]
     squared = [mi.Float64(0) for _ in values]
     k = mi.UInt32(0)
     while k < steps:
         for c in range(len(values)):
-            row = _in_a_row(values[c], start + k, step, pixels)
+            row = dr.gather(block, values[c], start + k, shape=(step, pixels))
             for i in range(step):
                 value = mi.Float64(row[i])
                 totals[c] += value
                 if dr.hint(squares, mode="scalar"):
                     squared[c] += dr.square(value - first[c])
         k += 1
-    return totals, squared
-
-
-def _in_a_row(values: Number, index: Number, step: int, pixels: int) -> Any:
-    kind: Any = mi.ArrayXf
-    return dr.gather(kind, values, index, shape=(step, pixels))
+    within = [dr.maximum(squared[c] - dr.square(totals[c] - n * first[c]) / n, 0) for c in range(len(values))]
+    return totals, within if squares else []
 
 
 def _weighted_sums(values: list[Number], place: Point2, film: Film) -> list[Any]:

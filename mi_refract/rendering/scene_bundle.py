@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from mi_refract.media import file_in
 from mi_refract.numerics import Scene
 from mi_refract.plugins.scene_parser import Node, ParsedScene, restore
 
@@ -78,7 +79,7 @@ def unpack(bundle: SceneBundle, folder: str) -> dict[str, str]:
     if new := root is None or not root.is_dir():
         root = Path(tempfile.mkdtemp(prefix="scene-", dir=folder))
     assert root is not None
-    moved = {name: root / str(i) / Path(name).name for i, name in enumerate(bundle.files)}
+    moved = {name: root / str(i) / Path(file_in(name) or name).name for i, name in enumerate(bundle.files)}
     if new:
         for name, path in moved.items():
             path.parent.mkdir()

@@ -22,8 +22,10 @@ Points = Sequence[tuple[float, float]]
 
 # Stand-in colours: matplotlib writes them, `_page_svg` turns each into the style sheet's variable.
 INK, MUTED, LINE = "#010203", "#010204", "#010205"
-SERIES = [f"#0102{16 + i:02x}" for i in range(10)]
+SERIES = [f"#0102{16 + i:02x}" for i in range(12)]
 DASHED = (0, (4, 3))
+# Of a name relative to its point, in pixels: the nearest first.
+PLACES = sorted(((x, y) for x in range(7, 130, 6) for y in range(-96, 97, 4)), key=lambda place: math.hypot(*place))
 VARIABLES = {INK: "--ink", MUTED: "--muted", LINE: "--line"} | {c: f"--c{i}" for i, c in enumerate(SERIES)}
 
 STYLE: dict[str, Any] = {
@@ -168,27 +170,34 @@ def scatter_svg(panels: Mapping[str, Scatter], axes: Axes, *, floor: str, front:
                 panel.set_xlim(left=0)
             if math.isfinite(least := panels[setting].floor):
                 panel.axvline(least, color=MUTED, linewidth=1, linestyle=(0, (1, 2)))
-                place = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "fontsize": 9.5}
-                panel.annotate(floor, (least, 0), (-4, 6), color=MUTED, ha="right", **place)
             if front:  # steps along the front, on to the panel's edges
                 best, (_, right), (_, top) = pareto(every), panel.get_xlim(), panel.get_ylim()
                 xs, ys = zip((best[0][0], top), *best, (right, best[-1][1]), strict=True)
-                panel.step(xs, ys, where="post", color=MUTED, linewidth=1, zorder=1, scalex=False, scaley=False)
+                steps = [x for x in xs for _ in "xy"][1:], [y for y in ys for _ in "xy"][:-1]
+                panel.plot(*steps, color=MUTED, linewidth=1, zorder=1, scalex=False, scaley=False)
             _ticks(panel, axes.logarithmic)
         _printable(figure)
-        figure.canvas.draw()  # settles the layout that the labels' places depend on
-        for panel, subjects in zip(grid, drawn.values(), strict=False):
-            # Every subject's name stands beside its highest point, moved down where another name is in the way.
+        figure.draw_without_rendering()  # settles the layout that the labels' places depend on
+        for panel, (setting, subjects) in zip(grid, drawn.items(), strict=False):
+            # A subject's name is right of its highest point, that of the floor at the foot of its line: as near as it
+            # covers no line and no other name.
             heads = {s: max(points, key=lambda p: p[1]) for s, points in subjects.items()}
-            placed: list[tuple[float, float]] = []
-            for subject, head in sorted(heads.items(), key=lambda item: -item[1][1]):
-                x, y = panel.transData.transform(head)
-                lowered = y
-                while any(abs(x - px) < 95 and abs(lowered - py) < 13 for px, py in placed):
-                    lowered -= 1
-                placed.append((x, lowered))
-                text = {"fontsize": 9.5, "color": colours[subject], "va": "center", "textcoords": "offset pixels"}
-                panel.annotate(subject, head, (7, lowered - y), **text)
+            named: list[tuple[Any, ...]] = [(s, heads[s], colours[s], "data") for s in heads]
+            named.sort(key=lambda label: -label[1][1])
+            if math.isfinite(least := panels[setting].floor):
+                named.append((floor, (least, 0), MUTED, ("data", "axes fraction")))
+            paths = [line.get_transform().transform_path(line.get_path()) for line in panel.lines]
+            inside, taken = panel.get_window_extent(), list[Any]()
+            style = {"fontsize": 9.5, "va": "center", "textcoords": "offset pixels", "in_layout": False}
+            for name, point, colour, coordinates in named:
+                text = printable_lines(name)
+                label = panel.annotate(text, point, PLACES[0], xycoords=coordinates, color=colour, **style)
+                for label.xyann in (*PLACES, PLACES[0]):
+                    box = label.get_window_extent()
+                    covers = any(x.intersects_bbox(box, filled=False) or box.count_contains(x.vertices) for x in paths)
+                    if not covers and not box.count_overlaps(taken) and inside.y0 < box.y0 < box.y1 < inside.y1:
+                        break
+                taken.append(box)
         for panel in grid[len(drawn) :]:
             panel.set_visible(False)
         for panel in figure.axes[::columns]:

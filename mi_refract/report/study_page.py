@@ -5,8 +5,9 @@ steer the page:
 
 - `first_page`: questions and answers on top (`FirstPage`); words between backticks are code;
 - `title`: the page's name;
-- `studies`: {study: {"title", "text", "terms", "axes"}}, all optional: heading, introduction and glossary of a study,
-  and the fields of `plots.Axes`, which say how the curves of its rows are drawn;
+- `studies`: {study: {"title", "text", "terms", "axes", "scale"}}, all optional: heading, introduction and glossary of a
+  study; the fields of `plots.Axes`, which say how the curves of its rows are drawn; and the smallest and the largest
+  number that mean something, between which the colours of its matrices run (by default those of its rows);
 - `scatter`: [{"study", "x", "y", "title", "interval", "floor", "front"}]: plots of one metric against another, a panel
   per setting; all but the first three optional. `interval` are two metrics between which x lies, `floor` the subject
   whose x is a line (it has no y), `front` steps along the points that no other one of the panel beats in x and y;
@@ -15,6 +16,7 @@ steer the page:
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -32,6 +34,8 @@ LABELS = ("subject", "case", "setting")
 NOT_RUN = "not run"
 State = Literal["yes", "no", "plain", "not measured"]
 STATES: tuple[State, ...] = get_args(State)
+COLUMNS = 13  # of a matrix, beside its labels: more do not fit into a window of 1280 pixels
+CHARACTERS = 148  # of a table's line there
 
 
 class Answer(TypedDict):
@@ -140,20 +144,24 @@ def phrase(row: Row, metric: str) -> str:
 
 
 def _shade(row: Row | None, metric: str, scale: tuple[float, float]) -> dict[str, Any]:
-    """A cell of the matrix: its number, how deep its colour is on the logarithmic scale, what it broke or missed."""
+    """A cell of the matrix: its number, how deep its colour is on the logarithmic scale, what it broke or missed.
+
+    `beyond`: whether the number is larger than the scale's end, or none.
+    """
     if row is None or not row.values:
         text, state, hint = ("not run", "not-run", row.reason) if row else ("·", "none", "")
-        return {"text": text, "state": state, "depth": 0, "hint": hint, "broken": []}
-    low, high = map(math.log, scale)
+        return {"text": text, "state": state, "depth": 0, "hint": hint, "broken": [], "beyond": False}
+    low, high = scale
     value, shown = row.values.get(metric, 0), cell(row, metric)
-    place = (math.log(value) - low) / (high - low) if 0 < value < math.inf and high > low else 0
-    beyond = (*row.broken, *row.missed)
+    place = math.log(value / low) / math.log(high / low) if low < value <= high else 0
+    exceeded = (*row.broken, *row.missed)
     return {
         "text": shown["text"] if shown else "·",
         "state": row.verdict,
-        "depth": round(place, 3) if value < math.inf else 1,  # NaN is no small error
+        "depth": round(place, 3) if value <= high else 1,  # NaN is no small error
+        "beyond": not value <= high,
         "hint": "\n".join(phrase(row, m) for m in row.values),
-        "broken": [shown["budget"] if shown and m == metric else phrase(row, m) for m in beyond],
+        "broken": [shown["budget"] if shown and m == metric else phrase(row, m) for m in exceeded],
     }
 
 
@@ -182,7 +190,7 @@ def _study(name: str, rows: list[Row], context: Mapping[str, Any], images: Embed
             ]
             figures.append({"row": row, "panes": panes, "paired": roles[:2] == ["reference", "test"]})
     positive = [x for row in rows if 0 < (x := row.values.get(metrics[0], 0)) < math.inf] if metrics else []
-    scale = (min(positive), max(positive)) if positive else None
+    scale = about.get("scale") or ((min(positive), max(positive)) if positive else None)
     return {
         "key": key,
         "title": about.get("title", name),
@@ -203,8 +211,9 @@ def _study(name: str, rows: list[Row], context: Mapping[str, Any], images: Embed
 def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> list[dict[str, Any]]:
     """A table per setting, under a matrix of subjects by cases, where there is enough to see; else one of all settings.
 
-    Subjects and cases of which nothing was run in a setting are left out. Without matrices, rows that share no metric
-    with the others have a table of their own.
+    The cases are the matrix's columns, or its lines where they are too many and more than the subjects. Subjects and
+    cases of which nothing was run in a setting are left out. Without matrices, rows that share no metric with the
+    others have a table of their own.
     """
     run = {(row.setting, label) for row in rows if row.values for label in (("s", row.subject), ("c", row.case))}
     rows = [row for row in rows if {(row.setting, ("s", row.subject)), (row.setting, ("c", row.case))} <= run]
@@ -217,8 +226,12 @@ def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | No
         subjects, cases = (dict.fromkeys(getattr(row, label) for row in telling) for label in ("subject", "case"))
         cells = {(row.subject, row.case): row for row in part}
         if len(subjects) >= 3 and len(cases) >= 3 and len(cells) == len(part) and scale is not None:
-            lines = [(s, [_shade(cells.get((s, c)), metrics[0], scale) for c in cases]) for s in subjects]
-            matrices[setting] = {"metric": metrics[0], "cases": list(cases), "lines": lines}
+            shades = {key: _shade(cells.get(key), metrics[0], scale) for key in itertools.product(subjects, cases)}
+            if len(cases) > max(COLUMNS, len(subjects)):
+                columns, lines = subjects, [(c, [shades[s, c] for s in subjects]) for c in cases]
+            else:
+                columns, lines = cases, [(s, [shades[s, c] for c in cases]) for s in subjects]
+            matrices[setting] = {"metric": metrics[0], "columns": list(columns), "lines": lines}
     if any(matrices.values()):
         return [{"heading": s, "matrix": matrices[s], "table": _table(part, metrics, s)} for s, part in parts.items()]
     groups: list[tuple[set[str], list[int]]] = []  # metrics, and the places of the rows that have any of them
@@ -235,7 +248,10 @@ def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | No
 
 
 def _table(rows: list[Row], metrics: list[str], heading: str = "") -> dict[str, Any]:
-    """Columns: the labels that differ between rows, then every metric; a label equal to the one above is marked."""
+    """Columns: the labels that differ between rows, then every metric; a label equal to the one above is marked.
+
+    `parts`: the metrics of one table after the other, as many as fit into a line.
+    """
     rows = [row for row in rows if row.values]
     keys = [k for k in LABELS if len({getattr(row, k) for row in rows}) > 1] or ["subject"]
     used = [m for m in metrics if any(m in row.values for row in rows)]
@@ -245,7 +261,18 @@ def _table(rows: list[Row], metrics: list[str], heading: str = "") -> dict[str, 
         lines.append((row, [(label, labels[: i + 1] == above[: i + 1]) for i, label in enumerate(labels)]))
         above = labels
     shared = [label for k in LABELS if k not in keys and (label := getattr(rows[0], k)) and label != heading]
-    return {"keys": keys, "metrics": used, "lines": lines, "shared": " · ".join(shared)}
+    room = CHARACTERS - sum(max(len(getattr(row, key)) for row in rows) + 3 for key in keys)
+    parts: list[list[str]] = [[]]
+    left = room
+    for metric in used:
+        shown = [word for row in rows if (x := cell(row, metric)) for word in (x["text"], x["budget"])]
+        width = max(map(len, metric.split() + shown)) + 3
+        if width > left and parts[-1]:
+            parts.append([])
+            left = room
+        parts[-1].append(metric)
+        left -= width
+    return {"keys": keys, "parts": parts, "lines": lines, "shared": " · ".join(shared)}
 
 
 def _undrawn(lines: Iterable[Points], axes: Axes) -> int:

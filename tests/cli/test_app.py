@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import mitsuba as mi
 import pytest
+import typer
 from support.processes import ENVIRONMENT, python
+from support.readme import blocks
 
 import mi_refract
 from mi_refract import backend, cli
 from mi_refract.cli import app
 
 
-@pytest.mark.parametrize("arguments", [["nonesuch"], ["render"], ["doctor", "extra"], ["several lines"]])
+@pytest.mark.parametrize("arguments", [["nonesuch"], ["render"], ["scene"], ["doctor", "extra"], ["several lines"]])
 def test_an_error_is_one_line(arguments, capfd, monkeypatch):
     def fails(*arguments, **options):
         raise ValueError("first\n  second\n")
@@ -57,6 +62,51 @@ def test_the_help_has_a_line_for_each_command_and_each_command_its_own(name, cap
     assert [line.split(None, 1)[1] for line in lines if line.startswith(f"  {name} ")] == [app.COMMANDS[name].help]
     assert app.main([name, "--help"]) == 0
     assert capfd.readouterr().out.startswith(f"Usage: mi-refract {name} ")
+
+
+def commands_of(command, name=""):
+    """The names of a command and of all commands below it."""
+    below = command.list_commands(None) if hasattr(command, "list_commands") else ()
+    return [name, *(y for x in below for y in commands_of(command.get_command(None, x), f"{name} {x}".strip()))]
+
+
+COMMANDS = commands_of(typer.main.get_command(app.app))
+ROOT = Path(mi_refract.__file__).parents[1]
+READMES = [ROOT / "README.md", *ROOT.glob("mi_refract/*/README.md"), ROOT / "validation/README.md"]
+
+
+@pytest.fixture
+def parsed(monkeypatch, capfd):
+    """`parsed("mi-refract rays check a.csv")`: the command that it would run, after its options were checked."""
+    called = []
+    monkeypatch.setattr(typer.core.TyperCommand, "invoke", lambda self, context: called.append(context.command_path))
+
+    def parse(line):
+        called[:] = []
+        program, *words = shlex.split(line, comments=True)
+        assert (program, app.main(words)) == ("mi-refract", 0), (line, capfd.readouterr().err)
+        return called[0] if called else line  # `--keys` and the like print and end before that
+
+    return parse
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_help_ends_with_two_or_three_examples_that_are_parsed(name, capfd, parsed):
+    assert app.main([*name.split(), "--help"]) == 0
+    *_, head, examples = capfd.readouterr().out.partition("\n  Examples:\n")
+    examples = [line.strip() for line in examples.splitlines()]
+    assert head and len(examples) in (2, 3)
+    called = [parsed(line) for line in examples]
+    assert called[0].startswith(f"mi-refract {name}".strip())
+
+
+@pytest.mark.parametrize("path", READMES, ids=lambda path: path.parent.name)
+def test_the_command_lines_of_a_readme_are_parsed(path, parsed):
+    lines = [line for block in blocks(path, "bash") for line in block.replace("\\\n", " ").splitlines()]
+    lines = [line for line in lines if line.startswith("mi-refract ")]
+    assert lines or path.parent.name in ("formulas", "media", "plugins", "validation")
+    for line in lines:
+        parsed(re.sub(r"[>|;&].*|\[[^]]*\]", "", line))
 
 
 HEAVY = ("mitsuba", "drjit", "numpy", "OpenImageIO", "matplotlib", "scipy")

@@ -287,7 +287,6 @@ def test_a_lens_tracer_with_its_own_indices(call, tmp_path):
 
 @pytest.mark.filterwarnings("default")
 def test_an_index_beyond_the_makers_fit_is_a_warning_in_one_line(call):
-    pytest.importorskip("opticalglass")
     code, _, err = call("export", "--medium", "CDGM:D-ZF93", "--wavelengths", "2325", "-o", "r.csv")
     assert (code, err.count("\n")) == (0, 1)
     assert err.startswith("mi-refract: CDGM:D-ZF93: the index at 2325 nm is an extrapolation; ")

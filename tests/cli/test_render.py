@@ -70,6 +70,8 @@ def test_the_image_is_mitsubas_and_the_header_says_how_it_was_made(render, scene
     assert header["mi_refract:render_seconds"] > 0 and header["Software"] == f"mi_refract {mi_refract.__version__}"
     # As OpenImageIO sorts them.
     assert header["channels"] == ("R", "G", "B", "B.variance", "G.variance", "R.variance")
+    again = render("--spp", 9, "--seed", 3, "-D", "bsdf=refract")
+    assert again == (0, out, f"{scene.with_name('out.exr')}: complete with 9 spp\n")
     assert render("--spp", 2, "-D", "bsdf=diffuse")[0] == 0  # a define swaps the plugin
     pixels, metadata = read_exr(scene.with_name("out.exr"))
     assert metadata["mi_refract:formulas"] == "none"

@@ -16,8 +16,8 @@ import numpy as np
 import psutil
 import pytest
 from distributed import Security
-from support.dask_workers import program, tls_settings, until
-from support.processes import ENVIRONMENT
+from support.dask_workers import program, tls_settings
+from support.processes import ENVIRONMENT, until
 from support.renders import GLASS
 
 from mi_refract.cluster import on_worker

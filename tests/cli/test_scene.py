@@ -1,5 +1,10 @@
-"""`mi-refract scene export`: what it prints, writes and refuses, and with which exit code."""
+"""`mi-refract scene list` and `export`: what they print, write and refuse, also where the package is installed."""
 
+import os
+import subprocess
+import sys
+import tarfile
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -51,3 +56,38 @@ def test_refused_in_one_line(words, says, export, tmp_path):
     assert (code, out) == (2, "") and says in err
     assert err.startswith("mi-refract: ") and err.count("\n") == 1
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_scenes_are_listed_with_what_they_show(run):
+    code, out, err = run("scene", "list")
+    lines = out.splitlines()
+    assert (code, err, lines[0]) == (0, "", f"in {SCENES}:")
+    assert {line.split()[0] for line in lines[1:]} == {
+        *(path.stem for path in SCENES.glob("*.xml")),
+        *(f"planar/{path.name}" for path in SCENES.glob("planar/*.toml")),
+    }
+    assert any(line.split(None, 1) == ["sphere", "A glass ball on a checkerboard"] for line in lines)
+    assert all(len(line.split(None, 1)) == 2 for line in lines)
+
+
+def test_a_wheel_has_scenes_and_glasses_and_an_sdist_has_all(tmp_path, monkeypatch):
+    """The wheel: all files of the package, and the scenes but their images; it works where it is unpacked."""
+    build = pytest.importorskip("hatchling.build")
+    root = SCENES.parent
+    monkeypatch.chdir(root)
+    there = tmp_path / "there"
+    with zipfile.ZipFile(tmp_path / build.build_wheel(str(tmp_path))) as wheel:
+        wheel.extractall(there)
+    package = {str(x.relative_to(root)) for x in (root / "mi_refract").rglob("*.*") if "__pycache__" not in x.parts}
+    scenes = {f"mi_refract/{x.relative_to(root)}" for kind in ("xml", "toml", "ply") for x in SCENES.rglob(f"*.{kind}")}
+    assert {"mi_refract/py.typed", "mi_refract/media/glasses.json", "mi_refract/report/templates/diff.js"} <= package
+    assert package | scenes <= {str(path.relative_to(there)) for path in there.rglob("*.*")}
+    assert sum(path.stat().st_size for path in (there / "mi_refract" / "scenes").rglob("*.*")) < 300_000
+    command = [sys.executable, "-m", "mi_refract.cli", "scene", "export", "sphere", "--to", "mitsuba", "--level", "0"]
+    subprocess.run(command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(there)}, check=True)
+    assert (tmp_path / "sphere-mitsuba" / "scene.xml").is_file()
+    with tarfile.open(tmp_path / build.build_sdist(str(tmp_path))) as sdist:
+        names = {name.partition("/")[2] for name in sdist.getnames()}
+    folders = ("mi_refract", "scenes", "tests", "validation", ".ci", ".github")
+    files = {str(x.relative_to(root)) for folder in folders for x in (root / folder).rglob("*") if x.is_file()}
+    assert {name for name in files if "__pycache__" not in name} <= names

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 
 import numpy as np
@@ -56,7 +57,8 @@ def paths_of(result):
 @pytest.mark.parametrize("suffix", ["", ".png", ".pdf", ".SVG"])
 def test_a_line_is_printed_and_a_figure_is_drawn(trace, ball, suffix):
     output = ball.with_name(f"image{suffix}")
-    assert trace(*(["-o", output] if suffix else [])) == (0, "ball.toml: 7 rays, 14 hits, 7 escaped\n", "")
+    written = f"{output}: written\n" if suffix else ""
+    assert trace(*(["-o", output] if suffix else [])) == (0, f"ball.toml: 7 rays, 14 hits, 7 escaped\n{written}", "")
     assert sorted(ball.parent.iterdir()) == sorted([ball, output] if suffix else [ball])
     assert not suffix or output.read_bytes().startswith(FORMATS[suffix.lower()])
 
@@ -92,20 +94,22 @@ def test_the_table(trace):
     code, out, err = trace("--table")
     assert (code, err) == (0, "")
     lines = out.splitlines()
-    assert (lines[0], len(lines)) == ("ball.toml: 7 rays, 14 hits, 7 escaped", 5)
-    assert lines[1].split()[-4:] == ["rms", "largest", "marginal", "paraxial"]
-    assert lines[4].split()[3:6] == ["1.5", "0.5", "-0.5"]
+    assert (lines[0], len(lines)) == ("ball.toml: 7 rays, 14 hits, 7 escaped", 6)
+    assert lines[1].split()[-5:] == ["rms", "largest", "marginal", "paraxial", "NA"]
+    assert lines[2].split()[-1] == "0.814889"  # sin 2(i − r)
+    assert lines[5].split()[3:6] == ["1.5", "0.5", "-0.5"]
     assert "1.10445, 0" in lines[2]  # sin i / sin 2(i − r) for sin i = 0.9, sin r = 0.6
     spread = json.loads(trace("--table", "--json")[1])["foci"][0]["spread"]
     assert spread["marginal"][0] == pytest.approx(1.1044455683692647, abs=1e-12)
     assert spread["paraxial"] == pytest.approx([1.5, 0], abs=1e-14)
     assert spread["cardinal"]["focal_length"] == pytest.approx(1.5, rel=1e-14)
+    assert spread["aperture"] == pytest.approx(math.sin(2 * (math.asin(0.9) - math.asin(0.6))), rel=1e-14)
     assert "foci" not in json.loads(trace("--json")[1])
 
 
 def test_a_spot_on_a_plane(trace):
     code, out, err = trace("--plane", "-2,0")
-    assert (code, err, len(out.splitlines())) == (0, "", 7)
+    assert (code, err, len(out.splitlines())) == (0, "", 9)
     one, other = (
         json.loads(trace("--json", "--plane", at)[1])["foci"][0]["spread"]["on_plane"] for at in ("3,0", "3,5,180")
     )
@@ -124,6 +128,19 @@ def test_options_override_the_file(trace, ball):
     ball.write_text(BALL)
     assert trace("--rays", 101)[1] == "ball.toml: 101 rays, 202 hits, 101 escaped\n"
     assert trace("--max-depth", 1)[1] == "ball.toml: 7 rays, 7 hits, 7 stopped at max_depth\n"
+
+
+@pytest.mark.parametrize(
+    "first, second, where",
+    [("", "", "shape[0] and shape[1]"), ('name = "crown"', 'name = "flint"', "shape[0] 'crown' and shape[1] 'flint'")],
+)
+def test_shapes_that_do_not_fit_are_named_and_the_exit_code_is_1(trace, ball, first, second, where):
+    other = BALL.partition("[[shape]]")[2].partition("[[beam]]")[0].replace("1.5", "1.6")
+    ball.write_text(BALL.replace("n = 1.5", f"n = 1.5\n{first}") + f"[[shape]]{other}at = [1.2, 0]\n{second}")
+    code, out, err = trace()
+    assert (code, out) == (1, "ball.toml: 7 rays, 14 hits, 7 stopped by a medium mismatch\n")
+    fault = "overlap, leave a gap, or are turned round: 7 paths in index 1.5 met a boundary between 1.6 and 1"
+    assert err.startswith(f"mi-refract: {ball}: {where} {fault}; expected ") and err.count("\n") == 1
 
 
 def directions(paths):
@@ -197,6 +214,7 @@ def test_the_keys_of_a_scene_are_printed_without_one(run):
     code, out, err = run("trace", "--keys")
     assert (code, err) == (0, "")
     assert out == scene_file.reference() + "\n"
-    keys = "`title`", "`wavelengths`", "`luneburg`", "`focal_length` (number > 0) from the front", "`from`", "`scale`"
-    assert all(key in out for key in keys)
-    assert all(line.count("|") == 4 for line in out.splitlines() if line)
+    keys = "title", "wavelengths", "focal_length  from the front to the focus (number > 0)", "R1", "from", "scale"
+    assert all(f"\n  {key} " in out or f"\n  {key}\n" in out for key in keys)
+    assert '[[shape]] kind = "luneburg": ' in out and '[[beam]] kind = "fan": ' in out
+    assert max(map(len, out.splitlines())) <= 80

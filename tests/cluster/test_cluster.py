@@ -18,13 +18,13 @@ import distributed
 import pytest
 from distributed import CancelledError
 from distributed.comm import CommClosedError, connect
-from support.dask_workers import accepted, kill, tls_settings, until
-from support.processes import ENVIRONMENT, python
+from support.dask_workers import accepted, kill, tls_settings
+from support.processes import ENVIRONMENT, python, until
 
 from mi_refract.cluster import on_worker
 from mi_refract.cluster import workers as workers_module
 from mi_refract.cluster.connection import cluster_errors, connected
-from mi_refract.cluster.on_worker import GLASSES, HOST, LLVM, MIXED, UNUSABLE, WIDTH, differences, machine
+from mi_refract.cluster.on_worker import HOST, LLVM, MIXED, UNUSABLE, WIDTH, differences, machine
 from mi_refract.cluster.workers import AHEAD, Workers, fetched, results
 from mi_refract.io.errors import LostSchedulerError, NoWorkersError
 
@@ -155,28 +155,21 @@ def test_facts_of_this_process_and_the_name_of_a_machine(variant):
     assert machine(HERE | {HOST: "there", WIDTH: "16", LLVM: "18.1"}, HERE) == "there (libLLVM 18.1; vector width 16)"
 
 
-def test_versions_have_a_digest_of_the_sources_and_of_the_glass_catalogues(tmp_path):
+def test_the_version_has_a_digest_of_the_sources_and_of_the_glasses(tmp_path):
     """Of names and contents: two installations of the same version may differ in a line, or in a glass."""
     copy = tmp_path / "mi_refract"
     shutil.copytree(Path(on_worker.__file__).parents[1], copy, ignore=shutil.ignore_patterns("__pycache__"))
     environment = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
-    glasses = tmp_path / "opticalglass"
-    glasses.mkdir()
-    (glasses / "__init__.py").touch()
-    versions, catalogues = [], []
+    versions = []
     changes = [(None, ""), (copy / "formulas" / "__init__.py", "# a comment"), (copy / "new.py", "")]
-    changes += [(glasses / "SCHOTT.xls", "1.5"), (glasses / "SCHOTT.xls", "2")]
+    changes += [(copy / "media" / "glasses.json", " ")]
     for path, text in changes:
         if path:
             path.write_text(text + (path.read_text() if path.exists() else ""))
-        code = "from mi_refract.cluster import on_worker as w; print(w.our_version()); print(w.glass_catalogues())"
-        command = [sys.executable, "-c", code]
-        version, catalogue = subprocess.check_output(command, env=environment, cwd=tmp_path, text=True).splitlines()
-        versions.append(version)
-        catalogues.append(catalogue)
-    assert versions[0] == on_worker.our_version() and [len(set(versions[:i])) for i in (1, 2, 3, 5)] == [1, 2, 3, 3]
-    assert [len(set(catalogues[:i])) for i in (3, 4, 5)] == [1, 2, 3]
-    assert on_worker.facts("scalar_rgb")[GLASSES] == on_worker.glass_catalogues()
+        command = [sys.executable, "-c", "from mi_refract.cluster import on_worker; print(on_worker.our_version())"]
+        versions.append(subprocess.check_output(command, env=environment, cwd=tmp_path, text=True).strip())
+    assert versions[0] == on_worker.our_version() == on_worker.facts("scalar_rgb")["mi_refract"]
+    assert len(set(versions)) == 4
 
 
 MODULE = "mi_refract.cluster.on_worker"
@@ -296,14 +289,12 @@ def test_who_is_refused_gets_no_call(workers):
     assert len(found) == 6 and own not in [pid for _, pid, _ in found]
 
 
-def test_what_is_not_finished_is_cancelled(workers):
-    found = results(workers, process_of, [(0.0,), (30.0,), (30.0,), (30.0,)])
+def test_what_is_not_finished_is_cancelled(workers, tmp_path):
+    found = results(workers, until, [(tmp_path.exists,), *[((tmp_path / "end").exists,)] * 3])
     next(found)
     found.close()
     until(lambda: not any(workers.client.processing().values()), seconds=10)
-    for address in workers.accepted:  # which still sleep
-        kill(workers.client, address)
-    until(lambda: not {*workers.accepted} & {*workers.client.nthreads()})
+    (tmp_path / "end").touch()  # of those that have begun
 
 
 def test_a_slow_result_is_waited_for_and_a_lost_one_is_not(workers):

@@ -182,6 +182,15 @@ def test_the_table_holds(tmp_path, row, name):
         assert (result.status, "different metadata: " in result.reason) == (expected, word == "compared"), result.reason
 
 
+@pytest.mark.parametrize("icc", [b"A" * 200, ICC[:-1], ICC[:16] + b"GRAY" + ICC[20:]])
+def test_a_profile_that_openimageio_drops_counts(tmp_path, icc):
+    chunk = b"iCCP", b"a\0\0" + zlib.compress(icc)
+    for name, chunks, status in (("b.png", [], "different"), ("c.png", [chunk], "equal")):
+        png(tmp_path / "a.png", chunk)
+        png(tmp_path / name, *chunks)
+        assert folders.diff(tmp_path / "a.png", tmp_path / name).results[0].status == status
+
+
 def test_what_a_user_ignores_does_not_count_and_the_rest_is_named(tmp_path):
     paths = [tmp_path / "a.exr", tmp_path / "b.exr"]
     for path, view in zip(paths, ("left", "right"), strict=True):

@@ -172,6 +172,21 @@ def test_a_variance_is_accepted_with_its_image(pair):
         assert (old / name).read_bytes() == (new / name).read_bytes()
 
 
+@pytest.mark.parametrize("method", ["auto", "welch", "tolerance"])
+def test_by_the_json_what_was_compared_with_a_variance_is_not_accepted(pair, method):
+    """The file has no digest of it. A method that reads none is not hindered by the setting."""
+    values = {"method": method, "variance": "{stem}_var.exr"} | ({} if method == "tolerance" else {"spp": 16})
+    written(pair[1] / "a.exr", of(samples(3, 16, gain=1.5).mean(0)))
+    how, file = Settings(rules=(Entry("*", values),)), pair[0].parent / "out.json"
+    results_file.write(file, folders.diff(*pair, how, to_accept=True))
+    for now in (how, Settings.for_all(method="tolerance")):
+        if method == "tolerance":
+            assert len(list(accept.changes(results_file.with_settings(results_file.read(file), now)))) == 1
+        else:
+            with pytest.raises(ValueError, match="its variance is in a separate file; accept it without --from"):
+                results_file.with_settings(results_file.read(file), now)
+
+
 # Bad input --------------------------------------------------------------------------------------------------------
 
 

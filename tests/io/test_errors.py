@@ -40,6 +40,7 @@ def deep():
         (raises(ValueError("size = 0;\n  expected 1 or more")), 2, "it: size = 0; expected 1 or more"),
         (raises(OSError("folder: not writable")), 2, "it: folder: not writable"),
         (raises(FileNotFoundError(2, "No such file or directory", "a.exr")), 2, "it: a.exr: No such file or directory"),
+        (raises(BrokenPipeError(32, "Broken pipe")), 2, "it: Broken pipe"),  # of another pipe than stdout
         (raises(OSError(28, "No space left on device")), 2, "it: No space left on device"),
         (raises(ModuleNotFoundError("No module named 'scipy'")), 2, "it: No module named 'scipy'"),
         (raises(MemoryError()), 2, "it: out of memory"),
@@ -81,9 +82,12 @@ CASES = {
     "equal, stdout closed": ("ab", ">&-", 0, "", ""),
     "different, stdout closed": ("ac", ">&-", 1, "", ""),
     "different, all closed": ("ac", "<&- >&- 2>&-", 1, "", ""),
-    "equal, nobody reads": ("ab", "| sleep 0", 2, "", "mi-refract: Broken pipe"),
-    "equal, disk full": ("ab", ">/dev/full", 2, "", "mi-refract: No space left on device"),
+    "equal, nobody reads": ("ab", "| sleep 0", 141, "", ""),
+    "equal, disk full": ("ab", ">/dev/full", 2, "", "mi-refract: stdout: No space left on device"),
+    "different, disk full": ("ac", "--github >/dev/full", 2, "", "mi-refract: stdout: No space left on device"),
+    "unbuffered, disk full": ("ab", ">/dev/full", 2, "", "mi-refract: stdout: No space left on device"),
     "misuse, disk full": ("aa", "--method nope 2>/dev/full", 2, "", ""),
+    "much, disk full": (OWN.format("print('x' * 2**20)"), ">/dev/full", 2, "", "it: stdout: No space left on device"),
     "error, disk full": (OWN.format("print('x') or [][1]"), ">/dev/full", 2, "", INDEX),
     "closed numbers": (f"import os\n{NUMBER}", "2>&- <&-", 0, "3", ""),
 }
@@ -104,7 +108,8 @@ def test_streams_that_are_closed_full_or_not_read(case, images):
     words = ["-c", chosen] if len(chosen) > 2 else ["-m", "mi_refract.cli", "diff", *(images[x] for x in chosen)]
     # The reader of the pipe has gone before the command prints.
     command = ["bash", "-c", f'set -o pipefail; "$@" {connected}', "bash", sys.executable, *map(str, words)]
-    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
+    environment = ENVIRONMENT | {"PYTHONUNBUFFERED": "1"} if case.startswith("unbuffered") else ENVIRONMENT
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout, done.stderr.strip()) == (code, out, said)
 
 

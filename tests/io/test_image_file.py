@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import struct
+import sys
 
 import numpy as np
 import OpenImageIO as oiio
@@ -212,6 +213,34 @@ def test_as_many_values_as_are_allowed_are_read(tmp_path):
     assert read(path, pixels.size).pixels.shape == pixels.shape
     with pytest.raises(ValueError, match=r"a\.tif: 300 × 300 × 3 values; expected up to 269999 values"):
         read(path, pixels.size - 1)
+
+
+def test_twice_as_many_pages_take_twice_as_many_steps(tmp_path):
+    """Python's own, counted one by one."""
+    spec, steps = oiio.ImageSpec(1, 1, 1, "uint8"), 0
+
+    def count(frame, event, _):
+        nonlocal steps
+        if frame.f_code.co_filename != image_file.__file__:
+            return None
+        frame.f_trace_opcodes, frame.f_trace_lines = True, False
+        steps += event == "opcode"
+        return count
+
+    taken = []
+    for pages in (100, 200):
+        output = oiio.ImageOutput.create("a.tif")
+        for number in range(pages):
+            assert output.open(str(tmp_path / "a.tif"), spec, "AppendSubimage" if number else "Create")
+            assert output.write_image(np.zeros((1, 1, 1), np.uint8))
+        output.close()
+        before, steps = sys.gettrace(), 0
+        sys.settrace(count)
+        found = image_file.read_parts(tmp_path / "a.tif")
+        sys.settrace(before)
+        assert len(found) == pages
+        taken.append(steps)
+    assert taken[0] < taken[1] < 2.1 * taken[0]
 
 
 def test_what_the_system_does_not_give(tmp_path):

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from support.processes import until
 
 from mi_refract.io import process_group
 from mi_refract.io.errors import TooMuchOutputError
@@ -24,13 +25,6 @@ def alive(pid):
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
-
-
-def wait_for(condition, seconds=60):
-    deadline = time.monotonic() + seconds
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.01)
-    return condition()
 
 
 def shell(text, *arguments):
@@ -87,7 +81,7 @@ def test_a_signal_to_us_ends_it_too(tmp_path, number):
     """And has its usual effect on us."""
     us = subprocess.Popen([sys.executable, "-c", PARENT, tmp_path / "pid"], stderr=subprocess.DEVNULL)
     try:
-        assert wait_for((tmp_path / "pid").exists)
+        until((tmp_path / "pid").exists)
         us.send_signal(number)
         assert us.wait(60) in (-number, 128 + number)
     finally:

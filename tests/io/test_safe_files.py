@@ -8,7 +8,6 @@ import shutil
 import socket
 import stat
 import tempfile
-import tomllib
 import tracemalloc
 from pathlib import Path
 
@@ -182,16 +181,6 @@ def test_update_between_refuses_what_is_ambiguous(document, text, message, tmp_p
     with pytest.raises(ValueError, match=rf"README\.md: .*{message}"):
         update_between(path, "t", text)
     assert path.read_text() == document
-
-
-def test_what_is_no_code_travels_with_the_package():
-    """All of it but the READMEs: `py.typed`, and the templates of the pages."""
-    root = Path(__file__).parents[2]
-    data = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
-    folders = {name: root / name.replace(".", "/") for name in data}
-    taken = {path for name, globs in data.items() for glob in globs for path in folders[name].glob(glob)}
-    others = {path for path in (root / "mi_refract").rglob("*.*") if path.suffix not in (".py", ".pyc", ".md")}
-    assert {path.suffix for path in others} >= {".j2", ".css", ".js", ".typed"} and others <= taken
 
 
 # The lock -------------------------------------------------------------------------------------------------------------

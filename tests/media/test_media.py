@@ -3,20 +3,20 @@ printed elsewhere, and the one line that a scene gets for anything else."""
 
 import math
 import sys
-from importlib.util import find_spec
 
 import drjit as dr
 import numpy as np
 import pytest
 
 from mi_refract import media
-from mi_refract.media import LINES, glass_catalogs
+from mi_refract.media import LINES
 
 # N-BK7 by Schott: coefficients printed for micrometres.
 B = 1.03961212, 0.231792344, 1.01046945
 C = 0.00600069867, 0.0200179144, 103.560653
 SELLMEIER = f"sellmeier({B[0]}, {B[1]}, {B[2]}, {C[0] * 1e6}, {C[1] * 1e6}, {C[2] * 1e6})"
 RESONANCES = f"sellmeier_nm({B[0]}, {B[1]}, {B[2]}, {', '.join(repr(1e3 * math.sqrt(c)) for c in C)})"
+MICROMETRES = f"sellmeier_um({', '.join(map(str, (*B, *C)))})"  # as catalogues print them
 TABLE = "table(400: 1.53, 500: 1.52, 900: 1.5)"
 
 
@@ -25,22 +25,25 @@ def bk7(w):
     return math.sqrt(1 + sum(b * square / (square - c) for b, c in zip(B, C, strict=True)))
 
 
-def abbe(w):
-    return 1.5168 + 0.5168 / 64.17 * (w**-2 - LINES["d"] ** -2) / (LINES["F"] ** -2 - LINES["C"] ** -2)
+def abbe(w, n_d=1.5168, v_d=64.17):
+    return n_d + (n_d - 1) / v_d * (w**-2 - LINES["d"] ** -2) / (LINES["F"] ** -2 - LINES["C"] ** -2)
 
 
 CLOSED = {
     "1.5": lambda w: 1.5,
     "cauchy(1.458, 3540, 1e7)": lambda w: 1.458 + 3540 / w**2 + 1e7 / w**4,
+    "cauchy_um(1.458, 0.00354, 1e-5)": lambda w: 1.458 + 3540 / w**2 + 1e7 / w**4,
     SELLMEIER: bk7,
+    MICROMETRES: bk7,
     RESONANCES: bk7,
     "abbe(1.5168, 64.17)": abbe,
+    "517642": lambda w: abbe(w, 1.517, 64.2),
+    "003-283": lambda w: abbe(w, 2.003, 28.3),
     TABLE: lambda w: float(np.interp(w, [400, 500, 900], [1.53, 1.52, 1.5])),
+    "table_um(0.4: 1.53, 0.5: 1.52, 0.9: 1.5)": lambda w: float(np.interp(w, [400, 500, 900], [1.53, 1.52, 1.5])),
+    f"hold( {TABLE} )": lambda w: float(np.interp(w, [400, 500, 900], [1.53, 1.52, 1.5])),
 }
-
-
-def medium(spec):
-    return media.parse(float(spec) if spec[0].isdigit() else spec)
+medium = media.parse
 
 
 @pytest.fixture(params=list(CLOSED), ids=lambda spec: spec.partition("(")[0])
@@ -146,7 +149,23 @@ BAD = {
     "cauchy(1, 2": r"expected cauchy\(…\), sellmeier\(…\), sellmeier_nm\(…\), abbe\(…\), table\(…\)",
     "sine(1, 2)": r"expected cauchy\(…\)",
     "sellmeier(1)": "as many C in nm² as B",
-    "sellmeier(1, 0.01)": "C1 = 0.01; expected nm²; from µm² multiply by 1e6",
+    "sellmeier(1, 0.01)": r"C1 = 0.01; expected nm²; from µm² multiply by 1e6, or write sellmeier_um\(…\)",
+    "sellmeier_um(1, 1, 6000, 20000)": r"C1 = 6000; expected µm²; from nm² write sellmeier\(…\)",
+    "cauchy(1.5046, 0.0042)": r"B = 0.0042; expected nm²; from µm² multiply by 1e6, or write cauchy_um\(…\)",
+    "cauchy(1.5, 4000, 1e-5)": "C = 1e-05; expected nm⁴; from µm⁴ multiply by 1e12, or",
+    "cauchy_um(1.5, 4200)": "n = 32408.9 at 360 nm; expected up to 10 in 360 … 830 nm; coefficients in another unit",
+    "abbe_um(1.5, 64)": r"or with _um, such as table_um\(…\)",
+    "abbe(64.2, 1.517)": r"n_d = 64.2, V_d = 1.517; expected n_d first: abbe\(1.517, 64.2\)",
+    "abbe(0.9, 64)": "n_d = 0.9; expected an index above 1, up to 10",
+    "abbe(1.5, 500)": "V_d = 500; expected .*, from 5 to 200",
+    "517000": "V_d = 0; expected",
+    "table(0.4: 1.53, 0.7: 1.51)": r"the first wavelength = 0.4; expected nm; from µm write table_um\(…\)",
+    "table_um(400: 1.53, 700: 1.51)": r"the first wavelength = 400; expected µm; from nm write table\(…\)",
+    "hold(table(400: 1.53))": "two or more wavelengths",
+    "N-BK7": "unknown material; a glass has its maker's name: SCHOTT:N-BK7$",
+    "s-bsl7": "its maker's name: OHARA:S-BSL 7$",
+    "nan": "expected a positive finite number, or a material's name",
+    "-1.5": "expected a positive finite number",
     "sellmeier(1, -0.01)": "C1 = -0.01; expected nm²",
     "sellmeier(1, 1, 10000, 250000)": "C2: n is infinite at 500 nm; expected no pole in 360 … 830 nm",
     "sellmeier(-1.5, 10000)": "n is not positive at 360 nm",
@@ -155,7 +174,7 @@ BAD = {
     "sellmeier_nm(1, 500)": "L1: n is infinite at 500 nm",
     "abbe(1.5)": r"expected abbe\(n_d, V_d\)",
     "abbe(1.5, 0)": "V_d = 0; expected",
-    "table(500: 1.5)": "two or more, wavelengths in nm, increasing",
+    "table(500: 1.5)": "two or more wavelengths, increasing",
     "table(500: 1.5, 400: 1.5)": "increasing",
     "table(500: 1.5, 500: 1.6)": "increasing",
     "table(0: 1.5, 500: 1.6)": "increasing",
@@ -165,6 +184,7 @@ BAD = {
     "table(400: 1.5, 500: nan)": "n = nan at 500 nm",
     "MATERIAL:wader": "unknown material; nearest: MATERIAL:water, ",
     "FOO:BAR": "expected these, or CDGM:…, HIKARI:…",
+    517642: "expected an index; the code of a glass is a text: '517642'",
     0: "expected a positive finite number, or a material's name",
     -1.5: "expected a positive finite number",
     math.inf: "expected a positive finite number",
@@ -252,13 +272,7 @@ def test_materials_have_the_index_that_was_printed_elsewhere(name, wavelength, n
 
 # Catalogues of glass ---------------------------------------------------------------------------------------------
 
-READS = pytest.mark.skipif(
-    not all(find_spec(name) for name in ("opticalglass", "pandas")),
-    reason="opticalglass is not installed: pip install 'mi-refract[glass]'",
-)
 
-
-@READS
 @pytest.mark.parametrize(
     ("glass", "n_d", "v_d"),
     [
@@ -280,7 +294,6 @@ def test_n_d_and_v_d_are_those_of_the_maker(glass, n_d, v_d):
     assert (n["d"] - 1) / (n["F"] - n["C"]) == pytest.approx(v_d, abs=0.06 if ":" in glass else 1e-10)
 
 
-@READS
 @pytest.mark.parametrize(
     ("glass", "low", "high"),
     [("SCHOTT:N-BK7", 290, 2500), ("SCHOTT:F2", 320, 2500), ("HOYA:FCD515", 320, 2500)],
@@ -294,7 +307,6 @@ def test_a_glass_has_an_index_where_its_maker_prints_one_or_a_transmittance_abov
             media.index(glass, beyond)
 
 
-@READS
 @pytest.mark.parametrize(
     ("glass", "valid", "fitted", "beyond"),
     [
@@ -315,7 +327,6 @@ def test_beyond_the_makers_fit_an_index_is_a_warning(glass, valid, fitted, beyon
             found.index(asked)
 
 
-@READS
 def test_glasses_are_named_in_any_case_and_errors_say_what_there_is():
     assert media.parse("schott:n-bk7").name == "SCHOTT:N-BK7"
     assert media.parse("OHARA:S-BSL7").name == media.parse("ohara: s-bsl 7").name == "OHARA:S-BSL 7"
@@ -326,10 +337,139 @@ def test_glasses_are_named_in_any_case_and_errors_say_what_there_is():
         media.parse("HIKARI:J-PSKH8")
 
 
-def test_without_the_package_a_glass_says_which_command_brings_it(monkeypatch):
-    for name in ["opticalglass", *(name for name in sys.modules if name.startswith("opticalglass."))]:
-        monkeypatch.setitem(sys.modules, name, None)
-    glass_catalogs.read.cache_clear()
-    with pytest.raises(ValueError, match=r"^int_ior = 'SCHOTT:N-BK7': .*pip install 'mi-refract\[glass\]'$") as error:
-        media.parse("SCHOTT:N-BK7", "int_ior")
-    assert "\n" not in str(error.value)
+# Files -----------------------------------------------------------------------------------------------------------
+
+PAGE = "DATA:\n  - type: {}\n    wavelength_range: 0.3 2.5\n    coefficients: {}\n"
+NK = "DATA:\n  - type: tabulated nk\n    data: |\n        0.4 1.53 1e-7\n        0.5 1.52 2e-7\n        0.9 1.5 3e-7\n"
+SELLMEIER_2 = f"0 {B[0]} {C[0]} {B[1]} {C[1]} {B[2]} {C[2]}"
+SELLMEIER_1 = f"0 {B[0]} {C[0] ** 0.5!r} {B[1]} {C[1] ** 0.5!r} {B[2]} {C[2] ** 0.5!r}"
+ZEMAX = """CC a catalogue
+NM OTHER 2 0 1.6 36 0 1
+CD 1 0.01
+NM X-1 {} 517642 1.517 64.2 0 1
+CD {}
+TD 0 0 0 0 0 0
+LD 0.3 2.5
+"""
+
+
+def interpolated(w):
+    return float(np.interp(w, [400, 500, 900], [1.53, 1.52, 1.5]))
+
+
+def powers(*pairs, exponent=0.5):
+    """n or n² = Σ a λ^p, λ in µm."""
+    return lambda w: sum(a * (w / 1000) ** p for a, p in pairs) ** exponent
+
+
+def gas(w):
+    return 1 + 1e-8 * (5792105 / (238.0185 - (w / 1000) ** -2) + 167917 / (57.362 - (w / 1000) ** -2))
+
+
+SCHOTT_1992 = powers((2.27, 0), (-0.01, 2), (0.0105, -2), (1e-4, -4))
+LONG = (2.27, 0), (-0.01, 2), (0.0105, -2), (1e-4, 4)
+FILES = {
+    "nm.csv": ("# mine\nWavelength (nm),n,k\n400,1.53,0\n500,1.52,0\n900,1.5,1e-3\n", interpolated),
+    "um.csv": ("k;wl_µm;n\n0;0.4;1.53\n0;0.5;1.52\n0;0.9;1.5\n", interpolated),
+    "nk.yml": (NK, interpolated),
+    "1.yml": (PAGE.format("formula 1", SELLMEIER_1), bk7),
+    "2.yml": (PAGE.format("formula 2", SELLMEIER_2), bk7),
+    "3.yml": (PAGE.format("formula 3", "2.27 -0.01 2 0.0105 -2 1e-4 -4"), SCHOTT_1992),
+    "5.yaml": (
+        PAGE.format("formula 5", "1.5 0.004 -2 1e-3 -3.5"),
+        powers((1.5, 0), (4e-3, -2), (1e-3, -3.5), exponent=1),
+    ),
+    "6.yml": (PAGE.format("formula 6", "0 0.05792105 238.0185 0.00167917 57.362"), gas),
+    "1.agf:x-1": (ZEMAX.format(1, "2.27 -0.01 0.0105 1e-4 0 0"), SCHOTT_1992),
+    "2.agf:X-1": (ZEMAX.format(2, f"{B[0]} {C[0]} {B[1]} {C[1]} {B[2]} {C[2]} 0 0"), bk7),
+    "5.AGF:X-1": (ZEMAX.format(5, "1.5 0.004 1e-3"), powers((1.5, 0), (0.004, -1), (1e-3, -3.5), exponent=1)),
+    "11.agf:X-1": (ZEMAX.format(11, f"{B[0]} {C[0]} {B[1]} {C[1]} {B[2]} {C[2]} 0 0 0 0"), bk7),
+    "12.agf:X-1": (ZEMAX.format(12, "2.27 -0.01 0.0105 0 0 0 1e-4 1e-5"), powers(*LONG, (1e-5, 6))),
+    "13.agf:X-1": (ZEMAX.format(13, "2.27 -0.01 1e-4 0.0105"), powers(*LONG)),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_an_index_is_read_from_a_file(name, tmp_path, vectorised):
+    """Also where the name of the folder has a colon, of UTF-16 as Zemax writes, and in Dr.Jit arrays."""
+    (folder := tmp_path / "a:b (c)").mkdir()
+    (folder / name.partition(":")[0]).write_text(FILES[name][0], "utf-16" if name.startswith("11.agf") else "utf-8")
+    found = media.parse(f"file:{folder}/{name}")
+    wavelengths = [410.0, 505.0, 700.0]
+    expected = [FILES[name][1](w) for w in wavelengths]
+    np.testing.assert_allclose(found.index(np.array(wavelengths)), expected, rtol=1e-14)
+    np.testing.assert_allclose(found.index(dr.value_t(vectorised.vector)(*wavelengths)), expected, rtol=1e-14)
+    assert found.valid == ((400, 900) if FILES[name][1] is interpolated else (300, 2500))
+    assert found.relative_to == ("air" if "agf" in name.lower() else "")
+    assert media.file_in(f"hold( file:{folder}/{name})") == f"{folder}/{name.partition(':')[0]}"
+
+
+@pytest.mark.parametrize(
+    ("said", "relative"),
+    [("SPECS:\n    n_absolute: false\n", "air"), ("CONDITIONS:\n    n_is_absolute: true\n", "vacuum"), ("", "")],
+)
+def test_k_and_the_reference_of_an_index_are_read(said, relative, tmp_path):
+    table = "  - type: tabulated k\n    data: |\n        0.4 1e-8\n        0.8 2e-8\n"
+    page = PAGE.format("formula 2", SELLMEIER_2) + table + said
+    (tmp_path / "glass.yml").write_text(page)
+    found = media.parse("file:glass.yml", find=lambda name: tmp_path / name)
+    assert (found.relative_to, found.k, found.valid) == (relative, ((400, 800), (1e-8, 2e-8)), (300, 2500))
+    (tmp_path / "nk.yml").write_text(NK)
+    held = media.parse(f"hold(file:{tmp_path}/nk.yml)")
+    assert (held.k, held.hold) == (((400, 500, 900), (1e-7, 2e-7, 3e-7)), True)
+
+
+def test_yaml_is_an_extra_that_the_error_names(tmp_path, monkeypatch):
+    (tmp_path / "glass.yml").write_text(NK)
+    monkeypatch.setitem(sys.modules, "yaml", None)
+    with pytest.raises(ImportError, match=r"YAML needs PyYAML: pip install 'mi-refract\[yaml\]'"):
+        media.parse(f"file:{tmp_path}/glass.yml")
+
+
+def test_held_beyond_its_range_an_index_is_that_of_its_end_and_a_warning(vectorised):
+    found = media.parse(f"hold({TABLE})")
+    with pytest.warns(UserWarning, match="the index at 390 nm is that of the end of its range, 400 to 900 nm"):
+        assert found.index(390.0) == 1.53
+    assert np.array(found.index(dr.value_t(vectorised.vector)(390, 400, 1000))).tolist() == [1.53, 1.53, 1.5]
+    assert math.isnan(found.index_or_nan(math.nan)) and math.isnan(found.index_or_nan(-1.0))
+
+
+BAD_FILES = {
+    "no.csv": (None, "No such file"),
+    "a.csv": ("wl,n\n0.4,1.5\n0.5,1.5\n", "header 'wl,n'; expected nm or µm in one column's name, n, and k: 'nm,n,k'"),
+    "b.csv": ("nm,n\n400,1.5\n", "two or more"),
+    "c.csv": ("nm,n\n400,x\n500,1.5\n", "expected numbers in the columns nm, n"),
+    "d.csv": ("nm,n\n400,1.5\n500\n", "expected numbers"),
+    "e.csv": ("nm,n\n500,1.5\n400,1.5\n", "increasing"),
+    "f.csv": ("nm,n,k\n400,1.5,-1\n500,1.5,0\n", "k = -1; expected a number ≥ 0"),
+    "g.csv": ("nm,n\n400,15\n500,15\n", "n = 15 at 400 nm; expected up to 10"),
+    "h.txt": ("", "expected a .csv, a .yml of refractiveindex.info, or a glass of a Zemax catalogue as file:NAME.agf:"),
+    "a.yml": ("just: text", "expected a page of refractiveindex.info"),
+    "b.yml": ("[", "expected a page of refractiveindex.info"),
+    "c.yml": (PAGE.format("formula 4", "1 2 3"), "formula 4; expected formula 1, 2, 3, 5 or 6, or a table"),
+    "d.yml": (
+        "DATA:\n  - type: tabulated k\n    data: |\n        0.4 1\n        0.5 1\n",
+        "no index; expected a formula",
+    ),
+    "e.yml": (PAGE.format("formula 2", "0 1 0.25"), "C1: n is infinite at 500 nm"),
+    "f.yml": (
+        "DATA:\n  - type: tabulated n\n    data: |\n        0.4 1 1 1\n        0.5\n",
+        "a table of n; expected n, k or nk, and as",
+    ),
+    "g.yml": (PAGE.format("formula 2", "0 1"), "2 coefficients; expected an odd number of them"),
+    "a.agf": (ZEMAX, "expected a .csv"),
+    "a.agf:Y": (ZEMAX.format(1, "1"), "no glass Y; nearest: "),
+    "b.agf:X-1": (ZEMAX.format(3, "1"), "glass X-1: formula 3; expected one of 1, 2, 5, 6, 10, 11, 12, 13"),
+    "c.agf:OTHER": (ZEMAX, "glass OTHER: expected a formula, and lines CD and LD of numbers"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_what_a_file_lacks_is_said_in_one_line(name, tmp_path):
+    content, said = BAD_FILES[name]
+    if content is not None:
+        (tmp_path / name.partition(":")[0]).write_text(content, "utf-8")
+    with pytest.raises(ValueError) as error:
+        media.parse(f"file:{tmp_path}/{name}", "int_ior")
+    assert said in str(error.value) and "\n" not in str(error.value)
+    assert str(error.value).startswith(f"int_ior = 'file:{tmp_path}/{name}': ")

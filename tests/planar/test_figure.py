@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.image import AxesImage
 from support.planar_scenes import SLAB, ball, beam, polygon, scene
 
-from mi_refract.planar import Event
+from mi_refract.planar import Event, focal_points
 from mi_refract.planar import figure as drawing
 from mi_refract.planar.light import Light
 from mi_refract.planar.path_tree import follow_scene
@@ -79,6 +79,15 @@ def test_of_many_media_a_few_are_named(drawn):
     assert (labels[0], labels[-1]) == ("n = 1", "n = 1.8 – 2")
 
 
+def test_media_of_nearly_the_same_index_have_tints_of_their_own(drawn):
+    media = tuple(replace(SLANTED.regions[0], indices=(n,)) for n in (1.45, 1.48))
+    tints = [
+        np.array(patch.get_facecolor())
+        for patch in drawn(replace(SLANTED, regions=media)).axes[0].get_legend().get_patches()
+    ]
+    assert np.abs(tints[2] - tints[1]).max() > 0.1 < np.abs(tints[1] - tints[0]).max()
+
+
 def test_opacity_is_the_root_of_the_power(drawn):
     given = replace(SLANTED, branches=1)
     weights = follow_scene(given)[0].paths.weights
@@ -123,7 +132,10 @@ def test_paths_that_end_otherwise_are_marked(drawn, event, mark):
     panel = drawn(given).axes[0]
     (line,) = [line for line in panel.lines if line.get_marker() == mark]
     np.testing.assert_allclose(line.get_xydata(), [[0 if event == Event.MAX_DEPTH else 1, 0.1]], atol=1e-12)
-    note = drawing.MARKS[event][1].format(1)
+    note = {
+        Event.MAX_DEPTH: "○ 1 stopped after `max_depth` boundaries",
+        Event.MEDIUM_MISMATCH: "× shape[0] overlap, leave a gap, or are turned round: 1 path in index 1.5 met",
+    }[event]
     assert note in panel.get_xlabel().replace("\n", " ")
     clean = drawn(replace(given, segments=(square,), max_depth=5)).axes[0]
     assert {line.get_marker() for line in clean.lines} == {"+"}
@@ -178,7 +190,32 @@ def test_every_leg_is_there_once():
 def test_the_default_view_holds_everything():
     given = scene(ball(1.5), beam(3, 0.5, x=-9), (1, 0))
     far = 1 + 2 * drawing.MARGIN
-    np.testing.assert_allclose(drawing.around(given, follow_scene(given)), (-far, far, -far, far))
+    np.testing.assert_allclose(drawing.around(given, follow_scene(given), np.empty((0, 2))), (-far, far, -far, far))
+
+
+@pytest.mark.parametrize(("n", "focus"), [(1.5, 1.5), (1.1, 5.5), (1.01, None), (2.5, None)])
+def test_a_focus_is_marked_and_the_view_holds_it_unless_it_is_far_away(drawn, n, focus):
+    """n/(2 (n − 1)) from the centre of a ball, for rays near its axis; inside a ball of n > 2."""
+    panel = drawn(scene(ball(n), beam(9, 0.01), (1, 0))).axes[0]
+    marks = [line.get_xydata() for line in panel.lines if line.get_marker() == "D"]
+    assert ("◇ focus" in panel.get_xlabel()) is bool(marks) is (focus is not None)
+    assert panel.get_xlim()[1] == pytest.approx(
+        max(focus or 1, 1) + drawing.MARGIN * max((focus or 1) + 1, 2), rel=1e-3
+    )
+    if focus:
+        np.testing.assert_allclose(marks, [[[focus, 0]]], atol=1e-3)
+
+
+def test_rays_that_do_not_come_together_have_no_focus():
+    """A fan from the middle of a ball, and rays that a slab leaves parallel or crossing all over the place."""
+    fan = np.array([(1, y) for y in np.linspace(-0.3, 0.3, 9)])
+    crossing = np.array([(1, y) for y in (0.2, -0.1, 0.3, -0.3)])
+    for given in (
+        scene(ball(1.5), np.zeros((9, 2)), fan),
+        scene(GLASS, beam(5, 1.0), (1, 0)),
+        scene(GLASS, beam(4, 1.0), crossing),
+    ):
+        assert not len(focal_points.foci(given, follow_scene(given)))
 
 
 def test_density_is_length_where_the_line_is():

@@ -101,7 +101,7 @@ def test_groups_are_by_colour_beam_and_reflections():
     rays = {0: 3, 1: 2}  # the sixth meets nothing
     assert named == [(c, b, bits, rays[b]) for c in ("red", "blue") for b in (0, 1) for bits in (0, 1, 2)]
     lines = focal_points.table(made).splitlines()
-    assert len(lines) == 2 * 13
+    assert len(lines) == 13 + 1 + 13  # two tables and a line between
     assert lines[0].split()[:3] == ["colour", "beam", "reflected"]
     assert lines[3].split()[:4] == ["red", "0", "1", "3"]
 
@@ -112,7 +112,7 @@ def test_a_slab_only_moves_a_beam():
     assert group.spread.cardinal == Cardinal(afocal=True)
     lines = focal_points.table([group]).splitlines()
     assert lines[1].split()[4] == "–"
-    assert lines[3].split()[3:] == ["infinite", "–", "–", "–", "–"]
+    assert lines[4].split()[3:] == ["infinite", "–", "–", "–", "–"]
 
 
 # The paraxial limit --------------------------------------------------------------------------------------------

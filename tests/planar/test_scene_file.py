@@ -156,35 +156,49 @@ def test_what_is_not_said_of_a_scene_and_round_numbers(read):
 
 BAD = [  # what is replaced, by what: the place and what was found or expected
     ("max_depth = 5", "max_depths = 5", "unknown key `max_depths`; expected title, index"),
-    ("radius = 2,", 'radius = "2",', "shape[0].radius: expected `float`, got `str`"),
-    ("radius = 2,", "radius = nan,", "shape[0].radius: expected a finite number, got nan"),
-    ("n = 1.3", "n = 0", "shape[2].n: expected `float` > 0.0"),
-    ("index = [1, 1.1]", "index = [1, -1.1]", "index[1]: expected `float` > 0.0"),
-    ('title = "A disc"', 'title = " "', "title: expected `str` that is not blank"),
-    ('name = "disc"', 'name = ""', "shape[0].name: expected `str` that is not blank"),
+    ("radius = 2,", 'radius = "2",', "shape[0].radius: text; expected a number"),
+    ("radius = 2,", "radius = nan,", "shape[0].radius: nan; expected a finite number"),
+    ("n = 1.3", "n = 0", "shape[2].n: expected a number > 0.0"),
+    ("index = [1, 1.1]", "index = [1, -1.1]", "index[1]: expected a number > 0.0"),
+    ('title = "A disc"', 'title = " "', "title: expected text that is not blank"),
+    ('name = "disc"', 'name = ""', "shape[0].name: expected text that is not blank"),
     ("view = ", 'light = "D65"\nview = ', "light: 'D65' without wavelengths; expected"),
     ("n = 1.3", "n = [1, 2, 3]", "shape[2].n: 3 numbers; expected 1, or one for each of 2"),
     ('colours = ["red", "blue"]', "", "index: 2 numbers; expected 1, or one for each of 1"),
-    ('["red", "blue"]', "[]", "colours: expected `array` of length >= 1"),
-    ("max_depth = 5", "max_depth = 0", "max_depth: expected `int` >= 1"),
-    ("branches = 1", "branches = -1", "branches: expected `int` >= 0"),
+    ('["red", "blue"]', "[]", "colours: expected a list [ … ] of length >= 1"),
+    ("max_depth = 5", "max_depth = 0", "max_depth: expected a whole number >= 1"),
+    ("branches = 1", "branches = -1", "branches: expected a whole number >= 0"),
     ("view = [-2, 2,", "view = [2, -2,", "view: [2.0, -2.0, -1.5, 1.5]; expected [x0, x1, y0, y1], x0 < x1"),
     ('"ellipse"', '"elipse"', "shape[2].kind: invalid value 'elipse'; expected polygon, rectangle"),
     ("radii = [1, 2]", 'radii = [1, 2], name = "disc"', "shape[2].name: 'disc' is the name of another shape"),
     ('"disc", at', '"dish", at', "shape[1].within: 'dish'; expected the name of a shape above: 'disc'"),
     ('"disc", at', '"disc", outside = 1, at', "shape[1].within: 'disc', but `outside` is set"),
     ("scale = [1, 0.5]", "scale = [1, 0]", "shape[0]: scale: (1.0, 0.0); expected numbers of size"),
-    ("radii = [1, 2]", "radii = [1, 1e99], scale = 99", "shape[2]: a number beyond ±1e+100"),
+    ("radii = [1, 2]", "radii = [1, 1e99], scale = 99", "expected up to ±1e+100"),
     ("radii = [1, 2]", "radii = [1e-20, 2e-20]", "shape[2]: it shrinks to a point beside coordinates of 9; expected"),
     ("facets = 20", "facets = 3", "shape[2].facets: 3, for 4 arcs"),
-    ("count = 3", "count = 0", "beam[1].count: expected `int` >= 1"),
+    ("count = 3", "count = 0", "beam[1].count: expected a whole number >= 1"),
     ("direction = [3, 4]", "direction = [0, 0]", "beam[0].direction: [0, 0]; expected degrees, or"),
-    ("origins = [[0, 1]", "origins = [[0, 1e101]", "beam[2]: a number beyond ±1e+100"),
+    ("origins = [[0, 1]", "origins = [[0, 1e101]", "beam[2]: 1e+101; expected up to ±1e+100"),
     ("[-90, 90]", "[-1e308, 1e308]", "beam[1].angles: [-1e+308, 1e+308]"),
     ("[180, [0, -1e300]]", "[180]", "beam[2]: directions: 1, for 2 origins"),
     ("shape = [", "shape = 3 # [", "expected TOML"),
+    ("max_depth = 5", "max_depth = .5", "max_depth = .5: numbers have a digit on either side of the point, as 0.8"),
+    ("max_depth = 5", "index = [ 1., 2]", "index = [ 1., 2]: numbers have a digit on either side of the point"),
+    (
+        'title = "A disc"',
+        "title = Disc",
+        "line 1, column 9): title = Disc: text is in quotes; true and false are in lower",
+    ),
     (SHAPES, "", "object missing required field `shape`"),
-    (SHAPES, "shape = []\n", "shape: expected `array` of length >= 1"),
+    (SHAPES, "[shape]\nradius = 1\n", "shape: a table { … }; expected a list [ … ] of tables, [[…]] in TOML"),
+    (
+        'kind = "circle", ',
+        "",
+        "shape[0]: object missing required field `kind`; expected polygon, rectangle, prism, circle",
+    ),
+    ("radius = 2,", "", "shape[0]: object missing required field `radius`"),
+    (SHAPES, "shape = []\n", "shape: expected a list [ … ] of length >= 1"),
     (BEAMS, "", "object missing required field `beam`"),
 ]
 # Colours by wavelength.
@@ -194,9 +208,9 @@ BAD_GLASSES = [
     (CAUCHY, "glas", "shape[2].n = 'glas': unknown material; expected vacuum"),
     (CAUCHY, "cauchy(1.5", "shape[2].n = 'cauchy(1.5'; expected cauchy(…)"),
     (CAUCHY, "table(500: 1.5, 900: 1.4)", "shape[2].n: table(500: 1.5, 900: 1.4): no index"),
-    (TWO_LINES, "wavelengths = 1", "wavelengths: expected `int` >= 2"),
-    (TWO_LINES, "wavelengths = [-500]", "wavelengths[0]: expected `float` >= 100.0"),
-    (TWO_LINES, "wavelengths = 257", "wavelengths: expected `int` <= 256"),
+    (TWO_LINES, "wavelengths = 1", "wavelengths: expected a whole number >= 2"),
+    (TWO_LINES, "wavelengths = [-500]", "wavelengths[0]: expected a number >= 100.0"),
+    (TWO_LINES, "wavelengths = 257", "wavelengths: expected a whole number <= 256"),
     ("title", 'colours = ["a", "b"]\ntitle', "colours and wavelengths are both set; expected one"),
     ("title", 'light = "A"\ntitle', "light: invalid enum value 'A'; expected D65, flat"),
 ]
@@ -241,12 +255,25 @@ LENS = DISC.replace('"circle"', '"lens"') + "thickness = 1\ncurvature = [1, -1]\
         (DISC + FAN * 17, "beam[16].count: 17000000 rays in this beam and those before it; expected up to 16777216"),
         (LENS.replace("radius = 1", "radius = 2"), "shape[0].radius = 2: a surface is smaller"),
         (LENS.replace("radius = 1\n", "").replace("-1", "2"), "shape[0].curvature = [1.0, 2.0]: the surfaces never"),
+        (
+            LENS.replace("curvature", "R1 = 1\ncurvature"),
+            "shape[0]: curvature, R1, R2; expected either `curvature`, or",
+        ),
+        (LENS.replace("curvature = [1, -1]", "R1 = 1"), "shape[0]: curvature, R1, R2; expected either `curvature`, or"),
     ],
 )
 def test_what_is_too_much_or_no_shape_names_its_key(read, text, expected):
     with pytest.raises(ValueError, match=r"^[^\n]*$") as caught:
         read(text)
     assert expected in str(caught.value)
+
+
+def test_a_lens_has_curvatures_or_radii_of_curvature(read):
+    curvatures, radii = (
+        read(LENS.replace("curvature = [1, -1]", keys)) for keys in ("curvature = [0.25, 0]", "R1 = 4\nR2 = 0")
+    )
+    for name, values in vars(curvatures.segments[0]).items():
+        np.testing.assert_array_equal(getattr(radii.segments[0], name), values)
 
 
 NUMBERS = [0, -1, 1, 3, 0.5, 1e-300, -1e300, 1e308, 10**400, math.inf, math.nan, True, "", "disc"]
@@ -274,7 +301,9 @@ def toml(value):
     changes=strategies.lists(strategies.tuples(strategies.integers(0, 20), VALUES), max_size=2),
 )
 def test_whatever_the_values_a_file_is_a_scene_or_one_line(tmp_path_factory, kind, changes):
-    fields = [name for name in kind.__struct_fields__ if name not in ("within", "outside", "facets", "arcs")]
+    fields = [
+        name for name in kind.__struct_fields__ if name not in ("within", "outside", "facets", "arcs", "R1", "R2")
+    ]
     table = {"kind": kind.__struct_config__.tag} | {name: PLAUSIBLE.get(name, 1) for name in fields}
     table |= {kind.__struct_fields__[j % len(kind.__struct_fields__)]: value for j, value in changes}
     path = tmp_path_factory.getbasetemp() / "any.toml"
@@ -328,9 +357,12 @@ def test_a_shape_may_touch_what_it_lies_in_and_must_not_contradict_it(read):
     inner = [(1.3, 1.1), (1.3, 1.5), (1.3, 1.7), (1.5, 1.1), (1.5, 1.1), (1.7, 1.1), (1.7, 1.1), (1.7, 1.1)]
     assert media_of(read(TWO.format(first="0.3", second="2.3", more=INNER))) == inner
     for more, expected in (
-        (INNER.replace(', within = "left"', ""), r"shape\[2\]: along shape\[0\] there is index 1.5; expected 1.1"),
-        (AGAIN, r"shape\[2\]: along shape\[0\] there is index 1.5; expected 1.1"),
-        (ALONG, r"shape\[2\]: it runs along shape\[0\]"),
+        (
+            INNER.replace(', within = "left"', ""),
+            r"shape\[2\]: along shape\[0\] 'left' there is index 1.5; expected 1.1",
+        ),
+        (AGAIN, r"shape\[2\]: along shape\[0\] 'left' there is index 1.5; expected 1.1"),
+        (ALONG, r"shape\[2\]: it runs along shape\[0\] 'left'"),
     ):
         with pytest.raises(ValueError, match=expected):
             read(TWO.format(first="0.3", second="2.3", more=more))
@@ -357,6 +389,13 @@ def test_a_material_has_the_index_of_each_wavelength(read):
     assert [x.wavelengths for x in given] == [(450.0,), tuple(np.linspace(380, 730, 36))]
     plain = read(SCENE.replace("n = 1.3", f'n = "{CAUCHY}"'))  # without wavelengths: the d line
     assert plain.regions[-1].indices == pytest.approx((1.5 + 4000 / media.LINES["d"] ** 2,) * 2, rel=1e-15)
+
+
+def test_a_file_of_an_index_is_looked_for_beside_the_scene(read, tmp_path):
+    (tmp_path / "glass.csv").write_text("nm,n\n480,1.6\n580,1.5\n")
+    with pytest.warns(UserWarning, match="587.562 nm is that of the end of its range"):
+        scene = read(GLASSES.replace(CAUCHY, "hold(file:glass.csv)"))
+    assert scene.regions[-1].indices == pytest.approx((1.6 - 6.1327e-3, 1.5), rel=1e-9)
 
 
 def test_what_is_measured_against_vacuum_is_made_relative_to_air():

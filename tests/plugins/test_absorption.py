@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.glass_scenes import GLASS, attached, camera, refusal, sampled, surface, vector
 
+from mi_refract.plugins import check_integrator
 from mi_refract.plugins.absorption import BEYOND, HERE
 from mi_refract.plugins.refract import followed_context
 
@@ -46,6 +47,15 @@ def test_of_three_colours_and_of_a_spectrum(each_variant):
     assert sigma(int_absorption=part) == pytest.approx(values, rel=1e-6)
     expected = -np.log(left) / unit
     assert sigma(int_colour=colour, int_colour_distance=unit) == pytest.approx(expected, rel=1e-5, abs=1e-12)
+
+
+def test_absorption_of_a_file_is_4_pi_k_over_the_wavelength_in_the_unit_of_the_scene(each_variant, tmp_path, logged):
+    """Beyond the table's ends that of the ends, with a warning."""
+    (tmp_path / "k.csv").write_text("nm,n,k\n400,1.5,4e-6\n600,1.5,6e-6\n700,1.5,7e-6\n")
+    found = sigma(int_absorption=f"hold(file:{tmp_path}/k.csv)", int_absorption_unit=1e-3)
+    assert found == pytest.approx(4 * math.pi * 1e-8 * 1e6, rel=1e-5 if mi.is_spectral else 0.3)
+    (text,) = [text for text in logged if "int_absorption" in text]
+    assert "k from 400 to 700 nm; other light (0.5% of the colour) has the absorption of the range's end" in text
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 20.0])
@@ -93,10 +103,32 @@ def rgb(*value):
         ({"ext_colour_distance": 0.5}, "ext_colour is not given; expected both, or neither"),
         ({"int_colour": 0.5, "int_colour_distance": 0.0}, "int_colour_distance = 0.0; expected a positive finite"),
         ({"int_colour": 0.5, "int_colour_distance": math.inf}, "int_colour_distance = inf; expected"),
+        ({"int_absorption": "file:no.csv"}, "int_absorption = 'file:no.csv': no.csv: No such file"),
+        (
+            {"int_absorption": "hold(file:{nk})"},
+            "int_absorption_unit = 0.0; expected the scene's unit in metres: 0.001",
+        ),
+        ({"int_absorption": "hold(file:{nk})", "int_absorption_unit": -1.0}, "int_absorption_unit = -1.0; expected"),
+        ({"int_absorption": 1.0, "int_absorption_unit": 1.0}, "int_absorption = 1.0; expected .* a file with k"),
+        (
+            {"int_absorption": "SCHOTT:F2", "int_absorption_unit": 1.0},
+            "int_absorption = 'SCHOTT:F2'; expected .* with k",
+        ),
+        ({"int_absorption": "file:{nk}", "int_absorption_unit": 1.0}, "has k from 400 to 700 nm: 0.5% .* hold"),
         ({"int_colour": 0.5, "int_absorption": 1.0}, "int_absorption and int_colour are both set; expected one"),
+        ({"int_color": 0.5, "int_color_distance": 1.0}, "unknown parameter int_color; expected int_colour"),
+        ({"ext_color_distance": 1.0}, "unknown parameter ext_color_distance; expected ext_colour_distance"),
+        (
+            {"specular_transmittance": -1.0},
+            "specular_transmittance = -1.0; expected a number, a spectrum or a texture, ≥",
+        ),
+        ({"specular_reflectance": math.nan}, "specular_reflectance = nan; expected .* ≥ 0 and finite"),
+        ({"specular_reflectance": rgb(1, -1, 1)}, "specular_reflectance = .*; expected .* ≥ 0 and finite"),
     ],
 )
-def test_what_is_refused_is_named(typical_variant, parameters, said):
+def test_what_is_refused_is_named(typical_variant, parameters, said, tmp_path):
+    (tmp_path / "nk.csv").write_text("nm,n,k\n400,1.5,0\n700,1.5,0\n")
+    parameters = {k: x.format(nk=tmp_path / "nk.csv") if isinstance(x, str) else x for k, x in parameters.items()}
     assert re.search(said, refusal(load, **parameters))
 
 
@@ -107,23 +139,49 @@ def test_a_negative_value_of_a_spectrum_is_refused(each_variant):
         mi.load_string(text)
 
 
-def test_an_integrator_that_does_not_track_media_is_refused(each_variant, logged):
-    bsdf, said = load(ext_colour=0.5, ext_colour_distance=1.0), "refract: ext_colour; expected the integrator refract"
+def test_a_call_that_does_not_follow_media_is_refused(each_variant):
+    bsdf = load(ext_colour=0.5, ext_colour_distance=1.0)
     assert np.isfinite(sampled(bsdf, (0, 0, 1), 0.5, followed_context()).weight).all()
-    if not dr.is_jit_v(mi.Float):
-        assert refusal(sampled, bsdf, (0, 0, 1), 0.5).startswith(said)
-        return
-    for _ in range(2):  # one warning in all
-        assert np.isinf(sampled(bsdf, (0, 0, 1), 0.5).weight).all()
-    assert [text.startswith(said) for text in logged] == [True]
-
-
-def test_with_path_light_that_meets_absorption_is_infinite_and_no_other_scene(llvm_variant):
-    """Also while the absorbing scene is in memory."""
-    whole = {"type": "scene", "sensor": camera(8, 60), "light": {"type": "constant"}, "integrator": {"type": "path"}}
-    clear, absorbing = (
-        mi.load_dict(whole | {"ball": {"type": "sphere", "bsdf": GLASS | more}}) for more in ({}, {"int_absorption": 1})
+    assert refusal(sampled, bsdf, (0, 0, 1), 0.5).startswith(
+        "refract: ext_colour; expected the integrator refract_path"
     )
-    first, image, again = (np.array(mi.render(scene, spp=4)) for scene in (clear, absorbing, clear))
-    assert np.isfinite(first).all() and np.isfinite(again).all()
-    assert not np.isfinite(image[4, 4]).any() and np.isfinite(image[0, 0]).all()
+
+
+def seen(**more):
+    """Two balls with BSDFs of their own."""
+    ball = {"type": "sphere", "bsdf": GLASS | more}
+    balls = {"ball": ball, "other": {"type": "sphere", "center": [1, 0, 0], "bsdf": GLASS | more | {"int_ior": 1.4}}}
+    whole = {"type": "scene", "sensor": camera(8, 60), "light": {"type": "constant"}, "integrator": {"type": "path"}}
+    return mi.load_dict(whole | balls)
+
+
+@pytest.mark.parametrize("integrator", ["path", "volpath", "prb", "ptracer"])
+def test_each_scene_whose_absorption_is_not_followed_is_named_once_and_no_other(integrator, llvm_variant, logged):
+    """All of them are in memory. An image without a warning is finite."""
+    clear, first, second = seen(), seen(int_absorption=1.0), seen(ext_absorption=2.0)
+    said = "refract: {}; expected the integrator refract_path, or no absorption; where light meets it, the image is not"
+    expected = ((clear, ""), (first, "int_absorption"), (second, "ext_absorption"), (first, ""), (clear, ""))
+    for scene, parameter in expected:
+        logged.clear()
+        image = np.array(mi.render(scene, integrator=mi.load_dict({"type": integrator}), spp=4))
+        assert [text.startswith(said.format(parameter)) for text in logged] == [True] * bool(parameter)
+        assert np.isfinite(image).all() == (scene is clear)
+        if integrator == "path":
+            assert np.isfinite(image[0, 0]).all() and np.isfinite(image[4, 4]).any() == (scene is clear)
+
+
+def test_a_frozen_function_says_it_too(llvm_variant, logged):
+    made = seen(int_absorption=1.0)
+    dr.freeze(lambda seed: mi.render(made, spp=4, seed=seed))(dr.opaque(mi.UInt32, 1))
+    assert sum("int_absorption; expected the integrator refract_path" in text for text in logged) == 2  # one a BSDF
+
+
+@pytest.mark.parametrize("inner", ["refract_path", "path"])
+@pytest.mark.parametrize("outer", [{"type": "moment"}, {"type": "aov", "aovs": "d:depth"}], ids=lambda x: x["type"])
+def test_an_integrator_is_checked_by_those_that_it_calls(outer, inner, rgb_variant):
+    ball = {"type": "sphere", "bsdf": GLASS | {"int_absorption": 1.0}}
+    made = mi.load_dict({"type": "scene", "ball": ball, "integrator": outer | {"inner": {"type": inner}}})
+    if inner == "path":
+        assert "refract: int_absorption; expected the integrator" in refusal(check_integrator, made)
+    else:
+        check_integrator(made)

@@ -5,6 +5,7 @@ One wavelength goes on for all of them, and no light is lost or made.
 
 import itertools
 import math
+import re
 
 import drjit as dr
 import mitsuba as mi
@@ -142,7 +143,9 @@ def test_at_the_plateau_the_light_of_the_others_is_reflected_by_chance(spectral_
 def test_an_index_within_1e_7_of_the_surroundings_is_not_rounded(spectral_variant):
     """κ = k² − 1 = 4e-7 at grazing incidence: in float32 the index would be off by a third of n − 1."""
     excess, wavelength, angle = 2e-7, 500.0, math.pi / 2 - 1e-3
-    bent = sample(load(f"cauchy(1, {excess * wavelength**2!r})"), tilted(angle), REFRACTED, (wavelength,) * 4)
+    bent = sample(
+        load(f"cauchy_um(1, {excess * (wavelength / 1000) ** 2!r})"), tilted(angle), REFRACTED, (wavelength,) * 4
+    )
     sin_i, cos_i = (float(np.float32(x)) for x in (math.sin(angle), math.cos(angle)))
     expected = math.sqrt(1 - sin_i**2 / (sin_i**2 + cos_i**2) / (1 + excess) ** 2)
     assert -bent.wo[2] == pytest.approx(expected, rel=4e-7)
@@ -183,9 +186,30 @@ def test_a_spectrum_is_no_index_where_it_becomes_a_colour(scalar_variant):
 
 
 def test_a_medium_whose_range_leaves_out_colour_is_refused(spectral_variant):
-    said = r"int_ior: .* from 420 to 830 nm: .* of the colour lies outside; expected at most"
-    with pytest.raises(RuntimeError, match=said):
-        load("table(420: 1.5, 830: 1.4)")
+    said = r"int_ior: .* from {} to {} nm: {} of the colour lies outside; expected at least 380 … 716 nm, or hold\(…\)"
+    for low, high, lost in ((420, 830, "5.1%"), (400, 700, "0.5%"), (390, 710, "0.15%")):
+        with pytest.raises(RuntimeError, match=said.format(low, high, lost)):
+            load(f"table({low}: 1.5, {high}: 1.4)")
+    load("table(380: 1.5, 716: 1.4)")
+
+
+def test_a_medium_that_is_held_has_the_index_of_its_end_with_a_warning_of_how_much(spectral_variant, logged):
+    bsdf = load("hold(table(450: 1.5, 700: 1.4))")
+    for wavelength, index in ((380.0, 1.5), (450.0, 1.5), (575.0, 1.45), (800.0, 1.4)):
+        bent = sample(bsdf, tilted(0.5), REFRACTED, (wavelength, 500.0, 600.0, 700.0))
+        assert bent.wo[0] == pytest.approx(-math.sin(0.5) / index, rel=1e-6)
+    (text,) = logged
+    assert re.search(r"450 to 700 nm; other light \(46% of the colour\) has the index of the range's end", text)
+
+
+def test_a_file_of_an_index_is_looked_for_beside_the_scene(spectral_variant, tmp_path):
+    (tmp_path / "glass.csv").write_text("µm,n\n0.36,1.5\n0.83,1.4\n", "utf-8")
+    (tmp_path / "scene.xml").write_text(
+        '<bsdf type="refract" version="3.0.0"><string name="int_ior" value="file:glass.csv"/>'
+        '<float name="ext_ior" value="1"/></bsdf>'
+    )
+    bent = sample(mi.load_file(str(tmp_path / "scene.xml")), tilted(0.5), REFRACTED, (360.0, 500.0, 600.0, 700.0))
+    assert bent.wo[0] == pytest.approx(-math.sin(0.5) / 1.5, rel=1e-6)
 
 
 def test_coefficients_are_parameters(spectral_variant):

@@ -13,7 +13,7 @@ from support.glass_scenes import BLACK, GLASS, PLACE, SKY, camera, equal_means, 
 from support.variants import switch
 
 from mi_refract.image_diff import pixelwise, tile_statistics
-from mi_refract.plugins import refract_path, sampling, scene_features
+from mi_refract.plugins import path_loop, refract_path, sampling, scene_features
 from mi_refract.rendering import scene_files
 from validation.run.context import SCENES
 
@@ -192,11 +192,23 @@ def test_a_deterministic_image_errs_by_what_it_says_was_truncated(llvm_variant):
     assert exact[..., 3].max() < 0.01
 
 
-def test_what_would_be_left_to_chance_is_refused(llvm_variant):
-    blend = {"type": "blendbsdf", "weight": 0.5, "a": {"type": "refract"}, "b": {"type": "conductor"}}
-    for bsdf in ({"type": "diffuse"}, {"type": "thindielectric"}, blend):
-        scene = glass_ball(sky=LIT, other={"type": "sphere", "bsdf": bsdf})
-        assert "expected only smooth dielectrics and conductors" in refusal(render, scene, 1, deterministic=True)
+BLEND = {"type": "blendbsdf", "weight": 0.5, "a": {"type": "refract"}, "b": {"type": "conductor"}}
+
+
+@pytest.mark.parametrize(
+    ("other", "kind"),
+    [
+        ({"bsdf": {"type": "diffuse"}}, "SmoothDiffuse"),
+        ({"bsdf": {"type": "thindielectric"}}, "ThinDielectric"),
+        ({"bsdf": BLEND}, "BlendBSDF"),
+        ({"type": "instance", "group": {"type": "ref", "id": "group"}}, "Instance"),
+    ],
+)
+def test_what_would_be_left_to_chance_is_refused_by_name(other, kind, llvm_variant):
+    group = {"type": "shapegroup", "id": "group", "ball": {"type": "sphere", "bsdf": BLACK}}
+    scene = glass_ball(sky=LIT, group=group, other={"type": "sphere"} | other)
+    text = f"refract_path: deterministic = true: {kind} at 'other'; expected only smooth dielectrics and conductors"
+    assert refusal(render, scene, 1, deterministic=True) == text
 
 
 # What is left out, and what is refused -------------------------------------------------------------------------
@@ -260,6 +272,16 @@ def test_parameters_and_their_defaults_are_written_out(scalar_variant):
         lines = [f"  {name} = {value}," for name, value in zip(names, values, strict=True)]
         said = str(mi.load_dict({"type": "refract_path"} | parameters))
         assert said.splitlines() == ["RefractPath[", *lines, "  left out = no scene seen yet,", "]"]
+
+
+def test_samples_of_a_scalar_render_share_their_loop(scalar_variant, monkeypatch):
+    """Which is half of the time of a sample. An image of one block is rendered by one thread."""
+    made, start = [], path_loop.PathLoop.__init__
+    monkeypatch.setattr(path_loop.PathLoop, "__init__", lambda self, *more: made.append(self) or start(self, *more))
+    for count in (1, 2):
+        render(glass_ball(4, sky=LIT), 4, split_depth=1)
+        assert len(made) == count
+    assert made[0].branch is made[1].branch  # making a class takes ten times as long as a sample
 
 
 # Where flags, tangents and seeds were taken for granted ---------------------------------------------------------

@@ -7,12 +7,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mitsuba as mi
+import numpy as np
 import pytest
 from support.readme import python_blocks
 
 from mi_refract import backend, plugins
 
 ROOT = Path(__file__).parents[2]
+README = Path(plugins.__file__).with_name("README.md")
 LOAD = "mi.load_dict({'type': 'refract'})"
 SET = "mi.set_variant('scalar_rgb')"
 XML = '<scene version="3.0.0"><shape type="sphere"><bsdf type="refract"/></shape></scene>'
@@ -72,8 +75,8 @@ def test_switching_to_a_vectorised_variant_and_back():
     assert outcome.returncode == 0, outcome.stderr
 
 
-def example(number, **changes):
-    code = python_blocks(Path(plugins.__file__).with_name("README.md"))[number]
+def example(number, path=README, **changes):
+    code = python_blocks(path)[number]
     for old, new in changes.values():
         assert old in code
         code = code.replace(old, new)
@@ -91,6 +94,14 @@ def test_the_readme_in_a_scene(tmp_path, monkeypatch, llvm_variant):
         wait=("mi.render(scene)", "mi.render(scene), write_async=False"),
     )
     assert (tmp_path / "diamond.png").stat().st_size > 0
+
+
+def test_the_smallest_scene_of_the_first_page(tmp_path, monkeypatch, llvm_variant):
+    monkeypatch.chdir(tmp_path)
+    size = ('"width": 400, "height": 300', '"width": 8, "height": 6')
+    example(0, ROOT / "README.md", size=size, wait=("spp=64)", "spp=4), write_async=False"))
+    image = np.array(mi.Bitmap(str(tmp_path / "ball.png")))
+    assert image.shape == (6, 8, 3) and image[0, 0].min() == 255 > image[3, 0].max()  # the sky, and the floor
 
 
 def test_the_readme_recovers_an_index_from_an_image(capsys, llvm_variant):

@@ -25,7 +25,7 @@ def facts(**parts):
     """The names of what is true of a scene of a glass ball and `parts`."""
     ball = {"type": "sphere", "bsdf": {"type": "refract"}}
     every = dataclasses.asdict(needs(**{"sensor": {"type": "perspective"}, "ball": ball} | parts))
-    return {name for name, value in every.items() if value is True} - {"refracting", "deterministic", "shape_media"}
+    return {name for name, value in every.items() if value is True} - {"refracting", "shape_media"}
 
 
 def sphere(bsdf, **parts):

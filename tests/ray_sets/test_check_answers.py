@@ -276,7 +276,7 @@ def test_a_wrong_signal_and_several_signals_are_stated():
     for tir in set(GOOD) - {"zero"}:
         found = check(some(), answers, tir=tir)
         assert (found.exit_code, found.tir, found.problems[0].kind) == (1, tir, "zero")
-    with pytest.raises(ValueError, match="no column `transmitted`"):
+    with pytest.raises(ValueError, match="expected answers with a column `transmitted`"):
         check(some(), answers, tir="flag")
     mixed = changed(answers, np.flatnonzero(~exact("f32")[0].transmitted)[::2], np.nan)
     found = check(some(), mixed)

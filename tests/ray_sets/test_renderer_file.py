@@ -80,10 +80,10 @@ REFUSED = {
     "command: {python!r}: 'python'; expected {python}": TITLED.replace("./r", "{python!r}"),
     "command: {python.x}: 'python.x'; expected {python}": TITLED.replace("./r", "{python.x}"),
     "command: {: Single '{' encountered in format string; expected {python}": TITLED.replace("./r", "{"),
-    "rays[0].gives_up: expected `float` >= 0": f"{TITLED}gives_up = -1\n",
-    "rays[0].recorded.random: expected a finite number": f"{TITLED}recorded = {{ random = nan }}\n",
+    "rays[0].gives_up: expected a number >= 0": f"{TITLED}gives_up = -1\n",
+    "rays[0].recorded.random: nan; expected a finite number": f"{TITLED}recorded = {{ random = nan }}\n",
     "deviation[0]: object missing required field `reason`": f'{TITLED}[[rays.deviation]]\nregime = "x"\n',
-    "images.spp[...]: expected `int` >= 1": (
+    "images.spp[...]: expected a whole number >= 1": (
         'title = "T"\n[images]\nexport = "json"\ncommand = ["x"]\nspp = { a = 0 }\n'
     ),
     "Invalid value": "title = ",

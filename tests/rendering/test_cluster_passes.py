@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from support.dask_workers import accepted, joined, kill, until
-from support.processes import python
+from support.dask_workers import accepted, joined, kill
+from support.processes import python, until
 from support.renders import GLASS
 
 from mi_refract.cluster import workers as workers_module
@@ -72,7 +72,7 @@ def busy(client):
 
 def test_two_workers_and_a_machine_with_another_llvm(client, scene, variant):
     """Which says so in the header."""
-    found, expected = rendered(scene, 200, source(client, scene, variant)), rendered(scene, 200)
+    found, expected = rendered(scene, 80, source(client, scene, variant)), rendered(scene, 80)
     same(found, expected)
     assert found[1]["mi_refract:machines"] == os.uname().nodename
     until(lambda: not busy(client), 10)
@@ -123,7 +123,7 @@ def test_eight_workers_out_of_order(scene, variant):
         try:
             with connected(process.stdout.readline().strip()) as client:
                 passes = source(client, scene, variant)
-                same(rendered(scene, 100, passes), rendered(scene, 100))
+                same(rendered(scene, 70, passes), rendered(scene, 70))
                 assert len(passes.workers.machines) == 8
         finally:
             process.kill()

@@ -111,16 +111,16 @@ def test_few_passes_have_the_variance_of_their_samples(tmp_path, llvm):
 def test_renders_under_a_wide_filter_are_equal_to_their_like(tmp_path, llvm, spp, pass_spp):
     """Neighbours share samples there, also in files whose variance has as many degrees of freedom as samples.
 
-    At a family error of 20 % more than 8 of 15 pairs are different once in 1270 runs, where 20 % is what comes up.
+    At a family error of 20 % more than 6 of 10 pairs are different once in 1157 runs, where 20 % is what comes up.
     """
     scene, images = changed(tmp_path, ('"box"', '"gaussian"')), []
-    for seed in range(30):
+    for seed in range(20):
         output = tmp_path / "a.exr"
         rendering(output, seed, scene, {"res": "64"}, spp=spp, pass_spp=pass_spp, restart=True).run()
         images.append(read(output))
     pairs = zip(images[::2], images[1::2], strict=True)
     verdicts = [compare("auto", a, b, family_error=0.2, resolution=9.0).verdict for a, b in pairs]
-    assert verdicts.count(Verdict.DIFFERENT) <= 8
+    assert verdicts.count(Verdict.DIFFERENT) <= 6
 
 
 def test_pixels_that_are_not_finite_are_counted(tmp_path, llvm, monkeypatch):
@@ -340,26 +340,6 @@ def forged(header=None, nodes=None, more=b""):
 KINDS = ["total", "between", "within"]
 
 
-def test_the_catalogue_of_a_glass_is_part_of_the_render(tmp_path, llvm, monkeypatch):
-    """Here and on workers; where no glass of a catalogue is named, catalogues do not count."""
-    pytest.importorskip("opticalglass")
-    for name, index in (("glass", "SCHOTT:N-BK7"), ("number", "water")):
-        bsdf = f'<bsdf type="refract"><string name="int_ior" value="{index}"/></bsdf>'
-        (tmp_path / f"{name}.xml").write_text(SKY.format(f'<shape type="sphere">{bsdf}</shape>'))
-
-    def begun(name):
-        return resume(Job(tmp_path / f"{name}.xml"), tmp_path / f"{name}.exr", Limits(spp=16, pass_spp=4))
-
-    for name in ("glass", "number"):
-        render = begun(name)
-        assert (on_worker.GLASSES in render.tolerated_facts) == (name == "number")
-        stopped_after(render, 2)
-    monkeypatch.setattr(on_worker, "glass_catalogues", lambda: "another")
-    assert begun("number").progress.passes == 2
-    with pytest.raises(ValueError, match=r"glass catalogues was \w+, is another; pass --restart"):
-        begun("glass")
-
-
 def test_sums_from_elsewhere_are_checked(tmp_path, llvm):
     render = rendering(tmp_path / "a.exr", spp=16, pass_spp=4)
 
@@ -546,9 +526,7 @@ def ended_by(number, output, spp, variant="llvm_ad_rgb", handler="default"):
 def test_sigkill_at_random_times_leaves_a_checkpoint_and_the_same_bits(tmp_path, llvm):
     output, limits = tmp_path / "a.exr", {"spp": 800, "pass_spp": 4}
     assert ended_by(signal.SIGKILL, output, 800)[0] == -signal.SIGKILL
-    for _ in range(2):
-        if ended_by(signal.SIGKILL, output, 800)[0] == 0:
-            break
+    ended_by(signal.SIGKILL, output, 800)  # or to its end
     if not output.exists():
         render = rendering(output, defines={"res": "32"}, **limits)
         assert render.progress.passes

@@ -116,6 +116,20 @@ def test_a_file_that_is_called_as_a_material_changes_nothing_elsewhere(folder, t
     np.testing.assert_array_equal(image(elsewhere(folder, there, pack(scene))), expected)
 
 
+def test_a_file_of_an_index_is_part_of_the_scene_here_and_elsewhere(folder, there):
+    scene = written(folder)
+    glass = GLASS.replace("diamond", "hold(file:../far/n(1).csv)")
+    scene.write_text(scene.read_text().replace("</scene>", glass))
+    (folder / "far" / "n(1).csv").write_text("nm,n\n400,1.5\n700,1.5\n")
+    assert parse_scene(scene).files()["hold(file:../far/n(1).csv)"].samefile(folder / "far" / "n(1).csv")
+    expected = image(load_scene(scene))
+    np.testing.assert_array_equal(image(elsewhere(folder, there, pack(scene))), expected)
+    # As with the index that the file has.
+    (folder / "scenes-gone").rename(folder / "scenes"), (folder / "common-gone").rename(folder / "common")
+    scene.write_text(scene.read_text().replace("hold(file:../far/n(1).csv)", "1.5"))
+    np.testing.assert_allclose(image(load_scene(scene)), expected, rtol=1e-5)
+
+
 PARAMETERS = """<scene version="3.0.0"><medium type="homogeneous" id="m"><rgb name="albedo" value="1 2 3"/></medium>
 <sensor type="thinlens"><transform name="to_world"><rotate x="1" y="2" angle="33.3"/><scale x="0.3" y="7"/></transform>
 <string name="fov_axis" value="a&quot;&lt;b"/><float name="fov" value="1e-3"/></sensor>

@@ -16,7 +16,7 @@ from support.browser import needs_chromium, seen
 
 from mi_refract.io.text import compact, distinguishable, printable
 from mi_refract.report import documents, run_report
-from mi_refract.report.plots import Axes, curves_svg, pareto
+from mi_refract.report.plots import Axes, Scatter, curves_svg, pareto, scatter_svg
 from mi_refract.report.row import Row
 from mi_refract.report.study_page import NOT_RUN
 
@@ -229,8 +229,34 @@ def test_matrix_marks_a_row_whose_other_metric_broke(tmp_path):
     text = html(tmp_path, rows)
     assert re.search(r'<td class="fail" [^>]*>1e-8<small>misjudged 7 &gt; 0</small>', text)
     assert re.search(r'<td class="fail" [^>]*>·<small>misjudged 8 &gt; 0</small>', text)
-    assert re.search(r'<td class="info" style="--depth:1" [^>]*>nan<', text)
+    assert re.search(r'<td class="info beyond" style="--depth:1" [^>]*>nan<', text)
     assert re.search(r'<td class="not-run" [^>]*title="lost">not run<', text)
+
+
+def test_colours_run_over_what_means_something_and_mark_what_is_beyond(tmp_path):
+    values = itertools.cycle([1e-12, 1.0, 1e4, 1e8, 2e69, INF])
+    rows = [Row("s", s, c, "", {"error": next(values)}) for s, c in itertools.product("abc", "xyz")]
+    shown = html(tmp_path, rows, {"studies": {"s": {"scale": (1.0, 1e8)}}})
+    cells = dict(re.findall(r'<td class="([^"]*" style="--depth:[^"]*)" [^>]*>([^<]*)<', shown))
+    assert cells == {
+        'info" style="--depth:0': "1",
+        'info" style="--depth:0.5': "10000",
+        'info" style="--depth:1.0': "1e8",
+        'info beyond" style="--depth:1': "inf",
+    }
+    assert '<span>1</span><i></i><span>1e8</span><i class="beyond">' in shown
+
+
+def test_what_would_not_fit_beside_each_other_is_put_below(tmp_path):
+    """More cases than fit beside each other are the lines of a matrix; more metrics have a second table."""
+    rows = [Row("s", s, f"case {i}", "", {"x": 1.0 + i}) for s in "abc" for i in range(20)]
+    head = re.search(r'class="matrix".*?<thead>(.*?)</thead>', html(tmp_path, rows, {}), re.S)[1]
+    assert re.findall("<th>(.*?)</th>", head) == ["a", "b", "c"]
+    values = {f"measurement{i}": 1.0 for i in range(20)}
+    text = html(tmp_path, [Row("s", x, "", "", values, replay={"seed": 1}) for x in "ab"], {})
+    heads = [re.findall("<th>(.+?)</th>", head) for head in re.findall("<thead>(.*?)</thead>", text, re.S)]
+    assert len(heads) > 1 and list(itertools.chain(*heads)) == list(values)
+    assert text.count("<summary>replay</summary>") == 2
 
 
 def test_images_are_embedded_exactly_and_once(tmp_path):
@@ -266,6 +292,10 @@ def test_curves_keep_the_guide_and_literal_names():
     assert "slope −1" in svg and ">$x$</text>" in svg and "var(--c0)" in svg
     assert ">seconds</text>" in svg and ">relMSE</text>" in svg
     assert curves_svg({"x": [(1, 0), (NAN, 1)]}, axes, salt="s") == ""
+    svg = curves_svg({f"line {i}": [(1, i + 1), (2, i + 1)] for i in range(12)}, axes, salt="s")
+    style = (documents.HERE / "report.css").read_text("utf-8")
+    values = [re.findall(rf"{name}: (#\w+)", style) for name in set(re.findall(r"--c\d+", svg))]
+    assert len({light for light, _ in values}) == len({dark for _, dark in values}) == 12
     for wrong in ({"x_scale": "cubic"}, {"slope": 2, "y_scale": "linear"}):
         with pytest.raises(ValueError, match="axes: "):
             Axes(**wrong)
@@ -304,6 +334,24 @@ def test_a_scatter_shows_front_floor_and_intervals_where_asked(tmp_path):
     assert floored == plain + 1 and ">copy</text>" in text
     wide = paths(interval=["low", "high"])[1]
     assert wide.count("<path") == plain and wide != text
+
+
+def test_no_line_of_a_scatter_goes_through_a_name():
+    """Points close to each other, the floor's line among them, and the front's right of the last one."""
+    points = {name: [(1 + 0.01 * i, 10.0**i)] for i, name in enumerate(["first", "second", "third"])}
+    panel = Scatter(points | {"last": [(2.0, 0.1)]}, [("last", 1.9, 2.1, 0.1)], floor=1.03)
+    svg = scatter_svg({"here": panel}, Axes("x", "y", "linear"), floor="floor", front=True, salt="s")
+    places = re.findall(r'x="([\d.]+)" y="([\d.]+)"[^>]*>(\w+)</text>', svg)
+    names = {name: (float(x), float(y)) for x, y, name in places if name in [*points, "last", "floor"]}
+    assert len(names) == 5, svg
+    for d in re.findall(r'<path d="(M[^"z]*)" clip-path="[^"]*" style="[^"]*stroke: var\(--(?!line)', svg):
+        corners = [tuple(map(float, pair)) for pair in re.findall(r"([\d.]+) ([\d.]+)", d)]
+        for (x0, y0), (x1, y1) in itertools.pairwise(corners):  # upright or level
+            for name, (x, y) in names.items():
+                across = max(min(x0, x1), x) < min(max(x0, x1), x + 5 * len(name))
+                assert not (across or x <= x0 == x1 <= x + 5 * len(name)) or not (
+                    min(y0, y1) < y - 1 and y - 6 < max(y0, y1)
+                ), (name, d)
 
 
 def test_an_overlay_stands_beside_the_other_images_in_a_fixed_order(tmp_path):

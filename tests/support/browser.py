@@ -15,7 +15,14 @@ needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PAT
 def browse(page, profile):
     """The page's DOM after its scripts ran, and whatever the console said."""
     quiet = ("background-networking", "component-update", "sync", "gpu", "dev-shm-usage")
-    flags = ("--headless", "--no-sandbox", *(f"--disable-{q}" for q in quiet), "--no-first-run", "--dump-dom")
+    flags = (
+        "--headless",
+        "--no-sandbox",
+        *(f"--disable-{q}" for q in quiet),
+        "--no-first-run",
+        "--dump-dom",
+        "--window-size=1280,900",
+    )
     more = (f"--user-data-dir={profile}", "--enable-logging=stderr", "--virtual-time-budget=10000", page.as_uri())
     done = subprocess.run([CHROMIUM, *flags, *more], capture_output=True, text=True, timeout=120, check=True)
     return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]

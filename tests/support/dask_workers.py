@@ -7,8 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 from support.processes import ENVIRONMENT
@@ -66,11 +65,3 @@ def program(*words: str, security: Any) -> Iterator[subprocess.Popen[bytes]]:
     finally:
         process.kill()
         process.wait()
-
-
-def until(reached: Callable[[], Any], seconds: float = 60.0) -> None:
-    """Wait until something is so; a failure after `seconds`."""
-    deadline = time.monotonic() + seconds
-    while not reached():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)

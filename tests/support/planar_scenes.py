@@ -56,6 +56,7 @@ def scene(segments, origins, directions, **given):
     default = {
         "path": Path("test.toml"),
         "title": "A test",
+        "shape_names": ("shape[0]",) * len(segments[0]),
         "light": Light(given.pop("colours", ("",) * len(segments))),
         "regions": (Region(outline, tuple(s.n_left[0] for s in segments)),),
         "index": (1.0,) * len(segments),

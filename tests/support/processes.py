@@ -1,11 +1,14 @@
-"""Python code in a process of its own that imports the package from this checkout."""
+"""Python code in a process of its own that imports the package from this checkout, and waiting for what it does."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])}
@@ -20,3 +23,11 @@ def python(code: str, *arguments: object, **environment: str) -> subprocess.Pope
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
+
+
+def until(reached: Callable[[], Any], seconds: float = 60.0) -> None:
+    """Wait until something is so; a failure after `seconds`."""
+    deadline = time.monotonic() + seconds
+    while not reached():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)

@@ -201,8 +201,7 @@ def test_what_is_drawn_is_kept_by_seed():
 @pytest.mark.filterwarnings("ignore:.*is an extrapolation")  # wavelengths are drawn beyond the fit of a glass
 @pytest.mark.parametrize("name", RUN)
 def test_a_study_holds_its_bounds_none_of_which_is_a_hundred_times_too_wide(name, tmp_path, llvm_variant, monkeypatch):
-    one = {"SCHOTT": glass_catalogs.CATALOGS["SCHOTT"]}  # each takes a second
-    monkeypatch.setattr(glass_catalogs, "CATALOGS", one)
+    monkeypatch.setattr(glass_catalogs, "CATALOGS", ("SCHOTT",))  # each takes a second
     tasks = STUDIES[name].tasks(here("quick", tmp_path, "llvm_ad_rgb"))
     made = [(task, row) for task in tasks for row in task.run()]
     silent = [row.name for task, row in made if not (row.bounds or row.reason or task.timed)]

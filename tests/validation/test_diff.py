@@ -64,7 +64,7 @@ def test_the_defects_are_seen_and_no_other_sampler(llvm_variant, monkeypatch):
 
 
 def test_what_nobody_sees_is_equal_and_what_a_person_sees_is_different():
-    rows = {name: visible_changes.kind_row(name, 4) for name in visible_changes.KINDS}
+    rows = {name: visible_changes.kind_row(name, 2) for name in visible_changes.KINDS}
     assert {row.verdict for row in rows.values()} == {"pass", "info"}
     dues = {name: due for name, (_, _, due) in visible_changes.KINDS.items()}
     assert min(list(dues.values()).count(due) for due in (False, True)) >= 3
@@ -107,7 +107,7 @@ def test_the_table_of_defects_is_made_of_the_rows_of_the_self_test():
 def test_bounds_elsewhere_fail(monkeypatch, local, patch, failed):
     real = flip.flip
     monkeypatch.setattr(flip, "flip", lambda *pair: real(*pair, local=local, patch=patch))
-    assert {visible_changes.kind_row(name, 4).verdict for name in failed} == {"fail"}
+    assert {visible_changes.kind_row(name, 2).verdict for name in failed} == {"fail"}
 
 
 @pytest.mark.parametrize("defect", [False, True])

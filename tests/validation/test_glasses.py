@@ -24,7 +24,6 @@ SOME = ("SCHOTT:N-BK7", "SCHOTT:F2", "SUMITA:K-BK7")
 
 @pytest.fixture
 def rays():
-    pytest.importorskip("opticalglass")
     return glasses.given(SOME)
 
 
@@ -84,7 +83,6 @@ table.write(rays, np.where(d < 0, 0, k * a - (k * c + np.sqrt(np.abs(d))) * n), 
 
 def test_a_program_is_judged_for_its_own_index_and_a_broken_one_fails(tmp_path):
     """Every glass has n = 1.5: all directions are right, and no index is."""
-    pytest.importorskip("opticalglass")
 
     def rows_of(text):
         (tmp_path / "program.py").write_text(text)
@@ -103,19 +101,12 @@ def test_a_program_is_judged_for_its_own_index_and_a_broken_one_fails(tmp_path):
         assert row.verdict == verdict and said in row.reason and "\n" not in row.reason
 
 
-def test_without_catalogues_here_the_row_is_not_run(monkeypatch):
-    monkeypatch.setattr(glasses, "find_spec", lambda name: None)
-    (row,) = glasses.system_rows(SYSTEMS["rayoptics"], CATALOGUES["rayoptics"], FULL)
-    assert row.verdict == "not run" and "pip install" in row.reason
-
-
 @pytest.mark.parametrize("name", CATALOGUES)
 def test_systems_that_are_installed_answer_for_their_indices(name):
     catalogue = CATALOGUES[name]
     assert (SCRIPTS / catalogue.script).is_file() and set(catalogue.others) <= set(catalogue.glasses) <= set(GLASSES)
     if reason := environments.absent(SYSTEMS[name]):
         pytest.skip(reason)
-    pytest.importorskip("opticalglass")
     rows = glasses.system_rows(SYSTEMS[name], catalogue, FULL)
     assert len(rows) > len(glasses.REGIMES) and {row.verdict for row in rows} == {"pass"}
     assert {row.case for row in rows if row.missed} <= set(catalogue.others)
@@ -139,8 +130,6 @@ OTHER_CATALOGUES = [
 
 @pytest.mark.parametrize(("system", "glass", "coefficients", "printed", "line"), OTHER_CATALOGUES)
 def test_the_recorded_difference_is_that_of_the_other_catalogue(system, glass, coefficients, printed, line):
-    pytest.importorskip("opticalglass")
-
     def there(w):
         if isinstance(coefficients, dict):
             return sum(x * (w / 1000) ** power for power, x in coefficients.items()) ** 0.5

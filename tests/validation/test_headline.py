@@ -57,7 +57,8 @@ def test_the_names_are_those_of_the_studies():
     assert all(name == study.NAME for study, name in named.items()) and per_formula.ALL == headline.EVERYTHING
     known = {headline.COMMON, metrics.WORST_IN_U, metrics.MISCLASSIFIED, metrics.MISCLASSIFIED_FAR}
     assert known <= per_formula.TERMS.keys()
-    assert metrics.EQUAL_TIME in error_against_time.TERMS and metrics.WRONG_PATH in layered_paths.TERMS
+    assert metrics.EQUAL_TIME in error_against_time.TERMS
+    assert {metrics.WRONG_PATH, metrics.OFF_EXACT, metrics.BUILTIN_OFF_EXACT} <= layered_paths.TERMS.keys()
     compared = {metrics.CHANGED_SHARE, metrics.WELCH_ALARMS, metrics.TIME_OVER_DIELECTRIC}
     assert compared <= against_dielectric.TERMS.keys()
     assert metrics.ERROR_OVER_BOUND in traced_bodies.TERMS and headline.SHALLOW in optical_chains.TERMS
@@ -121,6 +122,11 @@ def test_the_image_is_of_the_scene_that_differs_and_the_plot_of_methods_in_turn(
     assert page["image"]["row"] == rows[1].name and page["plot"]["row"] == rows[0].name
     drawn = {"path + refract": [(1.0, 1.0)]}
     methods = [Row("efficiency", "every method", row.case, "llvm_ad_rgb", {"x": 1.0}, curves=drawn) for row in FAST[:3]]
+    exact = {"off exact": 0.0033, "off exact, built-in": 0.018}
+    seen = Row("paths", "refract", "mirage, telescope: image", "llvm_ad_rgb", exact, images=images | {"exact": "c.exr"})
+    shown = headline.first_page([*rows, seen])["image"]
+    assert shown["row"] == seen.name and shown["labels"]["exact"] == "exact paths"
+    assert "1.8 % of the pixels of `dielectric` are wrong, 0.33 % of those of `refract`" in shown["caption"]
     plot = headline.first_page([*rows, *methods, *FAST])["plot"]
     assert plot["labels"] == {"path + refract": "refract"} and plot["row"] == methods[1].name  # of median gain
     assert {answer["state"] for answer in page["answers"]} <= set(STATES)

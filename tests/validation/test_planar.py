@@ -172,7 +172,8 @@ def test_either_segment_is_right_at_their_vertex():
 
 
 def test_a_wrong_arc_and_a_wrong_place_behind_a_joint_are_seen(monkeypatch):
-    aimed = "joints", SCALAR, (20.0,), (0,)
+    aimed, circle = ("joints", SCALAR, (20.0,), (0,)), list(joints.AIMS["joints"](20.0))[:3]
+    monkeypatch.setitem(joints.AIMS, "joints", lambda turn: circle)
     monkeypatch.setattr(joints, "SCALAR_SHARE", 10)
     assert joints.row(*aimed).verdict == "pass"
 
@@ -213,6 +214,7 @@ def test_walls_do_what_segments_do_and_wrong_walls_are_seen(llvm_variant):
 
 def test_methods_that_differ_in_a_bit_are_seen(scalar_context, monkeypatch):
     context = scalar_context(scalar_rays=4)
+    monkeypatch.setitem(times.ROUNDS, context.profile.name, 1)
 
     def verdicts():
         return {row.case: row.verdict for row in times.measure(context, SCALAR, (10,)) if row.budgets}

@@ -103,6 +103,16 @@ def test_right_answers_pass_and_a_small_error_of_the_normal_fails(rows_of):
     assert {row.case for row in off if row.verdict == "fail"} >= {"random", "grazing"}
 
 
+def test_a_length_counts_as_a_direction_does(rows_of):
+    """Right directions, and lengths that the bound of a textbook's formula allows where k is large."""
+    wide = "k, a, n = (x.astype(np.longdouble) for x in (k, a, n))"
+    unit = "a, n = (x / np.sqrt((x * x).sum(1, keepdims=True)) for x in (a, n))"
+    for factor, missed in ((0, set()), (1e-10, {LARGE})):
+        rows = rows_of(f"{wide}; {unit}", f"b = b * (1 + (k > 1000) * {factor})")
+        assert {row.verdict for row in rows} == {"pass"}
+        assert {row.case for row in rows if per_ray.BACKWARD in row.missed} == missed
+
+
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_the_random_rays_are_those_of_before_any_result(precision):
     """None is left out: rays near the critical angle stay where they were drawn."""

@@ -72,6 +72,7 @@ def test_what_is_the_same_is_not_tested_by_chance_and_still_compared(small):
     )
     assert right.verdict == "pass" and right.reason.startswith("left out: Welch's test")
     assert "Welch alarms" not in right.values and not right.curves
+    assert not right.images and wrong.images  # of one colour there is nothing to see
     assert {"|mean ratio − 1|", "changed share"} <= set(wrong.broken)
     quiet, noisy = np.ones((4, 8, 8, 3)), np.random.default_rng(1).random((4, 8, 8, 3))
     assert against_dielectric._budgets("nested", "").keys() == {"|mean ratio − 1|", "Welch alarms"}
@@ -269,7 +270,7 @@ def test_numbers_that_do_not_fill_the_square_are_seen(llvm_variant, source, coun
 
 
 READS = pytest.mark.skipif(
-    find_spec("opticalglass") is None, reason="opticalglass is not installed: pip install 'mi-refract[glass]'"
+    any(find_spec(name) is None for name in catalogs.READERS), reason="no opticalglass: bash .ci/setup dev"
 )
 HERE = Context(PROFILES["quick"], Path(), "llvm_ad_rgb", backend.detect(), backend.usable_variants())
 GLASS = "cauchy(1.5046, 4200)"
@@ -288,19 +289,26 @@ def test_indices_are_those_of_the_catalogue_and_another_unit_is_found(catalog, m
     row = catalogs.catalog_row(catalog)
     assert row.verdict == "pass" and row.values["glasses"] > 100
     assert catalog not in catalogs.CONSISTENT or row.values["missing"] == 0
-    monkeypatch.setattr(glass_catalogs, "NANOMETRES", 1000.001)
+    for module in (dispersion, glass_catalogs):
+        monkeypatch.setattr(module, "NANOMETRES", 1000.001)
     assert set(catalogs.catalog_row(catalog).broken) == {"formula error"}
 
 
 @READS
 def test_a_glass_with_the_numbers_of_another_is_found(monkeypatch):
-    glasses = dict(glass_catalogs.read("SCHOTT"))
-    glasses["N-BK7"] = replace(glasses["N-BK7"], printed=glasses["F2"].printed, v_d=glasses["F2"].v_d)
-    monkeypatch.setattr(glass_catalogs, "read", lambda catalog: glasses)
+    table, glasses = catalogs.tables("SCHOTT")
+    glasses["N-BK7"] = replace(glasses["N-BK7"], lines=glasses["F2"].lines, v_d=glasses["F2"].v_d)
+    monkeypatch.setattr(catalogs, "tables", lambda catalog: (table, glasses))
     assert set(catalogs.catalog_row("SCHOTT").broken) == {"largest miss"}
     monkeypatch.setattr(catalogs, "find_spec", lambda name: None)
     (row,) = catalogs.rows(None)
-    assert row.verdict == "not run" and "pip install" in row.reason
+    assert row.verdict == "not run" and row.reason.endswith("bash .ci/setup validation")
+
+
+@READS
+def test_the_packages_file_is_what_is_written_of_the_makers_tables(tmp_path):
+    catalogs.write(tmp_path / "glasses.json")
+    assert (tmp_path / "glasses.json").read_bytes() == glass_catalogs.FILE.read_bytes()
 
 
 def test_a_wrong_index_is_found_in_directions(spectral, monkeypatch):

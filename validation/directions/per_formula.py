@@ -25,6 +25,7 @@ from validation.run.metrics import (
     ERROR_OVER_BOUND,
     MISCLASSIFIED,
     MISCLASSIFIED_FAR,
+    ROUNDINGS,
     TIME_OVER_COPY,
     WORST_ANGLE,
     WORST_CHORD,
@@ -180,4 +181,4 @@ def summary(name: str, parts: list[Row], setting: Setting, times: dict[str, floa
     return Row(NAME, name, ALL, setting.label, values | times, budgets, goals, replay=replay)
 
 
-STUDY = Study(NAME, "Directions", about(__doc__), TERMS, tasks, scatter=SCATTER, again=drawn_rows)
+STUDY = Study(NAME, "Directions", about(__doc__), TERMS, tasks, scatter=SCATTER, scale=ROUNDINGS, again=drawn_rows)

@@ -23,7 +23,7 @@ from validation.reference.fast_reference import Screen
 from validation.run import seeds
 from validation.run.array_settings import DOCUMENTED, Setting, budget_of, settings
 from validation.run.context import Context
-from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED, MISCLASSIFIED_FAR, WORST_IN_U
+from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED, MISCLASSIFIED_FAR, ROUNDINGS, WORST_IN_U
 from validation.study import Study, Task, about
 
 NAME = "sweep"
@@ -163,4 +163,4 @@ def _disagreement(found: Gathered, chord: np.ndarray, wrong: np.ndarray) -> floa
     return float(np.max(np.abs(screened - chord) / np.maximum(1, chord / 1e6), initial=0))
 
 
-STUDY = Study(NAME, "Sweep", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))
+STUDY = Study(NAME, "Sweep", about(__doc__), TERMS, tasks, scale=ROUNDINGS, again=repeated.by_tasks(tasks))

@@ -1,14 +1,25 @@
 """Glasses of the makers' catalogues, at the spectral lines for which an index is printed.
 
-Makers print coefficients of a formula and, beside them, indices with five or six decimals. Of each glass the formula
-is evaluated here, and by the package that holds the catalogues; both must agree to rounding. Schott's and Hikari's
-formulas give all of their printed indices. Those of the other makers miss many of their own by a few units of the fifth
-decimal: the row says of how many glasses, and by how much. V_d is compared with the printed one.
+The package has the coefficients of the makers' formulas in one file; the makers' own spreadsheets, which it was made
+from, are read here through the package `opticalglass`. Makers print coefficients of a formula and, beside them, indices
+with five or six decimals. Of each glass the formula is evaluated with the coefficients of the file, and by
+`opticalglass` with those of the spreadsheet; both must agree to rounding. Schott's and Hikari's formulas give all of
+their printed indices. Those of the other makers miss many of their own by a few units of the fifth decimal: the row
+says of how many glasses, and by how much. V_d is compared with the printed one.
+
+`python -c 'from validation.media import catalogs; catalogs.write()'` makes the file anew, after a new edition of
+`opticalglass`; SOURCES says which documents its spreadsheets are.
 """
 
 from __future__ import annotations
 
+import importlib
+import json
+import math
+import warnings
+from dataclasses import dataclass
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,44 +31,111 @@ from validation.limits import CATALOG_FORMULA, PRINTED_INDEX
 from validation.run.context import Context
 from validation.study import Study, Task, about
 
+READERS = "opticalglass", "pandas"  # what the spreadsheets are read with
+ABSENT = "{} is not installed: bash .ci/setup validation"
 CONSISTENT = "SCHOTT", "HIKARI"  # whose formulas give all of their printed indices
+# nm. Hoya prints its formula's own numbers beyond the t line: there no glass is off by more than the last digit, within
+# it a third are. Schott's fit begins at the i line: of what it prints below, most is off by 1e-5 to 4e-5.
+FITTED = {"HOYA": (365.0, 1014.0), "SCHOTT": (365.0, 2326.0)}
+ANY = (0.0, math.inf)
+# The spreadsheets of opticalglass 1.1.1, as they name and date themselves.
+SOURCES = {
+    "CDGM": "CDGM, optical glass, spreadsheet of September 2018",
+    "HIKARI": "Hikari, general catalog data, revision of 2020-04-01",
+    "HOYA": "Hoya, glass data table of 2018-12-15",
+    "OHARA": "Ohara, recommended glasses, spreadsheet of 2018-05-14",
+    "SCHOTT": "Schott, optical glass datatable of 2018-06-01",
+    "SUMITA": "Sumita, optical glass data, version 12.00.05 of 2020-07-29",
+}
 TERMS = {
     "glasses": "of the catalogue, with a formula",
-    "formula error": "largest difference from the index that the package gives for the same coefficients, relative",
+    "formula error": "largest difference from the index that `opticalglass` gives for the spreadsheet, relative",
     "largest miss": "largest difference of an index from the printed one",
     "missing": "glasses of which a printed index is missed by more than half a unit of the fifth decimal and 1e-6",
     "V_d off": "largest difference of V_d from the printed one",
 }
 
 
+@dataclass(frozen=True)
+class Printed:
+    """What a maker prints of a glass. `here`: the entry of the package's file that it makes."""
+
+    here: glass_catalogs.Glass
+    lines: dict[str, float]  # n at spectral lines
+    v_d: float
+    name: str  # as opticalglass has it
+
+
+def tables(catalog: str) -> tuple[Any, dict[str, Printed]]:
+    """A maker's spreadsheet: `opticalglass`'s object of it, and all glasses by name.
+
+    A glass has an index at wavelengths between those for which its maker prints an index, or a transmittance above 0.
+    The formula is fitted in the range of the printed indices (Ohara's technical information, 2.3, says so), or less
+    where FITTED says.
+    """
+    module: Any = importlib.import_module(f"opticalglass.{catalog.lower()}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        (name,) = [name for name in vars(module) if name.lower() == f"{catalog.lower()}catalog"]
+        table, most, glasses = getattr(module, name)(), FITTED.get(catalog, ANY), {}
+        for name, row in table.df.iterrows():
+            printed, transmitting = _finite(row["refractive indices"]), _finite(row["internal transmission mm, 10"])
+            lines = [float(LINES.get(line, line)) for line in printed if line in LINES or isinstance(line, float)]
+            wavelengths = lines + [float(w) for w, share in transmitting.items() if share > 0]
+            c = row["dispersion coefficients"].tolist()
+            if len(_finite(row["dispersion coefficients"])) < len(c):
+                c = []
+            if catalog == "HOYA":  # mantissas, each before its exponent of ten
+                c = [float(f"{x!r}e{int(y)}") for x, y in zip(c[::2], c[1::2], strict=True)]
+            fitted = max(math.floor(min(lines)), most[0]), min(math.ceil(max(lines)), most[1])
+            glasses[str(name).strip()] = Printed(
+                glass_catalogs.Glass((min(wavelengths), max(wavelengths)), fitted, tuple(map(float, c))),
+                {line: n for line, n in printed.items() if line in LINES},
+                float(row["abbe number"]["vd"]),
+                str(name),
+            )
+    return table, glasses
+
+
+def _finite(series: Any) -> dict[Any, float]:
+    """The entries that are numbers, by column: a line's letter or a wavelength in nm."""
+    pandas: Any = importlib.import_module("pandas")
+    numbers = pandas.to_numeric(series, errors="coerce")
+    return {column: float(x) for column, x in numbers.items() if math.isfinite(x)}
+
+
+def write(path: Path = glass_catalogs.FILE) -> None:
+    """Write the package's file of glasses: a line per glass, sorted."""
+
+    def numbers(values: tuple[float, ...]) -> list[float]:
+        return [int(x) if x == int(x) else x for x in values]
+
+    parts = []
+    for catalog, source in SOURCES.items():
+        glasses = {name: [*map(numbers, printed.here)] for name, printed in tables(catalog)[1].items()}
+        lines = [f"  {json.dumps(name)}: {json.dumps(glasses[name])}" for name in sorted(glasses)]
+        parts.append(f' "{catalog}": {{"source": {json.dumps(source)}, "glasses": {{\n' + ",\n".join(lines) + "}}")
+    path.write_text("{\n" + ",\n".join(parts) + "\n}\n", "utf-8")
+
+
 def rows(context: Context) -> list[Row]:
     """One per catalogue."""
-    absent = [name for name in ("opticalglass", "pandas") if find_spec(name) is None]
-    if absent:
-        reason = f"{absent[0]} is not installed: pip install 'mi-refract[glass]'"
-        return [Row(STUDY.name, "catalogues", "printed lines", "", reason=reason)]
+    if absent := [name for name in READERS if find_spec(name) is None]:
+        return [Row(STUDY.name, "catalogues", "printed lines", "", reason=ABSENT.format(absent[0]))]
     return [catalog_row(catalog) for catalog in glass_catalogs.CATALOGS]
 
 
 def catalog_row(catalog: str) -> Row:
     """Every glass that has a formula, at every line that is printed."""
-    from opticalglass.glass import glass_catalog_factory
-
-    glasses = glass_catalogs.read(catalog)  # first: the package warns while it reads
-    table: Any = glass_catalog_factory(catalog if catalog == "CDGM" else catalog.capitalize())
-    others, misses, errors, v_d = (
-        {str(name).strip(): name for name in table.df.index},
-        dict[str, float](),
-        list[float](),
-        list[float](),
-    )
-    for name, glass in glasses.items():
-        if glass.coefficients:
-            medium, other = media.parse(f"{catalog}:{name}"), table.create_glass(others[name], catalog)
-            n: dict[str, Any] = {line: medium.index(LINES[line]) for line in {*glass.printed, *"dFC"}}
-            errors += [abs(n[line] / float(other.calc_rindex(LINES[line])) - 1) for line in glass.printed]
-            misses[name] = max((abs(n[line] - printed) for line, printed in glass.printed.items()), default=0.0)
-            v_d.append(abs((n["d"] - 1) / (n["F"] - n["C"]) - glass.v_d))
+    table, glasses = tables(catalog)
+    misses, errors, v_d = dict[str, float](), list[float](), list[float]()
+    for name, printed in glasses.items():
+        if printed.here.coefficients:
+            medium, other = media.parse(f"{catalog}:{name}"), table.create_glass(printed.name, catalog)
+            n: dict[str, Any] = {line: medium.index(LINES[line]) for line in {*printed.lines, *"dFC"}}
+            errors += [abs(n[line] / float(other.calc_rindex(LINES[line])) - 1) for line in printed.lines]
+            misses[name] = max((abs(n[line] - at_line) for line, at_line in printed.lines.items()), default=0.0)
+            v_d.append(abs((n["d"] - 1) / (n["F"] - n["C"]) - printed.v_d))
     missing = sum(miss > PRINTED_INDEX for miss in misses.values())
     values = {"glasses": len(misses), "formula error": np.max(errors), "largest miss": np.max([*misses.values()])}
     values |= {"missing": missing, "V_d off": np.max(v_d)}

@@ -9,7 +9,6 @@ float32 the ratio that scales the ray's part along the surface is rounded, which
 from __future__ import annotations
 
 import functools
-from importlib.util import find_spec
 from typing import Any
 
 import drjit as dr
@@ -43,7 +42,6 @@ MATERIALS = (
     "MATERIAL:diamond",
     "SCHOTT:N-BK7",
 )
-CATALOGUES = all(find_spec(name) for name in ("opticalglass", "pandas"))
 TERMS = {
     "worst / u": "the largest distance of a direction from the certified one, in roundoffs u of the precision",
     "with the ratio in float32": "the same with what the ratio's rounding adds; the other figures leave it out",
@@ -64,8 +62,6 @@ def tasks(context: Context) -> list[Task]:
 def rows(context: Context, spec: str) -> list[Row]:
     """Of the index, of the BSDF, and of a formula in each setting with float64."""
     row = functools.partial(Row, NAME, SUBJECTS.get(spec, spec))
-    if spec.startswith("SCHOTT") and not CATALOGUES:
-        return [row("all", "", reason="opticalglass is not installed: pip install 'mi-refract[glass]'")]
     medium, count = media.parse(spec), context.profile.rays
     missing = context.variants.get(SPECTRAL, "not in this wheel")
     table = [index_row(medium, spec)]

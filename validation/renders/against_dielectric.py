@@ -56,6 +56,7 @@ AXES = {"x": "seconds", "y": "relMSE", "slope": -1}  # relMSE is a variance
 # Paths in these scenes are short: a difference in the last bit stays one, unless it flips the choice of a lobe.
 SHORT_PATHS = {"sphere", "slab", "prism", "furnace"}
 CHANGED = 1e-5
+UNIFORM = 1e-3  # images of one colour are not shown
 TILE = 16
 CURVE_SEEDS = 2
 TIMED = 0.1  # seconds of a render whose time counts
@@ -98,7 +99,8 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
     }
     images, folder, means = {}, Path("images") / scene, (test.mean(0), reference.mean(0))
     (context.out / folder).mkdir(parents=True, exist_ok=True)
-    for role, image in (("reference", means[1]), ("test", means[0]), ("difference", means[0] - means[1])):
+    shown = (("reference", means[1]), ("test", means[0]), ("difference", means[0] - means[1]))
+    for role, image in () if np.ptp(means) <= UNIFORM else shown:
         images[role] = str(folder / (f"{BUILTIN}.exr" if role == "reference" else f"{plugin} {role}.exr"))
         pixels = image.astype(np.float32)
         image_file.write_exr(context.out / images[role], pixels, metadata=replay | {"role": role})

@@ -26,11 +26,12 @@ DIRECTIONS, EVERYTHING, COMMON = "directions", "all regimes", "generic"
 OURS, BUILTIN_FORMULA = ("compensated", "promoted"), "mi.fresnel + mi.refract"
 GROUND_TRUTH, RENDERS, EFFICIENCY, PATHS = "ground_truth", "renders", "efficiency", "paths"
 PLUGIN, BUILTIN, INTEGRATOR, METHODS = "refract", "dielectric", "refract_path", "every method"
-MIRAGE, ROUNDED = "mirage", "exact, indices in float32"
+MIRAGE, EXACT, ROUNDED = "mirage", "exact", "exact, indices in float32"
 LAYERS, SHALLOW = 1000, "89.55°"
 INSTALL = "other renderers, by `python -m validation renderers --install "
 NOT_MEASURED = "Not measured in this run."
 LEAD = "`refract` is this project's drop-in replacement for Mitsuba's material of smooth glass, `dielectric`."
+LINES = "its thin lines are right, light along a layer of air"
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 PLOTTED = {
     "path + dielectric": "dielectric",
@@ -75,7 +76,7 @@ def first_page(rows: Sequence[Row], profile: str = "") -> FirstPage:
         text, state = (texts[key], state) if texts[key] else (NOT_MEASURED, "not measured")
         answers.append({"question": question, "text": text, "state": state, "study": study})
     page: FirstPage = {"lead": LEAD, "answers": answers}
-    if image := _image(ours):
+    if image := _image(ours, select(paths, PATHS, PLUGIN)):
         page["image"] = image
     if plot := _plot(rows):
         page["plot"] = plot
@@ -199,15 +200,20 @@ def remedies(rows: Sequence[Row]) -> dict[str, int]:
     return dict(counts.most_common()) | ({"": others} if others else {})
 
 
-def _image(ours: Sequence[Row]) -> ShownRow | None:
-    """The scene in which the plugins differ most, else the first one."""
+def _image(ours: Sequence[Row], paths: Sequence[Row]) -> ShownRow | None:
+    """The two plugins beside exact paths; else the scene in which the plugins differ most, else the first one."""
+    for row in (row for row in paths if EXACT in row.images):
+        off, builtin_off = (percent(row.values[metric]) for metric in (metrics.OFF_EXACT, metrics.BUILTIN_OFF_EXACT))
+        said = f"beside exact paths, {builtin_off} of the pixels of `{BUILTIN}` are wrong, {off} of those of `{PLUGIN}`"
+        labels = {"reference": BUILTIN, "test": PLUGIN, EXACT: "exact paths"}
+        return {"row": row.name, "labels": labels, "caption": f"Scene `{MIRAGE}`: {said}; {LINES}."}
     pairs = [row for row in ours if {"reference", "test"} <= row.images.keys()]
     if not pairs:
         return None
     row = max(pairs, key=lambda row: row.values.get(metrics.WELCH_ALARMS, 0))
     said = "the two differ" if row.values.get(metrics.WELCH_ALARMS) else "the same up to noise"
     if row.case == MIRAGE and row.values.get(metrics.WELCH_ALARMS):
-        said = f"`{PLUGIN}` keeps the edges that `{BUILTIN}` breaks into stairs"
+        said = f"`{PLUGIN}` keeps the edges that `{BUILTIN}` breaks into stairs; {LINES}"
     labels = {"reference": BUILTIN, "test": PLUGIN}
     return {"row": row.name, "labels": labels, "caption": f"Scene `{row.case}`: {said}."}
 

@@ -11,6 +11,7 @@ MISCLASSIFIED = "TIR misclassified"
 WORST_CHORD = "worst chord"
 WORST_IN_U = "worst / u"
 WORST_ANGLE = "worst rad"
+ROUNDINGS = 1.0, 2.0**53  # between which an error in u means something: one rounding, and no right digit of a double
 # Times
 TIME_OVER_COPY = "time / copy"
 TIME_OVER_PLAIN = "time / plain"
@@ -20,6 +21,8 @@ TIME_OVER_DIELECTRIC = "time / dielectric"
 WRONG_PATH = "wrong path"
 WRONG_PATH_FAR = "wrong path, beyond rounding"
 # Images
+OFF_EXACT = "off exact"
+BUILTIN_OFF_EXACT = "off exact, built-in"
 MEANS_DIFFER = "|mean ratio − 1|"
 CHANGED_SHARE = "changed share"
 WELCH_ALARMS = "Welch alarms"

@@ -30,8 +30,8 @@ from validation.run import seeds
 from validation.run.array_settings import DOCUMENTED, right_plugins
 from validation.run.bsdf_sampling import OFFSET
 from validation.run.context import SCENES, Context
-from validation.run.metrics import WRONG_PATH
-from validation.run.render_methods import save_image
+from validation.run.metrics import BUILTIN_OFF_EXACT, OFF_EXACT, WRONG_PATH
+from validation.run.render_methods import Camera, opened, save_image
 from validation.study import Study, Task, about
 
 INDICES, RATIOS = "exact, indices in float32", "exact, ratios in float32"
@@ -46,6 +46,10 @@ TERMS = {
     "ray offset": "the place error if the exact path had no ray offset: the same for every plugin",
     "pixels off": "pixels of which a channel differs by more than 0.1 from the built-in's, same seed",
     "pixels off, control": "the same between two formulas at the rounding limit: caused by flipped lobes alone",
+    "exact (image)": "the image by Snell's and Fresnel's laws in double precision, with Mitsuba's ray offset",
+    OFF_EXACT: "pixels of which a channel differs by more than 0.1 from that image, by other random numbers",
+    BUILTIN_OFF_EXACT: "the same of the built-in's image",
+    "off exact / built-in": "the one over the other",
 }
 AXES = {"x": "distance, or mrad of entry", "y": "deviation", "x_scale": "linear", "y_scale": "log"}
 NAME = "paths"
@@ -54,6 +58,7 @@ SCALAR = "needs a compiled variant: on scalar arrays formulas compute in double 
 SEED = 2028
 RAYS = 64
 VISIBLE = 0.1
+EXACT_SPP = 64
 # The images: a scene, what its parameters are, and the name of the view.
 VIEWS: tuple[tuple[str, dict[str, str], str], ...] = (
     ("mirage", {}, "mirage, telescope"),
@@ -385,26 +390,72 @@ def view_rows(context: Context, scene: str, parameters: dict[str, Any], name: st
     """`refract` and the built-in, image against image; and what flipped lobes alone do, as a control."""
     if context.variant.startswith("scalar"):
         return [Row(NAME, PLUGIN, f"{name}: image", context.variant, reason=SCALAR)]
-    profile, right = context.profile, right_plugins()[0]
-    spp = max(1, profile.spp // 4)
-
-    def render(plugin: str) -> np.ndarray:
-        import mitsuba as mi
-
-        path = str(SCENES / f"{scene}.xml")
-        loaded = mi.load_file(path, **scene_files.REPRODUCIBLE, bsdf=plugin, res=profile.resolution, **parameters)
-        return np.array(mi.render(loaded, spp=spp, seed=0), dtype=np.float64)
-
-    reference, test, control = map(render, (BUILTIN, PLUGIN, right))
+    profile, right, exact = context.profile, right_plugins()[0], name == VIEWS[0][-1]
+    spp, plugins = EXACT_SPP if exact else max(1, profile.spp // 4), (BUILTIN, PLUGIN, right)
+    path = SCENES / f"{scene}.xml"
+    scenes = {plugin: opened(path, plugin, profile.resolution, **parameters) for plugin in plugins}
+    reference, test, control = (Camera(scenes[plugin])(spp, seed=0)[0] for plugin in plugins)
     values = {
         "pixels off": pixelwise.changes(reference, test, VISIBLE).share,
         "pixels off, control": pixelwise.changes(control, test, VISIBLE).share,
     }
     about = {"scene": f"{scene}.xml", "resolution": profile.resolution, "spp": spp, "seed": 0, **parameters}
     shown = {"reference": (BUILTIN, reference), "test": (PLUGIN, test)}
-    images = {role: save_image(context.out, f"{name} {plugin}", x, about) for role, (plugin, x) in shown.items()}
     replay, budgets = about | {"control": right}, {"pixels off, control": limits.FLIPPED}
+    if exact:
+        image = exact_image(LAYERS[scene], scenes[PLUGIN], spp)
+        shown["exact"] = "exact", image
+        off, builtin_off = (pixelwise.changes(image, x, VISIBLE).share for x in (test, reference))
+        values |= {OFF_EXACT: off, BUILTIN_OFF_EXACT: builtin_off, "off exact / built-in": off / builtin_off}
+        budgets["off exact / built-in"] = limits.OFF_EXACT
+    images = {role: save_image(context.out, f"{name} {plugin}", x, about) for role, (plugin, x) in shown.items()}
     return [Row(NAME, PLUGIN, f"{name}: image", context.variant, values, budgets, replay=replay, images=images)]
+
+
+def exact_image(layers: Layers, scene: Any, spp: int) -> np.ndarray:
+    """Plane layers seen by the scene's camera, by Snell's and Fresnel's laws in double precision.
+
+    Random numbers choose between reflection and refraction. With P = n d as in `exact_path`, of the s wave
+    R = ((P_n − P'_n)/(P_n + P'_n))²; that of the p wave differs by the step of the index, up to 7e-6 of it.
+    """
+    import mitsuba as mi
+    from mitsuba.ad.integrators.common import ADIntegrator
+
+    sensor, count = scene.sensors()[0], len(layers.boundaries)
+    sampler, spp = ADIntegrator.prepare(None, sensor, SEED, spp, [])
+    ray, _, _ = ADIntegrator.sample_rays(None, scene, sensor, sampler)
+    generator: Any = mi.PCG32
+    number, width = mi.Float64, dr.width(ray.o)
+    indices, heights = number(layers.indices), number(layers.boundaries)
+
+    def step(p: Any, momentum: Any, medium: Any, random: Any, active: Any) -> tuple[Any, ...]:
+        down = momentum.y < 0
+        boundary, beyond = dr.select(down, medium, medium - 1), dr.select(down, medium + 1, medium - 1)
+        active &= (boundary >= 0) & (boundary < count)
+        height = dr.gather(number, heights, boundary, active)
+        length = (height - p.y) / momentum.y
+        active &= length * momentum.x < layers.end - p.x
+        n, n_beyond = (dr.gather(number, indices, x, active) for x in (medium, beyond))
+        before = dr.abs(momentum.y)
+        after = dr.sqrt(dr.maximum(before * before + (n_beyond - n) * (n_beyond + n), 0))
+        through = random.next_float64() >= dr.square((before - after) / (before + after))
+        up = dr.select(through, dr.mulsign(after, momentum.y), -momentum.y)
+        place = p + length * momentum
+        place.y = height + dr.mulsign(OFFSET * (1 + dr.max(dr.abs(place))), up)
+        p, momentum.y = dr.select(active, place, p), dr.select(active, up, momentum.y)
+        return p, momentum, dr.select(active & through, beyond, medium), random, active
+
+    start = mi.Point3d(ray.o), layers.indices[0] * dr.normalize(mi.Vector3d(ray.d)), dr.zeros(mi.Int32, width)
+    state: Any = *start, generator(width), dr.full(mi.Bool, True, width)
+    p, momentum, medium, *_ = dr.while_loop(state, lambda *state: state[-1], step)
+    # In the innermost medium there is the road; out of the others, into air, light passes through upright faces.
+    left = medium < count
+    p = dr.select(left, p + momentum * ((POOL + STEP - p.x) / momentum.x), p)
+    squares = layers.indices[0] ** 2 - dr.square(momentum.y) - dr.square(momentum.z)
+    momentum.x = dr.select(left, dr.sqrt(squares), momentum.x)
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(p), mi.Vector3f(dr.normalize(momentum))))
+    radiance = np.array(si.emitter(scene).eval(si), float).T
+    return np.asarray(radiance.reshape(*sensor.film().crop_size()[::-1], spp, 3).mean(2))
 
 
 RECORDS = (BUILTIN, *(f"{PLUGIN}_{name}" for name in DOCUMENTED), INDICES, RATIOS, "every plugin")

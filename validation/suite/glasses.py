@@ -6,15 +6,14 @@ with the direction and with the ratio of indices that it used. Directions are ju
 bound of the textbook formula for the ray; indices are compared with those of `mi_refract.media`, glass by glass. What
 evaluates the same formula with the same coefficients differs by rounding. Where a system has another edition or
 another fit of a maker's catalogue, the row says so: the difference was recorded, and more than 1e-5, which is what
-makers print, misses a goal. rayoptics reads the same tables of the makers as this package, through opticalglass, and
-shows that the formulas are evaluated alike; optiland and raysect have tables of their own. batoid has no catalogue, but
-a telescope with two glasses by name.
+makers print, misses a goal. rayoptics reads the tables of the makers that this package has its coefficients from,
+through opticalglass, and shows that the formulas are evaluated alike; optiland and raysect have tables of their own.
+batoid has no catalogue, but a telescope with two glasses by name.
 """
 
 from __future__ import annotations
 
 import functools
-from importlib.util import find_spec
 
 import numpy as np
 
@@ -62,8 +61,6 @@ def tasks(context: Context) -> list[Task]:
 def system_rows(system: System, catalogue: GlassCatalogue, context: Context) -> list[Row]:
     """A row per regime and one per glass, or one that says why there are none."""
     row = functools.partial(Row, NAME, system.title, "every glass", "f64")
-    if find_spec("opticalglass") is None:
-        return [row(reason="opticalglass is not installed: pip install 'mi-refract[glass]'")]
     rays, reason = given(catalogue.glasses), environments.why_not(system, context.profile.name)
 
     def answer() -> Answers:

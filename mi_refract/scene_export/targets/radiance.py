@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ..plain_scene import Colour, Diffuse, Environment, Glass, PlainScene
+from ..plain_scene import Diffuse, Environment, Glass, PlainScene
 from .shared_files import Files, material_names, numbers, readme
 
 COMMANDS = """
@@ -18,6 +18,7 @@ vwrays -fd -x {width} -y {height} -pa 0 -pj 1 -c 1024 -vf camera.vf |
 RAYPATH must name both this folder and Radiance's lib. 1024 is the number of samples per pixel.
 image.f32 holds {height} rows of {width} pixels of 3 float32, the top row first.
 """
+SOURCE = "sky source everywhere 0 0 4 0 0 1 360\n"
 ASSUMPTIONS = (
     "At a boundary both rays are followed while their share is above 0.01 (-lw). Below it, Russian roulette (a "
     "negative -lr) decides, without bias.",
@@ -29,7 +30,24 @@ ASSUMPTIONS = (
 
 def files(plain: PlainScene) -> Files:
     """The files of the export, by name."""
-    sky, maps = _sky(plain.sky)
+    maps: Files = {}
+    if isinstance(plain.sky, Environment):
+        height, width = plain.sky.pixels.shape[:2]
+        pixels = np.concatenate([plain.sky.pixels, plain.sky.pixels[:, :1]], axis=1)
+        head = f"2\n0 {height - 1} {height}\n0 {width} {width + 1}\n"
+        for i, colour in enumerate("rgb"):
+            rows = [" ".join(map(repr, row)) for row in pixels[..., i].astype(float).tolist()]
+            maps[f"sky_{colour}.dat"] = (head + "\n".join(rows) + "\n").encode()
+        x, y, z = (f"({a!r})*Dx + ({b!r})*Dy + ({c!r})*Dz" for a, b, c in plain.sky.rotation.T.tolist())
+        functions = (
+            f"x = {x};\ny = {y};\nz = {z};\nturn = atan2(x, -z)/(2*PI) - {0.5 / width!r};\n"
+            f"row = Acos(y)/PI*{height - 1};\ncolumn = (turn - floor(turn))*{width};\n"
+        )
+        maps["sky.cal"] = functions.encode()
+        sky = "void colordata map 9 noop noop noop sky_r.dat sky_g.dat sky_b.dat sky.cal row column 0 0\n"
+        sky += f"map glow sky 0 0 4 1 1 1 0\n{SOURCE}"
+    else:
+        sky = f"void glow sky 0 0 4 {numbers(plain.sky)} 0\n{SOURCE}" if any(plain.sky) else ""
     camera, names = plain.camera, material_names(plain)
     commands = COMMANDS.format(width=camera.width, height=camera.height, depth=plain.max_depth)
     meshes = [
@@ -55,24 +73,3 @@ def files(plain: PlainScene) -> Files:
         "camera.vf": f"VIEW= -vtv {where} -vh {camera.fov_x_degrees!r} -vv {fov_y!r}\n".encode(),
         "README.txt": readme(plain, "Radiance", commands, ASSUMPTIONS),
     }
-
-
-def _sky(sky: Colour | Environment) -> tuple[str, Files]:
-    """The sky's lines in the scene, and the files that they name."""
-    source = "sky source everywhere 0 0 4 0 0 1 360\n"
-    if not isinstance(sky, Environment):
-        return f"void glow sky 0 0 4 {numbers(sky)} 0\n{source}" if any(sky) else "", {}
-    height, width = sky.pixels.shape[:2]
-    pixels = np.concatenate([sky.pixels, sky.pixels[:, :1]], axis=1)
-    head = f"2\n0 {height - 1} {height}\n0 {width} {width + 1}\n"
-    maps = {}
-    for i, colour in enumerate("rgb"):
-        rows = [" ".join(map(repr, row)) for row in pixels[..., i].astype(float).tolist()]
-        maps[f"sky_{colour}.dat"] = (head + "\n".join(rows) + "\n").encode()
-    x, y, z = (f"({a!r})*Dx + ({b!r})*Dy + ({c!r})*Dz" for a, b, c in sky.rotation.T.tolist())
-    functions = (
-        f"x = {x};\ny = {y};\nz = {z};\nturn = atan2(x, -z)/(2*PI) - {0.5 / width!r};\n"
-        f"row = Acos(y)/PI*{height - 1};\ncolumn = (turn - floor(turn))*{width};\n"
-    )
-    lines = "void colordata map 9 noop noop noop sky_r.dat sky_g.dat sky_b.dat sky.cal row column 0 0\n"
-    return f"{lines}map glow sky 0 0 4 1 1 1 0\n{source}", maps | {"sky.cal": functions.encode()}
