@@ -1,15 +1,20 @@
-"""Fixtures for pytest that compare images: `assert_image_equal` and `assert_image_unbiased`.
+"""Fixtures for pytest that compare images: `assert_image_equal` and `assert_image_unbiased`; and two options.
 
 In the conftest.py of the tests: `pytest_plugins = ["mi_refract.pytest_plugin"]`. It is no entry point, because that
 would load Mitsuba, and with it a libLLVM, into every pytest run of the environment, before any conftest.py could choose
-one. An image is a file, or an array, H × W × C or H × W. Nothing is ever written, and a reference that does not exist
-fails the test.
+one. An image is a file, or an array, H × W × C or H × W. A reference that does not exist fails the test.
+
+`--mi-refract-accept` copies images that are not equal over their references, as `mi-refract accept` does, where both
+are files, or the reference is an EXR file and the image an array. `--mi-refract-report OUT.html` writes the page of
+`mi-refract diff` about all comparisons. Otherwise nothing is written.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import shlex
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +22,8 @@ import pytest
 
 if TYPE_CHECKING:
     from mi_refract.image_diff.comparison import Comparison
+    from mi_refract.image_diff.html_report import Page
+    from mi_refract.image_diff.results import Result, Results
     from mi_refract.io.image_file import Image as ReadImage
 
 Image = Any  # the path of a file, or what numpy makes an array of
@@ -25,8 +32,68 @@ RUNS = 8
 REFERENCE_SEED = 1 << 16  # the first of a rendered reference: both sides must not share a seed
 
 
+ACCEPT, REPORT = "--mi-refract-accept", "--mi-refract-report"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """The options."""
+    group = parser.getgroup("mi-refract", "images")
+    group.addoption(ACCEPT, action="store_true", help="copy images that are not equal over their references")
+    group.addoption(REPORT, type=Path, metavar="OUT.html", help="write a page about the images that are not equal")
+
+
+@dataclass(frozen=True)
+class Compared:
+    """What the tests of a session have compared, for the page."""
+
+    page: Page
+    results: list[Result] = field(default_factory=list)
+
+    def add(self, result: Result) -> None:
+        """One more result; the page keeps its images."""
+        from mi_refract.image_diff.results import FAILED
+
+        self.results.append(result)
+        if result.status in FAILED:
+            self.page.view(result, self.as_results(Path()))
+
+    def as_results(self, root: Path) -> Results:
+        """The results, with commands that run tests."""
+        from mi_refract.image_diff.results import Results
+
+        class TestResults(Results):
+            def command(self, verb: str, *names: str, flags: Sequence[str] | None = None) -> str:
+                words = [REPORT if word == "--report" else word for word in flags or ()]
+                return shlex.join(["pytest", *words, *[ACCEPT] * (verb == "accept"), *names])
+
+        return TestResults(root, root, tuple(sorted(self.results, key=lambda result: result.order)))
+
+
+COMPARED = pytest.StashKey[Compared]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Begin the page. UsageError where the tests run in several processes."""
+    if path := config.getoption(REPORT, None):
+        from mi_refract.image_diff.html_report import Page
+        from mi_refract.io.safe_files import writable
+
+        if config.getoption("numprocesses", None) or hasattr(config, "workerinput"):
+            raise pytest.UsageError(f"{REPORT}: the tests run in several processes; expected -n 0")
+        try:
+            config.stash[COMPARED] = Compared(Page(writable(path, (".html", ".htm"))))
+        except (ValueError, OSError) as error:
+            raise pytest.UsageError(str(error)) from None
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Write the page."""
+    if compared := session.config.stash.get(COMPARED, None):
+        compared.page.write(compared.as_results(session.config.rootpath), {"pytest": pytest.__version__})
+
+
 @pytest.fixture
-def assert_image_equal() -> Callable[..., Comparison]:
+def assert_image_equal(request: pytest.FixtureRequest) -> Callable[..., Comparison]:
     """`assert_image_equal(test, reference, method="auto", **options)`: the verdict must be equal.
 
     The methods and their options are those of `mi-refract diff`. Inconclusive fails, too. Returns the comparison.
@@ -34,13 +101,15 @@ def assert_image_equal() -> Callable[..., Comparison]:
 
     def check(test: Image, reference: Image, method: str = "auto", **options: Any) -> Comparison:
         __tracebackhide__ = True
-        return _require_equal(method, lambda: (_image("reference", reference), _image("test", test)), options)
+        if request.config.getoption(ACCEPT, False) and isinstance(reference, str | os.PathLike):
+            _accept(Path(reference), test, method, options)
+        return _require_equal(request, method, lambda: (_image("reference", reference), _image("test", test)), options)
 
     return check
 
 
 @pytest.fixture
-def assert_image_unbiased() -> Callable[..., Comparison]:
+def assert_image_unbiased(request: pytest.FixtureRequest) -> Callable[..., Comparison]:
     """`assert_image_unbiased(render, reference, runs=8, seed=0, **options)`: the means of renders must be equal.
 
     `render(seed)` returns an image; it is called with `runs` seeds from `seed` on. `reference` is a folder of
@@ -68,20 +137,52 @@ def assert_image_unbiased() -> Callable[..., Comparison]:
                 references = [_image(f"reference {first + i}", image) for i, image in enumerate(known)]
             return references, [_image(f"test {seed + i}", image) for i, image in enumerate(rendered)]
 
-        return _require_equal("welch", sides, options)
+        return _require_equal(request, "welch", sides, options)
 
     return check
 
 
-def _require_equal(method: str, sides: Callable[[], tuple[Any, Any]], options: dict[str, Any]) -> Comparison:
+def _accept(reference: Path, test: Image, method: str, options: dict[str, Any]) -> None:
+    """Copy the image over the reference, or to where it would be, unless they are equal."""
     __tracebackhide__ = True
-    from mi_refract.image_diff.comparison import Verdict
-    from mi_refract.image_diff.methods import compare
+    from mi_refract.image_diff import accept, folders
+    from mi_refract.image_diff.settings import Settings
+    from mi_refract.io import image_file, safe_files
 
     try:
-        comparison = compare(method, *sides(), **options)
+        with safe_files.temporary_folder() as folder:
+            if not isinstance(test, str | os.PathLike):
+                image, test = image_file.named("test", test), folder / "test.exr"
+                image_file.write_exr(test, image.pixels, image.channels)
+            settings = Settings.for_all(method=method, **options)
+            accept.Acceptance(list(accept.changes(folders.diff(reference, test, settings, to_accept=True)))).run()
     except (ValueError, OSError) as error:
+        pytest.fail(f"could not accept: {error}", pytrace=False)
+
+
+def _require_equal(
+    request: pytest.FixtureRequest, method: str, sides: Callable[[], tuple[Any, Any]], options: dict[str, Any]
+) -> Comparison:
+    __tracebackhide__ = True
+    from mi_refract.image_diff.comparison import Verdict
+    from mi_refract.image_diff.file_pair import mean_image
+    from mi_refract.image_diff.methods import compare
+    from mi_refract.image_diff.results import Result, Status
+    from mi_refract.image_diff.settings import ComparisonSpec
+
+    name, compared = request.node.nodeid, request.config.stash.get(COMPARED, None)
+    result = Result(name, Status.ERROR, Path("reference"), Path("test"), ComparisonSpec(method))
+    try:
+        reference, test = sides()
+        comparison = compare(method, reference, test, **options)
+    except (ValueError, OSError) as error:
+        if compared:
+            compared.add(replace(result, error=str(error)))
         pytest.fail(f"could not compare: {error}", pytrace=False)
+    if compared:
+        images = [mean_image(side) if isinstance(side, list) else side for side in (reference, test)]
+        shown = dict(zip(("reference", "test"), images, strict=True))
+        compared.add(replace(result, status=Status(str(comparison.verdict)), comparison=comparison, images=shown))
     if comparison.verdict is not Verdict.EQUAL:
         lines = [f"{comparison.method}: {comparison.verdict}: {comparison.reason}"]
         for metric in comparison.metrics:

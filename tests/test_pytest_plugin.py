@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from support.processes import python
 
+from mi_refract.image_diff.html_report import Page
 from mi_refract.io import image_file
 
 pytest_plugins = ["pytester", "mi_refract.pytest_plugin"]
@@ -95,6 +96,64 @@ def test_a_project_names_the_plugin_in_its_conftest(pytester):
     result = pytester.runpytest_subprocess("-p", "no:cacheprovider")
     result.assert_outcomes(passed=1, failed=1)
     result.stdout.fnmatch_lines(["*tolerance: different: *"])
+
+
+TESTS = """
+import numpy as np
+
+def test_new(assert_image_equal):
+    assert_image_equal(np.ones((8, 8, 3)), "new.exr")
+
+def test_changed(assert_image_equal):
+    assert_image_equal("test.exr", "old.exr", "exact")
+
+def test_equal(assert_image_equal):
+    assert_image_equal(np.zeros((8, 8, 3)), "zero.exr")
+
+def test_two_arrays(assert_image_equal):
+    assert_image_equal(np.ones((8, 8, 3)), np.zeros((8, 8, 3)))
+"""
+
+
+def test_failures_are_on_a_page_and_images_are_accepted(pytester):
+    pytester.makeconftest('pytest_plugins = ["mi_refract.pytest_plugin"]')
+    name = f"{pytester.makepyfile(TESTS).name}::test_"
+    for file, value in {"old": 0, "test": 1, "zero": 0}.items():
+        image_file.write_exr(pytester.path / f"{file}.exr", np.full((8, 8, 3), value, np.float32), ("R", "G", "B"))
+    before = {path.name: path.read_bytes() for path in pytester.path.glob("*.exr")}
+
+    def run(*words):
+        return pytester.runpytest_subprocess("-p", "no:cacheprovider", *words)
+
+    run("--mi-refract-report", "out.html").assert_outcomes(passed=1, failed=3)
+    page = (pytester.path / "out.html").read_text("utf-8")
+    assert "4 images: 1 could not be compared, 2 different, 1 equal" in page
+    assert f"pytest {name}changed" in page and f"pytest --mi-refract-accept {name}changed" in page
+    assert page.count('data-role="difference"') == 2
+    assert {path.name: path.read_bytes() for path in pytester.path.glob("*.exr")} == before  # nothing is written
+    run("--mi-refract-accept").assert_outcomes(passed=3, failed=1)
+    after = {path.name: path.read_bytes() for path in pytester.path.glob("*.exr")}
+    assert after == before | {"old.exr": before["test.exr"], "new.exr": after["new.exr"]}
+
+
+def test_renders_are_on_the_page_by_their_mean(request, assert_image_unbiased, tmp_path):
+    from mi_refract.pytest_plugin import COMPARED, Compared  # pytest imports it first
+
+    compared = request.config.stash[COMPARED] = Compared(Page(tmp_path / "out.html"))
+    with pytest.raises(pytest.fail.Exception):
+        assert_image_unbiased(lambda seed: render(seed, 1.1), render, runs=2)
+    del request.config.stash[COMPARED]
+    (result,) = compared.results
+    mean = np.mean([render(seed, 1.1) for seed in (0, 1)], 0)
+    np.testing.assert_allclose(result.images["test"].pixels, mean, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"), [(["out.txt"], "expected a file name that ends in"), (["out.html", "-n2"], "expected -n 0")]
+)
+def test_a_page_that_cannot_be_written_is_a_wrong_command_line(pytester, words, message):
+    with pytest.raises(pytest.UsageError, match=message):
+        pytester.parseconfigure("-p", "mi_refract.pytest_plugin", "--mi-refract-report", *words)
 
 
 def test_the_plugin_itself_imports_no_renderer():

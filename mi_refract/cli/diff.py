@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import enum
 import importlib.util
-import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -21,7 +20,7 @@ import typer
 from mi_refract.image_diff import folders, pairing, text_reports
 from mi_refract.image_diff.methods import AUTO, METHODS
 from mi_refract.image_diff.results import Status
-from mi_refract.image_diff.settings import FILE, Settings, from_words, key_tables, load
+from mi_refract.image_diff.settings import FILE, Settings, from_words, key_tables, load, nearest
 from mi_refract.io.errors import MISUSE
 from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.safe_files import writable
@@ -44,7 +43,8 @@ Set = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Set a key of [defaults], except map, for all images."),
 ]
 File = Annotated[
-    Path | None, typer.Option(metavar="FILE.toml", help=f"Settings of images. Default: {FILE} beside the references.")
+    Path | None,
+    typer.Option(metavar="FILE.toml", help=f"Settings of images. Default: {FILE} beside or above them."),
 ]
 MaxValues = Annotated[
     int, typer.Option("--max-values", metavar="N", min=1, help="Largest image to read: width × height × channels.")
@@ -201,15 +201,18 @@ def require_extra(*packages: str) -> None:
 
 def _settings(reference: Path, method: str, words: Sequence[str], file: Path | None, max_values: int) -> Settings:
     """What the options and the settings file say. ValueError or OSError for what they cannot mean."""
-    beside = (reference if reference.is_dir() else reference.parent) / FILE
-    path = file or (beside if os.path.lexists(beside) else None)
+    folder = reference if reference.is_dir() else reference.parent
+    path = file or nearest(folder)
     flags = ["--method", method] if method != AUTO else []
     flags += [each for word in words for each in ("--set", word)]
     flags += ["--max-values", str(max_values)] if max_values != MAX_VALUES else []
     flags += ["--settings", str(file)] if file else []
     layer = from_words(method, words)
     settings = load(path, layer, max_values) if path else Settings((layer,), max_values=max_values)
-    return replace(settings, flags=tuple(flags))
+    above = folder.resolve().relative_to(path.parent.resolve()) if path and not file else Path()
+    if path and above.parts and settings.maps:
+        raise ValueError(f"{path}: `map` is for whole folders; expected {path.parent} as REFERENCE, or --settings")
+    return replace(settings, flags=tuple(flags), above=above)
 
 
 @contextlib.contextmanager

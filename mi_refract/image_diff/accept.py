@@ -79,8 +79,8 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
             raise ValueError(f"{target}: expected a name that ends in {result.test.suffix}, as {result.test} does")
         copies = [Copy(result.test, target, compared, result.digests.get(target, ""))]
         if result.how.reads_variance:  # it goes with the image, and before it: the image is still to be accepted then
-            beside = zip((result.test, target), reversed(results.roots), strict=True)
-            source, to = (pairing.beside(result.how.variance, path, root) for path, root in beside)
+            how, beside = result.how, zip((result.test, target), reversed(results.roots), strict=True)
+            source, to = (pairing.beside(how.variance, path, root, how.above) for path, root in beside)
             if source.exists():
                 copies.insert(0, Copy(source, to, result.digests.get(source, ""), result.digests.get(to, "")))
             elif to.exists():

@@ -78,15 +78,16 @@ def compare(
     selected = []
     for side, (renders, root) in enumerate(zip(sides, roots, strict=True)):
         if how.reads_variance and len(renders) == 1:
-            beside = pairing.beside(how.variance, renders[0].path, root)
+            beside = pairing.beside(how.variance, renders[0].path, root, how.above)
             if beside == renders[0].path:
                 raise ValueError(f"variance = {how.variance!r}: names {beside} itself; expected another image")
             renders = [channels.with_file(renders[0], read(beside, how.max_values))] if beside.exists() else renders
         selected.append(channels.chosen(renders, how.channels, side))
     reference, test = selected
     if how.reads_variance and not (len(reference) > 1 or channels.has_variance(reference[0])):
-        raise FileNotFoundError(f"{pairing.beside(how.variance, path, roots[0])}: no such file; expected a variance")
-    file = pairing.beside(how.mask, result.target, roots[0]) if how.mask else None
+        beside = pairing.beside(how.variance, path, roots[0], how.above)
+        raise FileNotFoundError(f"{beside}: no such file; expected a variance")
+    file = pairing.beside(how.mask, result.target, roots[0], how.above) if how.mask else None
     if (file or how.ignore) and reference[-1].place:
         raise ValueError(f"{path}: has several parts or MIP levels; masks are supported for single images only")
     mask = mask_of(reference[0], file, how.ignore, how.max_values)

@@ -92,7 +92,7 @@ def diff(
     for result in compared:
         done.append(result)
         progress(len(done), len(pairs))
-    return replace(results, results=tuple(sorted(done, key=lambda result: list(Status).index(result.status))))
+    return replace(results, results=tuple(sorted(done, key=lambda result: result.order)))
 
 
 def bounded_map(
@@ -197,7 +197,7 @@ def _digests(result: Result, roots: tuple[Path, Path], decoded: Mapping[Path, st
     paths = [result.reference, result.test, *result.variants]
     if result.how.reads_variance:
         sides = zip((result.target, result.test), roots, strict=True)
-        paths += [pairing.beside(result.how.variance, path, root) for path, root in sides if path]
+        paths += [pairing.beside(result.how.variance, path, root, result.how.above) for path, root in sides if path]
     return {path: decoded.get(path) or digest(path) for path in paths if path}
 
 

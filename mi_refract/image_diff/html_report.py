@@ -69,12 +69,12 @@ class Page:
     def __init__(self, path: str | Path) -> None:
         """`path`: of the file."""
         self.path = Path(path)
-        self._shown: dict[tuple[int, str], Shown] = {}
+        self._shown: dict[tuple[float | str, ...], Shown] = {}
         self._lock = threading.Lock()
 
     def view(self, result: Result, results: Results) -> None:
         """Keep what the page shows of the result, unless those before it on the page fill it."""
-        place = _place(result)
+        place = result.order
         with self._lock:
             if sum(shown.size for other, shown in self._shown.items() if other < place) > PAGE:
                 return
@@ -96,7 +96,7 @@ class Page:
         """
         images, failures, used, rest = EmbeddedImages(), [], 0, list[Result]()
         for number, result in enumerate(results.of(*FAILED), 1):
-            shown = self._shown.get(_place(result))
+            shown = self._shown.get(result.order)
             # The first pair is shown, however large; after one that does not fit none is.
             if rest or shown is None or (used and used + shown.size > PAGE):
                 rest.append(result)
@@ -135,11 +135,6 @@ def write(path: str | Path, results: Results, context: Mapping[str, Any] | None 
     for result in results.of(*FAILED):
         page.view(result, results)
     page.write(results, context or {}, replay)
-
-
-def _place(result: Result) -> tuple[int, str]:
-    """Where the result stands on the page."""
-    return FAILED.index(result.status), result.name
 
 
 def _cut(failures: list[dict[str, Any]], equal: list[dict[str, Any]], articles: int, lines: int) -> dict[str, Any]:
@@ -205,10 +200,8 @@ def cause(result: Result) -> str:
         return WORDS[result.status]
     if None in (result.reference, result.test):
         return str(result.category)
-    beyond = [metric for metric in result.comparison.metrics if not metric.holds] if result.comparison else []
-    # The number that is the most times its bound.
-    times = [m.value / m.bound if m.bound and not math.isnan(m.value) else math.inf for m in beyond]
-    return beyond[times.index(max(times))].name if beyond else str(result.status)
+    _, metric = result.worst
+    return metric.name if metric else str(result.status)
 
 
 # What it shows of a pair --------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mi_refract.io.image_file import Image, Pixels, any_channel
 
-from . import channels, flip, metadata, pixelwise, welch
+from . import channels, flip, metadata, pixel_statistics, pixelwise, welch
 from .comparison import (
     NONNEGATIVE,
     Comparison,
@@ -38,6 +38,8 @@ from .comparison import (
 
 AUTO = "auto"
 CHOSEN_BY_AUTO = ("welch", "tolerance")
+NOT_FOR_NOISE = ("tolerance", "flip")  # methods that take noise for a difference
+OTHER_NOISE = "these two look like the same image with other noise: --method welch with several renders decides"
 DECIDING = {"hard_fail", "allow_failures"}  # options that say by how much a single pixel may differ
 UNSEEN = 0.1  # share of the lit pixels that may differ so that black would be accepted there, too
 CLOSER = 100.0  # where the test image is so many times closer to the reference than black is, it is no black
@@ -219,7 +221,11 @@ def _compare(
         if reason := preconditions(a, b, allow_nonfinite):
             result = nonfinite_result(method, reason, *aligned(a, b))
         else:
-            result = _of_finite(method, *_finite_pair(a, b), options)
+            a, b = _finite_pair(a, b)
+            result = _of_finite(method, a, b, options)
+            may_be_noise = method in NOT_FOR_NOISE and result.verdict is Verdict.DIFFERENT
+            if may_be_noise and pixel_statistics.differ_like_noise(a.pixels, b.pixels):
+                result = replace(result, reason=f"{result.reason}; {OTHER_NOISE}")
         if besides:
             reason = f"{besides}; the other channels: {result.reason}"
             return replace(result, verdict=Verdict.DIFFERENT, reason=reason, warning="")

@@ -71,7 +71,7 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
         sides = [(path, root) for path, root in ((pair.reference, reference), (pair.test, test)) if path]
         files = {mask} if (mask := _mask_of(pair, reference)) else set()
         if pair.how.reads_variance:
-            files |= {beside(pair.how.variance, path, root) for path, root in sides}
+            files |= {beside(pair.how.variance, path, root, pair.how.above) for path, root in sides}
         own |= files - {pair.reference, pair.test}
     found = [pair for pair in found if not {pair.reference, pair.test} - {None} <= own]
     # A reference that is a variant, and has no new image, is not one that was removed. In a tree of both no image is
@@ -175,7 +175,7 @@ def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> 
 
 def _mask_of(pair: Result, root: Path) -> Path | None:
     """The mask that the settings name for a pair; `root`: the folder of the references."""
-    return beside(pair.how.mask, pair.target, root) if pair.how.mask else None
+    return beside(pair.how.mask, pair.target, root, pair.how.above) if pair.how.mask else None
 
 
 def _with_variants(pair: Result, others: Sequence[Path]) -> Result:
@@ -220,10 +220,14 @@ def is_inside(path: Path, folder: Path) -> bool:
     return path.parent.resolve().is_relative_to(folder.resolve())
 
 
-def beside(template: str, target: Path, root: Path) -> Path:
-    """The file that a template means for a reference: beside it, or below `root` after "{root}/"."""
-    base, rest = (root, template[len(ROOT) :]) if template.startswith(ROOT) else (target.parent, template)
-    return base / name_patterns.filled(rest, name_patterns.fields(target.relative_to(root).as_posix()))
+def beside(template: str, target: Path, root: Path, above: Path = Path()) -> Path:
+    """The file that a template means for a reference: beside it, or after "{root}/" below the folder of the settings.
+
+    `root`: the folder that is compared, `above`: its path in that of the settings.
+    """
+    top = root.joinpath(*[".."] * len(above.parts))
+    base, rest = (top, template[len(ROOT) :]) if template.startswith(ROOT) else (target.parent, template)
+    return base / name_patterns.filled(rest, name_patterns.fields((above / target.relative_to(root)).as_posix()))
 
 
 # Folders ------------------------------------------------------------------------------------------------------------

@@ -26,11 +26,23 @@ sum of these variances says, over the correlations ρₕ of pixels at every dist
 difference d of two images that are equal but for noise: γₕ = Σ (d(x + h) − d(x))², and ρₕ = 1 − γₕ/γ∞. A true
 difference that is smooth cancels in γₕ. One that repeats itself every few pixels may make F up to ten times as large,
 and is then detected from √F times its size on.
+
+**The same image with other noise.** Let a pixel of two single images come from one distribution, independently of other
+pixels. Then a pixel of one may be exchanged with that of the other: the sign s of d = b − a is a fair coin, whatever
+|d| and a + b are. So are s times a sign that these decide, and the product of the s of two pixels. Of N fair coins
+P(|Σ| ≥ z√N) ≤ 2 exp(−z²/2) (Hoeffding 1963). `differ_like_noise` tests the sums of
+
+- s, in tiles and in the whole image: light;
+- s times the sign of a + b less its median, less its mean around, and of its slopes: contrast, sharpness, motion;
+- products of s that are so far apart that no filter reaches: whatever has a shape.
+
+Noise that only one side has, as after denoising, is in a + b less its mean around.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,6 +53,12 @@ from mi_refract.io.image_file import block_mean, block_sum
 ROUNDING = 1e-12  # of m²: more than that of u in float64, which is some 1e-16 (m² + u)
 RADIUS = 2  # pixels: of a Gaussian filter of σ = 0.5, Mitsuba's default, ρ is 0.0003 at 2√2 and 1e-4 at 3
 FAR = ((0, 6), (6, 0), (5, 5), (5, -5))  # where no filter reaches
+REACH = 4.0  # F at which sums of signs are tested: under a Gaussian filter of σ = 0.5 it is 4πσ² = 3.1
+FALSE = 0.01  # probability that noise is not called so
+WIDE = 32  # pixels, of a tile of signs
+FAINT = 0.1  # of the RMS relative change: a smaller one does not count, as last bits beside a true difference
+SOME = 0.25  # share of the pixels that are not black which must change: noise is everywhere
+SHOWN = 0.2  # a correlation of that size must show
 NEAR = tuple((y, x) for y in range(RADIUS + 1) for x in range(-RADIUS, RADIUS + 1) if (y, x) > (0, 0))
 
 
@@ -70,8 +88,8 @@ def inflation(difference: Array, variance: Array, tile: int) -> Inflation:
 
     def variogram(y: int, x: int) -> float:
         """The mean squared difference of pixels that are y rows and x columns apart."""
-        one = scaled[: height - y, max(-x, 0) : width - max(x, 0)]
-        change = scaled[y:, max(x, 0) : width - max(-x, 0)] - one
+        one, two = _apart(scaled, y, x)
+        change = two - one
         return float(np.mean(np.square(change, out=change), dtype=np.float64))
 
     if not (far := float(np.mean([variogram(*lag) for lag in FAR]))) > 0:
@@ -79,6 +97,47 @@ def inflation(difference: Array, variance: Array, tile: int) -> Inflation:
     correlations = sum(1 - variogram(*lag) / far for lag in NEAR)
     freedom = max(int(noisy.any(-1).sum()) / (2 * RADIUS + 1) ** 2, 1.0)
     return Inflation(max(1.0, 1 + 2 * correlations), freedom)  # −h is as far as h
+
+
+def _apart(values: Array, y: int, x: int) -> tuple[Array, Array]:
+    """Of all pairs of pixels that are y rows and x columns apart, the first and the second; H × W × C."""
+    height, width = values.shape[:2]
+    return values[: height - y, max(-x, 0) : width - max(x, 0)], values[y:, max(x, 0) : width - max(-x, 0)]
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def differ_like_noise(a: Array, b: Array) -> bool:
+    """Whether two images, H × W × C, look like the same image with other noise in each channel that differs.
+
+    It is a hint: what is smaller than a tile of signs, or weaker than the noise, is not seen beside noise.
+    """
+    changed = (a != b).any((0, 1))
+    if not changed.any():  # the numbers are the same, but not what they mean
+        return False
+    a, b = a[..., changed].astype(np.float32), b[..., changed].astype(np.float32)
+    both, size = a + b, np.abs(a) + np.abs(b)
+    share = np.divide(b - a, size, out=np.zeros_like(size), where=size > 0)
+    signs = np.sign(share) * (np.abs(share) > FAINT * np.sqrt(np.square(share).mean((0, 1), dtype=np.float64)))
+    count, tiles = np.count_nonzero(signs, (0, 1)), block_sum(signs, WIDE)
+    z2 = 2 * REACH * math.log(2 * (tiles.size + (5 + len(FAR)) * count.size) / FALSE)
+    if (count < np.maximum(SOME * np.count_nonzero(size, (0, 1)), z2 / SHOWN**2)).any():
+        return False
+
+    def sums_of_coins() -> Iterator[tuple[Array, Array]]:
+        """Their sum and number."""
+        yield tiles, block_sum(np.abs(signs), WIDE)
+        yield signs.sum((0, 1)), count
+        edged = np.pad(both, ((1, 1), (1, 1), (0, 0)), mode="edge")
+        above, below, left, right = edged[:-2, 1:-1], edged[2:, 1:-1], edged[1:-1, :-2], edged[1:-1, 2:]
+        around = (above + below + left + right) / 4
+        for feature in (below - above, right - left, both - around, both - np.median(both, (0, 1))):
+            coins = signs * np.sign(feature)
+            yield coins.sum((0, 1)), np.count_nonzero(coins, (0, 1))
+        for lag in FAR:
+            one, two = _apart(signs, *lag)
+            yield np.einsum("ijk,ijk->k", one, two), np.count_nonzero(one * two, (0, 1))
+
+    return all((np.square(total) <= z2 * number).all() for total, number in sums_of_coins())
 
 
 @dataclass(frozen=True)

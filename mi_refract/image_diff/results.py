@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,7 +11,7 @@ from pathlib import Path
 
 from mi_refract.io.image_file import Image
 
-from .comparison import Comparison
+from .comparison import Comparison, Metric
 from .name_patterns import literal
 from .settings import ComparisonSpec
 
@@ -80,6 +81,21 @@ class Result:
     def word(self) -> str:
         """The verdict in a word: of an image that only one side has, what happened to it."""
         return str(self.category if None in (self.reference, self.test) else self.status)
+
+    @property
+    def worst(self) -> tuple[float, Metric | None]:
+        """The number that is the most times its bound, and how many times; NaN and what may be none are ∞ times it."""
+        beyond = [metric for metric in self.comparison.metrics if not metric.holds] if self.comparison else []
+        times = [m.value / m.bound if m.bound and not math.isnan(m.value) else math.inf for m in beyond]
+        return (max(times), beyond[times.index(max(times))]) if beyond else (0.0, None)
+
+    @property
+    def order(self) -> tuple[float | str, ...]:
+        """By status, then the worst first; of equally many times a bound the larger number, then by name."""
+        lone = None in (self.reference, self.test)
+        times, metric = self.worst if self.status in FAILED else (0.0, None)
+        value = metric.value if metric and not math.isnan(metric.value) else math.inf if metric else 0.0
+        return [*Status].index(self.status), lone, -times, -value, self.name
 
     @property
     def warning(self) -> str:

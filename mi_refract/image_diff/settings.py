@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import os
 import platform
 import sys
 import tomllib
@@ -58,7 +59,7 @@ class ComparisonSpec:
     and as rectangles. `variance`: a template of the image that holds the variance of one sample of each pixel.
     `channels`: those that are compared, by their names in the reference and in the new image; none: all. `fields`: of
     the map that pairs the image with its reference, for `accept`. `entries`: the tables of the settings file that
-    apply. `error`: why the settings cannot be applied.
+    apply. `above`: as of `Settings`. `error`: why the settings cannot be applied.
     """
 
     method: str = AUTO
@@ -73,6 +74,7 @@ class ComparisonSpec:
     channels: Names = ()
     fields: Mapping[str, str] = field(default_factory=dict)
     entries: tuple[str, ...] = ()
+    above: Path = Path()
     error: str = ""
 
     @property
@@ -116,13 +118,15 @@ class Settings:
     """The layers in their order, and what holds for the whole comparison.
 
     `maps`: which reference belongs to which new image; none: the one of the same path. `max_values`: of each image.
-    `flags`: the words of the command line that set the same.
+    `flags`: the words of the command line that set the same. `above`: the path of the compared folder in that of the
+    settings file; the names of images in the file begin with it.
     """
 
     rules: tuple[Entry, ...] = ()
     maps: tuple[Map, ...] = ()
     max_values: int = MAX_VALUES
     flags: tuple[str, ...] = ()
+    above: Path = Path()
 
     @classmethod
     def for_all(cls, **values: Any) -> Settings:
@@ -135,10 +139,12 @@ class Settings:
         Its `error` is that of a layer, or says that two tables of the same pattern contradict each other, or that the
         method does not have an option.
         """
-        layers = [rule for rule in self.rules if not rule.pattern or matches(rule.pattern, name)]
+        path = (self.above / name).as_posix()
+        layers = [rule for rule in self.rules if not rule.pattern or matches(rule.pattern, path)]
         reasons = dict.fromkeys(layer.values["reason"] for layer in layers if "reason" in layer.values)
         entries = tuple(x.where for x in layers if x.where != COMMAND_LINE and (x.values or x.error))
-        spec = ComparisonSpec(reason="; ".join(reasons), max_values=self.max_values, entries=entries)
+        reason = "; ".join(reasons)
+        spec = ComparisonSpec(reason=reason, max_values=self.max_values, entries=entries, above=self.above)
         merged: dict[str, Any] = {"method": AUTO}
         set_by: dict[str, str] = {}
         tables: dict[tuple[str, str], Entry] = {}
@@ -168,8 +174,8 @@ class Settings:
         return replace(spec, **merged, options=options)
 
     def unused(self, names: Sequence[str]) -> list[str]:
-        """The patterns that match none of these names."""
-        patterns = [rule.pattern for rule in self.rules if rule.pattern]
+        """The patterns that match none of these names; of the settings of a folder above it says nothing."""
+        patterns = [rule.pattern for rule in self.rules if rule.pattern and self.above == Path()]
         return [pattern for pattern in patterns if not any(matches(pattern, name) for name in names)]
 
 
@@ -281,6 +287,16 @@ class NameKey(msgspec.Struct):
     """What an `[[image]]` table must have, whatever is wrong with the rest."""
 
     name: Text
+
+
+def nearest(folder: Path) -> Path | None:
+    """The settings file of a folder of references: its own, or in a git repository that of the nearest folder above.
+
+    The search ends at the folder that holds `.git`; where none does, nothing above `folder` is read.
+    """
+    folders = [folder, *folder.resolve().parents]
+    repository = next((i for i, each in enumerate(folders) if os.path.lexists(each / ".git")), 0)
+    return next((each / FILE for each in folders[: repository + 1] if os.path.lexists(each / FILE)), None)
 
 
 def load(path: str | Path, command_line: Entry | None = None, max_values: int = MAX_VALUES) -> Settings:

@@ -236,12 +236,12 @@ def from_renders(
 class Level:
     """The tests of one level of tiles; every array is tiles × tiles × C.
 
-    `t`: positive where the test is brighter. `p`: of no difference; `beyond`: of none beyond the margin; both 0 where a
-    value is not finite. `silent`: no noise on either side, of which a t-test knows nothing: p is 1 there, and `off`
-    where the means differ beyond the margin. `heavy`: noise from a few pixels only. `shown`: p of none beyond the
-    margin by the noise that the pixels show; 0 where that is not tested. `hollow`: the same of noise that the pixels do
-    not show; 1 where they do. `of_pixels`: p of no pixel beyond the margin; `of_silent`: the same of tiles without
-    noise; None where that is not tested.
+    `reference`: its means; `difference`: how much larger those of the test are; `t`: of that. `p`: of no difference;
+    `beyond`: of none beyond the margin; both 0 where a value is not finite. `silent`: no noise on either side, of which
+    a t-test knows nothing: p is 1 there, and `off` where the means differ beyond the margin. `heavy`: noise from a few
+    pixels only. `shown`: p of none beyond the margin by the noise that the pixels show; 0 where that is not tested.
+    `hollow`: the same of noise that the pixels do not show; 1 where they do. `of_pixels`: p of no pixel beyond the
+    margin; `of_silent`: the same of tiles without noise; None where that is not tested.
     """
 
     t: Array
@@ -254,6 +254,8 @@ class Level:
     allowed: Array
     error: Array
     freedom: Array
+    reference: Array
+    difference: Array
     shown: Array | float = 0.0
     hollow: Array | float = 1.0
     of_pixels: Array | None = None
@@ -318,7 +320,7 @@ def compare_tiles(
         off = silent & (np.abs(difference) > allowed)
     # NaN becomes 0: what is not finite equals nothing.
     p, p_beyond = (np.nan_to_num(2 * special.stdtr(freedom, -np.abs(x)), nan=0.0) for x in (t, beyond))
-    return Level(t, p, p_beyond, silent, off, few & ~silent, mean, allowed, error, freedom)
+    return Level(t, p, p_beyond, silent, off, few & ~silent, mean, allowed, error, freedom, m1, difference)
 
 
 def with_silent_pixels(level: Level, a: Array, b: Array, margin: float, tile: int, odds: Array | float = 7.0) -> Level:
@@ -393,20 +395,45 @@ class TileTests:
         return sidak(self.family_error, self.p.size)
 
     @cached_property
-    def differing(self) -> Alarms:
-        """The tests that differ."""
-
-        def count(p: Array | None, among: Flags | bool = True) -> int:
-            return 0 if p is None else int(((p <= self.threshold) & among).sum())
-
-        tiles = doubtful = pixels = silent_far = 0
+    def _flags(self) -> list[dict[str, Flags]]:
+        """Of each level, the tests that differ, by the fields of `Alarms`."""
+        none = 1.0  # the p of what is not tested
+        flags = []
         for level in self.levels:
             in_doubt = level.heavy | (level.shown > self.threshold)
-            tiles += count(level.beyond, ~level.silent & ~in_doubt)
-            doubtful += count(np.where(in_doubt, level.beyond, level.hollow), ~level.silent)
-            pixels += count(level.of_pixels)
-            silent_far += count(level.of_silent)
-        return Alarms(tiles, doubtful, pixels, silent_far, int(self.levels[0].off.sum()))
+            p = {
+                "tiles": np.where(in_doubt | level.silent, none, level.beyond),
+                "doubtful": np.where(level.silent, none, np.where(in_doubt, level.beyond, level.hollow)),
+                "pixels": np.full(level.p.shape, none) if level.of_pixels is None else level.of_pixels,
+                "silent_far": np.full(level.p.shape, none) if level.of_silent is None else level.of_silent,
+            }
+            off = level.off & (level is self.levels[0])
+            flags.append({name: x <= self.threshold for name, x in p.items()} | {"silent": off})
+        return flags
+
+    @cached_property
+    def differing(self) -> Alarms:
+        """The tests that differ."""
+        return Alarms(**{name: sum(int(flags[name].sum()) for flags in self._flags) for name in Alarms._fields})
+
+    def worst(self) -> tuple[str, int, int, int, int]:
+        """The largest of the tests that differ: its field of `Alarms`, its level, row, column and channel.
+
+        Of tiles by standard errors, of their pixels by p on the finest level, of tiles without noise by the difference;
+        a field counts where none before it differs. ValueError where no test does.
+        """
+        for name in ("tiles", "silent_far", "pixels", "doubtful", "silent"):
+            best = []
+            for number, (level, flags) in enumerate(zip(self.levels, self._flags, strict=True)):
+                size = level.difference if "silent" in name else level.t if name != "pixels" else level.of_pixels
+                if flags[name].any() and size is not None:
+                    size = np.nan_to_num(-size if name == "pixels" else np.abs(size), nan=np.inf)
+                    at = np.unravel_index(int(np.where(flags[name], size, -np.inf).argmax()), size.shape)
+                    best.append((0.0 if name == "pixels" else float(size[at]), -number, at))
+            if best:
+                _, finer, (row, column, channel) = max(best)
+                return name, -finer, int(row), int(column), int(channel)
+        raise ValueError("no test differs")
 
     @property
     def alarms(self) -> int:

@@ -94,6 +94,31 @@ def settled(pair):
     return pair
 
 
+def test_in_a_repository_a_folder_inside_finds_the_settings_and_masks_above(run, folders, tmp_path):
+    """Names, `{dir}` and `{root}` are those of the whole folder; nothing above the repository is read."""
+    old, new = folders
+    rule = '[[image]]\nname = "inner/*.exr"\nreason = "masked"\nmask = "{root}/masks/{dir}/{stem}.exr"\n'
+    rule += '[[image]]\nname = "other/*"\nreason = "of another folder"\n'
+    (old / "mi-refract.toml").write_text(rule)
+    image(old / "masks" / "inner" / "changed.exr")  # black on the left
+    image(new / "inner" / "changed.exr", value=9)  # in the fifth column
+    calls = [(old / "inner", new / "inner"), (old / "inner/changed.exr", new / "inner/changed.exr")]
+    assert run("diff", old, new, "inner/*")[0] == 0
+    for repository, code in ((None, 1), (old / "inner", 1), (old, 0), (tmp_path, 0)):
+        if repository:
+            (repository / ".git").mkdir()
+        for sides in calls:
+            assert run("diff", *sides)[::2] == (code, ""), repository
+        if repository:
+            (repository / ".git").rmdir()
+    (tmp_path / ".git").mkdir()
+    assert "mask {root}/masks/{dir}/{stem}.exr" in run("diff", old / "inner", "--check-settings")[1]
+    assert run("diff", *calls[0], "--settings", old / "mi-refract.toml")[0] == 1  # names are those of its folder
+    (old / "mi-refract.toml").write_text('[defaults]\nmap = { reference = "{name}", test = "{name}" }\n')
+    code, _, err = run("diff", *calls[0])
+    assert code == 2 and err.endswith("`map` is for whole folders; expected " + f"{old} as REFERENCE, or --settings\n")
+
+
 def test_settings_lie_beside_the_references_or_are_named(run, pair, tmp_path):
     old, new = pair
     rule = '[[image]]\nname = "louder.exr"\nmethod = "tolerance"\nfail = 0.2\nreason = "known to be louder"\n'

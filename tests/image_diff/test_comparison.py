@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from support.diff_images import of
 
 from mi_refract.image_diff.comparison import Verdict, preconditions
 from mi_refract.image_diff.methods import METHODS, choice, compare, groups
+from mi_refract.image_diff.pixel_statistics import differ_like_noise
 from mi_refract.image_diff.pixelwise import changes
 from mi_refract.io.image_file import Image
 
@@ -308,3 +310,65 @@ def test_the_number_of_images_must_fit_the_method():
     ):
         with pytest.raises(ValueError, match=message):
             compare(method, *sides)
+
+
+# Other noise ---------------------------------------------------------------------------------------------------------
+
+
+def noisy(seed, spread=0.2, width=0.5, shape=(96, 128)):
+    """A render of a few discs on waves, with noise of this spread under a Gaussian filter of this width in pixels."""
+    rng = np.random.default_rng(7)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    pixels = 0.4 + 0.2 * np.sin(x / 9) * np.cos(y / 13)
+    for row, column, radius, value in rng.uniform((0, 0, 5, 0.02), (*shape, 30, 1), (8, 4)):
+        pixels = np.where(np.hypot(y - row, x - column) < radius, value, pixels)
+    noise = np.random.default_rng(seed).gamma(spread**-2, spread**2, (*shape, 3)) - 1
+    return pixels[..., None] * [1, 0.8, 0.5] * (1 + ndimage.gaussian_filter(noise, (width, width, 0), truncate=4))
+
+
+def brighter(pixels, gain, part):
+    pixels = pixels.copy()
+    pixels[part] *= gain
+    return pixels
+
+
+PART = np.s_[20:60, 30:70]
+OTHER_NOISE = {
+    "other seeds": lambda: (noisy(1), noisy(2)),
+    "little noise": lambda: (noisy(1, 0.05), noisy(2, 0.05)),
+    "much noise": lambda: (noisy(1, 1.0), noisy(2, 1.0)),
+    "box filter": lambda: (noisy(1, width=0.1), noisy(2, width=0.1)),
+    "codes": lambda: tuple(np.round(255 * np.clip(noisy(i), 0, 1)) / 255 for i in (1, 2)),
+}
+TRUE_DIFFERENCES = {
+    "brighter": lambda: (noisy(1), 1.05 * noisy(1)),
+    "brighter, other seeds": lambda: (noisy(1), 1.1 * noisy(2)),
+    "a part, other seeds": lambda: (noisy(1), brighter(noisy(2), 1.5, PART)),
+    "a part, other last bits": lambda: (noisy(1), brighter(noisy(1) * (1 + 1e-6 * noisy(2)), 1.5, PART)),
+    "shifted": lambda: (noisy(1), np.roll(noisy(1), 1, 1)),
+    "shifted, other seeds": lambda: (noisy(1, 0.05), np.roll(noisy(2, 0.05), 1, 1)),
+    "blurred": lambda: (noisy(1), ndimage.uniform_filter(noisy(1), (3, 3, 1))),
+    "denoised": lambda: (noisy(1), noisy(2, 1e-3)),
+    "fewer samples": lambda: (noisy(1), noisy(2, 0.6)),
+    "mirrored": lambda: (noisy(1), noisy(2)[:, ::-1]),
+    "swapped channels": lambda: (noisy(1), noisy(2)[..., ::-1]),
+    "one channel with other noise": lambda: (noisy(1), np.dstack([noisy(2)[..., 0], 1.05 * noisy(1)[..., 1:]])),
+    "too few pixels": lambda: (noisy(1)[:30, :30], noisy(2)[:30, :30]),
+    "no noise": lambda: (noisy(1, 1e-3), brighter(noisy(1, 1e-3), 1.5, PART)),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_NOISE | TRUE_DIFFERENCES)
+def test_what_looks_like_other_noise_is_called_so_and_stays_different(name):
+    sides = [of(pixels) for pixels in (OTHER_NOISE | TRUE_DIFFERENCES)[name]()]
+    for method in ("auto", "flip"):
+        result = compare(method, *sides)
+        assert result.verdict is DIFFERENT or (method == "flip" and name != "much noise")
+        hint = name in OTHER_NOISE and result.verdict is DIFFERENT
+        assert ("the same image with other noise" in result.reason) == hint
+
+
+def test_the_hint_is_rare_where_it_is_false_and_usual_where_it_is_true():
+    """At most one of 100 images with other noise fails its tests, so at most two of 20: three have 1e-3."""
+    said = [differ_like_noise(noisy(i), noisy(i + 100)) for i in range(20)]
+    assert sum(said) >= 18

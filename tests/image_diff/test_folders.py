@@ -32,6 +32,21 @@ def images(folder, gains):
         image(folder / name, gain=gain)
 
 
+def test_the_worst_images_come_first(tmp_path):
+    """By how many times a number is its bound, and what one side alone has last."""
+    old, new = tmp_path / "old", tmp_path / "new"
+    for side, few in ((old, 0), (new, 7)):
+        for name, columns in {"a.exr": few, "b.exr": 5 * few, "c.exr": 0, "d.exr": 2 * few}.items():
+            pixels = np.full((40, 60, 3), 0.5)
+            pixels[:, :columns] = 1
+            image_file.write_exr(tmp_path / "x.exr", pixels, ("R", "G", "B"))
+            side.mkdir(exist_ok=True)
+            (tmp_path / "x.exr").rename(side / name)
+    image(old / "0 removed.exr")
+    names = ["b.exr", "d.exr", "a.exr", "0 removed.exr", "c.exr"]
+    assert [result.name for result in diff.diff(old, new).results] == names
+
+
 def test_folders_are_matched_by_name(folders):
     old, new = folders
     results = diff.diff(old, new)

@@ -81,7 +81,10 @@ def test_failures_come_first_with_numbers_and_commands_and_nothing_is_fetched_or
     order = [text.index(place) for place in places]
     assert order == sorted(order)
     numbers = ('<td class="fail">12</td><td class="limit">&gt; 0', "≰ 1", "1e-9", "0.013", "≤ 1e-3")
-    causes = [f'data-filter="{cause}"><b>1</b>' for cause in ("could not be compared", "tiles that differ", "removed")]
+    causes = [
+        f'data-filter="{cause}">{cause}: <b>1</b> image<'
+        for cause in ("could not be compared", "tiles that differ", "removed")
+    ]
     for words in (*numbers, *causes, "1 &amp; 2", "12 tiles differ.", "p-value", "mi-refract diff a b"):
         assert words in text, words
     found = results(tmp_path)
@@ -373,7 +376,7 @@ const wait = setInterval(async () => {
     control.value = value;
     control.dispatchEvent(new Event("input", { bubbles: true }));
   };
-  const seen = {};
+  const seen = { small: all("nav a[data-text] canvas").map((each) => each.height) };
   const visible = (selector) => all(selector).filter((each) => !each.hidden).map((each) => each.id || each.textContent);
   press("/");
   set(active(), "b/ DIFF");
@@ -430,15 +433,16 @@ def test_the_strip_of_names_is_searched_and_the_page_builds_the_command(many, tm
     found = seen(page, tmp_path / "profile")
     words = shlex.split(found.pop("built"))
     assert found == {
+        "small": [32] * 7 + [4],
         "strip": ["b/1.exr", "b/3.exr", "b/5.exr"],
-        "articles": ["pair-6", "pair-7", "pair-8"],
+        "articles": ["pair-5", "pair-6", "pair-7"],
         "count": "3 of 9",
         "typed": ["side", True],
         "ticked": ["b/1.exr"],
         "mode": "flicker",
         "unfolded": [0, True],
         "folded": [8, False],
-        "cause": [["pair-1"], "1 could not be compared"],
+        "cause": [["pair-1"], "could not be compared: 1 image"],
         "all": "8 ticked",
         "clip": ["inset(0px 0px 0px 50%)", "inset(0px 0px 0px 52%)"],
         "requests": 0,

@@ -354,8 +354,12 @@ def test_as_many_samples_as_it_says_decide(counts, whose):
     """Twice the number shows 5 % in so many tiles; half of it does not."""
     rng, options = np.random.default_rng(4), {"tile": 4, "hidden": 0.0}
     result = auto(*(lit(rng, count, 1.0, 0.0) for count in counts), **options)
-    words = re.search(r"; about ([0-9,]+) samples per pixel (.*) would decide$", result.reason)
+    words = re.search(
+        r"; about ([0-9,]+) samples per pixel (.*?)( \((.*) times as many\))? would decide$", result.reason
+    )
     assert (result.verdict, words[2]) == (INCONCLUSIVE, whose)
+    times = None if whose == "a side" and counts[0] != counts[1] else float(words[4])
+    assert not times or times == pytest.approx(int(words[1].replace(",", "")) / min(counts), rel=0.06)
     for factor, verdict in ((0.5, INCONCLUSIVE), (2, EQUAL)):
         count = int(factor * int(words[1].replace(",", "")))
         sides = (lit(rng, n, 1.0, 0.0) for n in (counts[0] if whose != "a side" else count, count))
@@ -405,6 +409,42 @@ def test_a_gain_too_small_for_a_tile_is_seen_in_the_whole_image(rng):
     assert noisy.verdict is INCONCLUSIVE and noisy.minimum_detectable > 0.05
 
 
+@pytest.mark.parametrize("noise", [0.05, 0.0])
+@pytest.mark.parametrize(
+    ("part", "gain", "words"),
+    [
+        (
+            np.s_[16:32, 32:48],
+            0.9,
+            r"(9\.\d|10) % darker in R, 0.9\d* instead of .*, in the 16 × 16 pixels around \(140, 29\)",
+        ),
+        (np.s_[:], 1.02, r"[12]\.?\d? % brighter in R, 1.02\d* instead of .*, in the whole image"),
+        (np.s_[64:70, 64:80], 2.0, r".* % brighter in R, .*, in the 16 × 6 pixels around \(172, 72\)"),
+    ],
+    ids=["a tile", "everywhere", "in the corner"],
+)
+def test_where_and_how_much_is_said(rng, part, gain, words, noise):
+    sides = [renders(rng, 6, shape=(70, 80, 3), deviation=noise) for _ in range(2)]
+    for image in sides[1]:
+        image.pixels[part][..., 0] *= gain
+    result = welch(*([replace(image, origin=(100, 5)) for image in side] for side in sides))
+    words = words if noise else words.replace("the whole image", "the 16 × 16 pixels around .*")  # of tiles alone
+    assert result.verdict is DIFFERENT and re.match(words, result.reason), result.reason
+    assert re.search(r"; \d+ of \d+ tests differ: ", result.reason)
+
+
+def test_what_moves_within_a_tile_and_what_was_black_are_told_as_such(rng):
+    sides = [renders(rng, 6, deviation=0.05) for _ in range(2)]
+    for image in sides[1]:
+        image.pixels[:16:2, :16, 1] *= 1.2
+        image.pixels[1:16:2, :16, 1] *= 0.8
+    words = "other pixels of G in the 16 × 16 pixels around (8, 8), the mean of which is the same within the noise; "
+    assert welch(*sides).reason.startswith(words)
+    for image in sides[0]:
+        image.pixels[16:32, :16, 2] = 0
+    assert welch(*sides).reason.startswith("brighter in B, 1")
+
+
 @pytest.mark.parametrize(
     "size, gain, options, verdict, share",
     [
@@ -427,7 +467,7 @@ def test_a_noisy_part_is_counted_where_the_median_tile_is_quiet(size, gain, opti
     assert result.minimum_detectable < 0.01
     assert result.verdict is verdict
     assert metric(result, "share of the tiles whose noise hides a difference of 0.05") == share
-    assert f"of 0.05 in {share:.3g} of the tiles" in result.reason
+    assert f"of 5 % in {100 * share:.2g} % of the tiles" in result.reason
 
 
 def test_a_tile_with_the_noise_of_one_pixel_is_flagged(rng):
@@ -479,7 +519,7 @@ def test_what_moves_within_the_tiles_is_seen_in_noise(what, variance, rng):
 
     one, two = INSIDE[what]
     result = welch(side(one), side(two))
-    assert result.verdict is DIFFERENT and "of their pixels differ" in result.reason
+    assert result.verdict is DIFFERENT and "of their pixels" in result.reason
     assert welch(side(one), side(one)).verdict is EQUAL
     if what == "stripes inverted":
         assert metric(result, "tests of tiles and channels that differ") == 0
@@ -518,7 +558,7 @@ def test_a_channel_without_noise_and_an_image_without(alpha, verdict, rng):
     flat = [[of(np.dstack([values] * 3))] * 3 for values in alphas]
     assert welch(*flat).verdict is verdict
     if not np.any(alpha):
-        assert "16 of tiles without noise differ" in result.reason
+        assert "16 of tiles without noise" in result.reason
         assert (result.maps["flags"] == 2).all()
         assert metric(result, "tiles without noise that differ") == 16
 

@@ -336,7 +336,7 @@ def test_an_index_that_is_off_moves_prism_bows_and_focus(monkeypatch):
     rows = *rows, closed_forms.achromat_row
     index, trace = light.Light.indices, closed_forms.traced
     with monkeypatch.context() as patch:
-        patch.setattr(light.Light, "indices", lambda *x: tuple(n * (1 + 1e-12 * (n > 1)) for n in index(*x)))
+        patch.setattr(light.Light, "indices", lambda *x, **y: tuple(n * (1 + 1e-12 * (n > 1)) for n in index(*x, **y)))
         assert [row().verdict for row in rows[:3]] == ["pass", "fail", "fail"]
 
     def off(scene, by):

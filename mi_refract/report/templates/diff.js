@@ -51,6 +51,19 @@ function clear() {
   build();
 }
 
+// Each name in the strip has a small copy of its image.
+root.addEventListener("painted", () => {
+  for (const link of all("nav a[data-text]")) {
+    const panes = document.querySelector(link.hash), source = panes.querySelector("[data-role=test] canvas") ?? panes.querySelector("canvas");
+    if (!source) continue;
+    const small = document.createElement("canvas");
+    small.height = Math.min(64, source.height);
+    small.width = Math.max(1, Math.round(source.width * small.height / source.height));
+    small.getContext("2d").drawImage(source, 0, 0, small.width, small.height);
+    link.prepend(small);
+  }
+});
+
 // Keys: x ticks the failure under the strip of names.
 function tick() {
   const under = (article) => article.getBoundingClientRect().bottom > 130;

@@ -81,7 +81,7 @@ function paintMap(canvas) {
   paint(canvas, paneOf(canvas).dataset.paint === "heat" ? heat(gain) : deviation(gain, root.dataset.sign === "signed"));
 }
 function paintAll(which = () => true) {
-  for (const canvas of all("canvas").filter(which)) isMap(canvas) ? paintMap(canvas) : paint(canvas, light(tones[paneOf(canvas).dataset.paint]));
+  for (const canvas of all(".pane canvas").filter(which)) isMap(canvas) ? paintMap(canvas) : paint(canvas, light(tones[paneOf(canvas).dataset.paint]));
 }
 
 // Every study has the same bar; they move together.
@@ -237,6 +237,7 @@ async function start() {
   setSign("signed");
   setMode("side");
   listen();
+  root.dispatchEvent(new Event("painted"));
   root.dataset.ready = "1";
 }
 start();
