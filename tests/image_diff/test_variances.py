@@ -178,7 +178,7 @@ def test_by_the_json_what_was_compared_with_a_variance_is_not_accepted(pair, met
     values = {"method": method, "variance": "{stem}_var.exr"} | ({} if method == "tolerance" else {"spp": 16})
     written(pair[1] / "a.exr", of(samples(3, 16, gain=1.5).mean(0)))
     how, file = Settings(rules=(Entry("*", values),)), pair[0].parent / "out.json"
-    results_file.write(file, folders.diff(*pair, how, to_accept=True))
+    results_file.write(folders.diff(*pair, how, to_accept=True), data=file)
     for now in (how, Settings.for_all(method="tolerance")):
         if method == "tolerance":
             assert len(list(accept.changes(results_file.with_settings(results_file.read(file), now)))) == 1
