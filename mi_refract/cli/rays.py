@@ -8,7 +8,7 @@ import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -24,13 +24,16 @@ from mi_refract.regimes import REGIMES
 
 from .interrupts import as_exceptions
 
+if TYPE_CHECKING:
+    from mi_refract.ray_sets.check_answers import Findings
+
 app = typer.Typer(
     help="Check the refraction of other programs against certified answers.",
     add_completion=False,
     rich_markup_mode=None,
 )
 
-UNWRAPPED = 10_000  # columns: wider than any line
+COLUMNS, UNWRAPPED = 80, 10_000  # of a summary; wider than any line
 
 
 def _print_regimes(wanted: bool) -> None:
@@ -46,7 +49,7 @@ Regime = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME",
-        help="A regime of rays, see `export --regimes`; may be repeated. Default: all with unit vectors.",
+        help="A regime of rays, see --regimes; may be repeated. Default: all with unit vectors.",
     ),
 ]
 Count = Annotated[int, typer.Option(min=1, help="Number of rays per regime.")]
@@ -80,6 +83,8 @@ Backward = Annotated[
         f"(a sound program: {TEXTBOOK_BACKWARD:g}, for ratios of indices up to 2.5).",
     ),
 ]
+Regimes = Annotated[bool, typer.Option("--regimes", is_eager=True, callback=_print_regimes, help="List the regimes.")]
+WithTable = Annotated[bool, typer.Option("--table", help="Also print all numbers of each regime: a wide table.")]
 Report = Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML page.")]
 Junit = Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")]
 Json = Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")]
@@ -95,9 +100,7 @@ def export(
     two_sided: TwoSided = False,
     medium: Medium = None,
     wavelengths: Wavelengths = None,
-    regimes: Annotated[
-        bool, typer.Option("--regimes", is_eager=True, callback=_print_regimes, help="List the regimes.")
-    ] = False,
+    regimes: Regimes = False,
 ) -> None:
     """Write rays for another program: incident directions, normals and indices of refraction."""
     writable(output, files.SUFFIXES)
@@ -119,6 +122,7 @@ def check(
     tir: Tir = "auto",
     formula: Formula = None,
     backward: Backward = None,
+    table: WithTable = False,
     report: Report = None,
     junit: Junit = None,
     json: Json = None,
@@ -128,9 +132,10 @@ def check(
     Exit code 0: every answer is within the error bound, though not all may be right; 1: some are wrong; 2: the answers
     do not match the rays.
     """
-    checked = _checker(context, tir, formula, backward, report, junit, json)
+    checked, write = _checker(context, tir, formula, backward, table, report, junit, json)
     rays = files.read(file) if file else ray_set.make()
-    raise typer.Exit(checked(rays, files.read_answers(answers, most=files.most_answers(rays)), str(answers)))
+    findings = checked(rays, files.read_answers(answers, most=files.most_answers(rays)), str(answers))
+    raise typer.Exit(write({str(answers): findings}))
 
 
 # Those of `run` that choose the rays.
@@ -156,6 +161,7 @@ def run(
         typer.Option("--rays", metavar="FILE", help="Use these rays, as exported, instead of generating some."),
     ] = None,
     regime: Regime = None,
+    regimes: Regimes = False,
     count: Count = ray_set.COUNT,
     precision: Annotated[
         str | None, typer.Option(help="f32 (default) or f64; with --renderer, only the functions of this precision.")
@@ -170,6 +176,7 @@ def run(
     timeout: Annotated[
         float, typer.Option(min=0, metavar="SECONDS", help="Time limit of the command, up to a week.")
     ] = files.TIMEOUT,
+    table: WithTable = False,
     report: Report = None,
     junit: Junit = None,
     json: Json = None,
@@ -180,7 +187,7 @@ def run(
     do not match the rays, or the command fails or exceeds its time limit. With --renderer, the largest exit code of its
     functions.
     """
-    checked = _checker(context, tir, formula, backward, report, junit, json)
+    checked, write = _checker(context, tir, formula, backward, table, report, junit, json)
     for name in (*CHOOSING, *([] if renderer else ["precision"])) if file else ():
         if getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE":
             option = f"--{name.replace('_', '-')}"
@@ -194,21 +201,18 @@ def run(
         functions = [x for x in renderer_file.load(renderer).rays if precision in (None, x.precision)]
         if not functions:
             raise ValueError(f"{renderer}: no function{f' in {precision}' if precision else ''}; expected [[rays]]")
-        if len(functions) > 1 and (report or junit or json):
-            text = f"{renderer}: {len(functions)} functions, but one report"
-            raise ValueError(f"{text}; select a function with --precision")
         calls = [(renderer_file.filled(x.command), x.title, x.precision, x.tir, x.deviations) for x in functions]
     else:
         calls = [(command or [], shlex.join(command or []), precision or ray_set.PRECISION, "auto", {})]
-    codes = []
+    checks = {}
     for words, title, kind, declared, deviations in calls:
         rays = files.read(file) if file else _made(regime, count, kind, seed, two_sided, medium, wavelengths)
         with as_exceptions():
             answers = files.answers_of(words, rays, timeout=timeout, cwd=renderer)
-        codes.append(checked(rays, answers, title, declared))
+        checks[f"{title}, {kind}" if renderer else title] = checked(rays, answers, title, declared)
         for name, reason in deviations.items():
             print(printable(f"known deviation of {title}: {name}: {reason}"))
-    raise typer.Exit(max(codes))
+    raise typer.Exit(write(checks))
 
 
 def _checker(
@@ -216,14 +220,16 @@ def _checker(
     tir: str,
     formula: str | None,
     backward: float | None,
+    table: bool,
     report: Path | None,
     junit: Path | None,
     json: Path | None,
-) -> Callable[..., int]:
-    """`checked(rays, answers, title, tir="auto")`: check the answers, print and write the reports; the exit code.
+) -> tuple[Callable[..., Findings], Callable[[dict[str, Findings]], int]]:
+    """`checked(rays, answers, title, tir="auto")`: check the answers and print the findings.
 
-    `tir` there is the declared signal, which an option overrides. ValueError or OSError, before anything runs, for an
-    option that cannot be met.
+    `tir` there is the declared signal, which an option overrides. The second function, `write(checks)`, writes the
+    reports of all findings, by title; the largest exit code. ValueError or OSError, before anything runs, for an option
+    that cannot be met.
     """
     needed = ("flint", "jinja2") if report else ("flint",)
     if not all(map(importlib.util.find_spec, needed)):
@@ -237,22 +243,26 @@ def _checker(
         if path:
             writable(path, suffixes)
 
-    def checked(rays: RaySet, answers: Answers, title: str, declared: str = "auto") -> int:
+    def checked(rays: RaySet, answers: Answers, title: str, declared: str = "auto") -> Findings:
         print(printable(f"{title}: {_summary(rays)}"))
         signal = declared if tir == "auto" else tir
         found = check_answers.check(rays, answers, tir=signal, error_bound=error_bound, most_backward=most_backward)
-        # On a terminal, too: a wrapped line is easier to read than a squeezed column.
-        Console(width=UNWRAPPED).print(reports.table(found), highlight=False)
-        if report:
-            about = {"answers": title} | {key: rays.header[key] for key in ("seed", "checksum")} | provenance()
-            reports.write_html(report, found, about, shlex.join(["mi-refract", *context.obj]))
-        if junit:
-            reports.write_junit(junit, found, title)
-        if json:
-            reports.write_json(json, found)
-        return found.exit_code
+        if table and found.regimes:
+            # On a terminal, too: a wrapped line is easier to read than a squeezed column.
+            Console(width=UNWRAPPED).print(reports.table(found), highlight=False)
+        Console(width=COLUMNS).print(reports.summary(found), highlight=False)
+        return found
 
-    return checked
+    def write(checks: dict[str, Findings]) -> int:
+        if report:
+            reports.write_html(report, checks, provenance(), shlex.join(["mi-refract", *context.obj]))
+        if junit:
+            reports.write_junit(junit, checks)
+        if json:
+            reports.write_json(json, checks)
+        return max(findings.exit_code for findings in checks.values())
+
+    return checked, write
 
 
 def _made(

@@ -149,35 +149,45 @@ def cells(errors: RegimeErrors, ulp: float) -> dict[str, str]:
     }
 
 
-def table(findings: Findings) -> RenderableType:
-    """The regimes, the problems of the set, the diagnosis and the sentence, for rich's console."""
+def summary(findings: Findings) -> RenderableType:
+    """The regimes by grade, the problems of the set, the diagnosis and the sentence, for rich's console."""
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
+    grades = Table.grid(padding=(0, 2))
+    for word, style in STYLES.items():
+        if names := [errors.regime for errors in findings.regimes if grade(errors) == word]:
+            every = 1 < len(names) == len(findings.regimes)
+            grades.add_row(Text(word, style=style), Text("every regime" if every else printable("; ".join(names))))
     notes = [*map(problem_text, findings.problems), *ratio(findings), signal(findings), *explained(findings)]
     notes += [MEANING] if findings.right > 0 and not findings.wrong else []
-    lines = [Text(printable(line)) for line in (*notes, sentence(findings))]
-    if not findings.regimes:
-        return Group(*lines)
-    rows = Table("", "regime", *cells(findings.regimes[0], findings.ulp), box=None, pad_edge=False)
+    return Group(grades, *(Text(printable(line)) for line in (*notes, sentence(findings))))
+
+
+def table(findings: Findings) -> RenderableType:
+    """A line per regime, with all its numbers, for rich's console."""
+    from rich.table import Table
+    from rich.text import Text
+
+    head = cells(findings.regimes[0], findings.ulp) if findings.regimes else ()
+    rows = Table("", "regime", *head, box=None, pad_edge=False)
     for column in rows.columns[2:]:
         column.justify = "right"
     for errors in findings.regimes:
         word = Text(grade(errors), style=STYLES[grade(errors)])
         rows.add_row(word, Text(printable(errors.regime)), *cells(errors, findings.ulp).values())
-    return Group(rows, *lines)
+    return rows
 
 
 # Files -------------------------------------------------------------------------------------------------------------
 
 
 def as_data(findings: Findings) -> dict[str, Any]:
-    """`{"schema": 1, "exit_code", "sentence", "precision", …, "regimes": [...], "explanations": [...]}`."""
+    """`{"exit_code", "sentence", "precision", …, "regimes": [...], "explanations": [...]}`."""
     diagnosis = findings.diagnosis
     regimes = [dataclasses.asdict(x) | {"worst_ulps": x.worst / findings.ulp} for x in findings.regimes]
     return {
-        "schema": SCHEMA,
         "exit_code": findings.exit_code,
         "sentence": sentence(findings),
         "precision": findings.precision,
@@ -196,13 +206,23 @@ def as_data(findings: Findings) -> dict[str, Any]:
     }
 
 
-def write_json(path: str | Path, findings: Findings) -> None:
-    """Write `as_data` as strict JSON: NaN and the infinities become words. OSError where that fails."""
-    write_strict_json(path, as_data(findings))
+def write_json(path: str | Path, checks: Mapping[str, Findings]) -> None:
+    """Write `{"schema": 1, "exit_code", "functions": [{"title", …}, …]}` as strict JSON, with the entries of `as_data`.
+
+    `checks`: findings by the title of the function; the exit code is the largest. NaN and the infinities become words.
+    OSError where that fails.
+    """
+    functions = [{"title": title} | as_data(findings) for title, findings in checks.items()]
+    exit_code = max(findings.exit_code for findings in checks.values())
+    write_strict_json(path, {"schema": SCHEMA, "exit_code": exit_code, "functions": functions})
 
 
-def write_junit(path: str | Path, findings: Findings, name: str) -> None:
-    """One test case per regime, and one for the set of answers: an error where they do not match the rays."""
+def write_junit(path: str | Path, checks: Mapping[str, Findings]) -> None:
+    """A suite per function: a case per regime, and one for the answers: an error where they do not match the rays."""
+    documents.write_junit(path, "mi-refract rays", {title: _cases(findings) for title, findings in checks.items()})
+
+
+def _cases(findings: Findings) -> list[documents.Case]:
     answers = documents.Case("answers", "complete and understood")
     if not findings.answered or findings.problems or findings.tir == UNCLEAR:
         lines = [*map(problem_text, findings.problems), *ratio(findings), signal(findings)]
@@ -217,11 +237,29 @@ def write_junit(path: str | Path, findings: Findings, name: str) -> None:
             lines = [wrong, *explained(findings), *numbers, json.dumps(strict(errors.replay))]
             case = documents.Case("rays", errors.regime, "failure", wrong, lines)
         cases.append(case)
-    documents.write_junit(path, "mi-refract rays", {name: cases})
+    return cases
 
 
-def write_html(path: str | Path, findings: Findings, context: Mapping[str, Any], replay: str = "") -> None:
-    """Write the HTML page. `context` is shown on top; `replay` is the command that repeats the check. OSError."""
+def write_html(
+    path: str | Path, checks: Mapping[str, Findings], context: Mapping[str, Any] | None = None, replay: str = ""
+) -> None:
+    """Write the HTML page.
+
+    `checks`: findings by the title of the function. `context` is shown on top of each; `replay` is the command that
+    repeats the checks. OSError.
+    """
+    content = {
+        "title": "mi-refract rays",
+        "sentence": "; ".join(map(sentence, checks.values())),
+        "checks": [_section(title, findings, context or {}) for title, findings in checks.items()],
+        "most_right": f"{RIGHT:g}",
+        "pi": math.pi,
+        "command": replay,
+    }
+    write_page(path, "rays.html.j2", content, EmbeddedImages())
+
+
+def _section(title: str, findings: Findings, context: Mapping[str, Any]) -> dict[str, Any]:
     rows = []
     for errors in findings.regimes:
         shown = cells(errors, findings.ulp)
@@ -237,9 +275,10 @@ def write_html(path: str | Path, findings: Findings, context: Mapping[str, Any],
                 "replay": json.dumps(strict(errors.replay), indent=1),
             }
         )
-    noted = dict(zip(["ratio of indices"], ratio(findings), strict=False))
-    content = {
-        "title": "mi-refract rays",
+    about = {"answers": title, "precision": findings.precision, "error bound": findings.error_bound}
+    about |= {key: findings.header[key] for key in ("seed", "checksum") if key in findings.header}
+    return {
+        "name": title,
         "sentence": sentence(findings),
         "state": "fail" if findings.exit_code else "pass",
         "counts": [
@@ -247,7 +286,7 @@ def write_html(path: str | Path, findings: Findings, context: Mapping[str, Any],
             ("info", "within the error bound only", findings.answered - findings.right - findings.wrong),
             ("fail", "wrong", findings.wrong),
         ],
-        "context": {"precision": findings.precision, "error bound": findings.error_bound, **context, **noted},
+        "context": about | dict(context) | dict(zip(["ratio of indices"], ratio(findings), strict=False)),
         "problems": [problem_text(x) for x in findings.problems],
         "signal": signal(findings),
         "unclear": findings.tir == UNCLEAR,
@@ -255,8 +294,4 @@ def write_html(path: str | Path, findings: Findings, context: Mapping[str, Any],
         "explanations": findings.explanations,
         "head": list(cells(findings.regimes[0], findings.ulp)) if findings.regimes else [],
         "rows": rows,
-        "most_right": f"{RIGHT:g}",
-        "pi": math.pi,
-        "command": replay,
     }
-    write_page(path, "rays.html.j2", content, EmbeddedImages())

@@ -418,8 +418,9 @@ def test_markup_and_escapes_in_a_regime_stay_text(tmp_path):
         files.read(files.write(tmp_path / "rays.npz", forged)), Answers(one.ids, one.rays.a.astype(float))
     )
     stream = io.StringIO()
-    Console(file=stream, width=1000, force_terminal=True, color_system=None).print(reports.table(found))
-    assert "[/] [bold]x[link=http://a]" in stream.getvalue()
+    console = Console(file=stream, width=1000, force_terminal=True, color_system=None)
+    console.print(reports.table(found), reports.summary(found))
+    assert stream.getvalue().count("[/] [bold]x[link=http://a]") >= 2
     assert "\x1b[2J" not in stream.getvalue() and "\u202e" not in stream.getvalue()
 
 

@@ -1,8 +1,11 @@
 """A folder with `mi-refract-renderer.toml` is a renderer."""
 
+import json
+import re
 import shutil
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 from support.readme import python_blocks
@@ -118,7 +121,6 @@ INVERTED = PROGRAM.replace("rows[:, 7:8] / rows[:, 8:9]", "rows[:, 8:9] / rows[:
         (("none", "right"), "auto", (), 2),
         (("right",), "auto", ("--precision", "f64"), 2),
         (("right",), "auto", ("--", "true"), 2),
-        (("right", "right"), "auto", ("--json", "a.json"), 2),
     ],
 )
 def test_every_function_of_a_renderer_is_checked_and_a_known_deviation_excuses_nothing(
@@ -138,5 +140,27 @@ def test_every_function_of_a_renderer_is_checked_and_a_known_deviation_excuses_n
     assert ("known deviation of function" in out and ": critical: inverts k" in out) == ("wrong" in programs)
     assert ("zero vector, which is not the signal" in out) == (signal == "nan" and not option)
     if option and expected:
-        said = {"--precision": "no function in f64", "--": "expected one of them", "--json": "but one report"}
+        said = {"--precision": "no function in f64", "--": "expected one of them"}
         assert said[option[0]] in err and err.count("\n") == 1
+
+
+def test_every_report_holds_every_function_of_a_renderer(folder, run, tmp_path):
+    """Two functions of one title, which differ in their precision; one of them is wrong."""
+    both = [("f32", "right"), ("f64", "wrong")]
+    text = "title = 'T'\n"
+    for precision, name in both:
+        text += f"[[rays]]\ntitle = 'F'\nprecision = '{precision}'\ncommand = ['{{python}}', '{name}.py']\n"
+    where = folder(text)
+    (where / "right.py").write_text(PROGRAM)
+    (where / "wrong.py").write_text(INVERTED)
+    page, suites, data = (tmp_path / f"out.{ending}" for ending in ("html", "xml", "json"))
+    options = ("--report", page, "--junit", suites, "--json", data)
+    status, *_ = run("rays", "run", "--renderer", where, "--regime", "generic", "--count", 20, *options)
+    document = json.loads(data.read_text())
+    found = [(function["title"], function["exit_code"]) for function in document["functions"]]
+    assert (status, document["exit_code"], found) == (1, 1, [("F, f32", 0), ("F, f64", 1)])
+    assert [suite.get("name") for suite in ElementTree.parse(suites).getroot()] == ["F, f32", "F, f64"]
+    html = page.read_text()
+    assert [html.count(f"<h1>{function['sentence']}</h1>") for function in document["functions"]] == [1, 1]
+    links = re.findall('href="#([^"]+)"', html)
+    assert "check-2" in links and [html.count(f'id="{link}"') for link in links] == [1] * len(links)

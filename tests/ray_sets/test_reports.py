@@ -135,16 +135,19 @@ def test_json_junit_and_a_page_that_stands_alone(tmp_path):
     b[:5] = np.nan
     wrong = check_answers.check(to, Answers(to.ids[:-2], b[:-2]))
     for result, code, diagnosis, failures, errors in ((right, 0, None, 0, 0), (wrong, 2, "eta inverted", 3, 1)):
-        reports.write_json(tmp_path / "out.json", result)
+        title = "a & b \x1b[31m <program>"
+        reports.write_json(tmp_path / "out.json", {title: result})
         text = (tmp_path / "out.json").read_text()
-        data = json.loads(text, parse_constant=pytest.fail)
-        assert (data["schema"], data["exit_code"], data["diagnosis"]) == (1, result.exit_code, diagnosis)
+        document = json.loads(text, parse_constant=pytest.fail)
+        (data,) = document["functions"]
+        assert (document["schema"], document["exit_code"], data["title"]) == (1, result.exit_code, title)
+        assert (data["exit_code"], data["diagnosis"]) == (result.exit_code, diagnosis)
         assert result.exit_code == code and data["wrong"] == sum(x["wrong"] for x in data["regimes"])
         assert data["rays"]["checksum"] == result.header["checksum"] and "n_ratio" not in data
         assert data["regimes"][0]["worst_ulps"] == result.regimes[0].worst * 2**23
         assert data["total_internal_reflection"] == {"signal": result.tir, "detected": True}
 
-        reports.write_junit(tmp_path / "out.xml", result, "a & b \x1b[31m <program>")
+        reports.write_junit(tmp_path / "out.xml", {title: result})
         root = ElementTree.parse(tmp_path / "out.xml").getroot()
         for element in (root, root[0]):
             assert [int(element.get(key)) for key in ("tests", "failures", "errors")] == [4, failures, errors]
@@ -152,7 +155,7 @@ def test_json_junit_and_a_page_that_stands_alone(tmp_path):
         assert [case.get("name") for case in root[0]][1:] == ["generic", "k ≫ 1", "critical"]
         assert ["eta inverted" in failure.text for failure in root.findall(".//failure")] == [True] * failures
 
-        reports.write_html(tmp_path / "out.html", result, {"answers": hostile}, f"mi-refract rays run -- {hostile}")
+        reports.write_html(tmp_path / "out.html", {hostile: result}, replay=f"mi-refract rays run -- {hostile}")
         text = (tmp_path / "out.html").read_text()
         page = Page(text)
         assert not page.open and all(link.startswith("#") for link in page.links)
@@ -171,10 +174,10 @@ def test_every_report_has_the_ratio(tmp_path):
     ray = f"{FLINT} to air at 587.561829 nm"
     assert data["n_ratio"] == {"largest": pytest.approx(1e-3, rel=1e-3), "id": 4, "ray": ray, "tolerance": 1e-5}
     assert data["problems"] == [{"kind": "index", "count": 1, "text": "id 4"}]
-    reports.write_junit(tmp_path / "a.xml", result, "answers")
+    reports.write_junit(tmp_path / "a.xml", {"answers": result})
     (failure,) = ElementTree.parse(tmp_path / "a.xml").getroot().iter("failure")
     assert "1 answers used a different ratio of indices" in failure.get("message")
-    reports.write_html(tmp_path / "a.html", result, {})
+    reports.write_html(tmp_path / "a.html", {"answers": result})
     text = "<dt>ratio of indices</dt><dd>n_ratio: the largest relative difference"
     assert text in (tmp_path / "a.html").read_text()
 
@@ -183,6 +186,6 @@ def test_every_report_has_the_ratio(tmp_path):
 def test_a_browser_reports_no_error(tmp_path):
     to = ray_set.make(("generic",), 60)
     result = check_answers.check(to, Answers(to.ids, glsl(to.rays.a, to.rays.n, 1 / to.rays.k)))
-    reports.write_html(tmp_path / "out.html", result, {})
+    reports.write_html(tmp_path / "out.html", {"answers": result})
     dom, said = browse(tmp_path / "out.html", tmp_path / "profile")
     assert said == [] and reports.sentence(result) in dom

@@ -62,8 +62,11 @@ FORMS = {
     "JUnit": lambda results, path: results_file.write(results, path) or path.read_text(),
     "HTML": lambda results, path: html_report.write(path, results, {NAME: [NAME]}, NAME) or path.read_text(),
     "terminal, rays": lambda results, path: printed(reports.table(findings())),
-    "JUnit, rays": lambda results, path: reports.write_junit(path, findings(), NAME) or path.read_text(),
-    "HTML, rays": lambda results, path: reports.write_html(path, findings(), {NAME: NAME}, NAME) or path.read_text(),
+    "terminal, summary of rays": lambda results, path: printed(reports.summary(findings())),
+    "JUnit, rays": lambda results, path: reports.write_junit(path, {NAME: findings()}) or path.read_text(),
+    "HTML, rays": lambda results, path: (
+        reports.write_html(path, {NAME: findings()}, {NAME: NAME}, NAME) or path.read_text()
+    ),
 }
 
 
