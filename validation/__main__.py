@@ -21,6 +21,7 @@ from validation.run import command_line
 
 if TYPE_CHECKING:
     from validation.study import Study
+    from validation.suite.renderers import System
 
 # By name on the command line, which is that of the room: the modules whose STUDY is run, in the order of the report.
 ROOMS = {
@@ -102,6 +103,7 @@ def _command(
 ) -> int:
     """Measure the formulas and the plugin against certified answers, and write the report."""
     names, target = studies or [], ClusterTarget(scheduler, workers)
+    joined: list[System] = []
     if unknown := [name for name in names if name not in ROOMS]:
         raise ValueError(f"unknown study {unknown[0]!r}; expected {', '.join(ROOMS)}")
     if profile not in PROFILES:
@@ -124,12 +126,13 @@ def _command(
         from validation.suite import rendered_images
         from validation.suite.renderers import system
 
-        for folder in renderers:
-            rendered_images.join(system.join(folder))
+        for folder in reversed(renderers):  # the last one to join is the first of the report
+            joined.insert(0, system.join(folder))
+            rendered_images.join(joined[0])
     target.check()
     try:
         with safe_files.held(out / LOCK, "a validation"):
-            return _run(names, profile, out, write_tables, goals, target)
+            return _run(names, profile, out, write_tables, goals, target, joined)
     except KeyboardInterrupt:
         print("validation: interrupted; run the same command again to resume", file=sys.stderr)
         raise
@@ -143,7 +146,15 @@ def modules(studies: list[str], profile: str) -> list[str]:
     return [f"{room.replace('-', '_')}.{module}" for room in rooms for module in ROOMS[room]]
 
 
-def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: bool, target: ClusterTarget) -> int:
+def _run(
+    names: list[str],
+    profile: str,
+    out: Path,
+    write_tables: bool,
+    goals: bool,
+    target: ClusterTarget,
+    joined: list[System],
+) -> int:
     from rich.console import Console
 
     from mi_refract import backend
@@ -169,12 +180,17 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
         rows = study.summarise(rows)
     if not context.profile.quick:  # whose few cases need not come near any bound
         rows = [*rows, *tightness.rows(rows)]
+    first_page = headline.first_page(rows, profile)
+    if joined:
+        from validation.suite import matrix
+
+        first_page["answers"] = [*matrix.answers(rows, joined), *first_page["answers"]]
     described = runner.describe(context, time.perf_counter() - start)
     described |= {
         "replay": " ".join(["python -m validation", *names, f"--profile {profile}"]),
         "studies": {study.name: study.described for study in studies} | {tightness.NAME: tightness.ABOUT},
         "scatter": [scatter for study in studies for scatter in study.scatter],
-        "first_page": headline.first_page(rows, profile),
+        "first_page": first_page,
     }
     run_report.write_json(out / "rows.json", rows, described | {"tasks": spent})
     run_report.write_junit(out / "junit.xml", rows, described)

@@ -33,7 +33,7 @@ def write_json(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]
 def verdict(rows: Sequence[Row]) -> str:
     """One sentence: how many checks (budgets that were measured) passed or failed, how many rows were not run."""
     measured = sum(len(row.budgets) for row in rows if row.values)
-    broken = sum(len(row.broken) for row in rows)
+    broken = study_page.failed_checks(rows)
     missing = sum(row.verdict == "not run" for row in rows)
     if not measured:
         sentence = "Nothing was checked"
@@ -70,20 +70,20 @@ def write_junit(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any
 
 
 def summary(rows: Sequence[Row], context: Mapping[str, Any] | None = None) -> RenderableType:
-    """For rich's console: broken budgets, the answers of the context's `first_page`, then the verdict."""
+    """For rich's console: the answers of the context's `first_page`, broken budgets, then the verdict."""
     from rich.console import Group
     from rich.padding import Padding
     from rich.text import Text
 
     broken = [(row, metric) for row in rows for metric in row.broken]
     parts: list[RenderableType] = []
-    if broken:
-        parts += [_bounds_table("broken budget", "budget", broken, "bold red"), Text()]
     styles = {"yes": "bold green", "no": "bold red", "plain": "bold", "not measured": "bold yellow"}
     for answer in ((context or {}).get("first_page") or {}).get("answers", ()):
         text = Text.assemble(*((part, "cyan" if i % 2 else "") for i, part in enumerate(answer["text"].split("`"))))
         parts.append(Text(answer["question"].replace("`", ""), style=styles[answer["state"]]))
         parts.append(Padding(text, (0, 0, 1, 2)))
+    if broken:
+        parts += [_bounds_table("broken budget", "budget", broken, "bold red"), Text()]
     return Group(*parts, Text(verdict(rows), style="bold red" if broken else "bold"))
 
 

@@ -36,6 +36,7 @@ State = Literal["yes", "no", "plain", "not measured"]
 STATES: tuple[State, ...] = get_args(State)
 COLUMNS = 13  # of a matrix, beside its labels: more do not fit into a window of 1280 pixels
 CHARACTERS = 148  # of a table's line there
+LISTED = 3  # failures on the first screen
 
 
 class Answer(TypedDict):
@@ -75,6 +76,10 @@ def prepare(rows: Sequence[Row], context: Mapping[str, Any], images: EmbeddedIma
     Errors: ValueError where the first page has an unknown state or row; those of `EmbeddedImages.embed`.
     """
     verdicts = Counter(row.verdict for row in rows)
+    failures = [row for row in rows if row.broken]
+    # Of checks, as in the sentence above them; of rows where nothing is checked.
+    held = sum(len(row.budgets) - len(row.broken) for row in rows if row.values)
+    counts = {"pass": held, "fail": failed_checks(rows), NOT_RUN: verdicts[NOT_RUN], "info": verdicts["info"]}
     studies = by_study(rows)
     keys = {name: f"study-{number}" for number, name in enumerate(studies, 1)}
     screen: dict[str, Any] = {}
@@ -102,16 +107,24 @@ def prepare(rows: Sequence[Row], context: Mapping[str, Any], images: EmbeddedIma
         "first": screen,
         "title": context.get("title", "mi_refract"),
         "state": "fail" if verdicts["fail"] else "pass" if verdicts["pass"] else "empty",
-        "counts": [(word, verdicts[word]) for word in ("pass", "fail", NOT_RUN, "info")],
+        "counts": list(counts.items()),
         "context": {key: value for key, value in context.items() if key not in STEERING},
         "command": context.get("replay", ""),
-        "failures": [row for row in rows if row.broken],
+        "failures": failures,
+        "failed": counts["fail"],
+        "unlisted": failed_checks(failures[LISTED:]),
         "missing": not_run(rows),
         "absent": verdicts[NOT_RUN],
         "studies": [_study(name, members, context, images, keys[name]) for name, members in studies.items()],
+        "listed": LISTED,
         "cell": cell,
         "phrase": phrase,
     }
+
+
+def failed_checks(rows: Iterable[Row]) -> int:
+    """How many budgets of the rows are broken."""
+    return sum(len(row.broken) for row in rows)
 
 
 def not_run(rows: Sequence[Row]) -> dict[str, list[Row]]:
@@ -196,7 +209,7 @@ def _study(name: str, rows: list[Row], context: Mapping[str, Any], images: Embed
         "title": about.get("title", name),
         "text": about.get("text", ""),
         "terms": about.get("terms", {}),
-        "failures": sum(row.verdict == "fail" for row in rows),
+        "failures": failed_checks(rows),
         "scale": scale,
         "panels": _panels(rows, metrics, scale),
         "missing": not_run(rows),

@@ -144,11 +144,11 @@ def printed(table):
     return console.export_text()
 
 
-def test_the_terminal_shows_what_is_broken_first_and_takes_names_literally():
+def test_the_terminal_shows_answers_then_what_is_broken_and_takes_names_literally():
     page = {"answers": [{"question": "Is it [red]right?", "text": "`No`.", "state": "no", "study": "speed"}]}
     rows = [*ROWS, dataclasses.replace(BAD, subject="[red]x")]
     text = printed(run_report.summary(rows, {"first_page": page}))
-    words = "cross / generic / llvm float32", "[red]x / generic", "Is it [red]right?", "No.", "4 of 5 checks failed"
+    words = "Is it [red]right?", "No.", "cross / generic / llvm float32", "[red]x / generic", "4 of 5 checks failed"
     order = [text.index(word) for word in words]
     assert order == sorted(order)
     goals = [dataclasses.replace(GOOD, subject=f"goal {limit}", goals={"time": limit}) for limit in (2.0, 1.1)]
@@ -405,12 +405,15 @@ PAGE = {
 
 def test_what_is_broken_comes_before_the_answers_and_they_before_the_studies_and_what_was_not_run(tmp_path):
     write_exr(tmp_path / "a.exr", np.full((4, 4, 3), 0.5))
-    broken = [dataclasses.replace(GOOD, values={"worst": 1.0}, case=str(i)) for i in range(5)]
+    both = {"worst": 1.0, "p99": 1.0}
+    broken = [dataclasses.replace(GOOD, values=both, budgets=dict.fromkeys(both, 0.5), case=str(i)) for i in range(5)]
     absent = [Row("speed", name, "", "cuda", reason="no GPU" if name < "d" else "no time") for name in "dabc"]
     text = html(tmp_path, [GOOD, CURVES, IMAGES, *broken, *absent], {"first_page": PAGE})
-    parts = "5 of 6 checks failed", 'class="broken"', "and 2 more", 'class="answers"', 'id="study-1"', 'id="missing"'
+    parts = "10 of 11 checks failed", 'class="broken"', "and 4 more", 'class="answers"', 'id="study-1"', 'id="missing"'
     order = [text.index(words) for words in parts]
     assert order == sorted(order)
+    assert [len(re.findall(words, text)) for words in ("Failures <b>10</b>", '<b class="bad">10</b>')] == [1, 1]
+    assert "p99 <b>1</b> &gt; 0.5 allowed</li>" in text
     assert "Is <code>it</code> right?" in text and "Up to &lt;2&gt; <code>ulp</code>." in text
     assert '<a href="#study-1">More</a>' in text and '<a href="#missing">More</a>' in text
     assert re.findall(r'class="(yes|not-measured)"', text) == ["yes", "not-measured"]

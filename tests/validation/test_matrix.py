@@ -36,7 +36,8 @@ def test_numbers_and_verdicts_are_those_of_the_rows_and_stand_before_them():
     right, wrong, equal, different, known = rows[1:6]
     assert (right.study, right.subject, right.case, right.values[matrix.OFF]) == ("matrix", "A, f32", "random", 1e-6)
     assert [row.verdict for row in rows[1:6]] == ["pass", "fail", "pass", "fail", "pass"]
-    assert (wrong.reason, equal.reason) == ("A 1.2; zero", "B 3; why")
+    assert wrong.values[matrix.FAILED] == 1.0
+    assert (wrong.reason, equal.reason) == ("wrong 3 > 0 allowed; A 1.2; zero", "B 3; why")
     assert (equal.subject, equal.values[matrix.OFF]) == ("B", 0.02)
     assert [row.values["differs"] for row in (equal, different, known)] == [0, 1, 1]
     assert known.missed == {"differs": 0.0}

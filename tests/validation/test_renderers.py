@@ -19,7 +19,7 @@ from mi_refract.ray_sets.renderer_file import RaysCommand
 from validation import __main__ as command
 from validation import limits
 from validation.run.context import PROFILES, Context
-from validation.suite import per_ray, rendered_images
+from validation.suite import matrix, per_ray, rendered_images
 from validation.suite.per_ray import LARGE, TOTAL
 from validation.suite.renderers import SYSTEMS, System, environments
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
@@ -437,6 +437,29 @@ def test_a_renderer_that_joins_is_judged_as_every_other_one(mine, few, monkeypat
     monkeypatch.setitem(rendered_images.SIZES, "quick", rendered_images.Size(16, 64, 1, 0.5))
     (row,) = rendered_images.pair_rows(context, "Mine", "sphere")
     assert row.verdict == "pass" and row.replay["verdict"] in ("equal", "inconclusive") and row.replay["spp"] == 64
+
+
+def test_a_renderer_that_joins_comes_first_in_the_report_and_what_was_not_measured_is_said_once(
+    mine, few, monkeypatch, tmp_path, capsys
+):
+    folder, out = mine(), tmp_path / "out"
+    SYSTEMS.clear()
+    SYSTEMS["other"] = System("other", "Other", calls=(RaysCommand("another program", "f64", ("false",), "zero"),))
+    monkeypatch.setitem(command.ROOMS, "suite", ("matrix", "per_ray"))
+    assert command.main(["suite", "--renderer", str(folder), "--out", str(out)]) == 1
+    document = json.loads((out / "rows.json").read_text())
+    assert list(dict.fromkeys(row["subject"] for row in document["rows"] if row["study"] == "matrix")) == [
+        "Mine, refract, f64",
+        "another program, f64",
+    ]
+    first, *others = document["context"]["first_page"]["answers"]
+    assert (first["question"], first["state"]) == ("Your renderer: Mine, refract, f64", "yes")
+    assert first["text"].startswith("exact only for inputs more than 8 roundings off: k ≫ 1 (")
+    assert ["Not measured" in answer["question"] + answer["text"] for answer in others] == [False, True]
+    said = capsys.readouterr().out
+    assert said.startswith("Your renderer: Mine") and said.count("Not measured") == 1
+    found = matrix.of_rows(row for row in document["rows"] if row["study"] == "per_ray")["rays"]
+    assert found[-1]["sentence"].startswith("no answers: ended with status 1")
 
 
 @pytest.mark.parametrize(

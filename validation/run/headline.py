@@ -29,7 +29,7 @@ PLUGIN, BUILTIN, INTEGRATOR, METHODS = "refract", "dielectric", "refract_path", 
 MIRAGE, EXACT, ROUNDED = "mirage", "exact", "exact, indices in float32"
 LAYERS, SHALLOW = 1000, "89.55°"
 INSTALL = "other renderers, by `python -m validation renderers --install "
-NOT_MEASURED = "Not measured in this run."
+NOT_MEASURED = "Not measured in this run"
 LEAD = "`refract` is this project's drop-in replacement for Mitsuba's material of smooth glass, `dielectric`."
 LINES = "its thin lines are right, light along a layer of air"
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -69,12 +69,16 @@ def first_page(rows: Sequence[Row], profile: str = "") -> FirstPage:
         ),
         "missing": ("What was not run, and what does it need?", [], NOT_RUN if facts["remedies"] else ""),
     }
-    texts, answers = _texts(facts), list[Answer]()
+    texts, answers, unmeasured = _texts(facts), list[Answer](), list[str]()
     for key, (question, evidence, study) in questions.items():
         verdicts = {row.verdict for row in evidence}
         state: State = "no" if "fail" in verdicts else "yes" if "pass" in verdicts else "plain"
-        text, state = (texts[key], state) if texts[key] else (NOT_MEASURED, "not measured")
-        answers.append({"question": question, "text": text, "state": state, "study": study})
+        if texts[key]:
+            answers.append({"question": question, "text": texts[key], "state": state, "study": study})
+        else:
+            unmeasured.append(question)
+    if unmeasured:
+        answers.append({"question": NOT_MEASURED, "text": " ".join(unmeasured), "state": "not measured", "study": ""})
     page: FirstPage = {"lead": LEAD, "answers": answers}
     if image := _image(ours, select(paths, PATHS, PLUGIN)):
         page["image"] = image

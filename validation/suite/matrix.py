@@ -19,6 +19,7 @@ from mi_refract.ray_sets.judged_answers import RIGHT
 from mi_refract.report.documents import write_page
 from mi_refract.report.embedded_images import EmbeddedImages
 from mi_refract.report.row import Row, strict
+from mi_refract.report.study_page import Answer, State, phrase
 from validation import limits
 from validation.run.context import Context
 from validation.run.metrics import DETECTABLE, MEAN_DIFFERENCE, WORST_ANGLE
@@ -27,13 +28,14 @@ from validation.study import Study, Task, about
 from . import per_ray, rendered_images
 from .per_ray import BACKWARD, LARGE, OFF_RECORDED, RECORDED
 from .rendered_images import INCONCLUSIVE
+from .renderers import System
 
 NAME = "matrix"
-OFF = "off by"
+OFF, FAILED = "off by", "failed checks"
 TERMS = {
     OFF: "rays: the largest angle, in radians, without misclassified rays; images: |test / reference − 1| of the means",
     BACKWARD: per_ray.TERMS[BACKWARD],
-    "disagrees": "1 where a budget is broken in the row that this comes from",
+    FAILED: "number of broken budgets in the row that this comes from",
     RECORDED: per_ray.TERMS[RECORDED],
     OFF_RECORDED: "the error over the one recorded earlier, or the reverse if that is larger; a goal, which fails no "
     "run",
@@ -65,7 +67,7 @@ def _cells(row: Row) -> list[Row]:
     system = f"{row.subject}, {row.setting}" if row.study == per_ray.NAME else row.subject
     if not row.values:
         return [Row(NAME, system, case, "", reason=row.reason) for case in cases]
-    values, goals = {"disagrees": float(bool(row.broken))}, {}
+    values, goals = {FAILED: float(len(row.broken))}, {}
     if row.study == rendered_images.NAME:
         verdict = row.replay.get("verdict")
         values |= {"differs": float(verdict == "different"), INCONCLUSIVE: float(verdict == INCONCLUSIVE)}
@@ -75,8 +77,9 @@ def _cells(row: Row) -> list[Row]:
         values |= {OFF: row.values[WORST_ANGLE]} if WORST_ANGLE in row.values else {}
         values |= {name: row.values[name] for name in (BACKWARD, RECORDED, OFF_RECORDED) if name in row.values}
         goals = {name: row.goals[name] for name in (BACKWARD, OFF_RECORDED) if name in row.goals}
-    reason = "; ".join(filter(None, (row.replay.get("renderer", ""), row.reason)))
-    return [Row(NAME, system, case, "", values, {"disagrees": 0.0}, goals, reason) for case in cases]
+    failed = [f"{phrase(row, metric)} allowed" for metric in row.broken]
+    reason = "; ".join(filter(None, (*failed, row.replay.get("renderer", ""), row.reason)))
+    return [Row(NAME, system, case, "", values, {FAILED: 0.0}, goals, reason) for case in cases]
 
 
 def with_summary(rows: list[Row]) -> list[Row]:
@@ -162,6 +165,20 @@ def of_rows(rows: Iterable[Stored]) -> Stored:
     return {"schema": 1, "rays": rays, "images": images, "not_run": not_run}
 
 
+def answers(rows: Iterable[Row], joined: Iterable[System]) -> list[Answer]:
+    """How the renderers that joined the suite did, for the first page: by function, and for the images."""
+    titles = {title for system in joined for title in (system.title, *(call.title for call in system.calls))}
+    own = of_rows(row.as_dict() for row in rows if row.study in CHECKS and row.subject in titles)
+    made: list[Answer] = []
+    for kind in ("rays", "images", "not_run"):
+        for found in own[kind]:
+            name = ", ".join(found[key] for key in ("system", "precision") if key in found)
+            text = found["reason"] if kind == "not_run" else found["sentence"]
+            state: State = "not measured" if kind == "not_run" else "no" if found["wrong"] else "yes"
+            made.append({"question": f"Your renderer: {name}", "text": text, "state": state, "study": NAME})
+    return made
+
+
 def _of_rays(cells: list[Stored]) -> Stored:
     """What a function of refraction got wrong, and its numbers by set."""
     sets = {}
@@ -175,6 +192,8 @@ def _of_rays(cells: list[Stored]) -> Stored:
     within = {name: x["backward_error"] for name, x in sets.items() if x["verdict"] == "within bound"}
     off = [f"{name} (up to {compact(m) if isinstance(m, (int, float)) else m or '–'})" for name, m in within.items()]
     parts = [f"wrong: {', '.join(wrong)}"] if wrong else []
+    if not sets.keys() & per_ray.SETS:
+        parts = [f"no answers: {cells[0]['reason']}"]
     parts += [f"exact only for inputs more than {RIGHT:g} roundings off: {', '.join(off)}"] if off else []
     sentence = "; ".join([*(parts or ["right in every set"]), *filter(None, [about["remark"]])])
     return about | {"wrong": bool(wrong), "sentence": sentence, "sets": sets}

@@ -147,7 +147,7 @@ WHY = {
 
 
 def join(system: System) -> None:
-    """Take a system that renders by a command into the study. ValueError for an unknown export or scene."""
+    """Make a system that renders by a command the first one of the study. ValueError for an unknown export or scene."""
     images, where = system.images, f"{system.folder}: images."
     if images is None:
         return
@@ -161,7 +161,9 @@ def join(system: System) -> None:
             f"{system.folder}: title: {system.title!r} is the title of another renderer; expected a unique title"
         )
     assumed, draw = images.assumed or ("not said.",), functools.partial(by_command, system)
-    IMAGE_RENDERERS[system.title] = ImageRenderer(system.name, draw, images.spp, assumed)
+    others = dict(IMAGE_RENDERERS)
+    IMAGE_RENDERERS.clear()
+    IMAGE_RENDERERS.update({system.title: ImageRenderer(system.name, draw, images.spp, assumed)} | others)
     TERMS[f"{system.title}, assumed"] = " ".join(assumed)
 
 

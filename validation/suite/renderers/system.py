@@ -86,9 +86,11 @@ SYSTEMS: dict[str, System] = {
 
 
 def join(folder: Path) -> System:
-    """Take the renderer of a folder into the table. ValueError where one has its name; other errors as of `load`."""
+    """Make the renderer of a folder the first of the table. ValueError where one has its name, or as of `load`."""
     system = load(folder)
     if system.name in SYSTEMS:
         raise ValueError(f"{folder}: {system.name!r} is already the name of a renderer; rename the folder")
-    SYSTEMS[system.name] = system
+    others = dict(SYSTEMS)
+    SYSTEMS.clear()
+    SYSTEMS.update({system.name: system} | others)
     return system
