@@ -7,6 +7,7 @@ it is NaN: such light is lost.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -34,6 +35,7 @@ DEFAULTS = {"int_ior": "bk7", "ext_ior": "air"}
 EXPECTED = "a positive finite number, or a material's name, a glass or formula (mi_refract.media), spectrum or texture"
 warned: set[str] = set()  # what `warn_once` has logged
 LUMINANCE = 0.212671, 0.715160, 0.072169  # of linear sRGB, as Mitsuba's
+THICK = 1.0  # metres: glass is thinner
 LOST = 1e-3  # of the colour of light of equal power at all wavelengths: the most that may lie outside a medium's range
 
 
@@ -146,8 +148,10 @@ class TexturedRatio:
 def read_ratio(v: Variant, props: Properties) -> tuple[DispersiveRatio | TexturedRatio | None, float]:
     """The ratio of a boundary where it is not one number, and the number: of the d line; 1 where a texture says it.
 
-    `v`: the variant's module. ValueError with plugin, parameter and what is expected.
+    `v`: the variant's module. ValueError with plugin, parameter and what is expected. A warning of k that is left out.
     """
+    import numpy as np
+
     indices = {name: read_index(v, props, name, default) for name, default in DEFAULTS.items()}
     dispersive = [name for name, index in indices.items() if isinstance(index, Medium) and index.dispersive]
     d_line = media.LINES["d"]
@@ -162,6 +166,14 @@ def read_ratio(v: Variant, props: Properties) -> tuple[DispersiveRatio | Texture
     number = float(media.relative_index(inside, outside, d_line))
     for name in dispersive:
         label, medium = f"{PLUGIN}: {name}: {indices[name].name}", indices[name]
+        absorption = name.replace("ior", "absorption")
+        if medium.k and not {absorption, name.replace("ior", "colour")} & {*props.keys()}:
+            visible = np.arange(400.0, 701.0)
+            with np.errstate(divide="ignore"):
+                half_left = math.log(2) * 1e-9 * visible / (4 * math.pi * np.interp(visible, *medium.k))  # metres
+            if (least := half_left.min()) < THICK:
+                text = f"{label} has k: of light at {visible[half_left.argmin()]:g} nm half is left after {least:.2g} m"
+                warn_once(f"{text}, which is rendered only with {absorption} and {absorption}_unit")
         if not v.is_spectral:
             warn_once(f"{label}: all light has the index of the d line, 587.6 nm, here")
         elif lost := lost_colour(f"{label} has an index", medium.valid, medium.hold):

@@ -440,6 +440,10 @@ BAD_FILES = {
     "b.csv": ("nm,n\n400,1.5\n", "two or more"),
     "c.csv": ("nm,n\n400,x\n500,1.5\n", "expected numbers in the columns nm, n"),
     "d.csv": ("nm,n\n400,1.5\n500\n", "expected numbers"),
+    "i.csv": (
+        "nm;n\n400;1,52\n500;1,51\n",
+        "expected numbers in the columns nm, n, with decimal points, and no more columns",
+    ),
     "e.csv": ("nm,n\n500,1.5\n400,1.5\n", "increasing"),
     "f.csv": ("nm,n,k\n400,1.5,-1\n500,1.5,0\n", "k = -1; expected a number ≥ 0"),
     "g.csv": ("nm,n\n400,15\n500,15\n", "n = 15 at 400 nm; expected up to 10"),
