@@ -2,11 +2,14 @@
 printed elsewhere, and the one line that a scene gets for anything else."""
 
 import math
+import re
 import sys
+from pathlib import Path
 
 import drjit as dr
 import numpy as np
 import pytest
+from support.readme import python_blocks
 
 from mi_refract import media
 from mi_refract.media import LINES
@@ -204,6 +207,15 @@ def test_what_is_refused_is_said_in_one_line_with_the_parameter(spec, said):
 def test_poles_outside_the_visible_end_the_range():
     assert media.parse("sellmeier_nm(1, 0.01, 200, 9000)").valid == pytest.approx((200, 9000))
     assert math.isnan(media.parse("cauchy(1, 2000)").index_or_nan(500.0, {"A": -1.0}))
+
+
+def test_the_values_of_the_readme(llvm_variant):
+    (code,) = python_blocks(Path(media.__file__).with_name("README.md"))
+    exec(code, names := {})
+    found = re.findall(r"^(.*\S)  # (1\.\d{5}|\(.*?\))", code, re.MULTILINE)
+    assert len(found) == 4
+    for text, value in found:
+        assert eval(text, names) == pytest.approx(eval(value), abs=5e-6)
 
 
 @pytest.fixture
