@@ -76,7 +76,7 @@ def read(text: str, label: str, find: Callable[[str], Path]) -> Medium:
 def _csv(text: str) -> Medium:
     """Columns of the wavelength, whose name has its unit, of `n`, and of `k` where there is one; `#` is a comment."""
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    rows = [[cell.strip() for cell in re.split(r"[,;\t]", line.rstrip(" ,;\t"))] for line in lines]
+    rows = [[cell.strip(' "') for cell in re.split(r"[,;\t]", line.rstrip(" ,;\t"))] for line in lines]
     header = [cell.lower() for cell in rows[0]] if rows else []
     units = [(i, unit) for i, cell in enumerate(header) if (unit := UNIT.search(cell))]
     if len(units) != 1 or "n" not in header:

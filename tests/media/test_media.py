@@ -381,7 +381,7 @@ def gas(w):
 SCHOTT_1992 = powers((2.27, 0), (-0.01, 2), (0.0105, -2), (1e-4, -4))
 LONG = (2.27, 0), (-0.01, 2), (0.0105, -2), (1e-4, 4)
 FILES = {
-    "nm.csv": ("# mine\nWavelength (nm),n,k\n400,1.53,0\n500,1.52,0\n900,1.5,1e-3\n", interpolated),
+    "nm.csv": ('# mine\n"Wavelength (nm)","n","k"\n400,1.53,0\n500,1.52,0\n900,1.5,1e-3\n', interpolated),
     "um.csv": ("k;wl_µm;n\n0;0.4;1.53\n0;0.5;1.52\n0;0.9;1.5\n", interpolated),
     "nk.yml": (NK, interpolated),
     "1.yml": (PAGE.format("formula 1", SELLMEIER_1), bk7),
