@@ -175,6 +175,10 @@ def read_ratio(v: Variant, props: Properties) -> tuple[DispersiveRatio | Texture
                 text = f"{label} has k: of light at {visible[half_left.argmin()]:g} nm half is left after {least:.2g} m"
                 warn_once(f"{text}, which is rendered only with {absorption} and {absorption}_unit")
         if not v.is_spectral:
+            try:
+                medium.index(d_line)
+            except ValueError as error:
+                raise ValueError(f"{PLUGIN}: {name}: {error}") from None
             warn_once(f"{label}: all light has the index of the d line, 587.6 nm, here")
         elif lost := lost_colour(f"{label} has an index", medium.valid, medium.hold):
             text = f"{label} has an index from {medium.valid[0]:g} to {medium.valid[1]:g} nm"
