@@ -180,17 +180,17 @@ def read_ratio(v: Variant, props: Properties) -> tuple[DispersiveRatio | Texture
             except ValueError as error:
                 raise ValueError(f"{PLUGIN}: {name}: {error}") from None
             warn_once(f"{label}: all light has the index of the d line, 587.6 nm, here")
-        elif lost := lost_colour(f"{label} has an index", medium.valid, medium.hold):
-            text = f"{label} has an index from {medium.valid[0]:g} to {medium.valid[1]:g} nm"
+        else:
             held = "has the index of the range's end" if medium.hold else "is lost there"
-            warn_once(f"{text}; other light ({100 * lost:.2g}% of the colour) {held}")
+            check_range(f"{label} has an index", medium.valid, medium.hold, held)
     return DispersiveRatio(v, inside, outside) if dispersive else None, number
 
 
-def lost_colour(label: str, valid: tuple[float, float], hold: bool) -> float:
-    """The largest share of X, Y and Z, of light of equal power at all wavelengths, outside a range in nm.
+def check_range(label: str, valid: tuple[float, float], hold: bool, held: str) -> None:
+    """A warning where colour lies outside a range in nm; without `hold` ValueError where more than LOST does.
 
-    ValueError, without `hold`, where it is above LOST. `label`: what has the range, for the message.
+    That is the largest share of X, Y and Z, of light of equal power at all wavelengths. `label`: what has the range,
+    `held`: what becomes of other light, for the messages.
     """
     import numpy as np
 
@@ -200,15 +200,18 @@ def lost_colour(label: str, valid: tuple[float, float], hold: bool) -> float:
     xyz = np.concatenate([np.array(response(x), float).reshape(3, -1) for x in lanes], axis=1)
     shares = xyz / xyz.sum(1, keepdims=True)
     lost = shares[:, (wavelengths < valid[0]) | (wavelengths > valid[1])].sum(1).max()
+    label = f"{label} from {valid[0]:g} to {valid[1]:g} nm"
+    share = f"{np.format_float_positional(100 * lost, 2, fractional=False, trim='-')}% of the colour"
     if lost > LOST and not hold:
         below = np.cumsum(shares, axis=1)
         low = wavelengths[np.argmax(below.max(0) > LOST / 2)]  # half of it on either side
         high = wavelengths[np.argmax(below.min(0) >= 1 - LOST / 2)]
         raise ValueError(
-            f"{label} from {valid[0]:g} to {valid[1]:g} nm: {100 * lost:.2g}% of the colour lies outside; expected at "
-            f"least {low:g} … {high:g} nm, or hold(…) around the text, by which the values at its ends go on"
+            f"{label}: {share} lies outside; expected at least {low:g} … {high:g} nm, or hold(…) around the text, by "
+            "which the values at its ends go on"
         )
-    return float(lost)
+    if lost:
+        warn_once(f"{label}; other light ({share}) {held}")
 
 
 def find_file(name: str) -> Path:
