@@ -170,7 +170,8 @@ def read_ratio(v: Variant, props: Properties) -> tuple[DispersiveRatio | Texture
         if medium.k and not {absorption, name.replace("ior", "colour")} & {*props.keys()}:
             visible = np.arange(400.0, 701.0)
             with np.errstate(divide="ignore"):
-                half_left = math.log(2) * 1e-9 * visible / (4 * math.pi * np.interp(visible, *medium.k))  # metres
+                absorbing = 4 * math.pi * np.interp(visible, medium.k[0], medium.k[1], 0, 0)
+                half_left = math.log(2) * 1e-9 * visible / absorbing  # metres
             if (least := half_left.min()) < THICK:
                 text = f"{label} has k: of light at {visible[half_left.argmin()]:g} nm half is left after {least:.2g} m"
                 warn_once(f"{text}, which is rendered only with {absorption} and {absorption}_unit")
