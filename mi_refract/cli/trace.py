@@ -74,6 +74,6 @@ def trace(
         data["foci"] = [asdict(group) for group in foci]
     print(json_text(data) if as_json else "\n".join(lines))
     if wrong := mismatches(loaded, traced):
-        expected = "expected shapes that touch, lie in one another by `within`, or are apart"
+        expected = "expected shapes that share whole edges, lie in one another by `within`, or are apart"
         print(printable(f"mi-refract: {scene}: {'; '.join(wrong)}; {expected}"), file=sys.stderr)
         raise typer.Exit(1)

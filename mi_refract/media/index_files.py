@@ -76,20 +76,23 @@ def read(text: str, label: str, find: Callable[[str], Path]) -> Medium:
 def _csv(text: str) -> Medium:
     """Columns of the wavelength, whose name has its unit, of `n`, and of `k` where there is one; `#` is a comment."""
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    rows = [[cell.strip() for cell in re.split(r"[,;\t]", line)] for line in lines]
+    rows = [[cell.strip(' "') for cell in re.split(r"[,;\t]", line.rstrip(" ,;\t"))] for line in lines]
     header = [cell.lower() for cell in rows[0]] if rows else []
     units = [(i, unit) for i, cell in enumerate(header) if (unit := UNIT.search(cell))]
     if len(units) != 1 or "n" not in header:
         raise ValueError(f"header {','.join(header)!r}; expected nm or µm in one column's name, n, and k: 'nm,n,k'")
     column, unit = units[0]
     factor = 1 if unit[1] else NANOMETRES
+    expected = f"expected numbers in the columns {', '.join(header)}, with decimal points, and no more columns"
+    if any(len(row) != len(header) for row in rows):  # 400;1,52 for one
+        raise ValueError(expected)
     try:
         values = [
             [factor * parse_number(row[column]), *(parse_number(row[header.index(x)]) for x in "nk" if x in header)]
             for row in rows[1:]
         ]
-    except (ValueError, IndexError):
-        raise ValueError(f"expected numbers in the columns {', '.join(header)}") from None
+    except ValueError:
+        raise ValueError(expected) from None
     return _tabulated("n" + "k" * ("k" in header), values)
 
 

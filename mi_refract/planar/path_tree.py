@@ -191,8 +191,9 @@ def mismatches(scene: PlanarScene, traced: Sequence[Branches], most: int = 3) ->
             found[pair] += int(number)
             media = f"between {segments.n_left[at]:.6g} and {segments.n_right[at]:.6g}"
             examples.setdefault(pair, f"in index {indices[ends[j], last[ends[j]]]:.6g} met a boundary {media}")
+    fault = "overlap, share part of an edge, leave a gap, or are turned round"
     return [
-        f"{' and '.join(pair)} overlap, leave a gap, or are turned round: {_plural(number, 'path')} {examples[pair]}"
+        f"{' and '.join(pair)} {fault}: {_plural(number, 'path')} {examples[pair]}"
         for pair, number in found.most_common(most)
     ]
 

@@ -17,7 +17,7 @@ import mitsuba.mitsuba_ext
 from mi_refract import media
 from mi_refract.numerics import BSDF, Interaction, Mask, Number, Properties, Spectrum, Texture
 
-from .index_parameter import find_file, lost_colour, read_knots, warn_once
+from .index_parameter import check_range, find_file, read_knots
 
 # Attributes of a boundary: σ on the side from which light comes along `si.wi`, and on the other.
 HERE, BEYOND = "absorption here", "absorption beyond"
@@ -121,9 +121,8 @@ def _from_k(plugin: str, name: str, text: Any, unit: Any) -> Absorption:
     if isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < math.inf:
         raise ValueError(f"{plugin}: {name}_unit = {unit!r}; expected the scene's unit in metres: 0.001 for mm")
     knots, k = medium.k
-    if lost := lost_colour(f"{label} = {text!r} has k", (knots[0], knots[-1]), medium.hold):
-        text = f"{label} = {text!r} has k from {knots[0]:g} to {knots[-1]:g} nm"
-        warn_once(f"{text}; other light ({100 * lost:.2g}% of the colour) has the absorption of the range's end")
+    held = "has the absorption of the range's end"
+    check_range(f"{label} = {text!r} has k", (knots[0], knots[-1]), medium.hold, held)
     ends = min(knots[0], mi.MI_CIE_MIN), max(knots[-1], mi.MI_CIE_MAX)  # beyond, the values at the ends go on
     pairs = [*zip(knots, k, strict=True)]
     pairs = [(ends[0], k[0])] * (ends[0] < knots[0]) + pairs + [(ends[1], k[-1])] * (ends[1] > knots[-1])

@@ -7,6 +7,7 @@ it is NaN: such light is lost.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -34,6 +35,7 @@ DEFAULTS = {"int_ior": "bk7", "ext_ior": "air"}
 EXPECTED = "a positive finite number, or a material's name, a glass or formula (mi_refract.media), spectrum or texture"
 warned: set[str] = set()  # what `warn_once` has logged
 LUMINANCE = 0.212671, 0.715160, 0.072169  # of linear sRGB, as Mitsuba's
+THICK = 1.0  # metres: glass is thinner
 LOST = 1e-3  # of the colour of light of equal power at all wavelengths: the most that may lie outside a medium's range
 
 
@@ -146,8 +148,10 @@ class TexturedRatio:
 def read_ratio(v: Variant, props: Properties) -> tuple[DispersiveRatio | TexturedRatio | None, float]:
     """The ratio of a boundary where it is not one number, and the number: of the d line; 1 where a texture says it.
 
-    `v`: the variant's module. ValueError with plugin, parameter and what is expected.
+    `v`: the variant's module. ValueError with plugin, parameter and what is expected. A warning of k that is left out.
     """
+    import numpy as np
+
     indices = {name: read_index(v, props, name, default) for name, default in DEFAULTS.items()}
     dispersive = [name for name, index in indices.items() if isinstance(index, Medium) and index.dispersive]
     d_line = media.LINES["d"]
@@ -162,19 +166,32 @@ def read_ratio(v: Variant, props: Properties) -> tuple[DispersiveRatio | Texture
     number = float(media.relative_index(inside, outside, d_line))
     for name in dispersive:
         label, medium = f"{PLUGIN}: {name}: {indices[name].name}", indices[name]
+        absorption = name.replace("ior", "absorption")
+        if medium.k and not {absorption, name.replace("ior", "colour")} & {*props.keys()}:
+            visible = np.arange(400.0, 701.0)
+            with np.errstate(divide="ignore"):
+                absorbing = 4 * math.pi * np.interp(visible, medium.k[0], medium.k[1], 0, 0)
+                half_left = math.log(2) * 1e-9 * visible / absorbing  # metres
+            if (least := half_left.min()) < THICK:
+                text = f"{label} has k: of light at {visible[half_left.argmin()]:g} nm half is left after {least:.2g} m"
+                warn_once(f"{text}, which is rendered only with {absorption} and {absorption}_unit")
         if not v.is_spectral:
+            try:
+                medium.index(d_line)
+            except ValueError as error:
+                raise ValueError(f"{PLUGIN}: {name}: {error}") from None
             warn_once(f"{label}: all light has the index of the d line, 587.6 nm, here")
-        elif lost := lost_colour(f"{label} has an index", medium.valid, medium.hold):
-            text = f"{label} has an index from {medium.valid[0]:g} to {medium.valid[1]:g} nm"
+        else:
             held = "has the index of the range's end" if medium.hold else "is lost there"
-            warn_once(f"{text}; other light ({100 * lost:.2g}% of the colour) {held}")
+            check_range(f"{label} has an index", medium.valid, medium.hold, held)
     return DispersiveRatio(v, inside, outside) if dispersive else None, number
 
 
-def lost_colour(label: str, valid: tuple[float, float], hold: bool) -> float:
-    """The largest share of X, Y and Z, of light of equal power at all wavelengths, outside a range in nm.
+def check_range(label: str, valid: tuple[float, float], hold: bool, held: str) -> None:
+    """A warning where colour lies outside a range in nm; without `hold` ValueError where more than LOST does.
 
-    ValueError, without `hold`, where it is above LOST. `label`: what has the range, for the message.
+    That is the largest share of X, Y and Z, of light of equal power at all wavelengths. `label`: what has the range,
+    `held`: what becomes of other light, for the messages.
     """
     import numpy as np
 
@@ -184,15 +201,18 @@ def lost_colour(label: str, valid: tuple[float, float], hold: bool) -> float:
     xyz = np.concatenate([np.array(response(x), float).reshape(3, -1) for x in lanes], axis=1)
     shares = xyz / xyz.sum(1, keepdims=True)
     lost = shares[:, (wavelengths < valid[0]) | (wavelengths > valid[1])].sum(1).max()
+    label = f"{label} from {valid[0]:g} to {valid[1]:g} nm"
+    share = f"{np.format_float_positional(100 * lost, 2, fractional=False, trim='-')}% of the colour"
     if lost > LOST and not hold:
         below = np.cumsum(shares, axis=1)
         low = wavelengths[np.argmax(below.max(0) > LOST / 2)]  # half of it on either side
         high = wavelengths[np.argmax(below.min(0) >= 1 - LOST / 2)]
         raise ValueError(
-            f"{label} from {valid[0]:g} to {valid[1]:g} nm: {100 * lost:.2g}% of the colour lies outside; expected at "
-            f"least {low:g} … {high:g} nm, or hold(…) around the text, by which the values at its ends go on"
+            f"{label}: {share} lies outside; expected at least {low:g} … {high:g} nm, or hold(…) around the text, by "
+            "which the values at its ends go on"
         )
-    return float(lost)
+    if lost:
+        warn_once(f"{label}; other light ({share}) {held}")
 
 
 def find_file(name: str) -> Path:

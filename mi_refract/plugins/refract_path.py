@@ -99,7 +99,7 @@ def integrator_class(v: Variant) -> type:
 
         def begin_render(self, sensor: Sensor) -> None:
             """To be called before `sample` where `render` is not; else each sample inspects the scene anew."""
-            self.needs, self.loops, self.rendering = None, [], True
+            self.loops, self.rendering = [], True
             self.near = to_camera(sensor)
 
         def end_render(self) -> None:
@@ -135,8 +135,8 @@ def integrator_class(v: Variant) -> type:
 
         def path_loop(self, scene: Scene, sampler: Sampler) -> PathLoop:
             """Of a pass of a render, or of one sample of it in a scalar variant."""
-            if self.loops and not vectorised:
-                return self.loops[0]
+            if not vectorised and (loop := next((loop for loop in self.loops if loop.scene is scene), None)):
+                return loop
             needs = self.scene_features(scene)
             features = self.path_features(needs)
             count = min(self.samples_per_pass, sampler.sample_count()) if vectorised else 1
@@ -200,16 +200,12 @@ def integrator_class(v: Variant) -> type:
             )
 
         def scene_features(self, scene: Scene) -> SceneFeatures:
-            """Of the scene as it is now, inspected once a render, as an edit of the scene can change them.
-
-            Another integrator that calls `sample` does not say when a render begins: then they are inspected anew.
-            """
-            if self.needs is None or not self.rendering:
-                self.needs = inspect(scene)
-                if self.needs.absorbing or self.needs.media:
-                    check_media(v, scene)
-                mi.Log(mi.LogLevel.Info, f"{INTEGRATOR}: left out: {self.left_out()}")  # type: ignore[operator]
-            return self.needs
+            """Of the scene as it is now: an edit of the scene can change them."""
+            self.needs = needs = inspect(scene)
+            if needs.absorbing or needs.media:
+                check_media(v, scene)
+            mi.Log(mi.LogLevel.Info, f"{INTEGRATOR}: left out: {self.left_out()}")  # type: ignore[operator]
+            return needs
 
         def left_out(self) -> str:
             """What was left out of the scene rendered last, each feature with the reason."""

@@ -139,7 +139,8 @@ def test_shapes_that_do_not_fit_are_named_and_the_exit_code_is_1(trace, ball, fi
     ball.write_text(BALL.replace("n = 1.5", f"n = 1.5\n{first}") + f"[[shape]]{other}at = [1.2, 0]\n{second}")
     code, out, err = trace()
     assert (code, out) == (1, "ball.toml: 7 rays, 14 hits, 7 stopped by a medium mismatch\n")
-    fault = "overlap, leave a gap, or are turned round: 7 paths in index 1.5 met a boundary between 1.6 and 1"
+    fault = "overlap, share part of an edge, leave a gap, or are turned round"
+    fault += ": 7 paths in index 1.5 met a boundary between 1.6 and 1"
     assert err.startswith(f"mi-refract: {ball}: {where} {fault}; expected ") and err.count("\n") == 1
 
 

@@ -2,11 +2,14 @@
 printed elsewhere, and the one line that a scene gets for anything else."""
 
 import math
+import re
 import sys
+from pathlib import Path
 
 import drjit as dr
 import numpy as np
 import pytest
+from support.readme import python_blocks
 
 from mi_refract import media
 from mi_refract.media import LINES
@@ -206,6 +209,15 @@ def test_poles_outside_the_visible_end_the_range():
     assert math.isnan(media.parse("cauchy(1, 2000)").index_or_nan(500.0, {"A": -1.0}))
 
 
+def test_the_values_of_the_readme(llvm_variant):
+    (code,) = python_blocks(Path(media.__file__).with_name("README.md"))
+    exec(code, names := {})
+    found = re.findall(r"^(.*\S)  # (1\.\d{5}|\(.*?\))", code, re.MULTILINE)
+    assert len(found) == 4
+    for text, value in found:
+        assert eval(text, names) == pytest.approx(eval(value), abs=5e-6)
+
+
 @pytest.fixture
 def named(scalar_variant):
     """Names of Mitsuba's table are its numbers."""
@@ -369,7 +381,7 @@ def gas(w):
 SCHOTT_1992 = powers((2.27, 0), (-0.01, 2), (0.0105, -2), (1e-4, -4))
 LONG = (2.27, 0), (-0.01, 2), (0.0105, -2), (1e-4, 4)
 FILES = {
-    "nm.csv": ("# mine\nWavelength (nm),n,k\n400,1.53,0\n500,1.52,0\n900,1.5,1e-3\n", interpolated),
+    "nm.csv": ('# mine\n"Wavelength (nm)","n","k"\n400,1.53,0\n500,1.52,0\n900,1.5,1e-3\n', interpolated),
     "um.csv": ("k;wl_µm;n\n0;0.4;1.53\n0;0.5;1.52\n0;0.9;1.5\n", interpolated),
     "nk.yml": (NK, interpolated),
     "1.yml": (PAGE.format("formula 1", SELLMEIER_1), bk7),
@@ -440,6 +452,10 @@ BAD_FILES = {
     "b.csv": ("nm,n\n400,1.5\n", "two or more"),
     "c.csv": ("nm,n\n400,x\n500,1.5\n", "expected numbers in the columns nm, n"),
     "d.csv": ("nm,n\n400,1.5\n500\n", "expected numbers"),
+    "i.csv": (
+        "nm;n\n400;1,52\n500;1,51\n",
+        "expected numbers in the columns nm, n, with decimal points, and no more columns",
+    ),
     "e.csv": ("nm,n\n500,1.5\n400,1.5\n", "increasing"),
     "f.csv": ("nm,n,k\n400,1.5,-1\n500,1.5,0\n", "k = -1; expected a number ≥ 0"),
     "g.csv": ("nm,n\n400,15\n500,15\n", "n = 15 at 400 nm; expected up to 10"),

@@ -134,7 +134,7 @@ def test_paths_that_end_otherwise_are_marked(drawn, event, mark):
     np.testing.assert_allclose(line.get_xydata(), [[0 if event == Event.MAX_DEPTH else 1, 0.1]], atol=1e-12)
     note = {
         Event.MAX_DEPTH: "○ 1 stopped after `max_depth` boundaries",
-        Event.MEDIUM_MISMATCH: "× shape[0] overlap, leave a gap, or are turned round: 1 path in index 1.5 met",
+        Event.MEDIUM_MISMATCH: "× shape[0] overlap, share part of an edge",
     }[event]
     assert note in panel.get_xlabel().replace("\n", " ")
     clean = drawn(replace(given, segments=(square,), max_depth=5)).axes[0]

@@ -58,6 +58,19 @@ def test_absorption_of_a_file_is_4_pi_k_over_the_wavelength_in_the_unit_of_the_s
     assert "k from 400 to 700 nm; other light (0.5% of the colour) has the absorption of the range's end" in text
 
 
+@pytest.mark.parametrize(
+    ("k", "more", "warns"),
+    [(1e-6, {}, True), (1e-8, {}, False), (1e-6, {"int_absorption": 0.5}, False), (0, {}, False)],
+)
+def test_k_that_is_left_out_is_a_warning_where_it_is_visible(llvm_variant, tmp_path, logged, k, more, warns):
+    """ln 2 · 600 nm/(4π · 1e-6) = 33 mm."""
+    (tmp_path / "k.csv").write_text(f"nm,n,k\n380,1.5,0\n599,1.5,0\n600,1.5,{k}\n601,1.5,0\n780,1.5,0\n")
+    load(int_ior=f"file:{tmp_path}/k.csv", **more)
+    texts = [text for text in logged if "has k" in text]
+    assert len(texts) == warns
+    assert all("at 600 nm half is left after 0.033 m" in text and "int_absorption_unit" in text for text in texts)
+
+
 @pytest.mark.parametrize("scale", [0.1, 1.0, 20.0])
 def test_three_colours_become_a_spectrum_in_proportion(scale, spectral_variant):
     """As Mitsuba's emitters have it: twice the largest colour, times the spectrum of a colour whose largest is 1/2."""

@@ -185,9 +185,15 @@ def test_a_spectrum_is_no_index_where_it_becomes_a_colour(scalar_variant):
         mi.load_string(JUMP)
 
 
+def test_a_medium_without_an_index_at_the_d_line_is_refused_where_that_is_rendered(rgb_variant):
+    said = r"refract: int_ior: table.*: no index at 587.562 nm; expected a wavelength from 600 to 700 nm, or hold\(…\)"
+    with pytest.raises(RuntimeError, match=said):
+        load("table(600: 1.5, 700: 1.4)")
+
+
 def test_a_medium_whose_range_leaves_out_colour_is_refused(spectral_variant):
     said = r"int_ior: .* from {} to {} nm: {} of the colour lies outside; expected at least 380 … 716 nm, or hold\(…\)"
-    for low, high, lost in ((420, 830, "5.1%"), (400, 700, "0.5%"), (390, 710, "0.15%")):
+    for low, high, lost in ((420, 830, "5.1%"), (400, 700, "0.5%"), (390, 710, "0.15%"), (600, 605, "100%")):
         with pytest.raises(RuntimeError, match=said.format(low, high, lost)):
             load(f"table({low}: 1.5, {high}: 1.4)")
     load("table(380: 1.5, 716: 1.4)")

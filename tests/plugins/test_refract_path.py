@@ -284,6 +284,15 @@ def test_samples_of_a_scalar_render_share_their_loop(scalar_variant, monkeypatch
     assert made[0].branch is made[1].branch  # making a class takes ten times as long as a sample
 
 
+def test_a_scalar_render_of_another_scene_meanwhile_has_a_loop_of_its_own(scalar_variant):
+    """As two threads do with one integrator: their samples alternate."""
+    method, sampler = mi.load_dict({"type": "refract_path"}), mi.load_dict({"type": "independent"})
+    scenes = [mi.load_dict({"type": "scene", "sky": {"type": "constant", "radiance": x}}) for x in (1.0, 2.0, 1.0)]
+    method.begin_render(None)
+    seen = [method.sample(scene, sampler, mi.Ray3f([0, 0, 0], [0, 0, 1]))[0][0] for scene in scenes]
+    assert seen == [1, 2, 1]
+
+
 # Where flags, tangents and seeds were taken for granted ---------------------------------------------------------
 
 POLARIZER = {"type": "polarizer", "theta": 20.0}
