@@ -75,6 +75,9 @@ def main() -> None:
     """Start, print the address, wait, and end with all workers."""
     signal.pthread_sigmask(signal.SIG_UNBLOCK, signal.valid_signals())
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is for who started us
+    # One line of our stdout is read: what workers log there goes to stderr, or the pipe fills up and they wait for ever.
+    answer = os.dup(1)
+    os.dup2(2, 1)
     try:
         import dask
         from distributed import LocalCluster
@@ -92,10 +95,10 @@ def main() -> None:
                 local_directory=str(folder),
                 silence_logs=logging.CRITICAL,
             )
-            print(cluster.scheduler_address, flush=True)
+            os.write(answer, f"{cluster.scheduler_address}\n".encode())
             sys.stdin.buffer.read()
     except Exception as error:
-        print(f"{type(error).__name__}: {' '.join(str(error).split())}", flush=True)
+        os.write(answer, f"{type(error).__name__}: {' '.join(str(error).split())}\n".encode())
     finally:
         if os.getpgrp() == os.getpid():  # workers are of our group: at once, whatever they render
             with contextlib.suppress(ProcessLookupError):

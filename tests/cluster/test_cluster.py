@@ -271,6 +271,11 @@ def test_each_call_has_its_number_and_only_a_few_are_begun(workers):
     assert values == {i: 1 / (i + 7) for i in range(20)}
 
 
+def test_a_worker_may_log_more_than_a_pipe_holds(workers):
+    calls = results(workers, os.write, [(1, b"logged\n" * 20000)])
+    assert [result for _, result, _ in calls] == [140000]
+
+
 def test_an_error_of_a_call_is_its_own(workers):
     """Also one that Dask raises, too."""
     with pytest.raises(ZeroDivisionError, match="division by zero"):
