@@ -150,12 +150,13 @@ def as_shown(image: Image, names: Collection[str]) -> Image:
 
 def identical_as_shown(reference: Image, test: Image) -> str:
     """How the channels that only one image has are read, if every pixel is identical then; else ""."""
+    if not (lone := set(reference.channels) ^ set(test.channels)):
+        return ""
     one, two = as_shown(reference, test.channels), as_shown(test, reference.channels)
     same = one.pixels.shape == two.pixels.shape and set(one.channels) == set(two.channels)
     if not same or not np.array_equal(one.pixels, two.select(one.channels), equal_nan=True):
         return ""
     readings = {"A": "a missing alpha is read as 1", "Y": "gray is read as R = G = B"}
-    lone = set(reference.channels) ^ set(test.channels)
     return "; ".join(words for name, words in readings.items() if name in lone)
 
 
