@@ -67,7 +67,8 @@ def diff(
         every = pairing.pairs(reference, test, settings)
     elif reference.is_dir() and test.is_dir():
         name = reference.resolve().name
-        every = [Result(name, Status.DIFFERENT, reference, test, settings.of(name), target=reference)]
+        how = replace(replace(settings, above=settings.above.parent).of(name), above=settings.above)
+        every = [Result(name, Status.DIFFERENT, reference, test, how, target=reference)]
     else:
         raise NotADirectoryError(
             f"{test if reference.is_dir() else reference}: not a folder; --renders expects folders"
