@@ -172,6 +172,8 @@ def _require_equal(
 
     name, compared = request.node.nodeid, request.config.stash.get(COMPARED, None)
     result = Result(name, Status.ERROR, Path("reference"), Path("test"), ComparisonSpec(method))
+    if compared:  # a test may compare several images
+        result = replace(result, target=Path(str(len(compared.results))))
     try:
         reference, test = sides()
         comparison = compare(method, reference, test, **options)
