@@ -204,7 +204,8 @@ def _settings(
     reference: Path, test: Path, method: str, words: Sequence[str], file: Path | None, max_values: int
 ) -> Settings:
     """What the options and the settings file say. ValueError or OSError for what they cannot mean."""
-    folder = reference if test.is_dir() else reference.parent  # which need not exist yet
+    # A folder of references need not exist yet.
+    folder = reference if reference.is_dir() or test.is_dir() else reference.parent
     path = file or nearest(folder)
     flags = ["--method", method] if method != AUTO else []
     flags += [each for word in words for each in ("--set", word)]
