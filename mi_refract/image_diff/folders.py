@@ -84,7 +84,7 @@ def diff(
         result = _compared(pair, results, keep=maps or view is not None, digests=(digests or to_accept) and not renders)
         if view and result.status in FAILED:
             view(result, results)
-        return result if maps else _without_images(result)  # those of hundreds would fill the memory
+        return result if maps else without_images(result)  # those of hundreds would fill the memory
 
     # Together, the pairs that are compared at once have no more values than one pair may have.
     most = 2 * settings.max_values
@@ -132,7 +132,8 @@ def _values(pair: Result) -> int:
     return 0
 
 
-def _without_images(result: Result) -> Result:
+def without_images(result: Result) -> Result:
+    """The result without its images and maps."""
     comparison = replace(result.comparison, maps={}) if result.comparison else None
     return replace(result, images={}, comparison=comparison)
 
@@ -177,7 +178,7 @@ def _compared(result: Result, results: Results, *, keep: bool, digests: bool) ->
                 with contextlib.suppress(ValueError, OSError):  # without digests it is not accepted
                     result = replace(result, digests=_digests(result, results.roots, decoded))
     if not keep or result.status not in FAILED:
-        return _without_images(result)
+        return without_images(result)
     if result.images:
         return result
     images, unread = dict[str, Image](), []
