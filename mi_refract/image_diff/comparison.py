@@ -141,11 +141,11 @@ def as_shown(image: Image, names: Collection[str]) -> Image:
     if values.keys() - {"A", *names} == {"Y"} and {*"RGB"} <= set(names) - values.keys():
         values = dict.fromkeys("RGB", values.pop("Y")) | values
     if "A" in names:
-        values.setdefault("A", np.ones(image.pixels.shape[:2]) if image.mask is None else image.mask)
+        ones = np.ones(image.pixels.shape[:2], image.pixels.dtype)
+        values.setdefault("A", ones if image.mask is None else ones * image.mask)
     if values.keys() == set(image.channels):
         return image
-    pixels = np.stack([*values.values()], -1).astype(image.pixels.dtype, copy=False)
-    return replace(image, pixels=pixels, channels=tuple(values))
+    return replace(image, pixels=np.stack([*values.values()], -1), channels=tuple(values))
 
 
 def identical_as_shown(reference: Image, test: Image) -> str:
