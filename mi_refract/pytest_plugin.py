@@ -50,12 +50,13 @@ class Compared:
     results: list[Result] = field(default_factory=list)
 
     def add(self, result: Result) -> None:
-        """One more result; the page keeps its images."""
+        """One more result, of whose images the page keeps what it shows."""
+        from mi_refract.image_diff.folders import without_images
         from mi_refract.image_diff.results import FAILED
 
-        self.results.append(result)
         if result.status in FAILED:
             self.page.view(result, self.as_results(Path()))
+        self.results.append(without_images(result))
 
     def as_results(self, root: Path) -> Results:
         """The results, with commands that run tests."""
@@ -172,6 +173,8 @@ def _require_equal(
 
     name, compared = request.node.nodeid, request.config.stash.get(COMPARED, None)
     result = Result(name, Status.ERROR, Path("reference"), Path("test"), ComparisonSpec(method))
+    if compared:  # a test may compare several images
+        result = replace(result, target=Path(str(len(compared.results))))
     try:
         reference, test = sides()
         comparison = compare(method, reference, test, **options)

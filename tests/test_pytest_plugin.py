@@ -1,5 +1,7 @@
 """The fixtures for pytest: here, and in a run of pytest of their own."""
 
+import re
+
 import numpy as np
 import pytest
 from support.processes import python
@@ -112,6 +114,9 @@ def test_equal(assert_image_equal):
 
 def test_two_arrays(assert_image_equal):
     assert_image_equal(np.ones((8, 8, 3)), np.zeros((8, 8, 3)))
+
+def test_wrong_option(assert_image_equal):
+    assert_image_equal("test.exr", "old.exr", "exact", fial=1)
 """
 
 
@@ -125,25 +130,45 @@ def test_failures_are_on_a_page_and_images_are_accepted(pytester):
     def run(*words):
         return pytester.runpytest_subprocess("-p", "no:cacheprovider", *words)
 
-    run("--mi-refract-report", "out.html").assert_outcomes(passed=1, failed=3)
+    run("--mi-refract-report", "out.html").assert_outcomes(passed=1, failed=4)
     page = (pytester.path / "out.html").read_text("utf-8")
-    assert "4 images: 1 could not be compared, 2 different, 1 equal" in page
+    assert "5 images: 2 could not be compared, 2 different, 1 equal" in page
     assert f"pytest {name}changed" in page and f"pytest --mi-refract-accept {name}changed" in page
     assert page.count('data-role="difference"') == 2
     assert {path.name: path.read_bytes() for path in pytester.path.glob("*.exr")} == before  # nothing is written
-    run("--mi-refract-accept").assert_outcomes(passed=3, failed=1)
+    accepted = run("--mi-refract-accept")
+    accepted.assert_outcomes(passed=3, failed=2)
+    accepted.stdout.fnmatch_lines(["could not accept: unknown key 'fial'; expected *"])
     after = {path.name: path.read_bytes() for path in pytester.path.glob("*.exr")}
     assert after == before | {"old.exr": before["test.exr"], "new.exr": after["new.exr"]}
 
 
-def test_renders_are_on_the_page_by_their_mean(request, assert_image_unbiased, tmp_path):
+def test_the_page_shows_each_of_several_images_of_one_test(request, assert_image_equal, tmp_path):
+    """Their numbers are the same."""
     from mi_refract.pytest_plugin import COMPARED, Compared  # pytest imports it first
 
+    compared = request.config.stash[COMPARED] = Compared(Page(tmp_path / "out.html"))
+    for pixels in np.split(np.eye(2), 2):
+        with pytest.raises(pytest.fail.Exception):
+            assert_image_equal(np.repeat(pixels, 3, 0), np.zeros((3, 2)), "exact")
+    del request.config.stash[COMPARED]
+    compared.page.write(compared.as_results(tmp_path), {})
+    shown = re.findall(r'id="p\d"[^>]*>([^<]+)<', (tmp_path / "out.html").read_text("utf-8"))
+    assert len(shown) % 2 == 0 and shown[: len(shown) // 2] != shown[len(shown) // 2 :]
+
+
+def test_renders_are_on_the_page_by_their_mean(request, assert_image_unbiased, tmp_path, monkeypatch):
+    """Only the page has images: those of hundreds of tests would fill the memory."""
+    from mi_refract.pytest_plugin import COMPARED, Compared  # pytest imports it first
+
+    viewed = []
+    monkeypatch.setattr(Page, "view", lambda self, result, results: viewed.append(result))
     compared = request.config.stash[COMPARED] = Compared(Page(tmp_path / "out.html"))
     with pytest.raises(pytest.fail.Exception):
         assert_image_unbiased(lambda seed: render(seed, 1.1), render, runs=2)
     del request.config.stash[COMPARED]
-    (result,) = compared.results
+    assert [(dict(kept.images), kept.comparison.maps) for kept in compared.results] == [({}, {})]
+    (result,) = viewed
     mean = np.mean([render(seed, 1.1) for seed in (0, 1)], 0)
     np.testing.assert_allclose(result.images["test"].pixels, mean, rtol=1e-6)
 

@@ -84,7 +84,7 @@ def diff(
     require_extra("scipy", *(("jinja2", "matplotlib") if report else ()))
     if test is None and not check_settings:
         raise ValueError("two paths are needed; expected mi-refract diff REFERENCE TEST")
-    chosen = _settings(reference, method, options or [], settings, max_values)
+    chosen = _settings(reference, test or reference, method, options or [], settings, max_values)
     if check_settings or test is None:
         test = test or reference
         every = pairing.pairs(reference, test, chosen)
@@ -162,12 +162,13 @@ def accept(
             raise ValueError("--from repeats an earlier comparison; do not combine it with --method or --set")
         results = results_file.read(source, reference, test)
         results = replace(results, results=tuple(pairing.named(results.results, names or [])))
-        results = results_file.with_settings(results, _settings(results.reference, AUTO, [], settings, max_values))
+        chosen = _settings(results.reference, results.test, AUTO, [], settings, max_values)
+        results = results_file.with_settings(results, chosen)
         text_reports.print_errors(results)
     elif reference is None or test is None:
         raise ValueError("two paths are needed; expected mi-refract accept REFERENCE TEST, or --from OUT.json")
     else:
-        chosen = _settings(reference, method, options or [], settings, max_values)
+        chosen = _settings(reference, test, method, options or [], settings, max_values)
         with _progress() as progress:
             results = folders.diff(reference, test, chosen, names=names or [], to_accept=True, progress=progress)
         text_reports.print_results(results)
@@ -199,9 +200,12 @@ def require_extra(*packages: str) -> None:
         raise ValueError("comparing needs the extra `diff`: pip install 'mi-refract[diff]'")
 
 
-def _settings(reference: Path, method: str, words: Sequence[str], file: Path | None, max_values: int) -> Settings:
+def _settings(
+    reference: Path, test: Path, method: str, words: Sequence[str], file: Path | None, max_values: int
+) -> Settings:
     """What the options and the settings file say. ValueError or OSError for what they cannot mean."""
-    folder = reference if reference.is_dir() else reference.parent
+    # A folder of references need not exist yet.
+    folder = reference if reference.is_dir() or test.is_dir() else reference.parent
     path = file or nearest(folder)
     flags = ["--method", method] if method != AUTO else []
     flags += [each for word in words for each in ("--set", word)]

@@ -88,7 +88,7 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
         for copy in copies:
             for path, root in zip((copy.reference, copy.new), results.roots, strict=True):
                 if not pairing.is_inside(path, root):
-                    raise ValueError(f"{path}: outside of {root}, by a link to a folder; expected a folder")
+                    raise ValueError(f"{path}: outside of {root}, by a link or a template; expected a path inside")
             if digest(copy.reference) != copy.compared:
                 yield copy
 

@@ -141,21 +141,22 @@ def as_shown(image: Image, names: Collection[str]) -> Image:
     if values.keys() - {"A", *names} == {"Y"} and {*"RGB"} <= set(names) - values.keys():
         values = dict.fromkeys("RGB", values.pop("Y")) | values
     if "A" in names:
-        values.setdefault("A", np.ones(image.pixels.shape[:2]) if image.mask is None else image.mask)
+        ones = np.ones(image.pixels.shape[:2], image.pixels.dtype)
+        values.setdefault("A", ones if image.mask is None else ones * image.mask)
     if values.keys() == set(image.channels):
         return image
-    pixels = np.stack([*values.values()], -1).astype(image.pixels.dtype, copy=False)
-    return replace(image, pixels=pixels, channels=tuple(values))
+    return replace(image, pixels=np.stack([*values.values()], -1), channels=tuple(values))
 
 
 def identical_as_shown(reference: Image, test: Image) -> str:
     """How the channels that only one image has are read, if every pixel is identical then; else ""."""
+    if not (lone := set(reference.channels) ^ set(test.channels)):
+        return ""
     one, two = as_shown(reference, test.channels), as_shown(test, reference.channels)
     same = one.pixels.shape == two.pixels.shape and set(one.channels) == set(two.channels)
     if not same or not np.array_equal(one.pixels, two.select(one.channels), equal_nan=True):
         return ""
     readings = {"A": "a missing alpha is read as 1", "Y": "gray is read as R = G = B"}
-    lone = set(reference.channels) ^ set(test.channels)
     return "; ".join(words for name, words in readings.items() if name in lone)
 
 

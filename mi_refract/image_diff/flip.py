@@ -192,8 +192,8 @@ def _codes(image: Image) -> Pixels:
     """Codes of sRGB, H × W × C, from 0 to 255; of alpha to half of that, its part on average over black and white."""
     white = 127.5 if image.channels == (ALPHA,) else 255.0
     is_coded = encoding(image) == "sRGB"
-    codes: Pixels = np.nan_to_num(image.select(_colours(image))) if is_coded else srgb_encode(_linear(image).clip(0, 1))
-    codes = white * codes
+    values = (np.nan_to_num(image.select(_colours(image))) if is_coded else _linear(image)).clip(0, 1)
+    codes: Pixels = white * (values if is_coded else srgb_encode(values))
     return codes
 
 

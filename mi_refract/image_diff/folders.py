@@ -67,7 +67,8 @@ def diff(
         every = pairing.pairs(reference, test, settings)
     elif reference.is_dir() and test.is_dir():
         name = reference.resolve().name
-        every = [Result(name, Status.DIFFERENT, reference, test, settings.of(name), target=reference)]
+        how = replace(replace(settings, above=settings.above.parent).of(name), above=settings.above)
+        every = [Result(name, Status.DIFFERENT, reference, test, how, target=reference)]
     else:
         raise NotADirectoryError(
             f"{test if reference.is_dir() else reference}: not a folder; --renders expects folders"
@@ -83,7 +84,7 @@ def diff(
         result = _compared(pair, results, keep=maps or view is not None, digests=(digests or to_accept) and not renders)
         if view and result.status in FAILED:
             view(result, results)
-        return result if maps else _without_images(result)  # those of hundreds would fill the memory
+        return result if maps else without_images(result)  # those of hundreds would fill the memory
 
     # Together, the pairs that are compared at once have no more values than one pair may have.
     most = 2 * settings.max_values
@@ -131,7 +132,8 @@ def _values(pair: Result) -> int:
     return 0
 
 
-def _without_images(result: Result) -> Result:
+def without_images(result: Result) -> Result:
+    """The result without its images and maps."""
     comparison = replace(result.comparison, maps={}) if result.comparison else None
     return replace(result, images={}, comparison=comparison)
 
@@ -176,7 +178,7 @@ def _compared(result: Result, results: Results, *, keep: bool, digests: bool) ->
                 with contextlib.suppress(ValueError, OSError):  # without digests it is not accepted
                     result = replace(result, digests=_digests(result, results.roots, decoded))
     if not keep or result.status not in FAILED:
-        return _without_images(result)
+        return without_images(result)
     if result.images:
         return result
     images, unread = dict[str, Image](), []

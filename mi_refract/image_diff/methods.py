@@ -163,8 +163,8 @@ def compare(
     INCONCLUSIVE where a method calls the images equal but would call a black one equal, too, or one with some of its
     channels black, or passes many pixels that change by half; where channels whose variance `welch` does not know
     differ by more than `tolerance` allows; and where no value of a channel is finite. DIFFERENT where one of two images
-    has channels besides, and where the files say that their numbers mean something else; `ignore_metadata`: patterns of
-    names of metadata that do not count.
+    has channels besides, unless they are `identical_as_shown`, and where the files say that their numbers mean
+    something else; `ignore_metadata`: patterns of names of metadata that do not count.
 
     ValueError for an unknown method or option, an option of another type or out of its range, several renders for a
     method that takes one, and images that cannot be compared.

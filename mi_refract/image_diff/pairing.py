@@ -107,8 +107,8 @@ def how_of(settings: Settings, name: str, target: Path) -> ComparisonSpec:
 
 
 def unused_templates(pairs: Sequence[Result]) -> list[str]:
-    """The templates of `accept` that match no file."""
-    templates = dict.fromkeys(template for pair in pairs for template in pair.how.accept)
+    """The templates of `accept` that match no file; as of `Settings.unused`."""
+    templates = dict.fromkeys(each for pair in pairs if not pair.how.above.parts for each in pair.how.accept)
     for pair in pairs:
         for template in pair.how.accept:
             if pair.error or _matched(pair, template, pair.variants):

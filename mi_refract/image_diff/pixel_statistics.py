@@ -105,39 +105,43 @@ def _apart(values: Array, y: int, x: int) -> tuple[Array, Array]:
     return values[: height - y, max(-x, 0) : width - max(x, 0)], values[y:, max(x, 0) : width - max(-x, 0)]
 
 
-@np.errstate(over="ignore", invalid="ignore")
 def differ_like_noise(a: Array, b: Array) -> bool:
     """Whether two images, H × W × C, look like the same image with other noise in each channel that differs.
 
     It is a hint: what is smaller than a tile of signs, or weaker than the noise, is not seen beside noise.
     """
-    changed = (a != b).any((0, 1))
-    if not changed.any():  # the numbers are the same, but not what they mean
+    changed = np.flatnonzero((a != b).any((0, 1)))  # none: the numbers are the same, but not what they mean
+    if not changed.size or min(a.shape[:2]) <= max(map(max, FAR)):
         return False
-    a, b = a[..., changed].astype(np.float32), b[..., changed].astype(np.float32)
+    # One at a time: a channel takes some fourteen times its memory.
+    return all(_differs_like_noise(a[..., [i]], b[..., [i]], changed.size) for i in changed)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _differs_like_noise(a: Array, b: Array, channels: int) -> bool:
+    """`differ_like_noise` for one of so many channels that differ."""
+    a, b = a.astype(np.float32), b.astype(np.float32)
     both, size = a + b, np.abs(a) + np.abs(b)
     share = np.divide(b - a, size, out=np.zeros_like(size), where=size > 0)
-    signs = np.sign(share) * (np.abs(share) > FAINT * np.sqrt(np.square(share).mean((0, 1), dtype=np.float64)))
-    count, tiles = np.count_nonzero(signs, (0, 1)), block_sum(signs, WIDE)
-    z2 = 2 * REACH * math.log(2 * (tiles.size + (5 + len(FAR)) * count.size) / FALSE)
-    if (count < np.maximum(SOME * np.count_nonzero(size, (0, 1)), z2 / SHOWN**2)).any():
+    signs = np.sign(share) * (np.abs(share) > FAINT * np.sqrt(np.square(share).mean(dtype=np.float64)))
+    count, tiles = np.count_nonzero(signs), block_sum(signs, WIDE)
+    z2 = 2 * REACH * math.log(2 * (tiles.size + 5 + len(FAR)) * channels / FALSE)
+    if count < max(SOME * np.count_nonzero(size), z2 / SHOWN**2):
         return False
 
-    def sums_of_coins() -> Iterator[tuple[Array, Array]]:
-        """Their sum and number."""
-        yield tiles, block_sum(np.abs(signs), WIDE)
-        yield signs.sum((0, 1)), count
+    def coins() -> Iterator[Array]:
+        yield signs
         edged = np.pad(both, ((1, 1), (1, 1), (0, 0)), mode="edge")
         above, below, left, right = edged[:-2, 1:-1], edged[2:, 1:-1], edged[1:-1, :-2], edged[1:-1, 2:]
         around = (above + below + left + right) / 4
-        for feature in (below - above, right - left, both - around, both - np.median(both, (0, 1))):
-            coins = signs * np.sign(feature)
-            yield coins.sum((0, 1)), np.count_nonzero(coins, (0, 1))
+        for feature in (below - above, right - left, both - around, both - np.median(both)):
+            yield signs * np.sign(feature)
         for lag in FAR:
             one, two = _apart(signs, *lag)
-            yield np.einsum("ijk,ijk->k", one, two), np.count_nonzero(one * two, (0, 1))
+            yield one * two
 
-    return all((np.square(total) <= z2 * number).all() for total, number in sums_of_coins())
+    fair = (np.square(tiles) <= z2 * block_sum(np.abs(signs), WIDE)).all()
+    return bool(fair) and all(float(x.sum()) ** 2 <= z2 * np.count_nonzero(x) for x in coins())
 
 
 @dataclass(frozen=True)

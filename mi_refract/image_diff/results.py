@@ -91,11 +91,11 @@ class Result:
 
     @property
     def order(self) -> tuple[float | str, ...]:
-        """By status, then the worst first; of equally many times a bound the larger number, then by name."""
+        """By status, then the worst first; of equally many times a bound the larger number, then by name and target."""
         lone = None in (self.reference, self.test)
         times, metric = self.worst if self.status in FAILED else (0.0, None)
         value = metric.value if metric and not math.isnan(metric.value) else math.inf if metric else 0.0
-        return [*Status].index(self.status), lone, -times, -value, self.name
+        return [*Status].index(self.status), lone, -times, -value, self.name, str(self.target)
 
     @property
     def warning(self) -> str:

@@ -11,21 +11,19 @@ import math
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
 from mi_refract.io import safe_files
 from mi_refract.io.text import printable
 from mi_refract.io.typed_table import convert
+from mi_refract.report import documents
 from mi_refract.report.row import write_strict_json
 
 from . import pairing, text_reports
 from .results import FAILED, Result, Results, Status
 from .settings import ComparisonSpec, Settings
-
-if TYPE_CHECKING:
-    from mi_refract.report import documents
 
 SCHEMA = 1
 MOST = 2**28  # bytes of a file
@@ -57,8 +55,6 @@ def write(
     warning, and `text_reports.markdown` with `report` and `url` is appended to the file that $GITHUB_STEP_SUMMARY
     names. Errors: OSError; a summary that cannot be written leaves the files.
     """
-    from mi_refract.report import documents
-
     if junit:
         cases = [_junit_case(result, results) for result in results.results]
         documents.write_junit(junit, "mi-refract diff", {str(results.test): cases})
@@ -91,8 +87,6 @@ def _outcome(result: Result, results: Results) -> Literal["", "failure", "error"
 
 
 def _junit_case(result: Result, results: Results) -> documents.Case:
-    from mi_refract.report import documents
-
     outcome, reason, details, metrics = _outcome(result, results), text_reports.why(result), [], []
     if result.warning and not outcome:
         details.append(f"warning: {result.warning}")

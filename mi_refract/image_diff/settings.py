@@ -130,7 +130,11 @@ class Settings:
 
     @classmethod
     def for_all(cls, **values: Any) -> Settings:
-        """These values, such as `method="tolerance", fail=0.1`, for all images."""
+        """These values, such as `method="tolerance", fail=0.1`, for all images. ValueError for what is no key."""
+        if (method := values.get("method", AUTO)) not in ACCEPTED:
+            raise ValueError(f"method {method!r}; expected {', '.join(ACCEPTED)}")
+        if unknown := values.keys() - options_of(None) - {*ImageKeys.__struct_fields__}:
+            raise ValueError(f"unknown key {min(unknown)!r}; expected a key of [defaults], or skip")
         return cls((Entry("", values, COMMAND_LINE),))
 
     def of(self, name: str) -> ComparisonSpec:

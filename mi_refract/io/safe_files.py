@@ -23,6 +23,7 @@ import sys
 import tempfile
 import threading
 import time
+import zlib
 from collections.abc import Iterator, Sequence
 from io import BufferedReader
 from pathlib import Path
@@ -33,7 +34,8 @@ _KEPT = 40  # characters of the file's own name: a name of 255 bytes has no room
 _KINDS = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 _LONGEST_CHANGE = 5.0  # seconds that creating or renaming may take on a slow file system
 _unfinished: set[Path] = set()
-_PREFIX = "mi_refract_"  # of temporary folders
+# Names of temporary folders: no user chooses them, and a lock may not be seen by other hosts that share the disk.
+_PREFIX, _SUFFIX = f"mi_refract-{zlib.crc32(os.uname().nodename.encode()):08x}-", ".part"
 _TEMPORARY = re.compile(r"\.[0-9a-f]{32}\.part")
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -150,13 +152,13 @@ def full_disk_names(path: str | os.PathLike[str]) -> Iterator[None]:
 def temporary_folder() -> Iterator[Path]:
     """A new folder for temporary files, removed at the end, also by `end_process`.
 
-    Folders whose processes were killed are removed first: as long as a process lives, it holds a lock on its folder.
+    Folders whose processes on this host were killed are removed first: a process that lives locks its folder.
     """
     parent = Path(tempfile.gettempdir())
     _remove_abandoned(parent)
     while True:
         with _changing:
-            folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
+            folder = Path(tempfile.mkdtemp(_SUFFIX, _PREFIX, parent))
             _unfinished.add(folder)
         with contextlib.suppress(FileNotFoundError):  # another process found it before it was locked
             lock = os.open(folder, _FOLDER)
@@ -174,7 +176,7 @@ def temporary_folder() -> Iterator[Path]:
 
 @functools.cache  # once in a process
 def _remove_abandoned(parent: Path) -> None:
-    for folder in parent.glob(f"{_PREFIX}*"):
+    for folder in parent.glob(f"{_PREFIX}*{_SUFFIX}"):
         with contextlib.suppress(OSError):  # locked, another user's, or gone meanwhile
             lock = os.open(folder, _FOLDER)
             try:

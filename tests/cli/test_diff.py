@@ -97,8 +97,10 @@ def settled(pair):
 def test_in_a_repository_a_folder_inside_finds_the_settings_and_masks_above(run, folders, tmp_path):
     """Names, `{dir}` and `{root}` are those of the whole folder; nothing above the repository is read."""
     old, new = folders
-    rule = '[[image]]\nname = "inner/*.exr"\nreason = "masked"\nmask = "{root}/masks/{dir}/{stem}.exr"\n'
+    rule = '[defaults]\naccept = ["{stem}-other{suffix}"]\n'
+    rule += '[[image]]\nname = "inner/*.exr"\nreason = "masked"\nmask = "{root}/masks/{dir}/{stem}.exr"\n'
     rule += '[[image]]\nname = "other/*"\nreason = "of another folder"\n'
+    rule += "".join(f'[[image]]\nname = "{name}"\nskip = true\nreason = "all"\n' for name in ("renders", "added/*"))
     (old / "mi-refract.toml").write_text(rule)
     image(old / "masks" / "inner" / "changed.exr")  # black on the left
     image(new / "inner" / "changed.exr", value=9)  # in the fifth column
@@ -112,6 +114,10 @@ def test_in_a_repository_a_folder_inside_finds_the_settings_and_masks_above(run,
         if repository:
             (repository / ".git").rmdir()
     (tmp_path / ".git").mkdir()
+    sides = samples(old / "renders", 2), samples(new / "renders", 2, 100)
+    assert run("diff", *sides, "--renders")[1].endswith("1 image: 1 skipped\n")
+    image(new / "added" / "first.exr")
+    assert run("accept", old / "added", new / "added", "--yes")[1].endswith("nothing to accept\n")
     assert "mask {root}/masks/{dir}/{stem}.exr" in run("diff", old / "inner", "--check-settings")[1]
     assert run("diff", *calls[0], "--settings", old / "mi-refract.toml")[0] == 1  # names are those of its folder
     (old / "mi-refract.toml").write_text('[defaults]\nmap = { reference = "{name}", test = "{name}" }\n')

@@ -354,6 +354,8 @@ TRUE_DIFFERENCES = {
     "swapped channels": lambda: (noisy(1), noisy(2)[..., ::-1]),
     "one channel with other noise": lambda: (noisy(1), np.dstack([noisy(2)[..., 0], 1.05 * noisy(1)[..., 1:]])),
     "too few pixels": lambda: (noisy(1)[:30, :30], noisy(2)[:30, :30]),
+    "too few rows": lambda: tuple(noisy(i, shape=(5, 2000)) for i in (1, 2)),
+    "too few columns": lambda: tuple(noisy(i, shape=(2000, 4)) for i in (1, 2)),
     "no noise": lambda: (noisy(1, 1e-3), brighter(noisy(1, 1e-3), 1.5, PART)),
 }
 

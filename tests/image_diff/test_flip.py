@@ -245,7 +245,9 @@ def test_hdr_and_ldr():
             assert compare("flip", of(lines), of(other), hdr=hdr).verdict is DIFFERENT
     bright, other = of(50 * (1 + SMOOTH)), of(75 * (1 + SMOOTH))  # too bright for a display
     assert compare("flip", bright, other, hdr="yes").verdict is DIFFERENT
-    assert compare("flip", bright, other, hdr="no").metrics[0].value == 0
+    coded = [replace(image, metadata={"oiio:ColorSpace": "srgb_rec709_scene"}) for image in (bright, other)]
+    for sides, hdr in (((bright, other), "no"), (coded, "auto")):
+        assert [metric.value for metric in compare("flip", *sides, hdr=hdr).metrics[:4]] == [0] * 4
     for light in (1e-3, 0.25, 1.0, 1e4):  # an image of one brightness
         one = np.full((16, 16, 3), light)
         for gain in (1.2, 2):

@@ -47,17 +47,23 @@ with temporary_folder() as folder:
 
 
 def test_a_temporary_folder_whose_process_was_killed_is_removed_by_the_next_one(tmp_path, monkeypatch):
-    """That of a living process stays, and so does what only looks like one."""
+    """That of a living process stays, and so does what only looks like one, or another host's."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    (tmp_path / "mi_refract_link").symlink_to(tmp_path)
-    (tmp_path / "mi_refract_file").touch()
+    others = [
+        tmp_path / name for name in ("mi_refract_results", "mi_refract-1.part", "mi_refract-00000000-12345678.part")
+    ]
+    for other in others:
+        other.mkdir()
     with python(HOLDING, TMPDIR=str(tmp_path)) as living, python(HOLDING, TMPDIR=str(tmp_path)) as killed:
         kept, left = (Path(process.stdout.readline().strip()) for process in (living, killed))
         killed.kill()
         killed.wait()
         assert (left / "half").exists()
+        link, file = (left.with_stem(f"{left.stem}_{kind}") for kind in ("link", "file"))
+        link.symlink_to(tmp_path)
+        file.touch()
         with safe_files.temporary_folder() as folder:
-            assert {*tmp_path.iterdir()} == {kept, folder, tmp_path / "mi_refract_link", tmp_path / "mi_refract_file"}
+            assert {*tmp_path.iterdir()} == {kept, folder, link, file, *others}
         living.kill()
     assert not folder.exists()
 
