@@ -75,7 +75,7 @@ def main() -> None:
     """Start, print the address, wait, and end with all workers."""
     signal.pthread_sigmask(signal.SIG_UNBLOCK, signal.valid_signals())
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is for who started us
-    # One line of our stdout is read: what workers log there goes to stderr, or the pipe fills up and they wait for ever.
+    # One line of our stdout is read: what workers log there goes to stderr, or the pipe fills up and they wait.
     answer = os.dup(1)
     os.dup2(2, 1)
     try:
