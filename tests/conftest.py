@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import sys
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from typing import Any
 
 import hypothesis
@@ -23,12 +22,6 @@ hypothesis.settings.load_profile("short")
 
 def pytest_report_header() -> str:
     return f"mi_refract: {VARIANT}; {backend.summary()}"
-
-
-@pytest.hookimpl(wrapper=True, optionalhook=True)
-def pytest_xdist_auto_num_workers() -> Generator[None, int, int]:
-    """Of `-n auto`: one process more than there are cores, because tests of clusters and killed commands wait."""
-    return (yield) + ("PYTEST_XDIST_AUTO_NUM_WORKERS" not in os.environ)
 
 
 @pytest.hookimpl(optionalhook=True)
