@@ -250,6 +250,22 @@ def test_a_texture_that_holds_no_index_is_refused_and_an_edit_loses_its_light(ty
         assert (sampled(bsdf, (0.6, 0, 0.8), number, u=0.75).weight == 0).all()
 
 
+@pytest.mark.parametrize("nested", [False, True])
+def test_an_attribute_that_the_shape_does_not_have_is_refused(llvm_variant, nested):
+    glass = {"type": "refract", "int_ior": {"type": "mesh_attribute", "name": "vertex_n"}}
+    if nested:
+        checkers = {"type": "checkerboard", "color0": 1.5, "color1": glass["int_ior"]}
+        glass = {"type": "mask", "opacity": 0.5, "inner": glass | {"int_ior": checkers}}
+    props = mi.Properties()
+    props["glass"] = mi.load_dict(glass)
+    mesh = mi.Mesh("triangle", 3, 1, props=props)
+    camera = {"type": "perspective", "film": {"type": "hdrfilm", "width": 2, "height": 2}}
+    scene = mi.load_dict({"type": "scene", "mesh": mesh, "integrator": {"type": "refract_path"}, "camera": camera})
+    assert "refract: 'mesh' has no attribute 'vertex_n', which a texture" in refusal(mi.render, scene, spp=1)
+    mesh.add_attribute("vertex_n", 1, [1.5] * 3)
+    mi.render(scene, spp=1)
+
+
 def test_of_a_coloured_texture_the_luminance_is_the_index(needs_variant):
     needs_variant("llvm_ad_rgb")
     mi.set_variant("llvm_ad_rgb")
