@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.glass_scenes import refusal, sampled, surface, vector
 
+from mi_refract import mitsuba_mesh
 from mi_refract.formulas import FORMULAS, fresnel
 
 TINTED = {"int_ior": 1.5, "ext_ior": 1.0, "specular_reflectance": 0.3, "specular_transmittance": 0.6}
@@ -258,7 +259,7 @@ def test_an_attribute_that_the_shape_does_not_have_is_refused(llvm_variant, nest
         glass = {"type": "mask", "opacity": 0.5, "inner": glass | {"int_ior": checkers}}
     props = mi.Properties()
     props["glass"] = mi.load_dict(glass)
-    mesh = mi.Mesh("triangle", 3, 1, props=props)
+    mesh = mitsuba_mesh.make(mi, np.eye(3), np.arange(3)[None], properties=props)
     camera = {"type": "perspective", "film": {"type": "hdrfilm", "width": 2, "height": 2}}
     scene = mi.load_dict({"type": "scene", "mesh": mesh, "integrator": {"type": "refract_path"}, "camera": camera})
     assert "refract: 'mesh' has no attribute 'vertex_n', which a texture" in refusal(mi.render, scene, spp=1)

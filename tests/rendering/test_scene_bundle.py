@@ -231,7 +231,11 @@ def test_the_formulas_of_a_scene(bsdf, formulas):
         ("", {"res": "8193"}, "a film of 8193 × 8193 pixels; expected 1 to 67108864"),
         (ABSORPTION, {}, "refract: int_absorption; expected the integrator refract_path, or no absorption"),
         (ABSORPTION, {"integrator": "refract_path"}, ""),
-        (ATTRIBUTE, {}, "refract: 'ball' has no attribute 'vertex_n', which a texture of its BSDF reads; expected a mesh"),
+        (
+            ATTRIBUTE,
+            {},
+            "refract: 'ball' has no attribute 'vertex_n', which a texture of its BSDF reads; expected",
+        ),
     ],
 )
 def test_what_is_refused_is_named(tmp_path, parameter, defines, message):
