@@ -132,7 +132,7 @@ def _write_named(write: Callable[[Any, Any], int | None], stdout: Any, content: 
 def _failed(name: str, error: BaseException) -> int:
     unread = False
     with contextlib.suppress(OSError, ValueError):  # a stderr that cannot be written says nothing
-        if isinstance(error, BrokenPipeError):
+        if isinstance(error, BrokenPipeError) and hasattr(select, "poll"):  # Windows has other errors for it
             pipe = select.poll()
             pipe.register(sys.stdout, 0)
             unread = bool(pipe.poll(0))  # POLLERR: its reader has gone; else another pipe broke
