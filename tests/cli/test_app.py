@@ -134,7 +134,7 @@ import os, select, signal, subprocess, sys
 for name in ("fcntl", "grp", "pwd", "resource", "termios"):
     sys.modules[name] = None
 for module, names in {
-    os: "O_CLOEXEC O_DIRECTORY O_NOFOLLOW O_NONBLOCK chown fchmod fork geteuid getpgrp getuid killpg mkfifo setsid",
+    os: "O_CLOEXEC O_DIRECTORY O_NOFOLLOW chown fchmod fork geteuid getpgrp getuid killpg mkfifo setsid",
     select: "epoll poll",
     signal: "SIGHUP pthread_kill pthread_sigmask sigpending sigtimedwait sigwait",
 }.items():

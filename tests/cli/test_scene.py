@@ -82,6 +82,7 @@ def built(tmp_path_factory):
 @pytest.mark.parametrize("kind", ["wheel", "sdist"])
 def test_what_is_installed_has_scenes_and_glasses_and_runs(kind, built, tmp_path):
     """All files of the package, and the scenes but their images."""
+    pytest.importorskip("pip")
     root, there = SCENES.parent, tmp_path / "there"
     pip = [
         sys.executable,
