@@ -136,7 +136,8 @@ def diff(
         if page:
             from mi_refract.io.image_file import provenance
 
-            software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
+            versions = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
+            software = {name: version for name, version in versions.items() if version != "unknown"}
             page.write(results, software, results.command("diff", *(names or [])), str(json or ""))
     finally:  # a file that cannot be written hides no verdict
         text_reports.print_results(results)

@@ -103,6 +103,8 @@ def describe(error: BaseException) -> str:
         text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     elif isinstance(error, MemoryError):
         text = f"out of memory{f': {error}' if str(error) else ''}"
+    elif isinstance(error, ModuleNotFoundError) and error.name in ("mitsuba", "drjit"):
+        text = f"{error}; only images are compared without it: pip install mi-refract"
     elif isinstance(error, ValueError | OSError | ImportError) and str(error):
         text = str(error)
     else:
