@@ -1,4 +1,4 @@
-"""Comparing images without Mitsuba: all commands and fixtures, here with its import refused, and in a fresh environment."""
+"""Comparing images without Mitsuba: all commands and fixtures, with its import refused, and in a fresh environment."""
 
 from __future__ import annotations
 
@@ -18,13 +18,15 @@ ABSENT = ("mitsuba", "drjit", "matplotlib")
 INSTALL = "MI_REFRACT_INSTALL"
 MOST = 300e6  # bytes
 
-# Imports every module of the room.
-PROGRAM = '''
+# Imports every module of the room; its arguments are what it may not import.
+PROGRAM = """
 import pkgutil, sys
+
+ABSENT = sys.argv[1:]
 
 class Refuse:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in %(absent)r:
+        if name.partition(".")[0] in ABSENT:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 sys.meta_path.insert(0, Refuse())
@@ -53,8 +55,8 @@ code = pytest.main(["-q", "-p", "no:cacheprovider", "--rootdir=.", "--mi-refract
 assert code == 0, code
 room = {f"mi_refract.image_diff.{each.name}" for each in pkgutil.iter_modules(mi_refract.image_diff.__path__)}
 assert not room - set(sys.modules), room - set(sys.modules)
-assert not set(%(absent)r) & set(sys.modules)
-''' % {"absent": ABSENT}  # fmt: skip
+assert not set(ABSENT) & set(sys.modules)
+"""
 TESTS = """
 import numpy as np
 import pytest
@@ -84,7 +86,9 @@ def project(pair, tmp_path):
 
 
 def check(python, project, environment):
-    done = subprocess.run([python, "-c", PROGRAM], cwd=project, env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [python, "-c", PROGRAM, *ABSENT], cwd=project, env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     assert re.search(r"module named '\w+'; only images are compared without it: pip install mi-refract$", done.stderr)
 
