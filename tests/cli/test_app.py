@@ -73,6 +73,7 @@ def commands_of(command, name=""):
 COMMANDS = commands_of(typer.main.get_command(app.app))
 ROOT = Path(mi_refract.__file__).parents[1]
 READMES = [ROOT / "README.md", *ROOT.glob("mi_refract/*/README.md"), ROOT / "validation/README.md"]
+PAGES = [path for path in ROOT.glob(".github/docs/**/*.md") if "mi-refract " in "".join(blocks(path, "bash"))]
 
 
 @pytest.fixture
@@ -100,7 +101,7 @@ def test_every_help_ends_with_two_or_three_examples_that_are_parsed(name, capfd,
     assert called[0].startswith(f"mi-refract {name}".strip())
 
 
-@pytest.mark.parametrize("path", READMES, ids=lambda path: path.parent.name)
+@pytest.mark.parametrize("path", [*READMES, *PAGES], ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_the_command_lines_of_a_readme_are_parsed(path, parsed):
     lines = [line for block in blocks(path, "bash") for line in block.replace("\\\n", " ").splitlines()]
     lines = [line for line in lines if line.startswith("mi-refract ")]
