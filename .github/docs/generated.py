@@ -20,6 +20,9 @@ from mi_refract.io.typed_table import key_table
 from mi_refract.planar import scene_file
 from mi_refract.ray_sets import header, renderer_file
 
+MOST_LINES = 4  # of a comment that is shown
+LONGEST = 100  # characters of a value that is shown
+
 
 def docstring(name: str) -> str:
     """Of a module."""
@@ -88,6 +91,18 @@ def member(name: str, value: Any) -> str:
     return f"``````{{py:{kind}}} {name}{signature(plain)}\n{text}\n``````"
 
 
+class Named:
+    """A default that has no literal, by its name."""
+
+    def __init__(self, value: Any) -> None:
+        """`value`: the default."""
+        self.name = getattr(value, "__name__", "...")
+
+    def __repr__(self) -> str:
+        """Valid Python, which Sphinx parses."""
+        return self.name if self.name.isidentifier() else "..."
+
+
 def signature(value: Any) -> str:
     """As it is called; nothing for what is not."""
     from sphinx.util.inspect import stringify_signature
@@ -98,25 +113,33 @@ def signature(value: Any) -> str:
         found = inspect.signature(value)
     except (TypeError, ValueError):
         return ""
-    parameters = [x for x in found.parameters.values() if x.name not in ("self", "cls")]
-    return stringify_signature(found.replace(parameters=parameters))
+    parameters = [
+        x.replace(default=Named(x.default)) if repr(x.default)[:1] == "<" and x.default is not x.empty else x
+        for x in found.parameters.values()
+        if x.name not in ("self", "cls")
+    ]
+    returns = inspect.Signature.empty if inspect.isclass(value) else found.return_annotation
+    return stringify_signature(found.replace(parameters=parameters, return_annotation=returns))
 
 
 def constant(name: str, value: Any, module: ModuleType) -> str:
-    """The comment beside its definition, and its value, or the keys of a table."""
+    """The comment at its definition, and its value, or the keys of a table."""
     if isinstance(value, dict):
-        return f"{comment(name, module)}\n\nKeys: {', '.join(f'`{key}`' for key in value)}."
-    shown = f"Value: `{value!r}`." if isinstance(value, (str, int, float)) else ""
+        shown = f"Keys: {', '.join(f'`{key}`' for key in value)}."
+    else:
+        shown = f"Value: `{value!r}`." if len(repr(value)) < LONGEST and repr(value)[0] != "<" else ""
     return f"{comment(name, module)}\n\n{shown}"
 
 
 def comment(name: str, module: ModuleType) -> str:
-    """What stands behind `NAME = …` in the room."""
+    """What stands above or behind `NAME = …` in the room."""
     paths = getattr(module, "__path__", None)
     names = [f"{module.__name__}.{x.name}" for x in pkgutil.iter_modules(paths)] if paths else [module.__name__]
     for source in map(inspect.getsource, map(importlib.import_module, names)):
-        if found := re.search(rf"^{name}\b[^=\n]*=.*?  # (.*)$", source, re.MULTILINE):
-            return found[1][0].upper() + found[1][1:] + "."
+        if found := re.search(rf"((?:^# .*\n)*)^{name}\b[^=\n]*=[^#\n]*(?:# (.*))?$", source, re.MULTILINE):
+            above = [line.removeprefix("# ") for line in found[1].splitlines() if "fmt:" not in line]
+            text = found[2] or " ".join(above if len(above) <= MOST_LINES else ())
+            return text[:1].upper() + text[1:].removesuffix(".") + "." * bool(text)
     return ""
 
 
