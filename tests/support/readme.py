@@ -8,7 +8,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / ".github" / "docs"
 READMES = [ROOT / "README.md", *sorted(ROOT.glob("mi_refract/*/README.md")), ROOT / "validation" / "README.md"]
-PAGES = sorted(DOCS.rglob("*.md"))
+PAGES = sorted(path for path in DOCS.rglob("*.md") if "python" not in path.parts)  # those are written by a build
 
 
 def python_blocks(path: Path) -> list[str]:
