@@ -51,6 +51,12 @@ MaxValues = Annotated[
 ]
 
 
+def _json_schema() -> str:
+    from mi_refract.image_diff import results_file
+
+    return results_file.json_schema()
+
+
 def diff(
     reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")],
     test: Annotated[
@@ -76,12 +82,16 @@ def diff(
         bool,
         typer.Option("--methods", is_eager=True, callback=shows(key_tables), help="Print the methods and all keys."),
     ] = False,
+    json_schema: Annotated[
+        bool,
+        typer.Option("--json-schema", is_eager=True, callback=shows(_json_schema), help="Print the schema of --json."),
+    ] = False,
     check_settings: Annotated[
         bool, typer.Option("--check-settings", help="Print how each image would be compared, and by which settings.")
     ] = False,
 ) -> None:
     """Compare images with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
-    require_extra("scipy", *(("jinja2", "matplotlib") if report else ()))
+    require_extra("scipy", *["jinja2"] * bool(report))
     if test is None and not check_settings:
         raise ValueError("two paths are needed; expected mi-refract diff REFERENCE TEST")
     chosen = _settings(reference, test or reference, method, options or [], settings, max_values)
@@ -118,16 +128,23 @@ def diff(
             digests=bool(json),
             progress=progress,
         )
-    text_reports.print_results(results)
-    if page:
-        from mi_refract.io.image_file import provenance
+    try:
+        if junit or json:
+            from mi_refract.image_diff import results_file
 
-        software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
-        page.write(results, software, results.command("diff", *(names or [])), str(json or ""))
-    if junit or json or github:
+            results_file.write(results, junit, json)
+        if page:
+            from mi_refract.io.image_file import provenance
+
+            versions = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
+            software = {name: version for name, version in versions.items() if version != "unknown"}
+            page.write(results, software, results.command("diff", *(names or [])), str(json or ""))
+    finally:  # a file that cannot be written hides no verdict
+        text_reports.print_results(results)
+    if github:
         from mi_refract.image_diff import results_file
 
-        results_file.write(results, junit, json, github, str(report or ""), report_url)
+        results_file.write_github(results, str(report or ""), report_url)
     raise typer.Exit(results.exit_code)
 
 

@@ -26,9 +26,9 @@ _QUESTION = "__import__({!r}, fromlist=['facts']).facts({!r})"
 
 
 class Workers:
-    """Of a client's scheduler. `accepted`: threads by the addresses of those that are there and may have work.
+    """Of a client's scheduler. `usable`: threads by the addresses of those that are there and may have work.
 
-    `refused`: why, by address; `machines`: the names of all that ever were accepted.
+    `refused`: why, by address; `machines`: the names of all that ever were usable.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Workers:
         `facts`: the name of the module whose `facts(variant)` workers are asked for. `task`: what they are for, a verb.
         """
         self.client, self.expected, self.tolerated, self.warn, self.task = client, expected, tolerated, warn, task
-        self.accepted: dict[str, int] = {}
+        self.usable: dict[str, int] = {}
         self.refused: dict[str, str] = {}
         self.machines: dict[str, str] = {}
         self._question = _QUESTION.format(facts, variant)
@@ -63,11 +63,11 @@ class Workers:
         while True:
             self.look(at_once=True)
             waited = time.monotonic() - began
-            answered = not self._asked and (self.accepted or self.refused or waited > nobody)
+            answered = not self._asked and (self.usable or self.refused or waited > nobody)
             if answered or waited > PATIENCE:
                 break
             time.sleep(0.05)
-        if not self.accepted:
+        if not self.usable:
             reason = "; ".join(self.refused.values()) or ("workers do not answer" if self._asked else "no workers")
             text = f"{self.client.scheduler.address}: no worker that may {self.task}: {reason}"
             raise NoWorkersError(f"{text}; expected at least one with the software and hardware of this process")
@@ -78,18 +78,18 @@ class Workers:
         LostSchedulerError where the scheduler has gone, NoWorkersError where all workers have, for longer than ALONE.
         """
         with cluster_errors(self.client):
-            if at_once or not self.accepted or time.monotonic() - self._looked >= BETWEEN_LOOKS:
+            if at_once or not self.usable or time.monotonic() - self._looked >= BETWEEN_LOOKS:
                 self._looked, present = time.monotonic(), self.client.nthreads()
-                for known in (self.accepted, self.refused, self._asked):
+                for known in (self.usable, self.refused, self._asked):
                     for address in known.keys() - present.keys():
                         del known[address]
                 for address, threads in present.items():
                     if address in self._asked and self._asked[address].done():
                         self._judge(address, threads, self._asked.pop(address))
-                    elif not any(address in known for known in (self._asked, self.accepted, self.refused)):
+                    elif not any(address in known for known in (self._asked, self.usable, self.refused)):
                         options: dict[str, Any] = {"workers": [address], "pure": False, "priority": 1000}
                         self._asked[address] = self.client.submit(eval, self._question, **options)
-        if self.accepted or not self.machines:
+        if self.usable or not self.machines:
             self._alone_since = None
         elif self._alone_since is None:
             self._alone_since = time.monotonic()
@@ -112,7 +112,7 @@ class Workers:
             self.refused[address] = f"worker {address}{host} is refused: {'; '.join(different)}"
             self.warn(self.refused[address])
         else:
-            self.accepted[address] = threads
+            self.usable[address] = threads
             self.machines[address] = on_worker.machine(there, self.expected)
 
 
@@ -155,7 +155,7 @@ def results(
     begun: dict[Any, tuple[int, tuple[Any, ...], frozenset[str]]] = {}  # number, arguments, who may make the call
 
     def begin(number: int, arguments: tuple[Any, ...]) -> None:
-        allowed = frozenset(workers.accepted)
+        allowed = frozenset(workers.usable)
         options: dict[str, Any] = {"workers": sorted(allowed), "pure": False, "priority": -number}
         begun[client.submit(_with_address, function, *arguments, **options)] = number, arguments, allowed
 
@@ -165,14 +165,14 @@ def results(
             with cluster_errors(client):
                 for future, (number, arguments, allowed) in list(begun.items()):
                     # Dask would wait for these workers to come back.
-                    if workers.accepted and allowed.isdisjoint(workers.accepted) and not future.done():
+                    if workers.usable and allowed.isdisjoint(workers.usable) and not future.done():
                         del begun[future]
                         client.cancel([future], force=True)
                         begin(number, arguments)
-                room = AHEAD * sum(workers.accepted.values()) - len(begun)
+                room = AHEAD * sum(workers.usable.values()) - len(begun)
                 for number, arguments in itertools.islice(waiting, max(0, room)):
                     begin(number, arguments)
-            if not begun and workers.accepted:
+            if not begun and workers.usable:
                 return
             if not begun:
                 time.sleep(_POLL)

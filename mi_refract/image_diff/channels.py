@@ -92,8 +92,8 @@ def selected(image: Image, names: Mapping[str, str]) -> Image:
     pairs = spreads(image.channels)
     missing = [name for name in names if name not in image.channels]
     if missing:
-        accepted = ", ".join(means(image.channels))
-        raise ValueError(f"{image.path}: no channel {missing[0]!r}; in `channels` expected {accepted}")
+        known = ", ".join(means(image.channels))
+        raise ValueError(f"{image.path}: no channel {missing[0]!r}; in `channels` expected {known}")
     kept = dict(names)
     for old, new in names.items():
         if old in pairs:

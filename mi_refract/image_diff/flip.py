@@ -25,6 +25,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from mi_refract.io.image_file import Image, Pixels, block_mean, srgb_decode, srgb_encode
+from mi_refract.io.text import distinguishable
 
 from .comparison import Comparison, Metric, Range, one_of, only, verdict_of
 
@@ -68,6 +69,8 @@ def flip(
         "twice as much; larger squares by less; for LDR images",
     ] = ONE_WAY,
     largest: Annotated[float, "FLIP error that no pixel may exceed, 0 to 1"] = 1.0,
+    mean: Annotated[float, "FLIP error allowed on average over the image, 0 to 1"] = 1.0,
+    percentile_99: Annotated[float, "FLIP error that 1 % of the pixels may exceed, 0 to 1"] = 1.0,
     hdr: Annotated[str, "auto (by the file's format), yes or no", one_of("auto", "yes", "no")] = "auto",
     # Below 1 its filters see nothing; above 1000 they are larger than any image.
     ppd: Annotated[
@@ -91,8 +94,8 @@ def flip(
         Metric("FLIP error throughout a patch", patched.value, patch),
         *([] if wide else [Metric("change one way, in codes", changed.value, one_way)]),
         Metric("largest FLIP error", float(error.max()), largest),
-        Metric("mean FLIP error", float(error.mean())),
-        Metric("99th percentile of the FLIP error", float(np.percentile(error, 99))),
+        Metric("mean FLIP error", float(error.mean()), mean),
+        Metric("99th percentile of the FLIP error", float(np.percentile(error, 99)), percentile_99),
     )
     reason = f"local FLIP error {worst.value:.3g}, largest {error.max():.3g} ({'HDR' if wide else 'LDR'})"
     if worst.value:
@@ -103,6 +106,10 @@ def flip(
             said, window = f"at least {changed.error:.0f} codes brighter or darker", changed
         x, y = window.x + reference.origin[0], window.y + reference.origin[1]
         reason += f"; {said} in {window.width} × {window.height} pixels from x = {x}, y = {y}"
+    for metric, name in zip(metrics[-2:], ("mean", "percentile_99"), strict=True):
+        if not metric.holds:
+            value, bound = distinguishable(metric.value, metric.bound)
+            reason = f"{metric.name} {value} > {name} = {bound}; {reason}"
     return Comparison("flip", verdict_of(metrics), reason, metrics, maps={"flip": error, "local": around})
 
 

@@ -12,7 +12,7 @@ import os
 import shlex
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,7 +26,6 @@ from mi_refract.io.safe_files import write_atomically
 from mi_refract.io.text import beside_bound, compact, printable
 from mi_refract.report.documents import rendered
 from mi_refract.report.embedded_images import EmbeddedImages, encoded, strongest
-from mi_refract.report.plots import histogram_svg
 
 from . import flip
 from .name_patterns import literal
@@ -39,7 +38,8 @@ FULL = "Not embedded: the page is full."
 IMAGE_BYTES, MAP_BYTES = 4_600_000, 1_200_000  # two images and three maps fill a page
 ARTICLES, LINES = 1000, 5000  # failures with all their numbers, and images in a line, before the page is measured
 NAMED = 10  # images without a place on the page that the command for a page of the rest names
-MAP_WIDTH, FLIP_WIDTH, HISTOGRAM_ROWS = 960, 640, 512
+MAP_WIDTH, FLIP_WIDTH, HISTOGRAM_ROWS, BINS = 960, 640, 512, 20
+BAR_BYTES = 80  # of a bar of a histogram on the page
 SIGNED = ("difference", "t")
 
 _one_at_a_time = threading.Lock()  # what is made of a pair takes several times its memory, and every processor
@@ -51,16 +51,19 @@ Pane = dict[str, Any]
 
 @dataclass(frozen=True)
 class Shown:
-    """The panes of a pair for the viewer of `mi_refract.report`; `note`: why others are missing."""
+    """The panes of a pair for the viewer of `mi_refract.report`; `note`: why others are missing.
+
+    `histogram`: the shares of the p-values in equal bins from 0 to 1.
+    """
 
     panes: list[Pane] = field(default_factory=list)
     note: str = ""
-    histogram: str = ""
+    histogram: Sequence[float] = ()
 
     @property
     def size(self) -> int:
         """Bytes on a page."""
-        return sum(len(pane["data"]) for pane in self.panes) + len(self.histogram)
+        return sum(len(pane["data"]) for pane in self.panes) + BAR_BYTES * len(self.histogram)
 
 
 class Page:
@@ -227,11 +230,12 @@ def shown_of(result: Result, image_bytes: float, map_bytes: float) -> Shown:
                 makers.append(functools.partial(map_pane, "difference", change, map_bytes))
                 if "flip" not in maps and all(np.isfinite(x.pixels.astype(np.float32)).all() for x in (one, two)):
                     makers.append(functools.partial(_flip, one, two, map_bytes))
-            histogram = ""
+            histogram: Sequence[float] = ()
             if "p" in maps:  # a histogram shows it better than a map
                 p_values = maps.pop("p")
                 some = p_values[:: -(-len(p_values) // HISTOGRAM_ROWS)]
-                histogram = histogram_svg(some[np.isfinite(some)], "p-value", "share of the tiles", salt=result.name)
+                counts, _ = np.histogram(some[np.isfinite(some)], BINS, (0, 1))
+                histogram = (counts / counts.sum()).tolist() if counts.any() else ()
             if "q" in maps:
                 maps["−log₁₀ q"] = -np.log10(np.maximum(maps.pop("q"), 1e-30))
             makers += [

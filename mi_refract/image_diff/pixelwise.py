@@ -109,8 +109,8 @@ def paired(
 
 def paired_accepts(a: Pixels, b: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
     """The pixels, H × W, of two images, H × W × C, that `paired` takes for unchanged."""
-    accepted: NDArray[np.bool_] = (np.abs(b - a) / _scale(a, b) <= options["threshold"]).all(-1)
-    return accepted
+    unchanged: NDArray[np.bool_] = (np.abs(b - a) / _scale(a, b) <= options["threshold"]).all(-1)
+    return unchanged
 
 
 def _scale(a: Pixels, b: Pixels) -> Pixels:
@@ -218,9 +218,9 @@ def tolerance_accepts(a: Pixels, b: Pixels, options: Mapping[str, Any]) -> NDArr
 
     `hard_fail` is not among the reasons: it counts for other pixels than those within `fail` only where these fail.
     """
-    accepted = np.ones(a.shape[:2], bool)
-    accepted.reshape(-1)[_beyond(np.abs(b - a), a, b, options["fail"], options["fail_relative"])] = False
-    return accepted
+    equal = np.ones(a.shape[:2], bool)
+    equal.reshape(-1)[_beyond(np.abs(b - a), a, b, options["fail"], options["fail_relative"])] = False
+    return equal
 
 
 def _most(percent: float, pixels: int) -> int:

@@ -16,16 +16,16 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from mi_refract.io import safe_files
-from mi_refract.io.text import printable
+from mi_refract.io.text import json_text, printable
 from mi_refract.io.typed_table import convert
 from mi_refract.report import documents
 from mi_refract.report.row import write_strict_json
 
 from . import pairing, text_reports
-from .results import FAILED, Result, Results, Status
+from .results import FAILED, Category, Result, Results, Status
 from .settings import ComparisonSpec, Settings
 
-SCHEMA = 1
+SCHEMA: Literal[1] = 1
 MOST = 2**28  # bytes of a file
 OUTCOMES: dict[Status, Literal["", "failure", "error", "skipped"]] = {  # of JUnit
     Status.ERROR: "error",
@@ -35,48 +35,117 @@ OUTCOMES: dict[Status, Literal["", "failure", "error", "skipped"]] = {  # of JUn
     Status.SKIPPED: "skipped",
 }
 EXPECTED = "expected a file that mi-refract diff --json wrote"
-PathText = Annotated[str, msgspec.Meta(min_length=1, pattern=r"^[^\0]*$")]
-Digest = Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$")]
 
 
-def write(
-    results: Results,
-    junit: Path | None = None,
-    data: Path | None = None,
-    github: bool = False,
-    report: str = "",
-    url: str = "",
-) -> None:
-    """Write what programs read of the results: JUnit's XML, the JSON in `data`, and what GitHub shows of a job.
+# The JSON -----------------------------------------------------------------------------------------------------------
+
+_PathText = Annotated[str, msgspec.Meta(min_length=1, pattern=r"^[^\0]*$")]
+_Number = float | Literal["nan", "inf", "-inf"]  # strict JSON has no such numbers
+
+
+def _doc(meaning: str) -> msgspec.Meta:
+    return msgspec.Meta(description=meaning)
+
+
+_Digest = Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$"), _doc("SHA-256; empty where there is no file")]
+
+
+class Digests(msgspec.Struct):
+    """The SHA-256 of the files of an image when they were compared."""
+
+    reference: _Digest
+    test: _Digest
+    variants: list[_Digest]
+
+
+class MeasuredNumber(msgspec.Struct):
+    """A number that the method measured; in equal images it is at most its bound, where it has one."""
+
+    name: str
+    value: _Number
+    bound: _Number | None
+
+
+class Entry(msgspec.Struct):
+    """One image, or with --renders one pair of folders."""
+
+    name: Annotated[str, _doc("path of the new image in its folder")]
+    status: Annotated[Status, _doc("the verdict; error: could not be compared")]
+    category: Annotated[Category, _doc("what happened to the image between the folders; unknown without a verdict")]
+    reason: str
+    warning: Annotated[str, _doc("what an equal image is near to failing, and remarks on its mask")]
+    error: Annotated[str, _doc("why the image could not be compared")]
+    reference: Annotated[_PathText | None, _doc("null: only among the new images")]
+    test: Annotated[_PathText | None, _doc("null: only among the references")]
+    target: Annotated[_PathText, _doc("where the reference is, or would be")]
+    digests: Annotated[Digests | None, _doc("null for an equal image, for an unreadable file and with --renders")]
+    method: str
+    method_why: Annotated[str, _doc("why `auto` chose this method")]
+    options: Annotated[dict[str, Any], _doc("the options of the method that were set")]
+    channels: Annotated[list[tuple[str, str]], _doc("[of the reference, of the new image]; empty: all")]
+    variance: Annotated[str, _doc("template of the image that holds the variance")]
+    mask: Annotated[str, _doc("template of the mask")]
+    ignore: Annotated[list[tuple[int, int, int, int]], _doc("rectangles that do not count: [x, y, width, height]")]
+    why_so: Annotated[str, _doc("`reason` in the settings")]
+    entries: Annotated[list[str], _doc("tables of the settings that apply")]
+    matched: Annotated[_PathText | None, _doc("the further reference that the image is equal to")]
+    variants: Annotated[list[_PathText], _doc("further references, by `accept` in the settings")]
+    metrics: list[MeasuredNumber]
+    minimum_detectable_difference: Annotated[_Number, _doc("relative; nan where the method knows none")]
+    reproduce: Annotated[str, _doc("the command that compares this image again")]
+    accept: Annotated[str, _doc("the command that makes the new image the reference")]
+
+
+class Document(msgspec.Struct):
+    """What `mi-refract diff --json` writes. Other keys may be added without another number of `schema`."""
+
+    schema: Literal[1]
+    exit_code: Annotated[int, msgspec.Meta(ge=0, le=3), _doc("of the command")]
+    sentence: Annotated[str, _doc("the last line of the output")]
+    reference: _PathText
+    test: _PathText
+    renders: Annotated[bool, _doc("--renders: each folder holds renders of one image")]
+    counts: Annotated[dict[Status, int], _doc("images of each status")]
+    results: list[Entry]
+
+
+def json_schema() -> str:
+    """The JSON Schema (draft 2020-12) of what `write` writes as JSON, as text."""
+    schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | msgspec.json.schema(Document)
+    return json_text(schema, 1)
+
+
+# Writing ------------------------------------------------------------------------------------------------------------
+
+
+def write(results: Results, junit: Path | None = None, data: Path | None = None) -> None:
+    """Write JUnit's XML, and the JSON in `data`. OSError where a file cannot be written.
 
     JUnit has a case for each image: "different" is a failure, "inconclusive" too unless it is to pass, no verdict an
-    error. JSON: `{"schema": 1, "exit_code", "sentence", "reference", "test", "counts", "results": [...]}`, in which NaN
-    and the infinities are words. For GitHub a workflow command is printed for each image that is not equal or has a
-    warning, and `text_reports.markdown` with `report` and `url` is appended to the file that $GITHUB_STEP_SUMMARY
-    names. Errors: OSError; a summary that cannot be written leaves the files.
+    error. The JSON is a `Document`.
     """
+    if data:
+        entries = [_json_entry(result, results) for result in results.results]
+        counts = {status: len(results.of(status)) for status in Status}
+        paths, code = (str(results.reference), str(results.test)), results.exit_code
+        document = Document(SCHEMA, code, text_reports.sentence(results), *paths, results.renders, counts, entries)
+        write_strict_json(data, msgspec.to_builtins(document))
     if junit:
         cases = [_junit_case(result, results) for result in results.results]
         documents.write_junit(junit, "mi-refract diff", {str(results.test): cases})
-    if data:
-        document = {
-            "schema": SCHEMA,
-            "exit_code": results.exit_code,
-            "sentence": text_reports.sentence(results),
-            "reference": results.reference,
-            "test": results.test,
-            "renders": results.renders,
-            "counts": {str(status): len(results.of(status)) for status in Status},
-            "results": [_json_entry(result, results) for result in results.results],
-        }
-        write_strict_json(data, document)
-    if github:
-        for result in results.results:
-            if result.warning or result.status in FAILED:
-                print(_github_command(result, _outcome(result, results)))
-        if path := os.environ.get("GITHUB_STEP_SUMMARY"):
-            with safe_files.full_disk_names(path), Path(path).open("a", encoding="utf-8") as stream:
-                stream.write(text_reports.markdown(results, report, url))
+
+
+def write_github(results: Results, report: str = "", url: str = "") -> None:
+    """Print a workflow command for each image that is not equal or has a warning, and add to the job's summary.
+
+    `text_reports.markdown` with `report` and `url` is appended to the file that $GITHUB_STEP_SUMMARY names. OSError.
+    """
+    for result in results.results:
+        if result.warning or result.status in FAILED:
+            print(_github_command(result, _outcome(result, results)))
+    if path := os.environ.get("GITHUB_STEP_SUMMARY"):
+        with safe_files.full_disk_names(path), Path(path).open("a", encoding="utf-8") as stream:
+            stream.write(text_reports.markdown(results, report, url))
 
 
 def _outcome(result: Result, results: Results) -> Literal["", "failure", "error", "skipped"]:
@@ -99,38 +168,39 @@ def _junit_case(result: Result, results: Results) -> documents.Case:
     return documents.Case(result.method, result.name, outcome, message, details, kind, metrics)
 
 
-def _json_entry(result: Result, results: Results) -> dict[str, Any]:
+def _json_entry(result: Result, results: Results) -> Entry:
     comparison, how, digests = result.comparison, result.how, None
     if result.digests is not None and result.status in FAILED:  # of what was compared; "" where there is no file
         one, two = (result.digests[path] if path else "" for path in (result.reference, result.test))
-        digests = {"reference": one, "test": two, "variants": [result.digests[path] for path in result.variants]}
-    return {
-        "name": result.name,
-        "status": str(result.status),
-        "category": str(result.category),
-        "reason": result.reason,
-        "warning": result.warning,
-        "error": result.error,
-        "reference": result.reference,
-        "test": result.test,
-        "target": result.target,
-        "digests": digests,
-        "method": result.method,
-        "method_why": comparison.chosen if comparison else "",
-        "options": dict(how.options),
-        "channels": how.channels,
-        "variance": how.variance if how.reads_variance else "",
-        "mask": how.mask,
-        "ignore": how.ignore,
-        "why_so": how.reason,
-        "entries": how.entries,
-        "matched": result.matched,
-        "variants": result.variants,
-        "metrics": [vars(metric) for metric in comparison.metrics] if comparison else [],
-        "minimum_detectable_difference": comparison.minimum_detectable if comparison else math.nan,
-        "reproduce": results.reproduce(result),
-        "accept": results.accept(result),
-    }
+        digests = Digests(one, two, [result.digests[path] for path in result.variants])
+    reference, test, matched = (str(x) if x else None for x in (result.reference, result.test, result.matched))
+    return Entry(
+        name=result.name,
+        status=result.status,
+        category=result.category,
+        reason=result.reason,
+        warning=result.warning,
+        error=result.error,
+        reference=reference,
+        test=test,
+        target=str(result.target),
+        digests=digests,
+        method=result.method,
+        method_why=comparison.chosen if comparison else "",
+        options=dict(how.options),
+        channels=list(how.channels),
+        variance=how.variance if how.reads_variance else "",
+        mask=how.mask,
+        ignore=list(how.ignore),
+        why_so=how.reason,
+        entries=list(how.entries),
+        matched=matched,
+        variants=[str(path) for path in result.variants],
+        metrics=[MeasuredNumber(**vars(metric)) for metric in comparison.metrics] if comparison else [],
+        minimum_detectable_difference=comparison.minimum_detectable if comparison else math.nan,
+        reproduce=results.reproduce(result),
+        accept=results.accept(result),
+    )
 
 
 def _github_command(result: Result, outcome: str) -> str:
@@ -146,39 +216,7 @@ def _escaped(text: object) -> str:
     return printable(text).replace("%", "%25")
 
 
-# What is read of it -------------------------------------------------------------------------------------------------
-
-
-class Digests(msgspec.Struct):
-    """The SHA-256 of the files of an image when they were compared; "" where there was none."""
-
-    reference: Digest
-    test: Digest
-    variants: list[Digest]
-
-
-class Entry(msgspec.Struct):
-    """What is needed of one image."""
-
-    name: str
-    status: Status
-    target: PathText
-    error: str = ""
-    reference: PathText | None = None
-    test: PathText | None = None
-    variants: list[PathText] = []
-    digests: Digests | None = None
-    options: dict[str, Any] = {}
-    variance: str = ""
-
-
-class Document(msgspec.Struct):
-    """What is needed of the file."""
-
-    reference: PathText
-    test: PathText
-    results: list[Entry]
-    renders: bool = False
+# Reading ------------------------------------------------------------------------------------------------------------
 
 
 def read(path: str | Path, reference: Path | None = None, test: Path | None = None) -> Results:

@@ -248,12 +248,12 @@ def _verdict(tests: TileTests, resolution: float, hidden: float) -> tuple[Verdic
     if tests.levels[0].silent.all():
         return Verdict.EQUAL, "no noise, and no tile differs beyond the margin"
     visible, share = tests.minimum_detectable(), tests.hidden_share(resolution)
-    in_some = f"one of {_percent(resolution)} in {_percent(share)} of the tiles"
+    one, in_some = f"one of {_percent(visible)}", f"one of {_percent(resolution)} in {_percent(share)} of the tiles"
     if not visible <= resolution or share > hidden:
-        where = f"one of {_percent(visible)} in the median tile, and {in_some}"
+        where = f"{one} in the median tile" + (f", and {in_some}" if share else "")
         return Verdict.INCONCLUSIVE, f"no difference is seen, but noise hides {where}"
-    where = f"in a tile of median noise, and noise hides {in_some}"
-    return Verdict.EQUAL, f"no difference; one of {_percent(visible)} would have been seen {where}"
+    where = "in a tile of median noise" + (f", and noise hides {in_some}" if share else "")
+    return Verdict.EQUAL, f"no difference; {one} would have been seen {where}"
 
 
 def _percent(share: float) -> str:

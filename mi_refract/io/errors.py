@@ -11,7 +11,6 @@ import contextlib
 import functools
 import io
 import os
-import select
 import sys
 import traceback
 from collections.abc import Callable
@@ -19,7 +18,7 @@ from typing import Any
 
 from .text import printable
 
-MISUSE, INTERRUPTED, UNREAD = 2, 130, 141
+MISUSE, INTERRUPTED = 2, 130
 TRACEBACK = "MI_REFRACT_TRACEBACK"  # environment variable: with "1" the traceback is printed as well
 
 
@@ -61,9 +60,9 @@ def exit_code(
     """What `body()` returns, None as 0; 2 after any exception, and 130 after Ctrl-C or one of `interruptions`.
 
     The exception is one line on stderr, `name: …`. What the body printed is on its way when this returns: a stdout
-    that cannot be written is an exception as well. A pipe that nobody reads any more, as before `| head`, is no error
-    and no verdict: 141, without a line. A standard stream that is closed is replaced by the null device, so that no
-    file of ours takes its number.
+    that cannot be written is an exception as well. A pipe that nobody reads any more, as before `| head`, is none: what
+    is still printed is dropped. A standard stream that is closed is replaced by the null device, so that no file of
+    ours takes its number.
     """
     for number, (stream, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         if getattr(sys, stream) is None:
@@ -76,7 +75,7 @@ def exit_code(
             setattr(sys, stream, open(number, mode, closefd=False))  # noqa: SIM115 (it lasts as long as the process)
     buffer = getattr(sys.stdout, "buffer", None)
     if isinstance(raw := getattr(buffer, "raw", buffer), io.FileIO):
-        setattr(raw, "write", functools.partial(_write_named, type(raw).write, raw))  # noqa: B010 (a method, for mypy)
+        setattr(raw, "write", functools.partial(_write_stdout, type(raw).write, raw))  # noqa: B010 (a method, for mypy)
     for output in (sys.stdout, sys.stderr):  # no character is one that they cannot print
         if hasattr(output, "reconfigure") and output.errors in ("strict", "surrogateescape"):
             output.reconfigure(errors="backslashreplace")
@@ -86,8 +85,6 @@ def exit_code(
     except interruptions:
         return INTERRUPTED
     except SystemExit as ended:
-        if isinstance(ended.__context__, BrokenPipeError):  # rich ends the process with 1, as if that were a verdict
-            return _failed(name, ended.__context__)
         if isinstance(ended.code, int | None):
             return ended.code or 0
         return _failed(name, ValueError(ended.code))
@@ -106,6 +103,8 @@ def describe(error: BaseException) -> str:
         text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     elif isinstance(error, MemoryError):
         text = f"out of memory{f': {error}' if str(error) else ''}"
+    elif isinstance(error, ModuleNotFoundError) and error.name in ("mitsuba", "drjit"):
+        text = f"{error}; only images are compared without it: pip install mi-refract"
     elif isinstance(error, ValueError | OSError | ImportError) and str(error):
         text = str(error)
     else:
@@ -120,26 +119,21 @@ def print_traceback(error: BaseException) -> None:
             traceback.print_exception(error)
 
 
-def _write_named(write: Callable[[Any, Any], int | None], stdout: Any, content: Any) -> int | None:
-    """`write`, whose errors name what could not be written."""
+def _write_stdout(write: Callable[[Any, Any], int | None], stdout: Any, content: Any) -> int | None:
+    """`write`, whose errors name what could not be written; what no reader of a pipe is left for is dropped."""
     try:
         return write(stdout, content)
+    except BrokenPipeError:
+        return len(content)
     except OSError as error:
         error.filename = "stdout"
         raise
 
 
 def _failed(name: str, error: BaseException) -> int:
-    unread = False
     with contextlib.suppress(OSError, ValueError):  # a stderr that cannot be written says nothing
-        if isinstance(error, BrokenPipeError):
-            pipe = select.poll()
-            pipe.register(sys.stdout, 0)
-            unread = bool(pipe.poll(0))  # POLLERR: its reader has gone; else another pipe broke
-    with contextlib.suppress(OSError, ValueError):
         print_traceback(error)
-        if not unread:
-            print(f"{name}: {describe(error)}", file=sys.stderr, flush=True)
+        print(f"{name}: {describe(error)}", file=sys.stderr, flush=True)
     for output in (sys.stdout, sys.stderr):
         try:
             output.flush()
@@ -147,4 +141,4 @@ def _failed(name: str, error: BaseException) -> int:
             # What is left would be tried again when Python ends, and change the exit code to 120.
             with contextlib.suppress(OSError, ValueError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())
-    return UNREAD if unread else MISUSE
+    return MISUSE

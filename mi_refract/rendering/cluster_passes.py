@@ -121,7 +121,7 @@ class _Node:
 
 
 class ClusterPasses:
-    """Renders passes on workers that were accepted. To be closed at the end, which cancels what is still begun."""
+    """Renders passes on workers that are usable. To be closed at the end, which cancels what is still begun."""
 
     def __init__(
         self,
@@ -192,7 +192,7 @@ class ClusterPasses:
         client = self.workers.client
         while True:
             self.workers.look()
-            there = frozenset(self.workers.accepted)
+            there = frozenset(self.workers.usable)
             with cluster_errors(client):
                 # Each worker unpacks the bundle once, first: Dask gives tasks to workers that have it already.
                 self._handed = {address: done for address, done in self._handed.items() if address in there}
@@ -220,7 +220,7 @@ class ClusterPasses:
 
         A node of as many passes as there are workers takes as long as one: of less the client would receive too many.
         """
-        count = max(1, len(self.workers.accepted))
+        count = max(1, len(self.workers.usable))
         least = max(k for k in range(LEVELS + 1) if ARITY**k <= count)
         if not self._pass_seconds:
             return 0, least
@@ -231,7 +231,7 @@ class ClusterPasses:
 
     def _begin(self, first: int, stop: int, last: int) -> None:
         """Begin nodes until each thread has AHEAD tasks; at least the one that is asked for."""
-        most = AHEAD * sum(self.workers.accepted.values())
+        most = AHEAD * sum(self.workers.usable.values())
         while True:
             for node in self._begun:
                 node.tasks[:] = [task for task in node.tasks if not task.done()]  # what is done need not be kept for us
@@ -247,8 +247,8 @@ class ClusterPasses:
             self._begun.append(begun)
 
     def _submitted(self, level: int, first: int, task: int) -> _Node | None:
-        """A node, submitted to the workers that are accepted now; None where there are none."""
-        if not (allowed := frozenset(self.workers.accepted)):
+        """A node, submitted to the workers that are usable now; None where there are none."""
+        if not (allowed := frozenset(self.workers.usable)):
             return None
         (offset, spp), bundle, client = self._series, self._bundle(allowed), self.workers.client
         options: dict[str, Any] = {"retries": RETRIES, "pure": False, "priority": -next(self._count)}

@@ -107,7 +107,7 @@ def _plan(
     if most is None:
         most = FIRST_LANES // pixels if limits.by_error else LANES
     asked = begun or limits.pass_spp
-    return plan_passes(pixels, total, asked, renderer.accepted, moments=renderer.moments, most=most)
+    return plan_passes(pixels, total, asked, renderer.rounded, moments=renderer.moments, most=most)
 
 
 def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> Identity:

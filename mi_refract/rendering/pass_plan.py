@@ -87,14 +87,14 @@ def plan_passes(
     pixels: int,
     total: int | None,
     asked: int | None,
-    accepted: Callable[[int], int],
+    rounded: Callable[[int], int],
     *,
     moments: bool,
     most: int = LANES,
 ) -> PassPlan:
     """The passes of a render.
 
-    `asked`: samples per pixel of a pass, where the user says; `most`: at most, where nobody does. `accepted`: what a
+    `asked`: samples per pixel of a pass, where the user says; `most`: at most, where nobody does. `rounded`: what a
     sampler makes of a number of samples, which it may round up. `moments`: whether second moments within a pass are
     known. Where they are not, a render of few samples is cut into FEW passes, for their spread. ValueError for a pass
     that the sampler does not take.
@@ -102,15 +102,15 @@ def plan_passes(
     spp = asked or usual_spp(pixels, total, most)
     if min(spp, total or spp) * pixels > MASK:
         raise ValueError(f"{spp} samples per pixel in a pass of {pixels} pixels; expected up to 2³² − 1 samples in all")
-    if asked and accepted(asked) != asked:
-        raise ValueError(f"{asked} samples per pixel in a pass; the sampler supports {accepted(asked)}")
+    if asked and rounded(asked) != asked:
+        raise ValueError(f"{asked} samples per pixel in a pass; the sampler supports {rounded(asked)}")
     if total and not asked:
         spp = spp if moments else min(spp, max(1, total // FEW))
-    while spp > 1 and accepted(spp) != spp:
+    while spp > 1 and rounded(spp) != spp:
         spp -= 1
-    spp = accepted(spp)  # which may be more than one: some samplers take no fewer than 4
+    spp = rounded(spp)  # which may be more than one: some samplers take no fewer than 4
     if total and (rest := total % spp):
-        total += accepted(rest) - rest
+        total += rounded(rest) - rest
     return PassPlan(spp, total)
 
 

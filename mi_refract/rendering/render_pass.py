@@ -69,7 +69,7 @@ class PassRenderer:
         """How many of the channels, from the first on, are colours: all, where a film has none of COLOURS."""
         return sum(name in COLOURS for name in self.channels) or len(self.channels)
 
-    def accepted(self, spp: int) -> int:
+    def rounded(self, spp: int) -> int:
         """The samples per pixel that the sampler makes of these: it may round up."""
         sampler = self.scene.sensors()[0].sampler().clone()
         with _quiet():

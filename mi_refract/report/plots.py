@@ -1,4 +1,4 @@
-"""Plots as SVG elements in the colours of the page: curves, histograms, scatter plots."""
+"""Plots as SVG elements in the colours of the page: curves, scatter plots."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ from mi_refract.io.text import compact, printable_lines
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Panel
     from matplotlib.figure import Figure
-
-    from mi_refract.io.image_file import Pixels
 
 Points = Sequence[tuple[float, float]]
 
@@ -111,21 +109,6 @@ def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str, size: tup
         columns = max(1, min(len(names), int(size[0] * 72 // (5 * max(map(len, names)) + 44))))
         figure.set_size_inches(size[0], size[1] + 0.21 * math.ceil(len(names) / columns))
         figure.legend(handles, names, loc="outside lower left", ncols=columns, borderaxespad=0, columnspacing=1.2)
-        return _page_svg(figure)
-
-
-def histogram_svg(values: Sequence[float] | Pixels, x: str, y: str, *, salt: str, bins: int = 20) -> str:
-    """Shares of values from 0 to 1 in equal bins, and a dashed line where all would be the same. "" without values."""
-    if not len(values):
-        return ""
-    import numpy as np
-
-    counts, edges = np.histogram(values, bins, (0, 1))
-    with _figure(salt) as figure:
-        figure.set_size_inches(5.3, 2.4)
-        panel = figure.add_subplot(xlabel=x, ylabel=y, xlim=(0, 1))
-        panel.stairs(counts / len(values), edges, fill=True, color=SERIES[0])
-        panel.axhline(1 / bins, color=MUTED, linewidth=1, linestyle=DASHED)
         return _page_svg(figure)
 
 

@@ -63,9 +63,9 @@ class Node:
                 f"{names} {'is' if one else 'are'} not supported", f"a scene without {'it' if one else 'them'}"
             )
 
-    def error(self, what: str, accepted: str) -> ValueError:
-        """The error that names the file and the plugin, what is wrong, and what would be accepted."""
-        return ValueError(" ".join(f"{self.scene.path}: {self}: {what}; expected {accepted}".split()))
+    def error(self, what: str, expected: str) -> ValueError:
+        """The error that names the file and the plugin, what is wrong, and what was expected."""
+        return ValueError(" ".join(f"{self.scene.path}: {self}: {what}; expected {expected}".split()))
 
     def value(self, kind: type[Kind], name: str, default: Kind | None = None) -> Kind:
         """A number, a text or a truth value. ValueError where it is of another type, missing, or not finite."""

@@ -199,7 +199,7 @@ def test_a_worker_that_differs_is_refused_by_name(client, lie, honest_again, dif
         found = accepted(client, VARIANT, warn=said.append)
     finally:
         client.run(exec, honest_again, workers=[liar])
-    assert (list(found.accepted), list(found.refused), said) == ([honest], [liar], [found.refused[liar]])
+    assert (list(found.usable), list(found.refused), said) == ([honest], [liar], [found.refused[liar]])
     assert said[0].startswith(f"worker {liar}{different}") and "\n" not in said[0]
     assert list(found.machines.values()) == [os.uname().nodename]
 
@@ -222,7 +222,7 @@ def test_a_worker_whose_answer_is_lost_is_asked_again(client, monkeypatch):
         workers_module, "fetched", lambda client, future: fetched(client, future) if lost else lost.append(future) or ()
     )
     found = accepted(client, VARIANT)
-    until(lambda: found.look(at_once=True) or len(found.accepted) == 2)
+    until(lambda: found.look(at_once=True) or len(found.usable) == 2)
     assert lost and not found.refused
 
 
@@ -286,8 +286,8 @@ def test_an_error_of_a_call_is_its_own(workers):
 
 
 def test_who_is_refused_gets_no_call(workers):
-    refused = sorted(workers.accepted)[0]
-    workers.accepted.pop(refused)
+    refused = sorted(workers.usable)[0]
+    workers.usable.pop(refused)
     workers.refused[refused] = "made up"
     own = workers.client.run(os.getpid, workers=[refused])[refused]
     found = list(results(workers, process_of, [(0.1,)] * 6))
@@ -304,7 +304,7 @@ def test_what_is_not_finished_is_cancelled(workers, tmp_path):
 
 def test_a_slow_result_is_waited_for_and_a_lost_one_is_not(workers):
     """Dask itself would wait until somebody has computed a lost one again: nobody does."""
-    client, address = workers.client, sorted(workers.accepted)[0]
+    client, address = workers.client, sorted(workers.usable)[0]
     slow, lost = (client.submit(make, workers=[address], pure=False) for make in (Slow, os.getpid))
     until(lambda: slow.done() and lost.done())
     assert isinstance(fetched(client, slow)[0], Slow)
@@ -322,4 +322,4 @@ def test_calls_of_lost_workers_are_made_again(workers, count):
     for address in victims:
         kill(workers.client, address)
     assert sorted(number for number, _, _ in found) == [1, 2]
-    until(lambda: workers.look(at_once=True) or not {*victims} & {*workers.accepted})
+    until(lambda: workers.look(at_once=True) or not {*victims} & {*workers.usable})

@@ -221,14 +221,20 @@ def test_a_map_is_full_of_colour_where_its_upper_hundredth_is_and_keeps_the_stro
 
 
 @pytest.mark.parametrize(("rows", "kept"), [(1, 1), (512, 512), (513, 257), (1300, 434)])
-def test_a_histogram_is_of_512_rows_at_most(rows, kept, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(html_report, "histogram_svg", lambda values, *words, salt: drawn.append(values) or "")
+def test_a_histogram_is_of_512_rows_at_most(rows, kept):
     p = np.linspace(0, 1, 2 * rows, dtype=np.float32).reshape(rows, 2)
     p[0, 1] = np.nan
     comparison = Comparison("welch", Verdict.DIFFERENT, "", maps={"p": p})
-    html_report.shown_of(Result("x", Status.DIFFERENT, None, None, comparison=comparison), np.inf, np.inf)
-    assert len(drawn[0]) == 2 * kept - 1
+    result = Result("x", Status.DIFFERENT, None, None, comparison=comparison)
+    counts = np.array(html_report.shown_of(result, np.inf, np.inf).histogram) * (2 * kept - 1)
+    assert counts.size == html_report.BINS and counts.sum() == pytest.approx(2 * kept - 1)
+    assert counts == pytest.approx(counts.round(), abs=1e-9)
+
+
+def test_the_bars_of_a_histogram_are_the_shares_of_the_p_values(tmp_path):
+    heights = np.array(re.findall(r'<rect [^>]* height="(.*?)"', written(tmp_path)), float)
+    counts = np.histogram(np.linspace(0, 1, 24, dtype=np.float32), html_report.BINS, (0, 1))[0]
+    assert heights / heights.max() == pytest.approx(counts / counts.max(), abs=1e-3)
 
 
 @pytest.mark.parametrize(

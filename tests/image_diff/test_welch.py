@@ -452,6 +452,7 @@ def test_what_moves_within_a_tile_and_what_was_black_are_told_as_such(rng):
         (64, 0.9, {"family_error": 1e-5}, INCONCLUSIVE, 0.25),  # too dark, hidden by its own noise
         (24, 1.0, {}, EQUAL, 9 / 256),
         (24, 1.0, {"hidden": 0.03}, INCONCLUSIVE, 9 / 256),
+        (0, 1.0, {}, EQUAL, 0),
     ],
 )
 def test_a_noisy_part_is_counted_where_the_median_tile_is_quiet(size, gain, options, verdict, share):
@@ -467,7 +468,8 @@ def test_a_noisy_part_is_counted_where_the_median_tile_is_quiet(size, gain, opti
     assert result.minimum_detectable < 0.01
     assert result.verdict is verdict
     assert metric(result, "share of the tiles whose noise hides a difference of 0.05") == share
-    assert f"of 5 % in {100 * share:.2g} % of the tiles" in result.reason
+    assert (f"of 5 % in {100 * share:.2g} % of the tiles" if share else "in a tile of median noise") in result.reason
+    assert share or "of the tiles" not in result.reason
 
 
 def test_a_tile_with_the_noise_of_one_pixel_is_flagged(rng):

@@ -91,7 +91,7 @@ def test_workers_that_are_killed(client, scene, variant, count, spp):
 
     def watch(render):
         if render.progress.passes >= 3 and not victims:
-            victims.extend(sorted(passes.workers.accepted)[:count])
+            victims.extend(sorted(passes.workers.usable)[:count])
             for address in victims:
                 kill(client, address)
 
@@ -142,7 +142,7 @@ def test_a_worker_that_joins_late_is_used(client, scene, variant, monkeypatch):
     def watch(render):
         assert time.monotonic() < deadline
         busy = (a for a, keys in client.processing().items() if any("render_node" in str(key) for key in keys))
-        if (set(passes.workers.accepted) - before) & set(busy):
+        if (set(passes.workers.usable) - before) & set(busy):
             raise Used
 
     with joined(client), pytest.raises(Used):
@@ -178,8 +178,8 @@ def test_each_call_continues_the_last_one_and_an_offset_changes_the_seeds(client
 
 def test_who_is_refused_gets_no_task(client, scene, variant):
     passes = source(client, scene, variant)
-    honest, liar = sorted(passes.workers.accepted)
-    del passes.workers.accepted[liar]
+    honest, liar = sorted(passes.workers.usable)
+    del passes.workers.usable[liar]
     passes.workers.refused[liar] = "made up"
     passes.workers.machines = {honest: "honest"}  # another one would stand in the header by its address
     found = rendered(scene, 40, passes)
@@ -217,6 +217,6 @@ def test_what_is_wrong_with_the_scene_is_said_as_by_a_local_render(client, scene
     [(None, 2, (0, 0)), (10.0, 2, (0, 0)), (10.0, 16, (0, 1)), (0.3, 2, (1, 1)), (0.01, 2, (2, 3)), (1.0, 200, (0, 3))],
 )
 def test_levels_follow_the_time_of_a_pass(seconds, workers, levels):
-    passes = ClusterPasses(SimpleNamespace(accepted=dict.fromkeys(range(workers), 1)), None, "", 0)
+    passes = ClusterPasses(SimpleNamespace(usable=dict.fromkeys(range(workers), 1)), None, "", 0)
     passes._pass_seconds.extend([] if seconds is None else [seconds] * 5)
     assert passes.levels() == levels

@@ -57,7 +57,7 @@ def findings():
 
 FORMS = {
     "terminal": lambda results, path: said(text_reports.print_results, results),
-    "GitHub": lambda results, path: said(results_file.write, results, github=True).replace("::", ""),
+    "GitHub": lambda results, path: said(results_file.write_github, results).replace("::", ""),
     "Markdown": lambda results, path: text_reports.markdown(results),
     "JUnit": lambda results, path: results_file.write(results, path) or path.read_text(),
     "HTML": lambda results, path: html_report.write(path, results, {NAME: [NAME]}, NAME) or path.read_text(),
