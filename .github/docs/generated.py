@@ -7,8 +7,11 @@ import enum
 import functools
 import importlib
 import inspect
+import operator
 import pkgutil
 import re
+import types
+import typing
 from collections.abc import Iterator
 from types import ModuleType
 from typing import Any
@@ -103,6 +106,15 @@ class Named:
         return self.name if self.name.isidentifier() else "..."
 
 
+def plain_type(annotation: Any) -> Any:
+    """A type without the constraints of `Annotated`."""
+    if hasattr(annotation, "__metadata__"):
+        return plain_type(annotation.__origin__)
+    if isinstance(annotation, types.UnionType) or typing.get_origin(annotation) is typing.Union:
+        return functools.reduce(operator.or_, map(plain_type, typing.get_args(annotation)))
+    return annotation
+
+
 def signature(value: Any) -> str:
     """As it is called; nothing for what is not."""
     from sphinx.util.inspect import stringify_signature
@@ -115,7 +127,7 @@ def signature(value: Any) -> str:
         return ""
     parameters = [
         x.replace(default=Named(x.default)) if repr(x.default)[:1] == "<" and x.default is not x.empty else x
-        for x in found.parameters.values()
+        for x in (y.replace(annotation=plain_type(y.annotation)) for y in found.parameters.values())
         if x.name not in ("self", "cls")
     ]
     returns = inspect.Signature.empty if inspect.isclass(value) else found.return_annotation
