@@ -7,4 +7,4 @@ Each room holds the studies of one name on the command line. `run/` is what all 
 that share no code with the package.
 """
 
-__all__ = ["limits", "readme_tables", "runner", "study"]
+__all__ = ["limits", "runner", "study", "tables"]

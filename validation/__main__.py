@@ -82,7 +82,7 @@ def _command(
     ] = "quick",
     out: Annotated[Path, typer.Option(help="Folder of the report.")] = Path("out"),
     write_tables: Annotated[
-        bool, typer.Option("--write-tables", help="Also write the tables of the READMEs and the gallery.")
+        bool, typer.Option("--write-tables", help="Also write the tables of the documentation and the gallery.")
     ] = False,
     goals: Annotated[bool, typer.Option("--goals", help="Also print the goals for run times.")] = False,
     scheduler: Annotated[
@@ -168,9 +168,9 @@ def _run(
     variant = backend.activate(may_restart=True)
     print(printable(f"validation: {backend.summary()}"), file=sys.stderr)
     if write_tables:  # imported and checked before the run
-        from . import readme_tables
+        from . import tables
 
-        readme_tables.check(names)
+        tables.check(names)
     context = here(profile, out, variant)
     chosen = modules(names, profile)
     studies: list[Study] = [import_module(f"validation.{name}").STUDY for name in chosen]
@@ -196,7 +196,7 @@ def _run(
     run_report.write_junit(out / "junit.xml", rows, described)
     run_report.write_html(out / "report.html", rows, described, out)
     if write_tables:
-        readme_tables.write(rows, context, names)
+        tables.write(rows, context, names)
     runner.forget(context)
     console = Console()
     console.print(run_report.summary(rows, described))

@@ -1,6 +1,7 @@
 """What files say besides their numbers: where two say otherwise, the same numbers do not mean the same.
 
-The table in the README says what is compared, in which format. What is not known to have no meaning is compared.
+What is compared, in which format: "Metadata that are compared" in the documentation. What is not known to have no
+meaning is compared.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ USUAL = {
 }
 SHOWN = 60  # characters of a value
 
-# Patterns of names, which the README lists: by whom, when and how fast a file was made, how its numbers are packed,
+# Patterns of names, which that page lists: by whom, when and how fast a file was made, how its numbers are packed,
 # what OpenImageIO says twice, and what every method requires to be the same.
 WITHOUT_MEANING = """
 Artist Copyright Date DateTime DocumentName Exif:* File GPS:* HostComputer Hostname IPTC:* ImageDescription Make Memory

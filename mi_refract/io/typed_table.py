@@ -121,32 +121,31 @@ def _check_finite(value: Any, path: str, infinite: bool) -> None:
             _check_finite(item, f"{path}[{key}]" if isinstance(value, list) else f"{path}.{key}", infinite)
 
 
-def key_table(title: str, kind: type[msgspec.Struct]) -> str:
-    """A Markdown table of the keys of a struct: name, type with its limits, meaning, default."""
-    rows = [f"| `{name}` | {accepted} | {meaning} |" for name, accepted, meaning in _keys(kind)]
+def key_table(title: str, kind: type[msgspec.Struct], shared: type[msgspec.Struct] = msgspec.Struct) -> str:
+    """A Markdown table of the keys of a struct that `shared` has not: name, type with its limits, meaning, default."""
+    rows = [f"| `{name}` | {accepted} | {meaning} |" for name, accepted, meaning in _keys(kind, shared)]
     return "\n".join([f"| {title} | type | meaning |", "|---|---|---|", *rows])
 
 
 def key_list(title: str, kind: type[msgspec.Struct], shared: type[msgspec.Struct] = msgspec.Struct) -> str:
-    """The same in lines of up to 80 columns, for a terminal, without the keys that `shared` has."""
+    """The same in lines of up to 80 columns, for a terminal."""
     lines = textwrap.wrap(title, 80)
-    for key, accepted, meaning in _keys(kind):
-        if (key, accepted, meaning) not in _keys(shared):
-            lines += textwrap.wrap(f"  {key:14}{meaning} ({accepted})", 80, subsequent_indent=" " * 16)
+    for key, accepted, meaning in _keys(kind, shared):
+        lines += textwrap.wrap(f"  {key:14}{meaning} ({accepted})", 80, subsequent_indent=" " * 16)
     return "\n".join(lines)
 
 
-def _keys(kind: type[msgspec.Struct]) -> list[tuple[str, str, str]]:
-    """Name, type, and meaning with the default, of each key."""
+def _keys(kind: type[msgspec.Struct], shared: type[msgspec.Struct] = msgspec.Struct) -> list[tuple[str, str, str]]:
+    """Name, type, and meaning with the default, of each key that `shared` has not."""
     keys = []
     for field in msgspec.inspect.type_info(kind).fields:  # type: ignore[attr-defined]
         described = isinstance(field.type, msgspec.inspect.Metadata)
         schema = field.type.extra_json_schema or {} if described else {}
         bare = field.type.type if described else field.type
         value = list(field.default) if isinstance(field.default, tuple) else field.default
-        default = "" if field.required or value in (None, "", [], msgspec.NODEFAULT) else f"; default {value!r}"
+        default = "" if value in (None, "", [], msgspec.NODEFAULT, msgspec.UNSET) else f"; default {value!r}"
         keys.append((field.encode_name, _type_text(bare), f"{schema.get('description', '')}{default}"))
-    return keys
+    return [key for key in keys if key not in _keys(shared)]
 
 
 _WORDS = {"Str": "text", "Float": "number", "Int": "whole number", "Bool": "true or false", "Dict": "table"}

@@ -207,16 +207,10 @@ class Medium:
     def index(self, wavelength: Number, coefficients: Coefficients | None = None) -> Number:
         """n at a wavelength.
 
-        Args:
-            wavelength: in nm; float, numpy array of any shape, or Dr.Jit array.
-            coefficients: other values of some of the medium's own, for derivatives.
-
-        Returns:
-            Of the shape of `wavelength`. Dr.Jit arrays: NaN outside `valid` without `hold`, or where n is not a
-            positive number.
-
-        Raises:
-            ValueError: for the same, of floats and numpy arrays. Outside `fitted` and `valid` these give a warning.
+        `wavelength`: in nm; a float, a numpy array of any shape, or a Dr.Jit array; the result has its shape.
+        `coefficients`: other values of some of the medium's own, for derivatives. Outside `valid` without `hold`, or
+        where n is not a positive number: NaN of Dr.Jit arrays, ValueError of floats and numpy arrays; these give a
+        warning outside `fitted`, and outside `valid` with `hold`.
         """
         n = self.index_or_nan(wavelength, coefficients)
         if not dr.is_array_v(wavelength):

@@ -1,6 +1,28 @@
 """What a scene says of a material, as a `Medium`: a number, a formula, a glass of a catalogue, a material's name.
 
-The materials that no catalogue of glass has: air, water, fused silica, diamond; and the ratio of two indices.
+| text | index; λ in nm unless the name says µm |
+|---|---|
+| `1.5` | this number at all wavelengths; as a number or as text |
+| `bk7` | a name in Mitsuba's table: one number for all wavelengths, for `bk7` 1.5046, which N-BK7 has at 1.2 µm |
+| `cauchy(A, B, C, …)` | n = A + B/λ² + C/λ⁴ + …; B in nm², C in nm⁴ |
+| `sellmeier(B1, …, C1, …)` | n² = 1 + Σ B λ²/(λ² − C); first all B, then all C, in nm² |
+| `sellmeier_nm(B1, …, L1, …)` | the same with C = L², L in nm |
+| `table(400: 1.53, 500: 1.52, …)` | linear between these wavelengths |
+| `cauchy_um(…)`, `sellmeier_um(…)`, `table_um(…)` | the same with λ in µm: B in µm², C in µm⁴; Sellmeier's C in µm² |
+| `abbe(n_d, V_d)` | Cauchy's formula with two terms, through n_d and V_d |
+| `517642` | the six-digit code of a glass as text, n_d − 1 and V_d: `abbe(1.517, 64.2)` |
+| `003283` | a code below 300 is that of n_d above 2: `abbe(2.003, 28.3)` |
+| `SCHOTT:N-BK7` | a glass of the catalogues CDGM, Hikari, Hoya, Ohara, Schott, Sumita; spaces do not count |
+| `file:glass.csv`, `file:glass.yml` | a table, or a page of refractiveindex.info (needs the extra `yaml`) |
+| `file:catalogue.agf:GLASS` | a glass of a catalogue for Zemax |
+| `MATERIAL:water` | at 20 °C, Daimon and Masumura 2007, relative to vacuum |
+| `MATERIAL:fused-silica` | at 20 °C, Malitson 1965, relative to air |
+| `MATERIAL:diamond` | Peter 1923 |
+| `AIR:ciddor`, `AIR:edlen` | dry, 15 °C, 101325 Pa; Ciddor 1996, Edlén 1966 |
+| `hold(…)` | around any of these: outside its range the index is that at the range's end |
+
+Numbers in the wrong unit or order are an error that says what was probably meant: `cauchy(1.5046, 0.0042)`,
+`abbe(64.2, 1.517)`, an index above 10.
 """
 
 from __future__ import annotations
@@ -111,20 +133,7 @@ def index(spec: float | str, wavelength: Number) -> Number:
 
 
 def parse(spec: float | str, name: str = "", find: Callable[[str], Path] = Path) -> Medium:
-    """The material that `spec` says, λ in nm:
-
-    - a number, or a name of Mitsuba's table of materials: the same n at all λ
-    - `cauchy(A, B, …)`: n = A + B/λ² + C/λ⁴ + …
-    - `sellmeier(B1, …, C1, …)`: n² = 1 + Σ B λ²/(λ² − C), C in nm²
-    - `sellmeier_nm(B1, …, L1, …)`: the same with C = L², L in nm
-    - `table(400: 1.53, 500: 1.52, …)`: linear between its wavelengths
-    - `cauchy_um(…)`, `sellmeier_um(…)`, `table_um(…)`: the same as without `_um`, λ in µm (and B, C in µm², …)
-    - `abbe(n_d, V_d)`: Cauchy's formula with two terms through both
-    - `517642`, the six-digit code of a glass: `abbe(1.517, 64.2)`
-    - `SCHOTT:N-BK7` and others of the catalogues CDGM, Hikari, Hoya, Ohara, Schott, Sumita
-    - `MATERIAL:water`, `MATERIAL:fused-silica`, `MATERIAL:diamond`, `AIR:ciddor`, `AIR:edlen`
-    - `file:glass.csv`, `file:glass.yml`, `file:catalogue.agf:GLASS`: see `index_files`
-    - `hold(…)` around one of these: outside its range the index is that at the range's end
+    """The material that `spec` says: a number, or a text of the module's table.
 
     ValueError, with `name` (that of the parameter) and what would be accepted, for anything else; for n that is not
     positive, or above 10, at a wavelength from 360 to 830 nm; and for numbers that are not finite.

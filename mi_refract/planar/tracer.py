@@ -10,7 +10,7 @@ Conventions:
   segment, and a ray that comes from the other one of them ends there with MEDIUM_MISMATCH.
 - A ray starts in the medium on the near side of the first boundary it meets, unless `n_start` says otherwise.
 
-Source: document 004, with its slips corrected (mi_refract/formulas/README.md, "Errata of the documents").
+Source: document 004, with its slips corrected ("Errata of the documents" in the documentation).
 """
 
 from __future__ import annotations

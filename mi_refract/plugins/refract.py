@@ -2,31 +2,25 @@
 
 | parameter | type | meaning and default | exposed | differentiable |
 |---|---|---|---|---|
-| `int_ior`, `ext_ior` | number, string | index inside (`bk7`) and outside (`air`), also by name | as `eta` | yes |
-| | dispersive material, spectrum | index by wavelength, see `mi_refract.media` | `int_ior_A`, … | yes |
-| | texture | index by point | texture | yes |
+| `int_ior`, `ext_ior` | number, name | index inside (`bk7`, which is 1.5046) and outside (`air`) | `eta` | yes |
+| | dispersive material | a text of `mi_refract.media`, such as `SCHOTT:N-BK7` | `int_ior_B1`, … | yes |
+| | spectrum | index by wavelength, in spectral variants | `int_ior_n_360`, … | yes |
+| | texture | index by point | yes | yes |
 | `eta` | number | int_ior / ext_ior, only by `mi.traverse` | yes | yes |
-| `specular_reflectance`, `specular_transmittance` | number, texture | tint of the lobe (1) | texture | yes |
-| `int_absorption`, `ext_absorption` | number, spectrum | σ of the medium on that side (0) | spectrum | yes |
-| `int_colour`, `ext_colour` | number, spectrum | what white light keeps after the distance below | spectrum | yes |
-| `int_colour_distance`, `ext_colour_distance` | number | with the former; no default | no | no |
-| `int_absorption_unit`, `ext_…` | number | unit of the scene in metres, for k from a file | no | no |
-| `formula` | string | a key of `FORMULAS`, or `auto` (default) | no | no |
+| `specular_reflectance`, `specular_transmittance` | number, spectrum, texture | tint of the lobe (1) | yes | yes |
+| `int_absorption`, `ext_absorption` | number, spectrum | σ of the medium on that side, per length (0) | yes | yes |
+| | `file:…` | k of a file, with `int_absorption_unit` | yes | yes |
+| `int_absorption_unit`, `ext_absorption_unit` | number | the scene's unit of length in metres; no default | no | no |
+| `int_colour`, `ext_colour` | number, spectrum | instead of σ: what white light keeps after a distance | yes | yes |
+| `int_colour_distance`, `ext_colour_distance` | number | that distance; no default | no | no |
+| `formula` | string | a key of `mi_refract.FORMULAS`, or `auto` (default) | no | no |
 
-A plugin class belongs to one variant: `plugin_class` makes it of the functions below, `register` makes it known. In
-these functions `self.v` is the variant's module and `self.wide` its float64.
+After a distance t in a medium, exp(−σ t) of the light is left; σ = 4πk/λ, and a colour, above 0 and up to 1, is
+exp(−σ t). Absorption is for `refract_path` only. A ratio of indices outside 2⁻²⁰ … 2²⁰ is an error; where an edit of a
+texture makes one, light is lost. `auto` is the fastest formula that is right to the last bit. An edit of `eta` compiles
+nothing. `refract_<formula>` is the same plugin with that formula.
 
-At a dispersive boundary `refract_path` carries N wavelengths (4). Reflected light has one direction and keeps all of
-them. Refracted light has the direction of the first, the hero, and the others end. With R_i the reflectance of
-wavelength i, R̄ their mean (0 for a wavelength without an index) and T the hero's transmittance, a lobe is chosen by
-
-    P = R̄ / (R̄ + T),    1 − P = T / (R̄ + T);    weights R_i / P reflected,  T / (1 − P) = R̄ + T for the refracted hero
-
-so each wavelength has the right mean. No weight exceeds N + 1 reflected, as R_i / P = R_i + R_i T / R̄ and R_i ≤ N R̄,
-nor 2 refracted. (Chosen by the hero's R alone, R_i / R_hero has no bound: R_hero = 0 where the indices are equal.
-Chosen by R̄, a refracted weight reaches N, and N² with the factor below.) Where R_i is the same for all, P = R and the
-weights are 1. What the hero weighs more for the others' having ended, a factor up to N, is the integrator's to multiply
-with (`DISPERSED` in `sampled_type`). For other integrators the index is that of the d line.
+For integrators other than `refract_path`, and in RGB and mono variants, a dispersive index is that of the d line.
 """
 
 from __future__ import annotations
@@ -223,7 +217,22 @@ def ratios(
 def sample(
     self: Refract, ctx: Context, si: Interaction, sample1: Number, sample2: Point2, active: Mask = True
 ) -> tuple[BSDFSample, Spectrum]:
-    """One of the two lobes, by `sample1`; see the module docstring."""
+    """One of the two lobes, by `sample1`.
+
+    At a dispersive boundary `refract_path` carries N wavelengths (4). Reflected light has one direction and keeps all
+    of them. Refracted light has the direction of the first, the hero, and the others end. With R_i the reflectance of
+    wavelength i, R̄ their mean (0 for a wavelength without an index) and T the hero's transmittance, a lobe is chosen
+    by
+
+        P = R̄ / (R̄ + T),    1 − P = T / (R̄ + T)
+
+    with the weights R_i / P reflected and T / (1 − P) = R̄ + T for the refracted hero, so each wavelength has the right
+    mean. No weight exceeds N + 1 reflected, as R_i / P = R_i + R_i T / R̄ and R_i ≤ N R̄, nor 2 refracted. (Chosen by
+    the hero's R alone, R_i / R_hero has no bound: R_hero = 0 where the indices are equal. Chosen by R̄, a refracted
+    weight reaches N, and N² with the factor below.) Where R_i is the same for all, P = R and the weights are 1. What
+    the hero weighs more for the others' having ended, a factor up to N, is the integrator's to multiply with
+    (`DISPERSED` in `sampled_type`).
+    """
     v = self.v
     has_r, has_t = ctx.is_enabled(FLAGS.DeltaReflection, 0), ctx.is_enabled(FLAGS.DeltaTransmission, 1)
     if not (has_r or has_t):
@@ -461,7 +470,10 @@ class UnfollowedLight:
 
 
 def plugin_class(v: Variant) -> type:
-    """The class of the plugin for one variant, given its module (`mitsuba.llvm_ad_rgb`, say)."""
+    """The class of the plugin for one variant, given its module (`mitsuba.llvm_ad_rgb`, say).
+
+    Its methods are the functions above, where `self.v` is that module and `self.wide` its float64.
+    """
 
     def dispersive(self: Refract) -> bool:
         """Whether the direction depends on the wavelength, where `refract_path` samples."""

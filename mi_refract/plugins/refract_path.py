@@ -4,12 +4,20 @@
 |---|---|---|
 | `max_depth`, `rr_depth` | integer | as in `path`: longest path (-1: no limit), start of Russian roulette (5) |
 | `hide_emitters` | boolean | as in `path` (false) |
+| `samples_per_pass`, `block_size` | integer | as in `path` |
+| `timeout` | number | as in `path`: seconds, in scalar variants (-1: no limit) |
 | `split_depth` | integer | both lobes are followed at so many boundaries, counted from the camera (0) |
 | `split_weight` | number | a lobe whose share of the light would be smaller is not followed (0.01) |
-| `deterministic` | boolean | no lobe is chosen by chance; lobes with a smaller share are dropped (false) |
-| `camera_absorption`, `camera_colour`, `camera_colour_distance` | number, spectrum | the medium at the camera (none) |
+| `deterministic` | boolean | no lobe is chosen by chance; lobes with a share below `split_weight` are dropped (false) |
+| `camera_absorption` | number, spectrum | σ of the medium at the camera (0), as `int_absorption` of `refract` |
+| `camera_absorption_unit` | number | as `int_absorption_unit` of `refract` |
+| `camera_colour` | number, spectrum | as `int_colour` of `refract` |
+| `camera_colour_distance` | number | as `int_colour_distance` of `refract` |
 
-With `deterministic` the channel `truncated` holds what was dropped: times the largest radiance it bounds the error.
+No parameter is exposed to `mi.traverse`. Only `refract` and `dielectric` are split, not what is within another BSDF,
+and no sample into more than 4096 paths. With `deterministic`, which is for scenes of smooth dielectrics and conductors
+alone, both lobes are followed up to 64 boundaries deep, and the default of `split_weight` is 0.001; the channel
+`truncated` holds what was dropped: times the largest radiance it bounds the error.
 
 Derivatives are attached: rays move with the index. Edges that move across a pixel, or in the view of a surface that is
 not smooth, are not in them. A render that is differentiated does not split.

@@ -37,10 +37,7 @@ class KeyedMultijitter:
     def __init__(self, v: Variant, sampler: Sampler, count: int) -> None:
         """Draw a point of the sampler as the seed of each pixel.
 
-        Args:
-            v: the variant's module.
-            sampler: seeded, one lane a sample.
-            count: samples of a pixel in this wavefront.
+        `v`: the variant's module. `sampler`: seeded, one lane a sample. `count`: samples of a pixel in this wavefront.
         """
         self.v, lanes = v, sampler.wavefront_size()
         # A symbolic loop cannot read another lane, so there each lane is a pixel of its own.

@@ -97,13 +97,9 @@ class ParsedScene:
     def load(self, allowed: Collection[str] = (), moved: Mapping[str, str] | None = None) -> Scene:
         """The scene itself, in the variant that it was parsed for; once, as Mitsuba takes the state apart.
 
-        Args:
-            allowed: names of plugins that may run beside Mitsuba's and ours.
-            moved: where files are now, by their names in the scene.
-
-        Raises:
-            ValueError: for other plugins, and for files and parameters that would end the process.
-            RuntimeError: of Mitsuba, where it cannot make a plugin.
+        `allowed`: names of plugins that may run beside Mitsuba's and ours. `moved`: where files are now, by their names
+        in the scene. ValueError for other plugins, and for files and parameters that would end the process;
+        RuntimeError of Mitsuba, where it cannot make a plugin.
         """
         path, nodes = self.path, self.state.nodes
         # Where a Python plugin of Mitsuba is not registered in the variant, it looks for a file of that name.
@@ -138,16 +134,10 @@ class ParsedScene:
 def parse(path: Path, defines: Mapping[str, str] | None = None, variant: str = "") -> ParsedScene:
     """Parse a scene file.
 
-    Args:
-        path: the file.
-        defines: values that replace those of `<default>` elements.
-        variant: of Mitsuba; default: the present one.
-
-    Raises:
-        ValueError: for circular references, plugins nested too deeply, and a pipe or a device in place of the
-            scene or of a file that a plugin names; Mitsuba waits for one that is included or read as a spectrum.
-        OSError: for a file that cannot be read.
-        Exception: whatever Mitsuba raises where it cannot parse the file.
+    `defines`: values that replace those of `<default>` elements. `variant`: of Mitsuba; by default the present one.
+    ValueError for circular references, plugins nested too deeply, and a pipe or a device in place of the scene or of a
+    file that a plugin names; Mitsuba waits for one that is included or read as a spectrum. OSError for a file that
+    cannot be read. Whatever Mitsuba raises where it cannot parse the file.
     """
     config = _config(variant)
     require_file(path)

@@ -48,27 +48,34 @@ _AIR = dataclasses.replace(media.parse(1.0), name=AIR, relative_to="air")
 Text = Annotated[str, Meta(min_length=1, max_length=200)]
 MediumName = Annotated[str, Meta(min_length=1, max_length=512)]
 Wavelength = Annotated[float, Meta(gt=0, lt=LARGEST_WAVELENGTH)]
+Wavelengths = Annotated[list[Wavelength], Meta(min_length=1, max_length=MOST_MEDIA)]
 Pairs = Annotated[list[tuple[MediumName, MediumName]], Meta(min_length=2, max_length=2 * MOST_MEDIA)]
+
+
+def _doc(meaning: str) -> Meta:
+    return Meta(description=meaning)
 
 
 class RaysHeader(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The keys of a header. Those of media are all there or none."""
 
-    format: Literal["mi_refract rays 1"]
-    version: Text
-    precision: Literal["f32", "f64"]
-    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)]
-    count: Annotated[int, Meta(ge=1, le=2**63 - 1)]
-    two_sided: bool
-    a: Text
-    n: Text
-    indices: Text = msgspec.field(name="n_from, n_to")
-    answer: Text
-    regimes: dict[Text, tuple[int, int]]  # first and last id
-    checksum: Annotated[str, Meta(pattern="^sha256:[0-9a-f]{64}$")]
-    columns_of_media: MediumName | UnsetType = msgspec.field(name="wavelength, medium", default=UNSET)
-    media: Pairs | UnsetType = UNSET
-    wavelengths: Annotated[list[Wavelength], Meta(min_length=1, max_length=MOST_MEDIA)] | UnsetType = UNSET
+    format: Annotated[Literal["mi_refract rays 1"], _doc("the format, and its version")]
+    version: Annotated[Text, _doc("version of mi_refract that wrote the file")]
+    precision: Annotated[Literal["f32", "f64"], _doc("of all numbers but `id`")]
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1), _doc("of the random rays")]
+    count: Annotated[int, Meta(ge=1, le=2**63 - 1), _doc("rays of each regime")]
+    two_sided: Annotated[bool, _doc("whether normals are on either side of the surface")]
+    a: Annotated[Text, _doc("what `ax, ay, az` are, for readers")]
+    n: Annotated[Text, _doc("what `nx, ny, nz` are, for readers")]
+    indices: Annotated[Text, _doc("what they are, for readers")] = msgspec.field(name="n_from, n_to")
+    answer: Annotated[Text, _doc("the columns of an answer, for readers")]
+    regimes: Annotated[dict[Text, tuple[int, int]], _doc("first and last id of each regime")]
+    checksum: Annotated[str, Meta(pattern="^sha256:[0-9a-f]{64}$"), _doc("of header and rays")]
+    columns_of_media: Annotated[MediumName | UnsetType, _doc("what they are, for readers; of rays with media")] = (
+        msgspec.field(name="wavelength, medium", default=UNSET)
+    )
+    media: Annotated[Pairs | UnsetType, _doc("pairs [from, to] of the column `medium`; of rays with media")] = UNSET
+    wavelengths: Annotated[Wavelengths | UnsetType, _doc("in nm; of rays with media")] = UNSET
 
     def __post_init__(self) -> None:
         """ValueError for some keys of media without the others."""

@@ -1,4 +1,4 @@
-"""`mi-refract-renderer.toml`: a renderer's refraction, how to run it, and what is known of it. See README.md here.
+"""`mi-refract-renderer.toml`: a renderer's refraction, how to run it, and what is known of it. See its how-to page.
 
 Whoever has the folder of such a file can check the renderer: `mi-refract rays run --renderer FOLDER`.
 """

@@ -7,13 +7,12 @@ import re
 import shlex
 import subprocess
 import sys
-from pathlib import Path
 
 import mitsuba as mi
 import pytest
 import typer
 from support.processes import ENVIRONMENT, python
-from support.readme import blocks
+from support.readme import PAGES, READMES, ROOT, blocks
 
 import mi_refract
 from mi_refract import backend, cli
@@ -71,8 +70,6 @@ def commands_of(command, name=""):
 
 
 COMMANDS = commands_of(typer.main.get_command(app.app))
-ROOT = Path(mi_refract.__file__).parents[1]
-READMES = [ROOT / "README.md", *ROOT.glob("mi_refract/*/README.md"), ROOT / "validation/README.md"]
 
 
 @pytest.fixture
@@ -100,12 +97,10 @@ def test_every_help_ends_with_two_or_three_examples_that_are_parsed(name, capfd,
     assert called[0].startswith(f"mi-refract {name}".strip())
 
 
-@pytest.mark.parametrize("path", READMES, ids=lambda path: path.parent.name)
-def test_the_command_lines_of_a_readme_are_parsed(path, parsed):
+@pytest.mark.parametrize("path", [*READMES, *PAGES], ids=lambda path: str(path.relative_to(ROOT)))
+def test_the_command_lines_of_a_page_are_parsed(path, parsed):
     lines = [line for block in blocks(path, "bash") for line in block.replace("\\\n", " ").splitlines()]
-    lines = [line for line in lines if line.startswith("mi-refract ")]
-    assert lines or path.parent.name in ("formulas", "media", "plugins", "validation")
-    for line in lines:
+    for line in (line for line in lines if line.startswith("mi-refract ")):
         parsed(re.sub(r"[>|;&].*|\[[^]]*\]", "", line))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from support.media_rays import CROWN, FLINT
 from support.ray_programs import glsl
-from support.readme import blocks, python_blocks
+from support.readme import DOCS, blocks, python_blocks
 
 from mi_refract.ray_sets import files, ray_set
 
@@ -181,12 +181,12 @@ def test_programs_that_are_right_and_wrong_in_every_report(call, program):
     assert (code, out.splitlines()[-1]) == (2, "no ray was answered")
 
 
-def test_the_readme_shows_what_is_printed_and_the_table_is_printed_when_it_is_wanted(call, program):
+def test_the_page_shows_what_is_printed_and_the_table_is_printed_when_it_is_wanted(call, program):
     """All but the numbers, whose last digits depend on NumPy."""
-    readme = Path(ray_set.__file__).with_name("README.md")
-    Path("my_tracer.py").write_text(python_blocks(readme)[0])
+    page = DOCS / "how-to/check-a-shaders-rays.md"
+    Path("my_tracer.py").write_text(python_blocks(page)[0])
     code, out, _ = call("run", "--", sys.executable, "my_tracer.py")
-    shown, wrong = (re.sub("[0-9.]+", "#", " ".join(text.split())) for text in blocks(readme, "text"))
+    shown, wrong = (re.sub("[0-9.]+", "#", " ".join(text.split())) for text in blocks(page, "text"))
     assert code == 0 and len(out.splitlines()) < 12
     assert re.sub("[0-9.]+", "#", one_line(out.replace(sys.executable, "python"))) == shown
     code, out, _ = call("run", *FEW, "--table", "--", *program, "inverted")

@@ -121,7 +121,7 @@ def test_what_ends_a_render_ends_its_workers_and_leaves_a_checkpoint(render, sce
     np.testing.assert_array_equal(found, read_exr(scene.with_name("local.exr"))[0])
 
 
-# TLS, with a scheduler and a worker that are started as the README says ----------------------------------------------
+# TLS, with a scheduler and a worker that are started as the how-to says ----------------------------------------------
 
 OWN, OTHER = Security.temporary(), Security.temporary()
 MIXED = Security.temporary()

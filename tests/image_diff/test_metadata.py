@@ -1,10 +1,9 @@
-"""What files say besides their numbers: the table of the README, cell by cell, in two files of the same codes."""
+"""What files say besides their numbers: the table of the page, cell by cell, in two files of the same codes."""
 
 from __future__ import annotations
 
 import struct
 import zlib
-from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
@@ -14,13 +13,14 @@ from PIL import ImageCms
 from PIL.TiffImagePlugin import IFDRational
 from support.diff_images import exr_of_integers
 from support.diff_images import tiff as write_tiff
+from support.readme import DOCS
 
 from mi_refract.image_diff import comparison, folders, metadata
 from mi_refract.image_diff.methods import METHODS
 from mi_refract.image_diff.settings import Settings
 from mi_refract.io import image_file
 
-README = Path(metadata.__file__).with_name("README.md").read_text("utf-8")
+PAGE = (DOCS / "reference/image-metadata.md").read_text("utf-8")
 SINGLE = [name for name, method in METHODS.items() if not method.takes_renders]
 CODES = np.random.default_rng(1).integers(0, 256, (8, 8, 3), np.uint8)
 GRAY, FOUR = CODES[..., :1], np.dstack([CODES, CODES[..., :1]])
@@ -159,15 +159,15 @@ CASES = {
 
 
 def table():
-    """What the README says of each cell."""
-    text = README.partition("<!-- begin: metadata -->\n")[2].partition("<!-- end: metadata -->")[0]
+    """What the page says of each cell."""
+    text = PAGE.partition("<!-- begin: metadata -->\n")[2].partition("<!-- end: metadata -->")[0]
     (_, *names), _, *rows = (line.strip("| ").split(" | ") for line in text.splitlines())
     return {(row, name): word for row, *words in rows for name, word in zip(names, words, strict=True) if word != "–"}
 
 
 def test_every_cell_of_the_table_is_tested_and_what_is_ignored_is_listed():
     assert table().keys() == CASES.keys()
-    assert f"```\n{metadata.WITHOUT_MEANING.strip()}\n```" in README
+    assert f"```\n{metadata.WITHOUT_MEANING.strip()}\n```" in PAGE
 
 
 @pytest.mark.parametrize(("row", "name"), CASES, ids=map(" ".join, CASES))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import re
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
 from support.diff_images import found, image
+from support.readme import DOCS, blocks
 
 from mi_refract.image_diff import folders as diff
 from mi_refract.image_diff import methods, settings
@@ -18,7 +18,7 @@ from mi_refract.image_diff.settings import ComparisonSpec, Entry, Settings, from
 from mi_refract.io import image_file
 
 A = '[[image]]\nname = "a"\nreason = "r"\n'
-README = Path(diff.__file__).with_name("README.md")
+PAGES = [DOCS / "how-to" / f"{name}.md" for name in ("set-thresholds-for-single-images", "compare-noisy-renders")]
 RULES = """
 [[image]]
 name = "inner/*"
@@ -137,14 +137,14 @@ def test_skipped_images_and_wrong_entries_that_match_nothing_are_reported(folder
 # The file ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_readme_names_every_method_and_key_and_its_settings_are_accepted(load):
-    text = README.read_text("utf-8")
-    assert all(table in text for table in settings.key_tables().split("\n\n")[:2])
+def test_the_pages_name_every_method_and_their_settings_are_accepted(load):
+    text = (DOCS / "how-to/compare-images.md").read_text("utf-8")
     assert all(f"| `{name}` |" in text for name in methods.METHODS)
+    text = (DOCS / "how-to/coming-from-other-image-diffs.md").read_text("utf-8")
     flags = dict(re.findall(r"^\| `-(\w+)` \| `(\w+)` \|", text, re.MULTILINE))  # of idiff
     assert {flag: name.replace("_", "") for flag, name in flags.items()} == {flag: flag for flag in flags}
     assert set(flags.values()) == methods.METHODS["tolerance"].options.keys()
-    examples = [load(each) for each in re.findall("```toml\n(.*?)```", text, re.DOTALL)]
+    examples = [load(text) for page in PAGES for text in blocks(page, "toml")]
     assert [rule.error for chosen in examples for rule in chosen.rules if rule.error] == []
     assert examples[0].of("glass/caustic1.exr").method == "tolerance"
 

@@ -4,12 +4,11 @@ printed elsewhere, and the one line that a scene gets for anything else."""
 import math
 import re
 import sys
-from pathlib import Path
 
 import drjit as dr
 import numpy as np
 import pytest
-from support.readme import python_blocks
+from support.readme import DOCS, python_blocks
 
 from mi_refract import media
 from mi_refract.media import LINES
@@ -209,8 +208,8 @@ def test_poles_outside_the_visible_end_the_range():
     assert math.isnan(media.parse("cauchy(1, 2000)").index_or_nan(500.0, {"A": -1.0}))
 
 
-def test_the_values_of_the_readme(llvm_variant):
-    (code,) = python_blocks(Path(media.__file__).with_name("README.md"))
+def test_the_values_of_the_page(llvm_variant):
+    (code,) = python_blocks(DOCS / "how-to/dispersion-and-coloured-glass.md")
     exec(code, names := {})
     found = re.findall(r"^(.*\S)  # (1\.\d{5}|\(.*?\))", code, re.MULTILINE)
     assert len(found) == 4

@@ -1,22 +1,22 @@
-"""Scene files: what a file says and cannot say, colours, shapes that touch, the scenes that ship, and the README."""
+"""Scene files: what a file says and cannot say, colours, shapes that touch, the scenes that ship, and their page."""
 
 import math
 import re
 from pathlib import Path
-from typing import get_args
 
 import hypothesis
 import numpy as np
 import pytest
 from hypothesis import strategies
+from support.readme import DOCS, blocks, python_blocks
 
-from mi_refract import media, planar
+from mi_refract import media
 from mi_refract.planar import Event, light, scene_file, trace
 from mi_refract.planar.light import Light, of_wavelengths
 from mi_refract.planar.scene_file import load
 
 SCENES = Path(__file__).parents[2] / "scenes" / "planar"
-README = Path(planar.__file__).with_name("README.md").read_text()
+PAGE = DOCS / "how-to/trace-rays-in-two-dimensions.md"
 ULP = 2.0**-52
 
 
@@ -434,30 +434,19 @@ def test_daylight_has_the_powers_of_cie():
     assert np.array(powers) / powers[1] == pytest.approx([1.17008, 1, 0.800268], rel=2e-5)
 
 
-# The room's README ------------------------------------------------------------------------------------------------
+# The how-to page ---------------------------------------------------------------------------------------------------
 
 
-def test_the_python_of_the_readme_runs_and_its_scene_is_one(read, tmp_path, monkeypatch, capsys):
+def test_the_python_of_the_page_runs_and_its_scene_is_one(read, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scenes").symlink_to(SCENES.parent)
-    python, (toml_text,) = (
-        re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL) for language in ("python", "toml")
-    )
-    for code in python:
+    (toml_text,) = blocks(PAGE, "toml")
+    for code in python_blocks(PAGE):
         exec(code, {})
     assert "escaped" in capsys.readouterr().out
     assert (tmp_path / "doublet.svg").stat().st_size > 1000
     assert len(read(toml_text).origins) == 15
 
 
-def test_every_option_kind_and_event_is_in_the_readme(capfd):
-    pytest.importorskip("typer")
-    from mi_refract.cli import app
-
-    with pytest.raises(SystemExit):
-        app.app(["trace", "--help"], prog_name="mi-refract")
-    options = set(re.findall(r"(--[a-z][a-z-]+)", capfd.readouterr().out)) - {"--help", "--output"}
-    assert len(options) > 8 and all(f"| `{option}" in README or f"`{option}`" in README for option in options)
-    kinds = [*get_args(scene_file.AnyShape), *get_args(scene_file.AnyBeam)]
-    names = [kind.__struct_config__.tag for kind in kinds] + [event.name for event in planar.Event]
-    assert all(f"`{name}`" in README for name in names)
+def test_every_event_is_on_the_page():
+    assert all(f"| `{event.name}` |" in PAGE.read_text("utf-8") for event in Event if event.name != "NONE")

@@ -1,21 +1,18 @@
-"""`import mi_refract` in any order with `set_variant`, what it costs, and the examples of the README as printed.
+"""`import mi_refract` in any order with `set_variant`, what it costs, and the examples of the documentation as printed.
 
 Each case of the import is a fresh interpreter.
 """
 
 import subprocess
 import sys
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.readme import python_blocks
+from support.readme import DOCS, ROOT, python_blocks
 
-from mi_refract import backend, plugins
+from mi_refract import backend
 
-ROOT = Path(__file__).parents[2]
-README = Path(plugins.__file__).with_name("README.md")
 LOAD = "mi.load_dict({'type': 'refract'})"
 SET = "mi.set_variant('scalar_rgb')"
 XML = '<scene version="3.0.0"><shape type="sphere"><bsdf type="refract"/></shape></scene>'
@@ -75,8 +72,8 @@ def test_switching_to_a_vectorised_variant_and_back():
     assert outcome.returncode == 0, outcome.stderr
 
 
-def example(number, path=README, **changes):
-    code = python_blocks(path)[number]
+def example(path, **changes):
+    (code,) = python_blocks(path)
     for old, new in changes.values():
         assert old in code
         code = code.replace(old, new)
@@ -85,10 +82,10 @@ def example(number, path=README, **changes):
     return names
 
 
-def test_the_readme_in_a_scene(tmp_path, monkeypatch, llvm_variant):
+def test_the_plugin_in_a_scene(tmp_path, monkeypatch, llvm_variant):
     monkeypatch.chdir(ROOT)
     example(
-        0,
+        DOCS / "how-to/render-with-the-plugin.md",
         output=('"diamond.png"', f'r"{tmp_path}/diamond.png"'),
         size=('bsdf="refract"', 'bsdf="refract", res=8, spp=1'),
         wait=("mi.render(scene)", "mi.render(scene), write_async=False"),
@@ -99,13 +96,14 @@ def test_the_readme_in_a_scene(tmp_path, monkeypatch, llvm_variant):
 def test_the_smallest_scene_of_the_first_page(tmp_path, monkeypatch, llvm_variant):
     monkeypatch.chdir(tmp_path)
     size = ('"width": 400, "height": 300', '"width": 8, "height": 6')
-    example(0, ROOT / "README.md", size=size, wait=("spp=64)", "spp=4), write_async=False"))
+    example(ROOT / "README.md", size=size, wait=("spp=64)", "spp=4), write_async=False"))
     image = np.array(mi.Bitmap(str(tmp_path / "ball.png")))
     assert image.shape == (6, 8, 3) and image[0, 0].min() == 255 > image[3, 0].max()  # the sky, and the floor
 
 
-def test_the_readme_recovers_an_index_from_an_image(capsys, llvm_variant):
-    names = example(1, pixels=('"width": 64, "height": 64', '"width": 24, "height": 24'), steps=("60", "50"))
+def test_an_index_is_recovered_from_an_image(capsys, llvm_variant):
+    page = DOCS / "how-to/recover-an-index-from-an-image.md"
+    names = example(page, pixels=('"width": 64, "height": 64', '"width": 24, "height": 24'), steps=("60", "50"))
     (eta,) = names["adam"]["ball.bsdf.eta"]
     assert eta == pytest.approx(1.6, abs=0.05)
     assert capsys.readouterr().out.startswith("[1.")

@@ -13,7 +13,6 @@ import sys
 import time
 import tracemalloc
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ from rich.console import Console
 from support.media_rays import ALL, CROWN, FLINT, MEDIA, WATER, WAVELENGTHS
 from support.processes import ENVIRONMENT
 from support.ray_programs import BAD
-from support.readme import python_blocks
+from support.readme import DOCS, python_blocks
 
 from mi_refract import media, regimes
 from mi_refract.numerics import float_expansions
@@ -31,7 +30,7 @@ from mi_refract.ray_sets import check_answers, files, header, ray_set, reports
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.regimes import Rays
 
-README = Path(ray_set.__file__).with_name("README.md").read_text()
+PAGE = DOCS / "how-to/check-a-shaders-rays.md"
 FORMATS = list(itertools.product(ray_set.PRECISIONS, ("csv", "npz")))
 SMALL = {"names": ("generic", "k ≪ 1", "k ≫ 1", "denormal"), "count": 300, "seed": 5}
 AIR = dataclasses.replace(media.parse(1.0), relative_to="air")
@@ -62,12 +61,14 @@ def test_the_rays_are_the_regimes_own_and_normals_face_them():
         np.testing.assert_array_equal(facing.a, either.a)
 
 
-def test_the_program_in_the_readme_is_right_and_its_table_has_every_mistake(tmp_path):
-    (tmp_path / "my_tracer.py").write_text(python_blocks(Path(ray_set.__file__).with_name("README.md"))[0])
+def test_the_program_on_the_page_is_right_and_its_table_has_every_mistake(tmp_path):
+    (tmp_path / "my_tracer.py").write_text(python_blocks(PAGE)[0])
     rays = ray_set.make(count=50)
     answers = files.answers_of([sys.executable, str(tmp_path / "my_tracer.py")], rays)
     assert check_answers.check(rays, answers).exit_code == 0
-    assert all(f"| {mistake} |" in README for mistake in [*BAD, "f32 where f64 was claimed", "too few digits"])
+    assert all(
+        f"| {mistake} |" in PAGE.read_text("utf-8") for mistake in [*BAD, "f32 where f64 was claimed", "too few digits"]
+    )
 
 
 @pytest.mark.parametrize("precision, ending", FORMATS)

@@ -4,15 +4,13 @@ import json
 import re
 import shutil
 import sys
-from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-from support.readme import python_blocks
+from support.readme import DOCS, blocks, python_blocks
 
-from mi_refract.ray_sets import ray_set, renderer_file
+from mi_refract.ray_sets import renderer_file
 
-README = Path(ray_set.__file__).with_name("README.md")
 RAYS = '[[rays]]\ntitle = "r"\nprecision = "f32"\ncommand = ["./r"]\n'
 TITLED = f'title = "T"\n{RAYS}'
 
@@ -29,20 +27,17 @@ def folder(tmp_path):
     return made
 
 
-def test_the_readme_s_program_is_compiled_and_right(folder, run):
-    def code(language):
-        section = README.read_text().split("## A renderer in a folder")[1]
-        return section.split(f"```{language}\n")[1].split("```")[0]
-
-    assert renderer_file.reference() in README.read_text() and len(code("c").splitlines()) <= 20
+def test_the_page_s_program_is_compiled_and_right(folder, run):
+    (program,), (text,) = (blocks(DOCS / "how-to/describe-a-renderer.md", language) for language in ("c", "toml"))
+    assert len(program.splitlines()) <= 20
     if not shutil.which("cc"):
         pytest.skip("no C compiler in PATH")
-    where = folder(code("toml"))
-    (where / "tracer.c").write_text(code("c"))
+    where = folder(text)
+    (where / "tracer.c").write_text(program)
     status, out, err = run("rays", "run", "--renderer", where, "--regime", "generic", "--regime", "critical")
     assert (status, err) == (0, "")
     assert "My tracer, in C: 2000 rays, 2 regimes, f64" in out and "2000 answers, all right" in out
-    (where / "tracer.c").write_text(code("c").replace("from / to", "to / from"))
+    (where / "tracer.c").write_text(program.replace("from / to", "to / from"))
     status, out, _ = run("rays", "run", "--renderer", where, "--regime", "generic")
     assert status == 1 and "eta inverted" in out
 
@@ -106,7 +101,7 @@ def test_a_file_that_is_none_is_refused_in_a_line(folder, said):
     assert text.startswith(f"{where / renderer_file.NAME}: ") and said in text and "\n" not in text
 
 
-PROGRAM = python_blocks(README)[0]
+PROGRAM = python_blocks(DOCS / "how-to/check-a-shaders-rays.md")[0]
 INVERTED = PROGRAM.replace("rows[:, 7:8] / rows[:, 8:9]", "rows[:, 8:9] / rows[:, 7:8]")
 
 

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.processes import python
-from support.readme import python_blocks
+from support.readme import DOCS, python_blocks
 from support.renders import BALL, SCENES, pixels, rendering
 
 from mi_refract.cluster import on_worker
@@ -66,8 +66,8 @@ def same_as_fresh(output, scene=BALL, **limits):
 # The image and its header -------------------------------------------------------------------------------------------
 
 
-def test_the_header_of_the_readmes_example_renders_the_same_image_again(tmp_path, monkeypatch):
-    *_, code = python_blocks(Path(long_render.__file__).with_name("README.md"))
+def test_the_header_of_the_pages_example_renders_the_same_image_again(tmp_path, monkeypatch):
+    (code,) = python_blocks(DOCS / "how-to/render-for-hours.md")
     monkeypatch.chdir(SCENES.parent)
     for old, new in {'"nested.exr"': f'r"{tmp_path}/a.exr"', "spp=256": "spp=2", '{"': '{"res": "8", "'}.items():
         assert old in code

@@ -116,15 +116,15 @@ CHANGES = {
 }
 
 
-# What README.md says that `flip` does not see: single pixels, most lines that move by a pixel, faint changes; and of
-# what is a few pixels wide, changes of less than two thirds of white.
+# What the documentation says that `flip` does not see: single pixels, most lines that move by a pixel, faint changes;
+# and of what is a few pixels wide, changes of less than two thirds of white.
 FAINT = ("0.5 % brighter", "a dead pixel", "a firefly", "shifted by a pixel")
 SMALL, SEEN_OF_SMALL = ("one line", "border", "single pixels", "a lamp on black"), ("inverted", "gray instead of black")
 MOVES = ("shuffled", "shifted by a pixel", "mirrored")
 
 
 def sees(method, name, change, a, b):
-    """Whether README.md says that a method sees the change of a picture, from pixels `a` to `b`."""
+    """Whether the documentation says that a method sees the change of a picture, from pixels `a` to `b`."""
     if method == "flip":
         return change not in FAINT and (name not in SMALL or change in SEEN_OF_SMALL)
     if method == "welch":  # light that moves between fewer than some 30 pixels

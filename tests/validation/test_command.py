@@ -1,4 +1,4 @@
-"""The command of the validation: it resumes, refuses misuse in one line, and writes the tables of the READMEs."""
+"""The command of the validation: it resumes, refuses misuse in one line, and writes the tables of the documentation."""
 
 import dataclasses
 import functools
@@ -19,7 +19,7 @@ from mi_refract.image_diff import self_test
 from mi_refract.image_diff.methods import METHODS
 from mi_refract.report.row import Row
 from validation import __main__ as command
-from validation import readme_tables, runner
+from validation import runner, tables
 from validation.diff import planted_defects, visible_changes
 from validation.run import render_methods
 from validation.run.context import SCENES, beyond_builtin, here
@@ -207,7 +207,7 @@ def test_misuse_is_one_line_and_exit_code_2(arguments, words, capsys, tmp_path):
     assert words in printed and len(printed.splitlines()) == 1
 
 
-# The README ----------------------------------------------------------------------------------------------------------
+# The documentation ----------------------------------------------------------------------------------------------------
 
 
 def test_the_accuracy_table_holds_the_rows_and_nothing_else():
@@ -216,7 +216,7 @@ def test_the_accuracy_table_holds_the_rows_and_nothing_else():
     rows = [row(setting="llvm float32", values=values | {"TIR misclassified": 3.0}, replay={"rays": 28000})]
     rows.append(row(setting="llvm float64", values=values, replay={"rays": 28000}))
     floor = [dataclasses.replace(r, subject="copy", values={"time / copy": 1.0}, replay={}) for r in rows]
-    lines = readme_tables.accuracy([*rows, *floor]).splitlines()
+    lines = tables.accuracy([*rows, *floor]).splitlines()
     assert len(lines) == 6
     single = ["4.97e-8", "0.834", "3", "1.01 (0.98–1.2)", "1.05"]
     expected = ["`promoted`", "this project", *single, "4.97e-8", "0.834", "1.01 (0.98–1.2)"]
@@ -224,7 +224,7 @@ def test_the_accuracy_table_holds_the_rows_and_nothing_else():
     values |= {"TIR misclassified": 1469.0}  # without a budget
     of = {"case": "on a denormal", "values": values, "budgets": {}, "replay": {"count": 4000}}
     denormal = [dataclasses.replace(r, **of) for r in rows]
-    lines = readme_tables.accuracy([*rows, *denormal]).splitlines()
+    lines = tables.accuracy([*rows, *denormal]).splitlines()
     assert len(lines) == 7 and "in 17 of the 18 regimes" in lines[0] and "1469 of 4000" in lines[-1]
     assert lines[-1].startswith("| every one, `on a denormal` | denormal numbers are taken for 0 |")
 
@@ -243,18 +243,17 @@ NAMED = {
 }
 
 
-@pytest.mark.parametrize("marker", readme_tables.TABLES)
-def test_a_readme_holds_its_table_which_is_not_written_from_a_run_that_measured_too_little(marker):
-    table = readme_tables.TABLES[marker]
+@pytest.mark.parametrize("marker", tables.TABLES)
+def test_a_page_holds_its_table_which_is_not_written_from_a_run_that_measured_too_little(marker):
+    table = tables.TABLES[marker]
     assert table.study in command.ROOMS
-    readme_tables.check([table.study])
-    text = (readme_tables.ROOT / table.path).read_text()
+    tables.check([table.study])
+    text = (tables.ROOT / table.path).read_text()
     written = text.partition(f"<!-- begin: {marker} -->")[2].partition(f"<!-- end: {marker} -->")[0]
     assert [word for word in NAMED[marker] if word not in written] == []
     images = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)
-    assert all(((readme_tables.ROOT / table.path).parent / name).is_file() for name in images)
-    with pytest.raises(ValueError, match=r"README: no .*"):
+    assert all(((tables.ROOT / table.path).parent / name).is_file() for name in images)
+    with pytest.raises(ValueError, match=r"documentation: no .*"):
         table.make([row(values={}, reason="not run")])
-    assert len((readme_tables.ROOT / "README.md").read_text().splitlines()) <= 120  # the first page
-    assert (marker in readme_tables.chosen([])) == (marker != "suite")
-    assert marker in readme_tables.chosen([table.study])
+    assert (marker in tables.chosen([])) == (marker != "suite")
+    assert marker in tables.chosen([table.study])

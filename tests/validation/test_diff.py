@@ -13,7 +13,7 @@ import pytest
 from mi_refract.image_diff import flip, folders, self_test, tile_statistics
 from mi_refract.image_diff.methods import METHODS
 from mi_refract.image_diff.settings import Settings
-from validation import limits, readme_tables
+from validation import limits, tables
 from validation.diff import planted_defects, times, visible_changes, welch_nulls
 
 
@@ -77,7 +77,7 @@ def test_what_nobody_sees_is_equal_and_what_a_person_sees_is_different():
     assert np.isnan(codes[0]) and codes[-1] < 12
     assert (np.diff(codes[~np.isnan(codes)]) <= 0).all()  # the wider, the fainter
     assert 1 < limit_rows[-1].values[visible_changes.PIXELS] <= 2
-    text = readme_tables.visible([*rows.values(), *limit_rows])
+    text = tables.visible([*rows.values(), *limit_rows])
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
     assert [line[0] for line in lines[2 : 2 + len(rows)]] == list(rows)
     assert (lines[2][2], lines[2][-1], lines[-1][:2]) == ("not seen", "0.0%", ["codes of 255", "never"])
@@ -87,7 +87,7 @@ def test_what_nobody_sees_is_equal_and_what_a_person_sees_is_different():
 def test_the_table_of_defects_is_made_of_the_rows_of_the_self_test():
     rng = np.random.default_rng(1)
     rows = self_test.examine(rng.gamma(16, 1 / 16, (4, 16, 16, 3)), "noise", trials=1, null_pairs=2)
-    lines = readme_tables.seen(rows).splitlines()
+    lines = tables.seen(rows).splitlines()
     assert lines[0].startswith("noise; 1 trials each of 2 renders a side. Minimum detectable difference in a tile: ")
     assert [line.split("|")[1].strip() for line in lines[4:-1]] == list(self_test.DEFECTS)
     assert lines[-2].count("not read") == len(METHODS)

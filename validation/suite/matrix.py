@@ -89,7 +89,7 @@ def with_summary(rows: list[Row]) -> list[Row]:
 
 
 def table(rows: list[Row]) -> tuple[str, list[str], list[list[str]]]:
-    """The matrix as the table of a README: the text above it, its head, and its lines.
+    """The matrix as a table of the documentation: the text above it, its head, and its lines.
 
     ValueError where no system was run.
     """
@@ -98,7 +98,7 @@ def table(rows: list[Row]) -> tuple[str, list[str], list[list[str]]]:
         if row.study == NAME:
             systems.setdefault(row.subject, {})[row.case] = row
     if not any(row.values for cells in systems.values() for row in cells.values()):
-        raise ValueError("README: no other renderer was run; its table needs at least one")
+        raise ValueError("documentation: no other renderer was run; its table needs at least one")
     checks = [check for names in CHECKS.values() for check in names]
     lines = [[system, *(_text(cells.get(check)) for check in checks)] for system, cells in systems.items()]
     return TEXT, ["", *checks], lines

@@ -1,4 +1,4 @@
-"""The tables of the READMEs and the image gallery, all made from the rows of one run.
+"""The tables of the documentation and the image gallery, all made from the rows of one run.
 
 Rows are selected by the studies' own constants for names of studies and metrics: a renamed label is an error when this
 module is imported, not after the run.
@@ -38,6 +38,7 @@ from validation.suite import matrix
 
 ROOT = SCENES.parent
 GALLERY = SCENES / "gallery.png"
+PAGES = ".github/docs/explanation"
 
 
 class Table(NamedTuple):
@@ -86,7 +87,7 @@ def _measured(rows: list[Row], study: str, needs: Iterable[str] = (), subject: s
 def _table(text: str, heading: Iterable[str], lines: list[list[str]], missing: str) -> str:
     """Markdown: a line of text, and a table. ValueError where it has no lines: `missing` says what was not measured."""
     if not lines:
-        raise ValueError(f"README: no {missing}; its table needs them")
+        raise ValueError(f"documentation: no {missing}; its table needs them")
     heading = [*heading]
     first, *others = (f"| {' | '.join(cells)} |" for cells in (heading, *lines))
     return "\n".join([text, "", first, "|---" * len(heading) + "|", *others])
@@ -312,15 +313,17 @@ def visible(rows: list[Row]) -> str:
 
 TABLES = {
     "accuracy": Table("README.md", "directions", accuracy),
-    "renders": Table("validation/README.md", "renders", renders),
-    "paths": Table("validation/README.md", "stability", paths),
-    "efficiency": Table("mi_refract/plugins/README.md", "efficiency", efficiency),
-    "changing": Table("mi_refract/plugins/README.md", "efficiency", changing),
-    "planar": Table("mi_refract/planar/README.md", "planar", planar),
-    "defects": Table("mi_refract/image_diff/README.md", "diff", seen),
-    "visible": Table("mi_refract/image_diff/README.md", "diff", visible),
+    "renders": Table(f"{PAGES}/refract-and-dielectric.md", "renders", renders),
+    "paths": Table(f"{PAGES}/refract-and-dielectric.md", "stability", paths),
+    "efficiency": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency", efficiency),
+    "changing": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency", changing),
+    "planar": Table(f"{PAGES}/how-accurate-planar-paths-are.md", "planar", planar),
+    "defects": Table(f"{PAGES}/what-image-methods-detect.md", "diff", seen),
+    "visible": Table(f"{PAGES}/how-tolerance-and-flip-decide.md", "diff", visible),
     "suite": Table(
-        "validation/README.md", "suite", lambda rows: _table(*matrix.table(rows), "other renderers were run")
+        f"{PAGES}/what-the-validation-shows.md",
+        "suite",
+        lambda rows: _table(*matrix.table(rows), "other renderers were run"),
     ),
 }
 
