@@ -106,9 +106,9 @@ def flip(
             said, window = f"at least {changed.error:.0f} codes brighter or darker", changed
         x, y = window.x + reference.origin[0], window.y + reference.origin[1]
         reason += f"; {said} in {window.width} × {window.height} pixels from x = {x}, y = {y}"
-    for metric, name in zip(metrics[-2:], ("mean", "percentile_99"), strict=True):
+    for metric, name, most in zip(metrics[-2:], ("mean", "percentile_99"), (mean, percentile_99), strict=True):
         if not metric.holds:
-            value, bound = distinguishable(metric.value, metric.bound)
+            value, bound = distinguishable(metric.value, most)
             reason = f"{metric.name} {value} > {name} = {bound}; {reason}"
     return Comparison("flip", verdict_of(metrics), reason, metrics, maps={"flip": error, "local": around})
 

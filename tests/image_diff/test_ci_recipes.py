@@ -1,4 +1,4 @@
-"""The action for GitHub, and the README's recipes for GitHub, GitLab and CTest: run as they are printed."""
+"""The action for GitHub, and the recipes of the page for GitHub, GitLab and CTest: run as they are printed."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ from support.diff_images import image
 from support.processes import ENVIRONMENT
 from support.readme import blocks
 
-from mi_refract import image_diff
-
 ROOT = Path(__file__).parents[2]
 ACTION = ROOT / ".github" / "actions" / "diff"
-README = Path(image_diff.__file__).with_name("README.md")
+PAGE = ROOT / ".github" / "docs" / "how-to" / "compare-images-in-ci.md"
+LIST = str((ACTION / "requirements.txt").relative_to(ROOT))
 FILES = ["diff.json", "junit.xml", "report.html"]
 BASH = ["bash", "--noprofile", "--norc", "-e", "-o", "pipefail"]  # what `shell: bash` is on a runner
 
@@ -110,7 +109,7 @@ def environment(programs):
 def project(tmp_path):
     """A repository: references, and a program that renders an image that is equal, and one with another gain."""
     folder = tmp_path / "project"
-    for name in ("equal.exr", "inner/other.exr"):
+    for name in ("ball.exr", "inner/other.exr"):
         image(folder / "references" / name)
     set_gain(folder, 1.0)
     return folder
@@ -119,7 +118,7 @@ def project(tmp_path):
 def set_gain(project, gain):
     """What `render_all` will render."""
     rendered = project.parent / "rendered"
-    for name, factor in (("equal.exr", 1.0), ("inner/other.exr", gain)):
+    for name, factor in (("ball.exr", 1.0), ("inner/other.exr", gain)):
         image(rendered / name, gain=factor)
     program(project / "render_all", f'#!/bin/bash\nmkdir -p "$1" && cp -r "{rendered}"/* "$1"\n')
 
@@ -178,16 +177,21 @@ def test_the_verdict_the_report_and_the_new_images_of_a_job(act, project, progra
     assert words[-4:] == ["--no-deps", "-r", str(ACTION / "requirements.txt"), f"{ACTION}/../../.."]
 
 
-def test_new_images_of_an_artifact_are_accepted_as_the_readme_says_and_a_bad_one_is_an_error(act, project, environment):
+def test_the_way_of_the_page_from_a_first_folder_to_accepted_images(act, project, programs, environment):
+    """And an image that cannot be read is an error."""
+    install, make, accept = blocks(PAGE, "bash")
+    shutil.rmtree(project / "references")
+    assert call([*BASH, "-c", install + make], project, environment)[0] == 0
+    *_, address, package = (programs / "installed").read_text().split()
+    assert address.endswith(f"/{LIST}") and package == "mi-refract"
+    assert act().code == 0
     folder = act(1.1).folder
-    (command,) = re.findall(r"`(mi-refract accept .*?)`", README.read_text("utf-8").partition("## In CI")[2])
-    words = command.replace("ARTIFACT", str(folder)).split()
-    assert call([*words, "--yes"], project, environment)[0] == 0
+    assert call([*accept.replace("ARTIFACT", str(folder)).split(), "--yes"], project, environment)[0] == 0
     assert act(1.1).code == 0
-    (project / "references" / "equal.exr").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
+    (project / "references" / "ball.exr").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
     job = act(1.1)
     assert (job.code, job.outputs["verdict"]) == (2, "error")
-    assert job.artifacts["mi-refract-diff"] == sorted([*FILES, "new/equal.exr"])
+    assert job.artifacts["mi-refract-diff"] == sorted([*FILES, "new/ball.exr"])
     assert "a Git LFS pointer, not the image; run `git lfs pull`" in job.annotations[0]
 
 
@@ -212,7 +216,7 @@ def test_names_that_github_refuses_and_hostile_ones_are_left_out(tmp_path, capsy
     names = ["b.exr", "in/c.exr", 'quoted".exr', "../../out.exr", "gone.exr"]
     paths = {name: str(tmp_path / "a.exr") for name in names} | {"gone.exr": str(tmp_path / "gone")}
     results = [{"name": name, "status": "different", "test": path} for name, path in paths.items()]
-    results += [{"name": "equal.exr", "status": "equal", "test": paths["b.exr"]}]
+    results += [{"name": "ball.exr", "status": "equal", "test": paths["b.exr"]}]
     results += [{"name": "removed.exr", "status": "different", "test": None}]
     (tmp_path / "diff.json").write_text(json.dumps({"results": results}))
     files["main"](str(tmp_path / "diff.json"), str(new))
@@ -221,7 +225,7 @@ def test_names_that_github_refuses_and_hostile_ones_are_left_out(tmp_path, capsy
     assert [line.split(": left out")[0] for line in lines] == [f"new_images.py: {name!r}" for name in names[2:]]
 
 
-def test_the_action_is_one_that_a_runner_can_trust_and_the_readme_names_its_inputs_and_outputs():
+def test_the_action_is_one_that_a_runner_can_trust_and_the_page_names_its_inputs_and_outputs():
     """Other actions have a version, no expression stands in a script, and every step names its shell."""
     text = (ACTION / "action.yml").read_text("utf-8")
     action = read_yaml(text)
@@ -233,12 +237,11 @@ def test_the_action_is_one_that_a_runner_can_trust_and_the_readme_names_its_inpu
     for kind, name in expressions:
         assert name in {"inputs": action["inputs"], "steps": steps}[kind]
     assert {name for kind, name in expressions if kind == "inputs"} == set(action["inputs"])
-    section = README.read_text("utf-8").partition("## In CI")[2].partition("\n## ")[0]
-    assert not [name for name in (*action["inputs"], *action["outputs"]) if f"`{name}`" not in section]
+    assert not [name for name in (*action["inputs"], *action["outputs"]) if f"`{name}`" not in PAGE.read_text("utf-8")]
 
 
-def test_the_workflow_of_the_readme_and_the_job_of_this_project(act, environment, tmp_path):
-    steps = read_yaml(blocks(README, "yaml")[0])["jobs"]["images"]["steps"]
+def test_the_workflow_of_the_page_and_the_job_of_this_project(act, environment, tmp_path):
+    steps = read_yaml(blocks(PAGE, "yaml")[0])["jobs"]["images"]["steps"]
     assert [step for step in steps if "run" in step] == [{"run": "./render_all new/"}]
     last = steps[-1]
     assert re.fullmatch(r"OWNER/mi_refract/(.*)@\w+", last["uses"])[1] == str(ACTION.relative_to(ROOT))
@@ -257,12 +260,12 @@ def test_the_workflow_of_the_readme_and_the_job_of_this_project(act, environment
 
 
 @pytest.mark.parametrize(("gain", "code"), [(1.0, 0), (1.1, 1), (np.nan, 1)])
-def test_the_gitlab_job_of_the_readme(project, environment, programs, gain, code):
-    job = read_yaml(blocks(README, "yaml")[1])["images"]
+def test_the_gitlab_job_of_the_page(project, environment, programs, gain, code):
+    job = read_yaml(blocks(PAGE, "yaml")[1])["images"]
     set_gain(project, gain)
     returned, _, err = call([*BASH, "-c", "\n".join(job["script"])], project, environment)
     assert (returned, err) == (code, "")
-    assert (programs / "installed").read_text() == "install\nmi-refract[diff]\n"
+    assert (programs / "installed").read_text().split()[-2].endswith(f"/{LIST}")
     kept = [*job["artifacts"]["paths"], job["artifacts"]["reports"]["junit"]]
     assert job["artifacts"]["when"] == "always"
     assert all((project / path).exists() for path in kept)
@@ -274,8 +277,8 @@ def test_the_gitlab_job_of_the_readme(project, environment, programs, gain, code
 @pytest.mark.parametrize(
     ("render", "failed"), [(1.0, []), (1.1, ["images"]), (None, ["render", "images"])], ids=["equal", "louder", "none"]
 )
-def test_the_ctest_of_the_readme(project, environment, tmp_path, render, failed):
-    (text,) = blocks(README, "cmake")
+def test_the_ctest_of_the_page(project, environment, tmp_path, render, failed):
+    (text,) = blocks(PAGE, "cmake")
     (project / "CMakeLists.txt").write_text(
         f"cmake_minimum_required(VERSION 3.18)\nproject(p NONE)\nenable_testing()\n{text}"
     )
