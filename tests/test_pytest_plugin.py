@@ -1,10 +1,12 @@
 """The fixtures for pytest: here, and in a run of pytest of their own."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from support.processes import python
+from support.readme import DOCS, python_blocks
 
 from mi_refract.image_diff.html_report import Page
 from mi_refract.io import image_file
@@ -29,6 +31,17 @@ def test_what_is_equal_passes(assert_image_equal, assert_image_unbiased, tmp_pat
     for i in range(8):
         image_file.write_exr(tmp_path / "renders" / f"{i}.exr", render(100 + i))
     assert_image_unbiased(render, tmp_path / "renders", runs=6)
+
+
+def test_the_test_of_the_page_passes(assert_image_equal, assert_image_unbiased, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, image in {"out/ball": IMAGE, "references/ball": IMAGE + 1e-3, "references/ball/a": render(100)}.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        image_file.write_exr(tmp_path / f"{name}.exr", image)
+    image_file.write_exr(tmp_path / "references/ball/b.exr", render(101))
+    (code,) = python_blocks(DOCS / "how-to/compare-images-in-pytest.md")
+    exec(code, names := {"mi": SimpleNamespace(render=lambda scene, seed: render(seed)), "scene": None})
+    names["test_ball"](assert_image_equal, assert_image_unbiased)
 
 
 @pytest.mark.parametrize(
