@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -27,8 +28,11 @@ if TYPE_CHECKING:
 
     from .formulas import FORMULAS, reflect, reflect_sandwich, refract_2d
 
-__all__ = ["FORMULAS", "reflect", "reflect_sandwich", "refract_2d"]
+__all__ = ["FORMULAS", "SCENES", "reflect", "reflect_sandwich", "refract_2d"]
 __version__ = "0.1.0"
+
+# The scenes of the package: `scenes` in it where it is installed, beside it in a checkout.
+SCENES = next((x for x in (Path(__file__).parents[i] / "scenes" for i in (0, 1)) if x.is_dir()), Path("scenes"))
 
 
 def __getattr__(name: str) -> Any:

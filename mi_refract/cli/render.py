@@ -116,7 +116,7 @@ def render(
 
     limits = Limits(spp, share, tile_share, seconds, pass_spp)
     job = Job(scene, defines, seed, tuple(allow_plugins or ()))
-    console = Console(stderr=True)
+    console = Console(stderr=True, force_terminal=sys.stderr.isatty())  # FORCE_COLOR makes no terminal of a pipe
     spinner = console.status(Text(printable(f"{scene.name}, {chosen}"))) if console.is_terminal else None
     with spinner or contextlib.nullcontext():
         rendering = resume(job, output, limits, restart=restart)

@@ -8,15 +8,13 @@ from typing import Annotated
 
 import typer
 
+from mi_refract import SCENES
 from mi_refract.io.text import printable
 from mi_refract.rendering import scene_files
 
 from .doctor import activate
 
 app = typer.Typer(help="Write scenes for other renderers.", add_completion=False, rich_markup_mode=None)
-
-# `mi_refract/scenes` of an installed package; of a checkout, `scenes` beside the package.
-SCENES = next((x for x in (Path(__file__).parents[i] / "scenes" for i in (1, 2)) if x.is_dir()), Path("scenes"))
 
 
 @app.command("list")

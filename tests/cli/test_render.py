@@ -46,7 +46,8 @@ def passes_by_mitsuba(scene, spp, seed=0, **parameters):
     return passes.mean(0).astype(np.float32), passes.var(0, ddof=1)
 
 
-def test_the_image_is_mitsubas_and_the_header_says_how_it_was_made(render, scene):
+def test_the_image_is_mitsubas_and_the_header_says_how_it_was_made(render, scene, monkeypatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")  # as CI and notebooks set it: colours, but no moving bar in a pipe
     code, out, err = render("--spp", 9, "--seed", 3, "-D", "bsdf=refract")
     assert (code, err) == (0, "") and "out.exr: scalar_rgb, 9 spp in 9 passes" in out
     pixels, header = read_exr(scene.with_name("out.exr"))

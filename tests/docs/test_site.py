@@ -37,6 +37,16 @@ def test_every_table_and_every_room_has_a_place():
     assert {f"reference/{page}.md" for page in listed} == generated.pages().keys()
 
 
+def test_every_page_is_in_one_table_of_contents():
+    listed = []
+    for path in PATHS:
+        for block in re.findall(r"^```\{toctree\}\n(.*?)^```", path.read_text("utf-8"), re.MULTILINE | re.DOTALL):
+            lines = (line for line in block.splitlines() if not line.startswith(":"))
+            listed += [(path.parent / line).relative_to(DOCS).as_posix() for line in lines]
+    sources = {path.relative_to(DOCS).with_suffix("").as_posix() for path in (*PATHS, *DOCS.glob("tutorials/*.ipynb"))}
+    assert sorted(x for x in listed if "/python/" not in x) == sorted(sources - {"index"})
+
+
 def test_bk7_of_mitsuba_is_shown_to_be_off():
     names = generated.mitsuba_names()
     assert len(names) > 20 and generated.KNOWN.keys() <= set(names)

@@ -63,7 +63,7 @@ def test_file_has_the_common_form(name):
     assert comment and len(comment[1].split()) >= 20
     defaults = {d.get("name"): d.get("value") for d in root.iter("default")}
     integrator = "refract_path" if name in BEYOND else "path"
-    common = {key: value for key, value in defaults.items() if key not in ("fov", "max_depth")}
+    common = {key: value for key, value in defaults.items() if key not in ("fov", "glass", "max_depth")}
     assert common == DEFAULTS | {"integrator": integrator} and "max_depth" in defaults
     assert "dielectric" not in text and root.findall(".//bsdf[@type='$bsdf']")
     for bsdf in root.iter("bsdf"):
@@ -77,14 +77,17 @@ def iors(path):
     An index is a number, or the text of a dispersive material.
     """
 
+    root = ET.parse(path).getroot()
+    defaults = {f"${d.get('name')}": d.get("value") for d in root.iter("default")}
+
     def value(p):
-        if re.search("[(:]", p.get("value")):
-            return p.get("value")
+        text = defaults.get(p.get("value"), p.get("value"))
+        if re.search("[(:]", text):
+            return text
         props = mi.Properties()
-        props["ior"] = p.get("value") if p.tag == "string" else float(p.get("value"))
+        props["ior"] = text if p.tag == "string" else float(text)
         return mi.lookup_ior(props, "ior", 1.0)
 
-    root = ET.parse(path).getroot()
     media = {
         b.get("id"): tuple(value(b.find(f"*[@name='{n}']")) for n in ("int_ior", "ext_ior"))
         for b in root.findall(".//bsdf[@type='$bsdf']")
