@@ -19,7 +19,7 @@ _FIELD = re.compile(r"\{([^{}]*)\}(/?)")  # with the slash behind it
 
 def matches(pattern: str, name: str) -> bool:
     """Whether the whole name matches the pattern."""
-    return _fits(_wild(pattern), name)
+    return _fits(_wild(pattern), name) if any(sign in pattern for sign in "*?\\") else pattern == name
 
 
 STAR = "\0"  # any characters, in a regular expression that is not finished; no name holds it

@@ -114,7 +114,7 @@ def test_the_list_holds_what_the_extra_names_but_mitsuba():
     extras = project["optional-dependencies"]
     named = [Requirement(text) for text in (*project["dependencies"], *extras["cli"], *extras["diff"])]
     lines = [line.partition("#")[0].strip() for line in LIST.read_text("utf-8").splitlines()]
-    pinned = dict(re.fullmatch(r"([\w-]+)==([\d.]+)", line).groups() for line in lines if line)
+    pinned = dict(re.fullmatch(r"([\w-]+)==([\d.]+)(?:; .*)?", line).groups() for line in lines if line)
     for requirement in named:
         if requirement.name not in (*ABSENT, "mi-refract"):
             assert requirement.specifier.contains(pinned[requirement.name]), requirement
