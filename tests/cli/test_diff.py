@@ -303,7 +303,7 @@ def strange(pair):
     return pair
 
 
-PUBLISHED = DOCS / "how-to" / f"diff-report-{results_file.SCHEMA}.schema.json"
+PUBLISHED = DOCS / "_static" / f"diff-report-{results_file.SCHEMA}.schema.json"
 
 
 def read_json(path):
