@@ -36,8 +36,9 @@ myst_heading_anchors = 4
 myst_links_external_new_tab = False
 nb_execution_mode = "off" if os.environ.get("MI_REFRACT_DOCS_EXECUTE") == "off" else "force"
 nb_execution_raise_on_error = True
+nb_execution_show_tb = True
 nb_execution_in_temp = True  # as for a reader who has the notebook alone
-nb_execution_timeout = 120
+nb_execution_timeout = 600  # of a cell, on a machine that does other work
 
 html_theme = "furo"
 html_title = "mi_refract"

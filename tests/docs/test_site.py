@@ -4,11 +4,12 @@ import importlib.util
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.readme import DOCS, ROOT, python_blocks
 from support.readme import PAGES as PATHS
 
-from mi_refract import media
+from mi_refract import media, oracle
 from mi_refract.io import image_file
 from mi_refract.planar import path_tree, scene_file
 from mi_refract.rendering.long_render import render_to_exr
@@ -17,7 +18,18 @@ PAGES = {path.relative_to(DOCS).as_posix(): path for path in PATHS}
 SPEC = importlib.util.spec_from_file_location("generated", DOCS / "generated.py")
 generated = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(generated)
-OTHER_TESTS = "".join(path.read_text("utf-8") for path in ROOT.glob("tests/**/test_*.py") if path != Path(__file__))
+# Pages whose Python another test runs, with smaller images, or a program or a cluster beside it.
+ELSEWHERE = {
+    "how-to/check-a-shaders-rays.md": "cli/test_rays.py",
+    "how-to/coming-from-other-image-diffs.md": "image_diff/test_other_image_diffs.py",
+    "how-to/compare-images-in-pytest.md": "test_pytest_plugin.py",
+    "how-to/dispersion-and-coloured-glass.md": "media/test_media.py",
+    "how-to/recover-an-index-from-an-image.md": "plugins/test_registration.py",
+    "how-to/render-for-hours.md": "rendering/test_long_render.py",
+    "how-to/render-on-a-cluster.md": "docs/test_pages.py",
+    "how-to/render-with-the-plugin.md": "plugins/test_registration.py",
+    "how-to/trace-rays-in-two-dimensions.md": "planar/test_scene_file.py",
+}
 CALLS = {
     (name, *words.split())
     for path in PAGES.values()
@@ -54,15 +66,28 @@ def test_bk7_of_mitsuba_is_shown_to_be_off():
     assert media.index("SCHOTT:N-BK7", 1200.0) == pytest.approx(1.5046, abs=5e-4)
 
 
-@pytest.mark.parametrize("name", [name for name, path in PAGES.items() if python_blocks(path)])
+def test_the_other_pages_are_in_other_tests():
+    assert all(Path(page).name in (ROOT / "tests" / test).read_text("utf-8") for page, test in ELSEWHERE.items())
+
+
+@pytest.mark.parametrize("name", [x for x, path in PAGES.items() if python_blocks(path) and x not in ELSEWHERE])
 def test_the_python_of_a_page_runs(name, tmp_path, monkeypatch, llvm_variant):
-    if f'"{Path(name).name}"' in OTHER_TESTS or f"/{Path(name).name}" in OTHER_TESTS:
-        pytest.skip("another test runs it")
     (tmp_path / "scenes").symlink_to(ROOT / "scenes")
     monkeypatch.chdir(tmp_path)
     names = {}
     for code in python_blocks(PAGES[name]):
         exec(code, names)
+
+
+def test_rays_are_checked_from_python_as_the_page_says(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before, after = python_blocks(PAGES["how-to/check-a-shaders-rays.md"])[1].split("\n...\n")
+    exec(before, names := {})
+    rays = names["rays"]
+    answers = oracle.refract(rays.rays.a, rays.rays.n, rays.rays.k, fresnel=False, progress=False)
+    np.savez("answers.npz", id=rays.ids, b=answers.direction)
+    exec(after, names)
+    assert names["findings"].exit_code == 0
 
 
 def named(table):
