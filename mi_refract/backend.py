@@ -29,6 +29,7 @@ from .io.safe_files import temporary_folder
 
 CHOICE = "DRJIT_LIBLLVM_PATH"  # where Dr.Jit looks first
 OWN_CHOICE = "MI_REFRACT_LIBLLVM"  # set to the same value where the choice was ours, not the user's
+WINDOWS = "LLVM-C.dll" if sys.platform == "win32" else ""  # what a libLLVM is called there
 TIMEOUT = 120.0  # seconds; a probe takes 0.4 s of one idle core
 
 # Last line of the output: "works", or the reason why not. 67 numbers: full vectors and a remainder.
@@ -167,6 +168,8 @@ def candidates() -> list[str]:
     for folder in folders:
         if folder.startswith("/"):
             found += map(str, Path("/").glob(f"{folder[1:]}/libLLVM*"))
+    if WINDOWS:  # where Dr.Jit looks itself
+        found += [str(x) for folder in os.environ["PATH"].split(os.pathsep) if (x := Path(folder, WINDOWS)).is_file()]
     loaded, paths = _loaded() or set(), set(map(os.path.realpath, found))
     versioned = [(path in loaded, version, path) for path in paths if (version := _version(path)) is not None]
     return [path for _, _, path in sorted(versioned, reverse=True)]
@@ -176,7 +179,7 @@ def _version(path: str) -> tuple[int, ...] | None:
     """From the file's name: (19, 1) of libLLVM.so.19.1, (15,) of libLLVM-15.so.1; None: not LLVM's C interface."""
     name = re.fullmatch(r"libLLVM(?:-(\d[\d.]*))?\.(?:so|dylib)(?:\.(\d[\d.]*))?", Path(path).name)
     if name is None:
-        return None
+        return () if Path(path).name == WINDOWS else None
     return tuple(int(part) for part in re.findall(r"\d+", name[1] or name[2] or ""))
 
 

@@ -51,6 +51,13 @@ def test_highest_version_first_and_llvms_c_interface_only(tmp_path, monkeypatch)
     assert [Path(path).name for path in backend.candidates() if path.startswith(str(tmp_path))] == versions
 
 
+def test_on_windows_it_is_looked_for_in_path(tmp_path, monkeypatch):
+    monkeypatch.setattr(backend, "WINDOWS", "LLVM-C.dll")
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{tmp_path / 'none'}")
+    (tmp_path / "LLVM-C.dll").touch()
+    assert str(tmp_path / "LLVM-C.dll") in backend.candidates()
+
+
 # What a library can do to a process
 
 

@@ -2,7 +2,8 @@
 
 While Mitsuba renders, a handler of its own takes SIGINT: it allocates memory, also where it has interrupted `malloc`,
 and then both wait for ever; or it makes the rendering return early. Python's own handler waits until Mitsuba or an
-import returns. So no handler runs here: signals are blocked in every thread, and one thread waits for them.
+import returns. So no handler runs here: signals are blocked in every thread, and one thread waits for them. Windows can
+block none: there Ctrl-C is Python's KeyboardInterrupt, which ends a command with 130 as soon as Mitsuba returns.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ import threading
 from collections.abc import Callable, Iterator
 
 SHOW_CURSOR = b"\x1b[?25h"  # which a spinner hides
-_ENDING = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 _blocked: set[signal.Signals] = set()  # from `end_at_once` on
 _unblocked = threading.Event()  # within `as_exceptions`
 _last_acts: list[Callable[[], None]] = []
@@ -28,8 +28,11 @@ def end_at_once(*, even_if_ignored: bool) -> None:
     threads that they start block what their parent blocks. A signal that the caller has ignored, such as SIGINT of a
     shell's background job or SIGHUP of `nohup`, stays ignored; but with `even_if_ignored` SIGINT ends the process.
     """
-    ignored = {number for number in _ENDING if signal.getsignal(number) is signal.SIG_IGN}
-    _blocked.update(_ENDING - ignored | {signal.SIGINT})  # Mitsuba's handler would take it even where it is ignored
+    if not hasattr(signal, "pthread_sigmask"):
+        return
+    ending = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+    ignored = {number for number in ending if signal.getsignal(number) is signal.SIG_IGN}
+    _blocked.update(ending - ignored | {signal.SIGINT})  # Mitsuba's handler would take it even where it is ignored
     signal.pthread_sigmask(signal.SIG_BLOCK, _blocked)
     from mi_refract.io import safe_files  # it takes longer than all before it
 
@@ -41,8 +44,8 @@ def end_at_once(*, even_if_ignored: bool) -> None:
         if _last_acts:
             acting = threading.Thread(target=_last_acts[-1], name="last act", daemon=True)
             acting.start()
-            while acting.is_alive() and signal.sigtimedwait(waited, 0.05) is None:
-                pass
+            while acting.is_alive() and not signal.sigpending() & waited:
+                acting.join(0.05)
         if os.isatty(2):
             os.write(2, SHOW_CURSOR)
         safe_files.end_process(128 + caught)

@@ -40,10 +40,12 @@ def started(workers: int) -> Iterator[tuple[str, Any]]:
 
     UsageError for a number out of range; NoWorkersError, one line, where they cannot be started.
     """
-    from distributed.security import Security
-
     if not 1 <= workers <= MOST:
         raise UsageError(f"--workers {workers}; expected a whole number from 1 to {MOST}")
+    if not hasattr(os, "killpg"):
+        raise UsageError(f"--workers {workers}: Windows cannot end them with the render; expected no --workers there")
+    from distributed.security import Security
+
     security = Security.temporary()
     process = subprocess.Popen(
         [sys.executable, "-P", "-m", __name__],  # -P: no module of the working folder takes the place of one of ours

@@ -38,7 +38,7 @@ def facts(variant: str) -> dict[str, str]:
     found[UNUSABLE] = "" if here.usable else f"{variant}: {here.reason}"
     if family == "llvm" and here.usable:
         found |= {LLVM: here.reason.removeprefix("libLLVM "), WIDTH: vector_width()}
-    return found | {HOST: os.uname().nodename}
+    return found | {HOST: platform.node()}
 
 
 def vector_width() -> str:

@@ -1,10 +1,13 @@
-"""Run another program in a process group of its own, so that all processes that it started end with it."""
+"""Run another program in a process group of its own, so that all processes that it started end with it.
+
+Windows has no such groups: there only the program itself is ended.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
-import selectors
+import queue
 import signal
 import subprocess
 import threading
@@ -12,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import IO, Any, NoReturn
 
 from .errors import TooMuchOutputError
 
@@ -79,34 +82,38 @@ def run(
             raise TimeoutError(f"did not end within {timeout:g} s") from None
         finally:
             with contextlib.suppress(ProcessLookupError, PermissionError):  # macOS forbids it for a group of zombies
-                os.killpg(process.pid, signal.SIGKILL)
+                os.killpg(process.pid, signal.SIGKILL) if hasattr(os, "killpg") else process.kill()
             process.wait()
-            for output in filter(None, (process.stdout, process.stderr)):
-                output.close()
     return Ended(process.returncode, out, said)
 
 
 def _read(process: subprocess.Popen[bytes], deadline: float, most: int) -> tuple[bytes, bytes]:
     """All that the program prints: its stdout, and its stderr where it is a pipe."""
-    assert process.stdout
-    kept: dict[int, list[bytes]] = {pipe.fileno(): [] for pipe in (process.stdout, process.stderr) if pipe}
-    room = most
-    with selectors.DefaultSelector() as selector:
-        for number in kept:
-            selector.register(number, selectors.EVENT_READ)
-        while selector.get_map():
-            if not (ready := selector.select(max(0, deadline - time.monotonic()))):
-                raise subprocess.TimeoutExpired(process.args, deadline)
-            for key, _ in ready:
-                piece = os.read(key.fd, _PIECE)
-                kept[key.fd].append(piece)
-                room -= len(piece)
-                if not piece:
-                    selector.unregister(key.fd)
-            if room < 0:
-                raise TooMuchOutputError(f"more than {most} bytes of output")
-    out, *said = (b"".join(pieces) for pieces in kept.values())
-    return out, said[0] if said else b""
+    arriving: queue.SimpleQueue[tuple[list[bytes], bytes]] = queue.SimpleQueue()
+
+    def pump(pipe: IO[bytes], kept: list[bytes]) -> None:
+        with pipe, contextlib.suppress(OSError):
+            while piece := pipe.read(_PIECE):
+                arriving.put((kept, piece))
+        arriving.put((kept, b""))
+
+    out: list[bytes] = []
+    said: list[bytes] = []
+    pumps = [(pipe, kept) for pipe, kept in ((process.stdout, out), (process.stderr, said)) if pipe]
+    for both in pumps:  # a thread for each: Windows cannot wait for two pipes at once
+        threading.Thread(target=pump, args=both, daemon=True).start()
+    room, going = most, len(pumps)
+    while going:
+        try:
+            kept, piece = arriving.get(timeout=max(0, deadline - time.monotonic()))
+        except queue.Empty:
+            raise subprocess.TimeoutExpired(process.args, deadline) from None
+        kept.append(piece)
+        going -= not piece
+        room -= len(piece)
+        if room < 0:
+            raise TooMuchOutputError(f"more than {most} bytes of output")
+    return b"".join(out), b"".join(said)
 
 
 @contextlib.contextmanager
@@ -134,7 +141,7 @@ def _signals_raise() -> Iterator[Callable[[], None]]:
 
     before: dict[signal.Signals, Any] = {}
     if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        for number in {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)}:  # Windows has none
             if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
                 before[number] = signal.signal(number, note)
     try:

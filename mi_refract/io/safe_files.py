@@ -3,18 +3,19 @@
 They are written under a temporary name in the same folder and renamed at the end. An exception or Ctrl-C removes the
 temporary one; a process that SIGKILL ends leaves it behind, hidden (`.NAME.….part`). A temporary folder that is left
 behind is removed by the next process that makes one.
-A lock is the operating system's (`flock`), so it ends with the process that holds it, however that ends.
+A lock is the operating system's (`flock`), so it ends with the process that holds it, however that ends. Windows has
+none: there nobody is kept out, and temporary folders of killed processes stay.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import functools
 import hashlib
 import json
 import os
+import platform
 import re
 import secrets
 import shutil
@@ -29,15 +30,21 @@ from io import BufferedReader
 from pathlib import Path
 from typing import NoReturn
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 _PIECE = 2**20  # bytes
 _KEPT = 40  # characters of the file's own name: a name of 255 bytes has no room for more
 _KINDS = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 _LONGEST_CHANGE = 5.0  # seconds that creating or renaming may take on a slow file system
 _unfinished: set[Path] = set()
 # Names of temporary folders: no user chooses them, and a lock may not be seen by other hosts that share the disk.
-_PREFIX, _SUFFIX = f"mi_refract-{zlib.crc32(os.uname().nodename.encode()):08x}-", ".part"
+_PREFIX, _SUFFIX = f"mi_refract-{zlib.crc32(platform.node().encode()):08x}-", ".part"
 _TEMPORARY = re.compile(r"\.[0-9a-f]{32}\.part")
-_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+_AS_IT_IS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)  # no link; not for other programs
+_FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | _AS_IT_IS
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
 _changing = threading.Lock()  # held where `_unfinished` changes, or a file in it is created or renamed
@@ -128,7 +135,7 @@ def move_into_place(temporary: Path, path: str | os.PathLike[str]) -> None:
 
 def sync(path: Path) -> None:
     """Wait until the file is on the disk. OSError where there is no room for it."""
-    with path.open("rb") as file, full_disk_names(path):
+    with path.open("r+b") as file, full_disk_names(path):  # Windows syncs only what may be written
         os.fsync(file)
 
 
@@ -161,9 +168,9 @@ def temporary_folder() -> Iterator[Path]:
             folder = Path(tempfile.mkdtemp(_SUFFIX, _PREFIX, parent))
             _unfinished.add(folder)
         with contextlib.suppress(FileNotFoundError):  # another process found it before it was locked
-            lock = os.open(folder, _FOLDER)
+            lock = os.open(folder if fcntl else os.devnull, _FOLDER)  # Windows opens no folder
             with contextlib.suppress(OSError):  # a file system without locks: nobody gets one
-                fcntl.flock(lock, fcntl.LOCK_EX)
+                _lock(lock)
             if folder.is_dir():
                 break
             os.close(lock)
@@ -174,13 +181,20 @@ def temporary_folder() -> Iterator[Path]:
         os.close(lock)
 
 
+def _lock(file: int, *, wait: bool = True) -> None:
+    """Lock an open file for this process. BlockingIOError where another has it; OSError where there are no locks."""
+    if not fcntl:
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+    fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+
+
 @functools.cache  # once in a process
 def _remove_abandoned(parent: Path) -> None:
     for folder in parent.glob(f"{_PREFIX}*{_SUFFIX}"):
         with contextlib.suppress(OSError):  # locked, another user's, or gone meanwhile
             lock = os.open(folder, _FOLDER)
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                _lock(lock, wait=False)
                 if os.fstat(lock).st_uid == os.getuid():
                     shutil.rmtree(folder, ignore_errors=True)
             finally:
@@ -246,9 +260,9 @@ def held(path: Path, what: str, place: Path | None = None, expected: str = "anot
     without locks, as some networks', keeps nobody out.
     """
     while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+        file = os.open(path, os.O_RDWR | os.O_CREAT | _AS_IT_IS, 0o644)
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(file, wait=False)
             with contextlib.suppress(FileNotFoundError):
                 if os.path.samestat(path.lstat(), os.fstat(file)):
                     break
@@ -269,11 +283,15 @@ def held(path: Path, what: str, place: Path | None = None, expected: str = "anot
     try:
         since = time.strftime("%Y-%m-%d %H:%M:%S %z")
         os.ftruncate(file, 0)
-        os.write(file, json.dumps({"process": os.getpid(), "host": os.uname().nodename, "since": since}).encode())
+        os.write(file, json.dumps({"process": os.getpid(), "host": platform.node(), "since": since}).encode())
         yield
     finally:
-        path.unlink(missing_ok=True)  # while it is held: nobody else's file is removed
+        if fcntl:  # while it is held: nobody else's file is removed
+            path.unlink(missing_ok=True)
         os.close(file)
+        if not fcntl:  # Windows removes no file that is open
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
 
 
 # Reading -------------------------------------------------------------------------------------------------------------

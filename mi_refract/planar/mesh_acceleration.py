@@ -24,6 +24,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from mi_refract import mitsuba_mesh
 from mi_refract.backend import activate
 from mi_refract.numerics import Mask, Number
 
@@ -189,15 +190,10 @@ def _strokes(of: str, a: Array, b: Array, vertices: Vertices) -> Any:
     if mi.variant() is None:
         activate()
     variant: Any = getattr(mi, of)
-    count, middle = len(starts), (starts + ends) / 2
+    middle = (starts + ends) / 2
     corners = (middle, -1), (2 * starts - middle, 1), (2 * ends - middle, 1)
-    mesh = variant.Mesh("strokes", 3 * count, count)
-    parameters = mi.traverse(mesh)
     places = np.concatenate([np.insert(corner, 2, z, axis=1) for corner, z in corners])
-    faces = np.arange(3 * count, dtype=np.uint32).reshape(3, count).T
-    for name, values in (("vertex_positions", places.astype(np.float32)), ("faces", faces)):
-        parameters[name] = type(parameters[name])(values.ravel())
-    parameters.update()
+    mesh = mitsuba_mesh.make(variant, places, np.arange(len(places)).reshape(3, -1).T)
     # mi.load_dict would build for the variant that is set now.
     config = mi.parser.ParserConfig(of)
     state = mi.parser.parse_dict(config, {"type": "scene", "strokes": mesh})

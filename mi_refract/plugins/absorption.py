@@ -76,7 +76,7 @@ def read_absorption(plugin: str, props: Properties, side: str) -> Absorption | N
 
     value = props[name]
     if not length and ((isinstance(value, str) and media.file_in(value)) or f"{sigma}_unit" in props):
-        return _from_k(plugin, name, value, props.get(f"{sigma}_unit", 0.0))
+        return _from_k(plugin, name, value, props.get(f"{sigma}_unit", None))
     expected = "a number or a spectrum " + ("above 0 and up to 1" if length else "≥ 0, and finite")
     values = read_values(plugin, props, name, expected, bool(length), textures=False)
     if not type(value).__name__.endswith("Color3d") or length or not any(values):
@@ -119,7 +119,8 @@ def _from_k(plugin: str, name: str, text: Any, unit: Any) -> Absorption:
     if not medium or not medium.k:
         raise ValueError(f"{label} = {text!r}; expected a number, a spectrum, or with {name}_unit a file with k")
     if isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < math.inf:
-        raise ValueError(f"{plugin}: {name}_unit = {unit!r}; expected the scene's unit in metres: 0.001 for mm")
+        found = f"{name} = {text!r}: {name}_unit is missing" if unit is None else f"{name}_unit = {unit!r}"
+        raise ValueError(f"{plugin}: {found}; expected the scene's unit in metres: 0.001 for mm")
     knots, k = medium.k
     held = "has the absorption of the range's end"
     check_range(f"{label} = {text!r} has k", (knots[0], knots[-1]), medium.hold, held)

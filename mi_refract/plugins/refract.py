@@ -5,7 +5,7 @@
 | `int_ior`, `ext_ior` | number, name | index inside (`bk7`, which is 1.5046) and outside (`air`) | `eta` | yes |
 | | dispersive material | a text of `mi_refract.media`, such as `SCHOTT:N-BK7` | `int_ior_B1`, … | yes |
 | | spectrum | index by wavelength, in spectral variants | `int_ior_n_360`, … | yes |
-| | texture | index by point | yes | yes |
+| | texture | index by point; for `refract_path`, an attribute that the shape lacks is an error | yes | yes |
 | `eta` | number | int_ior / ext_ior, only by `mi.traverse` | yes | yes |
 | `specular_reflectance`, `specular_transmittance` | number, spectrum, texture | tint of the lobe (1) | yes | yes |
 | `int_absorption`, `ext_absorption` | number, spectrum | σ of the medium on that side, per length (0) | yes | yes |

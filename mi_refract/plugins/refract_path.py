@@ -38,7 +38,7 @@ from .index_parameter import warn_once
 from .medium_tracking import MediumTracker, ShapeMedia, check_media, extinction
 from .path_loop import PathFeatures, PathLoop
 from .sampling import KeyedMultijitter, SceneSampler
-from .scene_features import SceneFeatures, inspect
+from .scene_features import SceneFeatures, check_attributes, inspect
 
 INTEGRATOR = "refract_path"
 MOST_PATHS = 4096  # that one sample may split into
@@ -210,6 +210,8 @@ def integrator_class(v: Variant) -> type:
         def scene_features(self, scene: Scene) -> SceneFeatures:
             """Of the scene as it is now: an edit of the scene can change them."""
             self.needs = needs = inspect(scene)
+            if needs.textured:
+                check_attributes(scene)
             if needs.absorbing or needs.media:
                 check_media(v, scene)
             mi.Log(mi.LogLevel.Info, f"{INTEGRATOR}: left out: {self.left_out()}")  # type: ignore[operator]

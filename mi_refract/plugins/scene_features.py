@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import operator
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -135,6 +136,25 @@ def inspect(scene: Scene) -> SceneFeatures:
         chance=next(chance, ""),
         unknown=unknown,
     )
+
+
+def check_attributes(scene: Scene) -> None:
+    """ValueError where a texture of `refract` is an attribute that its shape does not have: Mitsuba takes it for 0."""
+    shapes = all_shapes(scene)
+    for i, shape in enumerate(shapes):
+        for bsdf in nested(shape.bsdf()):
+            textures = children(bsdf) if bsdf_name(bsdf) == "Refract" else []
+            while textures:
+                texture = textures.pop()
+                textures += children(texture)
+                if texture.class_name() != "MeshAttribute":
+                    continue
+                name = re.search(r'name = "(.*)"', str(texture))  # it shows its name nowhere else
+                if name and not dr.all(shape.has_attribute(name[1])):
+                    raise ValueError(
+                        f"refract: {shape_name(shapes, i)} has no attribute {name[1]!r}, which a texture of its BSDF "
+                        "reads; expected a mesh with that attribute"
+                    )
 
 
 def all_shapes(scene: Scene) -> list[Shape]:

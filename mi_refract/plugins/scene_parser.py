@@ -23,7 +23,7 @@ import mitsuba as mi
 import mitsuba.mitsuba_ext
 import numpy as np
 
-from mi_refract import media
+from mi_refract import media, mitsuba_mesh
 from mi_refract.formulas import FORMULAS
 from mi_refract.io import image_file, safe_files
 from mi_refract.numerics import Properties, Scene
@@ -265,6 +265,7 @@ def check_faces(path: Path) -> None:
         mesh = mi.load_dict({"type": "ply", "filename": str(path.absolute()), "face_normals": True})
     except RuntimeError:
         return
-    faces, count = np.array(mesh.faces_buffer()), mesh.vertex_count()
-    if faces.size and faces.max() >= count:
-        raise ValueError(f"{path}: vertex {faces.max()} of a face; expected 0 to {count - 1}, the vertices of the file")
+    vertices, faces = mitsuba_mesh.arrays(mesh)
+    if faces.size and faces.max() >= len(vertices):
+        expected = f"expected 0 to {len(vertices) - 1}, the vertices of the file"
+        raise ValueError(f"{path}: vertex {faces.max()} of a face; {expected}")

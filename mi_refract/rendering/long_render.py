@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 import os
+import platform
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -164,7 +165,7 @@ class LongRender:
 
         def here(first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
             for number in range(first, stop):
-                yield 0, self.renderer.render(offset + number, spp), os.uname().nodename
+                yield 0, self.renderer.render(offset + number, spp), platform.node()
 
         with safe_files.held(lock_of(self.output), "a render", self.output, "another file"):
             if self._file_stamps() != self._files_before:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import mitsuba as mi
 import numpy as np
 
+from mi_refract import mitsuba_mesh
 from mi_refract.formulas import FORMULAS
 from mi_refract.plugins import PLUGIN, read_ior, scene_parser
 
@@ -110,10 +111,9 @@ def _parts(shape: Node, surface: Surface, level: int) -> tuple[Triangles, ...]:
             mesh = mi.load_dict({"type": shape.type, "filename": str(path.absolute()), "face_normals": flat})
     except RuntimeError as error:
         raise shape.error(f"{path}: {error}", "a mesh that Mitsuba reads") from None
-    if mesh.has_vertex_normals():
+    if mitsuba_mesh.has_normals(mesh):
         raise shape.error("smooth normals", "face_normals = true")
-    vertices = np.array(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)
-    return ((vertices, np.array(mesh.faces_buffer(), np.int64).reshape(-1, 3)),)
+    return (mitsuba_mesh.arrays(mesh),)
 
 
 def _frame(shape: Node) -> Vertices:

@@ -123,6 +123,43 @@ def test_a_command_imports_what_it_needs(pair, tmp_path, words, unused):
         assert "2 images: " in out and "'OpenImageIO'" in err
 
 
+# Of what Windows has not, all that Python's own library does without once it is imported on Linux, as does NumPy.
+WINDOWS = """
+import os, select, signal, subprocess, sys
+for name in ("fcntl", "grp", "pwd", "resource", "termios"):
+    sys.modules[name] = None
+for module, names in {
+    os: "O_CLOEXEC O_DIRECTORY O_NOFOLLOW chown fchmod fork geteuid getpgrp getuid killpg mkfifo setsid",
+    select: "epoll poll",
+    signal: "SIGHUP pthread_kill pthread_sigmask sigpending sigtimedwait sigwait",
+}.items():
+    for name in names.split():
+        vars(module).pop(name, None)
+from mi_refract.cli import main
+sys.exit(main())
+"""
+RENDER = ("render", ROOT / "scenes/sphere.xml", "-o", "out.exr", "-D", "res=8", "--spp", "1", "--variant", "scalar_rgb")
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said", "out"),
+    [
+        (("--help",), 0, "", "Commands:"),
+        (("diff", "IMAGES", "--json", "out.json"), 1, "", "2 images: "),
+        (RENDER, 0, "", "out.exr: scalar_rgb, 1 spp in 1 pass"),
+        (("rays", "run", "--count", "5", "--", sys.executable, "-c", "exit(2)"), 2, "ended with status 2", ""),
+        (("rays", "run", "--timeout", "0.2", "--", "sleep", "600"), 2, "did not finish within 0.2 s", ""),
+    ],
+    ids=lambda x: " ".join(map(str, x[:2])) if isinstance(x, tuple) else "",
+)
+def test_without_what_windows_has_not(pair, tmp_path, words, code, said, out):
+    words = [y for x in words for y in (pair if x == "IMAGES" else [x])]
+    command = [sys.executable, "-c", WINDOWS, *map(str, words)]
+    done = subprocess.run(command, env=ENVIRONMENT, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, len(done.stderr.splitlines())) == (code, bool(said)), done
+    assert out in done.stdout and said in done.stderr
+
+
 # doctor ---------------------------------------------------------------------------------------------------------------
 
 

@@ -13,7 +13,8 @@ from xml.etree import ElementTree
 import msgspec
 import pytest
 from support.diff_images import BROKEN, image, samples, tree
-from support.processes import ENVIRONMENT, ROOT
+from support.processes import ENVIRONMENT
+from support.readme import DOCS
 
 from mi_refract.image_diff import methods, results_file, text_reports
 from mi_refract.image_diff.results import Result, Results, Status
@@ -302,7 +303,7 @@ def strange(pair):
     return pair
 
 
-PUBLISHED = ROOT / ".github" / "docs" / "how-to" / f"diff-report-{results_file.SCHEMA}.schema.json"
+PUBLISHED = DOCS / "_static" / f"diff-report-{results_file.SCHEMA}.schema.json"
 
 
 def read_json(path):

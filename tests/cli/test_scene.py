@@ -4,11 +4,11 @@ import os
 import subprocess
 import sys
 import tarfile
-import zipfile
 from pathlib import Path
 
 import pytest
 
+import mi_refract
 from mi_refract.cli import app
 
 SCENES = Path(app.__file__).parents[2] / "scenes"
@@ -70,24 +70,51 @@ def test_scenes_are_listed_with_what_they_show(run):
     assert all(len(line.split(None, 1)) == 2 for line in lines)
 
 
-def test_a_wheel_has_scenes_and_glasses_and_an_sdist_has_all(tmp_path, monkeypatch):
-    """The wheel: all files of the package, and the scenes but their images; it works where it is unpacked."""
-    build = pytest.importorskip("hatchling.build")
-    root = SCENES.parent
-    monkeypatch.chdir(root)
-    there = tmp_path / "there"
-    with zipfile.ZipFile(tmp_path / build.build_wheel(str(tmp_path))) as wheel:
-        wheel.extractall(there)
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """The wheel and the sdist of this checkout."""
+    build, folder = pytest.importorskip("hatchling.build"), tmp_path_factory.mktemp("dist")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(SCENES.parent)
+        return {"wheel": folder / build.build_wheel(str(folder)), "sdist": folder / build.build_sdist(str(folder))}
+
+
+@pytest.mark.parametrize("kind", ["wheel", "sdist"])
+def test_what_is_installed_has_scenes_and_glasses_and_runs(kind, built, tmp_path):
+    """All files of the package, and the scenes but their images."""
+    pytest.importorskip("pip")
+    root, there = SCENES.parent, tmp_path / "there"
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--no-index",
+        "--no-build-isolation",
+        "--no-compile",
+    ]
+    subprocess.run([*pip, "--target", there, built[kind]], check=True, timeout=120)
     package = {str(x.relative_to(root)) for x in (root / "mi_refract").rglob("*.*") if "__pycache__" not in x.parts}
     scenes = {f"mi_refract/{x.relative_to(root)}" for kind in ("xml", "toml", "ply") for x in SCENES.rglob(f"*.{kind}")}
     assert {"mi_refract/py.typed", "mi_refract/media/glasses.json", "mi_refract/report/templates/diff.js"} <= package
     assert package | scenes <= {str(path.relative_to(there)) for path in there.rglob("*.*")}
     assert sum(path.stat().st_size for path in (there / "mi_refract" / "scenes").rglob("*.*")) < 300_000
-    command = [sys.executable, "-m", "mi_refract.cli", "scene", "export", "sphere", "--to", "mitsuba", "--level", "0"]
-    subprocess.run(command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(there)}, check=True)
+    assert not {"tests", "validation", "scenes"} & {path.name for path in there.iterdir()}
+    installed = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": str(there)}}
+    command = [there / "bin" / "mi-refract", "scene", "export", "sphere", "--to", "mitsuba", "--level", "0"]
+    subprocess.run(command, check=True, **installed)
     assert (tmp_path / "sphere-mitsuba" / "scene.xml").is_file()
-    with tarfile.open(tmp_path / build.build_sdist(str(tmp_path))) as sdist:
+    code = "from importlib import metadata; import mi_refract as m; print(m.__file__, m.__version__); "
+    code += "print(metadata.version('mi-refract'))"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, **installed).stdout
+    assert said.split() == [str(there / "mi_refract/__init__.py"), mi_refract.__version__, mi_refract.__version__]
+
+
+def test_the_sdist_has_all(built):
+    with tarfile.open(built["sdist"]) as sdist:
         names = {name.partition("/")[2] for name in sdist.getnames()}
-    folders = ("mi_refract", "scenes", "tests", "validation", ".ci", ".github")
+    root, folders = SCENES.parent, ("mi_refract", "scenes", "tests", "validation", ".ci", ".github")
     files = {str(x.relative_to(root)) for folder in folders for x in (root / folder).rglob("*") if x.is_file()}
     assert {name for name in files if "__pycache__" not in name} <= names

@@ -26,7 +26,7 @@ from mi_refract.cluster import workers as workers_module
 from mi_refract.cluster.connection import cluster_errors, connected
 from mi_refract.cluster.on_worker import HOST, LLVM, MIXED, UNUSABLE, WIDTH, differences, machine
 from mi_refract.cluster.workers import AHEAD, Workers, fetched, results
-from mi_refract.io.errors import LostSchedulerError, NoWorkersError
+from mi_refract.io.errors import LostSchedulerError, NoWorkersError, UsageError
 
 VARIANT = "scalar_rgb"
 HERE = {"mitsuba": "3.9.1", LLVM: "19.1", WIDTH: "8", UNUSABLE: "", HOST: "here"}
@@ -64,6 +64,12 @@ def test_misuse(options, message, monkeypatch):
     with pytest.raises((ConnectionError, ValueError)) as caught, connected(**options):
         pass
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_where_processes_have_no_groups_there_are_no_workers(monkeypatch):
+    monkeypatch.delattr(os, "killpg")
+    with pytest.raises(UsageError, match="--workers 1: Windows cannot end them"), connected(workers=1):
+        pass
 
 
 def test_a_client_is_nobody_elses_default(client):

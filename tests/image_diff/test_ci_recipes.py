@@ -17,11 +17,10 @@ import pytest
 import yaml
 from support.diff_images import image
 from support.processes import ENVIRONMENT
-from support.readme import blocks
+from support.readme import DOCS, ROOT, blocks
 
-ROOT = Path(__file__).parents[2]
 ACTION = ROOT / ".github" / "actions" / "diff"
-PAGE = ROOT / ".github" / "docs" / "how-to" / "compare-images-in-ci.md"
+PAGE = DOCS / "how-to" / "compare-images-in-ci.md"
 LIST = str((ACTION / "requirements.txt").relative_to(ROOT))
 FILES = ["diff.json", "junit.xml", "report.html"]
 BASH = ["bash", "--noprofile", "--norc", "-e", "-o", "pipefail"]  # what `shell: bash` is on a runner

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from support.processes import ROOT
+from support.readme import DOCS
 
 from mi_refract.image_diff import methods
 from mi_refract.image_diff.comparison import Verdict
 from mi_refract.io.image_file import Image
 
-PAGE = ROOT / ".github" / "docs" / "how-to" / "coming-from-other-image-diffs.md"
+PAGE = DOCS / "how-to" / "coming-from-other-image-diffs.md"
 LIMITS = {"black–white": (1, 1, 1), "red only": (1, 0, 0), "green only": (0, 1, 0), "blue only": (0, 0, 1)}
 LIMITS |= {"red one way, green and blue the other": (1, -1, -1)}
 

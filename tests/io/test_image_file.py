@@ -228,7 +228,7 @@ def test_twice_as_many_pages_take_twice_as_many_steps(tmp_path):
         return count
 
     taken = []
-    for pages in (100, 200):
+    for pages in (100, 100, 200):  # the first is not counted whole by every Python
         output = oiio.ImageOutput.create("a.tif")
         for number in range(pages):
             assert output.open(str(tmp_path / "a.tif"), spec, "AppendSubimage" if number else "Create")
@@ -240,7 +240,7 @@ def test_twice_as_many_pages_take_twice_as_many_steps(tmp_path):
         sys.settrace(before)
         assert len(found) == pages
         taken.append(steps)
-    assert taken[0] < taken[1] < 2.1 * taken[0]
+    assert taken[1] < taken[2] < 2.1 * taken[1]
 
 
 def test_what_the_system_does_not_give(tmp_path):

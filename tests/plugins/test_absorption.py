@@ -119,7 +119,7 @@ def rgb(*value):
         ({"int_absorption": "file:no.csv"}, "int_absorption = 'file:no.csv': no.csv: No such file"),
         (
             {"int_absorption": "hold(file:{nk})"},
-            "int_absorption_unit = 0.0; expected the scene's unit in metres: 0.001",
+            "int_absorption = 'hold.*': int_absorption_unit is missing; expected the scene's unit in metres: 0.001",
         ),
         ({"int_absorption": "hold(file:{nk})", "int_absorption_unit": -1.0}, "int_absorption_unit = -1.0; expected"),
         ({"int_absorption": 1.0, "int_absorption_unit": 1.0}, "int_absorption = 1.0; expected .* a file with k"),

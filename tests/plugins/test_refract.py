@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.glass_scenes import refusal, sampled, surface, vector
 
+from mi_refract import mitsuba_mesh
 from mi_refract.formulas import FORMULAS, fresnel
 
 TINTED = {"int_ior": 1.5, "ext_ior": 1.0, "specular_reflectance": 0.3, "specular_transmittance": 0.6}
@@ -248,6 +249,22 @@ def test_a_texture_that_holds_no_index_is_refused_and_an_edit_loses_its_light(ty
     parameters.update()
     for number in (0.0, 0.999999):
         assert (sampled(bsdf, (0.6, 0, 0.8), number, u=0.75).weight == 0).all()
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_an_attribute_that_the_shape_does_not_have_is_refused(llvm_variant, nested):
+    glass = {"type": "refract", "int_ior": {"type": "mesh_attribute", "name": "vertex_n"}}
+    if nested:
+        checkers = {"type": "checkerboard", "color0": 1.5, "color1": glass["int_ior"]}
+        glass = {"type": "mask", "opacity": 0.5, "inner": glass | {"int_ior": checkers}}
+    props = mi.Properties()
+    props["glass"] = mi.load_dict(glass)
+    mesh = mitsuba_mesh.make(mi, np.eye(3), np.arange(3)[None], properties=props)
+    camera = {"type": "perspective", "film": {"type": "hdrfilm", "width": 2, "height": 2}}
+    scene = mi.load_dict({"type": "scene", "mesh": mesh, "integrator": {"type": "refract_path"}, "camera": camera})
+    assert "refract: 'mesh' has no attribute 'vertex_n', which a texture" in refusal(mi.render, scene, spp=1)
+    mesh.add_attribute("vertex_n", 1, [1.5] * 3)
+    mi.render(scene, spp=1)
 
 
 def test_of_a_coloured_texture_the_luminance_is_the_index(needs_variant):

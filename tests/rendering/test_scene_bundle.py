@@ -213,8 +213,9 @@ def test_errors_name_the_files_as_they_are_here(folder, there):
 NESTED = SCENES / "nested.xml"
 ABSORBING = """<scene version="3.0.0"><default name="integrator" value="path"/><integrator type="$integrator"/>
 <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/></film></sensor>
-<shape type="sphere"><bsdf type="refract">PARAMETER</bsdf></shape></scene>"""
+<shape type="sphere" id="ball"><bsdf type="refract">PARAMETER</bsdf></shape></scene>"""
 ABSORPTION = '<float name="int_absorption" value="0.5"/>'
+ATTRIBUTE = '<texture type="mesh_attribute" name="ext_ior"><string name="name" value="vertex_n"/></texture>'
 
 
 @pytest.mark.parametrize(
@@ -230,6 +231,11 @@ def test_the_formulas_of_a_scene(bsdf, formulas):
         ("", {"res": "8193"}, "a film of 8193 × 8193 pixels; expected 1 to 67108864"),
         (ABSORPTION, {}, "refract: int_absorption; expected the integrator refract_path, or no absorption"),
         (ABSORPTION, {"integrator": "refract_path"}, ""),
+        (
+            ATTRIBUTE,
+            {},
+            "refract: 'ball' has no attribute 'vertex_n', which a texture of its BSDF reads; expected",
+        ),
     ],
 )
 def test_what_is_refused_is_named(tmp_path, parameter, defines, message):

@@ -26,7 +26,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.variants import switch
 
-from mi_refract import oracle
+from mi_refract import mitsuba_mesh, oracle
 from mi_refract.image_diff import folders, settings
 from mi_refract.image_diff.results import Status
 from mi_refract.io import errors, image_file
@@ -227,8 +227,8 @@ def rendered(path, defines):
     import mitsuba as mi
 
     scene = scene_files.load_scene(path, defines)
-    meshes = (shape for shape in scene.shapes() if shape.is_mesh())
-    if any(np.max(np.array(mesh.faces_buffer()), initial=0) >= mesh.vertex_count() for mesh in meshes):
+    meshes = (mitsuba_mesh.arrays(shape) for shape in scene.shapes() if shape.is_mesh())
+    if any(np.max(faces, initial=0) >= len(vertices) for vertices, faces in meshes):
         return "a face without its vertices"
     film = scene.sensors()[0].film()
     if math.prod(film.crop_size()) <= PIXELS:

@@ -1,12 +1,15 @@
 """CI fails where little ran: too few passed cases, no libLLVM, an install that failed."""
 
 import os
+import re
 import runpy
 import shutil
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[2]
 MINIMUM = runpy.run_path(str(ROOT / ".ci" / "minimum"))["main"]
@@ -36,6 +39,21 @@ def test_no_step_of_ci_goes_on_after_a_failure():
     assert text.count(".ci/minimum") == text.count("--junitxml") + text.count("-m validation --out") + 1
     assert "MI_REFRACT_NEEDS_LLVM=1" in text
     assert "bash .ci/run" in (ROOT / ".github" / "workflows" / "ci.yml").read_text()
+
+
+def test_the_address_of_the_repository_and_the_names_of_templates_are_one():
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]
+    files = [ROOT / "CITATION.cff", *(x for x in (ROOT / ".github").glob("**/*.*") if x.suffix in (".md", ".yml"))]
+    found = {url for path in files for url in re.findall(r"https://github\.com/mi[-_]refract/[\w-]+", path.read_text())}
+    assert found == {urls["Source"]}
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert (citation["repository-code"], citation["url"]) == (urls["Source"], urls["Documentation"])
+    assert "version" not in citation  # it stands in one place
+    for path in (ROOT / ".github" / "ISSUE_TEMPLATE").glob("[!c]*.yml"):
+        template = yaml.safe_load(path.read_text())
+        assert {"name", "description", "body"} <= {*template} and all(
+            x["attributes"]["label"] for x in template["body"]
+        )
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")

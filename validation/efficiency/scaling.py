@@ -26,6 +26,7 @@ import drjit as dr
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from mi_refract import mitsuba_mesh
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run.context import SCENES, Context
@@ -96,12 +97,7 @@ def _triangles(method: Method, size: int, resolution: int) -> Camera:
     vertices, faces = ball_mesh(size)
     properties = mi.Properties()
     properties["glass"] = mi.load_dict({"type": method.bsdf, "int_ior": "bk7", "ext_ior": "air"})
-    mesh = mi.Mesh("ball", len(vertices), len(faces), props=properties)
-    parameters = mi.traverse(mesh)
-    for key, values in (("positions", 4.5 * vertices), ("faces", faces)):
-        name = next(name for name in parameters.keys() if name.endswith(key))  # noqa: SIM118  no dictionary
-        parameters[name] = type(parameters[name])(values.ravel())
-    parameters.update()
+    mesh = mitsuba_mesh.make(mi, 4.5 * vertices, faces, properties=properties)
     return _in_memory(method, {"ball": mesh}, 10.0, resolution)
 
 

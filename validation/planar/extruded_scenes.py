@@ -17,6 +17,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from mi_refract import mitsuba_mesh
 from mi_refract.planar import Event, Paths, Segments
 from mi_refract.planar.curves import points
 from mi_refract.plugins import PLUGIN
@@ -109,13 +110,9 @@ def extrude(segments: Segments) -> Any:
         properties = mi.Properties()
         properties["face_normals"] = True
         properties["glass"] = mi.load_dict({"type": PLUGIN, "ext_ior": left, "int_ior": right})
-        mesh = mi.Mesh("walls", 4 * count, 2 * count, props=properties)
-        parameters = mi.traverse(mesh)
-        for key, values in (("positions", np.stack(corners, 1).astype(np.float32)), ("faces", faces.astype(np.uint32))):
-            name = next(name for name in parameters.keys() if name.endswith(key))  # noqa: SIM118  no dictionary
-            parameters[name] = type(parameters[name])(values.ravel())
+        vertices, triangles = np.stack(corners, 1).reshape(-1, 3), faces.reshape(-1, 3)
+        mesh = mitsuba_mesh.make(mi, vertices, triangles, properties=properties)
         mesh.add_attribute("face_segment", 1, np.repeat(chosen, 2).astype(float).tolist())
-        parameters.update()
         meshes[f"walls_{k}"] = mesh
     return mi.load_dict({"type": "scene", **meshes})
 

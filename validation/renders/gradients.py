@@ -25,6 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refract import mitsuba_mesh
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run.context import Context
@@ -96,12 +97,9 @@ def mesh(bsdf: Nodes) -> Nodes:
     """A plane whose normals vary from vertex to vertex."""
     props = mi.Properties()
     props["bsdf"] = mi.load_dict(bsdf)
-    square = mi.Mesh("square", 4, 2, has_vertex_normals=True, props=props)
-    params = mi.traverse(square)
-    params["vertex_positions"] = mi.Float([-9, -9, 0, 9, -9, 0, 9, 9, 0, -9, 9, 0])
-    params["vertex_normals"] = mi.Float([0.2, 0, 1, 0, 0.3, 1, 0, 0, 1, -0.1, 0.1, 1])
-    params["faces"] = mi.UInt32([0, 1, 2, 0, 2, 3])
-    params.update()
+    corners = np.array([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]])
+    normals = np.array([[0.2, 0, 1], [0, 0.3, 1], [0, 0, 1], [-0.1, 0.1, 1]])
+    square = mitsuba_mesh.make(mi, corners, np.array([[0, 1, 2], [0, 2, 3]]), normals, properties=props)
     return scene(20, mesh=square, light=sky())
 
 

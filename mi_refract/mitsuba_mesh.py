@@ -1,0 +1,45 @@
+"""Mitsuba's meshes as arrays, and back: the one place that knows how Mitsuba lays them out and names their parts."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def arrays(mesh: Any) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The vertices (V, 3) of a mesh, and its faces (F, 3): the numbers of their vertices."""
+    vertices = np.array(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)
+    return vertices, np.array(mesh.faces_buffer(), np.int64).reshape(-1, 3)
+
+
+def has_normals(mesh: Any) -> bool:
+    """Whether the mesh has normals of vertices, between which it interpolates."""
+    return bool(mesh.has_vertex_normals())
+
+
+def make(
+    v: ModuleType,
+    vertices: NDArray[Any],
+    faces: NDArray[Any],
+    normals: NDArray[Any] | None = None,
+    *,
+    properties: Any = None,
+) -> Any:
+    """A mesh of the Mitsuba variant `v`, of vertices (V, 3), faces (F, 3) and normals of the vertices (V, 3) or None.
+
+    `properties`: Mitsuba's `Properties` with its BSDF, emitter and flags.
+    """
+    import mitsuba as mi
+
+    smooth, more = normals is not None, {} if properties is None else {"props": properties}
+    mesh = v.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=smooth, **more)
+    parameters = mi.traverse(mesh)
+    parts = {"vertex_positions": vertices, "faces": faces} | ({"vertex_normals": normals} if smooth else {})
+    for name, values in parts.items():
+        number = np.uint32 if name == "faces" else np.float32
+        parameters[name] = type(parameters[name])(np.asarray(values, number).ravel())
+    parameters.update()
+    return mesh
