@@ -64,8 +64,8 @@ def flip(
     patch: Annotated[float, "FLIP error that may fill a square of 0.24 degrees, 0 to 1"] = PATCH,
     one_way: Annotated[
         float,
-        "codes of 255 by which all of a 3 × 3 square may change one way, in luma; a channel, or a 2 × 2 square, by "
-        "twice as much; larger squares by less; for LDR images",
+        "codes of 255 by which all of a 3 × 3 square may change one way, in luma; a single channel and a 2 × 2 square by "
+        "twice as much, larger squares by less; for LDR images",
     ] = ONE_WAY,
     largest: Annotated[float, "FLIP error that no pixel may exceed, 0 to 1"] = 1.0,
     hdr: Annotated[str, "auto (by the file's format), yes or no", one_of("auto", "yes", "no")] = "auto",

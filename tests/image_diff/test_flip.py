@@ -174,9 +174,8 @@ def test_every_change_one_way_against_its_definition():
     luma = (two - one) @ np.float32([0.299, 0.587, 0.114])
     for ppd, sides in ((67, range(2, 9)), (20, range(2, 3)), (100, range(3, 13))):
         scale = max(1, ppd / 67)
-        weights = {side: (side / scale - 1) / 2 * (31 / 32 if side < 3 * scale else 1) for side in sides}
         value = max(
-            (sign * kind[y : y + side, x : x + side]).min() * weights[side]
+            (sign * kind[y : y + side, x : x + side]).min() * (side / scale - 1) / 2 * (31 / 32 if side < 3 * scale else 1)
             for kind in (luma, *np.moveaxis((two - one) / 2, -1, 0))
             for sign in (1, -1)
             for side in sides
@@ -187,7 +186,7 @@ def test_every_change_one_way_against_its_definition():
 
 
 def test_an_edge_that_moves_by_half_a_pixel_is_within_the_bound_however_wide_it_is_blurred():
-    """The bound is that of a Gaussian of (side − 1)/2 pixels, in squares of every side; of 2 × 2, that of a box."""
+    """The bound of a Gaussian is that of a width of (side − 1)/2 pixels, in squares of every side; that of a box, in a square of 2 × 2."""
     steps = np.arange(64.0)[None]
     for width in (0.3, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 5.0):
         for place in (31.5, 31.75, 32.0):
