@@ -102,7 +102,7 @@ def iors(path):
 @each_scene
 def test_loads_at_the_size_of_the_notes_and_renders_and_media_nest(name):
     """The ray offset is absolute: a scene a hundred times smaller leaks at its edges."""
-    scene = load(name)
+    scene = load(name, spp=16)
     box = scene.bbox()
     assert 30 < np.linalg.norm(box.max - box.min) < 3000
     film = scene.sensors()[0].film()
