@@ -1,11 +1,13 @@
 """The documentation site. `.ci/docs` builds it; CONTRIBUTING says how its pages are divided."""
 
+import functools
 import os
 import re
 import sys
 from pathlib import Path
 
 import mitsuba
+from nbclient import NotebookClient
 from sphinx.application import Sphinx
 
 import mi_refract
@@ -37,6 +39,8 @@ myst_links_external_new_tab = False
 nb_execution_mode = "off" if os.environ.get("MI_REFRACT_DOCS_EXECUTE") == "off" else "force"
 nb_execution_raise_on_error = True
 nb_execution_show_tb = True
+# `%%bash` hands over a hundred bytes at a time, which may end within an escape sequence.
+NotebookClient.__init__ = functools.partialmethod(NotebookClient.__init__, coalesce_streams=True)
 nb_execution_in_temp = True  # as for a reader who has the notebook alone
 nb_execution_timeout = 600  # of a cell, on a machine that does other work
 

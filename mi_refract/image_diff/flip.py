@@ -37,10 +37,9 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear Rec. 709
 # a white line one pixel wide on black that vanishes (0.65). `validation.diff.visible_changes` measures these and more.
 LOCAL = 0.5
 PATCH = 0.12  # 7 to 10 of 255 codes of gray; no antialiasing that was tried fills a patch with two thirds of it
-# An edge from black to white that moves by half a pixel changes all pixels of a square of w × w by at most 62/(w − 1)
-# codes one way, w = 3 … 8: 255 (Φ(1.25) − Φ(0.75)) = 30.9 for w = 3, where it is blurred by a Gaussian of one pixel.
-# w = 2: 255/4 = 63.75, where it is blurred by a box of one pixel. A single pixel may change by all 255.
-ONE_WAY, SIDE, BOXED = 31.0, 2, 62 / 64
+# An edge from black to white, blurred by a Gaussian of σ pixels, that moves by half a pixel changes all pixels of a
+# 3 × 3 square by at most 255 (Φ(1.25) − Φ(0.75)) = 30.9 codes one way: at σ = 1.
+ONE_WAY, SIDE = 31.0, 3
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # of codes, as in JPEG (BT.601)
 CODED = re.compile(r"srgb|gamma|^g\d\d")  # colour spaces, in OpenImageIO's words, of what a display is sent
 LINEAR = re.compile(r"^lin|linear|^aces|^raw$|^data$")
@@ -65,8 +64,8 @@ def flip(
     patch: Annotated[float, "FLIP error that may fill a square of 0.24 degrees, 0 to 1"] = PATCH,
     one_way: Annotated[
         float,
-        "codes of 255 by which all of a 3 × 3 square may change one way, in luma; a channel, or a 2 × 2 square, by "
-        "twice as much; larger squares by less; for LDR images",
+        "codes of 255 by which all of a 3 × 3 square may change one way, in luma; a single channel by twice as much, "
+        "larger squares by less; for LDR images",
     ] = ONE_WAY,
     largest: Annotated[float, "FLIP error that no pixel may exceed, 0 to 1"] = 1.0,
     mean: Annotated[float, "FLIP error allowed on average over the image, 0 to 1"] = 1.0,
@@ -272,9 +271,9 @@ def one_way_change(reference: Pixels, test: Pixels, ppd: float) -> Window:
     """The square in which all pixels change the most one way, all brighter or all darker.
 
     `reference`, `test`: codes, H × W × C. A change is that of luma, or half of that of one channel, as eyes and
-    subsampled JPEG files resolve colours half as well. `value`: the smallest change in a square of w = 2 … 8 pixels a
-    side, times (w − 1)/2 or, for w < 3, BOXED times this: an edge that moves by half a pixel stays below ONE_WAY. With
-    more than 67 pixels per degree, w is counted in pixels of that size.
+    subsampled JPEG files resolve colours half as well. `value`: the smallest change in a square of w = 3 … 8 pixels a
+    side, times (w − 1)/2, as an edge that moves by half a pixel changes it by up to 255 φ(1)/(w − 1), at a blur of
+    (w − 1)/2 pixels. With more than 67 pixels per degree, w is counted in pixels of that size.
     """
     change = (test - reference).astype(np.float32, copy=False)
     kinds = [change[..., 0]] if change.shape[2] == 1 else [change @ LUMA, *np.moveaxis(change / 2, -1, 0)]
@@ -286,8 +285,7 @@ def one_way_change(reference: Pixels, test: Pixels, ppd: float) -> Window:
             least = np.minimum(least[1:], least[:-1])
             least = np.minimum(least[:, 1:], least[:, :-1])
             if side >= SIDE * scale:
-                weight = (side / scale - 1) / 2 * (BOXED if side < 3 * scale else 1)
-                window = _worst(least, weight, side, side)
+                window = _worst(least, (side / scale - 1) / 2, side, side)
                 worst = max(worst, window, key=lambda window: window.value)
     return worst
 

@@ -338,6 +338,7 @@ OTHER_NOISE = {
     "little noise": lambda: (noisy(1, 0.05), noisy(2, 0.05)),
     "much noise": lambda: (noisy(1, 1.0), noisy(2, 1.0)),
     "box filter": lambda: (noisy(1, width=0.1), noisy(2, width=0.1)),
+    "few pixels": lambda: (noisy(1)[:48, :48], noisy(2)[:48, :48]),
     "codes": lambda: tuple(np.round(255 * np.clip(noisy(i), 0, 1)) / 255 for i in (1, 2)),
 }
 TRUE_DIFFERENCES = {
@@ -353,7 +354,7 @@ TRUE_DIFFERENCES = {
     "mirrored": lambda: (noisy(1), noisy(2)[:, ::-1]),
     "swapped channels": lambda: (noisy(1), noisy(2)[..., ::-1]),
     "one channel with other noise": lambda: (noisy(1), np.dstack([noisy(2)[..., 0], 1.05 * noisy(1)[..., 1:]])),
-    "too few pixels": lambda: (noisy(1)[:30, :30], noisy(2)[:30, :30]),
+    "too few pixels": lambda: (noisy(1)[:44, :44], noisy(2)[:44, :44]),
     "too few rows": lambda: tuple(noisy(i, shape=(5, 2000)) for i in (1, 2)),
     "too few columns": lambda: tuple(noisy(i, shape=(2000, 4)) for i in (1, 2)),
     "no noise": lambda: (noisy(1, 1e-3), brighter(noisy(1, 1e-3), 1.5, PART)),

@@ -61,7 +61,6 @@ VISIBLE = {
     "half of the image is 10 codes brighter": (np.full((SIZE, SIZE), GRAY), GRAY + 10 * (X > 255)),
     "a cube of 4 pixels is gone": (with_square(200, 100, 4, 255), with_square(200, 100, 0, 0)),
     "a dot of 3 pixels": (PLAIN, with_square(200, 100, 3, GRAY + 32)),
-    "a dot of 2 pixels": (PLAIN, with_square(200, 100, 2, GRAY + 65)),
     "a dot of 5 pixels": (PLAIN, with_square(200, 100, 5, GRAY - 16)),
     "a blue dot of 3 pixels": (PLAIN, with_square(200, 100, 3, (GRAY, GRAY, GRAY + 64))),
     "a facet": (CUBE, with_square(204, 104, 6, (141, 141, 141), CUBE)),
@@ -72,8 +71,6 @@ CLOSE = {
     "another antialiasing": (edge(0), edge(0, samples=2)),
     "an edge moved by half a pixel": (edge(0), edge(0.5)),
     "a fainter dot of 3 pixels": (PLAIN, with_square(200, 100, 3, GRAY + 31)),
-    "a fainter dot of 2 pixels": (PLAIN, with_square(200, 100, 2, GRAY + 63)),
-    "an edge that a box moves by half a pixel": (255 * np.clip(X - 255.25, 0, 1), 255 * np.clip(X - 255.75, 0, 1)),
     "a fainter blue dot of 3 pixels": (PLAIN, with_square(200, 100, 3, (GRAY, GRAY, GRAY + 62))),
     "a blurred edge moved by half a pixel": (255 * ndtr(X - 256.25), 255 * ndtr(X - 255.75)),
     "a faint edge blurred otherwise": (30 * ndtr((X - 256) / 2), 30 * ndtr((X - 256) / 3)),
@@ -172,11 +169,10 @@ def test_every_change_one_way_against_its_definition():
     one, two = (rng.integers(0, 256, (17, 14, 3)).astype(np.float32) for _ in range(2))
     two[3:9, 4:11] = one[3:9, 4:11] + rng.uniform(8, 30, (6, 7, 3))
     luma = (two - one) @ np.float32([0.299, 0.587, 0.114])
-    for ppd, sides in ((67, range(2, 9)), (20, range(2, 3)), (100, range(3, 13))):
+    for ppd, sides in ((67, range(3, 9)), (20, range(3, 4)), (100, range(5, 13))):
         scale = max(1, ppd / 67)
-        weights = {side: (side / scale - 1) / 2 * (31 / 32 if side < 3 * scale else 1) for side in sides}
         value = max(
-            (sign * kind[y : y + side, x : x + side]).min() * weights[side]
+            (sign * kind[y : y + side, x : x + side]).min() * (side / scale - 1) / 2
             for kind in (luma, *np.moveaxis((two - one) / 2, -1, 0))
             for sign in (1, -1)
             for side in sides
@@ -187,17 +183,15 @@ def test_every_change_one_way_against_its_definition():
 
 
 def test_an_edge_that_moves_by_half_a_pixel_is_within_the_bound_however_wide_it_is_blurred():
-    """The bound is that of a Gaussian of (side − 1)/2 pixels, in squares of every side; of 2 × 2, that of a box."""
+    """The bound is that of a width of (side − 1)/2 pixels, in squares of every side."""
     steps = np.arange(64.0)[None]
     for width in (0.3, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 5.0):
         for place in (31.5, 31.75, 32.0):
             one, two = (np.repeat(255 * ndtr((steps - place - x) / width), 9, 0)[..., None] for x in (0.25, -0.25))
             value = one_way_change(one, two, 67.0).value
             assert value < 30.9
-            if 2 * width in range(2, 8) and place == (32.0 if 2 * width % 2 == 0 else 31.5):
+            if width in (1.0, 1.5, 2.0, 2.5, 3.0, 3.5) and place == (32.0 if 2 * width % 2 == 0 else 31.5):
                 assert value > 30.8
-            one, two = (np.repeat(255 * np.clip(steps - place - x, 0, 1), 9, 0)[..., None] for x in (0.25, -0.25))
-            assert one_way_change(one, two, 67.0).value < 31
 
 
 def test_images_smaller_than_a_window():

@@ -86,6 +86,7 @@ def project(pair, tmp_path):
 
 
 def check(python, project, environment):
+    environment = environment | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
     done = subprocess.run(
         [python, "-c", PROGRAM, *ABSENT], cwd=project, env=environment, capture_output=True, text=True
     )

@@ -609,6 +609,18 @@ def test_rare_events_are_no_evidence_against_a_side_that_does_not_know_its_noise
     assert welch(beside(far, np.full_like(mean, 1e-9)), beside(mean, variance), **how).verdict is DIFFERENT
 
 
+@pytest.mark.parametrize(("count", "verdict"), [(1, INCONCLUSIVE), (3, INCONCLUSIVE), (4, DIFFERENT), (16, DIFFERENT)])
+def test_a_tile_whose_noise_comes_from_fewer_than_four_pixels_is_no_evidence(count, verdict):
+    """`count` pixels have all the variance of a tile, nearly all on one side, and differ by 30 standard errors."""
+    mean, variance = full(1.0, 1e-9, shape=(16, 16, 1))
+    variance.flat[:count] = 1.0
+    other = mean.copy()
+    other.flat[:count] += 30 / 1000**0.5
+    result = welch(beside(mean, 1e-3 * variance), beside(other, variance), spp_reference=1000, spp_test=1000)
+    assert result.verdict is verdict
+    assert ("heavy-tailed" in result.reason) == (verdict is INCONCLUSIVE)
+
+
 @pytest.mark.parametrize(("samples", "verdict"), [(15_000, INCONCLUSIVE), (16_000, DIFFERENT)])
 def test_the_noise_of_a_side_is_well_known_by_16_times_the_samples_of_the_other(samples, verdict):
     """Here 16 pixels are brighter by 0.7 σ of the tile each."""

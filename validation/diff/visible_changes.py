@@ -47,7 +47,7 @@ TERMS = {
     ERROR: "largest of the changes that nobody sees, smallest of those that a person sees",
     LOCAL: "mean in the worst window, its median over the trials",
     THROUGHOUT: "exceeded in all of 0.24 degrees, its median over the trials",
-    ONE_WAY: "of a 3 × 3 square, or its like of another width, its median over the trials",
+    ONE_WAY: "of a 3 × 3 square, or its like of a wider one, its median over the trials",
     BOUND: f"{CONFIDENCE:.0%} upper bound of the share that is called different, exact binomial (Clopper and Pearson)",
     CODES: "the smallest change of a gray square that is called different; none where even white is not",
     PIXELS: "the smallest move of a black edge on white that is called different, in quarters of a pixel",

@@ -36,7 +36,7 @@ PAIRS = (
 NULL_PAIRS = "null pairs, exact", "null pairs, tolerance", "null pairs, paired", "null pairs, flip"
 UNSEEN = (
     *("last bits", "one code", "dithering", "other antialiasing", "less antialiasing"),
-    *("a quarter pixel", "JPEG", "half floats"),
+    *("a quarter pixel", "half a pixel", "JPEG", "noise", "half floats"),
 )
 # By study and metric, for bounds that no case comes near: the subjects of which this is known, and what is excluded.
 EXCLUDES: dict[tuple[str, str], tuple[tuple[str, ...], str]] = {
