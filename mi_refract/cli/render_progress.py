@@ -134,5 +134,6 @@ def parse_seconds(text: str, option: str) -> float:
 
 def shown_error(error: RelativeError) -> str:
     """`0.42 % (0.40 to 0.44 %)`: an estimate and its interval, where there is one; or `at most 0.42 %`."""
-    interval = f" ({100 * error.low:.2g} to {100 * error.high:.2g} %)" if math.isfinite(error.high) else ""
-    return f"{'at most ' * error.at_most}{100 * error.value:.2g} %{interval}"
+    value, low, high = (f"{float(f'{100 * share:.2g}'):g}" for share in (error.value, error.low, error.high))
+    interval = f" ({low} to {high} %)" if math.isfinite(error.high) else ""
+    return f"{'at most ' * error.at_most}{value} %{interval}"

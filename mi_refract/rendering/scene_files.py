@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mi_refract import SCENES
 from mi_refract.io.image_file import one_line
 
 if TYPE_CHECKING:  # they import Dr.Jit and Mitsuba
@@ -43,7 +44,8 @@ def parse_scene(path: str | os.PathLike[str], defines: Mapping[str, str] | None 
 
     path, defines = Path(path), dict(defines or {})
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such scene file")
+        ours = SCENES / path.name
+        raise FileNotFoundError(f"{path}: no such scene file" + f"; the package has {ours}" * ours.is_file())
     if taken := [name for name in TAKEN if name in defines]:
         raise ValueError(f"define {taken[0]!r}: reserved by Mitsuba's parser; expected any name except {TAKEN}")
     with _in_one_line(path):

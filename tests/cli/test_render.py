@@ -11,7 +11,7 @@ import pytest
 from support.renders import GLASS
 
 import mi_refract
-from mi_refract import backend
+from mi_refract import SCENES, backend
 from mi_refract.io.image_file import installed_version, read_exr
 from mi_refract.rendering.pass_plan import scalar_seed_of
 
@@ -96,6 +96,7 @@ def test_the_best_variant_is_the_default(render, scene, monkeypatch, needs_varia
 
 BAD = {
     "no scene": ({"scene": "none.xml"}, (), "none.xml: no such scene file"),
+    "no checkout": ({"scene": "sphere.xml"}, (), f"no such scene file; the package has {SCENES / 'sphere.xml'}"),
     "no variant": ({"variant": "llvm_rgb"}, (), "variant 'llvm_rgb': unknown; expected scalar_rgb"),
     "no folder": ({"output": "none/out.exr"}, (), "is not a folder"),
     "a device": ({"output": "device.exr"}, (), "device.exr: is a device; expected the name of a file"),

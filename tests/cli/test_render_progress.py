@@ -48,6 +48,7 @@ def test_an_error_has_its_interval_where_there_is_one():
     assert shown_error(RelativeError(0.0042, 0.004, 0.0044)) == "0.42 % (0.4 to 0.44 %)"
     assert shown_error(RelativeError(0.0042)) == "0.42 %"
     assert shown_error(RelativeError(0.0042, at_most=True)) == "at most 0.42 %"
+    assert shown_error(RelativeError(1.73, 1.7, 11.2)) == "170 % (170 to 1100 %)"
 
 
 @pytest.fixture

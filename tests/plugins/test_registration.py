@@ -73,7 +73,7 @@ def test_switching_to_a_vectorised_variant_and_back():
 
 
 def example(path, **changes):
-    (code,) = python_blocks(path)
+    code = "".join(python_blocks(path))
     for old, new in changes.values():
         assert old in code
         code = code.replace(old, new)
@@ -87,10 +87,13 @@ def test_the_plugin_in_a_scene(tmp_path, monkeypatch, llvm_variant):
     example(
         DOCS / "how-to/render-with-the-plugin.md",
         output=('"diamond.png"', f'r"{tmp_path}/diamond.png"'),
+        outputs=('f"diamond-', f'rf"{tmp_path}/diamond-'),
         size=('bsdf="refract"', 'bsdf="refract", res=8, spp=1'),
         wait=("mi.render(scene)", "mi.render(scene), write_async=False"),
     )
     assert (tmp_path / "diamond.png").stat().st_size > 0
+    frozen = [np.array(mi.Bitmap(str(path))) for path in sorted(tmp_path.glob("diamond-*.exr"))]
+    assert len(frozen) == 3 and not np.array_equal(frozen[0], frozen[2])  # of different indices
 
 
 def test_the_smallest_scene_of_the_first_page(tmp_path, monkeypatch, llvm_variant):

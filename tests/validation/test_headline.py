@@ -119,8 +119,9 @@ def test_what_was_not_run_is_counted_by_what_would_make_it_run():
     text = answer_to(4, OURS, ABSENT, ABSENT, RENDERER, other)["text"]
     assert text.startswith("4 of 5 measurements: 2 need an NVIDIA GPU")
     assert f"1 needs other renderers, by `{INSTALL}`;" in text and text.endswith("1 has other reasons.")
+    assert answer_to(4, OURS, ABSENT, ABSENT)["text"].startswith("2 of 3 measurements need an NVIDIA GPU")
     second = dataclasses.replace(RENDERER, remedy=RENDERER.remedy.replace("pyglm", "batoid"))
-    both = "2 need other renderers, by `python -m validation renderers --install batoid,pyglm`"
+    both = "2 of 2 measurements need other renderers, by `python -m validation renderers --install batoid,pyglm`"
     assert both in answer_to(4, RENDERER, second)["text"]
     assert "`--profile standard` runs every study" in answer_to(4, OURS, profile="quick")["text"]
 
