@@ -36,7 +36,10 @@ smartquotes = False
 myst_enable_extensions = ["attrs_inline", "colon_fence"]
 myst_heading_anchors = 4
 myst_links_external_new_tab = False
-nb_execution_mode = "off" if os.environ.get("MI_REFRACT_DOCS_EXECUTE") == "off" else "force"
+nb_execution_mode = "force"
+if os.environ.get("MI_REFRACT_DOCS_EXECUTE") == "off":
+    nb_execution_mode = "off"
+    suppress_warnings += ["misc.highlighting_failure"]  # no kernel says that `%%bash` is no Python
 nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 # `%%bash` hands over a hundred bytes at a time, which may end within an escape sequence.
