@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def arrays(mesh: Any) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The vertices (V, 3) of a mesh, and its faces (F, 3): the numbers of their vertices."""
-    vertices = np.array(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)
-    return vertices, np.array(mesh.faces_buffer(), np.int64).reshape(-1, 3)
+def arrays(mesh: Any) -> tuple[NDArray[Any], NDArray[np.uint32]]:
+    """The vertices (V, 3) of a mesh in Mitsuba's precision, and its faces (F, 3): the numbers of their vertices."""
+    return np.array(mesh.vertex_positions_buffer()).reshape(-1, 3), np.array(mesh.faces_buffer()).reshape(-1, 3)
 
 
 def has_normals(mesh: Any) -> bool:

@@ -136,8 +136,7 @@ def diff(
         if page:
             from mi_refract.io.image_file import provenance
 
-            versions = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
-            software = {name: version for name, version in versions.items() if version != "unknown"}
+            software = {key.rpartition(":")[2]: x for key, x in provenance().items() if ":" in key and x != "unknown"}
             page.write(results, software, results.command("diff", *(names or [])), str(json or ""))
     finally:  # a file that cannot be written hides no verdict
         text_reports.print_results(results)

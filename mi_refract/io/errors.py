@@ -73,12 +73,13 @@ def exit_code(
                     os.dup2(null, number)
                     os.close(null)
             setattr(sys, stream, open(number, mode, closefd=False))  # noqa: SIM115 (it lasts as long as the process)
-    buffer = getattr(sys.stdout, "buffer", None)
-    if isinstance(raw := getattr(buffer, "raw", buffer), io.FileIO):
-        setattr(raw, "write", functools.partial(_write_stdout, type(raw).write, raw))  # noqa: B010 (a method, for mypy)
-    for output in (sys.stdout, sys.stderr):  # no character is one that they cannot print
+    for known_as in ("stdout", "stderr"):
+        output = getattr(sys, known_as)
+        buffer = getattr(output, "buffer", None)
+        if isinstance(raw := getattr(buffer, "raw", buffer), io.FileIO):
+            raw.write = functools.partial(_write_named, type(raw).write, raw, known_as)  # type: ignore[method-assign]
         if hasattr(output, "reconfigure") and output.errors in ("strict", "surrogateescape"):
-            output.reconfigure(errors="backslashreplace")
+            output.reconfigure(errors="backslashreplace")  # no character is one that it cannot print
     try:
         code = body() or 0
         sys.stdout.flush()
@@ -119,14 +120,14 @@ def print_traceback(error: BaseException) -> None:
             traceback.print_exception(error)
 
 
-def _write_stdout(write: Callable[[Any, Any], int | None], stdout: Any, content: Any) -> int | None:
+def _write_named(write: Callable[[Any, Any], int | None], stream: Any, name: str, content: Any) -> int | None:
     """`write`, whose errors name what could not be written; what no reader of a pipe is left for is dropped."""
     try:
-        return write(stdout, content)
+        return write(stream, content)
     except BrokenPipeError:
         return len(content)
     except OSError as error:
-        error.filename = "stdout"
+        error.filename = name
         raise
 
 

@@ -1,7 +1,7 @@
 """Tables that users write, TOML or JSON, as `msgspec.Struct`s: unknown keys, types and limits are checked on the way.
 
 A field of a struct is a key: its annotation is the type, `Annotated[float, Meta(gt=0, description="…")]` adds limits
-and what the key means, its default makes it optional. The READMEs' tables of keys come from the same structs.
+and what the key means, its default makes it optional. The documentation's tables of keys come from the same structs.
 Do not put a `pattern` for texts into a union with a list: msgspec 0.22 then frees a wrong pointer at exit.
 """
 

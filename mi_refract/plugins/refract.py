@@ -7,7 +7,7 @@
 | | spectrum | index by wavelength, in spectral variants | `int_ior_n_360`, … | yes |
 | | texture | index by point; for `refract_path`, an attribute that the shape lacks is an error | yes | yes |
 | `eta` | number | int_ior / ext_ior, only by `mi.traverse` | yes | yes |
-| `specular_reflectance`, `specular_transmittance` | number, spectrum, texture | tint of the lobe (1) | yes | yes |
+| `specular_reflectance`, `specular_transmittance` | number, spectrum, texture | tint of the lobe, ≥ 0 (1) | yes | yes |
 | `int_absorption`, `ext_absorption` | number, spectrum | σ of the medium on that side, per length (0) | yes | yes |
 | | `file:…` | k of a file, with `int_absorption_unit` | yes | yes |
 | `int_absorption_unit`, `ext_absorption_unit` | number | the scene's unit of length in metres; no default | no | no |

@@ -147,9 +147,8 @@ def check_attributes(scene: Scene) -> None:
             while textures:
                 texture = textures.pop()
                 textures += children(texture)
-                if texture.class_name() != "MeshAttribute":
-                    continue
-                name = re.search(r'name = "(.*)"', str(texture))  # it shows its name nowhere else
+                # It shows its name nowhere else.
+                name = texture.class_name() == "MeshAttribute" and re.search(r'name = "(.*)"', str(texture))
                 if name and not dr.all(shape.has_attribute(name[1])):
                     raise ValueError(
                         f"refract: {shape_name(shapes, i)} has no attribute {name[1]!r}, which a texture of its BSDF "

@@ -113,7 +113,8 @@ def _parts(shape: Node, surface: Surface, level: int) -> tuple[Triangles, ...]:
         raise shape.error(f"{path}: {error}", "a mesh that Mitsuba reads") from None
     if mitsuba_mesh.has_normals(mesh):
         raise shape.error("smooth normals", "face_normals = true")
-    return (mitsuba_mesh.arrays(mesh),)
+    vertices, faces = mitsuba_mesh.arrays(mesh)
+    return ((vertices.astype(np.float64), faces.astype(np.int64)),)
 
 
 def _frame(shape: Node) -> Vertices:

@@ -9,6 +9,7 @@ import runpy
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -243,7 +244,8 @@ def test_the_workflow_of_the_page_and_the_job_of_this_project(act, environment, 
     steps = read_yaml(blocks(PAGE, "yaml")[0])["jobs"]["images"]["steps"]
     assert [step for step in steps if "run" in step] == [{"run": "./render_all new/"}]
     last = steps[-1]
-    assert re.fullmatch(r"mi-refract/mi_refract/(.*)@\w+", last["uses"])[1] == str(ACTION.relative_to(ROOT))
+    source = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["urls"]["Source"]
+    assert last["uses"] == f"{source.removeprefix('https://github.com/')}/{ACTION.relative_to(ROOT)}@main"
     assert act(1.001, **last["with"]).code == 0
     assert act(1.1, **last["with"]).code == 1
     text = (ROOT / ".github" / "workflows" / "ci.yml").read_text("utf-8")

@@ -40,7 +40,7 @@ def deep():
         (raises(ValueError("size = 0;\n  expected 1 or more")), 2, "it: size = 0; expected 1 or more"),
         (raises(OSError("folder: not writable")), 2, "it: folder: not writable"),
         (raises(FileNotFoundError(2, "No such file or directory", "a.exr")), 2, "it: a.exr: No such file or directory"),
-        (raises(BrokenPipeError(32, "Broken pipe")), 2, "it: Broken pipe"),  # of another pipe than stdout
+        (raises(BrokenPipeError(32, "Broken pipe")), 2, "it: Broken pipe"),  # of a pipe of another program
         (raises(OSError(28, "No space left on device")), 2, "it: No space left on device"),
         (raises(ModuleNotFoundError("No module named 'scipy'")), 2, "it: No module named 'scipy'"),
         (raises(MemoryError()), 2, "it: out of memory"),
@@ -85,6 +85,7 @@ CASES = {
     "equal, nobody reads": ("ab", "| sleep 0", 0, "", ""),
     "different, nobody reads": ("ac", "| sleep 0", 1, "", ""),
     "unbuffered, nobody reads": ("ac", "| sleep 0", 1, "", ""),
+    "warned, nobody reads": (OWN.format("print('x', file=__import__('sys').stderr) or 3"), "2>&1 | sleep 0", 3, "", ""),
     "error, nobody reads": (OWN.format("print('x' * 2**20) or [][1]"), "| sleep 0", 2, "", INDEX),
     "equal, disk full": ("ab", ">/dev/full", 2, "", "mi-refract: stdout: No space left on device"),
     "different, disk full": ("ac", "--github >/dev/full", 2, "", "mi-refract: stdout: No space left on device"),

@@ -1,8 +1,8 @@
 """The table of other renderers and libraries: one folder of systems/ for each, with its `mi-refract-renderer.toml`.
 
-The file says how to install the system, how its functions are run, and how it behaved; README.md in
-`mi_refract.ray_sets` explains its keys. A script that it names is in scripts/, a lock of its packages in locks/, and
-what renders images, where that takes more than a command, in `image_renderers`. Programs under the GPL are run, never
+The file says how to install the system, how its functions are run, and how it behaved; its keys are those of
+`mi_refract.ray_sets.renderer_file`. A script that it names is in scripts/, a lock of its packages in locks/, and what
+renders images, where that takes more than a command, in `image_renderers`. Programs under the GPL are run, never
 imported nor redistributed.
 """
 
