@@ -21,15 +21,14 @@ def main(arguments: list[str] | None = None) -> int:
         end_at_once(even_if_ignored=rendering)
     from mi_refract.io.errors import exit_code
 
-    return exit_code("mi-refract", lambda: _run(arguments))
+    def run() -> int:
+        if arguments == ["--version"]:  # importing the parser takes ten times as long as all the rest of this
+            from mi_refract import __version__
 
+            print(__version__)
+            return 0
+        from .app import main
 
-def _run(arguments: list[str]) -> int:
-    if arguments == ["--version"]:  # importing the parser takes ten times as long as all the rest of this
-        from mi_refract import __version__
+        return main(arguments)
 
-        print(__version__)
-        return 0
-    from .app import main
-
-    return main(arguments)
+    return exit_code("mi-refract", run)
