@@ -21,14 +21,15 @@ def main(arguments: list[str] | None = None) -> int:
         end_at_once(even_if_ignored=rendering)
     from mi_refract.io.errors import exit_code
 
-    def run() -> int:
-        if arguments == ["--version"]:  # importing the parser takes ten times as long as all the rest of this
-            from mi_refract import __version__
+    return exit_code("mi-refract", lambda: _run(arguments))
 
-            print(__version__)
-            return 0
-        from .app import main
 
-        return main(arguments)
+def _run(arguments: list[str]) -> int:
+    if arguments == ["--version"]:  # importing the parser takes ten times as long as all the rest of this
+        from mi_refract import __version__
 
-    return exit_code("mi-refract", run)
+        print(__version__)
+        return 0
+    from .app import main
+
+    return main(arguments)
