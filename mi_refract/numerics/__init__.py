@@ -4,10 +4,11 @@ In: floats, numpy arrays or Dr.Jit arrays. Out: sums and products with their exa
 three words, and operations that make Dr.Jit's arrays behave alike on every backend.
 
 `error_free` and `float_expansions` are modules that each have a `dot`, `cross` and `two_prod`: the first for the
-formulas, in the precision of the arrays, the second for the code that checks them, in float64.
+formulas, in the precision of the arrays, the second for the code that checks them, in float64. `mitsuba_mesh` reads and
+makes Mitsuba's meshes, whose layout no other file knows.
 """
 
-from . import error_free, float_expansions
+from . import error_free, float_expansions, mitsuba_mesh
 from .drjit_arrays import (
     BSDF,
     ArrayType,
@@ -73,6 +74,7 @@ __all__ = [
     "float_expansions",
     "from_numpy",
     "ieee_divide",
+    "mitsuba_mesh",
     "replace_grad",
     "scale_to_unit",
     "two_prod",

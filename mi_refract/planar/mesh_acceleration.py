@@ -24,9 +24,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract import mitsuba_mesh
 from mi_refract.backend import activate
-from mi_refract.numerics import Mask, Number
+from mi_refract.numerics import Mask, Number, mitsuba_mesh
 
 from .array_backend import ArrayBackend, Index, Scatter, Table, Vector2, Vertices, negated
 from .intersect import NOWHERE, Hit, LineSegments, Ray, Start

@@ -23,10 +23,10 @@ import mitsuba as mi
 import mitsuba.mitsuba_ext
 import numpy as np
 
-from mi_refract import media, mitsuba_mesh
+from mi_refract import media
 from mi_refract.formulas import FORMULAS
 from mi_refract.io import image_file, safe_files
-from mi_refract.numerics import Properties, Scene
+from mi_refract.numerics import Properties, Scene, mitsuba_mesh
 
 from .index_parameter import PLUGIN
 from .refract_path import INTEGRATOR

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import mitsuba as mi
 import numpy as np
 
-from mi_refract import mitsuba_mesh
 from mi_refract.formulas import FORMULAS
+from mi_refract.numerics import mitsuba_mesh
 from mi_refract.plugins import PLUGIN, read_ior, scene_parser
 
 from . import tessellation

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from support.glass_scenes import refusal, sampled, surface, vector
 
-from mi_refract import mitsuba_mesh
 from mi_refract.formulas import FORMULAS, fresnel
+from mi_refract.numerics import mitsuba_mesh
 
 TINTED = {"int_ior": 1.5, "ext_ior": 1.0, "specular_reflectance": 0.3, "specular_transmittance": 0.6}
 REFLECTED, TRANSMITTED = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission

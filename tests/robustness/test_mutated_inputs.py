@@ -26,10 +26,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.variants import switch
 
-from mi_refract import mitsuba_mesh, oracle
+from mi_refract import oracle
 from mi_refract.image_diff import folders, settings
 from mi_refract.image_diff.results import Status
 from mi_refract.io import errors, image_file
+from mi_refract.numerics import mitsuba_mesh
 from mi_refract.planar import scene_file
 from mi_refract.plugins import scene_parser
 from mi_refract.ray_sets import check_answers, files, ray_set, renderer_file

@@ -26,7 +26,7 @@ import drjit as dr
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from mi_refract import mitsuba_mesh
+from mi_refract.numerics import mitsuba_mesh
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run.context import SCENES, Context

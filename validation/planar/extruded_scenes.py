@@ -17,7 +17,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract import mitsuba_mesh
+from mi_refract.numerics import mitsuba_mesh
 from mi_refract.planar import Event, Paths, Segments
 from mi_refract.planar.curves import points
 from mi_refract.plugins import PLUGIN

@@ -25,7 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refract import mitsuba_mesh
+from mi_refract.numerics import mitsuba_mesh
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run.context import Context
