@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 def arrays(mesh: Any) -> tuple[NDArray[Any], NDArray[np.uint32]]:
     """The vertices (V, 3) of a mesh in Mitsuba's precision, and its faces (F, 3): the numbers of their vertices."""
+    import numpy as np
+
     return np.array(mesh.vertex_positions_buffer()).reshape(-1, 3), np.array(mesh.faces_buffer()).reshape(-1, 3)
 
 
@@ -32,6 +36,7 @@ def make(
     `properties`: Mitsuba's `Properties` with its BSDF, emitter and flags.
     """
     import mitsuba as mi
+    import numpy as np
 
     smooth, more = normals is not None, {} if properties is None else {"props": properties}
     mesh = v.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=smooth, **more)
