@@ -9,4 +9,5 @@ __all__ = [
     "fast_reference",
     "optical_systems",
     "planar_retrace",
+    "standard_numbers",
 ]
