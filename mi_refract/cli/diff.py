@@ -21,6 +21,7 @@ from mi_refract.image_diff import folders, pairing, text_reports
 from mi_refract.image_diff.methods import AUTO, METHODS
 from mi_refract.image_diff.results import Status
 from mi_refract.image_diff.settings import FILE, Settings, from_words, key_tables, load, nearest
+from mi_refract.io import reference_pack
 from mi_refract.io.errors import MISUSE
 from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.safe_files import writable
@@ -111,7 +112,7 @@ def diff(
     for path, suffixes in ((report, (".html", ".htm")), (junit, (".xml",)), (json, (".json",))):
         if path:
             writable(path, suffixes)
-    page = None
+    pack, page = reference_pack.of_references(reference, test), None
     if report:
         from mi_refract.image_diff.html_report import Page
 
@@ -132,7 +133,7 @@ def diff(
         if junit or json:
             from mi_refract.image_diff import results_file
 
-            results_file.write(results, junit, json)
+            results_file.write(results, junit, json, pack)
         if page:
             from mi_refract.io.image_file import provenance
 

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mi_refract.formulas import TEXTBOOK_BACKWARD
+from mi_refract.io import reference_pack
 from mi_refract.io.image_file import provenance
 from mi_refract.io.safe_files import writable
 from mi_refract.io.text import printable
@@ -25,6 +26,7 @@ from mi_refract.regimes import REGIMES
 from .interrupts import as_exceptions
 
 if TYPE_CHECKING:
+    from mi_refract.io.reference_pack import PackReference
     from mi_refract.ray_sets.check_answers import Findings
 
 app = typer.Typer(
@@ -132,7 +134,8 @@ def check(
     Exit code 0: every answer is within the error bound, though not all may be right; 1: some are wrong; 2: the answers
     do not match the rays.
     """
-    checked, write = _checker(context, tir, formula, backward, table, report, junit, json)
+    pack = reference_pack.of_references(file, answers) if file else None
+    checked, write = _checker(context, tir, formula, backward, table, report, junit, json, pack)
     rays = files.read(file) if file else ray_set.make()
     findings = checked(rays, files.read_answers(answers, most=files.most_answers(rays)), str(answers))
     raise typer.Exit(write({str(answers): findings}))
@@ -187,7 +190,8 @@ def run(
     do not match the rays, or the command fails or exceeds its time limit. With --renderer, the largest exit code of its
     functions.
     """
-    checked, write = _checker(context, tir, formula, backward, table, report, junit, json)
+    pack = reference_pack.of_references(file) if file else None
+    checked, write = _checker(context, tir, formula, backward, table, report, junit, json, pack)
     for name in (*CHOOSING, *([] if renderer else ["precision"])) if file else ():
         if getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE":
             option = f"--{name.replace('_', '-')}"
@@ -224,10 +228,11 @@ def _checker(
     report: Path | None,
     junit: Path | None,
     json: Path | None,
+    pack: PackReference | None,
 ) -> tuple[Callable[..., Findings], Callable[[dict[str, Findings]], int]]:
     """`checked(rays, answers, title, tir="auto")`: check the answers and print the findings.
 
-    `tir` there is the declared signal, which an option overrides. The second function, `write(checks)`, writes the
+    `tir` there is the declared signal, which an option overrides. `pack`: that the rays are from. The second function, `write(checks)`, writes the
     reports of all findings, by title; the largest exit code. ValueError or OSError, before anything runs, for an option
     that cannot be met.
     """
@@ -254,12 +259,13 @@ def _checker(
         return found
 
     def write(checks: dict[str, Findings]) -> int:
+        replay = shlex.join(["mi-refract", *context.obj])
         if report:
-            reports.write_html(report, checks, provenance(), shlex.join(["mi-refract", *context.obj]))
+            reports.write_html(report, checks, provenance(), replay)
         if junit:
             reports.write_junit(junit, checks)
         if json:
-            reports.write_json(json, checks)
+            reports.write_json(json, checks, pack, replay)
         return max(findings.exit_code for findings in checks.values())
 
     return checked, write

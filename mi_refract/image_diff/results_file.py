@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from mi_refract.io import safe_files
+from mi_refract.io.reference_pack import PackReference
 from mi_refract.io.text import json_text, printable
 from mi_refract.io.typed_table import convert
 from mi_refract.report import documents
@@ -78,7 +79,7 @@ class Entry(msgspec.Struct):
     reference: Annotated[_PathText | None, _doc("null: only among the new images")]
     test: Annotated[_PathText | None, _doc("null: only among the references")]
     target: Annotated[_PathText, _doc("where the reference is, or would be")]
-    digests: Annotated[Digests | None, _doc("null for an equal image, for an unreadable file and with --renders")]
+    digests: Annotated[Digests | None, _doc("null for an unreadable file and with --renders")]
     method: str
     method_why: Annotated[str, _doc("why `auto` chose this method")]
     options: Annotated[dict[str, Any], _doc("the options of the method that were set")]
@@ -107,6 +108,7 @@ class Document(msgspec.Struct):
     renders: Annotated[bool, _doc("--renders: each folder holds renders of one image")]
     counts: Annotated[dict[Status, int], _doc("images of each status")]
     results: list[Entry]
+    pack: Annotated[PackReference | None, _doc("the reference pack that the references are from; null: none")]
 
 
 def json_schema() -> str:
@@ -118,7 +120,9 @@ def json_schema() -> str:
 # Writing ------------------------------------------------------------------------------------------------------------
 
 
-def write(results: Results, junit: Path | None = None, data: Path | None = None) -> None:
+def write(
+    results: Results, junit: Path | None = None, data: Path | None = None, pack: PackReference | None = None
+) -> None:
     """Write JUnit's XML, and the JSON in `data`. OSError where a file cannot be written.
 
     JUnit has a case for each image: "different" is a failure, "inconclusive" too unless it is to pass, no verdict an
@@ -128,7 +132,8 @@ def write(results: Results, junit: Path | None = None, data: Path | None = None)
         entries = [_json_entry(result, results) for result in results.results]
         counts = {status: len(results.of(status)) for status in Status}
         paths, code = (str(results.reference), str(results.test)), results.exit_code
-        document = Document(SCHEMA, code, text_reports.sentence(results), *paths, results.renders, counts, entries)
+        sentence = text_reports.sentence(results)
+        document = Document(SCHEMA, code, sentence, *paths, results.renders, counts, entries, pack)
         write_strict_json(data, msgspec.to_builtins(document))
     if junit:
         cases = [_junit_case(result, results) for result in results.results]
@@ -170,7 +175,7 @@ def _junit_case(result: Result, results: Results) -> documents.Case:
 
 def _json_entry(result: Result, results: Results) -> Entry:
     comparison, how, digests = result.comparison, result.how, None
-    if result.digests is not None and result.status in FAILED:  # of what was compared; "" where there is no file
+    if result.digests is not None:  # of what was compared; "" where there is no file
         one, two = (result.digests[path] if path else "" for path in (result.reference, result.test))
         digests = Digests(one, two, [result.digests[path] for path in result.variants])
     reference, test, matched = (str(x) if x else None for x in (result.reference, result.test, result.matched))

@@ -4,4 +4,4 @@ In: paths, pixels, commands, tables of TOML. Out: files that are complete or not
 output of other programs, checked values; errors are one line that says what, where, and what was expected.
 """
 
-__all__ = ["errors", "image_file", "process_group", "safe_files", "text", "typed_table"]
+__all__ = ["errors", "image_file", "process_group", "reference_pack", "safe_files", "text", "typed_table"]

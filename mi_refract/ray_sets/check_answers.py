@@ -100,6 +100,8 @@ class Findings:
     explanations: tuple[Explanation, ...]  # of wrong answers
     header: Header  # of the rays
     ratio: RatioDifference | None = None  # where answers say which ratio was used
+    most_backward: float = np.inf  # in u: the largest backward error of an answer that is not wrong
+    digest: str = ""  # of the answers
 
     def total(self, name: str) -> int:
         """The sum of a count of `RegimeErrors` over the regimes."""
@@ -233,6 +235,8 @@ def check(
         explanations=tuple(explanations),
         header=header,
         ratio=ratio,
+        most_backward=most_backward,
+        digest=answers.digest,
     )
 
 

@@ -12,6 +12,7 @@ back exactly in float32.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import re
@@ -81,14 +82,19 @@ def write(path: str | Path, rays: RaySet) -> Path:
     if headers.has_media(rays.header):
         wavelength, medium = headers.columns(rays.header, rays.ids).T
         arrays |= {"wavelength": wavelength.astype(rays.rays.k.dtype), "medium": medium.astype(np.int64)}
+    write_atomically(path, npz({**arrays, "header": np.array(json.dumps(rays.header))}))
+    return path
+
+
+def npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """An .npz file of these arrays by name. The same arrays give the same bytes."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
-        for name, array in {**arrays, "header": np.array(json.dumps(rays.header))}.items():
-            # A ZipInfo made here has a fixed date: the same set gives the same bytes.
+        for name, array in arrays.items():
+            # A ZipInfo made here has a fixed date.
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as file:
                 np.lib.format.write_array(file, np.asanyarray(array), allow_pickle=False)
-    write_atomically(path, buffer.getvalue())
-    return path
+    return buffer.getvalue()
 
 
 def as_csv(rays: RaySet) -> str:
@@ -140,9 +146,10 @@ def read_answers(path: str | Path, *, most: int = MOST_RAYS) -> Answers:
 
 def parse_answers(text: str | bytes, name: str = "answers") -> Answers:
     """The answers in the text of a CSV file. ValueError, one line that begins with `name`, where it holds none."""
-    stream = io.BytesIO(text.encode() if isinstance(text, str) else text)
+    content = text.encode() if isinstance(text, str) else text
     try:
-        return _answers(_read_csv(stream, ANSWER_LAYOUTS, MOST_RAYS))
+        table = _read_csv(io.BytesIO(content), ANSWER_LAYOUTS, MOST_RAYS)
+        return _answers(table._replace(digest=hashlib.sha256(content).hexdigest()))
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
 
@@ -163,7 +170,7 @@ def _answers(table: Table) -> Answers:
     if ratios is not None and len(wrong := ratios[~((ratios >= LEAST_RATIO) & (ratios <= 1 / LEAST_RATIO))]):
         text = f"{N_RATIO} is {wrong[0]:g} for {len(wrong)} rays"
         raise ValueError(f"{text}; expected n_from / n_to, {LEAST_RATIO:g} … {1 / LEAST_RATIO:g}")
-    return Answers(ids.astype(np.int64), table.numbers[:, 1:4], transmitted, table.header, ratios)
+    return Answers(ids.astype(np.int64), table.numbers[:, 1:4], transmitted, table.header, ratios, table.digest)
 
 
 def answers_of(
@@ -203,11 +210,15 @@ def answers_of(
 
 
 class Table(NamedTuple):
-    """A header, empty where there is none; the names of the columns; their numbers (N, columns), float64."""
+    """A header, empty where there is none; the names of the columns; their numbers (N, columns), float64.
+
+    `digest`: SHA-256 of the bytes that were read; "" where it is not known.
+    """
 
     header: Header
     columns: Layout
     numbers: Array
+    digest: str = ""
 
 
 def _read(path: Path, layouts: Sequence[Layout], most: int, made: Callable[[Table], T]) -> T:
@@ -221,8 +232,10 @@ def _read(path: Path, layouts: Sequence[Layout], most: int, made: Callable[[Tabl
     numbers = most * _NUMBER_BYTES * max(map(len, layouts))
     largest = numbers + _NPZ_MORE_BYTES if suffix == ".npz" else most * _ROW_BYTES + _TOP_BYTES
     with safe_files.opened(path, largest) as stream:
+        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        stream.seek(0)
         try:
-            return made(_READERS[suffix](stream, layouts, most))
+            return made(_READERS[suffix](stream, layouts, most)._replace(digest=digest))
         except ValueError as error:
             raise ValueError(f"{path}: {one_line(str(error))}") from None
 

@@ -93,6 +93,7 @@ class Answers:
 
     `transmitted`: of True and False, or of 1 and 0.
     `n_ratio`: (N,) the n_from / n_to that the program used, if it reports it.
+    `digest`: SHA-256 of the file, or of what the program printed; "" of arrays.
     """
 
     ids: Ids
@@ -100,6 +101,7 @@ class Answers:
     transmitted: NDArray[Any] | None = None
     header: Header = field(default_factory=dict)
     n_ratio: Array | None = None
+    digest: str = ""
 
     def __post_init__(self) -> None:
         """ValueError where the shapes do not match, and for a `transmitted` that is neither 0 nor 1."""
@@ -112,9 +114,9 @@ class Answers:
             object.__setattr__(self, "transmitted", self.transmitted.astype(bool))  # `~` of an integer is another one
 
     def __getitem__(self, rows: Rows) -> Answers:
-        """Some of the answers, under the same header."""
+        """Some of the answers, under the same header and digest."""
         columns = [None if column is None else column[rows] for column in (self.transmitted, self.n_ratio)]
-        return Answers(self.ids[rows], self.b[rows], columns[0], self.header, columns[1])
+        return Answers(self.ids[rows], self.b[rows], columns[0], self.header, columns[1], self.digest)
 
 
 def default(media: Sequence[str] = ()) -> tuple[str, ...]:

@@ -9,6 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import msgspec
+
+from mi_refract import __version__
 from mi_refract.io.text import compact, printable
 from mi_refract.regimes import REGIMES
 from mi_refract.report import documents
@@ -23,6 +26,8 @@ from .tir_signal import NONE, UNCLEAR
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+
+    from mi_refract.io.reference_pack import PackReference
 
 SCHEMA = 1
 STYLES = {"wrong": "bold red", "within bound": "yellow", "right": "", "exact": "green"}
@@ -193,7 +198,9 @@ def as_data(findings: Findings) -> dict[str, Any]:
         "precision": findings.precision,
         "ulp": findings.ulp,
         "error_bound": findings.error_bound,
+        "backward_error": findings.most_backward,
         "total_internal_reflection": {"signal": findings.tir, "detected": not findings.tir_given},
+        "answers_sha256": findings.digest,
         "answered": findings.answered,
         "wrong": findings.wrong,
         "right": findings.right,
@@ -206,15 +213,19 @@ def as_data(findings: Findings) -> dict[str, Any]:
     }
 
 
-def write_json(path: str | Path, checks: Mapping[str, Findings]) -> None:
-    """Write `{"schema": 1, "exit_code", "functions": [{"title", …}, …]}` as strict JSON, with the entries of `as_data`.
+def write_json(
+    path: str | Path, checks: Mapping[str, Findings], pack: PackReference | None = None, replay: str = ""
+) -> None:
+    """Write `{"schema": 1, "exit_code", …, "functions": [{"title", …}, …]}` as strict JSON; see `as_data`.
 
-    `checks`: findings by the title of the function; the exit code is the largest. NaN and the infinities become words.
-    OSError where that fails.
+    `checks`: findings by the title of the function; the exit code is the largest. `pack`: that the rays are from, null
+    where they are from none. `replay`: the command that repeats the checks, with `version` of mi_refract. NaN and the
+    infinities become words. OSError where that fails.
     """
     functions = [{"title": title} | as_data(findings) for title, findings in checks.items()]
     exit_code = max(findings.exit_code for findings in checks.values())
-    write_strict_json(path, {"schema": SCHEMA, "exit_code": exit_code, "functions": functions})
+    made = {"version": __version__, "command": replay, "pack": pack and msgspec.structs.asdict(pack)}
+    write_strict_json(path, {"schema": SCHEMA, "exit_code": exit_code} | made | {"functions": functions})
 
 
 def write_junit(path: str | Path, checks: Mapping[str, Findings]) -> None:

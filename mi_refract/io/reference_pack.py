@@ -1,0 +1,109 @@
+"""The reference pack that `python -m validation pack` writes: its index, and proof that nobody changed its files.
+
+An unpacked pack is a folder with the file INDEX, which holds the SHA-256 of every other file but SUMS. SUMS says the
+same for `sha256sum --check`, and that of INDEX, which identifies the pack.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from . import safe_files
+from .typed_table import convert
+
+INDEX, SUMS = "mi-refract-pack.json", "SHA256SUMS"
+FORMAT = "mi_refract pack 1"
+MOST = 2**24  # bytes of either
+EXPECTED = "expected the pack as it was published"
+
+Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", description="SHA-256")]
+
+
+def _doc(meaning: str) -> Meta:
+    return Meta(description=meaning)
+
+
+class PackedFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A file of a pack."""
+
+    sha256: Digest
+    content: Annotated[str, _doc("what it holds")]
+    schema: Annotated[str, _doc("of a JSON file: the file with its JSON Schema")] = ""
+
+
+class PackIndex(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The content of INDEX."""
+
+    format: Annotated[Literal["mi_refract pack 1"], _doc("the format, and its version")]
+    version: Annotated[str, _doc("version of mi_refract that wrote the pack")]
+    quick: Annotated[bool, _doc("made with --quick: few rays, small images")]
+    made_with: Annotated[dict[str, str], _doc("everything that the bytes depend on, by name")]
+    files: Annotated[dict[str, PackedFile], _doc("every other file but SHA256SUMS, by its path with slashes")]
+
+
+class PackReference(msgspec.Struct, frozen=True):
+    """The pack that references are from, as results name it."""
+
+    version: Annotated[str, _doc("version of mi_refract that wrote the pack")]
+    sha256: Annotated[Digest, _doc(f"of the pack's {INDEX}, which holds that of every file")]
+    path: Annotated[str, _doc("of the references in the pack")]
+
+
+def sums(index: bytes, files: dict[str, PackedFile]) -> str:
+    """The text of SUMS for an index with these bytes and files."""
+    digests = {name: file.sha256 for name, file in files.items()} | {INDEX: hashlib.sha256(index).hexdigest()}
+    return "".join(f"{digest}  {name}\n" for name, digest in sorted(digests.items()))
+
+
+def of_references(reference: Path, answers: Path | None = None) -> PackReference | None:
+    """The pack that holds a file or folder of references; None where no pack does.
+
+    Every file of the pack is read. ValueError, one line, where one is missing, damaged or edited, the pack has another
+    format, a reference is no file of it, or `answers` lie in or below a folder with the INDEX of another pack. OSError
+    where a file cannot be read.
+    """
+    if (root := _root(reference)) is None:
+        return None
+    path = root / INDEX
+    text = safe_files.read_bytes(path, MOST)
+    index = _parsed(text, path)
+    for name, file in index.files.items():
+        if not (root / name).is_file():
+            raise ValueError(f"{root / name}: missing, or not a file; {EXPECTED}")
+        with safe_files.opened(root / name, sys.maxsize) as stream:
+            if hashlib.file_digest(stream, "sha256").hexdigest() != file.sha256:
+                raise ValueError(f"{root / name}: damaged or edited: its SHA-256 is not that of {INDEX}; {EXPECTED}")
+    if not (root / SUMS).is_file() or safe_files.read_bytes(root / SUMS, MOST) != sums(text, index.files).encode():
+        raise ValueError(f"{root / SUMS}: not the digests of {INDEX}, one of them was edited; {EXPECTED}")
+    place = reference.resolve()
+    for each in [place] if place.is_file() else sorted(place.rglob("*")):
+        name = each.relative_to(root).as_posix()
+        if each.is_file() and name not in {*index.files, INDEX, SUMS}:
+            raise ValueError(f"{each}: not a file of the pack {root}; expected answers in another folder")
+    other = answers and _root(answers)
+    if other and safe_files.read_bytes(other / INDEX, MOST) != text:
+        raise ValueError(f"{answers}: answers to another pack: {other / INDEX} differs from {path}")
+    return PackReference(index.version, hashlib.sha256(text).hexdigest(), place.relative_to(root).as_posix())
+
+
+def _root(path: Path) -> Path | None:
+    """The nearest folder, at `path` or above it, that holds an INDEX."""
+    place = path.resolve()
+    return next((folder for folder in (place, *place.parents) if (folder / INDEX).is_file()), None)
+
+
+def _parsed(text: bytes, path: Path) -> PackIndex:
+    try:
+        data = json.loads(text)
+    except (ValueError, RecursionError):
+        raise ValueError(f"{path}: damaged: not JSON; {EXPECTED}") from None
+    if (found := data.get("format") if isinstance(data, dict) else None) != FORMAT:
+        raise ValueError(f"{path}: a pack of another version: format {str(found)[:60]!r}; expected {FORMAT!r}")
+    return convert(data, PackIndex, str(path))

@@ -1,0 +1,66 @@
+/* Judges answers to the rays of this pack as `mi-refract rays check` does. C99; link with -lm. */
+#include <math.h>
+
+typedef struct { double id, a[3], n[3], n_from, n_to; } Ray;            /* a row of rays/f32.csv, rays/f64.csv */
+typedef struct { double id, transmitted, b[3], b_low[3], angle_limit, length_limit, decided; } Certified;
+typedef enum { WRONG, WITHIN_BOUND, RIGHT } Verdict;
+typedef long double Real;                                               /* exact to 1e-19 where it has 80 bits */
+
+static const double BACKWARD_LIMIT = 8;                                 /* in units of roundoff u */
+
+static Real dot(const Real *p, const Real *q) { return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]; }
+
+static Real cross(const Real *p, const Real *q, Real *r) {              /* r = p × q; its length */
+    for (int i = 0; i < 3; i++)
+        r[i] = p[(i + 1) % 3] * q[(i + 2) % 3] - p[(i + 2) % 3] * q[(i + 1) % 3];
+    return sqrtl(dot(r, r));
+}
+
+static Real unit(const double *v, Real *r) {                            /* r = v/|v|; |v| */
+    Real wide[3] = {v[0], v[1], v[2]}, length = sqrtl(dot(wide, wide));
+    for (int i = 0; i < 3; i++)
+        r[i] = wide[i] / length;
+    return length;
+}
+
+/* The least relative change of a, n and k for which the answer is exact. All vectors are unit. */
+static Real backward_error(const Real *a, const Real *n, Real k, const Real *b, int transmitted) {
+    Real axis[3], w[3], defect[3];
+    Real cosine = dot(a, n), sine = cross(n, a, axis), e = k * sine;
+    if (!transmitted) {                                                 /* until the decision is the other one */
+        Real step = fabsl(1 - e * e) / (2 * e * (2 * k * fabsl(cosine) + e));
+        return fminl(step, fabsl(asinl(1 / k) - atan2l(sine, fabsl(cosine))) / 2);
+    }
+    for (int i = 0; i < 3; i++)
+        w[i] = k * a[i] - b[i];                                         /* Snell's law: n × w = 0 */
+    Real size = cross(n, w, defect), gamma = fabsl(dot(n, w));
+    Real along = sine > 0 ? fabsl(dot(defect, axis)) / sine : 0, across = sqrtl(fmaxl(size * size - along * along, 0));
+    Real worst = -dot(n, b) * ((cosine > 0) - (cosine < 0));            /* on the wrong side n must turn by so much */
+    for (int i = 0; i <= 32; i++) {
+        Real turn = i * acosl(-1) / 64, x = cosl(turn), y = sinl(turn);
+        worst = fmaxl(worst, (along * x + across * y) / (k * sqrtl(cosine * cosine * x * x + y * y) + gamma + e * x));
+    }
+    return worst;
+}
+
+/* `b`, `transmitted`: the answer; b does not count where all is reflected. `u`: 0x1p-24 of f32, 0x1p-53 of f64. */
+static Verdict judge(const Ray *ray, const Certified *certified, const double *b, int transmitted, double u) {
+    Real a[3], n[3], found[3], exact[3], axis[3], k = (Real)ray->n_from / ray->n_to;
+    Real of_a = unit(ray->a, a), length = unit(b, found), off = fminl(fabsl(length - 1), fabsl(length / of_a - 1));
+    unit(ray->n, n);
+    if (transmitted != certified->transmitted) {
+        if (certified->decided)
+            return WRONG;
+    } else if (transmitted) {
+        for (int i = 0; i < 3; i++)
+            exact[i] = (Real)certified->b[i] + certified->b_low[i];
+        Real angle = atan2l(cross(found, exact, axis), dot(found, exact));
+        if (!(angle <= certified->angle_limit && off <= certified->length_limit)) /* so is NaN */
+            return WRONG;
+    }
+    if (!transmitted && !certified->transmitted)
+        return RIGHT;
+    if (transmitted && !(off * (2 + off) / (4 * (2 * k + 1)) <= BACKWARD_LIMIT * u)) /* of the length: |b|² − 1 */
+        return WITHIN_BOUND;
+    return backward_error(a, n, k, found, transmitted) <= BACKWARD_LIMIT * u ? RIGHT : WITHIN_BOUND;
+}
