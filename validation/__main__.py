@@ -1,4 +1,4 @@
-"""`python -m validation [STUDY …] [--profile quick|standard|full] [--out DIR]`, or `python -m validation renderers …`.
+"""`python -m validation [STUDY …] [--profile quick|standard|full] [--out DIR]`, or `… renderers|pack …`.
 
 Exit code 0 where every budget held, 1 where one was broken, 2 for misuse and errors, 130 where it was interrupted.
 """
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mi_refract.cli import interrupts
 from mi_refract.cluster.connection import ClusterTarget
 from mi_refract.io import safe_files
 from mi_refract.io.text import printable
@@ -65,10 +66,18 @@ def main(arguments: list[str] | None = None) -> int:
         from validation.suite.renderers import command
 
         return command.main(words[1:])
+    if words[:1] == ["pack"]:
+        from validation.pack import command as pack
+
+        if arguments is None:  # while Mitsuba renders, Ctrl-C would end that only
+            interrupts.end_at_once(even_if_ignored=False)
+        return pack.main(words[1:])
     return command_line.exit_code(app, "validation", words)
 
 
-@app.command(epilog="`python -m validation renderers` lists and installs other renderers.")
+@app.command(
+    epilog="`python -m validation renderers` lists and installs other renderers; `pack` writes the reference pack."
+)
 def _command(
     studies: Annotated[
         list[str] | None,

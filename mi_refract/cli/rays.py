@@ -232,9 +232,9 @@ def _checker(
 ) -> tuple[Callable[..., Findings], Callable[[dict[str, Findings]], int]]:
     """`checked(rays, answers, title, tir="auto")`: check the answers and print the findings.
 
-    `tir` there is the declared signal, which an option overrides. `pack`: that the rays are from. The second function, `write(checks)`, writes the
-    reports of all findings, by title; the largest exit code. ValueError or OSError, before anything runs, for an option
-    that cannot be met.
+    `tir` there is the declared signal, which an option overrides. `pack`: that the rays are from. The second function,
+    `write(checks)`, writes the reports of all findings, by title; the largest exit code. ValueError or OSError, before
+    anything runs, for an option that cannot be met.
     """
     needed = ("flint", "jinja2") if report else ("flint",)
     if not all(map(importlib.util.find_spec, needed)):

@@ -19,7 +19,7 @@ from . import safe_files
 from .typed_table import convert
 
 INDEX, SUMS = "mi-refract-pack.json", "SHA256SUMS"
-FORMAT = "mi_refract pack 1"
+FORMAT: Literal["mi_refract pack 1"] = "mi_refract pack 1"
 MOST = 2**24  # bytes of either
 EXPECTED = "expected the pack as it was published"
 

@@ -36,7 +36,7 @@ int main(int count, char **names) {
     Ray ray;
     Certified exact;
     puts("id,bx,by,bz,transmitted");
-    while (certified && row(rays, &ray.id, 9) && row(certified, &exact.id, 11) && exact.id == ray.id) {
+    while (certified && row(rays, &ray.id, 9) && row(certified, &exact.id, 15) && exact.id == ray.id) {
         REAL a[3] = {ray.a[0], ray.a[1], ray.a[2]}, n[3] = {ray.n[0], ray.n[1], ray.n[2]}, b[3];
         int transmitted = refract(a, n, (REAL)ray.n_from / (REAL)ray.n_to, b);
         double answer[3] = {b[0], b[1], b[2]};

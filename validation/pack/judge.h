@@ -2,7 +2,10 @@
 #include <math.h>
 
 typedef struct { double id, a[3], n[3], n_from, n_to; } Ray;            /* a row of rays/f32.csv, rays/f64.csv */
-typedef struct { double id, transmitted, b[3], b_low[3], angle_limit, length_limit, decided; } Certified;
+typedef struct {                                                       /* a row of rays/certified-….csv */
+    double id, transmitted, b[3], b_low[3], cos_t;
+    double angle_limit, length_limit, decided, plane_limit, radicand_limit, side_open;
+} Certified;
 typedef enum { WRONG, WITHIN_BOUND, RIGHT } Verdict;
 typedef long double Real;                                               /* exact to 1e-19 where it has 80 bits */
 
@@ -43,11 +46,33 @@ static Real backward_error(const Real *a, const Real *n, Real k, const Real *b, 
     return worst;
 }
 
+/* Whether rounding of a textbook's formula can give the direction b, where its error bound is too wide to tell. */
+static int possible(const Real *a, const Real *n, Real k, const Real *b, const Certified *limits) {
+    Real t[3], rest[3], off[3], cosine = dot(a, n), sign = cosine < 0 ? -1 : 1, onward = sign * dot(b, n);
+    for (int i = 0; i < 3; i++)
+        t[i] = a[i] - cosine * n[i], rest[i] = b[i] - onward * sign * n[i];
+    Real sine = sqrtl(dot(t, t)), e = k * sine, along = sine > 0 ? dot(rest, t) / sine : 0;
+    for (int i = 0; i < 3; i++)
+        off[i] = rest[i] - (sine > 0 ? along * t[i] / sine : 0);
+    Real across = sqrtl(dot(off, off)), plane = along * along + across * across;
+    Real root2 = limits->transmitted ? (Real)limits->cos_t * limits->cos_t : 1 - e * e;
+    Real low = sqrtl(fmaxl(root2 - limits->radicand_limit, 0)), high = sqrtl(fmaxl(root2 + limits->radicand_limit, 0));
+    onward = limits->side_open ? fabsl(onward) : onward;
+    Real root = fminl(fmaxl(plane > 0 ? e * onward * along / plane : low, low), high);
+    Real turned = e * onward - root * along;
+    if (sqrtl(e * e + root * root) <= limits->plane_limit)
+        return 1;
+    Real error = sqrtl((root * root + e * e) * across * across + turned * turned);
+    return error <= limits->plane_limit && e * along + root * onward > 0;
+}
+
 /* `b`, `transmitted`: the answer; b does not count where all is reflected. `u`: 0x1p-24 of f32, 0x1p-53 of f64. */
 static Verdict judge(const Ray *ray, const Certified *certified, const double *b, int transmitted, double u) {
     Real a[3], n[3], found[3], exact[3], axis[3], k = (Real)ray->n_from / ray->n_to;
     Real of_a = unit(ray->a, a), length = unit(b, found), off = fminl(fabsl(length - 1), fabsl(length / of_a - 1));
     unit(ray->n, n);
+    if (transmitted && (!(length > 0 && length < HUGE_VAL) || !possible(a, n, k, found, certified)))
+        return WRONG;
     if (transmitted != certified->transmitted) {
         if (certified->decided)
             return WRONG;
@@ -55,7 +80,7 @@ static Verdict judge(const Ray *ray, const Certified *certified, const double *b
         for (int i = 0; i < 3; i++)
             exact[i] = (Real)certified->b[i] + certified->b_low[i];
         Real angle = atan2l(cross(found, exact, axis), dot(found, exact));
-        if (!(angle <= certified->angle_limit && off <= certified->length_limit)) /* so is NaN */
+        if (!(angle <= certified->angle_limit && off <= certified->length_limit))
             return WRONG;
     }
     if (!transmitted && !certified->transmitted)

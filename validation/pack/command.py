@@ -1,0 +1,52 @@
+"""`python -m validation pack -o FOLDER [--quick]`: writes the reference pack."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mi_refract.io import safe_files
+from mi_refract.io.text import printable
+from validation.run import command_line
+
+NAME = "validation pack"
+app = command_line.application()
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command line; the exit code."""
+    return command_line.exit_code(app, NAME, arguments)
+
+
+@app.command()
+def _command(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="The folder of the archive.")],
+    quick: Annotated[bool, typer.Option("--quick", help="Few rays and small images: to see what a pack is.")] = False,
+) -> None:
+    """Write the reference pack, one zip file that needs nothing of ours: scenes, images, rays, standard numbers."""
+    if not output.is_dir():
+        safe_files.check_parent(output)
+        output.mkdir()
+    safe_files.check_parent(output / "pack")
+    from mi_refract import __version__, backend
+
+    variant = backend.activate("llvm_ad_rgb")
+    from validation import runner
+
+    from . import contents
+
+    known = runner.facts(variant)
+    made_with = {name: known[name] for name in sorted(known) if name not in ("host", "cannot run", "other renderers")}
+    made = contents.Contents(contents.QUICK if quick else contents.FULL)
+    parts = made.parts()
+    for number, (name, make) in enumerate(parts):
+        print(printable(f"{NAME}: {number + 1} of {len(parts)}: {name}"), file=sys.stderr, flush=True)
+        make()
+    files = made.whole(__version__, quick, made_with | {"variant": variant})
+    top = f"mi-refract-pack-{__version__}{'-quick' if quick else ''}"
+    path = output / f"{top}.zip"
+    safe_files.write_atomically(path, contents.archive(files, top))
+    print(printable(f"{path}: {len(files)} files, {path.stat().st_size / 1e6:.1f} MB"))
