@@ -137,7 +137,7 @@ class StandardNumber:
 # Laws ------------------------------------------------------------------------------------------------------------
 
 
-def _radians(degrees: Any) -> np.longdouble:
+def _radians(degrees: Any) -> Any:
     return np.longdouble(degrees) * closed_forms.HALF_TURN / 180
 
 
