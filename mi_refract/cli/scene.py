@@ -33,7 +33,7 @@ def list_scenes() -> None:
 def export(
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="A Mitsuba scene, or the name of one of `scene list`.")],
     to: Annotated[
-        str, typer.Option(metavar="TARGET", help="Renderer: cycles|luxcore|radiance|raysect|povray|mitsuba|obj+json.")
+        str, typer.Option(metavar="TARGET", help="For cycles|luxcore|radiance|raysect|povray|mitsuba|obj+json|gltf.")
     ],
     output: Annotated[
         Path | None,

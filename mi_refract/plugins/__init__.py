@@ -22,7 +22,7 @@ def register(variant: Variant) -> None:
 # Importing Mitsuba calls `register`, which must be there; the modules below need Mitsuba.
 import mitsuba  # noqa: E402, F401
 
-from .index_parameter import PLUGIN, read_ior  # noqa: E402
+from .index_parameter import PLUGIN, read_ior, read_medium  # noqa: E402
 from .medium_tracking import check_integrator  # noqa: E402
 from .refract_path import INTEGRATOR  # noqa: E402
 from .scene_features import SceneFeatures, inspect  # noqa: E402
@@ -34,6 +34,7 @@ __all__ = [
     "check_integrator",
     "inspect",
     "read_ior",
+    "read_medium",
     "register",
     "scene_parser",
 ]

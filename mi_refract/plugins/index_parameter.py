@@ -223,10 +223,18 @@ def find_file(name: str) -> Path:
 
 def read_ior(props: Properties, name: str, default: str) -> float:
     """An index of refraction that is one number, in double precision. ValueError for all else, and as `read_index`."""
-    index = read_index(mi, props, name, default)
-    if isinstance(index, Medium) and not index.dispersive:
-        return float(index.index(media.LINES["d"]))
+    medium = read_medium(props, name, default)
+    if not medium.dispersive:
+        return float(medium.index(media.LINES["d"]))
     raise ValueError(f"{PLUGIN}: {name} = {props[name]}; expected one number for all wavelengths and points")
+
+
+def read_medium(props: Properties, name: str, default: str) -> Medium:
+    """The parameter's `Medium`, the same at all points. ValueError for a texture, and as `read_index`."""
+    index = read_index(mi, props, name, default)
+    if isinstance(index, Medium):
+        return index
+    raise ValueError(f"{PLUGIN}: {name} = {props[name]}; expected the same index at all points")
 
 
 def read_index(v: Variant, props: Properties, name: str, default: str) -> Medium | Texture:

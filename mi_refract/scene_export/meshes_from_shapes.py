@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 import mitsuba as mi
 import numpy as np
 
+from mi_refract import media
 from mi_refract.formulas import FORMULAS
 from mi_refract.numerics import mitsuba_mesh
-from mi_refract.plugins import PLUGIN, read_ior, scene_parser
+from mi_refract.plugins import PLUGIN, read_medium, scene_parser
 
 from . import tessellation
 from .mitsuba_nodes import Node
-from .plain_scene import Colour, Diffuse, Glass, Light, Material, Mesh
+from .plain_scene import LINES, WAVELENGTHS, Colour, Diffuse, Glass, Light, Material, Mesh, VolumeGlass
 from .tessellation import Triangles, Vertices
 
 GLASSES = ("dielectric", PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS))
@@ -29,6 +30,7 @@ SHAPES: dict[str, tuple[Callable[[int], int], Callable[[int], Triangles]]] = {
     "rectangle": (lambda level: 2, lambda level: tessellation.rectangle()),
     "sphere": (lambda level: 20 << 2 * level, tessellation.sphere),
 }
+ROUND = {"sphere": (1, 1, 1), "cylinder": (1, 1, 0)}  # their normals: vertices times this
 FARTHEST = 1e30  # of all coordinates: float32 holds products with directions
 MOST = 2**24  # triangles of all shapes, counted before they are made
 BLACK = (0.0, 0.0, 0.0)
@@ -70,7 +72,11 @@ def meshes_of_shape(shape: Node, level: int, most: int = MOST, eye: Vertices | N
             raise shape.error(f"coordinates beyond {FARTHEST:g}", "finite ones, up to that")
         if surface.one_sided and eye is not None and tessellation.encloses(placed[faces], eye):
             raise shape.error("diffuse on the outside only, around the camera", "its BSDF in a `twosided`")
-        yield Mesh(f"{name}_{i}" if i else name, placed, faces[:, ::-1] if flipped else faces, material)
+        normals = None
+        if shape.type in ROUND:
+            normals = (vertices * ROUND[shape.type]) @ frame[:3, :3].T * (-1 if flipped else 1)
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        yield Mesh(f"{name}_{i}" if i else name, placed, faces[:, ::-1] if flipped else faces, material, normals)
 
 
 def with_unique_names(meshes: Iterable[Mesh]) -> tuple[Mesh, ...]:
@@ -179,15 +185,53 @@ def _scattering(bsdf: Node) -> Surface:
             raise bsdf.error("two BSDFs", "the same on both sides")
         return replace(_scattering(inner[0]), one_sided=False)
     if bsdf.type in GLASSES:
-        glass = Glass(read_ior(bsdf.props, "int_ior", "bk7"), read_ior(bsdf.props, "ext_ior", "air"))
-        bsdf.ignore("int_ior", "ext_ior", "formula")
-        bsdf.finish()
-        return Surface((glass,))
+        return Surface((_glass(bsdf),))
     if bsdf.type == "diffuse":
         colours, scales = _colours(bsdf, "reflectance", DEFAULT[0])
         bsdf.finish()
         return Surface(tuple(map(Diffuse, colours)), scales, one_sided=any(colour != BLACK for colour in colours))
     raise bsdf.error("this BSDF is not supported", f"diffuse, twosided, {', '.join(GLASSES)}")
+
+
+def _glass(bsdf: Node) -> Glass:
+    """One with two numbers where these say all, and otherwise a VolumeGlass."""
+    sides = {"int_ior": "bk7", "ext_ior": "air"}
+    inside, outside = (read_medium(bsdf.props, name, default) for name, default in sides.items())
+    sigmas = [_sigma(bsdf, side) if bsdf.type != "dielectric" else None for side in ("int", "ext")]
+    said = [
+        f"{name} = {bsdf.props.get(name, default)}"
+        for (name, default), medium in zip(sides.items(), (inside, outside), strict=True)
+        if medium.dispersive
+    ]
+    said += [name for name in bsdf.names if name.endswith(("_absorption", "_colour"))]
+    bsdf.ignore(*sides, "formula")
+    bsdf.finish()
+    n_int, n_ext = (float(medium.index(media.LINES["d"])) for medium in (inside, outside))
+    if not said:
+        return Glass(n_int, n_ext)
+    spectrum: tuple[float, ...] = ()
+    if inside.dispersive or outside.dispersive:
+        denser, other = (inside, outside) if n_int >= n_ext else (outside, inside)
+        spectrum = tuple(np.asarray(media.relative_index(denser, other, np.array(WAVELENGTHS))).tolist())
+        if missing := [f"{w:g} nm" for w, n in zip(WAVELENGTHS, spectrum, strict=True) if not math.isfinite(n)]:
+            raise bsdf.error(f"{', '.join(said)}: no index at {missing[0]}", "one from 400 to 700 nm")
+        n = spectrum[LINES.index("d")]
+        n_int, n_ext = (n * n_ext, n_ext) if n_int >= n_ext else (n_int, n * n_int)
+    return VolumeGlass(n_int, n_ext, ", ".join(said), spectrum, *(sigma or BLACK for sigma in sigmas))
+
+
+def _sigma(bsdf: Node, side: str) -> Colour | None:
+    """σ of a side, red, green and blue; None where the scene says none."""
+    sigma, colour, distance = f"{side}_absorption", f"{side}_colour", f"{side}_colour_distance"
+    if sigma in bsdf.names:
+        return bsdf.colour(sigma, None)
+    if colour not in bsdf.names:
+        return None
+    left, length = bsdf.colour(colour, None), bsdf.value(float, distance)
+    if not all(0 < x <= 1 for x in left) or length <= 0:
+        raise bsdf.error(f"{colour} = {left} after {distance} = {length}", "colours above 0 and up to 1, a length")
+    r, g, b = (-math.log(x) / length for x in left)
+    return r, g, b
 
 
 def _colours(node: Node, name: str, default: float | None) -> tuple[tuple[Colour, ...], tuple[float, float] | None]:

@@ -7,12 +7,16 @@ with Rec. 709 primaries.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_refract import media
+
 Colour = tuple[float, float, float]
+LINES = "FdC"  # by which Abbe's number is defined
+WAVELENGTHS = (*(media.LINES[line] for line in LINES), *map(float, range(400, 701, 10)))  # nm
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,20 @@ class Glass:
 
     int_ior: float
     ext_ior: float
+
+
+@dataclass(frozen=True)
+class VolumeGlass(Glass):
+    """A glass whose index depends on the wavelength, or that absorbs; its two indices are those at the d line.
+
+    `said`: the parameters that say so. `spectrum`: the index of the denser medium over that of the other at
+    WAVELENGTHS; () for one number. σ of either side: light that travels t keeps exp(−σ t) of its red, green and blue.
+    """
+
+    said: str = field(compare=False)
+    spectrum: tuple[float, ...] = ()
+    int_sigma: Colour = (0.0, 0.0, 0.0)
+    ext_sigma: Colour = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -40,17 +58,21 @@ class Light:
     radiance: Colour
 
 
-Material = Glass | Diffuse | Light
+Material = Glass | Diffuse | Light  # a VolumeGlass is a Glass
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Flat triangles of one material, counterclockwise as seen from the side of their normals. Names are unique."""
+    """Flat triangles of one material, counterclockwise as seen from the side of their normals. Names are unique.
+
+    `normals` (V, 3): of the sphere or the cylinder at each vertex, None where the surface itself is flat.
+    """
 
     name: str
     vertices: NDArray[np.float64]  # (V, 3)
     faces: NDArray[np.int64]  # (F, 3), indices of vertices
     material: Material
+    normals: NDArray[np.float64] | None = None
 
     def triangles(self) -> NDArray[np.float64]:
         """(F, 3, 3): the corners of each triangle."""

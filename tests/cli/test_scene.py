@@ -40,6 +40,8 @@ def test_names_paths_levels_and_defines(export, tmp_path):
         (["nowhere", "--to", "cycles"], "no such scene; expected a file, balls, "),
         (["prism", "--to", "blender"], "expected cycles, luxcore, radiance"),
         (["prism", "--to", "povray"], "a diffuse surface"),
+        (["furnace", "--to", "gltf", "--level", "0"], "mantle_core: media of 1.5168 and 2.419 touch; expected"),
+        (["rainbow_drop", "--to", "luxcore"], "drop: int_ior = MATERIAL:water; expected one number"),
         (["prism", "--to", "cycles", "-o", "no/where"], "not a folder"),
         (["prism", "--to", "cycles", "-o", "full"], "already contains files"),
         (["prism", "--to", "cycles", "-D", "nothing=1"], "nothing"),

@@ -6,6 +6,7 @@ place in the image, from (0, 0) at its upper left corner to (1, 1). `Scene.sky(d
 
 import json
 import re
+import struct
 import types
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -332,5 +333,81 @@ def obj(folder, monkeypatch):
     return found
 
 
+@dataclass
+class Model:
+    """A glTF file: its JSON, and by mesh its positions, normals, triangles (as indices) and material."""
+
+    tree: dict
+    meshes: dict
+
+
+def glb(path):
+    """A binary glTF file, by its specification: a header, a chunk of JSON, a chunk of binary data."""
+    data = path.read_bytes()
+    assert data[:4] == b"glTF" and struct.unpack("<2I", data[4:12]) == (2, len(data))
+    length, kind = struct.unpack("<I4s", data[12:20])
+    assert kind == b"JSON" and data[24 + length : 28 + length] == b"BIN\0"
+    return model(json.loads(data[20 : 20 + length]), data[28 + length :])
+
+
+def model(tree, data):
+    def array(index):
+        accessor = tree["accessors"][index]
+        view = tree["bufferViews"][accessor["bufferView"]]
+        kind, width = {5125: "<u4", 5126: "<f4"}[accessor["componentType"]], {"SCALAR": 1, "VEC3": 3}[accessor["type"]]
+        start = view["byteOffset"] + accessor.get("byteOffset", 0)
+        return np.frombuffer(data, kind, accessor["count"] * width, start).reshape(-1, width)
+
+    found = Model(tree, {})
+    for node in tree["nodes"]:
+        if "mesh" in node:
+            assert not {"matrix", "translation", "rotation", "scale"} & node.keys()
+            (part,) = tree["meshes"][node["mesh"]]["primitives"]
+            attributes = part["attributes"]
+            places, normals, indices = map(array, (attributes["POSITION"], attributes["NORMAL"], part["indices"]))
+            material = tree["materials"][part["material"]]
+            found.meshes[node["name"]] = places, normals, indices.reshape(-1, 3), material
+    return found
+
+
+def gltf(folder, monkeypatch):
+    """The two files say the same. A camera looks along −z, and +y is up in its image."""
+    read = glb(folder / "scene.glb")
+    tree = json.loads((folder / "scene.gltf").read_text())
+    other = model(tree, (folder / tree["buffers"][0]["uri"]).read_bytes())
+    assert other.tree | {"buffers": 0, "bufferViews": 0} == read.tree | {"buffers": 0, "bufferViews": 0}
+    for name, (places, normals, faces, _) in read.meshes.items():
+        assert all((a == b).all() for a, b in zip((places, normals, faces), other.meshes[name][:3], strict=True))
+    (node,) = (node for node in tree["nodes"] if "camera" in node)
+    matrix, view = np.reshape(node["matrix"], (4, 4)).T, tree["cameras"][node["camera"]]["perspective"]
+    extras, high = tree["scenes"][0]["extras"], np.tan(view["yfov"] / 2)
+
+    def ray(x, y):
+        return matrix[:3, 3], matrix[:3, :3] @ [(2 * x - 1) * high * view["aspectRatio"], (1 - 2 * y) * high, -1]
+
+    place = lambda x, y, z: (0.5 + np.arctan2(z, x) / (2 * np.pi), np.arccos(y) / np.pi)  # noqa: E731
+    sky = on_map(folder / "sky.exr", place)
+    found = Scene((extras["width"], extras["height"]), extras["max_depth"], ray, sky)
+    for name, (places, _, faces, material) in read.meshes.items():
+        found.triangles[name] = places[faces]
+        more, base = material["extensions"], material["pbrMetallicRoughness"]
+        assert set(more) <= set(tree["extensionsUsed"]) and (base["metallicFactor"], base["roughnessFactor"]) == (0, 0)
+        index = more["KHR_materials_ior"]["ior"]
+        if "KHR_materials_transmission" in more:
+            assert more["KHR_materials_transmission"] == {"transmissionFactor": 1}
+            assert base["baseColorFactor"] == [1, 1, 1, 1] and more["KHR_materials_volume"]["thicknessFactor"] > 0
+            found.indices[name] = index
+            continue
+        assert index == 1 and more["KHR_materials_specular"] == {"specularFactor": 0}
+        if "emissiveFactor" in material:
+            strength = more.get("KHR_materials_emissive_strength", {"emissiveStrength": 1})["emissiveStrength"]
+            assert max(material["emissiveFactor"]) <= 1 and not any(base["baseColorFactor"][:3])
+            found.lights[name] = np.multiply(strength, material["emissiveFactor"])
+        else:
+            assert material["doubleSided"]
+            found.colours[name] = base["baseColorFactor"][:3]
+    return found
+
+
 READERS = {"radiance": radiance, "luxcore": luxcore, "povray": povray, "cycles": cycles, "raysect": raysect}
-READERS["obj+json"] = obj
+READERS |= {"obj+json": obj, "gltf": gltf}

@@ -35,7 +35,7 @@ from . import structs
 
 Files = dict[str, bytes]
 HERE = Path(__file__).parent
-TARGETS = {"mitsuba": "mitsuba", "obj+json": "obj"}  # of `scene export`, and their folder in the pack
+TARGETS = {"mitsuba": "mitsuba", "obj+json": "obj", "gltf": "gltf"}  # of `scene export`, and their folder in the pack
 # Samples per pixel: what 20 s on two cores give, or 1 % of noise. The other scenes hold more than triangles of glass
 # with one index can say, or take minutes.
 SPP = {

@@ -12,11 +12,11 @@ from pathlib import Path
 
 from mi_refract.io import safe_files
 
-from ..plain_scene import PlainScene
-from . import luxcore, mitsuba, povray, radiance, scene_json, shared_files
+from ..plain_scene import PlainScene, VolumeGlass
+from . import gltf, luxcore, mitsuba, povray, radiance, scene_json, shared_files
 from .shared_files import Files
 
-__all__ = ["TARGETS", "luxcore", "mitsuba", "povray", "radiance", "scene_json", "shared_files", "write"]
+__all__ = ["TARGETS", "gltf", "luxcore", "mitsuba", "povray", "radiance", "scene_json", "shared_files", "write"]
 
 TARGETS: dict[str, Callable[[PlainScene], Files]] = {
     "cycles": scene_json.cycles_files,
@@ -26,7 +26,9 @@ TARGETS: dict[str, Callable[[PlainScene], Files]] = {
     "povray": povray.files,
     "mitsuba": mitsuba.files,
     "obj+json": scene_json.obj_files,
+    "gltf": gltf.files,
 }
+HOLD_VOLUMES = ("gltf",)  # dispersion and absorption
 
 
 def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> list[Path]:
@@ -44,6 +46,10 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
     elif place.exists():
         raise NotADirectoryError(f"{folder}: is not a folder; expected a new folder or an empty one")
     safe_files.check_parent(place)
+    for mesh in plain.meshes:
+        if isinstance(mesh.material, VolumeGlass) and target not in HOLD_VOLUMES:
+            expected = f"one number for all wavelengths and no absorption, or --to {' or '.join(HOLD_VOLUMES)}"
+            raise ValueError(f"{plain.name}: {mesh.name}: {mesh.material.said}; expected {expected}")
     files = TARGETS[target](plain)
     with safe_files.replacing(place, folder=True) as temporary:
         for name, content in files.items():

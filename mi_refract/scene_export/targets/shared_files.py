@@ -14,7 +14,7 @@ from mi_refract import __version__
 from mi_refract.io.image_file import NO_DATE, write_exr
 from mi_refract.io.safe_files import temporary_folder
 
-from ..plain_scene import Environment, Material, PlainScene
+from ..plain_scene import Environment, Glass, Material, PlainScene
 
 Files = dict[str, bytes]  # contents by name
 Array = NDArray[np.float64]
@@ -36,11 +36,13 @@ def numbers(values: Iterable[float], separator: str = " ") -> str:
     return separator.join(repr(float(value)) for value in values)
 
 
-def readme(plain: PlainScene, target: str, commands: str, assumptions: Sequence[str]) -> bytes:
+def readme(
+    plain: PlainScene, target: str, commands: str, assumptions: Sequence[str], shading: str = "flat-shaded "
+) -> bytes:
     """README.txt: the commands that render the scene, and the differences between the models."""
     camera = plain.camera
     lines = [
-        f"{plain.name}: {len(plain.meshes)} flat-shaded meshes of {sum(len(m.faces) for m in plain.meshes)} triangles,",
+        f"{plain.name}: {len(plain.meshes)} {shading}meshes of {sum(len(m.faces) for m in plain.meshes)} triangles,",
         f"{camera.width} x {camera.height} pixels, box filter, linear Rec. 709. Written by mi_refract {__version__}.",
         "",
         f"To render with {target}:",
@@ -60,6 +62,12 @@ def readme(plain: PlainScene, target: str, commands: str, assumptions: Sequence[
 def material_names(plain: PlainScene) -> dict[Material, str]:
     """A name for each material."""
     return {material: f"material{number}" for number, material in enumerate(plain.materials)}
+
+
+def outermost_index(plain: PlainScene) -> float:
+    """That of the medium around all glass; 1 without glass. Precondition: the glass farthest along +x is not inside."""
+    glasses = [(mesh.vertices[:, 0].max(), mesh.material) for mesh in plain.meshes if isinstance(mesh.material, Glass)]
+    return max(glasses, key=lambda glass: glass[0])[1].ext_ior if glasses else 1.0
 
 
 def ply_files(plain: PlainScene) -> Files:

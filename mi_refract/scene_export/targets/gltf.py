@@ -1,0 +1,240 @@
+"""glTF 2.0 with Khronos' extensions for glass: `scene.glb`, and the same as `scene.gltf`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from mi_refract import __version__
+from mi_refract.io.errors import MissingExtraError
+
+from ..plain_scene import (
+    LINES,
+    WAVELENGTHS,
+    Diffuse,
+    Environment,
+    Glass,
+    Light,
+    Material,
+    Mesh,
+    PlainScene,
+    VolumeGlass,
+)
+from ..tessellation import Vertices, is_closed
+from .shared_files import LIGHT_INSIDE, Axes, Files, exr, outermost_index, readme, sky_exr
+
+COMMANDS = """
+scene.glb     all of the scene but its sky, in one file
+scene.gltf    the same as JSON, with gltf_buffer.bin
+sky.exr       the sky, by longitude and latitude; glTF holds none. Absent where the sky is black
+"""
+ASSUMPTIONS = (
+    "glTF holds no depth of paths, no size of the image and no filter: max_depth = {depth} (2 is light, one surface, "
+    "camera), {width} x {height} pixels, a box filter. extras of the scene say the same.",
+    "sky.exr holds linear radiance. Its top row is seen in direction +y, its middle column in +x, and columns to the "
+    "right of it turn to +z, as in the equirectangular maps of three.js.",
+    "Indices are relative to the medium around all glass, {outside!r}, because glTF has 1 there.",
+    "thicknessFactor is 4 V/S, the mean chord of a convex body. A path tracer does not use it, only that it is not 0.",
+    "A radiance of 1 is one candela per square metre there, and a unit of the scene is one metre. Nothing is a light "
+    "of KHR_lights_punctual: what is exported has none.",
+    "A light that is open has a black back, {offset:.3g} behind it: glTF shows nothing there, or the light, "
+    "as doubleSided is understood.",
+    "A diffuse surface is Lambert's where specularFactor = 0, or ior = 1, takes the coating of glTF's material away.",
+    LIGHT_INSIDE,
+)
+SKY_AXES: Axes = (-1, 0, 0), (0, 0, -1), (0, 1, 0)  # of three.js
+BLACK = (0.0, 0.0, 0.0)
+BACK = 1e-5  # of the largest coordinate: some hundred roundoffs of float32
+NEAR = 1e-4  # of the largest distance from the camera: its near plane
+
+
+def files(plain: PlainScene) -> Files:
+    """The files of the export, by name. ValueError for what glTF cannot hold, MissingExtraError without trimesh."""
+    try:
+        import trimesh
+        from trimesh.exchange import gltf
+    except ModuleNotFoundError:
+        raise MissingExtraError("glTF needs trimesh: pip install 'mi-refract[gltf]'") from None
+    outside = outermost_index(plain)
+    turned = (_around_glass(plain, mesh, outside) for mesh in plain.meshes)
+    meshes = [mesh for mesh in map(_without_slivers, turned) if len(mesh.faces)]
+    largest = max((float(np.abs(mesh.vertices).max()) for mesh in meshes), default=1.0)
+    backs = [_back(mesh, BACK * largest) for mesh in meshes if isinstance(mesh.material, Light)]
+    shown = [*meshes, *(back for back in backs if back)]
+    materials = list(dict.fromkeys(mesh.material for mesh in shown))
+    camera, extras = plain.camera, {"max_depth": plain.max_depth, "width": plain.camera.width}
+    scene = trimesh.Scene(metadata=extras | {"height": camera.height})
+    for mesh in shown:
+        vertices, faces, normals = mesh.vertices, mesh.faces, mesh.normals
+        if normals is None:  # corners of a vertex's faces have the normals of these
+            vertices, faces = mesh.triangles().reshape(-1, 3), np.arange(mesh.faces.size).reshape(-1, 3)
+            normals = np.repeat(_facet_normals(mesh), 3, axis=0)
+        solid = trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False)
+        scene.add_geometry(solid, node_name=mesh.name, geom_name=mesh.name)
+    ahead = np.subtract(camera.target, camera.origin)
+    right = np.cross(ahead, camera.up)
+    axes = np.stack([right, np.cross(right, ahead), -ahead], axis=1)
+    place = np.eye(4)
+    place[:3, :3], place[:3, 3] = axes / np.linalg.norm(axes, axis=0), camera.origin
+    scene.camera = trimesh.scene.Camera("camera", fov=(1.0, 1.0))  # its angles are replaced below
+    scene.camera_transform = place
+    high = math.tan(math.radians(camera.fov_x_degrees) / 2) * camera.height / camera.width
+    far = max((float(np.linalg.norm(mesh.vertices - camera.origin, axis=1).max()) for mesh in meshes), default=1.0)
+    view = {"aspectRatio": camera.width / camera.height, "yfov": 2 * math.atan(high), "znear": NEAR * far}
+
+    def complete(tree: dict[str, Any]) -> None:
+        """Put in what trimesh has no words for."""
+        tree["asset"]["generator"] = f"mi_refract {__version__} by trimesh {trimesh.__version__}"
+        tree["cameras"] = [{"name": "camera", "type": "perspective", "perspective": view}]
+        for mesh, made in zip(shown, tree.get("meshes", []), strict=True):
+            made["primitives"][0]["material"] = materials.index(mesh.material)
+        if materials:
+            tree["materials"] = [_material(f"material{i}", each, meshes) for i, each in enumerate(materials)]
+            tree["extensionsUsed"] = sorted({name for entry in tree["materials"] for name in entry["extensions"]})
+
+    single: bytes = gltf.export_glb(scene, include_normals=True, tree_postprocessor=complete)
+    several: Files = gltf.export_gltf(scene, include_normals=True, merge_buffers=True, tree_postprocessor=complete)
+    several["scene.gltf"] = several.pop("model.gltf")
+    sky = sky_exr(plain, SKY_AXES)
+    if not isinstance(plain.sky, Environment) and any(plain.sky):
+        sky = {"sky.exr": exr(np.full((4, 8, 3), plain.sky, np.float32))}
+    values = {"depth": plain.max_depth, "width": camera.width, "height": camera.height, "outside": outside}
+    said = [text.format(**values, offset=BACK * largest) for text in ASSUMPTIONS] + _said(meshes)
+    return several | sky | {"scene.glb": single, "README.txt": readme(plain, "a glTF renderer", COMMANDS, said, "")}
+
+
+def _around_glass(plain: PlainScene, mesh: Mesh, outside: float) -> Mesh:
+    """The mesh; of glass, turned so that its normals point out of the glass, into the medium around all of it."""
+    material, place = mesh.material, f"{plain.name}: {mesh.name}"
+    if isinstance(material, Diffuse) and max(material.reflectance) > 1:
+        raise ValueError(f"{place}: reflectance = {material.reflectance}; expected at most 1 in glTF")
+    if not isinstance(material, Glass):
+        return mesh
+    if not is_closed(mesh.faces):
+        raise ValueError(f"{place}: glass with an open surface; expected a closed one: glTF's volumes are bounded")
+    if not math.isclose(material.ext_ior, outside, rel_tol=1e-12):  # a hollow of the glass, or another glass
+        material = replace(material, int_ior=material.ext_ior, ext_ior=material.int_ior)
+        if isinstance(material, VolumeGlass):
+            material = replace(material, int_sigma=material.ext_sigma, ext_sigma=material.int_sigma)
+        mesh = replace(mesh, faces=mesh.faces[:, ::-1], normals=None if mesh.normals is None else -mesh.normals)
+    if not math.isclose(material.ext_ior, outside, rel_tol=1e-12):
+        two = f"media of {material.int_ior!r} and {material.ext_ior!r} touch"
+        raise ValueError(
+            f"{place}: {two}; expected {outside!r}, the medium around all glass, on one side: glTF has no other"
+        )
+    if material.int_ior < outside:
+        raise ValueError(
+            f"{place}: index {material.int_ior!r} in {outside!r}; expected a glass of at least that: glTF's ior >= 1"
+        )
+    if isinstance(material, VolumeGlass):
+        if any(material.ext_sigma):
+            raise ValueError(
+                f"{place}: {material.said}: the medium around all glass absorbs; expected one that does not"
+            )
+        if material.spectrum and not 0 < _abbe(material) < math.inf:
+            raise ValueError(f"{place}: {material.said}; expected an index that falls with the wavelength")
+    return replace(mesh, material=material)
+
+
+def _back(lamp: Mesh, offset: float) -> Mesh | None:
+    """A black surface behind a lamp; None where it is closed, so that nobody sees it from behind."""
+    if is_closed(lamp.faces):
+        return None
+    corners = lamp.triangles() - offset * (
+        _facet_normals(lamp)[:, None] if lamp.normals is None else lamp.normals[lamp.faces]
+    )
+    faces = np.arange(lamp.faces.size).reshape(-1, 3)[:, ::-1]
+    return Mesh(f"{lamp.name}-back", corners.reshape(-1, 3), faces, Light(BLACK))
+
+
+def _areas(mesh: Mesh) -> Vertices:
+    """(F, 3): normals of the triangles, as long as they are large."""
+    a, b, c = mesh.triangles().swapaxes(0, 1)
+    return np.cross(b - a, c - a) / 2
+
+
+def _without_slivers(mesh: Mesh) -> Mesh:
+    """The mesh without triangles that have no area, and so no normal."""
+    return replace(mesh, faces=mesh.faces[np.linalg.norm(_areas(mesh), axis=1) > 0])
+
+
+def _facet_normals(mesh: Mesh) -> Vertices:
+    areas = _areas(mesh)
+    return np.asarray(areas / np.linalg.norm(areas, axis=1, keepdims=True))
+
+
+def _material(name: str, material: Material, meshes: Iterable[Mesh]) -> dict[str, Any]:
+    """An entry of "materials". `meshes`: by whose chords the glass is as thick as it is."""
+    base = {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.0}
+    entry: dict[str, Any] = {"name": name, "pbrMetallicRoughness": base, "doubleSided": isinstance(material, Diffuse)}
+    if isinstance(material, Glass):
+        n = material.int_ior / material.ext_ior
+        parts = [mesh for mesh in meshes if mesh.material == material]
+        surface = sum(np.linalg.norm(_areas(mesh), axis=1).sum() for mesh in parts)
+        inside = sum(np.linalg.det(mesh.triangles()).sum() for mesh in parts) / 6
+        volume: dict[str, Any] = {"thicknessFactor": float(4 * inside / surface)}
+        entry["extensions"] = {
+            "KHR_materials_transmission": {"transmissionFactor": 1.0},
+            "KHR_materials_ior": {"ior": n},
+            "KHR_materials_volume": volume,
+        }
+        if isinstance(material, VolumeGlass):
+            if sigma := max(material.int_sigma):  # exp(−σ t) = colour^(t/distance)
+                volume["attenuationDistance"] = 1 / sigma
+                volume["attenuationColor"] = [math.exp(-x / sigma) for x in material.int_sigma]
+            if material.spectrum:
+                entry["extensions"]["KHR_materials_dispersion"] = {"dispersion": 20 / _abbe(material)}
+        return entry
+    colour = material.reflectance if isinstance(material, Diffuse) else BLACK
+    base["baseColorFactor"] = [*colour, 1.0]
+    entry["extensions"] = {"KHR_materials_specular": {"specularFactor": 0.0}, "KHR_materials_ior": {"ior": 1.0}}
+    if isinstance(material, Light):
+        strength = max(1.0, *material.radiance)
+        entry["emissiveFactor"] = [x / strength for x in material.radiance]
+        if strength > 1:
+            entry["extensions"]["KHR_materials_emissive_strength"] = {"emissiveStrength": strength}
+    return entry
+
+
+def _abbe(material: VolumeGlass) -> float:
+    """V = (n_d − 1)/(n_F − n_C) of the index relative to the medium around; infinite without dispersion."""
+    f, d, c = material.spectrum[: len(LINES)]
+    return (d - 1) / (f - c) if f != c else math.inf
+
+
+def _said(meshes: Sequence[Mesh]) -> list[str]:
+    """What README.txt says of these meshes: how flat the round ones are, and what their formulas become."""
+    said, angles = [], {mesh.name: _angular_error(mesh) for mesh in meshes if mesh.normals is not None}
+    if angles:
+        widest = max(angles, key=lambda name: angles[name])
+        said.append(
+            "Spheres and cylinders have normals at their vertices, those of the round surface. Facets are flat: the "
+            f"largest angle between a facet's normal and that of the surface is {math.degrees(angles[widest]):.4f} "
+            f"degrees ({widest}). One level more halves it. Renderers refract at the normals of the vertices, "
+            "interpolated; Mitsuba, as exported for it, at the facets."
+        )
+    for material in dict.fromkeys(mesh.material for mesh in meshes):
+        if isinstance(material, VolumeGlass) and material.spectrum:
+            n, v = np.array(material.spectrum), _abbe(material)
+            d = n[LINES.index("d")]
+            # The formula of KHR_materials_dispersion, with its constants.
+            theirs = d + (d - 1) / v * (523655 / np.square(WAVELENGTHS) - 1.5168)
+            name = next(mesh.name for mesh in meshes if mesh.material == material)
+            said.append(
+                f"{name}: {material.said} becomes Abbe's number {v:.4g}, because glTF has no other formula. From 400 "
+                f"to 700 nm its index differs from the scene's by up to {np.abs(theirs - n).max():.2g}."
+            )
+    return said
+
+
+def _angular_error(mesh: Mesh) -> float:
+    """The largest angle between the normals of a facet and of its corners, in radians."""
+    assert mesh.normals is not None
+    facets = _facet_normals(mesh)[:, None]
+    corners = mesh.normals[mesh.faces]
+    sines = np.linalg.norm(np.cross(facets, corners), axis=-1)
+    return float(np.arctan2(sines, (facets * corners).sum(-1)).max())
