@@ -67,10 +67,10 @@ def main(arguments: list[str] | None = None) -> int:
 
         return command.main(words[1:])
     if words[:1] == ["pack"]:
-        from validation.pack import command as pack
-
         if arguments is None:  # while Mitsuba renders, Ctrl-C would end that only
             interrupts.end_at_once(even_if_ignored=False)
+        from validation.pack import command as pack
+
         return pack.main(words[1:])
     return command_line.exit_code(app, "validation", words)
 

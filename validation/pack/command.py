@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from mi_refract.io import safe_files
+from mi_refract.io.image_file import installed_version
 from mi_refract.io.text import printable
 from validation.run import command_line
 
@@ -45,7 +46,8 @@ def _command(
     for number, (name, make) in enumerate(parts):
         print(printable(f"{NAME}: {number + 1} of {len(parts)}: {name}"), file=sys.stderr, flush=True)
         make()
-    files = made.whole(__version__, quick, made_with | {"variant": variant})
+    made_with |= {"variant": variant, "trimesh": installed_version("trimesh")}
+    files = made.whole(__version__, quick, made_with)
     top = f"mi-refract-pack-{__version__}{'-quick' if quick else ''}"
     path = output / f"{top}.zip"
     safe_files.write_atomically(path, contents.archive(files, top))

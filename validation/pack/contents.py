@@ -36,6 +36,7 @@ from . import structs
 Files = dict[str, bytes]
 HERE = Path(__file__).parent
 TARGETS = {"mitsuba": "mitsuba", "obj+json": "obj", "gltf": "gltf"}  # of `scene export`, and their folder in the pack
+BEYOND_GLTF = ("furnace", "matched", "nested")  # glass within glass, or beside it
 # Samples per pixel: what 20 s on two cores give, or 1 % of noise. The other scenes hold more than triangles of glass
 # with one index can say, or take minutes.
 SPP = {
@@ -171,6 +172,8 @@ class Contents:
         """A scene as flat triangles in each format, and its image, rendered from those triangles."""
         plain = from_mitsuba.load(SCENES / f"{name}.xml", level=self.size.level, res=str(self.size.pixels))
         for target, place in TARGETS.items():
+            if target == "gltf" and name in BEYOND_GLTF:
+                continue
             for file, content in targets.TARGETS[target](plain).items():
                 self.files[f"scenes/{name}/{place}/{file}"] = content
         path, spp = f"scenes/{name}/mitsuba/scene.xml", max(2, SPP[name] // self.size.less)
@@ -204,7 +207,9 @@ class Contents:
         files |= structs.schemas() | {f"programs/{x}": (HERE / x).read_bytes() for x in ("check_rays.c", "judge.h")}
         files["LICENSE"] = HERE.parents[1].joinpath("LICENSE").read_bytes()
         template = jinja2.Template((HERE / "readme.md.j2").read_text("utf-8"), undefined=jinja2.StrictUndefined)
-        files["README.md"] = (template.render(version=version, images=self.images) + "\n").encode()
+        files["README.md"] = (
+            template.render(version=version, images=self.images, beyond_gltf=BEYOND_GLTF) + "\n"
+        ).encode()
         entries = {}
         for path in sorted(files):
             content = next(text for begin, text in ABOUT.items() if path.startswith(begin))
