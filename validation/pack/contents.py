@@ -37,18 +37,18 @@ Files = dict[str, bytes]
 HERE = Path(__file__).parent
 TARGETS = {"mitsuba": "mitsuba", "obj+json": "obj", "gltf": "gltf"}  # of `scene export`, and their folder in the pack
 BEYOND_GLTF = ("furnace", "matched", "nested")  # glass within glass, or beside it
-# Samples per pixel: what 20 s on two cores give, or 1 % of noise. The other scenes hold more than triangles of glass
-# with one index can say, or take minutes.
+# Samples per pixel: 3 % of noise or less, and a few minutes on two cores for all. The other scenes hold more than
+# triangles of glass with one index can say, or take as long as all of these.
 SPP = {
-    "balls": 256,
-    "diamond": 256,
+    "balls": 1024,
+    "diamond": 512,
     "furnace": 256,
-    "lightpipe": 128,
-    "matched": 256,
-    "nested": 256,
-    "prism": 512,
-    "slab": 512,
-    "sphere": 512,
+    "lightpipe": 256,
+    "matched": 512,
+    "nested": 512,
+    "prism": 1024,
+    "slab": 1024,
+    "sphere": 1024,
 }
 SEED = 0
 UNREPEATABLE = ("mi_refract:render_seconds", "mi_refract:machines", "mi_refract:scene")
