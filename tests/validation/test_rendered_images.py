@@ -11,12 +11,11 @@ from mi_refract.image_diff.comparison import Verdict
 from mi_refract.io import image_file
 from mi_refract.scene_export import targets
 from mi_refract.scene_export.plain_scene import Diffuse, Glass, Light
-from mi_refract.scene_export.targets import shared_files
 from validation import limits
 from validation.run.context import PROFILES, Context
 from validation.suite import exports, matrix, rendered_images, spectral_lines
 from validation.suite.rendered_images import INCONCLUSIVE, THREE, Size
-from validation.suite.renderers import SYSTEMS, environments, image_renderers
+from validation.suite.renderers import SYSTEMS, environments
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS, ImageRenderer
 
 SMALL = Size(48, 32, 1, 0.2)
@@ -107,18 +106,7 @@ def test_what_does_not_render_or_is_not_finite_is_never_a_pass(judged, monkeypat
     assert (row.verdict, row.reason) == ("not run", "the command that brings it")
 
 
-def test_three_finds_the_sky_where_it_looks(monkeypatch):
-    monkeypatch.setattr(shared_files, "FINER", 8)
-    sky, directions = rendered_images.askew(), np.random.default_rng(3).normal(size=(4000, 3))
-    x, y, z = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
-    image = shared_files.longitude_latitude(sky, image_renderers.THREE_AXES)
-    u, v = 0.5 + np.arctan2(z, x) / (2 * np.pi), np.arccos(y) / np.pi
-    rows, columns = image.shape[:2]
-    texel = image[np.minimum((v * rows).astype(int), rows - 1), np.minimum((u * columns).astype(int), columns - 1)]
-    # Half a texel is 0.003 rad, the sky's slope below 2.
-    assert np.abs(texel - shared_files.radiance(sky, directions)).max() < 0.01
-    assert np.abs(texel - shared_files.radiance(sky, directions * [1, 1, -1])).max() > 0.1
-
+NO_VALIDATOR = environments.absent(SYSTEMS[exports.VALIDATOR])
 
 # Exports -----------------------------------------------------------------------------------------------------------
 
@@ -178,6 +166,29 @@ def test_the_scene_is_not_symmetric():
     image = exports.reference(diffuse=False)
     for other in (image[:, ::-1], image[:, :, ::-1], image[:, ::-1, ::-1]):
         assert exports.compared(image, other)[exports.OVER] > 2
+
+
+@pytest.mark.skipif(NO_VALIDATOR != "", reason=NO_VALIDATOR)
+@pytest.mark.parametrize(
+    "scene, old, new, verdict",
+    [
+        ("prism", b"", b"", "pass"),
+        ("prism", b'"transmissionFactor":1.0', b'"transmissionFactor":9.0', "fail"),
+        ("furnace", b"", b"", "not run"),
+    ],
+)
+def test_khronos_validator_sees_a_value_out_of_range(scene, old, new, verdict, context, monkeypatch, tmp_path):
+    """A scene that glTF cannot hold says so."""
+    for name in ("meshes", f"{scene}.xml"):
+        (tmp_path / name).symlink_to(exports.SCENES / name)
+    make = targets.TARGETS["gltf"]
+    monkeypatch.setitem(
+        targets.TARGETS, "gltf", lambda plain: {name: data.replace(old, new) for name, data in make(plain).items()}
+    )
+    monkeypatch.setattr(exports, "SCENES", tmp_path)
+    (row,) = exports.validated(context)
+    assert (row.case, row.verdict) == (scene, verdict), row.values
+    assert "touch" in row.reason if verdict == "not run" else row.values[exports.WARNINGS] == 0
 
 
 # Spectral lines ------------------------------------------------------------------------------------------------------

@@ -5,6 +5,8 @@ POV-Ray is not given: it has glass and lights only), a tilted camera, a film tha
 users get: the exported files, and the options in the exported README.txt. The images are some renders a side; their
 RMSE may be twice what the spread between renders predicts, and 1 % of the mean. A camera, a sky or an index that is
 wrong exceeds that many times.
+
+Khronos' `gltf-validator` reads the glTF export of each scene of `scenes/` that glTF can hold.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_refract.report.row import Row
-from mi_refract.scene_export import from_mitsuba
+from mi_refract.scene_export import from_mitsuba, targets
 from mi_refract.scene_export.plain_scene import Camera, Diffuse, Light, Material, Mesh, PlainScene
 from validation import limits
 from validation.run.context import SCENES, Context
@@ -26,15 +28,19 @@ from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
 from .rendered_images import RENDERS, THREE, askew, by_plugin, why_not
 from .renderers import SYSTEMS, environments
+from .renderers.system import SCRIPTS
 
 NAME = "exports"
 SEEDS = range(1, RENDERS + 1)  # of the other renderer's
 SPP, SIZE = 512, (16, 9)
 OVER, NOISE = "RMSE / allowed", "noise / mean"
+ERRORS, WARNINGS = "errors", "warnings"
+VALIDATOR, LEVEL = "gltf_validator", 2
 TERMS = {
     OVER: "of the two means by pixel and channel; allowed: twice the noise that the spread between renders predicts, "
     "and 1 % of the mean",
     NOISE: "the predicted noise of the difference of the two means",
+    ERRORS: "of both files, `scene.glb` and `scene.gltf`; so are the warnings, a goal",
 }
 LEFT_OUT = {THREE: "it counts the light of the sky twice, see the study of images; without MIS it is here"} | {
     title: "it is the reference" for title, renderer in IMAGE_RENDERERS.items() if renderer.system == "mitsuba"
@@ -61,7 +67,8 @@ def _quad(name: str, low: tuple[float, float], high: tuple[float, float], materi
 def tasks(context: Context) -> list[Task]:
     """One per renderer."""
     titles = [title for title in IMAGE_RENDERERS if title not in LEFT_OUT]
-    return [Task(f"exports: {title}", functools.partial(rows, context, title)) for title in titles]
+    made = [Task(f"exports: {title}", functools.partial(rows, context, title)) for title in titles]
+    return [*made, Task(f"exports: {SYSTEMS[VALIDATOR].title}", functools.partial(validated, context))]
 
 
 def rows(context: Context, title: str) -> list[Row]:
@@ -75,6 +82,32 @@ def rows(context: Context, title: str) -> list[Row]:
     values, budgets = compared(reference(diffuse=title != "POV-Ray"), theirs), {OVER: 1.0, NOISE: limits.EXPORT_NOISE}
     replay = {"renderer": system.source, "spp": THEIRS.get(title, 256), "reference spp": SPP, "seeds": [*SEEDS]}
     return [row(values, budgets, replay=replay)]
+
+
+def validated(context: Context) -> list[Row]:
+    """What Khronos' validator says of the glTF exports: a row per scene; not run, where glTF cannot hold it."""
+    system, result = SYSTEMS[VALIDATOR], []
+    for path in sorted(SCENES.glob("*.xml")):
+        row = functools.partial(Row, NAME, system.title, path.stem, "glTF")
+
+        def counts(path: Path = path) -> dict[str, float]:
+            with tempfile.TemporaryDirectory() as folder:
+                try:
+                    plain = from_mitsuba.load(path, level=LEVEL)
+                    made = targets.write(plain, "gltf", Path(folder) / "scene")
+                except ValueError as why:
+                    raise environments.Unable(str(why)) from None
+                files = [str(file) for file in made if file.suffix in (".glb", ".gltf")]
+                command = ("node", str(SCRIPTS / "validate_gltf.mjs"), "{environment}")
+                said = [line.split() for line in environments.ask(system, command, "\n".join(files)).splitlines()]
+            if len(said) != len(files) or not files:
+                raise ValueError(f"{len(said)} answers to {len(files)} files; expected one to each")
+            return {name: float(sum(int(line[i]) for line in said)) for i, name in enumerate((ERRORS, WARNINGS))}
+
+        lost = ERRORS, 1.0
+        values, nothing = environments.attempt(row, environments.why_not(system, context.profile.name), lost, counts)
+        result += nothing if values is None else [row(values, {ERRORS: 0.0}, {WARNINGS: 0.0})]
+    return result
 
 
 def drawn(title: str) -> np.ndarray:

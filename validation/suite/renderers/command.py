@@ -82,7 +82,7 @@ def _install(system: System) -> int:
 def _line(system: System) -> str:
     draws = any(renderer.system == system.name for renderer in IMAGE_RENDERERS.values())
     able = {"rays": system.calls, "images": draws, "lenses": system.lens}
-    does = " and ".join(word for word, can in able.items() if can)
+    does = " and ".join(word for word, can in able.items() if can) or "exports"
     state = "absent" if environments.absent(system) else "installed"
     size = system.install.megabytes if system.install else 0
     return f"{system.name:10} {state:9} {does:16} {size:5} MB  {system.source}  [{system.licence}]"

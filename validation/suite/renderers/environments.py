@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from mi_refract.io import process_group
-from mi_refract.io.errors import TooMuchOutputError
+from mi_refract.io.errors import MissingExtraError, TooMuchOutputError
 from mi_refract.io.safe_files import write_atomically
 from mi_refract.ray_sets import renderer_file
 from mi_refract.report.row import Reason, Row
@@ -202,7 +202,7 @@ def attempt(
         return None, [row(reason=reason)]
     try:
         return answer(), []
-    except Unable as cause:
+    except (Unable, MissingExtraError) as cause:
         return None, [row(reason=f"cannot run here: {' '.join(str(cause).split())}")]
     except (Broken, ValueError, OSError) as defect:
         metric, text = lost[0], " ".join(str(defect).split())

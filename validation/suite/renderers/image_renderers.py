@@ -20,7 +20,7 @@ from mi_refract.io.image_file import Image
 from mi_refract.rendering import scene_files
 from mi_refract.scene_export import targets
 from mi_refract.scene_export.plain_scene import PlainScene
-from mi_refract.scene_export.targets import luxcore, povray, radiance, scene_json, shared_files
+from mi_refract.scene_export.targets import luxcore, povray, radiance, scene_json
 from validation.run.render_methods import Camera
 
 from . import environments
@@ -28,7 +28,6 @@ from .system import SCRIPTS, SYSTEMS, System
 
 HOURS = 4 * 3600.0  # after which a renderer hangs
 PASS = 2048  # samples a pixel
-THREE_AXES = (-1, 0, 0), (0, 0, -1), (0, 1, 0)  # of its maps of the sky
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -105,10 +104,8 @@ def _three(mis: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[
     chromium, node = next(filter(None, map(shutil.which, BROWSERS)), None), shutil.which("node")
     if not (chromium and node):
         raise environments.Unable("no node or no Chromium in PATH")
-    (folder / "scene").mkdir()
-    files = shared_files.json_and_ply(plain) | shared_files.sky_exr(plain, THREE_AXES)
-    for name, content in files.items():
-        (folder / "scene" / name).write_bytes(content)
+    meshes = tuple(dataclasses.replace(mesh, normals=None) for mesh in plain.meshes)  # flat, as on the other side
+    targets.write(dataclasses.replace(plain, meshes=meshes), "gltf", folder / "scene")
     script, home = SCRIPTS / "three_images.mjs", environments.folder(SYSTEMS["three"])
     sizes = (plain.camera.width, plain.camera.height, spp, mis, *seeds)
     words = [node, *map(str, (script, home, chromium, folder / "scene", folder, *sizes))]
@@ -141,6 +138,7 @@ def _rgb(image: Image) -> Image:
 
 
 THREE = (
+    "It reads the export to glTF, by three's GLTFLoader, with facets for normals, as the other side has them.",
     "A glass has one index, the quotient of the two; radiance is not scaled by the square of the index.",
     "The tent filter of its pixels is replaced by a box.",
     "Its Russian roulette is off, and its random numbers are those of a seed (PCG): its strata are the same in all "

@@ -1,8 +1,9 @@
-// Render scene.json by three-gpu-pathtracer in a headless browser, WebGL2 on the processor:
+// Render scene.glb, with sky.exr around it where there is one, by three-gpu-pathtracer in a headless browser, WebGL2 on the processor:
 //   node three_images.mjs NPM_FOLDER CHROMIUM SCENE_FOLDER OUT_FOLDER WIDTH HEIGHT SPP MIS SEED…
 // One seedN.f32 per seed: rows from the top, three float32 a pixel. MIS: 1 for multiple importance
 // sampling of the sky, as the library comes, 0 without.
 import { createServer } from "node:http";
+import { existsSync } from "node:fs";
 import { readFile, writeFile } from "node:fs/promises";
 import { createRequire } from "node:module";
 import { extname, join, resolve } from "node:path";
@@ -47,7 +48,8 @@ try {
   }
   await tab.waitForFunction("window.prepare");
   const size = [Number(width), Number(height)];
-  await tab.evaluate((size, mis) => window.prepare(size, mis), size, mis === "1");
+  const prepare = (...words) => window.prepare(...words);
+  await tab.evaluate(prepare, size, mis === "1", existsSync(join(scene, "sky.exr")));
   for (const seed of seeds) {
     const pixels = await tab.evaluate((spp, seed) => window.render(spp, seed), Number(spp), Number(seed));
     await writeFile(join(out, `seed${seed}.f32`), Buffer.from(pixels, "base64"));
