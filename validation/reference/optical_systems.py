@@ -256,15 +256,15 @@ def round_trip() -> System:
     return System(-a, a, boundaries, _direction(a))
 
 
-def prism(apex: Any, i: Array, down: Any = 0.4) -> System:
+def prism(apex: Any, i: Array, down: Any = 0.4, index: Any = BK7) -> System:
     """A prism deviates by i + asin(n sin(A − r)) − A. Rays come onto its left side, the share `down` from the apex."""
     half = apex / 2
     height, angle = SIDE * np.cos(half), i - half
     top = vectors(0, 2 * height / 3, 0)
     normals = [vectors(0, np.sin(half), side * np.cos(half)) for side in (-1, 1)]
-    a, after = (vectors(0, np.sin(x), np.cos(x)) for x in (angle, angle - closed_forms.deviation(i, apex, BK7)))
+    a, after = (vectors(0, np.sin(x), np.cos(x)) for x in (angle, angle - closed_forms.deviation(i, apex, index)))
     place = top + vectors(11, 0, 0) - np.reshape(down, (-1, 1)) * vectors(0, height, SIDE * np.sin(half))
-    boundaries = tuple(Boundary(Plane(top, n), k, 60) for n, k in zip(normals, (1 / BK7, BK7), strict=True))
+    boundaries = tuple(Boundary(Plane(top, n), k, 60) for n, k in zip(normals, (1 / index, index), strict=True))
     return System(place - 40 * a, a, boundaries, _direction(after))
 
 
