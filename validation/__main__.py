@@ -39,7 +39,7 @@ ROOMS = {
     "robustness": ("code_mutants",),
     "suite": (
         *("matrix", "per_ray", "small_mistakes", "rendered_images", "spectral_lines"),
-        *("lenses", "glasses", "exports"),
+        *("lenses", "glasses", "exports", "standard_numbers"),
     ),
 }
 # What the profile `quick` runs where no study is named.

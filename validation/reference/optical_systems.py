@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path as File
 from typing import Any
@@ -181,6 +181,18 @@ class System:
             p = moved(j, "place", p, b)
             yield start, p, n, a, b
             p = p - vectors(0, 0, boundary.thickness)
+
+    def steps(self) -> Generator[tuple[Array, Array, Array], Array, Path]:
+        """Yields a, n and k wherever a ray is refracted, is sent b, and returns the path."""
+        p, b = self.origins, self.directions
+        places, directions = [], []
+        for boundary in self.boundaries:
+            p, n = boundary.surface.meet(p, b)
+            b = b - 2 * dot(n, b) * n if boundary.k is None else unit((yield b, n, np.asarray(boundary.k)))
+            places.append(p)
+            directions.append(b)
+            p = p - vectors(0, 0, boundary.thickness)
+        return Path(np.array(places), np.array(directions))
 
     def path(self, refract: Refract = snell, moved: Moved = lambda j, what, x, axis: x) -> Path:
         """By Snell's law in extended precision, or by a formula, in the coordinates of the system."""
