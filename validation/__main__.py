@@ -36,11 +36,11 @@ ROOMS = {
     "media": ("catalogs", "ray_directions", "closed_forms", "renders"),
     "planar": ("against_retrace", "closed_paths", "joints", "extruded_scenes", "times"),
     "diff": ("planted_defects", "visible_changes", "welch_nulls", "times"),
-    "ground-truth": ("traced_bodies",),
+    "ground-truth": ("traced_bodies", "standard_numbers"),
     "robustness": ("code_mutants",),
     "suite": (
         *("matrix", "per_ray", "small_mistakes", "rendered_images", "spectral_lines"),
-        *("lenses", "glasses", "exports"),
+        *("lenses", "glasses", "exports", "standard_numbers"),
     ),
 }
 # What the profile `quick` runs where no study is named.

@@ -19,14 +19,17 @@ from mi_refract.io.image_file import srgb_encode
 from mi_refract.io.safe_files import update_between, write_atomically
 from mi_refract.io.text import compact
 from mi_refract.plugins import PLUGIN
+from mi_refract.ray_sets.header import PRECISIONS
 from mi_refract.regimes import REGIMES
 from mi_refract.report.embedded_images import png
 from mi_refract.report.row import Row
 from validation.diff import visible_changes
 from validation.directions import per_formula
 from validation.efficiency import changing_indices, error_against_time
+from validation.ground_truth import standard_numbers
 from validation.planar import against_retrace
 from validation.planar import times as planar_times
+from validation.reference.standard_numbers import NUMBERS
 from validation.renders import against_dielectric, colours
 from validation.run import headline
 from validation.run import metrics as m
@@ -35,10 +38,12 @@ from validation.run.context import SCENES, Context
 from validation.run.render_methods import BUILTIN, METHODS
 from validation.stability import layered_paths
 from validation.suite import matrix
+from validation.suite import standard_numbers as numbers_by_others
 
 ROOT = SCENES.parent
 GALLERY = SCENES / "gallery.png"
 PAGES = ".github/docs/explanation"
+NUMBERS_PAGE = ".github/docs/reference/standard-numbers.md"
 
 
 class Table(NamedTuple):
@@ -311,6 +316,37 @@ def visible(rows: list[Row]) -> str:
     return "\n\n".join([first, _table(text, sides, [["codes of 255", *codes]] if edge else [], missing)])
 
 
+def numbers(rows: list[Row]) -> str:
+    """Every standard number, what is printed of it, and what the plugin makes of it."""
+    study, lines = standard_numbers, []
+    mine = {row.case: row for row in _measured(rows, study.NAME, [m.ERROR_OVER_BOUND], PLUGIN)}
+    for number in NUMBERS.values():
+        if row := mine.get(number.name):
+            digits = f"{number.value:.9g}{number.unit.replace('mm', ' mm')}"
+            measured = f"{row.values[study.MEASURED]:.9g}"
+            cells = _cells(row, [study.BOUND, m.ERROR_OVER_BOUND, study.SECONDS])
+            lines.append([number.name, digits, number.printed or "–", measured, *cells, row.setting])
+    text = 'Bounds are of |measured − value|; their terms are in the report\'s study "Standard numbers".'
+    heading = ["number", "value", "printed", f"`{PLUGIN}`", "bound", "error / bound", "seconds", "variant"]
+    return _table(text, heading, lines, "standard numbers were measured")
+
+
+def numbers_elsewhere(rows: list[Row]) -> str:
+    """Standard numbers by others: the error over its bound; ✗ where it is beyond."""
+    mine = [row for row in rows if row.study == numbers_by_others.NAME]
+    cells: dict[str, dict[str, str]] = {}
+    for row in _measured(mine, numbers_by_others.NAME, [m.ERROR_OVER_BOUND]):
+        subject = f"{row.subject}, {row.setting}" if row.setting in PRECISIONS else row.subject
+        (share,) = _cells(row, [m.ERROR_OVER_BOUND])
+        cells.setdefault(subject, {})[row.case] = share + (" ✗" if row.broken else "")
+    asked = [name for name in NUMBERS if any(name in by_name for by_name in cells.values())]
+    lines = [[name, *(by_name.get(name, "") for by_name in cells.values())] for name in asked]
+    absent = dict.fromkeys(row.subject for row in mine if not row.values)
+    text = "Error over bound: of rays in each system's own precision."
+    text += f"\nNot run here: {', '.join(absent)}." if absent else ""
+    return _table(text, ["number", *cells], lines, "other renderers were asked for standard numbers")
+
+
 TABLES = {
     "accuracy": Table("README.md", "directions", accuracy),
     "renders": Table(f"{PAGES}/refract-and-dielectric.md", "renders", renders),
@@ -320,6 +356,8 @@ TABLES = {
     "planar": Table(f"{PAGES}/how-accurate-planar-paths-are.md", "planar", planar),
     "defects": Table(f"{PAGES}/what-image-methods-detect.md", "diff", seen),
     "visible": Table(f"{PAGES}/how-tolerance-and-flip-decide.md", "diff", visible),
+    "standard numbers": Table(NUMBERS_PAGE, "ground-truth", numbers),
+    "standard numbers by others": Table(NUMBERS_PAGE, "suite", numbers_elsewhere),
     "suite": Table(
         f"{PAGES}/what-the-validation-shows.md",
         "suite",

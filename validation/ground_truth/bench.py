@@ -31,6 +31,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from mi_refract.plugins.refract import followed_context
 from validation.reference import closed_forms, optical_systems
 from validation.reference.optical_systems import ASKEW, BK7, Answers, Array, Boundary, Path, System, dot, length, unit
 from validation.run.context import SCENES
@@ -43,10 +44,14 @@ APEX = closed_forms.HALF_TURN / 3
 
 @dataclass(frozen=True)
 class Bench:
-    """A system, and its scenes: `scenes(plugin)`, one a boundary or one for all, shapes by name for Mitsuba."""
+    """A system, and its scenes: `scenes(plugin)`, one a boundary or one for all, shapes by name for Mitsuba.
+
+    `nm`: wavelength of the rays, in a spectral variant.
+    """
 
     system: System
     scenes: Callable[[str], list[dict[str, Any]]]
+    nm: float | None = None
 
     def roundings(self) -> dict[tuple[int, str], Array]:
         """How far each value may be off: N × 1, of places in mm."""
@@ -60,18 +65,26 @@ class Bench:
             sizes |= {(j, "into"): INTO * one, (j, "onward"): ONWARD * one}
         return {key: U * size for key, size in sizes.items()}
 
+    def summed(self, changes: Callable[[Path], Answers]) -> Answers:
+        """Σ size/NUDGE |change| over all roundings; `changes`: by answer, of a path with one value moved by NUDGE."""
+        totals: Answers = {}
+        for (boundary, what), size in self.roundings().items():
+            for way in range(3 if what == "place" else 2):
+                path = self.system.path(moved=optical_systems.nudged(boundary, what, way))
+                for name, change in changes(path).items():
+                    totals[name] = totals.get(name, 0) + size / optical_systems.NUDGE * np.abs(change)
+        return totals
+
     @functools.cached_property
     def bounds(self) -> Answers:
         """Of the norm of each answer's deviation, N × A: roundings, and what was printed."""
         system = self.system
         exact = system.off(system.path())
-        totals = {name: np.full(x.shape[:2], system.printed.get(name, 0), np.longdouble) for name, x in exact.items()}
-        for (boundary, what), size in self.roundings().items():
-            for way in range(3 if what == "place" else 2):
-                moved = system.off(system.path(moved=optical_systems.nudged(boundary, what, way)))
-                for name, total in totals.items():
-                    total += size / optical_systems.NUDGE * length(moved[name] - exact[name])[..., 0]
-        return totals
+
+        def changes(path: Path) -> Answers:
+            return {name: length(moved - exact[name])[..., 0] for name, moved in system.off(path).items()}
+
+        return {name: total + system.printed.get(name, 0) for name, total in self.summed(changes).items()}
 
     @property
     def index_seen(self) -> float:
@@ -97,10 +110,11 @@ class Bench:
         scenes *= len(system.boundaries) // len(scenes)
         origins, directions = ((x @ system.turn).astype(np.float32) for x in (system.origins, system.directions))
         if dr.is_jit_v(mi.Float):
-            found = np.moveaxis(_through(scenes, system.boundaries, origins.T, directions.T, spawned), 2, 3)
+            found = _through(scenes, system.boundaries, origins.T, directions.T, spawned, self.nm)
+            found = np.moveaxis(found, 2, 3)
         else:
             rays = zip(origins, directions, strict=True)
-            found = np.stack([_through(scenes, system.boundaries, o, d, spawned) for o, d in rays], axis=2)
+            found = np.stack([_through(scenes, system.boundaries, o, d, spawned, self.nm) for o, d in rays], axis=2)
         places, directions = found
         return Path(places @ system.turn.T, unit(directions @ system.turn.T))
 
@@ -109,13 +123,17 @@ class Bench:
         return {name: np.nan_to_num(length(x)[..., 0], nan=np.inf) for name, x in self.system.off(path).items()}
 
 
-def _through(scenes: list[Any], boundaries: tuple[Boundary, ...], o: Array, d: Array, spawned: bool) -> Array:
+def _through(
+    scenes: list[Any], boundaries: tuple[Boundary, ...], o: Array, d: Array, spawned: bool, nm: float | None = None
+) -> Array:
     """Places and directions behind the boundaries, 2 × B × 3 (× N); one kernel where there are any."""
     import mitsuba as mi
 
     ray, places, directions = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), [], []
-    sampling = mi.BSDFContext()
+    sampling = followed_context()
     for scene, boundary in zip(scenes, boundaries, strict=True):
+        if nm is not None:
+            ray.wavelengths = type(ray.wavelengths)(nm)
         si = scene.ray_intersect(ray)
         met = si.is_valid()
         if met is False:  # a scalar variant has no BSDF to ask then, and ends the process
@@ -135,8 +153,9 @@ def _through(scenes: list[Any], boundaries: tuple[Boundary, ...], o: Array, d: A
 
 
 def glass(plugin: str, inside: Any, outside: Any = 1.0) -> dict[str, Any]:
-    """Mitsuba's dictionary of a glass by its two indices."""
-    return {"type": plugin, "int_ior": float(inside), "ext_ior": float(outside)}
+    """Mitsuba's dictionary of a glass by its two indices; a text stays one."""
+    inside = inside if isinstance(inside, str) else float(inside)
+    return {"type": plugin, "int_ior": inside, "ext_ior": float(outside)}
 
 
 def _placed(scale: Any = 1.0) -> Any:
@@ -177,23 +196,27 @@ def _double_gauss(plugin: str) -> list[dict[str, Any]]:
     return scenes
 
 
+def prism(plugin: str, index: Any = BK7) -> list[dict[str, Any]]:
+    """The scene of a prism of 60°."""
+    mesh = {"type": "ply", "filename": str(SCENES / "meshes" / "prism.ply"), "face_normals": True}
+    return [{"prism": mesh | {"to_world": _placed(), "bsdf": glass(plugin, index)}}]
+
+
+def ball(plugin: str, index: Any = BK7) -> list[dict[str, Any]]:
+    """The scene of a ball around the origin."""
+    return [{"ball": {"type": "sphere", "radius": optical_systems.RADIUS, "bsdf": glass(plugin, index)}}]
+
+
 def benches() -> dict[str, Bench]:
     """All of them, by name."""
     down = np.linspace(0.3, 0.6, optical_systems.RAYS)
     least = optical_systems.prism(
         APEX, closed_forms.least_deviated(APEX, BK7) + 0 * optical_systems.degrees(0, 1), down
     )
-    mesh = {"type": "ply", "filename": str(SCENES / "meshes" / "prism.ply"), "face_normals": True}
 
     def slab(plugin: str) -> list[dict[str, Any]]:
         block = {"type": "cube", "to_world": _placed([60, 60, optical_systems.THICKNESS / 2])}
         return [{"block": block | {"bsdf": glass(plugin, BK7)}}]
-
-    def prism(plugin: str) -> list[dict[str, Any]]:
-        return [{"prism": mesh | {"to_world": _placed(), "bsdf": glass(plugin, BK7)}}]
-
-    def ball(plugin: str, index: Any = BK7) -> list[dict[str, Any]]:
-        return [{"ball": {"type": "sphere", "radius": optical_systems.RADIUS, "bsdf": glass(plugin, index)}}]
 
     drop = functools.partial(ball, index=optical_systems.WATER)
     return {

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path as File
 from typing import Any
@@ -182,6 +182,18 @@ class System:
             yield start, p, n, a, b
             p = p - vectors(0, 0, boundary.thickness)
 
+    def steps(self) -> Generator[tuple[Array, Array, Array], Array, Path]:
+        """Yields a, n and k wherever a ray is refracted, is sent b, and returns the path."""
+        p, b = self.origins, self.directions
+        places, directions = [], []
+        for boundary in self.boundaries:
+            p, n = boundary.surface.meet(p, b)
+            b = b - 2 * dot(n, b) * n if boundary.k is None else unit((yield b, n, np.asarray(boundary.k)))
+            places.append(p)
+            directions.append(b)
+            p = p - vectors(0, 0, boundary.thickness)
+        return Path(np.array(places), np.array(directions))
+
     def path(self, refract: Refract = snell, moved: Moved = lambda j, what, x, axis: x) -> Path:
         """By Snell's law in extended precision, or by a formula, in the coordinates of the system."""
         steps = list(self.walk(refract, moved))
@@ -256,15 +268,15 @@ def round_trip() -> System:
     return System(-a, a, boundaries, _direction(a))
 
 
-def prism(apex: Any, i: Array, down: Any = 0.4) -> System:
+def prism(apex: Any, i: Array, down: Any = 0.4, index: Any = BK7) -> System:
     """A prism deviates by i + asin(n sin(A − r)) − A. Rays come onto its left side, the share `down` from the apex."""
     half = apex / 2
     height, angle = SIDE * np.cos(half), i - half
     top = vectors(0, 2 * height / 3, 0)
     normals = [vectors(0, np.sin(half), side * np.cos(half)) for side in (-1, 1)]
-    a, after = (vectors(0, np.sin(x), np.cos(x)) for x in (angle, angle - closed_forms.deviation(i, apex, BK7)))
+    a, after = (vectors(0, np.sin(x), np.cos(x)) for x in (angle, angle - closed_forms.deviation(i, apex, index)))
     place = top + vectors(11, 0, 0) - np.reshape(down, (-1, 1)) * vectors(0, height, SIDE * np.sin(half))
-    boundaries = tuple(Boundary(Plane(top, n), k, 60) for n, k in zip(normals, (1 / BK7, BK7), strict=True))
+    boundaries = tuple(Boundary(Plane(top, n), k, 60) for n, k in zip(normals, (1 / index, index), strict=True))
     return System(place - 40 * a, a, boundaries, _direction(after))
 
 

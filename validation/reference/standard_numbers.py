@@ -35,7 +35,7 @@ room's; and measured indices of water by wavelength.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,6 +91,7 @@ class StandardNumber:
     fitted: str = ""
     unit: str = ""
     half_unit: float | None = None  # of the last printed digit, where it is not what the digits say
+    medium: str = ""  # of an index by wavelength: the text that the plugin is given, with `given` in it
 
     @functools.cached_property
     def value(self) -> float:
@@ -138,7 +139,7 @@ class StandardNumber:
 
 
 def _radians(degrees: Any) -> Any:
-    return np.longdouble(degrees) * closed_forms.HALF_TURN / 180
+    return np.asarray(degrees, np.longdouble) * closed_forms.HALF_TURN / 180
 
 
 def _degrees(radians: Any) -> Any:
@@ -153,21 +154,58 @@ def reflectances(n: Any, incidence: Any) -> tuple[np.ndarray, Any]:
     return np.array([s * s, p * p]), within
 
 
-def plates(n: Any, incidence: Any, count: float = 1, absorbance: float = 0.0, together: bool = False) -> Any:
-    """Transmittance of `count` parallel plates in air; `absorbance`: σ d, straight through one of them.
+def polarised_plates(n: Any, incidence: Any, count: float = 1, absorbance: Any = 0.0, together: bool = False) -> Any:
+    """Transmittance of `count` parallel plates in air for s and p.
 
-    One plate: T = (1 − R)² a/(1 − R² a²), R' = R + a² R (1 − R)²/(1 − R² a²), a = exp(−σ d/cosθ_t). Two that stand one
-    behind the other: T = T₁ T₂/(1 − R₁' R₂'), R' = R₁' + T₁² R₂'/(1 − R₁' R₂'). Without absorption count plates pass
-    (1 − R)/(1 + (2 count − 1) R). `together`: R is the mean of both polarisations at each boundary.
+    One plate: T = (1 − R)² a/(1 − R² a²), R' = R + a² R (1 − R)²/(1 − R² a²), a = exp(−σ d/cosθ_t), with the absorbance
+    σ d straight through it. Two that stand one behind the other: T = T₁ T₂/(1 − R₁' R₂'), R' = R₁' + T₁² R₂'/(1 − R₁'
+    R₂'). Without absorption count plates pass (1 − R)/(1 + (2 count − 1) R). `together`: one entry, for a renderer in
+    which R is the mean of both polarisations at each boundary.
     """
-    r, within = reflectances(n, incidence)
-    r = np.array([r.mean()]) if together else r
-    a = np.exp(-np.longdouble(absorbance) / within)
+    r, a = _boundary(n, incidence, absorbance, together)
     through, back = (1 - r) ** 2 * a / (1 - (r * a) ** 2), r + a * a * r * (1 - r) ** 2 / (1 - (r * a) ** 2)
     t, b = through, back
     for _ in range(round(count) - 1):
         t, b = t * through / (1 - b * back), b + t * t * back / (1 - b * back)
-    return t.mean()
+    return t
+
+
+def _boundary(n: Any, incidence: Any, absorbance: Any, together: bool) -> tuple[np.ndarray, np.ndarray]:
+    """R, and what a way through a plate leaves."""
+    r, within = reflectances(n, incidence)
+    r = r.mean(keepdims=True) if together else r
+    return r, np.exp(-np.longdouble(absorbance) / within) + 0 * r
+
+
+def paths_through(most: int, **given: Any) -> tuple[np.ndarray, np.ndarray]:
+    """What leaves plates as of `polarised_plates` after 1 … `most` boundaries; and what is still on its way then.
+
+    Boundary by boundary: at the one of number i, of 2 count, light goes on to i + 1 or i − 1.
+    """
+    r, a = _boundary(given["n"], given["incidence"], given.get("absorbance", 0.0), given.get("together", False))
+    last, passed = 2 * round(given.get("count", 1)), []
+    onward, back = np.zeros((2, last, len(r)), np.longdouble)
+    onward[0] = 1
+    for _ in range(most):
+        after, before = np.zeros_like(onward), np.zeros_like(back)
+        leaves = np.zeros_like(r)
+        for i in range(last):
+            ahead, behind = (1 - r) * onward[i] + r * back[i], r * onward[i] + (1 - r) * back[i]
+            glass_ahead = i % 2 == 0
+            if i + 1 < last:
+                after[i + 1] = ahead * (a if glass_ahead else 1)
+            else:
+                leaves = ahead
+            if i > 0:
+                before[i - 1] = behind * (1 if glass_ahead else a)
+        onward, back = after, before
+        passed.append(leaves)
+    return np.array(passed), (onward + back).sum(0)
+
+
+def plates(**given: Any) -> Any:
+    """The mean of both polarisations of `polarised_plates`."""
+    return polarised_plates(**given).mean()
 
 
 def deviation(n: Any, apex: Any) -> Any:
@@ -211,8 +249,8 @@ def retarding_incidence(n: Any, each: Any, steep: bool) -> Any:
     return _degrees(np.arcsin(np.sqrt(x)))
 
 
-def diffuse(n: float, outside: bool, passed: bool) -> Any:
-    """R or T of diffuse light from outside or from inside."""
+def diffuse(n: float, outside: float, passed: float) -> Any:
+    """R or, where `passed` is 1, T of diffuse light from outside, where `outside` is 1, or from inside."""
     reflected = closed_forms.hemispherical(float(n))["outside" if outside else "inside"]
     return 1 - reflected if passed else reflected
 
@@ -230,10 +268,10 @@ def khronos(n_d: Any, abbe: Any, nm: Any) -> Any:
     return max(n_d + (n_d - 1) / abbe * (523655 / np.longdouble(nm) ** 2 - np.longdouble("1.5168")), 1)
 
 
-def khronos_sample(n_d: Any, abbe: Any, channel: float) -> Any:
-    """n_d ± (n_d − 1) 0.025 (20/V_d): the sample of GLSL, `channel` −1 for red and 1 for blue."""
+def khronos_sample(n_d: Any, abbe: Any, nm: float) -> Any:
+    """n_d ± (n_d − 1) 0.025 (20/V_d): the sample of GLSL, + for blue and − for red."""
     n_d = np.longdouble(n_d)
-    return n_d + channel * (n_d - 1) / 40 * (20 / np.longdouble(abbe))
+    return n_d + np.sign(587.56 - nm) * (n_d - 1) / 40 * (20 / np.longdouble(abbe))
 
 
 @functools.cache
@@ -241,11 +279,15 @@ def _lens() -> Any:
     return optical_systems.double_gauss().path()
 
 
+def behind_the_lens(path: optical_systems.Path, ray: float, slope: float) -> Any:
+    """Of a ray's path, behind the last surface: y in mm or, where `slope` is 1, dy/dz."""
+    y, b = path.places[-1][round(ray), 1], path.directions[-1][round(ray)]
+    return b[1] / b[2] if slope else y
+
+
 def lens(ray: float, slope: float) -> Any:
-    """y in mm, or the slope dy/dz, of a ray behind the last surface of the double Gauss, by Snell's law."""
-    path, number = _lens(), round(ray)
-    b = path.directions[-1][number]
-    return b[1] / b[2] if slope else path.places[-1][number][1]
+    """By Snell's law, in extended precision, of a ray through the double Gauss."""
+    return behind_the_lens(_lens(), ray, slope)
 
 
 @functools.cache
@@ -253,10 +295,45 @@ def cie_absorbance() -> float:
     """σ d of the glass of CIE 171's case, by Gauss and Newton: least squares of the nine printed transmittances."""
     printed, angles, x = np.array(CIE_PRINTED, float), range(0, 90, 10), 0.04
     for _ in range(8):
-        at = [np.array([plates(CIE_INDEX, angle, 1, x + h) for angle in angles], float) for h in (0, 1e-5, -1e-5)]
+        at = [
+            np.array([plates(n=CIE_INDEX, incidence=angle, absorbance=x + h) for angle in angles], float)
+            for h in (0, 1e-5, -1e-5)
+        ]
         slope = (at[1] - at[2]) / 2e-5
         x += float(slope @ (printed - at[0]) / (slope @ slope))
     return round(x, 8)
+
+
+# Rays ------------------------------------------------------------------------------------------------------------
+
+
+def prism(numbers: Sequence[StandardNumber]) -> optical_systems.System:
+    """A prism with a ray for each number of its kind, at the incidence of the least deviation."""
+    apex = _radians([number.given["apex"] for number in numbers])
+    index = np.array([_index(number) for number in numbers])
+    return optical_systems.prism(apex, closed_forms.least_deviated(apex, index), index=index)
+
+
+def _index(number: StandardNumber) -> Any:
+    if "n" in number.given:
+        return np.longdouble(number.given["n"])
+    return sellmeier(GLASSES[number.medium.partition(":")[2]][0], number.given["nm"])
+
+
+def drop(numbers: Sequence[StandardNumber]) -> optical_systems.System:
+    """A drop with a ray for each rainbow of one order, at the incidence at which the deflection is stationary."""
+    index, order = np.array([number.given["n"] for number in numbers], np.longdouble), numbers[0].given["order"]
+    return optical_systems.drop(round(order), closed_forms.rainbow_incidence(index, order), index)
+
+
+def deviated(a: Any, b: Any) -> Any:
+    """The angles between directions (N × 3) in the plane x = 0, clockwise, in degrees."""
+    return _degrees(np.arctan2(a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1], a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]))
+
+
+def from_antisolar(a: Any, b: Any) -> Any:
+    """The angles from the point opposite to the sun, which shines along a, of light that left along b; in degrees."""
+    return _degrees(np.arctan2(optical_systems.length(np.cross(a, b))[:, 0], -optical_systems.dot(a, b)[:, 0]))
 
 
 # The table -------------------------------------------------------------------------------------------------------
@@ -285,14 +362,18 @@ def _table() -> Iterator[StandardNumber]:
         yield StandardNumber(
             f"slab, n = 1.52, {angle:g}°", "transmittance", plates, {"n": 1.52, "incidence": angle}, one, PILE
         )
-    for angle in (30.0, 45.0, 60.0):
+    for angle in (0.0, 45.0):
+        given = {"n": 1.52, "incidence": angle, "count": 2}
+        yield StandardNumber(f"2 slabs, n = 1.52, {angle:g}°", "transmittance", plates, given, pile, PILE)
+    for count, angle in ((1, 30.0), (1, 45.0), (1, 60.0), (4, 0.0)):
         law = functools.partial(plates, together=True)
-        given = {"n": 1.52, "incidence": angle}
-        name, text = f"slab without polarisation, n = 1.52, {angle:g}°", "(1 − R)/(1 + R), R the mean of s and p"
-        yield StandardNumber(name, "transmittance, unpolarised", law, given, text, PILE)
-    for count, angle in ((2, 0.0), (4, 0.0), (4, 45.0)):
         given = {"n": 1.52, "incidence": angle, "count": count}
-        yield StandardNumber(f"{count} slabs, n = 1.52, {angle:g}°", "transmittance", plates, given, pile, PILE)
+        slabs = "slab" if count == 1 else f"{count} slabs"
+        name, text = (
+            f"{slabs} without polarisation, n = 1.52, {angle:g}°",
+            f"{pile.split(',')[0]}, R the mean of s and p",
+        )
+        yield StandardNumber(name, "transmittance, unpolarised", law, given, text, PILE)
     for angle, printed in zip(range(0, 90, 10), CIE_PRINTED, strict=True):
         given = {"n": CIE_INDEX, "incidence": float(angle), "absorbance": cie_absorbance()}
         fit = "σ d, by least squares to the nine printed values; the index is given"
@@ -309,7 +390,8 @@ def _table() -> Iterator[StandardNumber]:
         law = functools.partial(_prism_of_glass, GLASSES["N-BK7"][0])
         text, source = "2 asin(n(λ) sin(A/2)) − A, Sellmeier's n(λ)", f"{PRISM}; {SCHOTT}"
         name = f"prism of 60°, N-BK7, line {line}"
-        yield StandardNumber(name, "deviation", law, {"nm": nm, "apex": APEX}, text, source, unit="°")
+        given, medium = {"nm": nm, "apex": APEX}, "SCHOTT:N-BK7"
+        yield StandardNumber(name, "deviation", law, given, text, source, unit="°", medium=medium)
     for n in (1.3333, 1.3318, 1.3435):
         for order in (1, 2):
             text = f"|{order}π + 2i − {2 * (order + 1)}r − π|, cos i = √((n² − 1)/{order * (order + 2)})"
@@ -337,23 +419,24 @@ def _table() -> Iterator[StandardNumber]:
         for outside in (True, False):
             for passed in (False, True):
                 side, what = "outside" if outside else "inside", "transmittance" if passed else "reflectance"
-                law = functools.partial(diffuse, outside=outside, passed=passed)
+                given = {"n": n, "outside": float(outside), "passed": float(passed)}
                 text = "see validation.reference.closed_forms.hemispherical; 1 − R_i = (1 − R_e)/n², T = 1 − R"
-                yield StandardNumber(f"diffuse {what}, n = {n:g}, from {side}", "diffuse", law, {"n": n}, text, DIFFUSE)
+                yield StandardNumber(
+                    f"diffuse {what}, n = {n:g}, from {side}", "diffuse", diffuse, given, text, DIFFUSE
+                )
     for glass, (coefficients, printed_at) in GLASSES.items():
         for line, printed in printed_at.items():
             law, text = functools.partial(sellmeier, coefficients), "n² = 1 + Σ B λ²/(λ² − C)"
-            name = f"index of {glass}, line {line}"
-            yield StandardNumber(name, "index", law, {"nm": LINES[line]}, text, SCHOTT, printed=printed)
+            name, given, medium = f"index of {glass}, line {line}", {"nm": LINES[line]}, f"SCHOTT:{glass}"
+            yield StandardNumber(name, "index", law, given, text, SCHOTT, printed=printed, medium=medium)
     for line, nm in (("C", 656.27), ("F", 486.13)):
         given, text = {"n_d": 2.42, "abbe": 55.0, "nm": nm}, "n_d + (n_d − 1)/V_d (523655/λ² − 1.5168), at least 1"
-        yield StandardNumber(
-            f"glTF dispersion, n_{line}", "index", khronos, given, text, f"{KHRONOS}, Overview (normative)"
-        )
-    for line, channel in (("C", -1.0), ("F", 1.0)):
-        given = {"n_d": 2.42, "abbe": 55.0, "channel": channel}
-        name, text = f"glTF dispersion, sample, n_{line}", "n_d ± (n_d − 1) 0.025 (20/V_d)"
-        yield StandardNumber(name, "index", khronos_sample, given, text, f"{KHRONOS}, Implementation (not normative)")
+        name, source = f"glTF dispersion, n_{line}", f"{KHRONOS}, Overview (normative)"
+        yield StandardNumber(name, "index", khronos, given, text, source, medium="abbe({n_d}, {abbe})")
+    for line, nm in (("C", 656.27), ("F", 486.13)):
+        given, text = {"n_d": 2.42, "abbe": 55.0, "nm": nm}, "n_d ± (n_d − 1) 0.025 (20/V_d), + at F and − at C"
+        name, source = f"glTF dispersion, sample, n_{line}", f"{KHRONOS}, Implementation (not normative)"
+        yield StandardNumber(name, "index", khronos_sample, given, text, source)
     for ray, field_angle in ((1, 10), (5, 14)):
         for slope, what, unit in ((0.0, "y", "mm"), (1.0, "dy/dz", "")):
             numbers = optical_systems.double_gauss_data()["rays"][ray]["surfaces"][-1]

@@ -1,0 +1,192 @@
+"""The table of standard numbers against other forms and prints; and errors planted in what is measured of each."""
+
+import csv
+import dataclasses
+import io
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mi_refract import media
+from validation.ground_truth import bench
+from validation.ground_truth import standard_numbers as study
+from validation.reference import optical_systems
+from validation.reference import standard_numbers as table
+from validation.run.render_methods import under
+
+NUMBERS = table.NUMBERS
+
+
+def value(name):
+    return NUMBERS[name].value
+
+
+# The table -------------------------------------------------------------------------------------------------------
+
+# To the digits that are in circulation.
+KNOWN = {
+    "slab, n = 1.52, 0°": 0.91832,
+    "slab, n = 1.52, 30°": 0.91596,
+    "slab, n = 1.52, 45°": 0.90253,
+    "slab, n = 1.52, 60°": 0.84347,
+    "prism of 60°, n = 1.5": 37.181,
+    "prism of 60°, n = 1.5168": 38.647,
+    "prism of 60°, n = 1.52": 38.928,
+    "rainbow of order 1, n = 1.3333": 42.03,
+    "rainbow of order 2, n = 1.3333": 50.97,
+    "rainbow of order 1, n = 1.3318": 42.25,
+    "rainbow of order 2, n = 1.3318": 50.58,
+    "rainbow of order 1, n = 1.3435": 40.58,
+    "rainbow of order 2, n = 1.3435": 53.61,
+    "glTF dispersion, sample, n_C": 2.40709,
+    "glTF dispersion, sample, n_F": 2.43291,
+}
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_a_number_has_the_digits_that_are_in_circulation(name):
+    decimals = len(repr(KNOWN[name]).partition(".")[2])
+    assert round(value(name), decimals) == KNOWN[name]
+
+
+def test_the_table_is_plain_data_with_unique_names_and_every_number_says_where_it_is_from():
+    rows = table.rows()
+    assert len(rows) == len(NUMBERS) >= 18
+    assert json.loads(json.dumps(rows, allow_nan=False)) == rows
+    out = io.StringIO()
+    writer = csv.DictWriter(out, rows[0])
+    writer.writerows(rows)
+    assert all(row["source"] and row["law"] and row["kind"] in table.KINDS and row["given"] for row in rows)
+    assert {row["kind"] for row in rows} == set(table.KINDS)
+
+
+@pytest.mark.parametrize("name", [name for name, number in NUMBERS.items() if number.printed])
+def test_a_law_gives_the_printed_digits_but_for_the_glass_that_no_slab_is(name):
+    row = NUMBERS[name].as_dict()
+    within = 0.0021 if row["fitted"] else row["printed_half_unit"] * (1 + 1e-9)
+    assert abs(row["off_print"]) <= within and row["off_print"] == row["value"] - row["printed_value"]
+
+
+def test_the_glass_of_the_cie_is_the_polynomial_and_its_absorption_the_least_square():
+    cosines = np.cos(np.deg2rad(np.arange(0, 90, 10)))
+    polynomial = np.polynomial.polynomial.polyval(cosines, table.CIE_POLYNOMIAL)
+    assert [f"{x:.4f}" for x in polynomial] == list(table.CIE_PRINTED)
+
+    def misses(absorbance):
+        return sum(
+            (float(NUMBERS[f"CIE 171 clear glass, {angle}°"].at(absorbance=absorbance)) - float(printed)) ** 2
+            for angle, printed in zip(range(0, 90, 10), table.CIE_PRINTED, strict=True)
+        )
+
+    best = table.cie_absorbance()
+    assert misses(best) < min(misses(best - 1e-5), misses(best + 1e-5))
+
+
+def test_plates_are_the_sum_of_all_paths_and_a_pile_of_clear_ones_is_stokes_formula():
+    cases: list[dict[str, Any]] = [
+        {"n": 1.52, "incidence": 60.0},
+        {"n": 1.52, "incidence": 70.0, "absorbance": 0.3},
+        {"n": 1.7, "incidence": 45.0, "count": 3},
+        {"n": 1.52, "incidence": 60.0, "together": True, "count": 2},
+    ]
+    for given in cases:
+        passed, left = table.paths_through(150, **given)
+        assert passed.sum(0) == pytest.approx(table.polarised_plates(**given), abs=1e-13) and left.max() < 1e-13
+    r, _ = table.reflectances(1.7, 45.0)
+    assert table.polarised_plates(1.7, 45.0, 3) == pytest.approx((1 - r) / (1 + 5 * r), abs=1e-16)
+    # Where each boundary passes the mean less passes, but straight through the same.
+    assert value("slab without polarisation, n = 1.52, 60°") < value("slab, n = 1.52, 60°") - 0.01
+    assert table.plates(n=1.52, incidence=0.0, together=True) == table.plates(n=1.52, incidence=0.0)
+
+
+def test_the_rhomb_retards_by_90_degrees_at_two_incidences_and_the_largest_is_between_them():
+    gentle, steep = (table.retarding_incidence(1.51, 45, steep) for steep in (False, True))
+    for incidence, minutes in ((gentle, 48 * 60 + 37), (steep, 54 * 60 + 37)):
+        assert abs(float(incidence) * 60 - minutes) < 0.6
+        # From the amplitudes themselves, complex beyond the critical angle.
+        i = math.radians(float(incidence))
+        beyond = 1j * math.sqrt((1.51 * math.sin(i)) ** 2 - 1)
+        s = (1.51 * math.cos(i) - beyond) / (1.51 * math.cos(i) + beyond)
+        p = (math.cos(i) - 1.51 * beyond) / (math.cos(i) + 1.51 * beyond)
+        assert abs(math.degrees(np.angle(p / s))) == pytest.approx(45, abs=1e-9)
+    largest = NUMBERS["largest retardation, n = 1.51"]
+    assert largest.value == pytest.approx(2 * math.degrees(math.atan((1.51**2 - 1) / (2 * 1.51))), abs=1e-12)
+    assert gentle < largest.given["incidence"] < steep and largest.slope("incidence") < 1e-6
+
+
+def test_the_package_has_the_indices_of_the_table():
+    for number in NUMBERS.values():
+        if number.kind == "index" and number.medium.startswith("SCHOTT"):
+            assert media.index(number.medium, number.given["nm"]) == pytest.approx(number.value, rel=1e-15)
+
+
+def test_diffuse_shares_add_up_and_share_etendue():
+    for n in (1.5, 1.333):
+        shares = {
+            (side, what): value(f"diffuse {what}, n = {n:g}, from {side}")
+            for side in ("outside", "inside")
+            for what in ("reflectance", "transmittance")
+        }
+        for side in ("outside", "inside"):
+            assert shares[side, "reflectance"] + shares[side, "transmittance"] == pytest.approx(1, abs=1e-15)
+        assert shares["inside", "transmittance"] * n * n == pytest.approx(shares["outside", "transmittance"], abs=1e-15)
+
+
+# What is measured ------------------------------------------------------------------------------------------------
+
+
+def altered(number, bound):
+    """Another number of the same name, whose value is two bounds away; what its law is given says by how much."""
+    name = next(name for name in ("n", "n_d", "nm") if name in number.given)
+    step = 2 * bound / number.slope(name)
+    return dataclasses.replace(number, given={**number.given, name: number.given[name] + step})
+
+
+def seen(number, measured, bound):
+    """Whether the row of a number that was measured of something else fails."""
+    return study.row(number, dataclasses.replace(measured, bound=bound), "refract", "").broken == {"error / bound": 1.0}
+
+
+def measured_and_altered(numbers, samples=0):
+    """Each number is within its bound, and beyond it where the plugin is given something else by two bounds' worth."""
+    found = study.measure(numbers, samples)
+    rows = [study.row(number, found[number.name], "refract", "") for number in numbers]
+    assert [(row.case, row.broken) for row in rows if row.verdict != "pass"] == []
+    wrong = study.measure([altered(number, found[number.name].bound) for number in numbers], samples)
+    assert [x.name for x in numbers if not seen(x, wrong[x.name], found[x.name].bound)] == []
+
+
+SCALAR = [kind for kind in table.KINDS if kind != "double Gauss"]
+
+
+@pytest.mark.parametrize("kind", SCALAR)
+def test_every_number_is_within_its_bound_and_twice_that_is_seen(kind, needs_variant):
+    numbers = [number for number in NUMBERS.values() if number.kind == kind and number.given.get("count", 1) == 1]
+    for variant in dict.fromkeys(study.SCALAR[study.need(number)] for number in numbers):
+        needs_variant(variant)
+        with under(variant):
+            measured_and_altered([number for number in numbers if study.SCALAR[study.need(number)] == variant])
+
+
+@pytest.mark.parametrize(("need", "count"), [("polarised", 2), ("plain", 4)])
+def test_piles_are_within_their_bounds_and_twice_that_is_seen(need, count, needs_variant):
+    needs_variant(study.COMPILED[need])
+    numbers = [x for x in NUMBERS.values() if x.given.get("count") == count and study.need(x) == need]
+    with under(study.COMPILED[need]):
+        measured_and_altered(numbers, 1 << 14)
+
+
+def test_the_double_gauss_is_within_its_bounds_and_another_glass_by_twice_that_is_seen(scalar_context, monkeypatch):
+    numbers = [number for number in NUMBERS.values() if number.kind == "double Gauss"]
+    found, glass, share = study.measure(numbers), bench.glass, 1e-6
+    assert [x.name for x in numbers if study.row(x, found[x.name], "refract", "").verdict != "pass"] == []
+    denser = optical_systems.double_gauss_data()["prescription"]
+    path = optical_systems.double_gauss([[c, d, n * (1 + share * (n > 1))] for c, d, n in denser]).path()
+    changed = [abs(float(table.behind_the_lens(path, **x.given)) - x.value) / share for x in numbers]
+    more = max(2 * found[x.name].bound / change for x, change in zip(numbers, changed, strict=True))
+    monkeypatch.setattr(bench, "glass", lambda plugin, *n: glass(plugin, *(x * (1 + more * (x > 1)) for x in n)))
+    wrong = study.measure(numbers)
+    assert [x.name for x in numbers if not seen(x, wrong[x.name], found[x.name].bound)] == []

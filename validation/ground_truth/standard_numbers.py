@@ -1,0 +1,413 @@
+"""Standard numbers: published and closed-form values, measured through `refract` in Mitsuba.
+
+The numbers are those of `validation/reference/standard_numbers.py`, each with its law, its source and, where a source
+prints it, its digits. Plates are rendered: by `refract_path`, both lobes followed at twelve boundaries and nothing
+behind them, so that there is no noise; a pile of four by Mitsuba's `path`, with noise. In polarised variants; where
+each boundary passes the mean of both polarisations, in one without. Prisms, drops and the double Gauss are traced, as
+in the ground truth. The rhomb is a body of Mitsuba's, and its retardation δ is read from the Mueller matrix of the ray
+through it, whose last element is cos δ. Brewster's and the critical angle are found by trying angles, the diffuse
+shares by the BSDF's probabilities at the nodes of a quadrature, indices by the ratio that a sample of it returns.
+
+The error is divided by its bound, in which all roundings to float32 add up at their worst; u = 2⁻²⁴.
+
+- Plates. The ray's direction turns by 39u at each boundary (see `ground_truth/bench.py`), twelve times; of each
+  polarisation the transmittance changes by so much times its slope. A weight is off by 45u a boundary with Mueller
+  matrices: 16u for the products of amplitudes, four rotations and a product of 5u each, 4u for lobes. Without, by 8u.
+  A path counts as often as it meets boundaries. What is still on its way behind twelve of them is missing. In an
+  absorbing plate Mitsuba sets a ray off along the normal, which makes its way shorter by sin²θ of that offset.
+- Four plates: Student's t over 16 sets of samples, which chance exceeds once in ten thousand runs, and these roundings.
+- Rays: see `ground_truth/bench.py`.
+- Retardation: 39u three times, times its slope, and four weights over sin δ.
+- Brewster's and the critical angle: 8u for the sines and cosines of a direction, 2u for the ratio of indices.
+- Diffuse shares: `limits.DIFFUSE`. Indices: 3u for the ratio, and the rounded wavelength; for glTF's formula, half a
+  unit of the last digit of the three constants that it prints.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract.plugins import PLUGIN
+from mi_refract.plugins.refract import followed_context
+from mi_refract.report.row import Row
+from validation import limits
+from validation.reference import closed_forms, optical_systems
+from validation.reference import standard_numbers as table
+from validation.reference.standard_numbers import StandardNumber
+from validation.run.bsdf_sampling import OFFSET, sample_all
+from validation.run.context import Context
+from validation.run.metrics import ERROR_OVER_BOUND
+from validation.run.render_methods import under
+from validation.study import Study, Task, about
+
+from . import bench
+from .bench import FIRST, INTO, NORMAL, ONWARD, Bench, U, glass
+
+NAME = "standard numbers"
+MEASURED, EXACT, PRINTED, BOUND, SECONDS = "measured", "exact", "printed", "bound", "seconds"
+# In the profile `quick` and where nothing is compiled: one variant has polarisation and wavelengths.
+COMPILED = {"plain": "llvm_ad_mono", "spectral": "llvm_ad_spectral", "polarised": "llvm_ad_mono_polarized"}
+SCALAR = {"plain": "scalar_rgb", "spectral": "scalar_spectral", "polarised": "scalar_spectral_polarized"}
+TERMS = dict(table.KINDS) | {
+    EXACT: "the law in extended precision",
+    PRINTED: "as the source prints it, where one in hand does",
+    BOUND: "of |measured − exact|",
+    SECONDS: "of the measurement, shared by what one render measures",
+}
+BOUNDARIES = 12  # of a path through plates: 4096 paths are the most that a sample splits into
+THICKNESS, HALF_SIZE, FAR = 200.0, 6000.0, 1e4  # of plates, which stand as far apart as they are thick
+TURN = NORMAL + INTO + ONWARD
+WEIGHT, PLAIN_WEIGHT = 45.0, 8.0
+SAMPLES = {"standard": 1 << 18, "full": 1 << 22}  # of a pile of four plates
+SETS = 16
+NM = 550.0  # in variants that need a wavelength
+ANGLE, RATIO = 8.0, 2.0
+SMALL = 1e-7  # of the difference quotients in extended precision
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What the plugin makes of a number, and by how much it may differ from the law."""
+
+    value: float
+    bound: float
+    seconds: float = 0.0
+
+
+def tasks(context: Context) -> list[Task]:
+    """One per kind; piles of plates, which take millions of samples, where something is compiled."""
+    return [Task(f"{NAME}: {kind}", functools.partial(kind_rows, kind, context), timed=True) for kind in table.KINDS]
+
+
+def kind_rows(kind: str, context: Context) -> list[Row]:
+    """A row per number."""
+    scalar = context.profile.quick or context.scalar
+    numbers = [
+        number
+        for number in table.NUMBERS.values()
+        if number.kind == kind and not (scalar and number.given.get("count", 1) > 1)
+    ]
+    variants = {number.name: (SCALAR if scalar else COMPILED)[need(number)] for number in numbers}
+    made = []
+    for variant in dict.fromkeys(variants.values()):
+        mine = [number for number in numbers if variants[number.name] == variant]
+        if (reason := context.variants.get(variant, "not in this wheel")) is not None:
+            made += [Row(NAME, PLUGIN, number.name, variant, reason=reason) for number in mine]
+            continue
+        with under(variant):
+            found = measure(mine, SAMPLES.get(context.profile.name, 0))
+        made += [row(number, found[number.name], PLUGIN, variant) for number in mine]
+    return made
+
+
+def noisy(number: StandardNumber) -> bool:
+    """Whether it is measured with noise: twelve boundaries of such a pile leave too much light within."""
+    return number.given.get("count", 1) > 2
+
+
+def row(number: StandardNumber, found: Measured, subject: str, setting: str) -> Row:
+    """The error over its bound."""
+    read = number.print_reading
+    values = {MEASURED: found.value, EXACT: number.value} | ({PRINTED: read[0]} if read else {})
+    error = abs(found.value - number.value)
+    values |= {BOUND: found.bound, ERROR_OVER_BOUND: error / found.bound, SECONDS: found.seconds}
+    remark = "; ".join(filter(None, (number.source, number.fitted and f"fitted: {number.fitted}")))
+    budgets, replay = {ERROR_OVER_BOUND: limits.STANDARD}, {"law": number.formula, **number.given}
+    return Row(NAME, subject, number.name, setting, values, budgets, reason=remark, replay=replay)
+
+
+def need(number: StandardNumber) -> str:
+    """What its variant of Mitsuba must have."""
+    if "nm" in number.given:
+        return "spectral"
+    return "polarised" if number.kind in ("transmittance", "retardation", "Brewster's angle") else "plain"
+
+
+def measure(numbers: Sequence[StandardNumber], samples: int = 0) -> dict[str, Measured]:
+    """In the present variant, by name. `samples`: of light through a pile of plates."""
+    made: dict[str, Measured] = {}
+    groups: dict[tuple[Any, ...], list[StandardNumber]] = {}
+    for number in numbers:
+        groups.setdefault((number.kind, *_together(number)), []).append(number)
+    for (kind, *_), group in groups.items():
+        start = time.perf_counter()
+        found = MEASURES[kind](group, samples)
+        seconds = (time.perf_counter() - start) / len(group)
+        pairs = zip(group, found, strict=True)
+        made |= {x.name: Measured(float(value), float(bound), seconds) for x, (value, bound) in pairs}
+    return made
+
+
+def _together(number: StandardNumber) -> tuple[Any, ...]:
+    """Numbers for which this is the same are measured by one render."""
+    if number.kind.startswith("transmittance"):
+        return tuple(number.given.get(name) for name in ("n", "count", "absorbance"))
+    return () if number.kind == "double Gauss" else (number.name,)
+
+
+Answers = list[tuple[Any, Any]]  # value and bound of each number of a group
+
+
+# Plates ----------------------------------------------------------------------------------------------------------
+
+
+def transmittances(group: Sequence[StandardNumber], samples: int) -> Answers:
+    """Of one plate or pile at the angles of all numbers: what its integrator sees behind it of a lamp of radiance 1."""
+    import mitsuba as mi
+
+    noise = noisy(group[0])
+    integrator: dict[str, Any] = {"type": "path" if noise else "refract_path", "max_depth": -1, "rr_depth": 1 << 20}
+    if not noise:
+        integrator |= {"split_depth": BOUNDARIES, "split_weight": 0.0, "max_depth": BOUNDARIES + 1}
+    scene: Any = mi.load_dict(_plates(group[0]) | {"integrator": integrator})
+    angles = np.deg2rad([number.given["incidence"] for number in group])
+    d = np.stack([np.sin(angles), 0 * angles, np.cos(angles)])
+    seen = _radiances(scene, np.repeat(d, samples if noise else 1, axis=1)).reshape(
+        len(group), SETS if noise else 1, -1
+    )
+    means, chance = seen.mean(2), np.zeros(len(group))
+    if noise:
+        from scipy import stats
+
+        chance = stats.t.isf(limits.FALSE_ALARM / 2, SETS - 1) * means.std(1, ddof=1) / math.sqrt(SETS)
+    return [
+        (mean, plates_bound(number) + more) for number, mean, more in zip(group, means.mean(1), chance, strict=True)
+    ]
+
+
+def _radiances(scene: Any, d: np.ndarray) -> np.ndarray:
+    """By the scene's integrator, of rays along d (3 × N) that meet the first plate on the axis."""
+    import mitsuba as mi
+
+    o, sampler = np.array([[0], [0], [-THICKNESS / 2]]) - THICKNESS * d, mi.load_dict({"type": "independent"})
+    vectorised = dr.is_jit_v(mi.Float)
+    sampler.seed(0, d.shape[1] if vectorised else 1)
+
+    def seen(o: Any, d: Any) -> Any:
+        ray: Any = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
+        if mi.is_spectral:
+            ray.wavelengths = type(ray.wavelengths)(NM)
+        return np.array(scene.integrator().sample(scene, sampler, ray)[0], float)
+
+    if vectorised:
+        return np.asarray(seen(o, d).reshape(-1, d.shape[1])[0])
+    return np.array([seen(*ray).ravel()[0] for ray in zip(o.T, d.T, strict=True)])
+
+
+def plates_bound(number: StandardNumber) -> float:
+    """See the module."""
+    polarised = number.kind == "transmittance"
+    given: dict[str, Any] = {**number.given, "together": not polarised}
+
+    def slope(name: str) -> float:
+        """Σ |∂T/∂given|/count: no polarisation makes up for the other."""
+        ends = [table.polarised_plates(**{**given, name: np.longdouble(given[name]) + x}) for x in (SMALL, -SMALL)]
+        return float(np.abs(ends[0] - ends[1]).mean() / (2 * SMALL))
+
+    passed, left = table.paths_through(BOUNDARIES, **given)
+    met = np.arange(1, BOUNDARIES + 1) @ passed + BOUNDARIES * left
+    total = slope("incidence") * math.degrees(FIRST + BOUNDARIES * TURN) * U + slope("n") * given["n"] * RATIO * U
+    total += (WEIGHT if polarised else PLAIN_WEIGHT) * U * float(met.mean())
+    if not noisy(number):
+        total += float(left.mean())
+    if "absorbance" in given:
+        sine = math.sin(math.radians(given["incidence"])) / given["n"]
+        way = OFFSET * (1 + 4 * THICKNESS) / THICKNESS * sine**2 + BOUNDARIES * bench.PLACE * U
+        total += slope("absorbance") * given["absorbance"] * way
+    return float(total)
+
+
+def _plates(number: StandardNumber) -> dict[str, Any]:
+    """Plates across z, the first one around the origin, and a lamp behind them."""
+    import mitsuba as mi
+
+    move, given = mi.ScalarTransform4f, number.given
+    material = glass(PLUGIN, given["n"])
+    if "absorbance" in given:
+        material["int_absorption"] = given["absorbance"] / THICKNESS
+    parts: dict[str, Any] = {"type": "scene"}
+    for i in range(round(given.get("count", 1))):
+        place = move().translate([0, 0, 2 * i * THICKNESS]).scale([HALF_SIZE, HALF_SIZE, THICKNESS / 2])
+        parts[f"plate_{i}"] = {"type": "cube", "to_world": place, "bsdf": material}
+    behind = move().translate([0, 0, FAR]).scale(20 * FAR).rotate([1, 0, 0], 180)
+    light = {"type": "area", "radiance": {"type": "uniform", "value": 1.0}}
+    lamp = {"type": "rectangle", "to_world": behind, "light": light}
+    return parts | {"lamp": lamp | {"bsdf": {"type": "diffuse", "reflectance": 0.0}}}
+
+
+# Rays ------------------------------------------------------------------------------------------------------------
+
+
+def traced_angle(group: Sequence[StandardNumber], samples: int) -> Answers:
+    """The deviation by a prism, or the angle of a rainbow."""
+    (number,) = group
+    make, angle = (prism_bench, table.deviated) if number.kind == "deviation" else (drop_bench, table.from_antisolar)
+    case = make(number)
+    return _read(case, [lambda path: angle(case.system.directions, path.directions[-1])[0]])
+
+
+def double_gauss(group: Sequence[StandardNumber], samples: int) -> Answers:
+    """Through the lens of the ground truth."""
+    places = [(number.given["ray"], number.given["slope"]) for number in group]
+    readings = [lambda path, at=at: table.behind_the_lens(path, *at) for at in places]
+    return _read(bench.benches()["double Gauss"], readings)
+
+
+def _read(case: Bench, readings: Sequence[Callable[[optical_systems.Path], Any]]) -> Answers:
+    """What each reading makes of the path traced; and what roundings do to it, of any ray."""
+    exact, path = case.system.path(), case.traced(PLUGIN)
+
+    def changes(moved: optical_systems.Path) -> optical_systems.Answers:
+        return {str(i): read(moved) - read(exact) for i, read in enumerate(readings)}
+
+    return [(read(path), bound.max()) for read, bound in zip(readings, case.summed(changes).values(), strict=True)]
+
+
+def prism_bench(number: StandardNumber) -> Bench:
+    """By the index, or by the name of the glass and the wavelength."""
+    medium, nm = number.medium or number.given["n"], number.given.get("nm")
+    return Bench(table.prism([number]), lambda plugin: bench.prism(plugin, medium), nm)
+
+
+def drop_bench(number: StandardNumber) -> Bench:
+    """A ball of that index."""
+    return Bench(table.drop([number]), lambda plugin: bench.ball(plugin, number.given["n"]))
+
+
+# The BSDF --------------------------------------------------------------------------------------------------------
+
+
+def retardation(group: Sequence[StandardNumber], samples: int) -> Answers:
+    """Through a rhomb whose end faces stand across the ray, so that it meets the long ones at its acute angle."""
+    import mitsuba as mi
+
+    (number,) = group
+    angle = math.radians(number.given["incidence"])
+    matrix = np.eye(4)
+    matrix[0, 0], matrix[0, 2] = 2 * math.tan(angle), 1 / math.tan(angle)
+    shape = {
+        "type": "cube",
+        "to_world": mi.ScalarTransform4f(matrix.tolist()),
+        "bsdf": glass(PLUGIN, number.given["n"]),
+    }
+    scene: Any = mi.load_dict({"type": "scene", "rhomb": shape})
+    d = np.array([math.sin(angle), 0, -math.cos(angle)])
+    start = np.array([-matrix[0, 0], 0, 0]) - 2 * d
+    ray: Any = mi.Ray3f(mi.Point3f(start), mi.Vector3f(d))
+    total: Any = mi.Spectrum(1)
+    context = followed_context()
+    for lobe in (1, 0, 0, 1):
+        si = scene.ray_intersect(ray)
+        context.component = lobe
+        sample, weight = si.bsdf().sample(context, si, 0.5, [0.5, 0.5])
+        total = total @ si.to_world_mueller(weight, -sample.wo, si.wi)
+        ray = si.spawn_ray(si.to_world(sample.wo))
+    mueller = np.array(total, float).reshape(4, 4, -1)[..., 0]
+    both = math.acos(mueller[3, 3] / mueller[0, 0])
+    share = number.given["reflections"] / 2
+    bound = number.slope("incidence") * math.degrees(FIRST + 3 * TURN) + number.slope("n") * number.given["n"] * RATIO
+    return [(math.degrees(both) * share, U * (bound + math.degrees(4 * WEIGHT / math.sin(both)) * share))]
+
+
+def brewster(group: Sequence[StandardNumber], samples: int) -> Answers:
+    """Where the last element of the Mueller matrix, r_s r_p, changes its sign."""
+    (number,) = group
+    found = _crossing(number.given["n"], lambda bsdf, wi: _sampled(bsdf, wi, 0)["weight"][:, -1])
+    return [(found, _angle_bound(number))]
+
+
+def critical(group: Sequence[StandardNumber], samples: int) -> Answers:
+    """From where on nothing is transmitted."""
+    import mitsuba as mi
+
+    (number,) = group
+
+    def reflected(bsdf: Any, wi: Any) -> Any:
+        return np.where(_sampled(bsdf, wi, 1)["type"] == int(mi.BSDFFlags.DeltaTransmission), -1.0, 1.0)
+
+    return [(_crossing(1 / number.given["n"], reflected), _angle_bound(number))]
+
+
+def _angle_bound(number: StandardNumber) -> float:
+    return U * float(math.degrees(ANGLE) + number.slope("n") * number.given["n"] * RATIO)
+
+
+def _sampled(bsdf: Any, wi: np.ndarray, lobe: int) -> dict[str, np.ndarray]:
+    """One lobe; both of them by the random number 0 and 1 − u."""
+    import mitsuba as mi
+
+    return sample_all(bsdf, mi.BSDFContext(), wi, np.full(len(wi), lobe * (1 - 2 * U)))
+
+
+def _crossing(ratio: float, sign: Callable[[Any, Any], np.ndarray]) -> float:
+    """The angle, in degrees, at which `sign(bsdf, wi)` changes; from inside where the ratio n_to/n_from is below 1."""
+    import mitsuba as mi
+
+    bsdf: Any = mi.load_dict(glass(PLUGIN, max(ratio, 1 / ratio)))
+    low, high, side = 0.01, 89.99, 1 if ratio > 1 else -1
+    for _ in range(5):
+        angles = np.linspace(low, high, 65)
+        wi = np.stack([np.sin(np.deg2rad(angles)), 0 * angles, side * np.cos(np.deg2rad(angles))], axis=1)
+        values = sign(bsdf, wi)
+        changes = np.flatnonzero(np.signbit(values[1:]) != np.signbit(values[:-1]))
+        if not len(changes):
+            return math.nan
+        low, high = angles[changes[0]], angles[changes[-1] + 1]
+    return float(low + high) / 2
+
+
+def diffuse(group: Sequence[StandardNumber], samples: int) -> Answers:
+    """Probabilities of the lobe at the nodes; inside, 1 − 1/n² of all light is beyond the critical angle."""
+    import mitsuba as mi
+
+    (number,) = group
+    n, passed = number.given["n"], bool(number.given["passed"])
+    outside, inside, weight = closed_forms.nodes(n, np.float32)
+    cosine = (outside if number.given["outside"] else -inside).astype(float)
+    wi = np.stack([np.sqrt(1 - cosine**2), 0 * cosine, cosine], axis=1)
+    share = 1.0 if number.given["outside"] else 1 / n**2
+    powers = _sampled(mi.load_dict(glass(PLUGIN, n)), wi, int(passed))["pdf"][:, 0]
+    value = share * float((weight * powers).sum()) + (0 if passed else 1 - share)
+    return [(value, limits.DIFFUSE * U * number.value)]
+
+
+def index(group: Sequence[StandardNumber], samples: int) -> Answers:
+    """The ratio of indices of a sample straight through, at the wavelength."""
+    import mitsuba as mi
+
+    (number,) = group
+    given, nm = number.given, number.given["nm"]
+    medium = number.medium.format(**given)
+    if number.law is table.khronos_sample:
+        ends = {w: float(number.at(nm=w)) for w in (486.13, 656.27)}
+        medium = f"hold(table(486.13: {ends[486.13]!r}, 587.56: {given['n_d']!r}, 656.27: {ends[656.27]!r}))"
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi, si.wavelengths = mi.Vector3f(0, 0, 1), type(si.wavelengths)(nm)
+    sample, _ = mi.load_dict(glass(PLUGIN, medium)).sample(followed_context(), si, 1 - 2 * U, [0.5, 0.5])
+    bound = U * (3 * number.value + number.slope("nm") * nm)
+    if number.law is table.khronos:
+        bound += (given["n_d"] - 1) / given["abbe"] * (0.5 / nm**2 + 0.5e-4)
+    return [(np.array(sample.eta, float).ravel()[0], bound)]
+
+
+MEASURES: dict[str, Callable[[Sequence[StandardNumber], int], Answers]] = {
+    "transmittance": transmittances,
+    "transmittance, unpolarised": transmittances,
+    "deviation": traced_angle,
+    "rainbow": traced_angle,
+    "Brewster's angle": brewster,
+    "critical angle": critical,
+    "retardation": retardation,
+    "diffuse": diffuse,
+    "index": index,
+    "double Gauss": double_gauss,
+}
+STUDY = Study(NAME, "Standard numbers", about(__doc__), TERMS, tasks)
