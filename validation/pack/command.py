@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -28,10 +29,10 @@ def _command(
     quick: Annotated[bool, typer.Option("--quick", help="Few rays and small images: to see what a pack is.")] = False,
 ) -> None:
     """Write the reference pack, one zip file that needs nothing of ours: scenes, images, rays, standard numbers."""
-    if not output.is_dir():
-        safe_files.check_parent(output)
-        output.mkdir()
-    safe_files.check_parent(output / "pack")
+    safe_files.check_parent(output / "pack" if output.exists() else output)
+    if not all(map(importlib.util.find_spec, ("flint", "jinja2", "trimesh"))):
+        raise ValueError("a pack needs the extra `validation`: pip install 'mi-refract[validation]'")
+    output.mkdir(exist_ok=True)
     from mi_refract import __version__, backend
 
     variant = backend.activate("llvm_ad_rgb")
