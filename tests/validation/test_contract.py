@@ -124,6 +124,7 @@ OTHERWISE = {
     "diff.times": "times",
     "suite.exports": "several seeds a side",
     "suite.rendered_images": "several seeds a side",
+    "suite.standard_numbers": "eight seeds an image; of glasses, which rays they are does not matter",
     "media.renders": "sixteen seeds a side in the furnace, eight by Welch's test; the rest is times and closed forms",
     "robustness.code_mutants": "each mutant is a case of its own, and the study is longer in full",
     "ground_truth.standard_numbers": "one number is drawn, in sixteen sets of samples; the rest has no noise",

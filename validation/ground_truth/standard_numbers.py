@@ -83,29 +83,21 @@ class Measured:
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per kind; piles of plates, which take millions of samples, where something is compiled."""
-    return [Task(f"{NAME}: {kind}", functools.partial(kind_rows, kind, context), timed=True) for kind in table.KINDS]
+    """One per variant of Mitsuba; piles of plates, which take thousands of paths, where something is compiled."""
+    return [Task(f"{NAME}: {need}", functools.partial(rows, need, context), timed=True) for need in COMPILED]
 
 
-def kind_rows(kind: str, context: Context) -> list[Row]:
-    """A row per number."""
+def rows(needed: str, context: Context) -> list[Row]:
+    """A row per number that is measured in a variant."""
     scalar = context.profile.quick or context.scalar
-    numbers = [
-        number
-        for number in table.NUMBERS.values()
-        if number.kind == kind and not (scalar and number.given.get("count", 1) > 1)
-    ]
-    variants = {number.name: (SCALAR if scalar else COMPILED)[need(number)] for number in numbers}
-    made = []
-    for variant in dict.fromkeys(variants.values()):
-        mine = [number for number in numbers if variants[number.name] == variant]
-        if (reason := context.variants.get(variant, "not in this wheel")) is not None:
-            made += [Row(NAME, PLUGIN, number.name, variant, reason=reason) for number in mine]
-            continue
-        with under(variant):
-            found = measure(mine, SAMPLES.get(context.profile.name, 0))
-        made += [row(number, found[number.name], PLUGIN, variant) for number in mine]
-    return made
+    numbers = [number for number in table.NUMBERS.values() if need(number) == needed]
+    numbers = [number for number in numbers if not (scalar and number.given.get("count", 1) > 1)]
+    variant = (SCALAR if scalar else COMPILED)[needed]
+    if (reason := context.variants.get(variant, "not in this wheel")) is not None:
+        return [Row(NAME, PLUGIN, number.name, variant, reason=reason) for number in numbers]
+    with under(variant):
+        found = measure(numbers, SAMPLES.get(context.profile.name, 0))
+    return [row(number, found[number.name], PLUGIN, variant) for number in numbers]
 
 
 def noisy(number: StandardNumber) -> bool:
