@@ -15,7 +15,7 @@ from mi_refract.ray_sets import ray_set
 from mi_refract.ray_sets.ray_set import Answers
 from mi_refract.ray_sets.renderer_file import RaysCommand
 from mi_refract.report.row import Row
-from validation import tables
+from validation import limits, tables
 from validation.ground_truth import bench
 from validation.ground_truth import standard_numbers as study
 from validation.reference import optical_systems
@@ -198,6 +198,13 @@ def test_the_double_gauss_is_within_its_bounds_and_another_glass_by_twice_that_i
     monkeypatch.setattr(bench, "glass", lambda plugin, *n: glass(plugin, *(x * (1 + more * (x > 1)) for x in n)))
     wrong = study.measure(numbers)
     assert [x.name for x in numbers if not seen(x, wrong[x.name], found[x.name].bound)] == []
+
+
+def test_a_bound_that_would_hold_whatever_comes_fails():
+    for number in NUMBERS.values():
+        if "n" in number.given and not study.noisy(number):
+            wide = study.Measured(number.value, 2e-3 * number.slope("n") * number.given["n"])
+            assert study.row(number, wide, "refract", "").broken == {"index seen": limits.STANDARD_SEEN}
 
 
 def test_a_run_has_a_row_for_each_number_of_a_variant_and_says_why_where_there_is_none(tmp_path):
