@@ -30,13 +30,7 @@ MODULES = command.modules([], "full")
 STUDIES = {name: importlib.import_module(f"validation.{name}").STUDY for name in MODULES}
 RUN = (
     *("directions.bsdf_samples", "directions.planted_defects", "directions.sweep", "diff.planted_defects"),
-    *(
-        "ground_truth.traced_bodies",
-        "ground_truth.standard_numbers",
-        "media.catalogs",
-        "media.closed_forms",
-        "planar.against_retrace",
-    ),
+    *("ground_truth.traced_bodies", "media.catalogs", "media.closed_forms", "planar.against_retrace"),
     *("planar.closed_paths", "planar.extruded_scenes", "planar.joints", "renders.random_numbers"),
     *("stability.derivatives", "stability.energy", "stability.layered_paths", "stability.optical_chains"),
     *("suite.small_mistakes", "media.ray_directions", "renders.gradients"),
