@@ -21,10 +21,12 @@ from mi_refract.report.row import Row
 from validation import __main__ as command
 from validation import runner, tables
 from validation.diff import planted_defects, visible_changes
+from validation.reference.standard_numbers import NUMBERS
 from validation.run import render_methods
 from validation.run.context import SCENES, beyond_builtin, here
 from validation.stability import layered_paths
 from validation.study import Study, Task
+from validation.suite import standard_numbers as by_others
 from validation.suite.renderers import SYSTEMS
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
@@ -154,7 +156,7 @@ def validate(tmp_path, monkeypatch):
     def run(work):
         study = Study("directions", "A study", "What it asks.", {}, lambda context: [Task("a task", work)])
         monkeypatch.setattr(command, "import_module", lambda name: types.SimpleNamespace(STUDY=study))
-        return command.main(["ground-truth", "--out", str(tmp_path)])
+        return command.main(["robustness", "--out", str(tmp_path)])  # a room of one study
 
     return run
 
@@ -167,7 +169,7 @@ def test_the_exit_code_follows_the_budgets(validate, tmp_path, budget, code):
     context = written["context"]
     assert written["rows"][0]["verdict"] == ("pass" if code == 0 else "fail")
     assert context["versions"]["mitsuba"] == mi.__version__
-    assert context["replay"] == "python -m validation ground-truth --profile quick"
+    assert context["replay"] == "python -m validation robustness --profile quick"
 
 
 def test_an_interruption_says_how_to_go_on_and_two_validations_do_not_share_a_folder(validate, tmp_path, capsys):
@@ -177,7 +179,7 @@ def test_an_interruption_says_how_to_go_on_and_two_validations_do_not_share_a_fo
     assert validate(interrupted) == 130
     assert "run the same command again to resume" in capsys.readouterr().err
     codes = []
-    second = ["ground-truth", "--out", str(tmp_path)]
+    second = ["robustness", "--out", str(tmp_path)]
     assert validate(lambda: codes.append(command.main(second)) or [row()]) == 0
     assert codes == [2] and {path.name for path in tmp_path.iterdir()} == FILES
     (said,) = [line for line in capsys.readouterr().err.splitlines() if "is already running" in line]
@@ -239,6 +241,16 @@ NAMED = {
     "planar": [path.stem for path in SCENES.glob("planar/*.toml")],
     "defects": [*planted_defects.GLASSES, *self_test.DEFECTS, *METHODS],
     "visible": [*visible_changes.KINDS, *map(str, visible_changes.SQUARES)],
+    "standard numbers": [*NUMBERS],
+    "standard numbers by others": [
+        *(
+            number.name
+            for number in [*by_others.of_kind(*by_others.RAYS, "index"), *by_others.plates()]
+            if "glTF" not in number.name
+        ),
+        *(call.title for name, system in SYSTEMS.items() if name != "mi_refract" for call in system.calls),
+        *(title for title in IMAGE_RENDERERS if title != by_others.NOT_ASKED),
+    ],
     "suite": [*(call.title for system in SYSTEMS.values() for call in system.calls), *IMAGE_RENDERERS],
 }
 
@@ -255,5 +267,5 @@ def test_a_page_holds_its_table_which_is_not_written_from_a_run_that_measured_to
     assert all(((tables.ROOT / table.path).parent / name).is_file() for name in images)
     with pytest.raises(ValueError, match=r"documentation: no .*"):
         table.make([row(values={}, reason="not run")])
-    assert (marker in tables.chosen([])) == (marker != "suite")
+    assert (marker in tables.chosen([])) == (table.study != "suite")
     assert marker in tables.chosen([table.study])

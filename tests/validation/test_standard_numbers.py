@@ -11,11 +11,19 @@ import numpy as np
 import pytest
 
 from mi_refract import media
+from mi_refract.ray_sets import ray_set
+from mi_refract.ray_sets.ray_set import Answers
+from mi_refract.ray_sets.renderer_file import RaysCommand
+from mi_refract.report.row import Row
+from validation import limits, tables
 from validation.ground_truth import bench
 from validation.ground_truth import standard_numbers as study
 from validation.reference import optical_systems
 from validation.reference import standard_numbers as table
+from validation.run.context import here
 from validation.run.render_methods import under
+from validation.suite import standard_numbers as others
+from validation.suite.small_mistakes import textbook
 
 NUMBERS = table.NUMBERS
 
@@ -190,3 +198,105 @@ def test_the_double_gauss_is_within_its_bounds_and_another_glass_by_twice_that_i
     monkeypatch.setattr(bench, "glass", lambda plugin, *n: glass(plugin, *(x * (1 + more * (x > 1)) for x in n)))
     wrong = study.measure(numbers)
     assert [x.name for x in numbers if not seen(x, wrong[x.name], found[x.name].bound)] == []
+
+
+def test_a_bound_that_would_hold_whatever_comes_fails():
+    for number in NUMBERS.values():
+        if "n" in number.given and not study.noisy(number):
+            wide = study.Measured(number.value, 2e-3 * number.slope("n") * number.given["n"])
+            assert study.row(number, wide, "refract", "").broken == {"index seen": limits.STANDARD_SEEN}
+
+
+def test_a_run_has_a_row_for_each_number_of_a_variant_and_says_why_where_there_is_none(tmp_path):
+    context = here("quick", tmp_path, "scalar_rgb")
+    rows = [row for task in study.STUDY.tasks(context) if task.name.endswith("spectral") for row in task.run()]
+    assert {row.case for row in rows} == {x.name for x in NUMBERS.values() if "nm" in x.given}
+    assert [row.case for row in rows if row.verdict != "pass" or not row.reason or row.values["seconds"] <= 0] == []
+    absent = dataclasses.replace(context, variants={**context.variants, "scalar_spectral": "absent"})
+    assert {(row.verdict, row.reason) for row in study.rows("spectral", absent)} == {("not run", "absent")}
+
+
+# By others -------------------------------------------------------------------------------------------------------
+
+
+def program(share=0.0):
+    """A textbook's formula as a program that answers rays; the denser index is off by a share of it."""
+
+    def refract(rays):
+        k = rays.rays.k[:, None].astype(float)
+        with np.errstate(invalid="ignore"):
+            b = textbook(
+                rays.rays.a.astype(float), rays.rays.n.astype(float), np.where(k > 1, k * (1 + share), k / (1 + share))
+            )
+        return Answers(rays.ids, b.astype(rays.rays.a.dtype).astype(float), header={"system": "textbook"})
+
+    return refract
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_a_textbooks_formula_is_within_the_bounds_of_rays_and_an_index_off_by_twice_them_is_seen(precision):
+    call, numbers = RaysCommand("textbook", precision, ("program",)), others.of_kind(*others.RAYS)
+
+    def rows(share):
+        found = others.measure(numbers, call, program(share))
+        return {x.name: others.row(x, "textbook", precision, *found[x.name], "") for x in numbers}
+
+    right, tiny = rows(0.0), 1e-4 if precision == "f32" else 1e-9
+    assert [name for name, row in right.items() if row.verdict != "pass"] == []
+    moved = {name: abs(row.values["measured"] - right[name].values["measured"]) for name, row in rows(tiny).items()}
+    share = max(2 * right[name].values["bound"] / moved[name] * tiny for name in moved if moved[name] > 0)
+    assert share < tiny
+    assert [name for name, row in rows(share).items() if row.broken != {"error / bound": 1.0}] == []
+
+
+def test_an_index_of_a_catalogue_is_the_printed_one_and_another_or_none_is_seen():
+    numbers = [x for x in others.of_kind("index") if x.medium.startswith("SCHOTT:")]
+    media, lines = list(dict.fromkeys(x.medium for x in numbers)), list(table.LINES.values())
+    rays = ray_set.make(["generic"], 40, "f64", 0, media=media, wavelengths=lines)
+
+    def broken(ratio):
+        answers = Answers(rays.ids, rays.rays.a, n_ratio=ratio)
+        found = others.indices(rays, answers, numbers)
+        return [others.row(x, "catalogue", "f64", n, 5e-6, "").broken for x, n in zip(numbers, found, strict=True)]
+
+    k = rays.rays.k
+    assert broken(k) == [{}] * 9
+    assert broken(np.where(k > 1, k + 1e-5, 1 / (1 / k + 1e-5))) == [{"error / bound": 1.0}] * 9
+    assert broken(None) == [{"error / bound": 1.0}] * 9
+
+
+def test_images_means_have_students_bound_and_the_plates_are_closed_and_lit_from_behind():
+    rng, number = np.random.default_rng(7), NUMBERS["slab without polarisation, n = 1.52, 60°"]
+    means = rng.binomial(1 << 16, number.value, others.SEEDS) / (1 << 16)
+    value, bound = others.of_means(means)
+    assert others.row(number, "x", "", value, bound, "").verdict == "pass" and bound < 0.01
+    assert others.row(number, "x", "", value + 2 * bound, bound, "").broken == {"error / bound": 1.0}
+    scene = others.plate_scene(NUMBERS["4 slabs without polarisation, n = 1.52, 0°"])
+    *plates, lamp = scene.meshes
+    for plate in plates:
+        a, b, c = plate.triangles().swapaxes(0, 1)
+        volume = (a * np.cross(b, c)).sum() / 6  # positive where normals point outward
+        assert volume == pytest.approx((2 * others.WIDE) ** 2 * others.THICK)
+    a, b, c = lamp.triangles().swapaxes(0, 1)
+    assert (
+        len(plates) == 4
+        and (np.cross(b - a, c - a)[:, 2] < 0).all()
+        and a[:, 2].min() > plates[-1].vertices[:, 2].max()
+    )
+
+
+def test_the_tables_of_the_documentation_have_every_number_that_was_measured():
+    numbers = [NUMBERS["slab, n = 1.52, 0°"], NUMBERS["index of F2, line d"]]
+    own = [study.row(x, study.Measured(x.value, 1e-6), "refract", "llvm_ad_mono") for x in numbers]
+    lines = tables.numbers(own).splitlines()[-2:]
+    assert lines[0].startswith("| slab, n = 1.52, 0° | 0.918318028 | – | 0.918318028 |") and "| 1.62004 |" in lines[1]
+    theirs = [others.row(x, name, "f64", x.value, 1e-6, "") for x in numbers for name in ("A", "B")]
+    theirs += [
+        others.row(numbers[0], "C", "", 1.0, 1e-6, ""),
+        Row(others.NAME, "D", "every ray", "f32", reason="absent"),
+    ]
+    text = tables.numbers_elsewhere(theirs)
+    assert "| number | A, f64 | B, f64 | C |" in text and " ✗ |" in text and "Not run here: D." in text
+    for make in (tables.numbers, tables.numbers_elsewhere):
+        with pytest.raises(ValueError, match="documentation: no "):
+            make([])

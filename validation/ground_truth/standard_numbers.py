@@ -13,7 +13,7 @@ The error is divided by its bound, in which all roundings to float32 add up at t
 - Plates. The ray's direction turns by 39u at each boundary (see `ground_truth/bench.py`), twelve times; of each
   polarisation the transmittance changes by so much times its slope. A weight is off by 45u a boundary with Mueller
   matrices: 16u for the products of amplitudes, four rotations and a product of 5u each, 4u for lobes. Without, by 8u.
-  A path counts as often as it meets boundaries. What is still on its way behind twelve of them is missing. In an
+  A path counts as often as it meets boundaries. What passes after more than twelve is missing. In an
   absorbing plate Mitsuba sets a ray off along the normal, which makes its way shorter by sin²θ of that offset.
 - Four plates: Student's t over 16 sets of samples, which chance exceeds once in ten thousand runs, and these roundings.
 - Rays: see `ground_truth/bench.py`.
@@ -53,6 +53,7 @@ from .bench import FIRST, INTO, NORMAL, ONWARD, Bench, U, glass
 
 NAME = "standard numbers"
 MEASURED, EXACT, PRINTED, BOUND, SECONDS = "measured", "exact", "printed", "bound", "seconds"
+INDEX_SEEN = "index seen"
 # In the profile `quick` and where nothing is compiled: one variant has polarisation and wavelengths.
 COMPILED = {"plain": "llvm_ad_mono", "spectral": "llvm_ad_spectral", "polarised": "llvm_ad_mono_polarized"}
 SCALAR = {"plain": "scalar_rgb", "spectral": "scalar_spectral", "polarised": "scalar_spectral_polarized"}
@@ -60,6 +61,7 @@ TERMS = dict(table.KINDS) | {
     EXACT: "the law in extended precision",
     PRINTED: "as the source prints it, where one in hand does",
     BOUND: "of |measured − exact|",
+    INDEX_SEEN: "the relative error of the index that moves the number to its bound",
     SECONDS: "of the measurement, shared by what one render measures",
 }
 BOUNDARIES = 12  # of a path through plates: 4096 paths are the most that a sample splits into
@@ -83,29 +85,21 @@ class Measured:
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per kind; piles of plates, which take millions of samples, where something is compiled."""
-    return [Task(f"{NAME}: {kind}", functools.partial(kind_rows, kind, context), timed=True) for kind in table.KINDS]
+    """One per variant of Mitsuba; piles of plates, which take thousands of paths, where something is compiled."""
+    return [Task(f"{NAME}: {need}", functools.partial(rows, need, context), timed=True) for need in COMPILED]
 
 
-def kind_rows(kind: str, context: Context) -> list[Row]:
-    """A row per number."""
+def rows(needed: str, context: Context) -> list[Row]:
+    """A row per number that is measured in a variant."""
     scalar = context.profile.quick or context.scalar
-    numbers = [
-        number
-        for number in table.NUMBERS.values()
-        if number.kind == kind and not (scalar and number.given.get("count", 1) > 1)
-    ]
-    variants = {number.name: (SCALAR if scalar else COMPILED)[need(number)] for number in numbers}
-    made = []
-    for variant in dict.fromkeys(variants.values()):
-        mine = [number for number in numbers if variants[number.name] == variant]
-        if (reason := context.variants.get(variant, "not in this wheel")) is not None:
-            made += [Row(NAME, PLUGIN, number.name, variant, reason=reason) for number in mine]
-            continue
-        with under(variant):
-            found = measure(mine, SAMPLES.get(context.profile.name, 0))
-        made += [row(number, found[number.name], PLUGIN, variant) for number in mine]
-    return made
+    numbers = [number for number in table.NUMBERS.values() if need(number) == needed]
+    numbers = [number for number in numbers if not (scalar and number.given.get("count", 1) > 1)]
+    variant = (SCALAR if scalar else COMPILED)[needed]
+    if (reason := context.variants.get(variant, "not in this wheel")) is not None:
+        return [Row(NAME, PLUGIN, number.name, variant, reason=reason) for number in numbers]
+    with under(variant):
+        found = measure(numbers, SAMPLES.get(context.profile.name, 0))
+    return [row(number, found[number.name], PLUGIN, variant) for number in numbers]
 
 
 def noisy(number: StandardNumber) -> bool:
@@ -121,6 +115,9 @@ def row(number: StandardNumber, found: Measured, subject: str, setting: str) -> 
     values |= {BOUND: found.bound, ERROR_OVER_BOUND: error / found.bound, SECONDS: found.seconds}
     remark = "; ".join(filter(None, (number.source, number.fitted and f"fitted: {number.fitted}")))
     budgets, replay = {ERROR_OVER_BOUND: limits.STANDARD}, {"law": number.formula, **number.given}
+    if "n" in number.given and not noisy(number):
+        values[INDEX_SEEN] = found.bound / (number.slope("n") * number.given["n"])
+        budgets[INDEX_SEEN] = limits.STANDARD_SEEN
     return Row(NAME, subject, number.name, setting, values, budgets, reason=remark, replay=replay)
 
 
@@ -217,7 +214,7 @@ def plates_bound(number: StandardNumber) -> float:
     total = slope("incidence") * math.degrees(FIRST + BOUNDARIES * TURN) * U + slope("n") * given["n"] * RATIO * U
     total += (WEIGHT if polarised else PLAIN_WEIGHT) * U * float(met.mean())
     if not noisy(number):
-        total += float(left.mean())
+        total += float((table.polarised_plates(**given) - passed.sum(0)).mean())
     if "absorbance" in given:
         sine = math.sin(math.radians(given["incidence"])) / given["n"]
         way = OFFSET * (1 + 4 * THICKNESS) / THICKNESS * sine**2 + BOUNDARIES * bench.PLACE * U

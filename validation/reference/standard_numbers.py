@@ -19,11 +19,11 @@ where nothing is printed "" or null; all of it is as `json.dumps` takes it.
 of those of both polarisations. A renderer without polarisation takes the mean at each boundary; that is another number,
 and the same at normal incidence only.
 
-**CIE 171:2006, 5.10, a roof opening with clear glass of 6 mm.** The case states the directional transmittance as the
-polynomial of Tregenza and Sharples' algorithm 2.34; its values are `CIE_POLYNOMIAL`'s. They were fitted: they rise from
-0° to 20°, which no plane slab does. So the index 1.52 is given (Radiance's for window glass), the absorption of the
-glass is fitted here, by least squares to the nine printed values, and `off_print` says by how much each is missed: by
-0.0021 or less. A renderer is compared with `value`.
+**CIE 171:2006, 5.5 and 5.10, clear glass of 6 mm.** As it is quoted, the report defines the directional transmittance
+by the polynomial of Tregenza and Sharples' algorithm 2.34; the values are `CIE_POLYNOMIAL`'s. They were fitted: they
+rise from 0° to 20°, as no plane slab's do. So the index 1.52 is given (Radiance's for window glass), the absorption of
+the glass is fitted here, by least squares to the nine printed values, and `off_print` says by how much each is missed:
+by 0.0021 or less. A renderer is compared with `value`.
 
 **KHR_materials_dispersion.** The normative formula of n(λ) goes through n_d. The sample of GLSL in the specification's
 section "Implementation", which is not normative, puts n_C and n_F at equal distances from it.
@@ -343,7 +343,7 @@ PILE = (
     "11, 545); Born and Wolf, Principles of Optics, 1.5.2 (Fresnel's formulae)"
 )
 CIE = (
-    "CIE 171:2006, 5.10, by its quotation in Radiance's mailing list, Glass transmittance, 2017-03-06; Tregenza and "
+    "CIE 171:2006, 5.5 and 5.10, as quoted in Radiance's mailing list, Glass transmittance, 2017-03-06; Tregenza and "
     "Sharples, Daylighting Algorithms (1993), 2.34, Directional transmittance of clear glass"
 )
 PRISM = "Born and Wolf, Principles of Optics, 4.7.2"
