@@ -120,21 +120,27 @@ def test_a_formula_becomes_abbes_number_with_its_largest_difference(glass, expor
 )
 @pytest.mark.parametrize("index", ["1.5", "SCHOTT:N-BK7"])
 def test_absorption_and_a_hollow(index, ball, hollow, export):
-    """Colour to the power of t over distance. A hollow is a part of the glass's surface: it faces what is in it."""
+    """Colour to the power of t over distance, or 1 − colour over distance, as Blender has it.
+
+    A hollow is a part of the mesh of the glass: it faces what is in it.
+    """
     inside, outside = ior("int", index) + ior("ext", "air"), ior("int", "air") + ior("ext", index)
     model, _ = export(ball + inside, HOLLOW % (hollow + outside))
-    outer, inner = (model.meshes[name] for name in ("ball", "hollow"))
-    assert outer[3] is inner[3] and len(model.tree["materials"]) == 1
-    found = extensions(model, "hollow")
+    places, normals, faces, _ = model.meshes["ball"]
+    assert list(model.meshes) == ["ball"] and len(model.tree["materials"]) == 1
+    found = extensions(model, "ball")
     keeps = np.array(found["volume"]["attenuationColor"]) ** (8 / found["volume"]["attenuationDistance"])
     expected = [0.42, 0.85, 0.5] if "colour" in ball else np.exp([-0.8, 0, -1.6])
     np.testing.assert_allclose(keeps, expected, rtol=1e-12)
-    assert np.linalg.det(inner[0][inner[2]]).sum() < 0 < np.linalg.det(outer[0][outer[2]]).sum()
-    assert (np.einsum("ij,ij->i", inner[0], inner[1]) < 0).all()
-    volumes = [np.linalg.det(part[0][part[2]]).sum() / 6 for part in (outer, inner)]
-    corners = np.concatenate([part[0][part[2]] for part in (outer, inner)]).swapaxes(0, 1)
-    surface = np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0]), axis=1).sum() / 2
-    assert found["volume"]["thicknessFactor"] == pytest.approx(4 * sum(volumes) / surface, rel=1e-5)
+    blenders = np.subtract(1, found["volume"]["attenuationColor"]) / found["volume"]["attenuationDistance"]
+    np.testing.assert_allclose(blenders, -np.log(expected) / 8, rtol=5e-4, atol=1e-15)
+    radii, outward = np.linalg.norm(places, axis=1), np.einsum("ij,ij->i", places, normals)
+    assert {*radii.round(5)} == {1, 2} and (np.sign(outward) == np.where(radii > 1.5, 1, -1)).all()
+    corners = places[faces].swapaxes(0, 1)
+    areas = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    assert (np.einsum("ij,ij->i", areas, normals[faces[:, 0]]) > 0).all()
+    volume, surface = np.linalg.det(places[faces]).sum() / 6, np.linalg.norm(areas, axis=1).sum() / 2
+    assert found["volume"]["thicknessFactor"] == pytest.approx(4 * volume / surface, rel=1e-5)
 
 
 def test_an_open_lamp_is_black_from_behind(export):
@@ -181,6 +187,11 @@ MESHES = {
         Mesh("in", *BALL, Glass(1.7, 1.5)),
     ],
     "in: index 1.0 in 1.33; expected a glass of at least that": [Mesh("in", *BALL, Glass(1.0, 1.33))],
+    "hollow: a hollow; expected the same glass around it": [
+        Mesh("out", 2 * BALL[0], BALL[1], Glass(1.5, 1.0)),
+        Mesh("hollow", BALL[0] + 9, BALL[1], Glass(1.0, 1.5)),
+        Mesh("far", BALL[0] + 18, BALL[1], Glass(1.5, 1.0)),
+    ],
     "grey: reflectance = (0.5, 1.5, 0.5); expected at most 1": [Mesh("grey", *PANE, Diffuse((0.5, 1.5, 0.5)))],
 }
 

@@ -24,7 +24,7 @@ from ..plain_scene import (
     PlainScene,
     VolumeGlass,
 )
-from ..tessellation import Vertices, is_closed
+from ..tessellation import Vertices, encloses, is_closed
 from .shared_files import LIGHT_INSIDE, Axes, Files, exr, outermost_index, readme, sky_exr
 
 COMMANDS = """
@@ -36,7 +36,7 @@ ASSUMPTIONS = (
     "glTF holds no depth of paths, no size of the image and no filter: max_depth = {depth} (2 is light, one surface, "
     "camera), {width} x {height} pixels, a box filter. extras of the scene say the same.",
     "sky.exr holds linear radiance. Its top row is seen in direction +y, its middle column in +x, and columns to the "
-    "right of it turn to +z, as in the equirectangular maps of three.js.",
+    "right of it turn to +z, as in the equirectangular maps of three.js, and in Blender after its import.",
     "Indices are relative to the medium around all glass, {outside!r}, because glTF has 1 there.",
     "thicknessFactor is 4 V/S, the mean chord of a convex body. A path tracer does not use it, only that it is not 0.",
     "A radiance of 1 is one candela per square metre there, and a unit of the scene is one metre. Nothing is a light "
@@ -49,6 +49,9 @@ ASSUMPTIONS = (
 SKY_AXES: Axes = (-1, 0, 0), (0, 0, -1), (0, 1, 0)  # of three.js
 BLACK = (0.0, 0.0, 0.0)
 BACK = 1e-5  # of the largest coordinate: some hundred roundoffs of float32
+# Of 1/σ, the distance of attenuationColor c: Blender takes σ = (1 − c)/distance for −log(c)/distance, off by SHORT/2;
+# c rounded to float32 is off by 2^-24/SHORT in σ.
+SHORT = 2.0**-10
 NEAR = 1e-4  # of the largest distance from the camera: its near plane
 
 
@@ -64,16 +67,12 @@ def files(plain: PlainScene) -> Files:
     meshes = [mesh for mesh in map(_without_slivers, turned) if len(mesh.faces)]
     largest = max((float(np.abs(mesh.vertices).max()) for mesh in meshes), default=1.0)
     backs = [_back(mesh, BACK * largest) for mesh in meshes if isinstance(mesh.material, Light)]
-    shown = [*meshes, *(back for back in backs if back)]
+    shown = [*_with_hollows(plain, meshes), *(back for back in backs if back)]
     materials = list(dict.fromkeys(mesh.material for mesh in shown))
     camera, extras = plain.camera, {"max_depth": plain.max_depth, "width": plain.camera.width}
     scene = trimesh.Scene(metadata=extras | {"height": camera.height})
-    for mesh in shown:
-        vertices, faces, normals = mesh.vertices, mesh.faces, mesh.normals
-        if normals is None:  # corners of a vertex's faces have the normals of these
-            vertices, faces = mesh.triangles().reshape(-1, 3), np.arange(mesh.faces.size).reshape(-1, 3)
-            normals = np.repeat(_facet_normals(mesh), 3, axis=0)
-        solid = trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False)
+    for mesh in map(_with_normals, shown):
+        solid = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False)
         scene.add_geometry(solid, node_name=mesh.name, geom_name=mesh.name)
     ahead = np.subtract(camera.target, camera.origin)
     right = np.cross(ahead, camera.up)
@@ -140,15 +139,46 @@ def _around_glass(plain: PlainScene, mesh: Mesh, outside: float) -> Mesh:
     return replace(mesh, material=material)
 
 
+def _with_hollows(plain: PlainScene, meshes: Sequence[Mesh]) -> list[Mesh]:
+    """The meshes, with each hollow a part of the glass around it: a volume is what one mesh bounds."""
+    bodies = {mesh.name: mesh for mesh in meshes}
+    glasses = [mesh for mesh in meshes if isinstance(mesh.material, Glass)]
+    solids = sorted((mesh for mesh in glasses if _volume(mesh) > 0), key=_volume)
+    for hollow in (mesh for mesh in glasses if _volume(mesh) <= 0):
+        del bodies[hollow.name]
+        around = (each for each in solids if each.material == hollow.material)
+        solid = next((each for each in around if encloses(each.triangles(), hollow.vertices[0])), None)
+        if solid is None:
+            raise ValueError(f"{plain.name}: {hollow.name}: a hollow; expected the same glass around it")
+        one, other = _with_normals(bodies[solid.name]), _with_normals(hollow)
+        vertices, normals = (
+            np.concatenate([getattr(x, name) for x in (one, other)]) for name in ("vertices", "normals")
+        )
+        faces = np.concatenate([one.faces, other.faces + len(one.vertices)])
+        bodies[solid.name] = replace(one, vertices=vertices, faces=faces, normals=normals)
+    return list(bodies.values())
+
+
+def _with_normals(mesh: Mesh) -> Mesh:
+    """The mesh; a flat one with the normals of its faces, and so with corners of its own for each of them."""
+    if mesh.normals is not None:
+        return mesh
+    normals, faces = np.repeat(_facet_normals(mesh), 3, axis=0), np.arange(mesh.faces.size).reshape(-1, 3)
+    return replace(mesh, vertices=mesh.triangles().reshape(-1, 3), faces=faces, normals=normals)
+
+
+def _volume(mesh: Mesh) -> float:
+    return float(np.linalg.det(mesh.triangles()).sum() / 6)
+
+
 def _back(lamp: Mesh, offset: float) -> Mesh | None:
     """A black surface behind a lamp; None where it is closed, so that nobody sees it from behind."""
     if is_closed(lamp.faces):
         return None
-    corners = lamp.triangles() - offset * (
-        _facet_normals(lamp)[:, None] if lamp.normals is None else lamp.normals[lamp.faces]
-    )
-    faces = np.arange(lamp.faces.size).reshape(-1, 3)[:, ::-1]
-    return Mesh(f"{lamp.name}-back", corners.reshape(-1, 3), faces, Light(BLACK))
+    front = _with_normals(lamp)
+    assert front.normals is not None
+    places, normals, faces = front.vertices - offset * front.normals, -front.normals, front.faces[:, ::-1]
+    return Mesh(f"{lamp.name}-back", places, faces, Light(BLACK), normals)
 
 
 def _areas(mesh: Mesh) -> Vertices:
@@ -175,8 +205,7 @@ def _material(name: str, material: Material, meshes: Iterable[Mesh]) -> dict[str
         n = material.int_ior / material.ext_ior
         parts = [mesh for mesh in meshes if mesh.material == material]
         surface = sum(np.linalg.norm(_areas(mesh), axis=1).sum() for mesh in parts)
-        inside = sum(np.linalg.det(mesh.triangles()).sum() for mesh in parts) / 6
-        volume: dict[str, Any] = {"thicknessFactor": float(4 * inside / surface)}
+        volume: dict[str, Any] = {"thicknessFactor": float(4 * sum(map(_volume, parts)) / surface)}
         entry["extensions"] = {
             "KHR_materials_transmission": {"transmissionFactor": 1.0},
             "KHR_materials_ior": {"ior": n},
@@ -184,8 +213,9 @@ def _material(name: str, material: Material, meshes: Iterable[Mesh]) -> dict[str
         }
         if isinstance(material, VolumeGlass):
             if sigma := max(material.int_sigma):  # exp(−σ t) = colour^(t/distance)
-                volume["attenuationDistance"] = 1 / sigma
-                volume["attenuationColor"] = [math.exp(-x / sigma) for x in material.int_sigma]
+                distance = SHORT / sigma
+                volume["attenuationDistance"] = distance
+                volume["attenuationColor"] = [math.exp(-x * distance) for x in material.int_sigma]
             if material.spectrum:
                 entry["extensions"]["KHR_materials_dispersion"] = {"dispersion": 20 / _abbe(material)}
         return entry
