@@ -278,7 +278,7 @@ class PathLoop:
         # Should we continue tracing to reach one more vertex?
         active_next = hit & (s.depth + 1 < features.max_depth)
         if features.deterministic:
-            self._truncate(s, hit & (active_next ^ True), 1)
+            self._truncate(s, hit & (active_next ^ True), s.throughput, s.eta)
         # Where the last vertex is transparent the pixel is: `path` samples the BSDF there, too.
         if not (self.vectorised or active_next or (hit and features.null)):
             s.valid_ray = s.valid_ray or hit
@@ -400,11 +400,17 @@ class PathLoop:
         boundary = active & s.specular_so_far & self._is_boundary(bsdf)
         s.specular_so_far = s.specular_so_far & mi.has_flag(bs.sampled_type, LOBES.Delta)
         both = boundary & (s.depth <= features.split_depth) & (s.share * dr.minimum(p, 1 - p) > features.split_weight)
-        if self.vectorised or both:
+        asked = boundary if features.deterministic else both
+        if self.vectorised or asked:
             reflected = mi.has_flag(bs.sampled_type, LOBES.DeltaReflection)
-            other, weight = bsdf.sample(self.context, si, dr.select(reflected, LAST, FIRST), sample_2, both)
-            both = both & (other.sampled_type != bs.sampled_type)
-            ray, other_throughput, optional = self._next(s, si, bsdf, other, weight * other.pdf, both)
+            other, weight = bsdf.sample(self.context, si, dr.select(reflected, LAST, FIRST), sample_2, asked)
+            asked = asked & (other.sampled_type != bs.sampled_type)
+            both = both & asked
+            ray, other_throughput, optional = self._next(s, si, bsdf, other, weight * other.pdf, asked)
+            if features.deterministic:
+                # The sample 1/2 has selected the stronger lobe; where it alone is followed the other one is dropped.
+                self._truncate(s, asked & (both ^ True), other_throughput, s.eta * other.eta)
+        if self.vectorised or both:
             # The lobe that was sampled has the odd number.
             branch = self.branch(
                 ray.o, ray.d, other_throughput, s.depth, s.eta * other.eta, s.share * dr.detach(other.pdf), 2 * s.node,
@@ -415,10 +421,7 @@ class PathLoop:
             s.waiting = dr.select(both, s.waiting + 1, s.waiting)
             s.node = dr.select(both, 2 * s.node + 1, s.node)
             s.share = dr.select(both, s.share * dr.detach(bs.pdf), s.share)
-        if features.deterministic:
-            # The sample 1/2 has selected the stronger lobe; the other one is dropped.
-            self._truncate(s, boundary & (both ^ True), 1 - p)
-            both = boundary
+        both = boundary if features.deterministic else both
         return dr.select(both, throughput * bs.pdf, throughput)
 
     def _pop(self, s: LoopState, active_next: Mask) -> Mask:
@@ -436,9 +439,9 @@ class PathLoop:
         s.specular_so_far = s.specular_so_far | popped
         return active_next | popped
 
-    def _truncate(self, s: LoopState, where: Mask, share: Number) -> None:
+    def _truncate(self, s: LoopState, where: Mask, throughput: Spectrum, eta: Number) -> None:
         # η²: radiance that was lost where the path entered a denser medium is regained where it leaves.
-        lost = dr.max(self.v.unpolarized_spectrum(s.throughput)) * dr.square(s.eta) * share
+        lost = dr.max(self.v.unpolarized_spectrum(throughput)) * dr.square(eta)
         s.truncated = dr.select(where, s.truncated + lost, s.truncated)
 
     def _boundaries(self) -> list[tuple[Count, Count]]:

@@ -192,6 +192,17 @@ def test_a_deterministic_image_errs_by_what_it_says_was_truncated(llvm_variant):
     assert exact[..., 3].max() < 0.01
 
 
+def test_what_is_truncated_bounds_what_a_tilted_plate_loses(typical_variant):
+    """At 60° a boundary reflects s-polarised light almost twice as well as the mean of both polarisations."""
+    tilted = mi.ScalarTransform4f().rotate([1, 0, 0], 60).scale([1e3, 1e3, 1])
+    plate = {"type": "cube", "to_world": tilted, "bsdf": {"type": "refract", "int_ior": 1.52}}
+    parts = {"sensor": camera(1, fov=0.01), "plate": plate, "sky": {"type": "constant"}}
+    scene = mi.load_dict({"type": "scene"} | parts)
+    exact, coarse = (render(scene, 1, deterministic=True, split_weight=w, max_depth=64) for w in (1 / 4096, 0.01))
+    lost = (exact - coarse)[..., 0].item()
+    assert 0.005 < lost <= coarse[..., -1].item() + 1e-6
+
+
 BLEND = {"type": "blendbsdf", "weight": 0.5, "a": {"type": "refract"}, "b": {"type": "conductor"}}
 
 
