@@ -12,7 +12,6 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])}
-ENVIRONMENT.pop("PYTHONDONTWRITEBYTECODE", None)  # each process would compile the package anew, a quarter of its start
 
 
 def python(code: str, *arguments: object, **environment: str) -> subprocess.Popen[str]:
