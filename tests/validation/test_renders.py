@@ -362,7 +362,7 @@ def test_a_weight_that_is_taken_twice_colours_the_furnace(spectral, monkeypatch)
 
 
 def test_media_that_absorb_more_are_found(spectral, monkeypatch):
-    """A slab by 1e-5, and a scene against `volpath` by a tenth, which moves its mean by 2 to 4 %: p < 1e-28 of a tile."""
+    """A slab by 1e-5, and a scene against `volpath` by a tenth, which moves its mean by 2 to 4 %: p < 1e-28."""
     monkeypatch.setattr(renders, "SIZE", 24)
     scenes = [functools.partial(renders.volpath_rows, name=name) for name in ("nested", "matt inside")]
     for factor, rows in ((1.00001, renders.slab_rows), *((1.1, rows) for rows in scenes)):
