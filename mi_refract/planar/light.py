@@ -74,7 +74,8 @@ def of_wavelengths(nm: Sequence[float] | int, power: str = "flat") -> Light:
         if mi.variant() is None:
             activate()
         # The present variant stays: to switch, and back, takes 0.1 s. Its classes are known once it is named.
-        si, config = mi.scalar_spectral.SurfaceInteraction3f(), mi.parser.ParserConfig("scalar_spectral")
+        variant: Any = mi.scalar_spectral
+        si, config = variant.SurfaceInteraction3f(), mi.parser.ParserConfig("scalar_spectral")
         spectrum: Any = mi.parser.instantiate(config, mi.parser.parse_dict(config, {"type": "d65"}))
         vector = type(si.wavelengths)
         powers = ()
