@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 
 from mi_refract import backend
 
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # or each process compiles the package anew: a quarter of its start
 VARIANT = backend.activate()
 USABLE: dict[str, str | None] = backend.usable_variants()
 # `--hypothesis-profile=long` draws other examples every time, and more.

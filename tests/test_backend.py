@@ -10,12 +10,11 @@ from pathlib import Path
 
 import drjit
 import pytest
+from support.processes import ENVIRONMENT
 
 from mi_refract import backend
 
-ROOT = Path(backend.__file__).parents[1]
 NANOTHREAD = Path(drjit.__file__).parent / "libnanothread.so"  # a shared library, but not LLVM
-PYTHON = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])}
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +31,7 @@ def apart(tmp_path, monkeypatch):
 
 def run(code, **environment):
     done = subprocess.run(
-        [sys.executable, "-c", code], env=PYTHON | environment, capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", code], env=ENVIRONMENT | environment, capture_output=True, text=True, timeout=120
     )
     assert done.returncode >= 0, f"died by signal {-done.returncode}: {done.stderr[-500:]}"
     return done
@@ -190,7 +189,7 @@ print(np.isfinite(np.array(mi.render(mi.load_dict(scene), spp=1))).all())
 def test_the_verdict_is_the_fate_of_an_image(path, tmp_path, monkeypatch):
     if path is None:
         pytest.skip("no libLLVM on this machine")
-    environment = PYTHON | {backend.CHOICE: path, "DRJIT_CACHE_DIR": str(tmp_path)}
+    environment = ENVIRONMENT | {backend.CHOICE: path, "DRJIT_CACHE_DIR": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", IMAGE], env=environment, capture_output=True, text=True)
     drawn = done.returncode == 0 and done.stdout == "True\n"
     monkeypatch.setenv(backend.CHOICE, path)
@@ -234,7 +233,7 @@ def test_a_command_restarts_with_the_library_that_works(tmp_path, monkeypatch):
         pytest.skip(backend.llvm().reason)
     (tmp_path / "libLLVM.so").symlink_to(NANOTHREAD)
     plain = {"LD_LIBRARY_PATH": str(tmp_path), backend.CHOICE: "", backend.OWN_CHOICE: ""}
-    environment = {key: value for key, value in (PYTHON | plain).items() if value}
+    environment = {key: value for key, value in (ENVIRONMENT | plain).items() if value}
     code = "from mi_refract import backend; print(backend.activate(may_restart={})); print(backend.llvm().reason)"
 
     def stdout(may_restart, before="import drjit"):

@@ -73,13 +73,15 @@ def of_wavelengths(nm: Sequence[float] | int, power: str = "flat") -> Light:
 
         if mi.variant() is None:
             activate()
-        with mi.util.variant_context("scalar_spectral"):
-            spectrum, si = mi.load_dict({"type": "d65"}), mi.SurfaceInteraction3f()
-            vector = type(si.wavelengths)
-            powers = ()
-            for w in wavelengths:
-                si.wavelengths = vector(w)
-                powers += (float(spectrum.eval(si)[0]),)
+        # The present variant stays: to switch, and back, takes 0.1 s. Its classes are known once it is named.
+        variant: Any = mi.scalar_spectral
+        si, config = variant.SurfaceInteraction3f(), mi.parser.ParserConfig("scalar_spectral")
+        spectrum: Any = mi.parser.instantiate(config, mi.parser.parse_dict(config, {"type": "d65"}))
+        vector = type(si.wavelengths)
+        powers = ()
+        for w in wavelengths:
+            si.wavelengths = vector(w)
+            powers += (float(spectrum.eval(si)[0]),)
     return Light(tuple(f"{w:.6g} nm" for w in wavelengths), wavelengths, powers)
 
 

@@ -79,14 +79,16 @@ def made(name):  # not kept: Mitsuba traces calls of every texture that is alive
 
 @functools.cache
 def stack_of_path(name, parameters):
-    return np.stack([by_path(made(name), SPP[name in WRAPPED], seed, **dict(parameters)) for seed in range(8)])
+    scene = made(name)
+    return np.stack([by_path(scene, SPP[name in WRAPPED], seed, **dict(parameters)) for seed in range(8)])
 
 
 @pytest.mark.parametrize(("name", "parameters"), FOLLOWED, ids=str)
 def test_other_numbers_give_the_same_mean(name, parameters, llvm_variant):
     """Welch's test on tiles, one false alarm in 1000 images; and of the whole, one in 10,000."""
     theirs = stack_of_path(name, tuple(x for x in parameters.items() if x[0] != "split_depth"))
-    ours = np.stack([render(made(name), SPP[name in WRAPPED], 100 + seed, **parameters) for seed in range(8)])
+    scene = made(name)
+    ours = np.stack([render(scene, SPP[name in WRAPPED], 100 + seed, **parameters) for seed in range(8)])
     assert tile_statistics.compare_stacks(theirs, ours, 8, 1e-3, 1e-5).alarms == 0
     assert equal_means(theirs, ours)
 
