@@ -120,6 +120,11 @@ def address() -> str:
     return str(_worker().address)
 
 
+def with_address(function: Callable[..., Result], *arguments: Any) -> tuple[str, Result]:
+    """The address, and what the call returns."""
+    return address(), function(*arguments)
+
+
 def scratch_folder() -> str:
     """A folder for files, which is removed with the worker."""
     folder = str(_worker().local_directory)

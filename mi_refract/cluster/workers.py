@@ -157,7 +157,7 @@ def results(
     def begin(number: int, arguments: tuple[Any, ...]) -> None:
         allowed = frozenset(workers.usable)
         options: dict[str, Any] = {"workers": sorted(allowed), "pure": False, "priority": -number}
-        begun[client.submit(_with_address, function, *arguments, **options)] = number, arguments, allowed
+        begun[client.submit(on_worker.with_address, function, *arguments, **options)] = number, arguments, allowed
 
     try:
         while True:
@@ -184,7 +184,3 @@ def results(
     finally:
         if begun and client.status == "running":
             client.cancel(list(begun), force=True)
-
-
-def _with_address(function: Callable[..., Any], *arguments: Any) -> tuple[str, Any]:
-    return on_worker.address(), function(*arguments)

@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 from mi_refract.io.text import printable
 
-from .results import FAILED, Result, Results, Status
+from .results import FAILED, Category, Result, Results, Status
 
 FEW = 20  # equal images that are listed one by one
 SUMMARY_ROWS = 500  # GitHub cuts a summary at 1 MiB
@@ -74,9 +74,11 @@ def print_table(rows: Rows, styles: Mapping[str, str] | None = None) -> None:
 
 
 def sentence(results: Results) -> str:
-    """All statuses in one line: "12 images: 1 different, 11 equal"."""
-    counts = Counter(result.status for result in results.results)
-    counted = ", ".join(f"{counts[status]} {WORDS[status]}" for status in Status if counts[status])
+    """All verdicts in one line: "12 images: 1 different, 2 added, 9 equal"."""
+    lone = {Category.ADDED: "added", Category.REMOVED: "removed"}
+    counts = Counter(lone.get(result.category, WORDS[result.status]) for result in results.results)
+    order = dict.fromkeys([WORDS[Status.ERROR], WORDS[Status.DIFFERENT], *lone.values(), *WORDS.values()])
+    counted = ", ".join(f"{counts[word]} {word}" for word in order if counts[word])
     number, warnings = len(results.results), sum(bool(result.warning) for result in results.results)
     warned = f", {warnings} with a warning" if warnings else ""
     further = len({path for result in results.results for path in result.variants})

@@ -404,7 +404,7 @@ def test_github(run, strange, tmp_path, monkeypatch):
     assert rest == "only among the new images"
     assert file.count(",") == 1 and ":" not in file and "%250A" in file
     text = summary.read_text()
-    assert text.startswith("before\n### mi-refract diff: 3 images: 1 could not be compared, 2 different\n")
+    assert text.startswith("before\n### mi-refract diff: 3 images: 1 could not be compared, 1 different, 1 added\n")
     assert "<script>" not in text and "`" not in text
     rows = [line for line in text.splitlines() if line.startswith("| ")]
     assert len(rows) == 4
