@@ -220,7 +220,9 @@ NUMBERS_ALARM = limit(1e-4, "probability of any false alarm of the chi-square te
 NEIGHBOUR_ALARM = limit(1e-8, "probability of a false alarm of a test: 5e-5 in a run of 5000 tests")
 NEIGHBOUR = limit(0.01, "relative: differences of the mean that each row must be able to see")
 # Gradients of images
-GRADIENT_ALARM = limit(4.42, "standard errors: a false alarm once in 10⁵ rows, 5e-4 in a run of 50")
-GRADIENT = limit(0.05, "relative: the error of a derivative that each row must be able to see")
+GRADIENT_ALARM = limit(1e-5, "probability that a row's interval leaves the truth out, all looks: 1e-3 in a run of 100")
+GRADIENT = limit(0.05, "relative: the error that a derivative has at most, but by GRADIENT_ALARM")
+UNBIASED = limit(1.0, "of the interval, which leaves out the truth by GRADIENT_ALARM")
 TRUNCATION = limit(0.02, "relative, of D(h), e = (fh)²/6 at the frequency f: D is off by (fh)⁴/30 = 1.2 e², 5e-4")
-BACKWARD_MODE = limit(0.05, "of the standard error: both modes draw the same numbers, and add them in another order")
+STEP = limit(1.2 * TRUNCATION**2, "relative: by what the step of finite differences may move D, see TRUNCATION")
+FORWARD_MODE = limit(0.05, "of the standard error: both modes draw the same numbers, and add them in another order")

@@ -30,7 +30,7 @@ from validation.ground_truth import standard_numbers
 from validation.planar import against_retrace
 from validation.planar import times as planar_times
 from validation.reference.standard_numbers import NUMBERS
-from validation.renders import against_dielectric, colours
+from validation.renders import against_dielectric, colours, gradients
 from validation.run import headline
 from validation.run import metrics as m
 from validation.run.array_settings import PLAIN
@@ -176,6 +176,31 @@ def renders(rows: list[Row]) -> str:
     text = _replay(mine, "{resolution}² pixels, {spp} spp, {seeds} seeds, {variant}.")
     cells = [[row.case, *_cells(row, columns, intervals=False)] for row in mine]
     return _table(text, ["scene", *columns.values()], cells, "scenes were rendered")
+
+
+def derivatives(rows: list[Row]) -> str:
+    """By parameter and integrator whether the derivative is right, how far it is off, its time and its variance."""
+    study, cells = gradients, {(row.case, row.subject): row for row in _measured(rows, gradients.NAME)}
+
+    def cell(case: str, name: str) -> str:
+        row = cells[case, name]
+        found = row.reason or "undecided"
+        if "off" in row.values:
+            off = row.values["gradient"] / row.values["differences"] - 1
+            found += f" ({off:+.1%} ± {row.values['interval']:.1%})"
+        time, variance = _cells(cells.get((f"{case}: {study.TIME}", name)), [study.TIME], intervals=False), ""
+        if study.VARIANCE in row.values:
+            variance = f", variance {compact(row.values[study.VARIANCE])}"
+        return f"{found}<br>time {time[0]}{variance}"
+
+    every = all((case, name) in cells for case in study.TABLE for name in study.INTEGRATORS)
+    lines = [[case, *(cell(case, name) for name in study.INTEGRATORS)] for case in (study.TABLE if every else ())]
+    heading = ["derivative with respect to", *(f"`{name}`" for name in study.INTEGRATORS)]
+    text = (
+        "In brackets: how far the derivative is off, and its interval. Time: over that of an image by `path`. "
+        "Variance:\nby one path, over the square of the derivative."
+    )
+    return _table(text, heading, lines, "derivatives were measured by every integrator")
 
 
 def paths(rows: list[Row]) -> str:
@@ -350,6 +375,7 @@ def numbers_elsewhere(rows: list[Row]) -> str:
 TABLES = {
     "accuracy": Table("README.md", "directions", accuracy),
     "renders": Table(f"{PAGES}/refract-and-dielectric.md", "renders", renders),
+    "derivatives": Table(f"{PAGES}/which-derivatives-are-correct.md", "renders", derivatives),
     "paths": Table(f"{PAGES}/refract-and-dielectric.md", "stability", paths),
     "efficiency": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency", efficiency),
     "changing": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency", changing),

@@ -5,7 +5,7 @@
 | `int_ior`, `ext_ior` | number, name | index inside (`bk7`, which is 1.5046) and outside (`air`) | `eta` | yes |
 | | dispersive material | a text of `mi_refract.media`, such as `SCHOTT:N-BK7` | `int_ior_B1`, … | yes |
 | | spectrum | index by wavelength, in spectral variants | `int_ior_n_360`, … | yes |
-| | texture | index by point; for `refract_path`, an attribute that the shape lacks is an error | yes | yes |
+| | texture | index by point; an attribute that a shape lacks: error by `refract_path`, else a warning | yes | yes |
 | `eta` | number | int_ior / ext_ior, only by `mi.traverse` | yes | yes |
 | `specular_reflectance`, `specular_transmittance` | number, spectrum, texture | tint of the lobe, ≥ 0 (1) | yes | yes |
 | `int_absorption`, `ext_absorption` | number, spectrum | σ of the medium on that side, per length (0) | yes | yes |
@@ -52,6 +52,7 @@ from mi_refract.numerics import (
 
 from .absorption import BEYOND, HERE, absorbing_parameter, read_absorption, read_values
 from .index_parameter import PLUGIN, DispersiveRatio, TexturedRatio, one_number, parameter_type, read_ratio, warn_once
+from .scene_features import mesh_attributes
 
 Refract: TypeAlias = Any  # an object of the class that `plugin_class` makes
 Context: TypeAlias = Any  # an `mi.BSDFContext`
@@ -134,7 +135,7 @@ def read_parameters(self: Refract, props: Properties, formula: str = "auto") -> 
         read_values(PLUGIN, props, name, "a number, a spectrum or a texture, ≥ 0 and finite")
     self.textures = {name: props.get_texture(name, 1.0) for name in tints}
     self.absorptions = {side: read_absorption(PLUGIN, props, side) for side in ("int", "ext")}
-    self.reported = False  # of `UnfollowedLight`
+    self.reported = set[str]()  # of `LostLight`
     self.eta = parameter_type(v)(eta)
     set_ratio(self, checked("int_ior / ext_ior", eta))
     both_sides = FLAGS.FrontSide | FLAGS.BackSide
@@ -143,6 +144,9 @@ def read_parameters(self: Refract, props: Properties, formula: str = "auto") -> 
         FLAGS.DeltaTransmission | both_sides | FLAGS.NonSymmetric,
     ]
     self.m_flags = self.m_components[0] | self.m_components[1]
+    textured = self.textures or isinstance(self.varying, TexturedRatio)
+    # Of the shape, which only a sample knows. Mitsuba's scalar variants refuse what a shape lacks.
+    self.attributes = mesh_attributes(self) if textured and dr.is_jit_v(v.Float) else []
 
 
 def checked(name: str, eta: float) -> float:
@@ -242,7 +246,7 @@ def sample(
     if self.dispersive and not followed:
         names = " in ".join(medium.name for medium in self.varying.sides.values())
         warn_once(f"{PLUGIN}: {names}: all light has the index of the d line; expected the integrator refract_path")
-    ray = refract(self, si, active, si.wavelengths[0] if by_wavelength else None)
+    ray, met = refract(self, si, active, si.wavelengths[0] if by_wavelength else None), v.Bool(active)
     active, others = ray.active, other_rays(self, si, ray) if by_wavelength else []
 
     # --- The lobe ---
@@ -287,8 +291,13 @@ def sample(
         weight = weight @ v.mueller.absorber(tint) if v.is_polarized else weight * tint
     if self.absorbing and not followed:
         # Infinite, as only `refract_path` can be right. (Not NaN: some integrators drop such a sample.)
-        self.unfollowed.report(self, active)
+        text = f"{absorbing_parameter(self)}; expected the integrator refract_path, or no absorption"
+        self.lost.report(self, text, "where light meets it, the image is not finite", active)
         weight = v.Spectrum(dr.inf)
+    # `refract_path` has checked them, and nothing can be read where a function is recorded.
+    for name in () if followed or dr.flag(dr.JitFlag.FreezingScope) else self.attributes:
+        text = f"a shape has no attribute {name!r}, which a texture of its BSDF reads; expected a mesh that has it"
+        self.lost.report(self, text, "Mitsuba takes it for 0", met & (si.shape.has_attribute(name, met) ^ True))
     return bs, dr.select(active, weight, 0)
 
 
@@ -431,8 +440,8 @@ def to_string(self: Refract) -> str:
     return "Refract[\n" + "".join("  " + line.replace("\n", "\n  ") + ",\n" for line in lines) + "]"
 
 
-class UnfollowedLight:
-    """Light that meets absorption under an integrator that does not follow it: an error where one can be raised.
+class LostLight:
+    """Light that meets what cannot be rendered: an error where one can be raised.
 
     A symbolic call has the BSDFs of all scenes in memory, and does not know which of them light will meet. `dr.print`
     does once the image is computed: one warning for all BSDFs that light met for the first time.
@@ -440,25 +449,24 @@ class UnfollowedLight:
 
     def __init__(self, v: Variant) -> None:
         """`v`: the variant's module."""
-        self.v, self.logged = v, False  # in the image that was traced last
+        self.v, self.logged = v, set[str]()  # in the image that was traced last
 
-    def report(self, bsdf: Refract, active: Mask) -> None:
-        """RuntimeError, or a warning when the image is computed, where a lane is `active`; once a BSDF."""
-        v, parameter = self.v, absorbing_parameter(bsdf)
-        text = f"{PLUGIN}: {parameter}; expected the integrator refract_path, or no absorption"
+    def report(self, bsdf: Refract, text: str, effect: str, active: Mask) -> None:
+        """RuntimeError, or a warning when the image is computed, where a lane is `active`; once a BSDF and text."""
+        v, text = self.v, f"{PLUGIN}: {text}"
 
         def warn(_: str) -> None:
-            bsdf.reported = True
-            if not self.logged:
-                self.logged = True
-                mi.Log(mi.LogLevel.Warn, f"{text}; where light meets it, the image is not finite")  # type: ignore[operator]
+            bsdf.reported.add(text)
+            if text not in self.logged:
+                self.logged.add(text)
+                mi.Log(mi.LogLevel.Warn, f"{text}; {effect}")  # type: ignore[operator]
 
         frozen = dr.flag(dr.JitFlag.FreezingScope)  # there nothing can be read
         if not frozen and not dr.flag(dr.JitFlag.SymbolicScope):
             if dr.any(active):
                 raise RuntimeError(text)
-        elif not bsdf.reported:
-            self.logged = False
+        elif text not in bsdf.reported:
+            self.logged.discard(text)
             if frozen:
                 warn("")
                 return
@@ -487,7 +495,7 @@ def plugin_class(v: Variant) -> type:
         "__doc__": "Smooth dielectric boundary; see the module docstring.",
         "v": v,
         "wide": dr.float64_array_t(v.Float),
-        "unfollowed": UnfollowedLight(v),
+        "lost": LostLight(v),
         "__init__": read_parameters,
         "eval": evaluate,
         "dispersive": property(dispersive),

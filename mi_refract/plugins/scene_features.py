@@ -143,17 +143,24 @@ def check_attributes(scene: Scene) -> None:
     shapes = all_shapes(scene)
     for i, shape in enumerate(shapes):
         for bsdf in nested(shape.bsdf()):
-            textures = children(bsdf) if bsdf_name(bsdf) == "Refract" else []
-            while textures:
-                texture = textures.pop()
-                textures += children(texture)
-                # It shows its name nowhere else.
-                name = texture.class_name() == "MeshAttribute" and re.search(r'name = "(.*)"', str(texture))
-                if name and not dr.all(shape.has_attribute(name[1])):
+            for name in mesh_attributes(bsdf) if bsdf_name(bsdf) == "Refract" else []:
+                if not dr.all(shape.has_attribute(name)):
                     raise ValueError(
-                        f"refract: {shape_name(shapes, i)} has no attribute {name[1]!r}, which a texture of its BSDF "
+                        f"refract: {shape_name(shapes, i)} has no attribute {name!r}, which a texture of its BSDF "
                         "reads; expected a mesh with that attribute"
                     )
+
+
+def mesh_attributes(bsdf: BSDF) -> list[str]:
+    """The names of the attributes of meshes that its textures read."""
+    names, textures = list[str](), children(bsdf)
+    while textures:
+        texture = textures.pop()
+        textures += children(texture)
+        # It shows its name nowhere else.
+        if texture.class_name() == "MeshAttribute" and (name := re.search(r'name = "(.*)"', str(texture))):
+            names.append(name[1])
+    return names
 
 
 def all_shapes(scene: Scene) -> list[Shape]:

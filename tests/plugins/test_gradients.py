@@ -190,6 +190,20 @@ def test_tints_have_the_derivatives_of_refract_path(integrator, name, llvm_varia
     assert abs(ours.mean() - theirs.mean()) < 5.36 * error
 
 
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+def test_prb_projective_gives_what_prb_gives_where_no_edge_moves(variant, needs_variant):
+    """Its first part is that of `prb`, with the same random numbers; polarised variants it refuses."""
+    needs_variant(variant)
+    switch(variant)
+    found = []
+    for integrator in ("prb", "prb_projective"):
+        scene = load(integrator, **NUMBER)
+        params, (key,) = attached(scene, "specular_transmittance")
+        dr.backward(loss(scene, params))
+        found.append(grad(params, key))
+    assert found[0] == pytest.approx(found[1], rel=1e-4) and found[0] != 0
+
+
 # Frozen --------------------------------------------------------------------------------------------------------------
 
 

@@ -22,6 +22,7 @@ from validation import __main__ as command
 from validation import runner, tables
 from validation.diff import planted_defects, visible_changes
 from validation.reference.standard_numbers import NUMBERS
+from validation.renders import gradients
 from validation.run import render_methods
 from validation.run.context import SCENES, beyond_builtin, here
 from validation.stability import layered_paths
@@ -240,6 +241,7 @@ NAMED = {
     "changing": ["a new scene for each image", "an edit among 300 glasses", "a sweep of 12 indices"],
     "planar": [path.stem for path in SCENES.glob("planar/*.toml")],
     "defects": [*planted_defects.GLASSES, *self_test.DEFECTS, *METHODS],
+    "derivatives": [*gradients.TABLE, *gradients.INTEGRATORS],
     "visible": [*visible_changes.KINDS, *map(str, visible_changes.SQUARES)],
     "standard numbers": [*NUMBERS],
     "standard numbers by others": [

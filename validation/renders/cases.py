@@ -33,9 +33,14 @@ class Case:
 
 
 def study(
-    name: str, title: str, doc: str | None, terms: Mapping[str, str], cases: Callable[[Context], Iterable[Case]]
+    name: str,
+    title: str,
+    doc: str | None,
+    terms: Mapping[str, str],
+    cases: Callable[[Context], Iterable[Case]],
+    timed: Callable[[Context], Iterable[Case]] = lambda context: (),
 ) -> Study:
-    """A study with a task for each case, all of them repeated with other seeds."""
+    """A study with a task for each case, all of them repeated with other seeds but those that are `timed`."""
 
     def rows(context: Context, case: Case) -> list[Row]:
         if reason := context.variants.get(case.variant):
@@ -50,7 +55,11 @@ def study(
             return [Task(name, lambda: [Row(name, OURS, "every case", context.variant, reason=reason)])]
         return [Task(f"{name}: {case.title}", functools.partial(rows, context, case)) for case in cases(context)]
 
-    return Study(name, title, about(doc), terms, tasks, again=by_tasks(tasks))
+    def every(context: Context) -> list[Task]:
+        clocks = () if context.scalar else timed(context)
+        return tasks(context) + [Task(f"{name}: {c.title}", functools.partial(rows, context, c), True) for c in clocks]
+
+    return Study(name, title, about(doc), terms, every, again=by_tasks(tasks))
 
 
 def variants(context: Context) -> tuple[str, str, str]:

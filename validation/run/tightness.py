@@ -45,7 +45,7 @@ EXCLUDES: dict[tuple[str, str], tuple[tuple[str, ...], str]] = {
     ("samples", "eta worst"): (("refract − dielectric",), "equal to the last bit; an index off by 2e-7, an ulp of 1.5"),
     ("samples", "lobe flips"): (("refract − dielectric",), "none flipped; a density off by 1e-2 on a thousand rays"),
     ("features", "off after an edit"): (("refract",), "equal to the last bit; an index off by 1e-5"),
-    ("gradients", "backward"): (("refract_path",), "the same seeds: a mode off by a twentieth of the standard error"),
+    ("gradients", "forward"): (("refract_path",), "the same seeds: a mode off by a twentieth of the standard error"),
     ("passes", "beyond"): (("--until",), "the claim of 5 %: 14 of 100; most renders end a pass or more below it"),
     ("planar", "difference"): (("trace",), "`error / bound` holds every path to less; a facet turned by 1e-9"),
     ("planar_closed", "difference"): (("trace",), "`error / bound` holds every path to less"),
