@@ -258,16 +258,18 @@ class Images:
     """The images of a case, and their derivatives in its parameter."""
 
     def __init__(self, case: Gradient) -> None:
-        """ValueError where the scene has no such parameter, or Mitsuba says that it is not differentiable."""
+        """ValueError where the scene has no such parameter, or one of integers, which nothing differentiates."""
         self.case, self.scene = case, mi.load_dict(case.make(), parallel=False, optimize=False)
         self.params = mi.traverse(self.scene)
         keys = [key for key in self.params.keys() if key.endswith(case.key)]  # noqa: SIM118  no dictionary
         if len(keys) != 1:
             raise ValueError(f"{NAME}: {len(keys)} parameters end with {case.key!r}; expected one")
         (self.key,) = keys
-        if self.params.flags(self.key) & +mi.ParamFlags.NonDifferentiable:
-            raise ValueError(f"{NAME}: no integrator differentiates {self.key!r}; expected a differentiable parameter")
         self.before = dr.detach(self.params[self.key])
+        probe = type(self.before)(self.before)  # Mitsuba's flag denies it of a camera's place, which has them
+        dr.enable_grad(probe)
+        if not dr.grad_enabled(probe):
+            raise ValueError(f"{NAME}: no integrator differentiates {self.key!r}; expected a differentiable parameter")
 
     def set(self, x: Any) -> None:
         """The parameter as it is at `x`."""
