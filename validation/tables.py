@@ -368,7 +368,7 @@ def numbers_elsewhere(rows: list[Row]) -> str:
     lines = [[name, *(by_name.get(name, "") for by_name in cells.values())] for name in asked]
     absent = dict.fromkeys(row.subject for row in mine if not row.values)
     text = "Error over bound: of rays in each system's own precision."
-    text += f"\nNot run here: {', '.join(absent)}." if absent else ""
+    text += f"\nNot run here: {'; '.join(absent)}." if absent else ""
     return _table(text, ["number", *cells], lines, "other renderers were asked for standard numbers")
 
 

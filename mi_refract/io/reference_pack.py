@@ -69,9 +69,14 @@ def of_references(reference: Path, answers: Path | None = None) -> PackReference
     format, a reference is no file of it, or `answers` lie in or below a folder with the INDEX of another pack. OSError
     where a file cannot be read.
     """
-    if (root := _root(reference)) is None:
+    places = reference.absolute(), reference.resolve()  # a link in a pack is a file of it
+    found = next(((place, folder) for place in places for folder in (place, *place.parents) if _is_pack(folder)), None)
+    if found is None:
         return None
+    place, root = found
     path = root / INDEX
+    if not path.is_file():
+        raise ValueError(f"{path}: missing, or not a file; {EXPECTED}")
     text = safe_files.read_bytes(path, MOST)
     index = _parsed(text, path)
     for name, file in index.files.items():
@@ -80,23 +85,26 @@ def of_references(reference: Path, answers: Path | None = None) -> PackReference
         with safe_files.opened(root / name, sys.maxsize) as stream:
             if hashlib.file_digest(stream, "sha256").hexdigest() != file.sha256:
                 raise ValueError(f"{root / name}: damaged or edited: its SHA-256 is not that of {INDEX}; {EXPECTED}")
-    if not (root / SUMS).is_file() or safe_files.read_bytes(root / SUMS, MOST) != sums(text, index.files).encode():
-        raise ValueError(f"{root / SUMS}: not the digests of {INDEX}, one of them was edited; {EXPECTED}")
-    place = reference.resolve()
+    if safe_files.read_bytes(root / SUMS, MOST) != sums(text, index.files).encode():
+        raise ValueError(f"{root / SUMS}: not the digests of {INDEX}: one of the two was edited; {EXPECTED}")
     for each in [place] if place.is_file() else sorted(place.rglob("*")):
         name = each.relative_to(root).as_posix()
         if each.is_file() and name not in {*index.files, INDEX, SUMS}:
             raise ValueError(f"{each}: not a file of the pack {root}; expected answers in another folder")
-    other = answers and _root(answers)
-    if other and safe_files.read_bytes(other / INDEX, MOST) != text:
-        raise ValueError(f"{answers}: answers to another pack: {other / INDEX} differs from {path}")
+    for folder in (answers.resolve(), *answers.resolve().parents) if answers else ():
+        if (folder / INDEX).is_file():
+            if safe_files.read_bytes(folder / INDEX, MOST) != text:
+                raise ValueError(f"{answers}: answers to another pack: {folder / INDEX} differs from {path}")
+            break
     return PackReference(index.version, hashlib.sha256(text).hexdigest(), place.relative_to(root).as_posix())
 
 
-def _root(path: Path) -> Path | None:
-    """The nearest folder, at `path` or above it, that holds an INDEX."""
-    place = path.resolve()
-    return next((folder for folder in (place, *place.parents) if (folder / INDEX).is_file()), None)
+def _is_pack(folder: Path) -> bool:
+    """Whether its SUMS name an INDEX. An INDEX alone says which pack the answers beside it are to."""
+    if not (folder / SUMS).is_file():
+        return False
+    with (folder / SUMS).open("rb") as file:
+        return INDEX.encode() in file.read(MOST)
 
 
 def _parsed(text: bytes, path: Path) -> PackIndex:

@@ -294,10 +294,13 @@ def sample(
         text = f"{absorbing_parameter(self)}; expected the integrator refract_path, or no absorption"
         self.lost.report(self, text, "where light meets it, the image is not finite", active)
         weight = v.Spectrum(dr.inf)
-    # `refract_path` has checked them, and nothing can be read where a function is recorded.
-    for name in () if followed or dr.flag(dr.JitFlag.FreezingScope) else self.attributes:
+    # `refract_path` has checked them; where a function is recorded nothing can be read; an interaction that was made by
+    # hand has no shape.
+    unasked = followed or si.shape is None or dr.flag(dr.JitFlag.FreezingScope)
+    for name in () if unasked else self.attributes:
         text = f"a shape has no attribute {name!r}, which a texture of its BSDF reads; expected a mesh that has it"
-        self.lost.report(self, text, "Mitsuba takes it for 0", met & (si.shape.has_attribute(name, met) ^ True))
+        here = met & (si.shape != None)  # noqa: E711  an array
+        self.lost.report(self, text, "Mitsuba takes it for 0", here & (si.shape.has_attribute(name, here) ^ True))
     return bs, dr.select(active, weight, 0)
 
 

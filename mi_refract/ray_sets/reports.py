@@ -198,7 +198,7 @@ def as_data(findings: Findings) -> dict[str, Any]:
         "precision": findings.precision,
         "ulp": findings.ulp,
         "error_bound": findings.error_bound,
-        "backward_error": findings.most_backward,
+        "backward_error_limit": findings.most_backward if math.isfinite(findings.most_backward) else None,
         "total_internal_reflection": {"signal": findings.tir, "detected": not findings.tir_given},
         "answers_sha256": findings.digest,
         "answered": findings.answered,

@@ -219,6 +219,16 @@ def test_triangles_without_an_area_are_left_out(tmp_path):
     assert not (tmp_path / "new" / "sky.exr").exists()
 
 
+def test_neither_a_wide_floor_nor_a_far_lamp_hides_what_is_near(tmp_path):
+    """Nothing is before the near plane, and a lamp's black back is behind it by its own size, not the scene's."""
+    wide = Mesh("floor", 1e5 * PANE[0] - [0, 0, 2], PANE[1], Diffuse((0.5, 0.5, 0.5)))
+    lamp = Mesh("lamp", PANE[0] + [0, 0, 5], PANE[1], Light((1.0, 1.0, 1.0)))
+    targets.write(plain([wide, lamp]), "gltf", tmp_path / "new")
+    model = glb(tmp_path / "new" / "scene.glb")
+    assert 0 < model.tree["cameras"][0]["perspective"]["znear"] < 4
+    assert np.abs(model.meshes["lamp-back"][0][:, 2] - model.meshes["lamp"][0][:, 2]).max() < 1e-3
+
+
 def test_trimesh_that_is_missing(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     with pytest.raises(ImportError, match=r"^glTF needs trimesh: pip install 'mi-refract\[gltf\]'$"):

@@ -133,7 +133,13 @@ def test_a_program_in_c_is_judged_as_by_us(pack, run, precision, mistake):
     assert (status, done.returncode) == (1, 1) if mistake[0] else (0, 0)
     assert (wrong, within, right) == (found["wrong"], 104 - found["wrong"] - found["right"], found["right"])
     # Of another number of rays, or of another set, there is no verdict.
-    assert subprocess.run([program, "rays/f32.csv", "README.md"], capture_output=True).returncode == 1
+    Path("few.csv").write_text("".join(Path(f"rays/{precision}.csv").read_text().splitlines(keepends=True)[:40]))
+    for names in (
+        ("rays/f32.csv", "README.md"),
+        ("README.md", "README.md"),
+        ("few.csv", f"rays/certified-{precision}.csv"),
+    ):
+        assert subprocess.run([program, *names], capture_output=True).returncode == 1
 
 
 def test_the_program_of_the_readme_reads_the_rays(pack):
@@ -219,6 +225,7 @@ BAD = {  # by what the error says
     "numbers/standard_numbers.csv: damaged or edited: its SHA-256": edited("numbers/standard_numbers.csv"),
     "looks/prism.png: damaged or edited": edited("looks/prism.png", lambda text: text[:-9]),
     "scene.xml: missing, or not a file": lambda pack, _: (pack / "scenes/prism/mitsuba/scene.xml").unlink(),
+    f"{INDEX}: missing, or not a file": lambda pack, _: (pack / INDEX).unlink(),
     f"{INDEX}: damaged: not JSON": edited(INDEX, lambda text: text[:-9]),
     f"{INDEX}: a pack of another version: format 'mi_refract pack 2'": edited(
         INDEX, lambda text: text.replace(b"mi_refract pack 1", b"mi_refract pack 2")
@@ -249,6 +256,14 @@ def test_references_that_are_not_the_pack_s_are_refused(pack, answers, run):
     shutil.copy("images/prism.exr", "images/added.exr")
     code, _, error = run("diff", "images", answers / "my_images")
     assert (code, "images/added.exr: not a file of the pack" in error) == (2, True)
+
+
+def test_a_copy_of_the_index_says_what_answers_are_to_and_makes_no_pack_of_them(pack, answers, run):
+    shutil.copy(INDEX, answers)
+    assert run("diff", "images", answers / "my_images", "--json", "to_the_pack.json")[0] == 0
+    assert run("diff", answers / "my_images", "images", "--json", "to_mine.json")[0] == 0
+    found = [json.loads(Path(f"{name}.json").read_text())["pack"] for name in ("to_the_pack", "to_mine")]
+    assert found[0]["path"] == "images" and found[1] is None
 
 
 def test_answers_to_the_rays_of_another_pack_are_refused(pack, answers, run):

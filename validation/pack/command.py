@@ -32,7 +32,6 @@ def _command(
     safe_files.check_parent(output / "pack" if output.exists() else output)
     if not all(map(importlib.util.find_spec, ("flint", "jinja2", "trimesh"))):
         raise ValueError("a pack needs the extra `validation`: pip install 'mi-refract[validation]'")
-    output.mkdir(exist_ok=True)
     from mi_refract import __version__, backend
 
     variant = backend.activate("llvm_ad_rgb")
@@ -50,6 +49,7 @@ def _command(
     made_with |= {"variant": variant, "trimesh": installed_version("trimesh")}
     files = made.whole(__version__, quick, made_with)
     top = f"mi-refract-pack-{__version__}{'-quick' if quick else ''}"
+    output.mkdir(exist_ok=True)
     path = output / f"{top}.zip"
     safe_files.write_atomically(path, contents.archive(files, top))
     print(printable(f"{path}: {len(files)} files, {path.stat().st_size / 1e6:.1f} MB"))

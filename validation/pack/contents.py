@@ -59,7 +59,7 @@ COLUMNS = {
     "bx_low, by_low, bz_low (b_low)": "the rest of the exact direction: b + b_low has 106 bits",
     "cos_t": "the cosine of the angle of refraction; 0 where all is reflected",
     "angle_limit": "radians: an answer farther from the exact direction is wrong",
-    "length_limit": "an answer is wrong whose length is off 1, and off |a|, by more, relative",
+    "length_limit": "an answer is wrong whose length differs from both 1 and |a| by more, relative",
     "decided": "1 where an answer is wrong that does not know whether the ray is transmitted; 0 where it may err",
     "plane_limit": "of k times the error of a direction across the plane of incidence, or off the roots below",
     "radicand_limit": "by which cos² of the angle of refraction may be off, before its root is taken",

@@ -41,18 +41,18 @@ ASSUMPTIONS = (
     "thicknessFactor is 4 V/S, the mean chord of a convex body. A path tracer does not use it, only that it is not 0.",
     "A radiance of 1 is one candela per square metre there, and a unit of the scene is one metre. Nothing is a light "
     "of KHR_lights_punctual: what is exported has none.",
-    "A light that is open has a black back, {offset:.3g} behind it: glTF shows nothing there, or the light, "
-    "as doubleSided is understood.",
-    "A diffuse surface is Lambert's where specularFactor = 0, or ior = 1, takes the coating of glTF's material away.",
+    "A light that is open has a black back, {offset:.3g} behind it: renderers disagree on what the back of a one-sided "
+    "light shows.",
+    "Diffuse surfaces have specularFactor = 0 and ior = 1. A renderer that ignores both gives them a glossy coat.",
     LIGHT_INSIDE,
 )
 SKY_AXES: Axes = (-1, 0, 0), (0, 0, -1), (0, 1, 0)  # of three.js
 BLACK = (0.0, 0.0, 0.0)
-BACK = 1e-5  # of the largest coordinate: some hundred roundoffs of float32
+BACK = 1e-5  # of the lamp's largest coordinate: some hundred roundoffs of float32
 # Of 1/σ, the distance of attenuationColor c: Blender takes σ = (1 − c)/distance for −log(c)/distance, off by SHORT/2;
 # c rounded to float32 is off by 2^-24/SHORT in σ.
 SHORT = 2.0**-10
-NEAR = 1e-4  # of the largest distance from the camera: its near plane
+LEAST_NEAR = 1e-6  # the near plane of a camera that lies on a surface
 
 
 def files(plain: PlainScene) -> Files:
@@ -65,8 +65,9 @@ def files(plain: PlainScene) -> Files:
     outside = outermost_index(plain)
     turned = (_around_glass(plain, mesh, outside) for mesh in plain.meshes)
     meshes = [mesh for mesh in map(_without_slivers, turned) if len(mesh.faces)]
-    largest = max((float(np.abs(mesh.vertices).max()) for mesh in meshes), default=1.0)
-    backs = [_back(mesh, BACK * largest) for mesh in meshes if isinstance(mesh.material, Light)]
+    lit = [mesh for mesh in meshes if isinstance(mesh.material, Light)]
+    lamps = {mesh.name: BACK * float(np.abs(mesh.vertices).max()) for mesh in lit}
+    backs = [_back(mesh, lamps[mesh.name]) for mesh in lit]
     shown = [*_with_hollows(plain, meshes), *(back for back in backs if back)]
     materials = list(dict.fromkeys(mesh.material for mesh in shown))
     camera, extras = plain.camera, {"max_depth": plain.max_depth, "width": plain.camera.width}
@@ -82,8 +83,10 @@ def files(plain: PlainScene) -> Files:
     scene.camera = trimesh.scene.Camera("camera", fov=(1.0, 1.0))  # its angles are replaced below
     scene.camera_transform = place
     high = math.tan(math.radians(camera.fov_x_degrees) / 2) * camera.height / camera.width
-    far = max((float(np.linalg.norm(mesh.vertices - camera.origin, axis=1).max()) for mesh in meshes), default=1.0)
-    view = {"aspectRatio": camera.width / camera.height, "yfov": 2 * math.atan(high), "znear": NEAR * far}
+    corners = np.concatenate([mesh.triangles() for mesh in meshes]) if meshes else np.empty((0, 3, 3))
+    nearest = trimesh.triangles.closest_point(corners, np.broadcast_to(camera.origin, (len(corners), 3)))
+    near = float(np.linalg.norm(nearest - camera.origin, axis=1).min(initial=1.0)) / 2 or LEAST_NEAR
+    view = {"aspectRatio": camera.width / camera.height, "yfov": 2 * math.atan(high), "znear": near}
 
     def complete(tree: dict[str, Any]) -> None:
         """Put in what trimesh has no words for."""
@@ -102,7 +105,7 @@ def files(plain: PlainScene) -> Files:
     if not isinstance(plain.sky, Environment) and any(plain.sky):
         sky = {"sky.exr": exr(np.full((4, 8, 3), plain.sky, np.float32))}
     values = {"depth": plain.max_depth, "width": camera.width, "height": camera.height, "outside": outside}
-    said = [text.format(**values, offset=BACK * largest) for text in ASSUMPTIONS] + _said(meshes)
+    said = [text.format(**values, offset=max(lamps.values(), default=0.0)) for text in ASSUMPTIONS] + _said(meshes)
     return several | sky | {"scene.glb": single, "README.txt": readme(plain, "a glTF renderer", COMMANDS, said, "")}
 
 
