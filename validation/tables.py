@@ -184,7 +184,8 @@ def derivatives(rows: list[Row]) -> str:
 
     def cell(case: str, name: str) -> str:
         row = cells[case, name]
-        found = row.reason or "undecided"
+        found, error, _ = (row.reason or "undecided").partition(study.ERROR)  # its words are in the report
+        found += error.removesuffix(": ")
         if "off" in row.values:
             off = row.values["gradient"] / row.values["differences"] - 1
             found += f" ({off:+.1%} ± {row.values['interval']:.1%})"

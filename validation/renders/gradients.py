@@ -50,6 +50,7 @@ ROUNDS, SEED = 6, 2037
 SIZE = 16
 VARIANCE, TIME = "variance", "time / image"
 RIGHT, BIASED, MISSING = "right", "biased", "missing"
+ERROR = "an error: "
 TERMS = {
     "off": "|gradient / differences − 1|",
     "interval": "half the width of its interval, which leaves the truth out once in 10⁵ rows; what would be seen",
@@ -385,7 +386,7 @@ def judged(
         try:
             gradients = [gradient(i) for i in range(count)]
         except RuntimeError as error:
-            return {}, f"{MISSING}: {first_cause(error)}"
+            return {}, f"{MISSING}: {ERROR}{first_cause(error)}"
         if not (np.isfinite(gradients).all() and any(gradients)):
             return {}, f"{MISSING}: {'infinite' if any(gradients) else 'it is 0'}"
         values = compared(gradients, [difference(i) for i in range(count)], case.spp)
