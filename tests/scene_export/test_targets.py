@@ -205,6 +205,19 @@ def test_the_plain_scene_renders_equal_and_another_index_would_be_seen(tmp_path)
     assert methods.compare("welch", first, renders(path, 100), tile=16).verdict == Verdict.DIFFERENT
 
 
+@pytest.mark.parametrize("target", ["povray", "gltf"])
+def test_glass_whose_normals_point_inward_is_the_same_glass(target):
+    vertices, faces = tessellation.sphere(1)
+    outward, inward = (
+        Mesh("ball", vertices, faces, Glass(1.5, 1.0)),
+        Mesh("ball", vertices, faces[:, ::-1], Glass(1.0, 1.5)),
+    )
+    one, two = (
+        targets.TARGETS[target](PlainScene("ball", (mesh,), (1.0, 1.0, 1.0), CAMERA, 8)) for mesh in (outward, inward)
+    )
+    assert one == two
+
+
 def test_povray(tmp_path):
     """What it does not follow is refused; black surfaces; indices relative to what is outside."""
     pane = Mesh("pane", *tessellation.rectangle(), GLASS)

@@ -25,7 +25,7 @@ from ..plain_scene import (
     VolumeGlass,
 )
 from ..tessellation import Vertices, encloses, is_closed
-from .shared_files import LIGHT_INSIDE, Axes, Files, exr, outermost_index, readme, sky_exr
+from .shared_files import LIGHT_INSIDE, Axes, Files, exr, outermost_index, outward, readme, sky_exr, turned
 
 COMMANDS = """
 scene.glb     all of the scene but its sky, in one file
@@ -62,6 +62,7 @@ def files(plain: PlainScene) -> Files:
         from trimesh.exchange import gltf
     except ModuleNotFoundError:
         raise MissingExtraError("glTF needs trimesh: pip install 'mi-refract[gltf]'") from None
+    plain = outward(plain)
     outside = outermost_index(plain)
     turned = (_around_glass(plain, mesh, outside) for mesh in plain.meshes)
     meshes = [mesh for mesh in map(_without_slivers, turned) if len(mesh.faces)]
@@ -119,10 +120,9 @@ def _around_glass(plain: PlainScene, mesh: Mesh, outside: float) -> Mesh:
     if not is_closed(mesh.faces):
         raise ValueError(f"{place}: glass with an open surface; expected a closed one: glTF's volumes are bounded")
     if not math.isclose(material.ext_ior, outside, rel_tol=1e-12):  # a hollow of the glass, or another glass
-        material = replace(material, int_ior=material.ext_ior, ext_ior=material.int_ior)
-        if isinstance(material, VolumeGlass):
-            material = replace(material, int_sigma=material.ext_sigma, ext_sigma=material.int_sigma)
-        mesh = replace(mesh, faces=mesh.faces[:, ::-1], normals=None if mesh.normals is None else -mesh.normals)
+        mesh = turned(mesh)
+        material = mesh.material
+        assert isinstance(material, Glass)
     if not math.isclose(material.ext_ior, outside, rel_tol=1e-12):
         two = f"media of {material.int_ior!r} and {material.ext_ior!r} touch"
         raise ValueError(

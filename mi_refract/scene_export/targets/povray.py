@@ -9,7 +9,7 @@ import numpy as np
 
 from ..plain_scene import Diffuse, Environment, Glass, Light, Mesh, PlainScene
 from ..tessellation import is_closed
-from .shared_files import LIGHT_INSIDE, Files, numbers, outermost_index, readme, sky_exr
+from .shared_files import LIGHT_INSIDE, Files, numbers, outermost_index, outward, readme, sky_exr
 
 COMMANDS = """
 povray +Iscene.pov +Oimage.exr +FE +W{width} +H{height} -A -D File_Gamma=1.0 Declare=dx=0.5 Declare=dy=0.5
@@ -37,6 +37,7 @@ def files(plain: PlainScene) -> Files:
         if isinstance(mesh.material, Diffuse) and any(mesh.material.reflectance):
             raise ValueError(f"{place}: a diffuse surface; the export to POV-Ray supports glass and lights only")
     # POV-Ray assumes that the outermost medium has index 1: indices are relative to that one.
+    plain = outward(plain)
     outside = outermost_index(plain)
     media = {outside, *(mesh.material.int_ior for mesh in plain.meshes if isinstance(mesh.material, Glass))}
     for mesh in plain.meshes:  # POV-Ray has one index per body

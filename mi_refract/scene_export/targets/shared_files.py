@@ -14,7 +14,8 @@ from mi_refract import __version__
 from mi_refract.io.image_file import NO_DATE, write_exr
 from mi_refract.io.safe_files import temporary_folder
 
-from ..plain_scene import Environment, Glass, Material, PlainScene
+from ..plain_scene import Environment, Glass, Material, Mesh, PlainScene, VolumeGlass
+from ..tessellation import is_closed
 
 Files = dict[str, bytes]  # contents by name
 Array = NDArray[np.float64]
@@ -64,8 +65,28 @@ def material_names(plain: PlainScene) -> dict[Material, str]:
     return {material: f"material{number}" for number, material in enumerate(plain.materials)}
 
 
+def turned(mesh: Mesh) -> Mesh:
+    """The same boundary, of glass, seen from its other side: with normals the other way and the media exchanged."""
+    assert isinstance(mesh.material, Glass)
+    material = dataclasses.replace(mesh.material, int_ior=mesh.material.ext_ior, ext_ior=mesh.material.int_ior)
+    if isinstance(material, VolumeGlass):
+        material = dataclasses.replace(material, int_sigma=material.ext_sigma, ext_sigma=material.int_sigma)
+    normals = None if mesh.normals is None else -mesh.normals
+    return dataclasses.replace(mesh, faces=mesh.faces[:, ::-1], normals=normals, material=material)
+
+
+def outward(plain: PlainScene) -> PlainScene:
+    """The same scene, with all closed glass turned so that its normals point outward: `int_ior` is inside."""
+
+    def inside_out(mesh: Mesh) -> bool:
+        closed = isinstance(mesh.material, Glass) and is_closed(mesh.faces)
+        return closed and float(np.linalg.det(mesh.triangles()).sum()) < 0
+
+    return dataclasses.replace(plain, meshes=tuple(turned(mesh) if inside_out(mesh) else mesh for mesh in plain.meshes))
+
+
 def outermost_index(plain: PlainScene) -> float:
-    """That of the medium around all glass; 1 without glass. Precondition: the glass farthest along +x is not inside."""
+    """That of the medium around all glass, all of it `outward`; 1 without glass."""
     glasses = [(mesh.vertices[:, 0].max(), mesh.material) for mesh in plain.meshes if isinstance(mesh.material, Glass)]
     return max(glasses, key=lambda glass: glass[0])[1].ext_ior if glasses else 1.0
 
