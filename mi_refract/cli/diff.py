@@ -189,6 +189,10 @@ def accept(
         with _progress() as progress:
             results = folders.diff(reference, test, chosen, names=names or [], to_accept=True, progress=progress)
         text_reports.print_results(results)
+    if reference_pack.of_references(results.reference):
+        raise ValueError(
+            f"{results.reference}: in a reference pack, which stays as published; expected your own references"
+        )
     try:
         copies = list(accepting.changes(results, as_variant))
     except accepting.UnreadableImage as error:

@@ -258,6 +258,13 @@ def test_references_that_are_not_the_pack_s_are_refused(pack, answers, run):
     assert (code, "images/added.exr: not a file of the pack" in error) == (2, True)
 
 
+def test_no_image_is_accepted_into_a_pack(pack, answers, run):
+    shutil.copy("images/prism.exr", answers / "my_images/sphere.exr")
+    code, _, error = run("accept", "images", answers / "my_images", "--yes")
+    assert (code, "images: in a reference pack" in error) == (2, True)
+    assert run("diff", "images", answers / "my_images")[0] == 1  # the pack is whole
+
+
 def test_a_copy_of_the_index_says_what_answers_are_to_and_makes_no_pack_of_them(pack, answers, run):
     shutil.copy(INDEX, answers)
     assert run("diff", "images", answers / "my_images", "--json", "to_the_pack.json")[0] == 0
