@@ -21,7 +21,6 @@ from .errors import TooMuchOutputError
 
 LONGEST = 7 * 86_400.0  # seconds that a program may have
 _PIECE = 2**16  # bytes
-_LOOK = 0.5  # seconds: a signal that comes just before Python waits does not end the wait
 
 
 @dataclass(frozen=True)
@@ -105,12 +104,9 @@ def _read(process: subprocess.Popen[bytes], deadline: float, most: int) -> tuple
         threading.Thread(target=pump, args=both, daemon=True).start()
     room, going = most, len(pumps)
     while going:
-        left = deadline - time.monotonic()
         try:
-            kept, piece = arriving.get(timeout=max(0, min(_LOOK, left)))
+            kept, piece = arriving.get(timeout=max(0, deadline - time.monotonic()))
         except queue.Empty:
-            if left > _LOOK:
-                continue
             raise subprocess.TimeoutExpired(process.args, deadline) from None
         kept.append(piece)
         going -= not piece
