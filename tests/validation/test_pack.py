@@ -16,6 +16,7 @@ import pytest
 from support.processes import ENVIRONMENT, ROOT
 from support.readme import DOCS, blocks
 
+from mi_refract import backend
 from mi_refract.image_diff import results_file
 from mi_refract.io import image_file
 from mi_refract.io.reference_pack import INDEX, SUMS
@@ -30,6 +31,8 @@ SINGLE = ("-DREAL=float", "-DU=0x1p-24")
 def archive(tmp_path_factory):
     """An archive that a process of its own wrote."""
     pytest.importorskip("trimesh", reason="glTF needs trimesh")
+    if reason := backend.usable_variants()["llvm_ad_rgb"]:
+        pytest.skip(f"a pack is rendered in llvm_ad_rgb: {reason}")
     folder = tmp_path_factory.mktemp("packs")
     done = subprocess.run(
         [sys.executable, "-m", "validation", *QUICK, folder],
@@ -301,11 +304,11 @@ def test_misuse_of_the_command(words, message, tmp_path, monkeypatch, capfd):
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_ctrl_c_leaves_nothing(tmp_path):
+def test_ctrl_c_leaves_nothing(tmp_path, needs_variant):
+    needs_variant("llvm_ad_rgb")
     pytest.importorskip("trimesh", reason="glTF needs trimesh")
     words = [sys.executable, "-m", "validation", "pack", "-o", tmp_path]
-    started = subprocess.Popen(words, cwd=ROOT, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
-    assert "1 of 12: rays in f32" in started.stderr.readline()
-    started.send_signal(signal.SIGINT)
-    assert started.wait(60) == 130 and not list(tmp_path.iterdir())
-    started.stderr.close()
+    with subprocess.Popen(words, cwd=ROOT, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True) as started:
+        assert "1 of 12: rays in f32" in started.stderr.readline()
+        started.send_signal(signal.SIGINT)
+        assert started.wait(60) == 130 and not list(tmp_path.iterdir())
