@@ -51,6 +51,7 @@ class SceneFeatures:
     """Facts about a scene. `unknown`: the plugins that are not known, and so count as needing everything."""
 
     smooth: bool  # some BSDF has a lobe that is not a delta: then sampling emitters is worth while
+    delta: bool  # some BSDF has a lobe that is one
     sampleable: bool  # some emitter can be sampled
     lamps: bool  # some emitter other than the environment can be
     area: bool  # some shape emits
@@ -60,6 +61,7 @@ class SceneFeatures:
     only_glass: bool  # every BSDF has delta lobes only
     textured: bool  # a BSDF or a light may vary over its surface, or with its tangent
     null: bool  # some BSDF has a null lobe
+    perturbed: bool  # some BSDF has a shading normal of its own
     dispersive: bool  # some BSDF refracts by wavelength
     absorbing: bool  # some BSDF has an absorbing medium on one side
     media: bool  # some shape, sensor or emitter has a medium of Mitsuba's
@@ -111,6 +113,7 @@ def inspect(scene: Scene) -> SceneFeatures:
     shape_media = any(shape.interior_medium() or shape.exterior_medium() for shape in shapes)
     return SceneFeatures(
         smooth=everything or bool(flags & +lobes.Smooth),
+        delta=everything or bool(flags & +lobes.Delta),
         sampleable=bool(emitters),  # Mitsuba refuses a scene all of whose emitters have the weight 0
         lamps=any(not emitter.is_environment() and emitter.sampling_weight() > 0 for emitter in emitters),
         area=bool(opaque or lamps),
@@ -128,6 +131,7 @@ def inspect(scene: Scene) -> SceneFeatures:
         or not deltas <= WITHOUT_TANGENT
         or not {lamp.class_name() for lamp in lamps} <= PLAIN_LAMPS,
         null=everything or bool(flags & +lobes.Null),
+        perturbed=everything or bool(names & {"BumpMap", "NormalMap"}),
         dispersive=everything or any(getattr(bsdf, "dispersive", False) for bsdf in bsdfs),  # no plugin of Mitsuba's is
         absorbing=everything or any(getattr(bsdf, "absorbing", False) for bsdf in bsdfs),
         media=shape_media or any(end.get_medium() for end in (*emitters, *scene.sensors())),
