@@ -410,16 +410,13 @@ class LampTracer:
     ) -> Spectrum:
         """The weight of a sample, corrected for shading normals n: |n·wi| |geometric·wo| / (|n·wo| |geometric·wi|)."""
         upper, lower = dr.abs(dr.dot(si.n, leaving)), dr.abs(dr.dot(si.n, arriving))
+        corrected = weight * _quotient(upper * dr.abs(si.wi.z), lower * dr.abs(bs.wo.z))
         if not self.features.perturbed:
-            return weight * _quotient(upper * dr.abs(si.wi.z), lower * dr.abs(bs.wo.z))
-        # The normal is the BSDF's own. A delta lobe shows it, wi + η wo where light is refracted; another is evaluated.
-        normal = si.wi + bs.wo * bs.eta
-        turned = _quotient(dr.abs(dr.dot(normal, si.wi)), dr.abs(dr.dot(normal, bs.wo)))
-        refracted = mi.has_flag(bs.sampled_type, LOBES.DeltaTransmission) & (bs.eta != 1)
-        delta = weight * (dr.select(refracted, turned, 1) * _quotient(upper, lower))
+            return corrected
+        # The normal is known to the BSDF alone, which is evaluated as path tracing does.
         smooth = active & mi.has_flag(bs.sampled_type, LOBES.Smooth)
         value = self._radiance(si, bsdf, bs.wo, smooth) * _quotient(upper, lower * bs.pdf)
-        return dr.select(smooth, value, delta)
+        return dr.select(smooth, value, corrected)
 
     def _radiance(self, si: Interaction, bsdf: Any, wo: Vector3, active: Mask) -> Spectrum:
         """The BSDF times the cosine for light that comes along −wi and leaves along wo, as path tracing evaluates it."""

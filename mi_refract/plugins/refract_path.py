@@ -248,6 +248,7 @@ def integrator_class(v: Variant) -> type:
                 "the render is differentiated": not symbolic,
                 "a frozen function": dr.flag(dr.JitFlag.FreezingScope),
                 "the scene has media": needs.media,
+                f"a {needs.delta_perturbed} has delta lobes": bool(needs.delta_perturbed),
                 self.unconnected: bool(self.unconnected),
                 (lamps := lamp_tracing.refused_lamps(scene)): bool(lamps),
             }

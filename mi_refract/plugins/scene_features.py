@@ -36,6 +36,7 @@ CONSTANT_TEXTURES = {
     "RegularSpectrum", "SRGBReflectanceSpectrum", "UniformSpectrum",
 }
 # fmt: on
+PERTURBING = {"BumpMap", "NormalMap"}  # their shading normal is not that of the interaction
 # One reflected and one refracted direction, each sampled by a side of one threshold of `sample1`: what can be split.
 BOUNDARIES = {"Refract", "SmoothDielectric"}
 # No choice is left to chance where the lobes of `BOUNDARIES` are both followed.
@@ -52,6 +53,7 @@ class SceneFeatures:
 
     smooth: bool  # some BSDF has a lobe that is not a delta: then sampling emitters is worth while
     delta: bool  # some BSDF has a lobe that is one
+    delta_perturbed: str  # one that has it, and may have a shading normal of its own; "" where none is
     sampleable: bool  # some emitter can be sampled
     lamps: bool  # some emitter other than the environment can be
     area: bool  # some shape emits
@@ -61,7 +63,7 @@ class SceneFeatures:
     only_glass: bool  # every BSDF has delta lobes only
     textured: bool  # a BSDF or a light may vary over its surface, or with its tangent
     null: bool  # some BSDF has a null lobe
-    perturbed: bool  # some BSDF has a shading normal of its own
+    perturbed: bool  # some BSDF may have a shading normal of its own
     dispersive: bool  # some BSDF refracts by wavelength
     absorbing: bool  # some BSDF has an absorbing medium on one side
     media: bool  # some shape, sensor or emitter has a medium of Mitsuba's
@@ -114,6 +116,7 @@ def inspect(scene: Scene) -> SceneFeatures:
     return SceneFeatures(
         smooth=everything or bool(flags & +lobes.Smooth),
         delta=everything or bool(flags & +lobes.Delta),
+        delta_perturbed=next((n for n in map(bsdf_name, filter(_has_delta, bsdfs)) if n not in KNOWN - PERTURBING), ""),
         sampleable=bool(emitters),  # Mitsuba refuses a scene all of whose emitters have the weight 0
         lamps=any(not emitter.is_environment() and emitter.sampling_weight() > 0 for emitter in emitters),
         area=bool(opaque or lamps),
@@ -131,7 +134,7 @@ def inspect(scene: Scene) -> SceneFeatures:
         or not deltas <= WITHOUT_TANGENT
         or not {lamp.class_name() for lamp in lamps} <= PLAIN_LAMPS,
         null=everything or bool(flags & +lobes.Null),
-        perturbed=everything or bool(names & {"BumpMap", "NormalMap"}),
+        perturbed=everything or bool(names & PERTURBING),
         dispersive=everything or any(getattr(bsdf, "dispersive", False) for bsdf in bsdfs),  # no plugin of Mitsuba's is
         absorbing=everything or any(getattr(bsdf, "absorbing", False) for bsdf in bsdfs),
         media=shape_media or any(end.get_medium() for end in (*emitters, *scene.sensors())),
@@ -201,6 +204,10 @@ def nested(bsdf: BSDF) -> Iterator[BSDF]:
     for child in children(bsdf):
         if hasattr(child, "eval_null_transmission"):
             yield from nested(child)
+
+
+def _has_delta(bsdf: BSDF) -> bool:
+    return bool(bsdf.flags() & +mi.BSDFFlags.Delta)
 
 
 def _black(bsdf: BSDF) -> bool:
