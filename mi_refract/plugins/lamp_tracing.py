@@ -33,15 +33,29 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refract.numerics import Count, Emitter, Interaction, Mask, Number, Point2, Ray, Scene, Sensor, Shape, Spectrum
-from mi_refract.numerics import Variant, Vector3
+from mi_refract.numerics import (
+    Count,
+    Emitter,
+    Interaction,
+    Mask,
+    Number,
+    Point2,
+    Ray,
+    Scene,
+    Sensor,
+    Shape,
+    Spectrum,
+    Variant,
+    Vector3,
+)
 
 from .absorption import HERE
+from .film import SQUARES_DIGITS, SQUARES_LOWEST, Splats, expected_weights, film_colours
 from .medium_tracking import THROUGH
 from .path_loop import PathLoop
 from .refract import DISPERSED, followed_context
 from .sampling import IndependentNumbers, KeyedMultijitter
-from .scene_features import KNOWN_SHAPES, KNOWN, all_shapes, bsdf_name, nested
+from .scene_features import KNOWN, KNOWN_SHAPES, bsdf_name, nested
 
 MOST_TARGETS = 16  # spheres at which directions are aimed
 MARGIN = 1 + 1e-4  # of a sphere's radius: rounding must not leave its rim out
@@ -173,7 +187,7 @@ class Aim:
         return axis, dr.select(outside, dr.square(radius) / distance2, 2)
 
     def place(self, lamp: Count, chosen: Count, d: Vector3, sample: Point2) -> tuple[Vector3, Number]:
-        """A point on the disk of the sphere that was chosen, perpendicular to `d` through its centre, and its density."""
+        """A point on the disk of the chosen sphere that is perpendicular to `d`, and its density."""
         v = self.v
         center, radius = self.sphere(chosen)
         disk = v.warp.square_to_uniform_disk_concentric(sample)
@@ -262,10 +276,15 @@ class LampTracer:
         numbers: Any = KeyedMultijitter(v, v.UInt32(0), count, count) if self.vectorised else IndependentNumbers(v, 0)
         sums = [0.0] * len(self.lamps)
         for _ in range(1 if self.vectorised else count):
-            lamp, _, weight = self._emitted(numbers, v.Bool(True))
-            value = dr.sum(v.unpolarized_spectrum(weight))
-            for i, (index, power) in enumerate(zip(lamp, value, strict=True) if self.vectorised else [(lamp, value)]):
-                sums[int(index)] += float(power) if math.isfinite(power) else 0.0
+            lamp, _, power = self._emitted(numbers, v.Bool(True))
+            power = dr.sum(v.unpolarized_spectrum(power))
+            power = dr.select(dr.isfinite(power), power, 0)
+            if self.vectorised:
+                powers = dr.zeros(v.Float, len(sums))
+                dr.scatter_add(powers, power, lamp)
+                sums = [float(x) for x in powers]
+            else:
+                sums[int(lamp)] += power
         total = sum(sums)
         even = 1 / len(sums)
         return [DEFENSIVE * even + (1 - DEFENSIVE) * (x / total if total else even) for x in sums]
@@ -394,7 +413,7 @@ class LampTracer:
         self, s: LightPath, si: Interaction, bs: Any, bsdf: Any, ray: Ray, throughput: Spectrum, active: Mask
     ) -> Spectrum:
         """Take over the medium beyond a boundary; what it declares on this side is that of the way so far."""
-        v, through = self.v, active & ((bs.sampled_type & THROUGH) != 0)
+        through = active & ((bs.sampled_type & THROUGH) != 0)
         first = through & (s.known ^ True)
         if self.vectorised or (first and bsdf.has_attribute(HERE, first)):
             here = bsdf.eval_attribute(HERE, si, first)
@@ -419,7 +438,7 @@ class LampTracer:
         return dr.select(smooth, value, corrected)
 
     def _radiance(self, si: Interaction, bsdf: Any, wo: Vector3, active: Mask) -> Spectrum:
-        """The BSDF times the cosine for light that comes along −wi and leaves along wo, as path tracing evaluates it."""
+        """The BSDF times the cosine of wi, for light that comes along −wi and leaves along wo, as path tracing has it."""
         seen = self.v.SurfaceInteraction3f(si)
         seen.wi = wo
         value = bsdf.eval(self.loop.context, seen, si.wi, active)
@@ -460,7 +479,9 @@ class Camera:
         self.width, self.height = (int(n) for n in film.crop_size())
         self.parallel = sensor.class_name() == "OrthographicCamera"
         if self.parallel:
-            corner, right, down = (sensor.sample_ray(0, 0, v.Point2f(*p), v.Point2f(0))[0] for p in ((0, 0), (1, 0), (0, 1)))
+            corner, right, down = (
+                sensor.sample_ray(0, 0, v.Point2f(*p), v.Point2f(0))[0] for p in ((0, 0), (1, 0), (0, 1))
+            )
             self.origin, self.d = corner.o, corner.d
             x, y = right.o - corner.o, down.o - corner.o
             # (x, y) of a point p on the film, from 0 to 1, is that of p − origin in the basis dual to x, y.
@@ -489,98 +510,10 @@ class Camera:
         return v.Point2f(place.x * self.width, place.y * self.height), ray, importance, active
 
 
-# Splats ---------------------------------------------------------------------------------------------------------------
-
-# A float32 m 2^e with a 24-bit m is an integer in units of 2^LOWEST, of which digits of 32 bits are added up in 64 bits.
-# Integers have the same sum in any order of threads. A pixel takes 2^31 splats.
-BITS = 32
-DIGITS, LOWEST = 5, -87  # of radiance from 2^-64 to 2^64
-SQUARES_DIGITS, SQUARES_LOWEST = 8, -135
-
-
-class Splats:
-    """Exact sums of what reaches each pixel, in each channel, under the film's reconstruction filter."""
-
-    def __init__(self, v: Variant, sensor: Sensor, channels: int, digits: int = DIGITS, lowest: int = LOWEST) -> None:
-        """`v`: the variant's module."""
-        self.v, self.vectorised, self.channels = v, dr.is_jit_v(v.Float), channels
-        self.per_sum, self.lowest = digits, lowest
-        film = sensor.film()
-        self.width, self.height = (int(n) for n in film.crop_size())
-        self.rfilter = None if film.rfilter().is_box_filter() else film.rfilter()
-        self.reach = math.ceil(self.rfilter.radius() - 0.5) if self.rfilter else 0
-        self.count = self.width * self.height * channels
-        if self.vectorised:
-            self.wide = dr.uint64_array_t(v.Float)
-            self.digits = dr.opaque(self.wide, 0, self.count * digits)
-            self.beyond = dr.opaque(v.UInt32, 0, self.count)  # splats that are too large, or not finite
-        else:
-            self.sums = [0.0] * self.count
-
-    def add(self, place: Point2, values: list[Number], active: Mask) -> None:
-        """`place`: in pixels, from the corner of the film's crop window."""
-        x, y = (self.v.Int32(dr.floor(place[i])) for i in range(2))
-        for j in range(-self.reach, self.reach + 1):
-            for i in range(-self.reach, self.reach + 1):
-                weight, inside = 1.0, active
-                if self.rfilter:
-                    weight = self._weight(x + i + 0.5 - place.x) * self._weight(y + j + 0.5 - place.y)
-                    inside = active & (x + i >= 0) & (x + i < self.width) & (y + j >= 0) & (y + j < self.height)
-                index = ((y + j) * self.width + x + i) * self.channels
-                for channel, value in enumerate(values):
-                    self._add(index + channel, value * weight, inside)
-
-    def _weight(self, apart: Number) -> Number:
-        near = dr.abs(apart) <= self.rfilter.radius()
-        return dr.select(near, self.rfilter.eval(apart), 0)
-
-    def _add(self, index: Count, value: Number, active: Mask) -> None:
-        v = self.v
-        if not self.vectorised:
-            if active:
-                self.sums[int(index)] += value
-            return
-        index, bits = v.UInt32(dr.select(active, index, 0)), dr.reinterpret_array(v.UInt32, v.Float32(value))
-        shift = v.Int32((bits >> 23) & 255) - (150 + self.lowest)
-        large = active & (shift >= BITS * (self.per_sum - 1))
-        kept = active & (shift >= 0) & (large ^ True)
-        dr.scatter_add(self.beyond, v.UInt32(1), index, large)
-        shift = v.UInt32(dr.select(kept, shift, 0))
-        whole = self.wide((bits & 0x7FFFFF) | 0x800000) << self.wide(shift % BITS)
-        first = index * self.per_sum + shift // BITS
-        for more, digit in enumerate((whole & 0xFFFFFFFF, whole >> BITS)):
-            dr.scatter_add(self.digits, dr.select(bits >> 31 != 0, self.wide(0) - digit, digit), first + more, kept)
-
-    def image(self) -> Any:
-        """The sums, H × W × channels, in float64; NaN where a splat was too large or not finite."""
-        import numpy as np
-
-        shape = self.height, self.width, self.channels
-        if not self.vectorised:
-            return np.array(self.sums).reshape(shape)
-        digits = np.array(self.digits).view(np.int64).reshape(-1, self.per_sum)
-        sums = np.zeros(self.count)
-        for i in reversed(range(self.per_sum)):
-            sums += digits[:, i] * 2.0 ** (BITS * i + self.lowest)
-        return np.where(np.array(self.beyond) > 0, np.nan, sums).reshape(shape)
-
-
-def film_colours(v: Variant, spectrum: Spectrum, wavelengths: Number, channels: tuple[str, ...]) -> list[Number]:
-    """What a film with these channels makes of a sample's spectrum: R, G, B, or X, Y, Z, or Y."""
-    spectrum = v.unpolarized_spectrum(spectrum)
-    if v.is_spectral:
-        colour = v.spectrum_to_srgb(spectrum, wavelengths)
-    else:
-        colour = v.Color3f(spectrum.x) if v.is_monochromatic else v.Color3f(spectrum)
-    if channels[0] == "X":
-        colour = v.srgb_to_xyz(colour)
-    return list(colour) if channels[0] in ("R", "X") else [v.luminance(colour)]
-
-
 def lamp_image(tracer: LampTracer, seed: int, paths: int, channels: tuple[str, ...], *, squares: bool = False) -> Any:
     """The lamps' part of an image, of so many light paths: H × W × colours, and the variance of it.
 
-    Both in float64, for the filter as it is, whose integral may differ from 1. The variance is None without `squares`.
+    Both in float64. The variance is None without `squares`.
     """
     v, camera = tracer.v, tracer.camera
     pixels = camera.width * camera.height
@@ -604,7 +537,9 @@ def lamp_image(tracer: LampTracer, seed: int, paths: int, channels: tuple[str, .
         numbers = IndependentNumbers(v, seed)
         for _ in range(paths):
             tracer.trace(numbers, splat)
-    mean = sums.image() * (pixels / paths)
+    expected = expected_weights(camera.sensor.film())
+    area = 1 if expected is None else expected
+    mean = sums.image() * (pixels / paths) / area
     if of_squares is None:
         return mean, None
-    return mean, (of_squares.image() * (pixels**2 / paths) - mean**2).clip(0) / paths
+    return mean, (of_squares.image() * (pixels**2 / paths) / area**2 - mean**2).clip(0) / paths

@@ -339,7 +339,9 @@ class PathLoop:
             s.prev_bsdf_delta = dr.select(hit, mi.has_flag(bsdf_sample.sampled_type, LOBES.Delta), s.prev_bsdf_delta)
         if features.caustics_apart:
             first = s.depth == 1
-            s.surface_first = dr.select(first, mi.has_flag(bsdf_sample.sampled_type, LOBES.Delta) ^ True, s.surface_first)
+            s.surface_first = dr.select(
+                first, mi.has_flag(bsdf_sample.sampled_type, LOBES.Delta) ^ True, s.surface_first
+            )
 
         # ---------------------- Stopping criterion ----------------------
         throughput_max = dr.max(v.unpolarized_spectrum(s.throughput))

@@ -161,16 +161,17 @@ def integrator_class(v: Variant) -> type:
 
         def add_caustics(self, scene: Scene, sensor: Sensor, seed: Any, spp: int, develop: bool) -> Any:
             """Add the lamps' part to the film, which holds path tracing's."""
-            import numpy as np
-
             film, sampler = sensor.film(), sensor.sampler().clone()
             if spp:
                 sampler.set_sample_count(spp)
-            spp, block = int(sampler.sample_count()), film.create_block()
-            splats, _ = self.caustic_image(scene, sensor, int(dr.slice(seed)), spp, ("R", "G", "B"))
-            values = np.zeros(block.tensor().shape, np.float32)
-            values[..., :3] = splats * spp
-            block.tensor()[:] = type(block.tensor())(values)
+            found = self.caustic_image(scene, sensor, int(dr.slice(seed)), int(sampler.sample_count()), ("R", "G", "B"))
+            # Colours on a film are sums; those of the samples' weights, by which it divides them, are its last channel
+            # before others.
+            block, sums = film.create_block(), film.develop(True)
+            weight = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
+            values = block.tensor().numpy()
+            values[..., :3] = found[0] * sums.numpy()[..., weight : weight + 1]
+            block.tensor()[:] = type(sums)(values)
             film.put_block(block)
             return film.develop() if develop else v.TensorXf()
 

@@ -36,7 +36,11 @@ class IndependentNumbers:
 
     def next_2d(self, sampler: Sampler, key: Count) -> Point2:
         """A point in [0, 1)²."""
-        return self.v.Point2f(self.generator.next_float32(), self.generator.next_float32())
+        return self.v.Point2f(*self.independent(key, 2))
+
+    def independent(self, key: Count, count: int) -> list[Number]:
+        """`count` numbers in [0, 1)."""
+        return [self.generator.next_float32() for _ in range(count)]
 
 
 def seeds_of(v: Variant, sampler: Sampler) -> Count:
@@ -56,7 +60,7 @@ class KeyedMultijitter:
     """
 
     def __init__(self, v: Variant, seed: Count, lanes: int, count: int) -> None:
-        """`v`: the variant's module. `seed`: one for all, or one a lane. `count`: samples of a pixel in this wavefront."""
+        """`v`: the variant's module. `seed`: one for all, or one a lane. `count`: samples of a pixel in the wavefront."""
         self.v = v
         # A symbolic loop cannot read another lane, so there each lane is a pixel of its own.
         self.count = count if lanes % count == 0 and not dr.flag(dr.JitFlag.SymbolicScope) else 1
