@@ -60,7 +60,7 @@ class KeyedMultijitter:
     """
 
     def __init__(self, v: Variant, seed: Count, lanes: int, count: int) -> None:
-        """`v`: the variant's module. `seed`: one for all, or one a lane. `count`: samples of a pixel in the wavefront."""
+        """`v`: the variant's module. `seed`: one for all, or one a lane. `count`: samples of a pixel, side by side."""
         self.v = v
         # A symbolic loop cannot read another lane, so there each lane is a pixel of its own.
         self.count = count if lanes % count == 0 and not dr.flag(dr.JitFlag.SymbolicScope) else 1

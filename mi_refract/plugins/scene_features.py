@@ -52,7 +52,6 @@ class SceneFeatures:
     """Facts about a scene. `unknown`: the plugins that are not known, and so count as needing everything."""
 
     smooth: bool  # some BSDF has a lobe that is not a delta: then sampling emitters is worth while
-    delta: bool  # some BSDF has a lobe that is one
     delta_perturbed: str  # one that has it, and may have a shading normal of its own; "" where none is
     sampleable: bool  # some emitter can be sampled
     lamps: bool  # some emitter other than the environment can be
@@ -115,7 +114,6 @@ def inspect(scene: Scene) -> SceneFeatures:
     shape_media = any(shape.interior_medium() or shape.exterior_medium() for shape in shapes)
     return SceneFeatures(
         smooth=everything or bool(flags & +lobes.Smooth),
-        delta=everything or bool(flags & +lobes.Delta),
         delta_perturbed=next((n for n in map(bsdf_name, filter(_has_delta, bsdfs)) if n not in KNOWN - PERTURBING), ""),
         sampleable=bool(emitters),  # Mitsuba refuses a scene all of whose emitters have the weight 0
         lamps=any(not emitter.is_environment() and emitter.sampling_weight() > 0 for emitter in emitters),
