@@ -19,6 +19,9 @@ and no sample into more than 4096 paths. With `deterministic`, which is for scen
 alone, both lobes are followed up to 64 boundaries deep, and the default of `split_weight` is 0.001; the channel
 `truncated` holds what was dropped: times the largest radiance it bounds the error.
 
+Light of lamps of zero size that passes a delta lobe before it reaches another lobe is missing, as in `path`: a warning
+says so once a scene (`SceneFeatures.missing`).
+
 Derivatives are attached: rays move with the index. Edges that move across a pixel, or in the view of a surface that is
 not smooth, are not in them. A render that is differentiated does not split.
 """
@@ -209,7 +212,9 @@ def integrator_class(v: Variant) -> type:
 
         def scene_features(self, scene: Scene) -> SceneFeatures:
             """Of the scene as it is now: an edit of the scene can change them."""
-            self.needs = needs = inspect(scene)
+            before, self.needs = self.needs, (needs := inspect(scene))
+            for path_class, text in needs.missing(max_depth=self.max_depth).items() if needs != before else ():
+                mi.Log(mi.LogLevel.Warn, f"{INTEGRATOR}: missing {path_class}: {text}")  # type: ignore[operator]
             if needs.textured:
                 check_attributes(scene)
             if needs.absorbing or needs.media:
