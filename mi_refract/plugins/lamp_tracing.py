@@ -438,7 +438,7 @@ class LampTracer:
         return dr.select(smooth, value, corrected)
 
     def _radiance(self, si: Interaction, bsdf: Any, wo: Vector3, active: Mask) -> Spectrum:
-        """The BSDF times the cosine of wi for light that comes along −wi and leaves along wo, as path tracing has it."""
+        """The BSDF times the cosine of wi, for light along −wi that leaves along wo, as path tracing evaluates it."""
         seen = self.v.SurfaceInteraction3f(si)
         seen.wi = wo
         value = bsdf.eval(self.loop.context, seen, si.wi, active)

@@ -21,12 +21,12 @@ and no sample into more than 4096 paths. With `deterministic`, which is for scen
 alone, both lobes are followed up to 64 boundaries deep, and the default of `split_weight` is 0.001; the channel
 `truncated` holds what was dropped: times the largest radiance it bounds the error.
 
-`caustics` = `path` finds a lamp through glass only where a path hits it by chance: the light of a point, spot or
-directional lamp is missing, that of a small lamp noisy. With `lamp` such light is traced from the lamps, onto surfaces
-that the camera sees directly (`lamp_tracing` says which paths), `light_paths` for each
-sample. It is for area, point, spot and
-directional lamps, perspective, thinlens and orthographic cameras, and not for media of Mitsuba's, derivatives, frozen
-functions or integrators that call this one: there it is an error, and `auto` means `path`.
+With `caustics` = `path`, light that passes glass or a mirror before it reaches another surface is found by chance, or not
+at all where the lamp is a point, a spot or directional. `lamp` traces it from the lamps to all surfaces that the camera
+sees directly, along `light_paths` paths for each sample of the camera (`lamp_tracing`). It takes area, point, spot and
+directional lamps, and perspective, thin-lens and orthographic cameras. In scenes with media of Mitsuba's, in frozen
+functions, for derivatives and within another integrator it is an error, and `auto` means `path`. What is missing then is
+named in a warning, once a scene (`SceneFeatures.missing`).
 
 Derivatives are attached: rays move with the index. Edges that move across a pixel, or in the view of a surface that is
 not smooth, are not in them. A render that is differentiated does not split.
@@ -124,6 +124,7 @@ def integrator_class(v: Variant) -> type:
             self.needs: SceneFeatures | None = None  # of the scene rendered last
             self.rendering = False  # between `begin_render` and `end_render`
             self.near: Any = None  # `to_camera` of the sensor of this render
+            self.apart = False  # lamps are traced in the scene rendered last
             self.unconnected = ""  # why that sensor's lamps cannot be traced
             self.loops: list[PathLoop] = []  # of this render: one a pass; in scalar variants one in all
 
@@ -210,7 +211,7 @@ def integrator_class(v: Variant) -> type:
             if not vectorised and (loop := next((loop for loop in self.loops if loop.scene is scene), None)):
                 return loop
             needs = self.scene_features(scene)
-            features = self.path_features(needs, scene)
+            features = self.path_features(needs)
             count = min(self.samples_per_pass, sampler.sample_count()) if vectorised else 1
             numbers: Any = SceneSampler()
             if vectorised and features.split_depth:
@@ -240,10 +241,19 @@ def integrator_class(v: Variant) -> type:
                     way = (place @ ray.o).z / (place @ ray.d).z
             return sigma, way
 
-        def caustics_apart(self, needs: SceneFeatures, scene: Scene, symbolic: bool) -> bool:
-            """Whether lamps are traced. ValueError where `caustics` = `lamp` and they cannot be."""
-            if self.caustics == "path" or not (needs.lamps and needs.smooth and needs.delta):
+        def caustics_of(self, scene: Scene, sensor: Sensor) -> str:
+            """What `caustics` means in a render: "path" or "lamp". ValueError where it cannot be."""
+            self.begin_render(sensor)
+            try:
+                return "lamp" if self.traces_lamps(scene, inspect(scene)) else "path"
+            finally:
+                self.rendering = False
+
+        def traces_lamps(self, scene: Scene, needs: SceneFeatures) -> bool:
+            """Whether lamps are traced in this render. ValueError where `caustics` = `lamp` and they cannot be."""
+            if self.caustics == "path" or not (needs.lamps and needs.smooth and (needs.delta or needs.null)):
                 return False
+            symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
             reasons = {
                 "another integrator calls it": not self.rendering,
                 "the render is differentiated": not symbolic,
@@ -258,7 +268,7 @@ def integrator_class(v: Variant) -> type:
                 raise ValueError(f"{INTEGRATOR}: caustics = lamp: {reason}; expected caustics = path")
             return not reason
 
-        def path_features(self, needs: SceneFeatures, scene: Scene) -> PathFeatures:
+        def path_features(self, needs: SceneFeatures) -> PathFeatures:
             """The features that are traced for a scene. ValueError where `deterministic` is set and impossible."""
             # Local memory has no derivatives, and the evaluated loops that derivatives need have no local memory.
             symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
@@ -289,13 +299,18 @@ def integrator_class(v: Variant) -> type:
                 dispersion=needs.dispersive,
                 absorption=needs.absorbing or needs.media or self.camera is not None,
                 null=needs.null,
-                caustics_apart=self.caustics_apart(needs, scene, symbolic),
+                caustics_apart=self.apart,
                 perturbed=needs.perturbed,
             )
 
         def scene_features(self, scene: Scene) -> SceneFeatures:
             """Of the scene as it is now: an edit of the scene can change them."""
-            self.needs = needs = inspect(scene)
+            before, self.needs = self.needs, (needs := inspect(scene))
+            self.apart = self.traces_lamps(scene, needs)
+            for path_class, text in (
+                needs.missing("lamp" if self.apart else "path", self.max_depth).items() if needs != before else ()
+            ):
+                mi.Log(mi.LogLevel.Warn, f"{INTEGRATOR}: missing {path_class}: {text}")  # type: ignore[operator]
             if needs.textured:
                 check_attributes(scene)
             if needs.absorbing or needs.media:
