@@ -120,6 +120,8 @@ def render(
     spinner = console.status(Text(printable(f"{scene.name}, {chosen}"))) if console.is_terminal else None
     with spinner or contextlib.nullcontext():
         rendering = resume(job, output, limits, restart=restart)
+    if rendering.missing:
+        print(printable(f"mi-refract: {scene}: missing {rendering.missing}"), file=sys.stderr)
     if rendering.progress.passes:
         state = "complete with" if rendering.end() else "resuming from"
         print(printable(f"{output}: {state} {rendering.progress.done} spp"), file=sys.stderr)

@@ -1,8 +1,9 @@
 """Mitsuba's plugins: the BSDF `refract` and the integrator `refract_path`.
 
 In: a Mitsuba variant's module (`mitsuba.llvm_ad_rgb`, say) for `register`, a loaded scene for `inspect`. Out: plugins
-known to that variant by the names `PLUGIN`, `PLUGIN_<formula>` and `INTEGRATOR`; what a scene needs of an integrator.
-`import mi_refract` registers them in every variant. Importing this room imports Mitsuba.
+known to that variant by the names `PLUGIN`, `PLUGIN_<formula>` and `INTEGRATOR`; what a scene needs of an integrator,
+and which light its own does not find. `import mi_refract` registers the plugins in every variant. Importing this room
+imports Mitsuba.
 """
 
 from mi_refract.numerics import Variant
@@ -25,7 +26,7 @@ import mitsuba  # noqa: E402, F401
 from .index_parameter import PLUGIN, read_ior, read_medium  # noqa: E402
 from .medium_tracking import check_integrator  # noqa: E402
 from .refract_path import INTEGRATOR  # noqa: E402
-from .scene_features import SceneFeatures, inspect  # noqa: E402
+from .scene_features import SceneFeatures, inspect, missing_light  # noqa: E402
 
 __all__ = [
     "INTEGRATOR",
@@ -33,6 +34,7 @@ __all__ = [
     "SceneFeatures",
     "check_integrator",
     "inspect",
+    "missing_light",
     "read_ior",
     "read_medium",
     "register",

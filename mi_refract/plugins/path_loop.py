@@ -70,6 +70,8 @@ class PathFeatures:
     dispersion: bool  # some boundary refracts by wavelength
     absorption: bool  # some medium absorbs
     null: bool  # a BSDF may have a null lobe
+    caustics_apart: bool = False  # `lamp_tracing` adds its paths, which are left out here
+    perturbed: bool = False  # a BSDF may have a shading normal of its own
 
     @property
     def roulette(self) -> bool:
@@ -99,6 +101,8 @@ class LoopState:
     prev_si: Interaction = None
     prev_bsdf_pdf: Number = None
     prev_bsdf_delta: Mask = None
+    # --- caustics apart
+    surface_first: Mask = None  # the lobe at the first vertex was no delta
     # --- splitting
     specular_so_far: Mask = None  # every lobe since the camera was a delta; after another the path is not split
     share: Number = None  # share of the pixel's light: product of the probabilities of the lobes that were split
@@ -204,7 +208,7 @@ class PathLoop:
 
         # ---------------------- Hide area emitters ----------------------
         if features.hide_emitters and features.area:
-            camera, ray = ray, self._past_emitters(ray, active)
+            camera, ray = ray, self.past_emitters(ray, active)
             skipped += dr.dot(ray.o - camera.o, ray.d)
 
         # --------------------- Configure loop state ----------------------
@@ -214,6 +218,8 @@ class PathLoop:
             s.escaped = v.Bool(False)
         if features.emitter_sampling:
             s.prev_si, s.prev_bsdf_pdf, s.prev_bsdf_delta = dr.zeros(v.Interaction3f), v.Float(1), v.Bool(True)
+        if features.caustics_apart:
+            s.surface_first = v.Bool(False)
         if features.split_depth:
             s.share, s.node, s.waiting, s.specular_so_far = v.Float(1), v.UInt32(1), v.UInt32(0), v.Bool(True)
             s.stack = dr.alloc_local(self.branch, features.split_depth) if self.vectorised else ScalarStack()
@@ -231,10 +237,10 @@ class PathLoop:
             si = dr.zeros(v.SurfaceInteraction3f)
             si.t, si.time, si.wavelengths, si.wi = dr.inf, s.ray.time, s.ray.wavelengths, -s.ray.d
             radiance = self._emitted(s, si, self.scene.environment(), s.escaped)
-            s.result += dr.select(s.escaped, self._times(s.throughput, radiance), 0)
+            s.result += dr.select(s.escaped, self.times(s.throughput, radiance), 0)
         return s
 
-    def _past_emitters(self, ray: Ray, active: Mask) -> Ray:
+    def past_emitters(self, ray: Ray, active: Mask) -> Ray:
         """The ray from behind the area lights that it meets first."""
 
         def step(ray: Ray, active: Mask) -> tuple[Ray, Mask]:
@@ -261,7 +267,7 @@ class PathLoop:
             si = scene.ray_intersect(s.ray, self.ray_flags, s.depth == 0)
         hit = si.is_valid()
         if features.absorption:
-            s.throughput = self._attenuated(s.throughput, s.sigma, si.t + s.skipped)
+            s.throughput = self.attenuated(s.throughput, s.sigma, si.t + s.skipped)
 
         # ---------------------- Direct emission ----------------------
         emitter: Emitter = None
@@ -273,7 +279,7 @@ class PathLoop:
         elif features.area and (self.vectorised or hit):
             emitter = si.shape.emitter()
         if emitter is not None:
-            s.result += self._times(s.throughput, self._emitted(s, si, emitter, met))
+            s.result += self.times(s.throughput, self._emitted(s, si, emitter, met))
 
         # Should we continue tracing to reach one more vertex?
         active_next = hit & (s.depth + 1 < features.max_depth)
@@ -304,8 +310,8 @@ class PathLoop:
                 bsdf_value = si.to_world_mueller(bsdf_value, -wo, si.wi)
             if features.absorption:
                 endless = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-                emitter_weight = self._attenuated(emitter_weight, s.sigma, dr.select(endless, dr.inf, ds.dist))
-            contribution = self._times(self._times(s.throughput, bsdf_value), emitter_weight)
+                emitter_weight = self.attenuated(emitter_weight, s.sigma, dr.select(endless, dr.inf, ds.dist))
+            contribution = self.times(self.times(s.throughput, bsdf_value), emitter_weight)
             contribution *= dr.select(ds.delta, 1, power_heuristic(ds.pdf, bsdf_pdf))
             s.result = dr.select(active_em, s.result + contribution, s.result)
 
@@ -331,6 +337,11 @@ class PathLoop:
             s.prev_si = dr.select(hit, v.Interaction3f(si), s.prev_si)
             s.prev_bsdf_pdf = dr.select(hit, bsdf_sample.pdf, s.prev_bsdf_pdf)
             s.prev_bsdf_delta = dr.select(hit, mi.has_flag(bsdf_sample.sampled_type, LOBES.Delta), s.prev_bsdf_delta)
+        if features.caustics_apart:
+            first = s.depth == 1
+            s.surface_first = dr.select(
+                first, mi.has_flag(bsdf_sample.sampled_type, LOBES.Delta) ^ True, s.surface_first
+            )
 
         # ---------------------- Stopping criterion ----------------------
         throughput_max = dr.max(v.unpolarized_spectrum(s.throughput))
@@ -361,7 +372,7 @@ class PathLoop:
         ray = si.spawn_ray(si.to_world(bs.wo))
         if dr.grad_enabled(weight, ray.d):
             weight, ray.d, bs.pdf = at_fixed_direction(v, self.context, si, bsdf, bs, weight, ray.d, active)
-        throughput, optional = self._times(s.throughput, weight), dict[str, Any]()
+        throughput, optional = self.times(s.throughput, weight), dict[str, Any]()
         if self.features.dispersion:
             # The first wavelength stands for all that end here; each is the first equally often.
             dispersed = (bs.sampled_type & DISPERSED) != 0
@@ -377,17 +388,20 @@ class PathLoop:
         radiance = emitter.eval(si, active)
         if not self.features.emitter_sampling:
             return radiance
+        if self.features.caustics_apart:
+            radiance = dr.select(si.is_valid() & s.surface_first & s.prev_bsdf_delta, 0, radiance)
         ds = self.v.DirectionSample3f(self.scene, si, s.prev_si)
         pdf = self.emitters.pdf(s.prev_si, ds, active & (s.prev_bsdf_delta ^ True))
         return radiance * dr.select(s.prev_bsdf_delta, 1, power_heuristic(s.prev_bsdf_pdf, pdf))
 
-    def _times(self, a: Spectrum, b: Spectrum) -> Spectrum:
+    def times(self, a: Spectrum, b: Spectrum) -> Spectrum:
+        """The product of two spectra, or of Mueller matrices."""
         return a @ b if self.v.is_polarized else a * b
 
-    def _attenuated(self, light: Spectrum, sigma: Spectrum, length: Number) -> Spectrum:
+    def attenuated(self, light: Spectrum, sigma: Spectrum, length: Number) -> Spectrum:
         """Light after a distance in an absorbing medium."""
         share = absorbed(sigma, length)
-        return self._times(light, self.v.mueller.absorber(share) if self.v.is_polarized else share)
+        return self.times(light, self.v.mueller.absorber(share) if self.v.is_polarized else share)
 
     # Splitting -----------------------------------------------------------------------------------------------------
 

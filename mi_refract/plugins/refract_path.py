@@ -9,6 +9,8 @@
 | `split_depth` | integer | both lobes are followed at so many boundaries, counted from the camera (0) |
 | `split_weight` | number | a lobe whose share of the light would be smaller is not followed (0.01) |
 | `deterministic` | boolean | no lobe is chosen by chance; lobes with a share below `split_weight` are dropped (false) |
+| `caustics` | string | light through glass and over mirrors onto other surfaces: see below (`path`) |
+| `light_paths` | number | light paths for each sample of the camera, where lamps are traced (0.25) |
 | `camera_absorption` | number, spectrum | σ of the medium at the camera (0), as `int_absorption` of `refract` |
 | `camera_absorption_unit` | number | as `int_absorption_unit` of `refract` |
 | `camera_colour` | number, spectrum | as `int_colour` of `refract` |
@@ -18,6 +20,13 @@ No parameter is exposed to `mi.traverse`. Only `refract` and `dielectric` are sp
 and no sample into more than 4096 paths. With `deterministic`, which is for scenes of smooth dielectrics and conductors
 alone, both lobes are followed up to 64 boundaries deep, and the default of `split_weight` is 0.001; the channel
 `truncated` holds what was dropped: times the largest radiance it bounds the error.
+
+With `caustics` = `path`, light that passes glass or a mirror before it reaches another surface is found by chance, or not
+at all where the lamp is a point, a spot or directional. `lamp` traces it from the lamps to all surfaces that the camera
+sees directly, along `light_paths` paths for each sample of the camera (`lamp_tracing`). It takes area, point, spot and
+directional lamps, and perspective, thin-lens and orthographic cameras. In scenes with media of Mitsuba's, in frozen
+functions, for derivatives and within another integrator it is an error, and `auto` means `path`. What is missing then is
+named in a warning, once a scene (`SceneFeatures.missing`).
 
 Derivatives are attached: rays move with the index. Edges that move across a pixel, or in the view of a surface that is
 not smooth, are not in them. A render that is differentiated does not split.
@@ -33,11 +42,12 @@ import mitsuba as mi
 
 from mi_refract.numerics import Mask, MediumPlugin, Number, Properties, Ray, Sampler, Scene, Sensor, Spectrum, Variant
 
+from . import lamp_tracing
 from .absorption import read_absorption
 from .index_parameter import warn_once
 from .medium_tracking import MediumTracker, ShapeMedia, check_media, extinction
 from .path_loop import PathFeatures, PathLoop
-from .sampling import KeyedMultijitter, SceneSampler
+from .sampling import KeyedMultijitter, SceneSampler, seeds_of
 from .scene_features import SceneFeatures, check_attributes, inspect
 
 INTEGRATOR = "refract_path"
@@ -61,6 +71,16 @@ def read_flag(props: Properties, name: str) -> bool:
     if not isinstance(value, bool):
         raise ValueError(f"{INTEGRATOR}: {name} = {value!r}; expected true or false")
     return value
+
+
+def read_caustics(props: Properties) -> tuple[str, float]:
+    """`caustics` and `light_paths`. ValueError with what is expected."""
+    caustics, paths = props.get("caustics", "path"), props.get("light_paths", 0.25)
+    if caustics not in ("path", "lamp", "auto"):
+        raise ValueError(f"{INTEGRATOR}: caustics = {caustics!r}; expected path, lamp or auto")
+    if isinstance(paths, bool) or not isinstance(paths, (int, float)) or not 0 < paths <= 64:
+        raise ValueError(f"{INTEGRATOR}: light_paths = {paths!r}; expected a number above 0 and up to 64")
+    return str(caustics), float(paths)
 
 
 def read_split(props: Properties, deterministic: bool) -> tuple[int, float]:
@@ -97,18 +117,22 @@ def integrator_class(v: Variant) -> type:
             self.rr_depth = read_count(props, "rr_depth", 5, 1)
             self.deterministic = read_flag(props, "deterministic")
             self.split_depth, self.split_weight = read_split(props, self.deterministic)
+            self.caustics, self.light_paths = read_caustics(props)
             self.camera = read_absorption(INTEGRATOR, props, "camera")
             self.samples_per_pass = props.get("samples_per_pass", UNLIMITED)
             # Not the scene, which holds its integrator: a circle cannot be frozen.
             self.needs: SceneFeatures | None = None  # of the scene rendered last
             self.rendering = False  # between `begin_render` and `end_render`
             self.near: Any = None  # `to_camera` of the sensor of this render
+            self.apart = False  # lamps are traced in the scene rendered last
+            self.unconnected = ""  # why that sensor's lamps cannot be traced
             self.loops: list[PathLoop] = []  # of this render: one a pass; in scalar variants one in all
 
         def begin_render(self, sensor: Sensor) -> None:
             """To be called before `sample` where `render` is not; else each sample inspects the scene anew."""
             self.loops, self.rendering = [], True
             self.near = to_camera(sensor)
+            self.unconnected = lamp_tracing.refused_sensor(sensor)
 
         def end_render(self) -> None:
             """To be called after the samples were evaluated. ValueError where absorption was contradictory."""
@@ -116,14 +140,55 @@ def integrator_class(v: Variant) -> type:
             for loop in loops:
                 loop.refuse()
 
-        def render(self, scene: Scene, sensor: Sensor | int = 0, *more: Any, **named: Any) -> Any:
-            self.begin_render(scene.sensors()[sensor] if isinstance(sensor, int) else sensor)
+        def render(
+            self,
+            scene: Scene,
+            sensor: Sensor | int = 0,
+            seed: Any = 0,
+            spp: int = 0,
+            develop: bool = True,
+            evaluate: bool = True,
+        ) -> Any:
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            self.begin_render(sensor)
             try:
-                image = super().render(scene, sensor, *more, **named)
+                image = super().render(scene, sensor, seed, spp, develop, evaluate)
+                if any(loop.features.caustics_apart for loop in self.loops):
+                    image = self.add_caustics(scene, sensor, seed, spp, develop)
                 self.end_render()
             finally:
                 self.loops, self.rendering = [], False
             return image
+
+        def add_caustics(self, scene: Scene, sensor: Sensor, seed: Any, spp: int, develop: bool) -> Any:
+            """Add the lamps' part to the film, which holds path tracing's."""
+            film, sampler = sensor.film(), sensor.sampler().clone()
+            if spp:
+                sampler.set_sample_count(spp)
+            found = self.caustic_image(scene, sensor, int(dr.slice(seed)), int(sampler.sample_count()), ("R", "G", "B"))
+            # Colours on a film are sums; those of the samples' weights, by which it divides them, are its last channel
+            # before others.
+            block, sums = film.create_block(), film.develop(True)
+            weight = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
+            values = block.tensor().numpy()
+            values[..., :3] = found[0] * sums.numpy()[..., weight : weight + 1]
+            block.tensor()[:] = type(sums)(values)
+            film.put_block(block)
+            return film.develop() if develop else v.TensorXf()
+
+        def caustic_image(
+            self, scene: Scene, sensor: Sensor, seed: int, spp: int, channels: tuple[str, ...], *, squares: bool = False
+        ) -> Any:
+            """The lamps' part of the image of a render that has begun; None where path tracing has all of it.
+
+            `lamp_tracing.lamp_image` says what it is.
+            """
+            loop = next((loop for loop in self.loops if loop.features.caustics_apart), None)
+            if loop is None:
+                return None
+            tracer = lamp_tracing.LampTracer(loop, sensor, lambda ray: self.camera_medium(scene, ray, None))
+            paths = max(1, round(self.light_paths * spp * tracer.camera.width * tracer.camera.height))
+            return lamp_tracing.lamp_image(tracer, seed, paths, channels, squares=squares)
 
         def aov_names(self) -> list[str]:
             return ["truncated"] if self.deterministic else []
@@ -148,7 +213,9 @@ def integrator_class(v: Variant) -> type:
             needs = self.scene_features(scene)
             features = self.path_features(needs)
             count = min(self.samples_per_pass, sampler.sample_count()) if vectorised else 1
-            numbers = KeyedMultijitter(v, sampler, count) if vectorised and features.split_depth else SceneSampler()
+            numbers: Any = SceneSampler()
+            if vectorised and features.split_depth:
+                numbers = KeyedMultijitter(v, seeds_of(v, sampler), sampler.wavefront_size(), count)
             media = (ShapeMedia(v) if needs.shape_media else MediumTracker(v, scene)) if features.absorption else None
             loop = PathLoop(v, scene, features, numbers, media)
             if self.rendering:
@@ -173,6 +240,33 @@ def integrator_class(v: Variant) -> type:
                 if (place := self.near if self.rendering else to_camera(sensors[0])) is not None:
                     way = (place @ ray.o).z / (place @ ray.d).z
             return sigma, way
+
+        def caustics_of(self, scene: Scene, sensor: Sensor) -> str:
+            """What `caustics` means in a render: "path" or "lamp". ValueError where it cannot be."""
+            self.begin_render(sensor)
+            try:
+                return "lamp" if self.traces_lamps(scene, inspect(scene)) else "path"
+            finally:
+                self.rendering = False
+
+        def traces_lamps(self, scene: Scene, needs: SceneFeatures) -> bool:
+            """Whether lamps are traced in this render. ValueError where `caustics` = `lamp` and they cannot be."""
+            if self.caustics == "path" or not (needs.lamps and needs.smooth and (needs.delta or needs.null)):
+                return False
+            symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
+            reasons = {
+                "another integrator calls it": not self.rendering,
+                "the render is differentiated": not symbolic,
+                "a frozen function": dr.flag(dr.JitFlag.FreezingScope),
+                "the scene has media": needs.media,
+                f"a {needs.delta_perturbed} has delta lobes": bool(needs.delta_perturbed),
+                self.unconnected: bool(self.unconnected),
+                (lamps := lamp_tracing.refused_lamps(scene)): bool(lamps),
+            }
+            reason = next((text for text, found in reasons.items() if found), "")
+            if reason and self.caustics == "lamp":
+                raise ValueError(f"{INTEGRATOR}: caustics = lamp: {reason}; expected caustics = path")
+            return not reason
 
         def path_features(self, needs: SceneFeatures) -> PathFeatures:
             """The features that are traced for a scene. ValueError where `deterministic` is set and impossible."""
@@ -205,11 +299,18 @@ def integrator_class(v: Variant) -> type:
                 dispersion=needs.dispersive,
                 absorption=needs.absorbing or needs.media or self.camera is not None,
                 null=needs.null,
+                caustics_apart=self.apart,
+                perturbed=needs.perturbed,
             )
 
         def scene_features(self, scene: Scene) -> SceneFeatures:
             """Of the scene as it is now: an edit of the scene can change them."""
-            self.needs = needs = inspect(scene)
+            before, self.needs = self.needs, (needs := inspect(scene))
+            self.apart = self.traces_lamps(scene, needs)
+            for path_class, text in (
+                needs.missing("lamp" if self.apart else "path", self.max_depth).items() if needs != before else ()
+            ):
+                mi.Log(mi.LogLevel.Warn, f"{INTEGRATOR}: missing {path_class}: {text}")  # type: ignore[operator]
             if needs.textured:
                 check_attributes(scene)
             if needs.absorbing or needs.media:
@@ -225,7 +326,7 @@ def integrator_class(v: Variant) -> type:
 
         def to_string(self) -> str:
             depth = -1 if self.max_depth == UNLIMITED else self.max_depth
-            names = ("rr_depth", "hide_emitters", "split_depth", "split_weight", "deterministic")
+            names = ("rr_depth", "hide_emitters", "split_depth", "split_weight", "deterministic", "caustics")
             lines = [f"max_depth = {depth}", *(f"{name} = {getattr(self, name)}" for name in names)]
             return "RefractPath[\n" + "".join(f"  {x},\n" for x in [*lines, f"left out = {self.left_out()}"]) + "]"
 

@@ -8,6 +8,7 @@ for plugins on the lists below, which are known not to need it. Any other plugin
 from __future__ import annotations
 
 import functools
+import math
 import operator
 import re
 from collections.abc import Iterator
@@ -36,6 +37,7 @@ CONSTANT_TEXTURES = {
     "RegularSpectrum", "SRGBReflectanceSpectrum", "UniformSpectrum",
 }
 # fmt: on
+PERTURBING = {"BumpMap", "NormalMap"}  # their shading normal is not that of the interaction
 # One reflected and one refracted direction, each sampled by a side of one threshold of `sample1`: what can be split.
 BOUNDARIES = {"Refract", "SmoothDielectric"}
 # No choice is left to chance where the lobes of `BOUNDARIES` are both followed.
@@ -44,6 +46,12 @@ DETERMINISTIC = BOUNDARIES | {"SmoothConductor", "TwoSidedBRDF"}
 WITHOUT_TANGENT = DETERMINISTIC | {"BlendBSDF", "MaskBSDF", "Null", "ThinDielectric"}
 # Plugins that sample with `sample1` or with `sample2`, and never with both.
 EITHER = DETERMINISTIC | {"Null", "RoughConductor", "SmoothDiffuse", "ThinDielectric"}
+BEAM = "DirectionalArea"  # the emitter of zero size that no shadow ray finds: its `sample_direction` gives nothing
+# Integrators that find lamps of zero size by shadow rays only, as they call themselves → `volumes` of `missing`.
+SHADOW_RAYS = {
+    **dict.fromkeys(("PathIntegrator", "PathProjectiveIntegrator", "PRBIntegrator", "RefractPath"), False),
+    **dict.fromkeys(("PRBVolpathIntegrator", "VolumetricMisPathIntegrator", "VolumetricSimplePathIntegrator"), True),
+}
 
 
 @dataclass(frozen=True)
@@ -51,6 +59,7 @@ class SceneFeatures:
     """Facts about a scene. `unknown`: the plugins that are not known, and so count as needing everything."""
 
     smooth: bool  # some BSDF has a lobe that is not a delta: then sampling emitters is worth while
+    delta_perturbed: str  # one that has it, and may have a shading normal of its own; "" where none is
     sampleable: bool  # some emitter can be sampled
     lamps: bool  # some emitter other than the environment can be
     area: bool  # some shape emits
@@ -60,11 +69,14 @@ class SceneFeatures:
     only_glass: bool  # every BSDF has delta lobes only
     textured: bool  # a BSDF or a light may vary over its surface, or with its tangent
     null: bool  # some BSDF has a null lobe
+    perturbed: bool  # some BSDF may have a shading normal of its own
     dispersive: bool  # some BSDF refracts by wavelength
     absorbing: bool  # some BSDF has an absorbing medium on one side
     media: bool  # some shape, sensor or emitter has a medium of Mitsuba's
     shape_media: bool  # some shape has one
     refracting: bool  # some BSDF has a refracted direction
+    delta: bool  # some BSDF has a delta lobe other than a null lobe
+    zero_size: tuple[str, ...]  # the classes of the emitters whose light has one position, or one direction at each
     chance: str  # the first plugin that is not of `DETERMINISTIC`, and its shape; "" where there is none
     unknown: tuple[str, ...] = ()
 
@@ -87,6 +99,36 @@ class SceneFeatures:
         }
         return {feature: reason for feature, (left_out, reason) in reasons.items() if left_out}
 
+    def missing(self, caustics: str = "path", max_depth: int = -1, *, volumes: bool = False) -> dict[str, str]:
+        """The light of lamps of zero size that is not found: class of paths → what is black, and what mends it.
+
+        In Heckbert's notation: L is a lamp, S a delta or null lobe, D any other lobe, E the camera. A class is listed
+        where the scene has a lamp of zero size and the lobes, and `max_depth` allows its shortest path. Its geometry
+        may leave no such path. L S* E is not listed: a lamp of zero size is not visible itself.
+        Source: Heckbert 1990, "Adaptive radiosity textures for bidirectional ray tracing".
+
+        `caustics`: "path" where all paths begin at the camera, "lamp" where those of L S+ (D|S)* D E begin at the lamp.
+        `max_depth`: as of `path`. `volumes`: shadow rays go through null lobes and media scatter, as in `volpath`.
+        """
+        null, most = self.null and not volumes, math.inf if max_depth < 0 else max_depth
+        lobes = ", ".join([*["glass", "mirrors"] * self.delta, *["null"] * null])
+        shadowed, beam = (", ".join(x for x in self.zero_size if (x == BEAM) == only) for only in (False, True))
+        lamps, area = ", ".join(self.zero_size), "expected area lights in place of such lamps"
+        cast = f"that delta lobes ({lobes}) cast on other surfaces is black"
+        # Class, whether its lamps and lobes are there, edges of its shortest path, text.
+        classes = {
+            "path": (
+                ("L S+ D (S|D)* E", shadowed and lobes, 3, f"light of {shadowed} {cast}; {area}"),
+                ("L (S|D)* D (S|D)* E", beam, 2, f"all light of {beam} is black; expected a lamp of another type"),
+            ),
+            "lamp": (
+                ("L S+ D (S|D)* S E", lamps and lobes, 4, f"light of {lamps} {cast} where such lobes show it; {area}"),
+                ("L D (S|D)* E", beam, 2, f"direct light of {beam} is black; expected a lamp of another type"),
+            ),
+        }[caustics]
+        surface = self.smooth or (self.media and volumes)
+        return {name: text for name, there, edges, text in classes if there and surface and edges <= most}
+
 
 def inspect(scene: Scene) -> SceneFeatures:
     """What a Mitsuba scene needs as it is now; an edit of its parameters can change that."""
@@ -108,9 +150,11 @@ def inspect(scene: Scene) -> SceneFeatures:
     flags = functools.reduce(operator.or_, (bsdf.flags() for bsdf in bsdfs), 0)
     deltas = {bsdf_name(bsdf) for bsdf in bsdfs if not bsdf.flags() & +lobes.Smooth}
     lamps = [shape.emitter() for shape in shapes if shape.is_emitter()]
+    points = [emitter for emitter in emitters if emitter.flags() & +mi.EmitterFlags.Delta]
     shape_media = any(shape.interior_medium() or shape.exterior_medium() for shape in shapes)
     return SceneFeatures(
         smooth=everything or bool(flags & +lobes.Smooth),
+        delta_perturbed=next((n for n in map(bsdf_name, filter(_has_delta, bsdfs)) if n not in KNOWN - PERTURBING), ""),
         sampleable=bool(emitters),  # Mitsuba refuses a scene all of whose emitters have the weight 0
         lamps=any(not emitter.is_environment() and emitter.sampling_weight() > 0 for emitter in emitters),
         area=bool(opaque or lamps),
@@ -128,14 +172,35 @@ def inspect(scene: Scene) -> SceneFeatures:
         or not deltas <= WITHOUT_TANGENT
         or not {lamp.class_name() for lamp in lamps} <= PLAIN_LAMPS,
         null=everything or bool(flags & +lobes.Null),
+        perturbed=everything or bool(names & PERTURBING),
         dispersive=everything or any(getattr(bsdf, "dispersive", False) for bsdf in bsdfs),  # no plugin of Mitsuba's is
         absorbing=everything or any(getattr(bsdf, "absorbing", False) for bsdf in bsdfs),
         media=shape_media or any(end.get_medium() for end in (*emitters, *scene.sensors())),
         shape_media=shape_media,
         refracting=everything or bool(flags & +lobes.Transmission),
+        delta=everything or bool(flags & +(lobes.DeltaReflection | lobes.DeltaTransmission)),
+        zero_size=tuple(sorted({lamp.class_name() for lamp in points if lamp.sampling_weight() > 0})),
         chance=next(chance, ""),
         unknown=unknown,
     )
+
+
+def missing_light(scene: Scene) -> dict[str, str]:
+    """What the scene's integrator misses of it, as `SceneFeatures.missing`, and those that it calls.
+
+    Only where they are `path`, `refract_path`, `prb`, `prb_projective`, `volpath`, `volpathmis` or `prbvolpath`: of
+    others nothing is known.
+    """
+    features, integrators, missing = inspect(scene), [scene.integrator()], dict[str, str]()
+    while integrators:
+        integrator = integrators.pop()
+        integrators += [child for child in children(integrator) if hasattr(child, "aov_names")]
+        name, _, parameters = str(integrator).partition("[")
+        if name in SHADOW_RAYS and (depth := re.search(r"max_depth = (-?\d+)", parameters)):
+            own = integrator is scene.integrator() and hasattr(integrator, "caustics_of")
+            caustics = integrator.caustics_of(scene, scene.sensors()[0]) if own else "path"
+            missing |= features.missing(caustics, int(depth[1]), volumes=SHADOW_RAYS[name])
+    return missing
 
 
 def check_attributes(scene: Scene) -> None:
@@ -197,6 +262,10 @@ def nested(bsdf: BSDF) -> Iterator[BSDF]:
     for child in children(bsdf):
         if hasattr(child, "eval_null_transmission"):
             yield from nested(child)
+
+
+def _has_delta(bsdf: BSDF) -> bool:
+    return bool(bsdf.flags() & +mi.BSDFFlags.Delta)
 
 
 def _black(bsdf: BSDF) -> bool:

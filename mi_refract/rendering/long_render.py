@@ -27,6 +27,7 @@ from mi_refract.io.image_file import SUFFIXES, Metadata, installed_version, prov
 from mi_refract.io.safe_files import writable
 from mi_refract.io.text import printable
 from mi_refract.numerics import Scene
+from mi_refract.plugins import missing_light
 from mi_refract.plugins.scene_parser import ParsedScene
 
 from . import checkpoint, rendered_file
@@ -220,6 +221,7 @@ class LongRender:
             "mi_refract:scene": str(self.job.scene),
             "mi_refract:defines": json.dumps(dict(self.job.defines), sort_keys=True),
             "mi_refract:formulas": ", ".join(formulas_in(self.scene)) or "none",
+            "mi_refract:missing": self.missing or "none known",
         }
         metadata |= provenance() | self.renderer.filter_header
         header = rendered_file.header(progress, total, metadata, self.ended_by)
@@ -264,6 +266,11 @@ class LongRender:
         if plan.spp != self.plan.spp:
             self.plan = plan
             self.progress.rebase(plan.spp)
+
+    @property
+    def missing(self) -> str:
+        """The light that the scene's integrator cannot find, by class of paths: `missing_light` in one line, or ""."""
+        return "; ".join(f"{path_class}: {text}" for path_class, text in missing_light(self.scene).items())
 
     @property
     def has_all_samples(self) -> bool:

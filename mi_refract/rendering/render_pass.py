@@ -13,7 +13,7 @@ import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -21,16 +21,14 @@ import numpy as np
 
 from mi_refract.io.image_file import Metadata
 from mi_refract.numerics import Scene
+from mi_refract.plugins.film import STEP, expected_weights, film_colours, filter_weights
 
 from .pass_plan import FEW, scalar_seed_of, seed_of
 from .pass_sums import Doubles, PassSums
-from .sample_sums import Film, Filter, image_sums
-
-MitsubaFilm: TypeAlias = Any  # an `mi.Film`
+from .sample_sums import Film, image_sums
 
 # One thread would be the caller's own, which keeps denormals: the others take them for 0, and bits would differ.
 LEAST_THREADS = 2
-STEP = 1 / 256  # of a pixel, at which filters are integrated
 COLOURS = ("R", "G", "B", "X", "Y", "Z")
 
 
@@ -60,7 +58,7 @@ class PassRenderer:
         rfilter = self.scene.sensors()[0].film().rfilter()
         if rfilter.is_box_filter():
             return {"mi_refract:filter_radius": 0.5, "mi_refract:filter_area": 1.0}
-        weights = _weights(rfilter)
+        weights = filter_weights(rfilter)
         area = float((np.square(weights.sum()) / np.square(weights).sum() * STEP) ** 2)  # w is a product of two
         return {"mi_refract:filter_radius": float(rfilter.radius()), "mi_refract:filter_area": area}
 
@@ -88,8 +86,10 @@ class PassRenderer:
                     samples = _samples(self.scene, self.channels, spp, seed_of(self.seed, number))
                     # More passes say the variance better.
                     total, weights, within = image_sums(*samples, pixels, squares=number < FEW - 1)
-                if hasattr(self.scene.integrator(), "end_render"):
-                    self.scene.integrator().end_render()
+                integrator = self.scene.integrator()
+                if hasattr(integrator, "end_render"):
+                    self._add_caustics(total, weights, within, number, spp)
+                    integrator.end_render()
             elif dr.is_jit_v(mi.Float):
                 total, weights = _rendered(self.scene, spp, seed_of(self.seed, number))
             else:
@@ -102,6 +102,21 @@ class PassRenderer:
         within = None if within is None else within / np.square(self.expected)
         return PassSums(spp, 1, total, np.zeros_like(total), within, weights, colours=self.colours)
 
+    def _add_caustics(
+        self, total: Doubles, weights: Doubles | None, within: Doubles | None, number: int, spp: int
+    ) -> None:
+        """Add the lamps' part of the image to the sums of a pass, where the integrator keeps it apart."""
+        sensor, seed = self.scene.sensors()[0], seed_of(self.seed, number)
+        squares, caustics = within is not None, self.scene.integrator().caustic_image
+        if (found := caustics(self.scene, sensor, seed, spp, self.channels, squares=squares)) is None:
+            return
+        image, variance = found
+        colours, weight = image.shape[-1], spp if weights is None else weights
+        total[..., :colours] += image * weight
+        if within is not None:  # the variance of the mean is within / spp (spp − 1), and w in units of `expected`
+            share = 1 if self.expected is None else np.square(self.expected)
+            within[..., :colours] += spp * (spp - 1) * variance * share
+
 
 def pass_renderer(scene: Scene, seed: int) -> PassRenderer:
     """How to render the passes of a loaded scene, with its first sensor."""
@@ -112,33 +127,7 @@ def pass_renderer(scene: Scene, seed: int) -> PassRenderer:
     plain = type(integrator).render is mi.SamplingIntegrator.render or hasattr(integrator, "begin_render")
     special = film.sample_border() or mi.has_flag(film.flags(), mi.FilmFlags.Special)
     keeps = dr.is_jit_v(mi.Float) and isinstance(integrator, mi.SamplingIntegrator) and plain and not special
-    return PassRenderer(scene, seed, channels, keeps, expected=_expected_weights(film))
-
-
-def _expected_weights(film: MitsubaFilm) -> Doubles | None:
-    """∫ w over all places of samples, for each pixel, H × W × 1; None for a box. Filters are products of two in 1D."""
-    rfilter = film.rfilter()
-    if rfilter.is_box_filter():
-        return None
-    weights = _weights(rfilter)
-    half = len(weights) // 2
-    ends, sums = np.arange(-half, half + 1) * STEP, np.cumsum([0, *weights]) * STEP
-
-    def along(pixels: int) -> Doubles:
-        middle = np.arange(pixels) + 0.5
-        border = half if film.sample_border() else 0
-        return np.asarray(np.interp(pixels + border - middle, ends, sums) - np.interp(-border - middle, ends, sums))
-
-    width, height = (int(n) for n in film.crop_size())
-    return np.asarray(along(height)[:, None, None] * along(width)[:, None])
-
-
-def _weights(rfilter: Filter) -> Doubles:
-    """The weights in one dimension, at STEPs from −radius to radius."""
-    half = math.ceil(rfilter.radius() / STEP)
-    places = (np.arange(-half, half) + 0.5) * STEP
-    found = rfilter.eval(mi.Float(places)) if dr.is_jit_v(mi.Float) else [rfilter.eval(place) for place in places]
-    return np.where(np.abs(places) <= rfilter.radius(), np.array(found, np.float64), 0)
+    return PassRenderer(scene, seed, channels, keeps, expected=expected_weights(film))
 
 
 @contextlib.contextmanager
@@ -199,15 +188,7 @@ def _samples(scene: Scene, channels: tuple[str, ...], spp: int, seed: int) -> tu
     ray, weight, place = ADIntegrator.sample_rays(None, scene, sensor, sampler)
     ray.scale_differential(1 / math.sqrt(spp))
     radiance, valid, others = integrator.sample(scene, sampler, ray, sensor.get_medium(), mi.Bool(True))
-    # What the film makes of a sample's spectrum: R, G, B, or X, Y, Z, or Y.
-    spectrum = mi.unpolarized_spectrum(weight * radiance)
-    if mi.is_spectral:
-        colour = mi.spectrum_to_srgb(spectrum, ray.wavelengths)
-    else:
-        colour = mi.Color3f(spectrum.x) if mi.is_monochromatic else mi.Color3f(spectrum)
-    if channels[0] == "X":
-        colour = mi.srgb_to_xyz(colour)
-    values = list(colour) if channels[0] in ("R", "X") else [mi.luminance(colour)]
+    values = film_colours(mi, weight * radiance, ray.wavelengths, channels)
     if "A" in channels[: len(values) + 1]:
         values.append(dr.select(valid, mi.Float(1), mi.Float(0)))
     values += list(others)

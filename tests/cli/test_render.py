@@ -63,6 +63,7 @@ def test_the_image_is_mitsubas_and_the_header_says_how_it_was_made(render, scene
         "scene": str(scene),
         "defines": '{"bsdf": "refract"}',
         "formulas": "promoted (auto)",
+        "missing": "none known",
         "version:mi_refract": mi_refract.__version__,
         "version:mitsuba": mi.__version__,
         "version:drjit": installed_version("drjit"),
@@ -78,6 +79,21 @@ def test_the_image_is_mitsubas_and_the_header_says_how_it_was_made(render, scene
     assert metadata["mi_refract:formulas"] == "none"
     np.testing.assert_array_equal(pixels[..., :3], passes_by_mitsuba(scene, 2, bsdf="diffuse")[0])
     assert not np.array_equal(pixels[..., :3], passes_by_mitsuba(scene, 2)[0])
+
+
+@pytest.mark.parametrize("integrator", ["path", "refract_path", "ptracer"])
+def test_light_that_is_missing_is_named_on_stderr_and_in_the_header(render, scene, integrator):
+    lamp = '<emitter type="point"><point name="position" value="0, 4, 0"/></emitter>'
+    text = SCENE.replace('<emitter type="constant"/>', lamp).replace('"path"', f'"{integrator}"')
+    scene.write_text(text)
+    code, _, err = render("--spp", 2)
+    missing = read_exr(scene.with_name("out.exr"))[1]["mi_refract:missing"]
+    if integrator == "ptracer":
+        assert (code, err, missing) == (0, "", "none known")
+    else:
+        assert (code, err) == (0, f"mi-refract: {scene}: missing {missing}\n")
+        cast = "light of PointLight that delta lobes (glass, mirrors) cast on other surfaces is black"
+        assert missing.startswith(f"L S+ D (S|D)* E: {cast}; expected ")
 
 
 @pytest.mark.parametrize("usable", [True, False])

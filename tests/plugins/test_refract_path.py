@@ -138,7 +138,7 @@ def multijitter(pixels):
     """12 samples a pixel; numbers of one dimension and of two by key, pixel by pixel."""
     sampler = mi.load_dict({"type": "independent", "sample_count": 12})
     sampler.seed(3, 12 * pixels)
-    numbers = sampling.KeyedMultijitter(mi, sampler, 12)
+    numbers = sampling.KeyedMultijitter(mi, sampling.seeds_of(mi, sampler), 12 * pixels, 12)
 
     def one(key):
         return np.array(numbers.next_1d(sampler, mi.UInt32(key))).reshape(pixels, 12)

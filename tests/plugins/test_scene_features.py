@@ -5,10 +5,11 @@ import dataclasses
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.glass_scenes import BLACK, sampled
+from support.glass_scenes import BLACK, PLACE, camera, sampled
 from support.variants import switch
 
-from mi_refract.plugins.scene_features import EITHER, inspect
+from mi_refract.plugins import inspect, missing_light
+from mi_refract.plugins.scene_features import EITHER
 from validation.run.context import SCENES
 
 GLASS_ONLY = {"balls", "fibre", "furnace", "glasses64", "lightpipe", "mirage", "rainbow_drop", "slab"}
@@ -25,7 +26,7 @@ def facts(**parts):
     """The names of what is true of a scene of a glass ball and `parts`."""
     ball = {"type": "sphere", "bsdf": {"type": "refract"}}
     every = dataclasses.asdict(needs(**{"sensor": {"type": "perspective"}, "ball": ball} | parts))
-    return {name for name, value in every.items() if value is True} - {"refracting", "shape_media"}
+    return {name for name, value in every.items() if value is True} - {"refracting", "shape_media", "delta"}
 
 
 def sphere(bsdf, **parts):
@@ -130,6 +131,7 @@ def test_what_is_not_known_needs_everything(scalar_variant):
     assert facts(part=part) == EVERYTHING
     (name,) = needs(part=part).unknown
     assert name.endswith("Refract")
+    assert {*needs(part=part, lamp=POINT).missing()} == {CAST}
     group = {"type": "shapegroup", "id": "group", "a": {"type": "sphere", "bsdf": BLACK}}
     instance = {"type": "instance", "group": {"type": "ref", "id": "group"}}
     assert facts(group=group, instance=instance) == EVERYTHING | {"area"}
@@ -170,3 +172,114 @@ def test_what_is_left_out_has_its_reason_and_an_edit_can_bring_it_back(scalar_va
     params["lamp.bsdf.reflectance.value"] = 0.1
     params.update()
     assert inspect(scene).smooth
+
+
+# What is missing ----------------------------------------------------------------------------------------------------
+
+DOWN = PLACE().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+POINT, SPOT = {"type": "point", "position": [0, 0, 4]}, {"type": "spot", "to_world": DOWN}
+SUNLIGHT = {"type": "directional", "direction": [0, 0, -1]}
+PROJECTOR = {"type": "projector", "to_world": DOWN, "irradiance": {"type": "rgb", "value": 1.0}}
+SQUARE = {"type": "rectangle", "to_world": DOWN}
+BEAM = SQUARE | {"emitter": {"type": "directionalarea"}}
+CAST, ALL_OF_BEAM = "L S+ D (S|D)* E", "L (S|D)* D (S|D)* E"
+
+
+def under_a_pane(lamp, bsdf, integrator="path", floor=None, more=None, **parameters):
+    """A floor, seen from below a pane; the lamp is above the pane."""
+    parts = {"floor": {"type": "rectangle", "bsdf": floor or {"type": "diffuse"}}, "lamp": lamp}
+    if bsdf:
+        parts["pane"] = {"type": "rectangle", "to_world": PLACE().translate([0, 0, 1]).scale(3), "bsdf": bsdf}
+    if more:
+        parts["more"] = more
+    eye = camera(8, 60) | {"to_world": PLACE().look_at([1.5, 0, 0.6], [0, 0, 0], [0, 0, 1])}
+    if called := parameters.pop("calls", None):
+        parameters = {"called": {"type": called} | parameters}
+    return mi.load_dict({"type": "scene", "eye": eye, "integrator": {"type": integrator} | parameters} | parts)
+
+
+CLEAR, HOLES = {"type": "null"}, {"type": "mask", "nested": {"type": "diffuse"}}
+MIRROR = {"type": "twosided", "nested": {"type": "conductor"}}
+GLASS = {"type": "dielectric"}
+CLOUDY = {"type": "sphere", "bsdf": GLASS, "interior": MEDIUM}
+
+
+@pytest.mark.parametrize(
+    ("lamp", "bsdf", "others", "missing"),
+    [
+        *((lamp, GLASS, {}, {CAST}) for lamp in (POINT, SPOT, SUNLIGHT, PROJECTOR)),
+        *((POINT, {"type": bsdf}, {}, {CAST}) for bsdf in ("refract", "thindielectric", "plastic", "retarder", "hair")),
+        *((POINT, bsdf, {}, {CAST}) for bsdf in (CLEAR, HOLES, MIRROR)),
+        *((BEAM, bsdf, {}, {ALL_OF_BEAM}) for bsdf in (None, GLASS)),
+        # Nothing is missing without such a lamp, without a delta lobe, without another one, and of shorter paths.
+        *((lamp, GLASS, {}, set()) for lamp in ({"type": "constant"}, SQUARE | {"emitter": {"type": "area"}})),
+        (POINT | {"sampling_weight": 0.0}, GLASS, {"more": {"type": "constant"}}, set()),
+        *((POINT, bsdf, {}, set()) for bsdf in (None, {"type": "roughdielectric"}, {"type": "principled"})),
+        *((lamp, GLASS, {"floor": BLACK}, set()) for lamp in (POINT, BEAM)),
+        *((POINT, GLASS, {"max_depth": depth}, missing) for depth, missing in ((2, set()), (3, {CAST}))),
+        *((BEAM, GLASS, {"max_depth": depth}, missing) for depth, missing in ((1, set()), (2, {ALL_OF_BEAM}))),
+        # Shadow rays of `volpath` go through null lobes, and its media scatter.
+        *((POINT, bsdf, {"integrator": "volpath"}, set()) for bsdf in (CLEAR, HOLES)),
+        *((POINT, {"type": bsdf}, {"integrator": "volpathmis"}, {CAST}) for bsdf in ("thindielectric", "dielectric")),
+        (POINT, GLASS, {"floor": BLACK, "more": CLOUDY, "integrator": "path"}, set()),
+        (POINT, GLASS, {"floor": BLACK, "more": CLOUDY, "integrator": "volpath"}, {CAST}),
+        # Only what is known is named.
+        *((POINT, GLASS, {"integrator": name}, set()) for name in ("ptracer", "direct", "depth")),
+        (POINT, GLASS, {"integrator": "refract_path"}, {CAST}),
+        *((POINT, GLASS, {"integrator": "moment", "calls": name}, {CAST}) for name in ("path", "refract_path")),
+        (POINT, GLASS, {"integrator": "moment", "calls": "path", "max_depth": 2}, set()),
+    ],
+)
+def test_what_an_integrator_misses_is_predicted(lamp, bsdf, others, missing, scalar_variant):
+    assert {*missing_light(under_a_pane(lamp, bsdf, **others))} == missing
+
+
+def test_what_is_missing_says_why_and_what_mends_it(scalar_variant):
+    scene = under_a_pane(POINT, {"type": "mask", "nested": GLASS})
+    (text,) = missing_light(scene).values()
+    assert text == (
+        "light of PointLight that delta lobes (glass, mirrors, null) cast on other surfaces is black; "
+        "expected area lights in place of such lamps"
+    )
+
+
+@pytest.mark.parametrize("integrator", ["path", "refract_path", "volpath"])
+@pytest.mark.parametrize(
+    ("lamp", "bsdf"), [(POINT, None), (POINT, GLASS), (SUNLIGHT, CLEAR), (SPOT, HOLES), (BEAM, None)]
+)
+def test_what_is_predicted_is_black_and_a_tracer_from_the_lamp_finds_it(lamp, bsdf, integrator, scalar_variant):
+    scene, tracer = under_a_pane(lamp, bsdf, integrator), mi.load_dict({"type": "ptracer"})
+    ours, theirs = np.array(mi.render(scene, spp=4)), np.array(mi.render(scene, spp=4000, integrator=tracer))
+    assert theirs.mean() > 0
+    assert ours.mean() == (0 if missing_light(scene) else pytest.approx(theirs.mean(), rel=0.1))
+
+
+@pytest.mark.parametrize(("integrator", "black"), [("prb", True), ("prb_projective", True), ("prbvolpath", False)])
+def test_what_is_predicted_of_integrators_for_derivatives_is_black(integrator, black, llvm_variant):
+    scene = under_a_pane(POINT, CLEAR, integrator)
+    assert bool(missing_light(scene)) == (np.array(mi.render(scene, spp=4)).max() == 0) == black
+
+
+@pytest.mark.parametrize(
+    ("lamp", "bsdf", "max_depth", "missing"),
+    [
+        (POINT, GLASS, -1, {"L S+ D (S|D)* S E"}),
+        (POINT, CLEAR, 4, {"L S+ D (S|D)* S E"}),
+        (POINT, GLASS, 3, set()),
+        (POINT, None, -1, set()),
+        (BEAM, GLASS, -1, {"L S+ D (S|D)* S E", "L D (S|D)* E"}),
+        (BEAM, GLASS, 3, {"L D (S|D)* E"}),
+    ],
+)
+def test_what_is_missing_where_caustics_are_traced_from_the_lamp(lamp, bsdf, max_depth, missing, scalar_variant):
+    assert {*inspect(under_a_pane(lamp, bsdf)).missing("lamp", max_depth)} == missing
+
+
+def test_refract_path_warns_once_a_scene_of_what_is_missing(logged, scalar_variant):
+    for bsdf in (GLASS, GLASS, None):
+        scene = under_a_pane(POINT, bsdf, "refract_path")
+        for seed in range(2):
+            mi.render(scene, spp=1, seed=seed)
+    warnings = [text for text in logged if "missing" in text]
+    assert len(warnings) == 2
+    assert all(text.startswith("refract_path: missing L S+ D (S|D)* E: light of PointLight") for text in warnings)

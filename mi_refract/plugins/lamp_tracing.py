@@ -1,0 +1,545 @@
+"""Light traced from the lamps, through glass and over mirrors, onto surfaces that the camera sees: caustics.
+
+A path from a lamp L to the camera E has vertices S, where the light takes a delta lobe (a null lobe is one), and D, any
+others. Of a render with `caustics` = `lamp` each class of paths belongs to one part:
+
+| class (Heckbert's notation) | part | found by |
+|---|---|---|
+| L E, L S⁺ E | path tracing | rays that hit the lamp |
+| L D (S\\|D)* E | path tracing | rays that hit the lamp, and emitter sampling |
+| L S (S\\|D)* S E | path tracing | rays that hit the lamp: of a lamp of zero size nothing |
+| L S E′, L S (S\\|D)* D E | **lamp tracing** | connections of the last D with the camera |
+
+So the lamps' part has the paths whose first vertex is S and whose last one is D, and path tracing leaves out what it
+finds of them: radiance of a lamp that a ray meets after a delta lobe, on a path whose first lobe was none. Light of the
+environment is path tracing's alone.
+
+A light path starts at a point on a lamp, in a direction aimed at the bounding sphere of a shape with delta lobes. With
+the probability p_j of sphere j, whose cone has the solid angle ω_j as seen from that point, a direction has the density
+
+    q = Σ p_j / ω_j    over the spheres that it meets,
+
+so where spheres overlap no light is counted twice. A directional lamp has disks in the place of cones. Adjoint BSDFs,
+with the correction for shading normals: Veach 1997, section 5.3.2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_refract.numerics import (
+    Count,
+    Emitter,
+    Interaction,
+    Mask,
+    Number,
+    Point2,
+    Ray,
+    Scene,
+    Sensor,
+    Shape,
+    Spectrum,
+    Variant,
+    Vector3,
+)
+
+from .absorption import HERE
+from .film import SQUARES_DIGITS, SQUARES_LOWEST, Splats, expected_weights, film_colours
+from .medium_tracking import THROUGH
+from .path_loop import PathLoop
+from .refract import DISPERSED, followed_context
+from .sampling import IndependentNumbers, KeyedMultijitter
+from .scene_features import KNOWN, KNOWN_SHAPES, bsdf_name, nested
+
+MOST_TARGETS = 16  # spheres at which directions are aimed
+MARGIN = 1 + 1e-4  # of a sphere's radius: rounding must not leave its rim out
+LANES = 2**24  # light paths at a time
+PILOT = 256  # light paths by which the power of a lamp is estimated
+DEFENSIVE = 0.1  # share of the light paths that all lamps have alike, whatever the estimate says
+SENSORS = {"PerspectiveCamera", "ThinLensCamera", "OrthographicCamera"}
+AREA, PLACE, DIRECTION = range(3)  # kinds of lamps
+KINDS = {"AreaLight": AREA, "PointLight": PLACE, "SpotLight": PLACE, "DirectionalEmitter": DIRECTION}
+LOBES = mi.BSDFFlags
+
+
+def refused_lamps(scene: Scene) -> str:
+    """Why the lamps of a scene cannot be traced; "" where they can be."""
+    found = {lamp.class_name() for lamp in scene.emitters() if not lamp.is_environment()} - KINDS.keys()
+    return f"it traces area, point, spot and directional lamps, not {min(found)}" if found else ""
+
+
+def refused_sensor(sensor: Sensor) -> str:
+    """Why light cannot be traced to a sensor; "" where it can be."""
+    if sensor.class_name() not in SENSORS:
+        return f"it traces light to perspective, thinlens and orthographic cameras, not {sensor.class_name()}"
+    if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special) or sensor.film().sample_border():
+        return "it traces light to a hdrfilm without sample_border"
+    return ""
+
+
+# Aim ------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """Bounds of some shapes."""
+
+    center: tuple[float, ...]
+    radius: float
+
+
+def targets(scene: Scene) -> list[Sphere]:
+    """Spheres, up to MOST_TARGETS, that bound every shape with a delta lobe, and every one that is not known."""
+
+    def is_target(shape: Shape) -> bool:
+        names = {bsdf_name(bsdf): bsdf.flags() for bsdf in nested(shape.bsdf())}
+        unknown = shape.class_name() not in KNOWN_SHAPES or not names.keys() <= KNOWN
+        return unknown or any(flags & +LOBES.Delta for flags in names.values())
+
+    return merged([bounding_sphere(shape) for shape in scene.shapes() if is_target(shape)], MOST_TARGETS)
+
+
+def bounding_sphere(shape: Shape) -> Sphere:
+    """About the middle of its bounding box."""
+    box = shape.bbox()
+    half = [float(x) / 2 for x in box.extents()]
+    radius = half[0] if shape.class_name() == "Sphere" else math.hypot(*half)
+    return Sphere(tuple(map(float, box.center())), radius * MARGIN)
+
+
+def merged(spheres: list[Sphere], most: int) -> list[Sphere]:
+    """`most` spheres, at most, that bound these: halves along the axis on which the centres lie farthest apart."""
+    if len(spheres) <= most:
+        return spheres
+    columns = list(zip(*(s.center for s in spheres), strict=True))
+    if most == 1:
+        center = tuple((min(x) + max(x)) / 2 for x in columns)
+        return [Sphere(center, max(math.dist(center, s.center) + s.radius for s in spheres))]
+    axis = max(range(3), key=lambda i: max(columns[i]) - min(columns[i]))
+    ordered, half = sorted(spheres, key=lambda s: s.center[axis]), len(spheres) // 2
+    return merged(ordered[:half], most // 2) + merged(ordered[half:], most - most // 2)
+
+
+class Aim:
+    """Directions from points toward spheres, and places on a plane behind which the spheres are."""
+
+    def __init__(self, v: Variant, spheres: list[Sphere], odds: list[list[float]]) -> None:
+        """`v`: the variant's module. `odds`: for each lamp the probability of each sphere."""
+        self.v, self.count, self.vectorised = v, len(spheres), dr.is_jit_v(v.Float)
+        self.x, self.y, self.z = (self._table(s.center[i] for s in spheres) for i in range(3))
+        self.radius = self._table(s.radius for s in spheres)
+        self.odds = self._table(p for row in odds for p in row)
+
+    def _table(self, values: Iterable[float]) -> Any:
+        numbers: Any = [float(x) for x in values]
+        if self.vectorised:
+            numbers = self.v.Float(numbers)
+            dr.make_opaque(numbers)
+        return numbers
+
+    def _at(self, table: Any, index: Count) -> Any:
+        return dr.gather(self.v.Float, table, index) if self.vectorised else table[int(index)]
+
+    def sphere(self, j: Count) -> tuple[Vector3, Number]:
+        """Centre and radius."""
+        return self.v.Point3f(self._at(self.x, j), self._at(self.y, j), self._at(self.z, j)), self._at(self.radius, j)
+
+    def choose(self, lamp: Count, sample: Number) -> Count:
+        """A sphere for a light path of a lamp."""
+        chosen, below = self.v.UInt32(0), self.v.Float(0)
+        for j in range(self.count - 1):
+            below += self._at(self.odds, lamp * self.count + j)
+            chosen = dr.select(sample >= below, self.v.UInt32(j + 1), chosen)
+        return chosen
+
+    def direction(self, lamp: Count, chosen: Count, o: Vector3, sample: Point2) -> tuple[Vector3, Number]:
+        """A direction from `o` toward the sphere that was chosen, and its density q."""
+        v = self.v
+        axis, sine2 = self._cone(chosen, o)
+        height = _one_minus_cosine(sine2)
+        z = 1 - sample.x * height
+        around = dr.sincos(2 * math.pi * sample.y)
+        r = dr.safe_sqrt((1 - z) * (1 + z))
+        d = v.Frame3f(axis).to_world(v.Vector3f(r * around[1], r * around[0], z))
+        density = v.Float(0)
+        for j in range(self.count):
+            other, other_sine2 = self._cone(j, o)
+            # The sine squared: a cosine does not resolve a narrow cone.
+            within = (dr.squared_norm(dr.cross(other, d)) <= other_sine2) & (dr.dot(other, d) > 0)
+            inside = (chosen == j) | (other_sine2 > 1) | within
+            share = self._at(self.odds, lamp * self.count + j) / (2 * math.pi * _one_minus_cosine(other_sine2))
+            density += dr.select(inside, share, 0)
+        return d, density
+
+    def _cone(self, j: Count, o: Vector3) -> tuple[Vector3, Number]:
+        """Axis and squared sine of the half angle of the cone from `o` about sphere j; from within it, 2."""
+        center, radius = self.sphere(j)
+        apart = center - o
+        distance2 = dr.squared_norm(apart)
+        outside = distance2 > dr.square(radius)
+        axis = dr.select(outside, apart * dr.rsqrt(distance2), self.v.Vector3f(0, 0, 1))
+        return axis, dr.select(outside, dr.square(radius) / distance2, 2)
+
+    def place(self, lamp: Count, chosen: Count, d: Vector3, sample: Point2) -> tuple[Vector3, Number]:
+        """A point on the disk of the chosen sphere that is perpendicular to `d`, and its density."""
+        v = self.v
+        center, radius = self.sphere(chosen)
+        disk = v.warp.square_to_uniform_disk_concentric(sample)
+        p = center + v.Frame3f(d).to_world(v.Vector3f(disk.x * radius, disk.y * radius, 0))
+        density = v.Float(0)
+        for j in range(self.count):
+            other, other_radius = self.sphere(j)
+            apart = dr.squared_norm(dr.cross(p - other, d))
+            inside = (chosen == j) | (apart <= dr.square(other_radius))
+            share = self._at(self.odds, lamp * self.count + j) / (math.pi * dr.square(other_radius))
+            density += dr.select(inside, share, 0)
+        return p, density
+
+
+def _quotient(a: Number, b: Number) -> Number:
+    """a / b; 0 where b is 0."""
+    return dr.select(b > 0, a / dr.select(b > 0, b, 1), 0)
+
+
+def _one_minus_cosine(sine2: Number) -> Number:
+    """1 − cos of an angle, of its squared sine; 2, a whole sphere, where that is above 1."""
+    return dr.select(sine2 > 1, 2, sine2 / (1 + dr.safe_sqrt(1 - sine2)))
+
+
+# Light paths ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class LightPath:
+    """The state of a light path between vertices; None for parts that the features leave out."""
+
+    ray: Ray
+    throughput: Spectrum
+    depth: Count  # vertices so far
+    active: Mask
+    # --- dispersion
+    wavelength_count: Number = None  # as in the path loop
+    # --- absorption: that of the medium at the lamp is not known before the first boundary, which declares it
+    sigma: Spectrum = None  # of the medium that the ray is in
+    known: Mask = None
+    unattenuated: Number = None  # length of the way in the unknown medium
+    skipped: Number = None  # as in the path loop
+
+
+class LampTracer:
+    """The lamps' part of an image; see the module docstring."""
+
+    def __init__(self, loop: PathLoop, sensor: Sensor, camera_medium: Callable[[Ray], tuple[Spectrum, Number]]) -> None:
+        """`loop`: that of path tracing. `camera_medium`: σ at the camera, and the way from there to a ray's origin."""
+        v, scene = loop.v, loop.scene
+        self.v, self.scene, self.loop, self.features = v, scene, loop, loop.features
+        self.vectorised = loop.vectorised
+        self.context = followed_context()
+        self.context.mode = mi.TransportMode.Importance
+        self.camera, self.camera_medium = Camera(v, sensor), camera_medium
+        box = scene.bbox()
+        self.size = math.hypot(*(float(x) for x in box.extents()))
+        self.center = v.Point3f(box.center())
+        self.lamps = [lamp for lamp in scene.emitters() if not lamp.is_environment()]
+        indices = [i for i, lamp in enumerate(scene.emitters()) if not lamp.is_environment()]
+        kinds = [KINDS[lamp.class_name()] for lamp in self.lamps]
+        self.kinds: Any = v.UInt32(kinds) if self.vectorised else kinds
+        dr.make_opaque(self.kinds)
+        self.any = set(kinds)
+        self.pointers = dr.gather(v.EmitterPtr, scene.emitters_dr(), v.UInt32(indices)) if self.vectorised else None
+        spheres = targets(scene)
+        odds = [self._odds(lamp, spheres) for lamp in self.lamps]
+        self.aim = Aim(v, spheres, odds)
+        self.choice = v.DiscreteDistribution([1.0] * len(self.lamps))
+        if len(self.lamps) > 1:
+            self.choice = v.DiscreteDistribution(self._powers())
+
+    def _odds(self, lamp: Emitter, spheres: list[Sphere]) -> list[float]:
+        """The probability of each sphere: by its solid angle as seen from the lamp, or by its disk."""
+        if KINDS[lamp.class_name()] == DIRECTION:
+            sizes = [s.radius**2 for s in spheres]
+        else:
+            place = lamp.bbox().center()
+            squares = [(s.radius, math.dist(s.center, map(float, place))) for s in spheres]
+            sizes = [float(_one_minus_cosine(2.0 if r >= x else (r / x) ** 2)) for r, x in squares]
+        return [size / sum(sizes) for size in sizes]
+
+    def _powers(self) -> list[float]:
+        """Probabilities of the lamps, in proportion to their power toward the spheres as a pilot estimates it."""
+        v, count = self.v, PILOT * len(self.lamps) if self.vectorised else 16 * len(self.lamps)
+        numbers: Any = KeyedMultijitter(v, v.UInt32(0), count, count) if self.vectorised else IndependentNumbers(v, 0)
+        sums = [0.0] * len(self.lamps)
+        for _ in range(1 if self.vectorised else count):
+            lamp, _, power = self._emitted(numbers, v.Bool(True))
+            power = dr.sum(v.unpolarized_spectrum(power))
+            power = dr.select(dr.isfinite(power), power, 0)
+            if self.vectorised:
+                powers = dr.zeros(v.Float, len(sums))
+                dr.scatter_add(powers, power, lamp)
+                sums = [float(x) for x in powers]
+            else:
+                sums[int(lamp)] += power
+        total = sum(sums)
+        even = 1 / len(sums)
+        return [DEFENSIVE * even + (1 - DEFENSIVE) * (x / total if total else even) for x in sums]
+
+    def _emitted(self, numbers: Any, active: Mask) -> tuple[Count, Ray, Spectrum]:
+        """A ray from a lamp toward a sphere, and its radiant power over the density of all that was chosen."""
+        v, camera = self.v, self.camera.sensor
+        time = camera.shutter_open()
+        if camera.shutter_open_time() > 0:
+            time = time + numbers.next_1d(None, 4) * camera.shutter_open_time()
+        reference = dr.zeros(v.SurfaceInteraction3f)
+        number = numbers.next_1d(None, 5) if v.is_spectral else 0.0
+        wavelengths, weight = camera.sample_wavelengths(reference, number, active)
+        lamp, probability = v.UInt32(0), v.Float(1)
+        if len(self.lamps) > 1:
+            lamp, probability = self.choice.sample_pmf(numbers.next_1d(None, 0), active)
+        emitter = dr.gather(v.EmitterPtr, self.pointers, lamp) if self.vectorised else self.lamps[int(lamp)]
+        kind = dr.gather(v.UInt32, self.kinds, lamp) if self.vectorised else self.kinds[int(lamp)]
+        chosen = self.aim.choose(lamp, numbers.next_1d(None, 2))
+        on_lamp, aimed = numbers.next_2d(None, 1), numbers.next_2d(None, 3)
+        reference.p, reference.time, reference.wavelengths = self.center, time, wavelengths
+        origin, d, density, power = v.Point3f(0), v.Vector3f(0, 0, 1), v.Float(1), v.Spectrum(0)
+
+        here = active & (kind == AREA)
+        if AREA in self.any and (self.vectorised or here):
+            ps, place = emitter.sample_position(time, on_lamp, here)
+            toward, q = self.aim.direction(lamp, chosen, ps.p, aimed)
+            si = v.SurfaceInteraction3f(ps, wavelengths)
+            si.shape = emitter.get_shape()
+            si.wi = si.to_local(toward)
+            radiance = emitter.eval(si, here)
+            origin = dr.select(here, si.spawn_ray(toward).o, origin)
+            d, density = dr.select(here, toward, d), dr.select(here, q, density)
+            power = dr.select(here, radiance * (place * dr.abs(si.wi.z)), power)
+        here = active & (kind == PLACE)
+        if PLACE in self.any and (self.vectorised or here):
+            ds, _ = emitter.sample_direction(reference, on_lamp, here)
+            toward, q = self.aim.direction(lamp, chosen, ds.p, aimed)
+            reference.p = ds.p + toward  # at a distance of 1 the irradiance is the intensity
+            _, intensity = emitter.sample_direction(reference, on_lamp, here)
+            origin, d, density = (dr.select(here, *x) for x in ((ds.p, origin), (toward, d), (q, density)))
+            power = dr.select(here, intensity, power)
+        here = active & (kind == DIRECTION)
+        if DIRECTION in self.any and (self.vectorised or here):
+            reference.p = self.center
+            ds, irradiance = emitter.sample_direction(reference, on_lamp, here)
+            p, q = self.aim.place(lamp, chosen, -ds.d, aimed)
+            origin = dr.select(here, p + ds.d * (2 * self.size), origin)
+            d, density = dr.select(here, -ds.d, d), dr.select(here, q, density)
+            power = dr.select(here, irradiance, power)
+        power = power * dr.select(density > 0, 1 / (density * probability), 0)
+        return lamp, v.Ray3f(origin, d, time, wavelengths), power * v.Spectrum(weight)
+
+    def trace(self, numbers: Any, splat: Callable[..., None]) -> None:
+        """Light paths, one a lane: `splat(place on the film, value, wavelengths, active)` for each connection."""
+        v, features = self.v, self.features
+        _, ray, power = self._emitted(numbers, v.Bool(True))
+        s = LightPath(ray, power, v.UInt32(0), dr.max(v.unpolarized_spectrum(power)) > 0)
+        if features.dispersion:
+            s.wavelength_count = v.Float(dr.size_v(v.UnpolarizedSpectrum))
+        if features.absorption:
+            s.sigma, s.known = v.UnpolarizedSpectrum(0), v.Bool(False)
+            s.unattenuated, s.skipped = v.Float(0), v.Float(0)
+        start = dr.max(v.unpolarized_spectrum(power))
+
+        def vertex(s: LightPath) -> tuple[LightPath]:
+            return self._vertex(s, numbers, start, splat)
+
+        dr.while_loop((s,), lambda s: s.active, vertex, label="lamp_tracing")
+
+    def _vertex(self, s: LightPath, numbers: Any, start: Number, splat: Callable[..., None]) -> tuple[LightPath]:
+        v, features, loop = self.v, self.features, self.loop
+        key = (s.depth + 2) * 4
+
+        # ---------------------- Surface interaction ----------------------
+        si = self.scene.ray_intersect(s.ray, +mi.RayFlags.All, False, s.active)
+        hit = s.active & si.is_valid()
+        if not (self.vectorised or hit):
+            s.active = False
+            return (s,)
+        if features.absorption:
+            length = si.t + s.skipped
+            s.throughput = dr.select(s.known, loop.attenuated(s.throughput, s.sigma, length), s.throughput)
+            s.unattenuated = dr.select(s.known, 0, s.unattenuated + length)
+        bsdf = si.bsdf()
+
+        # ---------------------- Connection with the camera ----------------------
+        connected = hit & (s.depth > 0) & mi.has_flag(bsdf.flags(), LOBES.Smooth) & (s.depth + 2 <= features.max_depth)
+        sample_1, roulette_1, *rest = numbers.independent(key, 4)
+        aperture = sample_2 = v.Point2f(*rest)
+        if self.vectorised or connected:
+            self._connect(s, si, bsdf, aperture, connected, splat)
+
+        # ---------------------- BSDF sampling ----------------------
+        active_next = hit & (s.depth + 2 < features.max_depth)
+        if not (self.vectorised or active_next):
+            s.active = False
+            return (s,)
+        bs, weight = bsdf.sample(self.context, si, sample_1, sample_2, active_next)
+        active_next &= (s.depth > 0) | mi.has_flag(bs.sampled_type, LOBES.Delta)
+        if v.is_polarized:
+            weight = si.to_world_mueller(weight, -si.wi, bs.wo)
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        weight = self._toward_camera(si, bsdf, bs, weight, s.ray.d, ray.d, active_next)
+        throughput = loop.times(weight, s.throughput)
+        if features.dispersion:
+            dispersed = (bs.sampled_type & DISPERSED) != 0
+            throughput = throughput * dr.select(dispersed, s.wavelength_count, 1)
+            s.wavelength_count = dr.select(dispersed, 1, s.wavelength_count)
+        if features.absorption:
+            throughput = self._cross(s, si, bs, bsdf, ray, throughput, active_next)
+        s.ray, s.throughput, s.depth = ray, throughput, s.depth + 1
+
+        # ---------------------- Stopping criterion ----------------------
+        largest = dr.max(v.unpolarized_spectrum(s.throughput))
+        active_next &= largest > 0
+        if features.roulette:
+            probability = dr.minimum(largest / start, 0.95)
+            roulette = active_next & (s.depth >= features.rr_depth)
+            active_next &= (roulette & (roulette_1 >= probability)) ^ True
+            s.throughput = dr.select(roulette, s.throughput * dr.rcp(probability), s.throughput)
+        s.active = active_next
+        return (s,)
+
+    def _cross(
+        self, s: LightPath, si: Interaction, bs: Any, bsdf: Any, ray: Ray, throughput: Spectrum, active: Mask
+    ) -> Spectrum:
+        """Take over the medium beyond a boundary; what it declares on this side is that of the way so far."""
+        through = active & ((bs.sampled_type & THROUGH) != 0)
+        first = through & (s.known ^ True)
+        if self.vectorised or (first and bsdf.has_attribute(HERE, first)):
+            here = bsdf.eval_attribute(HERE, si, first)
+            throughput = dr.select(first, self.loop.attenuated(throughput, here, s.unattenuated), throughput)
+            s.sigma = dr.select(first, here, s.sigma)
+        s.known = s.known | through
+        s.sigma = self.loop.media.cross(s.sigma, s.depth, si, bs, bsdf, ray, active)
+        s.skipped = dr.dot(ray.o - si.p, ray.d)
+        return throughput
+
+    def _toward_camera(
+        self, si: Interaction, bsdf: Any, bs: Any, weight: Spectrum, arriving: Vector3, leaving: Vector3, active: Mask
+    ) -> Spectrum:
+        """The weight of a sample, corrected for shading normals n: |n·wi| |geometric·wo| / (|n·wo| |geometric·wi|)."""
+        upper, lower = dr.abs(dr.dot(si.n, leaving)), dr.abs(dr.dot(si.n, arriving))
+        corrected = weight * _quotient(upper * dr.abs(si.wi.z), lower * dr.abs(bs.wo.z))
+        if not self.features.perturbed:
+            return corrected
+        # The normal is known to the BSDF alone, which is evaluated as path tracing does.
+        smooth = active & mi.has_flag(bs.sampled_type, LOBES.Smooth)
+        value = self._radiance(si, bsdf, bs.wo, smooth) * _quotient(upper, lower * bs.pdf)
+        return dr.select(smooth, value, corrected)
+
+    def _radiance(self, si: Interaction, bsdf: Any, wo: Vector3, active: Mask) -> Spectrum:
+        """The BSDF times the cosine of wi, for light along −wi that leaves along wo, as path tracing evaluates it."""
+        seen = self.v.SurfaceInteraction3f(si)
+        seen.wi = wo
+        value = bsdf.eval(self.loop.context, seen, si.wi, active)
+        return si.to_world_mueller(value, -si.wi, wo) if self.v.is_polarized else value
+
+    def _connect(
+        self, s: LightPath, si: Interaction, bsdf: Any, aperture: Point2, active: Mask, splat: Callable[..., None]
+    ) -> None:
+        v, loop = self.v, self.loop
+        place, camera_ray, importance, active = self.camera.connect(si, aperture, active)
+        if self.features.hide_emitters and self.features.area:
+            # The camera looks past lamps, and does not see the surface of one.
+            active = active & (si.shape.emitter() == None) if self.vectorised else active and not si.shape.emitter()  # noqa: E711
+            camera_ray = loop.past_emitters(camera_ray, active)
+            active &= dr.dot(si.p - camera_ray.o, camera_ray.d) > 0
+        d = -camera_ray.d
+        value = self._radiance(si, bsdf, si.to_local(d), active)
+        active &= dr.max(dr.abs(v.unpolarized_spectrum(value))) > 0
+        active &= self.scene.ray_test(si.spawn_ray_to(camera_ray.o), active) ^ True
+        value = loop.times(value, s.throughput) * (
+            importance * _quotient(dr.abs(dr.dot(si.n, d)), dr.abs(dr.dot(si.n, s.ray.d)))
+        )
+        if self.features.absorption:
+            sigma, way = self.camera_medium(camera_ray)
+            length = dr.norm(si.p - camera_ray.o) + way + s.unattenuated
+            value = loop.attenuated(value, dr.select(s.known, s.sigma, sigma), length)
+        if self.vectorised or active:
+            splat(place, value, si.wavelengths, active)
+
+
+class Camera:
+    """How much of the light that leaves a point a camera's film receives."""
+
+    def __init__(self, v: Variant, sensor: Sensor) -> None:
+        """`v`: the variant's module. `sensor`: of SENSORS."""
+        self.v, self.sensor = v, sensor
+        film = sensor.film()
+        self.width, self.height = (int(n) for n in film.crop_size())
+        self.parallel = sensor.class_name() == "OrthographicCamera"
+        if self.parallel:
+            corner, right, down = (
+                sensor.sample_ray(0, 0, v.Point2f(*p), v.Point2f(0))[0] for p in ((0, 0), (1, 0), (0, 1))
+            )
+            self.origin, self.d = corner.o, corner.d
+            x, y = right.o - corner.o, down.o - corner.o
+            # (x, y) of a point p on the film, from 0 to 1, is that of p − origin in the basis dual to x, y.
+            self.area = dr.norm(dr.cross(x, y))
+            self.to_x = dr.cross(y, self.d) / dr.dot(x, dr.cross(y, self.d))
+            self.to_y = dr.cross(x, self.d) / dr.dot(y, dr.cross(x, self.d))
+
+    def connect(self, si: Interaction, aperture: Point2, active: Mask) -> tuple[Point2, Ray, Number, Mask]:
+        """Place on the film in pixels, the camera's ray through it, its importance; whether the film sees the point.
+
+        Importance: radiance of a pixel of area 1 from reflected power, ∫ L dx = Σ f Φ W.
+        """
+        v, pixels = self.v, self.width * self.height
+        if self.parallel:
+            apart = si.p - self.origin
+            place = v.Point2f(dr.dot(apart, self.to_x), dr.dot(apart, self.to_y))
+            importance, active = pixels / self.area, active & (dr.dot(apart, self.d) > 0)
+        else:
+            ds, weight = self.sensor.sample_direction(si, aperture, active)
+            place = v.Point2f(ds.uv.x / self.width, ds.uv.y / self.height)
+            importance = v.unpolarized_spectrum(weight)[0] * pixels
+        active &= (place.x >= 0) & (place.x < 1) & (place.y >= 0) & (place.y < 1)
+        ray, _ = self.sensor.sample_ray(si.time, 0, place, aperture, active)
+        far = dr.dot(si.p - ray.o, ray.d)
+        active &= (importance > 0) & (far > 0) & (far <= ray.maxt)
+        return v.Point2f(place.x * self.width, place.y * self.height), ray, importance, active
+
+
+def lamp_image(tracer: LampTracer, seed: int, paths: int, channels: tuple[str, ...], *, squares: bool = False) -> Any:
+    """The lamps' part of an image, of so many light paths: H × W × colours, and the variance of it.
+
+    Both in float64. The variance is None without `squares`.
+    """
+    v, camera = tracer.v, tracer.camera
+    pixels = camera.width * camera.height
+    colours = 3 if channels[0] in ("R", "X") else 1
+    sums = Splats(v, camera.sensor, colours)
+    of_squares = Splats(v, camera.sensor, colours, SQUARES_DIGITS, SQUARES_LOWEST) if squares else None
+
+    def splat(place: Point2, value: Spectrum, wavelengths: Number, active: Mask) -> None:
+        values = [x / pixels for x in film_colours(v, value, wavelengths, channels)]
+        sums.add(place, values, active)
+        if of_squares:
+            of_squares.add(place, [dr.square(x) for x in values], active)
+
+    if tracer.vectorised:
+        for number, start in enumerate(range(0, paths, LANES)):
+            lanes = min(LANES, paths - start)
+            chunk = v.sample_tea_32(dr.opaque(v.UInt32, seed), number)[0]
+            tracer.trace(KeyedMultijitter(v, chunk, lanes, lanes), splat)
+            dr.eval(*(each for every in (sums, of_squares) if every for each in (every.digits, every.beyond)))
+    else:
+        numbers = IndependentNumbers(v, seed)
+        for _ in range(paths):
+            tracer.trace(numbers, splat)
+    expected = expected_weights(camera.sensor.film())
+    area = 1 if expected is None else expected
+    mean = sums.image() * (pixels / paths) / area
+    if of_squares is None:
+        return mean, None
+    return mean, (of_squares.image() * (pixels**2 / paths) / area**2 - mean**2).clip(0) / paths
