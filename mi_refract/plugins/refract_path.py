@@ -21,12 +21,12 @@ and no sample into more than 4096 paths. With `deterministic`, which is for scen
 alone, both lobes are followed up to 64 boundaries deep, and the default of `split_weight` is 0.001; the channel
 `truncated` holds what was dropped: times the largest radiance it bounds the error.
 
-With `caustics` = `path`, light that passes glass or a mirror before it reaches another surface is found by chance, or not
-at all where the lamp is a point, a spot or directional. `lamp` traces it from the lamps to all surfaces that the camera
-sees directly, along `light_paths` paths for each sample of the camera (`lamp_tracing`). It takes area, point, spot and
-directional lamps, and perspective, thin-lens and orthographic cameras. In scenes with media of Mitsuba's, in frozen
-functions, for derivatives and within another integrator it is an error, and `auto` means `path`. What is missing then is
-named in a warning, once a scene (`SceneFeatures.missing`).
+With `caustics` = `path`, light that passes glass or a mirror before it reaches another surface is found by chance, or
+not at all where the lamp is a point, a spot or directional. `lamp` traces it from the lamps to all surfaces that the
+camera sees directly, along `light_paths` paths for each sample of the camera (`lamp_tracing`). It takes area, point,
+spot and directional lamps, and perspective, thin-lens and orthographic cameras. In scenes with media of Mitsuba's, in
+frozen functions, for derivatives and within another integrator it is an error, and `auto` means `path`. What is missing
+then is named in a warning, once a scene (`SceneFeatures.missing`).
 
 Derivatives are attached: rays move with the index. Edges that move across a pixel, or in the view of a surface that is
 not smooth, are not in them. A render that is differentiated does not split.
@@ -327,6 +327,7 @@ def integrator_class(v: Variant) -> type:
         def to_string(self) -> str:
             depth = -1 if self.max_depth == UNLIMITED else self.max_depth
             names = ("rr_depth", "hide_emitters", "split_depth", "split_weight", "deterministic", "caustics")
+            names += ("light_paths",)
             lines = [f"max_depth = {depth}", *(f"{name} = {getattr(self, name)}" for name in names)]
             return "RefractPath[\n" + "".join(f"  {x},\n" for x in [*lines, f"left out = {self.left_out()}"]) + "]"
 

@@ -275,12 +275,18 @@ def test_what_cannot_be_is_refused_in_one_line(parameters, said, rgb_variant):
 
 def test_parameters_and_their_defaults_are_written_out(scalar_variant):
     names = ("max_depth", "rr_depth", "hide_emitters", "split_depth", "split_weight", "deterministic")
+    names += ("caustics", "light_paths")
+    plain = "path", 0.25
     for parameters, values in (
-        ({}, (-1, 5, False, 0, 0.01, False)),
-        ({"max_depth": 7, "rr_depth": 3, "hide_emitters": True, "split_depth": 2}, (7, 3, True, 2, 0.01, False)),
-        ({"max_depth": 0, "deterministic": True}, (0, 5, False, 64, 0.001, True)),
-        ({"split_depth": 12, "split_weight": 0.0}, (-1, 5, False, 12, 0.0, False)),
-        ({"split_depth": 64, "split_weight": 1 / 4096}, (-1, 5, False, 64, 1 / 4096, False)),
+        ({}, (-1, 5, False, 0, 0.01, False, *plain)),
+        (
+            {"max_depth": 7, "rr_depth": 3, "hide_emitters": True, "split_depth": 2},
+            (7, 3, True, 2, 0.01, False, *plain),
+        ),
+        ({"max_depth": 0, "deterministic": True}, (0, 5, False, 64, 0.001, True, *plain)),
+        ({"split_depth": 12, "split_weight": 0.0}, (-1, 5, False, 12, 0.0, False, *plain)),
+        ({"split_depth": 64, "split_weight": 1 / 4096}, (-1, 5, False, 64, 1 / 4096, False, *plain)),
+        ({"caustics": "auto", "light_paths": 2}, (-1, 5, False, 0, 0.01, False, "auto", 2.0)),
     ):
         lines = [f"  {name} = {value}," for name, value in zip(names, values, strict=True)]
         said = str(mi.load_dict({"type": "refract_path"} | parameters))
@@ -301,7 +307,7 @@ def test_a_scalar_render_of_another_scene_meanwhile_has_a_loop_of_its_own(scalar
     """As two threads do with one integrator: their samples alternate."""
     method, sampler = mi.load_dict({"type": "refract_path"}), mi.load_dict({"type": "independent"})
     scenes = [mi.load_dict({"type": "scene", "sky": {"type": "constant", "radiance": x}}) for x in (1.0, 2.0, 1.0)]
-    method.begin_render(None)
+    method.begin_render(mi.load_dict({"type": "perspective"}))
     seen = [method.sample(scene, sampler, mi.Ray3f([0, 0, 0], [0, 0, 1]))[0][0] for scene in scenes]
     assert seen == [1, 2, 1]
 
