@@ -234,10 +234,9 @@ def disk_scene(body: str, lamp: str, bsdf: str, resolution: int) -> tuple[Any, A
 
     setup, radius = ON_AXIS[body, lamp]
     origin = FAR * np.array([0, math.sin(ELEVATION), math.cos(ELEVATION)])
-    bodies = {
-        "ball": lambda: {"type": "sphere", "center": [0, BALL_HEIGHT, 0], "bsdf": glass(bsdf)},
-        "lens": lambda: lens_mesh(LENS_HEIGHT, glass(bsdf), 128, 384),
-    }
+    solid: Any = {"type": "sphere", "center": [0, BALL_HEIGHT, 0], "bsdf": glass(bsdf)}
+    if body == "lens":
+        solid = lens_mesh(LENS_HEIGHT, glass(bsdf), 128, 384)
     beam = math.degrees(setup.widest) + 1
     down = mi.ScalarTransform4f().look_at([0, TOP, 0], [0, 0, 0], [1, 0, 0])
     lamps = {
@@ -248,11 +247,11 @@ def disk_scene(body: str, lamp: str, bsdf: str, resolution: int) -> tuple[Any, A
     flat = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(radius)
     disk = {"type": "disk", "to_world": flat, "bsdf": {"type": "diffuse", "reflectance": REFLECTANCE}}
     view = sensor(resolution, FIELD, [*origin])
-    parts = {"sensor": view, "disk": disk, "body": bodies[body](), "lamp": lamps[lamp]}
-    # A pixel is a square of side a at distance 1: rays through it, x + y + forward, meet the floor at t, in a² t²/|d_y|.
+    parts = {"sensor": view, "disk": disk, "body": solid, "lamp": lamps[lamp]}
+    # A pixel is a square of side a at distance 1; rays through it, d = x + y + forward, meet the floor at t d, in an
+    # area of a² t²/|d_y|.
     half = math.tan(math.radians(FIELD / 2))
-    across = half * ((np.arange(resolution) + 0.5) / resolution * 2 - 1)
-    x, y = np.meshgrid(across, -across)
-    d_y = -math.sin(ELEVATION) + y * math.cos(ELEVATION)
+    y = half * (1 - (np.arange(resolution) + 0.5) / resolution * 2)
+    d_y = y[:, None] * math.cos(ELEVATION) - math.sin(ELEVATION)
     area = np.square(2 * half / resolution * origin[1] / d_y) / np.abs(d_y)
     return mi.load_dict({"type": "scene"} | parts), np.pi / REFLECTANCE * area

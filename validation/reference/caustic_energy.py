@@ -41,7 +41,10 @@ class Ball(NamedTuple):
 
     def normal(self, p: Array) -> Array:
         """Outward, of places on it."""
-        return np.asarray((p - [0, self.z]) / self.radius)
+        q = p - [0, self.z]
+        return np.asarray(
+            q / np.hypot(*q.T)[:, None]
+        )  # over the radius its length, and that of directions, would drift
 
 
 class Above(NamedTuple):
@@ -91,8 +94,8 @@ def flux(setup: Setup, radii: Any, most: int = 2, polarised: bool = False, steps
 
 
 def _flux(setup: Setup, radii: Array, most: int, polarised: bool, steps: int) -> Array:
-    step = setup.widest / steps
-    at = step * (np.arange(steps) + 0.5)
+    step = float(setup.widest) / steps
+    at: Array = step * (np.arange(steps) + 0.5)
     ring = 2 * np.pi * step * (at if setup.lamp is None else np.sin(at))
     found = np.zeros(len(radii))
     for x, shares in parts(setup, at, most, polarised):
