@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from mi_refract.formulas import bounds
-from validation.run.metrics import EQUAL_TIME, EQUAL_TIME_DEFAULTS
+from validation.run.metrics import EQUAL_TIME, EQUAL_TIME_CAUSTIC, EQUAL_TIME_DEFAULTS
 
 
 class Limit(float):
@@ -133,6 +133,15 @@ ONLY_GLASS = {
     EQUAL_TIME_DEFAULTS: limit(0.12, "of the built-in's defaults: stratification comes on top"),
 }
 MIXED = {EQUAL_TIME: limit(0.8, "of the built-in's with the same sampler, where surfaces scatter, too")}
+CAUSTICS = {
+    EQUAL_TIME: limit(0.4, "of the built-in's with the same sampler, of lamps that are small"),
+    EQUAL_TIME_CAUSTIC: limit(0.05, "of the built-in's, where the caustic is seen: paths hardly ever meet such a lamp"),
+}
+CAUSTIC_ENERGY = limit(
+    5e-3, "relative: a lost internal reflection at the back of a ball is 1e-3, a lost η² more than 1"
+)
+CAUSTIC_NOISE = limit(1.25e-3, "relative standard error of an energy: a quarter of what it may be off")
+CAUSTIC_DETECTABLE = limit(0.01, "of the mean over the caustic: with more noise a caustic could be wrong and pass")
 NOISE = limit(
     1e-5, "of float32 images: below it independent seeds give the same image, and there is no error to compare"
 )

@@ -47,6 +47,7 @@ from mi_refract.numerics import (
     Spectrum,
     Variant,
     Vector3,
+    mitsuba_mesh,
 )
 
 from .absorption import HERE
@@ -108,6 +109,9 @@ def targets(scene: Scene) -> list[Sphere]:
 def bounding_sphere(shape: Shape) -> Sphere:
     """About the middle of its bounding box."""
     box = shape.bbox()
+    if not box.valid():  # of rectangles that Mitsuba has merged into a mesh
+        vertices, _ = mitsuba_mesh.arrays(shape)
+        box = mi.ScalarBoundingBox3f(*([*map(float, ends(0))] for ends in (vertices.min, vertices.max)))
     half = [float(x) / 2 for x in box.extents()]
     radius = half[0] if shape.class_name() == "Sphere" else math.hypot(*half)
     return Sphere(tuple(map(float, box.center())), radius * MARGIN)

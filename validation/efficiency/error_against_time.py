@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import math
 import statistics
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -103,6 +104,8 @@ class Measured:
 
 
 Found = dict[str, dict[int, Measured]]  # by subject and samples per pixel
+Shoot = Callable[[int, int], tuple[np.ndarray, float]]  # samples per pixel and seed → image, seconds; as `Camera`
+Figures = Callable[[np.ndarray, np.ndarray, np.ndarray], dict[str, float]]  # image, reference, its variance → errors
 
 
 def tasks(context: Context) -> list[Task]:
@@ -144,7 +147,7 @@ def _measured_rows(context: Context, path: Path, extent: Extent, methods: tuple[
     cameras = {s.name: camera(path, s.method, resolution, sampler=s.sampler, spp=spp) for s in subjects}
     look = cameras[builtins[1].name]
     references = np.stack([look(spp, seed=FIRST_REFERENCE + i)[0] for i in range(extent.references)])
-    measured = measure(cameras, references, extent)
+    measured = measure(cameras, references, extent.spp, extent.rounds, errors)
     goals = goals_of(subjects, measured, scene_features.inspect(look.scene).only_glass)
     replay = {
         "scene": path.name,
@@ -202,24 +205,26 @@ def best_sampler(path: Path, resolution: int, extent: Extent, seeds: int = 3) ->
     return min(costs, key=lambda sampler: costs[sampler])
 
 
-def measure(cameras: dict[str, Camera], references: np.ndarray, extent: Extent) -> Found:
+def measure(
+    cameras: Mapping[str, Shoot], references: np.ndarray, spps: tuple[int, ...], count: int, figures_of: Figures
+) -> Found:
     """By subject and samples per pixel. An image a round of each; every second round in the reverse order.
 
-    The first image of each is thrown away: it compiles.
+    `count`: of rounds; the first image of each is thrown away: it compiles. `figures_of`: as `errors`.
     """
     mean, own = references.mean(0), references.var(0, ddof=1) / len(references)
     found: Found = {name: {} for name in cameras}
-    for spp in extent.spp:
+    for spp in spps:
         shots: dict[str, list[tuple[np.ndarray, float]]] = {name: [] for name in cameras}
         order = list(cameras)
-        for seed in range(extent.rounds + 1):
+        for seed in range(count + 1):
             for name in order:
                 shots[name].append(cameras[name](spp, seed))
             order.reverse()
         for name, (_, *rounds) in shots.items():
-            by_round = [errors(image, mean, own) for image, _ in rounds]
-            figures = {metric: [figure[metric] for figure in by_round] for metric in METRICS}
-            kept = [image for image, _ in rounds] if spp == extent.spp[-1] else []
+            by_round = [figures_of(image, mean, own) for image, _ in rounds]
+            figures = {metric: [figure[metric] for figure in by_round] for metric in by_round[0]}
+            kept = [image for image, _ in rounds] if spp == spps[-1] else []
             found[name][spp] = Measured([seconds for _, seconds in rounds], figures, kept)
     return found
 

@@ -4,6 +4,7 @@ In: rays, scenes or parameters. Out: directions, paths and powers to compare wit
 """
 
 __all__ = [
+    "caustic_energy",
     "closed_forms",
     "exact_lens",
     "fast_reference",

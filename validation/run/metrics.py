@@ -30,6 +30,7 @@ SMALLEST_P = "smallest p, adjusted"
 MEAN_DIFFERENCE = "mean difference"
 DETECTABLE = "minimum detectable difference"
 EQUAL_TIME = "equal-time MSE"
+EQUAL_TIME_CAUSTIC = "equal-time MSE, caustic"
 EQUAL_TIME_DEFAULTS = "equal-time MSE / independent"
 
 

@@ -1,0 +1,120 @@
+"""Caustics: the quadrature of their energy, scenes that have some, and defects that the study must detect."""
+
+import dataclasses
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refract import backend, planar
+from validation.efficiency import caustic_scenes, caustics
+from validation.efficiency.caustic_scenes import LENS_APERTURE, LENS_HEIGHT, LENS_RADIUS, ON_AXIS, POINT, SPOT
+from validation.efficiency.caustics import BY_CLASS, Extent
+from validation.reference import caustic_energy
+from validation.run.context import PROFILES, Context
+from validation.run.metrics import DETECTABLE, WELCH_ALARMS
+from validation.run.render_methods import BUILTIN
+
+SMALL = Extent(24, 16, 64, 16, (caustics.SQUARE,), renders=6)
+
+
+@pytest.fixture
+def context(tmp_path, llvm_variant, monkeypatch):
+    monkeypatch.setitem(caustics.EXTENTS, "standard", SMALL)
+    return Context(PROFILES["standard"], tmp_path, "llvm_ad_rgb", backend.detect(), backend.usable_variants())
+
+
+# The quadrature ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("key", ON_AXIS, ids=str)
+def test_parts_of_a_ray_are_those_of_the_planar_tracer(key):
+    """Where light that has met 1 to 5 boundaries meets the floor, and its share of both waves."""
+    setup, _ = ON_AXIS[key]
+    curves = {
+        "ball": planar.shapes.circle(1.0).mapped(np.eye(2), (0, caustic_scenes.BALL_HEIGHT)),
+        "lens": planar.shapes.polygon(
+            [[-LENS_APERTURE, LENS_HEIGHT], [LENS_APERTURE, LENS_HEIGHT]],
+            [0, 2 * math.degrees(math.asin(LENS_APERTURE / LENS_RADIUS))],
+        ),
+    }
+    at = setup.widest * (np.arange(20) + 0.5) / 20
+    origins, directions = np.zeros((20, 2)), np.stack([np.sin(at), -np.cos(at)], 1)
+    origins[:, 1] = setup.lamp or 9.0
+    if setup.lamp is None:
+        origins[:, 0], directions = at, np.tile([0.0, -1.0], (20, 1))
+    tracer, checked = planar.Tracer(curves[key[0]].between(setup.eta, 1.0)), 0
+    for met, part in enumerate(caustic_energy.parts(setup, at, 5, polarised=True), 1):
+        reflect = 1 if met == 1 else 2 ** (met - 1) - 2  # at the first boundary, or at all but the first and the last
+        paths = tracer(origins, directions, met, reflect=reflect, weights=True)
+        last = planar.Event.REFLECTED if met == 1 else planar.Event.REFRACTED
+        left = paths.events[:, met - 1] == last
+        assert (part.shares[:, ~left] == 0).all()
+        np.testing.assert_allclose(part.shares[:, left].T, paths.polarised[left, met], rtol=1e-9, atol=1e-12)
+        down = left & (paths.directions[:, 1] < 0)
+        assert np.isinf(part.x[left & ~down]).all()
+        slope = paths.directions[down, 0] / paths.directions[down, 1]
+        x = paths.points[down, met, 0] - slope * paths.points[down, met, 1]
+        np.testing.assert_allclose(part.x[down], x, rtol=1e-9, atol=1e-9)
+        checked += down.sum()
+    assert checked >= 30
+
+
+def test_no_light_is_lost_and_the_power_on_a_disk_is_known_so_well():
+    for setup, radius in ON_AXIS.values():
+        at = setup.widest * np.array([0.1, 0.5, 0.8])
+        np.testing.assert_allclose(sum(part.shares for part in caustic_energy.parts(setup, at, 60)), 1, rtol=1e-12)
+        (power,), (step,) = caustic_energy.flux(setup, [radius], steps=20_000)
+        (better,), _ = caustic_energy.flux(setup, [radius], steps=200_000)
+        assert abs(power - better) <= 2 * step + 1e-9 and step < 1e-4 * power
+
+
+# Scenes --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("body", [*caustic_scenes.BODIES][2:])
+def test_bodies_have_a_caustic_and_show_glass(body, llvm_variant):
+    truth = caustics.reference(body, POINT, dataclasses.replace(SMALL, renders=2))
+    assert truth.caustic.sum() >= 8 and (truth.caustic <= truth.without_glass).all()
+    assert (~truth.without_glass).any() or body == "pool"  # below its surface
+
+
+def test_lamps_have_the_same_irradiance_below_the_body(scalar_variant):
+    """Of a surface that faces them; a square whose side is 0.7 of its distance has less, as its corners are farther."""
+    points, place = (np.arange(8) + 0.5) / 8, dr.zeros(mi.SurfaceInteraction3f)
+    for lamp in caustic_scenes.LAMPS:
+        scene = mi.load_dict({"type": "scene", "lamp": caustic_scenes.lamp_of(lamp)})
+        samples = [scene.emitters()[0].sample_direction(place, [x, y]) for x in points for y in points]
+        irradiance = np.mean([weight[0] * np.dot(ds.d, caustic_scenes.TOWARDS) for ds, weight in samples])
+        assert irradiance == pytest.approx(1, rel=0.25 if lamp == "square 0.7" else 0.02)
+
+
+# Defects -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("index", "verdict"), [(1.5, "pass"), (1.56, "fail")])
+def test_the_energy_of_another_index_is_wrong(context, monkeypatch, index, verdict):
+    glass = caustic_scenes.glass
+    monkeypatch.setattr(caustic_scenes, "glass", lambda bsdf: glass(bsdf, index))
+    monkeypatch.setitem(caustics.EXTENTS, "standard", dataclasses.replace(SMALL, energy_spp=128))
+    (row,) = caustics.energy_rows(context, "ball", SPOT, (BY_CLASS,))
+    assert row.verdict == verdict and row.broken.keys() <= {"energy off"}
+    (unaimed,) = caustics.energy_rows(context, "ball", POINT, (BY_CLASS,))
+    assert unaimed.verdict == "not run" and "does not aim" in unaimed.reason
+
+
+def test_light_that_is_missing_is_an_alarm_and_noise_no_pass(context, monkeypatch):
+    """Of a point lamp `path` finds no caustic; the sum of classes has other seeds than the reference."""
+    monkeypatch.setattr(caustics, "HOLDING", (BUILTIN, BY_CLASS))
+    path, by_class = caustics.image_rows(context, "lens", POINT, (BUILTIN, BY_CLASS))
+    assert path.broken[WELCH_ALARMS] == 0 and path.values["light missing"] > 0.5
+    assert by_class.values[WELCH_ALARMS] == 0 and abs(by_class.values["light missing"]) < 0.1
+    assert by_class.broken.keys() == {DETECTABLE} and path.images.keys() == {"reference", "test"}
+
+
+def test_scalar_variants_are_not_run(scalar_context):
+    (task,) = caustics.tasks(scalar_context())
+    (row,) = task.run()
+    assert row.verdict == "not run" and row.reason == caustics.SCALAR
