@@ -240,7 +240,7 @@ def test_what_is_missing_says_why_and_what_mends_it(scalar_variant):
     (text,) = missing_light(scene).values()
     assert text == (
         "light of PointLight that delta lobes (glass, mirrors, null) cast on other surfaces is black; "
-        "expected area lights in place of such lamps"
+        "expected refract_path with caustics = lamp, or area lights in place of such lamps"
     )
 
 
