@@ -327,7 +327,8 @@ def integrator_class(v: Variant) -> type:
 
         def to_string(self) -> str:
             depth = -1 if self.max_depth == UNLIMITED else self.max_depth
-            names = "rr_depth hide_emitters split_depth split_weight deterministic caustics light_paths".split()
+            names = ["rr_depth", "hide_emitters", "split_depth", "split_weight", "deterministic"]
+            names += ["caustics", "light_paths"]
             lines = [f"max_depth = {depth}", *(f"{name} = {getattr(self, name)}" for name in names)]
             return "RefractPath[\n" + "".join(f"  {x},\n" for x in [*lines, f"left out = {self.left_out()}"]) + "]"
 
