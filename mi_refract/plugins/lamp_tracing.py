@@ -391,8 +391,12 @@ class LampTracer:
         active_next &= (s.depth > 0) | mi.has_flag(bs.sampled_type, LOBES.Delta)
         if v.is_polarized:
             weight = si.to_world_mueller(weight, -si.wi, bs.wo)
+        # Shading normals n: |n·wi| |geometric·wo| / (|n·wo| |geometric·wi|).
+        geometric = _quotient(dr.abs(dr.dot(si.n, si.to_world(bs.wo))), dr.abs(dr.dot(si.n, s.ray.d)))
+        weight = weight * (geometric * _quotient(dr.abs(si.wi.z), dr.abs(bs.wo.z)))
+        if features.perturbed:
+            bs.wo, weight = self._own_normal(si, bsdf, bs, weight, s.ray.d, numbers, key + 1, active_next)
         ray = si.spawn_ray(si.to_world(bs.wo))
-        weight = self._toward_camera(si, bsdf, bs, weight, s.ray.d, ray.d, active_next)
         throughput = loop.times(weight, s.throughput)
         if features.dispersion:
             dispersed = (bs.sampled_type & DISPERSED) != 0
@@ -428,18 +432,22 @@ class LampTracer:
         s.skipped = dr.dot(ray.o - si.p, ray.d)
         return throughput
 
-    def _toward_camera(
-        self, si: Interaction, bsdf: Any, bs: Any, weight: Spectrum, arriving: Vector3, leaving: Vector3, active: Mask
-    ) -> Spectrum:
-        """The weight of a sample, corrected for shading normals n: |n·wi| |geometric·wo| / (|n·wo| |geometric·wi|)."""
-        upper, lower = dr.abs(dr.dot(si.n, leaving)), dr.abs(dr.dot(si.n, arriving))
-        corrected = weight * _quotient(upper * dr.abs(si.wi.z), lower * dr.abs(bs.wo.z))
-        if not self.features.perturbed:
-            return corrected
-        # The normal is known to the BSDF alone, which is evaluated as path tracing does.
-        smooth = active & mi.has_flag(bs.sampled_type, LOBES.Smooth)
-        value = self._radiance(si, bsdf, bs.wo, smooth) * _quotient(upper, lower * bs.pdf)
-        return dr.select(smooth, value, corrected)
+    def _own_normal(
+        self, si: Interaction, bsdf: Any, bs: Any, weight: Spectrum, arriving: Vector3, numbers: Any, key: Count,
+        active: Mask,
+    ) -> tuple[Vector3, Spectrum]:  # fmt: skip
+        """Direction and weight where the shading normal is the BSDF's own: evaluated as path tracing does.
+
+        Light may go there where the BSDF samples nothing for light that comes from the lamp. So one half of the
+        directions are those of a sample, and the other half all alike.
+        """
+        own = active & (mi.has_flag(bsdf.flags(), LOBES.Delta) ^ True)
+        choice, x, y = numbers.independent(key, 3)
+        wo = dr.select(choice < 0.5, bs.wo, self.v.warp.square_to_uniform_sphere(self.v.Point2f(x, y)))
+        density = (bsdf.pdf(self.context, si, wo, own) + 1 / (4 * math.pi)) / 2
+        cosines = _quotient(dr.abs(dr.dot(si.n, si.to_world(wo))), dr.abs(dr.dot(si.n, arriving)))
+        value = self._radiance(si, bsdf, wo, own) * (cosines / density)
+        return dr.select(own, wo, bs.wo), dr.select(own, value, weight)
 
     def _radiance(self, si: Interaction, bsdf: Any, wo: Vector3, active: Mask) -> Spectrum:
         """The BSDF times the cosine of wi, for light along −wi that leaves along wo, as path tracing evaluates it."""

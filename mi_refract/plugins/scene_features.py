@@ -59,7 +59,7 @@ class SceneFeatures:
     """Facts about a scene. `unknown`: the plugins that are not known, and so count as needing everything."""
 
     smooth: bool  # some BSDF has a lobe that is not a delta: then sampling emitters is worth while
-    delta_perturbed: str  # one that has it, and may have a shading normal of its own; "" where none is
+    delta_perturbed: str  # one within a BSDF with delta lobes that may have a shading normal of its own, or ""
     sampleable: bool  # some emitter can be sampled
     lamps: bool  # some emitter other than the environment can be
     area: bool  # some shape emits
@@ -145,6 +145,13 @@ def inspect(scene: Scene) -> SceneFeatures:
         for kind in (shapes[i].class_name(), *map(bsdf_name, within[i]))
         if kind in random
     )
+    perturbed = (
+        name
+        for each in within
+        if each and each[0].flags() & +mi.BSDFFlags.Delta
+        for name in map(bsdf_name, each)
+        if name not in KNOWN - PERTURBING
+    )
     everything = bool(unknown)
     lobes = mi.BSDFFlags
     flags = functools.reduce(operator.or_, (bsdf.flags() for bsdf in bsdfs), 0)
@@ -154,7 +161,7 @@ def inspect(scene: Scene) -> SceneFeatures:
     shape_media = any(shape.interior_medium() or shape.exterior_medium() for shape in shapes)
     return SceneFeatures(
         smooth=everything or bool(flags & +lobes.Smooth),
-        delta_perturbed=next((n for n in map(bsdf_name, filter(_has_delta, bsdfs)) if n not in KNOWN - PERTURBING), ""),
+        delta_perturbed=next(perturbed, ""),
         sampleable=bool(emitters),  # Mitsuba refuses a scene all of whose emitters have the weight 0
         lamps=any(not emitter.is_environment() and emitter.sampling_weight() > 0 for emitter in emitters),
         area=bool(opaque or lamps),
@@ -262,10 +269,6 @@ def nested(bsdf: BSDF) -> Iterator[BSDF]:
     for child in children(bsdf):
         if hasattr(child, "eval_null_transmission"):
             yield from nested(child)
-
-
-def _has_delta(bsdf: BSDF) -> bool:
-    return bool(bsdf.flags() & +mi.BSDFFlags.Delta)
 
 
 def _black(bsdf: BSDF) -> bool:

@@ -135,6 +135,7 @@ def test_what_is_not_known_needs_everything(scalar_variant):
     group = {"type": "shapegroup", "id": "group", "a": {"type": "sphere", "bsdf": BLACK}}
     instance = {"type": "instance", "group": {"type": "ref", "id": "group"}}
     assert facts(group=group, instance=instance) == EVERYTHING | {"area"}
+    assert {*needs(group=group, instance=instance, lamp=POINT).missing(volumes=True)} == {CAST}
     group["a"]["interior"] = MEDIUM
     assert facts(group=group, instance=instance) == EVERYTHING | {"area", "media"}
 
@@ -254,9 +255,12 @@ def test_what_is_predicted_is_black_and_a_tracer_from_the_lamp_finds_it(lamp, bs
     assert ours.mean() == (0 if missing_light(scene) else pytest.approx(theirs.mean(), rel=0.1))
 
 
-@pytest.mark.parametrize(("integrator", "black"), [("prb", True), ("prb_projective", True), ("prbvolpath", False)])
-def test_what_is_predicted_of_integrators_for_derivatives_is_black(integrator, black, llvm_variant):
-    scene = under_a_pane(POINT, CLEAR, integrator)
+@pytest.mark.parametrize(
+    ("integrator", "bsdf", "black"),
+    [("prb", CLEAR, True), ("prb_projective", CLEAR, True), ("prbvolpath", CLEAR, False), ("prbvolpath", GLASS, True)],
+)
+def test_what_is_predicted_of_integrators_for_derivatives_is_black(integrator, bsdf, black, llvm_variant):
+    scene = under_a_pane(POINT, bsdf, integrator)
     assert bool(missing_light(scene)) == (np.array(mi.render(scene, spp=4)).max() == 0) == black
 
 
