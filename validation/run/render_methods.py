@@ -28,7 +28,7 @@ class Method:
     name: str
     integrator: str
     bsdf: str
-    parameters: dict[str, int | str] = field(default_factory=dict)
+    parameters: dict[str, float | str] = field(default_factory=dict)
 
     def plugin(self, max_depth: int) -> dict[str, Any]:
         """For `mi.load_dict`; without Russian roulette, as in the scene files."""
