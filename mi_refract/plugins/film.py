@@ -41,7 +41,8 @@ class Splats:
         self.count = self.width * self.height * channels
         if self.vectorised:
             self.wide: Any = dr.uint64_array_t(v.Float)
-            self.digits = dr.zeros(self.wide, self.count * digits)
+            kind: Any = self.wide
+            self.digits: Any = dr.zeros(kind, self.count * digits)
             dr.make_opaque(self.digits)
             self.beyond = dr.opaque(v.UInt32, 0, self.count)  # splats that are too large, or not finite
         else:
