@@ -40,7 +40,7 @@ LEAST_PIXELS, LEAST_SPP = 128, 16  # of a batch
 LARGEST, TIMED = 2**20, 2**16  # samples of a batch, and of one whose time is measured on processors
 BATCHES = 8
 COPIES = 2  # of a pixel
-Z, CLEARLY = 1.96, 1.0  # standard deviations: of the interval, 95 % of a normal distribution; of a preference
+Z, CLEARLY = 1.96, 0.7  # standard deviations: of the interval, 95 % of a normal distribution; of a preference
 # The relative standard error of the least time of one batch; of k batches it is 1/√k of that.
 TIME_ERROR = 0.05
 ROUNDING = 1e-5  # of a pixel's brightness: noise that is no more is none
@@ -147,11 +147,11 @@ def choose(pilot: Pilot) -> Choice:
 
     ValueError where no light is seen; RuntimeError of Mitsuba.
     """
-    race, best = Race(pilot.measure, pilot.allowed), dict[str, str]()
+    race, best = Race(pilot.measure, pilot.allowed), Settings()
     for i, options in enumerate(STEPS):
         merged = [{**best, **option} for option in options if pilot.usable(option)]
         changed = [{name: value for name, value in each.items() if pilot.own.get(name) != value} for each in merged]
-        best = {**race.best(changed if best in changed else [best, *changed], (i + 1) / len(STEPS))}
+        best = race.best(changed if best in changed else [best, *changed], (i + 1) / len(STEPS))
     if race.of(settings_text(best), OWN, CLEARLY).high >= 1:
         best = {}
     if not any(batch.light for batches in race.batches.values() for batch in batches):

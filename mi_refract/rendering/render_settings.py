@@ -7,8 +7,8 @@ parameters in what Mitsuba's parser has read; the file stays as it is. Parameter
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import replace
+from typing import TypeAlias
 
 from mi_refract.plugins import scene_parser
 from mi_refract.plugins.scene_parser import Node, ParsedScene
@@ -19,7 +19,7 @@ INTEGRATORS = ("path", "refract_path")
 NAMES = {"sampler": "|".join(SAMPLERS), "integrator": "|".join(INTEGRATORS), "split_depth": "[0-9]{1,2}"}
 _SHARED = ("sample_count", "seed")  # parameters of every sampler
 _SPLITTING = ("split_depth", "split_weight")  # of `refract_path`, which `path` does not have
-Settings = Mapping[str, str]  # by NAMES; {}: the scene's own
+Settings: TypeAlias = dict[str, str]  # by NAMES; {}: the scene's own
 
 
 def parse_settings(text: str) -> Settings:
