@@ -9,8 +9,9 @@ the same pixels. So of two of them the ratio of the costs has an interval from w
     log (σ²/σ'²) ± z s,    s² = Var(v/σ² − v'/σ'²) / n,    v: estimates of the n pixels, σ²: their mean
 
 Candidates of a step run in turn, in batches of twice as many pixels each time; one whose interval, relative to the
-cheapest, lies above 1 is dropped. A stratified sampler is measured with as many samples as a pass of the render has.
-The pilot's samples are not in the image, so it stays unbiased.
+cheapest, lies above 1 is dropped. A sampler is measured with as many samples as a pass of the render has, as strata
+depend on it; with fewer, 16 at least, where the pilot would be too long. The scene's own settings stay where the best
+are not clearly cheaper. The pilot's samples are not in the image, so it stays unbiased.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ LEAST_PIXELS, LEAST_SPP = 128, 16  # of a batch
 LARGEST, TIMED = 2**20, 2**16  # samples of a batch, and of one whose time is measured on processors
 BATCHES = 8
 COPIES = 2  # of a pixel
-Z, CLEARLY = 1.96, 0.7  # standard deviations: of the interval, 95 % of a normal distribution; of a preference
+# Standard deviations: of the intervals, 95 % of a normal distribution; and of a difference that decides. Where it is
+# none, either choice costs the same.
+Z, CLEARLY = 1.96, 0.7
 # The relative standard error of the least time of one batch; of k batches it is 1/√k of that.
 TIME_ERROR = 0.05
 ROUNDING = 1e-5  # of a pixel's brightness: noise that is no more is none

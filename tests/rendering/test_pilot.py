@@ -7,6 +7,7 @@ import math
 import re
 from types import SimpleNamespace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from support.renders import BALL, GLASS, SCENES, pixels
@@ -236,6 +237,19 @@ def test_what_a_pilot_cannot_choose_for_is_an_error_and_nothing_is_written(tmp_p
     assert (
         message in str(error.value) and "\n" not in str(error.value) and [*tmp_path.iterdir()] == [tmp_path / "a.xml"]
     )
+
+
+def test_a_sampler_that_is_not_mitsubas_is_an_error(tmp_path, llvm):
+    class Fixed(mi.Sampler):
+        pass
+
+    mi.register_sampler("fixed", Fixed)
+    (tmp_path / "a.xml").write_text(GLASS.replace('sampler type="independent"', 'sampler type="fixed"'))
+    job = Job(tmp_path / "a.xml", allow_plugins=["fixed"], settings=AUTO)
+    with pytest.raises(
+        ValueError, match=r"the scene's sampler is fixed; expected independent, .*, or settings by name"
+    ):
+        resume(job, tmp_path / "a.exr", Limits(spp=4, pass_spp=4))
 
 
 def test_a_scene_with_another_integrator_keeps_it(tmp_path, llvm):
