@@ -65,6 +65,7 @@ class SceneFeatures:
     media: bool  # some shape, sensor or emitter has a medium of Mitsuba's
     shape_media: bool  # some shape has one
     refracting: bool  # some BSDF has a refracted direction
+    splitting: bool  # some shape's BSDF is of `BOUNDARIES`
     chance: str  # the first plugin that is not of `DETERMINISTIC`, and its shape; "" where there is none
     unknown: tuple[str, ...] = ()
 
@@ -133,6 +134,7 @@ def inspect(scene: Scene) -> SceneFeatures:
         media=shape_media or any(end.get_medium() for end in (*emitters, *scene.sensors())),
         shape_media=shape_media,
         refracting=everything or bool(flags & +lobes.Transmission),
+        splitting=any(bsdf_name(bsdf) in BOUNDARIES for each in within for bsdf in each[:1]),
         chance=next(chance, ""),
         unknown=unknown,
     )

@@ -26,8 +26,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refract.plugins import scene_parser
-from mi_refract.plugins.scene_features import BOUNDARIES, all_shapes, bsdf_name, inspect
+from mi_refract.plugins import inspect, scene_parser
 from mi_refract.plugins.scene_parser import ParsedScene
 
 from .pass_plan import MASK, PassPlan, seed_of
@@ -50,7 +49,7 @@ ROUNDING = 1e-5  # of a pixel's brightness: noise that is no more is none
 # What is tried, step by step, with the best of the steps before: in each the first that is not clearly dearer than the
 # cheapest. The scene's own settings are always among them.
 STEPS: tuple[tuple[Settings, ...], ...] = (
-    tuple({"sampler": name} for name in ("multijitter", "stratified", "ldsampler", "orthogonal", "independent")),
+    tuple({"sampler": name} for name in SAMPLERS),
     (*({"integrator": "refract_path", "split_depth": str(depth)} for depth in range(4)), {"integrator": "path"}),
 )
 
@@ -99,7 +98,7 @@ def ratio(batches: list[Batch], others: list[Batch], z: float = Z) -> Ratio:
     return Ratio(value, value / factor, value * factor, float(variance), float(seconds))
 
 
-@dataclass
+@dataclass(frozen=True)
 class Race:
     """Candidates against each other. `measure` renders batch number … by settings; batches are kept.
 
@@ -109,7 +108,11 @@ class Race:
     measure: Callable[[Settings, int], Batch]
     allowed: Callable[[float], float]
     batches: dict[str, list[Batch]] = field(default_factory=dict)  # by the text of the settings
-    took: float = 0.0
+
+    @property
+    def took(self) -> float:
+        """Seconds so far."""
+        return sum(batch.took for batches in self.batches.values() for batch in batches)
 
     def best(self, candidates: list[Settings], share: float = 1.0) -> Settings:
         """The first that is not dearer than the cheapest by CLEARLY. `share`: of the seconds, so far."""
@@ -119,7 +122,6 @@ class Race:
                 mine = self.batches.setdefault(name, [])
                 if len(mine) <= number:
                     mine.append(self.measure(candidate, number))
-                    self.took += mine[-1].took
             least = self.cheapest(list(left))
             left = {n: c for n, c in left.items() if self.of(n, least).low <= 1}
             predicted = sum(2 * self.batches[name][number].took for name in left)
@@ -199,7 +201,7 @@ class Pilot:
             expected = f"{', '.join(SAMPLERS)}, or settings by name"
             raise ValueError(f"{what}: the scene's sampler is {self.own['sampler']}; expected {expected}")
         features = inspect(renderer.scene)
-        self.splits = any(bsdf_name(shape.bsdf()) in BOUNDARIES for shape in all_shapes(renderer.scene) if shape.bsdf())
+        self.splits = features.splitting
         self.same_image = not (features.absorbing or features.dispersive or features.media)  # `path` ignores these
         node = integrator_node(parsed, {})
         self.swappable = node is not None and not any(

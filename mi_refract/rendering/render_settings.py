@@ -14,7 +14,7 @@ from mi_refract.plugins import scene_parser
 from mi_refract.plugins.scene_parser import Node, ParsedScene
 
 AUTO, OWN = "auto", "the scene's own"
-SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
+SAMPLERS = ("multijitter", "stratified", "ldsampler", "orthogonal", "independent")  # the first that is as good as any
 INTEGRATORS = ("path", "refract_path")
 NAMES = {"sampler": "|".join(SAMPLERS), "integrator": "|".join(INTEGRATORS), "split_depth": "[0-9]{1,2}"}
 _SHARED = ("sample_count", "seed")  # parameters of every sampler

@@ -107,7 +107,7 @@ BAD = {
     "nothing": ("", "''; expected auto, or sampler=…, integrator=…, split_depth=…"),
     "an unknown name": ("smapler=independent", "expected auto, or sampler=…"),
     "auto and more": ("auto,split_depth=1", "'auto'; expected"),
-    "an unknown sampler": ("sampler=sobol", "sampler = 'sobol'; expected independent, stratified"),
+    "an unknown sampler": ("sampler=sobol", "sampler = 'sobol'; expected multijitter, stratified"),
     "an unknown integrator": ("integrator=volpath", "integrator = 'volpath'; expected path, refract_path"),
     "no depth": ("split_depth=", "split_depth = ''; expected 0 to 12"),
     "a negative depth": ("split_depth=-1", "split_depth = '-1'; expected 0 to 12"),
@@ -247,7 +247,7 @@ def test_a_sampler_that_is_not_mitsubas_is_an_error(tmp_path, llvm):
     (tmp_path / "a.xml").write_text(GLASS.replace('sampler type="independent"', 'sampler type="fixed"'))
     job = Job(tmp_path / "a.xml", allow_plugins=["fixed"], settings=AUTO)
     with pytest.raises(
-        ValueError, match=r"the scene's sampler is fixed; expected independent, .*, or settings by name"
+        ValueError, match=r"the scene's sampler is fixed; expected multijitter, .*, or settings by name"
     ):
         resume(job, tmp_path / "a.exr", Limits(spp=4, pass_spp=4))
 
