@@ -35,7 +35,7 @@ from .render_pass import PassRenderer, samples_of_pixels, set_spp
 from .render_settings import AUTO, OWN, SAMPLERS, Settings, integrator_node, own_settings, settings_text
 
 SHARE = 0.05  # of the render, which the pilot takes at most, once each candidate has had its first batch
-OPEN_SAMPLES = 2**22  # of which it takes as much time where the render's number of samples is not known
+OPEN_SAMPLES = 2**20  # of which it takes as much time where the render's number of samples is not known
 LEAST_PIXELS, LEAST_SPP = 128, 16  # of a batch
 LARGEST, TIMED = 2**20, 2**16  # samples of a batch, and of one whose time is measured on processors
 BATCHES = 8
