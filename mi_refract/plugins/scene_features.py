@@ -78,6 +78,7 @@ class SceneFeatures:
     refracting: bool  # some BSDF has a refracted direction
     delta: bool  # some BSDF has a delta lobe other than a null lobe
     zero_size: tuple[str, ...]  # the classes of the emitters whose light has one position, or one direction at each
+    splitting: bool  # some shape's BSDF is of `BOUNDARIES`
     chance: str  # the first plugin that is not of `DETERMINISTIC`, and its shape; "" where there is none
     unknown: tuple[str, ...] = ()
 
@@ -190,6 +191,7 @@ def inspect(scene: Scene) -> SceneFeatures:
         refracting=everything or bool(flags & +lobes.Transmission),
         delta=everything or bool(flags & +(lobes.DeltaReflection | lobes.DeltaTransmission)),
         zero_size=tuple(sorted({lamp.class_name() for lamp in points if lamp.sampling_weight() > 0})),
+        splitting=any(bsdf_name(bsdf) in BOUNDARIES for each in within for bsdf in each[:1]),
         chance=next(chance, ""),
         unknown=unknown,
     )
