@@ -196,7 +196,8 @@ def test_results_name_pack_and_answers_and_can_be_repeated(pack, answers, run):
     index = hashlib.sha256(Path(INDEX).read_bytes()).hexdigest()
     of_rays, of_images = json.loads(texts[0]), json.loads(texts[2])
     assert of_rays["pack"] == {"version": of_rays["version"], "sha256": index, "path": "rays/f64.csv"}
-    assert of_rays["command"] == commands[0] and of_images["pack"] == of_rays["pack"] | {"path": "images"}
+    assert [of_rays["command"], of_images["command"]] == commands
+    assert (of_images["version"], of_images["pack"]) == (of_rays["version"], of_rays["pack"] | {"path": "images"})
     digest = hashlib.sha256(Path("answers.csv").read_bytes()).hexdigest()
     assert of_rays["functions"][0]["answers_sha256"] == digest
     for entry in msgspec.convert(of_images, results_file.Document).results:
