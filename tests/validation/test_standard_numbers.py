@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.readme import DOCS
 
 from mi_refract import media
 from mi_refract.ray_sets import ray_set
@@ -49,8 +50,6 @@ KNOWN = {
     "rainbow of order 2, n = 1.3318": 50.58,
     "rainbow of order 1, n = 1.3435": 40.58,
     "rainbow of order 2, n = 1.3435": 53.61,
-    "glTF dispersion, sample, n_C": 2.40709,
-    "glTF dispersion, sample, n_F": 2.43291,
 }
 
 
@@ -69,6 +68,13 @@ def test_the_table_is_plain_data_with_unique_names_and_every_number_says_where_i
     writer.writerows(rows)
     assert all(row["source"] and row["law"] and row["kind"] in table.KINDS and row["given"] for row in rows)
     assert {row["kind"] for row in rows} == set(table.KINDS)
+
+
+def test_an_index_is_measured_of_a_glass_that_the_plugin_knows_and_glTFs_sample_is_only_quoted():
+    glasses = {number.medium.format(**number.given) for number in NUMBERS.values() if number.kind == "index"}
+    assert glasses == {*(f"SCHOTT:{name}" for name in table.GLASSES), "abbe(2.42, 55.0)"}
+    page = (DOCS / "reference/standard-numbers.md").read_text()
+    assert all(f"{2.42 + sign * (2.42 - 1) * 0.025 * 20 / 55:.5f}" in page for sign in (-1, 1))
 
 
 @pytest.mark.parametrize("name", [name for name, number in NUMBERS.items() if number.printed])

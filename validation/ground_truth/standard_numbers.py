@@ -382,13 +382,11 @@ def index(group: Sequence[StandardNumber], samples: int) -> Answers:
 
     (number,) = group
     given, nm = number.given, number.given["nm"]
-    medium = number.medium.format(**given)
-    if number.law is table.khronos_sample:
-        ends = {w: float(number.at(nm=w)) for w in (486.13, 656.27)}
-        medium = f"hold(table(486.13: {ends[486.13]!r}, 587.56: {given['n_d']!r}, 656.27: {ends[656.27]!r}))"
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi, si.wavelengths = mi.Vector3f(0, 0, 1), type(si.wavelengths)(nm)
-    sample, _ = mi.load_dict(glass(PLUGIN, medium)).sample(followed_context(), si, 1 - 2 * U, [0.5, 0.5])
+    sample, _ = mi.load_dict(glass(PLUGIN, number.medium.format(**given))).sample(
+        followed_context(), si, 1 - 2 * U, [0.5, 0.5]
+    )
     bound = U * (3 * number.value + number.slope("nm") * nm)
     if number.law is table.khronos:
         bound += (given["n_d"] - 1) / given["abbe"] * (0.5 / nm**2 + 0.5e-4)
