@@ -206,6 +206,32 @@ def test_the_double_gauss_is_within_its_bounds_and_another_glass_by_twice_that_i
     assert [x.name for x in numbers if not seen(x, wrong[x.name], found[x.name].bound)] == []
 
 
+LENS = [(1, lambda path: table.behind_the_lens(path, 1, 0)), (5, lambda path: table.behind_the_lens(path, 5, 1))]
+TRACED = {  # a bench, and what is read of its rays
+    "prism": lambda: study.angle_read(NUMBERS["prism of 60°, n = 1.5"]),
+    "drop": lambda: study.angle_read(NUMBERS["rainbow of order 2, n = 1.3333"]),
+    "double Gauss": lambda: (bench.benches()["double Gauss"], LENS),
+}
+
+
+@pytest.mark.parametrize("name", TRACED)
+def test_independent_roundings_stay_within_the_bound_of_a_ray_and_are_not_far_from_it(name):
+    case, readings = TRACED[name]()
+    bounds, rng, sizes = study.read_bounds(case, readings), np.random.default_rng(3), case.roundings()
+    exact, ratios = case.system.path(), []
+    counts = {key: round(bench.COUNTS[key[1]] if key[0] >= 0 else bench.FIRST) for key in sizes}
+    for _ in range(60):
+        shifts = {
+            key: size / counts[key] * rng.uniform(-1, 1, (counts[key], len(size), 3)).sum(0)
+            for key, size in sizes.items()
+        }
+        path = case.system.path(moved=lambda j, what, x, axis, s=shifts: x + s.get((j, what), 0))
+        ratios += [
+            abs(float(read(path) - read(exact))) / bound for (_, read), bound in zip(readings, bounds, strict=True)
+        ]
+    assert 0.2 < max(ratios) < 1
+
+
 def test_a_bound_that_would_hold_whatever_comes_fails():
     for number in NUMBERS.values():
         if "n" in number.given and not study.noisy(number):
