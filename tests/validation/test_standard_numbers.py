@@ -281,6 +281,50 @@ def test_a_textbooks_formula_is_within_the_bounds_of_rays_and_an_index_off_by_tw
     assert [name for name, row in rows(share).items() if row.broken != {"error / bound": 1.0}] == []
 
 
+def boundary(precision, share=0.0):
+    """Fresnel's equations as a program that answers what is reflected; the denser index is off by a share of it."""
+    real = np.float32 if precision == "f32" else np.float64
+
+    def reflect(rays):
+        c, k = -rays.rays.a[:, 2], rays.rays.k.astype(real)
+        n = (1 / (np.where(k > 1, k * (1 + share), k / (1 + share)))).astype(real)
+        root = np.sqrt((n * n - (1 - c * c)).astype(np.complex64 if precision == "f32" else complex))
+        s, p = (c - root) / (c + root), (n * n * c - root) / (n * n * c + root)
+        return {"s": np.abs(s) ** 2, "p": np.abs(p) ** 2, "phase": np.angle(p / s)}
+
+    return reflect
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_fresnels_equations_are_within_the_bounds_of_a_boundary_and_an_index_off_by_twice_them_is_seen(precision):
+    numbers = others.reflected(("p", "phase"))
+
+    def rows(share):
+        found = others.measure_reflected(numbers, precision, boundary(precision, share))
+        return {x.name: others.row(x, "a program", precision, *found[x.name], "") for x in numbers}
+
+    assert {x.kind for x in numbers} == {"Brewster's angle", "retardation", "diffuse"}
+    right, tiny = rows(0.0), 1e-4 if precision == "f32" else 1e-9
+    assert [name for name, row in right.items() if row.verdict != "pass"] == []
+    moved = {name: abs(row.values["measured"] - right[name].values["measured"]) for name, row in rows(tiny).items()}
+    flat = "largest retardation, n = 1.51"  # stationary in the incidence, not in the index
+    for name in {*moved} - {flat}:
+        share = 2.5 * right[name].values["bound"] / moved[name] * tiny
+        assert share < 20 * tiny and rows(share)[name].broken == {"error / bound": 1.0}, name
+
+
+def test_a_program_that_answers_reflectances_is_asked_and_one_that_leaves_some_out_fails(tmp_path, monkeypatch):
+    title, *rest = others.FRESNEL
+    context = here("quick", tmp_path, "scalar_rgb")
+    rows = others.fresnel_rows(title, context)
+    assert len(rows) == 9 and {row.verdict for row in rows} == {"pass"}
+    monkeypatch.setattr(others.environments, "run", lambda *_: '{"system": "one", "s": [], "p": [0.5]}')
+    (row,) = others.fresnel_rows(title, context)
+    assert row.broken == {"unanswered": 0.0} and row.reason == "answers s, p; expected 517 each of s, p, phase"
+    monkeypatch.setattr(others.environments, "absent", lambda system: "install it")
+    assert all(row.verdict == "not run" for name in rest for row in others.fresnel_rows(name, context))
+
+
 def test_an_index_of_a_catalogue_is_the_printed_one_and_another_or_none_is_seen():
     numbers = [x for x in others.of_kind("index") if x.medium.startswith("SCHOTT:")]
     media, lines = list(dict.fromkeys(x.medium for x in numbers)), list(table.LINES.values())
