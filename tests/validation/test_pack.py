@@ -164,7 +164,7 @@ def test_the_javascript_of_the_readme_answers_rightly(pack, run):
 
 def test_the_glsl_of_the_readme_compiles(pack):
     if not shutil.which("glslangValidator"):
-        pytest.skip("no glslangValidator in PATH")
+        pytest.skip("no glslangValidator in PATH; Debian: glslang-tools")
     Path("read.comp").write_text(*blocks(pack / "README.md", "glsl"))
     assert subprocess.run(["glslangValidator", "read.comp"], timeout=60).returncode == 0
 
