@@ -318,9 +318,14 @@ def test_a_program_that_answers_reflectances_is_asked_and_one_that_leaves_some_o
     context = here("quick", tmp_path, "scalar_rgb")
     rows = others.fresnel_rows(title, context)
     assert len(rows) == 9 and {row.verdict for row in rows} == {"pass"}
-    monkeypatch.setattr(others.environments, "run", lambda *_: '{"system": "one", "s": [], "p": [0.5]}')
-    (row,) = others.fresnel_rows(title, context)
-    assert row.broken == {"unanswered": 0.0} and row.reason == "answers s, p; expected 517 each of s, p, phase"
+    for text, reason in {
+        '{"system": "one", "s": [], "p": [0.5], "phase": [0]}': "[(0,), (1,), (1,)] answers; expected 517",
+        '{"system": "one", "s": []}': "no answer: KeyError('p'); expected system, s, p, phase in JSON",
+        "[]": "no answer: TypeError('list indices must be integers or slices, not str'); expected system, s, p, phase",
+    }.items():
+        monkeypatch.setattr(others.environments, "run", lambda *_, text=text: text)
+        (row,) = others.fresnel_rows(title, context)
+        assert row.broken == {"unanswered": 0.0} and row.reason.startswith(reason)
     monkeypatch.setattr(others.environments, "absent", lambda system: "install it")
     assert all(row.verdict == "not run" for name in rest for row in others.fresnel_rows(name, context))
 

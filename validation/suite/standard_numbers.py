@@ -276,11 +276,15 @@ def fresnel_rows(title: str, context: Context) -> list[Row]:
     made = functools.partial(Row, NAME, title, "every boundary", asked.precision)
 
     def reflect(rays: RaySet) -> dict[str, Any]:
-        found = json.loads(environments.run(environments.script(system, *asked.script), as_csv(rays)))
-        versions.append(str(found.pop("system")))
-        if {key: len(x) for key, x in found.items()} != dict.fromkeys(asked.answers, len(rays)):
-            raise ValueError(f"answers {', '.join(found)}; expected {len(rays)} each of {', '.join(asked.answers)}")
-        return {key: np.array(x, float) for key, x in found.items()}
+        data = json.loads(environments.run(environments.script(system, *asked.script), as_csv(rays)))
+        try:
+            versions.append(str(data["system"]))
+            found = {key: np.array(data[key], float) for key in asked.answers}
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"no answer: {error!r}; expected system, {', '.join(asked.answers)} in JSON") from None
+        if {x.shape for x in found.values()} != {(len(rays),)}:
+            raise ValueError(f"{[x.shape for x in found.values()]} answers; expected {len(rays)} numbers of each")
+        return found
 
     lost, reason = ("unanswered", float(len(numbers))), environments.why_not(system, context.profile.name)
     answer = functools.partial(measure_reflected, numbers, asked.precision, reflect)
@@ -328,11 +332,8 @@ def reflections(number: StandardNumber, dtype: Any) -> tuple[Any, float, Read]:
     """
     n = number.given["n"]
     if number.kind == "Brewster's angle":
-        return (
-            np.cos(np.deg2rad(number.value + np.linspace(-REACH, REACH, GRID))),
-            n,
-            functools.partial(_shifted, number),
-        )
+        angles = number.value + np.linspace(-REACH, REACH, GRID)
+        return np.cos(np.deg2rad(angles)), n, functools.partial(_shifted, number)
     if number.kind == "retardation":
         count, angle = number.given["reflections"], number.given["incidence"]
 
@@ -369,10 +370,8 @@ def share_of(into: Any, cosine: Any) -> np.ndarray:
 def slopes(into: float, cosine: Any) -> list[np.ndarray]:
     """∂R/∂ln of the cosine and of the index, 2 × N each, in extended precision."""
     up = 1 + np.longdouble(1e-12)
-    ends = [
-        [share_of(into * x, cosine * y) for x, y in way] for way in (((1, up), (1, 1 / up)), ((up, 1), (1 / up, 1)))
-    ]
-    return [(high - low) / (2 * (up - 1)) for high, low in ends]
+    ways = (1, up), (up, 1)
+    return [(share_of(into * x, cosine * y) - share_of(into / x, cosine / y)) / (2 * (up - 1)) for x, y in ways]
 
 
 # Glasses ---------------------------------------------------------------------------------------------------------
