@@ -178,17 +178,25 @@ def integrator_class(v: Variant) -> type:
             return film.develop() if develop else v.TensorXf()
 
         def caustic_image(
-            self, scene: Scene, sensor: Sensor, seed: int, spp: int, channels: tuple[str, ...], *, squares: bool = False
+            self,
+            scene: Scene,
+            sensor: Sensor,
+            seed: int,
+            spp: int,
+            channels: tuple[str, ...],
+            *,
+            squares: bool = False,
+            paths: int = 0,
         ) -> Any:
             """The lamps' part of the image of a render that has begun; None where path tracing has all of it.
 
-            `lamp_tracing.lamp_image` says what it is.
+            `lamp_tracing.lamp_image` says what it is. `paths`: of light, where they are not those of `spp`.
             """
             loop = next((loop for loop in self.loops if loop.features.caustics_apart), None)
             if loop is None:
                 return None
             tracer = lamp_tracing.LampTracer(loop, sensor, lambda ray: self.camera_medium(scene, ray, None))
-            paths = max(1, round(self.light_paths * spp * tracer.camera.width * tracer.camera.height))
+            paths = paths or max(1, round(self.light_paths * spp * tracer.camera.width * tracer.camera.height))
             return lamp_tracing.lamp_image(tracer, seed, paths, channels, squares=squares)
 
         def aov_names(self) -> list[str]:

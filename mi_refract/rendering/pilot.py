@@ -26,12 +26,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refract.plugins import inspect, scene_parser
+from mi_refract.plugins import inspect, missing_light, scene_parser
 from mi_refract.plugins.scene_parser import ParsedScene
 
 from .pass_plan import MASK, PassPlan, seed_of
 from .pass_sums import Doubles
-from .render_pass import PassRenderer, samples_of_pixels, set_spp
+from .render_pass import PassRenderer, quiet, samples_of_pixels, set_spp
 from .render_settings import AUTO, OWN, SAMPLERS, Settings, integrator_node, own_settings, settings_text
 
 SHARE = 0.05  # of the render, which the pilot takes at most, once each candidate has had its first batch
@@ -39,6 +39,7 @@ OPEN_SAMPLES = 2**20  # of which it takes as much time where the render's number
 LEAST_PIXELS, LEAST_SPP = 128, 16  # of a batch
 LARGEST, TIMED = 2**20, 2**16  # samples of a batch, and of one whose time is measured on processors
 BATCHES = 8
+LEAST_LIGHT_PATHS = 2**14
 COPIES = 2  # of a pixel
 # Standard deviations: of the intervals, 95 % of a normal distribution; and of a difference that decides. Where it is
 # none, either choice costs the same.
@@ -48,8 +49,10 @@ TIME_ERROR = 0.05
 ROUNDING = 1e-5  # of a pixel's brightness: noise that is no more is none
 # What is tried, step by step, with the best of the steps before: in each the first that is not clearly dearer than the
 # cheapest. The scene's own settings are always among them.
+CAUSTICS: Settings = {"integrator": "refract_path", "caustics": "lamp"}
 STEPS: tuple[tuple[Settings, ...], ...] = (
     tuple({"sampler": name} for name in SAMPLERS),
+    (CAUSTICS,),
     (*({"integrator": "refract_path", "split_depth": str(depth)} for depth in range(4)), {"integrator": "path"}),
 )
 
@@ -102,11 +105,12 @@ def ratio(batches: list[Batch], others: list[Batch], z: float = Z) -> Ratio:
 class Race:
     """Candidates against each other. `measure` renders batch number … by settings; batches are kept.
 
-    `allowed`: seconds in all, given those of a pixel in a pass by the scene's own settings.
+    `allowed`: seconds in all, given those of a pixel in a pass by the settings `own`, from which it starts.
     """
 
     measure: Callable[[Settings, int], Batch]
     allowed: Callable[[float], float]
+    own: str = OWN
     batches: dict[str, list[Batch]] = field(default_factory=dict)  # by the text of the settings
 
     @property
@@ -125,7 +129,7 @@ class Race:
             least = self.cheapest(list(left))
             left = {n: c for n, c in left.items() if self.of(n, least).low <= 1}
             predicted = sum(2 * self.batches[name][number].took for name in left)
-            seconds = min(batch.seconds for batch in self.batches[OWN])
+            seconds = min(batch.seconds for batch in self.batches[self.own])
             if len(left) == 1 or self.took + predicted > share * self.allowed(seconds):
                 break
         return next(c for n, c in left.items() if self.of(n, least, CLEARLY).low <= 1)
@@ -150,27 +154,29 @@ class Choice:
 def choose(pilot: Pilot) -> Choice:
     """Try STEPS. Settings that are the scene's own are not among those that are chosen.
 
+    Where lamps can be traced that path tracing does not find, they are, whatever it costs.
     ValueError where no light is seen; RuntimeError of Mitsuba.
     """
-    race, best = Race(pilot.measure, pilot.allowed), Settings()
+    start = best = pilot.start
+    race = Race(pilot.measure, pilot.allowed, settings_text(start))
     for i, options in enumerate(STEPS):
-        merged = [{**best, **option} for option in options if pilot.usable(option)]
+        merged = [each for option in options if pilot.usable(each := {**best, **option})]
         changed = [{name: value for name, value in each.items() if pilot.own.get(name) != value} for each in merged]
         best = race.best(changed if best in changed else [best, *changed], (i + 1) / len(STEPS))
-    if race.of(settings_text(best), OWN, CLEARLY).high >= 1:
-        best = {}
+    if race.of(settings_text(best), race.own, CLEARLY).high >= 1:
+        best = start
     if not any(batch.light for batches in race.batches.values() for batch in batches):
         raise ValueError(f"--settings {AUTO}: the pilot sees no light; expected some, or settings by name")
-    costs = {name: vars(race.of(name, OWN)) for name in race.batches}
+    costs = {name: vars(race.of(name, race.own)) for name in race.batches}
     rounded = {name: {key: float(f"{value:.3g}") for key, value in cost.items()} for name, cost in costs.items()}
-    return Choice(best, {"seconds": float(f"{race.took:.3g}"), "costs": rounded})
+    return Choice(best, {"seconds": float(f"{race.took:.3g}"), "of": race.own, "costs": rounded})
 
 
 def lines_of(figures: dict[str, Any]) -> list[str]:
     """A line for each candidate of `Choice.figures`."""
     return [
         f"cost {cost['value']:g} ({cost['low']:g} to {cost['high']:g}), variance {cost['variance']:g} and time "
-        f"{cost['time']:g} of {OWN}: {name}"
+        f"{cost['time']:g} of {figures['of']}: {name}"
         for name, cost in sorted(figures["costs"].items(), key=lambda item: -float(item[1]["value"]))
     ]
 
@@ -213,17 +219,34 @@ class Pilot:
         self._samplers: dict[str, Any] = {}
         self._integrators: dict[str, Any] = {}
         self._seconds: dict[str, float] = {}  # of a pixel in a pass
+        self._lamps: dict[Any, tuple[Doubles, float]] = {}  # by integrator: see `_trace_lamps`
+        changed = {name: value for name, value in CAUSTICS.items() if self.own.get(name) != value}
+        self.start: Settings = changed if missing_light(renderer.scene) and self.usable(CAUSTICS) else {}
 
-    def usable(self, option: Settings) -> bool:
-        """Whether an option of STEPS can be rendered here, and gives the same image but for noise."""
-        if "sampler" in option:
+    def usable(self, settings: Settings) -> bool:
+        """Whether settings can be rendered here, and give the same image but for noise and light that was missing."""
+        if "sampler" in settings:
             try:
-                self._sampler(option)
+                self._sampler(settings)
             except ValueError:  # not with as many samples as a pass shall have
-                return option["sampler"] == self.own["sampler"]
+                if settings["sampler"] != self.own["sampler"]:
+                    return False
+        if not settings.keys() - {"sampler"}:
             return True
-        same = option["integrator"] == self.own.get("integrator")
-        return self.swappable and (same or self.same_image) and (self.splits or option.get("split_depth", "0") == "0")
+        every = self.own | settings
+        if not self.swappable or not (every["integrator"] == self.own["integrator"] or self.same_image):
+            return False
+        traced = every.get("caustics", "path") != "path"
+        if every["integrator"] == "path":
+            return not traced
+        return (self.splits or every.get("split_depth", "0") == "0") and (not traced or self._lamps_traceable())
+
+    def _lamps_traceable(self) -> bool:
+        scene, integrator = self.renderer.scene, self._integrator(CAUSTICS)
+        try:
+            return bool(integrator.caustics_of(scene, scene.sensors()[0]) == "lamp")
+        except ValueError:
+            return False
 
     def measure(self, settings: Settings, number: int) -> Batch:
         """Batch `number` of a candidate. Its pixels and seeds are those of all candidates.
@@ -233,7 +256,8 @@ class Pilot:
         name, sampler, integrator = settings_text(settings), self._sampler(settings), self._integrator(settings)
         if name not in self._seconds:
             self._seconds[name] = math.inf
-            self._render(integrator, sampler, np.zeros(COPIES, np.uint32), 0, False)  # it compiles
+            with quiet():  # what is missing is said of the settings that are chosen
+                self._render(integrator, sampler, np.zeros(COPIES, np.uint32), 0, False)  # it compiles
         own_spp, spp = self._sampler({}).sample_count(), sampler.sample_count()
         size = max(LEAST_PIXELS, self.samples / 4 / (COPIES * own_spp * self.candidates))
         size = max(1, int(min(min(size, TIMED / (COPIES * own_spp)) * 2**number, LARGEST / (COPIES * own_spp))))
@@ -243,9 +267,15 @@ class Pilot:
             integrator, sampler, pixels, seed_of(self.renderer.seed, MASK - number), number == 0
         )
         means = values.reshape(len(values), size, COPIES, spp).mean(-1)
-        self._seconds[name] = min(self._seconds[name], took / len(pixels))
+        seconds, of_lamps = took / len(pixels), 0.0
+        if integrator in self._lamps:
+            one, each = self._lamps[integrator]
+            paths = integrator.light_paths * spp  # for each pixel
+            of_lamps = one.ravel()[pixels[::COPIES]] / (paths * one.size)
+            seconds += paths * each
+        self._seconds[name] = min(self._seconds[name], seconds)
         light, variance = float(np.nan_to_num(means).mean()), means.var(-1, ddof=1).mean(0)
-        return Batch(variance, light, took / len(pixels), self._seconds[name] * len(pixels))
+        return Batch(variance + of_lamps, light, seconds, self._seconds[name] * len(pixels))
 
     def allowed(self, own_seconds: float) -> float:
         """Seconds of the pilot, given those of a pixel in a pass with the scene's own settings."""
@@ -298,5 +328,31 @@ class Pilot:
             if alone:
                 dr.set_thread_count(threads)
         if hasattr(integrator, "end_render"):
+            if integrator not in self._lamps:
+                self._trace_lamps(integrator)
             integrator.end_render()
         return np.array([np.array(value) for value in values], np.float64), took
+
+    def _trace_lamps(self, integrator: Any) -> None:
+        """Where lamps are traced: the variance of a pixel by one light path, and the seconds of one."""
+        paths = min(max(int(self.samples / self.candidates), LEAST_LIGHT_PATHS), TIMED)
+
+        def trace(count: int) -> tuple[Any, float]:
+            before = self.clock()
+            image = integrator.caustic_image(
+                self.renderer.scene, self.renderer.scene.sensors()[0], self.renderer.seed, 1, self.renderer.channels,
+                squares=True, paths=count,
+            )  # fmt: skip
+            return image, self.clock() - before
+
+        if trace(paths)[0] is None:  # it compiles
+            return
+        threads = dr.thread_count()
+        if not self.cuda:
+            dr.set_thread_count(1)
+        try:
+            (_, variance), took = trace(paths)
+        finally:
+            if not self.cuda:
+                dr.set_thread_count(threads)
+        self._lamps[integrator] = np.nan_to_num(variance.mean(-1)) * paths, took / paths

@@ -74,7 +74,7 @@ class PassRenderer:
     def render(self, number: int, spp: int) -> PassSums:
         """Pass `number`. The scene's own errors pass; InterruptedError where Mitsuba stopped before the last sample."""
         within, film = None, self.scene.sensors()[0].film()
-        with _quiet():
+        with quiet():
             if self.moments:
                 if dr.thread_count() < LEAST_THREADS:
                     dr.set_thread_count(LEAST_THREADS)
@@ -117,7 +117,7 @@ class PassRenderer:
 
 def set_spp(sampler: Sampler, spp: int) -> int:
     """The samples per pixel that a sampler makes of these, and has from here on: it may round up."""
-    with _quiet():
+    with quiet():
         sampler.set_sample_count(spp)
     return int(sampler.sample_count())
 
@@ -135,7 +135,7 @@ def pass_renderer(scene: Scene, seed: int) -> PassRenderer:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Without Mitsuba's warning, at every pass, that a sampler rounds up: it is taken into account."""
     logger: Any = mi.logger()  # type: ignore[operator]
     before = logger.log_level()

@@ -16,9 +16,16 @@ from mi_refract.plugins.scene_parser import Node, ParsedScene
 AUTO, OWN = "auto", "the scene's own"
 SAMPLERS = ("multijitter", "stratified", "ldsampler", "orthogonal", "independent")  # the first that is as good as any
 INTEGRATORS = ("path", "refract_path")
-NAMES = {"sampler": "|".join(SAMPLERS), "integrator": "|".join(INTEGRATORS), "split_depth": "[0-9]{1,2}"}
+NAMES = {
+    "sampler": "|".join(SAMPLERS),
+    "integrator": "|".join(INTEGRATORS),
+    "split_depth": "[0-9]{1,2}",
+    "caustics": "path|lamp",
+}
 _SHARED = ("sample_count", "seed")  # parameters of every sampler
-_SPLITTING = ("split_depth", "split_weight")  # of `refract_path`, which `path` does not have
+_TYPES = {"split_depth": "Integer", "caustics": "String"}  # of `refract_path`; `path` has neither
+_DEFAULTS = {"split_depth": 0, "caustics": "path"}
+_OWN = (*_TYPES, "split_weight", "light_paths")  # parameters that `path` does not have
 Settings: TypeAlias = dict[str, str]  # by NAMES; {}: the scene's own
 
 
@@ -45,15 +52,14 @@ def settings_text(settings: Settings) -> str:
 
 
 def own_settings(parsed: ParsedScene) -> Settings:
-    """What the scene itself says; `split_depth` only where its integrator is `refract_path`."""
+    """What the scene itself says; `split_depth` and `caustics` only where its integrator is `refract_path`."""
     sampler, integrator = (_find(parsed.nodes, *path) for path in (("Sensor", "Sampler"), ("Integrator",)))
-    own = {"sampler": "independent" if sampler is None else parsed.nodes[sampler][1]}
+    own: Settings = {"sampler": "independent" if sampler is None else parsed.nodes[sampler][1]}
     if integrator is not None:
         own["integrator"] = parsed.nodes[integrator][1]
         if own["integrator"] == "refract_path":
-            own["split_depth"] = str(
-                {name: value for name, _, value in parsed.nodes[integrator][3]}.get("split_depth", 0)
-            )
+            given = {name: value for name, _, value in parsed.nodes[integrator][3]}
+            own |= {name: str(given.get(name, default)) for name, default in _DEFAULTS.items()}
     return own
 
 
@@ -66,9 +72,11 @@ def integrator_node(parsed: ParsedScene, settings: Settings) -> Node | None:
     if any(kind == "ResolvedReference" for _, kind, _ in parameters):
         return None
     plugin = settings.get("integrator", plugin)
-    dropped = _SPLITTING if plugin == "path" else [name for name in settings if name == "split_depth"]
+    changed = [name for name in settings if name in _TYPES]
+    dropped = _OWN if plugin == "path" else changed
     parameters = [each for each in parameters if each[0] not in dropped]
-    parameters += [(name, "Integer", int(settings[name])) for name in settings if name == "split_depth"]
+    values = {name: int(settings[name]) if _TYPES[name] == "Integer" else settings[name] for name in changed}
+    parameters += [(name, _TYPES[name], value) for name, value in values.items()]
     return kind, plugin, identifier, parameters
 
 
@@ -83,8 +91,8 @@ def with_settings(parsed: ParsedScene, settings: Settings) -> ParsedScene:
         if node is None or number is None:
             expected = "expected `path` or `refract_path` with numbers as its parameters, or sampler=… alone"
             raise ValueError(f"{what}: the scene's integrator is {own}; {expected}")
-        if node[1] == "path" and "split_depth" in settings:
-            raise ValueError(f"{what}: `path` has no split_depth; expected integrator=refract_path")
+        if node[1] == "path" and (foreign := min(settings.keys() & _TYPES.keys(), default="")):
+            raise ValueError(f"{what}: `path` has no {foreign}; expected integrator=refract_path")
         nodes[number] = node
     if plugin := settings.get("sampler"):
         sensor, number = _find(nodes, "Sensor"), _find(nodes, "Sensor", "Sampler")
