@@ -26,7 +26,7 @@ SPLIT = "sampler=multijitter,integrator=refract_path,split_depth=1"
 # The choice, from figures ---------------------------------------------------------------------------------------------
 
 
-def made_up(costs, own=None, noise=0.1, light=1.0, seconds=1e9):
+def made_up(costs, own=None, noise=0.1, light=1.0, seconds=1e9, start=None):
     """A pilot whose candidates have variances and times by the text of their settings; else 1 and 1."""
     asked = []
 
@@ -38,7 +38,8 @@ def made_up(costs, own=None, noise=0.1, light=1.0, seconds=1e9):
         return Batch(found, light, time, time * size)
 
     own = own or {"sampler": "independent", "integrator": "path"}
-    return SimpleNamespace(own=own, usable=lambda option: True, measure=measure, allowed=lambda t: seconds, asked=asked)
+    methods = {"usable": lambda option: True, "measure": measure, "allowed": lambda t: seconds}
+    return SimpleNamespace(own=own, start=start or {}, asked=asked, **methods)
 
 
 CHOICES = {
@@ -54,6 +55,14 @@ CHOICES = {
         {"split_depth=1": (0.5, 0.5)},
         {"sampler": "multijitter", "integrator": "refract_path", "split_depth": "3"},
         "split_depth=1",
+    ),
+    "caustics, then splitting": (
+        {
+            "sampler=multijitter,integrator=refract_path,caustics=lamp": (0.01, 3),
+            "sampler=multijitter,integrator=refract_path,caustics=lamp,split_depth=2": (0.003, 4),
+        },
+        None,
+        "sampler=multijitter,integrator=refract_path,caustics=lamp,split_depth=2",
     ),
     "no noise": ({OWN: (0, 1), "sampler=ldsampler": (1e-20, 1)}, None, OWN),
 }
@@ -71,6 +80,12 @@ def test_the_cheapest_is_chosen_unless_it_cannot_be_told_from_the_scenes_own(cos
         assert cost["high"] < 1
 
 
+def test_light_that_is_missing_is_traced_whatever_it_costs():
+    lamp = "integrator=refract_path,caustics=lamp"
+    pilot = made_up({f"{lamp},sampler=stratified": (0.5, 1), OWN: (0.1, 1)}, start=parse_settings(lamp))
+    assert settings_text(choose(pilot).settings) == f"{lamp},sampler=stratified" and (OWN, 0) not in pilot.asked
+
+
 def test_a_candidate_that_cannot_win_is_dropped_after_one_batch_and_seconds_end_the_pilot():
     pilot = made_up({"sampler=stratified": (10, 1)})
     choose(pilot)
@@ -79,7 +94,7 @@ def test_a_candidate_that_cannot_win_is_dropped_after_one_batch_and_seconds_end_
     short = made_up({}, seconds=1)
     choose(short)
     assert {number for _, number in short.asked} == {0}
-    assert len(short.asked) == len(STEPS[0]) + len(STEPS[1]) - 1  # the scene's own are in both
+    assert len(short.asked) == sum(map(len, STEPS)) - 1  # the scene's own are in two steps
 
 
 def test_the_interval_holds_the_ratio_as_often_as_it_says():
