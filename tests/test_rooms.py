@@ -60,6 +60,7 @@ def test_a_room_says_what_it_is_for_and_what_it_offers(room: str) -> None:
 FILLED = {
     "Hit",
     "LongRender",
+    "LightPath",
     "LoopState",
     "PassSums",
     "PathState",

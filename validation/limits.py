@@ -189,7 +189,7 @@ BODY = limit(1.0, "error over the sum of the largest effects of every rounding o
 STANDARD = limit(1.0, "error of a standard number over its bound, whose terms the study derives")
 STANDARD_SEEN = limit(1e-3, "relative: of an index; crown glasses of the table differ by twice that, 1.52 and 1.5168")
 INDEX_SEEN = limit(1e-4, "relative: an index off by this must move a ray to its bound, or the bound is no test")
-FALSE_ALARM = limit(1e-4, "probability that Student's t of the rainbow exceeds its bound by chance")
+FALSE_ALARM = limit(1e-4, "probability that noise, or a sum of independent roundings, exceeds its bound by chance")
 RAINBOW_RESOLVED = limit(0.0145 / 10, "degrees, standard error: INDEX_SEEN moves the rainbow by 0.0145")
 # Pixels may move the edge: σ²/4(D − D₀) at 0.1 degrees is 3.5e-4; the parabola carries 1.7 of it to D₀, 6e-4, which
 # images without noise show, too.

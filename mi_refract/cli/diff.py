@@ -59,6 +59,7 @@ def _json_schema() -> str:
 
 
 def diff(
+    context: typer.Context,
     reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")],
     test: Annotated[
         Path | None, typer.Argument(metavar="TEST", help="What to compare with it; optional with --check-settings.")
@@ -133,7 +134,7 @@ def diff(
         if junit or json:
             from mi_refract.image_diff import results_file
 
-            results_file.write(results, junit, json, pack)
+            results_file.write(results, reference_pack.origin(context.obj, pack), junit, json)
         if page:
             from mi_refract.io.image_file import provenance
 

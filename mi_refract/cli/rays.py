@@ -259,13 +259,13 @@ def _checker(
         return found
 
     def write(checks: dict[str, Findings]) -> int:
-        replay = shlex.join(["mi-refract", *context.obj])
+        origin = reference_pack.origin(context.obj, pack)
         if report:
-            reports.write_html(report, checks, provenance(), replay)
+            reports.write_html(report, checks, provenance(), origin.command)
         if junit:
             reports.write_junit(junit, checks)
         if json:
-            reports.write_json(json, checks, pack, replay)
+            reports.write_json(json, checks, origin)
         return max(findings.exit_code for findings in checks.values())
 
     return checked, write

@@ -58,6 +58,14 @@ def render(
     pass_spp: Annotated[
         int | None, typer.Option(min=1, max=2**32 - 1, help="Samples per pixel in one pass; fewer need less memory.")
     ] = None,
+    settings: Annotated[
+        str | None,
+        typer.Option(
+            metavar="auto|NAME=VALUE,…",
+            help="Replace the scene's sampler, integrator (path, refract_path) or split_depth; auto: a short pilot "
+            "measures which pay.",
+        ),
+    ] = None,
     restart: Annotated[
         bool, typer.Option("--restart", help="Start over; ignore any checkpoint or existing image.")
     ] = False,
@@ -113,15 +121,18 @@ def render(
     chosen = activate(variant)
     from mi_refract.rendering.end_conditions import Limits
     from mi_refract.rendering.long_render import Job, resume
+    from mi_refract.rendering.render_settings import OWN
 
     limits = Limits(spp, share, tile_share, seconds, pass_spp)
-    job = Job(scene, defines, seed, tuple(allow_plugins or ()))
+    job = Job(scene, defines, seed, tuple(allow_plugins or ()), OWN if settings is None else settings)
     console = Console(stderr=True, force_terminal=sys.stderr.isatty())  # FORCE_COLOR makes no terminal of a pipe
     spinner = console.status(Text(printable(f"{scene.name}, {chosen}"))) if console.is_terminal else None
     with spinner or contextlib.nullcontext():
         rendering = resume(job, output, limits, restart=restart)
     if rendering.missing:
         print(printable(f"mi-refract: {scene}: missing {rendering.missing}"), file=sys.stderr)
+    for line in rendering.pilot_lines():
+        print(printable(f"{output}: {line}"), file=sys.stderr)
     if rendering.progress.passes:
         state = "complete with" if rendering.end() else "resuming from"
         print(printable(f"{output}: {state} {rendering.progress.done} spp"), file=sys.stderr)

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from mi_refract.io import safe_files
-from mi_refract.io.reference_pack import PackReference
+from mi_refract.io.reference_pack import Origin
 from mi_refract.io.text import json_text, printable
 from mi_refract.io.typed_table import convert
 from mi_refract.report import documents
@@ -97,7 +97,7 @@ class Entry(msgspec.Struct):
     accept: Annotated[str, _doc("the command that makes the new image the reference")]
 
 
-class Document(msgspec.Struct):
+class Document(Origin, frozen=True, kw_only=True):
     """What `mi-refract diff --json` writes. Other keys may be added without another number of `schema`."""
 
     schema: Literal[1]
@@ -108,7 +108,6 @@ class Document(msgspec.Struct):
     renders: Annotated[bool, _doc("--renders: each folder holds renders of one image")]
     counts: Annotated[dict[Status, int], _doc("images of each status")]
     results: list[Entry]
-    pack: Annotated[PackReference | None, _doc("the reference pack that the references are from; null: none")]
 
 
 def json_schema() -> str:
@@ -120,20 +119,24 @@ def json_schema() -> str:
 # Writing ------------------------------------------------------------------------------------------------------------
 
 
-def write(
-    results: Results, junit: Path | None = None, data: Path | None = None, pack: PackReference | None = None
-) -> None:
+def write(results: Results, origin: Origin, junit: Path | None = None, data: Path | None = None) -> None:
     """Write JUnit's XML, and the JSON in `data`. OSError where a file cannot be written.
 
     JUnit has a case for each image: "different" is a failure, "inconclusive" too unless it is to pass, no verdict an
-    error. The JSON is a `Document`.
+    error. The JSON is a `Document`, with `origin`.
     """
     if data:
-        entries = [_json_entry(result, results) for result in results.results]
-        counts = {status: len(results.of(status)) for status in Status}
-        paths, code = (str(results.reference), str(results.test)), results.exit_code
-        sentence = text_reports.sentence(results)
-        document = Document(SCHEMA, code, sentence, *paths, results.renders, counts, entries, pack)
+        document = Document(
+            **msgspec.structs.asdict(origin),
+            schema=SCHEMA,
+            exit_code=results.exit_code,
+            sentence=text_reports.sentence(results),
+            reference=str(results.reference),
+            test=str(results.test),
+            renders=results.renders,
+            counts={status: len(results.of(status)) for status in Status},
+            results=[_json_entry(result, results) for result in results.results],
+        )
         write_strict_json(data, msgspec.to_builtins(document))
     if junit:
         cases = [_junit_case(result, results) for result in results.results]

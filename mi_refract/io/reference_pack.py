@@ -8,12 +8,16 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
+
+from mi_refract import __version__
 
 from . import safe_files
 from .typed_table import convert
@@ -54,6 +58,19 @@ class PackReference(msgspec.Struct, frozen=True):
     version: Annotated[str, _doc("version of mi_refract that wrote the pack")]
     sha256: Annotated[Digest, _doc(f"of the pack's {INDEX}, which holds that of every file")]
     path: Annotated[str, _doc("of the references in the pack")]
+
+
+class Origin(msgspec.Struct, frozen=True, kw_only=True):
+    """What a file of results says of itself, so that a published result can be repeated."""
+
+    version: Annotated[str, _doc("version of mi_refract that wrote this")]
+    command: Annotated[str, _doc("the command line that wrote this")]
+    pack: Annotated[PackReference | None, _doc("the reference pack that the references are from; null: none")]
+
+
+def origin(words: Sequence[str], pack: PackReference | None) -> Origin:
+    """Of what this version of `mi-refract` writes, called with these words."""
+    return Origin(version=__version__, command=shlex.join(["mi-refract", *words]), pack=pack)
 
 
 def sums(index: bytes, files: dict[str, PackedFile]) -> str:

@@ -33,6 +33,7 @@ __all__ = [
     "PLUGIN",
     "SceneFeatures",
     "check_integrator",
+    "film",
     "inspect",
     "missing_light",
     "read_ior",

@@ -36,12 +36,14 @@ class Splats:
         self.per_sum, self.lowest = digits, lowest
         film = sensor.film()
         self.width, self.height = (int(n) for n in film.crop_size())
-        self.rfilter = None if film.rfilter().is_box_filter() else film.rfilter()
+        self.rfilter: Any = None if film.rfilter().is_box_filter() else film.rfilter()
         self.reach = math.ceil(self.rfilter.radius() - 0.5) if self.rfilter else 0
         self.count = self.width * self.height * channels
         if self.vectorised:
-            self.wide = dr.uint64_array_t(v.Float)
-            self.digits = dr.opaque(self.wide, 0, self.count * digits)
+            self.wide: Any = dr.uint64_array_t(v.Float)
+            kind: Any = self.wide
+            self.digits: Any = dr.zeros(kind, self.count * digits)
+            dr.make_opaque(self.digits)
             self.beyond = dr.opaque(v.UInt32, 0, self.count)  # splats that are too large, or not finite
         else:
             self.sums = [0.0] * self.count
@@ -69,7 +71,8 @@ class Splats:
             if active:
                 self.sums[int(index)] += value
             return
-        index, bits = v.UInt32(dr.select(active, index, 0)), dr.reinterpret_array(v.UInt32, v.Float32(value))
+        index = v.UInt32(dr.select(active, index, 0))
+        bits: Any = dr.reinterpret_array(v.UInt32, v.Float32(value))
         shift = v.Int32((bits >> 23) & 255) - (150 + self.lowest)
         large = active & (shift >= BITS * (self.per_sum - 1))
         kept = active & (shift >= 0) & (large ^ True)

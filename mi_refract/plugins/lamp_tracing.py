@@ -65,7 +65,7 @@ PILOT = 256  # light paths by which the power of a lamp is estimated
 DEFENSIVE = 0.1  # share of the light paths that all lamps have alike, whatever the estimate says
 SENSORS = {"PerspectiveCamera", "ThinLensCamera", "OrthographicCamera"}
 AREA, PLACE, DIRECTION = range(3)  # kinds of lamps
-KINDS = {"AreaLight": AREA, "PointLight": PLACE, "SpotLight": PLACE, "DirectionalEmitter": DIRECTION}
+KINDS = {"AreaLight": AREA, "PointLight": PLACE, "SpotLight": PLACE, "DirectionalEmitter": DIRECTION}  # TRACED_LAMPS
 LOBES = mi.BSDFFlags
 
 

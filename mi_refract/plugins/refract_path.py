@@ -9,7 +9,7 @@
 | `split_depth` | integer | both lobes are followed at so many boundaries, counted from the camera (0) |
 | `split_weight` | number | a lobe whose share of the light would be smaller is not followed (0.01) |
 | `deterministic` | boolean | no lobe is chosen by chance; lobes with a share below `split_weight` are dropped (false) |
-| `caustics` | string | light through glass and over mirrors onto other surfaces: see below (`path`) |
+| `caustics` | word | `path`, `lamp` or `auto`: how light through glass onto other surfaces is found (`path`) |
 | `light_paths` | number | light paths for each sample of the camera, where lamps are traced (0.25) |
 | `camera_absorption` | number, spectrum | σ of the medium at the camera (0), as `int_absorption` of `refract` |
 | `camera_absorption_unit` | number | as `int_absorption_unit` of `refract` |
@@ -165,7 +165,8 @@ def integrator_class(v: Variant) -> type:
             film, sampler = sensor.film(), sensor.sampler().clone()
             if spp:
                 sampler.set_sample_count(spp)
-            found = self.caustic_image(scene, sensor, int(dr.slice(seed)), int(sampler.sample_count()), ("R", "G", "B"))
+            number: Any = dr.slice(seed)
+            found = self.caustic_image(scene, sensor, int(number), int(sampler.sample_count()), ("R", "G", "B"))
             # Colours on a film are sums; those of the samples' weights, by which it divides them, are its last channel
             # before others.
             block, sums = film.create_block(), film.develop(True)
@@ -177,17 +178,25 @@ def integrator_class(v: Variant) -> type:
             return film.develop() if develop else v.TensorXf()
 
         def caustic_image(
-            self, scene: Scene, sensor: Sensor, seed: int, spp: int, channels: tuple[str, ...], *, squares: bool = False
+            self,
+            scene: Scene,
+            sensor: Sensor,
+            seed: int,
+            spp: int,
+            channels: tuple[str, ...],
+            *,
+            squares: bool = False,
+            paths: int = 0,
         ) -> Any:
             """The lamps' part of the image of a render that has begun; None where path tracing has all of it.
 
-            `lamp_tracing.lamp_image` says what it is.
+            `lamp_tracing.lamp_image` says what it is. `paths`: of light, where they are not those of `spp`.
             """
             loop = next((loop for loop in self.loops if loop.features.caustics_apart), None)
             if loop is None:
                 return None
             tracer = lamp_tracing.LampTracer(loop, sensor, lambda ray: self.camera_medium(scene, ray, None))
-            paths = max(1, round(self.light_paths * spp * tracer.camera.width * tracer.camera.height))
+            paths = paths or max(1, round(self.light_paths * spp * tracer.camera.width * tracer.camera.height))
             return lamp_tracing.lamp_image(tracer, seed, paths, channels, squares=squares)
 
         def aov_names(self) -> list[str]:
@@ -326,8 +335,8 @@ def integrator_class(v: Variant) -> type:
 
         def to_string(self) -> str:
             depth = -1 if self.max_depth == UNLIMITED else self.max_depth
-            names = ("rr_depth", "hide_emitters", "split_depth", "split_weight", "deterministic", "caustics")
-            names += ("light_paths",)
+            names = ["rr_depth", "hide_emitters", "split_depth", "split_weight", "deterministic"]
+            names += ["caustics", "light_paths"]
             lines = [f"max_depth = {depth}", *(f"{name} = {getattr(self, name)}" for name in names)]
             return "RefractPath[\n" + "".join(f"  {x},\n" for x in [*lines, f"left out = {self.left_out()}"]) + "]"
 

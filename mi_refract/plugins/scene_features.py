@@ -46,6 +46,7 @@ DETERMINISTIC = BOUNDARIES | {"SmoothConductor", "TwoSidedBRDF"}
 WITHOUT_TANGENT = DETERMINISTIC | {"BlendBSDF", "MaskBSDF", "Null", "ThinDielectric"}
 # Plugins that sample with `sample1` or with `sample2`, and never with both.
 EITHER = DETERMINISTIC | {"Null", "RoughConductor", "SmoothDiffuse", "ThinDielectric"}
+TRACED_LAMPS = {"AreaLight", "DirectionalEmitter", "PointLight", "SpotLight"}  # that `lamp_tracing` takes
 BEAM = "DirectionalArea"  # the emitter of zero size that no shadow ray finds: its `sample_direction` gives nothing
 # Integrators that find lamps of zero size by shadow rays only, as they call themselves → `volumes` of `missing`.
 SHADOW_RAYS = {
@@ -77,6 +78,7 @@ class SceneFeatures:
     refracting: bool  # some BSDF has a refracted direction
     delta: bool  # some BSDF has a delta lobe other than a null lobe
     zero_size: tuple[str, ...]  # the classes of the emitters whose light has one position, or one direction at each
+    splitting: bool  # some shape's BSDF is of `BOUNDARIES`
     chance: str  # the first plugin that is not of `DETERMINISTIC`, and its shape; "" where there is none
     unknown: tuple[str, ...] = ()
 
@@ -113,16 +115,18 @@ class SceneFeatures:
         null, most = self.null and not volumes, math.inf if max_depth < 0 else max_depth
         lobes = ", ".join([*["glass", "mirrors"] * self.delta, *["null"] * null])
         shadowed, beam = (", ".join(x for x in self.zero_size if (x == BEAM) == only) for only in (False, True))
-        lamps, area = ", ".join(self.zero_size), "expected area lights in place of such lamps"
+        lamps, area = ", ".join(self.zero_size), "area lights in place of such lamps"
+        seen = "where such lobes show it"
+        traced = "refract_path with caustics = lamp, or " if {*self.zero_size} <= TRACED_LAMPS else ""
         cast = f"that delta lobes ({lobes}) cast on other surfaces is black"
         # Class, whether its lamps and lobes are there, edges of its shortest path, text.
         classes = {
             "path": (
-                ("L S+ D (S|D)* E", shadowed and lobes, 3, f"light of {shadowed} {cast}; {area}"),
+                ("L S+ D (S|D)* E", shadowed and lobes, 3, f"light of {shadowed} {cast}; expected {traced}{area}"),
                 ("L (S|D)* D (S|D)* E", beam, 2, f"all light of {beam} is black; expected a lamp of another type"),
             ),
             "lamp": (
-                ("L S+ D (S|D)* S E", lamps and lobes, 4, f"light of {lamps} {cast} where such lobes show it; {area}"),
+                ("L S+ D (S|D)* S E", lamps and lobes, 4, f"light of {lamps} {cast} {seen}; expected {area}"),
                 ("L D (S|D)* E", beam, 2, f"direct light of {beam} is black; expected a lamp of another type"),
             ),
         }[caustics]
@@ -187,6 +191,7 @@ def inspect(scene: Scene) -> SceneFeatures:
         refracting=everything or bool(flags & +lobes.Transmission),
         delta=everything or bool(flags & +(lobes.DeltaReflection | lobes.DeltaTransmission)),
         zero_size=tuple(sorted({lamp.class_name() for lamp in points if lamp.sampling_weight() > 0})),
+        splitting=any(bsdf_name(bsdf) in BOUNDARIES for each in within for bsdf in each[:1]),
         chance=next(chance, ""),
         unknown=unknown,
     )

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 
-from mi_refract import __version__
 from mi_refract.io.text import compact, printable
 from mi_refract.regimes import REGIMES
 from mi_refract.report import documents
@@ -27,7 +26,7 @@ from .tir_signal import NONE, UNCLEAR
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from mi_refract.io.reference_pack import PackReference
+    from mi_refract.io.reference_pack import Origin
 
 SCHEMA = 1
 STYLES = {"wrong": "bold red", "within bound": "yellow", "right": "", "exact": "green"}
@@ -213,18 +212,15 @@ def as_data(findings: Findings) -> dict[str, Any]:
     }
 
 
-def write_json(
-    path: str | Path, checks: Mapping[str, Findings], pack: PackReference | None = None, replay: str = ""
-) -> None:
+def write_json(path: str | Path, checks: Mapping[str, Findings], origin: Origin) -> None:
     """Write `{"schema": 1, "exit_code", …, "functions": [{"title", …}, …]}` as strict JSON; see `as_data`.
 
-    `checks`: findings by the title of the function; the exit code is the largest. `pack`: that the rays are from, null
-    where they are from none. `replay`: the command that repeats the checks, with `version` of mi_refract. NaN and the
-    infinities become words. OSError where that fails.
+    `checks`: findings by the title of the function; the exit code is the largest. The keys of `origin` are among those
+    of the file. NaN and the infinities become words. OSError where that fails.
     """
     functions = [{"title": title} | as_data(findings) for title, findings in checks.items()]
     exit_code = max(findings.exit_code for findings in checks.values())
-    made = {"version": __version__, "command": replay, "pack": pack and msgspec.structs.asdict(pack)}
+    made = msgspec.to_builtins(origin)
     write_strict_json(path, {"schema": SCHEMA, "exit_code": exit_code} | made | {"functions": functions})
 
 

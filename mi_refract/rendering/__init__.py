@@ -13,7 +13,9 @@ __all__ = [
     "long_render",
     "pass_plan",
     "pass_sums",
+    "pilot",
     "render_pass",
+    "render_settings",
     "scene_bundle",
     "scene_files",
 ]

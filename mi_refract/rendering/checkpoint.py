@@ -25,6 +25,7 @@ from mi_refract.io.errors import CheckpointError
 from mi_refract.io.safe_files import opened, replacing
 
 from .pass_sums import ARITY, ARRAYS, Doubles, PassSums, PassTree
+from .render_settings import AUTO
 
 Identity = dict[str, Any]  # everything that the bits of a render depend on, by name
 FORMAT = 3
@@ -33,7 +34,9 @@ _HEADER = 2**24  # bytes of its line, at most
 # Seconds from the state of one checkpoint to that of the next, unless a pass takes longer. A kill loses as many, and
 # those in which the next one is written.
 INTERVAL = 25.0
-PASS = "samples of a pass"  # in an identity: a finished image may be refined with passes of another size
+# In an identity:
+PASS = "samples of a pass"  # a finished image may be refined with passes of another size
+SETTINGS, PILOT = "settings", "pilot"  # the settings, and where a pilot has chosen them its figures
 
 
 @dataclass
@@ -192,9 +195,14 @@ def _progress(file: BufferedReader, header: dict[str, Any], shape: tuple[int, in
 
 
 def changes(before: Identity, now: Identity) -> str:
-    """What differs between two identities, but for the size of passes, by name; "" where nothing does."""
+    """What differs between two identities, but for the size of passes, by name; "" where nothing does.
+
+    Settings that a pilot has chosen are those that AUTO asks for.
+    """
     texts = []
-    for name in {**before, **now}.keys() - {PASS}:
+    if now.get(SETTINGS) == AUTO and PILOT in before:
+        now = {**now, SETTINGS: before[SETTINGS]}
+    for name in {**before, **now}.keys() - {PASS, PILOT}:
         if before.get(name) != now.get(name):
             changed = f"{name} was {before.get(name)}, is {now.get(name)}"
             texts.append("the scene has changed" if name == "scene" else changed)

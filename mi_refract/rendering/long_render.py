@@ -6,6 +6,7 @@ every 25 s, and looks at the error after 8, 12, 16, 24 … passes.
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
 import math
@@ -31,11 +32,13 @@ from mi_refract.plugins import missing_light
 from mi_refract.plugins.scene_parser import ParsedScene
 
 from . import checkpoint, rendered_file
-from .checkpoint import PASS, CheckpointWriter, Identity, Progress
+from .checkpoint import PASS, PILOT, SETTINGS, CheckpointWriter, Identity, Progress
 from .end_conditions import Limits, RelativeError, needed_spp, reached, relative_error, require_interval
 from .pass_plan import FIRST_LANES, LANES, PassPlan, next_stop, plan_passes
 from .pass_sums import ARITY, PassSums
+from .pilot import Pilot, choose, lines_of
 from .render_pass import PassRenderer, pass_renderer
+from .render_settings import AUTO, OWN, parse_settings, settings_text, with_settings
 from .scene_files import formulas_in, load_parsed, naming, parse_scene
 
 
@@ -44,12 +47,14 @@ class Job:
     """What is rendered: the scene in a file, in the present variant, with its first sensor.
 
     `defines`: values of its `<default>`s. `allow_plugins`: names of plugins that it may bring, which are code.
+    `settings`: what replaces its own (see `render_settings`), or AUTO: a pilot chooses them.
     """
 
     scene: Path
     defines: Mapping[str, str] = field(default_factory=dict)
     seed: int = 0
     allow_plugins: Collection[str] = ()
+    settings: str = OWN
 
 
 # Where passes are rendered. Of first, stop, last, offset, spp: level, sums and machines ("a, b") of nodes that make up
@@ -70,6 +75,7 @@ def resume(
         raise ValueError(f"seed = {job.seed}; expected a whole number from 0 to 2³² − 1")
     if limits.until is not None:
         require_interval()
+    settings = job.settings if job.settings == AUTO else settings_text(parse_settings(job.settings))
     parsed = parse_scene(job.scene, job.defines)
     scene = load_parsed(parsed, job.allow_plugins)
     renderer = pass_renderer(scene, job.seed)
@@ -79,15 +85,25 @@ def resume(
         if spp < 1:
             raise ValueError(f"{job.scene}: the sampler's sample_count = {spp}; expected 1 or more, or --spp")
 
-    progress, saved = Progress(_identity(job, parsed, renderer)), checkpoint.path_of(path)
+    identity, saved, image = _identity(job, parsed, renderer, settings), checkpoint.path_of(path), None
+    progress = Progress(identity)
     if kept := saved.exists() and not restart:
-        progress = checkpoint.read(saved, progress.identity, (*renderer.size[::-1], len(renderer.channels)))
-        if progress.rest is not None and (spp is None or progress.done < spp):
-            progress.rest = None  # it was the last pass, of fewer samples: a whole one takes its place
+        progress = checkpoint.read(saved, identity, (*renderer.size[::-1], len(renderer.channels)))
     elif not restart:
-        image = rendered_file.read(path, renderer.channels, progress.identity)
-        if image is not None and (spp is None or image.done <= (_plan(renderer, spp, limits).total or 0)):
-            progress = image
+        image = rendered_file.read(path, renderer.channels, identity)
+        progress = image or progress
+    if progress.identity[SETTINGS] == AUTO:
+        progress.identity |= _choose(job, parsed, renderer, None if limits.by_error else spp, limits)
+    if chosen := parse_settings(progress.identity[SETTINGS]):
+        parsed = with_settings(parsed, chosen)
+        del scene, renderer
+        gc.collect()  # as in `_choose`
+        scene = load_parsed(parsed, job.allow_plugins)
+        renderer = pass_renderer(scene, job.seed)
+    if kept and progress.rest is not None and (spp is None or progress.done < spp):
+        progress.rest = None  # it was the last pass, of fewer samples: a whole one takes its place
+    if image is not None and spp is not None and image.done > (_plan(renderer, spp, limits).total or 0):
+        progress = Progress(progress.identity)
     begun = progress.identity.get(PASS) if progress.tree.passes else None
     if begun and limits.pass_spp not in (None, begun):
         raise ValueError(f"{saved}: has passes of {begun} samples per pixel; expected --pass-spp {begun}, or --restart")
@@ -101,19 +117,44 @@ def resume(
     return LongRender(job, path, limits, parsed, scene, renderer, spp, plan, progress)
 
 
+def _choose(job: Job, parsed: ParsedScene, renderer: PassRenderer, spp: int | None, limits: Limits) -> Identity:
+    """What a pilot adds to the identity. `spp`: samples per pixel, where that is known. Errors: those of `Pilot`."""
+
+    def plan(rounded: Callable[[int], int]) -> PassPlan:
+        return _plan(renderer, spp, limits, most=LANES, rounded=rounded)
+
+    gc.collect()  # Dr.Jit compiles every plugin that is alive
+    try:
+        choice = choose(Pilot(parsed, renderer, plan, limits.seconds))
+    except RuntimeError as error:  # Mitsuba's own
+        raise ValueError(naming(job.scene, error)) from None
+    return {SETTINGS: settings_text(choice.settings), PILOT: choice.figures}
+
+
 def _plan(
-    renderer: PassRenderer, total: int | None, limits: Limits, begun: int | None = None, most: int | None = None
+    renderer: PassRenderer,
+    total: int | None,
+    limits: Limits,
+    begun: int | None = None,
+    most: int | None = None,
+    rounded: Callable[[int], int] | None = None,
 ) -> PassPlan:
-    """The passes of `total` samples per pixel. `begun`: of each, where there are some already; `most`: else at most."""
+    """The passes of `total` samples per pixel. `begun`: of each, where there are some already; `most`: else at most.
+
+    `rounded`: what a sampler makes of a number of samples, by default the scene's own.
+    """
     pixels = math.prod(renderer.size)
     if most is None:
         most = FIRST_LANES // pixels if limits.by_error else LANES
     asked = begun or limits.pass_spp
-    return plan_passes(pixels, total, asked, renderer.rounded, moments=renderer.moments, most=most)
+    return plan_passes(pixels, total, asked, rounded or renderer.rounded, moments=renderer.moments, most=most)
 
 
-def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> Identity:
-    """Everything that the bits of a render depend on, by names for messages; but for PASS, which its plan says."""
+def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer, settings: str) -> Identity:
+    """Everything that the bits of a render depend on, by names for messages; but for PASS, which its plan says.
+
+    `parsed`, `renderer`: of the scene with its own settings.
+    """
     digest = hashlib.sha256(json.dumps(parsed.nodes).encode())
     for name, path in parsed.files(job.allow_plugins).items():
         digest.update(json.dumps([name, hashlib.sha256(path.read_bytes()).hexdigest()]).encode())
@@ -123,6 +164,7 @@ def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> Identity
         "scene": digest.hexdigest(),
         "defines": dict(job.defines),
         "seed": job.seed,
+        SETTINGS: settings,
         "variant": str(mi.variant()),
         "film": f"{width} × {height} {', '.join(renderer.channels)}",
         "colours": renderer.colours,
@@ -220,6 +262,7 @@ class LongRender:
             "mi_refract:seed": self.job.seed,
             "mi_refract:scene": str(self.job.scene),
             "mi_refract:defines": json.dumps(dict(self.job.defines), sort_keys=True),
+            "mi_refract:settings": progress.identity[SETTINGS],
             "mi_refract:formulas": ", ".join(formulas_in(self.scene)) or "none",
             "mi_refract:missing": self.missing or "none known",
         }
@@ -287,6 +330,14 @@ class LongRender:
         sums = self.progress.sums()
         return None if sums is None else sums.mean
 
+    def pilot_lines(self) -> list[str]:
+        """What a pilot has chosen, and why, line by line; [] where there was none."""
+        settings, figures = (self.progress.identity.get(name) for name in (SETTINGS, PILOT))
+        if figures is None:
+            return []
+        text = settings if settings == OWN else f"--settings {settings}"
+        return [*lines_of(figures), f"a pilot of {figures['seconds']:g} s has chosen {text}"]
+
     def give_up(self) -> None:
         """Before a signal ends this process: write a checkpoint, say so on stderr, and remove the lock file."""
         if not self.checkpoints.active:
@@ -319,15 +370,17 @@ def render_to_exr(
     spp: int | None = None,
     seed: int = 0,
     allow_plugins: Collection[str] = (),
+    settings: str = OWN,
 ) -> Metadata:
     """Render a scene file from its first pass on, and return the header of the EXR file.
 
     `defines`: values for the scene's `<default>`s. `spp`: samples per pixel; None: what the scene says.
-    `allow_plugins`: names of plugins that the scene may bring, which are code. ValueError or OSError in one line,
-    before the rendering where possible; InterruptedError for a rendering that was cut short. No image is written then,
-    and what is done is kept in a checkpoint.
+    `allow_plugins`: names of plugins that the scene may bring, which are code. `settings`: "auto", which measures what
+    suits the scene, or such as "sampler=multijitter,integrator=refract_path,split_depth=2". ValueError or OSError in
+    one line, before the rendering where possible; InterruptedError for a rendering that was cut short. No image is
+    written then, and what is done is kept in a checkpoint.
     """
-    job = Job(Path(scene), dict(defines or {}), seed, allow_plugins)
+    job = Job(Path(scene), dict(defines or {}), seed, allow_plugins, settings)
     return resume(job, output, Limits(spp=spp), restart=True).run()
 
 

@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refract.io.image_file import Metadata
-from mi_refract.numerics import Scene
+from mi_refract.numerics import Ray, Sampler, Scene, Spectrum
 from mi_refract.plugins.film import STEP, expected_weights, film_colours, filter_weights
 
 from .pass_plan import FEW, scalar_seed_of, seed_of
@@ -69,15 +69,12 @@ class PassRenderer:
 
     def rounded(self, spp: int) -> int:
         """The samples per pixel that the sampler makes of these: it may round up."""
-        sampler = self.scene.sensors()[0].sampler().clone()
-        with _quiet():
-            sampler.set_sample_count(spp)
-        return int(sampler.sample_count())
+        return set_spp(self.scene.sensors()[0].sampler().clone(), spp)
 
     def render(self, number: int, spp: int) -> PassSums:
         """Pass `number`. The scene's own errors pass; InterruptedError where Mitsuba stopped before the last sample."""
         within, film = None, self.scene.sensors()[0].film()
-        with _quiet():
+        with quiet():
             if self.moments:
                 if dr.thread_count() < LEAST_THREADS:
                     dr.set_thread_count(LEAST_THREADS)
@@ -118,6 +115,13 @@ class PassRenderer:
             within[..., :colours] += spp * (spp - 1) * variance * share
 
 
+def set_spp(sampler: Sampler, spp: int) -> int:
+    """The samples per pixel that a sampler makes of these, and has from here on: it may round up."""
+    with quiet():
+        sampler.set_sample_count(spp)
+    return int(sampler.sample_count())
+
+
 def pass_renderer(scene: Scene, seed: int) -> PassRenderer:
     """How to render the passes of a loaded scene, with its first sensor."""
     film, integrator = scene.sensors()[0].film(), scene.integrator()
@@ -131,7 +135,7 @@ def pass_renderer(scene: Scene, seed: int) -> PassRenderer:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Without Mitsuba's warning, at every pass, that a sampler rounds up: it is taken into account."""
     logger: Any = mi.logger()  # type: ignore[operator]
     before = logger.log_level()
@@ -187,11 +191,50 @@ def _samples(scene: Scene, channels: tuple[str, ...], spp: int, seed: int) -> tu
     sampler, spp = ADIntegrator.prepare(None, sensor, seed, spp, integrator.aov_names())
     ray, weight, place = ADIntegrator.sample_rays(None, scene, sensor, sampler)
     ray.scale_differential(1 / math.sqrt(spp))
-    radiance, valid, others = integrator.sample(scene, sampler, ray, sensor.get_medium(), mi.Bool(True))
+    values = _channels(scene, integrator, channels, sampler, ray, weight)
+    return values, mi.Point2f(place) - mi.Point2f(sensor.film().crop_offset())
+
+
+def _channels(
+    scene: Scene, integrator: Any, channels: tuple[str, ...], sampler: Sampler, ray: Ray, weight: Spectrum
+) -> list[Any]:
+    """The values of samples by channels, of the rays that a sensor has weighted."""
+    medium = scene.sensors()[0].get_medium()
+    radiance, valid, others = integrator.sample(scene, sampler, ray, medium, mi.Bool(True))
     values = film_colours(mi, weight * radiance, ray.wavelengths, channels)
     if "A" in channels[: len(values) + 1]:
         values.append(dr.select(valid, mi.Float(1), mi.Float(0)))
     values += list(others)
     if len(values) != len(channels):
         raise ValueError(f"{len(values)} values in a sample; expected {len(channels)}, those of the film")
-    return values, mi.Point2f(place) - mi.Point2f(sensor.film().crop_offset())
+    return values
+
+
+def samples_of_pixels(
+    renderer: PassRenderer, integrator: Any, sampler: Sampler, pixels: np.ndarray, seed: int
+) -> list[Any]:
+    """The colours of the samples of some pixels by channels, those of a pixel in a row, not yet evaluated.
+
+    `pixels`: their numbers, row by row; one that is there twice has samples that do not depend on each other.
+    `sampler`: as many samples a pixel as it says, stratified as in a pass of so many.
+    """
+    scene, sensor = renderer.scene, renderer.scene.sensors()[0]
+    spp, (width, _) = sampler.sample_count(), renderer.size
+    if hasattr(integrator, "begin_render"):
+        integrator.begin_render(sensor)
+    sampler.set_samples_per_wavefront(spp)
+    sampler.seed(seed, len(pixels) * spp)
+    number = dr.arange(mi.UInt32, len(pixels) * spp) // dr.opaque(mi.UInt32, spp)
+    number = dr.gather(mi.UInt32, mi.UInt32(pixels), number)
+    y = number // dr.opaque(mi.UInt32, width)
+    place = mi.Vector2f(mi.Float(number - y * width), mi.Float(y)) + sampler.next_2d()
+    # In the order of `ADIntegrator.sample_rays`.
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Vector2f(0)
+    time = sensor.shutter_open()
+    if sensor.shutter_open_time() > 0:
+        time += sampler.next_1d() * sensor.shutter_open_time()
+    wavelength = sampler.next_1d() if mi.is_spectral else 0
+    place /= mi.ScalarVector2f(renderer.size)
+    ray, weight = sensor.sample_ray_differential(time, wavelength, place, aperture)
+    ray.scale_differential(1 / math.sqrt(spp))
+    return _channels(scene, integrator, renderer.channels, sampler, ray, weight)[: renderer.colours]

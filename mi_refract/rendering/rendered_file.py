@@ -61,9 +61,10 @@ def read(output: Path, channels: tuple[str, ...], identity: Identity) -> Progres
         spp, passes = int(said["spp"]), int(said["passes"])
         contrasts = [float(contrast) for contrast in json.loads(said["contrasts"])]
         machines = {name for name in str(said["machines"]).split(", ") if name}
-        progress = Progress(identity, seconds=float(said["render_seconds"]), machines=machines)
+        kept = json.loads(said["identity"])
+        progress = Progress(kept, seconds=float(said["render_seconds"]), machines=machines)
         variance_from = said["variance_from"]
-        if changes(json.loads(said["identity"]), identity) or not 1 <= passes <= spp or len(contrasts) != passes - 1:
+        if changes(kept, identity) or not 1 <= passes <= spp or len(contrasts) != passes - 1:
             return None
         mean = image.select(channels).astype(np.float64)
         variance = image.select([VARIANCE.format(name) for name in channels]) if spp > 1 else np.zeros(())

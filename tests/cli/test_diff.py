@@ -16,9 +16,11 @@ from support.diff_images import BROKEN, image, samples, tree
 from support.processes import ENVIRONMENT
 from support.readme import DOCS
 
+from mi_refract import __version__
 from mi_refract.image_diff import methods, results_file, text_reports
 from mi_refract.image_diff.results import Result, Results, Status
 from mi_refract.io import errors
+from mi_refract.io.reference_pack import origin
 
 EVIL = 'a"b<script>alert(1)<∕script>|`*[x](y)*`,:%0A::error::.exr'
 
@@ -362,6 +364,8 @@ def test_json(run, strange, tmp_path):
     assert run("diff", old, new, "--json", out)[0] == 1
     data = read_json(out)
     assert data["exit_code"] == 1
+    command = shlex.join(["mi-refract", "diff", str(old), str(new), "--json", str(out)])
+    assert [data[key] for key in ("version", "command", "pack")] == [__version__, command, None]
     assert data["counts"] == {"error": 0, "different": 2, "inconclusive": 0, "equal": 1, "skipped": 0}
     by_name = {result["name"]: result for result in data["results"]}
     assert by_name[EVIL]["category"] == "added"
@@ -473,7 +477,7 @@ def test_strangers_words_stay_text(tmp_path, capfd):
     name = "a\n::error::b\x1b[31m\udcff\uffff\u2028\u202e.exr"
     result = Result(name, Status.ERROR, tmp_path, tmp_path, error=name)
     results = Results(tmp_path, tmp_path, (result,))
-    results_file.write(results, tmp_path / "out.xml", tmp_path / "out.json")
+    results_file.write(results, origin([], None), tmp_path / "out.xml", tmp_path / "out.json")
     results_file.write_github(results)
     forms = [capfd.readouterr().out, text_reports.markdown(results).partition("|---|\n")[2]]
     forms.append(ElementTree.parse(tmp_path / "out.xml").find(".//testcase").get("name"))

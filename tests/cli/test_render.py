@@ -130,6 +130,12 @@ BAD = {
     "no option": ({}, ("--nonesuch",), "--nonesuch"),
     "no error": ({}, ("--until", ""), "--until ; expected more than 0 %"),
     "no error of tiles": ({}, ("--until-tile", ""), "--until-tile ; expected more than 0 %"),
+    "no settings": ({}, ("--settings", "fast"), "--settings fast: 'fast'; expected auto, or sampler=…, integrator=…"),
+    "a pilot of a scalar variant": (
+        {},
+        ("--settings", "auto"),
+        "--settings auto: samples cannot be rendered one by one",
+    ),
     "no time": ({}, ("--time", ""), "--time ; expected a time of more than 0"),
     "malformed": (SCENE.replace("</shape>", ""), (), "mismatch"),
     "unknown parameter": (SCENE.replace("max_depth", "max_dept"), (), "max_dept"),
@@ -163,6 +169,20 @@ def test_bad_input(render, scene, changed, options, message):
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert err.startswith("mi-refract: ") and message in err
     assert [path for path in scene.parent.iterdir() if not path.is_symlink()] == [scene]
+
+
+def test_settings_replace_those_of_the_scene(render, scene):
+    """The image is that of the scene with another sampler; without the option it is another render."""
+    sampler = SCENE.replace('"independent"', '"stratified"')
+    options = "--spp", 4, "--pass-spp", 4
+    assert render(*options, "--settings", "sampler=stratified")[0] == 0
+    pixels, header = read_exr(scene.with_name("out.exr"))
+    assert header["mi_refract:settings"] == "sampler=stratified"
+    assert render(*options)[2] == ""  # from its first pass on
+    assert read_exr(scene.with_name("out.exr"))[1]["mi_refract:settings"] == "the scene's own"
+    scene.write_text(sampler)
+    assert render(*options)[0] == 0
+    np.testing.assert_array_equal(read_exr(scene.with_name("out.exr"))[0], pixels)
 
 
 def test_a_plugin_of_the_scenes_own_runs_only_where_it_is_allowed(render, scene):

@@ -25,6 +25,7 @@ VALUES = {  # of a row of a table, by its type
     "integer": 4,
     "boolean": True,
     "string": "wedge",
+    "word": "lamp",
     "name": "water",
     "dispersive material": "SCHOTT:N-BK7",
     "spectrum": {"type": "irregular", "wavelengths": "360, 830", "values": "0.5, 0.6"},

@@ -26,6 +26,7 @@ from mi_refract.image_diff.methods import METHODS, choice, compare
 from mi_refract.image_diff.results import Category, Status
 from mi_refract.image_diff.settings import Entry, Settings, load
 from mi_refract.io.image_file import read, write_exr
+from mi_refract.io.reference_pack import origin
 
 EQUAL, DIFFERENT, INCONCLUSIVE = Verdict.EQUAL, Verdict.DIFFERENT, Verdict.INCONCLUSIVE
 RGB, XYZ = channels.RGB, channels.XYZ
@@ -178,7 +179,7 @@ def test_by_the_json_what_was_compared_with_a_variance_is_not_accepted(pair, met
     values = {"method": method, "variance": "{stem}_var.exr"} | ({} if method == "tolerance" else {"spp": 16})
     written(pair[1] / "a.exr", of(samples(3, 16, gain=1.5).mean(0)))
     how, file = Settings(rules=(Entry("*", values),)), pair[0].parent / "out.json"
-    results_file.write(folders.diff(*pair, how, to_accept=True), data=file)
+    results_file.write(folders.diff(*pair, how, to_accept=True), origin([], None), data=file)
     for now in (how, Settings.for_all(method="tolerance")):
         if method == "tolerance":
             assert len(list(accept.changes(results_file.with_settings(results_file.read(file), now)))) == 1
@@ -407,7 +408,7 @@ def test_welch_is_chosen_and_reports_and_settings_say_so(films, tmp_path):
     results = folders.diff(*films, to_accept=True)
     assert {x.name: x.status for x in results.results} == {"off.exr": Status.DIFFERENT, "same.exr": Status.EQUAL}
     assert {result.method_in_words for result in results.results} == {f"welch ({BOTH})"}
-    results_file.write(results, data=tmp_path / "out.json")
+    results_file.write(results, origin([], None), data=tmp_path / "out.json")
     entries = json.loads((tmp_path / "out.json").read_text())["results"]
     assert {(x["method"], x["method_why"]) for x in entries} == {("welch", BOTH)}
     how = Settings(rules=(Entry("*", BESIDE | {"channels": (("X", "a.X"), ("Y", "Y"))}),))

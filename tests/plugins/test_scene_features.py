@@ -26,7 +26,12 @@ def facts(**parts):
     """The names of what is true of a scene of a glass ball and `parts`."""
     ball = {"type": "sphere", "bsdf": {"type": "refract"}}
     every = dataclasses.asdict(needs(**{"sensor": {"type": "perspective"}, "ball": ball} | parts))
-    return {name for name, value in every.items() if value is True} - {"refracting", "shape_media", "delta"}
+    return {name for name, value in every.items() if value is True} - {
+        "refracting",
+        "shape_media",
+        "delta",
+        "splitting",
+    }
 
 
 def sphere(bsdf, **parts):
@@ -66,6 +71,11 @@ LIT = {"sampleable", "lamps", "area"}
 )
 def test_each_part_adds_what_it_needs_and_no_more(part, seen, scalar_variant):
     assert facts(part=part) == seen | (set() if "smooth" in seen else {"only_glass"})
+
+
+def test_what_is_within_another_bsdf_does_not_split(scalar_variant):
+    assert needs(ball=sphere("dielectric")).splitting and needs(ball=sphere("refract")).splitting
+    assert not needs(ball=sphere("mask", a={"type": "refract"})).splitting
 
 
 def test_a_lamp_with_the_weight_0_is_never_sampled(scalar_variant):
@@ -240,7 +250,7 @@ def test_what_is_missing_says_why_and_what_mends_it(scalar_variant):
     (text,) = missing_light(scene).values()
     assert text == (
         "light of PointLight that delta lobes (glass, mirrors, null) cast on other surfaces is black; "
-        "expected area lights in place of such lamps"
+        "expected refract_path with caustics = lamp, or area lights in place of such lamps"
     )
 
 

@@ -14,6 +14,7 @@ from support.browser import browse, needs_chromium
 from support.media_rays import ALL, FLINT, answered
 from support.ray_programs import glsl
 
+from mi_refract.io.reference_pack import origin
 from mi_refract.ray_sets import check_answers, ray_set, reports
 from mi_refract.ray_sets.check_answers import Findings, Problem, RegimeErrors
 from mi_refract.ray_sets.diagnosis import Explanation
@@ -136,7 +137,7 @@ def test_json_junit_and_a_page_that_stands_alone(tmp_path):
     wrong = check_answers.check(to, Answers(to.ids[:-2], b[:-2]))
     for result, code, diagnosis, failures, errors in ((right, 0, None, 0, 0), (wrong, 2, "eta inverted", 3, 1)):
         title = "a & b \x1b[31m <program>"
-        reports.write_json(tmp_path / "out.json", {title: result})
+        reports.write_json(tmp_path / "out.json", {title: result}, origin(["rays"], None))
         text = (tmp_path / "out.json").read_text()
         document = json.loads(text, parse_constant=pytest.fail)
         (data,) = document["functions"]

@@ -14,6 +14,7 @@ from mi_refract.image_diff import html_report, results_file, text_reports
 from mi_refract.image_diff.comparison import Comparison, Metric, Verdict
 from mi_refract.image_diff.results import Result, Results, Status
 from mi_refract.image_diff.settings import ComparisonSpec
+from mi_refract.io.reference_pack import origin
 from mi_refract.planar import figure, path_tree, scene_file
 from mi_refract.ray_sets import check_answers, reports
 from mi_refract.ray_sets.diagnosis import Explanation
@@ -59,7 +60,7 @@ FORMS = {
     "terminal": lambda results, path: said(text_reports.print_results, results),
     "GitHub": lambda results, path: said(results_file.write_github, results).replace("::", ""),
     "Markdown": lambda results, path: text_reports.markdown(results),
-    "JUnit": lambda results, path: results_file.write(results, path) or path.read_text(),
+    "JUnit": lambda results, path: results_file.write(results, origin([], None), path) or path.read_text(),
     "HTML": lambda results, path: html_report.write(path, results, {NAME: [NAME]}, NAME) or path.read_text(),
     "terminal, rays": lambda results, path: printed(reports.table(findings())),
     "terminal, summary of rays": lambda results, path: printed(reports.summary(findings())),

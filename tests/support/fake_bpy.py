@@ -81,8 +81,8 @@ def named(**attributes):
     return SimpleNamespace(new=new, made=made)
 
 
-def run(folder, monkeypatch, *words):
-    """Run the script with these options; Blender's `bpy` as the script leaves it, and `rendered`: seeds and files."""
+def installed(monkeypatch):
+    """Blender's `bpy`, for scripts to import; `rendered`: seeds and files."""
     bpy = mock.MagicMock(rendered=[])
     scene = bpy.context.scene
     bpy.ops.render.render = lambda write_still: bpy.rendered.append((scene.cycles.seed, scene.render.filepath))
@@ -91,6 +91,12 @@ def run(folder, monkeypatch, *words):
     bpy.data.objects = named(data=lambda data: data)
     monkeypatch.setitem(sys.modules, "bpy", bpy)
     monkeypatch.setitem(sys.modules, "mathutils", SimpleNamespace(Vector=Vector, Matrix=Vector))
+    return bpy
+
+
+def run(folder, monkeypatch, *words):
+    """Run the script of an export with these options; `bpy` as the script leaves it."""
+    bpy = installed(monkeypatch)
     monkeypatch.setattr(sys, "argv", ["render.py", "--spp", "3", "--out", str(folder), *words])
     runpy.run_path(str(folder / "render.py"))["main"]()
     return bpy

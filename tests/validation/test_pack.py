@@ -164,7 +164,7 @@ def test_the_javascript_of_the_readme_answers_rightly(pack, run):
 
 def test_the_glsl_of_the_readme_compiles(pack):
     if not shutil.which("glslangValidator"):
-        pytest.skip("no glslangValidator in PATH")
+        pytest.skip("no glslangValidator in PATH; Debian: glslang-tools")
     Path("read.comp").write_text(*blocks(pack / "README.md", "glsl"))
     assert subprocess.run(["glslangValidator", "read.comp"], timeout=60).returncode == 0
 
@@ -196,7 +196,8 @@ def test_results_name_pack_and_answers_and_can_be_repeated(pack, answers, run):
     index = hashlib.sha256(Path(INDEX).read_bytes()).hexdigest()
     of_rays, of_images = json.loads(texts[0]), json.loads(texts[2])
     assert of_rays["pack"] == {"version": of_rays["version"], "sha256": index, "path": "rays/f64.csv"}
-    assert of_rays["command"] == commands[0] and of_images["pack"] == of_rays["pack"] | {"path": "images"}
+    assert [of_rays["command"], of_images["command"]] == commands
+    assert (of_images["version"], of_images["pack"]) == (of_rays["version"], of_rays["pack"] | {"path": "images"})
     digest = hashlib.sha256(Path("answers.csv").read_bytes()).hexdigest()
     assert of_rays["functions"][0]["answers_sha256"] == digest
     for entry in msgspec.convert(of_images, results_file.Document).results:

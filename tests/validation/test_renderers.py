@@ -4,14 +4,18 @@ import ast
 import dataclasses
 import json
 import re
+import runpy
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support import fake_bpy
 
 from mi_refract import oracle, regimes
+from mi_refract.io import image_file
 from mi_refract.ray_sets import renderer_file
 from mi_refract.ray_sets.files import parse_answers
 from mi_refract.ray_sets.header import PRECISIONS
@@ -288,6 +292,30 @@ def test_scripts_import_nothing_of_ours_and_we_nothing_of_theirs():
     ours = {*(root / "mi_refract").rglob("*.py"), *(root / "validation").rglob("*.py")}
     for path in ours - scripts:
         assert not imported(path) & (theirs | {path.stem for path in scripts}), path.name
+
+
+def test_cycles_reads_a_gltf_export_with_the_settings_of_its_own_one(tmp_path, monkeypatch):
+    pytest.importorskip("trimesh")
+    bpy, camera = fake_bpy.installed(monkeypatch), SimpleNamespace(type="CAMERA", data=SimpleNamespace(clip_end=100))
+    bpy.data.objects = [SimpleNamespace(type="MESH"), camera]
+
+    def run(words, timeout):
+        monkeypatch.setattr(sys, "argv", words[1:])
+        runpy.run_path(words[1])
+        for seed, file in bpy.rendered:
+            image_file.write_exr(file, np.full((9, 16, 3), seed, np.float32))
+        return ""
+
+    monkeypatch.setattr(environments, "run", run)
+    plain = exports.scene()
+    images = IMAGE_RENDERERS["Cycles, glTF"].draw(plain, tmp_path, 3, [1, 2])
+    assert [image.pixels[0, 0, 0] for image in images] == [1, 2]
+    bpy.ops.import_scene.gltf.assert_called_with(filepath=str(tmp_path / "scene" / "scene.glb"))
+    bpy.data.images.load.assert_called_with(str(tmp_path / "scene" / "sky.exr"))
+    scene = bpy.context.scene
+    assert scene.camera is camera and camera.data.clip_end >= 1e6
+    assert (scene.cycles.samples, scene.cycles.max_bounces) == (3, plain.max_depth - 2)
+    assert not bpy.data.meshes.made  # they are the importer's
 
 
 # Installing ----------------------------------------------------------------------------------------------------

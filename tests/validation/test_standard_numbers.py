@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.readme import DOCS
 
 from mi_refract import media
 from mi_refract.ray_sets import ray_set
@@ -49,8 +50,6 @@ KNOWN = {
     "rainbow of order 2, n = 1.3318": 50.58,
     "rainbow of order 1, n = 1.3435": 40.58,
     "rainbow of order 2, n = 1.3435": 53.61,
-    "glTF dispersion, sample, n_C": 2.40709,
-    "glTF dispersion, sample, n_F": 2.43291,
 }
 
 
@@ -69,6 +68,13 @@ def test_the_table_is_plain_data_with_unique_names_and_every_number_says_where_i
     writer.writerows(rows)
     assert all(row["source"] and row["law"] and row["kind"] in table.KINDS and row["given"] for row in rows)
     assert {row["kind"] for row in rows} == set(table.KINDS)
+
+
+def test_an_index_is_measured_of_a_glass_that_the_plugin_knows_and_glTFs_sample_is_only_quoted():
+    glasses = {number.medium.format(**number.given) for number in NUMBERS.values() if number.kind == "index"}
+    assert glasses == {*(f"SCHOTT:{name}" for name in table.GLASSES), "abbe(2.42, 55.0)"}
+    page = (DOCS / "reference/standard-numbers.md").read_text()
+    assert all(f"{2.42 + sign * (2.42 - 1) * 0.025 * 20 / 55:.5f}" in page for sign in (-1, 1))
 
 
 @pytest.mark.parametrize("name", [name for name, number in NUMBERS.items() if number.printed])
@@ -200,6 +206,32 @@ def test_the_double_gauss_is_within_its_bounds_and_another_glass_by_twice_that_i
     assert [x.name for x in numbers if not seen(x, wrong[x.name], found[x.name].bound)] == []
 
 
+LENS = [(1, lambda path: table.behind_the_lens(path, 1, 0)), (5, lambda path: table.behind_the_lens(path, 5, 1))]
+TRACED = {  # a bench, and what is read of its rays
+    "prism": lambda: study.angle_read(NUMBERS["prism of 60°, n = 1.5"]),
+    "drop": lambda: study.angle_read(NUMBERS["rainbow of order 2, n = 1.3333"]),
+    "double Gauss": lambda: (bench.benches()["double Gauss"], LENS),
+}
+
+
+@pytest.mark.parametrize("name", TRACED)
+def test_independent_roundings_stay_within_the_bound_of_a_ray_and_are_not_far_from_it(name):
+    case, readings = TRACED[name]()
+    bounds, rng, sizes = study.read_bounds(case, readings), np.random.default_rng(3), case.roundings()
+    exact, ratios = case.system.path(), []
+    counts = {key: round(bench.COUNTS[key[1]] if key[0] >= 0 else bench.FIRST) for key in sizes}
+    for _ in range(60):
+        shifts = {
+            key: size / counts[key] * rng.uniform(-1, 1, (counts[key], len(size), 3)).sum(0)
+            for key, size in sizes.items()
+        }
+        path = case.system.path(moved=lambda j, what, x, axis, s=shifts: x + s.get((j, what), 0))
+        ratios += [
+            abs(float(read(path) - read(exact))) / bound for (_, read), bound in zip(readings, bounds, strict=True)
+        ]
+    assert 0.2 < max(ratios) < 1
+
+
 def test_a_bound_that_would_hold_whatever_comes_fails():
     for number in NUMBERS.values():
         if "n" in number.given and not study.noisy(number):
@@ -247,6 +279,55 @@ def test_a_textbooks_formula_is_within_the_bounds_of_rays_and_an_index_off_by_tw
     share = max(2 * right[name].values["bound"] / moved[name] * tiny for name in moved if moved[name] > 0)
     assert share < tiny
     assert [name for name, row in rows(share).items() if row.broken != {"error / bound": 1.0}] == []
+
+
+def boundary(precision, share=0.0):
+    """Fresnel's equations as a program that answers what is reflected; the denser index is off by a share of it."""
+    real = np.float32 if precision == "f32" else np.float64
+
+    def reflect(rays):
+        c, k = -rays.rays.a[:, 2], rays.rays.k.astype(real)
+        n = (1 / (np.where(k > 1, k * (1 + share), k / (1 + share)))).astype(real)
+        root = np.sqrt((n * n - (1 - c * c)).astype(np.complex64 if precision == "f32" else complex))
+        s, p = (c - root) / (c + root), (n * n * c - root) / (n * n * c + root)
+        return {"s": np.abs(s) ** 2, "p": np.abs(p) ** 2, "phase": np.angle(p / s)}
+
+    return reflect
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_fresnels_equations_are_within_the_bounds_of_a_boundary_and_an_index_off_by_twice_them_is_seen(precision):
+    numbers = others.reflected(("p", "phase"))
+
+    def rows(share):
+        found = others.measure_reflected(numbers, precision, boundary(precision, share))
+        return {x.name: others.row(x, "a program", precision, *found[x.name], "") for x in numbers}
+
+    assert {x.kind for x in numbers} == {"Brewster's angle", "retardation", "diffuse"}
+    right, tiny = rows(0.0), 1e-4 if precision == "f32" else 1e-9
+    assert [name for name, row in right.items() if row.verdict != "pass"] == []
+    moved = {name: abs(row.values["measured"] - right[name].values["measured"]) for name, row in rows(tiny).items()}
+    flat = "largest retardation, n = 1.51"  # stationary in the incidence, not in the index
+    for name in {*moved} - {flat}:
+        share = 2.5 * right[name].values["bound"] / moved[name] * tiny
+        assert share < 20 * tiny and rows(share)[name].broken == {"error / bound": 1.0}, name
+
+
+def test_a_program_that_answers_reflectances_is_asked_and_one_that_leaves_some_out_fails(tmp_path, monkeypatch):
+    title, *rest = others.FRESNEL
+    context = here("quick", tmp_path, "scalar_rgb")
+    rows = others.fresnel_rows(title, context)
+    assert len(rows) == 9 and {row.verdict for row in rows} == {"pass"}
+    for text, reason in {
+        '{"system": "one", "s": [], "p": [0.5], "phase": [0]}': "[(0,), (1,), (1,)] answers; expected 517",
+        '{"system": "one", "s": []}': "no answer: KeyError('p'); expected system, s, p, phase in JSON",
+        "[]": "no answer: TypeError('list indices must be integers or slices, not str'); expected system, s, p, phase",
+    }.items():
+        monkeypatch.setattr(others.environments, "run", lambda *_, text=text: text)
+        (row,) = others.fresnel_rows(title, context)
+        assert row.broken == {"unanswered": 0.0} and row.reason.startswith(reason)
+    monkeypatch.setattr(others.environments, "absent", lambda system: "install it")
+    assert all(row.verdict == "not run" for name in rest for row in others.fresnel_rows(name, context))
 
 
 def test_an_index_of_a_catalogue_is_the_printed_one_and_another_or_none_is_seen():

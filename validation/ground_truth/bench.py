@@ -24,7 +24,7 @@ answer is taken from differences of the exact path, and all of them add up. In u
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,6 +38,7 @@ from validation.run.context import SCENES
 
 U = 2.0**-24
 FIRST, INTO, NORMAL, PLACE, ONWARD = 1.0, 9.0, 20.0, 28.0, 10.0
+COUNTS = {"into": INTO, "normal": NORMAL, "place": PLACE, "onward": ONWARD}
 STEP = 1e-2  # mm
 APEX = closed_forms.HALF_TURN / 3
 
@@ -65,15 +66,16 @@ class Bench:
             sizes |= {(j, "into"): INTO * one, (j, "onward"): ONWARD * one}
         return {key: U * size for key, size in sizes.items()}
 
-    def summed(self, changes: Callable[[Path], Answers]) -> Answers:
-        """Σ size/NUDGE |change| over all roundings; `changes`: by answer, of a path with one value moved by NUDGE."""
-        totals: Answers = {}
+    def effects(self, changes: Callable[[Path], Answers]) -> Iterator[tuple[float, Answers]]:
+        """Of each value: how many roundings of at most 1u are in its size, and size/NUDGE |change|, by answer.
+
+        `changes`: by answer, of a path with one value moved by NUDGE.
+        """
         for (boundary, what), size in self.roundings().items():
             for way in range(3 if what == "place" else 2):
                 path = self.system.path(moved=optical_systems.nudged(boundary, what, way))
-                for name, change in changes(path).items():
-                    totals[name] = totals.get(name, 0) + size / optical_systems.NUDGE * np.abs(change)
-        return totals
+                effect = {name: size / optical_systems.NUDGE * np.abs(x) for name, x in changes(path).items()}
+                yield FIRST if boundary < 0 else COUNTS[what], effect
 
     @functools.cached_property
     def bounds(self) -> Answers:
@@ -84,7 +86,8 @@ class Bench:
         def changes(path: Path) -> Answers:
             return {name: length(moved - exact[name])[..., 0] for name, moved in system.off(path).items()}
 
-        return {name: total + system.printed.get(name, 0) for name, total in self.summed(changes).items()}
+        effects = [effect for _, effect in self.effects(changes)]
+        return {name: np.sum([x[name] for x in effects], axis=0) + system.printed.get(name, 0) for name in exact}
 
     @property
     def index_seen(self) -> float:

@@ -8,7 +8,8 @@ in the ground truth. The rhomb is a body of Mitsuba's, and its retardation δ is
 through it, whose last element is cos δ. Brewster's and the critical angle are found by trying angles, the diffuse
 shares by the BSDF's probabilities at the nodes of a quadrature, indices by the ratio that a sample of it returns.
 
-The error is divided by its bound, in which all roundings to float32 add up at their worst; u = 2⁻²⁴.
+The error is divided by its bound, in which all roundings to float32 add up at their worst but where it says otherwise;
+u = 2⁻²⁴.
 
 - Plates. The ray's direction turns by 39u at each boundary (see `ground_truth/bench.py`), twelve times; of each
   polarisation the transmittance changes by so much times its slope. A weight is off by 45u a boundary with Mueller
@@ -16,7 +17,8 @@ The error is divided by its bound, in which all roundings to float32 add up at t
   A path counts as often as it meets boundaries. What passes after more than twelve is missing. In an
   absorbing plate Mitsuba sets a ray off along the normal, which makes its way shorter by sin²θ of that offset.
 - Four plates: Student's t over 16 sets of samples, which chance exceeds once in ten thousand runs, and these roundings.
-- Rays: see `ground_truth/bench.py`.
+- Rays: the roundings of `ground_truth/bench.py`, in each component, as independent ones: their sum exceeds
+  √(2 ln(2/p) Σ c²), where c is the largest effect of each, with a probability p (Hoeffding), once in ten thousand runs.
 - Retardation: 39u three times, times its slope, and four weights over sin δ.
 - Brewster's and the critical angle: 8u for the sines and cosines of a direction, 2u for the ratio of indices.
 - Diffuse shares: `limits.DIFFUSE`. Indices: 3u for the ratio, and the rounded wavelength; for glTF's formula, half a
@@ -243,29 +245,45 @@ def _plates(number: StandardNumber) -> dict[str, Any]:
 # Rays ------------------------------------------------------------------------------------------------------------
 
 
+Readings = Sequence[tuple[int, Callable[[optical_systems.Path], Any]]]  # the number of a ray, and what is read of it
+
+
 def traced_angle(group: Sequence[StandardNumber], samples: int) -> Answers:
     """The deviation by a prism, or the angle of a rainbow."""
-    (number,) = group
+    return _read(*angle_read(*group))
+
+
+def angle_read(number: StandardNumber) -> tuple[Bench, Readings]:
+    """The prism or the drop with its ray, and the angle as it is read of a path."""
     make, angle = (prism_bench, table.deviated) if number.kind == "deviation" else (drop_bench, table.from_antisolar)
     case = make(number)
-    return _read(case, [lambda path: angle(case.system.directions, path.directions[-1])[0]])
+    return case, [(0, lambda path: angle(case.system.directions, path.directions[-1])[0])]
 
 
 def double_gauss(group: Sequence[StandardNumber], samples: int) -> Answers:
     """Through the lens of the ground truth."""
     places = [(number.given["ray"], number.given["slope"]) for number in group]
-    readings = [lambda path, at=at: table.behind_the_lens(path, *at) for at in places]
+    readings = [(round(at[0]), lambda path, at=at: table.behind_the_lens(path, *at)) for at in places]
     return _read(bench.benches()["double Gauss"], readings)
 
 
-def _read(case: Bench, readings: Sequence[Callable[[optical_systems.Path], Any]]) -> Answers:
-    """What each reading makes of the path traced; and what roundings do to it, of any ray."""
-    exact, path = case.system.path(), case.traced(PLUGIN)
+def _read(case: Bench, readings: Readings) -> Answers:
+    """What each reading, of one ray, makes of the path traced; and what roundings do to it."""
+    path = case.traced(PLUGIN)
+    return list(zip([read(path) for _, read in readings], read_bounds(case, readings), strict=True))
+
+
+def read_bounds(case: Bench, readings: Readings) -> list[float]:
+    """By Hoeffding's inequality: Σ effect²/count is that of the squares of single roundings."""
+    exact, squares = case.system.path(), [0.0] * len(readings)
 
     def changes(moved: optical_systems.Path) -> optical_systems.Answers:
-        return {str(i): read(moved) - read(exact) for i, read in enumerate(readings)}
+        return {str(i): read(moved) - read(exact) for i, (_, read) in enumerate(readings)}
 
-    return [(read(path), bound.max()) for read, bound in zip(readings, case.summed(changes).values(), strict=True)]
+    for count, effect in case.effects(changes):
+        for i, (ray, _) in enumerate(readings):
+            squares[i] += float(effect[str(i)][ray, 0]) ** 2 / count
+    return [math.sqrt(2 * math.log(2 / limits.FALSE_ALARM) * square) for square in squares]
 
 
 def prism_bench(number: StandardNumber) -> Bench:
@@ -382,13 +400,11 @@ def index(group: Sequence[StandardNumber], samples: int) -> Answers:
 
     (number,) = group
     given, nm = number.given, number.given["nm"]
-    medium = number.medium.format(**given)
-    if number.law is table.khronos_sample:
-        ends = {w: float(number.at(nm=w)) for w in (486.13, 656.27)}
-        medium = f"hold(table(486.13: {ends[486.13]!r}, 587.56: {given['n_d']!r}, 656.27: {ends[656.27]!r}))"
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi, si.wavelengths = mi.Vector3f(0, 0, 1), type(si.wavelengths)(nm)
-    sample, _ = mi.load_dict(glass(PLUGIN, medium)).sample(followed_context(), si, 1 - 2 * U, [0.5, 0.5])
+    sample, _ = mi.load_dict(glass(PLUGIN, number.medium.format(**given))).sample(
+        followed_context(), si, 1 - 2 * U, [0.5, 0.5]
+    )
     bound = U * (3 * number.value + number.slope("nm") * nm)
     if number.law is table.khronos:
         bound += (given["n_d"] - 1) / given["abbe"] * (0.5 / nm**2 + 0.5e-4)

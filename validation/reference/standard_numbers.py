@@ -25,11 +25,9 @@ rise from 0° to 20°, as no plane slab's do. So the index 1.52 is given (Radian
 the glass is fitted here, by least squares to the nine printed values, and `off_print` says by how much each is missed:
 by 0.0021 or less. A renderer is compared with `value`.
 
-**KHR_materials_dispersion.** The normative formula of n(λ) goes through n_d. The sample of GLSL in the specification's
-section "Implementation", which is not normative, puts n_C and n_F at equal distances from it.
-
 Left out, for want of a source or of a derivation: the illuminances of the CIE's cases, which are the sky's and the
-room's; and measured indices of water by wavelength.
+room's; and measured indices of water by wavelength. And the sample of GLSL in KHR_materials_dispersion, which is not
+normative: three indices, no index by wavelength that a glass could have.
 """
 
 from __future__ import annotations
@@ -268,12 +266,6 @@ def khronos(n_d: Any, abbe: Any, nm: Any) -> Any:
     return max(n_d + (n_d - 1) / abbe * (523655 / np.longdouble(nm) ** 2 - np.longdouble("1.5168")), 1)
 
 
-def khronos_sample(n_d: Any, abbe: Any, nm: float) -> Any:
-    """n_d ± (n_d − 1) 0.025 (20/V_d): the sample of GLSL, + for blue and − for red."""
-    n_d = np.longdouble(n_d)
-    return n_d + np.sign(587.56 - nm) * (n_d - 1) / 40 * (20 / np.longdouble(abbe))
-
-
 @functools.cache
 def _lens() -> Any:
     return optical_systems.double_gauss().path()
@@ -433,10 +425,6 @@ def _table() -> Iterator[StandardNumber]:
         given, text = {"n_d": 2.42, "abbe": 55.0, "nm": nm}, "n_d + (n_d − 1)/V_d (523655/λ² − 1.5168), at least 1"
         name, source = f"glTF dispersion, n_{line}", f"{KHRONOS}, Overview (normative)"
         yield StandardNumber(name, "index", khronos, given, text, source, medium="abbe({n_d}, {abbe})")
-    for line, nm in (("C", 656.27), ("F", 486.13)):
-        given, text = {"n_d": 2.42, "abbe": 55.0, "nm": nm}, "n_d ± (n_d − 1) 0.025 (20/V_d), + at F and − at C"
-        name, source = f"glTF dispersion, sample, n_{line}", f"{KHRONOS}, Implementation (not normative)"
-        yield StandardNumber(name, "index", khronos_sample, given, text, source)
     for ray, field_angle in ((1, 10), (5, 14)):
         for slope, what, unit in ((0.0, "y", "mm"), (1.0, "dy/dz", "")):
             numbers = optical_systems.double_gauss_data()["rays"][ray]["surfaces"][-1]

@@ -45,7 +45,13 @@ TERMS = {
 LEFT_OUT = {THREE: "it counts the light of the sky twice, see the study of images; without MIS it is here"} | {
     title: "it is the reference" for title, renderer in IMAGE_RENDERERS.items() if renderer.system == "mitsuba"
 }
-THEIRS = {"POV-Ray": 256, "Cycles": 512, "LuxCore": 1024, "Radiance": 512}  # samples a pixel and render; others 256
+THEIRS = {
+    "POV-Ray": 256,
+    "Cycles": 512,
+    "Cycles, glTF": 512,
+    "LuxCore": 1024,
+    "Radiance": 512,
+}  # samples a pixel and render; others 256
 
 
 def scene(diffuse: bool = True) -> PlainScene:

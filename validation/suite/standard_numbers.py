@@ -5,13 +5,16 @@ boundary by boundary: places and normals are exact, each refraction is the progr
 `mi-refract rays run`; what it answers is the next ray. The critical angle is where its signal of total internal
 reflection begins, on a grid of rays around it. Indices are those of its glasses by name. The transmittance of plates is
 the mean of small images of a lamp behind them, by renderers of images; these do not follow polarisation, so it is the
-transmittance of boundaries that pass the mean of both, which is another number but straight through. Brewster's angle,
-retardations, diffuse shares and absorbing glass are asked of nobody: no interface here answers with a polarisation, a
-share or a coefficient.
+transmittance of boundaries that pass the mean of both, which is another number but straight through. Some answer what a
+boundary reflects, ray by ray. Its share of p gives Brewster's angle: the law's curve is shifted to fit best within
+±REACH. Its share of unpolarised light, at the nodes of a quadrature, gives the diffuse reflectance; the phase of its
+amplitudes, the retardation. Diffuse transmittances, polarised slabs and absorbing glass are asked of nobody: nothing
+here answers with them.
 
 The bound of a ray's number is that of the textbook formula: each answer is exact for inputs within 8u, and inputs and
 answers are rounded, 2u; the sum of what each may do to the number; u = 2⁻²⁴ or 2⁻⁵³. Of the critical angle, 32u, what
-the program is known to give up, and a step of the grid. Of an index, half a unit of the last digit that the maker
+the program is known to give up, and a step of the grid. Of a share or a phase, 10u of 1, and of what 10u of the cosine
+and of the index do to it. Of an index, half a unit of the last digit that the maker
 prints. Of an image, Student's t over eight seeds, which chance exceeds once in ten thousand runs, and a half float's
 rounding.
 """
@@ -19,11 +22,12 @@ rounding.
 from __future__ import annotations
 
 import functools
+import json
 import math
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,7 +40,7 @@ from mi_refract.ray_sets.renderer_file import RaysCommand
 from mi_refract.report.row import Row
 from mi_refract.scene_export.plain_scene import Camera, Glass, Light, Mesh, PlainScene
 from validation import limits
-from validation.reference import optical_systems
+from validation.reference import closed_forms, optical_systems
 from validation.reference import standard_numbers as table
 from validation.reference.optical_systems import System as Optics
 from validation.reference.standard_numbers import StandardNumber
@@ -57,6 +61,7 @@ TERMS = dict(table.KINDS) | {
     "unanswered": "numbers without an answer, because the program crashed, hung or answered no numbers",
 }
 ROUNDED = limits.TEXTBOOK_BACKWARD + 2  # u
+REACH = 5.0  # degrees
 CRITICAL, GRID = 32.0, 33  # u on either side of a critical angle; rays from twice as far before it to as far behind
 STEP = 4 / (GRID - 1)
 SEEDS, SPP, PIXELS = 8, 16, 64
@@ -66,7 +71,25 @@ THICK, WIDE = 100.0, 3000.0  # of plates
 NOT_ASKED = "Mitsuba, ptracer"  # sees no lamp through glass
 DEPTH = 64
 RAYS, IMAGES = ("deviation", "rainbow", "double Gauss", "critical angle"), "transmittance, unpolarised"
+
+
+class Fresnel(NamedTuple):
+    """Who answers what a boundary reflects: the script and its options, and the names of its answers."""
+
+    system: str
+    script: tuple[str, ...]
+    precision: str
+    answers: tuple[str, ...]
+
+
+FRESNEL = {
+    "Mitsuba, mi.fresnel_polarized": Fresnel("mitsuba", ("mitsuba_fresnel.py",), "f32", ("s", "p", "phase")),
+    "optiland, JonesFresnel": Fresnel("optiland", ("optiland_fresnel.py",), "f64", ("s", "p", "phase")),
+    "MaterialX, mx_fresnel_dielectric_polarized": Fresnel("materialx", ("materialx_fresnel.py",), "f32", ("s", "p")),
+    "Radiance, rtrace": Fresnel("radiance", ("radiance_rays.py", "fresnel"), "f32", ("mean",)),
+}
 Refract = Callable[[RaySet], Answers]
+Reflect = Callable[[RaySet], dict[str, Any]]
 
 
 def of_kind(*kinds: str) -> list[StandardNumber]:
@@ -92,12 +115,13 @@ def tasks(context: Context) -> list[Task]:
         Task(f"{NAME}: glasses of {SYSTEMS[name].title}", functools.partial(glass_rows, SYSTEMS[name], known, context))
         for name, known in CATALOGUES.items()
     ]
+    powers = [Task(f"{NAME}: {title}", functools.partial(fresnel_rows, title, context)) for title in FRESNEL]
     images = [
         Task(f"{NAME}: images of {title}", functools.partial(image_rows, title, context))
         for title in IMAGE_RENDERERS
         if title != NOT_ASKED
     ]
-    return [*rays, *glasses, *images]
+    return [*rays, *glasses, *powers, *images]
 
 
 def row(number: StandardNumber, subject: str, setting: str, measured: float, bound: float, remark: str) -> Row:
@@ -240,6 +264,114 @@ def critical_angles(
         size = math.degrees(spread[number.name])
         found[number.name] = (number.value + place * size, size * (1 + STEP))
     return found
+
+
+# Fresnel's equations ---------------------------------------------------------------------------------------------
+
+
+def fresnel_rows(title: str, context: Context) -> list[Row]:
+    """A row per number that what a boundary reflects gives, or one that says why there are none."""
+    asked = FRESNEL[title]
+    system, numbers, versions = SYSTEMS[asked.system], reflected(asked.answers), list[str]()
+    made = functools.partial(Row, NAME, title, "every boundary", asked.precision)
+
+    def reflect(rays: RaySet) -> dict[str, Any]:
+        data = json.loads(environments.run(environments.script(system, *asked.script), as_csv(rays)))
+        try:
+            versions.append(str(data["system"]))
+            found = {key: np.array(data[key], float) for key in asked.answers}
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"no answer: {error!r}; expected system, {', '.join(asked.answers)} in JSON") from None
+        if {x.shape for x in found.values()} != {(len(rays),)}:
+            raise ValueError(f"{[x.shape for x in found.values()]} answers; expected {len(rays)} numbers of each")
+        return found
+
+    lost, reason = ("unanswered", float(len(numbers))), environments.why_not(system, context.profile.name)
+    answer = functools.partial(measure_reflected, numbers, asked.precision, reflect)
+    found, nothing = environments.attempt(made, reason, lost, answer)
+    if found is None:
+        return nothing
+    return [row(x, title, asked.precision, *found[x.name], versions[0]) for x in numbers]
+
+
+def reflected(known: Sequence[str]) -> list[StandardNumber]:
+    """The numbers that these answers give."""
+    kinds = {"p": "Brewster's angle", "phase": "retardation"}
+    shares = [x for x in of_kind("diffuse") if not x.given["passed"]]
+    return [*of_kind(*(kind for key, kind in kinds.items() if key in known)), *shares]
+
+
+def measure_reflected(
+    numbers: Sequence[StandardNumber], precision: str, reflect: Reflect
+) -> dict[str, tuple[float, float]]:
+    """What a program makes of numbers by what a boundary reflects, and the bound, by name."""
+    dtype, roundoff = PRECISIONS[precision], float(np.finfo(PRECISIONS[precision]).eps) / 2
+    cosines, reads, k = [], [], []
+    for number in numbers:
+        cosine, into, read = reflections(number, dtype)
+        cosines.append(np.asarray(cosine, dtype).astype(np.longdouble))
+        reads.append(read)
+        k.append(np.full(len(cosine), 1 / into, dtype))
+    cosine = np.concatenate(cosines)
+    a = optical_systems.vectors(np.sqrt(1 - cosine**2), 0, -cosine).astype(dtype)
+    n = np.broadcast_to(np.array([0, 0, 1], dtype), a.shape)
+    answers = reflect(of_rays(regimes.Rays(a, n, np.concatenate(k)), precision))
+    ends, found = np.cumsum([len(x) for x in cosines])[:-1], {}
+    for i, (number, read) in enumerate(zip(numbers, reads, strict=True)):
+        value, bound = read(cosines[i], {key: np.split(x, ends)[i] for key, x in answers.items()})
+        found[number.name] = float(value), ROUNDED * roundoff * float(bound)
+    return found
+
+
+Read = Callable[[Any, dict[str, Any]], tuple[Any, Any]]
+
+
+def reflections(number: StandardNumber, dtype: Any) -> tuple[Any, float, Read]:
+    """Cosines of incidence, the index over that in front, and what makes the number, and its bound over ROUNDED u, of
+    the cosines and the answers at them.
+    """
+    n = number.given["n"]
+    if number.kind == "Brewster's angle":
+        angles = number.value + np.linspace(-REACH, REACH, GRID)
+        return np.cos(np.deg2rad(angles)), n, functools.partial(_shifted, number)
+    if number.kind == "retardation":
+        count, angle = number.given["reflections"], number.given["incidence"]
+
+        def read(cosine: Any, found: dict[str, Any]) -> tuple[Any, Any]:
+            slope = number.slope("n") * n + number.slope("incidence") * np.rad2deg(cosine / np.sqrt(1 - cosine**2))
+            return count * np.rad2deg(np.abs(found["phase"]))[0], slope[0] + count * math.degrees(1)
+
+        return np.cos(np.deg2rad([angle])), 1 / n, read
+    outside, inside, weight = closed_forms.nodes(n, dtype)
+    cosine, into, share = (outside, n, 1.0) if number.given["outside"] else (inside, 1 / n, 1 / n**2)
+
+    def total(cosine: Any, found: dict[str, Any]) -> tuple[Any, Any]:
+        """The rest, 1 − share of all light, is beyond the critical angle."""
+        power = found["mean"] if "mean" in found else (found["s"] + found["p"]) / 2
+        off = 1 + sum(np.abs(each).mean(0) for each in slopes(into, cosine))
+        return share * (weight * power).sum() + 1 - share, share * (weight * off).sum()
+
+    return cosine, into, total
+
+
+def _shifted(number: StandardNumber, cosine: Any, found: dict[str, Any]) -> tuple[Any, Any]:
+    """Brewster's angle of the curve of R_p, of first order in its shift along the law's: least squares."""
+    by_cosine, by_index = (x[1] for x in slopes(number.given["n"], cosine))
+    slope = by_cosine * np.deg2rad(-np.sqrt(1 - cosine**2) / cosine)  # per degree
+    off, weight = share_of(number.given["n"], cosine)[1] - found["p"], slope / (slope**2).sum()
+    return number.value + (off * weight).sum(), (np.abs(weight) * (1 + np.abs(by_cosine) + np.abs(by_index))).sum()
+
+
+def share_of(into: Any, cosine: Any) -> np.ndarray:
+    """R_s and R_p, 2 × N, of cosines of incidence."""
+    return table.reflectances(into, np.rad2deg(np.arccos(cosine)))[0]
+
+
+def slopes(into: float, cosine: Any) -> list[np.ndarray]:
+    """∂R/∂ln of the cosine and of the index, 2 × N each, in extended precision."""
+    up = 1 + np.longdouble(1e-12)
+    ways = (1, up), (up, 1)
+    return [(share_of(into * x, cosine * y) - share_of(into / x, cosine / y)) / (2 * (up - 1)) for x, y in ways]
 
 
 # Glasses ---------------------------------------------------------------------------------------------------------

@@ -104,13 +104,29 @@ def _three(mis: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[
     chromium, node = next(filter(None, map(shutil.which, BROWSERS)), None), shutil.which("node")
     if not (chromium and node):
         raise environments.Unable("no node or no Chromium in PATH")
-    meshes = tuple(dataclasses.replace(mesh, normals=None) for mesh in plain.meshes)  # flat, as on the other side
-    targets.write(dataclasses.replace(plain, meshes=meshes), "gltf", folder / "scene")
+    _write_gltf(plain, folder / "scene")
     script, home = SCRIPTS / "three_images.mjs", environments.folder(SYSTEMS["three"])
     sizes = (plain.camera.width, plain.camera.height, spp, mis, *seeds)
     words = [node, *map(str, (script, home, chromium, folder / "scene", folder, *sizes))]
     environments.run(words, timeout=HOURS)
     return [_raw(folder / f"seed{seed}.f32", plain) for seed in seeds]
+
+
+def _cycles_gltf(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+    """By Blender's importer of glTF, with the settings of the export to Cycles."""
+    targets.write(plain, "cycles", folder / "cycles")
+    _write_gltf(plain, folder / "scene")
+    words = map(
+        str, (folder / "scene", folder / "cycles" / "render.py", "--spp", spp, "--out", folder, "--seeds", *seeds)
+    )
+    environments.run(environments.script(SYSTEMS["cycles"], "gltf_by_cycles.py", *words), timeout=HOURS)
+    return [_rgb(image_file.read(folder / f"seed{seed}.exr")) for seed in seeds]
+
+
+def _write_gltf(plain: PlainScene, folder: Path) -> None:
+    """With facets for normals, as the other side has them."""
+    meshes = tuple(dataclasses.replace(mesh, normals=None) for mesh in plain.meshes)
+    targets.write(dataclasses.replace(plain, meshes=meshes), "gltf", folder)
 
 
 def _mitsuba(integrator: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
@@ -147,6 +163,10 @@ THREE = (
     "and a black back.",
     "bounces and transmissiveBounces are Mitsuba's max_depth.",
 )
+CYCLES_GLTF = (
+    "It reads the export to glTF, by Blender's importer, with facets for normals, as the other side has them.",
+    *scene_json.CYCLES_ASSUMPTIONS,
+)
 MITSUBA = ("Mitsuba's `dielectric` in the same variant and scene file; no Russian roulette.",)
 PTRACER = (
     *MITSUBA,
@@ -172,6 +192,7 @@ IMAGE_RENDERERS: dict[str, ImageRenderer] = {
     "Mitsuba, ptracer": _renderer("mitsuba", _ptracer, PTRACER, caustic=32768, sphere=512),
     "Radiance": _renderer("radiance", _radiance, radiance.ASSUMPTIONS, 960, 448, 24),
     "Cycles": _renderer("cycles", _cycles, scene_json.CYCLES_ASSUMPTIONS, 512, 128, 32),
+    "Cycles, glTF": _renderer("cycles", _cycles_gltf, CYCLES_GLTF, 512, 128, 32),
     # furnace: a scene without lamps, which raysect meets by chance
     "raysect": _renderer("raysect", _raysect, scene_json.RAYSECT_ASSUMPTIONS, 2048, 768, 256, furnace=128),
     "LuxCore": _renderer("luxcore", _luxcore, luxcore.ASSUMPTIONS, 1280, 1024, 576),

@@ -1,11 +1,14 @@
 """Radiance's `rtrace`: every ray meets a ring of its own between the two media, and `-otdW` prints what follows.
 
+With `fresnel` the answer is the weight of the reflected ray.
+
 A ring takes its normal as given, where a polygon would compute one from its corners. The rings are far apart, and so
 small that no ray meets another one's.
 """
 
 import os
 import subprocess
+import sys
 import tempfile
 from importlib.metadata import version
 from pathlib import Path
@@ -40,10 +43,12 @@ def scene(rays, centres):
 def answers(out, rays):
     """The child on the far side of each ray's ring, else the reflected one where it carries all; NaN where is neither.
 
+    And the weight of the reflected child, NaN where there is none.
+
     `-t` prints children before their parent, with a tab before each of them in binary output, too. A ray's own record
     is the one that is unturned and of weight 1.
     """
-    b, position = np.full((len(rays), 3), np.nan), 0
+    b, weights, position = np.full((len(rays), 3), np.nan), np.full(len(rays), np.nan), 0
     for i, (a, n) in enumerate(zip(rays.a, rays.n, strict=True)):
         while not _is(_record(out, position), a):
             if out[position : position + 1] != b"\t":
@@ -51,9 +56,11 @@ def answers(out, rays):
             child = _record(out, position + 1)
             if child[:3] @ n < 0 or child[3] == 1:
                 b[i] = child[:3]
+            if child[:3] @ n > 0:
+                weights[i] = child[3]
             position += 1 + RECORD
         position += RECORD
-    return b
+    return b, weights
 
 
 def _record(out, position):
@@ -72,4 +79,8 @@ with tempfile.TemporaryDirectory() as folder:
     (Path(folder) / "scene.oct").write_bytes(run("oconv", f"{folder}/scene.rad"))
     starts = np.concatenate([centres - START * rays.a, rays.a], axis=1)
     out = run("rtrace", *OPTIONS, f"{folder}/scene.oct", given=starts.tobytes())
-table.write(rays, answers(out, rays), f"Radiance, pyradiance {version('pyradiance')}")
+system, (b, weights) = f"Radiance, pyradiance {version('pyradiance')}", answers(out, rays)
+if sys.argv[1:] == ["fresnel"]:
+    table.write_fresnel(system, mean=weights)
+else:
+    table.write(rays, b, system)

@@ -84,3 +84,12 @@ def write(rays, b, system, transmitted=None):
         columns.append(("n_ratio", map(repr, rays.k.tolist())))
     names, values = zip(*columns, strict=True)
     print("\n".join(map(",".join, [names, *zip(*values, strict=True)])))
+
+
+def write_fresnel(system, **found):
+    """To stdout, as JSON: what a boundary reflects of each ray, by name, in the order of the rays.
+
+    `s`, `p`: shares of the power of each polarisation. `mean`: of unpolarised light, where these are not known.
+    `phase`: of the p over the s wave, in radians, where p is −s at normal incidence.
+    """
+    print(json.dumps({"system": system, **{name: np.asarray(x, float).tolist() for name, x in found.items()}}))

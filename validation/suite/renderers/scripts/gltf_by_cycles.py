@@ -1,0 +1,29 @@
+"""Cycles on a glTF scene as Blender's importer makes it: `python gltf_by_cycles.py FOLDER RENDER.py --spp 256 --out .`
+
+FOLDER: a glTF export. RENDER.py: that of a Cycles export of the same scene, for its settings and depth.
+"""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import bpy
+
+folder, path = map(Path, (sys.argv.pop(1), sys.argv.pop(1)))
+spec = importlib.util.spec_from_file_location("render", path)
+cycles = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(cycles)
+
+
+def build(plain, _):
+    """What the importer makes of the file, and the sky beside it."""
+    bpy.ops.import_scene.gltf(filepath=str(folder / "scene.glb"))
+    sky = {"environment": "sky.exr"} if (folder / "sky.exr").exists() else {"radiance": (0, 0, 0)}
+    cycles.world(sky, folder)
+    scene = bpy.context.scene
+    scene.camera = next(thing for thing in bpy.data.objects if thing.type == "CAMERA")
+    scene.camera.data.clip_end = 1e6
+
+
+cycles.build = build
+cycles.main()
