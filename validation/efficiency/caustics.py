@@ -216,7 +216,8 @@ def reference(body: str, lamp: str, extent: Extent) -> Reference:
     renders = np.stack([look(extent.checked_spp, seed=FIRST_REFERENCE + i)[0] for i in range(extent.renders)])
     without_glass = Camera(scene, seen_in_glass())(64, seed=0)[0].max(-1) == 0
     direct = camera_of(black, BUILTIN)(extent.checked_spp, seed=0)[0].mean(-1)
-    light = renders.mean((0, -1))
+    # Of a render that is none of them: pixels that their noise had chosen would be too bright in them.
+    light = look(extent.checked_spp, seed=FIRST_REFERENCE - 1)[0].mean(-1)
     return Reference(renders, without_glass, without_glass & (light - direct > SHARE * light))
 
 
