@@ -111,11 +111,8 @@ def test_light_that_is_missing_is_an_alarm_and_noise_no_pass(context, monkeypatc
     assert path.broken[WELCH_ALARMS] == 0 and path.values["light missing"] > 0.5
     assert by_class.values[WELCH_ALARMS] == 0 and abs(by_class.values["light missing"]) < 0.1
     assert by_class.verdict == "pass" and abs(ours.values["light missing"]) < 0.1
-    assert (
-        ours.values[WELCH_ALARMS] == 0
-        and ours.broken.keys() == {DETECTABLE}
-        and path.images.keys() == {"reference", "test"}
-    )
+    assert ours.values[WELCH_ALARMS] == 0 and ours.broken.keys() == {DETECTABLE}
+    assert path.images.keys() == {"reference", "test"}
 
 
 def test_scalar_variants_are_not_run(scalar_context):
