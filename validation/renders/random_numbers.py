@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refract.plugins.sampling import KeyedMultijitter
+from mi_refract.plugins.sampling import KeyedMultijitter, seeds_of
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run.context import Context
@@ -77,7 +77,8 @@ def histograms(make: Any, count: int, seed: int) -> Iterator[tuple[str, Any, int
     pixels = max(LANES // count, 1)
     sampler = mi.load_dict({"type": "independent", "sample_count": count})
     sampler.seed(seed, pixels * count)
-    source, random, before = make(mi, sampler, count), np.random.default_rng(seed), [np.empty(0)] * 3
+    seeds = seeds_of(mi, sampler)
+    source, random, before = make(mi, seeds, pixels * count, count), np.random.default_rng(seed), [np.empty(0)] * 3
     pick = np.arange(pixels), np.zeros(pixels, int)
     for key in range(KEYS):
         if key % 2 == 0:
