@@ -114,6 +114,9 @@ def bounding_sphere(shape: Shape) -> Sphere:
         box = mi.ScalarBoundingBox3f(*([*map(float, ends(0))] for ends in (vertices.min, vertices.max)))
     half = [float(x) / 2 for x in box.extents()]
     radius = half[0] if shape.class_name() == "Sphere" else math.hypot(*half)
+    if not math.isfinite(radius):
+        text = f"refract_path: caustics = lamp: the bounds of a {shape.class_name()} are not known"
+        raise ValueError(f"{text}; expected caustics = path")
     return Sphere(tuple(map(float, box.center())), radius * MARGIN)
 
 
@@ -247,9 +250,9 @@ class LampTracer:
         self.context = followed_context()
         self.context.mode = mi.TransportMode.Importance
         self.camera, self.camera_medium = Camera(v, sensor), camera_medium
-        box = scene.bbox()
-        self.size = math.hypot(*(float(x) for x in box.extents()))
-        self.center = v.Point3f(box.center())
+        # Not `scene.bbox()`, which leaves out rectangles that Mitsuba has merged into a mesh.
+        (bounds,) = merged([bounding_sphere(shape) for shape in scene.shapes()], 1)
+        self.size, self.center = 2 * bounds.radius, v.Point3f(*bounds.center)
         self.lamps = [lamp for lamp in scene.emitters() if not lamp.is_environment()]
         indices = [i for i, lamp in enumerate(scene.emitters()) if not lamp.is_environment()]
         kinds = [KINDS[lamp.class_name()] for lamp in self.lamps]
@@ -336,7 +339,7 @@ class LampTracer:
             reference.p = self.center
             ds, irradiance = emitter.sample_direction(reference, on_lamp, here)
             p, q = self.aim.place(lamp, chosen, -ds.d, aimed)
-            origin = dr.select(here, p + ds.d * (2 * self.size), origin)
+            origin = dr.select(here, p + ds.d * self.size, origin)
             d, density = dr.select(here, -ds.d, d), dr.select(here, q, density)
             power = dr.select(here, irradiance, power)
         power = power * dr.select(density > 0, 1 / (density * probability), 0)
