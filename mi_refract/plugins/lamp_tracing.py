@@ -61,7 +61,7 @@ from .scene_features import KNOWN, KNOWN_SHAPES, bsdf_name, nested
 MOST_TARGETS = 16  # spheres at which directions are aimed
 MARGIN = 1 + 1e-4  # of a sphere's radius: rounding must not leave its rim out
 LANES = 2**24  # light paths at a time
-PILOT = 256  # light paths by which the power of a lamp is estimated
+PILOT, MOST_PILOT = 256, 2**14  # light paths by which the power of a lamp is estimated, and of all
 DEFENSIVE = 0.1  # share of the light paths that all lamps have alike, whatever the estimate says
 SENSORS = {"PerspectiveCamera", "ThinLensCamera", "OrthographicCamera"}
 AREA, PLACE, DIRECTION = range(3)  # kinds of lamps
@@ -82,6 +82,11 @@ def refused_sensor(sensor: Sensor) -> str:
     if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special) or sensor.film().sample_border():
         return "it traces light to a hdrfilm without sample_border"
     return ""
+
+
+def lit(lamp: Emitter) -> bool:
+    """Whether path tracing would find light of a lamp that is not in the environment: one of zero size is sampled."""
+    return KINDS[lamp.class_name()] == AREA or lamp.sampling_weight() > 0
 
 
 # Aim ------------------------------------------------------------------------------------------------------------------
@@ -253,8 +258,9 @@ class LampTracer:
         # Not `scene.bbox()`, which leaves out rectangles that Mitsuba has merged into a mesh.
         (bounds,) = merged([bounding_sphere(shape) for shape in scene.shapes()], 1)
         self.size, self.center = 2 * bounds.radius, v.Point3f(*bounds.center)
-        self.lamps = [lamp for lamp in scene.emitters() if not lamp.is_environment()]
-        indices = [i for i, lamp in enumerate(scene.emitters()) if not lamp.is_environment()]
+        emitters = scene.emitters()
+        indices = [i for i, lamp in enumerate(emitters) if not lamp.is_environment() and lit(lamp)]
+        self.lamps = [emitters[i] for i in indices]
         kinds = [KINDS[lamp.class_name()] for lamp in self.lamps]
         self.kinds: Any = v.UInt32(kinds) if self.vectorised else kinds
         dr.make_opaque(self.kinds)
@@ -279,19 +285,17 @@ class LampTracer:
 
     def _powers(self) -> list[float]:
         """Probabilities of the lamps, in proportion to their power toward the spheres as a pilot estimates it."""
-        v, count = self.v, PILOT * len(self.lamps) if self.vectorised else 16 * len(self.lamps)
+        import numpy as np
+
+        v, count = self.v, min(PILOT, MOST_PILOT // len(self.lamps) + 1) * len(self.lamps)
         numbers: Any = KeyedMultijitter(v, v.UInt32(0), count, count) if self.vectorised else IndependentNumbers(v, 0)
         sums = [0.0] * len(self.lamps)
         for _ in range(1 if self.vectorised else count):
-            lamp, _, power = self._emitted(numbers, v.Bool(True))
-            power = dr.sum(v.unpolarized_spectrum(power))
-            power = dr.select(dr.isfinite(power), power, 0)
-            if self.vectorised:
-                powers = dr.zeros(v.Float, len(sums))
-                dr.scatter_add(powers, power, lamp)
-                sums = [float(x) for x in powers]
-            else:
-                sums[int(lamp)] += power
+            lamps, _, light = self._emitted(numbers, v.Bool(True))
+            powers = dr.sum(v.unpolarized_spectrum(light))
+            # Added in a fixed order: the bits of an image depend on the sums.
+            for lamp, power in zip(np.ravel(lamps).tolist(), np.ravel(powers).tolist(), strict=True):
+                sums[lamp] += power if math.isfinite(power) else 0
         total = sum(sums)
         even = 1 / len(sums)
         return [DEFENSIVE * even + (1 - DEFENSIVE) * (x / total if total else even) for x in sums]
