@@ -23,6 +23,20 @@ def has_normals(mesh: Any) -> bool:
     return bool(mesh.has_vertex_normals())
 
 
+def is_smooth(mesh: Any) -> bool:
+    """Whether normals of vertices differ from those of the faces, by more than 1e-3."""
+    import numpy as np
+
+    if not has_normals(mesh):
+        return False
+    vertices, faces = arrays(mesh)
+    p, q, r = (vertices[faces[:, i]].astype(float) for i in range(3))
+    face = np.cross(q - p, r - p)
+    face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), np.finfo(float).tiny)
+    normals = np.array(mesh.vertex_normals_buffer()).reshape(-1, 3)[faces]
+    return bool((np.linalg.norm(np.cross(normals, face[:, None]), axis=-1) > 1e-3).any())
+
+
 def make(
     v: ModuleType,
     vertices: NDArray[Any],

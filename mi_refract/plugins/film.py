@@ -90,11 +90,13 @@ class Splats:
         shape = self.height, self.width, self.channels
         if not self.vectorised:
             return np.array(self.sums).reshape(shape)
-        digits = np.array(self.digits).view(np.int64).reshape(-1, self.per_sum)
-        sums = np.zeros(self.count)
+        double: Any = dr.float64_array_t(self.v.Float)
+        signed: Any = dr.int64_array_t(self.v.Float)
+        first, sums = dr.arange(self.v.UInt32, self.count) * self.per_sum, dr.zeros(double, self.count)
         for i in reversed(range(self.per_sum)):
-            sums += digits[:, i] * 2.0 ** (BITS * i + self.lowest)
-        return np.where(np.array(self.beyond) > 0, np.nan, sums).reshape(shape)
+            digit = dr.gather(self.wide, self.digits, first + i)
+            sums += double(dr.reinterpret_array(signed, digit)) * 2.0 ** (BITS * i + self.lowest)
+        return np.array(dr.select(self.beyond > 0, dr.nan, sums)).reshape(shape)
 
 
 def film_colours(v: Variant, spectrum: Spectrum, wavelengths: Number, channels: tuple[str, ...]) -> list[Number]:

@@ -56,7 +56,7 @@ from .medium_tracking import THROUGH
 from .path_loop import PathLoop
 from .refract import DISPERSED, followed_context
 from .sampling import IndependentNumbers, KeyedMultijitter
-from .scene_features import KNOWN, KNOWN_SHAPES, bsdf_name, nested
+from .scene_features import KNOWN, KNOWN_SHAPES, all_shapes, bsdf_name, nested
 
 MOST_TARGETS = 16  # spheres at which directions are aimed
 MARGIN = 1 + 1e-4  # of a sphere's radius: rounding must not leave its rim out
@@ -71,8 +71,18 @@ LOBES = mi.BSDFFlags
 
 def refused_lamps(scene: Scene) -> str:
     """Why the lamps of a scene cannot be traced; "" where they can be."""
-    found = {lamp.class_name() for lamp in scene.emitters() if not lamp.is_environment()} - KINDS.keys()
-    return f"it traces area, point, spot and directional lamps, not {min(found)}" if found else ""
+    lamps = [lamp for lamp in scene.emitters() if not lamp.is_environment()]
+    if found := {lamp.class_name() for lamp in lamps} - KINDS.keys():
+        return f"it traces area, point, spot and directional lamps, not {min(found)}"
+    shapes = [lamp.get_shape() for lamp in lamps if lamp.class_name() == "AreaLight"]
+    if any(shape.is_mesh() and mitsuba_mesh.is_smooth(shape) for shape in shapes):
+        return "the normals of an area lamp are not those of its faces"
+    # Mitsuba has the same matrix for light that comes from the lamp, whose order it would turn around.
+    if mi.is_polarized and any(
+        bsdf_name(bsdf) == "LinearRetarder" for shape in all_shapes(scene) for bsdf in nested(shape.bsdf())
+    ):
+        return "a retarder"
+    return ""
 
 
 def refused_sensor(sensor: Sensor) -> str:

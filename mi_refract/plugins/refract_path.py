@@ -25,8 +25,9 @@ With `caustics` = `path`, light that passes glass or a mirror before it reaches 
 not at all where the lamp is a point, a spot or directional. `lamp` traces it from the lamps to all surfaces that the
 camera sees directly, along `light_paths` paths for each sample of the camera (`lamp_tracing`). It takes area, point,
 spot and directional lamps, and perspective, thin-lens and orthographic cameras. In scenes with media of Mitsuba's, in
-frozen functions, for derivatives and within another integrator it is an error, and `auto` means `path`. What is missing
-then is named in a warning, once a scene (`SceneFeatures.missing`).
+frozen functions, for derivatives and within another integrator it is an error, and `auto` means `path`: so with `auto`
+derivatives are those of the image by path tracing. What is missing is named in a warning, once a scene
+(`SceneFeatures.missing`).
 
 Derivatives are attached: rays move with the index. Edges that move across a pixel, or in the view of a surface that is
 not smooth, are not in them. A render that is differentiated does not split.

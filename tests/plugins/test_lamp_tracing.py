@@ -4,11 +4,14 @@ Images of path tracing and of both parts together are compared by the difference
 with a false alarm in 10,000 runs of a test.
 """
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.variants import switch
 
 import mi_refract  # noqa: F401
+from mi_refract.numerics import mitsuba_mesh
 
 FALSE_ALARM = 1e-4
 SIZE = 16
@@ -189,3 +192,60 @@ def test_a_point_lamp_of_weight_0_is_off(llvm_variant):
 def test_light_from_infinity_does_not_pass_air_that_absorbs(llvm_variant):
     parts = {"lamp": SUN, "ball": ball({"type": "refract", "ext_absorption": 1e-3})}
     assert tiles(scene(parts, caustics="lamp", camera_absorption=1e-3), 4, [0]).max() == 0
+
+
+# Refused --------------------------------------------------------------------------------------------------------------
+
+
+def tilted_lamp():
+    corners = np.array([[-1, -1, 3], [1, -1, 3], [1, 1, 3], [-1, 1, 3]], np.float32)
+    normals, faces = np.tile(np.float32([0.6, 0, -0.8]), (4, 1)), np.uint32([[0, 2, 1], [0, 3, 2]])
+    properties = mi.Properties()
+    properties["emitter"] = mi.load_dict({"type": "area"})
+    return mitsuba_mesh.make(mi, corners, faces, normals, properties=properties)
+
+
+MEDIUM = {"type": "homogeneous", "albedo": 0.0, "sigma_t": 0.1}
+REFUSED = {
+    "a lamp of another kind": (lambda: {"lamp": {"type": "projector", "irradiance": noise(2, 2, 3)}}, "Projector"),
+    "a lamp with normals of its own": (lambda: {"lamp": tilted_lamp()}, "normals of an area lamp"),
+    "a camera of another kind": (lambda: {"sensor": {"type": "irradiancemeter", "film": FILM}}, "Irradiance"),
+    "a border": (lambda: {"sensor": camera(film={"sample_border": True})}, "sample_border"),
+    "a medium": (lambda: {"ball": ball() | {"interior": MEDIUM}}, "media"),
+    "glass with bumps": (lambda: {"ball": ball(bumps({"type": "refract"}))}, "BumpMap"),
+}
+FILM = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}}
+
+
+@pytest.mark.parametrize(("parts", "message"), REFUSED.values(), ids=REFUSED)
+def test_what_lamps_cannot_be_traced_in_is_an_error_and_auto_is_path_tracing(parts, message, llvm_variant):
+    parts, name = parts(), "refract_path: caustics = lamp: "
+    if parts.get("sensor", {}).get("type") == "irradiancemeter":
+        parts = {"meter": ball({"type": "diffuse"}, (0, 0, 3), 0.1) | {"sensor": parts["sensor"]}, "sensor": FILM}
+    one, other = (scene(parts, caustics=caustics) for caustics in ("path", "auto"))
+    np.testing.assert_array_equal(*(np.array(mi.render(loaded, spp=1)) for loaded in (one, other)))
+    refused = scene(parts, caustics="lamp")
+    with pytest.raises(ValueError, match=f"^{name}.*{message}.*; expected caustics = path$"):
+        refused.integrator().render(refused, spp=1)
+
+
+def test_another_integrator_cannot_have_lamps_traced_nor_a_derivative(llvm_variant):
+    loaded = scene({}, caustics="lamp")
+    around = mi.load_dict({"type": "aov", "aovs": "d:depth", "image": {"type": "refract_path", "caustics": "lamp"}})
+    with pytest.raises((RuntimeError, ValueError), match="another integrator calls it"):
+        around.render(loaded, spp=1)
+    parameters = mi.traverse(loaded)
+    key = next(key for key in parameters.keys() if key.endswith("bsdf.eta"))  # noqa: SIM118
+    dr.enable_grad(parameters[key])
+    parameters.update()
+    with pytest.raises(RuntimeError, match="the render is differentiated"):
+        dr.backward(dr.sum(mi.render(loaded, parameters, spp=1), axis=None))
+
+
+def test_a_retarder_turns_light_another_way_from_the_lamp(needs_variant):
+    needs_variant("llvm_ad_mono_polarized")
+    switch("llvm_ad_mono_polarized")
+    parts = {"ball": ball({"type": "retarder", "delta": 90.0}), "lamp": {"type": "point", "position": [1, 0, 4]}}
+    loaded = scene(parts, caustics="lamp")
+    with pytest.raises(ValueError, match="a retarder"):
+        loaded.integrator().render(loaded, spp=1)
