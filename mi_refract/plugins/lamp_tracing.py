@@ -174,11 +174,10 @@ class Aim:
         """A direction from `o` toward the sphere that was chosen, and its density q."""
         v = self.v
         axis, sine2 = self._cone(chosen, o)
-        height = _one_minus_cosine(sine2)
-        z = 1 - sample.x * height
+        height = sample.x * _one_minus_cosine(sine2)  # 1 − cos, which in a narrow cone is below the steps of a cosine
         around = dr.sincos(2 * math.pi * sample.y)
-        r = dr.safe_sqrt((1 - z) * (1 + z))
-        d = v.Frame3f(axis).to_world(v.Vector3f(r * around[1], r * around[0], z))
+        r = dr.safe_sqrt(height * (2 - height))
+        d = v.Frame3f(axis).to_world(v.Vector3f(r * around[1], r * around[0], 1 - height))
         density = v.Float(0)
         for j in range(self.count):
             other, other_sine2 = self._cone(j, o)
@@ -352,13 +351,15 @@ class LampTracer:
     def trace(self, numbers: Any, splat: Callable[..., None]) -> None:
         """Light paths, one a lane: `splat(place on the film, value, wavelengths, active)` for each connection."""
         v, features = self.v, self.features
-        _, ray, power = self._emitted(numbers, v.Bool(True))
+        lamp, ray, power = self._emitted(numbers, v.Bool(True))
         s = LightPath(ray, power, v.UInt32(0), dr.max(v.unpolarized_spectrum(power)) > 0)
         if features.dispersion:
             s.wavelength_count = v.Float(dr.size_v(v.UnpolarizedSpectrum))
         if features.absorption:
             s.sigma, s.known = v.UnpolarizedSpectrum(0), v.Bool(False)
-            s.unattenuated, s.skipped = v.Float(0), v.Float(0)
+            # Light of a directional lamp comes from infinity.
+            kind = dr.gather(v.UInt32, self.kinds, lamp) if self.vectorised else self.kinds[int(lamp)]
+            s.unattenuated, s.skipped = dr.select(kind == DIRECTION, v.Float(dr.inf), 0), v.Float(0)
         start = dr.max(v.unpolarized_spectrum(power))
 
         def vertex(s: LightPath) -> tuple[LightPath]:

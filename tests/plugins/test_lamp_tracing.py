@@ -165,3 +165,27 @@ def test_lamp_tracing_has_the_image_of_path_tracing(name, llvm_variant, tmp_path
         for caustics, first in (("path", 0), ("lamp", 100))
     ]
     assert difference(*images) < 1
+
+
+def point(height=5.0, **parameters):
+    return {"type": "point", "position": [0, 0, height], "intensity": height**2} | parameters
+
+
+SUN = {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0}
+
+
+def test_a_far_lamp_is_directional(llvm_variant):
+    lamps = ((point(4e3), range(8)), (SUN, range(100, 108)))
+    images = [tiles(scene({"lamp": each}, caustics="lamp", max_depth=3), 64, seeds) for each, seeds in lamps]
+    assert difference(*images) < 1
+
+
+def test_a_point_lamp_of_weight_0_is_off(llvm_variant):
+    off, on = point(sampling_weight=0.0), point(4.0)
+    images = [tiles(scene(parts, caustics="lamp"), 4, [0]) for parts in ({"lamp": on, "more": off}, {"lamp": on})]
+    np.testing.assert_allclose(*images, rtol=1e-5)
+
+
+def test_light_from_infinity_does_not_pass_air_that_absorbs(llvm_variant):
+    parts = {"lamp": SUN, "ball": ball({"type": "refract", "ext_absorption": 1e-3})}
+    assert tiles(scene(parts, caustics="lamp", camera_absorption=1e-3), 4, [0]).max() == 0
