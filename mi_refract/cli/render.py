@@ -62,8 +62,8 @@ def render(
         str | None,
         typer.Option(
             metavar="auto|NAME=VALUE,…",
-            help="Replace the scene's sampler, integrator (path, refract_path) or split_depth; auto: a short pilot "
-            "measures which pay.",
+            help="Replace the scene's sampler, integrator (path, refract_path), split_depth or caustics; auto: a short "
+            "pilot measures which pay.",
         ),
     ] = None,
     restart: Annotated[

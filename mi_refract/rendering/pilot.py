@@ -345,14 +345,15 @@ class Pilot:
             )  # fmt: skip
             return image, self.clock() - before
 
-        if trace(paths)[0] is None:  # it compiles
+        if trace(paths)[0] is None:
             return
         threads = dr.thread_count()
         if not self.cuda:
             dr.set_thread_count(1)
         try:
-            (_, variance), took = trace(paths)
+            # In an empty cache of kernels the first of them compiles once more, which takes ten times as long.
+            ((_, variance), first), (_, second) = trace(paths), trace(paths)
         finally:
             if not self.cuda:
                 dr.set_thread_count(threads)
-        self._lamps[integrator] = np.nan_to_num(variance.mean(-1)) * paths, took / paths
+        self._lamps[integrator] = np.nan_to_num(variance.mean(-1)) * paths, min(first, second) / paths

@@ -19,7 +19,7 @@ INTEGRATORS = ("path", "refract_path")
 NAMES = {
     "sampler": "|".join(SAMPLERS),
     "integrator": "|".join(INTEGRATORS),
-    "split_depth": "[0-9]{1,2}",
+    "split_depth": "[0-9]|[1-5][0-9]|6[0-4]",  # up to 64, as `refract_path` has it
     "caustics": "path|lamp",
 }
 _SHARED = ("sample_count", "seed")  # parameters of every sampler
@@ -38,7 +38,7 @@ def parse_settings(text: str) -> Settings:
             expected = ", ".join(f"{each}=…" for each in NAMES)
             raise ValueError(f"--settings {text}: {item!r}; expected {AUTO}, or {expected}")
         if not re.fullmatch(NAMES[name], value):
-            expected = "0 to 12" if name == "split_depth" else NAMES[name].replace("|", ", ")
+            expected = "0 to 64" if name == "split_depth" else NAMES[name].replace("|", ", ")
             raise ValueError(f"--settings {text}: {name} = {value!r}; expected {expected}")
         if name in found:
             raise ValueError(f"--settings {text}: {name} is given twice; expected once")
@@ -47,8 +47,8 @@ def parse_settings(text: str) -> Settings:
 
 
 def settings_text(settings: Settings) -> str:
-    """What `parse_settings` reads."""
-    return ",".join(f"{name}={value}" for name, value in settings.items()) or OWN
+    """What `parse_settings` reads, in the order of NAMES: a checkpoint compares texts."""
+    return ",".join(f"{name}={settings[name]}" for name in NAMES if name in settings) or OWN
 
 
 def own_settings(parsed: ParsedScene) -> Settings:

@@ -13,9 +13,12 @@ import pytest
 from support.renders import BALL, GLASS, SCENES, pixels
 
 from mi_refract.io.errors import CheckpointError
+from mi_refract.plugins import lamp_tracing
 from mi_refract.rendering.end_conditions import Limits
 from mi_refract.rendering.long_render import Job, render_to_exr, resume
-from mi_refract.rendering.pilot import STEPS, Batch, choose, ratio
+from mi_refract.rendering.pass_plan import plan_passes
+from mi_refract.rendering.pilot import LEAST_LIGHT_PATHS, STEPS, Batch, Pilot, choose, ratio
+from mi_refract.rendering.render_pass import pass_renderer
 from mi_refract.rendering.render_settings import AUTO, OWN, parse_settings, settings_text, with_settings
 from mi_refract.rendering.scene_bundle import pack
 from mi_refract.rendering.scene_files import load_parsed, parse_scene
@@ -59,10 +62,10 @@ CHOICES = {
     "caustics, then splitting": (
         {
             "sampler=multijitter,integrator=refract_path,caustics=lamp": (0.01, 3),
-            "sampler=multijitter,integrator=refract_path,caustics=lamp,split_depth=2": (0.003, 4),
+            "sampler=multijitter,integrator=refract_path,split_depth=2,caustics=lamp": (0.003, 4),
         },
         None,
-        "sampler=multijitter,integrator=refract_path,caustics=lamp,split_depth=2",
+        "sampler=multijitter,integrator=refract_path,split_depth=2,caustics=lamp",
     ),
     "no noise": ({OWN: (0, 1), "sampler=ldsampler": (1e-20, 1)}, None, OWN),
 }
@@ -82,8 +85,10 @@ def test_the_cheapest_is_chosen_unless_it_cannot_be_told_from_the_scenes_own(cos
 
 def test_light_that_is_missing_is_traced_whatever_it_costs():
     lamp = "integrator=refract_path,caustics=lamp"
-    pilot = made_up({f"{lamp},sampler=stratified": (0.5, 1), OWN: (0.1, 1)}, start=parse_settings(lamp))
-    assert settings_text(choose(pilot).settings) == f"{lamp},sampler=stratified" and (OWN, 0) not in pilot.asked
+    pilot = made_up({f"sampler=stratified,{lamp}": (0.5, 1), OWN: (0.1, 1)}, start=parse_settings(lamp))
+    text = settings_text(choose(pilot).settings)
+    assert text == f"sampler=stratified,{lamp}" and (OWN, 0) not in pilot.asked
+    assert settings_text(parse_settings(text)) == text  # else a checkpoint would refuse the printed settings
 
 
 def test_a_candidate_that_cannot_win_is_dropped_after_one_batch_and_seconds_end_the_pilot():
@@ -124,12 +129,12 @@ BAD = {
     "auto and more": ("auto,split_depth=1", "'auto'; expected"),
     "an unknown sampler": ("sampler=sobol", "sampler = 'sobol'; expected multijitter, stratified"),
     "an unknown integrator": ("integrator=volpath", "integrator = 'volpath'; expected path, refract_path"),
-    "no depth": ("split_depth=", "split_depth = ''; expected 0 to 12"),
-    "a negative depth": ("split_depth=-1", "split_depth = '-1'; expected 0 to 12"),
+    "no depth": ("split_depth=", "split_depth = ''; expected 0 to 64"),
+    "a negative depth": ("split_depth=-1", "split_depth = '-1'; expected 0 to 64"),
     "a space": ("sampler= independent", "sampler = ' independent'"),
     "twice": ("split_depth=1,split_depth=2", "split_depth is given twice; expected once"),
     "path that splits": ("split_depth=1", "`path` has no split_depth; expected integrator=refract_path"),
-    "too many paths": ("integrator=refract_path,split_depth=99", "split_depth = 99"),
+    "too deep": ("integrator=refract_path,split_depth=65", "split_depth = '65'; expected 0 to 64"),
 }
 
 
@@ -231,6 +236,25 @@ def test_a_checkpoint_keeps_the_choice(tmp_path, llvm):
         begun(OWN, restart=True).run(stop)
     with pytest.raises(CheckpointError, match=f"settings was {OWN}, is auto; pass --restart"):
         begun(AUTO)
+
+
+def test_the_time_of_light_paths_has_no_compilation_in_it(tmp_path, llvm, monkeypatch):
+    """The second trace compiles again where Dr.Jit's cache of kernels is empty."""
+    lamp = '<shape type="rectangle"><emitter type="area"/></shape>'
+    (tmp_path / "a.xml").write_text(GLASS.replace('<emitter type="constant"/>', lamp))
+    parsed, took = parse_scene(tmp_path / "a.xml"), []
+    renderer = pass_renderer(load_parsed(parsed), 0)
+
+    def trace(*args, **named):
+        took.append(100 if len(took) < 2 else 1)
+        return 2 * (np.zeros((*renderer.size[::-1], 3)),)
+
+    monkeypatch.setattr(lamp_tracing, "lamp_image", trace)
+    pixel_count = math.prod(renderer.size)
+    pilot = Pilot(parsed, renderer, lambda rounded: plan_passes(pixel_count, 16, None, rounded, moments=True))
+    pilot.clock = lambda: sum(took)
+    batch = pilot.measure({"integrator": "refract_path", "caustics": "lamp"}, 0)
+    assert 0 < batch.seconds < 2 * 0.25 * 16 / LEAST_LIGHT_PATHS
 
 
 DARK = GLASS.replace('<emitter type="constant"/>', "")
