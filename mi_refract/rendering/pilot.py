@@ -39,6 +39,8 @@ OPEN_SAMPLES = 2**20  # of which it takes as much time where the render's number
 LEAST_PIXELS, LEAST_SPP = 128, 16  # of a batch
 LARGEST, TIMED = 2**20, 2**16  # samples of a batch, and of one whose time is measured on processors
 BATCHES = 8
+FIREFLY = 1 / 3  # share of one pixel in the sum of variances, above which it does not say whether to trace lamps
+SEEN = 0.01  # of the light: so much of it by caustics decides where path tracing has met less than half of them
 LEAST_LIGHT_PATHS = 2**14
 COPIES = 2  # of a pixel
 # Standard deviations: of the intervals, 95 % of a normal distribution; and of a difference that decides. Where it is
@@ -62,13 +64,24 @@ class Batch:
     """What one candidate did with some pixels.
 
     `variance`: of the mean over a pass, estimated for each pixel; `light`: the mean of all; `seconds`: of a pixel in a
-    pass; `took`: of all.
+    pass; `took`: of all. `caustics`: the mean of the light that is traced from lamps, `all_caustics`: of the image.
     """
 
     variance: Doubles
     light: float
     seconds: float
     took: float
+    caustics: float = 0.0
+    all_caustics: float = 0.0
+
+
+@dataclass(frozen=True)
+class Lamps:
+    """The lamps' part of an image: by pixel its variance by one light path, and its light; the seconds of a path."""
+
+    variance: Doubles
+    light: Doubles
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -91,14 +104,35 @@ def ratio(batches: list[Batch], others: list[Batch], z: float = Z) -> Ratio:
     least = np.square(ROUNDING * light) + np.finfo(np.float64).tiny
     known = np.isfinite(ours) & np.isfinite(theirs)
     ours, theirs = ours[known] + least, theirs[known] + least
-    if not len(ours):
-        return Ratio(1, 0, math.inf, 1, 1)
+    if not len(ours) or unseen(batches, others) or unseen(others, batches):
+        return UNKNOWN
+    apart = any(batch.all_caustics for batch in batches) != any(batch.all_caustics for batch in others)
+    if apart and max(ours.max() / ours.sum(), theirs.max() / theirs.sum()) > FIREFLY:
+        return UNKNOWN
     variance = ours.mean() / theirs.mean()
     spread = (ours / ours.mean() - theirs / theirs.mean()).std() / math.sqrt(len(ours))
     seconds = min(batch.seconds for batch in batches[:count]) / min(batch.seconds for batch in others[:count])
     factor = math.exp(z * math.hypot(spread, 0 if batches is others else TIME_ERROR / math.sqrt(count)))
     value = float(variance * seconds)
     return Ratio(value, value / factor, value * factor, float(variance), float(seconds))
+
+
+UNKNOWN = Ratio(1, 0, math.inf, 1, 1)
+
+
+def unseen(batches: list[Batch], others: list[Batch]) -> bool:
+    """Whether `others`, by path tracing, do not know their variance, as `batches` have traced lamps.
+
+    They have met less than half of that light, or their pixels have less than half of what a pixel has in the mean.
+    """
+    count = min(len(batches), len(others))
+    ours, theirs = batches[:count], others[:count]
+    whole, caustics, light = (
+        sum(getattr(batch, name) for batch in ours) / count for name in ("all_caustics", "caustics", "light")
+    )
+    if not whole or any(batch.all_caustics for batch in theirs) or whole < SEEN * light:
+        return False
+    return bool(caustics < whole / 2 or sum(batch.light for batch in theirs) / count < light - caustics / 2)
 
 
 @dataclass(frozen=True)
@@ -162,8 +196,13 @@ def choose(pilot: Pilot) -> Choice:
     for i, options in enumerate(STEPS):
         merged = [each for option in options if pilot.usable(each := {**best, **option})]
         changed = [{name: value for name, value in each.items() if pilot.own.get(name) != value} for each in merged]
+        before = best
         best = race.best(changed if best in changed else [best, *changed], (i + 1) / len(STEPS))
-    if race.of(settings_text(best), race.own, CLEARLY).high >= 1:
+        # Where it cannot be told, lamps are traced: a pilot of path tracing may have met none.
+        if options == (CAUSTICS,) and changed:
+            unknown = race.of(settings_text(changed[0]), settings_text(before)).high == math.inf
+            best = changed[0] if unknown else best
+    if 1 <= race.of(settings_text(best), race.own, CLEARLY).high < math.inf:
         best = start
     if not any(batch.light for batches in race.batches.values() for batch in batches):
         raise ValueError(f"--settings {AUTO}: the pilot sees no light; expected some, or settings by name")
@@ -219,7 +258,8 @@ class Pilot:
         self._samplers: dict[str, Any] = {}
         self._integrators: dict[str, Any] = {}
         self._seconds: dict[str, float] = {}  # of a pixel in a pass
-        self._lamps: dict[Any, tuple[Doubles, float]] = {}  # by integrator: see `_trace_lamps`
+        self._untold = 0.0  # seconds that are in no batch
+        self._lamps: Lamps | None = None  # alike for all candidates that trace them
         changed = {name: value for name, value in CAUSTICS.items() if self.own.get(name) != value}
         self.start: Settings = changed if missing_light(renderer.scene) and self.usable(CAUSTICS) else {}
 
@@ -267,15 +307,16 @@ class Pilot:
             integrator, sampler, pixels, seed_of(self.renderer.seed, MASK - number), number == 0
         )
         means = values.reshape(len(values), size, COPIES, spp).mean(-1)
-        seconds, of_lamps = took / len(pixels), 0.0
-        if integrator in self._lamps:
-            one, each = self._lamps[integrator]
-            paths = integrator.light_paths * spp  # for each pixel
-            of_lamps = one.ravel()[pixels[::COPIES]] / (paths * one.size)
-            seconds += paths * each
-        self._seconds[name] = min(self._seconds[name], seconds)
+        seconds, caustics, everywhere = took / len(pixels), 0.0, 0.0
         light, variance = float(np.nan_to_num(means).mean()), means.var(-1, ddof=1).mean(0)
-        return Batch(variance + of_lamps, light, seconds, self._seconds[name] * len(pixels))
+        if getattr(integrator, "apart", False) and self._lamps is not None:
+            paths, own = integrator.light_paths * spp, pixels[::COPIES]  # paths for each pixel
+            variance = variance + self._lamps.variance[own] / (paths * math.prod(self.renderer.size))
+            caustics, everywhere = float(self._lamps.light[own].mean()), float(self._lamps.light.mean())
+            seconds += paths * self._lamps.seconds
+        self._seconds[name] = min(self._seconds[name], seconds)
+        took, self._untold = self._seconds[name] * len(pixels) + self._untold, 0.0
+        return Batch(variance, light + caustics, seconds, took, caustics, everywhere)
 
     def allowed(self, own_seconds: float) -> float:
         """Seconds of the pilot, given those of a pixel in a pass with the scene's own settings."""
@@ -328,13 +369,13 @@ class Pilot:
             if alone:
                 dr.set_thread_count(threads)
         if hasattr(integrator, "end_render"):
-            if integrator not in self._lamps:
+            if getattr(integrator, "apart", False) and self._lamps is None:
                 self._trace_lamps(integrator)
             integrator.end_render()
         return np.array([np.array(value) for value in values], np.float64), took
 
     def _trace_lamps(self, integrator: Any) -> None:
-        """Where lamps are traced: the variance of a pixel by one light path, and the seconds of one."""
+        """Measure the lamps' part of the image."""
         paths = min(max(int(self.samples / self.candidates), LEAST_LIGHT_PATHS), TIMED)
 
         def trace(count: int) -> tuple[Any, float]:
@@ -345,15 +386,16 @@ class Pilot:
             )  # fmt: skip
             return image, self.clock() - before
 
-        if trace(paths)[0] is None:
-            return
+        trace(paths)
         threads = dr.thread_count()
         if not self.cuda:
             dr.set_thread_count(1)
         try:
             # In an empty cache of kernels the first of them compiles once more, which takes ten times as long.
-            ((_, variance), first), (_, second) = trace(paths), trace(paths)
+            ((light, variance), first), (_, second) = trace(paths), trace(paths)
         finally:
             if not self.cuda:
                 dr.set_thread_count(threads)
-        self._lamps[integrator] = np.nan_to_num(variance.mean(-1)) * paths, min(first, second) / paths
+        variance, light = (np.nan_to_num(x.mean(-1)).ravel() for x in (variance, light))
+        self._lamps = Lamps(variance * paths, light, min(first, second) / paths)
+        self._untold += first + second

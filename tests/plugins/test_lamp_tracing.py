@@ -238,8 +238,13 @@ def test_another_integrator_cannot_have_lamps_traced_nor_a_derivative(llvm_varia
     key = next(key for key in parameters.keys() if key.endswith("bsdf.eta"))  # noqa: SIM118
     dr.enable_grad(parameters[key])
     parameters.update()
-    with pytest.raises(RuntimeError, match="the render is differentiated"):
-        dr.backward(dr.sum(mi.render(loaded, parameters, spp=1), axis=None))
+    image = mi.render(loaded, parameters, spp=1)
+    with pytest.raises((RuntimeError, ValueError)) as caught:
+        dr.backward(dr.sum(image, axis=None))
+    errors = [caught.value]
+    while errors[-1].__cause__ is not None:
+        errors.append(errors[-1].__cause__)
+    assert any("the render is differentiated" in str(error) for error in errors)
 
 
 def test_a_retarder_turns_light_another_way_from_the_lamp(needs_variant):
