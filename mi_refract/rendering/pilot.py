@@ -276,7 +276,7 @@ class Pilot:
         every = self.own | settings
         if not self.swappable or not (every["integrator"] == self.own["integrator"] or self.same_image):
             return False
-        traced = every.get("caustics", "path") != "path"
+        traced = every.get("caustics") == "lamp"
         if every["integrator"] == "path":
             return not traced
         return (self.splits or every.get("split_depth", "0") == "0") and (not traced or self._lamps_traceable())

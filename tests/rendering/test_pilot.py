@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -89,6 +90,24 @@ def test_light_that_is_missing_is_traced_whatever_it_costs():
     text = settings_text(choose(pilot).settings)
     assert text == f"sampler=stratified,{lamp}" and (OWN, 0) not in pilot.asked
     assert settings_text(parse_settings(text)) == text  # else a checkpoint would refuse the printed settings
+
+
+@pytest.mark.parametrize(
+    ("light", "caustics", "chosen"), [(0.8, 0.2, True), (0.99, 0.2, False), (0.992, 0.008, False), (0.99, 0.05, True)]
+)
+def test_lamps_are_traced_where_path_tracing_has_not_met_their_light(light, caustics, chosen):
+    """Then its noise is not known. `caustics`: what the pixels of the pilot have of 0.2, or of 0.008, of the image."""
+    lamp = "sampler=multijitter,integrator=refract_path,caustics=lamp"
+    pilot = made_up({lamp: (5, 5)})
+    measure, everywhere = pilot.measure, 0.008 if caustics == 0.008 else 0.2
+
+    def measured(settings, number):
+        if "caustics" in settings:
+            return replace(measure(settings, number), light=1.0, caustics=caustics, all_caustics=everywhere)
+        return replace(measure(settings, number), light=light)
+
+    pilot.measure = measured
+    assert ("caustics" in choose(pilot).settings) == chosen
 
 
 def test_a_candidate_that_cannot_win_is_dropped_after_one_batch_and_seconds_end_the_pilot():
