@@ -12,6 +12,9 @@ Candidates of a step run in turn, in batches of twice as many pixels each time; 
 cheapest, lies above 1 is dropped. A sampler is measured with as many samples as a pass of the render has, as strata
 depend on it; with fewer, 16 at least, where the pilot would be too long. The scene's own settings stay where the best
 are not clearly cheaper. The pilot's samples are not in the image, so it stays unbiased.
+
+Light that is traced from lamps (`caustics` of `refract_path`) is measured once for the whole image. What path tracing
+has hardly met of it in the pilot's pixels, its variance does not hold: there lamps are traced.
 """
 
 from __future__ import annotations
@@ -39,19 +42,20 @@ OPEN_SAMPLES = 2**20  # of which it takes as much time where the render's number
 LEAST_PIXELS, LEAST_SPP = 128, 16  # of a batch
 LARGEST, TIMED = 2**20, 2**16  # samples of a batch, and of one whose time is measured on processors
 BATCHES = 8
-FIREFLY = 1 / 3  # share of one pixel in the sum of variances, above which it does not say whether to trace lamps
-SEEN = 0.01  # of the light: so much of it by caustics decides where path tracing has met less than half of them
-LEAST_LIGHT_PATHS = 2**14
 COPIES = 2  # of a pixel
+LEAST_LIGHT_PATHS = 2**14
+# The variance of path tracing does not say whether to trace lamps where one pixel has so large a share of it, or where
+# path tracing has met less than half of the caustics, if they are so much of the light.
+FIREFLY, SEEN = 1 / 3, 0.01
 # Standard deviations: of the intervals, 95 % of a normal distribution; and of a difference that decides. Where it is
 # none, either choice costs the same.
 Z, CLEARLY = 1.96, 0.7
 # The relative standard error of the least time of one batch; of k batches it is 1/√k of that.
 TIME_ERROR = 0.05
 ROUNDING = 1e-5  # of a pixel's brightness: noise that is no more is none
-# What is tried, step by step, with the best of the steps before: in each the first that is not clearly dearer than the
-# cheapest. The scene's own settings are always among them.
 CAUSTICS: Settings = {"integrator": "refract_path", "caustics": "lamp"}
+# What is tried, step by step, with the best of the steps before, which is always among them: in each the first that is
+# not clearly dearer than the cheapest.
 STEPS: tuple[tuple[Settings, ...], ...] = (
     tuple({"sampler": name} for name in SAMPLERS),
     (CAUSTICS,),
