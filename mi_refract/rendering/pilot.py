@@ -209,7 +209,8 @@ def choose(pilot: Pilot) -> Choice:
     if 1 <= race.of(settings_text(best), race.own, CLEARLY).high < math.inf:
         best = start
     if not any(batch.light for batches in race.batches.values() for batch in batches):
-        raise ValueError(f"--settings {AUTO}: the pilot sees no light; expected some, or settings by name")
+        text = f"{pilot.parsed.path}: --settings {AUTO}: the pilot sees no light"
+        raise ValueError(f"{text}; expected some, or settings by name")
     costs = {name: vars(race.of(name, race.own)) for name in race.batches}
     rounded = {name: {key: float(f"{value:.3g}") for key, value in cost.items()} for name, cost in costs.items()}
     return Choice(best, {"seconds": float(f"{race.took:.3g}"), "of": race.own, "costs": rounded})

@@ -43,7 +43,8 @@ def made_up(costs, own=None, noise=0.1, light=1.0, seconds=1e9, start=None):
 
     own = own or {"sampler": "independent", "integrator": "path"}
     methods = {"usable": lambda option: True, "measure": measure, "allowed": lambda t: seconds}
-    return SimpleNamespace(own=own, start=start or {}, asked=asked, **methods)
+    parsed = SimpleNamespace(path="made-up.xml")
+    return SimpleNamespace(own=own, start=start or {}, asked=asked, parsed=parsed, **methods)
 
 
 CHOICES = {

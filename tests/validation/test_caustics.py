@@ -104,14 +104,14 @@ def test_the_energy_of_another_index_is_wrong(context, monkeypatch, index, verdi
     assert unaimed.verdict == "not run" and "does not aim" in unaimed.reason
 
 
-def test_light_that_is_missing_is_an_alarm_and_noise_misses_a_goal(context, monkeypatch):
+def test_light_that_is_missing_is_an_alarm_and_noise_no_pass(context, monkeypatch):
     """Of a point lamp `path` finds no caustic; the sum of classes has other seeds than the reference."""
     monkeypatch.setattr(caustics, "HOLDING", (BUILTIN, BY_CLASS, FROM_LAMPS))
     path, by_class, ours = caustics.image_rows(context, "lens", POINT, (BUILTIN, BY_CLASS, FROM_LAMPS))
     assert path.broken[WELCH_ALARMS] == 0 and path.values["light missing"] > 0.5
     assert by_class.values[WELCH_ALARMS] == 0 and abs(by_class.values["light missing"]) < 0.1
     assert by_class.verdict == "pass" and abs(ours.values["light missing"]) < 0.1
-    assert ours.values[WELCH_ALARMS] == 0 and ours.missed.keys() == {DETECTABLE}
+    assert ours.values[WELCH_ALARMS] == 0 and ours.broken.keys() == {DETECTABLE}
     assert path.images.keys() == {"reference", "test"}
 
 
