@@ -5,6 +5,7 @@ place in the image, from (0, 0) at its upper left corner to (1, 1). `Scene.sky(d
 """
 
 import json
+import math
 import re
 import struct
 import types
@@ -20,7 +21,10 @@ from mi_refract.io.image_file import read_exr
 
 @dataclass
 class Scene:
-    """A scene that was read. By mesh: its triangles, index inside over outside, radiance or reflectance."""
+    """A scene that was read. By mesh: its triangles, index inside over outside, radiance or reflectance.
+
+    By lamp without size: what it makes of a place, as `lamp` says.
+    """
 
     size: tuple[int, int]
     depth: int
@@ -30,6 +34,7 @@ class Scene:
     indices: dict = field(default_factory=dict)
     lights: dict = field(default_factory=dict)
     colours: dict = field(default_factory=dict)
+    lamps: dict = field(default_factory=dict)
 
 
 def unit(vector):
@@ -41,6 +46,20 @@ def pinhole(origin, ahead, up, wide, high):
     right = unit(np.cross(unit(ahead), up))
     upward = np.cross(right, unit(ahead))
     return lambda x, y: (np.asarray(origin), unit(ahead) + (2 * x - 1) * wide * right + (1 - 2 * y) * high * upward)
+
+
+def lamp(colour, place=None, direction=None, falloff=lambda angle: 1.0):
+    """A function of a place: the direction to the lamp, and the irradiance of a surface there that faces it.
+
+    `falloff`: of the angle from `direction`, in radians.
+    """
+
+    def lit(point):
+        away = -np.asarray(direction) if place is None else np.subtract(place, point)
+        angle = 0.0 if direction is None else np.arccos(np.clip(unit(direction) @ -unit(away), -1, 1))
+        return unit(away), np.array(colour) * falloff(angle) / (1 if place is None else away @ away)
+
+    return lit
 
 
 def linear(table, rows, columns):
@@ -308,6 +327,12 @@ def obj(folder, monkeypatch):
         found.sky = on_map(folder / document["sky"]["environment"], place)
     else:
         found.sky = plain_sky(document["sky"]["radiance"])
+    for entry in document.get("lamps", []):
+        colour = entry["irradiance" if entry["type"] == "directional" else "intensity"]
+        cone = [math.radians(entry.get(f"{name}_degrees", 0)) for name in ("beam", "cutoff")]
+        falls = lambda angle, cone=cone: np.interp(angle, cone, [1, 0])  # noqa: E731
+        more = {"falloff": falls} if entry["type"] == "spot" else {}
+        found.lamps[entry["name"]] = lamp(colour, entry.get("position"), entry.get("direction"), **more)
     library, vertices = {}, []
     for part in (folder / "scene.mtl").read_text().split("newmtl ")[1:]:
         name, *lines = part.splitlines()
@@ -370,6 +395,23 @@ def model(tree, data):
     return found
 
 
+def punctual(tree):
+    """Of the lights of KHR_lights_punctual: the name and the matrix of the node, and the entry."""
+    nodes = [tree["nodes"][i] for i in tree["scenes"][0]["nodes"]]
+    lit = [node for node in nodes if "KHR_lights_punctual" in node.get("extensions", {})]
+    lights = tree["extensions"]["KHR_lights_punctual"]["lights"] if lit else []
+    assert not lit or "KHR_lights_punctual" in tree["extensionsUsed"]
+    assert [node["extensions"]["KHR_lights_punctual"]["light"] for node in lit] == list(range(len(lights)))
+    matrices = (np.reshape(node["matrix"], (4, 4)).T for node in lit)
+    return [(node["name"], *rest) for node, *rest in zip(lit, matrices, lights, strict=True)]
+
+
+def cone(innerConeAngle, outerConeAngle):
+    """The sample of the extension."""
+    scale = 1 / max(0.001, math.cos(innerConeAngle) - math.cos(outerConeAngle))
+    return lambda angle: np.clip((np.cos(angle) - math.cos(outerConeAngle)) * scale, 0, 1) ** 2
+
+
 def gltf(folder, monkeypatch):
     """The two files say the same. A camera looks along −z, and +y is up in its image."""
     read = glb(folder / "scene.glb")
@@ -388,6 +430,13 @@ def gltf(folder, monkeypatch):
     place = lambda x, y, z: (0.5 + np.arctan2(z, x) / (2 * np.pi), np.arccos(y) / np.pi)  # noqa: E731
     sky = on_map(folder / "sky.exr", place)
     found = Scene((extras["width"], extras["height"]), extras["max_depth"], ray, sky)
+    for name, matrix, light in punctual(tree):
+        colour = np.multiply(light["color"], light["intensity"])
+        place, direction = (None if light["type"] == "directional" else matrix[:3, 3]), -matrix[:3, 2]
+        if light["type"] == "spot":
+            found.lamps[name] = lamp(colour, place, direction, cone(**light["spot"]))
+        else:
+            found.lamps[name] = lamp(colour, place, direction if place is None else None)
     for name, (places, _, faces, material) in read.meshes.items():
         found.triangles[name] = places[faces]
         more, base = material["extensions"], material["pbrMetallicRoughness"]

@@ -29,6 +29,7 @@ TARGETS: dict[str, Callable[[PlainScene], Files]] = {
     "gltf": gltf.files,
 }
 HOLD_VOLUMES = ("gltf",)  # dispersion and absorption
+HOLD_LAMPS = ("mitsuba", "obj+json", "gltf")  # without size
 
 
 def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> list[Path]:
@@ -50,6 +51,11 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
         if isinstance(mesh.material, VolumeGlass) and target not in HOLD_VOLUMES:
             expected = f"one number for all wavelengths and no absorption, or --to {' or '.join(HOLD_VOLUMES)}"
             raise ValueError(f"{plain.name}: {mesh.name}: {mesh.material.said}; expected {expected}")
+    for lamp in plain.lamps:
+        if target not in HOLD_LAMPS:
+            what = f"a {lamp.kind} lamp is not exported to {target}"
+            expected = f"area lamps, an environment, or --to {' or '.join(HOLD_LAMPS)}"
+            raise ValueError(f"{plain.name}: {lamp.name}: {what}; expected {expected}")
     files = TARGETS[target](plain)
     with safe_files.replacing(place, folder=True) as temporary:
         for name, content in files.items():
