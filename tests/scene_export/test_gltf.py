@@ -172,6 +172,13 @@ def test_the_edge_of_a_spot_is_said(beam, cutoff, export):
     assert most == pytest.approx(np.abs(ramp - cone(**light["spot"])(angle)).max(), abs=0.006)
 
 
+def test_a_unit_sphere_whose_vertices_are_its_normals(export):
+    """One view of the buffer for both; whoever reads the file checks that it says its stride."""
+    model, _ = export(ior("ext", 1), f'<shape type="sphere" id="unit">{LAMP}</shape>')
+    places, normals, *_ = model.meshes["unit"]
+    assert (places == normals).all() and len({accessor["bufferView"] for accessor in model.tree["accessors"]}) < 6
+
+
 def test_a_lamp_that_gives_no_light(export):
     """Its colour is not 0/0."""
     model, _ = export(ior("ext", 1), '<emitter type="point"><rgb name="intensity" value="0"/></emitter>')

@@ -383,7 +383,9 @@ def model(tree, data):
         start = view["byteOffset"] + accessor.get("byteOffset", 0)
         return np.frombuffer(data, kind, accessor["count"] * width, start).reshape(-1, width)
 
-    found = Model(tree, {})
+    found, views = Model(tree, {}), [accessor["bufferView"] for accessor in tree.get("accessors", [])]
+    shared = {view for view in views if views.count(view) > 1}
+    assert all("byteStride" in tree["bufferViews"][view] for view in shared), "by the specification"
     for node in tree["nodes"]:
         if "mesh" in node:
             assert not {"matrix", "translation", "rotation", "scale"} & node.keys()

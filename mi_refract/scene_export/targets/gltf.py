@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -103,7 +104,10 @@ def files(plain: PlainScene) -> Files:
         tree["asset"]["generator"] = f"mi_refract {__version__} by trimesh {trimesh.__version__}"
         tree["cameras"] = [{"name": "camera", "type": "perspective", "perspective": view}]
         for mesh, made in zip(shown, tree.get("meshes", []), strict=True):
-            made["primitives"][0]["material"] = materials.index(mesh.material)
+            (part,) = made["primitives"]
+            part["material"] = materials.index(mesh.material)
+            for accessor in part["attributes"].values():  # which share a view where their numbers are the same
+                tree["bufferViews"][tree["accessors"][accessor]["bufferView"]]["byteStride"] = 12
         if materials:
             tree["materials"] = [_material(f"material{i}", each, meshes) for i, each in enumerate(materials)]
         used = {name for entry in tree.get("materials", []) for name in entry["extensions"]}
@@ -117,8 +121,10 @@ def files(plain: PlainScene) -> Files:
             tree["extensionsUsed"] = sorted(used)
 
     single: bytes = gltf.export_glb(scene, include_normals=True, tree_postprocessor=complete)
-    several: Files = gltf.export_gltf(scene, include_normals=True, merge_buffers=True, tree_postprocessor=complete)
-    several["scene.gltf"] = several.pop("model.gltf")
+    start, end = 20, 20 + int.from_bytes(single[12:16], "little")  # of the JSON, by the specification
+    tree = json.loads(single[start:end])
+    tree.get("buffers", [{}])[0]["uri"] = "gltf_buffer.bin"
+    several = {"scene.gltf": json.dumps(tree).encode(), "gltf_buffer.bin": single[end + 8 :]}
     sky = sky_exr(plain, SKY_AXES)
     if not isinstance(plain.sky, Environment) and any(plain.sky):
         sky = {"sky.exr": exr(np.full((4, 8, 3), plain.sky, np.float32))}
