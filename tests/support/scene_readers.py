@@ -247,6 +247,12 @@ def cycles(folder, monkeypatch):
         (path,) = bpy.data.images.load.call_args.args
         place = lambda x, y, z: (0.5 - np.arctan2(y, x) / (2 * np.pi), np.arccos(z) / np.pi)  # noqa: E731
         found.sky = on_map(path, place)
+    for name, made in data.lights.made.items():
+        placed, sun = data.objects.made[name], made.kind == "SUN"
+        assert placed.data is made and (made.angle if sun else made.shadow_soft_size) == 0
+        colour = np.multiply(made.color, made.energy) / (1 if sun else 4 * np.pi)  # W/m², or W in all directions
+        place = None if sun else placed.matrix_world[:3, 3]
+        found.lamps[name] = lamp(colour, place, -placed.matrix_world[:3, 2] if sun else None)
     for name, mesh in data.meshes.made.items():
         ((vertices, _, faces), _) = mesh.from_pydata.call_args
         found.triangles[name] = np.array(vertices)[np.array(faces)]

@@ -319,7 +319,8 @@ def _said_of_lamps(lamps: Sequence[Lamp]) -> list[str]:
         return []
     said = [
         "Lamps without size are those of KHR_lights_punctual, without a range: 1 W/sr of Mitsuba's is one candela, "
-        "1 W/m^2 one lux."
+        "1 W/m^2 one lux. Blender's importer has them as bright as lamps with a size in its lighting mode Unitless "
+        "(COMPAT) only; its Standard mode divides them by 683."
     ]
     for lamp in lamps:
         if isinstance(lamp, SpotLamp):
