@@ -26,7 +26,7 @@ from validation.run.context import SCENES, Context
 from validation.study import Study, Task, about
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
-from .rendered_images import RENDERS, THREE, askew, by_plugin, why_not
+from .rendered_images import RASTER, RENDERS, THREE, askew, by_plugin, why_not
 from .renderers import SYSTEMS, environments
 from .renderers.system import SCRIPTS
 
@@ -42,9 +42,10 @@ TERMS = {
     NOISE: "the predicted noise of the difference of the two means",
     ERRORS: "of both files, `scene.glb` and `scene.gltf`; so are the warnings, a goal",
 }
-LEFT_OUT = {THREE: "it counts the light of the sky twice, see the study of images; without MIS it is here"} | {
-    title: "it is the reference" for title, renderer in IMAGE_RENDERERS.items() if renderer.system == "mitsuba"
-}
+LEFT_OUT = {
+    THREE: "it counts the light of the sky twice, see the study of images; without MIS it is here",
+    RASTER: "it traces no paths, see the study of images",
+} | {title: "it is the reference" for title, renderer in IMAGE_RENDERERS.items() if renderer.system == "mitsuba"}
 THEIRS = {
     "POV-Ray": 256,
     "Cycles": 512,
