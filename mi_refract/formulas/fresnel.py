@@ -248,6 +248,6 @@ def _mueller(s2: Number, p2: Number, cross: tuple[Number, Number]) -> list[list[
 
 def _phase(x: Number, y: Number) -> tuple[Any, Any]:
     """(x + i y)² / |x + i y|², real and imaginary part; −1 for x = 0, y = 0 included."""
-    length = dr.sqrt(x * x + y * y)
+    length = dr.sqrt(dr.fma(x, x, y * y))
     x, y = dr.select(length > 0, ieee_divide(x, length), 0 * length), dr.select(length > 0, ieee_divide(y, length), 1)
     return (x - y) * (x + y), 2 * x * y

@@ -8,7 +8,7 @@ from typing import Any
 
 import drjit as dr
 
-from mi_refract.numerics import Number, Vector3, as_component, scale_to_unit
+from mi_refract.numerics import Number, Vector3, as_component, ieee_quotients, scale_to_unit
 
 from .bounds import CONTRASTING, ROUNDING, Budget, cancelling
 from .documented import refract_cross, refract_decomposed, refract_rotated, refract_wedge, refract_wedge_contrast
@@ -52,7 +52,8 @@ class Formula:
         scale: Any = 1
         if self.scales:
             (a, scale), (n, _) = scale_to_unit(a), scale_to_unit(n)
-        b, transmitted = self.unchecked(a, n, k, contrast)
+        with ieee_quotients(a):
+            b, transmitted = self.unchecked(a, n, k, contrast)
         # `b` has the length of `a`, and a zero or non-finite `n` makes it NaN: one length tells of both.
         b, length2 = b * scale, dr.dot(b, b)
         valid = (k >= SMALLEST_RATIO) & (k <= LARGEST_RATIO) & (length2 > 0) & (length2 < dr.inf)

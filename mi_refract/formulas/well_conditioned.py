@@ -42,6 +42,7 @@ from mi_refract.numerics import (
     error_free,
     ieee_divide,
     replace_grad,
+    rounded_product,
     two_sum,
 )
 
@@ -185,7 +186,7 @@ def _correct(vector: type, n: Vector3, around: list[DoubleWord], along: DoubleWo
     inverse = ieee_divide(1, dr.dot(n, n))
 
     def solve(around: list[Any], along: Number) -> Any:
-        return dr.fma(n, along, dr.cross(vector(*around), n)) * inverse
+        return vector(*(rounded_product(x, inverse) for x in dr.fma(n, along, dr.cross(vector(*around), n))))
 
     b = solve([x.hi for x in around], along.hi)
     missing = [

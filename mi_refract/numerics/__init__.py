@@ -36,7 +36,9 @@ from .drjit_arrays import (
     differentiated,
     from_numpy,
     ieee_divide,
+    ieee_quotients,
     replace_grad,
+    rounded_product,
     scale_to_unit,
 )
 from .error_free import DoubleWord, TripleWord, two_prod, two_sum
@@ -74,8 +76,10 @@ __all__ = [
     "float_expansions",
     "from_numpy",
     "ieee_divide",
+    "ieee_quotients",
     "mitsuba_mesh",
     "replace_grad",
+    "rounded_product",
     "scale_to_unit",
     "two_prod",
     "two_sum",

@@ -1,4 +1,4 @@
-"""Small helpers around Dr.Jit arrays: precision, division by 0, derivatives, scaling. No optics.
+"""Small helpers around Dr.Jit arrays: precision, rounding, division by 0, derivatives, scaling. No optics.
 
 Each works on scalar, LLVM and CUDA arrays of either precision. Before them, names for the types of Dr.Jit and Mitsuba
 in signatures. Both packages are untyped to mypy, so each name stands for `Any`: it tells a reader what to pass, and
@@ -7,6 +7,7 @@ checks nothing.
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import drjit as dr
@@ -100,6 +101,28 @@ def ieee_divide(x: Number, y: Number) -> Number:
     if isinstance(y, float) and y == 0:
         return x * dr.rcp(y)
     return x / y
+
+
+def rounded_product(x: Number, y: Number) -> Number:
+    """fl(x y), also where it is added to something: for an x y whose rounding error is known, or is to be found.
+
+    CUDA's compiler may turn a product and a sum into one operation, which does not round the product. It leaves
+    `dr.fma` alone, here with a −0 that it cannot know, because it is NaN where a factor is.
+    """
+    if dr.JitBackend.CUDA not in (dr.backend_v(x), dr.backend_v(y)):
+        return x * y
+    unknown = y if not dr.is_jit_v(x) or x.state == dr.VarState.Literal else x
+    return dr.fma(x, y, -dr.minimum(dr.abs(dr.detach(unknown)), 0))
+
+
+def ieee_quotients(kind: ArrayType) -> contextlib.AbstractContextManager[None]:
+    """Within it, reciprocals, roots and derivatives of arrays like `kind` have the digits of float64 on CUDA, too.
+
+    There Dr.Jit's `rcp`, and with it `rsqrt` and the derivatives of quotients and roots, otherwise has the 20 bits of
+    one instruction.
+    """
+    few = dr.type_v(kind) == dr.VarType.Float64 and dr.backend_v(kind) == dr.JitBackend.CUDA
+    return dr.scoped_set_flag(dr.JitFlag.FastMath, False) if few else contextlib.nullcontext()
 
 
 def differentiated(x: Number | Vector3) -> bool:

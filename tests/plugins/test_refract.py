@@ -212,7 +212,8 @@ def test_the_powers_are_a_short_kernel(vectorised):
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         dr.eval(fresnel.local_powers(vectorised.vector(*x[:3]), transmitted, x[3], x[4]))
-        assert max(entry.get("operation_count", 0) for entry in dr.kernel_history()) <= 45
+        most = {"llvm": 45, "cuda": 47}[vectorised.backend]
+        assert max(entry.get("operation_count", 0) for entry in dr.kernel_history()) <= most
 
 
 # An index that is a texture: a number in each point of the surface ----------------------------------------------

@@ -62,11 +62,11 @@ class Setting:
 
     @functools.cached_property
     def flushes(self) -> bool:
-        """Whether denormal numbers are taken for 0, which Dr.Jit's threads do. This is tested, not assumed."""
+        """Whether sums take denormal numbers for 0: Dr.Jit's threads do, and float32 on CUDA. Tested, not assumed."""
         if self.is_scalar:
             return False
-        least = np.full(1 << 16, np.finfo(self.precision).smallest_subnormal)
-        return not np.array(dr.value_t(self.vector)(least) > 0).all()
+        least = dr.value_t(self.vector)(np.full(1 << 16, np.finfo(self.precision).smallest_subnormal))
+        return not np.array(least + least > 0).all()
 
     def no_budget(self, budget: Budget, regime: str) -> str:
         """Why a formula has no budget in a regime; "" where it is."""
