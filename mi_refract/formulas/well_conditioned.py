@@ -38,6 +38,7 @@ from mi_refract.numerics import (
     TripleWord,
     Vector3,
     as_component,
+    computed_in_float64,
     differentiated,
     error_free,
     ieee_divide,
@@ -78,6 +79,7 @@ class LocalCosines(NamedTuple):
     cos_t: Number  # √|radicand|
 
 
+@computed_in_float64
 def local_cosines(x: Number, y: Number, z: Number, contrast: Number) -> LocalCosines:
     """The cosines of a float32 ray with these components, z along the normal. `contrast`: κ = k² − 1, in float64.
 
@@ -93,6 +95,7 @@ def local_cosines(x: Number, y: Number, z: Number, contrast: Number) -> LocalCos
     return LocalCosines(sin2, dr.abs(z), radicand, cos_t)
 
 
+@computed_in_float64
 def refract_promoted(
     a: Vector3, n: Vector3, k: Number, contrast: Number = None, local: LocalCosines | None = None
 ) -> Refracted:

@@ -8,7 +8,9 @@ checks nothing.
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING, Any, TypeAlias
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import drjit as dr
 
@@ -50,6 +52,8 @@ Point2: TypeAlias = Any
 # Mitsuba's medium of a shape or a sensor, and its texture.
 MediumPlugin: TypeAlias = Any
 Texture: TypeAlias = Any
+
+Result = TypeVar("Result")
 
 # Dr.Jit's type stubs say that the first returns an object, and nothing of what the second returns.
 _reinterpret: Any = dr.reinterpret_array
@@ -123,6 +127,17 @@ def ieee_quotients(kind: ArrayType) -> contextlib.AbstractContextManager[None]:
     """
     few = dr.type_v(kind) == dr.VarType.Float64 and dr.backend_v(kind) == dr.JitBackend.CUDA
     return dr.scoped_set_flag(dr.JitFlag.FastMath, False) if few else contextlib.nullcontext()
+
+
+def computed_in_float64(function: Callable[..., Result]) -> Callable[..., Result]:
+    """`function` of a number or vector first, within `ieee_quotients` of float64 whatever that argument's precision."""
+
+    @functools.wraps(function)
+    def with_ieee_quotients(x: Any, *args: Any, **kwargs: Any) -> Result:
+        with ieee_quotients(dr.float64_array_t(type(x))):
+            return function(x, *args, **kwargs)
+
+    return with_ieee_quotients
 
 
 def differentiated(x: Number | Vector3) -> bool:

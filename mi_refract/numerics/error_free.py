@@ -103,8 +103,9 @@ class DoubleWord:
         r = x·rsqrt(x) is a few u off, whatever rsqrt the backend has; the exact defect of r² corrects it to a few u².
         Neither a division nor a square root is left, which both take longer than all else here.
         """
-        with ieee_quotients(self.hi):
-            inverse = dr.rsqrt(dr.select(self.hi > 0, self.hi, 1))
+        positive = dr.select(self.hi > 0, self.hi, 1)
+        with ieee_quotients(self.hi):  # the reciprocal of a denormal number is infinite
+            inverse = dr.rsqrt(positive) if dr.type_v(positive) == dr.VarType.Float32 else dr.rcp(dr.sqrt(positive))
         root = rounded_product(self.hi, inverse)
         return DoubleWord(root, (dr.fma(-root, root, self.hi) + self.lo) * (0.5 * inverse))
 
