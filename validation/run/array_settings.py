@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.accuracy import Subject
-from mi_refract.formulas import FORMULAS, Budget, automatic
+from mi_refract.formulas import AUTOMATIC, FORMULAS, Budget
 from mi_refract.plugins import PLUGIN
 from mi_refract.regimes import REGIMES
 
@@ -18,6 +18,7 @@ from .context import Context
 
 BUILTIN = "mi.fresnel + mi.refract"
 DOCUMENTED = tuple(name for name, formula in FORMULAS.items() if not formula.budget.at_the_limit)
+RIGHT_PLUGINS = tuple(f"{PLUGIN}_{name}" for name in FORMULAS if name not in (*DOCUMENTED, AUTOMATIC))
 PLAIN = "decomposed"  # the common form, which the built-in shares: its radicand cancels as the built-in's does
 
 
@@ -100,13 +101,6 @@ def settings(context: Context) -> list[Setting]:
 def running(context: Context) -> list[Setting]:
     """Those that run here."""
     return [setting for setting in settings(context) if setting.vector is not None]
-
-
-def right_plugins() -> list[str]:
-    """The plugins at the rounding limit whose formula is not the default's in the present variant."""
-    import mitsuba as mi
-
-    return [f"{PLUGIN}_{name}" for name in FORMULAS if name not in (*DOCUMENTED, automatic(dr.backend_v(mi.Float)))]
 
 
 def budget_of(subject: str) -> Budget:
