@@ -128,8 +128,14 @@ def test_float_expansions_multiply_exactly_divide_and_regain_what_cancels():
 # Dr.Jit arrays -------------------------------------------------------------------------------------------------------
 
 
-def test_compiled_sums_add_rounded_products_and_quotients_have_all_digits(vectorised):
-    """In one kernel with what uses them: there a compiler may fuse x·y + z, and choose instructions of 20 bits."""
+@pytest.mark.parametrize("as_cuda", [False, True])
+def test_compiled_sums_add_rounded_products_and_quotients_have_all_digits(vectorised, as_cuda, monkeypatch):
+    """In one kernel with what uses them: there a compiler may fuse x·y + z, and choose instructions of 20 bits.
+
+    as_cuda: what is done for CUDA changes no number elsewhere.
+    """
+    if as_cuda:
+        monkeypatch.setattr(dr, "backend_v", lambda x: dr.JitBackend.CUDA)
     number, rng = dr.value_t(vectorised.vector), np.random.default_rng(5)
     x, y = (number(rng.uniform(1, 2, 1000).astype(vectorised.precision)) for _ in range(2))
     root = DoubleWord(x).sqrt()
