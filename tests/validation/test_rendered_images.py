@@ -174,19 +174,22 @@ def test_the_scene_is_not_symmetric():
     [
         ("prism", b"", b"", "pass"),
         ("prism", b'"transmissionFactor":1.0', b'"transmissionFactor":9.0', "fail"),
+        ("lamps", b"", b"", "pass"),
+        ("lamps", b'"light":0', b'"light":9', "fail"),
+        ("lamps", b'"byteStride":12', b'"byteStride": 8', "fail"),
         ("furnace", b"", b"", "not run"),
     ],
 )
 def test_khronos_validator_sees_a_value_out_of_range(scene, old, new, verdict, context, monkeypatch, tmp_path):
     """A scene that glTF cannot hold says so."""
-    for name in ("meshes", f"{scene}.xml"):
+    for name in ("meshes", f"{scene}.xml") if scene != "lamps" else ():
         (tmp_path / name).symlink_to(exports.SCENES / name)
     make = targets.TARGETS["gltf"]
     monkeypatch.setitem(
         targets.TARGETS, "gltf", lambda plain: {name: data.replace(old, new) for name, data in make(plain).items()}
     )
     monkeypatch.setattr(exports, "SCENES", tmp_path)
-    (row,) = exports.validated(context)
+    (row,) = (row for row in exports.validated(context) if row.case == scene)
     assert (row.case, row.verdict) == (scene, verdict), row.values
     assert "touch" in row.reason if verdict == "not run" else row.values[exports.WARNINGS] == 0
 

@@ -6,7 +6,8 @@ users get: the exported files, and the options in the exported README.txt. The i
 RMSE may be twice what the spread between renders predicts, and 1 % of the mean. A camera, a sky or an index that is
 wrong exceeds that many times.
 
-Khronos' `gltf-validator` reads the glTF export of each scene of `scenes/` that glTF can hold.
+Khronos' `gltf-validator` reads the glTF export of each scene of `scenes/` that glTF can hold, and of one with lamps
+without size and a unit sphere, whose vertices are its normals.
 """
 
 from __future__ import annotations
@@ -14,13 +15,25 @@ from __future__ import annotations
 import dataclasses
 import functools
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from mi_refract.report.row import Row
-from mi_refract.scene_export import from_mitsuba, targets
-from mi_refract.scene_export.plain_scene import Camera, Diffuse, Light, Material, Mesh, PlainScene
+from mi_refract.scene_export import from_mitsuba, targets, tessellation
+from mi_refract.scene_export.plain_scene import (
+    Camera,
+    Diffuse,
+    DirectionalLamp,
+    Glass,
+    Light,
+    Material,
+    Mesh,
+    PlainScene,
+    PointLamp,
+    SpotLamp,
+)
 from validation import limits
 from validation.run.context import SCENES, Context
 from validation.study import Study, Task, about
@@ -65,6 +78,16 @@ def scene(diffuse: bool = True) -> PlainScene:
     return dataclasses.replace(balls, name="balls", meshes=(*balls.meshes, *extra), sky=askew(), camera=camera)
 
 
+def lit() -> PlainScene:
+    """A unit sphere of glass, and a lamp without size of each kind."""
+    vertices, faces = tessellation.sphere(LEVEL)
+    ball, place, ahead = Mesh("ball", vertices, faces, Glass(1.5, 1.0), vertices), (1.0, 2.0, 3.0), (0.0, 0.6, -0.8)
+    lamps = PointLamp("point", place, place), DirectionalLamp("sun", ahead, place)
+    spots = (SpotLamp(f"spot{beam:g}", place, place, ahead, beam, 30.0) for beam in (0.0, 20.0, 30.0))
+    camera = Camera((0.0, 0.0, 9.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, *SIZE)
+    return PlainScene("lamps", (ball,), (0.0, 0.0, 0.0), camera, 8, (*lamps, *spots))
+
+
 def _quad(name: str, low: tuple[float, float], high: tuple[float, float], material: Material) -> Mesh:
     """A rectangle in the plane z = 0 that faces +z."""
     corners = [(low[0], low[1], 0.0), (high[0], low[1], 0.0), (high[0], high[1], 0.0), (low[0], high[1], 0.0)]
@@ -94,14 +117,15 @@ def rows(context: Context, title: str) -> list[Row]:
 def validated(context: Context) -> list[Row]:
     """What Khronos' validator says of the glTF exports: a row per scene; not run, where glTF cannot hold it."""
     system, result = SYSTEMS[VALIDATOR], []
-    for path in sorted(SCENES.glob("*.xml")):
-        row = functools.partial(Row, NAME, system.title, path.stem, "glTF")
+    paths = sorted(SCENES.glob("*.xml"))
+    scenes = {path.stem: functools.partial(from_mitsuba.load, path, level=LEVEL) for path in paths} | {"lamps": lit}
+    for name, load in scenes.items():
+        row = functools.partial(Row, NAME, system.title, name, "glTF")
 
-        def counts(path: Path = path) -> dict[str, float]:
+        def counts(load: Callable[[], PlainScene] = load) -> dict[str, float]:
             with tempfile.TemporaryDirectory() as folder:
                 try:
-                    plain = from_mitsuba.load(path, level=LEVEL)
-                    made = targets.write(plain, "gltf", Path(folder) / "scene")
+                    made = targets.write(load(), "gltf", Path(folder) / "scene")
                 except ValueError as why:
                     raise environments.Unable(str(why)) from None
                 files = [str(file) for file in made if file.suffix in (".glb", ".gltf")]

@@ -124,7 +124,7 @@ def files(plain: PlainScene) -> Files:
     start, end = 20, 20 + int.from_bytes(single[12:16], "little")  # of the JSON, by the specification
     tree = json.loads(single[start:end])
     tree.get("buffers", [{}])[0]["uri"] = "gltf_buffer.bin"
-    several = {"scene.gltf": json.dumps(tree).encode(), "gltf_buffer.bin": single[end + 8 :]}
+    several = {"scene.gltf": json.dumps(tree, separators=(",", ":")).encode(), "gltf_buffer.bin": single[end + 8 :]}
     sky = sky_exr(plain, SKY_AXES)
     if not isinstance(plain.sky, Environment) and any(plain.sky):
         sky = {"sky.exr": exr(np.full((4, 8, 3), plain.sky, np.float32))}
