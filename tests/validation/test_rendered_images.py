@@ -155,7 +155,7 @@ def test_what_is_allowed_is_noise_and_one_percent(context, monkeypatch):
     assert values[exports.OVER] < 1 and values[exports.NOISE] > limits.EXPORT_NOISE
     spoilt = renders(2)
     spoilt[0, 3, 4] = np.nan
-    monkeypatch.setattr(exports, "reference", lambda diffuse: renders(1))
+    monkeypatch.setattr(exports, "reference", lambda shown: renders(1))
     for draw, verdict in ((lambda title: spoilt, "fail"), *((raising(error), verdict) for error, verdict in NOT_DRAWN)):
         monkeypatch.setattr(exports, "drawn", draw)
         assert [row.verdict for row in exports.rows(context, "Radiance")] == [verdict]
@@ -163,7 +163,7 @@ def test_what_is_allowed_is_noise_and_one_percent(context, monkeypatch):
 
 def test_the_scene_is_not_symmetric():
     """Otherwise what is mirrored or upside down would look the same: differences above what is allowed."""
-    image = exports.reference(diffuse=False)
+    image = exports.reference("no patch")
     for other in (image[:, ::-1], image[:, :, ::-1], image[:, ::-1, ::-1]):
         assert exports.compared(image, other)[exports.OVER] > 2
 

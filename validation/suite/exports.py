@@ -1,10 +1,10 @@
 """Exports: what is written for another renderer, rendered by it on 16 × 9 pixels, is Mitsuba's image of the same scene.
 
 Nothing in the scene is symmetric: four balls of different glass under a turned sky, a lamp and a coloured patch (which
-POV-Ray is not given: it has glass and lights only), a tilted camera, a film that is not square. The renderers read what
-users get: the exported files, and the options in the exported README.txt. The images are some renders a side; their
-RMSE may be twice what the spread between renders predicts, and 1 % of the mean. A camera, a sky or an index that is
-wrong exceeds that many times.
+POV-Ray is not given: it has glass and lights only), for Cycles also a point and a directional lamp, a tilted camera, a
+film that is not square. The renderers read what users get: the exported files, and the options in the exported
+README.txt. The images are some renders a side; their RMSE may be twice what the spread between renders predicts, and
+1 % of the mean. A camera, a sky or an index that is wrong exceeds that many times.
 
 Khronos' `gltf-validator` reads the glTF export of each scene of `scenes/` that glTF can hold, and of one with lamps
 without size and a unit sphere, whose vertices are its normals.
@@ -55,6 +55,8 @@ TERMS = {
     NOISE: "the predicted noise of the difference of the two means",
     ERRORS: "of both files, `scene.glb` and `scene.gltf`; so are the warnings, a goal",
 }
+# What is in the scene for a renderer, if not all but lamps without size.
+SHOWN = {"POV-Ray": "no patch", "Cycles": "lamps", "Cycles, glTF": "lamps"}
 LEFT_OUT = {
     THREE: "it counts the light of the sky twice, see the study of images; without MIS it is here",
     RASTER: "it traces no paths, see the study of images",
@@ -68,14 +70,16 @@ THEIRS = {
 }  # samples a pixel and render; others 256
 
 
-def scene(diffuse: bool = True) -> PlainScene:
-    """The balls of `balls`, seen from another place, with a lamp; `diffuse`: and with a patch."""
+def scene(shown: str = "") -> PlainScene:
+    """The balls of `balls`, seen from another place, with a lamp and a patch. `shown`: one of SHOWN."""
     balls = from_mitsuba.load(SCENES / "balls.xml", level=2)
     camera = Camera((30.0, 15.0, 240.0), (3.0, -4.0, 0.0), (0.3, 1.0, 0.2), 48.0, *SIZE)
     extra = [_quad("lamp", (-100.0, 22.0), (-72.0, 50.0), Light((3.0, 2.0, 1.0)))]
-    if diffuse:
+    if shown != "no patch":
         extra.append(_quad("patch", (70.0, -50.0), (105.0, 10.0), Diffuse((0.2, 0.5, 0.9))))
-    return dataclasses.replace(balls, name="balls", meshes=(*balls.meshes, *extra), sky=askew(), camera=camera)
+    meshes, bulb = (*balls.meshes, *extra), PointLamp("bulb", (60.0, 0.0, 80.0), (6000.0, 3000.0, 9000.0))
+    lamps = (bulb, DirectionalLamp("sun", (0.0, 0.6, -0.8), (1.0, 3.0, 2.0))) if shown == "lamps" else ()
+    return dataclasses.replace(balls, name="balls", meshes=meshes, sky=askew(), camera=camera, lamps=lamps)
 
 
 def lit() -> PlainScene:
@@ -109,7 +113,7 @@ def rows(context: Context, title: str) -> list[Row]:
     theirs, nothing = environments.attempt(row, why_not(system, context), lost, lambda: drawn(title))
     if theirs is None:
         return nothing
-    values, budgets = compared(reference(diffuse=title != "POV-Ray"), theirs), {OVER: 1.0, NOISE: limits.EXPORT_NOISE}
+    values, budgets = compared(reference(SHOWN.get(title, "")), theirs), {OVER: 1.0, NOISE: limits.EXPORT_NOISE}
     replay = {"renderer": system.source, "spp": THEIRS.get(title, 256), "reference spp": SPP, "seeds": [*SEEDS]}
     return [row(values, budgets, replay=replay)]
 
@@ -144,15 +148,14 @@ def validated(context: Context) -> list[Row]:
 def drawn(title: str) -> np.ndarray:
     """Renders by another renderer: renders × height × width × 3."""
     with tempfile.TemporaryDirectory() as folder:
-        plain = scene(diffuse=title != "POV-Ray")
-        images = IMAGE_RENDERERS[title].draw(plain, Path(folder), THEIRS.get(title, 256), SEEDS)
+        images = IMAGE_RENDERERS[title].draw(scene(SHOWN.get(title, "")), Path(folder), THEIRS.get(title, 256), SEEDS)
     return np.stack([image.pixels for image in images]).astype(np.float64)
 
 
 @functools.cache
-def reference(diffuse: bool) -> np.ndarray:
+def reference(shown: str) -> np.ndarray:
     """Renders by this plugin, in the present variant: renders × height × width × 3."""
-    return np.stack(by_plugin(scene(diffuse), SPP)).astype(np.float64)
+    return np.stack(by_plugin(scene(shown), SPP)).astype(np.float64)
 
 
 def compared(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
