@@ -1,4 +1,4 @@
-"""A real browser, where there is one: what a page's own script did to it."""
+"""Pages: that they stand alone; and a real browser, where there is one: what a page's own script did to it."""
 
 import html
 import json
@@ -12,19 +12,19 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PATH: the page's script was not run")
 
 
+def assert_stands_alone(text):
+    """It fetches nothing, and no id is there twice."""
+    assert not re.findall(r"https?:|@import|url\((?!#)|\bsrc=|<link|<iframe", text)
+    ids = re.findall(r'\bid="([^"]*)"', text)
+    assert len(ids) == len(set(ids))
+
+
 def browse(page, profile):
     """The page's DOM after its scripts ran, and whatever the console said."""
-    quiet = ("background-networking", "component-update", "sync", "gpu", "dev-shm-usage")
-    flags = (
-        "--headless",
-        "--no-sandbox",
-        *(f"--disable-{q}" for q in quiet),
-        "--no-first-run",
-        "--dump-dom",
-        "--window-size=1280,900",
-    )
-    more = (f"--user-data-dir={profile}", "--enable-logging=stderr", "--virtual-time-budget=10000", page.as_uri())
-    done = subprocess.run([CHROMIUM, *flags, *more], capture_output=True, text=True, timeout=120, check=True)
+    flags = ["--headless", "--no-sandbox", "--no-first-run", "--dump-dom", "--enable-logging=stderr"]
+    flags += ["--window-size=1280,900", "--virtual-time-budget=10000", f"--user-data-dir={profile}", page.as_uri()]
+    flags += [f"--disable-{x}" for x in ("background-networking", "component-update", "sync", "gpu", "dev-shm-usage")]
+    done = subprocess.run([CHROMIUM, *flags], capture_output=True, text=True, timeout=120, check=True)
     return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
 
 
