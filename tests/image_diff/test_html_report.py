@@ -368,14 +368,7 @@ def test_a_noisy_full_size_pair_stays_within_its_bytes(tmp_path):
 
 # In a browser -----------------------------------------------------------------------------------------------------
 
-# Waits for the page's own script; what it leaves in `seen` is read.
-LIST = """<script>
-const wait = setInterval(async () => {
-  if (!root.dataset.ready) return;
-  clearInterval(wait);
-  const $ = (selector) => document.querySelector(selector);
-  const active = () => document.activeElement ?? document.body;
-  const press = (key) => active().dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
+LIST = """
   const set = (control, value) => {
     control.value = value;
     control.dispatchEvent(new Event("input", { bubbles: true }));
@@ -413,9 +406,7 @@ const wait = setInterval(async () => {
   press("ArrowRight");
   seen.clip.push(clip());
   seen.requests = performance.getEntriesByType("resource").length;
-  root.dataset.seen = JSON.stringify(seen);
-}, 20);
-</script></body>"""
+"""
 
 
 @needs_chromium
@@ -432,9 +423,7 @@ def test_the_browser_sees_a_request_and_an_error(tmp_path):
 @needs_chromium
 def test_the_strip_of_names_is_searched_and_the_page_builds_the_command(many, tmp_path, run):
     image(many[1] / "-dash it's.exr", 0.5)
-    page = tmp_path / "out.html"
-    page.write_text(page_of(many, page).replace("</body>", LIST), "utf-8")
-    found = seen(page, tmp_path / "profile")
+    found = seen(tmp_path, page_of(many, tmp_path / "out.html"), LIST)
     words = shlex.split(found.pop("built"))
     assert found == {
         "small": [32] * 7 + [4],

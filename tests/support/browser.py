@@ -28,9 +28,27 @@ def browse(page, profile):
     return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
 
 
-def seen(page, profile):
-    """What the page's scripts left as JSON in `data-seen`; none of them failed, and the console says nothing."""
-    dom, console = browse(page, profile)
+BEGIN = """<script>
+const wait = setInterval(() => {
+  if (!root.dataset.ready) return;
+  clearInterval(wait);
+  const $ = (selector) => document.querySelector(selector);
+  const active = () => document.activeElement ?? document.body;
+  const press = (key) => active().dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
+"""
+END = """  root.dataset.seen = JSON.stringify(seen);
+}, 20);
+</script></body>"""
+
+
+def seen(folder, text, script):
+    """What a script leaves in `seen` that runs after those of the page; none of them failed, and the console is empty.
+
+    It has `$(selector)`, `active()`, the element with the focus, and `press(key)`.
+    """
+    page = folder / "report.html"
+    page.write_text(text.replace("</body>", f"{BEGIN}{script}{END}"), "utf-8")
+    dom, console = browse(page, folder / "profile")
     assert console == []
     tag = re.search("<html[^>]*>", dom)[0]
     assert 'data-ready="1"' in tag and "data-error" not in tag
