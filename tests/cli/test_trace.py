@@ -47,11 +47,7 @@ def trace(ball, run):
 def paths_of(result):
     code, out, err = result
     assert (code, err) == (0, "")
-
-    def refuse(name):
-        raise AssertionError(f"{name} is no JSON")
-
-    return [path for colour in json.loads(out, parse_constant=refuse)["colours"] for path in colour["paths"]]
+    return [path for colour in json.loads(out, parse_constant=pytest.fail)["colours"] for path in colour["paths"]]
 
 
 @pytest.mark.parametrize("suffix", ["", ".png", ".pdf", ".SVG"])
