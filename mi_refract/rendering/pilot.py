@@ -44,7 +44,7 @@ from .render_pass import PassRenderer, quiet, samples_of_pixels, set_spp
 from .render_settings import AUTO, DEFAULTS, OWN, SAMPLERS, Settings, integrator_node, own_settings, settings_text
 
 SHARE = 0.05  # of the render, which the pilot takes at most, unless the least of each candidate takes more
-AIMED = 0.8  # of that, as times are not known well
+AIMED = 0.7  # of that, as times are not known well
 OPEN_SAMPLES = 2**20  # of which it takes as much time where the render's number of samples is not known
 FIRST = 1 / 6  # of its samples: those of the first batch, which says how many pixels the second may have
 LEAST_PIXELS, LEAST_SPP = 32, 16  # of a batch
