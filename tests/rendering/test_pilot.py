@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
@@ -318,13 +319,14 @@ def test_a_sampler_whose_noise_cannot_be_measured_is_an_error(tmp_path, llvm, sa
 
 
 def test_the_time_of_a_render_has_its_pilot_in_it(tmp_path, llvm, monkeypatch):
-    """A clock that only the pilot moves, beyond the limit: one pass is rendered."""
-    clock = [0.0]
-    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    """A clock that a look moves by a second, and the pilot beyond the limit: one pass is rendered."""
+    clock = itertools.count()
+    monkeypatch.setattr(time, "monotonic", lambda: float(next(clock)))
 
     def chosen(pilot):
-        clock[0] += 3600
-        return Choice({}, {"seconds": 3600.0, "of": OWN, "costs": {}})
+        for _ in range(60):
+            time.monotonic()
+        return Choice({}, {"seconds": 60.0, "of": OWN, "costs": {}})
 
     monkeypatch.setattr(long_render, "choose", chosen)
     render = resume(Job(BALL, {"res": "8"}, settings=AUTO), tmp_path / "a.exr", Limits(seconds=60, pass_spp=1))
