@@ -92,6 +92,7 @@ CHOICES = {
         {"found": finds(1 / 64, 640, both=True), "seconds": 1000},
         LAMPS,
     ),
+    "lamps, of whose little light much is found": ({LAMPS: (1, 3)}, {"found": finds(1 / 64, 640), "lamps": 1e-3}, OWN),
     "lamps, of whose light nothing is found": ({LAMPS: (1, 3)}, {"found": finds(0, 0), "lamps": 0.3}, LAMPS),
     "lamps, of whose little light nothing is found": ({LAMPS: (1, 3)}, {"found": finds(0, 0), "lamps": 1e-3}, OWN),
 }
