@@ -32,7 +32,7 @@ ROOMS = {
         *("against_dielectric", "colours", "unused_features", "invisible_changes"),
         *("neighbours", "random_numbers", "gradients", "rendering_passes"),
     ),
-    "efficiency": ("error_against_time", "scaling", "changing_indices", "caustics"),
+    "efficiency": ("error_against_time", "scaling", "changing_indices", "caustics", "chosen_settings"),
     "media": ("catalogs", "ray_directions", "closed_forms", "renders"),
     "planar": ("against_retrace", "closed_paths", "joints", "extruded_scenes", "times"),
     "diff": ("planted_defects", "visible_changes", "welch_nulls", "times"),

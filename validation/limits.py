@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from mi_refract.formulas import bounds
-from validation.run.metrics import EQUAL_TIME, EQUAL_TIME_CAUSTIC, EQUAL_TIME_DEFAULTS
+from validation.run.metrics import EQUAL_TIME, EQUAL_TIME_CAUSTIC, EQUAL_TIME_DEFAULTS, EQUAL_TIME_HAND
 
 
 class Limit(float):
@@ -137,6 +137,12 @@ CAUSTICS = {
     EQUAL_TIME: limit(0.4, "of the built-in's with the same sampler, of lamps that are small"),
     EQUAL_TIME_CAUSTIC: limit(0.05, "of the built-in's, where the caustic is seen: paths hardly ever meet such a lamp"),
 }
+CHOSEN = {
+    EQUAL_TIME_HAND: limit(1.1, "of the best settings by hand: what a pilot of 5 % of the render can tell"),
+    EQUAL_TIME_DEFAULTS: limit(1.05, "of Mitsuba's defaults: who lets a pilot choose loses no more than it takes"),
+}
+CHOSEN_MEDIAN = {EQUAL_TIME_DEFAULTS: limit(0.5, "of Mitsuba's defaults, in the median of the scenes")}
+PILOT_SHARE = limit(0.05, "of the render, but for compilation, and for renders that take less than a second")
 CAUSTIC_ENERGY = limit(
     5e-3, "relative: a lost internal reflection at the back of a ball is 1e-3, a lost η² more than 1"
 )

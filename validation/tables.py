@@ -26,7 +26,7 @@ from mi_refract.report.embedded_images import png
 from mi_refract.report.row import Row
 from validation.diff import visible_changes
 from validation.directions import per_formula
-from validation.efficiency import changing_indices, error_against_time
+from validation.efficiency import changing_indices, chosen_settings, error_against_time
 from validation.ground_truth import standard_numbers
 from validation.planar import against_retrace
 from validation.planar import times as planar_times
@@ -271,6 +271,16 @@ def changing(rows: list[Row]) -> str:
     return _table(text, ["", "time over the built-in's"], cells, "changes of indices were timed")
 
 
+def settings(rows: list[Row]) -> str:
+    """What a pilot chooses, over the best settings by hand and over Mitsuba's defaults."""
+    mine = [row for row in _measured(rows, chosen_settings.NAME) if row.case != chosen_settings.EVERY]
+    metrics = m.EQUAL_TIME_HAND, m.EQUAL_TIME_DEFAULTS, chosen_settings.SHARE
+    cells = [[row.case, f"`{row.replay['chosen']}`", *_cells(row, metrics)] for row in mine]
+    text = _replay(mine, "MSE × time, pilot included, {resolution}² pixels, {spp} spp, {rounds} rounds, {setting}.")
+    heading = ["scene", "chosen", "over the best by hand", "over Mitsuba's defaults", "pilot over render"]
+    return _table(text, heading, cells, "chosen settings were measured")
+
+
 def planar(rows: list[Row]) -> str:
     """By scene the distance of paths from the retrace, and the time per path by the number of segments."""
     study, missing = against_retrace, "planar paths were traced on LLVM"
@@ -401,6 +411,7 @@ TABLES = {
     "paths": Table(f"{PAGES}/refract-and-dielectric.md", "stability", paths),
     "efficiency": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency", efficiency),
     "changing": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency", changing),
+    "settings": Table(".github/docs/how-to/render-for-hours.md", "efficiency", settings),
     "planar": Table(f"{PAGES}/how-accurate-planar-paths-are.md", "planar", planar),
     "defects": Table(f"{PAGES}/what-image-methods-detect.md", "diff", seen),
     "visible": Table(f"{PAGES}/how-tolerance-and-flip-decide.md", "diff", visible),

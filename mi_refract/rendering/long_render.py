@@ -92,8 +92,10 @@ def resume(
     elif not restart:
         image = rendered_file.read(path, renderer.channels, identity)
         progress = image or progress
-    if progress.identity[SETTINGS] == AUTO:
+    began, piloted = time.monotonic(), progress.identity[SETTINGS] == AUTO
+    if piloted:
         progress.identity |= _choose(job, parsed, renderer, None if limits.by_error else spp, limits)
+    pilot_seconds = time.monotonic() - began if piloted else None
     if chosen := parse_settings(progress.identity[SETTINGS]):
         parsed = with_settings(parsed, chosen)
         del scene, renderer
@@ -114,7 +116,7 @@ def resume(
         more = f"expected --spp {progress.done} or more, or --restart"
         raise ValueError(f"{saved}: already holds {progress.done} samples per pixel; {more}")
     progress.identity[PASS] = plan.spp
-    return LongRender(job, path, limits, parsed, scene, renderer, spp, plan, progress)
+    return LongRender(job, path, limits, parsed, scene, renderer, spp, plan, progress, pilot_seconds)
 
 
 def _choose(job: Job, parsed: ParsedScene, renderer: PassRenderer, spp: int | None, limits: Limits) -> Identity:
@@ -179,8 +181,9 @@ def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer, settings: s
 class LongRender:
     """A render in passes; made by `resume`.
 
-    `spp`: samples per pixel at the end, None where another limit ends it. `ended_by`: that limit, in words.
-    `warnings`: what went wrong without ending the render.
+    `spp`: samples per pixel at the end, None where another limit ends it. `pilot_seconds`: of the pilot that `resume`
+    ran, None where it ran none. `ended_by`: that limit, in words. `warnings`: what went wrong without ending the
+    render.
     """
 
     job: Job
@@ -192,6 +195,7 @@ class LongRender:
     spp: int | None
     plan: PassPlan
     progress: Progress
+    pilot_seconds: float | None = None
     ended_by: str = ""
     warnings: list[str] = field(default_factory=list)
 
@@ -228,7 +232,8 @@ class LongRender:
 
     def _run(self, nodes: Passes, watch: Callable[[LongRender], None]) -> Metadata:
         progress, done_before = self.progress, self.progress.passes
-        deadline = math.inf if self.limits.seconds is None else time.monotonic() + self.limits.seconds
+        seconds = math.inf if self.limits.seconds is None else self.limits.seconds - (self.pilot_seconds or 0)
+        deadline = time.monotonic() + seconds
         while not (end := self.end()):
             self._fit_passes()
             tree, plan, first = progress.tree, self.plan, progress.first
@@ -331,11 +336,13 @@ class LongRender:
         return None if sums is None else sums.mean
 
     def pilot_lines(self) -> list[str]:
-        """What a pilot has chosen, and why, line by line; [] where there was none."""
+        """What a pilot has chosen, with figures if this command ran it, line by line; [] where there was none."""
         settings, figures = (self.progress.identity.get(name) for name in (SETTINGS, PILOT))
         if figures is None:
             return []
         text = settings if settings == OWN else f"--settings {settings}"
+        if self.pilot_seconds is None:
+            return [f"the pilot of an earlier command has chosen {text}"]
         return [*lines_of(figures), f"a pilot of {figures['seconds']:g} s has chosen {text}"]
 
     def give_up(self) -> None:

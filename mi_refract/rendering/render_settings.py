@@ -24,7 +24,7 @@ NAMES = {
 }
 _SHARED = ("sample_count", "seed")  # parameters of every sampler
 _TYPES = {"split_depth": "Integer", "caustics": "String"}  # of `refract_path`; `path` has neither
-_DEFAULTS = {"split_depth": 0, "caustics": "path"}
+DEFAULTS = {"split_depth": "0", "caustics": "path"}
 _OWN = (*_TYPES, "split_weight", "light_paths")  # parameters that `path` does not have
 Settings: TypeAlias = dict[str, str]  # by NAMES; {}: the scene's own
 
@@ -59,7 +59,7 @@ def own_settings(parsed: ParsedScene) -> Settings:
         own["integrator"] = parsed.nodes[integrator][1]
         if own["integrator"] == "refract_path":
             given = {name: value for name, _, value in parsed.nodes[integrator][3]}
-            own |= {name: str(given.get(name, default)) for name, default in _DEFAULTS.items()}
+            own |= {name: str(given.get(name, default)) for name, default in DEFAULTS.items()}
     return own
 
 

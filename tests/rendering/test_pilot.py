@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
-from dataclasses import replace
+import time
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -15,10 +16,11 @@ from support.renders import BALL, GLASS, SCENES, pixels
 
 from mi_refract.io.errors import CheckpointError
 from mi_refract.plugins import lamp_tracing
+from mi_refract.rendering import long_render
 from mi_refract.rendering.end_conditions import Limits
 from mi_refract.rendering.long_render import Job, render_to_exr, resume
 from mi_refract.rendering.pass_plan import plan_passes
-from mi_refract.rendering.pilot import LEAST_LIGHT_PATHS, STEPS, Batch, Pilot, choose, ratio
+from mi_refract.rendering.pilot import LIGHT_PATHS, Choice, Passes, Pilot, choose, ratios
 from mi_refract.rendering.render_pass import pass_renderer
 from mi_refract.rendering.render_settings import AUTO, OWN, parse_settings, settings_text, with_settings
 from mi_refract.rendering.scene_bundle import pack
@@ -30,115 +32,112 @@ SPLIT = "sampler=multijitter,integrator=refract_path,split_depth=1"
 # The choice, from figures ---------------------------------------------------------------------------------------------
 
 
-def made_up(costs, own=None, noise=0.1, light=1.0, seconds=1e9, start=None):
-    """A pilot whose candidates have variances and times by the text of their settings; else 1 and 1."""
+PLAIN = "sampler=multijitter,integrator=refract_path"
+DEEP = f"{PLAIN},split_depth=3"
+LAMPS = f"{DEEP},caustics=lamp"
+
+
+def made_up(costs, light=1.0, seconds=10_000, lamps=0.1, found=None, rare=()):
+    """A pilot whose candidates have variances and times by the text of their settings; else 1 and 1.
+
+    `lamps`: the brightness of what lamps light; `found`: samples of it in a batch of so many pixels, channels × pixels
+    × COPIES × samples. Candidates that are `rare` have one sample in the first pixel that has a variance of 10⁶ alone.
+    """
     asked = []
 
-    def measure(settings, number):
-        asked.append((settings_text(settings), number))
-        variance, time = costs.get(settings_text(settings), (1, 1))
-        size = 100 * 2**number
-        found = variance * (1 + noise * np.random.default_rng([number, *settings_text(settings).encode()]).random(size))
-        return Batch(found, light, time, time * size)
+    def measure(settings, number, size):
+        asked.append((name := settings_text(settings), number))
+        variance, time = costs.get(name, (1, 1))
+        means = light + math.sqrt(variance) * np.random.default_rng(number).normal(size=(1, size, 2))
+        if name in rare and number == 0:
+            means[:, 0, 0] += math.sqrt(2e6 * size)
+        if name != LAMPS:
+            return Passes(means, time)
+        x = found(size)
+        return Passes(means, time, 0.0, lamps, 0.0, np.stack([x.mean(-1), x.var(-1, ddof=1) / x.shape[-1]]))
 
-    own = own or {"sampler": "independent", "integrator": "path"}
-    methods = {"usable": lambda option: True, "measure": measure, "allowed": lambda t: seconds}
+    candidates = [parse_settings(text) for text in (OWN, PLAIN, DEEP, *[LAMPS] * (found is not None))]
+    methods = {"measure": measure, "allowed": lambda t: seconds}
     parsed = SimpleNamespace(path="made-up.xml")
-    return SimpleNamespace(own=own, start=start or {}, asked=asked, parsed=parsed, **methods)
+    return SimpleNamespace(candidates=candidates, first=64, asked=asked, parsed=parsed, **methods)
+
+
+def finds(share, size, both=False):
+    """Of a share of passes each has one sample of a brightness `size`; `both`: the copies of a pixel have it alike."""
+
+    def found(pixels):
+        x = np.zeros((1, pixels, 2, 16))
+        x[:, : round(share * pixels), : 2 if both else 1, 0] = size
+        return x
+
+    return found
 
 
 CHOICES = {
-    "all are alike": ({}, None, OWN),
-    "a sampler": ({"sampler=orthogonal": (0.5, 1.2)}, None, "sampler=orthogonal"),
-    "less noise, but slower": ({"sampler=orthogonal": (0.5, 2.2)}, None, OWN),
-    "splitting, with the sampler that is best without": (
-        {"sampler=ldsampler": (0.7, 1), "sampler=ldsampler,integrator=refract_path,split_depth=2": (0.1, 2)},
-        None,
-        "sampler=ldsampler,integrator=refract_path,split_depth=2",
+    "all are alike": ({}, {}, OWN),
+    "a stratified sampler": ({PLAIN: (0.5, 1.2), DEEP: (0.5, 2)}, {}, PLAIN),
+    "less noise, but slower": ({PLAIN: (0.5, 2.2), DEEP: (0.5, 2.2)}, {}, OWN),
+    "splitting": ({PLAIN: (0.7, 1), DEEP: (0.1, 2)}, {}, DEEP),
+    "splitting that hardly pays": ({PLAIN: (0.5, 1), DEEP: (0.48, 1)}, {}, PLAIN),
+    "no noise": ({OWN: (0, 1), PLAIN: (0, 1), DEEP: (1e-20, 1)}, {}, OWN),
+    # Rare and bright samples: what has less in it has met none of them, and is no better for that.
+    "rare samples, met where glass is split": ({DEEP: (0.5, 3)}, {"rare": (DEEP,)}, PLAIN),
+    "rare samples, met by all but the scene's own": ({DEEP: (0.5, 3)}, {"rare": (DEEP, PLAIN)}, PLAIN),
+    # Lamps: they cost three times as much time. Light of them, 0.1, has been found in samples of a brightness.
+    "lamps, found evenly": ({LAMPS: (1, 3)}, {"found": finds(1.0, 1.6, both=True)}, OWN),
+    "lamps, found in a few bright samples": ({LAMPS: (1, 3)}, {"found": finds(1 / 64, 640)}, LAMPS),
+    # Both copies of a pixel have one such sample: they differ by nothing, and yet it is noise.
+    "lamps, found in two bright samples that are alike": (
+        {LAMPS: (1, 3)},
+        {"found": finds(1 / 64, 640, both=True), "seconds": 1000},
+        LAMPS,
     ),
-    "less splitting": (
-        {"split_depth=1": (0.5, 0.5)},
-        {"sampler": "multijitter", "integrator": "refract_path", "split_depth": "3"},
-        "split_depth=1",
-    ),
-    "caustics, then splitting": (
-        {
-            "sampler=multijitter,integrator=refract_path,caustics=lamp": (0.01, 3),
-            "sampler=multijitter,integrator=refract_path,split_depth=2,caustics=lamp": (0.003, 4),
-        },
-        None,
-        "sampler=multijitter,integrator=refract_path,split_depth=2,caustics=lamp",
-    ),
-    "no noise": ({OWN: (0, 1), "sampler=ldsampler": (1e-20, 1)}, None, OWN),
+    "lamps, of whose little light much is found": ({LAMPS: (1, 3)}, {"found": finds(1 / 64, 640), "lamps": 1e-3}, OWN),
+    "lamps, of whose light nothing is found": ({LAMPS: (1, 3)}, {"found": finds(0, 0), "lamps": 0.3}, LAMPS),
+    "lamps, of whose little light nothing is found": ({LAMPS: (1, 3)}, {"found": finds(0, 0), "lamps": 1e-3}, OWN),
 }
 
 
-@pytest.mark.parametrize("costs, own, expected", CHOICES.values(), ids=CHOICES)
-def test_the_cheapest_is_chosen_unless_it_cannot_be_told_from_the_scenes_own(costs, own, expected):
-    choice = choose(made_up(costs, own))
-    assert settings_text(choice.settings) == expected
-    cost = choice.figures["costs"][expected]
-    assert cost["low"] <= cost["value"] <= cost["high"] and cost["value"] == pytest.approx(
-        cost["variance"] * cost["time"], rel=0.01
-    )
-    if expected != OWN:
-        assert cost["high"] < 1
+@pytest.mark.parametrize("costs, named, expected", CHOICES.values(), ids=CHOICES)
+def test_the_cheapest_is_chosen_unless_the_scenes_own_are_alike(costs, named, expected):
+    choice = choose(made_up(costs, **named))
+    assert settings_text(choice.settings) == choice.figures["of"] == expected
+    assert choice.figures["costs"][expected]["value"] == 1
+    for cost in choice.figures["costs"].values():
+        assert cost["low"] <= cost["value"] <= cost["high"]
+        assert cost["value"] == pytest.approx(cost["variance"] * cost["time"], rel=0.01)
 
 
-def test_light_that_is_missing_is_traced_whatever_it_costs():
-    lamp = "integrator=refract_path,caustics=lamp"
-    pilot = made_up({f"sampler=stratified,{lamp}": (0.5, 1), OWN: (0.1, 1)}, start=parse_settings(lamp))
-    text = settings_text(choose(pilot).settings)
-    assert text == f"sampler=stratified,{lamp}" and (OWN, 0) not in pilot.asked
-    assert settings_text(parse_settings(text)) == text  # else a checkpoint would refuse the printed settings
-
-
-@pytest.mark.parametrize(
-    ("light", "caustics", "chosen"), [(0.8, 0.2, True), (0.99, 0.2, False), (0.992, 0.008, False), (0.99, 0.05, True)]
-)
-def test_lamps_are_traced_where_path_tracing_has_not_met_their_light(light, caustics, chosen):
-    """Then its noise is not known. `caustics`: what the pixels of the pilot have of 0.2, or of 0.008, of the image."""
-    lamp = "sampler=multijitter,integrator=refract_path,caustics=lamp"
-    pilot = made_up({lamp: (5, 5)})
-    measure, everywhere = pilot.measure, 0.008 if caustics == 0.008 else 0.2
-
-    def measured(settings, number):
-        if "caustics" in settings:
-            return replace(measure(settings, number), light=1.0, caustics=caustics, all_caustics=everywhere)
-        return replace(measure(settings, number), light=light)
-
-    pilot.measure = measured
-    assert ("caustics" in choose(pilot).settings) == chosen
-
-
-def test_a_candidate_that_cannot_win_is_dropped_after_one_batch_and_seconds_end_the_pilot():
-    pilot = made_up({"sampler=stratified": (10, 1)})
+def test_a_candidate_that_cannot_win_has_one_batch_and_seconds_end_the_pilot():
+    pilot = made_up({OWN: (100, 1)})
     choose(pilot)
-    assert pilot.asked.count(("sampler=stratified", 0)) == 1 and ("sampler=stratified", 1) not in pilot.asked
-    assert (OWN, 1) in pilot.asked and len(pilot.asked) == len(set(pilot.asked))  # nothing is measured twice
-    short = made_up({}, seconds=1)
-    choose(short)
-    assert {number for _, number in short.asked} == {0}
-    assert len(short.asked) == sum(map(len, STEPS)) - 1  # the scene's own are in two steps
+    assert pilot.asked == [(OWN, 0), (PLAIN, 0), (DEEP, 0), (PLAIN, 1), (DEEP, 1)]
+    # The light of lamps is that of the candidate before, which is measured on as long as they are.
+    pilot = made_up({OWN: (1e6, 1), DEEP: (1, 20)}, seconds=1e5, found=finds(1.0, 1.6, both=True))
+    choose(pilot)
+    assert pilot.asked[4:] == [(PLAIN, 1), (DEEP, 1), (LAMPS, 1)]
+    short = made_up({}, seconds=64 * 2 * (3 + 1))  # three candidates have had one batch, and one more is a third
+    assert choose(short).figures["seconds"] == 64 * 2 * 3 and {number for _, number in short.asked} == {0}
 
 
 def test_the_interval_holds_the_ratio_as_often_as_it_says():
     """95 % of a normal distribution; the time is exact here, and its share of the interval is small."""
     inside, rng = 0, np.random.default_rng(1)
-    for _ in range(400):
-        scale = rng.exponential(size=500)  # of a pixel, in both
-        a, b = ([Batch(scale * factor * rng.chisquare(1, 500), 1.0, 1.0, 1.0)] for factor in (0.5, 1))
-        found = ratio(a, b)
-        inside += found.low <= 0.5 <= found.high
+    for _ in range(200):
+        scale = rng.exponential(size=(1, 500, 1))  # of a pixel, in both
+        own, other = (Passes(factor * scale * rng.normal(size=(1, 500, 2)), 1.0) for factor in (1, 0.5))
+        found = ratios({OWN: own, PLAIN: other}, OWN)[PLAIN]
+        inside += found.low <= 0.25 <= found.high
         assert found.time == 1 and found.low < found.value < found.high
-    assert 0.9 < inside / 400 <= 1
-    assert ratio(a, a).value == 1
-    assert ratio([Batch(np.full(500, math.nan), 1.0, 1.0, 1.0)], b).high == math.inf
+    assert 0.9 < inside / 200 <= 1
+    assert ratios({OWN: own}, OWN)[OWN].value == 1
+    nothing = Passes(np.full((1, 500, 2), math.nan), 1.0)
+    assert ratios({OWN: own, PLAIN: nothing}, OWN)[PLAIN].high == math.inf
 
 
 def test_a_pilot_without_light_is_an_error():
     with pytest.raises(ValueError, match="auto: the pilot sees no light; expected"):
-        choose(made_up({}, light=0.0))
+        choose(made_up(dict.fromkeys((OWN, PLAIN, DEEP), (0, 1)), light=0.0))
 
 
 # Settings by hand -----------------------------------------------------------------------------------------------------
@@ -216,13 +215,14 @@ def test_the_choice_is_repeated_by_hand_bit_for_bit_kept_and_where_only_glass_ma
     settings = header["mi_refract:settings"]
     assert "integrator=refract_path,split_depth=" in settings and not settings.endswith("=0")
     figures = json.loads(header["mi_refract:identity"])["pilot"]
-    assert figures["costs"][settings]["value"] < 0.5 and figures["costs"][OWN]["value"] == 1
+    assert figures["costs"][settings]["value"] == 1 and figures["costs"][OWN]["value"] > 2
     by_hand, bits = header_and_bits(tmp_path / "b.exr", spp=16, settings=settings)
     np.testing.assert_array_equal(bits, chosen)
     assert by_hand["mi_refract:settings"] == settings and "pilot" not in json.loads(by_hand["mi_refract:identity"])
     # The finished image is refined with the settings that it has; a plain render replaces it.
     again = resume(Job(BALLS, GLASS_ONLY, settings=AUTO), tmp_path / "a.exr", Limits(spp=16))
-    assert again.end() == "16 spp" and again.pilot_lines()[-1].endswith(f"has chosen --settings {settings}")
+    assert again.end() == "16 spp"  # nothing is measured, and no old figures are printed as if they were new
+    assert again.pilot_lines() == [f"the pilot of an earlier command has chosen --settings {settings}"]
     assert resume(Job(BALLS, GLASS_ONLY), tmp_path / "a.exr", Limits(spp=16)).progress.passes == 0
     # Workers are sent the scene with its settings.
     assert pack(again.parsed).nodes == with_settings(parse_scene(BALLS, GLASS_ONLY), parse_settings(settings)).nodes
@@ -273,8 +273,8 @@ def test_the_time_of_light_paths_has_no_compilation_in_it(tmp_path, llvm, monkey
     pixel_count = math.prod(renderer.size)
     pilot = Pilot(parsed, renderer, lambda rounded: plan_passes(pixel_count, 16, None, rounded, moments=True))
     pilot.clock = lambda: sum(took)
-    batch = pilot.measure({"integrator": "refract_path", "caustics": "lamp"}, 0)
-    assert 0 < batch.seconds < 2 * 0.25 * 16 / LEAST_LIGHT_PATHS
+    passes = pilot.measure({"integrator": "refract_path", "caustics": "lamp"}, 0, 8)
+    assert 0 < passes.seconds < 2 * 0.25 * 16 / LIGHT_PATHS
 
 
 DARK = GLASS.replace('<emitter type="constant"/>', "")
@@ -298,21 +298,45 @@ def test_what_a_pilot_cannot_choose_for_is_an_error_and_nothing_is_written(tmp_p
     )
 
 
-def test_a_sampler_that_is_not_mitsubas_is_an_error(tmp_path, llvm):
+NO_NOISE = {
+    "no sampler of Mitsuba's": ("fixed", "the scene's sampler is fixed; expected multijitter, .*, or settings by name"),
+    # Its error is the same in all copies of a pixel, so its variance says nothing.
+    "the middles of cells": ("multijitter", "the scene's sampler is multijitter without jitter; expected multijitter"),
+}
+
+
+@pytest.mark.parametrize("sampler, message", NO_NOISE.values(), ids=NO_NOISE)
+def test_a_sampler_whose_noise_cannot_be_measured_is_an_error(tmp_path, llvm, sampler, message):
     class Fixed(mi.Sampler):
         pass
 
     mi.register_sampler("fixed", Fixed)
-    (tmp_path / "a.xml").write_text(GLASS.replace('sampler type="independent"', 'sampler type="fixed"'))
+    jitter = '<boolean name="jitter" value="false"/>' if sampler == "multijitter" else ""
+    text = GLASS.replace('sampler type="independent">', f'sampler type="{sampler}">{jitter}')
+    (tmp_path / "a.xml").write_text(text)
     job = Job(tmp_path / "a.xml", allow_plugins=["fixed"], settings=AUTO)
-    with pytest.raises(
-        ValueError, match=r"the scene's sampler is fixed; expected multijitter, .*, or settings by name"
-    ):
+    with pytest.raises(ValueError, match=message):
         resume(job, tmp_path / "a.exr", Limits(spp=4, pass_spp=4))
+
+
+def test_the_time_of_a_render_has_its_pilot_in_it(tmp_path, llvm, monkeypatch):
+    """A clock that a look moves by a second, and the pilot beyond the limit: one pass is rendered."""
+    clock = itertools.count()
+    monkeypatch.setattr(time, "monotonic", lambda: float(next(clock)))
+
+    def chosen(pilot):
+        for _ in range(60):
+            time.monotonic()
+        return Choice({}, {"seconds": 60.0, "of": OWN, "costs": {}})
+
+    monkeypatch.setattr(long_render, "choose", chosen)
+    render = resume(Job(BALL, {"res": "8"}, settings=AUTO), tmp_path / "a.exr", Limits(seconds=60, pass_spp=1))
+    render.run()
+    assert render.progress.passes == 1 and render.ended_by == "--time 60 s"
 
 
 def test_a_scene_with_another_integrator_keeps_it(tmp_path, llvm):
     (tmp_path / "a.xml").write_text(re.sub("<integrator.*/integrator>", '<integrator type="depth"/>', GLASS))
     render = resume(Job(tmp_path / "a.xml", settings=AUTO), tmp_path / "a.exr", Limits(spp=4))
     costs = render.progress.identity["pilot"]["costs"]
-    assert len(costs) == len(STEPS[0]) and not any("integrator" in name for name in costs)
+    assert [*costs] == [OWN, "sampler=multijitter"]

@@ -240,6 +240,7 @@ NAMED = {
     "paths": layered_paths.plugins(),
     "efficiency": [method.name for method in render_methods.METHODS],
     "changing": ["a new scene for each image", "an edit among 300 glasses", "a sweep of 12 indices"],
+    "settings": ["balls", "slab", "ball, square 0.05"],
     "planar": [path.stem for path in SCENES.glob("planar/*.toml")],
     "defects": [*planted_defects.GLASSES, *self_test.DEFECTS, *METHODS],
     "derivatives": [*gradients.TABLE, *gradients.INTEGRATORS],

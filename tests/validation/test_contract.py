@@ -112,6 +112,7 @@ OTHERWISE = {
     "renders.unused_features": "times and equality to the last bit",
     "efficiency.error_against_time": "several seeds a method, with intervals",
     "efficiency.changing_indices": "times",
+    "efficiency.chosen_settings": "several seeds a method, with intervals",
     "efficiency.caustics": "eight seeds a side, and six of each time",
     "efficiency.scaling": "times",
     "planar.times": "times",

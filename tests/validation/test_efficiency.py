@@ -10,8 +10,10 @@ import pytest
 from scipy.stats import binom
 
 from mi_refract import FORMULAS, backend
+from mi_refract.rendering import pilot
+from mi_refract.rendering.scene_files import load_parsed, parse_scene
 from validation import limits
-from validation.efficiency import error_against_time, scaling
+from validation.efficiency import chosen_settings, error_against_time, scaling
 from validation.efficiency.error_against_time import Extent
 from validation.run import kernel_timing, render_methods
 from validation.run.array_settings import BUILTIN as BUILTIN_KERNEL
@@ -199,3 +201,28 @@ def test_a_slow_subject_is_seen_on_every_backend_that_runs_and_goals_are_those_o
         if not setting.is_scalar:
             assert found["slow"]["operations"] > found["decomposed"]["operations"]
             assert found["slow"]["compile ms"] > 1  # NaN where a cache had the kernel
+
+
+# Settings that a pilot chooses ---------------------------------------------------------------------------------------
+
+
+def test_a_pilot_that_chooses_badly_misses_its_goals(context, monkeypatch):
+    """Where all is glass the scene's own settings cost ten times as much as splitting."""
+    small = chosen_settings.Extent(("balls",), 24, 16, 2, samplers=("multijitter",), depths=(3,))
+    monkeypatch.setitem(chosen_settings.EXTENTS, "standard", small)
+    (row,) = chosen_settings.scene_rows(context, "balls")
+    assert "split_depth=3" in row.reason and row.values["equal-time MSE / independent"] < 0.5
+    assert row.values["equal-time MSE / best by hand"] == pytest.approx(1 + row.values[chosen_settings.SHARE])
+    monkeypatch.setattr(pilot, "LOST", math.inf)
+    monkeypatch.setattr(pilot, "MARGIN", math.inf)  # all are alike
+    monkeypatch.setattr(pilot, "SURELY", math.inf)
+    (worse,) = chosen_settings.scene_rows(context, "balls")
+    assert "split_depth" not in worse.reason and "equal-time MSE / best by hand" in worse.missed
+    summary = chosen_settings.summarise([worse, worse])[-1]
+    assert summary.case == chosen_settings.EVERY and "equal-time MSE / independent" in summary.missed
+
+
+@pytest.mark.parametrize("name", chosen_settings.OTHERS)
+def test_scenes_beside_the_scene_files_can_be_read_from_their_files(name, tmp_path, llvm_variant):
+    path, defines = chosen_settings.scene_file(name, "refract", 8, tmp_path)
+    assert len(load_parsed(parse_scene(path, defines)).shapes()) > 1

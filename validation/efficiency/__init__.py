@@ -3,4 +3,4 @@
 In: integrators, BSDFs and samplers. Out: rows with errors, times and memory, and curves of them.
 """
 
-__all__ = ["caustic_scenes", "caustics", "changing_indices", "error_against_time", "scaling"]
+__all__ = ["caustic_scenes", "caustics", "changing_indices", "chosen_settings", "error_against_time", "scaling"]

@@ -32,6 +32,7 @@ DETECTABLE = "minimum detectable difference"
 EQUAL_TIME = "equal-time MSE"
 EQUAL_TIME_CAUSTIC = "equal-time MSE, caustic"
 EQUAL_TIME_DEFAULTS = "equal-time MSE / independent"
+EQUAL_TIME_HAND = "equal-time MSE / best by hand"
 
 
 def low(metric: str) -> str:
