@@ -315,11 +315,10 @@ def integrator_class(v: Variant) -> type:
 
         def scene_features(self, scene: Scene) -> SceneFeatures:
             """Of the scene as it is now: an edit of the scene can change them."""
-            before, self.needs = self.needs, (needs := inspect(scene))
+            before, self.needs = (self.needs, self.apart), (needs := inspect(scene))
             self.apart = self.traces_lamps(scene, needs)
-            for path_class, text in (
-                needs.missing("lamp" if self.apart else "path", self.max_depth).items() if needs != before else ()
-            ):
+            missing = needs.missing("lamp" if self.apart else "path", self.max_depth)
+            for path_class, text in missing.items() if (needs, self.apart) != before else ():
                 mi.Log(mi.LogLevel.Warn, f"{INTEGRATOR}: missing {path_class}: {text}")  # type: ignore[operator]
             if needs.textured:
                 check_attributes(scene)
