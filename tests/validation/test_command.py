@@ -21,9 +21,10 @@ from mi_refract.report.row import Row
 from validation import __main__ as command
 from validation import runner, tables
 from validation.diff import planted_defects, visible_changes
-from validation.efficiency import caustic_scenes, error_against_time
+from validation.efficiency import caustic_scenes
 from validation.reference.standard_numbers import NUMBERS
 from validation.renders import gradients
+from validation.run import render_methods
 from validation.run.context import SCENES, beyond_builtin, here
 from validation.stability import layered_paths
 from validation.study import Study, Task
@@ -239,7 +240,7 @@ NAMED = {
     "on a GPU": [*FORMULAS, "ns per ray"],
     "renders": [path.stem for path in SCENES.glob("*.xml") if not beyond_builtin(path)],
     "paths": layered_paths.plugins(),
-    "efficiency": [method.name for method in error_against_time.MEASURED],
+    "efficiency": [method.name for method in render_methods.METHODS],
     "caustics": [*caustic_scenes.BODIES, *caustic_scenes.LAMPS],
     "changing": ["a new scene for each image", "an edit among 300 glasses", "a sweep of 12 indices"],
     "planar": [path.stem for path in SCENES.glob("planar/*.toml")],
