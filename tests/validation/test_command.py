@@ -256,7 +256,7 @@ NAMED = {
             if "glTF" not in number.name
         ),
         *(call.title for name, system in SYSTEMS.items() if name != "mi_refract" for call in system.calls),
-        *(title for title in IMAGE_RENDERERS if title != by_others.NOT_ASKED),
+        *(title for title in IMAGE_RENDERERS if title not in by_others.NOT_ASKED),
     ],
     "suite": [*(call.title for system in SYSTEMS.values() for call in system.calls), *IMAGE_RENDERERS],
 }
