@@ -40,7 +40,7 @@ ROOMS = {
     "robustness": ("code_mutants",),
     "suite": (
         *("matrix", "per_ray", "small_mistakes", "rendered_images", "spectral_lines"),
-        *("lenses", "glasses", "exports", "standard_numbers"),
+        *("lenses", "glasses", "exports", "standard_numbers", "caustic_energies"),
     ),
 }
 # What the profile `quick` runs where no study is named.

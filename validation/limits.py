@@ -146,6 +146,7 @@ PILOT_SHARE = limit(0.05, "of the render, but for compilation, and for renders t
 CAUSTIC_ENERGY = limit(
     5e-3, "relative: a lost internal reflection at the back of a ball is 1e-3, a lost η² more than 1"
 )
+CAUSTIC_LEVEL = limit(0.05, "relative: the level, by photons that are counted in neighbourhoods, below facets")
 CAUSTIC_NOISE = limit(1.25e-3, "relative standard error of an energy: a quarter of what it may be off")
 CAUSTIC_DETECTABLE = limit(0.01, "of the mean over the caustic: with more noise a caustic could be wrong and pass")
 NOISE = limit(

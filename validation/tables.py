@@ -26,7 +26,7 @@ from mi_refract.report.embedded_images import png
 from mi_refract.report.row import Row
 from validation.diff import visible_changes
 from validation.directions import per_formula
-from validation.efficiency import changing_indices, chosen_settings, error_against_time
+from validation.efficiency import caustics, changing_indices, chosen_settings, error_against_time
 from validation.ground_truth import standard_numbers
 from validation.planar import against_retrace
 from validation.planar import times as planar_times
@@ -36,13 +36,13 @@ from validation.run import headline
 from validation.run import metrics as m
 from validation.run.array_settings import PLAIN
 from validation.run.context import SCENES, Context
-from validation.run.render_methods import BUILTIN, METHODS
+from validation.run.render_methods import BUILTIN, FROM_LAMPS
 from validation.stability import layered_paths
-from validation.suite import matrix
+from validation.suite import caustic_energies, matrix
 from validation.suite import standard_numbers as numbers_by_others
 
 ROOT = SCENES.parent
-GALLERY = SCENES / "gallery.png"
+GALLERY, CAUSTICS = SCENES / "gallery.png", SCENES / "caustics.png"
 PAGES = ".github/docs/explanation"
 NUMBERS_PAGE = ".github/docs/reference/standard-numbers.md"
 
@@ -75,7 +75,7 @@ def chosen(studies: list[str]) -> dict[str, Table]:
 
 
 def write(rows: list[Row], context: Context, studies: list[str]) -> None:
-    """Write the tables of the studies that were run, and the gallery where scenes were rendered.
+    """Write the tables of the studies that were run, and the galleries where their scenes were rendered.
 
     ValueError where a marker is missing, or the run has not measured what a table holds.
     """
@@ -84,6 +84,8 @@ def write(rows: list[Row], context: Context, studies: list[str]) -> None:
             update_between(ROOT / table.path, marker, text)
     if any(row.study == against_dielectric.NAME and row.images for row in rows):
         write_atomically(GALLERY, gallery(rows, context))
+    if any(row.study == caustics.NAME and row.images for row in rows):
+        write_atomically(CAUSTICS, caustic_pairs(rows, context))
 
 
 def _measured(rows: list[Row], study: str, needs: Iterable[str] = (), subject: str = "") -> list[Row]:
@@ -245,7 +247,7 @@ def efficiency(rows: list[Row]) -> str:
     scenes: dict[str, dict[str, Row]] = {}
     for row in mine:
         scenes.setdefault(row.case, {})[row.subject] = row
-    methods = [method.name for method in METHODS if method != BUILTIN]
+    methods = [method.name for method in error_against_time.MEASURED if method != BUILTIN]
     cells = [
         [
             scene,
@@ -279,6 +281,73 @@ def settings(rows: list[Row]) -> str:
     text = _replay(mine, "MSE × time, pilot included, {resolution}² pixels, {spp} spp, {rounds} rounds, {setting}.")
     heading = ["scene", "chosen", "over the best by hand", "over Mitsuba's defaults", "pilot over render"]
     return _table(text, heading, cells, "chosen settings were measured")
+
+
+def caustics_from_lamps(rows: list[Row]) -> str:
+    """Error × time and missing light by body and lamp; whose paths the noise is that is left; energies."""
+    study, missing = caustics, "caustics were rendered"
+    path, ours, by_class = BUILTIN.name, FROM_LAMPS.name, caustics.BY_CLASS.name
+    found: dict[str, dict[str, Row]] = {}
+    for row in _measured(rows, study.NAME):
+        found.setdefault(row.case, {})[row.subject] = row
+    energies = {case: by_name for case, by_name in found.items() if case.startswith(study.ENERGY_OF)}
+    images = {case: by_name for case, by_name in found.items() if path in by_name}
+    columns = m.EQUAL_TIME, m.EQUAL_TIME_CAUSTIC
+    cells = [
+        [
+            case,
+            *_cells(by_name.get(ours), (*columns, m.TIME_OVER_BUILTIN)),
+            *_cells(by_name.get(by_class), columns, intervals=False),
+            # Of a lamp of some size it is the noise of `path`.
+            "–" if m.EQUAL_TIME in by_name[path].values else _percent(by_name[path], study.MISSING, 1),
+            _percent(by_name.get(ours), study.MISSING, 1),
+        ]
+        for case, by_name in images.items()
+    ]
+    heading = ["body, lamp", "MSE × time", "of the caustic alone", "time", f"`{by_class}`: MSE × time"]
+    heading += ["of the caustic alone", "light missing, `path`", "lamps traced"]
+    text = _replay([by_name[path] for by_name in images.values()], "{resolution}² pixels, {spp} spp, {rounds} rounds, ")
+    text += "over `path` + `dielectric`; `light_paths` at its default."
+    parts = [_table(text, heading, cells, missing)]
+    classes = study.SEEN, study.MIRRORED, study.LIT, study.CAST
+    noise = [
+        [case, *(_percent(by_name[study.BY_PART], name, 1) for name in classes)]
+        for case, by_name in images.items()
+        if study.BY_PART in by_name
+    ]
+    names = [f"`{name}`".replace("|", "\\|") for name in classes]
+    parts.append(_table("Shares of the noise that is left, by class of paths:", ["", *names], noise, missing))
+    off = [
+        [case.removeprefix(study.ENERGY_OF), *(_off(by_name.get(x)) for x in (ours, by_class))]
+        for case, by_name in energies.items()
+    ]
+    text = "Energy of the caustic below a body on the axis of a lamp: how far it is off, and its standard error.\n"
+    text += f"`{by_class}` does not aim: below a point lamp it is not measured."
+    parts.append(_table(text, ["", "lamps traced", f"`{by_class}`"], off, missing))
+    return "\n\n".join(parts)
+
+
+def caustics_by_others(rows: list[Row]) -> str:
+    """By renderer how far the energy of a caustic is off."""
+    study = caustic_energies
+    mine = [row for row in rows if row.study == study.NAME]
+    cases = [*dict.fromkeys(row.case for row in mine if row.values)]
+    cells: dict[str, dict[str, str]] = {}
+    for row in mine:
+        off = f"{row.replay['power'] / row.replay['exact power'] - 1:+.1%}" if study.OFF in row.values else "not run"
+        cells.setdefault(row.subject, {})[row.case] = off + (" ✗" if row.broken else "")
+    lines = [[name, *(by_case.get(case, "–") for case in cases)] for name, by_case in cells.items()] if cases else []
+    return _table("Power on the disk, over the exact one:", ["", *cases], lines, "caustics were rendered by others")
+
+
+def _off(row: Row | None) -> str:
+    """How far an energy is off, and its standard error."""
+    return " ± ".join(_percent(row, x, 3) for x in (caustics.OFF, caustics.NOISE)) if row else "–"
+
+
+def _percent(row: Row | None, metric: str, digits: int) -> str:
+    """A value of a row in per cent; – where there is none."""
+    return f"{row.values[metric]:.{digits}%}" if row and metric in row.values else "–"
 
 
 def planar(rows: list[Row]) -> str:
@@ -412,6 +481,8 @@ TABLES = {
     "efficiency": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency", efficiency),
     "changing": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency", changing),
     "settings": Table(".github/docs/how-to/render-for-hours.md", "efficiency", settings),
+    "caustics": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency", caustics_from_lamps),
+    "caustics by others": Table(f"{PAGES}/what-each-formula-costs.md", "suite", caustics_by_others),
     "planar": Table(f"{PAGES}/how-accurate-planar-paths-are.md", "planar", planar),
     "defects": Table(f"{PAGES}/what-image-methods-detect.md", "diff", seen),
     "visible": Table(f"{PAGES}/how-tolerance-and-flip-decide.md", "diff", visible),
@@ -433,10 +504,30 @@ def gallery(rows: list[Row], context: Context) -> bytes:
     drawn = [row for row in rows if row.subject == PLUGIN and row.images]
     paths = [r.images["test"] for study in (against_dielectric, colours) for r in drawn if r.study == study.NAME]
     tiles = [tile for path in paths if (tile := image_file.read_exr(context.out / path)[0]).std() > 1e-3]
-    side, gap, columns = tiles[0].shape[0], 4, 8
+    return _sheet(tiles, 8)
+
+
+def caustic_pairs(rows: list[Row], context: Context) -> bytes:
+    """A PNG of every body and lamp: by `path` above, and below it with lamps traced. All have the same irradiance."""
+    by_method = [
+        {
+            row.case: row.images["test"]
+            for row in rows
+            if row.images and (row.study, row.subject) == (caustics.NAME, name)
+        }
+        for name in (BUILTIN.name, FROM_LAMPS.name)
+    ]
+    above, below = ([image_file.read_exr(context.out / found[case])[0] for case in by_method[0]] for found in by_method)
+    pairs = [np.concatenate(pair) for pair in zip(above, below, strict=True)]
+    return _sheet([pair.repeat(2, 0).repeat(2, 1) for pair in pairs], 6)
+
+
+def _sheet(tiles: list[np.ndarray], columns: int) -> bytes:
+    """A PNG of images of one size, side by side."""
+    (height, width), gap = tiles[0].shape[:2], 4
     lines = -(-len(tiles) // columns)
-    sheet = np.ones((lines * (side + gap) - gap, columns * (side + gap) - gap, 3), np.float32)
+    sheet = np.ones((lines * (height + gap) - gap, columns * (width + gap) - gap, 3), np.float32)
     for i, tile in enumerate(tiles):
-        y, x = (place * (side + gap) for place in divmod(i, columns))
-        sheet[y : y + side, x : x + side] = srgb_encode(tile.clip(0, 1))
+        y, x = i // columns * (height + gap), i % columns * (width + gap)
+        sheet[y : y + height, x : x + width] = srgb_encode(tile.clip(0, 1))
     return png(np.rint(255 * sheet).astype(np.uint8))

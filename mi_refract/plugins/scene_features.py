@@ -109,9 +109,12 @@ class SceneFeatures:
         may leave no such path. L S* E is not listed: a lamp of zero size is not visible itself.
         Source: Heckbert 1990, "Adaptive radiosity textures for bidirectional ray tracing".
 
-        `caustics`: "path" where all paths begin at the camera, "lamp" where those of L S+ (D|S)* D E begin at the lamp.
+        `caustics`: "path" where all paths begin at the camera, "lamp" where those of L S+ (D|S)* D E begin at the lamp;
+        else ValueError.
         `max_depth`: as of `path`. `volumes`: shadow rays go through null lobes and media scatter, as in `volpath`.
         """
+        if caustics not in ("path", "lamp"):
+            raise ValueError(f"missing: caustics = {caustics!r}; expected path or lamp")
         null, most = self.null and not volumes, math.inf if max_depth < 0 else max_depth
         lobes = ", ".join([*["glass", "mirrors"] * self.delta, *["null"] * null])
         shadowed, beam = (", ".join(x for x in self.zero_size if (x == BEAM) == only) for only in (False, True))

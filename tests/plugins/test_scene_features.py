@@ -289,6 +289,21 @@ def test_what_is_missing_where_caustics_are_traced_from_the_lamp(lamp, bsdf, max
     assert {*inspect(under_a_pane(lamp, bsdf)).missing("lamp", max_depth)} == missing
 
 
+def test_what_is_missing_of_another_way_is_an_error(scalar_variant):
+    with pytest.raises(ValueError, match=r"^missing: caustics = 'auto'; expected path or lamp$"):
+        needs().missing("auto")
+
+
+def test_refract_path_warns_again_where_lamps_are_traced_no_more(logged, scalar_variant):
+    scene = under_a_pane(POINT, GLASS)
+    method = mi.load_dict({"type": "refract_path", "caustics": "auto"})
+    cameras = [mi.load_dict(x) for x in (camera(4), camera(4, sample_border=True), camera(4))]
+    for sensor in cameras:
+        method.render(scene, sensor, spp=1)
+    classes = [text.partition(": light")[0] for text in logged if "missing" in text]
+    assert classes == [f"refract_path: missing L S+ D (S|D)* {end}" for end in ("S E", "E", "S E")]
+
+
 def test_refract_path_warns_once_a_scene_of_what_is_missing(logged, scalar_variant):
     for bsdf in (GLASS, GLASS, None):
         scene = under_a_pane(POINT, bsdf, "refract_path")

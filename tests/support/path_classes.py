@@ -13,6 +13,9 @@ FROM_LAMPS = tuple(word for word in CLASSES if word[0] == "S" and word[-1] == "D
 UNSEEN = tuple(word for word in CLASSES if word[0] == "S" == word[-1])  # of lamps of zero size
 MIRROR = {"type": "conductor"}
 WHITE = {"type": "diffuse", "reflectance": 0.8}
+# Two letters that are in no class: a surface that is half S and half D, and a D with a normal of its own.
+HALVES = {"type": "blendbsdf", "weight": 0.5, "delta": MIRROR, "rest": WHITE}
+TILTED = {"type": "normalmap", "normalmap": {"type": "rgb", "value": [0.8, 0.5, 0.9]}, "bsdf": WHITE}
 HALF, BEYOND = (
     (0.45, 1.2),
     0.05,
@@ -27,7 +30,7 @@ def max_depth(word):
 
 def scene(word, lamp="area", size=8, delta=MIRROR, black=None):
     """Loaded; `delta`: the BSDF of S. `black`: the number of a vertex, from 0, that is black."""
-    bsdfs = {"S": delta, "D": WHITE}
+    bsdfs = {"S": delta, "D": WHITE, "H": HALVES, "T": TILTED}
     parts = {"sensor": camera(len(word) + 1, size), "lamp": light(lamp)}
     for i, letter in enumerate(word):
         bsdf = BLACK if i == black else bsdfs[letter]

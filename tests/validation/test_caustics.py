@@ -9,13 +9,17 @@ import numpy as np
 import pytest
 
 from mi_refract import backend, planar
+from mi_refract.io import image_file
+from mi_refract.rendering import scene_files
+from mi_refract.scene_export import targets
 from validation.efficiency import caustic_scenes, caustics
-from validation.efficiency.caustic_scenes import LENS_APERTURE, LENS_HEIGHT, LENS_RADIUS, ON_AXIS, POINT, SPOT
-from validation.efficiency.caustics import BY_CLASS, FROM_LAMPS, Extent
+from validation.efficiency.caustics import BY_CLASS, Extent
 from validation.reference import caustic_energy
+from validation.reference.caustic_energy import LENS_APERTURE, LENS_HEIGHT, LENS_RADIUS, ON_AXIS, PARALLEL, POINT, SPOT
 from validation.run.context import PROFILES, Context
 from validation.run.metrics import DETECTABLE, WELCH_ALARMS
-from validation.run.render_methods import BUILTIN
+from validation.run.render_methods import BUILTIN, FROM_LAMPS, Camera
+from validation.suite import caustic_energies
 
 SMALL = Extent(24, 16, 64, 16, (caustics.SQUARE,), renders=4)
 
@@ -34,7 +38,7 @@ def test_parts_of_a_ray_are_those_of_the_planar_tracer(key):
     """Where light that has met 1 to 5 boundaries meets the floor, and its share of both waves."""
     setup, _ = ON_AXIS[key]
     curves = {
-        "ball": planar.shapes.circle(1.0).mapped(np.eye(2), (0, caustic_scenes.BALL_HEIGHT)),
+        "ball": planar.shapes.circle(1.0).mapped(np.eye(2), (0, caustic_energy.BALL_HEIGHT)),
         "lens": planar.shapes.polygon(
             [[-LENS_APERTURE, LENS_HEIGHT], [LENS_APERTURE, LENS_HEIGHT]],
             [0, 2 * math.degrees(math.asin(LENS_APERTURE / LENS_RADIUS))],
@@ -88,6 +92,38 @@ def test_lamps_have_the_same_irradiance_below_the_body(scalar_variant):
         samples = [scene.emitters()[0].sample_direction(place, [x, y]) for x in points for y in points]
         irradiance = np.mean([weight[0] * np.dot(ds.d, caustic_scenes.TOWARDS) for ds, weight in samples])
         assert irradiance == pytest.approx(1, rel=0.25 if lamp == "square 0.7" else 0.02)
+
+
+def test_above_a_black_floor_noise_is_of_the_lamp_that_is_seen_in_glass(context, monkeypatch):
+    monkeypatch.setattr(caustic_scenes, "FLOOR", caustics.NEARLY_BLACK)
+    monkeypatch.setattr(caustics, "NOISE_RENDERS", 1)
+    monkeypatch.setitem(caustics.EXTENTS, "standard", dataclasses.replace(SMALL, spp=256))
+    scene = caustic_scenes.scene("ball", POINT, "dielectric", SMALL.resolution)
+    pixels = Camera(scene, caustics.seen_in_glass())(64, 0)[0].max(-1) == 0
+    noise = caustics.noise_row(context, "ball", caustics.SQUARE, pixels).values
+    assert sum(noise.values()) == pytest.approx(1) and noise[caustics.MIRRORED] > 0.9
+
+
+LAMPS = {
+    POINT: '<emitter type="point"><point name="position" value="0, 4.5, 0"/></emitter>',
+    PARALLEL: '<emitter type="directional"><vector name="direction" value="0, -1, 0"/></emitter>',
+}
+
+
+@pytest.mark.parametrize(("body", "factor"), [("ball", 1), ("lens", 1.1)])
+def test_the_power_below_facets_is_right_where_we_are_the_other_renderer(context, monkeypatch, body, factor):
+    def draw(plain, lamp, folder):
+        targets.write(plain, "mitsuba", folder / "scene")
+        path = folder / "scene" / "scene.xml"
+        path.write_text(path.read_text().replace("</scene>", f"{LAMPS[lamp]}</scene>"))
+        method = mi.load_dict(FROM_LAMPS.plugin(plain.max_depth))
+        image, _ = Camera(scene_files.load_scene(path), method)(64, seed=0)
+        return [image_file.named("image", np.float32(image * (factor if len(plain.meshes) > 1 else 1)))]
+
+    monkeypatch.setitem(caustic_energies.RENDERERS, "ours", caustic_energies.Renderer("mitsuba", draw))
+    (row,) = caustic_energies.rows(context, "ours", body)
+    assert row.verdict == ("pass" if factor == 1 else "fail")
+    assert row.values[caustic_energies.OFF] == pytest.approx(factor - 1, abs=0.02)
 
 
 # Defects -------------------------------------------------------------------------------------------------------------

@@ -21,12 +21,14 @@ from mi_refract.report.row import Row
 from validation import __main__ as command
 from validation import runner, tables
 from validation.diff import planted_defects, visible_changes
+from validation.efficiency import caustic_scenes
 from validation.reference.standard_numbers import NUMBERS
 from validation.renders import gradients
 from validation.run import render_methods
 from validation.run.context import SCENES, beyond_builtin, here
 from validation.stability import layered_paths
 from validation.study import Study, Task
+from validation.suite import caustic_energies
 from validation.suite import standard_numbers as by_others
 from validation.suite.renderers import SYSTEMS
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
@@ -239,12 +241,14 @@ NAMED = {
     "renders": [path.stem for path in SCENES.glob("*.xml") if not beyond_builtin(path)],
     "paths": layered_paths.plugins(),
     "efficiency": [method.name for method in render_methods.METHODS],
+    "caustics": [*caustic_scenes.BODIES, *caustic_scenes.LAMPS],
     "changing": ["a new scene for each image", "an edit among 300 glasses", "a sweep of 12 indices"],
     "settings": ["balls", "slab", "ball, square 0.05"],
     "planar": [path.stem for path in SCENES.glob("planar/*.toml")],
     "defects": [*planted_defects.GLASSES, *self_test.DEFECTS, *METHODS],
     "derivatives": [*gradients.TABLE, *gradients.INTEGRATORS],
     "visible": [*visible_changes.KINDS, *map(str, visible_changes.SQUARES)],
+    "caustics by others": [*caustic_energies.RENDERERS],
     "standard numbers": [*NUMBERS],
     "standard numbers by others": [
         *(

@@ -118,6 +118,7 @@ OTHERWISE = {
     "planar.times": "times",
     "diff.planted_defects": "trials with seeds of their own",
     "diff.times": "times",
+    "suite.caustic_energies": "two seeds, where a renderer is random; a level is compared",
     "suite.exports": "several seeds a side",
     "suite.rendered_images": "several seeds a side",
     "suite.standard_numbers": "eight seeds an image; of glasses, which rays they are does not matter",

@@ -14,7 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.numerics import mitsuba_mesh
-from validation.reference.caustic_energy import Above, Ball, Setup
+from validation.reference import caustic_energy
+from validation.reference.caustic_energy import (
+    BALL_HEIGHT,
+    FIELD,
+    ON_AXIS,
+    PARALLEL,
+    POINT,
+    REFLECTANCE,
+    SPOT,
+    TOP,
+    VIEWPOINT,
+)
 from validation.run.context import SCENES
 from validation.run.render_methods import sensor
 
@@ -46,7 +57,6 @@ def spot() -> Nodes:
     return {"type": "spot", "to_world": place, "intensity": DISTANCE**2, "cutoff_angle": 25.0, "beam_width": 20.0}
 
 
-POINT, SPOT, PARALLEL = "point", "spot", "directional"
 ZERO_SIZE: dict[str, Callable[[], Nodes]] = {
     POINT: lambda: {"type": "point", "position": [*(DISTANCE * TOWARDS)], "intensity": DISTANCE**2},
     SPOT: spot,
@@ -100,17 +110,6 @@ def revolved(profile: Array, bsdf: Nodes, turns: int, normals: Array | None = No
     return grid_mesh(around(profile), bsdf, None if normals is None else around(normals))
 
 
-LENS_RADIUS, LENS_APERTURE = 1.0, 0.6
-
-
-def lens_mesh(bottom: float, bsdf: Nodes, rings: int, turns: int, scale: float = 1.0) -> Any:
-    """A plano-convex lens, flat below, of LENS_RADIUS and LENS_APERTURE times `scale`, in facets."""
-    angle = np.linspace(0, math.asin(LENS_APERTURE / LENS_RADIUS), rings + 1)
-    radius, centre = scale * LENS_RADIUS, bottom - scale * math.sqrt(LENS_RADIUS**2 - LENS_APERTURE**2)
-    cap = np.stack([radius * np.sin(angle), centre + radius * np.cos(angle)], 1)
-    return revolved(np.concatenate([cap, [[0, bottom]]]), bsdf, turns)
-
-
 # Bodies --------------------------------------------------------------------------------------------------------
 
 
@@ -134,7 +133,7 @@ def ball(bsdf: str) -> Nodes:
 
 def lens(bsdf: str) -> Nodes:
     """A plano-convex lens over the floor, whose focus is below it."""
-    return {"lens": lens_mesh(1.2, glass(bsdf), 24, 72, scale=1.8)}
+    return {"lens": revolved(caustic_energy.lens_profile(24, 1.2, scale=1.8), glass(bsdf), 72)}
 
 
 def water_glass(bsdf: str) -> Nodes:
@@ -195,37 +194,21 @@ BODIES: dict[str, Callable[[str], Nodes]] = {
     "pool": pool,
 }
 CAMERA, BELOW_WATER = [0.0, 5.0, 8.0], [0.0, 1.9, 4.5]
+FLOOR = 0.5  # its reflectance
 
 
-def scene(body: str, lamp: str, bsdf: str, resolution: int, sampler: str = "independent") -> Any:
-    """A body and a lamp of these names, loaded; its glass by the plugin `bsdf`."""
+def scene(body: str, lamp: str, bsdf: str, resolution: int, floor: float = FLOOR) -> Any:
+    """A body and a lamp of these names, loaded; its glass by the plugin `bsdf`; `floor`: its reflectance."""
     import mitsuba as mi
 
     view = sensor(resolution, *((70, BELOW_WATER) if body == "pool" else (24, CAMERA)), target=(0.0, 0.4, 0.0))
     flat = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(6)
-    floor = {"type": "rectangle", "to_world": flat, "bsdf": {"type": "diffuse", "reflectance": 0.5}}
-    view["sampler"] = {"type": sampler}
-    parts = {"sensor": view, "floor": floor, "lamp": lamp_of(lamp)} | BODIES[body](bsdf)
+    below = {"type": "rectangle", "to_world": flat, "bsdf": {"type": "diffuse", "reflectance": floor}}
+    parts = {"sensor": view, "floor": below, "lamp": lamp_of(lamp)} | BODIES[body](bsdf)
     return mi.load_dict({"type": "scene"} | parts, parallel=False, optimize=False)
 
 
 # A disk below a body, on the axis of a lamp --------------------------------------------------------------------
-
-FAR, ELEVATION, FIELD = 20.0, math.radians(30), 10.0
-REFLECTANCE = 0.02  # of the disk: light that comes back to it is 0.02 of what glass reflects of it
-TOP, BALL_HEIGHT, LENS_HEIGHT = 4.5, 2.5, 2.7
-_BALL = (Ball(BALL_HEIGHT, 1.0),)
-_LENS = (
-    Ball(LENS_HEIGHT - math.sqrt(LENS_RADIUS**2 - LENS_APERTURE**2), LENS_RADIUS),
-    Above(LENS_HEIGHT),
-)
-_WIDEST = {"ball": math.asin(1 / (TOP - BALL_HEIGHT)), "lens": math.atan(LENS_APERTURE / (TOP - LENS_HEIGHT))}
-ON_AXIS = {  # by body and lamp: the quadrature's setup, and the radius of a disk in the shadow, around the caustic
-    **{("ball", lamp): (Setup(_BALL, TOP, _WIDEST["ball"]), 1.5) for lamp in (POINT, SPOT)},
-    ("ball", PARALLEL): (Setup(_BALL, None, 1.0), 0.9),
-    **{("lens", lamp): (Setup(_LENS, TOP, _WIDEST["lens"]), 1.2) for lamp in (POINT, SPOT)},
-    ("lens", PARALLEL): (Setup(_LENS, None, LENS_APERTURE), 0.5),
-}
 
 
 def disk_scene(body: str, lamp: str, bsdf: str, resolution: int) -> tuple[Any, Array]:
@@ -233,10 +216,9 @@ def disk_scene(body: str, lamp: str, bsdf: str, resolution: int) -> tuple[Any, A
     import mitsuba as mi
 
     setup, radius = ON_AXIS[body, lamp]
-    origin = FAR * np.array([0, math.sin(ELEVATION), math.cos(ELEVATION)])
     solid: Any = {"type": "sphere", "center": [0, BALL_HEIGHT, 0], "bsdf": glass(bsdf)}
     if body == "lens":
-        solid = lens_mesh(LENS_HEIGHT, glass(bsdf), 128, 384)
+        solid = revolved(caustic_energy.lens_profile(128), glass(bsdf), 384)
     beam = math.degrees(setup.widest) + 1
     down = mi.ScalarTransform4f().look_at([0, TOP, 0], [0, 0, 0], [1, 0, 0])
     lamps = {
@@ -246,12 +228,6 @@ def disk_scene(body: str, lamp: str, bsdf: str, resolution: int) -> tuple[Any, A
     }
     flat = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(radius)
     disk = {"type": "disk", "to_world": flat, "bsdf": {"type": "diffuse", "reflectance": REFLECTANCE}}
-    view = sensor(resolution, FIELD, [*origin])
+    view = sensor(resolution, FIELD, [*VIEWPOINT])
     parts = {"sensor": view, "disk": disk, "body": solid, "lamp": lamps[lamp]}
-    # A pixel is a square of side a at distance 1; rays through it, d = x + y + forward, meet the floor at t d, in an
-    # area of a² t²/|d_y|.
-    half = math.tan(math.radians(FIELD / 2))
-    y = half * (1 - (np.arange(resolution) + 0.5) / resolution * 2)
-    d_y = y[:, None] * math.cos(ELEVATION) - math.sin(ELEVATION)
-    area = np.square(2 * half / resolution * origin[1] / d_y) / np.abs(d_y)
-    return mi.load_dict({"type": "scene"} | parts), np.pi / REFLECTANCE * area
+    return mi.load_dict({"type": "scene"} | parts), caustic_energy.power_by_radiance(resolution)

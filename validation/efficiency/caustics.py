@@ -9,7 +9,9 @@ methods have the sampler `independent`, and as many samples. MSE × time is comp
 the whole image and where the caustic is seen: in pixels that see no glass, and have more than a quarter of their light
 by it. Where `path` has met no lamp its error is too small, so these ratios are upper bounds. What small lamps light
 through glass and is seen through glass again stays noise in all methods, and is not compared; the reference has that
-noise, too, so the MSE of a whole image with a very small lamp says little.
+noise, too, so the MSE of a whole image with a very small lamp says little. *Noise by class*: whose paths make the noise
+that is left with small lamps. Of what is seen in glass L S+ E is what a floor leaves that is nearly black, L D (S|D)* S
+E has the noise of a point lamp, and L S+ D (S|D)* S E has the rest.
 """
 
 from __future__ import annotations
@@ -39,30 +41,36 @@ from validation.run.metrics import (
     TIME_OVER_BUILTIN,
     WELCH_ALARMS,
 )
-from validation.run.render_methods import BUILTIN, DIELECTRIC, OURS, Camera, Method, save_image
+from validation.run.render_methods import BUILTIN, DIELECTRIC, FROM_LAMPS, OURS, Camera, Method, save_image
 from validation.study import Study, Task, about
 
 from . import caustic_scenes as scenes
 from .error_against_time import SCALAR, Measured, errors, measure
 
 NAME = "caustics"
+SEEN, LIT, MIRRORED, CAST = "(S|D)* D E", "L D (S|D)* S E", "L S+ E", "L S+ D (S|D)* S E"  # classes of paths
+BY_PART = "noise by class"
+ENERGY_OF, OFF, NOISE, MISSING = "energy: ", "energy off", "standard error", "light missing"
 TERMS = {
     EQUAL_TIME: "MSE × time over that of path + dielectric with the same sampler and as many samples; low, high: its "
     "95 % interval over the rounds",
     EQUAL_TIME_CAUSTIC: "the same of the pixels where the caustic is seen",
     TIME_OVER_BUILTIN: "at equal samples per pixel; low, high: its 95 % interval",
     "MSE": "mean over pixels and channels of the squared error",
-    "light missing": "of the pixels where the caustic is seen: 1 − the mean of the images over that of the reference",
+    MISSING: "of the pixels where the caustic is seen: 1 − the mean of the images over that of the reference",
     WELCH_ALARMS: "tiles and channels, and the caustic and all else, whose mean differs from the reference's; at most "
     "one row in 500 by chance; of small lamps in pixels that see no glass",
     DETECTABLE: "of the mean over the caustic, or over all else, where it is larger",
-    "energy off": "|power on the disk over the exact one − 1|",
-    "standard error": "of the power over the exact one",
+    OFF: "|power on the disk over the exact one − 1|",
+    NOISE: "of the power over the exact one",
     "quadrature": "bound of the error of the exact power, relative",
+    SEEN: "share in the noise (variance, all pixels and channels): of what is seen outside glass",
+    LIT: "of surfaces that the lamp lights straight, seen in glass",
+    MIRRORED: "of the lamp itself, seen in glass: found by paths that meet it",
+    CAST: "of caustics seen in glass: neither end can be connected",
 }
 # What is rendered: integrator settings, and the BSDF of glass. `ptracer` stands for the sum of two integrators.
 BY_CLASS = Method("path + ptracer", "ptracer", DIELECTRIC)
-FROM_LAMPS = Method(f"{OURS}, caustics from lamps", OURS, PLUGIN, {"caustics": "lamp"})
 METHODS = (BUILTIN, Method(OURS, OURS, PLUGIN), FROM_LAMPS, BY_CLASS)
 HOLDING = FROM_LAMPS, BY_CLASS  # the caustics of lamps of any size
 # Of a disk: the image is a caustic and nothing else.
@@ -71,6 +79,7 @@ DEPTH, TILE, SHARE = 12, 8, 0.25
 FIRST_REFERENCE = 1000  # seed: no method has seen any from here on
 NOT_AIMED = 8
 MORE = {"diamond": 4, "ring": 8}  # times the samples that are tested: the caustic is dim, or on few pixels
+NOISE_RENDERS, NEARLY_BLACK = 4, 1e-6  # of the noise by class: times the rounds; the reflectance of a floor
 BOUNDARIES = 6  # that light which counts for the energy of a caustic may meet
 
 
@@ -118,7 +127,7 @@ def tasks(context: Context) -> list[Task]:
     extent = EXTENTS[context.profile.name]
     found = [
         Task(f"{NAME}: energy, {body}, {lamp}", functools.partial(energy_rows, context, body, lamp))
-        for body, lamp in scenes.ON_AXIS
+        for body, lamp in caustic_energy.ON_AXIS
     ]
     for body, lamp in extent.cases():
         run = functools.partial(image_rows, context, body, lamp)
@@ -178,24 +187,24 @@ def camera_of(scene: Any, method: Method, max_depth: int = DEPTH) -> Camera | Su
 def energy_rows(context: Context, body: str, lamp: str, methods: tuple[Method, ...] = ENERGY) -> list[Row]:
     """Of each method: the power on the disk against the quadrature."""
     extent, rows = EXTENTS[context.profile.name], []
-    setup, radius = scenes.ON_AXIS[body, lamp]
+    setup, radius = caustic_energy.ON_AXIS[body, lamp]
     exact, step = caustic_energy.flux(setup, radius, BOUNDARIES)
     for method in methods:
-        row = functools.partial(Row, NAME, method.name, f"energy: {body}, {lamp}", context.variant)
-        if method == BY_CLASS and lamp == scenes.POINT:
+        row = functools.partial(Row, NAME, method.name, f"{ENERGY_OF}{body}, {lamp}", context.variant)
+        if method == BY_CLASS and lamp == caustic_energy.POINT:
             rows.append(row(reason="ptracer does not aim: measured with a spot, which has the same light"))
             continue
-        spp = extent.energy_spp * (NOT_AIMED if method == BY_CLASS and lamp == scenes.PARALLEL else 1)
+        spp = extent.energy_spp * (NOT_AIMED if method == BY_CLASS and lamp == caustic_energy.PARALLEL else 1)
         scene, weights = scenes.disk_scene(body, lamp, method.bsdf, extent.resolution)
         look = camera_of(scene, method, BOUNDARIES + 2)
         shots = [look(spp, seed)[0] for seed in range(extent.renders)]
         ratios = [float((image.mean(-1) * weights).sum() / exact) for image in shots]
         values = {
-            "energy off": abs(statistics.fmean(ratios) - 1),
-            "standard error": statistics.stdev(ratios) / math.sqrt(len(ratios)),
+            OFF: abs(statistics.fmean(ratios) - 1),
+            NOISE: statistics.stdev(ratios) / math.sqrt(len(ratios)),
             "quadrature": step / exact,
         }
-        budgets = {"energy off": limits.CAUSTIC_ENERGY, "standard error": limits.CAUSTIC_NOISE}
+        budgets = {OFF: limits.CAUSTIC_ENERGY, NOISE: limits.CAUSTIC_NOISE}
         replay = {"method": method.plugin(BOUNDARIES + 2), "body": body, "lamp": lamp, "radius": radius}
         replay |= {"exact power": exact, "resolution": extent.resolution, "spp": spp, "renders": extent.renders}
         rows.append(row(values, budgets, replay=replay))
@@ -227,7 +236,7 @@ def reference(body: str, lamp: str, extent: Extent) -> Reference:
 
 
 def image_rows(context: Context, body: str, lamp: str, methods: tuple[Method, ...] = METHODS) -> list[Row]:
-    """A row per method, of which the first is the built-in."""
+    """A row per method, of which the first is the built-in; of a small lamp one more, of the noise by class."""
     extent = EXTENTS[context.profile.name]
     truth = reference(body, lamp, extent)
     loaded = {m.bsdf: scenes.scene(body, lamp, m.bsdf, extent.resolution) for m in methods}
@@ -250,7 +259,7 @@ def image_rows(context: Context, body: str, lamp: str, methods: tuple[Method, ..
             values |= _tested(truth.renders * compared, images * compared, truth.caustic)
             budgets = {WELCH_ALARMS: 0.0} | ({} if method == BY_CLASS else {DETECTABLE: limits.CAUSTIC_DETECTABLE})
         dark, light = (x[:, truth.caustic].mean() for x in (images, truth.renders))
-        values["light missing"] = float(1 - dark / light)
+        values[MISSING] = float(1 - dark / light)
         goals = limits.CAUSTICS if holds and small and method != BY_CLASS else {}
         replay: dict[str, Any] = {"method": method.plugin(DEPTH), "body": body, "lamp": lamp}
         replay |= {"resolution": extent.resolution, "spp": extent.spp, "rounds": extent.rounds}
@@ -259,7 +268,35 @@ def image_rows(context: Context, body: str, lamp: str, methods: tuple[Method, ..
         shown = {"reference": truth.renders.mean(0), "test": measured[method.name].images[0]}
         paths = {role: save_image(context.out, f"{case} {method.name} {role}", x, {}) for role, x in shown.items()}
         rows.append(Row(NAME, method.name, case, context.variant, values, budgets, goals, "", replay, paths))
+    if small and FROM_LAMPS in methods:
+        rows.append(noise_row(context, body, lamp, truth.without_glass))
     return rows
+
+
+def noise_row(context: Context, body: str, lamp: str, without_glass: np.ndarray) -> Row:
+    """Shares of classes of paths in the noise of FROM_LAMPS: their covariances with the image, over its variance."""
+    extent = EXTENTS[context.profile.name]
+    renders = NOISE_RENDERS * extent.rounds
+
+    def images(lamp: str, floor: float) -> np.ndarray:
+        look = camera_of(scenes.scene(body, lamp, FROM_LAMPS.bsdf, extent.resolution, floor), FROM_LAMPS)
+        return np.stack([look(extent.spp, seed)[0] for seed in range(renders)])
+
+    every = images(lamp, scenes.FLOOR)
+    apart = every - every.mean(0)
+    whole = np.square(apart).sum()
+
+    def share(part: np.ndarray, pixels: np.ndarray) -> float:
+        return float(((part - part.mean(0)) * apart)[:, pixels].sum() / whole)
+
+    # The same paths as in `every`: a floor that is black would need fewer random numbers.
+    values = {SEEN: share(every, without_glass), MIRRORED: share(images(lamp, NEARLY_BLACK), ~without_glass)}
+    values[LIT] = float(images(caustic_energy.POINT, scenes.FLOOR).var(0)[~without_glass].sum() * renders / whole)
+    values[CAST] = 1 - sum(values.values())
+    replay = {"method": FROM_LAMPS.plugin(DEPTH), "body": body, "lamp": lamp, "resolution": extent.resolution}
+    replay |= {"spp": extent.spp, "renders": renders}
+    reason = f"of {FROM_LAMPS.name}: most is of {max(values, key=lambda name: values[name])}"
+    return Row(NAME, BY_PART, f"{body}, {lamp}", context.variant, values, reason=reason, replay=replay)
 
 
 def _tested(references: np.ndarray, images: np.ndarray, caustic: np.ndarray) -> dict[str, float]:

@@ -32,7 +32,7 @@ from validation.run.metrics import (
     TIME_OVER_BUILTIN,
     WELCH_ALARMS,
 )
-from validation.run.render_methods import BUILTIN, METHODS, OURS, Camera, Method, camera
+from validation.run.render_methods import BUILTIN, FROM_LAMPS, METHODS, OURS, Camera, Method, camera
 from validation.study import Study, Task, about
 
 TERMS = {
@@ -50,6 +50,7 @@ INDEPENDENT, STRATIFIED = "independent", ("multijitter", "orthogonal")
 EPSILON, WORST = 0.01, 1e-3
 TILE = 16
 FIRST_REFERENCE = 1000  # seed: no method has seen any from here on
+MEASURED = (*METHODS, FROM_LAMPS)  # in scenes without lamps the last is `refract_path` as it is
 METRICS = ("MSE", "MSE, trimmed", "relMSE", "relMSE, trimmed")
 
 
@@ -116,7 +117,7 @@ def tasks(context: Context) -> list[Task]:
     ]
 
 
-def scene_rows(context: Context, path: Path, methods: tuple[Method, ...] = METHODS) -> list[Row]:
+def scene_rows(context: Context, path: Path, methods: tuple[Method, ...] = MEASURED) -> list[Row]:
     """A row per method and sampler, and one of the curves; a single one with the reason where nothing is measured."""
     extent = EXTENTS[context.profile.name]
     reason = ""

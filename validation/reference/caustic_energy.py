@@ -14,6 +14,7 @@ unpolarised light at every boundary, as renderers without polarisation have them
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -134,3 +135,48 @@ def _floor(p: Array, d: Array) -> Array:
     """Where rays meet z = 0; infinity where they go up."""
     down = d[:, 1] < 0
     return np.where(down, p[:, 0] - d[:, 0] * p[:, 1] / np.where(down, d[:, 1], -1), np.inf)
+
+
+# Disks below a ball and a lens ---------------------------------------------------------------------------------
+
+POINT, SPOT, PARALLEL = "point", "spot", "directional"
+LENS_RADIUS, LENS_APERTURE = 1.0, 0.6
+TOP, BALL_HEIGHT, LENS_HEIGHT = 4.5, 2.5, 2.7  # of lamps, of the ball's centre and the flat side of the lens
+_BALL = (Ball(BALL_HEIGHT, 1.0),)
+_LENS = (Ball(LENS_HEIGHT - math.sqrt(LENS_RADIUS**2 - LENS_APERTURE**2), LENS_RADIUS), Above(LENS_HEIGHT))
+_WIDEST = {"ball": math.asin(1 / (TOP - BALL_HEIGHT)), "lens": math.atan(LENS_APERTURE / (TOP - LENS_HEIGHT))}
+ON_AXIS = {  # by body and lamp: the quadrature's setup, and the radius of a disk in the shadow, around the caustic
+    **{("ball", lamp): (Setup(_BALL, TOP, _WIDEST["ball"]), 1.5) for lamp in (POINT, SPOT)},
+    ("ball", PARALLEL): (Setup(_BALL, None, 1.0), 0.9),
+    **{("lens", lamp): (Setup(_LENS, TOP, _WIDEST["lens"]), 1.2) for lamp in (POINT, SPOT)},
+    ("lens", PARALLEL): (Setup(_LENS, None, LENS_APERTURE), 0.5),
+}
+REFLECTANCE = 0.02  # of the disk: light that comes back to it is 0.02 of what glass reflects of it
+_ELEVATION, FIELD = math.radians(30), 10.0  # of a camera that looks at the middle of the disk, in radians and degrees
+VIEWPOINT = 20 * np.array([0, math.sin(_ELEVATION), math.cos(_ELEVATION)])  # y is up
+
+
+def ball_profile(rings: int) -> Array:
+    """The ball from its top to its bottom: distance from the axis, height (rings + 1 × 2)."""
+    angle = np.linspace(0, np.pi, rings + 1)
+    return np.stack([np.sin(angle), BALL_HEIGHT + np.cos(angle)], 1)
+
+
+def lens_profile(rings: int, bottom: float = LENS_HEIGHT, scale: float = 1.0) -> Array:
+    """The plano-convex lens, flat below at `bottom`, as `ball_profile`; its size is multiplied by `scale`."""
+    angle = np.linspace(0, math.asin(LENS_APERTURE / LENS_RADIUS), rings + 1)
+    centre = bottom - scale * math.sqrt(LENS_RADIUS**2 - LENS_APERTURE**2)
+    cap = np.stack([scale * LENS_RADIUS * np.sin(angle), centre + scale * LENS_RADIUS * np.cos(angle)], 1)
+    return np.concatenate([cap, [[0, bottom]]])
+
+
+def power_by_radiance(resolution: int) -> Array:
+    """By pixel of a square image from VIEWPOINT: power on the disk over radiance, in m² sr.
+
+    A pixel is a square of side a at distance 1; rays through it, d = x + y + forward, meet the floor at t d, in an area
+    of a² t²/|d_y|.
+    """
+    half = math.tan(math.radians(FIELD / 2))
+    y = half * (1 - (np.arange(resolution) + 0.5) / resolution * 2)
+    d_y = y[:, None] * math.cos(_ELEVATION) - math.sin(_ELEVATION)
+    return np.asarray(np.pi / REFLECTANCE * np.square(2 * half / resolution * VIEWPOINT[1] / d_y) / np.abs(d_y))

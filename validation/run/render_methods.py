@@ -42,6 +42,7 @@ METHODS = (
     Method(OURS, OURS, PLUGIN),
     *(Method(f"{OURS}, split {n}", OURS, PLUGIN, {"split_depth": n}) for n in (1, 2, 3)),
 )
+FROM_LAMPS = Method(f"{OURS}, caustics from lamps", OURS, PLUGIN, {"caustics": "lamp"})
 
 
 class Camera:

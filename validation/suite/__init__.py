@@ -4,6 +4,7 @@ In: rays and plain scenes, given to the programs of `renderers/`. Out: rows per 
 """
 
 __all__ = [
+    "caustic_energies",
     "exports",
     "glasses",
     "lenses",

@@ -45,6 +45,10 @@ class ImageRenderer:
     assumed: Sequence[str]
 
 
+def unedited(scene: Path) -> None:
+    """The files as they were exported."""
+
+
 def by_script(
     target: str,
     ending: str,
@@ -52,7 +56,7 @@ def by_script(
     folder: Path,
     spp: int,
     seeds: Sequence[int],
-    edit: Callable[[Path], None] = lambda folder: None,
+    edit: Callable[[Path], None] = unedited,
     more: Sequence[str] = (),
 ) -> list[Image]:
     """By the script that is exported with the scene, after `edit(folder)` of its files, with `more` options."""
@@ -74,23 +78,31 @@ def by_command(system: System, plain: PlainScene, folder: Path, spp: int, seeds:
     return [_rgb(image_file.read(folder / f"seed{seed}.exr")) for seed in seeds]
 
 
-def _radiance(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+def radiance_images(
+    plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int], edit: Callable[[Path], None] = unedited
+) -> list[Image]:
+    """By rtrace with the options of README.txt, after `edit(folder)` of the exported files."""
     targets.write(plain, "radiance", folder / "scene")
+    edit(folder / "scene")
     sizes = map(str, (plain.camera.width, plain.camera.height, spp, *seeds))
     words = str(folder / "scene"), str(folder), *sizes
     environments.run(environments.script(SYSTEMS["radiance"], "radiance_images.py", *words), timeout=HOURS)
     return [_raw(folder / f"seed{seed}.f32", plain) for seed in seeds]
 
 
-def _povray(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+def povray_images(
+    plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int], edit: Callable[[Path], None] = unedited
+) -> list[Image]:
     """The same image for every seed, for it has no noise: the means over grids of samples, √spp on a side of a pixel.
 
-    Random grids would not do: they move all pixels together, and a tile knows nothing of its noise then.
+    Random grids would not do: they move all pixels together, and a tile knows nothing of its noise then. The exported
+    files are edited by `edit(folder)`.
     """
     side, camera = math.isqrt(spp), plain.camera
     width, height = side * camera.width, side * camera.height
     finer = dataclasses.replace(plain, camera=dataclasses.replace(camera, width=width, height=height))
     targets.write(finer, "povray", folder / "scene")
+    edit(folder / "scene")
     lines = (folder / "scene" / "README.txt").read_text().splitlines()
     command = next(line.split() for line in lines if line.split()[:1] == ["povray"])
     environments.run(command, timeout=HOURS, where=folder / "scene")
@@ -194,13 +206,13 @@ IMAGE_RENDERERS: dict[str, ImageRenderer] = {
     "Mitsuba, volpath": _renderer("mitsuba", _volpath, MITSUBA, 1024, 768, 256, furnace=128, caustic=8192),
     "Mitsuba, prb": _renderer("mitsuba", _prb, MITSUBA, 1024, 768, 256, furnace=128, caustic=8192),
     "Mitsuba, ptracer": _renderer("mitsuba", _ptracer, PTRACER, caustic=32768, sphere=512),
-    "Radiance": _renderer("radiance", _radiance, radiance.ASSUMPTIONS, 960, 448, 24),
+    "Radiance": _renderer("radiance", radiance_images, radiance.ASSUMPTIONS, 960, 448, 24),
     "Cycles": _renderer("cycles", _cycles, scene_json.CYCLES_ASSUMPTIONS, 512, 128, 32),
     "Cycles, glTF": _renderer("cycles", _cycles_gltf, CYCLES_GLTF, 512, 128, 32),
     # furnace: a scene without lamps, which raysect meets by chance
     "raysect": _renderer("raysect", _raysect, scene_json.RAYSECT_ASSUMPTIONS, 2048, 768, 256, furnace=128),
     "LuxCore": _renderer("luxcore", _luxcore, luxcore.ASSUMPTIONS, 1280, 1024, 576),
-    "POV-Ray": _renderer("povray", _povray, POVRAY, 64, 64, 64),
+    "POV-Ray": _renderer("povray", povray_images, POVRAY, 64, 64, 64),
     "three-gpu-pathtracer": _renderer("three", functools.partial(_three, "mis"), THREE, prism=8, furnace=8),
     "three-gpu-pathtracer, no MIS": _renderer("three", functools.partial(_three, "none"), THREE, prism=8, furnace=8),
     "three, MeshPhysicalMaterial": _renderer("three", functools.partial(_three, "raster"), RASTER, prism=512),

@@ -1,7 +1,7 @@
 """Render `scene.rad` by Radiance's rtrace: `python radiance_images.py FOLDER OUT WIDTH HEIGHT SPP SEED…`
 
-Run by the Python that has pyradiance, with the options of the exported README.txt. The rays of every pixel are random
-within it; one `seedN.f32` per seed: rows from the top, three float32 a pixel.
+Run by the Python that has pyradiance, with the options of README.txt, after mkpmap where that is in it. The rays of
+every pixel are random within it; one `seedN.f32` per seed: rows from the top, three float32 a pixel.
 """
 
 import os
@@ -26,8 +26,10 @@ def main():
     os.environ["RAYPATH"] = f".:{home / 'lib'}"
     octree = Path(out, "scene.oct")
     octree.write_bytes(subprocess.run([home / "bin/oconv", "-w", "scene.rad"], check=True, stdout=-1).stdout)
-    exported = re.search(r"rtrace (.*?)scene\.oct", Path("README.txt").read_text(), re.DOTALL)[1]
-    rtrace = [home / "bin/rtrace", *exported.replace("\\", " ").split(), *RTRACE.split(), octree]
+    options = dict(re.findall(r"(rtrace|mkpmap) (.*?)scene\.oct", Path("README.txt").read_text(), re.DOTALL))
+    if "mkpmap" in options:  # a photon map that is older than the octree is an error
+        subprocess.run([home / "bin/mkpmap", *options["mkpmap"].split(), octree], check=True)
+    rtrace = [home / "bin/rtrace", *options["rtrace"].replace("\\", " ").split(), *RTRACE.split(), octree]
     view = Path("camera.vf").read_text()
     size = int(height), int(width)
     samples = [(seed, rng) for seed in seeds for rng in [np.random.default_rng(int(seed))] * int(spp)]
