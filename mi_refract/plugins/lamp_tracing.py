@@ -51,7 +51,7 @@ from mi_refract.numerics import (
 )
 
 from .absorption import HERE
-from .film import SQUARES_DIGITS, SQUARES_LOWEST, Splats, expected_weights, film_colours
+from .film import Splats, expected_weights, film_colours
 from .medium_tracking import THROUGH
 from .path_loop import PathLoop
 from .refract import DISPERSED, followed_context
@@ -572,13 +572,13 @@ def lamp_image(tracer: LampTracer, seed: int, paths: int, channels: tuple[str, .
     pixels = camera.width * camera.height
     colours = 3 if channels[0] in ("R", "X") else 1
     sums = Splats(v, camera.sensor, colours)
-    of_squares = Splats(v, camera.sensor, colours, SQUARES_DIGITS, SQUARES_LOWEST) if squares else None
+    of_squares = Splats(v, camera.sensor, colours, squares=True) if squares else None
 
     def splat(place: Point2, value: Spectrum, wavelengths: Number, active: Mask) -> None:
         values = [x / tracer.unit / pixels for x in film_colours(v, value, wavelengths, channels)]
         sums.add(place, values, active)
         if of_squares:
-            of_squares.add(place, [dr.square(x) for x in values], active)
+            of_squares.add(place, values, active)
 
     if tracer.vectorised:
         for number, start in enumerate(range(0, paths, LANES)):

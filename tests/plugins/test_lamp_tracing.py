@@ -12,6 +12,7 @@ from support.variants import switch
 
 import mi_refract  # noqa: F401
 from mi_refract.numerics import mitsuba_mesh
+from mi_refract.plugins.film import Splats
 
 FALSE_ALARM = 1e-4
 SIZE = 16
@@ -195,6 +196,18 @@ def test_a_point_lamp_of_weight_0_is_off(llvm_variant):
     off, on = point(sampling_weight=0.0), point(4.0)
     images = [tiles(scene(parts, caustics="lamp"), 4, [0]) for parts in ({"lamp": on, "more": off}, {"lamp": on})]
     np.testing.assert_allclose(*images, rtol=1e-5)
+
+
+@pytest.mark.parametrize("rfilter", ["box", "gaussian", "lanczos"])
+def test_of_one_splat_the_sum_of_squares_is_the_square_of_the_sum(rfilter, typical_variant):
+    sensor = mi.load_dict(camera(film={"rfilter": {"type": rfilter}}))
+    images = []
+    for squares in (False, True):
+        splats = Splats(getattr(mi, mi.variant()), sensor, 2, squares=squares)
+        splats.add(mi.Point2f(7.2, 9.9), [mi.Float(3.0), mi.Float(-0.5)], mi.Bool(True))
+        images.append(splats.image())
+    assert images[0].any()
+    np.testing.assert_allclose(images[1], images[0] ** 2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("factor", [2.0**-90, 2.0**90])
