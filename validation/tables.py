@@ -6,6 +6,7 @@ module is imported, not after the run.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
@@ -49,12 +50,13 @@ NUMBERS_PAGE = ".github/docs/reference/standard-numbers.md"
 class Table(NamedTuple):
     """Where a table is written, between its markers; `study` is what must be run for it, by its command-line name.
 
-    `make` gives the Markdown. ValueError, one line, where the rows do not hold what the table needs.
+    `make` gives the Markdown, or None where the table stays as it is, because it needs another machine. ValueError, one
+    line, where the rows do not hold what the table needs.
     """
 
     path: str
     study: str
-    make: Callable[[list[Row]], str]
+    make: Callable[[list[Row]], str | None]
 
 
 def check(studies: list[str]) -> None:
@@ -78,7 +80,8 @@ def write(rows: list[Row], context: Context, studies: list[str]) -> None:
     ValueError where a marker is missing, or the run has not measured what a table holds.
     """
     for marker, table in chosen(studies).items():
-        update_between(ROOT / table.path, marker, table.make(rows))
+        if text := table.make(rows):
+            update_between(ROOT / table.path, marker, text)
     if any(row.study == against_dielectric.NAME and row.images for row in rows):
         write_atomically(GALLERY, gallery(rows, context))
 
@@ -161,6 +164,23 @@ def accuracy(rows: list[Row]) -> str:
         lines.append(cells + _cells(double, wide))
     heading = ["formula", "source", *columns, "float64: worst chord", "in u", "time / copy"]
     return _table(text, heading, lines, "directions were measured on LLVM")
+
+
+def on_a_gpu(rows: list[Row]) -> str | None:
+    """By formula the worst error over the regimes with a budget and the time, in float32 and float64 on CUDA."""
+    columns = [m.WORST_IN_U, m.MISCLASSIFIED, "ns per ray", m.TIME_OVER_COPY]
+    found = {
+        (row.subject, row.setting): row
+        for row in _measured(rows, per_formula.NAME, ["ns per ray"])
+        if row.setting.startswith("cuda")
+    }
+    lines = []
+    for subject in dict.fromkeys(subject for subject, _ in found):
+        cells = (_cells(found.get((subject, f"cuda {x.__name__}")), columns, False) for x in PRECISIONS.values())
+        lines.append([f"`{subject}`", *itertools.chain(*cells)])
+    heading = ["formula", "float32: in u", "TIR misclassified", "ns per ray", "time / copy"]
+    heading += ["float64: in u", *heading[2:]]
+    return _table("Rays streamed through memory; medians.", heading, lines, "GPU") if lines else None
 
 
 def renders(rows: list[Row]) -> str:
@@ -375,6 +395,7 @@ def numbers_elsewhere(rows: list[Row]) -> str:
 
 TABLES = {
     "accuracy": Table("README.md", "directions", accuracy),
+    "on a GPU": Table(f"{PAGES}/what-each-formula-costs.md", "directions", on_a_gpu),
     "renders": Table(f"{PAGES}/refract-and-dielectric.md", "renders", renders),
     "derivatives": Table(f"{PAGES}/which-derivatives-are-correct.md", "renders", derivatives),
     "paths": Table(f"{PAGES}/refract-and-dielectric.md", "stability", paths),

@@ -8,10 +8,11 @@ answer may be from the exact one. Nothing here imports Mitsuba.
 from . import fresnel
 from .bounds import NEGLIGIBLE, ROUNDING, TEXTBOOK_BACKWARD, UNIT, Budget, cancelling, radicand_for
 from .documented import contract, reflect, reflect_sandwich, refract_2d, wedge
-from .table import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, Formula, automatic, resolve
+from .table import AUTOMATIC, FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, Formula, resolve
 from .well_conditioned import LocalCosines, Refracted, local_cosines
 
 __all__ = [
+    "AUTOMATIC",
     "FORMULAS",
     "LARGEST_RATIO",
     "NEGLIGIBLE",
@@ -23,7 +24,6 @@ __all__ = [
     "Formula",
     "LocalCosines",
     "Refracted",
-    "automatic",
     "cancelling",
     "contract",
     "fresnel",

@@ -129,15 +129,15 @@ def refract_2d(
     Source: document 004, with X = k R/√(1 + R²) in place of the printed k R/(1 + R²), and R = i_Bβ/i_Bα, infinite
     along the boundary, multiplied out. `i`, `l`: two components each, `l` unit; `b` keeps the length of `i`.
     """
-    along_n, along_l = l[0] * i[1] - l[1] * i[0], l[0] * i[0] + l[1] * i[1]
-    length = dr.sqrt(i[0] * i[0] + i[1] * i[1])
+    along_n, along_l = dr.fma(l[0], i[1], -(l[1] * i[0])), dr.fma(l[0], i[0], l[1] * i[1])
+    length = dr.sqrt(dr.fma(i[0], i[0], i[1] * i[1]))
     x = ieee_divide(k * dr.abs(along_l), length)
     scale = (l[0] * l[0] + l[1] * l[1]) * length * k
     valid = (scale > 0) & (scale < dr.inf)
     transmitted = valid & (x <= 1) & (along_n != 0)
-    b_n = dr.select(transmitted, dr.mulsign(dr.safe_sqrt(1 - x * x) * length, along_n), -along_n)
+    b_n = dr.select(transmitted, dr.mulsign(dr.safe_sqrt(dr.fma(-x, x, 1)) * length, along_n), -along_n)
     b_l = dr.select(transmitted, dr.mulsign(x * length, along_l), along_l)
-    b = [l[0] * b_l - l[1] * b_n, l[0] * b_n + l[1] * b_l]
+    b = [dr.fma(l[0], b_l, -(l[1] * b_n)), dr.fma(l[0], b_n, l[1] * b_l)]
     return [dr.select(valid, b_j, dr.nan) for b_j in b], transmitted
 
 

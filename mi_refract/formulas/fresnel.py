@@ -28,6 +28,7 @@ from mi_refract.numerics import (
     Number,
     Vector3,
     as_component,
+    computed_in_float64,
     differentiated,
     ieee_divide,
     replace_grad,
@@ -63,6 +64,7 @@ def _divide(x: Number, y: Number) -> Any:
 # Powers --------------------------------------------------------------------------------------------------------
 
 
+@computed_in_float64
 def powers(cos_i: Number, cos_t: Number, transmitted: Mask, k: Number, contrast: Number = None) -> tuple[Any, Any]:
     """(R, T) for unpolarised light, both between 0 and 1; (1, 0) where the ray is not transmitted.
 
@@ -101,6 +103,7 @@ def powers(cos_i: Number, cos_t: Number, transmitted: Mask, k: Number, contrast:
     return number(powers[0]), number(powers[1])
 
 
+@computed_in_float64
 def local_powers(a: Vector3, transmitted: Mask, k: Number, contrast: Number) -> tuple[Any, Any]:
     """(R, T) as `powers` gives them, of a float32 ray `a` (3,) that meets a boundary whose normal is the z axis.
 
@@ -139,6 +142,7 @@ def _with_slope(reflected: Number, through: Number, r: Number, t: Number, whole:
 # Cosines and amplitudes ----------------------------------------------------------------------------------------
 
 
+@computed_in_float64
 def refracted_cosine(cos_i: Number, k: Number, contrast: Number = None) -> tuple[Any, Any]:
     """(|cos θ_t|, transmitted): √|cos²θ_t|, cos²θ_t = k² cos²θ_i − κ, which is positive where the ray is transmitted.
 
@@ -149,6 +153,7 @@ def refracted_cosine(cos_i: Number, k: Number, contrast: Number = None) -> tuple
     return type(cos_i)(_root(radicand)), (radicand.hi >= 0) & (cos_i > 0)
 
 
+@computed_in_float64
 def amplitudes(cos_i: Number, k: Number, contrast: Number = None) -> tuple[Any, Any]:
     """Complex amplitudes (r_s, r_p) of the reflected wave, with the phase under total internal reflection.
 
@@ -192,6 +197,7 @@ def mueller_transmission(cos_i: Number, cos_t: Number, transmitted: Mask, k: Num
     return _mueller(t_s, t_p, (cross, 0))
 
 
+@computed_in_float64
 def transmitted_powers(cos_i: Number, cos_t: Number, transmitted: Mask, k: Number) -> tuple[Any, Any, Any]:
     """(T_s, T_p, √(T_s T_p)) of the transmitted waves; 0 where not transmitted. Arguments as for `powers`."""
     c, y, ratio, number = _wide(cos_i), _wide(cos_t), _wide(k), type(cos_i)
@@ -248,6 +254,6 @@ def _mueller(s2: Number, p2: Number, cross: tuple[Number, Number]) -> list[list[
 
 def _phase(x: Number, y: Number) -> tuple[Any, Any]:
     """(x + i y)² / |x + i y|², real and imaginary part; −1 for x = 0, y = 0 included."""
-    length = dr.sqrt(x * x + y * y)
+    length = dr.sqrt(dr.fma(x, x, y * y))
     x, y = dr.select(length > 0, ieee_divide(x, length), 0 * length), dr.select(length > 0, ieee_divide(y, length), 1)
     return (x - y) * (x + y), 2 * x * y

@@ -8,7 +8,7 @@ from typing import Any
 
 import drjit as dr
 
-from mi_refract.numerics import Number, Vector3, as_component, scale_to_unit
+from mi_refract.numerics import Number, Vector3, as_component, ieee_quotients, scale_to_unit
 
 from .bounds import CONTRASTING, ROUNDING, Budget, cancelling
 from .documented import refract_cross, refract_decomposed, refract_rotated, refract_wedge, refract_wedge_contrast
@@ -29,8 +29,7 @@ class Formula:
     """A formula of refraction, `entry(a, n, k) -> (b, transmitted)`, with its source and its error budget.
 
     `takes_contrast`, `takes_local`: these arguments are used, not ignored. `scales`: the function wants lengths near 1.
-    `automatic_for`: the kinds of array it is the default on. `time_goal`: what a ray in float32, streamed through a
-    CPU, may take as a multiple of the plain form's time.
+    `time_goal`: what a ray in float32, streamed through a CPU, may take as a multiple of the plain form's time.
     """
 
     function: Callable[..., Refracted]
@@ -40,7 +39,6 @@ class Formula:
     takes_contrast: bool = False
     takes_local: bool = False
     scales: bool = False
-    automatic_for: tuple[str, ...] = ()
     time_goal: float | None = None
 
     def __call__(self, a: Vector3, n: Vector3, k: Number, contrast: Number = None) -> Refracted:
@@ -52,7 +50,8 @@ class Formula:
         scale: Any = 1
         if self.scales:
             (a, scale), (n, _) = scale_to_unit(a), scale_to_unit(n)
-        b, transmitted = self.unchecked(a, n, k, contrast)
+        with ieee_quotients(a):
+            b, transmitted = self.unchecked(a, n, k, contrast)
         # `b` has the length of `a`, and a zero or non-finite `n` makes it NaN: one length tells of both.
         b, length2 = b * scale, dr.dot(b, b)
         valid = (k >= SMALLEST_RATIO) & (k <= LARGEST_RATIO) & (length2 > 0) & (length2 < dr.inf)
@@ -90,7 +89,6 @@ FORMULAS = {
         budget=ROUNDING,
         takes_contrast=True,
         scales=True,
-        automatic_for=("cuda",),
         time_goal=2.0,
     ),
     "promoted": Formula(
@@ -100,25 +98,19 @@ FORMULAS = {
         budget=ROUNDING,
         takes_contrast=True,
         takes_local=True,
-        automatic_for=("scalar", "llvm"),
         time_goal=1.1,
     ),
 }
 
 
-def automatic(backend: dr.JitBackend) -> str:
-    """The key of the cheapest formula at the rounding limit in a local frame, where the normal is a literal axis.
-
-    On CPUs float64 has half the throughput of float32, and the promoted form a third of the operations. A consumer's
-    GPU has a 64th.
-    """
-    kind = {dr.JitBackend.CUDA: "cuda", dr.JitBackend.LLVM: "llvm"}.get(backend, "scalar")
-    return next(key for key, formula in FORMULAS.items() if kind in formula.automatic_for)
+# The cheapest formula at the rounding limit in a local frame, where the normal is a literal axis: of what it computes
+# in float64 Fresnel's equations need all anyhow, so it is the cheapest on GPUs with slow float64, too.
+AUTOMATIC = "promoted"
 
 
-def resolve(name: str, backend: dr.JitBackend) -> tuple[str, Formula]:
+def resolve(name: str) -> tuple[str, Formula]:
     """The key and entry behind `name`, a key of FORMULAS or "auto". ValueError otherwise."""
-    key = automatic(backend) if name == "auto" else name
+    key = AUTOMATIC if name == "auto" else name
     if key not in FORMULAS:
         raise ValueError(f"formula = {name!r}: unknown; expected auto, {', '.join(FORMULAS)}")
     return key, FORMULAS[key]

@@ -38,10 +38,12 @@ from mi_refract.numerics import (
     TripleWord,
     Vector3,
     as_component,
+    computed_in_float64,
     differentiated,
     error_free,
     ieee_divide,
     replace_grad,
+    rounded_product,
     two_sum,
 )
 
@@ -77,6 +79,7 @@ class LocalCosines(NamedTuple):
     cos_t: Number  # √|radicand|
 
 
+@computed_in_float64
 def local_cosines(x: Number, y: Number, z: Number, contrast: Number) -> LocalCosines:
     """The cosines of a float32 ray with these components, z along the normal. `contrast`: κ = k² − 1, in float64.
 
@@ -92,6 +95,7 @@ def local_cosines(x: Number, y: Number, z: Number, contrast: Number) -> LocalCos
     return LocalCosines(sin2, dr.abs(z), radicand, cos_t)
 
 
+@computed_in_float64
 def refract_promoted(
     a: Vector3, n: Vector3, k: Number, contrast: Number = None, local: LocalCosines | None = None
 ) -> Refracted:
@@ -185,7 +189,7 @@ def _correct(vector: type, n: Vector3, around: list[DoubleWord], along: DoubleWo
     inverse = ieee_divide(1, dr.dot(n, n))
 
     def solve(around: list[Any], along: Number) -> Any:
-        return dr.fma(n, along, dr.cross(vector(*around), n)) * inverse
+        return vector(*(rounded_product(x, inverse) for x in dr.fma(n, along, dr.cross(vector(*around), n))))
 
     b = solve([x.hi for x in around], along.hi)
     missing = [

@@ -9,6 +9,8 @@ A template is a relative path in which fields stand for parts of an image's path
 
 from __future__ import annotations
 
+import fnmatch
+import glob
 import re
 from collections.abc import Collection, Mapping
 from pathlib import PurePosixPath
@@ -19,22 +21,13 @@ _FIELD = re.compile(r"\{([^{}]*)\}(/?)")  # with the slash behind it
 
 def matches(pattern: str, name: str) -> bool:
     """Whether the whole name matches the pattern."""
-    return _fits(_wild(pattern), name) if any(sign in pattern for sign in "*?\\") else pattern == name
+    return fnmatch.fnmatchcase(name, _for_fnmatch(pattern))
 
 
-STAR = "\0"  # any characters, in a regular expression that is not finished; no name holds it
-
-
-def _wild(pattern: str) -> str:
+def _for_fnmatch(pattern: str) -> str:
+    """The same pattern for `fnmatch`, where brackets are wild and keep a star from being so."""
     parts = re.findall(r"\\[*?\\]|.", pattern, re.DOTALL)
-    return "".join({"*": STAR, "?": "."}.get(part, re.escape(part[-1])) for part in parts)
-
-
-def _fits(wild: str, name: str) -> bool:
-    """Whether the whole name matches; each star but the last takes the shortest text, once and for all: no search."""
-    first, *rest = wild.split(STAR)
-    text = first + "".join(f"(?>.*?{part})" for part in rest[:-1]) + "".join(f".*{part}" for part in rest[-1:])
-    return re.fullmatch(text, name, re.DOTALL) is not None
+    return "".join(part if part in "*?" else glob.escape(part[-1]) for part in parts)
 
 
 def literal(name: str) -> str:
@@ -69,8 +62,8 @@ def filled(template: str, values: Mapping[str, str]) -> str:
 def expanded(template: str, values: Mapping[str, str], names: list[str]) -> list[str]:
     """The names that match the filled template: its `*` and `?` are wild, those in the values are not."""
     parts = re.split(r"(\{[^{}]*\}/?)", template)
-    pattern = "".join(re.escape(filled(part, values)) if part.startswith("{") else _wild(part) for part in parts)
-    return [name for name in names if _fits(pattern, name)]
+    pattern = "".join(glob.escape(filled(x, values)) if x.startswith("{") else _for_fnmatch(x) for x in parts)
+    return [name for name in names if fnmatch.fnmatchcase(name, pattern)]
 
 
 def parsed(template: str, name: str) -> dict[str, str] | None:

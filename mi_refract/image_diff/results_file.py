@@ -150,7 +150,10 @@ def write_github(results: Results, report: str = "", url: str = "") -> None:
     """
     for result in results.results:
         if result.warning or result.status in FAILED:
-            print(_github_command(result, _outcome(result, results)))
+            file, title = result.test or result.reference or result.name, f"{result.name}: {result.word}"
+            file, title = (_escaped(x).replace(":", "%3A").replace(",", "%2C") for x in (file, title))
+            level = "error" if _outcome(result, results) in ("failure", "error") else "warning"
+            print(f"::{level} file={file},title={title}::{_escaped(text_reports.why(result))}")
     if path := os.environ.get("GITHUB_STEP_SUMMARY"):
         with safe_files.full_disk_names(path), Path(path).open("a", encoding="utf-8") as stream:
             stream.write(text_reports.markdown(results, report, url))
@@ -209,14 +212,6 @@ def _json_entry(result: Result, results: Results) -> Entry:
         reproduce=results.reproduce(result),
         accept=results.accept(result),
     )
-
-
-def _github_command(result: Result, outcome: str) -> str:
-    """The workflow command that shows the image beside the changes of a pull request."""
-    file, title = result.test or result.reference or result.name, f"{result.name}: {result.word}"
-    file, title = (_escaped(x).replace(":", "%3A").replace(",", "%2C") for x in (file, title))
-    level = "error" if outcome in ("failure", "error") else "warning"
-    return f"::{level} file={file},title={title}::{_escaped(text_reports.why(result))}"
 
 
 def _escaped(text: object) -> str:

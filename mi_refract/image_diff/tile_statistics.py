@@ -492,15 +492,15 @@ def compare_stacks(reference: Array, test: Array, tile: int, family_error: float
     return TileTests([compare_tiles(evidence.one, evidence.two, margin)], family_error)
 
 
-def relative_mse(image: Array, references: Array, epsilon: float = 0.01) -> float:
-    """mean((x − r)²/(r² + ε)) against the mean r of a stack of independent renders, less what r's own noise adds.
+def relative_mse(image: Array, references: Array) -> float:
+    """mean((x − r)²/(r² + 0.01)) against the mean r of a stack of independent renders, less what r's own noise adds.
 
     `image` H × W × C, `references` renders × H × W × C. ValueError for other shapes.
     """
     r = references.mean(0)
     same_shape(r, image)
     own = references.var(0, ddof=1) / len(references)
-    return float(((np.square(image - r) - own) / (np.square(r) + epsilon)).mean())
+    return float(((np.square(image - r) - own) / (np.square(r) + 0.01)).mean())
 
 
 def same_shape(reference: Array, test: Array) -> None:

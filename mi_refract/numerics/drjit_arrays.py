@@ -1,4 +1,4 @@
-"""Small helpers around Dr.Jit arrays: precision, division by 0, derivatives, scaling. No optics.
+"""Small helpers around Dr.Jit arrays: precision, rounding, division by 0, derivatives, scaling. No optics.
 
 Each works on scalar, LLVM and CUDA arrays of either precision. Before them, names for the types of Dr.Jit and Mitsuba
 in signatures. Both packages are untyped to mypy, so each name stands for `Any`: it tells a reader what to pass, and
@@ -7,7 +7,10 @@ checks nothing.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeAlias
+import contextlib
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import drjit as dr
 
@@ -49,6 +52,8 @@ Point2: TypeAlias = Any
 # Mitsuba's medium of a shape or a sensor, and its texture.
 MediumPlugin: TypeAlias = Any
 Texture: TypeAlias = Any
+
+Result = TypeVar("Result")
 
 # Dr.Jit's type stubs say that the first returns an object, and nothing of what the second returns.
 _reinterpret: Any = dr.reinterpret_array
@@ -100,6 +105,39 @@ def ieee_divide(x: Number, y: Number) -> Number:
     if isinstance(y, float) and y == 0:
         return x * dr.rcp(y)
     return x / y
+
+
+def rounded_product(x: Number, y: Number) -> Number:
+    """fl(x y), also where it is added to something: for an x y whose rounding error is known, or is to be found.
+
+    CUDA's compiler may turn a product and a sum into one operation, which does not round the product. It leaves
+    `dr.fma` alone, here with a −0 that it cannot know, because it is NaN where a factor is.
+    """
+    if dr.JitBackend.CUDA not in (dr.backend_v(x), dr.backend_v(y)):
+        return x * y
+    unknown = y if not dr.is_jit_v(x) or x.state == dr.VarState.Literal else x
+    return dr.fma(x, y, -dr.minimum(dr.abs(dr.detach(unknown)), 0))
+
+
+def ieee_quotients(kind: ArrayType) -> contextlib.AbstractContextManager[None]:
+    """Within it, reciprocals, roots and derivatives of arrays like `kind` have the digits of float64 on CUDA, too.
+
+    There Dr.Jit's `rcp`, and with it `rsqrt` and the derivatives of quotients and roots, otherwise has the 20 bits of
+    one instruction.
+    """
+    few = dr.type_v(kind) == dr.VarType.Float64 and dr.backend_v(kind) == dr.JitBackend.CUDA
+    return dr.scoped_set_flag(dr.JitFlag.FastMath, False) if few else contextlib.nullcontext()
+
+
+def computed_in_float64(function: Callable[..., Result]) -> Callable[..., Result]:
+    """`function` of a number or vector first, within `ieee_quotients` of float64 whatever that argument's precision."""
+
+    @functools.wraps(function)
+    def with_ieee_quotients(x: Any, *args: Any, **kwargs: Any) -> Result:
+        with ieee_quotients(dr.float64_array_t(type(x))):
+            return function(x, *args, **kwargs)
+
+    return with_ieee_quotients
 
 
 def differentiated(x: Number | Vector3) -> bool:

@@ -2,7 +2,8 @@
 
 A *pair* `(hi, lo)` stands for the unevaluated sum hi + lo with |lo| ≤ u |hi|, u the roundoff of the working
 precision (2⁻²⁴ in float32, 2⁻⁵³ in float64). All functions hold for any Dr.Jit float type, scalar, LLVM or CUDA,
-as long as nothing over- or underflows. They need a true fused multiply-add: `dr.fma` is one on every backend.
+as long as nothing over- or underflows. They need a true fused multiply-add, which `dr.fma` is on every backend, and
+products that are rounded before they are added up, which `rounded_product` sees to.
 
 Sources: Knuth, TAOCP 2, 4.2.2 (two_sum); Ogita, Rump, Oishi 2005 (dot); Kahan, in Jeannerod, Louvet, Muller
 2013 (difference of products); Joldes, Muller, Popescu 2017 (double-word operations and their bounds).
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from .drjit_arrays import Mask, Number, Vector3
+from .drjit_arrays import Mask, Number, Vector3, ieee_quotients, rounded_product
 
 Pair = tuple[Number, Number]
 
@@ -34,7 +35,7 @@ def fast_two_sum(x: Number, y: Number) -> Pair:
 
 def two_prod(x: Number, y: Number) -> Pair:
     """p = fl(x y) and e with p + e = x y exactly."""
-    p = x * y
+    p = rounded_product(x, y)
     return p, dr.fma(x, y, -p)
 
 
@@ -102,8 +103,10 @@ class DoubleWord:
         r = x·rsqrt(x) is a few u off, whatever rsqrt the backend has; the exact defect of r² corrects it to a few u².
         Neither a division nor a square root is left, which both take longer than all else here.
         """
-        inverse = dr.rsqrt(dr.select(self.hi > 0, self.hi, 1))
-        root = self.hi * inverse
+        positive = dr.select(self.hi > 0, self.hi, 1)
+        with ieee_quotients(self.hi):  # the reciprocal of a denormal number is infinite
+            inverse = dr.rsqrt(positive) if dr.type_v(positive) == dr.VarType.Float32 else dr.rcp(dr.sqrt(positive))
+        root = rounded_product(self.hi, inverse)
         return DoubleWord(root, (dr.fma(-root, root, self.hi) + self.lo) * (0.5 * inverse))
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from .drjit_arrays import Number, Vector3
+from .drjit_arrays import Number, Vector3, rounded_product
 from .error_free import two_sum
 
 FloatExpansion = list[Number]
@@ -21,12 +21,12 @@ _SPLITTER = 2.0**27 + 1
 def two_prod(x: Number, y: Number) -> tuple[Number, Number]:
     """p = fl(x y) and e with p + e = x y exactly. float64 only."""
     (x_hi, x_lo), (y_hi, y_lo) = _split(x), _split(y)
-    p = x * y
+    p = rounded_product(x, y)
     return p, ((x_hi * y_hi - p) + x_hi * y_lo + x_lo * y_hi) + x_lo * y_lo
 
 
 def _split(x: Number) -> tuple[Number, Number]:
-    c = _SPLITTER * x
+    c = rounded_product(x, _SPLITTER)
     hi = c - (c - x)
     return hi, x - hi
 

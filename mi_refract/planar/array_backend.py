@@ -73,7 +73,11 @@ class ArrayBackend:
             dr.scatter(filled[name], x, j * stride + lane, active, mode=dr.ReduceMode.NoConflicts)
 
         if count:  # Dr.Jit refuses an empty array
-            work(lane, scatter)
+            # With fast math CUDA's quotients are approximations, and its compiler fuses their last product with a sum
+            # in one kernel and not in another.
+            fast = self.name != "cuda" and dr.flag(dr.JitFlag.FastMath)
+            with dr.scoped_set_flag(dr.JitFlag.FastMath, fast):
+                work(lane, scatter)
         dr.eval(*filled.values())
         return {name: values.numpy().reshape(buffers[name][2]) for name, values in filled.items()}
 

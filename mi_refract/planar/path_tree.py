@@ -174,16 +174,13 @@ def summary(scene: PlanarScene, traced: Sequence[Branches]) -> str:
     return ", ".join([_plural(rays, "ray") + colours, *split, hits, *said])
 
 
-def mismatches(scene: PlanarScene, traced: Sequence[Branches], most: int = 3) -> list[str]:
-    """A line for each pair of shapes between which paths ended with MEDIUM_MISMATCH, for the `most` frequent pairs."""
+def mismatches(scene: PlanarScene, traced: Sequence[Branches]) -> list[str]:
+    """A line for each of the three pairs of shapes between which most paths ended with MEDIUM_MISMATCH."""
     found: Counter[tuple[str, ...]] = Counter()
     examples: dict[tuple[str, ...], str] = {}
     for segments, branches in zip(scene.segments, traced, strict=True):
-        ends, last, indices = (
-            np.flatnonzero(branches.end == Event.MEDIUM_MISMATCH),
-            branches.last,
-            branches.paths.indices,
-        )
+        ends, last = np.flatnonzero(branches.end == Event.MEDIUM_MISMATCH), branches.last
+        indices = branches.paths.indices
         assert indices is not None
         met = np.stack([branches.paths.hits[ends, last[ends] - j] for j in (1, 0)], axis=1)  # none begins with one
         for (before, at), j, number in zip(*np.unique(met, axis=0, return_index=True, return_counts=True), strict=True):
@@ -194,7 +191,7 @@ def mismatches(scene: PlanarScene, traced: Sequence[Branches], most: int = 3) ->
     fault = "overlap, share part of an edge, leave a gap, or are turned round"
     return [
         f"{' and '.join(pair)} {fault}: {_plural(number, 'path')} {examples[pair]}"
-        for pair, number in found.most_common(most)
+        for pair, number in found.most_common(3)
     ]
 
 

@@ -280,7 +280,7 @@ def _unit(v: Vector2) -> Vector2:
 
 def _mirrored(d: Vector2, line: Vector2) -> Vector2:
     c = 2 * cross(line, d)
-    return type(d)(d.x + c * line.y, d.y - c * line.x)
+    return type(d)(dr.fma(c, line.y, d.x), dr.fma(-c, line.x, d.y))
 
 
 def _shares(d: Vector2, line: Vector2, k: Number, through: Mask) -> Vector2:

@@ -127,7 +127,7 @@ def read_parameters(self: Refract, props: Properties, formula: str = "auto") -> 
         raise ValueError(f"{PLUGIN}_{formula}: `formula` cannot be set on {PLUGIN}_{formula}")
     self.requested = props.get("formula", formula)
     try:
-        self.formula_name, self.formula = resolve(self.requested, dr.backend_v(v.Float))
+        self.formula_name, self.formula = resolve(self.requested)
     except ValueError as error:
         raise ValueError(f"{PLUGIN}: {error}") from None
     tints = [name for name in LOBES if name in props]

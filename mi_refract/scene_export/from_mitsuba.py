@@ -7,15 +7,27 @@ import os
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mi_refract.io.image_file import read_exr
 
 from .meshes_from_shapes import MOST, meshes_of_shape, with_unique_names
 from .mitsuba_nodes import Node, SceneFile
-from .plain_scene import Camera, Colour, Environment, Mesh, PlainScene
+from .plain_scene import (
+    Camera,
+    Colour,
+    DirectionalLamp,
+    Environment,
+    Lamp,
+    Mesh,
+    PlainScene,
+    PointLamp,
+    SpotLamp,
+)
 
 LEVEL = 5  # of the tessellation: spheres of 20480 triangles, circles of 256 segments
 LEVELS = range(9)
+LAMPS = ("point", "spot", "directional")
 INTEGRATORS = ("path", "refract_path", "prb", "volpath", "prbvolpath")
 
 
@@ -33,6 +45,7 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) ->
         raise FileNotFoundError(f"{path}: no such scene file")
     root = SceneFile(path, defines).node(0)
     shapes: list[Mesh] = []
+    lamps: list[Lamp] = []
     camera: Camera | None = None
     max_depth: int | None = None
     sky: Colour | Environment | None = None
@@ -52,6 +65,8 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) ->
                 raise child.error("hide_emitters", "false")
             child.ignore("rr_depth")
             child.finish()
+        elif child.kind == "Emitter" and child.type in LAMPS:
+            lamps.append(_lamp(child))
         elif child.kind == "Emitter" and sky is None:
             sky = _sky(child)
         elif child.kind != "BSDF":  # a named BSDF is read with the shapes that use it
@@ -61,7 +76,10 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) ->
         raise ValueError(f"{path}: no sensor; expected a scene with one")
     if max_depth is None:
         raise ValueError(f"{path}: no integrator; expected a scene with one")
-    return PlainScene(path.stem, with_unique_names(shapes), sky or (0.0, 0.0, 0.0), camera, max_depth)
+    named = with_unique_names([*shapes, *lamps])
+    meshes = tuple(part for part in named if isinstance(part, Mesh))
+    without_size = tuple(part for part in named if isinstance(part, Lamp))
+    return PlainScene(path.stem, meshes, sky or (0.0, 0.0, 0.0), camera, max_depth, without_size)
 
 
 def _camera(sensor: Node) -> Camera:
@@ -96,6 +114,45 @@ def _camera(sensor: Node) -> Camera:
     return Camera((x, y, z), (to_x, to_y, to_z), (up_x, up_y, up_z), fov_x, width, height)
 
 
+def _rotation(emitter: Node) -> NDArray[np.float64]:
+    """(3, 3): that of `to_world`, whose shift is ignored."""
+    rotation = emitter.transform()[:3, :3]
+    if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-9):
+        raise emitter.error("to_world is not a rotation", "a rotation")
+    return rotation
+
+
+def _lamp(emitter: Node) -> Lamp:
+    """A lamp without size. A `position` or `direction` beside a `to_world` stays unread: an error, as in Mitsuba."""
+    name, placed = emitter.props.id() or emitter.type, "to_world" in emitter.names
+    lamp: Lamp
+    if emitter.type == "directional":
+        direction = _rotation(emitter)[:, 2] if placed else emitter.point("direction", (0, 0, 1))
+        if not (length := np.linalg.norm(direction)):
+            raise emitter.error("direction = 0, 0, 0", "a vector of any length but 0")
+        lamp = DirectionalLamp(name, _triple(direction / length), emitter.colour("irradiance", 1.0))
+    elif emitter.type == "point":
+        position = emitter.transform()[:3, 3] if placed else emitter.point("position", (0, 0, 0))
+        lamp = PointLamp(name, _triple(position), emitter.colour("intensity", 1.0))
+    else:
+        direction, position = _rotation(emitter)[:, 2], emitter.transform()[:3, 3]
+        cutoff = emitter.value(float, "cutoff_angle", 20.0)
+        beam = emitter.value(float, "beam_width", 0.75 * cutoff)
+        if not (0 < cutoff <= 180 and beam >= 0):
+            raise emitter.error(f"cutoff_angle = {cutoff}, beam_width = {beam}", "angles of 0 to 180 degrees")
+        where, intensity = _triple(position), emitter.colour("intensity", 1.0)
+        lamp = SpotLamp(name, where, intensity, _triple(direction), min(beam, cutoff), cutoff)
+    if not emitter.value(float, "sampling_weight", 1.0) > 0:
+        raise emitter.error("sampling_weight = 0", "a positive number: Mitsuba sees no light of this lamp")
+    emitter.finish()
+    return lamp
+
+
+def _triple(vector: NDArray[np.float64]) -> Colour:
+    x, y, z = map(float, vector)
+    return x, y, z
+
+
 def _sky(emitter: Node) -> Colour | Environment:
     sky: Colour | Environment
     if emitter.type == "constant":
@@ -108,12 +165,9 @@ def _sky(emitter: Node) -> Colour | Environment:
             raise emitter.error(str(error), "an OpenEXR file") from None
         if pixels.shape[2] != 3 or min(pixels.shape[:2]) < 2 or not np.isfinite(pixels).all() or (pixels < 0).any():
             raise emitter.error(f"{path}: {pixels.shape[1]} × {pixels.shape[0]} × {pixels.shape[2]}", "finite RGB")
-        rotation = emitter.transform()[:3, :3]
-        if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-9):
-            raise emitter.error("to_world is not a rotation", "a rotation")
-        sky = Environment(scale * pixels, rotation)
+        sky = Environment(scale * pixels, _rotation(emitter))
     else:
-        raise emitter.error("this emitter is not supported", "constant, envmap, and area on a shape")
+        raise emitter.error("this emitter is not supported", f"constant, envmap, {', '.join(LAMPS)}, area on a shape")
     emitter.ignore("sampling_weight", "mis_compensation")
     emitter.finish()
     return sky

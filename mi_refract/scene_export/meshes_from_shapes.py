@@ -17,7 +17,7 @@ from mi_refract.plugins import PLUGIN, read_medium, scene_parser
 
 from . import tessellation
 from .mitsuba_nodes import Node
-from .plain_scene import LINES, WAVELENGTHS, Colour, Diffuse, Glass, Light, Material, Mesh, VolumeGlass
+from .plain_scene import LINES, WAVELENGTHS, Colour, Diffuse, Glass, Lamp, Light, Material, Mesh, VolumeGlass
 from .tessellation import Triangles, Vertices
 
 GLASSES = ("dielectric", PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS))
@@ -79,18 +79,18 @@ def meshes_of_shape(shape: Node, level: int, most: int = MOST, eye: Vertices | N
         yield Mesh(f"{name}_{i}" if i else name, placed, faces[:, ::-1] if flipped else faces, material, normals)
 
 
-def with_unique_names(meshes: Iterable[Mesh]) -> tuple[Mesh, ...]:
-    """The meshes, renamed: letters, digits and underscores only, unique without regard to case."""
+def with_unique_names(parts: Iterable[Mesh | Lamp]) -> tuple[Mesh | Lamp, ...]:
+    """The meshes and lamps, renamed: letters, digits and underscores only, unique without regard to case."""
     taken: set[str] = set()
-    result = []
-    for mesh in meshes:
-        name = stem = re.sub(r"\W", "_", mesh.name, flags=re.ASCII)
+    result: list[Mesh | Lamp] = []
+    for part in parts:
+        name = stem = re.sub(r"\W", "_", part.name, flags=re.ASCII)
         count = 1
         while name.lower() in taken:
             count += 1
             name = f"{stem}_{count}"
         taken.add(name.lower())
-        result.append(replace(mesh, name=name))
+        result.append(replace(part, name=name))
     return tuple(result)
 
 
@@ -139,14 +139,8 @@ def _frame(shape: Node) -> Vertices:
         start, end = (shape.point(name, (0, 0, z)) for name, z in (("p0", 0), ("p1", 1)))
         radius = positive("radius", shape.value(float, "radius", 1.0))
         length = positive("length", float(np.linalg.norm(end - start)))
-        # An orthonormal, right-handed basis; the identity for an axis (0, 0, 1). Duff et al. 2017.
-        x, y, z = axis = (end - start) / length
-        sign = np.copysign(1.0, z)
-        a = -1 / (sign + z)
-        b = x * y * a
-        basis = np.stack([[1 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y], axis], axis=1)
         local[:3, 3] = start
-        local[:3, :3] = basis * [radius, radius, length]
+        local[:3, :3] = tessellation.basis((end - start) / length) * [radius, radius, length]
     placed = frame @ local
     if shape.type in ("sphere", "cylinder"):  # Mitsuba stretches neither, but the second along its axis
         squares = placed[:3, :3].T @ placed[:3, :3]

@@ -80,6 +80,43 @@ class Mesh:
 
 
 @dataclass(frozen=True)
+class Lamp:
+    """A lamp without size. Names of lamps and meshes are unique; directions, in which light travels, have length 1."""
+
+    name: str
+
+    @property
+    def kind(self) -> str:
+        """Mitsuba's name of the plugin: point, spot or directional."""
+        return type(self).__name__.removesuffix("Lamp").lower()
+
+
+@dataclass(frozen=True)
+class PointLamp(Lamp):
+    """`intensity`, per steradian, in every direction: a surface that faces it has intensity/distance² of irradiance."""
+
+    position: Colour
+    intensity: Colour
+
+
+@dataclass(frozen=True)
+class SpotLamp(PointLamp):
+    """Up to `beam_degrees` from `direction` all of `intensity`, none from `cutoff_degrees` on, linear between."""
+
+    direction: Colour
+    beam_degrees: float
+    cutoff_degrees: float
+
+
+@dataclass(frozen=True)
+class DirectionalLamp(Lamp):
+    """Parallel light from infinitely far away. `irradiance`: of a surface at right angles to it."""
+
+    direction: Colour
+    irradiance: Colour
+
+
+@dataclass(frozen=True)
 class Environment:
     """Radiance from infinitely far away by direction, (H, W, 3), interpolated linearly between columns and rows.
 
@@ -113,6 +150,7 @@ class PlainScene:
     sky: Colour | Environment
     camera: Camera
     max_depth: int
+    lamps: tuple[Lamp, ...] = ()
 
     @property
     def materials(self) -> tuple[Material, ...]:

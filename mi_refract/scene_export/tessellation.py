@@ -61,6 +61,18 @@ def encloses(triangles: NDArray[np.float64], point: Vertices) -> bool:
     return bool(halves.sum() > np.pi)
 
 
+def basis(axis: Vertices) -> Vertices:
+    """(3, 3): orthonormal and right-handed, its last column an axis of length 1; the identity for (0, 0, 1).
+
+    Source: Duff et al. 2017, Building an Orthonormal Basis, Revisited.
+    """
+    x, y, z = axis
+    sign = np.copysign(1.0, z)
+    a = -1 / (sign + z)
+    b = x * y * a
+    return np.stack([[1 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y], axis], axis=1)
+
+
 def grid(u: NDArray[np.float64], v: NDArray[np.float64], chosen: NDArray[np.bool_]) -> Triangles:
     """Two triangles for each chosen cell [i, j] between u[i], u[i + 1], v[j], v[j + 1] in the plane z = 0."""
     vertices = np.stack([*np.meshgrid(u, v, indexing="ij"), np.zeros((len(u), len(v)))], axis=-1)

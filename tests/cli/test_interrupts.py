@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import random
 import signal
-import subprocess
 import sys
-import time
 
 import pytest
-from support.processes import ENVIRONMENT, python
+from support.processes import python
 
 from mi_refract import cli
 from validation.run.context import SCENES
@@ -22,24 +19,6 @@ def interrupted(process, code, number=signal.SIGINT):
         assert process.wait(timeout=30) == code, process.stderr.read()
     finally:
         process.kill()  # or a failure would wait for it without end
-
-
-def test_at_any_time(tmp_path, needs_variant):
-    """From the first line of ours, which blocks SIGINT, to the end: 130, or 0 where it was too late."""
-    needs_variant("llvm_ad_rgb")
-    words = ["render", SCENES / "sphere.xml", "-o", tmp_path / "out.exr", "-D", "res=64", "--variant", "llvm_ad_rgb"]
-    command = [sys.executable, "-m", "mi_refract.cli", *map(str, words)]
-    start = time.monotonic()
-    subprocess.run(command, env=ENVIRONMENT, check=True, capture_output=True)
-    took = time.monotonic() - start
-    for _ in range(2):
-        process = subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
-        time.sleep(took * random.uniform(0.1, 1.1))
-        process.send_signal(signal.SIGINT)
-        said = process.communicate(timeout=30)[1]
-        assert process.returncode in (130, 0, -signal.SIGINT), said
-        assert process.returncode != -signal.SIGINT or b"mi_refract.cli.app" not in said
-        assert [path.name for path in tmp_path.iterdir()] in ([], ["out.exr"])
 
 
 # A libLLVM is tried, which takes a minute; it says so itself.

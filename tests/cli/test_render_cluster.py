@@ -17,7 +17,7 @@ import psutil
 import pytest
 from distributed import Security
 from support.dask_workers import program, tls_settings
-from support.processes import ENVIRONMENT, until
+from support.processes import ENVIRONMENT, assert_refused, until
 from support.renders import GLASS
 
 from mi_refract.cluster import on_worker
@@ -37,13 +37,6 @@ def render(scene, run):
         return run("render", scene, "-o", scene.with_name(output), "--variant", "scalar_rgb", *options)
 
     return call
-
-
-def refused(outcome, *messages):
-    """Exit code 2 and one line."""
-    code, out, err = outcome
-    assert (code, out, err.count("\n")) == (2, "", 1) and err.startswith("mi-refract: ")
-    assert all(message in err for message in messages), err
 
 
 @pytest.mark.parametrize(
@@ -67,7 +60,7 @@ def test_misuse(render, scene, options, message, monkeypatch, tmp_path_factory):
         scene.write_text(GLASS.replace('<emitter type="constant"/>', named))
     if options == ("--workers", 1):
         monkeypatch.setitem(sys.modules, "distributed", None)
-    refused(render(*options), message)
+    assert_refused(render(*options), message)
     assert list(scene.parent.iterdir()) == [scene]
 
 
@@ -165,5 +158,5 @@ def test_who_is_not_trusted_is_refused(render, scheduler, scene, security, proto
     with dask.config.set(tls_settings(security)):
         outcome = render("--scheduler", address)
     hint = "and the files of `distributed.comm.tls` in Dask's configuration"
-    refused(outcome, f"--scheduler {address}: no Dask scheduler answers: ", hint)
+    assert_refused(outcome, f"--scheduler {address}: no Dask scheduler answers: ", hint)
     assert list(scene.parent.iterdir()) == [scene]

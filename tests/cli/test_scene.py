@@ -7,6 +7,7 @@ import tarfile
 from pathlib import Path
 
 import pytest
+from support.processes import assert_refused
 
 import mi_refract
 from mi_refract.cli import app
@@ -54,9 +55,7 @@ def test_refused_in_one_line(words, says, export, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "scene.xml").write_text("<scene version='3.0.0'><bsdf type='hair'/></scene")
     before = sorted(tmp_path.rglob("*"))
-    code, out, err = export(*words)
-    assert (code, out) == (2, "") and says in err
-    assert err.startswith("mi-refract: ") and err.count("\n") == 1
+    assert_refused(export(*words), says)
     assert sorted(tmp_path.rglob("*")) == before
 
 

@@ -19,18 +19,10 @@ AROUND_A_NORMAL = [name for name, entry in REGIMES.items() if isinstance(entry.b
 Z = [0.0, 0.0, 1.0]
 
 
-@pytest.fixture(scope="module")
-def certified():
-    answers = {}
-
-    def ask(regime, count, precision, normal=None):
-        key = regime, count, precision, normal
-        if key not in answers:
-            rays = make(regime, count, precision, seed=7, normal=normal)
-            answers[key] = rays, oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-        return answers[key]
-
-    return ask
+@functools.cache
+def certified(regime, count, precision, normal=None):
+    rays = make(regime, count, precision, seed=7, normal=normal)
+    return rays, oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
 
 
 def broken(subject, rays, exact, setting, budget):
@@ -41,7 +33,7 @@ def broken(subject, rays, exact, setting, budget):
 
 @pytest.mark.parametrize("regime", REGIMES)
 @pytest.mark.parametrize("name", FORMULAS)
-def test_within_its_budget_in_every_regime(name, regime, setting, certified):
+def test_within_its_budget_in_every_regime(name, regime, setting):
     if reason := setting.no_budget(FORMULAS[name].budget, regime):
         pytest.skip(reason)
     rays, exact = certified(regime, COUNTS[setting.backend], setting.precision)
@@ -89,7 +81,7 @@ def test_the_critical_angle_is_transmitted_along_the_surface_and_the_next_ratio_
 @pytest.mark.parametrize("axis", [(0, 0, 1), (0, -1, 0)])
 @pytest.mark.parametrize("regime", AROUND_A_NORMAL)
 @pytest.mark.parametrize("name", EXACT)
-def test_a_literal_axis_is_folded_away_and_nothing_else_changes(name, regime, axis, setting, certified):
+def test_a_literal_axis_is_folded_away_and_nothing_else_changes(name, regime, axis, setting):
     """As in a local frame. A literal normal takes shorter ways through both formulas."""
     rays, exact = certified(regime, COUNTS[setting.backend], setting.precision, axis)
     assert (rays.n == axis).all()

@@ -15,7 +15,7 @@ import OpenImageIO
 import pytest
 import typer
 from support.diff_images import BROKEN, found, image, tree
-from support.processes import python
+from support.processes import assert_refused, python
 
 from mi_refract.image_diff import accept
 from mi_refract.image_diff import folders as diff
@@ -414,9 +414,7 @@ def test_a_json_that_is_not_ours_is_one_line(run, compared, change, words):
     old, _, out = compared
     out.write_bytes(change) if isinstance(change, bytes) else edited(out, change)
     before = tree(old)
-    code, said, err = run("accept", "--from", out, "--yes")
-    assert (code, said, err.count("\n")) == (2, "", 1)
-    assert err.startswith("mi-refract: ") and words in err
+    assert_refused(run("accept", "--from", out, "--yes"), words)
     assert tree(old) == before
 
 
@@ -443,9 +441,7 @@ def test_bad_words_with_from(run, compared):
         ([old, new, "none*", "--from", out], "none*: matches no image; expected "),
         ([], "two paths are needed"),
     ]:
-        code, said, err = run("accept", *words, "--yes")
-        assert (code, said, err.count("\n")) == (2, "", 1)
-        assert message in err
+        assert_refused(run("accept", *words, "--yes"), message)
 
 
 # --as-variant -----------------------------------------------------------------------------------------------------

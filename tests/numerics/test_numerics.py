@@ -14,6 +14,8 @@ from mi_refract.numerics import (
     float_expansions,
     from_numpy,
     ieee_divide,
+    ieee_quotients,
+    rounded_product,
     scale_to_unit,
 )
 
@@ -124,6 +126,32 @@ def test_float_expansions_multiply_exactly_divide_and_regain_what_cancels():
 
 
 # Dr.Jit arrays -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("as_cuda", [False, True])
+def test_compiled_sums_add_rounded_products_and_quotients_have_all_digits(vectorised, as_cuda, monkeypatch):
+    """In one kernel with what uses them: there a compiler may fuse x·y + z, and choose instructions of 20 bits.
+
+    as_cuda: what is done for CUDA changes no number elsewhere.
+    """
+    if as_cuda:
+        monkeypatch.setattr(dr, "backend_v", lambda x: dr.JitBackend.CUDA)
+    number, rng = dr.value_t(vectorised.vector), np.random.default_rng(5)
+    x, y = (number(rng.uniform(1, 2, 1000).astype(vectorised.precision)) for _ in range(2))
+    root = DoubleWord(x).sqrt()
+    products = [rounded_product(x, y), error_free.two_prod(x, y)[0], root.hi]
+    if vectorised.name == "float64":
+        p, e = float_expansions.two_prod(x, y)
+        products.append(p)
+        assert dr.all(e == error_free.two_prod(x, y)[1])
+    for product in products:
+        evaluated = number(product)
+        dr.eval(evaluated)
+        assert dr.all(product - evaluated == 0)
+    assert dr.all(dr.abs(dr.fma(-root.hi, root.hi, x) - 2 * root.hi * root.lo) <= 64 * vectorised.roundoff**2)
+    with ieee_quotients(number):
+        assert dr.all(dr.abs(dr.fma(dr.rcp(x), x, -1)) <= 4 * vectorised.roundoff)
+        assert dr.all(dr.abs(dr.rsqrt(x) ** 2 * x - 1) <= 16 * vectorised.roundoff)
 
 
 @pytest.mark.parametrize("offset", range(0, 64, 8))

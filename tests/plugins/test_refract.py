@@ -79,8 +79,7 @@ def test_attached_sampling_has_the_derivative_of_the_reflectance(llvm_variant):
 
 @pytest.mark.parametrize("formula", ["auto", *FORMULAS])
 def test_every_formula_bends_the_ray_and_is_named(typical_variant, formula):
-    fastest = "compensated" if typical_variant.startswith("cuda") else "promoted"
-    written = f"formula = {f'{fastest} (auto)' if formula == 'auto' else formula},"
+    written = f"formula = {'promoted (auto)' if formula == 'auto' else formula},"
     named = [load(int_ior=1.5, ext_ior=1, formula=formula)]
     named += [load(f"refract_{formula}", int_ior=1.5, ext_ior=1)] if formula != "auto" else []
     for bsdf in named:
@@ -212,7 +211,8 @@ def test_the_powers_are_a_short_kernel(vectorised):
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         dr.eval(fresnel.local_powers(vectorised.vector(*x[:3]), transmitted, x[3], x[4]))
-        assert max(entry.get("operation_count", 0) for entry in dr.kernel_history()) <= 45
+        most = {"llvm": 45, "cuda": 47}[vectorised.backend]
+        assert max(entry.get("operation_count", 0) for entry in dr.kernel_history()) <= most
 
 
 # An index that is a texture: a number in each point of the surface ----------------------------------------------

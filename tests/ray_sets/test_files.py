@@ -16,9 +16,6 @@ import zipfile
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from rich.console import Console
 from support.media_rays import ALL, CROWN, FLINT, MEDIA, WATER, WAVELENGTHS
 from support.processes import ENVIRONMENT
 from support.ray_programs import BAD
@@ -26,8 +23,8 @@ from support.readme import DOCS, python_blocks
 
 from mi_refract import media, regimes
 from mi_refract.numerics import float_expansions
-from mi_refract.ray_sets import check_answers, files, header, ray_set, reports
-from mi_refract.ray_sets.ray_set import Answers, RaySet
+from mi_refract.ray_sets import check_answers, files, header, ray_set
+from mi_refract.ray_sets.ray_set import RaySet
 from mi_refract.regimes import Rays
 
 PAGE = DOCS / "how-to/check-a-shaders-rays.md"
@@ -359,24 +356,6 @@ def test_a_header_that_is_not_ours_is_refused(tmp_path, rays, message, changes):
     refused(npz_of(tmp_path / "rays.npz", rays, json.dumps(top)), message)
 
 
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-    lambda some: st.lists(some, max_size=3) | st.dictionaries(st.text(max_size=5), some, max_size=3),
-    max_leaves=6,
-)
-
-
-@given(
-    changes=st.dictionaries(st.sampled_from([*WITH_MEDIA.header]) | st.text(max_size=3), JSON, min_size=1, max_size=3)
-)
-def test_any_header_is_read_as_it_is_or_refused_in_one_line(tmp_path_factory, changes):
-    path = npz_of(tmp_path_factory.getbasetemp() / "header.npz", FOUR, json.dumps(FOUR.header | changes))
-    try:
-        assert files.read(path).header == FOUR.header  # with another, the checksum does not fit
-    except ValueError as error:
-        assert str(error).startswith(f"{path}: ") and "\n" not in str(error) and len(str(error)) < 600
-
-
 @pytest.mark.parametrize("text", ["[" * 100_000, "1" * 10_000, '{"format": NaN}', "7"])
 def test_an_array_header_of_any_json(tmp_path, text):
     refused(npz_of(tmp_path / "rays.npz", FOUR, text), "not a file of rays")
@@ -409,20 +388,6 @@ def test_ratios_that_are_not_those_of_the_media(tmp_path, wrong, factor):
     else:
         refused(path, f"rays.csv: ray {wrong} has n_from / n_to = ")
         refused(path, f", {header.described(rays.header, wrong)}")
-
-
-def test_markup_and_escapes_in_a_regime_stay_text(tmp_path):
-    """Rich would read [bold] and fail on [/]; a terminal would obey an escape."""
-    name, one = "[/] [bold]x[link=http://a] \x1b[2J\u202e", ray_set.make(["generic"], 20)
-    forged = ray_set.with_checksum(dataclasses.replace(one, header=one.header | {"regimes": {name: [0, 19]}}))
-    found = check_answers.check(
-        files.read(files.write(tmp_path / "rays.npz", forged)), Answers(one.ids, one.rays.a.astype(float))
-    )
-    stream = io.StringIO()
-    console = Console(file=stream, width=1000, force_terminal=True, color_system=None)
-    console.print(reports.table(found), reports.summary(found))
-    assert stream.getvalue().count("[/] [bold]x[link=http://a]") >= 2
-    assert "\x1b[2J" not in stream.getvalue() and "\u202e" not in stream.getvalue()
 
 
 # Answers -------------------------------------------------------------------------------------------------------------

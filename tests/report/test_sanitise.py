@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import io
+import json
 from xml.etree import ElementTree
 
 import pytest
@@ -77,6 +78,11 @@ def test_names_reasons_and_errors_of_images_and_of_rays(form, results, tmp_path)
     assert "task.x" in text
     assert shows_more_than_text(text) == []
     assert "<script>&" not in text or form.startswith(("terminal", "GitHub"))
+
+
+def test_json_holds_every_name(results, tmp_path):
+    results_file.write(results, origin([], None), data=tmp_path / "out.json")
+    assert json.loads((tmp_path / "out.json").read_bytes())["results"][0]["name"] == NAME
 
 
 def test_names_of_rows_and_what_other_programs_said(tmp_path):

@@ -15,7 +15,7 @@ import pytest
 from mi_refract.io import image_file
 from mi_refract.scene_export import from_mitsuba, meshes_from_shapes, targets, tessellation
 from mi_refract.scene_export.mitsuba_nodes import SceneFile
-from mi_refract.scene_export.plain_scene import Diffuse, Glass, Light
+from mi_refract.scene_export.plain_scene import Diffuse, DirectionalLamp, Glass, Light, PointLamp, SpotLamp
 
 SCENES = Path(__file__).parents[2] / "scenes"
 PLANE = ["diamond", "lightpipe", "nested", "prism", "slab"]  # nothing in them is curved
@@ -81,6 +81,32 @@ def test_what_is_read(scene):
     text = "".join(f'<shape type="sphere" id="{name}"><bsdf type="$bsdf"/></shape>' for name in ("a b", "A.b"))
     names = [mesh.name for mesh in from_mitsuba.load(scene("</scene>", f"{text}</scene>"), level=0).meshes]
     assert names[-2:] == ["a_b", "A_b_2"]  # unique without regard to case
+
+
+LAMPS = {
+    '<emitter type="point" id="a b"/>': PointLamp("a_b", (0, 0, 0), (1, 1, 1)),
+    '<emitter type="point"><rgb name="intensity" value="1, 0, 2"/><point name="position" value="1, 2, 3"/></emitter>': (
+        PointLamp("point", (1, 2, 3), (1, 0, 2))
+    ),
+    '<emitter type="point"><transform name="to_world"><scale value="2"/><translate x="4"/></transform></emitter>': (
+        PointLamp("point", (4, 0, 0), (1, 1, 1))
+    ),
+    '<emitter type="spot"/>': SpotLamp("spot", (0, 0, 0), (1, 1, 1), (0, 0, 1), 15, 20),
+    '<emitter type="spot"><float name="cutoff_angle" value="40"/><float name="beam_width" value="50"/>'
+    '<transform name="to_world"><lookat origin="1, 2, 3" target="1, -5, 3" up="0, 0, 1"/></transform></emitter>': (
+        SpotLamp("spot", (1, 2, 3), (1, 1, 1), (0, -1, 0), 40, 40)
+    ),
+    '<emitter type="directional" id="BALL"/>': DirectionalLamp("BALL_2", (0, 0, 1), (1, 1, 1)),
+    '<emitter type="directional"><vector name="direction" x="0" y="3" z="-4"/>'
+    '<rgb name="irradiance" value="1, 0, 2"/></emitter>': DirectionalLamp("directional", (0, 0.6, -0.8), (1, 0, 2)),
+}
+
+
+@pytest.mark.parametrize("text", LAMPS)
+def test_lamps_without_size(text, scene):
+    """Mitsuba's defaults, one sky beside them, names that no mesh has."""
+    found = from_mitsuba.load(scene("</scene>", f"{text}</scene>"), level=0)
+    assert found.lamps == (LAMPS[text],) and found.sky == (0.5, 0.25, 1) and len(found.meshes) == 3
 
 
 # --- the same geometry, materials and sky ----------------------------------------------------------------
@@ -234,13 +260,31 @@ BOARD = (
 )
 COLOUR = '<rgb name="radiance" value="0.5, 0.25, 1"/>'
 TURN = '<transform name="radiance"><rotate x="1" angle="30"/></transform>'
+PLACE, WAY = '<point name="position" x="1" y="2" z="3"/>', '<vector name="direction" x="0" y="2" z="0"/>'
+SHIFT = '<transform name="to_world"><translate x="1" y="2" z="3"/></transform>'
+
+
+def lamps(text):
+    return "</scene>", f"{text}</scene>"
+
+
 REFUSED = {
     "ptracer": ('type="path"', 'type="ptracer"'),
     "max_depth = -1": ('value="5"', 'value="-1"'),
     "thinlens": ('"perspective"', '"thinlens"'),
     "gaussian": ('"box"', '"gaussian"'),
     "crop_width": ("<rfilter", '<integer name="crop_width" value="4"/><rfilter'),
-    "emitter too many": ("</scene>", '<emitter type="point"/></scene>'),
+    "emitter too many": ("</scene>", '<emitter type="constant"/></scene>'),
+    "projector": ("</scene>", '<emitter type="projector"/></scene>'),
+    "texture is not supported": lamps('<emitter type="spot"><texture type="bitmap" name="texture"/></emitter>'),
+    "position is not supported": lamps(f'<emitter type="point">{PLACE}{SHIFT}</emitter>'),
+    "direction is not supported": lamps(f'<emitter type="directional">{WAY}{SHIFT}</emitter>'),
+    "direction = 0, 0, 0": lamps(f'<emitter type="directional">{WAY.replace("2", "0")}</emitter>'),
+    "spot: to_world is not a rotation": lamps(f'<emitter type="spot">{SHIFT.replace("translate", "scale")}</emitter>'),
+    "cutoff_angle = 0.0, beam": lamps('<emitter type="spot"><float name="cutoff_angle" value="0"/></emitter>'),
+    "beam_width = -1.0": lamps('<emitter type="spot"><float name="beam_width" value="-1"/></emitter>'),
+    "point: intensity = ": lamps('<emitter type="point"><spectrum name="intensity" value="400:1, 700:2"/></emitter>'),
+    "sampling_weight = 0": lamps('<emitter type="point"><float name="sampling_weight" value="0"/></emitter>'),
     "roughdielectric": ('type="$bsdf"', 'type="roughdielectric"'),
     "specular_transmittance": ("<string", '<float name="specular_transmittance" value="0.5"/><string'),
     "unknown material": ('"water"', '"nonsense"'),

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.scene_readers import glb
+from support.scene_readers import cone, glb, punctual
 
 from mi_refract.scene_export import from_mitsuba, targets, tessellation
 from mi_refract.scene_export.plain_scene import Camera, Diffuse, Glass, Light, Mesh, PlainScene
@@ -156,6 +156,36 @@ def test_an_open_lamp_is_black_from_behind(export):
     assert (front[0][:, 2] == 0).all() and (back[0][:, 2] > -1e-4).all() and (back[0][:, 2] < -100 * SINGLE).all()
 
 
+@pytest.mark.parametrize("beam, cutoff", [(15, 20), (0, 90), (40, 40)])
+def test_the_edge_of_a_spot_is_said(beam, cutoff, export):
+    """The largest difference between the extension's sample and Mitsuba's ramp: 1 where the ramp is a step."""
+    angles = f'<float name="cutoff_angle" value="{cutoff}"/><float name="beam_width" value="{beam}"/>'
+    model, said = export(ior("ext", 1), f'<emitter type="spot" id="lamp">{angles}</emitter>')
+    ((_, _, light),) = punctual(model.tree)
+    words = re.search(r"lamp: from (\S+) to (\S+) degrees glTF leaves .* by up to (\S+) of the intensity", said)
+    low, high, most = map(float, words.groups())
+    inner, outer = np.degrees([light["spot"]["innerConeAngle"], light["spot"]["outerConeAngle"]])
+    assert (low, high) == pytest.approx((inner, outer)) and inner < outer
+    assert (low, high) == pytest.approx((beam, cutoff), rel=1.1e-3)
+    angle = np.radians(np.linspace(inner, outer, 5000, endpoint=False))
+    ramp = np.clip((np.radians(cutoff) - angle) / max(np.radians(cutoff - beam), 1e-9), 0, 1)
+    assert most == pytest.approx(np.abs(ramp - cone(**light["spot"])(angle)).max(), abs=0.006)
+
+
+def test_a_unit_sphere_whose_vertices_are_its_normals(export):
+    """One view of the buffer for both; whoever reads the file checks that it says its stride."""
+    model, _ = export(ior("ext", 1), f'<shape type="sphere" id="unit">{LAMP}</shape>')
+    places, normals, *_ = model.meshes["unit"]
+    assert (places == normals).all() and len({accessor["bufferView"] for accessor in model.tree["accessors"]}) < 6
+
+
+def test_a_lamp_that_gives_no_light(export):
+    """Its colour is not 0/0."""
+    model, _ = export(ior("ext", 1), '<emitter type="point"><rgb name="intensity" value="0"/></emitter>')
+    ((_, _, light),) = punctual(model.tree)
+    assert light == {"name": "point", "type": "point", "intensity": 0}
+
+
 PARTS = {
     "ball: int_ior = table(400: 1.5, 700: 1.6); expected an index that falls": ior("int", "table(400: 1.5, 700: 1.6)"),
     "int_ior = table(450: 1.6, 700: 1.5): no index at 400 nm; expected": ior("int", "table(450: 1.6, 700: 1.5)"),
@@ -166,6 +196,9 @@ PARTS = {
     "int_absorption = k.csv; expected an RGB colour": '<string name="int_absorption" value="k.csv"/>',
     "int_colour and int_colour_distance are not supported": '<float name="int_absorption" value="1"/>'
     + colour("int", "1, 1, 1"),
+    "lamp: cutoff_angle = 91 degrees; expected at most 90": ior("ext", 1)
+    + '</bsdf></shape><emitter type="spot" id="lamp"><float name="cutoff_angle" value="91"/></emitter>'
+    '<shape type="cube"><bsdf type="refract">',
     "ball: index 1.2 in 1.3; expected a glass of at least that": ior("int", 1.2) + ior("ext", 1.3),
 }
 

@@ -3,6 +3,7 @@
 The film is not square, the camera's `up` is not at right angles to where it looks, and the sky's map has no symmetry.
 """
 
+import dataclasses
 import json
 import os
 import re
@@ -23,11 +24,23 @@ from mi_refract.image_diff import methods
 from mi_refract.image_diff.comparison import Verdict
 from mi_refract.io import image_file
 from mi_refract.scene_export import from_mitsuba, targets, tessellation
-from mi_refract.scene_export.plain_scene import Camera, Diffuse, Environment, Glass, Light, Mesh, PlainScene
+from mi_refract.scene_export.plain_scene import (
+    Camera,
+    Diffuse,
+    DirectionalLamp,
+    Environment,
+    Glass,
+    Light,
+    Mesh,
+    PlainScene,
+    PointLamp,
+    SpotLamp,
+)
 
 SCENES = Path(__file__).parents[2] / "scenes"
 CAMERA = Camera((0.0, 0.0, 9.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, 8, 4)
 BALL = tessellation.sphere(0)
+UP = (0.0, 0.0, 1.0)
 GLASS, GREY, LAMP = Glass(1.5, 1.25), Diffuse((0.1, 0.2, 0.3)), Light((1.0, 2.0, 3.0))
 
 
@@ -62,6 +75,21 @@ def test_every_target_writes_its_folder(target, sky, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0", "1", "2"]
     page = (DOCS / "how-to/export-a-scene.md").read_text("utf-8")
     assert target in re.findall(r"^\| `(.*?)` \|", page, re.MULTILINE)
+
+
+LAMPS = PointLamp("bulb", UP, UP), SpotLamp("bulb", UP, UP, UP, 20.0, 20.0), DirectionalLamp("bulb", UP, UP)
+REFUSED = [(x, y) for x in LAMPS for y in targets.TARGETS if x.kind not in targets.HOLD_LAMPS.get(y, ())]
+
+
+@pytest.mark.parametrize("lamp, target", REFUSED)
+def test_a_lamp_that_a_target_does_not_hold_is_refused(lamp, target, tmp_path):
+    """It is not dropped: 4 targets hold no lamp without size, Cycles no spot."""
+    assert len(REFUSED) == 4 * 3 + 1
+    scene = dataclasses.replace(plain(GLASS), lamps=(lamp,))
+    what = f"a scene: bulb: a {lamp.kind} lamp is not exported to {target}; expected area lamps, an environment, or"
+    with pytest.raises(ValueError, match=rf"^{what} --to (cycles or )?mitsuba or obj\+json or gltf$"):
+        targets.write(scene, target, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
 
 
 def test_what_is_there_stays_and_an_empty_folder_is_taken(tmp_path):
@@ -185,6 +213,53 @@ def test_the_export_has_mitsubas_rays_surfaces_indices_lights_and_sky(
         expected.append(list(original.environment().eval(si)))
     tolerance = 1e-5 if sky == COLOUR else 0.5 * np.ptp(MAP) / 16
     np.testing.assert_allclose(found.sky(directions), expected, atol=tolerance)
+
+
+LIT = {
+    "bulb": """<emitter type="point" id="bulb"><point name="position" x="3" y="2" z="1"/>
+      <rgb name="intensity" value="3, 2, 0.5"/></emitter>""",
+    "soft": """<emitter type="spot" id="soft">
+      <transform name="to_world"><lookat origin="1,4,9" target="2,-1,0" up="0,0,1"/></transform>
+      <float name="cutoff_angle" value="35"/><float name="beam_width" value="20"/></emitter>""",
+    "sharp": """<emitter type="spot" id="sharp">
+      <transform name="to_world"><lookat origin="-5,0,2" target="0,0,0" up="0,1,0"/></transform>
+      <float name="cutoff_angle" value="50"/><float name="beam_width" value="90"/>
+      <rgb name="intensity" value="0, 0, 0.25"/></emitter>""",
+    "sun": """<emitter type="directional" id="sun"><vector name="direction" x="1" y="-2" z="-3"/>
+      <rgb name="irradiance" value="0.5, 4, 2"/></emitter>""",
+    "moon": """<emitter type="directional" id="moon">
+      <transform name="to_world"><rotate x="1" angle="100"/></transform></emitter>""",
+}
+
+
+@pytest.mark.parametrize("target", targets.HOLD_LAMPS)
+def test_lamps_without_size_light_what_mitsubas_light(target, tmp_path, monkeypatch, scalar_variant):
+    """At random places, from the same side with the same irradiance; but for the edge of a cone in glTF."""
+    lit = {name: text for name, text in LIT.items() if text.split('"')[1] in targets.HOLD_LAMPS[target]}
+    (tmp_path / "scene.xml").write_text(SCENE.replace('"1.1"', '"1.3"') % "".join([COLOUR, *lit.values()]))
+    targets.write(from_mitsuba.load(tmp_path / "scene.xml", level=0), target, tmp_path / "new")
+
+    def mitsubas(path):
+        def lit(emitter, point):
+            here = mi.Interaction3f(0, 0, mi.Color0f(), mi.Point3f(point))
+            found, weight = emitter.sample_direction(here, [0.5, 0.5])
+            return np.array(found.d), np.array(weight)
+
+        made = mi.load_file(str(path), parallel=False, optimize=False).emitters()
+        return {each.id(): lambda point, each=each: lit(each, point) for each in made if each.id() in LIT}
+
+    expected = mitsubas(tmp_path / "scene.xml")
+    mine = target == "mitsuba"
+    found = mitsubas(tmp_path / "new" / "scene.xml") if mine else READERS[target](tmp_path / "new", monkeypatch).lamps
+    assert found.keys() == expected.keys() == lit.keys()
+    edges = {"soft": ((1, -5, -9), 20, 35), "sharp": ((5, 0, -2), 49.95, 50)} if target == "gltf" else {}
+    for name, lamp in found.items():
+        axis, low, high = edges.get(name, ((0, 0, 1), 0, 0))
+        for point in np.random.default_rng(6).normal(size=(300, 3)) * 4:
+            (way, light), (expected_way, expected_light) = lamp(point), expected[name](point)
+            np.testing.assert_allclose(way, expected_way, atol=64 * SINGLE)
+            if not low < np.degrees(np.arccos(-way @ axis / np.linalg.norm(axis))) < high:
+                np.testing.assert_allclose(light, expected_light, rtol=1e-4, atol=1e-7)
 
 
 def test_the_plain_scene_renders_equal_and_another_index_would_be_seen(tmp_path):

@@ -20,6 +20,13 @@ class Vector(np.ndarray):
     def cross(self, other):
         return Vector(np.cross(self, other))
 
+    def to_track_quat(self, track, up):
+        """A rotation that takes −z to this direction."""
+        assert (track, up) == ("-Z", "Y")
+        back = -self.normalized()
+        right = Vector(np.cross(np.eye(3)[np.argmin(np.abs(back))], back)).normalized()
+        return SimpleNamespace(to_matrix=lambda: Vector(np.stack([right, np.cross(back, right), back], axis=1)))
+
     def transposed(self):
         return self.T
 
@@ -88,6 +95,7 @@ def installed(monkeypatch):
     bpy.ops.render.render = lambda write_still: bpy.rendered.append((scene.cycles.seed, scene.render.filepath))
     bpy.data.materials, bpy.data.worlds = named(node_tree=Tree), named(node_tree=Tree)
     bpy.data.meshes, bpy.data.cameras = named(materials=list, from_pydata=mock.Mock), named()
+    bpy.data.lights = named(kind=lambda kind: kind)
     bpy.data.objects = named(data=lambda data: data)
     monkeypatch.setitem(sys.modules, "bpy", bpy)
     monkeypatch.setitem(sys.modules, "mathutils", SimpleNamespace(Vector=Vector, Matrix=Vector))

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 import unicodedata
 
-BIDI = (
-    "".join(
-        c
-        for c in map(chr, range(sys.maxunicode + 1))
-        if unicodedata.bidirectional(c) in ("LRE", "RLE", "PDF", "LRO", "RLO", "LRI", "RLI", "FSI", "PDI")
-    )
-    + "\u061c\u200e\u200f"
-)  # all of Bidi_Control
+TURNING = ["LRE", "RLE", "PDF", "LRO", "RLO", "LRI", "RLI", "FSI", "PDI"]
+# All of Bidi_Control.
+BIDI = "\u061c\u200e\u200f" + "".join(filter(lambda c: unicodedata.bidirectional(c) in TURNING, map(chr, range(2**16))))
 CONTROLS = "".join(map(chr, (*range(32), *range(0x7F, 0xA0))))
-NAME = f"::error::a##[error]b##vso[task.x]\x1b[31m[red][/nothing]\udcff\uffff\u2028\u200b<script>&\"'`|{BIDI}"
+NAME = f"::error::\n::error::##[error]b##vso[task.x]\x1b[31m[red][/nothing]\udcff\uffff\u2028\u200b<script>&\"'`|{BIDI}"
 
 
 def shows_more_than_text(form: str, allowed: str = "\n") -> list[str]:

@@ -1,4 +1,4 @@
-"""Python code in a process of its own that imports the package from this checkout, and waiting for what it does."""
+"""Python code in a process of its own that imports the package from this checkout; what a command that fails prints."""
 
 from __future__ import annotations
 
@@ -23,6 +23,13 @@ def python(code: str, *arguments: object, **environment: str) -> subprocess.Pope
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
+
+
+def assert_refused(outcome: tuple[int, str, str], *messages: object) -> None:
+    """Of the fixture `run`: exit code 2, and nothing printed but one line on stderr that holds the messages."""
+    code, out, err = outcome
+    assert (code, out, err.count("\n")) == (2, "", 1) and err.startswith("mi-refract: ")
+    assert all(str(message) in err for message in messages), err
 
 
 def until(reached: Callable[[], Any], seconds: float = 60.0) -> None:

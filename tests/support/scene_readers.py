@@ -5,6 +5,7 @@ place in the image, from (0, 0) at its upper left corner to (1, 1). `Scene.sky(d
 """
 
 import json
+import math
 import re
 import struct
 import types
@@ -20,7 +21,10 @@ from mi_refract.io.image_file import read_exr
 
 @dataclass
 class Scene:
-    """A scene that was read. By mesh: its triangles, index inside over outside, radiance or reflectance."""
+    """A scene that was read. By mesh: its triangles, index inside over outside, radiance or reflectance.
+
+    By lamp without size: what it makes of a place, as `lamp` says.
+    """
 
     size: tuple[int, int]
     depth: int
@@ -30,6 +34,7 @@ class Scene:
     indices: dict = field(default_factory=dict)
     lights: dict = field(default_factory=dict)
     colours: dict = field(default_factory=dict)
+    lamps: dict = field(default_factory=dict)
 
 
 def unit(vector):
@@ -41,6 +46,20 @@ def pinhole(origin, ahead, up, wide, high):
     right = unit(np.cross(unit(ahead), up))
     upward = np.cross(right, unit(ahead))
     return lambda x, y: (np.asarray(origin), unit(ahead) + (2 * x - 1) * wide * right + (1 - 2 * y) * high * upward)
+
+
+def lamp(colour, place=None, direction=None, falloff=lambda angle: 1.0):
+    """A function of a place: the direction to the lamp, and the irradiance of a surface there that faces it.
+
+    `falloff`: of the angle from `direction`, in radians.
+    """
+
+    def lit(point):
+        away = -np.asarray(direction) if place is None else np.subtract(place, point)
+        angle = 0.0 if direction is None else np.arccos(np.clip(unit(direction) @ -unit(away), -1, 1))
+        return unit(away), np.array(colour) * falloff(angle) / (1 if place is None else away @ away)
+
+    return lit
 
 
 def linear(table, rows, columns):
@@ -228,6 +247,12 @@ def cycles(folder, monkeypatch):
         (path,) = bpy.data.images.load.call_args.args
         place = lambda x, y, z: (0.5 - np.arctan2(y, x) / (2 * np.pi), np.arccos(z) / np.pi)  # noqa: E731
         found.sky = on_map(path, place)
+    for name, made in data.lights.made.items():
+        placed, sun = data.objects.made[name], made.kind == "SUN"
+        assert placed.data is made and (made.angle if sun else made.shadow_soft_size) == 0
+        colour = np.multiply(made.color, made.energy) / (1 if sun else 4 * np.pi)  # W/m², or W in all directions
+        place = None if sun else placed.matrix_world[:3, 3]
+        found.lamps[name] = lamp(colour, place, -placed.matrix_world[:3, 2] if sun else None)
     for name, mesh in data.meshes.made.items():
         ((vertices, _, faces), _) = mesh.from_pydata.call_args
         found.triangles[name] = np.array(vertices)[np.array(faces)]
@@ -308,6 +333,12 @@ def obj(folder, monkeypatch):
         found.sky = on_map(folder / document["sky"]["environment"], place)
     else:
         found.sky = plain_sky(document["sky"]["radiance"])
+    for entry in document.get("lamps", []):
+        colour = entry["irradiance" if entry["type"] == "directional" else "intensity"]
+        cone = [math.radians(entry.get(f"{name}_degrees", 0)) for name in ("beam", "cutoff")]
+        falls = lambda angle, cone=cone: np.interp(angle, cone, [1, 0])  # noqa: E731
+        more = {"falloff": falls} if entry["type"] == "spot" else {}
+        found.lamps[entry["name"]] = lamp(colour, entry.get("position"), entry.get("direction"), **more)
     library, vertices = {}, []
     for part in (folder / "scene.mtl").read_text().split("newmtl ")[1:]:
         name, *lines = part.splitlines()
@@ -358,7 +389,9 @@ def model(tree, data):
         start = view["byteOffset"] + accessor.get("byteOffset", 0)
         return np.frombuffer(data, kind, accessor["count"] * width, start).reshape(-1, width)
 
-    found = Model(tree, {})
+    found, views = Model(tree, {}), [accessor["bufferView"] for accessor in tree.get("accessors", [])]
+    shared = {view for view in views if views.count(view) > 1}
+    assert all("byteStride" in tree["bufferViews"][view] for view in shared), "by the specification"
     for node in tree["nodes"]:
         if "mesh" in node:
             assert not {"matrix", "translation", "rotation", "scale"} & node.keys()
@@ -368,6 +401,23 @@ def model(tree, data):
             material = tree["materials"][part["material"]]
             found.meshes[node["name"]] = places, normals, indices.reshape(-1, 3), material
     return found
+
+
+def punctual(tree):
+    """Of the lights of KHR_lights_punctual: the name and the matrix of the node, and the entry."""
+    nodes = [tree["nodes"][i] for i in tree["scenes"][0]["nodes"]]
+    lit = [node for node in nodes if "KHR_lights_punctual" in node.get("extensions", {})]
+    lights = tree["extensions"]["KHR_lights_punctual"]["lights"] if lit else []
+    assert not lit or "KHR_lights_punctual" in tree["extensionsUsed"]
+    assert [node["extensions"]["KHR_lights_punctual"]["light"] for node in lit] == list(range(len(lights)))
+    matrices = (np.reshape(node["matrix"], (4, 4)).T for node in lit)
+    return [(node["name"], *rest) for node, *rest in zip(lit, matrices, lights, strict=True)]
+
+
+def cone(innerConeAngle, outerConeAngle):
+    """The sample of the extension."""
+    scale = 1 / max(0.001, math.cos(innerConeAngle) - math.cos(outerConeAngle))
+    return lambda angle: np.clip((np.cos(angle) - math.cos(outerConeAngle)) * scale, 0, 1) ** 2
 
 
 def gltf(folder, monkeypatch):
@@ -388,6 +438,13 @@ def gltf(folder, monkeypatch):
     place = lambda x, y, z: (0.5 + np.arctan2(z, x) / (2 * np.pi), np.arccos(y) / np.pi)  # noqa: E731
     sky = on_map(folder / "sky.exr", place)
     found = Scene((extras["width"], extras["height"]), extras["max_depth"], ray, sky)
+    for name, matrix, light in punctual(tree):
+        colour = np.multiply(light["color"], light["intensity"])
+        place, direction = (None if light["type"] == "directional" else matrix[:3, 3]), -matrix[:3, 2]
+        if light["type"] == "spot":
+            found.lamps[name] = lamp(colour, place, direction, cone(**light["spot"]))
+        else:
+            found.lamps[name] = lamp(colour, place, direction if place is None else None)
     for name, (places, _, faces, material) in read.meshes.items():
         found.triangles[name] = places[faces]
         more, base = material["extensions"], material["pbrMetallicRoughness"]

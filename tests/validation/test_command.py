@@ -235,6 +235,7 @@ def test_the_accuracy_table_holds_the_rows_and_nothing_else():
 # What each table must name.
 NAMED = {
     "accuracy": [*FORMULAS, "on a denormal"],
+    "on a GPU": [*FORMULAS, "ns per ray"],
     "renders": [path.stem for path in SCENES.glob("*.xml") if not beyond_builtin(path)],
     "paths": layered_paths.plugins(),
     "efficiency": [method.name for method in render_methods.METHODS],
@@ -251,7 +252,7 @@ NAMED = {
             if "glTF" not in number.name
         ),
         *(call.title for name, system in SYSTEMS.items() if name != "mi_refract" for call in system.calls),
-        *(title for title in IMAGE_RENDERERS if title != by_others.NOT_ASKED),
+        *(title for title in IMAGE_RENDERERS if title not in by_others.NOT_ASKED),
     ],
     "suite": [*(call.title for system in SYSTEMS.values() for call in system.calls), *IMAGE_RENDERERS],
 }
@@ -267,7 +268,11 @@ def test_a_page_holds_its_table_which_is_not_written_from_a_run_that_measured_to
     assert [word for word in NAMED[marker] if word not in written] == []
     images = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)
     assert all(((tables.ROOT / table.path).parent / name).is_file() for name in images)
-    with pytest.raises(ValueError, match=r"documentation: no .*"):
-        table.make([row(values={}, reason="not run")])
+    nothing = [row(values={}, reason="not run")]
+    if marker == "on a GPU":  # the table stays as it is
+        assert table.make(nothing) is None
+    else:
+        with pytest.raises(ValueError, match=r"documentation: no .*"):
+            table.make(nothing)
     assert (marker in tables.chosen([])) == (table.study != "suite")
     assert marker in tables.chosen([table.study])

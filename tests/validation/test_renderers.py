@@ -310,7 +310,8 @@ def test_cycles_reads_a_gltf_export_with_the_settings_of_its_own_one(tmp_path, m
     plain = exports.scene()
     images = IMAGE_RENDERERS["Cycles, glTF"].draw(plain, tmp_path, 3, [1, 2])
     assert [image.pixels[0, 0, 0] for image in images] == [1, 2]
-    bpy.ops.import_scene.gltf.assert_called_with(filepath=str(tmp_path / "scene" / "scene.glb"))
+    file = str(tmp_path / "scene" / "scene.glb")
+    bpy.ops.import_scene.gltf.assert_called_with(filepath=file, export_import_convert_lighting_mode="COMPAT")
     bpy.data.images.load.assert_called_with(str(tmp_path / "scene" / "sky.exr"))
     scene = bpy.context.scene
     assert scene.camera is camera and camera.data.clip_end >= 1e6

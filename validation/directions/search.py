@@ -122,7 +122,7 @@ def climb(
         score = np.where(inside, score, -np.inf)
         best = score.reshape(-1, CHILDREN).argmax(1) + rows * CHILDREN
         # A child as bad as its parent replaces it: a plateau is crossed at random.
-        taken = score[best] >= herd.score
+        taken = inside[best] & (score[best] >= herd.score)
         rays = Rays.joined([herd.rays, children[best]])[np.where(taken, len(herd) + rows, rows)]
         herd = Herd(rays, herd.regime, herd.decision, np.where(taken, score[best], herd.score), names)
     return herd

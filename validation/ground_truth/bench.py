@@ -148,6 +148,8 @@ def _through(
         directions.append(onward)
         ray = si.spawn_ray(onward) if spawned else mi.Ray3f(dr.fma(STEP, onward, si.p), onward)
         ray.o.z -= boundary.thickness
+        if dr.backend_v(ray.o) == dr.JitBackend.CUDA:  # OptiX traces the rays of a kernel in one scene
+            dr.eval(ray, places, directions)
     dr.eval(places, directions)
     return np.array([[np.array(x, np.longdouble) for x in vectors] for vectors in (places, directions)])
 

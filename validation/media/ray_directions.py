@@ -16,7 +16,7 @@ import numpy as np
 
 from mi_refract import media, oracle
 from mi_refract.accuracy import BUDGETS, RayBounds, evaluate, judge
-from mi_refract.formulas import FORMULAS, resolve
+from mi_refract.formulas import AUTOMATIC, FORMULAS
 from mi_refract.media import Medium
 from mi_refract.plugins.refract import followed_context
 from mi_refract.regimes import Rays
@@ -114,11 +114,10 @@ def sampled_row(medium: Medium, spec: str, count: int) -> Row:
         si.wavelengths = type(si.wavelengths)(mi.Float(drawn.wavelengths.astype(np.float32)))
         bs, weight = bsdf.sample(asked, si, 0.5, [0.5, 0.5])
         b, transmitted = np.array(bs.wo, float).T.astype(np.longdouble), np.array(weight, float)[0] > 0
-        formula, _ = resolve("auto", dr.backend_v(mi.Float))
     k = drawn.rays.k
     rounding = (k.astype(np.float32).astype(float) - k)[:, None] * drawn.rays.a * [1, 1, 0]
-    values = judged(b - rounding, transmitted, drawn.rays, formula, 2.0**-24)
-    values["with the ratio in float32"] = judged(b, transmitted, drawn.rays, formula, 2.0**-24)["worst / u"]
+    values = judged(b - rounding, transmitted, drawn.rays, AUTOMATIC, 2.0**-24)
+    values["with the ratio in float32"] = judged(b, transmitted, drawn.rays, AUTOMATIC, 2.0**-24)["worst / u"]
     replay = drawn.replay | {"int_ior": spec}
     return Row(NAME, SUBJECTS.get(spec, spec), "refract", SPECTRAL, values, dict(BUDGETS), replay=replay)
 

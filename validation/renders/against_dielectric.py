@@ -28,7 +28,7 @@ from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing
-from validation.run.array_settings import right_plugins
+from validation.run.array_settings import RIGHT_PLUGINS
 from validation.run.context import NO_REFERENCE, Context
 from validation.run.metrics import (
     CHANGED_SHARE,
@@ -131,7 +131,7 @@ def _timed(
 
     # Both forms at the rounding limit are timed, whichever of them is the default; `quick` saves kernels.
     profile = context.profile
-    others = right_plugins() if plugin == PLUGIN and not profile.quick else []
+    others = RIGHT_PLUGINS if plugin == PLUGIN and not profile.quick else []
     cameras = cameras | {name: Camera(opened(path, name, profile.resolution)) for name in others}
     _, seconds = cameras[BUILTIN](profile.spp, seed=0)
     spp = profile.spp

@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.accuracy import Subject
-from mi_refract.formulas import FORMULAS, Budget, automatic
+from mi_refract.formulas import AUTOMATIC, FORMULAS, Budget
 from mi_refract.plugins import PLUGIN
 from mi_refract.regimes import REGIMES
 
@@ -18,6 +18,7 @@ from .context import Context
 
 BUILTIN = "mi.fresnel + mi.refract"
 DOCUMENTED = tuple(name for name, formula in FORMULAS.items() if not formula.budget.at_the_limit)
+RIGHT_PLUGINS = tuple(f"{PLUGIN}_{name}" for name in FORMULAS if name not in (*DOCUMENTED, AUTOMATIC))
 PLAIN = "decomposed"  # the common form, which the built-in shares: its radicand cancels as the built-in's does
 
 
@@ -62,11 +63,11 @@ class Setting:
 
     @functools.cached_property
     def flushes(self) -> bool:
-        """Whether denormal numbers are taken for 0, which Dr.Jit's threads do. This is tested, not assumed."""
+        """Whether sums take denormal numbers for 0: Dr.Jit's threads do, and float32 on CUDA. Tested, not assumed."""
         if self.is_scalar:
             return False
-        least = np.full(1 << 16, np.finfo(self.precision).smallest_subnormal)
-        return not np.array(dr.value_t(self.vector)(least) > 0).all()
+        least = dr.value_t(self.vector)(np.full(1 << 16, np.finfo(self.precision).smallest_subnormal))
+        return not np.array(least + least > 0).all()
 
     def no_budget(self, budget: Budget, regime: str) -> str:
         """Why a formula has no budget in a regime; "" where it is."""
@@ -100,13 +101,6 @@ def settings(context: Context) -> list[Setting]:
 def running(context: Context) -> list[Setting]:
     """Those that run here."""
     return [setting for setting in settings(context) if setting.vector is not None]
-
-
-def right_plugins() -> list[str]:
-    """The plugins at the rounding limit whose formula is not the default's in the present variant."""
-    import mitsuba as mi
-
-    return [f"{PLUGIN}_{name}" for name in FORMULAS if name not in (*DOCUMENTED, automatic(dr.backend_v(mi.Float)))]
 
 
 def budget_of(subject: str) -> Budget:

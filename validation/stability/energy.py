@@ -16,7 +16,7 @@ import numpy as np
 
 from mi_refract import oracle, regimes
 from mi_refract.accuracy import lengths
-from mi_refract.formulas import fresnel, resolve
+from mi_refract.formulas import AUTOMATIC, FORMULAS, fresnel
 from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.closed_forms import GRADE, hemispherical, nodes
@@ -179,7 +179,7 @@ def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray
     a: Any = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cos_i], axis=1).astype(setting.precision)
     n: Any = np.tile(np.array([[0, 0, 1]], setting.precision), (len(k), 1))
     exact = oracle.refract(a, n, k, progress=False)
-    formula = resolve("auto", dr.backend_v(setting.vector))[1]
+    formula = FORMULAS[AUTOMATIC]
 
     widened: Any = dr.float64_array_t(dr.value_t(setting.vector))
 

@@ -27,7 +27,7 @@ from mi_refract.rendering import scene_files
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import seeds
-from validation.run.array_settings import DOCUMENTED, right_plugins
+from validation.run.array_settings import DOCUMENTED, RIGHT_PLUGINS
 from validation.run.bsdf_sampling import OFFSET
 from validation.run.context import SCENES, Context
 from validation.run.metrics import BUILTIN_OFF_EXACT, OFF_EXACT, WRONG_PATH
@@ -390,7 +390,7 @@ def view_rows(context: Context, scene: str, parameters: dict[str, Any], name: st
     """`refract` and the built-in, image against image; and what flipped lobes alone do, as a control."""
     if context.variant.startswith("scalar"):
         return [Row(NAME, PLUGIN, f"{name}: image", context.variant, reason=SCALAR)]
-    profile, right, exact = context.profile, right_plugins()[0], name == VIEWS[0][-1]
+    profile, right, exact = context.profile, RIGHT_PLUGINS[0], name == VIEWS[0][-1]
     spp, plugins = EXACT_SPP if exact else max(1, profile.spp // 4), (BUILTIN, PLUGIN, right)
     path = SCENES / f"{scene}.xml"
     scenes = {plugin: opened(path, plugin, profile.resolution, **parameters) for plugin in plugins}

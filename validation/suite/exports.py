@@ -1,12 +1,13 @@
 """Exports: what is written for another renderer, rendered by it on 16 × 9 pixels, is Mitsuba's image of the same scene.
 
 Nothing in the scene is symmetric: four balls of different glass under a turned sky, a lamp and a coloured patch (which
-POV-Ray is not given: it has glass and lights only), a tilted camera, a film that is not square. The renderers read what
-users get: the exported files, and the options in the exported README.txt. The images are some renders a side; their
-RMSE may be twice what the spread between renders predicts, and 1 % of the mean. A camera, a sky or an index that is
-wrong exceeds that many times.
+POV-Ray is not given: it has glass and lights only), for Cycles also a point and a directional lamp, a tilted camera, a
+film that is not square. The renderers read what users get: the exported files, and the options in the exported
+README.txt. The images are some renders a side; their RMSE may be twice what the spread between renders predicts, and
+1 % of the mean. A camera, a sky or an index that is wrong exceeds that many times.
 
-Khronos' `gltf-validator` reads the glTF export of each scene of `scenes/` that glTF can hold.
+Khronos' `gltf-validator` reads the glTF export of each scene of `scenes/` that glTF can hold, and of one with lamps
+without size and a unit sphere, whose vertices are its normals.
 """
 
 from __future__ import annotations
@@ -14,19 +15,31 @@ from __future__ import annotations
 import dataclasses
 import functools
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from mi_refract.report.row import Row
-from mi_refract.scene_export import from_mitsuba, targets
-from mi_refract.scene_export.plain_scene import Camera, Diffuse, Light, Material, Mesh, PlainScene
+from mi_refract.scene_export import from_mitsuba, targets, tessellation
+from mi_refract.scene_export.plain_scene import (
+    Camera,
+    Diffuse,
+    DirectionalLamp,
+    Glass,
+    Light,
+    Material,
+    Mesh,
+    PlainScene,
+    PointLamp,
+    SpotLamp,
+)
 from validation import limits
 from validation.run.context import SCENES, Context
 from validation.study import Study, Task, about
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
-from .rendered_images import RENDERS, THREE, askew, by_plugin, why_not
+from .rendered_images import RASTER, RENDERS, THREE, askew, by_plugin, why_not
 from .renderers import SYSTEMS, environments
 from .renderers.system import SCRIPTS
 
@@ -42,9 +55,12 @@ TERMS = {
     NOISE: "the predicted noise of the difference of the two means",
     ERRORS: "of both files, `scene.glb` and `scene.gltf`; so are the warnings, a goal",
 }
-LEFT_OUT = {THREE: "it counts the light of the sky twice, see the study of images; without MIS it is here"} | {
-    title: "it is the reference" for title, renderer in IMAGE_RENDERERS.items() if renderer.system == "mitsuba"
-}
+# What is in the scene for a renderer, if not all but lamps without size.
+SHOWN = {"POV-Ray": "no patch", "Cycles": "lamps", "Cycles, glTF": "lamps"}
+LEFT_OUT = {
+    THREE: "it counts the light of the sky twice, see the study of images; without MIS it is here",
+    RASTER: "it traces no paths, see the study of images",
+} | {title: "it is the reference" for title, renderer in IMAGE_RENDERERS.items() if renderer.system == "mitsuba"}
 THEIRS = {
     "POV-Ray": 256,
     "Cycles": 512,
@@ -54,14 +70,26 @@ THEIRS = {
 }  # samples a pixel and render; others 256
 
 
-def scene(diffuse: bool = True) -> PlainScene:
-    """The balls of `balls`, seen from another place, with a lamp; `diffuse`: and with a patch."""
+def scene(shown: str = "") -> PlainScene:
+    """The balls of `balls`, seen from another place, with a lamp and a patch. `shown`: one of SHOWN."""
     balls = from_mitsuba.load(SCENES / "balls.xml", level=2)
     camera = Camera((30.0, 15.0, 240.0), (3.0, -4.0, 0.0), (0.3, 1.0, 0.2), 48.0, *SIZE)
     extra = [_quad("lamp", (-100.0, 22.0), (-72.0, 50.0), Light((3.0, 2.0, 1.0)))]
-    if diffuse:
+    if shown != "no patch":
         extra.append(_quad("patch", (70.0, -50.0), (105.0, 10.0), Diffuse((0.2, 0.5, 0.9))))
-    return dataclasses.replace(balls, name="balls", meshes=(*balls.meshes, *extra), sky=askew(), camera=camera)
+    meshes, bulb = (*balls.meshes, *extra), PointLamp("bulb", (60.0, 0.0, 80.0), (6000.0, 3000.0, 9000.0))
+    lamps = (bulb, DirectionalLamp("sun", (0.0, 0.6, -0.8), (1.0, 3.0, 2.0))) if shown == "lamps" else ()
+    return dataclasses.replace(balls, name="balls", meshes=meshes, sky=askew(), camera=camera, lamps=lamps)
+
+
+def lit() -> PlainScene:
+    """A unit sphere of glass, and a lamp without size of each kind."""
+    vertices, faces = tessellation.sphere(LEVEL)
+    ball, place, ahead = Mesh("ball", vertices, faces, Glass(1.5, 1.0), vertices), (1.0, 2.0, 3.0), (0.0, 0.6, -0.8)
+    lamps = PointLamp("point", place, place), DirectionalLamp("sun", ahead, place)
+    spots = (SpotLamp(f"spot{beam:g}", place, place, ahead, beam, 30.0) for beam in (0.0, 20.0, 30.0))
+    camera = Camera((0.0, 0.0, 9.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, *SIZE)
+    return PlainScene("lamps", (ball,), (0.0, 0.0, 0.0), camera, 8, (*lamps, *spots))
 
 
 def _quad(name: str, low: tuple[float, float], high: tuple[float, float], material: Material) -> Mesh:
@@ -85,7 +113,7 @@ def rows(context: Context, title: str) -> list[Row]:
     theirs, nothing = environments.attempt(row, why_not(system, context), lost, lambda: drawn(title))
     if theirs is None:
         return nothing
-    values, budgets = compared(reference(diffuse=title != "POV-Ray"), theirs), {OVER: 1.0, NOISE: limits.EXPORT_NOISE}
+    values, budgets = compared(reference(SHOWN.get(title, "")), theirs), {OVER: 1.0, NOISE: limits.EXPORT_NOISE}
     replay = {"renderer": system.source, "spp": THEIRS.get(title, 256), "reference spp": SPP, "seeds": [*SEEDS]}
     return [row(values, budgets, replay=replay)]
 
@@ -93,14 +121,15 @@ def rows(context: Context, title: str) -> list[Row]:
 def validated(context: Context) -> list[Row]:
     """What Khronos' validator says of the glTF exports: a row per scene; not run, where glTF cannot hold it."""
     system, result = SYSTEMS[VALIDATOR], []
-    for path in sorted(SCENES.glob("*.xml")):
-        row = functools.partial(Row, NAME, system.title, path.stem, "glTF")
+    paths = sorted(SCENES.glob("*.xml"))
+    scenes = {path.stem: functools.partial(from_mitsuba.load, path, level=LEVEL) for path in paths} | {"lamps": lit}
+    for name, load in scenes.items():
+        row = functools.partial(Row, NAME, system.title, name, "glTF")
 
-        def counts(path: Path = path) -> dict[str, float]:
+        def counts(load: Callable[[], PlainScene] = load) -> dict[str, float]:
             with tempfile.TemporaryDirectory() as folder:
                 try:
-                    plain = from_mitsuba.load(path, level=LEVEL)
-                    made = targets.write(plain, "gltf", Path(folder) / "scene")
+                    made = targets.write(load(), "gltf", Path(folder) / "scene")
                 except ValueError as why:
                     raise environments.Unable(str(why)) from None
                 files = [str(file) for file in made if file.suffix in (".glb", ".gltf")]
@@ -119,15 +148,14 @@ def validated(context: Context) -> list[Row]:
 def drawn(title: str) -> np.ndarray:
     """Renders by another renderer: renders × height × width × 3."""
     with tempfile.TemporaryDirectory() as folder:
-        plain = scene(diffuse=title != "POV-Ray")
-        images = IMAGE_RENDERERS[title].draw(plain, Path(folder), THEIRS.get(title, 256), SEEDS)
+        images = IMAGE_RENDERERS[title].draw(scene(SHOWN.get(title, "")), Path(folder), THEIRS.get(title, 256), SEEDS)
     return np.stack([image.pixels for image in images]).astype(np.float64)
 
 
 @functools.cache
-def reference(diffuse: bool) -> np.ndarray:
+def reference(shown: str) -> np.ndarray:
     """Renders by this plugin, in the present variant: renders × height × width × 3."""
-    return np.stack(by_plugin(scene(diffuse), SPP)).astype(np.float64)
+    return np.stack(by_plugin(scene(shown), SPP)).astype(np.float64)
 
 
 def compared(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:

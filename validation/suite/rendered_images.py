@@ -130,10 +130,10 @@ def askew() -> Environment:
     return Environment(pixels.astype(np.float32), np.array(first) @ np.array(second))
 
 
-THREE, PTRACER = "three-gpu-pathtracer", "Mitsuba, ptracer"
+THREE, RASTER, PTRACER = "three-gpu-pathtracer", "three, MeshPhysicalMaterial", "Mitsuba, ptracer"
 SCENES = {
     "sphere": Scene(functools.partial(_scene, "sphere"), (PTRACER,)),
-    "prism": Scene(functools.partial(_scene, "prism"), (THREE,)),
+    "prism": Scene(functools.partial(_scene, "prism"), (THREE, RASTER)),
     "environment": Scene(environment),
     "furnace": Scene(furnace, (THREE,)),
     "caustic": Scene(caustic, more=4),
@@ -142,6 +142,8 @@ SCENES = {
 WHY = {
     THREE: "its shadow rays to the sky pass straight through glass, beside the refracted rays that find the same sky, "
     "so that this light counts twice; see the same without multiple importance sampling (MIS)",
+    RASTER: "a surface that emits lights nothing, the sky has no shadows, and a ray is refracted once, at the first "
+    "surface, and shows what the image without glass has thicknessFactor farther",
     PTRACER: "no path from a lamp is joined with the camera behind smooth glass, so that the ball is black",
 }
 

@@ -48,7 +48,7 @@ from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND
 from validation.study import Study, Task, about
 
-from .rendered_images import COMPILED
+from .rendered_images import COMPILED, PTRACER, RASTER
 from .renderers import SYSTEMS, System, environments
 from .renderers.glass_catalogues import CATALOGUES, GlassCatalogue
 from .renderers.image_renderers import IMAGE_RENDERERS
@@ -68,7 +68,7 @@ SEEDS, SPP, PIXELS = 8, 16, 64
 FIELD = 0.2  # degrees
 HALF_FLOAT = 2.0**-12  # relative
 THICK, WIDE = 100.0, 3000.0  # of plates
-NOT_ASKED = "Mitsuba, ptracer"  # sees no lamp through glass
+NOT_ASKED = PTRACER, RASTER  # see no lamp through plates
 DEPTH = 64
 RAYS, IMAGES = ("deviation", "rainbow", "double Gauss", "critical angle"), "transmittance, unpolarised"
 
@@ -85,7 +85,7 @@ class Fresnel(NamedTuple):
 FRESNEL = {
     "Mitsuba, mi.fresnel_polarized": Fresnel("mitsuba", ("mitsuba_fresnel.py",), "f32", ("s", "p", "phase")),
     "optiland, JonesFresnel": Fresnel("optiland", ("optiland_fresnel.py",), "f64", ("s", "p", "phase")),
-    "MaterialX, mx_fresnel_dielectric_polarized": Fresnel("materialx", ("materialx_fresnel.py",), "f32", ("s", "p")),
+    "MaterialX, mx_fresnel_*_polarized": Fresnel("materialx", ("materialx_fresnel.py",), "f32", ("s", "p", "phase")),
     "Radiance, rtrace": Fresnel("radiance", ("radiance_rays.py", "fresnel"), "f32", ("mean",)),
 }
 Refract = Callable[[RaySet], Answers]
@@ -119,7 +119,7 @@ def tasks(context: Context) -> list[Task]:
     images = [
         Task(f"{NAME}: images of {title}", functools.partial(image_rows, title, context))
         for title in IMAGE_RENDERERS
-        if title != NOT_ASKED
+        if title not in NOT_ASKED
     ]
     return [*rays, *glasses, *powers, *images]
 

@@ -29,6 +29,9 @@ TARGETS: dict[str, Callable[[PlainScene], Files]] = {
     "gltf": gltf.files,
 }
 HOLD_VOLUMES = ("gltf",)  # dispersion and absorption
+# Lamps without size: glTF has no falloff of its own for a spot's edge, which its README.txt says; Blender has another.
+ALL_LAMPS = ("point", "spot", "directional")
+HOLD_LAMPS = {"cycles": ("point", "directional"), "mitsuba": ALL_LAMPS, "obj+json": ALL_LAMPS, "gltf": ALL_LAMPS}
 
 
 def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> list[Path]:
@@ -50,6 +53,12 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
         if isinstance(mesh.material, VolumeGlass) and target not in HOLD_VOLUMES:
             expected = f"one number for all wavelengths and no absorption, or --to {' or '.join(HOLD_VOLUMES)}"
             raise ValueError(f"{plain.name}: {mesh.name}: {mesh.material.said}; expected {expected}")
+    for lamp in plain.lamps:
+        if lamp.kind not in HOLD_LAMPS.get(target, ()):
+            what = f"a {lamp.kind} lamp is not exported to {target}"
+            able = [name for name, kinds in HOLD_LAMPS.items() if lamp.kind in kinds]
+            expected = f"area lamps, an environment, or --to {' or '.join(able)}"
+            raise ValueError(f"{plain.name}: {lamp.name}: {what}; expected {expected}")
     files = TARGETS[target](plain)
     with safe_files.replacing(place, folder=True) as temporary:
         for name, content in files.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -16,16 +17,20 @@ from ..plain_scene import (
     LINES,
     WAVELENGTHS,
     Diffuse,
+    DirectionalLamp,
     Environment,
     Glass,
+    Lamp,
     Light,
     Material,
     Mesh,
     PlainScene,
+    PointLamp,
+    SpotLamp,
     VolumeGlass,
 )
 from ..tessellation import Vertices, encloses, is_closed
-from .shared_files import LIGHT_INSIDE, Axes, Files, exr, outermost_index, outward, readme, sky_exr, turned
+from .shared_files import LIGHT_INSIDE, Axes, Files, exr, frame, outermost_index, outward, readme, sky_exr, turned
 
 COMMANDS = """
 scene.glb     all of the scene but its sky, in one file
@@ -39,8 +44,7 @@ ASSUMPTIONS = (
     "right of it turn to +z, as in the equirectangular maps of three.js, and in Blender after its import.",
     "Indices are relative to the medium around all glass, {outside!r}, because glTF has 1 there.",
     "thicknessFactor is 4 V/S, the mean chord of a convex body. A path tracer does not use it, only that it is not 0.",
-    "A radiance of 1 is one candela per square metre there, and a unit of the scene is one metre. Nothing is a light "
-    "of KHR_lights_punctual: what is exported has none.",
+    "A radiance of 1 is one candela per square metre there, and a unit of the scene is one metre.",
     "A light that is open has a black back, {offset:.3g} behind it: renderers disagree on what the back of a one-sided "
     "light shows.",
     "Diffuse surfaces have specularFactor = 0 and ior = 1. A renderer that ignores both gives them a glossy coat.",
@@ -52,6 +56,8 @@ BACK = 1e-5  # of the lamp's largest coordinate: some hundred roundoffs of float
 # Of 1/σ, the distance of attenuationColor c: Blender takes σ = (1 − c)/distance for −log(c)/distance, off by SHORT/2;
 # c rounded to float32 is off by 2^-24/SHORT in σ.
 SHORT = 2.0**-10
+PUNCTUAL = "KHR_lights_punctual"
+EDGE = 1e-3  # of a spot's angle: glTF has no sharp edge
 LEAST_NEAR = 1e-6  # the near plane of a camera that lies on a surface
 
 
@@ -62,6 +68,10 @@ def files(plain: PlainScene) -> Files:
         from trimesh.exchange import gltf
     except ModuleNotFoundError:
         raise MissingExtraError("glTF needs trimesh: pip install 'mi-refract[gltf]'") from None
+    for lamp in plain.lamps:
+        if isinstance(lamp, SpotLamp) and lamp.cutoff_degrees > 90:
+            wide = f"cutoff_angle = {lamp.cutoff_degrees:g} degrees"
+            raise ValueError(f"{plain.name}: {lamp.name}: {wide}; expected at most 90, as glTF has it")
     plain = outward(plain)
     outside = outermost_index(plain)
     turned = (_around_glass(plain, mesh, outside) for mesh in plain.meshes)
@@ -94,19 +104,33 @@ def files(plain: PlainScene) -> Files:
         tree["asset"]["generator"] = f"mi_refract {__version__} by trimesh {trimesh.__version__}"
         tree["cameras"] = [{"name": "camera", "type": "perspective", "perspective": view}]
         for mesh, made in zip(shown, tree.get("meshes", []), strict=True):
-            made["primitives"][0]["material"] = materials.index(mesh.material)
+            (part,) = made["primitives"]
+            part["material"] = materials.index(mesh.material)
+            for accessor in part["attributes"].values():  # which share a view where their numbers are the same
+                tree["bufferViews"][tree["accessors"][accessor]["bufferView"]]["byteStride"] = 12
         if materials:
             tree["materials"] = [_material(f"material{i}", each, meshes) for i, each in enumerate(materials)]
-            tree["extensionsUsed"] = sorted({name for entry in tree["materials"] for name in entry["extensions"]})
+        used = {name for entry in tree.get("materials", []) for name in entry["extensions"]}
+        if plain.lamps:
+            tree["extensions"] = {PUNCTUAL: {"lights": [_punctual(lamp) for lamp in plain.lamps]}}
+            count = len(tree["nodes"])
+            tree["scenes"][0]["nodes"] += range(count, count + len(plain.lamps))
+            tree["nodes"] += [_placed(i, lamp) for i, lamp in enumerate(plain.lamps)]
+            used.add(PUNCTUAL)
+        if used:
+            tree["extensionsUsed"] = sorted(used)
 
     single: bytes = gltf.export_glb(scene, include_normals=True, tree_postprocessor=complete)
-    several: Files = gltf.export_gltf(scene, include_normals=True, merge_buffers=True, tree_postprocessor=complete)
-    several["scene.gltf"] = several.pop("model.gltf")
+    start, end = 20, 20 + int.from_bytes(single[12:16], "little")  # of the JSON, by the specification
+    tree = json.loads(single[start:end])
+    tree.get("buffers", [{}])[0]["uri"] = "gltf_buffer.bin"
+    several = {"scene.gltf": json.dumps(tree, separators=(",", ":")).encode(), "gltf_buffer.bin": single[end + 8 :]}
     sky = sky_exr(plain, SKY_AXES)
     if not isinstance(plain.sky, Environment) and any(plain.sky):
         sky = {"sky.exr": exr(np.full((4, 8, 3), plain.sky, np.float32))}
     values = {"depth": plain.max_depth, "width": camera.width, "height": camera.height, "outside": outside}
     said = [text.format(**values, offset=max(lamps.values(), default=0.0)) for text in ASSUMPTIONS] + _said(meshes)
+    said += _said_of_lamps(plain.lamps)
     return several | sky | {"scene.glb": single, "README.txt": readme(plain, "a glTF renderer", COMMANDS, said, "")}
 
 
@@ -233,6 +257,31 @@ def _material(name: str, material: Material, meshes: Iterable[Mesh]) -> dict[str
     return entry
 
 
+def _punctual(lamp: Lamp) -> dict[str, Any]:
+    """An entry of "lights": 1 W/sr is one candela, 1 W/m² one lux, as a radiance of 1 is one candela per m²."""
+    assert isinstance(lamp, PointLamp | DirectionalLamp)
+    colour = lamp.irradiance if isinstance(lamp, DirectionalLamp) else lamp.intensity
+    strength = max(colour)
+    entry = {"name": lamp.name, "type": lamp.kind, "intensity": strength}
+    if strength:
+        entry["color"] = [x / strength for x in colour]
+    if isinstance(lamp, SpotLamp):
+        inner, outer = map(math.radians, _cone(lamp))
+        entry["spot"] = {"innerConeAngle": inner, "outerConeAngle": outer}
+    return entry
+
+
+def _placed(index: int, lamp: Lamp) -> dict[str, Any]:
+    """The node of a lamp, which shines along its −z."""
+    matrix = frame(lamp) * [1, -1, -1, 1]
+    return {"name": lamp.name, "matrix": matrix.T.ravel().tolist(), "extensions": {PUNCTUAL: {"light": index}}}
+
+
+def _cone(lamp: SpotLamp) -> tuple[float, float]:
+    """The angles between which the intensity falls, in degrees."""
+    return min(lamp.beam_degrees, (1 - EDGE) * lamp.cutoff_degrees), lamp.cutoff_degrees
+
+
 def _abbe(material: VolumeGlass) -> float:
     """V = (n_d − 1)/(n_F − n_C) of the index relative to the medium around; infinite without dispersion."""
     f, d, c = material.spectrum[: len(LINES)]
@@ -260,6 +309,30 @@ def _said(meshes: Sequence[Mesh]) -> list[str]:
             said.append(
                 f"{name}: {material.said} becomes Abbe's number {v:.4g}, because glTF has no other formula. From 400 "
                 f"to 700 nm its index differs from the scene's by up to {np.abs(theirs - n).max():.2g}."
+            )
+    return said
+
+
+def _said_of_lamps(lamps: Sequence[Lamp]) -> list[str]:
+    """What README.txt says of lamps without size: their units, and what their cones become."""
+    if not lamps:
+        return []
+    said = [
+        "Lamps without size are those of KHR_lights_punctual, without a range: 1 W/sr of Mitsuba's is one candela, "
+        "1 W/m^2 one lux. Blender's importer has them as bright as lamps with a size in its lighting mode Unitless "
+        "(COMPAT) only; its Standard mode divides them by 683."
+    ]
+    for lamp in lamps:
+        if isinstance(lamp, SpotLamp):
+            inner, outer = _cone(lamp)
+            angle = np.linspace(inner, outer, 1001)
+            ours = np.interp(angle, [lamp.beam_degrees, outer], [1, 0])
+            cosine, low, high = (np.cos(np.radians(x)) for x in (angle, outer, inner))
+            theirs = np.clip((cosine - low) / max(0.001, high - low), 0, 1) ** 2  # the extension's sample
+            said.append(
+                f"{lamp.name}: from {inner:.6g} to {outer:g} degrees glTF leaves the falloff to the renderer. That of "
+                f"the extension's sample differs from the scene's by up to {np.abs(theirs - ours).max():.2g} of the "
+                "intensity."
             )
     return said
 

@@ -6,8 +6,18 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from ..plain_scene import Colour, Diffuse, Environment, Glass, PlainScene
-from .shared_files import Files, exr, numbers, ply_files, readme
+from ..plain_scene import (
+    Colour,
+    Diffuse,
+    DirectionalLamp,
+    Environment,
+    Glass,
+    Lamp,
+    PlainScene,
+    PointLamp,
+    SpotLamp,
+)
+from .shared_files import Array, Files, exr, frame, numbers, ply_files, readme
 
 COMMANDS = "mi-refract render scene.xml -o image.exr --spp 1024        (-D bsdf=dielectric for Mitsuba's own glass)"
 SCENE = """<scene version="3.0.0">
@@ -41,7 +51,7 @@ SCENE = """<scene version="3.0.0">
         </film>
     </sensor>
 {shapes}
-{sky}
+{sky}{lamps}
 </scene>
 """
 SHAPE = """
@@ -69,16 +79,32 @@ def files(plain: PlainScene) -> Files:
         shapes.append(SHAPE.format(name=quoteattr(mesh.name), file=quoteattr(f"{mesh.name}.ply"), plugin=plugin))
     sky, own = "", {}
     if isinstance(plain.sky, Environment):
-        matrix = np.eye(4)
-        matrix[:3, :3] = plain.sky.rotation
-        turn = f'<transform name="to_world"><matrix value="{numbers(matrix.ravel())}"/></transform>'
-        sky = f'\n    <emitter type="envmap"><string name="filename" value="sky.exr"/>{turn}</emitter>'
+        turn = np.eye(4)
+        turn[:3, :3] = plain.sky.rotation
+        sky = f'\n    <emitter type="envmap"><string name="filename" value="sky.exr"/>{_to_world(turn)}</emitter>'
         own = {"sky.exr": exr(plain.sky.pixels)}
     elif any(plain.sky):
         sky = f'\n    <emitter type="constant">{_rgb("radiance", plain.sky)}</emitter>'
-    text = SCENE.format(camera=camera, max_depth=plain.max_depth, shapes="\n".join(shapes), sky=sky, **vectors)
+    more = {"shapes": "\n".join(shapes), "sky": sky, "lamps": "".join(map(_lamp, plain.lamps))}
+    text = SCENE.format(camera=camera, max_depth=plain.max_depth, **more, **vectors)
     own |= {"scene.xml": text.encode(), "README.txt": readme(plain, "Mitsuba", COMMANDS, ())}
     return ply_files(plain) | own
+
+
+def _lamp(lamp: Lamp) -> str:
+    said = _to_world(frame(lamp))
+    if isinstance(lamp, PointLamp):
+        said += _rgb("intensity", lamp.intensity)
+    if isinstance(lamp, DirectionalLamp):
+        said += _rgb("irradiance", lamp.irradiance)
+    if isinstance(lamp, SpotLamp):
+        angles = {"cutoff_angle": lamp.cutoff_degrees, "beam_width": lamp.beam_degrees}
+        said += "".join(f'<float name="{name}" value="{angle!r}"/>' for name, angle in angles.items())
+    return f'\n    <emitter type="{lamp.kind}" id={quoteattr(lamp.name)}>{said}</emitter>'
+
+
+def _to_world(matrix: Array) -> str:
+    return f'<transform name="to_world"><matrix value="{numbers(matrix.ravel())}"/></transform>'
 
 
 def _rgb(name: str, colour: Colour) -> str:

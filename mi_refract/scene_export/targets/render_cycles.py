@@ -46,6 +46,8 @@ def build(plain, folder):
         mesh.from_pydata(vertices, [], faces)
         mesh.materials.append(materials[entry["material"]])
         bpy.context.scene.collection.objects.link(bpy.data.objects.new(name, mesh))
+    for entry in plain.get("lamps", []):
+        lamp(entry)
     world(plain["sky"], folder)
     camera(plain["camera"])
 
@@ -99,6 +101,21 @@ def light(nodes, links, entry):
 
 
 SHADERS = {"glass": glass, "diffuse": diffuse, "light": light}
+
+
+def lamp(entry):
+    """Place a lamp without size. Blender's power of a point is 4π times the intensity, that of a sun the irradiance."""
+    directional = entry["type"] == "directional"
+    made = bpy.data.lights.new(entry["name"], "SUN" if directional else "POINT")
+    made.color, made.energy = entry["irradiance" if directional else "intensity"], 1 if directional else 4 * math.pi
+    placed = bpy.data.objects.new(entry["name"], made)
+    if directional:  # it shines along its −z
+        made.angle = 0
+        placed.matrix_world = Vector(entry["direction"]).to_track_quat("-Z", "Y").to_matrix().to_4x4()
+    else:
+        made.shadow_soft_size = 0
+        placed.matrix_world = Matrix.Translation(Vector(entry["position"]))
+    bpy.context.scene.collection.objects.link(placed)
 
 
 def world(sky, folder):

@@ -90,7 +90,7 @@ def raysect_files(plain: PlainScene) -> Files:
 OBJ_COMMANDS = """
 scene.obj    the triangles, one object per mesh
 scene.mtl    the materials as far as Wavefront's format can say them
-scene.json   camera, sky, max_depth, all materials, and the material of each object by name
+scene.json   camera, sky, lamps, max_depth, all materials, and the material of each object by name
 sky.exr      only where the sky is a map, by longitude and latitude
 """
 OBJ_ASSUMPTIONS = (
@@ -101,6 +101,10 @@ OBJ_ASSUMPTIONS = (
     "max_depth counts the segments of a path from the camera: 2 is light, one surface, camera.",
     "sky.exr: +y is the zenith. The pixel in row j of H and column i of W has its centre at theta = pi (j + 1/2) / H, "
     "phi = 2 pi (i + 1/2) / W, and is seen in direction (sin(phi) sin(theta), cos(theta), -cos(phi) sin(theta)).",
+    "lamps have no size. The intensity of a point is per steradian: a surface that faces it has intensity / distance^2 "
+    "of irradiance. That of a spot is whole up to beam_degrees from its direction, 0 from cutoff_degrees on, and "
+    "linear in the angle between. The irradiance of a directional lamp is that of a surface at right angles to its "
+    "light. Light travels along direction.",
     "Your program may scale radiance by the square of the index at a boundary, or not: the images differ only where a "
     "camera, a light or a diffuse surface is inside glass.",
 )

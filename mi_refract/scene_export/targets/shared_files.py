@@ -14,8 +14,19 @@ from mi_refract import __version__
 from mi_refract.io.image_file import NO_DATE, write_exr
 from mi_refract.io.safe_files import temporary_folder
 
-from ..plain_scene import Environment, Glass, Material, Mesh, PlainScene, VolumeGlass
-from ..tessellation import is_closed
+from ..plain_scene import (
+    DirectionalLamp,
+    Environment,
+    Glass,
+    Lamp,
+    Material,
+    Mesh,
+    PlainScene,
+    PointLamp,
+    SpotLamp,
+    VolumeGlass,
+)
+from ..tessellation import basis, is_closed
 
 Files = dict[str, bytes]  # contents by name
 Array = NDArray[np.float64]
@@ -120,6 +131,8 @@ def scene_json(plain: PlainScene, where: Mapping[str, Mapping[str, str]], sky_fi
         },
         "meshes": {mesh.name: {**where[mesh.name], "material": names[mesh.material]} for mesh in plain.meshes},
     }
+    if plain.lamps:
+        document["lamps"] = [{"type": lamp.kind} | dataclasses.asdict(lamp) for lamp in plain.lamps]
     return json.dumps(document, indent=1).encode()
 
 
@@ -127,6 +140,16 @@ def json_and_ply(plain: PlainScene, sky_file: str = "sky.exr") -> Files:
     """`scene.json`, and the PLY files that it names."""
     where = {mesh.name: {"file": f"{mesh.name}.ply"} for mesh in plain.meshes}
     return {"scene.json": scene_json(plain, where, sky_file)} | ply_files(plain)
+
+
+def frame(lamp: Lamp) -> Array:
+    """(4, 4): orthonormal axes, the third where the lamp shines, if anywhere, and its place, if it has one."""
+    matrix = np.eye(4)
+    if isinstance(lamp, SpotLamp | DirectionalLamp):
+        matrix[:3, :3] = basis(np.array(lamp.direction))
+    if isinstance(lamp, PointLamp):
+        matrix[:3, 3] = lamp.position
+    return matrix
 
 
 # The sky -----------------------------------------------------------------------------------------------------------

@@ -99,14 +99,14 @@ def _povray(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> 
     return [image_file.named(f"seed {seed}", coarse.astype(np.float32)) for seed in seeds]
 
 
-def _three(mis: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-    """With multiple importance sampling of the sky ("1"), as the library comes, or without ("0")."""
+def _three(mode: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+    """Path traced with multiple importance sampling of the sky ("mis"), as it comes, or "none"; or "raster"."""
     chromium, node = next(filter(None, map(shutil.which, BROWSERS)), None), shutil.which("node")
     if not (chromium and node):
         raise environments.Unable("no node or no Chromium in PATH")
     _write_gltf(plain, folder / "scene")
     script, home = SCRIPTS / "three_images.mjs", environments.folder(SYSTEMS["three"])
-    sizes = (plain.camera.width, plain.camera.height, spp, mis, *seeds)
+    sizes = (plain.camera.width, plain.camera.height, spp, mode, *seeds)
     words = [node, *map(str, (script, home, chromium, folder / "scene", folder, *sizes))]
     environments.run(words, timeout=HOURS)
     return [_raw(folder / f"seed{seed}.f32", plain) for seed in seeds]
@@ -163,6 +163,10 @@ THREE = (
     "and a black back.",
     "bounces and transmissiveBounces are Mitsuba's max_depth.",
 )
+RASTER = (
+    THREE[0],
+    "It is a rasteriser: no light between surfaces. Each pixel is the mean of a grid of samples, without noise.",
+)
 CYCLES_GLTF = (
     "It reads the export to glTF, by Blender's importer, with facets for normals, as the other side has them.",
     *scene_json.CYCLES_ASSUMPTIONS,
@@ -197,6 +201,7 @@ IMAGE_RENDERERS: dict[str, ImageRenderer] = {
     "raysect": _renderer("raysect", _raysect, scene_json.RAYSECT_ASSUMPTIONS, 2048, 768, 256, furnace=128),
     "LuxCore": _renderer("luxcore", _luxcore, luxcore.ASSUMPTIONS, 1280, 1024, 576),
     "POV-Ray": _renderer("povray", _povray, POVRAY, 64, 64, 64),
-    "three-gpu-pathtracer": _renderer("three", functools.partial(_three, "1"), THREE, prism=8, furnace=8),
-    "three-gpu-pathtracer, no MIS": _renderer("three", functools.partial(_three, "0"), THREE, prism=8, furnace=8),
+    "three-gpu-pathtracer": _renderer("three", functools.partial(_three, "mis"), THREE, prism=8, furnace=8),
+    "three-gpu-pathtracer, no MIS": _renderer("three", functools.partial(_three, "none"), THREE, prism=8, furnace=8),
+    "three, MeshPhysicalMaterial": _renderer("three", functools.partial(_three, "raster"), RASTER, prism=512),
 }

@@ -17,7 +17,7 @@ spec.loader.exec_module(cycles)
 
 def build(plain, _):
     """What the importer makes of the file, and the sky beside it."""
-    bpy.ops.import_scene.gltf(filepath=str(folder / "scene.glb"))
+    bpy.ops.import_scene.gltf(filepath=str(folder / "scene.glb"), export_import_convert_lighting_mode="COMPAT")
     sky = {"environment": "sky.exr"} if (folder / "sky.exr").exists() else {"radiance": (0, 0, 0)}
     cycles.world(sky, folder)
     scene = bpy.context.scene

@@ -1,14 +1,15 @@
-// Render scene.glb, with sky.exr around it where there is one, by three-gpu-pathtracer in a headless browser, WebGL2 on the processor:
-//   node three_images.mjs NPM_FOLDER CHROMIUM SCENE_FOLDER OUT_FOLDER WIDTH HEIGHT SPP MIS SEED…
-// One seedN.f32 per seed: rows from the top, three float32 a pixel. MIS: 1 for multiple importance
-// sampling of the sky, as the library comes, 0 without.
+// Render scene.glb, with sky.exr around it where there is one, by three-gpu-pathtracer or by three itself in a headless browser, WebGL2
+// on the processor:
+//   node three_images.mjs NPM_FOLDER CHROMIUM SCENE_FOLDER OUT_FOLDER WIDTH HEIGHT SPP MODE SEED…
+// One seedN.f32 per seed: rows from the top, three float32 a pixel. MODE: mis with multiple importance
+// sampling of the sky, as the path tracer comes, none without; raster by three's rasteriser, the same for all seeds.
 import { createServer } from "node:http";
 import { existsSync } from "node:fs";
 import { readFile, writeFile } from "node:fs/promises";
 import { createRequire } from "node:module";
 import { extname, join, resolve } from "node:path";
 
-const [npm, chromium, scene, out, width, height, spp, mis, ...seeds] = process.argv.slice(2);
+const [npm, chromium, scene, out, width, height, spp, mode, ...seeds] = process.argv.slice(2);
 const puppeteer = createRequire(join(resolve(npm), "package.json"))("puppeteer-core");
 const PATIENCE = 3_600_000; // ms: a busy machine is slow
 const page = new URL("three_images.html", import.meta.url);
@@ -49,7 +50,7 @@ try {
   await tab.waitForFunction("window.prepare");
   const size = [Number(width), Number(height)];
   const prepare = (...words) => window.prepare(...words);
-  await tab.evaluate(prepare, size, mis === "1", existsSync(join(scene, "sky.exr")));
+  await tab.evaluate(prepare, size, mode, existsSync(join(scene, "sky.exr")));
   for (const seed of seeds) {
     const pixels = await tab.evaluate((spp, seed) => window.render(spp, seed), Number(spp), Number(seed));
     await writeFile(join(out, `seed${seed}.f32`), Buffer.from(pixels, "base64"));
