@@ -23,7 +23,7 @@ STEP = 1 / 256  # of a pixel, at which filters are integrated
 # A float32 is an integer in units of 2^LOWEST. Its digits of 32 bits are added up in 64 bits, as integers have the same
 # sum in any order of threads. A pixel takes 2^31 splats.
 BITS = 32
-DIGITS, LOWEST = 5, -87  # of radiance from 2^-64 to 2^64
+DIGITS, LOWEST = 5, -87  # of values from 2^-64 to 2^64
 SQUARES_DIGITS, SQUARES_LOWEST = 8, -135
 
 
