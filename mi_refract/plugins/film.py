@@ -23,17 +23,17 @@ STEP = 1 / 256  # of a pixel, at which filters are integrated
 # A float32 is an integer in units of 2^LOWEST. Its digits of 32 bits are added up in 64 bits, as integers have the same
 # sum in any order of threads. A pixel takes 2^31 splats.
 BITS = 32
-DIGITS, LOWEST = 5, -87  # of radiance from 2^-64 to 2^64
+DIGITS, LOWEST = 5, -87  # of values from 2^-64 to 2^64
 SQUARES_DIGITS, SQUARES_LOWEST = 8, -135
 
 
 class Splats:
-    """Exact sums of what reaches each pixel, in each channel, under the film's reconstruction filter."""
+    """Exact sums of what reaches each pixel, in each channel, under the film's reconstruction filter; or of squares."""
 
-    def __init__(self, v: Variant, sensor: Sensor, channels: int, digits: int = DIGITS, lowest: int = LOWEST) -> None:
+    def __init__(self, v: Variant, sensor: Sensor, channels: int, *, squares: bool = False) -> None:
         """`v`: the variant's module."""
-        self.v, self.vectorised, self.channels = v, dr.is_jit_v(v.Float), channels
-        self.per_sum, self.lowest = digits, lowest
+        self.v, self.vectorised, self.channels, self.squares = v, dr.is_jit_v(v.Float), channels, squares
+        self.per_sum, self.lowest = (SQUARES_DIGITS, SQUARES_LOWEST) if squares else (DIGITS, LOWEST)
         film = sensor.film()
         self.width, self.height = (int(n) for n in film.crop_size())
         self.rfilter: Any = None if film.rfilter().is_box_filter() else film.rfilter()
@@ -42,7 +42,7 @@ class Splats:
         if self.vectorised:
             self.wide: Any = dr.uint64_array_t(v.Float)
             kind: Any = self.wide
-            self.digits: Any = dr.zeros(kind, self.count * digits)
+            self.digits: Any = dr.zeros(kind, self.count * self.per_sum)
             dr.make_opaque(self.digits)
             self.beyond = dr.opaque(v.UInt32, 0, self.count)  # splats that are too large, or not finite
         else:
@@ -59,7 +59,8 @@ class Splats:
                     inside = active & (x + i >= 0) & (x + i < self.width) & (y + j >= 0) & (y + j < self.height)
                 index = ((y + j) * self.width + x + i) * self.channels
                 for channel, value in enumerate(values):
-                    self._add(index + channel, value * weight, inside)
+                    share = value * weight
+                    self._add(index + channel, dr.square(share) if self.squares else share, inside)
 
     def _weight(self, apart: Number) -> Number:
         near = dr.abs(apart) <= self.rfilter.radius()

@@ -51,12 +51,12 @@ from mi_refract.numerics import (
 )
 
 from .absorption import HERE
-from .film import SQUARES_DIGITS, SQUARES_LOWEST, Splats, expected_weights, film_colours
+from .film import Splats, expected_weights, film_colours
 from .medium_tracking import THROUGH
 from .path_loop import PathLoop
 from .refract import DISPERSED, followed_context
 from .sampling import IndependentNumbers, KeyedMultijitter
-from .scene_features import KNOWN, KNOWN_SHAPES, all_shapes, bsdf_name, nested
+from .scene_features import KNOWN, KNOWN_SHAPES, all_shapes, bsdf_name, children, nested
 
 MOST_TARGETS = 16  # spheres at which directions are aimed
 MARGIN = 1 + 1e-4  # of a sphere's radius: rounding must not leave its rim out
@@ -92,6 +92,12 @@ def refused_sensor(sensor: Sensor) -> str:
     if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special) or sensor.film().sample_border():
         return "it traces light to a hdrfilm without sample_border"
     return ""
+
+
+def by_area(lamp: Emitter) -> bool:
+    """Whether points on a lamp are sampled by its area, though its radiance varies."""
+    exact = lamp.class_name() != "AreaLight" or lamp.get_shape().class_name() in ("Disk", "Rectangle", "Sphere")
+    return not exact and any(x.is_spatially_varying() for x in children(lamp) if hasattr(x, "is_spatially_varying"))
 
 
 def lit(lamp: Emitter) -> bool:
@@ -275,12 +281,20 @@ class LampTracer:
         dr.make_opaque(self.kinds)
         self.any = set(kinds)
         self.pointers = dr.gather(v.EmitterPtr, scene.emitters_dr(), v.UInt32(indices)) if self.vectorised else None
+        # By a texture Mitsuba samples no mesh right whose (u, v) overlap, nor a cylinder that is turned. One call a
+        # shape: a call of a pointer is traced for shapes that cannot be sampled, too.
+        self.by_area = [i for i, lamp in enumerate(self.lamps) if by_area(lamp)]
         spheres = targets(scene)
         odds = [self._odds(lamp, spheres) for lamp in self.lamps]
         self.aim = Aim(v, spheres, odds)
         self.choice = v.DiscreteDistribution([1.0] * len(self.lamps))
-        if len(self.lamps) > 1:
-            self.choice = v.DiscreteDistribution(self._powers())
+        self.unit = 1.0  # a power of two near the mean power of a light path: sums of splats have a range
+        if self.vectorised or len(self.lamps) > 1:
+            sums, paths = self._pilot()
+            total, even = sum(sums), 1 / len(sums)
+            odds_of_lamps = [DEFENSIVE * even + (1 - DEFENSIVE) * (x / total if total else even) for x in sums]
+            self.choice = v.DiscreteDistribution(odds_of_lamps)
+            self.unit = 2.0 ** min(max(math.frexp(total / paths)[1], -126), 126)
 
     def _odds(self, lamp: Emitter, spheres: list[Sphere]) -> list[float]:
         """The probability of each sphere: by its solid angle as seen from the lamp, or by its disk."""
@@ -292,8 +306,8 @@ class LampTracer:
             sizes = [float(_one_minus_cosine(2.0 if r >= x else (r / x) ** 2)) for r, x in squares]
         return [size / sum(sizes) for size in sizes]
 
-    def _powers(self) -> list[float]:
-        """Probabilities of the lamps, in proportion to their power toward the spheres as a pilot estimates it."""
+    def _pilot(self) -> tuple[list[float], int]:
+        """The power of each lamp toward the spheres as some light paths estimate it, and their number."""
         import numpy as np
 
         v, count = self.v, min(PILOT, MOST_PILOT // len(self.lamps) + 1) * len(self.lamps)
@@ -303,11 +317,9 @@ class LampTracer:
             lamps, _, light = self._emitted(numbers, v.Bool(True))
             powers = dr.sum(v.unpolarized_spectrum(light))
             # Added in a fixed order: the bits of an image depend on the sums.
-            for lamp, power in zip(np.ravel(lamps).tolist(), np.ravel(powers).tolist(), strict=True):
-                sums[lamp] += power if math.isfinite(power) else 0
-        total = sum(sums)
-        even = 1 / len(sums)
-        return [DEFENSIVE * even + (1 - DEFENSIVE) * (x / total if total else even) for x in sums]
+            for lamp, power in np.broadcast(np.ravel(lamps), np.ravel(powers)):
+                sums[lamp] += float(power) if math.isfinite(power) else 0
+        return sums, count
 
     def _emitted(self, numbers: Any, active: Mask) -> tuple[Count, Ray, Spectrum]:
         """A ray from a lamp toward a sphere, and its radiant power over the density of all that was chosen."""
@@ -331,6 +343,11 @@ class LampTracer:
         here = active & (kind == AREA)
         if AREA in self.any and (self.vectorised or here):
             ps, place = emitter.sample_position(time, on_lamp, here)
+            for i in self.by_area:
+                this = here & (lamp == i)
+                if self.vectorised or this:
+                    own = self.lamps[i].get_shape().sample_position(time, on_lamp, this)
+                    ps, place = dr.select(this, own, ps), dr.select(this, _quotient(1, own.pdf), place)
             toward, q = self.aim.direction(lamp, chosen, ps.p, aimed)
             si = v.SurfaceInteraction3f(ps, wavelengths)
             si.shape = emitter.get_shape()
@@ -508,16 +525,19 @@ class Camera:
         film = sensor.film()
         self.width, self.height = (int(n) for n in film.crop_size())
         self.parallel = sensor.class_name() == "OrthographicCamera"
+        corner, right, down = (
+            sensor.sample_ray(0, 0, v.Point2f(*p), v.Point2f(0.5))[0] for p in ((0, 0), (1, 0), (0, 1))
+        )
+        self.axis = v.Vector3f(sensor.world_transform() @ v.Vector3f(0, 0, 1))
         if self.parallel:
-            corner, right, down = (
-                sensor.sample_ray(0, 0, v.Point2f(*p), v.Point2f(0))[0] for p in ((0, 0), (1, 0), (0, 1))
-            )
             self.origin, self.d = corner.o, corner.d
             x, y = right.o - corner.o, down.o - corner.o
             # (x, y) of a point p on the film, from 0 to 1, is that of p − origin in the basis dual to x, y.
-            self.area = dr.norm(dr.cross(x, y))
             self.to_x = dr.cross(y, self.d) / dr.dot(x, dr.cross(y, self.d))
             self.to_y = dr.cross(x, self.d) / dr.dot(y, dr.cross(x, self.d))
+        else:  # at the distance 1, through the middle of the lens
+            x, y = (ray.d / dr.dot(ray.d, self.axis) - corner.d / dr.dot(corner.d, self.axis) for ray in (right, down))
+        self.area = dr.norm(dr.cross(x, y))
 
     def connect(self, si: Interaction, aperture: Point2, active: Mask) -> tuple[Point2, Ray, Number, Mask]:
         """Place on the film in pixels, the camera's ray through it, its importance; whether the film sees the point.
@@ -530,9 +550,12 @@ class Camera:
             place = v.Point2f(dr.dot(apart, self.to_x), dr.dot(apart, self.to_y))
             importance, active = pixels / self.area, active & (dr.dot(apart, self.d) > 0)
         else:
-            ds, weight = self.sensor.sample_direction(si, aperture, active)
+            # Not the weight of this sample: Mitsuba's is 0 beyond a film that has no `principal_point_offset_x`.
+            ds, _ = self.sensor.sample_direction(si, aperture, active)
             place = v.Point2f(ds.uv.x / self.width, ds.uv.y / self.height)
-            importance = v.unpolarized_spectrum(weight)[0] * pixels
+            cosine = -dr.dot(ds.d, self.axis)
+            importance = _quotient(pixels, self.area * cosine**3 * dr.square(ds.dist))
+            active = active & (ds.pdf > 0)
         active &= (place.x >= 0) & (place.x < 1) & (place.y >= 0) & (place.y < 1)
         ray, _ = self.sensor.sample_ray(si.time, 0, place, aperture, active)
         far = dr.dot(si.p - ray.o, ray.d)
@@ -549,13 +572,13 @@ def lamp_image(tracer: LampTracer, seed: int, paths: int, channels: tuple[str, .
     pixels = camera.width * camera.height
     colours = 3 if channels[0] in ("R", "X") else 1
     sums = Splats(v, camera.sensor, colours)
-    of_squares = Splats(v, camera.sensor, colours, SQUARES_DIGITS, SQUARES_LOWEST) if squares else None
+    of_squares = Splats(v, camera.sensor, colours, squares=True) if squares else None
 
     def splat(place: Point2, value: Spectrum, wavelengths: Number, active: Mask) -> None:
-        values = [x / pixels for x in film_colours(v, value, wavelengths, channels)]
+        values = [x / tracer.unit / pixels for x in film_colours(v, value, wavelengths, channels)]
         sums.add(place, values, active)
         if of_squares:
-            of_squares.add(place, [dr.square(x) for x in values], active)
+            of_squares.add(place, values, active)
 
     if tracer.vectorised:
         for number, start in enumerate(range(0, paths, LANES)):
@@ -568,8 +591,8 @@ def lamp_image(tracer: LampTracer, seed: int, paths: int, channels: tuple[str, .
         for _ in range(paths):
             tracer.trace(numbers, splat)
     expected = expected_weights(camera.sensor.film())
-    area = 1 if expected is None else expected
-    mean = sums.image() * (pixels / paths) / area
+    scale = pixels * tracer.unit / (1 if expected is None else expected)
+    mean = sums.image() * (scale / paths)
     if of_squares is None:
         return mean, None
-    return mean, (of_squares.image() * (pixels**2 / paths) / area**2 - mean**2).clip(0) / paths
+    return mean, (of_squares.image() * (scale**2 / paths) - mean**2).clip(0) / paths

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import functools
 import operator
+from collections.abc import Callable
 from dataclasses import dataclass, make_dataclass
 from typing import Any
 
@@ -43,7 +44,7 @@ from .absorption import absorbed
 from .medium_tracking import MediumTracker, ShapeMedia
 from .refract import DISPERSED, followed_context
 from .sampling import ONE, KeyedMultijitter, NonConstantEmitters, SceneEmitters, SceneSampler
-from .scene_features import BOUNDARIES, all_shapes, bsdf_name, plugin_number
+from .scene_features import BOUNDARIES, all_shapes, bsdf_name, children, nested, plugin_number
 
 # Samples near 0 and near 1 select the two lobes of a boundary; a lobe of smaller probability is not followed.
 FIRST, LAST = 2.0**-25, ONE
@@ -154,13 +155,19 @@ def power_heuristic(a: Number, b: Number) -> Number:
 
 
 def at_fixed_direction(
-    v: Variant, context: Any, si: Interaction, bsdf: BSDF, bs: BSDFSample, weight: Spectrum, d: Vector3, active: Mask
-) -> tuple[Spectrum, Vector3, Number]:
+    v: Variant, context: Any, si: Interaction, bsdf: BSDF, bs: BSDFSample, weight: Spectrum, d: Vector3, active: Mask,
+    own_odds: Mask,
+) -> tuple[Spectrum, Vector3, Number]:  # fmt: skip
     """Weight, world direction and density of a sample, as they are differentiated.
 
-    The direction of a delta lobe moves with the parameters. Any other direction is a fixed point of the integrand:
-    d/dx ∫ f dω = ∫ f'(ω)/p(ω) p(ω) dω, in which neither ω nor p is differentiated.
+    The direction of a delta lobe moves with the parameters; its probability p is not differentiated: of its weight f/p
+    it is f'/p. Any other direction is a fixed point of the integrand: d/dx ∫ f dω = ∫ f'(ω)/p(ω) p(ω) dω, in which
+    neither ω nor p is differentiated. `own_odds`: where the BSDF's weight of a delta lobe is so already, though p is
+    differentiated.
     """
+    if dr.grad_enabled(bs.pdf):
+        odds = dr.select(active & (bs.pdf > 0) & (own_odds ^ True), bs.pdf, 1)
+        weight = weight * (odds / dr.detach(odds))
     smooth = active & mi.has_flag(bs.sampled_type, LOBES.Smooth)
     wo = si.to_local(dr.detach(d))
     value, pdf = bsdf.eval_pdf(context, si, wo, smooth)
@@ -169,6 +176,14 @@ def at_fixed_direction(
     smooth &= pdf > 0
     value = value / dr.detach(dr.select(smooth, pdf, 1))
     return dr.select(smooth, value, weight), dr.select(smooth, dr.detach(d), d), dr.select(smooth, pdf, bs.pdf)
+
+
+def has_own_odds(bsdf: BSDF) -> bool:
+    """Whether a mask whose opacity may have a derivative is within a BSDF; see `at_fixed_direction`."""
+    masks = [inner for inner in nested(bsdf) if bsdf_name(inner) == "MaskBSDF"]
+    textures = (child for mask in masks for child in children(mask) if hasattr(child, "is_spatially_varying"))
+    opacities = (value for mask in masks for key, value in mi.traverse(mask) if key.startswith("opacity"))
+    return any(texture.is_spatially_varying() for texture in textures) or any(map(dr.grad_enabled, opacities))
 
 
 class PathLoop:
@@ -192,7 +207,8 @@ class PathLoop:
         # so they must not trace rays: what a ray meets is evaluated at once.
         self.evaluated = self.vectorised and not dr.flag(dr.JitFlag.SymbolicLoops)
         self.branch = branch_type(v, features.dispersion, features.absorption)
-        self.boundaries = self._boundaries() if features.split_depth and self.vectorised else []
+        self.boundaries = self._ranges(lambda bsdf: bsdf_name(bsdf) in BOUNDARIES) if features.split_depth else []
+        self.own_odds = self._ranges(has_own_odds) if self.evaluated else []
 
     def refuse(self) -> None:
         """ValueError where the absorption that the paths met was contradictory."""
@@ -371,7 +387,8 @@ class PathLoop:
             weight = si.to_world_mueller(weight, -bs.wo, si.wi)
         ray = si.spawn_ray(si.to_world(bs.wo))
         if dr.grad_enabled(weight, ray.d):
-            weight, ray.d, bs.pdf = at_fixed_direction(v, self.context, si, bsdf, bs, weight, ray.d, active)
+            own_odds = self._is_of(self.own_odds, bsdf)
+            weight, ray.d, bs.pdf = at_fixed_direction(v, self.context, si, bsdf, bs, weight, ray.d, active, own_odds)
         throughput, optional = self.times(s.throughput, weight), dict[str, Any]()
         if self.features.dispersion:
             # The first wavelength stands for all that end here; each is the first equally often.
@@ -458,13 +475,15 @@ class PathLoop:
         lost = dr.max(self.v.unpolarized_spectrum(throughput)) * dr.square(eta)
         s.truncated = dr.select(where, s.truncated + lost, s.truncated)
 
-    def _boundaries(self) -> list[tuple[Count, Count]]:
-        """The numbers of the BSDFs that are `BOUNDARIES`, as ranges: first, and one after the last.
+    def _ranges(self, wanted: Callable[[BSDF], bool]) -> list[tuple[Count, Count]]:
+        """The numbers of the shapes' BSDFs that are wanted, as ranges: first, and one after the last.
 
         Mitsuba numbers BSDFs as they are loaded. Opaque: another scene is other data, not another kernel.
         """
+        if not self.vectorised:
+            return []
         v, ranges = self.v, list[list[int]]()
-        bsdfs = [bsdf for shape in all_shapes(self.scene) if (bsdf := shape.bsdf()) and bsdf_name(bsdf) in BOUNDARIES]
+        bsdfs = [bsdf for shape in all_shapes(self.scene) if (bsdf := shape.bsdf()) and wanted(bsdf)]
         for number in sorted({plugin_number(v, v.BSDFPtr(bsdf)) for bsdf in bsdfs}):
             if ranges and ranges[-1][1] == number:
                 ranges[-1][1] += 1
@@ -472,11 +491,15 @@ class PathLoop:
                 ranges.append([number, number + 1])
         return [(dr.opaque(v.UInt32, first), dr.opaque(v.UInt32, last)) for first, last in ranges]
 
+    def _is_of(self, ranges: list[tuple[Count, Count]], bsdf: BSDF) -> Mask:
+        """Whether the number of a BSDF is in one of the ranges."""
+        number, inside = dr.reinterpret_array(self.v.UInt32, bsdf), self.v.Bool(False)
+        for first, last in ranges:
+            inside |= (number >= first) & (number < last)
+        return inside
+
     def _is_boundary(self, bsdf: BSDF) -> Mask:
         """Whether a BSDF is known to have one reflected and one refracted direction, and no others."""
         if not self.vectorised:
             return bsdf_name(bsdf) in BOUNDARIES
-        number, inside = dr.reinterpret_array(self.v.UInt32, bsdf), self.v.Bool(False)
-        for first, last in self.boundaries:
-            inside |= (number >= first) & (number < last)
-        return inside
+        return self._is_of(self.boundaries, bsdf)

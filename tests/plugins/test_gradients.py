@@ -190,6 +190,33 @@ def test_tints_have_the_derivatives_of_refract_path(integrator, name, llvm_varia
     assert abs(ours.mean() - theirs.mean()) < 5.36 * error
 
 
+@pytest.mark.parametrize("bsdf", ["plastic", "mask"])
+@pytest.mark.parametrize("name", ["diffuse_reflectance", "specular_reflectance"])
+def test_the_odds_of_a_lobe_are_no_part_of_a_derivative(name, bsdf, llvm_variant):
+    """`plastic` chooses a lobe by its colours. An image that is linear in a colour c has the derivative I(1) − I(0).
+
+    Of 12² · 256 paths, of which the lobe takes a tenth or more: 5 % is seven standard deviations.
+    """
+    plastic = {"type": "plastic", "diffuse_reflectance": 0.4, "specular_reflectance": 0.5}
+    ball = {"type": "sphere", "bsdf": plastic if bsdf == "plastic" else {"type": "mask", "opacity": 0.6, "b": plastic}}
+    method = {"type": "refract_path", "max_depth": 2}
+    scene = mi.load_dict({"type": "scene", "integrator": method, "view": camera(12, 20), "sky": sky(), "ball": ball})
+    params, (key,) = attached(scene, name)
+    dr.backward(loss(scene, params, 0, 256))
+    backward = grad(params, key)
+    dr.set_grad(params[key], 1)
+    params.update()
+    image = loss(scene, params, 0, 256)
+    dr.forward(params[key])
+    ends = []
+    for value in (0.0, 1.0):
+        params[key] = value
+        params.update()
+        ends.append(vector(loss(scene, params, 0, 256))[0])
+    expected = pytest.approx(ends[1] - ends[0], rel=0.05)
+    assert backward == expected and vector(dr.grad(image))[0] == expected
+
+
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
 def test_prb_projective_gives_what_prb_gives_where_no_edge_moves(variant, needs_variant):
     """Its first part is that of `prb`, with the same random numbers; polarised variants it refuses."""

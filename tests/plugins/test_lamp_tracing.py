@@ -12,6 +12,7 @@ from support.variants import switch
 
 import mi_refract  # noqa: F401
 from mi_refract.numerics import mitsuba_mesh
+from mi_refract.plugins.film import Splats
 
 FALSE_ALARM = 1e-4
 SIZE = 16
@@ -104,7 +105,7 @@ def difference(a, b):
     return np.abs(t).max() / least
 
 
-PARTS = {"sensor", "floor", "ball", "lamp", "more", "sky", "bsdf"} | {f"b{i}" for i in range(40)}
+PARTS = {"group", "sensor", "floor", "ball", "lamp", "more", "sky", "bsdf"} | {f"b{i}" for i in range(40)}
 ROW = {f"b{i}": ball(center=(-2 + 0.5 * (i % 8), -1.2 + 0.5 * (i // 8), 0.5), radius=0.24) for i in range(40)}
 IN_GLASS = {"lamp": glow((0, 0, 1.2), 0.5)}  # all light passes glass
 WHITE = {"type": "diffuse", "reflectance": 0.9}
@@ -114,6 +115,12 @@ WALL = {
     "bsdf": WHITE,
 }
 BLOCKER = {"type": "disk", "to_world": mi.ScalarTransform4f().look_at([0, -5, 2.5], [-0.3, 0, 0], [0, 0, 1]).scale(0.1)}
+TEXTURED = {"emitter": {"type": "area", "radiance": noise(4, 4, 3)}}
+GROUP = {"type": "shapegroup", "ball": ball(center=(0, 0, 0), radius=1.0)}
+INSTANCE = {"type": "instance", "group": {"type": "ref", "id": "group"}} | {
+    "to_world": mi.ScalarTransform4f().translate([0, 0, 1.2]).scale([0.8, 0.6, 1.0])
+}
+TUBE = {"type": "cylinder", "p0": [-1, 0, 4], "p1": [1, 0, 4], "radius": 0.2}
 CROP = {"width": 40, "height": 30, "crop_width": 16, "crop_height": 16, "crop_offset_x": 14, "crop_offset_y": 9}
 
 
@@ -133,7 +140,7 @@ AGREE = {
     "crop window": agree(sensor=camera(film=CROP)),
     "wide filter": agree(sensor=camera(film={"rfilter": {"type": "gaussian"}, "width": 24})),
     "clipped": agree(sensor=camera(near_clip=3.0, far_clip=6.4), more=BLOCKER),
-    "off the axis": agree(sensor=camera(principal_point_offset_x=0.2)),
+    "off the axis": agree(sensor=camera(film=CROP, principal_point_offset_x=0.1, principal_point_offset_y=-0.2)),
     "hidden lamp": agree(more=lamp((0, -4, 2), 0.8, 0.1), hide_emitters=True),
     "mirror": agree(ball=ball({"type": "conductor", "material": "Au"})),
     "mask": agree(
@@ -154,7 +161,9 @@ AGREE = {
     "smooth normals, glass": agree(ball="polyhedron", bsdf={"type": "refract"}),
     "a bubble in glass": agree(more=ball({"type": "refract", "int_ior": 1.0, "ext_ior": 1.5}, radius=0.4)),
     "more spheres than targets": agree(ball=floor(), **ROW),
-    "textured lamp": agree(lamp=lamp() | {"emitter": {"type": "area", "radiance": noise(4, 4, 3)}}),
+    "textured lamp": agree(lamp=lamp() | TEXTURED),
+    "textured lamp, turned": agree(lamp=TUBE | TEXTURED),
+    "instance": agree(group=GROUP, ball=INSTANCE),
 }
 
 
@@ -187,6 +196,24 @@ def test_a_point_lamp_of_weight_0_is_off(llvm_variant):
     off, on = point(sampling_weight=0.0), point(4.0)
     images = [tiles(scene(parts, caustics="lamp"), 4, [0]) for parts in ({"lamp": on, "more": off}, {"lamp": on})]
     np.testing.assert_allclose(*images, rtol=1e-5)
+
+
+@pytest.mark.parametrize("rfilter", ["box", "gaussian", "lanczos"])
+def test_of_one_splat_the_sum_of_squares_is_the_square_of_the_sum(rfilter, typical_variant):
+    sensor = mi.load_dict(camera(film={"rfilter": {"type": rfilter}}))
+    images = []
+    for squares in (False, True):
+        splats = Splats(getattr(mi, mi.variant()), sensor, 2, squares=squares)
+        splats.add(mi.Point2f(7.2, 9.9), [mi.Float(3.0), mi.Float(-0.5)], mi.Bool(True))
+        images.append(splats.image())
+    assert images[0].any()
+    np.testing.assert_allclose(images[1], images[0] ** 2, rtol=1e-6)
+
+
+@pytest.mark.parametrize("factor", [2.0**-90, 2.0**90])
+def test_an_image_scales_with_its_lamps(factor, llvm_variant):
+    one, other = (tiles(scene({"lamp": lamp(radiance=8 * x)}, caustics="lamp"), 4, [0]) for x in (1, factor))
+    np.testing.assert_allclose(other / factor, one, rtol=1e-5)
 
 
 def test_light_from_infinity_does_not_pass_air_that_absorbs(llvm_variant):
