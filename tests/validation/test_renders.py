@@ -218,7 +218,9 @@ def test_a_wrapper_that_is_split_as_if_it_were_glass_is_seen(llvm_variant, monke
 def test_a_direction_that_stays_attached_is_seen(context, monkeypatch):
     """Rough metal fails, glass does not: after its lobes the direction is attached in any case."""
     metal, glass = gradients.QUICK  # both pass without the defect, see test_contract.py
-    monkeypatch.setattr(path_loop, "at_fixed_direction", lambda v, context, si, bsdf, bs, w, d, active, own: (w, d, bs.pdf))
+    monkeypatch.setattr(
+        path_loop, "at_fixed_direction", lambda v, context, si, bsdf, bs, w, d, active, own: (w, d, bs.pdf)
+    )
     (attached,), (through,) = (gradients.rows(replace(context, profile=PROFILES["quick"]), x) for x in (metal, glass))
     assert "off / interval" in attached.broken and attached.values["off"] > 0.05
     assert through.verdict == "pass"
