@@ -127,6 +127,13 @@ def test_the_herd_stays_in_its_domain_and_gets_no_better(vectorised, monkeypatch
     assert ((last.rays.k >= 1e-6) & (last.rays.k <= np.where(unit, 1.5, 1e6))).all()
 
 
+def test_rays_that_are_not_judged_do_not_leave_their_regime(vectorised):
+    """In float64 the screen resolves no ray of this regime, so that every child is as bad as its parent."""
+    herd = search.climb("promoted", PROMOTED, ["on a denormal"], vectorised, 4, sample=500)
+    lengths = np.linalg.norm(np.stack([herd.rays.a, herd.rays.n]).astype(float), axis=2)
+    assert np.abs(lengths - 1).max() <= 4 * vectorised.roundoff
+
+
 def test_every_formula_has_its_rows(scalar_context, monkeypatch, float32):
     for study in (search, sweep):
         monkeypatch.setattr(study, "settings", lambda context: [float32])
