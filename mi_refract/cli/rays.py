@@ -104,7 +104,10 @@ def export(
     wavelengths: Wavelengths = None,
     regimes: Regimes = False,
 ) -> None:
-    """Write rays for another program: incident directions, normals and indices of refraction."""
+    """Write rays for another program.
+
+    A ray has an incident direction, a normal, and the indices of refraction of the media that it leaves and enters.
+    """
     writable(output, files.SUFFIXES)
     rays = _made(regime, count, precision, seed, two_sided, medium, wavelengths)
     files.write(output, rays)

@@ -57,7 +57,7 @@ Result = TypeVar("Result")
 
 # Dr.Jit's type stubs say that the first returns an object, and nothing of what the second returns.
 _reinterpret: Any = dr.reinterpret_array
-replace_grad: Any = dr.replace_grad
+replace_grad: Any = dr.replace_grad  # Dr.Jit's own, with a type
 
 ALIGNMENT = 64  # bytes, of what Dr.Jit reads in one go
 

@@ -52,7 +52,7 @@ from .path_loop import PathFeatures, PathLoop
 from .sampling import KeyedMultijitter, SceneSampler, seeds_of
 from .scene_features import SceneFeatures, check_attributes, inspect
 
-INTEGRATOR = "refract_path"
+INTEGRATOR = "refract_path"  # its name in Mitsuba
 MOST_PATHS = 4096  # that one sample may split into
 DEEPEST = 64  # split_depth: memory is set aside in every lane
 UNLIMITED = 2**32 - 1
