@@ -222,8 +222,8 @@ def choose(pilot: Pilot) -> Choice:
 def lines_of(figures: dict[str, Any]) -> list[str]:
     """A line for each candidate of `Choice.figures`."""
     return [
-        f"cost {cost['value']:g} ({cost['low']:g} to {cost['high']:g}), variance {cost['variance']:g} and time "
-        f"{cost['time']:g} of the chosen: {name}"
+        f"{name}: {cost['value']:g} × the cost of the chosen settings ({cost['low']:g} to {cost['high']:g}): "
+        f"{cost['variance']:g} × the variance, {cost['time']:g} × the time"
         for name, cost in sorted(figures["costs"].items(), key=lambda item: -float(item[1]["value"]))
     ]
 

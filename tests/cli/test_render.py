@@ -114,6 +114,8 @@ def test_the_best_variant_is_the_default(render, scene, monkeypatch, needs_varia
 BAD = {
     "no scene": ({"scene": "none.xml"}, (), "none.xml: no such scene file"),
     "no checkout": ({"scene": "sphere.xml"}, (), f"no such scene file; the package has {SCENES / 'sphere.xml'}"),
+    "a name alone": ({"scene": "sphere"}, (), f"no such scene file; the package has {SCENES / 'sphere.xml'}"),
+    "a folder": ({"scene": str(SCENES)}, (), f"{SCENES}: no such scene file"),
     "no variant": ({"variant": "llvm_rgb"}, (), "variant 'llvm_rgb': unknown; expected scalar_rgb"),
     "no folder": ({"output": "none/out.exr"}, (), "is not a folder"),
     "a device": ({"output": "device.exr"}, (), "device.exr: is a device; expected the name of a file"),
