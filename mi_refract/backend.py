@@ -176,7 +176,7 @@ def candidates() -> list[str]:
 
 
 def _version(path: str) -> tuple[int, ...] | None:
-    """From the file's name: (19, 1) of libLLVM.so.19.1, (15,) of libLLVM-15.so.1; None: not LLVM's C interface."""
+    """The version in a file's name: (19, 1) of libLLVM.so.19.1, (15,) of libLLVM-15.so.1; None for another file."""
     name = re.fullmatch(r"libLLVM(?:-(\d[\d.]*))?\.(?:so|dylib)(?:\.(\d[\d.]*))?", Path(path).name)
     if name is None:
         return () if Path(path).name == WINDOWS else None
@@ -231,7 +231,7 @@ def _announce(backend: Backend) -> None:
 
 
 def restart_if_needed() -> None:
-    """For commands: have Dr.Jit use the libLLVM that works.
+    """Make Dr.Jit use the libLLVM that works; for commands.
 
     Where Dr.Jit was imported with another one already, start this process's command line again, and do not return.
     """

@@ -211,7 +211,7 @@ class Judgement:
 
     @property
     def crossed(self) -> Flags:
-        """On the other side of the surface, where the bound leaves the side open."""
+        """The rays whose answer is on the other side of the surface, where the bound leaves the side open."""
         exact = self.bounds.exact
         crossed: Flags = self.bounds.side_open & self.compared & exact.transmitted & (self.error > exact.cos_t)
         return crossed

@@ -239,7 +239,7 @@ def _compare(
 
 
 def _finite_pair(reference: Image, test: Image) -> tuple[Image, Image]:
-    """Both with the channels in the reference's order, and 0 for what is not finite."""
+    """Both images with the channels in the reference's order, and 0 for what is not finite."""
     a, b = (finite(pixels) for pixels in aligned(reference, test))
     return replace(reference, pixels=a), replace(test, pixels=b, channels=reference.channels)
 

@@ -191,7 +191,7 @@ def _with_variants(pair: Result, others: Sequence[Path]) -> Result:
 
 
 def _matched(pair: Result, template: str, paths: Sequence[Path]) -> list[Path]:
-    """Those of the paths that a template of `accept` means for the reference of a pair, by their names."""
+    """The paths that a template of `accept` means for the reference of a pair, by their names."""
     names = {path.relative_to(pair.target.parent).as_posix(): path for path in paths}
     values = {**name_patterns.fields(pair.target.name), **pair.how.fields}
     return [names[name] for name in name_patterns.expanded(template, values, sorted(names))]

@@ -185,7 +185,7 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
 
 
 def sizes(changes: Pixels, clean: Pixels, tallies: dict[str, Tally]) -> dict[str, float]:
-    """Of the tile and channel where the change is largest relative to the noise there: the size of a defect.
+    """The size of a defect: figures of the tile and channel where the change is largest relative to the noise.
 
     The minimum detectable difference is printed for the median tile; in a noisier tile it is so much larger.
     """

@@ -264,7 +264,7 @@ def named(name: str, pixels: ArrayLike) -> Image:
 
 
 def _parts(source: ImageInput) -> Iterator[tuple[int, int]]:
-    """Each part and MIP level by number; the source is at it. Not counted first: some formats are decoded here."""
+    """Each part and MIP level by number; the source is at it. Counting first would decode some formats."""
     part = 0
     while source.seek_subimage(part, 0):
         level = 0

@@ -108,7 +108,7 @@ def _alternatives(kind: Any) -> list[Any]:
 
 
 def _structs(kinds: list[Any], value: Any) -> list[Any]:
-    """Those of the types that describe this table."""
+    """The types that describe this table."""
     structs = [each for each in kinds if isinstance(each, msgspec.inspect.StructType) and isinstance(value, dict)]
     return [each for each in structs if each.tag_field is None or each.tag == value.get(each.tag_field)]
 

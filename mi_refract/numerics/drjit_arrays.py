@@ -120,7 +120,7 @@ def rounded_product(x: Number, y: Number) -> Number:
 
 
 def ieee_quotients(kind: ArrayType) -> contextlib.AbstractContextManager[None]:
-    """Within it, reciprocals, roots and derivatives of arrays like `kind` have the digits of float64 on CUDA, too.
+    """A context in which reciprocals, roots and derivatives of arrays like `kind` have the digits of float64 on CUDA.
 
     There Dr.Jit's `rcp`, and with it `rsqrt` and the derivatives of quotients and roots, otherwise has the 20 bits of
     one instruction.

@@ -55,7 +55,7 @@ def absorbed(sigma: Spectrum, length: Number) -> Spectrum:
 
 
 def read_absorption(plugin: str, props: Properties, side: str) -> Absorption | None:
-    """Of `int`, `ext` or `camera`; None where the scene does not say. ValueError with the parameter."""
+    """The absorption of `int`, `ext` or `camera`; None where the scene does not say. ValueError with the parameter."""
     sigma, colour, distance = f"{side}_absorption", f"{side}_colour", f"{side}_colour_distance"
     for known in (colour, distance):
         if (unknown := known.replace("colour", "color")) in props:

@@ -186,7 +186,7 @@ def absorbs_only(v: Variant, medium: MediumPlugin) -> bool:
 def check_integrator(scene: Scene) -> None:
     """ValueError where a BSDF absorbs and the scene's integrator is neither `refract_path` nor calls only that.
 
-    As with that integrator also where a texture is an attribute that its shape does not have.
+    Also where the texture of a BSDF reads an attribute that its shape does not have.
     """
     check_attributes(scene)
 

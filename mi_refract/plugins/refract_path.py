@@ -106,7 +106,7 @@ def integrator_class(v: Variant) -> type:
     vectorised = dr.is_jit_v(v.Float)
 
     def to_camera(sensor: Sensor) -> Any:
-        """From the world to the camera, whose rays leave the plane z = 0; None where they start at the sensor."""
+        """The transform from world to camera, whose rays leave the plane z = 0; None where they start at the sensor."""
         return sensor.world_transform().inverse() if isinstance(sensor, v.ProjectiveCamera) else None
 
     class RefractPath(v.SamplingIntegrator):  # type: ignore[misc]
@@ -131,13 +131,13 @@ def integrator_class(v: Variant) -> type:
             self.loops: list[PathLoop] = []  # of this render: one a pass; in scalar variants one in all
 
         def begin_render(self, sensor: Sensor) -> None:
-            """To be called before `sample` where `render` is not; else each sample inspects the scene anew."""
+            """Call this before `sample` where `render` is not called; else each sample inspects the scene anew."""
             self.loops, self.rendering = [], True
             self.near = to_camera(sensor)
             self.unconnected = lamp_tracing.refused_sensor(sensor)
 
         def end_render(self) -> None:
-            """To be called after the samples were evaluated. ValueError where absorption was contradictory."""
+            """Call this after the samples were evaluated. ValueError where absorption was contradictory."""
             loops, self.loops, self.rendering = self.loops, [], False
             for loop in loops:
                 loop.refuse()
@@ -218,7 +218,7 @@ def integrator_class(v: Variant) -> type:
             return dr.select(end.valid_ray, end.result, 0), end.valid_ray, [end.truncated][: len(self.aov_names())]
 
         def path_loop(self, scene: Scene, sampler: Sampler) -> PathLoop:
-            """Of a pass of a render, or of one sample of it in a scalar variant."""
+            """The loop of a pass of a render, or of one sample of it in a scalar variant."""
             if not vectorised and (loop := next((loop for loop in self.loops if loop.scene is scene), None)):
                 return loop
             needs = self.scene_features(scene)
@@ -315,7 +315,7 @@ def integrator_class(v: Variant) -> type:
             )
 
         def scene_features(self, scene: Scene) -> SceneFeatures:
-            """Of the scene as it is now: an edit of the scene can change them."""
+            """The features of the scene as it is now: an edit of the scene can change them."""
             before, self.needs = (self.needs, self.apart), (needs := inspect(scene))
             self.apart = self.traces_lamps(scene, needs)
             missing = needs.missing("lamp" if self.apart else "path", self.max_depth)

@@ -239,7 +239,7 @@ class CheckpointWriter:
             self._thread.start()
 
     def wait(self) -> None:
-        """Until no checkpoint is being written."""
+        """Wait until no checkpoint is being written."""
         if self._thread is not None:
             self._thread.join()
             self._thread = None

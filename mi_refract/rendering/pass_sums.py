@@ -126,7 +126,7 @@ class PassSums:
             self.within = self.within + other.within
 
     def _weights_of(self, piece: slice) -> Any:
-        """Of some pixels, once for each channel; one number where it is that of all."""
+        """The weights of some pixels, once for each channel; one number where it is that of all."""
         if self.weights is None:
             return float(self.spp)
         return np.repeat(self.weights.reshape(-1, 1)[piece], self.total.shape[-1], 1)

@@ -83,7 +83,7 @@ class Passes:
     found: Doubles | None = None
 
     def of(self, pixels: Any) -> Passes:
-        """Only some pixels."""
+        """The same for some pixels only."""
         found = None if self.found is None else self.found[:, :, pixels]
         return replace(self, means=self.means[:, pixels], found=found)
 
@@ -147,7 +147,7 @@ def _of_found(means: Doubles, within: Doubles, light: float) -> float:
 
 
 def ratios(found: dict[str, Passes], of: str) -> dict[str, Ratio]:
-    """By candidate, over the cost of one of them. The intervals are by the jackknife, over groups of pixels."""
+    """The cost of each candidate over that of one of them. Intervals are by the jackknife, over groups of pixels."""
     known = np.logical_and.reduce([np.isfinite(each.means).all((0, 2)) for each in found.values()])
     group = np.cumsum(known) % GROUPS
 
@@ -171,7 +171,7 @@ UNKNOWN = Ratio(1, 0, math.inf, 1, 1)
 
 
 def known(costs: dict[str, Ratio]) -> dict[str, Ratio]:
-    """Without the scene's own settings where they have less noise than the next: they have not met all of it."""
+    """The costs without the scene's own where it has less noise than the next: it has not met all of it."""
     (first, own), *others = costs.items()
     if first == OWN and others and own.variance * MARGIN < others[0][1].variance:
         return dict(others)
@@ -269,7 +269,7 @@ class Pilot:
         self.first = max(LEAST_PIXELS, int(FIRST * self.samples / per_pixel))
 
     def _candidates(self) -> list[Settings]:
-        """In their order; only those that trace lamps where all else misses light."""
+        """The candidates in their order; only those that trace lamps where all else misses light."""
         node, features = integrator_node(self.parsed, {}), inspect(self.renderer.scene)
         best = self.own | {"sampler": next(filter(self._fits, (*SAMPLERS, self.own["sampler"])))}
         found = [self.own, best]
@@ -338,7 +338,7 @@ class Pilot:
         return min(limit, self.samples / int(self._sampler({}).sample_count()) * seconds)
 
     def _sampler(self, settings: Settings) -> Any:
-        """With as many samples as a pass of the render has, or fewer where that would be few pixels."""
+        """A sampler with as many samples as a pass of the render, or fewer where that would be few pixels."""
         name = settings.get("sampler", self.own["sampler"])
         if name not in self._samplers:
             own = name == self.own["sampler"]

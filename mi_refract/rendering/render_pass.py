@@ -136,7 +136,7 @@ def pass_renderer(scene: Scene, seed: int) -> PassRenderer:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Without Mitsuba's warning, at every pass, that a sampler rounds up: it is taken into account."""
+    """A context without Mitsuba's warning, at every pass, that a sampler rounds up: it is taken into account."""
     logger: Any = mi.logger()  # type: ignore[operator]
     before = logger.log_level()
     logger.set_log_level(mi.LogLevel.Error)

@@ -185,7 +185,7 @@ def camera_of(scene: Any, method: Method, max_depth: int = DEPTH) -> Camera | Su
 
 
 def energy_rows(context: Context, body: str, lamp: str, methods: tuple[Method, ...] = ENERGY) -> list[Row]:
-    """Of each method: the power on the disk against the quadrature."""
+    """A row for each method: the power on the disk against the quadrature."""
     extent, rows = EXTENTS[context.profile.name], []
     setup, radius = caustic_energy.ON_AXIS[body, lamp]
     exact, step = caustic_energy.flux(setup, radius, BOUNDARIES)
@@ -224,7 +224,7 @@ class Reference:
 
 
 def reference(body: str, lamp: str, extent: Extent) -> Reference:
-    """By the sum of Mitsuba's two integrators."""
+    """The reference by the sum of Mitsuba's two integrators."""
     scene, black = (scenes.scene(body, lamp, bsdf, extent.resolution) for bsdf in (DIELECTRIC, scenes.BLACK))
     look = SumOfClasses(scene, DEPTH)
     renders = np.stack([look(extent.checked(body), seed=FIRST_REFERENCE + i)[0] for i in range(extent.renders)])

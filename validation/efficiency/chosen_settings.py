@@ -138,7 +138,7 @@ def scene_file(name: str, bsdf: str, resolution: int, folder: Path) -> tuple[Pat
 
 
 def full(settings: Settings) -> Settings:
-    """With what is left to its default."""
+    """The settings, and the defaults of those that are not set."""
     every = {"sampler": "independent", "integrator": "path"} | settings
     return (DEFAULTS if every["integrator"] == OURS else {}) | every
 

@@ -98,7 +98,7 @@ def of_kind(*kinds: str) -> list[StandardNumber]:
 
 
 def plates() -> list[StandardNumber]:
-    """Those that renderers without polarisation can be asked."""
+    """The numbers that renderers without polarisation can be asked."""
     straight = [x for x in of_kind("transmittance") if not (x.given["incidence"] or "absorbance" in x.given)]
     return [*straight, *of_kind(IMAGES)]
 
@@ -224,7 +224,7 @@ def together(systems: Sequence[Optics], refract: Callable[[Any, Any, Any], Any])
 
 
 def conditions(optics: Optics, reading: Callable[[optical_systems.Path], Any]) -> Any:
-    """By how many u a reading of each ray is off if a, n, k and b are off by u at each boundary, to first order."""
+    """How many u a reading of each ray is off if a, n, k and b are off by u at each boundary, to first order."""
     exact, total = reading(optics.path()), 0.0
     for j, boundary in enumerate(optics.boundaries):
         for what in (*["into"] * (j == 0), "normal", "index", "onward") if boundary.k is not None else ():
