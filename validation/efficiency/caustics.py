@@ -9,9 +9,9 @@ methods have the sampler `independent`, and as many samples. MSE × time is comp
 the whole image and where the caustic is seen: in pixels that see no glass, and have more than a quarter of their light
 by it. Where `path` has met no lamp its error is too small, so these ratios are upper bounds. What small lamps light
 through glass and is seen through glass again stays noise in all methods, and is not compared; the reference has that
-noise, too, so the MSE of a whole image with a very small lamp says little. *Noise by class*: whose paths make the noise
-that is left with small lamps. Of what is seen in glass L S+ E is what a floor leaves that is nearly black, L D (S|D)* S
-E has the noise of a point lamp, and L S+ D (S|D)* S E has the rest.
+noise, too, so the MSE of a whole image with a very small lamp says little. *Noise by class*: which paths make the
+noise that is left with small lamps. Of what is seen in glass, L S+ E is what is left over a nearly black floor,
+L D (S|D)* S E has the noise with a point lamp, and L S+ D (S|D)* S E has the rest.
 """
 
 from __future__ import annotations
