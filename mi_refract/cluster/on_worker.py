@@ -32,13 +32,13 @@ def facts(variant: str) -> dict[str, str]:
     """Facts of this process by name: versions that the bits depend on, and why the variant cannot run, or ""."""
     family = variant.partition("_")[0]
     here = backend.detect()[family]
-    found = {name: installed_version(name) for name in ("mitsuba", "drjit")}
-    found |= {"mi_refract": our_version(), "processor": platform.machine()}
-    found["Python"] = ".".join(platform.python_version_tuple()[:2])
-    found[UNUSABLE] = "" if here.usable else f"{variant}: {here.reason}"
+    by_name = {name: installed_version(name) for name in ("mitsuba", "drjit")}
+    by_name |= {"mi_refract": our_version(), "processor": platform.machine()}
+    by_name["Python"] = ".".join(platform.python_version_tuple()[:2])
+    by_name[UNUSABLE] = "" if here.usable else f"{variant}: {here.reason}"
     if family == "llvm" and here.usable:
-        found |= {LLVM: here.reason.removeprefix("libLLVM "), WIDTH: vector_width()}
-    return found | {HOST: platform.node()}
+        by_name |= {LLVM: here.reason.removeprefix("libLLVM "), WIDTH: vector_width()}
+    return by_name | {HOST: platform.node()}
 
 
 def vector_width() -> str:

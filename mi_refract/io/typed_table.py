@@ -86,12 +86,12 @@ def _names(kind: Any, value: Any, path: str) -> list[str]:
         if name and (tags := [each.tag for each in kinds if getattr(each, "tag_field", None) == name]):
             return tags
         if name:
-            found = [
+            types = [
                 field.type for each in _structs(kinds, value) for field in each.fields if field.encode_name == name
             ]
         else:
-            found = [each.item_type for each in kinds if hasattr(each, "item_type")]
-        kinds = [each for one in found for each in _alternatives(one)]
+            types = [each.item_type for each in kinds if hasattr(each, "item_type")]
+        kinds = [each for one in types for each in _alternatives(one)]
         if isinstance(value, dict):
             value = value.get(name)  # None of the dots that msgspec writes for a name that a user chose
         else:

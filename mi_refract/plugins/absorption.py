@@ -119,8 +119,8 @@ def _from_k(plugin: str, name: str, text: Any, unit: Any) -> Absorption:
     if not medium or not medium.k:
         raise ValueError(f"{label} = {text!r}; expected a number, a spectrum, or with {name}_unit a file with k")
     if isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < math.inf:
-        found = f"{name} = {text!r}: {name}_unit is missing" if unit is None else f"{name}_unit = {unit!r}"
-        raise ValueError(f"{plugin}: {found}; expected the scene's unit in metres: 0.001 for mm")
+        problem = f"{name} = {text!r}: {name}_unit is missing" if unit is None else f"{name}_unit = {unit!r}"
+        raise ValueError(f"{plugin}: {problem}; expected the scene's unit in metres: 0.001 for mm")
     knots, k = medium.k
     held = "has the absorption of the range's end"
     check_range(f"{label} = {text!r} has k", (knots[0], knots[-1]), medium.hold, held)

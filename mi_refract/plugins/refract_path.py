@@ -168,13 +168,13 @@ def integrator_class(v: Variant) -> type:
             if spp:
                 sampler.set_sample_count(spp)
             number: Any = dr.slice(seed)
-            found = self.caustic_image(scene, sensor, int(number), int(sampler.sample_count()), ("R", "G", "B"))
+            caustic = self.caustic_image(scene, sensor, int(number), int(sampler.sample_count()), ("R", "G", "B"))
             # Colours on a film are sums; those of the samples' weights, by which it divides them, are its last channel
             # before others.
             block, sums = film.create_block(), film.develop(True)
             weight = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
             values = block.tensor().numpy()
-            values[..., :3] = found[0] * sums.numpy()[..., weight : weight + 1]
+            values[..., :3] = caustic[0] * sums.numpy()[..., weight : weight + 1]
             block.tensor()[:] = type(sums)(values)
             film.put_block(block)
             return film.develop() if develop else v.TensorXf()

@@ -71,10 +71,10 @@ def image_sums(
         means = [mi.Float(dr.select(weight == 0, 0, total / weight)) for total in totals]
         weights, within = [weight], _squared_sums(values, place, means, film) if squares else []
     kind: Any = mi.ArrayXd
-    found = [dr.ravel(kind(columns)) if columns else None for columns in (totals, weights, within)]
-    dr.eval(found)  # in one kernel
+    sums = [dr.ravel(kind(columns)) if columns else None for columns in (totals, weights, within)]
+    dr.eval(sums)  # in one kernel
     shape = film.height, film.width, -1
-    total, *others = (None if each is None else np.array(each).reshape(shape) for each in found)
+    total, *others = (None if each is None else np.array(each).reshape(shape) for each in sums)
     assert total is not None
     return total, others[0], others[1]
 
