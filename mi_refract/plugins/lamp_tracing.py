@@ -431,7 +431,7 @@ class LampTracer:
         weight = weight * (geometric * _quotient(dr.abs(si.wi.z), dr.abs(bs.wo.z)))
         if features.perturbed:
             bs.wo, weight = self._own_normal(si, bsdf, bs, weight, s.ray.d, numbers, key + 1, active_next)
-        ray = si.spawn_ray(si.to_world(bs.wo))
+        ray = loop.spawn_ray(si, bs)
         throughput = loop.times(weight, s.throughput)
         if features.dispersion:
             dispersed = (bs.sampled_type & DISPERSED) != 0

@@ -30,6 +30,9 @@ frozen functions, for derivatives and within another integrator it is an error, 
 derivatives are those of the image by path tracing. What is missing is named in a warning, once a scene
 (`SceneFeatures.missing`).
 
+Rays of delta lobes start nearer to the surface that they leave than those of `path` (`ray_origins`): glass may be as
+thin as 2e-6 of its size and its largest coordinate. A thinner shape is named in a warning (`SceneFeatures.thin`).
+
 Derivatives are attached: rays move with the index. Edges that move across a pixel, or in the view of a surface that is
 not smooth, are not in them. A render that is differentiated does not split.
 """
@@ -312,6 +315,7 @@ def integrator_class(v: Variant) -> type:
                 null=needs.null,
                 caustics_apart=self.apart,
                 perturbed=needs.perturbed,
+                delta_extent=needs.delta_extent,
             )
 
         def scene_features(self, scene: Scene) -> SceneFeatures:
@@ -319,8 +323,11 @@ def integrator_class(v: Variant) -> type:
             before, self.needs = (self.needs, self.apart), (needs := inspect(scene))
             self.apart = self.traces_lamps(scene, needs)
             missing = needs.missing("lamp" if self.apart else "path", self.max_depth)
-            for path_class, text in missing.items() if (needs, self.apart) != before else ():
-                mi.Log(mi.LogLevel.Warn, f"{INTEGRATOR}: missing {path_class}: {text}")  # type: ignore[operator]
+            warnings = [f"missing {path_class}: {text}" for path_class, text in missing.items()]
+            if needs.thin:
+                warnings.append(f"{needs.thin}; expected a thicker shape, or one nearer to the origin")
+            for text in warnings if (needs, self.apart) != before else ():
+                mi.Log(mi.LogLevel.Warn, f"{INTEGRATOR}: {text}")  # type: ignore[operator]
             if needs.textured:
                 check_attributes(scene)
             if needs.absorbing or needs.media:

@@ -20,6 +20,8 @@ import mitsuba as mi
 
 from mi_refract.numerics import BSDF, Scene, Shape, Variant
 
+from . import ray_origins
+
 # fmt: off
 KNOWN = {
     "BlendBSDF", "BumpMap", "MaskBSDF", "NormalMap", "TwoSidedBRDF",
@@ -80,6 +82,8 @@ class SceneFeatures:
     zero_size: tuple[str, ...]  # the classes of the emitters whose light has one position, or one direction at each
     splitting: bool  # some shape's BSDF is of `BOUNDARIES`
     chance: str  # the first plugin that is not of `DETERMINISTIC`, and its shape; "" where there is none
+    delta_extent: float  # of the largest shape with delta lobes, as `ray_origins` takes it
+    thin: str  # the first shape of glass that rays step over, and why; "" where there is none
     unknown: tuple[str, ...] = ()
 
     @property
@@ -165,6 +169,18 @@ def inspect(scene: Scene) -> SceneFeatures:
     deltas = {bsdf_name(bsdf) for bsdf in bsdfs if not bsdf.flags() & +lobes.Smooth}
     lamps = [shape.emitter() for shape in shapes if shape.is_emitter()]
     points = [emitter for emitter in emitters if emitter.flags() & +mi.EmitterFlags.Delta]
+    with_delta = [
+        i
+        for i, inner in enumerate(within)
+        if any(bsdf.flags() & +lobes.Delta or bsdf_name(bsdf) not in KNOWN for bsdf in inner)
+    ]
+    delta_extent = math.inf if opaque else ray_origins.extent_of(shapes[i] for i in with_delta)
+    thin = (
+        f"{shape_name(shapes, i)} {text}"
+        for i in with_delta
+        if any(bsdf.flags() & +lobes.DeltaTransmission for bsdf in within[i])
+        and (text := ray_origins.too_thin(shapes[i], delta_extent))
+    )
     shape_media = any(shape.interior_medium() or shape.exterior_medium() for shape in shapes)
     return SceneFeatures(
         smooth=everything or bool(flags & +lobes.Smooth),
@@ -196,6 +212,8 @@ def inspect(scene: Scene) -> SceneFeatures:
         zero_size=tuple(sorted({lamp.class_name() for lamp in points if lamp.sampling_weight() > 0})),
         splitting=any(bsdf_name(bsdf) in BOUNDARIES for each in within for bsdf in each[:1]),
         chance=next(chance, ""),
+        delta_extent=delta_extent,
+        thin=next(thin, ""),
         unknown=unknown,
     )
 

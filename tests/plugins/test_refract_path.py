@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import gc
+import math
 
 import drjit as dr
 import mitsuba as mi
@@ -40,7 +41,8 @@ def test_where_nothing_is_left_out_the_numbers_and_the_image_are_those_of_path(
         pytest.skip("RGB variants stand for the others")
 
     def everything(scene):
-        return dataclasses.replace(scene_features.inspect(scene), both_numbers=True, plain_environment=False)
+        changed = {"both_numbers": True, "plain_environment": False, "delta_extent": math.inf}
+        return dataclasses.replace(scene_features.inspect(scene), **changed)
 
     monkeypatch.setattr(refract_path, "inspect", everything)
     vectorised = dr.is_jit_v(mi.Float)
@@ -123,6 +125,35 @@ def test_nothing_to_see_is_black(rgb_variant):
         for parameters in ({}, {"split_depth": 2, "max_depth": -1}):
             assert (render(scene, 2, **parameters) == 0).all()
     assert (render(glass_ball(sky=LIT), 2, max_depth=0) == 0).all()
+
+
+WHITE_FLOOR = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 1.0}}
+
+
+@pytest.mark.parametrize(
+    ("shape", "scale", "place"),
+    [
+        ("cube", (1, 1, 5e-5), (0, 0, 0)),
+        ("cube", (1, 1, 5e-4), (12, 0, 0)),
+        ("cube", (1, 1, 2e-3), (100, 30, 5)),
+        ("cube", (1, 1, 1), (0, 0, 1000)),
+        ("cube", (1000, 1000, 1000), (1, 2, 3)),
+        ("sphere", (1e-4, 1e-4, 1e-4), (0, 0, 0)),
+        ("sphere", (1000, 1000, 1000), (0, 0, 1000)),
+    ],
+)
+@pytest.mark.parametrize("floor", [False, True])
+def test_glass_in_even_light_is_invisible_however_thin_and_far_from_the_origin(shape, scale, place, floor, rgb_variant):
+    """Each boundary is met once: a ray that steps over one, or meets it again, carries 1.5² times too much or less."""
+    at = PLACE().translate([*place]).rotate([0.48, 0.6, 0.64], 40)
+    parts = {"glass": {"type": shape, "to_world": at.scale([*scale]), "bsdf": GLASS}, "sky": {"type": "constant"}}
+    far = max(scale)
+    if floor:
+        parts["floor"] = WHITE_FLOOR | {"to_world": at.translate([0, 0, -4 * far]).scale(20 * far)}
+    eye = camera(16, origin=at @ mi.ScalarPoint3f(0.3 * far, 0.2 * far, 4 * far), target=place)
+    count = 16 if dr.is_jit_v(mi.Float) else 1
+    image = render(mi.load_dict({"type": "scene", "sensor": eye} | parts), count, max_depth=-1, rr_depth=1000)
+    assert image == pytest.approx(1, abs=1e-3)
 
 
 # Splitting -----------------------------------------------------------------------------------------------------

@@ -312,3 +312,24 @@ def test_refract_path_warns_once_a_scene_of_what_is_missing(logged, scalar_varia
     warnings = [text for text in logged if "missing" in text]
     assert len(warnings) == 2
     assert all(text.startswith("refract_path: missing L S+ D (S|D)* E: light of PointLight") for text in warnings)
+
+
+# Rays that start beyond the glass -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("thickness", "place", "others", "thin"),
+    [
+        (1e-3, 12, {}, ""),
+        (1e-5, 12, {}, "'pane' is 1e-05 thick, and rays start 2.86e-05 beside its surface"),
+        (1e-5, 0, {}, ""),
+        # Beside a cylinder rays start as Mitsuba's do.
+        (1e-3, 12, {"pipe": {"type": "cylinder", "bsdf": GLASS}}, "'pane' is 0.001 thick, and rays start 0.00125"),
+        (1e-5, 12, {"bsdf": {"type": "conductor"}}, ""),
+    ],
+)
+def test_glass_that_rays_step_over_is_named(thickness, place, others, thin, scalar_variant):
+    at = PLACE().translate([place, 0, 0]).scale([1, 1, thickness / 2])
+    pane = {"type": "cube", "id": "pane", "to_world": at, "bsdf": others.get("bsdf", GLASS)}
+    found = needs(pane=pane, **{name: part for name, part in others.items() if name != "bsdf"}).thin
+    assert thin in found and bool(thin) == bool(found)
