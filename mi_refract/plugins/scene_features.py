@@ -49,6 +49,7 @@ WITHOUT_TANGENT = DETERMINISTIC | {"BlendBSDF", "MaskBSDF", "Null", "ThinDielect
 # Plugins that sample with `sample1` or with `sample2`, and never with both.
 EITHER = DETERMINISTIC | {"Null", "RoughConductor", "SmoothDiffuse", "ThinDielectric"}
 TRACED_LAMPS = {"AreaLight", "DirectionalEmitter", "PointLight", "SpotLight"}  # that `lamp_tracing` takes
+CAST = "L S+ D (S|D)* E"  # the class of paths of caustics; see `SceneFeatures.missing`
 BEAM = "DirectionalArea"  # the emitter of zero size that no shadow ray finds: its `sample_direction` gives nothing
 # Integrators that find lamps of zero size by shadow rays only, as they call themselves → `volumes` of `missing`.
 SHADOW_RAYS = {
@@ -129,7 +130,7 @@ class SceneFeatures:
         # Class, whether its lamps and lobes are there, edges of its shortest path, text.
         classes = {
             "path": (
-                ("L S+ D (S|D)* E", shadowed and lobes, 3, f"light of {shadowed} {cast}; expected {traced}{area}"),
+                (CAST, shadowed and lobes, 3, f"light of {shadowed} {cast}; expected {traced}{area}"),
                 ("L (S|D)* D (S|D)* E", beam, 2, f"all light of {beam} is black; expected a lamp of another type"),
             ),
             "lamp": (
@@ -234,6 +235,19 @@ def missing_light(scene: Scene) -> dict[str, str]:
             caustics = integrator.caustics_of(scene, scene.sensors()[0]) if own else "path"
             missing |= features.missing(caustics, int(depth[1]), volumes=SHADOW_RAYS[name])
     return missing
+
+
+def differentiated(scene: Scene) -> bool:
+    """Whether a parameter of the scene has a derivative, also while derivatives are suspended, as in `mi.render`."""
+
+    def attached(value: Any) -> bool:
+        if not dr.is_diff_v(value):
+            return False
+        if dr.is_tensor_v(value):
+            return attached(value.array)
+        return any(map(attached, value)) if dr.depth_v(value) > 1 else value.index_ad != 0
+
+    return any(attached(value) for _, value in mi.traverse(scene))
 
 
 def check_attributes(scene: Scene) -> None:

@@ -115,7 +115,7 @@ def test_lamps_are_chosen_by_their_weights_and_the_sky_is_met(split_depth, typic
     vectorised = dr.is_jit_v(mi.Float)
     scene, spp = glass_ball(24 if vectorised else 4, **lamps()), 64 if vectorised else 8
     theirs = np.stack([by_path(scene, spp, i) for i in range(8)])
-    ours = np.stack([render(scene, spp, 100 + i, split_depth=split_depth) for i in range(8)])
+    ours = np.stack([render(scene, spp, 100 + i, split_depth=split_depth, caustics="path") for i in range(8)])
     assert tile_statistics.compare_stacks(theirs, ours, theirs.shape[1], 1e-3, 1e-5).alarms == 0
 
 
@@ -307,7 +307,7 @@ def test_what_cannot_be_is_refused_in_one_line(parameters, said, rgb_variant):
 def test_parameters_and_their_defaults_are_written_out(scalar_variant):
     names = ("max_depth", "rr_depth", "hide_emitters", "split_depth", "split_weight", "deterministic")
     names += ("caustics", "light_paths")
-    plain = "path", 0.25
+    plain = "auto", 0.25
     for parameters, values in (
         ({}, (-1, 5, False, 0, 0.01, False, *plain)),
         (
@@ -317,7 +317,7 @@ def test_parameters_and_their_defaults_are_written_out(scalar_variant):
         ({"max_depth": 0, "deterministic": True}, (0, 5, False, 64, 0.001, True, *plain)),
         ({"split_depth": 12, "split_weight": 0.0}, (-1, 5, False, 12, 0.0, False, *plain)),
         ({"split_depth": 64, "split_weight": 1 / 4096}, (-1, 5, False, 64, 1 / 4096, False, *plain)),
-        ({"caustics": "auto", "light_paths": 2}, (-1, 5, False, 0, 0.01, False, "auto", 2.0)),
+        ({"caustics": "lamp", "light_paths": 2}, (-1, 5, False, 0, 0.01, False, "lamp", 2.0)),
     ):
         lines = [f"  {name} = {value}," for name, value in zip(names, values, strict=True)]
         said = str(mi.load_dict({"type": "refract_path"} | parameters))
@@ -407,7 +407,7 @@ def test_an_edit_is_seen_whatever_calls(around, llvm_variant):
     """A black floor that turns grey."""
     floor = {"type": "rectangle", "to_world": PLACE().translate([0, 0, -2]).scale(9), "bsdf": BLACK}
     scene = glass_ball(floor=floor, spot={"type": "point", "position": [0, 4, 4], "intensity": 30.0})
-    method, params, means = within(around, max_depth=5), mi.traverse(scene), []
+    method, params, means = within(around, max_depth=5, caustics="path"), mi.traverse(scene), []
     for grey in (0.0, 0.5):
         params[parameter(params, "reflectance.value")] = grey
         params.update()
