@@ -279,7 +279,7 @@ def integrator_class(v: Variant) -> type:
                 "the scene has media": needs.media,
                 f"a {needs.delta_perturbed} has delta lobes": bool(needs.delta_perturbed),
                 self.unconnected: bool(self.unconnected),
-                (lamps := lamp_tracing.refused_lamps(scene)): bool(lamps),
+                (lamps := "" if frozen else lamp_tracing.refused_lamps(scene)): bool(lamps),
             }
             reason = next((text for text, found in reasons.items() if found), "")
             if reason and self.caustics == "lamp":
