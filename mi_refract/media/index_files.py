@@ -80,7 +80,7 @@ def _csv(text: str) -> Medium:
     header = [cell.lower() for cell in rows[0]] if rows else []
     units = [(i, unit) for i, cell in enumerate(header) if (unit := UNIT.search(cell))]
     if len(units) != 1 or "n" not in header:
-        raise ValueError(f"header {','.join(header)!r}; expected nm or µm in one column's name, n, and k: 'nm,n,k'")
+        raise ValueError(f"header {','.join(header)!r}; expected nm or µm in one name, n, and optionally k: 'nm,n,k'")
     column, unit = units[0]
     factor = 1 if unit[1] else NANOMETRES
     expected = f"expected numbers in the columns {', '.join(header)}, with decimal points, and no more columns"

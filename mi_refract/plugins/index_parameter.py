@@ -208,8 +208,8 @@ def check_range(label: str, valid: tuple[float, float], hold: bool, held: str) -
         low = wavelengths[np.argmax(below.max(0) > LOST / 2)]  # half of it on either side
         high = wavelengths[np.argmax(below.min(0) >= 1 - LOST / 2)]
         raise ValueError(
-            f"{label}: {share} lies outside; expected at least {low:g} … {high:g} nm, or hold(…) around the text, by "
-            "which the values at its ends go on"
+            f"{label}: {share} lies outside; expected at least {low:g} … {high:g} nm, or hold(…) around the text, "
+            "which extends the values at its ends"
         )
     if lost:
         warn_once(f"{label}; other light ({share}) {held}")
