@@ -1,7 +1,7 @@
 """Light traced from the lamps, through glass and over mirrors, onto surfaces that the camera sees: caustics.
 
 A path from a lamp L to the camera E has vertices S, where the light takes a delta lobe (a null lobe is one), and D, any
-others. Of a render with `caustics` = `lamp` each class of paths belongs to one part:
+others. In a render with `caustics` = `lamp` each class of paths belongs to one part:
 
 | class (Heckbert's notation) | part | found by |
 |---|---|---|
