@@ -80,7 +80,8 @@ def _csv(text: str) -> Medium:
     header = [cell.lower() for cell in rows[0]] if rows else []
     units = [(i, unit) for i, cell in enumerate(header) if (unit := UNIT.search(cell))]
     if len(units) != 1 or "n" not in header:
-        raise ValueError(f"header {','.join(header)!r}; expected nm or µm in one column's name, n, and k: 'nm,n,k'")
+        expected = "a column whose name contains nm or µm, a column n, and optionally k, as in 'nm,n,k'"
+        raise ValueError(f"header {','.join(header)!r}; expected {expected}")
     column, unit = units[0]
     factor = 1 if unit[1] else NANOMETRES
     expected = f"expected numbers in the columns {', '.join(header)}, with decimal points, and no more columns"
@@ -99,13 +100,13 @@ def _csv(text: str) -> Medium:
 def _tabulated(kind: str, rows: Sequence[Sequence[float]]) -> Medium:
     """A medium from rows of λ in nm and the columns `kind`: "n", "k" or "nk". Without n it has no coefficients."""
     if kind not in ("n", "k", "nk") or {len(row) for row in rows} != {1 + len(kind)}:
-        raise ValueError(f"a table of {kind}; expected n, k or nk, and as many numbers in each line")
+        raise ValueError(f"a table of {kind}; expected n, k or nk, and a number for each in every line")
     wavelengths, columns = [row[0] for row in rows], dict(zip(kind, [*zip(*rows, strict=True)][1:], strict=True))
     form, coefficients = table([*zip(wavelengths, columns.get("n", [1.0] * len(rows)), strict=True)])
     k = columns.get("k", ())
     bad = [x for x in k if not 0 <= x < math.inf]
     if bad:
-        raise ValueError(f"k = {bad[0]:g}; expected a number ≥ 0, and finite")
+        raise ValueError(f"k = {bad[0]:g}; expected a finite number ≥ 0")
     valid = wavelengths[0], wavelengths[-1]
     return Medium("", form, coefficients if "n" in kind else {}, valid, k=(form.knots, tuple(k)) if k else None)
 

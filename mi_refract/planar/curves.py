@@ -62,7 +62,8 @@ class Curve:
         matrix, at = np.asarray(matrix, float), np.asarray(at, float)
         determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
         if not (math.isfinite(determinant) and determinant and np.isfinite(at).all()):
-            raise ValueError(f"matrix = {matrix.tolist()}, at = {at.tolist()}; expected finite, determinant not 0")
+            text = f"matrix = {matrix.tolist()}, at = {at.tolist()}"
+            raise ValueError(f"{text}; expected finite numbers, and a determinant other than 0")
         # Computed by column: so products with 0 and 1 are exact, while a matrix product may sum in any order.
         x, y = matrix.T
         vertices, control = (p[:, :1] * x + p[:, 1:] * y + at for p in (self.vertices, self.control))
@@ -77,8 +78,8 @@ class Curve:
         """
         arcs = np.flatnonzero(~self.straight)
         if not 0 < len(arcs) <= facets:
-            text = f"facets: {facets}, for {len(arcs)} arcs"
-            raise ValueError(f"{text}; expected one or more arcs, and a facet or more for each")
+            text = f"facets: {facets} for {len(arcs)} arcs"
+            raise ValueError(f"{text}; expected at least one arc, and at least one facet per arc")
         steps = np.ones(len(self), int)
         steps[arcs] = np.diff(np.arange(len(arcs) + 1) * facets // len(arcs))
         return polygonal(self._chords(steps), self.closed)

@@ -108,8 +108,8 @@ def follow(
 def _check_size(paths: int, max_depth: int, reflections: int, most: int = MOST, taken: int = 0) -> None:
     if paths * (max_depth + 1) > most - taken:
         size = f"{paths} paths of up to {max_depth} boundaries with up to {reflections} partial reflections"
-        rest = f", of which other colours take {taken}" if taken else ""
-        raise ValueError(f"{size}; expected fewer rays, branches or boundaries, {most} legs altogether{rest}")
+        others = f", including {taken} of other colours" if taken else ""
+        raise ValueError(f"{size}; expected fewer rays, branches or boundaries, up to {most} legs in total{others}")
 
 
 def follow_scene(scene: PlanarScene, *, most: int = MOST, **how: Any) -> tuple[Branches, ...]:

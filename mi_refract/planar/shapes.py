@@ -144,10 +144,10 @@ def lens(
         rims = [vertex + depths[0], vertex + thickness + depths[1]]
     if math.isnan(rims[0] + rims[1]):
         radii = (1 / (abs(c) * math.sqrt(1 + k)) for c, k in zip(curvature, conic, strict=True) if c and k > -1)
-        raise ValueError(f"radius = {radius:g}: a surface is smaller; expected at most {min(radii, default=0):g}")
+        raise ValueError(f"radius = {radius:g}: larger than a surface; expected at most {min(radii, default=0):g}")
     if rims[1] < rims[0]:
         largest = _tip(curvature, thickness, conic)[1]
-        text = f"the surfaces meet within it; expected at most {largest:g}, or no radius"
+        text = f"the surfaces meet inside it; expected at most {largest:g}, or no radius"
         raise ValueError(f"radius = {radius:g}: {text}")
     front = _surface(vertex, rims[0], radius, curvature[0], conic[0])
     back = _surface(vertex + thickness, rims[1], radius, curvature[1], conic[1])

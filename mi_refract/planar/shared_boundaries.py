@@ -47,15 +47,15 @@ def boundaries(parts: list[Part]) -> tuple[tuple[Segments, ...], tuple[str, ...]
     keep = first != last
     for part, count in zip(parts, np.bincount(owner, keep), strict=True):
         if not count:
-            size = f"beside coordinates of {np.abs(vertices).max():g}; expected above {NEAR:.0e} of that"
-            raise ValueError(f"{part.where}: it shrinks to a point {size}")
+            limit = f"{NEAR:.0e} of the largest coordinate, {np.abs(vertices).max():g}"
+            raise ValueError(f"{part.where}: too small, rounding makes it a point; expected a size above {limit}")
     places = np.stack([np.minimum(first, last), np.maximum(first, last), control_ids], axis=1)
     _, originals, place_ids = np.unique(places, axis=0, return_index=True, return_inverse=True)
     original = originals[place_ids]  # for each piece, the number of the first piece at the same place
     for j in np.flatnonzero((original != np.arange(len(owner))) & keep):
         i, part, earlier = int(original[j]), parts[owner[j]], parts[owner[original[j]]].where
         if not part.curve.closed:
-            raise ValueError(f"{part.where}: it runs along {earlier}; expected a boundary of its own")
+            raise ValueError(f"{part.where}: runs along {earlier}; expected a boundary elsewhere")
         side = int(first[i] != first[j])
         if tuple(media[i, side]) != part.right:
             index, outside = (", ".join(f"{x:g}" for x in n) for n in (media[i, side], part.right))

@@ -106,7 +106,7 @@ class Tracer:
             check_range(f"segments.{name}", getattr(segments, name), largest)
         lowest_index = min(segments.n_left.min(), segments.n_right.min())
         if lowest_index < 1 / largest:
-            raise ValueError(f"segments: the index {lowest_index:g}; expected at least {1 / largest:g}")
+            raise ValueError(f"segments: index {lowest_index:g}; expected at least {1 / largest:g}")
         # If |middle| exceeds twice the extent of the boundaries, coordinates are taken relative to their middle: there
         # |x − middle| < |middle|/2, so the differences are exact, and float32 keeps all its digits for them.
         start, end, control = segments.start, segments.end, segments.control
@@ -123,7 +123,7 @@ class Tracer:
         lower, upper = self.boundaries.box
         size = float(np.subtract(upper, lower).max())
         if 0 < size < 1 / largest:
-            raise ValueError(f"segments: within {size:g} of each other; expected {1 / largest:g} or more")
+            raise ValueError(f"segments: their box is {size:g} wide; expected {1 / largest:g} or more")
         # For a more distant origin, the rounding of its coordinates would exceed the margin of the box.
         self.farthest_origin = min(largest, size / (12 * arrays.roundoff) or largest)
         self.mesh = _build_mesh(arrays, segments, method)

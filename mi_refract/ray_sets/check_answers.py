@@ -179,7 +179,8 @@ def check(
     header, precision = rays.header, rays.precision
     checksum = answers.header.get("checksum")
     if checksum not in (None, header["checksum"]):
-        raise ValueError(f"the answers are to rays with the checksum {shown(checksum)}; expected {header['checksum']}")
+        text = f"the answers belong to rays with the checksum {shown(checksum)}"
+        raise ValueError(f"{text}; expected {header['checksum']}")
     # Select the rays that have an answer, and the first answer to each, in the order of the rays.
     ids, first, counts = np.unique(answers.ids, return_index=True, return_counts=True)
     position = np.searchsorted(ids, rays.ids).clip(max=max(len(ids) - 1, 0))

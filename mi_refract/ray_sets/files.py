@@ -117,7 +117,7 @@ def read(path: str | Path) -> RaySet:
 def _rays(table: Table) -> RaySet:
     header, numbers = table.header, table.numbers
     if header.get("format") != FORMAT:
-        raise ValueError(f"not a file of rays; expected what `mi-refract rays export` writes ({FORMAT})")
+        raise ValueError(f"not a file of rays; expected one that `mi-refract rays export` wrote ({FORMAT})")
     headers.check(header, len(numbers))
     with np.errstate(all="ignore"):
         vectors_and_ratio = numbers[:, 1:4], numbers[:, 4:7], numbers[:, 7] / numbers[:, 8]
@@ -125,7 +125,7 @@ def _rays(table: Table) -> RaySet:
     rays = RaySet(Rays(a, n, k), np.arange(len(numbers)), header)
     # Compare the numbers too: a file may contain digits that are lost in the set's precision.
     if not np.array_equal(rays.numbers, numbers) or checksum(header, numbers) != header["checksum"]:
-        raise ValueError("the checksum does not match: the file was edited or cut short; expected it as exported")
+        raise ValueError("the checksum does not match: the file was edited or cut short; expected the file as exported")
     valid = np.isfinite(a).all(1) & np.isfinite(n).all(1) & a.any(1) & n.any(1) & np.isfinite(k) & (k > 0)
     if not valid.all():
         raise ValueError(f"ray {np.argmin(valid)} is invalid: zero or non-finite vector, or index ≤ 0")
@@ -197,7 +197,7 @@ def answers_of(
     try:
         ended = process_group.run(command, as_csv(rays).encode(), timeout, cwd=cwd, env=env, most=most)
     except TooMuchOutputError as error:
-        raise ValueError(f"{name}: {error}; expected one answer a ray") from None
+        raise ValueError(f"{name}: {error}; expected one answer per ray") from None
     except TimeoutError:
         raise ValueError(f"{name}: did not finish within {timeout:g} s; set a longer --timeout") from None
     except OSError as error:
@@ -325,7 +325,7 @@ def _read_npz(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
                 if not array.ndim or array.shape[1:] not in ((width,), ()) or array.size != len(array) * width:
                     raise ValueError(f"{name} has the shape {array.shape}, not (rows, {width})")
                 if array.dtype.kind not in "biuf":
-                    raise ValueError(f"{name} holds {array.dtype}, not real numbers")
+                    raise ValueError(f"{name} contains {array.dtype}, not real numbers")
                 if len(array) > most:
                     raise ValueError(f"{len(array)} rows, more than {most}")
                 with np.errstate(over="ignore"):

@@ -62,21 +62,21 @@ class RaysHeader(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     format: Annotated[Literal["mi_refract rays 1"], _doc("the format, and its version")]
     version: Annotated[Text, _doc("version of mi_refract that wrote the file")]
-    precision: Annotated[Literal["f32", "f64"], _doc("of all numbers but `id`")]
-    seed: Annotated[int, Meta(ge=0, le=2**63 - 1), _doc("of the random rays")]
-    count: Annotated[int, Meta(ge=1, le=2**63 - 1), _doc("rays of each regime")]
-    two_sided: Annotated[bool, _doc("whether normals are on either side of the surface")]
-    a: Annotated[Text, _doc("what `ax, ay, az` are, for readers")]
-    n: Annotated[Text, _doc("what `nx, ny, nz` are, for readers")]
-    indices: Annotated[Text, _doc("what they are, for readers")] = msgspec.field(name="n_from, n_to")
+    precision: Annotated[Literal["f32", "f64"], _doc("precision of all numbers except `id`")]
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1), _doc("seed of the random rays")]
+    count: Annotated[int, Meta(ge=1, le=2**63 - 1), _doc("number of rays of each regime")]
+    two_sided: Annotated[bool, _doc("whether normals may be on either side of the surface")]
+    a: Annotated[Text, _doc("meaning of `ax, ay, az`, for readers")]
+    n: Annotated[Text, _doc("meaning of `nx, ny, nz`, for readers")]
+    indices: Annotated[Text, _doc("their meaning, for readers")] = msgspec.field(name="n_from, n_to")
     answer: Annotated[Text, _doc("the columns of an answer, for readers")]
     regimes: Annotated[dict[Text, tuple[int, int]], _doc("first and last id of each regime")]
-    checksum: Annotated[str, Meta(pattern="^sha256:[0-9a-f]{64}$"), _doc("of header and rays")]
-    columns_of_media: Annotated[MediumName | UnsetType, _doc("what they are, for readers; of rays with media")] = (
+    checksum: Annotated[str, Meta(pattern="^sha256:[0-9a-f]{64}$"), _doc("checksum of header and rays")]
+    columns_of_media: Annotated[MediumName | UnsetType, _doc("only with media: their meaning, for readers")] = (
         msgspec.field(name="wavelength, medium", default=UNSET)
     )
-    media: Annotated[Pairs | UnsetType, _doc("pairs [from, to] of the column `medium`; of rays with media")] = UNSET
-    wavelengths: Annotated[Wavelengths | UnsetType, _doc("in nm; of rays with media")] = UNSET
+    media: Annotated[Pairs | UnsetType, _doc("only with media: pairs [from, to] for the column `medium`")] = UNSET
+    wavelengths: Annotated[Wavelengths | UnsetType, _doc("only with media: wavelengths in nm")] = UNSET
 
     def __post_init__(self) -> None:
         """ValueError if only some of the keys of media are present."""

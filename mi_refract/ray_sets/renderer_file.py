@@ -26,14 +26,14 @@ class Deviation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A regime in which a function is known to be wrong."""
 
     regime: Annotated[str, Meta(min_length=1, description="a regime, or a set of rays of the study")]
-    reason: Annotated[str, Meta(min_length=1, description="why")]
+    reason: Annotated[str, Meta(min_length=1, description="the reason")]
 
 
 class RaysCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A function of refraction. `command` contains its placeholders, as in the file."""
 
-    title: Annotated[str, Meta(min_length=1, description="name of the function, as reports show it")]
-    precision: Annotated[Literal["f32", "f64"], Meta(description="the precision that it claims")]
+    title: Annotated[str, Meta(min_length=1, description="name of the function in reports")]
+    precision: Annotated[Literal["f32", "f64"], Meta(description="the precision of its answers")]
     command: Annotated[
         Command, Meta(description="reads rays on stdin and writes answers to stdout, as CSV; runs in the file's folder")
     ]
@@ -44,14 +44,15 @@ class RaysCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gives_up: Annotated[
         float,
         Meta(
-            ge=0, description="rays with cos²θ_t below this count as totally reflected, by the renderer's documentation"
+            ge=0,
+            description="rays with cos²θ_t below this are totally reflected, according to the renderer's documentation",
         ),
     ] = 0.0
-    lengths: Annotated[str, Meta(description="what it does with vectors that are not unit")] = ""
-    remark: Annotated[str, Meta(description="what else is known about it")] = ""
+    lengths: Annotated[str, Meta(description="how it handles vectors that are not unit")] = ""
+    remark: Annotated[str, Meta(description="further remarks")] = ""
     recorded: Annotated[
         dict[str, float | list[float]],  # msgspec 0.22 misreads limits within a union with a list
-        Meta(description="the largest angle in radians of an earlier run, by set of rays: a number, or [from, to]"),
+        Meta(description="largest angle in radians in an earlier run, by set of rays: a number, or [from, to]"),
     ] = {}
     deviation: Annotated[
         tuple[Deviation, ...],
@@ -84,10 +85,11 @@ class ImagesCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     export: Annotated[str, Meta(min_length=1, description="a target of `mi-refract scene export`")]
     command: Annotated[
-        Command, Meta(description="renders {scene}, with {spp} samples a pixel and the seed {seed}, into {image}")
+        Command, Meta(description="renders {scene} with {spp} samples per pixel and the seed {seed} into {image}")
     ]
     spp: Annotated[
-        dict[str, Annotated[int, Meta(ge=1)]], Meta(description="samples a pixel by scene; no other scene is rendered")
+        dict[str, Annotated[int, Meta(ge=1)]],
+        Meta(description="samples per pixel by scene; other scenes are not rendered"),
     ]
     assumed: Annotated[tuple[Text, ...], Meta(description="how its model differs from Mitsuba's")] = ()
     deviations: Annotated[dict[str, Text], Meta(description="scenes on which it is known to differ, and why")] = (
@@ -102,7 +104,7 @@ class ImagesCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class RendererFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A renderer. `install` is the table of the file, unchecked."""
 
-    title: Annotated[str, Meta(min_length=1, description="name of the renderer, as reports show it")]
+    title: Annotated[str, Meta(min_length=1, description="name of the renderer in reports")]
     licence: Annotated[str, Meta(description="its licence")] = ""
     rays: Annotated[tuple[RaysCommand, ...], Meta(description="`[[rays]]`: functions that answer rays")] = ()
     images: Annotated[ImagesCommand | None, Meta(description="`[images]`: how it renders a scene")] = None

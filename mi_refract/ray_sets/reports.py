@@ -70,7 +70,7 @@ def sentence(findings: Findings) -> str:
     elif findings.wrong or findings.tir == UNCLEAR:
         text = f"{findings.wrong} of {answers} are wrong"
     elif not findings.total("judged"):
-        text = f"{answers}, none of them a {'decidable ' if findings.total('compared') else ''}direction"
+        text = f"{answers}, none with a {'decidable ' if findings.total('compared') else ''}direction"
     elif findings.total("exact") == findings.answered:
         text = f"{answers}, all exact up to rounding"
     else:

@@ -55,7 +55,7 @@ REGIMES = {
     "critical, to the ulp": Regime(
         functools.partial(components.to_the_ulp, 0.05, 1.5),
         2.51,
-        "k in 1.05 … 2.5, the radicand of the rounded numbers as near to 0 as two ulps of one of them, both sides",
+        "k in 1.05 … 2.5, two ulps of one number or less from the critical angle, both sides",
     ),
     "critical, any k, to the ulp": Regime(
         functools.partial(components.to_the_ulp, 1e-6, 9.9e5),
@@ -75,7 +75,10 @@ REGIMES = {
     "k ≫ 1": Regime(drawn("k ≫ 1"), 1e6, "k in 10 … 1e6, k sin θ uniform in 0 … 1.2"),
     "k ≪ 1": Regime(drawn("k ≪ 1"), 0.1, "k in 1e-6 … 0.1, cosine uniform"),
     "axes, signed zeros": Regime(
-        components.zeros, 1e6, "n, and a of every other ray, with zeros of either sign; not tangential", any_k=True
+        components.zeros,
+        1e6,
+        "n, and a of about half of the rays, with zeros of either sign; not tangential",
+        any_k=True,
     ),
     "denormal": Regime(
         components.denormal, 1e6, "as before, the zeros of a, n or both replaced by denormal numbers", any_k=True
@@ -83,7 +86,7 @@ REGIMES = {
     "on a denormal": Regime(
         components.on_a_denormal,
         1e6,
-        "n an axis, n·a a denormal number: all that keeps a from being tangential",
+        "n an axis, n·a a denormal number: if it were 0, the ray would be tangential",
         rests_on_denormals=True,
         any_k=True,
     ),
@@ -97,7 +100,7 @@ REGIMES = {
     "off unit": Regime(
         components.off_unit,
         1e6,
-        "a and n turned by a matrix in their own precision, all angles and k",
+        "a and n rotated by a matrix in their own precision, angles and ratios of all sets",
         False,
         any_k=True,
     ),

@@ -448,7 +448,10 @@ def test_hold_extends_an_index_beyond_its_range_with_a_warning(vectorised):
 
 BAD_FILES = {
     "no.csv": (None, "No such file"),
-    "a.csv": ("wl,n\n0.4,1.5\n0.5,1.5\n", "header 'wl,n'; expected nm or µm in one column's name, n, and k: 'nm,n,k'"),
+    "a.csv": (
+        "wl,n\n0.4,1.5\n0.5,1.5\n",
+        "header 'wl,n'; expected a column whose name contains nm or µm, a column n, ",
+    ),
     "b.csv": ("nm,n\n400,1.5\n", "two or more"),
     "c.csv": ("nm,n\n400,x\n500,1.5\n", "expected numbers in the columns nm, n"),
     "d.csv": ("nm,n\n400,1.5\n500\n", "expected numbers"),
@@ -457,7 +460,7 @@ BAD_FILES = {
         "expected numbers in the columns nm, n, with decimal points, and no more columns",
     ),
     "e.csv": ("nm,n\n500,1.5\n400,1.5\n", "increasing"),
-    "f.csv": ("nm,n,k\n400,1.5,-1\n500,1.5,0\n", "k = -1; expected a number ≥ 0"),
+    "f.csv": ("nm,n,k\n400,1.5,-1\n500,1.5,0\n", "k = -1; expected a finite number ≥ 0"),
     "g.csv": ("nm,n\n400,15\n500,15\n", "n = 15 at 400 nm; expected up to 10"),
     "h.txt": ("", "expected a .csv, a .yml of refractiveindex.info, or a glass of a Zemax catalogue as file:NAME.agf:"),
     "a.yml": ("just: text", "expected a page of refractiveindex.info"),
@@ -470,7 +473,7 @@ BAD_FILES = {
     "e.yml": (PAGE.format("formula 2", "0 1 0.25"), "C1: n is infinite at 500 nm"),
     "f.yml": (
         "DATA:\n  - type: tabulated n\n    data: |\n        0.4 1 1 1\n        0.5\n",
-        "a table of n; expected n, k or nk, and as",
+        "a table of n; expected n, k or nk, and a number for each",
     ),
     "g.yml": (PAGE.format("formula 2", "0 1"), "2 coefficients; expected an odd number of them"),
     "a.agf": (ZEMAX, "expected a .csv"),

@@ -175,13 +175,13 @@ BAD = [  # replaced text, replacement, part of the error
     ('"disc", at', '"disc", outside = 1, at', "shape[1].within: 'disc', but `outside` is set"),
     ("scale = [1, 0.5]", "scale = [1, 0]", "shape[0]: scale: (1.0, 0.0); expected numbers of size"),
     ("radii = [1, 2]", "radii = [1, 1e99], scale = 99", "expected up to ±1e+100"),
-    ("radii = [1, 2]", "radii = [1e-20, 2e-20]", "shape[2]: it shrinks to a point beside coordinates of 9; expected"),
-    ("facets = 20", "facets = 3", "shape[2].facets: 3, for 4 arcs"),
+    ("radii = [1, 2]", "radii = [1e-20, 2e-20]", "shape[2]: too small, rounding makes it a point; expected"),
+    ("facets = 20", "facets = 3", "shape[2].facets: 3 for 4 arcs"),
     ("count = 3", "count = 0", "beam[1].count: expected a whole number >= 1"),
     ("direction = [3, 4]", "direction = [0, 0]", "beam[0].direction: [0, 0]; expected degrees, or"),
     ("origins = [[0, 1]", "origins = [[0, 1e101]", "beam[2]: 1e+101; expected up to ±1e+100"),
     ("[-90, 90]", "[-1e308, 1e308]", "beam[1].angles: [-1e+308, 1e+308]"),
-    ("[180, [0, -1e300]]", "[180]", "beam[2]: directions: 1, for 2 origins"),
+    ("[180, [0, -1e300]]", "[180]", "beam[2]: directions: 1 for 2 origins"),
     ("shape = [", "shape = 3 # [", "expected TOML"),
     ("max_depth = 5", "max_depth = .5", "max_depth = .5: numbers have a digit on either side of the point, as 0.8"),
     ("max_depth = 5", "index = [ 1., 2]", "index = [ 1., 2]: numbers have a digit on either side of the point"),
@@ -253,7 +253,7 @@ LENS = DISC.replace('"circle"', '"lens"') + "thickness = 1\ncurvature = [1, -1]\
         (BALL + FAN, "shape[0]: 5000000 or more pieces; expected at most 4194304"),
         ('colours = ["red", "blue"]\n' + BALL + FAN, "shape[0]: 10000000 or more pieces"),
         (DISC + FAN * 17, "beam[16].count: 17000000 rays in this beam and those before it; expected up to 16777216"),
-        (LENS.replace("radius = 1", "radius = 2"), "shape[0].radius = 2: a surface is smaller"),
+        (LENS.replace("radius = 1", "radius = 2"), "shape[0].radius = 2: larger than a surface"),
         (LENS.replace("radius = 1\n", "").replace("-1", "2"), "shape[0].curvature = [1.0, 2.0]: the surfaces never"),
         (
             LENS.replace("curvature", "R1 = 1\ncurvature"),
@@ -362,7 +362,7 @@ def test_a_shape_may_touch_the_one_around_it_with_the_same_index_outside(read):
             r"shape\[2\]: the index along shape\[0\] 'left' is 1.5; expected 1.1",
         ),
         (AGAIN, r"shape\[2\]: the index along shape\[0\] 'left' is 1.5; expected 1.1"),
-        (ALONG, r"shape\[2\]: it runs along shape\[0\] 'left'"),
+        (ALONG, r"shape\[2\]: runs along shape\[0\] 'left'"),
     ):
         with pytest.raises(ValueError, match=expected):
             read(TWO.format(first="0.3", second="2.3", more=more))

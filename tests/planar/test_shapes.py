@@ -183,17 +183,17 @@ def test_a_surface_reaches_as_far_as_it_exists():
             radius = 1 / (c * math.sqrt(1 + conic))
             hemisphere = shapes.lens((c, c), 1, radius=radius, conic=(conic, conic))
             assert off_conic(hemisphere.vertices[0], c, conic) <= 8 * ULP * radius
-            with pytest.raises(ValueError, match="a surface is smaller"):
+            with pytest.raises(ValueError, match="larger than a surface"):
                 shapes.lens((c, c), 1, radius=radius * (1 + 1e-14), conic=(conic, conic))
 
 
 IMPOSSIBLE = [
     *((lambda c=c, t=t: shapes.lens(c, t), "curvature.*never meet") for c, t in (((0.02, 0.03), 1), ((0, 0), 1))),
     (lambda: shapes.lens((0.1, -0.5), 20.5), "curvature.*never meet"),  # but their far halves do
-    (lambda: shapes.lens((0.02, -0.02), 1, radius=60), "radius = 60: a surface is smaller; expected at most 50"),
+    (lambda: shapes.lens((0.02, -0.02), 1, radius=60), "radius = 60: larger than a surface; expected at most 50"),
     (
         lambda: shapes.lens((0.02, -0.02), 1, radius=20),
-        "radius = 20: the surfaces meet within it; expected at most 7.05",
+        "radius = 20: the surfaces meet inside it; expected at most 7.05",
     ),
     (lambda: shapes.ellipse_lens(1.0, 4, 1.5, 1), "expected n > 1, 0 < thickness < 4"),
     (lambda: shapes.ellipse_lens(1.5, 4, 4, 1), "expected n > 1, 0 < thickness < 4"),
@@ -201,7 +201,7 @@ IMPOSSIBLE = [
     (lambda: shapes.polygon([(0, 0), (1, 1), (2, 2)]), "no area"),
     (lambda: shapes.polygon([(0, 0), (1, 0), (0, 1)], [0, 0]), "arcs: 2 for 3 pieces"),
     (lambda: shapes.polygon([(0, 0), (1, 0), (0, 1)], [0, 360, 0]), "above -360"),
-    (lambda: shapes.circle(2).faceted(3), "facets: 3, for 4 arcs"),
+    (lambda: shapes.circle(2).faceted(3), "facets: 3 for 4 arcs"),
     (lambda: shapes.rectangle(1, 1).faceted(100), "for 0 arcs"),
     *((lambda m=m: shapes.circle(1).mapped(m), "determinant") for m in (np.zeros((2, 2)), [[math.nan, 0], [0, 1]])),
     (lambda: shapes.polyline([(1, 0), (2, 0)]).mapped([[1, 2], [2, 4]]), "determinant"),

@@ -348,7 +348,7 @@ BAD_ARGUMENTS = [
     ({"max_depth": 2**32}, "1 rays, max_depth = 4294967296; expected a product below 2³²"),
     ({"origins": [(0.0, math.nan)]}, "origins[0, 1] = nan; expected finite"),
     ({"origins": [(0.0, 1e101)]}, "origins, relative to the segments: 1e+101; expected up to ±1.1259e+15"),
-    ({"end": [(1e-300, 0.0)]}, "segments: within 1.5e-300 of each other; expected 1e-100 or more"),
+    ({"end": [(1e-300, 0.0)]}, "segments: their box is 1.5e-300 wide; expected 1e-100 or more"),
     ({"control": [(0.5, 1e101)], "weight": [1.0]}, "segments.control: 1e+101; expected up to ±1e+100"),
     ({"directions": [(0.0, 0.0)]}, "directions[0] = (0, 0); expected a direction"),
     ({"directions": [(0.0, 1.0)] * 2}, "directions: shape (2, 2); expected (1, 2)"),
@@ -379,8 +379,8 @@ def test_arcs_may_share_their_ends():
 def test_float32_has_its_own_range(needs_variant):
     needs_variant("llvm_ad_rgb")
     bad = [({"end": [(1e16, 0.0)]}, -1.0, r"segments.end: 1e\+16; expected up to ±1e\+15")]
-    bad += [({"n_left": [1e-20]}, -1.0, "segments: the index 1e-20; expected at least 1e-15")]
-    bad += [({"end": [(1e-20, 0.0)]}, -1.0, "segments: within 1.5e-20 of each other; expected 1e-15 or more")]
+    bad += [({"n_left": [1e-20]}, -1.0, "segments: index 1e-20; expected at least 1e-15")]
+    bad += [({"end": [(1e-20, 0.0)]}, -1.0, "segments: their box is 1.5e-20 wide; expected 1e-15 or more")]
     # From there, rounding would let rays start behind the boundaries.
     beyond = r"origins, relative to the segments: \S+; expected up to ±2.09715e\+06"
     bad += [({}, -1e8, beyond), ({"start": [(0.0, 1e9)], "end": [(1.0, 1e9)]}, 0.0, beyond)]

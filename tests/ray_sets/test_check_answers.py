@@ -466,7 +466,7 @@ def test_undecidable_rays_are_counted_and_do_not_pass_alone():
     assert (findings.exit_code, findings.wrong, findings.total("judged")) == (1, 0, 0) and findings.total(
         "compared"
     ) > 0
-    assert "none of them a decidable direction" in reports.sentence(findings)
+    assert "none with a decidable direction" in reports.sentence(findings)
 
 
 def bounds_of(rays):
@@ -684,7 +684,7 @@ def test_missing_duplicate_and_unknown_answers(ids, count):
             (lambda to, b, x=x: check(to, Answers(to.ids, b), most_backward=x), "expected a positive number of round")
             for x in (0.0, np.nan)
         ),
-        (lambda to, b: check(to, Answers(to.ids, b, header={"checksum": "x"})), "the answers are to rays with the ch"),
+        (lambda to, b: check(to, Answers(to.ids, b, header={"checksum": "x"})), "the answers belong to rays with"),
         (lambda to, b: Answers(to.ids, b[1:]), "expected a direction for each id"),
         (lambda to, b: Answers(to.ids, b, n_ratio=np.ones(2)), "expected a direction for each id"),
         (lambda to, b: Answers(to.ids, b, np.full(len(b), 2)), "^answers: transmitted is 2; expected 0 or 1$"),

@@ -501,7 +501,7 @@ def npy(shape, dtype="<f8", content=b""):
 
 B = "an .npz file with id, b"
 MEMBERS = {
-    "complex": (np.zeros((2, 3), complex), "b holds complex128, not real numbers"),
+    "complex": (np.zeros((2, 3), complex), "b contains complex128, not real numbers"),
     "objects": (np.array([print, None], dtype=object), "Object arrays cannot be loaded"),
     "a row more": (np.zeros((3, 3)), "id has 2 rows, b has 3 rows"),
     "wide": (np.zeros((2, 4)), "b has the shape (2, 4)"),

@@ -91,8 +91,8 @@ NEAREST = f"nearest of the common mistakes, no explanation: {HANDEDNESS}"
             f"{MISMATCH}; 2 of them are wrong",
             [],
         ),
-        (findings(regime(judged=0)), 1, "10 answers, none of them a decidable direction", []),
-        (findings(regime(compared=0, judged=0)), 1, "10 answers, none of them a direction", []),
+        (findings(regime(judged=0)), 1, "10 answers, none with a decidable direction", []),
+        (findings(regime(compared=0, judged=0)), 1, "10 answers, none with a direction", []),
     ],
 )
 def test_sentence_and_explanations(result, code, sentence, lines):
