@@ -142,11 +142,11 @@ def parse(spec: float | str, name: str = "", find: Callable[[str], Path] = Path)
     """
     label = f"{name} = {spec!r}" if name else repr(spec)
     if isinstance(spec, str):
-        return _of_text(spec.strip(), label, find)
-    return _of_number(spec, label)
+        return _parse_text(spec.strip(), label, find)
+    return _constant_medium(spec, label)
 
 
-def _of_number(n: float, label: str) -> Medium:
+def _constant_medium(n: float, label: str) -> Medium:
     if isinstance(n, bool) or not isinstance(n, (int, float)) or not 0 < n < math.inf:
         raise ValueError(f"{label}; expected a positive finite number, or a material's name")
     if 100_000 <= n < 1_000_000 and n == int(n):
@@ -156,13 +156,13 @@ def _of_number(n: float, label: str) -> Medium:
 
 def file_in(text: str) -> str:
     """The name of the file in a text: "glass.yml" for `hold(file:glass.yml)`; "" if it does not name a file."""
-    held = HOLD.fullmatch(text.strip())
-    return index_files.split((held[1] if held else text).strip())[0]
+    inner = HOLD.fullmatch(text.strip())
+    return index_files.split((inner[1] if inner else text).strip())[0]
 
 
-def _of_text(text: str, label: str, find: Callable[[str], Path]) -> Medium:
-    if held := HOLD.fullmatch(text):
-        return replace(_of_text(held[1].strip(), label, find), name=text, hold=True)
+def _parse_text(text: str, label: str, find: Callable[[str], Path]) -> Medium:
+    if inner := HOLD.fullmatch(text):
+        return replace(_parse_text(inner[1].strip(), label, find), name=text, hold=True)
     if code := GLASS_CODE.fullmatch(text):  # three digits of n_d − 1 and three of V_d
         n_d, v_d = int(code[1]) / 1000, int(code[2]) / 10
         return replace(_formula(f"abbe({n_d + (1 if n_d >= LEAST_CODE else 2):g}, {v_d:g})", label), name=text)
@@ -171,7 +171,7 @@ def _of_text(text: str, label: str, find: Callable[[str], Path]) -> Medium:
     except ValueError:
         pass
     else:
-        return _of_number(number, label)
+        return _constant_medium(number, label)
     if index_files.split(text)[0]:
         return _checked(replace(index_files.read(text, label, find), name=text), label)
     if ":" in text.partition("(")[0]:

@@ -64,21 +64,21 @@ class Ray:
 class Start:
     """The segment that a ray starts on.
 
-    vertices, ways, sides: for both ends, the number of the vertex, the vector from p to it, and f of it.
+    vertices, vectors, sides: for both ends, the number of the vertex, the vector from p to it, and f of it.
     For an arc also:
-    middle: the vector from p to the control point.
-    other: s and r, up to a common factor, where the ray's line meets the arc once more.
-    again: whether that place is ahead and between the arc's ends.
-    aways, bends: the direction of the arc away from either vertex, and its `bend` there as in `Hit`.
+    to_control: the vector from p to the control point.
+    second_root: s and r, up to a common factor, where the ray's line meets the arc once more.
+    second_ahead: whether that place is ahead and between the arc's ends.
+    outward, bends: the direction of the arc away from either vertex, and its `bend` there as in `Hit`.
     """
 
     vertices: Vertices
-    ways: tuple[Vector2, Vector2]
+    vectors: tuple[Vector2, Vector2]
     sides: tuple[Number, Number]
-    middle: Vector2 = None
-    other: tuple[Number, Number] = None, None
-    again: Mask = False
-    aways: tuple[Vector2, Vector2] = None, None
+    to_control: Vector2 = None
+    second_root: tuple[Number, Number] = None, None
+    second_ahead: Mask = False
+    outward: tuple[Vector2, Vector2] = None, None
     bends: tuple[Number, Number] = None, None
 
 
@@ -154,12 +154,12 @@ class LineSegments:
 
     def _view(self, ray: Ray, start: Start, vertex: Index, place: Vector2) -> View:
         """The vector from the ray's start to a vertex, and f of it."""
-        way = place - ray.p
-        side = cross(ray.d, way)
-        for own_vertex, own_way, own_side in zip(start.vertices, start.ways, start.sides, strict=True):
+        vector = place - ray.p
+        side = cross(ray.d, vector)
+        for own_vertex, own_vector, own_side in zip(start.vertices, start.vectors, start.sides, strict=True):
             same = vertex == own_vertex
-            way, side = dr.select(same, own_way, way), dr.select(same, own_side, side)
-        return way, side
+            vector, side = dr.select(same, own_vector, vector), dr.select(same, own_side, side)
+        return vector, side
 
     def nearer(self, best: Hit, ray: Ray, start: Start, i: Index, active: Mask = True) -> Hit:
         """The crossing of segment i, if it comes before `best`."""
@@ -178,10 +178,10 @@ class LineSegments:
         """The crossing of segment i, the vector e from start to end, and whether the crossing is ahead."""
         (to_a, f_a), (to_b, f_b) = views
         a_left, b_left = f_a >= 0, f_b >= 0
-        way = dr.select((vertices[1] == start.vertices[0]) | (vertices[1] == start.vertices[1]), to_b, to_a)
+        to_end = dr.select((vertices[1] == start.vertices[0]) | (vertices[1] == start.vertices[1]), to_b, to_a)
         # |d × e| = |f_a| + |f_b| without cancellation. `reach` is λ times that; its sign is right where λ's may not be.
         scale: Number = dr.abs(f_a) + dr.abs(f_b)
-        reach = dr.select(a_left, -1, 1) * cross(way, e)
+        reach = dr.select(a_left, -1, 1) * cross(to_end, e)
         # The crossing lies between the ends: it is ahead if both ends are, and behind if both are. This decides for a
         # ray along the segment, where the sign of `reach` is noise.
         t_a, t_b = dr.dot(to_a, ray.d), dr.dot(to_b, ray.d)
@@ -196,11 +196,11 @@ class LineSegments:
 
     def place(self, hit: Hit) -> tuple[Vector2, Vector2]:
         """The point of a hit, from the nearer end, and the segment's direction there."""
-        there = hit.segment != NOWHERE
-        a, b, _ = self._segment(hit.segment, there)
+        exists = hit.segment != NOWHERE
+        a, b, _ = self._segment(hit.segment, exists)
         e = b - a
         point = dr.select(hit.r < hit.s, dr.fma(e, hit.r, a), dr.fma(e, -hit.s, b))
-        return point, self.arrays.gather(self.directions, hit.segment, there)
+        return point, self.arrays.gather(self.directions, hit.segment, exists)
 
 
 class ConicArcs(LineSegments):
@@ -221,21 +221,21 @@ class ConicArcs(LineSegments):
 
     def start(self, ray: Ray) -> Start:
         """Quantities of the ray's start, computed once per ray, not per arc."""
-        there = ray.own != NOWHERE
-        (a, b, _), (c, w, turn) = self._segment(ray.own, there), self._shape(ray.own, there)
+        exists = ray.own != NOWHERE
+        (a, b, _), (c, w, turn) = self._segment(ray.own, exists), self._shape(ray.own, exists)
         s, r = self._shares(ray)
         chords = _chord(a, c, b, w, s, r), _chord(b, c, a, w, r, s)
         to_c = ((c - a) * (s * s) + (c - b) * (r * r)) * dr.rcp(_total(w, s, r))
         # The ends lie on the sides of the ray that the chords point to. Their product also gives the place where the
         # line meets the arc again.
         g_a, g_b = self._chord_sides(ray, chords)
-        again = there & (turn != 0) & ((g_a >= 0) == (g_b >= 0)) & (ray.left == (turn > 0))
+        second_ahead = exists & (turn != 0) & ((g_a >= 0) == (g_b >= 0)) & (ray.left == (turn > 0))
         line, straight = super().start(ray), turn == 0
-        ways = (dr.select(straight, x, -way * y) for x, way, y in zip(line.ways, chords, (r, s), strict=True))
+        vectors = (dr.select(straight, x, -chord * y) for x, chord, y in zip(line.vectors, chords, (r, s), strict=True))
         sides = dr.select(straight, line.sides[0], g_a * r), dr.select(straight, line.sides[1], g_b * s)
         bend = turn * dr.rcp(w * w)
-        arc_fields = to_c, (dr.abs(g_b), dr.abs(g_a)), again, (c - a, c - b), (bend, -bend)
-        return Start(line.vertices, tuple(ways), sides, *arc_fields)
+        arc_fields = to_c, (dr.abs(g_b), dr.abs(g_a)), second_ahead, (c - a, c - b), (bend, -bend)
+        return Start(line.vertices, tuple(vectors), sides, *arc_fields)
 
     def _chord_sides(self, ray: Ray, chords: tuple[Vector2, Vector2]) -> tuple[Number, Number]:
         """−d × chord for both ends of the arc on which the ray starts.
@@ -243,8 +243,8 @@ class ConicArcs(LineSegments):
         If the ends are on different sides of a ray that leaves to the left, the arc starts on the left. If rounding
         contradicts that, the sign of the smaller value is changed.
         """
-        sizes = [dr.maximum(dr.abs(cross(ray.d, way)), SIGN * (dr.abs(way.x) + dr.abs(way.y))) for way in chords]
-        a_left, b_left = (cross(ray.d, way) <= 0 for way in chords)
+        sizes = [dr.maximum(dr.abs(cross(ray.d, v)), SIGN * (dr.abs(v.x) + dr.abs(v.y))) for v in chords]
+        a_left, b_left = (cross(ray.d, v) <= 0 for v in chords)
         wrong = (a_left != b_left) & (a_left != ray.left)
         smaller = sizes[0] < sizes[1]
         a_left = dr.select(wrong & smaller, ray.left, a_left)
@@ -258,7 +258,7 @@ class ConicArcs(LineSegments):
         line, line_ahead = self._crossing(ray, start, i, b - a, vertices, views)
         (to_a, f_a), (to_b, f_b) = views
         own, straight = i == ray.own, turn == 0
-        to_c = dr.select(own, start.middle, c - ray.p)
+        to_c = dr.select(own, start.to_control, c - ray.p)
         a_left = f_a >= 0
         once = a_left != (f_b >= 0)
         # For an arc that is crossed once: its left and right vertex, its directions there from left to right, its bend.
@@ -272,16 +272,16 @@ class ConicArcs(LineSegments):
         smaller, larger = (dr.abs(h), dr.abs(f_a)), (dr.abs(f_b), dr.abs(h))
         smaller_valid, larger_valid = (rest >= 0) & ((h >= 0) != a_left), (rest >= 0) & ((h >= 0) != (f_b >= 0))
         only_larger = once & larger_valid
-        roots = zip(start.other, smaller, larger, strict=True)
+        roots = zip(start.second_root, smaller, larger, strict=True)
         first_root = tuple(dr.select(own, x, dr.select(only_larger, z, y)) for x, y, z in roots)
-        ways = to_a, to_c, to_b
-        hit, ahead = self._hit(ray, i, ways, w, first_root, dr.select(own, turn < 0, a_left), ends)
+        vectors = to_a, to_c, to_b
+        hit, ahead = self._hit(ray, i, vectors, w, first_root, dr.select(own, turn < 0, a_left), ends)
         hit, ahead = dr.select(straight, line, hit), dr.select(straight, line_ahead, ahead)
         ahead = self._beyond(start, hit, ahead) & dr.select(straight, once, smaller_valid | only_larger)
-        ahead = dr.select(own, start.again, ahead) & active
+        ahead = dr.select(own, start.second_ahead, ahead) & active
         best = dr.select(ahead & self._before(hit, best), hit, best)
         # Of two crossings, neither is at a vertex up to rounding: their distances decide.
-        hit, ahead = self._hit(ray, i, ways, w, larger, negated(a_left), ends)
+        hit, ahead = self._hit(ray, i, vectors, w, larger, negated(a_left), ends)
         ahead &= active & larger_valid & negated(once | own | straight)
         return dr.select(ahead & (hit.distance < best.distance), hit, best)
 
@@ -297,25 +297,25 @@ class ConicArcs(LineSegments):
         def at_shared(pair: tuple[Any, Any]) -> Any:
             return dr.select(shared[0], *pair)
 
-        left, way = at_shared(tuple(lefts)), at_shared(start.ways)
-        away, bend = at_shared(start.aways), at_shared(start.bends)
-        own, other = dr.select(left, away, -away), dr.select(left, hit.along, hit.into)
-        near = dr.abs(hit.distance) <= 64 * self.arrays.roundoff * (dr.abs(way.x) + dr.abs(way.y))
+        left, vector = at_shared(tuple(lefts)), at_shared(start.vectors)
+        outward, bend = at_shared(start.outward), at_shared(start.bends)
+        own, other = dr.select(left, outward, -outward), dr.select(left, hit.along, hit.into)
+        near = dr.abs(hit.distance) <= 64 * self.arrays.roundoff * (dr.abs(vector.x) + dr.abs(vector.y))
         near &= (shared[0] | shared[1]) & (dr.dot(own, other) > 0) & ((bend != 0) | (hit.bend != 0))
         behind = self._turned(other, own, (hit.bend, dr.select(left, bend, -bend)), dr.select(left, -1, 1))
         return dr.select(near, negated(behind), ahead)
 
     def _hit(
-        self, ray: Ray, i: Index, ways: Three, w: Number, root: Root, to_left: Mask, ends: Ends
+        self, ray: Ray, i: Index, vectors: Three, w: Number, root: Root, to_left: Mask, ends: Ends
     ) -> tuple[Hit, Mask]:
         """The `Hit` of a root, and whether it is ahead."""
         s, r = root
         size = s + r
         s, r = ieee_divide(s, size), ieee_divide(r, size)
-        to_a, to_c, to_b = ways
-        way = (to_a * (s * s) + to_c * (2 * w * s * r) + to_b * (r * r)) * dr.rcp(_total(w, s, r))
+        to_a, to_c, to_b = vectors
+        vector = (to_a * (s * s) + to_c * (2 * w * s * r) + to_b * (r * r)) * dr.rcp(_total(w, s, r))
         e = _tangent(to_a, to_c, to_b, w, s, r)
-        distance = dr.dot(way, ray.d)
+        distance = dr.dot(vector, ray.d)
         ahead = distance * dr.abs(cross(ray.d, e)) > ray.slack * (dr.abs(e.x) + dr.abs(e.y))
         return Hit(distance, i, s, r, to_left, *ends), ahead & (distance > 0)
 
@@ -343,8 +343,8 @@ class ConicArcs(LineSegments):
 
     def place(self, hit: Hit) -> tuple[Vector2, Vector2]:
         """The point of a hit, from the nearer end, and the arc's unit direction there."""
-        there = hit.segment != NOWHERE
-        (a, b, _), (c, w, turn) = self._segment(hit.segment, there), self._shape(hit.segment, there)
+        exists = hit.segment != NOWHERE
+        (a, b, _), (c, w, turn) = self._segment(hit.segment, exists), self._shape(hit.segment, exists)
         s, r = hit.s, hit.r
         point = dr.select(r < s, dr.fma(_chord(a, c, b, w, s, r), r, a), dr.fma(_chord(b, c, a, w, r, s), s, b))
         e = _tangent(a, c, b, w, s, r)

@@ -93,7 +93,7 @@ class MeshAcceleration:
         no other boundary can come first.
         """
         # From the ray's start, moved off its own segment, to the side that the ray leaves to.
-        x, y = (self.mi.Float(e) for e in start.ways[1] - start.ways[0])
+        x, y = (self.mi.Float(e) for e in start.vectors[1] - start.vectors[0])
         size = dr.select(ray.left, OFFSET, -OFFSET) * dr.rsqrt(dr.fma(x, x, y * y))
         q, number = (ray.p - self.centre) * self.scale, self.arrays.number
         q = dr.select(ray.own != NOWHERE, type(q)(q.x - number(y * size), q.y + number(x * size)), q)

@@ -166,11 +166,15 @@ def _answers(table: Table) -> Answers:
     if len(wrong):
         text = f"{len(wrong)} ids are not whole numbers below 2^53, the first is {wrong[0]:g}"
         raise ValueError(f"{text}; expected the ids of the rays")
-    if transmitted is not None and len(wrong := transmitted[~np.isin(transmitted, (0, 1))]):
-        raise ValueError(f"{TRANSMITTED} is {wrong[0]} for {len(wrong)} rays; expected 0 or 1")
-    if ratios is not None and len(wrong := ratios[~((ratios >= LEAST_RATIO) & (ratios <= 1 / LEAST_RATIO))]):
-        text = f"{N_RATIO} is {wrong[0]:g} for {len(wrong)} rays"
-        raise ValueError(f"{text}; expected n_from / n_to, {LEAST_RATIO:g} … {1 / LEAST_RATIO:g}")
+    if transmitted is not None:
+        wrong = transmitted[~np.isin(transmitted, (0, 1))]
+        if len(wrong):
+            raise ValueError(f"{TRANSMITTED} is {wrong[0]} for {len(wrong)} rays; expected 0 or 1")
+    if ratios is not None:
+        wrong = ratios[~((ratios >= LEAST_RATIO) & (ratios <= 1 / LEAST_RATIO))]
+        if len(wrong):
+            text = f"{N_RATIO} is {wrong[0]:g} for {len(wrong)} rays"
+            raise ValueError(f"{text}; expected n_from / n_to, {LEAST_RATIO:g} … {1 / LEAST_RATIO:g}")
     return Answers(ids.astype(np.int64), table.numbers[:, 1:4], transmitted, table.header, ratios, table.digest)
 
 

@@ -177,19 +177,19 @@ def possible(b: Array, bounds: RayBounds, rows: Index, signal: str = "") -> Flag
     sine, cosine = lengths(tangent), np.abs(c[:, 0])
     t = tangent / np.where(sine > 0, sine, 1)[:, None]
     onward = (b * m).sum(1)
-    rest = b - onward[:, None] * m  # m before t: near the normal, t is orthogonal to m only up to rounding
-    along = (rest * t).sum(1)
-    across = lengths(rest - along[:, None] * t)
+    tangential = b - onward[:, None] * m  # m before t: near the normal, t is orthogonal to m only up to rounding
+    along = (tangential * t).sum(1)
+    across = lengths(tangential - along[:, None] * t)
 
     u, k, exact = bounds.u[rows], bounds.k[rows], bounds.exact
     slack = np.asarray(bounds.budget.of_terms(u, np.minimum(k, 1.0) if signal == "reflected" else k))
     with np.errstate(invalid="ignore", divide="ignore"):
         if signal == "tangent":
             e = size = k * sine
-            off, forward = e * across / np.hypot(along, across), along
+            distance, forward = e * across / np.hypot(along, across), along
         elif signal == "reflected":
             size = np.ones(len(rows))
-            off = np.sqrt(across**2 + (sine * onward + cosine * along) ** 2)
+            distance = np.sqrt(across**2 + (sine * onward + cosine * along) ** 2)
             forward = sine * along - cosine * onward
         else:
             e = k * sine
@@ -197,9 +197,9 @@ def possible(b: Array, bounds: RayBounds, rows: Index, signal: str = "") -> Flag
             x = bounds.budget.radicand_error_bound(u, k)
             low, high = (np.sqrt(np.maximum(root2 + sign * x, 0)) for sign in (-1, 1))
             onward = np.where(bounds.budget.side_open(u, exact.cos_i[rows]), np.abs(onward), onward)
-            plane = along**2 + across**2
-            nearest = np.where(plane > 0, e * onward * along / plane, low).clip(low, high)
-            off = np.sqrt((nearest**2 + e * e) * across**2 + (e * onward - nearest * along) ** 2)
+            tangential2 = along**2 + across**2
+            nearest = np.where(tangential2 > 0, e * onward * along / tangential2, low).clip(low, high)
+            distance = np.sqrt((nearest**2 + e * e) * across**2 + (e * onward - nearest * along) ** 2)
             forward, size = e * along + nearest * onward, np.hypot(e, nearest)
         # Possible if a vector of this size is within `slack` of the line of b, and b does not point away from it.
-        return np.asarray((size <= slack) | (off <= slack) & (forward > 0))
+        return np.asarray((size <= slack) | (distance <= slack) & (forward > 0))

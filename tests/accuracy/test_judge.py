@@ -86,11 +86,11 @@ def test_the_radicand_does_not_depend_on_lengths(a_length, n_length):
 
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
 def test_the_relative_radicand_agrees_with_the_oracle_near_the_critical_angle(precision):
-    given = regimes.make("critical", 50, precision, seed=1)
-    exact = oracle.relative_radicand(given.a, given.n, given.k)
+    critical = regimes.make("critical", 50, precision, seed=1)
+    exact = oracle.relative_radicand(critical.a, critical.n, critical.k)
     near = np.abs(exact) < 1e-2
     assert near.sum() > 10
-    np.testing.assert_allclose(relative_radicand(given)[near].astype(float), np.abs(exact[near]), rtol=1e-2)
+    np.testing.assert_allclose(relative_radicand(critical)[near].astype(float), np.abs(exact[near]), rtol=1e-2)
 
 
 # Bounds and verdict --------------------------------------------------------------------------------------------------
@@ -98,10 +98,10 @@ def test_the_relative_radicand_agrees_with_the_oracle_near_the_critical_angle(pr
 
 def test_lengths_off_unit_widen_the_bound():
     """To 3 u if the program may have made the vectors unit; otherwise to the error of their lengths."""
-    given = rays(a_length=1 + 2.0**-40, n_length=1 - 2.0**-41)
-    exact = certified(given)
+    off_unit = rays(a_length=1 + 2.0**-40, n_length=1 - 2.0**-41)
+    exact = certified(off_unit)
     for budget, normalised, u in (("decomposed", True, 3 * U), ("decomposed", False, 2.0**-40), ("promoted", False, U)):
-        bounds = RayBounds(given, exact, FORMULAS[budget].budget, U, normalised)
+        bounds = RayBounds(off_unit, exact, FORMULAS[budget].budget, U, normalised)
         np.testing.assert_allclose(bounds.u, u, rtol=1e-3)
         assert np.all(bounds.unit) == normalised
     assert np.all(RayBounds(rays(), exact, DECOMPOSED, U).unit)
@@ -157,10 +157,10 @@ def test_misclassified_blank_and_undecided_rays_are_wrong_and_not_compared():
 def test_an_infinite_error_fails_also_within_an_infinite_bound():
     """At normal incidence with k = 1e300 the bound is infinite, and ∞/∞ = NaN is not at most 1."""
     n = np.array([[0.0, 0, 1]])
-    given = Rays(-n, n, np.array([1e300]))
-    exact = certified(given)
+    incident = Rays(-n, n, np.array([1e300]))
+    exact = certified(incident)
     with np.errstate(over="ignore", invalid="ignore"):
-        bounds = RayBounds(given, exact, DECOMPOSED, U)
+        bounds = RayBounds(incident, exact, DECOMPOSED, U)
         judgement = judge(np.full((1, 3), np.nan), exact.transmitted, bounds)
         assert np.isinf(bounds.chord) and np.isnan(judgement.share)
         assert judgement.compared and judgement.wrong
@@ -171,12 +171,12 @@ def test_an_infinite_error_fails_also_within_an_infinite_bound():
 
 def judged(a, k, answer, budget, precision=np.float64):
     """The judgement of `answer(exact)`, which returns b, or None for a, and whether the ray is transmitted."""
-    given = Rays(np.array([a], precision), np.array([[0.0, 0.0, 1.0]], precision), np.array([k], precision))
-    exact = certified(given)
+    incident = Rays(np.array([a], precision), np.array([[0.0, 0.0, 1.0]], precision), np.array([k], precision))
+    exact = certified(incident)
     b, transmitted = answer(exact)
-    b = given.a if b is None else np.asarray(b, float).reshape(1, 3)
+    b = incident.a if b is None else np.asarray(b, float).reshape(1, 3)
     u = float(np.finfo(precision).eps) / 2
-    return judge(b.astype(np.longdouble), np.array([transmitted]), RayBounds(given, exact, budget, u))
+    return judge(b.astype(np.longdouble), np.array([transmitted]), RayBounds(incident, exact, budget, u))
 
 
 def on_the_wrong_side(exact):
