@@ -123,11 +123,11 @@ def cancelling(growth: int) -> Budget:
 # with |a| and |n|.
 CONTRASTING = Budget(10, 8, 1, side=SIDE)
 
-# In u: the backward error of `decomposed` (see `mi_refract.accuracy.backward_error`) due to rounding, for k up to 2.5.
+# The backward error of `decomposed` (see `mi_refract.accuracy.backward_error`) due to rounding, in u, for k up to 2.5.
 # With c = cos θ_i, e = k sin θ_i, q = k c − √R: the error of the radicand R = 1 − k² (1 − c²) is
 # ΔR = k² (6c + 5c² + sin² θ_i) + 2e² + 1, including the vectors' lengths; that of the linear terms is k + |q| + 1 + e.
 # So the backward errors are
 #   directions  (k + |q| + 1 + e + e (ΔR/2 + 2√R (k c + |q| + 1))) / (k c + |q| + e)   7.8 at most
 #   decisions   ΔR / (2 (2k c + 1)), at e = 1                                          5.8
 #   lengths     (ΔR + 2 (k + |q| + 1 + e)) / (4 (2k + 1))                              3.4
-TEXTBOOK_BACKWARD = 8.0
+TEXTBOOK_BACKWARD = 8.0  # the largest backward error of `decomposed` due to rounding, in u, for k up to 2.5

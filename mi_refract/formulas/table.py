@@ -21,15 +21,17 @@ from .well_conditioned import LocalCosines, Refracted, refract_compensated, refr
 #                allows 0.0064u, less than the sum of these bounds; but of 2·10⁷ rays with k ≈ 2²⁰, chosen for the worst
 #                rounding, none has a total error above 0.863u.
 #   decomposed   k n·a − s √… loses the root if it is below ulp(k)/2: b may be 0 at normal incidence from 2²⁴ on.
-SMALLEST_RATIO, LARGEST_RATIO = 2.0**-20, 2.0**20
+SMALLEST_RATIO = 2.0**-20  # smallest k that a formula takes
+LARGEST_RATIO = 2.0**20  # largest k that a formula takes
 
 
 @dataclass(frozen=True)
 class Formula:
     """A formula of refraction, `entry(a, n, k) -> (b, transmitted)`, with its source and its error budget.
 
-    `takes_contrast`, `takes_local`: whether the function takes these arguments. `scales`: whether its input must be
-    scaled to lengths near 1. `time_goal`: the time limit per float32 ray on a CPU, as a multiple of the plain form's.
+    `source`: document and equation. `takes_contrast`, `takes_local`: whether the function takes these arguments.
+    `scales`: whether its input must be scaled to lengths near 1. `time_goal`: the time limit per float32 ray on a CPU,
+    as a multiple of the plain form's.
     """
 
     function: Callable[..., Refracted]
@@ -42,10 +44,11 @@ class Formula:
     time_goal: float | None = None
 
     def __call__(self, a: Vector3, n: Vector3, k: Number, contrast: Number = None) -> Refracted:
-        """The formula as a total function: NaN and False for invalid input.
+        """The refracted directions b (3,) of rays `a` (3,) at normals `n` (3,), and whether each is transmitted.
 
-        Input is invalid if `a` or `n` is zero or not finite, `k` is outside 2⁻²⁰ … 2²⁰, or `contrast` is not finite or
-        not above −1.
+        Dr.Jit arrays of one backend and precision; `k` = n_from / n_to may be a number. `contrast`: κ = k² − 1, if it
+        is known more accurately than from k. Invalid input gives NaN and False without an error: `a` or `n` zero or not
+        finite, `k` outside 2⁻²⁰ … 2²⁰, `contrast` not finite or not above −1.
         """
         n, k = type(a)(n), as_component(a, k)
         scale: Any = 1
@@ -72,6 +75,7 @@ class Formula:
         return self.function(a, n, k, contrast) if self.takes_contrast else self.function(a, n, k)
 
 
+# Every formula by its name.
 FORMULAS = {
     "wedge": Formula(refract_wedge, "000, boxed", "b = k n(n∧a) + s n √(a² + k²(n∧a)²)", budget=cancelling(1)),
     "wedge_contrast": Formula(
@@ -106,8 +110,8 @@ FORMULAS = {
 }
 
 
-# The cheapest formula at the rounding limit in a local frame, where the normal is a literal axis. Fresnel's equations
-# need everything that it computes in float64, so it is also the cheapest on GPUs with slow float64.
+# The formula for "auto": the cheapest at the rounding limit in a local frame, where the normal is a literal axis.
+# Fresnel's equations need everything that it computes in float64, so it is also the cheapest on GPUs with slow float64.
 AUTOMATIC = "promoted"
 
 

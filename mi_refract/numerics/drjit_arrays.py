@@ -56,7 +56,7 @@ Result = TypeVar("Result")
 
 # In Dr.Jit's type stubs the first returns `object`, and the second has no return type.
 _reinterpret: Any = dr.reinterpret_array
-replace_grad: Any = dr.replace_grad
+replace_grad: Any = dr.replace_grad  # Dr.Jit's own, with a type
 
 ALIGNMENT = 64  # bytes that Dr.Jit reads at once
 

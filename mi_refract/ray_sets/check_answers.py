@@ -1,9 +1,10 @@
 """Compare answers to a ray set with certified directions: how large the errors are, in which regimes, and why.
 
 The oracle certifies every ray. An answer is wrong if its error exceeds the a-priori bound of a documented formula for
-that ray. Errors are angles, over the rays whose total internal reflection was classified correctly; the error of the
-length is reported separately. If answers have a column `n_ratio`, the program's ratio of indices, directions are
-compared with the certified ones for that ratio, and the ratio is compared with that of the ray.
+that ray, and right if its backward errors are small too. Errors are angles, over the rays whose total internal
+reflection was classified correctly; the error of the length is reported separately. If answers have a column `n_ratio`,
+the program's ratio of indices, directions are compared with the certified ones for that ratio, and the ratio is
+compared with that of the ray.
 
 All rays, their answers and certified answers are arrays. Steps that take more memory than these run on pieces of them.
 """
