@@ -101,7 +101,7 @@ def test_answers_do_not_choose_the_rays(call):
     answer(to, top)
     assert call("check", "answers.csv", "--rays", "one.csv")[0] == 0
     code, _, err = call("check", "answers.csv", "--rays", "others.csv")
-    assert (code, "the answers are to rays with the checksum 'sha256:" in err) == (2, True)
+    assert (code, "the answers belong to rays with the checksum 'sha256:" in err) == (2, True)
     answer(to, [line for line in top if "checksum" not in line])
     code, out, _ = call("check", "answers.csv", "--rays", "others.csv")
     assert (code, "12999 without an answer" in out) == (2, True)
@@ -207,7 +207,7 @@ BAD_PROGRAMS = {
     "ended with status 3; expected": "import sys; sys.stdin.read(); print('id,bx,by,bz'); sys.exit(3)",
     "was killed by SIGSEGV; expected": "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
     "the table is empty": "pass",
-    "bytes of output; expected one answer a ray": "while True: print('id,bx,by,bz' * 1000)",
+    "bytes of output; expected one answer per ray": "while True: print('id,bx,by,bz' * 1000)",
     "the first row is 'hello'": "print('hello'); print('id,bx,by,bz')",
     "not text": "import os; os.write(1, bytes(range(256)))",
 }
