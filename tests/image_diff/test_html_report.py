@@ -56,7 +56,7 @@ def written(folder, found=None):
     return (folder / "report.html").read_text("utf-8")
 
 
-def page_of(sides, place, source="", settings=folders.AS_ASKED):
+def page_of(sides, place, source="", settings=folders.NO_SETTINGS):
     """The page as the command writes it: each pair while its images are in memory."""
     report = html_report.Page(place)
     report.write(folders.diff(*sides, settings, view=report.view), {}, "mi-refract diff old new", source)
