@@ -1,7 +1,7 @@
-"""What programs read of a comparison: JUnit, GitHub's commands, JSON; and that JSON, read for accepting what it names.
+"""Results for other programs: JUnit, GitHub's workflow commands and JSON; and reading that JSON, to accept its images.
 
-When the JSON is read, its paths are taken as parts of two folders, which may be others than those that were compared:
-a CI's JSON fits the new images that were downloaded from it.
+The JSON's paths are mapped to two folders, which may differ from the compared ones: the JSON of a CI run can be used
+with the new images that were downloaded from that run.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from .results import FAILED, Category, Result, Results, Status
 from .settings import ComparisonSpec, Settings
 
 SCHEMA: Literal[1] = 1
-MOST = 2**28  # bytes of a file
-OUTCOMES: dict[Status, Literal["", "failure", "error", "skipped"]] = {  # of JUnit
+MOST = 2**28  # bytes of a JSON file
+OUTCOMES: dict[Status, Literal["", "failure", "error", "skipped"]] = {  # the words of JUnit
     Status.ERROR: "error",
     Status.DIFFERENT: "failure",
     Status.INCONCLUSIVE: "failure",
@@ -41,7 +41,7 @@ EXPECTED = "expected a file that mi-refract diff --json wrote"
 # The JSON -----------------------------------------------------------------------------------------------------------
 
 _PathText = Annotated[str, msgspec.Meta(min_length=1, pattern=r"^[^\0]*$")]
-_Number = float | Literal["nan", "inf", "-inf"]  # strict JSON has no such numbers
+_Number = float | Literal["nan", "inf", "-inf"]  # strict JSON has no numbers for these
 
 
 def _doc(meaning: str) -> msgspec.Meta:
@@ -111,7 +111,7 @@ class Document(Origin, frozen=True, kw_only=True):
 
 
 def json_schema() -> str:
-    """The JSON Schema (draft 2020-12) of what `write` writes as JSON, as text."""
+    """Return the JSON Schema (draft 2020-12) of the JSON that `write` writes, as text."""
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | msgspec.json.schema(Document)
     return json_text(schema, 1)
 
@@ -120,10 +120,10 @@ def json_schema() -> str:
 
 
 def write(results: Results, origin: Origin, junit: Path | None = None, data: Path | None = None) -> None:
-    """Write JUnit's XML, and the JSON in `data`. OSError where a file cannot be written.
+    """Write JUnit's XML to `junit`, and the JSON to `data`. OSError if a file cannot be written.
 
-    JUnit has a case for each image: "different" is a failure, "inconclusive" too unless it is to pass, no verdict an
-    error. The JSON is a `Document`, with `origin`.
+    JUnit has a case for each image: "different" is a failure, "inconclusive" is one unless it passes by the option
+    --inconclusive, and an image that could not be compared is an error. The JSON is a `Document`, with `origin`.
     """
     if data:
         document = Document(
@@ -144,9 +144,10 @@ def write(results: Results, origin: Origin, junit: Path | None = None, data: Pat
 
 
 def write_github(results: Results, report: str = "", url: str = "") -> None:
-    """Print a workflow command for each image that is not equal or has a warning, and add to the job's summary.
+    """Print a workflow command for each image that is not equal or has a warning, and append to the job's summary.
 
-    `text_reports.markdown` with `report` and `url` is appended to the file that $GITHUB_STEP_SUMMARY names. OSError.
+    `text_reports.markdown` with `report` and `url` is appended to the file $GITHUB_STEP_SUMMARY. OSError if it cannot
+    be written.
     """
     for result in results.results:
         if result.warning or result.status in FAILED:
@@ -160,7 +161,7 @@ def write_github(results: Results, report: str = "", url: str = "") -> None:
 
 
 def _outcome(result: Result, results: Results) -> Literal["", "failure", "error", "skipped"]:
-    """What the image is for a test runner; "" where it passes."""
+    """Return the outcome in the words of JUnit; "" if the image passes."""
     if result.status is Status.INCONCLUSIVE and results.inconclusive == "pass":
         return ""
     return OUTCOMES[result.status]
@@ -181,9 +182,9 @@ def _junit_case(result: Result, results: Results) -> documents.Case:
 
 def _json_entry(result: Result, results: Results) -> Entry:
     comparison, how, digests = result.comparison, result.how, None
-    if result.digests is not None:  # of what was compared; "" where there is no file
-        one, two = (result.digests[path] if path else "" for path in (result.reference, result.test))
-        digests = Digests(one, two, [result.digests[path] for path in result.variants])
+    if result.digests is not None:
+        of_reference, of_test = (result.digests[path] if path else "" for path in (result.reference, result.test))
+        digests = Digests(of_reference, of_test, [result.digests[path] for path in result.variants])
     reference, test, matched = (str(x) if x else None for x in (result.reference, result.test, result.matched))
     return Entry(
         name=result.name,
@@ -215,7 +216,7 @@ def _json_entry(result: Result, results: Results) -> Entry:
 
 
 def _escaped(text: object) -> str:
-    """Text of a workflow command."""
+    """Return the text escaped for a workflow command."""
     return printable(text).replace("%", "%25")
 
 
@@ -223,10 +224,10 @@ def _escaped(text: object) -> str:
 
 
 def read(path: str | Path, reference: Path | None = None, test: Path | None = None) -> Results:
-    """The results; those that are not equal with their digests. `reference`, `test`: by default the paths in the file.
+    """Return the results in a JSON file; those that are not equal have their paths and digests.
 
-    ValueError for a file that `--json` did not write, of another version, of `--renders`, or with a path outside of the
-    two; OSError where it cannot be read.
+    `reference`, `test`: by default the paths in the file. ValueError for a file that `--json` did not write, of another
+    version, written with `--renders`, or with a path outside of the two folders; OSError if it cannot be read.
     """
     try:
         data = json.loads(safe_files.read_bytes(path, MOST))
@@ -249,30 +250,33 @@ def read(path: str | Path, reference: Path | None = None, test: Path | None = No
         if entry.status not in FAILED:
             results.append(Result(entry.name, entry.status, None, None))
             continue
-        one = _moved(f"{where}.reference", entry.reference, before[0], now[0]) if entry.reference else None
-        two = _moved(f"{where}.test", entry.test, before[1], now[1]) if entry.test else None
-        none = entry.target == "."  # of what is wrong in the settings and matches no image
-        target = Path() if none else _moved(f"{where}.target", entry.target, before[0], now[0])
-        # Of single files, the variants lie beside the reference.
+        old_image = _moved(f"{where}.reference", entry.reference, before[0], now[0]) if entry.reference else None
+        new_image = _moved(f"{where}.test", entry.test, before[1], now[1]) if entry.test else None
+        without_target = entry.target == "."  # an invalid entry of the settings that matches no image
+        target = Path() if without_target else _moved(f"{where}.target", entry.target, before[0], now[0])
+        # If two files were compared, the variants are beside the reference.
         roots = (before[0].parent, now[0].parent) if entry.target == str(before[0]) else (before[0], now[0])
-        variants = tuple(_moved(f"{where}.variants", each, *roots) for each in entry.variants)
+        variants = tuple(_moved(f"{where}.variants", path, *roots) for path in entry.variants)
         digests = None
         if entry.digests is not None:
             if len(entry.digests.variants) != len(variants):
                 count = f"{len(entry.digests.variants)} of {len(variants)} variants"
                 raise ValueError(f"{where}.digests: {count}; {EXPECTED}")
-            words = zip(variants, entry.digests.variants, strict=True)
-            pairs = [(one, entry.digests.reference), (two, entry.digests.test), *words]
-            digests = {file: word for file, word in pairs if file}
+            of_variants = zip(variants, entry.digests.variants, strict=True)
+            by_file = [(old_image, entry.digests.reference), (new_image, entry.digests.test), *of_variants]
+            digests = {file: digest for file, digest in by_file if file}
         options = {"allow_nonfinite": entry.options.get("allow_nonfinite") is True}
         how = ComparisonSpec(options=options, variance=entry.variance)
-        result = Result(entry.name, entry.status, one, two, how, error=entry.error)
+        result = Result(entry.name, entry.status, old_image, new_image, how, error=entry.error)
         results.append(replace(result, digests=digests, target=target, variants=variants))
     return Results(*now, tuple(results))
 
 
 def _moved(where: str, text: str, before: Path, now: Path) -> Path:
-    """The path of the file as one in `now`. ValueError where it leads out of it, by `..` or by a link to a folder."""
+    """Return the path in the folder `now` instead of `before`.
+
+    ValueError if it leads out of the folder, by `..` or by a link to a folder.
+    """
     path = Path(text)
     moved = now / path.relative_to(before) if path.is_relative_to(before) else None
     if moved is None or not (moved == now or pairing.is_inside(moved, now)):
@@ -281,16 +285,16 @@ def _moved(where: str, text: str, before: Path, now: Path) -> Path:
 
 
 def with_settings(results: Results, settings: Settings) -> Results:
-    """The results with `settings`, of which the file says no more than whether values need be finite.
+    """Return the results with `settings`; of the settings in the JSON only `allow_nonfinite` is kept.
 
-    ValueError for an image with a variance in a file of its own, of which the file has no digest.
+    ValueError for an image with a variance in a separate file, because the JSON has no digest of it.
     """
-    changed = []
+    updated = []
     for result in results.results:
         inside = result.target.is_relative_to(results.reference)
         target = result.target.relative_to(results.reference) if inside else Path()
         how = pairing.how_of(settings, result.name, target)
         if result.status in FAILED and (result.how.variance or how.reads_variance):
             raise ValueError(f"{result.name}: its variance is in a separate file; accept it without --from")
-        changed.append(replace(result, how=replace(how, options=result.how.options)))
-    return replace(results, results=tuple(changed))
+        updated.append(replace(result, how=replace(how, options=result.how.options)))
+    return replace(results, results=tuple(updated))
