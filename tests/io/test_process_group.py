@@ -34,7 +34,7 @@ def shell(text, *arguments):
 def test_what_goes_in_and_what_comes_out():
     given = os.urandom(300_000)  # more than a pipe holds, both ways at once
     ended = process_group.run(shell("cat; echo said >&2; exit 3"), given, 60, keep_stderr=True)
-    assert (ended.status, ended.out, ended.said) == (3, given, b"said\n")
+    assert (ended.status, ended.out, ended.err) == (3, given, b"said\n")
     many = 2**31 + 1  # more than Linux writes at a time; zeros that nobody has touched take no memory
     assert int(process_group.run(["wc", "-c"], bytes(many), 60).out) == many
     assert process_group.run(["true"], given, 60).out == b""
