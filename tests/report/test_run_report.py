@@ -291,7 +291,7 @@ def test_curves_keep_the_guide_and_literal_names():
     assert ">seconds</text>" in svg and ">relMSE</text>" in svg
     assert curves_svg({"x": [(1, 0), (NAN, 1)]}, axes, salt="s") == ""
     svg = curves_svg({f"line {i}": [(1, i + 1), (2, i + 1)] for i in range(12)}, axes, salt="s")
-    style = (documents.HERE / "report.css").read_text("utf-8")
+    style = (documents.TEMPLATES / "report.css").read_text("utf-8")
     values = [re.findall(rf"{name}: (#\w+)", style) for name in set(re.findall(r"--c\d+", svg))]
     assert len({light for light, _ in values}) == len({dark for _, dark in values}) == 12
     for wrong in ({"x_scale": "cubic"}, {"slope": 2, "y_scale": "linear"}):
