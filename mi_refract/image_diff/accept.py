@@ -140,10 +140,10 @@ class Acceptance:
 
     def _state(self) -> str:
         names = [str(copy.reference) for copy in self.copies]
-        done, left = names[: self._replaced], names[self._replaced :]
-        if not (done and left):
+        done, rest = names[: self._replaced], names[self._replaced :]
+        if not (done and rest):
             return "all references are replaced" if done else "no reference is replaced"
-        return f"replaced: {_listed(done)}; not replaced: {_listed(left)}; the same command again accepts these"
+        return f"replaced: {_listed(done)}; not replaced: {_listed(rest)}; run the same command again to accept these"
 
     def _require_unchanged(self) -> None:
         for copy in self.copies:

@@ -283,10 +283,14 @@ def samples(image: Image, side: str, spp: int, least: int = 2) -> int:
 
     ValueError, which names the option of that `side`, for fewer than `least`, and if the header has no such number.
     """
-    value = spp or image.metadata.get(SPP, "no samples per pixel")
-    if (count := _whole(value)) < least:
-        where = "samples per pixel:" if spp else "its header names"
-        raise ValueError(f"{image.path}: {where} {value!r:.60}; expected `spp` or `spp_{side}`, {least} to 10¹⁵")
+    value = spp or image.metadata.get(SPP)
+    count = _whole(value)
+    if count < least:
+        where = "" if spp else " in its header"
+        text = "none" if value is None else f"{value!r:.60}"
+        raise ValueError(
+            f"{image.path}: samples per pixel{where}: {text}; expected `spp` or `spp_{side}`, {least} to 10¹⁵"
+        )
     return count
 
 

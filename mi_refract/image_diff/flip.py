@@ -64,11 +64,11 @@ def flip(
     local: Annotated[
         float, "mean FLIP error allowed in any square of 0.12 degrees, 0 to 1; less in wider squares"
     ] = LOCAL,
-    patch: Annotated[float, "FLIP error that may fill a square of 0.24 degrees, 0 to 1"] = PATCH,
+    patch: Annotated[float, "FLIP error allowed throughout a square of 0.24 degrees, 0 to 1"] = PATCH,
     one_way: Annotated[
         float,
-        "codes of 255 by which all of a 3 × 3 square may change one way, in luma; a single channel by twice as much, "
-        "larger squares by less; for LDR images",
+        "codes of 255 by which the luma of all pixels of a 3 × 3 square may rise, or fall; twice as much for a single "
+        "channel, less for larger squares; for LDR images",
     ] = ONE_WAY,
     largest: Annotated[float, "FLIP error that no pixel may exceed, 0 to 1"] = 1.0,
     mean: Annotated[float, "FLIP error allowed on average over the image, 0 to 1"] = 1.0,

@@ -148,7 +148,7 @@ def _cut(failures: list[dict[str, Any]], equal: list[dict[str, Any]], articles: 
     without_images = sum(entry["note"] == FULL for entry in failures[:articles])
     left_out = {
         f"images of {without_images} of {len(failures)} failures": without_images,
-        f"all but a line of {len(further) - dropped} failures": len(further) - dropped,
+        f"details of {len(further) - dropped} failures": len(further) - dropped,
         f"{dropped} failures": dropped,
         f"{dropped_equal} equal images": dropped_equal,
     }

@@ -73,7 +73,7 @@ def difference(images: Sequence[Image], ignored: Sequence[str] = ()) -> str:
         if ALPHA in names and None in (first.get(ALPHA), other.get(ALPHA)):  # one image has no alpha channel
             names.remove(ALPHA)
         if names:
-            old, new = (values.get(names[0], "not there") for values in (first, other))
+            old, new = (values.get(names[0], "absent") for values in (first, other))
             more = f", and {', '.join(names[1:])}" if len(names) > 1 else ""
             return f"different metadata: {names[0]} ({old:.{SHOWN}} → {new:.{SHOWN}}){more}"
     return ""

@@ -52,7 +52,7 @@ _Digest = Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$"), _doc("SHA-2
 
 
 class Digests(msgspec.Struct):
-    """The SHA-256 of the files of an image when they were compared."""
+    """The SHA-256 of the files of an image at the time of the comparison."""
 
     reference: _Digest
     test: _Digest
@@ -60,7 +60,7 @@ class Digests(msgspec.Struct):
 
 
 class MeasuredNumber(msgspec.Struct):
-    """A number that the method measured; in equal images it is at most its bound, where it has one."""
+    """A number that the method measured; for equal images it is at most its bound, if it has one."""
 
     name: str
     value: _Number
@@ -72,41 +72,41 @@ class Entry(msgspec.Struct):
 
     name: Annotated[str, _doc("path of the new image in its folder")]
     status: Annotated[Status, _doc("the verdict; error: could not be compared")]
-    category: Annotated[Category, _doc("what happened to the image between the folders; unknown without a verdict")]
+    category: Annotated[Category, _doc("change of the image between the folders; unknown without a verdict")]
     reason: str
-    warning: Annotated[str, _doc("what an equal image is near to failing, and remarks on its mask")]
+    warning: Annotated[str, _doc("bounds for warnings that an equal image exceeds, and remarks on its mask")]
     error: Annotated[str, _doc("why the image could not be compared")]
     reference: Annotated[_PathText | None, _doc("null: only among the new images")]
     test: Annotated[_PathText | None, _doc("null: only among the references")]
-    target: Annotated[_PathText, _doc("where the reference is, or would be")]
+    target: Annotated[_PathText, _doc("path of the reference, which may not exist yet")]
     digests: Annotated[Digests | None, _doc("null for an unreadable file and with --renders")]
     method: str
     method_why: Annotated[str, _doc("why `auto` chose this method")]
     options: Annotated[dict[str, Any], _doc("the options of the method that were set")]
-    channels: Annotated[list[tuple[str, str]], _doc("[of the reference, of the new image]; empty: all")]
-    variance: Annotated[str, _doc("template of the image that holds the variance")]
+    channels: Annotated[list[tuple[str, str]], _doc("pairs [name in the reference, in the new image]; empty: all")]
+    variance: Annotated[str, _doc("template of the image that contains the variance")]
     mask: Annotated[str, _doc("template of the mask")]
-    ignore: Annotated[list[tuple[int, int, int, int]], _doc("rectangles that do not count: [x, y, width, height]")]
+    ignore: Annotated[list[tuple[int, int, int, int]], _doc("rectangles not compared: [x, y, width, height]")]
     why_so: Annotated[str, _doc("`reason` in the settings")]
     entries: Annotated[list[str], _doc("tables of the settings that apply")]
-    matched: Annotated[_PathText | None, _doc("the further reference that the image is equal to")]
-    variants: Annotated[list[_PathText], _doc("further references, by `accept` in the settings")]
+    matched: Annotated[_PathText | None, _doc("the variant that the image is equal to")]
+    variants: Annotated[list[_PathText], _doc("variants: further references, by `accept` in the settings")]
     metrics: list[MeasuredNumber]
-    minimum_detectable_difference: Annotated[_Number, _doc("relative; nan where the method knows none")]
+    minimum_detectable_difference: Annotated[_Number, _doc("relative; nan if the method has none")]
     reproduce: Annotated[str, _doc("the command that compares this image again")]
     accept: Annotated[str, _doc("the command that makes the new image the reference")]
 
 
 class Document(Origin, frozen=True, kw_only=True):
-    """What `mi-refract diff --json` writes. Other keys may be added without another number of `schema`."""
+    """The JSON of `mi-refract diff --json`. Keys may be added without a change of the number `schema`."""
 
     schema: Literal[1]
-    exit_code: Annotated[int, msgspec.Meta(ge=0, le=3), _doc("of the command")]
+    exit_code: Annotated[int, msgspec.Meta(ge=0, le=3), _doc("exit code of the command")]
     sentence: Annotated[str, _doc("the last line of the output")]
     reference: _PathText
     test: _PathText
-    renders: Annotated[bool, _doc("--renders: each folder holds renders of one image")]
-    counts: Annotated[dict[Status, int], _doc("images of each status")]
+    renders: Annotated[bool, _doc("--renders: each folder contains renders of one image")]
+    counts: Annotated[dict[Status, int], _doc("number of images of each status")]
     results: list[Entry]
 
 

@@ -225,11 +225,11 @@ class Keys(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     ] = ()
     mask: Annotated[
         str | None,
-        Meta(description="an image beside the reference: white pixels count, black do not; {root}: the top folder"),
+        Meta(description="an image beside the reference: only white pixels are compared; {root}: the top folder"),
     ] = None
     ignore: Annotated[
         tuple[Rectangle, ...],
-        Meta(min_length=1, description="rectangles of pixels that do not count: x, y, width, height"),
+        Meta(min_length=1, description="rectangles of pixels that are not compared: x, y, width, height"),
     ] = ()
     variance: Annotated[
         str | None,

@@ -247,7 +247,7 @@ def _verdict(tests: TileTests, resolution: float, hidden: float) -> tuple[Verdic
     if differing := ", ".join(f"{count} {name}" for name, count in counts.items() if count):
         return Verdict.DIFFERENT, f"{sum(counts.values())} of {tests.p.size} tests differ: {differing}"
     if silent or doubtful:
-        where = f"{silent} without noise, {doubtful} heavy-tailed or of more noise than their pixels show"
+        where = f"{silent} without noise, {doubtful} heavy-tailed or noisier than their pixels show"
         return Verdict.INCONCLUSIVE, f"only tiles that are unsuited to a t-test differ: {where}"
     if tests.levels[0].silent.all():
         return Verdict.EQUAL, "no noise, and no tile differs beyond the margin"
@@ -278,7 +278,7 @@ def _worst(tests: TileTests, image: Image, channels: Sequence[str], tile: int) -
     where = "the whole image" if level.t[..., 0].size == 1 else f"the {columns} × {rows} pixels around ({x}, {y})"
     old, change = (float(values[row, column, channel]) for values in (level.reference, level.difference))
     if kind == "pixels" or not change:
-        return f"other pixels of {name} in {where}, the mean of which is the same within the noise"
+        return f"different pixels of {name} in {where}, with the same mean within the noise"
     up, down = ("brighter", "darker") if name.rpartition(".")[2] in COLOURS else ("higher", "lower")
     direction = up if change > 0 else down
     amount = f"{_percent(abs(change / old))} " if old > 0 else ""

@@ -38,8 +38,8 @@ class PackedFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A file of a pack."""
 
     sha256: Digest
-    content: Annotated[str, _doc("what it holds")]
-    schema: Annotated[str, _doc("of a JSON file: the file with its JSON Schema")] = ""
+    content: Annotated[str, _doc("description of the content")]
+    schema: Annotated[str, _doc("for a JSON file: the file with its JSON Schema")] = ""
 
 
 class PackIndex(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -48,16 +48,16 @@ class PackIndex(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     format: Annotated[Literal["mi_refract pack 1"], _doc("the format, and its version")]
     version: Annotated[str, _doc("version of mi_refract that wrote the pack")]
     quick: Annotated[bool, _doc("made with --quick: few rays, small images")]
-    made_with: Annotated[dict[str, str], _doc("everything that the bytes depend on, by name")]
-    files: Annotated[dict[str, PackedFile], _doc("every other file but SHA256SUMS, by its path with slashes")]
+    made_with: Annotated[dict[str, str], _doc("versions and settings that the bytes depend on, by name")]
+    files: Annotated[dict[str, PackedFile], _doc("all other files except SHA256SUMS, by path with slashes")]
 
 
 class PackReference(msgspec.Struct, frozen=True):
     """The pack of the references, as results name it."""
 
     version: Annotated[str, _doc("version of mi_refract that wrote the pack")]
-    sha256: Annotated[Digest, _doc(f"of the pack's {INDEX}, which holds that of every file")]
-    path: Annotated[str, _doc("of the references in the pack")]
+    sha256: Annotated[Digest, _doc(f"SHA-256 of the pack's {INDEX}, which contains that of every file")]
+    path: Annotated[str, _doc("path of the references in the pack")]
 
 
 class Origin(msgspec.Struct, frozen=True, kw_only=True):
@@ -65,7 +65,7 @@ class Origin(msgspec.Struct, frozen=True, kw_only=True):
 
     version: Annotated[str, _doc("version of mi_refract that wrote this")]
     command: Annotated[str, _doc("the command line that wrote this")]
-    pack: Annotated[PackReference | None, _doc("the reference pack that the references are from; null: none")]
+    pack: Annotated[PackReference | None, _doc("the pack that contains the references; null: none")]
 
 
 def origin(words: Sequence[str], pack: PackReference | None) -> Origin:

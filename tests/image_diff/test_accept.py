@@ -269,7 +269,7 @@ def test_after_an_error_replaced_files_are_listed_and_a_second_call_finishes(
     monkeypatch.setattr(safe_files, "move_into_place", fail)
     code, _, err = run(*words)
     rest = f"{old}/01.exr" if count == 2 else f"{old}/01.exr … {old}/11.exr (11 in the order above)"
-    state = f"replaced: {old}/00.exr; not replaced: {rest}; the same command again accepts these"
+    state = f"replaced: {old}/00.exr; not replaced: {rest}; run the same command again to accept these"
     assert (code, err) == (2, f"mi-refract: {old}/01.exr: Read-only file system; {state}\n")
     assert tree(old) == before | {"00.exr": after["00.exr"]}  # and no hidden files
     monkeypatch.undo()

@@ -192,7 +192,7 @@ def test_an_invalid_number_of_samples_in_a_header_is_an_error(tmp_path, spp):
         assert output.open(str(path), spec) and output.write_image(np.ones((8, 8, 2), np.float32)) and output.close()
     results = diff.diff(tmp_path / "old", tmp_path / "new")
     assert {r.name: str(r.status) for r in results.results} == {"noisy.exr": "error", "same.exr": "equal"}
-    assert "old/noisy.exr: its header names " in results.results[0].error
+    assert "old/noisy.exr: samples per pixel in its header: " in results.results[0].error
 
 
 def test_concurrent_pairs_respect_the_limit_of_values(tmp_path, monkeypatch):

@@ -357,7 +357,7 @@ def test_a_page_of_thousands_of_images_respects_its_limit(tmp_path, monkeypatch)
     more = [int(count) for count in re.findall(r"… and (\d+) more", text)]
     assert articles >= 20 and lines >= articles and articles + lines + sum(more) == 1200
     assert "rest.html" not in text  # no image has a pane
-    in_lines = f"all but a line of {900 - articles - more[0]} failures"
+    in_lines = f"details of {900 - articles - more[0]} failures"
     assert left_out == f"{in_lines}, {more[0]} failures, {more[1]} equal images"
 
 

@@ -206,7 +206,7 @@ BAD = [  # a change, settings, and part of the error
     (lambda old: None, {"variance": "{name}"}, "itself; expected another image"),
     (lambda old: None, {"spp_test": 1}, "samples per pixel: 1; expected `spp` or `spp_test`, 2 to 10¹⁵"),
     (lambda old: None, {"spp_reference": -3}, "spp_reference = -3; expected a number of at least 0"),
-    (lambda old: None, {"spp_test": 0}, "names 'no samples per pixel'; expected `spp` or `spp_test`"),
+    (lambda old: None, {"spp_test": 0}, "samples per pixel in its header: none; expected `spp` or `spp_test`"),
     (lambda old: None, {"channels": (("Q", "Q"),)}, "no channel 'Q'; in `channels` expected R, G"),
     *(
         (_write("", MEAN, **{FREEDOM: named}), {}, "; expected a whole number, 1 to 10¹⁵")

@@ -439,7 +439,7 @@ def test_the_reason_for_changes_within_a_tile_and_for_black_references(rng):
     for image in sides[1]:
         image.pixels[:16:2, :16, 1] *= 1.2
         image.pixels[1:16:2, :16, 1] *= 0.8
-    words = "other pixels of G in the 16 × 16 pixels around (8, 8), the mean of which is the same within the noise; "
+    words = "different pixels of G in the 16 × 16 pixels around (8, 8), with the same mean within the noise; "
     assert welch(*sides).reason.startswith(words)
     for image in sides[0]:
         image.pixels[16:32, :16, 2] = 0
