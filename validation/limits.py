@@ -47,6 +47,7 @@ PRISM_ANGLE = limit(
 BOW_ANGLE = limit(160 * 2.0**-53, "radians: four boundaries of 8u, each turned on by those after it, and their points")
 FOCAL_DISTANCE = limit(5.4e-10, "relative: (h/R)² at h = 1e-3 and the steepest R = 43; aberration is tenths of that")
 FURNACE_CHANNEL = limit(3e-3, "relative: what a colour of the furnace would be seen at, in each channel")
+PANE = limit(1e-3, "one ray in 500 may pass between two faces, beside the edges of a pane")
 ABSORPTION_SEEN = limit(0.01, "relative: a difference of an image's mean from `volpath` that must be seen")
 SLAB_ABSORPTION = limit(2e-6, "relative: σ d up to 8 in float32, with a way that is off by 2u: 16u and the exponential")
 DISPERSION_TIME = limit(1.25, "over the same scene with the index of the d line, with as many samples")

@@ -71,7 +71,7 @@ TERMS = {
 }
 # What is rendered: integrator settings, and the BSDF of glass. `ptracer` stands for the sum of two integrators.
 BY_CLASS = Method("path + ptracer", "ptracer", DIELECTRIC)
-METHODS = (BUILTIN, Method(OURS, OURS, PLUGIN), FROM_LAMPS, BY_CLASS)
+METHODS = (BUILTIN, Method(OURS, OURS, PLUGIN, {"caustics": "path"}), FROM_LAMPS, BY_CLASS)
 HOLDING = FROM_LAMPS, BY_CLASS  # the caustics of lamps of any size
 # Of a disk: the image is a caustic and nothing else.
 ENERGY = replace(FROM_LAMPS, parameters={"caustics": "lamp", "light_paths": 4.0}), BY_CLASS
