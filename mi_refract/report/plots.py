@@ -128,8 +128,8 @@ def scatter_svg(panels: Mapping[str, Scatter], axes: Axes, *, floor: str, front:
     can be.
     """
     drawn: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    for setting, panel in panels.items():
-        by_subject = {subject: sorted(drawable(points, axes)) for subject, points in panel.points.items()}
+    for setting, scatter in panels.items():
+        by_subject = {subject: sorted(drawable(points, axes)) for subject, points in scatter.points.items()}
         if any(by_subject.values()):
             drawn[setting] = {subject: points for subject, points in by_subject.items() if points}
     if not drawn:
