@@ -72,7 +72,7 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
         except (ValueError, OSError) as error:
             raise UnreadableImage(result, describe(error)) from error
         if decoded[result.test] != compared:
-            raise _changed(result.test)
+            raise _changed_error(result.test)
         if not result.how.options.get("allow_nonfinite") and not all(np.isfinite(x.pixels).all() for x in images):
             raise ValueError(
                 f"{result.test}: values that are not finite; to accept them, compare with --set allow_nonfinite=true"
@@ -121,7 +121,7 @@ class Acceptance:
                 copy.reference.parent.mkdir(parents=True, exist_ok=True)
                 hidden_file = stack.enter_context(safe_files.beside(copy.reference))
                 if safe_files.copy(copy.new, hidden_file) != copy.compared:
-                    raise _changed(copy.new)
+                    raise _changed_error(copy.new)
                 safe_files.sync(hidden_file)
                 hidden_files.append(hidden_file)
             self._require_unchanged()
@@ -149,12 +149,12 @@ class Acceptance:
         for copy in self.copies:
             for path, before in ((copy.new, copy.compared), (copy.reference, copy.replaced)):
                 if digest(path) != before:
-                    raise _changed(path)
+                    raise _changed_error(path)
 
 
 def _listed(names: Sequence[str]) -> str:
     return ", ".join(names) if len(names) <= FEW else f"{names[0]} … {names[-1]} ({len(names)} in the order above)"
 
 
-def _changed(path: Path) -> OSError:
+def _changed_error(path: Path) -> OSError:
     return OSError(f"{path}: changed since it was compared")

@@ -253,7 +253,7 @@ def _estimate(image: Image, side: str, spp: int, allow_nonfinite: bool) -> Estim
                 hint = f"; of X, Y, Z that were written as colours, as Mitsuba's: channels = {list(XYZ)}"
                 raise ValueError(
                     f"{image.path}: its variance of {name} is negative in {below.sum()} pixels, the first "
-                    f"{_at(image, below)}; expected at least 0{hint if name in 'RGB' else ''}"
+                    f"{_first(image, below)}; expected at least 0{hint if name in 'RGB' else ''}"
                 )
         elif name in pairs:
             spread, is_moment = pairs[name]
@@ -268,14 +268,14 @@ def _estimate(image: Image, side: str, spp: int, allow_nonfinite: bool) -> Estim
         unknown = ~np.isfinite(v)
         if (wrong := unknown & np.isfinite(m)).any() and not allow_nonfinite:
             raise ValueError(
-                f"{image.path}: its variance of {name} is not finite {_at(image, wrong)}; expected finite values"
+                f"{image.path}: its variance of {name} is not finite {_first(image, wrong)}; expected finite values"
             )
         variance[..., i] = np.where(unknown, 0, np.maximum(v, 0))
     freedom = spp - 1
     if FREEDOM in image.metadata and (image.variances or pairs):
         freedom = _freedom(image)
     image_of_means = replace(image, pixels=image.select(names), channels=tuple(names), variances={})
-    return Estimate(image_of_means, variance, spp, freedom, _shared(image, freedom < spp - 1))
+    return Estimate(image_of_means, variance, spp, freedom, _shared_factor(image, freedom < spp - 1))
 
 
 def samples(image: Image, side: str, spp: int, least: int = 2) -> int:
@@ -307,7 +307,7 @@ def _whole(value: object) -> int:
     return int(float(str(value))) if re.fullmatch(r"[0-9]{1,15}(\.0)?", str(value)) else -1
 
 
-def _shared(image: Image, of_passes: bool) -> float | None:
+def _shared_factor(image: Image, of_passes: bool) -> float | None:
     """Return `Estimate.shared` by the header; `of_passes`: the variance was estimated from passes.
 
     Without filter in the header, pixels of passes may share samples, so it has to be estimated.
@@ -323,7 +323,7 @@ def _shared(image: Image, of_passes: bool) -> float | None:
     return 1.0 if radius <= 0.5 else (2 * radius) ** 2
 
 
-def _at(image: Image, flags: NDArray[np.bool_]) -> str:
+def _first(image: Image, flags: NDArray[np.bool_]) -> str:
     y, x = np.unravel_index(int(flags.argmax()), flags.shape)
     return f"at x = {x + image.origin[0]}, y = {y + image.origin[1]}"
 

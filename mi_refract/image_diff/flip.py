@@ -261,7 +261,7 @@ def local_error(error: Pixels, ppd: float) -> tuple[Window, Pixels]:
     around, worst_windows = np.zeros(error.shape, np.float32), []
     for h, w, weight in windows(height, width, ppd):
         means = (sums[h:, w:] - sums[:-h, w:] - sums[h:, :-w] + sums[:-h, :-w]) / (h * w)
-        worst_windows.append(_worst(np.maximum(means, 0), weight, w, h))  # a difference of sums may be −1e-16
+        worst_windows.append(_worst_window(np.maximum(means, 0), weight, w, h))  # a difference of sums may be −1e-16
         # Each mean is stored at the centre of its window; pixels next to the border get that of the nearest window.
         padding = [(gap // 2, gap - gap // 2) for gap in (h - 1, w - 1)]
         np.maximum(around, np.pad(np.float32(weight) * means.astype(np.float32), padding, mode="edge"), out=around)
@@ -274,7 +274,7 @@ def patch_error(error: Pixels, ppd: float) -> Window:
 
     h, w = (min(max(1, round(SURFACE * ppd)), size) for size in error.shape)
     rows, columns = (slice(k // 2, k // 2 + size - k + 1) for k, size in zip((h, w), error.shape, strict=True))
-    return _worst(minimum_filter(error, (h, w))[rows, columns], 1.0, w, h)
+    return _worst_window(minimum_filter(error, (h, w))[rows, columns], 1.0, w, h)
 
 
 def one_way_change(reference: Pixels, test: Pixels, ppd: float) -> Window:
@@ -295,12 +295,12 @@ def one_way_change(reference: Pixels, test: Pixels, ppd: float) -> Window:
             least = np.minimum(least[1:], least[:-1])
             least = np.minimum(least[:, 1:], least[:, :-1])
             if side >= SIDE * scale:
-                window = _worst(least, (side / scale - 1) / 2, side, side)
+                window = _worst_window(least, (side / scale - 1) / 2, side, side)
                 worst = max(worst, window, key=lambda window: window.value)
     return worst
 
 
-def _worst(errors: Pixels, weight: float, width: int, height: int) -> Window:
+def _worst_window(errors: Pixels, weight: float, width: int, height: int) -> Window:
     y, x = np.unravel_index(int(errors.argmax()), errors.shape)
     error = float(errors[y, x])
     return Window(weight * error, error, int(x), int(y), width, height)

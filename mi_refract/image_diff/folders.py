@@ -81,14 +81,15 @@ def diff(
     results = Results(reference, test, (), renders, inconclusive, tuple(unused), settings.flags)
 
     def compare(pair: Result) -> Result:
-        result = _compared(pair, results, keep=maps or view is not None, digests=(digests or to_accept) and not renders)
+        with_digests = (digests or to_accept) and not renders
+        result = _compare_pair(pair, results, keep=maps or view is not None, digests=with_digests)
         if view and result.status in FAILED:
             view(result, results)
         return result if maps else without_images(result)
 
     # The pairs that are compared at the same time together have at most as many values as one pair may have.
     max_values = 2 * settings.max_values
-    compared = map(compare, pairs) if len(pairs) == 1 else bounded_map(compare, pairs, _values, max_values, WORKERS)
+    compared = map(compare, pairs) if len(pairs) == 1 else bounded_map(compare, pairs, _size, max_values, WORKERS)
     done: list[Result] = []
     for result in compared:
         done.append(result)
@@ -125,7 +126,7 @@ def bounded_map(
                 future.cancel()
 
 
-def _values(pair: Result) -> int:
+def _size(pair: Result) -> int:
     """Return the number of values in both images; 0 if a file cannot be read, or if it is no pair of files."""
     files = [path for path in (pair.reference, pair.test) if path and path.is_file()]
     with contextlib.suppress(Exception):  # the comparison reports any error
@@ -139,7 +140,7 @@ def without_images(result: Result) -> Result:
     return replace(result, images={}, comparison=comparison)
 
 
-def _compared(result: Result, results: Results, *, keep: bool, digests: bool) -> Result:
+def _compare_pair(result: Result, results: Results, *, keep: bool, digests: bool) -> Result:
     """Compare the two sides of a pair, if it has both, and return its result; with status ERROR after any error.
 
     `keep`: a result that is not equal keeps its images and maps, as far as they can be read. Each file is read once.
@@ -156,7 +157,7 @@ def _compared(result: Result, results: Results, *, keep: bool, digests: bool) ->
             if results.renders:
                 return file_pair.read_renders(path, how.max_values)
             return image_file.read_parts(path, how.max_values, decoded)
-        except Exception as error:  # any error: `_judged` raises it again
+        except Exception as error:  # any error: `_judge` raises it again
             return error
 
     if how.skip and not how.error:
@@ -165,7 +166,7 @@ def _compared(result: Result, results: Results, *, keep: bool, digests: bool) ->
         result = replace(result, status=Status.ERROR)
     else:
         try:
-            result = _judged(result, results.roots, read, functools.partial(image_file.read, digests=decoded))
+            result = _judge(result, results.roots, read, functools.partial(image_file.read, digests=decoded))
             if decoded is not None:
                 result = replace(result, digests=_digests(result, results.roots, decoded))
         except Exception as error:  # any error: the other pairs are compared all the same
@@ -196,7 +197,7 @@ def _compared(result: Result, results: Results, *, keep: bool, digests: bool) ->
 
 
 def _digests(result: Result, roots: tuple[Path, Path], decoded: Mapping[Path, str]) -> dict[Path, str]:
-    """Return the digests of all files of a result, of those in `decoded` from there."""
+    """Return the digests of all files of a result; those in `decoded` are not computed again."""
     paths = [result.reference, result.test, *result.variants]
     if result.how.reads_variance:
         sides = zip((result.target, result.test), roots, strict=True)
@@ -204,7 +205,7 @@ def _digests(result: Result, roots: tuple[Path, Path], decoded: Mapping[Path, st
     return {path: decoded.get(path) or digest(path) for path in paths if path}
 
 
-def _judged(result: Result, roots: tuple[Path, Path], read: Read, read_one: file_pair.ReadOne) -> Result:
+def _judge(result: Result, roots: tuple[Path, Path], read: Read, read_one: file_pair.ReadOne) -> Result:
     """Return the result of comparing the new image with the reference, or with the first variant that it is equal to.
 
     Without an equal one: an inconclusive result if there is any, else that of the reference. `read`: returns images or

@@ -126,7 +126,7 @@ class Page:
         }
         articles, lines = ARTICLES, LINES
         while True:
-            text = rendered("diff.html.j2", content | _cut(failures, equal, articles, lines), images)
+            text = rendered("diff.html.j2", content | _limited(failures, equal, articles, lines), images)
             if len(text) <= LIMIT or not lines:
                 break
             articles, lines = articles // 2, lines // 2
@@ -141,7 +141,7 @@ def write(path: str | Path, results: Results, context: Mapping[str, Any] | None 
     page.write(results, context or {}, replay)
 
 
-def _cut(failures: list[dict[str, Any]], equal: list[dict[str, Any]], articles: int, lines: int) -> dict[str, Any]:
+def _limited(failures: list[dict[str, Any]], equal: list[dict[str, Any]], articles: int, lines: int) -> dict[str, Any]:
     """Return the content of the page with at most so many articles and lines, and what is left out."""
     further = failures[articles:]
     dropped, dropped_equal = max(len(further) - lines, 0), max(len(equal) - lines, 0)
@@ -233,7 +233,7 @@ def shown_of(result: Result, image_bytes: float, map_bytes: float) -> Shown:
                     change = two.pixels - one.pixels
                 makers.append(functools.partial(map_pane, "difference", change, map_bytes))
                 if "flip" not in maps and all(np.isfinite(x.pixels.astype(np.float32)).all() for x in (one, two)):
-                    makers.append(functools.partial(_flip, one, two, map_bytes))
+                    makers.append(functools.partial(_flip_pane, one, two, map_bytes))
             histogram: Sequence[float] = ()
             if "p" in maps:  # shown as a histogram instead of a map
                 p_values = maps.pop("p")
@@ -278,7 +278,7 @@ def map_pane(name: str, values: Pixels, max_bytes: float, note: str = "") -> Pan
     return _pane(name, paint, gain, small, max_bytes, largest, note or reduced)
 
 
-def _flip(reference: Image, test: Image, max_bytes: float) -> Pane:
+def _flip_pane(reference: Image, test: Image, max_bytes: float) -> Pane:
     """Return a pane of the FLIP map of the images at the displayed size; at full size FLIP would take seconds."""
     side = -(-reference.pixels.shape[1] // FLIP_WIDTH)
     one, two = (replace(image, pixels=block_mean(image.pixels, side)) for image in (reference, test))

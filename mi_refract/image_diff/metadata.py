@@ -66,7 +66,7 @@ def difference(images: Sequence[Image], ignored: Sequence[str] = ()) -> str:
 
     `ignored`: patterns of names that are not compared. Images that were not read from a file are skipped.
     """
-    metadata = [_compared(image, tuple(ignored)) for image in images if image.stored]
+    metadata = [_compared_metadata(image, tuple(ignored)) for image in images if image.stored]
     for other in metadata[1:]:
         first = metadata[0]
         names = [name for name in sorted(first.keys() | other.keys()) if first.get(name) != other.get(name)]
@@ -79,7 +79,7 @@ def difference(images: Sequence[Image], ignored: Sequence[str] = ()) -> str:
     return ""
 
 
-def _compared(image: Image, ignored: tuple[str, ...]) -> dict[str, str]:
+def _compared_metadata(image: Image, ignored: tuple[str, ...]) -> dict[str, str]:
     """Return the metadata to compare, as text by name, without ignored ones and DEFAULTS."""
     space = str(image.metadata.get(SPACE, "")).lower()
     space = SPACES.get(space, space) or ("srgb_rec709_scene" if image.stored in CODED else "lin_rec709_scene")

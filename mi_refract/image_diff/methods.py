@@ -228,7 +228,7 @@ def _compare(
             result = nonfinite_result(method, reason, *aligned(a, b))
         else:
             a, b = _finite_pair(a, b)
-            result = _of_finite(method, a, b, options)
+            result = _compare_finite(method, a, b, options)
             may_be_noise = method in NOT_FOR_NOISE and result.verdict is Verdict.DIFFERENT
             if may_be_noise and pixel_statistics.differ_like_noise(a.pixels, b.pixels):
                 result = replace(result, reason=f"{result.reason}; {OTHER_NOISE}")
@@ -252,7 +252,7 @@ def _finite_pair(reference: Image, test: Image) -> tuple[Image, Image]:
     return replace(reference, pixels=a), replace(test, pixels=b, channels=reference.channels)
 
 
-def _of_finite(method: str, a: Image, b: Image, options: Options) -> Comparison:
+def _compare_finite(method: str, a: Image, b: Image, options: Options) -> Comparison:
     """Return the result of a method, and of `tolerance` for the channels that the method does not compare.
 
     INCONCLUSIVE if black would pass. Both images are finite and have the same channels in the same order.

@@ -93,7 +93,7 @@ def inflation(difference: Array, variance: Array, tile: int) -> Inflation:
 
     def variogram(y: int, x: int) -> float:
         """Return the mean squared difference of pixels that are y rows and x columns apart."""
-        one, two = _apart(scaled, y, x)
+        one, two = _pairs_apart(scaled, y, x)
         change = two - one
         return float(np.mean(np.square(change, out=change), dtype=np.float64))
 
@@ -105,7 +105,7 @@ def inflation(difference: Array, variance: Array, tile: int) -> Inflation:
     return Inflation(max(1.0, 1 + 2 * correlations), freedom)  # NEAR has one of the distances h and −h
 
 
-def _apart(values: Array, y: int, x: int) -> tuple[Array, Array]:
+def _pairs_apart(values: Array, y: int, x: int) -> tuple[Array, Array]:
     """Return the first and the second pixels of all pairs that are y rows and x columns apart, H × W × C each."""
     height, width = values.shape[:2]
     return values[: height - y, max(-x, 0) : width - max(x, 0)], values[y:, max(x, 0) : width - max(-x, 0)]
@@ -143,7 +143,7 @@ def _differs_like_noise(a: Array, b: Array, channels: int) -> bool:
         for feature in (below - above, right - left, both - around, both - np.median(both)):
             yield signs * np.sign(feature)
         for lag in FAR:
-            one, two = _apart(signs, *lag)
+            one, two = _pairs_apart(signs, *lag)
             yield one * two
 
     fair = (np.square(tiles) <= z2 * block_sum(np.abs(signs), WIDE)).all()

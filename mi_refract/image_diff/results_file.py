@@ -250,13 +250,13 @@ def read(path: str | Path, reference: Path | None = None, test: Path | None = No
         if entry.status not in FAILED:
             results.append(Result(entry.name, entry.status, None, None))
             continue
-        old_image = _moved(f"{where}.reference", entry.reference, before[0], now[0]) if entry.reference else None
-        new_image = _moved(f"{where}.test", entry.test, before[1], now[1]) if entry.test else None
+        old_image = _mapped_path(f"{where}.reference", entry.reference, before[0], now[0]) if entry.reference else None
+        new_image = _mapped_path(f"{where}.test", entry.test, before[1], now[1]) if entry.test else None
         without_target = entry.target == "."  # an invalid entry of the settings that matches no image
-        target = Path() if without_target else _moved(f"{where}.target", entry.target, before[0], now[0])
+        target = Path() if without_target else _mapped_path(f"{where}.target", entry.target, before[0], now[0])
         # If two files were compared, the variants are beside the reference.
         roots = (before[0].parent, now[0].parent) if entry.target == str(before[0]) else (before[0], now[0])
-        variants = tuple(_moved(f"{where}.variants", path, *roots) for path in entry.variants)
+        variants = tuple(_mapped_path(f"{where}.variants", path, *roots) for path in entry.variants)
         digests = None
         if entry.digests is not None:
             if len(entry.digests.variants) != len(variants):
@@ -272,7 +272,7 @@ def read(path: str | Path, reference: Path | None = None, test: Path | None = No
     return Results(*now, tuple(results))
 
 
-def _moved(where: str, text: str, before: Path, now: Path) -> Path:
+def _mapped_path(where: str, text: str, before: Path, now: Path) -> Path:
     """Return the path in the folder `now` instead of `before`.
 
     ValueError if it leads out of the folder, by `..` or by a link to a folder.

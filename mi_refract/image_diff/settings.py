@@ -318,14 +318,14 @@ def load(path: str | Path, command_line: Entry | None = None, max_values: int = 
     """
     path = Path(path)
     document = parse_toml(read_bytes(path, MOST), Document, str(path), infinite=True)
-    defaults = _values(document.defaults, DefaultsKeys, f"{path}: {DEFAULTS}")
+    defaults = _checked_values(document.defaults, DefaultsKeys, f"{path}: {DEFAULTS}")
     maps = tuple(_listed(defaults.pop("map", None)))
     rules = [Entry("", defaults, DEFAULTS), *([command_line] if command_line else [])]
     for number, table in enumerate(document.image):
         where = f"image[{number}]"
         name = convert({key: table[key] for key in table if key == "name"}, NameKey, f"{path}: {where}").name
         try:
-            values = _values(table, ImageKeys, f"{path}: {where}")
+            values = _checked_values(table, ImageKeys, f"{path}: {where}")
         except ValueError as error:
             rules.append(Entry(name, {}, where, error=str(error)))
             continue
@@ -345,14 +345,14 @@ def from_words(method: str, words: Sequence[str]) -> Entry:
         key, equals, value = word.partition("=")
         if not equals or key in table:
             raise ValueError(f"--set {word}; expected KEY=VALUE, each key once")
-        table[key] = _value(key, value)
+        table[key] = _parsed_value(key, value)
     if method != AUTO and "method" in table:
         raise ValueError(f"--set method={table['method']} with --method; expected one of them")
-    values = _values(table, Keys, "--set", method)
+    values = _checked_values(table, Keys, "--set", method)
     return Entry("", values if method == AUTO else {"method": method, **values}, COMMAND_LINE)
 
 
-def _value(key: str, text: str) -> Any:
+def _parsed_value(key: str, text: str) -> Any:
     """Parse a value of the command line: TOML in brackets, channels separated by commas, a number, a flag, or text."""
     if text[:1] in ("[", "{"):
         with contextlib.suppress(ValueError):  # a template also begins with a brace
@@ -367,14 +367,14 @@ def _value(key: str, text: str) -> Any:
     return {"true": True, "false": False}.get(text, text)
 
 
-def _values(table: dict[str, Any], kind: type[Keys], where: str, method: str | None = None) -> dict[str, Any]:
+def _checked_values(table: dict[str, Any], kind: type[Keys], where: str, method: str | None = None) -> dict[str, Any]:
     """Return the checked values of the keys that are set. Options are those of the method, or without one of any."""
     method = table.get("method", method)
     checked = convert(table, _struct(kind, kind.__name__, method if method in ACCEPTED else None), where, infinite=True)
     values = {key: getattr(checked, key) for key in table}
     if "channels" in values:
-        named = values["channels"]
-        values["channels"] = tuple(named.items()) if isinstance(named, dict) else tuple(zip(named, named, strict=True))
+        names = values["channels"]
+        values["channels"] = tuple(names.items()) if isinstance(names, dict) else tuple(zip(names, names, strict=True))
     return values
 
 

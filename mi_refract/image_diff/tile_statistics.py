@@ -174,7 +174,7 @@ class Evidence:
             level = compare_tiles(one, two, margin, inflations)
             if pixels:
                 p = pixels.p(one.area, np.square(level.allowed), max(inflations))
-                hollow = self._by_scatter(level, one, two, pixels, max(inflations).factor)
+                hollow = self._p_by_scatter(level, one, two, pixels, max(inflations).factor)
                 level = replace(level, of_pixels=np.where(level.silent, 1.0, np.nan_to_num(p, nan=0.0)), hollow=hollow)
             if self.one_sided:
                 level = replace(level, shown=self.one_sided.p(level, one.area, tile))
@@ -186,7 +186,7 @@ class Evidence:
                 inflations = max(inflations[0], one.inflation(margin)), max(inflations[1], two.inflation(margin))
 
     @staticmethod
-    def _by_scatter(level: Level, one: Side, two: Side, pixels: PixelSums, factor: float) -> Array:
+    def _p_by_scatter(level: Level, one: Side, two: Side, pixels: PixelSums, factor: float) -> Array:
         """Return the p-value of no difference of a tile beyond the margin, by the scatter of its pixels' differences d.
 
         It is 1 where Σd² is at least HOLLOW times the sum of the stated variances: there the pixels show that noise.

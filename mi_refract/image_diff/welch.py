@@ -113,7 +113,7 @@ def compare_renders(
     channels: Sequence[str] = reference[0].channels
     unit = "samples per pixel"
     if single:
-        channels, evidence = _of_estimates(*known, tile)
+        channels, evidence = _evidence(*known, tile)
         counts = known[0].spp, known[1].spp
     else:
         counts, unit = _checked_counts(reference, test, set_spp)
@@ -126,9 +126,9 @@ def compare_renders(
 
     verdict, reason = _verdict(tests, resolution, hidden)
     if tests.alarms or tests.differing.silent_far:
-        reason = f"{_worst(tests, reference[0], channels, tile)}; {reason}"
+        reason = f"{_worst_difference(tests, reference[0], channels, tile)}; {reason}"
     elif verdict is Verdict.INCONCLUSIVE:
-        reason += _deciding(counts, unit, tests.quieter(resolution, hidden))
+        reason += _deciding_samples(counts, unit, tests.quieter(resolution, hidden))
     finest, differing = levels[0], tests.differing
     share_name = f"share of the tiles whose noise hides a difference of {resolution:.2g}"
     metrics = (
@@ -194,7 +194,7 @@ def _identical(a: Image, b: Image) -> bool:
     return np.array_equal(a.pixels[some_rows], b.pixels[some_rows]) and np.array_equal(a.pixels, b.pixels)
 
 
-def _of_estimates(a: Estimate, b: Estimate, tile: int) -> tuple[list[str], Evidence]:
+def _evidence(a: Estimate, b: Estimate, tile: int) -> tuple[list[str], Evidence]:
     """Return the channels whose variance at least one side knows, and the evidence of these channels.
 
     If only one side knows the variance s² of a sample, that side gets the variance of both means, s² (1/n₁ + 1/n₂), and
@@ -267,7 +267,7 @@ def _percent(share: float) -> str:
     return f"{float(f'{100 * share:.2g}'):g} %"
 
 
-def _worst(tests: TileTests, image: Image, channels: Sequence[str], tile: int) -> str:
+def _worst_difference(tests: TileTests, image: Image, channels: Sequence[str], tile: int) -> str:
     """Return where the test image differs the most, and how: "1.8 % darker in R in the 16 × 16 pixels around …"."""
     kind, level_index, row, column, channel = tests.worst()
     level, side = tests.levels[level_index], tile * GROWTH**level_index
@@ -286,7 +286,7 @@ def _worst(tests: TileTests, image: Image, channels: Sequence[str], tile: int) -
     return f"{amount}{direction} in {name}, {values}, in {where}"
 
 
-def _deciding(counts: tuple[int, int], unit: str, quieter: float) -> str:
+def _deciding_samples(counts: tuple[int, int], unit: str, quieter: float) -> str:
     """Return how many samples or renders would multiply the noise's variance by `quieter`; "" if no number would.
 
     `counts`: n₁ and n₂. The smaller is increased until 1/n₁ + 1/n₂ is `quieter` times its present value. If it would

@@ -87,9 +87,9 @@ def exit_code(
     except SystemExit as error:
         if isinstance(error.code, int | None):
             return error.code or 0
-        return _failed(name, ValueError(error.code))
+        return _report(name, ValueError(error.code))
     except Exception as error:
-        return _failed(name, error)
+        return _report(name, error)
     return code
 
 
@@ -130,7 +130,7 @@ def _write_named(write: Callable[[Any, Any], int | None], stream: Any, name: str
         raise
 
 
-def _failed(name: str, error: BaseException) -> int:
+def _report(name: str, error: BaseException) -> int:
     """Print the error on stderr, if that can be written, and return the exit code MISUSE."""
     with contextlib.suppress(OSError, ValueError):
         print_traceback(error)

@@ -157,7 +157,7 @@ def read_parts(
                 return [replace(image, path=path) for image in read_parts(copy, max_values, first_only=first_only)]
             except ImageError as error:
                 raise ImageError(str(error).replace(str(copy), str(path))) from None
-    source, kind = _checked(path, max_values)
+    source, kind = _checked_source(path, max_values)
     images: list[Image] = []
     values = 0
     try:
@@ -168,7 +168,7 @@ def read_parts(
             if first_only:
                 break
         if not images:
-            raise ImageError(f"{path}: corrupt {kind} file: {_without(path, source.geterror()) or 'no image'}")
+            raise ImageError(f"{path}: corrupt {kind} file: {_without_path(path, source.geterror()) or 'no image'}")
         several = images[-1].part[0] > 0 or (first_only and source.seek_subimage(1, 0))
         with_levels = {image.part[0] for image in images if image.part[1]}
         if first_only and source.seek_subimage(0, 1):
@@ -186,7 +186,7 @@ def read_parts(
 
 def count_values(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> int:
     """Return width × height × channels of all images in a file, from their headers. Errors: those of `read_parts`."""
-    source, _ = _checked(Path(path), max_values)
+    source, _ = _checked_source(Path(path), max_values)
     try:
         specs = (source.spec() for _ in _parts(source))
         return sum(int(spec.width * spec.height * spec.nchannels) for spec in specs)
@@ -194,7 +194,7 @@ def count_values(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> 
         source.close()
 
 
-def _checked(path: Path, max_values: int) -> tuple[ImageInput, str]:
+def _checked_source(path: Path, max_values: int) -> tuple[ImageInput, str]:
     """Return OpenImageIO's reader of a file, and its kind for error messages. Errors: those of `read_parts`."""
     kind = path.suffix[1:].upper() or "image"
     try:
@@ -244,7 +244,7 @@ def _opened(path: Path, kind: str, max_values: int, max_bytes: int, option: str 
         finally:
             oiio.attribute("limits:imagesize_MB", before)
     if source is None:
-        message = _without(path, oiio.geterror())
+        message = _without_path(path, oiio.geterror())
         if "MB limit" in message:
             raise ImageError(f"{path}: {message}; expected up to {max_values} values{option}")
         raise ImageError(f"{path}: corrupt {kind} file: {message}")
@@ -308,13 +308,13 @@ def _image(
     if "ICCProfile" in metadata:
         metadata.pop(PNG_PROFILE, None)  # kept if OpenImageIO drops the profile because of errors in it
     types = [str(channel_type) for channel_type in (spec.channelformats or [spec.format] * spec.nchannels)]
-    if reason := _misread(format_name, set(types), metadata, spec.height):
+    if reason := _misread_reason(format_name, set(types), metadata, spec.height):
         raise ImageError(f"{path}: {reason}")
     runs = []  # consecutive channels that are read in the same type
     for read_as, channel_run in itertools.groupby(range(spec.nchannels), lambda i: WIDE.get(types[i], "float")):
         numbers = list(channel_run)
         pixels = source.read_image(*part, numbers[0], numbers[-1] + 1, read_as)
-        if message := _without(path, source.geterror()) or ("" if pixels is not None else "no pixels"):
+        if message := _without_path(path, source.geterror()) or ("" if pixels is not None else "no pixels"):
             raise ImageError(f"{path}: corrupt {kind} file: {message}")
         pixels = np.asarray(pixels).reshape(spec.height, spec.width, -1)
         if pixels.dtype.kind in "iu":  # integers of EXR files are identifiers and counts
@@ -326,7 +326,7 @@ def _image(
     return Image(path, pixels, channels, origin, metadata, display, str(spec.format), part=part)
 
 
-def _misread(format_name: str, types: set[str], metadata: Metadata, rows: int) -> str:
+def _misread_reason(format_name: str, types: set[str], metadata: Metadata, rows: int) -> str:
     """Return why OpenImageIO would return other numbers than those of the file; "" if it would not."""
     if types & {"uint64", "int64"}:
         return "integers of 64 bits; expected up to 32"
@@ -338,7 +338,7 @@ def _misread(format_name: str, types: set[str], metadata: Metadata, rows: int) -
     return f"colours in {space}, which OpenImageIO converts with loss; expected R, G, B" if space in CONVERTED else ""
 
 
-def _without(path: Path, message: str) -> str:
+def _without_path(path: Path, message: str) -> str:
     """Return OpenImageIO's message on one line, without the path that some of its readers add."""
     return one_line(message.replace(f"EXR Error ({path}): ", "").replace(str(path), path.name))
 

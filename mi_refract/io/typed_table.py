@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import msgspec
 
 T = TypeVar("T")
-_PLAIN = {  # msgspec's types in words
+_WORDS_OF_TYPES = {  # msgspec's types in words
     "str": "text",
     "float": "a number",
     "int": "a whole number",
@@ -25,7 +25,7 @@ _PLAIN = {  # msgspec's types in words
     "object": "a table { … }",
     "null": "nothing",
 }
-_TYPES = "`((?:{0})(?: [|] (?:{0}))*)`".format("|".join(_PLAIN))
+_TYPES = "`((?:{0})(?: [|] (?:{0}))*)`".format("|".join(_WORDS_OF_TYPES))
 
 
 def parse_toml(text: str | bytes, kind: type[T], where: str, *, infinite: bool = False) -> T:
@@ -35,11 +35,11 @@ def parse_toml(text: str | bytes, kind: type[T], where: str, *, infinite: bool =
     except RecursionError:
         raise ValueError(f"{where}: brackets nested too deeply; expected TOML") from None
     except ValueError as error:
-        raise ValueError(f"{where}: {error}{_line_in_doubt(text, str(error))}; expected TOML") from None
+        raise ValueError(f"{where}: {error}{_line_of_error(text, str(error))}; expected TOML") from None
     return convert(document, kind, where, infinite=infinite)
 
 
-def _line_in_doubt(text: str | bytes, error: str) -> str:
+def _line_of_error(text: str | bytes, error: str) -> str:
     """Return the line of an error of `tomllib`, with a hint if it has a frequent mistake; "" without a line number."""
     match = re.search(r"at line (\d+)", error)
     if not match:
@@ -70,17 +70,23 @@ def convert(value: Any, kind: type[T], where: str, *, infinite: bool = False) ->
         message = f"{message[0].lower()}{message[1:]}".replace("object contains unknown field", "unknown key")
         message = message.replace(r"matching regex '\\S'", "that is not blank").replace(" | null`", "`")
         if message.startswith("expected "):
-            message = re.sub(_TYPES, lambda types: " or ".join(map(_PLAIN.__getitem__, types[1].split(" | "))), message)
+            message = re.sub(_TYPES, _in_words, message)
             message = re.sub(r"(.*), got (\D+)", r"\2; \1", message)
             message = re.sub(r"^(a table .*a list \[ … \])", r"\1 of tables, [[…]] in TOML", message)
         if missing := re.fullmatch(r"object missing required field `(\w+)`", message):
             path = f"{path or '$'}.{missing[1]}"
-        if (missing or message.startswith(("unknown key", "invalid "))) and (names := _names(kind, value, path)):
-            message = f"{message}; expected {', '.join(names)}"
+        if missing or message.startswith(("unknown key", "invalid ")):
+            names = _accepted_names(kind, value, path)
+            message += f"; expected {', '.join(names)}" if names else ""
         raise ValueError(" ".join(f"{where}: {f'{key}: ' if key else ''}{message}".split())) from None
 
 
-def _names(kind: Any, value: Any, path: str) -> list[str]:
+def _in_words(types: re.Match[str]) -> str:
+    """Return the types of a message of msgspec in words: "a number or text" for `float | str`."""
+    return " or ".join(_WORDS_OF_TYPES[name] for name in types[1].split(" | "))
+
+
+def _accepted_names(kind: Any, value: Any, path: str) -> list[str]:
     """Return the names that msgspec accepts at a path: keys of a table, or words. Empty if unknown."""
     types = _alternatives(msgspec.inspect.type_info(kind))
     for index, name in re.findall(r"\[([^]]*)\]|\.([^.[]+)", path):

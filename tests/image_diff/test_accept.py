@@ -324,10 +324,10 @@ def test_unreadable_files_have_no_digest(folders, tmp_path, monkeypatch):
 
 def test_accept_asks_for_confirmation(run, pair, terminal):
     old, new = pair
-    before, asked = tree(old), []
-    terminal(asked.append)
+    before, questions = tree(old), []
+    terminal(questions.append)
     code, out, _ = run("accept", old, new)
-    assert (code, out.splitlines()[-1], asked) == (1, "nothing accepted", ["Accept 1 as the reference?"])
+    assert (code, out.splitlines()[-1], questions) == (1, "nothing accepted", ["Accept 1 as the reference?"])
     assert tree(old) == before
     terminal(lambda question: image(new / "louder.exr", value=0.1) is not None)
     code, out, err = run("accept", old, new)
