@@ -300,7 +300,7 @@ def examine(renders: Pixels, case: str, trials: int = TRIALS, null_pairs: int = 
     repeats = ((renders[[i]], through_a_file(renders[i])[None]) for i in range(len(renders)))
     rows += false_alarms(nulls, repeats, case, setting, independent=False)
     if not half:
-        why = "of fewer than four renders the noise is not known"
+        why = f"welch needs {RENDERS} or more of one image, whose spread is their noise"
         return [*rows, Row(STUDY, "renders", case, setting, reason=why)]
     return [*rows, Row(STUDY, "renders", case, setting, {"noise": noise(renders)})]
 
@@ -325,7 +325,8 @@ def table(rows: Sequence[Row]) -> list[tuple[str, ...]]:
 
 def summary(rows: Sequence[Row]) -> list[str]:
     """Return lines about the renders and the equal pairs, and which rows failed."""
-    others = [row for row in rows if row.values and row.subject not in DEFECTS]
-    lines = [f"{row.subject}: " + ", ".join(f"{name} {x:.3g}" for name, x in row.values.items()) for row in others]
+    others = {row.subject: row for row in rows if row.subject not in DEFECTS}
+    figures = {name: ", ".join(f"{key} {x:.3g}" for key, x in row.values.items()) for name, row in others.items()}
+    lines = [f"{name}: {figures[name] or row.reason}" for name, row in others.items()]
     broken = [f"{row.subject}: {', '.join(row.broken)}" for row in rows if row.verdict == "fail"]
     return [*lines, f"failed: {'; '.join(broken)}" if broken else "every defect that had to be seen was seen"]

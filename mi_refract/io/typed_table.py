@@ -7,6 +7,7 @@ Do not put a `pattern` for texts into a union with a list: msgspec 0.22 then fre
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import textwrap
@@ -152,7 +153,8 @@ def _keys(kind: type[msgspec.Struct], shared: type[msgspec.Struct] = msgspec.Str
         if isinstance(field_type, msgspec.inspect.Metadata):
             schema, field_type = field_type.extra_json_schema or {}, field_type.type
         value = list(field.default) if isinstance(field.default, tuple) else field.default
-        default = "" if value in (None, "", [], msgspec.NODEFAULT, msgspec.UNSET) else f"; default {value!r}"
+        unset = value in (None, "", [], msgspec.NODEFAULT, msgspec.UNSET)
+        default = "" if unset else f"; default {json.dumps(value).replace('Infinity', 'inf')}"
         keys.append((field.encode_name, _type_text(field_type), f"{schema.get('description', '')}{default}"))
     return [key for key in keys if key not in _keys(shared)]
 
@@ -173,5 +175,5 @@ def _type_text(kind: Any) -> str:
         return f"list of {_type_text(kind.item_type)}"
     if name == "Tuple":
         return f"[{', '.join(map(_type_text, kind.item_types))}]"
-    limits = [f"{sign} {value:g}" for key, sign in _LIMITS.items() if (value := getattr(kind, key, None)) is not None]
+    limits = [f"{sign} {value:.9g}" for key, sign in _LIMITS.items() if (value := getattr(kind, key, None)) is not None]
     return " ".join([_WORDS.get(name, "table"), ", ".join(limits)]).strip()
