@@ -77,7 +77,7 @@ def compact(value: float, digits: int = 3) -> str:
 
 
 def distinguishable(value: float, budget: float) -> tuple[str, str]:
-    """Return both as text, with enough digits to distinguish them if they differ."""
+    """Return both numbers as text, with enough digits to distinguish them if they differ."""
     for digits in range(3, 18):
         texts = compact(value, digits), compact(budget, digits)
         if texts[0] != texts[1] or value == budget:
@@ -86,6 +86,6 @@ def distinguishable(value: float, budget: float) -> tuple[str, str]:
 
 
 def beside_bound(value: float, bound: float) -> tuple[str, str]:
-    """Return both as text, distinguishable, the bound after ≤ or >, or after ≰ if the value is NaN."""
+    """Return both numbers as text, distinguishable, the bound after ≤ or >, or after ≰ if the value is NaN."""
     text, limit = distinguishable(value, bound)
     return text, f"{'≤' if value <= bound else '>' if value > bound else '≰'} {limit}"

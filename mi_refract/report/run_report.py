@@ -69,7 +69,7 @@ def write_junit(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any
 
 
 def summary(rows: Sequence[Row], context: Mapping[str, Any] | None = None) -> RenderableType:
-    """Return for rich's console: the answers of the context's `first_page`, the broken budgets, and the verdict."""
+    """Return the answers of the context's `first_page`, the broken budgets and the verdict, for rich's console."""
     from rich.console import Group
     from rich.padding import Padding
     from rich.text import Text
@@ -87,7 +87,7 @@ def summary(rows: Sequence[Row], context: Mapping[str, Any] | None = None) -> Re
 
 
 def goals_table(rows: Sequence[Row]) -> RenderableType:
-    """Return for rich's console: every measured goal, missed ones first, or a line that says there are none."""
+    """Return every measured goal, missed ones first, or a line that says there are none, for rich's console."""
     from rich.text import Text
 
     goals = [(row, metric) for row in rows if row.values for metric in row.goals]
