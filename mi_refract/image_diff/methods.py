@@ -142,7 +142,7 @@ def choice(reference: Sequence[Image], test: Sequence[Image], *, spp: bool = Fal
         name, other_name = ("reference", "new image") if known[0] else ("new image", "reference")
         is_own_render = not with_variance.variances and channels.SPP in with_variance.metadata
         if is_own_render and not spp and channels.SPP not in without.metadata:
-            return "tolerance", f"of the {other_name} neither variance nor samples per pixel are known"
+            return "tolerance", f"the {other_name} has neither a variance nor samples per pixel"
         return "welch", f"the variance of the {name} is known"
     return "tolerance", ""
 
