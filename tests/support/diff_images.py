@@ -14,19 +14,19 @@ SIZE = (32, 48, 3)
 
 
 def of(pixels, channels=None, **rest):
-    """An image in memory, of R, G, B, or of Y where there is one channel."""
+    """An image in memory with the channels R, G, B, or Y for a single channel."""
     pixels = np.asarray(pixels, np.float32)
     names = ("Y",) if pixels.shape[-1] == 1 else tuple("RGBA"[: pixels.shape[-1]])
     return Image(Path("a.exr"), pixels, channels or names, **rest)
 
 
-def metric(found, begin):
-    """The value of the metric whose name begins so."""
-    return next(each.value for each in found.metrics if each.name.startswith(begin))
+def metric(comparison, prefix):
+    """The value of the metric whose name has this prefix."""
+    return next(metric.value for metric in comparison.metrics if metric.name.startswith(prefix))
 
 
 def image(path, seed=0, *, gain=1.0, noise=0.0, shape=SIZE, value=None, channels=("R", "G", "B")):
-    """An image written to `path`: the same smooth one for every seed, but for `noise` (σ over mean). Its pixels."""
+    """Write an image to `path` and return its pixels: smooth, with `noise` (σ over mean) that depends on the seed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     x = np.linspace(0.2, 1.0, shape[1])[None, :, None] * np.ones(shape)
     pixels = gain * x * (1 + noise * np.random.default_rng(seed).standard_normal(shape))
@@ -37,14 +37,14 @@ def image(path, seed=0, *, gain=1.0, noise=0.0, shape=SIZE, value=None, channels
 
 
 def samples(folder, count=6, first=0, **how):
-    """Independent renders of that image in a folder."""
+    """Write independent renders of that image to a folder."""
     for i in range(count):
         image(folder / f"{i}.exr", first + i, **{"noise": 0.1, **how})
     return folder
 
 
 def cut(path, keep):
-    """Keep so many bytes of a file (negative: all but so many), or that share of them."""
+    """Keep so many bytes of a file (negative: remove so many at the end), or a share of them."""
     data = path.read_bytes()
     path.write_bytes(data[: keep if isinstance(keep, int) else int(keep * len(data))])
 
@@ -66,23 +66,23 @@ BROKEN = {
 
 
 def tree(folder):
-    """Every file with what it holds."""
+    """The content of every file in a folder, by relative path."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def found(results):
-    """Status and category by name."""
+def outcomes(results):
+    """Status and category of each image by name."""
     return {result.name: (str(result.status), str(result.category)) for result in results.results}
 
 
-# Files that OpenImageIO does not write --------------------------------------------------------------------------------
+# Files that OpenImageIO cannot write ----------------------------------------------------------------------------------
 
 
 TIFF_TYPES = {1: "B", 2: "B", 3: "H", 4: "I", 5: "I", 7: "B", 12: "d"}
 
 
 def tiff(path, pixels, tags=None):
-    """An uncompressed TIFF of H × W × C pixels of any type; `tags`: more of them, or others, as (type, values)."""
+    """Write an uncompressed TIFF of H × W × C pixels of any type; `tags`: added or replaced tags, as (type, values)."""
     height, width, count = pixels.shape
     kind, data = {"u": 1, "i": 2, "f": 3}[pixels.dtype.kind], pixels.tobytes()
     entries = {256: (4, [width]), 257: (4, [height]), 258: (3, [8 * pixels.itemsize] * count), 259: (3, [1])}
@@ -104,7 +104,7 @@ def tiff(path, pixels, tags=None):
 
 
 def exr_of_integers(path, pixels, channels):
-    """An EXR of uint32: one of float32 whose header is changed."""
+    """Write an EXR of uint32, by changing the header of one of float32."""
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "float")
     spec.channelnames = channels
     spec.attribute("compression", "none")

@@ -49,7 +49,7 @@ def absent(system: System) -> str:
     try:
         if install and install.apt:
             ended = process_group.run([install.program, "--version"], b"", _ASKING, keep_stderr=True)
-            present = install.version in (ended.out + ended.said).decode(errors="replace")
+            present = install.version in (ended.out + ended.err).decode(errors="replace")
         elif install:
             present = json.loads((folder(system) / "installed.json").read_text()) == _mark(system)
     except (OSError, ValueError, TimeoutError, TooMuchOutputError):
@@ -178,7 +178,7 @@ def run(command: Sequence[str], given: str = "", timeout: float | None = None, w
         raise Broken(str(error)) from None
     except OSError as error:
         raise Broken(f"{command[0]}: {error.strerror}") from None
-    lines = [line.strip() for line in ended.said.decode(errors="replace").splitlines() if line.strip()]
+    lines = [line.strip() for line in ended.err.decode(errors="replace").splitlines() if line.strip()]
     last = lines[-1] if lines else "no word on stderr"  # which names the error
     if ended.status == CANNOT:
         raise Unable(last)
