@@ -62,7 +62,7 @@ def test_tasks_have_different_names_and_those_that_time_something_say_so(variant
         assert {task.name for task in tasks if not task.timed and reached(task.run) & CLOCKS} == set()
         assert any(reached(task.run) & CLOCKS for task in tasks if task.timed)
     twice = Study("s", "", "", {}, lambda context: [Task("a", list), Task("a", list)])
-    with pytest.raises(ValueError, match="two tasks are called 'a'; expected different names"):
+    with pytest.raises(ValueError, match="two tasks have the name 'a'; expected unique names"):
         runner.tasks([twice], here("quick", Path(), variant))
 
 
