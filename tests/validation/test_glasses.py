@@ -24,7 +24,7 @@ SOME = ("SCHOTT:N-BK7", "SCHOTT:F2", "SUMITA:K-BK7")
 
 @pytest.fixture
 def rays():
-    return glasses.given(SOME)
+    return glasses.rays_for(SOME)
 
 
 def of_f2(rays):
@@ -164,7 +164,7 @@ def traced(given=None, own=None, indices=None):
     ours, known = lenses.planar()
     given = ours if given is None else given
     rays = {lenses.GIVEN: given, lenses.OWN: given if own is None else own}
-    return lenses.answered("A", lenses.Answer("A 1.0", known if indices is None else indices, rays))
+    return lenses.answer_rows("A", lenses.Answer("A 1.0", known if indices is None else indices, rays))
 
 
 def test_another_trace_is_no_other_index_and_another_index_no_other_trace():

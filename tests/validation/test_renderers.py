@@ -72,9 +72,9 @@ def few(monkeypatch):
     """Sets of forty rays, of those that other systems are asked."""
     smaller = {name: dataclasses.replace(kind, count=40) for name, kind in per_ray.SETS.items()}
     monkeypatch.setattr(per_ray, "SETS", smaller)
-    per_ray.given.cache_clear()
+    per_ray.all_rays.cache_clear()
     yield
-    per_ray.given.cache_clear()
+    per_ray.all_rays.cache_clear()
 
 
 @pytest.fixture
@@ -98,7 +98,7 @@ def test_right_answers_pass_and_a_small_error_of_the_normal_fails(rows_of):
     assert [(row.case, row.verdict) for row in rows] == [(name, "pass") for name in per_ray.SETS]
     assert all(row.reason == "a program 1.0; total internal reflection: zero" for row in rows)
     assert all("worst rad" in row.values for row in rows if row.case != TOTAL)
-    rays = per_ray.given("f64")
+    rays = per_ray.all_rays("f64")
     exact = oracle.refract(rays.rays.a, rays.rays.n, rays.rays.k, fresnel=False, progress=False)
     through = {name: exact.transmitted[rays.regime == name].mean() for name in per_ray.SETS}
     assert (through["grazing"], through[TOTAL]) == (1, 0) and through["near-critical"] > 0.9
@@ -126,7 +126,7 @@ def test_the_random_rays_are_those_of_before_any_result(precision):
     cosine, k = rng.uniform(0, 1, count), 1.5 ** rng.choice([-1.0, 1.0], count)
     across = np.cross(n.astype(float), rng.normal(size=n.shape))
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    rays = per_ray.given(precision)
+    rays = per_ray.all_rays(precision)
     rays = rays.rays[rays.regime == per_ray.RANDOM]
     behind = (rays.a * n).sum(1, keepdims=True) > 0  # there the normal is turned: all face the ray
     np.testing.assert_array_equal(rays.n, np.where(behind, -n, n))
@@ -169,8 +169,8 @@ def test_what_a_system_gives_up_is_counted_and_recorded_errors_are_goals_on_both
     for value in (1e-2, 1e-30):
         rows = [row for row in rows_of(recorded=dict.fromkeys(RECORDED, value)) if row.case in RECORDED]
         assert all(row.missed == {per_ray.OFF_RECORDED: limits.RECORDED} and row.verdict == "pass" for row in rows)
-    assert [per_ray.off(x, 2, 4) for x in (1, 2, 3, 4, 8)] == [2, 1, 1, 1, 2]
-    assert per_ray.off(0, 2, 4) == np.inf and np.isnan(per_ray.off(np.nan, 2, 4))
+    assert [per_ray.off_recorded(x, 2, 4) for x in (1, 2, 3, 4, 8)] == [2, 1, 1, 1, 2]
+    assert per_ray.off_recorded(0, 2, 4) == np.inf and np.isnan(per_ray.off_recorded(np.nan, 2, 4))
 
 
 def test_every_recorded_error_of_mitsuba_is_a_goal():
@@ -186,7 +186,7 @@ def test_what_is_absent_large_or_cannot_run_here_is_not_run_and_programs_run_wit
     assert (row.verdict, row.reason) == ("not run", "cannot run here: no driver")
     monkeypatch.setenv("PYTHONPATH", str(SCRIPTS))
     asked = "import os, sys; print(os.environ.get('PYTHONPATH'), sys.stdin.read())"
-    assert environments.run([sys.executable, "-c", asked], given="rays") == "None rays\n"
+    assert environments.run([sys.executable, "-c", asked], stdin="rays") == "None rays\n"
     with pytest.raises(environments.Unable, match="no no-such-program in PATH"):
         environments.ask(System("a", "A"), ("no-such-program",))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -220,11 +220,11 @@ def unscaled(a, n, k):
 
 # What is said of vectors of other lengths, as the answer to a ray `a` of the length l, and to a normal of that length.
 LENGTHS = {
-    "takes vectors of any length as they are": (
+    "uses vectors of any length without normalising them": (
         lambda a, n, k, length: unscaled(length * a, n, k),
         lambda a, n, k, length: unscaled(a, length * n, k),
     ),
-    "takes the index that a ray leaves from its speed 1/n, not from the medium": (
+    "derives the index of the medium that a ray leaves from its speed 1/n": (
         lambda a, n, k, length: unscaled(a, n, k / length),
     ),
 }

@@ -349,7 +349,7 @@ def test_an_index_of_a_catalogue_is_the_printed_one_and_another_or_none_is_seen(
 def test_images_means_have_students_bound_and_the_plates_are_closed_and_lit_from_behind():
     rng, number = np.random.default_rng(7), NUMBERS["slab without polarisation, n = 1.52, 60°"]
     means = rng.binomial(1 << 16, number.value, others.SEEDS) / (1 << 16)
-    value, bound = others.of_means(means)
+    value, bound = others.mean_and_bound(means)
     assert others.row(number, "x", "", value, bound, "").verdict == "pass" and bound < 0.01
     assert others.row(number, "x", "", value + 2 * bound, bound, "").broken == {"error / bound": 1.0}
     scene = others.plate_scene(NUMBERS["4 slabs without polarisation, n = 1.52, 0°"])
