@@ -52,6 +52,7 @@ BOW_ANGLE = limit(
 )
 FOCAL_DISTANCE = limit(5.4e-10, "relative: (h/R)² at h = 1e-3 and the smallest R = 43; aberration is tenths of that")
 FURNACE_CHANNEL = limit(3e-3, "relative, in each channel: the deviation from white that must be detected")
+PANE = limit(1e-3, "relative: one ray in 500 may pass between two faces at the edges of a pane")
 ABSORPTION_SEEN = limit(0.01, "relative: a difference of an image's mean from `volpath` that must be detected")
 SLAB_ABSORPTION = limit(2e-6, "relative: σ d up to 8 in float32, a path length off by 2u: 16u, and the exponential")
 DISPERSION_TIME = limit(1.25, "over the same scene with the index of the d line and as many samples")

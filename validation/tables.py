@@ -30,7 +30,7 @@ from validation.ground_truth import standard_numbers
 from validation.planar import against_retrace
 from validation.planar import times as planar_times
 from validation.reference.standard_numbers import NUMBERS
-from validation.renders import against_dielectric, colours, gradients
+from validation.renders import against_dielectric, colours, gradients, thin_panes
 from validation.run import headline
 from validation.run import metrics as m
 from validation.run.array_settings import PLAIN
@@ -197,6 +197,19 @@ def renders(rows: list[Row]) -> str:
     text = _replay(measured, "{resolution}² pixels, {spp} spp, {seeds} seeds, {variant}.")
     cells = [[row.case, *_cells(row, columns, intervals=False)] for row in measured]
     return _table(text, ["scene", *columns.values()], cells, "scenes were rendered")
+
+
+def panes(rows: list[Row]) -> str:
+    """Return the error of the radiance of thin panes, by method."""
+    measured = _measured(rows, thin_panes.NAME)
+    methods = dict.fromkeys(row.subject for row in measured)
+    by_case = {(row.case, row.subject): row for row in measured}
+    lines = [
+        [case, *(_cells(by_case.get((case, method)), [thin_panes.OFF])[0] for method in methods)]
+        for case in dict.fromkeys(row.case for row in measured)
+    ]
+    text = _replay(measured, "Deviation of the mean radiance from 1. {spp} spp, {setting}.")
+    return _table(text, ["pane", *(f"`{method}`" for method in methods)], lines, "panes were rendered")
 
 
 def derivatives(rows: list[Row]) -> str:
@@ -477,6 +490,7 @@ TABLES = {
     "accuracy": Table("README.md", "directions", accuracy),
     "on a GPU": Table(f"{PAGES}/what-each-formula-costs.md", "directions", on_a_gpu),
     "renders": Table(f"{PAGES}/refract-and-dielectric.md", "renders", renders),
+    "panes": Table(f"{PAGES}/refract-and-dielectric.md", "renders", panes),
     "derivatives": Table(f"{PAGES}/which-derivatives-are-correct.md", "renders", derivatives),
     "paths": Table(f"{PAGES}/refract-and-dielectric.md", "stability", paths),
     "efficiency": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency", efficiency),

@@ -82,7 +82,8 @@ def refused_lamps(scene: Scene) -> str:
         bsdf_name(bsdf) == "LinearRetarder" for shape in all_shapes(scene) for bsdf in nested(shape.bsdf())
     ):
         return "a retarder"
-    return ""
+    unbounded = (x.class_name() for x in scene.shapes() if not math.isfinite(bounding_sphere(x).radius))
+    return next((f"the bounds of a {name} are not known" for name in unbounded), "")
 
 
 def refused_sensor(sensor: Sensor) -> str:
@@ -128,16 +129,13 @@ def targets(scene: Scene) -> list[Sphere]:
 
 
 def bounding_sphere(shape: Shape) -> Sphere:
-    """About the middle of its bounding box."""
+    """About the middle of its bounding box; with an infinite radius, or NaN, where its bounds are not known."""
     box = shape.bbox()
     if not box.valid():  # of rectangles that Mitsuba has merged into a mesh
         vertices, _ = mitsuba_mesh.arrays(shape)
         box = mi.ScalarBoundingBox3f(*([*map(float, ends(0))] for ends in (vertices.min, vertices.max)))
     half = [float(x) / 2 for x in box.extents()]
     radius = half[0] if shape.class_name() == "Sphere" else math.hypot(*half)
-    if not math.isfinite(radius):
-        text = f"refract_path: caustics = lamp: the bounds of a {shape.class_name()} are not known"
-        raise ValueError(f"{text}; expected caustics = path")
     return Sphere(tuple(map(float, box.center())), radius * MARGIN)
 
 
@@ -431,7 +429,7 @@ class LampTracer:
         weight = weight * (geometric * _quotient(dr.abs(si.wi.z), dr.abs(bs.wo.z)))
         if features.perturbed:
             bs.wo, weight = self._own_normal(si, bsdf, bs, weight, s.ray.d, numbers, key + 1, active_next)
-        ray = si.spawn_ray(si.to_world(bs.wo))
+        ray = loop.spawn_ray(si, bs)
         throughput = loop.times(weight, s.throughput)
         if features.dispersion:
             dispersed = (bs.sampled_type & DISPERSED) != 0

@@ -39,8 +39,8 @@ STRAY = 0.01  # of the crossings of a shape: more are a contradiction
 NEVER = 2**32 - 1  # as the number of a vertex
 FEW = 2  # crossings: of a shape with few of them, so many may be beside an edge, unless they are half of all
 # Of the distance from a surface to the origin of the next ray: a surface nearer to the first one than the rest is not
-# seen. The rounding of a point is a thousandth of that distance.
-SEARCHED = 1 - 1 / 64
+# seen. Rounding moves a point by up to an eighth of that distance (`ray_origins`).
+SEARCHED = 3 / 4
 # A null lobe is no boundary. What scatters on its way through is one as well.
 THROUGH = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DiffuseTransmission
 
@@ -95,7 +95,7 @@ class Crossings:
             if contradicts(crossed, stepped_over):
                 raise ValueError(
                     f"refract_path: {name} absorbs, and is so thin that rays miss one of its sides; expected a sheet "
-                    "thicker than 1e-4 of its largest coordinate: move the scene to the origin"
+                    "thicker than 1e-5 of its size and its largest coordinate: move the scene to the origin"
                 )
             if contradicts(crossed, wrong) and (worst is None or depth < first):
                 first, worst = depth, name

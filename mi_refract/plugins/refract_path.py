@@ -9,7 +9,7 @@
 | `split_depth` | integer | both lobes are followed at so many boundaries, counted from the camera (0) |
 | `split_weight` | number | a lobe whose share of the light would be smaller is not followed (0.01) |
 | `deterministic` | boolean | no lobe is chosen by chance; lobes with a share below `split_weight` are dropped (false) |
-| `caustics` | word | `path`, `lamp` or `auto`: how light through glass onto other surfaces is found (`path`) |
+| `caustics` | word | `path`, `lamp` or `auto`: how light through glass onto other surfaces is found (`auto`) |
 | `light_paths` | number | light paths for each sample of the camera, where lamps are traced (0.25) |
 | `camera_absorption` | number, spectrum | σ of the medium at the camera (0), as `int_absorption` of `refract` |
 | `camera_absorption_unit` | number | as `int_absorption_unit` of `refract` |
@@ -26,9 +26,12 @@ not at all where the lamp is a point, a spot or directional. `lamp` traces it fr
 camera sees directly, along `light_paths` paths for each sample of the camera (`lamp_tracing`). It pays where lamps are
 small; with lamps nearly as large as the scene error × time was up to 2.4 of that of `path`. It takes area, point, spot
 and directional lamps, and perspective, thin-lens and orthographic cameras. In scenes with media of Mitsuba's, in
-frozen functions, for derivatives and within another integrator it is an error, and `auto` means `path`: so with `auto`
-derivatives are those of the image by path tracing. What is missing is named in a warning, once a scene
-(`SceneFeatures.missing`).
+frozen functions, within another integrator and where a parameter of the scene is differentiated it is an error. `auto`
+means `lamp` where a lamp is a point, a spot or directional and lamps can be traced, else `path`: so derivatives are
+those of the image by path tracing. What is missing is named in a warning, once a scene (`SceneFeatures.missing`).
+
+Rays of delta lobes start nearer to the surface that they leave than those of `path` (`ray_origins`): glass may be as
+thin as 2e-6 of its size and its largest coordinate. A thinner shape is named in a warning (`SceneFeatures.thin`).
 
 Derivatives are attached: rays move with the index. Edges that move across a pixel, or in the view of a surface that is
 not smooth, are not in them. A render that is differentiated does not split.
@@ -50,7 +53,7 @@ from .index_parameter import warn_once
 from .medium_tracking import MediumTracker, ShapeMedia, check_media, extinction
 from .path_loop import PathFeatures, PathLoop
 from .sampling import KeyedMultijitter, SceneSampler, seeds_of
-from .scene_features import SceneFeatures, check_attributes, inspect
+from .scene_features import CAST, SceneFeatures, check_attributes, differentiated, inspect
 
 INTEGRATOR = "refract_path"
 MOST_PATHS = 4096  # that one sample may split into
@@ -77,7 +80,7 @@ def read_flag(props: Properties, name: str) -> bool:
 
 def read_caustics(props: Properties) -> tuple[str, float]:
     """`caustics` and `light_paths`. ValueError with what is expected."""
-    caustics, paths = props.get("caustics", "path"), props.get("light_paths", 0.25)
+    caustics, paths = props.get("caustics", "auto"), props.get("light_paths", 0.25)
     if caustics not in ("path", "lamp", "auto"):
         raise ValueError(f"{INTEGRATOR}: caustics = {caustics!r}; expected path, lamp or auto")
     if isinstance(paths, bool) or not isinstance(paths, (int, float)) or not 0 < paths <= 64:
@@ -128,6 +131,7 @@ def integrator_class(v: Variant) -> type:
             self.near: Any = None  # `to_camera` of the sensor of this render
             self.apart = False  # lamps are traced in the scene rendered last
             self.unconnected = ""  # why that sensor's lamps cannot be traced
+            self.untraced = ""  # why no lamps were traced in the scene rendered last, though `caustics` = `auto`
             self.loops: list[PathLoop] = []  # of this render: one a pass; in scalar variants one in all
 
         def begin_render(self, sensor: Sensor) -> None:
@@ -262,21 +266,25 @@ def integrator_class(v: Variant) -> type:
 
         def traces_lamps(self, scene: Scene, needs: SceneFeatures) -> bool:
             """Whether lamps are traced in this render. ValueError where `caustics` = `lamp` and they cannot be."""
+            self.untraced = ""
             if self.caustics == "path" or not (needs.lamps and needs.smooth and (needs.delta or needs.null)):
                 return False
-            symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
+            if self.caustics == "auto" and CAST not in needs.missing("path", self.max_depth):
+                return False
+            symbolic, frozen = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops), dr.flag(dr.JitFlag.FreezingScope)
             reasons = {
                 "another integrator calls it": not self.rendering,
-                "the render is differentiated": not symbolic,
-                "a frozen function": dr.flag(dr.JitFlag.FreezingScope),
+                "the render is differentiated": not symbolic or (not frozen and differentiated(scene)),
+                "a frozen function": frozen,
                 "the scene has media": needs.media,
                 f"a {needs.delta_perturbed} has delta lobes": bool(needs.delta_perturbed),
                 self.unconnected: bool(self.unconnected),
-                (lamps := lamp_tracing.refused_lamps(scene)): bool(lamps),
+                (lamps := "" if frozen else lamp_tracing.refused_lamps(scene)): bool(lamps),
             }
             reason = next((text for text, found in reasons.items() if found), "")
             if reason and self.caustics == "lamp":
                 raise ValueError(f"{INTEGRATOR}: caustics = lamp: {reason}; expected caustics = path")
+            self.untraced = reason
             return not reason
 
         def path_features(self, needs: SceneFeatures) -> PathFeatures:
@@ -312,6 +320,7 @@ def integrator_class(v: Variant) -> type:
                 null=needs.null,
                 caustics_apart=self.apart,
                 perturbed=needs.perturbed,
+                delta_extent=needs.delta_extent,
             )
 
         def scene_features(self, scene: Scene) -> SceneFeatures:
@@ -319,8 +328,12 @@ def integrator_class(v: Variant) -> type:
             before, self.needs = (self.needs, self.apart), (needs := inspect(scene))
             self.apart = self.traces_lamps(scene, needs)
             missing = needs.missing("lamp" if self.apart else "path", self.max_depth)
-            for path_class, text in missing.items() if (needs, self.apart) != before else ():
-                mi.Log(mi.LogLevel.Warn, f"{INTEGRATOR}: missing {path_class}: {text}")  # type: ignore[operator]
+            untraced = f"; its lamps are not traced: {self.untraced}" if self.untraced else ""
+            warnings = [f"missing {path_class}: {text}{untraced}" for path_class, text in missing.items()]
+            if needs.thin:
+                warnings.append(f"{needs.thin}; expected a thicker shape, or one nearer to the origin")
+            for text in warnings if (needs, self.apart) != before else ():
+                mi.Log(mi.LogLevel.Warn, f"{INTEGRATOR}: {text}")  # type: ignore[operator]
             if needs.textured:
                 check_attributes(scene)
             if needs.absorbing or needs.media:

@@ -271,6 +271,9 @@ class Pilot:
     def _candidates(self) -> list[Settings]:
         """In their order; only those that trace lamps where all else misses light."""
         node, features = integrator_node(self.parsed, {}), inspect(self.renderer.scene)
+        if self.own.get("caustics") == "auto":
+            scene = self.renderer.scene
+            self.own["caustics"] = scene.integrator().caustics_of(scene, scene.sensors()[0])
         best = self.own | {"sampler": next(filter(self._fits, (*SAMPLERS, self.own["sampler"])))}
         found = [self.own, best]
         fixed = node is None or any(

@@ -20,11 +20,11 @@ NAMES = {
     "sampler": "|".join(SAMPLERS),
     "integrator": "|".join(INTEGRATORS),
     "split_depth": "[0-9]|[1-5][0-9]|6[0-4]",  # up to 64, as `refract_path` has it
-    "caustics": "path|lamp",
+    "caustics": "path|lamp|auto",
 }
 _SHARED = ("sample_count", "seed")  # parameters of every sampler
 _TYPES = {"split_depth": "Integer", "caustics": "String"}  # of `refract_path`; `path` has neither
-DEFAULTS = {"split_depth": "0", "caustics": "path"}
+DEFAULTS = {"split_depth": "0", "caustics": "auto"}
 _OWN = (*_TYPES, "split_weight", "light_paths")  # parameters that `path` does not have
 Settings: TypeAlias = dict[str, str]  # by NAMES; {}: the scene's own
 

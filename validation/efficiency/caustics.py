@@ -74,7 +74,7 @@ TERMS = {
 }
 # Methods: integrator settings, and the BSDF of glass. `ptracer` stands for the sum of two integrators.
 BY_CLASS = Method("path + ptracer", "ptracer", DIELECTRIC)
-METHODS = (BUILTIN, Method(OURS, OURS, PLUGIN), FROM_LAMPS, BY_CLASS)
+METHODS = (BUILTIN, Method(OURS, OURS, PLUGIN, {"caustics": "path"}), FROM_LAMPS, BY_CLASS)
 HOLDING = FROM_LAMPS, BY_CLASS  # methods that render caustics of lamps of any size
 # Methods for the disk, whose image holds nothing but the caustic.
 ENERGY = replace(FROM_LAMPS, parameters={"caustics": "lamp", "light_paths": 4.0}), BY_CLASS

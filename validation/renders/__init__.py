@@ -12,5 +12,6 @@ __all__ = [
     "neighbours",
     "random_numbers",
     "rendering_passes",
+    "thin_panes",
     "unused_features",
 ]
