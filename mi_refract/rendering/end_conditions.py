@@ -54,19 +54,19 @@ def relative_error(sums: PassSums) -> RelativeError:
     colours = sums.mean[..., : sums.colours]
     known = np.isfinite(colours)
     mean = abs(float(colours[known].mean())) if known.any() else math.nan
-    found = np.asarray([each for each in sums.contrasts if math.isfinite(each)])
+    contrasts = np.asarray([each for each in sums.contrasts if math.isfinite(each)])
     if not mean > 0 or not sums.freedom:
         return RelativeError(math.nan)
-    squared, spread = float(found.mean()) if found.size else math.nan, math.nan
-    if at_most := not found.size and (variance := sums.variance) is not None:
+    squared, spread = float(contrasts.mean()) if contrasts.size else math.nan, math.nan
+    if at_most := not contrasts.size and (variance := sums.variance) is not None:
         known = np.isfinite(variance := variance[..., : sums.colours])
         squared = float(variance[known].mean())
-    if found.size > 1:
+    if contrasts.size > 1:
         with contextlib.suppress(ImportError):  # without SciPy, which is an extra, there is no interval
             from scipy.stats import t  # takes a second
 
-            quantile = float(t.ppf((1 + LEVEL) / 2, found.size - 1))
-            spread = quantile * float(found.std(ddof=1)) * math.sqrt(1 + 1 / found.size)
+            quantile = float(t.ppf((1 + LEVEL) / 2, contrasts.size - 1))
+            spread = quantile * float(contrasts.std(ddof=1)) * math.sqrt(1 + 1 / contrasts.size)
     value, low, high = (math.sqrt(max(x, 0) / sums.spp) / mean for x in (squared, squared - spread, squared + spread))
     return RelativeError(value, low, high, at_most)
 
