@@ -67,10 +67,10 @@ SAMPLE_MUELLER = limit(6, "errors of the radicand: one on each side of the bound
 
 # Stability -----------------------------------------------------------------------------------------------------
 
-# Where ln cos θ changes by x to first order, cos²θ changes by 2x of itself, and |1 − √(1 ± 2x)| ≤ 2x/(1 + √(1 − 2x)).
-# A form at the rounding limit is off by 1.005u a step, where a length has left 1, and by cos θ u/2 ≤ 0.02u for the
-# rounded k that scales the tangent: x ≤ 1.025 condition · u. That is a cosine off by 2 condition · u at most while
-# √(1 − 2x) ≥ 0.025, so while condition · u ≤ 0.487.
+# If ln cos θ changes by x to first order, cos²θ has the relative change 2x, and |1 − √(1 ± 2x)| ≤ 2x/(1 + √(1 − 2x)).
+# A form at the rounding limit has an error of 1.005u per step, since lengths differ from 1, and of cos θ u/2 ≤ 0.02u
+# for the rounded k that scales the tangent: x ≤ 1.025 condition · u. The cosine is then off by at most 2 condition · u
+# as long as √(1 − 2x) ≥ 0.025, that is for condition · u ≤ 0.487.
 MIRAGE = limit(2.0, "error of the cosine over condition · u, as long as condition · u ≤ FIRST_ORDER")
 FIRST_ORDER = limit(0.487, "condition · u up to which the bound of first order holds")
 LIGHT_PIPE = limit(

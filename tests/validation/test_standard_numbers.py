@@ -100,15 +100,15 @@ def test_the_glass_of_the_cie_is_its_polynomial_and_its_absorbance_is_the_least_
 
 
 def test_plates_are_the_sum_of_all_paths_and_clear_piles_obey_stokes_formula():
-    cases: list[dict[str, Any]] = [
+    piles: list[dict[str, Any]] = [
         {"n": 1.52, "incidence": 60.0},
         {"n": 1.52, "incidence": 70.0, "absorbance": 0.3},
         {"n": 1.7, "incidence": 45.0, "count": 3},
         {"n": 1.52, "incidence": 60.0, "together": True, "count": 2},
     ]
-    for given in cases:
-        passed, left = table.paths_through(150, **given)
-        assert passed.sum(0) == pytest.approx(table.polarised_plates(**given), abs=1e-13) and left.max() < 1e-13
+    for pile in piles:
+        passed, left = table.paths_through(150, **pile)
+        assert passed.sum(0) == pytest.approx(table.polarised_plates(**pile), abs=1e-13) and left.max() < 1e-13
     r, _ = table.reflectances(1.7, 45.0)
     assert table.polarised_plates(1.7, 45.0, 3) == pytest.approx((1 - r) / (1 + 5 * r), abs=1e-16)
     # If each boundary transmits the mean of both polarisations, less is transmitted, except at normal incidence.

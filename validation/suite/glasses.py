@@ -1,4 +1,4 @@
-"""Glasses by name and wavelength in lens designers' ray tracers: wrong indices are told from wrong directions.
+"""Glasses by name and wavelength in lens designers' ray tracers: are their indices and their directions right?
 
 Rays pass between glasses and air at six wavelengths; `mi-refract rays export --medium … --wavelengths …` writes such
 rays. A program looks up its own index for each medium and wavelength, refracts the ray, and returns the direction and

@@ -2,8 +2,8 @@
 
 The achromat is that of `scenes/planar/achromat.toml`, made of N-BK7 and F2, at its six wavelengths. The sequential
 traces of rayoptics and optiland (float64) and the planar trace of this package compute where rays close to the axis and
-at the edge cross the axis. Each is compared with a trace in 80 decimals for the indices that it used, so that an error
-of the trace is told from a different index. With the same indices, only rounding errors remain; the bound adds all of
+at the edge cross the axis. Each is compared with a trace in 80 decimals for the indices that it used, so that different
+indices do not count as errors of the trace. With the same indices, only rounding errors remain; the bound adds all of
 them at their worst, to first order. In a second case each system takes the glasses by name from its own catalogue, and
 the indices are compared as well.
 """

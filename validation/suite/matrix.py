@@ -127,7 +127,7 @@ def _text(row: Row | None) -> str:
 # wrong answer are last.
 
 MADE_BY = "python -m validation suite"
-Stored = dict[str, Any]  # a row of rows.json, or what is made of some
+Stored = dict[str, Any]  # a row of rows.json, or a summary of rows
 
 
 def read(folder: Path) -> Stored:
