@@ -8,7 +8,7 @@ s² is the mean of m independent contrasts between passes (`PassSums.contrasts`)
 one more quantity of their distribution. So with 95 % probability it lies within  s² ± t s_c √(1 + 1/m),  s_c their
 standard deviation, as far as passes are normally distributed: what no sample has met yet is in no estimate.
 
-Of a single pass there is no contrast, and s² is that of its samples, as if they were independent. Where the sampler
+A single pass has no contrast: there s² is that of its samples, as if they were independent. Where the sampler
 stratifies them their mean varies less, Var(x̄) ≤ s²/n for strata of equal probability (Cochran, Sampling Techniques,
 1977, 5.6), so this is an upper bound.
 """

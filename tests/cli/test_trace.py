@@ -198,7 +198,14 @@ def test_the_keys_of_a_scene_are_printed_without_one(run):
     code, out, err = run("trace", "--keys")
     assert (code, err) == (0, "")
     assert out == scene_file.reference() + "\n"
-    keys = "title", "wavelengths", "focal_length  from the front to the focus (number > 0)", "R1", "from", "scale"
+    keys = (
+        "title",
+        "wavelengths",
+        "focal_length  distance from the front to the focus (number > 0)",
+        "R1",
+        "from",
+        "scale",
+    )
     assert all(f"\n  {key} " in out or f"\n  {key}\n" in out for key in keys)
     assert '[[shape]] kind = "luneburg": ' in out and '[[beam]] kind = "fan": ' in out
     assert max(map(len, out.splitlines())) <= 80

@@ -281,7 +281,7 @@ def test_answers_to_the_rays_of_another_pack_are_rejected(pack, answers, run):
     text = (answers / "answers.csv").read_text()
     (answers / "answers.csv").write_text(f"# checksum: sha256:{'0' * 64}\n{text}")
     code, _, error = run("rays", "check", answers / "answers.csv", "--rays", "rays/f64.csv", "--json", "r.json")
-    assert (code, "the answers are to rays with the checksum" in error) == (2, True) and not Path("r.json").exists()
+    assert (code, "the answers belong to rays with the checksum" in error) == (2, True) and not Path("r.json").exists()
 
 
 # The command ----------------------------------------------------------------------------------------------------------
