@@ -19,21 +19,23 @@ app = typer.Typer(help="Write scenes for other renderers.", add_completion=False
 
 @app.command("list")
 def list_scenes() -> None:
-    """List the scenes of the package: those that `export` knows by their names, and files for `mi-refract trace`."""
+    """List the package's scenes: names for `mi-refract scene export`, and files for `mi-refract trace`."""
     print(printable(f"in {SCENES}:"))
     paths = [*sorted(SCENES.glob("*.xml")), *sorted(SCENES.glob("planar/*.toml"))]
     names = [path.stem if path.suffix == ".xml" else str(path.relative_to(SCENES)) for path in paths]
     for name, path in zip(names, paths, strict=True):
         pattern = r"<!--(.*?[.:])\s" if path.suffix == ".xml" else r'title = "(.*?)"'
-        said = re.search(pattern, path.read_text("utf-8"), re.DOTALL)
-        print(printable(f"{name:{max(map(len, names))}}  {' '.join(said[1].split()).rstrip('.:') if said else ''}"))
+        match = re.search(pattern, path.read_text("utf-8"), re.DOTALL)
+        title = " ".join(match[1].split()).rstrip(".:") if match else ""
+        print(printable(f"{name:{max(map(len, names))}}  {title}"))
 
 
 @app.command()
 def export(
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="A Mitsuba scene, or the name of one of `scene list`.")],
     to: Annotated[
-        str, typer.Option(metavar="TARGET", help="For cycles|luxcore|radiance|raysect|povray|mitsuba|obj+json|gltf.")
+        str,
+        typer.Option(metavar="TARGET", help="Format: cycles|luxcore|radiance|raysect|povray|mitsuba|obj+json|gltf."),
     ],
     output: Annotated[
         Path | None,
@@ -47,7 +49,7 @@ def export(
         typer.Option("-D", metavar="NAME=VALUE", help="Replace the value of a <default>; may be repeated."),
     ] = None,
 ) -> None:
-    """Write a Mitsuba scene as triangles for another renderer, with a README.txt that says how to render it."""
+    """Write a Mitsuba scene as triangles for another renderer, with instructions in README.txt."""
     defines = scene_files.parse_defines(define or [])
     activate("scalar_rgb")
     from mi_refract.scene_export import from_mitsuba, targets
@@ -60,5 +62,5 @@ def export(
     plain = from_mitsuba.load(path, level=from_mitsuba.LEVEL if level is None else level, **defines)
     written = targets.write(plain, to, folder)
     triangles = sum(len(mesh.faces) for mesh in plain.meshes)
-    done = f"{len(written)} files, {triangles} triangles; {folder / 'README.txt'} says how to render them"
-    print(printable(f"{folder}: {done}"))
+    summary = f"{len(written)} files, {triangles} triangles; {folder / 'README.txt'} says how to render them"
+    print(printable(f"{folder}: {summary}"))
