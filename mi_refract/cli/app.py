@@ -112,7 +112,7 @@ class Commands(TyperGroup):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return the command with that name, or None."""
         if cmd_name not in COMMANDS:
-            return None
+            raise ValueError(f"unknown command {cmd_name!r}; expected {', '.join(COMMANDS)}")
         entry = COMMANDS[cmd_name]
         command = getattr(importlib.import_module(f".{entry.module}", __package__), entry.attribute)
         if not isinstance(command, typer.Typer):

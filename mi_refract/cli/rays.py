@@ -16,7 +16,7 @@ from rich.table import Table
 
 from mi_refract.formulas import TEXTBOOK_BACKWARD
 from mi_refract.io import reference_pack
-from mi_refract.io.image_file import provenance
+from mi_refract.io.image_file import versions
 from mi_refract.io.safe_files import writable
 from mi_refract.io.text import printable
 from mi_refract.ray_sets import files, ray_set
@@ -104,7 +104,10 @@ def export(
     wavelengths: Wavelengths = None,
     regimes: Regimes = False,
 ) -> None:
-    """Write rays for another program: incident directions, normals and indices of refraction."""
+    """Write rays for another program.
+
+    A ray has an incident direction, a normal, and the indices of refraction of the media that it leaves and enters.
+    """
     writable(output, files.SUFFIXES)
     rays = _make_rays(regime, count, precision, seed, two_sided, medium, wavelengths)
     files.write(output, rays)
@@ -266,7 +269,7 @@ def _checker(
     def write_reports(checks: dict[str, Findings]) -> int:
         origin = reference_pack.origin(context.obj, pack)
         if report:
-            reports.write_html(report, checks, provenance(), origin.command)
+            reports.write_html(report, checks, versions(), origin.command)
         if junit:
             reports.write_junit(junit, checks)
         if json:
