@@ -110,7 +110,7 @@ class Commands(TyperGroup):
         return list(COMMANDS)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return the command with that name, or None."""
+        """Return the command with that name. ValueError for an unknown name."""
         if cmd_name not in COMMANDS:
             raise ValueError(f"unknown command {cmd_name!r}; expected {', '.join(COMMANDS)}")
         entry = COMMANDS[cmd_name]
