@@ -247,7 +247,7 @@ def _root(radicand: DoubleWord) -> Any:
 
 
 def _mueller(s2: Number, p2: Number, cross: tuple[Number, Number]) -> list[list[Number]]:
-    """From the powers of both waves and their interference a_p a_s*."""
+    """The Mueller matrix of the powers of both waves and their interference a_p a_s*."""
     mean, half, re, im = 0.5 * (s2 + p2), 0.5 * (s2 - p2), cross[0], cross[1]
     return [[mean, half, 0, 0], [half, mean, 0, 0], [0, 0, re, -im], [0, 0, im, re]]
 

@@ -55,7 +55,7 @@ def _difference(a: Pixels, b: Pixels) -> Pixels:
 
 @dataclass(frozen=True)
 class Changes:
-    """Of two arrays: the share of changed pixels, the largest change, the RMS change, the ratio of the means."""
+    """The share of changed pixels, the largest change, the RMS change and the ratio of the means of two arrays."""
 
     share: float
     largest: float

@@ -142,7 +142,7 @@ class LineSegments:
         return dr.maximum(ray.s, least), dr.maximum(ray.r, least)
 
     def none(self) -> Hit:
-        """No crossing, at distance ∞."""
+        """The hit that stands for no crossing, at distance ∞."""
         number, nowhere, way = self.arrays.number, self.arrays.index(NOWHERE), self.arrays.vector(0)
         left = self.arrays.mask(False)
         return Hit(number(dr.inf), nowhere, number(0), number(0), left, nowhere, nowhere, way, way, number(0))

@@ -72,8 +72,8 @@ LOBES = mi.BSDFFlags
 def refused_lamps(scene: Scene) -> str:
     """Why the lamps of a scene cannot be traced; "" where they can be."""
     lamps = [lamp for lamp in scene.emitters() if not lamp.is_environment()]
-    if found := {lamp.class_name() for lamp in lamps} - KINDS.keys():
-        return f"it traces area, point, spot and directional lamps, not {min(found)}"
+    if untraced := {lamp.class_name() for lamp in lamps} - KINDS.keys():
+        return f"it traces area, point, spot and directional lamps, not {min(untraced)}"
     shapes = [lamp.get_shape() for lamp in lamps if lamp.class_name() == "AreaLight"]
     if any(shape.is_mesh() and mitsuba_mesh.is_smooth(shape) for shape in shapes):
         return "the normals of an area lamp are not those of its faces"

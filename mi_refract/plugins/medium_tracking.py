@@ -6,7 +6,7 @@ medium between them, or the camera is in a medium that was not declared. `Crossi
 
 A ray starts a little beside the surface that it left. Next to an edge where three media meet it may miss a boundary,
 and be in a medium that is not there: one in 30,000 in a tumbler of water. So few are no contradiction. A sheet that is
-thinner than that distance, 1e-4 of the largest coordinate, is refused: a path would never leave it.
+thinner than that distance (`ray_origins`) is refused: a path would never leave it.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ def absorbs_only(v: Variant, medium: MediumPlugin) -> bool:
 def check_integrator(scene: Scene) -> None:
     """ValueError where a BSDF absorbs and the scene's integrator is neither `refract_path` nor calls only that.
 
-    As with that integrator also where a texture is an attribute that its shape does not have.
+    Also where the texture of a BSDF reads an attribute that its shape does not have.
     """
     check_attributes(scene)
 

@@ -220,10 +220,10 @@ def inspect(scene: Scene) -> SceneFeatures:
 
 
 def missing_light(scene: Scene) -> dict[str, str]:
-    """What the scene's integrator misses of it, as `SceneFeatures.missing`, and those that it calls.
+    """The light that the scene's integrator, and those that it calls, cannot find: as `SceneFeatures.missing`.
 
-    Only where they are `path`, `refract_path`, `prb`, `prb_projective`, `volpath`, `volpathmis` or `prbvolpath`: of
-    others nothing is known.
+    Known of `path`, `refract_path`, `prb`, `prb_projective`, `volpath`, `volpathmis` and `prbvolpath`; nothing is
+    returned for others.
     """
     features, integrators, missing = inspect(scene), [scene.integrator()], dict[str, str]()
     while integrators:
