@@ -146,7 +146,8 @@ class PassTree:
     def add(self, node: PassSums, level: int = 0) -> None:
         """Add a node of ARITY**level passes that follow those of the tree. The tree may change the node later."""
         if any(self.counts[:level]) or node.passes != ARITY**level:
-            raise ValueError(f"{node.passes} passes after {self.passes}; expected {ARITY**level}, where they begin")
+            expected = f"expected {ARITY**level} after a multiple of {ARITY**level}"
+            raise ValueError(f"{node.passes} passes after {self.passes}; {expected}")
         self.passes += node.passes
         while True:
             while len(self.levels) <= level:

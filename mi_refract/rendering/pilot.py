@@ -70,10 +70,10 @@ class Passes:
     """Passes of one candidate over some pixels. `means`: of each pass, channels × pixels × COPIES.
 
     `seconds`: time of one pixel in one pass, with its light paths. `fixed_seconds`: time that does not depend on the
-    number of pixels, with that of measuring the lamps. Only where lamps are traced: `lamp_variance` is the variance of
-    a pixel in the lamps' part of a pass, `lamp_light` the mean of that part, both over the image. `found`: light of
-    lamps that the candidate before has found by path tracing, as `means`, and the variance of each such mean if the
-    samples of a pass were independent.
+    number of pixels, with that of measuring the lamps. The others are set only if lamps are traced. `lamp_variance`:
+    variance of a pixel in the lamps' part of a pass; `lamp_light`: mean of that part; both over the image.
+    `found_light`: light of lamps that the candidate before has found by path tracing, as `means`, and the variance of
+    each such mean if the samples of a pass were independent.
     """
 
     means: Doubles
@@ -81,12 +81,12 @@ class Passes:
     lamp_variance: float | None = None
     lamp_light: float = 0.0
     fixed_seconds: float = 0.0
-    found: Doubles | None = None
+    found_light: Doubles | None = None
 
     def of(self, pixels: Any) -> Passes:
         """Return the same for some pixels only."""
-        found = None if self.found is None else self.found[:, :, pixels]
-        return replace(self, means=self.means[:, pixels], found=found)
+        found_light = None if self.found_light is None else self.found_light[:, :, pixels]
+        return replace(self, means=self.means[:, pixels], found_light=found_light)
 
     @property
     def total_seconds(self) -> float:
@@ -94,11 +94,11 @@ class Passes:
         return self.fixed_seconds + self.seconds * float(self.means[0].size)
 
     def __add__(self, other: Passes) -> Passes:  # noqa: D105
-        means, found = np.concatenate([self.means, other.means], 1), self.found
-        if found is not None and other.found is not None:
-            found = np.concatenate([found, other.found], 2)
+        means, found_light = np.concatenate([self.means, other.means], 1), self.found_light
+        if found_light is not None and other.found_light is not None:
+            found_light = np.concatenate([found_light, other.found_light], 2)
         seconds, fixed_seconds = min(self.seconds, other.seconds), self.fixed_seconds + other.fixed_seconds
-        return replace(self, means=means, found=found, seconds=seconds, fixed_seconds=fixed_seconds)
+        return replace(self, means=means, found_light=found_light, seconds=seconds, fixed_seconds=fixed_seconds)
 
 
 @dataclass(frozen=True)
@@ -123,14 +123,16 @@ class Ratio:
 
 def variances(passes: dict[str, Passes]) -> dict[str, float]:
     """Return σ² of each candidate; `passes`: of the candidates, in their order."""
-    values = {name: _variance(each.means) + (each.lamp_variance or 0.0) for name, each in passes.items()}
-    least, last = 0.0, [*passes][-1]
+    values = {name: _variance(measured.means) + (measured.lamp_variance or 0.0) for name, measured in passes.items()}
     names = [*passes][1:] if next(iter(passes)) == OWN else [*passes]
+    last = passes[[*passes][-1]]
+    least = 0.0
     for name in reversed([name for name in names if passes[name].lamp_variance is None]):
-        if not least and (found := passes[last].found) is not None:
-            values[name] = _variance(passes[last].means) + _found_variance(found[0], found[1], passes[last].lamp_light)
+        if not least and last.found_light is not None:
+            means, independent = last.found_light
+            values[name] = _variance(last.means) + _found_variance(means, independent, last.lamp_light)
         least = values[name] = max(values[name], least)
-    brightness = np.mean([each.means.mean() + each.lamp_light for each in passes.values()])
+    brightness = np.mean([measured.means.mean() + measured.lamp_light for measured in passes.values()])
     floor = (ROUNDING * brightness) ** 2 + np.finfo(np.float64).tiny
     return {name: value + floor for name, value in values.items()}
 
@@ -143,7 +145,7 @@ def _variance(means: Doubles) -> float:
 def _found_variance(means: Doubles, independent: Doubles, light: float) -> float:
     """Return σ²(x) of the light of lamps that path tracing has found.
 
-    `means`, `independent`: the two parts of `Passes.found`; `light`: μ, the mean of all such light.
+    `means`, `independent`: the two parts of `Passes.found_light`; `light`: μ, the mean of all such light.
     """
     mean, count = float(means.mean()), means[0].size
     variance = float(independent.mean()) if np.count_nonzero(means.any(0)) < FEW_FINDS else _variance(means)
@@ -208,7 +210,7 @@ def choose(pilot: Pilot) -> Choice:
     costs = plausible(ratios(first, last))
     least = min(cost.high for cost in costs.values())
     left = [name for name, cost in costs.items() if cost.low <= LOST * least]
-    if last in left[1:] and first[last].found is not None:  # `found` is measured with the candidate before
+    if last in left[1:] and first[last].found_light is not None:  # `found_light` is measured with the candidate before
         left = [name for name in first if name in {*left, before_last}]
     spent, seconds = sum(passes.total_seconds for passes in first.values()), [first[name].seconds for name in left]
     pixels = int((PLANNED * pilot.allowed(min(seconds)) - spent) / COPIES / sum(seconds))
@@ -341,11 +343,11 @@ class Pilot:
             return Passes(means, seconds, fixed_seconds=fixed_seconds)
         paths, lamps = integrator.light_paths * spp, self._lamps  # `paths` for each pixel
         fixed_seconds, self._lamp_seconds = fixed_seconds + self._lamp_seconds, 0.0
-        found = None
+        found_light = None
         if previous is not None and settings == self.candidates[-1] == self.candidates[-2] | CAUSTICS:
-            found = np.stack([(previous - values).mean(-1), (previous - values).var(-1, ddof=1) / spp])
+            found_light = np.stack([(previous - values).mean(-1), (previous - values).var(-1, ddof=1) / spp])
         variance = lamps.variance / (paths * math.prod(self.renderer.size))
-        return Passes(means, seconds + paths * lamps.seconds, variance, lamps.light, fixed_seconds, found)
+        return Passes(means, seconds + paths * lamps.seconds, variance, lamps.light, fixed_seconds, found_light)
 
     def allowed(self, seconds: float) -> float:
         """Return the seconds that the pilot may take; `seconds`: of a pixel in a pass."""
