@@ -44,7 +44,7 @@ from .scene_files import formulas_in, load_parsed, naming, parse_scene
 
 @dataclass(frozen=True)
 class Job:
-    """The scene file of a render, which uses the present variant and the scene's first sensor, and its options.
+    """What to render: a scene file, in the present variant, with the scene's first sensor.
 
     `defines`: values of the scene's `<default>`s. `allow_plugins`: names of plugins that the scene may contain, which
     are code. `settings`: replace those of the scene (see `render_settings`); AUTO: a pilot chooses them.

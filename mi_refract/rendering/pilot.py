@@ -46,10 +46,10 @@ from .render_settings import AUTO, DEFAULTS, OWN, SAMPLERS, Settings, integrator
 
 SHARE = 0.05  # largest share of the render's time that the pilot takes, unless the smallest batches take more
 PLANNED = 0.7  # share of the allowed time that is planned, because times are not known well
-OPEN_SAMPLES = 2**20  # size of the pilot where the render's number of samples is not known
+OPEN_SAMPLES = 2**20  # samples of the pilot if the render's number of samples is not known
 FIRST = 1 / 6  # share of the pilot's samples in the first batch, whose times determine the size of the second
 LEAST_PIXELS, LEAST_SPP = 32, 16  # of a batch
-MOST_SPP = 1 / 2048  # samples per pixel over the pilot's samples, at most; with more, there would be few pixels
+MOST_SPP = 1 / 2048  # largest share of the pilot's samples in one pass of a pixel, unless LEAST_SPP is more
 LARGEST, TIMED = 2**20, 2**18  # most samples of a batch, and of a batch whose time is measured on processors
 COPIES = 2  # passes of each pixel
 LIGHT_PATHS = 2**13  # that measure the light of lamps, at least
