@@ -14,7 +14,7 @@ The backward error, the least ε that takes n × w to 0, is the largest componen
 Near the critical angle it is small where the angle to the exact direction is not: there the last digit of an input
 moves the direction as far.
 
-Of a mirror direction k is 1, and n × w says little near grazing incidence, where b is nearly a. There b itself is
+For a mirror direction k is 1, and n × w says little near grazing incidence, where b is nearly a. There b itself is
 compared with m = a − 2 (n·a) n: δa moves m by up to ε in all directions, δn by 2ε in the plane of incidence and by
 2ε cos θ_i across it, so that
 
@@ -31,7 +31,7 @@ or |θ_i − asin(1/k)| / 2, where that is less: by turning a and n alone.
 The length of an answer has a backward error of its own. Its parts along the surface, e, and across it, √(1 − e²), may
 be those of different inputs, each within ε. Then e is off by ε (2 k cos θ_i + e) in either, so that
 
-    | |b|² − 1 | ≤ 4 ε e (2 k cos θ_i + e) ≤ 4 ε (2 k + 1)     with k = 1 of a mirror direction
+    | |b|² − 1 | ≤ 4 ε e (2 k cos θ_i + e) ≤ 4 ε (2 k + 1)     with k = 1 for a mirror direction
 
 Source: Higham, Accuracy and Stability of Numerical Algorithms, 2002, 1.5. In extended precision: n × w, of terms up to
 k, is off by 8·2⁻⁶⁴ k, and h ≥ k; b − m by as much, and h ≥ 1. So a backward error is right to 2⁻⁶¹, 2⁻⁸ u of float64.

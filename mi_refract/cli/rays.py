@@ -16,7 +16,7 @@ from rich.table import Table
 
 from mi_refract.formulas import TEXTBOOK_BACKWARD
 from mi_refract.io import reference_pack
-from mi_refract.io.image_file import provenance
+from mi_refract.io.image_file import versions
 from mi_refract.io.safe_files import writable
 from mi_refract.io.text import printable
 from mi_refract.ray_sets import files, ray_set
@@ -264,7 +264,7 @@ def _checker(
     def write(checks: dict[str, Findings]) -> int:
         origin = reference_pack.origin(context.obj, pack)
         if report:
-            reports.write_html(report, checks, provenance(), origin.command)
+            reports.write_html(report, checks, versions(), origin.command)
         if junit:
             reports.write_junit(junit, checks)
         if json:

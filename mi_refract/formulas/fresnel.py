@@ -146,7 +146,7 @@ def _with_slope(reflected: Number, through: Number, r: Number, t: Number, whole:
 def refracted_cosine(cos_i: Number, k: Number, contrast: Number = None) -> tuple[Any, Any]:
     """(|cos θ_t|, transmitted): √|cos²θ_t|, cos²θ_t = k² cos²θ_i − κ, which is positive where the ray is transmitted.
 
-    Under total internal reflection the cosine is imaginary; its modulus is returned. 0 ≤ cos_i ≤ 1. Of the exact
+    Under total internal reflection the cosine is imaginary; its modulus is returned. 0 ≤ cos_i ≤ 1. For the exact
     cos_i and k (or κ) both are right to the last bit, however near to the critical angle.
     """
     radicand, _ = _differences(cos_i, k, contrast)

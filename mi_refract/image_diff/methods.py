@@ -139,7 +139,7 @@ def choice(reference: Sequence[Image], test: Sequence[Image], *, spp: bool = Fal
         (one,), (two,) = (reference, test) if known[0] else (test, reference)
         name, other = ("reference", "new image") if known[0] else ("new image", "reference")
         if not one.variances and channels.SPP in one.metadata and not spp and channels.SPP not in two.metadata:
-            return "tolerance", f"of the {other} neither variance nor samples per pixel are known"
+            return "tolerance", f"the {other} has neither a variance nor samples per pixel"
         return "welch", f"the variance of the {name} is known"
     return "tolerance", ""
 

@@ -3,8 +3,8 @@
 A method for single images compares two renders with the same random numbers, one of them with a defect. A method for
 several renders compares clean renders with defective ones of other seeds. A defect is seen where the method calls the
 images different, or refuses to compare them; "inconclusive" counts as not seen. There is one row for each defect: the
-share of trials in which each method saw it. Of a file that cannot be read there is no such share: that is an error
-before any method is asked. Equal pairs have other seeds for a method that takes several renders, and other last bits
+share of trials in which each method saw it. A file that cannot be read has no such share: that is an error before
+any method is asked. Equal pairs have other seeds for a method that takes several renders, and other last bits
 for one that does not; `exact` sees those, and is given the same image twice.
 
 The row fails where a method misses a defect that it must see. Every method must see values that are not finite, another

@@ -357,12 +357,18 @@ def one_line(text: str) -> str:
     return " ".join(text.split())
 
 
-def provenance() -> dict[str, str]:
-    """Header attributes: `Software`, and `mi_refract:version:NAME` for mi_refract, mitsuba and drjit."""
+def versions() -> dict[str, str]:
+    """The versions of mi_refract, mitsuba and drjit; "unknown" of one that is not installed."""
     from mi_refract import __version__
 
-    versions = {"mi_refract": __version__} | {name: installed_version(name) for name in ("mitsuba", "drjit")}
-    return {"Software": f"mi_refract {__version__}"} | {f"mi_refract:version:{n}": v for n, v in versions.items()}
+    return {"mi_refract": __version__} | {name: installed_version(name) for name in ("mitsuba", "drjit")}
+
+
+def provenance() -> dict[str, str]:
+    """Header attributes: `Software`, and `mi_refract:version:NAME` for each of `versions`."""
+    software = versions()
+    header = {f"mi_refract:version:{name}": version for name, version in software.items()}
+    return {"Software": f"mi_refract {software['mi_refract']}"} | header
 
 
 def installed_version(distribution: str) -> str:

@@ -110,7 +110,7 @@ def _tabulated(kind: str, rows: Sequence[Sequence[float]]) -> Medium:
 
 
 def _refractiveindex_info(text: str) -> Medium:
-    """Formulas 1, 2, 3, 5 and 6 and tables; see "Dispersion formulas" there. Of several entries the first with n."""
+    """Formulas 1, 2, 3, 5 and 6 and tables; see "Dispersion formulas" there. The first entry with n counts."""
     try:
         import yaml
     except ModuleNotFoundError:

@@ -73,7 +73,6 @@ class SceneFeatures:
     only_glass: bool  # every BSDF has delta lobes only
     textured: bool  # a BSDF or a light may vary over its surface, or with its tangent
     null: bool  # some BSDF has a null lobe
-    perturbed: bool  # some BSDF may have a shading normal of its own
     dispersive: bool  # some BSDF refracts by wavelength
     absorbing: bool  # some BSDF has an absorbing medium on one side
     media: bool  # some shape, sensor or emitter has a medium of Mitsuba's
@@ -203,7 +202,6 @@ def inspect(scene: Scene) -> SceneFeatures:
         or not deltas <= WITHOUT_TANGENT
         or not {lamp.class_name() for lamp in lamps} <= PLAIN_LAMPS,
         null=everything or bool(flags & +lobes.Null),
-        perturbed=everything or bool(names & PERTURBING),
         dispersive=everything or any(getattr(bsdf, "dispersive", False) for bsdf in bsdfs),  # no plugin of Mitsuba's is
         absorbing=everything or any(getattr(bsdf, "absorbing", False) for bsdf in bsdfs),
         media=shape_media or any(end.get_medium() for end in (*emitters, *scene.sensors())),
@@ -251,9 +249,19 @@ def differentiated(scene: Scene) -> bool:
 
 
 def check_attributes(scene: Scene) -> None:
-    """ValueError where a texture of `refract` is an attribute that its shape does not have: Mitsuba takes it for 0."""
+    """ValueError for attributes of meshes that Mitsuba does not read right.
+
+    One that a texture of `refract` names and the shape does not have is 0 there. One that a lamp emits is read in the
+    first face wherever a point on the lamp is sampled.
+    """
     shapes = all_shapes(scene)
     for i, shape in enumerate(shapes):
+        lamp = shape.emitter()
+        if lamp is not None and lamp.sampling_weight() > 0 and (found := mesh_attributes(lamp)):
+            raise ValueError(
+                f"refract_path: {shape_name(shapes, i)} emits the attribute {found[0]!r} of its mesh, which Mitsuba "
+                "reads in one face only where it samples a lamp; expected a bitmap, or sampling_weight = 0"
+            )
         for bsdf in nested(shape.bsdf()):
             for name in mesh_attributes(bsdf) if bsdf_name(bsdf) == "Refract" else []:
                 if not dr.all(shape.has_attribute(name)):
@@ -263,9 +271,9 @@ def check_attributes(scene: Scene) -> None:
                     )
 
 
-def mesh_attributes(bsdf: BSDF) -> list[str]:
-    """The names of the attributes of meshes that its textures read."""
-    names, textures = list[str](), children(bsdf)
+def mesh_attributes(node: mi.Object) -> list[str]:
+    """The names of the attributes of meshes that the textures of a BSDF or a lamp read."""
+    names, textures = list[str](), children(node)
     while textures:
         texture = textures.pop()
         textures += children(texture)

@@ -123,7 +123,7 @@ def test_plugins_that_take_either_number_have_been_tried(name, bsdf, scalar_vari
     assert ("both_numbers" in facts(part={"type": "sphere", "bsdf": bsdf})) == both
 
 
-EVERYTHING = {"both_numbers", "smooth", "null", "textured", "dispersive", "absorbing", "perturbed"}
+EVERYTHING = {"both_numbers", "smooth", "null", "textured", "dispersive", "absorbing"}
 
 
 def test_what_is_not_known_needs_everything(scalar_variant):
