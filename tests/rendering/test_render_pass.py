@@ -64,7 +64,7 @@ IMAGES = [  # every kind of variant, filter and format
 
 @pytest.mark.parametrize(("variant", "rfilter", "pixel_format", "options"), IMAGES)
 def test_a_pass_is_mitsubas_image(tmp_path, needs_variant, variant, rfilter, pixel_format, options):
-    """Also with `refract_path`, which seeds its splits."""
+    """Also with `refract_path`, which seeds its splits, or passes would not be independent."""
     needs_variant(variant)
     mi.set_variant(variant)
     scene = scene_of(tmp_path, rfilter, pixel_format, **options)
