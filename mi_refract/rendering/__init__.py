@@ -1,9 +1,9 @@
-"""Renders Mitsuba scene files in passes into EXR files that hold their own noise: the work of `mi-refract render`.
+"""Rendering of Mitsuba scene files in passes into EXR files with per-channel variance, for `mi-refract render`.
 
-In: a scene file, values for its `<default>`s, what ends the render, a seed; Mitsuba's present variant. Out: an EXR file
-with the film's channels, the variance of each, and in its header all that is needed to render it again; meanwhile a
-checkpoint from which the same command goes on. The bits depend on none of: threads, order, interruptions,
-workers that are alike.
+Input: a scene file, values of its `<default>`s, limits of the render, a seed, and Mitsuba's present variant. Output: an
+EXR file with the film's channels, the variance of each, and a header with everything that is needed to render it again;
+until then a checkpoint, from which the same command resumes. The bits do not depend on the number of threads, the order
+of passes, interruptions, or which of several equal workers renders a pass.
 """
 
 __all__ = [

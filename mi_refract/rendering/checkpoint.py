@@ -1,8 +1,8 @@
 """The progress of a render, and its checkpoint: a file beside the output from which the same command resumes.
 
-The file begins with a SHA-256 of all the rest, which is written last and checked first. The rest is a line of JSON,
-what is rendered and how far, and the sums of every level of the tree of passes as float64. A resumed render has the
-same bits as one without interruption.
+The file contains, in this order: the SHA-256 of all that follows, which is written last and checked first; a line of
+JSON with the render's identity and progress; the sums of every level of the tree of passes as float64. A resumed render
+has the same bits as one without interruption.
 """
 
 from __future__ import annotations
@@ -29,22 +29,23 @@ from .render_settings import AUTO
 
 Identity = dict[str, Any]  # everything that the bits of a render depend on, by name
 FORMAT = 3
-_DIGEST = hashlib.sha256().digest_size  # at the start of the file, of all that follows
-_HEADER = 2**24  # bytes of its line, at most
-# Seconds from the state of one checkpoint to that of the next, unless a pass takes longer. A kill loses as many, and
-# those in which the next one is written.
+_DIGEST = hashlib.sha256().digest_size  # bytes at the start of the file
+_HEADER = 2**24  # bytes of the line of JSON, at most
+# Seconds from the state of one checkpoint to that of the next, unless a pass takes longer. A kill loses at most this
+# time and that of writing the next checkpoint.
 INTERVAL = 25.0
-# In an identity:
+# Names in an identity:
 PASS = "samples of a pass"  # a finished image may be refined with passes of another size
-SETTINGS, PILOT = "settings", "pilot"  # the settings, and where a pilot has chosen them its figures
+SETTINGS, PILOT = "settings", "pilot"  # the settings, and the figures of the pilot if one has chosen them
 
 
 @dataclass
 class Progress:
-    """What a render has: `base`, an older image that it refines, the `tree` of its passes, and `rest`.
+    """The passes that a render has finished.
 
-    `identity`: everything that the bits depend on. `rest`: the last pass, where it has fewer samples than the others.
-    `seconds`: of rendering; `machines`: where. `lock` is held where any of it changes or is written.
+    `identity`: everything that the bits depend on. `base`: sums of a finished image that the render refines. `tree`:
+    sums of the passes after it. `rest`: the last pass, if it has fewer samples than the others. `seconds`: time of
+    rendering. `machines`: where the passes were rendered. `lock` is held while any of these changes or is written.
     """
 
     identity: Identity
@@ -57,21 +58,21 @@ class Progress:
 
     @property
     def first(self) -> int:
-        """The number of the first pass of the tree: how many passes the base has."""
+        """The number of the first pass of the tree, which is the number of passes in the base."""
         return self.base.passes if self.base else 0
 
     @property
     def passes(self) -> int:
-        """Passes that are done, those of the base included."""
+        """Number of finished passes, including those of the base."""
         return self.first + self.tree.passes + (self.rest is not None)
 
     @property
     def done(self) -> int:
-        """Samples per pixel that are done."""
+        """Samples per pixel of all finished passes."""
         return sum(sums.spp for sums in (self.base, *self.tree.levels, self.rest) if sums is not None)
 
     def add(self, level: int, sums: PassSums, machines: str, seconds: float, *, rest: bool) -> None:
-        """Add a node of passes, rendered on `machines` ("a, b"); `rest`: it is the last pass, of fewer samples."""
+        """Add a node of passes, rendered on `machines` ("a, b"). `rest`: it is the last pass, of fewer samples."""
         with self.lock:
             if rest:
                 self.rest = sums
@@ -81,14 +82,14 @@ class Progress:
             self.machines.update(machines.split(", "))
 
     def rebase(self, pass_spp: int) -> None:
-        """Make all passes the base; those that follow have so many samples per pixel."""
+        """Move all passes to the base. The next passes have `pass_spp` samples per pixel each."""
         base = self.sums()
         with self.lock:
             self.base, self.tree, self.rest = base, PassTree(), None
             self.identity[PASS] = pass_spp
 
     def sums(self) -> PassSums | None:
-        """The sums of all passes, in memory of their own; None before the first pass."""
+        """Return the sums of all passes, which share no memory with this object; None before the first pass."""
         with self.lock:
             total = self.base.copy() if self.base else None
             for sums in (self.tree.sums(), self.rest):
@@ -100,15 +101,15 @@ class Progress:
 
 
 def path_of(output: Path) -> Path:
-    """The checkpoint of a render into this file."""
+    """Return the path of the checkpoint of a render into this file."""
     return output.with_name(f"{output.name}.checkpoint")
 
 
 def write(path: Path, progress: Progress) -> None:
-    """Replace the file, complete or not at all. OSError as the system raises it; the old file stays then."""
-    named = {"base": progress.base, "rest": progress.rest}
-    named |= {f"level{i}": sums for i, sums in enumerate(progress.tree.levels)}
-    nodes = {name: sums for name, sums in named.items() if sums is not None}
+    """Replace the file by a complete one. On an OSError the old file stays."""
+    all_nodes = {"base": progress.base, "rest": progress.rest}
+    all_nodes |= {f"level{i}": sums for i, sums in enumerate(progress.tree.levels)}
+    nodes = {name: sums for name, sums in all_nodes.items() if sums is not None}
     header = {
         "format": FORMAT,
         "identity": progress.identity,
@@ -133,32 +134,31 @@ def write(path: Path, progress: Progress) -> None:
 
 
 def read(path: Path, identity: Identity, shape: tuple[int, int, int]) -> Progress:
-    """The progress that a file holds, of an image of H × W × C.
+    """Return the progress in a checkpoint of an image of H × W × C.
 
-    CheckpointError for a damaged file, for one of a render of another identity, and for what is no file. OSError where
-    the file cannot be opened.
+    CheckpointError for a damaged file, for a render of another identity, and for a path that is no file. OSError if the
+    file cannot be opened.
     """
-    different = ""
     try:
         with opened(path, sys.maxsize) as file:
             digest = file.read(_DIGEST)
             if hashlib.file_digest(file, "sha256").digest() != digest:
-                raise ValueError("its digest is another")
+                raise ValueError("its digest does not match")
             file.seek(_DIGEST)
             header = json.loads(file.readline(_HEADER))
             if header["format"] != FORMAT:
                 raise ValueError(f"format {header['format']}")
-            different = changes(header["identity"], identity)
-            if not different:
+            differences = changes(header["identity"], identity)
+            if not differences:
                 return _progress(file, header, shape)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         text = f"{path}: damaged checkpoint ({type(error).__name__}: {error})"
         raise CheckpointError(f"{text}; pass --restart to start over") from None
-    raise CheckpointError(f"{path}: belongs to a different render: {different}; pass --restart to start over")
+    raise CheckpointError(f"{path}: belongs to a different render: {differences}; pass --restart to start over")
 
 
 def _progress(file: BufferedReader, header: dict[str, Any], shape: tuple[int, int, int]) -> Progress:
-    """What follows the header. ValueError where it is not what the header and the shape of the image say."""
+    """Read and return what follows the header. ValueError if it does not match the header or the image's shape."""
     identity, counts, nodes = header["identity"], header["counts"], header["nodes"]
     progress = Progress(identity, seconds=float(header["seconds"]), machines={str(name) for name in header["machines"]})
     size, pass_spp = os.fstat(file.fileno()).st_size, identity[PASS]
@@ -175,12 +175,12 @@ def _progress(file: BufferedReader, header: dict[str, Any], shape: tuple[int, in
 
     sums: dict[str, PassSums] = {}
     for name, (spp, passes, kinds) in nodes.items():
-        right = all(type(count) is int for count in (passes, spp, pass_spp)) and 1 <= passes <= spp
+        valid = all(type(count) is int for count in (passes, spp, pass_spp)) and 1 <= passes <= spp
         if name in expected:
-            right = passes == expected[name] and spp == passes * pass_spp
+            valid = passes == expected[name] and spp == passes * pass_spp
         elif name == "rest":
-            right = passes == 1 <= spp < pass_spp
-        if not right:
+            valid = passes == 1 <= spp < pass_spp
+        if not valid:
             raise ValueError(f"{name}: {passes} passes of {spp} samples per pixel")
         arrays = {kind: doubles(*shape[:2], 1 if kind == "weights" else shape[2]) for kind in ARRAYS if kind in kinds}
         contrasts = doubles(passes - 1).tolist()
@@ -195,9 +195,9 @@ def _progress(file: BufferedReader, header: dict[str, Any], shape: tuple[int, in
 
 
 def changes(before: Identity, now: Identity) -> str:
-    """What differs between two identities, but for the size of passes, by name; "" where nothing does.
+    """Return the differences between two identities, except the size of passes; "" if there are none.
 
-    Settings that a pilot has chosen are those that AUTO asks for.
+    AUTO equals settings that a pilot has chosen.
     """
     texts = []
     if now.get(SETTINGS) == AUTO and PILOT in before:
@@ -210,17 +210,17 @@ def changes(before: Identity, now: Identity) -> str:
 
 
 class CheckpointWriter:
-    """Writes a render's progress to its checkpoint, while `active`: as long as the render holds its output's lock."""
+    """Writes a render's progress to its checkpoint while `active`, which is as long as the render holds its lock."""
 
     def __init__(self, output: Path, progress: Progress, warnings: list[str]) -> None:
-        """A checkpoint that cannot be written is a warning."""
+        """`output`: of the render. `warnings`: receives a line whenever a checkpoint cannot be written."""
         self.path, self.progress, self.warnings = path_of(output), progress, warnings
         self.active, self.interval = False, INTERVAL
         self._last, self._passes_before = time.monotonic(), progress.passes
         self._thread: threading.Thread | None = None
 
     def write(self) -> None:
-        """Write what is new, if anything is."""
+        """Write the checkpoint if there are new passes."""
         with self.progress.lock:
             if not self.active or self.progress.passes == self._passes_before:
                 return
@@ -231,7 +231,7 @@ class CheckpointWriter:
                 self.warnings.append(f"{self.path}: checkpoint not written: {reason}; will be tried again")
 
     def write_when_due(self, took: float) -> None:
-        """Write beside the next pass, if the last checkpoint would be too old after it. `took`: seconds of a pass."""
+        """Write in a thread if the last checkpoint would be too old after the next pass. `took`: seconds of a pass."""
         self.wait()
         if time.monotonic() - self._last + took > self.interval:
             self._last = time.monotonic()

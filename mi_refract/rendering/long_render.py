@@ -1,7 +1,7 @@
-"""A render in passes, from where it was left until one of its limits is reached.
+"""A render in passes, which resumes from a checkpoint or a finished image and ends at the first limit that it reaches.
 
-`resume` loads the scene and what there is of its image; `LongRender.run` renders pass after pass, writes a checkpoint
-every 25 s, and looks at the error after 8, 12, 16, 24 … passes.
+`resume` loads the scene and the existing passes of its image. `LongRender.run` renders pass after pass, writes a
+checkpoint every 25 s, and estimates the error after 8, 12, 16, 24 … passes.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ from .scene_files import formulas_in, load_parsed, naming, parse_scene
 
 @dataclass(frozen=True)
 class Job:
-    """What is rendered: the scene in a file, in the present variant, with its first sensor.
+    """What to render: a scene file, in the present variant, with the scene's first sensor.
 
-    `defines`: values of its `<default>`s. `allow_plugins`: names of plugins that it may bring, which are code.
-    `settings`: what replaces its own (see `render_settings`), or AUTO: a pilot chooses them.
+    `defines`: values of the scene's `<default>`s. `allow_plugins`: names of plugins that the scene may contain, which
+    are code. `settings`: replace those of the scene (see `render_settings`); AUTO: a pilot chooses them.
     """
 
     scene: Path
@@ -57,18 +57,18 @@ class Job:
     settings: str = OWN
 
 
-# Where passes are rendered. Of first, stop, last, offset, spp: level, sums and machines ("a, b") of nodes that make up
-# the passes from `first` to `stop`, in their order. Passes up to `last` may be begun, which are probably asked for
-# next. `offset`: added to their numbers for their seeds. `spp`: samples per pixel of each.
+# Renders passes. Arguments: first, stop, last, offset, spp. Yields level, sums and machines ("a, b") of the nodes that
+# make up the passes from `first` to `stop`, in their order. It may begin passes up to `last`, which the next call will
+# probably request. `offset`: added to the number of a pass for its seed. `spp`: samples per pixel of each pass.
 Passes: TypeAlias = Callable[[int, int, int, int, int], Iterator[tuple[int, PassSums, str]]]
 
 
 def resume(
     job: Job, output: str | os.PathLike[str], limits: Limits | None = None, *, restart: bool = False
 ) -> LongRender:
-    """Load the scene, and the checkpoint or the finished image that the render continues; neither with `restart`.
+    """Load the scene, and without `restart` its checkpoint or finished image; return the render that continues it.
 
-    ValueError or OSError, one line, for everything that can be known before the first pass.
+    ValueError or OSError, one line, for every error that can be found before the first pass.
     """
     path, limits = writable(output, SUFFIXES), limits or Limits()
     if not 0 <= job.seed < 2**32:
@@ -87,48 +87,51 @@ def resume(
 
     identity, saved, image = _identity(job, parsed, renderer, settings), checkpoint.path_of(path), None
     progress = Progress(identity)
-    if kept := saved.exists() and not restart:
+    if has_checkpoint := saved.exists() and not restart:
         progress = checkpoint.read(saved, identity, (*renderer.size[::-1], len(renderer.channels)))
     elif not restart:
         image = rendered_file.read(path, renderer.channels, identity)
         progress = image or progress
-    began, piloted = time.monotonic(), progress.identity[SETTINGS] == AUTO
-    if piloted:
+    pilot_seconds, start = None, time.monotonic()
+    if progress.identity[SETTINGS] == AUTO:
         progress.identity |= _choose(job, parsed, renderer, None if limits.by_error else spp, limits)
-    pilot_seconds = time.monotonic() - began if piloted else None
+        pilot_seconds = time.monotonic() - start
     if chosen := parse_settings(progress.identity[SETTINGS]):
         parsed = with_settings(parsed, chosen)
         del scene, renderer
         gc.collect()  # as in `_choose`
         scene = load_parsed(parsed, job.allow_plugins)
         renderer = pass_renderer(scene, job.seed)
-    if kept and progress.rest is not None and (spp is None or progress.done < spp):
-        progress.rest = None  # it was the last pass, of fewer samples: a whole one takes its place
+    if has_checkpoint and progress.rest is not None and (spp is None or progress.done < spp):
+        progress.rest = None  # it was the last pass, with fewer samples: a full pass replaces it
     if image is not None and spp is not None and image.done > (_plan(renderer, spp, limits).total or 0):
         progress = Progress(progress.identity)
-    begun = progress.identity.get(PASS) if progress.tree.passes else None
-    if begun and limits.pass_spp not in (None, begun):
-        raise ValueError(f"{saved}: has passes of {begun} samples per pixel; expected --pass-spp {begun}, or --restart")
+    pass_spp = progress.identity.get(PASS) if progress.tree.passes else None
+    if pass_spp and limits.pass_spp not in (None, pass_spp):
+        expected = f"expected --pass-spp {pass_spp}, or --restart"
+        raise ValueError(f"{saved}: has passes of {pass_spp} samples per pixel; {expected}")
     base = progress.base.spp if progress.base else 0
-    plan = _plan(renderer, None if spp is None else max(0, spp - base), limits, begun)
-    # A sampler may have rounded the last pass up.
-    if kept and spp is not None and progress.done > (base + (plan.total or 0) if base < spp else spp):
-        more = f"expected --spp {progress.done} or more, or --restart"
-        raise ValueError(f"{saved}: already holds {progress.done} samples per pixel; {more}")
+    plan = _plan(renderer, None if spp is None else max(0, spp - base), limits, pass_spp)
+    planned = spp
+    if spp is not None and base < spp:
+        planned = base + (plan.total or 0)  # may be more than `spp`, where the sampler rounds the last pass up
+    if has_checkpoint and planned is not None and progress.done > planned:
+        expected = f"expected --spp {progress.done} or more, or --restart"
+        raise ValueError(f"{saved}: already holds {progress.done} samples per pixel; {expected}")
     progress.identity[PASS] = plan.spp
     return LongRender(job, path, limits, parsed, scene, renderer, spp, plan, progress, pilot_seconds)
 
 
 def _choose(job: Job, parsed: ParsedScene, renderer: PassRenderer, spp: int | None, limits: Limits) -> Identity:
-    """What a pilot adds to the identity. `spp`: samples per pixel, where that is known. Errors: those of `Pilot`."""
+    """Return what a pilot adds to the identity. `spp`: samples per pixel, None if unknown. Errors: those of `Pilot`."""
 
     def plan(rounded: Callable[[int], int]) -> PassPlan:
         return _plan(renderer, spp, limits, most=LANES, rounded=rounded)
 
-    gc.collect()  # Dr.Jit compiles every plugin that is alive
+    gc.collect()  # Dr.Jit compiles every plugin that exists
     try:
         choice = choose(Pilot(parsed, renderer, plan, limits.seconds))
-    except RuntimeError as error:  # Mitsuba's own
+    except RuntimeError as error:  # raised by Mitsuba
         raise ValueError(naming(job.scene, error)) from None
     return {SETTINGS: settings_text(choice.settings), PILOT: choice.figures}
 
@@ -137,25 +140,26 @@ def _plan(
     renderer: PassRenderer,
     total: int | None,
     limits: Limits,
-    begun: int | None = None,
+    pass_spp: int | None = None,
     most: int | None = None,
     rounded: Callable[[int], int] | None = None,
 ) -> PassPlan:
-    """The passes of `total` samples per pixel. `begun`: of each, where there are some already; `most`: else at most.
+    """Return the plan of `total` samples per pixel.
 
-    `rounded`: what a sampler makes of a number of samples, by default the scene's own.
+    `pass_spp`: samples per pixel of a pass, if passes exist; `most`: else, at most. `rounded`: rounds a number of
+    samples as a sampler does, by default the scene's own.
     """
     pixels = math.prod(renderer.size)
     if most is None:
         most = FIRST_LANES // pixels if limits.by_error else LANES
-    asked = begun or limits.pass_spp
-    return plan_passes(pixels, total, asked, rounded or renderer.rounded, moments=renderer.moments, most=most)
+    fixed = pass_spp or limits.pass_spp
+    return plan_passes(pixels, total, fixed, rounded or renderer.rounded, moments=renderer.moments, most=most)
 
 
 def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer, settings: str) -> Identity:
-    """Everything that the bits of a render depend on, by names for messages; but for PASS, which its plan says.
+    """Return everything that the bits of a render depend on, by name, except PASS, which the plan determines.
 
-    `parsed`, `renderer`: of the scene with its own settings.
+    `parsed`, `renderer`: the scene with its own settings. Error messages contain the names.
     """
     digest = hashlib.sha256(json.dumps(parsed.nodes).encode())
     for name, path in parsed.files(job.allow_plugins).items():
@@ -179,11 +183,11 @@ def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer, settings: s
 
 @dataclass
 class LongRender:
-    """A render in passes; made by `resume`.
+    """A render in passes; `resume` returns it.
 
-    `spp`: samples per pixel at the end, None where another limit ends it. `pilot_seconds`: of the pilot that `resume`
-    ran, None where it ran none. `ended_by`: that limit, in words. `warnings`: what went wrong without ending the
-    render.
+    `spp`: samples per pixel at the end, None if only another limit ends the render. `pilot_seconds`: time of the pilot
+    that `resume` ran, None if it ran none. `ended_by`: the limit that ended the render, in words. `warnings`: errors
+    that did not end the render.
     """
 
     job: Job
@@ -204,10 +208,11 @@ class LongRender:
         self._files_before = self._file_stamps()
 
     def run(self, watch: Callable[[LongRender], None] = lambda render: None, passes: Passes | None = None) -> Metadata:
-        """Render what is left and write the image; its header. `watch` is called after every node of passes.
+        """Render the passes that are left, write the image and return its header.
 
-        `passes`: where they are rendered, by default in this process. On any error what is done stays in the
-        checkpoint. BlockingIOError where another process renders into the same file, or did so since `resume`.
+        `watch`: called after every node of passes. `passes`: renders passes, by default in this process. On any error
+        the checkpoint keeps all finished passes. BlockingIOError if another process renders into the same file, or has
+        done so since `resume`.
         """
 
         def here(first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
@@ -224,7 +229,7 @@ class LongRender:
                 return self._run(passes or here, watch)
             except BaseException as error:
                 self.checkpoints.write()
-                if isinstance(error, RuntimeError):  # Mitsuba's own
+                if isinstance(error, RuntimeError):  # raised by Mitsuba
                     raise ValueError(naming(self.job.scene, error)) from None
                 raise
             finally:
@@ -237,19 +242,19 @@ class LongRender:
         while not (end := self.end()):
             self._fit_passes()
             tree, plan, first = progress.tree, self.plan, progress.first
-            # Passes up to the next look at the error; those up to the look after it may be begun meanwhile.
+            # Render up to the next estimate of the error; passes up to the estimate after it may be begun.
             done, rest = tree.passes, tree.passes == plan.full_passes
-            look = 1 if progress.passes == 0 and self.renderer.moments else next_stop(first + done) - first
+            stop = 1 if progress.passes == 0 and self.renderer.moments else next_stop(first + done) - first
             last = next_stop(next_stop(first + done)) - first
             if plan.full_passes is not None:
                 last = done + 1 if rest else plan.full_passes
-            before = time.monotonic()
+            node_start = time.monotonic()
             spp = plan.rest if rest else plan.spp
-            for level, sums, machines in nodes(done, min(look, last), last, first, spp):
-                took = time.monotonic() - before
+            for level, sums, machines in nodes(done, min(stop, last), last, first, spp):
+                took = time.monotonic() - node_start
                 sums.check((*self.renderer.size[::-1], len(self.renderer.channels)), ARITY**level, spp)
                 progress.add(level, sums, machines, took, rest=rest)
-                before = time.monotonic()
+                node_start = time.monotonic()
                 watch(self)
                 self.checkpoints.write_when_due(took)
                 if time.monotonic() >= deadline:
@@ -279,10 +284,10 @@ class LongRender:
         return header
 
     def end(self) -> str:
-        """What ends the render with what it has; "" where passes are left to render."""
+        """Return what ends the render now; "" if there are passes left to render."""
         progress, full = self.progress, self.plan.full_passes
         passes = progress.passes
-        if passes == 1 or _looked(passes):
+        if passes == 1 or _is_stop(passes):
             sums = progress.sums()
             assert sums is not None
             if reason := reached(self.limits, sums):
@@ -292,51 +297,51 @@ class LongRender:
                 finite = np.isfinite(colours).any()
                 problem = "the image is still black" if finite else "no pixel of the image is finite"
                 text = f"{self.output}: {problem}; --until cannot be evaluated"
-                if not finite and self.limits.seconds is None:  # and no pixel will be
+                if not finite and self.limits.seconds is None:  # pixels do not become finite
                     raise ValueError(f"{text}; expected --spp or --time")
                 self.warnings += [] if text in self.warnings else [text]
         missing = full is None or progress.tree.passes < full or (self.plan.rest and progress.rest is None)
         return "" if missing else f"{progress.done} spp"
 
     def _fit_passes(self) -> None:
-        """Where the error ends the render, have the passes up to the next look make as many samples as it needs.
+        """If the error ends the render, change the size of passes so that the next stop has as many samples as needed.
 
-        At least a third more than there are, else an estimate would be looked at often.
+        These are at least a third more than there are now, so that estimates stay few.
         """
         passes = self.progress.passes
-        if self.limits.pass_spp or not self.limits.by_error or not _looked(passes):
+        if self.limits.pass_spp or not self.limits.by_error or not _is_stop(passes):
             return
         sums = self.progress.sums()
         assert sums is not None
-        more = max(needed_spp(self.limits, sums) - sums.spp, sums.spp / 3) / (next_stop(passes) - passes)
+        most = max(needed_spp(self.limits, sums) - sums.spp, sums.spp / 3) / (next_stop(passes) - passes)
         left = None if self.spp is None else max(0, self.spp - sums.spp)
-        plan = _plan(self.renderer, left, self.limits, most=int(min(more, LANES)))
+        plan = _plan(self.renderer, left, self.limits, most=int(min(most, LANES)))
         if plan.spp != self.plan.spp:
             self.plan = plan
             self.progress.rebase(plan.spp)
 
     @property
     def missing(self) -> str:
-        """The light that the scene's integrator cannot find, by class of paths: `missing_light` in one line, or ""."""
+        """The light that the scene's integrator misses, by class of paths: `missing_light` in one line; "" for none."""
         return "; ".join(f"{path_class}: {text}" for path_class, text in missing_light(self.scene).items())
 
     @property
     def has_all_samples(self) -> bool:
-        """Whether it has as many samples per pixel as were asked for."""
+        """Whether the image has the requested number of samples per pixel."""
         return self.progress.done == self.spp
 
     def error(self) -> RelativeError | None:
-        """The present error; None before the first pass."""
+        """Return the present error; None before the first pass."""
         sums = self.progress.sums()
         return None if sums is None else relative_error(sums)
 
     def image(self) -> np.ndarray | None:
-        """The present image, H × W × channels; None before the first pass."""
+        """Return the present image, H × W × channels; None before the first pass."""
         sums = self.progress.sums()
         return None if sums is None else sums.mean
 
     def pilot_lines(self) -> list[str]:
-        """What a pilot has chosen, with figures if this command ran it, line by line; [] where there was none."""
+        """Return lines about the settings that a pilot chose, with figures if this command ran it; [] if none did."""
         settings, figures = (self.progress.identity.get(name) for name in (SETTINGS, PILOT))
         if figures is None:
             return []
@@ -346,26 +351,29 @@ class LongRender:
         return [*lines_of(figures), f"a pilot of {figures['seconds']:g} s has chosen {text}"]
 
     def give_up(self) -> None:
-        """Before a signal ends this process: write a checkpoint, say so on stderr, and remove the lock file."""
+        """Write a checkpoint, report it on stderr and remove the lock file, before a signal ends this process."""
         if not self.checkpoints.active:
             return
         before = len(self.warnings)
         self.checkpoints.write()
-        said = self.warnings[before:]
-        if not said and self.checkpoints.path.exists():
-            said = [f"{self.checkpoints.path}: {self.progress.done} spp; run the same command again to resume"]
-        for text in said:
-            os.write(2, f"\nmi-refract: {printable(text)}\n".encode(errors="replace"))
+        messages = self.warnings[before:]
+        if not messages and self.checkpoints.path.exists():
+            messages = [f"{self.checkpoints.path}: {self.progress.done} spp; run the same command again to resume"]
+        for message in messages:
+            os.write(2, f"\nmi-refract: {printable(message)}\n".encode(errors="replace"))
         lock_of(self.output).unlink(missing_ok=True)
 
     def _file_stamps(self) -> list[tuple[int, int] | None]:
-        """What changes when another render writes the image or the checkpoint."""
-        paths = (self.output, self.checkpoints.path)
-        return [(s.st_ino, s.st_mtime_ns) if path.exists() and (s := path.stat()) else None for path in paths]
+        """Return inode and time of the image and the checkpoint, which change when another render writes them."""
+        stamps: list[tuple[int, int] | None] = []
+        for path in (self.output, self.checkpoints.path):
+            status = path.stat() if path.exists() else None
+            stamps.append((status.st_ino, status.st_mtime_ns) if status else None)
+        return stamps
 
 
-def _looked(passes: int) -> bool:
-    """Whether the error is looked at after so many passes."""
+def _is_stop(passes: int) -> bool:
+    """Return whether the error is estimated after so many passes."""
     return passes > 0 and next_stop(passes - 1) == passes
 
 
@@ -381,16 +389,16 @@ def render_to_exr(
 ) -> Metadata:
     """Render a scene file from its first pass on, and return the header of the EXR file.
 
-    `defines`: values for the scene's `<default>`s. `spp`: samples per pixel; None: what the scene says.
-    `allow_plugins`: names of plugins that the scene may bring, which are code. `settings`: "auto", which measures what
-    suits the scene, or such as "sampler=multijitter,integrator=refract_path,split_depth=2". ValueError or OSError in
-    one line, before the rendering where possible; InterruptedError for a rendering that was cut short. No image is
-    written then, and what is done is kept in a checkpoint.
+    `defines`: values of the scene's `<default>`s. `spp`: samples per pixel; None: the scene's. `allow_plugins`: names
+    of plugins that the scene may contain, which are code. `settings`: replace those of the scene, for example
+    "sampler=multijitter,integrator=refract_path,split_depth=2"; "auto": a pilot measures which suit the scene.
+    ValueError or OSError in one line, before the rendering if possible; InterruptedError for a rendering that was cut
+    short. Then no image is written, and a checkpoint keeps all finished passes.
     """
     job = Job(Path(scene), dict(defines or {}), seed, allow_plugins, settings)
     return resume(job, output, Limits(spp=spp), restart=True).run()
 
 
 def lock_of(output: Path) -> Path:
-    """The lock of a render into this file."""
+    """Return the path of the lock file of a render into this file."""
     return output.with_name(f".{output.name}.lock")

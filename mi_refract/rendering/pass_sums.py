@@ -1,7 +1,7 @@
-"""Sums over passes in float64, in an order that depends on their numbers alone.
+"""Sums over passes in float64, in an order that depends only on the numbers of the passes.
 
-Passes are summed in a tree: each ARITY nodes in a row, from the first on, make one of the next level, and within it
-they are added from the left. Whoever adds which nodes where, the bits of the result are the same.
+Passes are summed in a tree: every ARITY consecutive nodes, from the first on, are added from left to right and make one
+node of the next level. So the bits of the result do not depend on where and when nodes are added.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from .pass_plan import FEW
 
 ARITY = 8
 ARRAYS = ("total", "between", "within", "weights")  # of `PassSums`
-_PIECE = 2**15  # values that are added at a time: what is needed of them stays in the cache
+_PIECE = 2**15  # values that are added at a time, so that they stay in the cache
 Doubles = NDArray[np.float64]
 
 
 @dataclass
 class PassSums:
-    """Sums over some passes in a row, H × W × C each. A pixel's mean is Σ w v / Σ w over the samples v that reach it.
+    """Sums over consecutive passes, H × W × C each. A pixel's mean is Σ w v / Σ w over the samples v that reach it.
 
-    `total`: Σ w v. `weights`: Σ w, H × W × 1, in units in which `spp` of it are expected; None: it is `spp`.
-    `between`: one less than passes, estimates of a sample's variance, summed: Σ nᵢ (xᵢ − x)² without weights.
-    `within`: Σ of (w (v − xᵢ))² over the samples of every pass, where xᵢ is the pass's mean; None where unknown, or
-    where FEW passes make it needless.
-    `contrasts`: these estimates once more, each as its mean over all pixels, in the first `colours` channels.
+    `total`: Σ w v. `weights`: Σ w, H × W × 1, in units in which `spp` is expected; None: `spp` in every pixel.
+    `between`: the sum of `passes` − 1 estimates of a sample's variance; Σ nᵢ (xᵢ − x)² without weights. `within`: Σ of
+    (w (v − xᵢ))² over the samples of every pass, where xᵢ is the pass's mean; None if unknown, and for FEW passes or
+    more, which do not need it. `contrasts`: the same estimates as in `between`, each averaged over all pixels and the
+    first `colours` channels.
     """
 
     spp: int
@@ -41,41 +41,42 @@ class PassSums:
     colours: int = 3
 
     def copy(self) -> PassSums:
-        """The same, in memory of its own."""
+        """Return a copy that shares no memory."""
         arrays: dict[str, Any] = {name: getattr(self, name) for name in ARRAYS}
         arrays = {name: None if array is None else array.copy() for name, array in arrays.items()}
         return replace(self, contrasts=list(self.contrasts), **arrays)
 
     def check(self, shape: tuple[int, ...], passes: int, spp: int) -> None:
-        """ValueError unless these are sums of so many passes, of `spp` samples per pixel each, over H × W × C."""
-        counts, expected = (self.passes, self.spp, len(self.contrasts)), (passes, passes * spp, passes - 1)
-        shapes = {name: np.shape(array) for name in ARRAYS if (array := getattr(self, name)) is not None}
-        wanted = {name: (*shape[:2], 1) if name == "weights" else shape for name in shapes}
-        if counts != expected or shapes != wanted:
+        """Raise ValueError unless these are sums of `passes` of `spp` samples per pixel each, over H × W × C."""
+        counts, expected_counts = (self.passes, self.spp, len(self.contrasts)), (passes, passes * spp, passes - 1)
+        arrays = {name: getattr(self, name) for name in ARRAYS}
+        shapes = {name: np.shape(array) for name, array in arrays.items() if array is not None}
+        expected_shapes = {name: (*shape[:2], 1) if name == "weights" else shape for name in shapes}
+        if counts != expected_counts or shapes != expected_shapes:
             text = f"{self.passes} passes of {self.spp} samples per pixel in all over {shapes.get('total')}"
             raise ValueError(f"sums of {text}; expected {passes} of {passes * spp} over {shape}")
-        known = np.isfinite(self.total)
-        for squares in (x for x in (self.between, self.within) if x is not None):
-            if not ((squares >= 0) & (squares < np.inf) | ~known).all():
+        finite = np.isfinite(self.total)
+        for squares in (self.between, self.within):
+            if squares is not None and not ((squares >= 0) & (squares < np.inf) | ~finite).all():
                 raise ValueError("sums of squares that are negative or not finite")
         if self.weights is not None and not np.isfinite(self.weights).all():
             raise ValueError("weights that are not finite")
 
     @property
     def mean(self) -> Doubles:
-        """The image; 0 where no sample has reached a pixel."""
+        """The image; 0 in pixels that no sample has reached."""
         if self.weights is None:
             return np.asarray(self.total / self.spp)
         return np.divide(self.total, self.weights, out=np.zeros_like(self.total), where=self.weights != 0)
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom of `variance`; 0 where nothing is known of it."""
+        """Degrees of freedom of `variance`; 0 if it is unknown."""
         return self.spp - 1 if self.within is not None else self.passes - 1
 
     @property
     def variance(self) -> Doubles | None:
-        """`spp` times that of the mean, from the samples or from the spread of passes; None where unknown."""
+        """The variance of the mean times `spp`, from the samples or from the spread of passes; None if unknown."""
         if not self.freedom:
             return None
         variance = (self.between if self.within is None else self.within + self.between) / self.freedom
@@ -85,39 +86,40 @@ class PassSums:
         return np.asarray(variance)
 
     def add(self, other: PassSums) -> None:
-        """Take in the sums of the passes that follow: m + n samples per pixel then, with totals a, c and weights u, v.
+        """Add the sums of the passes that follow. Let m and n be both `spp`, a and c both totals, u and v both weights.
 
-        The next estimate of a sample's variance is  (av − cu)²/(u + v)² (m + n)/(mn) , the squared difference of the
-        totals less the part that their weights explain. Without weights it is (x − y)² mn/(m + n), of the means x and y
-        (Chan et al. 1979), and exactly 0 where all samples are equal.
+        The new estimate of a sample's variance is  (av − cu)²/(u + v)² (m + n)/(mn) , the squared difference of the
+        totals without the part that their weights explain. Without weights it is (x − y)² mn/(m + n), with the means x
+        and y (Chan et al. 1979), and exactly 0 where all samples are equal.
         """
         channels, count = self.total.shape[-1], 1 / self.spp + 1 / other.spp
         a, b, c, d = (x.reshape(-1, channels) for x in (self.total, self.between, other.total, other.between))
-        growth, known, rows = 0.0, 0, max(1, _PIECE // channels)
+        contrast, values, rows = 0.0, 0, max(1, _PIECE // channels)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             for i in range(0, len(a), rows):
                 piece = slice(i, i + rows)
                 u, v = self._weights_of(piece), other._weights_of(piece)
-                both: Any = u + v
-                if isinstance(both, np.ndarray):
-                    both[both == 0] = 1  # no sample has reached such a pixel, and its totals are 0 as well
-                apart = a[piece] * v
-                apart -= c[piece] * u
-                apart /= both
-                apart *= apart
-                apart *= count
+                weights: Any = u + v
+                if isinstance(weights, np.ndarray):
+                    weights[weights == 0] = 1  # no sample has reached such a pixel, so its totals are 0, too
+                estimate = a[piece] * v
+                estimate -= c[piece] * u
+                estimate /= weights
+                estimate *= estimate
+                estimate *= count
                 b[piece] += d[piece]
-                b[piece] += apart
+                b[piece] += estimate
                 a[piece] += c[piece]
-                colours = apart[:, : self.colours]
-                if not np.isfinite(total := float(colours.sum())):
+                colours = estimate[:, : self.colours]
+                total = float(colours.sum())
+                if not np.isfinite(total):
                     colours = colours[np.isfinite(colours)]
                     total = float(colours.sum())
-                growth, known = growth + total, known + colours.size
-        self.contrasts = [*self.contrasts, *other.contrasts, growth / known if known else np.nan]
+                contrast, values = contrast + total, values + colours.size
+        self.contrasts = [*self.contrasts, *other.contrasts, contrast / values if values else np.nan]
         if self.weights is not None or other.weights is not None:  # one of them may come from a finished image
-            ours, theirs = (x.spp if x.weights is None else x.weights for x in (self, other))
-            self.weights = np.asarray(ours + theirs)
+            w1, w2 = (x.spp if x.weights is None else x.weights for x in (self, other))
+            self.weights = np.asarray(w1 + w2)
         self.passes += other.passes
         self.spp += other.spp
         if self.within is None or other.within is None or self.passes >= FEW:
@@ -126,25 +128,26 @@ class PassSums:
             self.within = self.within + other.within
 
     def _weights_of(self, piece: slice) -> Any:
-        """The weights of some pixels, once for each channel; one number where it is that of all."""
+        """Return the weights of some pixels, repeated for each channel; one number if all weights are equal."""
         if self.weights is None:
             return float(self.spp)
         return np.repeat(self.weights.reshape(-1, 1)[piece], self.total.shape[-1], 1)
 
 
 class PassTree:
-    """The sums of all passes so far: of every level the nodes that do not yet make one of the next."""
+    """The sums of all passes so far: for each level, of the nodes that do not yet make one of the next level."""
 
     def __init__(self) -> None:
-        """Without a pass."""
+        """Create a tree without passes."""
         self.levels: list[PassSums | None] = []
-        self.counts: list[int] = []  # nodes in each level's sum, fewer than ARITY
+        self.counts: list[int] = []  # number of nodes in the sum of each level, fewer than ARITY
         self.passes = 0
 
     def add(self, node: PassSums, level: int = 0) -> None:
-        """Add a node of ARITY**level passes, which begins where the last one ended. The tree owns it from here on."""
+        """Add a node of ARITY**level passes that follow those of the tree. The tree may change the node later."""
         if any(self.counts[:level]) or node.passes != ARITY**level:
-            raise ValueError(f"{node.passes} passes after {self.passes}; expected {ARITY**level}, where they begin")
+            expected = f"expected {ARITY**level} after a multiple of {ARITY**level}"
+            raise ValueError(f"{node.passes} passes after {self.passes}; {expected}")
         self.passes += node.passes
         while True:
             while len(self.levels) <= level:
@@ -161,7 +164,7 @@ class PassTree:
             level += 1
 
     def sums(self) -> PassSums | None:
-        """The sums of all passes, in memory of their own; None without passes."""
+        """Return the sums of all passes, which share no memory with the tree; None without passes."""
         total: PassSums | None = None
         for sums in reversed(self.levels):
             if sums is not None and total is not None:
@@ -172,7 +175,7 @@ class PassTree:
 
 
 def aligned_nodes(first: int, stop: int, largest: int) -> list[tuple[int, int]]:
-    """Nodes that make up the passes from `first` to `stop`: level, up to `largest`, and number of the first pass."""
+    """Return the nodes that make up the passes from `first` to `stop`: level, at most `largest`, and first pass."""
     nodes = []
     while first < stop:
         level = 0

@@ -1,10 +1,10 @@
-"""One pass of a render: the mean of every pixel's samples, and their squares. The number of threads does not show.
+"""One pass of a render: sums of the samples of every pixel, with bits that do not depend on the number of threads.
 
-Mitsuba adds samples to the film in the order in which threads come by, and the last bits of an image change with it.
-Here the samples of the JIT variants are kept, and each pixel is summed by one lane, from its first sample to its last,
-in float64. Under a filter w that is wider than a pixel, a pixel is Σ w v / Σ w over the samples of its neighbours, too.
-The two sums are kept apart: the mean of such quotients over passes would be biased, by 2 % of a pixel beside a bright
-edge in passes of 4 samples.
+Mitsuba adds samples to the film in the order in which threads finish, and the last bits of an image depend on that
+order. Here the samples of JIT variants are kept, and one lane sums each pixel, from its first sample to its last, in
+float64. With a filter w that is wider than a pixel, a pixel is Σ w v / Σ w over its own samples and those of its
+neighbours. The two sums are stored separately, because the mean of such quotients over passes is biased: by 2 % for a
+pixel beside a bright edge in passes of 4 samples.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from .pass_plan import FEW, scalar_seed_of, seed_of
 from .pass_sums import Doubles, PassSums
 from .sample_sums import Film, image_sums
 
-# One thread would be the caller's own, which keeps denormals: the others take them for 0, and bits would differ.
+# A single thread is the caller's own, which keeps denormals. Other threads flush them to 0, so bits would differ.
 LEAST_THREADS = 2
 COLOURS = ("R", "G", "B", "X", "Y", "Z")
 
 
 @dataclass(frozen=True)
 class PassRenderer:
-    """A scene, the seed of its render, and what its first sensor's film holds; of the present variant."""
+    """A scene in the present variant, the seed of its render, and the channels of its first sensor's film."""
 
     scene: Scene
     seed: int
     channels: tuple[str, ...]
-    moments: bool  # whether samples can be kept: then second moments are known, too
-    expected: Doubles | None = None  # Σ w of one sample in each pixel, H × W × 1, where the filter is no box
+    moments: bool  # whether samples can be kept, so that their second moments are known
+    expected: Doubles | None = None  # Σ w of one sample in each pixel, H × W × 1; None for a box filter
 
     @property
     def size(self) -> tuple[int, int]:
@@ -50,29 +50,29 @@ class PassRenderer:
 
     @property
     def filter_header(self) -> Metadata:
-        """What a file says of the film's filter w: its radius in pixels, and its area (∫∫w)²/∫∫w².
+        """The file's entries on the film's filter w: its radius in pixels, and its area (∫∫w)²/∫∫w².
 
-        The noise of a tile's mean has as many times the variance that it would have if pixels were independent. More
-        than 0.5, and 1, have neighbours share samples.
+        The variance of a tile's mean is that of independent pixels times the area. Neighbours share samples if the
+        radius is above 0.5 and the area above 1.
         """
         rfilter = self.scene.sensors()[0].film().rfilter()
         if rfilter.is_box_filter():
             return {"mi_refract:filter_radius": 0.5, "mi_refract:filter_area": 1.0}
         weights = filter_weights(rfilter)
-        area = float((np.square(weights.sum()) / np.square(weights).sum() * STEP) ** 2)  # w is a product of two
+        area = float((np.square(weights.sum()) / np.square(weights).sum() * STEP) ** 2)  # w(x, y) = w(x) w(y)
         return {"mi_refract:filter_radius": float(rfilter.radius()), "mi_refract:filter_area": area}
 
     @property
     def colours(self) -> int:
-        """How many of the channels, from the first on, are colours: all, where a film has none of COLOURS."""
+        """Number of channels, from the first on, that are colours; that of all channels if none is in COLOURS."""
         return sum(name in COLOURS for name in self.channels) or len(self.channels)
 
     def rounded(self, spp: int) -> int:
-        """The samples per pixel that the sampler makes of these: it may round up."""
+        """Return `spp` as the scene's sampler rounds it up."""
         return set_spp(self.scene.sensors()[0].sampler().clone(), spp)
 
     def render(self, number: int, spp: int) -> PassSums:
-        """Pass `number`. The scene's own errors pass; InterruptedError where Mitsuba stopped before the last sample."""
+        """Render pass `number` and return its sums. InterruptedError if Mitsuba stopped before the last sample."""
         within, film = None, self.scene.sensors()[0].film()
         with quiet():
             if self.moments:
@@ -81,7 +81,7 @@ class PassRenderer:
                 pixels = Film(*self.size, spp, None if film.rfilter().is_box_filter() else film.rfilter())
                 with dr.suspend_grad():
                     samples = _samples(self.scene, self.channels, spp, seed_of(self.seed, number))
-                    # More passes say the variance better.
+                    # For more passes their spread is the better estimate of the variance.
                     total, weights, within = image_sums(*samples, pixels, squares=number < FEW - 1)
                 integrator = self.scene.integrator()
                 if hasattr(integrator, "end_render"):
@@ -102,32 +102,33 @@ class PassRenderer:
     def _add_caustics(
         self, total: Doubles, weights: Doubles | None, within: Doubles | None, number: int, spp: int
     ) -> None:
-        """Add the lamps' part of the image to the sums of a pass, where the integrator keeps it apart."""
+        """Add the lamps' part of the image to the sums of a pass, if the integrator renders it separately."""
         sensor, seed = self.scene.sensors()[0], seed_of(self.seed, number)
-        squares, caustics = within is not None, self.scene.integrator().caustic_image
-        if (lamps := caustics(self.scene, sensor, seed, spp, self.channels, squares=squares)) is None:
+        caustic_image = self.scene.integrator().caustic_image
+        caustics = caustic_image(self.scene, sensor, seed, spp, self.channels, squares=within is not None)
+        if caustics is None:
             return
-        image, variance = lamps
-        colours, weight = image.shape[-1], spp if weights is None else weights
-        total[..., :colours] += image * weight
-        if within is not None:  # the variance of the mean is within / spp (spp − 1), and w in units of `expected`
-            share = 1 if self.expected is None else np.square(self.expected)
-            within[..., :colours] += spp * (spp - 1) * variance * share
+        image, variance = caustics
+        colours = image.shape[-1]
+        total[..., :colours] += image * (spp if weights is None else weights)
+        if within is not None:  # the variance of the mean is within / spp (spp − 1), with w in units of `expected`
+            squared_weight = 1 if self.expected is None else np.square(self.expected)
+            within[..., :colours] += spp * (spp - 1) * variance * squared_weight
 
 
 def set_spp(sampler: Sampler, spp: int) -> int:
-    """The samples per pixel that a sampler makes of these, and has from here on: it may round up."""
+    """Set the samples per pixel of a sampler, and return their number, which the sampler may have rounded up."""
     with quiet():
         sampler.set_sample_count(spp)
     return int(sampler.sample_count())
 
 
 def pass_renderer(scene: Scene, seed: int) -> PassRenderer:
-    """How to render the passes of a loaded scene, with its first sensor."""
+    """Return the renderer of a loaded scene's passes, with its first sensor."""
     film, integrator = scene.sensors()[0].film(), scene.integrator()
     film.prepare(integrator.aov_names())
     channels = tuple(str(field.name) for field in film.bitmap().struct_())
-    # Samples can be kept where the integrator only gives samples, and the film only takes them.
+    # Samples can be kept if the integrator does nothing but return samples, and the film nothing but store them.
     plain = type(integrator).render is mi.SamplingIntegrator.render or hasattr(integrator, "begin_render")
     special = film.sample_border() or mi.has_flag(film.flags(), mi.FilmFlags.Special)
     keeps = dr.is_jit_v(mi.Float) and isinstance(integrator, mi.SamplingIntegrator) and plain and not special
@@ -136,7 +137,7 @@ def pass_renderer(scene: Scene, seed: int) -> PassRenderer:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """A context without Mitsuba's warning, at every pass, that a sampler rounds up: it is taken into account."""
+    """Suppress Mitsuba's warning that a sampler rounds up, which it repeats at every pass; plans account for it."""
     logger: Any = mi.logger()  # type: ignore[operator]
     before = logger.log_level()
     logger.set_log_level(mi.LogLevel.Error)
@@ -147,21 +148,21 @@ def quiet() -> Iterator[None]:
 
 
 def _rendered(scene: Scene, spp: int, seed: int) -> tuple[Doubles, Doubles | None]:
-    """`total` and `weights` by `mi.render`; by one thread where it would add in the order of threads."""
+    """Return Σ w v and Σ w by `mi.render`, which runs in one thread if the order of threads would change sums."""
     film = scene.sensors()[0].film()
     box = film.rfilter().is_box_filter()
     threads = dr.thread_count()
-    one = dr.is_jit_v(mi.Float) or not box
-    if one:
+    one_thread = dr.is_jit_v(mi.Float) or not box
+    if one_thread:
         _set_threads(1)
     try:
         mi.render(scene, spp=spp, seed=seed)
-        if scene.integrator().should_stop():  # by its `timeout`, or a signal that Mitsuba has taken
+        if scene.integrator().should_stop():  # by its `timeout`, or by a signal that Mitsuba handled
             raise InterruptedError("the rendering was stopped before its last sample")
     finally:
-        if one:
+        if one_thread:
             _set_threads(threads)
-    mean = np.array(film.bitmap(), np.float64)  # what `aov` returns has fewer channels
+    mean = np.array(film.bitmap(), np.float64)  # the return value of `aov` has fewer channels
     mean = mean.reshape(*mean.shape[:2], -1)
     raw = film.bitmap(raw=True)
     names = [field.name for field in raw.struct_()]
@@ -172,7 +173,7 @@ def _rendered(scene: Scene, spp: int, seed: int) -> tuple[Doubles, Doubles | Non
 
 
 def _set_threads(count: int) -> None:
-    """When no kernel runs: a kernel is run by the threads that are there when its turn comes."""
+    """Set the number of threads after all kernels: a kernel runs in the threads that exist when it starts."""
     if dr.is_jit_v(mi.Float):
         dr.sync_thread()
     dr.set_thread_count(count)
@@ -182,29 +183,29 @@ def _set_threads(count: int) -> None:
 
 
 def _samples(scene: Scene, channels: tuple[str, ...], spp: int, seed: int) -> tuple[list[Any], Any]:
-    """The values of all samples by channels, those of a pixel in a row, and their places on the film."""
-    from mitsuba.ad.integrators.common import ADIntegrator  # there is none in scalar variants
+    """Return the values of all samples by channel, pixel after pixel, and their positions on the film."""
+    from mitsuba.ad.integrators.common import ADIntegrator  # does not exist in scalar variants
 
     sensor, integrator = scene.sensors()[0], scene.integrator()
     if hasattr(integrator, "begin_render"):
         integrator.begin_render(sensor)
     sampler, spp = ADIntegrator.prepare(None, sensor, seed, spp, integrator.aov_names())
-    ray, weight, place = ADIntegrator.sample_rays(None, scene, sensor, sampler)
+    ray, weight, position = ADIntegrator.sample_rays(None, scene, sensor, sampler)
     ray.scale_differential(1 / math.sqrt(spp))
     values = _channels(scene, integrator, channels, sampler, ray, weight)
-    return values, mi.Point2f(place) - mi.Point2f(sensor.film().crop_offset())
+    return values, mi.Point2f(position) - mi.Point2f(sensor.film().crop_offset())
 
 
 def _channels(
     scene: Scene, integrator: Any, channels: tuple[str, ...], sampler: Sampler, ray: Ray, weight: Spectrum
 ) -> list[Any]:
-    """The values of samples by channels, of the rays that a sensor has weighted."""
+    """Return the values of samples by channel; `ray`, `weight`: as sampled by the sensor."""
     medium = scene.sensors()[0].get_medium()
-    radiance, valid, others = integrator.sample(scene, sampler, ray, medium, mi.Bool(True))
+    radiance, valid, aovs = integrator.sample(scene, sampler, ray, medium, mi.Bool(True))
     values = film_colours(mi, weight * radiance, ray.wavelengths, channels)
     if "A" in channels[: len(values) + 1]:
         values.append(dr.select(valid, mi.Float(1), mi.Float(0)))
-    values += list(others)
+    values += list(aovs)
     if len(values) != len(channels):
         raise ValueError(f"{len(values)} values in a sample; expected {len(channels)}, those of the film")
     return values
@@ -213,10 +214,10 @@ def _channels(
 def samples_of_pixels(
     renderer: PassRenderer, integrator: Any, sampler: Sampler, pixels: np.ndarray, seed: int
 ) -> list[Any]:
-    """The colours of the samples of some pixels by channels, those of a pixel in a row, not yet evaluated.
+    """Return the colours of the samples of some pixels by channel, pixel after pixel, not yet evaluated.
 
-    `pixels`: their numbers, row by row; one that is there twice has samples that do not depend on each other.
-    `sampler`: as many samples a pixel as it says, stratified as in a pass of so many.
+    `pixels`: numbers of pixels, row by row; a repeated number has independent samples. `sampler`: determines the
+    samples per pixel, which are stratified as in a pass.
     """
     scene, sensor = renderer.scene, renderer.scene.sensors()[0]
     spp, (width, _) = sampler.sample_count(), renderer.size
@@ -227,14 +228,14 @@ def samples_of_pixels(
     number = dr.arange(mi.UInt32, len(pixels) * spp) // dr.opaque(mi.UInt32, spp)
     number = dr.gather(mi.UInt32, mi.UInt32(pixels), number)
     y = number // dr.opaque(mi.UInt32, width)
-    place = mi.Vector2f(mi.Float(number - y * width), mi.Float(y)) + sampler.next_2d()
-    # In the order of `ADIntegrator.sample_rays`.
+    position = mi.Vector2f(mi.Float(number - y * width), mi.Float(y)) + sampler.next_2d()
+    # Random numbers in the order of `ADIntegrator.sample_rays`.
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Vector2f(0)
     time = sensor.shutter_open()
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
     wavelength = sampler.next_1d() if mi.is_spectral else 0
-    place /= mi.ScalarVector2f(renderer.size)
-    ray, weight = sensor.sample_ray_differential(time, wavelength, place, aperture)
+    position /= mi.ScalarVector2f(renderer.size)
+    ray, weight = sensor.sample_ray_differential(time, wavelength, position, aperture)
     ray.scale_differential(1 / math.sqrt(spp))
     return _channels(scene, integrator, renderer.channels, sampler, ray, weight)[: renderer.colours]

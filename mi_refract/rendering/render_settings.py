@@ -1,7 +1,7 @@
-"""Settings that a render may replace in its scene: the sampler, and how `refract_path` traces.
+"""Settings that replace those of a scene: the sampler, the integrator, and parameters of `refract_path`.
 
-`sampler=multijitter,integrator=refract_path,split_depth=1`: any of `NAMES`, each once. They replace plugins and
-parameters in what Mitsuba's parser has read; the file stays as it is. Parameters that both plugins have are kept.
+Example: `sampler=multijitter,integrator=refract_path,split_depth=1`; any of `NAMES`, each once. They replace plugins
+and parameters in the parsed scene, not in its file. Parameters that the old and the new plugin share are kept.
 """
 
 from __future__ import annotations
@@ -14,28 +14,31 @@ from mi_refract.plugins import scene_parser
 from mi_refract.plugins.scene_parser import Node, ParsedScene
 
 AUTO, OWN = "auto", "the scene's own"
-SAMPLERS = ("multijitter", "stratified", "ldsampler", "orthogonal", "independent")  # the first that is as good as any
+SAMPLERS = ("multijitter", "stratified", "ldsampler", "orthogonal", "independent")  # in the order of preference
 INTEGRATORS = ("path", "refract_path")
 NAMES = {
     "sampler": "|".join(SAMPLERS),
     "integrator": "|".join(INTEGRATORS),
-    "split_depth": "[0-9]|[1-5][0-9]|6[0-4]",  # up to 64, as `refract_path` has it
+    "split_depth": "[0-9]|[1-5][0-9]|6[0-4]",  # up to 64, the limit of `refract_path`
     "caustics": "path|lamp|auto",
 }
-_SHARED = ("sample_count", "seed")  # parameters of every sampler
-_TYPES = {"split_depth": "Integer", "caustics": "String"}  # of `refract_path`; `path` has neither
+_SAMPLER_PARAMETERS = ("sample_count", "seed")  # of every sampler
+_TYPES = {"split_depth": "Integer", "caustics": "String"}  # parameters of `refract_path` that can be set
 DEFAULTS = {"split_depth": "0", "caustics": "auto"}
-_OWN = (*_TYPES, "split_weight", "light_paths")  # parameters that `path` does not have
+_NOT_IN_PATH = (*_TYPES, "split_weight", "light_paths")  # parameters of `refract_path` that `path` does not have
 Settings: TypeAlias = dict[str, str]  # by NAMES; {}: the scene's own
 
 
 def parse_settings(text: str) -> Settings:
-    """`"split_depth=1"` → `{"split_depth": "1"}`, by NAMES; `OWN` → `{}`. ValueError for another syntax."""
-    settings: dict[str, str] = {}
+    """Return the settings in the order of NAMES: `"split_depth=1"` → `{"split_depth": "1"}`, `OWN` → `{}`.
+
+    ValueError for another syntax.
+    """
+    settings: Settings = {}
     for item in () if text == OWN else text.split(","):
         name, _, value = item.partition("=")
         if name not in NAMES:
-            expected = ", ".join(f"{each}=…" for each in NAMES)
+            expected = ", ".join(f"{known}=…" for known in NAMES)
             raise ValueError(f"--settings {text}: {item!r}; expected {AUTO}, or {expected}")
         if not re.fullmatch(NAMES[name], value):
             expected = "0 to 64" if name == "split_depth" else NAMES[name].replace("|", ", ")
@@ -47,24 +50,24 @@ def parse_settings(text: str) -> Settings:
 
 
 def settings_text(settings: Settings) -> str:
-    """What `parse_settings` reads, in the order of NAMES: a checkpoint compares texts."""
+    """Return the text for `parse_settings`, in the order of NAMES, because checkpoints compare texts."""
     return ",".join(f"{name}={settings[name]}" for name in NAMES if name in settings) or OWN
 
 
 def own_settings(parsed: ParsedScene) -> Settings:
-    """What the scene itself says; `split_depth` and `caustics` only where its integrator is `refract_path`."""
+    """Return the scene's own settings; `split_depth` and `caustics` only if its integrator is `refract_path`."""
     sampler, integrator = (_find(parsed.nodes, *path) for path in (("Sensor", "Sampler"), ("Integrator",)))
     own: Settings = {"sampler": "independent" if sampler is None else parsed.nodes[sampler][1]}
     if integrator is not None:
         own["integrator"] = parsed.nodes[integrator][1]
         if own["integrator"] == "refract_path":
-            given = {name: value for name, _, value in parsed.nodes[integrator][3]}
-            own |= {name: str(given.get(name, default)) for name, default in DEFAULTS.items()}
+            parameters = {name: value for name, _, value in parsed.nodes[integrator][3]}
+            own |= {name: str(parameters.get(name, default)) for name, default in DEFAULTS.items()}
     return own
 
 
 def integrator_node(parsed: ParsedScene, settings: Settings) -> Node | None:
-    """The scene's integrator with these settings; None where it is none of INTEGRATORS, or has plugins within it."""
+    """Return the scene's integrator with these settings; None if it is none of INTEGRATORS, or contains plugins."""
     number = _find(parsed.nodes, "Integrator")
     if number is None or parsed.nodes[number][1] not in INTEGRATORS:
         return None
@@ -73,15 +76,15 @@ def integrator_node(parsed: ParsedScene, settings: Settings) -> Node | None:
         return None
     plugin = settings.get("integrator", plugin)
     changed = [name for name in settings if name in _TYPES]
-    dropped = _OWN if plugin == "path" else changed
-    parameters = [each for each in parameters if each[0] not in dropped]
+    dropped = _NOT_IN_PATH if plugin == "path" else changed
+    parameters = [parameter for parameter in parameters if parameter[0] not in dropped]
     values = {name: int(settings[name]) if _TYPES[name] == "Integer" else settings[name] for name in changed}
     parameters += [(name, _TYPES[name], value) for name, value in values.items()]
     return kind, plugin, identifier, parameters
 
 
 def with_settings(parsed: ParsedScene, settings: Settings) -> ParsedScene:
-    """The scene with these settings, to be loaded. ValueError where its integrator cannot have them."""
+    """Return the parsed scene with these settings. ValueError if they do not suit its integrator."""
     if not settings:
         return parsed
     nodes, what = list(parsed.nodes), f"{parsed.path}: --settings {settings_text(settings)}"
@@ -96,24 +99,28 @@ def with_settings(parsed: ParsedScene, settings: Settings) -> ParsedScene:
         nodes[number] = node
     if plugin := settings.get("sampler"):
         sensor, number = _find(nodes, "Sensor"), _find(nodes, "Sensor", "Sampler")
-        if sensor is not None and number is None:  # its sensor would make one
+        if sensor is not None and number is None:  # the sensor would make one by default
             kind, sensor_plugin, identifier, parameters = nodes[sensor]
             nodes[sensor] = kind, sensor_plugin, identifier, [*parameters, ("sampler", "ResolvedReference", len(nodes))]
             nodes.append(("Sampler", plugin, "", []))
         elif number is not None:
             kind, before, identifier, parameters = nodes[number]
-            kept = [each for each in parameters if before == plugin or each[0] in _SHARED]
-            nodes[number] = kind, plugin, identifier, kept
+            if before != plugin:
+                parameters = [parameter for parameter in parameters if parameter[0] in _SAMPLER_PARAMETERS]
+            nodes[number] = kind, plugin, identifier, parameters
     return replace(scene_parser.restore(parsed.path, nodes), folders=parsed.folders, named=parsed.named)
 
 
 def _find(nodes: list[Node], *kinds: str) -> int | None:
-    """The number of the first node of a kind in the scene, of the first of the next kind in that, and so on."""
-    found = 0
+    """Return the number of the first node of the first kind in the scene, of the second kind in that node, and so on.
+
+    None if there is no such node.
+    """
+    parent = 0
     for kind in kinds:
-        inside = (value for _, type_, value in nodes[found][3] if type_ == "ResolvedReference")
-        number = next((i for i in inside if nodes[i][0] == kind), None)
+        children = (value for _, type_, value in nodes[parent][3] if type_ == "ResolvedReference")
+        number = next((child for child in children if nodes[child][0] == kind), None)
         if number is None:
             return None
-        found = number
-    return found
+        parent = number
+    return parent

@@ -1,4 +1,4 @@
-"""The image of a render as an EXR file: means, the variance of one sample beside each, and how it was made."""
+"""The image of a render as an EXR file with the mean and the variance of one sample per channel, and provenance."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SAMPLES = "samples: an upper bound where the sampler stratifies them"
 
 
 def header(progress: Progress, sums: PassSums, metadata: Metadata, ended_by: str) -> Metadata:
-    """`metadata`, and what is known of the passes, whose sums are `sums`."""
+    """Return `metadata` and the entries on the passes. `sums`: of all passes of `progress`."""
     source = "nothing" if not sums.freedom else "passes" if sums.within is None else SAMPLES
     return metadata | {
         "mi_refract:spp": sums.spp,
@@ -46,32 +46,32 @@ def write(output: Path, channels: tuple[str, ...], sums: PassSums, header: Metad
 
 
 def nonfinite_pixels(sums: PassSums) -> int:
-    """Pixels with a value that is not finite."""
+    """Return the number of pixels with a non-finite value."""
     return int((~np.isfinite(sums.total).all(-1)).sum())
 
 
 def read(output: Path, channels: tuple[str, ...], identity: Identity) -> Progress | None:
-    """The finished render that a file holds, to be refined; None where there is none of this identity.
+    """Return the progress of a finished image, for refining it; None if there is no image of this identity.
 
-    Its sums are those of the file's float32.
+    The sums have the precision of the file, float32.
     """
     try:
         image = image_file.read(output, image_file.MAX_VALUES * 4)
-        said = {name.removeprefix("mi_refract:"): value for name, value in image.metadata.items()}
-        spp, passes = int(said["spp"]), int(said["passes"])
-        contrasts = [float(contrast) for contrast in json.loads(said["contrasts"])]
-        machines = {name for name in str(said["machines"]).split(", ") if name}
-        kept = json.loads(said["identity"])
-        progress = Progress(kept, seconds=float(said["render_seconds"]), machines=machines)
-        variance_from = said["variance_from"]
-        if changes(kept, identity) or not 1 <= passes <= spp or len(contrasts) != passes - 1:
+        header = {name.removeprefix("mi_refract:"): value for name, value in image.metadata.items()}
+        spp, passes = int(header["spp"]), int(header["passes"])
+        contrasts = [float(contrast) for contrast in json.loads(header["contrasts"])]
+        machines = {name for name in str(header["machines"]).split(", ") if name}
+        image_identity = json.loads(header["identity"])
+        progress = Progress(image_identity, seconds=float(header["render_seconds"]), machines=machines)
+        variance_from = header["variance_from"]
+        if changes(image_identity, identity) or not 1 <= passes <= spp or len(contrasts) != passes - 1:
             return None
         mean = image.select(channels).astype(np.float64)
         variance = image.select([VARIANCE.format(name) for name in channels]) if spp > 1 else np.zeros(())
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
     variance = np.broadcast_to(variance.astype(np.float64), mean.shape)
-    # Their sum over freedom is the variance that the file holds; under a wide filter a pixel has the expected weight.
+    # `within` and `between` give the variance in the file; with a wide filter every pixel gets the expected weight.
     within = variance * (spp - passes) if variance_from == SAMPLES and passes < FEW else None
     progress.base = PassSums(
         spp, passes, mean * spp, variance * (passes - 1), within, contrasts=contrasts, colours=int(identity["colours"])

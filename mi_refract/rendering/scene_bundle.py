@@ -1,6 +1,6 @@
-"""A scene as one bundle, what Mitsuba's parser made of its XML and every file that it names, for another machine.
+"""A scene as one bundle for another machine: the parsed XML, and the contents of every file that it names.
 
-There the files lie in a folder of their own, and plugins get their paths.
+The other machine writes the files to a separate folder, and passes their new paths to plugins.
 """
 
 from __future__ import annotations
@@ -23,13 +23,16 @@ from .scene_files import load_parsed
 
 MEBIBYTE = 2**20
 LIMIT = 256  # MiB
-_KEPT = 2  # bundles and scenes that a process keeps
+_KEPT = 2  # number of bundles and of scenes that a process keeps
 
 
 @dataclass(frozen=True)
 class SceneBundle:
-    """`scene`: its path on the machine that made the bundle; `nodes`: those of `ParsedScene`, values of `<default>`s,
-    included files and spectra in place; `files`: by their names in the scene; `digest`: of all of it.
+    """A scene and its files.
+
+    `scene`: path of the scene on the machine that made the bundle. `nodes`: of `ParsedScene`, with the values of
+    `<default>`s, included files and spectra inserted. `files`: contents, by their names in the scene. `digest`: SHA-256
+    of all these.
     """
 
     scene: str
@@ -39,10 +42,11 @@ class SceneBundle:
 
 
 def pack(parsed: ParsedScene, limit: int = LIMIT) -> SceneBundle:
-    """The bundle of a scene. `limit`: MiB of all files; ValueError for more."""
+    """Return the bundle of a scene. `limit`: MiB of all files; ValueError for more."""
     named = parsed.files()
     sizes = {path: path.stat().st_size for path in named.values()}
-    if (size := sum(sizes.values())) > limit * MEBIBYTE:  # before they are in memory
+    size = sum(sizes.values())
+    if size > limit * MEBIBYTE:  # checked before files are read
         largest = max(sizes, key=sizes.__getitem__)
         listed = f"{size / MEBIBYTE:.1f} MiB of files, the largest {largest} ({sizes[largest] / MEBIBYTE:.1f} MiB)"
         more = f"--bundle-limit {-(-size // MEBIBYTE)}, if all workers have the memory"
@@ -53,16 +57,16 @@ def pack(parsed: ParsedScene, limit: int = LIMIT) -> SceneBundle:
     return SceneBundle(str(parsed.path), parsed.nodes, files, digest)
 
 
-# Where it is rendered -------------------------------------------------------------------------------------------------
+# On the machine that renders it ---------------------------------------------------------------------------------------
 
 _unpacked: OrderedDict[str, Path] = OrderedDict()
 _loaded: OrderedDict[tuple[str, str], Scene] = OrderedDict()
 
 
 def load(bundle: SceneBundle, variant: str, folder: str) -> tuple[Scene, dict[str, str]]:
-    """The scene, loaded in the present variant, and `unpack`'s answer; both are kept for a next time.
+    """Return the scene, loaded in the present variant, and the result of `unpack`; both are kept for later calls.
 
-    `folder`: where to unpack. Errors: those of `load_scene`, with the names of the machine that made the bundle.
+    `folder`: as in `unpack`. Errors: those of `load_scene`, with the file names of the machine that made the bundle.
     """
     moved, key = unpack(bundle, folder), (bundle.digest, variant)
     if key not in _loaded:
@@ -74,17 +78,18 @@ def load(bundle: SceneBundle, variant: str, folder: str) -> tuple[Scene, dict[st
 
 
 def unpack(bundle: SceneBundle, folder: str) -> dict[str, str]:
-    """Write the files of a bundle below `folder`, once in a process: where they are, by their names in the scene."""
+    """Write the files of a bundle below `folder`, once per process; return their paths, by their names in the scene."""
     root = _unpacked.get(bundle.digest)
-    if new := root is None or not root.is_dir():
+    is_new = root is None or not root.is_dir()
+    if is_new:
         root = Path(tempfile.mkdtemp(prefix="scene-", dir=folder))
     assert root is not None
     moved = {name: root / str(i) / Path(file_in(name) or name).name for i, name in enumerate(bundle.files)}
-    if new:
+    if is_new:
         for name, path in moved.items():
             path.parent.mkdir()
             path.write_bytes(bundle.files[name])
-        _unpacked[bundle.digest] = root  # only when it is complete
+        _unpacked[bundle.digest] = root  # only if it is complete
         if len(_unpacked) > _KEPT:
             shutil.rmtree(_unpacked.popitem(last=False)[1], ignore_errors=True)
     return {name: str(path) for name, path in moved.items()}
@@ -92,7 +97,7 @@ def unpack(bundle: SceneBundle, folder: str) -> dict[str, str]:
 
 @contextlib.contextmanager
 def original_names(moved: Mapping[str, str]) -> Iterator[None]:
-    """Within, errors name files as the scene does."""
+    """Within this context, replace paths of `unpack` in errors by the names in the scene."""
     try:
         yield
     except Exception as error:

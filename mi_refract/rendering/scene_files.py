@@ -1,4 +1,4 @@
-"""Scene files: parsed and loaded, with their errors in one line."""
+"""Parsing and loading of scene files, with errors in one line."""
 
 from __future__ import annotations
 
@@ -16,13 +16,16 @@ if TYPE_CHECKING:  # they import Dr.Jit and Mitsuba
     from mi_refract.numerics import Scene
     from mi_refract.plugins.scene_parser import ParsedScene
 
-TAKEN = ("config", "filename")  # names that mi.parser.parse_file would take for its own
-REPRODUCIBLE: Any = {"parallel": False, "optimize": False}  # for mi.load_file, as `ParsedScene.load` does
-PIXELS = 2**26  # of an image; four channels of them are 1 GiB
+TAKEN = ("config", "filename")  # parameters of mi.parser.parse_file, which cannot be names of defines
+REPRODUCIBLE: Any = {"parallel": False, "optimize": False}  # options for mi.load_file, as in `ParsedScene.load`
+PIXELS = 2**26  # most pixels of an image; four channels of them are 1 GiB
 
 
 def parse_defines(items: Sequence[str]) -> dict[str, str]:
-    """`["bsdf=dielectric"]` → `{"bsdf": "dielectric"}`. ValueError for another syntax, or a name given twice."""
+    """Return values by name: `["bsdf=dielectric"]` → `{"bsdf": "dielectric"}`.
+
+    ValueError for another syntax, or a name given twice.
+    """
     defines: dict[str, str] = {}
     for item in items:
         name, equals, value = item.partition("=")
@@ -35,10 +38,10 @@ def parse_defines(items: Sequence[str]) -> dict[str, str]:
 
 
 def parse_scene(path: str | os.PathLike[str], defines: Mapping[str, str] | None = None) -> ParsedScene:
-    """Parse a Mitsuba scene in an XML file, for the present variant; nothing of it runs.
+    """Parse a Mitsuba scene in an XML file, for the present variant, without running any of its plugins.
 
     `defines`: values that replace those of its `<default>`s. FileNotFoundError for a missing file; ValueError, in one
-    line, for what Mitsuba's parser does not accept, circular references, and pipes.
+    line, for errors of Mitsuba's parser, circular references, and pipes.
     """
     from mi_refract.plugins import scene_parser
 
@@ -57,9 +60,9 @@ def load_parsed(
 ) -> Scene:
     """Load a parsed scene, once.
 
-    A scene may bring plugins, which are code: only those in `allow_plugins`, Mitsuba's own and ours are loaded.
-    `moved`: where files are now, by their names in the scene. ValueError, in one line, for other plugins, what Mitsuba
-    does not accept, a scene without a sensor or an integrator, and a film that is empty or too large.
+    A scene may contain plugins, which are code: only those in `allow_plugins`, Mitsuba's own and ours are loaded.
+    `moved`: new paths of files, by their names in the scene. ValueError, in one line, for other plugins, errors of
+    Mitsuba, a scene without a sensor or an integrator, and a film that is empty or too large.
     """
     import mitsuba as mi
 
@@ -69,7 +72,7 @@ def load_parsed(
     with _in_one_line(path):
         scene: Any = parsed.load(allow_plugins, moved)
         if not isinstance(scene, mi.Scene):
-            raise ValueError(f"{path}: holds a {type(scene).__name__}; expected a <scene>")
+            raise ValueError(f"{path}: contains a {type(scene).__name__}; expected a <scene>")
         if not scene.sensors():
             raise ValueError(f"{path}: the scene has no sensor; expected at least one")
         if scene.integrator() is None:
@@ -84,12 +87,12 @@ def load_parsed(
 def load_scene(
     path: str | os.PathLike[str], defines: Mapping[str, str] | None = None, allow_plugins: Collection[str] = ()
 ) -> Scene:
-    """Parse a scene file and load it, in the present variant. Arguments and errors: those of both."""
+    """Parse and load a scene file, in the present variant. Arguments and errors: of `parse_scene` and `load_parsed`."""
     return load_parsed(parse_scene(path, defines), allow_plugins)
 
 
 def formulas_in(scene: Scene) -> list[str]:
-    """The formulas of the `refract` BSDFs in a scene, sorted; "promoted (auto)" where the plugin chose it."""
+    """Return the formulas of the `refract` BSDFs in a scene, sorted; "promoted (auto)" if the plugin chose it."""
     texts = (str(shape.bsdf()) for shape in scene.shapes())
     return sorted({name for text in texts for name in re.findall(r"Refract\[.*?formula = (.+?),\n", text, re.DOTALL)})
 
@@ -105,7 +108,7 @@ def _in_one_line(path: Path) -> Iterator[None]:
 
 
 def naming(path: str | os.PathLike[str], error: Exception) -> str:
-    """The error as one line that names the file, without the line numbers of Mitsuba's source."""
+    """Return the error as one line that names the file, without the line numbers of Mitsuba's source."""
     text = re.sub(r"\[\w+\.(cpp|h):\d+\] ", "", one_line(str(error)))
     text = re.sub(r"Traceback \(most recent call last\):.* (\w+Error: )", "", text)
     return text if str(path) in text else f"{path}: {text}"

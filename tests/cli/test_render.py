@@ -143,7 +143,7 @@ BAD = {
     "no time": ({}, ("--time", ""), "--time ; expected a time of more than 0"),
     "malformed": (SCENE.replace("</shape>", ""), (), "mismatch"),
     "unknown parameter": (SCENE.replace("max_depth", "max_dept"), (), "max_dept"),
-    "a BSDF": ('<bsdf version="3.0.0" type="dielectric"/>', (), "holds a BSDF; expected a <scene>"),
+    "a BSDF": ('<bsdf version="3.0.0" type="dielectric"/>', (), "contains a BSDF; expected a <scene>"),
     "no sensor": ('<scene version="3.0.0"/>', (), "the scene has no sensor"),
     "no integrator": (re.sub("<integrator.*/integrator>", "", SCENE), (), "scene.xml: the scene has no integrator"),
     "a film without pixels": (

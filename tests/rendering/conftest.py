@@ -1,4 +1,4 @@
-"""What every test of rendering needs."""
+"""Fixtures for tests of rendering."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ import pytest
 
 @pytest.fixture
 def llvm(needs_variant: Callable[[str], None]) -> None:
-    """`llvm_ad_rgb` for the test, also in a file of `scalar_variant`."""
+    """Use `llvm_ad_rgb` for the test, also in a file that uses `scalar_variant`."""
     needs_variant("llvm_ad_rgb")

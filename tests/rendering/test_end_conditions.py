@@ -1,4 +1,4 @@
-"""The error of a render from its own passes: right on average, and seldom too small where it ends a render."""
+"""The error of a render, estimated from its passes: right on average, and rarely too small when it ends a render."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ SIZE = (12, 12, 3)
 
 
 def noisy(kind, truth, spp):
-    """A pass of `spp` samples per pixel, each with a standard deviation of its mean."""
+    """Return a pass of `spp` samples per pixel; the standard deviation of a sample is its mean, if not "rare"."""
     if kind == "normal":
         return RNG.normal(truth, truth * spp**-0.5)
     if kind == "exponential":
         return truth * RNG.gamma(spp, 1 / spp, SIZE)
-    # One sample in 20 is bright: what comes of caustics. The same in all colours.
+    # One sample in 20 is bright, in all colours, as in caustics.
     return truth * RNG.binomial(spp, 0.05, SIZE[:2])[..., None] / (spp * 0.05)
 
 
@@ -45,21 +45,22 @@ def true_error(sums, truth):
 
 
 @pytest.mark.parametrize("kind", ["normal", "exponential", "rare"])
-def test_the_estimate_is_right_on_average(kind):
+def test_the_estimated_error_is_right_on_average(kind):
     truth, squares = RNG.uniform(0.2, 2, SIZE), []
     for _ in range(60):
         sums = sums_of(noisy(kind, truth, 4) for _ in range(16))
         squares.append((relative_error(sums).value ** 2, true_error(sums, truth) ** 2))
     estimated, true = np.mean(squares, 0)
-    # Of 60 each, over 144 pixels and more: standard errors of 1.5 % where samples are rare, of kurtosis 20.
+    # Both are means of 60 over at least 144 pixels: standard errors of 1.5 % for rare samples, with a kurtosis of 20.
     assert estimated == pytest.approx(true, rel=0.08)
 
 
 @pytest.mark.parametrize(("passes", "at_most"), [(1, True), (2, False), (4, False)])
-def test_of_stratified_samples_the_estimate_is_right_or_said_to_be_a_bound(passes, at_most):
-    """Samples in n strata have the variance σ² (1 − 1/n³) n/(n − 1): n² + n + 1 times that of their mean is stated.
+def test_the_estimate_for_stratified_samples_is_right_or_marked_as_a_bound(passes, at_most):
+    """Samples in n strata have the variance σ² (1 − 1/n³) n/(n − 1), so their estimate is n² + n + 1 times too large.
 
-    Of 60 renders each, over 432 values: standard errors of 1.3 %, so a tolerance of 8 % fails once in 10⁹ times.
+    Both are means of 60 renders with 432 values each: standard errors of 1.3 %. A tolerance of 8 % fails once in 10⁹
+    times.
     """
     n, truth, squares = 4, RNG.uniform(0.2, 2, SIZE), []
     for _ in range(60):
@@ -67,54 +68,56 @@ def test_of_stratified_samples_the_estimate_is_right_or_said_to_be_a_bound(passe
         for _ in range(passes):
             values = truth * (0.5 + (np.arange(n)[:, None, None, None] + RNG.random((n, *SIZE))) / n)
             tree.add(PassSums(n, 1, values.sum(0), np.zeros(SIZE), values.var(0) * n))
-        found = relative_error(tree.sums())
-        squares.append((found.value**2, true_error(tree.sums(), truth) ** 2))
-        assert found.at_most == at_most
+        error = relative_error(tree.sums())
+        squares.append((error.value**2, true_error(tree.sums(), truth) ** 2))
+        assert error.at_most == at_most
     estimated, true = np.mean(squares, 0)
     assert estimated == pytest.approx(true * (n * n + n + 1 if at_most else 1), rel=0.08)
 
 
-MOST = int(binom.ppf(0.999, 500, 0.05))  # a test that fails once in 1000 times
+MOST = int(binom.ppf(0.999, 500, 0.05))  # more renders of 500 are beyond a limit of 5 % once in 1000 tests
 
 
 @pytest.mark.parametrize(
-    ("kind", "judge", "enough"),
+    ("kind", "bound", "reliable"),
     [(kind, "high", True) for kind in ("normal", "exponential", "rare")] + [("rare", "value", False)],
 )
-def test_what_ends_a_render_is_true_as_often_as_stated(kind, judge, enough):
-    """Of 500 renders: the error is above the one asked for with a probability of 5 % at most.
+def test_a_render_ends_above_its_error_limit_with_at_most_5_percent(kind, bound, reliable):
+    """The limit is exactly the error that 12 passes have on average, so an estimate ends a render by chance.
 
-    It is asked for exactly the error that 12 passes have on average: there an estimate ends a render by chance. By the
-    estimate without its interval it is above more often, or this test could not fail.
+    If the estimate without its interval ends the render, more renders are above the limit, so this test can fail.
     """
-    truth, beyond = np.ones(SIZE), 0
-    asked = math.sqrt({"normal": 1, "exponential": 1, "rare": 19}[kind] / 48)
+    truth, above = np.ones(SIZE), 0
+    limit = math.sqrt({"normal": 1, "exponential": 1, "rare": 19}[kind] / 48)
     for _ in range(500):
         tree = PassTree()
-        while not tree.passes or not getattr(relative_error(tree.sums()), judge) <= asked:
+        while not tree.passes or not getattr(relative_error(tree.sums()), bound) <= limit:
             for _ in range(next_stop(tree.passes) - tree.passes):
                 tree.add(leaf(noisy(kind, truth, 4)))
-        beyond += true_error(tree.sums(), truth) > asked
-    assert bool(beyond <= MOST) is enough
+        above += true_error(tree.sums(), truth) > limit
+    assert bool(above <= MOST) is reliable
 
 
-# Student's t at 97.5 %, of 1 to 3 degrees of freedom (tables).
+# Student's t at 97.5 % for 1 to 3 degrees of freedom, from tables.
 @pytest.mark.parametrize("contrasts, t", [([1.0, 3.0], 12.7062), ([4.0, 5.0, 6.0], 4.30265), ([1, 2, 3, 2], 3.18245)])
-def test_the_interval_is_that_of_one_more_contrast(contrasts, t):
-    """s² ± t s_c √(1 + 1/m), as the root of s²/n over the mean."""
+def test_the_interval_is_the_prediction_interval_of_one_more_contrast(contrasts, t):
+    """It is s² ± t s_c √(1 + 1/m), converted to an error by √(s²/n) / mean."""
     sums = PassSums(100, len(contrasts) + 1, np.full(SIZE, 200.0), np.zeros(SIZE), contrasts=contrasts)
     squared, half = np.mean(contrasts), t * np.std(contrasts, ddof=1) * math.sqrt(1 + 1 / len(contrasts))
-    found = relative_error(sums)
+    error = relative_error(sums)
     expected = [math.sqrt(max(x, 0) / 100) / 2 for x in (squared, squared - half, squared + half)]
-    assert [found.value, found.low, found.high] == pytest.approx(expected, rel=1e-3)  # t has six digits
+    assert [error.value, error.low, error.high] == pytest.approx(expected, rel=1e-3)  # t has six digits
 
 
-def test_little_is_known_of_one_pass_of_black_or_without_scipy(monkeypatch):
-    nine = sums_of(noisy("normal", np.ones(SIZE), 4) for _ in range(9))
+def test_the_error_of_one_pass_or_a_black_image_and_the_interval_of_two_passes_are_unknown():
     assert math.isnan(relative_error(leaf(np.ones(SIZE))).value)
     assert math.isnan(relative_error(sums_of([np.zeros(SIZE)] * 9)).value)
     two = relative_error(sums_of(noisy("normal", np.ones(SIZE), 4) for _ in range(2)))
     assert two.value > 0 and math.isnan(two.high) and not two.high <= 1 and not RelativeError(math.nan).high <= 1
+
+
+def test_there_is_no_interval_without_scipy(monkeypatch):
+    nine = sums_of(noisy("normal", np.ones(SIZE), 4) for _ in range(9))
     require_interval()
     monkeypatch.setitem(sys.modules, "scipy.stats", None)
     assert relative_error(nine).value > 0 and math.isnan(relative_error(nine).high)
@@ -123,7 +126,7 @@ def test_little_is_known_of_one_pass_of_black_or_without_scipy(monkeypatch):
         require_interval()
 
 
-def test_pixels_that_are_not_finite_are_left_out():
+def test_non_finite_pixels_are_left_out():
     images = [noisy("normal", np.ones(SIZE), 4) for _ in range(32)]
     images[3][0, 0, 0], images[3][1, 1] = np.nan, np.inf
     sums = sums_of(images)
@@ -134,11 +137,11 @@ def test_pixels_that_are_not_finite_are_left_out():
 @pytest.mark.parametrize(
     ("side", "truth", "noise", "expected"),
     [
-        (192, 1.0, {(16, 16): 5, (32, 32): 1}, 1 / 4),  # of 144 tiles one has 5 in place of 0.1, and three have 1
-        (64, 0.0, {}, 0.01 / 4),  # a dark tile is judged as if it had 1 % of the mean
+        (192, 1.0, {(16, 16): 5, (32, 32): 1}, 1 / 4),  # of 144 tiles, one has the noise 5, three 1 and all others 0.1
+        (64, 0.0, {}, 0.01 / 4),  # a dark tile counts as if it had 1 % of the mean
     ],
 )
-def test_the_worst_tile_but_one_in_a_hundred(side, truth, noise, expected):
+def test_the_worst_tile_leaves_out_one_percent_of_the_tiles(side, truth, noise, expected):
     image, deviation = np.ones((side, side, 1)), np.full((side, side, 1), 0.1 if noise else 1e-4)
     image[:16, :16] = truth
     for (height, width), value in reversed(noise.items()):

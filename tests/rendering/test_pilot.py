@@ -1,4 +1,4 @@
-"""Settings that replace those of a scene, by hand or as a pilot chooses them."""
+"""Settings that replace those of a scene: given by the user, or chosen by a pilot."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from mi_refract.rendering.scene_files import load_parsed, parse_scene
 BALLS, GLASS_ONLY = SCENES / "balls.xml", {"res": "24"}
 SPLIT = "sampler=multijitter,integrator=refract_path,split_depth=1"
 
-# The choice, from figures ---------------------------------------------------------------------------------------------
+# The choice, from made-up measurements --------------------------------------------------------------------------------
 
 
 PLAIN = "sampler=multijitter,integrator=refract_path"
@@ -38,15 +38,18 @@ LAMPS = f"{DEEP},caustics=lamp"
 
 
 def made_up(costs, light=1.0, seconds=10_000, lamps=0.1, found=None, rare=()):
-    """A pilot whose candidates have variances and times by the text of their settings; else 1 and 1.
+    """Return a pilot with made-up measurements.
 
-    `lamps`: the brightness of what lamps light; `found`: samples of it in a batch of so many pixels, channels × pixels
-    × COPIES × samples. Candidates that are `rare` have one sample in the first pixel that has a variance of 10⁶ alone.
+    `costs`: variance and time of candidates, by the text of their settings; 1 and 1 for all others. `lamps`: mean light
+    of lamps. `found`: returns the samples of this light that path tracing finds, for a number of pixels, channels ×
+    pixels × COPIES × samples. `rare`: candidates with one bright sample in the first pixel that alone has a variance of
+    10⁶.
     """
-    asked = []
+    batches = []
 
     def measure(settings, number, size):
-        asked.append((name := settings_text(settings), number))
+        name = settings_text(settings)
+        batches.append((name, number))
         variance, time = costs.get(name, (1, 1))
         means = light + math.sqrt(variance) * np.random.default_rng(number).normal(size=(1, size, 2))
         if name in rare and number == 0:
@@ -59,11 +62,11 @@ def made_up(costs, light=1.0, seconds=10_000, lamps=0.1, found=None, rare=()):
     candidates = [parse_settings(text) for text in (OWN, PLAIN, DEEP, *[LAMPS] * (found is not None))]
     methods = {"measure": measure, "allowed": lambda t: seconds}
     parsed = SimpleNamespace(path="made-up.xml")
-    return SimpleNamespace(candidates=candidates, first=64, asked=asked, parsed=parsed, **methods)
+    return SimpleNamespace(candidates=candidates, first_pixels=64, batches=batches, parsed=parsed, **methods)
 
 
 def finds(share, size, both=False):
-    """Of a share of passes each has one sample of a brightness `size`; `both`: the copies of a pixel have it alike."""
+    """Return a `found` with a sample of brightness `size` in one pass of a share of the pixels; `both`: in both."""
 
     def found(pixels):
         x = np.zeros((1, pixels, 2, 16))
@@ -74,33 +77,33 @@ def finds(share, size, both=False):
 
 
 CHOICES = {
-    "all are alike": ({}, {}, OWN),
+    "all cost the same": ({}, {}, OWN),
     "a stratified sampler": ({PLAIN: (0.5, 1.2), DEEP: (0.5, 2)}, {}, PLAIN),
     "less noise, but slower": ({PLAIN: (0.5, 2.2), DEEP: (0.5, 2.2)}, {}, OWN),
     "splitting": ({PLAIN: (0.7, 1), DEEP: (0.1, 2)}, {}, DEEP),
     "splitting that hardly pays": ({PLAIN: (0.5, 1), DEEP: (0.48, 1)}, {}, PLAIN),
     "no noise": ({OWN: (0, 1), PLAIN: (0, 1), DEEP: (1e-20, 1)}, {}, OWN),
-    # Rare and bright samples: what has less in it has met none of them, and is no better for that.
-    "rare samples, met where glass is split": ({DEEP: (0.5, 3)}, {"rare": (DEEP,)}, PLAIN),
-    "rare samples, met by all but the scene's own": ({DEEP: (0.5, 3)}, {"rare": (DEEP, PLAIN)}, PLAIN),
-    # Lamps: they cost three times as much time. Light of them, 0.1, has been found in samples of a brightness.
+    # Rare and bright samples: candidates that have missed them seem to have less noise.
+    "rare samples, only where glass is split": ({DEEP: (0.5, 3)}, {"rare": (DEEP,)}, PLAIN),
+    "rare samples, missed by the scene's own": ({DEEP: (0.5, 3)}, {"rare": (DEEP, PLAIN)}, PLAIN),
+    # Tracing lamps takes three times as long. The mean of their light is 0.1 unless `lamps` gives it.
     "lamps, found evenly": ({LAMPS: (1, 3)}, {"found": finds(1.0, 1.6, both=True)}, OWN),
     "lamps, found in a few bright samples": ({LAMPS: (1, 3)}, {"found": finds(1 / 64, 640)}, LAMPS),
-    # Both copies of a pixel have one such sample: they differ by nothing, and yet it is noise.
-    "lamps, found in two bright samples that are alike": (
+    # Both passes of one pixel have such a sample: their difference is 0, yet there is noise.
+    "lamps, found in two equal bright samples": (
         {LAMPS: (1, 3)},
         {"found": finds(1 / 64, 640, both=True), "seconds": 1000},
         LAMPS,
     ),
-    "lamps, of whose little light much is found": ({LAMPS: (1, 3)}, {"found": finds(1 / 64, 640), "lamps": 1e-3}, OWN),
-    "lamps, of whose light nothing is found": ({LAMPS: (1, 3)}, {"found": finds(0, 0), "lamps": 0.3}, LAMPS),
-    "lamps, of whose little light nothing is found": ({LAMPS: (1, 3)}, {"found": finds(0, 0), "lamps": 1e-3}, OWN),
+    "faint lamps, found": ({LAMPS: (1, 3)}, {"found": finds(1 / 64, 640), "lamps": 1e-3}, OWN),
+    "lamps, not found": ({LAMPS: (1, 3)}, {"found": finds(0, 0), "lamps": 0.3}, LAMPS),
+    "faint lamps, not found": ({LAMPS: (1, 3)}, {"found": finds(0, 0), "lamps": 1e-3}, OWN),
 }
 
 
-@pytest.mark.parametrize("costs, named, expected", CHOICES.values(), ids=CHOICES)
-def test_the_cheapest_is_chosen_unless_the_scenes_own_are_alike(costs, named, expected):
-    choice = choose(made_up(costs, **named))
+@pytest.mark.parametrize("costs, options, expected", CHOICES.values(), ids=CHOICES)
+def test_the_cheapest_candidate_is_chosen_unless_the_scenes_own_is_similar(costs, options, expected):
+    choice = choose(made_up(costs, **options))
     assert settings_text(choice.settings) == choice.figures["of"] == expected
     assert choice.figures["costs"][expected]["value"] == 1
     for cost in choice.figures["costs"].values():
@@ -108,65 +111,65 @@ def test_the_cheapest_is_chosen_unless_the_scenes_own_are_alike(costs, named, ex
         assert cost["value"] == pytest.approx(cost["variance"] * cost["time"], rel=0.01)
 
 
-def test_a_candidate_that_cannot_win_has_one_batch_and_seconds_end_the_pilot():
+def test_the_second_batch_omits_losers_and_is_skipped_without_time():
     pilot = made_up({OWN: (100, 1)})
     choose(pilot)
-    assert pilot.asked == [(OWN, 0), (PLAIN, 0), (DEEP, 0), (PLAIN, 1), (DEEP, 1)]
-    # The light of lamps is that of the candidate before, which is measured on as long as they are.
+    assert pilot.batches == [(OWN, 0), (PLAIN, 0), (DEEP, 0), (PLAIN, 1), (DEEP, 1)]
+    # The light of lamps is measured with the candidate before, so this one is kept with them.
     pilot = made_up({OWN: (1e6, 1), DEEP: (1, 20)}, seconds=1e5, found=finds(1.0, 1.6, both=True))
     choose(pilot)
-    assert pilot.asked[4:] == [(PLAIN, 1), (DEEP, 1), (LAMPS, 1)]
-    short = made_up({}, seconds=64 * 2 * (3 + 1))  # three candidates have had one batch, and one more is a third
-    assert choose(short).figures["seconds"] == 64 * 2 * 3 and {number for _, number in short.asked} == {0}
+    assert pilot.batches[4:] == [(PLAIN, 1), (DEEP, 1), (LAMPS, 1)]
+    short = made_up({}, seconds=64 * 2 * (3 + 1))  # enough for the three first batches and one more, not for three more
+    assert choose(short).figures["seconds"] == 64 * 2 * 3 and {number for _, number in short.batches} == {0}
 
 
-def test_the_interval_holds_the_ratio_as_often_as_it_says():
-    """95 % of a normal distribution; the time is exact here, and its share of the interval is small."""
+def test_the_interval_of_a_ratio_contains_it_with_95_percent():
+    """For normally distributed noise. The times are exact here, and their error is a small part of the interval."""
     inside, rng = 0, np.random.default_rng(1)
     for _ in range(200):
-        scale = rng.exponential(size=(1, 500, 1))  # of a pixel, in both
+        scale = rng.exponential(size=(1, 500, 1))  # of each pixel, for both candidates
         own, other = (Passes(factor * scale * rng.normal(size=(1, 500, 2)), 1.0) for factor in (1, 0.5))
-        found = ratios({OWN: own, PLAIN: other}, OWN)[PLAIN]
-        inside += found.low <= 0.25 <= found.high
-        assert found.time == 1 and found.low < found.value < found.high
+        ratio = ratios({OWN: own, PLAIN: other}, OWN)[PLAIN]
+        inside += ratio.low <= 0.25 <= ratio.high
+        assert ratio.time == 1 and ratio.low < ratio.value < ratio.high
     assert 0.9 < inside / 200 <= 1
     assert ratios({OWN: own}, OWN)[OWN].value == 1
-    nothing = Passes(np.full((1, 500, 2), math.nan), 1.0)
-    assert ratios({OWN: own, PLAIN: nothing}, OWN)[PLAIN].high == math.inf
+    not_finite = Passes(np.full((1, 500, 2), math.nan), 1.0)
+    assert ratios({OWN: own, PLAIN: not_finite}, OWN)[PLAIN].high == math.inf
 
 
-def test_a_pilot_without_light_is_an_error():
+def test_a_pilot_that_sees_no_light_is_an_error():
     with pytest.raises(ValueError, match="auto: the pilot sees no light; expected"):
         choose(made_up(dict.fromkeys((OWN, PLAIN, DEEP), (0, 1)), light=0.0))
 
 
-# Settings by hand -----------------------------------------------------------------------------------------------------
+# Settings given by the user -------------------------------------------------------------------------------------------
 
-BAD = {
-    "nothing": ("", "''; expected auto, or sampler=…, integrator=…, split_depth=…"),
+INVALID = {
+    "empty": ("", "''; expected auto, or sampler=…, integrator=…, split_depth=…"),
     "an unknown name": ("smapler=independent", "expected auto, or sampler=…"),
-    "auto and more": ("auto,split_depth=1", "'auto'; expected"),
+    "auto and another": ("auto,split_depth=1", "'auto'; expected"),
     "an unknown sampler": ("sampler=sobol", "sampler = 'sobol'; expected multijitter, stratified"),
     "an unknown integrator": ("integrator=volpath", "integrator = 'volpath'; expected path, refract_path"),
     "no depth": ("split_depth=", "split_depth = ''; expected 0 to 64"),
     "a negative depth": ("split_depth=-1", "split_depth = '-1'; expected 0 to 64"),
     "a space": ("sampler= independent", "sampler = ' independent'"),
     "twice": ("split_depth=1,split_depth=2", "split_depth is given twice; expected once"),
-    "path that splits": ("split_depth=1", "`path` has no split_depth; expected integrator=refract_path"),
+    "split depth of path": ("split_depth=1", "`path` has no split_depth; expected integrator=refract_path"),
     "too deep": ("integrator=refract_path,split_depth=65", "split_depth = '65'; expected 0 to 64"),
 }
 
 
 @pytest.mark.usefixtures("scalar_variant")
-@pytest.mark.parametrize("text, message", BAD.values(), ids=BAD)
-def test_settings_that_are_wrong(tmp_path, text, message):
+@pytest.mark.parametrize("text, message", INVALID.values(), ids=INVALID)
+def test_invalid_settings_are_refused(tmp_path, text, message):
     with pytest.raises(ValueError) as error:
         resume(Job(BALL, settings=text), tmp_path / "a.exr")
     assert message in str(error.value) and "\n" not in str(error.value) and not [*tmp_path.iterdir()]
 
 
 @pytest.mark.usefixtures("scalar_variant")
-def test_settings_replace_plugins_and_keep_what_both_have():
+def test_settings_replace_plugins_and_keep_common_parameters():
     parsed = parse_scene(BALL, {"res": "8", "max_depth": "7"})
     assert with_settings(parsed, {}) is parsed
     scene = load_parsed(with_settings(parsed, parse_settings(SPLIT)))
@@ -180,12 +183,16 @@ def test_settings_replace_plugins_and_keep_what_both_have():
 
 
 @pytest.mark.usefixtures("scalar_variant")
-def test_a_sampler_comes_to_a_sensor_that_has_none_and_keeps_its_own_parameters(tmp_path):
+def test_a_sampler_is_added_to_a_sensor_without_one(tmp_path):
     (tmp_path / "a.xml").write_text(
         '<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"/></scene>'
     )
     parsed = with_settings(parse_scene(tmp_path / "a.xml"), {"sampler": "stratified"})
     assert "Stratified" in str(load_parsed(parsed).sensors()[0].sampler())
+
+
+@pytest.mark.usefixtures("scalar_variant")
+def test_only_a_sampler_of_the_same_plugin_keeps_its_own_parameters(tmp_path):
     own = '<sampler type="multijitter"><boolean name="jitter" value="false"/></sampler>'
     (tmp_path / "a.xml").write_text(GLASS.replace('<sampler type="independent">', own[:-10] + "<!-- -->"))
     for name, jitter in {"multijitter": False, "stratified": True}.items():
@@ -195,7 +202,7 @@ def test_a_sampler_comes_to_a_sensor_that_has_none_and_keeps_its_own_parameters(
 
 
 @pytest.mark.usefixtures("scalar_variant")
-def test_scenes_that_a_pilot_cannot_measure(tmp_path):
+def test_a_pilot_needs_a_jit_variant(tmp_path):
     with pytest.raises(ValueError, match=r"samples cannot be rendered one by one; expected .* llvm_ad_rgb"):
         resume(Job(BALL, {"res": "8"}, settings=AUTO), tmp_path / "a.exr")
     assert not [*tmp_path.iterdir()]
@@ -204,108 +211,112 @@ def test_scenes_that_a_pilot_cannot_measure(tmp_path):
 # A pilot of a scene ---------------------------------------------------------------------------------------------------
 
 
-def header_and_bits(output, **named):
-    header = render_to_exr(BALLS, output, defines=GLASS_ONLY, **named)
+def header_and_pixels(output, **options):
+    header = render_to_exr(BALLS, output, defines=GLASS_ONLY, **options)
     return header, pixels(output)
 
 
-def test_the_choice_is_repeated_by_hand_bit_for_bit_kept_and_where_only_glass_makes_noise_splits(tmp_path, llvm):
-    """There splitting has a hundredth of the variance."""
-    header, chosen = header_and_bits(tmp_path / "a.exr", spp=16, settings=AUTO)
+def test_chosen_settings_split_at_glass_and_give_the_bits_of_the_same_settings_by_name(tmp_path, llvm):
+    """Only glass makes noise in this scene, and splitting has a hundredth of the variance."""
+    header, chosen = header_and_pixels(tmp_path / "a.exr", spp=16, settings=AUTO)
     settings = header["mi_refract:settings"]
     assert "integrator=refract_path,split_depth=" in settings and not settings.endswith("=0")
     figures = json.loads(header["mi_refract:identity"])["pilot"]
     assert figures["costs"][settings]["value"] == 1 and figures["costs"][OWN]["value"] > 2
-    by_hand, bits = header_and_bits(tmp_path / "b.exr", spp=16, settings=settings)
-    np.testing.assert_array_equal(bits, chosen)
-    assert by_hand["mi_refract:settings"] == settings and "pilot" not in json.loads(by_hand["mi_refract:identity"])
-    # The finished image is refined with the settings that it has; a plain render replaces it.
+    header, by_name = header_and_pixels(tmp_path / "b.exr", spp=16, settings=settings)
+    np.testing.assert_array_equal(by_name, chosen)
+    assert header["mi_refract:settings"] == settings and "pilot" not in json.loads(header["mi_refract:identity"])
+    # The finished image is refined with its own settings. A render with the scene's own settings replaces it.
     again = resume(Job(BALLS, GLASS_ONLY, settings=AUTO), tmp_path / "a.exr", Limits(spp=16))
-    assert again.end() == "16 spp"  # nothing is measured, and no old figures are printed as if they were new
+    assert again.end() == "16 spp"  # no pilot runs, and the figures of the earlier one are not printed
     assert again.pilot_lines() == [f"the pilot of an earlier command has chosen --settings {settings}"]
     assert resume(Job(BALLS, GLASS_ONLY), tmp_path / "a.exr", Limits(spp=16)).progress.passes == 0
-    # Workers are sent the scene with its settings.
+    # Workers receive the scene with its settings.
     assert pack(again.parsed).nodes == with_settings(parse_scene(BALLS, GLASS_ONLY), parse_settings(settings)).nodes
 
 
-def test_a_checkpoint_keeps_the_choice(tmp_path, llvm):
+def test_a_checkpoint_keeps_the_chosen_settings(tmp_path, llvm):
     class Stop(Exception):
         pass
 
     def stop(render):
         raise Stop
 
-    def begun(settings, restart=False):
+    def render_with(settings, restart=False):
         limits = Limits(spp=32, pass_spp=16)
         return resume(Job(BALLS, GLASS_ONLY, settings=settings), tmp_path / "a.exr", limits, restart=restart)
 
     with pytest.raises(Stop):
-        begun(AUTO).run(stop)
-    resumed = begun(AUTO)
+        render_with(AUTO).run(stop)
+    resumed = render_with(AUTO)
     assert resumed.progress.passes == 1
     settings = resumed.progress.identity["settings"]
-    assert settings != OWN and begun(settings).progress.passes == 1
+    assert settings != OWN and render_with(settings).progress.passes == 1
     for other in (OWN, "sampler=ldsampler"):
         with pytest.raises(CheckpointError, match=f"settings was {settings}, is {other}; pass --restart"):
-            begun(other)
+            render_with(other)
     resumed.run()
-    bits = pixels(tmp_path / "a.exr")
-    begun(settings, restart=True).run()
-    np.testing.assert_array_equal(pixels(tmp_path / "a.exr"), bits)
+    image = pixels(tmp_path / "a.exr")
+    render_with(settings, restart=True).run()
+    np.testing.assert_array_equal(pixels(tmp_path / "a.exr"), image)
     with pytest.raises(Stop):
-        begun(OWN, restart=True).run(stop)
+        render_with(OWN, restart=True).run(stop)
     with pytest.raises(CheckpointError, match=f"settings was {OWN}, is auto; pass --restart"):
-        begun(AUTO)
+        render_with(AUTO)
 
 
-def test_the_time_of_light_paths_has_no_compilation_in_it(tmp_path, llvm, monkeypatch):
-    """The second trace compiles again where Dr.Jit's cache of kernels is empty."""
+def test_the_time_of_light_paths_excludes_compilation(tmp_path, llvm, monkeypatch):
+    """The second trace compiles again if Dr.Jit's cache of kernels is empty."""
     lamp = '<shape type="rectangle"><emitter type="area"/></shape>'
     (tmp_path / "a.xml").write_text(GLASS.replace('<emitter type="constant"/>', lamp))
-    parsed, took = parse_scene(tmp_path / "a.xml"), []
+    parsed, seconds = parse_scene(tmp_path / "a.xml"), []
     renderer = pass_renderer(load_parsed(parsed), 0)
 
-    def trace(*args, **named):
-        took.append(100 if len(took) < 2 else 1)
+    def trace(*arguments, **options):
+        seconds.append(100 if len(seconds) < 2 else 1)
         return 2 * (np.zeros((*renderer.size[::-1], 3)),)
 
     monkeypatch.setattr(lamp_tracing, "lamp_image", trace)
     pixel_count = math.prod(renderer.size)
     pilot = Pilot(parsed, renderer, lambda rounded: plan_passes(pixel_count, 16, None, rounded, moments=True))
-    pilot.clock = lambda: sum(took)
+    pilot.clock = lambda: sum(seconds)
     passes = pilot.measure({"integrator": "refract_path", "caustics": "lamp"}, 0, 8)
     assert 0 < passes.seconds < 2 * 0.25 * 16 / LIGHT_PATHS
 
 
 DARK = GLASS.replace('<emitter type="constant"/>', "")
-CANNOT = {
-    "no light": (DARK, {}, "auto: the pilot sees no light; expected some"),
+UNMEASURABLE = {
+    "no light": (DARK, "auto: the pilot sees no light; expected some"),
     "a film with a border": (
         GLASS.replace("</film>", '<boolean name="sample_border" value="true"/></film>'),
-        {},
         "samples cannot be rendered one by one; expected an integrator of samples, a film without a border",
     ),
 }
 
 
-@pytest.mark.parametrize("text, named, message", CANNOT.values(), ids=CANNOT)
-def test_what_a_pilot_cannot_choose_for_is_an_error_and_nothing_is_written(tmp_path, llvm, text, named, message):
-    (tmp_path / "a.xml").write_text(text)
+@pytest.mark.parametrize("scene, message", UNMEASURABLE.values(), ids=UNMEASURABLE)
+def test_a_scene_that_a_pilot_cannot_measure_is_an_error(tmp_path, llvm, scene, message):
+    (tmp_path / "a.xml").write_text(scene)
     with pytest.raises(ValueError) as error:
-        resume(Job(tmp_path / "a.xml", settings=AUTO), tmp_path / "a.exr", Limits(**named))
-    assert (
-        message in str(error.value) and "\n" not in str(error.value) and [*tmp_path.iterdir()] == [tmp_path / "a.xml"]
-    )
+        resume(Job(tmp_path / "a.xml", settings=AUTO), tmp_path / "a.exr")
+    assert message in str(error.value) and "\n" not in str(error.value)
+    assert [*tmp_path.iterdir()] == [tmp_path / "a.xml"]
 
 
-NO_NOISE = {
-    "no sampler of Mitsuba's": ("fixed", "the scene's sampler is fixed; expected multijitter, .*, or settings by name"),
-    # Its error is the same in all copies of a pixel, so its variance says nothing.
-    "the middles of cells": ("multijitter", "the scene's sampler is multijitter without jitter; expected multijitter"),
+UNSUITABLE_SAMPLERS = {
+    "a sampler that is not Mitsuba's": (
+        "fixed",
+        "the scene's sampler is fixed; expected multijitter, .*, or settings by name",
+    ),
+    # Its error is the same in all passes of a pixel, so they show no variance.
+    "a sampler without jitter": (
+        "multijitter",
+        "the scene's sampler is multijitter without jitter; expected multijitter",
+    ),
 }
 
 
-@pytest.mark.parametrize("sampler, message", NO_NOISE.values(), ids=NO_NOISE)
+@pytest.mark.parametrize("sampler, message", UNSUITABLE_SAMPLERS.values(), ids=UNSUITABLE_SAMPLERS)
 def test_a_sampler_whose_noise_cannot_be_measured_is_an_error(tmp_path, llvm, sampler, message):
     class Fixed(mi.Sampler):
         pass
@@ -319,23 +330,23 @@ def test_a_sampler_whose_noise_cannot_be_measured_is_an_error(tmp_path, llvm, sa
         resume(job, tmp_path / "a.exr", Limits(spp=4, pass_spp=4))
 
 
-def test_the_time_of_a_render_has_its_pilot_in_it(tmp_path, llvm, monkeypatch):
-    """A clock that a look moves by a second, and the pilot beyond the limit: one pass is rendered."""
+def test_the_time_limit_of_a_render_includes_its_pilot(tmp_path, llvm, monkeypatch):
+    """Each reading of the clock moves it by a second, and the pilot exceeds the limit: one pass is rendered."""
     clock = itertools.count()
     monkeypatch.setattr(time, "monotonic", lambda: float(next(clock)))
 
-    def chosen(pilot):
+    def slow_choice(pilot):
         for _ in range(60):
             time.monotonic()
         return Choice({}, {"seconds": 60.0, "of": OWN, "costs": {}})
 
-    monkeypatch.setattr(long_render, "choose", chosen)
+    monkeypatch.setattr(long_render, "choose", slow_choice)
     render = resume(Job(BALL, {"res": "8"}, settings=AUTO), tmp_path / "a.exr", Limits(seconds=60, pass_spp=1))
     render.run()
     assert render.progress.passes == 1 and render.ended_by == "--time 60 s"
 
 
-def test_a_scene_with_another_integrator_keeps_it(tmp_path, llvm):
+def test_a_scene_keeps_an_integrator_other_than_path(tmp_path, llvm):
     (tmp_path / "a.xml").write_text(re.sub("<integrator.*/integrator>", '<integrator type="depth"/>', GLASS))
     render = resume(Job(tmp_path / "a.xml", settings=AUTO), tmp_path / "a.exr", Limits(spp=4))
     costs = render.progress.identity["pilot"]["costs"]

@@ -1,4 +1,4 @@
-"""One pass: Mitsuba's image, with the same bits on any number of threads, and the second moments of its samples."""
+"""One pass: its image is Mitsuba's, with the same bits for any number of threads, and with second moments."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mi_refract.rendering.render_pass import pass_renderer
 from mi_refract.rendering.sample_sums import Film, image_sums
 from mi_refract.rendering.scene_files import load_scene
 
-# The sums of Mitsuba are in float32, under a wide filter of 25 pixels' samples.
+# Mitsuba sums in float32, with a wide filter over the samples of 25 pixels.
 CLOSE = {"rtol": 2e-5, "atol": 2e-6}
 WIDTH, HEIGHT = 5, 3
 
@@ -29,11 +29,10 @@ def scene_of(tmp_path, rfilter="box", pixel_format="rgb", more=(), **defines):
     return load_scene(tmp_path / "scene.xml", {"res": "16"} | defines)
 
 
-def by_mitsuba(scene, number, spp, seed=3):
-    """The whole film of a pass, all channels."""
-    mi.render(
-        scene, spp=spp, seed=seed_of(seed, number) if dr.is_jit_v(mi.Float) else scalar_seed_of(seed, number, 256)
-    )
+def mitsuba_image(scene, number, spp, seed=3):
+    """Return all channels of a pass as rendered by `mi.render`."""
+    pass_seed = seed_of(seed, number) if dr.is_jit_v(mi.Float) else scalar_seed_of(seed, number, 256)
+    mi.render(scene, spp=spp, seed=pass_seed)
     image = np.array(scene.sensors()[0].film().bitmap())
     return image.reshape(*image.shape[:2], -1)
 
@@ -65,7 +64,7 @@ IMAGES = [  # every kind of variant, filter and format
 
 @pytest.mark.parametrize(("variant", "rfilter", "pixel_format", "options"), IMAGES)
 def test_a_pass_is_mitsubas_image(tmp_path, needs_variant, variant, rfilter, pixel_format, options):
-    """Of `refract_path`, too, which seeds its splits: two passes with the same numbers would not be independent."""
+    """Also with `refract_path`, which seeds its splits, or passes would not be independent."""
     needs_variant(variant)
     mi.set_variant(variant)
     scene = scene_of(tmp_path, rfilter, pixel_format, **options)
@@ -74,10 +73,10 @@ def test_a_pass_is_mitsubas_image(tmp_path, needs_variant, variant, rfilter, pix
     renderer = pass_renderer(scene, 3)
     assert renderer.moments == variant.startswith("llvm")
     for number, spp in ((0, 13), (5, 13)):
-        found = renderer.render(number, spp).mean
-        expected = by_mitsuba(scene, number, spp)
-        assert found.shape == expected.shape == (*renderer.size[::-1], len(renderer.channels))
-        np.testing.assert_allclose(found, expected, **CLOSE)
+        image = renderer.render(number, spp).mean
+        expected = mitsuba_image(scene, number, spp)
+        assert image.shape == expected.shape == (*renderer.size[::-1], len(renderer.channels))
+        np.testing.assert_allclose(image, expected, **CLOSE)
     assert renderer.colours == (1 if pixel_format == "luminance" else 3)
     np.testing.assert_array_equal(renderer.render(0, 13).total, renderer.render(0, 13).total)
     if options.get("more") == OUTPUTS:
@@ -87,13 +86,13 @@ def test_a_pass_is_mitsubas_image(tmp_path, needs_variant, variant, rfilter, pix
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"])
 @pytest.mark.parametrize("rfilter", ["gaussian", "lanczos"])
 def test_a_wide_filters_sums_are_those_of_mitsubas_film(tmp_path, needs_variant, variant, rfilter):
-    """Totals and weights apart: a mean over passes of their quotients would be biased."""
+    """Totals and weights are separate, because a mean of their quotients over passes would be biased."""
     needs_variant(variant)
     mi.set_variant(variant)
     scene = scene_of(tmp_path, rfilter)
     renderer = pass_renderer(scene, 3)
     sums = renderer.render(0, 2)
-    by_mitsuba(scene, 0, 2)
+    mitsuba_image(scene, 0, 2)
     raw = np.array(scene.sensors()[0].film().bitmap(raw=True))
     assert raw.shape == (16, 16, 4) and np.ptp(raw[..., 3]) > 1
     np.testing.assert_allclose(sums.total * renderer.expected, raw[..., :3], **CLOSE)
@@ -101,13 +100,13 @@ def test_a_wide_filters_sums_are_those_of_mitsubas_film(tmp_path, needs_variant,
 
 
 @pytest.mark.parametrize("rfilter", ["gaussian", "lanczos", "tent"])
-def test_the_weights_of_a_wide_filter_are_those_expected(tmp_path, llvm, rfilter):
-    """On average they are spp in every pixel, also at the border, which fewer samples reach."""
+def test_the_mean_weight_of_a_wide_filter_is_spp_in_every_pixel(tmp_path, llvm, rfilter):
+    """Also at the border, which fewer samples reach."""
     renderer = pass_renderer(scene_of(tmp_path, rfilter), 3)
-    found = np.array([renderer.render(number, 4).weights for number in range(64)])
-    error = found.std(0, ddof=1) / 8
-    # Of 256 means, with the standard error from 64 values: beyond 6 of them less than once in 1e4 runs.
-    assert np.all(np.abs(found.mean(0) - 4) < 6 * error) and error.max() < 0.2
+    weights = np.array([renderer.render(number, 4).weights for number in range(64)])
+    error = weights.std(0, ddof=1) / 8
+    # One of 256 means is beyond 6 standard errors, estimated from 64 values, less than once in 1e4 runs.
+    assert np.all(np.abs(weights.mean(0) - 4) < 6 * error) and error.max() < 0.2
     assert np.ptp(renderer.expected) > 0.1
 
 
@@ -117,33 +116,33 @@ def test_the_weights_of_a_wide_filter_are_those_expected(tmp_path, llvm, rfilter
     [({"type": "box"}, 0.5, 1.0), ({"type": "tent", "radius": 3.0}, 3.0, (3 * 1.5) ** 2)]
     + [({"type": "gaussian", "stddev": x}, 4 * x, 4 * np.pi * x**2) for x in (1.0, 3.0)],
 )
-def test_the_file_says_how_wide_the_filter_is(needs_variant, variant, rfilter, radius, area):
-    """(∫∫w)²/∫∫w²; of a Gaussian that ends nowhere, and Mitsuba's ends at four standard deviations."""
+def test_the_header_contains_radius_and_area_of_the_filter(needs_variant, variant, rfilter, radius, area):
+    """The area is (∫∫w)²/∫∫w². Of a Gaussian it is that of an infinite one; Mitsuba's ends at 4 standard deviations."""
     needs_variant(variant)
     mi.set_variant(variant)
     film = {"type": "hdrfilm", "width": 4, "height": 4, "filter": rfilter}
     scene = mi.load_dict(
         {"type": "scene", "integrator": {"type": "path"}, "sensor": {"type": "perspective", "film": film}}
     )
-    found = pass_renderer(scene, 0).filter_header
-    assert found["mi_refract:filter_radius"] == radius
-    assert found["mi_refract:filter_area"] == pytest.approx(area, rel=0.01)
+    header = pass_renderer(scene, 0).filter_header
+    assert header["mi_refract:filter_radius"] == radius
+    assert header["mi_refract:filter_area"] == pytest.approx(area, rel=0.01)
 
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
 @pytest.mark.parametrize("spp", [7, 8])
-def test_the_number_of_threads_does_not_show(tmp_path, llvm, rfilter, spp):
+def test_the_bits_do_not_depend_on_the_number_of_threads(tmp_path, llvm, rfilter, spp):
     renderer, threads = pass_renderer(scene_of(tmp_path, rfilter, res="64"), 3), dr.thread_count()
     try:
-        found = []
+        renders = []
         for count in (1, 2, 3, 3):
             dr.set_thread_count(count)
-            found.append(renderer.render(0, spp))
+            renders.append(renderer.render(0, spp))
     finally:
         dr.set_thread_count(threads)
-    for sums in found[1:]:
-        np.testing.assert_array_equal(sums.total, found[0].total)
-        np.testing.assert_array_equal(sums.within, found[0].within)
+    for sums in renders[1:]:
+        np.testing.assert_array_equal(sums.total, renders[0].total)
+        np.testing.assert_array_equal(sums.within, renders[0].within)
 
 
 DIM = """
@@ -162,28 +161,33 @@ print(pass_renderer(scene, 0).render(0, 4).total.sum())
 """
 
 
-def test_one_thread_takes_denormals_for_0_as_several_do(llvm):
-    """The caller's own thread keeps them, in a process that has rendered nothing before."""
-    found = []
+def test_a_render_in_one_thread_flushes_denormals_as_in_several(llvm):
+    """The caller's own thread keeps denormals in a process that has rendered nothing before."""
+    totals = []
     for count in (1, 3):
         with python(DIM, count) as process:
-            found.append(process.communicate(timeout=120)[0].splitlines()[-1])
-    assert found[0] == found[1]
+            totals.append(process.communicate(timeout=120)[0].splitlines()[-1])
+    assert totals[0] == totals[1]
 
 
-def test_an_integrator_with_a_render_of_its_own_runs_in_one_thread(tmp_path, llvm, monkeypatch):
+def test_an_integrator_with_its_own_render_method_runs_in_one_thread(tmp_path, llvm, monkeypatch):
     scene = scene_of(tmp_path, "gaussian", integrator="ptracer")
     renderer, threads = pass_renderer(scene, 3), dr.thread_count()
     assert not renderer.moments
     counts, render = [], mi.render
-    monkeypatch.setattr(mi, "render", lambda *a, **k: (counts.append(dr.thread_count()), render(*a, **k))[1])
+
+    def counting_render(*arguments, **options):
+        counts.append(dr.thread_count())
+        return render(*arguments, **options)
+
+    monkeypatch.setattr(mi, "render", counting_render)
     one, two = (renderer.render(0, 4).total for _ in range(2))
     np.testing.assert_array_equal(one, two)
     assert counts == [1, 1] and dr.thread_count() == threads
 
 
 def test_passes_of_scalar_variants_share_no_random_numbers(tmp_path):
-    """Mitsuba's sequence of pixel k of N is seed · N + k, modulo 2³²: by `seed_of` these two would be the same."""
+    """Pixel k of N has Mitsuba's sequence seed · N + k, modulo 2³². With `seed_of` these two passes would be equal."""
     mi.set_variant("scalar_rgb")
     renderer = pass_renderer(scene_of(tmp_path, res="64"), 0)
     same = (np.array(mi.render(renderer.scene, spp=1, seed=seed_of(0, number))) for number in (1105, 2867))
@@ -197,15 +201,15 @@ def test_passes_of_scalar_variants_share_no_random_numbers(tmp_path):
 
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
-def test_the_spread_of_samples_is_that_of_passes(tmp_path, llvm, rfilter):
-    """The variance from within passes, averaged over pixels, against that between 64 of them."""
+def test_the_variance_within_passes_is_that_between_passes(tmp_path, llvm, rfilter):
+    """Averaged over pixels, and compared with the variance between 64 passes."""
     renderer = pass_renderer(scene_of(tmp_path, rfilter), 3)
     passes = [renderer.render(number, 16) for number in range(64)]
     assert all((sums.within is not None) == (number < FEW - 1) for number, sums in enumerate(passes))
     between = 16 * np.var([sums.mean for sums in passes], 0, ddof=1)
     within = np.mean([sums.within / 15 for sums in passes[: FEW - 1]], 0)
-    # Of 63 and of 105 degrees of freedom in each of 256 pixels, that share samples under the wide filter: a standard
-    # error of √(2/63 · 9/256) = 3.3 % at most. Without strata the wide filter's is 13 % too large here.
+    # Both have 63 and 105 degrees of freedom in each of 256 pixels, which share samples with the wide filter. So the
+    # standard error is √(2/63 · 9/256) = 3.3 % at most. Without strata, `within` of the wide filter is 13 % too large.
     np.testing.assert_allclose(within.mean(), between.mean(), rtol=0.1)
 
 
@@ -222,24 +226,24 @@ def test_equal_samples_have_no_second_moment(llvm, rfilter):
 
 
 def sums_of(samples, *, squares=True):
-    """Under a box; `samples`: H × W × spp × C."""
+    """Return the sums with a box filter; `samples`: H × W × spp × C."""
     values = [mi.Float(samples[..., c].ravel()) for c in range(samples.shape[3])]
     return image_sums(values, None, Film(WIDTH, HEIGHT, samples.shape[2], None), squares=squares)
 
 
 @pytest.mark.parametrize("spp", [1, 2, 3, 4, 6, 7, 8, 12, 16])
 @pytest.mark.parametrize("channels", [1, 3, 5])
-def test_sums_and_squares(llvm, spp, channels):
-    """Within n roundings of the terms, also where the first sample, from which differences are taken, lies far off.
+def test_sums_and_squares_are_accurate(llvm, spp, channels):
+    """They are within n roundings of their terms, also if the first sample, from which all are subtracted, is far off.
 
-    Samples are read in rows of 1, 2, 4 or 8.
+    Samples are read 1, 2, 4 or 8 at a time.
     """
     for first in (0.5, 1e4):
         samples = np.random.default_rng(spp).random((HEIGHT, WIDTH, spp, channels), np.float32)
         samples[:, :, 0] = first
         total, weights, within = sums_of(samples)
-        bare, _, nothing = sums_of(samples, squares=False)
-        assert nothing is None and np.array_equal(bare, total)
+        total_only, _, no_squares = sums_of(samples, squares=False)
+        assert no_squares is None and np.array_equal(total_only, total)
         samples = samples.astype(np.float64)
         np.testing.assert_allclose(total, samples.sum(2), rtol=spp * 2**-52)
         mean = samples.mean(2, keepdims=True)
@@ -249,10 +253,10 @@ def test_sums_and_squares(llvm, spp, channels):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-@pytest.mark.parametrize("place", [0, 3])
-def test_what_is_not_finite_stays_in_its_pixel_and_channel(llvm, value, place):
+@pytest.mark.parametrize("number", [0, 3])
+def test_a_non_finite_sample_affects_only_its_pixel_and_channel(llvm, value, number):
     samples = np.ones((HEIGHT, WIDTH, 8, 3), np.float32)
-    samples[1, 2, place, 1] = value
+    samples[1, 2, number, 1] = value
     total, _, within = sums_of(samples)
     assert np.argwhere(~np.isfinite(total)).tolist() == [[1, 2, 1]]
     assert not within[np.isfinite(total)].any()

@@ -1,4 +1,4 @@
-"""Scene files and their bundles: what is loaded, complete elsewhere, and refused before the rendering."""
+"""Scene files and their bundles: loading here and on another machine, and errors before the rendering."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ pytestmark = pytest.mark.usefixtures("scalar_variant")
 
 @pytest.fixture
 def folder(tmp_path):
-    """scenes/, common/sky.xml, and two textures: common/bright.exr, and far/dark.exr."""
+    """Return a folder with scenes/, common/sky.xml, two spectra, and textures common/bright.exr and far/dark.exr."""
     for name in ("scenes/empty", "common/gone", "far"):
         (tmp_path / name).mkdir(parents=True)
     (tmp_path / "scenes" / "link").symlink_to(tmp_path / "far")
@@ -51,12 +51,12 @@ def folder(tmp_path):
 
 
 @pytest.fixture
-def there(tmp_path_factory):
-    """The folder of another machine."""
-    return tmp_path_factory.mktemp("there")
+def other_machine(tmp_path_factory):
+    """Return the folder of another machine."""
+    return tmp_path_factory.mktemp("other_machine")
 
 
-def written(folder, texture=BRIGHT, more=SKY):
+def write_scene(folder, texture=BRIGHT, more=SKY):
     path = folder / "scenes" / "scene.xml"
     path.write_text(SCENE.format(texture=texture, more=more))
     return path
@@ -66,11 +66,11 @@ def pack(scene, defines=None):
     return scene_bundle.pack(parse_scene(scene, defines))
 
 
-def elsewhere(folder, there, bundle):
-    """The scene of a bundle, loaded after all that it was made of has gone."""
+def load_without_originals(folder, other_machine, bundle):
+    """Load the scene of a bundle after all original files have been moved away."""
     for name in ("scenes", "common", "far"):
         (folder / name).rename(folder / f"{name}-gone")
-    return scene_bundle.load(bundle, str(mi.variant()), str(there))[0]
+    return scene_bundle.load(bundle, str(mi.variant()), str(other_machine))[0]
 
 
 def image(scene):
@@ -81,7 +81,7 @@ SPECTRUM = '<emitter type="constant"><spectrum name="radiance" filename="{folder
 
 
 @pytest.mark.parametrize(
-    ("name", "more", "defines"),
+    ("texture", "more", "defines"),
     [
         (BRIGHT, SKY, {}),
         ("{folder}/far/dark.exr", SKY, {}),
@@ -96,36 +96,37 @@ SPECTRUM = '<emitter type="constant"><spectrum name="radiance" filename="{folder
         (BRIGHT, SPECTRUM.replace("{folder}/common", "common"), {}),  # from the working folder
     ],
 )
-def test_the_same_image_elsewhere(folder, there, name, more, defines, monkeypatch):
-    """Named by `../`, also after a link, absolutely, through a <path>, by a define; a spectrum by a parameter, too."""
+def test_a_bundle_gives_the_same_image_on_another_machine(folder, other_machine, texture, more, defines, monkeypatch):
+    """Files are named by `../`, also after a link, by an absolute path, through a <path>, and by a define."""
     monkeypatch.chdir(folder)
     defines = {key: value.format(folder=folder) for key, value in defines.items()}
-    scene = written(folder, name.format(folder=folder), more.format(folder=folder))
+    scene = write_scene(folder, texture.format(folder=folder), more.format(folder=folder))
     expected = image(load_scene(scene, defines))
     bundle = pack(scene, defines)
     assert len(bundle.files) == 1
-    np.testing.assert_array_equal(image(elsewhere(folder, there, bundle)), expected)
+    np.testing.assert_array_equal(image(load_without_originals(folder, other_machine, bundle)), expected)
     assert expected.std() > 0
 
 
-def test_a_file_that_is_called_as_a_material_changes_nothing_elsewhere(folder, there):
-    scene = written(folder)
+def test_a_file_with_the_name_of_a_material_is_not_used(folder, other_machine):
+    scene = write_scene(folder)
     scene.write_text(scene.read_text().replace("</scene>", GLASS))
     (scene.parent / "diamond").write_text("no material")
     expected = image(load_scene(scene))
-    np.testing.assert_array_equal(image(elsewhere(folder, there, pack(scene))), expected)
+    np.testing.assert_array_equal(image(load_without_originals(folder, other_machine, pack(scene))), expected)
 
 
-def test_a_file_of_an_index_is_part_of_the_scene_here_and_elsewhere(folder, there):
-    scene = written(folder)
+def test_a_file_of_an_index_is_part_of_the_scene_and_its_bundle(folder, other_machine):
+    scene = write_scene(folder)
     glass = GLASS.replace("diamond", "hold(file:../far/n(1).csv)")
     scene.write_text(scene.read_text().replace("</scene>", glass))
     (folder / "far" / "n(1).csv").write_text("nm,n\n400,1.5\n700,1.5\n")
     assert parse_scene(scene).files()["hold(file:../far/n(1).csv)"].samefile(folder / "far" / "n(1).csv")
     expected = image(load_scene(scene))
-    np.testing.assert_array_equal(image(elsewhere(folder, there, pack(scene))), expected)
-    # As with the index that the file has.
-    (folder / "scenes-gone").rename(folder / "scenes"), (folder / "common-gone").rename(folder / "common")
+    np.testing.assert_array_equal(image(load_without_originals(folder, other_machine, pack(scene))), expected)
+    # The same image as with the number in the file.
+    (folder / "scenes-gone").rename(folder / "scenes")
+    (folder / "common-gone").rename(folder / "common")
     scene.write_text(scene.read_text().replace("hold(file:../far/n(1).csv)", "1.5"))
     np.testing.assert_allclose(image(load_scene(scene)), expected, rtol=1e-5)
 
@@ -140,7 +141,7 @@ PARAMETERS = """<scene version="3.0.0"><medium type="homogeneous" id="m"><rgb na
 
 @pytest.mark.parametrize("scene", [None, *sorted(SCENES.glob("*.xml"))], ids=lambda path: path and path.stem)
 def test_a_scene_is_restored_to_the_last_bit(tmp_path, scene):
-    """Every parameter, also the inverses of transforms; Mitsuba's own XML of a state loses them, and some children."""
+    """Every parameter, also the inverses of transforms. XML that Mitsuba writes loses these, and some children."""
     (tmp_path / "scene.xml").write_text(PARAMETERS)
     parsed = parse_scene(scene or tmp_path / "scene.xml")
     restored = scene_parser.restore(parsed.path, json.loads(json.dumps(parsed.nodes)))
@@ -148,64 +149,64 @@ def test_a_scene_is_restored_to_the_last_bit(tmp_path, scene):
     for a, b in pairs:
         b.file_index, b.offset = a.file_index, a.offset
     assert all(a == b for a, b in pairs) and len(pairs) > 5
-    for a, b in pairs:  # of transforms, Mitsuba compares the matrices alone
+    for a, b in pairs:  # Mitsuba compares only the matrices of transforms
         for name in (name for name in a.props.keys() if a.props.type(name).name == "Transform"):  # noqa: SIM118
             inverses = (np.array(node.props[name].inverse_transpose) for node in (a, b))
             np.testing.assert_array_equal(*inverses)
 
 
-def test_unpacked_and_loaded_once_for_each_set_of_defines(folder, there):
-    """The same files with another value are another scene, also where Mitsuba would write the same text."""
+def test_a_bundle_is_unpacked_and_loaded_once_for_each_set_of_defines(folder, other_machine):
+    """The same files with another value are another scene, also if Mitsuba would write both values alike."""
     more = '<default name="light" value="1"/><default name="size" value="1"/>'
     more += '<emitter type="constant"><float name="radiance" value="$light"/></emitter>'
     more += '<shape type="sphere"><transform name="to_world"><scale value="$size"/></transform></shape>'
-    scene = written(folder, more=more)
+    scene = write_scene(folder, more=more)
     assert len({pack(scene, {"size": size}).digest for size in ("1", "1.0000002")}) == 2
     bundles = [pack(scene, {"light": light}) for light in ("1", "1", "3")]
-    one, same, other = (scene_bundle.load(bundle, "scalar_rgb", str(there))[0] for bundle in bundles)
-    assert one is same and len([*there.iterdir()]) == 2
-    np.testing.assert_allclose(image(other), 3 * image(one), rtol=1e-6)
+    one, same, brighter = (scene_bundle.load(bundle, "scalar_rgb", str(other_machine))[0] for bundle in bundles)
+    assert one is same and len([*other_machine.iterdir()]) == 2
+    np.testing.assert_allclose(image(brighter), 3 * image(one), rtol=1e-6)
 
 
-def test_what_was_unpacked_in_part_is_unpacked_again(folder, there, monkeypatch):
-    bundle = pack(written(folder))
+def test_an_incomplete_bundle_is_unpacked_again(folder, other_machine, monkeypatch):
+    bundle = pack(write_scene(folder))
 
     def full(*_):
         raise OSError("No space left on device")
 
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
         patch.setattr(scene_bundle.Path, "write_bytes", full)
-        scene_bundle.unpack(bundle, str(there))
-    moved = scene_bundle.unpack(bundle, str(there))
+        scene_bundle.unpack(bundle, str(other_machine))
+    moved = scene_bundle.unpack(bundle, str(other_machine))
     assert {name: Path(path).read_bytes() for name, path in moved.items()} == bundle.files
 
 
-def test_the_digest_is_of_every_byte(folder):
-    before = pack(written(folder)).digest
-    assert pack(written(folder)).digest == before
+def test_the_digest_depends_on_every_byte(folder):
+    before = pack(write_scene(folder)).digest
+    assert pack(write_scene(folder)).digest == before
     content = bytearray((folder / "common" / "bright.exr").read_bytes())
     content[-1] ^= 1
     (folder / "common" / "bright.exr").write_bytes(content)
-    assert pack(written(folder)).digest != before
+    assert pack(write_scene(folder)).digest != before
 
 
-def test_too_large(folder, monkeypatch):
-    scene = written(folder)
+def test_a_bundle_that_is_too_large_is_refused_before_files_are_read(folder, monkeypatch):
+    scene = write_scene(folder)
     mi.Bitmap(np.random.default_rng(0).random((400, 400, 3), np.float32)).write(str(folder / "common" / "bright.exr"))
     message = rf"{scene}: 1\.\d MiB of files, the largest {folder}/scenes/\.\./common/bright\.exr \(1\.\d MiB\); "
     message += "the limit for a cluster is 1 MiB; raise it by --bundle-limit 2, if all workers have the memory"
     parsed = parse_scene(scene)
-    monkeypatch.delattr(scene_bundle.Path, "read_bytes")  # known before anything is in memory
+    monkeypatch.delattr(scene_bundle.Path, "read_bytes")
     with pytest.raises(ValueError, match=message):
         scene_bundle.pack(parsed, 1)
 
 
-def test_errors_name_the_files_as_they_are_here(folder, there):
-    scene = written(folder)
+def test_errors_of_a_bundle_contain_the_original_names_of_files(folder, other_machine):
+    scene = write_scene(folder)
     (folder / "common" / "bright.exr").write_bytes(b"no image")
-    with pytest.raises(ValueError, match=rf"^{scene}: .*\.\./common/bright\.exr") as caught:
-        scene_bundle.load(pack(scene), "scalar_rgb", str(there))
-    assert str(there) not in str(caught.value)
+    with pytest.raises(ValueError, match=rf"^{scene}: .*\.\./common/bright\.exr") as error:
+        scene_bundle.load(pack(scene), "scalar_rgb", str(other_machine))
+    assert str(other_machine) not in str(error.value)
 
 
 # Scene files ----------------------------------------------------------------------------------------------------------
@@ -221,7 +222,7 @@ ATTRIBUTE = '<texture type="mesh_attribute" name="ext_ior"><string name="name" v
 @pytest.mark.parametrize(
     "bsdf, formulas", [("refract", ["promoted (auto)"]), ("refract_cross", ["cross"]), ("dielectric", [])]
 )
-def test_the_formulas_of_a_scene(bsdf, formulas):
+def test_formulas_in_a_scene_are_those_of_its_refract_bsdfs(bsdf, formulas):
     assert formulas_in(load_scene(NESTED, {"res": "8", "bsdf": bsdf})) == formulas
 
 
@@ -238,7 +239,7 @@ def test_the_formulas_of_a_scene(bsdf, formulas):
         ),
     ],
 )
-def test_what_is_refused_is_named(tmp_path, parameter, defines, message):
+def test_errors_of_a_scene_name_its_file_and_the_problem(tmp_path, parameter, defines, message):
     path = NESTED if "res" in defines else tmp_path / "a.xml"
     (tmp_path / "a.xml").write_text(ABSORBING.replace("PARAMETER", parameter))
     if not message:
