@@ -241,7 +241,7 @@ def test_each_point_has_its_own_index(each_variant):
 def test_a_texture_that_holds_no_index_is_refused_and_an_edit_loses_its_light(typical_variant, index):
     checkers = {"type": "checkerboard", "color0": 1.5, "color1": texture(1.5, index)}
     for name, bad in (("int_ior", texture(1.5, index)), ("ext_ior", checkers)):
-        message = f"refract: {name}: its texture holds {index:g}; expected indices from"
+        message = f"refract: {name}: its texture contains {index:g}; expected indices from"
         assert message in refusal(load, **{name: bad})
     bsdf = load(int_ior=texture(1.5, 1.5), ext_ior=1.0)
     parameters = mi.traverse(bsdf)
@@ -280,7 +280,7 @@ def test_an_attribute_that_the_shape_does_not_have_is_refused(llvm_variant, nest
 def test_of_a_coloured_texture_the_luminance_is_the_index(needs_variant):
     needs_variant("llvm_ad_rgb")
     mi.set_variant("llvm_ad_rgb")
-    for colour, said in (([0.0, 2.0, 0.0], ""), ([0.0, 0.0, 0.0], "its texture holds 0;")):
+    for colour, said in (([0.0, 2.0, 0.0], ""), ([0.0, 0.0, 0.0], "its texture contains 0;")):
         pixels = mi.Bitmap(np.full((1, 1, 3), colour, np.float32))
         index = {"type": "bitmap", "bitmap": pixels, "raw": True}
         assert said in refusal(load, int_ior=index) if said else load(int_ior=index)
