@@ -323,10 +323,10 @@ def test_refract_path_warns_once_a_scene_of_what_is_missing(logged, scalar_varia
     ("thickness", "place", "others", "thin"),
     [
         (1e-3, 12, {}, ""),
-        (1e-5, 12, {}, "'pane' is 1e-05 thick, and rays start 2.86e-05 beside its surface"),
+        (1e-5, 12, {}, "'pane' is 1e-05 thick, but rays start 2.86e-05 from its surface"),
         (1e-5, 0, {}, ""),
         # Beside a cylinder rays start as Mitsuba's do.
-        (1e-3, 12, {"pipe": {"type": "cylinder", "bsdf": GLASS}}, "'pane' is 0.001 thick, and rays start 0.00125"),
+        (1e-3, 12, {"pipe": {"type": "cylinder", "bsdf": GLASS}}, "'pane' is 0.001 thick, but rays start 0.00125"),
         (1e-5, 12, {"bsdf": {"type": "conductor"}}, ""),
     ],
 )
