@@ -1,8 +1,8 @@
 """The features that a loaded Mitsuba scene needs of an integrator, and those that it can omit, in every variant.
 
-A black surface needs no feature: it is a `diffuse` whose reflectance is the number 0, such as Mitsuba's default for area
-lights. In spectral variants `<rgb value="0"/>` is a spectrum of about 3e-8, which is not black. A feature is omitted
-only if all plugins are in the lists below, of plugins known not to need it. Any other plugin, and an instance, needs
+A black surface needs no feature: it is a `diffuse` with the number 0 as reflectance, Mitsuba's default for area lights.
+In spectral variants `<rgb value="0"/>` is a spectrum of about 3e-8, which is not black. A feature is omitted only if
+all plugins are in the lists below, of plugins known not to need it. Any other plugin, and an instance, needs
 everything.
 """
 
@@ -116,7 +116,7 @@ class SceneFeatures:
         Source: Heckbert 1990, "Adaptive radiosity textures for bidirectional ray tracing".
 
         `caustics`: "path" if all paths start at the camera, "lamp" if those of L S+ (D|S)* D E start at the lamp; else
-        ValueError. `max_depth`: as in `path`. `volumes`: shadow rays pass null lobes and media scatter, as in `volpath`.
+        ValueError. `max_depth`: as in `path`. `volumes`: media scatter and shadow rays pass null lobes (`volpath`).
         """
         if caustics not in ("path", "lamp"):
             raise ValueError(f"missing: caustics = {caustics!r}; expected path or lamp")
