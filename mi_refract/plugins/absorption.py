@@ -131,9 +131,9 @@ def _from_k(plugin: str, name: str, text: Any, unit: Any) -> Absorption:
     check_range(f"{label} = {text!r} has k", (knots[0], knots[-1]), medium.hold, effect)
     # Outside the range k has its value at the range's end.
     wavelengths, values = [*knots], [*k]
-    if mi.MI_CIE_MIN < knots[0]:
+    if knots[0] > mi.MI_CIE_MIN:
         wavelengths, values = [mi.MI_CIE_MIN, *wavelengths], [k[0], *values]
-    if mi.MI_CIE_MAX > knots[-1]:
+    if knots[-1] < mi.MI_CIE_MAX:
         wavelengths, values = [*wavelengths, mi.MI_CIE_MAX], [*values, k[-1]]
     sigma = mi.Properties()
     sigma[name] = _parsed.Spectrum(
