@@ -105,7 +105,7 @@ BOTH_NUMBERS = {
 
 @pytest.mark.parametrize(("name", "bsdf"), (ONE_NUMBER | BOTH_NUMBERS).items())
 def test_the_list_of_plugins_that_use_one_random_number(name, bsdf, scalar_variant):
-    """Tests on a grid which of `sample1` and `sample2` a sample depends on. `measured`, which needs a file, is left out."""
+    """Tests on a grid which of `sample1` and `sample2` a sample depends on, but for `measured`, which needs a file."""
     assert set(ONE_NUMBER) == EITHER
     loaded, grid, both = mi.load_dict(bsdf), (np.arange(16) + 0.5) / 16, name in BOTH_NUMBERS
     assert name in (loaded.class_name(), type(loaded).__name__)
