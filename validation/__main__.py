@@ -54,7 +54,7 @@ QUICK = (
     "diff.planted_defects",
 )
 LOCK = "validation.lock"  # in the folder of the report, while it is being made
-PROFILES = {"quick": "about a minute", "standard": "about an hour", "full": "hours"}
+PROFILES = {"quick": "a minute and a half", "standard": "about an hour", "full": "hours"}
 
 app = command_line.application()
 

@@ -30,7 +30,7 @@ from mi_refract.numerics import (
     replace_grad,
 )
 
-PLUGIN = "refract"
+PLUGIN = "refract"  # the name of the BSDF in Mitsuba
 DEFAULTS = {"int_ior": "bk7", "ext_ior": "air"}
 EXPECTED = "a positive finite number, or a material's name, a glass or formula (mi_refract.media), spectrum or texture"
 warned: set[str] = set()  # texts that `warn_once` has logged

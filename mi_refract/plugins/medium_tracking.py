@@ -7,7 +7,7 @@ error with the name of such a shape.
 
 A ray starts at a small distance from the surface that it leaves. Near an edge where three media meet it may miss a
 boundary, and have the wrong σ: one ray in 30,000 in a tumbler of water. So a small share of wrong crossings is not an
-error. An absorbing sheet that is thinner than that distance is an error: a path would never leave it.
+error. An absorbing sheet that is thinner than that distance (`ray_origins`) is one: a path would never leave it.
 """
 
 from __future__ import annotations
@@ -193,7 +193,7 @@ def absorbs_only(v: Variant, medium: MediumPlugin) -> bool:
 def check_integrator(scene: Scene) -> None:
     """ValueError if a BSDF absorbs and the scene's integrator is not `refract_path`, and does not call only that.
 
-    ValueError also if a texture of `refract` reads an attribute that its shape lacks, as in `check_attributes`.
+    ValueError also for mesh attributes that Mitsuba does not read correctly; see `check_attributes`.
     """
     check_attributes(scene)
 

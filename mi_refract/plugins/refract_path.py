@@ -55,7 +55,7 @@ from .path_loop import PathFeatures, PathLoop
 from .sampling import KeyedMultijitter, SceneSampler, seeds_of
 from .scene_features import CAST, SceneFeatures, check_attributes, differentiated, inspect
 
-INTEGRATOR = "refract_path"
+INTEGRATOR = "refract_path"  # its name in Mitsuba
 MOST_PATHS = 4096  # that one sample may split into
 DEEPEST = 64  # split_depth: memory is set aside in every lane
 UNLIMITED = 2**32 - 1
@@ -109,7 +109,7 @@ def integrator_class(v: Variant) -> type:
     vectorised = dr.is_jit_v(v.Float)
 
     def to_camera(sensor: Sensor) -> Any:
-        """From the world to the camera, whose rays leave the plane z = 0; None where they start at the sensor."""
+        """The transform from world to camera, whose rays leave the plane z = 0; None where they start at the sensor."""
         return sensor.world_transform().inverse() if isinstance(sensor, v.ProjectiveCamera) else None
 
     class RefractPath(v.SamplingIntegrator):  # type: ignore[misc]
@@ -135,13 +135,13 @@ def integrator_class(v: Variant) -> type:
             self.loops: list[PathLoop] = []  # of this render: one a pass; in scalar variants one in all
 
         def begin_render(self, sensor: Sensor) -> None:
-            """To be called before `sample` where `render` is not; else each sample inspects the scene anew."""
+            """Call this before `sample` where `render` is not called; else each sample inspects the scene anew."""
             self.loops, self.rendering = [], True
             self.near = to_camera(sensor)
             self.unconnected = lamp_tracing.refused_sensor(sensor)
 
         def end_render(self) -> None:
-            """To be called after the samples were evaluated. ValueError where absorption was contradictory."""
+            """Call this after the samples were evaluated. ValueError where absorption was contradictory."""
             loops, self.loops, self.rendering = self.loops, [], False
             for loop in loops:
                 loop.refuse()
@@ -172,13 +172,13 @@ def integrator_class(v: Variant) -> type:
             if spp:
                 sampler.set_sample_count(spp)
             number: Any = dr.slice(seed)
-            found = self.caustic_image(scene, sensor, int(number), int(sampler.sample_count()), ("R", "G", "B"))
+            caustic = self.caustic_image(scene, sensor, int(number), int(sampler.sample_count()), ("R", "G", "B"))
             # Colours on a film are sums; those of the samples' weights, by which it divides them, are its last channel
             # before others.
             block, sums = film.create_block(), film.develop(True)
             weight = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
             values = block.tensor().numpy()
-            values[..., :3] = found[0] * sums.numpy()[..., weight : weight + 1]
+            values[..., :3] = caustic[0] * sums.numpy()[..., weight : weight + 1]
             block.tensor()[:] = type(sums)(values)
             film.put_block(block)
             return film.develop() if develop else v.TensorXf()
@@ -222,7 +222,7 @@ def integrator_class(v: Variant) -> type:
             return dr.select(end.valid_ray, end.result, 0), end.valid_ray, [end.truncated][: len(self.aov_names())]
 
         def path_loop(self, scene: Scene, sampler: Sampler) -> PathLoop:
-            """Of a pass of a render, or of one sample of it in a scalar variant."""
+            """The loop of a pass of a render, or of one sample of it in a scalar variant."""
             if not vectorised and (loop := next((loop for loop in self.loops if loop.scene is scene), None)):
                 return loop
             needs = self.scene_features(scene)
@@ -319,12 +319,11 @@ def integrator_class(v: Variant) -> type:
                 absorption=needs.absorbing or needs.media or self.camera is not None,
                 null=needs.null,
                 caustics_apart=self.apart,
-                perturbed=needs.perturbed,
                 delta_extent=needs.delta_extent,
             )
 
         def scene_features(self, scene: Scene) -> SceneFeatures:
-            """Of the scene as it is now: an edit of the scene can change them."""
+            """The features of the scene as it is now: an edit of the scene can change them."""
             before, self.needs = (self.needs, self.apart), (needs := inspect(scene))
             self.apart = self.traces_lamps(scene, needs)
             missing = needs.missing("lamp" if self.apart else "path", self.max_depth)

@@ -31,7 +31,7 @@ Settings: TypeAlias = dict[str, str]  # by NAMES; {}: the scene's own
 
 def parse_settings(text: str) -> Settings:
     """`"split_depth=1"` → `{"split_depth": "1"}`, by NAMES; `OWN` → `{}`. ValueError for another syntax."""
-    found: dict[str, str] = {}
+    settings: dict[str, str] = {}
     for item in () if text == OWN else text.split(","):
         name, _, value = item.partition("=")
         if name not in NAMES:
@@ -40,10 +40,10 @@ def parse_settings(text: str) -> Settings:
         if not re.fullmatch(NAMES[name], value):
             expected = "0 to 64" if name == "split_depth" else NAMES[name].replace("|", ", ")
             raise ValueError(f"--settings {text}: {name} = {value!r}; expected {expected}")
-        if name in found:
+        if name in settings:
             raise ValueError(f"--settings {text}: {name} is given twice; expected once")
-        found[name] = value
-    return {name: found[name] for name in NAMES if name in found}
+        settings[name] = value
+    return {name: settings[name] for name in NAMES if name in settings}
 
 
 def settings_text(settings: Settings) -> str:

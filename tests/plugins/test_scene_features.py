@@ -119,7 +119,7 @@ def test_the_list_of_plugins_that_use_one_random_number(name, bsdf, scalar_varia
     assert ("both_numbers" in facts(part={"type": "sphere", "bsdf": bsdf})) == both
 
 
-EVERYTHING = {"both_numbers", "smooth", "null", "textured", "dispersive", "absorbing", "perturbed"}
+EVERYTHING = {"both_numbers", "smooth", "null", "textured", "dispersive", "absorbing"}
 
 
 def test_unknown_plugins_need_everything(scalar_variant):
@@ -334,3 +334,12 @@ def test_glass_that_rays_step_over_is_reported(thickness, place, others, thin, s
     pane = {"type": "cube", "id": "pane", "to_world": at, "bsdf": others.get("bsdf", GLASS)}
     text = needs(pane=pane, **{name: part for name, part in others.items() if name != "bsdf"}).thin
     assert thin in text and bool(thin) == bool(text)
+
+
+def test_the_size_of_merged_meshes_is_that_of_all_parts(llvm_variant):
+    """Mitsuba's bounding box of such a mesh omits rectangles."""
+    part = '<shape type="{}"><transform name="to_world"><scale value="{}"/></transform><ref id="glass"/></shape>'
+    parts = [part.format("cube", 1), part.format("rectangle", 20), part.format("rectangle", 10)]
+    scene = mi.load_string(f'<scene version="3.0.0"><bsdf type="refract" id="glass"/>{"".join(parts)}</scene>')
+    assert [shape.class_name() for shape in scene.shapes()] == ["Mesh"]
+    assert inspect(scene).delta_extent == 64
