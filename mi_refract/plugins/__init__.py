@@ -1,18 +1,18 @@
 """Mitsuba's plugins: the BSDF `refract` and the integrator `refract_path`.
 
-In: a Mitsuba variant's module (`mitsuba.llvm_ad_rgb`, say) for `register`, a loaded scene for `inspect`. Out: plugins
-known to that variant by the names `PLUGIN`, `PLUGIN_<formula>` and `INTEGRATOR`; what a scene needs of an integrator,
-and which light its own does not find. `import mi_refract` registers the plugins in every variant. Importing this room
-imports Mitsuba.
+Input: a Mitsuba variant's module, such as `mitsuba.llvm_ad_rgb`, for `register`; a loaded scene for `inspect`. Output:
+plugins registered in that variant with the names `PLUGIN`, `PLUGIN_<formula>` and `INTEGRATOR`; the features that a
+scene needs of an integrator, and the light that its integrator misses. `import mi_refract` registers the plugins in
+every variant. Importing this package imports Mitsuba.
 """
 
 from mi_refract.numerics import Variant
 
 
 def register(variant: Variant) -> None:
-    """Make `refract`, `refract_<formula>` and `refract_path` known to one variant, given its module.
+    """Register `refract`, `refract_<formula>` and `refract_path` in one variant, given its module.
 
-    Registering again is harmless. Registration is lost when the variant is switched: `mi_refract` repeats it then.
+    Registering again is harmless. Registration is lost when the variant is switched; then `mi_refract` repeats it.
     """
     from . import refract, refract_path
 
@@ -20,7 +20,7 @@ def register(variant: Variant) -> None:
     refract_path.register(variant)
 
 
-# Importing Mitsuba calls `register`, which must be there; the modules below need Mitsuba.
+# Importing Mitsuba calls `register`, so it is defined first; the modules below need Mitsuba.
 import mitsuba  # noqa: E402, F401
 
 from .index_parameter import PLUGIN, read_ior, read_medium  # noqa: E402

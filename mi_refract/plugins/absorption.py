@@ -1,8 +1,9 @@
-"""Absorption on both sides of a boundary, exp(−σ t) after a distance t (Beer–Lambert), as parameters of `refract`.
+"""Absorption on both sides of a boundary, as parameters of `refract`.
 
-`int_absorption`, `ext_absorption`: σ, a number or a spectrum, per unit of the scene. Or `int_colour`, in (0, 1], what
-is left of white light after the distance `int_colour_distance`: σ = −log(colour)/distance; `ext_colour` likewise.
-Or a file with k, the imaginary part of the index: σ = 4πk/λ, by `int_absorption_unit`, the scene's unit in metres.
+After a distance t, exp(−σ t) of the light is left (Beer–Lambert). `int_absorption`, `ext_absorption`: σ, a number or a
+spectrum, per unit of the scene. Instead, `int_colour`, in (0, 1], is what is left of white light after the distance
+`int_colour_distance`: σ = −log(colour)/distance; `ext_colour` likewise. Or `int_absorption` names a file with k, the
+imaginary part of the index: σ = 4πk/λ, where `int_absorption_unit` is the scene's unit in metres.
 """
 
 from __future__ import annotations
@@ -19,47 +20,51 @@ from mi_refract.numerics import BSDF, Interaction, Mask, Number, Properties, Spe
 
 from .index_parameter import check_range, find_file, read_knots
 
-# Attributes of a boundary: σ on the side from which light comes along `si.wi`, and on the other.
+# Attributes of a boundary: σ on the side that `si.wi` points to, and on the other side.
 HERE, BEYOND = "absorption here", "absorption beyond"
 ENDLESS = 1e30  # σ times this distance is finite in float32, and its exponential is 0
 _parsed: Any = mitsuba.mitsuba_ext  # types that do not depend on the variant
-LEAST_COLOUR = 1e-30  # its logarithm is finite; a spectrum that Mitsuba makes of an RGB colour may end at 0
+LEAST_COLOUR = 1e-30  # its logarithm is finite; Mitsuba converts some RGB colours to spectra that reach 0
 
 
 def absorbing_parameter(bsdf: BSDF) -> str:
-    """The name of the parameter of `refract` that makes it absorb; "" where it does not, and for other BSDFs."""
+    """Return the name of the first absorption parameter of a `refract`; "" if it has none, and for other BSDFs."""
     return next((side.name for side in getattr(bsdf, "absorptions", {}).values() if side), "")
 
 
 class Absorption:
-    """σ on one side of a boundary, from a texture that is the same everywhere on it."""
+    """σ on one side of a boundary, given by a texture that does not vary over the surface."""
 
     DRJIT_STRUCT: ClassVar = {"texture": object}  # for frozen functions
 
     def __init__(self, name: str, texture: Texture, factor: float, distance: float) -> None:
-        """σ = factor × texture, or −log(texture)/distance where there is a distance."""
+        """σ = factor × texture, or −log(texture)/distance if `distance` is not 0."""
         self.name, self.texture, self.factor, self.distance = name, texture, factor, distance
 
     def eval(self, si: Interaction, active: Mask) -> Spectrum:
-        """σ at the wavelengths of `si`."""
+        """Return σ at the wavelengths of `si`."""
         value = self.texture.eval(si, active)
         if not self.distance:
             return value * self.factor
-        # Where a lane is not active the texture gives 0.
+        # In inactive lanes the texture returns 0.
         return -dr.log(dr.select(active, dr.maximum(value, LEAST_COLOUR), 1)) / self.distance
 
 
 def absorbed(sigma: Spectrum, length: Number) -> Spectrum:
-    """exp(−σ t), with a derivative in σ that is 0 after an infinite distance."""
+    """Return exp(−σ t); after an infinite distance its derivative in σ is 0."""
     return dr.exp(-sigma * dr.minimum(length, ENDLESS))
 
 
 def read_absorption(plugin: str, props: Properties, side: str) -> Absorption | None:
-    """The absorption of `int`, `ext` or `camera`; None where the scene does not say. ValueError with the parameter."""
+    """Return the absorption of a side, "int", "ext" or "camera"; None if the scene gives none.
+
+    ValueError names the parameter.
+    """
     sigma, colour, distance = f"{side}_absorption", f"{side}_colour", f"{side}_colour_distance"
-    for known in (colour, distance):
-        if (unknown := known.replace("colour", "color")) in props:
-            raise ValueError(f"{plugin}: unknown parameter {unknown}; expected {known}")
+    for name in (colour, distance):
+        american = name.replace("colour", "color")
+        if american in props:
+            raise ValueError(f"{plugin}: unknown parameter {american}; expected {name}")
     if sigma in props:
         if colour in props or distance in props:
             raise ValueError(f"{plugin}: {sigma} and {colour} are both set; expected one of them")
@@ -81,7 +86,7 @@ def read_absorption(plugin: str, props: Properties, side: str) -> Absorption | N
     values = read_values(plugin, props, name, expected, bool(length), textures=False)
     if not type(value).__name__.endswith("Color3d") or length or not any(values):
         return Absorption(name, props.get_unbounded_texture(name), 1.0, float(length))
-    # Mitsuba makes a spectrum of an RGB colour up to 1 only, and a smooth one of 1/2; of the others, in proportion.
+    # Mitsuba converts RGB colours up to 1 only to a spectrum, and those up to 1/2 to a smooth one. So scale them.
     factor, scaled = 2 * max(values), mi.Properties()
     scaled[name] = props[name] / factor
     props.mark_queried(name)
@@ -91,9 +96,9 @@ def read_absorption(plugin: str, props: Properties, side: str) -> Absorption | N
 def read_values(
     plugin: str, props: Properties, name: str, expected: str, share: bool = False, textures: bool = True
 ) -> tuple[float, ...]:
-    """The values of a number, of three colours or of a spectrum; none of a texture, where `textures` may be.
+    """Return the values of a number, an RGB colour or a spectrum; () for a texture, if `textures` are allowed.
 
-    ValueError with the parameter where one is negative or not finite, or, of a `share`, 0 or above 1.
+    ValueError names the parameter if a value is negative or not finite; with `share`, if it is 0 or above 1.
     """
     value = props[name]
     values: tuple[float, ...] = ()
@@ -113,7 +118,7 @@ def read_values(
 
 
 def _from_k(plugin: str, name: str, text: Any, unit: Any) -> Absorption:
-    """σ = 4πk/λ of a file with k. ValueError with the parameter."""
+    """Return σ = 4πk/λ, with k from a file. ValueError names the parameter."""
     label = f"{plugin}: {name}"
     medium = media.parse(text, label, find_file) if isinstance(text, str) else None
     if not medium or not medium.k:
@@ -122,11 +127,16 @@ def _from_k(plugin: str, name: str, text: Any, unit: Any) -> Absorption:
         problem = f"{name} = {text!r}: {name}_unit is missing" if unit is None else f"{name}_unit = {unit!r}"
         raise ValueError(f"{plugin}: {problem}; expected the scene's unit in metres: 0.001 for mm")
     knots, k = medium.k
-    held = "has the absorption of the range's end"
-    check_range(f"{label} = {text!r} has k", (knots[0], knots[-1]), medium.hold, held)
-    ends = min(knots[0], mi.MI_CIE_MIN), max(knots[-1], mi.MI_CIE_MAX)  # beyond, the values at the ends go on
-    pairs = [*zip(knots, k, strict=True)]
-    pairs = [(ends[0], k[0])] * (ends[0] < knots[0]) + pairs + [(ends[1], k[-1])] * (ends[1] > knots[-1])
-    made = mi.Properties()
-    made[name] = _parsed.Spectrum([w for w, _ in pairs], [4e9 * math.pi * x / w * unit for w, x in pairs])
-    return Absorption(name, made.get_unbounded_texture(name), 1.0, 0.0)
+    effect = "has the absorption of the range's end"
+    check_range(f"{label} = {text!r} has k", (knots[0], knots[-1]), medium.hold, effect)
+    # Outside the range k has its value at the range's end.
+    wavelengths, values = [*knots], [*k]
+    if knots[0] > mi.MI_CIE_MIN:
+        wavelengths, values = [mi.MI_CIE_MIN, *wavelengths], [k[0], *values]
+    if knots[-1] < mi.MI_CIE_MAX:
+        wavelengths, values = [*wavelengths, mi.MI_CIE_MAX], [*values, k[-1]]
+    sigma = mi.Properties()
+    sigma[name] = _parsed.Spectrum(
+        wavelengths, [4e9 * math.pi * x / w * unit for w, x in zip(wavelengths, values, strict=True)]
+    )
+    return Absorption(name, sigma.get_unbounded_texture(name), 1.0, 0.0)

@@ -1,4 +1,4 @@
-"""The film of a sensor: its colours, its filter, and sums of splats that have the same bits in any order."""
+"""The film of a sensor: its colours, its filter, and exact sums of splats, which do not depend on their order."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ if TYPE_CHECKING:  # the plugin needs no numpy
 Film: TypeAlias = Any  # an `mi.Film`
 Filter: TypeAlias = Any  # an `mi.ReconstructionFilter`
 
-STEP = 1 / 256  # of a pixel, at which filters are integrated
-# A float32 is an integer in units of 2^LOWEST. Its digits of 32 bits are added up in 64 bits, as integers have the same
-# sum in any order of threads. A pixel takes 2^31 splats.
+STEP = 1 / 256  # in pixels: the step of the integration of filters
+# A float32 becomes an integer in units of 2^LOWEST. Its digits of 32 bits are added up as 64-bit integers, whose sum
+# does not depend on the order of threads. A pixel may receive up to 2^31 splats.
 BITS = 32
-DIGITS, LOWEST = 5, -87  # of values from 2^-64 to 2^64
+DIGITS, LOWEST = 5, -87  # for values from 2^-64 to 2^64
 SQUARES_DIGITS, SQUARES_LOWEST = 8, -135
 
 
 class Splats:
-    """Exact sums of what reaches each pixel, in each channel, under the film's reconstruction filter; or of squares."""
+    """Exact sums of the filtered splats of each pixel and channel, or of their squares."""
 
     def __init__(self, v: Variant, sensor: Sensor, channels: int, *, squares: bool = False) -> None:
         """`v`: the variant's module."""
@@ -44,12 +44,12 @@ class Splats:
             kind: Any = self.wide
             self.digits: Any = dr.zeros(kind, self.count * self.per_sum)
             dr.make_opaque(self.digits)
-            self.beyond = dr.opaque(v.UInt32, 0, self.count)  # splats that are too large, or not finite
+            self.beyond = dr.opaque(v.UInt32, 0, self.count)  # number of splats that are too large or not finite
         else:
             self.sums = [0.0] * self.count
 
     def add(self, place: Point2, values: list[Number], active: Mask) -> None:
-        """`place`: in pixels, from the corner of the film's crop window."""
+        """Add a splat. `place`: in pixels, from the corner of the film's crop window. `values`: one a channel."""
         x, y = (self.v.Int32(dr.floor(place[i])) for i in range(2))
         for j in range(-self.reach, self.reach + 1):
             for i in range(-self.reach, self.reach + 1):
@@ -62,9 +62,9 @@ class Splats:
                     share = value * weight
                     self._add(index + channel, dr.square(share) if self.squares else share, inside)
 
-    def _weight(self, apart: Number) -> Number:
-        near = dr.abs(apart) <= self.rfilter.radius()
-        return dr.select(near, self.rfilter.eval(apart), 0)
+    def _weight(self, offset: Number) -> Number:
+        inside = dr.abs(offset) <= self.rfilter.radius()
+        return dr.select(inside, self.rfilter.eval(offset), 0)
 
     def _add(self, index: Count, value: Number, active: Mask) -> None:
         v = self.v
@@ -76,16 +76,17 @@ class Splats:
         bits: Any = dr.reinterpret_array(v.UInt32, v.Float32(value))
         shift = v.Int32((bits >> 23) & 255) - (150 + self.lowest)
         large = active & (shift >= BITS * (self.per_sum - 1))
-        kept = active & (shift >= 0) & (large ^ True)
+        in_range = active & (shift >= 0) & (large ^ True)
         dr.scatter_add(self.beyond, v.UInt32(1), index, large)
-        shift = v.UInt32(dr.select(kept, shift, 0))
-        whole = self.wide((bits & 0x7FFFFF) | 0x800000) << self.wide(shift % BITS)
+        shift = v.UInt32(dr.select(in_range, shift, 0))
+        mantissa = self.wide((bits & 0x7FFFFF) | 0x800000) << self.wide(shift % BITS)
         first = index * self.per_sum + shift // BITS
-        for more, digit in enumerate((whole & 0xFFFFFFFF, whole >> BITS)):
-            dr.scatter_add(self.digits, dr.select(bits >> 31 != 0, self.wide(0) - digit, digit), first + more, kept)
+        for i, digit in enumerate((mantissa & 0xFFFFFFFF, mantissa >> BITS)):
+            signed = dr.select(bits >> 31 != 0, self.wide(0) - digit, digit)
+            dr.scatter_add(self.digits, signed, first + i, in_range)
 
     def image(self) -> Any:
-        """The sums, H × W × channels, in float64; NaN where a splat was too large or not finite."""
+        """Return the sums, H × W × channels, in float64; NaN where a splat was too large or not finite."""
         import numpy as np
 
         shape = self.height, self.width, self.channels
@@ -101,7 +102,7 @@ class Splats:
 
 
 def film_colours(v: Variant, spectrum: Spectrum, wavelengths: Number, channels: tuple[str, ...]) -> list[Number]:
-    """What a film with these channels makes of a sample's spectrum: R, G, B, or X, Y, Z, or Y."""
+    """Return the values of a sample's spectrum in a film's channels: R, G, B, or X, Y, Z, or Y."""
     spectrum = v.unpolarized_spectrum(spectrum)
     if v.is_spectral:
         colour = v.spectrum_to_srgb(spectrum, wavelengths)
@@ -113,7 +114,10 @@ def film_colours(v: Variant, spectrum: Spectrum, wavelengths: Number, channels: 
 
 
 def expected_weights(film: Film) -> Doubles | None:
-    """∫ w over all places of samples, for each pixel, H × W × 1; None for a box. Filters are products of two in 1D."""
+    """Return the integral of the filter w over all sample positions, for each pixel, H × W × 1; None for a box filter.
+
+    A filter is the product of two in one dimension.
+    """
     import numpy as np
 
     rfilter = film.rfilter()
@@ -124,19 +128,19 @@ def expected_weights(film: Film) -> Doubles | None:
     ends, sums = np.arange(-half, half + 1) * STEP, np.cumsum([0, *weights]) * STEP
 
     def along(pixels: int) -> Doubles:
-        middle = np.arange(pixels) + 0.5
+        centre = np.arange(pixels) + 0.5
         border = half if film.sample_border() else 0
-        return np.asarray(np.interp(pixels + border - middle, ends, sums) - np.interp(-border - middle, ends, sums))
+        return np.asarray(np.interp(pixels + border - centre, ends, sums) - np.interp(-border - centre, ends, sums))
 
     width, height = (int(n) for n in film.crop_size())
     return np.asarray(along(height)[:, None, None] * along(width)[:, None])
 
 
 def filter_weights(rfilter: Filter) -> Doubles:
-    """The weights in one dimension, at STEPs from −radius to radius."""
+    """Return the weights of a filter in one dimension, at the middle of each STEP from −radius to radius."""
     import numpy as np
 
     half = math.ceil(rfilter.radius() / STEP)
-    places = (np.arange(-half, half) + 0.5) * STEP
-    weights = rfilter.eval(mi.Float(places)) if dr.is_jit_v(mi.Float) else [rfilter.eval(place) for place in places]
-    return np.where(np.abs(places) <= rfilter.radius(), np.array(weights, np.float64), 0)
+    offsets = (np.arange(-half, half) + 0.5) * STEP
+    weights = rfilter.eval(mi.Float(offsets)) if dr.is_jit_v(mi.Float) else [rfilter.eval(x) for x in offsets]
+    return np.where(np.abs(offsets) <= rfilter.radius(), np.array(weights, np.float64), 0)

@@ -1,8 +1,8 @@
 """The indices of a boundary, as parameters of `refract`: numbers, names, dispersive media, textures.
 
-Mitsuba's names stay what they are in its table: constants. A ratio of indices that is not one number is a function of
-the wavelength (`DispersiveRatio`) or of the point of the surface (`TexturedRatio`), in float64. Where there is no index
-it is NaN: such light is lost.
+Mitsuba's material names mean the constants of its table. A ratio of indices that is not one number is a function of the
+wavelength (`DispersiveRatio`) or of the point on the surface (`TexturedRatio`), in float64. Where no index exists it is
+NaN, and such light is lost.
 """
 
 from __future__ import annotations
@@ -33,35 +33,35 @@ from mi_refract.numerics import (
 PLUGIN = "refract"  # the name of the BSDF in Mitsuba
 DEFAULTS = {"int_ior": "bk7", "ext_ior": "air"}
 EXPECTED = "a positive finite number, or a material's name, a glass or formula (mi_refract.media), spectrum or texture"
-warned: set[str] = set()  # what `warn_once` has logged
-LUMINANCE = 0.212671, 0.715160, 0.072169  # of linear sRGB, as Mitsuba's
-THICK = 1.0  # metres: glass is thinner
-LOST = 1e-3  # of the colour of light of equal power at all wavelengths: the most that may lie outside a medium's range
+warned: set[str] = set()  # texts that `warn_once` has logged
+LUMINANCE = 0.212671, 0.715160, 0.072169  # weights of linear sRGB in the luminance, as in Mitsuba
+THICK = 1.0  # metres: absorption that takes longer to halve the light does not matter
+LOST = 1e-3  # the largest share of the colour of white light that may lie outside a medium's range
 
 
 def warn_once(text: str) -> None:
-    """A warning in Mitsuba's log, once a process."""
+    """Write a warning to Mitsuba's log, once a process."""
     if text not in warned:
         warned.add(text)
         mi.Log(mi.LogLevel.Warn, text)  # type: ignore[operator]
 
 
 def parameter_type(v: Variant) -> ArrayType:
-    """The type of a number that `mi.traverse` shows. In scalar variants Mitsuba cannot set a bare Python float."""
+    """Return the type of numbers that `mi.traverse` exposes. In scalar variants Mitsuba cannot set a Python float."""
     scalar: Any = dr.scalar
     number: ArrayType = v.Float if dr.is_jit_v(v.Float) else scalar.Array1f
     return number
 
 
 def one_number(name: str, value: Number) -> Number:
-    """The value of a parameter of `parameter_type`; ValueError where an edit gave it several entries."""
+    """Return the value of a parameter of type `parameter_type`; ValueError if an edit gave it several entries."""
     if len(value) != 1:
         raise ValueError(f"{PLUGIN}: {name} has {len(value)} entries; expected one number")
     return value[0]
 
 
 class DispersiveRatio:
-    """n_int/n_ext of two media by wavelength. Their coefficients are differentiable parameters, `int_ior_B` for one."""
+    """n_int/n_ext of two media by wavelength. Their coefficients are differentiable parameters, such as `int_ior_B`."""
 
     DRJIT_STRUCT: ClassVar = {"shown": dict, "exact": dict}  # for frozen functions
 
@@ -74,20 +74,20 @@ class DispersiveRatio:
         wide: Any = self.wide
         self.shown: dict[str, Number] = {name: number(value) for name, value in shown}
         self.exact: dict[str, Number] = {name: wide(value) for name, value in shown}
-        # Where in the array of a table's values a coefficient is: by its name, the array's name and the place.
+        # Coefficients that are values of a table: name of the coefficient → name of the array of values, and position.
         self.places: dict[str, tuple[str, int]] = {}
         for side, medium in self.sides.items():
             if isinstance(medium.dispersion, Table) and dr.is_jit_v(wide):
                 values = f"{side}_{TABLE_VALUES}"
                 self.exact[values] = wide([*medium.coefficients.values()])
                 self.places |= {f"{side}_{key}": (values, i) for i, key in enumerate(medium.coefficients)}
-        # Opaque: an edit changes the data of a kernel and not its code.
+        # Opaque, so that an edit changes the data of a kernel and not its code.
         dr.make_opaque(*self.shown.values(), *self.exact.values())
 
     def at(self, wavelength: Number) -> Number:
-        """The ratio at a wavelength in nm, in float64; NaN outside the range of either medium.
+        """Return the ratio at a wavelength in nm, in float64; NaN outside the range of either medium.
 
-        Derivatives in the coefficients are formed anew in each call: the first `dr.backward` frees what it walks.
+        Each call builds the graph of the derivatives in the coefficients again, as `dr.backward` frees it.
         """
         values = dict(self.exact)
         for key, shown in self.shown.items():
@@ -99,22 +99,22 @@ class DispersiveRatio:
 
     @property
     def differentiated(self) -> bool:
-        """Whether a coefficient carries a derivative."""
+        """Whether derivatives of a coefficient are tracked."""
         return any(map(differentiated, self.shown.values()))
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
-        """Show the coefficients. No dot in a name: Mitsuba would call what was set by what follows the last one."""
+        """Expose the coefficients. Names contain no dot: Mitsuba reports changes by what follows the last dot."""
         for name, value in self.shown.items():
             cb.put(name, value, mi.ParamFlags.Differentiable)
 
     def changed(self, keys: Collection[str]) -> None:
-        """Take over coefficients that were set; those that were not keep their double precision."""
+        """Read the edited coefficients; those that were not edited keep their double precision."""
         for key in [key for key in self.shown if not keys or key in keys]:
             number = one_number(key, self.shown[key])
             self.exact[key] = self.wide(dr.detach(self.shown[key]) if dr.is_jit_v(self.shown[key]) else number)
             if key in self.places:
-                values, place = self.places[key]
-                dr.scatter(self.exact[values], self.exact[key], place)
+                values, position = self.places[key]
+                dr.scatter(self.exact[values], self.exact[key], position)
         dr.make_opaque(*self.shown.values(), *self.exact.values())
 
 
@@ -122,7 +122,7 @@ class TexturedRatio:
     """n_int/n_ext where one of them, or both, is a texture of numbers."""
 
     DRJIT_STRUCT: ClassVar = {"sides": dict}  # for frozen functions
-    differentiated = False  # of numbers: a texture's values carry their own
+    differentiated = False  # no coefficient exists; derivatives of a texture's values are tracked by the texture
 
     def __init__(self, v: Variant, sides: Mapping[str, Texture | float]) -> None:
         """`v`: the variant's module. `sides`: `int_ior` and `ext_ior`."""
@@ -130,25 +130,26 @@ class TexturedRatio:
         self.wide: ArrayType = dr.float64_array_t(v.Float)
 
     def at(self, si: Interaction, active: Mask) -> Number:
-        """The ratio in float64; NaN where it is not one."""
+        """Return the ratio in float64; NaN where it is not a ratio of indices."""
         inside, outside = (self.wide(n if isinstance(n, float) else n.eval_1(si, active)) for n in self.sides.values())
         eta = inside / outside
         return dr.select((eta >= SMALLEST_RATIO) & (eta <= LARGEST_RATIO), eta, dr.nan)
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
-        """Show the textures."""
+        """Expose the textures."""
         for name, texture in self.sides.items():
             if not isinstance(texture, float):
                 cb.put(name, texture, mi.ParamFlags.Differentiable)
 
     def changed(self, keys: Collection[str]) -> None:
-        """Nothing: textures take over what is set."""
+        """Do nothing: textures read their own edits."""
 
 
 def read_ratio(v: Variant, props: Properties) -> tuple[DispersiveRatio | TexturedRatio | None, float]:
-    """The ratio of a boundary where it is not one number, and the number: of the d line; 1 where a texture says it.
+    """Return the ratio of a boundary if it is not one number, else None; and its value at the d line, 1 for textures.
 
-    `v`: the variant's module. ValueError with plugin, parameter and what is expected. A warning of k that is left out.
+    `v`: the variant's module. ValueError names plugin, parameter and what is expected. Logs a warning if a medium has a
+    k that is not rendered.
     """
     import numpy as np
 
@@ -172,26 +173,30 @@ def read_ratio(v: Variant, props: Properties) -> tuple[DispersiveRatio | Texture
             with np.errstate(divide="ignore"):
                 absorbing = 4 * math.pi * np.interp(visible, medium.k[0], medium.k[1], 0, 0)
                 half_left = math.log(2) * 1e-9 * visible / absorbing  # metres
-            if (least := half_left.min()) < THICK:
-                text = f"{label} has k: of light at {visible[half_left.argmin()]:g} nm half is left after {least:.2g} m"
-                warn_once(f"{text}, which is rendered only with {absorption} and {absorption}_unit")
+            shortest = half_left.min()
+            if shortest < THICK:
+                wavelength = visible[half_left.argmin()]
+                warn_once(
+                    f"{label} has k: of light at {wavelength:g} nm half is left after {shortest:.2g} m, which is "
+                    f"rendered only with {absorption} and {absorption}_unit"
+                )
         if not v.is_spectral:
             try:
                 medium.index(d_line)
             except ValueError as error:
                 raise ValueError(f"{PLUGIN}: {name}: {error}") from None
-            warn_once(f"{label}: all light has the index of the d line, 587.6 nm, here")
+            warn_once(f"{label}: all light has the index of the d line, 587.6 nm, in this variant")
         else:
-            held = "has the index of the range's end" if medium.hold else "is lost there"
-            check_range(f"{label} has an index", medium.valid, medium.hold, held)
+            effect = "has the index of the range's end" if medium.hold else "is lost"
+            check_range(f"{label} has an index", medium.valid, medium.hold, effect)
     return DispersiveRatio(v, inside, outside) if dispersive else None, number
 
 
-def check_range(label: str, valid: tuple[float, float], hold: bool, held: str) -> None:
-    """A warning where colour lies outside a range in nm; without `hold` ValueError where more than LOST does.
+def check_range(label: str, valid: tuple[float, float], hold: bool, effect: str) -> None:
+    """Log a warning if visible light lies outside a range in nm; ValueError if more than LOST does, without `hold`.
 
-    That is the largest share of X, Y and Z, of light of equal power at all wavelengths. `label`: what has the range,
-    `held`: what becomes of other light, for the messages.
+    The measure is the largest share of X, Y and Z, for light of equal power at all wavelengths. `label`: what has the
+    range, `effect`: what happens to light outside of it, for the messages.
     """
     import numpy as np
 
@@ -205,24 +210,24 @@ def check_range(label: str, valid: tuple[float, float], hold: bool, held: str) -
     share = f"{np.format_float_positional(100 * lost, 2, fractional=False, trim='-')}% of the colour"
     if lost > LOST and not hold:
         below = np.cumsum(shares, axis=1)
-        low = wavelengths[np.argmax(below.max(0) > LOST / 2)]  # half of it on either side
+        low = wavelengths[np.argmax(below.max(0) > LOST / 2)]  # LOST / 2 on either side
         high = wavelengths[np.argmax(below.min(0) >= 1 - LOST / 2)]
         raise ValueError(
-            f"{label}: {share} lies outside; expected at least {low:g} … {high:g} nm, or hold(…) around the text, "
-            "which extends the values at its ends"
+            f"{label}: {share} lies outside; expected at least {low:g} … {high:g} nm, or hold(…) around the text, to "
+            "extend the values at its ends"
         )
     if lost:
-        warn_once(f"{label}; other light ({share}) {held}")
+        warn_once(f"{label}; other light ({share}) {effect}")
 
 
 def find_file(name: str) -> Path:
-    """Where Mitsuba looks for a file: in the folder of the scene first."""
+    """Return the path by which Mitsuba finds a file; it looks in the folder of the scene first."""
     untyped: Any = mi  # its stubs have no types for file resolvers
     return Path(str(untyped.file_resolver().resolve(name)))
 
 
 def read_ior(props: Properties, name: str, default: str) -> float:
-    """An index of refraction that is one number, in double precision. ValueError for all else, and as `read_index`."""
+    """Return an index that is one number, in double precision. ValueError for others, and as `read_index`."""
     medium = read_medium(props, name, default)
     if not medium.dispersive:
         return float(medium.index(media.LINES["d"]))
@@ -230,7 +235,7 @@ def read_ior(props: Properties, name: str, default: str) -> float:
 
 
 def read_medium(props: Properties, name: str, default: str) -> Medium:
-    """The parameter's `Medium`, the same at all points. ValueError for a texture, and as `read_index`."""
+    """Return the parameter's `Medium`. ValueError for a texture, and as `read_index`."""
     index = read_index(mi, props, name, default)
     if isinstance(index, Medium):
         return index
@@ -238,9 +243,9 @@ def read_medium(props: Properties, name: str, default: str) -> Medium:
 
 
 def read_index(v: Variant, props: Properties, name: str, default: str) -> Medium | Texture:
-    """The parameter's `Medium`, or a texture. `v`: the variant's module.
+    """Return the parameter's `Medium` or texture. `v`: the variant's module.
 
-    ValueError with plugin, parameter, value and what is expected.
+    ValueError names plugin, parameter, value and what is expected.
     """
     value, label = props.get(name, default), f"{PLUGIN}: {name}"
     if isinstance(value, (str, int, float)) and not isinstance(value, bool):
@@ -250,7 +255,7 @@ def read_index(v: Variant, props: Properties, name: str, default: str) -> Medium
             return media.parse(knots[1][0], name=label)
         table = "table(" + ", ".join(f"{w!r}: {n!r}" for w, n in zip(*knots, strict=True)) + ")"
         if not v.is_spectral:
-            raise ValueError(f"{label}: this variant makes a spectrum a colour; use the string {name} = {table!r}")
+            raise ValueError(f"{label}: this variant converts spectra to colours; use the string {name} = {table!r}")
         return media.parse(table, name=label)
     if isinstance(value, mi.Object) and hasattr(value, "is_spatially_varying"):
         _check_texture(v, label, value)
@@ -259,9 +264,10 @@ def read_index(v: Variant, props: Properties, name: str, default: str) -> Medium
 
 
 def _check_texture(v: Variant, label: str, texture: Texture) -> None:
-    """ValueError for a texture that holds what is no index, as far as `mi.traverse` shows its values.
+    """ValueError if a texture has a value that is not an index, as far as `mi.traverse` exposes its values.
 
-    Of three colours the index is their luminance; in spectral variants they are coefficients, which say nothing.
+    The index of an RGB colour is its luminance. In spectral variants RGB textures store coefficients of spectra, which
+    are not checked.
     """
     import numpy as np
 
@@ -275,17 +281,17 @@ def _check_texture(v: Variant, label: str, texture: Texture) -> None:
             if v.is_spectral:
                 continue
             values = values @ LUMINANCE
-        if (bad := values[~((values >= SMALLEST_RATIO) & (values <= LARGEST_RATIO))]).size:
+        invalid = values[~((values >= SMALLEST_RATIO) & (values <= LARGEST_RATIO))]
+        if invalid.size:
             expected = f"indices from {SMALLEST_RATIO:.2g} to {LARGEST_RATIO:.2g}"
-            raise ValueError(f"{label}: its texture holds {bad[0]:g}; expected {expected} everywhere")
+            raise ValueError(f"{label}: its texture contains {invalid[0]:g}; expected {expected} everywhere")
 
 
 def read_knots(value: Any) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-    """The knots of a `<spectrum>` or of a plugin `uniform`, `regular` or `irregular`; None for anything else.
+    """Return the knots of a `<spectrum>` or of a plugin `uniform`, `regular` or `irregular`; None for anything else.
 
-    A piecewise linear function: increasing wavelengths in nm, none for a constant, and the values.
+    They define a piecewise linear function: increasing wavelengths in nm, () for a constant, and the values.
     """
-
     import numpy as np
 
     def numbers(value: Any) -> tuple[float, ...]:
@@ -296,11 +302,11 @@ def read_knots(value: Any) -> tuple[tuple[float, ...], tuple[float, ...]] | None
     kind = value.class_name() if isinstance(value, mi.Object) else ""
     if kind not in ("UniformSpectrum", "RegularSpectrum", "IrregularSpectrum"):
         return None
-    shown = mi.traverse(value)
+    parameters = mi.traverse(value)
     if kind == "UniformSpectrum":
-        return (), numbers(shown["value"])
-    values = numbers(shown["values"])
+        return (), numbers(parameters["value"])
+    values = numbers(parameters["values"])
     if kind == "IrregularSpectrum":
-        return numbers(shown["wavelengths"]), values
-    (first, last), steps = numbers(shown["range"]), len(values) - 1
+        return numbers(parameters["wavelengths"]), values
+    (first, last), steps = numbers(parameters["range"]), len(values) - 1
     return tuple(first + (last - first) * (i / steps) for i in range(len(values))), values

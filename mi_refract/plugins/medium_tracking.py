@@ -1,12 +1,13 @@
 """The absorbing medium that a path is in: declared by the BSDFs (`MediumTracker`), or by the shapes (`ShapeMedia`).
 
-A BSDF declares σ on both of its sides: a path that goes through it is in the medium beyond. What it declares of the
-side from which light comes must be what the path has, or the image is wrong: a neighbour declares another σ of the
-medium between them, or the camera is in a medium that was not declared. `Crossings.refuse` names such a shape.
+A BSDF declares σ on both of its sides. A path that goes through it enters the medium of the other side. The σ declared
+on the side from which the path arrives must equal the σ of the path. Otherwise the image is wrong: a neighbour declares
+another σ for the medium between them, or the camera is in a medium that was not declared. `Crossings.refuse` raises an
+error with the name of such a shape.
 
-A ray starts a little beside the surface that it left. Next to an edge where three media meet it may miss a boundary,
-and be in a medium that is not there: one in 30,000 in a tumbler of water. So few are no contradiction. A sheet that is
-thinner than that distance (`ray_origins`) is refused: a path would never leave it.
+A ray starts at a small distance from the surface that it leaves. Near an edge where three media meet it may miss a
+boundary, and have the wrong σ: one ray in 30,000 in a tumbler of water. So a small share of wrong crossings is not an
+error. An absorbing sheet that is thinner than that distance (`ray_origins`) is one: a path would never leave it.
 """
 
 from __future__ import annotations
@@ -34,37 +35,40 @@ from mi_refract.numerics import (
 from .absorption import BEYOND, HERE, absorbing_parameter
 from .scene_features import all_shapes, check_attributes, children, nested, plugin_number, shape_name
 
-TOLERANCE = 1e-3  # relative: σ may have been given as a number here and as a colour there
-STRAY = 0.01  # of the crossings of a shape: more are a contradiction
-NEVER = 2**32 - 1  # as the number of a vertex
-FEW = 2  # crossings: of a shape with few of them, so many may be beside an edge, unless they are half of all
-# Of the distance from a surface to the origin of the next ray: a surface nearer to the first one than the rest is not
-# seen. Rounding moves a point by up to an eighth of that distance (`ray_origins`).
+TOLERANCE = 1e-3  # relative: one side may give σ as a number and the other one as a colour
+STRAY = 0.01  # the largest share of wrong crossings of a shape that is not an error
+FEW = 2  # so many wrong crossings are not an error either, unless they are half of the crossings
+NEVER = 2**32 - 1  # the depth of a shape's first wrong crossing, if none exists
+# The share of the way from a ray's origin back to the surface that is searched for another surface. Rounding moves a
+# point by up to an eighth of this distance (`ray_origins`).
 SEARCHED = 3 / 4
-# A null lobe is no boundary. What scatters on its way through is one as well.
+# A null lobe does not change the medium. Rough and diffuse transmission do.
 THROUGH = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DiffuseTransmission
 
 
 class Crossings:
-    """For each shape: how often light went through it, came through another medium than it declares, how soon, and how
-    often it was stepped over because it is too thin."""
+    """Counts for each shape: [crossings, wrong crossings, least depth of a wrong crossing, times it was stepped over].
+
+    A crossing is wrong if the σ of the path is not the one that the shape declares. A shape is stepped over if it is so
+    thin that the ray starts beyond it.
+    """
 
     def __init__(self, v: Variant, scene: Scene) -> None:
         """`v`: the variant's module."""
         self.v, self.vectorised, self.shapes = v, dr.is_jit_v(v.Float), all_shapes(scene)
-        self.tally: dict[int, list[int]] = {}  # in scalar variants, by the position of the shape in the scene
-        self.positions: dict[int, int] = {}  # of a shape, by its number
-        self.counts: list[Any] = []  # the tally in compiled variants: arrays by the number of a shape
-        # What a frozen function writes nobody reads.
+        self.tally: dict[int, list[int]] = {}  # scalar variants: position of the shape in the scene → its counts
+        self.positions: dict[int, int] = {}  # Mitsuba's number of a shape → its position
+        self.counts: list[Any] = []  # compiled variants: four arrays, indexed by the number of the shape
+        # Counts that a frozen function writes could not be read.
         if self.vectorised and not dr.flag(dr.JitFlag.FreezingScope):
             for i, shape in enumerate(self.shapes):
                 self.positions[plugin_number(v, v.ShapePtr(shape))] = i
-            # The last number is that of all shapes that the scene does not show.
+            # The last entry counts all shapes that `all_shapes` does not return.
             size = max(self.positions, default=0) + 2
             self.counts = [dr.opaque(v.UInt32, start, size) for start in (0, 0, NEVER, 0)]
 
     def add(self, shape: Shape, depth: Count, through: Mask, wrong: Mask, thin: Mask) -> None:
-        """`wrong`, `thin`: of those that go `through`. `depth`: the number of the vertex, 0 for the first."""
+        """Count the lanes that go `through` a shape; `wrong` and `thin` are subsets of them. `depth`: 0 at first."""
         if self.counts:
             crossed, contradicted, first, stepped_over = self.counts
             numbers: Count = dr.reinterpret_array(self.v.UInt32, shape)
@@ -82,14 +86,14 @@ class Crossings:
                 row[1:3] = row[1] + 1, min(row[2], int(depth))
 
     def refuse(self) -> None:
-        """ValueError with a shape that light came to through another medium than it declares, or stepped over."""
+        """ValueError names a shape that was stepped over, or the shape with the earliest wrong crossing."""
 
         def contradicts(crossed: int, wrong: int) -> bool:
             return wrong > STRAY * crossed and (wrong > FEW or 2 * wrong >= crossed)
 
         counted = enumerate(zip(*self.counts, strict=True))
         rows = [(self.positions.get(number, -1), [int(count) for count in row]) for number, row in counted]
-        first, worst = NEVER, None  # what is wrong first is the cause
+        first, cause = NEVER, None  # later wrong crossings follow from the first
         for position, (crossed, wrong, depth, stepped_over) in sorted([*rows, *self.tally.items()]):
             name = shape_name(self.shapes, position) if position >= 0 else "a shape"
             if contradicts(crossed, stepped_over):
@@ -97,13 +101,13 @@ class Crossings:
                     f"refract_path: {name} absorbs, and is so thin that rays miss one of its sides; expected a sheet "
                     "thicker than 1e-5 of its size and its largest coordinate: move the scene to the origin"
                 )
-            if contradicts(crossed, wrong) and (worst is None or depth < first):
-                first, worst = depth, name
-        if worst is not None:
+            if contradicts(crossed, wrong) and (cause is None or depth < first):
+                first, cause = depth, name
+        if cause is not None:
             camera = "camera_absorption, or the sensor's medium, as the camera's surroundings absorb"
             outside = "ext_absorption (or ext_colour) as the medium around it absorbs"
             raise ValueError(
-                f"refract_path: inconsistent absorption at {worst}: the medium that light arrives in differs from the "
+                f"refract_path: inconsistent absorption at {cause}: the medium that light arrives in differs from the "
                 f"one its BSDF declares; expected {f'{outside}; {camera}' if first else f'{camera}; {outside}'}"
             )
 
@@ -119,30 +123,33 @@ class MediumTracker:
     def cross(
         self, sigma: Spectrum, depth: Count, si: Interaction, bs: BSDFSample, bsdf: BSDF, ray: Ray, active: Mask
     ) -> Spectrum:
-        """σ along `ray`, after a sample of the BSDF: of the other side where light goes through, else as it was."""
+        """Return σ along `ray`, the next ray, and count the crossing.
+
+        That is the σ of the other side if the BSDF sample is a transmission, else `sigma`.
+        """
         v, through = self.v, active & ((bs.sampled_type & THROUGH) != 0)
         if not self.vectorised and not through:
             return sigma
-        # A BSDF that declares nothing has σ = 0; asking for an attribute that is absent raises in scalar variants.
+        # A BSDF that declares nothing has σ = 0. In scalar variants `eval_attribute` raises for an absent attribute.
         declared = [self.vectorised or bsdf.has_attribute(name, through) for name in (HERE, BEYOND)]
         here, beyond = (
-            bsdf.eval_attribute(name, si, through) if known else v.UnpolarizedSpectrum(0)
-            for name, known in zip((HERE, BEYOND), declared, strict=True)
+            bsdf.eval_attribute(name, si, through) if has else v.UnpolarizedSpectrum(0)
+            for name, has in zip((HERE, BEYOND), declared, strict=True)
         )
-        apart = dr.abs(here - sigma) - TOLERANCE * dr.maximum(here, sigma)
-        # Whether there is another surface between this one and the origin of the ray.
+        excess = dr.abs(here - sigma) - TOLERANCE * dr.maximum(here, sigma)
+        # Another surface between this one and the origin of the next ray?
         back = si.p - ray.o
         length = dr.norm(back)
         absorbs = through & (dr.max(beyond) > 0) & (length > 0)
-        search = v.Ray3f(ray.o, back / dr.select(length > 0, length, 1), ray.time, ray.wavelengths)
-        search.maxt = length * SEARCHED
-        thin = absorbs & self.scene.ray_test(dr.detach(search), absorbs)
-        self.crossings.add(si.shape, depth, through, through & (dr.max(apart) > 0), thin)
+        ray_back = v.Ray3f(ray.o, back / dr.select(length > 0, length, 1), ray.time, ray.wavelengths)
+        ray_back.maxt = length * SEARCHED
+        thin = absorbs & self.scene.ray_test(dr.detach(ray_back), absorbs)
+        self.crossings.add(si.shape, depth, through, through & (dr.max(excess) > 0), thin)
         return dr.select(through, beyond, sigma)
 
 
 class ShapeMedia:
-    """Absorption by the media of the shapes (`interior`, `exterior`), as `volpath` follows them."""
+    """Absorption by the media of the shapes (`interior`, `exterior`), which are followed as `volpath` does."""
 
     def __init__(self, v: Variant) -> None:
         """`v`: the variant's module."""
@@ -151,18 +158,18 @@ class ShapeMedia:
     def cross(
         self, sigma: Spectrum, depth: Count, si: Interaction, bs: BSDFSample, bsdf: BSDF, ray: Ray, active: Mask
     ) -> Spectrum:
-        """σ along `ray`: of the medium on its side of the shape, where the shape has media."""
-        turns = active & si.is_medium_transition()
-        if not self.vectorised and not turns:
+        """Return σ along `ray`, the next ray: that of the medium on its side if the shape has media, else `sigma`."""
+        transition = active & si.is_medium_transition()
+        if not self.vectorised and not transition:
             return sigma
         medium = si.target_medium(ray.d)
         if not self.vectorised and medium is None:
             return self.v.UnpolarizedSpectrum(0)
-        return dr.select(turns, extinction(self.v, medium, si.wavelengths, turns), sigma)
+        return dr.select(transition, extinction(self.v, medium, si.wavelengths, transition), sigma)
 
 
 def extinction(v: Variant, medium: MediumPlugin, wavelengths: Number, active: Mask) -> Spectrum:
-    """σ of a homogeneous medium; 0 where there is none."""
+    """Return σ of a homogeneous medium; 0 for a null pointer."""
     mei = dr.zeros(v.MediumInteraction3f)
     mei.wavelengths = wavelengths
     return medium.get_scattering_coefficients(mei, active)[2]
@@ -172,44 +179,44 @@ def absorbs_only(v: Variant, medium: MediumPlugin) -> bool:
     """Whether a medium is homogeneous and scatters no light of any visible wavelength."""
     if not medium.is_homogeneous():
         return False
-    if dr.flag(dr.JitFlag.FreezingScope):  # what a frozen function computes nobody reads
+    if dr.flag(dr.JitFlag.FreezingScope):  # while a frozen function is recorded, values cannot be read
         return True
     mei = dr.zeros(v.MediumInteraction3f)
     visible = [(mi.MI_CIE_MIN + (mi.MI_CIE_MAX - mi.MI_CIE_MIN) * i / 64,) for i in range(65)]
-    for line in visible if v.is_spectral else [()]:
-        mei.wavelengths = type(mei.wavelengths)(*line)
+    for wavelength in visible if v.is_spectral else [()]:
+        mei.wavelengths = type(mei.wavelengths)(*wavelength)
         if dr.any(medium.get_scattering_coefficients(mei, True)[0] != 0, axis=None):
             return False
     return True
 
 
 def check_integrator(scene: Scene) -> None:
-    """ValueError where a BSDF absorbs and the scene's integrator is neither `refract_path` nor calls only that.
+    """ValueError if a BSDF absorbs and the scene's integrator is not `refract_path`, and does not call only that.
 
-    Also where the texture of a BSDF reads an attribute that its shape does not have.
+    ValueError also for mesh attributes that Mitsuba does not read correctly; see `check_attributes`.
     """
     check_attributes(scene)
 
-    def follows(integrator: Any) -> bool:
+    def follows_media(integrator: Any) -> bool:
         called = [child for child in children(integrator) if hasattr(child, "aov_names")]
-        return type(integrator).__name__ == "RefractPath" or (bool(called) and all(map(follows, called)))
+        return type(integrator).__name__ == "RefractPath" or (bool(called) and all(map(follows_media, called)))
 
-    declared = (absorbing_parameter(bsdf) for shape in all_shapes(scene) for bsdf in nested(shape.bsdf()))
-    name = next(filter(None, declared), "")
-    if name and not follows(scene.integrator()):
+    parameters = (absorbing_parameter(bsdf) for shape in all_shapes(scene) for bsdf in nested(shape.bsdf()))
+    name = next(filter(None, parameters), "")
+    if name and not follows_media(scene.integrator()):
         raise ValueError(f"refract: {name}; expected the integrator refract_path, or no absorption")
 
 
 def check_media(v: Variant, scene: Scene) -> None:
-    """ValueError for what is not followed.
+    """ValueError for a medium that `refract_path` cannot follow.
 
-    That is a medium of a sensor or a shape that scatters, one in a scene whose BSDFs absorb as well, and an absorbing
-    BSDF within another one, which does not pass on what it declares.
+    These are: a medium of a sensor or a shape that scatters or varies; a medium of a shape in a scene whose BSDFs
+    absorb; and an absorbing BSDF nested in another one, which hides its attributes.
     """
 
-    def check(owner: str, medium: MediumPlugin, otherwise: str = "") -> None:
+    def check(owner: str, medium: MediumPlugin, alternative: str = "") -> None:
         if medium is not None and not absorbs_only(v, medium):
-            expected = f"a homogeneous medium with an albedo of 0{otherwise}"
+            expected = f"a homogeneous medium with an albedo of 0{alternative}"
             raise ValueError(f"refract_path: {owner} scatters or varies; expected {expected}")
 
     for sensor in scene.sensors():

@@ -1,15 +1,15 @@
-"""The path loop of `refract_path`, in the terms of Mitsuba's `path` and `prb_basic`, with three optional parts.
+"""The path loop of `refract_path`. It follows Mitsuba's `path` and `prb_basic`, and has three optional parts.
 
-Each part, and each section of the loop, is traced only where `PathFeatures` has it:
+Each part, and each section of the loop, is traced only if `PathFeatures` contains it:
 
-- *absorption*: the throughput is multiplied by exp(−σ t) along each ray; σ is that of the medium that the ray is in.
-- *dispersion*: where the direction depends on the wavelength, the path goes on with its first wavelength, whose
-  throughput is multiplied by the number of wavelengths that the path carried.
-- *splitting*: at a boundary both lobes are followed, depth first. One lobe goes on at once, the other is pushed on a
-  stack; where a path ends, the branch that was pushed last is popped. So the stack of a lane has `split_depth` entries
-  at most, however many paths the lane follows.
+- *absorption*: along each ray the throughput is multiplied by exp(−σ t) of the medium that the ray is in.
+- *dispersion*: if the direction depends on the wavelength, only the first wavelength continues. Its throughput is
+  multiplied by the number of wavelengths that the path had.
+- *splitting*: at a boundary both lobes are followed, depth first. One lobe continues at once, the other one is pushed
+  on a stack. When a path ends, the last branch is popped. So the stack of a lane has at most `split_depth` entries,
+  however many paths the lane follows.
 
-In scalar variants a pointer may be None and needs an `if`; in the others lanes are masked.
+In scalar variants a pointer may be None, which needs an `if`; in vectorised variants lanes are masked.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ from .refract import DISPERSED, followed_context
 from .sampling import ONE, KeyedMultijitter, NonConstantEmitters, SceneEmitters, SceneSampler
 from .scene_features import BOUNDARIES, all_shapes, bsdf_name, children, nested, plugin_number
 
-# Samples near 0 and near 1 select the two lobes of a boundary; a lobe of smaller probability is not followed.
+# These values of `sample1` select the first and the last lobe of a boundary. A less probable lobe is not followed.
 FIRST, LAST = 2.0**-25, ONE
 LOBES = mi.BSDFFlags
 
 
 @dataclass(frozen=True)
 class PathFeatures:
-    """The features that are traced: those that the scene needs and the integrator's parameters allow."""
+    """The features that the loop traces: those that the scene needs and the integrator's parameters allow."""
 
     max_depth: int
     rr_depth: int
@@ -64,17 +64,17 @@ class PathFeatures:
     split_weight: float
     deterministic: bool
     emitter_sampling: bool
-    lamps_only: bool  # emitter sampling leaves out a constant environment
+    lamps_only: bool  # emitter sampling excludes the environment, which is constant
     area: bool  # some shape emits
-    environment: bool
-    first_number: bool  # a BSDF sample takes `sample1`
-    second_number: bool  # a BSDF sample takes `sample2`, two numbers; delta lobes need none
-    all_of_hit: bool  # a hit needs more than its shading frame
-    dispersion: bool  # some boundary refracts by wavelength
+    environment: bool  # an environment emitter exists
+    first_number: bool  # BSDF sampling uses `sample1`
+    second_number: bool  # BSDF sampling uses `sample2`, two numbers; delta lobes do not
+    all_of_hit: bool  # BSDFs use more of an interaction than its shading frame
+    dispersion: bool  # the refraction of some boundary depends on the wavelength
     absorption: bool  # some medium absorbs
     null: bool  # a BSDF may have a null lobe
-    caustics_apart: bool = False  # `lamp_tracing` adds its paths, which are left out here
-    delta_extent: float = math.inf  # of the largest shape with delta lobes; see `ray_origins`
+    caustics_apart: bool = False  # `lamp_tracing` renders caustics, so this loop skips them
+    delta_extent: float = math.inf  # extent of the largest shape with delta lobes; see `ray_origins`
 
     @property
     def roulette(self) -> bool:
@@ -83,46 +83,46 @@ class PathFeatures:
 
     @property
     def environment_after_loop(self) -> bool:
-        """Whether the environment is evaluated once, after the loop: a lane has one path only."""
+        """Whether the environment is evaluated once, after the loop: possible if a lane has one path only."""
         return self.environment and not self.split_depth
 
 
 @dataclass
 class LoopState:
-    """The state of a lane between vertices; None for parts that the features leave out."""
+    """The loop state of a lane; fields of optional parts are None if the features do not contain the part."""
 
     ray: Ray
     throughput: Spectrum
     result: Spectrum  # radiance accumulated so far
     depth: Count  # depth of the current vertex
     active: Mask
-    valid_ray: Mask  # whether the pixel is opaque here
+    valid_ray: Mask  # the alpha of the sample
     sampler: Sampler
     eta: Number  # product of the relative indices along the path
     escaped: Mask = None  # the ray has left the scene
-    # --- emitter sampling: the previous vertex, and the density and kind of its BSDF sample
+    # --- emitter sampling: the previous vertex, the density of its BSDF sample, and whether that is of a delta lobe
     prev_si: Interaction = None
     prev_bsdf_pdf: Number = None
     prev_bsdf_delta: Mask = None
     # --- caustics apart
-    surface_first: Mask = None  # the lobe at the first vertex was no delta
+    surface_first: Mask = None  # the lobe at the first vertex was not a delta lobe
     # --- splitting
-    specular_so_far: Mask = None  # every lobe since the camera was a delta; after another the path is not split
-    share: Number = None  # share of the pixel's light: product of the probabilities of the lobes that were split
+    specular_so_far: Mask = None  # all lobes since the camera were delta lobes; only such paths split
+    share: Number = None  # product of the probabilities of the lobes at which the path was split
     node: Count = None  # number of this branch in the tree: 2 n and 2 n + 1 are the branches of n
-    waiting: Count = None  # how many branches are on the stack
+    waiting: Count = None  # number of branches on the stack
     stack: Any = None
-    truncated: Number = None  # `deterministic`: light that was dropped
+    truncated: Number = None  # `deterministic`: throughput of the dropped branches
     # --- dispersion
-    wavelength_count: Number = None  # wavelengths that the path carries: all, or one after a dispersive boundary
+    wavelength_count: Number = None  # wavelengths of the path: all, or one after a dispersive boundary
     # --- absorption
-    sigma: Spectrum = None  # of the medium that the ray is in
-    skipped: Number = None  # distance from the last vertex to the origin of the ray, which is beside the surface
+    sigma: Spectrum = None  # σ of the medium that the ray is in
+    skipped: Number = None  # distance from the previous vertex to the origin of the ray
 
 
 @functools.cache
 def branch_type(v: Variant, dispersion: bool, absorption: bool) -> type:
-    """The type of what is on the stack: of a branch, the part of `LoopState` that it has to itself."""
+    """Return the type of a stack entry: the fields of `LoopState` that a branch does not share."""
     branch = {"o": v.Point3f, "d": v.Vector3f, "throughput": v.Spectrum, "depth": v.UInt32, "eta": v.Float}
     branch |= {"share": v.Float, "node": v.UInt32}
     branch |= {"wavelength_count": v.Float} if dispersion else {}
@@ -131,41 +131,41 @@ def branch_type(v: Variant, dispersion: bool, absorption: bool) -> type:
 
 
 class ScalarStack:
-    """`dr.alloc_local` for scalar variants, which have no local memory."""
+    """A replacement of `dr.alloc_local` for scalar variants, which have no local memory."""
 
     def __init__(self) -> None:
         """An empty stack."""
         self.branches: list[Any] = []
 
     def write(self, branch: Any, index: int, active: bool) -> None:
-        """Put `branch` at `index`; entries above it are lost."""
+        """Write `branch` at `index`, and drop the entries above it."""
         self.branches[index:] = [branch]
 
     def read(self, index: int, active: bool) -> Any:
-        """The branch at `index`."""
+        """Return the branch at `index`."""
         return self.branches[index]
 
 
 def power_heuristic(a: Number, b: Number) -> Number:
-    """The weight a²/(a² + b²) of a sample whose technique has density `a`, where another has `b`; 0 if both are 0.
+    """Return the weight a²/(a² + b²) of a sample of a technique with the density `a`; the other technique has `b`.
 
-    Source: Veach 1997, section 9.2.4, β = 2.
+    The weight is 0 if both are 0, and if a² is infinite. Source: Veach 1997, section 9.2.4, β = 2.
     """
     a, b = dr.square(a), dr.square(b)
-    some = (a + b > 0) & dr.isfinite(a)
-    return dr.select(some, a / dr.select(some, a + b, 1), 0)
+    valid = (a + b > 0) & dr.isfinite(a)
+    return dr.select(valid, a / dr.select(valid, a + b, 1), 0)
 
 
 def at_fixed_direction(
     v: Variant, context: Any, si: Interaction, bsdf: BSDF, bs: BSDFSample, weight: Spectrum, d: Vector3, active: Mask,
     own_odds: Mask,
 ) -> tuple[Spectrum, Vector3, Number]:  # fmt: skip
-    """Weight, world direction and density of a sample, as they are differentiated.
+    """Return weight, world direction and density of a BSDF sample, with the derivatives that an estimator needs.
 
-    The direction of a delta lobe moves with the parameters; its probability p is not differentiated: of its weight f/p
-    it is f'/p. Any other direction is a fixed point of the integrand: d/dx ∫ f dω = ∫ f'(ω)/p(ω) p(ω) dω, in which
-    neither ω nor p is differentiated. `own_odds`: where the BSDF's weight of a delta lobe is so already, though p is
-    differentiated.
+    The direction of a delta lobe moves with the parameters, but its probability p must be detached: the derivative of
+    the weight f/p is f'/p. The direction ω of any other lobe is detached: d/dx ∫ f dω = ∫ f'(ω)/p(ω) p(ω) dω, where
+    ω and p are not differentiated. `own_odds`: lanes in which the BSDF's weight of a delta lobe has the derivative f'/p
+    already, although p is attached.
     """
     if dr.grad_enabled(bs.pdf):
         odds = dr.select(active & (bs.pdf > 0) & (own_odds ^ True), bs.pdf, 1)
@@ -181,7 +181,7 @@ def at_fixed_direction(
 
 
 def has_own_odds(bsdf: BSDF) -> bool:
-    """Whether a mask whose opacity may have a derivative is within a BSDF; see `at_fixed_direction`."""
+    """Whether a BSDF contains a `mask` whose opacity may be differentiated; see `at_fixed_direction`."""
     masks = [inner for inner in nested(bsdf) if bsdf_name(inner) == "MaskBSDF"]
     textures = (child for mask in masks for child in children(mask) if hasattr(child, "is_spatially_varying"))
     opacities = (value for mask in masks for key, value in mi.traverse(mask) if key.startswith("opacity"))
@@ -189,7 +189,7 @@ def has_own_odds(bsdf: BSDF) -> bool:
 
 
 class PathLoop:
-    """The loop over the vertices of a path, and of all that it splits into."""
+    """The loop over the vertices of a path, and of all paths that it splits into."""
 
     def __init__(
         self,
@@ -199,35 +199,35 @@ class PathLoop:
         numbers: SceneSampler | KeyedMultijitter,
         media: MediumTracker | ShapeMedia | None = None,
     ) -> None:
-        """`v`: the variant's module. `numbers`: those of all paths. `media`: needed where `features.absorption`."""
+        """`v`: the variant's module. `numbers`: random numbers. `media`: required if `features.absorption`."""
         self.v, self.scene, self.features, self.numbers = v, scene, features, numbers
         self.media: Any = media
         self.vectorised, self.context = dr.is_jit_v(v.Float), followed_context()
         self.emitters = (NonConstantEmitters if features.lamps_only else SceneEmitters)(v, scene)
         self.ray_flags = +(mi.RayFlags.All if features.all_of_hit else mi.RayFlags.ShadingFrame)
-        # Derivatives need loops that are evaluated. The kernels of their reverse sweep may run after the scene is gone,
-        # so they must not trace rays: what a ray meets is evaluated at once.
+        # Derivatives need evaluated loops. The kernels of the reverse sweep may run after the scene was freed, so they
+        # must not trace rays: intersections are evaluated at once.
         self.evaluated = self.vectorised and not dr.flag(dr.JitFlag.SymbolicLoops)
         self.branch = branch_type(v, features.dispersion, features.absorption)
         self.boundaries = self.ranges(lambda bsdf: bsdf_name(bsdf) in BOUNDARIES) if features.split_depth else []
         self.own_odds = self.ranges(has_own_odds) if self.evaluated else []
 
     def refuse(self) -> None:
-        """ValueError where the absorption that the paths met was contradictory."""
+        """ValueError if the absorption along the paths was inconsistent; see `Crossings.refuse`."""
         if isinstance(self.media, MediumTracker):
             self.media.crossings.refuse()
 
-    def run(self, ray: Ray, sampler: Sampler, active: Mask, sigma: Spectrum = 0, way: Number = 0) -> LoopState:
-        """Follow `ray` and everything that it splits into. `result` of the state at the end is the radiance.
+    def run(self, ray: Ray, sampler: Sampler, active: Mask, sigma: Spectrum = 0, distance: Number = 0) -> LoopState:
+        """Follow `ray` and all paths that it splits into. Return the final state; its `result` is the radiance.
 
-        `sigma`: absorption at the camera. `way`: from there to the origin of the ray.
+        `sigma`: σ at the camera. `distance`: from the camera to the origin of the ray.
         """
-        v, features, skipped = self.v, self.features, way
+        v, features, skipped = self.v, self.features, distance
 
         # ---------------------- Hide area emitters ----------------------
         if features.hide_emitters and features.area:
-            camera, ray = ray, self.past_emitters(ray, active)
-            skipped += dr.dot(ray.o - camera.o, ray.d)
+            camera_ray, ray = ray, self.past_emitters(ray, active)
+            skipped += dr.dot(ray.o - camera_ray.o, ray.d)
 
         # --------------------- Configure loop state ----------------------
         valid_ray = v.Bool(features.environment and not features.hide_emitters)
@@ -259,7 +259,7 @@ class PathLoop:
         return s
 
     def past_emitters(self, ray: Ray, active: Mask) -> Ray:
-        """The ray from behind the area lights that it meets first."""
+        """Return the ray beyond the area lights that it hits first."""
 
         def step(ray: Ray, active: Mask) -> tuple[Ray, Mask]:
             si = self.scene.ray_intersect(ray, +mi.RayFlags.Minimal, True, active)
@@ -273,7 +273,7 @@ class PathLoop:
         return dr.while_loop((self.v.Ray3f(ray), active), lambda _, active: active, step)[0]
 
     def _vertex(self, s: LoopState) -> tuple[LoopState]:
-        """One iteration: from a ray to the vertex that it meets, and on to the next ray."""
+        """Run one iteration: intersect the ray, process the vertex, and sample the next ray."""
         v, scene, features = self.v, self.scene, self.features
 
         # ---------------------- Surface interaction ----------------------
@@ -289,27 +289,27 @@ class PathLoop:
 
         # ---------------------- Direct emission ----------------------
         emitter: Emitter = None
-        met = hit
+        active_emitter = hit
         if features.environment_after_loop:
             s.escaped = hit ^ True
         if features.environment and not features.environment_after_loop:
-            emitter, met = si.emitter(scene), v.Bool(True)
+            emitter, active_emitter = si.emitter(scene), v.Bool(True)
         elif features.area and (self.vectorised or hit):
             emitter = si.shape.emitter()
         if emitter is not None:
-            s.result += self.times(s.throughput, self._emitted(s, si, emitter, met))
+            s.result += self.times(s.throughput, self._emitted(s, si, emitter, active_emitter))
 
         # Should we continue tracing to reach one more vertex?
         active_next = hit & (s.depth + 1 < features.max_depth)
         if features.deterministic:
             self._truncate(s, hit & (active_next ^ True), s.throughput, s.eta)
-        # Where the last vertex is transparent the pixel is: `path` samples the BSDF there, too.
+        # If the last vertex is transparent, the pixel is: like `path`, sample the BSDF there, too.
         if not (self.vectorised or active_next or (hit and features.null)):
             s.valid_ray = s.valid_ray or hit
             s.active = self._pop(s, active_next) if features.split_depth else active_next
             return (s,)
         bsdf = si.bsdf()
-        # Random numbers of split paths are those of their vertex in the tree.
+        # The random numbers of a split path depend on its vertex in the tree.
         key = (s.node * 0x9E3779B9 + s.depth) * 4 if features.split_depth else 0
 
         # ---------------------- Emitter sampling ----------------------
@@ -319,7 +319,7 @@ class PathLoop:
             wo = si.to_local(ds.d)
             bsdf_value, bsdf_pdf = bsdf.eval_pdf(self.context, si, wo, active_em)
             active_em &= ds.pdf != 0
-            if not dr.grad_enabled(bsdf_value):  # a value of 0 needs no shadow ray, but may have a derivative
+            if not dr.grad_enabled(bsdf_value):  # a value of 0 needs a shadow ray only for its derivative
                 active_em &= dr.max(dr.abs(v.unpolarized_spectrum(bsdf_value))) > 0
             active_em = active_em & (scene.ray_test(si.spawn_ray_to(ds.p), active_em) ^ True)
             if self.evaluated:
@@ -327,8 +327,8 @@ class PathLoop:
             if v.is_polarized:
                 bsdf_value = si.to_world_mueller(bsdf_value, -wo, si.wi)
             if features.absorption:
-                endless = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-                emitter_weight = self.attenuated(emitter_weight, s.sigma, dr.select(endless, dr.inf, ds.dist))
+                at_infinity = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+                emitter_weight = self.attenuated(emitter_weight, s.sigma, dr.select(at_infinity, dr.inf, ds.dist))
             contribution = self.times(self.times(s.throughput, bsdf_value), emitter_weight)
             contribution *= dr.select(ds.delta, 1, power_heuristic(ds.pdf, bsdf_pdf))
             s.result = dr.select(active_em, s.result + contribution, s.result)
@@ -349,7 +349,7 @@ class PathLoop:
         s.eta = s.eta * bsdf_sample.eta
         for name, value in optional.items():
             setattr(s, name, dr.select(hit, value, getattr(s, name)))
-        # A ray that has left the scene is kept for the environment.
+        # A ray that has left the scene keeps its state for the environment.
         s.ray, s.throughput = dr.select(hit, ray, s.ray), dr.select(hit, throughput, s.throughput)
         if features.emitter_sampling:
             s.prev_si = dr.select(hit, v.Interaction3f(si), s.prev_si)
@@ -364,10 +364,10 @@ class PathLoop:
         # ---------------------- Stopping criterion ----------------------
         throughput_max = dr.max(v.unpolarized_spectrum(s.throughput))
         differentiated = dr.grad_enabled(s.throughput)
-        if not differentiated:  # a throughput of 0 may have a derivative
+        if not differentiated:  # a differentiated throughput of 0 may have a derivative
             active_next = active_next & (throughput_max != 0)
         if features.roulette:
-            # A branch must not be ended because it is one of several: its probability is that of an unsplit path.
+            # Roulette uses the throughput of the unsplit path, so that a branch does not end because it is one of many.
             unsplit = throughput_max / s.share if features.split_depth else throughput_max
             rr_prob = dr.detach(dr.minimum(unsplit * dr.square(s.eta), 0.95))
             if differentiated:
@@ -381,14 +381,14 @@ class PathLoop:
         return (s,)
 
     def spawn_ray(self, si: Interaction, bs: BSDFSample) -> Ray:
-        """The ray in the direction of a BSDF sample."""
+        """Return the ray in the direction of a BSDF sample."""
         delta = mi.has_flag(bs.sampled_type, LOBES.Delta) if self.features.second_number else True
         return ray_origins.spawn_ray(self.v, si, si.to_world(bs.wo), self.features.delta_extent, delta)
 
     def _next(
         self, s: LoopState, si: Interaction, bsdf: BSDF, bs: BSDFSample, weight: Spectrum, active: Mask
     ) -> tuple[Ray, Spectrum, dict[str, Any]]:
-        """The ray after a sample of the BSDF, its throughput, and the state of optional parts that it changes."""
+        """Return the next ray of a BSDF sample, its throughput, and new values for the state of optional parts."""
         v = self.v
         if v.is_polarized:
             weight = si.to_world_mueller(weight, -bs.wo, si.wi)
@@ -398,7 +398,7 @@ class PathLoop:
             weight, ray.d, bs.pdf = at_fixed_direction(v, self.context, si, bsdf, bs, weight, ray.d, active, own_odds)
         throughput, optional = self.times(s.throughput, weight), dict[str, Any]()
         if self.features.dispersion:
-            # The first wavelength stands for all that end here; each is the first equally often.
+            # The first wavelength represents all that end here; each wavelength is the first one equally often.
             dispersed = (bs.sampled_type & DISPERSED) != 0
             throughput = throughput * dr.select(dispersed, s.wavelength_count, 1)
             optional["wavelength_count"] = dr.select(dispersed, 1, s.wavelength_count)
@@ -408,7 +408,7 @@ class PathLoop:
         return ray, throughput, optional
 
     def _emitted(self, s: LoopState, si: Interaction, emitter: Emitter, active: Mask) -> Spectrum:
-        """The radiance of an emitter that the ray has met, with its weight beside emitter sampling."""
+        """Return the radiance of an emitter that the ray has hit, times its weight against emitter sampling."""
         radiance = emitter.eval(si, active)
         if not self.features.emitter_sampling:
             return radiance
@@ -419,13 +419,13 @@ class PathLoop:
         return radiance * dr.select(s.prev_bsdf_delta, 1, power_heuristic(s.prev_bsdf_pdf, pdf))
 
     def times(self, a: Spectrum, b: Spectrum) -> Spectrum:
-        """The product of two spectra, or of Mueller matrices."""
+        """Return the product of two spectra or Mueller matrices."""
         return a @ b if self.v.is_polarized else a * b
 
     def attenuated(self, light: Spectrum, sigma: Spectrum, length: Number) -> Spectrum:
-        """Light after a distance in an absorbing medium."""
-        share = absorbed(sigma, length)
-        return self.times(light, self.v.mueller.absorber(share) if self.v.is_polarized else share)
+        """Return `light` after a distance in an absorbing medium."""
+        transmittance = absorbed(sigma, length)
+        return self.times(light, self.v.mueller.absorber(transmittance) if self.v.is_polarized else transmittance)
 
     # Splitting -----------------------------------------------------------------------------------------------------
 
@@ -433,37 +433,38 @@ class PathLoop:
         self, s: LoopState, si: Interaction, bsdf: BSDF, bs: BSDFSample, sample_2: Point2, throughput: Spectrum,
         active: Mask,
     ) -> Spectrum:  # fmt: skip
-        """Push the lobe that was not sampled where both are worth following; the throughput of the other one."""
+        """Push the other lobe where the path splits; return the throughput of the sampled lobe."""
         features, p = self.features, dr.detach(bs.pdf)
-        boundary = active & s.specular_so_far & self._is_boundary(bsdf)
+        at_boundary = active & s.specular_so_far & self._is_boundary(bsdf)
         s.specular_so_far = s.specular_so_far & mi.has_flag(bs.sampled_type, LOBES.Delta)
-        both = boundary & (s.depth <= features.split_depth) & (s.share * dr.minimum(p, 1 - p) > features.split_weight)
-        asked = boundary if features.deterministic else both
-        if self.vectorised or asked:
+        split = at_boundary & (s.depth <= features.split_depth)
+        split = split & (s.share * dr.minimum(p, 1 - p) > features.split_weight)
+        active_other = at_boundary if features.deterministic else split
+        if self.vectorised or active_other:
             reflected = mi.has_flag(bs.sampled_type, LOBES.DeltaReflection)
-            other, weight = bsdf.sample(self.context, si, dr.select(reflected, LAST, FIRST), sample_2, asked)
-            asked = asked & (other.sampled_type != bs.sampled_type)
-            both = both & asked
-            ray, other_throughput, optional = self._next(s, si, bsdf, other, weight * other.pdf, asked)
+            other, weight = bsdf.sample(self.context, si, dr.select(reflected, LAST, FIRST), sample_2, active_other)
+            active_other = active_other & (other.sampled_type != bs.sampled_type)
+            split = split & active_other
+            ray, other_throughput, optional = self._next(s, si, bsdf, other, weight * other.pdf, active_other)
             if features.deterministic:
-                # The sample 1/2 has selected the stronger lobe; where it alone is followed the other one is dropped.
-                self._truncate(s, asked & (both ^ True), other_throughput, s.eta * other.eta)
-        if self.vectorised or both:
-            # The lobe that was sampled has the odd number.
+                # sample1 = 1/2 has selected the stronger lobe. Where the path does not split, the other one is dropped.
+                self._truncate(s, active_other & (split ^ True), other_throughput, s.eta * other.eta)
+        if self.vectorised or split:
+            # The sampled lobe has the odd number.
             branch = self.branch(
                 ray.o, ray.d, other_throughput, s.depth, s.eta * other.eta, s.share * dr.detach(other.pdf), 2 * s.node,
                 **optional,
             )  # fmt: skip
-            # The index of an idle lane must be in range as well: local memory is accessed there.
-            s.stack.write(branch, dr.select(both, s.waiting, 0), both)
-            s.waiting = dr.select(both, s.waiting + 1, s.waiting)
-            s.node = dr.select(both, 2 * s.node + 1, s.node)
-            s.share = dr.select(both, s.share * dr.detach(bs.pdf), s.share)
-        both = boundary if features.deterministic else both
-        return dr.select(both, throughput * bs.pdf, throughput)
+            # Inactive lanes access local memory as well, so their index must be in range.
+            s.stack.write(branch, dr.select(split, s.waiting, 0), split)
+            s.waiting = dr.select(split, s.waiting + 1, s.waiting)
+            s.node = dr.select(split, 2 * s.node + 1, s.node)
+            s.share = dr.select(split, s.share * dr.detach(bs.pdf), s.share)
+        without_chance = at_boundary if features.deterministic else split
+        return dr.select(without_chance, throughput * bs.pdf, throughput)
 
     def _pop(self, s: LoopState, active_next: Mask) -> Mask:
-        """Where a path has ended, go on with the branch that was pushed last."""
+        """Continue with the branch that was pushed last where a path has ended; return the active lanes."""
         popped = (active_next ^ True) & (s.waiting > 0)
         if not self.vectorised and not popped:
             return active_next
@@ -477,20 +478,21 @@ class PathLoop:
         s.specular_so_far = s.specular_so_far | popped
         return active_next | popped
 
-    def _truncate(self, s: LoopState, where: Mask, throughput: Spectrum, eta: Number) -> None:
-        # η²: radiance that was lost where the path entered a denser medium is regained where it leaves.
+    def _truncate(self, s: LoopState, dropped: Mask, throughput: Spectrum, eta: Number) -> None:
+        """Add the throughput of the `dropped` branches to `truncated`."""
+        # η²: radiance that is reduced where the path enters a denser medium is increased again where it leaves it.
         lost = dr.max(self.v.unpolarized_spectrum(throughput)) * dr.square(eta)
-        s.truncated = dr.select(where, s.truncated + lost, s.truncated)
+        s.truncated = dr.select(dropped, s.truncated + lost, s.truncated)
 
-    def ranges(self, wanted: Callable[[BSDF], bool]) -> list[tuple[Count, Count]]:
-        """The numbers of the shapes' BSDFs that are wanted, as ranges: first, and one after the last.
+    def ranges(self, predicate: Callable[[BSDF], bool]) -> list[tuple[Count, Count]]:
+        """Return the numbers of the shapes' BSDFs that satisfy `predicate`, as ranges: first, and one after the last.
 
-        Mitsuba numbers BSDFs as they are loaded. Opaque: another scene is other data, not another kernel.
+        Mitsuba numbers BSDFs in the order of loading. The ranges are opaque, so that scenes share a kernel.
         """
         if not self.vectorised:
             return []
         v, ranges = self.v, list[list[int]]()
-        bsdfs = [bsdf for shape in all_shapes(self.scene) if (bsdf := shape.bsdf()) and wanted(bsdf)]
+        bsdfs = [bsdf for shape in all_shapes(self.scene) if (bsdf := shape.bsdf()) and predicate(bsdf)]
         for number in sorted({plugin_number(v, v.BSDFPtr(bsdf)) for bsdf in bsdfs}):
             if ranges and ranges[-1][1] == number:
                 ranges[-1][1] += 1
@@ -506,7 +508,7 @@ class PathLoop:
         return inside
 
     def _is_boundary(self, bsdf: BSDF) -> Mask:
-        """Whether a BSDF is known to have one reflected and one refracted direction, and no others."""
+        """Whether a BSDF has one reflected and one refracted direction, and no others."""
         if not self.vectorised:
             return bsdf_name(bsdf) in BOUNDARIES
         return self.is_of(self.boundaries, bsdf)

@@ -1,12 +1,13 @@
-"""Where rays start that leave a surface: beside it, farther than rounding moves the surface or the ray.
+"""The origins of rays that leave a surface: at a distance from it that is larger than the rounding errors.
 
-Mitsuba's `spawn_ray` starts a ray 1500 (1 + |p|) u from the surface, where |p| is the largest coordinate of its point
-and u = 2⁻²⁴ in float32: 9 mm at 100 m. There a ray that enters a pane of 4 mm starts behind the pane, and its light
-never leaves the glass. Rays from delta lobes start here at the distance
+Mitsuba's `spawn_ray` starts a ray 1500 (1 + |p|) u from the surface, where |p| is the largest coordinate of the point
+and u = 2⁻²⁴ in float32: 9 mm at 100 m. A ray that enters a pane of 4 mm then starts behind the pane, and its light
+never leaves the glass. So this module starts the rays of delta lobes at the distance
 
     min(32 (E + |p|), 1500 (1 + |p|)) u,
 
-where E is the extent of the largest shape with such lobes. No ray met its own plane again at 8 (E + |p|) u.
+where E is the extent of the largest shape with such lobes. At 8 (E + |p|) u no ray was found to hit its own plane
+again.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import mitsuba as mi
 
 from mi_refract.numerics import Interaction, Mask, Ray, Shape, Variant, Vector3, mitsuba_mesh
 
-# The points of hits on these are known that well: on `QUADRICS` as measured on processors; CUDA has code of its own.
+# Points of hits on these shapes are that accurate. For `QUADRICS` this was measured on CPUs; CUDA has its own code.
 MESHES = {"BlenderMesh", "Cube", "Mesh", "OBJMesh", "PLYMesh", "SerializedMesh"}
 QUADRICS = {"Disk", "Rectangle", "Sphere"}
 MITSUBA, OURS = 1500, 32
@@ -35,7 +36,7 @@ class Size(NamedTuple):
 
 
 def size_of(shape: Shape) -> Size | None:
-    """None where it is not known, or where points on the shape are not known well enough."""
+    """Return the size of a shape; None if it is unknown, or if points on the shape are not accurate enough."""
     name = shape.class_name()
     if name not in (MESHES if "cuda" in str(mi.variant()) else MESHES | QUADRICS):
         return None
@@ -53,32 +54,29 @@ def size_of(shape: Shape) -> Size | None:
 
 
 def extent_of(sizes: Sequence[Size | None]) -> float:
-    """E in powers of two, so that similar scenes have the same kernel; ∞ where rays start as Mitsuba's do."""
+    """Return E rounded up to a power of two, so that similar scenes share a kernel; ∞ if rays start as Mitsuba's do."""
     extent = max((math.inf if size is None else size.extent for size in sizes), default=math.inf)
     return 2.0 ** math.ceil(math.log2(extent)) if 0 < extent < math.inf else math.inf
 
 
 def too_thin(size: Size | None, extent: float) -> str:
-    """What is wrong with a shape that rays step over, as far as its bounding box shows; "" where nothing is.
-
-    `extent`: E, as in `spawn_ray`.
-    """
+    """Return a text if a shape is so thin, by its bounding box, that rays start beyond it; else "". `extent`: E."""
     if size is None:
         return ""
     distance = min(OURS / MITSUBA * (extent + size.place), 1 + size.place) * mi.math.RayEpsilon
     if size.thickness >= distance:
         return ""
-    return f"is {size.thickness:.3g} thick, and rays start {distance:.3g} beside its surface, so its light is lost"
+    return f"is {size.thickness:.3g} thick, but rays start {distance:.3g} from its surface, so its light is lost"
 
 
 def spawn_ray(v: Variant, si: Interaction, d: Vector3, extent: float, delta: Mask) -> Ray:
-    """The ray from a surface in the direction d. `extent`: E; `delta`: whether d is that of a delta lobe."""
+    """Return the ray from a surface in the direction d. `extent`: E; `delta`: whether d is that of a delta lobe."""
     if extent == math.inf:
         return si.spawn_ray(d)
     u, size = v.math.RayEpsilon / MITSUBA, dr.max(dr.abs(si.p))
     distance = dr.fma(size, OURS * u, OURS * extent * u)
     far = (1 + size) * v.math.RayEpsilon
-    if OURS * extent > MITSUBA:  # else it is the lesser one everywhere
+    if OURS * extent > MITSUBA:  # otherwise distance ≤ far everywhere
         distance = dr.minimum(distance, far)
     if delta is not True:
         distance = dr.select(delta, distance, far)

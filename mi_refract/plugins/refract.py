@@ -5,22 +5,22 @@
 | `int_ior`, `ext_ior` | number, name | index inside (`bk7`, which is 1.5046) and outside (`air`) | `eta` | yes |
 | | dispersive material | a text of `mi_refract.media`, such as `SCHOTT:N-BK7` | `int_ior_B1`, … | yes |
 | | spectrum | index by wavelength, in spectral variants | `int_ior_n_360`, … | yes |
-| | texture | index by point; an attribute that a shape lacks: error by `refract_path`, else a warning | yes | yes |
+| | texture | index by point; a missing mesh attribute is an error of `refract_path`, else a warning | yes | yes |
 | `eta` | number | int_ior / ext_ior, only by `mi.traverse` | yes | yes |
 | `specular_reflectance`, `specular_transmittance` | number, spectrum, texture | tint of the lobe, ≥ 0 (1) | yes | yes |
 | `int_absorption`, `ext_absorption` | number, spectrum | σ of the medium on that side, per length (0) | yes | yes |
-| | `file:…` | k of a file, with `int_absorption_unit` | yes | yes |
+| | `file:…` | k from a file, with `int_absorption_unit` | yes | yes |
 | `int_absorption_unit`, `ext_absorption_unit` | number | the scene's unit of length in metres; no default | no | no |
-| `int_colour`, `ext_colour` | number, spectrum | instead of σ: what white light keeps after a distance | yes | yes |
+| `int_colour`, `ext_colour` | number, spectrum | instead of σ: the share of white light after a distance | yes | yes |
 | `int_colour_distance`, `ext_colour_distance` | number | that distance; no default | no | no |
 | `formula` | string | a key of `mi_refract.FORMULAS`, or `auto` (default) | no | no |
 
 After a distance t in a medium, exp(−σ t) of the light is left; σ = 4πk/λ, and a colour, above 0 and up to 1, is
-exp(−σ t). Absorption is for `refract_path` only. A ratio of indices outside 2⁻²⁰ … 2²⁰ is an error; where an edit of a
-texture makes one, light is lost. `auto` is the fastest formula that is right to the last bit. An edit of `eta` compiles
-nothing. `refract_<formula>` is the same plugin with that formula.
+exp(−σ t). Only `refract_path` renders absorption. A ratio of indices outside 2⁻²⁰ … 2²⁰ is an error; if an edit of a
+texture makes such a ratio, its light is lost. `auto` is the fastest formula that is right to the last bit. An edit of
+`eta` compiles no kernel. `refract_<formula>` is the same plugin with that formula.
 
-For integrators other than `refract_path`, and in RGB and mono variants, a dispersive index is that of the d line.
+With integrators other than `refract_path`, and in RGB and mono variants, a dispersive index is its value at the d line.
 """
 
 from __future__ import annotations
@@ -60,22 +60,22 @@ LOBES = ("specular_reflectance", "specular_transmittance")  # tint of the reflec
 FLAGS = mi.BSDFFlags
 FIXED_DIRECTIONS = "prb, prb_basic, prb_projective and prbvolpath do not differentiate the direction of a delta lobe"
 MOVING_DIRECTIONS = "refract_path or volpath, or path, which is biased"
-VALUE_AT_LOBE = 1e-4  # of `evaluate`: with any tint that matters above 1e-8, below which prbvolpath takes 1e-8 for it
-SAME_DIRECTION = 1e-4  # a direction that was sampled comes back from world space with an error of 1e-6
+VALUE_AT_LOBE = 1e-4  # `evaluate` returns tint × this; prbvolpath clamps values to at least 1e-8, where no tint matters
+SAME_DIRECTION = 1e-4  # a sampled direction that is transformed to world space and back has an error of 1e-6
 
-# A BSDF's arguments are a wavelength and a direction, and of the path it knows nothing. So the integrator says that it
-# follows wavelengths and media by a bit of `type_mask` in the context. (State beside the arguments would not do: Dr.Jit
-# samples a BSDF again for derivatives, after the integrator has returned.) The same bit of `sampled_type` in a sample:
-# the lobe is that of the first wavelength only.
+# A BSDF's arguments are wavelengths and a direction; it does not know the path. So the integrator reports by a bit of
+# `type_mask` in the context that it follows wavelengths and media. (State outside of the arguments would be wrong:
+# Dr.Jit samples a BSDF again for derivatives, after the integrator has returned.) The same bit of a sample's
+# `sampled_type` reports that its direction is valid for the first wavelength only.
 DISPERSED = 1 << 30
 if any(int(flag) & DISPERSED for flag in FLAGS):
     raise ImportError("bit 30 of mitsuba.BSDFFlags is in use; expected a version of Mitsuba that leaves it free")
 
 
 def followed_context() -> Context:
-    """A context for sampling BSDFs, of an integrator that follows wavelengths and media along a path.
+    """Return a context for sampling BSDFs by an integrator that follows wavelengths and media along a path.
 
-    Every render of `refract_path` has it: Dr.Jit traces the BSDFs of other scenes that are in memory as well.
+    Every render of `refract_path` uses it, as Dr.Jit also traces the BSDFs of other scenes in memory.
     """
     context = mi.BSDFContext()
     context.type_mask |= DISPERSED
@@ -83,7 +83,7 @@ def followed_context() -> Context:
 
 
 def is_followed(context: Context) -> bool:
-    """Whether a context is of an integrator that follows wavelengths and media."""
+    """Whether the integrator of a context follows wavelengths and media."""
     return bool(context.type_mask & DISPERSED)
 
 
@@ -104,22 +104,22 @@ class Ray(NamedTuple):
     transmitted: Mask
     r: Number
     t: Number
-    active: Mask  # where there is an index
+    active: Mask  # lanes that have an index
 
 
 class OtherRay(NamedTuple):
-    """What `refract_path` needs of a wavelength that is not the hero."""
+    """Values of a wavelength other than the hero."""
 
     side: Side
-    valid: Mask  # where there is an index
-    r: Number  # reflectance; 0 where there is no index
+    valid: Mask  # lanes that have an index
+    r: Number  # reflectance; 0 without an index
 
 
 # Parameters ----------------------------------------------------------------------------------------------------------
 
 
 def read_parameters(self: Refract, props: Properties, formula: str = "auto") -> None:
-    """ValueError with plugin, parameter and what is expected."""
+    """Set the attributes of a new plugin. ValueError names plugin, parameter and what is expected."""
     v = self.v
     v.BSDF.__init__(self, props)
     self.varying, eta = read_ratio(v, props)  # `varying`: a ratio that is not one number, or None
@@ -135,7 +135,7 @@ def read_parameters(self: Refract, props: Properties, formula: str = "auto") -> 
         read_values(PLUGIN, props, name, "a number, a spectrum or a texture, ≥ 0 and finite")
     self.textures = {name: props.get_texture(name, 1.0) for name in tints}
     self.absorptions = {side: read_absorption(PLUGIN, props, side) for side in ("int", "ext")}
-    self.reported = set[str]()  # of `LostLight`
+    self.reported = set[str]()  # texts that `LostLight` has logged
     self.eta = parameter_type(v)(eta)
     set_ratio(self, checked("int_ior / ext_ior", eta))
     both_sides = FLAGS.FrontSide | FLAGS.BackSide
@@ -145,25 +145,25 @@ def read_parameters(self: Refract, props: Properties, formula: str = "auto") -> 
     ]
     self.m_flags = self.m_components[0] | self.m_components[1]
     textured = self.textures or isinstance(self.varying, TexturedRatio)
-    # Of the shape, which only a sample knows. Mitsuba's scalar variants refuse what a shape lacks.
+    # Mesh attributes that textures read. Only `sample` knows the shape; scalar variants raise if the shape lacks one.
     self.attributes = mesh_attributes(self) if textured and dr.is_jit_v(v.Float) else []
 
 
 def checked(name: str, eta: float) -> float:
-    """`eta`; ValueError where it is not a ratio of indices."""
+    """Return `eta`. ValueError if it is not a ratio of indices."""
     if not SMALLEST_RATIO <= eta <= LARGEST_RATIO:
         raise ValueError(f"{PLUGIN}: {name} = {eta!r}; expected a ratio from {SMALLEST_RATIO} to {LARGEST_RATIO}")
     return eta
 
 
 def set_ratio(self: Refract, eta: Number) -> None:
-    """Set k from either side, in float64. Opaque: an edit changes the data of a kernel and not its code.
+    """Set k of both sides, in float64. They are opaque, so that an edit changes the data of a kernel and not its code.
 
-    A kernel gathers these numbers ray by ray, so there are no more than save it a division. κ = (k − 1)(k + 1) is
-    formed there: it is off by 2⁻⁵²/κ, which is what rounding the ratio of the indices to float64 makes it.
+    A kernel gathers these numbers for each ray, so only those that save a division are stored. The kernel computes
+    κ = (k − 1)(k + 1) with a relative error of 2⁻⁵²/κ; rounding the ratio of the indices to float64 causes as much.
 
-    They carry no derivative: the first `dr.backward` frees what it walks, and a second image would find none. `ratios`
-    forms it anew in each render.
+    No derivatives are tracked here: the first `dr.backward` would free their graph, and a second image would have none.
+    `ratios` builds the graph in each render.
     """
     eta = dr.detach(eta)
     self.k_inner, self.k_outer = self.wide(eta), self.wide(1 / eta)
@@ -171,7 +171,7 @@ def set_ratio(self: Refract, eta: Number) -> None:
 
 
 def traverse(self: Refract, cb: mi.TraversalCallback) -> None:
-    """Show the parameters."""
+    """Expose the parameters."""
     if self.varying:
         self.varying.traverse(cb)
     else:
@@ -183,27 +183,28 @@ def traverse(self: Refract, cb: mi.TraversalCallback) -> None:
 
 
 def parameters_changed(self: Refract, keys: Collection[str]) -> None:
-    """Take over what was set. ValueError for a value that is not an index."""
+    """Read the edited parameters. ValueError for a value that is not an index."""
     if self.varying:
         self.varying.changed(keys)
         if isinstance(self.varying, DispersiveRatio):
             set_ratio(self, self.varying.at(self.wide(LINES["d"])))
     elif not keys or "eta" in keys:
         if dr.is_jit_v(self.eta) and dr.flag(dr.JitFlag.FreezingScope):
-            # A number cannot be read while a function is recorded. A value that is not an index loses its light.
+            # Numbers cannot be read while a function is recorded. Light is lost if the value is not an index.
             eta = self.wide(dr.detach(self.eta))
             set_ratio(self, dr.select((eta >= SMALLEST_RATIO) & (eta <= LARGEST_RATIO), eta, dr.nan))
             return
-        # A number is read back, so that an edit compiles nothing. What was not edited keeps its double precision.
-        kept: Any = dr.slice(self.k_inner)
-        number, kept = float(one_number("eta", self.eta)), float(kept)
-        set_ratio(self, kept if dr.scalar.Array1f(kept)[0] == number else checked("eta", number))
+        # The number is read back, so that an edit compiles no kernel. An unedited one keeps its double precision.
+        before: Any = dr.slice(self.k_inner)
+        before, number = float(before), float(one_number("eta", self.eta))
+        edited = dr.scalar.Array1f(before)[0] != number
+        set_ratio(self, checked("eta", number) if edited else before)
 
 
 def ratios(
     self: Refract, si: Interaction, active: Mask, wavelength: Number | None = None
 ) -> tuple[Number, Number, Mask]:
-    """k from inside and from outside, in float64, at a wavelength or of the d line; and the lanes that have one."""
+    """Return k from inside, k from outside, in float64, at a wavelength or the d line; and the lanes that have them."""
     if wavelength is not None or isinstance(self.varying, TexturedRatio):
         eta = self.varying.at(si, active) if wavelength is None else self.varying.at(self.wide(wavelength))
         valid = dr.isfinite(eta)
@@ -221,21 +222,21 @@ def ratios(
 def sample(
     self: Refract, ctx: Context, si: Interaction, sample1: Number, sample2: Point2, active: Mask = True
 ) -> tuple[BSDFSample, Spectrum]:
-    """One of the two lobes, by `sample1`.
+    """Sample one of the two lobes; `sample1` selects it.
 
-    At a dispersive boundary `refract_path` carries N wavelengths (4). Reflected light has one direction and keeps all
-    of them. Refracted light has the direction of the first, the hero, and the others end. With R_i the reflectance of
-    wavelength i, R̄ their mean (0 for a wavelength without an index) and T the hero's transmittance, a lobe is chosen
-    by
+    At a dispersive boundary a path of `refract_path` has N wavelengths (4). Reflected light keeps all of them, as their
+    direction is the same. Refracted light has the direction of the first one, the hero, and the others end. Let R_i be
+    the reflectance of wavelength i, 0 without an index, R̄ the mean of R_i, and T the transmittance of the hero. The
+    probabilities of reflection and refraction are
 
         P = R̄ / (R̄ + T),    1 − P = T / (R̄ + T)
 
-    with the weights R_i / P reflected and T / (1 − P) = R̄ + T for the refracted hero, so each wavelength has the right
-    mean. No weight exceeds N + 1 reflected, as R_i / P = R_i + R_i T / R̄ and R_i ≤ N R̄, nor 2 refracted. (Chosen by
-    the hero's R alone, R_i / R_hero has no bound: R_hero = 0 where the indices are equal. Chosen by R̄, a refracted
-    weight reaches N, and N² with the factor below.) Where R_i is the same for all, P = R and the weights are 1. What
-    the hero weighs more for the others' having ended, a factor up to N, is the integrator's to multiply with
-    (`DISPERSED` in `sampled_type`).
+    with the weights R_i / P for reflected light and T / (1 − P) = R̄ + T for the refracted hero, so the mean of each
+    wavelength is right. A weight is at most N + 1 if reflected, as R_i / P = R_i + R_i T / R̄ and R_i ≤ N R̄, and at
+    most 2 if refracted. (With the hero's R as the probability, R_i / R_hero has no bound: R_hero = 0 if the indices are
+    equal. With R̄, a refracted weight reaches N, and N² with the factor below.) If all R_i are equal, P = R and the
+    weights are 1. To account for the wavelengths that end, the integrator multiplies the throughput of the hero by the
+    number of wavelengths that the path had, up to N (`DISPERSED` in `sampled_type`).
     """
     v = self.v
     has_r, has_t = ctx.is_enabled(FLAGS.DeltaReflection, 0), ctx.is_enabled(FLAGS.DeltaTransmission, 1)
@@ -246,7 +247,7 @@ def sample(
     if self.dispersive and not followed:
         names = " in ".join(medium.name for medium in self.varying.sides.values())
         warn_once(f"{PLUGIN}: {names}: all light has the index of the d line; expected the integrator refract_path")
-    ray, met = refract(self, si, active, si.wavelengths[0] if by_wavelength else None), v.Bool(active)
+    ray, hit = refract(self, si, active, si.wavelengths[0] if by_wavelength else None), v.Bool(active)
     active, others = ray.active, other_rays(self, si, ray) if by_wavelength else []
 
     # --- The lobe ---
@@ -255,12 +256,11 @@ def sample(
         hero_r, hero_t = (v.Float(ieee_divide(x, ray.r + ray.t)) for x in (ray.r, ray.t))
         reflectances = hero_r, *(other.r for other in others)
         odds_r, odds_t = self.wide(sum(reflectances)) / len(reflectances), self.wide(hero_t)
-    whole = odds_r + odds_t
-    # sample1 < P, without waiting for the division. Not ≤: an index-matched boundary never reflects, not even
-    # the sample that is exactly 0.
-    selected_r = (self.wide(sample1) * whole < odds_r if both else v.Bool(has_r)) & active
+    total = odds_r + odds_t
+    # sample1 < P, without waiting for the division. Not ≤: an index-matched boundary must not reflect if sample1 = 0.
+    selected_r = (self.wide(sample1) * total < odds_r if both else v.Bool(has_r)) & active
     selected_t = (selected_r ^ True) & active
-    value = v.Float(ieee_divide(dr.select(selected_r, odds_r, odds_t), whole))
+    value = v.Float(ieee_divide(dr.select(selected_r, odds_r, odds_t), total))
     bs = v.BSDFSample3f()
     bs.pdf = 1 if not both else dr.detach(value) if differentiated(value) else value
     bs.sampled_component = dr.select(selected_r, v.UInt32(0), v.UInt32(1))
@@ -272,7 +272,7 @@ def sample(
     # --- Its weight ---
     radiance = ctx.mode == mi.TransportMode.Radiance
     factor = dr.select(selected_t, dr.square(v.Float(ray.side.k)), 1) if radiance else 1
-    # Cosines below 1e-19 have squares of 0 in float32: such a lobe has no density and no weight.
+    # Squares of cosines below 1e-19 are 0 in float32: the density and the weight of such a lobe are 0.
     scale = dr.select(bs.pdf > 0, ieee_divide(factor, bs.pdf), 0) if v.is_polarized or by_wavelength else factor
     if v.is_polarized:
         weight = mueller(self, ctx, si, bs, ray, selected_r, others) * scale
@@ -280,7 +280,7 @@ def sample(
         powers = [dr.select(selected_r, r, t) for r, t in zip(reflectances, (hero_t, *[0] * len(others)), strict=True)]
         weight = v.Spectrum(*powers) * scale
     elif both:
-        # 1, with the derivative of log `value`: the choice of a lobe is detached, its probability is not.
+        # 1, with the derivative of log `value`: the choice of the lobe is detached, its probability is attached.
         one = replace_grad(v.Float(1), value / dr.detach(value)) if differentiated(value) else 1
         weight = v.Spectrum(one * factor)
     else:
@@ -290,27 +290,28 @@ def sample(
         tint = dr.select(selected, texture.eval(si, selected), v.UnpolarizedSpectrum(1))
         weight = weight @ v.mueller.absorber(tint) if v.is_polarized else weight * tint
     if self.absorbing and not followed:
-        # Infinite, as only `refract_path` can be right. (Not NaN: some integrators drop such a sample.)
+        # Infinite, as only `refract_path` renders absorption. (Not NaN: some integrators drop NaN.)
         text = f"{absorbing_parameter(self)}; expected the integrator refract_path, or no absorption"
         self.lost.report(self, text, "where light meets it, the image is not finite", active)
         weight = v.Spectrum(dr.inf)
-    # `refract_path` has checked them; where a function is recorded nothing can be read; an interaction that was made by
-    # hand has no shape.
-    unasked = followed or si.shape is None or dr.flag(dr.JitFlag.FreezingScope)
-    for name in () if unasked else self.attributes:
+    # Attributes are not checked if `refract_path` has done it, if the interaction has no shape, or while a function is
+    # recorded, as values cannot be read then.
+    unchecked = followed or si.shape is None or dr.flag(dr.JitFlag.FreezingScope)
+    for name in () if unchecked else self.attributes:
         text = f"a shape has no attribute {name!r}, which a texture of its BSDF reads; expected a mesh that has it"
-        here = met & (si.shape != None)  # noqa: E711  an array
-        self.lost.report(self, text, "Mitsuba takes it for 0", here & (si.shape.has_attribute(name, here) ^ True))
+        has_shape = hit & (si.shape != None)  # noqa: E711  an array
+        missing = has_shape & (si.shape.has_attribute(name, has_shape) ^ True)
+        self.lost.report(self, text, "Mitsuba takes it for 0", missing)
     return bs, dr.select(active, weight, 0)
 
 
 def refract(self: Refract, si: Interaction, active: Mask, wavelength: Number | None = None) -> Ray:
-    """The ray's side, refracted direction and reflectance. The normal is a literal: Dr.Jit folds it away."""
+    """Return the refracted ray. The normal is a literal, which Dr.Jit folds."""
     a, outside = -si.wi, si.wi.z >= 0
     inner, outer, active = ratios(self, si, active, wavelength)
     k, eta = (dr.select(outside, *pair) for pair in ((outer, inner), (inner, outer)))
     side = Side(k, (k - 1) * (k + 1))
-    # Unchecked: the ratio is checked where it is set, and NaN stays NaN.
+    # Unchecked: the ratio was checked when it was set, and NaN stays NaN.
     local = local_cosines(a.x, a.y, a.z, side.contrast)
     wo, transmitted = self.formula.unchecked(a, self.v.Vector3f(0, 0, 1), *side, local)
     odds = fresnel.local_odds(local, transmitted, *side)
@@ -318,7 +319,7 @@ def refract(self: Refract, si: Interaction, active: Mask, wavelength: Number | N
 
 
 def other_rays(self: Refract, si: Interaction, ray: Ray) -> list[OtherRay]:
-    """The wavelengths but the first."""
+    """Return the values of all wavelengths but the first."""
     v, others = self.v, []
     for i in range(1, dr.size_v(v.UnpolarizedSpectrum)):
         inner, outer, valid = ratios(self, si, v.Bool(True), si.wavelengths[i])
@@ -339,9 +340,9 @@ def mueller(
     selected_r: Mask,
     others: list[OtherRay],
 ) -> Spectrum:
-    """The Mueller matrix of the selected lobe, turned into the implicit Stokes bases of both directions.
+    """Return the Mueller matrix of the selected lobe, rotated to the implicit Stokes bases of both directions.
 
-    `others`: the wavelengths but the first, which are reflected only; none where all go the same way.
+    `others`: the wavelengths but the first, which are only reflected; [] if all wavelengths have one direction.
     """
     v, cos_i, cos_t = self.v, dr.abs(si.wi.z), dr.abs(ray.wo.z)
     r: Any = fresnel.mueller_reflection(cos_i, *ray.side)
@@ -350,16 +351,16 @@ def mueller(
         matrices: Any = [fresnel.mueller_reflection(cos_i, *other.side) for other in others]
         for i in range(4):
             for j in range(4):
-                more = (dr.select(other.valid, m[i][j], 0) for other, m in zip(others, matrices, strict=True))
-                r[i][j] = v.UnpolarizedSpectrum(r[i][j], *more)
+                entries = (dr.select(other.valid, m[i][j], 0) for other, m in zip(others, matrices, strict=True))
+                r[i][j] = v.UnpolarizedSpectrum(r[i][j], *entries)
                 t[i][j] = v.UnpolarizedSpectrum(t[i][j], *[0] * len(others))
-    entries = [[dr.select(selected_r, x, y) for x, y in zip(*rows, strict=True)] for rows in zip(r, t, strict=True)]
-    matrix = v.Spectrum(entries) if others else v.Spectrum(v.Matrix4f(entries))
-    # Radiance: light arrives along −wo and leaves along wi. Importance: the other way round.
+    selected = [[dr.select(selected_r, x, y) for x, y in zip(*rows, strict=True)] for rows in zip(r, t, strict=True)]
+    matrix = v.Spectrum(selected) if others else v.Spectrum(v.Matrix4f(selected))
+    # Radiance: light arrives along −wo and leaves along wi. Importance: in reverse.
     radiance = ctx.mode == mi.TransportMode.Radiance
     bases = []
     for direction in (-bs.wo, si.wi) if radiance else (-si.wi, bs.wo):
-        # The unit normal of the plane of incidence; any tangent where there is no such plane.
+        # The unit normal of the plane of incidence; at normal incidence, which defines no plane, any tangent.
         axis = v.Vector3f(-direction.y, direction.x, 0)
         length = dr.norm(axis)
         normal = dr.select(length > 0, axis / dr.select(length > 0, length, 1), v.Vector3f(1, 0, 0))
@@ -371,12 +372,12 @@ def mueller(
 
 
 def evaluate(self: Refract, ctx: Context, si: Interaction, wo: Vector3, active: Mask = True) -> Spectrum:
-    """0: a pair of delta lobes has no density anywhere. For `prb` and its kin, while they differentiate, more than 0.
+    """Return 0, as delta lobes have no density; but a value above 0 to `prb` and its variants while they differentiate.
 
-    They sample without derivatives, in a symbolic loop, and differentiate log eval at the direction that was sampled;
-    they read no derivative from 0. So where `wo` is the direction of a lobe, the value is its tint times a constant,
-    and the derivative in a tint is right. That in the index is not, as the direction should move with it: it is
-    infinite. (Not NaN, which Dr.Jit leaves out of a sum.)
+    These sample without derivatives, in a symbolic loop, and differentiate log eval at the sampled direction, which
+    gives no derivative if eval is 0. So if `wo` is the direction of a lobe, the value is the lobe's tint times a
+    constant, and the derivative in a tint is right. The derivative in the index would be wrong, as the direction should
+    move with it; so it is infinite. (Not NaN, which Dr.Jit leaves out of sums.)
     """
     v = self.v
     if not (dr.is_diff_v(v.Float) and dr.flag(dr.JitFlag.SymbolicLoops)):
@@ -393,32 +394,32 @@ def evaluate(self: Refract, ctx: Context, si: Interaction, wo: Vector3, active: 
         value *= replace_grad(v.Float(1), v.Float(index) * dr.inf)
     ray = refract(self, si, active)
     lobe = dr.select(reflected, v.Vector3f(ray.a.x, ray.a.y, si.wi.z), ray.wo)
-    near = active & (dr.squared_norm(dr.detach(wo - lobe)) < SAME_DIRECTION**2)
-    value = dr.select(near, value * VALUE_AT_LOBE, 0)
+    on_lobe = active & (dr.squared_norm(dr.detach(wo - lobe)) < SAME_DIRECTION**2)
+    value = dr.select(on_lobe, value * VALUE_AT_LOBE, 0)
     return v.Spectrum(v.mueller.absorber(value)) if v.is_polarized else value
 
 
 def pdf(self: Refract, ctx: Context, si: Interaction, wo: Vector3, active: Mask = True) -> Number:
-    """0: a delta lobe has no density."""
+    """Return 0: a delta lobe has no density."""
     return self.v.Float(0)
 
 
 def eval_pdf(self: Refract, ctx: Context, si: Interaction, wo: Vector3, active: Mask = True) -> tuple[Spectrum, Number]:
-    """0 and 0, as `pdf`; what `evaluate` is for `prb` alone."""
+    """Return 0 and 0. Values above 0 of `evaluate` are for `prb` and its variants only."""
     return self.v.Spectrum(0), self.v.Float(0)
 
 
-# Attributes: Mitsuba finds what `traverse` shows, and gives 0 for what it does not find (an error in scalars) --------
+# Attributes: Mitsuba finds what `traverse` exposes; others are 0, or an error in scalar variants ---------------------
 
 
 def has_attribute(self: Refract, name: str, active: Mask = True) -> Mask:
-    """True for what `traverse` shows, and for absorption where there is any."""
+    """Whether an attribute exists: a parameter that `traverse` exposes, or `HERE` and `BEYOND` if a side absorbs."""
     v = self.v
     return v.Bool(self.absorbing) if name in (HERE, BEYOND) else v.BSDF.has_attribute(self, name, active)
 
 
 def eval_attribute(self: Refract, name: str, si: Interaction, active: Mask = True) -> Spectrum:
-    """As `has_attribute`; 0 for any other, in vectorised variants."""
+    """Return the value of an attribute; in vectorised variants 0 if it does not exist."""
     v = self.v
     if name not in (HERE, BEYOND):
         return v.BSDF.eval_attribute(self, name, si, active)
@@ -427,14 +428,14 @@ def eval_attribute(self: Refract, name: str, si: Interaction, active: Mask = Tru
 
 
 def eval_attribute_1(self: Refract, name: str, si: Interaction, active: Mask = True) -> Number:
-    """As `eval_attribute`."""
+    """Return the value of an attribute that is one number, as `eval_attribute`."""
     if name == "eta" and not self.varying and not dr.is_jit_v(self.v.Float):
-        return self.eta[0]  # Mitsuba finds no number in an array
+        return self.eta[0]  # an array, which Mitsuba does not read
     return self.v.BSDF.eval_attribute_1(self, name, si, active)
 
 
 def to_string(self: Refract) -> str:
-    """The parameters, one a line."""
+    """Return the parameters, one a line."""
     chosen = f"{self.formula_name} (auto)" if self.requested == "auto" else self.formula_name
     sides = self.varying.sides.items() if self.varying else [("eta", self.eta[0])]
     lines = [f"{side} = {index.name if isinstance(index, Medium) else index}" for side, index in sides]
@@ -444,18 +445,18 @@ def to_string(self: Refract) -> str:
 
 
 class LostLight:
-    """Light that meets what cannot be rendered: an error where one can be raised.
+    """Reports of light that cannot be rendered correctly: an error if one can be raised, else a warning.
 
-    A symbolic call has the BSDFs of all scenes in memory, and does not know which of them light will meet. `dr.print`
-    does once the image is computed: one warning for all BSDFs that light met for the first time.
+    A symbolic call traces the BSDFs of all scenes in memory, before it is known which of them light will hit. Then
+    `dr.print`, which runs when the image is computed, logs one warning for all BSDFs that light hits the first time.
     """
 
     def __init__(self, v: Variant) -> None:
         """`v`: the variant's module."""
-        self.v, self.logged = v, set[str]()  # in the image that was traced last
+        self.v, self.logged = v, set[str]()  # texts logged for the image that was traced last
 
     def report(self, bsdf: Refract, text: str, effect: str, active: Mask) -> None:
-        """RuntimeError, or a warning when the image is computed, where a lane is `active`; once a BSDF and text."""
+        """RuntimeError, or a warning when the image is computed, if a lane is `active`; once for each BSDF and text."""
         v, text = self.v, f"{PLUGIN}: {text}"
 
         def warn(_: str) -> None:
@@ -464,7 +465,7 @@ class LostLight:
                 self.logged.add(text)
                 mi.Log(mi.LogLevel.Warn, f"{text}; {effect}")  # type: ignore[operator]
 
-        frozen = dr.flag(dr.JitFlag.FreezingScope)  # there nothing can be read
+        frozen = dr.flag(dr.JitFlag.FreezingScope)  # while a function is recorded, values cannot be read
         if not frozen and not dr.flag(dr.JitFlag.SymbolicScope):
             if dr.any(active):
                 raise RuntimeError(text)
@@ -481,17 +482,17 @@ class LostLight:
 
 
 def plugin_class(v: Variant) -> type:
-    """The class of the plugin for one variant, given its module (`mitsuba.llvm_ad_rgb`, say).
+    """Return the class of the plugin for one variant, given its module, such as `mitsuba.llvm_ad_rgb`.
 
-    Its methods are the functions above, where `self.v` is that module and `self.wide` its float64.
+    Its methods are the functions above. `self.v` is that module and `self.wide` its type of float64.
     """
 
     def dispersive(self: Refract) -> bool:
-        """Whether the direction depends on the wavelength, where `refract_path` samples."""
+        """Whether the direction depends on the wavelength if `refract_path` samples."""
         return v.is_spectral and isinstance(self.varying, DispersiveRatio)
 
     def absorbing(self: Refract) -> bool:
-        """Whether a side absorbs light, which only `refract_path` can render."""
+        """Whether a side absorbs light, which only `refract_path` renders."""
         return any(self.absorptions.values())
 
     members = {
@@ -504,15 +505,15 @@ def plugin_class(v: Variant) -> type:
         "dispersive": property(dispersive),
         "absorbing": property(absorbing),
     }
-    named = traverse, parameters_changed, sample, pdf, eval_pdf, has_attribute, eval_attribute, eval_attribute_1
-    return type("Refract", (v.BSDF,), members | {method.__name__: method for method in (*named, to_string)})
+    methods = traverse, parameters_changed, sample, pdf, eval_pdf, has_attribute, eval_attribute, eval_attribute_1
+    members |= {method.__name__: method for method in (*methods, to_string)}
+    return type("Refract", (v.BSDF,), members)
 
 
 def register(variant: Variant) -> None:
-    """Make `refract` known to one variant, given its module; and `refract_<formula>` for every formula.
+    """Register `refract` in one variant, given its module; and `refract_<formula>` for every formula.
 
-    The latter are for scenes whose plugin is a parameter, so that no parameter is left to name the formula.
-    Registering again is harmless.
+    The latter serve scenes that take the name of the plugin as a parameter. Registering again is harmless.
     """
     plugin = plugin_class(variant)
     variant.register_bsdf(PLUGIN, plugin)

@@ -1,4 +1,4 @@
-"""Random numbers of paths, also of paths that split, and the choice of an emitter."""
+"""Random numbers for paths, also for paths that split; and the choice of an emitter."""
 
 from __future__ import annotations
 
@@ -12,57 +12,57 @@ ONE = 1 - 2.0**-24  # the largest float32 below 1
 
 
 class SceneSampler:
-    """The scene's own sampler: numbers in the order in which they are drawn; keys are ignored."""
+    """The scene's own sampler. Keys are ignored: numbers come in the order of the calls."""
 
     def next_1d(self, sampler: Sampler, key: Count) -> Number:
-        """A number in [0, 1)."""
+        """Return a number in [0, 1)."""
         return sampler.next_1d()
 
     def next_2d(self, sampler: Sampler, key: Count) -> Point2:
-        """A point in [0, 1)²."""
+        """Return a point in [0, 1)²."""
         return sampler.next_2d()
 
 
 class IndependentNumbers:
-    """Independent numbers for scalar variants, one after the other; keys are ignored."""
+    """Independent random numbers for scalar variants. Keys are ignored: numbers come in the order of the calls."""
 
     def __init__(self, v: Variant, seed: int) -> None:
         """`v`: the variant's module."""
         self.v, self.generator = v, v.PCG32(initstate=seed)
 
     def next_1d(self, sampler: Sampler, key: Count) -> Number:
-        """A number in [0, 1)."""
+        """Return a number in [0, 1)."""
         return self.generator.next_float32()
 
     def next_2d(self, sampler: Sampler, key: Count) -> Point2:
-        """A point in [0, 1)²."""
+        """Return a point in [0, 1)²."""
         return self.v.Point2f(*self.independent(key, 2))
 
     def independent(self, key: Count, count: int) -> list[Number]:
-        """`count` numbers in [0, 1)."""
+        """Return `count` numbers in [0, 1)."""
         return [self.generator.next_float32() for _ in range(count)]
 
 
 def seeds_of(v: Variant, sampler: Sampler) -> Count:
-    """A seed for each lane, from a point that is drawn from a sampler."""
+    """Return a seed for each lane, made of a point of the sampler."""
     return v.sample_tea_32(*(dr.reinterpret_array(v.UInt32, x) for x in dr.detach(sampler.next_2d())))[0]
 
 
 class KeyedMultijitter:
-    """Stratified numbers for the lanes of a wavefront, in which the samples of a pixel lie side by side.
+    """Stratified random numbers for the lanes of a wavefront, in which the samples of a pixel are adjacent.
 
-    A Mitsuba sampler counts dimensions in the order in which numbers are drawn: a path that draws one number more would
-    shift the dimensions of all that follow. Here a number depends on its key. Each key is a dimension of its own that
-    is stratified over the samples of a pixel: correlated multi-jittered sampling (Kensler 2013).
+    A Mitsuba sampler counts dimensions in the order of the calls: a path that draws one number more shifts all later
+    dimensions. Here a number depends on its key. Each key is a dimension of its own that is stratified over the samples
+    of a pixel: correlated multi-jittered sampling (Kensler 2013).
 
-    The scene's sampler seeds those of camera paths (`seeds_of`): it alone knows the seed and the pass of every render,
-    also where another integrator calls this one.
+    For camera paths the seeds come from the scene's sampler (`seeds_of`), which knows the seed and the pass of every
+    render, also if another integrator calls this one.
     """
 
     def __init__(self, v: Variant, seed: Count, lanes: int, count: int) -> None:
-        """`v`: the variant's module. `seed`: one for all, or one a lane. `count`: samples of a pixel, side by side."""
+        """`v`: the variant's module. `seed`: one for all lanes, or one a lane. `count`: samples of a pixel."""
         self.v = v
-        # A symbolic loop cannot read another lane, so there each lane is a pixel of its own.
+        # A symbolic loop cannot read other lanes: each lane counts as a pixel.
         self.count = count if lanes % count == 0 and not dr.flag(dr.JitFlag.SymbolicScope) else 1
         self.rows = next(r for r in range(math.isqrt(self.count), 0, -1) if self.count % r == 0)
         self.columns = self.count // self.rows
@@ -70,84 +70,85 @@ class KeyedMultijitter:
         pixel = self.lane // self.count
         self.index = self.lane - pixel * self.count
         if self.count > 1 and dr.width(seed) > 1:
-            seed = dr.gather(v.UInt32, seed, self.lane - self.index)  # of the first lane of the pixel
+            seed = dr.gather(v.UInt32, seed, self.lane - self.index)  # the seed of the pixel's first lane
         self.pixel = v.sample_tea_32(pixel, seed)[0]
 
     def next_1d(self, sampler: Sampler, key: Count) -> Number:
-        """A number in [0, 1): the n samples of a pixel with the same key lie in n equal intervals, one in each."""
+        """Return a number in [0, 1). The n samples of a pixel with one key lie in n equal intervals, one in each."""
         v, (permutation, noise) = self.v, self.v.sample_tea_32(self.pixel, key)
         stratum = v.permute_kensler(self.index, self.count, permutation)
         return self._placed(stratum, self._unit(v.sample_tea_32(self.lane, noise)[0]), self.count)
 
     def next_2d(self, sampler: Sampler, key: Count) -> Point2:
-        """A point in [0, 1)²: stratified in cells of rows × columns, and in x and in y alone."""
-        v, (of_cells, noise) = self.v, self.v.sample_tea_32(self.pixel, key)
-        # Seeds that differ by a known constant give permutations that depend on each other: each has a hash of its own.
-        of_rows, of_columns = v.sample_tea_32(noise, of_cells)
-        cell = v.permute_kensler(self.index, self.count, of_cells)
+        """Return a point in [0, 1)², stratified in rows × columns cells, and in x and y each over all samples."""
+        v, (cell_seed, noise) = self.v, self.v.sample_tea_32(self.pixel, key)
+        # Seeds with a constant difference give dependent permutations. So each seed is a hash of its own.
+        row_seed, column_seed = v.sample_tea_32(noise, cell_seed)
+        cell = v.permute_kensler(self.index, self.count, cell_seed)
         row = cell // self.columns
         column = cell - row * self.columns
-        # Within its cell a sample has a row and a column to itself, too.
-        inner_row = v.permute_kensler(row, self.rows, of_rows)
-        inner_column = v.permute_kensler(column, self.columns, of_columns)
+        # Cells are divided likewise: no two samples share a fine row or a fine column.
+        inner_row = v.permute_kensler(row, self.rows, row_seed)
+        inner_column = v.permute_kensler(column, self.columns, column_seed)
         x, y = (self._unit(word) for word in v.sample_tea_32(self.lane, noise))
         x, y = self._placed(inner_row, x, self.rows), self._placed(inner_column, y, self.columns)
         return v.Point2f(self._placed(column, x, self.columns), self._placed(row, y, self.rows))
 
     def independent(self, key: Count, count: int) -> list[Number]:
-        """`count` numbers in [0, 1), up to 4, without strata: for a quarter of the time."""
+        """Return `count` ≤ 4 numbers in [0, 1) without stratification, in a quarter of the time."""
         v = self.v
         words = [x for i in range(0, count, 2) for x in v.sample_tea_32(self.lane ^ self.pixel, key + i)]
         return [self._unit(word) for word in words[:count]]
 
     def _unit(self, word: Count) -> Number:
-        """24 bits as a number in [0, 1)."""
+        """Return the upper 24 bits as a number in [0, 1)."""
         return self.v.Float(word >> 8) * 2.0**-24
 
     def _placed(self, stratum: Count, x: Number, count: int) -> Number:
+        """Return x, in [0, 1), mapped to a stratum of `count`."""
         return dr.minimum((self.v.Float(stratum) + x) * (1 / count), ONE)
 
 
 class SceneEmitters:
-    """All emitters, chosen by Mitsuba."""
+    """Emitter sampling by Mitsuba, of all emitters."""
 
     def __init__(self, v: Variant, scene: Scene) -> None:
         """`v`: the variant's module."""
         self.scene = scene
 
     def sample(self, si: Interaction, sample: Point2, active: Mask) -> tuple[Interaction, Spectrum]:
-        """A direction toward an emitter, and its radiance over the density; occlusion is not tested."""
+        """Return a direction sample toward an emitter, and radiance / density; occlusion is not tested."""
         direction: tuple[Interaction, Spectrum] = self.scene.sample_emitter_direction(si, sample, False, active)
         return direction
 
     def pdf(self, reference: Interaction, ds: Interaction, active: Mask) -> Number:
-        """The density per solid angle, seen from `reference`, with which `sample` returns `ds`."""
+        """Return the density per solid angle, seen from `reference`, with which `sample` returns `ds`."""
         return self.scene.pdf_emitter_direction(reference, ds, active)
 
 
 class NonConstantEmitters:
-    """All emitters but a constant environment, chosen by their sampling weights.
+    """Emitter sampling of all emitters but a constant environment, in proportion to their sampling weights.
 
-    Light that is the same from all directions adds little noise where only the BSDF is sampled; the noise is that of
-    what occludes it. Sampling it as an emitter would leave fewer samples for the others.
+    Light that is the same from all directions adds little noise if only the BSDF is sampled: only occluders cause any.
+    Sampling it as an emitter would leave fewer samples for the other emitters.
     """
 
     def __init__(self, v: Variant, scene: Scene) -> None:
         """`v`: the variant's module."""
         self.v, emitters = v, scene.emitters()
-        kept = [i for i, emitter in enumerate(emitters) if not emitter.is_environment()]
-        weights = [float(emitters[i].sampling_weight()) for i in kept]
+        lamps = [i for i, emitter in enumerate(emitters) if not emitter.is_environment()]
+        weights = [float(emitters[i].sampling_weight()) for i in lamps]
         self.total, self.vectorised = sum(weights), dr.is_jit_v(v.Float)
-        if not self.total:  # no emitter is sampled
+        if not self.total:  # then `sample` and `pdf` are not called
             return
         if self.vectorised:
-            self.pointers = dr.gather(v.EmitterPtr, scene.emitters_dr(), v.UInt32(kept))
+            self.pointers = dr.gather(v.EmitterPtr, scene.emitters_dr(), v.UInt32(lamps))
         else:
-            self.pointers = [emitters[i] for i in kept]
-        self.choice = v.DiscreteDistribution(weights) if len(kept) > 1 else None
+            self.pointers = [emitters[i] for i in lamps]
+        self.choice = v.DiscreteDistribution(weights) if len(lamps) > 1 else None
 
     def sample(self, si: Interaction, sample: Point2, active: Mask) -> tuple[Interaction, Spectrum]:
-        """As `SceneEmitters.sample`."""
+        """Return a direction sample as `SceneEmitters.sample` does."""
         v, index, probability = self.v, self.v.UInt32(0), 1.0
         if self.choice:
             index, x, probability = self.choice.sample_reuse_pmf(sample.x, active)
@@ -158,7 +159,7 @@ class NonConstantEmitters:
         return ds, radiance / probability
 
     def pdf(self, reference: Interaction, ds: Interaction, active: Mask) -> Number:
-        """As `SceneEmitters.pdf`; 0 for the environment."""
+        """Return the density as `SceneEmitters.pdf` does; 0 for the environment."""
         if not self.vectorised and (ds.emitter is None or ds.emitter.is_environment() or not active):
             return 0.0
         lamp = active & (ds.emitter.is_environment() ^ True)

@@ -1,4 +1,4 @@
-"""Absorption as parameters of `refract`: what they may be, and what is made of them."""
+"""Absorption parameters of `refract`: accepted values, and the σ that they give."""
 
 import math
 import re
@@ -22,12 +22,12 @@ def load(**parameters):
 
 
 def sigma(side=BEYOND, outside=True, **parameters):
-    """What a boundary with these parameters says of a side, seen from outside or from inside."""
+    """Return σ of one side of a boundary with these parameters, seen from outside or from inside."""
     si = surface((0.6, 0, 0.8 if outside else -0.8), WAVELENGTHS)
     return vector(load(**parameters).eval_attribute(side, si, True))
 
 
-def test_each_side_is_here_or_beyond(each_variant):
+def test_attributes_follow_the_side_that_light_comes_from(each_variant):
     both = {"int_absorption": 40.0, "ext_absorption": 0.25}
     assert sigma(HERE, **both) == pytest.approx(0.25) == sigma(BEYOND, outside=False, **both)
     assert sigma(BEYOND, **both) == pytest.approx(40) == sigma(HERE, outside=False, **both)
@@ -36,60 +36,62 @@ def test_each_side_is_here_or_beyond(each_variant):
     assert sigma(int_colour=0.25, int_colour_distance=2.0) == pytest.approx(math.log(4) / 2, rel=1e-6)
 
 
-def test_of_three_colours_and_of_a_spectrum(each_variant):
+def test_rgb_colours_and_spectra_give_sigma(each_variant):
     if mi.is_monochromatic:
         pytest.skip("no colours")
-    values, left, unit = ([0.4, 0.5, 0.6, 0.7],) * 2 + (1.0,)
-    part = colour = SPECTRUM
+    values, colours, distance = [0.4, 0.5, 0.6, 0.7], [0.4, 0.5, 0.6, 0.7], 1.0
+    absorption = colour = SPECTRUM
     if not mi.is_spectral:
-        values, left, unit = [0.5, 2, 4], [0.25, 1, 0.5], 0.5
-        part, colour = ({"type": "rgb", "value": x} for x in (values, left))
-    assert sigma(int_absorption=part) == pytest.approx(values, rel=1e-6)
-    expected = -np.log(left) / unit
-    assert sigma(int_colour=colour, int_colour_distance=unit) == pytest.approx(expected, rel=1e-5, abs=1e-12)
+        values, colours, distance = [0.5, 2, 4], [0.25, 1, 0.5], 0.5
+        absorption, colour = ({"type": "rgb", "value": x} for x in (values, colours))
+    assert sigma(int_absorption=absorption) == pytest.approx(values, rel=1e-6)
+    expected = -np.log(colours) / distance
+    assert sigma(int_colour=colour, int_colour_distance=distance) == pytest.approx(expected, rel=1e-5, abs=1e-12)
 
 
-def test_absorption_of_a_file_is_4_pi_k_over_the_wavelength_in_the_unit_of_the_scene(each_variant, tmp_path, logged):
-    """Beyond the table's ends that of the ends, with a warning."""
+def test_a_file_with_k_gives_4_pi_k_over_wavelength(each_variant, tmp_path, logged):
+    """In the scene's unit. Outside the table k has its value at the table's end, with a warning."""
     (tmp_path / "k.csv").write_text("nm,n,k\n400,1.5,4e-6\n600,1.5,6e-6\n700,1.5,7e-6\n")
-    found = sigma(int_absorption=f"hold(file:{tmp_path}/k.csv)", int_absorption_unit=1e-3)
-    assert found == pytest.approx(4 * math.pi * 1e-8 * 1e6, rel=1e-5 if mi.is_spectral else 0.3)
+    absorption = sigma(int_absorption=f"hold(file:{tmp_path}/k.csv)", int_absorption_unit=1e-3)
+    assert absorption == pytest.approx(4 * math.pi * 1e-8 * 1e6, rel=1e-5 if mi.is_spectral else 0.3)
     (text,) = [text for text in logged if "int_absorption" in text]
     assert "k from 400 to 700 nm; other light (0.5% of the colour) has the absorption of the range's end" in text
 
 
 @pytest.mark.parametrize(
-    ("k", "more", "warns"),
+    ("k", "parameters", "warns"),
     [(1e-6, {}, True), (1e-8, {}, False), (1e-6, {"int_absorption": 0.5}, False), (0, {}, False)],
 )
-def test_k_that_is_left_out_is_a_warning_where_it_is_visible(llvm_variant, tmp_path, logged, k, more, warns):
-    """ln 2 · 600 nm/(4π · 1e-6) = 33 mm."""
+def test_a_visible_k_that_is_not_rendered_is_a_warning(llvm_variant, tmp_path, logged, k, parameters, warns):
+    """Half is left after ln 2 · 600 nm/(4π · 1e-6) = 33 mm."""
     (tmp_path / "k.csv").write_text(f"nm,n,k\n380,1.5,0\n599,1.5,0\n600,1.5,{k}\n601,1.5,0\n780,1.5,0\n")
-    load(int_ior=f"file:{tmp_path}/k.csv", **more)
+    load(int_ior=f"file:{tmp_path}/k.csv", **parameters)
     texts = [text for text in logged if "has k" in text]
     assert len(texts) == warns
     assert all("at 600 nm half is left after 0.033 m" in text and "int_absorption_unit" in text for text in texts)
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 20.0])
-def test_three_colours_become_a_spectrum_in_proportion(scale, spectral_variant):
-    """As Mitsuba's emitters have it: twice the largest colour, times the spectrum of a colour whose largest is 1/2."""
+def test_an_rgb_colour_becomes_a_spectrum_in_proportion(scale, spectral_variant):
+    """As for Mitsuba's emitters: twice the largest value × the spectrum of a colour whose largest value is 1/2."""
     colour = np.array([0.1, 0.3, 0.2]) * scale
-    found = sigma(int_absorption={"type": "rgb", "value": colour.tolist()})
+    absorption = sigma(int_absorption={"type": "rgb", "value": colour.tolist()})
     half = mi.load_dict({"type": "srgb", "color": (colour / colour.max() / 2).tolist()})
-    assert found == pytest.approx(2 * colour.max() * vector(half.eval(surface(wavelengths=WAVELENGTHS))), rel=1e-5)
-    assert found[1] > 2 * found[3] > 0  # more of green at 500 nm than of red at 700
+    spectrum = vector(half.eval(surface(wavelengths=WAVELENGTHS)))
+    assert absorption == pytest.approx(2 * colour.max() * spectrum, rel=1e-5)
+    assert absorption[1] > 2 * absorption[3] > 0  # more at 500 nm, green, than at 700 nm, red
     assert (sigma(int_absorption={"type": "rgb", "value": 0.0}) < 1e-6).all()
 
 
-def test_where_nothing_is_left_of_a_colour_absorption_is_finite(spectral_variant):
+def test_absorption_of_a_colour_of_0_is_finite(spectral_variant):
     """A spectrum is 0 outside its range."""
-    part = {"type": "irregular", "wavelengths": "450, 650", "values": "0.5, 0.5"}
-    found, half, most = sigma(int_colour=part, int_colour_distance=1.0), math.log(2), 30 * math.log(10)
-    assert found == pytest.approx([most, half, half, most], rel=1e-5)
+    colour = {"type": "irregular", "wavelengths": "450, 650", "values": "0.5, 0.5"}
+    half, largest = math.log(2), 30 * math.log(10)
+    absorption = sigma(int_colour=colour, int_colour_distance=1.0)
+    assert absorption == pytest.approx([largest, half, half, largest], rel=1e-5)
 
 
-def test_parameters_are_differentiable(llvm_variant):
+def test_absorption_is_differentiable(llvm_variant):
     bsdf = load(int_colour=0.25, int_colour_distance=2.0)
     params, (key,) = attached(bsdf, "int_colour.value")
     dr.backward(bsdf.eval_attribute(BEYOND, surface(), True).x)
@@ -101,7 +103,7 @@ def rgb(*value):
 
 
 @pytest.mark.parametrize(
-    ("parameters", "said"),
+    ("parameters", "message"),
     [
         ({"int_absorption": -0.1}, "int_absorption = -0.1; expected a number or a spectrum ≥ 0"),
         ({"ext_absorption": math.nan}, "ext_absorption = nan; expected"),
@@ -139,20 +141,20 @@ def rgb(*value):
         ({"specular_reflectance": rgb(1, -1, 1)}, "specular_reflectance = .*; expected .* ≥ 0 and finite"),
     ],
 )
-def test_what_is_refused_is_named(typical_variant, parameters, said, tmp_path):
+def test_invalid_parameters_are_errors(typical_variant, parameters, message, tmp_path):
     (tmp_path / "nk.csv").write_text("nm,n,k\n400,1.5,0\n700,1.5,0\n")
     parameters = {k: x.format(nk=tmp_path / "nk.csv") if isinstance(x, str) else x for k, x in parameters.items()}
-    assert re.search(said, refusal(load, **parameters))
+    assert re.search(message, refusal(load, **parameters))
 
 
-def test_a_negative_value_of_a_spectrum_is_refused(each_variant):
-    """Of `<spectrum>` by us; of a plugin `irregular` by Mitsuba."""
+def test_a_negative_value_of_a_spectrum_is_an_error(each_variant):
+    """We raise it for `<spectrum>`; Mitsuba does for a plugin `irregular`."""
     text = '<bsdf type="refract" version="3.0.0"><spectrum name="int_absorption" value="400:0.3, 700:-0.1"/></bsdf>'
     with pytest.raises(RuntimeError, match="int_absorption"):
         mi.load_string(text)
 
 
-def test_a_call_that_does_not_follow_media_is_refused(each_variant):
+def test_sampling_without_following_media_is_an_error(each_variant):
     bsdf = load(ext_colour=0.5, ext_colour_distance=1.0)
     assert np.isfinite(sampled(bsdf, (0, 0, 1), 0.5, followed_context()).weight).all()
     assert refusal(sampled, bsdf, (0, 0, 1), 0.5).startswith(
@@ -160,41 +162,42 @@ def test_a_call_that_does_not_follow_media_is_refused(each_variant):
     )
 
 
-def seen(**more):
-    """Two balls with BSDFs of their own."""
-    ball = {"type": "sphere", "bsdf": GLASS | more}
-    balls = {"ball": ball, "other": {"type": "sphere", "center": [1, 0, 0], "bsdf": GLASS | more | {"int_ior": 1.4}}}
-    whole = {"type": "scene", "sensor": camera(8, 60), "light": {"type": "constant"}, "integrator": {"type": "path"}}
-    return mi.load_dict(whole | balls)
+def two_balls(**parameters):
+    """Return a scene of two balls, each with its own BSDF."""
+    glass = GLASS | parameters
+    first = {"type": "sphere", "bsdf": glass}
+    second = {"type": "sphere", "center": [1, 0, 0], "bsdf": glass | {"int_ior": 1.4}}
+    parts = {"sensor": camera(8, 60), "light": {"type": "constant"}, "integrator": {"type": "path"}}
+    return mi.load_dict({"type": "scene"} | parts | {"ball": first, "other": second})
 
 
 @pytest.mark.parametrize("integrator", ["path", "volpath", "prb", "ptracer"])
-def test_each_scene_whose_absorption_is_not_followed_is_named_once_and_no_other(integrator, llvm_variant, logged):
-    """All of them are in memory. An image without a warning is finite."""
-    clear, first, second = seen(), seen(int_absorption=1.0), seen(ext_absorption=2.0)
-    said = "refract: {}; expected the integrator refract_path, or no absorption; where light meets it, the image is not"
-    expected = ((clear, ""), (first, "int_absorption"), (second, "ext_absorption"), (first, ""), (clear, ""))
+def test_a_scene_with_absorption_that_is_not_followed_gives_one_warning(integrator, llvm_variant, logged):
+    """All scenes are in memory. An image without a warning is finite."""
+    clear, inside, outside = two_balls(), two_balls(int_absorption=1.0), two_balls(ext_absorption=2.0)
+    message = "; expected the integrator refract_path, or no absorption; where light meets it, the image is not"
+    expected = ((clear, ""), (inside, "int_absorption"), (outside, "ext_absorption"), (inside, ""), (clear, ""))
     for scene, parameter in expected:
         logged.clear()
         image = np.array(mi.render(scene, integrator=mi.load_dict({"type": integrator}), spp=4))
-        assert [text.startswith(said.format(parameter)) for text in logged] == [True] * bool(parameter)
+        assert [text.startswith(f"refract: {parameter}{message}") for text in logged] == [True] * bool(parameter)
         assert np.isfinite(image).all() == (scene is clear)
         if integrator == "path":
             assert np.isfinite(image[0, 0]).all() and np.isfinite(image[4, 4]).any() == (scene is clear)
 
 
-def test_a_frozen_function_says_it_too(llvm_variant, logged):
-    made = seen(int_absorption=1.0)
-    dr.freeze(lambda seed: mi.render(made, spp=4, seed=seed))(dr.opaque(mi.UInt32, 1))
+def test_a_frozen_function_gives_the_warning_too(llvm_variant, logged):
+    scene = two_balls(int_absorption=1.0)
+    dr.freeze(lambda seed: mi.render(scene, spp=4, seed=seed))(dr.opaque(mi.UInt32, 1))
     assert sum("int_absorption; expected the integrator refract_path" in text for text in logged) == 2  # one a BSDF
 
 
 @pytest.mark.parametrize("inner", ["refract_path", "path"])
 @pytest.mark.parametrize("outer", [{"type": "moment"}, {"type": "aov", "aovs": "d:depth"}], ids=lambda x: x["type"])
-def test_an_integrator_is_checked_by_those_that_it_calls(outer, inner, rgb_variant):
+def test_nested_integrators_are_checked(outer, inner, rgb_variant):
     ball = {"type": "sphere", "bsdf": GLASS | {"int_absorption": 1.0}}
-    made = mi.load_dict({"type": "scene", "ball": ball, "integrator": outer | {"inner": {"type": inner}}})
+    scene = mi.load_dict({"type": "scene", "ball": ball, "integrator": outer | {"inner": {"type": inner}}})
     if inner == "path":
-        assert "refract: int_absorption; expected the integrator" in refusal(check_integrator, made)
+        assert "refract: int_absorption; expected the integrator" in refusal(check_integrator, scene)
     else:
-        check_integrator(made)
+        check_integrator(scene)

@@ -1,7 +1,7 @@
-"""Gradients of images in the parameters of `refract`, and renders within `dr.freeze`.
+"""Gradients of images in the parameters of `refract`, and renders in `dr.freeze`.
 
-Gradients of several views, by several integrators, in a frozen step. What is replayed is what is traced anew, also
-after an edit: Dr.Jit must see every array that a BSDF in memory gathers from, of other scenes as well.
+Gradients are tested for several views and integrators, also in a frozen step. A replayed function must give the image
+of a new trace, also after an edit: Dr.Jit must know every array that BSDFs in memory read, also those of other scenes.
 """
 
 import functools
@@ -56,14 +56,14 @@ WAYS = ("backward", "backward without update", "forward")
 @pytest.mark.parametrize(("forward", "update"), [(False, True), (False, False), (True, True)], ids=WAYS)
 @pytest.mark.parametrize(("variant", "integrator", "glass", "name"), CASES, ids=lambda x: x if type(x) is str else "")
 def test_every_view_has_its_gradient(variant, integrator, glass, name, forward, update, needs_variant):
-    """One `enable_grad` for all views: each `backward` frees the graph that it walks. Bound: the order of sums."""
+    """One `enable_grad` serves all views, although `backward` frees its graph. Bound: the order of sums."""
     needs_variant(variant)
     switch(variant)
 
     def gradients(views):
         scene = load(integrator, **glass)
         params = mi.traverse(scene)
-        key, found = parameter(params, name), []
+        key, derivatives = parameter(params, name), []
         dr.enable_grad(params[key])
         if update:
             params.update()
@@ -71,12 +71,12 @@ def test_every_view_has_its_gradient(variant, integrator, glass, name, forward, 
             image = loss(scene, params, view)
             if forward:
                 dr.set_grad(params[key], 1)
-                found.append(vector(dr.forward_to(image))[0])
+                derivatives.append(vector(dr.forward_to(image))[0])
             else:
                 dr.backward(image)
-                found.append(grad(params, key))
+                derivatives.append(grad(params, key))
             dr.clear_grad(params[key])
-        return found
+        return derivatives
 
     together = gradients([0, 1, 2, 0])
     alone = [gradients([view])[0] for view in range(VIEWS)]
@@ -84,8 +84,8 @@ def test_every_view_has_its_gradient(variant, integrator, glass, name, forward, 
     assert len({round(x, 7) for x in alone}) == VIEWS and np.abs(alone).min() > 0
 
 
-def test_a_scene_that_was_differentiated_leaves_no_damage(needs_variant):
-    """`backward` leaves kernels for later. Where they trace rays and the scene has gone by then, the process ends."""
+def test_a_differentiated_scene_can_be_freed(needs_variant):
+    """`backward` defers kernels. If such a kernel traced rays in a scene that was freed, the process would crash."""
     needs_variant("llvm_ad_rgb")
     program = f"""
 import faulthandler, sys
@@ -109,29 +109,29 @@ for integrator in ("refract_path", "volpath", "path", *["refract_path"] * 6):
             grad(params, key)
     del scene, params
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)
+    assert process.returncode == 0, process.stderr[-2000:]
 
 
-def test_double_precision_survives_what_is_no_edit(llvm_variant):
-    """`update` after `enable_grad` says that eta may have changed: what float32 rounds to the same number has not."""
+def test_an_update_without_an_edit_keeps_double_precision(llvm_variant):
+    """`update` after `enable_grad` reports a change of eta. If eta is the same in float32, it was not edited."""
     bsdf = mi.load_dict({"type": "refract", "int_ior": 1.0003 + 3e-8, "ext_ior": 1.0003})
 
-    def bent():
+    def refracted():
         return sampled(bsdf, ((1 - 1e-8) ** 0.5, 0, 1e-4), 1.0).wo[2]
 
-    before = bent()
+    before = refracted()
     params, (key,) = attached(bsdf, "eta")
-    assert bent() == before
+    assert refracted() == before
     for value, same in ((mi.Float(params[key]), True), (1 + 2**-23, False)):
         params[key] = value
         params.update()
-        assert (bent() == before) == same
+        assert (refracted() == before) == same
 
 
 @pytest.mark.parametrize("matt", [True, False])
-def test_a_moving_edge_in_the_view_of_a_matt_point_is_a_warning(matt, llvm_variant, logged):
-    """Of a lamp that is seen through glass: its derivative is missing, in Mitsuba's integrators as well."""
+def test_a_moving_edge_seen_from_a_matt_surface_is_a_warning(matt, llvm_variant, logged):
+    """The edge of a lamp seen through glass: its derivative is missing, in Mitsuba's integrators as well."""
     lamp = {"type": "rectangle", "to_world": PLACE().translate([0, 0, 3]).rotate([0, 1, 0], 180)}
     floor = {"floor": {"type": "rectangle", "bsdf": {"type": "diffuse"}}} if matt else {}
     scene = glass_ball(12, lamp=lamp | {"emitter": {"type": "area"}}, **floor)
@@ -142,21 +142,21 @@ def test_a_moving_edge_in_the_view_of_a_matt_point_is_a_warning(matt, llvm_varia
     assert sum("derivatives leave out edges of area lights that move" in text for text in logged) == matt
 
 
-def test_an_image_without_chance_is_not_differentiated(llvm_variant):
+def test_differentiating_a_deterministic_render_is_an_error(llvm_variant):
     scene, method = glass_ball(sky=sky()), mi.load_dict({"type": "refract_path", "deterministic": True})
     params, _ = attached(scene, ".eta")
     with pytest.raises(ValueError, match="such a render cannot be differentiated"):
         dr.backward(dr.mean(mi.render(scene, params, integrator=method, spp=4), axis=None))
 
 
-# What prb and its kin can give ---------------------------------------------------------------------------------------
+# Derivatives of prb and its variants ---------------------------------------------------------------------------------
 
 FIXED = ["prb", "prb_basic", "prb_projective", "prbvolpath"]
 
 
 @pytest.mark.parametrize("others", [[], ["specular_transmittance"]], ids=["alone", "with another"])
 @pytest.mark.parametrize("integrator", [*FIXED, "volpath", "path", "refract_path"])
-def test_a_derivative_in_the_index_is_no_number_where_directions_are_fixed(integrator, others, llvm_variant, logged):
+def test_a_derivative_in_the_index_is_infinite_if_directions_are_fixed(integrator, others, llvm_variant, logged):
     scene = load(integrator, **NUMBER)
     params, keys = attached(scene, "eta", *others)
     dr.backward(loss(scene, params))
@@ -170,20 +170,20 @@ def test_a_derivative_in_the_index_is_no_number_where_directions_are_fixed(integ
 
 @functools.cache
 def derivatives(integrator, name, first):
-    """Of eight images, one a seed."""
-    scene, found = load(integrator, **NUMBER), []
+    """Return the derivatives of eight images with seeds from `first`."""
+    scene, gradients = load(integrator, **NUMBER), []
     params, (key,) = attached(scene, name)
     for seed in range(first, first + 8):
         dr.backward(loss(scene, params, 0, 256, seed))
-        found.append(grad(params, key))
+        gradients.append(grad(params, key))
         dr.clear_grad(params[key])
-    return np.array(found)
+    return np.array(gradients)
 
 
 @pytest.mark.parametrize("integrator", FIXED)
 @pytest.mark.parametrize("name", ["specular_reflectance", "specular_transmittance"])
 def test_tints_have_the_derivatives_of_refract_path(integrator, name, llvm_variant):
-    """Of 12² · 256 paths each: t of 8 seeds a side, one false alarm in 10⁴ (14 degrees of freedom: 5.36)."""
+    """Student's t for 8 seeds of 12² · 256 paths a side; one false alarm in 10⁴ (14 degrees of freedom: 5.36)."""
     ours, theirs = derivatives("refract_path", name, 100), derivatives(integrator, name, 200)
     error = np.sqrt((ours.var(ddof=1) + theirs.var(ddof=1)) / 8)
     assert error < 0.02 * abs(ours.mean())
@@ -192,10 +192,10 @@ def test_tints_have_the_derivatives_of_refract_path(integrator, name, llvm_varia
 
 @pytest.mark.parametrize("bsdf", ["plastic", "mask"])
 @pytest.mark.parametrize("name", ["diffuse_reflectance", "specular_reflectance"])
-def test_the_odds_of_a_lobe_are_no_part_of_a_derivative(name, bsdf, llvm_variant):
-    """`plastic` chooses a lobe by its colours. An image that is linear in a colour c has the derivative I(1) − I(0).
+def test_probabilities_of_lobes_are_detached(name, bsdf, llvm_variant):
+    """`plastic` selects a lobe by its colours. The derivative of an image that is linear in a colour is I(1) − I(0).
 
-    Of 12² · 256 paths, of which the lobe takes a tenth or more: 5 % is seven standard deviations.
+    With 12² · 256 paths, of which the lobe gets at least a tenth, 5 % is seven standard deviations.
     """
     plastic = {"type": "plastic", "diffuse_reflectance": 0.4, "specular_reflectance": 0.5}
     ball = {"type": "sphere", "bsdf": plastic if bsdf == "plastic" else {"type": "mask", "opacity": 0.6, "b": plastic}}
@@ -218,17 +218,17 @@ def test_the_odds_of_a_lobe_are_no_part_of_a_derivative(name, bsdf, llvm_variant
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
-def test_prb_projective_gives_what_prb_gives_where_no_edge_moves(variant, needs_variant):
-    """Its first part is that of `prb`, with the same random numbers; polarised variants it refuses."""
+def test_prb_projective_equals_prb_if_no_edge_moves(variant, needs_variant):
+    """Its first part equals `prb`, with the same random numbers. It does not support polarised variants."""
     needs_variant(variant)
     switch(variant)
-    found = []
+    gradients = []
     for integrator in ("prb", "prb_projective"):
         scene = load(integrator, **NUMBER)
         params, (key,) = attached(scene, "specular_transmittance")
         dr.backward(loss(scene, params))
-        found.append(grad(params, key))
-    assert found[0] == pytest.approx(found[1], rel=1e-4) and found[0] != 0
+        gradients.append(grad(params, key))
+    assert gradients[0] == pytest.approx(gradients[1], rel=1e-4) and gradients[0] != 0
 
 
 # Frozen --------------------------------------------------------------------------------------------------------------
@@ -236,7 +236,7 @@ def test_prb_projective_gives_what_prb_gives_where_no_edge_moves(variant, needs_
 
 @pytest.fixture
 def no_collection():
-    """A scene that the garbage collector finds while Dr.Jit records ends the process, Mitsuba's own as well."""
+    """Switch off garbage collection: if it frees any scene while Dr.Jit records, the process crashes."""
     gc.collect()
     gc.disable()
     yield
@@ -253,7 +253,7 @@ STEPS = [
 @pytest.mark.parametrize("integrator", ["refract_path", "path"])
 @pytest.mark.parametrize(("glass", "start"), STEPS, ids=["index", "index and tint", "texture"])
 def test_a_step_of_an_optimisation_can_be_frozen(glass, start, integrator, llvm_variant):
-    """Six steps of Adam within `dr.freeze` and without: the same numbers, but for the order of sums."""
+    """Six steps of Adam give the same numbers in `dr.freeze` and without it, up to the order of sums."""
     target = mi.render(load(integrator, **glass), spp=16, seed=9)
 
     def optimise(freeze):
@@ -285,7 +285,7 @@ def test_a_step_of_an_optimisation_can_be_frozen(glass, start, integrator, llvm_
     assert np.abs(plain[-1] - plain[0]).min() > 0.01
 
 
-def test_an_index_that_is_none_is_no_image_in_a_frozen_step(llvm_variant):
+def test_an_invalid_index_loses_its_light_in_a_frozen_step(llvm_variant):
     scene = load("refract_path", int_ior=1.5)
     params = mi.traverse(scene)
     key = parameter(params, "eta")
@@ -296,13 +296,13 @@ def test_an_index_that_is_none_is_no_image_in_a_frozen_step(llvm_variant):
         params.update()
         return mi.render(scene, params, spp=4, seed=1)
 
-    right = [image(params, mi.Float(x)) for x in (1.5, 1.4, 1.3)][-1]
-    assert np.isfinite(right).all()
+    valid = [image(params, mi.Float(x)) for x in (1.5, 1.4, 1.3)][-1]
+    assert np.isfinite(valid).all()
     middle = np.array(image(params, mi.Float(-1.0)))[6, 6]
     assert np.isnan(middle).all() or (middle == 0).all()
 
 
-# A parameter of each, and a value to set.
+# Parameters of glass, one of them, and a new value for it.
 GLASSES = {
     "a number": ({"int_ior": 1.5}, ".eta", 1.3),
     "a dispersive medium": ({"int_ior": "cauchy(1.5, 4000)"}, "int_ior_A", 1.3),
@@ -312,7 +312,7 @@ GLASSES = {
     "a tint": ({"int_ior": 1.5, "specular_transmittance": 0.5}, "transmittance.value", 0.9),
 }
 INTEGRATORS = ("path", "refract_path")
-ABSORBING = ("absorption", "a colour")  # for which `path` refuses
+ABSORBING = ("absorption", "a colour")  # not supported by `path`
 
 
 def walled(parameters, integrator):
@@ -333,13 +333,13 @@ def recorded(scene):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("glass", GLASSES)
-def test_a_frozen_render_is_the_traced_one_and_follows_an_edit(glass, integrator, llvm_variant, no_collection):
-    """While the next glass is in memory in another scene; in one of a number, the glass that `path` refuses."""
+def test_a_frozen_render_equals_a_new_trace_also_after_an_edit(glass, integrator, llvm_variant, no_collection):
+    """Another scene in memory has another glass. `path` renders "a number" with absorbing glass in that scene."""
     (parameters, name, value), kinds = GLASSES[glass], [*GLASSES]
-    beside = GLASSES[kinds[kinds.index(glass) - 1]][0]
+    others = GLASSES[kinds[kinds.index(glass) - 1]][0]
     if glass in ABSORBING and integrator == "path":
-        beside, (parameters, name, value) = parameters, GLASSES["a number"]
-    scene, other = walled(parameters, integrator), walled(beside, "refract_path")
+        others, (parameters, name, value) = parameters, GLASSES["a number"]
+    scene, other = walled(parameters, integrator), walled(others, "refract_path")
     params, image, before = mi.traverse(scene), recorded(scene), None
     key = parameter(params, name)
     for seed in range(4):
@@ -351,13 +351,13 @@ def test_a_frozen_render_is_the_traced_one_and_follows_an_edit(glass, integrator
         assert replayed == pytest.approx(traced, abs=1e-5), seed
         assert seed != 2 or np.abs(replayed - before).max() > 0.05
         before = replayed
-    assert image.n_recordings <= 3  # the third knows what varies, and the integrator what the scene needs
+    assert image.n_recordings <= 3  # by then Dr.Jit knows what varies, and the integrator which features are needed
     del other
 
 
 @pytest.mark.parametrize("split_depth", [0, 2])
-def test_a_frozen_render_follows_the_index_and_a_lamp_that_turns_grey(split_depth, llvm_variant, no_collection):
-    """What is recorded must hold for any value: a lamp's black surface counts as one that may reflect."""
+def test_a_frozen_render_follows_edits_of_index_and_reflectance(split_depth, llvm_variant, no_collection):
+    """A recording must be valid for any value: the black surface of a lamp counts as one that may reflect."""
     lamp = {"type": "rectangle", "to_world": PLACE().translate([0, 0, -2]).scale(9)}
     method = {"type": "refract_path", "max_depth": 5, "rr_depth": 100, "split_depth": split_depth}
     scene = glass_ball(integrator=method, sky=sky(), lamp=lamp | {"emitter": {"type": "area"}, "bsdf": BLACK})
@@ -367,7 +367,7 @@ def test_a_frozen_render_follows_the_index_and_a_lamp_that_turns_grey(split_dept
         params[key] = type(params[key])(value)
         params.update()
         mean = np.mean([np.array(image(params, dr.opaque(mi.UInt32, seed))).mean() for seed in range(4)])
-        # Without the recording a black lamp needs no emitter sample: other numbers, the same mean.
+        # Without a recording a black lamp needs no emitter samples: other random numbers, the same mean.
         traced = [np.array(mi.render(scene, spp=4, seed=seed)).mean() for seed in range(4)]
         assert mean == pytest.approx(np.mean(traced), rel=0.01)
         assert before is None or abs(mean / before - 1) > 0.002

@@ -1,4 +1,4 @@
-"""Each class of paths alone, which part of a render with `caustics` = `lamp` holds it, and all of them at once."""
+"""Renders with `caustics` = `lamp` of each class of paths alone, and of all classes together."""
 
 import itertools
 
@@ -15,8 +15,8 @@ def renders(scene, word, spp=256, count=8, first=0, **parameters):
 
 
 @pytest.mark.parametrize("word", CLASSES)
-def test_a_scene_is_lit_by_its_class_and_by_no_other(word, llvm_variant):
-    """It needs every vertex, and shorter paths find nothing."""
+def test_a_scene_is_lit_only_by_its_class_of_paths(word, llvm_variant):
+    """The image is black if a vertex is black, and for shorter paths."""
     scene = path_classes.scene(word)
     assert renders(scene, word, count=1, type="path").mean() > 1e-4
     assert renders(scene, word, count=1, type="path", max_depth=max_depth(word) - 1).max() == 0
@@ -28,15 +28,15 @@ AGREE = [(word, path_classes.MIRROR) for word in (*CLASSES, "STD")] + [(word, GL
 
 
 @pytest.mark.parametrize(("word", "delta"), AGREE, ids=lambda x: x if isinstance(x, str) else x["type"])
-def test_caustics_from_lamps_have_the_light_of_every_class(word, delta, llvm_variant):
+def test_renders_with_caustics_from_lamps_have_the_light_of_every_class(word, delta, llvm_variant):
     scene = path_classes.scene(word, delta=delta)
     theirs, ours = renders(scene, word, type="path"), renders(scene, word, caustics="lamp")
     assert theirs.mean() > 0 and equal_means(theirs, ours)
 
 
 @pytest.mark.parametrize(("word", "lamp"), [*((word, "point") for word in CLASSES), ("SD", "spot"), ("SDD", "spot")])
-def test_of_lamps_of_zero_size_they_have_all_but_what_is_seen_by_a_delta_lobe(word, lamp, llvm_variant):
-    """`ptracer` has what surfaces show that scatter, `path` what no delta lobe has cast on them."""
+def test_lamps_of_zero_size_light_all_classes_but_those_seen_through_a_delta_lobe(word, lamp, llvm_variant):
+    """The reference is `ptracer` for light seen on surfaces that scatter, else `path`."""
     scene = path_classes.scene(word, lamp)
     ours = renders(scene, word, caustics="lamp")
     if word in UNSEEN:
@@ -47,8 +47,8 @@ def test_of_lamps_of_zero_size_they_have_all_but_what_is_seen_by_a_delta_lobe(wo
 
 
 @pytest.mark.parametrize("lamp", ["area", "point"])
-def test_the_sum_over_classes_is_the_image_where_all_are_lit_at_once(lamp, llvm_variant):
-    """Of three vertices that are half S and half D: an eighth of each class alone, of those that have an estimator."""
+def test_a_scene_with_all_classes_is_the_sum_of_its_classes(lamp, llvm_variant):
+    """Three vertices are half S and half D: the image is the sum of an eighth of each class that has an estimator."""
     words = ["".join(letters) for letters in itertools.product("SD", repeat=3)]
     theirs = []
     for word in words:

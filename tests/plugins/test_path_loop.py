@@ -1,6 +1,6 @@
-"""The path loop of `refract_path`, one path at a time: the random numbers are given, so that its light is known.
+"""The path loop of `refract_path`, one path at a time, with fixed random numbers, so that the radiance is known.
 
-In `scalar_rgb`: the loop is the same in every variant, and nothing is compiled.
+The tests run in `scalar_rgb`: the loop is the same in every variant, and nothing is compiled.
 """
 
 import math
@@ -19,10 +19,10 @@ REFLECTED, TRANSMITTED, UPWARD = (0.0, 0.5), (0.999, 0.5), (0.5, 0.5)
 ALBEDO, RADIANCE = 0.5, 3.0
 
 
-class Given:
-    """Random numbers: at each vertex the next of `points`, whose x chooses the lobe; 1/2 for all else.
+class FixedNumbers:
+    """Random numbers: at each vertex the next of `points`, whose x selects the lobe; 1/2 for all other numbers.
 
-    Keeps the keys of the numbers that choose lobes, as unsigned numbers have them elsewhere.
+    `keys`: the keys of the numbers that select lobes, modulo 2³² as in compiled variants.
     """
 
     def __init__(self, *points):
@@ -42,13 +42,13 @@ class Given:
 
 
 def sheet(z, size=10.0, x=0.0, turn=0, **parts):
-    """A square across the z axis, which faces upward."""
+    """Return a square across the z axis, which faces upward."""
     place = PLACE().translate([x, 0, z]).rotate([1, 0, 0], turn).scale(size)
     return {"type": "rectangle", "to_world": place} | parts
 
 
 def lamp(z, x=0.0):
-    """A square of the area 1 that shines downward: its density from below is far from 0 and from infinity."""
+    """Return an area light of size 1 that faces downward; its density from below is far from 0 and from infinity."""
     return sheet(z, 0.5, x, 180, emitter={"type": "area", "radiance": RADIANCE})
 
 
@@ -57,51 +57,51 @@ def wall():
 
 
 def follow(parts, numbers, o=(0, 0, 1), d=(0.6, 0, -0.8), **parameters):
-    """The radiance and the alpha of one sample along a ray. `numbers`: points, or what gives numbers."""
+    """Return the radiance and the alpha of one sample along a ray. `numbers`: a list of points, or a sampler."""
     scene, method = mi.load_dict({"type": "scene"} | parts), mi.load_dict({"type": "refract_path"} | parameters)
     features = method.path_features(method.scene_features(scene))
-    numbers = Given(*numbers) if isinstance(numbers, list) else numbers
+    numbers = FixedNumbers(*numbers) if isinstance(numbers, list) else numbers
     end = path_loop.PathLoop(mi.scalar_rgb, scene, features, numbers).run(mi.Ray3f(o, d), None, True)
     return np.array(end.result), bool(end.valid_ray)
 
 
 def reflectance(cosine, k):
-    """The unpolarised reflectance from an index to another, `k` times smaller: Fresnel's formulas as printed."""
-    other = math.sqrt(1 - k * k * (1 - cosine**2))
-    return (((k * cosine - other) / (k * cosine + other)) ** 2 + ((cosine - k * other) / (cosine + k * other)) ** 2) / 2
+    """Return the unpolarised Fresnel reflectance, for an index that is `k` times smaller on the other side."""
+    cos_t = math.sqrt(1 - k * k * (1 - cosine**2))
+    return (((k * cosine - cos_t) / (k * cosine + cos_t)) ** 2 + ((cosine - k * cos_t) / (cosine + k * cos_t)) ** 2) / 2
 
 
-# From z = 1 down to glass at z = 0, and up again: the reflected ray is at x = 2.25 where z = 2.
+# From z = 1 down to glass at z = 0, and up again: the reflected ray is at x = 2.25 for z = 2.
 SLANTED = reflectance(0.8, 1 / 1.5)
 
 
-def test_light_that_a_popped_branch_meets_counts_whole():
-    """The other branch has ended beyond a matt wall, whose samples share their light with emitter samples."""
+def test_emission_that_a_popped_branch_hits_has_the_weight_1():
+    """The other branch has ended beyond a matt wall, whose BSDF samples share their weight with emitter samples."""
     parts = {"glass": sheet(0, bsdf=GLASS), "wall": wall(), "lamp": lamp(2, 2.25)}
-    found, _ = follow(parts, [TRANSMITTED, UPWARD], max_depth=3, split_depth=1)
-    assert found == pytest.approx(SLANTED * RADIANCE, rel=1e-5)
+    radiance, _ = follow(parts, [TRANSMITTED, UPWARD], max_depth=3, split_depth=1)
+    assert radiance == pytest.approx(SLANTED * RADIANCE, rel=1e-5)
 
 
 @pytest.mark.parametrize(("weight", "splits"), [(0.0, True), (0.004, True), (0.007, False), (0.04, False)])
-def test_a_popped_branch_splits_again_where_its_share_is_large_enough(weight, splits):
-    """It has met glass only, whatever the branch before it met. It goes on from inside the second sheet into air.
+def test_a_popped_branch_splits_again_if_its_share_is_large_enough(weight, splits):
+    """The branch has hit glass only, whatever the branch before it hit. It leaves the second sheet into air.
 
-    Its share is that of the reflected light, 5 %, of which the second sheet reflects 11 %. Without a split chance picks
-    that, and the lamp beyond is not met.
+    Its share is that of the reflected light, 5 %, of which the second sheet reflects 11 %. Without a split the random
+    number selects the reflection, and the lamp is not hit.
     """
     sine = 0.6 * 1.5
     beyond = lamp(3, 2.25 + sine / math.sqrt(1 - sine**2))
     parts = {"glass": sheet(0, bsdf=GLASS), "wall": wall(), "second": sheet(2, bsdf=GLASS), "lamp": beyond}
     points = [TRANSMITTED, UPWARD, REFLECTED]
-    found, _ = follow(parts, points, max_depth=3, split_depth=2, split_weight=weight)
+    radiance, _ = follow(parts, points, max_depth=3, split_depth=2, split_weight=weight)
     assert SLANTED * reflectance(0.8, 1.5) == pytest.approx(0.0054, abs=1e-3)
     expected = splits * SLANTED * (1 - reflectance(0.8, 1.5)) * RADIANCE * 1.5**2  # n² times the radiance inside
-    assert found == pytest.approx(expected, rel=1e-5)
+    assert radiance == pytest.approx(expected, rel=1e-5)
 
 
-def test_no_two_vertices_of_branches_have_the_same_random_number():
-    """Four sheets of glass, of which each splits, two of them on either side."""
-    numbers, parts = Given(), {f"sheet {z}": sheet(z, bsdf=GLASS) for z in range(4)}
+def test_all_vertices_of_branches_have_different_random_numbers():
+    """Four sheets of glass split the path, two on either side of the camera."""
+    numbers, parts = FixedNumbers(), {f"sheet {z}": sheet(z, bsdf=GLASS) for z in range(4)}
     follow(parts, numbers, (0, 0, 1.5), split_depth=4, split_weight=1e-3, max_depth=7)
     assert len(numbers.keys) > 10
     assert len(set(numbers.keys)) == len(numbers.keys)
@@ -109,18 +109,19 @@ def test_no_two_vertices_of_branches_have_the_same_random_number():
 
 @pytest.mark.parametrize(("lobe", "lit"), [(REFLECTED, False), (TRANSMITTED, True)])
 def test_no_path_splits_after_a_matt_wall(lobe, lit):
-    """From the wall straight up to glass: only the lobe that chance picks is followed, and the lamp is beyond it."""
+    """From the wall straight up to glass: only the sampled lobe is followed, and the lamp is beyond the glass."""
     parts = {"glass": sheet(0, bsdf=GLASS), "wall": wall(), "lamp": lamp(2)}
-    found, _ = follow(parts, [UPWARD, lobe], (0, 0, -0.5), (0, 0, -1), max_depth=4, split_depth=4, split_weight=0.01)
+    depths = {"max_depth": 4, "split_depth": 4}
+    radiance, _ = follow(parts, [UPWARD, lobe], (0, 0, -0.5), (0, 0, -1), split_weight=0.01, **depths)
     # The wall is inside the glass, where radiance is n² times that in air.
-    assert found == pytest.approx(ALBEDO * RADIANCE * 1.5**2 if lit else 0, rel=1e-5)
+    assert radiance == pytest.approx(ALBEDO * RADIANCE * 1.5**2 if lit else 0, rel=1e-5)
 
 
-def test_roulette_does_not_end_a_branch_for_being_one_of_several():
-    """It is judged by what it lost beside its share R = 5 %, which is nothing: it survives with probability 0.95."""
+def test_roulette_ignores_the_share_of_a_branch():
+    """Throughput / share is 1, although the share R is 5 %: the branch survives with the probability 0.95."""
     parts = {"glass": sheet(0, bsdf=GLASS), "lamp": lamp(2, 2.25)}
-    found, _ = follow(parts, [REFLECTED], max_depth=3, rr_depth=1, split_depth=1)
-    assert found == pytest.approx(SLANTED * RADIANCE / 0.95, rel=1e-5)
+    radiance, _ = follow(parts, [REFLECTED], max_depth=3, rr_depth=1, split_depth=1)
+    assert radiance == pytest.approx(SLANTED * RADIANCE / 0.95, rel=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -133,7 +134,7 @@ def test_roulette_does_not_end_a_branch_for_being_one_of_several():
     ],
     ids=str,
 )
-def test_a_pixel_is_transparent_where_light_goes_straight_through(bsdf, point, alpha):
+def test_a_pixel_is_transparent_if_light_passes_straight_through(bsdf, point, alpha):
     assert follow({"pane": sheet(0, bsdf=bsdf)}, [point], max_depth=4)[1] == alpha
 
 
@@ -141,19 +142,19 @@ def test_a_pixel_is_transparent_where_light_goes_straight_through(bsdf, point, a
     ("a", "b", "weight"),
     [(3, 4, 9 / 25), (4, 3, 16 / 25), (1, 0, 1), (0, 1, 0), (0, 0, 0), (math.inf, 1, 0), (1, math.inf, 0)],
 )
-def test_samples_are_weighted_by_their_densities(a, b, weight):
-    """An infinite density has no weight, as in Mitsuba's `path`."""
+def test_the_power_heuristic(a, b, weight):
+    """The weight of an infinite density is 0, as in Mitsuba's `path`."""
     assert path_loop.power_heuristic(float(a), float(b)) == pytest.approx(weight)
 
 
 @pytest.mark.parametrize("weights", [(1.0,), (1.0, 3.0), (0.0, 2.0, 2.0)])
-def test_lamps_are_sampled_as_if_there_were_no_sky(weights):
-    """By their weights: as Mitsuba samples the same lamps without the sky."""
+def test_lamps_beside_a_constant_sky_are_sampled_by_their_weights(weights):
+    """As Mitsuba samples the same lamps without the sky."""
     emitters = ({"type": "area", "radiance": 1.0 + i, "sampling_weight": x} for i, x in enumerate(weights))
     lamps = {f"lamp{i}": lamp(2, 3.0 * i) | {"emitter": emitter} for i, emitter in enumerate(emitters)}
-    # Mitsuba orders merged meshes by address: of two scenes, the lamps would not always be in the same order.
+    # By default Mitsuba orders merged meshes by address: the order of lamps could differ between the scenes.
     dark, lit = (
-        mi.load_dict({"type": "scene"} | lamps | x, **REPRODUCIBLE) for x in ({}, {"sky": {"type": "constant"}})
+        mi.load_dict({"type": "scene"} | lamps | sky, **REPRODUCIBLE) for sky in ({}, {"sky": {"type": "constant"}})
     )
     ours = sampling.NonConstantEmitters(mi.scalar_rgb, lit)
     si = dark.ray_intersect(mi.Ray3f([0.1, 0, -2], [0, 0, 1]))
@@ -169,10 +170,10 @@ def test_lamps_are_sampled_as_if_there_were_no_sky(weights):
 
 
 @pytest.mark.parametrize(("max_depth", "lit"), [(-1, True), (800, False), (900, True)])
-def test_minus_one_is_no_limit_of_the_depth(max_depth, lit):
-    """Between mirrors 1/64 apart a ray meets one at each 3/256 of its way in x: 853 until it leaves at 10."""
+def test_a_max_depth_of_minus_one_is_no_limit(max_depth, lit):
+    """Between mirrors 1/64 apart a ray hits one after each 3/256 in x: 853 mirrors until it leaves at x = 10."""
     mirror = {"type": "conductor", "material": "none"}
     parts = {"lower": sheet(0, bsdf=mirror), "upper": sheet(1 / 64, bsdf=mirror), "sky": {"type": "constant"}}
     parts = parts | {name: parts[name] | {"bsdf": {"type": "twosided", "a": mirror}} for name in ("lower", "upper")}
-    found, _ = follow(parts, [], (0, 0, 1 / 128), max_depth=max_depth, rr_depth=10**6)
-    assert found == pytest.approx(1 if lit else 0)
+    radiance, _ = follow(parts, [], (0, 0, 1 / 128), max_depth=max_depth, rr_depth=10**6)
+    assert radiance == pytest.approx(1 if lit else 0)

@@ -1,4 +1,4 @@
-"""The BSDF `refract`: Mitsuba's dielectric where it is a drop-in, numbers where it does better, and its errors."""
+"""The BSDF `refract`: equal to Mitsuba's `dielectric` as a drop-in, more accurate at the limits; its errors."""
 
 import itertools
 import json
@@ -29,37 +29,37 @@ def load(plugin="refract", **parameters):
 
 
 def context(mode="Radiance", **parameters):
-    made = mi.BSDFContext(getattr(mi.TransportMode, mode))
+    ctx = mi.BSDFContext(getattr(mi.TransportMode, mode))
     for name, value in parameters.items():
-        setattr(made, name, value)
-    return made
+        setattr(ctx, name, value)
+    return ctx
 
 
 # As a drop-in --------------------------------------------------------------------------------------------------
 
 
-def test_flags_and_densities_are_those_of_the_built_in(each_variant):
+def test_flags_and_densities_equal_those_of_dielectric(each_variant):
     """A delta lobe has no density."""
     ours, theirs = load(), load("dielectric")
     assert ours.component_count() == theirs.component_count() and ours.flags() == theirs.flags()
     assert [ours.flags(i) for i in range(2)] == [theirs.flags(i) for i in range(2)]
-    asked = mi.BSDFContext(), surface(), mi.Vector3f(0, 0, -1)
-    for x in (*ours.eval_pdf(*asked), ours.eval(*asked), ours.pdf(*asked)):
+    arguments = mi.BSDFContext(), surface(), mi.Vector3f(0, 0, -1)
+    for x in (*ours.eval_pdf(*arguments), ours.eval(*arguments), ours.pdf(*arguments)):
         assert not np.array(x).any()
-    nothing = sampled(ours, (0, 0, 1), 0.0, context(component=3))
-    assert (nothing.weight == 0).all() and nothing.pdf == 0
+    no_lobe = sampled(ours, (0, 0, 1), 0.0, context(component=3))
+    assert (no_lobe.weight == 0).all() and no_lobe.pdf == 0
 
 
 @pytest.mark.parametrize("mode", ["Radiance", "Importance"])
 @pytest.mark.parametrize("lobes", LOBES)
-def test_samples_are_those_of_the_built_in(each_variant, mode, lobes):
-    """From both sides, beyond the critical angle too; in polarised variants whole Mueller matrices."""
-    bsdfs, asked, weights = (load(**TINTED), load("dielectric", **TINTED)), context(mode, **LOBES[lobes]), []
+def test_samples_equal_those_of_dielectric(each_variant, mode, lobes):
+    """From both sides, also beyond the critical angle; in polarised variants whole Mueller matrices."""
+    bsdfs, ctx, weights = (load(**TINTED), load("dielectric", **TINTED)), context(mode, **LOBES[lobes]), []
     for z, sample1 in itertools.product((0.9999, 0.9, 0.3, -0.9, -0.6, -0.2), (0.0, 0.999)):
         wi = 0.6 * math.sqrt(1 - z * z), 0.8 * math.sqrt(1 - z * z), z
-        ours, theirs = (vars(sampled(bsdf, wi, sample1, asked)) for bsdf in bsdfs)
+        ours, theirs = (vars(sampled(bsdf, wi, sample1, ctx)) for bsdf in bsdfs)
         weights.append(np.abs(theirs["weight"]).max())
-        for name in theirs if weights[-1] else ("weight", "mueller"):  # where no light goes, no direction matters
+        for name in theirs if weights[-1] else ("weight", "mueller"):  # with the weight 0 the direction is irrelevant
             assert ours[name] == pytest.approx(theirs[name], abs=3e-6), (name, z, sample1)
     assert max(weights) > 0.1
     assert all(weights) == (not lobes.startswith("transmission"))
@@ -78,12 +78,12 @@ def test_attached_sampling_has_the_derivative_of_the_reflectance(llvm_variant):
 
 
 @pytest.mark.parametrize("formula", ["auto", *FORMULAS])
-def test_every_formula_bends_the_ray_and_is_named(typical_variant, formula):
-    written = f"formula = {'promoted (auto)' if formula == 'auto' else formula},"
-    named = [load(int_ior=1.5, ext_ior=1, formula=formula)]
-    named += [load(f"refract_{formula}", int_ior=1.5, ext_ior=1)] if formula != "auto" else []
-    for bsdf in named:
-        assert written in str(bsdf)
+def test_every_formula_refracts_and_is_in_the_text(typical_variant, formula):
+    text = f"formula = {'promoted (auto)' if formula == 'auto' else formula},"
+    bsdfs = [load(int_ior=1.5, ext_ior=1, formula=formula)]
+    bsdfs += [load(f"refract_{formula}", int_ior=1.5, ext_ior=1)] if formula != "auto" else []
+    for bsdf in bsdfs:
+        assert text in str(bsdf)
         assert sampled(bsdf, (0.6, 0, 0.8), 0.9).wo == pytest.approx([-0.4, 0, -math.sqrt(1 - 0.16)], abs=1e-6)
 
 
@@ -101,8 +101,8 @@ def test_index_from_names_numbers_and_ints(typical_variant, parameters, eta):
     assert sampled(load(**parameters), (0, 0, 1), 1.0).eta == np.float32(eta)
 
 
-def test_contrast_is_formed_in_double_and_rounded_once(typical_variant):
-    """Indices that differ by 3e-8: float32 sees no difference in their ratio, the contrast keeps all of it."""
+def test_the_contrast_is_computed_in_double_precision(typical_variant):
+    """Indices that differ by 3e-8: their ratio is 1 in float32, but the contrast keeps the difference."""
     inside = 1.0003 + 3e-8
     exact, wi = inside / 1.0003, (math.sqrt(1 - 1e-4**2), 0, 1e-4)
     bsdf = load(int_ior=inside, ext_ior=1.0003, formula="promoted")
@@ -116,7 +116,7 @@ def test_eta_can_be_read_and_edited(typical_variant):
     bsdf = load(**TINTED)
     params = mi.traverse(bsdf)
     assert {"specular_reflectance.value", "specular_transmittance.value"} < {*params.keys()}
-    eta = params["eta"][0]  # an array of one number, as `roughdielectric` has it
+    eta = params["eta"][0]  # an array of one number, as in `roughdielectric`
     assert (float(eta), f"{eta:.3f}", json.dumps(eta)) == (1.5, "1.500", "1.5")
     params["eta"] = 1.25
     params.update()
@@ -127,7 +127,7 @@ def test_eta_can_be_read_and_edited(typical_variant):
         assert "eta = " in refusal(params.update)
 
 
-def test_a_change_without_keys_may_be_of_anything(scalar_variant):
+def test_a_change_without_keys_reads_all_parameters(scalar_variant):
     for keys, eta in (([], 1.25), (["eta"], 1.25), (["specular_reflectance"], 1.5)):
         bsdf = load(int_ior=1.5, ext_ior=1)
         bsdf.eta = dr.scalar.Array1f(1.25)  # as Mitsuba sets it
@@ -140,25 +140,25 @@ TINTS = {"specular_reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.8]}, "spe
 
 @pytest.mark.parametrize("tints", [{}, TINTS], ids=["plain", "tinted"])
 @pytest.mark.parametrize("name", ["eta", *TINTS, "int_ior", "roughness"])
-def test_attributes_are_those_of_rough_glass(typical_variant, name, tints):
-    """In compiled variants what is absent is 0; in scalar ones both raise. (Smooth glass gives 0 for its eta.)"""
+def test_attributes_equal_those_of_rough_glass(typical_variant, name, tints):
+    """An absent attribute is 0 in compiled variants, and an error in scalar ones. (`dielectric` returns 0 for eta.)"""
 
-    def answers(bsdf):
-        found = [vector(bsdf.has_attribute(name)).any()]
+    def values(bsdf):
+        results = [vector(bsdf.has_attribute(name)).any()]
         for evaluate in (bsdf.eval_attribute, bsdf.eval_attribute_1, bsdf.eval_attribute_3):
             try:
-                found.append(vector(evaluate(name, surface())).tolist())
+                results.append(vector(evaluate(name, surface())).tolist())
             except RuntimeError:
-                found.append("raised")
-        return found
+                results.append("raised")
+        return results
 
-    assert answers(load(**tints)) == answers(load("roughdielectric", **tints))
+    assert values(load(**tints)) == values(load("roughdielectric", **tints))
 
 
-def test_an_attribute_is_asked_of_all_bsdfs_of_a_scene(llvm_variant):
-    """As scripts that write feature buffers do: of glass that lacks it, beside a plaster that has it."""
-    plaster = {"type": "plastic", "specular_reflectance": 0.5}
-    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3), "bsdf": plaster}
+def test_an_attribute_can_be_evaluated_for_all_bsdfs_of_a_scene(llvm_variant):
+    """Scripts that write feature buffers do so: glass lacks the attribute, a plastic wall has it."""
+    plastic = {"type": "plastic", "specular_reflectance": 0.5}
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3), "bsdf": plastic}
     scene = mi.load_dict({"type": "scene", "wall": wall, "glass": {"type": "sphere", "bsdf": {"type": "refract"}}})
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(mi.Float(0, 2), 0, 5), mi.Vector3f(0, 0, -1)))
     has = si.bsdf().has_attribute("specular_reflectance")
@@ -167,7 +167,7 @@ def test_an_attribute_is_asked_of_all_bsdfs_of_a_scene(llvm_variant):
         assert np.array(evaluate("specular_reflectance", si, active=has)).T.tolist() == [[0] * 3, [0.5] * 3]
 
 
-def test_a_sample_that_is_not_asked_for_has_no_weight(scalar_variant):
+def test_the_weight_of_an_inactive_sample_is_0(scalar_variant):
     for bsdf, sample1 in itertools.product((load(), load(**TINTED)), (0.0, 0.9)):
         weights = [bsdf.sample(context(), surface(), sample1, [0, 0], active)[1] for active in (False, True)]
         assert [np.array(weight).any() for weight in weights] == [False, True]
@@ -176,19 +176,19 @@ def test_a_sample_that_is_not_asked_for_has_no_weight(scalar_variant):
 # At the limits -------------------------------------------------------------------------------------------------
 
 
-def test_nothing_reflects_where_nothing_differs_and_everything_where_it_must(typical_variant):
-    """Index-matched, and the sample that is exactly 0: the built-in reflects with density 0 there."""
+def test_an_index_matched_boundary_transmits_and_total_reflection_reflects_all(typical_variant):
+    """Also if sample1 is exactly 0, where `dielectric` reflects with the density 0. NaN stays NaN."""
     matched, glass = load(int_ior=1.3, ext_ior=1.3), load(int_ior=1.5, ext_ior=1)
     for wi in ((0, 0, 1), (0.6, 0, 0.8), (0.6, 0, -0.8)):
-        through = sampled(matched, wi, 0.0)
-        assert through.wo.tolist() == [-np.float32(x) for x in wi]
-        assert through.pdf == 1 and through.weight == pytest.approx(1)
-    whole = sampled(glass, (0.8, 0, -0.6), 0.999999)
-    assert whole.pdf == 1 and whole.weight == pytest.approx(1)
-    assert whole.wo == pytest.approx([-0.8, 0, -0.6])
+        transmitted = sampled(matched, wi, 0.0)
+        assert transmitted.wo.tolist() == [-np.float32(x) for x in wi]
+        assert transmitted.pdf == 1 and transmitted.weight == pytest.approx(1)
+    reflected = sampled(glass, (0.8, 0, -0.6), 0.999999)
+    assert reflected.pdf == 1 and reflected.weight == pytest.approx(1)
+    assert reflected.wo == pytest.approx([-0.8, 0, -0.6])
     assert np.isnan(sampled(glass, (math.nan, 0, 1), 0.5).wo).any()
-    none = sampled(glass, (0, 0, math.nan), 0.5)
-    assert np.isnan(none.wo).any() and np.isnan(none.pdf)
+    invalid = sampled(glass, (0, 0, math.nan), 0.5)
+    assert np.isnan(invalid.wo).any() and np.isnan(invalid.pdf)
 
 
 @pytest.mark.parametrize("z", [0.0, 1e-30, 1e-12, 1e-7, 1e-4])
@@ -202,7 +202,7 @@ def test_weights_and_densities_are_probabilities_down_to_grazing_incidence(typic
 
 
 def test_the_powers_are_a_short_kernel(vectorised):
-    """Operations of the kernel that turns (a, mask, k, κ) into R and T, the root of cos θ_t included."""
+    """Counts the operations of the kernel that computes R and T from (a, mask, k, κ), with the root of cos θ_t."""
     if vectorised.name != "float32":
         pytest.skip("the plugin's precision is float32")
     x = [dr.value_t(vectorised.vector)(np.linspace(0.1, 0.9, 64)) for _ in range(5)]
@@ -215,7 +215,7 @@ def test_the_powers_are_a_short_kernel(vectorised):
         assert max(entry.get("operation_count", 0) for entry in dr.kernel_history()) <= most
 
 
-# An index that is a texture: a number in each point of the surface ----------------------------------------------
+# An index that is a texture: a number at each point of the surface ----------------------------------------------
 
 
 def texture(*values):
@@ -226,9 +226,9 @@ def texture(*values):
 def test_each_point_has_its_own_index(each_variant):
     bsdf = load(int_ior=texture(1.2, 1.8), ext_ior=1.0)
     for u, eta in ((0.25, 1.2), (0.75, 1.8)):
-        through = sampled(bsdf, (0.6, 0, 0.8), 0.999999, u=u)
-        assert through.wo == pytest.approx([-0.6 / eta, 0, -math.sqrt(1 - (0.6 / eta) ** 2)], rel=1e-6)
-        assert through.weight == pytest.approx(eta**-2, rel=1e-6)
+        transmitted = sampled(bsdf, (0.6, 0, 0.8), 0.999999, u=u)
+        assert transmitted.wo == pytest.approx([-0.6 / eta, 0, -math.sqrt(1 - (0.6 / eta) ** 2)], rel=1e-6)
+        assert transmitted.weight == pytest.approx(eta**-2, rel=1e-6)
     both = load(int_ior=texture(1.2, 1.8), ext_ior=texture(1.1, 1.1))
     assert sampled(both, (0.6, 0, 0.8), 0.999999, u=0.75).wo[0] == pytest.approx(-0.6 * 1.1 / 1.8, rel=1e-6)
     parameters = mi.traverse(bsdf)
@@ -238,22 +238,22 @@ def test_each_point_has_its_own_index(each_variant):
 
 
 @pytest.mark.parametrize("index", [0.0, -1.5, math.nan, math.inf, 1e30, 1e-10])
-def test_a_texture_that_holds_no_index_is_refused_and_an_edit_loses_its_light(typical_variant, index):
+def test_an_invalid_index_in_a_texture_is_an_error_and_an_edit_to_it_loses_light(typical_variant, index):
     checkers = {"type": "checkerboard", "color0": 1.5, "color1": texture(1.5, index)}
     for name, bad in (("int_ior", texture(1.5, index)), ("ext_ior", checkers)):
-        message = f"refract: {name}: its texture holds {index:g}; expected indices from"
+        message = f"refract: {name}: its texture contains {index:g}; expected indices from"
         assert message in refusal(load, **{name: bad})
     bsdf = load(int_ior=texture(1.5, 1.5), ext_ior=1.0)
     parameters = mi.traverse(bsdf)
     parameters["int_ior.data"][:] = index
     parameters.update()
-    for number in (0.0, 0.999999):
-        assert (sampled(bsdf, (0.6, 0, 0.8), number, u=0.75).weight == 0).all()
+    for sample1 in (0.0, 0.999999):
+        assert (sampled(bsdf, (0.6, 0, 0.8), sample1, u=0.75).weight == 0).all()
 
 
 @pytest.mark.parametrize("nested", [False, True])
-def test_an_attribute_that_the_shape_does_not_have_is_refused(llvm_variant, nested, logged):
-    """By `refract_path`. Under other integrators light that meets it tells, once."""
+def test_a_missing_mesh_attribute_is_an_error(llvm_variant, nested, logged):
+    """In `refract_path`. With other integrators it is one warning, when light hits the shape."""
     glass = {"type": "refract", "int_ior": {"type": "mesh_attribute", "name": "vertex_n"}}
     if nested:
         checkers = {"type": "checkerboard", "color0": 1.5, "color1": glass["int_ior"]}
@@ -277,22 +277,24 @@ def test_an_attribute_that_the_shape_does_not_have_is_refused(llvm_variant, nest
             mi.render(scene, spp=1)
 
 
-def test_of_a_coloured_texture_the_luminance_is_the_index(needs_variant):
+def test_the_index_of_an_rgb_texture_is_its_luminance(needs_variant):
     needs_variant("llvm_ad_rgb")
     mi.set_variant("llvm_ad_rgb")
-    for colour, said in (([0.0, 2.0, 0.0], ""), ([0.0, 0.0, 0.0], "its texture holds 0;")):
-        pixels = mi.Bitmap(np.full((1, 1, 3), colour, np.float32))
-        index = {"type": "bitmap", "bitmap": pixels, "raw": True}
-        assert said in refusal(load, int_ior=index) if said else load(int_ior=index)
+    green, black = (
+        {"type": "bitmap", "bitmap": mi.Bitmap(np.full((1, 1, 3), colour, np.float32)), "raw": True}
+        for colour in ([0.0, 2.0, 0.0], [0.0, 0.0, 0.0])
+    )
+    assert load(int_ior=green)
+    assert "its texture contains 0;" in refusal(load, int_ior=black)
 
 
-# What is refused -----------------------------------------------------------------------------------------------
+# Errors --------------------------------------------------------------------------------------------------------
 
 TOO_FAR = "int_ior / ext_ior = {}; expected a ratio from"
 
 
 @pytest.mark.parametrize(
-    ("parameters", "words"),
+    ("parameters", "message"),
     [
         ({"int_ior": 0}, "int_ior = 0; expected"),
         ({"int_ior": -1.5}, "int_ior = -1.5; expected"),
@@ -313,5 +315,5 @@ TOO_FAR = "int_ior / ext_ior = {}; expected a ratio from"
         ),
     ],
 )
-def test_bad_parameters_are_named_with_what_is_accepted(typical_variant, parameters, words):
-    assert words in refusal(load, **parameters).replace("\n", " ")
+def test_invalid_parameters_are_errors_with_what_is_expected(typical_variant, parameters, message):
+    assert message in refusal(load, **parameters).replace("\n", " ")

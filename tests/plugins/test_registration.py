@@ -1,6 +1,6 @@
-"""`import mi_refract` in any order with `set_variant`, what it costs, and the examples of the documentation as printed.
+"""`import mi_refract` before and after `set_variant`, the modules that it loads, and examples of the documentation.
 
-Each case of the import is a fresh interpreter.
+Each case of the import runs in a new interpreter.
 """
 
 import subprocess
@@ -18,7 +18,7 @@ SET = "mi.set_variant('scalar_rgb')"
 XML = '<scene version="3.0.0"><shape type="sphere"><bsdf type="refract"/></shape></scene>'
 HEAVY = ("numpy", "OpenImageIO", "flint", "matplotlib", "scipy", "rich", "typer", "jinja2")
 LOADED = "[name in sys.modules for name in ('drjit', 'mitsuba')]"
-CASES = {  # code, and what it prints, or has in its error
+CASES = {  # code, and what it prints; for cases that fail, a part of the error
     "before any variant": (f"import mitsuba as mi; import mi_refract; {SET}; {LOAD}", ""),
     "before mitsuba": (f"import mi_refract; import mitsuba as mi; {SET}; {LOAD}", ""),
     "after a search for mitsuba": (
@@ -32,16 +32,16 @@ CASES = {  # code, and what it prints, or has in its error
         f"mi.set_variant('scalar_spectral'); {LOAD}; {SET}; {LOAD}; importlib.reload(mi_refract); {LOAD}",
         "",
     ),
-    "parsed from XML, where Mitsuba asks scalar_rgb": (
+    "parsed from XML, for which Mitsuba uses scalar_rgb": (
         "import mitsuba as mi; mi.set_variant('scalar_spectral'); import mi_refract;"
         f"config, xml = mi.parser.ParserConfig('scalar_spectral'), {XML!r};"
         "mi.parser.write_string(mi.parser.parse_string(config, xml)); mi.load_string(xml)",
         "",
     ),
-    "not at all": (f"import mitsuba as mi; {SET}; {LOAD}", "Error"),
-    "a name that is not there": ("import mi_refract; mi_refract.refelct", "'mi_refract' has no attribute 'refelct'"),
+    "not imported": (f"import mitsuba as mi; {SET}; {LOAD}", "Error"),
+    "a missing name": ("import mi_refract; mi_refract.refelct", "'mi_refract' has no attribute 'refelct'"),
     "no heavy package": (f"import mitsuba, mi_refract, sys; print([m for m in {HEAVY!r} if m in sys.modules])", "[]"),
-    "mitsuba and Dr.Jit when they are needed": (
+    "mitsuba and Dr.Jit only when needed": (
         f"import mi_refract, sys; print({LOADED}, mi_refract.reflect.__name__, {LOADED})",
         "[False, False] reflect [True, False]",
     ),
@@ -53,14 +53,14 @@ def run(code):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_plugin_is_known_after_the_import(case):
+def test_the_plugin_is_registered_by_the_import(case):
     code, text = CASES[case]
-    outcome = run(code)
-    if fails := case.startswith(("not", "a name")):
-        assert text in outcome.stderr
+    process = run(code)
+    if case in ("not imported", "a missing name"):
+        assert process.returncode != 0 and text in process.stderr
     else:
-        assert outcome.stdout.strip() == text
-    assert (outcome.returncode != 0) == fails, outcome.stderr
+        assert process.returncode == 0, process.stderr
+        assert process.stdout.strip() == text
 
 
 def test_switching_to_a_vectorised_variant_and_back():
@@ -68,8 +68,8 @@ def test_switching_to_a_vectorised_variant_and_back():
     if not usable:
         pytest.skip("no LLVM or CUDA variant runs here")
     steps = [usable[0], "scalar_rgb", usable[-1], usable[0]]
-    outcome = run("import mitsuba as mi, mi_refract;" + "".join(f"mi.set_variant('{x}'); {LOAD};" for x in steps))
-    assert outcome.returncode == 0, outcome.stderr
+    process = run("import mitsuba as mi, mi_refract;" + "".join(f"mi.set_variant('{x}'); {LOAD};" for x in steps))
+    assert process.returncode == 0, process.stderr
 
 
 def example(path, **changes):
@@ -82,7 +82,7 @@ def example(path, **changes):
     return names
 
 
-def test_the_plugin_in_a_scene(tmp_path, monkeypatch, llvm_variant):
+def test_the_example_of_the_plugin_in_a_scene(tmp_path, monkeypatch, llvm_variant):
     monkeypatch.chdir(ROOT)
     example(
         DOCS / "how-to/render-with-the-plugin.md",
@@ -96,7 +96,7 @@ def test_the_plugin_in_a_scene(tmp_path, monkeypatch, llvm_variant):
     assert len(frozen) == 3 and not np.array_equal(frozen[0], frozen[2])  # of different indices
 
 
-def test_the_smallest_scene_of_the_first_page(tmp_path, monkeypatch, llvm_variant):
+def test_the_example_of_the_first_page(tmp_path, monkeypatch, llvm_variant):
     monkeypatch.chdir(tmp_path)
     size = ('"width": 400, "height": 300', '"width": 8, "height": 6')
     example(ROOT / "README.md", size=size, wait=("spp=64)", "spp=4), write_async=False"))
@@ -104,7 +104,7 @@ def test_the_smallest_scene_of_the_first_page(tmp_path, monkeypatch, llvm_varian
     assert image.shape == (6, 8, 3) and image[0, 0].min() == 255 > image[3, 0].max()  # the sky, and the floor
 
 
-def test_an_index_is_recovered_from_an_image(capsys, llvm_variant):
+def test_the_example_that_recovers_an_index_from_an_image(capsys, llvm_variant):
     page = DOCS / "how-to/recover-an-index-from-an-image.md"
     names = example(page, pixels=('"width": 64, "height": 64', '"width": 24, "height": 24'), steps=("60", "50"))
     (eta,) = names["adam"]["ball.bsdf.eta"]

@@ -1,4 +1,4 @@
-"""What a scene needs is seen in every variant, feature by feature; what is not known counts as needed."""
+"""The features that a scene needs, in every variant; unknown plugins need all of them."""
 
 import dataclasses
 
@@ -23,15 +23,11 @@ def needs(**parts):
 
 
 def facts(**parts):
-    """The names of what is true of a scene of a glass ball and `parts`."""
+    """Return the names of the features, except four, that are true for a scene of a glass ball and `parts`."""
     ball = {"type": "sphere", "bsdf": {"type": "refract"}}
-    every = dataclasses.asdict(needs(**{"sensor": {"type": "perspective"}, "ball": ball} | parts))
-    return {name for name, value in every.items() if value is True} - {
-        "refracting",
-        "shape_media",
-        "delta",
-        "splitting",
-    }
+    features = dataclasses.asdict(needs(**{"sensor": {"type": "perspective"}, "ball": ball} | parts))
+    excluded = {"refracting", "shape_media", "delta", "splitting"}
+    return {name for name, value in features.items() if value is True} - excluded
 
 
 def sphere(bsdf, **parts):
@@ -47,7 +43,7 @@ LIT = {"sampleable", "lamps", "area"}
 
 
 @pytest.mark.parametrize(
-    ("part", "seen"),
+    ("part", "expected"),
     [
         ({"type": "sphere"}, {"smooth"}),
         (sphere("diffuse", reflectance=1e-6), {"smooth"}),
@@ -69,21 +65,21 @@ LIT = {"sampleable", "lamps", "area"}
         (LAMP | {"emitter": {"type": "directionalarea"}}, SUN | {"area"}),
     ],
 )
-def test_each_part_adds_what_it_needs_and_no_more(part, seen, scalar_variant):
-    assert facts(part=part) == seen | (set() if "smooth" in seen else {"only_glass"})
+def test_each_part_adds_only_the_features_that_it_needs(part, expected, scalar_variant):
+    assert facts(part=part) == expected | (set() if "smooth" in expected else {"only_glass"})
 
 
-def test_what_is_within_another_bsdf_does_not_split(scalar_variant):
+def test_a_nested_bsdf_does_not_split(scalar_variant):
     assert needs(ball=sphere("dielectric")).splitting and needs(ball=sphere("refract")).splitting
     assert not needs(ball=sphere("mask", a={"type": "refract"})).splitting
 
 
 def test_a_lamp_with_the_weight_0_is_never_sampled(scalar_variant):
-    """Beside a constant sky, which is not sampled either, it is met by the BSDFs' own samples only."""
+    """With a constant sky, which is not sampled either, only BSDF samples find it."""
     expected = {"only_glass", "sampleable", "area", "environment", "plain_environment"}
-    for weight, more in ((0.0, set()), (1.0, {"lamps"})):
+    for weight, lamps in ((0.0, set()), (1.0, {"lamps"})):
         lamp = LAMP | {"emitter": {"type": "area", "sampling_weight": weight}}
-        assert facts(sky={"type": "constant"}, lamp=lamp) == expected | more
+        assert facts(sky={"type": "constant"}, lamp=lamp) == expected | lamps
 
 
 ONE_NUMBER = {
@@ -108,27 +104,27 @@ BOTH_NUMBERS = {
 
 
 @pytest.mark.parametrize(("name", "bsdf"), (ONE_NUMBER | BOTH_NUMBERS).items())
-def test_plugins_that_take_either_number_have_been_tried(name, bsdf, scalar_variant):
-    """Which of `sample1` and `sample2` a sample depends on, tried on a grid; `measured` needs a file."""
+def test_the_list_of_plugins_that_use_one_random_number(name, bsdf, scalar_variant):
+    """Tests on a grid which of `sample1` and `sample2` a sample depends on, but for `measured`, which needs a file."""
     assert set(ONE_NUMBER) == EITHER
     loaded, grid, both = mi.load_dict(bsdf), (np.arange(16) + 0.5) / 16, name in BOTH_NUMBERS
     assert name in (loaded.class_name(), type(loaded).__name__)
 
-    def several(pairs):
+    def differ(pairs):
         samples = [sampled(loaded, (0.36, 0.48, 0.8), x, sample2=point) for x, point in pairs]
         return len({(*s.wo, s.pdf) for s in samples}) > 1
 
-    asked = several((x, (0.3, 0.6)) for x in grid), several((0.3, (x, 1 - x)) for x in grid)
-    assert all(asked) == both
+    used = differ((x, (0.3, 0.6)) for x in grid), differ((0.3, (x, 1 - x)) for x in grid)
+    assert all(used) == both
     assert ("both_numbers" in facts(part={"type": "sphere", "bsdf": bsdf})) == both
 
 
 EVERYTHING = {"both_numbers", "smooth", "null", "textured", "dispersive", "absorbing"}
 
 
-def test_what_is_not_known_needs_everything(scalar_variant):
+def test_unknown_plugins_need_everything(scalar_variant):
 
-    class Refract(mi.BSDF):  # ours by its name, but not by its module
+    class Refract(mi.BSDF):  # it has the name of our class, but another module
         def __init__(self, props):
             super().__init__(props)
             self.m_flags = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.FrontSide
@@ -152,13 +148,13 @@ def test_what_is_not_known_needs_everything(scalar_variant):
 
 @pytest.mark.parametrize(("reflectance", "black"), [(0.0, True), ({"type": "rgb", "value": 1e-9}, False)])
 def test_a_spectrum_from_rgb_is_never_exactly_black(reflectance, black):
-    """Mitsuba calls its largest value 0."""
+    """Its `max` in Mitsuba is 0."""
     switch("scalar_spectral")
     assert ("smooth" in facts(part=sphere("diffuse", reflectance=reflectance))) != black
 
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
-def test_the_scenes(variant, needs_variant):
+def test_features_of_our_scenes(variant, needs_variant):
     needs_variant(variant)
     switch(variant)
     scenes = {path.stem: inspect(mi.load_file(str(path), res=4)) for path in SCENES.glob("*.xml")}
@@ -170,10 +166,10 @@ def test_the_scenes(variant, needs_variant):
     assert set(reasons) == {"emitter sampling", "a random number", "media", "null lobes", "dispersion", "absorption"}
 
 
-def test_what_is_left_out_has_its_reason_and_an_edit_can_bring_it_back(scalar_variant):
-    """A lamp's own black surface, made grey."""
+def test_omitted_features_have_reasons_and_an_edit_can_require_them(scalar_variant):
+    """The edit makes the black surface of a lamp grey."""
     matt = {"type": "sphere"}
-    assert "met" in needs(a=matt, sky={"type": "constant"}).left_out["sampling the environment"]
+    assert "BSDF sampling finds it" in needs(a=matt, sky={"type": "constant"}).left_out["sampling the environment"]
     dark = needs(a=matt).left_out
     assert dark["emitter sampling"] == "no emitter can be sampled"
     assert {"area lights", "environment"} <= set(dark)
@@ -185,7 +181,7 @@ def test_what_is_left_out_has_its_reason_and_an_edit_can_bring_it_back(scalar_va
     assert inspect(scene).smooth
 
 
-# What is missing ----------------------------------------------------------------------------------------------------
+# Missing light ------------------------------------------------------------------------------------------------------
 
 DOWN = PLACE().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
 POINT, SPOT = {"type": "point", "position": [0, 0, 4]}, {"type": "spot", "to_world": DOWN}
@@ -196,17 +192,20 @@ BEAM = SQUARE | {"emitter": {"type": "directionalarea"}}
 CAST, ALL_OF_BEAM = "L S+ D (S|D)* E", "L (S|D)* D (S|D)* E"
 
 
-def under_a_pane(lamp, bsdf, integrator="path", floor=None, more=None, **parameters):
-    """A floor, seen from below a pane; the lamp is above the pane."""
+def under_a_pane(lamp, bsdf, integrator="path", floor=None, more=None, calls=None, **parameters):
+    """Return a scene of a floor seen from below a pane, with the lamp above the pane, and a part `more`.
+
+    `calls`: an integrator nested in `integrator`, which gets the parameters instead.
+    """
     parts = {"floor": {"type": "rectangle", "bsdf": floor or {"type": "diffuse"}}, "lamp": lamp}
     if bsdf:
         parts["pane"] = {"type": "rectangle", "to_world": PLACE().translate([0, 0, 1]).scale(3), "bsdf": bsdf}
     if more:
         parts["more"] = more
-    eye = camera(8, 60) | {"to_world": PLACE().look_at([1.5, 0, 0.6], [0, 0, 0], [0, 0, 1])}
-    if called := parameters.pop("calls", None):
-        parameters = {"called": {"type": called} | parameters}
-    return mi.load_dict({"type": "scene", "eye": eye, "integrator": {"type": integrator} | parameters} | parts)
+    view = camera(8, 60) | {"to_world": PLACE().look_at([1.5, 0, 0.6], [0, 0, 0], [0, 0, 1])}
+    if calls:
+        parameters = {"called": {"type": calls} | parameters}
+    return mi.load_dict({"type": "scene", "eye": view, "integrator": {"type": integrator} | parameters} | parts)
 
 
 CLEAR, HOLES = {"type": "null"}, {"type": "mask", "nested": {"type": "diffuse"}}
@@ -222,19 +221,19 @@ CLOUDY = {"type": "sphere", "bsdf": GLASS, "interior": MEDIUM}
         *((POINT, {"type": bsdf}, {}, {CAST}) for bsdf in ("refract", "thindielectric", "plastic", "retarder", "hair")),
         *((POINT, bsdf, {}, {CAST}) for bsdf in (CLEAR, HOLES, MIRROR)),
         *((BEAM, bsdf, {}, {ALL_OF_BEAM}) for bsdf in (None, GLASS)),
-        # Nothing is missing without such a lamp, without a delta lobe, without another one, and of shorter paths.
+        # Nothing is missing without such a lamp, a delta lobe or another lobe, nor if `max_depth` excludes the paths.
         *((lamp, GLASS, {}, set()) for lamp in ({"type": "constant"}, SQUARE | {"emitter": {"type": "area"}})),
         (POINT | {"sampling_weight": 0.0}, GLASS, {"more": {"type": "constant"}}, set()),
         *((POINT, bsdf, {}, set()) for bsdf in (None, {"type": "roughdielectric"}, {"type": "principled"})),
         *((lamp, GLASS, {"floor": BLACK}, set()) for lamp in (POINT, BEAM)),
         *((POINT, GLASS, {"max_depth": depth}, missing) for depth, missing in ((2, set()), (3, {CAST}))),
         *((BEAM, GLASS, {"max_depth": depth}, missing) for depth, missing in ((1, set()), (2, {ALL_OF_BEAM}))),
-        # Shadow rays of `volpath` go through null lobes, and its media scatter.
+        # In `volpath` shadow rays pass null lobes, and media scatter.
         *((POINT, bsdf, {"integrator": "volpath"}, set()) for bsdf in (CLEAR, HOLES)),
         *((POINT, {"type": bsdf}, {"integrator": "volpathmis"}, {CAST}) for bsdf in ("thindielectric", "dielectric")),
         (POINT, GLASS, {"floor": BLACK, "more": CLOUDY, "integrator": "path"}, set()),
         (POINT, GLASS, {"floor": BLACK, "more": CLOUDY, "integrator": "volpath"}, {CAST}),
-        # Only what is known is named.
+        # Other integrators are not examined.
         *((POINT, GLASS, {"integrator": name}, set()) for name in ("ptracer", "direct", "depth")),
         (POINT, GLASS, {"integrator": "refract_path", "caustics": "path"}, {CAST}),
         (POINT, GLASS, {"integrator": "refract_path"}, {"L S+ D (S|D)* S E"}),
@@ -242,11 +241,11 @@ CLOUDY = {"type": "sphere", "bsdf": GLASS, "interior": MEDIUM}
         (POINT, GLASS, {"integrator": "moment", "calls": "path", "max_depth": 2}, set()),
     ],
 )
-def test_what_an_integrator_misses_is_predicted(lamp, bsdf, others, missing, scalar_variant):
+def test_missing_light_lists_the_classes_of_paths(lamp, bsdf, others, missing, scalar_variant):
     assert {*missing_light(under_a_pane(lamp, bsdf, **others))} == missing
 
 
-def test_what_is_missing_says_why_and_what_mends_it(scalar_variant):
+def test_missing_light_gives_reason_and_remedy(scalar_variant):
     scene = under_a_pane(POINT, {"type": "mask", "nested": GLASS})
     (text,) = missing_light(scene).values()
     assert text == (
@@ -259,7 +258,7 @@ def test_what_is_missing_says_why_and_what_mends_it(scalar_variant):
 @pytest.mark.parametrize(
     ("lamp", "bsdf"), [(POINT, None), (POINT, GLASS), (SUNLIGHT, CLEAR), (SPOT, HOLES), (BEAM, None)]
 )
-def test_what_is_predicted_is_black_and_a_tracer_from_the_lamp_finds_it(lamp, bsdf, integrator, scalar_variant):
+def test_missing_light_is_black_and_ptracer_finds_it(lamp, bsdf, integrator, scalar_variant):
     by_path = {"caustics": "path"} if integrator == "refract_path" else {}
     scene, tracer = under_a_pane(lamp, bsdf, integrator, **by_path), mi.load_dict({"type": "ptracer"})
     ours, theirs = np.array(mi.render(scene, spp=4)), np.array(mi.render(scene, spp=4000, integrator=tracer))
@@ -271,7 +270,7 @@ def test_what_is_predicted_is_black_and_a_tracer_from_the_lamp_finds_it(lamp, bs
     ("integrator", "bsdf", "black"),
     [("prb", CLEAR, True), ("prb_projective", CLEAR, True), ("prbvolpath", CLEAR, False), ("prbvolpath", GLASS, True)],
 )
-def test_what_is_predicted_of_integrators_for_derivatives_is_black(integrator, bsdf, black, llvm_variant):
+def test_missing_light_is_black_in_differentiable_integrators(integrator, bsdf, black, llvm_variant):
     scene = under_a_pane(POINT, bsdf, integrator)
     assert bool(missing_light(scene)) == (np.array(mi.render(scene, spp=4)).max() == 0) == black
 
@@ -287,16 +286,16 @@ def test_what_is_predicted_of_integrators_for_derivatives_is_black(integrator, b
         (BEAM, GLASS, 3, {"L D (S|D)* E"}),
     ],
 )
-def test_what_is_missing_where_caustics_are_traced_from_the_lamp(lamp, bsdf, max_depth, missing, scalar_variant):
+def test_missing_light_if_caustics_are_traced_from_the_lamp(lamp, bsdf, max_depth, missing, scalar_variant):
     assert {*inspect(under_a_pane(lamp, bsdf)).missing("lamp", max_depth)} == missing
 
 
-def test_what_is_missing_of_another_way_is_an_error(scalar_variant):
+def test_missing_light_of_another_caustics_is_an_error(scalar_variant):
     with pytest.raises(ValueError, match=r"^missing: caustics = 'auto'; expected path or lamp$"):
         needs().missing("auto")
 
 
-def test_refract_path_warns_again_where_lamps_are_traced_no_more(logged, scalar_variant):
+def test_refract_path_warns_again_if_lamps_are_no_longer_traced(logged, scalar_variant):
     scene = under_a_pane(POINT, GLASS)
     method = mi.load_dict({"type": "refract_path"})
     cameras = [mi.load_dict(x) for x in (camera(4), camera(4, sample_border=True), camera(4))]
@@ -306,7 +305,7 @@ def test_refract_path_warns_again_where_lamps_are_traced_no_more(logged, scalar_
     assert classes == [f"refract_path: missing L S+ D (S|D)* {end}" for end in ("S E", "E", "S E")]
 
 
-def test_refract_path_warns_once_a_scene_of_what_is_missing(logged, scalar_variant):
+def test_refract_path_warns_once_a_scene_about_missing_light(logged, scalar_variant):
     for bsdf in (GLASS, GLASS, None):
         scene = under_a_pane(POINT, bsdf, "refract_path", caustics="path")
         for seed in range(2):
@@ -316,25 +315,25 @@ def test_refract_path_warns_once_a_scene_of_what_is_missing(logged, scalar_varia
     assert all(text.startswith("refract_path: missing L S+ D (S|D)* E: light of PointLight") for text in warnings)
 
 
-# Rays that start beyond the glass -----------------------------------------------------------------------------------
+# Glass that is too thin ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("thickness", "place", "others", "thin"),
     [
         (1e-3, 12, {}, ""),
-        (1e-5, 12, {}, "'pane' is 1e-05 thick, and rays start 2.86e-05 beside its surface"),
+        (1e-5, 12, {}, "'pane' is 1e-05 thick, but rays start 2.86e-05 from its surface"),
         (1e-5, 0, {}, ""),
-        # Beside a cylinder rays start as Mitsuba's do.
-        (1e-3, 12, {"pipe": {"type": "cylinder", "bsdf": GLASS}}, "'pane' is 0.001 thick, and rays start 0.00125"),
+        # In a scene with a cylinder rays start as in Mitsuba.
+        (1e-3, 12, {"pipe": {"type": "cylinder", "bsdf": GLASS}}, "'pane' is 0.001 thick, but rays start 0.00125"),
         (1e-5, 12, {"bsdf": {"type": "conductor"}}, ""),
     ],
 )
-def test_glass_that_rays_step_over_is_named(thickness, place, others, thin, scalar_variant):
+def test_glass_that_rays_step_over_is_reported(thickness, place, others, thin, scalar_variant):
     at = PLACE().translate([place, 0, 0]).scale([1, 1, thickness / 2])
     pane = {"type": "cube", "id": "pane", "to_world": at, "bsdf": others.get("bsdf", GLASS)}
-    found = needs(pane=pane, **{name: part for name, part in others.items() if name != "bsdf"}).thin
-    assert thin in found and bool(thin) == bool(found)
+    text = needs(pane=pane, **{name: part for name, part in others.items() if name != "bsdf"}).thin
+    assert thin in text and bool(thin) == bool(text)
 
 
 def test_the_size_of_merged_meshes_is_that_of_all_parts(llvm_variant):

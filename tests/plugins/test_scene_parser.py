@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("scalar_variant")
 
 @pytest.fixture
 def load(tmp_path):
-    """`load("<bsdf/>", other="<scene/>")`: the scene of these elements, with other files beside it."""
+    """`load("<bsdf/>", other="<scene/>")` loads a scene of these elements, with other scene files in its folder."""
 
     def call(elements, *allowed, defines=None, **files):
         for name, text in ({"s": elements} | files).items():
@@ -32,7 +32,7 @@ def load(tmp_path):
 
 @pytest.fixture
 def bait(tmp_path):
-    """Files in the places where Mitsuba looks for plugins. It would fail to load them, and say so."""
+    """A folder with files where Mitsuba looks for plugins. It would fail to load them with an error."""
     for path in ("plugins/evil.so", "evil.so", "more/plugins/evil.so", "more/evil.so"):
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_text("native code")
@@ -55,14 +55,14 @@ def bait(tmp_path):
         '<bsdf type="%s/evil"/>',
     ],
 )
-def test_a_plugin_of_the_scenes_own_is_refused_by_name(elements, load, bait):
+def test_a_plugin_that_ships_with_the_scene_is_an_error(elements, load, bait):
     with pytest.raises(ValueError, match=r"s\.xml: plugin '.*evil': neither Mitsuba's nor .*--allow-plugins .*evil$"):
         load(elements.replace("%s", str(bait)), other='<bsdf type="evil"/>')
 
 
 @pytest.mark.parametrize("place", ["scene", "path", "working folder"])
-def test_a_file_named_as_a_plugin_in_python_is_refused(place, load, tmp_path, monkeypatch):
-    """In scalar variants Mitsuba registers none of its own, and looks for a file; ours are registered everywhere."""
+def test_a_file_with_the_name_of_a_python_plugin_is_an_error(place, load, tmp_path, monkeypatch):
+    """In scalar variants Mitsuba registers none of these plugins, and looks for a file. Ours are always registered."""
     folder, searched = tmp_path if place == "scene" else tmp_path / "more", '<path value="more"/>' * (place == "path")
     (folder / "plugins").mkdir(parents=True)
     if place == "working folder":
@@ -76,7 +76,7 @@ def test_a_file_named_as_a_plugin_in_python_is_refused(place, load, tmp_path, mo
 
 
 def test_an_allowed_plugin_is_loaded(load, bait):
-    """Mitsuba says that the file is no native code: it tried."""
+    """Mitsuba's error about the file, which is not native code, shows that it tried to load it."""
     with pytest.raises(RuntimeError, match=r"Error while loading plugin .*plugins/evil\.so"):
         load('<bsdf type="evil"/>', "evil")
     with pytest.raises(ValueError, match="plugin 'worse'"):
@@ -100,8 +100,8 @@ sys.exit(code or main(["render", "s.xml", "-o", "out.exr", "--variant", "scalar_
 """
 
 
-def test_mitsubas_own_plugins_are_not_looked_for_in_the_folder_of_the_scene(tmp_path, monkeypatch):
-    """Nor in a <path>, nor in the working folder. In a process of its own: plugins are loaded once."""
+def test_mitsubas_plugins_are_not_loaded_from_the_folder_of_the_scene(tmp_path, monkeypatch):
+    """Nor from a <path> or the working folder. In a process of its own, as a plugin is loaded once a process."""
     film = '<film type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/></film>'
     sensor = f'<sensor type="perspective">{film}</sensor>'
     elements = f'<path value="more"/><integrator type="path"/>{sensor}<shape type="sphere"/><emitter type="constant"/>'
@@ -115,8 +115,8 @@ def test_mitsubas_own_plugins_are_not_looked_for_in_the_folder_of_the_scene(tmp_
     assert "t.toml: 3 rays" in out
 
 
-def test_the_names_are_mitsubas():
-    """Of plugins in C++ those of the folder; of plugins in Python those that its own modules register."""
+def test_all_plugins_of_mitsuba_are_known():
+    """C++ plugins are files in its folder; Python plugins are registered by its modules."""
     own = scene_parser.own_folder()
     text = "".join(path.read_text() for path in (own / "python").rglob("*.py"))
     assert sorted(re.findall(r"\.register_\w+\(\s*[\"'](\w+)[\"']", text)) == sorted(scene_parser.PYTHON)
@@ -126,14 +126,14 @@ def test_the_names_are_mitsubas():
     assert not any("/" in name or not name for name in scene_parser.known_plugins())
 
 
-def test_our_scenes_pass():
+def test_our_scenes_use_known_plugins_and_existing_files():
     for path in SCENES.glob("*.xml"):
         parsed = scene_parser.parse(path)
         assert {node.props.plugin_name() for node in parsed.state.nodes} <= scene_parser.known_plugins()
         assert all(file.is_file() for file in parsed.files().values())
 
 
-def test_the_search_path_is_as_before(load):
+def test_loading_restores_the_search_path(load):
     before = [str(folder) for folder in mi.file_resolver()]
     load(f"{SENSOR}<path value='.'/>")
     with pytest.raises(ValueError, match="evil"):
@@ -142,8 +142,8 @@ def test_the_search_path_is_as_before(load):
 
 
 @pytest.mark.parametrize("last", [3, 10**9])
-def test_a_face_without_its_vertices_is_refused(last, load, tmp_path):
-    """Mitsuba writes a normal for each vertex of a face, wherever that is, unless all faces are flat."""
+def test_a_face_with_a_missing_vertex_is_an_error(last, load, tmp_path):
+    """Mitsuba would write a normal for each vertex of a face, also to invalid memory, unless face normals are used."""
     head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n"
     mesh = tmp_path / "more" / "m.ply"
@@ -175,8 +175,8 @@ for name in sys.argv[1].split():
 """
 
 
-def test_no_plugin_ends_the_process_for_want_of_a_parameter(tmp_path, monkeypatch):
-    """Each one of Mitsuba's, with nothing inside, in the place of each kind of plugin."""
+def test_no_plugin_crashes_without_parameters(tmp_path, monkeypatch):
+    """Every plugin of Mitsuba, empty, as every kind of plugin."""
     monkeypatch.chdir(tmp_path)
     names = {*scene_parser.known_plugins(), "rgb", "spectrum"}
     with python(EMPTY, " ".join(sorted(names))) as process:
@@ -185,8 +185,8 @@ def test_no_plugin_ends_the_process_for_want_of_a_parameter(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("element", ["emitter type='envmap'", "texture type='bitmap'"])
-def test_an_image_is_refused_by_its_header(element, load, tmp_path):
-    """Mitsuba believes it: a width of 8 million took minutes, an attribute of 800 MB as much memory."""
+def test_an_image_with_a_corrupt_header_is_an_error(element, load, tmp_path):
+    """Mitsuba does not check it: a width of 8 million took minutes, an attribute of 800 MB as much memory."""
     good = (SCENES / "lamps.exr").read_bytes()
     scene = f'{SENSOR}<{element}><string name="filename" value="sky.exr"/></{element.split()[0]}>'
     (tmp_path / "sky.exr").write_bytes(good)
@@ -211,11 +211,11 @@ def test_an_image_is_refused_by_its_header(element, load, tmp_path):
         assert "max-values" not in str(caught.value)
 
 
-# What is known to end the process ---------------------------------------------------------------------------------
+# Scenes that would crash the process ------------------------------------------------------------------------------
 
 
 def chain(count, back=1):
-    """BSDFs that each hold a reference to the one before, or to the one after."""
+    """Return BSDFs, each with a reference to the previous one, or with `back=-1` to the next one."""
     links = range(1, count) if back > 0 else range(count - 1)
     last = 0 if back > 0 else count - 1
     bsdfs = "".join(f'<bsdf type="twosided" id="b{i}"><ref id="b{i - back}"/></bsdf>' for i in links)
@@ -242,7 +242,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_would_end_the_process_is_refused(case, load, tmp_path, monkeypatch):
+def test_a_scene_that_would_crash_the_process_is_an_error(case, load, tmp_path, monkeypatch):
     elements, message = REFUSED[case]
     os.mkfifo(tmp_path / "pipe")
     monkeypatch.setattr(mi.parser, "instantiate", lambda *arguments: pytest.fail("ran"))
@@ -251,12 +251,12 @@ def test_what_would_end_the_process_is_refused(case, load, tmp_path, monkeypatch
     assert "\n" not in str(caught.value)
 
 
-def test_a_text_too_long_for_the_name_of_a_file_is_none(load):
+def test_a_text_too_long_for_a_file_name_is_no_error(load):
     table = ", ".join(f"{360 + 5 * i}: 1.5" for i in range(95))
     load(f'{SENSOR}<bsdf type="refract"><string name="int_ior" value="table({table})"/></bsdf>')
 
 
-def test_a_scene_that_is_a_pipe_is_refused(tmp_path):
+def test_a_scene_that_is_a_pipe_is_an_error(tmp_path):
     os.mkfifo(tmp_path / "s.xml")
     with pytest.raises(ValueError, match=r"s\.xml: not a regular file"):
         scene_parser.parse(tmp_path / "s.xml")
@@ -266,7 +266,7 @@ def test_a_scene_that_is_a_pipe_is_refused(tmp_path):
 
 
 def test_files_are_those_that_mitsuba_opens(load, tmp_path):
-    """Files of the folder of a <path> before those beside the scene; included files the other way round."""
+    """Files in the folder of a <path> precede those in the scene's folder; for included files it is the reverse."""
     for i, folder in enumerate((tmp_path, tmp_path / "more")):
         (folder / "plugins").mkdir(parents=True)
         (folder / "plugins" / "evil.so").write_text("native code")
