@@ -32,7 +32,7 @@ from mi_refract.numerics import (
 )
 
 from .absorption import BEYOND, HERE, absorbing_parameter
-from .scene_features import all_shapes, check_attributes, children, nested, plugin_number, shape_name
+from .scene_features import all_shapes, check_shapes, children, nested, plugin_number, shape_name
 
 TOLERANCE = 1e-3  # relative: σ may have been given as a number here and as a colour there
 STRAY = 0.01  # of the crossings of a shape: more are a contradiction
@@ -186,9 +186,9 @@ def absorbs_only(v: Variant, medium: MediumPlugin) -> bool:
 def check_integrator(scene: Scene) -> None:
     """ValueError where a BSDF absorbs and the scene's integrator is neither `refract_path` nor calls only that.
 
-    As with that integrator also where a texture is an attribute that its shape does not have.
+    As with that integrator also for what `check_shapes` says.
     """
-    check_attributes(scene)
+    check_shapes(scene)
 
     def follows(integrator: Any) -> bool:
         called = [child for child in children(integrator) if hasattr(child, "aov_names")]

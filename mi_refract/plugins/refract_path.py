@@ -50,7 +50,7 @@ from .index_parameter import warn_once
 from .medium_tracking import MediumTracker, ShapeMedia, check_media, extinction
 from .path_loop import PathFeatures, PathLoop
 from .sampling import KeyedMultijitter, SceneSampler, seeds_of
-from .scene_features import SceneFeatures, check_attributes, inspect
+from .scene_features import SceneFeatures, check_shapes, inspect
 
 INTEGRATOR = "refract_path"
 MOST_PATHS = 4096  # that one sample may split into
@@ -320,8 +320,7 @@ def integrator_class(v: Variant) -> type:
             missing = needs.missing("lamp" if self.apart else "path", self.max_depth)
             for path_class, text in missing.items() if (needs, self.apart) != before else ():
                 mi.Log(mi.LogLevel.Warn, f"{INTEGRATOR}: missing {path_class}: {text}")  # type: ignore[operator]
-            if needs.textured:
-                check_attributes(scene)
+            check_shapes(scene)
             if needs.absorbing or needs.media:
                 check_media(v, scene)
             mi.Log(mi.LogLevel.Info, f"{INTEGRATOR}: left out: {self.left_out()}")  # type: ignore[operator]

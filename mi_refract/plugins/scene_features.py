@@ -40,6 +40,7 @@ CONSTANT_TEXTURES = {
 PERTURBING = {"BumpMap", "NormalMap"}  # their shading normal is not that of the interaction
 # One reflected and one refracted direction, each sampled by a side of one threshold of `sample1`: what can be split.
 BOUNDARIES = {"Refract", "SmoothDielectric"}
+CURVES = {"BSplineCurve", "LinearCurve"}
 # No choice is left to chance where the lobes of `BOUNDARIES` are both followed.
 DETERMINISTIC = BOUNDARIES | {"SmoothConductor", "TwoSidedBRDF"}
 # Of a hit these need the shading normal only, which is all that `RayFlags.ShadingFrame` gives: no tangent, no (u, v).
@@ -60,7 +61,7 @@ class SceneFeatures:
     """Facts about a scene. `unknown`: the plugins that are not known, and so count as needing everything."""
 
     smooth: bool  # some BSDF has a lobe that is not a delta: then sampling emitters is worth while
-    delta_perturbed: str  # one within a BSDF with delta lobes that may have a shading normal of its own, or ""
+    delta_perturbed: str  # one in a BSDF with delta lobes, not null, that may have a shading normal of its own, or ""
     sampleable: bool  # some emitter can be sampled
     lamps: bool  # some emitter other than the environment can be
     area: bool  # some shape emits
@@ -154,7 +155,7 @@ def inspect(scene: Scene) -> SceneFeatures:
     perturbed = (
         name
         for each in within
-        if each and each[0].flags() & +mi.BSDFFlags.Delta
+        if each and each[0].flags() & (+mi.BSDFFlags.DeltaReflection | +mi.BSDFFlags.DeltaTransmission)
         for name in map(bsdf_name, each)
         if name not in KNOWN - PERTURBING
     )
@@ -216,11 +217,11 @@ def missing_light(scene: Scene) -> dict[str, str]:
     return missing
 
 
-def check_attributes(scene: Scene) -> None:
-    """ValueError for attributes of meshes that Mitsuba does not read right.
+def check_shapes(scene: Scene) -> None:
+    """ValueError for shapes that Mitsuba renders wrong.
 
-    One that a texture of `refract` names and the shape does not have is 0 there. One that a lamp emits is read in the
-    first face wherever a point on the lamp is sampled.
+    An attribute that a texture of `refract` names and the mesh does not have is 0 there. One that a lamp emits is read
+    in the first face wherever a point on the lamp is sampled. A ray within a curve does not meet it.
     """
     shapes = all_shapes(scene)
     for i, shape in enumerate(shapes):
@@ -231,6 +232,11 @@ def check_attributes(scene: Scene) -> None:
                 "reads in one face only where it samples a lamp; expected a bitmap, or sampling_weight = 0"
             )
         for bsdf in nested(shape.bsdf()):
+            if bsdf_name(bsdf) in BOUNDARIES and shape.class_name() in CURVES:
+                raise ValueError(
+                    f"refract_path: {shape_name(shapes, i)} is a {shape.class_name()} of glass, which rays do not "
+                    "meet from within; expected a mesh"
+                )
             for name in mesh_attributes(bsdf) if bsdf_name(bsdf) == "Refract" else []:
                 if not dr.all(shape.has_attribute(name)):
                     raise ValueError(

@@ -8,7 +8,7 @@ import pytest
 from support.glass_scenes import BLACK, PLACE, camera, sampled
 from support.variants import switch
 
-from mi_refract.plugins import inspect, missing_light
+from mi_refract.plugins import check_integrator, inspect, missing_light
 from mi_refract.plugins.scene_features import EITHER
 from validation.run.context import SCENES
 
@@ -121,6 +121,17 @@ def test_plugins_that_take_either_number_have_been_tried(name, bsdf, scalar_vari
     asked = several((x, (0.3, 0.6)) for x in grid), several((0.3, (x, 1 - x)) for x in grid)
     assert all(asked) == both
     assert ("both_numbers" in facts(part={"type": "sphere", "bsdf": bsdf})) == both
+
+
+@pytest.mark.parametrize("kind", ["bsplinecurve", "linearcurve"])
+def test_a_curve_of_glass_is_an_error(kind, llvm_variant, tmp_path):
+    (tmp_path / "fibre.txt").write_text("\n".join(f"{x} 0 0 0.3" for x in range(4)))
+    fibre = {"type": kind, "filename": str(tmp_path / "fibre.txt"), "bsdf": {"type": "dielectric"}}
+    made = mi.load_dict(
+        {"type": "scene", "fibre": fibre, "integrator": {"type": "refract_path"}, "sensor": {"type": "perspective"}}
+    )
+    with pytest.raises(ValueError, match=r"'fibre' is a .*Curve of glass.*; expected a mesh"):
+        check_integrator(made)
 
 
 EVERYTHING = {"both_numbers", "smooth", "null", "textured", "dispersive", "absorbing"}
