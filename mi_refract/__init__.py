@@ -42,7 +42,7 @@ def __getattr__(name: str) -> Any:
 
 
 def _register_plugins() -> None:
-    """In the present variant, and by a callback of Mitsuba's in every later one."""
+    """Register the plugins in the present variant, and by a callback of Mitsuba's in every later one."""
     import mitsuba as mi
 
     from . import plugins

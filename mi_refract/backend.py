@@ -157,26 +157,26 @@ def libraries() -> list[Library]:
 
 def candidates() -> list[str]:
     """Every libLLVM on this machine, the highest version first; before all others the one that is loaded, if any."""
-    found: list[str] = []
+    names: list[str] = []
     ldconfig = shutil.which("ldconfig", path=os.pathsep.join([os.environ.get("PATH", ""), "/sbin", "/usr/sbin"]))
     if ldconfig:
         listing = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, check=False).stdout
-        found += re.findall(r"=> (\S*/libLLVM\S*)$", listing, re.MULTILINE)
+        names += re.findall(r"=> (\S*/libLLVM\S*)$", listing, re.MULTILINE)
     folders = [*os.environ.get("LD_LIBRARY_PATH", "").split(":"), f"{sys.prefix}/lib", "/usr/lib", "/usr/lib64"]
     folders += ["/usr/lib/*-linux-gnu", "/usr/lib/llvm*/lib*", "/usr/lib/llvm/*/lib*", "/usr/local/lib*"]
     folders += ["/usr/local/llvm*/lib*", "/opt/homebrew/opt/llvm*/lib", "/usr/local/opt/llvm*/lib"]
     for folder in folders:
         if folder.startswith("/"):
-            found += map(str, Path("/").glob(f"{folder[1:]}/libLLVM*"))
+            names += map(str, Path("/").glob(f"{folder[1:]}/libLLVM*"))
     if WINDOWS:  # where Dr.Jit looks itself
-        found += [str(x) for folder in os.environ["PATH"].split(os.pathsep) if (x := Path(folder, WINDOWS)).is_file()]
-    loaded, paths = _loaded() or set(), set(map(os.path.realpath, found))
+        names += [str(x) for folder in os.environ["PATH"].split(os.pathsep) if (x := Path(folder, WINDOWS)).is_file()]
+    loaded, paths = _loaded() or set(), set(map(os.path.realpath, names))
     versioned = [(path in loaded, version, path) for path in paths if (version := _version(path)) is not None]
     return [path for _, _, path in sorted(versioned, reverse=True)]
 
 
 def _version(path: str) -> tuple[int, ...] | None:
-    """From the file's name: (19, 1) of libLLVM.so.19.1, (15,) of libLLVM-15.so.1; None: not LLVM's C interface."""
+    """The version in a file's name: (19, 1) of libLLVM.so.19.1, (15,) of libLLVM-15.so.1; None for another file."""
     name = re.fullmatch(r"libLLVM(?:-(\d[\d.]*))?\.(?:so|dylib)(?:\.(\d[\d.]*))?", Path(path).name)
     if name is None:
         return () if Path(path).name == WINDOWS else None
@@ -231,7 +231,7 @@ def _announce(backend: Backend) -> None:
 
 
 def restart_if_needed() -> None:
-    """For commands: have Dr.Jit use the libLLVM that works.
+    """Make Dr.Jit use the libLLVM that works; for commands.
 
     Where Dr.Jit was imported with another one already, start this process's command line again, and do not return.
     """

@@ -30,7 +30,7 @@ ROOMS = {
     "stability": ("optical_chains", "energy", "derivatives", "layered_paths"),
     "renders": (
         *("against_dielectric", "colours", "unused_features", "invisible_changes"),
-        *("neighbours", "random_numbers", "gradients", "rendering_passes"),
+        *("neighbours", "random_numbers", "gradients", "rendering_passes", "thin_panes"),
     ),
     "efficiency": ("error_against_time", "scaling", "changing_indices", "caustics", "chosen_settings"),
     "media": ("catalogs", "ray_directions", "closed_forms", "renders"),
@@ -54,7 +54,7 @@ QUICK = (
     "diff.planted_defects",
 )
 LOCK = "validation.lock"  # in the folder of the report, while it is being made
-PROFILES = {"quick": "about a minute", "standard": "about an hour", "full": "hours"}
+PROFILES = {"quick": "a minute and a half", "standard": "about an hour", "full": "hours"}
 
 app = command_line.application()
 

@@ -46,7 +46,8 @@ PRISM_ANGLE = limit(
 # A direction that is off by ε moves the next incidence by up to 2ε, and so on: 8u (1 + 3 + 5 + 7), 2u each for points.
 BOW_ANGLE = limit(160 * 2.0**-53, "radians: four boundaries of 8u, each turned on by those after it, and their points")
 FOCAL_DISTANCE = limit(5.4e-10, "relative: (h/R)² at h = 1e-3 and the steepest R = 43; aberration is tenths of that")
-FURNACE_CHANNEL = limit(3e-3, "relative: what a colour of the furnace would be seen at, in each channel")
+FURNACE_CHANNEL = limit(3e-3, "relative: a colour of the furnace that would be seen, in each channel")
+PANE = limit(1e-3, "one ray in 500 may pass between two faces, beside the edges of a pane")
 ABSORPTION_SEEN = limit(0.01, "relative: a difference of an image's mean from `volpath` that must be seen")
 SLAB_ABSORPTION = limit(2e-6, "relative: σ d up to 8 in float32, with a way that is off by 2u: 16u and the exponential")
 DISPERSION_TIME = limit(1.25, "over the same scene with the index of the d line, with as many samples")
@@ -103,7 +104,7 @@ REFLECTANCE = {
 
 PATH_BOUNDARY = limit(2.0**-24, "of the direction, (2 m + 1) times after m boundaries: the cosine is rounded twice")
 OFF_EXACT = limit(1.0, "of the built-in's pixels: where the two images differ, `refract` is the one that is right")
-FLIPPED = limit(1e-3, "of the pixels: those of which a last bit changes the choice between reflection and refraction")
+FLIPPED = limit(1e-3, "of the pixels: a last bit changes the choice between reflection and refraction there")
 
 # Renders -------------------------------------------------------------------------------------------------------
 
@@ -122,7 +123,7 @@ EDIT = limit(
 )
 FROZEN = limit(1e-5, "of a pixel: the order in which samples are added up")
 
-STOPPED_WRONGLY = limit(1e-3, "probability of more renders beyond the error that they ended by, if it is below 5 %")
+STOPPED_WRONGLY = limit(1e-3, "probability of so many renders with a larger error than they ended by, if each has 5 %")
 PASSES_TIME = limit(1.03, "over one call of `mi.render`: each pass is traced again, and its samples are read again")
 
 # Efficiency ----------------------------------------------------------------------------------------------------
@@ -139,7 +140,7 @@ CAUSTICS = {
 }
 CHOSEN = {
     EQUAL_TIME_HAND: limit(1.1, "of the best settings by hand: what a pilot of 5 % of the render can tell"),
-    EQUAL_TIME_DEFAULTS: limit(1.05, "of Mitsuba's defaults: who lets a pilot choose loses no more than it takes"),
+    EQUAL_TIME_DEFAULTS: limit(1.05, "of Mitsuba's defaults: a pilot that gains nothing costs its own 5 %"),
 }
 CHOSEN_MEDIAN = {EQUAL_TIME_DEFAULTS: limit(0.5, "of Mitsuba's defaults, in the median of the scenes")}
 PILOT_SHARE = limit(0.05, "of the render, but for compilation, and for renders that take less than a second")
@@ -158,10 +159,10 @@ SCALING = {
 }
 CHANGING = {
     "a new scene for each image": limit(
-        0.2, "of the built-in's: a record of 0.06, with Mitsuba's loading three times it"
+        0.2, "of the built-in's: recorded were 0.06, three times that with Mitsuba's loading"
     ),
-    "an edit among 300 glasses": limit(0.3, "of the built-in's: a record of 0.13; tracing 300 plugins is the same"),
-    "a sweep of 12 indices": limit(0.4, "of the built-in's: a record of 0.26, of images that take 10 ms"),
+    "an edit among 300 glasses": limit(0.3, "of the built-in's: recorded were 0.13; tracing 300 plugins is the same"),
+    "a sweep of 12 indices": limit(0.4, "of the built-in's: recorded were 0.26, for images that take 10 ms"),
 }
 
 # Planar --------------------------------------------------------------------------------------------------------
@@ -204,7 +205,7 @@ RAINBOW_BLUR = limit(1e-3, "degrees that pixels may move the edge of the rainbow
 
 # Robustness ----------------------------------------------------------------------------------------------------
 
-UNEXPLAINED = limit(0.05, "of the mutants of our code: no test notices them, and nothing explains why none could")
+UNEXPLAINED = limit(0.05, "of the mutants of our code: no test detects them, and no explanation is recorded")
 
 # Other renderers -----------------------------------------------------------------------------------------------
 

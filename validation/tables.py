@@ -31,7 +31,7 @@ from validation.ground_truth import standard_numbers
 from validation.planar import against_retrace
 from validation.planar import times as planar_times
 from validation.reference.standard_numbers import NUMBERS
-from validation.renders import against_dielectric, colours, gradients
+from validation.renders import against_dielectric, colours, gradients, thin_panes
 from validation.run import headline
 from validation.run import metrics as m
 from validation.run.array_settings import PLAIN
@@ -121,7 +121,7 @@ def _replay(rows: list[Row], template: str) -> str:
 
 
 def accuracy(rows: list[Row]) -> str:
-    """By formula the worst error over the regimes with a budget, misclassified rays and times, in float32 and float64.
+    """The worst error of each formula over the regimes with a budget, misclassified rays, times; float32 and float64.
 
     A row for each regime in which no formula has one, since denormal numbers are taken for 0: of the formula that
     misclassifies most.
@@ -169,7 +169,7 @@ def accuracy(rows: list[Row]) -> str:
 
 
 def on_a_gpu(rows: list[Row]) -> str | None:
-    """By formula the worst error over the regimes with a budget and the time, in float32 and float64 on CUDA."""
+    """The worst error of each formula over the regimes with a budget, and the time, in float32 and float64 on CUDA."""
     columns = [m.WORST_IN_U, m.MISCLASSIFIED, "ns per ray", m.TIME_OVER_COPY]
     found = {
         (row.subject, row.setting): row
@@ -200,8 +200,21 @@ def renders(rows: list[Row]) -> str:
     return _table(text, ["scene", *columns.values()], cells, "scenes were rendered")
 
 
+def panes(rows: list[Row]) -> str:
+    """How far the light of thin panes is off, by each method."""
+    mine = _measured(rows, thin_panes.NAME)
+    methods = dict.fromkeys(row.subject for row in mine)
+    by_case = {(row.case, row.subject): row for row in mine}
+    lines = [
+        [case, *(_cells(by_case.get((case, method)), [thin_panes.OFF])[0] for method in methods)]
+        for case in dict.fromkeys(row.case for row in mine)
+    ]
+    text = _replay(mine, "Deviation of the mean radiance from 1. {spp} spp, {setting}.")
+    return _table(text, ["pane", *(f"`{method}`" for method in methods)], lines, "panes were rendered")
+
+
 def derivatives(rows: list[Row]) -> str:
-    """By parameter and integrator whether the derivative is right, how far it is off, its time and its variance."""
+    """Whether each derivative is right, how far it is off, its time and variance, by parameter and integrator."""
     study, cells = gradients, {(row.case, row.subject): row for row in _measured(rows, gradients.NAME)}
 
     def cell(case: str, name: str) -> str:
@@ -242,7 +255,7 @@ def paths(rows: list[Row]) -> str:
 
 
 def efficiency(rows: list[Row]) -> str:
-    """By scene MSE × time of every method, over the built-in with the same sampler; and what all scenes say of it."""
+    """MSE × time of every method by scene, over the built-in with the same sampler; and what all scenes say of it."""
     mine = _measured(rows, error_against_time.NAME, [m.EQUAL_TIME, m.EQUAL_TIME_DEFAULTS])
     scenes: dict[str, dict[str, Row]] = {}
     for row in mine:
@@ -328,7 +341,7 @@ def caustics_from_lamps(rows: list[Row]) -> str:
 
 
 def caustics_by_others(rows: list[Row]) -> str:
-    """By renderer how far the energy of a caustic is off."""
+    """How far the energy of a caustic is off, by renderer."""
     study = caustic_energies
     mine = [row for row in rows if row.study == study.NAME]
     cases = [*dict.fromkeys(row.case for row in mine if row.values)]
@@ -351,7 +364,7 @@ def _percent(row: Row | None, metric: str, digits: int) -> str:
 
 
 def planar(rows: list[Row]) -> str:
-    """By scene the distance of paths from the retrace, and the time per path by the number of segments."""
+    """The distance of paths from the retrace by scene, and the time per path by the number of segments."""
     study, missing = against_retrace, "planar paths were traced on LLVM"
     by_case = {(row.case, row.setting): row for row in _measured(rows, study.NAME, subject=study.TRACE)}
     retraced = []
@@ -384,10 +397,10 @@ def planar(rows: list[Row]) -> str:
 
 
 def seen(rows: list[Row]) -> str:
-    """In how many trials each method of comparison saw each planted defect, and its false alarms."""
+    """The share of trials in which each method of comparison saw each planted defect, and its false alarms."""
 
     def percent(shares: list[float], digits: int = 0) -> str:
-        """Of several scenes: one number where they are the same, else the smallest and the largest."""
+        """The share of several scenes: one number where they are the same, else the smallest and the largest."""
         return "–".join(dict.fromkeys(f"{100 * x:.{digits}f}" for x in (min(shares), max(shares)))) + " %"
 
     def shares(method: str, trials: list[Row]) -> str:
@@ -476,6 +489,7 @@ TABLES = {
     "accuracy": Table("README.md", "directions", accuracy),
     "on a GPU": Table(f"{PAGES}/what-each-formula-costs.md", "directions", on_a_gpu),
     "renders": Table(f"{PAGES}/refract-and-dielectric.md", "renders", renders),
+    "panes": Table(f"{PAGES}/refract-and-dielectric.md", "renders", panes),
     "derivatives": Table(f"{PAGES}/which-derivatives-are-correct.md", "renders", derivatives),
     "paths": Table(f"{PAGES}/refract-and-dielectric.md", "stability", paths),
     "efficiency": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency", efficiency),

@@ -16,6 +16,8 @@ from collections.abc import Iterator
 from types import ModuleType
 from typing import Any
 
+import msgspec
+
 import mi_refract
 from mi_refract import media
 from mi_refract.image_diff import settings
@@ -72,9 +74,11 @@ def own(module: ModuleType) -> dict[str, Any]:
 def described(name: str, value: Any, module: ModuleType) -> str:
     """One name as a directive of Sphinx's Python domain."""
     if inspect.isclass(value) and value.__module__.startswith("mi_refract"):
-        members = [x for x in vars(value).items() if not x[0].startswith("_")]
-        below = [member(key, x) for key, x in members]
-        kind, text = "class", "\n\n".join([inspect.getdoc(value) or "", *filter(None, below)])
+        members = [x for x in vars(value).items() if x[0] == "__call__" or not x[0].startswith("_")]
+        parts = [inspect.getdoc(value) or "", *(member(key, x) for key, x in members)]
+        if issubclass(value, msgspec.Struct):  # a table that users write or read
+            parts.insert(1, key_table("key", value, value.__base__))
+        kind, text = "class", "\n\n".join(filter(None, parts))
     elif inspect.isroutine(value) or isinstance(value, functools._lru_cache_wrapper):
         kind, text = "function", inspect.getdoc(value) or ""
     else:
@@ -119,7 +123,7 @@ def signature(value: Any) -> str:
     """As it is called; nothing for what is not."""
     from sphinx.util.inspect import stringify_signature
 
-    if not callable(value) or (inspect.isclass(value) and issubclass(value, enum.Enum)):
+    if not callable(value) or (inspect.isclass(value) and issubclass(value, (enum.Enum, msgspec.Struct))):
         return ""
     try:
         found = inspect.signature(value)
@@ -222,7 +226,7 @@ def rays_keys() -> str:
 
 def diff_keys() -> str:
     """The keys of a settings file of `diff`, and the options of each method."""
-    return settings.key_tables().replace("<", r"\<")
+    return settings.key_tables()
 
 
 # Materials ------------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ The backward error, the least ε that takes n × w to 0, is the largest componen
 Near the critical angle it is small where the angle to the exact direction is not: there the last digit of an input
 moves the direction as far.
 
-Of a mirror direction k is 1, and n × w says little near grazing incidence, where b is nearly a. There b itself is
+For a mirror direction k is 1, and n × w says little near grazing incidence, where b is nearly a. There b itself is
 compared with m = a − 2 (n·a) n: δa moves m by up to ε in all directions, δn by 2ε in the plane of incidence and by
 2ε cos θ_i across it, so that
 
@@ -31,7 +31,7 @@ or |θ_i − asin(1/k)| / 2, where that is less: by turning a and n alone.
 The length of an answer has a backward error of its own. Its parts along the surface, e, and across it, √(1 − e²), may
 be those of different inputs, each within ε. Then e is off by ε (2 k cos θ_i + e) in either, so that
 
-    | |b|² − 1 | ≤ 4 ε e (2 k cos θ_i + e) ≤ 4 ε (2 k + 1)     with k = 1 of a mirror direction
+    | |b|² − 1 | ≤ 4 ε e (2 k cos θ_i + e) ≤ 4 ε (2 k + 1)     with k = 1 for a mirror direction
 
 Source: Higham, Accuracy and Stability of Numerical Algorithms, 2002, 1.5. In extended precision: n × w, of terms up to
 k, is off by 8·2⁻⁶⁴ k, and h ≥ k; b − m by as much, and h ≥ 1. So a backward error is right to 2⁻⁶¹, 2⁻⁸ u of float64.
@@ -62,10 +62,10 @@ def of_directions(b: Array, rays: Rays, reflected: NDArray[np.bool_] | None = No
     gamma = (n * w).sum(1)
     of_refracted = _least(np.cross(n, w), axis, (k * cosine, k), (gamma, gamma), k * lengths(axis))
     of_mirrored = _least(b - mirror, np.cross(axis, mirror), (one, one), (2 * one, 2 * cosine), 0 * one)
-    found = np.where(reflected, of_mirrored, of_refracted)
+    error = np.where(reflected, of_mirrored, of_refracted)
     onward = (n * b).sum(1) * np.sign(cosine) * np.where(reflected, -1, 1)
-    found = np.maximum(found, -onward.astype(float))  # on the wrong side: n must turn by so much
-    return np.where(np.isfinite(b).all(1), found, np.inf)
+    error = np.maximum(error, -onward.astype(float))  # on the wrong side: n must turn by so much
+    return np.where(np.isfinite(b).all(1), error, np.inf)
 
 
 def _least(defect: Array, axis: Array, ellipse: tuple[Array, Array], other: tuple[Array, Array], along: Array) -> Array:
@@ -78,12 +78,12 @@ def _least(defect: Array, axis: Array, ellipse: tuple[Array, Array], other: tupl
     part = np.where(size > 0, np.abs((defect * axis).sum(1)) / size, 0)
     across = np.sqrt(np.maximum((defect * defect).sum(1) - part * part, 0))
     x, y, a, b, c, d, segment = (np.abs(v).astype(float) for v in (part, across, *ellipse, *other, along))
-    found = np.zeros(len(x))
+    least = np.zeros(len(x))
     for turn in _TURNS:
         cos, sin = np.cos(turn), np.sin(turn)
         h = np.sqrt((a * cos) ** 2 + (b * sin) ** 2) + np.sqrt((c * cos) ** 2 + (d * sin) ** 2) + segment * cos
-        np.fmax(found, (x * cos + y * sin) / h, out=found)
-    return found
+        np.fmax(least, (x * cos + y * sin) / h, out=least)
+    return least
 
 
 @np.errstate(all="ignore")
@@ -94,8 +94,8 @@ def of_lengths(b: Array, rays: Rays, reflected: NDArray[np.bool_]) -> Array:
     """
     k, length = np.where(reflected, 1, rays.k.astype(np.longdouble)), lengths(b)
     off = np.fmin(np.abs(length**2 - 1), np.abs((length / lengths(rays.a)) ** 2 - 1))
-    found: Array = (off / (4 * (2 * k + 1))).astype(float)
-    return found
+    error: Array = (off / (4 * (2 * k + 1))).astype(float)
+    return error
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")

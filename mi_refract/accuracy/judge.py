@@ -157,14 +157,14 @@ class RayBounds:
 
     def decided_of(self, some: Flags) -> Flags:
         """`decided` of the rays in the mask, False elsewhere. (The radicand takes time.)"""
-        rays, found = self.rays[some], some.copy()
+        rays, above = self.rays[some], some.copy()
         if self.budget.at_the_limit:
             # A tangential ray at k = 1 has no terms, and NaN is not within anything.
-            found[some] = ~(relative_radicand(rays) <= NEGLIGIBLE * self.roundoff**2)
-            return found
+            above[some] = ~(relative_radicand(rays) <= NEGLIGIBLE * self.roundoff**2)
+            return above
         u = self.u[some]
-        found[some] = absolute_radicand(rays) > self.budget.radicand_error_bound(u, self.k[some])
-        decided: Flags = found & ~self.side_open
+        above[some] = absolute_radicand(rays) > self.budget.radicand_error_bound(u, self.k[some])
+        decided: Flags = above & ~self.side_open
         return decided
 
 
@@ -211,7 +211,7 @@ class Judgement:
 
     @property
     def crossed(self) -> Flags:
-        """On the other side of the surface, where the bound leaves the side open."""
+        """The rays whose answer is on the other side of the surface, where the bound leaves the side open."""
         exact = self.bounds.exact
         crossed: Flags = self.bounds.side_open & self.compared & exact.transmitted & (self.error > exact.cos_t)
         return crossed
@@ -251,11 +251,11 @@ def judge(
     known = ~exact.undecided & ~np.broadcast_to(blank, len(exact))
     misjudged = (transmitted != exact.transmitted) & known
     measure = errors_of_normalised if bounds.normalised else errors
-    found = measure(b, bounds.rays, exact)
+    measured = measure(b, bounds.rays, exact)
     return Judgement(
         bounds,
-        *found,
-        error=found.angle if bounds.normalised else found.chord,
+        *measured,
+        error=measured.angle if bounds.normalised else measured.chord,
         compared=~misjudged & known & directed,
         misjudged=misjudged,
         blank=np.broadcast_to(blank, len(exact)),

@@ -110,9 +110,9 @@ class Commands(TyperGroup):
         return list(COMMANDS)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """The command of that name; None where there is none."""
+        """The command of that name. ValueError where there is none."""
         if cmd_name not in COMMANDS:
-            return None
+            raise ValueError(f"unknown command {cmd_name!r}; expected {', '.join(COMMANDS)}")
         entry = COMMANDS[cmd_name]
         command = getattr(importlib.import_module(f".{entry.module}", __package__), entry.attribute)
         if not isinstance(command, typer.Typer):

@@ -136,9 +136,9 @@ def diff(
 
             results_file.write(results, reference_pack.origin(context.obj, pack), junit, json)
         if page:
-            from mi_refract.io.image_file import provenance
+            from mi_refract.io.image_file import versions
 
-            software = {key.rpartition(":")[2]: x for key, x in provenance().items() if ":" in key and x != "unknown"}
+            software = {name: version for name, version in versions().items() if version != "unknown"}
             page.write(results, software, results.command("diff", *(names or [])), str(json or ""))
     finally:  # a file that cannot be written hides no verdict
         text_reports.print_results(results)

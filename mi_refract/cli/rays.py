@@ -16,7 +16,7 @@ from rich.table import Table
 
 from mi_refract.formulas import TEXTBOOK_BACKWARD
 from mi_refract.io import reference_pack
-from mi_refract.io.image_file import provenance
+from mi_refract.io.image_file import versions
 from mi_refract.io.safe_files import writable
 from mi_refract.io.text import printable
 from mi_refract.ray_sets import files, ray_set
@@ -104,7 +104,10 @@ def export(
     wavelengths: Wavelengths = None,
     regimes: Regimes = False,
 ) -> None:
-    """Write rays for another program: incident directions, normals and indices of refraction."""
+    """Write rays for another program.
+
+    A ray has an incident direction, a normal, and the indices of refraction of the media that it leaves and enters.
+    """
     writable(output, files.SUFFIXES)
     rays = _made(regime, count, precision, seed, two_sided, medium, wavelengths)
     files.write(output, rays)
@@ -251,17 +254,17 @@ def _checker(
     def checked(rays: RaySet, answers: Answers, title: str, declared: str = "auto") -> Findings:
         print(printable(f"{title}: {_summary(rays)}"))
         signal = declared if tir == "auto" else tir
-        found = check_answers.check(rays, answers, tir=signal, error_bound=error_bound, most_backward=most_backward)
-        if table and found.regimes:
+        findings = check_answers.check(rays, answers, tir=signal, error_bound=error_bound, most_backward=most_backward)
+        if table and findings.regimes:
             # On a terminal, too: a wrapped line is easier to read than a squeezed column.
-            Console(width=UNWRAPPED).print(reports.table(found), highlight=False)
-        Console(width=COLUMNS).print(reports.summary(found), highlight=False)
-        return found
+            Console(width=UNWRAPPED).print(reports.table(findings), highlight=False)
+        Console(width=COLUMNS).print(reports.summary(findings), highlight=False)
+        return findings
 
     def write(checks: dict[str, Findings]) -> int:
         origin = reference_pack.origin(context.obj, pack)
         if report:
-            reports.write_html(report, checks, provenance(), origin.command)
+            reports.write_html(report, checks, versions(), origin.command)
         if junit:
             reports.write_junit(junit, checks)
         if json:

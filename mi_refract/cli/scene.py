@@ -19,7 +19,10 @@ app = typer.Typer(help="Write scenes for other renderers.", add_completion=False
 
 @app.command("list")
 def list_scenes() -> None:
-    """List the scenes of the package: those that `export` knows by their names, and files for `mi-refract trace`."""
+    """List the scenes of the package.
+
+    `export` knows the scenes of Mitsuba by these names; the others are files for `mi-refract trace`.
+    """
     print(printable(f"in {SCENES}:"))
     paths = [*sorted(SCENES.glob("*.xml")), *sorted(SCENES.glob("planar/*.toml"))]
     names = [path.stem if path.suffix == ".xml" else str(path.relative_to(SCENES)) for path in paths]
@@ -33,7 +36,8 @@ def list_scenes() -> None:
 def export(
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="A Mitsuba scene, or the name of one of `scene list`.")],
     to: Annotated[
-        str, typer.Option(metavar="TARGET", help="For cycles|luxcore|radiance|raysect|povray|mitsuba|obj+json|gltf.")
+        str,
+        typer.Option(metavar="TARGET", help="cycles, luxcore, radiance, raysect, povray, mitsuba, obj+json or gltf."),
     ],
     output: Annotated[
         Path | None,
@@ -47,7 +51,10 @@ def export(
         typer.Option("-D", metavar="NAME=VALUE", help="Replace the value of a <default>; may be repeated."),
     ] = None,
 ) -> None:
-    """Write a Mitsuba scene as triangles for another renderer, with a README.txt that says how to render it."""
+    """Write a Mitsuba scene for another renderer, as triangles.
+
+    A README.txt says how to render it.
+    """
     defines = scene_files.parse_defines(define or [])
     activate("scalar_rgb")
     from mi_refract.scene_export import from_mitsuba, targets

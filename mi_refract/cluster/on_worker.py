@@ -29,16 +29,16 @@ _renderer = ThreadPoolExecutor(1, "renderer")
 
 @functools.cache
 def facts(variant: str) -> dict[str, str]:
-    """Of this process, by name: versions that the bits depend on, and why the variant cannot run, "" where it can."""
+    """Facts of this process by name: versions that the bits depend on, and why the variant cannot run, or ""."""
     family = variant.partition("_")[0]
     here = backend.detect()[family]
-    found = {name: installed_version(name) for name in ("mitsuba", "drjit")}
-    found |= {"mi_refract": our_version(), "processor": platform.machine()}
-    found["Python"] = ".".join(platform.python_version_tuple()[:2])
-    found[UNUSABLE] = "" if here.usable else f"{variant}: {here.reason}"
+    by_name = {name: installed_version(name) for name in ("mitsuba", "drjit")}
+    by_name |= {"mi_refract": our_version(), "processor": platform.machine()}
+    by_name["Python"] = ".".join(platform.python_version_tuple()[:2])
+    by_name[UNUSABLE] = "" if here.usable else f"{variant}: {here.reason}"
     if family == "llvm" and here.usable:
-        found |= {LLVM: here.reason.removeprefix("libLLVM "), WIDTH: vector_width()}
-    return found | {HOST: platform.node()}
+        by_name |= {LLVM: here.reason.removeprefix("libLLVM "), WIDTH: vector_width()}
+    return by_name | {HOST: platform.node()}
 
 
 def vector_width() -> str:
@@ -57,10 +57,7 @@ def vector_width() -> str:
 
 @functools.cache
 def our_version() -> str:
-    """With a short digest of the package's source and of its glasses: between two releases the version stays the same.
-
-    Of the names and contents of files.
-    """
+    """The version and a short digest of the package's source and glasses, which change between two releases."""
     package, digest = Path(__file__).parents[1], hashlib.sha256()
     for path in sorted({*package.rglob("*.py"), *package.rglob("*.json")}):
         digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
@@ -68,7 +65,7 @@ def our_version() -> str:
 
 
 def differences(there: Mapping[str, str], here: Mapping[str, str], tolerated: Collection[str] = ()) -> list[str]:
-    """In words, what a worker has that we have not, but for the names in `tolerated`."""
+    """What a worker has that we have not, in words, but for the names in `tolerated`."""
     if there.get(UNUSABLE):
         return [there[UNUSABLE]]
     names = [name for name in here if name not in (HOST, UNUSABLE, *tolerated)]

@@ -26,7 +26,7 @@ _QUESTION = "__import__({!r}, fromlist=['facts']).facts({!r})"
 
 
 class Workers:
-    """Of a client's scheduler. `usable`: threads by the addresses of those that are there and may have work.
+    """The workers of a client's scheduler. `usable`: threads by address, of those that may have work.
 
     `refused`: why, by address; `machines`: the names of all that ever were usable.
     """
@@ -117,7 +117,7 @@ class Workers:
 
 
 def finished(client: Client, futures: Sequence[Future]) -> list[Future]:
-    """Those of the futures that are done, after waiting a little for one. Errors: those of `cluster_errors`."""
+    """The futures that are done, after a short wait for one. Errors: those of `cluster_errors`."""
     from distributed import wait
 
     with contextlib.suppress(TimeoutError), cluster_errors(client), client.as_current():
@@ -145,7 +145,7 @@ def fetched(client: Client, future: Future) -> tuple[Any, ...]:
 def results(
     workers: Workers, function: Callable[..., Any], calls: Iterable[tuple[Any, ...]]
 ) -> Iterator[tuple[int, Any, str]]:
-    """Of every `function(*call)` its number from 0, its result and the worker's machine, in the order of their ends.
+    """Number (from 0), result and worker's machine of every `function(*call)`, in the order in which they end.
 
     `calls` is asked for the next one as soon as a worker has room. A call whose worker is lost is made again by another
     one. The errors of a call pass as they are; ConnectionError, one line, where the scheduler or all workers have gone,

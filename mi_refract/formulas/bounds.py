@@ -128,4 +128,4 @@ CONTRASTING = Budget(10, 8, 1, side=SIDE)
 #   directions  (k + |q| + 1 + e + e (ΔR/2 + 2√R (k c + |q| + 1))) / (k c + |q| + e)   7.8 at most
 #   decisions   ΔR / (2 (2k c + 1)), at e = 1                                          5.8
 #   lengths     (ΔR + 2 (k + |q| + 1 + e)) / (4 (2k + 1))                              3.4
-TEXTBOOK_BACKWARD = 8.0
+TEXTBOOK_BACKWARD = 8.0  # the largest backward error, in u, that rounding leaves of `decomposed` for k up to 2.5

@@ -146,7 +146,7 @@ def _with_slope(reflected: Number, through: Number, r: Number, t: Number, whole:
 def refracted_cosine(cos_i: Number, k: Number, contrast: Number = None) -> tuple[Any, Any]:
     """(|cos θ_t|, transmitted): √|cos²θ_t|, cos²θ_t = k² cos²θ_i − κ, which is positive where the ray is transmitted.
 
-    Under total internal reflection the cosine is imaginary; its modulus is returned. 0 ≤ cos_i ≤ 1. Of the exact
+    Under total internal reflection the cosine is imaginary; its modulus is returned. 0 ≤ cos_i ≤ 1. For the exact
     cos_i and k (or κ) both are right to the last bit, however near to the critical angle.
     """
     radicand, _ = _differences(cos_i, k, contrast)
@@ -247,7 +247,7 @@ def _root(radicand: DoubleWord) -> Any:
 
 
 def _mueller(s2: Number, p2: Number, cross: tuple[Number, Number]) -> list[list[Number]]:
-    """From the powers of both waves and their interference a_p a_s*."""
+    """The Mueller matrix of the powers of both waves and their interference a_p a_s*."""
     mean, half, re, im = 0.5 * (s2 + p2), 0.5 * (s2 - p2), cross[0], cross[1]
     return [[mean, half, 0, 0], [half, mean, 0, 0], [0, 0, re, -im], [0, 0, im, re]]
 

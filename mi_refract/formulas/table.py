@@ -21,15 +21,17 @@ from .well_conditioned import LocalCosines, Refracted, refract_compensated, refr
 #                is off by more than 0.863u in all.
 #   decomposed   k n·a − s √… loses the root where it is below ulp(k)/2: b may be 0 at normal incidence from 2²⁴ on.
 # and k², κ and Fresnel's terms are within the range of numbers.
-SMALLEST_RATIO, LARGEST_RATIO = 2.0**-20, 2.0**20
+SMALLEST_RATIO = 2.0**-20  # the least k that a formula takes
+LARGEST_RATIO = 2.0**20  # the largest k that a formula takes
 
 
 @dataclass(frozen=True)
 class Formula:
     """A formula of refraction, `entry(a, n, k) -> (b, transmitted)`, with its source and its error budget.
 
-    `takes_contrast`, `takes_local`: these arguments are used, not ignored. `scales`: the function wants lengths near 1.
-    `time_goal`: what a ray in float32, streamed through a CPU, may take as a multiple of the plain form's time.
+    `source`: document and equation. `takes_contrast`, `takes_local`: these arguments are used, not ignored. `scales`:
+    `function` needs lengths near 1. `time_goal`: the largest time of a ray in float32, streamed through a CPU, over
+    that of the plain form.
     """
 
     function: Callable[..., Refracted]
@@ -42,9 +44,11 @@ class Formula:
     time_goal: float | None = None
 
     def __call__(self, a: Vector3, n: Vector3, k: Number, contrast: Number = None) -> Refracted:
-        """The formula as a total function: NaN and False for invalid input.
+        """The refracted directions b (3,) of rays `a` (3,) at normals `n` (3,), and a mask: which are transmitted.
 
-        That is: `a` or `n` zero or not finite, `k` outside 2⁻²⁰ … 2²⁰, `contrast` not finite or not above −1.
+        Dr.Jit arrays of one backend and precision; `k` = n_from / n_to may be a number. `contrast`: κ = k² − 1 where it
+        is known better than k. NaN and False for invalid input, without an error: `a` or `n` zero or not finite, `k`
+        outside 2⁻²⁰ … 2²⁰, `contrast` not finite or not above −1.
         """
         n, k = type(a)(n), as_component(a, k)
         scale: Any = 1
@@ -64,11 +68,12 @@ class Formula:
     ) -> Refracted:
         """The formula alone. Precondition: what `__call__` tests; NaN gives NaN and False.
 
-        `local`: the cosines of a float32 ray, where `n` is the literal z axis and somebody needs them anyhow.
+        `local`: the cosines of a float32 ray, where `n` is the literal z axis and the caller has them.
         """
         return self.function(a, n, k, *(contrast, local)[: self.takes_contrast + self.takes_local])
 
 
+# Every formula by its name.
 FORMULAS = {
     "wedge": Formula(refract_wedge, "000, boxed", "b = k n(n∧a) + s n √(a² + k²(n∧a)²)", budget=cancelling(1)),
     "wedge_contrast": Formula(
@@ -103,8 +108,8 @@ FORMULAS = {
 }
 
 
-# The cheapest formula at the rounding limit in a local frame, where the normal is a literal axis: of what it computes
-# in float64 Fresnel's equations need all anyhow, so it is the cheapest on GPUs with slow float64, too.
+# The formula that "auto" means: the cheapest at the rounding limit where the normal is a literal axis. Fresnel's
+# equations need its float64 numbers anyway, so that holds on GPUs with slow float64, too.
 AUTOMATIC = "promoted"
 
 

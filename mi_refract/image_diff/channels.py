@@ -46,7 +46,7 @@ Names = tuple[tuple[str, str], ...]  # of the reference and of the test
 
 
 def spreads(channels: Sequence[str]) -> dict[str, tuple[str, bool]]:
-    """Of every channel that has one: the name of the channel of its variance (False) or second moment (True).
+    """The channel with the variance (False) or the second moment (True) of each channel that has one.
 
     `moment` puts "m2_" before the name of one integrator: of "img.nested.X" the squares are m2_img.nested.X,
     img.m2_nested.X or img.nested.m2_X.
@@ -115,7 +115,7 @@ def chosen(images: Sequence[Image], names: Names, side: int) -> list[Image]:
 
 
 def matched(reference: Image, test: Image) -> tuple[Image, Image]:
-    """Both with the same channels as far as Mitsuba's layouts say, apart from those of variance.
+    """Both images with the same channels as far as Mitsuba's layouts say, apart from those of variance.
 
     What `moment` holds as "nested.X", "nested.Y", "nested.Z" with its squares takes the place of the film's colours, if
     these repeat it, as X, Y, Z; whatever the nested integrator is called. They are compared with the colours of a film
@@ -184,7 +184,7 @@ class Estimate:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Of every channel, whether its variance is known."""
+        """Whether the variance of each channel is known."""
         return np.asarray(np.isfinite(self.variance).all((0, 1)))
 
 

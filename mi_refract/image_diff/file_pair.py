@@ -1,6 +1,6 @@
 """Comparing a new image with one reference: two files, or two folders of renders, with what the settings say of them.
 
-Of files with several images every part and MIP level is compared with the one of the same number. The verdict is the
+In files with several images each part and MIP level is compared with the one of the same number. The verdict is the
 worst of them, with the place of the image that it is about. A part or level that only one of the files has is a
 difference. What a mask leaves out is 0 in both images before a method sees them, and shares of pixels are of those that
 count.

@@ -139,7 +139,7 @@ def choice(reference: Sequence[Image], test: Sequence[Image], *, spp: bool = Fal
         (one,), (two,) = (reference, test) if known[0] else (test, reference)
         name, other = ("reference", "new image") if known[0] else ("new image", "reference")
         if not one.variances and channels.SPP in one.metadata and not spp and channels.SPP not in two.metadata:
-            return "tolerance", f"of the {other} neither variance nor samples per pixel are known"
+            return "tolerance", f"the {other} has neither a variance nor samples per pixel"
         return "welch", f"the variance of the {name} is known"
     return "tolerance", ""
 
@@ -239,7 +239,7 @@ def _compare(
 
 
 def _finite_pair(reference: Image, test: Image) -> tuple[Image, Image]:
-    """Both with the channels in the reference's order, and 0 for what is not finite."""
+    """Both images with the channels in the reference's order, and 0 for what is not finite."""
     a, b = (finite(pixels) for pixels in aligned(reference, test))
     return replace(reference, pixels=a), replace(test, pixels=b, channels=reference.channels)
 
@@ -257,22 +257,22 @@ def _of_finite(method: str, a: Image, b: Image, options: Options) -> Comparison:
         one, two = only(a, names), only(b, names)
         how = options if by == method else {}
         if result and np.array_equal(one.pixels, two.pixels):
-            found = Comparison(by, Verdict.EQUAL, "identical")
+            comparison = Comparison(by, Verdict.EQUAL, "identical")
         else:
-            found = METHODS[by].function(one, two, **how)
-        if found.is_equal and (doubt := blind_to(METHODS[by], one, two, how)):
-            found = found.but(Verdict.INCONCLUSIVE, doubt)
+            comparison = METHODS[by].function(one, two, **how)
+        if comparison.is_equal and (doubt := blind_to(METHODS[by], one, two, how)):
+            comparison = comparison.but(Verdict.INCONCLUSIVE, doubt)
         if result is None:
-            result = found
+            result = comparison
             continue
         listed = ", ".join(names)
-        bounded = (replace(each, name=f"{each.name}, in {listed}") for each in found.metrics if each.bound is not None)
+        bounded = (replace(x, name=f"{x.name}, in {listed}") for x in comparison.metrics if x.bound is not None)
         result = replace(
             result,
-            verdict=min(result.verdict, found.verdict, key=[*Verdict].index),
-            reason=f"{result.reason}; by {by} {listed}: {found.reason}",
+            verdict=min(result.verdict, comparison.verdict, key=[*Verdict].index),
+            reason=f"{result.reason}; by {by} {listed}: {comparison.reason}",
             metrics=(*result.metrics, *bounded),
-            maps=result.maps | {f"{name} of {listed}": values for name, values in found.maps.items() if name == by},
+            maps=result.maps | {f"{name} of {listed}": x for name, x in comparison.maps.items() if name == by},
         )
     assert result is not None  # an image has channels
     return result

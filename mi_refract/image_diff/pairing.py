@@ -61,32 +61,32 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
         if nothing:
             raise ValueError(f"{folder}: contains no image; expected at least one")
     if settings.maps:
-        found = _mapped(old, new, settings.maps)
+        results = _mapped(old, new, settings.maps)
     else:
-        found = [_pair(name, old.get(name), new.get(name), Path(name)) for name in sorted(old | new)]
-    found = [replace(pair, how=how_of(settings, pair.name, pair.target)) for pair in found]
-    found = [replace(pair, target=reference / pair.target) for pair in found]
+        results = [_pair(name, old.get(name), new.get(name), Path(name)) for name in sorted(old | new)]
+    results = [replace(pair, how=how_of(settings, pair.name, pair.target)) for pair in results]
+    results = [replace(pair, target=reference / pair.target) for pair in results]
     own: set[Path] = set()  # masks and variances that the settings name for a pair: they are no images to compare
-    for pair in found:
+    for pair in results:
         sides = [(path, root) for path, root in ((pair.reference, reference), (pair.test, test)) if path]
         files = {mask} if (mask := _mask_of(pair, reference)) else set()
         if pair.how.reads_variance:
             files |= {beside(pair.how.variance, path, root, pair.how.above) for path, root in sides}
         own |= files - {pair.reference, pair.test}
-    found = [pair for pair in found if not {pair.reference, pair.test} - {None} <= own]
+    results = [pair for pair in results if not {pair.reference, pair.test} - {None} <= own]
     # A reference that is a variant, and has no new image, is not one that was removed. In a tree of both no image is
     # its own reference.
-    with_new, tests = {pair.target for pair in found if pair.test}, {realpath(x.test) for x in found if x.test}
+    with_new, tests = {pair.target for pair in results if pair.test}, {realpath(x.test) for x in results if x.test}
     others = [path for path in old.values() if path not in own | with_new and realpath(path) not in tests]
-    found = [_with_variants(pair, others) for pair in found]
-    taken = {path for pair in found for path in pair.variants}
-    found = [pair for pair in found if pair.test or pair.target not in taken]
-    if not found and not lost and not missed:
+    results = [_with_variants(pair, others) for pair in results]
+    taken = {path for pair in results for path in pair.variants}
+    results = [pair for pair in results if pair.test or pair.target not in taken]
+    if not results and not lost and not missed:
         raise ValueError(f"defaults.map fits no image in {reference} and {test}; expected templates of their paths")
     unread = (_pair(name, None, None, reference / name, error) for name, error in lost + missed)
-    found += [replace(pair, how=settings.of(pair.name)) for pair in unread]
+    results += [replace(pair, how=settings.of(pair.name)) for pair in unread]
     skipped = (_pair(name, None, None, reference / name) for name in sorted({*concealed, *hidden}))
-    return [*found, *(replace(pair, how=HIDDEN) for pair in skipped)]
+    return [*results, *(replace(pair, how=HIDDEN) for pair in skipped)]
 
 
 def _pair(name: str, reference: Path | None, test: Path | None, target: Path, error: str = "") -> Result:
@@ -191,7 +191,7 @@ def _with_variants(pair: Result, others: Sequence[Path]) -> Result:
 
 
 def _matched(pair: Result, template: str, paths: Sequence[Path]) -> list[Path]:
-    """Those of the paths that a template of `accept` means for the reference of a pair, by their names."""
+    """The paths that a template of `accept` means for the reference of a pair, by their names."""
     names = {path.relative_to(pair.target.parent).as_posix(): path for path in paths}
     values = {**name_patterns.fields(pair.target.name), **pair.how.fields}
     return [names[name] for name in name_patterns.expanded(template, values, sorted(names))]

@@ -64,7 +64,7 @@ NEAR = tuple((y, x) for y in range(RADIUS + 1) for x in range(-RADIUS, RADIUS + 
 
 @dataclass(frozen=True, order=True)
 class Inflation:
-    """By how much tile means vary more than with independent pixels, at least 1: those of a wide filter correlate.
+    """How much more tile means vary than with independent pixels, at least 1: those of a wide filter correlate.
 
     `freedom`: degrees of freedom of that estimate. Few tiles make it a guess, which t-tests have to know.
     """
@@ -74,7 +74,7 @@ class Inflation:
 
 
 def inflation(difference: Array, variance: Array, tile: int) -> Inflation:
-    """Of the difference of two images and its variance, both H × W × C; 1 for images of less than 12 pixels a side.
+    """F from the difference of two images and its variance, both H × W × C; 1 below 12 pixels a side.
 
     Its degrees of freedom are the number of squares of 2 RADIUS + 1 pixels with noise, whose means would show F, too.
     """
@@ -100,7 +100,7 @@ def inflation(difference: Array, variance: Array, tile: int) -> Inflation:
 
 
 def _apart(values: Array, y: int, x: int) -> tuple[Array, Array]:
-    """Of all pairs of pixels that are y rows and x columns apart, the first and the second; H × W × C."""
+    """The first and the second of all pairs of pixels that are y rows and x columns apart; H × W × C."""
     height, width = values.shape[:2]
     return values[: height - y, max(-x, 0) : width - max(x, 0)], values[y:, max(x, 0) : width - max(-x, 0)]
 

@@ -55,7 +55,7 @@ def _difference(a: Pixels, b: Pixels) -> Pixels:
 
 @dataclass(frozen=True)
 class Changes:
-    """Of two arrays: the share of changed pixels, the largest change, the RMS change, the ratio of the means."""
+    """The share of changed pixels, the largest change, the RMS change and the ratio of the means of two arrays."""
 
     share: float
     largest: float
@@ -103,7 +103,7 @@ def paired(
         Metric("RMS change", measured.rms),
         Metric("ratio of the means", _mean_ratio(a, b)),
     )
-    reason = f"{share:.3%} of the pixels are changed, the largest by {measured.largest:.3g} of its value"
+    reason = f"{compact(100 * share)} % of the pixels are changed, the largest by {measured.largest:.3g} of its value"
     return Comparison("paired", verdict_of(metrics), reason, metrics, maps={"difference": _difference(a, b)})
 
 

@@ -91,7 +91,7 @@ class Result:
 
     @property
     def order(self) -> tuple[float | str, ...]:
-        """By status, then the worst first; of equally many times a bound the larger number, then by name and target."""
+        """The key to sort by: status, then the worst first, then name and target."""
         lone = None in (self.reference, self.test)
         times, metric = self.worst if self.status in FAILED else (0.0, None)
         value = metric.value if metric and not math.isnan(metric.value) else math.inf if metric else 0.0

@@ -3,8 +3,8 @@
 A method for single images compares two renders with the same random numbers, one of them with a defect. A method for
 several renders compares clean renders with defective ones of other seeds. A defect is seen where the method calls the
 images different, or refuses to compare them; "inconclusive" counts as not seen. There is one row for each defect: the
-share of trials in which each method saw it. Of a file that cannot be read there is no such share: that is an error
-before any method is asked. Equal pairs have other seeds for a method that takes several renders, and other last bits
+share of trials in which each method saw it. A file that cannot be read has no such share: that is an error before
+any method is asked. Equal pairs have other seeds for a method that takes several renders, and other last bits
 for one that does not; `exact` sees those, and is given the same image twice.
 
 The row fails where a method misses a defect that it must see. Every method must see values that are not finite, another
@@ -185,7 +185,7 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
 
 
 def sizes(changes: Pixels, clean: Pixels, tallies: dict[str, Tally]) -> dict[str, float]:
-    """Of the tile and channel where the change is largest relative to the noise there: the size of a defect.
+    """The size of a defect: figures of the tile and channel where the change is largest relative to the noise.
 
     The minimum detectable difference is printed for the median tile; in a noisier tile it is so much larger.
     """
@@ -292,7 +292,7 @@ def examine(renders: Pixels, case: str, trials: int = TRIALS, null_pairs: int = 
     repeats = ((renders[[i]], through_a_file(renders[i])[None]) for i in range(len(renders)))
     rows += false_alarms(nulls, repeats, case, setting, independent=False)
     if not half:
-        why = "of fewer than four renders the noise is not known"
+        why = f"welch needs {RENDERS} or more of one image, whose spread is their noise"
         return [*rows, Row(STUDY, "renders", case, setting, reason=why)]
     return [*rows, Row(STUDY, "renders", case, setting, {"noise": noise(renders)})]
 
@@ -317,7 +317,8 @@ def table(rows: Sequence[Row]) -> list[tuple[str, ...]]:
 
 def summary(rows: Sequence[Row]) -> list[str]:
     """Lines about the renders and the equal pairs, and what failed."""
-    others = [row for row in rows if row.values and row.subject not in DEFECTS]
-    lines = [f"{row.subject}: " + ", ".join(f"{name} {x:.3g}" for name, x in row.values.items()) for row in others]
+    others = {row.subject: row for row in rows if row.subject not in DEFECTS}
+    figures = {name: ", ".join(f"{key} {x:.3g}" for key, x in row.values.items()) for name, row in others.items()}
+    lines = [f"{name}: {figures[name] or row.reason}" for name, row in others.items()]
     broken = [f"{row.subject}: {', '.join(row.broken)}" for row in rows if row.verdict == "fail"]
     return [*lines, f"failed: {'; '.join(broken)}" if broken else "every defect that had to be seen was seen"]

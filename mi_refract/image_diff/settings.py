@@ -232,7 +232,7 @@ class Keys(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     ] = None
     channels: Annotated[
         list[Text] | dict[Text, Text] | None,
-        Meta(description="the channels to compare: names, or { <of the reference> = <of the new image>, … }"),
+        Meta(description='the channels to compare: names, or { "in the reference" = "in the new image", … }'),
     ] = None
 
     def __post_init__(self) -> None:
@@ -390,7 +390,8 @@ def _listed(value: Any) -> list[Any]:
 
 def key_tables() -> str:
     """The keys of a settings file, and the options of each method, in Markdown."""
-    parts = [key_table("`[defaults]`", DefaultsKeys), key_table("`[[image]]`", ImageKeys)]
+    parts = [key_table("`[defaults]` and `[[image]]`", Keys)]
+    parts += [key_table("`[defaults]` only", DefaultsKeys, Keys), key_table("`[[image]]` only", ImageKeys, Keys)]
     for name, method in METHODS.items():
         parts.append(f"`{name}`: {method.summary}")
         parts += [key_table("option", _struct(msgspec.Struct, name, name))] if method.options else []

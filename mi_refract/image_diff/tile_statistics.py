@@ -123,7 +123,7 @@ class OneSided:
     correlated: Inflation
 
     def p(self, level: Level, area: Array, tile: int) -> Array:
-        """Of no difference beyond the margin; 0 where the other side is not brighter.
+        """The p of no difference beyond the margin; 0 where the other side is not brighter.
 
         Where the noise is well known, a pixel may move the mean of a tile by SINGLE of its standard error at most: what
         bright pixels add beyond that may be rare light. If an event moves the mean by more than that, equal images have
@@ -209,7 +209,7 @@ def from_renders(
     counts = counts or (len(reference), len(test))
 
     def band(top: int) -> tuple[list[tuple[Array, Array, Array]], PixelSums]:
-        """Of a row of tiles: totals of the renders, of their mean's variances and of the squares; the sums of u."""
+        """Totals of a row of tiles: of the renders, their mean's variances and the squares; and the sums of u."""
         rows = [np.array([render[top : top + tile] for render in side], np.float64) for side in sides]
         with np.errstate(invalid="ignore", over="ignore"):
             variances = [x.var(0, ddof=1) / len(x) for x in rows]
@@ -275,7 +275,7 @@ class Level:
             return (self.reach(threshold) + self.allowed) / self.mean
 
     def reach(self, threshold: float) -> Array:
-        """By how much the differences that are seen exceed the margin; NaN without light or noise."""
+        """How much the differences that are seen exceed the margin; NaN without light or noise."""
         from scipy import special
 
         noisy = ~self.silent & self.lit
@@ -396,7 +396,7 @@ class TileTests:
 
     @cached_property
     def _flags(self) -> list[dict[str, Flags]]:
-        """Of each level, the tests that differ, by the fields of `Alarms`."""
+        """The tests of each level that differ, by the fields of `Alarms`."""
         none = 1.0  # the p of what is not tested
         flags = []
         for level in self.levels:

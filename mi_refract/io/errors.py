@@ -105,7 +105,7 @@ def describe(error: BaseException) -> str:
     elif isinstance(error, MemoryError):
         text = f"out of memory{f': {error}' if str(error) else ''}"
     elif isinstance(error, ModuleNotFoundError) and error.name in ("mitsuba", "drjit"):
-        text = f"{error}; only images are compared without it: pip install mi-refract"
+        text = f"{error}; only commands that compare images work without it: pip install mi-refract"
     elif isinstance(error, ValueError | OSError | ImportError) and str(error):
         text = str(error)
     else:

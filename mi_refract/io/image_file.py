@@ -156,25 +156,25 @@ def read_parts(
             except ImageError as error:
                 raise ImageError(str(error).replace(str(copy), str(path))) from None
     source, kind = _checked(path, max_values)
-    found: list[Image] = []
+    images: list[Image] = []
     taken = 0
     try:
         besides = image_headers.hidden_metadata(path)
         for part in _parts(source):
-            found.append(_image(path, source, kind, part, (max_values, taken), besides))
-            taken += found[-1].pixels.size
+            images.append(_image(path, source, kind, part, (max_values, taken), besides))
+            taken += images[-1].pixels.size
             if first_only:
                 break
-        if not found:
+        if not images:
             raise ImageError(f"{path}: corrupt {kind} file: {_without(path, source.geterror()) or 'no image'}")
-        several = found[-1].part[0] > 0 or (first_only and source.seek_subimage(1, 0))
-        levelled = {image.part[0] for image in found if image.part[1]}
+        several = images[-1].part[0] > 0 or (first_only and source.seek_subimage(1, 0))
+        levelled = {image.part[0] for image in images if image.part[1]}
         levelled |= {0} if first_only and source.seek_subimage(0, 1) else set()
-        for number, image in enumerate(found):
+        for number, image in enumerate(images):
             words = [f"part {image.part[0]}"] * several
             words += [f"MIP level {image.part[1]}"] * (image.part[0] in levelled)
-            found[number] = replace(image, place=", ".join(words))
-        return found
+            images[number] = replace(image, place=", ".join(words))
+        return images
     except MemoryError:
         raise ImageError(f"{path}: more pixels than fit in memory") from None
     finally:
@@ -264,7 +264,7 @@ def named(name: str, pixels: ArrayLike) -> Image:
 
 
 def _parts(source: ImageInput) -> Iterator[tuple[int, int]]:
-    """Each part and MIP level by number; the source is at it. Not counted first: some formats are decoded here."""
+    """Each part and MIP level by number; the source is at it. Counting first would decode some formats."""
     part = 0
     while source.seek_subimage(part, 0):
         level = 0
@@ -357,12 +357,18 @@ def one_line(text: str) -> str:
     return " ".join(text.split())
 
 
-def provenance() -> dict[str, str]:
-    """Header attributes: `Software`, and `mi_refract:version:NAME` for mi_refract, mitsuba and drjit."""
+def versions() -> dict[str, str]:
+    """The versions of mi_refract, mitsuba and drjit; "unknown" of one that is not installed."""
     from mi_refract import __version__
 
-    versions = {"mi_refract": __version__} | {name: installed_version(name) for name in ("mitsuba", "drjit")}
-    return {"Software": f"mi_refract {__version__}"} | {f"mi_refract:version:{n}": v for n, v in versions.items()}
+    return {"mi_refract": __version__} | {name: installed_version(name) for name in ("mitsuba", "drjit")}
+
+
+def provenance() -> dict[str, str]:
+    """Header attributes: `Software`, and `mi_refract:version:NAME` for each of `versions`."""
+    software = versions()
+    header = {f"mi_refract:version:{name}": version for name, version in software.items()}
+    return {"Software": f"mi_refract {software['mi_refract']}"} | header
 
 
 def installed_version(distribution: str) -> str:
@@ -390,8 +396,7 @@ def srgb_decode(code: Pixels) -> Pixels:
 def any_channel(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """`flags.any(-1)`, of few channels ten times as fast: NumPy takes long for many short reductions."""
     few = 0 < flags.shape[-1] <= FEW_CHANNELS
-    found: NDArray[np.bool_] = functools.reduce(np.logical_or, np.moveaxis(flags, -1, 0)) if few else np.any(flags, -1)
-    return found
+    return np.asarray(functools.reduce(np.logical_or, np.moveaxis(flags, -1, 0)) if few else flags.any(-1))
 
 
 def block_sum(pixels: Pixels, side: int) -> Pixels:

@@ -75,11 +75,11 @@ def hidden_metadata(path: Path) -> dict[str, bytes | float]:
                 said.setdefault(name, []).append(value)
     for name in said.keys() & REFUSED.keys():
         raise ImageError(f"{path}: {REFUSED[name]}")
-    found: dict[str, bytes | float] = {name: b" ".join(values) for name, values in said.items()}
+    metadata: dict[str, bytes | float] = {name: b" ".join(values) for name, values in said.items()}
     with contextlib.suppress(KeyError, ValueError, ZeroDivisionError):
-        found["PixelAspectRatio"] = 1 / float(found["hdr:PIXASPECT"])  # there it is height over width
-        del found["hdr:PIXASPECT"]
-    return found
+        metadata["PixelAspectRatio"] = 1 / float(metadata["hdr:PIXASPECT"])  # there it is height over width
+        del metadata["hdr:PIXASPECT"]
+    return metadata
 
 
 # Each of these gives names and values. `size`: of the file, which no value exceeds.

@@ -69,7 +69,7 @@ class Origin(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def origin(words: Sequence[str], pack: PackReference | None) -> Origin:
-    """Of what this version of `mi-refract` writes, called with these words."""
+    """The origin of what this version of `mi-refract` writes, called with these words."""
     return Origin(version=__version__, command=shlex.join(["mi-refract", *words]), pack=pack)
 
 

@@ -306,11 +306,11 @@ def opened(path: str | os.PathLike[str], most: int) -> Iterator[BufferedReader]:
     """
     # A pipe without a writer would block when it is opened.
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0))) as file:
-        found = os.fstat(file.fileno())
-        if not stat.S_ISREG(found.st_mode):
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
             raise ValueError(f"{path}: not a regular file")
-        if found.st_size > most:
-            raise ValueError(f"{path}: {found.st_size} bytes; expected up to {most}")
+        if status.st_size > most:
+            raise ValueError(f"{path}: {status.st_size} bytes; expected up to {most}")
         yield file
 
 

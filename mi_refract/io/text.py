@@ -77,7 +77,7 @@ def compact(value: float, digits: int = 3) -> str:
 
 
 def distinguishable(value: float, budget: float) -> tuple[str, str]:
-    """Both as text, with as many digits as it takes to tell them apart when they differ."""
+    """Both numbers as text, with as many digits as it takes to tell them apart when they differ."""
     for digits in range(3, 18):
         texts = compact(value, digits), compact(budget, digits)
         if texts[0] != texts[1] or value == budget:
@@ -86,6 +86,6 @@ def distinguishable(value: float, budget: float) -> tuple[str, str]:
 
 
 def beside_bound(value: float, bound: float) -> tuple[str, str]:
-    """Both as text, told apart, the bound with how the value compares: NaN is neither above nor below."""
+    """Both numbers as text, told apart, the bound with how the value compares: NaN is neither above nor below."""
     text, limit = distinguishable(value, bound)
     return text, f"{'≤' if value <= bound else '>' if value > bound else '≰'} {limit}"

@@ -7,6 +7,7 @@ Do not put a `pattern` for texts into a union with a list: msgspec 0.22 then fre
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import textwrap
@@ -85,12 +86,12 @@ def _names(kind: Any, value: Any, path: str) -> list[str]:
         if name and (tags := [each.tag for each in kinds if getattr(each, "tag_field", None) == name]):
             return tags
         if name:
-            found = [
+            types = [
                 field.type for each in _structs(kinds, value) for field in each.fields if field.encode_name == name
             ]
         else:
-            found = [each.item_type for each in kinds if hasattr(each, "item_type")]
-        kinds = [each for one in found for each in _alternatives(one)]
+            types = [each.item_type for each in kinds if hasattr(each, "item_type")]
+        kinds = [each for one in types for each in _alternatives(one)]
         if isinstance(value, dict):
             value = value.get(name)  # None of the dots that msgspec writes for a name that a user chose
         else:
@@ -107,7 +108,7 @@ def _alternatives(kind: Any) -> list[Any]:
 
 
 def _structs(kinds: list[Any], value: Any) -> list[Any]:
-    """Those of the types that describe this table."""
+    """The types that describe this table."""
     structs = [each for each in kinds if isinstance(each, msgspec.inspect.StructType) and isinstance(value, dict)]
     return [each for each in structs if each.tag_field is None or each.tag == value.get(each.tag_field)]
 
@@ -143,7 +144,8 @@ def _keys(kind: type[msgspec.Struct], shared: type[msgspec.Struct] = msgspec.Str
         schema = field.type.extra_json_schema or {} if described else {}
         bare = field.type.type if described else field.type
         value = list(field.default) if isinstance(field.default, tuple) else field.default
-        default = "" if value in (None, "", [], msgspec.NODEFAULT, msgspec.UNSET) else f"; default {value!r}"
+        unset = value in (None, "", [], msgspec.NODEFAULT, msgspec.UNSET)
+        default = "" if unset else f"; default {json.dumps(value).replace('Infinity', 'inf')}"
         keys.append((field.encode_name, _type_text(bare), f"{schema.get('description', '')}{default}"))
     return [key for key in keys if key not in _keys(shared)]
 
@@ -164,5 +166,5 @@ def _type_text(kind: Any) -> str:
         return f"list of {_type_text(kind.item_type)}"
     if name == "Tuple":
         return f"[{', '.join(_type_text(each) for each in kind.item_types)}]"
-    limits = [f"{sign} {value:g}" for key, sign in _LIMITS.items() if (value := getattr(kind, key, None)) is not None]
+    limits = [f"{sign} {value:.9g}" for key, sign in _LIMITS.items() if (value := getattr(kind, key, None)) is not None]
     return " ".join([_WORDS.get(name, "table"), ", ".join(limits)]).strip()

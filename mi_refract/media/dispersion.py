@@ -88,7 +88,7 @@ class Terms(Dispersion):
             return np.sqrt(total)
 
     def poles(self, c: Coefficients) -> dict[str, float]:
-        """Of resonances."""
+        """The wavelengths of the resonances, by name."""
         squares = {r: float(c[r] ** 2 if self.squared else c[r]) for _, r in self.resonances}
         return {name: math.sqrt(square) for name, square in squares.items() if square > 0}
 

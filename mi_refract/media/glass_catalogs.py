@@ -1,6 +1,6 @@
 """Optical glasses from the makers' catalogues: the file `glasses.json` here.
 
-Of each catalogue it names the document that the numbers were copied from, with its date. Of each glass it has [range,
+For each catalogue it names the document that the numbers were copied from, with its date; for each glass it has [range,
 fitted, coefficients]: both ranges in nm, the coefficients in the maker's order, for λ in µm. Indices are relative to
 air at the makers' conditions, 20 to 22 °C and 101325 Pa, dry.
 

@@ -80,7 +80,7 @@ def _csv(text: str) -> Medium:
     header = [cell.lower() for cell in rows[0]] if rows else []
     units = [(i, unit) for i, cell in enumerate(header) if (unit := UNIT.search(cell))]
     if len(units) != 1 or "n" not in header:
-        raise ValueError(f"header {','.join(header)!r}; expected nm or µm in one column's name, n, and k: 'nm,n,k'")
+        raise ValueError(f"header {','.join(header)!r}; expected nm or µm in one name, n, and optionally k: 'nm,n,k'")
     column, unit = units[0]
     factor = 1 if unit[1] else NANOMETRES
     expected = f"expected numbers in the columns {', '.join(header)}, with decimal points, and no more columns"
@@ -110,7 +110,7 @@ def _tabulated(kind: str, rows: Sequence[Sequence[float]]) -> Medium:
 
 
 def _refractiveindex_info(text: str) -> Medium:
-    """Formulas 1, 2, 3, 5 and 6 and tables; see "Dispersion formulas" there. Of several entries the first with n."""
+    """Formulas 1, 2, 3, 5 and 6 and tables; see "Dispersion formulas" there. The first entry with n counts."""
     try:
         import yaml
     except ModuleNotFoundError:
@@ -118,15 +118,15 @@ def _refractiveindex_info(text: str) -> Medium:
     try:
         page: Any = yaml.safe_load(text)
         entries = [(str(entry["type"]).split(), entry) for entry in page["DATA"]]
-        found = [_entry(kind, entry) for kind, entry in entries]
+        media = [_entry(kind, entry) for kind, entry in entries]
         said: dict[str, Any] = (page.get("SPECS") or {}) | (page.get("CONDITIONS") or {})
         absolute = said.get("n_is_absolute", said.get("n_absolute"))
     except (yaml.YAMLError, KeyError, TypeError, IndexError, AttributeError, ZeroDivisionError):
         raise ValueError("expected a page of refractiveindex.info, with DATA of one formula or table") from None
-    with_n = [medium for medium in found if medium.coefficients]
+    with_n = [medium for medium in media if medium.coefficients]
     if not with_n:
         raise ValueError("no index; expected a formula, or tabulated n")
-    k = next((medium.k for medium in found if medium.k), None)
+    k = next((medium.k for medium in media if medium.k), None)
     relative_to = "" if absolute is None else "vacuum" if absolute else "air"
     return replace(with_n[0], relative_to=relative_to, k=k)
 
@@ -161,17 +161,17 @@ def _resonances(power: int, first: float, pairs: Sequence[tuple[float, float]], 
 
 def _zemax(text: str, glass: str) -> Medium:
     """A glass of an AGF catalogue: of lines `NM name formula …`, `CD coefficients`, `LD shortest longest`, in µm."""
-    found: dict[str, dict[str, list[str]]] = {}
+    glasses: dict[str, dict[str, list[str]]] = {}
     lines: dict[str, list[str]] = {}
     for line in text.splitlines():
         key, *words = line.split() or [""]
         if key == "NM" and words:
-            lines = found.setdefault(words[0].lower(), {})
+            lines = glasses.setdefault(words[0].lower(), {})
         lines[key] = words
-    if glass.lower() not in found:
-        near = ", ".join(x.upper() for x in difflib.get_close_matches(glass.lower(), found, 3, 0.0))
+    if glass.lower() not in glasses:
+        near = ", ".join(x.upper() for x in difflib.get_close_matches(glass.lower(), glasses, 3, 0.0))
         raise ValueError(f"no glass {glass}; nearest: {near or 'none'}")
-    lines = found[glass.lower()]
+    lines = glasses[glass.lower()]
     try:
         number, c = int(float(lines["NM"][1])), [parse_number(x) for x in lines["CD"]]
         low, high = (NANOMETRES * parse_number(x) for x in lines["LD"][:2])

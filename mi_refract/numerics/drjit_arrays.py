@@ -57,7 +57,7 @@ Result = TypeVar("Result")
 
 # Dr.Jit's type stubs say that the first returns an object, and nothing of what the second returns.
 _reinterpret: Any = dr.reinterpret_array
-replace_grad: Any = dr.replace_grad
+replace_grad: Any = dr.replace_grad  # Dr.Jit's own, with a type
 
 ALIGNMENT = 64  # bytes, of what Dr.Jit reads in one go
 
@@ -120,7 +120,7 @@ def rounded_product(x: Number, y: Number) -> Number:
 
 
 def ieee_quotients(kind: ArrayType) -> contextlib.AbstractContextManager[None]:
-    """Within it, reciprocals, roots and derivatives of arrays like `kind` have the digits of float64 on CUDA, too.
+    """A context in which reciprocals, roots and derivatives of arrays like `kind` have the digits of float64 on CUDA.
 
     There Dr.Jit's `rcp`, and with it `rsqrt` and the derivatives of quotients and roots, otherwise has the 20 bits of
     one instruction.

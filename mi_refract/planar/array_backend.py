@@ -148,5 +148,5 @@ def choose_backend(name: str | None, precision: str) -> ArrayBackend:
 
 
 def negated(mask: Mask) -> Mask:
-    """Not `mask`: `~True` of a Python bool is −2."""
+    """The complement of `mask`: `~True` of a Python bool is −2."""
     return not mask if isinstance(mask, bool) else ~mask

@@ -336,7 +336,7 @@ def table(groups: Sequence[Group]) -> str:
         names.append((group.colour or "–", str(group.beam), bits or "–"))
     foci: list[Cells] = [("rays", "focus", "spot at", "rms", "largest", "marginal", "paraxial", "NA")]
     lengths = "focal length", "back focal length", "front focal length"
-    cardinals: list[Cells] = [(*lengths, "front principal point", "back one")]
+    cardinals: list[Cells] = [(*lengths, "front principal point", "back principal point")]
     spots: list[Cells] = [("on the plane at", "rms", "extent")]
     for s in (group.spread for group in groups):
         focus = _text(s.focus) + (" (virtual)" if s.virtual else "")

@@ -1,6 +1,6 @@
 """Where a ray in the plane meets directed segments and arcs of conics: first by signs, then by distances. No optics.
 
-Of a ray p + λd and a segment from A to B, f(V) = d × (V − p) says on which side of the ray a vertex V lies; 0 counts
+For a ray p + λd and a segment from A to B, f(V) = d × (V − p) says on which side of the ray a vertex V lies; 0 counts
 as its left. If A and B lie on different sides, the ray's line crosses the segment once, at μ = f(A)/(f(A) − f(B)) and
 
     λ = ((A − p) × (B − A)) / (d × (B − A))
@@ -64,7 +64,7 @@ class Ray:
 class Start:
     """The segment that a ray starts on: numbers of its vertices, the ways from p to them, their sides of the ray.
 
-    Of an arc also the way to its control point, s and r (up to a common factor) of where the ray's line meets it once
+    For an arc also the way to its control point, s and r (up to a common factor) of where the ray's line meets it once
     more, whether that is ahead, between the arc's ends, and as of a `Hit` the directions and `bend` from its vertices.
     """
 
@@ -142,7 +142,7 @@ class LineSegments:
         return dr.maximum(ray.s, least), dr.maximum(ray.r, least)
 
     def none(self) -> Hit:
-        """No crossing, at distance ∞."""
+        """The hit that stands for no crossing, at distance ∞."""
         number, nowhere, way = self.arrays.number, self.arrays.index(NOWHERE), self.arrays.vector(0)
         left = self.arrays.mask(False)
         return Hit(number(dr.inf), nowhere, number(0), number(0), left, nowhere, nowhere, way, way, number(0))

@@ -176,7 +176,7 @@ def summary(scene: PlanarScene, traced: Sequence[Branches]) -> str:
 
 def mismatches(scene: PlanarScene, traced: Sequence[Branches]) -> list[str]:
     """A line for each of the three pairs of shapes between which most paths ended with MEDIUM_MISMATCH."""
-    found: Counter[tuple[str, ...]] = Counter()
+    counts: Counter[tuple[str, ...]] = Counter()
     examples: dict[tuple[str, ...], str] = {}
     for segments, branches in zip(scene.segments, traced, strict=True):
         ends, last = np.flatnonzero(branches.end == Event.MEDIUM_MISMATCH), branches.last
@@ -185,13 +185,13 @@ def mismatches(scene: PlanarScene, traced: Sequence[Branches]) -> list[str]:
         met = np.stack([branches.paths.hits[ends, last[ends] - j] for j in (1, 0)], axis=1)  # none begins with one
         for (before, at), j, number in zip(*np.unique(met, axis=0, return_index=True, return_counts=True), strict=True):
             pair = tuple(sorted({scene.shape_names[before], scene.shape_names[at]}))
-            found[pair] += int(number)
+            counts[pair] += int(number)
             media = f"between {segments.n_left[at]:.6g} and {segments.n_right[at]:.6g}"
             examples.setdefault(pair, f"in index {indices[ends[j], last[ends[j]]]:.6g} met a boundary {media}")
     fault = "overlap, share part of an edge, leave a gap, or are turned round"
     return [
         f"{' and '.join(pair)} {fault}: {_plural(number, 'path')} {examples[pair]}"
-        for pair, number in found.most_common(3)
+        for pair, number in counts.most_common(3)
     ]
 
 

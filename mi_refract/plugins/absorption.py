@@ -55,7 +55,7 @@ def absorbed(sigma: Spectrum, length: Number) -> Spectrum:
 
 
 def read_absorption(plugin: str, props: Properties, side: str) -> Absorption | None:
-    """Of `int`, `ext` or `camera`; None where the scene does not say. ValueError with the parameter."""
+    """The absorption of `int`, `ext` or `camera`; None where the scene does not say. ValueError with the parameter."""
     sigma, colour, distance = f"{side}_absorption", f"{side}_colour", f"{side}_colour_distance"
     for known in (colour, distance):
         if (unknown := known.replace("colour", "color")) in props:
@@ -119,8 +119,8 @@ def _from_k(plugin: str, name: str, text: Any, unit: Any) -> Absorption:
     if not medium or not medium.k:
         raise ValueError(f"{label} = {text!r}; expected a number, a spectrum, or with {name}_unit a file with k")
     if isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < math.inf:
-        found = f"{name} = {text!r}: {name}_unit is missing" if unit is None else f"{name}_unit = {unit!r}"
-        raise ValueError(f"{plugin}: {found}; expected the scene's unit in metres: 0.001 for mm")
+        problem = f"{name} = {text!r}: {name}_unit is missing" if unit is None else f"{name}_unit = {unit!r}"
+        raise ValueError(f"{plugin}: {problem}; expected the scene's unit in metres: 0.001 for mm")
     knots, k = medium.k
     held = "has the absorption of the range's end"
     check_range(f"{label} = {text!r} has k", (knots[0], knots[-1]), medium.hold, held)

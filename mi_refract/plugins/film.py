@@ -138,5 +138,5 @@ def filter_weights(rfilter: Filter) -> Doubles:
 
     half = math.ceil(rfilter.radius() / STEP)
     places = (np.arange(-half, half) + 0.5) * STEP
-    found = rfilter.eval(mi.Float(places)) if dr.is_jit_v(mi.Float) else [rfilter.eval(place) for place in places]
-    return np.where(np.abs(places) <= rfilter.radius(), np.array(found, np.float64), 0)
+    weights = rfilter.eval(mi.Float(places)) if dr.is_jit_v(mi.Float) else [rfilter.eval(place) for place in places]
+    return np.where(np.abs(places) <= rfilter.radius(), np.array(weights, np.float64), 0)

@@ -30,7 +30,7 @@ from mi_refract.numerics import (
     replace_grad,
 )
 
-PLUGIN = "refract"
+PLUGIN = "refract"  # the name of the BSDF in Mitsuba
 DEFAULTS = {"int_ior": "bk7", "ext_ior": "air"}
 EXPECTED = "a positive finite number, or a material's name, a glass or formula (mi_refract.media), spectrum or texture"
 warned: set[str] = set()  # what `warn_once` has logged
@@ -208,8 +208,8 @@ def check_range(label: str, valid: tuple[float, float], hold: bool, held: str) -
         low = wavelengths[np.argmax(below.max(0) > LOST / 2)]  # half of it on either side
         high = wavelengths[np.argmax(below.min(0) >= 1 - LOST / 2)]
         raise ValueError(
-            f"{label}: {share} lies outside; expected at least {low:g} … {high:g} nm, or hold(…) around the text, by "
-            "which the values at its ends go on"
+            f"{label}: {share} lies outside; expected at least {low:g} … {high:g} nm, or hold(…) around the text, "
+            "which extends the values at its ends"
         )
     if lost:
         warn_once(f"{label}; other light ({share}) {held}")

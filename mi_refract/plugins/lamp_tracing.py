@@ -1,7 +1,7 @@
 """Light traced from the lamps, through glass and over mirrors, onto surfaces that the camera sees: caustics.
 
 A path from a lamp L to the camera E has vertices S, where the light takes a delta lobe (a null lobe is one), and D, any
-others. Of a render with `caustics` = `lamp` each class of paths belongs to one part:
+others. In a render with `caustics` = `lamp` each class of paths belongs to one part:
 
 | class (Heckbert's notation) | part | found by |
 |---|---|---|
@@ -75,8 +75,8 @@ LOBES = mi.BSDFFlags
 def refused_lamps(scene: Scene) -> str:
     """Why the lamps of a scene cannot be traced; "" where they can be."""
     lamps = [lamp for lamp in scene.emitters() if not lamp.is_environment()]
-    if found := {lamp.class_name() for lamp in lamps} - KINDS.keys():
-        return f"it traces area, point, spot and directional lamps, not {min(found)}"
+    if untraced := {lamp.class_name() for lamp in lamps} - KINDS.keys():
+        return f"it traces area, point, spot and directional lamps, not {min(untraced)}"
     shapes = [lamp.get_shape() for lamp in lamps if lamp.class_name() == "AreaLight"]
     if any(shape.is_mesh() and mitsuba_mesh.is_smooth(shape) for shape in shapes):
         return "the normals of an area lamp are not those of its faces"
@@ -90,7 +90,8 @@ def refused_lamps(scene: Scene) -> str:
         bsdf_name(bsdf) == "LinearRetarder" for shape in all_shapes(scene) for bsdf in nested(shape.bsdf())
     ):
         return "a retarder"
-    return ""
+    unbounded = (x.class_name() for x in scene.shapes() if not math.isfinite(bounding_sphere(x).radius))
+    return next((f"the bounds of a {name} are not known" for name in unbounded), "")
 
 
 def refused_sensor(sensor: Sensor) -> str:
@@ -166,16 +167,13 @@ def targets(scene: Scene) -> list[Sphere]:
 
 
 def bounding_sphere(shape: Shape) -> Sphere:
-    """About the middle of its bounding box."""
+    """About the middle of its bounding box; with an infinite radius, or NaN, where its bounds are not known."""
     box = shape.bbox()
     if shape.class_name() == "Mesh":  # the box of one that Mitsuba has merged from others leaves out rectangles
         vertices, _ = mitsuba_mesh.arrays(shape)
         box = mi.ScalarBoundingBox3f(*([*map(float, ends(0))] for ends in (vertices.min, vertices.max)))
     half = [float(x) / 2 for x in box.extents()]
     radius = half[0] if shape.class_name() == "Sphere" else math.hypot(*half)
-    if not math.isfinite(radius):
-        text = f"refract_path: caustics = lamp: the bounds of a {shape.class_name()} are not known"
-        raise ValueError(f"{text}; expected caustics = path")
     return Sphere(tuple(map(float, box.center())), radius * MARGIN)
 
 
@@ -477,7 +475,7 @@ class LampTracer:
         own = active_next & (s.depth > 0) & self._is_one_way(bsdf)
         if self.one_way if self.vectorised else own:
             weight = self._seen(si, bsdf, bs, weight, s.ray.d, numbers, key + 1, own)
-        ray = si.spawn_ray(si.to_world(bs.wo))
+        ray = loop.spawn_ray(si, bs)
         throughput = loop.times(weight, s.throughput)
         if features.dispersion:
             dispersed = (bs.sampled_type & DISPERSED) != 0

@@ -6,7 +6,7 @@ medium between them, or the camera is in a medium that was not declared. `Crossi
 
 A ray starts a little beside the surface that it left. Next to an edge where three media meet it may miss a boundary,
 and be in a medium that is not there: one in 30,000 in a tumbler of water. So few are no contradiction. A sheet that is
-thinner than that distance, 1e-4 of the largest coordinate, is refused: a path would never leave it.
+thinner than that distance (`ray_origins`) is refused: a path would never leave it.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ STRAY = 0.01  # of the crossings of a shape: more are a contradiction
 NEVER = 2**32 - 1  # as the number of a vertex
 FEW = 2  # crossings: of a shape with few of them, so many may be beside an edge, unless they are half of all
 # Of the distance from a surface to the origin of the next ray: a surface nearer to the first one than the rest is not
-# seen. The rounding of a point is a thousandth of that distance.
-SEARCHED = 1 - 1 / 64
+# seen. Rounding moves a point by up to an eighth of that distance (`ray_origins`).
+SEARCHED = 3 / 4
 # A null lobe is no boundary. What scatters on its way through is one as well.
 THROUGH = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DiffuseTransmission
 
@@ -95,7 +95,7 @@ class Crossings:
             if contradicts(crossed, stepped_over):
                 raise ValueError(
                     f"refract_path: {name} absorbs, and is so thin that rays miss one of its sides; expected a sheet "
-                    "thicker than 1e-4 of its largest coordinate: move the scene to the origin"
+                    "thicker than 1e-5 of its size and its largest coordinate: move the scene to the origin"
                 )
             if contradicts(crossed, wrong) and (worst is None or depth < first):
                 first, worst = depth, name
@@ -186,7 +186,7 @@ def absorbs_only(v: Variant, medium: MediumPlugin) -> bool:
 def check_integrator(scene: Scene) -> None:
     """ValueError where a BSDF absorbs and the scene's integrator is neither `refract_path` nor calls only that.
 
-    As with that integrator also for what `check_shapes` says.
+    Also for what `check_shapes` says.
     """
     check_shapes(scene)
 

@@ -15,6 +15,7 @@ In scalar variants a pointer may be None and needs an `if`; in the others lanes 
 from __future__ import annotations
 
 import functools
+import math
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass, make_dataclass
@@ -40,6 +41,7 @@ from mi_refract.numerics import (
     Vector3,
 )
 
+from . import ray_origins
 from .absorption import absorbed
 from .medium_tracking import MediumTracker, ShapeMedia
 from .refract import DISPERSED, followed_context
@@ -72,6 +74,7 @@ class PathFeatures:
     absorption: bool  # some medium absorbs
     null: bool  # a BSDF may have a null lobe
     caustics_apart: bool = False  # `lamp_tracing` adds its paths, which are left out here
+    delta_extent: float = math.inf  # of the largest shape with delta lobes; see `ray_origins`
 
     @property
     def roulette(self) -> bool:
@@ -377,6 +380,11 @@ class PathLoop:
         s.active = self._pop(s, active_next) if features.split_depth else active_next
         return (s,)
 
+    def spawn_ray(self, si: Interaction, bs: BSDFSample) -> Ray:
+        """The ray in the direction of a BSDF sample."""
+        delta = mi.has_flag(bs.sampled_type, LOBES.Delta) if self.features.second_number else True
+        return ray_origins.spawn_ray(self.v, si, si.to_world(bs.wo), self.features.delta_extent, delta)
+
     def _next(
         self, s: LoopState, si: Interaction, bsdf: BSDF, bs: BSDFSample, weight: Spectrum, active: Mask
     ) -> tuple[Ray, Spectrum, dict[str, Any]]:
@@ -384,7 +392,7 @@ class PathLoop:
         v = self.v
         if v.is_polarized:
             weight = si.to_world_mueller(weight, -bs.wo, si.wi)
-        ray = si.spawn_ray(si.to_world(bs.wo))
+        ray = self.spawn_ray(si, bs)
         if dr.grad_enabled(weight, ray.d):
             own_odds = self.is_of(self.own_odds, bsdf)
             weight, ray.d, bs.pdf = at_fixed_direction(v, self.context, si, bsdf, bs, weight, ray.d, active, own_odds)

@@ -412,7 +412,7 @@ def eval_pdf(self: Refract, ctx: Context, si: Interaction, wo: Vector3, active: 
 
 
 def has_attribute(self: Refract, name: str, active: Mask = True) -> Mask:
-    """Those that `traverse` shows, and absorption where there is any."""
+    """True for what `traverse` shows, and for absorption where there is any."""
     v = self.v
     return v.Bool(self.absorbing) if name in (HERE, BEYOND) else v.BSDF.has_attribute(self, name, active)
 

@@ -9,7 +9,7 @@
 | `split_depth` | integer | both lobes are followed at so many boundaries, counted from the camera (0) |
 | `split_weight` | number | a lobe whose share of the light would be smaller is not followed (0.01) |
 | `deterministic` | boolean | no lobe is chosen by chance; lobes with a share below `split_weight` are dropped (false) |
-| `caustics` | word | `path`, `lamp` or `auto`: how light through glass onto other surfaces is found (`path`) |
+| `caustics` | word | `path`, `lamp` or `auto`: how light through glass onto other surfaces is found (`auto`) |
 | `light_paths` | number | light paths for each sample of the camera, where lamps are traced (0.25) |
 | `camera_absorption` | number, spectrum | σ of the medium at the camera (0), as `int_absorption` of `refract` |
 | `camera_absorption_unit` | number | as `int_absorption_unit` of `refract` |
@@ -26,9 +26,12 @@ not at all where the lamp is a point, a spot or directional. `lamp` traces it fr
 camera sees directly, along `light_paths` paths for each sample of the camera (`lamp_tracing`). It pays where lamps are
 small; with lamps nearly as large as the scene error × time was up to 2.4 of that of `path`. It takes area, point, spot
 and directional lamps, and perspective, thin-lens and orthographic cameras. In scenes with media of Mitsuba's, in
-frozen functions, for derivatives and within another integrator it is an error, and `auto` means `path`: so with `auto`
-derivatives are those of the image by path tracing. What is missing is named in a warning, once a scene
-(`SceneFeatures.missing`).
+frozen functions, within another integrator and where a parameter of the scene is differentiated it is an error. `auto`
+means `lamp` where a lamp is a point, a spot or directional and lamps can be traced, else `path`: so derivatives are
+those of the image by path tracing. What is missing is named in a warning, once a scene (`SceneFeatures.missing`).
+
+Rays of delta lobes start nearer to the surface that they leave than those of `path` (`ray_origins`): glass may be as
+thin as 2e-6 of its size and its largest coordinate. A thinner shape is named in a warning (`SceneFeatures.thin`).
 
 Derivatives are attached: rays move with the index. Edges that move across a pixel, or in the view of a surface that is
 not smooth, are not in them. A render that is differentiated does not split.
@@ -50,9 +53,9 @@ from .index_parameter import warn_once
 from .medium_tracking import MediumTracker, ShapeMedia, check_media, extinction
 from .path_loop import PathFeatures, PathLoop
 from .sampling import KeyedMultijitter, SceneSampler, seeds_of
-from .scene_features import SceneFeatures, check_shapes, inspect
+from .scene_features import CAST, SceneFeatures, check_shapes, differentiated, inspect
 
-INTEGRATOR = "refract_path"
+INTEGRATOR = "refract_path"  # its name in Mitsuba
 MOST_PATHS = 4096  # that one sample may split into
 DEEPEST = 64  # split_depth: memory is set aside in every lane
 UNLIMITED = 2**32 - 1
@@ -77,7 +80,7 @@ def read_flag(props: Properties, name: str) -> bool:
 
 def read_caustics(props: Properties) -> tuple[str, float]:
     """`caustics` and `light_paths`. ValueError with what is expected."""
-    caustics, paths = props.get("caustics", "path"), props.get("light_paths", 0.25)
+    caustics, paths = props.get("caustics", "auto"), props.get("light_paths", 0.25)
     if caustics not in ("path", "lamp", "auto"):
         raise ValueError(f"{INTEGRATOR}: caustics = {caustics!r}; expected path, lamp or auto")
     if isinstance(paths, bool) or not isinstance(paths, (int, float)) or not 0 < paths <= 64:
@@ -106,7 +109,7 @@ def integrator_class(v: Variant) -> type:
     vectorised = dr.is_jit_v(v.Float)
 
     def to_camera(sensor: Sensor) -> Any:
-        """From the world to the camera, whose rays leave the plane z = 0; None where they start at the sensor."""
+        """The transform from world to camera, whose rays leave the plane z = 0; None where they start at the sensor."""
         return sensor.world_transform().inverse() if isinstance(sensor, v.ProjectiveCamera) else None
 
     class RefractPath(v.SamplingIntegrator):  # type: ignore[misc]
@@ -128,16 +131,17 @@ def integrator_class(v: Variant) -> type:
             self.near: Any = None  # `to_camera` of the sensor of this render
             self.apart = False  # lamps are traced in the scene rendered last
             self.unconnected = ""  # why that sensor's lamps cannot be traced
+            self.untraced = ""  # why no lamps were traced in the scene rendered last, though `caustics` = `auto`
             self.loops: list[PathLoop] = []  # of this render: one a pass; in scalar variants one in all
 
         def begin_render(self, sensor: Sensor) -> None:
-            """To be called before `sample` where `render` is not; else each sample inspects the scene anew."""
+            """Call this before `sample` where `render` is not called; else each sample inspects the scene anew."""
             self.loops, self.rendering = [], True
             self.near = to_camera(sensor)
             self.unconnected = lamp_tracing.refused_sensor(sensor)
 
         def end_render(self) -> None:
-            """To be called after the samples were evaluated. ValueError where absorption was contradictory."""
+            """Call this after the samples were evaluated. ValueError where absorption was contradictory."""
             loops, self.loops, self.rendering = self.loops, [], False
             for loop in loops:
                 loop.refuse()
@@ -168,13 +172,13 @@ def integrator_class(v: Variant) -> type:
             if spp:
                 sampler.set_sample_count(spp)
             number: Any = dr.slice(seed)
-            found = self.caustic_image(scene, sensor, int(number), int(sampler.sample_count()), ("R", "G", "B"))
+            caustic = self.caustic_image(scene, sensor, int(number), int(sampler.sample_count()), ("R", "G", "B"))
             # Colours on a film are sums; those of the samples' weights, by which it divides them, are its last channel
             # before others.
             block, sums = film.create_block(), film.develop(True)
             weight = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
             values = block.tensor().numpy()
-            values[..., :3] = found[0] * sums.numpy()[..., weight : weight + 1]
+            values[..., :3] = caustic[0] * sums.numpy()[..., weight : weight + 1]
             block.tensor()[:] = type(sums)(values)
             film.put_block(block)
             return film.develop() if develop else v.TensorXf()
@@ -218,7 +222,7 @@ def integrator_class(v: Variant) -> type:
             return dr.select(end.valid_ray, end.result, 0), end.valid_ray, [end.truncated][: len(self.aov_names())]
 
         def path_loop(self, scene: Scene, sampler: Sampler) -> PathLoop:
-            """Of a pass of a render, or of one sample of it in a scalar variant."""
+            """The loop of a pass of a render, or of one sample of it in a scalar variant."""
             if not vectorised and (loop := next((loop for loop in self.loops if loop.scene is scene), None)):
                 return loop
             needs = self.scene_features(scene)
@@ -262,21 +266,25 @@ def integrator_class(v: Variant) -> type:
 
         def traces_lamps(self, scene: Scene, needs: SceneFeatures) -> bool:
             """Whether lamps are traced in this render. ValueError where `caustics` = `lamp` and they cannot be."""
+            self.untraced = ""
             if self.caustics == "path" or not (needs.lamps and needs.smooth and (needs.delta or needs.null)):
                 return False
-            symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
+            if self.caustics == "auto" and CAST not in needs.missing("path", self.max_depth):
+                return False
+            symbolic, frozen = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops), dr.flag(dr.JitFlag.FreezingScope)
             reasons = {
                 "another integrator calls it": not self.rendering,
-                "the render is differentiated": not symbolic,
-                "a frozen function": dr.flag(dr.JitFlag.FreezingScope),
+                "the render is differentiated": not symbolic or (not frozen and differentiated(scene)),
+                "a frozen function": frozen,
                 "the scene has media": needs.media,
                 f"a {needs.delta_perturbed} has delta lobes": bool(needs.delta_perturbed),
                 self.unconnected: bool(self.unconnected),
-                (lamps := lamp_tracing.refused_lamps(scene)): bool(lamps),
+                (lamps := "" if frozen else lamp_tracing.refused_lamps(scene)): bool(lamps),
             }
             reason = next((text for text, found in reasons.items() if found), "")
             if reason and self.caustics == "lamp":
                 raise ValueError(f"{INTEGRATOR}: caustics = lamp: {reason}; expected caustics = path")
+            self.untraced = reason
             return not reason
 
         def path_features(self, needs: SceneFeatures) -> PathFeatures:
@@ -311,15 +319,20 @@ def integrator_class(v: Variant) -> type:
                 absorption=needs.absorbing or needs.media or self.camera is not None,
                 null=needs.null,
                 caustics_apart=self.apart,
+                delta_extent=needs.delta_extent,
             )
 
         def scene_features(self, scene: Scene) -> SceneFeatures:
-            """Of the scene as it is now: an edit of the scene can change them."""
+            """The features of the scene as it is now: an edit of the scene can change them."""
             before, self.needs = (self.needs, self.apart), (needs := inspect(scene))
             self.apart = self.traces_lamps(scene, needs)
             missing = needs.missing("lamp" if self.apart else "path", self.max_depth)
-            for path_class, text in missing.items() if (needs, self.apart) != before else ():
-                mi.Log(mi.LogLevel.Warn, f"{INTEGRATOR}: missing {path_class}: {text}")  # type: ignore[operator]
+            untraced = f"; its lamps are not traced: {self.untraced}" if self.untraced else ""
+            warnings = [f"missing {path_class}: {text}{untraced}" for path_class, text in missing.items()]
+            if needs.thin:
+                warnings.append(f"{needs.thin}; expected a thicker shape, or one nearer to the origin")
+            for text in warnings if (needs, self.apart) != before else ():
+                mi.Log(mi.LogLevel.Warn, f"{INTEGRATOR}: {text}")  # type: ignore[operator]
             check_shapes(scene)
             if needs.absorbing or needs.media:
                 check_media(v, scene)

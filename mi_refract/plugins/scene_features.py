@@ -20,6 +20,8 @@ import mitsuba as mi
 
 from mi_refract.numerics import BSDF, Scene, Shape, Variant
 
+from . import ray_origins
+
 # fmt: off
 KNOWN = {
     "BlendBSDF", "BumpMap", "MaskBSDF", "NormalMap", "TwoSidedBRDF",
@@ -48,6 +50,7 @@ WITHOUT_TANGENT = DETERMINISTIC | {"BlendBSDF", "MaskBSDF", "Null", "ThinDielect
 # Plugins that sample with `sample1` or with `sample2`, and never with both.
 EITHER = DETERMINISTIC | {"Null", "RoughConductor", "SmoothDiffuse", "ThinDielectric"}
 TRACED_LAMPS = {"AreaLight", "DirectionalEmitter", "PointLight", "SpotLight"}  # that `lamp_tracing` takes
+CAST = "L S+ D (S|D)* E"  # the class of paths of caustics; see `SceneFeatures.missing`
 BEAM = "DirectionalArea"  # the emitter of zero size that no shadow ray finds: its `sample_direction` gives nothing
 # Integrators that find lamps of zero size by shadow rays only, as they call themselves → `volumes` of `missing`.
 SHADOW_RAYS = {
@@ -80,6 +83,8 @@ class SceneFeatures:
     zero_size: tuple[str, ...]  # the classes of the emitters whose light has one position, or one direction at each
     splitting: bool  # some shape's BSDF is of `BOUNDARIES`
     chance: str  # the first plugin that is not of `DETERMINISTIC`, and its shape; "" where there is none
+    delta_extent: float  # of the largest shape with delta lobes, as `ray_origins` takes it
+    thin: str  # the first shape of glass that rays step over, and why; "" where there is none
     unknown: tuple[str, ...] = ()
 
     @property
@@ -125,7 +130,7 @@ class SceneFeatures:
         # Class, whether its lamps and lobes are there, edges of its shortest path, text.
         classes = {
             "path": (
-                ("L S+ D (S|D)* E", shadowed and lobes, 3, f"light of {shadowed} {cast}; expected {traced}{area}"),
+                (CAST, shadowed and lobes, 3, f"light of {shadowed} {cast}; expected {traced}{area}"),
                 ("L (S|D)* D (S|D)* E", beam, 2, f"all light of {beam} is black; expected a lamp of another type"),
             ),
             "lamp": (
@@ -165,6 +170,18 @@ def inspect(scene: Scene) -> SceneFeatures:
     deltas = {bsdf_name(bsdf) for bsdf in bsdfs if not bsdf.flags() & +lobes.Smooth}
     lamps = [shape.emitter() for shape in shapes if shape.is_emitter()]
     points = [emitter for emitter in emitters if emitter.flags() & +mi.EmitterFlags.Delta]
+    with_delta = [
+        i
+        for i, inner in enumerate(within)
+        if any(bsdf.flags() & +lobes.Delta or bsdf_name(bsdf) not in KNOWN for bsdf in inner)
+    ]
+    delta_extent = math.inf if opaque else ray_origins.extent_of(shapes[i] for i in with_delta)
+    thin = (
+        f"{shape_name(shapes, i)} {text}"
+        for i in with_delta
+        if any(bsdf.flags() & +lobes.DeltaTransmission for bsdf in within[i])
+        and (text := ray_origins.too_thin(shapes[i], delta_extent))
+    )
     shape_media = any(shape.interior_medium() or shape.exterior_medium() for shape in shapes)
     return SceneFeatures(
         smooth=everything or bool(flags & +lobes.Smooth),
@@ -195,15 +212,17 @@ def inspect(scene: Scene) -> SceneFeatures:
         zero_size=tuple(sorted({lamp.class_name() for lamp in points if lamp.sampling_weight() > 0})),
         splitting=any(bsdf_name(bsdf) in BOUNDARIES for each in within for bsdf in each[:1]),
         chance=next(chance, ""),
+        delta_extent=delta_extent,
+        thin=next(thin, ""),
         unknown=unknown,
     )
 
 
 def missing_light(scene: Scene) -> dict[str, str]:
-    """What the scene's integrator misses of it, as `SceneFeatures.missing`, and those that it calls.
+    """The light that the scene's integrator, and those that it calls, cannot find: as `SceneFeatures.missing`.
 
-    Only where they are `path`, `refract_path`, `prb`, `prb_projective`, `volpath`, `volpathmis` or `prbvolpath`: of
-    others nothing is known.
+    Known of `path`, `refract_path`, `prb`, `prb_projective`, `volpath`, `volpathmis` and `prbvolpath`; nothing is
+    returned for others.
     """
     features, integrators, missing = inspect(scene), [scene.integrator()], dict[str, str]()
     while integrators:
@@ -215,6 +234,19 @@ def missing_light(scene: Scene) -> dict[str, str]:
             caustics = integrator.caustics_of(scene, scene.sensors()[0]) if own else "path"
             missing |= features.missing(caustics, int(depth[1]), volumes=SHADOW_RAYS[name])
     return missing
+
+
+def differentiated(scene: Scene) -> bool:
+    """Whether a parameter of the scene has a derivative, also while derivatives are suspended, as in `mi.render`."""
+
+    def attached(value: Any) -> bool:
+        if not dr.is_diff_v(value):
+            return False
+        if dr.is_tensor_v(value):
+            return attached(value.array)
+        return any(map(attached, value)) if dr.depth_v(value) > 1 else value.index_ad != 0
+
+    return any(attached(value) for _, value in mi.traverse(scene))
 
 
 def check_shapes(scene: Scene) -> None:

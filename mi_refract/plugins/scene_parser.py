@@ -179,14 +179,14 @@ def _config(variant: str) -> Any:
 
 
 def _nodes(state: ParserState) -> list[Node]:
-    found = []
+    nodes = []
     for node in state.nodes:
         props, parameters = node.props, []
         for name in props.keys():  # noqa: SIM118 (no dict)
             kind, value = props.type(name).name, props[name]
             parameters.append((name, kind, _CONVERSIONS[kind][0](value) if kind in _CONVERSIONS else value))
-        found.append((node.type.name, props.plugin_name(), props.id(), parameters))
-    return found
+        nodes.append((node.type.name, props.plugin_name(), props.id(), parameters))
+    return nodes
 
 
 def _spectrum(knots: Any) -> Any:

@@ -1,9 +1,10 @@
 """Compare answers to a ray set with certified directions: how large the errors are, in which regimes, and why.
 
-The oracle certifies every ray. An answer is right where its error is within the a-priori bound of a documented formula
-for that very ray. Errors are angles, over the rays whose total internal reflection was classified correctly; the error
-of the length is reported separately. Where answers have a column `n_ratio`, the program's ratio of indices, directions
-are compared with the certified ones for that ratio, and the ratio with that of the ray.
+The oracle certifies every ray. An answer is wrong where its error is beyond the a-priori bound of a documented formula
+for that very ray, and right where its backward errors are small, too. Errors are angles, over the rays whose total
+internal reflection was classified correctly; the error of the length is reported separately. Where answers have a
+column `n_ratio`, the program's ratio of indices, directions are compared with the certified ones for that ratio, and
+the ratio with that of the ray.
 
 All rays, their answers and certified answers are arrays. Whatever takes more memory than these is done in pieces.
 """

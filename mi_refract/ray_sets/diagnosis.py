@@ -194,6 +194,6 @@ def _loss(name: str, text: str, table: Table, column: str, possible: bool = True
 
 
 def _median_angle(table: Table, mask: Flags) -> float:
-    """Of the directions compared in the mask; NaN where there is none."""
+    """The median angle of the directions compared in the mask; NaN where there is none."""
     angles = table["angle"][table["compared"] & mask]
     return float(np.median(angles)) if len(angles) else math.nan

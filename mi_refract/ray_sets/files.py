@@ -274,8 +274,8 @@ def _read_csv(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
                     break
                 header[key[1:].strip()] = _value(value.strip()) if colon else ""
             if columns not in layouts:
-                found = f"the first row is {','.join(columns)[:60]!r}" if columns else "the table is empty"
-                raise ValueError(f"{found}; expected, in this order: {' or '.join(map(','.join, layouts))}")
+                problem = f"the first row is {','.join(columns)[:60]!r}" if columns else "the table is empty"
+                raise ValueError(f"{problem}; expected, in this order: {' or '.join(map(','.join, layouts))}")
             with warnings.catch_warnings(action="ignore", category=UserWarning):  # of a table without rows
                 try:
                     numbers = np.loadtxt(rows, delimiter=",", ndmin=2)  # `max_rows` would be allocated
@@ -332,8 +332,8 @@ def _read_npz(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
             if text.shape or text.dtype.kind != "U":
                 raise ValueError(f"header is {text.dtype} of the shape {text.shape}, not text")
     except _BROKEN_NPZ as error:
-        found, expected = one_line(str(error)) or type(error).__name__, dict.fromkeys(map(array_name, layouts[0]))
-        raise ValueError(f"{found}; expected an .npz file with {', '.join(expected)}") from None
+        problem, expected = one_line(str(error)) or type(error).__name__, dict.fromkeys(map(array_name, layouts[0]))
+        raise ValueError(f"{problem}; expected an .npz file with {', '.join(expected)}") from None
     header = _value(str(text))
     return Table(header if isinstance(header, dict) else {}, columns, np.hstack(list(arrays.values())))
 

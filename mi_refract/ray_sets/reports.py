@@ -166,7 +166,7 @@ def summary(findings: Findings) -> RenderableType:
             grades.add_row(Text(word, style=style), Text("every regime" if every else printable("; ".join(names))))
     notes = [*map(problem_text, findings.problems), *ratio(findings), signal(findings), *explained(findings)]
     notes += [MEANING] if findings.right > 0 and not findings.wrong else []
-    return Group(grades, *(Text(printable(line)) for line in (*notes, sentence(findings))))
+    return Group(*[grades] * bool(findings.regimes), *(Text(printable(line)) for line in (*notes, sentence(findings))))
 
 
 def table(findings: Findings) -> RenderableType:

@@ -40,6 +40,7 @@ class Regime:
         return self.any_k or self.angle is not None
 
 
+# Every regime by its name.
 REGIMES = {
     "generic": Regime(drawn("generic"), 1.5, "cosine uniform, k = 1.5 or 1/1.5", any_k=True),
     "near-normal": Regime(drawn("near-normal"), 2.5, "1e-12 … 1e-2 rad from the normal, k in 0.4 … 2.5", any_k=True),
@@ -59,7 +60,7 @@ REGIMES = {
     "critical, any k, to the ulp": Regime(
         functools.partial(components.to_the_ulp, 1e-6, 9.9e5),
         1e6,
-        "the same for k − 1 in 1e-6 … 1e6: grazing to near-normal",
+        'as "critical, to the ulp", for k − 1 in 1e-6 … 1e6: grazing to near-normal',
     ),
     "matched": Regime(drawn("matched"), 1.01, "|k − 1| from an ulp to 1e-2, cosine uniform"),
     "matched, grazing": Regime(
@@ -77,7 +78,10 @@ REGIMES = {
         components.zeros, 1e6, "n, and a of every other ray, with zeros of either sign; not tangential", any_k=True
     ),
     "denormal": Regime(
-        components.denormal, 1e6, "as before, the zeros of a, n or both replaced by denormal numbers", any_k=True
+        components.denormal,
+        1e6,
+        'as "axes, signed zeros", with denormal numbers for the zeros of a, n or both',
+        any_k=True,
     ),
     "on a denormal": Regime(
         components.on_a_denormal,

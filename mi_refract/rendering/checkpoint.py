@@ -173,7 +173,7 @@ def _progress(file: BufferedReader, header: dict[str, Any], shape: tuple[int, in
         file.readinto(array.data.cast("B"))
         return array
 
-    found: dict[str, PassSums] = {}
+    sums: dict[str, PassSums] = {}
     for name, (spp, passes, kinds) in nodes.items():
         right = all(type(count) is int for count in (passes, spp, pass_spp)) and 1 <= passes <= spp
         if name in expected:
@@ -184,13 +184,13 @@ def _progress(file: BufferedReader, header: dict[str, Any], shape: tuple[int, in
             raise ValueError(f"{name}: {passes} passes of {spp} samples per pixel")
         arrays = {kind: doubles(*shape[:2], 1 if kind == "weights" else shape[2]) for kind in ARRAYS if kind in kinds}
         contrasts = doubles(passes - 1).tolist()
-        found[name] = PassSums(spp, passes, **arrays, contrasts=contrasts, colours=identity["colours"])
+        sums[name] = PassSums(spp, passes, **arrays, contrasts=contrasts, colours=identity["colours"])
     if file.tell() != size:
         raise ValueError(f"{size} bytes; expected {file.tell()}")
-    progress.base, progress.rest = found.get("base"), found.get("rest")
+    progress.base, progress.rest = sums.get("base"), sums.get("rest")
     tree = progress.tree
     tree.counts, tree.passes = counts, sum(expected.values())
-    tree.levels = [found.get(f"level{i}") for i in range(len(counts))]
+    tree.levels = [sums.get(f"level{i}") for i in range(len(counts))]
     return progress
 
 
@@ -239,7 +239,7 @@ class CheckpointWriter:
             self._thread.start()
 
     def wait(self) -> None:
-        """Until no checkpoint is being written."""
+        """Wait until no checkpoint is being written."""
         if self._thread is not None:
             self._thread.join()
             self._thread = None

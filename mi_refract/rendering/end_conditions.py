@@ -8,7 +8,7 @@ s² is the mean of m independent contrasts between passes (`PassSums.contrasts`)
 one more quantity of their distribution. So with 95 % probability it lies within  s² ± t s_c √(1 + 1/m),  s_c their
 standard deviation, as far as passes are normally distributed: what no sample has met yet is in no estimate.
 
-Of a single pass there is no contrast, and s² is that of its samples, as if they were independent. Where the sampler
+A single pass has no contrast: there s² is that of its samples, as if they were independent. Where the sampler
 stratifies them their mean varies less, Var(x̄) ≤ s²/n for strata of equal probability (Cochran, Sampling Techniques,
 1977, 5.6), so this is an upper bound.
 """
@@ -54,19 +54,19 @@ def relative_error(sums: PassSums) -> RelativeError:
     colours = sums.mean[..., : sums.colours]
     known = np.isfinite(colours)
     mean = abs(float(colours[known].mean())) if known.any() else math.nan
-    found = np.asarray([each for each in sums.contrasts if math.isfinite(each)])
+    contrasts = np.asarray([each for each in sums.contrasts if math.isfinite(each)])
     if not mean > 0 or not sums.freedom:
         return RelativeError(math.nan)
-    squared, spread = float(found.mean()) if found.size else math.nan, math.nan
-    if at_most := not found.size and (variance := sums.variance) is not None:
+    squared, spread = float(contrasts.mean()) if contrasts.size else math.nan, math.nan
+    if at_most := not contrasts.size and (variance := sums.variance) is not None:
         known = np.isfinite(variance := variance[..., : sums.colours])
         squared = float(variance[known].mean())
-    if found.size > 1:
+    if contrasts.size > 1:
         with contextlib.suppress(ImportError):  # without SciPy, which is an extra, there is no interval
             from scipy.stats import t  # takes a second
 
-            quantile = float(t.ppf((1 + LEVEL) / 2, found.size - 1))
-            spread = quantile * float(found.std(ddof=1)) * math.sqrt(1 + 1 / found.size)
+            quantile = float(t.ppf((1 + LEVEL) / 2, contrasts.size - 1))
+            spread = quantile * float(contrasts.std(ddof=1)) * math.sqrt(1 + 1 / contrasts.size)
     value, low, high = (math.sqrt(max(x, 0) / sums.spp) / mean for x in (squared, squared - spread, squared + spread))
     return RelativeError(value, low, high, at_most)
 

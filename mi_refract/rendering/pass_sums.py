@@ -78,11 +78,11 @@ class PassSums:
         """`spp` times that of the mean, from the samples or from the spread of passes; None where unknown."""
         if not self.freedom:
             return None
-        found = (self.between if self.within is None else self.within + self.between) / self.freedom
+        variance = (self.between if self.within is None else self.within + self.between) / self.freedom
         if self.weights is not None:
             share = np.divide(self.spp, self.weights, out=np.zeros_like(self.weights), where=self.weights != 0)
-            found *= np.square(share)
-        return np.asarray(found)
+            variance *= np.square(share)
+        return np.asarray(variance)
 
     def add(self, other: PassSums) -> None:
         """Take in the sums of the passes that follow: m + n samples per pixel then, with totals a, c and weights u, v.
@@ -126,7 +126,7 @@ class PassSums:
             self.within = self.within + other.within
 
     def _weights_of(self, piece: slice) -> Any:
-        """Of some pixels, once for each channel; one number where it is that of all."""
+        """The weights of some pixels, once for each channel; one number where it is that of all."""
         if self.weights is None:
             return float(self.spp)
         return np.repeat(self.weights.reshape(-1, 1)[piece], self.total.shape[-1], 1)
@@ -173,11 +173,11 @@ class PassTree:
 
 def aligned_nodes(first: int, stop: int, largest: int) -> list[tuple[int, int]]:
     """Nodes that make up the passes from `first` to `stop`: level, up to `largest`, and number of the first pass."""
-    found = []
+    nodes = []
     while first < stop:
         level = 0
         while level < largest and first % ARITY ** (level + 1) == 0 and first + ARITY ** (level + 1) <= stop:
             level += 1
-        found.append((level, first))
+        nodes.append((level, first))
         first += ARITY**level
-    return found
+    return nodes

@@ -83,7 +83,7 @@ class Passes:
     found: Doubles | None = None
 
     def of(self, pixels: Any) -> Passes:
-        """Only some pixels."""
+        """The same for some pixels only."""
         found = None if self.found is None else self.found[:, :, pixels]
         return replace(self, means=self.means[:, pixels], found=found)
 
@@ -147,7 +147,7 @@ def _of_found(means: Doubles, within: Doubles, light: float) -> float:
 
 
 def ratios(found: dict[str, Passes], of: str) -> dict[str, Ratio]:
-    """By candidate, over the cost of one of them. The intervals are by the jackknife, over groups of pixels."""
+    """The cost of each candidate over that of one of them. Intervals are by the jackknife, over groups of pixels."""
     known = np.logical_and.reduce([np.isfinite(each.means).all((0, 2)) for each in found.values()])
     group = np.cumsum(known) % GROUPS
 
@@ -171,7 +171,7 @@ UNKNOWN = Ratio(1, 0, math.inf, 1, 1)
 
 
 def known(costs: dict[str, Ratio]) -> dict[str, Ratio]:
-    """Without the scene's own settings where they have less noise than the next: they have not met all of it."""
+    """The costs without the scene's own where it has less noise than the next: it has not met all of it."""
     (first, own), *others = costs.items()
     if first == OWN and others and own.variance * MARGIN < others[0][1].variance:
         return dict(others)
@@ -192,27 +192,27 @@ def choose(pilot: Pilot) -> Choice:
     ValueError where no light is seen; RuntimeError of Mitsuba.
     """
     named = {settings_text(settings): settings for settings in pilot.candidates}
-    found = {name: pilot.measure(settings, 0, pilot.first) for name, settings in named.items()}
-    if not any(np.nan_to_num(each.means).any() or each.light for each in found.values()):
+    passes = {name: pilot.measure(settings, 0, pilot.first) for name, settings in named.items()}
+    if not any(np.nan_to_num(each.means).any() or each.light for each in passes.values()):
         text = f"{pilot.parsed.path}: --settings {AUTO}: the pilot sees no light"
         raise ValueError(f"{text}; expected some, or settings by name")
-    *_, before, last = [OWN, *found]
-    costs = known(ratios(found, last))
+    *_, before, last = [OWN, *passes]
+    costs = known(ratios(passes, last))
     least = min(cost.high for cost in costs.values())
     left = [name for name, cost in costs.items() if cost.low <= LOST * least]
-    if last in left[1:] and found[last].found is not None:  # that is light of the one before
-        left = [name for name in found if name in {*left, before}]
-    took, seconds = sum(each.took for each in found.values()), {name: found[name].seconds for name in left}
+    if last in left[1:] and passes[last].found is not None:  # that is light of the one before
+        left = [name for name in passes if name in {*left, before}]
+    took, seconds = sum(each.took for each in passes.values()), {name: passes[name].seconds for name in left}
     pixels = int((AIMED * pilot.allowed(min(seconds.values())) - took) / COPIES / sum(seconds.values()))
-    more = {name: found[name] for name in left}
+    more = {name: passes[name] for name in left}
     if len(left) > 1 and pixels >= pilot.first:
-        more = {name: found[name] + pilot.measure(named[name], 1, pixels) for name in left}
-        took += sum(more[name].took - found[name].took for name in left)
+        more = {name: passes[name] + pilot.measure(named[name], 1, pixels) for name in left}
+        took += sum(more[name].took - passes[name].took for name in left)
     costs = known(ratios(more, left[0]))
     best = min(costs, key=lambda name: costs[name].value)
     alike = [name for name in costs if costs[name].value <= MARGIN * costs[best].value]
     chosen = OWN if OWN in alike and ratios(more, best)[OWN].high <= SURELY else next(n for n in alike if n != OWN)
-    table = {name: vars(cost) for name, cost in (ratios(found, chosen) | ratios(more, chosen)).items()}
+    table = {name: vars(cost) for name, cost in (ratios(passes, chosen) | ratios(more, chosen)).items()}
     rounded = {name: {key: float(f"{value:.3g}") for key, value in cost.items()} for name, cost in table.items()}
     share = SHARE * took / pilot.allowed(more[chosen].seconds)
     figures = {"seconds": float(f"{took:.3g}"), "share": float(f"{share:.3g}"), "of": chosen, "costs": rounded}
@@ -222,8 +222,8 @@ def choose(pilot: Pilot) -> Choice:
 def lines_of(figures: dict[str, Any]) -> list[str]:
     """A line for each candidate of `Choice.figures`."""
     return [
-        f"cost {cost['value']:g} ({cost['low']:g} to {cost['high']:g}), variance {cost['variance']:g} and time "
-        f"{cost['time']:g} of the chosen: {name}"
+        f"{name}: {cost['value']:g} × the cost of the chosen settings ({cost['low']:g} to {cost['high']:g}): "
+        f"{cost['variance']:g} × the variance, {cost['time']:g} × the time"
         for name, cost in sorted(figures["costs"].items(), key=lambda item: -float(item[1]["value"]))
     ]
 
@@ -254,8 +254,8 @@ class Pilot:
         unknown = self.own["sampler"] not in SAMPLERS
         fixed = not unknown and "jitter = 0" in str(renderer.scene.sensors()[0].sampler())  # its error is not noise
         if unknown or fixed:
-            found = f"the scene's sampler is {self.own['sampler']}{' without jitter' * fixed}"
-            raise ValueError(f"{what}: {found}; expected {', '.join(SAMPLERS)}, with jitter, or settings by name")
+            problem = f"the scene's sampler is {self.own['sampler']}{' without jitter' * fixed}"
+            raise ValueError(f"{what}: {problem}; expected {', '.join(SAMPLERS)}, with jitter, or settings by name")
         total = plan(renderer.rounded).total
         self.samples = OPEN_SAMPLES if total is None else SHARE * math.prod(renderer.size) * total
         self._samplers: dict[str, Any] = {}
@@ -269,21 +269,24 @@ class Pilot:
         self.first = max(LEAST_PIXELS, int(FIRST * self.samples / per_pixel))
 
     def _candidates(self) -> list[Settings]:
-        """In their order; only those that trace lamps where all else misses light."""
+        """The candidates in their order; only those that trace lamps where all else misses light."""
         node, features = integrator_node(self.parsed, {}), inspect(self.renderer.scene)
+        if self.own.get("caustics") == "auto":
+            scene = self.renderer.scene
+            self.own["caustics"] = scene.integrator().caustics_of(scene, scene.sensors()[0])
         best = self.own | {"sampler": next(filter(self._fits, (*SAMPLERS, self.own["sampler"])))}
-        found = [self.own, best]
+        tried = [self.own, best]
         fixed = node is None or any(
             name.startswith("camera_") or (name, value) == ("deterministic", True) for name, _, value in node[3]
         )
         beyond_path = features.absorbing or features.dispersive or features.media  # `path` ignores these
         if not fixed and (self.own["integrator"] == "refract_path" or not beyond_path):
-            found = [self.own, best | PLAIN, *[best | SPLIT] * features.splitting]
+            tried = [self.own, best | PLAIN, *[best | SPLIT] * features.splitting]
             if self._lamps_traceable():
                 missing = bool(missing_light(self.renderer.scene))
-                found = [each | CAUSTICS for each in found[1:]] if missing else [*found, found[-1] | CAUSTICS]
+                tried = [each | CAUSTICS for each in tried[1:]] if missing else [*tried, tried[-1] | CAUSTICS]
         known = DEFAULTS | self.own
-        changed = [{name: x for name, x in each.items() if known.get(name) != x} for each in found]
+        changed = [{name: x for name, x in each.items() if known.get(name) != x} for each in tried]
         return [each for i, each in enumerate(changed) if each not in changed[i + 1 :]]
 
     def _fits(self, sampler: str) -> bool:
@@ -338,7 +341,7 @@ class Pilot:
         return min(limit, self.samples / int(self._sampler({}).sample_count()) * seconds)
 
     def _sampler(self, settings: Settings) -> Any:
-        """With as many samples as a pass of the render has, or fewer where that would be few pixels."""
+        """A sampler with as many samples as a pass of the render, or fewer where that would be few pixels."""
         name = settings.get("sampler", self.own["sampler"])
         if name not in self._samplers:
             own = name == self.own["sampler"]

@@ -105,9 +105,9 @@ class PassRenderer:
         """Add the lamps' part of the image to the sums of a pass, where the integrator keeps it apart."""
         sensor, seed = self.scene.sensors()[0], seed_of(self.seed, number)
         squares, caustics = within is not None, self.scene.integrator().caustic_image
-        if (found := caustics(self.scene, sensor, seed, spp, self.channels, squares=squares)) is None:
+        if (lamps := caustics(self.scene, sensor, seed, spp, self.channels, squares=squares)) is None:
             return
-        image, variance = found
+        image, variance = lamps
         colours, weight = image.shape[-1], spp if weights is None else weights
         total[..., :colours] += image * weight
         if within is not None:  # the variance of the mean is within / spp (spp − 1), and w in units of `expected`
@@ -136,7 +136,7 @@ def pass_renderer(scene: Scene, seed: int) -> PassRenderer:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Without Mitsuba's warning, at every pass, that a sampler rounds up: it is taken into account."""
+    """A context without Mitsuba's warning, at every pass, that a sampler rounds up: it is taken into account."""
     logger: Any = mi.logger()  # type: ignore[operator]
     before = logger.log_level()
     logger.set_log_level(mi.LogLevel.Error)

@@ -20,18 +20,18 @@ NAMES = {
     "sampler": "|".join(SAMPLERS),
     "integrator": "|".join(INTEGRATORS),
     "split_depth": "[0-9]|[1-5][0-9]|6[0-4]",  # up to 64, as `refract_path` has it
-    "caustics": "path|lamp",
+    "caustics": "path|lamp|auto",
 }
 _SHARED = ("sample_count", "seed")  # parameters of every sampler
 _TYPES = {"split_depth": "Integer", "caustics": "String"}  # of `refract_path`; `path` has neither
-DEFAULTS = {"split_depth": "0", "caustics": "path"}
+DEFAULTS = {"split_depth": "0", "caustics": "auto"}
 _OWN = (*_TYPES, "split_weight", "light_paths")  # parameters that `path` does not have
 Settings: TypeAlias = dict[str, str]  # by NAMES; {}: the scene's own
 
 
 def parse_settings(text: str) -> Settings:
     """`"split_depth=1"` → `{"split_depth": "1"}`, by NAMES; `OWN` → `{}`. ValueError for another syntax."""
-    found: dict[str, str] = {}
+    settings: dict[str, str] = {}
     for item in () if text == OWN else text.split(","):
         name, _, value = item.partition("=")
         if name not in NAMES:
@@ -40,10 +40,10 @@ def parse_settings(text: str) -> Settings:
         if not re.fullmatch(NAMES[name], value):
             expected = "0 to 64" if name == "split_depth" else NAMES[name].replace("|", ", ")
             raise ValueError(f"--settings {text}: {name} = {value!r}; expected {expected}")
-        if name in found:
+        if name in settings:
             raise ValueError(f"--settings {text}: {name} is given twice; expected once")
-        found[name] = value
-    return {name: found[name] for name in NAMES if name in found}
+        settings[name] = value
+    return {name: settings[name] for name in NAMES if name in settings}
 
 
 def settings_text(settings: Settings) -> str:

@@ -32,12 +32,12 @@ class Film:
 
     @property
     def reach(self) -> int:
-        """To how many pixels on each side."""
+        """How many pixels a sample reaches on each side."""
         radius: float = self.rfilter.radius()
         return math.ceil(radius - 0.5)
 
     def pixels(self) -> tuple[Any, Any]:
-        """Their x and y."""
+        """x and y of the pixels."""
         index, width = dr.arange(mi.Int32, self.width * self.height), dr.opaque(mi.Int32, self.width)
         y = index // width
         return index - y * width, y
@@ -48,7 +48,7 @@ class Film:
         return inside, mi.UInt32(dr.select(inside, x + y * dr.opaque(mi.Int32, self.width), 0))
 
     def weight(self, apart: Number) -> Any:
-        """Of a sample so far from the middle of a pixel, along one axis."""
+        """The weight of a sample so far from the middle of a pixel, along one axis."""
         near = dr.abs(apart) <= self.rfilter.radius()
         return dr.select(near, self.rfilter.eval(apart), 0)
 
@@ -71,17 +71,17 @@ def image_sums(
         means = [mi.Float(dr.select(weight == 0, 0, total / weight)) for total in totals]
         weights, within = [weight], _squared_sums(values, place, means, film) if squares else []
     kind: Any = mi.ArrayXd
-    found = [dr.ravel(kind(columns)) if columns else None for columns in (totals, weights, within)]
-    dr.eval(found)  # in one kernel
+    sums = [dr.ravel(kind(columns)) if columns else None for columns in (totals, weights, within)]
+    dr.eval(sums)  # in one kernel
     shape = film.height, film.width, -1
-    total, *others = (None if each is None else np.array(each).reshape(shape) for each in found)
+    total, *others = (None if each is None else np.array(each).reshape(shape) for each in sums)
     assert total is not None
     return total, others[0], others[1]
 
 
 @dr.syntax
 def _box_sums(values: list[Number], film: Film, squares: bool) -> tuple[list[Any], list[Any]]:
-    """Of every pixel Σ v by channels; and for `squares` Σ (v − mean)², else nothing.
+    """Σ v of every pixel by channels; and for `squares` Σ (v − mean)², else nothing.
 
     Σ (v − mean)² = Σ d² − (Σ d)²/n of n samples, where d is the difference from the pixel's first: 0 if all are equal.
     """
@@ -107,7 +107,7 @@ def _box_sums(values: list[Number], film: Film, squares: bool) -> tuple[list[Any
 
 
 def _weighted_sums(values: list[Number], place: Point2, film: Film) -> list[Any]:
-    """Of every pixel Σ w v by channels, and Σ w, over the samples that reach it, always added in the same order.
+    """Σ w v of every pixel by channels, and Σ w, over the samples that reach it, always added in the same order.
 
     For each row of neighbours every pixel adds up its own samples with the weights that they have in each of them.
     """
@@ -145,7 +145,7 @@ def _own_samples(values: list[Number], place: Point2, x: Number, y: Number, film
 
 @dr.syntax
 def _squared_sums(values: list[Number], place: Point2, means: list[Number], film: Film) -> list[Any]:
-    """Of every pixel Σ (z − z̄)², by channels, of z = w (v − mean) over the samples that reach it.
+    """Σ (z − z̄)² of every pixel by channels, z = w (v − mean) over the samples that reach it.
 
     z̄ is the mean over those that lie in one pixel: their number there is fixed, so that pixels are strata.
     """

@@ -43,8 +43,8 @@ def parse_scene(path: str | os.PathLike[str], defines: Mapping[str, str] | None 
     from mi_refract.plugins import scene_parser
 
     path, defines = Path(path), dict(defines or {})
-    if not path.exists():
-        ours = SCENES / path.name
+    if not path.exists() or path.is_dir():
+        ours = (SCENES / path.name).with_suffix(".xml")
         raise FileNotFoundError(f"{path}: no such scene file" + f"; the package has {ours}" * ours.is_file())
     if taken := [name for name in TAKEN if name in defines]:
         raise ValueError(f"define {taken[0]!r}: reserved by Mitsuba's parser; expected any name except {TAKEN}")

@@ -70,7 +70,7 @@ def write_junit(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any
 
 
 def summary(rows: Sequence[Row], context: Mapping[str, Any] | None = None) -> RenderableType:
-    """For rich's console: the answers of the context's `first_page`, broken budgets, then the verdict."""
+    """The answers of the context's `first_page`, broken budgets, then the verdict, for rich's console."""
     from rich.console import Group
     from rich.padding import Padding
     from rich.text import Text
@@ -88,7 +88,7 @@ def summary(rows: Sequence[Row], context: Mapping[str, Any] | None = None) -> Re
 
 
 def goals_table(rows: Sequence[Row]) -> RenderableType:
-    """For rich's console: every goal that was measured, the missed ones first, or a line that says there are none."""
+    """Every goal that was measured, the missed ones first, or a line that says there are none, for rich's console."""
     from rich.text import Text
 
     goals = [(row, metric) for row in rows if row.values for metric in row.goals]

@@ -30,6 +30,7 @@ def test_an_error_is_one_line(arguments, capfd, monkeypatch):
     out, err = capfd.readouterr()
     assert out == "" and err.startswith("mi-refract: ") and err.count("\n") == 1
     assert arguments != ["several lines"] or err == "mi-refract: first second\n"
+    assert arguments != ["nonesuch"] or err.endswith(f"'nonesuch'; expected {', '.join(app.COMMANDS)}\n")
 
 
 def test_without_a_command_the_help_is_printed_and_with_version_the_version(capfd):
@@ -60,7 +61,9 @@ def test_the_help_has_a_line_for_each_command_and_each_command_its_own(name, cap
     lines = capfd.readouterr().out.splitlines()
     assert [line.split(None, 1)[1] for line in lines if line.startswith(f"  {name} ")] == [app.COMMANDS[name].help]
     assert app.main([name, "--help"]) == 0
-    assert capfd.readouterr().out.startswith(f"Usage: mi-refract {name} ")
+    out = capfd.readouterr().out
+    assert out.startswith(f"Usage: mi-refract {name} ")
+    assert not re.search(r"^  \w+ .*\.\.\.$", out.partition("Commands:")[2], re.MULTILINE)  # no line is cut
 
 
 def commands_of(command, name=""):

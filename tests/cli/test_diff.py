@@ -68,6 +68,7 @@ def test_methods_and_settings_in_words(run, pair, words, code):
 def test_the_methods_are_printed_without_images(run):
     code, out, err = run("diff", "--methods")
     assert (code, err) == (0, "")
+    assert out.count("| `mask` |") == 1  # keys that both tables have are listed once
     for name, method in methods.METHODS.items():
         assert f"`{name}`: {method.summary}" in out
         assert all(f"| `{option}` |" in out for option in method.options)

@@ -94,7 +94,8 @@ def test_light_that_is_missing_is_named_on_stderr_and_in_the_header(render, scen
     else:
         assert (code, err) == (0, f"mi-refract: {scene}: missing {missing}\n")
         cast = "light of PointLight that delta lobes (glass, mirrors) cast on other surfaces is black"
-        assert missing.startswith(f"L S+ D (S|D)* E: {cast}; expected ")
+        path_class, where = ("S E", " where such lobes show it") if integrator == "refract_path" else ("E", "")
+        assert missing.startswith(f"L S+ D (S|D)* {path_class}: {cast}{where}; expected ")
 
 
 @pytest.mark.parametrize("usable", [True, False])
@@ -114,6 +115,8 @@ def test_the_best_variant_is_the_default(render, scene, monkeypatch, needs_varia
 BAD = {
     "no scene": ({"scene": "none.xml"}, (), "none.xml: no such scene file"),
     "no checkout": ({"scene": "sphere.xml"}, (), f"no such scene file; the package has {SCENES / 'sphere.xml'}"),
+    "a name alone": ({"scene": "sphere"}, (), f"no such scene file; the package has {SCENES / 'sphere.xml'}"),
+    "a folder": ({"scene": str(SCENES)}, (), f"{SCENES}: no such scene file"),
     "no variant": ({"variant": "llvm_rgb"}, (), "variant 'llvm_rgb': unknown; expected scalar_rgb"),
     "no folder": ({"output": "none/out.exr"}, (), "is not a folder"),
     "a device": ({"output": "device.exr"}, (), "device.exr: is a device; expected the name of a file"),

@@ -28,6 +28,13 @@ def test_a_readme_is_a_screen(path):
     assert len(path.read_text("utf-8").splitlines()) <= (120 if path.parent == ROOT else 60)
 
 
+@pytest.mark.parametrize("path", [path for path in READMES if path.parent.parent.name == "mi_refract"], ids=name)
+def test_the_map_of_a_room_names_its_modules(path):
+    cells = re.findall(r"^\|(.*?)\|", path.read_text("utf-8"), re.MULTILINE)
+    modules = {module.stem for module in path.parent.glob("*.py")} - {"__init__"}
+    assert modules == set(re.findall(r"`(\w+)`", "".join(cells)))
+
+
 @pytest.mark.parametrize("path", ALL, ids=name)
 def test_links_lead_to_files_and_headings(path):
     text = re.sub(r"^```.*?^```|`[^`\n]*`", "", path.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)

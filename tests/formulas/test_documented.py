@@ -40,6 +40,15 @@ def test_within_its_budget_in_every_regime(name, regime, setting):
     assert broken(FORMULAS[name], rays, exact, setting, FORMULAS[name].budget) == {}
 
 
+@pytest.mark.parametrize("regime", REGIMES)
+@pytest.mark.parametrize("name", EXACT)
+def test_within_its_budget_where_a_compiler_fuses_products_and_sums(name, regime, fused):
+    if reason := fused.no_budget(FORMULAS[name].budget, regime):
+        pytest.skip(reason)
+    rays, exact = certified(regime, 1000, fused.precision)
+    assert broken(FORMULAS[name], rays, exact, fused, FORMULAS[name].budget) == {}
+
+
 def test_the_promoted_form_decides_exactly_beyond_2_to_the_minus_49_of_its_terms(float32):
     """Also at grazing incidence, where n·a is the rest of products that are much larger."""
     rays = make("critical, any k, to the ulp", 100_000, np.float32)

@@ -117,6 +117,12 @@ def test_powers_are_within_4u_and_amplitudes_within_8u(name, setting):
     assert r <= 4 and t <= 4 and amplitude <= 8
 
 
+@pytest.mark.parametrize("name", DRAWS)
+def test_powers_where_a_compiler_fuses_products_and_sums(name, fused):
+    r, t, amplitude = errors(fused, *certified(name, fused))
+    assert r <= 4 and t <= 4 and amplitude <= 8
+
+
 def test_the_worst_that_was_found(setting):
     columns = zip(*WORST[setting.name], strict=True)
     cos_i, k = (np.array([float.fromhex(x) for x in column], setting.precision) for column in columns)

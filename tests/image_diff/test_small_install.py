@@ -91,7 +91,9 @@ def check(python, project, environment):
         [python, "-c", PROGRAM, *ABSENT], cwd=project, env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    assert re.search(r"module named '\w+'; only images are compared without it: pip install mi-refract$", done.stderr)
+    assert re.search(
+        r"module named '\w+'; only commands that compare images work without it: pip install mi-refract$", done.stderr
+    )
 
 
 def test_every_command_and_fixture_works_without_mitsuba(project):

@@ -434,8 +434,8 @@ def test_the_method_that_auto_chooses():
         (([plain], [ours]), {}, ("welch", "the variance of the new image is known")),
         (([plain] * 2, [plain] * 2), {}, ("welch", "several renders")),
         (([plain], [plain]), {}, ("tolerance", "")),
-        (([unknown], [ours]), {}, ("tolerance", "of the reference neither variance nor samples per pixel are known")),
-        (([ours], [unknown]), {}, ("tolerance", "of the new image neither variance nor samples per pixel are known")),
+        (([unknown], [ours]), {}, ("tolerance", "the reference has neither a variance nor samples per pixel")),
+        (([ours], [unknown]), {}, ("tolerance", "the new image has neither a variance nor samples per pixel")),
         (([unknown], [ours]), {"spp": True}, ("welch", "the variance of the new image is known")),
         (([unknown], [theirs]), {}, ("welch", "the variance of the new image is known")),
     ):

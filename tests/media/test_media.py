@@ -447,7 +447,7 @@ def test_held_beyond_its_range_an_index_is_that_of_its_end_and_a_warning(vectori
 
 BAD_FILES = {
     "no.csv": (None, "No such file"),
-    "a.csv": ("wl,n\n0.4,1.5\n0.5,1.5\n", "header 'wl,n'; expected nm or µm in one column's name, n, and k: 'nm,n,k'"),
+    "a.csv": ("wl,n\n0.4,1.5\n0.5,1.5\n", "header 'wl,n'; expected nm or µm in one name, n, and optionally k"),
     "b.csv": ("nm,n\n400,1.5\n", "two or more"),
     "c.csv": ("nm,n\n400,x\n500,1.5\n", "expected numbers in the columns nm, n"),
     "d.csv": ("nm,n\n400,1.5\n500\n", "expected numbers"),

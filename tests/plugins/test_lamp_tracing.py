@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.glass_scenes import parameter
 from support.variants import switch
 
 import mi_refract  # noqa: F401
@@ -317,13 +318,37 @@ def test_another_integrator_cannot_have_lamps_traced_nor_a_derivative(llvm_varia
     key = next(key for key in parameters.keys() if key.endswith("bsdf.eta"))  # noqa: SIM118
     dr.enable_grad(parameters[key])
     parameters.update()
-    image = mi.render(loaded, parameters, spp=1)
     with pytest.raises((RuntimeError, ValueError)) as caught:
-        dr.backward(dr.sum(image, axis=None))
+        mi.render(loaded, parameters, spp=1)
     errors = [caught.value]
     while errors[-1].__cause__ is not None:
         errors.append(errors[-1].__cause__)
     assert any("the render is differentiated" in str(error) for error in errors)
+
+
+@pytest.mark.parametrize(
+    ("lamp", "differentiated", "max_depth", "means"),
+    [
+        ("point", None, 16, "lamp"),
+        ("point", None, 2, "path"),  # no caustic is so short
+        ("point", "bsdf.eta", 16, "path"),
+        ("point", "reflectance.value", 16, "path"),
+        ("area", None, 16, "path"),
+    ],
+)
+def test_by_default_lamps_are_traced_that_path_tracing_cannot_find(
+    lamp, differentiated, max_depth, means, llvm_variant
+):
+    parts = {"lamp": point()} if lamp == "point" else {}
+    images = []
+    for parameters in ({}, {"caustics": means}):
+        loaded = scene(parts, max_depth=max_depth, **parameters)
+        params = mi.traverse(loaded)
+        if differentiated and not parameters:
+            dr.enable_grad(params[parameter(params, differentiated)])
+            params.update()
+        images.append(np.array(mi.render(loaded, params, spp=4)))
+    np.testing.assert_array_equal(*images)
 
 
 def test_a_retarder_turns_light_another_way_from_the_lamp(needs_variant):

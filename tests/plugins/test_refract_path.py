@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import gc
+import math
 
 import drjit as dr
 import mitsuba as mi
@@ -40,7 +41,8 @@ def test_where_nothing_is_left_out_the_numbers_and_the_image_are_those_of_path(
         pytest.skip("RGB variants stand for the others")
 
     def everything(scene):
-        return dataclasses.replace(scene_features.inspect(scene), both_numbers=True, plain_environment=False)
+        changed = {"both_numbers": True, "plain_environment": False, "delta_extent": math.inf}
+        return dataclasses.replace(scene_features.inspect(scene), **changed)
 
     monkeypatch.setattr(refract_path, "inspect", everything)
     vectorised = dr.is_jit_v(mi.Float)
@@ -113,7 +115,7 @@ def test_lamps_are_chosen_by_their_weights_and_the_sky_is_met(split_depth, typic
     vectorised = dr.is_jit_v(mi.Float)
     scene, spp = glass_ball(24 if vectorised else 4, **lamps()), 64 if vectorised else 8
     theirs = np.stack([by_path(scene, spp, i) for i in range(8)])
-    ours = np.stack([render(scene, spp, 100 + i, split_depth=split_depth) for i in range(8)])
+    ours = np.stack([render(scene, spp, 100 + i, split_depth=split_depth, caustics="path") for i in range(8)])
     assert tile_statistics.compare_stacks(theirs, ours, theirs.shape[1], 1e-3, 1e-5).alarms == 0
 
 
@@ -123,6 +125,35 @@ def test_nothing_to_see_is_black(rgb_variant):
         for parameters in ({}, {"split_depth": 2, "max_depth": -1}):
             assert (render(scene, 2, **parameters) == 0).all()
     assert (render(glass_ball(sky=LIT), 2, max_depth=0) == 0).all()
+
+
+WHITE_FLOOR = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 1.0}}
+
+
+@pytest.mark.parametrize(
+    ("shape", "scale", "place"),
+    [
+        ("cube", (1, 1, 5e-5), (0, 0, 0)),
+        ("cube", (1, 1, 5e-4), (12, 0, 0)),
+        ("cube", (1, 1, 2e-3), (100, 30, 5)),
+        ("cube", (1, 1, 1), (0, 0, 1000)),
+        ("cube", (1000, 1000, 1000), (1, 2, 3)),
+        ("sphere", (1e-4, 1e-4, 1e-4), (0, 0, 0)),
+        ("sphere", (1000, 1000, 1000), (0, 0, 1000)),
+    ],
+)
+@pytest.mark.parametrize("floor", [False, True])
+def test_glass_in_even_light_is_invisible_however_thin_and_far_from_the_origin(shape, scale, place, floor, rgb_variant):
+    """Each boundary is met once: a ray that steps over one, or meets it again, carries 1.5² times too much or less."""
+    at = PLACE().translate([*place]).rotate([0.48, 0.6, 0.64], 40)
+    parts = {"glass": {"type": shape, "to_world": at.scale([*scale]), "bsdf": GLASS}, "sky": {"type": "constant"}}
+    far = max(scale)
+    if floor:
+        parts["floor"] = WHITE_FLOOR | {"to_world": at.translate([0, 0, -4 * far]).scale(20 * far)}
+    eye = camera(16, origin=at @ mi.ScalarPoint3f(0.3 * far, 0.2 * far, 4 * far), target=place)
+    count = 16 if dr.is_jit_v(mi.Float) else 1
+    image = render(mi.load_dict({"type": "scene", "sensor": eye} | parts), count, max_depth=-1, rr_depth=1000)
+    assert image == pytest.approx(1, abs=1e-3)
 
 
 # Splitting -----------------------------------------------------------------------------------------------------
@@ -276,7 +307,7 @@ def test_what_cannot_be_is_refused_in_one_line(parameters, said, rgb_variant):
 def test_parameters_and_their_defaults_are_written_out(scalar_variant):
     names = ("max_depth", "rr_depth", "hide_emitters", "split_depth", "split_weight", "deterministic")
     names += ("caustics", "light_paths")
-    plain = "path", 0.25
+    plain = "auto", 0.25
     for parameters, values in (
         ({}, (-1, 5, False, 0, 0.01, False, *plain)),
         (
@@ -286,7 +317,7 @@ def test_parameters_and_their_defaults_are_written_out(scalar_variant):
         ({"max_depth": 0, "deterministic": True}, (0, 5, False, 64, 0.001, True, *plain)),
         ({"split_depth": 12, "split_weight": 0.0}, (-1, 5, False, 12, 0.0, False, *plain)),
         ({"split_depth": 64, "split_weight": 1 / 4096}, (-1, 5, False, 64, 1 / 4096, False, *plain)),
-        ({"caustics": "auto", "light_paths": 2}, (-1, 5, False, 0, 0.01, False, "auto", 2.0)),
+        ({"caustics": "lamp", "light_paths": 2}, (-1, 5, False, 0, 0.01, False, "lamp", 2.0)),
     ):
         lines = [f"  {name} = {value}," for name, value in zip(names, values, strict=True)]
         said = str(mi.load_dict({"type": "refract_path"} | parameters))
@@ -376,7 +407,7 @@ def test_an_edit_is_seen_whatever_calls(around, llvm_variant):
     """A black floor that turns grey."""
     floor = {"type": "rectangle", "to_world": PLACE().translate([0, 0, -2]).scale(9), "bsdf": BLACK}
     scene = glass_ball(floor=floor, spot={"type": "point", "position": [0, 4, 4], "intensity": 30.0})
-    method, params, means = within(around, max_depth=5), mi.traverse(scene), []
+    method, params, means = within(around, max_depth=5, caustics="path"), mi.traverse(scene), []
     for grey in (0.0, 0.5):
         params[parameter(params, "reflectance.value")] = grey
         params.update()

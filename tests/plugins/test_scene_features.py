@@ -247,7 +247,8 @@ CLOUDY = {"type": "sphere", "bsdf": GLASS, "interior": MEDIUM}
         (POINT, GLASS, {"floor": BLACK, "more": CLOUDY, "integrator": "volpath"}, {CAST}),
         # Only what is known is named.
         *((POINT, GLASS, {"integrator": name}, set()) for name in ("ptracer", "direct", "depth")),
-        (POINT, GLASS, {"integrator": "refract_path"}, {CAST}),
+        (POINT, GLASS, {"integrator": "refract_path", "caustics": "path"}, {CAST}),
+        (POINT, GLASS, {"integrator": "refract_path"}, {"L S+ D (S|D)* S E"}),
         *((POINT, GLASS, {"integrator": "moment", "calls": name}, {CAST}) for name in ("path", "refract_path")),
         (POINT, GLASS, {"integrator": "moment", "calls": "path", "max_depth": 2}, set()),
     ],
@@ -270,7 +271,8 @@ def test_what_is_missing_says_why_and_what_mends_it(scalar_variant):
     ("lamp", "bsdf"), [(POINT, None), (POINT, GLASS), (SUNLIGHT, CLEAR), (SPOT, HOLES), (BEAM, None)]
 )
 def test_what_is_predicted_is_black_and_a_tracer_from_the_lamp_finds_it(lamp, bsdf, integrator, scalar_variant):
-    scene, tracer = under_a_pane(lamp, bsdf, integrator), mi.load_dict({"type": "ptracer"})
+    by_path = {"caustics": "path"} if integrator == "refract_path" else {}
+    scene, tracer = under_a_pane(lamp, bsdf, integrator, **by_path), mi.load_dict({"type": "ptracer"})
     ours, theirs = np.array(mi.render(scene, spp=4)), np.array(mi.render(scene, spp=4000, integrator=tracer))
     assert theirs.mean() > 0
     assert ours.mean() == (0 if missing_light(scene) else pytest.approx(theirs.mean(), rel=0.1))
@@ -307,7 +309,7 @@ def test_what_is_missing_of_another_way_is_an_error(scalar_variant):
 
 def test_refract_path_warns_again_where_lamps_are_traced_no_more(logged, scalar_variant):
     scene = under_a_pane(POINT, GLASS)
-    method = mi.load_dict({"type": "refract_path", "caustics": "auto"})
+    method = mi.load_dict({"type": "refract_path"})
     cameras = [mi.load_dict(x) for x in (camera(4), camera(4, sample_border=True), camera(4))]
     for sensor in cameras:
         method.render(scene, sensor, spp=1)
@@ -317,9 +319,30 @@ def test_refract_path_warns_again_where_lamps_are_traced_no_more(logged, scalar_
 
 def test_refract_path_warns_once_a_scene_of_what_is_missing(logged, scalar_variant):
     for bsdf in (GLASS, GLASS, None):
-        scene = under_a_pane(POINT, bsdf, "refract_path")
+        scene = under_a_pane(POINT, bsdf, "refract_path", caustics="path")
         for seed in range(2):
             mi.render(scene, spp=1, seed=seed)
     warnings = [text for text in logged if "missing" in text]
     assert len(warnings) == 2
     assert all(text.startswith("refract_path: missing L S+ D (S|D)* E: light of PointLight") for text in warnings)
+
+
+# Rays that start beyond the glass -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("thickness", "place", "others", "thin"),
+    [
+        (1e-3, 12, {}, ""),
+        (1e-5, 12, {}, "'pane' is 1e-05 thick, and rays start 2.86e-05 beside its surface"),
+        (1e-5, 0, {}, ""),
+        # Beside a cylinder rays start as Mitsuba's do.
+        (1e-3, 12, {"pipe": {"type": "cylinder", "bsdf": GLASS}}, "'pane' is 0.001 thick, and rays start 0.00125"),
+        (1e-5, 12, {"bsdf": {"type": "conductor"}}, ""),
+    ],
+)
+def test_glass_that_rays_step_over_is_named(thickness, place, others, thin, scalar_variant):
+    at = PLACE().translate([place, 0, 0]).scale([1, 1, thickness / 2])
+    pane = {"type": "cube", "id": "pane", "to_world": at, "bsdf": others.get("bsdf", GLASS)}
+    found = needs(pane=pane, **{name: part for name, part in others.items() if name != "bsdf"}).thin
+    assert thin in found and bool(thin) == bool(found)

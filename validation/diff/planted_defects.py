@@ -86,7 +86,7 @@ def _black_inside(sample: Any, *args: Any) -> tuple[Any, Any]:
 
 
 def _swapped_lobes(sample: Any, ctx: Any, si: Any, sample1: Any, *args: Any) -> tuple[Any, Any]:
-    """Each lobe as often as the other should be, but where total reflection leaves one only."""
+    """Sample each lobe as often as the other should be, but where total reflection leaves one only."""
     reflected, r = sample(ctx, si, 0 * sample1, *args)
     transmitted, t = sample(ctx, si, 0 * sample1 + (1 - 2.0**-24), *args)
     choice = sample1 < reflected.pdf
@@ -173,7 +173,7 @@ def defect_rows(context: Context, name: str) -> list[Row]:
     clean = trials(name, TRIALS)
 
     def row(defect: str, camera: Camera) -> Row:
-        """Of renders with the seeds of the clean ones."""
+        """The row of a defect, from renders with the seeds of the clean ones."""
         spoilt = [replace(x, spoil=functools.partial(_renders, camera, seed)) for seed, x in clean.items()]
         return self_test.detection(defect, False, spoilt, name, context.variant)
 

@@ -51,7 +51,7 @@ MEGABYTE = 1e6
 
 @dataclass(frozen=True)
 class Size:
-    """Of the large images, the number of pairs in the folder of small ones, and the rounds."""
+    """The size of the large images, the number of pairs in the folder of small ones, and the rounds."""
 
     height: int
     width: int

@@ -172,7 +172,7 @@ def somewhere(rng: Rng) -> tuple[Pixels, float, float]:
 
 
 def patched(image: Pixels, x: float, y: float, side: int, colour: Pixels | float) -> Pixels:
-    """With a square of one colour around that place."""
+    """The image with a square of one colour around that place."""
     image = image.copy()
     left, top = int(x) - side // 2, int(y) - side // 2
     image[top : top + side, left : left + side] = colour

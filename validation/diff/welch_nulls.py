@@ -79,7 +79,7 @@ def drawn(rng: Rng, n: int, law: Callable[[Rng, tuple[int, ...]], Array]) -> tup
 
 
 def lognormal(rng: Rng, shape: tuple[int, ...]) -> Array:
-    """Of σ = 1.5."""
+    """Lognormal light of σ = 1.5."""
     return np.asarray(np.exp(1.5 * rng.standard_normal(shape, np.float32), dtype=np.float64))
 
 
@@ -194,7 +194,7 @@ def null_rows(light: str, quick: bool, pairs: int) -> list[Row]:
 
 
 def null_row(form: str, light: str, results: list[Comparison], setting: str = "") -> Row:
-    """Of pairs that are equal."""
+    """The row of pairs that are equal."""
     counts = {verdict: float(sum(x.verdict is verdict for x in results)) for verdict in Verdict}
     values = {"pairs": float(len(results)), "alarms": counts[Verdict.DIFFERENT]}
     values["undecided"] = counts[Verdict.INCONCLUSIVE]
@@ -203,7 +203,7 @@ def null_row(form: str, light: str, results: list[Comparison], setting: str = ""
 
 
 def at_most(count: int, probability: float) -> float:
-    """More of so many events come up with a probability of `limits.NULL_ALARM` only."""
+    """The number of events that is exceeded with a probability of `limits.NULL_ALARM` only."""
     return float(stats.binom.ppf(1 - limits.NULL_ALARM, count, probability))
 
 
@@ -241,7 +241,7 @@ def scene_rows(context: Context, pairs: int) -> list[Row]:
 
 
 def power_rows(pairs: int) -> list[Row]:
-    """In each pair one tile of normal noise is made brighter by what the pair without that says."""
+    """Rows of pairs, one tile of normal noise brighter by what the pair without that says."""
     threshold = stats.norm.isf(tile_statistics.sidak(FAMILY_ERROR, 2 * (16 + 1)) / 2)
     share = threshold / (threshold + stats.norm.isf(tile_statistics.MISSED))  # of what is seen with 99 %, with 50 %
     rows = []
@@ -260,7 +260,7 @@ def power_rows(pairs: int) -> list[Row]:
 
 
 def brighter(side: Any, by: float) -> Any:
-    """With one tile of the mean, which is 1, brighter by so much."""
+    """The side with one tile brighter by a share of the mean, which is 1."""
     if isinstance(side, list):
         return [brighter(x, by) for x in side]
     pixels = side.pixels.copy()
@@ -274,7 +274,7 @@ def seen(result: Comparison) -> bool:
 
 
 def summarise(rows: list[Row]) -> list[Row]:
-    """With a row of all pairs."""
+    """The rows, and one of all pairs."""
     mine = [row.values for row in rows if row.study == NAME and "alarms" in row.values]
     if not mine:
         return rows

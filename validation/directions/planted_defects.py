@@ -173,7 +173,7 @@ TERMS = {name: mutant.text for name, mutant in MUTANTS.items()} | {
 
 
 def tasks(context: Context) -> list[Task]:
-    """On single precision where it is compiled, else on what there is."""
+    """One task, in single precision where it is compiled, else in what there is."""
     every = running(context)
     setting = next((s for s in every if s.precision is np.float32), every[0])
     return [Task(f"planted defects: {setting.label}", functools.partial(rows, setting))]

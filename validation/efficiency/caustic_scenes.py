@@ -65,7 +65,7 @@ ZERO_SIZE: dict[str, Callable[[], Nodes]] = {
 
 
 def side_of(lamp: str) -> float:
-    """Of a lamp by its name, over its distance; 0 for lamps of no size."""
+    """The side of a lamp by its name, over its distance; 0 for lamps of no size."""
     return 0.0 if lamp in ZERO_SIZE else float(lamp.split()[-1])
 
 

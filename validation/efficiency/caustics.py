@@ -9,9 +9,9 @@ methods have the sampler `independent`, and as many samples. MSE × time is comp
 the whole image and where the caustic is seen: in pixels that see no glass, and have more than a quarter of their light
 by it. Where `path` has met no lamp its error is too small, so these ratios are upper bounds. What small lamps light
 through glass and is seen through glass again stays noise in all methods, and is not compared; the reference has that
-noise, too, so the MSE of a whole image with a very small lamp says little. *Noise by class*: whose paths make the noise
-that is left with small lamps. Of what is seen in glass L S+ E is what a floor leaves that is nearly black, L D (S|D)* S
-E has the noise of a point lamp, and L S+ D (S|D)* S E has the rest.
+noise, too, so the MSE of a whole image with a very small lamp says little. *Noise by class*: which paths make the
+noise that is left with small lamps. Of what is seen in glass, L S+ E is what is left over a nearly black floor,
+L D (S|D)* S E has the noise with a point lamp, and L S+ D (S|D)* S E has the rest.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ TERMS = {
 }
 # What is rendered: integrator settings, and the BSDF of glass. `ptracer` stands for the sum of two integrators.
 BY_CLASS = Method("path + ptracer", "ptracer", DIELECTRIC)
-METHODS = (BUILTIN, Method(OURS, OURS, PLUGIN), FROM_LAMPS, BY_CLASS)
+METHODS = (BUILTIN, Method(OURS, OURS, PLUGIN, {"caustics": "path"}), FROM_LAMPS, BY_CLASS)
 HOLDING = FROM_LAMPS, BY_CLASS  # the caustics of lamps of any size
 # Of a disk: the image is a caustic and nothing else.
 ENERGY = replace(FROM_LAMPS, parameters={"caustics": "lamp", "light_paths": 4.0}), BY_CLASS
@@ -185,7 +185,7 @@ def camera_of(scene: Any, method: Method, max_depth: int = DEPTH) -> Camera | Su
 
 
 def energy_rows(context: Context, body: str, lamp: str, methods: tuple[Method, ...] = ENERGY) -> list[Row]:
-    """Of each method: the power on the disk against the quadrature."""
+    """A row for each method: the power on the disk against the quadrature."""
     extent, rows = EXTENTS[context.profile.name], []
     setup, radius = caustic_energy.ON_AXIS[body, lamp]
     exact, step = caustic_energy.flux(setup, radius, BOUNDARIES)
@@ -224,7 +224,7 @@ class Reference:
 
 
 def reference(body: str, lamp: str, extent: Extent) -> Reference:
-    """By the sum of Mitsuba's two integrators."""
+    """The reference by the sum of Mitsuba's two integrators."""
     scene, black = (scenes.scene(body, lamp, bsdf, extent.resolution) for bsdf in (DIELECTRIC, scenes.BLACK))
     look = SumOfClasses(scene, DEPTH)
     renders = np.stack([look(extent.checked(body), seed=FIRST_REFERENCE + i)[0] for i in range(extent.renders)])

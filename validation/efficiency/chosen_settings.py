@@ -1,8 +1,8 @@
 """Settings that a pilot chooses: their error × time over that of the best by hand, and over Mitsuba's defaults.
 
-`mi-refract render --settings auto` measures a few candidates before it renders. Here its choice is rendered beside
-settings by hand, of which every other round says which have the least error × time, and the rounds between say how
-much that is: a least of many measured in the same rounds would be too small. All rounds have seeds of their own; the
+`mi-refract render --settings auto` measures a few candidates before it renders. Here its choice is rendered
+beside settings by hand. Every other round selects those with the least error × time, and the rounds between measure how
+much that is: the least of many would be too small in the rounds that select it. All rounds have seeds of their own; the
 error is the variance over them, as all settings have the same expected image. Times are those of whole images. The
 pilot's share of the render is included, its compilation not.
 """
@@ -138,7 +138,7 @@ def scene_file(name: str, bsdf: str, resolution: int, folder: Path) -> tuple[Pat
 
 
 def full(settings: Settings) -> Settings:
-    """With what is left to its default."""
+    """The settings, and the defaults of those that are not set."""
     every = {"sampler": "independent", "integrator": "path"} | settings
     return (DEFAULTS if every["integrator"] == OURS else {}) | every
 

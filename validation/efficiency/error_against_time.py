@@ -93,7 +93,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class Measured:
-    """Of one subject at one number of samples: seconds and figures by round; the images at the most samples."""
+    """Seconds and figures by round of one subject at one number of samples; its images at the most samples."""
 
     seconds: list[float]
     figures: dict[str, list[float]]
@@ -209,7 +209,7 @@ def best_sampler(path: Path, resolution: int, extent: Extent, seeds: int = 3) ->
 def measure(
     cameras: Mapping[str, Shoot], references: np.ndarray, spps: tuple[int, ...], count: int, figures_of: Figures
 ) -> Found:
-    """By subject and samples per pixel. An image a round of each; every second round in the reverse order.
+    """`Measured` by subject and samples per pixel. A round has an image of each, every second one in reverse order.
 
     `count`: of rounds; the first image of each is thrown away: it compiles. `figures_of`: as `errors`.
     """
@@ -243,7 +243,7 @@ def errors(image: np.ndarray, mean: np.ndarray, own: np.ndarray) -> dict[str, fl
 
 
 def _values(subject: Subject, builtins: list[Subject], found: Found, references: np.ndarray) -> dict[str, float]:
-    """At the most samples per pixel. `builtins`: path + dielectric with `independent`, and with the best sampler."""
+    """Values at the most samples per pixel. `builtins`: path + dielectric with `independent`, and the best sampler."""
     spp = max(found[subject.name])
     test, default, best = (found[s.name][spp] for s in (subject, *builtins))
     same = default if subject == builtins[0] else best
@@ -265,7 +265,7 @@ def _values(subject: Subject, builtins: list[Subject], found: Found, references:
 
 
 def goals_of(subjects: list[Subject], found: Found, only_glass: bool) -> dict[str, dict[str, float]]:
-    """By subject: for the best of our methods at equal time, on glass alone the best that splits; and for the time."""
+    """Goals by subject: of the best of our methods at equal time, on glass alone of the best that splits; of time."""
     ours = [s for s in subjects if s.method.integrator == OURS]
     rivals = [s for s in ours if s.method.parameters or not only_glass]
     goals: dict[str, dict[str, float]] = {s.name: {} for s in ours}

@@ -141,7 +141,7 @@ KNOBS = {
 
 
 def measure(job: Job) -> dict[str, float]:
-    """In this process: seconds of the first image, of later ones and of the one after an edit; bytes held at most."""
+    """Measured in this process: seconds of the first image, later ones, one after an edit; most bytes held."""
     import mitsuba as mi
 
     import mi_refract  # noqa: F401  its plugins
@@ -224,7 +224,7 @@ def knob_rows(context: Context, knob: str, methods: tuple[Method, ...] = METHODS
 
 
 def _size_rows(context: Context, knob: str, size: int, methods: tuple[Method, ...]) -> list[Row]:
-    """In the order of the methods, of which the first is the built-in; medians over processes that take turns."""
+    """Rows in the order of the methods, the built-in first; medians over processes that take turns."""
     full = context.profile.name == "full"
     resolution, renders = (128, 5) if full else (64, 3)
     jobs = {m.name: Job(context.variant, knob, size, m.name, resolution, 16, renders) for m in methods}

@@ -67,7 +67,7 @@ class Bench:
         return {key: U * size for key, size in sizes.items()}
 
     def effects(self, changes: Callable[[Path], Answers]) -> Iterator[tuple[float, Answers]]:
-        """Of each value: how many roundings of at most 1u are in its size, and size/NUDGE |change|, by answer.
+        """For each value: how many roundings of at most 1u are in its size, and size/NUDGE |change|, by answer.
 
         `changes`: by answer, of a path with one value moved by NUDGE.
         """
@@ -79,7 +79,7 @@ class Bench:
 
     @functools.cached_property
     def bounds(self) -> Answers:
-        """Of the norm of each answer's deviation, N × A: roundings, and what was printed."""
+        """Bounds of the norm of each answer's deviation, N × A: roundings, and what was printed."""
         system = self.system
         exact = system.off(system.path())
 
@@ -105,7 +105,7 @@ class Bench:
         return 1 / max(float(ratio.max()) for ratio in ratios)
 
     def traced(self, plugin: str, spawned: bool = False) -> Path:
-        """By Mitsuba, in its present variant. `spawned`: rays go on as Mitsuba would have them."""
+        """The path by Mitsuba, in its present variant. `spawned`: rays go on as Mitsuba would have them."""
         import mitsuba as mi
 
         system = self.system
@@ -183,7 +183,7 @@ def _ellipsoid(plugin: str) -> list[dict[str, Any]]:
 
 
 def _double_gauss(plugin: str) -> list[dict[str, Any]]:
-    """Each surface is a whole sphere, or a rectangle, in a scene of its own whose origin is the vertex.
+    """A scene for each surface, a whole sphere or a rectangle, whose origin is the vertex.
 
     The side to which its normal points is the outside: of a sphere that bulges towards the light, the light's.
     """

@@ -131,7 +131,7 @@ def need(number: StandardNumber) -> str:
 
 
 def measure(numbers: Sequence[StandardNumber], samples: int = 0) -> dict[str, Measured]:
-    """In the present variant, by name. `samples`: of light through a pile of plates."""
+    """The numbers in the present variant, by name. `samples`: of light through a pile of plates."""
     made: dict[str, Measured] = {}
     groups: dict[tuple[Any, ...], list[StandardNumber]] = {}
     for number in numbers:
@@ -159,7 +159,7 @@ Answers = list[tuple[Any, Any]]  # value and bound of each number of a group
 
 
 def transmittances(group: Sequence[StandardNumber], samples: int) -> Answers:
-    """Of one plate or pile at the angles of all numbers: what its integrator sees behind it of a lamp of radiance 1."""
+    """One plate or pile at the angles of all numbers: what its integrator sees of a lamp of radiance 1 behind it."""
     import mitsuba as mi
 
     noise = noisy(group[0])
@@ -183,7 +183,7 @@ def transmittances(group: Sequence[StandardNumber], samples: int) -> Answers:
 
 
 def _radiances(scene: Any, d: np.ndarray) -> np.ndarray:
-    """By the scene's integrator, of rays along d (3 × N) that meet the first plate on the axis."""
+    """Radiances by the scene's integrator, of rays along d (3 × N) that meet the first plate on the axis."""
     import mitsuba as mi
 
     o, sampler = np.array([[0], [0], [-THICKNESS / 2]]) - THICKNESS * d, mi.load_dict({"type": "independent"})
@@ -274,7 +274,7 @@ def _read(case: Bench, readings: Readings) -> Answers:
 
 
 def read_bounds(case: Bench, readings: Readings) -> list[float]:
-    """By Hoeffding's inequality: Σ effect²/count is that of the squares of single roundings."""
+    """Bounds by Hoeffding's inequality: Σ effect²/count is that of the squares of single roundings."""
     exact, squares = case.system.path(), [0.0] * len(readings)
 
     def changes(moved: optical_systems.Path) -> optical_systems.Answers:
@@ -287,7 +287,7 @@ def read_bounds(case: Bench, readings: Readings) -> list[float]:
 
 
 def prism_bench(number: StandardNumber) -> Bench:
-    """By the index, or by the name of the glass and the wavelength."""
+    """The bench of a prism, by the index, or by the name of the glass and the wavelength."""
     medium, nm = number.medium or number.given["n"], number.given.get("nm")
     return Bench(table.prism([number]), lambda plugin: bench.prism(plugin, medium), nm)
 
@@ -340,7 +340,7 @@ def brewster(group: Sequence[StandardNumber], samples: int) -> Answers:
 
 
 def critical(group: Sequence[StandardNumber], samples: int) -> Answers:
-    """From where on nothing is transmitted."""
+    """The angle from which on nothing is transmitted."""
     import mitsuba as mi
 
     (number,) = group

@@ -102,7 +102,7 @@ def achromat_row() -> Row:
 
 
 def back_focal_distance(lens: Lens, n: Sequence[float]) -> float:
-    """From the last surface: a ray at height 1 along the axis, refracted by n' u' = n u − y c (n' − n)."""
+    """The distance from the last surface: a ray at height 1 along the axis, refracted by n' u' = n u − y c (n' − n)."""
     y, u = 1.0, 0.0
     for i, (c, thickness) in enumerate(zip(lens.curvatures, (*lens.thicknesses, 0.0), strict=True)):
         u = (n[i] * u - y * c * (n[i + 1] - n[i])) / n[i + 1]

@@ -60,7 +60,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def rows(context: Context, spec: str) -> list[Row]:
-    """Of the index, of the BSDF, and of a formula in each setting with float64."""
+    """Rows of the index, of the BSDF, and of a formula in each setting with float64."""
     row = functools.partial(Row, NAME, SUBJECTS.get(spec, spec))
     medium, count = media.parse(spec), context.profile.rays
     missing = context.variants.get(SPECTRAL, "not in this wheel")

@@ -139,7 +139,7 @@ def volpath_rows(context: Context, name: str) -> list[Row]:
 
 
 def slab_rows(context: Context) -> list[Row]:
-    """Without reflections: the index is that of the surroundings. Sides of 1 to 4 units, σ of 0.05 to 8."""
+    """The row of a slab without reflections: its index is that outside. Sides of 1 to 4 units, σ of 0.05 to 8."""
     film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}, "component_format": "float32"}
     place = mi.ScalarTransform4f().look_at([0.1, 0.2, 5], [0.1, 0.2, 4], [0, 1, 0]).scale(1e-3)
     straight = {"type": "orthographic", "to_world": place, "film": film | {"pixel_format": "rgb"}}

@@ -81,7 +81,7 @@ class Case:
 
     @functools.cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """Of the errors of points and directions, over u."""
+        """Bounds of the errors of points and directions, over u."""
         return growth(self.exact, self.segments)
 
     @property
@@ -122,7 +122,7 @@ def by_setting(
 
 
 def setting_rows(context: Context, setting: Setting) -> list[Row]:
-    """Of every scene in a setting: in every colour of a file, or three of its wavelengths; on scalar arrays in one."""
+    """Rows of every scene in a setting: in every colour, or three of its wavelengths; on scalar arrays in one."""
     rays = SCALAR_RAYS if setting.is_scalar else RAYS[context.profile.name]
     if context.profile.quick:
         return [row([case_of(FOLDER / f"{SHOWN}.toml", rays)], setting)]
@@ -166,7 +166,7 @@ def row(cases: list[Case], setting: Setting, formula: str | None = None) -> Row:
 
 
 def budgets(setting: Setting) -> dict[str, float]:
-    """In float32 what rounding may have grown to, in float64 equality, too."""
+    """The budgets: what rounding may have grown to, in float64 equality, too."""
     exact = {DIFFERENCE: limits.PLANAR_EQUAL, WRONG_PATH: 0.0} if setting.precision is np.float64 else {}
     return GROWN | exact
 

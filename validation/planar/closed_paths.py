@@ -65,7 +65,7 @@ class Closed:
 
     @property
     def bound(self) -> Array:
-        """Of that error, over u."""
+        """The bound of that error, over u."""
         point, direction = map(self.case.exact.last, self.case.bounds)
         return direction if self.directions is not None else point / self.reach + direction
 

@@ -122,7 +122,7 @@ def _case(curve: Curve, origins: Array, directions: Array, depth: int, reflect: 
 
 
 def _to_vertices(curves: Sequence[Curve], reflections: int, turn: float) -> Iterator[Case]:
-    """From places near an outline to each vertex: from within, reflected so often, and from outside."""
+    """Rays from places near an outline to each vertex: from within, reflected so often, and from outside."""
     for curve in (curve.mapped(affine(turn)) for curve in curves):
         middle = curve.vertices.mean(0)
         places = curve.outline(5) - middle

@@ -118,7 +118,7 @@ def _row(setting: Setting, run: Run, brute: Run | None) -> Row:
 
 
 def _tracer(setting: Setting, method: str, size: int) -> tuple[Tracer, float]:
-    """And the seconds that it took."""
+    """The tracer, and the seconds that it took."""
     segments, precision, start = field(size).segments, np.dtype(setting.precision).name, time.perf_counter()
     tracer = Tracer(segments, precision=precision, backend=setting.backend, method=method)
     return tracer, time.perf_counter() - start

@@ -33,7 +33,7 @@ class Ball(NamedTuple):
     radius: float
 
     def span(self, p: Array, d: Array) -> tuple[Array, Array]:
-        """From and to which distance rays from `p` along `d` (N × 2) are inside; from infinity where they miss."""
+        """The distances between which rays from `p` along `d` (N × 2) are inside; from infinity where they miss."""
         q = p - [0, self.z]
         along, root = -(q * d).sum(1), self.radius**2 - (q[:, 0] * d[:, 1] - q[:, 1] * d[:, 0]) ** 2
         half = np.sqrt(np.maximum(root, 0))
@@ -78,7 +78,7 @@ class Setup:
 
 
 class Part(NamedTuple):
-    """Of N rays what leaves after so many boundaries: where it meets the floor (N), its share of the s and p waves."""
+    """What leaves of N rays after so many boundaries: where it meets the floor (N), its share of the s and p waves."""
 
     x: Array
     shares: Array  # 2 × N
@@ -171,7 +171,7 @@ def lens_profile(rings: int, bottom: float = LENS_HEIGHT, scale: float = 1.0) ->
 
 
 def power_by_radiance(resolution: int) -> Array:
-    """By pixel of a square image from VIEWPOINT: power on the disk over radiance, in m² sr.
+    """Power on the disk over radiance, in m² sr, by pixel of a square image from VIEWPOINT.
 
     A pixel is a square of side a at distance 1; rays through it, d = x + y + forward, meet the floor at t d, in an area
     of a² t²/|d_y|.

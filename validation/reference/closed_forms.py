@@ -25,13 +25,13 @@ def refracted(incidence: Any, index: Any) -> Any:
 
 
 def lateral_shift(incidence: Any, index: Any) -> Any:
-    """By how much of its thickness a plane-parallel slab moves a ray aside: sin(i − r)/cos r."""
+    """The share of its thickness by which a plane-parallel slab moves a ray aside: sin(i − r)/cos r."""
     within = refracted(incidence, index)
     return np.sin(incidence - within) / np.cos(within)
 
 
 def deviation(incidence: Any, apex: Any, index: Any) -> Any:
-    """Of a ray in the principal section of a prism: i + asin(n sin(A − r)) − A."""
+    """The deviation of a ray in the principal section of a prism: i + asin(n sin(A − r)) − A."""
     return incidence + np.arcsin(index * np.sin(apex - refracted(incidence, index))) - apex
 
 
@@ -41,7 +41,7 @@ def least_deviated(apex: Any, index: Any) -> Any:
 
 
 def deflection(incidence: Any, index: Any, order: Any) -> Any:
-    """Of a ray through a ball with m reflections within: mπ + 2i − 2(m + 1) r."""
+    """The deflection of a ray through a ball with m reflections within: mπ + 2i − 2(m + 1) r."""
     return order * HALF_TURN + 2 * incidence - 2 * (order + 1) * refracted(incidence, index)
 
 

@@ -39,7 +39,7 @@ START = -20.0  # where its rays begin
 
 @dataclass(frozen=True)
 class Meeting:
-    """Of the ray with a surface: its height y, the sine of the ray before it and of the normal, all of them signed."""
+    """A ray that meets a surface: its height y, the sine of the ray before it and of the normal, all of them signed."""
 
     y: float
     sine: float
@@ -56,7 +56,7 @@ class Crossing:
 
 
 def crossing(lens: Lens, indices: Sequence[float], height: float, start: float) -> Crossing:
-    """Of a ray from z = `start` along the axis at `height`; `indices`: the medium before each surface and the last."""
+    """The crossing of a ray from z = `start` along the axis at `height`; `indices`: before each surface, and last."""
     with localcontext() as context:
         context.prec = DIGITS
         place, meetings = _traced(lens, indices, height, start)
@@ -89,7 +89,7 @@ class Rounding:
 
 
 def bound(lens: Lens, exact: Crossing, rounding: Rounding, u: float) -> float:
-    """Of the error of a crossing: each error at its worst, times how far it moves the crossing, and the last formula.
+    """The bound of a crossing: each error at its worst, times how far it moves the crossing, and the last formula.
 
     A distance to a sphere is off by 8u of what it is computed from, up to the radius.
     """

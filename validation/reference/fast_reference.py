@@ -62,7 +62,7 @@ class Screen:
         return np.array(error) / self.roundoff, np.array(wrong)
 
     def bound(self, budget: Budget) -> np.ndarray:
-        """In u, the bound of every ray's chord, as if it were unit to the last bit."""
+        """The bound of every ray's chord in u, as if it were unit to the last bit."""
         k, transmitted = self.rays.k.astype(np.float64), np.array(self._transmitted)
         return np.asarray(budget.chord(self.roundoff, k, self.cos_t, transmitted, cos_i=self.cos_i) / self.roundoff)
 

@@ -43,12 +43,12 @@ NUDGE = 1e-8  # mm, radians, and share of an index
 
 
 def dot(x: Array, y: Array) -> Array:
-    """Of vectors (… × 3), as … × 1."""
+    """Dot products of vectors (… × 3), as … × 1."""
     return np.asarray((x * y).sum(-1, keepdims=True))
 
 
 def length(x: Array) -> Array:
-    """Of vectors (… × 3), as … × 1."""
+    """Lengths of vectors (… × 3), as … × 1."""
     return np.sqrt(dot(x, x))
 
 
@@ -140,7 +140,7 @@ class Boundary:
 
 @dataclass(frozen=True)
 class Path:
-    """Of N rays at B boundaries: places, and unit directions behind each, B × N × 3."""
+    """N rays at B boundaries: places, and unit directions behind each, B × N × 3."""
 
     places: Array
     directions: Array
@@ -164,7 +164,7 @@ class System:
     def walk(
         self, refract: Refract = snell, moved: Moved = lambda j, what, x, axis: x
     ) -> Iterator[tuple[Array, Array, Array, Array, Array]]:
-        """At each boundary: where the rays come from, place, normal, directions before and behind.
+        """For each boundary: where the rays come from, place, normal, directions before and behind.
 
         `moved` may disturb the values "into", "normal", "index", "onward" and "place" of each boundary; −1: the start.
         """
@@ -195,7 +195,7 @@ class System:
         return Path(np.array(places), np.array(directions))
 
     def path(self, refract: Refract = snell, moved: Moved = lambda j, what, x, axis: x) -> Path:
-        """By Snell's law in extended precision, or by a formula, in the coordinates of the system."""
+        """The path by Snell's law in extended precision, or by a formula, in the coordinates of the system."""
         steps = list(self.walk(refract, moved))
         return Path(np.array([p for _, p, _, _, _ in steps]), np.array([unit(b) for _, _, _, _, b in steps]))
 
@@ -295,7 +295,7 @@ def ball(far: bool = False) -> Ball:
 
 
 def _miss(path: Path, focus: Array) -> Answers:
-    """From the last line to a point."""
+    """How far the last line misses a point."""
     to, b = focus - path.places[-1], path.directions[-1]
     return {"miss": (to - dot(to, b) * b)[:, None]}
 

@@ -42,7 +42,7 @@ class Retraced:
         return np.asarray((self.hits >= 0).sum(1))
 
     def last(self, x: Array) -> Array:
-        """Of N × (D+1) values, those of the last legs."""
+        """The values of the last legs, of N × (D+1)."""
         return x[np.arange(len(x)), self.met]
 
     @property
@@ -169,7 +169,7 @@ class Curves:
         return nearest, np.where(np.isfinite(nearest), hit, -1)
 
     def _arc_distance(self, p: Array, d: Array, own: Array, parted: Array) -> Array:
-        """Of the nearer root ahead, of those on the arc."""
+        """The distance of the nearer root ahead, of those on the arc."""
         # τ of the points in the triangle of each arc, and its change along the rays.
         t1, t2 = ((self.slopes[i] * (p - self.start[self.arcs])).sum(-1) for i in (1, 2))
         a, b = np.stack([1 - t1 - t2, t1, t2]), np.stack([(slope * d).sum(-1) for slope in self.slopes])

@@ -230,7 +230,7 @@ def critical(n: Any) -> Any:
 
 
 def retardation(n: Any, incidence: Any, reflections: float) -> Any:
-    """Of `reflections` total ones: tan(δ/2) = cosθ √(sin²θ − n⁻²)/sin²θ each, in degrees."""
+    """Degrees of retardation by `reflections` total reflections, tan(δ/2) = cosθ √(sin²θ − n⁻²)/sin²θ each."""
     angle, n = _radians(incidence), np.longdouble(n)
     sine2 = np.sin(angle) ** 2
     return _degrees(2 * reflections * np.arctan(np.cos(angle) * np.sqrt(sine2 - 1 / n**2) / sine2))
@@ -272,13 +272,13 @@ def _lens() -> Any:
 
 
 def behind_the_lens(path: optical_systems.Path, ray: float, slope: float) -> Any:
-    """Of a ray's path, behind the last surface: y in mm or, where `slope` is 1, dy/dz."""
+    """y in mm of a ray's path behind the last surface or, where `slope` is 1, dy/dz."""
     y, b = path.places[-1][round(ray), 1], path.directions[-1][round(ray)]
     return b[1] / b[2] if slope else y
 
 
 def lens(ray: float, slope: float) -> Any:
-    """By Snell's law, in extended precision, of a ray through the double Gauss."""
+    """The same of a ray through the double Gauss, by Snell's law in extended precision."""
     return behind_the_lens(_lens(), ray, slope)
 
 

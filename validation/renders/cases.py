@@ -63,7 +63,7 @@ def study(
 
 
 def variants(context: Context) -> tuple[str, str, str]:
-    """Of the run's backend: RGB, spectral and polarised."""
+    """The RGB, spectral and polarised variants of the run's backend."""
     family = context.variant.removesuffix("rgb")
     return context.variant, f"{family}spectral", f"{family}spectral_polarized"
 

@@ -108,7 +108,7 @@ def core(bsdf: Nodes, glass: Nodes = GLASS, **more: Any) -> Nodes:
 
 
 def plane(bsdf: Nodes, light: Nodes | None = None, **more: Nodes) -> Nodes:
-    """It fills the view."""
+    """A scene of a plane that fills the view."""
     wide = mi.ScalarTransform4f().rotate([1, 0, 0], -30).scale(9)
     return scene(20, plane={"type": "rectangle", "to_world": wide, "bsdf": bsdf}, light=light or sky(), **more)
 
@@ -289,7 +289,7 @@ class Images:
             self.set(dr.opaque(mi.Float, self.case.at))
 
     def image(self, method: Any, seed: int) -> np.ndarray:
-        """Without derivatives."""
+        """The image without derivatives."""
         return np.array(mi.render(self.scene, integrator=method, spp=self.case.spp, seed=seed), float)
 
     def differences(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -311,7 +311,7 @@ class Images:
             return np.array(method.render_forward(self.scene, params=x, spp=self.case.spp, seed=seed), float)
 
     def backward(self, method: Any, weights: np.ndarray, seed: int) -> float:
-        """That of the mean of the weighted pixels."""
+        """The derivative of the mean of the weighted pixels."""
         grad_in = mi.TensorXf((weights / weights.size).astype(np.float32))
         with self.attached() as x:
             method.render_backward(self.scene, params=x, grad_in=grad_in, spp=self.case.spp, seed=seed)
@@ -319,7 +319,7 @@ class Images:
 
 
 def integrator(name: str, **parameters: int) -> Any:
-    """With these parameters, to a depth of 6 without Russian roulette; no guiding, whose octree takes seconds."""
+    """An integrator with these parameters, depth 6, no Russian roulette; no guiding, whose octree takes seconds."""
     guiding = {"guiding": "none"} if name == "prb_projective" else {}
     return mi.load_dict({"type": name, "max_depth": 6, "rr_depth": 100} | guiding | parameters)
 

@@ -151,7 +151,7 @@ def scene(bsdfs: Iterable[Nodes], variant: str) -> Any:
 
 
 def measured(view: Any, bsdfs: int, method: Nodes, spp: int, samples: float, seed: int) -> Any:
-    """By BSDF and cell, the mean and its squared standard error, of two renders with as many pixels as needed."""
+    """Mean and squared standard error by BSDF and cell, of two renders with as many pixels as needed."""
     tall, pixels = -(-bsdfs * len(CELLS) // WIDE), max(8, round((samples / 2 / spp) ** 0.5))
     film = {"type": "hdrfilm", "width": WIDE * pixels, "height": tall * pixels, "rfilter": {"type": "box"}}
     place = mi.ScalarTransform4f().look_at([WIDE / 2, tall / 2, 3], [WIDE / 2, tall / 2, 0], [0, 1, 0])

@@ -70,7 +70,7 @@ def tasks(context: Context) -> list[Task]:
 def operations(
     plugin: str, parameters: dict[str, Any] | None = None, differentiate: bool = False, asked: Any = None
 ) -> float:
-    """Of a kernel that computes all of what `sample` returns, of directions and samples in memory.
+    """The operations of a kernel that computes all that `sample` returns, of directions and samples in memory.
 
     `asked`: the context; by default both lobes, in radiance mode, by an integrator that follows no wavelengths.
     """

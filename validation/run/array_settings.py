@@ -37,7 +37,7 @@ class Setting:
 
     @classmethod
     def of(cls, backend: str, precision: str) -> Setting:
-        """That of a backend that runs, in "float32" or "float64"."""
+        """The setting of a backend that runs, in "float32" or "float64"."""
         name = {"float32": "Array3f", "float64": "Array3f64"}[precision]
         return cls(backend, np.dtype(precision).type, getattr(getattr(dr, backend), name))
 
@@ -99,7 +99,7 @@ def settings(context: Context) -> list[Setting]:
 
 
 def running(context: Context) -> list[Setting]:
-    """Those that run here."""
+    """The settings that run here."""
     return [setting for setting in settings(context) if setting.vector is not None]
 
 

@@ -58,7 +58,7 @@ SCALAR_PROFILES = {
 
 
 def profiles(variant: str) -> dict[str, Profile]:
-    """Those for a variant of Mitsuba, by name."""
+    """The profiles for a variant of Mitsuba, by name."""
     return SCALAR_PROFILES if variant.startswith("scalar") else PROFILES
 
 
@@ -85,7 +85,7 @@ class Context:
 
     @property
     def comparable(self) -> list[Path]:
-        """Those of `scenes` that the built-in can render, too."""
+        """The `scenes` that the built-in can render, too."""
         return [path for path in self.scenes if not beyond_builtin(path)]
 
 

@@ -31,7 +31,7 @@ class Method:
     parameters: dict[str, float | str] = field(default_factory=dict)
 
     def plugin(self, max_depth: int) -> dict[str, Any]:
-        """For `mi.load_dict`; without Russian roulette, as in the scene files."""
+        """The dictionary for `mi.load_dict`; without Russian roulette, as in the scene files."""
         return {"type": self.integrator, "max_depth": max_depth, "rr_depth": max_depth, **self.parameters}
 
 

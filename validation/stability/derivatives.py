@@ -83,7 +83,7 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
 
 
 def drawn_rows(context: Context) -> list[Row]:
-    """Those with budgets, and those that are not run."""
+    """The rows with budgets, and those that are not run."""
     every = [row for setting in settings(context) for row in setting_rows(context, setting)]
     return [row for row in every if row.budgets or not row.values]
 
@@ -198,7 +198,7 @@ def binned(given: Inputs, y: np.ndarray) -> list[tuple[float, float]]:
 
 
 def reflectance_row(given: Inputs, setting: Setting) -> Row:
-    """Of exact cosines: those of the rays, rounded."""
+    """The row of exact cosines: those of the rays, rounded."""
     number = dr.value_t(dr.diff_array_t(setting.vector))
     k: Any = given.rays.k
     cos_i: Any = given.certified.cos_i.astype(setting.precision)

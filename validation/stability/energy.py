@@ -75,7 +75,7 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
 
 
 def drawn_rows(context: Context) -> list[Row]:
-    """Those that depend on the seed: in two regimes the cosine and k do not."""
+    """The rows that depend on the seed: in two regimes the cosine and k do not."""
     rows = [row for setting in running(context) for row in setting_rows(context, setting)]
     rows = [row for row in rows if "seed" in row.replay and row.case not in ("tangential", "exactly critical")]
     return [*rows, furnace_row(context, "refract")]
@@ -173,7 +173,7 @@ def power_errors(
 
 
 def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray, replay: dict[str, Any]) -> Row:
-    """In the local frame, where `a` is unit only up to rounding. The ratio is a double, as in the plugin."""
+    """The row in the local frame, where `a` is unit only up to rounding. The ratio is a double, as in the plugin."""
     azimuth = np.random.default_rng(seeds.current(SEED)).uniform(0, 2 * np.pi, len(k))
     sine = np.sqrt((1 - cos_i.astype(float)) * (1 + cos_i.astype(float)))
     a: Any = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cos_i], axis=1).astype(setting.precision)
@@ -287,7 +287,7 @@ def plugin_rows(context: Context) -> list[Row]:
 
 
 def furnace_row(context: Context, plugin: str) -> Row:
-    """Both weights are 1 where nothing is tinted, so the sum is R + T: right to an ulp of 1.
+    """The row of R + T: both weights are 1 where nothing is tinted, so the sum is right to an ulp of 1.
 
     Directions are uniform, and as many more graze the surface.
     """

@@ -86,11 +86,11 @@ class Layers:
     end: float
 
     def normal(self, p: np.ndarray) -> np.ndarray:
-        """Of the boundary at `p`, outward."""
+        """The outward normal of the boundary at `p`."""
         return np.array([p[0], p[1], 0.0]) / math.hypot(p[0], p[1]) if self.round else np.array([0.0, 1.0, 0.0])
 
     def distance(self, p: np.ndarray, d: np.ndarray, boundary: int, inward: bool) -> float:
-        """From `p` along `d` to a boundary, met from outside where `inward`; infinite where there is none."""
+        """Distance from `p` along `d` to a boundary, met from outside where `inward`; infinite where there is none."""
         if not 0 <= boundary < len(self.boundaries):
             return math.inf
         if not self.round:
@@ -172,7 +172,7 @@ def _read(scene: str) -> Layers:
     root = ET.parse(SCENES / f"{scene}.xml").getroot()
 
     def values(path: str, name: str = "value") -> list[float]:
-        """Of every element within those of the layers, by its path from the root."""
+        """The values of every element within those of the layers, by its path from the root."""
         named = [x for x in root.iterfind(path.partition("/")[0]) if (x.get("id") or "").startswith(prefixes)]
         return [float(y.attrib[name]) for x in named for y in x.iterfind(path.partition("/")[2])]
 
@@ -204,7 +204,7 @@ class Bundle:
     shown: int
 
     def exact(self, layers: Layers, offset: float = OFFSET) -> list[Path]:
-        """Their exact paths through layers, with Mitsuba's ray offset or another one."""
+        """The exact paths through layers, with Mitsuba's ray offset or another one."""
         rays = zip(self.origins, self.directions, self.media, strict=True)
         return [exact_path(layers, p, d, int(medium), offset) for p, d, medium in rays]
 
@@ -279,7 +279,7 @@ def trace(scene: Any, layers: Layers, rays: Bundle, steps: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Deviation:
-    """Of one traced path at the middle of each of its segments, which no ray offset separates from the exact one."""
+    """One traced path at the middle of each segment, which no ray offset separates from the exact one."""
 
     along: np.ndarray
     direction: np.ndarray
@@ -345,7 +345,7 @@ def path_rows(context: Context, layers: Layers) -> list[Row]:
 
 
 def _curves(rays: Bundle, found: dict[str, list[Deviation]]) -> dict[str, dict[str, list[tuple[float, float]]]]:
-    """By case and plugin: along the path that is shown, and at the end of every path."""
+    """Curves by case and plugin: along the path that is shown, and at the end of every path."""
     entry = 1e3 * np.hypot(rays.directions[:, 1], rays.directions[:, 0] if rays.media.any() else 0)
     curves: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for plugin, parts in found.items():

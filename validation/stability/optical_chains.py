@@ -44,7 +44,7 @@ PROBLEM = "the problem"
 
 
 def definition(make: Callable[[], optical_systems.System]) -> str:
-    """Of an optical system, in words."""
+    """An optical system in words."""
     return " ".join((getattr(make, "func", make).__doc__ or "").split())
 
 
@@ -90,7 +90,7 @@ def extent(context: Context, setting: Setting) -> Extent:
 
 
 def settings(context: Context) -> list[Setting]:
-    """Those of the directions, and scalar float32 for Mitsuba alone: Dr.Jit's own scalars compute in double."""
+    """The settings of the directions, and scalar float32 for Mitsuba alone: Dr.Jit's own scalars are double."""
     return [Setting("scalar", np.float32, dr.scalar.Array3f, mitsuba="scalar_rgb"), *backends.settings(context)]
 
 
@@ -119,7 +119,7 @@ def drawn_rows(context: Context) -> list[Row]:
 
 
 def subjects(context: Context, setting: Setting) -> dict[str, Subject]:
-    """Those of the setting that run there."""
+    """The subjects of the setting that run there."""
     return {name: subject for name, subject in setting.subjects.items() if name not in absent(context, setting)}
 
 

@@ -85,7 +85,7 @@ def revolved(name: str, profile: np.ndarray, material: Glass | Diffuse) -> Mesh:
 
 
 def luxcore(plain: PlainScene, lamp: str, folder: Path) -> list[Image]:
-    """Its bidirectional tracer."""
+    """Images by LuxCore's bidirectional tracer."""
     kind = {POINT: f'type = "point"\nposition = 0 {TOP} 0', PARALLEL: 'type = "sharpdistant"\ndirection = 0 -1 0'}[lamp]
 
     def edit(scene: Path) -> None:
@@ -99,7 +99,7 @@ def luxcore(plain: PlainScene, lamp: str, folder: Path) -> list[Image]:
 
 
 def radiance(plain: PlainScene, lamp: str, folder: Path) -> list[Image]:
-    """Its photon map of caustics."""
+    """Images by Radiance's photon map of caustics."""
     kind = {
         POINT: f"void light lamp 0 0 3 1e4 1e4 1e4\nlamp sphere place 0 0 4 0 {TOP} 0 0.01\n",
         PARALLEL: "void light lamp 0 0 3 1 1 1\nlamp source place 0 0 4 0 1 0 0.5\n",
@@ -119,7 +119,7 @@ def radiance(plain: PlainScene, lamp: str, folder: Path) -> list[Image]:
 
 
 def povray(plain: PlainScene, lamp: str, folder: Path) -> list[Image]:
-    """Its photons; the disk is one of its own, for the export has no diffuse surfaces. All renders are alike."""
+    """Images by POV-Ray's photons, all alike. The disk is written here: the export has no diffuse surfaces."""
     disk, *glass = plain.meshes
     kind = {
         POINT: f"<0, {TOP}, 0> rgb 1e6 fade_distance 0.01 fade_power 2",

@@ -149,7 +149,7 @@ def planar() -> tuple[np.ndarray, np.ndarray]:
 
 
 def wavelengths() -> tuple[float, ...]:
-    """Those of the file, in nm."""
+    """The wavelengths of the file, in nm."""
     return scene_file.load(FILE).light.wavelengths
 
 

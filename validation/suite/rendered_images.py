@@ -226,7 +226,7 @@ def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
 
 @functools.cache
 def reference(scene: str, size: Size) -> list[Image]:
-    """Of this plugin, in the present variant."""
+    """Images by this plugin, in the present variant."""
     renders = by_plugin(SCENES[scene].load(size.resolution), SCENES[scene].more * size.spp)
     return [image_file.named(f"{PLUGIN} {scene} {i}", pixels) for i, pixels in enumerate(renders)]
 

@@ -2,7 +2,7 @@
 
 The textbook's formula answers rays of the regime in which a mistake matters, once as it is and once with the mistake.
 An answer within the bound passes as "as good as a textbook's formula"; it is right if it is the exact refraction of
-inputs within the roundings that this formula itself is off by, at most; a mistake is seen where some answer is beyond.
+inputs within the roundings that this formula itself is off by, at most; a mistake is seen if some answer is not.
 """
 
 from __future__ import annotations

@@ -103,7 +103,7 @@ def mixed_rows(context: Context) -> list[Row]:
 
 
 def compared(one: list[Image], two: list[Image], size: Size) -> tuple[Comparison, dict[str, float]]:
-    """By Welch's t-test, also of pixels, for those of both are independent; and the numbers of the row."""
+    """The comparison by Welch's t-test, pixels too, as both sides' are independent; and the numbers of the row."""
     found = compare("welch", one, two, family_error=limits.SUITE_ERROR, resolution=size.wanted, pixels="yes")
     return found, measured(found, *(np.stack([image.pixels for image in side]) for side in (one, two)))
 

@@ -11,12 +11,11 @@ boundary reflects, ray by ray. Its share of p gives Brewster's angle: the law's 
 amplitudes, the retardation. Diffuse transmittances, polarised slabs and absorbing glass are asked of nobody: nothing
 here answers with them.
 
-The bound of a ray's number is that of the textbook formula: each answer is exact for inputs within 8u, and inputs and
-answers are rounded, 2u; the sum of what each may do to the number; u = 2⁻²⁴ or 2⁻⁵³. Of the critical angle, 32u, what
-the program is known to give up, and a step of the grid. Of a share or a phase, 10u of 1, and of what 10u of the cosine
-and of the index do to it. Of an index, half a unit of the last digit that the maker
-prints. Of an image, Student's t over eight seeds, which chance exceeds once in ten thousand runs, and a half float's
-rounding.
+Bounds, u = 2⁻²⁴ or 2⁻⁵³: for rays, the sum of what the roundings of the textbook formula may do to the number, 8u of
+each answer and 2u of inputs and answers; for the critical angle 32u, what the program is known to give up, and a step
+of the grid; for a share or a phase 10u of 1, and what 10u of the cosine and of the index do to it; for an index half a
+unit of the last digit that the maker prints; for an image Student's t over eight seeds, which chance exceeds once in
+ten thousand runs, and the rounding of a half float.
 """
 
 from __future__ import annotations
@@ -98,7 +97,7 @@ def of_kind(*kinds: str) -> list[StandardNumber]:
 
 
 def plates() -> list[StandardNumber]:
-    """Those that renderers without polarisation can be asked."""
+    """The numbers that renderers without polarisation can be asked."""
     straight = [x for x in of_kind("transmittance") if not (x.given["incidence"] or "absorbance" in x.given)]
     return [*straight, *of_kind(IMAGES)]
 
@@ -224,7 +223,7 @@ def together(systems: Sequence[Optics], refract: Callable[[Any, Any, Any], Any])
 
 
 def conditions(optics: Optics, reading: Callable[[optical_systems.Path], Any]) -> Any:
-    """By how many u a reading of each ray is off if a, n, k and b are off by u at each boundary, to first order."""
+    """How many u a reading of each ray is off if a, n, k and b are off by u at each boundary, to first order."""
     exact, total = reading(optics.path()), 0.0
     for j, boundary in enumerate(optics.boundaries):
         for what in (*["into"] * (j == 0), "normal", "index", "onward") if boundary.k is not None else ():

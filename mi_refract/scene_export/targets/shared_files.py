@@ -97,7 +97,7 @@ def outward(plain: PlainScene) -> PlainScene:
 
 
 def outermost_index(plain: PlainScene) -> float:
-    """That of the medium around all glass, all of it `outward`; 1 without glass."""
+    """The index of the medium around all glass, all of it `outward`; 1 without glass."""
     glasses = [(mesh.vertices[:, 0].max(), mesh.material) for mesh in plain.meshes if isinstance(mesh.material, Glass)]
     return max(glasses, key=lambda glass: glass[0])[1].ext_ior if glasses else 1.0
 

@@ -85,4 +85,5 @@ def _line(system: System) -> str:
     does = " and ".join(word for word, can in able.items() if can) or "exports"
     state = "absent" if environments.absent(system) else "installed"
     size = system.install.megabytes if system.install else 0
-    return f"{system.name:10} {state:9} {does:16} {size:5} MB  {system.source}  [{system.licence}]"
+    name = f"{system.name:{max(map(len, SYSTEMS))}}"
+    return f"{name} {state:9} {does:16} {size:5} MB  {system.source}  [{system.licence}]"

@@ -59,7 +59,7 @@ def by_script(
     edit: Callable[[Path], None] = unedited,
     more: Sequence[str] = (),
 ) -> list[Image]:
-    """By the script that is exported with the scene, after `edit(folder)` of its files, with `more` options."""
+    """Images by the script that is exported with the scene, after `edit(folder)` of its files, with `more` options."""
     targets.write(plain, target, folder / "scene")
     edit(folder / "scene")
     program = [environments.python(SYSTEMS[target]), "render.py", "--spp", str(spp), "--out", str(folder)]
@@ -68,7 +68,7 @@ def by_script(
 
 
 def by_command(system: System, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-    """By the command of the system's own file."""
+    """Images by the command of the system's own file."""
     if system.images is None:
         raise ValueError(f"{system.name}: no [images]; expected a system that renders by a command")
     targets.write(plain, system.images.export, folder / "scene")
@@ -81,7 +81,7 @@ def by_command(system: System, plain: PlainScene, folder: Path, spp: int, seeds:
 def radiance_images(
     plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int], edit: Callable[[Path], None] = unedited
 ) -> list[Image]:
-    """By rtrace with the options of README.txt, after `edit(folder)` of the exported files."""
+    """Images by rtrace with the options of README.txt, after `edit(folder)` of the exported files."""
     targets.write(plain, "radiance", folder / "scene")
     edit(folder / "scene")
     sizes = map(str, (plain.camera.width, plain.camera.height, spp, *seeds))
@@ -125,7 +125,7 @@ def _three(mode: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence
 
 
 def _cycles_gltf(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-    """By Blender's importer of glTF, with the settings of the export to Cycles."""
+    """Images by Blender's importer of glTF, with the settings of the export to Cycles."""
     targets.write(plain, "cycles", folder / "cycles")
     _write_gltf(plain, folder / "scene")
     words = map(
@@ -136,13 +136,13 @@ def _cycles_gltf(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]
 
 
 def _write_gltf(plain: PlainScene, folder: Path) -> None:
-    """With facets for normals, as the other side has them."""
+    """Write glTF with facets for normals, as the other side has them."""
     meshes = tuple(dataclasses.replace(mesh, normals=None) for mesh in plain.meshes)
     targets.write(dataclasses.replace(plain, meshes=meshes), "gltf", folder)
 
 
 def _mitsuba(integrator: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-    """By another integrator of Mitsuba's, with Mitsuba's `dielectric`, in this process and the present variant."""
+    """Images by another integrator of Mitsuba, with `dielectric`, in this process and the present variant."""
     targets.write(plain, "mitsuba", folder / "scene")
     parameters = {"bsdf": "dielectric", "integrator": integrator}
     camera = Camera(scene_files.load_scene(folder / "scene" / "scene.xml", parameters))
