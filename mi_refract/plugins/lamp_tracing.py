@@ -168,10 +168,7 @@ def targets(scene: Scene) -> list[Sphere]:
 
 def bounding_sphere(shape: Shape) -> Sphere:
     """About the middle of its bounding box; with an infinite radius, or NaN, where its bounds are not known."""
-    box = shape.bbox()
-    if shape.class_name() == "Mesh":  # the box of one that Mitsuba has merged from others leaves out rectangles
-        vertices, _ = mitsuba_mesh.arrays(shape)
-        box = mi.ScalarBoundingBox3f(*([*map(float, ends(0))] for ends in (vertices.min, vertices.max)))
+    box = mitsuba_mesh.bounding_box(shape)
     half = [float(x) / 2 for x in box.extents()]
     radius = half[0] if shape.class_name() == "Sphere" else math.hypot(*half)
     return Sphere(tuple(map(float, box.center())), radius * MARGIN)

@@ -17,7 +17,7 @@ from collections.abc import Iterable
 import drjit as dr
 import mitsuba as mi
 
-from mi_refract.numerics import Interaction, Mask, Ray, Shape, Variant, Vector3
+from mi_refract.numerics import Interaction, Mask, Ray, Shape, Variant, Vector3, mitsuba_mesh
 
 # The points of hits on these are known that well: on `QUADRICS` as measured on processors; CUDA has code of its own.
 MESHES = {"BlenderMesh", "Cube", "Mesh", "OBJMesh", "PLYMesh", "SerializedMesh"}
@@ -28,7 +28,7 @@ MITSUBA, OURS = 1500, 32
 def extent_of(shapes: Iterable[Shape]) -> float:
     """E in powers of two, so that similar scenes have the same kernel; ∞ where rays start as Mitsuba's do."""
     shapes = list(shapes)
-    boxes = [shape.bbox() for shape in shapes]
+    boxes = [mitsuba_mesh.bounding_box(shape) for shape in shapes]
     exact = MESHES if "cuda" in str(mi.variant()) else MESHES | QUADRICS
     if not boxes or not all(box.valid() for box in boxes) or not {s.class_name() for s in shapes} <= exact:
         return math.inf
@@ -41,7 +41,7 @@ def too_thin(shape: Shape, extent: float) -> str:
 
     `extent`: E, as in `spawn_ray`.
     """
-    box = shape.bbox()
+    box = mitsuba_mesh.bounding_box(shape)
     if not box.valid() or shape.class_name() in ("Disk", "Rectangle"):
         return ""
     u, place = 2.0**-24, max(abs(float(x)) for corner in (box.min, box.max) for x in corner)

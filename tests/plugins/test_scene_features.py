@@ -123,6 +123,20 @@ def test_plugins_that_take_either_number_have_been_tried(name, bsdf, scalar_vari
     assert ("both_numbers" in facts(part={"type": "sphere", "bsdf": bsdf})) == both
 
 
+def test_shapes_that_mitsuba_merges_are_as_large_as_before(rgb_variant):
+    shapes = {
+        "pane": {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 30).scale(1e4)},
+        "cube": {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.01)},
+    }
+    glass = {"type": "ref", "id": "glass"}
+    parts = {"type": "scene", "glass": {"type": "dielectric"}} | {
+        name: shapes[name] | {"bsdf": glass} for name in shapes
+    }
+    merged, apart = (mi.load_dict(parts, optimize=merge) for merge in (True, False))
+    assert len(merged.shapes()) < len(apart.shapes())
+    assert inspect(merged).delta_extent == inspect(apart).delta_extent
+
+
 @pytest.mark.parametrize("kind", ["bsplinecurve", "linearcurve"])
 def test_a_curve_of_glass_is_an_error(kind, llvm_variant, tmp_path):
     (tmp_path / "fibre.txt").write_text("\n".join(f"{x} 0 0 0.3" for x in range(4)))
