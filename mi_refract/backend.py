@@ -1,11 +1,11 @@
-"""Which Mitsuba variants really run here, and with which libLLVM.
+"""Find the Mitsuba variants that run on this machine, and the libLLVM that they need.
 
-Mitsuba's wheel brings no libLLVM, and not every libLLVM works: Dr.Jit refuses LLVM 14, and LLVM 15 and 16 end the
-process (no exception) in the first kernel with a minimum in it. So each library is first tried in a process of its own,
-and the answer is remembered in `$XDG_CACHE_HOME/mi_refract/backend.json`.
+Mitsuba's wheel does not contain libLLVM, and not every libLLVM works: Dr.Jit rejects LLVM 14, and LLVM 15 and 16 abort
+the process (without an exception) in the first kernel that computes a minimum. So each library is first tried in a
+separate process, and the result is stored in `$XDG_CACHE_HOME/mi_refract/backend.json`.
 
 Dr.Jit loads a libLLVM when it is imported, and no other one later. So call `activate` before Dr.Jit is imported; this
-module needs only the standard library. After that another library needs a new process:
+module needs only the standard library. Afterwards, a change of the library needs a new process, as started by
 `activate(may_restart=True)`, which is for commands.
 """
 
@@ -27,12 +27,12 @@ from pathlib import Path
 
 from .io.safe_files import temporary_folder
 
-CHOICE = "DRJIT_LIBLLVM_PATH"  # where Dr.Jit looks first
-OWN_CHOICE = "MI_REFRACT_LIBLLVM"  # set to the same value where the choice was ours, not the user's
-WINDOWS = "LLVM-C.dll" if sys.platform == "win32" else ""  # what a libLLVM is called there
+CHOICE = "DRJIT_LIBLLVM_PATH"  # the library that Dr.Jit tries first
+OWN_CHOICE = "MI_REFRACT_LIBLLVM"  # has the same value if this module, not the user, chose the library
+WINDOWS = "LLVM-C.dll" if sys.platform == "win32" else ""  # file name of libLLVM on Windows
 TIMEOUT = 120.0  # seconds; a probe takes 0.4 s of one idle core
 
-# Last line of the output: "works", or the reason why not. 67 numbers: full vectors and a remainder.
+# Prints "works" or fails with the reason in the last line. 67 numbers are full vectors and a remainder.
 _PROBE = """
 import ctypes, importlib, math, sys
 try:
@@ -66,7 +66,7 @@ print("works")
 
 @dataclass(frozen=True)
 class Backend:
-    """One way to run Dr.Jit. `reason` is why it is not usable, or what it runs on; one line."""
+    """One way to run Dr.Jit. `reason`: one line, why it is not usable, or what it runs on."""
 
     name: str  # "scalar", "llvm", "cuda"
     usable: bool
@@ -76,26 +76,26 @@ class Backend:
 
 @dataclass(frozen=True)
 class Library:
-    """A libLLVM and what is wrong with it; "" where it works."""
+    """A libLLVM and its defect, "" if it works."""
 
     path: str
     defect: str
 
     @property
     def works(self) -> bool:
-        """Whether nothing is wrong with it."""
+        """Whether the library has no defect."""
         return not self.defect
 
 
 def detect() -> dict[str, Backend]:
-    """The backends scalar, llvm, cuda, and whether they run in this process. Never raises; asks once a process."""
+    """The backends scalar, llvm and cuda, and whether they run in this process. Never raises; cached per process."""
     return {"scalar": Backend("scalar", True, "always there"), "llvm": llvm(), "cuda": cuda()}
 
 
 def usable_variants() -> dict[str, str | None]:
-    """Each variant of the installed Mitsuba: None if it runs here, else the reason in one line. Imports Mitsuba."""
+    """For each variant of the installed Mitsuba None if it runs here, else the reason in one line. Imports Mitsuba."""
     backends = detect()
-    _announce(backends["llvm"])
+    _set_library(backends["llvm"])
     import mitsuba as mi
 
     needed = {variant: backends[variant.partition("_")[0]] for variant in mi.variants()}
@@ -103,26 +103,26 @@ def usable_variants() -> dict[str, str | None]:
 
 
 def activate(preferred: str | None = None, *, may_restart: bool = False) -> str:
-    """Set a Mitsuba variant that runs here, register our plugins in it, and return its name.
+    """Set a Mitsuba variant that runs here, register this package's plugins in it, and return its name.
 
-    That is `preferred`, or without it llvm_ad_rgb where that runs, else scalar_rgb. ValueError, in one line, for a
+    The variant is `preferred`; by default llvm_ad_rgb if it runs here, else scalar_rgb. ValueError, in one line, for a
     variant that Mitsuba does not have or that cannot run here. `may_restart`: call `restart_if_needed` first.
     """
     if may_restart:
         restart_if_needed()
-    here = llvm()
-    _announce(here)
+    cpu = llvm()
+    _set_library(cpu)
     import mitsuba as mi
 
-    import mi_refract  # noqa: F401  its plugins join every variant set from here on
+    import mi_refract  # noqa: F401  registers its plugins in every variant that is set afterwards
 
     if preferred is None:
-        preferred = "llvm_ad_rgb" if here.usable else "scalar_rgb"
+        preferred = "llvm_ad_rgb" if cpu.usable else "scalar_rgb"
     elif preferred not in mi.variants():
         raise ValueError(f"variant {preferred!r}: unknown; expected {', '.join(_running())}")
     elif not preferred.startswith("scalar_") and (reason := usable_variants()[preferred]):
         raise ValueError(f"variant {preferred!r} cannot run here: {reason}; expected {', '.join(_running())}")
-    # Mitsuba looks for plugins in its own folder first; else it would run `plugins/sphere.so` of the working folder.
+    # Mitsuba must search its own folder for plugins first, not load `plugins/sphere.so` of the working folder.
     own, resolver = str(Path(mi.__file__).parent), mi.file_resolver()  # type: ignore[operator]  # a class to its stubs
     if str(next(iter(resolver))) != own:
         resolver.prepend(own)
@@ -135,48 +135,52 @@ def _running() -> list[str]:
 
 
 def advice() -> str:
-    """What to install to get more variants; one line."""
+    """Why a group of variants does not run and what to install for it; one line."""
     missing = [f"the {b.name}_* variants are missing: {b.reason}" for b in detect().values() if not b.usable]
     return missing[0] if missing else "nothing is missing"
 
 
 def summary() -> str:
     """The library that the CPU's variants run on; one line."""
-    here = llvm()
-    return f"llvm_* variants run on {here.reason}" if here.usable else f"only scalar_* variants run: {here.reason}"
+    cpu = llvm()
+    return f"llvm_* variants run on {cpu.reason}" if cpu.usable else f"only scalar_* variants run: {cpu.reason}"
 
 
 # libLLVM -------------------------------------------------------------------------------------------------------
 
 
 def libraries() -> list[Library]:
-    """Every libLLVM found here, tried, the highest version first; only the user's, if DRJIT_LIBLLVM_PATH is set."""
+    """Every libLLVM on this machine with its defect, in the order of `candidates`; only the user's, if one is set."""
     chosen = _users_choice()
     return [_try(path) for path in ([chosen] if chosen else candidates())]
 
 
 def candidates() -> list[str]:
-    """Every libLLVM on this machine, the highest version first; before all others the one that is loaded, if any."""
-    names: list[str] = []
+    """The paths of every libLLVM on this machine, the highest version first; a library that is loaded comes first."""
+    paths: list[str] = []
     ldconfig = shutil.which("ldconfig", path=os.pathsep.join([os.environ.get("PATH", ""), "/sbin", "/usr/sbin"]))
     if ldconfig:
         listing = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, check=False).stdout
-        names += re.findall(r"=> (\S*/libLLVM\S*)$", listing, re.MULTILINE)
+        paths += re.findall(r"=> (\S*/libLLVM\S*)$", listing, re.MULTILINE)
     folders = [*os.environ.get("LD_LIBRARY_PATH", "").split(":"), f"{sys.prefix}/lib", "/usr/lib", "/usr/lib64"]
     folders += ["/usr/lib/*-linux-gnu", "/usr/lib/llvm*/lib*", "/usr/lib/llvm/*/lib*", "/usr/local/lib*"]
     folders += ["/usr/local/llvm*/lib*", "/opt/homebrew/opt/llvm*/lib", "/usr/local/opt/llvm*/lib"]
     for folder in folders:
         if folder.startswith("/"):
-            names += map(str, Path("/").glob(f"{folder[1:]}/libLLVM*"))
-    if WINDOWS:  # where Dr.Jit looks itself
-        names += [str(x) for folder in os.environ["PATH"].split(os.pathsep) if (x := Path(folder, WINDOWS)).is_file()]
-    loaded, paths = _loaded() or set(), set(map(os.path.realpath, names))
-    versioned = [(path in loaded, version, path) for path in paths if (version := _version(path)) is not None]
+            paths += map(str, Path("/").glob(f"{folder[1:]}/libLLVM*"))
+    if WINDOWS:  # Dr.Jit itself searches PATH
+        paths += [str(x) for folder in os.environ["PATH"].split(os.pathsep) if (x := Path(folder, WINDOWS)).is_file()]
+    loaded = _loaded() or set()
+    versioned = []
+    for path in set(map(os.path.realpath, paths)):
+        version = _version(path)
+        if version is not None:
+            versioned.append((path in loaded, version, path))
     return [path for _, _, path in sorted(versioned, reverse=True)]
 
 
 def _version(path: str) -> tuple[int, ...] | None:
-    """The version in a file's name: (19, 1) of libLLVM.so.19.1, (15,) of libLLVM-15.so.1; None for another file."""
+    """The version in a file name: (19, 1) for libLLVM.so.19.1, (15,) for libLLVM-15.so.1; None if it is no libLLVM."""
     name = re.fullmatch(r"libLLVM(?:-(\d[\d.]*))?\.(?:so|dylib)(?:\.(\d[\d.]*))?", Path(path).name)
     if name is None:
         return () if Path(path).name == WINDOWS else None
@@ -195,19 +199,19 @@ def _users_choice() -> str | None:
 
 @functools.cache
 def llvm() -> Backend:
-    """Dr.Jit on the CPU, compiled: the best libLLVM that works. `library` without `usable`: it needs a new process."""
+    """Dr.Jit on the CPU with the best libLLVM that works. `library` without `usable`: it needs a new process."""
     chosen = _users_choice()
     defects = []
     for path in [chosen] if chosen else candidates():
         library = _try(path)
         if library.works:
             loaded = _loaded() if "drjit" in sys.modules else None
-            # A path without a folder is looked up by the dynamic linker, so only its name can be compared.
+            # The dynamic linker finds the folder of a path without one, so only its name can be compared.
             same = [os.path.realpath(path) == x if "/" in path else Path(x).name.startswith(path) for x in loaded or ()]
             if loaded is None or any(same):
                 return Backend("llvm", True, _title(path), path)
-            holds = ", ".join(sorted(map(_title, loaded))) or "no libLLVM"
-            reason = f"Dr.Jit was imported with {holds}; start Python with {CHOICE}={path}"
+            imported = ", ".join(sorted(map(_title, loaded))) or "no libLLVM"
+            reason = f"Dr.Jit was imported with {imported}; start Python with {CHOICE}={path}"
             return Backend("llvm", False, reason, path)
         defects.append(f"{CHOICE}={path}: {library.defect}" if chosen else f"{_title(path)}: {library.defect}")
     install = "apt-get install libllvm19" if shutil.which("apt-get") else "install LLVM 17 or newer"
@@ -216,7 +220,7 @@ def llvm() -> Backend:
 
 
 def _loaded() -> set[str] | None:
-    """The libLLVM files mapped into this process; None where the system does not tell."""
+    """The libLLVM files loaded in this process; None if the system does not list them."""
     try:
         maps = Path("/proc/self/maps").read_text()
     except OSError:
@@ -224,53 +228,53 @@ def _loaded() -> set[str] | None:
     return {os.path.realpath(path) for path in re.findall(r"(/\S*)$", maps, re.MULTILINE) if _version(path) is not None}
 
 
-def _announce(backend: Backend) -> None:
-    """Tell Dr.Jit, if it is not imported yet, which library to load."""
+def _set_library(backend: Backend) -> None:
+    """Set the library that Dr.Jit will load, unless Dr.Jit is imported already or the user chose one."""
     if backend.usable and backend.library and "drjit" not in sys.modules and not _users_choice():
         os.environ[CHOICE] = os.environ[OWN_CHOICE] = backend.library
 
 
 def restart_if_needed() -> None:
-    """Make Dr.Jit use the libLLVM that works; for commands.
+    """For commands: make Dr.Jit use the libLLVM that works.
 
-    Where Dr.Jit was imported with another one already, start this process's command line again, and do not return.
+    If Dr.Jit was imported with another one already, run this process's command line again, and do not return.
     """
-    here = llvm()
-    _announce(here)
-    # Where it was set already and did not help, go on without.
-    if here.usable or here.library is None or os.environ.get(CHOICE) == here.library:
+    cpu = llvm()
+    _set_library(cpu)
+    # If the library was set already and Dr.Jit did not load it, continue without it.
+    if cpu.usable or cpu.library is None or os.environ.get(CHOICE) == cpu.library:
         return
-    os.environ[CHOICE] = os.environ[OWN_CHOICE] = here.library
+    os.environ[CHOICE] = os.environ[OWN_CHOICE] = cpu.library
     sys.stdout.flush()
     sys.stderr.flush()
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
-# Trying --------------------------------------------------------------------------------------------------------
+# Probes --------------------------------------------------------------------------------------------------------
 
 
 @functools.cache
 def cuda() -> Backend:
-    """Dr.Jit on an NVIDIA GPU, and Mitsuba's ray tracing on it. Not remembered: drivers come and go."""
+    """Dr.Jit on an NVIDIA GPU, and Mitsuba's ray tracing on it. Not stored in the file, as drivers change."""
     defect, _ = _probe("cuda", {})
     return Backend("cuda", not defect, defect or "NVIDIA driver and OptiX")
 
 
 def _try(path: str) -> Library:
-    """Try one libLLVM, or remember how it went: the answer for an unchanged file, Dr.Jit and CPU does not change."""
+    """Try one libLLVM, or return the stored result if the file, Dr.Jit and the CPU have not changed."""
     try:
         state = Path(path).stat()
     except OSError as error:
         if "/" in path:
             return Library(path, (error.strerror or "cannot be read").lower())
         state = None
-    # The remembered defects by key; a file that is missing or not ours is an empty memory.
+    # The stored defects by key; a missing or invalid file counts as empty.
     try:
-        known = json.loads(_cache_file().read_text())
+        stored = json.loads(_cache_file().read_text())
     except (OSError, ValueError, RuntimeError):
-        known = None
-    known = {key: x for key, x in known.items() if isinstance(x, str)} if isinstance(known, dict) else {}
-    # What decides, besides the library: Dr.Jit, the CPU's instruction sets, and the probe itself.
+        stored = None
+    stored = {key: x for key, x in stored.items() if isinstance(x, str)} if isinstance(stored, dict) else {}
+    # The result depends on the library, on Dr.Jit, on the CPU's instruction sets, and on the probe itself.
     try:
         drjit = importlib.metadata.version("drjit")
     except importlib.metadata.PackageNotFoundError:
@@ -281,17 +285,17 @@ def _try(path: str) -> Library:
         flags = None
     machine = f"drjit {drjit}, {zlib.crc32((_PROBE + (flags[0] if flags else '')).encode()):08x}"
     key = state and f"{os.path.realpath(path)}, {state.st_mtime_ns}, {state.st_size}, {machine}"
-    if key in known:
-        return Library(path, known[key])
+    if key in stored:
+        return Library(path, stored[key])
     defect, lasting = _probe("llvm", {CHOICE: path})
     if key and lasting:
-        known[key] = defect
-        # Replaced in one step. Where it cannot be written, the next process tries again.
+        stored[key] = defect
+        # Replace the file in one step. If it cannot be written, the next process tries the library again.
         with contextlib.suppress(OSError, RuntimeError):
             _cache_file().parent.mkdir(parents=True, exist_ok=True)
             temporary = _cache_file().with_name(f"backend.json.{os.getpid()}")
             try:
-                temporary.write_text(json.dumps(dict(list(known.items())[-50:]), indent=1))
+                temporary.write_text(json.dumps(dict(list(stored.items())[-50:]), indent=1))
                 temporary.replace(_cache_file())
             finally:
                 temporary.unlink(missing_ok=True)
@@ -299,13 +303,13 @@ def _try(path: str) -> Library:
 
 
 def _probe(name: str, environment: dict[str, str]) -> tuple[str, bool]:
-    """(defect, lasting) of a backend, tried in a process of its own. A lasting defect would be found again."""
+    """(defect, lasting) of a backend, tried in a separate process. A lasting defect would occur again."""
     with temporary_folder() as folder:
-        # An empty kernel cache: a kernel on disk would not be compiled.
+        # With an empty kernel cache, so that the kernels are compiled.
         own = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "DRJIT_CACHE_DIR": str(folder)}
         command = [sys.executable, "-c", _PROBE, name]
         try:
-            done = subprocess.run(
+            result = subprocess.run(
                 command,
                 env=os.environ | own | environment,
                 cwd=folder,
@@ -320,27 +324,27 @@ def _probe(name: str, environment: dict[str, str]) -> tuple[str, bool]:
             return f"a tiny kernel took longer than {TIMEOUT:.0f} s", False
         except OSError as error:
             return f"no process could be started: {error.strerror}", False
-    if done.returncode < 0:
-        lasting = done.returncode not in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT)
-        name = {s.value: s.name for s in signal.Signals}.get(-done.returncode, f"signal {-done.returncode}")
+    if result.returncode < 0:
+        lasting = result.returncode not in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT)
+        name = {s.value: s.name for s in signal.Signals}.get(-result.returncode, f"signal {-result.returncode}")
         return f"ends the process in Dr.Jit's kernels ({name})", lasting
-    if done.returncode == 0 and done.stdout.endswith("works\n"):
+    if result.returncode == 0 and result.stdout.endswith("works\n"):
         return "", True
-    # The line that says most: Dr.Jit's own if it refused the library, else the last.
-    lines = [line.strip() for line in done.stderr.splitlines() if line.strip()] or ["no answer"]
+    # Report Dr.Jit's own message if it rejected the library, else the last line.
+    lines = [line.strip() for line in result.stderr.splitlines() if line.strip()] or ["no answer"]
     if "libcuda.so.1: cannot open" in lines[-1]:
         return "no NVIDIA driver: libcuda.so.1 not found", True
     if lines[-1] != "refused":
         return lines[-1][:200], True
     # "jit_find_library(): Unable to load "x": x: invalid ELF header!", "jit_llvm_init(): ... too old. The Dr.Jit ..."
-    said = next((line for line in lines[:-1] if name in line or name == "llvm"), "no message")
-    said = re.sub(r'^(\w+\(\): )?(Unable to load "[^"]*": [^:]*: )?', "", said)
-    return f"refused by Dr.Jit: {said.split('. ')[0].rstrip('.! ')[:200]}", True
+    message = next((line for line in lines[:-1] if name in line or name == "llvm"), "no message")
+    message = re.sub(r'^(\w+\(\): )?(Unable to load "[^"]*": [^:]*: )?', "", message)
+    return f"refused by Dr.Jit: {message.split('. ')[0].rstrip('.! ')[:200]}", True
 
 
-# Remembering ---------------------------------------------------------------------------------------------------
+# Stored results ------------------------------------------------------------------------------------------------
 
 
 def _cache_file() -> Path:
-    """RuntimeError where the user has no home directory."""
+    """The file of stored results. RuntimeError if the user has no home directory."""
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "mi_refract" / "backend.json"

@@ -1,12 +1,13 @@
-"""Fixtures for pytest that compare images: `assert_image_equal` and `assert_image_unbiased`; and two options.
+"""Fixtures for pytest that compare images, `assert_image_equal` and `assert_image_unbiased`, and two options.
 
-In the conftest.py of the tests: `pytest_plugins = ["mi_refract.pytest_plugin"]`. It is no entry point, because that
-would load Mitsuba, and with it a libLLVM, into every pytest run of the environment, before any conftest.py could choose
-one. An image is a file, or an array, H × W × C or H × W. A reference that does not exist fails the test.
+Put this into the conftest.py of the tests: `pytest_plugins = ["mi_refract.pytest_plugin"]`. The plugin is no entry
+point, because an entry point would load Mitsuba, and with it a libLLVM, into every pytest run of the environment,
+before a conftest.py could choose one. An image is a file or an array, H × W × C or H × W. A missing reference fails the
+test.
 
-`--mi-refract-accept` copies images that are not equal over their references, as `mi-refract accept` does, where both
-are files, or the reference is an EXR file and the image an array. `--mi-refract-report OUT.html` writes the page of
-`mi-refract diff` about all comparisons. Otherwise nothing is written.
+`--mi-refract-accept` copies images that are not equal over their references, as `mi-refract accept` does, if both are
+files, or if the reference is an EXR file and the image an array. `--mi-refract-report OUT.html` writes the page of
+`mi-refract diff` about all comparisons. Without these options nothing is written.
 """
 
 from __future__ import annotations
@@ -26,17 +27,16 @@ if TYPE_CHECKING:
     from mi_refract.image_diff.results import Result, Results
     from mi_refract.io.image_file import Image as ReadImage
 
-Image = Any  # the path of a file, or what numpy makes an array of
-Renderer = Callable[[int], Image]  # of a seed
+Image = Any  # the path of a file, or anything that NumPy converts to an array
+Renderer = Callable[[int], Image]  # the argument: seed
 RUNS = 8
-REFERENCE_SEED = 1 << 16  # the first of a rendered reference: both sides must not share a seed
-
+REFERENCE_SEED = 1 << 16  # the first seed of a rendered reference: the sides must not share a seed
 
 ACCEPT, REPORT = "--mi-refract-accept", "--mi-refract-report"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """The options."""
+    """Add the options."""
     group = parser.getgroup("mi-refract", "images")
     group.addoption(ACCEPT, action="store_true", help="copy images that are not equal over their references")
     group.addoption(REPORT, type=Path, metavar="OUT.html", help="write a page about the images that are not equal")
@@ -44,13 +44,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @dataclass(frozen=True)
 class Compared:
-    """What the tests of a session have compared, for the page."""
+    """The comparisons of a session, for the page."""
 
     page: Page
     results: list[Result] = field(default_factory=list)
 
     def add(self, result: Result) -> None:
-        """One more result, of whose images the page keeps what it shows."""
+        """Add a result; the page keeps the images that it shows."""
         from mi_refract.image_diff.folders import without_images
         from mi_refract.image_diff.results import FAILED
 
@@ -59,7 +59,7 @@ class Compared:
         self.results.append(without_images(result))
 
     def as_results(self, root: Path) -> Results:
-        """The results, with commands that run tests."""
+        """Return the results, whose commands run pytest."""
         from mi_refract.image_diff.results import Results
 
         class TestResults(Results):
@@ -74,7 +74,7 @@ COMPARED = pytest.StashKey[Compared]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Begin the page. UsageError where the tests run in several processes."""
+    """Create the page. UsageError if the tests run in several processes, or if the page cannot be written."""
     if path := config.getoption(REPORT, None):
         from mi_refract.image_diff.html_report import Page
         from mi_refract.io.safe_files import writable
@@ -95,9 +95,9 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 @pytest.fixture
 def assert_image_equal(request: pytest.FixtureRequest) -> Callable[..., Comparison]:
-    """`assert_image_equal(test, reference, method="auto", **options)`: the verdict must be equal.
+    """`assert_image_equal(test, reference, method="auto", **options)`: fail unless the images are equal.
 
-    The methods and their options are those of `mi-refract diff`. Inconclusive fails, too. Returns the comparison.
+    The methods and their options are those of `mi-refract diff`. "Inconclusive" fails, too. Returns the comparison.
     """
 
     def check(test: Image, reference: Image, method: str = "auto", **options: Any) -> Comparison:
@@ -111,11 +111,11 @@ def assert_image_equal(request: pytest.FixtureRequest) -> Callable[..., Comparis
 
 @pytest.fixture
 def assert_image_unbiased(request: pytest.FixtureRequest) -> Callable[..., Comparison]:
-    """`assert_image_unbiased(render, reference, runs=8, seed=0, **options)`: the means of renders must be equal.
+    """`assert_image_unbiased(render, reference, runs=8, seed=0, **options)`: fail unless the means are equal.
 
-    `render(seed)` returns an image; it is called with `runs` seeds from `seed` on. `reference` is a folder of
-    independent renders, or a function like `render`, called with as many other seeds. Welch's t-test with its options;
-    inconclusive fails, too: more runs or samples are needed then. Returns the comparison.
+    `render(seed)` returns an image; it is called with `runs` seeds from `seed` on. `reference`: a folder of independent
+    renders, or a function like `render`, which is called with as many other seeds. The test is Welch's t-test with the
+    options of `welch`. "Inconclusive" fails, too; more runs or samples are needed then. Returns the comparison.
     """
 
     def check(
@@ -128,15 +128,15 @@ def assert_image_unbiased(request: pytest.FixtureRequest) -> Callable[..., Compa
         from mi_refract.image_diff.file_pair import read_renders
 
         first = seed + REFERENCE_SEED
-        known = [reference(i) for i in range(first, first + runs)] if callable(reference) else Path(reference)
-        rendered = [render(i) for i in range(seed, seed + runs)]
+        references = [reference(i) for i in range(first, first + runs)] if callable(reference) else Path(reference)
+        renders = [render(i) for i in range(seed, seed + runs)]
 
         def sides() -> tuple[list[ReadImage], list[ReadImage]]:
-            if isinstance(known, Path):
-                references = read_renders(known)
+            if isinstance(references, Path):
+                reference_images = read_renders(references)
             else:
-                references = [_image(f"reference {first + i}", image) for i, image in enumerate(known)]
-            return references, [_image(f"test {seed + i}", image) for i, image in enumerate(rendered)]
+                reference_images = [_image(f"reference {first + i}", image) for i, image in enumerate(references)]
+            return reference_images, [_image(f"test {seed + i}", image) for i, image in enumerate(renders)]
 
         return _require_equal(request, "welch", sides, options)
 
@@ -144,7 +144,7 @@ def assert_image_unbiased(request: pytest.FixtureRequest) -> Callable[..., Compa
 
 
 def _accept(reference: Path, test: Image, method: str, options: dict[str, Any]) -> None:
-    """Copy the image over the reference, or to where it would be, unless they are equal."""
+    """Copy the image to the path of the reference, unless they are equal."""
     __tracebackhide__ = True
     from mi_refract.image_diff import accept, folders
     from mi_refract.image_diff.settings import Settings
@@ -164,6 +164,7 @@ def _accept(reference: Path, test: Image, method: str, options: dict[str, Any]) 
 def _require_equal(
     request: pytest.FixtureRequest, method: str, sides: Callable[[], tuple[Any, Any]], options: dict[str, Any]
 ) -> Comparison:
+    """Compare both sides, add the result to the page, and fail the test unless they are equal."""
     __tracebackhide__ = True
     from mi_refract.image_diff.comparison import Verdict
     from mi_refract.image_diff.file_pair import mean_image
@@ -173,7 +174,7 @@ def _require_equal(
 
     name, compared = request.node.nodeid, request.config.stash.get(COMPARED, None)
     result = Result(name, Status.ERROR, Path("reference"), Path("test"), ComparisonSpec(method))
-    if compared:  # a test may compare several images
+    if compared:  # number the result, because a test may compare several images
         result = replace(result, target=Path(str(len(compared.results))))
     try:
         reference, test = sides()

@@ -1,4 +1,4 @@
-"""Chooses the libLLVM before anything imports Dr.Jit, once for all tests, and says which variants run here."""
+"""Fixtures for all tests. The libLLVM is chosen once, before anything imports Dr.Jit."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import pytest
 
 from mi_refract import backend
 
-os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # or each process compiles the package anew: a quarter of its start
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # otherwise each process compiles the package: a quarter of its start
 VARIANT = backend.activate()
 USABLE: dict[str, str | None] = backend.usable_variants()
-# `--hypothesis-profile=long` draws other examples every time, and more.
+# `--hypothesis-profile=long` draws more examples, and others in each run.
 CHECKS = {"deadline": None, "suppress_health_check": list(hypothesis.HealthCheck)}
 hypothesis.settings.register_profile("short", max_examples=50, derandomize=True, database=None, **CHECKS)
 hypothesis.settings.register_profile("long", max_examples=1000, **CHECKS)
@@ -28,7 +28,7 @@ def pytest_report_header() -> str:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Each process begins with a contiguous part of the tests, so a fixture of a module is rarely made twice."""
+    """Start each process with a contiguous part of the tests, so that module fixtures are rarely made twice."""
     from xdist.scheduler import WorkStealingScheduling
 
     return WorkStealingScheduling(config, log) if config.option.dist == "load" else None
@@ -36,13 +36,13 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 @pytest.fixture(scope="session")
 def usable_variants() -> list[str]:
-    """The variants of Mitsuba that run here."""
+    """The Mitsuba variants that run here."""
     return [variant for variant, reason in USABLE.items() if reason is None]
 
 
 @pytest.fixture(scope="session")
 def needs_variant() -> Callable[[str], None]:
-    """`needs_variant("llvm_ad_rgb")` skips the test, with the reason, where that variant cannot run."""
+    """`needs_variant("llvm_ad_rgb")` skips the test, with the reason, if that variant cannot run."""
 
     def check(variant: str) -> None:
         if reason := USABLE[variant]:
@@ -51,71 +51,71 @@ def needs_variant() -> Callable[[str], None]:
     return check
 
 
-# The variant of a test, by the fixture that asks for it; the first of several.
+# The variant of a test by the fixture that the test requests; of several fixtures the first one here counts.
 FIXED = {"llvm": "llvm_ad_rgb", "llvm_variant": "llvm_ad_rgb", "llvm_spectral": "llvm_ad_spectral"}
 FIXED |= {"scalar_variant": "scalar_rgb", "scalar_context": "scalar_rgb"}
 
 
 @pytest.fixture(autouse=True)
 def variant(request: pytest.FixtureRequest) -> str:
-    """The variant of the test: its parameter, else the best that runs here. Switched only where it is another one."""
+    """The variant of the test: its parameter, otherwise the best that runs here; it is set before the test."""
     parameters = request.node.callspec.params if hasattr(request.node, "callspec") else {}
     fixed = [name for fixture, name in FIXED.items() if fixture in request.fixturenames]
-    wanted: str = parameters.get("each_variant", [*fixed, VARIANT][0])
-    if USABLE[wanted]:  # the fixture that asks for it skips the test
+    name: str = parameters.get("each_variant", [*fixed, VARIANT][0])
+    if USABLE[name]:  # the requested fixture skips the test
         return VARIANT
-    if wanted != VARIANT or "mitsuba" in sys.modules:
+    if name != VARIANT or "mitsuba" in sys.modules:
         from support.variants import switch
 
-        switch(wanted)
-    return wanted
+        switch(name)
+    return name
 
 
 @pytest.fixture
 def scalar_variant() -> None:
-    """`scalar_rgb` for the test, which `variant` sets."""
+    """Run the test in `scalar_rgb`, which `variant` sets."""
 
 
 @pytest.fixture
 def llvm_variant(needs_variant: Callable[[str], None]) -> None:
-    """`llvm_ad_rgb` for the test, which `variant` sets; skipped where it cannot run."""
+    """Run the test in `llvm_ad_rgb`, which `variant` sets; skip it if that cannot run."""
     needs_variant("llvm_ad_rgb")
 
 
-# Subsets of the variants, by the fixture that asks for them.
+# Subsets of the variants, by fixture.
 SUBSETS = {
-    # One a family and the one that differs most from it: for what no variant does by itself.
+    # Per family, the simplest variant and the one that differs most from it: for code without a branch on variants.
     "typical_variant": [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb", "_ad_spectral_polarized"))],
-    # One a family: for what does not ask whether light is polarised.
+    # One variant per family: for code that does not depend on polarisation.
     "rgb_variant": [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb"))],
     "spectral_variant": [name for name in USABLE if "_spectral" in name],  # light has wavelengths
     "polarized_variant": [name for name in USABLE if name.endswith("_polarized")],  # Mueller matrices
 }
-# Scalar arrays compute in double whatever they store: float32 is judged on the vectorised backends.
+# Scalar arrays compute in double even if they store float32: float32 is judged on the vectorised backends.
 SETTINGS = [("scalar", "float64")] + [(b, p) for b in ("llvm", "cuda") for p in ("float32", "float64")]
 CASES: dict[str, Any] = {
     "each_variant": list(USABLE),
     "setting": SETTINGS,  # every backend and precision
-    "float32": [case for case in SETTINGS if case[1] == "float32"],  # for what takes long in any precision
-    "vectorised": SETTINGS[1:],  # those that carry derivatives
+    "float32": [case for case in SETTINGS if case[1] == "float32"],  # for slow tests
+    "vectorised": SETTINGS[1:],  # settings with derivatives
 }
 
 
 @pytest.fixture(scope="module")
 def each_variant(request: pytest.FixtureRequest) -> str:
-    """Every variant of the wheel; tests are in the order of variants, because a switch takes a tenth of a second."""
+    """Every variant of the wheel. Tests are sorted by variant, because a switch takes a tenth of a second."""
     return request.param
 
 
 @pytest.fixture(scope="module")
 def typical_variant(each_variant: str) -> str:
-    """The variants of `SUBSETS`, by the name of the fixture."""
+    """The variants of `SUBSETS` that have this fixture's name."""
     return each_variant
 
 
 @pytest.fixture(scope="module")
 def setting(request: pytest.FixtureRequest) -> Any:
-    """The `Setting` of each backend and precision in `CASES` that runs here; it imports Dr.Jit."""
+    """The `Setting` of each backend and precision in `CASES` that runs here. This imports Dr.Jit."""
     from validation.run.array_settings import Setting
 
     return Setting.of(*request.param)
@@ -126,7 +126,7 @@ float32 = vectorised = setting
 
 
 def _case(case: str | tuple[str, str]) -> tuple[str, str, str | None]:
-    """Of a variant, or of a backend and a precision: its id, its backend, and why it cannot run here."""
+    """Return the id, the backend and the reason why it cannot run, of a variant or a (backend, precision)."""
     if isinstance(case, str):
         return case, case.partition("_")[0], USABLE[case]
     entry = backend.detect()[case[0]]
@@ -134,7 +134,7 @@ def _case(case: str | tuple[str, str]) -> tuple[str, str, str | None]:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """A test for each variant or setting that runs here, and one that is skipped for each backend that does not."""
+    """Make one test per variant or setting that runs here, and one skipped test per backend that does not."""
     for fixture in CASES.keys() & set(metafunc.fixturenames):
         parameters: dict[str, Any] = {}
         subsets = [cases for name, cases in SUBSETS.items() if name in metafunc.fixturenames]
@@ -146,22 +146,22 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Of the tests whose backend does not run here, one in each file stays, skipped; it says why for all."""
-    said, kept = set(), []
+    """Reduce the tests whose backend does not run here to one skipped test per file, with the reason for all."""
+    reported, remaining = set(), []
     for item in items:
         absent = item.get_closest_marker("absent")
         if absent:
-            if (item.path, *absent.args) in said:
+            if (item.path, *absent.args) in reported:
                 continue
-            said.add((item.path, *absent.args))
+            reported.add((item.path, *absent.args))
             item.add_marker(pytest.mark.skip(reason=absent.args[0]))
-        kept.append(item)
-    items[:] = kept
+        remaining.append(item)
+    items[:] = remaining
 
 
 @pytest.fixture
 def scalar_context(tmp_path, scalar_variant):
-    """`scalar_context(rays=800, ...)`: a run of the validation on scalar_rgb, standard but for what is given."""
+    """`scalar_context(rays=800, ...)`: a standard run of the validation on scalar_rgb with a changed profile."""
     from dataclasses import replace
 
     from validation.run.context import here
@@ -172,7 +172,7 @@ def scalar_context(tmp_path, scalar_variant):
 
 @pytest.fixture
 def follow(setting):
-    """`trace` in the setting; paths as lists, without what follows their ends."""
+    """`planar.trace` in the setting, with weights."""
     import numpy as np
 
     from mi_refract.planar import trace
@@ -186,7 +186,7 @@ def follow(setting):
 
 @pytest.fixture
 def pair(tmp_path):
-    """A folder with a pair that is equal and a pair that differs by 10 %."""
+    """Two folders of images: one image is equal in both, one differs by 10 %."""
     from support.diff_images import image
 
     for name, gain in (("equal.exr", 1.0), ("louder.exr", 1.1)):
@@ -197,7 +197,7 @@ def pair(tmp_path):
 
 @pytest.fixture
 def folders(tmp_path):
-    """Same, changed, removed and added images, one of them in a folder inside; and files that are none."""
+    """Two folders with same, changed, removed and added images, one in a subfolder, and with other files."""
     from support.diff_images import image
 
     old, new = tmp_path / "old", tmp_path / "new"
@@ -212,7 +212,7 @@ def folders(tmp_path):
 
 @pytest.fixture
 def run(capfd):
-    """`run("diff", old, new, "--samples")`: exit code, stdout, stderr."""
+    """`run("diff", old, new, "--renders")`: exit code, stdout and stderr of the command."""
     from mi_refract.cli import app
 
     def call(*words):

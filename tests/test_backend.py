@@ -1,4 +1,4 @@
-"""Which variants run here: libraries that abort, refuse, hang, lie; the memory of it; the choice of the user."""
+"""The variants that run here: libraries that abort, fail, hang or compute wrongly; the cache; the user's choice."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ NANOTHREAD = Path(drjit.__file__).parent / "libnanothread.so"  # a shared librar
 
 
 @pytest.fixture(autouse=True)
-def apart(tmp_path, monkeypatch):
-    """A memory of its own for every test, and no answer from before."""
+def empty_cache(tmp_path, monkeypatch):
+    """An empty cache for every test, on disk and in cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     cached = backend.llvm, backend.cuda
     for function in cached:
@@ -41,7 +41,7 @@ def one_line(text):
     return text and "\n" not in text
 
 
-def test_highest_version_first_and_llvms_c_interface_only(tmp_path, monkeypatch):
+def test_candidates_are_sorted_by_version_and_have_llvms_c_interface(tmp_path, monkeypatch):
     versions = ["libLLVM.so.100", "libLLVM.so.21.1", "libLLVM-15.so.1", "libLLVM-14.0.6.so.1", "libLLVM-9.so"]
     versions.append("libLLVM.so")
     for name in [*sorted(versions), "libLLVMSupport.so.19", "libLLVM-C.so", "libLLVMCore.a"]:
@@ -50,19 +50,19 @@ def test_highest_version_first_and_llvms_c_interface_only(tmp_path, monkeypatch)
     assert [Path(path).name for path in backend.candidates() if path.startswith(str(tmp_path))] == versions
 
 
-def test_on_windows_it_is_looked_for_in_path(tmp_path, monkeypatch):
+def test_candidates_on_windows_come_from_path(tmp_path, monkeypatch):
     monkeypatch.setattr(backend, "WINDOWS", "LLVM-C.dll")
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{tmp_path / 'none'}")
     (tmp_path / "LLVM-C.dll").touch()
     assert str(tmp_path / "LLVM-C.dll") in backend.candidates()
 
 
-# What a library can do to a process
+# Probes of libraries
 
 
 @pytest.fixture
 def probed(tmp_path, monkeypatch):
-    """`probed(code)`: what is wrong with a library whose kernel does this, and how many probes there have been."""
+    """`probed(code)`: the defect of a library for which `import drjit` runs this code, and the number of probes."""
     modules, log, library = tmp_path / "modules", tmp_path / "log", tmp_path / "libLLVM.so.19.1"
     modules.mkdir()
     library.write_text("one")
@@ -89,7 +89,7 @@ MADE_UP = "is made up"
     [(b"no library at all", "file too short"), (b"\x7fELF" + bytes(4096), "refused"), (None, "refused by Dr.Jit")],
     ids=["text", "broken ELF", "another library"],
 )
-def test_a_file_that_is_not_llvm(tmp_path, content, defect, monkeypatch):
+def test_files_that_are_not_llvm_are_defective(tmp_path, content, defect, monkeypatch):
     path = tmp_path / "libLLVM.so.19.1"
     path.write_bytes(NANOTHREAD.read_bytes() if content is None else content)
     monkeypatch.setenv(backend.CHOICE, str(path))
@@ -110,19 +110,19 @@ def test_a_file_that_is_not_llvm(tmp_path, content, defect, monkeypatch):
     ],
     ids=["abort", "segmentation fault", "killed", "hangs", "raises", "silent", "works"],
 )
-def test_the_end_of_a_probe_is_remembered_where_it_would_be_found_again(probed, monkeypatch, code, defect, lasting):
+def test_lasting_results_of_a_probe_are_stored(probed, monkeypatch, code, defect, lasting):
     monkeypatch.setattr(backend, "TIMEOUT", 3.0 if "sleep" in code else 60.0)
-    found, count = probed(code)
-    assert defect in found if defect else found == ""
-    assert count == 1 and "\n" not in found
-    assert probed(code) == (found, 1 if lasting else 2)
+    reported, count = probed(code)
+    assert defect in reported if defect else reported == ""
+    assert count == 1 and "\n" not in reported
+    assert probed(code) == (reported, 1 if lasting else 2)
 
 
-# Memory
+# Cache
 
 
 @pytest.mark.parametrize("change", ["content", "time", "drjit"])
-def test_a_change_asks_again(probed, monkeypatch, change):
+def test_changes_cause_a_new_probe(probed, monkeypatch, change):
     assert probed() == probed() == (MADE_UP, 1)
     library = Path(os.environ[backend.CHOICE])
     if change == "content":
@@ -137,15 +137,15 @@ def test_a_change_asks_again(probed, monkeypatch, change):
 
 
 @pytest.mark.parametrize("content", ["", "{", "[1]", '{"key": 1}', "null", "\x00"])
-def test_a_spoilt_memory_is_an_empty_one(probed, content, tmp_path):
-    memory = tmp_path / "cache" / "mi_refract" / "backend.json"
-    memory.parent.mkdir(parents=True)
-    memory.write_text(content)
+def test_a_damaged_cache_counts_as_empty(probed, content, tmp_path):
+    cache = tmp_path / "cache" / "mi_refract" / "backend.json"
+    cache.parent.mkdir(parents=True)
+    cache.write_text(content)
     assert probed() == probed() == (MADE_UP, 1)
-    assert list(json.loads(memory.read_text()).values()) == [MADE_UP] and list(memory.parent.iterdir()) == [memory]
+    assert list(json.loads(cache.read_text()).values()) == [MADE_UP] and list(cache.parent.iterdir()) == [cache]
 
 
-def test_a_memory_that_cannot_be_written(probed, monkeypatch, tmp_path):
+def test_a_cache_that_cannot_be_written(probed, monkeypatch, tmp_path):
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     assert [probed(), probed()] == [(MADE_UP, 1), (MADE_UP, 2)]
@@ -161,7 +161,7 @@ def test_the_users_choice_is_the_only_candidate(probed):
     assert here.reason.startswith(f"{backend.CHOICE}={os.environ[backend.CHOICE]}: {MADE_UP}; expected ")
 
 
-def test_our_own_choice_is_not_the_users_and_there_may_be_no_library(probed, monkeypatch):
+def test_the_packages_own_choice_and_no_library(probed, monkeypatch):
     library = os.environ[backend.CHOICE]
     probed()
     monkeypatch.setenv(backend.OWN_CHOICE, library)
@@ -175,7 +175,7 @@ def test_our_own_choice_is_not_the_users_and_there_may_be_no_library(probed, mon
     assert "LLVM 17" in here.reason or "libllvm19" in here.reason
 
 
-# The verdict of the tiny kernel is compared with what matters: does an image come out, or does the process die?
+# The verdict of the probe is compared with a real render, which succeeds or aborts the process.
 IMAGE = """
 import mitsuba as mi, numpy as np
 mi.set_variant("llvm_ad_rgb")
@@ -186,7 +186,7 @@ print(np.isfinite(np.array(mi.render(mi.load_dict(scene), spp=1))).all())
 
 
 @pytest.mark.parametrize("path", backend.candidates() or [None])
-def test_the_verdict_is_the_fate_of_an_image(path, tmp_path, monkeypatch):
+def test_the_verdict_agrees_with_rendering_an_image(path, tmp_path, monkeypatch):
     if path is None:
         pytest.skip("no libLLVM on this machine")
     environment = ENVIRONMENT | {backend.CHOICE: path, "DRJIT_CACHE_DIR": str(tmp_path)}
@@ -198,7 +198,7 @@ def test_the_verdict_is_the_fate_of_an_image(path, tmp_path, monkeypatch):
     assert library.works == drawn, done.stderr[-500:]
 
 
-def test_every_variant_has_an_answer(usable_variants, monkeypatch):
+def test_every_variant_is_usable_or_has_a_reason(usable_variants, monkeypatch):
     import mitsuba as mi
 
     answers = backend.usable_variants()
@@ -208,7 +208,7 @@ def test_every_variant_has_an_answer(usable_variants, monkeypatch):
     assert all(reason is None or one_line(reason) for reason in answers.values())
 
 
-def test_activate_a_variant_that_is_unknown_or_cannot_run(monkeypatch):
+def test_activating_an_unknown_variant_or_one_that_cannot_run_is_an_error(monkeypatch):
     for variant in ("llvm_ad_rbg", "", "scalar_rgb_double"):
         with pytest.raises(ValueError, match=r"unknown; expected scalar_rgb, ") as error:
             backend.activate(variant)
@@ -225,8 +225,8 @@ def test_without_llvm_commands_run_in_scalar():
     assert summary.startswith(f"only scalar_* variants run: {backend.CHOICE}=/nonexistent.so: no such file")
 
 
-def test_a_command_restarts_with_the_library_that_works(tmp_path, monkeypatch):
-    """Dr.Jit takes the first file named libLLVM.so; here that is none of LLVM's."""
+def test_commands_restart_with_the_library_that_works(tmp_path, monkeypatch):
+    """Dr.Jit loads the first file named libLLVM.so, which here is another library."""
     monkeypatch.delenv(backend.CHOICE, raising=False)
     works = [library.path for library in backend.libraries() if library.works]
     if not works:
@@ -242,5 +242,5 @@ def test_a_command_restarts_with_the_library_that_works(tmp_path, monkeypatch):
 
     assert stdout(True).startswith("llvm_ad_rgb\nlibLLVM ")
     assert stdout(False).startswith("scalar_rgb\nDr.Jit was imported with no libLLVM; start Python with DRJIT_LIBLLVM")
-    # The package imports Dr.Jit no sooner than it must: then there is nothing to restart.
+    # Importing the package does not import Dr.Jit, so no restart is needed.
     assert stdout(False, before="import mi_refract").startswith("llvm_ad_rgb\nlibLLVM ")

@@ -1,4 +1,4 @@
-"""The fixtures for pytest: here, and in a run of pytest of their own."""
+"""The fixtures for pytest, in these tests and in separate runs of pytest."""
 
 import re
 from types import SimpleNamespace
@@ -19,7 +19,7 @@ def render(seed, gain=1.0):
     return gain * IMAGE * np.random.default_rng(seed).gamma(400, 1 / 400, IMAGE.shape)
 
 
-def test_what_is_equal_passes(assert_image_equal, assert_image_unbiased, tmp_path):
+def test_equal_images_pass(assert_image_equal, assert_image_unbiased, tmp_path):
     assert assert_image_equal(IMAGE, IMAGE).method == "tolerance"
     assert_image_equal(IMAGE + 1e-5, IMAGE, "tolerance")
     assert_image_equal(IMAGE[..., 0], IMAGE[..., 0], "exact")
@@ -33,7 +33,7 @@ def test_what_is_equal_passes(assert_image_equal, assert_image_unbiased, tmp_pat
     assert_image_unbiased(render, tmp_path / "renders", runs=6)
 
 
-def test_the_test_of_the_page_passes(assert_image_equal, assert_image_unbiased, tmp_path, monkeypatch):
+def test_the_documented_test_passes(assert_image_equal, assert_image_unbiased, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, image in {"out/ball": IMAGE, "references/ball": IMAGE + 1e-3, "references/ball/a": render(100)}.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -52,22 +52,22 @@ def test_the_test_of_the_page_passes(assert_image_equal, assert_image_unbiased, 
         (1.1 * IMAGE, "paired", {}, r"paired: different: (.|\n)*, at most "),
         (IMAGE * np.nan, "exact", {}, "exact: different: "),
         (IMAGE[:-1], "auto", {}, "could not compare: "),
-        ("missing.exr", "auto", {}, "could not compare: .*missing.exr"),  # and none is made
+        ("missing.exr", "auto", {}, "could not compare: .*missing.exr"),  # the reference is not created
         (["no numbers"], "auto", {}, "could not compare: "),
         (IMAGE, "telepathy", {}, "could not compare: method 'telepathy'; expected "),
         (IMAGE, "exact", {"threshold": 1}, "could not compare: "),
     ],
 )
-def test_what_is_not_equal_fails_and_says_why(assert_image_equal, tmp_path, monkeypatch, test, method, options, reason):
+def test_different_images_fail_with_a_reason(assert_image_equal, tmp_path, monkeypatch, test, method, options, reason):
     monkeypatch.chdir(tmp_path)
-    reference = IMAGE if isinstance(test, list | str) or np.isfinite(test).all() else test  # NaN: not even itself
+    reference = IMAGE if isinstance(test, list | str) or np.isfinite(test).all() else test  # NaN differs from itself
     for sides in ((test, reference), (reference, test)):
         with pytest.raises(pytest.fail.Exception, match=reason):
             assert_image_equal(*sides, method, **options)
     assert not list(tmp_path.iterdir())
 
 
-def test_bias_fails_and_so_does_what_cannot_be_told(assert_image_unbiased, tmp_path):
+def test_biased_and_inconclusive_renders_fail(assert_image_unbiased, tmp_path):
     with pytest.raises(pytest.fail.Exception, match="welch: different: "):
         assert_image_unbiased(lambda seed: render(seed, 1.03), render)
     with pytest.raises(pytest.fail.Exception, match="welch: inconclusive: "):
@@ -79,7 +79,7 @@ def test_bias_fails_and_so_does_what_cannot_be_told(assert_image_unbiased, tmp_p
         assert_image_unbiased(render, render, runs=1)
 
 
-def test_errors_of_the_users_own_code_are_shown_and_no_seed_is_rendered_twice(assert_image_unbiased):
+def test_errors_of_render_functions_are_raised_and_seeds_are_distinct(assert_image_unbiased):
     seeds = {"test": [], "reference": [], "broken": []}
 
     def watched(side):
@@ -96,8 +96,8 @@ def test_errors_of_the_users_own_code_are_shown_and_no_seed_is_rendered_twice(as
     assert not set(seeds["test"]) & set(seeds["reference"])
 
 
-def test_a_project_names_the_plugin_in_its_conftest(pytester):
-    """In a process of its own: a run inside this one would import extensions a second time, which they do not bear."""
+def test_the_plugin_works_from_a_conftest(pytester):
+    """In a separate process, because a run in this process would import extension modules twice, which fails."""
     pytester.makeconftest('pytest_plugins = ["mi_refract.pytest_plugin"]')
     pytester.makepyfile("""
         import numpy as np
@@ -133,7 +133,7 @@ def test_wrong_option(assert_image_equal):
 """
 
 
-def test_failures_are_on_a_page_and_images_are_accepted(pytester):
+def test_options_write_a_page_and_accept_images(pytester):
     pytester.makeconftest('pytest_plugins = ["mi_refract.pytest_plugin"]')
     name = f"{pytester.makepyfile(TESTS).name}::test_"
     for file, value in {"old": 0, "test": 1, "zero": 0}.items():
@@ -156,8 +156,8 @@ def test_failures_are_on_a_page_and_images_are_accepted(pytester):
     assert after == before | {"old.exr": before["test.exr"], "new.exr": after["new.exr"]}
 
 
-def test_the_page_shows_each_of_several_images_of_one_test(request, assert_image_equal, tmp_path):
-    """Their numbers are the same."""
+def test_the_page_shows_all_images_of_a_test(request, assert_image_equal, tmp_path):
+    """Even if their metrics are equal."""
     from mi_refract.pytest_plugin import COMPARED, Compared  # pytest imports it first
 
     compared = request.config.stash[COMPARED] = Compared(Page(tmp_path / "out.html"))
@@ -170,8 +170,8 @@ def test_the_page_shows_each_of_several_images_of_one_test(request, assert_image
     assert len(shown) % 2 == 0 and shown[: len(shown) // 2] != shown[len(shown) // 2 :]
 
 
-def test_renders_are_on_the_page_by_their_mean(request, assert_image_unbiased, tmp_path, monkeypatch):
-    """Only the page has images: those of hundreds of tests would fill the memory."""
+def test_the_page_shows_the_mean_of_renders(request, assert_image_unbiased, tmp_path, monkeypatch):
+    """Only the page keeps images, because those of hundreds of tests would fill the memory."""
     from mi_refract.pytest_plugin import COMPARED, Compared  # pytest imports it first
 
     viewed = []
@@ -180,7 +180,7 @@ def test_renders_are_on_the_page_by_their_mean(request, assert_image_unbiased, t
     with pytest.raises(pytest.fail.Exception):
         assert_image_unbiased(lambda seed: render(seed, 1.1), render, runs=2)
     del request.config.stash[COMPARED]
-    assert [(dict(kept.images), kept.comparison.maps) for kept in compared.results] == [({}, {})]
+    assert [(dict(result.images), result.comparison.maps) for result in compared.results] == [({}, {})]
     (result,) = viewed
     mean = np.mean([render(seed, 1.1) for seed in (0, 1)], 0)
     np.testing.assert_allclose(result.images["test"].pixels, mean, rtol=1e-6)
@@ -189,12 +189,12 @@ def test_renders_are_on_the_page_by_their_mean(request, assert_image_unbiased, t
 @pytest.mark.parametrize(
     ("words", "message"), [(["out.txt"], "expected a file name that ends in"), (["out.html", "-n2"], "expected -n 0")]
 )
-def test_a_page_that_cannot_be_written_is_a_wrong_command_line(pytester, words, message):
+def test_a_page_that_cannot_be_written_is_a_usage_error(pytester, words, message):
     with pytest.raises(pytest.UsageError, match=message):
         pytester.parseconfigure("-p", "mi_refract.pytest_plugin", "--mi-refract-report", *words)
 
 
-def test_the_plugin_itself_imports_no_renderer():
+def test_the_plugin_imports_no_renderer():
     code = "import sys, mi_refract.pytest_plugin; print({'mitsuba', 'drjit', 'numpy', 'OpenImageIO'} & {*sys.modules})"
     out, err = python(code).communicate()
     assert (out, err) == ("set()\n", "")

@@ -1,6 +1,6 @@
 """`python -m validation [STUDY …] [--profile quick|standard|full] [--out DIR]`, or `… renderers|pack …`.
 
-Exit code 0 where every budget held, 1 where one was broken, 2 for misuse and errors, 130 where it was interrupted.
+Exit code: 0 if every budget holds, 1 if one is broken, 2 for misuse and errors, 130 after an interruption.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from validation.study import Study
     from validation.suite.renderers import System
 
-# By name on the command line, which is that of the room: the modules whose STUDY is run, in the order of the report.
+# Name on the command line (that of the folder) → modules whose STUDY is run, in the order of the report.
 ROOMS = {
     "directions": ("per_formula", "planted_defects", "bsdf_samples", "sweep", "search"),
     "stability": ("optical_chains", "energy", "derivatives", "layered_paths"),
@@ -43,7 +43,7 @@ ROOMS = {
         *("lenses", "glasses", "exports", "standard_numbers", "caustic_energies"),
     ),
 }
-# What the profile `quick` runs where no study is named.
+# The studies of the profile `quick` if no study is named.
 QUICK = (
     "directions.per_formula",
     "directions.bsdf_samples",
@@ -53,25 +53,25 @@ QUICK = (
     "planar.against_retrace",
     "diff.planted_defects",
 )
-LOCK = "validation.lock"  # in the folder of the report, while it is being made
+LOCK = "validation.lock"  # exists in the report's folder during a run
 PROFILES = {"quick": "a minute and a half", "standard": "about an hour", "full": "hours"}
 
 app = command_line.application()
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line, or `arguments`; the exit code."""
+    """Run the command with `arguments` (default: those of the command line) and return its exit code."""
     words = sys.argv[1:] if arguments is None else arguments
     if words[:1] == ["renderers"]:
         from validation.suite.renderers import command
 
         return command.main(words[1:])
     if words[:1] == ["pack"]:
-        if arguments is None:  # while Mitsuba renders, Ctrl-C would end that only
+        if arguments is None:  # while Mitsuba renders, Ctrl-C would end only the render
             interrupts.end_at_once(even_if_ignored=False)
-        from validation.pack import command as pack
+        from validation.pack import command as pack_command
 
-        return pack.main(words[1:])
+        return pack_command.main(words[1:])
     return command_line.exit_code(app, "validation", words)
 
 
@@ -112,7 +112,7 @@ def _command(
 ) -> int:
     """Measure the formulas and the plugin against certified answers, and write the report."""
     names, target = studies or [], ClusterTarget(scheduler, workers)
-    joined: list[System] = []
+    own_renderers: list[System] = []
     if unknown := [name for name in names if name not in ROOMS]:
         raise ValueError(f"unknown study {unknown[0]!r}; expected {', '.join(ROOMS)}")
     if profile not in PROFILES:
@@ -135,20 +135,20 @@ def _command(
         from validation.suite import rendered_images
         from validation.suite.renderers import system
 
-        for folder in reversed(renderers):  # the last one to join is the first of the report
-            joined.insert(0, system.join(folder))
-            rendered_images.join(joined[0])
+        for folder in reversed(renderers):  # each one joins in front of the others
+            own_renderers.insert(0, system.join(folder))
+            rendered_images.join(own_renderers[0])
     target.check()
     try:
         with safe_files.held(out / LOCK, "a validation"):
-            return _run(names, profile, out, write_tables, goals, target, joined)
+            return _run(names, profile, out, write_tables, goals, target, own_renderers)
     except KeyboardInterrupt:
         print("validation: interrupted; run the same command again to resume", file=sys.stderr)
         raise
 
 
 def modules(studies: list[str], profile: str) -> list[str]:
-    """Names of the modules below `validation` whose studies are run."""
+    """Return the modules below `validation` whose studies are run."""
     if profile == "quick" and not studies:
         return list(QUICK)
     rooms = dict.fromkeys(studies or ROOMS)
@@ -162,7 +162,7 @@ def _run(
     write_tables: bool,
     goals: bool,
     target: ClusterTarget,
-    joined: list[System],
+    own_renderers: list[System],
 ) -> int:
     from rich.console import Console
 
@@ -187,28 +187,28 @@ def _run(
     rows, spent = runner.run(runner.tasks(studies, context), context, workers)
     for study in studies:
         rows = study.summarise(rows)
-    if not context.profile.quick:  # whose few cases need not come near any bound
+    if not context.profile.quick:  # its few cases need not come near any bound
         rows = [*rows, *tightness.rows(rows)]
     first_page = headline.first_page(rows, profile)
-    if joined:
+    if own_renderers:
         from validation.suite import matrix
 
-        first_page["answers"] = [*matrix.answers(rows, joined), *first_page["answers"]]
-    described = runner.describe(context, time.perf_counter() - start)
-    described |= {
+        first_page["answers"] = [*matrix.answers(rows, own_renderers), *first_page["answers"]]
+    about = runner.describe(context, time.perf_counter() - start)
+    about |= {
         "replay": " ".join(["python -m validation", *names, f"--profile {profile}"]),
         "studies": {study.name: study.described for study in studies} | {tightness.NAME: tightness.ABOUT},
         "scatter": [scatter for study in studies for scatter in study.scatter],
         "first_page": first_page,
     }
-    run_report.write_json(out / "rows.json", rows, described | {"tasks": spent})
-    run_report.write_junit(out / "junit.xml", rows, described)
-    run_report.write_html(out / "report.html", rows, described, out)
+    run_report.write_json(out / "rows.json", rows, about | {"tasks": spent})
+    run_report.write_junit(out / "junit.xml", rows, about)
+    run_report.write_html(out / "report.html", rows, about, out)
     if write_tables:
         tables.write(rows, context, names)
     runner.forget(context)
     console = Console()
-    console.print(run_report.summary(rows, described))
+    console.print(run_report.summary(rows, about))
     if goals:
         console.print(run_report.goals_table(rows))
     console.print(printable(f"report: {out / 'report.html'}"), highlight=False, markup=False)

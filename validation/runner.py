@@ -1,8 +1,8 @@
-"""Runs tasks, saves the rows of each as soon as it is finished, and resumes after an interruption.
+"""Runs tasks, saves the rows of each task when it finishes, and resumes after an interruption.
 
-Tasks that time nothing may run on the workers of a Dask cluster. A task holds closures, so it is not sent: a worker
-makes the same list of tasks and runs the one of that name. It must have the same sources, versions and other renderers.
-Images come back as files; rows are kept as they come.
+Tasks that measure no times may run on the workers of a Dask cluster. A task holds closures and cannot be sent. A worker
+therefore builds the same list of tasks and runs the task of the given name. It must have the same sources, versions and
+other renderers. It returns rows, and images as the contents of files.
 """
 
 from __future__ import annotations
@@ -36,27 +36,27 @@ from validation.suite.renderers import SYSTEMS, environments
 from . import repeated
 from .study import Study, Task
 
-# What rows depend on, beside what any render depends on.
+# Packages that rows depend on, in addition to those that a render depends on.
 PACKAGES = ("numpy", "scipy", "OpenImageIO", "python-flint", "jinja2")
-Finished = tuple[list[Row], dict[str, Any]]  # of a task: its rows, and its name and times
+Finished = tuple[list[Row], dict[str, Any]]  # a task's rows; its name and times
 
 
 def tasks(studies: Sequence[Study], context: Context) -> list[Task]:
-    """All tasks of these studies, and those that repeat them with other seeds. ValueError where two have one name."""
-    made = [task for study in studies for task in (*study.tasks(context), *repeated.tasks(study, context))]
-    names = Counter(task.name for task in made)
-    if twice := [name for name, count in names.items() if count > 1]:
-        raise ValueError(f"two tasks are called {twice[0]!r}; expected different names, by which workers find them")
-    return made
+    """Return all tasks of these studies, including repetitions with other seeds. ValueError if two have one name."""
+    every = [task for study in studies for task in (*study.tasks(context), *repeated.tasks(study, context))]
+    names = Counter(task.name for task in every)
+    if duplicates := [name for name, count in names.items() if count > 1]:
+        raise ValueError(f"two tasks have the name {duplicates[0]!r}; expected unique names")
+    return every
 
 
 def run(
     tasks: Sequence[Task], context: Context, workers: OnCluster | None = None
 ) -> tuple[list[Row], list[dict[str, Any]]]:
-    """All rows, in the order of the tasks; and of each task its name, seconds, and seconds of all processors.
+    """Return all rows in the order of the tasks, and each task's name, seconds and CPU seconds.
 
-    `workers` first run the tasks that are not timed; then the others run here, one after the other, so that what is
-    timed runs alone. Errors and KeyboardInterrupt pass, with the finished tasks kept.
+    `workers` first run the tasks that are not timed. The other tasks then run on this machine, one at a time, so that
+    nothing disturbs a timing. Finished tasks stay saved if an error or KeyboardInterrupt is raised.
     """
     store = context.out / "unfinished"
     store.mkdir(parents=True, exist_ok=True)
@@ -64,41 +64,41 @@ def run(
     files = [store / f"{hashlib.sha256((about + task.name).encode()).hexdigest()[:24]}.json" for task in tasks]
     finished: dict[int, Finished] = {}
 
-    def say(task: Task) -> None:
-        _say(f"task {len(finished) + 1} of {len(tasks)}: {task.name}")
+    def announce(task: Task) -> None:
+        _log(f"task {len(finished) + 1} of {len(tasks)}: {task.name}")
 
-    def keep(number: int, result: Finished) -> None:
+    def save(number: int, result: Finished) -> None:
         rows, spent = result
         write_atomically(files[number], json.dumps({"spent": spent, "rows": [row.as_dict() for row in rows]}))
         finished[number] = result
 
-    work = [(i, task.name) for i, task in enumerate(tasks) if not task.timed and not _recall(files[i])]
+    work = [(i, task.name) for i, task in enumerate(tasks) if not task.timed and not _saved(files[i])]
     if workers and work:
         for i, result in workers.run(work, context):
-            say(tasks[i])
-            keep(i, result)
+            announce(tasks[i])
+            save(i, result)
     for i, task in enumerate(tasks):
         if i not in finished:
-            say(task)
-            keep(i, _recall(files[i]) or timed(task))
-    order = [finished[i] for i in range(len(tasks))]
-    return [row for rows, _ in order for row in rows], [spent for _, spent in order]
+            announce(task)
+            save(i, _saved(files[i]) or timed(task))
+    results = [finished[i] for i in range(len(tasks))]
+    return [row for rows, _ in results for row in rows], [spent for _, spent in results]
 
 
-def _say(text: str) -> None:
+def _log(text: str) -> None:
     print(printable(f"validation: {text}"), file=sys.stderr, flush=True)
 
 
 def timed(task: Task) -> Finished:
-    """Run a task; its rows, and what it took."""
+    """Run a task and return its rows and times."""
     start, processors = time.perf_counter(), sum(os.times()[:4])
     rows = task.run()
     seconds, cpu = time.perf_counter() - start, sum(os.times()[:4]) - processors
     return rows, {"task": task.name, "seconds": round(seconds, 2), "CPU seconds": round(cpu, 2)}
 
 
-def _recall(file: Path) -> Finished | None:
-    """The rows of a finished task and its time; None if there are none or they cannot be read."""
+def _saved(file: Path) -> Finished | None:
+    """Return the saved rows and times of a finished task; None if the file is missing or unreadable."""
     try:
         record = json.loads(file.read_text())
         return [Row.from_dict(data) for data in record["rows"]], dict(record["spent"])
@@ -107,7 +107,7 @@ def _recall(file: Path) -> Finished | None:
 
 
 def forget(context: Context) -> None:
-    """Drop the rows of single tasks: once the report is written, the next run starts over."""
+    """Delete the saved rows of single tasks after the report is written, so that the next run starts over."""
     shutil.rmtree(context.out / "unfinished", ignore_errors=True)
 
 
@@ -115,9 +115,10 @@ def forget(context: Context) -> None:
 
 
 def describe(context: Context, seconds: float) -> dict[str, Any]:
-    """What all rows share."""
-    names = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    cores = [line.partition(":")[2].strip() for line in names if line.startswith("model name")]
+    """Return what all rows share: profile, variant, run time, versions and machine."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    cores = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     processor = f"{len(cores)} × {cores[0]}" if cores else platform.machine()
     return {
         "profile": context.profile.name,
@@ -131,26 +132,26 @@ def describe(context: Context, seconds: float) -> dict[str, Any]:
 
 
 def installed() -> list[str]:
-    """The other renderers that are installed here."""
+    """Return the names of the other renderers that are installed on this machine."""
     return [name for name, system in SYSTEMS.items() if not environments.absent(system)]
 
 
 def sources() -> str:
-    """A digest of all that rows are made from: the package, the validation, scenes and tests."""
+    """Return a digest of all sources that rows depend on: the package, the validation, scenes and tests."""
     digest = hashlib.sha256()
-    here = Path(__file__).parent
+    folder = Path(__file__).parent
     groups = [Path(mi_refract.__file__).parent.rglob("*.py"), SCENES.rglob("*")]
-    groups += [here.rglob(f"*.{kind}") for kind in ("py", "json", "toml", "j2")]
-    groups.append(here.with_name("tests").rglob("*.py"))  # which mutants of our code must not pass
+    groups += [folder.rglob(f"*.{kind}") for kind in ("py", "json", "toml", "j2")]
+    groups.append(folder.with_name("tests").rglob("*.py"))  # they must detect the mutants of our code
     for path in sorted(path for group in groups for path in group if path.is_file()):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
 def facts(variant: str) -> dict[str, str]:
-    """What rows depend on, of this process, by name: `on_worker.facts` and the sources of the validation."""
-    known = on_worker.facts(variant) | {name: installed_version(name) for name in PACKAGES}
-    return known | {"validation": sources()[:8], "other renderers": ", ".join(installed()) or "none"}
+    """Return what the rows of this process depend on: `on_worker.facts`, packages, sources and other renderers."""
+    versions = on_worker.facts(variant) | {name: installed_version(name) for name in PACKAGES}
+    return versions | {"validation": sources()[:8], "other renderers": ", ".join(installed()) or "none"}
 
 
 # On workers -----------------------------------------------------------------------------------------------------------
@@ -158,10 +159,10 @@ def facts(variant: str) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class OnCluster:
-    """Workers of a scheduler, or worker processes of one thread each on this machine.
+    """The workers of a scheduler, or single-threaded worker processes on this machine.
 
-    `modules`, names below `validation` of the modules whose STUDY is run, the profile and the variant of Mitsuba say
-    what the list of tasks is made from.
+    A worker builds the list of tasks from `modules` (modules below `validation` whose STUDY is run), `profile` and
+    `variant` (of Mitsuba).
     """
 
     modules: tuple[str, ...]
@@ -170,14 +171,15 @@ class OnCluster:
     target: connection.ClusterTarget = connection.LOCAL
 
     def run(self, work: Sequence[tuple[int, str]], context: Context) -> Iterator[tuple[int, Finished]]:
-        """The result of every task (number, name), in the order in which they end. A task's own errors pass.
+        """Run tasks, given as (number, name), and yield (number, result) as they finish.
 
-        ConnectionError, one line, where no worker may run tasks; workers that are refused are named on stderr.
+        The first error of a task is raised. ConnectionError, one line, if no worker is accepted; stderr names refused
+        workers.
         """
         from mi_refract.cluster.workers import Workers
 
         with connection.connected(self.target.scheduler, self.target.workers) as client:
-            workers = Workers(client, self.variant, facts(self.variant), warn=_say, facts=__name__)
+            workers = Workers(client, self.variant, facts(self.variant), warn=_log, facts=__name__)
             workers.wait()
             results = calls.results(workers, OnCluster.on_worker, [(self, name) for _, name in work])
             for number, ((rows, spent), files), machine in results:
@@ -187,7 +189,7 @@ class OnCluster:
                 yield work[number][0], (rows, spent | {"machine": machine})
 
     def on_worker(self, name: str) -> tuple[Finished, dict[str, bytes]]:
-        """The task of that name, run on a worker in a folder of its own, and its files by path. Its errors pass."""
+        """Run the task of this name in a temporary folder of a worker; return its result and its files by path."""
         scratch = on_worker.scratch_folder()
 
         def run_task() -> tuple[Finished, dict[str, bytes]]:

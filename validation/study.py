@@ -1,6 +1,6 @@
-"""A study: the question it asks, its text in the report, and the tasks that measure it.
+"""A study: one question, its text in the report, and the tasks that answer it.
 
-A module that holds a study ends with `STUDY = Study(...)`; `__main__.py` lists these modules.
+A module with a study ends with `STUDY = Study(...)`; `__main__.py` lists these modules.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from validation.run.context import Context
 
 @dataclass(frozen=True)
 class Task:
-    """A unit of work that is finished or not: an interrupted run keeps the rows of finished tasks.
+    """A unit of work. An interrupted run keeps the rows of finished tasks.
 
-    `name`: no other task of a run has it. `timed`: rows hold times or ratios of times, or depend on how fast something
-    is; it runs alone on this machine, never on a worker.
+    `name`: unique within a run. `timed`: the rows hold times or depend on speed, so the task runs alone on this machine
+    and never on a worker.
     """
 
     name: str
@@ -30,13 +30,13 @@ class Task:
 class Study:
     """One question and its measurements.
 
-    `name` is the `study` of its rows; `title`, `text` and `terms` (metric or case → meaning) are shown by the report.
-    `tasks(context)` lists what is to be run. `axes` says what the curves of its rows are drawn over, `scatter` which
-    metric is plotted against which, `scale` between which numbers its matrices have colours (all three as
-    `mi_refract.report.study_page` describes them). `summarise(rows)` returns all rows of a run with the summary of this
-    study among them. `again(context)`, of a study whose answer rests on random draws, gives the rows that they decide
-    (no times, no images), for `validation.repeated` to repeat. `records`: subjects that are measured for comparison.
-    Only they, and what is timed, have rows with neither bound nor remark.
+    `name` is the `study` of its rows. The report shows `title`, `text` and `terms` (metric or case → meaning).
+    `tasks(context)` returns the tasks. `axes` names the axes of the curves in its rows, `scatter` the pairs of metrics
+    that are plotted against each other, and `scale` the range of colours of its matrices: see
+    `mi_refract.report.study_page`. `summarise(rows)` returns all rows of a run, with a summary of this study added.
+    `again(context)`, for studies with random draws, returns the rows that depend on them (no times, no images);
+    `validation.repeated` calls it with other seeds. `records` names subjects that are measured for comparison only.
+    Rows without bound and remark belong to these subjects or to timed tasks.
     """
 
     name: str
@@ -53,13 +53,18 @@ class Study:
 
     @property
     def described(self) -> dict[str, Any]:
-        """What the report shows of the study: title, introduction, glossary and axes."""
+        """What the report shows of the study: title, introduction, glossary, axes and scale."""
         text = " ".join(self.text.split())
-        text += f" Recorded without a bound: {', '.join(f'`{name}`' for name in self.records)}." if self.records else ""
-        about: dict[str, Any] = {"title": self.title, "text": text, "terms": dict(self.terms)}
-        return about | ({"axes": dict(self.axes)} if self.axes else {}) | ({"scale": self.scale} if self.scale else {})
+        if self.records:
+            text += f" Recorded without a bound: {', '.join(f'`{name}`' for name in self.records)}."
+        description: dict[str, Any] = {"title": self.title, "text": text, "terms": dict(self.terms)}
+        if self.axes:
+            description["axes"] = dict(self.axes)
+        if self.scale:
+            description["scale"] = self.scale
+        return description
 
 
 def about(docstring: str | None) -> str:
-    """A module's docstring without its first line, up to a paragraph that begins with a command."""
+    """Return a module's docstring without its first line and without a final paragraph that shows a command."""
     return (docstring or "").partition("\n")[2].partition("\n\n`python")[0].strip()

@@ -1,7 +1,6 @@
-"""The tables of the documentation and the image gallery, all made from the rows of one run.
+"""Writes the tables of the documentation and the image galleries from the rows of one run.
 
-Rows are selected by the studies' own constants for names of studies and metrics: a renamed label is an error when this
-module is imported, not after the run.
+Rows are selected by the constants of the studies, so a removed study or metric fails at import, not after the run.
 """
 
 from __future__ import annotations
@@ -48,10 +47,10 @@ NUMBERS_PAGE = ".github/docs/reference/standard-numbers.md"
 
 
 class Table(NamedTuple):
-    """Where a table is written, between its markers; `study` is what must be run for it, by its command-line name.
+    """A table of the file `path`, between its markers. `study`: the command-line name of the study that measures it.
 
-    `make` gives the Markdown, or None where the table stays as it is, because it needs another machine. ValueError, one
-    line, where the rows do not hold what the table needs.
+    `make` returns the Markdown; None if the table stays as it is, because it needs another machine. It raises
+    ValueError, one line, if the rows lack what the table needs.
     """
 
     path: str
@@ -60,7 +59,7 @@ class Table(NamedTuple):
 
 
 def check(studies: list[str]) -> None:
-    """ValueError, one line, where a file or a marker of the tables of these studies is missing."""
+    """Raise ValueError, one line, if a file or a marker of the tables of these studies is missing."""
     for marker, table in chosen(studies).items():
         path = ROOT / table.path
         text = path.read_text() if path.is_file() else ""
@@ -70,14 +69,14 @@ def check(studies: list[str]) -> None:
 
 
 def chosen(studies: list[str]) -> dict[str, Table]:
-    """The tables of these studies. Without any: all but that of other renderers, which needs them installed."""
+    """Return the tables of these studies; without any, all tables except those of other renderers."""
     return {name: t for name, t in TABLES.items() if (t.study in studies if studies else t.study != "suite")}
 
 
 def write(rows: list[Row], context: Context, studies: list[str]) -> None:
-    """Write the tables of the studies that were run, and the galleries where their scenes were rendered.
+    """Write the tables of the studies that were run, and the galleries if their scenes were rendered.
 
-    ValueError where a marker is missing, or the run has not measured what a table holds.
+    ValueError if a marker is missing, or if the run did not measure what a table needs.
     """
     for marker, table in chosen(studies).items():
         if text := table.make(rows):
@@ -89,13 +88,13 @@ def write(rows: list[Row], context: Context, studies: list[str]) -> None:
 
 
 def _measured(rows: list[Row], study: str, needs: Iterable[str] = (), subject: str = "") -> list[Row]:
-    """The rows of a study, and of a subject, that have all of these metrics."""
-    mine = [row for row in rows if row.study == study and row.values and subject in ("", row.subject)]
-    return [row for row in mine if row.values.keys() >= set(needs)]
+    """Return the measured rows of a study (and a subject) that have all of these metrics."""
+    measured = [row for row in rows if row.study == study and row.values and subject in ("", row.subject)]
+    return [row for row in measured if row.values.keys() >= set(needs)]
 
 
 def _table(text: str, heading: Iterable[str], lines: list[list[str]], missing: str) -> str:
-    """Markdown: a line of text, and a table. ValueError where it has no lines: `missing` says what was not measured."""
+    """Return Markdown: a line of text and a table. ValueError without lines; `missing` says what was not measured."""
     if not lines:
         raise ValueError(f"documentation: no {missing}; its table needs them")
     heading = [*heading]
@@ -104,7 +103,7 @@ def _table(text: str, heading: Iterable[str], lines: list[list[str]], missing: s
 
 
 def _cells(row: Row | None, metrics: Iterable[str], intervals: bool = True) -> list[str]:
-    """The values of a row, with their 95 % intervals where it has them; – where it has no value."""
+    """Return the values of a row with their 95 % intervals, if any; – for a missing value."""
 
     def cell(metric: str) -> str:
         if row is None or metric not in row.values:
@@ -116,15 +115,15 @@ def _cells(row: Row | None, metrics: Iterable[str], intervals: bool = True) -> l
 
 
 def _replay(rows: list[Row], template: str) -> str:
-    """The template filled with what repeats the first row, and its `setting`."""
+    """Return the template, filled with the `replay` and the `setting` of the first row."""
     return template.format_map({**rows[0].replay, "setting": rows[0].setting}) if rows else ""
 
 
 def accuracy(rows: list[Row]) -> str:
-    """The worst error of each formula over the regimes with a budget, misclassified rays, times; float32 and float64.
+    """Return, for each formula, the worst error over the regimes with a budget, misclassified rays and times.
 
-    A row for each regime in which no formula has one, since denormal numbers are taken for 0: of the formula that
-    misclassifies most.
+    In float32 and float64. Regimes that need denormal numbers have no budget, because these are flushed to 0; each of
+    them has a row of its own, of the formula that misclassifies most rays.
     """
     columns = {
         "float32: worst chord": m.WORST_CHORD,
@@ -140,15 +139,15 @@ def accuracy(rows: list[Row]) -> str:
         if row.case == per_formula.ALL and row.setting in ("llvm float32", "llvm float64")
     }
     rays = max((row.replay["rays"] for row in by_name.values()), default=0)
-    resting = [name for name, regime in REGIMES.items() if regime.rests_on_denormals]
-    without = {
+    denormal = [name for name, regime in REGIMES.items() if regime.rests_on_denormals]
+    without_budget = {
         (row.case, row.setting): row
         for row in sorted(
             _measured(rows, per_formula.NAME, [m.MISCLASSIFIED]), key=lambda row: row.values[m.MISCLASSIFIED]
         )
-        if row.case in resting and not row.budgets and row.subject in FORMULAS
+        if row.case in denormal and not row.budgets and row.subject in FORMULAS
     }
-    outside = [name for name in resting if (name, "llvm float32") in without]
+    outside = [name for name in denormal if (name, "llvm float32") in without_budget]
     text = (
         f"Worst over {rays:,} rays in {len(REGIMES) - len(outside)} of the {len(REGIMES)} regimes; u = 2⁻²⁴ or 2⁻⁵³; "
         "times are medians over copying the same bytes\n"
@@ -160,7 +159,7 @@ def accuracy(rows: list[Row]) -> str:
         cells += _cells(by_name.get((subject, "llvm float32")), columns.values())
         lines.append(cells + _cells(by_name.get((subject, "llvm float64")), wide))
     for name in outside:
-        single, double = (without.get((name, f"llvm {precision}")) for precision in ("float32", "float64"))
+        single, double = (without_budget.get((name, f"llvm {precision}")) for precision in ("float32", "float64"))
         cells = [f"every one, `{name}`", "denormal numbers are taken for 0", *_cells(single, columns.values())]
         cells[4] += f" of {single.replay['count']}" if single else ""
         lines.append(cells + _cells(double, wide))
@@ -169,16 +168,16 @@ def accuracy(rows: list[Row]) -> str:
 
 
 def on_a_gpu(rows: list[Row]) -> str | None:
-    """The worst error of each formula over the regimes with a budget, and the time, in float32 and float64 on CUDA."""
+    """Return, for each formula, the worst error over the regimes with a budget and the time, on CUDA."""
     columns = [m.WORST_IN_U, m.MISCLASSIFIED, "ns per ray", m.TIME_OVER_COPY]
-    found = {
+    by_name = {
         (row.subject, row.setting): row
         for row in _measured(rows, per_formula.NAME, ["ns per ray"])
         if row.setting.startswith("cuda")
     }
     lines = []
-    for subject in dict.fromkeys(subject for subject, _ in found):
-        cells = (_cells(found.get((subject, f"cuda {x.__name__}")), columns, False) for x in PRECISIONS.values())
+    for subject in dict.fromkeys(subject for subject, _ in by_name):
+        cells = (_cells(by_name.get((subject, f"cuda {x.__name__}")), columns, False) for x in PRECISIONS.values())
         lines.append([f"`{subject}`", *itertools.chain(*cells)])
     heading = ["formula", "float32: in u", "TIR misclassified", "ns per ray", "time / copy"]
     heading += ["float64: in u", *heading[2:]]
@@ -186,7 +185,7 @@ def on_a_gpu(rows: list[Row]) -> str | None:
 
 
 def renders(rows: list[Row]) -> str:
-    """`refract` against `dielectric`, scene by scene."""
+    """Return the comparison of `refract` and `dielectric`, scene by scene."""
     columns = {
         m.CHANGED_SHARE: "pixels changed",
         m.MEANS_DIFFER: "means differ by",
@@ -194,43 +193,43 @@ def renders(rows: list[Row]) -> str:
         m.DETECTABLE: "minimum detectable difference",
         m.TIME_OVER_DIELECTRIC: "time",
     }
-    mine = _measured(rows, against_dielectric.NAME, subject=PLUGIN)
-    text = _replay(mine, "{resolution}² pixels, {spp} spp, {seeds} seeds, {variant}.")
-    cells = [[row.case, *_cells(row, columns, intervals=False)] for row in mine]
+    measured = _measured(rows, against_dielectric.NAME, subject=PLUGIN)
+    text = _replay(measured, "{resolution}² pixels, {spp} spp, {seeds} seeds, {variant}.")
+    cells = [[row.case, *_cells(row, columns, intervals=False)] for row in measured]
     return _table(text, ["scene", *columns.values()], cells, "scenes were rendered")
 
 
 def panes(rows: list[Row]) -> str:
-    """How far the light of thin panes is off, by each method."""
-    mine = _measured(rows, thin_panes.NAME)
-    methods = dict.fromkeys(row.subject for row in mine)
-    by_case = {(row.case, row.subject): row for row in mine}
+    """Return the error of the radiance of thin panes, by method."""
+    measured = _measured(rows, thin_panes.NAME)
+    methods = dict.fromkeys(row.subject for row in measured)
+    by_case = {(row.case, row.subject): row for row in measured}
     lines = [
         [case, *(_cells(by_case.get((case, method)), [thin_panes.OFF])[0] for method in methods)]
-        for case in dict.fromkeys(row.case for row in mine)
+        for case in dict.fromkeys(row.case for row in measured)
     ]
-    text = _replay(mine, "Deviation of the mean radiance from 1. {spp} spp, {setting}.")
+    text = _replay(measured, "Deviation of the mean radiance from 1. {spp} spp, {setting}.")
     return _table(text, ["pane", *(f"`{method}`" for method in methods)], lines, "panes were rendered")
 
 
 def derivatives(rows: list[Row]) -> str:
-    """Whether each derivative is right, how far it is off, its time and variance, by parameter and integrator."""
+    """Return, for each parameter and integrator, the verdict on the derivative, its error, time and variance."""
     study, cells = gradients, {(row.case, row.subject): row for row in _measured(rows, gradients.NAME)}
 
     def cell(case: str, name: str) -> str:
         row = cells[case, name]
-        found, error, _ = (row.reason or "undecided").partition(study.ERROR)  # its words are in the report
-        found += error.removesuffix(": ")
+        verdict, error, _ = (row.reason or "undecided").partition(study.ERROR)  # the report quotes the error itself
+        verdict += error.removesuffix(": ")
         if "off" in row.values:
             off = row.values["gradient"] / row.values["differences"] - 1
-            found += f" ({off:+.1%} ± {row.values['interval']:.1%})"
+            verdict += f" ({off:+.1%} ± {row.values['interval']:.1%})"
         time, variance = _cells(cells.get((f"{case}: {study.TIME}", name)), [study.TIME], intervals=False), ""
         if study.VARIANCE in row.values:
             variance = f", variance {compact(row.values[study.VARIANCE])}"
-        return f"{found}<br>time {time[0]}{variance}"
+        return f"{verdict}<br>time {time[0]}{variance}"
 
-    every = all((case, name) in cells for case in study.TABLE for name in study.INTEGRATORS)
-    lines = [[case, *(cell(case, name) for name in study.INTEGRATORS)] for case in (study.TABLE if every else ())]
+    complete = all((case, name) in cells for case in study.TABLE for name in study.INTEGRATORS)
+    lines = [[case, *(cell(case, name) for name in study.INTEGRATORS)] for case in (study.TABLE if complete else ())]
     heading = ["derivative with respect to", *(f"`{name}`" for name in study.INTEGRATORS)]
     text = (
         "In brackets: how far the derivative is off, and its interval. Time: over that of an image by `path`. "
@@ -240,25 +239,25 @@ def derivatives(rows: list[Row]) -> str:
 
 
 def paths(rows: list[Row]) -> str:
-    """The paths through the mirage, of every plugin and of exact arithmetic with rounded indices."""
+    """Return the errors of paths through the mirage, for every plugin and for exact arithmetic with rounded indices."""
     columns = {
         m.WRONG_PATH: "wrong path",
         layered_paths.MEDIAN_DIRECTION: "direction, median",
         layered_paths.DIRECTION: "direction, worst",
         layered_paths.PLACE: "place, worst",
     }
-    mine = _measured(rows, layered_paths.NAME, columns)
-    mine = [row for row in mine if row.replay["scene"] == f"{layered_paths.MIRAGE.scene}.xml"]
-    names = [row.subject if row.subject.startswith("exact") else f"`{row.subject}`" for row in mine]
-    cells = [[name, *_cells(row, columns)] for name, row in zip(names, mine, strict=True)]
-    return _table(_replay(mine, "{rays} rays, {setting}."), ["", *columns.values()], cells, "paths were traced")
+    measured = _measured(rows, layered_paths.NAME, columns)
+    measured = [row for row in measured if row.replay["scene"] == f"{layered_paths.MIRAGE.scene}.xml"]
+    names = [row.subject if row.subject.startswith("exact") else f"`{row.subject}`" for row in measured]
+    cells = [[name, *_cells(row, columns)] for name, row in zip(names, measured, strict=True)]
+    return _table(_replay(measured, "{rays} rays, {setting}."), ["", *columns.values()], cells, "paths were traced")
 
 
 def efficiency(rows: list[Row]) -> str:
-    """MSE × time of every method by scene, over the built-in with the same sampler; and what all scenes say of it."""
-    mine = _measured(rows, error_against_time.NAME, [m.EQUAL_TIME, m.EQUAL_TIME_DEFAULTS])
+    """Return MSE × time of every method by scene, over the built-in with the same sampler, and a summary."""
+    measured = _measured(rows, error_against_time.NAME, [m.EQUAL_TIME, m.EQUAL_TIME_DEFAULTS])
     scenes: dict[str, dict[str, Row]] = {}
-    for row in mine:
+    for row in measured:
         scenes.setdefault(row.case, {})[row.subject] = row
     methods = [method.name for method in error_against_time.MEASURED if method != BUILTIN]
     cells = [
@@ -270,8 +269,8 @@ def efficiency(rows: list[Row]) -> str:
         ]
         for scene, by_name in scenes.items()
     ]
-    text = _replay(mine, "{resolution}² pixels, {spp} spp, {rounds} rounds, {setting}.")
-    text += "".join(f"\n{sentence}" for sentence in headline.equal_time(mine))
+    text = _replay(measured, "{resolution}² pixels, {spp} spp, {rounds} rounds, {setting}.")
+    text += "".join(f"\n{sentence}" for sentence in headline.equal_time(measured))
     left_out = [row.case for row in rows if row.study == error_against_time.NAME and not row.values]
     text += f"\nNot measured: {', '.join(left_out)}." if left_out else ""
     heading = ["scene", "sampler", f"`{BUILTIN.name}`, over `independent`", *(f"`{name}`" for name in methods)]
@@ -279,39 +278,39 @@ def efficiency(rows: list[Row]) -> str:
 
 
 def changing(rows: list[Row]) -> str:
-    """What it costs to change an index, over the built-in."""
-    mine = _measured(rows, changing_indices.NAME)
-    cells = [[row.case, *_cells(row, [m.TIME_OVER_BUILTIN])] for row in mine]
-    text = _replay(mine, "Median of {rounds} rounds, {setting}, two sides in turn.")
+    """Return the time of changing an index, over the built-in's."""
+    measured = _measured(rows, changing_indices.NAME)
+    cells = [[row.case, *_cells(row, [m.TIME_OVER_BUILTIN])] for row in measured]
+    text = _replay(measured, "Median of {rounds} rounds, {setting}, two sides in turn.")
     return _table(text, ["", "time over the built-in's"], cells, "changes of indices were timed")
 
 
 def settings(rows: list[Row]) -> str:
-    """What a pilot chooses, over the best settings by hand and over Mitsuba's defaults."""
-    mine = [row for row in _measured(rows, chosen_settings.NAME) if row.case != chosen_settings.EVERY]
+    """Return the settings that a pilot chooses, and MSE × time over the best by hand and over Mitsuba's defaults."""
+    measured = [row for row in _measured(rows, chosen_settings.NAME) if row.case != chosen_settings.EVERY]
     metrics = m.EQUAL_TIME_HAND, m.EQUAL_TIME_DEFAULTS, chosen_settings.SHARE
-    cells = [[row.case, f"`{row.replay['chosen']}`", *_cells(row, metrics)] for row in mine]
-    text = _replay(mine, "MSE × time, pilot included, {resolution}² pixels, {spp} spp, {rounds} rounds, {setting}.")
+    cells = [[row.case, f"`{row.replay['chosen']}`", *_cells(row, metrics)] for row in measured]
+    text = _replay(measured, "MSE × time, pilot included, {resolution}² pixels, {spp} spp, {rounds} rounds, {setting}.")
     heading = ["scene", "chosen", "over the best by hand", "over Mitsuba's defaults", "pilot over render"]
     return _table(text, heading, cells, "chosen settings were measured")
 
 
 def caustics_from_lamps(rows: list[Row]) -> str:
-    """Error × time and missing light by body and lamp; whose paths the noise is that is left; energies."""
+    """Return MSE × time and missing light by body and lamp, the remaining noise by class of paths, and energies."""
     study, missing = caustics, "caustics were rendered"
     path, ours, by_class = BUILTIN.name, FROM_LAMPS.name, caustics.BY_CLASS.name
-    found: dict[str, dict[str, Row]] = {}
+    by_case: dict[str, dict[str, Row]] = {}
     for row in _measured(rows, study.NAME):
-        found.setdefault(row.case, {})[row.subject] = row
-    energies = {case: by_name for case, by_name in found.items() if case.startswith(study.ENERGY_OF)}
-    images = {case: by_name for case, by_name in found.items() if path in by_name}
+        by_case.setdefault(row.case, {})[row.subject] = row
+    energies = {case: by_name for case, by_name in by_case.items() if case.startswith(study.ENERGY_OF)}
+    images = {case: by_name for case, by_name in by_case.items() if path in by_name}
     columns = m.EQUAL_TIME, m.EQUAL_TIME_CAUSTIC
     cells = [
         [
             case,
             *_cells(by_name.get(ours), (*columns, m.TIME_OVER_BUILTIN)),
             *_cells(by_name.get(by_class), columns, intervals=False),
-            # Of a lamp of some size it is the noise of `path`.
+            # For a lamp with a size, the difference of `path` is noise.
             "–" if m.EQUAL_TIME in by_name[path].values else _percent(by_name[path], study.MISSING, 1),
             _percent(by_name.get(ours), study.MISSING, 1),
         ]
@@ -341,12 +340,12 @@ def caustics_from_lamps(rows: list[Row]) -> str:
 
 
 def caustics_by_others(rows: list[Row]) -> str:
-    """How far the energy of a caustic is off, by renderer."""
+    """Return the relative error of a caustic's power, by renderer."""
     study = caustic_energies
-    mine = [row for row in rows if row.study == study.NAME]
-    cases = [*dict.fromkeys(row.case for row in mine if row.values)]
+    measured = [row for row in rows if row.study == study.NAME]
+    cases = [*dict.fromkeys(row.case for row in measured if row.values)]
     cells: dict[str, dict[str, str]] = {}
-    for row in mine:
+    for row in measured:
         off = f"{row.replay['power'] / row.replay['exact power'] - 1:+.1%}" if study.OFF in row.values else "not run"
         cells.setdefault(row.subject, {})[row.case] = off + (" ✗" if row.broken else "")
     lines = [[name, *(by_case.get(case, "–") for case in cases)] for name, by_case in cells.items()] if cases else []
@@ -354,17 +353,17 @@ def caustics_by_others(rows: list[Row]) -> str:
 
 
 def _off(row: Row | None) -> str:
-    """How far an energy is off, and its standard error."""
+    """Return the relative error of an energy and its standard error."""
     return " ± ".join(_percent(row, x, 3) for x in (caustics.OFF, caustics.NOISE)) if row else "–"
 
 
 def _percent(row: Row | None, metric: str, digits: int) -> str:
-    """A value of a row in per cent; – where there is none."""
+    """Return a value of a row in per cent; – if it is missing."""
     return f"{row.values[metric]:.{digits}%}" if row and metric in row.values else "–"
 
 
 def planar(rows: list[Row]) -> str:
-    """The distance of paths from the retrace by scene, and the time per path by the number of segments."""
+    """Return the distance of paths from the retrace by scene, and the time per path by number of segments."""
     study, missing = against_retrace, "planar paths were traced on LLVM"
     by_case = {(row.case, row.setting): row for row in _measured(rows, study.NAME, subject=study.TRACE)}
     retraced = []
@@ -397,10 +396,10 @@ def planar(rows: list[Row]) -> str:
 
 
 def seen(rows: list[Row]) -> str:
-    """The share of trials in which each method of comparison saw each planted defect, and its false alarms."""
+    """Return in how many trials each method of comparison detected each planted defect, and its false alarms."""
 
     def percent(shares: list[float], digits: int = 0) -> str:
-        """The share of several scenes: one number where they are the same, else the smallest and the largest."""
+        """Return the range of the shares of several scenes; one number if they are equal."""
         return "–".join(dict.fromkeys(f"{100 * x:.{digits}f}" for x in (min(shares), max(shares)))) + " %"
 
     def shares(method: str, trials: list[Row]) -> str:
@@ -430,10 +429,12 @@ def seen(rows: list[Row]) -> str:
 
 
 def visible(rows: list[Row]) -> str:
-    """How large the errors of FLIP are in changes that nobody sees and that a person sees."""
+    """Return the errors of FLIP for changes that a person does not see and for those that a person sees."""
     study, missing = visible_changes, "visible changes were planted"
-    mine = _measured(rows, study.NAME)
-    kinds = [r for r in mine if r.case != study.LIMIT and r.subject in (*study.KINDS, study.EDGE)]  # not other seeds
+    measured = _measured(rows, study.NAME)
+    kinds = [
+        r for r in measured if r.case != study.LIMIT and r.subject in (*study.KINDS, study.EDGE)
+    ]  # not other seeds
     metrics = (*study.MEASURED, study.ERROR)
     cells = [
         [row.subject, row.reason, row.case, *_cells(row, metrics), f"{row.values[study.ALARMS]:.1%}"] for row in kinds
@@ -445,7 +446,7 @@ def visible(rows: list[Row]) -> str:
     ]
     heading = ["change", "", "by a person", *bounds, study.ERROR, study.ALARMS]
     first = _table(_replay(kinds, "{trials} pairs of {size}² pixels each, {setting}."), heading, cells, missing)
-    limits = [row for row in mine if row.case == study.LIMIT]
+    limits = [row for row in measured if row.case == study.LIMIT]
     squares = [row for row in limits if study.CODES in row.values]
     codes = [compact(row.values[study.CODES]) if row.values[study.CODES] < 255 else "never" for row in squares]
     edge = next((compact(row.values[study.PIXELS]) for row in limits if row.subject == study.EDGE), "")
@@ -455,11 +456,11 @@ def visible(rows: list[Row]) -> str:
 
 
 def numbers(rows: list[Row]) -> str:
-    """Every standard number, what is printed of it, and what the plugin makes of it."""
+    """Return all standard numbers with their printed digits and the plugin's results."""
     study, lines = standard_numbers, []
-    mine = {row.case: row for row in _measured(rows, study.NAME, [m.ERROR_OVER_BOUND], PLUGIN)}
+    by_name = {row.case: row for row in _measured(rows, study.NAME, [m.ERROR_OVER_BOUND], PLUGIN)}
     for number in NUMBERS.values():
-        if row := mine.get(number.name):
+        if row := by_name.get(number.name):
             digits = f"{number.value:.9g}{number.unit.replace('mm', ' mm')}"
             measured = f"{row.values[study.MEASURED]:.9g}"
             cells = _cells(row, [study.BOUND, m.ERROR_OVER_BOUND, study.SECONDS])
@@ -470,16 +471,16 @@ def numbers(rows: list[Row]) -> str:
 
 
 def numbers_elsewhere(rows: list[Row]) -> str:
-    """Standard numbers by others: the error over its bound; ✗ where it is beyond."""
-    mine = [row for row in rows if row.study == numbers_by_others.NAME]
+    """Return the errors of other renderers' standard numbers over their bounds; ✗ above 1."""
+    all_rows = [row for row in rows if row.study == numbers_by_others.NAME]
     cells: dict[str, dict[str, str]] = {}
-    for row in _measured(mine, numbers_by_others.NAME, [m.ERROR_OVER_BOUND]):
+    for row in _measured(all_rows, numbers_by_others.NAME, [m.ERROR_OVER_BOUND]):
         subject = f"{row.subject}, {row.setting}" if row.setting in PRECISIONS else row.subject
         (share,) = _cells(row, [m.ERROR_OVER_BOUND])
         cells.setdefault(subject, {})[row.case] = share + (" ✗" if row.broken else "")
-    asked = [name for name in NUMBERS if any(name in by_name for by_name in cells.values())]
-    lines = [[name, *(by_name.get(name, "") for by_name in cells.values())] for name in asked]
-    absent = dict.fromkeys(row.subject for row in mine if not row.values)
+    names = [name for name in NUMBERS if any(name in by_name for by_name in cells.values())]
+    lines = [[name, *(by_name.get(name, "") for by_name in cells.values())] for name in names]
+    absent = dict.fromkeys(row.subject for row in all_rows if not row.values)
     text = "Error over bound: of rays in each system's own precision."
     text += f"\nNot run here: {'; '.join(absent)}." if absent else ""
     return _table(text, ["number", *cells], lines, "other renderers were asked for standard numbers")
@@ -511,18 +512,19 @@ TABLES = {
 
 
 def gallery(rows: list[Row], context: Context) -> bytes:
-    """A PNG of every scene as `refract` rendered it, side by side; without the furnace, which is white when right.
+    """Return a PNG of all scenes as `refract` rendered them, side by side.
 
-    Scenes with dispersion or absorption come last, from a spectral variant.
+    The furnace is left out: it is white if correct. Scenes with dispersion or absorption, from a spectral variant, are
+    last.
     """
-    drawn = [row for row in rows if row.subject == PLUGIN and row.images]
-    paths = [r.images["test"] for study in (against_dielectric, colours) for r in drawn if r.study == study.NAME]
-    tiles = [tile for path in paths if (tile := image_file.read_exr(context.out / path)[0]).std() > 1e-3]
-    return _sheet(tiles, 8)
+    rendered = [row for row in rows if row.subject == PLUGIN and row.images]
+    paths = [r.images["test"] for study in (against_dielectric, colours) for r in rendered if r.study == study.NAME]
+    images = [image_file.read_exr(context.out / path)[0] for path in paths]
+    return _sheet([image for image in images if image.std() > 1e-3], 8)
 
 
 def caustic_pairs(rows: list[Row], context: Context) -> bytes:
-    """A PNG of every body and lamp: by `path` above, and below it with lamps traced. All have the same irradiance."""
+    """Return a PNG of all bodies and lamps, at equal irradiance: `path` above, with lamps traced below."""
     by_method = [
         {
             row.case: row.images["test"]
@@ -531,13 +533,15 @@ def caustic_pairs(rows: list[Row], context: Context) -> bytes:
         }
         for name in (BUILTIN.name, FROM_LAMPS.name)
     ]
-    above, below = ([image_file.read_exr(context.out / found[case])[0] for case in by_method[0]] for found in by_method)
+    above, below = (
+        [image_file.read_exr(context.out / images[case])[0] for case in by_method[0]] for images in by_method
+    )
     pairs = [np.concatenate(pair) for pair in zip(above, below, strict=True)]
     return _sheet([pair.repeat(2, 0).repeat(2, 1) for pair in pairs], 6)
 
 
 def _sheet(tiles: list[np.ndarray], columns: int) -> bytes:
-    """A PNG of images of one size, side by side."""
+    """Return a PNG of images of one size in rows of `columns`."""
     (height, width), gap = tiles[0].shape[:2], 4
     lines = -(-len(tiles) // columns)
     sheet = np.ones((lines * (height + gap) - gap, columns * (width + gap) - gap, 3), np.float32)

@@ -1,8 +1,8 @@
-"""How far directions are from the exact ones, and whether that is within their error bounds. One judge for all.
+"""Errors of directions against the exact ones, and whether they are within their bounds, for formulas and programs.
 
-In: rays, their certified answers from the oracle, and the directions and decisions of some program or formula as numpy
-arrays (`evaluate` gets them from a formula). Out: a `Judgement`, ray by ray, against the a-priori bounds of
-`formulas.Budget`.
+Input: rays, their certified answers from the oracle, and the directions and decisions of a program or formula as numpy
+arrays (`evaluate` computes them with a formula). Output: a `Judgement` with one verdict per ray, against the a-priori
+bounds of `formulas.Budget`.
 """
 
 from . import backward_error

@@ -1,4 +1,4 @@
-"""The judge of directions: every ray against its certified answer and the error bound of a formula for that ray."""
+"""Judge directions: compare every ray with its certified answer and with the error bound of a formula for that ray."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from mi_refract.regimes import Array, Rays
 
 Flags = NDArray[np.bool_]
 
-# In u: what making `a` and `n` unit in their own precision leaves of errors, with those of the components.
+# In u: the error of the lengths of `a` and `n`, that of the components included, after they were made unit in their own
+# precision.
 NORMALISING = 3.0
-# The most that `Judgement.values` may be.
+# The largest `Judgement.values` within the bounds.
 BUDGETS = {"error / bound": 1.0, "TIR misclassified, beyond its bound": 0.0}
 
 
@@ -28,7 +29,7 @@ BUDGETS = {"error / bound": 1.0, "TIR misclassified, beyond its bound": 0.0}
 
 
 class DirectionErrors(NamedTuple):
-    """Errors of directions b, (N,) float64 each; infinite where b is NaN."""
+    """Errors of directions b, (N,) float64 each; infinite if b is NaN."""
 
     chord: Array  # |b/|a| − exact|
     angle: Array  # between b and the exact direction, radians
@@ -38,7 +39,7 @@ class DirectionErrors(NamedTuple):
 def errors(b: Array, rays: Rays, exact: oracle.Certified) -> DirectionErrors:
     """Errors of `b` (N, 3), which should have the length of `a`, relative to |a|."""
     unit, low = b / lengths(rays.a)[:, None], exact.direction_low.astype(np.longdouble)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # b may be anything
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # b may have any values
         difference = (unit - exact.direction) - low
         chord, norm = lengths(difference), lengths(unit)
         across = lengths(np.cross(unit, difference)) / norm
@@ -47,26 +48,26 @@ def errors(b: Array, rays: Rays, exact: oracle.Certified) -> DirectionErrors:
 
 
 def errors_of_normalised(b: Array, rays: Rays, exact: oracle.Certified) -> DirectionErrors:
-    """Errors of `b` (N, 3) that may also have been made unit: `drift` is | |b| − 1 | where that is less.
+    """Errors of `b` (N, 3) that may also have been made unit: `drift` is | |b| − 1 | if that is less.
 
-    Chord and angle are those of b scaled to the length of `a`. NaN stays in `drift`.
+    Chord and angle are those of b scaled to the length of `a`. For NaN, `drift` is NaN.
     """
-    with np.errstate(all="ignore"):  # b may be anything
-        length, kept = lengths(b), lengths(rays.a)
-        drift = np.fmin(np.abs(length - 1), np.abs(length / kept - 1)).astype(float)
-        return errors(b * (kept / length)[:, None], rays, exact)._replace(drift=drift)
+    with np.errstate(all="ignore"):  # b may have any values
+        length, length_a = lengths(b), lengths(rays.a)
+        drift = np.fmin(np.abs(length - 1), np.abs(length / length_a - 1)).astype(float)
+        return errors(b * (length_a / length)[:, None], rays, exact)._replace(drift=drift)
 
 
 def absolute_radicand(rays: Rays) -> Array:
-    """(N,) |1 − k² sin²θ_i|, in extended precision: how far each ray is from the critical angle."""
+    """(N,) |1 − k² sin²θ_i| in extended precision: a measure of the distance from the critical angle."""
     a, n, k = (x.astype(np.longdouble) for x in (rays.a, rays.n, rays.k))
     return np.abs(1 - (k * lengths(np.cross(n, a)) / (lengths(a) * lengths(n))) ** 2)
 
 
 def relative_radicand(rays: Rays) -> Array:
-    """(N,) |(n·a)² − κ|n×a|²| over the mean of its two terms, right to 2⁻¹⁴⁰; NaN where both are 0.
+    """(N,) |(n·a)² − κ|n×a|²| over the mean of its two terms, with an error of 2⁻¹⁴⁰; NaN if both are 0.
 
-    Near the critical angle, where the terms are alike, it is the modulus of `oracle.relative_radicand`.
+    Near the critical angle, where the terms are nearly equal, it is the modulus of `oracle.relative_radicand`.
     """
     _, d, terms = regimes.radicand(*(x.T.astype(np.float64) for x in (rays.a, rays.n, rays.k)))
     with np.errstate(invalid="ignore"):
@@ -75,7 +76,7 @@ def relative_radicand(rays: Rays) -> Array:
 
 
 def lengths(v: Array) -> Array:
-    """(N,) of (N, 3), in extended precision."""
+    """(N,) the lengths of vectors (N, 3), in extended precision."""
     length: Array = np.sqrt((v.astype(np.longdouble) ** 2).sum(1))
     return length
 
@@ -85,9 +86,9 @@ def lengths(v: Array) -> Array:
 
 @dataclass(frozen=True)
 class RayBounds:
-    """What an error bound, `budget`, allows for each ray. Arrays are (N,).
+    """The errors that `budget` allows for each ray. Arrays are (N,).
 
-    `roundoff`: that of the answers' precision. `normalised`: `a`, `n` and `b` may have been made unit.
+    `roundoff`: that of the answers' precision. `normalised`: whether `a`, `n` and `b` may have been made unit.
     """
 
     rays: Rays
@@ -98,16 +99,16 @@ class RayBounds:
 
     @functools.cached_property
     def u(self) -> Any:
-        """The roundoff that the bound is taken at, a number or (N,).
+        """The roundoff for which the bound is computed, a number or (N,).
 
-        A formula for unit vectors is off by what `a` and `n` are off unit by, too; by no more than NORMALISING
-        roundoffs if they may have been made unit.
+        The error of a formula for unit vectors also depends on how far the lengths of `a` and `n` are from 1; this
+        counts as at most NORMALISING roundoffs if they may have been made unit.
         """
         if self.budget.at_the_limit:
             return self.roundoff
-        off = np.maximum(*(np.abs(lengths(v) - 1) for v in (self.rays.a, self.rays.n)))
-        most = NORMALISING * self.roundoff if self.normalised else np.inf
-        return np.clip(off, self.roundoff, most).astype(float)
+        length_error = np.maximum(*(np.abs(lengths(v) - 1) for v in (self.rays.a, self.rays.n)))
+        largest = NORMALISING * self.roundoff if self.normalised else np.inf
+        return np.clip(length_error, self.roundoff, largest).astype(float)
 
     @functools.cached_property
     def k(self) -> Array:
@@ -121,7 +122,7 @@ class RayBounds:
 
     @property
     def side_open(self) -> Flags:
-        """Whether the ray is so near to the surface that the formula need not know its side."""
+        """Whether the ray is so near the surface that the formula may be wrong about its side."""
         return np.asarray(self.budget.side_open(self.u, self.exact.cos_i))
 
     @property
@@ -142,9 +143,9 @@ class RayBounds:
 
     @functools.cached_property
     def length(self) -> Array:
-        """Bound of the error of the length, relative.
+        """Bound of the relative error of the length.
 
-        The square of the part across the surface is off by the radicand's error, x; all else by what is linear in u.
+        The square of the component across the surface has the radicand's error, x; all other errors are linear in u.
         """
         x = np.where(self.exact.transmitted, self.budget.radicand_error_bound(self.u, self.k), 0.0)
         shorter = np.where(x < 1, x / (1 + np.sqrt(np.maximum(1 - x, 0))), 1.0)
@@ -152,19 +153,18 @@ class RayBounds:
 
     @functools.cached_property
     def decided(self) -> Flags:
-        """Where total internal reflection must be decided rightly: the radicand exceeds the error the bound allows."""
+        """Whether the decision about total internal reflection must be right: the radicand exceeds its error bound."""
         return self.decided_of(np.ones(len(self.rays), bool))
 
-    def decided_of(self, some: Flags) -> Flags:
-        """`decided` of the rays in the mask, False elsewhere. (The radicand takes time.)"""
-        rays, above = self.rays[some], some.copy()
+    def decided_of(self, mask: Flags) -> Flags:
+        """`decided` for the rays in the mask, False elsewhere; this saves time, as the radicand is slow to compute."""
+        rays, result = self.rays[mask], mask.copy()
         if self.budget.at_the_limit:
-            # A tangential ray at k = 1 has no terms, and NaN is not within anything.
-            above[some] = ~(relative_radicand(rays) <= NEGLIGIBLE * self.roundoff**2)
-            return above
-        u = self.u[some]
-        above[some] = absolute_radicand(rays) > self.budget.radicand_error_bound(u, self.k[some])
-        decided: Flags = above & ~self.side_open
+            # For a tangential ray at k = 1 both terms are 0 and the ratio is NaN: then the ray counts as decided.
+            result[mask] = ~(relative_radicand(rays) <= NEGLIGIBLE * self.roundoff**2)
+            return result
+        result[mask] = absolute_radicand(rays) > self.budget.radicand_error_bound(self.u[mask], self.k[mask])
+        decided: Flags = result & ~self.side_open
         return decided
 
 
@@ -172,22 +172,22 @@ class RayBounds:
 class Judgement:
     """The verdict on each ray. Arrays are (N,).
 
-    Errors count where directions are `compared`: total internal reflection was decided rightly, and a direction came.
+    Errors count if directions are `compared`: total internal reflection was decided right, and b is a direction.
     """
 
     bounds: RayBounds
-    chord: Array  # |b/|a| − exact|; infinite where b is NaN
+    chord: Array  # |b/|a| − exact|; infinite if b is NaN
     angle: Array  # radians
-    drift: Array  # of the length of b, relative
-    error: Array  # what `bounds.chord` is of: the chord; of normalised answers the angle
+    drift: Array  # relative error of the length of b
+    error: Array  # the error that `bounds.chord` bounds: the chord, or the angle of normalised answers
     compared: Flags
-    misjudged: Flags  # transmitted where all is reflected, or the reverse
-    blank: Flags  # neither a direction nor a sign of total internal reflection
+    misjudged: Flags  # a totally reflected ray was classified as transmitted, or the reverse
+    blank: Flags  # neither a direction nor a signal of total internal reflection
 
     @functools.cached_property
     @np.errstate(over="ignore", invalid="ignore")
     def share(self) -> Array:
-        """Error over bound of the rays compared, 0 elsewhere; of normalised answers also that of the length."""
+        """Error over bound of the compared rays, 0 elsewhere; for normalised answers that of the length if larger."""
         share = self.error / self.bounds.chord
         if self.bounds.normalised:
             share = np.maximum(share, self.drift / self.bounds.length)
@@ -195,23 +195,23 @@ class Judgement:
 
     @functools.cached_property
     def far(self) -> Flags:
-        """Misclassified although the radicand exceeds the bound on its error; or undecided by the oracle."""
+        """Whether a ray is misclassified though the radicand exceeds its error bound, or undecided by the oracle."""
         far: Flags = self.bounds.decided_of(self.misjudged) | self.bounds.exact.undecided
         return far
 
     @functools.cached_property
     def wrong(self) -> Flags:
-        """The rays that break the bound."""
+        """Whether a ray breaks its bound."""
         wrong: Flags = ~(self.share <= 1) | self.far | self.blank
         return wrong
 
     def meets(self, budget: Budget) -> Flags:
-        """The answers that keep the bound of another budget."""
+        """Whether an answer keeps the bound of another budget."""
         return ~replace(self, bounds=replace(self.bounds, budget=budget)).wrong
 
     @property
     def crossed(self) -> Flags:
-        """The rays whose answer is on the other side of the surface, where the bound leaves the side open."""
+        """Whether a direction is on the wrong side of the surface where the bound allows it."""
         exact = self.bounds.exact
         crossed: Flags = self.bounds.side_open & self.compared & exact.transmitted & (self.error > exact.cos_t)
         return crossed
@@ -219,14 +219,14 @@ class Judgement:
     @property
     @np.errstate(over="ignore", invalid="ignore")
     def linear_needed(self) -> Array:
-        """The value of `budget.linear` that this ray needs, with the rest of the budget unchanged."""
+        """The value of `budget.linear` that each ray needs, with the rest of the budget unchanged."""
         needed = self.bounds.budget.linear * (self.error - self.bounds.of_root) / self.bounds.of_terms
         return np.where(self.compared & ~self.bounds.side_open, needed, 0.0)
 
     @property
     @np.errstate(over="ignore", invalid="ignore")
     def radicand_needed(self) -> Array:
-        """The value of `budget.radicand` that this ray needs, with the rest of the budget unchanged."""
+        """The value of `budget.radicand` that each ray needs, with the rest of the budget unchanged."""
         bounds, exact = self.bounds, self.bounds.exact
         needed = radicand_for(np.maximum(self.error - bounds.of_terms, 0), exact.cos_t)
         needed = np.where(exact.transmitted, needed, 0.0)
@@ -235,17 +235,17 @@ class Judgement:
         return np.where(bounds.side_open, 0.0, needed)
 
     def values(self) -> dict[str, float]:
-        """The worst of all rays; within the bounds where each is at most that of BUDGETS."""
+        """The worst values over all rays; they are within the bounds if none exceeds that of BUDGETS."""
         return {"error / bound": float(self.share.max()), "TIR misclassified, beyond its bound": float(self.far.sum())}
 
 
 def judge(
     b: Array, transmitted: Flags, bounds: RayBounds, directed: Flags | bool = True, blank: Flags | bool = False
 ) -> Judgement:
-    """Answers `b` (N, 3), in any precision, and whether each says that the ray is transmitted (N,), ray by ray.
+    """The verdict on answers: `b` (N, 3) in any precision, and whether each classifies its ray as transmitted (N,).
 
-    `directed`: whose b is a direction to compare; `blank`: whose b is neither that nor a sign of total internal
-    reflection. Of `bounds.normalised` answers the length counts less: see `errors_of_normalised`.
+    `directed`: whether b is a direction to compare. `blank`: whether b is neither a direction nor a signal of total
+    internal reflection. For `bounds.normalised` the errors are those of `errors_of_normalised`.
     """
     exact = bounds.exact
     known = ~exact.undecided & ~np.broadcast_to(blank, len(exact))
@@ -264,14 +264,14 @@ def judge(
 
 # Formulas -------------------------------------------------------------------------------------------------------------
 
-# What is called as the entries of FORMULAS are: `subject(a, n, k) -> (b, transmitted)`.
+# A function with the signature of the entries of FORMULAS: `subject(a, n, k) -> (b, transmitted)`.
 Subject: TypeAlias = Callable[[Vector3, Vector3, Number], tuple[Vector3, Mask]]
 
 
 def evaluate(subject: Subject, rays: Rays, vector: ArrayType) -> tuple[Array, NDArray[np.bool_]]:
-    """(b, transmitted) of all rays, (N, 3) in extended precision and (N,).
+    """(b, transmitted) for all rays, (N, 3) in extended precision and (N,).
 
-    `vector`: the 3-vector type of Dr.Jit to compute with. With scalar types the subject is called ray by ray.
+    `vector`: the 3-vector type of Dr.Jit to compute with. With scalar types the subject is called for each ray.
     """
     if dr.is_jit_v(vector):
         b, transmitted = subject(*arrays(rays, vector))
@@ -290,6 +290,6 @@ def arrays(rays: Rays, vector: ArrayType) -> tuple[Vector3, Vector3, Number]:
 def judge_formula(
     subject: Subject, rays: Rays, exact: oracle.Certified, vector: ArrayType, budget: Budget
 ) -> Judgement:
-    """`judge` what `subject` returns for all rays, computed in arrays of the 3-vector type `vector`."""
+    """`judge` the results of `subject` for all rays, computed with arrays of the 3-vector type `vector`."""
     u = float(np.finfo(rays.a.dtype).eps) / 2
     return judge(*evaluate(subject, rays, vector), RayBounds(rays, exact, budget, u))

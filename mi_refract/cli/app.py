@@ -1,4 +1,4 @@
-"""The command `mi-refract`: its list of commands, and how errors are printed.
+"""The list of commands of `mi-refract`, and the printing of errors.
 
 A command's module is imported only when that command is called, which keeps `--help` and `--version` fast. Errors are
 one line on stderr, `mi-refract: ...`, with exit code 2. Ctrl-C exits with 130.
@@ -28,10 +28,10 @@ from mi_refract.io.text import printable
 
 
 class Command(NamedTuple):
-    """Where a command is found, and its line of the help."""
+    """Where a command is defined, and its line in the help."""
 
-    module: str  # beside this one
-    attribute: str  # of it: a function, or a `typer.Typer` with commands of its own
+    module: str  # of this package
+    attribute: str  # of the module: a function, or a `typer.Typer` with subcommands
     help: str
 
 
@@ -47,7 +47,7 @@ COMMANDS = {
 }
 
 
-# Where the help of a command ends, by its name.
+# The examples at the end of a command's help, by the command's name.
 EXAMPLES = {
     "": ("doctor", "render scene.xml -o image.exr --spp 256", "diff references/ new/ --report out.html"),
     "render": (
@@ -90,27 +90,27 @@ EXAMPLES = {
 
 
 def examples(name: str) -> str:
-    """The EXAMPLES of a command, in lines that are not wrapped."""
+    """Return the EXAMPLES of a command as lines that typer does not wrap."""
     return "\n".join(["\b", "Examples:", *(f"  mi-refract {words}" for words in EXAMPLES.get(name, ()))])
 
 
 def with_examples(command: Any, name: str) -> Any:
-    """The command, which is called `name`, and those below it, with their examples where their help ends."""
+    """Append examples to the help of the command `name` and of its subcommands; return the command."""
     command.epilog = examples(name)
-    for below, one in getattr(command, "commands", {}).items():
-        with_examples(one, f"{name} {below}")
+    for subname, subcommand in getattr(command, "commands", {}).items():
+        with_examples(subcommand, f"{name} {subname}")
     return command
 
 
 class Commands(TyperGroup):
-    """The commands of COMMANDS, each imported when it is called."""
+    """The commands in COMMANDS; each module is imported when its command is called."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """The names, in the order of the help."""
+        """Return the names in the order of the help."""
         return list(COMMANDS)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """The command of that name. ValueError where there is none."""
+        """Return the command with that name. ValueError for an unknown name."""
         if cmd_name not in COMMANDS:
             raise ValueError(f"unknown command {cmd_name!r}; expected {', '.join(COMMANDS)}")
         entry = COMMANDS[cmd_name]
@@ -122,7 +122,7 @@ class Commands(TyperGroup):
         return with_examples(typer.main.get_command(command), cmd_name)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a line for each command, without importing it."""
+        """Write one line per command, without importing the commands."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, command.help) for name, command in COMMANDS.items()])
 
@@ -147,10 +147,10 @@ def _root(
 
 
 def shows(text: Callable[[], str]) -> Callable[[bool], None]:
-    """The callback of an eager flag that prints a text in place of what the command does."""
+    """Return the callback of an eager flag that prints a text instead of running the command."""
 
-    def callback(wanted: bool) -> None:
-        if wanted:
+    def callback(is_set: bool) -> None:
+        if is_set:
             print(text())
             raise typer.Exit
 
@@ -158,10 +158,10 @@ def shows(text: Callable[[], str]) -> Callable[[bool], None]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line, or `arguments`; the exit code. Warnings are one line on stderr, as errors are."""
+    """Run `arguments`, by default the command line, and return the exit code. Warnings are one line on stderr."""
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: print(printable(f"mi-refract: {message}"), file=sys.stderr)
         words = sys.argv[1:] if arguments is None else arguments
-        # `obj`: a command may show the command line that repeats it.
+        # `obj`: reports show the command line that made them.
         run = functools.partial(app, words, prog_name="mi-refract", standalone_mode=False, obj=words)
         return exit_code("mi-refract", run, (KeyboardInterrupt, typer.Abort))

@@ -1,7 +1,7 @@
-"""The commands `mi-refract diff`, `accept` and `self-test`: compare images with references, replace references, and
-show which defects a comparison detects.
+"""The commands `mi-refract diff`, `accept` and `self-test`.
 
-What only some calls need is imported there: of a comparison that takes a third of a second the imports are the most.
+They compare images with references, replace references, and show which defects a comparison detects. Modules that only
+some calls need are imported inside functions: imports take most of the third of a second of a small comparison.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from mi_refract.io.text import printable
 from .app import shows
 from .interrupts import last_act
 
-RENDERS, SPP = 16, 16  # of a scene, for the self-test
+RENDERS, SPP = 16, 16  # number of renders of a scene in the self-test, and their samples per pixel
 SCENE = ".xml"
-Inconclusive = enum.StrEnum("Inconclusive", {"PASS": "pass", "FAIL": "fail"})  # what such an image counts as
+Inconclusive = enum.StrEnum("Inconclusive", {"PASS": "pass", "FAIL": "fail"})  # how an inconclusive image counts
 
 
 Names = Annotated[
@@ -62,7 +62,8 @@ def diff(
     context: typer.Context,
     reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")],
     test: Annotated[
-        Path | None, typer.Argument(metavar="TEST", help="What to compare with it; optional with --check-settings.")
+        Path | None,
+        typer.Argument(metavar="TEST", help="The image or folder to compare; optional with --check-settings."),
     ] = None,
     names: Names = None,
     method: Method = AUTO,
@@ -79,7 +80,9 @@ def diff(
     ] = "",
     junit: Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")] = None,
     json: Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")] = None,
-    github: Annotated[bool, typer.Option("--github", help="Print annotations, write the job's summary.")] = False,
+    github: Annotated[
+        bool, typer.Option("--github", help="For GitHub Actions: print annotations and write the job's summary.")
+    ] = False,
     methods: Annotated[
         bool,
         typer.Option("--methods", is_eager=True, callback=shows(key_tables), help="Print the methods and all keys."),
@@ -89,25 +92,25 @@ def diff(
         typer.Option("--json-schema", is_eager=True, callback=shows(_json_schema), help="Print the schema of --json."),
     ] = False,
     check_settings: Annotated[
-        bool, typer.Option("--check-settings", help="Print how each image would be compared, and by which settings.")
+        bool, typer.Option("--check-settings", help="Print the method and settings of each image; compare nothing.")
     ] = False,
 ) -> None:
     """Compare images with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
     require_extra("scipy", *["jinja2"] * bool(report))
     if test is None and not check_settings:
         raise ValueError("two paths are needed; expected mi-refract diff REFERENCE TEST")
-    chosen = _settings(reference, test or reference, method, options or [], settings, max_values)
+    resolved = _settings(reference, test or reference, method, options or [], settings, max_values)
     if check_settings or test is None:
-        test = test or reference
-        every = pairing.pairs(reference, test, chosen)
-        pairs = pairing.named(every, names or [])
-        unused = chosen.unused([pair.name for pair in pairs])
-        unused += [] if test is reference else pairing.unused_templates(every)  # a variant would be its own new image
-        lines = [f"{pattern}: matches no image" for pattern in unused]
-        checked = (*pairs, *pairing.wrong_entries(chosen, every))
+        all_pairs = pairing.pairs(reference, test or reference, resolved)
+        pairs = pairing.named(all_pairs, names or [])
+        unused = resolved.unused([pair.name for pair in pairs])
+        if test is not None:  # REFERENCE compared with itself holds each variant as a new image
+            unused += pairing.unused_templates(all_pairs)
+        warnings = [f"{pattern}: matches no image" for pattern in unused]
+        checked = (*pairs, *pairing.wrong_entries(resolved, all_pairs))
         errors = [f"{pair.name}: {error}" for pair in checked if (error := pairing.error_of(pair, reference))]
         text_reports.print_table(text_reports.settings_table(pairs))
-        for line in lines + errors:
+        for line in warnings + errors:
             print(f"mi-refract: {printable(line)}", file=sys.stderr)
         raise typer.Exit(MISUSE if errors else 0)
     for path, suffixes in ((report, (".html", ".htm")), (junit, (".xml",)), (json, (".json",))):
@@ -122,7 +125,7 @@ def diff(
         results = folders.diff(
             reference,
             test,
-            chosen,
+            resolved,
             names=names or [],
             renders=renders,
             inconclusive=inconclusive or "",
@@ -140,7 +143,7 @@ def diff(
 
             software = {name: version for name, version in versions().items() if version != "unknown"}
             page.write(results, software, results.command("diff", *(names or [])), str(json or ""))
-    finally:  # a file that cannot be written hides no verdict
+    finally:  # print the verdict even if a file cannot be written
         text_reports.print_results(results)
     if github:
         from mi_refract.image_diff import results_file
@@ -160,14 +163,15 @@ def accept(
     settings: File = None,
     max_values: MaxValues = MAX_VALUES,
     source: Annotated[
-        Path | None, typer.Option("--from", metavar="OUT.json", help="Accept the images that diff --json compared.")
+        Path | None,
+        typer.Option("--from", metavar="OUT.json", help="Accept the results of an earlier diff --json OUT.json."),
     ] = None,
     as_variant: Annotated[
-        str, typer.Option(metavar="NAME", help="Add the new images as further references, named by key `accept`.")
+        str, typer.Option(metavar="NAME", help="Add the new images as further references, named as key `accept` says.")
     ] = "",
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
 ) -> None:
-    """Copy new images over references that they are not equal to, after confirmation. Nothing is deleted."""
+    """Copy new images over the references that they differ from, after confirmation. Nothing is deleted."""
     require_extra("scipy")
     from mi_refract.image_diff import accept as accepting
 
@@ -180,15 +184,15 @@ def accept(
             raise ValueError("--from repeats an earlier comparison; do not combine it with --method or --set")
         results = results_file.read(source, reference, test)
         results = replace(results, results=tuple(pairing.named(results.results, names or [])))
-        chosen = _settings(results.reference, results.test, AUTO, [], settings, max_values)
-        results = results_file.with_settings(results, chosen)
+        resolved = _settings(results.reference, results.test, AUTO, [], settings, max_values)
+        results = results_file.with_settings(results, resolved)
         text_reports.print_errors(results)
     elif reference is None or test is None:
         raise ValueError("two paths are needed; expected mi-refract accept REFERENCE TEST, or --from OUT.json")
     else:
-        chosen = _settings(reference, test, method, options or [], settings, max_values)
+        resolved = _settings(reference, test, method, options or [], settings, max_values)
         with _progress() as progress:
-            results = folders.diff(reference, test, chosen, names=names or [], to_accept=True, progress=progress)
+            results = folders.diff(reference, test, resolved, names=names or [], to_accept=True, progress=progress)
         text_reports.print_results(results)
     if reference_pack.of_references(results.reference):
         raise ValueError(
@@ -197,7 +201,7 @@ def accept(
     try:
         copies = list(accepting.changes(results, as_variant))
     except accepting.UnreadableImage as error:
-        if error.result.status is Status.ERROR:  # and printed
+        if error.result.status is Status.ERROR:  # printed above
             raise typer.Exit(MISUSE) from None
         raise
     for copy in copies:
@@ -217,7 +221,7 @@ def accept(
 
 
 def require_extra(*packages: str) -> None:
-    """ValueError, before anything is compared, where a package is not installed."""
+    """Raise ValueError if a package is not installed."""
     if not all(map(importlib.util.find_spec, packages)):
         raise ValueError("comparing needs the extra `diff`: pip install 'mi-refract[diff]'")
 
@@ -225,12 +229,13 @@ def require_extra(*packages: str) -> None:
 def _settings(
     reference: Path, test: Path, method: str, words: Sequence[str], file: Path | None, max_values: int
 ) -> Settings:
-    """What the options and the settings file say. ValueError or OSError for what they cannot mean."""
-    # A folder of references need not exist yet.
+    """Return the settings of the options and of the settings file. ValueError or OSError if either is invalid."""
+    # The folder of references may not exist yet.
     folder = reference if reference.is_dir() or test.is_dir() else reference.parent
     path = file or nearest(folder)
     flags = ["--method", method] if method != AUTO else []
-    flags += [each for word in words for each in ("--set", word)]
+    for word in words:
+        flags += ["--set", word]
     flags += ["--max-values", str(max_values)] if max_values != MAX_VALUES else []
     flags += ["--settings", str(file)] if file else []
     layer = from_words(method, words)
@@ -243,7 +248,7 @@ def _settings(
 
 @contextlib.contextmanager
 def _progress() -> Iterator[Callable[[int, int], None]]:
-    """A function to call with the numbers of images done and of all; a progress bar on a terminal."""
+    """Yield `progress(done, total)`, which counts images: it draws a progress bar on a terminal."""
     if not sys.stderr.isatty():
         yield lambda done, total: None
         return
@@ -267,8 +272,8 @@ AllowPlugins = Annotated[
 def self_test(reference: Images, max_values: MaxValues = MAX_VALUES, allow_plugins: AllowPlugins = None) -> None:
     """Inject synthetic defects into REFERENCE and report which methods detect them.
 
-    Exit code 0: every defect that had to be detected was detected, 1: one was missed, or equal images were reported as
-    different, 2: REFERENCE cannot be read.
+    Exit code 0: all required defects were detected, 1: one was missed, or equal images were reported as different, 2:
+    REFERENCE cannot be read.
     """
     require_extra("scipy")
     from mi_refract.image_diff import self_test as self_tests

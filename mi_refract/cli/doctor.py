@@ -1,4 +1,4 @@
-"""The command `mi-refract doctor`: what runs on this machine; and the variant of Mitsuba that a command runs."""
+"""The command `mi-refract doctor`, and the choice of the Mitsuba variant for the other commands."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] 
 
 
 def probe(*, every_backend: bool = True) -> None:
-    """Try the libLLVMs, and `every_backend`, in processes that Ctrl-C ends, too; `backend` remembers the outcome.
+    """Test the installed libLLVMs and, with `every_backend`, all backends; `backend` caches the result.
 
-    It may start the command line again.
+    The tests run in child processes, which Ctrl-C also ends. This process may restart itself.
     """
     with as_exceptions():
         backend.restart_if_needed()
@@ -51,6 +51,6 @@ def probe(*, every_backend: bool = True) -> None:
 
 
 def activate(variant: str | None = None) -> str:
-    """Set the variant, or the best that runs here, and return its name. Errors: those of `backend.activate`."""
+    """Set a Mitsuba variant, by default the best that runs here; return its name. Errors as `backend.activate`."""
     probe(every_backend=variant is not None and not variant.startswith("scalar_"))
     return backend.activate(variant)

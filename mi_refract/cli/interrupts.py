@@ -1,9 +1,9 @@
 """Ctrl-C, SIGTERM and SIGHUP end a command at once with exit code 128 + signal, and leave no temporary file.
 
-While Mitsuba renders, a handler of its own takes SIGINT: it allocates memory, also where it has interrupted `malloc`,
-and then both wait for ever; or it makes the rendering return early. Python's own handler waits until Mitsuba or an
-import returns. So no handler runs here: signals are blocked in every thread, and one thread waits for them. Windows can
-block none: there Ctrl-C is Python's KeyboardInterrupt, which ends a command with 130 as soon as Mitsuba returns.
+While Mitsuba renders, its own handler takes SIGINT. The handler allocates memory, which deadlocks if the signal
+interrupted `malloc`; or it makes the render return early. Python's handler only runs after Mitsuba or an import
+returns. So no handler runs here: every thread blocks the signals, and one thread waits for them. Windows cannot block
+signals: there Ctrl-C is Python's KeyboardInterrupt, which ends a command with 130 as soon as Mitsuba returns.
 """
 
 from __future__ import annotations
@@ -15,30 +15,30 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 
-SHOW_CURSOR = b"\x1b[?25h"  # which a spinner hides
-_blocked: set[signal.Signals] = set()  # from `end_at_once` on
-_unblocked = threading.Event()  # within `as_exceptions`
+SHOW_CURSOR = b"\x1b[?25h"  # a spinner hides the cursor
+_blocked: set[signal.Signals] = set()  # filled by `end_at_once`
+_unblocked = threading.Event()  # set within `as_exceptions`
 _last_acts: list[Callable[[], None]] = []
 
 
 def end_at_once(*, even_if_ignored: bool) -> None:
-    """From here on, SIGINT, SIGTERM and SIGHUP end this process with 128 + their number; 130 for Ctrl-C.
+    """Make SIGINT, SIGTERM and SIGHUP end this process with exit code 128 + signal number; 130 for Ctrl-C.
 
-    For the process's own command line, in its main thread. Call it before numpy, Mitsuba or Dr.Jit is imported: the
-    threads that they start block what their parent blocks. A signal that the caller has ignored, such as SIGINT of a
-    shell's background job or SIGHUP of `nohup`, stays ignored; but with `even_if_ignored` SIGINT ends the process.
+    Call it in the main thread, before numpy, Mitsuba or Dr.Jit is imported: the threads that they start inherit the
+    blocked signals. A signal that the caller ignores, such as SIGINT in a shell's background job or SIGHUP under
+    `nohup`, stays ignored. With `even_if_ignored`, it ends the process.
     """
     if not hasattr(signal, "pthread_sigmask"):
         return
     ending = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
     ignored = {number for number in ending if signal.getsignal(number) is signal.SIG_IGN}
-    _blocked.update(ending - ignored | {signal.SIGINT})  # Mitsuba's handler would take it even where it is ignored
+    _blocked.update(ending - ignored | {signal.SIGINT})  # Mitsuba's handler would take SIGINT even if it is ignored
     signal.pthread_sigmask(signal.SIG_BLOCK, _blocked)
-    from mi_refract.io import safe_files  # it takes longer than all before it
+    from mi_refract.io import safe_files  # a slow import, so after the signals are blocked
 
     def watch() -> None:
         caught = signal.sigwait(waited)
-        while _unblocked.is_set():  # the system has the main thread take the signal, as a rule
+        while _unblocked.is_set():  # the main thread handles the signal
             signal.pthread_kill(threading.main_thread().ident or 0, caught)
             caught = signal.sigwait(waited)
         if _last_acts:
@@ -51,16 +51,15 @@ def end_at_once(*, even_if_ignored: bool) -> None:
         safe_files.end_process(128 + caught)
 
     if waited := _blocked - (set() if even_if_ignored else ignored):
-        for number in waited:  # macOS does not queue what is ignored
-            signal.signal(
-                number, signal.default_int_handler if number == signal.SIGINT else lambda x, _: sys.exit(128 + x)
-            )
+        for number in waited:  # set a handler: macOS does not queue ignored signals
+            handler = signal.default_int_handler if number == signal.SIGINT else lambda x, _: sys.exit(128 + x)
+            signal.signal(number, handler)
         threading.Thread(target=watch, name="Ctrl-C", daemon=True).start()
 
 
 @contextlib.contextmanager
 def last_act(act: Callable[[], None]) -> Iterator[None]:
-    """Within, `act` is called before a signal ends the process. A second signal ends it without waiting for that."""
+    """Within this context, call `act` before a signal ends the process. A second signal does not wait for `act`."""
     _last_acts.append(act)
     try:
         yield
@@ -70,10 +69,10 @@ def last_act(act: Callable[[], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def as_exceptions() -> Iterator[None]:
-    """Within, SIGINT is a KeyboardInterrupt, and SIGTERM and SIGHUP a SystemExit.
+    """Within this context, SIGINT raises KeyboardInterrupt; SIGTERM and SIGHUP raise SystemExit.
 
-    For starting other programs, which inherit what is blocked; nothing that installs a handler of its own may be
-    called. Without `end_at_once` nothing changes.
+    Use it to start other programs, which inherit blocked signals. Do not call code that installs its own signal
+    handler. Nothing changes unless `end_at_once` was called.
     """
     if not _blocked:
         yield

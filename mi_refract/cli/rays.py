@@ -35,11 +35,11 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-COLUMNS, UNWRAPPED = 80, 10_000  # of a summary; wider than any line
+COLUMNS, UNWRAPPED = 80, 10_000  # width of a summary; a width beyond any line
 
 
-def _print_regimes(wanted: bool) -> None:
-    if wanted:
+def _print_regimes(is_set: bool) -> None:
+    if is_set:
         table = Table("regime", "rays", "", box=None, pad_edge=False)
         for name, regime in REGIMES.items():
             table.add_row(name, regime.text, "" if name in ray_set.DEFAULT else "only with --regime")
@@ -51,7 +51,7 @@ Regime = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME",
-        help="A regime of rays, see --regimes; may be repeated. Default: all with unit vectors.",
+        help="Regime of the rays, see --regimes; may be repeated. Default: all regimes of unit vectors.",
     ),
 ]
 Count = Annotated[int, typer.Option(min=1, help="Number of rays per regime.")]
@@ -109,7 +109,7 @@ def export(
     A ray has an incident direction, a normal, and the indices of refraction of the media that it leaves and enters.
     """
     writable(output, files.SUFFIXES)
-    rays = _made(regime, count, precision, seed, two_sided, medium, wavelengths)
+    rays = _make_rays(regime, count, precision, seed, two_sided, medium, wavelengths)
     files.write(output, rays)
     print(printable(f"{output}: {_summary(rays)}"))
 
@@ -122,7 +122,7 @@ def check(
     ],
     file: Annotated[
         Path | None,
-        typer.Option("--rays", metavar="FILE", help="The rays. Default: those of `export` without options."),
+        typer.Option("--rays", metavar="FILE", help="The rays. Default: the rays that `export` writes by default."),
     ] = None,
     tir: Tir = "auto",
     formula: Formula = None,
@@ -132,20 +132,20 @@ def check(
     junit: Junit = None,
     json: Json = None,
 ) -> None:
-    """Check a file of answers against certified ones.
+    """Check a file of answers against certified answers.
 
-    Exit code 0: every answer is within the error bound, though not all may be right; 1: some are wrong; 2: the answers
-    do not match the rays.
+    Exit code 0: every answer is within the error bound, which does not show that every answer is right; 1: some are
+    wrong; 2: the answers do not match the rays.
     """
     pack = reference_pack.of_references(file, answers) if file else None
-    checked, write = _checker(context, tir, formula, backward, table, report, junit, json, pack)
+    check_and_print, write_reports = _checker(context, tir, formula, backward, table, report, junit, json, pack)
     rays = files.read(file) if file else ray_set.make()
-    findings = checked(rays, files.read_answers(answers, most=files.most_answers(rays)), str(answers))
-    raise typer.Exit(write({str(answers): findings}))
+    findings = check_and_print(rays, files.read_answers(answers, most=files.most_answers(rays)), str(answers))
+    raise typer.Exit(write_reports({str(answers): findings}))
 
 
-# Those of `run` that choose the rays.
-CHOOSING = ("regime", "count", "seed", "two_sided", "medium", "wavelengths")
+# The parameters of `run` that select the rays.
+SELECTING = ("regime", "count", "seed", "two_sided", "medium", "wavelengths")
 
 
 @app.command()
@@ -160,11 +160,13 @@ def run(
     ] = None,
     renderer: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="Instead of COMMAND: every function of FOLDER/mi-refract-renderer.toml."),
+        typer.Option(
+            metavar="FOLDER", help="Instead of COMMAND, run every function of FOLDER/mi-refract-renderer.toml."
+        ),
     ] = None,
     file: Annotated[
         Path | None,
-        typer.Option("--rays", metavar="FILE", help="Use these rays, as exported, instead of generating some."),
+        typer.Option("--rays", metavar="FILE", help="Read the rays from this exported file; do not generate rays."),
     ] = None,
     regime: Regime = None,
     regimes: Regimes = False,
@@ -189,16 +191,17 @@ def run(
 ) -> None:
     """Run a command on rays and check its answers.
 
-    Exit code 0: every answer is within the error bound, though not all may be right; 1: some are wrong; 2: the answers
-    do not match the rays, or the command fails or exceeds its time limit. With --renderer, the largest exit code of its
-    functions.
+    Exit code 0: every answer is within the error bound, which does not show that every answer is right; 1: some are
+    wrong; 2: the answers do not match the rays, or the command fails or exceeds its time limit. With --renderer, the
+    largest exit code of its functions.
     """
     pack = reference_pack.of_references(file) if file else None
-    checked, write = _checker(context, tir, formula, backward, table, report, junit, json, pack)
-    for name in (*CHOOSING, *([] if renderer else ["precision"])) if file else ():
-        if getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE":
-            option = f"--{name.replace('_', '-')}"
-            raise ValueError(f"--rays {file} and {option}: both choose the rays; expected one of them")
+    check_and_print, write_reports = _checker(context, tir, formula, backward, table, report, junit, json, pack)
+    if file:
+        for name in SELECTING if renderer else (*SELECTING, "precision"):
+            if getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE":
+                option = f"--{name.replace('_', '-')}"
+                raise ValueError(f"--rays {file} and {option}: both choose the rays; expected one of them")
     calls: list[tuple[list[str], str, str, str, dict[str, str]]]
     if renderer:
         from mi_refract.ray_sets import renderer_file
@@ -212,14 +215,14 @@ def run(
     else:
         calls = [(command or [], shlex.join(command or []), precision or ray_set.PRECISION, "auto", {})]
     checks = {}
-    for words, title, kind, declared, deviations in calls:
-        rays = files.read(file) if file else _made(regime, count, kind, seed, two_sided, medium, wavelengths)
+    for words, title, format_, declared, deviations in calls:
+        rays = files.read(file) if file else _make_rays(regime, count, format_, seed, two_sided, medium, wavelengths)
         with as_exceptions():
             answers = files.answers_of(words, rays, timeout=timeout, cwd=renderer)
-        checks[f"{title}, {kind}" if renderer else title] = checked(rays, answers, title, declared)
+        checks[f"{title}, {format_}" if renderer else title] = check_and_print(rays, answers, title, declared)
         for name, reason in deviations.items():
             print(printable(f"known deviation of {title}: {name}: {reason}"))
-    raise typer.Exit(write(checks))
+    raise typer.Exit(write_reports(checks))
 
 
 def _checker(
@@ -233,11 +236,12 @@ def _checker(
     json: Path | None,
     pack: PackReference | None,
 ) -> tuple[Callable[..., Findings], Callable[[dict[str, Findings]], int]]:
-    """`checked(rays, answers, title, tir="auto")`: check the answers and print the findings.
+    """Check the options and return two functions, `check_and_print` and `write_reports`.
 
-    `tir` there is the declared signal, which an option overrides. `pack`: that the rays are from. The second function,
-    `write(checks)`, writes the reports of all findings, by title; the largest exit code. ValueError or OSError, before
-    anything runs, for an option that cannot be met.
+    `check_and_print(rays, answers, title, declared="auto")` checks the answers, prints the findings and returns them.
+    `declared` is the renderer's own signal of total internal reflection; `tir` overrides it. `write_reports(checks)`
+    writes the reports of all findings, by title, and returns the largest exit code. `pack`: the reference pack that the
+    rays are from. ValueError or OSError for an invalid option.
     """
     needed = ("flint", "jinja2") if report else ("flint",)
     if not all(map(importlib.util.find_spec, needed)):
@@ -245,13 +249,14 @@ def _checker(
     from mi_refract.ray_sets import check_answers, reports
     from mi_refract.ray_sets.tir_signal import LOOSEST
 
-    error_bound, most_backward = formula or LOOSEST, math.inf if backward is None else backward
+    error_bound = formula or LOOSEST
+    most_backward = math.inf if backward is None else backward
     check_answers.check_options(tir, error_bound, most_backward)
     for path, suffixes in ((report, (".html", ".htm")), (junit, (".xml",)), (json, (".json",))):
         if path:
             writable(path, suffixes)
 
-    def checked(rays: RaySet, answers: Answers, title: str, declared: str = "auto") -> Findings:
+    def check_and_print(rays: RaySet, answers: Answers, title: str, declared: str = "auto") -> Findings:
         print(printable(f"{title}: {_summary(rays)}"))
         signal = declared if tir == "auto" else tir
         findings = check_answers.check(rays, answers, tir=signal, error_bound=error_bound, most_backward=most_backward)
@@ -261,7 +266,7 @@ def _checker(
         Console(width=COLUMNS).print(reports.summary(findings), highlight=False)
         return findings
 
-    def write(checks: dict[str, Findings]) -> int:
+    def write_reports(checks: dict[str, Findings]) -> int:
         origin = reference_pack.origin(context.obj, pack)
         if report:
             reports.write_html(report, checks, versions(), origin.command)
@@ -271,10 +276,10 @@ def _checker(
             reports.write_json(json, checks, origin)
         return max(findings.exit_code for findings in checks.values())
 
-    return checked, write
+    return check_and_print, write_reports
 
 
-def _made(
+def _make_rays(
     regime: list[str] | None,
     count: int,
     precision: str,
@@ -283,7 +288,7 @@ def _made(
     medium: list[str] | None,
     wavelengths: str | None,
 ) -> RaySet:
-    """The rays that these options choose; `>>` and `<<` stand for ≫ and ≪."""
+    """Generate the rays that these options select. In names of regimes, `>>` and `<<` stand for ≫ and ≪."""
     try:
         in_nm = tuple(map(float, wavelengths.split(","))) if wavelengths is not None else ()
     except ValueError:
@@ -293,8 +298,8 @@ def _made(
 
 
 def _summary(rays: RaySet) -> str:
-    def counted(number: int, one: str, more: str) -> str:
-        return f"{number} {one if number == 1 else more}"
+    def counted(number: int, singular: str, plural: str) -> str:
+        return f"{number} {singular if number == 1 else plural}"
 
     header = rays.header
     text = f"{len(rays)} rays, {counted(len(header['regimes']), 'regime', 'regimes')}, {rays.precision}"

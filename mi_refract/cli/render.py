@@ -1,4 +1,4 @@
-"""The command `mi-refract render`: a Mitsuba scene into an EXR file, in passes."""
+"""The command `mi-refract render`: it renders a Mitsuba scene into an EXR file, in passes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from . import interrupts
 from .doctor import activate
 from .render_progress import parse_seconds, parse_share, shown, shown_error
 
-if TYPE_CHECKING:  # they import Mitsuba
+if TYPE_CHECKING:  # this import loads Mitsuba
     from mi_refract.rendering.long_render import LongRender, Passes
 
 
@@ -63,7 +63,7 @@ def render(
         typer.Option(
             metavar="auto|NAME=VALUE,…",
             help="Replace the scene's sampler, integrator (path, refract_path), split_depth or caustics; auto: a short "
-            "pilot measures which pay.",
+            "pilot render measures which settings are faster.",
         ),
     ] = None,
     restart: Annotated[
@@ -94,14 +94,15 @@ def render(
     mixed_workers: Annotated[
         bool,
         typer.Option(
-            "--mixed-workers", help="Accept another libLLVM or vector width; the bits then depend on the workers."
+            "--mixed-workers",
+            help="Accept workers with another libLLVM or vector width; the image's bits then depend on the workers.",
         ),
     ] = False,
 ) -> None:
     """Render a Mitsuba scene into an EXR file with per-channel variance and provenance metadata.
 
     An interrupted render resumes from its checkpoint; a finished image with fewer samples is refined. The scene may
-    use the plugins `refract` and `refract_path`, which Mitsuba's own executable does not know.
+    use the plugins `refract` and `refract_path`, which Mitsuba's own executable does not have.
     """
     from mi_refract.io.safe_files import writable
 
@@ -118,15 +119,16 @@ def render(
     seconds = None if duration is None else parse_seconds(duration, "--time")
     if preview is not None:
         writable(preview, (".png",))
-    chosen = activate(variant)
+    active_variant = activate(variant)
     from mi_refract.rendering.end_conditions import Limits
     from mi_refract.rendering.long_render import Job, resume
     from mi_refract.rendering.render_settings import OWN
 
     limits = Limits(spp, share, tile_share, seconds, pass_spp)
     job = Job(scene, defines, seed, tuple(allow_plugins or ()), OWN if settings is None else settings)
-    console = Console(stderr=True, force_terminal=sys.stderr.isatty())  # FORCE_COLOR makes no terminal of a pipe
-    spinner = console.status(Text(printable(f"{scene.name}, {chosen}"))) if console.is_terminal else None
+    # FORCE_COLOR must not turn a pipe into a terminal.
+    console = Console(stderr=True, force_terminal=sys.stderr.isatty())
+    spinner = console.status(Text(printable(f"{scene.name}, {active_variant}"))) if console.is_terminal else None
     with spinner or contextlib.nullcontext():
         rendering = resume(job, output, limits, restart=restart)
     if rendering.missing:
@@ -137,13 +139,13 @@ def render(
         state = "complete with" if rendering.end() else "resuming from"
         print(printable(f"{output}: {state} {rendering.progress.done} spp"), file=sys.stderr)
     with (
-        cluster_passes(cluster, rendering, str(chosen), bundle_limit, mixed=mixed_workers) as passes,
+        cluster_passes(cluster, rendering, str(active_variant), bundle_limit, mixed=mixed_workers) as passes,
         interrupts.last_act(rendering.give_up),
         shown(console, rendering, preview) as watch,
     ):
         header = rendering.run(watch, passes)
     count, error = rendering.progress.passes, rendering.error()
-    text = f"{output}: {chosen}, {header['mi_refract:spp']} spp in {count} pass{'es' if count != 1 else ''}"
+    text = f"{output}: {active_variant}, {header['mi_refract:spp']} spp in {count} pass{'es' if count != 1 else ''}"
     text += f", {header['mi_refract:render_seconds']:.2f} s"
     if error is not None and math.isfinite(error.value):
         text += f", relative error {shown_error(error)}"
@@ -151,16 +153,17 @@ def render(
     if bad := header["mi_refract:nonfinite_pixels"]:
         print(printable(f"mi-refract: {output}: {bad} pixels are not finite"), file=sys.stderr)
     if variant is None and not backend.llvm().usable:
-        print(printable(f"mi-refract: {chosen} is slow; {backend.summary()}"), file=sys.stderr)
+        print(printable(f"mi-refract: {active_variant} is slow; {backend.summary()}"), file=sys.stderr)
 
 
 @contextlib.contextmanager
 def cluster_passes(
     target: ClusterTarget, rendering: LongRender, variant: str, bundle_limit: int, *, mixed: bool
 ) -> Iterator[Passes | None]:
-    """Where passes are rendered; None for this process. Workers that are refused are named on stderr.
+    """Yield the function that renders passes on workers; None to render in this process.
 
-    ValueError for a scene that cannot be sent; ConnectionError where no scheduler answers or no worker may render.
+    Refused workers are listed on stderr. ValueError for a scene that cannot be sent; ConnectionError if no scheduler
+    answers or no worker is usable.
     """
     if not target.given or rendering.end():
         yield None

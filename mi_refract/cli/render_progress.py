@@ -1,6 +1,6 @@
-"""What `mi-refract render` reads and shows: quantities such as 1%, 10m, 1h30m; progress, warnings, and a preview.
+"""Progress, warnings and preview of `mi-refract render`, and the parsing of quantities such as 1%, 10m, 1h30m.
 
-Progress is a bar on a terminal, else a line every 30 s.
+Progress is a bar on a terminal, otherwise a line every 30 s.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from mi_refract.io.text import parse_number, printable
 from mi_refract.rendering.end_conditions import RelativeError
 from mi_refract.report.embedded_images import png
 
-if TYPE_CHECKING:  # it imports Mitsuba
+if TYPE_CHECKING:  # this import loads Mitsuba
     from mi_refract.rendering.long_render import LongRender
 
-PLAIN = 0.1  # the largest share that is understood without a percent sign
+PLAIN = 0.1  # the largest share that is accepted without a percent sign
 _SECONDS = {"d": 86400.0, "h": 3600.0, "m": 60.0, "s": 1.0}
-BAR = 12  # characters: of a terminal of 80 the text takes the others
-BETWEEN_LINES = 30.0  # seconds, where there is no terminal
-BETWEEN_LOOKS = 2.0  # seconds between two estimates of the error for the bar, at least
-LOOK_COST = 50.0  # times what an estimate takes is the least time between two
+BAR = 12  # width of the bar in characters: the text takes the rest of an 80-column terminal
+BETWEEN_LINES = 30.0  # seconds between two lines, without a terminal
+BETWEEN_ESTIMATES = 2.0  # least seconds between two estimates of the error for the bar
+ESTIMATE_COST = 50.0  # wait at least this many times the duration of an estimate until the next one
 BETWEEN_PREVIEWS = 10.0  # seconds
 
 
 @contextlib.contextmanager
 def shown(console: Console, rendering: LongRender, preview: Path | None) -> Iterator[Callable[[LongRender], None]]:
-    """Within, what it yields is to be called after every pass: it prints progress and warnings, writes the preview."""
+    """Yield a function to call after every pass: it prints progress and warnings, and writes the preview."""
     columns = BarColumn(BAR), TextColumn("{task.fields[text]}", markup=False)
-    moving = console.is_terminal and not console.is_dumb_terminal
+    has_bar = console.is_terminal and not console.is_dumb_terminal
     began, done = time.monotonic(), rendering.progress.done
     last_line, last_preview, warned = began, -math.inf, 0
-    between_lines = BETWEEN_LOOKS if moving else BETWEEN_LINES
+    between_lines = BETWEEN_ESTIMATES if has_bar else BETWEEN_LINES
 
     def warn() -> None:
         nonlocal warned
@@ -57,25 +57,25 @@ def shown(console: Console, rendering: LongRender, preview: Path | None) -> Iter
         if now - last_line >= between_lines:
             text = _text(render, now - began, render.progress.done - done)
             bar.update(task, completed=render.progress.done, text=text)
-            if not moving:
+            if not has_bar:
                 print(printable(f"{render.output}: {text}"), file=sys.stderr, flush=True)
             last_line = time.monotonic()
-            between_lines = max(between_lines, LOOK_COST * (last_line - now))
+            between_lines = max(between_lines, ESTIMATE_COST * (last_line - now))
         if preview is not None and now - last_preview >= BETWEEN_PREVIEWS:
             last_preview = now
             write_preview(preview, render)
         warn()
 
-    with Progress(*columns, console=console, transient=True, disable=not moving) as bar:
+    with Progress(*columns, console=console, transient=True, disable=not has_bar) as bar:
         task = bar.add_task("", total=rendering.spp, completed=done, text="first pass")
         try:
             yield watch
         finally:
-            warn()  # also of the last checkpoint, after an error
+            warn()  # after an error, too: the last checkpoint may have added warnings
 
 
 def _text(rendering: LongRender, seconds: float, new: int) -> str:
-    """One line about a render that made `new` samples per pixel in so many seconds."""
+    """Return one line of progress for a render that added `new` samples per pixel in `seconds`."""
     passes, count, done = rendering.plan.passes, rendering.progress.passes, rendering.progress.done
     parts = [f"pass {count} of {passes + rendering.progress.first}" if passes else f"{count} passes"]
     width, height = rendering.renderer.size
@@ -93,7 +93,7 @@ def _text(rendering: LongRender, seconds: float, new: int) -> str:
 
 
 def write_preview(path: Path, rendering: LongRender) -> None:
-    """Write the present image as a PNG file, sRGB. A failure is a warning of the render."""
+    """Write the current image as an sRGB PNG file. If that fails, add a warning to the render."""
     image = rendering.image()
     if image is None:
         return
@@ -106,7 +106,10 @@ def write_preview(path: Path, rendering: LongRender) -> None:
 
 
 def parse_share(text: str, option: str) -> float:
-    """`1%` or `0.01`, of 100 % at most. ValueError for anything else, also for `1` and `0.5`: is that 0.5 % or 50 %?"""
+    """Return the share that `1%` or `0.01` stands for, at most 1.
+
+    ValueError for anything else, and for numbers above PLAIN without a percent sign: `0.5` could mean 0.5 % or 50 %.
+    """
     number, percent = (text[:-1], True) if text.endswith("%") else (text, False)
     try:
         value = parse_number(number) / (100 if percent else 1)
@@ -120,20 +123,18 @@ def parse_share(text: str, option: str) -> float:
 
 
 def parse_seconds(text: str, option: str) -> float:
-    """`90`, `90s`, `10m`, `1h30m` or `2d` in seconds, more than 0. ValueError for anything else."""
-    parts = re.fullmatch(
-        r"(?=.)" + "".join(rf"(?:(\d{{1,9}}(?:\.\d{{1,9}})?){unit}{'?' if unit == 's' else ''})?" for unit in _SECONDS),
-        text,
-    )
-    given = zip(parts.groups(), _SECONDS.values(), strict=True) if parts else ()
-    seconds = sum(float(number) * unit for number, unit in given if number)
+    """Return the seconds of `90`, `90s`, `10m`, `1h30m` or `2d`, more than 0. ValueError for anything else."""
+    number = r"\d{1,9}(?:\.\d{1,9})?"
+    parts = re.fullmatch(rf"(?:({number})d)?(?:({number})h)?(?:({number})m)?(?:({number})s?)?", text)
+    counts = zip(parts.groups(), _SECONDS.values(), strict=True) if parts else ()
+    seconds = sum(float(count) * unit for count, unit in counts if count)
     if not seconds > 0:
         raise ValueError(f"{option} {text}; expected a time of more than 0, such as 90s, 10m or 1h30m")
     return seconds
 
 
 def shown_error(error: RelativeError) -> str:
-    """`0.42 % (0.40 to 0.44 %)`: an estimate and its interval, where there is one; or `at most 0.42 %`."""
+    """Return an estimate with its interval, if it has one: `0.42 % (0.4 to 0.44 %)`; or `at most 0.42 %`."""
     value, low, high = (f"{float(f'{100 * share:.2g}'):g}" for share in (error.value, error.low, error.high))
     interval = f" ({low} to {high} %)" if math.isfinite(error.high) else ""
     return f"{'at most ' * error.at_most}{value} %{interval}"

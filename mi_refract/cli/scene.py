@@ -21,15 +21,16 @@ app = typer.Typer(help="Write scenes for other renderers.", add_completion=False
 def list_scenes() -> None:
     """List the scenes of the package.
 
-    `export` knows the scenes of Mitsuba by these names; the others are files for `mi-refract trace`.
+    `export` takes the names of Mitsuba scenes; the others are files for `mi-refract trace`.
     """
     print(printable(f"in {SCENES}:"))
     paths = [*sorted(SCENES.glob("*.xml")), *sorted(SCENES.glob("planar/*.toml"))]
     names = [path.stem if path.suffix == ".xml" else str(path.relative_to(SCENES)) for path in paths]
     for name, path in zip(names, paths, strict=True):
         pattern = r"<!--(.*?[.:])\s" if path.suffix == ".xml" else r'title = "(.*?)"'
-        said = re.search(pattern, path.read_text("utf-8"), re.DOTALL)
-        print(printable(f"{name:{max(map(len, names))}}  {' '.join(said[1].split()).rstrip('.:') if said else ''}"))
+        match = re.search(pattern, path.read_text("utf-8"), re.DOTALL)
+        title = " ".join(match[1].split()).rstrip(".:") if match else ""
+        print(printable(f"{name:{max(map(len, names))}}  {title}"))
 
 
 @app.command()
@@ -53,7 +54,7 @@ def export(
 ) -> None:
     """Write a Mitsuba scene for another renderer, as triangles.
 
-    A README.txt says how to render it.
+    README.txt says how to render it.
     """
     defines = scene_files.parse_defines(define or [])
     activate("scalar_rgb")
@@ -67,5 +68,5 @@ def export(
     plain = from_mitsuba.load(path, level=from_mitsuba.LEVEL if level is None else level, **defines)
     written = targets.write(plain, to, folder)
     triangles = sum(len(mesh.faces) for mesh in plain.meshes)
-    done = f"{len(written)} files, {triangles} triangles; {folder / 'README.txt'} says how to render them"
-    print(printable(f"{folder}: {done}"))
+    summary = f"{len(written)} files, {triangles} triangles; {folder / 'README.txt'} says how to render them"
+    print(printable(f"{folder}: {summary}"))

@@ -1,4 +1,4 @@
-"""The command `mi-refract trace`: rays through the boundaries of a planar scene."""
+"""The command `mi-refract trace`: it traces rays through a planar scene."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def trace(
     branches: Annotated[
         int | None, typer.Option(min=0, help="Largest number of partial reflections on a path.")
     ] = None,
-    rays: Annotated[int | None, typer.Option(min=1, help="Number of rays in each beam that has several.")] = None,
+    rays: Annotated[int | None, typer.Option(min=1, help="Number of rays in each beam of more than one ray.")] = None,
     max_depth: Annotated[int | None, typer.Option(min=1, help="Largest number of boundaries on a path.")] = None,
     wavelengths: Annotated[
         str | None,

@@ -1,4 +1,4 @@
-"""A Dask client: of a scheduler at an address, or of worker processes that are started here. Failures are one line."""
+"""Dask clients, of a scheduler at an address or of worker processes started here. Errors are one line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from . import local_cluster
 Client: TypeAlias = Any  # a `distributed.Client`
 Future: TypeAlias = Any  # a `distributed.Future`
 Security: TypeAlias = Any  # a `distributed.Security`
-PATIENCE = 6.0  # seconds until a scheduler must have answered
+PATIENCE = 6.0  # time limit for the scheduler's answer, in seconds
 _EXPECTED = (
     "expected the address of a Dask scheduler, such as tcp://host:8786, or tls://host:8786 and the files of "
     "`distributed.comm.tls` in Dask's configuration"
@@ -27,18 +27,18 @@ _EXPECTED = (
 
 @dataclass(frozen=True)
 class ClusterTarget:
-    """Which processes work, as the options of a command say: this one where neither is given."""
+    """The processes that render, from a command's options; without options, this process."""
 
     scheduler: str | None = None
     workers: int | None = None
 
     @property
     def given(self) -> bool:
-        """Whether other processes work."""
+        """Whether other processes render."""
         return self.scheduler is not None or self.workers is not None
 
     def check(self) -> None:
-        """UsageError for options that exclude each other, MissingExtraError without Dask."""
+        """UsageError if both options are given, MissingExtraError without Dask."""
         if self.scheduler is not None and self.workers is not None:
             raise UsageError("--scheduler and --workers; expected one of them")
         if self.given:
@@ -59,27 +59,28 @@ def _require_dask() -> None:
 
 @contextlib.contextmanager
 def connected(scheduler: str | None = None, workers: int | None = None) -> Iterator[Client]:
-    """A `distributed.Client` of the scheduler at an address, or of so many processes of one thread each, started here.
+    """Yield a `distributed.Client` of a scheduler at an address, or of `workers` one-thread processes started here.
 
-    The processes speak TLS. A client of a `tls://` scheduler takes certificates from Dask's configuration, and refuses
-    every connection that is not encrypted. ConnectionError, one line, after PATIENCE where no scheduler answers;
-    MissingExtraError without Dask; UsageError unless exactly one of the two is given.
+    Local processes communicate by TLS. A client of a `tls://` scheduler takes certificates from Dask's configuration
+    and refuses unencrypted connections. ConnectionError if no scheduler answers within PATIENCE; MissingExtraError
+    without Dask; UsageError unless exactly one argument is given.
     """
     if (scheduler is None) == (workers is None):
         raise UsageError("expected either --scheduler ADDRESS or --workers N")
     _require_dask()
     import distributed
 
-    async def kind() -> str:
-        """What answers at the address, as it says."""
+    async def server_type() -> str:
+        """Return what the server at the address says it is, such as Scheduler."""
         options = {"timeout": PATIENCE / 2, "connection_args": security.get_connection_args("client")}
-        async with asyncio.timeout(PATIENCE), distributed.rpc(address, **options) as there:
-            return str((await there.identity()).get("type"))
+        async with asyncio.timeout(PATIENCE), distributed.rpc(address, **options) as server:
+            return str((await server.identity()).get("type"))
 
     with contextlib.ExitStack() as stack:
         stack.enter_context(warnings.catch_warnings())
-        warnings.simplefilter("ignore")  # of versions, large graphs: versions that matter are compared by `workers`
-        # Dask logs nothing: what matters of it is raised here. Other loggers stay as they are.
+        # Dask warns of large graphs and of versions; `workers` compares the versions that matter.
+        warnings.simplefilter("ignore")
+        # Silence Dask's loggers: failures that matter are raised here.
         for logger in map(logging.getLogger, list(logging.root.manager.loggerDict)):
             if logger.name.partition(".")[0] in ("distributed", "tornado", "asyncio") and not logger.disabled:
                 logger.disabled = True
@@ -88,13 +89,13 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
             address, security = stack.enter_context(local_cluster.started(workers))
         else:
             address = str(scheduler)
-            # None: as Dask's configuration says.
+            # None: the value in Dask's configuration.
             security = distributed.Security(require_encryption=address.startswith("tls://") or None)
         try:
-            # First, as a client that found nobody would take 16 s to give up.
-            if (answering := asyncio.run(kind())) != "Scheduler":
+            # Check the server before making a client: without a scheduler a client would take 16 s to give up.
+            if (answering := asyncio.run(server_type())) != "Scheduler":
                 raise ValueError(f"a Dask {answering} answers there")
-            # Results come from the workers themselves where these can be reached, else through the scheduler.
+            # Results come directly from workers that can be reached, otherwise through the scheduler.
             options: dict[str, Any] = {"timeout": PATIENCE, "set_as_default": False, "direct_to_workers": True}
             client = distributed.Client(address, security=security, **options)
         except Exception as error:
@@ -105,14 +106,15 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
         try:
             yield client
         finally:
-            with contextlib.suppress(Exception):  # a scheduler that is gone
+            with contextlib.suppress(Exception):  # the scheduler may have ended
                 client.close(timeout=2.0)
 
 
 @contextlib.contextmanager
 def cluster_errors(client: Client) -> Iterator[None]:
-    """Within, Dask's errors are one line: LostSchedulerError where its scheduler has gone, NoWorkersError for a task
-    that has ended several workers.
+    """Within this context, turn Dask's errors into one line.
+
+    LostSchedulerError if the scheduler has ended, NoWorkersError if several workers were lost on the same task.
     """
     from distributed import CancelledError, KilledWorker
     from distributed.comm import CommClosedError

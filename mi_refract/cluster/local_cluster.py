@@ -1,8 +1,8 @@
-"""A Dask scheduler and workers of one thread each, in a process of its own that ends with ours, however that ends.
+"""A Dask scheduler and single-threaded workers in a process of their own, which ends with this process in every case.
 
-No signal that is blocked here is blocked in the workers. Certificate and key are made for this once: without them every
-user of this machine could have the workers run code. The process, `python -m mi_refract.cluster.local_cluster`, reads
-the number of workers and Dask's `Security` from its stdin, prints the scheduler's address, and ends when stdin closes.
+The workers do not inherit blocked signals. Each cluster gets a new certificate and key: without them every user of this
+machine could run code on the workers. The process, `python -m mi_refract.cluster.local_cluster`, reads the number of
+workers and Dask's `Security` from stdin, prints the scheduler's address, and ends when stdin closes.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from mi_refract.io.errors import NoWorkersError, UsageError
 from mi_refract.io.safe_files import temporary_folder
 
 MOST = 1024  # workers
-# Dask watches itself: its profiler and monitors would take 5 % of the workers' time from kernels.
+# Dask's profiler and monitors would take 5 % of the workers' time.
 SETTINGS = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.system-monitor.interval": "10s",
     "distributed.admin.tick.interval": "1s",
-    # Dask's HTTP servers do not use TLS: pages of the scheduler and of workers would be for all users of this machine.
+    # Dask's HTTP servers do not use TLS: every user of this machine could read their pages.
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
-    # As long as a worker tries to reach one that has gone, when that is told before it tries; 30 s by default.
+    # How long a worker tries to reach a lost worker; 30 s by default.
     "distributed.comm.timeouts.connect": "4s",
 }
 
 
 @contextlib.contextmanager
 def started(workers: int) -> Iterator[tuple[str, Any]]:
-    """The address of a scheduler with so many workers, and the `Security` of its clients. They end at the end.
+    """Yield the address of a scheduler with `workers` workers, and the `Security` for clients; end them on exit.
 
-    UsageError for a number out of range; NoWorkersError, one line, where they cannot be started.
+    UsageError for a number out of range; NoWorkersError if the cluster cannot start.
     """
     if not 1 <= workers <= MOST:
         raise UsageError(f"--workers {workers}; expected a whole number from 1 to {MOST}")
@@ -48,7 +48,7 @@ def started(workers: int) -> Iterator[tuple[str, Any]]:
 
     security = Security.temporary()
     process = subprocess.Popen(
-        [sys.executable, "-P", "-m", __name__],  # -P: no module of the working folder takes the place of one of ours
+        [sys.executable, "-P", "-m", __name__],  # -P: do not import modules from the working folder
         env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -74,10 +74,10 @@ def started(workers: int) -> Iterator[tuple[str, Any]]:
 
 
 def main() -> None:
-    """Start, print the address, wait, and end with all workers."""
+    """Start the cluster, print its address, wait until stdin closes, and end with all workers."""
     signal.pthread_sigmask(signal.SIG_UNBLOCK, signal.valid_signals())
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is for who started us
-    # One line of our stdout is read: what workers log there goes to stderr, or the pipe fills up and they wait.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C
+    # The parent reads one line of stdout. Other output goes to stderr: otherwise the pipe fills and the workers block.
     answer = os.dup(1)
     os.dup2(2, 1)
     try:
@@ -102,7 +102,7 @@ def main() -> None:
     except Exception as error:
         os.write(answer, f"{type(error).__name__}: {' '.join(str(error).split())}\n".encode())
     finally:
-        if os.getpgrp() == os.getpid():  # workers are of our group: at once, whatever they render
+        if os.getpgrp() == os.getpid():  # the workers are in this process group: kill them, even during a kernel
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(os.getpid(), signal.SIGKILL)
         os._exit(1)

@@ -1,4 +1,4 @@
-"""What runs on a worker: its facts, that the bits of a result depend on, how they differ from ours, and tasks."""
+"""Code that runs on workers: tasks, and facts of the worker that change the bits of a result."""
 
 from __future__ import annotations
 
@@ -17,36 +17,38 @@ from mi_refract import backend
 from mi_refract.io.image_file import installed_version
 
 LLVM, WIDTH = "libLLVM", "vector width"
-MIXED = frozenset({LLVM, WIDTH})  # with other ones the same work is possible, but not the same bits
+MIXED = frozenset({LLVM, WIDTH})  # a worker that differs in these can do the same work, with other bits
 UNUSABLE = "cannot run"
 HOST = "host"
-_WIDTH_SYMBOL = "_Z21jit_llvm_vector_widthv"  # Dr.Jit does not show it to Python
+_WIDTH_SYMBOL = "_Z21jit_llvm_vector_widthv"  # Dr.Jit does not export it to Python
 Result = TypeVar("Result")
-# Mitsuba's variant is one of a thread, what it loads is best left to the thread that loaded it, and a pass uses all
-# threads that the worker has.
+# One thread for all renders: Mitsuba's variant belongs to a thread, its objects are best used by the thread that loaded
+# them, and one pass uses all threads of the worker.
 _renderer = ThreadPoolExecutor(1, "renderer")
 
 
 @functools.cache
 def facts(variant: str) -> dict[str, str]:
-    """Facts of this process by name: versions that the bits depend on, and why the variant cannot run, or ""."""
+    """Return facts of this process by name: versions that change the bits, the host, and why the variant cannot run.
+
+    That reason, UNUSABLE, is "" for a variant that can run.
+    """
     family = variant.partition("_")[0]
-    here = backend.detect()[family]
-    by_name = {name: installed_version(name) for name in ("mitsuba", "drjit")}
-    by_name |= {"mi_refract": our_version(), "processor": platform.machine()}
-    by_name["Python"] = ".".join(platform.python_version_tuple()[:2])
-    by_name[UNUSABLE] = "" if here.usable else f"{variant}: {here.reason}"
-    if family == "llvm" and here.usable:
-        by_name |= {LLVM: here.reason.removeprefix("libLLVM "), WIDTH: vector_width()}
-    return by_name | {HOST: platform.node()}
+    status = backend.detect()[family]
+    versions = {name: installed_version(name) for name in ("mitsuba", "drjit")}
+    versions |= {"mi_refract": our_version(), "processor": platform.machine()}
+    versions["Python"] = ".".join(platform.python_version_tuple()[:2])
+    if family == "llvm" and status.usable:
+        versions |= {LLVM: status.reason.removeprefix("libLLVM "), WIDTH: vector_width()}
+    return versions | {UNUSABLE: "" if status.usable else f"{variant}: {status.reason}", HOST: platform.node()}
 
 
 def vector_width() -> str:
-    """Numbers that a CPU's kernel computes at once; "unknown" where Dr.Jit does not tell."""
+    """Return how many numbers an LLVM kernel computes at once; "unknown" if Dr.Jit does not report it."""
     import drjit as dr
 
     try:
-        dr.eval(dr.arange(dr.llvm.UInt32, 1))  # before the first kernel it is not known
+        dr.eval(dr.arange(dr.llvm.UInt32, 1))  # the width is known after the first kernel
         library = ctypes.CDLL(str(next(Path(dr.__file__).parent.glob("libdrjit-core.*"))))
         width = getattr(library, _WIDTH_SYMBOL)
     except (OSError, AttributeError, StopIteration, RuntimeError):
@@ -57,39 +59,44 @@ def vector_width() -> str:
 
 @functools.cache
 def our_version() -> str:
-    """The version and a short digest of the package's source and glasses, which change between two releases."""
+    """Return this package's version, with a short hash of the names and contents of its source and glass files.
+
+    The hash tells two states of the source apart that have the same version.
+    """
     package, digest = Path(__file__).parents[1], hashlib.sha256()
     for path in sorted({*package.rglob("*.py"), *package.rglob("*.json")}):
         digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
     return f"{installed_version('mi-refract')} ({digest.hexdigest()[:8]})"
 
 
-def differences(there: Mapping[str, str], here: Mapping[str, str], tolerated: Collection[str] = ()) -> list[str]:
-    """What a worker has that we have not, in words, but for the names in `tolerated`."""
-    if there.get(UNUSABLE):
-        return [there[UNUSABLE]]
-    names = [name for name in here if name not in (HOST, UNUSABLE, *tolerated)]
+def differences(theirs: Mapping[str, str], ours: Mapping[str, str], tolerated: Collection[str] = ()) -> list[str]:
+    """Return the differences between a worker's facts and ours as text, without the names in `tolerated`."""
+    if theirs.get(UNUSABLE):
+        return [theirs[UNUSABLE]]
+    names = [name for name in ours if name not in (HOST, UNUSABLE, *tolerated)]
     return [
-        f"{name} {there.get(name, 'unknown')}, here {here[name]}" for name in names if there.get(name) != here[name]
+        f"{name} {theirs.get(name, 'unknown')}, here {ours[name]}" for name in names if theirs.get(name) != ours[name]
     ]
 
 
-def machine(there: Mapping[str, str], here: Mapping[str, str]) -> str:
-    """The name of a worker's machine; with what it has that we have not and that was tolerated."""
-    other = [f"{name} {there[name]}" for name in sorted(MIXED) if name in there and there[name] != here.get(name)]
-    return f"{there[HOST]} ({'; '.join(other)})" if other else there[HOST]
+def machine(theirs: Mapping[str, str], ours: Mapping[str, str]) -> str:
+    """Return the name of a worker's machine, with the tolerated differences."""
+    differing = [
+        f"{name} {theirs[name]}" for name in sorted(MIXED) if name in theirs and theirs[name] != ours.get(name)
+    ]
+    return f"{theirs[HOST]} ({'; '.join(differing)})" if differing else theirs[HOST]
 
 
 def one_at_a_time(call: Callable[[], Result]) -> Result:
-    """What `call` returns, in the thread of this process that has all calls, one after the other."""
+    """Run `call` in the one thread of this process for such calls, and return its result."""
     return _renderer.submit(call).result()
 
 
 def in_variant(variant: str, call: Callable[[], Result]) -> Result:
-    """As `one_at_a_time`, in a variant of Mitsuba, with as many threads of Dr.Jit as the worker was given.
+    """As `one_at_a_time`, in a Mitsuba variant, with as many Dr.Jit threads as the worker has threads.
 
-    So workers of one machine share its cores. Two threads at least: by one thread, a kernel runs on the caller's, which
-    keeps denormals; the others take them for 0. ValueError outside of a task.
+    So the workers of one machine share its cores. Dr.Jit gets at least two threads: with one thread a kernel runs on
+    the calling thread, which keeps denormals; Dr.Jit's threads flush them to 0. ValueError outside of a task.
     """
     threads = max(2, int(_worker().state.nthreads))
 
@@ -113,17 +120,17 @@ def _worker() -> Any:
 
 
 def address() -> str:
-    """The worker's address, its name for the scheduler. ValueError outside of a task."""
+    """Return the worker's address, by which the scheduler knows it. ValueError outside of a task."""
     return str(_worker().address)
 
 
 def with_address(function: Callable[..., Result], *arguments: Any) -> tuple[str, Result]:
-    """The address, and what the call returns."""
+    """Call the function and return the worker's address and the function's result."""
     return address(), function(*arguments)
 
 
 def scratch_folder() -> str:
-    """A folder for files, which is removed with the worker."""
+    """Return a folder for files, which is removed when the worker ends."""
     folder = str(_worker().local_directory)
     os.makedirs(folder, exist_ok=True)  # noqa: PTH103
     return folder

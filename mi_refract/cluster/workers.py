@@ -1,4 +1,4 @@
-"""The workers of a scheduler that may have work, each asked for its facts before it gets any; and calls on them."""
+"""The usable workers of a Dask scheduler, and function calls on them. A worker reports its facts before it is used."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from mi_refract.io.errors import NoWorkersError
 from . import on_worker
 from .connection import Client, Future, cluster_errors
 
-AHEAD = 2  # calls for each thread of the workers
+AHEAD = 2  # calls queued per worker thread
 _POLL = 0.5  # seconds
-PATIENCE = 120.0  # seconds until the first workers must have answered: they import Mitsuba, and try libLLVM
-NOBODY = 30.0  # seconds until a scheduler must have a worker at all
-ALONE = 120.0  # seconds until new workers must have come where all have gone
-BETWEEN_LOOKS = 2.0  # seconds
-# As text: a worker that cannot import a function which it is sent ends, and its nanny starts it again, without end.
-_QUESTION = "__import__({!r}, fromlist=['facts']).facts({!r})"
+PATIENCE = 120.0  # time limit for the first workers' facts, in seconds: workers import Mitsuba and test libLLVM
+NOBODY = 30.0  # time limit for a scheduler without any worker, in seconds
+ALONE = 120.0  # time limit for new workers after all have gone, in seconds
+BETWEEN_LOOKS = 2.0  # seconds between two looks at the scheduler's workers
+# Sent as text: a worker that cannot import the function it is sent dies, and its nanny restarts it again and again.
+_QUERY = "__import__({!r}, fromlist=['facts']).facts({!r})"
 
 
 class Workers:
-    """The workers of a client's scheduler. `usable`: threads by address, of those that may have work.
+    """The workers of a client's scheduler.
 
-    `refused`: why, by address; `machines`: the names of all that ever were usable.
+    `usable`: number of threads of each usable worker, by address. `refused`: the reason of each refusal, by address.
+    `machines`: machine names of all workers that were ever usable, by address.
     """
 
     def __init__(
@@ -41,54 +42,56 @@ class Workers:
         facts: str = on_worker.__name__,
         task: str = "work",
     ) -> None:
-        """`expected`: facts that workers must have, but for `tolerated`. `warn` is called with who is refused, and why.
+        """`expected`: facts that workers must have, except the names in `tolerated`.
 
-        `facts`: the name of the module whose `facts(variant)` workers are asked for. `task`: what they are for, a verb.
+        `warn` is called with a message for each refused worker. `facts`: name of the module whose `facts(variant)` runs
+        on the workers. `task`: a verb for error messages, such as render.
         """
         self.client, self.expected, self.tolerated, self.warn, self.task = client, expected, tolerated, warn, task
         self.usable: dict[str, int] = {}
         self.refused: dict[str, str] = {}
         self.machines: dict[str, str] = {}
-        self._question = _QUESTION.format(facts, variant)
-        self._asked: dict[str, Any] = {}  # answers that are awaited, by address
-        self._looked = -BETWEEN_LOOKS
+        self._query = _QUERY.format(facts, variant)
+        self._pending: dict[str, Any] = {}  # futures of the facts, by address
+        self._last_look = -BETWEEN_LOOKS
         self._alone_since: float | None = None
 
     def wait(self, nobody: float = NOBODY) -> None:
-        """Wait until those that are there have answered. NoWorkersError, one line, where none may have work.
+        """Wait until all present workers have reported their facts. NoWorkersError if none is usable.
 
-        `nobody`: seconds until there must be a worker.
+        `nobody`: time limit for the first worker, in seconds.
         """
         began = time.monotonic()
         while True:
             self.look(at_once=True)
             waited = time.monotonic() - began
-            answered = not self._asked and (self.usable or self.refused or waited > nobody)
+            answered = not self._pending and (self.usable or self.refused or waited > nobody)
             if answered or waited > PATIENCE:
                 break
             time.sleep(0.05)
         if not self.usable:
-            reason = "; ".join(self.refused.values()) or ("workers do not answer" if self._asked else "no workers")
-            text = f"{self.client.scheduler.address}: no worker that may {self.task}: {reason}"
+            reason = "; ".join(self.refused.values()) or ("workers do not answer" if self._pending else "no workers")
+            text = f"{self.client.scheduler.address}: no worker can {self.task}: {reason}"
             raise NoWorkersError(f"{text}; expected at least one with the software and hardware of this process")
 
     def look(self, *, at_once: bool = False) -> None:
-        """Ask those that are new, note what they answered and who has gone; seldom while some are there, or `at_once`.
+        """Update `usable` and `refused`: query new workers, evaluate their facts, forget lost workers.
 
-        LostSchedulerError where the scheduler has gone, NoWorkersError where all workers have, for longer than ALONE.
+        While workers are usable this happens every BETWEEN_LOOKS, or `at_once`. LostSchedulerError if the scheduler has
+        ended, NoWorkersError if all workers have been gone for longer than ALONE.
         """
         with cluster_errors(self.client):
-            if at_once or not self.usable or time.monotonic() - self._looked >= BETWEEN_LOOKS:
-                self._looked, present = time.monotonic(), self.client.nthreads()
-                for known in (self.usable, self.refused, self._asked):
+            if at_once or not self.usable or time.monotonic() - self._last_look >= BETWEEN_LOOKS:
+                self._last_look, present = time.monotonic(), self.client.nthreads()
+                for known in (self.usable, self.refused, self._pending):
                     for address in known.keys() - present.keys():
                         del known[address]
                 for address, threads in present.items():
-                    if address in self._asked and self._asked[address].done():
-                        self._judge(address, threads, self._asked.pop(address))
-                    elif not any(address in known for known in (self._asked, self.usable, self.refused)):
+                    if address in self._pending and self._pending[address].done():
+                        self._judge(address, threads, self._pending.pop(address))
+                    elif not any(address in known for known in (self._pending, self.usable, self.refused)):
                         options: dict[str, Any] = {"workers": [address], "pure": False, "priority": 1000}
-                        self._asked[address] = self.client.submit(eval, self._question, **options)
+                        self._pending[address] = self.client.submit(eval, self._query, **options)
         if self.usable or not self.machines:
             self._alone_since = None
         elif self._alone_since is None:
@@ -98,26 +101,28 @@ class Workers:
             raise NoWorkersError(f"{text}; expected new ones within {ALONE:.0f} s")
 
     def _judge(self, address: str, threads: int, answer: Future) -> None:
-        there: dict[str, str] = {}
+        """Add a worker to `usable` or to `refused`, from its facts."""
+        facts: dict[str, str] = {}
         if answer.status != "finished":
             error = answer.exception() if answer.status == "error" else None
-            different = [f"{type(error).__name__}: {error}" if error else answer.status]
+            differences = [f"{type(error).__name__}: {error}" if error else answer.status]
         else:
-            if not (answers := fetched(self.client, answer)):  # the worker has gone with it; else it is asked again
+            results = fetched(self.client, answer)
+            if not results:  # lost with the worker; a worker that is still there is queried again
                 return
-            (there,) = answers
-            different = on_worker.differences(there, self.expected, self.tolerated)
-        if different:
-            host = f" on {there[on_worker.HOST]}" if there else ""
-            self.refused[address] = f"worker {address}{host} is refused: {'; '.join(different)}"
+            (facts,) = results
+            differences = on_worker.differences(facts, self.expected, self.tolerated)
+        if differences:
+            host = f" on {facts[on_worker.HOST]}" if facts else ""
+            self.refused[address] = f"worker {address}{host} is refused: {'; '.join(differences)}"
             self.warn(self.refused[address])
         else:
             self.usable[address] = threads
-            self.machines[address] = on_worker.machine(there, self.expected)
+            self.machines[address] = on_worker.machine(facts, self.expected)
 
 
 def finished(client: Client, futures: Sequence[Future]) -> list[Future]:
-    """The futures that are done, after a short wait for one. Errors: those of `cluster_errors`."""
+    """Wait up to _POLL for a future, then return all that are done. Errors as `cluster_errors`."""
     from distributed import wait
 
     with contextlib.suppress(TimeoutError), cluster_errors(client), client.as_current():
@@ -126,10 +131,10 @@ def finished(client: Client, futures: Sequence[Future]) -> list[Future]:
 
 
 def fetched(client: Client, future: Future) -> tuple[Any, ...]:
-    """(result,) of a future that is done, however long it travels; () as soon as it is lost with its worker.
+    """Return (result,) of a future that is done, however long the transfer takes; () if its worker is lost meanwhile.
 
-    `future.result()` would wait until the task is done again, perhaps for workers that do not come back. The task's own
-    error passes; errors of `cluster_errors`.
+    `future.result()` would wait until the task has run again, perhaps for workers that do not come back. Raises the
+    task's own error, and the errors of `cluster_errors`.
     """
     with cluster_errors(client):
         transfer = asyncio.run_coroutine_threadsafe(client.gather(future, asynchronous=True), client.loop.asyncio_loop)
@@ -145,42 +150,42 @@ def fetched(client: Client, future: Future) -> tuple[Any, ...]:
 def results(
     workers: Workers, function: Callable[..., Any], calls: Iterable[tuple[Any, ...]]
 ) -> Iterator[tuple[int, Any, str]]:
-    """Number (from 0), result and worker's machine of every `function(*call)`, in the order in which they end.
+    """Run `function(*call)` on the workers for every call; yield (index of the call, result, the worker's machine).
 
-    `calls` is asked for the next one as soon as a worker has room. A call whose worker is lost is made again by another
-    one. The errors of a call pass as they are; ConnectionError, one line, where the scheduler or all workers have gone,
-    or where a call has ended several workers. What is begun and not finished is cancelled at the end.
+    Results come in the order in which they finish. `calls` is read only as workers have room. If a worker is lost,
+    another one repeats its call. An error of the function is raised unchanged. ConnectionError if the scheduler or all
+    workers have gone, or if several workers were lost on the same call. Unfinished calls are cancelled on exit.
     """
     client, waiting = workers.client, enumerate(calls)
-    begun: dict[Any, tuple[int, tuple[Any, ...], frozenset[str]]] = {}  # number, arguments, who may make the call
+    submitted: dict[Any, tuple[int, tuple[Any, ...], frozenset[str]]] = {}  # index, arguments, allowed workers
 
-    def begin(number: int, arguments: tuple[Any, ...]) -> None:
+    def submit(index: int, arguments: tuple[Any, ...]) -> None:
         allowed = frozenset(workers.usable)
-        options: dict[str, Any] = {"workers": sorted(allowed), "pure": False, "priority": -number}
-        begun[client.submit(on_worker.with_address, function, *arguments, **options)] = number, arguments, allowed
+        options: dict[str, Any] = {"workers": sorted(allowed), "pure": False, "priority": -index}
+        submitted[client.submit(on_worker.with_address, function, *arguments, **options)] = index, arguments, allowed
 
     try:
         while True:
             workers.look()
             with cluster_errors(client):
-                for future, (number, arguments, allowed) in list(begun.items()):
-                    # Dask would wait for these workers to come back.
+                for future, (index, arguments, allowed) in list(submitted.items()):
+                    # All allowed workers are lost: Dask would wait for them to come back.
                     if workers.usable and allowed.isdisjoint(workers.usable) and not future.done():
-                        del begun[future]
+                        del submitted[future]
                         client.cancel([future], force=True)
-                        begin(number, arguments)
-                room = AHEAD * sum(workers.usable.values()) - len(begun)
-                for number, arguments in itertools.islice(waiting, max(0, room)):
-                    begin(number, arguments)
-            if not begun and workers.usable:
+                        submit(index, arguments)
+                room = AHEAD * sum(workers.usable.values()) - len(submitted)
+                for index, arguments in itertools.islice(waiting, max(0, room)):
+                    submit(index, arguments)
+            if not submitted and workers.usable:
                 return
-            if not begun:
+            if not submitted:
                 time.sleep(_POLL)
                 continue
-            for future in finished(client, list(begun)):
+            for future in finished(client, list(submitted)):
                 for address, result in fetched(client, future):
-                    number = begun.pop(future)[0]
-                    yield number, result, workers.machines.get(address, address)
+                    index = submitted.pop(future)[0]
+                    yield index, result, workers.machines.get(address, address)
     finally:
-        if begun and client.status == "running":
-            client.cancel(list(begun), force=True)
+        if submitted and client.status == "running":
+            client.cancel(list(submitted), force=True)

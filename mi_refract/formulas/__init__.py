@@ -1,8 +1,8 @@
 """The formulas of refraction, Fresnel's equations, and bounds of their errors.
 
-In: directions `a`, normals `n` and ratios `k` as Dr.Jit arrays, in the conventions of the package's docstring. Out:
-`(b, transmitted)` from the entries of FORMULAS, powers and amplitudes from `fresnel`, and from `Budget` how far each
-answer may be from the exact one. Nothing here imports Mitsuba.
+Input: directions `a`, normals `n` and ratios `k` as Dr.Jit arrays, in the conventions of the package's docstring.
+Output: `(b, transmitted)` from the entries of FORMULAS, powers and amplitudes from `fresnel`, and from `Budget` the
+largest error that each answer may have. No module here imports Mitsuba.
 """
 
 from . import fresnel

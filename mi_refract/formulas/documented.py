@@ -1,11 +1,11 @@
 """One pure Dr.Jit function per documented formula of refraction.
 
 Every formula is `f(a, n, k) -> (b, transmitted)` in the conventions of the package docstring. The entries of FORMULAS
-are total functions without branches on data: input that is not a refraction (a zero or non-finite vector, a ratio
-outside 2⁻²⁰ … 2²⁰) gives NaN and False. The functions themselves leave that check out (NaN still gives NaN), for
-callers that have made it, as the plugin has. `a` and `n` are 3-vectors of any Dr.Jit backend and precision, `k` a
-number or an array of that precision; a wider `k` is rounded to it, once. The documented formulas take unit `a` and `n`;
-what those are off by, the result is off by. Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted ().
+are total functions without branches on data: invalid input (a zero or non-finite vector, a ratio outside
+2⁻²⁰ … 2²⁰) gives NaN and False. The functions of this module skip that check (NaN still gives NaN), for callers that
+have made it, such as the plugin. `a` and `n` are 3-vectors of any Dr.Jit backend and precision, `k` is a number or an
+array of that precision; a wider `k` is rounded to it once. The documented formulas take unit `a` and `n`; an error of
+their lengths is an error of the result. Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted ().
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from mi_refract.numerics import Mask, Number, Vector3, as_component, ieee_divide
 from .well_conditioned import Refracted
 
 
-def _conclude(a: Vector3, n: Vector3, c: Number, radicand: Number, b: Vector3) -> Refracted:
-    """Choose between the transmitted direction `b` and the mirror direction, for which the radicand is below 0.
+def _select_direction(a: Vector3, n: Vector3, c: Number, radicand: Number, b: Vector3) -> Refracted:
+    """The transmitted direction `b`, or the mirror direction where the radicand is below 0.
 
-    Roots are `dr.safe_sqrt`, √max(radicand, 0), with a finite derivative at 0.
+    Callers compute roots with `dr.safe_sqrt`, √max(radicand, 0), which has a finite derivative at 0.
     """
     transmitted = (radicand >= 0) & (c != 0)
     return dr.select(transmitted, b, a - n * ieee_divide(2 * c, dr.dot(n, n))), transmitted
@@ -32,7 +32,7 @@ def _conclude(a: Vector3, n: Vector3, c: Number, radicand: Number, b: Vector3) -
 
 
 def wedge(n: Vector3, a: Vector3) -> Vector3:
-    """n ∧ a, as its components on the basis bivectors (yz, zx, xy); in three dimensions these are those of n × a.
+    """The components of n ∧ a on the basis bivectors (yz, zx, xy); in three dimensions they equal those of n × a.
 
     Shapes (3,) and (3,) to (3,). Source: document 000.
     """
@@ -74,20 +74,20 @@ def refract_wedge(a: Vector3, n: Vector3, k: Number) -> Refracted:
     c, bivector = dr.dot(n, a), wedge(n, a)
     radicand = dr.dot(a, a) - k * k * dr.dot(bivector, bivector)  # (n∧a)² = −|n×a|²
     b = k * contract(n, bivector) + n * dr.mulsign(dr.safe_sqrt(radicand), c)
-    return _conclude(a, n, c, radicand, b)
+    return _select_direction(a, n, c, radicand, b)
 
 
 def refract_wedge_contrast(a: Vector3, n: Vector3, k: Number) -> Refracted:
     """b = k n(n∧a) + s n √((n·a)² + (n∧a)² (k² − 1)),  s = sign(n·a).
 
     Source: document 000, last form of "Refraction", made two-sided. Unit `n`.
-    Weak where k² − 1 loses digits (k near 1) and where two large terms cancel near the critical angle.
+    Weak for k near 1, where k² − 1 loses digits, and near the critical angle, where two large terms cancel.
     """
     k = as_component(a, k)
     c, bivector = dr.dot(n, a), wedge(n, a)
     radicand = c * c - dr.dot(bivector, bivector) * (k * k - 1)
     b = k * contract(n, bivector) + n * dr.mulsign(dr.safe_sqrt(radicand), c)
-    return _conclude(a, n, c, radicand, b)
+    return _select_direction(a, n, c, radicand, b)
 
 
 def refract_cross(a: Vector3, n: Vector3, k: Number) -> Refracted:
@@ -100,7 +100,7 @@ def refract_cross(a: Vector3, n: Vector3, k: Number) -> Refracted:
     cos, c = dr.dot(a, n), k * dr.cross(a, n)
     radicand = 1 - dr.dot(c, c)
     t = dr.cross(n, c) + n * dr.mulsign(dr.safe_sqrt(radicand), cos)
-    return _conclude(a, n, cos, radicand, t)
+    return _select_direction(a, n, cos, radicand, t)
 
 
 def refract_decomposed(a: Vector3, n: Vector3, k: Number) -> Refracted:
@@ -114,7 +114,7 @@ def refract_decomposed(a: Vector3, n: Vector3, k: Number) -> Refracted:
     c = dr.dot(n, a)
     radicand = 1 - k * k * (1 - c * c)
     b = k * a - n * (k * c - dr.mulsign(dr.safe_sqrt(radicand), c))
-    return _conclude(a, n, c, radicand, b)
+    return _select_direction(a, n, c, radicand, b)
 
 
 def refract_2d(
@@ -153,7 +153,7 @@ def refract_rotated(a: Vector3, n: Vector3, k: Number) -> Refracted:
     tangent = a - n * c
     sine = dr.norm(tangent)
     (b_n, b_t), transmitted = refract_2d((c, sine), (0, 1), k)
-    # Where the tangent is 0 its factor is the limit k, for the derivative's sake.
+    # For a tangent of 0 its factor is the limit k, so that derivatives are right.
     factor = dr.select(sine > 0, ieee_divide(b_t, sine), dr.select(transmitted, k, 1))
     b = n * b_n + tangent * factor
-    return _conclude(a, n, c, dr.select(transmitted, 1, -1), b)
+    return _select_direction(a, n, c, dr.select(transmitted, 1, -1), b)

@@ -1,4 +1,4 @@
-"""FORMULAS, the one table of formulas, sources and error bounds; it drives plugin, tests, timing and README."""
+"""FORMULAS, the table of all formulas with sources and error bounds; the plugin, tests, timing and README use it."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from .bounds import CONTRASTING, ROUNDING, Budget, cancelling
 from .documented import refract_cross, refract_decomposed, refract_rotated, refract_wedge, refract_wedge_contrast
 from .well_conditioned import LocalCosines, Refracted, refract_compensated, refract_promoted
 
-# Which k every formula takes; both directions of a boundary, so one is the inverse of the other. In float32
-#   promoted     k a + n (n·b − k n·a)/n² cancels: with v = 2⁻⁵³, n·a is off by 2v, the difference by v, n² by 1.5v,
-#                the quotient by v, so b by 5.5 k v at most: 0.011u for k = 2²⁰, 0.9u for 8.5e7. ROUNDING leaves
-#                0.0064u, less than all of these together; of 2·10⁷ rays with k ≈ 2²⁰ aimed at the worst rounding none
-#                is off by more than 0.863u in all.
-#   decomposed   k n·a − s √… loses the root where it is below ulp(k)/2: b may be 0 at normal incidence from 2²⁴ on.
-# and k², κ and Fresnel's terms are within the range of numbers.
-SMALLEST_RATIO = 2.0**-20  # the least k that a formula takes
-LARGEST_RATIO = 2.0**20  # the largest k that a formula takes
+# The range of k that every formula takes. One end is the inverse of the other, for both directions through a boundary.
+# Within it k², κ and Fresnel's terms neither over- nor underflow. In float32
+#   promoted     k a + n (n·b − k n·a)/n² cancels: with v = 2⁻⁵³, the error of n·a is 2v, of the difference v, of n²
+#                1.5v, of the quotient v. So that of b is at most 5.5 k v: 0.011u for k = 2²⁰, 0.9u for 8.5e7. ROUNDING
+#                allows 0.0064u, less than the sum of these bounds; but of 2·10⁷ rays with k ≈ 2²⁰, chosen for the worst
+#                rounding, none has a total error above 0.863u.
+#   decomposed   k n·a − s √… loses the root if it is below ulp(k)/2: b may be 0 at normal incidence from 2²⁴ on.
+SMALLEST_RATIO = 2.0**-20  # smallest k that a formula takes
+LARGEST_RATIO = 2.0**20  # largest k that a formula takes
 
 
 @dataclass(frozen=True)
 class Formula:
     """A formula of refraction, `entry(a, n, k) -> (b, transmitted)`, with its source and its error budget.
 
-    `source`: document and equation. `takes_contrast`, `takes_local`: these arguments are used, not ignored. `scales`:
-    `function` needs lengths near 1. `time_goal`: the largest time of a ray in float32, streamed through a CPU, over
-    that of the plain form.
+    `source`: document and equation. `takes_contrast`, `takes_local`: whether the function takes these arguments.
+    `scales`: whether its input must be scaled to lengths near 1. `time_goal`: the time limit per float32 ray on a CPU,
+    as a multiple of the plain form's.
     """
 
     function: Callable[..., Refracted]
@@ -44,11 +44,11 @@ class Formula:
     time_goal: float | None = None
 
     def __call__(self, a: Vector3, n: Vector3, k: Number, contrast: Number = None) -> Refracted:
-        """The refracted directions b (3,) of rays `a` (3,) at normals `n` (3,), and a mask: which are transmitted.
+        """The refracted directions b (3,) of rays `a` (3,) at normals `n` (3,), and whether each is transmitted.
 
-        Dr.Jit arrays of one backend and precision; `k` = n_from / n_to may be a number. `contrast`: κ = k² − 1 where it
-        is known better than k. NaN and False for invalid input, without an error: `a` or `n` zero or not finite, `k`
-        outside 2⁻²⁰ … 2²⁰, `contrast` not finite or not above −1.
+        Dr.Jit arrays of one backend and precision; `k` = n_from / n_to may be a number. `contrast`: κ = k² − 1, if it
+        is known more accurately than from k. Invalid input gives NaN and False without an error: `a` or `n` zero or not
+        finite, `k` outside 2⁻²⁰ … 2²⁰, `contrast` not finite or not above −1.
         """
         n, k = type(a)(n), as_component(a, k)
         scale: Any = 1
@@ -56,7 +56,7 @@ class Formula:
             (a, scale), (n, _) = scale_to_unit(a), scale_to_unit(n)
         with ieee_quotients(a):
             b, transmitted = self.unchecked(a, n, k, contrast)
-        # `b` has the length of `a`, and a zero or non-finite `n` makes it NaN: one length tells of both.
+        # `b` has the length of `a`, and a zero or non-finite `n` makes it NaN: its length shows whether both are valid.
         b, length2 = b * scale, dr.dot(b, b)
         valid = (k >= SMALLEST_RATIO) & (k <= LARGEST_RATIO) & (length2 > 0) & (length2 < dr.inf)
         if contrast is not None:
@@ -66,11 +66,13 @@ class Formula:
     def unchecked(
         self, a: Vector3, n: Vector3, k: Number, contrast: Number = None, local: LocalCosines | None = None
     ) -> Refracted:
-        """The formula alone. Precondition: what `__call__` tests; NaN gives NaN and False.
+        """The formula without the checks of `__call__`, which are its precondition; NaN gives NaN and False.
 
-        `local`: the cosines of a float32 ray, where `n` is the literal z axis and the caller has them.
+        `local`: the cosines of a float32 ray, if `n` is the literal z axis and the caller has computed them already.
         """
-        return self.function(a, n, k, *(contrast, local)[: self.takes_contrast + self.takes_local])
+        if self.takes_local:
+            return self.function(a, n, k, contrast, local)
+        return self.function(a, n, k, contrast) if self.takes_contrast else self.function(a, n, k)
 
 
 # Every formula by its name.
@@ -108,8 +110,8 @@ FORMULAS = {
 }
 
 
-# The formula that "auto" means: the cheapest at the rounding limit where the normal is a literal axis. Fresnel's
-# equations need its float64 numbers anyway, so that holds on GPUs with slow float64, too.
+# The formula for "auto": the cheapest at the rounding limit in a local frame, where the normal is a literal axis.
+# Fresnel's equations need everything that it computes in float64, so it is also the cheapest on GPUs with slow float64.
 AUTOMATIC = "promoted"
 
 

@@ -1,9 +1,9 @@
 """Compare images and folders of images.
 
-In: image files (or arrays), what counts as equal (a method and its options), and `mi-refract.toml` for exceptions.
-Out: a verdict for each image, with the numbers behind it; text, JSON, JUnit and one HTML page that show them; and
-references replaced by the images that a person has accepted. What cannot be compared is an error, and a method that
-could not have seen a difference says "inconclusive".
+Input: image files or arrays, a method with its options, and `mi-refract.toml` with exceptions for single images.
+Output: a verdict for each image with the measured numbers, as text, JSON, JUnit and one HTML page. `accept` replaces
+references by new images. An image that cannot be compared is an error. A method that could not have detected a
+difference returns "inconclusive".
 """
 
 __all__ = [

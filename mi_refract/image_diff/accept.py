@@ -1,4 +1,4 @@
-"""Accepting: new images become the references. The only part of the comparison that writes images."""
+"""Accepting: replace references by new images. The only module of the comparison that writes images."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ FEW = 10  # names in a message
 
 
 class UnreadableImage(ValueError):
-    """A new image that cannot be read, and so can be no reference; `result` is its comparison."""
+    """Error: a new image cannot be read, so it cannot become a reference; `result`: its comparison."""
 
     def __init__(self, result: Result, text: str) -> None:
-        """`text`: what the error says."""
+        """`text`: the message."""
         super().__init__(text)
         self.result = result
 
 
 @dataclass(frozen=True)
 class Copy:
-    """A new image that is to become the reference, and the digests of both when they were compared."""
+    """A file to copy over a reference; `compared`, `replaced`: the SHA-256 of both files when they were compared."""
 
     new: Path
     reference: Path
@@ -40,14 +40,16 @@ class Copy:
 
 
 def changes(results: Results, variant: str = "") -> Iterator[Copy]:
-    """A copy for each image that is not equal to its reference, or has none. `results`: of a `diff(to_accept=True)`.
+    """Yield a copy for each new image that differs from its reference, or has none.
 
-    Those that have been made already, by a call that was interrupted, are left out. `variant`: the copies become other
-    references beside the old ones, of that name; see `pairing.variant`. ValueError or OSError for a new image that can
-    be no reference: UnreadableImage, or one with values that are not finite, or of another format than the reference's
-    name says, or where the reference would be outside of its folder.
+    `results`: returned by `diff(to_accept=True)`. Copies that an interrupted call has made already are skipped.
+    `variant`: keep the old references, and add the new images as variants of this name, see `pairing.variant`.
+
+    Errors, for a new image that cannot become a reference: UnreadableImage; ValueError or OSError if it has values that
+    are not finite, if its format differs from the suffix of the reference, or if the reference would be outside of its
+    folder.
     """
-    taken = {result.target for result in results.results} if variant else set()
+    targets = {result.target for result in results.results} if variant else set()
     for result in results.of(*FAILED):
         if result.error and (result.test is None or result.digests is None):
             raise UnreadableImage(result, result.error)
@@ -60,17 +62,17 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
             if result.reference is None:
                 raise ValueError(f"{result.test}: has no reference yet; accept it without --as-variant first")
             target = pairing.variant(target, result.how, variant)
-        there = digest(target)
-        if target in taken or (variant and there not in ("", compared) and target not in result.variants):
+        existing = digest(target)
+        if target in targets or (variant and existing not in ("", compared) and target not in result.variants):
             raise ValueError(f"{target}: also the reference of another image; expected a reference of its own")
-        taken.add(target)
+        targets.add(target)
         decoded: dict[Path, str] = {}
         try:
             images = image_file.read_parts(result.test, result.how.max_values, decoded)
         except (ValueError, OSError) as error:
             raise UnreadableImage(result, describe(error)) from error
         if decoded[result.test] != compared:
-            raise _changed(result.test)
+            raise _changed_error(result.test)
         if not result.how.options.get("allow_nonfinite") and not all(np.isfinite(x.pixels).all() for x in images):
             raise ValueError(
                 f"{result.test}: values that are not finite; to accept them, compare with --set allow_nonfinite=true"
@@ -78,13 +80,15 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
         if target.suffix.lower() != result.test.suffix.lower():
             raise ValueError(f"{target}: expected a name that ends in {result.test.suffix}, as {result.test} does")
         copies = [Copy(result.test, target, compared, result.digests.get(target, ""))]
-        if result.how.reads_variance:  # it goes with the image, and before it: the image is still to be accepted then
-            how, beside = result.how, zip((result.test, target), reversed(results.roots), strict=True)
-            source, to = (pairing.beside(how.variance, path, root, how.above) for path, root in beside)
+        if result.how.reads_variance:  # copied before the image, so that an interrupted call can be repeated
+            how, sides = result.how, zip((result.test, target), reversed(results.roots), strict=True)
+            source, old = (pairing.beside(how.variance, path, root, how.above) for path, root in sides)
             if source.exists():
-                copies.insert(0, Copy(source, to, result.digests.get(source, ""), result.digests.get(to, "")))
-            elif to.exists():
-                raise ValueError(f"{source}: no such file, and {to} belongs to a different render; expected a variance")
+                copies.insert(0, Copy(source, old, result.digests.get(source, ""), result.digests.get(old, "")))
+            elif old.exists():
+                raise ValueError(
+                    f"{source}: no such file, and {old} belongs to a different render; expected a variance"
+                )
         for copy in copies:
             for path, root in zip((copy.reference, copy.new), results.roots, strict=True):
                 if not pairing.is_inside(path, root):
@@ -94,63 +98,63 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
 
 
 class Acceptance:
-    """Copies new images over their references: exactly the bytes that were compared, if the references are those, too.
+    """Copies new images over their references, if no file has changed since the comparison.
 
-    Every copy is complete, in a hidden file, before the first of them takes its name. Then they do so in their order.
+    All copies are written to hidden files first; then these are renamed in the order of `copies`.
     """
 
     def __init__(self, copies: Sequence[Copy]) -> None:
-        """`copies`: of `changes`."""
+        """`copies`: from `changes`."""
         self.copies = copies
         self._replaced = 0
         self._replacing = threading.Lock()
 
     def run(self) -> None:
-        """Accept all. OSError or ValueError where a file has changed, or cannot be written.
+        """Copy all files. OSError or ValueError if a file has changed or cannot be written.
 
-        Then no reference is replaced, or the error says which are.
+        After an error no reference is replaced, or the message lists those that are.
         """
         self._require_unchanged()
-        with contextlib.ExitStack() as hidden:
-            parts: list[Path] = []
+        with contextlib.ExitStack() as stack:
+            hidden_files: list[Path] = []
             for copy in self.copies:
                 copy.reference.parent.mkdir(parents=True, exist_ok=True)
-                part = hidden.enter_context(safe_files.beside(copy.reference))
-                if safe_files.copy(copy.new, part) != copy.compared:
-                    raise _changed(copy.new)
-                safe_files.sync(part)
-                parts.append(part)
+                hidden_file = stack.enter_context(safe_files.beside(copy.reference))
+                if safe_files.copy(copy.new, hidden_file) != copy.compared:
+                    raise _changed_error(copy.new)
+                safe_files.sync(hidden_file)
+                hidden_files.append(hidden_file)
             self._require_unchanged()
             try:
-                for copy, part in zip(self.copies, parts, strict=True):
+                for copy, hidden_file in zip(self.copies, hidden_files, strict=True):
                     with self._replacing:
-                        safe_files.move_into_place(part, copy.reference)
+                        safe_files.move_into_place(hidden_file, copy.reference)
                         self._replaced += 1
             except OSError as error:
                 raise OSError(f"{describe(error)}; {self._state()}") from error
 
     def stop(self) -> str:
-        """Replace no more references, from another thread, and return which are replaced. `run` never returns then."""
+        """Stop replacing references, and return which are replaced. Call it from another thread; `run` then hangs."""
         self._replacing.acquire()
         return self._state()
 
     def _state(self) -> str:
         names = [str(copy.reference) for copy in self.copies]
-        done, left = names[: self._replaced], names[self._replaced :]
-        if not (done and left):
+        done, rest = names[: self._replaced], names[self._replaced :]
+        if not (done and rest):
             return "all references are replaced" if done else "no reference is replaced"
-        return f"replaced: {_listed(done)}; not replaced: {_listed(left)}; the same command again accepts these"
+        return f"replaced: {_listed(done)}; not replaced: {_listed(rest)}; run the same command again to accept these"
 
     def _require_unchanged(self) -> None:
         for copy in self.copies:
             for path, before in ((copy.new, copy.compared), (copy.reference, copy.replaced)):
                 if digest(path) != before:
-                    raise _changed(path)
+                    raise _changed_error(path)
 
 
 def _listed(names: Sequence[str]) -> str:
     return ", ".join(names) if len(names) <= FEW else f"{names[0]} … {names[-1]} ({len(names)} in the order above)"
 
 
-def _changed(path: Path) -> OSError:
+def _changed_error(path: Path) -> OSError:
     return OSError(f"{path}: changed since it was compared")

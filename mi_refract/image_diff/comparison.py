@@ -1,6 +1,6 @@
-"""What a comparison of images says, and the preconditions of every method.
+"""The result of comparing two images, and the preconditions of every method.
 
-What cannot be compared is an error, and a value that is not finite equals nothing.
+Images that cannot be compared are an error, and a value that is not finite equals nothing.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from mi_refract.io.image_file import Image, Pixels
 
 Maps = dict[str, Pixels]
-# 4/3 as 1.333, or as whole pixels per metre at 72 dpi: 2835, so that half of one on each axis is 1/2835.
+# Relative tolerance of pixel aspect ratios. They may be rounded to 1.333, or follow from whole pixels per metre, 2835
+# at 72 dpi, where rounding both axes changes the ratio by up to 1/2835.
 ASPECT = 5e-4
 
 
 class Range(NamedTuple):
-    """The values of an option: whether one is among them, and all of them in words."""
+    """The allowed values of an option; `contains(value)`: whether a value is allowed; `words`: all of them in words."""
 
     contains: Callable[[Any], bool]
     words: str
@@ -32,7 +33,7 @@ NONNEGATIVE = Range(lambda x: x >= 0, "a number of at least 0")
 
 
 def one_of(*words: str) -> Range:
-    """The range of these words."""
+    """Return the range of these words."""
     return Range(words.__contains__, ", ".join(words))
 
 
@@ -46,7 +47,7 @@ class Verdict(enum.StrEnum):
 
 @dataclass(frozen=True)
 class Metric:
-    """A number that a method measured; where it has a bound, `value <= bound` holds for equal images."""
+    """A number that a method measured; if it has a bound, `value <= bound` holds for equal images."""
 
     name: str
     value: float
@@ -62,10 +63,10 @@ class Metric:
 class Comparison:
     """The result of a method.
 
-    `minimum_detectable`: the smallest relative difference that the method would have seen; NaN where it is not known.
-    `maps`: H × W or H × W × C arrays by name, of the images' size. `warning`: what an equal image is near to failing.
-    `part`: of files of several images, which it is about: its number and that of its MIP level. `chosen`: why the
-    method is this one, where that was left to `auto`.
+    `minimum_detectable`: the smallest relative difference that the method would have detected; NaN if unknown. `maps`:
+    arrays by name, H × W or H × W × C, of the images' size. `warning`: a bound for warnings that an equal image
+    exceeds. `part`: for files of several images, the number of the compared part and of its MIP level. `chosen`: why
+    `auto` chose the method.
     """
 
     method: str
@@ -84,58 +85,58 @@ class Comparison:
         return self.verdict is Verdict.EQUAL
 
     def but(self, verdict: Verdict, reason: str) -> Comparison:
-        """The result with another verdict, and the reason for that before its own."""
+        """Return the result with another verdict, and the reason for it before the present one."""
         return replace(self, verdict=verdict, reason=f"{reason}; {self.reason}")
 
     @property
     def method_in_words(self) -> str:
-        """The method, and why it is this one: "welch (the variance of both is known)"."""
+        """The method, and why `auto` chose it: "welch (the variance of both is known)"."""
         return f"{self.method} ({self.chosen})" if self.chosen else self.method
 
 
 def verdict_of(metrics: Sequence[Metric]) -> Verdict:
-    """EQUAL where every metric is within its bound, else DIFFERENT."""
+    """Return EQUAL if every metric is within its bound, else DIFFERENT."""
     return Verdict.EQUAL if all(metric.holds for metric in metrics) else Verdict.DIFFERENT
 
 
 def preconditions(reference: Image, test: Image, allow_nonfinite: bool = False) -> str:
-    """Why the two differ before any method is applied: values that are not finite, counted and located; "" if not.
+    """Return why the images differ before any method is applied: the number and place of values that are not finite.
 
-    With `allow_nonfinite` such a value is allowed where the other image has the same one: NaN, Inf or -Inf.
-    ValueError where the images cannot be compared, as `aligned`.
+    "" if all are finite. With `allow_nonfinite` such a value is allowed if the other image has the same one there: NaN,
+    Inf or -Inf. ValueError if the images cannot be compared, see `aligned`.
     """
     a, b = aligned(reference, test)
-    whole = np.isfinite(a), np.isfinite(b)
-    if all(x.all() for x in whole):
+    finite_a, finite_b = np.isfinite(a), np.isfinite(b)
+    if finite_a.all() and finite_b.all():
         return ""
     if allow_nonfinite:
-        lone = ~(whole[0] & whole[1]) & ~((a == b) | (np.isnan(a) & np.isnan(b)))
-        return (
-            f"not finite in one image only, or not the same value: {_located(reference, a, lone)}" if lone.any() else ""
-        )
-    two = replace(test, channels=reference.channels)
-    texts = (_located(image, x, ~good) for image, x, good in zip((reference, two), (a, b), whole, strict=True))
+        different = ~(finite_a & finite_b) & ~((a == b) | (np.isnan(a) & np.isnan(b)))
+        if not different.any():
+            return ""
+        return f"not finite in one image only, or not the same value: {_located(reference, a, different)}"
+    texts = _located(reference, a, ~finite_a), _located(replace(test, channels=reference.channels), b, ~finite_b)
     return "; ".join(filter(None, texts))
 
 
 def aligned(reference: Image, test: Image) -> tuple[Pixels, Pixels]:
-    """The pixels of both, with the channels in the reference's order.
+    """Return the pixels of both, with the channels in the reference's order.
 
-    ValueError where they cannot be compared: another size, other names of channels, or a header that puts the same
-    pixels elsewhere, in another shape, or turned.
+    ValueError if they differ in size, in names of channels, or in the position, aspect ratio or orientation of pixels
+    by their headers.
     """
-    for name, of in HEADER.items():
-        if of(reference) != of(test) and not (name == "pixel aspect ratio" and _same_aspect(reference, test)):
+    for name, text_of in HEADER.items():
+        expected, actual = text_of(reference), text_of(test)
+        if expected != actual and not (name == "pixel aspect ratio" and _same_aspect(reference, test)):
             hint = "; or `channels`: those to compare" if name == "channels" else ""
-            raise ValueError(f"{test.path}: {name} {of(test)}; expected {of(reference)}, as in {reference.path}{hint}")
+            raise ValueError(f"{test.path}: {name} {actual}; expected {expected}, as in {reference.path}{hint}")
     same_order = reference.channels == test.channels
     return reference.pixels, test.pixels if same_order else test.select(reference.channels)
 
 
 def as_shown(image: Image, names: Collection[str]) -> Image:
-    """The image with those of the channels `names` that need not be stored: an alpha of 1, R = G = B for a gray Y.
+    """Return the image with those channels of `names` that files may omit: an alpha of 1, and R = G = B for a gray Y.
 
-    Where a mask leaves pixels out, alpha is 0, as all channels are.
+    In pixels that a mask excludes, alpha is 0 like all channels.
     """
     values = dict(zip(image.channels, np.moveaxis(image.pixels, -1, 0), strict=True))
     if values.keys() - {"A", *names} == {"Y"} and {*"RGB"} <= set(names) - values.keys():
@@ -149,21 +150,22 @@ def as_shown(image: Image, names: Collection[str]) -> Image:
 
 
 def identical_as_shown(reference: Image, test: Image) -> str:
-    """How the channels that only one image has are read, if every pixel is identical then; else ""."""
-    if not (lone := set(reference.channels) ^ set(test.channels)):
+    """Return how omitted channels are read, if only one image has them and all pixels are identical then; else ""."""
+    unshared = set(reference.channels) ^ set(test.channels)
+    if not unshared:
         return ""
     one, two = as_shown(reference, test.channels), as_shown(test, reference.channels)
-    same = one.pixels.shape == two.pixels.shape and set(one.channels) == set(two.channels)
-    if not same or not np.array_equal(one.pixels, two.select(one.channels), equal_nan=True):
+    comparable = one.pixels.shape == two.pixels.shape and set(one.channels) == set(two.channels)
+    if not comparable or not np.array_equal(one.pixels, two.select(one.channels), equal_nan=True):
         return ""
     readings = {"A": "a missing alpha is read as 1", "Y": "gray is read as R = G = B"}
-    return "; ".join(words for name, words in readings.items() if name in lone)
+    return "; ".join(words for name, words in readings.items() if name in unshared)
 
 
 def shared_channels(reference: Image, test: Image) -> tuple[Image, Image, str]:
-    """Both images with the channels that both have, and what one has besides; "" where neither has more.
+    """Return both images with the channels that both have, and a text about those that only one has; "" if none.
 
-    Where each of them has channels that the other lacks nothing is said: these images cannot be compared.
+    If each image has channels that the other lacks, both are returned unchanged with "": they cannot be compared.
     """
     shared = [name for name in reference.channels if name in test.channels]
     added, missing = ([c for c in image.channels if c not in shared] for image in (test, reference))
@@ -178,36 +180,36 @@ def shared_channels(reference: Image, test: Image) -> tuple[Image, Image, str]:
 
 
 def only(image: Image, names: Sequence[str]) -> Image:
-    """The image with these channels only."""
+    """Return the image with these channels only."""
     return replace(image, pixels=image.select(names), channels=tuple(names))
 
 
 def finite(pixels: Pixels) -> Pixels:
-    """The pixels with 0 for what is not finite."""
+    """Return the pixels with 0 for values that are not finite."""
     return pixels if np.isfinite(pixels).all() else np.nan_to_num(pixels, posinf=0, neginf=0)
 
 
 def counted(image: Image) -> int:
-    """How many pixels count; all without a mask."""
+    """Return the number of pixels that are compared; all without a mask."""
     return image.pixels[..., 0].size if image.mask is None else int(image.mask.sum())
 
 
 def passes_black(method: Callable[..., Comparison], views: Iterable[Image], options: Mapping[str, Any]) -> bool:
-    """Whether a method with these options calls black different from none of these images."""
+    """Return whether a method with these options calls black different from none of these images."""
     black = ((image, replace(image, pixels=np.zeros_like(image.pixels))) for image in views)
     return all(method(*pair, **options).verdict is not Verdict.DIFFERENT for pair in black)
 
 
 def nonfinite_result(method: str, reason: str, *pixels: Pixels) -> Comparison:
-    """DIFFERENT, for images with values that are not finite; the map "nonfinite" marks them."""
-    bad = sum((~np.isfinite(x) for x in pixels), np.zeros(pixels[0].shape, np.float32))
-    metrics = (Metric("values that are not finite", float(bad.sum()), 0.0),)
-    return Comparison(method, Verdict.DIFFERENT, reason, metrics, maps={"nonfinite": (bad > 0).astype(np.float32)})
+    """Return the verdict DIFFERENT for images with values that are not finite; the map "nonfinite" marks them."""
+    count = sum((~np.isfinite(x) for x in pixels), np.zeros(pixels[0].shape, np.float32))
+    metrics = (Metric("values that are not finite", float(count.sum()), 0.0),)
+    return Comparison(method, Verdict.DIFFERENT, reason, metrics, maps={"nonfinite": (count > 0).astype(np.float32)})
 
 
-def place(at: NDArray[np.bool_] | Pixels, image: Image) -> str:
-    """The pixel and channel of the first largest value of `at`, H × W × C: "x = 3, y = 5, channel R"."""
-    y, x, c = np.unravel_index(int(at.argmax()), at.shape)
+def place(values: NDArray[np.bool_] | Pixels, image: Image) -> str:
+    """Return the pixel and channel of the largest of the `values`, H × W × C: "x = 3, y = 5, channel R"."""
+    y, x, c = np.unravel_index(int(values.argmax()), values.shape)
     return f"x = {x + image.origin[0]}, y = {y + image.origin[1]}, channel {image.channels[c]}"
 
 
@@ -216,15 +218,16 @@ def _same_aspect(*images: Image) -> bool:
     return all(isinstance(ratio, float | int) for ratio in ratios) and math.isclose(*ratios, rel_tol=ASPECT)
 
 
-def _located(image: Image, values: Pixels, bad: NDArray[np.bool_]) -> str:
-    if not bad.any():
+def _located(image: Image, values: Pixels, marked: NDArray[np.bool_]) -> str:
+    """Return the numbers of NaN and Inf among the marked values and the place of the first; "" if none is marked."""
+    if not marked.any():
         return ""
-    kinds = {"NaN": np.isnan(values[bad]).sum(), "Inf": np.isinf(values[bad]).sum()}
-    counts = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count) or f"{bad.sum()} finite"
-    return f"{image.path}: {counts}, the first at {place(bad, image)}"
+    kinds = {"NaN": np.isnan(values[marked]).sum(), "Inf": np.isinf(values[marked]).sum()}
+    counts = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count) or f"{marked.sum()} finite"
+    return f"{image.path}: {counts}, the first at {place(marked, image)}"
 
 
-HEADER: dict[str, Callable[[Image], str]] = {  # what must be the same, in words
+HEADER: dict[str, Callable[[Image], str]] = {  # properties that must be equal, as text
     "size": lambda image: f"{image.pixels.shape[1]} × {image.pixels.shape[0]}",
     "channels": lambda image: ", ".join(sorted(image.channels)),
     "data window": lambda image: "from x = {}, y = {}".format(*image.origin),

@@ -1,7 +1,8 @@
-"""What `mi-refract diff` shows in a browser: one offline HTML file, failures first, with images.
+"""The HTML report of `mi-refract diff`: one file that works offline, with failures first and their images.
 
-Verdicts come from the results; only the maps that the method did not make (the difference, FLIP) are made here. Images
-are embedded until the page is full: those further down keep their numbers, and the page says what it left out.
+The verdicts are those of the results. Only maps that the method does not provide (the difference, FLIP) are computed
+here. Images are embedded until the page is full; further failures are shown without images, and the page says what it
+leaves out.
 """
 
 from __future__ import annotations
@@ -32,17 +33,17 @@ from .name_patterns import literal
 from .results import FAILED, Result, Results, Status
 from .text_reports import WORDS, sentence
 
-LIMIT = 15_000_000  # bytes of a page
-PAGE = 13_000_000  # bytes of its images; the rest is for text
+LIMIT = 15_000_000  # largest size of a page in bytes
+PAGE = 13_000_000  # of these, bytes of images
 FULL = "Not embedded: the page is full."
 IMAGE_BYTES, MAP_BYTES = 4_600_000, 1_200_000  # two images and three maps fill a page
-ARTICLES, LINES = 1000, 5000  # failures with all their numbers, and images in a line, before the page is measured
-NAMED = 10  # images without a place on the page that the command for a page of the rest names
+ARTICLES, LINES = 1000, 5000  # failures with details, and images in one line each; fewer if the page is too large
+NAMED = 10  # images not on the page that the suggested command for a further page names
 MAP_WIDTH, FLIP_WIDTH, HISTOGRAM_ROWS, BINS = 960, 640, 512, 20
-BAR_BYTES = 80  # of a bar of a histogram on the page
+BAR_BYTES = 80  # bytes of the HTML of one bar of a histogram
 SIGNED = ("difference", "t")
 
-_one_at_a_time = threading.Lock()  # what is made of a pair takes several times its memory, and every processor
+_one_at_a_time = threading.Lock()  # encoding a pair needs several times its memory, and all processors
 Pane = dict[str, Any]
 
 
@@ -51,9 +52,9 @@ Pane = dict[str, Any]
 
 @dataclass(frozen=True)
 class Shown:
-    """The panes of a pair for the viewer of `mi_refract.report`; `note`: why others are missing.
+    """The images and maps of a pair, as panes for the viewer of `mi_refract.report`.
 
-    `histogram`: the shares of the p-values in equal bins from 0 to 1.
+    `note`: why panes are missing. `histogram`: the shares of the p-values in equal bins from 0 to 1.
     """
 
     panes: list[Pane] = field(default_factory=list)
@@ -62,54 +63,54 @@ class Shown:
 
     @property
     def size(self) -> int:
-        """Bytes on a page."""
+        """The size on the page in bytes."""
         return sum(len(pane["data"]) for pane in self.panes) + BAR_BYTES * len(self.histogram)
 
 
 class Page:
-    """One HTML file. `view` is for `folders.diff`, by several threads; `write` afterwards."""
+    """One HTML file. `folders.diff` calls `view` from several threads; call `write` afterwards."""
 
     def __init__(self, path: str | Path) -> None:
-        """`path`: of the file."""
+        """`path`: path of the file."""
         self.path = Path(path)
         self._shown: dict[tuple[float | str, ...], Shown] = {}
         self._lock = threading.Lock()
 
     def view(self, result: Result, results: Results) -> None:
-        """Keep what the page shows of the result, unless those before it on the page fill it."""
+        """Keep the panes of the result, unless results before it on the page fill it."""
         place = result.order
         with self._lock:
             if sum(shown.size for other, shown in self._shown.items() if other < place) > PAGE:
                 return
         shown = shown_of(result, IMAGE_BYTES, MAP_BYTES)
-        with self._lock:  # what fits on the page in its order, and one more: whatever the order in which it came
+        with self._lock:  # the results that fit on the page, and one more, independent of the order of the calls
             self._shown[place] = shown
-            kept, total = {}, 0
+            fitting, total = {}, 0
             for other in sorted(self._shown):
                 if total <= PAGE:
-                    kept[other] = self._shown[other]
+                    fitting[other] = self._shown[other]
                 total += self._shown[other].size
-            self._shown = kept
+            self._shown = fitting
 
     def write(self, results: Results, context: Mapping[str, Any], replay: str = "", source: str = "") -> None:
-        """Write the page. `context` is shown on top as it is; `replay`: the command that repeats the comparison.
+        """Write the page. OSError if it cannot be written.
 
-        `source`: the JSON of the comparison, where one is written: only what it compared is accepted then. Errors:
-        OSError for the page itself.
+        `context`: names and values shown at the top. `replay`: the command that repeats the comparison. `source`: the
+        path of its JSON, if one is written; the commands that accept images then accept only those compared in it.
         """
         images, failures, used, rest = EmbeddedImages(), [], 0, list[Result]()
         for number, result in enumerate(results.of(*FAILED), 1):
             shown = self._shown.get(result.order)
-            # The first pair is shown, however large; after one that does not fit none is.
+            # The first pair is shown, however large; after a pair that does not fit, no pair is shown.
             if rest or shown is None or (used and used + shown.size > PAGE):
                 rest.append(result)
                 shown = Shown(note=FULL)
             used += shown.size
             failures.append(item(result, results, shown, images) | {"key": f"pair-{number}"})
         equal = sorted((item(result, results) for result in results.of(Status.EQUAL)), key=lambda x: not x["warning"])
-        folders = results.test.is_dir() and not results.renders  # where names mean something
-        more = [*results.flags, "--report", "rest.html"]
-        # Without what is no image, and without names that cannot be shown as they are.
+        has_names = results.test.is_dir() and not results.renders
+        flags_of_rest = [*results.flags, "--report", "rest.html"]
+        # Results without images, such as invalid settings, and names with control characters are left out.
         named = [literal(x.name) for x in rest if (x.reference or x.test) and printable(x.name) == x.name][:NAMED]
         content = {
             "title": "mi-refract diff",
@@ -119,13 +120,13 @@ class Page:
             "context": {"reference": str(results.reference), "test": str(results.test)} | dict(context),
             "unused": results.unused,
             "command": replay,
-            "rest": results.command("diff", *named, flags=more) if named and folders else "",
+            "rest": results.command("diff", *named, flags=flags_of_rest) if named and has_names else "",
             "skipped": [item(result, results) for result in results.of(Status.SKIPPED)],
-            "ticks": results.command("accept", flags=["--from", source] if source else None) if folders else "",
+            "ticks": results.command("accept", flags=["--from", source] if source else None) if has_names else "",
         }
         articles, lines = ARTICLES, LINES
         while True:
-            text = rendered("diff.html.j2", content | _cut(failures, equal, articles, lines), images)
+            text = rendered("diff.html.j2", content | _limited(failures, equal, articles, lines), images)
             if len(text) <= LIMIT or not lines:
                 break
             articles, lines = articles // 2, lines // 2
@@ -133,30 +134,30 @@ class Page:
 
 
 def write(path: str | Path, results: Results, context: Mapping[str, Any] | None = None, replay: str = "") -> None:
-    """Write the page of results that have their images and maps; as `Page.write`."""
+    """Write the page of results that have their images and maps, see `Page.write`."""
     page = Page(path)
     for result in results.of(*FAILED):
         page.view(result, results)
     page.write(results, context or {}, replay)
 
 
-def _cut(failures: list[dict[str, Any]], equal: list[dict[str, Any]], articles: int, lines: int) -> dict[str, Any]:
-    """The lists, no longer than that, and what was left out of them."""
-    further, more_equal = failures[articles:], max(len(equal) - lines, 0)
-    more = max(len(further) - lines, 0)
-    without = sum(entry["note"] == FULL for entry in failures[:articles])
+def _limited(failures: list[dict[str, Any]], equal: list[dict[str, Any]], articles: int, lines: int) -> dict[str, Any]:
+    """Return the content of the page with at most so many articles and lines, and what is left out."""
+    further = failures[articles:]
+    dropped, dropped_equal = max(len(further) - lines, 0), max(len(equal) - lines, 0)
+    without_images = sum(entry["note"] == FULL for entry in failures[:articles])
     left_out = {
-        f"images of {without} of {len(failures)} failures": without,
-        f"all but a line of {len(further) - more} failures": len(further) - more,
-        f"{more} failures": more,
-        f"{more_equal} equal images": more_equal,
+        f"images of {without_images} of {len(failures)} failures": without_images,
+        f"details of {len(further) - dropped} failures": len(further) - dropped,
+        f"{dropped} failures": dropped,
+        f"{dropped_equal} equal images": dropped_equal,
     }
     return {
         "failures": failures[:articles],
         "further": further[:lines],
-        "more_failures": more,
+        "more_failures": dropped,
         "equal": equal[:lines],
-        "more_equal": more_equal,
+        "more_equal": dropped_equal,
         "left_out": [text for text, count in left_out.items() if count],
     }
 
@@ -164,7 +165,7 @@ def _cut(failures: list[dict[str, Any]], equal: list[dict[str, Any]], articles: 
 def item(
     result: Result, results: Results, shown: Shown = Shown(), images: EmbeddedImages | None = None
 ) -> dict[str, Any]:
-    """What the page says of an image. The panes of `shown` go to `images`."""
+    """Return the data of an image for the page's template. The panes of `shown` are added to `images`."""
     comparison, why = result.comparison, cause(result)
     detectable = comparison.minimum_detectable if comparison else math.nan
     commands = {"reproduce": results.reproduce(result), "accept": results.accept(result)}
@@ -196,7 +197,7 @@ def item(
 
 
 def cause(result: Result) -> str:
-    """Why an image failed, in few words that others have in common; "" of those that did not."""
+    """Return why an image failed, in few words, by which the page groups failures; "" if it did not fail."""
     if result.status not in FAILED:
         return ""
     if result.status in (Status.ERROR, Status.INCONCLUSIVE):
@@ -207,16 +208,19 @@ def cause(result: Result) -> str:
     return metric.name if metric else str(result.status)
 
 
-# What it shows of a pair --------------------------------------------------------------------------------------------
+# The panes of a pair ------------------------------------------------------------------------------------------------
 
 
 def shown_of(result: Result, image_bytes: float, map_bytes: float) -> Shown:
-    """Both images, their difference, FLIP, and the maps of the method, in about so many bytes an image and a map."""
+    """Return panes of both images, their difference, FLIP, and the maps of the method.
+
+    `image_bytes`, `map_bytes`: approximate sizes of an image and of a map in bytes.
+    """
     try:
         with _one_at_a_time:
             sides: dict[str, Image] = {}
             makers: list[Callable[[], Pane]] = []
-            for role, image in result.images.items():  # RGB or gray; of other channels the first stands for all
+            for role, image in result.images.items():  # R, G, B, or else the first channel
                 names = tuple("RGB") if {*"RGB"} <= {*image.channels} else image.channels[:1]
                 sides[role] = side = replace(image, pixels=image.select(names), channels=names)
                 paint = "code" if flip.encoding(side) == "sRGB" else "light"
@@ -229,12 +233,12 @@ def shown_of(result: Result, image_bytes: float, map_bytes: float) -> Shown:
                     change = two.pixels - one.pixels
                 makers.append(functools.partial(map_pane, "difference", change, map_bytes))
                 if "flip" not in maps and all(np.isfinite(x.pixels.astype(np.float32)).all() for x in (one, two)):
-                    makers.append(functools.partial(_flip, one, two, map_bytes))
+                    makers.append(functools.partial(_flip_pane, one, two, map_bytes))
             histogram: Sequence[float] = ()
-            if "p" in maps:  # a histogram shows it better than a map
+            if "p" in maps:  # shown as a histogram instead of a map
                 p_values = maps.pop("p")
-                some = p_values[:: -(-len(p_values) // HISTOGRAM_ROWS)]
-                counts, _ = np.histogram(some[np.isfinite(some)], BINS, (0, 1))
+                some_rows = p_values[:: -(-len(p_values) // HISTOGRAM_ROWS)]
+                counts, _ = np.histogram(some_rows[np.isfinite(some_rows)], BINS, (0, 1))
                 histogram = (counts / counts.sum()).tolist() if counts.any() else ()
             if "q" in maps:
                 maps["−log₁₀ q"] = -np.log10(np.maximum(maps.pop("q"), 1e-30))
@@ -243,37 +247,40 @@ def shown_of(result: Result, image_bytes: float, map_bytes: float) -> Shown:
                 for name, values in maps.items()
                 if name != "difference" and (name != "flags" or values.any())
             ]
-            with ThreadPoolExecutor(os.cpu_count()) as pool:  # deflating is most of the work, without Python's lock
+            with ThreadPoolExecutor(os.cpu_count()) as pool:  # most of the work is deflate, which releases the GIL
                 return Shown(list(pool.map(lambda make: make(), makers)), result.unread, histogram)
-    except Exception as error:  # of whatever kind: the page is for all images
+    except Exception as error:  # any error: the page shows the other images
         errors.print_traceback(error)
         return Shown(note=f"Cannot be shown: {errors.describe(error)}")
 
 
 def _pane(
-    role: str, paint: str, gain: float | None, pixels: Pixels, most: float, scale: float = 1.0, note: str = ""
+    role: str, paint: str, gain: float | None, pixels: Pixels, max_bytes: float, scale: float = 1.0, note: str = ""
 ) -> Pane:
-    embedded = encoded(pixels, most, scale)
+    embedded = encoded(pixels, max_bytes, scale)
     notes = ", ".join(filter(None, (note, embedded["note"])))
     return {"role": role, "paint": paint, "gain": gain, **embedded, "note": notes}
 
 
-def map_pane(name: str, values: Pixels, most: float, note: str = "") -> Pane:
-    """A pane whose colours are full at the largest value; its gain starts where the upper hundredth is full."""
+def map_pane(name: str, values: Pixels, max_bytes: float, note: str = "") -> Pane:
+    """Return a pane of a map whose strongest colour is the largest value.
+
+    The viewer starts with a gain at which the 99th percentile has the strongest colour.
+    """
     small = strongest(values.reshape(*values.shape[:2], -1), MAP_WIDTH)
     sizes = np.abs(small[np.isfinite(small)])
     largest = float(sizes.max(initial=0)) or 1.0
-    upper = float(np.quantile(sizes, 0.99)) if sizes.size else 0.0
-    gain = min(round(2 * math.log10(largest / upper)) / 2, 6) if upper else 0
+    percentile_99 = float(np.quantile(sizes, 0.99)) if sizes.size else 0.0
+    gain = min(round(2 * math.log10(largest / percentile_99)) / 2, 6) if percentile_99 else 0
     side = -(-values.shape[1] // MAP_WIDTH)
     reduced = f"strongest of {side} × {side} pixels" if side > 1 else ""
     paint = "signed" if name in SIGNED else "heat"
-    return _pane(name, paint, gain, small, most, largest, note or reduced)
+    return _pane(name, paint, gain, small, max_bytes, largest, note or reduced)
 
 
-def _flip(reference: Image, test: Image, most: float) -> Pane:
-    """The FLIP map of the images at the size in which it is shown; at full size it would take seconds."""
+def _flip_pane(reference: Image, test: Image, max_bytes: float) -> Pane:
+    """Return a pane of the FLIP map of the images at the displayed size; at full size FLIP would take seconds."""
     side = -(-reference.pixels.shape[1] // FLIP_WIDTH)
     one, two = (replace(image, pixels=block_mean(image.pixels, side)) for image in (reference, test))
     error = flip.flip_map(one, two, flip.is_hdr(one, two), max(flip.PIXELS_PER_DEGREE / side, 1.0))
-    return map_pane("flip", error, most, f"of means of {side} × {side} pixels" if side > 1 else "")
+    return map_pane("flip", error, max_bytes, f"of means of {side} × {side} pixels" if side > 1 else "")

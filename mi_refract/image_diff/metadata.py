@@ -1,7 +1,7 @@
-"""What files say besides their numbers: where two say otherwise, the same numbers do not mean the same.
+"""Comparison of metadata: if they differ, the same pixel values can have different meanings.
 
-What is compared, in which format: "Metadata that are compared" in the documentation. What is not known to have no
-meaning is compared.
+All metadata are compared except those that are known not to change the meaning. The documentation lists them by format,
+see "Metadata that are compared".
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from mi_refract.io.image_file import TEXT, Image
 from .name_patterns import matches
 
 SPACE, ALPHA = "oiio:ColorSpace", "oiio:UnassociatedAlpha"
-CODED = ("uint8", "uint16")  # types of numbers that are sRGB codes where no colour space is named; others are linear
-SPACES = {"srgb": "srgb_rec709_scene", "linear": "lin_rec709_scene", "rec709": ""}  # OpenImageIO says that of any PNM
-SPACES["g22_rec709_scene"] = "srgb_rec709_scene"  # a gAMA of 45455, by which PNG writers mean sRGB
+CODED = ("uint8", "uint16")  # types that are sRGB codes if no colour space is named; others are linear
+SPACES = {"srgb": "srgb_rec709_scene", "linear": "lin_rec709_scene"}
+SPACES["rec709"] = ""  # OpenImageIO reports it for every PNM
+SPACES["g22_rec709_scene"] = "srgb_rec709_scene"  # a gAMA of 45455, which PNG writers use for sRGB
 REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06)
-# What says the same as nothing.
-USUAL = {
+# Values with the same meaning as no metadata.
+DEFAULTS = {
     "screenWindowCenter": ["(0.0, 0.0)"],
     "screenWindowWidth": ["1.0"],
     "Exif:ColorSpace": ["1"],
@@ -34,15 +35,15 @@ USUAL = {
     "hdr:GAMMA": ["1.0"],
     "hdr:COLORCORR": ["1.0 1.0 1.0"],
     "hdr:NCOMP": ["3.0"],
-    # Radiance's own, and what Photoshop writes.
+    # The primaries of Radiance, and those that Photoshop writes.
     "hdr:PRIMARIES": ["0.64 0.33 0.29 0.6 0.15 0.06 0.333 0.333", "0.0 0.0 0.0 0.0 0.0 0.0 0.0 0.0"],
     "tiff:318": ["0.3127 0.329"],
     "tiff:319": [" ".join(map(str, REC709))],
 }
-SHOWN = 60  # characters of a value
+SHOWN = 60  # characters of a value in a message
 
-# Patterns of names, which that page lists: by whom, when and how fast a file was made, how its numbers are packed,
-# what OpenImageIO says twice, and what every method requires to be the same.
+# Patterns of names, which the documentation lists: author, date and render time, encoding of the numbers, duplicates
+# by OpenImageIO, and properties that every method requires to be equal.
 WITHOUT_MEANING = """
 Artist Copyright Date DateTime DocumentName Exif:* File GPS:* HostComputer Hostname IPTC:* ImageDescription Make Memory
 Model RenderTime Software Time cycles.* dc:* generatedBy hdr:CAPDATE hdr:GMT hdr:SOFTWARE mi_refract:* photoshop:*
@@ -57,36 +58,39 @@ ICCProfile:* hdr:exposure name oiio:AverageColor oiio:ConstantColor oiio:LoopCou
 oiio:subimages tiff:ColorSpace colorInteropID tiff:PageNumber tiff:PhotometricInterpretation tiff:UnassociatedAlpha
 tiff:subfiletype Orientation PixelAspectRatio ResolutionUnit XResolution YResolution
 """
-COMPARED = ("Exif:ColorSpace", "Exif:Gamma")  # of those
+COMPARED = ("Exif:ColorSpace", "Exif:Gamma")  # exceptions from these patterns
 
 
 def difference(images: Sequence[Image], ignored: Sequence[str] = ()) -> str:
-    """What the files of some images say otherwise than that of the first, in one line; "" for nothing.
+    """Return the first difference between the metadata of the first image and another one, in one line; "" if none.
 
-    `ignored`: patterns of names that do not count. Images that were not read from a file say nothing.
+    `ignored`: patterns of names that are not compared. Images that were not read from a file are skipped.
     """
-    said = [_said(image, tuple(ignored)) for image in images if image.stored]
-    for other in said[1:]:
-        names = [name for name in sorted(said[0].keys() | other.keys()) if said[0].get(name) != other.get(name)]
-        if ALPHA in names and None in (said[0].get(ALPHA), other.get(ALPHA)):  # one has no alpha of which it would be
+    metadata = [_compared_metadata(image, tuple(ignored)) for image in images if image.stored]
+    for other in metadata[1:]:
+        first = metadata[0]
+        names = [name for name in sorted(first.keys() | other.keys()) if first.get(name) != other.get(name)]
+        if ALPHA in names and None in (first.get(ALPHA), other.get(ALPHA)):  # one image has no alpha channel
             names.remove(ALPHA)
         if names:
-            one, two = (side.get(names[0], "not there") for side in (said[0], other))
+            old, new = (values.get(names[0], "absent") for values in (first, other))
             more = f", and {', '.join(names[1:])}" if len(names) > 1 else ""
-            return f"different metadata: {names[0]} ({one:.{SHOWN}} → {two:.{SHOWN}}){more}"
+            return f"different metadata: {names[0]} ({old:.{SHOWN}} → {new:.{SHOWN}}){more}"
     return ""
 
 
-def _said(image: Image, ignored: tuple[str, ...]) -> dict[str, str]:
-    """What the file says, as text by name, without what says the same as nothing."""
+def _compared_metadata(image: Image, ignored: tuple[str, ...]) -> dict[str, str]:
+    """Return the metadata to compare, as text by name, without ignored ones and DEFAULTS."""
     space = str(image.metadata.get(SPACE, "")).lower()
     space = SPACES.get(space, space) or ("srgb_rec709_scene" if image.stored in CODED else "lin_rec709_scene")
     texts = {name.removeprefix(TEXT) for name in image.metadata if name.startswith(TEXT)}
-    said = {name: _text(value) for name, value in image.metadata.items() if name not in texts} | {SPACE: space}
+    values = {name: _text(value) for name, value in image.metadata.items() if name not in texts} | {SPACE: space}
     if any(name.rpartition(".")[2] == "A" for name in image.channels):
-        said.setdefault(ALPHA, "0")
+        values.setdefault(ALPHA, "0")
     return {
-        name: text for name, text in said.items() if text not in USUAL.get(name, ()) and not _is_ignored(name, ignored)
+        name: text
+        for name, text in values.items()
+        if text not in DEFAULTS.get(name, ()) and not _is_ignored(name, ignored)
     }
 
 
@@ -101,5 +105,5 @@ def _text(value: Any) -> str:
 
 @functools.cache
 def _is_ignored(name: str, patterns: tuple[str, ...]) -> bool:
-    known = name not in COMPARED and any(matches(pattern, name) for pattern in WITHOUT_MEANING.split())
-    return known or any(matches(pattern, name) for pattern in patterns)
+    without_meaning = name not in COMPARED and any(matches(pattern, name) for pattern in WITHOUT_MEANING.split())
+    return without_meaning or any(matches(pattern, name) for pattern in patterns)

@@ -1,8 +1,8 @@
 """The table of methods, and `compare`, which applies one of them to two images.
 
-A method that calls two images equal must have been able to see a difference. So `compare` tests whether it would also
-have called the reference equal to black: for each group of channels that belong together, as a bright alpha or depth
-says nothing of a dim colour, and in each pixel.
+A method that calls two images equal must have been able to detect a difference. So `compare` tests whether the method
+would also have called a black image equal to the reference. It tests each group of channels that belong together,
+because a bright alpha or depth says nothing about a dim colour, and it counts the pixels in which black would pass.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from .comparison import (
 
 AUTO = "auto"
 CHOSEN_BY_AUTO = ("welch", "tolerance")
-NOT_FOR_NOISE = ("tolerance", "flip")  # methods that take noise for a difference
+NOT_FOR_NOISE = ("tolerance", "flip")  # methods that report noise as a difference
 OTHER_NOISE = "these two look like the same image with other noise: --method welch with several renders decides"
-DECIDING = {"hard_fail", "allow_failures"}  # options that say by how much a single pixel may differ
-UNSEEN = 0.1  # share of the lit pixels that may differ so that black would be accepted there, too
-CLOSER = 100.0  # where the test image is so many times closer to the reference than black is, it is no black
-LOST = 0.5  # a pixel that changes by more than this share of the brighter one may as well be black
-ROW_STEP = 16  # every so many rows show whether a method would see that an image is black
+DECIDING = {"hard_fail", "allow_failures"}  # options that limit the difference of a single pixel
+UNSEEN = 0.1  # share of the lit pixels that may differ and where the method would accept black, too
+CLOSER = 100.0  # a pixel that is so many times closer to the reference than black is counts as not different
+LOST = 0.5  # a pixel that changes by more than this share of the brighter one counts as black
+ROW_STEP = 16  # every row of this step is compared with black first
 
 Side = Image | Sequence[Image]
 Options = Mapping[str, Any]
@@ -52,7 +52,7 @@ Options = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Option:
-    """A keyword argument of a method; without a `range` numbers are at least 0."""
+    """A keyword argument of a method; by default numbers are at least 0."""
 
     name: str
     type: type
@@ -61,7 +61,7 @@ class Option:
     range: Range = NONNEGATIVE
 
     def checked(self, method: str, value: Any) -> Any:
-        """The value of the option; ValueError for one of another type or out of its range."""
+        """Return the value in the type of the option; ValueError for another type, and outside of the range."""
         if isinstance(value, bool) or not isinstance(value, (int, float) if self.type is float else self.type):
             raise ValueError(f"{method}: {self.name} = {value!r}; expected a value of type {self.type.__name__}")
         if not self.range.contains(value):
@@ -73,12 +73,14 @@ class Option:
 class Method:
     """A method of comparison.
 
-    `function(reference, test, **options)` takes one image a side, of the same channels in the same order, with finite
-    values; where `takes_renders`, a sequence of independent renders, as they are. `views(image, options)`: of an image
-    those parts, the last the whole, that are compared with black; None where black never passes. `accepts(pixels,
-    others, options)`: in which pixels the others pass; None where pixels are not judged alone, nor channels in groups.
-    `looks_at(reference, test)`: groups of channels, of which it compares one at a time; None for all of them at once.
-    Other channels are compared by `tolerance`.
+    - `function(reference, test, **options)`: takes one image a side, with the same channels in the same order and
+      finite values. If `takes_renders`, it takes a sequence of independent renders a side, unchanged.
+    - `views(image, options)`: yields the parts of an image that are compared with black, the whole image last. None:
+      black never passes.
+    - `accepts(pixels, others, options)`: returns the pixels in which `others` pass, H × W. None: pixels and groups of
+      channels are not judged separately.
+    - `looks_at(reference, test)`: returns groups of channels, each of which is compared separately. Channels in no
+      group are compared by `tolerance`. None: all channels are compared at once.
     """
 
     function: Callable[..., Comparison]
@@ -94,7 +96,7 @@ class Method:
 
     @functools.cached_property
     def options(self) -> dict[str, Option]:
-        """The keyword arguments by name, without those of every method."""
+        """The options by name, without those that all methods share."""
         hints = typing.get_type_hints(self.function, include_extras=True)
         parameters = inspect.signature(self.function).parameters
         return {
@@ -105,7 +107,7 @@ class Method:
 
 
 def _rows(image: Image, options: Options) -> tuple[Image, Image]:
-    """Where black would be seen in some of the rows, the others need not be looked at: pixels are judged alone."""
+    """Return some of the rows, and the whole image: if black is detected in these rows, the others are not needed."""
     return replace(image, pixels=image.pixels[::ROW_STEP]), image
 
 
@@ -119,16 +121,16 @@ METHODS = {
 
 
 def options_of_auto() -> dict[str, Option]:
-    """The options of the methods that "auto" chooses from; each is used where its method is chosen."""
+    """Return the options of the methods that "auto" chooses from; each has an effect if its method is chosen."""
     return {name: option for method in CHOSEN_BY_AUTO for name, option in METHODS[method].options.items()}
 
 
 def choice(reference: Sequence[Image], test: Sequence[Image], *, spp: bool = False) -> tuple[str, str]:
-    """The method that "auto" is for these images, and why it is that one; "" for `tolerance`, which needs no reason.
+    """Return the method that "auto" chooses for these images, and the reason; "" for `tolerance` of ordinary images.
 
-    It is `welch` where a side has several renders, or its variance is known. `spp`: whether an option says how many
-    samples per pixel there are. A render of `mi-refract render` always holds its variance: beside an image of somebody
-    else, of which nothing is known, it is compared as that is.
+    It is `welch` if a side has several renders, or a known variance. `spp`: whether an option gives the samples per
+    pixel. A render of `mi-refract render` always contains its variance; it is compared by `tolerance` with an image of
+    another renderer, of which neither variance nor samples per pixel are known.
     """
     if max(len(reference), len(test)) > 1:
         return "welch", "several renders"
@@ -136,10 +138,11 @@ def choice(reference: Sequence[Image], test: Sequence[Image], *, spp: bool = Fal
     if all(known):
         return "welch", "the variance of both is known"
     if any(known):
-        (one,), (two,) = (reference, test) if known[0] else (test, reference)
-        name, other = ("reference", "new image") if known[0] else ("new image", "reference")
-        if not one.variances and channels.SPP in one.metadata and not spp and channels.SPP not in two.metadata:
-            return "tolerance", f"the {other} has neither a variance nor samples per pixel"
+        (with_variance,), (without,) = (reference, test) if known[0] else (test, reference)
+        name, other_name = ("reference", "new image") if known[0] else ("new image", "reference")
+        is_own_render = not with_variance.variances and channels.SPP in with_variance.metadata
+        if is_own_render and not spp and channels.SPP not in without.metadata:
+            return "tolerance", f"the {other_name} has neither a variance nor samples per pixel"
         return "welch", f"the variance of the {name} is known"
     return "tolerance", ""
 
@@ -156,15 +159,16 @@ def compare(
 ) -> Comparison:
     """Compare two images, or two sequences of renders of one image, by a method of the table.
 
-    "auto" is `welch` where it can be, else `tolerance`; options of the other one are accepted and not used. There one
-    outrageous pixel is a difference, too, unless `hard_fail` or `allow_failures` say what a pixel may do. Channels
-    NAME.variance are what `welch` reads of single images, and otherwise left out, but for those that are `named`.
+    "auto" is `welch` if variances are known, see `choice`, else `tolerance`; options of the other one are accepted and
+    not used. With "auto", one `outrageous` pixel makes images different by `tolerance`, unless `hard_fail` or
+    `allow_failures` is set. `welch` reads the channels NAME.variance of single images; other methods ignore them,
+    except those in `named`.
 
-    INCONCLUSIVE where a method calls the images equal but would call a black one equal, too, or one with some of its
-    channels black, or passes many pixels that change by half; where channels whose variance `welch` does not know
-    differ by more than `tolerance` allows; and where no value of a channel is finite. DIFFERENT where one of two images
-    has channels besides, unless they are `identical_as_shown`, and where the files say that their numbers mean
-    something else; `ignore_metadata`: patterns of names of metadata that do not count.
+    The verdict is INCONCLUSIVE if a method calls the images equal but would also call a black image equal, or one with
+    a group of channels black, or accepts many pixels that change by half; if channels whose variance `welch` does not
+    know differ by more than `tolerance` allows; and if no value of a channel is finite. It is DIFFERENT if one image
+    has channels that the other lacks, unless the two are `identical_as_shown`, and if metadata differ that change the
+    meaning of the values; `ignore_metadata`: patterns of names of metadata that are not compared.
 
     ValueError for an unknown method or option, an option of another type or out of its range, several renders for a
     method that takes one, and images that cannot be compared.
@@ -179,100 +183,106 @@ def compare(
     for image in (*sides[0], *sides[1]):
         if len(set(image.channels)) < len(image.channels):
             raise ValueError(f"{image.path}: channels {', '.join(image.channels)}; expected each name once")
-    why = ""
-    if by_auto := method == AUTO:
-        method, why = choice(*sides, spp=any(options.get(name) for name in ("spp", "spp_reference", "spp_test")))
+    chosen_because, by_auto = "", method == AUTO
+    if by_auto:
+        has_spp = any(options.get(name) for name in ("spp", "spp_reference", "spp_test"))
+        method, chosen_because = choice(*sides, spp=has_spp)
         options = {name: value for name, value in options.items() if name in METHODS[method].options}
-    result = replace(_compare(method, sides, allow_nonfinite, named, options), chosen=why)
-    changed = by_auto and method == "tolerance" and result.is_equal and result.metrics[0].value > 0
-    if changed and not options.keys() & DECIDING:
+    result = replace(_compare(method, sides, allow_nonfinite, named, options), chosen=chosen_because)
+    some_pixels_differ = by_auto and method == "tolerance" and result.is_equal and result.metrics[0].value > 0
+    if some_pixels_differ and not options.keys() & DECIDING:
         a, b = _finite_pair(*(channels.without_variances(side[0], named) for side in sides))
-        if where := pixelwise.outrageous(a, b, options.get("fail", METHODS[method].options["fail"].default)):
-            result = result.but(Verdict.DIFFERENT, f"one pixel is far too bright: {where}")
-    if meant := metadata.difference([*sides[0], *sides[1]], ignore_metadata):
-        return replace(result.but(Verdict.DIFFERENT, meant), warning="")
+        if pixel := pixelwise.outrageous(a, b, options.get("fail", METHODS[method].options["fail"].default)):
+            result = result.but(Verdict.DIFFERENT, f"one pixel is far too bright: {pixel}")
+    if different_metadata := metadata.difference([*sides[0], *sides[1]], ignore_metadata):
+        return replace(result.but(Verdict.DIFFERENT, different_metadata), warning="")
     return result
 
 
 def _compare(
     method: str, sides: list[list[Image]], allow_nonfinite: bool, named: Collection[str], options: Options
 ) -> Comparison:
-    chosen = METHODS[method]
+    takes_renders, function = METHODS[method].takes_renders, METHODS[method].function
     if not all(sides):
         raise ValueError(f"{method}: no image on one side; expected at least one")
-    bare = [[channels.without_variances(image, named) for image in side] for side in sides]
-    single = len(bare[0]) == len(bare[1]) == 1
-    whole = sides if chosen.takes_renders else bare
-    if single and (reading := identical_as_shown(one := whole[0][0], two := whole[1][0])):
+    means = [[channels.without_variances(image, named) for image in side] for side in sides]
+    single = len(sides[0]) == len(sides[1]) == 1
+    compared = sides if takes_renders and single else means
+    one, two = compared[0][0], compared[1][0]
+    if single and (reading := identical_as_shown(one, two)):
         alike = [[as_shown(one, two.channels)], [as_shown(two, one.channels)]]
         result = _compare(method, alike, allow_nonfinite, named, options)
         return replace(result, reason=f"{result.reason}; {reading}")
-    if chosen.takes_renders:
-        result = chosen.function(*(whole if single else bare), allow_nonfinite=allow_nonfinite, **options)
-        if single and result.is_equal and (untested := channels.untested(sides[0][0], sides[1][0])):
+    if takes_renders:
+        result = function(*compared, allow_nonfinite=allow_nonfinite, **options)
+        if single and result.is_equal and (untested := channels.untested(one, two)):
             by_tolerance = compare("tolerance", *untested, allow_nonfinite=allow_nonfinite)
             if not by_tolerance.is_equal:
                 doubt = f"not tested, without variance: {', '.join(untested[0].channels)}: {by_tolerance.reason}"
                 return result.but(Verdict.INCONCLUSIVE, doubt)
     elif not single:
-        raise ValueError(f"{method}: {len(bare[0])} and {len(bare[1])} images; expected one per side")
+        raise ValueError(f"{method}: {len(sides[0])} and {len(sides[1])} images; expected one per side")
     else:
-        a, b, besides = shared_channels(bare[0][0], bare[1][0])
+        a, b, unshared = shared_channels(one, two)
         if reason := preconditions(a, b, allow_nonfinite):
             result = nonfinite_result(method, reason, *aligned(a, b))
         else:
             a, b = _finite_pair(a, b)
-            result = _of_finite(method, a, b, options)
+            result = _compare_finite(method, a, b, options)
             may_be_noise = method in NOT_FOR_NOISE and result.verdict is Verdict.DIFFERENT
             if may_be_noise and pixel_statistics.differ_like_noise(a.pixels, b.pixels):
                 result = replace(result, reason=f"{result.reason}; {OTHER_NOISE}")
-        if besides:
-            reason = f"{besides}; the other channels: {result.reason}"
+        if unshared:
+            reason = f"{unshared}; the other channels: {result.reason}"
             return replace(result, verdict=Verdict.DIFFERENT, reason=reason, warning="")
-    if not result.is_equal or (is_finite := np.isfinite(bare[0][0].pixels)).all():
+    is_finite = np.isfinite(means[0][0].pixels)
+    if not result.is_equal or is_finite.all():
         return result
-    names = bare[0][0].channels
-    if empty := [name for name, some in zip(names, is_finite.any((0, 1)), strict=True) if not some]:
-        return result.but(Verdict.INCONCLUSIVE, f"no value is finite, and nothing was compared, in {', '.join(empty)}")
+    by_channel = zip(means[0][0].channels, is_finite.any((0, 1)), strict=True)
+    if nonfinite := [name for name, any_finite in by_channel if not any_finite]:
+        reason = f"no value is finite, and nothing was compared, in {', '.join(nonfinite)}"
+        return result.but(Verdict.INCONCLUSIVE, reason)
     count = int(is_finite.size - is_finite.sum())
     return replace(result, reason=f"{result.reason}; not compared: {count} of {is_finite.size} values, not finite")
 
 
 def _finite_pair(reference: Image, test: Image) -> tuple[Image, Image]:
-    """Both images with the channels in the reference's order, and 0 for what is not finite."""
+    """Return both images with the channels in the reference's order, and 0 for values that are not finite."""
     a, b = (finite(pixels) for pixels in aligned(reference, test))
     return replace(reference, pixels=a), replace(test, pixels=b, channels=reference.channels)
 
 
-def _of_finite(method: str, a: Image, b: Image, options: Options) -> Comparison:
-    """The result of a method, and of `tolerance` for the channels that the method does not look at.
+def _compare_finite(method: str, a: Image, b: Image, options: Options) -> Comparison:
+    """Return the result of a method, and of `tolerance` for the channels that the method does not compare.
 
-    INCONCLUSIVE where black would pass. Both images are finite and have the same channels in the same order.
+    INCONCLUSIVE if black would pass. Both images are finite and have the same channels in the same order.
     """
     looks_at = METHODS[method].looks_at
-    parts = looks_at(a, b) if looks_at else [list(a.channels)]
-    others = [name for name in a.channels if not any(name in part for part in parts)]
+    groups_of_method = looks_at(a, b) if looks_at else [list(a.channels)]
+    others = [name for name in a.channels if not any(name in group for group in groups_of_method)]
+    steps = [(method, group) for group in groups_of_method] + ([("tolerance", others)] if others else [])
     result: Comparison | None = None
-    for by, names in [*((method, part) for part in parts), *([("tolerance", others)] if others else [])]:
+    for by, names in steps:
         one, two = only(a, names), only(b, names)
-        how = options if by == method else {}
+        options_of_step = options if by == method else {}
         if result and np.array_equal(one.pixels, two.pixels):
             comparison = Comparison(by, Verdict.EQUAL, "identical")
         else:
-            comparison = METHODS[by].function(one, two, **how)
-        if comparison.is_equal and (doubt := blind_to(METHODS[by], one, two, how)):
+            comparison = METHODS[by].function(one, two, **options_of_step)
+        if comparison.is_equal and (doubt := blind_to(METHODS[by], one, two, options_of_step)):
             comparison = comparison.but(Verdict.INCONCLUSIVE, doubt)
         if result is None:
             result = comparison
             continue
         listed = ", ".join(names)
-        bounded = (replace(x, name=f"{x.name}, in {listed}") for x in comparison.metrics if x.bound is not None)
+        metrics = [replace(m, name=f"{m.name}, in {listed}") for m in comparison.metrics if m.bound is not None]
+        maps = {f"{name} of {listed}": values for name, values in comparison.maps.items() if name == by}
         result = replace(
             result,
             verdict=min(result.verdict, comparison.verdict, key=[*Verdict].index),
             reason=f"{result.reason}; by {by} {listed}: {comparison.reason}",
-            metrics=(*result.metrics, *bounded),
-            maps=result.maps | {f"{name} of {listed}": x for name, x in comparison.maps.items() if name == by},
+            metrics=(*result.metrics, *metrics),
+            maps=result.maps | maps,
         )
     assert result is not None  # an image has channels
     return result
@@ -282,45 +292,45 @@ def _of_finite(method: str, a: Image, b: Image, options: Options) -> Comparison:
 
 
 def groups(names: Sequence[str]) -> dict[str, list[str]]:
-    """Channels that are judged together: the colours of each layer; every other channel alone."""
-    parts: dict[str, list[str]] = {}
+    """Return groups of channels that are judged together: the colours of each layer; every other channel separately."""
+    groups: dict[str, list[str]] = {}
     for name in names:
         layer, dot, last = name.rpartition(".")
         together = last in ("R", "G", "B", "X", "Y") or (last == "Z" and dot)  # a layer's X, Y, Z are a vector
-        parts.setdefault(layer + dot if together else name, []).append(name)
-    return parts
+        groups.setdefault(layer + dot if together else name, []).append(name)
+    return groups
 
 
 def blind_to(method: Method, a: Image, b: Image, options: Options) -> str:
-    """What black would pass in, in place of the test image `b`; "" where a difference would have been seen.
+    """Return why the method could not have detected a difference: where it accepts black; "" if it could have.
 
-    Of channels that are black in the reference: in place of that. Nothing is said of channels that are the same in both
-    images. Both are finite and have the same channels in the same order.
+    Black replaces the test image `b`, or the reference `a` in channels in which that is black. Channels that are
+    identical in both images are skipped. Both images are finite and have the same channels in the same order.
     """
     if method.views is None:
         return ""
     options = {name: option.default for name, option in method.options.items()} | dict(options)
-    parts = list(groups(a.channels).values()) if method.accepts else [list(a.channels)]
-    for names in parts:
+    separate = list(groups(a.channels).values()) if method.accepts else [list(a.channels)]
+    for names in separate:
         one, two = only(a, names), only(b, names)
         if not one.pixels.any():
             one, two = two, one
         if np.array_equal(one.pixels, two.pixels):
             continue
-        of = f" in {', '.join(names)}," if len(parts) > 1 else ""
+        in_channels = f" in {', '.join(names)}," if len(separate) > 1 else ""
         if passes_black(method.function, method.views(one, options), options):
-            return f"an all-black image would pass, too,{of} with these options"
+            return f"an all-black image would pass, too,{in_channels} with these options"
         if method.accepts is None:
             continue
         size, other, change = np.abs(one.pixels), np.abs(two.pixels), np.abs(two.pixels - one.pixels)
         lit = any_channel(size > 0)
-        far = lit & any_channel(change > size / CLOSER)
-        if far.sum() > UNSEEN * lit.sum():  # or else too few are unseen
+        changed = lit & any_channel(change > size / CLOSER)
+        if changed.sum() > UNSEEN * lit.sum():
             lost = change.max(-1) > LOST * np.maximum(size, other).max(-1)
             lost &= method.accepts(one.pixels, two.pixels, options)
-            black = method.accepts(one.pixels, np.zeros_like(size), options)
-            share = float((far & (black | lost)).sum() / lit.sum())
+            accepts_black = method.accepts(one.pixels, np.zeros_like(size), options)
+            share = float((changed & (accepts_black | lost)).sum() / lit.sum())
             if share > UNSEEN:
                 where = f"in {share:.0%} of the pixels that are not black,"
-                return f"black or a change by half would pass, too,{of} {where} with these options"
+                return f"black or a change by half would pass, too,{in_channels} {where} with these options"
     return ""

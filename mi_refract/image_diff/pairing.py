@@ -1,7 +1,7 @@
-"""Which image of one folder is compared with which of the other: by their paths, or as the settings map them.
+"""Pairs of references and new images, by their paths or by the maps of the settings.
 
-In: two paths and the settings. Out: a result for each pair, which is still to be compared, with the other references
-that it may match; and what cannot be read. No image is read here.
+Input: two paths and the settings. Output: a `Result` for each pair, not yet compared, with its variants, which are
+further references that the new image may match, and a `Result` for each path that cannot be read. No image is read.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from .results import Result, Status
 from .settings import ComparisonSpec, Map, Settings
 
 HIDDEN = ComparisonSpec(skip=True, reason="hidden: a name in its path begins with a dot")
-# Endings of images that OpenImageIO, as it is on PyPI, cannot read.
+# Suffixes of image formats that OpenImageIO from PyPI cannot read.
 UNREADABLE = {"arw", "astc", "avif", "cr2", "cr3", "dcm", "dng", "flif", "heic", "heif", "hif", "jxr", "ktx", "ktx2"}
 UNREADABLE |= {"nef", "pcx", "qoi", "raf", "xcf"}
-ROOT = "{root}/"  # before a template of a path that is not beside the reference
+ROOT = "{root}/"  # prefix of a template whose path is relative to the folder of the settings
 
 
 def require_apart(reference: Path, test: Path, maps: Sequence[Map] = (), new: bool = False) -> None:
-    """ValueError where one path is the other or lies within it, OSError where one does not exist.
+    """Raise ValueError if one path is or contains the other, OSError if one does not exist.
 
-    `maps`: where the settings have any, references and new images may share a folder. `new`: the reference need not
-    exist yet.
+    `maps`: of the settings; with any, references and new images may share a folder. `new`: the reference may be
+    missing.
     """
     for role, path in (("test", test), ("reference", reference)):
         if not path.exists() and not (new and role == "reference"):
@@ -43,50 +43,55 @@ def require_apart(reference: Path, test: Path, maps: Sequence[Map] = (), new: bo
 
 
 def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
-    """The images of both sides by name, each with how it is compared. ValueError where a folder holds no image."""
-    known = reference.exists()
-    if known and reference.is_dir() != test.is_dir():
+    """Return the pairs of both sides, each with its `ComparisonSpec`. ValueError if a folder contains no image."""
+    has_reference = reference.exists()
+    if has_reference and reference.is_dir() != test.is_dir():
         raise ValueError(f"{reference}, {test}: cannot compare a folder with a file")
     if not test.is_dir():
-        pair = _pair(reference.name, reference if known else None, test, reference)
+        pair = _pair(reference.name, reference if has_reference else None, test, reference)
         pair = replace(pair, how=settings.of(pair.name))
         if not pair.how.accept:
             return [pair]
         deep = any("/" in template for template in pair.how.accept)
-        beside_it = reference.parent.rglob("*") if deep else reference.parent.iterdir()
-        others = sorted(path for path in beside_it if path.is_file() and path != reference)
+        entries = reference.parent.rglob("*") if deep else reference.parent.iterdir()
+        others = sorted(path for path in entries if path.is_file() and path != reference)
         return [_with_variants(pair, [path for path in others if not path.samefile(test)])]
-    (old, lost, concealed), (new, missed, hidden) = images_in(reference) if known else ({}, [], []), images_in(test)
-    for folder, nothing in ((reference, known and not old and not lost), (test, not new and not missed)):
-        if nothing:
+    old, old_errors, old_hidden = images_in(reference) if has_reference else ({}, [], [])
+    new, new_errors, new_hidden = images_in(test)
+    for folder, empty in (
+        (reference, has_reference and not old and not old_errors),
+        (test, not new and not new_errors),
+    ):
+        if empty:
             raise ValueError(f"{folder}: contains no image; expected at least one")
     if settings.maps:
-        results = _mapped(old, new, settings.maps)
+        pairs = _mapped(old, new, settings.maps)
     else:
-        results = [_pair(name, old.get(name), new.get(name), Path(name)) for name in sorted(old | new)]
-    results = [replace(pair, how=how_of(settings, pair.name, pair.target)) for pair in results]
-    results = [replace(pair, target=reference / pair.target) for pair in results]
-    own: set[Path] = set()  # masks and variances that the settings name for a pair: they are no images to compare
-    for pair in results:
+        pairs = [_pair(name, old.get(name), new.get(name), Path(name)) for name in sorted(old | new)]
+    pairs = [replace(pair, how=how_of(settings, pair.name, pair.target)) for pair in pairs]
+    pairs = [replace(pair, target=reference / pair.target) for pair in pairs]
+    auxiliary: set[Path] = set()  # masks and variances of other images: they are not compared
+    for pair in pairs:
         sides = [(path, root) for path, root in ((pair.reference, reference), (pair.test, test)) if path]
-        files = {mask} if (mask := _mask_of(pair, reference)) else set()
+        mask = _mask_of(pair, reference)
+        files = {mask} if mask else set()
         if pair.how.reads_variance:
             files |= {beside(pair.how.variance, path, root, pair.how.above) for path, root in sides}
-        own |= files - {pair.reference, pair.test}
-    results = [pair for pair in results if not {pair.reference, pair.test} - {None} <= own]
-    # A reference that is a variant, and has no new image, is not one that was removed. In a tree of both no image is
-    # its own reference.
-    with_new, tests = {pair.target for pair in results if pair.test}, {realpath(x.test) for x in results if x.test}
-    others = [path for path in old.values() if path not in own | with_new and realpath(path) not in tests]
-    results = [_with_variants(pair, others) for pair in results]
-    taken = {path for pair in results for path in pair.variants}
-    results = [pair for pair in results if pair.test or pair.target not in taken]
-    if not results and not lost and not missed:
+        auxiliary |= files - {pair.reference, pair.test}
+    pairs = [pair for pair in pairs if not {pair.reference, pair.test} - {None} <= auxiliary]
+    # A variant without a new image of its own is not a removed reference. Where references and new images share a
+    # folder, a new image is no variant.
+    with_new, tests = {pair.target for pair in pairs if pair.test}, {realpath(x.test) for x in pairs if x.test}
+    others = [path for path in old.values() if path not in auxiliary | with_new and realpath(path) not in tests]
+    pairs = [_with_variants(pair, others) for pair in pairs]
+    variants = {path for pair in pairs for path in pair.variants}
+    pairs = [pair for pair in pairs if pair.test or pair.target not in variants]
+    if not pairs and not old_errors and not new_errors:
         raise ValueError(f"defaults.map fits no image in {reference} and {test}; expected templates of their paths")
-    unread = (_pair(name, None, None, reference / name, error) for name, error in lost + missed)
-    results += [replace(pair, how=settings.of(pair.name)) for pair in unread]
-    skipped = (_pair(name, None, None, reference / name) for name in sorted({*concealed, *hidden}))
-    return [*results, *(replace(pair, how=HIDDEN) for pair in skipped)]
+    unreadable = (_pair(name, None, None, reference / name, error) for name, error in old_errors + new_errors)
+    pairs += [replace(pair, how=settings.of(pair.name)) for pair in unreadable]
+    hidden = (_pair(name, None, None, reference / name) for name in sorted({*old_hidden, *new_hidden}))
+    return [*pairs, *(replace(pair, how=HIDDEN) for pair in hidden)]
 
 
 def _pair(name: str, reference: Path | None, test: Path | None, target: Path, error: str = "") -> Result:
@@ -94,21 +99,22 @@ def _pair(name: str, reference: Path | None, test: Path | None, target: Path, er
 
 
 def how_of(settings: Settings, name: str, target: Path) -> ComparisonSpec:
-    """How the image is compared with its reference; `name`, `target`: their paths in the folders.
+    """Return the `ComparisonSpec` of an image and its reference; `name`, `target`: their paths in the folders.
 
-    The fields of its `accept` are those of the map that pairs the two: those of the map's {name}, if it has one.
+    The fields of its `accept` are those of the map that pairs the two, and the parts of the map's {name} if it has one.
     """
     for rule in settings.maps:
         values = name_patterns.parsed(rule.reference, target.as_posix())
         if values is not None and name_patterns.filled(rule.test, values) == name:
-            own = name_patterns.fields(values["name"]) if "name" in values else {}
-            return replace(settings.of(name), fields=own | values)
+            of_name = name_patterns.fields(values["name"]) if "name" in values else {}
+            return replace(settings.of(name), fields=of_name | values)
     return settings.of(name)
 
 
 def unused_templates(pairs: Sequence[Result]) -> list[str]:
-    """The templates of `accept` that match no file; as of `Settings.unused`."""
-    templates = dict.fromkeys(each for pair in pairs if not pair.how.above.parts for each in pair.how.accept)
+    """Return the templates of `accept` that match no file, as `accept = …`; none of the settings of a parent folder."""
+    in_folder = [pair for pair in pairs if not pair.how.above.parts]
+    templates = dict.fromkeys(template for pair in in_folder for template in pair.how.accept)
     for pair in pairs:
         for template in pair.how.accept:
             if pair.error or _matched(pair, template, pair.variants):
@@ -117,16 +123,16 @@ def unused_templates(pairs: Sequence[Result]) -> list[str]:
 
 
 def named(items: Sequence[Result], patterns: Sequence[str]) -> list[Result]:
-    """The results whose names match one of the patterns; all without patterns.
+    """Return the results whose names match one of the patterns, or all if there are no patterns.
 
-    A pattern that is the name of an image, such as "a*.exr", is that image alone, unless a backslash says how it is to
-    be read. ValueError for one that matches none.
+    A pattern without a backslash that is the name of an image, such as "a*.exr", matches that image only. ValueError
+    for a pattern that matches no image.
     """
     names = {item.name for item in items}
     chosen: set[str] = set()
     for pattern in patterns:
-        alone = pattern in names and "\\" not in pattern
-        matched = {pattern} if alone else {name for name in names if name_patterns.matches(pattern, name)}
+        is_name = pattern in names and "\\" not in pattern
+        matched = {pattern} if is_name else {name for name in names if name_patterns.matches(pattern, name)}
         if not matched:
             raise ValueError(
                 f"{pattern}: matches no image; expected the path of an image in its folder (wildcards: * and ?)"
@@ -136,37 +142,42 @@ def named(items: Sequence[Result], patterns: Sequence[str]) -> list[Result]:
 
 
 def wrong_entries(settings: Settings, pairs: Sequence[Result]) -> list[Result]:
-    """A result without sides for each entry that is wrong and matches no image: where it does, that image says so."""
-    used = {pair.how.error for pair in pairs}
-    wrong = [rule for rule in settings.rules if rule.error and rule.error not in used]
+    """Return a result without sides for each invalid entry of the settings that no image reports as its error."""
+    reported = {pair.how.error for pair in pairs}
+    wrong = [rule for rule in settings.rules if rule.error and rule.error not in reported]
     return [_pair(f"the settings, {rule.where}", None, None, Path(), rule.error) for rule in wrong]
 
 
 def error_of(pair: Result, reference: Path) -> str:
-    """Why the pair cannot be compared, as far as that is known before it is; "" for nothing."""
+    """Return why the pair cannot be compared, as far as that is known without reading images; "" if it can be."""
     mask = _mask_of(pair, reference if reference.is_dir() else reference.parent)
     missing = f"{mask}: no such file; expected a mask" if mask and pair.reference and not mask.exists() else ""
     return pair.error or pair.how.error or missing
 
 
 def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> list[Result]:
-    """Pairs by the first map that fits. What no map calls a reference is none; a reference is no new image."""
+    """Return the pairs, each by the first map that matches.
+
+    A file of `old` that no map matches is not a reference, and a reference is not a new image.
+    """
     pairs: dict[str, Result] = {}
     for rule, (path, file) in itertools.product(maps, old.items()):
         if (values := name_patterns.parsed(rule.reference, path)) is None:
             continue
         name = name_patterns.filled(rule.test, values)
-        before = pairs.setdefault(name, _pair(name, file, new.get(name), Path(path)))
-        if before.reference != file:
-            error = f"{file}: a second reference, beside {before.reference}; expected one for {name}"
-            pairs[name] = replace(before, error=error)
+        first = pairs.setdefault(name, _pair(name, file, new.get(name), Path(path)))
+        if first.reference != file:
+            error = f"{file}: a second reference, beside {first.reference}; expected one for {name}"
+            pairs[name] = replace(first, error=error)
     references = {realpath(pair.reference) for pair in pairs.values() if pair.reference}
     for name, file in new.items():
         if name not in pairs and realpath(file) not in references:
-            fitting = ((rule, name_patterns.parsed(rule.test, name)) for rule in maps)
-            targets = (name_patterns.filled(rule.reference, values) for rule, values in fitting if values is not None)
-            if target := next(targets, None):
-                pairs[name] = _pair(name, None, file, Path(target))
+            for rule in maps:
+                values = name_patterns.parsed(rule.test, name)
+                if values is not None:
+                    target = name_patterns.filled(rule.reference, values)
+                    pairs[name] = _pair(name, None, file, Path(target))
+                    break
     return [pairs[name] for name in sorted(pairs)]
 
 
@@ -174,12 +185,12 @@ def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> 
 
 
 def _mask_of(pair: Result, root: Path) -> Path | None:
-    """The mask that the settings name for a pair; `root`: the folder of the references."""
+    """Return the path of the mask of a pair, or None; `root`: the folder of the references."""
     return beside(pair.how.mask, pair.target, root, pair.how.above) if pair.how.mask else None
 
 
 def _with_variants(pair: Result, others: Sequence[Path]) -> Result:
-    """The pair with those of the other references that its settings accept as well."""
+    """Return the pair with its variants: those of the `others` that match its templates of `accept`."""
     variants: dict[Path, None] = {}
     others = [path for path in others if path.is_relative_to(pair.target.parent)]
     for template in pair.how.accept:
@@ -191,16 +202,17 @@ def _with_variants(pair: Result, others: Sequence[Path]) -> Result:
 
 
 def _matched(pair: Result, template: str, paths: Sequence[Path]) -> list[Path]:
-    """The paths that a template of `accept` means for the reference of a pair, by their names."""
+    """Return the paths that match a template of `accept` of the pair, sorted by name."""
     names = {path.relative_to(pair.target.parent).as_posix(): path for path in paths}
     values = {**name_patterns.fields(pair.target.name), **pair.how.fields}
     return [names[name] for name in name_patterns.expanded(template, values, sorted(names))]
 
 
 def variant(target: Path, how: ComparisonSpec, name: str) -> Path:
-    """Where a variant of the reference `target` lies: by the first template of `accept` with the name or one `*`.
+    """Return the path of a variant of the reference `target`.
 
-    ValueError where there is none, or for a name that would not match it.
+    It is given by the first template of `accept` that contains the name, or else exactly one `*`. ValueError if there
+    is no such template, or if the name cannot be part of a file name.
     """
     if not name.strip() or name.startswith(".") or set(name) & set("/\\*?\0"):
         raise ValueError(f"--as-variant {name!r}; expected part of a file name, such as macos")
@@ -216,14 +228,14 @@ def variant(target: Path, how: ComparisonSpec, name: str) -> Path:
 
 
 def is_inside(path: Path, folder: Path) -> bool:
-    """Whether the path stays in the folder: no `..` and no link to another folder leads out of it."""
+    """Return whether the path is in the folder, after `..` and links to folders are resolved."""
     return path.parent.resolve().is_relative_to(folder.resolve())
 
 
 def beside(template: str, target: Path, root: Path, above: Path = Path()) -> Path:
-    """The file that a template means for a reference: beside it, or after "{root}/" below the folder of the settings.
+    """Return the path for a template: beside the image `target`, or after "{root}/" in the folder of the settings.
 
-    `root`: the folder that is compared, `above`: its path in that of the settings.
+    `root`: the compared folder; `above`: its path relative to the folder of the settings.
     """
     top = root.joinpath(*[".."] * len(above.parts))
     base, rest = (top, template[len(ROOT) :]) if template.startswith(ROOT) else (target.parent, template)
@@ -234,36 +246,37 @@ def beside(template: str, target: Path, root: Path, above: Path = Path()) -> Pat
 
 
 def images_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]], list[str]]:
-    """The files with an image's ending, by their path inside; (name, error) of what cannot be read; hidden images.
+    """Return the images of a folder by relative path, a list of (path, error), and the paths of hidden images.
 
-    What cannot be read: folders without permission, links to folders, which are not followed, and images of formats
-    that OpenImageIO does not read. What is in them would not be compared. A path is hidden if a name in it begins with
-    a dot.
+    Errors: folders without permission, links to folders, which are not followed, and images of formats that OpenImageIO
+    does not read. A path is hidden if a name in it begins with a dot.
     """
     import OpenImageIO as oiio
 
-    formats = (each.split(":") for each in oiio.get_string_attribute("extension_list").split(";") if each)
-    readable = (endings for name, endings in formats if name not in ("null", "term", "zfile"))
-    endings = {ending for listed in readable for ending in listed.split(",")}  # lower case
+    suffixes: set[str] = set()  # lower case, without the dot
+    for entry in filter(None, oiio.get_string_attribute("extension_list").split(";")):  # "openexr:exr,sxr,mxr"
+        format_name, extensions = entry.split(":")
+        if format_name not in ("null", "term", "zfile"):
+            suffixes.update(extensions.split(","))
     images: dict[str, Path] = {}
     failed: list[tuple[str, str]] = []
     hidden: list[str] = []
 
-    def note(path: Path, error: str) -> None:
+    def add_error(path: Path, error: str) -> None:
         name = path.relative_to(folder).as_posix()
         if "/." not in f"/{name}":
             failed.append((name, error))
 
-    for parent, folders, names in os.walk(folder, onerror=lambda error: note(Path(error.filename), str(error))):
+    for parent, folders, names in os.walk(folder, onerror=lambda error: add_error(Path(error.filename), str(error))):
         for path in (Path(parent, name) for name in sorted(folders)):
             if path.is_symlink():
-                note(path, f"{path}: a link to a folder; expected a folder")
+                add_error(path, f"{path}: a link to a folder; expected a folder")
         for path in (Path(parent, name) for name in names):
-            name, ending = path.relative_to(folder).as_posix(), path.suffix[1:].lower()
-            if ending in UNREADABLE:
-                note(path, f"{path}: OpenImageIO does not read {ending.upper()}; expected a format that it reads")
-            elif ending in endings and "/." in f"/{name}":
+            name, suffix = path.relative_to(folder).as_posix(), path.suffix[1:].lower()
+            if suffix in UNREADABLE:
+                add_error(path, f"{path}: OpenImageIO does not read {suffix.upper()}; expected a format that it reads")
+            elif suffix in suffixes and "/." in f"/{name}":
                 hidden.append(name)
-            elif ending in endings:
+            elif suffix in suffixes:
                 images[name] = path
     return images, failed, hidden

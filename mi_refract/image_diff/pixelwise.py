@@ -1,9 +1,10 @@
-"""Methods that look at every pixel alone: `exact`, `paired`, and `tolerance`, which counts as OpenImageIO's `idiff`.
+"""Methods that compare each pixel separately: `exact`, `paired`, and `tolerance`, which follows OpenImageIO's `idiff`.
 
-With `tolerance` a pixel differs where one of its channels does: by more than `fail`, and by more than `fail_relative`
-of the mean of both magnitudes. The bounds are applied in `idiff`'s order: up to `allow_failures` such pixels pass,
-whatever the others say; then `fail_percent` and `hard_fail` decide, and after them the same bounds for warnings.
-`outrageous` finds what `fail_percent` should not let pass: a pixel far brighter than all around it in the other image.
+With `tolerance`, a pixel differs if one of its channels differs by more than `fail`, and by more than `fail_relative`
+times the mean of both magnitudes. The bounds are applied in `idiff`'s order: up to `allow_failures` such pixels pass,
+whatever the other bounds are; then `fail_percent` and `hard_fail` decide; then the corresponding bounds for warnings.
+`outrageous` finds a pixel that `fail_percent` should not accept: one far brighter than its surroundings in the other
+image.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from mi_refract.io.text import compact, distinguishable
 from .comparison import Comparison, Metric, Verdict, counted, place, verdict_of
 from .tile_statistics import median_nonblack, same_shape
 
-CODES = {"uint8": 255, "uint16": 65535}  # of a file's integers, by their type, at 1
-BLOCK = 2**16  # pixels whose ratios are formed at once, in float64
-# A pixel is outrageous above both of these: a detail that moves by NEAR pixels is not, nor is any code value of a
-# display where the mean is more than a hundredth of white.
+CODES = {"uint8": 255, "uint16": 65535}  # the integer for the value 1, by the file's type
+BLOCK = 2**16  # pixels whose ratios are computed at once, in float64
+# A pixel is outrageous above both of these. A detail that moves by NEAR pixels is not outrageous. Nor is any value of a
+# display, up to white, if the mean is more than a hundredth of white.
 TIMES_AROUND, TIMES_MEAN, NEAR = 10.0, 100.0, 2
 
 
@@ -36,9 +37,9 @@ def exact(reference: Image, test: Image) -> Comparison:
     reason = "every value is the same"
     if changed:
         codes = CODES.get(reference.stored if reference.stored == test.stored else "", 0)
-        most = f"{difference.max() * codes:.0f} of {codes} codes" if codes else compact(float(difference.max()))
+        largest = f"{difference.max() * codes:.0f} of {codes} codes" if codes else compact(float(difference.max()))
         at = place(difference, reference)
-        reason = f"{changed} of {a[..., 0].size} pixels differ; largest difference {most} at {at}"
+        reason = f"{changed} of {a[..., 0].size} pixels differ; largest difference {largest} at {at}"
     metrics = (Metric("changed pixels", changed, 0.0), Metric("largest difference", float(difference.max()), 0.0))
     verdict = Verdict.DIFFERENT if changed else Verdict.EQUAL
     return Comparison("exact", verdict, reason, metrics, 0.0, {"difference": difference})
@@ -64,10 +65,11 @@ class Changes:
 
 
 def changes(reference: Pixels, test: Pixels, threshold: float) -> Changes:
-    """The changes between two arrays of one shape, … × C, in their own unit.
+    """Return the changes between two arrays of the same shape, … × C, in their unit.
 
-    A pixel is changed where a channel differs by more than `threshold`, or where a value of either is not finite; then
-    the largest and the RMS change are infinite, and the ratio of the means is NaN. ValueError for different shapes.
+    A pixel is changed if a channel differs by more than `threshold`, or if a value of either is not finite. With a
+    value that is not finite, the largest and the RMS change are infinite, and the ratio of the means is NaN. ValueError
+    for different shapes.
     """
     same_shape(reference, test)
     with np.errstate(invalid="ignore"):
@@ -90,7 +92,7 @@ def paired(
 ) -> Comparison:
     """Renders of the same random numbers: the share of changed pixels and the largest change.
 
-    A change is relative to the reference's value, or to the median of its channel without black pixels where that is
+    A change is relative to the reference's value, or to the median of its channel without black pixels if that is
     larger.
     """
     a, b = reference.pixels, test.pixels
@@ -108,16 +110,16 @@ def paired(
 
 
 def paired_accepts(a: Pixels, b: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
-    """The pixels, H × W, of two images, H × W × C, that `paired` takes for unchanged."""
+    """Return the pixels, H × W, of two images, H × W × C, that `paired` calls unchanged."""
     unchanged: NDArray[np.bool_] = (np.abs(b - a) / _scale(a, b) <= options["threshold"]).all(-1)
     return unchanged
 
 
 def _scale(a: Pixels, b: Pixels) -> Pixels:
-    """What changes are relative to, at every pixel and channel; above 0."""
-    floor = median_nonblack(np.abs(a))
-    of_channels = np.where(floor > 0, floor, floor.mean() or median_nonblack(np.abs(b)).mean() or 1.0)
-    return np.maximum(np.abs(a), of_channels)
+    """Return the value that changes are relative to, at every pixel and channel; above 0."""
+    medians = median_nonblack(np.abs(a))
+    floors = np.where(medians > 0, medians, medians.mean() or median_nonblack(np.abs(b)).mean() or 1.0)
+    return np.maximum(np.abs(a), floors)
 
 
 def _mean_ratio(reference: Pixels, test: Pixels) -> float:
@@ -150,18 +152,19 @@ def tolerance(
 ) -> Comparison:
     """Differences within absolute and relative thresholds, except for a few pixels, as `idiff` counts them.
 
-    There are warnings as in `idiff`: where more than `allow_failures` pixels differ, and that is no failure.
+    As in `idiff` there is a warning only if more than `allow_failures` pixels differ, and that is no failure.
     """
     a, b, pixels = reference.pixels, test.pixels, counted(reference)
-    # Not OpenImageIO's own `compare`: it rounds to float32, and what that does not hold would be equal.
+    # OpenImageIO's own `compare` would round to float32, which hides smaller differences of float64.
     with np.errstate(over="ignore"):
         difference = np.abs(b - a)
         maps = {"difference": difference.astype(np.float32, copy=False)}
     kind, largest = difference.dtype, float(difference.max())
-    failed, warned = (_beyond(difference, a, b, *x).size for x in ((fail, fail_relative), (warn, warn_relative)))
+    failed = _beyond(difference, a, b, fail, fail_relative).size
+    warned = _beyond(difference, a, b, warn, warn_relative).size
     few = failed <= allow_failures
     metrics = (
-        Metric("pixels beyond the tolerance", failed, max(allow_failures, _most(fail_percent, pixels))),
+        Metric("pixels beyond the tolerance", failed, max(allow_failures, _max_count(fail_percent, pixels))),
         Metric("largest difference", largest, None if few else _rounded(hard_fail, kind)),
         Metric("mean difference", float(difference.mean(dtype=np.float64))),
         Metric("RMS difference", float(np.sqrt(np.einsum("ijk,ijk->", *2 * [difference], dtype=float) / a.size))),
@@ -183,7 +186,7 @@ def tolerance(
     reason = f"{far}; {counts}" if only_far else f"{counts}; {far}"
 
     warnings = []
-    if warned > _most(warn_percent, pixels):
+    if warned > _max_count(warn_percent, pixels):
         bounds = f"warn = {warn:g} (> warn_percent = {warn_percent:g})"
         warnings.append(f"{_share(warned, pixels)} differ by more than {bounds}")
     if largest > _rounded(hard_warn, kind):
@@ -193,9 +196,11 @@ def tolerance(
 
 
 def outrageous(reference: Image, test: Image, fail: float) -> str:
-    """Where one image is TIMES_AROUND as bright as the other is within NEAR pixels, and TIMES_MEAN its mean; or "".
+    """Return where a pixel of one image is outrageous; "" if none is.
 
-    Differences up to `fail` are none. Both images are finite and have the same channels in the same order.
+    It is brighter than TIMES_AROUND times the other image within NEAR pixels, and than TIMES_MEAN times the mean of the
+    other image. Differences up to `fail` are ignored. Both images are finite and have the same channels in the same
+    order.
     """
     for image, other in ((test, reference), (reference, test)):
         size, bright = np.abs(other.pixels), np.abs(image.pixels)
@@ -208,48 +213,49 @@ def outrageous(reference: Image, test: Image, fail: float) -> str:
         excess = np.where(candidates & (bright > TIMES_AROUND * around), bright, 0)
         if excess.any():
             y, x, _ = np.unravel_index(int(excess.argmax()), excess.shape)
-            most = f"{compact(float(excess.max()))} at {place(excess, reference)}, of {image.path}"
-            return f"{most}; the other image has at most {compact(float(around[y, x].max()))} within {NEAR} pixels"
+            pixel = f"{compact(float(excess.max()))} at {place(excess, reference)}, of {image.path}"
+            return f"{pixel}; the other image has at most {compact(float(around[y, x].max()))} within {NEAR} pixels"
     return ""
 
 
 def tolerance_accepts(a: Pixels, b: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
-    """The pixels, H × W, in which `tolerance` takes two images, H × W × C, for equal.
+    """Return the pixels, H × W, of two images, H × W × C, that `tolerance` calls equal by `fail` and `fail_relative`.
 
-    `hard_fail` is not among the reasons: it counts for other pixels than those within `fail` only where these fail.
+    `hard_fail` is not used: it applies only if too many other pixels differ.
     """
     equal = np.ones(a.shape[:2], bool)
     equal.reshape(-1)[_beyond(np.abs(b - a), a, b, options["fail"], options["fail_relative"])] = False
     return equal
 
 
-def _most(percent: float, pixels: int) -> int:
-    """The largest number of pixels that is not more than this percentage."""
-    # count > percent / 100 · pixels, in float64 of a float32 percentage, is what idiff asks.
+def _max_count(percent: float, pixels: int) -> int:
+    """Return the largest number of pixels that is not more than this percentage."""
+    # idiff tests count > percent / 100 · pixels in float64, with a float32 percentage.
     return int(min(_rounded(percent) / 100 * pixels, pixels))
 
 
 def _rounded(bound: float, kind: np.dtype[Any] | type[np.floating[Any]] = np.float32) -> float:
-    """A threshold in the numbers of the images: a difference of one code value may lie between it and its float32."""
+    """Return a threshold in the type of the images: a difference of one code may be between it and its float32."""
     with np.errstate(over="ignore"):
         return float(np.asarray(bound, kind))
 
 
-def _beyond(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float) -> NDArray[np.intp]:
-    """The pixels with a channel that differs by more than `most`, and than that share of the mean of both; flat.
+def _beyond(difference: Pixels, a: Pixels, b: Pixels, absolute: float, share: float) -> NDArray[np.intp]:
+    """Return the flat indices of pixels with a channel that differs by more than both bounds.
 
-    In idiff's precision: a mean is rounded, the ratio to it is not.
+    `absolute`: bound of the difference; `share`: bound relative to the mean of both magnitudes. The precision is that
+    of idiff: a mean is rounded, the ratio to it is not.
     """
-    most, share = (_rounded(bound, difference.dtype) for bound in (most, share))
-    pixels = np.flatnonzero(any_channel(difference > most))  # few: the rest is cheaper there
+    absolute, share = _rounded(absolute, difference.dtype), _rounded(share, difference.dtype)
+    pixels = np.flatnonzero(any_channel(difference > absolute))  # usually few, so the ratios are cheap
     flat = [x.reshape(-1, a.shape[2]) for x in (difference, a, b)]
-    half = np.float64(0.5)  # of this type: half of a float32 would be rounded where it is subnormal
+    half = np.float64(0.5)  # in float32, half of a subnormal number would be rounded
     differing = []
     for block in np.array_split(pixels, pixels.size // BLOCK + 1):
         d, one, two = (x[block] for x in flat)
         mean = (np.abs(one) * half + np.abs(two) * half).astype(d.dtype)
         relative = np.divide(d, mean, out=np.zeros(mean.shape), where=mean > 0, dtype=np.float64)
-        differing.append(block[any_channel((d > most) & (relative > share))])
+        differing.append(block[any_channel((d > absolute) & (relative > share))])
     return np.concatenate(differing)
 
 

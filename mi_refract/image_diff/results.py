@@ -1,4 +1,4 @@
-"""What a comparison of files or folders found: a result for each image, and what they mean together."""
+"""Results of a comparison of files or folders: a result for each image, and the summary of all."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .settings import ComparisonSpec
 
 
 class Status(enum.StrEnum):
-    """A verdict; ERROR where there is none, SKIPPED where the settings ask for none. The most important first."""
+    """The verdict on an image; ERROR if it could not be compared, SKIPPED by the settings. The most important first."""
 
     ERROR = "error"
     DIFFERENT = "different"
@@ -27,7 +27,7 @@ class Status(enum.StrEnum):
 
 
 class Category(enum.StrEnum):
-    """What happened to an image between the two folders; UNKNOWN without a verdict."""
+    """The change of an image between the two folders; UNKNOWN without a verdict."""
 
     ADDED = "added"
     REMOVED = "removed"
@@ -38,19 +38,22 @@ class Category(enum.StrEnum):
 
 FAILED = (Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE)
 CATEGORIES = {Status.EQUAL: Category.UNCHANGED, Status.DIFFERENT: Category.CHANGED}
-INCONCLUSIVE = {"": 3, "pass": 0, "fail": 1}  # exit codes by what the user wants of it
+INCONCLUSIVE = {"": 3, "pass": 0, "fail": 1}  # exit codes by the option --inconclusive
 
 
 @dataclass(frozen=True)
 class Result:
-    """One image, and the outcome: DIFFERENT until it is compared. `error`: why there is no verdict.
+    """The result of one image. Before the comparison the status is DIFFERENT.
 
-    `name`: the path of the new image in its folder, or what it would be. `reference`, `test`: its files, or with
-    renders its folders; None where that side has none. `how`: the settings. `images`: the sides that the comparison is
-    about, or that could be read, by role, of several renders the mean; empty where they were not kept; `unread`: why
-    others are missing. `digests`: of its files, variants too, when they were compared; None where that was not asked,
-    or a file is unreadable. `target`: where the reference is, or would be. `variants`: other references that the
-    settings accept; `matched`: the one of them that the new image is equal to. `warnings`: of its mask.
+    - `name`: the path of the new image in its folder, or the path that it would have.
+    - `reference`, `test`: its files, or with renders its folders; None if that side has none. `target`: the path of the
+      reference, which may not exist yet.
+    - `how`: the settings. `error`: why there is no verdict. `warnings`: about its mask.
+    - `images`: the two compared images by role ("reference", "test"), for several renders their mean; empty if they
+      were not kept. `unread`: why one of them is missing.
+    - `digests`: SHA-256 of its files and variants when they were compared; None if not requested, or if a file is
+      unreadable.
+    - `variants`: further references that the settings accept; `matched`: the variant that the new image is equal to.
     """
 
     name: str
@@ -70,7 +73,7 @@ class Result:
 
     @property
     def category(self) -> Category:
-        """What happened to the image between the two folders."""
+        """The change of the image between the two folders."""
         if self.status in (Status.ERROR, Status.SKIPPED):
             return Category.UNKNOWN
         if self.reference is None or self.test is None:
@@ -79,37 +82,42 @@ class Result:
 
     @property
     def word(self) -> str:
-        """The verdict in a word: of an image that only one side has, what happened to it."""
+        """The verdict in a word; "added" or "removed" for an image that only one side has."""
         return str(self.category if None in (self.reference, self.test) else self.status)
 
     @property
     def worst(self) -> tuple[float, Metric | None]:
-        """The number that is the most times its bound, and how many times; NaN and what may be none are ∞ times it."""
+        """The largest ratio of a metric beyond its bound to that bound, and the metric; (0, None) if all bounds hold.
+
+        The ratio is ∞ for NaN, and if the bound is 0.
+        """
         beyond = [metric for metric in self.comparison.metrics if not metric.holds] if self.comparison else []
-        times = [m.value / m.bound if m.bound and not math.isnan(m.value) else math.inf for m in beyond]
-        return (max(times), beyond[times.index(max(times))]) if beyond else (0.0, None)
+        ratios = [m.value / m.bound if m.bound and not math.isnan(m.value) else math.inf for m in beyond]
+        return (max(ratios), beyond[ratios.index(max(ratios))]) if beyond else (0.0, None)
 
     @property
     def order(self) -> tuple[float | str, ...]:
-        """The key to sort by: status, then the worst first, then name and target."""
-        lone = None in (self.reference, self.test)
-        times, metric = self.worst if self.status in FAILED else (0.0, None)
-        value = metric.value if metric and not math.isnan(metric.value) else math.inf if metric else 0.0
-        return [*Status].index(self.status), lone, -times, -value, self.name, str(self.target)
+        """The sort key: by status, images of one side last, largest ratio of `worst`, largest value, name, target."""
+        one_sided = None in (self.reference, self.test)
+        ratio, metric = self.worst if self.status in FAILED else (0.0, None)
+        value = 0.0
+        if metric:
+            value = math.inf if math.isnan(metric.value) else metric.value
+        return [*Status].index(self.status), one_sided, -ratio, -value, self.name, str(self.target)
 
     @property
     def warning(self) -> str:
-        """What does not change the verdict, but is to be looked at; "" for nothing."""
+        """Remarks that do not change the verdict, but that a person should read; "" for none."""
         return "; ".join(filter(None, [*self.warnings, self.comparison.warning if self.comparison else ""]))
 
     @property
     def method(self) -> str:
-        """The method that was applied, or is to be."""
+        """The method that was applied, or that the settings choose."""
         return self.comparison.method if self.comparison else self.how.method
 
     @property
     def method_in_words(self) -> str:
-        """The method, and why it is this one."""
+        """The method, and why `auto` chose it."""
         return self.comparison.method_in_words if self.comparison else self.how.method
 
     @property
@@ -118,21 +126,21 @@ class Result:
         if self.comparison:
             count = len(self.variants)
             differ = "its variant differs" if count == 1 else f"its {count} variants differ"
-            also = f"; {differ}, too" if count and self.status is not Status.EQUAL else ""
-            return self.comparison.reason + (f"; matches {self.matched.name}" if self.matched else also)
+            of_variants = f"; {differ}, too" if count and self.status is not Status.EQUAL else ""
+            return self.comparison.reason + (f"; matches {self.matched.name}" if self.matched else of_variants)
         if self.status is Status.SKIPPED:
             return "skipped by the settings" if self.how.entries else "skipped"
-        sides = {Category.ADDED: "only among the new images", Category.REMOVED: "only among the references"}
-        return self.error or sides[self.category]
+        reasons = {Category.ADDED: "only among the new images", Category.REMOVED: "only among the references"}
+        return self.error or reasons[self.category]
 
 
 @dataclass(frozen=True)
 class Results:
-    """The outcome of `diff`, failures first.
+    """The results of `diff`, failures first.
 
-    `reference`, `test`: the paths; `renders`: each of them holds renders of one image. `inconclusive`: what that counts
-    as ("pass", "fail", or "" for an exit code of its own). `unused`: patterns of the settings that matched no image.
-    `flags`: the words of the command line that set the same for all images.
+    `reference`, `test`: the paths; `renders`: each of them contains renders of one image. `inconclusive`: what
+    inconclusive images count as ("pass", "fail", or "" for exit code 3). `unused`: patterns of the settings that
+    matched no image. `flags`: the options of the command line that give the same settings.
     """
 
     reference: Path
@@ -146,16 +154,16 @@ class Results:
     @property
     def roots(self) -> tuple[Path, Path]:
         """The folders of both sides."""
-        folders = self.test.is_dir()  # then the reference is one, if only later
-        return (self.reference, self.test) if folders else (self.reference.parent, self.test.parent)
+        are_folders = self.test.is_dir()  # the reference may not exist yet
+        return (self.reference, self.test) if are_folders else (self.reference.parent, self.test.parent)
 
     def of(self, *statuses: Status) -> list[Result]:
-        """The results with one of these statuses."""
+        """Return the results with one of these statuses."""
         return [result for result in self.results if result.status in statuses]
 
     @property
     def exit_code(self) -> int:
-        """2: something could not be compared, or nothing was; 1: different; 3: inconclusive; 0: all equal."""
+        """2: an image could not be compared, or all were skipped; 1: different; 3: inconclusive; 0: all equal."""
         if self.of(Status.ERROR) or len(self.of(Status.SKIPPED)) == len(self.results):
             return 2
         if self.of(Status.DIFFERENT):
@@ -163,21 +171,21 @@ class Results:
         return INCONCLUSIVE[self.inconclusive] if self.of(Status.INCONCLUSIVE) else 0
 
     def command(self, verb: str, *names: str, flags: Sequence[str] | None = None) -> str:
-        """The command line of `diff` or `accept` for the whole comparison, or for the images of these names alone."""
-        # A name that begins with a dash would be read as an option.
+        """Return the command line of `diff` or `accept` for the whole comparison, or for the images of these names."""
+        # A path that begins with a dash would be read as an option.
         words = [f"./{path}" if str(path).startswith("-") else str(path) for path in (self.reference, self.test)]
         words += self.flags if flags is None else flags
         words += ["--renders"] * (self.renders and verb == "diff")
         return shlex.join(["mi-refract", verb, *words, *["--"] * any(x.startswith("-") for x in names), *names])
 
     def reproduce(self, result: Result) -> str:
-        """The command that compares this image again; "" where one side has none."""
+        """Return the command that compares this image again; "" if one side has none."""
         if result.reference is None or result.test is None:
             return ""
         return self.command("diff", *self._names(result))
 
     def accept(self, result: Result) -> str:
-        """The command that makes the new image the reference; "" where there is none, or no need."""
+        """Return the command that makes the new image the reference; "" without a new image, or if it is equal."""
         if result.test is None or result.status is Status.EQUAL:
             return ""
         return self.command("accept", *self._names(result), flags=[] if self.renders else None)

@@ -1,7 +1,7 @@
-"""What programs read of a comparison: JUnit, GitHub's commands, JSON; and that JSON, read for accepting what it names.
+"""Results for other programs: JUnit, GitHub's workflow commands and JSON; and reading that JSON, to accept its images.
 
-When the JSON is read, its paths are taken as parts of two folders, which may be others than those that were compared:
-a CI's JSON fits the new images that were downloaded from it.
+The JSON's paths are mapped to two folders, which may differ from the compared ones: the JSON of a CI run can be used
+with the new images that were downloaded from that run.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from .results import FAILED, Category, Result, Results, Status
 from .settings import ComparisonSpec, Settings
 
 SCHEMA: Literal[1] = 1
-MOST = 2**28  # bytes of a file
-OUTCOMES: dict[Status, Literal["", "failure", "error", "skipped"]] = {  # of JUnit
+MOST = 2**28  # bytes of a JSON file
+OUTCOMES: dict[Status, Literal["", "failure", "error", "skipped"]] = {  # the words of JUnit
     Status.ERROR: "error",
     Status.DIFFERENT: "failure",
     Status.INCONCLUSIVE: "failure",
@@ -41,7 +41,7 @@ EXPECTED = "expected a file that mi-refract diff --json wrote"
 # The JSON -----------------------------------------------------------------------------------------------------------
 
 _PathText = Annotated[str, msgspec.Meta(min_length=1, pattern=r"^[^\0]*$")]
-_Number = float | Literal["nan", "inf", "-inf"]  # strict JSON has no such numbers
+_Number = float | Literal["nan", "inf", "-inf"]  # strict JSON has no numbers for these
 
 
 def _doc(meaning: str) -> msgspec.Meta:
@@ -52,7 +52,7 @@ _Digest = Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$"), _doc("SHA-2
 
 
 class Digests(msgspec.Struct):
-    """The SHA-256 of the files of an image when they were compared."""
+    """The SHA-256 of the files of an image at the time of the comparison."""
 
     reference: _Digest
     test: _Digest
@@ -60,7 +60,7 @@ class Digests(msgspec.Struct):
 
 
 class MeasuredNumber(msgspec.Struct):
-    """A number that the method measured; in equal images it is at most its bound, where it has one."""
+    """A number that the method measured; for equal images it is at most its bound, if it has one."""
 
     name: str
     value: _Number
@@ -72,46 +72,46 @@ class Entry(msgspec.Struct):
 
     name: Annotated[str, _doc("path of the new image in its folder")]
     status: Annotated[Status, _doc("the verdict; error: could not be compared")]
-    category: Annotated[Category, _doc("what happened to the image between the folders; unknown without a verdict")]
+    category: Annotated[Category, _doc("change of the image between the folders; unknown without a verdict")]
     reason: str
-    warning: Annotated[str, _doc("what an equal image is near to failing, and remarks on its mask")]
+    warning: Annotated[str, _doc("bounds for warnings that an equal image exceeds, and remarks on its mask")]
     error: Annotated[str, _doc("why the image could not be compared")]
     reference: Annotated[_PathText | None, _doc("null: only among the new images")]
     test: Annotated[_PathText | None, _doc("null: only among the references")]
-    target: Annotated[_PathText, _doc("where the reference is, or would be")]
+    target: Annotated[_PathText, _doc("path of the reference, which may not exist yet")]
     digests: Annotated[Digests | None, _doc("null for an unreadable file and with --renders")]
     method: str
     method_why: Annotated[str, _doc("why `auto` chose this method")]
     options: Annotated[dict[str, Any], _doc("the options of the method that were set")]
-    channels: Annotated[list[tuple[str, str]], _doc("[of the reference, of the new image]; empty: all")]
-    variance: Annotated[str, _doc("template of the image that holds the variance")]
+    channels: Annotated[list[tuple[str, str]], _doc("pairs [name in the reference, in the new image]; empty: all")]
+    variance: Annotated[str, _doc("template of the image that contains the variance")]
     mask: Annotated[str, _doc("template of the mask")]
-    ignore: Annotated[list[tuple[int, int, int, int]], _doc("rectangles that do not count: [x, y, width, height]")]
+    ignore: Annotated[list[tuple[int, int, int, int]], _doc("rectangles not compared: [x, y, width, height]")]
     why_so: Annotated[str, _doc("`reason` in the settings")]
     entries: Annotated[list[str], _doc("tables of the settings that apply")]
-    matched: Annotated[_PathText | None, _doc("the further reference that the image is equal to")]
-    variants: Annotated[list[_PathText], _doc("further references, by `accept` in the settings")]
+    matched: Annotated[_PathText | None, _doc("the variant that the image is equal to")]
+    variants: Annotated[list[_PathText], _doc("variants: further references, by `accept` in the settings")]
     metrics: list[MeasuredNumber]
-    minimum_detectable_difference: Annotated[_Number, _doc("relative; nan where the method knows none")]
+    minimum_detectable_difference: Annotated[_Number, _doc("relative; nan if the method has none")]
     reproduce: Annotated[str, _doc("the command that compares this image again")]
     accept: Annotated[str, _doc("the command that makes the new image the reference")]
 
 
 class Document(Origin, frozen=True, kw_only=True):
-    """What `mi-refract diff --json` writes. Other keys may be added without another number of `schema`."""
+    """The JSON of `mi-refract diff --json`. Keys may be added without a change of the number `schema`."""
 
     schema: Literal[1]
-    exit_code: Annotated[int, msgspec.Meta(ge=0, le=3), _doc("of the command")]
+    exit_code: Annotated[int, msgspec.Meta(ge=0, le=3), _doc("exit code of the command")]
     sentence: Annotated[str, _doc("the last line of the output")]
     reference: _PathText
     test: _PathText
-    renders: Annotated[bool, _doc("--renders: each folder holds renders of one image")]
-    counts: Annotated[dict[Status, int], _doc("images of each status")]
+    renders: Annotated[bool, _doc("--renders: each folder contains renders of one image")]
+    counts: Annotated[dict[Status, int], _doc("number of images of each status")]
     results: list[Entry]
 
 
 def json_schema() -> str:
-    """The JSON Schema (draft 2020-12) of what `write` writes as JSON, as text."""
+    """Return the JSON Schema (draft 2020-12) of the JSON that `write` writes, as text."""
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | msgspec.json.schema(Document)
     return json_text(schema, 1)
 
@@ -120,10 +120,10 @@ def json_schema() -> str:
 
 
 def write(results: Results, origin: Origin, junit: Path | None = None, data: Path | None = None) -> None:
-    """Write JUnit's XML, and the JSON in `data`. OSError where a file cannot be written.
+    """Write JUnit's XML to `junit`, and the JSON to `data`. OSError if a file cannot be written.
 
-    JUnit has a case for each image: "different" is a failure, "inconclusive" too unless it is to pass, no verdict an
-    error. The JSON is a `Document`, with `origin`.
+    JUnit has a case for each image: "different" is a failure, "inconclusive" is one unless it passes by the option
+    --inconclusive, and an image that could not be compared is an error. The JSON is a `Document`, with `origin`.
     """
     if data:
         document = Document(
@@ -144,9 +144,10 @@ def write(results: Results, origin: Origin, junit: Path | None = None, data: Pat
 
 
 def write_github(results: Results, report: str = "", url: str = "") -> None:
-    """Print a workflow command for each image that is not equal or has a warning, and add to the job's summary.
+    """Print a workflow command for each image that is not equal or has a warning, and append to the job's summary.
 
-    `text_reports.markdown` with `report` and `url` is appended to the file that $GITHUB_STEP_SUMMARY names. OSError.
+    `text_reports.markdown` with `report` and `url` is appended to the file $GITHUB_STEP_SUMMARY. OSError if it cannot
+    be written.
     """
     for result in results.results:
         if result.warning or result.status in FAILED:
@@ -160,7 +161,7 @@ def write_github(results: Results, report: str = "", url: str = "") -> None:
 
 
 def _outcome(result: Result, results: Results) -> Literal["", "failure", "error", "skipped"]:
-    """What the image is for a test runner; "" where it passes."""
+    """Return the outcome in the words of JUnit; "" if the image passes."""
     if result.status is Status.INCONCLUSIVE and results.inconclusive == "pass":
         return ""
     return OUTCOMES[result.status]
@@ -181,9 +182,9 @@ def _junit_case(result: Result, results: Results) -> documents.Case:
 
 def _json_entry(result: Result, results: Results) -> Entry:
     comparison, how, digests = result.comparison, result.how, None
-    if result.digests is not None:  # of what was compared; "" where there is no file
-        one, two = (result.digests[path] if path else "" for path in (result.reference, result.test))
-        digests = Digests(one, two, [result.digests[path] for path in result.variants])
+    if result.digests is not None:
+        of_reference, of_test = (result.digests[path] if path else "" for path in (result.reference, result.test))
+        digests = Digests(of_reference, of_test, [result.digests[path] for path in result.variants])
     reference, test, matched = (str(x) if x else None for x in (result.reference, result.test, result.matched))
     return Entry(
         name=result.name,
@@ -215,7 +216,7 @@ def _json_entry(result: Result, results: Results) -> Entry:
 
 
 def _escaped(text: object) -> str:
-    """Text of a workflow command."""
+    """Return the text escaped for a workflow command."""
     return printable(text).replace("%", "%25")
 
 
@@ -223,10 +224,10 @@ def _escaped(text: object) -> str:
 
 
 def read(path: str | Path, reference: Path | None = None, test: Path | None = None) -> Results:
-    """The results; those that are not equal with their digests. `reference`, `test`: by default the paths in the file.
+    """Return the results in a JSON file; those that are not equal have their paths and digests.
 
-    ValueError for a file that `--json` did not write, of another version, of `--renders`, or with a path outside of the
-    two; OSError where it cannot be read.
+    `reference`, `test`: by default the paths in the file. ValueError for a file that `--json` did not write, of another
+    version, written with `--renders`, or with a path outside of the two folders; OSError if it cannot be read.
     """
     try:
         data = json.loads(safe_files.read_bytes(path, MOST))
@@ -249,30 +250,33 @@ def read(path: str | Path, reference: Path | None = None, test: Path | None = No
         if entry.status not in FAILED:
             results.append(Result(entry.name, entry.status, None, None))
             continue
-        one = _moved(f"{where}.reference", entry.reference, before[0], now[0]) if entry.reference else None
-        two = _moved(f"{where}.test", entry.test, before[1], now[1]) if entry.test else None
-        none = entry.target == "."  # of what is wrong in the settings and matches no image
-        target = Path() if none else _moved(f"{where}.target", entry.target, before[0], now[0])
-        # Of single files, the variants lie beside the reference.
+        old_image = _mapped_path(f"{where}.reference", entry.reference, before[0], now[0]) if entry.reference else None
+        new_image = _mapped_path(f"{where}.test", entry.test, before[1], now[1]) if entry.test else None
+        without_target = entry.target == "."  # an invalid entry of the settings that matches no image
+        target = Path() if without_target else _mapped_path(f"{where}.target", entry.target, before[0], now[0])
+        # If two files were compared, the variants are beside the reference.
         roots = (before[0].parent, now[0].parent) if entry.target == str(before[0]) else (before[0], now[0])
-        variants = tuple(_moved(f"{where}.variants", each, *roots) for each in entry.variants)
+        variants = tuple(_mapped_path(f"{where}.variants", path, *roots) for path in entry.variants)
         digests = None
         if entry.digests is not None:
             if len(entry.digests.variants) != len(variants):
                 count = f"{len(entry.digests.variants)} of {len(variants)} variants"
                 raise ValueError(f"{where}.digests: {count}; {EXPECTED}")
-            words = zip(variants, entry.digests.variants, strict=True)
-            pairs = [(one, entry.digests.reference), (two, entry.digests.test), *words]
-            digests = {file: word for file, word in pairs if file}
+            of_variants = zip(variants, entry.digests.variants, strict=True)
+            by_file = [(old_image, entry.digests.reference), (new_image, entry.digests.test), *of_variants]
+            digests = {file: digest for file, digest in by_file if file}
         options = {"allow_nonfinite": entry.options.get("allow_nonfinite") is True}
         how = ComparisonSpec(options=options, variance=entry.variance)
-        result = Result(entry.name, entry.status, one, two, how, error=entry.error)
+        result = Result(entry.name, entry.status, old_image, new_image, how, error=entry.error)
         results.append(replace(result, digests=digests, target=target, variants=variants))
     return Results(*now, tuple(results))
 
 
-def _moved(where: str, text: str, before: Path, now: Path) -> Path:
-    """The path of the file as one in `now`. ValueError where it leads out of it, by `..` or by a link to a folder."""
+def _mapped_path(where: str, text: str, before: Path, now: Path) -> Path:
+    """Return the path in the folder `now` instead of `before`.
+
+    ValueError if it leads out of the folder, by `..` or by a link to a folder.
+    """
     path = Path(text)
     moved = now / path.relative_to(before) if path.is_relative_to(before) else None
     if moved is None or not (moved == now or pairing.is_inside(moved, now)):
@@ -281,16 +285,16 @@ def _moved(where: str, text: str, before: Path, now: Path) -> Path:
 
 
 def with_settings(results: Results, settings: Settings) -> Results:
-    """The results with `settings`, of which the file says no more than whether values need be finite.
+    """Return the results with `settings`; of the settings in the JSON only `allow_nonfinite` is kept.
 
-    ValueError for an image with a variance in a file of its own, of which the file has no digest.
+    ValueError for an image with a variance in a separate file, because the JSON has no digest of it.
     """
-    changed = []
+    updated = []
     for result in results.results:
         inside = result.target.is_relative_to(results.reference)
         target = result.target.relative_to(results.reference) if inside else Path()
         how = pairing.how_of(settings, result.name, target)
         if result.status in FAILED and (result.how.variance or how.reads_variance):
             raise ValueError(f"{result.name}: its variance is in a separate file; accept it without --from")
-        changed.append(replace(result, how=replace(how, options=result.how.options)))
-    return replace(results, results=tuple(changed))
+        updated.append(replace(result, how=replace(how, options=result.how.options)))
+    return replace(results, results=tuple(updated))

@@ -1,15 +1,15 @@
-"""The self-test of the comparison: defects planted in images must be seen, and equal pairs must not be reported.
+"""Self-test of the comparison: methods must detect defects planted in images, and must not report equal pairs.
 
 A method for single images compares two renders with the same random numbers, one of them with a defect. A method for
-several renders compares clean renders with defective ones of other seeds. A defect is seen where the method calls the
-images different, or refuses to compare them; "inconclusive" counts as not seen. There is one row for each defect: the
-share of trials in which each method saw it. A file that cannot be read has no such share: that is an error before
-any method is asked. Equal pairs have other seeds for a method that takes several renders, and other last bits
-for one that does not; `exact` sees those, and is given the same image twice.
+several renders compares clean renders with defective ones of other seeds. A defect is detected ("seen") if the method
+calls the images different or refuses to compare them; "inconclusive" counts as not seen. Each defect has one row with
+the share of trials in which each method saw it. A file that cannot be read has no such share, because reading it fails
+before any method is applied. The renders of an equal pair have other seeds for a method that takes several renders, and
+other last bits for one that does not. `exact` detects those, so it compares an image with itself.
 
-The row fails where a method misses a defect that it must see. Every method must see values that are not finite, another
-size, and a file that cannot be read; `exact` any changed bit; and a method that models the noise a defect larger than
-the minimum detectable difference that it prints.
+A row fails if a method misses a defect that it must see. Every method must see values that are not finite, another
+size, and a file that cannot be read; `exact` must see any changed bit; and a method that models the noise must see
+defects larger than the minimum detectable difference that it reports.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ STUDY = "self-test"
 TILE = METHODS["welch"].options["tile"].default
 TRIALS = 20  # per defect
 NULL_PAIRS = 500
-FALSE_ALARMS = 0.01  # at most this share of equal pairs
-CONFIDENCE = 0.95  # of the bound on that share, one-sided
+FALSE_ALARMS = 0.01  # largest share of equal pairs that may be called different
+CONFIDENCE = 0.95  # one-sided, of the upper bound of that share
 SEED = 2026
-RENDERS = 4  # at least: two a side
+RENDERS = 4  # minimum for methods that take several renders: two a side
 DETECTABLE, RATIO = "minimum detectable difference", "size / minimum detectable"
 UNREADABLE = "unreadable"
 IDENTICAL = "the pairs are identical bit for bit"
@@ -56,14 +56,14 @@ TERMS = {
 }
 
 
-Renders: TypeAlias = Pixels | list[Pixels]  # of one image: renders × H × W × C; a list where one has another size
+Renders: TypeAlias = Pixels | list[Pixels]  # of one image: renders × H × W × C; a list if one has another size
 
 
 @dataclass(frozen=True)
 class Defect:
-    """`plant` puts the defect into an image, H × W × C; it may raise the error of a file that cannot be read.
+    """A defect; `plant` returns an image, H × W × C, with it, or raises the error of a file that cannot be read.
 
-    `always_due`: every method must see it, however noisy the images are; only the first of several renders is spoilt.
+    `always_due`: every method must see it, however noisy the images are; only the first of several renders has it.
     """
 
     text: str
@@ -71,26 +71,30 @@ class Defect:
     always_due: bool = False
 
     def spoil(self, renders: Pixels) -> Renders:
-        """The renders with the defect in each of them, or in the first. Errors: those of `plant`."""
+        """Return the renders with the defect in each of them, or if `always_due` in the first. Errors: of `plant`."""
         if not self.always_due:
             return np.stack([self.plant(image) for image in renders])
         return [self.plant(renders[0]), *renders[1:]]
 
 
 def _with_centre(image: Pixels, value: float) -> Pixels:
-    """The image with this value in all channels of the pixel in the centre."""
+    """Return the image with this value in all channels of the pixel in the centre."""
     spoilt = image.copy()
     spoilt[image.shape[0] // 2, image.shape[1] // 2] = value
     return spoilt
 
 
 def through_a_file(image: Pixels, share: float = 1.0) -> Pixels:
-    """The image written as EXR, cut to a share of the bytes, and read again. ValueError for what cannot be read."""
+    """Return the image after writing it as EXR, truncating the file to a share of its bytes, and reading it.
+
+    ValueError if it cannot be read.
+    """
     channels = image_file.named("", image).channels
     with safe_files.temporary_folder() as folder:
         path = folder / "image.exr"
         image_file.write_exr(path, image, channels)
-        path.write_bytes((data := path.read_bytes())[: int(share * len(data))])
+        data = path.read_bytes()
+        path.write_bytes(data[: int(share * len(data))])
         return image_file.read(path).select(channels)
 
 
@@ -114,8 +118,8 @@ DEFECTS = {
 class Trial:
     """Renders, number × H × W × C: `clean` and `spoil()` have the same seeds, `other` are clean ones of other seeds.
 
-    `spoil` may raise ValueError or OSError: what cannot be read is not compared. With an empty `other` the methods
-    that take several renders are left out.
+    If `spoil` raises ValueError or OSError, nothing is compared. If `other` is empty, methods that take several renders
+    are left out.
     """
 
     clean: Pixels
@@ -125,7 +129,7 @@ class Trial:
 
 @dataclass
 class Tally:
-    """The verdicts of a method over several pairs, and the minimum detectable differences that it printed."""
+    """Counts of a method's verdicts over several pairs, and the minimum detectable differences that it reported."""
 
     seen: int = 0
     inconclusive: int = 0
@@ -134,17 +138,17 @@ class Tally:
 
     @property
     def bound(self) -> float:
-        """The upper bound of the rate where the trials are independent: exact, one-sided, at CONFIDENCE."""
+        """The exact one-sided upper bound of the rate, at CONFIDENCE, for independent trials."""
         test = stats.binomtest(self.seen, self.trials, alternative="less")
         return float(test.proportion_ci(CONFIDENCE, method="exact").high)
 
     def compare(self, method: str, reference: Renders, test: Renders) -> None:
-        """Compare the first image of each side, or all where the method takes several. A refusal counts as seen."""
+        """Compare the first image of each side, or all if the method takes several. A refusal counts as seen."""
         sides = [[image_file.named(name, x) for x in side] for name, side in (("reference", reference), ("test", test))]
-        whole = METHODS[method].takes_renders
         self.trials += 1
         try:
-            comparison = methods.compare(method, *(side if whole else side[0] for side in sides))
+            takes_renders = METHODS[method].takes_renders
+            comparison = methods.compare(method, *(side if takes_renders else side[0] for side in sides))
         except (ValueError, OSError):
             self.seen += 1
             return
@@ -155,52 +159,55 @@ class Tally:
 
 
 def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, setting: str) -> Row:
-    """The share of trials in which each method saw the defect; "missed" counts the trials in which it had to."""
+    """Return the row of a defect: the share of trials in which each method saw it.
+
+    "missed" counts the trials in which a method missed the defect although it had to see it.
+    """
     several = 2 * len(trials[0].other) >= RENDERS
     tallies = {method: Tally() for method in METHODS if several or not METHODS[method].takes_renders}
-    changes, cleans, unread = [], [], 0
+    changes, clean_tiles, unreadable = [], [], 0
     replay: dict[str, Any] = {"trials": len(trials), "renders a side": len(trials[0].clean)}
     for trial in trials:
         try:
             spoilt = trial.spoil()
         except (ValueError, OSError):
-            unread += 1
+            unreadable += 1
             continue
         if np.array_equal(spoilt[0], trial.clean[0]):
             return Row(STUDY, name, case, setting, reason="left out: it changes nothing in these images")
         for method, tally in tallies.items():
             tally.compare(method, trial.other if METHODS[method].takes_renders else trial.clean, spoilt)
         if not always_due:
-            cleans.append([block_mean(image, TILE) for image in trial.clean])
-            changes.append(np.mean([block_mean(image, TILE) for image in spoilt], 0) - np.mean(cleans[-1], 0))
-    if unread == len(trials):
+            clean_tiles.append([block_mean(image, TILE) for image in trial.clean])
+            changes.append(np.mean([block_mean(image, TILE) for image in spoilt], 0) - np.mean(clean_tiles[-1], 0))
+    if unreadable == len(trials):
         values = {UNREADABLE: 1.0, "missed": 0.0}
         return Row(STUDY, name, case, setting, values, {"missed": 0.0}, reason="not read", replay=replay)
-    size = sizes(np.array(changes), np.concatenate(cleans), tallies) if cleans else {}
-    large = size.get(RATIO, 0.0) > 1
-    due = [m for m in tallies if always_due or m == "exact" or (large and METHODS[m].takes_renders)]
+    size = sizes(np.array(changes), np.concatenate(clean_tiles), tallies) if clean_tiles else {}
+    is_large = size.get(RATIO, 0.0) > 1
+    due = [m for m in tallies if always_due or m == "exact" or (is_large and METHODS[m].takes_renders)]
     values = {method: tally.seen / tally.trials for method, tally in tallies.items()}
     values |= {"missed": float(sum(tallies[m].trials - tallies[m].seen for m in due)), **size}
     return Row(STUDY, name, case, setting, values, {"missed": 0.0}, replay=replay | {"due": due})
 
 
 def sizes(changes: Pixels, clean: Pixels, tallies: dict[str, Tally]) -> dict[str, float]:
-    """The size of a defect: figures of the tile and channel where the change is largest relative to the noise.
+    """Return the size of a defect in the tile and channel where its change is largest relative to the noise.
 
-    The minimum detectable difference is printed for the median tile; in a noisier tile it is so much larger.
+    The minimum detectable difference is reported for the median tile; it grows with the noise of a tile.
     """
-    printed = [x for method, tally in tallies.items() if METHODS[method].takes_renders for x in tally.detectable]
-    if not printed or len(clean) < 2:
+    reported = [x for method, tally in tallies.items() if METHODS[method].takes_renders for x in tally.detectable]
+    if not reported or len(clean) < 2:
         return {}
     mean, deviation = clean.mean(0), clean.std(0, ddof=1)
     noisy = (mean != 0) & (deviation > 0)
     if not noisy.any():
         return {}
     relative, noise = np.abs(changes.mean(0))[noisy] / np.abs(mean[noisy]), deviation[noisy] / np.abs(mean[noisy])
-    detectable = float(np.median(printed))
-    # A tile that is quieter than the median one gets no credit: few renders make some look quiet by chance.
-    share = relative / (detectable * np.maximum(noise / np.median(noise), 1))
-    return {"size": float(relative[share.argmax()]), RATIO: float(share.max()), DETECTABLE: detectable}
+    detectable = float(np.median(reported))
+    # A tile with less noise than the median one counts as that noisy: with few renders its noise may be low by chance.
+    ratio = relative / (detectable * np.maximum(noise / np.median(noise), 1))
+    return {"size": float(relative[ratio.argmax()]), RATIO: float(ratio.max()), DETECTABLE: detectable}
 
 
 def false_alarms(
@@ -210,11 +217,12 @@ def false_alarms(
     setting: str,
     independent: bool = True,
 ) -> list[Row]:
-    """A row for each method: how often it called equal pairs different.
+    """Return a row for each method: how often it called equal pairs different.
 
-    `pairs` have renders of other seeds on either side, for methods that take several renders; `repeats` have renders of
-    the same seeds, for the others: `exact` is given these, the rest a test side with `last_bits` moved. `independent`:
-    no render is in two pairs; then the upper bound of the rate must be at most FALSE_ALARMS, otherwise the rate itself.
+    `pairs`: renders with different seeds on the two sides, for methods that take several renders. `repeats`: renders
+    with the same seeds, for the others: `exact` compares these, the rest compare a test side with changed `last_bits`.
+    `independent`: no render is in two pairs; then the upper bound of the rate must be at most FALSE_ALARMS, otherwise
+    the rate itself.
     """
     tallies = {method: Tally() for method in METHODS}
     several = [method for method in METHODS if METHODS[method].takes_renders]
@@ -244,18 +252,18 @@ def false_alarms(
 
 
 def last_bits(pixels: Pixels, rng: np.random.Generator) -> Pixels:
-    """Every value as one of its two neighbours in float32, at random, as another processor may round it."""
+    """Return every value as one of its two neighbours in float32, at random, as another processor may round it."""
     towards = np.where(rng.random(pixels.shape) < 0.5, -np.inf, np.inf).astype(np.float32)
     return np.nextafter(pixels.astype(np.float32), towards)
 
 
-# Given images ------------------------------------------------------------------------------------------------
+# The user's images --------------------------------------------------------------------------------------------
 
 
 def read_images(path: Path, max_values: int = image_file.MAX_VALUES) -> Pixels:
-    """The renders of one image in a folder, or the image in a file, number × H × W × C; errors: those of `read`.
+    """Return the renders in a folder, or the image in a file, number × H × W × C, without channels of variance.
 
-    Without channels that hold the variance of others.
+    Errors: those of `image_file.read`, and ValueError for renders of different sizes or channels.
     """
     images = read_renders(path, max_values) if path.is_dir() else [image_file.read(path, max_values)]
     images = [without_variances(image) for image in images]
@@ -267,15 +275,15 @@ def read_images(path: Path, max_values: int = image_file.MAX_VALUES) -> Pixels:
 
 
 def examine(renders: Pixels, case: str, trials: int = TRIALS, null_pairs: int = NULL_PAIRS) -> list[Row]:
-    """The rows of every defect and of the null pairs on given renders of one image, number × H × W × C.
+    """Return the rows of every defect and of the null pairs, for renders of one image, number × H × W × C.
 
-    RENDERS or more, of independent seeds, are split in halves at random, `trials` times for each defect; of fewer, each
-    image is compared once: more trials would repeat it.
-    ValueError for values that are not finite: a planted NaN could not be distinguished from one that was there.
+    RENDERS or more, with independent seeds, are split in halves at random, `trials` times for each defect. With fewer
+    renders each is compared once, because further trials would repeat it. ValueError without a render, and for values
+    that are not finite: a planted NaN could not be distinguished from them.
     """
     if not len(renders) or not np.isfinite(renders).all():
         raise ValueError(f"{case}: a self-test needs at least one render, with finite values only")
-    rng, renders = np.random.default_rng(SEED), renders.astype(np.float32)  # as files hold them
+    rng, renders = np.random.default_rng(SEED), renders.astype(np.float32)  # the type in files
     half = len(renders) // 2 if len(renders) >= RENDERS else 0
     setting = f"{len(renders)} renders" if len(renders) > 1 else "1 render"
 
@@ -298,14 +306,14 @@ def examine(renders: Pixels, case: str, trials: int = TRIALS, null_pairs: int = 
 
 
 def noise(renders: Pixels) -> float:
-    """Standard deviation of a pixel over its mean, median over the lit part of the image."""
+    """Return the standard deviation of a pixel over its mean, median over the lit part of the image."""
     mean, deviation = renders.mean(0), renders.std(0, ddof=1)
     lit = mean > 0
     return float(np.median(deviation[lit] / mean[lit])) if lit.any() else 0.0
 
 
 def table(rows: Sequence[Row]) -> list[tuple[str, ...]]:
-    """A line for each defect, a column for each method: the share of trials in which it saw the defect."""
+    """Return the shares of trials in which a defect was seen: a line for each defect, a column for each method."""
     lines: list[tuple[str, ...]] = [("seen", *METHODS, "size", "")]
     for row in rows:
         if row.subject in DEFECTS:
@@ -316,7 +324,7 @@ def table(rows: Sequence[Row]) -> list[tuple[str, ...]]:
 
 
 def summary(rows: Sequence[Row]) -> list[str]:
-    """Lines about the renders and the equal pairs, and what failed."""
+    """Return lines about the renders and the equal pairs, and which rows failed."""
     others = {row.subject: row for row in rows if row.subject not in DEFECTS}
     figures = {name: ", ".join(f"{key} {x:.3g}" for key, x in row.values.items()) for name, row in others.items()}
     lines = [f"{name}: {figures[name] or row.reason}" for name, row in others.items()]

@@ -1,8 +1,8 @@
-"""How each image is compared: layers of settings, and the file and the words that they are written in.
+"""Settings of the comparison of each image, from `mi-refract.toml` and the command line.
 
 The layers are the `[defaults]` of `mi-refract.toml`, then the command line, then every `[[image]]` table whose name
-matches, in their order. Each is one mapping of the same keys. A later layer replaces the keys that it sets and inherits
-the others; where it changes the method, the options that the new method does not have are dropped.
+matches, in their order. All have the same keys. A later layer replaces the keys that it sets and inherits the others.
+If it changes the method, options that the new method does not have are dropped.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from .methods import AUTO, METHODS, Option, options_of_auto
 from .name_patterns import matches
 
 FILE = "mi-refract.toml"
-MOST = 2**22  # bytes of it
+MOST = 2**22  # bytes of the file
 DEFAULTS, COMMAND_LINE = "defaults", "command line"
 ACCEPTED = (AUTO, *METHODS)
 SYSTEMS = {"linux": "linux", "darwin": "macos", "win32": "windows"}  # by sys.platform
 PROCESSORS = {"x86_64": "x86_64", "amd64": "x86_64", "arm64": "arm64", "aarch64": "arm64"}  # by platform.machine()
 WORDS = tuple(dict.fromkeys((*SYSTEMS.values(), *PROCESSORS.values())))
 BESIDE = ("stem", "name", "suffix")  # fields of a template of a file beside the reference
-ANYWHERE = ("root", *name_patterns.FIELDS)
+ANYWHERE = ("root", *name_patterns.FIELDS)  # fields of a template of a file in any folder
 
-EVERY = frozenset(("allow_nonfinite", "ignore_metadata"))  # options of every method
+COMMON_OPTIONS = frozenset(("allow_nonfinite", "ignore_metadata"))  # options of every method
 
 Text = Annotated[str, Meta(min_length=1)]
 Length = Annotated[int, Meta(ge=1)]
-Rectangle = tuple[int, int, Length, Length]  # x, y, width and height, as the messages of the methods count pixels
+Rectangle = tuple[int, int, Length, Length]  # x, y, width and height in pixels, with x and y as in messages
 
 
 # Layers -------------------------------------------------------------------------------------------------------------
@@ -52,14 +52,16 @@ Rectangle = tuple[int, int, Length, Length]  # x, y, width and height, as the me
 
 @dataclass(frozen=True)
 class ComparisonSpec:
-    """How one image is compared: the method, the options that are set, and the `reason` from a settings file.
+    """The settings of one image: the method, the options that are set, and the `reason` from a settings file.
 
-    `max_values`: width × height × channels of an image, at most. `skip`: not compared at all. `accept`: templates of
-    other references, each as good as the first. `mask`, `ignore`: pixels that do not count, as a template of an image
-    and as rectangles. `variance`: a template of the image that holds the variance of one sample of each pixel.
-    `channels`: those that are compared, by their names in the reference and in the new image; none: all. `fields`: of
-    the map that pairs the image with its reference, for `accept`. `entries`: the tables of the settings file that
-    apply. `above`: as of `Settings`. `error`: why the settings cannot be applied.
+    - `max_values`: largest width × height × channels of an image. `skip`: do not compare the image.
+    - `accept`: templates of variants, which are further references.
+    - `mask`, `ignore`: pixels that are not compared, as a template of an image and as rectangles.
+    - `variance`: template of the image that contains the variance of one sample of each pixel.
+    - `channels`: channels to compare, as pairs of names in the reference and the new image; empty: all.
+    - `fields`: values of the fields of the map that pairs the image with its reference, for `accept`.
+    - `entries`: the tables of the settings file that apply. `above`: see `Settings`.
+    - `error`: why the settings cannot be applied.
     """
 
     method: str = AUTO
@@ -79,7 +81,7 @@ class ComparisonSpec:
 
     @property
     def reads_variance(self) -> bool:
-        """Whether the method is one that uses the variance."""
+        """Whether a variance is set and the method uses it."""
         return bool(self.variance) and self.method in (AUTO, "welch")
 
 
@@ -87,9 +89,9 @@ class ComparisonSpec:
 class Entry:
     """One layer of settings.
 
-    `pattern`: of the names of its images; "" for `[defaults]` and the command line, which are for all. `values`: of
-    `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `variance`, `channels`, and the options of methods and of
-    every method. `where`: its name in messages. `error`: what is wrong with it.
+    `pattern`: pattern of image names; "" for `[defaults]` and the command line, which apply to all images. `values`:
+    values by key: `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `variance`, `channels`, options of methods
+    and COMMON_OPTIONS. `where`: the name of the layer in messages. `error`: why the layer is invalid.
     """
 
     pattern: str
@@ -99,27 +101,27 @@ class Entry:
 
 
 class Map(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Which reference belongs to which new image: templates of both paths, with the same fields."""
+    """A rule that pairs references with new images: templates of both paths, with the same fields."""
 
     reference: str
     test: str
 
     def __post_init__(self) -> None:
-        """ValueError unless both have the same fields, and no `*`."""
+        """Raise ValueError unless both templates have the same fields, and no `*`."""
         for key in ("reference", "test"):
             _check_template(key, getattr(self, key), name_patterns.FIELDS)
-        one, two = map(name_patterns.fields_of, (self.reference, self.test))
-        if one != two or not one or "*" in self.reference + self.test:
+        fields, test_fields = map(name_patterns.fields_of, (self.reference, self.test))
+        if fields != test_fields or not fields or "*" in self.reference + self.test:
             raise ValueError("expected the same fields in `reference` and `test`, and no `*`")
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The layers in their order, and what holds for the whole comparison.
+    """The layers in their order, and settings of the whole comparison.
 
-    `maps`: which reference belongs to which new image; none: the one of the same path. `max_values`: of each image.
-    `flags`: the words of the command line that set the same. `above`: the path of the compared folder in that of the
-    settings file; the names of images in the file begin with it.
+    `maps`: rules that pair references with new images; empty: those of the same path. `max_values`: see
+    `ComparisonSpec`. `flags`: the options of the command line that give the same settings. `above`: the path of the
+    compared folder relative to that of the settings file; names of images in the file begin with it.
     """
 
     rules: tuple[Entry, ...] = ()
@@ -130,7 +132,10 @@ class Settings:
 
     @classmethod
     def for_all(cls, **values: Any) -> Settings:
-        """These values, such as `method="tolerance", fail=0.1`, for all images. ValueError for what is no key."""
+        """Return settings with these values for all images, such as `method="tolerance", fail=0.1`.
+
+        ValueError for an unknown key or method.
+        """
         if (method := values.get("method", AUTO)) not in ACCEPTED:
             raise ValueError(f"method {method!r}; expected {', '.join(ACCEPTED)}")
         if unknown := values.keys() - options_of(None) - {*ImageKeys.__struct_fields__}:
@@ -138,9 +143,9 @@ class Settings:
         return cls((Entry("", values, COMMAND_LINE),))
 
     def of(self, name: str) -> ComparisonSpec:
-        """How the image of this name is compared, by all layers that match it; a later one wins.
+        """Return the settings of the image of this name, from all layers that match it; a later layer wins.
 
-        Its `error` is that of a layer, or says that two tables of the same pattern contradict each other, or that the
+        `error` is set if a layer is invalid, if two tables with the same pattern contradict each other, or if the
         method does not have an option.
         """
         path = (self.above / name).as_posix()
@@ -151,12 +156,12 @@ class Settings:
         spec = ComparisonSpec(reason=reason, max_values=self.max_values, entries=entries, above=self.above)
         merged: dict[str, Any] = {"method": AUTO}
         set_by: dict[str, str] = {}
-        tables: dict[tuple[str, str], Entry] = {}
+        first_tables: dict[tuple[str, str], Entry] = {}  # the first table that sets a key, by pattern and key
         for layer in layers:
             if layer.error:
                 return replace(spec, error=layer.error)
             for key, value in layer.values.items():
-                other = tables.setdefault((layer.pattern, key), layer)
+                other = first_tables.setdefault((layer.pattern, key), layer)
                 if layer.pattern and key != "reason" and other.values[key] != value:
                     return replace(
                         spec,
@@ -170,35 +175,35 @@ class Settings:
             merged |= layer.values
         method = merged["method"]
         options = {key: merged.pop(key) for key in list(merged) if key in options_of(None)}
-        for name in options.keys() - options_of(method):
-            expected = ", ".join(sorted(options_of(method) - EVERY)) or "none"
-            error = f"{set_by[name]}: {name}: not an option of {method}; expected {expected}"
+        for option in options.keys() - options_of(method):
+            expected = ", ".join(sorted(options_of(method) - COMMON_OPTIONS)) or "none"
+            error = f"{set_by[option]}: {option}: not an option of {method}; expected {expected}"
             return replace(spec, error=error)
         merged.pop("reason", None)
         return replace(spec, **merged, options=options)
 
     def unused(self, names: Sequence[str]) -> list[str]:
-        """The patterns that match none of these names; of the settings of a folder above it says nothing."""
+        """Return the patterns that match none of these names; none if the settings are those of a parent folder."""
         patterns = [rule.pattern for rule in self.rules if rule.pattern and self.above == Path()]
         return [pattern for pattern in patterns if not any(matches(pattern, name) for name in names)]
 
 
 @functools.cache
 def options_of(method: str | None) -> frozenset[str]:
-    """The names of the options that a method takes, or for None of all methods."""
-    return frozenset(_options(method)) | EVERY
+    """Return the names of the options that a method takes, or for None those of all methods."""
+    return frozenset(_options(method)) | COMMON_OPTIONS
 
 
 def _options(method: str | None) -> dict[str, Option]:
-    """The options of a method, of those that "auto" chooses from, or for None of all."""
+    """Return the options of a method, or of those that "auto" chooses from, or for None of all methods."""
     if method == AUTO:
         return options_of_auto()
-    several = [METHODS[method]] if method else METHODS.values()
-    return {name: option for each in several for name, option in each.options.items()}
+    methods = [METHODS[method]] if method else METHODS.values()
+    return {name: option for method in methods for name, option in method.options.items()}
 
 
 def this_platform() -> frozenset[str]:
-    """The words that `when` may hold and that are true here: the system and the processor."""
+    """Return the words of `when` that apply here: the system and the processor."""
     words = SYSTEMS.get(sys.platform), PROCESSORS.get(platform.machine().lower())
     return frozenset(word for word in words if word)
 
@@ -220,11 +225,11 @@ class Keys(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     ] = ()
     mask: Annotated[
         str | None,
-        Meta(description="an image beside the reference: white pixels count, black do not; {root}: the top folder"),
+        Meta(description="an image beside the reference: only white pixels are compared; {root}: the top folder"),
     ] = None
     ignore: Annotated[
         tuple[Rectangle, ...],
-        Meta(min_length=1, description="rectangles of pixels that do not count: x, y, width, height"),
+        Meta(min_length=1, description="rectangles of pixels that are not compared: x, y, width, height"),
     ] = ()
     variance: Annotated[
         str | None,
@@ -236,7 +241,7 @@ class Keys(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     ] = None
 
     def __post_init__(self) -> None:
-        """ValueError for a method, a template or channels that do not exist."""
+        """Raise ValueError for an unknown method, an invalid template, and channels that are empty or not distinct."""
         if self.method not in ACCEPTED:
             raise ValueError(f"method: {self.method!r}; expected {', '.join(ACCEPTED)}")
         for template in self.accept:
@@ -270,7 +275,7 @@ class ImageKeys(Keys, forbid_unknown_fields=True, kw_only=True):
     skip: Annotated[bool, Meta(description="do not compare it")] = False
 
     def __post_init__(self) -> None:
-        """ValueError for a blank reason and a platform that cannot exist, too."""
+        """Raise ValueError also for a blank reason and for platforms that do not exist."""
         super().__post_init__()
         if not self.reason.strip():
             raise ValueError(f"reason: {self.reason!r}; expected text")
@@ -281,44 +286,46 @@ class ImageKeys(Keys, forbid_unknown_fields=True, kw_only=True):
 
 
 class Document(msgspec.Struct, forbid_unknown_fields=True):
-    """The file. An `[[image]]` table is checked on its own: what is wrong with it concerns its images alone."""
+    """The file. Each `[[image]]` table is checked separately, because an invalid one affects only its images."""
 
     defaults: dict[str, Any] = {}
     image: list[dict[str, Any]] = []
 
 
 class NameKey(msgspec.Struct):
-    """What an `[[image]]` table must have, whatever is wrong with the rest."""
+    """The key that an `[[image]]` table must have even if others are invalid."""
 
     name: Text
 
 
 def nearest(folder: Path) -> Path | None:
-    """The settings file of a folder of references: its own, or in a git repository that of the nearest folder above.
+    """Return the settings file of a folder of references: in the folder, or in a git repository in the nearest parent.
 
-    The search ends at the folder that holds `.git`; where none does, nothing above `folder` is read.
+    The search ends at the folder that contains `.git`; without one, only `folder` is searched. None if there is no
+    file.
     """
     folders = [folder, *folder.resolve().parents]
-    repository = next((i for i, each in enumerate(folders) if os.path.lexists(each / ".git")), 0)
-    return next((each / FILE for each in folders[: repository + 1] if os.path.lexists(each / FILE)), None)
+    repository = next((i for i, parent in enumerate(folders) if os.path.lexists(parent / ".git")), 0)
+    files = [parent / FILE for parent in folders[: repository + 1]]
+    return next((file for file in files if os.path.lexists(file)), None)
 
 
 def load(path: str | Path, command_line: Entry | None = None, max_values: int = MAX_VALUES) -> Settings:
-    """The settings of a file for this platform, with the layer of the command line.
+    """Return the settings of a file for this platform, with the layer of the command line.
 
-    A table with a name that is wrong in anything else is kept with its error: its images cannot be compared, the others
-    can. ValueError names the file and the key for whatever else is wrong; OSError as the system raises it.
+    An `[[image]]` table with a valid name but an error elsewhere becomes a layer with that error: only its images
+    cannot be compared. ValueError, with the file and the key, for other errors; OSError if the file cannot be read.
     """
     path = Path(path)
     document = parse_toml(read_bytes(path, MOST), Document, str(path), infinite=True)
-    defaults = _values(document.defaults, DefaultsKeys, f"{path}: {DEFAULTS}")
+    defaults = _checked_values(document.defaults, DefaultsKeys, f"{path}: {DEFAULTS}")
     maps = tuple(_listed(defaults.pop("map", None)))
     rules = [Entry("", defaults, DEFAULTS), *([command_line] if command_line else [])]
     for number, table in enumerate(document.image):
         where = f"image[{number}]"
         name = convert({key: table[key] for key in table if key == "name"}, NameKey, f"{path}: {where}").name
         try:
-            values = _values(table, ImageKeys, f"{path}: {where}")
+            values = _checked_values(table, ImageKeys, f"{path}: {where}")
         except ValueError as error:
             rules.append(Entry(name, {}, where, error=str(error)))
             continue
@@ -330,7 +337,7 @@ def load(path: str | Path, command_line: Entry | None = None, max_values: int = 
 
 
 def from_words(method: str, words: Sequence[str]) -> Entry:
-    """The layer of the command line: `--method`, `--set KEY=VALUE`. ValueError for anything else."""
+    """Return the layer of the command line, from `--method` and each `--set KEY=VALUE`. ValueError if invalid."""
     if method not in ACCEPTED:
         raise ValueError(f"--method {method}; expected {', '.join(ACCEPTED)}")
     table: dict[str, Any] = {}
@@ -338,41 +345,41 @@ def from_words(method: str, words: Sequence[str]) -> Entry:
         key, equals, value = word.partition("=")
         if not equals or key in table:
             raise ValueError(f"--set {word}; expected KEY=VALUE, each key once")
-        table[key] = _value(key, value)
+        table[key] = _parsed_value(key, value)
     if method != AUTO and "method" in table:
         raise ValueError(f"--set method={table['method']} with --method; expected one of them")
-    values = _values(table, Keys, "--set", method)
+    values = _checked_values(table, Keys, "--set", method)
     return Entry("", values if method == AUTO else {"method": method, **values}, COMMAND_LINE)
 
 
-def _value(key: str, text: str) -> Any:
-    """A value as the command line writes it: TOML in brackets, channels between commas, a number, a flag, or text."""
+def _parsed_value(key: str, text: str) -> Any:
+    """Parse a value of the command line: TOML in brackets, channels separated by commas, a number, a flag, or text."""
     if text[:1] in ("[", "{"):
-        with contextlib.suppress(ValueError):  # it may be a template
+        with contextlib.suppress(ValueError):  # a template also begins with a brace
             return tomllib.loads(f"value = {text}")["value"]
     if key == "channels":
         parts = [part.partition("=") for part in text.split(",")]
-        pairs = [(one.strip(), (two if equals else one).strip()) for one, equals, two in parts]
-        return dict(pairs) if len(dict(pairs)) == len(pairs) else [one for one, _ in pairs]
+        pairs = [(old.strip(), (new if equals else old).strip()) for old, equals, new in parts]
+        return dict(pairs) if len(dict(pairs)) == len(pairs) else [old for old, _ in pairs]
     for number in (int, float):
         with contextlib.suppress(ValueError):
             return number(text)
     return {"true": True, "false": False}.get(text, text)
 
 
-def _values(table: dict[str, Any], kind: type[Keys], where: str, method: str | None = None) -> dict[str, Any]:
-    """The checked values of the keys that are set. Options are those of the method, or of any where none is set."""
+def _checked_values(table: dict[str, Any], kind: type[Keys], where: str, method: str | None = None) -> dict[str, Any]:
+    """Return the checked values of the keys that are set. Options are those of the method, or without one of any."""
     method = table.get("method", method)
     checked = convert(table, _struct(kind, kind.__name__, method if method in ACCEPTED else None), where, infinite=True)
     values = {key: getattr(checked, key) for key in table}
     if "channels" in values:
-        named = values["channels"]
-        values["channels"] = tuple(named.items()) if isinstance(named, dict) else tuple(zip(named, named, strict=True))
+        names = values["channels"]
+        values["channels"] = tuple(names.items()) if isinstance(names, dict) else tuple(zip(names, names, strict=True))
     return values
 
 
 def _struct(kind: type[msgspec.Struct], name: str, method: str | None) -> Any:
-    """The struct with the options of a method besides."""
+    """Return the struct `kind` with the options of a method added."""
     fields = [(x.name, Annotated[x.type, Meta(description=x.help)], x.default) for x in _options(method).values()]
     return msgspec.defstruct(name, fields, bases=(kind,), forbid_unknown_fields=True, kw_only=True)
 
@@ -384,12 +391,12 @@ def _check_template(key: str, text: str, names: Collection[str]) -> None:
 
 
 def _listed(value: Any) -> list[Any]:
-    """A list as it is, None as an empty one, anything else as a list of it."""
+    """Return a list unchanged, an empty list for None, and a list of the value for anything else."""
     return value if isinstance(value, list) else [] if value is None else [value]
 
 
 def key_tables() -> str:
-    """The keys of a settings file, and the options of each method, in Markdown."""
+    """Return tables of the keys of a settings file and of the options of each method, in Markdown."""
     parts = [key_table("`[defaults]` and `[[image]]`", Keys)]
     parts += [key_table("`[defaults]` only", DefaultsKeys, Keys), key_table("`[[image]]` only", ImageKeys, Keys)]
     for name, method in METHODS.items():

@@ -1,6 +1,6 @@
-"""The results of `diff` as text for people: printed, and in Markdown for the summary of a GitHub job.
+"""The results of `diff` as text: for the terminal, and in Markdown for the summary of a GitHub job.
 
-Names of files and messages of errors may hold any character: each format escapes what would be read as more than text.
+File names and error messages may contain any character. Each format escapes those with a special meaning.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from mi_refract.io.text import printable
 
 from .results import FAILED, Category, Result, Results, Status
 
-FEW = 20  # equal images that are listed one by one
+FEW = 20  # equal images that are listed by name
 SUMMARY_ROWS = 500  # GitHub cuts a summary at 1 MiB
 WORDS = {
     Status.ERROR: "could not be compared",
@@ -26,15 +26,15 @@ WORDS = {
     Status.SKIPPED: "skipped",
 }
 RED = dict.fromkeys(("different", "added", "removed"), "bold red")
-STYLES = RED | {"inconclusive": "yellow", "equal": "green", "skipped": "dim"}  # of rich, by the first word of a row
-Rows = list[tuple[str, ...]]  # of a table; the first holds the names of the columns
+STYLES = RED | {"inconclusive": "yellow", "equal": "green", "skipped": "dim"}  # rich's styles, by the first cell
+Rows = list[tuple[str, ...]]  # rows of a table; the first has the names of the columns
 
 
 # Terminal -----------------------------------------------------------------------------------------------------------
 
 
 def print_results(results: Results) -> None:
-    """Print the table on stdout, and on stderr a line for each image that could not be compared, and for warnings."""
+    """Print the table and `sentence` on stdout, and errors and unused patterns of the settings on stderr."""
     print_errors(results)
     for pattern in results.unused:
         print(f"mi-refract: {printable(pattern)}: matches no image", file=sys.stderr)
@@ -42,7 +42,7 @@ def print_results(results: Results) -> None:
         equal = [result for result in results.of(Status.EQUAL) if not result.warning]
         failed = results.of(Status.DIFFERENT, Status.INCONCLUSIVE)
         rows: Rows = [("verdict", "image", "method", "why")]
-        for result in [*failed, *_warned(results), *equal[:FEW], *results.of(Status.SKIPPED)]:
+        for result in [*failed, *_equal_with_warning(results), *equal[:FEW], *results.of(Status.SKIPPED)]:
             rows.append((result.word, result.name, result.method_in_words, why(result)))
         print_table(rows, STYLES)
         if len(equal) > FEW:
@@ -57,58 +57,58 @@ def print_errors(results: Results) -> None:
 
 
 def print_table(rows: Rows, styles: Mapping[str, str] | None = None) -> None:
-    """Print it on stdout, made printable. `styles`: of rich, by the first cell of a row."""
+    """Print a table on stdout, without control characters. `styles`: rich's styles, by the first cell of a row."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    shown = Table(*rows[0], box=None, pad_edge=False)
+    table = Table(*rows[0], box=None, pad_edge=False)
     for row in rows[1:]:
         first, *others = map(printable, row)
-        shown.add_row(Text(first, style=(styles or {}).get(first, "")), *map(Text, others))
-    # In a file it is as wide as it must be: no line of a log is a wrapped one.
-    console = Console(width=None if sys.stdout.isatty() else 100_000)
+        table.add_row(Text(first, style=(styles or {}).get(first, "")), *map(Text, others))
+    console = Console(width=None if sys.stdout.isatty() else 100_000)  # lines of a log are not wrapped
     with console.capture() as capture:
-        console.print(shown, highlight=False)
+        console.print(table, highlight=False)
     print("\n".join(map(str.rstrip, capture.get().splitlines())))
 
 
 def sentence(results: Results) -> str:
-    """All verdicts in one line: "12 images: 1 different, 2 added, 9 equal"."""
-    lone = {Category.ADDED: "added", Category.REMOVED: "removed"}
-    counts = Counter(lone.get(result.category, WORDS[result.status]) for result in results.results)
-    order = dict.fromkeys([WORDS[Status.ERROR], WORDS[Status.DIFFERENT], *lone.values(), *WORDS.values()])
-    counted = ", ".join(f"{counts[word]} {word}" for word in order if counts[word])
-    number, warnings = len(results.results), sum(bool(result.warning) for result in results.results)
-    warned = f", {warnings} with a warning" if warnings else ""
-    further = len({path for result in results.results for path in result.variants})
-    also = f"; {further} further reference{'s' if further > 1 else ''}" if further else ""
-    return f"{number} image{'' if number == 1 else 's'}: {counted}{warned}{also}"
+    """Return all verdicts in one line: "12 images: 1 different, 2 added, 9 equal"."""
+    one_sided = {Category.ADDED: "added", Category.REMOVED: "removed"}
+    counts = Counter(one_sided.get(result.category, WORDS[result.status]) for result in results.results)
+    order = dict.fromkeys([WORDS[Status.ERROR], WORDS[Status.DIFFERENT], *one_sided.values(), *WORDS.values()])
+    text = ", ".join(f"{counts[word]} {word}" for word in order if counts[word])
+    if warnings := sum(bool(result.warning) for result in results.results):
+        text += f", {warnings} with a warning"
+    if variants := len({path for result in results.results for path in result.variants}):
+        text += f"; {variants} further reference{'s' if variants > 1 else ''}"
+    number = len(results.results)
+    return f"{number} image{'' if number == 1 else 's'}: {text}"
 
 
 def settings_table(pairs: Sequence[Result]) -> Rows:
-    """How each image would be compared, and the tables of the settings file that say so."""
+    """Return a table of the settings of each image, and the tables of the settings file that give them."""
     rows: Rows = [("image", "compared by", "from", "why")]
     for pair in pairs:
-        how, parts = pair.how, ["skipped"]
+        how, words = pair.how, ["skipped"]
         if not how.skip:
-            parts = [how.method, *(f"{name}={value}" for name, value in how.options.items())]
+            words = [how.method, *(f"{name}={value}" for name, value in how.options.items())]
             variants = ", ".join(path.relative_to(pair.target.parent).as_posix() for path in pair.variants)
-            named = ",".join(one if one == two else f"{one}={two}" for one, two in how.channels)
-            others = {"or": variants, "mask": how.mask, "variance": how.variance, "channels": named}
-            parts += [f"{name} {value}" for name, value in others.items() if value]
-            parts += [f"without {list(rectangle)}" for rectangle in how.ignore]
-        rows.append((pair.name, ", ".join(parts), ", ".join(how.entries) or "–", how.reason))
+            channels = ",".join(old if old == new else f"{old}={new}" for old, new in how.channels)
+            others = {"or": variants, "mask": how.mask, "variance": how.variance, "channels": channels}
+            words += [f"{name} {value}" for name, value in others.items() if value]
+            words += [f"without {list(rectangle)}" for rectangle in how.ignore]
+        rows.append((pair.name, ", ".join(words), ", ".join(how.entries) or "–", how.reason))
     return rows
 
 
 def why(result: Result) -> str:
-    """The reason of the verdict, the warning, and the settings' reason where the image has settings of its own."""
-    warned = f"; warning: {result.warning}" if result.warning else ""
-    return result.reason + warned + (f" [{result.how.reason}]" if result.how.reason else "")
+    """Return the reason of the verdict, the warning if any, and in brackets the reason in the settings if any."""
+    warning = f"; warning: {result.warning}" if result.warning else ""
+    return result.reason + warning + (f" [{result.how.reason}]" if result.how.reason else "")
 
 
-def _warned(results: Results) -> list[Result]:
+def _equal_with_warning(results: Results) -> list[Result]:
     return [result for result in results.of(Status.EQUAL) if result.warning]
 
 
@@ -116,11 +116,11 @@ def _warned(results: Results) -> list[Result]:
 
 
 def markdown(results: Results, report: str = "", url: str = "") -> str:
-    """A heading with the sentence, where the report is, and a table of what is not equal or has a warning.
+    """Return a heading with the sentence, a link to the report, and a table of images that differ or have a warning.
 
-    No summary can show an image of an artefact, nor link into one. So a report without a `url` is only named.
+    A summary can neither show an image from an artefact nor link to it. So a `report` without a `url` is only named.
     """
-    failed = [*results.of(*FAILED), *_warned(results)]
+    failed = [*results.of(*FAILED), *_equal_with_warning(results)]
     lines = [f"### mi-refract diff: {sentence(results)}", ""]
     run = [os.environ.get(f"GITHUB_{name}", "") for name in ("SERVER_URL", "REPOSITORY", "RUN_ID")]
     if report and url:
@@ -140,10 +140,10 @@ def markdown(results: Results, report: str = "", url: str = "") -> str:
 
 
 def _link(text: str, url: str) -> str:
-    """The text with a link to a URL, which is escaped so that it ends where the link does."""
+    """Return the text with a link to a URL; the URL is escaped, so that it cannot end the link."""
     return f"[{_literal(text)}]({quote(printable(url), safe=':/?#&=%@+,;~$!*[]-._')})"
 
 
 def _literal(text: str) -> str:
-    """Markdown that shows the text as it is."""
+    """Return Markdown that shows the text unchanged."""
     return re.sub(r"[!-,/:-@\[-`{-~]", lambda match: f"&#{ord(match[0])};", printable(text))

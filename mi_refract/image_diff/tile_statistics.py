@@ -1,20 +1,22 @@
 """Welch's t-test on the tiles of two images with known noise, from single tiles up to the whole image.
 
-Per tile and channel the means m₁, m₂ are compared by t = (m₁ − m₂)/√(v₁ + v₂), with v = s²/n for n samples of variance
-s². The variance v of a tile's mean is the sum of its pixels' variances, divided by their number squared. Its degrees of
-freedom follow Satterthwaite, f = v²/Σ(vᵢ²/fᵢ) over all pixels of both sides: a tile of 16² pixels knows its noise much
-better than the few renders do. (Welch, "The generalization of Student's problem", Biometrika 1947; Satterthwaite 1946;
-for renderers Jung, Hanika and Dachsbacher, "Detecting Bias in Monte Carlo Renderers using Welch's t-test", JCGT 2020.)
+The means m₁, m₂ of each tile and channel are compared by t = (m₁ − m₂)/√(v₁ + v₂), with v = s²/n for n samples of
+variance s². The variance v of a tile's mean is the sum of its pixels' variances, divided by their number squared. Its
+degrees of freedom follow Satterthwaite, f = v²/Σ(vᵢ²/fᵢ) over all pixels of both sides: with 16² pixels a tile's noise
+is known much better than that of one pixel from a few renders. (Welch, "The generalization of Student's problem",
+Biometrika 1947; Satterthwaite 1946; for renderers Jung, Hanika and Dachsbacher, "Detecting Bias in Monte Carlo
+Renderers using Welch's t-test", JCGT 2020.)
 
-Where one side has fewer samples than the other, n₂ < n₁, and light is rare, it may have none of that light in a tile,
-and a variance near 0. Equal images have the same variance σ² of a sample, so the estimates s₁², s₂² may be exchanged:
-the variance of m₁ − m₂ is the larger of s₁²/n₁ + s₂²/n₂ and s₁²/n₂ + s₂²/n₁. The second is the pooled estimate times
-(1/n₁ + 1/n₂), and with n₁ = n₂ the first. With that, for light of equal events at a rate λ on the small side:
+If one side has fewer samples than the other, n₂ < n₁, it may miss rare light in a tile, and its variance is near 0
+there. Equal images have the same variance σ² of a sample, so the estimates s₁², s₂² may be exchanged: the variance of
+m₁ − m₂ is the larger of s₁²/n₁ + s₂²/n₂ and s₁²/n₂ + s₂²/n₁. The second is the pooled estimate times (1/n₁ + 1/n₂); if
+n₁ = n₂ both are the same. Let the rare light consist of equal events, λ of them expected on the side with fewer
+samples. Then these bounds hold:
 
-- too few of them: no events are −√λ standard deviations, and P(t ≤ −x) ≤ exp(−x²/2) as for every mean of values of at
-  least 0 (Maurer 2003): no tile with fewer than x² expected events is an alarm at −x;
-- too many: k of them are x ≤ (k − λ)/√k by their own variance, and P ≤ exp(−(k ln(k/λ) − k + λ)) ≤ exp(−x²/2)
-  (Chernoff; with r = λ/k, −ln r − 1 + r ≥ (1 − r)²/2).
+- Too few events: no event is −√λ standard deviations, and P(t ≤ −x) ≤ exp(−x²/2) as for every mean of values of at
+  least 0 (Maurer 2003). A tile with fewer than x² expected events is no alarm at −x.
+- Too many events: k events are x ≤ (k − λ)/√k standard deviations by their own variance, and
+  P ≤ exp(−(k ln(k/λ) − k + λ)) ≤ exp(−x²/2) (Chernoff; with r = λ/k, −ln r − 1 + r ≥ (1 − r)²/2).
 """
 
 from __future__ import annotations
@@ -33,16 +35,16 @@ from mi_refract.io.image_file import block_area, block_sum
 
 from .pixel_statistics import Inflation, PixelSums, sums
 
-DARK = 1e-3  # a tile darker than this share of its channel's `median_nonblack` counts as that bright in ratios
-GROWTH = 4  # from one level of tiles to the next
-HEAVY = 4.0  # a tile whose noise comes from fewer pixels than this is heavy-tailed: its t is not a Student's
-SINGLE = 0.3  # of a tile's standard error: a pixel that moves its mean by more may be of light that is rare
-POOLED = 30  # blocks of tiles from which the correlation of pixels is estimated again, at least
-FEW_STEPS = 8  # of a fixed point, each of which halves its error at least
-MISSED = 0.01  # the minimum detectable difference is missed with this probability
-HOLLOW = 0.01  # of the variance that is claimed: pixels that scatter by less show none of that noise
-FAR = 10.0  # times the margin: a pixel without noise that is so far off is evidence, see `with_silent_pixels`
-UNSEEN = 1e-3  # of the margin: a tile with less noise than this decides nothing, see `Side.inflation`
+DARK = 1e-3  # smallest denominator of relative differences, relative to the channel's `median_nonblack`
+GROWTH = 4  # ratio of the tile sides of one level and the level below
+HEAVY = 4.0  # a tile whose noise comes from fewer pixels than this is heavy-tailed: its t has no Student distribution
+SINGLE = 0.3  # in units of a tile's standard error: a pixel that changes its mean by more may contain rare light
+POOLED = 30  # minimum number of blocks of tiles from which the correlation of pixels is estimated again
+FEW_STEPS = 8  # steps of a fixed-point iteration, each of which at least halves the error
+MISSED = 0.01  # probability with which the minimum detectable difference is missed
+HOLLOW = 0.01  # pixels that scatter by less than this share of the stated variance do not show that noise
+FAR = 10.0  # multiple of the margin by which a pixel without noise must differ, see `with_silent_pixels`
+UNSEEN = 1e-3  # relative to the margin: a tile with less noise than this is left out of `Side.inflation`
 WORKERS = 2
 
 Flags = NDArray[np.bool_]
@@ -50,12 +52,12 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Side:
-    """One side of a comparison: totals per tile and channel, tiles × tiles × C, over the pixels of a tile.
+    """One side of a comparison: sums per tile and channel, tiles × tiles × C, over the pixels of a tile.
 
-    `mean`: of the pixels; `variance`, `squares`: of the variances of these means, and of their squares. `freedom`:
-    degrees of freedom of a pixel's variance. `count`: samples of a pixel, in the unit of the other side; of all
-    channels or of each. `renders`: totals of each render; without them pixels are taken for independent, or to vary
-    together by `correlated`.
+    `area`: number of pixels. `mean`: sum of the pixels' means; `variance`, `squares`: sums of the variances of these
+    means, and of the squares of these variances. `freedom`: degrees of freedom of a pixel's variance. `count`: samples
+    of a pixel, in the unit of the other side; a number or one per channel. `renders`: sums of each render; without
+    them, `correlated` says how much the pixels correlate.
     """
 
     area: Array
@@ -68,7 +70,7 @@ class Side:
     correlated: Inflation = field(default_factory=Inflation)
 
     def coarser(self) -> Side:
-        """The same side in tiles GROWTH times as wide."""
+        """Return the same side in tiles GROWTH times as wide."""
         area, mean, variance, squares = (
             block_sum(x, GROWTH) for x in (self.area, self.mean, self.variance, self.squares)
         )
@@ -76,32 +78,33 @@ class Side:
         return replace(self, area=area, mean=mean, variance=variance, squares=squares, renders=renders)
 
     def spread(self, inflation: Inflation) -> tuple[Array, Array]:
-        """The variance v of the tile means, and v²/f for its degrees of freedom f (Satterthwaite 1946)."""
+        """Return the variance v of the tile means, and v²/f for its degrees of freedom f (Satterthwaite 1946)."""
         variance = self.variance * inflation.factor / self.area**2
-        freedom = self.freedom / inflation.factor  # correlated pixels are fewer
+        freedom = self.freedom / inflation.factor  # correlated pixels count as fewer independent ones
         squares = self.squares * inflation.factor**2 / self.area**4 / freedom
         return variance, squares + variance**2 / inflation.freedom
 
     def inflation(self, margin: float = 0.0) -> Inflation:
-        """How much more the tile means vary between renders than independent pixels would; `correlated` without them.
+        """Return how much more the tile means vary between renders than those of independent pixels.
 
-        `margin`: the equivalence margin. Where noise is below UNSEEN of it, as that of a plain sky, it may be the
-        rounding of a sum, the same in all pixels of a render. Such a tile differs beyond the margin by 1000 σ of
-        independent pixels or not at all, and says nothing of how the pixels of other tiles correlate.
+        Without renders it is `correlated`. `margin`: the equivalence margin. Tiles whose noise is below UNSEEN times
+        the margin, such as a plain sky, are left out: their noise may be the rounding of a sum, which is the same in
+        all pixels of a render and says nothing about the correlation in other tiles. Such a tile differs beyond the
+        margin by 1000 σ of independent pixels or not at all.
         """
         noisy = self.variance > np.square(UNSEEN * margin * self.mean)
         if self.renders is None or not noisy.any():
             return self.correlated
         between = self.renders.var(0, ddof=1)[noisy] / len(self.renders)
-        # The channels of a tile may share their noise: tiles count, not tiles and channels.
+        # The channels of a tile may have the same noise, so a tile counts once, not once per channel.
         freedom = self.freedom * int(noisy.any(-1).sum())
         return Inflation(max(1.0, float((between / self.variance[noisy]).mean())), freedom)
 
 
 def from_variances(mean: Array, variance: Array, freedom: float, tile: int, count: Array | float = 1.0) -> Side:
-    """One side from an image and the variance of its pixels, both H × W × C; `freedom`: of that variance.
+    """Return one side, from an image and the variance of its pixels, both H × W × C.
 
-    `count`: samples per pixel.
+    `freedom`: degrees of freedom of the variance; `count`: samples per pixel.
     """
     area = block_area(mean.shape[0], mean.shape[1], tile)
     squares = np.square(variance, dtype=np.float64)
@@ -110,11 +113,12 @@ def from_variances(mean: Array, variance: Array, freedom: float, tile: int, coun
 
 @dataclass(frozen=True)
 class OneSided:
-    """What the pixels show where the noise of one side alone is known.
+    """Data for tests by pixels where the noise of only one side is known.
 
     `brighter`: d of `pixel_statistics` at every pixel, H × W × C; 0 in channels whose noise both sides know.
-    `exponent`: g of that module. `well_known`: the channels whose noise is known from so many samples that it holds the
-    rare light of the other side. `correlated`: how much more tile means vary than those of independent pixels.
+    `exponent`: g of that module. `well_known`: the channels whose noise is known from so many samples that these
+    include the rare light of the other side. `correlated`: how much more tile means vary than those of independent
+    pixels.
     """
 
     brighter: Array
@@ -123,18 +127,18 @@ class OneSided:
     correlated: Inflation
 
     def p(self, level: Level, area: Array, tile: int) -> Array:
-        """The p of no difference beyond the margin; 0 where the other side is not brighter.
+        """Return the p-value of no difference beyond the margin, per tile; 0 where the other side is not brighter.
 
-        Where the noise is well known, a pixel may move the mean of a tile by SINGLE of its standard error at most: what
-        bright pixels add beyond that may be rare light. If an event moves the mean by more than that, equal images have
-        λ < 1/SINGLE² = 11 of them in a tile. So clipped, k of them are SINGLE k − √λ < (k − λ)/√λ σ.
-        Elsewhere the pixels alone say how large the noise is.
+        Where the noise is well known, the change of a tile's mean by one pixel is clipped to SINGLE times its standard
+        error, because brighter pixels may contain rare light. If one event changes the mean by more than that, equal
+        images have λ < 1/SINGLE² = 11 events in a tile; clipped, k of them are SINGLE k − √λ < (k − λ)/√λ σ.
+        In other channels the noise is estimated from the pixels of the tile.
         """
         from scipy import special
 
         height, width = self.brighter.shape[:2]
-        most = (SINGLE * level.error * area).repeat(tile, 0)[:height].repeat(tile, 1)[:, :width]
-        clipped = block_sum(np.minimum(self.brighter, most), tile)
+        limit = (SINGLE * level.error * area).repeat(tile, 0)[:height].repeat(tile, 1)[:, :width]
+        clipped = block_sum(np.minimum(self.brighter, limit), tile)
         with np.errstate(divide="ignore", invalid="ignore"):
             t = (clipped / area - level.allowed) / level.error
         total, squares = (block_sum(x, tile)[None] for x in (self.brighter, np.square(self.brighter)))
@@ -145,9 +149,10 @@ class OneSided:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Both sides in tiles of side `tile`; `pixels`: the sums over their pixels, None where these are not tested.
+    """Both sides in tiles of side `tile`.
 
-    `one_sided`: where the noise of one side alone is known. `odds`: of `with_silent_pixels`.
+    `pixels`: the sums over the pixels of each tile; None: pixels are not tested. `one_sided`: set if for some channel
+    the noise of only one side is known. `odds`: see `with_silent_pixels`.
     """
 
     tile: int
@@ -158,10 +163,10 @@ class Evidence:
     odds: Array | float = 7.0
 
     def levels(self, margin: float) -> Iterator[Level]:
-        """The tests of single tiles, then of blocks GROWTH times as wide, and so on to the whole image.
+        """Yield the tests of single tiles, then of blocks GROWTH times as wide, and so on up to the whole image.
 
-        `margin`: the equivalence margin. The correlation of pixels is estimated from all tiles, and again from blocks
-        where there are many: those show it over larger distances.
+        `margin`: the equivalence margin. The correlation of pixels is estimated from all tiles, and again from larger
+        blocks as long as there are POOLED of them: these show correlation over larger distances.
         """
         tile, one, two, pixels = self.tile, self.one, self.two, self.pixels
         inflations = one.inflation(margin), two.inflation(margin)
@@ -169,7 +174,7 @@ class Evidence:
             level = compare_tiles(one, two, margin, inflations)
             if pixels:
                 p = pixels.p(one.area, np.square(level.allowed), max(inflations))
-                hollow = self._by_scatter(level, one, two, pixels, max(inflations).factor)
+                hollow = self._p_by_scatter(level, one, two, pixels, max(inflations).factor)
                 level = replace(level, of_pixels=np.where(level.silent, 1.0, np.nan_to_num(p, nan=0.0)), hollow=hollow)
             if self.one_sided:
                 level = replace(level, shown=self.one_sided.p(level, one.area, tile))
@@ -181,35 +186,36 @@ class Evidence:
                 inflations = max(inflations[0], one.inflation(margin)), max(inflations[1], two.inflation(margin))
 
     @staticmethod
-    def _by_scatter(level: Level, one: Side, two: Side, pixels: PixelSums, factor: float) -> Array:
-        """p of no difference of a tile beyond the margin, by the scatter of the differences d of its pixels.
+    def _p_by_scatter(level: Level, one: Side, two: Side, pixels: PixelSums, factor: float) -> Array:
+        """Return the p-value of no difference of a tile beyond the margin, by the scatter of its pixels' differences d.
 
-        1 where Σd² is at least HOLLOW times the sum of the variances: the pixels show the noise that is claimed.
+        It is 1 where Σd² is at least HOLLOW times the sum of the stated variances: there the pixels show that noise.
         """
         from scipy import special
 
-        claimed, area = one.variance + two.variance, one.area
-        squares = pixels.total[0] + claimed
+        stated, area = one.variance + two.variance, one.area
+        squares = pixels.total[0] + stated
         total = two.mean - one.mean
         with np.errstate(divide="ignore", invalid="ignore"):
             scatter = np.maximum(squares - total**2 / area, 0) / (area - 1)
             t = (np.abs(total) / area - level.allowed) / np.sqrt(factor * scatter / area)
             p = 2 * special.stdtr(area - 1, -np.maximum(t, 0))
-        return np.where((squares < HOLLOW * claimed) & (area > 1), np.nan_to_num(p, nan=1.0), 1.0)
+        return np.where((squares < HOLLOW * stated) & (area > 1), np.nan_to_num(p, nan=1.0), 1.0)
 
 
 def from_renders(
     reference: Sequence[Array], test: Sequence[Array], tile: int, counts: tuple[float, float] | None = None
 ) -> Evidence:
-    """Two sets of independent renders, each H × W × C, at least 2 a side; needs memory for rows of tiles only.
+    """Return the evidence of two sets of independent renders, each H × W × C, at least 2 a side.
 
-    `counts`: samples per pixel of all renders of each side; None: as many as there are renders.
+    `counts`: samples per pixel of all renders of each side; None: the number of renders. The renders are processed by
+    rows of tiles, which limits the memory.
     """
     sides = reference, test
     counts = counts or (len(reference), len(test))
 
     def band(top: int) -> tuple[list[tuple[Array, Array, Array]], PixelSums]:
-        """Totals of a row of tiles: of the renders, their mean's variances and the squares; and the sums of u."""
+        """Return of one row of tiles the sums of each side (renders, variances, squares), and the sums of u."""
         rows = [np.array([render[top : top + tile] for render in side], np.float64) for side in sides]
         with np.errstate(invalid="ignore", over="ignore"):
             variances = [x.var(0, ddof=1) / len(x) for x in rows]
@@ -236,12 +242,16 @@ def from_renders(
 class Level:
     """The tests of one level of tiles; every array is tiles × tiles × C.
 
-    `reference`: its means; `difference`: how much larger those of the test are; `t`: of that. `p`: of no difference;
-    `beyond`: of none beyond the margin; both 0 where a value is not finite. `silent`: no noise on either side, of which
-    a t-test knows nothing: p is 1 there, and `off` where the means differ beyond the margin. `heavy`: noise from a few
-    pixels only. `shown`: p of none beyond the margin by the noise that the pixels show; 0 where that is not tested.
-    `hollow`: the same of noise that the pixels do not show; 1 where they do. `of_pixels`: p of no pixel beyond the
-    margin; `of_silent`: the same of tiles without noise; None where that is not tested.
+    - `reference`: means of the reference; `difference`: mean of the test image less that of the reference.
+    - `mean`: the larger magnitude of both means; `allowed`: the margin in the unit of the image; `error`: the standard
+      error of the difference; `freedom`: its degrees of freedom.
+    - `t`: Welch's t of the difference. `p`: p-value of no difference; `beyond`: p-value of no difference beyond the
+      margin. Both p-values are 0 where a value is not finite.
+    - `silent`: tiles without noise on either side. A t-test does not apply, and their p is 1. `off`: silent tiles whose
+      means differ beyond the margin. `heavy`: tiles whose noise comes from a few pixels only.
+    - `shown`: p-value of no difference beyond the margin, with the noise that the pixels show; 0: not tested.
+    - `hollow`: the same where the pixels do not show the stated noise; 1 where they do.
+    - `of_pixels`: p-value of no pixel beyond the margin; `of_silent`: the same for silent tiles. None: not tested.
     """
 
     t: Array
@@ -263,19 +273,19 @@ class Level:
 
     @property
     def lit(self) -> Flags:
-        """The tiles and channels with light; for darker ones relative differences mean nothing."""
+        """The tiles and channels with light; relative differences of darker ones are meaningless."""
         return self.mean > DARK * median_nonblack(self.mean)
 
     def detectable(self, threshold: float) -> Array:
-        """Relative differences that are seen with probability 1 − MISSED at that p; NaN without light or noise.
+        """Return the relative difference that is detected with probability 1 − MISSED, if p ≤ `threshold` is an alarm.
 
-        A difference δ is seen where δ ≥ margin + (t(1 − p/2) + t(1 − MISSED)) · error.
+        It is margin + (t(1 − p/2) + t(1 − MISSED)) · error, over the mean; NaN for tiles without light or noise.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             return (self.reach(threshold) + self.allowed) / self.mean
 
     def reach(self, threshold: float) -> Array:
-        """How much the differences that are seen exceed the margin; NaN without light or noise."""
+        """Return by how much the smallest detected difference exceeds the margin; NaN without light or noise."""
         from scipy import special
 
         noisy = ~self.silent & self.lit
@@ -288,19 +298,19 @@ class Level:
 def compare_tiles(
     one: Side, two: Side, margin: float, inflations: tuple[Inflation, Inflation] = (Inflation(), Inflation())
 ) -> Level:
-    """Welch's t-test of every tile; differences up to `margin` × the tile's mean count as none.
+    """Return Welch's t-tests of every tile; differences up to `margin` × the tile's mean count as none.
 
-    That mean is the larger one of both sides: light that one of them has must be seen.
+    That mean is the larger one of both sides, so that light that only one side has is detected.
     """
     from scipy import special
 
     def noise(ratio: Array | float) -> tuple[Array, Array, Flags]:
-        """The variance v of m₁ − m₂, v²/f, and whether v comes from few pixels.
+        """Return the variance v of m₁ − m₂, v²/f, and whether v comes from few pixels.
 
         `ratio`: 1 for s₁²/n₁ + s₂²/n₂, n₁/n₂ for s₁²/n₂ + s₂²/n₁.
         """
         (v1, d1), (v2, d2) = one.spread(inflations[0]), two.spread(inflations[1])
-        pixels = HEAVY * max(inflations).factor  # that share samples
+        pixels = HEAVY * max(inflations).factor  # correlated pixels
         squares = ratio**2 * one.squares + two.squares / ratio**2
         few = (ratio * one.variance + two.variance / ratio) ** 2 < pixels * squares
         return ratio * v1 + v2 / ratio, ratio**2 * d1 + d2 / ratio**2, few
@@ -318,21 +328,22 @@ def compare_tiles(
         t = np.where(silent, 0.0, difference / error)
         beyond = np.where(silent, 0.0, np.maximum(np.abs(difference) - allowed, 0) / error)
         off = silent & (np.abs(difference) > allowed)
-    # NaN becomes 0: what is not finite equals nothing.
+    # A p of NaN becomes 0: a value that is not finite equals nothing.
     p, p_beyond = (np.nan_to_num(2 * special.stdtr(freedom, -np.abs(x)), nan=0.0) for x in (t, beyond))
     return Level(t, p, p_beyond, silent, off, few & ~silent, mean, allowed, error, freedom, m1, difference)
 
 
 def with_silent_pixels(level: Level, a: Array, b: Array, margin: float, tile: int, odds: Array | float = 7.0) -> Level:
-    """The level of single tiles with those without noise `off` where a pixel is, too, and with their p.
+    """Return the level of single tiles with tests of the pixels of silent tiles.
 
-    The mean of such a tile does not show what was moved about inside. `a`, `b`: one render of each side.
+    A silent tile is also `off` if one of its pixels differs beyond the margin, because its mean does not change when
+    pixels are moved. `of_silent` is its p-value. `a`, `b`: one render of each side.
 
-    A value that comes up in every render can still be chance, as black is where light is rarely found. Let a pixel take
-    values with probabilities pₓ. All renders of each side, two or more, agree with probability s = Σ pₓ⁴ at most in
-    the same value, and with d = (Σ pₓ²)² − s in two different ones. As s + 7d ≤ 1, no tile of independent pixels is
-    without noise and has k different pixels with a probability above 7⁻ᵏ. `odds`, per channel: what stands for 7 where
-    the noise of one side is all that is known.
+    A value that is the same in every render can still be chance: where light is rare, all renders may be black. Let a
+    pixel take values with probabilities pₓ, and let each side have two or more renders. The probability that all
+    renders have the same value is at most s = Σ pₓ⁴; that the two sides have one value each, and different ones, at
+    most d = (Σ pₓ²)² − s. As s + 7d ≤ 1, the probability that a tile of independent pixels has no noise and k different
+    pixels is at most 7⁻ᵏ. `odds`: the number in place of 7 where the noise of only one side is known, per channel.
     """
     if not level.silent.any():
         return level
@@ -344,8 +355,8 @@ def with_silent_pixels(level: Level, a: Array, b: Array, margin: float, tile: in
 
 
 def median_nonblack(sizes: Array) -> Array:
-    """The median of each channel of … × C values without those that are 0 or less; 0 where none is left."""
-    # Not the mean: next to a lamp everything else would be dark.
+    """Return the median of each channel of … × C values, of those above 0; 0 if there are none."""
+    # The mean would not do: with a lamp in the image everything else would be dark.
     channels = sizes.reshape(-1, sizes.shape[-1]).T
     return np.array([np.median(x[x > 0].astype(np.float64)) if (x > 0).any() else 0.0 for x in channels])
 
@@ -354,17 +365,20 @@ def median_nonblack(sizes: Array) -> Array:
 
 
 def sidak(family_error: float, count: int) -> float:
-    """The p at which one of `count` independent tests is an alarm (Šidák 1967): 1 − (1 − family_error)^(1/count)."""
+    """Return the p at which one of `count` tests is an alarm (Šidák 1967): 1 − (1 − family_error)^(1/count)."""
     return float(-np.expm1(np.log1p(-family_error) / max(count, 1)))
 
 
 class Alarms(NamedTuple):
     """Numbers of tests that differ.
 
-    `tiles`: of the means of tiles; `doubtful`: of those that are heavy-tailed, or whose noise the pixels do not show;
-    also where they show less of it, and so a difference.
-    `pixels`: of the pixels of a tile. `silent`: single tiles and channels without noise whose means or pixels differ
-    beyond the margin; `silent_far`: so far beyond it, in so many pixels, that they are alarms.
+    - `tiles`: tests of the means of tiles.
+    - `doubtful`: the same of tiles that are heavy-tailed, or that do not differ by the noise which their pixels show;
+      also of tiles that differ only by that noise, where it is far below the stated one.
+    - `pixels`: tests of the pixels of a tile.
+    - `silent_far`: silent tiles and channels of the finest level with so many pixels so far beyond the margin that they
+      are alarms.
+    - `silent`: those whose mean or pixels differ beyond the margin at all.
     """
 
     tiles: int
@@ -376,14 +390,14 @@ class Alarms(NamedTuple):
 
 @dataclass(frozen=True)
 class TileTests:
-    """The tests of all tiles and channels with noise, on every level, at one probability of any false alarm."""
+    """The tests of all tiles and channels on every level; `family_error`: probability of any false alarm."""
 
     levels: list[Level]
     family_error: float
 
     @cached_property
     def p(self) -> Array:
-        """The p of every test, in one dimension: of tiles with noise, of their pixels, and of tiles without noise."""
+        """The p-values of all tests, flat: of tiles with noise, of their pixels, and of silent tiles."""
         of_tiles = [level.beyond[~level.silent] for level in self.levels]
         of_pixels = [level.of_pixels[~level.silent] for level in self.levels if level.of_pixels is not None]
         of_silent = [level.of_silent[level.silent] for level in self.levels if level.of_silent is not None]
@@ -396,16 +410,16 @@ class TileTests:
 
     @cached_property
     def _flags(self) -> list[dict[str, Flags]]:
-        """The tests of each level that differ, by the fields of `Alarms`."""
-        none = 1.0  # the p of what is not tested
+        """For each level the tests that differ, by the fields of `Alarms`."""
+        untested = 1.0
         flags = []
         for level in self.levels:
-            in_doubt = level.heavy | (level.shown > self.threshold)
+            doubtful = level.heavy | (level.shown > self.threshold)
             p = {
-                "tiles": np.where(in_doubt | level.silent, none, level.beyond),
-                "doubtful": np.where(level.silent, none, np.where(in_doubt, level.beyond, level.hollow)),
-                "pixels": np.full(level.p.shape, none) if level.of_pixels is None else level.of_pixels,
-                "silent_far": np.full(level.p.shape, none) if level.of_silent is None else level.of_silent,
+                "tiles": np.where(doubtful | level.silent, untested, level.beyond),
+                "doubtful": np.where(level.silent, untested, np.where(doubtful, level.beyond, level.hollow)),
+                "pixels": np.full(level.p.shape, untested) if level.of_pixels is None else level.of_pixels,
+                "silent_far": np.full(level.p.shape, untested) if level.of_silent is None else level.of_silent,
             }
             off = level.off & (level is self.levels[0])
             flags.append({name: x <= self.threshold for name, x in p.items()} | {"silent": off})
@@ -413,31 +427,31 @@ class TileTests:
 
     @cached_property
     def differing(self) -> Alarms:
-        """The tests that differ."""
+        """The numbers of tests that differ."""
         return Alarms(**{name: sum(int(flags[name].sum()) for flags in self._flags) for name in Alarms._fields})
 
     def worst(self) -> tuple[str, int, int, int, int]:
-        """The largest of the tests that differ: its field of `Alarms`, its level, row, column and channel.
+        """Return the worst of the tests that differ: its field of `Alarms`, its level, row, column and channel.
 
-        Of tiles by standard errors, of their pixels by p on the finest level, of tiles without noise by the difference;
-        a field counts where none before it differs. ValueError where no test does.
+        It belongs to the first field, in the order of the loop below, with a test that differs. Tiles are ranked by t,
+        silent tiles by the difference, and pixels by p on the finest level. ValueError if no test differs.
         """
         for name in ("tiles", "silent_far", "pixels", "doubtful", "silent"):
-            best = []
+            candidates = []
             for number, (level, flags) in enumerate(zip(self.levels, self._flags, strict=True)):
                 size = level.difference if "silent" in name else level.t if name != "pixels" else level.of_pixels
                 if flags[name].any() and size is not None:
                     size = np.nan_to_num(-size if name == "pixels" else np.abs(size), nan=np.inf)
                     at = np.unravel_index(int(np.where(flags[name], size, -np.inf).argmax()), size.shape)
-                    best.append((0.0 if name == "pixels" else float(size[at]), -number, at))
-            if best:
-                _, finer, (row, column, channel) = max(best)
-                return name, -finer, int(row), int(column), int(channel)
+                    candidates.append((0.0 if name == "pixels" else float(size[at]), -number, at))
+            if candidates:
+                _, minus_number, (row, column, channel) = max(candidates)  # the finest level of equal ones
+                return name, -minus_number, int(row), int(column), int(channel)
         raise ValueError("no test differs")
 
     @property
     def alarms(self) -> int:
-        """The number of tests that differ, whatever is known of their noise."""
+        """The number of tests that differ, doubtful and silent ones included."""
         return sum(self.differing) - self.differing.silent_far
 
     @property
@@ -446,44 +460,46 @@ class TileTests:
         return float(-np.expm1(self.p.size * np.log1p(-min(self.p.min(), 1 - 1e-16)))) if self.p.size else 1.0
 
     def minimum_detectable(self, level: int = 0) -> float:
-        """The smallest relative difference that is seen in the median tile of a level; NaN where none has noise."""
+        """Return the smallest relative difference detected in the median tile of a level; NaN if no tile has noise."""
         detectable = self.levels[level].detectable(self.threshold)
         return float(np.nanmedian(detectable)) if np.isfinite(detectable).any() else np.nan
 
     def hidden_share(self, resolution: float) -> float:
-        """The share of the tiles with light whose noise hides a difference of `resolution`, in the worst channel."""
+        """Return the share of lit tiles whose noise hides a difference of `resolution`, in the worst channel."""
         finest = self.levels[0]
         hidden = (finest.detectable(self.threshold) > resolution).sum((0, 1)).max()
         return float(hidden / max(finest.lit.any(-1).sum(), 1))
 
     def quieter(self, resolution: float, hidden: float) -> float:
-        """The factor by which the noise's variance must fall for `resolution` to be seen in all but `hidden` tiles.
+        """Return the factor on the noise's variance at which `resolution` is detected in the median and most tiles.
 
-        And in the median tile; at most 1, NaN without light or noise, 0 where no noise is low enough.
+        `hidden`: the share of tiles in which it may be missed. The factor is at most 1; NaN without light or noise; 0
+        if the difference is not detected even without noise.
         """
         finest = self.levels[0]
-        room = np.maximum(resolution * finest.mean - finest.allowed, 0)
-        factor = np.ones_like(room)
+        excess = np.maximum(resolution * finest.mean - finest.allowed, 0)
+        factor = np.ones_like(excess)
         with np.errstate(invalid="ignore", divide="ignore"):
-            for _ in range(FEW_STEPS):  # more samples are more degrees of freedom, too
+            for _ in range(FEW_STEPS):  # more samples also increase the degrees of freedom
                 reach = replace(finest, freedom=finest.freedom / factor).reach(self.threshold)
-                factor = np.sqrt(factor * np.minimum(np.square(room / reach), 1))
-        enough = np.sort(factor.reshape(-1, finest.mean.shape[-1]), 0)
-        allowed = int(hidden * max(finest.lit.any(-1).sum(), 1))  # NaN, of other tiles, is sorted last
-        if not np.isfinite(enough).any():
+                factor = np.sqrt(factor * np.minimum(np.square(excess / reach), 1))
+        factors = np.sort(factor.reshape(-1, finest.mean.shape[-1]), 0)  # NaN, of tiles without light, is last
+        allowed = int(hidden * max(finest.lit.any(-1).sum(), 1))
+        if not np.isfinite(factors).any():
             return np.nan
-        return float(np.nanmin([1.0, np.nanmedian(enough), *enough[min(allowed, len(enough) - 1)]]))
+        return float(np.nanmin([1.0, np.nanmedian(factors), *factors[min(allowed, len(factors) - 1)]]))
 
 
 # Stacks of renders ---------------------------------------------------------------------------------------------
 
 
 def compare_stacks(reference: Array, test: Array, tile: int, family_error: float, margin: float = 0.0) -> TileTests:
-    """Welch's test of single tiles of two stacks of independent renders, each renders × H × W × C.
+    """Return Welch's tests of single tiles of two stacks of independent renders, each renders × H × W × C.
 
-    Pixels are taken for independent, as under a box filter. A tile with a value that is not finite is an alarm.
-    `margin`: the equivalence margin, relative to the tile's mean, or to a thousandth of the channel's; above 0 it keeps
-    tiles without noise from differing by their last bits. ValueError for fewer than 2 renders a side, another shape.
+    Pixels are assumed to be independent, as under a box filter. A tile with a value that is not finite is an alarm.
+    `margin`: the equivalence margin, relative to the tile's mean, or to a thousandth of the channel's median if that is
+    larger; a margin above 0 ignores differences of tiles without noise in their last bits. ValueError for fewer than 2
+    renders a side, and for different shapes.
     """
     same_shape(reference[0], test[0])
     if min(len(reference), len(test)) < 2:
@@ -493,17 +509,17 @@ def compare_stacks(reference: Array, test: Array, tile: int, family_error: float
 
 
 def relative_mse(image: Array, references: Array) -> float:
-    """mean((x − r)²/(r² + 0.01)) against the mean r of a stack of independent renders, less what r's own noise adds.
+    """Return mean(((x − r)² − v)/(r² + 0.01)), with r the mean of a stack of independent renders and v its variance.
 
     `image` H × W × C, `references` renders × H × W × C. ValueError for other shapes.
     """
     r = references.mean(0)
     same_shape(r, image)
-    own = references.var(0, ddof=1) / len(references)
-    return float(((np.square(image - r) - own) / (np.square(r) + 0.01)).mean())
+    variance = references.var(0, ddof=1) / len(references)
+    return float(((np.square(image - r) - variance) / (np.square(r) + 0.01)).mean())
 
 
 def same_shape(reference: Array, test: Array) -> None:
-    """ValueError unless both arrays have one shape."""
+    """Raise ValueError unless both arrays have the same shape."""
     if reference.shape != test.shape:
         raise ValueError(f"images of different shapes: reference {reference.shape}, test {test.shape}")

@@ -35,8 +35,10 @@ from .tile_statistics import (
     with_silent_pixels,
 )
 
-WELL_KNOWN = 16  # times as many samples: a variance of 11 of their rare events is known to 1/√(16 · 11), 8 %
-COLOURS = ("R", "G", "B", "X", "Y", "Z")  # of which more is brighter
+# A side with so many times the samples of the other has 16 · 11 rare events where the other has 11, see `OneSided.p`,
+# so that their variance is known to 1/√(16 · 11), 8 %.
+WELL_KNOWN = 16
+COLOURS = ("R", "G", "B", "X", "Y", "Z")  # channels whose larger values are "brighter", not "higher"
 IDENTICAL = Metric("values that differ", 0.0, 0.0)
 
 
@@ -71,31 +73,32 @@ def compare_renders(
 ) -> Comparison:
     """Independent renders: Welch's t-test on the means of tiles and channels.
 
-    It takes two or more renders a side, or one a side whose variance is known (module `channels`); then pixels are
-    assumed to be independent, as under a box filter. A wider filter does not change the means of tiles, and hides
-    differences of pixels. Where the variance is that of filtered pixels, the header says how wide the filter is, or
-    `pixel_statistics.inflation` estimates it. The tests are of the mean of single tiles, of blocks of tiles and of the
-    whole image, and of whether the pixels of each differ by more than their noise explains.
+    Each side has two or more renders, or one render whose variance is known (see module `channels`). With one render,
+    pixels are assumed to be independent, as under a box filter. A wider filter does not change the means of tiles, and
+    hides differences of pixels. If the variance is that of filtered pixels, the header gives the width of the filter,
+    or `pixel_statistics.inflation` estimates how much pixels correlate. For single tiles, blocks of tiles and the whole
+    image there are two tests: of their mean, and of whether their pixels differ by more than the noise explains.
 
-    Where the variance of one side alone is known, the other side is assumed to have the same variance per sample (a
-    z-test, for many samples). A renderer with more noise per sample is then different, even if its mean is right.
+    If the variance of only one side is known, the other side is assumed to have the same variance per sample (a z-test,
+    for many samples). Then a renderer with more noise per sample is different, even if its mean is right.
 
     The side with fewer samples is never assumed to have less noise per sample than the other: it may have missed rare
-    light. Each render counts as one sample, unless the samples per pixel of all of them are known.
+    light. Each render counts as one sample, unless the samples per pixel of all renders are known.
 
-    Maps, in every tile. `t`: signed, by channels. `p`: of no difference at all, by channels; uniform for equal images.
-    `q`: p adjusted for the false discovery rate after Benjamini and Hochberg (1995), p₍ᵢ₎ N/i made monotonic, the
-    smallest of the channels. `flags`: 1 heavy-tailed, 2 no noise.
+    Maps, one value per tile. `t`: signed, per channel. `p`: p-value of no difference at all, per channel; uniformly
+    distributed for equal images. `q`: p adjusted for the false discovery rate after Benjamini and Hochberg (1995),
+    p₍ᵢ₎ N/i made monotonic, the smallest of the channels. `flags`: 1 heavy-tailed, 2 no noise.
 
-    EQUAL, however noisy, where both hold their variance and are identical in every value of every channel.
-    INCONCLUSIVE where the only tiles that differ are unsuited to a t-test (with the noise of a few pixels, or without
-    noise, and by little or in a few pixels), and where the noise hides differences of `resolution`, with the number of
-    samples that would show them. ValueError for fewer renders, the same render twice, images that cannot be compared.
+    EQUAL, however noisy, if both images contain their variance and are identical in every value of every channel.
+    INCONCLUSIVE if the only tiles that differ are unsuited to a t-test (their noise comes from a few pixels, or they
+    have no noise and differ by little or in a few pixels), or if the noise hides differences of `resolution`; then the
+    reason gives the number of samples that would decide. ValueError for fewer renders, the same render twice, and
+    images that cannot be compared.
     """
     single = len(reference) == len(test) == 1 and (has_variance(reference[0]) or has_variance(test[0]))
     one, two = reference[0], test[0]
-    same = single and bool(spreads(one.channels)) and set(one.channels) == set(two.channels)
-    same = same and np.array_equal(one.pixels, two.select(one.channels), equal_nan=True)
+    identical = single and bool(spreads(one.channels)) and set(one.channels) == set(two.channels)
+    identical = identical and np.array_equal(one.pixels, two.select(one.channels), equal_nan=True)
     set_spp = spp_reference or spp, spp_test or spp
     if single:
         known = estimates(reference[0], test[0], set_spp, allow_nonfinite)
@@ -103,14 +106,14 @@ def compare_renders(
     for image in (*reference[1:], *test):
         if reason := preconditions(reference[0], image, allow_nonfinite):
             return nonfinite_result("welch", reason, reference[0].pixels, aligned(reference[0], image)[1])
-    if same:
+    if identical:
         return Comparison("welch", Verdict.EQUAL, "identical in every value, variances included", (IDENTICAL,))
 
     tile = min(tile, max(reference[0].pixels.shape[:2]))
     channels: Sequence[str] = reference[0].channels
     unit = "samples per pixel"
     if single:
-        channels, evidence = _of_estimates(*known, tile)
+        channels, evidence = _evidence(*known, tile)
         counts = known[0].spp, known[1].spp
     else:
         counts, unit = _checked_counts(reference, test, set_spp)
@@ -123,9 +126,9 @@ def compare_renders(
 
     verdict, reason = _verdict(tests, resolution, hidden)
     if tests.alarms or tests.differing.silent_far:
-        reason = f"{_worst(tests, reference[0], channels, tile)}; {reason}"
+        reason = f"{_worst_difference(tests, reference[0], channels, tile)}; {reason}"
     elif verdict is Verdict.INCONCLUSIVE:
-        reason += _deciding(counts, unit, tests.quieter(resolution, hidden))
+        reason += _deciding_samples(counts, unit, tests.quieter(resolution, hidden))
     finest, differing = levels[0], tests.differing
     share_name = f"share of the tiles whose noise hides a difference of {resolution:.2g}"
     metrics = (
@@ -156,15 +159,15 @@ def compare_renders(
     return Comparison("welch", verdict, reason, metrics, tests.minimum_detectable(), maps)
 
 
-# What is known of both sides -------------------------------------------------------------------------------------
+# Estimates of both sides -----------------------------------------------------------------------------------------
 
 
 def _checked_counts(
     reference: Sequence[Image], test: Sequence[Image], spp: tuple[int, int]
 ) -> tuple[tuple[int, int], str]:
-    """The samples per pixel of all renders of each side, or their number, and which of both.
+    """Return the samples per pixel of all renders of each side, or else the number of renders, and the unit.
 
-    ValueError for fewer than 2 a side, and for the same render twice: it would halve the noise that is seen.
+    ValueError for fewer than 2 renders a side, and for the same render twice: it would halve the measured noise.
     """
     if min(len(reference), len(test)) < 2:
         raise ValueError(
@@ -173,7 +176,7 @@ def _checked_counts(
         )
     for side in (reference, test):
         if all(_identical(side[0], image) for image in side):
-            continue  # without noise
+            continue  # renders without noise may be the same
         for a, b in itertools.combinations(side, 2):
             if _identical(a, b) and (a.pixels != a.pixels[0, 0]).any():  # black ones may be the same
                 raise ValueError(
@@ -187,15 +190,15 @@ def _checked_counts(
 
 
 def _identical(a: Image, b: Image) -> bool:
-    few = np.s_[::37]  # rows: enough to tell noisy images apart, and quicker than all
-    return np.array_equal(a.pixels[few], b.pixels[few]) and np.array_equal(a.pixels, b.pixels)
+    some_rows = np.s_[::37]  # compared first, as they are enough for noisy images that differ
+    return np.array_equal(a.pixels[some_rows], b.pixels[some_rows]) and np.array_equal(a.pixels, b.pixels)
 
 
-def _of_estimates(a: Estimate, b: Estimate, tile: int) -> tuple[list[str], Evidence]:
-    """The channels whose variance one side knows at least, and what is known of them.
+def _evidence(a: Estimate, b: Estimate, tile: int) -> tuple[list[str], Evidence]:
+    """Return the channels whose variance at least one side knows, and the evidence of these channels.
 
-    Where one side alone knows the variance of a sample, that is all there is: it carries both means' variances,
-    s² (1/n₁ + 1/n₂), and the other side has none.
+    If only one side knows the variance s² of a sample, that side gets the variance of both means, s² (1/n₁ + 1/n₂), and
+    the other side gets 0.
     """
     b = replace(b, variance=b.variance[..., [b.image.channels.index(name) for name in a.image.channels]])
     known = a.known | b.known
@@ -206,11 +209,11 @@ def _of_estimates(a: Estimate, b: Estimate, tile: int) -> tuple[list[str], Evide
     only_one, only_two = ~b.known[known], ~a.known[known]
     w1 = np.where(only_two, 0, v1 * (1 / a.spp + only_one / b.spp))
     w2 = np.where(only_one, 0, v2 * (1 / b.spp + only_two / a.spp))
-    # A variance that carries both means' is as well known as the side that knows it does; the other one's is 0 there.
+    # Where one side has the variance of both means, there is nothing to exchange: the counts are equal.
     n1, n2 = (np.where(only_one | only_two, 1, x.spp) for x in (a, b))
 
-    alone = bool((only_one | only_two).any())
-    estimated = inflation(m2 - m1, w1 + w2, tile) if alone or None in (a.shared, b.shared) else Inflation()
+    one_known = bool((only_one | only_two).any())
+    estimated = inflation(m2 - m1, w1 + w2, tile) if one_known or None in (a.shared, b.shared) else Inflation()
     correlated = [estimated if x.shared is None else Inflation(x.shared) for x in (a, b)]
     one, two = (
         replace(from_variances(m, w, x.freedom, tile, n), correlated=c)
@@ -218,23 +221,24 @@ def _of_estimates(a: Estimate, b: Estimate, tile: int) -> tuple[list[str], Evide
     )
 
     def by_side(of_one: float, of_two: float, of_both: float) -> Pixels:
-        """A value by channel: of those whose variance one side knows alone, and of the others."""
+        """Return a value per channel, by which sides know its variance: the reference, the test image, or both."""
         return np.where(only_one, of_one, np.where(only_two, of_two, of_both))
 
-    # Let all n samples have one value of probability p, and of m others not all. For odds = 1 + (n − 1)/m the sum of
-    # pⁿ⁺ᵐ + odds pⁿ(1 − pᵐ) ≤ p over all values is at most 1, as that of 7 in `with_silent_pixels` is.
+    # Let all n samples of one side have the same value, of probability p, and not all m samples of the other side. For
+    # odds = 1 + (n − 1)/m, pⁿ⁺ᵐ + odds pⁿ(1 − pᵐ) ≤ p, so its sum over all values is at most 1. `with_silent_pixels`
+    # needs this, and proves it for the odds of 7.
     odds = by_side(1 + (a.spp - 1) / b.spp, 1 + (b.spp - 1) / a.spp, 7.0)
     exponent = by_side(rarity_exponent(a.spp, b.spp), rarity_exponent(b.spp, a.spp), 0.5)
     pixels = sums(m1, w1, m2, w2, tile, n1 / n2, exponent)
     one_sided = None
-    if alone:
+    if one_known:
         well_known = by_side(a.spp / b.spp, b.spp / a.spp, np.nan) >= WELL_KNOWN
         brighter = (m2 - m1) * by_side(1.0, -1.0, 0.0)
         one_sided = OneSided(brighter, exponent, well_known, max(estimated, *correlated))
     return names, Evidence(tile, one, two, pixels, one_sided, odds)
 
 
-# What the tests say ----------------------------------------------------------------------------------------------
+# Verdict and reason ----------------------------------------------------------------------------------------------
 
 
 def _verdict(tests: TileTests, resolution: float, hidden: float) -> tuple[Verdict, str]:
@@ -243,53 +247,58 @@ def _verdict(tests: TileTests, resolution: float, hidden: float) -> tuple[Verdic
     if differing := ", ".join(f"{count} {name}" for name, count in counts.items() if count):
         return Verdict.DIFFERENT, f"{sum(counts.values())} of {tests.p.size} tests differ: {differing}"
     if silent or doubtful:
-        where = f"{silent} without noise, {doubtful} heavy-tailed or of more noise than their pixels show"
+        where = f"{silent} without noise, {doubtful} heavy-tailed or noisier than their pixels show"
         return Verdict.INCONCLUSIVE, f"only tiles that are unsuited to a t-test differ: {where}"
     if tests.levels[0].silent.all():
         return Verdict.EQUAL, "no noise, and no tile differs beyond the margin"
     visible, share = tests.minimum_detectable(), tests.hidden_share(resolution)
-    one, in_some = f"one of {_percent(visible)}", f"one of {_percent(resolution)} in {_percent(share)} of the tiles"
+    smallest, hidden_ones = (
+        f"one of {_percent(visible)}",
+        f"one of {_percent(resolution)} in {_percent(share)} of the tiles",
+    )
     if not visible <= resolution or share > hidden:
-        where = f"{one} in the median tile" + (f", and {in_some}" if share else "")
+        where = f"{smallest} in the median tile" + (f", and {hidden_ones}" if share else "")
         return Verdict.INCONCLUSIVE, f"no difference is seen, but noise hides {where}"
-    where = "in a tile of median noise" + (f", and noise hides {in_some}" if share else "")
-    return Verdict.EQUAL, f"no difference; {one} would have been seen {where}"
+    where = "in a tile of median noise" + (f", and noise hides {hidden_ones}" if share else "")
+    return Verdict.EQUAL, f"no difference; {smallest} would have been seen {where}"
 
 
 def _percent(share: float) -> str:
     return f"{float(f'{100 * share:.2g}'):g} %"
 
 
-def _worst(tests: TileTests, image: Image, channels: Sequence[str], tile: int) -> str:
-    """Where the test image differs the most, and by how much: "1.8 % darker in R in the 16 × 16 pixels around …"."""
-    kind, number, row, column, channel = tests.worst()
-    level, side = tests.levels[number], tile * GROWTH**number
+def _worst_difference(tests: TileTests, image: Image, channels: Sequence[str], tile: int) -> str:
+    """Return where the test image differs the most, and how: "1.8 % darker in R in the 16 × 16 pixels around …"."""
+    kind, level_index, row, column, channel = tests.worst()
+    level, side = tests.levels[level_index], tile * GROWTH**level_index
     (height, width), name = image.pixels.shape[:2], channels[channel]
     top, left = row * side, column * side
     rows, columns = min(side, height - top), min(side, width - left)
     x, y = image.origin[0] + left + columns // 2, image.origin[1] + top + rows // 2
     where = "the whole image" if level.t[..., 0].size == 1 else f"the {columns} × {rows} pixels around ({x}, {y})"
-    one, change = (float(values[row, column, channel]) for values in (level.reference, level.difference))
+    old, change = (float(values[row, column, channel]) for values in (level.reference, level.difference))
     if kind == "pixels" or not change:
-        return f"other pixels of {name} in {where}, the mean of which is the same within the noise"
+        return f"different pixels of {name} in {where}, with the same mean within the noise"
     up, down = ("brighter", "darker") if name.rpartition(".")[2] in COLOURS else ("higher", "lower")
-    share = f"{_percent(abs(change / one))} {up if change > 0 else down}" if one > 0 else up if change > 0 else down
-    values = "{} instead of {}".format(*distinguishable(one + change, one))
-    return f"{share} in {name}, {values}, in {where}"
+    direction = up if change > 0 else down
+    amount = f"{_percent(abs(change / old))} " if old > 0 else ""
+    values = "{} instead of {}".format(*distinguishable(old + change, old))
+    return f"{amount}{direction} in {name}, {values}, in {where}"
 
 
-def _deciding(counts: tuple[int, int], unit: str, quieter: float) -> str:
-    """How many samples or renders divide the noise's variance by 1/`quieter`; "" where no number does.
+def _deciding_samples(counts: tuple[int, int], unit: str, quieter: float) -> str:
+    """Return how many samples or renders would multiply the noise's variance by `quieter`; "" if no number would.
 
-    Of n₁ and n₂, `counts`, the smaller rises until 1/n₁ + 1/n₂ is `quieter` times what it was, up to the other's
-    number; beyond that both rise.
+    `counts`: n₁ and n₂. The smaller is increased until 1/n₁ + 1/n₂ is `quieter` times its present value. If it would
+    exceed the larger, both sides get the same number.
     """
     if not quieter > 0:
         return ""
-    needed, most = quieter * (1 / counts[0] + 1 / counts[1]), max(counts)
-    count, whose = 2 / needed, "a side"
-    if counts[0] != counts[1] and (rest := needed - 1 / most) * most >= 1:
-        count, whose = 1 / rest, "of the new image" if counts[0] > counts[1] else "of the reference"
-    more = count / min(counts)
-    times = f" ({float(f'{more:.2g}'):,g} times as many)" if whose != "a side" or counts[0] == counts[1] else ""
-    return f"; about {float(f'{count:.1e}'):,.0f} {unit} {whose}{times} would decide"
+    needed, larger = quieter * (1 / counts[0] + 1 / counts[1]), max(counts)
+    rest = needed - 1 / larger  # 1/n of the smaller side
+    count, side = 2 / needed, "a side"
+    if counts[0] != counts[1] and rest * larger >= 1:
+        count, side = 1 / rest, "of the new image" if counts[0] > counts[1] else "of the reference"
+    factor = count / min(counts)
+    times = f" ({float(f'{factor:.2g}'):,g} times as many)" if side != "a side" or counts[0] == counts[1] else ""
+    return f"; about {float(f'{count:.1e}'):,.0f} {unit} {side}{times} would decide"

@@ -1,7 +1,7 @@
-"""Files, processes and tables, for all other rooms. Nothing here knows about refraction or Mitsuba.
+"""Files, processes and tables, for all other packages. Independent of refraction and Mitsuba.
 
-In: paths, pixels, commands, tables of TOML. Out: files that are complete or not there at all, images as arrays, the
-output of other programs, checked values; errors are one line that says what, where, and what was expected.
+Input: paths, pixels, commands, TOML tables. Output: files that are complete or not written at all, images as arrays,
+the output of other programs, checked values. Errors are one line: what is wrong, where, and what was expected.
 """
 
 __all__ = ["errors", "image_file", "process_group", "reference_pack", "safe_files", "text", "typed_table"]

@@ -1,8 +1,8 @@
-"""Errors that code catches by their cause, and what becomes of any error in a command: one line and exit code 2.
+"""Errors that callers catch by their cause, and how a command reports any error: one line and exit code 2.
 
-Each class is also the built-in error that Python's users expect for that cause. Every other error is a plain
-ValueError, OSError, ImportError …: nobody needs to tell it apart. The message of all of them is one line: what is
-wrong, where, and what was expected.
+Each class also derives from the built-in error for its cause. Causes that no caller distinguishes have no class: they
+raise ValueError, OSError, ImportError and so on. All messages are one line: what is wrong, where, and what was
+expected.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ TRACEBACK = "MI_REFRACT_TRACEBACK"  # environment variable: with "1" the traceba
 
 
 class MiRefractError(Exception):
-    """Base of the errors below; the message is written for a reader."""
+    """Base of the errors below; their messages are written for users."""
 
 
 class UsageError(MiRefractError, ValueError):
-    """Options or arguments that do not exist, or that exclude each other."""
+    """Options or arguments do not exist, or exclude each other."""
 
 
 class MissingExtraError(MiRefractError, ImportError):
@@ -35,15 +35,15 @@ class MissingExtraError(MiRefractError, ImportError):
 
 
 class ImageError(MiRefractError, ValueError):
-    """A file that is not a readable image, or larger than allowed."""
+    """A file is not a readable image, or is larger than allowed."""
 
 
 class CheckpointError(MiRefractError, ValueError):
-    """A checkpoint that is damaged, or that belongs to a different render."""
+    """A checkpoint is damaged, or belongs to a different render."""
 
 
 class TooMuchOutputError(MiRefractError, ValueError):
-    """Another program printed more than it may."""
+    """Another program printed more than allowed."""
 
 
 class LostSchedulerError(MiRefractError, ConnectionError):
@@ -51,18 +51,17 @@ class LostSchedulerError(MiRefractError, ConnectionError):
 
 
 class NoWorkersError(MiRefractError, ConnectionError):
-    """No worker of the scheduler may be given work, or none is left."""
+    """The scheduler has no worker that can be used, or none is left."""
 
 
 def exit_code(
     name: str, body: Callable[[], int | None], interruptions: tuple[type[BaseException], ...] = (KeyboardInterrupt,)
 ) -> int:
-    """What `body()` returns, None as 0; 2 after any exception, and 130 after Ctrl-C or one of `interruptions`.
+    """Return the exit code of `body()`, 0 for None; 2 after any exception, 130 after Ctrl-C or one of `interruptions`.
 
-    The exception is one line on stderr, `name: …`. What the body printed is on its way when this returns: a stdout
-    that cannot be written is an exception as well. A pipe that nobody reads any more, as before `| head`, is none: what
-    is still printed is dropped. A standard stream that is closed is replaced by the null device, so that no file of
-    ours takes its number.
+    An exception is printed in one line on stderr, `name: …`. The output is flushed; an error of writing stdout counts
+    as an exception. A closed pipe, as of `| head`, is no error: further output is dropped. A standard stream that is
+    closed is replaced by the null device, so that no file that the body opens gets its number.
     """
     for number, (stream, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         if getattr(sys, stream) is None:
@@ -72,33 +71,33 @@ def exit_code(
                 if (null := os.open(os.devnull, os.O_RDWR)) != number:
                     os.dup2(null, number)
                     os.close(null)
-            setattr(sys, stream, open(number, mode, closefd=False))  # noqa: SIM115 (it lasts as long as the process)
-    for known_as in ("stdout", "stderr"):
-        output = getattr(sys, known_as)
+            setattr(sys, stream, open(number, mode, closefd=False))  # noqa: SIM115 (stays open until the process ends)
+    for stream in ("stdout", "stderr"):
+        output = getattr(sys, stream)
         buffer = getattr(output, "buffer", None)
         if isinstance(raw := getattr(buffer, "raw", buffer), io.FileIO):
-            raw.write = functools.partial(_write_named, type(raw).write, raw, known_as)  # type: ignore[method-assign]
+            raw.write = functools.partial(_write_named, type(raw).write, raw, stream)  # type: ignore[method-assign]
         if hasattr(output, "reconfigure") and output.errors in ("strict", "surrogateescape"):
-            output.reconfigure(errors="backslashreplace")  # no character is one that it cannot print
+            output.reconfigure(errors="backslashreplace")  # every character can be printed
     try:
         code = body() or 0
         sys.stdout.flush()
     except interruptions:
         return INTERRUPTED
-    except SystemExit as ended:
-        if isinstance(ended.code, int | None):
-            return ended.code or 0
-        return _failed(name, ValueError(ended.code))
+    except SystemExit as error:
+        if isinstance(error.code, int | None):
+            return error.code or 0
+        return _report(name, ValueError(error.code))
     except Exception as error:
-        return _failed(name, error)
+        return _report(name, error)
     return code
 
 
 def describe(error: BaseException) -> str:
-    """An error in one line: its own words where it was raised for a reader, else its type as well."""
+    """Return an error in one line: its message if that was written for users, else with its type."""
     if isinstance(error, MiRefractError):
         text = str(error)
-    elif hasattr(error, "format_message"):  # typer's own errors, whose classes depend on its version
+    elif hasattr(error, "format_message"):  # typer's errors, whose classes depend on its version
         text = error.format_message()
     elif isinstance(error, OSError) and error.errno and error.strerror:
         text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
@@ -114,14 +113,14 @@ def describe(error: BaseException) -> str:
 
 
 def print_traceback(error: BaseException) -> None:
-    """The traceback on stderr, where the environment variable asks for it."""
+    """Print the traceback on stderr if the environment variable TRACEBACK is "1"."""
     if os.environ.get(TRACEBACK) == "1":
         with contextlib.suppress(OSError, ValueError):
             traceback.print_exception(error)
 
 
 def _write_named(write: Callable[[Any, Any], int | None], stream: Any, name: str, content: Any) -> int | None:
-    """`write`, whose errors name what could not be written; what no reader of a pipe is left for is dropped."""
+    """Call `write`, and add the name of the stream to its errors; output to a closed pipe is dropped."""
     try:
         return write(stream, content)
     except BrokenPipeError:
@@ -131,15 +130,16 @@ def _write_named(write: Callable[[Any, Any], int | None], stream: Any, name: str
         raise
 
 
-def _failed(name: str, error: BaseException) -> int:
-    with contextlib.suppress(OSError, ValueError):  # a stderr that cannot be written says nothing
+def _report(name: str, error: BaseException) -> int:
+    """Print the error on stderr, if that can be written, and return the exit code MISUSE."""
+    with contextlib.suppress(OSError, ValueError):
         print_traceback(error)
         print(f"{name}: {describe(error)}", file=sys.stderr, flush=True)
     for output in (sys.stdout, sys.stderr):
         try:
             output.flush()
         except (OSError, ValueError):
-            # What is left would be tried again when Python ends, and change the exit code to 120.
+            # Otherwise Python would try again to write the rest when it ends, and exit with code 120.
             with contextlib.suppress(OSError, ValueError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())
     return MISUSE

@@ -1,4 +1,4 @@
-"""Images: files, by OpenImageIO, which reads every format that it knows and writes OpenEXR; arithmetic on pixels.
+"""Images: reading all formats of OpenImageIO, writing OpenEXR, and arithmetic on pixels.
 
 Pixels are arrays of H × W × C float32, row 0 at the top. A file is written completely or not at all.
 """
@@ -28,17 +28,17 @@ ImageInput: TypeAlias = Any  # an `OpenImageIO.ImageInput`
 ImageSpec: TypeAlias = Any  # an `OpenImageIO.ImageSpec`
 SUFFIXES = (".exr",)
 PNG_PROFILE = "png:iCCP"
-TEXT = image_headers.TEXT  # begins the names of metadata that are texts of a PNG file
+TEXT = image_headers.TEXT  # prefix of the names of metadata that are texts of a PNG file
 MAX_VALUES = 2**28  # width × height × channels of an image: 1 GiB as float32
-# What is read in another type than float32. OpenImageIO rounds integers to float32 on the way to any other type.
+# Types that are not read as float32. OpenImageIO rounds integers to float32 when it converts them to any other type.
 WIDE = {"double": "double", "uint": "uint", "int": "int"}
-CONVERTED = ("CMYK", "YCbCrK", "CIELAB", "ICCLAB", "ITULAB", "LOGL", "LOGLUV")  # to R, G, B
+CONVERTED = ("CMYK", "YCbCrK", "CIELAB", "ICCLAB", "ITULAB", "LOGL", "LOGLUV")  # colour spaces converted to R, G, B
 MOST_HEADERS = 2**28  # bytes of a file beside 8 for each value
-OPTION = " (max-values)"  # for errors: where the limit can be changed
-# How files begin that OpenImageIO decodes when it opens them: GIF, JPEG 2000, JPEG XL.
+OPTION = " (max-values)"  # for errors: the option that changes the limit
+# Magic numbers of formats that OpenImageIO decodes when it opens a file: GIF, JPEG 2000, JPEG XL.
 WHEN_OPENED = (b"GIF", b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51", b"\0\0\0\x0cJXL ", b"\xff\x0a")
-LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\n"  # how a file begins that Git LFS has not brought yet
-NO_DATE = {"DateTime": "1970:01:01 00:00:00"}  # for the same bytes every day: without it OpenImageIO writes today's
+LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\n"  # start of a file that Git LFS has not fetched yet
+NO_DATE = {"DateTime": "1970:01:01 00:00:00"}  # for reproducible bytes: OpenImageIO would write the present date
 
 
 def write_exr(
@@ -50,8 +50,8 @@ def write_exr(
     """Write H × W × C pixels as an OpenEXR file of float32, with one header attribute for each entry of `metadata`.
 
     Attributes may be str, int or float; floats are stored in float32, ints beyond 32 bits as text. An existing file is
-    replaced. ValueError for a shape that does not fit `channels`, a name that does not end in .exr, or an attribute of
-    another type; OSError for a folder that cannot be written or a full disk. The old file stays then.
+    replaced; after an error it is unchanged. ValueError for a shape that does not fit `channels`, a name that does not
+    end in .exr, or an attribute of another type; OSError for a folder that cannot be written or a full disk.
     """
     import OpenImageIO as oiio
 
@@ -69,7 +69,7 @@ def write_exr(
             raise ValueError(f"{path}: attribute {name} = {value!r}; expected str, int, float")
         spec.attribute(name, str(value) if isinstance(value, int) and not -(2**31) <= value < 2**31 else value)
     try:
-        with safe_files.replacing(path, suffix=".exr") as temporary:  # OpenImageIO tells the format by the name
+        with safe_files.replacing(path, suffix=".exr") as temporary:  # OpenImageIO chooses the format by the suffix
             output = oiio.ImageOutput.create(str(temporary))
             if output is None:
                 raise OSError(one_line(oiio.geterror()))
@@ -77,10 +77,10 @@ def write_exr(
             message = output.geterror()
             if not (output.close() and done):
                 raise OSError(one_line(message or output.geterror()) or "OpenImageIO gives no reason")
-            # On a full disk `close` is True all the same when the image was small enough for a buffer.
+            # On a full disk `close` still returns True if the image is small enough for a buffer.
             source = oiio.ImageInput.open(str(temporary))
             if source is None or source.read_scanlines(0, 0, rows - 1, rows, 0, 0, count, "float") is None:
-                (source or oiio).geterror()  # or OpenImageIO would print it at the end of the process
+                (source or oiio).geterror()  # otherwise OpenImageIO prints it at the end of the process
                 raise OSError("the last row of pixels is missing; is the disk full?")
             source.close()
     except OSError as error:
@@ -89,16 +89,18 @@ def write_exr(
 
 @dataclass(frozen=True)
 class Image:
-    """An image as a file holds it.
+    """An image of a file.
 
-    `pixels`: H × W × C, float32, or float64 where the file holds numbers that float32 cannot; integers of a file are
-    mapped to 0 … 1, but for those of an EXR file. `channels`: C names. `origin`: (x, y) where the data window begins.
-    `metadata`: the header, by OpenImageIO's names, and what `image_headers` reads besides.
-    `display`: x, y, width and height of the display window; None where it is the data window. `stored`: the type of
-    the file's numbers, in OpenImageIO's word (uint8, half, float …); "" without a file. `mask`: H × W, the pixels that
-    count; None where all do. The others are 0. `part`: its number and that of its MIP level, from 0 on as OpenImageIO
-    counts; `place`: the same in words, "" in a file of one image. `variances`: H × W by channel, of one sample per
-    pixel, where another file holds them.
+    - `pixels`: H × W × C, float32, or float64 if the file has numbers that float32 cannot represent. Integers of a file
+      are mapped to 0 … 1, except those of an EXR file. `channels`: C names.
+    - `origin`: (x, y) of the first pixel of the data window. `display`: x, y, width and height of the display window;
+      None if it is the data window.
+    - `metadata`: the header, by OpenImageIO's names, with the additions of `image_headers.hidden_metadata`. `stored`:
+      the type of the file's numbers in OpenImageIO's notation (uint8, half, float …); "" without a file.
+    - `mask`: H × W, True for pixels that are compared; the others are 0. None: all pixels.
+    - `part`: the numbers of the part and of the MIP level, from 0 on as in OpenImageIO. `place`: the same in words; ""
+      in a file of one image.
+    - `variances`: H × W by channel, of one sample per pixel, from another file.
     """
 
     path: Path
@@ -114,16 +116,16 @@ class Image:
     variances: Mapping[str, NDArray[np.floating[Any]]] = field(default_factory=dict)
 
     def select(self, channels: Sequence[str]) -> NDArray[np.floating[Any]]:
-        """The pixels of these channels, in this order: H × W × len(channels). ValueError for a name not there."""
+        """Return the pixels of these channels, H × W × len(channels). ValueError for a channel that does not exist."""
         if missing := [name for name in channels if name not in self.channels]:
             raise ValueError(f"{self.path}: no channel {missing[0]!r}; expected {', '.join(self.channels)}")
         return self.pixels[..., [self.channels.index(name) for name in channels]]
 
 
 def read(path: str | os.PathLike[str], max_values: int = MAX_VALUES, digests: dict[Path, str] | None = None) -> Image:
-    """Read a file that holds one image, of any format that OpenImageIO reads; the name's ending tells which.
+    """Read a file with one image, in any format that OpenImageIO reads; the format is given by the suffix.
 
-    `digests`: as of `read_parts`. Raises what that raises, and ValueError for a file of several parts or MIP levels.
+    `digests`: see `read_parts`. Errors: those of `read_parts`, and ValueError for several parts or MIP levels.
     """
     image = read_parts(path, max_values, digests, first_only=True)[0]
     if image.place:
@@ -138,13 +140,13 @@ def read_parts(
     *,
     first_only: bool = False,
 ) -> list[Image]:
-    """Read every image of a file, by part and MIP level; a file of any format that OpenImageIO reads, told by its name.
+    """Read all images of a file, by part and MIP level, in any format that OpenImageIO reads, given by the suffix.
 
-    `max_values`: width × height × channels of all together, at most; asked of each header, before memory is allocated.
-    `digests`: gets the SHA-256 of the bytes that are decoded; those of a private copy, which nobody changes meanwhile.
-    `first_only`: of several images only the first, which has its `place` nevertheless. OSError for a file
-    that cannot be read; ValueError for one that is empty, truncated, too large, of another format than its name says,
-    deep, or without pixels. Both are one line that begins with the path.
+    `max_values`: largest width × height × channels of all images together; checked in each header before memory is
+    allocated. `digests`: receives the SHA-256 of the decoded bytes, which are read from a private copy, so that the
+    file cannot change in between. `first_only`: read only the first image; its `place` is set as otherwise. OSError if
+    the file cannot be read; ValueError if it is empty, truncated, too large, of another format than its suffix, deep,
+    or without pixels. Messages are one line that begins with the path.
     """
     path = Path(path)
     if digests is not None:
@@ -155,25 +157,26 @@ def read_parts(
                 return [replace(image, path=path) for image in read_parts(copy, max_values, first_only=first_only)]
             except ImageError as error:
                 raise ImageError(str(error).replace(str(copy), str(path))) from None
-    source, kind = _checked(path, max_values)
+    source, kind = _checked_source(path, max_values)
     images: list[Image] = []
-    taken = 0
+    values = 0
     try:
-        besides = image_headers.hidden_metadata(path)
+        hidden_metadata = image_headers.hidden_metadata(path)
         for part in _parts(source):
-            images.append(_image(path, source, kind, part, (max_values, taken), besides))
-            taken += images[-1].pixels.size
+            images.append(_image(path, source, kind, part, (max_values, values), hidden_metadata))
+            values += images[-1].pixels.size
             if first_only:
                 break
         if not images:
-            raise ImageError(f"{path}: corrupt {kind} file: {_without(path, source.geterror()) or 'no image'}")
+            raise ImageError(f"{path}: corrupt {kind} file: {_without_path(path, source.geterror()) or 'no image'}")
         several = images[-1].part[0] > 0 or (first_only and source.seek_subimage(1, 0))
-        levelled = {image.part[0] for image in images if image.part[1]}
-        levelled |= {0} if first_only and source.seek_subimage(0, 1) else set()
-        for number, image in enumerate(images):
+        with_levels = {image.part[0] for image in images if image.part[1]}
+        if first_only and source.seek_subimage(0, 1):
+            with_levels.add(0)
+        for i, image in enumerate(images):
             words = [f"part {image.part[0]}"] * several
-            words += [f"MIP level {image.part[1]}"] * (image.part[0] in levelled)
-            images[number] = replace(image, place=", ".join(words))
+            words += [f"MIP level {image.part[1]}"] * (image.part[0] in with_levels)
+            images[i] = replace(image, place=", ".join(words))
         return images
     except MemoryError:
         raise ImageError(f"{path}: more pixels than fit in memory") from None
@@ -182,8 +185,8 @@ def read_parts(
 
 
 def count_values(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> int:
-    """Width × height × channels of all images in a file, as their headers say. Errors: those of `read_parts`."""
-    source, _ = _checked(Path(path), max_values)
+    """Return width × height × channels of all images in a file, from their headers. Errors: those of `read_parts`."""
+    source, _ = _checked_source(Path(path), max_values)
     try:
         specs = (source.spec() for _ in _parts(source))
         return sum(int(spec.width * spec.height * spec.nchannels) for spec in specs)
@@ -191,8 +194,8 @@ def count_values(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> 
         source.close()
 
 
-def _checked(path: Path, max_values: int) -> tuple[ImageInput, str]:
-    """OpenImageIO's reader of a file that may hold an image, and its kind for error messages."""
+def _checked_source(path: Path, max_values: int) -> tuple[ImageInput, str]:
+    """Return OpenImageIO's reader of a file, and its kind for error messages. Errors: those of `read_parts`."""
     kind = path.suffix[1:].upper() or "image"
     try:
         str(path).encode()
@@ -200,20 +203,20 @@ def _checked(path: Path, max_values: int) -> tuple[ImageInput, str]:
         raise ImageError(f"{path}: expected a name in UTF-8") from None
     if path.exists() and not (path.is_file() or path.is_dir()):  # reading a pipe might never end
         raise ImageError(f"{path}: expected a regular file")
-    with path.open("rb") as file:  # the operating system's own words for what is missing or forbidden
-        begin = file.read(len(LFS_POINTER))
-    if not begin:
+    with path.open("rb") as file:  # raises the system's error for a missing or forbidden file
+        start = file.read(len(LFS_POINTER))
+    if not start:
         raise ImageError(f"{path}: corrupt {kind} file: it is empty")
-    if begin == LFS_POINTER:
+    if start == LFS_POINTER:
         raise ImageError(f"{path}: a Git LFS pointer, not the image; run `git lfs pull` to fetch it")
-    # Others hold 8 bytes a value or fewer, and are asked below.
-    return _opened(path, kind, max_values, max_values * (1 if begin.startswith(WHEN_OPENED) else 8)), kind
+    # Other formats have at most 8 bytes a value; their headers are checked after opening.
+    return _opened(path, kind, max_values, max_values * (1 if start.startswith(WHEN_OPENED) else 8)), kind
 
 
 def check_header(path: str | os.PathLike[str], max_values: int) -> None:
-    """ValueError, one line, for a file whose header is not that of an image of up to `max_values`; no pixels are read.
+    """Raise ValueError, in one line, unless the header is that of an image of up to `max_values`; read no pixels.
 
-    For readers that believe a header and allocate what it says.
+    Call this before a reader that allocates memory for the size in the header.
     """
     path = Path(path)
     image_headers.check_attributes(path)
@@ -224,15 +227,15 @@ def check_header(path: str | os.PathLike[str], max_values: int) -> None:
         source.close()
 
 
-_opening = threading.Lock()  # OpenImageIO has one limit for all that it opens
+_opening = threading.Lock()  # OpenImageIO's limit of the size is global
 
 
 def _opened(path: Path, kind: str, max_values: int, max_bytes: int, option: str = OPTION) -> ImageInput:
-    """OpenImageIO's reader of the file, if its pixels take up to `max_bytes`. Some formats are decoded here."""
+    """Return OpenImageIO's reader of the file, if its pixels need up to `max_bytes`. Some formats are decoded here."""
     import OpenImageIO as oiio
 
     config = oiio.ImageSpec()
-    config.attribute("oiio:UnassociatedAlpha", 1)  # else colours under a transparent alpha are read as black
+    config.attribute("oiio:UnassociatedAlpha", 1)  # otherwise colours under a transparent alpha are read as black
     with _opening:
         before = oiio.get_int_attribute("limits:imagesize_MB")
         oiio.attribute("limits:imagesize_MB", min(-(-max_bytes >> 20), 2**31 - 1))
@@ -241,7 +244,7 @@ def _opened(path: Path, kind: str, max_values: int, max_bytes: int, option: str 
         finally:
             oiio.attribute("limits:imagesize_MB", before)
     if source is None:
-        message = _without(path, oiio.geterror())
+        message = _without_path(path, oiio.geterror())
         if "MB limit" in message:
             raise ImageError(f"{path}: {message}; expected up to {max_values} values{option}")
         raise ImageError(f"{path}: corrupt {kind} file: {message}")
@@ -249,10 +252,10 @@ def _opened(path: Path, kind: str, max_values: int, max_bytes: int, option: str 
 
 
 def named(name: str, pixels: ArrayLike) -> Image:
-    """An image made of an array, H × W × C or H × W, with a name instead of a file.
+    """Return an image of an array, H × W × C or H × W, with a name instead of a file.
 
-    Channels are called R, G, B (, A) where there are three or four, else channel0, channel1 … Integers are kept as
-    they are. ValueError for another shape, or for values that are not numbers.
+    Three or four channels are called R, G, B (, A), others channel0, channel1 … Integers are not scaled. ValueError for
+    another shape, or for values that are not numbers.
     """
     pixels = np.asarray(pixels)
     if pixels.ndim not in (2, 3) or not pixels.size or pixels.dtype.kind not in "fiu":
@@ -264,7 +267,7 @@ def named(name: str, pixels: ArrayLike) -> Image:
 
 
 def _parts(source: ImageInput) -> Iterator[tuple[int, int]]:
-    """Each part and MIP level by number; the source is at it. Counting first would decode some formats."""
+    """Yield the number of each part and MIP level, after moving `source` there. Some formats are decoded here."""
     part = 0
     while source.seek_subimage(part, 0):
         level = 0
@@ -274,46 +277,48 @@ def _parts(source: ImageInput) -> Iterator[tuple[int, int]]:
         part += 1
 
 
-def _check_size(path: Path, spec: ImageSpec, max_values: int, taken: int = 0, option: str = OPTION) -> None:
-    """ValueError for more values than are allowed, beside those that other images of the file have taken."""
-    if spec.width * spec.height * spec.nchannels > max_values - taken:
-        beside = f" beside {taken} of other parts and MIP levels" if taken else ""
-        size = f"{spec.width} × {spec.height} × {spec.nchannels} values{beside}"
+def _check_size(path: Path, spec: ImageSpec, max_values: int, previous: int = 0, option: str = OPTION) -> None:
+    """Raise ValueError for more than `max_values`, together with the `previous` values of the file's other images."""
+    if spec.width * spec.height * spec.nchannels > max_values - previous:
+        others = f" beside {previous} of other parts and MIP levels" if previous else ""
+        size = f"{spec.width} × {spec.height} × {spec.nchannels} values{others}"
         raise ImageError(f"{path}: {size}; expected up to {max_values} values{option}")
 
 
 def _image(
-    path: Path, source: ImageInput, kind: str, part: tuple[int, int], values: tuple[int, int], besides: Metadata
+    path: Path, source: ImageInput, kind: str, part: tuple[int, int], values: tuple[int, int], hidden: Metadata
 ) -> Image:
-    """The part that the source is at. `values`: how many a file may have, and has so far; `besides`: more metadata."""
+    """Return the image at which `source` is. `values`: the allowed and the previous number; `hidden`: more metadata."""
     import OpenImageIO as oiio
 
-    spec, found = source.spec(), source.format_name()
-    # File endings by format: "openexr:exr,sxr;png:png;…".
-    endings = dict(pair.split(":") for pair in oiio.get_string_attribute("extension_list").split(";") if pair)
-    # The format "null" is black, whatever the file holds.
-    if path.suffix[1:].lower() not in endings.get(found, found).split(",") or found == "null":
-        raise ImageError(f"{path}: holds an image of format {found}; expected the format that its file name indicates")
+    spec, format_name = source.spec(), source.format_name()
+    # Suffixes by format: "openexr:exr,sxr;png:png;…".
+    suffixes = dict(pair.split(":") for pair in oiio.get_string_attribute("extension_list").split(";") if pair)
+    # The format "null" is always black.
+    if path.suffix[1:].lower() not in suffixes.get(format_name, format_name).split(",") or format_name == "null":
+        raise ImageError(
+            f"{path}: holds an image of format {format_name}; expected the format that its file name indicates"
+        )
     if spec.deep:
         raise ImageError(f"{path}: expected an image without deep samples")
     if min(spec.width, spec.height, spec.nchannels) < 1 or spec.depth > 1:
         raise ImageError(f"{path}: {spec.width} × {spec.height} × {spec.depth} pixels; expected a plane with pixels")
     _check_size(path, spec, *values)
-    metadata = {attribute.name: attribute.value for attribute in spec.extra_attribs} | besides
+    metadata = {attribute.name: attribute.value for attribute in spec.extra_attribs} | hidden
     if "ICCProfile" in metadata:
-        metadata.pop(PNG_PROFILE, None)  # left where OpenImageIO drops the profile, as it does one with errors
-    kinds = [str(each) for each in (spec.channelformats or [spec.format] * spec.nchannels)]
-    if reason := _misread(found, set(kinds), metadata, spec.height):
+        metadata.pop(PNG_PROFILE, None)  # kept if OpenImageIO drops the profile because of errors in it
+    types = [str(channel_type) for channel_type in (spec.channelformats or [spec.format] * spec.nchannels)]
+    if reason := _misread_reason(format_name, set(types), metadata, spec.height):
         raise ImageError(f"{path}: {reason}")
-    runs = []
-    for kind_read, run in itertools.groupby(range(spec.nchannels), lambda channel: WIDE.get(kinds[channel], "float")):
-        first, *others = run
-        pixels = source.read_image(*part, first, first + 1 + len(others), kind_read)
-        if message := _without(path, source.geterror()) or ("" if pixels is not None else "no pixels"):
+    runs = []  # consecutive channels that are read in the same type
+    for read_as, channel_run in itertools.groupby(range(spec.nchannels), lambda i: WIDE.get(types[i], "float")):
+        numbers = list(channel_run)
+        pixels = source.read_image(*part, numbers[0], numbers[-1] + 1, read_as)
+        if message := _without_path(path, source.geterror()) or ("" if pixels is not None else "no pixels"):
             raise ImageError(f"{path}: corrupt {kind} file: {message}")
         pixels = np.asarray(pixels).reshape(spec.height, spec.width, -1)
-        if pixels.dtype.kind in "iu":  # those of EXR files are names and counts of things
-            pixels = pixels.astype(float) if found == "openexr" else pixels / np.iinfo(pixels.dtype).max
+        if pixels.dtype.kind in "iu":  # integers of EXR files are identifiers and counts
+            pixels = pixels.astype(float) if format_name == "openexr" else pixels / np.iinfo(pixels.dtype).max
         runs.append(pixels)
     pixels = runs[0] if len(runs) == 1 else np.concatenate(runs, -1)
     display = (spec.full_x, spec.full_y, spec.full_width, spec.full_height)
@@ -321,28 +326,28 @@ def _image(
     return Image(path, pixels, channels, origin, metadata, display, str(spec.format), part=part)
 
 
-def _misread(found: str, kinds: set[str], metadata: Metadata, rows: int) -> str:
-    """Why OpenImageIO gives other numbers than those of the file; "" where it does not."""
-    if kinds & {"uint64", "int64"}:
+def _misread_reason(format_name: str, types: set[str], metadata: Metadata, rows: int) -> str:
+    """Return why OpenImageIO would return other numbers than those of the file; "" if it would not."""
+    if types & {"uint64", "int64"}:
         return "integers of 64 bits; expected up to 32"
-    if found == "tiff" and "double" in kinds and rows == 1:  # OpenImageIO 2.4 to 3.2 reads what lay in memory
+    if format_name == "tiff" and "double" in types and rows == 1:  # OpenImageIO 2.4 to 3.2 reads uninitialised memory
         return "one row of 64-bit numbers in a TIFF file; expected several rows, or 32 bits"
-    if metadata.get("tiff:PhotometricInterpretation") == 0 and not kinds <= {"uint8", "uint16"}:
-        return "0 is white in a TIFF file of more than 16 bits; expected 0 as black"  # with 8 or 16 it is read so
+    if metadata.get("tiff:PhotometricInterpretation") == 0 and not types <= {"uint8", "uint16"}:
+        return "0 is white in a TIFF file of more than 16 bits; expected 0 as black"  # 8 and 16 bits are inverted
     space = metadata.get("tiff:ColorSpace", metadata.get("jpeg:ColorSpace"))
     return f"colours in {space}, which OpenImageIO converts with loss; expected R, G, B" if space in CONVERTED else ""
 
 
-def _without(path: Path, message: str) -> str:
-    """OpenImageIO's words on one line, without the path that some of its readers put into them."""
+def _without_path(path: Path, message: str) -> str:
+    """Return OpenImageIO's message on one line, without the path that some of its readers add."""
     return one_line(message.replace(f"EXR Error ({path}): ", "").replace(str(path), path.name))
 
 
 def read_exr(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> tuple[NDArray[np.float32], Metadata]:
     """Read an EXR file: (pixels, metadata). Pixels are H × W × C float32; metadata is the header and "channels".
 
-    `metadata["channels"]` holds the C names in OpenImageIO's order: R, G, B, A first, then by name.
-    OSError for a file that cannot be read, ValueError for one that is not a complete EXR image of up to `max_values`.
+    `metadata["channels"]`: the C names in OpenImageIO's order: R, G, B, A first, then by name. OSError if the file
+    cannot be read, ValueError if it is not a complete EXR image of up to `max_values`.
     """
     path = Path(path)
     with path.open("rb") as file:
@@ -353,27 +358,27 @@ def read_exr(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> tupl
 
 
 def one_line(text: str) -> str:
-    """`text` with every run of white space, line breaks among them, as one space."""
+    """Return the text with every run of white space, including line breaks, as one space."""
     return " ".join(text.split())
 
 
 def versions() -> dict[str, str]:
-    """The versions of mi_refract, mitsuba and drjit; "unknown" of one that is not installed."""
+    """Return the versions of mi_refract, mitsuba and drjit; "unknown" of one that is not installed."""
     from mi_refract import __version__
 
     return {"mi_refract": __version__} | {name: installed_version(name) for name in ("mitsuba", "drjit")}
 
 
 def provenance() -> dict[str, str]:
-    """Header attributes: `Software`, and `mi_refract:version:NAME` for each of `versions`."""
+    """Return header attributes: `Software`, and `mi_refract:version:NAME` for each of `versions`."""
     software = versions()
     header = {f"mi_refract:version:{name}": version for name, version in software.items()}
     return {"Software": f"mi_refract {software['mi_refract']}"} | header
 
 
 def installed_version(distribution: str) -> str:
-    """The installed version of a distribution; "unknown" where it runs without being installed."""
-    import importlib.metadata  # which takes long
+    """Return the installed version of a distribution; "unknown" if it runs without being installed."""
+    import importlib.metadata  # imported late because it takes long
 
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):
         return importlib.metadata.version(distribution)
@@ -384,25 +389,29 @@ def installed_version(distribution: str) -> str:
 
 
 def srgb_encode(linear: Pixels) -> Pixels:
-    """The sRGB code, 0 to 1, of linear light of at least 0, value by value (IEC 61966-2-1)."""
+    """Return the sRGB code, 0 to 1, of linear light of at least 0, elementwise (IEC 61966-2-1)."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def srgb_decode(code: Pixels) -> Pixels:
-    """The linear light of sRGB codes; the inverse of `srgb_encode` (IEC 61966-2-1)."""
+    """Return the linear light of sRGB codes; the inverse of `srgb_encode` (IEC 61966-2-1)."""
     return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
 
 
 def any_channel(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """`flags.any(-1)`, of few channels ten times as fast: NumPy takes long for many short reductions."""
-    few = 0 < flags.shape[-1] <= FEW_CHANNELS
-    return np.asarray(functools.reduce(np.logical_or, np.moveaxis(flags, -1, 0)) if few else flags.any(-1))
+    """Return `flags.any(-1)`, for few channels ten times as fast: NumPy is slow for many short reductions."""
+    result: NDArray[np.bool_]
+    if 0 < flags.shape[-1] <= FEW_CHANNELS:
+        result = functools.reduce(np.logical_or, np.moveaxis(flags, -1, 0))
+    else:
+        result = np.any(flags, -1)
+    return result
 
 
 def block_sum(pixels: Pixels, side: int) -> Pixels:
-    """Sums over side × side blocks of H × W × C pixels, or of stacks of them: … × ⌈H/side⌉ × ⌈W/side⌉ × C.
+    """Return sums over side × side blocks of pixels, … × H × W × C: … × ⌈H/side⌉ × ⌈W/side⌉ × C.
 
-    Blocks at the right and lower edge are of what is left.
+    Blocks at the right and lower edge may be smaller.
     """
     rows, columns = np.arange(0, pixels.shape[-3], side), np.arange(0, pixels.shape[-2], side)
     sums: Pixels = np.add.reduceat(np.add.reduceat(pixels, rows, -3), columns, -2)
@@ -410,13 +419,13 @@ def block_sum(pixels: Pixels, side: int) -> Pixels:
 
 
 def block_area(height: int, width: int, side: int) -> Pixels:
-    """The number of pixels in each block of `block_sum`, with a last axis of length 1."""
+    """Return the number of pixels in each block of `block_sum`, with a last axis of length 1."""
     rows, columns = (np.diff(np.arange(0, size, side), append=size) for size in (height, width))
     return np.outer(rows, columns)[..., None].astype(np.float64)
 
 
 def block_mean(pixels: Pixels, side: int) -> Pixels:
-    """Means over the blocks of `block_sum`, in the precision of `pixels`."""
+    """Return means over the blocks of `block_sum`, in the precision of `pixels`."""
     with np.errstate(invalid="ignore"):
         sums = block_sum(pixels, side)
     return sums / block_area(pixels.shape[-3], pixels.shape[-2], side).astype(pixels.dtype)

@@ -1,4 +1,4 @@
-"""Headers of image files, byte by byte: what OpenImageIO does not check, and what it does not hand over."""
+"""Parsing of headers of image files: checks that OpenImageIO lacks, and metadata that it does not return."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from typing import BinaryIO
 from .errors import ImageError
 
 EXR, PNG, JPEG = b"\x76\x2f\x31\x01", b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
-ATTRIBUTES = 4096  # of an EXR file
-# Chunks of a PNG file that OpenImageIO reads, or that do not concern the numbers.
+ATTRIBUTES = 4096  # largest number of attributes of an EXR file
+# Chunks of a PNG file that OpenImageIO reads, or that do not affect the meaning of the pixels.
 CHUNKS = b"IHDR PLTE IDAT IEND tRNS gAMA sRGB cICP tIME pHYs oFFs eXIf bKGD hIST sBIT sPLT mDCV".split()
 TEXTS, TEXT = (b"tEXt", b"zTXt", b"iTXt"), "png:text:"
-SRGB = struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000)  # cHRM: the same as none
-# Tags of a TIFF file that OpenImageIO reads, or that say where the pixels are.
+SRGB = struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000)  # the default of cHRM
+# Tags of a TIFF file that OpenImageIO reads, or that give the location of the pixels.
 TAGS = {*range(254, 290), 292, 293, 296, 297, 305, 306, *range(315, 318), 320, *range(322, 326), 330, 332, 333, 334}
 TAGS |= {338, 339, 347, *range(512, 522), 529, 530, 531, 700, *range(33300, 33307), 33432, 33723, 34377, 34665, 34675}
 TAGS |= {18246, 18249, 32995, 32997, 34853, 37724, *range(40091, 40096)}
 SIZES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}  # bytes by type; others: 1
-FRACTION = 5
-PSD = (4, 7, 8)  # of Photoshop's colour modes CMYK, multichannel, duotone
+FRACTION = 5  # a TIFF type: numerator and denominator
+PSD = (4, 7, 8)  # Photoshop's colour modes CMYK, multichannel, duotone
 REFUSED = {
     "png:acTL": "an animated PNG; expected a single image",
     "jpeg:MPF": "a JPEG of several images (MPO); expected a single image",
@@ -33,13 +33,13 @@ REFUSED = {
 
 
 def check_attributes(path: Path) -> None:
-    """ValueError where an attribute of an OpenEXR file is larger than the file. OpenImageIO may not look."""
+    """Raise ValueError if an attribute of an OpenEXR file is larger than the file, which OpenImageIO may not check."""
     size = path.stat().st_size
     with path.open("rb") as file:
         if file.read(8)[:4] != EXR:
             return
         for _ in range(ATTRIBUTES):
-            if not _text(file):  # the name; behind the last attribute it is empty
+            if not _text(file):  # the name, which is empty after the last attribute
                 return
             _text(file)  # the type
             length = int.from_bytes(file.read(4), "little")
@@ -50,39 +50,39 @@ def check_attributes(path: Path) -> None:
 
 
 def _text(file: BinaryIO) -> bytes:
-    """The bytes up to a zero, which is read, too; EXR's names have up to 255."""
-    begin = file.read(256)
-    text, zero, _ = begin.partition(b"\0")
-    file.seek(len(text) + len(zero) - len(begin), os.SEEK_CUR)
+    """Read a name up to and including a zero byte, and return it without the zero; EXR's names have up to 255 bytes."""
+    block = file.read(256)
+    text, zero, _ = block.partition(b"\0")
+    file.seek(len(text) + len(zero) - len(block), os.SEEK_CUR)
     return text
 
 
 def hidden_metadata(path: Path) -> dict[str, bytes | float]:
-    """What the file says of its numbers and OpenImageIO does not hand over: "png:cHRM", "tiff:301", "hdr:COLORCORR".
+    """Return metadata about the pixels that OpenImageIO does not return: "png:cHRM", "tiff:301", "hdr:COLORCORR".
 
-    Values are as they are in the file, but for numbers of HDR files and fractions of TIFF files: "1.0 0.3127". That
-    OpenImageIO hands over the text "Comment" of a PNG file is "png:text:Comment", without a value. Radiance's PIXASPECT
-    is "PixelAspectRatio", as in other formats. ValueError for a file of several images of which OpenImageIO reads the
-    first alone, and for colours that it converts with loss.
+    Values are the bytes of the file, except numbers of HDR files and fractions of TIFF files, which are text: "1.0
+    0.3127". An entry "png:text:Comment" without a value means that OpenImageIO's "Comment" is a text of a PNG file.
+    Radiance's PIXASPECT is "PixelAspectRatio", as in other formats. ValueError for a file of several images of which
+    OpenImageIO reads only the first, and for colours that it converts with loss.
     """
     size = path.stat().st_size
-    said: dict[str, list[bytes]] = {}
-    # A file that ends too early, or leads beyond its end, is an error of OpenImageIO's.
+    values: dict[str, list[bytes]] = {}
+    # OpenImageIO reports a file that is truncated, or that points beyond its end.
     with path.open("rb") as file, contextlib.suppress(struct.error, OverflowError, OSError):
-        begin = file.read(8)
+        start = file.read(8)
         for magic, read in READERS.items():
-            for name, value in read(file, size) if begin.startswith(magic) else ():
-                said.setdefault(name, []).append(value)
-    for name in said.keys() & REFUSED.keys():
+            for name, value in read(file, size) if start.startswith(magic) else ():
+                values.setdefault(name, []).append(value)
+    for name in values.keys() & REFUSED.keys():
         raise ImageError(f"{path}: {REFUSED[name]}")
-    metadata: dict[str, bytes | float] = {name: b" ".join(values) for name, values in said.items()}
+    metadata: dict[str, bytes | float] = {name: b" ".join(several) for name, several in values.items()}
     with contextlib.suppress(KeyError, ValueError, ZeroDivisionError):
-        metadata["PixelAspectRatio"] = 1 / float(metadata["hdr:PIXASPECT"])  # there it is height over width
+        metadata["PixelAspectRatio"] = 1 / float(metadata["hdr:PIXASPECT"])  # PIXASPECT is height over width
         del metadata["hdr:PIXASPECT"]
     return metadata
 
 
-# Each of these gives names and values. `size`: of the file, which no value exceeds.
+# Each reader yields names and values. `size`: the size of the file, which limits the length of a value.
 
 
 def _png(file: BinaryIO, size: int) -> Iterator[tuple[str, bytes]]:
@@ -104,7 +104,7 @@ def _jpeg(file: BinaryIO, size: int) -> Iterator[tuple[str, bytes]]:
         after = file.tell() + length - 2
         if marker == 0xFFDA or marker < 0xFF00:  # the pixels begin
             return
-        if marker == 0xFFFF:  # the first byte only fills
+        if marker == 0xFFFF:  # the first byte is padding
             after = file.tell() - 3
         elif marker == 0xFFE2 and file.read(4) == b"MPF\0":
             yield "jpeg:MPF", b""
@@ -115,7 +115,7 @@ def _hdr(file: BinaryIO, size: int) -> Iterator[tuple[str, bytes]]:
     file.seek(0)
     while (line := file.readline(size)).strip():
         name, equals, value = line.partition(b"=")
-        # All else is a comment, or a command that made the file, of this image or of one that went into it.
+        # Other lines are comments, or commands that produced this image or one of its inputs.
         if equals and name.isalnum() and name != b"FORMAT":
             with contextlib.suppress(ValueError):
                 value = b" ".join(str(float(word)).encode() for word in value.split())
@@ -132,12 +132,12 @@ def _tiff(file: BinaryIO, size: int) -> Iterator[tuple[str, bytes]]:
         return struct.unpack(kind, file.read(struct.calcsize(kind)))
 
     file.seek(inline)
-    seen = {0}
-    while (at := unpack(offset)[0]) not in seen:
-        place = f" of part {len(seen) - 1}" if len(seen) > 1 else ""
-        seen.add(at)
-        file.seek(at)
-        first = at + struct.calcsize(count)
+    directories = {0}
+    while (directory := unpack(offset)[0]) not in directories:
+        suffix = f" of part {len(directories) - 1}" if len(directories) > 1 else ""
+        directories.add(directory)
+        file.seek(directory)
+        first = directory + struct.calcsize(count)
         entries = min(unpack(count)[0], size // 12)
         entry = struct.calcsize(f"{order}HH{offset[1]}") + inline
         for i in range(entries):
@@ -151,7 +151,7 @@ def _tiff(file: BinaryIO, size: int) -> Iterator[tuple[str, bytes]]:
                 if kind == FRACTION:
                     pairs = struct.iter_unpack(f"{order}II", value)
                     value = " ".join(f"{x / (y or math.nan):.6g}" for x, y in pairs).encode()
-                yield f"tiff:{tag}{place}", value
+                yield f"tiff:{tag}{suffix}", value
         file.seek(first + entries * entry)
 
 

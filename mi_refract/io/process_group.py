@@ -1,4 +1,4 @@
-"""Run another program in a process group of its own, so that all processes that it started end with it.
+"""Run another program in its own process group, so that all processes that it started end with it.
 
 Windows has no such groups: there only the program itself is ended.
 """
@@ -19,21 +19,21 @@ from typing import IO, Any, NoReturn
 
 from .errors import TooMuchOutputError
 
-LONGEST = 7 * 86_400.0  # seconds that a program may have
-_PIECE = 2**16  # bytes
+LONGEST = 7 * 86_400.0  # the largest timeout in seconds
+_CHUNK = 2**16  # bytes
 
 
 @dataclass(frozen=True)
 class Ended:
-    """A program that has ended: its exit status (−n: killed by signal n), its stdout, and its stderr where kept."""
+    """A program that has ended: its exit status (−n: killed by signal n), its stdout, and its stderr if kept."""
 
     status: int
     out: bytes
-    said: bytes
+    err: bytes
 
     @property
     def describe(self) -> str:
-        """How it ended, for an error message."""
+        """How the program ended, for an error message."""
         if self.status >= 0:
             return f"ended with status {self.status}"
         names = {member.value: member.name for member in signal.Signals}
@@ -42,7 +42,7 @@ class Ended:
 
 def run(
     command: Sequence[str],
-    given: bytes,
+    stdin: bytes,
     timeout: float,
     *,
     keep_stderr: bool = False,
@@ -50,7 +50,7 @@ def run(
     env: Mapping[str, str] | None = None,
     most: int = 2**30,
 ) -> Ended:
-    """Run `command` to its end, with `given` on its stdin. Its stderr is ours, unless it is kept.
+    """Run `command` to its end, with `stdin` as its input. Its stderr is that of this process, unless it is kept.
 
     Its process group is killed at the end, after any exception, and when SIGINT, SIGTERM or SIGHUP ends this process.
     `most`: bytes that it may print. OSError if it cannot be started; TimeoutError if it has not ended after `timeout`
@@ -58,25 +58,25 @@ def run(
     """
     if not 0 <= timeout <= LONGEST:
         raise ValueError(f"timeout {timeout:g} s; expected 0 … {LONGEST:g} s")
-    pipe, errors, deadline = subprocess.PIPE, subprocess.PIPE if keep_stderr else None, time.monotonic() + timeout
-    with _signals_raise() as begin:
+    pipe, stderr, deadline = subprocess.PIPE, subprocess.PIPE if keep_stderr else None, time.monotonic() + timeout
+    with _signals_raise() as allow_signals:
         process = subprocess.Popen(
-            list(command), bufsize=0, stdin=pipe, stdout=pipe, stderr=errors, cwd=cwd, env=env, start_new_session=True
+            list(command), bufsize=0, stdin=pipe, stdout=pipe, stderr=stderr, cwd=cwd, env=env, start_new_session=True
         )
 
         def feed() -> None:
             assert process.stdin
-            rest = memoryview(given)
-            with contextlib.suppress(OSError):  # nobody reads it
+            rest = memoryview(stdin)
+            with contextlib.suppress(OSError):  # the program does not read it
                 while rest:
                     rest = rest[process.stdin.write(rest) :]  # Linux writes up to 2 GiB at a time
             with contextlib.suppress(OSError):
                 process.stdin.close()
 
         try:
-            begin()
+            allow_signals()
             threading.Thread(target=feed, daemon=True).start()
-            out, said = _read(process, deadline, most)
+            out, err = _read(process, deadline, most)
             process.wait(max(0, deadline - time.monotonic()))
         except subprocess.TimeoutExpired:
             raise TimeoutError(f"did not end within {timeout:g} s") from None
@@ -84,68 +84,74 @@ def run(
             with contextlib.suppress(ProcessLookupError, PermissionError):  # macOS forbids it for a group of zombies
                 os.killpg(process.pid, signal.SIGKILL) if hasattr(os, "killpg") else process.kill()
             process.wait()
-    return Ended(process.returncode, out, said)
+    return Ended(process.returncode, out, err)
 
 
 def _read(process: subprocess.Popen[bytes], deadline: float, most: int) -> tuple[bytes, bytes]:
-    """All that the program prints: its stdout, and its stderr where it is a pipe."""
-    arriving: queue.SimpleQueue[tuple[list[bytes], bytes]] = queue.SimpleQueue()
+    """Return the program's stdout, and its stderr if that is a pipe."""
+    chunks: queue.SimpleQueue[tuple[list[bytes], bytes]] = queue.SimpleQueue()  # of both pipes; empty at the end of one
 
-    def pump(pipe: IO[bytes], kept: list[bytes]) -> None:
+    def pump(pipe: IO[bytes], output: list[bytes]) -> None:
         with pipe, contextlib.suppress(OSError):
-            while piece := pipe.read(_PIECE):
-                arriving.put((kept, piece))
-        arriving.put((kept, b""))
+            while chunk := pipe.read(_CHUNK):
+                chunks.put((output, chunk))
+        chunks.put((output, b""))
 
     out: list[bytes] = []
-    said: list[bytes] = []
-    pumps = [(pipe, kept) for pipe, kept in ((process.stdout, out), (process.stderr, said)) if pipe]
-    for both in pumps:  # a thread for each: Windows cannot wait for two pipes at once
-        threading.Thread(target=pump, args=both, daemon=True).start()
-    room, going = most, len(pumps)
-    while going:
+    err: list[bytes] = []
+    pumps = [(pipe, output) for pipe, output in ((process.stdout, out), (process.stderr, err)) if pipe]
+    for pipe_and_output in pumps:  # a thread for each pipe, because Windows cannot wait for two pipes
+        threading.Thread(target=pump, args=pipe_and_output, daemon=True).start()
+    size, open_pipes = 0, len(pumps)
+    while open_pipes:
         try:
-            kept, piece = arriving.get(timeout=max(0, deadline - time.monotonic()))
+            output, chunk = chunks.get(timeout=max(0, deadline - time.monotonic()))
         except queue.Empty:
             raise subprocess.TimeoutExpired(process.args, deadline) from None
-        kept.append(piece)
-        going -= not piece
-        room -= len(piece)
-        if room < 0:
+        output.append(chunk)
+        if not chunk:
+            open_pipes -= 1
+        size += len(chunk)
+        if size > most:
             raise TooMuchOutputError(f"more than {most} bytes of output")
-    return b"".join(out), b"".join(said)
+    return b"".join(out), b"".join(err)
 
 
 @contextlib.contextmanager
 def _signals_raise() -> Iterator[Callable[[], None]]:
-    """Within, SIGINT, SIGTERM and SIGHUP raise where they would end us: as soon as the yielded function was called.
+    """Within the context, SIGINT, SIGTERM and SIGHUP raise exceptions where they would end this process.
 
-    A signal before that call is kept, and raised by the call: until the program is started there is nothing to end.
-    Only in the main thread.
+    They do so after the yielded function is called, that is, when the program has been started and can be ended. A
+    signal before that is raised by the call. In other threads than the main thread this has no effect.
     """
-    caught: list[int] = []
-    ready: list[bool] = []
+    received: list[int] = []
+    allowed = False
 
-    def end(number: int) -> NoReturn:
+    def raise_exception(number: int) -> NoReturn:
         raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
 
-    def note(number: int, frame: object) -> None:
-        caught.append(number)
-        if ready:
-            end(number)
+    def handle(number: int, frame: object) -> None:
+        received.append(number)
+        if allowed:
+            raise_exception(number)
 
-    def begin() -> None:
-        ready.append(True)
-        if caught:
-            end(caught[0])
+    def allow() -> None:
+        nonlocal allowed
+        allowed = True
+        if received:
+            raise_exception(received[0])
 
-    before: dict[signal.Signals, Any] = {}
+    previous: dict[signal.Signals, Any] = {}
     if threading.current_thread() is threading.main_thread():
-        for number in {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)}:  # Windows has none
+        for number in {
+            signal.SIGINT,
+            signal.SIGTERM,
+            getattr(signal, "SIGHUP", signal.SIGINT),
+        }:  # Windows has no SIGHUP
             if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
-                before[number] = signal.signal(number, note)
+                previous[number] = signal.signal(number, handle)
     try:
-        yield begin
+        yield allow
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)

@@ -1,7 +1,7 @@
-"""The reference pack that `python -m validation pack` writes: its index, and proof that nobody changed its files.
+"""The reference pack that `python -m validation pack` writes: its index, and the check that its files are unchanged.
 
-An unpacked pack is a folder with the file INDEX, which holds the SHA-256 of every other file but SUMS. SUMS says the
-same for `sha256sum --check`, and that of INDEX, which identifies the pack.
+An unpacked pack is a folder with the file INDEX, which contains the SHA-256 of every other file except SUMS. SUMS
+contains the same digests for `sha256sum --check`, and that of INDEX, which identifies the pack.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .typed_table import convert
 
 INDEX, SUMS = "mi-refract-pack.json", "SHA256SUMS"
 FORMAT: Literal["mi_refract pack 1"] = "mi_refract pack 1"
-MOST = 2**24  # bytes of either
+MOST = 2**24  # bytes of INDEX and of SUMS
 EXPECTED = "expected the pack as it was published"
 
 Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", description="SHA-256")]
@@ -38,8 +38,8 @@ class PackedFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A file of a pack."""
 
     sha256: Digest
-    content: Annotated[str, _doc("what it holds")]
-    schema: Annotated[str, _doc("of a JSON file: the file with its JSON Schema")] = ""
+    content: Annotated[str, _doc("description of the content")]
+    schema: Annotated[str, _doc("for a JSON file: the file with its JSON Schema")] = ""
 
 
 class PackIndex(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -48,49 +48,49 @@ class PackIndex(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     format: Annotated[Literal["mi_refract pack 1"], _doc("the format, and its version")]
     version: Annotated[str, _doc("version of mi_refract that wrote the pack")]
     quick: Annotated[bool, _doc("made with --quick: few rays, small images")]
-    made_with: Annotated[dict[str, str], _doc("everything that the bytes depend on, by name")]
-    files: Annotated[dict[str, PackedFile], _doc("every other file but SHA256SUMS, by its path with slashes")]
+    made_with: Annotated[dict[str, str], _doc("versions and settings that the bytes depend on, by name")]
+    files: Annotated[dict[str, PackedFile], _doc("all other files except SHA256SUMS, by path with slashes")]
 
 
 class PackReference(msgspec.Struct, frozen=True):
-    """The pack that references are from, as results name it."""
+    """The pack of the references, as results name it."""
 
     version: Annotated[str, _doc("version of mi_refract that wrote the pack")]
-    sha256: Annotated[Digest, _doc(f"of the pack's {INDEX}, which holds that of every file")]
-    path: Annotated[str, _doc("of the references in the pack")]
+    sha256: Annotated[Digest, _doc(f"SHA-256 of the pack's {INDEX}, which contains that of every file")]
+    path: Annotated[str, _doc("path of the references in the pack")]
 
 
 class Origin(msgspec.Struct, frozen=True, kw_only=True):
-    """What a file of results says of itself, so that a published result can be repeated."""
+    """The origin of a file of results, so that a published result can be repeated."""
 
     version: Annotated[str, _doc("version of mi_refract that wrote this")]
     command: Annotated[str, _doc("the command line that wrote this")]
-    pack: Annotated[PackReference | None, _doc("the reference pack that the references are from; null: none")]
+    pack: Annotated[PackReference | None, _doc("the pack that contains the references; null: none")]
 
 
 def origin(words: Sequence[str], pack: PackReference | None) -> Origin:
-    """The origin of what this version of `mi-refract` writes, called with these words."""
+    """Return the origin of results that this version of `mi-refract` writes with these arguments."""
     return Origin(version=__version__, command=shlex.join(["mi-refract", *words]), pack=pack)
 
 
 def sums(index: bytes, files: dict[str, PackedFile]) -> str:
-    """The text of SUMS for an index with these bytes and files."""
+    """Return the text of SUMS for an index with these bytes and files."""
     digests = {name: file.sha256 for name, file in files.items()} | {INDEX: hashlib.sha256(index).hexdigest()}
     return "".join(f"{digest}  {name}\n" for name, digest in sorted(digests.items()))
 
 
 def of_references(reference: Path, answers: Path | None = None) -> PackReference | None:
-    """The pack that holds a file or folder of references; None where no pack does.
+    """Return the pack that contains a file or folder of references; None if no pack does.
 
-    Every file of the pack is read. ValueError, one line, where one is missing, damaged or edited, the pack has another
-    format, a reference is no file of it, or `answers` lie in or below a folder with the INDEX of another pack. OSError
-    where a file cannot be read.
+    Every file of the pack is read. ValueError, one line, if a file is missing, damaged or edited, if the pack has
+    another format, if a reference is not a file of the pack, or if `answers` are in a folder with the INDEX of another
+    pack. OSError if a file cannot be read.
     """
-    places = reference.absolute(), reference.resolve()  # a link in a pack is a file of it
-    found = next(((place, folder) for place in places for folder in (place, *place.parents) if _is_pack(folder)), None)
-    if found is None:
+    places = reference.absolute(), reference.resolve()  # a link inside a pack is a file of that pack
+    packs = ((place, folder) for place in places for folder in (place, *place.parents) if _is_pack(folder))
+    place, root = next(packs, (None, None))
+    if place is None or root is None:
         return None
-    place, root = found
     path = root / INDEX
     if not path.is_file():
         raise ValueError(f"{path}: missing, or not a file; {EXPECTED}")
@@ -104,10 +104,10 @@ def of_references(reference: Path, answers: Path | None = None) -> PackReference
                 raise ValueError(f"{root / name}: damaged or edited: its SHA-256 is not that of {INDEX}; {EXPECTED}")
     if safe_files.read_bytes(root / SUMS, MOST) != sums(text, index.files).encode():
         raise ValueError(f"{root / SUMS}: not the digests of {INDEX}: one of the two was edited; {EXPECTED}")
-    for each in [place] if place.is_file() else sorted(place.rglob("*")):
-        name = each.relative_to(root).as_posix()
-        if each.is_file() and name not in {*index.files, INDEX, SUMS}:
-            raise ValueError(f"{each}: not a file of the pack {root}; expected answers in another folder")
+    for entry in [place] if place.is_file() else sorted(place.rglob("*")):
+        name = entry.relative_to(root).as_posix()
+        if entry.is_file() and name not in {*index.files, INDEX, SUMS}:
+            raise ValueError(f"{entry}: not a file of the pack {root}; expected answers in another folder")
     for folder in (answers.resolve(), *answers.resolve().parents) if answers else ():
         if (folder / INDEX).is_file():
             if safe_files.read_bytes(folder / INDEX, MOST) != text:
@@ -117,7 +117,7 @@ def of_references(reference: Path, answers: Path | None = None) -> PackReference
 
 
 def _is_pack(folder: Path) -> bool:
-    """Whether its SUMS name an INDEX. An INDEX alone says which pack the answers beside it are to."""
+    """Return whether the folder has SUMS that name an INDEX. An INDEX alone is beside answers to that pack."""
     if not (folder / SUMS).is_file():
         return False
     with (folder / SUMS).open("rb") as file:
@@ -129,6 +129,7 @@ def _parsed(text: bytes, path: Path) -> PackIndex:
         data = json.loads(text)
     except (ValueError, RecursionError):
         raise ValueError(f"{path}: damaged: not JSON; {EXPECTED}") from None
-    if (found := data.get("format") if isinstance(data, dict) else None) != FORMAT:
-        raise ValueError(f"{path}: a pack of another version: format {str(found)[:60]!r}; expected {FORMAT!r}")
+    format_name = data.get("format") if isinstance(data, dict) else None
+    if format_name != FORMAT:
+        raise ValueError(f"{path}: a pack of another version: format {str(format_name)[:60]!r}; expected {FORMAT!r}")
     return convert(data, PackIndex, str(path))

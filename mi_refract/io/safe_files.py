@@ -1,10 +1,10 @@
-"""Files: only regular ones are read; they are either the old version or the new one, never half of it; and locks.
+"""Files: reading of regular files only, atomic writing, temporary files and folders, and locks.
 
-They are written under a temporary name in the same folder and renamed at the end. An exception or Ctrl-C removes the
-temporary one; a process that SIGKILL ends leaves it behind, hidden (`.NAME.….part`). A temporary folder that is left
-behind is removed by the next process that makes one.
-A lock is the operating system's (`flock`), so it ends with the process that holds it, however that ends. Windows has
-none: there nobody is kept out, and temporary folders of killed processes stay.
+A file is written under a temporary name in the same folder and renamed at the end. An exception or Ctrl-C removes the
+temporary file; after SIGKILL it remains, hidden (`.NAME.….part`). A temporary folder that remains is removed by the
+next process that creates one.
+Locks are those of the operating system (`flock`), which releases them whenever the process ends. Windows has no such
+locks: there no process is excluded, and temporary folders of killed processes remain.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-_PIECE = 2**20  # bytes
-_KEPT = 40  # characters of the file's own name: a name of 255 bytes has no room for more
+_CHUNK = 2**20  # bytes
+_NAME_LENGTH = 40  # characters of the file's name in a temporary name, which may have up to 255 bytes
 _KINDS = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 _LONGEST_CHANGE = 5.0  # seconds that creating or renaming may take on a slow file system
 _unfinished: set[Path] = set()
-# Names of temporary folders: no user chooses them, and a lock may not be seen by other hosts that share the disk.
+# Names of temporary folders contain the host, because other hosts that share the disk may not see a lock.
 _PREFIX, _SUFFIX = f"mi_refract-{zlib.crc32(platform.node().encode()):08x}-", ".part"
 _TEMPORARY = re.compile(r"\.[0-9a-f]{32}\.part")
-_AS_IT_IS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)  # no link; not for other programs
-_FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | _AS_IT_IS
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)  # and not inherited by other programs
+_FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | _NO_LINK
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
-_changing = threading.Lock()  # held where `_unfinished` changes, or a file in it is created or renamed
+_changing = threading.Lock()  # held while `_unfinished` changes, or while a path in it is created or renamed
 
 
 def writable(path: str | os.PathLike[str], suffixes: Sequence[str]) -> Path:
-    """`path` as a Path, if a file can be written there.
+    """Return `path` as a Path, if a file can be written there.
 
-    `suffixes`: accepted endings of the name, in lower case, with the dot. ValueError for another name; OSError for a
-    path that exists and is not a regular file, or for a folder that is missing or not writable.
+    `suffixes`: accepted suffixes, in lower case, with the dot. ValueError for another suffix; OSError if the path
+    exists and is not a regular file, or if its folder is missing or not writable.
     """
     path = Path(path)
     if path.suffix.lower() not in suffixes:
@@ -65,9 +65,9 @@ def writable(path: str | os.PathLike[str], suffixes: Sequence[str]) -> Path:
 
 
 def _require_file(path: Path) -> None:
-    """OSError where `path` exists and is not a regular file: a device or pipe must not be replaced by a file."""
+    """Raise OSError if `path` exists and is not a regular file: a device or pipe must not be replaced by a file."""
     names = [path, path.parent / path.readlink()] if path.is_symlink() else [path]
-    if any(name.parent.resolve().is_relative_to("/proc") for name in names):  # /dev/stdout, /dev/fd/3: may be of a file
+    if any(name.parent.resolve().is_relative_to("/proc") for name in names):  # /dev/stdout, /dev/fd/3, even of a file
         raise OSError(f"{path}: is a stream; expected the name of a file")
     kind = stat.S_IFMT(path.stat().st_mode) if path.exists() else stat.S_IFREG
     if kind == stat.S_IFDIR:
@@ -77,7 +77,7 @@ def _require_file(path: Path) -> None:
 
 
 def check_parent(path: Path) -> None:
-    """OSError where the parent folder of `path` is missing or not writable."""
+    """Raise OSError if the parent folder of `path` is missing or not writable."""
     if not path.parent.is_dir():
         raise NotADirectoryError(f"{path}: {path.parent} is not a folder; expected an existing one")
     if not os.access(path.parent, os.W_OK | os.X_OK):
@@ -85,16 +85,16 @@ def check_parent(path: Path) -> None:
 
 
 def temporary_name(path: Path, suffix: str = "") -> Path:
-    """A hidden name beside `path` that nobody can guess."""
-    return path.with_name(f".{path.name[:_KEPT]}.{secrets.token_hex(16)}.part{suffix}")
+    """Return a hidden, unpredictable name beside `path`."""
+    return path.with_name(f".{path.name[:_NAME_LENGTH]}.{secrets.token_hex(16)}.part{suffix}")
 
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str], suffix: str = "", *, folder: bool = False) -> Iterator[Path]:
     """Yield the path of a new empty file, or with `folder` a new empty folder, that replaces `path` at the end.
 
-    It lies beside `path`, its name ends in `suffix`, and it has the permissions of an existing `path`. On any exception
-    it is removed, and `path` stays as it was. OSError from the system, or where `path` is not a regular file.
+    It is beside `path`, its name ends in `suffix`, and it has the permissions of an existing `path`. After any
+    exception it is removed, and `path` is unchanged. OSError from the system, and if `path` is not a regular file.
     """
     with beside(path, suffix, folder=folder) as temporary:
         yield temporary
@@ -105,14 +105,17 @@ def replacing(path: str | os.PathLike[str], suffix: str = "", *, folder: bool = 
 
 @contextlib.contextmanager
 def beside(path: str | os.PathLike[str], suffix: str = "", *, folder: bool = False) -> Iterator[Path]:
-    """As `replacing`, but only `move_into_place` renames it, and what it has not renamed is removed at the end."""
+    """Yield a path as `replacing`, but remove it at the end unless `move_into_place` has renamed it."""
     path = Path(path)
     if not folder:
         _require_file(path)
     mode = stat.S_IMODE(path.stat().st_mode) if path.exists() else None
     temporary = temporary_name(path, suffix)
     with _changing, full_disk_names(path):
-        temporary.mkdir() if folder else temporary.touch(exist_ok=False)  # O_EXCL: an existing name or link is an error
+        if folder:
+            temporary.mkdir()
+        else:
+            temporary.touch(exist_ok=False)
         _unfinished.add(temporary)
         if mode is not None:
             temporary.chmod(mode | (stat.S_IRWXU if folder else stat.S_IRUSR | stat.S_IWUSR))
@@ -124,7 +127,7 @@ def beside(path: str | os.PathLike[str], suffix: str = "", *, folder: bool = Fal
 
 
 def move_into_place(temporary: Path, path: str | os.PathLike[str]) -> None:
-    """Rename what `beside` made to `path`, whose permissions it takes."""
+    """Rename a file or folder from `beside` to `path`, with the permissions of an existing `path`."""
     path = Path(path)
     with _changing:
         if path.exists():
@@ -134,19 +137,19 @@ def move_into_place(temporary: Path, path: str | os.PathLike[str]) -> None:
 
 
 def sync(path: Path) -> None:
-    """Wait until the file is on the disk. OSError where there is no room for it."""
-    with path.open("r+b") as file, full_disk_names(path):  # Windows syncs only what may be written
+    """Wait until the file is on the disk. OSError if the disk is full."""
+    with path.open("r+b") as file, full_disk_names(path):  # Windows can sync only writable files
         os.fsync(file)
 
 
 def is_full_disk(error: BaseException) -> bool:
-    """Whether this is the error of a full disk, of a quota or of a limit on the size of files."""
+    """Return whether this is the error of a full disk, of a quota or of a limit on the size of files."""
     return isinstance(error, OSError) and error.errno in _FULL
 
 
 @contextlib.contextmanager
 def full_disk_names(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Within, the error of a full disk, of a quota or of a limit on the size of files names this file."""
+    """Within the context, add this path to errors of a full disk, of a quota or of a limit on the size of files."""
     try:
         yield
     except OSError as error:
@@ -157,9 +160,9 @@ def full_disk_names(path: str | os.PathLike[str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """A new folder for temporary files, removed at the end, also by `end_process`.
+    """Yield a new folder for temporary files, which is removed at the end, also by `end_process`.
 
-    Folders whose processes on this host were killed are removed first: a process that lives locks its folder.
+    Folders of killed processes on this host are removed first; a running process locks its folder.
     """
     parent = Path(tempfile.gettempdir())
     _remove_abandoned(parent)
@@ -167,9 +170,9 @@ def temporary_folder() -> Iterator[Path]:
         with _changing:
             folder = Path(tempfile.mkdtemp(_SUFFIX, _PREFIX, parent))
             _unfinished.add(folder)
-        with contextlib.suppress(FileNotFoundError):  # another process found it before it was locked
-            lock = os.open(folder if fcntl else os.devnull, _FOLDER)  # Windows opens no folder
-            with contextlib.suppress(OSError):  # a file system without locks: nobody gets one
+        with contextlib.suppress(FileNotFoundError):  # another process has removed it before it was locked
+            lock = os.open(folder if fcntl else os.devnull, _FOLDER)  # Windows cannot open folders
+            with contextlib.suppress(OSError):  # the file system has no locks
                 _lock(lock)
             if folder.is_dir():
                 break
@@ -182,16 +185,16 @@ def temporary_folder() -> Iterator[Path]:
 
 
 def _lock(file: int, *, wait: bool = True) -> None:
-    """Lock an open file for this process. BlockingIOError where another has it; OSError where there are no locks."""
+    """Lock an open file for this process. BlockingIOError if another process has locked it; OSError without locks."""
     if not fcntl:
         raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
     fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
 
 
-@functools.cache  # once in a process
+@functools.cache  # once per process
 def _remove_abandoned(parent: Path) -> None:
     for folder in parent.glob(f"{_PREFIX}*{_SUFFIX}"):
-        with contextlib.suppress(OSError):  # locked, another user's, or gone meanwhile
+        with contextlib.suppress(OSError):  # the folder is locked, belongs to another user, or has been removed
             lock = os.open(folder, _FOLDER)
             try:
                 _lock(lock, wait=False)
@@ -216,9 +219,9 @@ def _remove(temporary: Path) -> None:
 
 
 def end_process(code: int) -> NoReturn:
-    """Remove all temporary files and folders, and end this process at once, whatever its other threads do."""
-    _changing.acquire(timeout=_LONGEST_CHANGE)  # never released: nothing is created or renamed from here on
-    for pause in (0.1, 0.0):  # twice: a thread that was about to open a file by its name creates it again
+    """Remove all temporary files and folders, and end this process at once, even if other threads are running."""
+    _changing.acquire(timeout=_LONGEST_CHANGE)  # never released: from here on nothing is created or renamed
+    for pause in (0.1, 0.0):  # twice, because a thread that is just opening a file by its name creates it again
         for temporary in tuple(_unfinished):
             _remove(temporary)
         time.sleep(pause if _unfinished else 0.0)
@@ -226,7 +229,7 @@ def end_process(code: int) -> NoReturn:
 
 
 def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> None:
-    """Replace the file `path` by `content` (text as UTF-8), complete or not at all. OSError as of `replacing`."""
+    """Replace the file `path` by `content` (text as UTF-8), completely or not at all. Errors: those of `replacing`."""
     with replacing(path) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
@@ -234,8 +237,8 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> None
 def update_between(path: str | Path, marker: str, text: str) -> None:
     """Put `text` between `<!-- begin: marker -->` and `<!-- end: marker -->`, each on its own line.
 
-    ValueError unless the file holds exactly one such pair in that order, or where `text` contains a marker itself;
-    OSError from reading or writing. The file is unchanged then.
+    ValueError unless the file contains exactly one such pair in that order, and if `text` contains a marker; OSError
+    from reading or writing. After an error the file is unchanged.
     """
     path = Path(path)
     begin, end = f"<!-- begin: {marker} -->", f"<!-- end: {marker} -->"
@@ -253,26 +256,26 @@ def update_between(path: str | Path, marker: str, text: str) -> None:
 
 @contextlib.contextmanager
 def held(path: Path, what: str, place: Path | None = None, expected: str = "another folder") -> Iterator[None]:
-    """Hold the lock file `path` within a `with` block, and remove it at the end.
+    """Hold the lock file `path` within the context, and remove it at the end.
 
-    BlockingIOError, at once and in one line, where another process holds it: `what` runs at `place` (by default the
-    folder of the lock file), in which process, and since when. OSError where the file cannot be made. A file system
-    without locks, as some networks', keeps nobody out.
+    BlockingIOError, at once and in one line, if another process holds it: that `what` runs at `place` (by default the
+    folder of the lock file), in which process, and since when. OSError if the file cannot be created. On a file system
+    without locks, as in some networks, no process is excluded.
     """
     while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT | _AS_IT_IS, 0o644)
+        file = os.open(path, os.O_RDWR | os.O_CREAT | _NO_LINK, 0o644)
         try:
             _lock(file, wait=False)
             with contextlib.suppress(FileNotFoundError):
                 if os.path.samestat(path.lstat(), os.fstat(file)):
                     break
-            os.close(file)  # its holder removed it meanwhile
+            os.close(file)  # its holder has removed it
         except BlockingIOError:
             os.close(file)
             holder = "in an unknown process"
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError), path.open("rb") as text:
-                said = json.loads(text.read(1000))  # it need not be complete: nobody waits for that
-                holder = f"in process {said['process']} on {said['host']} since {said['since']}"
+                content = json.loads(text.read(1000))  # may be incomplete
+                holder = f"in process {content['process']} on {content['host']} since {content['since']}"
             where = f"{place or path.parent}: {what} is already running {holder}"
             raise BlockingIOError(f"{where}; expected {expected}") from None
         except OSError as error:
@@ -286,10 +289,10 @@ def held(path: Path, what: str, place: Path | None = None, expected: str = "anot
         os.write(file, json.dumps({"process": os.getpid(), "host": platform.node(), "since": since}).encode())
         yield
     finally:
-        if fcntl:  # while it is held: nobody else's file is removed
+        if fcntl:  # before closing, so that no other process's file is removed
             path.unlink(missing_ok=True)
         os.close(file)
-        if not fcntl:  # Windows removes no file that is open
+        if not fcntl:  # Windows cannot remove open files
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
 
@@ -299,12 +302,11 @@ def held(path: Path, what: str, place: Path | None = None, expected: str = "anot
 
 @contextlib.contextmanager
 def opened(path: str | os.PathLike[str], most: int) -> Iterator[BufferedReader]:
-    """The file, open for reading, of `most` bytes at most.
+    """Yield the file, open for reading, if it has at most `most` bytes.
 
-    ValueError for a larger one, or for what is no file: a pipe or a device may never end. OSError where it cannot be
-    read.
+    ValueError for a larger file, and for a pipe or a device, which may never end. OSError if it cannot be read.
     """
-    # A pipe without a writer would block when it is opened.
+    # Without O_NONBLOCK, opening a pipe that has no writer would block.
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0))) as file:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
@@ -315,23 +317,23 @@ def opened(path: str | os.PathLike[str], most: int) -> Iterator[BufferedReader]:
 
 
 def read_bytes(path: str | os.PathLike[str], most: int) -> bytes:
-    """The bytes of the file. Errors as of `opened`; ValueError also where it grew meanwhile."""
+    """Return the bytes of the file. Errors: those of `opened`, and ValueError if it grows beyond `most` bytes."""
     with opened(path, most) as file:
-        # `read(n)` asks for n bytes of memory before it reads: not for `most`, which may be all there are.
+        # `read(n)` allocates n bytes before it reads, and `most` may be the whole memory.
         size = os.fstat(file.fileno()).st_size
         content = file.read(size + 1)
-        while size < len(content) <= most and (more := file.read(_PIECE)):  # it grew meanwhile
-            content += more
+        while size < len(content) <= most and (chunk := file.read(_CHUNK)):  # the file is growing
+            content += chunk
     if len(content) > most:
         raise ValueError(f"{path}: more than {most} bytes")
     return content
 
 
 def copy(source: str | os.PathLike[str], target: Path, most: int = sys.maxsize) -> str:
-    """Copy a regular file of up to `most` bytes into the file `target`; its SHA-256. Errors as of `opened`."""
+    """Copy a regular file of up to `most` bytes to `target`, and return its SHA-256. Errors: those of `opened`."""
     digest = hashlib.sha256()
-    with opened(source, most) as file, full_disk_names(target), target.open("wb") as copied:
-        while piece := file.read(_PIECE):
-            digest.update(piece)
-            copied.write(piece)
+    with opened(source, most) as file, full_disk_names(target), target.open("wb") as target_file:
+        while chunk := file.read(_CHUNK):
+            digest.update(chunk)
+            target_file.write(chunk)
     return digest.hexdigest()

@@ -1,7 +1,7 @@
-"""Refractive indices of materials by wavelength. Wavelengths are in nanometres, in air or in vacuum as the source says.
+"""Refractive indices of materials by wavelength, in nanometres, in air or vacuum as in the material's source.
 
-In: what a scene says of a material, a number or a string (see `parse`), and wavelengths as floats, numpy arrays or
-Dr.Jit arrays. Out: indices in double precision; Dr.Jit differentiates those of its arrays. Nothing here refracts.
+Input: the specification of a material in a scene, a number or a string (see `parse`), and wavelengths as floats, numpy
+arrays or Dr.Jit arrays. Output: indices in double precision; Dr.Jit can differentiate those of its arrays.
 """
 
 from . import glass_catalogs

@@ -1,6 +1,6 @@
-"""A material as an index of refraction by wavelength, and formulas of dispersion: n by λ in nm and by coefficients.
+"""A material as a function from wavelength to index, and dispersion formulas: n from λ in nm and coefficients.
 
-A formula takes floats, numpy arrays or Dr.Jit arrays alike, in double precision; Dr.Jit differentiates it.
+A formula takes floats, numpy arrays or Dr.Jit arrays, in double precision; Dr.Jit can differentiate it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import drjit as dr
 
 from mi_refract.numerics import Mask, Number, differentiated
 
-# Spectral lines by their letters, in nm, as catalogues of glass print them.
+# Wavelengths in nm of spectral lines by their letters, as in glass catalogues.
 # fmt: off
 LINES = {
     "i": 365.0146, "h": 404.6561, "g": 435.8343, "F'": 479.9914, "F": 486.1327, "e": 546.0740, "d": 587.5618,
@@ -26,11 +26,11 @@ LINES = {
 Coefficients = Mapping[str, Number]
 ANY = (0.0, math.inf)
 NANOMETRES = 1000  # in a µm
-TABLE_VALUES = "values"  # among the coefficients of a table: all of them, in one array
+TABLE_VALUES = "values"  # optional coefficient of a table: all its values in one array
 
 
 def where(condition: Mask, x: Number, y: Number) -> Number:
-    """`x` where the condition holds, else `y`; of any kind of number. NumPy is imported where it is used."""
+    """`x` where the condition is True, else `y`; for any kind of number."""
     if any(map(dr.is_array_v, (condition, x, y))):
         return dr.select(condition, x, y)
     import numpy as np
@@ -42,11 +42,11 @@ class Dispersion:
     """n(λ) with named coefficients."""
 
     def index(self, wavelength: Number, c: Coefficients) -> Number:
-        """N, dimensionless; here the same at all wavelengths."""
+        """The index at a wavelength; here the same at all wavelengths."""
         return c["n"] + 0 * wavelength
 
     def poles(self, c: Coefficients) -> dict[str, float]:
-        """Wavelengths at which n is infinite, in nm, by the coefficient that puts them there; here none."""
+        """Wavelengths in nm at which n is infinite, by the coefficient that determines them; here none."""
         return {}
 
 
@@ -57,8 +57,8 @@ CONSTANT = Dispersion()
 class Terms(Dispersion):
     """n or n² as `constant` + Σ a λ^p + Σ B λ²/(λ² − C): Cauchy's, Sellmeier's and Schott's formulas.
 
-    Powers: pairs of a coefficient's name and p. Resonances: pairs of the names of B and C, C in nm², or in nm where
-    `squared` (the resonance's wavelength itself is given).
+    powers: pairs of a coefficient's name and p. resonances: pairs of the names of B and C. C is in nm²; if `squared`,
+    the coefficient is its root, the wavelength of the resonance in nm.
     """
 
     power: int  # 1: the sum is n, 2: it is n²
@@ -68,7 +68,7 @@ class Terms(Dispersion):
     squared: bool = False
 
     def index(self, wavelength: Number, c: Coefficients) -> Number:
-        """NaN where n² is negative."""
+        """The index at a wavelength; NaN if n² is negative."""
         square = wavelength * wavelength
         total = self.constant + 0 * wavelength
         for name, p in self.powers:
@@ -88,19 +88,19 @@ class Terms(Dispersion):
             return np.sqrt(total)
 
     def poles(self, c: Coefficients) -> dict[str, float]:
-        """The wavelengths of the resonances, by name."""
+        """The wavelengths of the resonances."""
         squares = {r: float(c[r] ** 2 if self.squared else c[r]) for _, r in self.resonances}
         return {name: math.sqrt(square) for name, square in squares.items() if square > 0}
 
 
 class Abbe(Dispersion):
-    """A glass of which n_d and V_d are known: n = n_d + (n_d − 1)/V_d g, g = (λ⁻² − λ_d⁻²)/(λ_F⁻² − λ_C⁻²).
+    """A glass given by n_d and V_d: n = n_d + (n_d − 1)/V_d g, g = (λ⁻² − λ_d⁻²)/(λ_F⁻² − λ_C⁻²).
 
-    That is Cauchy's formula with two terms, through n_d, with V_d = (n_d − 1)/(n_F − n_C).
+    This is Cauchy's formula with two terms that has this n_d and this V_d = (n_d − 1)/(n_F − n_C).
     """
 
     def index(self, wavelength: Number, c: Coefficients) -> Number:
-        """Infinite at λ = 0 only."""
+        """The index at a wavelength; infinite only at λ = 0."""
         d, f, line_c = (LINES[line] ** -2 for line in "dFC")
         g = (1 / (wavelength * wavelength) - d) / (f - line_c)
         return c["n_d"] + (c["n_d"] - 1) / c["V_d"] * g
@@ -108,25 +108,25 @@ class Abbe(Dispersion):
 
 @dataclass(frozen=True)
 class Table(Dispersion):
-    """n at given wavelengths, increasing, and between two of them linear. The coefficients are the values of n."""
+    """n at given, increasing wavelengths, linear between them. The coefficients are the values of n."""
 
     knots: tuple[float, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the coefficients: `n_587_6` is n at 587.6 nm; of nine digits, or 17 where knots agree to nine."""
+        """Names of the coefficients: `n_587_6` is n at 587.6 nm; with 9 digits, or 17 if knots agree in 9."""
         digits = 9 if len({f"{knot:.9g}" for knot in self.knots}) == len(self.knots) else 17
         return tuple("n_" + f"{knot:.{digits}g}".replace(".", "_") for knot in self.knots)
 
     def index(self, wavelength: Number, c: Coefficients) -> Number:
-        """0 beyond the first knot and the last. `c[TABLE_VALUES]`: all values in one array, which kernels need."""
+        """The index at a wavelength, 0 outside the knots. `c[TABLE_VALUES]`: all values in one array, for kernels."""
         last, names = len(self.knots) - 2, self.names
-        segment: Any  # by number, in which the wavelength lies
+        segment: Any  # the number of the segment that contains the wavelength
         values: Any
         if not dr.is_array_v(wavelength):
             import numpy as np
 
-            segment = np.searchsorted(self.knots[1:-1], wavelength)  # a knot is the end of one
+            segment = np.searchsorted(self.knots[1:-1], wavelength)  # a knot belongs to the segment that it ends
             if np.ndim(segment):
                 values = np.array([c[name] for name in names])
                 start, end = values[segment], values[segment + 1]
@@ -141,34 +141,36 @@ class Table(Dispersion):
             if values is None:
                 values = wide([dr.detach(c[name])[0] if dr.is_array_v(c[name]) else c[name] for name in names])
             segment = dr.zeros(dr.uint32_array_t(wide))
-            for bit in reversed(range(last.bit_length())):  # the last that begins below the wavelength, or 0
+            for bit in reversed(range(last.bit_length())):  # the last segment that starts below the wavelength, or 0
                 later = dr.minimum(segment + (1 << bit), last)
                 segment = dr.select(dr.gather(wide, knots, later) < wavelength, later, segment)
             left, right = (dr.gather(wide, knots, segment + i) for i in (0, 1))
             start, end = (dr.gather(wide, values, segment + i) for i in (0, 1))
-        share = (wavelength - left) / (right - left)  # 0 at `left`, 1 at `right`: there the value is the knot's own
+        share = (wavelength - left) / (right - left)  # exactly 0 at `left` and 1 at `right`, so knots keep their values
         between = start * (1 - share) + end * share
         if dr.is_array_v(wavelength):
             for i, name in enumerate(names):
-                if differentiated(value := c[name]) or dr.width(value) > 1:
+                value = c[name]
+                if differentiated(value) or dr.width(value) > 1:
                     weight = dr.select(segment == i, 1 - share, dr.select(segment + 1 == i, share, 0))
                     between += weight * (value - (dr.detach(value) if dr.width(value) == 1 else dr.detach(value)[0]))
         return where((wavelength >= self.knots[0]) & (wavelength <= self.knots[-1]), between, 0 * wavelength)
 
 
 def table(pairs: Sequence[tuple[float, float]]) -> tuple[Table, dict[str, float]]:
-    """n linear between pairs of λ in nm and n. ValueError, without saying where, for what is no table of an index."""
+    """n from pairs of λ in nm and n, linear between them. ValueError, without the place, for an invalid table."""
     knots = tuple(w for w, _ in pairs)
     if len(knots) < 2 or not all(0 < a < b < math.inf for a, b in itertools.pairwise(knots)):
         raise ValueError("expected two or more wavelengths, increasing")
-    if bad := [f"{n:g} at {w:g} nm" for w, n in pairs if not 0 < n < math.inf]:
+    bad = [f"{n:g} at {w:g} nm" for w, n in pairs if not 0 < n < math.inf]
+    if bad:
         raise ValueError(f"n = {bad[0]}; expected a positive finite index")
     form = Table(knots)
     return form, dict(zip(form.names, (n for _, n in pairs), strict=True))
 
 
 def sellmeier(values: Sequence[float], squared: bool = False) -> tuple[Terms, dict[str, float]]:
-    """n² = 1 + Σ B_i λ²/(λ² − C_i), first all B, then all C in nm²; where `squared`, C_i = λ_i², and λ_i is given."""
+    """n² = 1 + Σ B_i λ²/(λ² − C_i); `values`: all B, then all C in nm², or if `squared` the λ_i with C_i = λ_i²."""
     letter = "L" if squared else "C"
     pairs = tuple((f"B{i}", f"{letter}{i}") for i in range(1, len(values) // 2 + 1))
     names = [b for b, _ in pairs] + [r for _, r in pairs]
@@ -176,7 +178,7 @@ def sellmeier(values: Sequence[float], squared: bool = False) -> tuple[Terms, di
 
 
 def power_series(power: int, terms: Iterable[tuple[float, float]]) -> tuple[Terms, dict[str, float]]:
-    """n or n² (`power` 1 or 2) = Σ a λ^p, of pairs of a and p for λ in µm. The coefficients, a0, a2, a_2, …: in nm."""
+    """n or n² (`power` 1 or 2) = Σ a λ^p, from pairs (a, p) for λ in µm. Coefficients a0, a2, a_2, … for λ in nm."""
     totals: dict[float, float] = {}
     for a, p in terms:
         totals[p] = totals.get(p, 0.0) + a
@@ -187,17 +189,17 @@ def power_series(power: int, terms: Iterable[tuple[float, float]]) -> tuple[Term
 
 @dataclass(frozen=True)
 class Medium:
-    """n(λ) of a material. λ is in nm; indices are in double precision, whatever the type of λ."""
+    """n(λ) of a material. λ is in nm; indices are in double precision for any type of λ."""
 
     name: str
     dispersion: Dispersion
     coefficients: dict[str, float]
-    valid: tuple[float, float] = ANY  # nm; outside there is no index
-    relative_to: str = ""  # "air" (20 °C, 101325 Pa, dry) or "vacuum"; "" where the source does not say
+    valid: tuple[float, float] = ANY  # nm; outside it there is no index
+    relative_to: str = ""  # "air" (20 °C, 101325 Pa, dry) or "vacuum"; "" if unknown
     is_air: bool = False
-    fitted: tuple[float, float] = ANY  # nm; outside, but within `valid`, the formula extrapolates
-    hold: bool = False  # outside `valid` the index is that of its end
-    k: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # λ in nm, and there the imaginary part of the index
+    fitted: tuple[float, float] = ANY  # nm; outside it, but within `valid`, the formula extrapolates
+    hold: bool = False  # outside `valid`, use the index at its end
+    k: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # wavelengths in nm, imaginary parts of the index
 
     @property
     def dispersive(self) -> bool:
@@ -208,36 +210,40 @@ class Medium:
         """n at a wavelength.
 
         `wavelength`: in nm; a float, a numpy array of any shape, or a Dr.Jit array; the result has its shape.
-        `coefficients`: other values of some of the medium's own, for derivatives. Outside `valid` without `hold`, or
-        where n is not a positive number: NaN of Dr.Jit arrays, ValueError of floats and numpy arrays; these give a
-        warning outside `fitted`, and outside `valid` with `hold`.
+        `coefficients`: values that replace some of the medium's own, for derivatives. Outside `valid` without `hold`,
+        or if n is not a positive number: NaN for Dr.Jit arrays, ValueError for floats and numpy arrays. For these there
+        is a warning outside `fitted`, and outside `valid` with `hold`.
         """
         n = self.index_or_nan(wavelength, coefficients)
         if not dr.is_array_v(wavelength):
             import numpy as np
 
             wavelengths, (low, high) = np.atleast_1d(wavelength), self.valid
-            if (missing := np.isnan(np.atleast_1d(n))).any():
+            missing = np.isnan(np.atleast_1d(n))
+            if missing.any():
                 text = f"{self.name}: no index at {wavelengths[missing][0]:g} nm"
                 raise ValueError(f"{text}; expected a wavelength from {low:g} to {high:g} nm, or hold(…) around it")
-            if self.hold and (held := wavelengths[(wavelengths < low) | (wavelengths > high)]).size:
-                text = f"{self.name}: the index at {held[0]:g} nm is that of the end of its range"
+            outside = wavelengths[(wavelengths < low) | (wavelengths > high)]
+            if self.hold and outside.size:
+                text = f"{self.name}: the index at {outside[0]:g} nm is that of the end of its range"
                 warnings.warn(f"{text}, {low:g} to {high:g} nm", stacklevel=2)
             low, high = self.fitted
-            if (beyond := wavelengths[(wavelengths < low) | (wavelengths > high)]).size:
-                text = f"{self.name}: the index at {beyond[0]:g} nm is an extrapolation"
+            outside = wavelengths[(wavelengths < low) | (wavelengths > high)]
+            if outside.size:
+                text = f"{self.name}: the index at {outside[0]:g} nm is an extrapolation"
                 warnings.warn(f"{text}; its formula is fitted from {low:g} to {high:g} nm", stacklevel=2)
         return n
 
     def index_or_nan(self, wavelength: Number, coefficients: Coefficients | None = None) -> Number:
-        """As `index`, with NaN for every type instead of an error."""
-        if compiled := dr.is_array_v(wavelength):
+        """As `index`, with NaN instead of an error for every type."""
+        compiled = dr.is_array_v(wavelength)
+        if compiled:
             wide: Any = dr.float64_array_t(type(wavelength))
             x = wide(wavelength)
         else:
             import numpy as np
 
-            x = np.asarray(wavelength, np.float64)  # a float, too: operations of numpy give NaN and do not raise
+            x = np.asarray(wavelength, np.float64)  # floats too, as numpy returns NaN where Python raises
         valid = x > 0
         if self.hold:
             x = dr.clip(x, *self.valid) if compiled else np.clip(x, *self.valid)

@@ -1,7 +1,7 @@
-"""Indices from files: a table as CSV, a page of refractiveindex.info as YAML, a glass of a catalogue for Zemax (AGF).
+"""Indices from files: a table as CSV, a page of refractiveindex.info as YAML, a glass of a Zemax catalogue (AGF).
 
-Their wavelengths are in µm, but for a CSV, whose header says nm or µm. k, the imaginary part of the index, is kept
-where a file has it.
+Wavelengths are in µm, except in CSV files, whose header contains nm or µm. k, the imaginary part of the index, is read
+if a file contains it.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from mi_refract.io.text import parse_number
 
 from .dispersion import NANOMETRES, Medium, Terms, power_series, table
 
-LARGEST = 2**24  # bytes of a file
+LARGEST = 2**24  # largest size of a file in bytes
 PREFIX = "file:"
 UNIT = re.compile(r"(?<![a-z])(?:(nm)|[uµμ]m)(?![a-z])")  # in the header of a CSV
 EXPECTED = "a .csv, a .yml of refractiveindex.info, or a glass of a Zemax catalogue as file:NAME.agf:GLASS"
-# Powers of λ of the coefficients of AGF's formulas of n²; of Conrady's, 5, of n.
+# Powers of λ of the coefficients of AGF's formulas for n²; for Conrady's formula, 5, for n.
 AGF_POWERS: dict[int, tuple[float, ...]] = {
     1: (0, 2, -2, -4, -6, -8),
     5: (0, -1, -3.5),
@@ -32,13 +32,13 @@ AGF_POWERS: dict[int, tuple[float, ...]] = {
     12: (0, 2, -2, -4, -6, -8, 4, 6),
     13: (0, 2, 4, -2, -4, -6, -8, -10, -12),
 }
-AGF_SELLMEIER = {2: 3, 6: 4, 11: 5}  # n² − 1 = Σ K λ²/(λ² − L), K and L in turn: so many
+AGF_SELLMEIER = {2: 3, 6: 4, 11: 5}  # n² − 1 = Σ K λ²/(λ² − L): the number of pairs (K, L)
 
 
 def split(text: str) -> tuple[str, str]:
-    """The file and the glass in it that a text names: ("a.agf", "X") for `file:a.agf:X`; the glass may be "".
+    """The file and the glass that a text names: ("a.agf", "X") for `file:a.agf:X`; the glass may be "".
 
-    ("", "") for a text that names no file.
+    ("", "") for a text that does not name a file.
     """
     if not text.lower().startswith(PREFIX):
         return "", ""
@@ -48,11 +48,11 @@ def split(text: str) -> tuple[str, str]:
 
 
 def read(text: str, label: str, find: Callable[[str], Path]) -> Medium:
-    """The medium that `text` names, as `split` reads it.
+    """The medium of the file and glass that `text` names, as in `split`.
 
-    ValueError, in one line, for a file that cannot be read, or holds no index. MissingExtraError without PyYAML.
+    ValueError, in one line, for a file that cannot be read or contains no index. MissingExtraError without PyYAML.
 
-    label: the parameter and its value, for the message. find: where a file is.
+    label: the parameter and its value, for the error. find: returns the path of a file from its name in `text`.
     """
     name, glass = split(text)
     path, suffix = find(name), Path(name).suffix.lower()
@@ -68,23 +68,24 @@ def read(text: str, label: str, find: Callable[[str], Path]) -> Medium:
         else:
             raise ValueError(f"expected {EXPECTED}")
     except (OSError, ValueError) as error:
-        said = error.strerror if isinstance(error, OSError) and error.strerror else " ".join(str(error).split())
-        raise ValueError(f"{label}: {path}: {said.removeprefix(f'{path}: ')}") from None
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else " ".join(str(error).split())
+        raise ValueError(f"{label}: {path}: {reason.removeprefix(f'{path}: ')}") from None
     return medium
 
 
 def _csv(text: str) -> Medium:
-    """Columns of the wavelength, whose name has its unit, of `n`, and of `k` where there is one; `#` is a comment."""
+    """A medium from columns of wavelengths, whose name contains the unit, `n`, and optionally `k`; # is a comment."""
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     rows = [[cell.strip(' "') for cell in re.split(r"[,;\t]", line.rstrip(" ,;\t"))] for line in lines]
     header = [cell.lower() for cell in rows[0]] if rows else []
     units = [(i, unit) for i, cell in enumerate(header) if (unit := UNIT.search(cell))]
     if len(units) != 1 or "n" not in header:
-        raise ValueError(f"header {','.join(header)!r}; expected nm or µm in one name, n, and optionally k: 'nm,n,k'")
+        expected = "a column whose name contains nm or µm, a column n, and optionally k, as in 'nm,n,k'"
+        raise ValueError(f"header {','.join(header)!r}; expected {expected}")
     column, unit = units[0]
     factor = 1 if unit[1] else NANOMETRES
     expected = f"expected numbers in the columns {', '.join(header)}, with decimal points, and no more columns"
-    if any(len(row) != len(header) for row in rows):  # 400;1,52 for one
+    if any(len(row) != len(header) for row in rows):  # such as 400;1,52
         raise ValueError(expected)
     try:
         values = [
@@ -97,20 +98,24 @@ def _csv(text: str) -> Medium:
 
 
 def _tabulated(kind: str, rows: Sequence[Sequence[float]]) -> Medium:
-    """A table of λ in nm and of what `kind` says: "n", "k" or "nk". Without n the medium has no coefficients."""
+    """A medium from rows of λ in nm and the columns `kind`: "n", "k" or "nk". Without n it has no coefficients."""
     if kind not in ("n", "k", "nk") or {len(row) for row in rows} != {1 + len(kind)}:
-        raise ValueError(f"a table of {kind}; expected n, k or nk, and as many numbers in each line")
+        raise ValueError(f"a table of {kind}; expected n, k or nk, and a number for each in every line")
     wavelengths, columns = [row[0] for row in rows], dict(zip(kind, [*zip(*rows, strict=True)][1:], strict=True))
     form, coefficients = table([*zip(wavelengths, columns.get("n", [1.0] * len(rows)), strict=True)])
     k = columns.get("k", ())
-    if bad := [x for x in k if not 0 <= x < math.inf]:
-        raise ValueError(f"k = {bad[0]:g}; expected a number ≥ 0, and finite")
+    bad = [x for x in k if not 0 <= x < math.inf]
+    if bad:
+        raise ValueError(f"k = {bad[0]:g}; expected a finite number ≥ 0")
     valid = wavelengths[0], wavelengths[-1]
     return Medium("", form, coefficients if "n" in kind else {}, valid, k=(form.knots, tuple(k)) if k else None)
 
 
 def _refractiveindex_info(text: str) -> Medium:
-    """Formulas 1, 2, 3, 5 and 6 and tables; see "Dispersion formulas" there. The first entry with n counts."""
+    """A medium from a page with formula 1, 2, 3, 5 or 6, or a table; of several entries the first with n.
+
+    The formulas are defined on refractiveindex.info in "Dispersion formulas".
+    """
     try:
         import yaml
     except ModuleNotFoundError:
@@ -119,15 +124,17 @@ def _refractiveindex_info(text: str) -> Medium:
         page: Any = yaml.safe_load(text)
         entries = [(str(entry["type"]).split(), entry) for entry in page["DATA"]]
         media = [_entry(kind, entry) for kind, entry in entries]
-        said: dict[str, Any] = (page.get("SPECS") or {}) | (page.get("CONDITIONS") or {})
-        absolute = said.get("n_is_absolute", said.get("n_absolute"))
+        conditions: dict[str, Any] = (page.get("SPECS") or {}) | (page.get("CONDITIONS") or {})
+        absolute = conditions.get("n_is_absolute", conditions.get("n_absolute"))
     except (yaml.YAMLError, KeyError, TypeError, IndexError, AttributeError, ZeroDivisionError):
         raise ValueError("expected a page of refractiveindex.info, with DATA of one formula or table") from None
     with_n = [medium for medium in media if medium.coefficients]
     if not with_n:
         raise ValueError("no index; expected a formula, or tabulated n")
     k = next((medium.k for medium in media if medium.k), None)
-    relative_to = "" if absolute is None else "vacuum" if absolute else "air"
+    relative_to = ""
+    if absolute is not None:
+        relative_to = "vacuum" if absolute else "air"
     return replace(with_n[0], relative_to=relative_to, k=k)
 
 
@@ -160,7 +167,7 @@ def _resonances(power: int, first: float, pairs: Sequence[tuple[float, float]], 
 
 
 def _zemax(text: str, glass: str) -> Medium:
-    """A glass of an AGF catalogue: of lines `NM name formula …`, `CD coefficients`, `LD shortest longest`, in µm."""
+    """A glass of an AGF catalogue, from lines `NM name formula …`, `CD coefficients`, `LD shortest longest` in µm."""
     glasses: dict[str, dict[str, list[str]]] = {}
     lines: dict[str, list[str]] = {}
     for line in text.splitlines():

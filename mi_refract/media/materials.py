@@ -1,4 +1,4 @@
-"""What a scene says of a material, as a `Medium`: a number, a formula, a glass of a catalogue, a material's name.
+"""Parse the specification of a material into a `Medium`: a number, a formula, a glass of a catalogue, or a name.
 
 | text | index; λ in nm unless the name says µm |
 |---|---|
@@ -21,7 +21,7 @@
 | `AIR:ciddor`, `AIR:edlen` | dry, 15 °C, 101325 Pa; Ciddor 1996, Edlén 1966 |
 | `hold(…)` | around any of these: outside its range the index is that at the range's end |
 
-Numbers in the wrong unit or order are an error that says what was probably meant: `cauchy(1.5046, 0.0042)`,
+Numbers in the wrong unit or order cause an error that suggests the right one: `cauchy(1.5046, 0.0042)`,
 `abbe(64.2, 1.517)`, an index above 10.
 """
 
@@ -41,19 +41,19 @@ from mi_refract.numerics import Number
 from . import glass_catalogs, index_files
 from .dispersion import ANY, CONSTANT, Abbe, Coefficients, Dispersion, Medium, Terms, sellmeier, table
 
-VISIBLE = 360.0, 830.0  # nm: where the eye, and Mitsuba, have a response to light
-MICROMETRES = 1.0  # nm², …: a coefficient below is one of square micrometres, …, as catalogues print it
+VISIBLE = 360.0, 830.0  # nm: the range in which the eye, and Mitsuba, respond to light
+MICROMETRES = 1.0  # nm², …: a smaller coefficient is probably in µm², …, as catalogues print it
 CAUCHY_NAMES = "ABCDEFGH"
 POWERS_OF_UNITS = "", "²", "⁴", "⁶", "⁸", "¹⁰", "¹²", "¹⁴"
 FORMULAS_OF_N = ("cauchy", "sellmeier", "sellmeier_nm", "abbe", "table")
-IN_MICROMETRES = ("cauchy", "sellmeier", "table")  # each with a twin NAME_um
+IN_MICROMETRES = ("cauchy", "sellmeier", "table")  # formulas that also exist as NAME_um
 HOLD = re.compile(r"hold\s*\((.*)\)")
-GLASS_CODE = re.compile(r"(\d{3})[-/]?(\d{3})(?:\.\d{3})?")  # 517642, and as Schott prints it 517642.251
-LEAST_CODE = 0.3  # a code of 003283 is n_d = 2.003: no glass has 1.3
-LARGEST_N = 10.0  # of formulas, in the visible: silicon has 6.9
-ABBE_NUMBERS = 5.0, 200.0  # glasses have 17 to 101
-SHORTEST, LONGEST = 30.0, 1e5  # nm: a table that ends below, or begins beyond, is in another unit
-LONGEST_POLE = 1000.0  # µm²: Sellmeier's formula of a glass has one in the ultraviolet
+GLASS_CODE = re.compile(r"(\d{3})[-/]?(\d{3})(?:\.\d{3})?")  # 517642, or with Schott's density 517642.251
+LEAST_CODE = 0.3  # n_d − 1 of a code below this has lost a 1: 003283 means n_d = 2.003, as no glass has n_d < 1.3
+LARGEST_N = 10.0  # largest index of formulas in the visible range: silicon has 6.9
+ABBE_NUMBERS = 5.0, 200.0  # range of V_d: glasses have 17 to 101
+SHORTEST, LONGEST = 30.0, 1e5  # nm: a table that ends below or starts above these is in another unit
+LONGEST_POLE = 1000.0  # µm²: in Sellmeier's formula of a glass, at least one C is below this, in the ultraviolet
 
 
 def _air(name: str, constant: float, terms: tuple[tuple[float, float], ...], valid: tuple[float, float]) -> Medium:
@@ -96,8 +96,8 @@ MATERIALS = {
     )
 }
 _CIDDOR = MATERIALS["AIR:ciddor"]
-# What catalogues of glass have around their samples: 20 °C, 101325 Pa, dry. n − 1 is proportional to the density, here
-# that of an ideal gas: within 2e-8 of Ciddor's own tables.
+# The air around the samples of glass catalogues: 20 °C, 101325 Pa, dry. n − 1 is proportional to the density, here that
+# of an ideal gas, which agrees with Ciddor's own tables to 2e-8.
 LABORATORY_AIR = replace(
     _CIDDOR,
     name="air at 20 °C",
@@ -112,10 +112,10 @@ def relative_index(
     inside_coefficients: Coefficients | None = None,
     outside_coefficients: Coefficients | None = None,
 ) -> Number:
-    """n_inside / n_outside at a wavelength in nm; NaN, for floats as well, where one of them has no index.
+    """n_inside / n_outside at a wavelength in nm; NaN, also for floats, if one of them has no index.
 
-    Beside an index that is relative to air, air has the index 1. Where the other one is relative to vacuum, the former
-    is multiplied by the index of air at 20 °C and 101325 Pa.
+    Next to an index relative to air, air has the index 1. If one index is relative to air and the other to vacuum, the
+    first is multiplied by the index of air at 20 °C and 101325 Pa.
     """
     n_inside = inside.index_or_nan(wavelength, inside_coefficients)
     n_outside = outside.index_or_nan(wavelength, outside_coefficients)
@@ -128,25 +128,25 @@ def relative_index(
 
 
 def index(spec: float | str, wavelength: Number) -> Number:
-    """n of a material at a wavelength in nm; see `parse` and `Medium.index` for what they take, and for errors."""
+    """n of a material at a wavelength in nm; arguments and errors as for `parse` and `Medium.index`."""
     return parse(spec).index(wavelength)
 
 
 def parse(spec: float | str, name: str = "", find: Callable[[str], Path] = Path) -> Medium:
-    """The material that `spec` says: a number, or a text of the module's table.
+    """The medium for `spec`: a number, or a text of the module's table.
 
-    ValueError, with `name` (that of the parameter) and what would be accepted, for anything else; for n that is not
+    ValueError, with `name` (that of the parameter) and the expected values, for anything else; for an n that is not
     positive, or above 10, at a wavelength from 360 to 830 nm; and for numbers that are not finite.
 
-    find: where a file is that a text names, by its name.
+    find: returns the path of a file from its name in the text.
     """
     label = f"{name} = {spec!r}" if name else repr(spec)
     if isinstance(spec, str):
-        return _of_text(spec.strip(), label, find)
-    return _of_number(spec, label)
+        return _parse_text(spec.strip(), label, find)
+    return _constant_medium(spec, label)
 
 
-def _of_number(n: float, label: str) -> Medium:
+def _constant_medium(n: float, label: str) -> Medium:
     if isinstance(n, bool) or not isinstance(n, (int, float)) or not 0 < n < math.inf:
         raise ValueError(f"{label}; expected a positive finite number, or a material's name")
     if 100_000 <= n < 1_000_000 and n == int(n):
@@ -155,15 +155,15 @@ def _of_number(n: float, label: str) -> Medium:
 
 
 def file_in(text: str) -> str:
-    """The name of the file that a text names: "glass.yml" of `hold(file:glass.yml)`; "" where it names none."""
-    held = HOLD.fullmatch(text.strip())
-    return index_files.split((held[1] if held else text).strip())[0]
+    """The name of the file in a text: "glass.yml" for `hold(file:glass.yml)`; "" if it does not name a file."""
+    inner = HOLD.fullmatch(text.strip())
+    return index_files.split((inner[1] if inner else text).strip())[0]
 
 
-def _of_text(text: str, label: str, find: Callable[[str], Path]) -> Medium:
-    if held := HOLD.fullmatch(text):
-        return replace(_of_text(held[1].strip(), label, find), name=text, hold=True)
-    if code := GLASS_CODE.fullmatch(text):  # n_d − 1, of which 1000 is left out, and V_d
+def _parse_text(text: str, label: str, find: Callable[[str], Path]) -> Medium:
+    if inner := HOLD.fullmatch(text):
+        return replace(_parse_text(inner[1].strip(), label, find), name=text, hold=True)
+    if code := GLASS_CODE.fullmatch(text):  # three digits of n_d − 1 and three of V_d
         n_d, v_d = int(code[1]) / 1000, int(code[2]) / 10
         return replace(_formula(f"abbe({n_d + (1 if n_d >= LEAST_CODE else 2):g}, {v_d:g})", label), name=text)
     try:
@@ -171,7 +171,7 @@ def _of_text(text: str, label: str, find: Callable[[str], Path]) -> Medium:
     except ValueError:
         pass
     else:
-        return _of_number(number, label)
+        return _constant_medium(number, label)
     if index_files.split(text)[0]:
         return _checked(replace(index_files.read(text, label, find), name=text), label)
     if ":" in text.partition("(")[0]:
@@ -186,18 +186,20 @@ def _of_text(text: str, label: str, find: Callable[[str], Path]) -> Medium:
         raise ValueError(f"{label}: unknown material; nearest: {near}; expected these, or {catalogs}, file:…")
     if "(" in text:
         return _formula(text, label)
-    # Mitsuba's table holds decimal numbers of at most seven digits in float32: the shortest gives them back.
+    # Mitsuba's table contains decimal numbers of at most seven digits as float32: seven digits give back the decimals.
     import mitsuba as mi
     from mitsuba.mitsuba_ext import Properties
 
-    variant: Any = mi.scalar_rgb  # the table is the same in all of them, and this one need not be set
+    variant: Any = mi.scalar_rgb  # the table is the same in all variants, and this one need not be set
     query = Properties()
     query["ior"] = text
     try:
         single = variant.lookup_ior(query, "ior", text)
     except RuntimeError as error:
-        if glasses := glass_catalogs.called(text):
-            raise ValueError(f"{label}: unknown material; a glass has its maker's name: {', '.join(glasses)}") from None
+        glasses = ", ".join(glass_catalogs.called(text))
+        if glasses:
+            advice = f"a glass needs the name of its manufacturer: {glasses}"
+            raise ValueError(f"{label}: unknown material; {advice}") from None
         expected = str(error).partition("choices are:")[2] or "the names of Mitsuba's table"
         raise ValueError(f"{label}: unknown material; expected {expected.strip()}") from None
     absolute = "vacuum" if text in ("air", "vacuum") else ""
@@ -205,7 +207,7 @@ def _of_text(text: str, label: str, find: Callable[[str], Path]) -> Medium:
 
 
 def _formula(text: str, label: str) -> Medium:
-    """The medium of a formula with its numbers. ValueError with the likely slip: another unit, or another order."""
+    """The medium of a formula with its numbers. ValueError with the likely mistake: another unit, or another order."""
     call = re.fullmatch(r"(\w+?)(_um)?\s*\((.*)\)", text)
     if not call or call[1] not in FORMULAS_OF_N or (call[2] and call[1] not in IN_MICROMETRES):
         raise ValueError(
@@ -214,19 +216,22 @@ def _formula(text: str, label: str) -> Medium:
     name, arguments = call[1], call[3]
     unit, nanometres = ("µm", 1000.0) if call[2] else ("nm", 1.0)
 
-    def numbers(counts: Sequence[int], says: str) -> list[float]:
+    def numbers(counts: Sequence[int], expected: str) -> list[float]:
         try:
             values = [parse_number(x) for x in arguments.split(",")]
         except ValueError:
             values = []
         if len(values) not in counts or not all(map(math.isfinite, values)):
-            raise ValueError(f"{label}; expected {says}, finite numbers")
+            raise ValueError(f"{label}; expected {expected}, finite numbers")
         return values
 
-    def slip(what: str, value: float, of: str = "", factor: str = "") -> ValueError:
-        other, instead = ("nm", name) if call[2] else ("µm", f"{name}_um")
-        ways = [f"multiply by {factor}"] * bool(factor) + [f"write {instead}(…)"] * (name in IN_MICROMETRES)
-        return ValueError(f"{label}: {what} = {value:g}; expected {unit}{of}; from {other}{of} {', or '.join(ways)}")
+    def wrong_unit(quantity: str, value: float, power: str = "", factor: str = "") -> ValueError:
+        other_unit, other_name = ("nm", name) if call[2] else ("µm", f"{name}_um")
+        remedies = [f"multiply by {factor}"] if factor else []
+        if name in IN_MICROMETRES:
+            remedies.append(f"write {other_name}(…)")
+        remedy = f"from {other_unit}{power} {', or '.join(remedies)}"
+        return ValueError(f"{label}: {quantity} = {value:g}; expected {unit}{power}; {remedy}")
 
     form: Dispersion
     valid = ANY
@@ -234,7 +239,7 @@ def _formula(text: str, label: str) -> Medium:
         values = numbers(range(1, len(CAUCHY_NAMES) + 1), f"{name}(A, B, …), λ in {unit}, up to 8")
         for i, x in enumerate(values[1:], 1):
             if not call[2] and 0 < abs(x) < MICROMETRES:
-                raise slip(CAUCHY_NAMES[i], x, POWERS_OF_UNITS[i], f"1e{6 * i}")
+                raise wrong_unit(CAUCHY_NAMES[i], x, POWERS_OF_UNITS[i], f"1e{6 * i}")
         coefficients = {CAUCHY_NAMES[i]: x * nanometres ** (2 * i) for i, x in enumerate(values)}
         form = Terms(1, powers=tuple((letter, -2 * i) for i, letter in enumerate(coefficients)))
     elif name == "abbe":
@@ -258,23 +263,24 @@ def _formula(text: str, label: str) -> Medium:
             raise ValueError(f"{label}: {error}") from None
         valid = form.knots[0], form.knots[-1]
         if valid[1] < SHORTEST or valid[0] > LONGEST:
-            raise slip("the first wavelength", pairs[0][0])
+            raise wrong_unit("the first wavelength", pairs[0][0])
     else:
         squared = name == "sellmeier_nm"
-        letter, of, factor = ("L", "", "1e3") if squared else ("C", "²", "1e6")
-        values = numbers(range(2, 14, 2), f"{name}(B1, …, {letter}1, …), as many {letter} in {unit}{of} as B, up to 6")
+        letter, power, factor = ("L", "", "1e3") if squared else ("C", "²", "1e6")
+        expected = f"{name}(B1, …, {letter}1, …), as many {letter} in {unit}{power} as B, up to 6"
+        values = numbers(range(2, 14, 2), expected)
         poles = values[len(values) // 2 :]
         for i, x in enumerate(poles, 1):
             if not call[2] and (0 < abs(x) < MICROMETRES or (squared and x < 0)):
-                raise slip(f"{letter}{i}", x, of, factor)
+                raise wrong_unit(f"{letter}{i}", x, power, factor)
         if call[2] and min(poles) > LONGEST_POLE:
-            raise slip("C1", poles[0], of)
+            raise wrong_unit("C1", poles[0], power)
         form, coefficients = sellmeier([*values[: len(poles)], *(x * nanometres**2 for x in poles)], squared)
     return _checked(Medium(text, form, coefficients, valid), label)
 
 
 def _checked(medium: Medium, label: str) -> Medium:
-    """The medium, valid up to the resonances on both sides of the visible. ValueError where it has no index there."""
+    """The medium, valid between the poles on both sides of the visible range. ValueError if it has no index there."""
     import numpy as np
 
     (low, high), (first, last) = medium.valid, VISIBLE
@@ -287,12 +293,14 @@ def _checked(medium: Medium, label: str) -> Medium:
     if first <= last:
         visible = np.linspace(first, last, 471)
         n = medium.index_or_nan(visible)
-        if (missing := np.isnan(n)).any():
+        missing = np.isnan(n)
+        if missing.any():
             at = visible[missing][0]
             raise ValueError(
                 f"{label}: n is not positive at {at:.6g} nm; expected a positive index everywhere in 360 … 830 nm"
             )
-        if (large := n > LARGEST_N).any():
+        large = n > LARGEST_N
+        if large.any():
             at = f"n = {n[large][0]:g} at {visible[large][0]:.6g} nm"
             raise ValueError(
                 f"{label}: {at}; expected up to {LARGEST_N:g} in 360 … 830 nm; coefficients in another unit?"

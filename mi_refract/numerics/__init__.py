@@ -1,11 +1,11 @@
-"""The arithmetic of the formulas of refraction. No optics in here.
+"""The arithmetic of the formulas of refraction. No optics.
 
-In: floats, numpy arrays or Dr.Jit arrays. Out: sums and products with their exact rounding errors, numbers of two or
-three words, and operations that make Dr.Jit's arrays behave alike on every backend.
+Input: floats, numpy arrays or Dr.Jit arrays. Output: sums and products with their exact rounding errors, numbers of two
+or three words, and operations that give the same results with Dr.Jit's arrays on every backend.
 
-`error_free` and `float_expansions` are modules that each have a `dot`, `cross` and `two_prod`: the first for the
-formulas, in the precision of the arrays, the second for the code that checks them, in float64. `mitsuba_mesh` reads and
-makes Mitsuba's meshes, whose layout no other file knows.
+`error_free` and `float_expansions` both have `dot`, `cross` and `two_prod`: the first for the formulas, in the
+precision of the arrays, the second for the code that checks them, in float64. `mitsuba_mesh` reads and creates
+Mitsuba's meshes; no other file depends on their layout.
 """
 
 from . import error_free, float_expansions, mitsuba_mesh

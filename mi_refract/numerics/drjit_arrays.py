@@ -1,8 +1,7 @@
 """Small helpers around Dr.Jit arrays: precision, rounding, division by 0, derivatives, scaling. No optics.
 
-Each works on scalar, LLVM and CUDA arrays of either precision. Before them, names for the types of Dr.Jit and Mitsuba
-in signatures. Both packages are untyped to mypy, so each name stands for `Any`: it tells a reader what to pass, and
-checks nothing.
+Each works on scalar, LLVM and CUDA arrays of either precision. The names for types of Dr.Jit and Mitsuba come first.
+Both packages are untyped to mypy, so each name stands for `Any`: it tells readers what to pass, but checks nothing.
 """
 
 from __future__ import annotations
@@ -22,16 +21,16 @@ if TYPE_CHECKING:  # the plugin needs no numpy
 Number: TypeAlias = Any
 # A number, or a numpy array with an entry for each ray.
 Values: TypeAlias = Any
-# Three `Number`s of one type, as `mi.Vector3f` or `drjit.llvm.Array3f` holds them; v.x, v.y, v.z or v[0], v[1], v[2].
+# Three `Number`s of one type, such as `mi.Vector3f` or `drjit.llvm.Array3f`; v.x, v.y, v.z or v[0], v[1], v[2].
 Vector3: TypeAlias = Any
 # A Python bool, or a Dr.Jit array of N of them.
 Mask: TypeAlias = Any
 # A class of Dr.Jit arrays: `type(x)` of a `Number` or a `Vector3`.
 ArrayType: TypeAlias = Any
-# One variant of Mitsuba as a module, as `import mitsuba` gives it after `set_variant`, or `mitsuba.llvm_ad_rgb`.
+# One variant of Mitsuba as a module: `mitsuba` after `set_variant`, or `mitsuba.llvm_ad_rgb`.
 Variant: TypeAlias = Any
 
-# Objects of a variant of Mitsuba, of the classes of the same name.
+# Objects of a variant of Mitsuba, instances of the classes of the same name.
 Scene: TypeAlias = Any
 Shape: TypeAlias = Any
 Emitter: TypeAlias = Any
@@ -55,11 +54,11 @@ Texture: TypeAlias = Any
 
 Result = TypeVar("Result")
 
-# Dr.Jit's type stubs say that the first returns an object, and nothing of what the second returns.
+# In Dr.Jit's type stubs the first returns `object`, and the second has no return type.
 _reinterpret: Any = dr.reinterpret_array
 replace_grad: Any = dr.replace_grad  # Dr.Jit's own, with a type
 
-ALIGNMENT = 64  # bytes, of what Dr.Jit reads in one go
+ALIGNMENT = 64  # bytes that Dr.Jit reads at once
 
 
 def as_component(a: Vector3, k: Number) -> Number:
@@ -73,9 +72,10 @@ def as_component(a: Vector3, k: Number) -> Number:
 
 
 def from_numpy(kind: ArrayType, values: NDArray[Any]) -> Any:
-    """The Dr.Jit array of a numpy array: numbers of (N,), a vector of (N, 3), in the precision of `kind`.
+    """A numpy array (N,) or (N, 3) as a Dr.Jit number or vector of type `kind`.
 
-    Dr.Jit's own conversion lets a kernel know the size and the place of the memory, so that others need another kernel.
+    With Dr.Jit's own conversion, a kernel would depend on the size and address of the memory, so that other arrays
+    would need another kernel.
     """
     import numpy as np
 
@@ -88,8 +88,8 @@ def from_numpy(kind: ArrayType, values: NDArray[Any]) -> Any:
 def aligned(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
     """A copy (N,) at an address that is a multiple of ALIGNMENT.
 
-    Dr.Jit uses numpy's memory as it lies, and reads it number by number where that is not aligned: another kernel, and
-    a slower one, by chance.
+    Dr.Jit uses numpy's memory in place. If that happens not to be aligned, it reads number by number, with another and
+    slower kernel.
     """
     import numpy as np
 
@@ -101,17 +101,17 @@ def aligned(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
 
 
 def ieee_divide(x: Number, y: Number) -> Number:
-    """x / y by the rules of IEEE 754 on every backend; a Python float would raise where y is 0."""
+    """x / y by the rules of IEEE 754 on every backend; Python floats would raise an exception for y = 0."""
     if isinstance(y, float) and y == 0:
         return x * dr.rcp(y)
     return x / y
 
 
 def rounded_product(x: Number, y: Number) -> Number:
-    """fl(x y), also where it is added to something: for an x y whose rounding error is known, or is to be found.
+    """fl(x y), rounded even if it is then added to something; for code that relies on the product's rounding error.
 
-    CUDA's compiler may turn a product and a sum into one operation, which does not round the product. It leaves
-    `dr.fma` alone, here with a −0 that it cannot know, because it is NaN where a factor is.
+    CUDA's compiler may fuse a product and a sum into one operation, which does not round the product. It does not
+    change `dr.fma`, here with a −0 that it cannot predict, as it is NaN if a factor is NaN.
     """
     if dr.JitBackend.CUDA not in (dr.backend_v(x), dr.backend_v(y)):
         return x * y
@@ -120,17 +120,17 @@ def rounded_product(x: Number, y: Number) -> Number:
 
 
 def ieee_quotients(kind: ArrayType) -> contextlib.AbstractContextManager[None]:
-    """A context in which reciprocals, roots and derivatives of arrays like `kind` have the digits of float64 on CUDA.
+    """A context in which reciprocals, roots and derivatives of arrays like `kind` are accurate in float64 on CUDA too.
 
-    There Dr.Jit's `rcp`, and with it `rsqrt` and the derivatives of quotients and roots, otherwise has the 20 bits of
-    one instruction.
+    Without it, Dr.Jit's `rcp` on CUDA, and so `rsqrt` and the derivatives of quotients and roots, has only the 20 bits
+    of one instruction.
     """
     few = dr.type_v(kind) == dr.VarType.Float64 and dr.backend_v(kind) == dr.JitBackend.CUDA
     return dr.scoped_set_flag(dr.JitFlag.FastMath, False) if few else contextlib.nullcontext()
 
 
 def computed_in_float64(function: Callable[..., Result]) -> Callable[..., Result]:
-    """`function` of a number or vector first, within `ieee_quotients` of float64 whatever that argument's precision."""
+    """`function` called within `ieee_quotients` of float64; its first argument: a number or vector of any precision."""
 
     @functools.wraps(function)
     def with_ieee_quotients(x: Any, *args: Any, **kwargs: Any) -> Result:
@@ -141,15 +141,15 @@ def computed_in_float64(function: Callable[..., Result]) -> Callable[..., Result
 
 
 def differentiated(x: Number | Vector3) -> bool:
-    """Whether `x` carries a derivative. The type is checked first, as asking Dr.Jit takes ten times as long."""
+    """Whether `x` has a derivative. The type is checked first, as the query of Dr.Jit takes ten times as long."""
     return dr.is_diff_v(x) and dr.grad_enabled(x)
 
 
 def scale_to_unit(v: Vector3) -> tuple[Vector3, Number]:
-    """(v / p, p), p the power of two for which the largest component of v / p is in [1, 2). Exact.
+    """(v / p, p) with the power of two p for which the largest component of v / p is in [1, 2). Exact.
 
-    Where squares could over- or underflow, which is in float32 on Dr.Jit's arrays; every other type has the range
-    for lengths of 1e-18 to 1e18 as it is, and p is the literal 1.
+    Only for Dr.Jit arrays of float32, whose squares could over- or underflow. The range of every other type suffices
+    for lengths of 1e-18 to 1e18, and p is the literal 1.
     """
     if dr.type_v(v) != dr.VarType.Float32 or not dr.is_jit_v(v):
         return v, 1
@@ -157,5 +157,5 @@ def scale_to_unit(v: Vector3) -> tuple[Vector3, Number]:
     bits, reinterpret = dr.uint32_array_t(number), _reinterpret
     x, y, z = (reinterpret(bits, dr.detach(v_i)) & 0x7FFFFFFF for v_i in v)  # ordered as |v_i| are
     exponent = dr.maximum(dr.maximum(x, y), z) & 0x7F800000
-    # 127 is the bias: of 1 / p and of p one each.
+    # 127 is the bias of the exponent, once for 1 / p and once for p.
     return v * reinterpret(number, (2 * 127 << 23) - exponent), reinterpret(number, exponent)

@@ -1,9 +1,9 @@
 """Error-free transforms and double-word arithmetic on Dr.Jit arrays. No optics.
 
 A *pair* `(hi, lo)` stands for the unevaluated sum hi + lo with |lo| ≤ u |hi|, u the roundoff of the working
-precision (2⁻²⁴ in float32, 2⁻⁵³ in float64). All functions hold for any Dr.Jit float type, scalar, LLVM or CUDA,
+precision (2⁻²⁴ in float32, 2⁻⁵³ in float64). All functions are valid for any Dr.Jit float type, scalar, LLVM or CUDA,
 as long as nothing over- or underflows. They need a true fused multiply-add, which `dr.fma` is on every backend, and
-products that are rounded before they are added up, which `rounded_product` sees to.
+products that are rounded before they are added, which `rounded_product` ensures.
 
 Sources: Knuth, TAOCP 2, 4.2.2 (two_sum); Ogita, Rump, Oishi 2005 (dot); Kahan, in Jeannerod, Louvet, Muller
 2013 (difference of products); Joldes, Muller, Popescu 2017 (double-word operations and their bounds).
@@ -21,14 +21,14 @@ Pair = tuple[Number, Number]
 
 
 def two_sum(x: Number, y: Number) -> Pair:
-    """s = fl(x + y) and e with s + e = x + y exactly, whatever the magnitudes."""
+    """s = fl(x + y) and e with s + e = x + y exactly, for any magnitudes."""
     s = x + y
     y_part = s - x
     return s, (x - (s - y_part)) + (y - y_part)
 
 
 def fast_two_sum(x: Number, y: Number) -> Pair:
-    """As `two_sum`, three operations instead of six. Precondition: |x| ≥ |y| or x = 0."""
+    """As `two_sum`, with three operations instead of six. Precondition: |x| ≥ |y| or x = 0."""
     s = x + y
     return s, y - (s - x)
 
@@ -44,7 +44,7 @@ class DoubleWord:
     """A number of twice the working precision, as the unevaluated sum hi + lo, |lo| ≤ 8u |hi|.
 
     Operations: + − × with another `DoubleWord` or a plain number, negation and `sqrt`. Relative error for normalised
-    operands, |lo| ≤ u |hi|: + − ≤ 3u² whatever cancels, × ≤ 5u², √ ≤ 16u²; for others + − ≤ 10u², × ≤ 90u².
+    operands, |lo| ≤ u |hi|: + − ≤ 3u² even if they cancel, × ≤ 5u², √ ≤ 16u²; for others + − ≤ 10u², × ≤ 90u².
     """
 
     hi: Number
@@ -52,7 +52,7 @@ class DoubleWord:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the low part is known to be 0 while a kernel is traced; operations then leave it out."""
+        """Whether the low part is known to be 0 while a kernel is traced; operations then omit it."""
         return isinstance(self.lo, int)
 
     @staticmethod
@@ -67,7 +67,7 @@ class DoubleWord:
 
     def __add__(self, other: DoubleWord | Number) -> DoubleWord:
         """AccurateDWPlusDW of Joldes, Muller, Popescu 2017; `other` may be a plain number."""
-        # Right also where the high parts cancel.
+        # Accurate also if the high parts cancel.
         other = DoubleWord.of(other)
         s, s_lo = two_sum(self.hi, other.hi)
         if other.is_plain:
@@ -86,7 +86,7 @@ class DoubleWord:
 
     def __mul__(self, other: DoubleWord | Number) -> DoubleWord:
         """x y; `other` may be a plain number."""
-        # lo · lo and the last normalisation are left out: |lo| ≤ 3u |hi| for normalised factors.
+        # lo · lo and the last normalisation are omitted: |lo| ≤ 3u |hi| for normalised factors.
         other = DoubleWord.of(other)
         p, e = two_prod(self.hi, other.hi)
         if not self.is_plain:
@@ -98,10 +98,10 @@ class DoubleWord:
         return self.hi + self.lo
 
     def sqrt(self) -> DoubleWord:
-        """√x for x ≥ 0; a finite number that means nothing for x < 0, and a finite derivative everywhere.
+        """√x for x ≥ 0; a meaningless finite number for x < 0, and a finite derivative everywhere.
 
-        r = x·rsqrt(x) is a few u off, whatever rsqrt the backend has; the exact defect of r² corrects it to a few u².
-        Neither a division nor a square root is left, which both take longer than all else here.
+        The error of r = x·rsqrt(x) is a few u on every backend; the exact defect of r² corrects it to a few u². This
+        avoids a division and a square root, which both take longer than all other operations here.
         """
         positive = dr.select(self.hi > 0, self.hi, 1)
         with ieee_quotients(self.hi):  # the reciprocal of a denormal number is infinite
@@ -117,11 +117,11 @@ def select(mask: Mask, x: DoubleWord, y: DoubleWord) -> DoubleWord:
 
 @dataclass(frozen=True)
 class TripleWord:
-    """A number to the third order in u: hi, plus the sum of `first`, each of order u, plus `second`, of order u².
+    """A number to third order in u: hi, plus the terms of `first`, each of order u, plus `second`, of order u².
 
-    Sums and products keep every error of first order as a term of its own and add up those of second order plainly. As
-    long as nothing has cancelled |first| ≤ 5u |hi| and |second| ≤ 100u² |hi|, so each operation here is right to 100u³
-    of its larger operand. Nothing may underflow at the third order.
+    Sums and products keep every error of first order as a separate term and add those of second order plainly. As long
+    as nothing has cancelled, |first| ≤ 5u |hi| and |second| ≤ 100u² |hi|, so the error of each operation is 100u³ of
+    its larger operand. Terms of third order must not underflow.
     """
 
     hi: Number
@@ -129,7 +129,7 @@ class TripleWord:
     second: Number = 0
 
     def __add__(self, other: TripleWord) -> TripleWord:
-        """x + y; the error of the sum of the high parts is one more term of first order."""
+        """x + y; the error of the sum of the high parts becomes another term of first order."""
         s, e = two_sum(self.hi, other.hi)
         return TripleWord(s, (*self.first, *other.first, e), self.second + other.second)
 
@@ -142,7 +142,7 @@ class TripleWord:
         return self + -other
 
     def collected(self) -> TripleWord:
-        """The same with one term of first order."""
+        """The same number with one term of first order."""
         first, *rest = self.first
         second = self.second
         for x in rest:
@@ -169,7 +169,7 @@ class TripleWord:
         return TripleWord(p, (e, q), dr.fma(twice, self.second, dr.fma(mid, mid, f)))
 
     def double(self) -> DoubleWord:
-        """Rounded to a pair, also where the terms of hi have cancelled."""
+        """The number rounded to a pair, accurate also if the terms of hi have cancelled."""
         # hi is a multiple of the last place of the first-order terms, or 0: `fast_two_sum` is exact.
         x = self.collected()
         hi, lo = fast_two_sum(x.hi, x.first[0])
@@ -177,19 +177,19 @@ class TripleWord:
 
     @property
     def pair(self) -> DoubleWord:
-        """The first two terms, of a number with at most one of first order."""
+        """The terms of order 0 and 1 as a pair, for a number with at most one term of first order."""
         return DoubleWord(self.hi, *self.first)
 
 
 def dot(x: Vector3, y: Vector3) -> TripleWord:
-    """x · y of two 3-vectors: error ≤ 3u³ Σ|xᵢ yᵢ|, and hi is 0 only where the sum is less than that."""
+    """x · y of two 3-vectors: error ≤ 3u³ Σ|xᵢ yᵢ|, and hi is 0 only if the sum is less than that."""
     p, e0 = two_prod(x[0], y[0])
     q, e1 = two_prod(x[1], y[1])
     r, e2 = two_prod(x[2], y[2])
     s, e3 = two_sum(p, q)
     s, e4 = two_sum(s, r)
-    # The five errors are at most u each of a partial sum; their own sum is kept as a pair, because after a
-    # cancellation of s they are all that is left.
+    # Each of the five errors is at most u of a partial sum. Their sum is kept as a pair, because it is all that is left
+    # if s cancels.
     t, t0 = two_sum(e0, e1)
     t, t1 = two_sum(t, e2)
     v, v0 = two_sum(e3, e4)
@@ -203,8 +203,8 @@ def dot(x: Vector3, y: Vector3) -> TripleWord:
 def cross(x: Vector3, y: Vector3) -> list[TripleWord]:
     """x × y of two 3-vectors, each component with relative error ≤ 6u³: its four exact terms are d, d_lo, e, e_lo.
 
-    Where p and q cancel, d is exact, and a multiple of the last place of e; elsewhere |d| ≥ max(|p|, |q|)/2, so that
-    |d_lo + e| ≤ 4u |d|. Either way `fast_two_sum` is exact.
+    If p and q cancel, d is exact, and a multiple of the last place of e; otherwise |d| ≥ max(|p|, |q|)/2, so that
+    |d_lo + e| ≤ 4u |d|. In both cases `fast_two_sum` is exact.
     """
     components = []
     for i, j in ((1, 2), (2, 0), (0, 1)):
@@ -218,7 +218,7 @@ def cross(x: Vector3, y: Vector3) -> list[TripleWord]:
 
 
 def defect(target: DoubleWord, *products: Pair) -> Number:
-    """target − Σ xᵢ yᵢ as a plain number: error ≤ u |result| + 4u² Σ|xᵢ yᵢ|, so small defects keep their digits."""
+    """target − Σ xᵢ yᵢ as a plain number: error ≤ u |result| + 4u² Σ|xᵢ yᵢ|, so small defects stay accurate."""
     rest, low = target.hi, target.lo
     for x, y in products[:-1]:
         p, e = two_prod(x, y)

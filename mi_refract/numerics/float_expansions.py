@@ -1,9 +1,9 @@
-"""Numbers as unevaluated sums of floats: what judges a formula computes with, next to the exact oracle.
+"""Numbers as unevaluated sums of floats, for the code that judges formulas, next to the exact oracle.
 
 An *expansion* is a list of floats, largest first, whose exact sum is the number. Only the operators + − × / are
-used, so the same source serves numpy arrays and Dr.Jit arrays, and nothing is shared with the compensated formula
-but `two_sum`. Nothing may over- or underflow. Sources: Dekker 1971 (two_prod without a fused multiply-add);
-Ogita, Rump, Oishi 2005 (repeated VecSum).
+used, so the same code works on numpy arrays and Dr.Jit arrays, and only `two_sum` is shared with the compensated
+formula. Nothing may over- or underflow. Sources: Dekker 1971 (two_prod without a fused multiply-add); Ogita, Rump,
+Oishi 2005 (repeated VecSum).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from .drjit_arrays import Number, Vector3, rounded_product
 from .error_free import two_sum
 
 FloatExpansion = list[Number]
-# Splits the 53 bits of a float64 in two halves, whose products are exact.
+# Splits the 53 bits of a float64 into two halves whose products are exact.
 _SPLITTER = 2.0**27 + 1
 
 
@@ -32,25 +32,25 @@ def _split(x: Number) -> tuple[Number, Number]:
 
 
 def distil(terms: Sequence[Number], words: int = 3) -> FloatExpansion:
-    """The sum of m `terms` in `words` floats: error ≤ (m u)^words Σ|terms|; exact where `words` floats can hold it.
+    """The sum of m `terms` in `words` floats: error ≤ (m u)^words Σ|terms|; exact if `words` floats can represent it.
 
-    Every pass takes the float sum out and leaves its exact rounding errors behind.
+    Every pass takes out the rounded sum and leaves its exact rounding errors.
     """
-    taken, rest = [], list(terms)
+    sums, rest = [], list(terms)
     for _ in range(words):
         total, errors = rest[0], []
         for term in rest[1:]:
             total, error = two_sum(total, term)
             errors.append(error)
-        taken.append(total)
+        sums.append(total)
         if not errors:
             break
         rest = errors
-    # Where the first sums cancelled, the next one leads.
-    for _ in taken:
-        for j in reversed(range(len(taken) - 1)):
-            taken[j], taken[j + 1] = two_sum(taken[j], taken[j + 1])
-    return taken
+    # If the first sums cancelled, a later one becomes the leading term.
+    for _ in sums:
+        for j in reversed(range(len(sums) - 1)):
+            sums[j], sums[j + 1] = two_sum(sums[j], sums[j + 1])
+    return sums
 
 
 def product(x: FloatExpansion, y: FloatExpansion, words: int = 3) -> FloatExpansion:
@@ -79,10 +79,10 @@ def quotient(x: FloatExpansion, y: FloatExpansion, words: int = 2) -> FloatExpan
 
 
 def dot(x: Vector3, y: Vector3, words: int = 3) -> FloatExpansion:
-    """x · y of two vectors of floats, and 0 where it is 0. One word more than asked for is kept for what cancels."""
+    """x · y of two vectors of floats, exactly 0 if it is 0; computed with one more word, as words may cancel."""
     return distil([part for x_i, y_i in zip(x, y, strict=True) for part in two_prod(x_i, y_i)], words + 1)[:words]
 
 
 def cross(x: Vector3, y: Vector3, words: int = 3) -> list[FloatExpansion]:
-    """x × y of two 3-vectors of floats, each component as `dot` has it."""
+    """x × y of two 3-vectors of floats, each component as in `dot`."""
     return [dot((x[i], x[j]), (y[j], -y[i]), words) for i, j in ((1, 2), (2, 0), (0, 1))]

@@ -1,4 +1,4 @@
-"""Mitsuba's meshes as arrays, and back: the one place that knows how Mitsuba lays them out and names their parts."""
+"""Convert between Mitsuba's meshes and arrays; only this file depends on the layout and the names of their buffers."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ if TYPE_CHECKING:
 
 
 def arrays(mesh: Any) -> tuple[NDArray[Any], NDArray[np.uint32]]:
-    """The vertices (V, 3) of a mesh in Mitsuba's precision, and its faces (F, 3): the numbers of their vertices."""
+    """The vertices (V, 3) of a mesh in Mitsuba's precision, and its faces (F, 3) as numbers of vertices."""
     import numpy as np
 
     return np.array(mesh.vertex_positions_buffer()).reshape(-1, 3), np.array(mesh.faces_buffer()).reshape(-1, 3)
 
 
 def bounding_box(shape: Any) -> Any:
-    """Of any shape. Of one that Mitsuba has merged from others its own leaves out their rectangles."""
-    if shape.class_name() != "Mesh":
-        return shape.bbox()
+    """The bounding box of a shape. Mitsuba's box of a mesh that it has merged from several shapes omits rectangles."""
     import mitsuba as mi
 
+    if shape.class_name() != "Mesh":
+        return shape.bbox()
     vertices, _ = arrays(shape)
     return mi.ScalarBoundingBox3f(*([*map(float, ends(0))] for ends in (vertices.min, vertices.max)))
 
 
 def has_normals(mesh: Any) -> bool:
-    """Whether the mesh has normals of vertices, between which it interpolates."""
+    """Whether the mesh has vertex normals, which it interpolates."""
     return bool(mesh.has_vertex_normals())
 
 
 def is_smooth(mesh: Any) -> bool:
-    """Whether normals of vertices differ from those of the faces, by more than 1e-3."""
+    """Whether vertex normals differ from those of the faces by more than 1e-3."""
     import numpy as np
 
     if not has_normals(mesh):
@@ -55,7 +55,7 @@ def make(
     *,
     properties: Any = None,
 ) -> Any:
-    """A mesh of the Mitsuba variant `v`, of vertices (V, 3), faces (F, 3) and normals of the vertices (V, 3) or None.
+    """A mesh of the Mitsuba variant `v` from vertices (V, 3), faces (F, 3) and vertex normals (V, 3) or None.
 
     `properties`: Mitsuba's `Properties` with its BSDF, emitter and flags.
     """

@@ -1,8 +1,8 @@
-"""Exact answers for refraction, each with a bound of what it leaves out. Needs python-flint.
+"""Exact answers for refraction, each with a bound of its error. Needs python-flint.
 
-In: numpy arrays `a`, `n`, `k`, taken as exact numbers. Out: `Certified` directions, cosines, powers and amplitudes to
-106 bits; `derivatives`, along a line of inputs. No formula of this package is imported: what judges them shares no code
-with them.
+Input: numpy arrays `a`, `n`, `k`, taken as exact numbers. Output: `Certified` directions, cosines, powers and
+amplitudes to 106 bits; `derivatives` along a line of inputs. The oracle judges the formulas of this package, so it
+shares no code with them.
 """
 
 try:

@@ -1,8 +1,8 @@
 """Certified answers: Snell's law solved by ball arithmetic for the exact values of the inputs.
 
-A float is a dyadic rational, so everything in the law short of its square roots is a polynomial that is
-computed exactly; the signs of n·a and of the radicand are then facts, at the critical angle too. The roots
-and the division follow in balls, whose radius is the certificate. No formula of this package is imported.
+A float is a dyadic rational, so everything in the law except its square roots and a division is a polynomial that is
+computed exactly; the signs of n·a and of the radicand are then certain, at the critical angle too. The roots and the
+division follow in balls, whose radius is the certificate. No formula of this package is imported.
 
 Writing A = |a|², N = |n|², c = n·a, s = sign(c), for a and n of any length:
 
@@ -28,26 +28,26 @@ from flint import arb, ctx
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
-Table = NDArray[np.void]  # of _ROW
+Table = NDArray[np.void]  # with rows of type _ROW
 Ball: TypeAlias = Any  # a `flint.arb`
 Ray = tuple[float, float, float, float, float, float, float, float | None]  # a, n, k, contrast
-Polynomials = tuple[Ball, ...]  # of the law, see `_exact`
+Polynomials = tuple[Ball, ...]  # the polynomials of the law, see `_exact`
 
-# The radicand of float64 inputs has its bits between 2^±12600: twice n·a (2 × 4200) and k² (4200).
+# The bits of the radicand of float64 inputs are between 2^±12600: twice n·a (2 × 4200) and k² (4200).
 EXACT_BITS = 16384
-# 160 bits leave the direction 1e-47 wide; the higher ones are taken only where a ball stays too wide.
+# With 160 bits the radius of the direction is 1e-47; higher precisions are used only if a ball stays too wide.
 PRECISIONS = (160, 320, 640)
 MAX_RADIUS = 1e-30
-# |x| ≤ 1 as a pair of doubles: |x − high| ≤ 2⁻⁵⁴, so |x − high − low| ≤ 2⁻¹⁰⁸. Two bits spare for the radius.
+# |x| ≤ 1 as a pair of doubles: |x − high| ≤ 2⁻⁵⁴, so |x − high − low| ≤ 2⁻¹⁰⁸. Two more bits for the radius.
 PAIR_ERROR = 2.0**-106
 
 CHUNK = 256  # rays between two steps of the progress bar
-MANY = 100_000  # rays from which a progress bar is shown: about two seconds
+MANY = 100_000  # from this number of rays on a progress bar is shown: about two seconds
 
 _UNKNOWN = complex(math.nan, math.nan)
 _NO_FRESNEL = (math.nan,) * 4 + (_UNKNOWN,) * 2
 _UNDECIDED = ((math.nan,) * 3,) * 2 + (math.nan,) * 4 + _NO_FRESNEL
-# The columns of a table of answers; of `Certified` all but `undecided`.
+# The columns of a table of answers: all fields of `Certified` except `undecided`.
 _ROW = np.dtype(
     [(name, np.float64, 3) for name in ("direction", "direction_low")]
     + [(name, np.float64) for name in ("radius", "transmitted", "cos_i", "cos_t")]
@@ -64,23 +64,23 @@ class Certified:
     Directions are unit, b/|a|. `x + x_low` is the value to about 106 bits, `x` alone the nearest double.
     `radius` bounds the error of every component of `direction + direction_low` and is at most 1e-30.
     `cos_i`, `cos_t` are |n·a|/|n||a| and |n·b|/|n||b|; `cos_t` is 0 where nothing is transmitted.
-    Reflectance and transmittance are unpolarised, R and 1 − R, each to 100 bits of its own size
-    short of underflow.
+    Reflectance and transmittance are R and 1 − R of unpolarised light, each with a relative error of 2⁻¹⁰⁰ unless it
+    underflows.
     Amplitudes follow Verdet, as in Mitsuba's `fresnel_polarized`: with η = 1/k,
         a_s = (cᵢ − ηcₜ)/(cᵢ + ηcₜ),  a_p = (ηcᵢ − cₜ)/(ηcᵢ + cₜ),
     and cₜ = −i√(k² sin²θi − 1) under total internal reflection. A tangential ray has R = 1, a_s = a_p = −1.
 
-    A ray with a or n zero or not finite, or k not finite and positive, has NaN numbers and both masks False.
+    For a ray with a or n zero or not finite, or k not finite and positive, all numbers are NaN and both masks False.
     """
 
     direction: np.ndarray  # (N, 3)
     direction_low: np.ndarray  # (N, 3)
     radius: np.ndarray  # (N,)
     transmitted: np.ndarray  # (N,) bool
-    undecided: np.ndarray  # (N,) bool: no precision sufficed, all numbers NaN; impossible for doubles
+    undecided: np.ndarray  # (N,) bool: no precision sufficed, all numbers are NaN; cannot occur for doubles
     cos_i: np.ndarray  # (N,)
     cos_t: np.ndarray  # (N,)
-    reflectance: np.ndarray  # (N,), as all below NaN without `fresnel`
+    reflectance: np.ndarray  # (N,); this and all below are NaN without `fresnel`
     reflectance_low: np.ndarray
     transmittance: np.ndarray
     transmittance_low: np.ndarray
@@ -104,18 +104,18 @@ def refract(
     """Solve Snell's law, sin θt = k sin θi in the plane of a and n, for exactly these numbers.
 
     a: (N, 3) float32 or float64, incident, toward the surface, any length. n: (N, 3), normal on either side,
-    any length. k: number or (N,), n_from/n_to. contrast: number or (N,), k² − 1 where it is known better than
-    k knows it: the problem solved then has k = √(1 + contrast). `fresnel=False` leaves the Fresnel terms NaN.
+    any length. k: number or (N,), n_from/n_to. contrast: number or (N,), k² − 1 if it is known more accurately than
+    from k: then the problem is solved for k = √(1 + contrast). `fresnel=False` leaves the Fresnel terms NaN.
     `progress` shows a bar on a terminal's stderr for 100,000 rays or more.
 
-    D = 0 is transmitted along the surface; n·a = 0 is tangential, not transmitted, b = a.
-    Raises ValueError on a wrong shape or dtype; never on a value.
+    For D = 0 the ray is transmitted along the surface; for n·a = 0 it is tangential, not transmitted, and b = a.
+    ValueError for a wrong shape or dtype, but not for any value.
     """
     a, n, k, contrast, valid = _checked(a, n, k, contrast)
     table = np.full(len(a), _BLANK)
     chunks: Iterable[int] = range(0, len(a), CHUNK)
     if progress and len(a) >= MANY and sys.stderr.isatty():
-        with contextlib.suppress(ImportError):  # a bar, where rich is installed
+        with contextlib.suppress(ImportError):  # without rich there is no bar
             from rich.console import Console
             from rich.progress import track
 
@@ -132,9 +132,9 @@ def _certified(table: Table, valid: NDArray[np.bool_]) -> Certified:
 
 
 def fresnel(cos_i: ArrayLike, k: ArrayLike, *, contrast: ArrayLike | None = None) -> Certified:
-    """As `refract`, of rays known by their cosine alone, for exactly these numbers; directions are NaN.
+    """As `refract`, for rays given by their cosine alone, for exactly these numbers; directions are NaN.
 
-    cos_i: (N,) float32 or float64. Rays whose cosine is outside 0 … 1 are invalid. Raises as `refract` does.
+    cos_i: (N,) float32 or float64. Rays whose cosine is outside 0 … 1 are invalid. Errors as for `refract`.
     """
     cos_i = _floats("cos_i", cos_i, ("N",))
     axis = np.tile([0.0, 0.0, 1.0], (len(cos_i), 1))
@@ -153,7 +153,10 @@ def fresnel(cos_i: ArrayLike, k: ArrayLike, *, contrast: ArrayLike | None = None
 def _checked(
     a: ArrayLike, n: ArrayLike, k: ArrayLike, contrast: ArrayLike | None
 ) -> tuple[Array, Array, Array, Array | None, NDArray[np.bool_]]:
-    """Check shapes and dtypes; float64 arrays (it holds float32 exactly) and the mask of valid rays."""
+    """The arguments as float64 arrays, which represent float32 exactly, and the mask of valid rays.
+
+    ValueError for wrong shapes or dtypes.
+    """
     a = _floats("a", a, ("N", 3))
     count = len(a)
     n, k = _floats("n", n, (count, 3)), np.broadcast_to(_floats("k", k, (), (count,)), (count,))
@@ -166,10 +169,13 @@ def _checked(
 
 
 def _floats(name: str, x: ArrayLike, *shapes: tuple[int | str, ...]) -> Array:
-    """`x` as float64, exactly. One of `shapes`, where "N" is any length."""
+    """`x` as float64, exactly. ValueError unless it has one of `shapes`, where "N" is any length."""
     x = np.asarray(float(x) if isinstance(x, int) else x)
-    fits = any(len(s) == x.ndim and all(map(lambda w, m: w in ("N", m), s, x.shape)) for s in shapes)
-    if x.dtype not in (np.float32, np.float64) or not fits:
+
+    def matches(shape: tuple[int | str, ...]) -> bool:
+        return len(shape) == x.ndim and all(n in ("N", m) for n, m in zip(shape, x.shape, strict=True))
+
+    if x.dtype not in (np.float32, np.float64) or not any(map(matches, shapes)):
         expected = " or ".join(f"({', '.join(map(str, s))})" if s else "a number" for s in shapes)
         raise ValueError(f"oracle: {name} is {x.dtype} {x.shape}; expected float32 or float64, {expected}")
     return x.astype(np.float64)
@@ -185,7 +191,7 @@ def _rays(a: Array, n: Array, k: Array, contrast: Array | None, index: NDArray[n
 
 
 def _fill(table: Table, index: NDArray[np.intp], polynomials: Iterator[Polynomials], fresnel: bool) -> None:
-    """Solve the rays of these polynomials, one precision after the other, into their rows of the table."""
+    """Solve the rays of these polynomials, with increasing precision, and store them in their rows of the table."""
     with ctx.workprec(EXACT_BITS):
         pending = list(zip(index, polynomials, strict=True))
     for bits in PRECISIONS:
@@ -219,7 +225,7 @@ def _exact(ax: Ball, ay: Ball, az: Ball, nx: Ball, ny: Ball, nz: Ball, k: float,
 
 
 def _exact_of_cosine(cos_i: float, k: float, contrast: float | None) -> Polynomials:
-    """The same of unit vectors at this cosine; the direction is left out."""
+    """The polynomials for unit vectors with this cosine; those of the direction are 0."""
     c = arb(cos_i)
     e = arb(k) * k - 1 if contrast is None else arb(contrast)
     c2 = c * c
@@ -228,10 +234,10 @@ def _exact_of_cosine(cos_i: float, k: float, contrast: float | None) -> Polynomi
 
 
 def _solve(polynomials: Polynomials, fresnel: bool) -> tuple[Any, ...]:
-    """One ray at the working precision: a row of the table."""
+    """The row of the table for one ray, at the working precision."""
     c, aa, nn, aann, _, _, _, k2, d, tx, ty, tz, nx, ny, nz = polynomials
     tangential, total = c == 0, d < 0
-    # A comparison of balls is true only when it is certain: none true means that 0 is inside.
+    # A comparison of balls is True only if it is certain. If none is True, the ball contains 0.
     if not (tangential or c > 0 or c < 0) or not (total or d >= 0):
         return _UNDECIDED
     scale = aa.rsqrt() / nn
@@ -256,9 +262,9 @@ def _solve(polynomials: Polynomials, fresnel: bool) -> tuple[Any, ...]:
 
 
 def _fresnel(polynomials: Polynomials, k: Ball, root: Ball, tangential: bool) -> tuple[complex, ...]:
-    """R, 1 − R as pairs, then a_s and a_p, with C = |c|, Q = √|D|.
+    """R and 1 − R as pairs, then a_s and a_p, with C = |c|, Q = √|D|.
 
-    Nothing cancels that is not exact (k²C² − D = (k²−1)AN, C² − k²D = (k²−1)(|n×a|² − D)):
+    All differences that cancel are exact (k²C² − D = (k²−1)AN, C² − k²D = (k²−1)(|n×a|² − D)):
 
     a_s = (kC − Q)/(kC + Q) = (k²−1)AN / (kC + Q)²
     a_p = (C − kQ)/(C + kQ) = (k²−1)(|n×a|² − D) / (C + kQ)²
@@ -286,10 +292,10 @@ def _fresnel(polynomials: Polynomials, k: Ball, root: Ball, tangential: bool) ->
 
 
 def relative_radicand(a: ArrayLike, n: ArrayLike, k: ArrayLike) -> Array:
-    """(N,) how far each ray is from the critical angle: D / max(c², |k²−1| |n×a|²), from −1 to 1, to 2⁻⁵³ of itself.
+    """(N,) the distance of each ray from the critical angle: D / max(c², |k²−1| |n×a|²), from −1 to 1, rounded once.
 
-    Exactly 0 at the critical angle, negative under total internal reflection; NaN where both terms are 0 or the ray
-    is invalid. Arguments as for `refract`.
+    Exactly 0 at the critical angle, negative under total internal reflection; NaN if both terms are 0 or the ray is
+    invalid. Arguments as for `refract`.
     """
     a, n, k, _, valid = _checked(a, n, k, None)
     index, ratio = np.flatnonzero(valid), np.full(len(a), math.nan)

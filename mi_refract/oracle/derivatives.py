@@ -1,7 +1,7 @@
 """Certified derivatives: Snell's law and Fresnel's equations in ball arithmetic, along a line of inputs.
 
-The inputs are a + ε a′ and k + ε k′ with exact a, a′, k, k′; every quantity is a power series in ε, cut after its
-first term, whose coefficients are balls. √D, D > 0 the radicand of `oracle`, is the only step that is not a polynomial.
+The inputs are a + ε a′ and k + ε k′ with exact a, a′, k, k′. Every quantity is a power series in ε to first order
+whose coefficients are balls. √D, with the radicand D > 0 of `oracle`, is the only step that is not a polynomial.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from numpy.typing import ArrayLike
 
 Series: TypeAlias = Any  # a `flint.arb_series`, or a ball
 
-# As many bits as the widest radicand of float32 inputs needs to be exact, and enough for float64 unless it cancels
-# to less than 2⁻⁶⁰⁰ of its terms; what a ball cannot decide is NaN.
+# With so many bits the radicand of any float32 inputs is exact; for float64 they suffice unless it cancels to less than
+# 2⁻⁶⁰⁰ of its terms. If a ball cannot decide, the result is NaN.
 BITS = 1200
 MAX_RADIUS = 1e-25
 
 
 def derivative(a: ArrayLike, n: ArrayLike, k: ArrayLike, along_a: ArrayLike, along_k: ArrayLike) -> np.ndarray:
-    """(N, 3): d/dε of b for a + ε along_a and k + ε along_k, where b keeps the length of `a`.
+    """(N, 3): d/dε of b for a + ε along_a and k + ε along_k, where b has the length of `a`.
 
-    a, n, along_a: (N, 3) of any lengths; k, along_k: (N,) or numbers. At n·a = 0 and D = 0 there is none: NaN.
-    Under total internal reflection it is that of the mirror direction.
+    a, n, along_a: (N, 3) of any lengths; k, along_k: (N,) or numbers. NaN for n·a = 0 and D = 0, where it does not
+    exist. Under total internal reflection it is the derivative of the mirror direction.
     """
     return _by_series(_direction, 3, a, n, k, along_a, along_k)
 
@@ -47,7 +47,7 @@ def _by_series(
     along_a: ArrayLike,
     along_k: ArrayLike,
 ) -> np.ndarray:
-    """(N, width): `solve` of each ray, as the coefficients of ε; NaN where a ball is too wide."""
+    """(N, width): the coefficients of ε from `solve` for each ray; NaN if a ball is too wide."""
     a, n, along_a = (np.asarray(x, np.float64) for x in (a, n, along_a))
     k, along_k = (np.broadcast_to(np.asarray(x, np.float64), len(a)) for x in (k, along_k))
     result = np.full((len(a), width), math.nan)
@@ -86,7 +86,7 @@ def _direction(a: list[Series], n: list[Series], k: Series) -> list[Series]:
 
 
 def _reflectance(cosine: list[Series], _: list[Series], k: Series) -> list[Series]:
-    """(r_s² + r_p²)/2 from the amplitudes as printed: at BITS bits nothing needs saving."""
+    """(r_s² + r_p²)/2 from the amplitudes as in textbooks: with BITS bits cancellation does no harm."""
     c = cosine[0]
     d = k * k * c * c - (k * k - 1)
     if d[0] < 0 and c[0] > 0:

@@ -1,7 +1,7 @@
 """Rays in two dimensions: boundaries between media, the paths of rays through them, scene files, figures.
 
-In: directed boundaries with a refractive index on either side, straight or arcs of conics, as arrays (`Segments`), as
-`shapes` or as a scene file (TOML). Out: `Paths` (points, boundaries met, events, power), focal points, focal lengths,
+Input: directed boundaries with a refractive index on either side, straight or arcs of conics, as arrays (`Segments`),
+`shapes` or a scene file (TOML). Output: `Paths` (points, boundaries met, events, power), focal points, focal lengths,
 an image.
 """
 

@@ -1,4 +1,4 @@
-"""One source for compiled and scalar arrays: number types by backend and precision, tables, output buffers.
+"""Compiled and scalar arrays behind one interface: number types by backend and precision, tables, output buffers.
 
 A compiled backend (LLVM, CUDA) follows all rays at once. The scalar backend follows one ray after the other with
 Python's own numbers, in double precision.
@@ -18,30 +18,30 @@ from mi_refract.numerics import Mask, aligned
 
 Index = Any  # a Python int, or a Dr.Jit array of uint32
 Vector2 = Any  # x and y, two Numbers
-Vertices = Any  # the numbers of a start and an end, Indices
+Vertices = Any  # two Indices: the numbers of a start and an end
 Table = Any  # rows to gather from; see `ArrayBackend.table`
-Buffer = tuple[Any, Any, tuple[int, ...]]  # type, value that fills it, and shape; vectors where that ends in 2
-Scatter = Callable[[str, Index, Any, Mask], None]  # name of a buffer, row, value, where
+Buffer = tuple[Any, Any, tuple[int, ...]]  # type, fill value, and shape; a last dimension of 2 holds vectors
+Scatter = Callable[[str, Index, Any, Mask], None]  # (name of a buffer, row, value, active)
 
 
 class ArrayBackend:
-    """Types and memory access of a compiled backend, "llvm" or "cuda", in a precision."""
+    """Types and memory access of a compiled backend, "llvm" or "cuda", in one precision."""
 
     def __init__(self, backend: str, precision: str) -> None:
-        """Both must be usable here: `choose_backend` checks that."""
+        """The backend must be able to run here: `choose_backend` checks that."""
         self.name, self.precision, arrays = backend, precision, getattr(dr, backend).ad
         wide = "64" if precision == "float64" else ""
-        self._types(getattr(arrays, f"Float{wide or '32'}"), arrays, wide)
+        self._set_types(getattr(arrays, f"Float{wide or '32'}"), arrays, wide)
         self.index, self.mask, self.byte, self.signed = arrays.UInt32, arrays.Bool, arrays.UInt8, arrays.Int32
 
-    def _types(self, number: Any, arrays: Any, wide: str) -> None:
-        """`vector` and `vector3`: in the plane and in space; `roundoff`: u, half the distance from 1 to the next."""
+    def _set_types(self, number: Any, arrays: Any, wide: str) -> None:
+        """Set `number`, `vector` (in the plane), `vector3` (in space), and `roundoff`: u, half the machine epsilon."""
         self.number, self.roundoff = number, float(np.finfo(self.precision).eps) / 2
         self._vectors = {n: getattr(arrays, f"Array{n}f{wide}") for n in (2, 3, 4)}
         self.vector, self.vector3, self._pair = self._vectors[2], self._vectors[3], arrays.Array2u
 
     def table(self, values: Any) -> Table:
-        """A numpy array (N, or N × 2, or N × 4; numbers, or indices where whole) as a table of N rows to `gather`."""
+        """A numpy array (N, N × 2 or N × 4; whole numbers become indices) as a table of N rows to `gather`."""
         values = np.ascontiguousarray(values)
         whole = values.dtype.kind in "iu"
         columns = 1 if values.ndim == 1 else values.shape[1]
@@ -50,18 +50,18 @@ class ArrayBackend:
         return row, kind(aligned(values.ravel(), np.dtype(np.uint32 if whole else self.precision)))
 
     def gather(self, table: Table, i: Index, active: Mask = True) -> Any:
-        """Row i of a table; of no meaning where not `active`."""
+        """Row i of a table; meaningless where not `active`."""
         row, values = table
         return dr.gather(row, values, i, active)
 
     def uniform(self, kind: Any, *values: Any) -> Any:
-        """A number or vector of type `kind` that is the same for all rays, but no part of the code of a kernel."""
+        """A number or vector of type `kind` that is the same for all rays, and not a constant in a kernel's code."""
         return dr.opaque(kind, values[0]) if len(values) == 1 else kind(*(dr.opaque(self.number, x) for x in values))
 
     def run(
         self, count: int, buffers: dict[str, Buffer], work: Callable[[Index, Scatter], None]
     ) -> dict[str, np.ndarray]:
-        """Run `work(i, scatter)` for all i < count; the buffers as numpy arrays.
+        """Run `work(i, scatter)` for all i < count, and return the buffers as numpy arrays.
 
         `scatter(name, j, x, active)` sets buffers[name][j, i] = x where `active`.
         """
@@ -72,7 +72,7 @@ class ArrayBackend:
             x = x if isinstance(x, self.vector) else type(filled[name])(x)
             dr.scatter(filled[name], x, j * stride + lane, active, mode=dr.ReduceMode.NoConflicts)
 
-        if count:  # Dr.Jit refuses an empty array
+        if count:  # Dr.Jit rejects an empty array
             # With fast math CUDA's quotients are approximations, and its compiler fuses their last product with a sum
             # in one kernel and not in another.
             fast = self.name != "cuda" and dr.flag(dr.JitFlag.FastMath)
@@ -83,16 +83,16 @@ class ArrayBackend:
 
 
 class ScalarBackend(ArrayBackend):
-    """The same with Python's own numbers, in double precision."""
+    """The same interface with Python's own numbers, in double precision."""
 
     def __init__(self) -> None:
-        """Needs no compiler."""
+        """Takes no arguments: the precision is float64."""
         self.name, self.precision = "scalar", "float64"
-        self._types(float, dr.scalar, "64")
+        self._set_types(float, dr.scalar, "64")
         self.index, self.mask, self.byte, self.signed = int, bool, np.uint8, np.int32
 
     def table(self, values: Any) -> Table:
-        """As a list of rows."""
+        """The rows as a list."""
         values = np.asarray(values)
         kind = int if values.dtype.kind in "iu" else float
         if values.ndim == 1:
@@ -101,7 +101,7 @@ class ScalarBackend(ArrayBackend):
         return [row(*map(kind, line)) for line in values]
 
     def gather(self, table: Table, i: Index, active: Mask = True) -> Any:
-        """Row i, or the first one where there is no row i: then it is not `active`."""
+        """Row i, or row 0 if row i does not exist: then it is not `active`."""
         return table[i if i < len(table) else 0]
 
     def uniform(self, kind: Any, *values: Any) -> Any:
@@ -111,7 +111,7 @@ class ScalarBackend(ArrayBackend):
     def run(
         self, count: int, buffers: dict[str, Buffer], work: Callable[[Index, Scatter], None]
     ) -> dict[str, np.ndarray]:
-        """One i after the other."""
+        """As for compiled backends, one i after the other."""
         filled = {name: np.full(shape, value, kind) for name, (kind, value, shape) in buffers.items()}
         for lane in range(count):
 
@@ -141,12 +141,12 @@ def choose_backend(name: str | None, precision: str) -> ArrayBackend:
     if name != "scalar":
         return ArrayBackend(name, precision)
     if precision == "float32":
-        accepted = "float64, or a compiled backend (llvm, cuda)"
+        expected = "float64, or a compiled backend (llvm, cuda)"
         missing = "" if llvm.usable else f"; llvm cannot run here: {llvm.reason}"
-        raise ValueError(f"precision = 'float32': scalar arrays compute in double; expected {accepted}{missing}")
+        raise ValueError(f"precision = 'float32': scalar arrays compute in double; expected {expected}{missing}")
     return ScalarBackend()
 
 
 def negated(mask: Mask) -> Mask:
-    """The complement of `mask`: `~True` of a Python bool is −2."""
+    """Not `mask`, for Dr.Jit masks and Python bools (`~True` is −2)."""
     return not mask if isinstance(mask, bool) else ~mask

@@ -1,7 +1,7 @@
-"""Where a ray in the plane meets directed segments and arcs of conics: first by signs, then by distances. No optics.
+"""Intersect a ray in the plane with directed segments and arcs of conics: first by signs, then by distances. No optics.
 
-For a ray p + λd and a segment from A to B, f(V) = d × (V − p) says on which side of the ray a vertex V lies; 0 counts
-as its left. If A and B lie on different sides, the ray's line crosses the segment once, at μ = f(A)/(f(A) − f(B)) and
+For a ray p + λd, f(V) = d × (V − p) tells on which side of the ray a vertex V lies; 0 counts as its left. If the ends A
+and B of a segment lie on different sides, the ray's line crosses the segment once, at μ = f(A)/(f(A) − f(B)) and
 
     λ = ((A − p) × (B − A)) / (d × (B − A))
 
@@ -11,8 +11,8 @@ ends of that segment are computed along it, and their signs are those of the sid
 of p does not carry the ray across a neighbour, however near.
 
 An arc from A to B with control point C and weight w is ((1−t)² A + 2w t(1−t) C + t² B) / ((1−t)² + 2w t(1−t) + t²).
-With s : r = 1−t : t the ray's line meets it where f(A) s² + 2 w f(C) s r + f(B) r² = 0. The signs of f(A) and f(B) say
-here, too, how many crossings there are, except for a ray that may touch the arc between its ends.
+With s : r = 1−t : t the ray's line meets it where f(A) s² + 2 w f(C) s r + f(B) r² = 0. Here, too, the signs of f(A)
+and f(B) give the number of crossings, except for a ray that may touch the arc between its ends.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from mi_refract.numerics import Mask, Number, ieee_divide
 from .array_backend import ArrayBackend, Index, Vector2, Vertices, negated
 from .segments import Segments
 
-NOWHERE = 0xFFFFFFFF  # the number of no segment
-# Of a start on its own segment: the least distance of its ends from the ray, in units of the segment's length.
+NOWHERE = 0xFFFFFFFF  # stands for "no segment"
+# For a ray that starts on a segment: least distance of the segment's ends from the ray, in units of its length.
 SIGN = 1e-22
-UNKNOWN = NOWHERE - 2  # from here on a number is no vertex
+UNKNOWN = NOWHERE - 2  # numbers from here on stand for "no vertex"
 Root = tuple[Number, Number]  # s and r, up to a common factor
-Three = tuple[Any, Any, Any]  # of the start, the control point and the end
+Three = tuple[Any, Any, Any]  # for the start, the control point and the end
 Ends = tuple[Index, Index, Vector2, Vector2, Number]  # the last five fields of `Hit`
 
 
@@ -46,9 +46,9 @@ def cross(a: Vector2, b: Vector2) -> Number:
 class Ray:
     """A ray from `p` along the unit vector `d`.
 
-    own: the segment that it starts on, at start + r (end − start) with r = 1 − s; NOWHERE for none.
+    own: the segment that it starts on, at start + r (end − start) with r = 1 − s; NOWHERE if it starts on none.
     left: whether it leaves to the left of that segment.
-    slack: a boundary no farther from `p` than that is not ahead; 0 for a ray that starts on a segment.
+    slack: a boundary up to this distance from `p` is not ahead; 0 for a ray that starts on a segment.
     """
 
     p: Vector2
@@ -62,32 +62,37 @@ class Ray:
 
 @dataclass
 class Start:
-    """The segment that a ray starts on: numbers of its vertices, the ways from p to them, their sides of the ray.
+    """The segment that a ray starts on.
 
-    For an arc also the way to its control point, s and r (up to a common factor) of where the ray's line meets it once
-    more, whether that is ahead, between the arc's ends, and as of a `Hit` the directions and `bend` from its vertices.
+    vertices, vectors, sides: for both ends, the number of the vertex, the vector from p to it, and f of it.
+    For an arc also:
+    to_control: the vector from p to the control point.
+    second_root: s and r, up to a common factor, where the ray's line meets the arc once more.
+    second_ahead: whether that place is ahead and between the arc's ends.
+    outward, bends: the direction of the arc away from either vertex, and its `bend` there as in `Hit`.
     """
 
     vertices: Vertices
-    ways: tuple[Vector2, Vector2]
+    vectors: tuple[Vector2, Vector2]
     sides: tuple[Number, Number]
-    middle: Vector2 = None
-    other: tuple[Number, Number] = None, None
-    again: Mask = False
-    aways: tuple[Vector2, Vector2] = None, None
+    to_control: Vector2 = None
+    second_root: tuple[Number, Number] = None, None
+    second_ahead: Mask = False
+    outward: tuple[Vector2, Vector2] = None, None
     bends: tuple[Number, Number] = None, None
 
 
-Seen = tuple[Vector2, Number]  # the way from the ray's start to a vertex, and f of it
+View = tuple[Vector2, Number]  # the vector from the ray's start to a vertex, and f of it
 
 
 @dataclass
 class Hit:
-    """A crossing. `segment` is NOWHERE where there is none; `s`, `r`: the place on it, as in `Ray`.
+    """A crossing of a ray and a segment.
 
-    to_left: the ray goes on to the left of the segment.
+    segment: NOWHERE if there is no crossing. s, r: the place on the segment, as in `Ray`.
+    to_left: whether the ray goes on to the left of the segment.
     left, right: numbers of the vertices on the left and on the right of the ray.
-    along, into: the segment's direction, from its left vertex to its right one, at the left and at the right one.
+    along, into: the segment's direction, from its left vertex to its right one, at the left and at the right vertex.
     bend: of an arc, twice the curvature at a vertex times the cube of |along| or |into|, positive to the left; else 0.
     """
 
@@ -104,7 +109,7 @@ class Hit:
 
 
 class LineSegments:
-    """M segments, all of them straight.
+    """M straight segments.
 
     box: the lower and the upper corner of a box around them, with a quarter of its size added on each side.
     """
@@ -121,64 +126,64 @@ class LineSegments:
         e = segments.end - segments.start
         self.directions = arrays.table(e / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), np.finfo(float).tiny))
 
-    def _of(self, i: Index, active: Mask = True) -> tuple[Vector2, Vector2, Vertices]:
+    def _segment(self, i: Index, active: Mask = True) -> tuple[Vector2, Vector2, Vertices]:
         """Start, end and vertices of segment i."""
         ends, vector = self.arrays.gather(self.ends, i, active), self.arrays.vector
         return vector(ends[0], ends[1]), vector(ends[2], ends[3]), self.arrays.gather(self.vertices, i, active)
 
     def start(self, ray: Ray) -> Start:
         """Quantities of the ray's start, computed once per ray, not per segment."""
-        a, b, vertices = self._of(ray.own, ray.own != NOWHERE)
+        a, b, vertices = self._segment(ray.own, ray.own != NOWHERE)
         (s, r), e = self._shares(ray), b - a
         own = type(vertices)(*(dr.select(ray.own != NOWHERE, v, NOWHERE) for v in vertices))
-        # f of both ends: of a ray that leaves to the left, the segment starts on the left and ends on the right.
+        # f of both ends: if the ray leaves to the left, the segment starts on its left and ends on its right.
         size = dr.maximum(dr.abs(cross(ray.d, e)), SIGN * (dr.abs(e.x) + dr.abs(e.y)))
         size = dr.select(ray.left, size, -size)
         return Start(own, (-e * r, e * s), (size * r, -size * s))
 
     def _shares(self, ray: Ray) -> tuple[Number, Number]:
-        """s and r of the ray's start, kept off both ends of the segment by u² of it: signs stay, no number changes."""
+        """s and r of the ray's start, at least u²: so signs are known at the ends too. Distances do not change."""
         least = self.arrays.roundoff**2
         return dr.maximum(ray.s, least), dr.maximum(ray.r, least)
 
     def none(self) -> Hit:
-        """The hit that stands for no crossing, at distance ∞."""
-        number, nowhere, way = self.arrays.number, self.arrays.index(NOWHERE), self.arrays.vector(0)
+        """A `Hit` without a segment, at distance ∞."""
+        number, nowhere, zero = self.arrays.number, self.arrays.index(NOWHERE), self.arrays.vector(0)
         left = self.arrays.mask(False)
-        return Hit(number(dr.inf), nowhere, number(0), number(0), left, nowhere, nowhere, way, way, number(0))
+        return Hit(number(dr.inf), nowhere, number(0), number(0), left, nowhere, nowhere, zero, zero, number(0))
 
-    def _seen(self, ray: Ray, start: Start, vertex: Index, place: Vector2) -> Seen:
-        """The way from the ray's start to a vertex, and f of it."""
-        way = place - ray.p
-        side = cross(ray.d, way)
-        for own, its_way, its_side in zip(start.vertices, start.ways, start.sides, strict=True):
-            same = vertex == own
-            way, side = dr.select(same, its_way, way), dr.select(same, its_side, side)
-        return way, side
+    def _view(self, ray: Ray, start: Start, vertex: Index, place: Vector2) -> View:
+        """The vector from the ray's start to a vertex, and f of it."""
+        vector = place - ray.p
+        side = cross(ray.d, vector)
+        for own_vertex, own_vector, own_side in zip(start.vertices, start.vectors, start.sides, strict=True):
+            same = vertex == own_vertex
+            vector, side = dr.select(same, own_vector, vector), dr.select(same, own_side, side)
+        return vector, side
 
     def nearer(self, best: Hit, ray: Ray, start: Start, i: Index, active: Mask = True) -> Hit:
         """The crossing of segment i, if it comes before `best`."""
-        a, b, vertices = self._of(i, active)
-        seen = self._seen(ray, start, vertices[0], a), self._seen(ray, start, vertices[1], b)
-        hit, ahead = self._crossing(ray, start, i, b - a, vertices, seen)
-        # Of two segments that share a vertex, the turn between them says which comes first, whatever λ rounds to.
+        a, b, vertices = self._segment(i, active)
+        views = self._view(ray, start, vertices[0], a), self._view(ray, start, vertices[1], b)
+        hit, ahead = self._crossing(ray, start, i, b - a, vertices, views)
+        # For two segments that share a vertex, the turn between them decides which comes first, however λ is rounded.
         turn = cross(hit.along, best.along)
         first = dr.select(hit.right == best.right, turn < 0, hit.distance < best.distance)
         first = ahead & active & dr.select(hit.left == best.left, turn > 0, first)
         return dr.select(first, hit, best)
 
     def _crossing(
-        self, ray: Ray, start: Start, i: Index, e: Vector2, vertices: Vertices, seen: tuple[Seen, Seen]
+        self, ray: Ray, start: Start, i: Index, e: Vector2, vertices: Vertices, views: tuple[View, View]
     ) -> tuple[Hit, Mask]:
-        """The crossing of segment i, which goes along e, and whether it is ahead."""
-        (to_a, f_a), (to_b, f_b) = seen
+        """The crossing of segment i, the vector e from start to end, and whether the crossing is ahead."""
+        (to_a, f_a), (to_b, f_b) = views
         a_left, b_left = f_a >= 0, f_b >= 0
-        way = dr.select((vertices[1] == start.vertices[0]) | (vertices[1] == start.vertices[1]), to_b, to_a)
-        # |d × e| = |f_a| + |f_b| without cancellation. `reach` is λ times that: its sign is right where λ's is lost.
+        to_end = dr.select((vertices[1] == start.vertices[0]) | (vertices[1] == start.vertices[1]), to_b, to_a)
+        # |d × e| = |f_a| + |f_b| without cancellation. `reach` is λ times that; its sign is right where λ's may not be.
         scale: Number = dr.abs(f_a) + dr.abs(f_b)
-        reach = dr.select(a_left, -1, 1) * cross(way, e)
-        # The crossing lies between the ends: ahead where both ends are, behind where both are. That decides for a ray
-        # along the segment, where the sign of `reach` is noise.
+        reach = dr.select(a_left, -1, 1) * cross(to_end, e)
+        # The crossing lies between the ends: it is ahead if both ends are, and behind if both are. This decides for a
+        # ray along the segment, where the sign of `reach` is noise.
         t_a, t_b = dr.dot(to_a, ray.d), dr.dot(to_b, ray.d)
         beyond = (dr.maximum(t_a, t_b) > 0) & (reach > ray.slack * (dr.abs(e.x) + dr.abs(e.y)))
         ahead = (a_left != b_left) & ((dr.minimum(t_a, t_b) > ray.slack) | beyond) & (i != ray.own)
@@ -191,21 +196,21 @@ class LineSegments:
 
     def place(self, hit: Hit) -> tuple[Vector2, Vector2]:
         """The point of a hit, from the nearer end, and the segment's direction there."""
-        there = hit.segment != NOWHERE
-        a, b, _ = self._of(hit.segment, there)
+        exists = hit.segment != NOWHERE
+        a, b, _ = self._segment(hit.segment, exists)
         e = b - a
         point = dr.select(hit.r < hit.s, dr.fma(e, hit.r, a), dr.fma(e, -hit.s, b))
-        return point, self.arrays.gather(self.directions, hit.segment, there)
+        return point, self.arrays.gather(self.directions, hit.segment, exists)
 
 
 class ConicArcs(LineSegments):
     """M segments, some of them arcs."""
 
     def __init__(self, arrays: ArrayBackend, segments: Segments) -> None:
-        """Copy them to the backend."""
+        """Copy the segments to the backend."""
         super().__init__(arrays, segments)
         straight, middle = segments.turn == 0, (segments.start + segments.end) / 2
-        # A straight one has r in equal steps along it, whatever control and weight it was given.
+        # With this control point and weight, r is proportional to the distance along a straight segment.
         control, weight = np.where(straight[:, None], middle, segments.control), np.where(straight, 1, segments.weight)
         self.shapes = arrays.table(np.column_stack([control, weight, segments.turn]))
 
@@ -216,29 +221,30 @@ class ConicArcs(LineSegments):
 
     def start(self, ray: Ray) -> Start:
         """Quantities of the ray's start, computed once per ray, not per arc."""
-        there = ray.own != NOWHERE
-        (a, b, _), (c, w, turn) = self._of(ray.own, there), self._shape(ray.own, there)
+        exists = ray.own != NOWHERE
+        (a, b, _), (c, w, turn) = self._segment(ray.own, exists), self._shape(ray.own, exists)
         s, r = self._shares(ray)
         chords = _chord(a, c, b, w, s, r), _chord(b, c, a, w, r, s)
         to_c = ((c - a) * (s * s) + (c - b) * (r * r)) * dr.rcp(_total(w, s, r))
-        # The sides of the ends are those of the chords: their product also says where the line meets the arc again.
+        # The ends lie on the sides of the ray that the chords point to. Their product also gives the place where the
+        # line meets the arc again.
         g_a, g_b = self._chord_sides(ray, chords)
-        again = there & (turn != 0) & ((g_a >= 0) == (g_b >= 0)) & (ray.left == (turn > 0))
+        second_ahead = exists & (turn != 0) & ((g_a >= 0) == (g_b >= 0)) & (ray.left == (turn > 0))
         line, straight = super().start(ray), turn == 0
-        ways = (dr.select(straight, x, -way * y) for x, way, y in zip(line.ways, chords, (r, s), strict=True))
+        vectors = (dr.select(straight, x, -chord * y) for x, chord, y in zip(line.vectors, chords, (r, s), strict=True))
         sides = dr.select(straight, line.sides[0], g_a * r), dr.select(straight, line.sides[1], g_b * s)
         bend = turn * dr.rcp(w * w)
-        others = to_c, (dr.abs(g_b), dr.abs(g_a)), again, (c - a, c - b), (bend, -bend)
-        return Start(line.vertices, tuple(ways), sides, *others)
+        arc_fields = to_c, (dr.abs(g_b), dr.abs(g_a)), second_ahead, (c - a, c - b), (bend, -bend)
+        return Start(line.vertices, tuple(vectors), sides, *arc_fields)
 
     def _chord_sides(self, ray: Ray, chords: tuple[Vector2, Vector2]) -> tuple[Number, Number]:
         """−d × chord for both ends of the arc on which the ray starts.
 
-        Where the ends are on either side of a ray that leaves to the left, the arc starts on the left. Rounding that
-        says otherwise is mended in the smaller of both.
+        If the ends are on different sides of a ray that leaves to the left, the arc starts on the left. If rounding
+        contradicts that, the sign of the smaller value is changed.
         """
-        sizes = [dr.maximum(dr.abs(cross(ray.d, way)), SIGN * (dr.abs(way.x) + dr.abs(way.y))) for way in chords]
-        a_left, b_left = (cross(ray.d, way) <= 0 for way in chords)
+        sizes = [dr.maximum(dr.abs(cross(ray.d, v)), SIGN * (dr.abs(v.x) + dr.abs(v.y))) for v in chords]
+        a_left, b_left = (cross(ray.d, v) <= 0 for v in chords)
         wrong = (a_left != b_left) & (a_left != ray.left)
         smaller = sizes[0] < sizes[1]
         a_left = dr.select(wrong & smaller, ray.left, a_left)
@@ -247,15 +253,15 @@ class ConicArcs(LineSegments):
 
     def nearer(self, best: Hit, ray: Ray, start: Start, i: Index, active: Mask = True) -> Hit:
         """The first crossing of arc i, if it comes before `best`."""
-        (a, b, vertices), (c, w, turn) = self._of(i, active), self._shape(i, active)
-        seen = self._seen(ray, start, vertices[0], a), self._seen(ray, start, vertices[1], b)
-        line, line_ahead = self._crossing(ray, start, i, b - a, vertices, seen)
-        (to_a, f_a), (to_b, f_b) = seen
+        (a, b, vertices), (c, w, turn) = self._segment(i, active), self._shape(i, active)
+        views = self._view(ray, start, vertices[0], a), self._view(ray, start, vertices[1], b)
+        line, line_ahead = self._crossing(ray, start, i, b - a, vertices, views)
+        (to_a, f_a), (to_b, f_b) = views
         own, straight = i == ray.own, turn == 0
-        to_c = dr.select(own, start.middle, c - ray.p)
+        to_c = dr.select(own, start.to_control, c - ray.p)
         a_left = f_a >= 0
         once = a_left != (f_b >= 0)
-        # Left and right vertex of an arc that is crossed once, its directions there, from left to right, and its bend.
+        # For an arc that is crossed once: its left and right vertex, its directions there from left to right, its bend.
         left, right = (dr.select(once, dr.select(a_left, vertices[j], vertices[1 - j]), UNKNOWN + j) for j in (0, 1))
         along, into = dr.select(a_left, c - a, c - b), dr.select(a_left, b - c, a - c)
         ends = left, right, along, into, dr.select(a_left, turn, -turn) * dr.rcp(w * w)
@@ -263,57 +269,60 @@ class ConicArcs(LineSegments):
         f_c = w * cross(ray.d, to_c)
         rest = dr.fma(f_c, f_c, -f_a * f_b)
         h = f_c + dr.mulsign(dr.sqrt(dr.maximum(rest, 0)), f_c)
-        one, other = (dr.abs(h), dr.abs(f_a)), (dr.abs(f_b), dr.abs(h))
-        valid, too = (rest >= 0) & ((h >= 0) != a_left), (rest >= 0) & ((h >= 0) != (f_b >= 0))
-        single = once & too
-        root = (dr.select(own, x, dr.select(single, z, y)) for x, y, z in zip(start.other, one, other, strict=True))
-        ways = to_a, to_c, to_b
-        hit, ahead = self._hit(ray, i, ways, w, tuple(root), dr.select(own, turn < 0, a_left), ends)
+        smaller, larger = (dr.abs(h), dr.abs(f_a)), (dr.abs(f_b), dr.abs(h))
+        smaller_valid, larger_valid = (rest >= 0) & ((h >= 0) != a_left), (rest >= 0) & ((h >= 0) != (f_b >= 0))
+        only_larger = once & larger_valid
+        roots = zip(start.second_root, smaller, larger, strict=True)
+        first_root = tuple(dr.select(own, x, dr.select(only_larger, z, y)) for x, y, z in roots)
+        vectors = to_a, to_c, to_b
+        hit, ahead = self._hit(ray, i, vectors, w, first_root, dr.select(own, turn < 0, a_left), ends)
         hit, ahead = dr.select(straight, line, hit), dr.select(straight, line_ahead, ahead)
-        ahead = self._beyond(start, hit, ahead) & dr.select(straight, once, valid | single)
-        ahead = dr.select(own, start.again, ahead) & active
+        ahead = self._beyond(start, hit, ahead) & dr.select(straight, once, smaller_valid | only_larger)
+        ahead = dr.select(own, start.second_ahead, ahead) & active
         best = dr.select(ahead & self._before(hit, best), hit, best)
-        # Where there are two crossings, neither is at a vertex, but for rounding: their distances decide.
-        hit, ahead = self._hit(ray, i, ways, w, other, negated(a_left), ends)
-        ahead &= active & too & negated(once | own | straight)
+        # Of two crossings, neither is at a vertex up to rounding: their distances decide.
+        hit, ahead = self._hit(ray, i, vectors, w, larger, negated(a_left), ends)
+        ahead &= active & larger_valid & negated(once | own | straight)
         return dr.select(ahead & (hit.distance < best.distance), hit, best)
 
     def _beyond(self, start: Start, hit: Hit, ahead: Mask) -> Mask:
-        """Whether a hit is ahead of the ray's start, which may be at a vertex that both curves share.
+        """Whether a hit is ahead of the ray's start; `ahead` is the answer from its distance.
 
-        Where rounding hides the distance, that is decided there as in `_before`.
+        The ray may start at a vertex that both curves share. Where rounding hides the distance there, the directions
+        and curvatures decide as in `_before`.
         """
         lefts = [side >= 0 for side in start.sides]
-        ons = [v == dr.select(left, hit.left, hit.right) for v, left in zip(start.vertices, lefts, strict=True)]
+        shared = [v == dr.select(left, hit.left, hit.right) for v, left in zip(start.vertices, lefts, strict=True)]
 
-        def there(pair: tuple[Any, Any]) -> Any:
-            return dr.select(ons[0], *pair)
+        def at_shared(pair: tuple[Any, Any]) -> Any:
+            return dr.select(shared[0], *pair)
 
-        left, way, away, bend = there(tuple(lefts)), there(start.ways), there(start.aways), there(start.bends)
-        own, other = dr.select(left, away, -away), dr.select(left, hit.along, hit.into)
-        near = dr.abs(hit.distance) <= 64 * self.arrays.roundoff * (dr.abs(way.x) + dr.abs(way.y))
-        near &= (ons[0] | ons[1]) & (dr.dot(own, other) > 0) & ((bend != 0) | (hit.bend != 0))
-        first = self._turned(other, own, (hit.bend, dr.select(left, bend, -bend)), dr.select(left, -1, 1))
-        return dr.select(near, negated(first), ahead)
+        left, vector = at_shared(tuple(lefts)), at_shared(start.vectors)
+        outward, bend = at_shared(start.outward), at_shared(start.bends)
+        own, other = dr.select(left, outward, -outward), dr.select(left, hit.along, hit.into)
+        near = dr.abs(hit.distance) <= 64 * self.arrays.roundoff * (dr.abs(vector.x) + dr.abs(vector.y))
+        near &= (shared[0] | shared[1]) & (dr.dot(own, other) > 0) & ((bend != 0) | (hit.bend != 0))
+        behind = self._turned(other, own, (hit.bend, dr.select(left, bend, -bend)), dr.select(left, -1, 1))
+        return dr.select(near, negated(behind), ahead)
 
     def _hit(
-        self, ray: Ray, i: Index, ways: Three, w: Number, root: Root, to_left: Mask, ends: Ends
+        self, ray: Ray, i: Index, vectors: Three, w: Number, root: Root, to_left: Mask, ends: Ends
     ) -> tuple[Hit, Mask]:
-        """A root as a hit, and whether it is ahead."""
+        """The `Hit` of a root, and whether it is ahead."""
         s, r = root
         size = s + r
         s, r = ieee_divide(s, size), ieee_divide(r, size)
-        to_a, to_c, to_b = ways
-        way = (to_a * (s * s) + to_c * (2 * w * s * r) + to_b * (r * r)) * dr.rcp(_total(w, s, r))
+        to_a, to_c, to_b = vectors
+        vector = (to_a * (s * s) + to_c * (2 * w * s * r) + to_b * (r * r)) * dr.rcp(_total(w, s, r))
         e = _tangent(to_a, to_c, to_b, w, s, r)
-        distance = dr.dot(way, ray.d)
+        distance = dr.dot(vector, ray.d)
         ahead = distance * dr.abs(cross(ray.d, e)) > ray.slack * (dr.abs(e.x) + dr.abs(e.y))
         return Hit(distance, i, s, r, to_left, *ends), ahead & (distance > 0)
 
     def _before(self, hit: Hit, best: Hit) -> Mask:
         """Whether `hit` comes before `best`: by distance, but by direction at a vertex that both share.
 
-        Where the arcs touch in that vertex, their curvatures decide: the one farther to the left, seen from the left
+        If the arcs touch in that vertex, their curvatures decide: the arc farther to the left, seen from the left
         vertex to the right one, comes later.
         """
         first, second = hit.distance, best.distance
@@ -326,7 +335,7 @@ class ConicArcs(LineSegments):
         return dr.select(tie & (hit.left == best.left), left, before)
 
     def _turned(self, e: Vector2, other: Vector2, bends: tuple[Number, Number], sign: Any) -> Mask:
-        """Whether sign · e × other < 0; where that is 0 up to rounding, whether e has the smaller curvature."""
+        """Whether sign · e × other < 0; if that is 0 up to rounding, whether e has the smaller curvature."""
         sine, x, y = sign * cross(e, other), dr.norm(e), dr.norm(other)
         touching = dr.abs(sine) <= 64 * self.arrays.roundoff * x * y
         touching &= (bends[0] != 0) | (bends[1] != 0)
@@ -334,8 +343,8 @@ class ConicArcs(LineSegments):
 
     def place(self, hit: Hit) -> tuple[Vector2, Vector2]:
         """The point of a hit, from the nearer end, and the arc's unit direction there."""
-        there = hit.segment != NOWHERE
-        (a, b, _), (c, w, turn) = self._of(hit.segment, there), self._shape(hit.segment, there)
+        exists = hit.segment != NOWHERE
+        (a, b, _), (c, w, turn) = self._segment(hit.segment, exists), self._shape(hit.segment, exists)
         s, r = hit.s, hit.r
         point = dr.select(r < s, dr.fma(_chord(a, c, b, w, s, r), r, a), dr.fma(_chord(b, c, a, w, r, s), s, b))
         e = _tangent(a, c, b, w, s, r)
@@ -349,7 +358,7 @@ def _total(w: Number, s: Number, r: Number) -> Number:
 
 
 def _chord(a: Vector2, c: Vector2, b: Vector2, w: Number, s: Number, r: Number) -> Vector2:
-    """The vector from the end `a` to the place on the arc, over r."""
+    """The vector from the end `a` to the place on the arc, divided by r."""
     return ((c - a) * (2 * w * s) + (b - a) * r) * dr.rcp(_total(w, s, r))
 
 

@@ -1,4 +1,4 @@
-"""The colours of the rays of a planar scene: by name, or by wavelength with powers and what the eye makes of them."""
+"""The colours of the rays of a planar scene: by name, or by wavelength with powers and visible colours."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from mi_refract.backend import activate
 
 from .segments import Array
 
-VISIBLE = 380.0, 730.0  # nm: where a number of wavelengths is spread over
+VISIBLE = 380.0, 730.0  # nm: the range of a given number of wavelengths
 SHORTEST, LONGEST = 100.0, 100_000.0  # nm
 MOST = 256  # wavelengths
 
 
 @dataclass(frozen=True)
 class Light:
-    """Colours that are followed one by one.
+    """Colours, each traced separately.
 
-    names: of colours, ("",) where there is one without a name. wavelengths: in nm, one per colour, or () where colours
-    are names only. powers: one per colour, relative; () for equal ones.
+    names: of the colours; ("",) for a single one without a name. wavelengths: in nm, one per colour; () for colours
+    with names only. powers: relative, one per colour; () for equal ones.
     """
 
     names: tuple[str, ...] = ("",)
@@ -38,11 +38,11 @@ class Light:
     def indices(
         self, spec: str | float | Sequence[float], where: str, find: Callable[[str], Path] = Path
     ) -> tuple[float, ...]:
-        """The index of a medium for each colour: one number for all, one for each, or a material.
+        """The index of a medium for each colour. `spec`: one number for all colours, one for each, or a material.
 
-        A material's index is relative to air; it is that of the d line where colours have no wavelengths.
-        `find`: where a file is that `spec` names.
-        ValueError for another count of numbers, as of `media.parse`, and for a wavelength out of the material's range.
+        A material's index is relative to air; for colours without wavelengths it is the index at the d line.
+        `find`: returns the path of a file that `spec` names.
+        ValueError for another count of numbers, as for `media.parse`, and for a wavelength out of the material's range.
         """
         if not isinstance(spec, str):
             numbers = tuple(np.ravel(spec).tolist())
@@ -61,19 +61,19 @@ class Light:
 
 
 def of_wavelengths(nm: Sequence[float] | int, power: str = "flat") -> Light:
-    """Colours by wavelength in nm, or so many evenly spread over the visible.
+    """Colours for wavelengths in nm, or for a number of wavelengths evenly spread over the visible range.
 
-    power: "flat", or "D65" for that of CIE's illuminant, as Mitsuba has it.
+    power: "flat", or "D65" for the powers of CIE's illuminant from Mitsuba.
     """
-    spread = np.linspace(*VISIBLE, nm) if isinstance(nm, int) else np.array(nm, float)
-    wavelengths = tuple(float(w) for w in spread)
+    values = np.linspace(*VISIBLE, nm) if isinstance(nm, int) else np.array(nm, float)
+    wavelengths = tuple(float(w) for w in values)
     powers = (1.0,) * len(wavelengths)
     if power == "D65":
         import mitsuba as mi
 
         if mi.variant() is None:
             activate()
-        # The present variant stays: to switch, and back, takes 0.1 s. Its classes are known once it is named.
+        # Keep the current variant, as switching there and back takes 0.1 s. Naming another one loads its classes.
         variant: Any = mi.scalar_spectral
         si, config = variant.SurfaceInteraction3f(), mi.parser.ParserConfig("scalar_spectral")
         spectrum: Any = mi.parser.instantiate(config, mi.parser.parse_dict(config, {"type": "d65"}))
@@ -86,23 +86,23 @@ def of_wavelengths(nm: Sequence[float] | int, power: str = "flat") -> Light:
 
 
 def parsed(text: str) -> list[float] | int:
-    """Wavelengths in nm with commas between them, or how many. ValueError for anything else."""
-    accepted = f"expected wavelengths in nm, such as 486.1,587.6, or how many, from 2 to {MOST}"
+    """Wavelengths in nm separated by commas, or their number. ValueError for anything else."""
+    expected = f"expected wavelengths in nm, such as 486.1,587.6, or their number, from 2 to {MOST}"
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        raise ValueError(f"--wavelengths {text}: {accepted}") from None
+        raise ValueError(f"--wavelengths {text}: {expected}") from None
     if len(numbers) == 1 and text.strip().isdigit() and 2 <= numbers[0] <= MOST:
         return int(numbers[0])
     if len(numbers) > MOST or not all(SHORTEST <= x <= LONGEST for x in numbers):
-        raise ValueError(f"--wavelengths {text}: {accepted}")
+        raise ValueError(f"--wavelengths {text}: {expected}")
     return numbers
 
 
 def linear_srgb(light: Light) -> Array:
-    """What the eye makes of each colour (C × 3, linear sRGB; negative where a screen cannot show it).
+    """The colour that the eye sees for each wavelength (C × 3, linear sRGB; negative if a screen cannot show it).
 
-    All of them together are (1, 1, 1): white. ValueError where none is visible.
+    All of them together are (1, 1, 1): white. ValueError if none is visible.
     """
     import mitsuba as mi
 
@@ -110,8 +110,8 @@ def linear_srgb(light: Light) -> Array:
         activate()
     variant: Any = mi.scalar_rgb
     matrix = np.array([variant.xyz_to_srgb([float(i == j) for j in range(3)]) for i in range(3)], float)
-    seen = np.array([variant.cie1931_xyz(float(w)) for w in light.wavelengths], float)
-    rgb: Array = (seen * np.array(light.powers)[:, None]) @ matrix
+    xyz = np.array([variant.cie1931_xyz(float(w)) for w in light.wavelengths], float)
+    rgb: Array = (xyz * np.array(light.powers)[:, None]) @ matrix
     total = rgb.sum(0)
     if not total.any():
         raise ValueError(

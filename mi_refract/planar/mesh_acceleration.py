@@ -1,18 +1,19 @@
-"""Finds the first boundary ahead with Mitsuba's own ray tracing, in time that grows like log M. Straight segments only.
+"""Find the first boundary ahead with Mitsuba's ray tracing, in time that grows like log M. Straight segments only.
 
 The mesh holds one triangle for each segment and each vertex, perpendicular to the plane z = 0. A triangle cuts that
-plane in a line, here called a stroke: along a segment, longer than it by MARGIN at either end, or across a vertex,
+plane in a line, here called a stroke: along a segment, extended by MARGIN at either end, or across a vertex,
 2 MARGIN long. Lengths are in units of half the scene's extent.
 
 Mitsuba traces in float32. So its ray, whose start is moved off its own segment by OFFSET, lies up to ε < MARGIN beside
-the given ray. But a ray that crosses a segment within ε of some place crosses the stroke of that segment, of its
-neighbour, or of a vertex between them. So the strokes met, in order, name every segment that must be tried, and
+the exact ray. But a ray that crosses a segment within ε of some place crosses the stroke of that segment, of its
+neighbour, or of a vertex between them. So the strokes on the ray, in order, list every segment that must be tested, and
 `LineSegments` decides exactly. In a wedge, where neighbours are within 4 MARGIN of each other, the order of
-strokes is not reliable: there all segments at the vertex are tried.
+strokes is not reliable: there all segments at the vertex are tested.
 
-Precondition: no segment is shorter than SHORTEST, and no two that share no vertex are closer than SHORTEST. The first
-is checked by the tracer, the second at the middle and the quarters of each segment (`crowded`). Where it fails
-elsewhere, a ray may miss a thin layer there, or meet its two sides in the wrong order and end with MEDIUM_MISMATCH.
+Precondition: no segment is shorter than SHORTEST, and no two segments without a common vertex are closer than SHORTEST.
+The tracer checks the first part; `crowded` checks the second at the middle and the quarters of each segment. Where two
+segments are closer elsewhere, a ray may miss a thin layer, or meet its two sides in the wrong order and end with
+MEDIUM_MISMATCH.
 """
 
 from __future__ import annotations
@@ -34,150 +35,161 @@ from .segments import Array, Segments
 MARGIN = 2.0**-19
 OFFSET = 2.0**-21
 SHORTEST = 2 * MARGIN
-STEP = 2.0**-22  # beyond a stroke that was no hit
-# A ray that starts on no segment is traced from BACK behind its start: that may be within ε of a boundary, which is
-# seen down to grazing angles of ε/BACK.
+STEP = 2.0**-22  # the search goes on this far behind a stroke
+# A ray that does not start on a segment is traced from BACK behind its start, as the start may be within ε of a
+# boundary. Such a boundary is found down to grazing angles of ε/BACK.
 BACK = 2.0**-6
-# Rays are coherent where their median step in place and direction is less: for others Embree's single-ray query takes
-# half the time of its query for packets.
+# Rays are coherent if the median difference of neighbours in origin and direction is below this. For other rays
+# Embree's single-ray query takes half the time of its packet query.
 COHERENT = 2.0**-5
-SAMPLE = 4096  # rays by which that is judged
+SAMPLE = 4096  # number of rays whose coherence is measured
 
 
 @dataclass
 class SearchState:
-    """How far along a ray has been searched, and the nearest segment that was found beyond that, or NOWHERE."""
+    """The distance up to which a ray has been searched, and the nearest segment found beyond it, or NOWHERE."""
 
-    gone: Number
-    held: Index
+    searched: Number
+    candidate: Index
 
 
 class MeshAcceleration:
-    """Strokes of M straight segments, and the segments that each one names.
+    """The strokes of M straight segments, and for each stroke a list of neighbouring segments.
 
-    crowded: two segments that share no vertex and are too close to each other; None where none were seen.
+    crowded: numbers of two segments that share no vertex and are closer than SHORTEST; None if no such pair was found.
     """
 
     def __init__(self, arrays: ArrayBackend, segments: Segments) -> None:
-        """Build the mesh and the lists of neighbours, and look for segments that are too close."""
+        """Build the mesh and the lists of neighbours, and search for segments that are too close."""
         import mitsuba
 
         self.arrays, self.coherent = arrays, True
         variant = "scalar_rgb" if arrays.name == "scalar" else f"{arrays.name}_ad_rgb"
         self.mi: Any = getattr(mitsuba, variant)
-        both, vertices = (segments.start, segments.end), segments.vertices
-        low, high = (f(np.concatenate(both), axis=0) for f in (np.min, np.max))
+        ends, vertices = np.concatenate([segments.start, segments.end]), segments.vertices
+        low, high = ends.min(axis=0), ends.max(axis=0)
         centre, self.half = (low + high) / 2, float((high - low).max() / 2)
         self.centre, self.scale = arrays.uniform(arrays.vector, *centre), arrays.uniform(arrays.number, 1 / self.half)
-        a, b = ((x - centre) / self.half for x in both)
-        self.scene = _strokes(variant, a, b, vertices)
-        self.crowded = self._crowded(a, b, vertices)
+        a, b = (segments.start - centre) / self.half, (segments.end - centre) / self.half
+        self.scene = _stroke_scene(variant, a, b, vertices)
+        self.crowded = self._find_crowded(a, b, vertices)
         self.wedges = arrays.table(_wedge_shares(a, b, vertices))
-        first, around = _around(vertices)
-        self.first, self.around = arrays.table(first), arrays.table(around)
+        first, neighbours = _neighbour_lists(vertices)
+        self.first, self.neighbours = arrays.table(first), arrays.table(neighbours)
 
-    def expect(self, origins: Array, directions: Array) -> None:
-        """Choose between Embree's queries for coherent rays and for single ones, by the order of these rays (N × 2)."""
-        places, turns = origins[:SAMPLE] / self.half, directions[:SAMPLE]
-        turns = turns / np.abs(turns).max(axis=1, keepdims=True)
-        steps = (np.abs(np.diff(x, axis=0)).sum(1) for x in (places, turns))
-        self.coherent = len(origins) < 2 or float(np.median(sum(steps))) < COHERENT
+    def choose_query(self, origins: Array, directions: Array) -> None:
+        """Choose Embree's query, for coherent rays or for single ones, from the order of these rays (N × 2 each)."""
+        places, directions = origins[:SAMPLE] / self.half, directions[:SAMPLE]
+        directions = directions / np.abs(directions).max(axis=1, keepdims=True)
+        steps = np.abs(np.diff(places, axis=0)).sum(1) + np.abs(np.diff(directions, axis=0)).sum(1)
+        self.coherent = len(origins) < 2 or float(np.median(steps)) < COHERENT
 
     def nearest(
         self, boundaries: LineSegments, ray: Ray, start: Start, search: SearchState, active: Mask
     ) -> tuple[Hit, SearchState, Mask]:
-        """The first boundary found so far, from where to search on, and whether no other can come before it."""
-        # From the ray's start, moved off its own segment, to the side to which the ray goes.
-        x, y = (self.mi.Float(e) for e in start.ways[1] - start.ways[0])
+        """Query the mesh once for the next stroke.
+
+        Returns the first boundary found so far, the state to continue the search from, and whether the search is over:
+        no other boundary can come first.
+        """
+        # From the ray's start, moved off its own segment, to the side that the ray leaves to.
+        x, y = (self.mi.Float(e) for e in start.vectors[1] - start.vectors[0])
         size = dr.select(ray.left, OFFSET, -OFFSET) * dr.rsqrt(dr.fma(x, x, y * y))
         q, number = (ray.p - self.centre) * self.scale, self.arrays.number
         q = dr.select(ray.own != NOWHERE, type(q)(q.x - number(y * size), q.y + number(x * size)), q)
-        hit, t, stroke = self._stroke(dr.fma(ray.d, search.gone, q), ray.d, active)
+        hit, t, stroke = self._next_stroke(dr.fma(ray.d, search.searched, q), ray.d, active)
         own = active & (ray.own != NOWHERE)
-        corner = own & self._near_end(ray.own, ray, own)
+        starts_in_wedge = own & self._in_wedge(ray.own, ray, own)
 
-        def tried(best: Hit, stroke: Index, hit: Mask, corner: Mask, held: Index) -> Hit:
+        def test_segments(best: Hit, stroke: Index, hit: Mask, starts_in_wedge: Mask, candidate: Index) -> Hit:
             best = boundaries.nearer(best, ray, start, stroke, hit & (stroke < boundaries.count))
-            # In a wedge all neighbours are tried: their strokes may be met in any order, and the start may lie beyond
-            # one of them, or beyond the stroke of the vertex between.
-            vague = hit & self._near_end(best.segment, best, hit)
-            lists = dr.select(vague, stroke, NOWHERE), dr.select(corner, ray.own, NOWHERE)
-            return self._also(best, boundaries, ray, start, held, lists)
+            # In a wedge all neighbours are tested: the ray may meet their strokes in any order, and its start may lie
+            # beyond one of them, or beyond the stroke of the vertex between.
+            hits_in_wedge = hit & self._in_wedge(best.segment, best, hit)
+            strokes = dr.select(starts_in_wedge, ray.own, NOWHERE), dr.select(hits_in_wedge, stroke, NOWHERE)
+            return self._nearest_neighbour(best, boundaries, ray, start, candidate, strokes)
 
         # A branch, not a select: neighbouring rays mostly agree.
-        held = dr.select(active, search.held, NOWHERE)
-        state = boundaries.none(), stroke, hit, corner, held
-        best = dr.if_stmt(state, hit | corner | (held != NOWHERE), tried, lambda best, *_: best, label="stroke")
-        gone = search.gone + t
-        settled = negated(hit) | (best.distance * self.scale <= gone + MARGIN)
-        return best, SearchState(gone + STEP, best.segment), settled
+        candidate = dr.select(active, search.candidate, NOWHERE)
+        state = boundaries.none(), stroke, hit, starts_in_wedge, candidate
+        needed = hit | starts_in_wedge | (candidate != NOWHERE)
+        best = dr.if_stmt(state, needed, test_segments, lambda best, *_: best, label="stroke")
+        searched = search.searched + t
+        settled = negated(hit) | (best.distance * self.scale <= searched + MARGIN)
+        return best, SearchState(searched + STEP, best.segment), settled
 
-    def _near_end(self, segment: Index, at: Hit | Ray, active: Mask) -> Mask:
+    def _in_wedge(self, segment: Index, at: Hit | Ray, active: Mask) -> Mask:
         """Whether a place on a segment is in a wedge at either end; true where there is no segment."""
-        some = active & (segment != NOWHERE)
-        near_a, near_b = self.arrays.gather(self.wedges, segment, some)
-        return negated(some) | (at.r < near_a) | (at.s < near_b)
+        exists = active & (segment != NOWHERE)
+        near_a, near_b = self.arrays.gather(self.wedges, segment, exists)
+        return negated(exists) | (at.r < near_a) | (at.s < near_b)
 
-    def _crowded(self, a: Array, b: Array, vertices: Vertices) -> tuple[int, int] | None:
+    def _find_crowded(self, a: Array, b: Array, vertices: Vertices) -> tuple[int, int] | None:
         """Two segments that share no vertex, one less than SHORTEST from the middle or a quarter of the other."""
         arrays, e = self.arrays, b - a
-        across = np.column_stack([-e[:, 1], e[:, 0]]) / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), 1e-300)
-        for share, d in itertools.product((0.25, 0.5, 0.75), (across, -across)):
+        normals = np.column_stack([-e[:, 1], e[:, 0]]) / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), 1e-300)
+        for share, d in itertools.product((0.25, 0.5, 0.75), (normals, -normals)):
             places, directions = arrays.table(a + share * e + OFFSET * d), arrays.table(d)
 
-            def work(lane: Index, scatter: Scatter, places: Table = places, directions: Table = directions) -> None:
-                q, way = arrays.gather(places, lane), arrays.gather(directions, lane)
-                hit, t, stroke = self._stroke(q, way, arrays.mask(True))
+            def query(lane: Index, scatter: Scatter, places: Table = places, directions: Table = directions) -> None:
+                place, direction = arrays.gather(places, lane), arrays.gather(directions, lane)
+                hit, t, stroke = self._next_stroke(place, direction, arrays.mask(True))
                 scatter("nearby", 0, stroke, hit & (t < SHORTEST))
 
-            stroke = arrays.run(len(a), {"nearby": (arrays.index, NOWHERE, (1, len(a)))}, work)["nearby"][0]
-            seen = np.flatnonzero(stroke < len(a))
-            other = stroke[seen]
-            apart = (vertices[seen, :, None] != vertices[other][:, None]).all((1, 2))
+            strokes = arrays.run(len(a), {"nearby": (arrays.index, NOWHERE, (1, len(a)))}, query)["nearby"][0]
+            near = np.flatnonzero(strokes < len(a))
+            neighbours = strokes[near]
+            apart = (vertices[near, :, None] != vertices[neighbours][:, None]).all((1, 2))
             if apart.any():
-                return int(seen[apart][0]), int(other[apart][0])
+                return int(near[apart][0]), int(neighbours[apart][0])
         return None
 
-    def _stroke(self, q: Vector2, d: Vector2, active: Mask) -> tuple[Mask, Number, Index]:
-        """Whether a stroke is ahead of a ray, its distance, and its number."""
+    def _next_stroke(self, q: Vector2, d: Vector2, active: Mask) -> tuple[Mask, Number, Index]:
+        """Whether there is a stroke ahead of a ray, its distance, and its number."""
         mi, number = self.mi, self.mi.Float
         ray = mi.Ray3f(mi.Point3f(number(q.x), number(q.y), 0), mi.Vector3f(number(d.x), number(d.y), 0))
-        seen = self.scene.ray_intersect_preliminary(ray, self.coherent, active)
-        return active & seen.is_valid(), self.arrays.number(seen.t), self.arrays.index(seen.prim_index)
+        pi = self.scene.ray_intersect_preliminary(ray, self.coherent, active)
+        return active & pi.is_valid(), self.arrays.number(pi.t), self.arrays.index(pi.prim_index)
 
-    def _also(
-        self, best: Hit, boundaries: LineSegments, ray: Ray, start: Start, held: Index, strokes: tuple[Index, Index]
+    def _nearest_neighbour(
+        self,
+        best: Hit,
+        boundaries: LineSegments,
+        ray: Ray,
+        start: Start,
+        candidate: Index,
+        strokes: tuple[Index, Index],
     ) -> Hit:
-        """The nearest of `best`, the segment `held`, and all segments that two strokes name; NOWHERE for none."""
-        later, sooner = strokes
+        """The nearest of `best`, the segment `candidate`, and all neighbours of two strokes; each may be NOWHERE."""
+        first_stroke, last_stroke = strokes
         gather = self.arrays.gather
 
-        def test(i: Index, stroke: Index, best: Hit, going: Mask) -> tuple[Index, Index, Hit, Mask]:
-            listed = going & (i > 0) & (stroke != NOWHERE)
-            named = gather(self.around, gather(self.first, stroke, listed) + i - 1, listed)
-            segment = dr.select(i == 0, held, dr.select(listed, named, NOWHERE))
+        def test(i: Index, stroke: Index, best: Hit, active: Mask) -> tuple[Index, Index, Hit, Mask]:
+            listed = active & (i > 0) & (stroke != NOWHERE)
+            neighbour = gather(self.neighbours, gather(self.first, stroke, listed) + i - 1, listed)
+            segment = dr.select(i == 0, candidate, dr.select(listed, neighbour, NOWHERE))
             end = segment == NOWHERE
-            best = boundaries.nearer(best, ray, start, segment, going & negated(end))
-            more = going & (negated(end) | ((stroke != later) & (later != NOWHERE)))
-            return dr.select(end, 1, i + 1), dr.select(end, later, stroke), best, more
+            best = boundaries.nearer(best, ray, start, segment, active & negated(end))
+            more = active & (negated(end) | ((stroke != last_stroke) & (last_stroke != NOWHERE)))
+            return dr.select(end, 1, i + 1), dr.select(end, last_stroke, stroke), best, more
 
-        stroke = dr.select(sooner == NOWHERE, later, sooner)
-        some = (held != NOWHERE) | (stroke != NOWHERE)
-        state = dr.select(held == NOWHERE, self.arrays.index(1), 0), stroke, best, some
-        return dr.while_loop(state, lambda i, stroke, best, going: going, test, label="also")[2]
+        stroke = dr.select(first_stroke == NOWHERE, last_stroke, first_stroke)
+        needed = (candidate != NOWHERE) | (stroke != NOWHERE)
+        state = dr.select(candidate == NOWHERE, self.arrays.index(1), 0), stroke, best, needed
+        return dr.while_loop(state, lambda i, stroke, best, active: active, test, label="neighbours")[2]
 
 
-def _strokes(of: str, a: Array, b: Array, vertices: Vertices) -> Any:
-    """A scene of the Mitsuba variant `of`: one triangle per stroke, which cuts the plane z = 0 along it.
+def _stroke_scene(variant_name: str, a: Array, b: Array, vertices: Vertices) -> Any:
+    """A Mitsuba scene with one triangle per stroke, which cuts the plane z = 0 along the stroke.
 
-    First the strokes of the segments from `a` to `b` (M × 2), then those of the vertices.
+    First come the strokes of the segments from `a` to `b` (M × 2), then those of the vertices.
     """
     import mitsuba as mi
 
     e = b - a
     length = np.linalg.norm(e, axis=1, keepdims=True)
     e = np.divide(e, length, out=np.zeros_like(e), where=length > 0)
-    # Across the principal axis of the segments at a vertex: along it they have strokes of their own.
+    # The stroke of a vertex lies across the principal axis of the segments there: along it they have their own strokes.
     number = vertices.ravel()
     xx, xy, yy = (np.bincount(number, np.repeat(e[:, i] * e[:, j], 2)) for i, j in ((0, 0), (0, 1), (1, 1)))
     angle = np.arctan2(2 * xy, xx - yy) / 2
@@ -188,28 +200,28 @@ def _strokes(of: str, a: Array, b: Array, vertices: Vertices) -> Any:
     ends = np.concatenate([b + MARGIN * e, place + across])
     if mi.variant() is None:
         activate()
-    variant: Any = getattr(mi, of)
+    variant: Any = getattr(mi, variant_name)
     middle = (starts + ends) / 2
     corners = (middle, -1), (2 * starts - middle, 1), (2 * ends - middle, 1)
     places = np.concatenate([np.insert(corner, 2, z, axis=1) for corner, z in corners])
     mesh = mitsuba_mesh.make(variant, places, np.arange(len(places)).reshape(3, -1).T)
-    # mi.load_dict would build for the variant that is set now.
-    config = mi.parser.ParserConfig(of)
+    # mi.load_dict would build the scene for the variant that is set now.
+    config = mi.parser.ParserConfig(variant_name)
     state = mi.parser.parse_dict(config, {"type": "scene", "strokes": mesh})
     mi.parser.transform_all(config, state)
     return mi.parser.instantiate(config, state)
 
 
 def _wedge_shares(a: Array, b: Array, vertices: Vertices) -> Array:
-    """M × 2: the share of each segment, from either end, where the next one at that vertex is within 4 MARGIN."""
-    ways = np.stack([b - a, a - b], 1).reshape(-1, 2)
-    angle, number = np.arctan2(ways[:, 1], ways[:, 0]), vertices.ravel()
+    """M × 2: the share of each segment, from either end, that is within 4 MARGIN of the next segment at that vertex."""
+    directions = np.stack([b - a, a - b], 1).reshape(-1, 2)
+    angle, number = np.arctan2(directions[:, 1], directions[:, 0]), vertices.ravel()
     order = np.lexsort([angle, number])
     begin = np.searchsorted(number[order], number[order])
     end = np.searchsorted(number[order], number[order], side="right")
     after = np.arange(1, len(order) + 1)
     after = np.where(after < end, after, begin)
-    # The angle to the next segment at the same vertex; half a turn where there is no other.
+    # The angle to the next segment at the same vertex; π if there is no other.
     turn = (angle[order[after]] - angle[order]) % (2 * np.pi)
     turn[end - begin == 1] = np.pi
     least = np.full(len(order), np.pi)
@@ -220,24 +232,26 @@ def _wedge_shares(a: Array, b: Array, vertices: Vertices) -> Array:
         return np.asarray(reach.reshape(-1, 2) / np.linalg.norm(b - a, axis=1, keepdims=True))
 
 
-def _around(vertices: Vertices) -> tuple[Any, Any]:
-    """(first, around): stroke i names the segments in `around` from first[i] to the next NOWHERE, but not its own."""
+def _neighbour_lists(vertices: Vertices) -> tuple[Any, Any]:
+    """(first, neighbours): the neighbours of stroke i are neighbours[first[i]] to the one before the next NOWHERE.
+
+    The neighbours of a stroke are all segments at its vertex, or at its two vertices, except its own segment.
+    """
     order = np.argsort(vertices.ravel(), kind="stable")
     degree = np.bincount(vertices.ravel())
     count = len(degree)
     begin = np.cumsum(degree) - degree
-    # A stroke names all segments at its vertex, or at its two vertices.
     segments = np.arange(len(vertices))
     strokes = np.concatenate([segments, segments, len(vertices) + np.arange(count)])
-    of = np.concatenate([*vertices.T, np.arange(count)])
-    sizes = degree[of]
+    stroke_vertices = np.concatenate([*vertices.T, np.arange(count)])
+    sizes = degree[stroke_vertices]
     within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    strokes, named = np.repeat(strokes, sizes), order[np.repeat(begin[of], sizes) + within] // 2
-    others = np.flatnonzero(strokes != named)
+    strokes, listed = np.repeat(strokes, sizes), order[np.repeat(begin[stroke_vertices], sizes) + within] // 2
+    others = np.flatnonzero(strokes != listed)
     others = others[np.argsort(strokes[others], kind="stable")]
-    strokes, named = strokes[others], named[others]
+    strokes, listed = strokes[others], listed[others]
     # A NOWHERE ends each list.
-    around = np.full(len(named) + len(vertices) + count, NOWHERE)
-    around[np.arange(len(named)) + strokes] = named
+    neighbours = np.full(len(listed) + len(vertices) + count, NOWHERE)
+    neighbours[np.arange(len(listed)) + strokes] = listed
     lengths = np.bincount(strokes, minlength=len(vertices) + count) + 1
-    return np.cumsum(lengths) - lengths, around
+    return np.cumsum(lengths) - lengths, neighbours

@@ -27,11 +27,11 @@ from .light import LONGEST, MOST, SHORTEST, Light, of_wavelengths
 from .segments import Array, Segments, check_range
 from .shared_boundaries import Indices, Part, boundaries
 
-# Limits of what a file may ask for, checked before memory is allocated.
+# Largest values that a file may contain, checked before memory is allocated.
 SIZE = 2**24  # bytes of the file
-PIECES = 2**22  # of all curves, once for each colour
-RAYS = 2**24  # of all beams
-FARTHEST = 1e100  # of all coordinates: products of two do not overflow
+PIECES = 2**22  # pieces of all curves, once for each colour
+RAYS = 2**24  # rays of all beams
+FARTHEST = 1e100  # coordinate: products of two do not overflow
 
 Positive = Annotated[float, Meta(gt=0)]
 Text = Annotated[str, Meta(pattern=r"\S")]
@@ -41,7 +41,7 @@ Points = Annotated[list[Point], Meta(min_length=1)]
 Box = tuple[float, float, float, float]
 Direction = float | Point
 Count = Annotated[int, Meta(ge=1, le=1_000_000)]
-Arcs = Annotated[list[float] | None, Meta(description="degrees by which each piece turns left, an arc; 0: straight")]
+Arcs = Annotated[list[float] | None, Meta(description="degrees by which each piece turns left, as an arc; 0: straight")]
 Index = Positive | Annotated[list[Positive], Meta(min_length=1)] | Annotated[str, Meta(min_length=1)]
 
 
@@ -53,15 +53,15 @@ def _doc(meaning: str) -> Meta:
 
 
 class Shape(Struct, forbid_unknown_fields=True, tag_field="kind"):
-    """What all shapes have."""
+    """The keys that all shapes have."""
 
-    scale: Annotated[float | Point, _doc("stretches the shape; done first")] = 1.0
-    rotate: Annotated[float, _doc("then turns it counter-clockwise, in degrees")] = 0.0
-    at: Annotated[Point, _doc("then moves its origin there")] = (0.0, 0.0)
+    scale: Annotated[float | Point, _doc("first, stretch the shape by this factor, or by two along x and y")] = 1.0
+    rotate: Annotated[float, _doc("then, turn it counter-clockwise, in degrees")] = 0.0
+    at: Annotated[Point, _doc("then, move its origin to this point")] = (0.0, 0.0)
     facets: Annotated[Count | None, _doc("number of chords that replace the arcs of a curve")] = None
 
     def __post_init__(self) -> None:
-        """ValueError for a scale that is 0, or out of range."""
+        """ValueError for a scale that is 0 or out of range."""
         if not all(1e-100 <= abs(factor) <= 1e100 for factor in np.ravel(self.scale)):
             raise ValueError(f"scale: {self.scale}; expected numbers of size 1e-100 to 1e100")
 
@@ -69,42 +69,42 @@ class Shape(Struct, forbid_unknown_fields=True, tag_field="kind"):
 class Inside(Shape):
     """A shape that lies in a medium."""
 
-    outside: Annotated[Index | None, _doc("index around the shape; that of the whole scene by default")] = None
+    outside: Annotated[Index | None, _doc("index around the shape; by default that of the scene")] = None
     within: Annotated[Text | None, _doc("instead of `outside`: the name of an earlier shape around this one")] = None
 
 
 class Solid(Inside, kw_only=True):
     """A closed curve around one medium."""
 
-    n: Annotated[Index, _doc('index inside: for all colours, for each, or of a material, as "SCHOTT:N-BK7"')]
-    name: Annotated[Text | None, _doc("a name that `within` of later shapes can use")] = None
+    n: Annotated[Index, _doc('index inside: one for all colours, one for each, or a material such as "SCHOTT:N-BK7"')]
+    name: Annotated[Text | None, _doc("a name for `within` of later shapes")] = None
 
 
 class Polygon(Solid, tag="polygon", kw_only=True):
     """A closed chain of straight pieces and arcs of circles."""
 
-    points: Annotated[Points, _doc("its corners")]
+    points: Annotated[Points, _doc("the corners")]
     arcs: Arcs = None
 
 
 class Rectangle(Solid, tag="rectangle", kw_only=True):
     """A rectangle around its origin."""
 
-    width: Annotated[Positive, _doc("along x")]
-    height: Annotated[Positive, _doc("along y")]
+    width: Annotated[Positive, _doc("size along x")]
+    height: Annotated[Positive, _doc("size along y")]
 
 
 class Prism(Solid, tag="prism", kw_only=True):
     """A triangle with two equal sides, its apex up, its centroid at the origin."""
 
-    side: Annotated[Positive, _doc("length of either side")]
-    apex: Annotated[float, Meta(gt=0, lt=180), _doc("the angle between them, in degrees")] = 60.0
+    side: Annotated[Positive, _doc("length of the two equal sides")]
+    apex: Annotated[float, Meta(gt=0, lt=180), _doc("the angle between the equal sides, in degrees")] = 60.0
 
 
 class Circle(Solid, tag="circle", kw_only=True):
     """A circle around its origin."""
 
-    radius: Annotated[Positive, _doc("of the circle")]
+    radius: Annotated[Positive, _doc("radius of the circle")]
 
 
 class Ellipse(Solid, tag="ellipse", kw_only=True):
@@ -116,26 +116,27 @@ class Ellipse(Solid, tag="ellipse", kw_only=True):
 class Lens(Solid, tag="lens", kw_only=True):
     """Two conic surfaces z = c r² / (1 + √(1 − (1 + K) c² r²)) on the x axis, with a rim between them."""
 
-    curvature: Annotated[Point | None, _doc("c of both surfaces, positive where the centre lies toward +x")] = None
-    R1: Annotated[float | None, _doc("radius of curvature of the front, 1/c; 0 where it is flat")] = None
-    R2: Annotated[float | None, _doc("of the back; R1 and R2 are in place of `curvature`")] = None
-    conic: Annotated[Point, _doc("K of each")] = (0.0, 0.0)
-    thickness: Annotated[Positive, _doc("on the axis")]
-    radius: Annotated[Positive | None, _doc("half the aperture; up to where the surfaces meet by default")] = None
-    vertex: Annotated[float, _doc("where the front meets the axis")] = 0.0
+    curvature: Annotated[Point | None, _doc("c of front and back, positive if the centre lies toward +x")] = None
+    R1: Annotated[float | None, _doc("radius of curvature of the front, 1/c; 0: flat")] = None
+    R2: Annotated[float | None, _doc("radius of curvature of the back; R1 and R2 replace `curvature`")] = None
+    conic: Annotated[Point, _doc("conic constants K of front and back")] = (0.0, 0.0)
+    thickness: Annotated[Positive, _doc("thickness on the axis")]
+    radius: Annotated[Positive | None, _doc("half the aperture; by default, where the surfaces meet")] = None
+    vertex: Annotated[float, _doc("x of the point where the front meets the axis")] = 0.0
 
     def __post_init__(self) -> None:
-        """ValueError unless the curvatures are said once."""
+        """ValueError unless the curvatures are given in exactly one way."""
         super().__post_init__()
-        if (self.R1 is None, self.R2 is None) != (self.curvature is not None,) * 2:
+        without_radii = self.curvature is not None
+        if (self.R1 is None) != without_radii or (self.R2 is None) != without_radii:
             raise ValueError("curvature, R1, R2; expected either `curvature`, or both R1 and R2")
 
 
 class EllipseLens(Solid, tag="ellipse_lens", kw_only=True):
     """Focuses rays along x into its origin: an ellipse of eccentricity outside/n (first colour), and a circle."""
 
-    focal_length: Annotated[Positive, _doc("from the front to the focus")]
-    thickness: Annotated[Positive, _doc("on the axis")]
+    focal_length: Annotated[Positive, _doc("distance from the front to the focus")]
+    thickness: Annotated[Positive, _doc("thickness on the axis")]
     radius: Annotated[Positive, _doc("half the aperture")]
 
 
@@ -149,35 +150,35 @@ class Luneburg(Inside, tag="luneburg", kw_only=True):
 class Boundary(Shape, tag="boundary", kw_only=True):
     """An open chain of straight pieces and arcs of circles between two media."""
 
-    points: Annotated[Points, _doc("its vertices")]
+    points: Annotated[Points, _doc("the vertices")]
     arcs: Arcs = None
-    n_left: Annotated[Index, _doc("index on the left, seen along it")]
+    n_left: Annotated[Index, _doc("index on the left, seen along the boundary")]
     n_right: Annotated[Index, _doc("index on the right")]
 
 
 def _curves(shape: AnyShape, n: dict[str, Indices]) -> list[tuple[Curve, Indices, Indices]]:
     """Curves around the shape's origin, with the indices on their left and right; `n`: indices by key.
 
-    A closed curve runs counter-clockwise: its inside is on the left. The own keys of most kinds are the arguments of
-    the function in `shapes` of their name.
+    A closed curve runs counter-clockwise: its inside is on the left. For most kinds, the keys of the kind are the
+    arguments of the function of the same name in `shapes`.
     """
-    outside, tag = n["outside"], type(shape).__struct_config__.tag
-    own = {key: getattr(shape, key) for key in type(shape).__annotations__}
+    outside, kind = n["outside"], type(shape).__struct_config__.tag
+    arguments = {key: getattr(shape, key) for key in type(shape).__annotations__}
     match shape:
         case Boundary():
             return [(shapes.polyline(shape.points, shape.arcs), n["n_left"], n["n_right"])]
         case Luneburg():
-            layers = shapes.luneburg(**own)
+            layers = shapes.luneburg(**arguments)
             media = [outside, *(tuple(x * ratio for x in outside) for _, ratio in layers)]
             return [(curve, media[j + 1], media[j]) for j, (curve, _) in enumerate(layers)]
         case Ellipse():
-            own = {"rx": shape.radii[0], "ry": shape.radii[1]}
+            arguments = {"rx": shape.radii[0], "ry": shape.radii[1]}
         case Lens():
-            pair = [1 / r if r else 0.0 for r in (own.pop("R1"), own.pop("R2"))]
-            own["curvature"] = shape.curvature or pair
+            curvatures = [1 / r if r else 0.0 for r in (arguments.pop("R1"), arguments.pop("R2"))]
+            arguments["curvature"] = shape.curvature or curvatures
         case EllipseLens():
-            own["n"] = n["n"][0] / outside[0]
-    return [(getattr(shapes, str(tag))(**own), n["n"], outside)]
+            arguments["n"] = n["n"][0] / outside[0]
+    return [(getattr(shapes, str(kind))(**arguments), n["n"], outside)]
 
 
 AnyShape = Polygon | Rectangle | Prism | Circle | Ellipse | Lens | EllipseLens | Luneburg | Boundary
@@ -195,7 +196,7 @@ class Parallel(Beam, tag="parallel", kw_only=True):
     start: Annotated[Point, _doc("start of the first ray")] = field(name="from")
     to: Annotated[Point, _doc("start of the last ray")]
     direction: Annotated[Direction, _doc("direction of all rays: degrees, or [x, y] that is not [0, 0]")]
-    count: Annotated[Count, _doc("number of rays; 1: from the middle")]
+    count: Annotated[Count, _doc("number of rays; a single ray starts in the middle")]
 
 
 class Fan(Beam, tag="fan", kw_only=True):
@@ -203,26 +204,26 @@ class Fan(Beam, tag="fan", kw_only=True):
 
     at: Annotated[Point, _doc("start of all rays")]
     angles: Annotated[Point, _doc("directions of the first and of the last ray, in degrees")]
-    count: Annotated[Count, _doc("number of rays; 1: in the middle")]
+    count: Annotated[Count, _doc("number of rays; a single ray has the middle direction")]
 
 
 class Rays(Beam, tag="rays", kw_only=True):
     """Rays one by one."""
 
-    origins: Annotated[Points, _doc("their starts")]
+    origins: Annotated[Points, _doc("starts of the rays")]
     directions: Annotated[list[Direction], _doc("a direction for each start, as for `parallel`")]
 
     def __post_init__(self) -> None:
         """ValueError for another number of directions than of origins."""
         if len(self.origins) != len(self.directions):
-            raise ValueError(f"directions: {len(self.directions)}, for {len(self.origins)} origins; expected as many")
+            raise ValueError(f"directions: {len(self.directions)} for {len(self.origins)} origins; expected one each")
 
 
 AnyBeam = Parallel | Fan | Rays
 
 
 def _spread(first: Array | float, last: Array | float, count: int) -> Array:
-    """`count` values evenly from the first to the last; a single one is in the middle. Whole numbers stay exact."""
+    """`count` evenly spaced values from the first to the last; a single one in the middle. Whole numbers stay exact."""
     if count == 1:
         return np.array([(first + last) / 2])
     steps = np.arange(count).reshape(-1, *[1] * np.ndim(first))
@@ -230,10 +231,10 @@ def _spread(first: Array | float, last: Array | float, count: int) -> Array:
 
 
 def _unit_vector(key: str, value: Direction) -> tuple[float, float]:
-    """A vector of length 1 from degrees or [x, y]."""
+    """The vector of length 1 for a direction in degrees or as [x, y]."""
     if isinstance(value, float):
         return unit(value)
-    size = max(map(abs, value))  # first by the larger component: a square may be out of range
+    size = max(map(abs, value))  # divide by the larger component first: a square could be out of range
     if not size:
         raise ValueError(f"{key}: [0, 0]; expected degrees, or [x, y] that is not [0, 0]")
     x, y = value[0] / size, value[1] / size
@@ -250,14 +251,14 @@ Wavelengths = Annotated[int, Meta(ge=2, le=MOST)] | Annotated[list[Nanometres], 
 class SceneTable(Struct, kw_only=True, forbid_unknown_fields=True):
     """A scene file."""
 
-    title: Annotated[Text | None, _doc("title of the figure; the file's name by default")] = None
-    index: Annotated[Index, _doc("index of the medium around all shapes, as `n` of a shape")] = 1.0
-    colours: Annotated[Names | None, _doc("names that matplotlib knows; one for each index")] = None
-    wavelengths: Annotated[Wavelengths | None, _doc("in nm, in place of `colours`; or how many, 380 to 730 nm")] = None
-    light: Annotated[Literal["flat", "D65"], _doc("powers of the wavelengths: equal, or of daylight")] = "flat"
+    title: Annotated[Text | None, _doc("title of the figure; by default the file's name")] = None
+    index: Annotated[Index, _doc("index of the medium around all shapes; values as for `n` of a shape")] = 1.0
+    colours: Annotated[Names | None, _doc("names of colours that matplotlib knows")] = None
+    wavelengths: Annotated[Wavelengths | None, _doc("nm, or how many from 380 to 730; replace `colours`")] = None
+    light: Annotated[Literal["flat", "D65"], _doc("powers of the wavelengths: equal, or those of daylight")] = "flat"
     max_depth: Annotated[int, Meta(ge=1, le=100_000), _doc("largest number of boundaries that a ray meets")] = 16
     branches: Annotated[int, Meta(ge=0, le=8), _doc("largest number of partial reflections on a path")] = 0
-    view: Annotated[Box | None, _doc("x0, x1, y0, y1: the part that the figure shows; all shapes by default")] = None
+    view: Annotated[Box | None, _doc("x0, x1, y0, y1 of the figure; by default it shows all shapes")] = None
     shape: Annotated[list[AnyShape], Meta(min_length=1), _doc("[[shape]]: boundaries between media")]
     beam: Annotated[list[AnyBeam], Meta(min_length=1), _doc("[[beam]]: rays to follow")]
 
@@ -268,12 +269,12 @@ class SceneTable(Struct, kw_only=True, forbid_unknown_fields=True):
 
 
 def reference() -> str:
-    """All kinds and keys: what `mi-refract trace --keys` prints."""
+    """All kinds and keys as text, for `mi-refract trace --keys`."""
     lists = [key_list("A scene:", SceneTable), key_list("Every [[shape]], which has a kind and its keys:", Solid)]
     for table, kinds in (("[[shape]]", AnyShape), ("[[beam]]", AnyBeam)):
         for kind in get_args(kinds):
-            about = (kind.__doc__ or "").partition("\n")[0]
-            lists.append(key_list(f'{table} kind = "{kind.__struct_config__.tag}": {about}', kind, Solid))
+            summary = (kind.__doc__ or "").partition("\n")[0]
+            lists.append(key_list(f'{table} kind = "{kind.__struct_config__.tag}": {summary}', kind, Solid))
     return "\n\n".join(lists)
 
 
@@ -289,13 +290,13 @@ class Region:
 class PlanarScene:
     """The content of a scene file, ready for `planar.trace` (once per colour) and for a figure.
 
-    `light`: its colours, one where there is no dispersion.
-    `segments`: one per colour, the same geometry with other indices. `shape_names`: of the shape of each segment, as
-    "shape[0] 'name'". `regions`: in drawing order, inner ones last.
+    `light`: its colours, one without dispersion.
+    `segments`: one `Segments` per colour, with the same geometry and other indices. `shape_names`: for each segment the
+    name of its shape, as "shape[0] 'name'". `regions`: in drawing order, inner ones last.
     `index`: of the medium around everything, per colour. `origins`, `directions`: N × 2, directions of length 1;
-    `beams`: N, the number of the `[[beam]]` (from 0) that a ray belongs to. `branches`: the most partial reflections
-    on a path; 0: rays are refracted wherever possible. `view`: x0, x1, y0, y1; None: all shapes. `fans`: by beam, the
-    angles in degrees of the first and of the last ray of a fan.
+    `beams`: N, the number of each ray's `[[beam]]`, from 0. `branches`: largest number of partial reflections on a
+    path; 0: rays are refracted wherever possible. `view`: x0, x1, y0, y1; None: all shapes. `fans`: for each beam, the
+    angles in degrees of the first and last ray if it is a fan, else None.
     """
 
     path: Path
@@ -315,32 +316,33 @@ class PlanarScene:
 
     @property
     def file(self) -> str:
-        """The file's name, of printable characters."""
+        """The file's name, with printable characters only."""
         return printable(self.path.name)
 
     @property
     def heading(self) -> str:
-        """The title on one line, of printable characters."""
+        """The title on one line, with printable characters only."""
         return printable(" ".join(self.title.split()))
 
 
 def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> PlanarScene:
-    """Read a scene file. `wavelengths`: in place of those that it names, in nm, or how many.
+    """Read a scene file. `wavelengths`: in nm, or their number; they replace those of the file.
 
-    ValueError, one line that names file and key (shapes and beams count from 0), for anything that is no scene;
-    OSError for a file that cannot be read.
+    ValueError, one line that names file and key (shapes and beams count from 0), for an invalid scene; OSError for a
+    file that cannot be read.
     """
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; expected a scene file")
     table = parse_toml(safe_files.read_bytes(path, SIZE), SceneTable, str(path))
-    chosen = table.wavelengths if wavelengths is None else wavelengths
+    if wavelengths is None:
+        wavelengths = table.wavelengths
     try:
-        if chosen is not None and table.colours:
+        if wavelengths is not None and table.colours:
             raise ValueError("colours and wavelengths are both set; expected one of them")
-        if chosen is None and table.light != "flat":
+        if wavelengths is None and table.light != "flat":
             raise ValueError(f"light: {table.light!r} without wavelengths; expected `wavelengths` that it weights")
-        light = Light(tuple(table.colours or [""])) if chosen is None else of_wavelengths(chosen, table.light)
+        light = Light(tuple(table.colours or [""])) if wavelengths is None else of_wavelengths(wavelengths, table.light)
         indices = functools.partial(light.indices, find=path.parent.joinpath)
         index = indices(table.index, "index")
         parts = _parts(table.shape, index, indices)
@@ -354,7 +356,7 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
 
 
 def _parts(tables: Sequence[AnyShape], ambient: Indices, indices: Callable[..., Indices]) -> list[Part]:
-    """The curves of all shapes, in their places."""
+    """The curves of all shapes, stretched, turned and moved, with the media on their sides."""
     parts: list[Part] = []
     media: dict[str, Indices] = {}
     pieces = 0
@@ -377,15 +379,16 @@ def _parts(tables: Sequence[AnyShape], ambient: Indices, indices: Callable[..., 
         curves = shape.layers if isinstance(shape, Luneburg) else 1
         pieces += curves * max(shape.facets or 4, len(getattr(shape, "points", ()))) * len(ambient)
         if pieces > PIECES:
-            most = f"at most {PIECES} pieces of curves in all shapes together, once for each colour"
-            raise ValueError(f"{where}: {pieces} or more pieces; expected {most}")
+            limit = f"at most {PIECES} pieces of curves in all shapes together, once for each colour"
+            raise ValueError(f"{where}: {pieces} or more pieces; expected {limit}")
         first = len(parts)
-        named = f"{where} '{printable(shape.name)}'" if isinstance(shape, Solid) and shape.name else where
+        shape_name = f"{where} '{printable(shape.name)}'" if isinstance(shape, Solid) and shape.name else where
         try:
             with np.errstate(all="ignore"):
                 for curve, left, right in _curves(shape, n):
                     chords = curve.faceted(shape.facets) if shape.facets else curve
-                    parts.append(Part(named, chords.mapped(affine(shape.rotate, shape.scale), shape.at), left, right))
+                    matrix = affine(shape.rotate, shape.scale)
+                    parts.append(Part(shape_name, chords.mapped(matrix, shape.at), left, right))
         except ValueError as error:
             raise ValueError(f"{where}.{error}") from None
         for part in parts[first:]:
@@ -394,9 +397,9 @@ def _parts(tables: Sequence[AnyShape], ambient: Indices, indices: Callable[..., 
 
 
 def _rays(tables: Sequence[AnyBeam]) -> tuple[Array, Array, NDArray[np.intp]]:
-    """Origins and directions of length 1, N × 2, and the number of each ray's beam."""
-    sizes = list(itertools.accumulate(len(b.origins) if isinstance(b, Rays) else b.count for b in tables))
-    for j, count in enumerate(sizes):
+    """Origins and directions of length 1 (N × 2), and the number of each ray's beam."""
+    totals = list(itertools.accumulate(len(b.origins) if isinstance(b, Rays) else b.count for b in tables))
+    for j, count in enumerate(totals):
         if count > RAYS:
             raise ValueError(f"beam[{j}].count: {count} rays in this beam and those before it; expected up to {RAYS}")
     rays = []
@@ -419,5 +422,5 @@ def _rays(tables: Sequence[AnyBeam]) -> tuple[Array, Array, NDArray[np.intp]]:
             raise ValueError(f"beam[{j}].{error}") from None
         check_range(f"beam[{j}]", origins, FARTHEST)
         rays.append((origins, directions))
-    beams = np.repeat(np.arange(len(rays)), np.diff(sizes, prepend=0))
+    beams = np.repeat(np.arange(len(rays)), np.diff(totals, prepend=0))
     return np.concatenate([o for o, _ in rays]), np.concatenate([d for _, d in rays]), beams

@@ -1,6 +1,6 @@
-"""Shapes in the plane by their usual parameters: polygons, circles, ellipses, prisms, lenses of conic surfaces.
+"""Shapes in the plane from their usual parameters: polygons, circles, ellipses, prisms, lenses of conic surfaces.
 
-Each is a `Curve` around its own origin; `Curve.mapped` stretches, turns and moves it. All lengths are above 0.
+Each shape is a `Curve` around its own origin; `Curve.mapped` stretches, turns and moves it. All lengths are above 0.
 """
 
 from __future__ import annotations
@@ -15,22 +15,23 @@ from numpy.typing import ArrayLike
 from .curves import Curve, area, joined, polygonal, unit
 from .segments import Array
 
-# 1 − (1 + K) c² r² counts as 0 up to this: at the rim of a half sphere, whose curvature is 1/R rounded.
+# 1 − (1 + K) c² r² counts as 0 up to this size: at the rim of a half sphere rounding of c = 1/R makes it differ from 0.
 FLAT = 8 * 2.0**-53
 
 
 def polyline(points: ArrayLike, arcs: Sequence[float] | None = None) -> Curve:
-    """An open curve from point to point (K × 2). `arcs`: degrees by which each piece turns left, a circle; 0: straight.
+    """An open curve from point to point (K × 2).
 
-    ValueError for fewer than 2 points, another number of pieces, or |degrees| ≥ 360.
+    `arcs`: for each piece, the degrees by which it turns left, as an arc of a circle; 0: straight.
+    ValueError for fewer than 2 points, another number of arcs than pieces, or |degrees| ≥ 360.
     """
     return _chain(points, arcs, closed=False)
 
 
 def polygon(points: ArrayLike, arcs: Sequence[float] | None = None) -> Curve:
-    """The same, closed by one more piece from the last point to the first; reversed where it runs clockwise.
+    """A closed curve: a `polyline` with one more piece from the last point to the first, reversed if it runs clockwise.
 
-    ValueError as for `polyline`, and for a polygon without area. It is not checked whether the polygon crosses itself.
+    ValueError as for `polyline`, and for a polygon without area. Whether the polygon crosses itself is not checked.
     """
     curve = _chain(points, arcs, closed=True)
     size = area(curve)
@@ -59,9 +60,10 @@ def _chain(points: ArrayLike, arcs: Sequence[float] | None, closed: bool) -> Cur
 
 
 def _arc(p: Array, q: Array, turn: float) -> Iterable[tuple[Array, Array, float]]:
-    """End, control and weight of the pieces of a circle's arc from p to q that turns left by `turn` degrees.
+    """End, control point and weight of the pieces of a circle's arc from p to q that turns left by `turn` degrees.
 
-    It passes its chord at tan(turn/4)/2 of the chord's length on the right; the tangents meet at tan(turn/2)/2.
+    The middle of the arc lies to the right of the chord at tan(turn/4)/2 of the chord's length, and the tangents at its
+    ends meet at tan(turn/2)/2.
     """
     middle, aside = (p + q) / 2, np.array([q[1] - p[1], p[0] - q[0]]) / 2
     if abs(turn) <= 90:
@@ -73,7 +75,7 @@ def _arc(p: Array, q: Array, turn: float) -> Iterable[tuple[Array, Array, float]
 
 
 def ellipse(rx: float, ry: float) -> Curve:
-    """An ellipse around the origin with half axes `rx`, `ry`: four arcs whose vertices and controls are exact."""
+    """An ellipse around the origin with half axes `rx`, `ry`: four arcs with exact vertices and control points."""
     vertices = np.array([(rx, 0.0), (0.0, ry), (-rx, 0.0), (0.0, -ry)])
     control = np.array([(rx, ry), (-rx, ry), (-rx, -ry), (rx, -ry)], float)
     return Curve(vertices, control, np.full(4, math.sqrt(0.5)), closed=True)
@@ -91,7 +93,7 @@ def rectangle(width: float, height: float) -> Curve:
 
 
 def prism(apex: float, side: float) -> Curve:
-    """A triangle with `apex` degrees at its top, between two sides of length `side`; centroid at the origin."""
+    """A triangle with the angle `apex`, in degrees, at its top between two sides of length `side`; centroid at 0."""
     cosine, sine = unit(apex / 2)
     x, y = side * sine, side * cosine / 3
     return polygon([(-x, -y), (x, -y), (0.0, 2 * y)])
@@ -101,7 +103,7 @@ def prism(apex: float, side: float) -> Curve:
 
 
 def sag(r: Any, curvature: float, conic: float = 0.0) -> Any:
-    """z = c r² / (1 + √(1 − (1 + K) c² r²)), `curvature` c and conic constant K; NaN for r beyond the surface."""
+    """z = c r² / (1 + √(1 − (1 + K) c² r²)) for `curvature` c and conic constant K; NaN for r beyond the surface."""
     r = np.asarray(r, float)
     square = 1 - (1 + conic) * (curvature * r) ** 2
     square = np.where(np.abs(square) <= FLAT, 0.0, square)
@@ -109,10 +111,10 @@ def sag(r: Any, curvature: float, conic: float = 0.0) -> Any:
 
 
 def _surface(vertex: float, rim: float, radius: float, curvature: float, conic: float) -> Curve:
-    """The conic surface from (rim, radius) over (vertex, 0) to (rim, −radius), in two arcs.
+    """The conic surface from (rim, radius) through (vertex, 0) to (rim, −radius), in two arcs.
 
-    With q = 1 − (1 + K) c z at the rim, which is the root in the sag, the tangents of either arc meet at
-    (vertex, ±radius/(1 + q)), and w² = (1 + q)/2: for every K, and c = 0, where the arcs are straight.
+    q = 1 − (1 + K) c z at the rim is the root in the sag. The end tangents of either arc meet at
+    (vertex, ±radius/(1 + q)), and w² = (1 + q)/2, for every K, and for c = 0, where the arcs are straight.
     """
     q = 1 - (1 + conic) * curvature * (rim - vertex)
     meeting = radius / (1 + q)
@@ -130,9 +132,9 @@ def lens(
 ) -> Curve:
     """A lens of two conic surfaces around the x axis, with `curvature` and `conic` constant of each; rim at ±`radius`.
 
-    Curvatures are positive where the centre lies toward +x. The front surface passes through (`vertex`, 0), the
-    other through (`vertex` + `thickness`, 0). Without a radius the lens ends where they meet.
-    ValueError where a surface does not reach the rim, or they meet before it, or never.
+    A curvature is positive if the centre lies toward +x. The front surface passes through (`vertex`, 0), the back
+    surface through (`vertex` + `thickness`, 0). Without a radius the lens ends where the surfaces meet.
+    ValueError if a surface does not reach the rim, or the surfaces meet before it, or they never meet.
     """
     if radius is None:
         rim, radius = _tip(curvature, thickness, conic)
@@ -141,20 +143,22 @@ def lens(
         depths = [float(sag(radius, c, k)) for c, k in zip(curvature, conic, strict=True)]
         rims = [vertex + depths[0], vertex + thickness + depths[1]]
     if math.isnan(rims[0] + rims[1]):
-        ends = (1 / (abs(c) * math.sqrt(1 + k)) for c, k in zip(curvature, conic, strict=True) if c and k > -1)
-        raise ValueError(f"radius = {radius:g}: a surface is smaller; expected at most {min(ends, default=0):g}")
+        radii = (1 / (abs(c) * math.sqrt(1 + k)) for c, k in zip(curvature, conic, strict=True) if c and k > -1)
+        raise ValueError(f"radius = {radius:g}: larger than a surface; expected at most {min(radii, default=0):g}")
     if rims[1] < rims[0]:
-        meet = _tip(curvature, thickness, conic)[1]
-        raise ValueError(f"radius = {radius:g}: the surfaces meet within it; expected at most {meet:g}, or no radius")
+        largest = _tip(curvature, thickness, conic)[1]
+        text = f"the surfaces meet inside it; expected at most {largest:g}, or no radius"
+        raise ValueError(f"radius = {radius:g}: {text}")
     front = _surface(vertex, rims[0], radius, curvature[0], conic[0])
     back = _surface(vertex + thickness, rims[1], radius, curvature[1], conic[1])
     return joined(front, back.reversed())
 
 
 def _tip(curvature: Sequence[float], thickness: float, conic: Sequence[float]) -> tuple[float, float]:
-    """(z, r) of the nearest point off the axis where the surfaces meet; ValueError where they never meet.
+    """(z, r) of the point nearest to the axis where the surfaces meet; ValueError if they never meet.
 
-    Both obey c r² = 2 z − c (1 + K) z², the other one with z − thickness for z. Without r² that is a quadratic in z.
+    The front obeys c r² = 2 z − c (1 + K) z², the back the same with z − thickness for z. Eliminating r² leaves a
+    quadratic equation in z.
     """
     (c1, c2), (k1, k2), t = curvature, (1 + k for k in conic), thickness
     if c1 == -c2 and k1 == k2 and c1:
@@ -166,7 +170,7 @@ def _tip(curvature: Sequence[float], thickness: float, conic: Sequence[float]) -
     for z in places:
         c, k, depth = (c1, k1, z) if abs(c1) >= abs(c2) else (c2, k2, z - t)
         square = 2 * depth / c - k * depth * depth if c else 0.0
-        # Only on the near half of both conics, which the sag describes.
+        # Keep only points on the near half of both conics, which the sag describes.
         if square > 0 and 1 - c1 * k1 * z >= -FLAT and 1 - c2 * k2 * (z - t) >= -FLAT:
             tips.append((math.sqrt(square), z))
     if not tips:
@@ -178,8 +182,8 @@ def _tip(curvature: Sequence[float], thickness: float, conic: Sequence[float]) -
 def ellipse_lens(n: float, focal_length: float, thickness: float, radius: float) -> Curve:
     """A lens that focuses rays along +x exactly into the origin; n = n_inside / n_outside > 1.
 
-    Its front is an ellipse of eccentricity 1/n whose far focus is the origin, its back a circle around that, which
-    the rays meet at right angles. ValueError for n ≤ 1, a thickness not below the focal length, and as for `lens`.
+    Its front is an ellipse of eccentricity 1/n whose far focus is the origin. Its back is a circle around the origin,
+    which the rays meet at right angles. ValueError for n ≤ 1, a thickness ≥ the focal length, and as for `lens`.
     """
     if not n > 1 or not 0 < thickness < focal_length:
         raise ValueError(f"n = {n:g}, thickness = {thickness:g}; expected n > 1, 0 < thickness < {focal_length:g}")
@@ -189,9 +193,9 @@ def ellipse_lens(n: float, focal_length: float, thickness: float, radius: float)
 
 
 def luneburg(radius: float, layers: int) -> list[tuple[Curve, float]]:
-    """Concentric circles, the largest first, and for each its index inside over that around the lens.
+    """Concentric circles, the largest first, each with the ratio of its index inside to the index around the lens.
 
-    n(r) = √(2 − (r/R)²) in steps of equal n², each layer with the value in the middle of its n².
+    n(r) = √(2 − (r/R)²) in layers of equal steps in n²; each layer has the n² in the middle of its step.
     """
     circles = [circle(radius * math.sqrt(1 - j / layers)) for j in range(layers)]
     return [(curve, math.sqrt(1 + (j + 0.5) / layers)) for j, curve in enumerate(circles)]

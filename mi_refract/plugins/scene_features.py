@@ -170,17 +170,17 @@ def inspect(scene: Scene) -> SceneFeatures:
     deltas = {bsdf_name(bsdf) for bsdf in bsdfs if not bsdf.flags() & +lobes.Smooth}
     lamps = [shape.emitter() for shape in shapes if shape.is_emitter()]
     points = [emitter for emitter in emitters if emitter.flags() & +mi.EmitterFlags.Delta]
-    with_delta = [
-        i
+    glass = {  # and mirrors
+        i: functools.reduce(operator.or_, (bsdf.flags() for bsdf in inner))
         for i, inner in enumerate(within)
         if any(bsdf.flags() & +lobes.Delta or bsdf_name(bsdf) not in KNOWN for bsdf in inner)
-    ]
-    delta_extent = math.inf if opaque else ray_origins.extent_of(shapes[i] for i in with_delta)
+    }
+    sizes = {i: ray_origins.size_of(shapes[i]) for i in glass}
+    delta_extent = math.inf if opaque else ray_origins.extent_of([*sizes.values()])
     thin = (
         f"{shape_name(shapes, i)} {text}"
-        for i in with_delta
-        if any(bsdf.flags() & +lobes.DeltaTransmission for bsdf in within[i])
-        and (text := ray_origins.too_thin(shapes[i], delta_extent))
+        for i, flags_of_all in glass.items()
+        if flags_of_all & +lobes.DeltaTransmission and (text := ray_origins.too_thin(sizes[i], delta_extent))
     )
     shape_media = any(shape.interior_medium() or shape.exterior_medium() for shape in shapes)
     return SceneFeatures(

@@ -1,6 +1,6 @@
-"""The usual mistakes: the answers that each one would give, and whether the program gave those.
+"""The common mistakes: the answers that each of them gives, and whether the program gave these answers.
 
-A mistake is visible on a ray where it changes the direction by more than VISIBLE. It explains an answer there that is
+A mistake is visible on a ray if it changes the direction by more than VISIBLE. There it explains an answer that is
 within SAME of the direction that the mistake gives. A loss of precision predicts no direction: it is recognised by a
 wider bound that contains the errors.
 """
@@ -26,17 +26,17 @@ from .tir_signal import unit
 Index = NDArray[np.intp]
 
 VISIBLE, SAME = 0.1, 5e-3  # radians
-MOST, ALL = 0.9, 0.99  # the share of the answers that a mistake, or a loss of precision, must explain
-HALF = 0.5  # the share of the wrong answers that are what a mistake gives, also where its effect is not visible
-FEWEST = 10  # answers: fewer are no evidence
-SAMPLE = 150  # wrong answers, and as many right ones
-MOST_TELLING = {2.0**-24: 7, 2.0**-53: 15}  # by roundoff: digits, fewer than distinguish its numbers
+MOST, ALL = 0.9, 0.99  # shares of the answers that a mistake and a loss of precision must explain
+HALF = 0.5  # share of all wrong answers, also those without a visible effect, that must equal those of the mistake
+FEWEST = 10  # number of answers: fewer are no evidence
+SAMPLE = 150  # number of wrong answers, and of right ones
+TELLING_DIGITS = {2.0**-24: 7, 2.0**-53: 15}  # by roundoff: numbers with so few digits are fewer than its floats
 FLOAT32, FEW_DIGITS, LENGTHS = "f32 where f64 was claimed", "too few digits", "missing normalisation"
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """A mistake, the share of a sample of the answers that it explains, and the median angle to its directions."""
+    """A mistake, the share of the sampled answers that it explains, and the median angle to its directions."""
 
     mistake: str
     text: str
@@ -46,7 +46,7 @@ class Explanation:
 
 
 def refract(a: Array, n: Array, k: Array) -> Array:
-    """The refracted direction (N, 3) for unit a and n (N, 3), k (N,), two-sided; NaN where nothing is transmitted.
+    """The refracted direction (N, 3) for unit a and n (N, 3), k (N,), on either side; NaN under total reflection.
 
     b = k a + n (s √(c² − (k² − 1) ‖n × a‖²) − k c),   c = n·a,  s = sign(c)
     """
@@ -57,20 +57,20 @@ def refract(a: Array, n: Array, k: Array) -> Array:
     return b
 
 
-# What each mistake answers -----------------------------------------------------------------------------------------
+# The answers of each mistake ---------------------------------------------------------------------------------------
 
 
 def predictions(rays: Rays, exact: oracle.Certified) -> Iterator[tuple[str, str, Array]]:
-    """(mistake, variant, the directions (N, 3) that it gives to the rays); variants follow each other.
+    """(mistake, variant, directions (N, 3) that it gives); the variants of a mistake are consecutive.
 
-    NaN where the mistake gives no direction, or programs differ.
+    NaN where the mistake gives no direction, or where programs with this mistake differ.
     """
     a, n, k = unit(rays.a.astype(float)), unit(rays.n.astype(float)), rays.k.astype(float)
     c = (a * n).sum(1, keepdims=True)
     refracted = np.where(exact.transmitted[:, None], exact.direction, np.nan)
 
     def flipped(v: Array) -> Array:
-        """`v` with its part along n reversed."""
+        """`v` with its component along n reversed."""
         return np.asarray(v - 2 * (v * n).sum(1, keepdims=True) * n)
 
     inverted = refract(a, n, 1 / k)
@@ -101,7 +101,7 @@ def predictions(rays: Rays, exact: oracle.Certified) -> Iterator[tuple[str, str,
             b = np.cos(angle) * np.sign(c) * n + np.sin(angle) * tangent / np.where(length > 0, length, 1)
             yield "degrees and radians", variant, b
 
-    # Signed permutations of the axes, without the identity and −1: to reverse all three is another mistake.
+    # Signed permutations of the axes, except the identity and −1: reversing all three axes is a mistake of its own.
     for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)):
         if order == (0, 1, 2) and len(set(signs)) == 1:
             continue
@@ -110,13 +110,17 @@ def predictions(rays: Rays, exact: oracle.Certified) -> Iterator[tuple[str, str,
         name = ", ".join(f"{'-' if s < 0 else ''}{'xyz'[i]}" for i, s in zip(order, signs, strict=True))
         yield "handedness", f"the answer's x, y, z are the right answer's {name}", refracted @ matrix.T
         for vector, (read_a, read_n) in {"a": (a @ matrix.T, n), "n": (a, n @ matrix.T)}.items():
-            # Where the normal changes sides, programs differ.
-            same = (read_a * read_n).sum(1, keepdims=True) * c > 0
-            yield "handedness", f"{vector} was read as its {name}", np.where(same, refract(read_a, read_n, k), np.nan)
+            # Programs differ if the normal is then on the other side.
+            same_side = (read_a * read_n).sum(1, keepdims=True) * c > 0
+            yield (
+                "handedness",
+                f"{vector} was read as its {name}",
+                np.where(same_side, refract(read_a, read_n, k), np.nan),
+            )
 
-    # The textbook formula, right for unit vectors only.
-    given_a, given_n = rays.a.astype(float), rays.n.astype(float)
-    for names, x, y in (("a and n were", given_a, given_n), ("a was", given_a, n), ("n was", a, given_n)):
+    # The textbook formula, which is right for unit vectors only, with the vectors as they are in the rays.
+    raw_a, raw_n = rays.a.astype(float), rays.n.astype(float)
+    for names, x, y in (("a and n were", raw_a, raw_n), ("a was", raw_a, n), ("n was", a, raw_n)):
         radicand, along = 1 - k[:, None] ** 2 * (1 - (x * y).sum(1, keepdims=True) ** 2), (x * y).sum(1, keepdims=True)
         b = k[:, None] * x + y * (np.copysign(np.sqrt(radicand), along) - k[:, None] * along)
         yield LENGTHS, f"{names} taken for {'unit vectors' if ' and ' in names else 'a unit vector'}", unit(b)
@@ -126,51 +130,51 @@ def predictions(rays: Rays, exact: oracle.Certified) -> Iterator[tuple[str, str,
 
 
 def sample(table: Table) -> Index:
-    """Rows of wrong and of right answers, evenly over the set, without rays whose bound excuses large errors."""
+    """Rows of wrong and of right answers, evenly over the set, without rays whose bound allows large errors."""
     wrong = table["beyond_bound"]
     return np.concatenate([evenly(table["evidence"] & mask) for mask in (wrong, ~wrong)])
 
 
 def evenly(mask: Flags) -> Index:
-    """SAMPLE rows of the mask or fewer, evenly over it."""
+    """At most SAMPLE rows of the mask, evenly over it."""
     rows = np.flatnonzero(mask)
     return rows[:: max(1, -(-len(rows) // SAMPLE))]
 
 
 def explain(judged: JudgedAnswers, table: Table, printed: Array) -> list[Explanation]:
-    """Every mistake, and the share of the answers that it explains. Precondition: some answers are wrong.
+    """Every mistake with the share of the answers that it explains. Precondition: some answers are wrong.
 
-    `judged`: the answers of `sample(table)`; `table`: of all; `printed` (M, 3): answers as they are in the file.
+    `judged`: the answers of `sample(table)`; `table`: of all answers; `printed` (M, 3): answers as read from the file.
     """
     bounds, wrong = judged.verdict.bounds, judged.verdict.wrong
     roundoff, best = bounds.roundoff, dict[str, Explanation]()
     with np.errstate(all="ignore"):
         for name, text, predicted in predictions(bounds.rays, bounds.exact):
             visible = _angle(predicted, bounds.exact.direction) > VISIBLE
-            every = np.nan_to_num(_angle(judged.b, predicted), nan=np.inf)
-            angle = every[visible]
-            share = float(np.mean(angle <= SAME)) if len(angle) else 0.0
-            told = every[wrong & np.isfinite(predicted).all(1)]
-            most = share >= MOST and (told <= SAME).sum() >= HALF * len(told)
-            median = float(np.median(angle)) if len(angle) else math.nan
-            explains = bool((visible & wrong).sum() >= FEWEST and most)
+            angles = np.nan_to_num(_angle(judged.b, predicted), nan=np.inf)
+            visible_angles = angles[visible]
+            share = float(np.mean(visible_angles <= SAME)) if len(visible_angles) else 0.0
+            wrong_angles = angles[wrong & np.isfinite(predicted).all(1)]
+            enough = share >= MOST and (wrong_angles <= SAME).sum() >= HALF * len(wrong_angles)
+            median = float(np.median(visible_angles)) if len(visible_angles) else math.nan
+            explains = bool((visible & wrong).sum() >= FEWEST and enough)
             variant = Explanation(name, text, share, median, explains)
             best[name] = max(best.get(name, variant), variant, key=_strength)
     lengths_only = _loss(LENGTHS, "directions are right, but not of length 1", table, "lengths")
     best[LENGTHS] = max(best[LENGTHS], lengths_only, key=_strength)
-    # float32 where float64 was claimed: errors of float32's size nearly everywhere, and none that is larger.
+    # float32 where float64 was claimed: nearly all errors have the size of float32's, and none is larger.
     everywhere = roundoff < F32 and _median_angle(table, table["compared"]) > F32 / 50
     float32 = _loss(FLOAT32, "errors are those of float32", table, "float32", everywhere)
-    # Too few digits: all numbers but the whole ones are equal to themselves so rounded.
+    # Too few digits: rounding to them does not change any number, whole numbers aside.
     digits = Explanation(FEW_DIGITS, "numbers have all their digits", 0.0, math.nan, False)
     values = printed.ravel()
     values = values[np.rint(values) != values].tolist()
-    candidates = range(1, MOST_TELLING[roundoff] + 1) if len(values) >= FEWEST else range(0)
+    candidates = range(1, TELLING_DIGITS[roundoff] + 1) if len(values) >= FEWEST else range(0)
     for count, (form, word) in itertools.product(candidates, (("f", "decimals"), ("g", "significant digits"))):
         if all(float(f"{x:.{count}{form}}") == x for x in values):
             digits = _loss(FEW_DIGITS, f"numbers are rounded to {count} {word}", table, "digits", least=count)
             break
-    # Numbers of few digits may keep the bound of float32, too.
+    # Numbers of few digits may also be within the bound of float32.
     float32 = replace(float32, explains=float32.explains and not digits.explains)
     return [*best.values(), *([float32] if roundoff < F32 else []), digits]
 
@@ -180,13 +184,13 @@ def _strength(explanation: Explanation) -> tuple[bool, float]:
 
 
 def _angle(u: Array, v: Array) -> Array:
-    """(N,): the angle between vectors (N, 3) of any length, in radians; NaN where one is no direction."""
+    """(N,) the angle between vectors (N, 3) of any length, in radians; NaN if one of them is zero or not finite."""
     across, along = lengths(np.cross(u, v)).astype(float), (u * v).sum(1)
     return np.where((across == 0) & (along == 0), np.nan, np.arctan2(across, along))
 
 
 def _loss(name: str, text: str, table: Table, column: str, possible: bool = True, least: int = 1) -> Explanation:
-    """A loss of precision: it explains the wrong answers whose number in the column is `least` or more."""
+    """A loss of precision, which explains the wrong answers whose number in `column` is `least` or more."""
     wrong = table["wrong"]
     count, total = int((table[column][wrong] >= least).sum()), int(wrong.sum())
     explains = bool(possible and count >= ALL * total and total >= FEWEST)
@@ -194,6 +198,6 @@ def _loss(name: str, text: str, table: Table, column: str, possible: bool = True
 
 
 def _median_angle(table: Table, mask: Flags) -> float:
-    """The median angle of the directions compared in the mask; NaN where there is none."""
+    """The median angle of the compared directions in the mask; NaN if there are none."""
     angles = table["angle"][table["compared"] & mask]
     return float(np.median(angles)) if len(angles) else math.nan

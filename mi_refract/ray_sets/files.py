@@ -1,9 +1,9 @@
-"""Files of rays and of answers, in CSV and in NumPy's .npz; and programs that read the one and print the other.
+"""Files of rays and of answers, in CSV and NumPy's .npz; and programs that read rays and print answers.
 
     rays      .csv: id, ax, ay, az, nx, ny, nz, n_from, n_to   .npz: id, a, n, n_from, n_to
     answers   .csv: id, bx, by, bz[, transmitted][, n_ratio]   .npz: id, b[, …]
 
-Rays with media have two columns or arrays more: wavelength, medium. The header is in lines `# key: value` on top of a
+Rays with media have two more columns or arrays: wavelength, medium. The header is in lines `# key: value` on top of a
 CSV file, and JSON text in the array `header` of an .npz file.
 
 A number in CSV is the shortest decimal that reads back, in float64, as exactly that number; a float32 number also reads
@@ -45,23 +45,23 @@ RAY_LAYOUTS = (COLUMNS, (*COLUMNS, *headers.COLUMNS))
 ANSWER_COLUMNS = ("id", "bx", "by", "bz")
 TRANSMITTED, N_RATIO = "transmitted", "n_ratio"
 ANSWER_LAYOUTS = tuple((*ANSWER_COLUMNS, *more) for more in ((), (TRANSMITTED,), (N_RATIO,), (TRANSMITTED, N_RATIO)))
-LEAST_RATIO = 1e-9  # of answers: a thousandth of the least in any set
+LEAST_RATIO = 1e-9  # smallest `n_ratio` of an answer: a thousandth of the smallest ratio in any set
 MOST_RAYS = 2**28 // len(COLUMNS)  # 3e7: their numbers take 2 GiB, and checking them takes 8 GB
-TIMEOUT = 300.0  # seconds, of a program
-# The names of the columns, in order. In an .npz file, `ax`, `ay`, `az` are one array, `a`, of the shape (N, 3).
+TIMEOUT = 300.0  # seconds for a program
+# The names of the columns, in order. In an .npz file, `ax`, `ay`, `az` are one array `a` of shape (N, 3).
 Layout = tuple[str, ...]
 T = TypeVar("T")
 
-# Visual C++ and others print a NaN as nan(ind) or the like; C has letters, digits and _ between the brackets.
+# Visual C++ and others print NaN as nan(ind) or similar; C allows letters, digits and _ between the brackets.
 _NAN = re.compile(r"nan\([A-Za-z0-9_]{0,32}\)", re.IGNORECASE)
 _LONGEST_LINE = 2**20  # characters
-_ROW_BYTES, _TOP_BYTES = 1024, 2**20  # of CSV: five times what the digits of a row need; the header
-_TEXT_BYTES = 2**32  # of CSV in memory
-_NUMBER_BYTES = 16  # a `longdouble`
-_ARRAY_TOP_BYTES = 2**14  # NumPy describes an array in 10,000 at most
+_ROW_BYTES, _TOP_BYTES = 1024, 2**20  # limits of CSV: a row, five times what its digits need; the header
+_TEXT_BYTES = 2**32  # limit of CSV text in memory
+_NUMBER_BYTES = 16  # size of a `longdouble`
+_ARRAY_TOP_BYTES = 2**14  # NumPy describes an array in at most 10,000 bytes
 _NPZ_HEADER_BYTES = 2**20
-_NPZ_MORE_BYTES = 2**24  # of a file beside its numbers
-_BROKEN_NPZ = (
+_NPZ_MORE_BYTES = 2**24  # limit of all other content of an .npz file
+_NPZ_ERRORS = (
     *(zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError),
     *(RuntimeError, TypeError, ValueError, OverflowError, MemoryError),
     *(SyntaxError, tokenize.TokenError),  # of NumPy's parser
@@ -72,7 +72,7 @@ _BROKEN_NPZ = (
 
 
 def write(path: str | Path, rays: RaySet) -> Path:
-    """Write .csv or .npz, completely or not at all. ValueError for another file ending; OSError where that fails."""
+    """Write a .csv or .npz file, completely or not at all. ValueError for another suffix; OSError if writing fails."""
     path = writable(path, SUFFIXES)
     if path.suffix.lower() == ".csv":
         write_atomically(path, as_csv(rays))
@@ -91,14 +91,14 @@ def npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, array in arrays.items():
-            # A ZipInfo made here has a fixed date.
+            # A ZipInfo without a date has a fixed one.
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as file:
                 np.lib.format.write_array(file, np.asanyarray(array), allow_pickle=False)
     return buffer.getvalue()
 
 
 def as_csv(rays: RaySet) -> str:
-    """The text of the CSV file."""
+    """The text of a CSV file of the rays."""
     columns, header = RAY_LAYOUTS[headers.has_media(rays.header)], rays.header
     top = [f"# {key}: {value if value == _value(value) else json.dumps(value)}" for key, value in header.items()]
     row = ",".join("%d" if name in ("id", "medium") else "%r" for name in columns)
@@ -106,10 +106,10 @@ def as_csv(rays: RaySet) -> str:
 
 
 def read(path: str | Path) -> RaySet:
-    """The rays of a file that is as `write` left it.
+    """The rays of a file that `write` wrote.
 
-    ValueError, one line, for another format, more than MOST_RAYS, a missing header, a cell that is not a number, or a
-    checksum that does not match (a file that was edited or cut short). OSError where the file cannot be read.
+    ValueError, one line, for another format, more than MOST_RAYS rays, a missing header, a cell that is not a number,
+    or a checksum that does not match (the file was edited or cut short). OSError if the file cannot be read.
     """
     return _read(Path(path), RAY_LAYOUTS, MOST_RAYS, _rays)
 
@@ -117,15 +117,15 @@ def read(path: str | Path) -> RaySet:
 def _rays(table: Table) -> RaySet:
     header, numbers = table.header, table.numbers
     if header.get("format") != FORMAT:
-        raise ValueError(f"not a file of rays; expected what `mi-refract rays export` writes ({FORMAT})")
+        raise ValueError(f"not a file of rays; expected one that `mi-refract rays export` wrote ({FORMAT})")
     headers.check(header, len(numbers))
     with np.errstate(all="ignore"):
-        parts = numbers[:, 1:4], numbers[:, 4:7], numbers[:, 7] / numbers[:, 8]
-        a, n, k = (x.astype(PRECISIONS[header["precision"]]) for x in parts)
+        vectors_and_ratio = numbers[:, 1:4], numbers[:, 4:7], numbers[:, 7] / numbers[:, 8]
+        a, n, k = (x.astype(PRECISIONS[header["precision"]]) for x in vectors_and_ratio)
     rays = RaySet(Rays(a, n, k), np.arange(len(numbers)), header)
-    # Equal numbers first: a file may hold digits that are lost in the set's precision.
+    # Compare the numbers too: a file may contain digits that are lost in the set's precision.
     if not np.array_equal(rays.numbers, numbers) or checksum(header, numbers) != header["checksum"]:
-        raise ValueError("the checksum does not match: the file was edited or cut short; expected it as exported")
+        raise ValueError("the checksum does not match: the file was edited or cut short; expected the file as exported")
     valid = np.isfinite(a).all(1) & np.isfinite(n).all(1) & a.any(1) & n.any(1) & np.isfinite(k) & (k > 0)
     if not valid.all():
         raise ValueError(f"ray {np.argmin(valid)} is invalid: zero or non-finite vector, or index ≤ 0")
@@ -137,15 +137,15 @@ def _rays(table: Table) -> RaySet:
 
 
 def read_answers(path: str | Path, *, most: int = MOST_RAYS) -> Answers:
-    """The answers in a file, `most` at most.
+    """The answers in a file, at most `most`.
 
-    ValueError, one line, where it holds none, or more. OSError where it cannot be read.
+    ValueError, one line, for a file that is not a table of answers, or has more. OSError if it cannot be read.
     """
     return _read(Path(path), ANSWER_LAYOUTS, most, _answers)
 
 
 def parse_answers(text: str | bytes, name: str = "answers") -> Answers:
-    """The answers in the text of a CSV file. ValueError, one line that begins with `name`, where it holds none."""
+    """The answers in the text of a CSV file. ValueError, one line that begins with `name`, for any other text."""
     content = text.encode() if isinstance(text, str) else text
     try:
         table = _read_csv(io.BytesIO(content), ANSWER_LAYOUTS, MOST_RAYS)
@@ -155,21 +155,26 @@ def parse_answers(text: str | bytes, name: str = "answers") -> Answers:
 
 
 def most_answers(rays: Sized) -> int:
-    """The most rows that answers to these rays may have: twice as many, and some for small sets."""
+    """The largest number of rows that answers to these rays may have: twice as many as rays, plus 100."""
     return 2 * len(rays) + 100
 
 
 def _answers(table: Table) -> Answers:
     columns = dict(zip(table.columns, table.numbers.T, strict=True))
     ids, transmitted, ratios = columns["id"], columns.get(TRANSMITTED), columns.get(N_RATIO)
-    if len(wrong := ids[~(np.abs(ids) < 2**53) | (np.rint(ids) != ids)]):
+    wrong = ids[~(np.abs(ids) < 2**53) | (np.rint(ids) != ids)]
+    if len(wrong):
         text = f"{len(wrong)} ids are not whole numbers below 2^53, the first is {wrong[0]:g}"
         raise ValueError(f"{text}; expected the ids of the rays")
-    if transmitted is not None and len(wrong := transmitted[~np.isin(transmitted, (0, 1))]):
-        raise ValueError(f"{TRANSMITTED} is {wrong[0]} for {len(wrong)} rays; expected 0 or 1")
-    if ratios is not None and len(wrong := ratios[~((ratios >= LEAST_RATIO) & (ratios <= 1 / LEAST_RATIO))]):
-        text = f"{N_RATIO} is {wrong[0]:g} for {len(wrong)} rays"
-        raise ValueError(f"{text}; expected n_from / n_to, {LEAST_RATIO:g} … {1 / LEAST_RATIO:g}")
+    if transmitted is not None:
+        wrong = transmitted[~np.isin(transmitted, (0, 1))]
+        if len(wrong):
+            raise ValueError(f"{TRANSMITTED} is {wrong[0]} for {len(wrong)} rays; expected 0 or 1")
+    if ratios is not None:
+        wrong = ratios[~((ratios >= LEAST_RATIO) & (ratios <= 1 / LEAST_RATIO))]
+        if len(wrong):
+            text = f"{N_RATIO} is {wrong[0]:g} for {len(wrong)} rays"
+            raise ValueError(f"{text}; expected n_from / n_to, {LEAST_RATIO:g} … {1 / LEAST_RATIO:g}")
     return Answers(ids.astype(np.int64), table.numbers[:, 1:4], transmitted, table.header, ratios, table.digest)
 
 
@@ -181,11 +186,11 @@ def answers_of(
     cwd: str | Path | None = None,
     env: Mapping[str, str] | None = None,
 ) -> Answers:
-    """The answers of a program, which reads rays on stdin and writes answers to stdout, in `timeout` seconds.
+    """The answers of a program that reads rays from stdin and writes answers to stdout within `timeout` seconds.
 
-    Its stderr is passed through. Every process of its group is ended with it. ValueError, one line that begins with the
-    command, where it ends with another status than 0, answers too late, prints no answers, or more than two for each
-    ray need. OSError where it cannot be started.
+    Its stderr is passed through. All processes of its group end with it. ValueError, one line that begins with the
+    command, if the program ends with a status other than 0, takes too long, does not print answers, or prints more than
+    two answers for each ray need. OSError if it cannot be started.
     """
     if not command:
         raise ValueError("no command; expected mi-refract rays run [OPTIONS] -- COMMAND")
@@ -196,7 +201,7 @@ def answers_of(
     try:
         ended = process_group.run(command, as_csv(rays).encode(), timeout, cwd=cwd, env=env, most=most)
     except TooMuchOutputError as error:
-        raise ValueError(f"{name}: {error}; expected one answer a ray") from None
+        raise ValueError(f"{name}: {error}; expected one answer per ray") from None
     except TimeoutError:
         raise ValueError(f"{name}: did not finish within {timeout:g} s; set a longer --timeout") from None
     except OSError as error:
@@ -206,13 +211,13 @@ def answers_of(
     return parse_answers(ended.out, name)
 
 
-# Tables of numbers that others wrote -------------------------------------------------------------------------------
+# Tables of numbers from other programs -----------------------------------------------------------------------------
 
 
 class Table(NamedTuple):
-    """A header, empty where there is none; the names of the columns; their numbers (N, columns), float64.
+    """A header, empty if the file has none; the names of the columns; their numbers (N, columns), float64.
 
-    `digest`: SHA-256 of the bytes that were read; "" where it is not known.
+    `digest`: SHA-256 of the bytes that were read; "" if it is not known.
     """
 
     header: Header
@@ -221,36 +226,39 @@ class Table(NamedTuple):
     digest: str = ""
 
 
-def _read(path: Path, layouts: Sequence[Layout], most: int, made: Callable[[Table], T]) -> T:
-    """What is made of the table in a file, which has `most` rows at most, in one of the layouts.
+def _read(path: Path, layouts: Sequence[Layout], most: int, convert: Callable[[Table], T]) -> T:
+    """The result of `convert` for the table in a file, which must have one of the layouts and at most `most` rows.
 
-    ValueError, one line that begins with the path, for another format, or what is no such table. OSError where the file
-    cannot be read.
+    ValueError, one line that begins with the path, for another format or an invalid table. OSError if the file cannot
+    be read.
     """
-    if (suffix := path.suffix.lower()) not in SUFFIXES:
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
         raise ValueError(f"{path}: expected a file name that ends in {' or '.join(SUFFIXES)}")
-    numbers = most * _NUMBER_BYTES * max(map(len, layouts))
-    largest = numbers + _NPZ_MORE_BYTES if suffix == ".npz" else most * _ROW_BYTES + _TOP_BYTES
+    if suffix == ".npz":
+        largest = most * _NUMBER_BYTES * max(map(len, layouts)) + _NPZ_MORE_BYTES
+    else:
+        largest = most * _ROW_BYTES + _TOP_BYTES
     with safe_files.opened(path, largest) as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
         stream.seek(0)
         try:
-            return made(_READERS[suffix](stream, layouts, most)._replace(digest=digest))
+            return convert(_READERS[suffix](stream, layouts, most)._replace(digest=digest))
         except ValueError as error:
             raise ValueError(f"{path}: {one_line(str(error))}") from None
 
 
 class _TooLongError(ValueError):
-    """A line, or a table."""
+    """A line or a table is too long."""
 
 
 def _read_csv(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
-    """The table in CSV text, whose names of columns are one of the layouts, in order.
+    """The table in CSV text, whose column names must be one of the layouts, in order.
 
-    ValueError, one line: bytes that are not text, other columns, a row that is too short, too long, or not of numbers,
+    ValueError, one line, for bytes that are not text, other columns, a row that is too short, too long, or not numbers,
     or more than `most` rows.
     """
-    number, line, rows_left = 0, "", most + 1  # with the names of the columns
+    number, line, rows_left = 0, "", most + 1  # one more for the row of column names
 
     def lines(text: io.TextIOWrapper) -> Iterator[str]:
         nonlocal number, line, rows_left
@@ -274,11 +282,11 @@ def _read_csv(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
                     break
                 header[key[1:].strip()] = _value(value.strip()) if colon else ""
             if columns not in layouts:
-                problem = f"the first row is {','.join(columns)[:60]!r}" if columns else "the table is empty"
-                raise ValueError(f"{problem}; expected, in this order: {' or '.join(map(','.join, layouts))}")
-            with warnings.catch_warnings(action="ignore", category=UserWarning):  # of a table without rows
+                reason = f"the first row is {','.join(columns)[:60]!r}" if columns else "the table is empty"
+                raise ValueError(f"{reason}; expected, in this order: {' or '.join(map(','.join, layouts))}")
+            with warnings.catch_warnings(action="ignore", category=UserWarning):  # "input contained no data"
                 try:
-                    numbers = np.loadtxt(rows, delimiter=",", ndmin=2)  # `max_rows` would be allocated
+                    numbers = np.loadtxt(rows, delimiter=",", ndmin=2)  # with `max_rows` it would allocate them all
                 except (_TooLongError, UnicodeDecodeError):
                     raise
                 except ValueError:
@@ -291,19 +299,19 @@ def _read_csv(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
 
 
 def _value(text: Any) -> Any:
-    """The value of JSON text, any other text unchanged, None for anything but text."""
+    """The value of JSON text; any other text unchanged; None if `text` is not a string."""
     try:
         return json.loads(text)
-    except (ValueError, RecursionError):  # of text that is nested too deep for the parser
+    except (ValueError, RecursionError):  # the latter for text that is nested too deeply for the parser
         return text
     except TypeError:
         return None
 
 
 def _read_npz(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
-    """The table in an archive, in the largest layout that is there; no other array is unpacked.
+    """The table in an archive, in the largest layout that it contains; no other array is unpacked.
 
-    ValueError, one line, for what is no such archive, and for arrays that are too large, before they are unpacked.
+    ValueError, one line, for an invalid archive, and for arrays that are too large, before they are unpacked.
     """
 
     def array_name(column: str) -> str:
@@ -312,8 +320,8 @@ def _read_npz(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
     try:
         with zipfile.ZipFile(stream) as archive:
             members = {name.removesuffix(".npy") for name in archive.namelist()}
-            whole = [layout for layout in layouts if all(array_name(column) in members for column in layout)]
-            columns = max(whole, key=len, default=layouts[0])
+            complete = [layout for layout in layouts if all(array_name(column) in members for column in layout)]
+            columns = max(complete, key=len, default=layouts[0])
             widths = Counter(map(array_name, columns))
             arrays = {}
             for name, width in widths.items():
@@ -321,7 +329,7 @@ def _read_npz(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
                 if not array.ndim or array.shape[1:] not in ((width,), ()) or array.size != len(array) * width:
                     raise ValueError(f"{name} has the shape {array.shape}, not (rows, {width})")
                 if array.dtype.kind not in "biuf":
-                    raise ValueError(f"{name} holds {array.dtype}, not real numbers")
+                    raise ValueError(f"{name} contains {array.dtype}, not real numbers")
                 if len(array) > most:
                     raise ValueError(f"{len(array)} rows, more than {most}")
                 with np.errstate(over="ignore"):
@@ -331,15 +339,15 @@ def _read_npz(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
             text = _array(archive, "header", _NPZ_HEADER_BYTES) if "header" in members else np.array("")
             if text.shape or text.dtype.kind != "U":
                 raise ValueError(f"header is {text.dtype} of the shape {text.shape}, not text")
-    except _BROKEN_NPZ as error:
-        problem, expected = one_line(str(error)) or type(error).__name__, dict.fromkeys(map(array_name, layouts[0]))
-        raise ValueError(f"{problem}; expected an .npz file with {', '.join(expected)}") from None
+    except _NPZ_ERRORS as error:
+        reason, expected = one_line(str(error)) or type(error).__name__, dict.fromkeys(map(array_name, layouts[0]))
+        raise ValueError(f"{reason}; expected an .npz file with {', '.join(expected)}") from None
     header = _value(str(text))
     return Table(header if isinstance(header, dict) else {}, columns, np.hstack(list(arrays.values())))
 
 
 def _array(archive: zipfile.ZipFile, name: str, most: int) -> NDArray[Any]:
-    """A member of up to `most` bytes, read to its end: only there zipfile compares its checksum."""
+    """A member of up to `most` bytes, read to its end, as zipfile checks the checksum only there."""
     try:
         info = archive.getinfo(f"{name}.npy")
     except KeyError:

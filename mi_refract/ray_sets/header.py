@@ -1,9 +1,9 @@
-"""The header of a file of rays: its keys, what each may be, and the media and the wavelength of each ray.
+"""The header of a file of rays: its keys and their valid values, and the medium and wavelength of each ray.
 
 In a set with media, the ratios of indices are those of media at wavelengths. Each ray has a wavelength and a pair of
 media, [from, to]: one of them is a medium of `mi_refract.media`, the other is air, whose index is 1. Both follow from
-the header and from the ray's place in its regime, so they are never stored: media take turns first, then wavelengths,
-then from and to. Where a regime needs k ≥ 1, the pair is turned to give it.
+the header and from the ray's position in its regime, so they are never stored: the medium varies fastest, then the
+wavelength, then the direction of the pair. For a regime that needs k ≥ 1, the pair has the direction that gives it.
 """
 
 from __future__ import annotations
@@ -29,20 +29,21 @@ Header = dict[str, Any]  # the `# key: value` lines of a file
 
 FORMAT = "mi_refract rays 1"
 PRECISIONS: dict[str, type[np.floating]] = {"f32": np.float32, "f64": np.float64}
-AUTO, FLAG = "auto", "flag"  # detect the signal of total internal reflection; the column `transmitted` is it
-TIR = ("zero", "nan", "reflected", "tangent", FLAG)  # the signals
+AUTO, FLAG = "auto", "flag"  # detect the signal of total internal reflection; the signal is the column `transmitted`
+TIR = ("zero", "nan", "reflected", "tangent", FLAG)  # signals of total internal reflection
 LARGEST_WAVELENGTH = 1e9  # nm
-MOST_MEDIA = 64  # media of a set, and wavelengths
+MOST_MEDIA = 64  # largest number of media in a set, and of wavelengths
 AIR = "air"
-COLUMNS = ("wavelength", "medium")  # of rays with media
+COLUMNS = ("wavelength", "medium")  # additional columns of rays with media
 CONVENTION = (
     "wavelength in nm; medium: the number, from 0, of the pair [from, to] in `media`; n_from / n_to is the ratio of "
     "their indices at that wavelength, where air has the index 1"
 )
-SMALLEST, LARGEST = 1e-6, 1e6  # of ratios
-# The relative difference of indices that a maker's five decimals, or another formula of a glass, leave open.
+SMALLEST, LARGEST = 1e-6, 1e6  # ratios
+# Ratios of media count as equal up to this relative difference: five decimals of a manufacturer, or another dispersion
+# formula of the same glass, can differ by as much.
 SAME = 1e-5
-TAKE_RATIOS = tuple(name for name, regime in REGIMES.items() if regime.takes_k)  # the regimes that media can be in
+TAKE_RATIOS = tuple(name for name, regime in REGIMES.items() if regime.takes_k)  # regimes that accept given ratios
 _AIR = dataclasses.replace(media.parse(1.0), name=AIR, relative_to="air")
 
 Text = Annotated[str, Meta(min_length=1, max_length=200)]
@@ -57,28 +58,28 @@ def _doc(meaning: str) -> Meta:
 
 
 class RaysHeader(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The keys of a header. Those of media are all there or none."""
+    """The keys of a header. The keys of media are all present or all absent."""
 
     format: Annotated[Literal["mi_refract rays 1"], _doc("the format, and its version")]
     version: Annotated[Text, _doc("version of mi_refract that wrote the file")]
-    precision: Annotated[Literal["f32", "f64"], _doc("of all numbers but `id`")]
-    seed: Annotated[int, Meta(ge=0, le=2**63 - 1), _doc("of the random rays")]
-    count: Annotated[int, Meta(ge=1, le=2**63 - 1), _doc("rays of each regime")]
-    two_sided: Annotated[bool, _doc("whether normals are on either side of the surface")]
-    a: Annotated[Text, _doc("what `ax, ay, az` are, for readers")]
-    n: Annotated[Text, _doc("what `nx, ny, nz` are, for readers")]
-    indices: Annotated[Text, _doc("what they are, for readers")] = msgspec.field(name="n_from, n_to")
+    precision: Annotated[Literal["f32", "f64"], _doc("precision of all numbers except `id`")]
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1), _doc("seed of the random rays")]
+    count: Annotated[int, Meta(ge=1, le=2**63 - 1), _doc("number of rays of each regime")]
+    two_sided: Annotated[bool, _doc("whether normals may be on either side of the surface")]
+    a: Annotated[Text, _doc("meaning of `ax, ay, az`, for readers")]
+    n: Annotated[Text, _doc("meaning of `nx, ny, nz`, for readers")]
+    indices: Annotated[Text, _doc("their meaning, for readers")] = msgspec.field(name="n_from, n_to")
     answer: Annotated[Text, _doc("the columns of an answer, for readers")]
     regimes: Annotated[dict[Text, tuple[int, int]], _doc("first and last id of each regime")]
-    checksum: Annotated[str, Meta(pattern="^sha256:[0-9a-f]{64}$"), _doc("of header and rays")]
-    columns_of_media: Annotated[MediumName | UnsetType, _doc("what they are, for readers; of rays with media")] = (
+    checksum: Annotated[str, Meta(pattern="^sha256:[0-9a-f]{64}$"), _doc("checksum of header and rays")]
+    columns_of_media: Annotated[MediumName | UnsetType, _doc("only with media: their meaning, for readers")] = (
         msgspec.field(name="wavelength, medium", default=UNSET)
     )
-    media: Annotated[Pairs | UnsetType, _doc("pairs [from, to] of the column `medium`; of rays with media")] = UNSET
-    wavelengths: Annotated[Wavelengths | UnsetType, _doc("in nm; of rays with media")] = UNSET
+    media: Annotated[Pairs | UnsetType, _doc("only with media: pairs [from, to] for the column `medium`")] = UNSET
+    wavelengths: Annotated[Wavelengths | UnsetType, _doc("only with media: wavelengths in nm")] = UNSET
 
     def __post_init__(self) -> None:
-        """ValueError for some keys of media without the others."""
+        """ValueError if only some of the keys of media are present."""
         keys = {"wavelength, medium": self.columns_of_media, "media": self.media, "wavelengths": self.wavelengths}
         missing = [key for key, value in keys.items() if value is UNSET]
         if 0 < len(missing) < len(keys):
@@ -86,9 +87,9 @@ class RaysHeader(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def check(header: Header, rays: int) -> None:
-    """ValueError, one line, for a header that `ray_set.make` does not write for so many rays.
+    """ValueError, one line, for a header that `ray_set.make` would not write for this number of rays.
 
-    Each regime has `count` rays, one after the other: no ray is without a regime, and none is in two.
+    Each regime has `count` consecutive rays: every ray is in exactly one regime.
     """
     convert(header, RaysHeader, "header")
     count, regimes = header["count"], header["regimes"]
@@ -101,14 +102,14 @@ def check(header: Header, rays: int) -> None:
             raise ValueError(f"{text}; expected {[i * count, (i + 1) * count - 1]}")
     if has_media(header):
         names = [pair[0] for pair in header["media"][::2]]
-        made = of_media(names, header["wavelengths"], header["precision"])
-        if header["media"] != made["media"]:
-            raise ValueError(f"header: media: {shown(header['media'])}; expected {shown(made['media'])}")
+        expected = of_media(names, header["wavelengths"], header["precision"])["media"]
+        if header["media"] != expected:
+            raise ValueError(f"header: media: {shown(header['media'])}; expected {shown(expected)}")
         check_regimes(header)
 
 
 def shown(value: Any) -> str:
-    """Any value of a header in an error: quoted, and not long."""
+    """A value of a header as text for an error: quoted, and at most 61 characters long."""
     try:
         text = ascii(value)
     except (RecursionError, ValueError):  # a number of thousands of digits
@@ -125,25 +126,27 @@ def has_media(header: Mapping[str, Any]) -> bool:
 
 
 def of_media(specs: Sequence[str], wavelengths: Sequence[float], precision: str) -> Header:
-    """The keys of a header for these media, and wavelengths in nm.
+    """The keys of a header for these media and wavelengths (nm).
 
-    ValueError, one line, for none of either, too many, duplicates in the set's precision, an unknown medium, or one
-    without an index at one of the wavelengths.
+    ValueError, one line, for no media or no wavelengths, too many, duplicates in the set's precision, an unknown
+    medium, or a medium without an index at one of the wavelengths.
     """
     text = f"{len(specs)} media and {len(wavelengths)} wavelengths"
     if not len(specs) or not len(wavelengths):
         raise ValueError(f"{text}; expected neither, or at least one of each")
     if max(len(specs), len(wavelengths)) > MOST_MEDIA:
         raise ValueError(f"{text}; expected up to {MOST_MEDIA} of each")
-    if wrong := [x for x in wavelengths if not 0 < x < LARGEST_WAVELENGTH]:
+    wrong = [x for x in wavelengths if not 0 < x < LARGEST_WAVELENGTH]
+    if wrong:
         raise ValueError(f"wavelength {wrong[0]:g}; expected nm, a number above 0")
     rounded = _rounded(wavelengths, precision)
     if len(np.unique(rounded)) < len(rounded) or not rounded.all():
         text = f"the wavelengths {shown(wavelengths)} are not all different in {precision}"
         raise ValueError(f"{text}; expected each once")
     names = [_parsed(spec).name for spec in specs]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise ValueError(f"medium {shown(twice[0])}: {names.count(twice[0])} times; expected each once")
+    repeated = [name for name in names if names.count(name) > 1]
+    if repeated:
+        raise ValueError(f"medium {shown(repeated[0])}: {names.count(repeated[0])} times; expected each once")
     in_nm = [float(x) for x in wavelengths]
     _ratios(tuple(names), tuple(in_nm), precision)
     pairs = [pair for name in names for pair in ([name, AIR], [AIR, name])]
@@ -151,26 +154,28 @@ def of_media(specs: Sequence[str], wavelengths: Sequence[float], precision: str)
 
 
 def check_regimes(header: Header) -> None:
-    """ValueError, one line, for a regime whose ratios are its own, or for fewer rays than there are combinations."""
-    if refused := [name for name in header["regimes"] if name in REGIMES and name not in TAKE_RATIOS]:
+    """ValueError, one line, for a regime that defines its own ratios, or for fewer rays than combinations of media."""
+    refused = [name for name in header["regimes"] if name in REGIMES and name not in TAKE_RATIOS]
+    if refused:
         text = f"regime {refused[0]!r} defines its own ratios of indices"
         raise ValueError(f"{text}; with media, expected one of {', '.join(map(repr, TAKE_RATIOS))}")
-    if header["count"] < (least := len(header["media"]) * len(header["wavelengths"])):
+    least = len(header["media"]) * len(header["wavelengths"])
+    if header["count"] < least:
         text = f"{header['count']} rays of each regime"
         raise ValueError(f"{text}; expected {least} or more, one for each medium, wavelength and side of the surface")
 
 
 def columns(header: Header, ids: Ids) -> Array:
-    """(N, 2) float64 of the rays with these ids (N,): wavelength in nm, number of the pair; (N, 0) without media."""
+    """(N, 2) float64 for the rays with these ids (N,): wavelength in nm, number of the pair; (N, 0) without media."""
     if not has_media(header):
         return np.empty((len(ids), 0))
-    pair, at = _combination(header, ids)
-    return np.column_stack([_rounded(header["wavelengths"], header["precision"])[at], pair])
+    pairs, wavelengths = _combinations(header, ids)
+    return np.column_stack([_rounded(header["wavelengths"], header["precision"])[wavelengths], pairs])
 
 
 def ratios(header: Header, ids: Ids) -> Array:
     """(N,) n_from / n_to of the rays with these ids, in the set's precision, as float64. Precondition: `has_media`."""
-    return _table(header)[_combination(header, ids)]
+    return _ratio_table(header)[_combinations(header, ids)]
 
 
 def described(header: Header, id_: int) -> str:
@@ -178,32 +183,32 @@ def described(header: Header, id_: int) -> str:
     if not has_media(header):
         return ""
     ((wavelength, pair),) = columns(header, np.array([id_]))
-    left, entered = header["media"][int(pair)]
-    return f"{left} to {entered} at {wavelength:.9g} nm"
+    outside, inside = header["media"][int(pair)]
+    return f"{outside} to {inside} at {wavelength:.9g} nm"
 
 
 def check_ratios(header: Header, k: Array) -> None:
-    """ValueError, one line, where `k` (N,) of all rays is not the ratio of their media."""
+    """ValueError, one line, if `k` (N,) of all rays is not the ratio of their media."""
     if has_media(header):
         expected = ratios(header, np.arange(len(k)))
-        other = np.flatnonzero(~(np.abs(k.astype(np.float64) - expected) <= SAME * expected))
-        if len(other):
-            text = f"ray {other[0]} has n_from / n_to = {float(k[other[0]]):.9g}"
-            raise ValueError(f"{text}; expected {expected[other[0]]:.9g}, {described(header, int(other[0]))}")
+        wrong = np.flatnonzero(~(np.abs(k.astype(np.float64) - expected) <= SAME * expected))
+        if len(wrong):
+            text = f"ray {wrong[0]} has n_from / n_to = {float(k[wrong[0]]):.9g}"
+            raise ValueError(f"{text}; expected {expected[wrong[0]]:.9g}, {described(header, int(wrong[0]))}")
 
 
-def _combination(header: Header, ids: Ids) -> tuple[Ids, Ids]:
-    """The number of the pair and that of the wavelength of each ray, (N,) both."""
-    count, total = header["count"], len(header["media"]) // 2
-    place = ids % count
-    medium, rest = place % total, place // total
-    at, turned = rest % len(header["wavelengths"]), rest // len(header["wavelengths"]) % 2
+def _combinations(header: Header, ids: Ids) -> tuple[Ids, Ids]:
+    """For each ray, the number of its pair (N,) and of its wavelength (N,)."""
+    count, medium_count = header["count"], len(header["media"]) // 2
+    position = ids % count
+    medium, rest = position % medium_count, position // medium_count
+    wavelength, turned = rest % len(header["wavelengths"]), rest // len(header["wavelengths"]) % 2
     least = np.array([REGIMES[name].least_k if name in REGIMES else 0.0 for name in header["regimes"]])[ids // count]
-    turned = np.where(least > 0, _table(header)[2 * medium, at] < least, turned)
-    return 2 * medium + turned, at
+    turned = np.where(least > 0, _ratio_table(header)[2 * medium, wavelength] < least, turned)
+    return 2 * medium + turned, wavelength
 
 
-def _table(header: Header) -> Array:
+def _ratio_table(header: Header) -> Array:
     names = tuple(pair[0] for pair in header["media"][::2])
     return _ratios(names, tuple(header["wavelengths"]), header["precision"])
 
@@ -211,23 +216,24 @@ def _table(header: Header) -> Array:
 @functools.lru_cache(maxsize=8)
 def _ratios(names: tuple[str, ...], wavelengths: tuple[float, ...], precision: str) -> Array:
     """(pairs, wavelengths) n_from / n_to in the set's precision, as float64."""
-    at, rows = _rounded(wavelengths, precision), []
+    nm, rows = _rounded(wavelengths, precision), []
     for medium in map(_parsed, names):
-        for wavelength in at.tolist():  # an error names the first that is wrong
+        for wavelength in nm.tolist():  # one by one, so that an error names the first wavelength without an index
             medium.index(wavelength)
-        rows += [media.relative_index(*pair, at) for pair in ((medium, _AIR), (_AIR, medium))]
+        rows += [media.relative_index(*pair, nm) for pair in ((medium, _AIR), (_AIR, medium))]
     k = _rounded(np.array(rows), precision)
-    if len(wrong := np.argwhere(~((k >= SMALLEST) & (k <= LARGEST)))):
+    wrong = np.argwhere(~((k >= SMALLEST) & (k <= LARGEST)))
+    if len(wrong):
         pair, i = wrong[0]
-        text = f"{names[pair // 2]}: n = {float(rows[pair - pair % 2][i]):.6g} beside air at {at[i]:.9g} nm"
+        text = f"{names[pair // 2]}: n = {float(rows[pair - pair % 2][i]):.6g} beside air at {nm[i]:.9g} nm"
         raise ValueError(f"{text}; expected {SMALLEST:g} … {LARGEST:g}")
     return k
 
 
 def _parsed(spec: str) -> media.Medium:
-    """The medium of a text. ValueError, one line, where it is none, or one of Mitsuba's table."""
+    """The medium of a text. ValueError, one line, for another text, and for a name of Mitsuba's table."""
     with contextlib.suppress(ValueError):
-        parse_number(spec.replace("-", ""))  # the index, or the code of a glass
+        parse_number(spec.replace("-", ""))  # an index, or the code of a glass
         return media.parse(spec)
     if ":" not in spec and "(" not in spec:
         expected = "a number, cauchy(A, B, …) or another formula, SCHOTT:N-BK7 or another glass"

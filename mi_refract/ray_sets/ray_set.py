@@ -1,9 +1,9 @@
 """Sets of incident rays for other programs, and their answers.
 
-A set holds one or several regimes of `mi_refract.regimes`, rounded to float32 or float64. The same regimes, count,
-precision and seed give the same set, bit for bit. The ratio n_from / n_to is exact: n_to is a power of two, 1 where it
-can be, and no index is below 1. So a program that divides them, in either precision, gets exactly the k of the ray.
-With media and wavelengths (see `header`), their ratios take the place of the regimes' own.
+A set contains one or several regimes of `mi_refract.regimes`, rounded to float32 or float64. The same regimes, count,
+precision and seed give the same set, bit for bit. The ratio n_from / n_to is exact: n_to is a power of two, 1 if
+possible, and no index is below 1. So a program that divides them, in either precision, gets exactly the k of the ray.
+With media and wavelengths (see `header`), their ratios replace the regimes' own.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from .header import FORMAT, PRECISIONS, Header, Ids
 
 Rows = NDArray[np.bool_] | NDArray[np.intp] | slice  # a mask (N,), indices, or a range
 
-# Their vectors are unit up to the rounding of each component, as the documented formulas require.
+# Regimes whose vectors are unit up to the rounding of each component, as the documented formulas require.
 DEFAULT = tuple(name for name, regime in regimes.REGIMES.items() if regime.unit and not regime.rests_on_denormals)
 COUNT, PRECISION = 1000, "f32"
 
 
 def indices(k: Array) -> tuple[Array, Array]:
-    """(n_from, n_to), each (N,) and at least 1. Their ratio is k, exactly."""
+    """(n_from, n_to), each (N,) and at least 1. Their ratio is exactly k."""
     _, exponent = np.frexp(k)
     n_to = np.ldexp(np.ones_like(k), np.maximum(1 - exponent, 0))
     return k * n_to, n_to
@@ -52,12 +52,12 @@ class RaySet:
         return len(self.ids)
 
     def __getitem__(self, rows: Rows) -> RaySet:
-        """Some of the rays, under the same header."""
+        """The selected rays, with the same header."""
         return RaySet(self.rays[rows], self.ids[rows], self.header)
 
     @property
     def precision(self) -> str:
-        """ "f32" or "f64": the precision of the numbers, and the one that the answers claim."""
+        """ "f32" or "f64": the precision of the rays, and that claimed for the answers."""
         return str(self.header["precision"])
 
     @property
@@ -67,7 +67,7 @@ class RaySet:
 
     @functools.cached_property
     def regime(self) -> NDArray[np.object_]:
-        """(N,): the name of each ray's regime."""
+        """(N,) the name of each ray's regime."""
         names = np.full(len(self), "", dtype=object)
         for name in self.header["regimes"]:
             names[in_regime(self.header, name, self.ids)] = name
@@ -76,12 +76,13 @@ class RaySet:
     @property
     def numbers(self) -> Array:
         """(N, 9) float64: id, a, n, n_from, n_to; with media (N, 11): wavelength, medium."""
-        rays, of_media = self.rays, headers.columns(self.header, self.ids).T
-        return np.column_stack([self.ids, rays.a, rays.n, *indices(rays.k), *of_media]).astype(np.float64, copy=False)
+        rays, media_columns = self.rays, headers.columns(self.header, self.ids).T
+        numbers = np.column_stack([self.ids, rays.a, rays.n, *indices(rays.k), *media_columns])
+        return numbers.astype(np.float64, copy=False)
 
 
 def in_regime(header: Header, name: str, ids: Ids) -> NDArray[np.bool_]:
-    """(N,) which of the ids are in the range of a regime."""
+    """(N,) whether each id is in the range of a regime."""
     first, last = header["regimes"][name]
     inside: NDArray[np.bool_] = (ids >= first) & (ids <= last)
     return inside
@@ -89,11 +90,12 @@ def in_regime(header: Header, name: str, ids: Ids) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Answers:
-    """A program's answers: ids (N,), b (N, 3) float64, the column `transmitted` (N,) if there is one, the header.
+    """A program's answers: ids (N,), directions b (N, 3) float64, and optional columns.
 
-    `transmitted`: of True and False, or of 1 and 0.
+    `transmitted`: (N,) True and False, or 1 and 0, if the column exists.
+    `header`: of the file; empty if it has none.
     `n_ratio`: (N,) the n_from / n_to that the program used, if it reports it.
-    `digest`: SHA-256 of the file, or of what the program printed; "" of arrays.
+    `digest`: SHA-256 of the file or of the program's output; "" for arrays.
     """
 
     ids: Ids
@@ -104,23 +106,25 @@ class Answers:
     digest: str = ""
 
     def __post_init__(self) -> None:
-        """ValueError where the shapes do not match, and for a `transmitted` that is neither 0 nor 1."""
+        """ValueError for shapes that do not match, and for a `transmitted` that is neither 0 nor 1."""
         columns = [column for column in (self.transmitted, self.n_ratio) if column is not None]
         if self.b.shape != (len(self.ids), 3) or any(column.shape != self.ids.shape for column in columns):
             raise ValueError(f"answers: b is {self.b.shape} for {len(self.ids)} ids; expected a direction for each id")
         if self.transmitted is not None:
-            if (wrong := self.transmitted[~np.isin(self.transmitted, (0, 1))]).size:
+            wrong = self.transmitted[~np.isin(self.transmitted, (0, 1))]
+            if wrong.size:
                 raise ValueError(f"answers: transmitted is {wrong[0]}; expected 0 or 1")
-            object.__setattr__(self, "transmitted", self.transmitted.astype(bool))  # `~` of an integer is another one
+            # As bool, since `~` of an integer is not its negation.
+            object.__setattr__(self, "transmitted", self.transmitted.astype(bool))
 
     def __getitem__(self, rows: Rows) -> Answers:
-        """Some of the answers, under the same header and digest."""
+        """The selected answers, with the same header and digest."""
         columns = [None if column is None else column[rows] for column in (self.transmitted, self.n_ratio)]
         return Answers(self.ids[rows], self.b[rows], columns[0], self.header, columns[1], self.digest)
 
 
 def default(media: Sequence[str] = ()) -> tuple[str, ...]:
-    """The names of DEFAULT; with media those whose ratios are not their own."""
+    """The regimes of DEFAULT; with media, those that do not define their own ratios."""
     return tuple(name for name in DEFAULT if not len(media) or name in headers.TAKE_RATIOS)
 
 
@@ -136,14 +140,15 @@ def make(
 ) -> RaySet:
     """`count` rays of each regime in `names`, by default those of `default`. Normals face the ray unless `two_sided`.
 
-    `media`: what `mi_refract.media` parses; each ray passes between one of them and air, at one of the `wavelengths` in
-    nm. ValueError, one line, for an unknown regime or precision, a duplicate regime, no ray at all; of media see
-    `header.of_media` and `header.check_regimes`.
+    `media`: specifications for `mi_refract.media`; each ray passes between one of these media and air, at one of the
+    `wavelengths` in nm. ValueError, one line, for an unknown regime or precision, a duplicate regime, or no rays; and
+    for media as in `header.of_media` and `header.check_regimes`.
     """
     from mi_refract import __version__
 
     names = default(media) if names is None else tuple(names)
-    if unknown := [name for name in names if name not in regimes.REGIMES]:
+    unknown = [name for name in names if name not in regimes.REGIMES]
+    if unknown:
         raise ValueError(f"regime {unknown[0]!r}: unknown; expected {', '.join(map(repr, regimes.REGIMES))}")
     if precision not in PRECISIONS:
         raise ValueError(f"precision {precision!r}: unknown; expected {', '.join(PRECISIONS)}")
@@ -180,13 +185,13 @@ def make(
 
 
 def facing(rays: Rays) -> Rays:
-    """The same rays, each with its normal on the side that it comes from."""
+    """The same rays, each with its normal on the side that the ray comes from."""
     c = float_expansions.dot(rays.n.T.astype(np.float64), rays.a.T.astype(np.float64))[0]
     return Rays(rays.a, np.where(c[:, None] > 0, -rays.n, rays.n), rays.k)
 
 
 def checksum(header: Header, numbers: Array) -> str:
-    """SHA-256 of the header without its own line, and of `RaySet.numbers`. It does not depend on the file format."""
+    """SHA-256 of the header without its checksum, and of `RaySet.numbers`. It does not depend on the file format."""
     hashed = {key: value for key, value in header.items() if key != "checksum"}
     digest = hashlib.sha256(json.dumps(hashed, sort_keys=True).encode())
     digest.update(np.ascontiguousarray(numbers, "<f8").data)
@@ -194,5 +199,5 @@ def checksum(header: Header, numbers: Array) -> str:
 
 
 def with_checksum(rays: RaySet) -> RaySet:
-    """The set, with its checksum in the header."""
+    """The set with its checksum in the header."""
     return replace(rays, header=rays.header | {"checksum": checksum(rays.header, rays.numbers)})

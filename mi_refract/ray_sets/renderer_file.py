@@ -1,6 +1,6 @@
-"""`mi-refract-renderer.toml`: a renderer's refraction, how to run it, and what is known of it. See its how-to page.
+"""`mi-refract-renderer.toml`: a renderer's functions of refraction, how to run them, and their known deviations.
 
-Whoever has the folder of such a file can check the renderer: `mi-refract rays run --renderer FOLDER`.
+`mi-refract rays run --renderer FOLDER` checks the renderer whose folder contains this file. See its how-to page.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from mi_refract.io import safe_files
 from mi_refract.io.typed_table import key_table, parse_toml
 
 NAME = "mi-refract-renderer.toml"
-SIZE = 2**20  # bytes: the most that such a file may have
+SIZE = 2**20  # largest size of the file in bytes
 Text = Annotated[str, Meta(min_length=1)]
 Command = Annotated[tuple[Text, ...], Meta(min_length=1)]
 
 
 class Deviation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where a function is known to be wrong."""
+    """A regime in which a function is known to be wrong."""
 
     regime: Annotated[str, Meta(min_length=1, description="a regime, or a set of rays of the study")]
-    reason: Annotated[str, Meta(min_length=1, description="why")]
+    reason: Annotated[str, Meta(min_length=1, description="the reason")]
 
 
 class RaysCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A function of refraction. `command` is as in the file, with its placeholders."""
+    """A function of refraction. `command` contains its placeholders, as in the file."""
 
-    title: Annotated[str, Meta(min_length=1, description="name of the function, as reports show it")]
-    precision: Annotated[Literal["f32", "f64"], Meta(description="the precision that it claims")]
+    title: Annotated[str, Meta(min_length=1, description="name of the function in reports")]
+    precision: Annotated[Literal["f32", "f64"], Meta(description="the precision of its answers")]
     command: Annotated[
         Command, Meta(description="reads rays on stdin and writes answers to stdout, as CSV; runs in the file's folder")
     ]
@@ -44,14 +44,15 @@ class RaysCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gives_up: Annotated[
         float,
         Meta(
-            ge=0, description="rays with cos²θ_t below this count as totally reflected, by the renderer's documentation"
+            ge=0,
+            description="rays with cos²θ_t below this are totally reflected, according to the renderer's documentation",
         ),
     ] = 0.0
-    lengths: Annotated[str, Meta(description="what it does with vectors that are not unit")] = ""
-    remark: Annotated[str, Meta(description="what else is known about it")] = ""
+    lengths: Annotated[str, Meta(description="how it handles vectors that are not unit")] = ""
+    remark: Annotated[str, Meta(description="further remarks")] = ""
     recorded: Annotated[
         dict[str, float | list[float]],  # msgspec 0.22 misreads limits within a union with a list
-        Meta(description="the largest angle in radians of an earlier run, by set of rays: a number, or [from, to]"),
+        Meta(description="largest angle in radians in an earlier run, by set of rays: a number, or [from, to]"),
     ] = {}
     deviation: Annotated[
         tuple[Deviation, ...],
@@ -67,25 +68,28 @@ class RaysCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise ValueError(f"recorded: {name}: {value}; expected a number above 0, or [from, to]")
 
     def recorded_range(self, name: str) -> tuple[float, float] | None:
-        """The recorded angle of a set of rays, as (from, to)."""
+        """The recorded angle of a set of rays as (from, to); None if none is recorded."""
         value = self.recorded.get(name)
-        return None if value is None else (value[0], value[1]) if isinstance(value, list) else (value, value)
+        if value is None:
+            return None
+        return (value[0], value[1]) if isinstance(value, list) else (value, value)
 
     @property
     def deviations(self) -> dict[str, str]:
-        """Reasons by regime."""
-        return {known.regime: known.reason for known in self.deviation}
+        """The reasons of the known deviations, by regime."""
+        return {deviation.regime: deviation.reason for deviation in self.deviation}
 
 
 class ImagesCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a renderer renders."""
+    """How to render an image with a renderer."""
 
     export: Annotated[str, Meta(min_length=1, description="a target of `mi-refract scene export`")]
     command: Annotated[
-        Command, Meta(description="renders {scene}, with {spp} samples a pixel and the seed {seed}, into {image}")
+        Command, Meta(description="renders {scene} with {spp} samples per pixel and the seed {seed} into {image}")
     ]
     spp: Annotated[
-        dict[str, Annotated[int, Meta(ge=1)]], Meta(description="samples a pixel by scene; no other scene is rendered")
+        dict[str, Annotated[int, Meta(ge=1)]],
+        Meta(description="samples per pixel by scene; other scenes are not rendered"),
     ]
     assumed: Annotated[tuple[Text, ...], Meta(description="how its model differs from Mitsuba's")] = ()
     deviations: Annotated[dict[str, Text], Meta(description="scenes on which it is known to differ, and why")] = (
@@ -98,9 +102,9 @@ class ImagesCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RendererFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A renderer. `install` is the table as it is in the file."""
+    """A renderer. `install` is the table of the file, unchecked."""
 
-    title: Annotated[str, Meta(min_length=1, description="name of the renderer, as reports show it")]
+    title: Annotated[str, Meta(min_length=1, description="name of the renderer in reports")]
     licence: Annotated[str, Meta(description="its licence")] = ""
     rays: Annotated[tuple[RaysCommand, ...], Meta(description="`[[rays]]`: functions that answer rays")] = ()
     images: Annotated[ImagesCommand | None, Meta(description="`[images]`: how it renders a scene")] = None
@@ -111,31 +115,33 @@ class RendererFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = None
 
     def __post_init__(self) -> None:
-        """ValueError where there is nothing to run, or two functions have one title."""
-        if not self.rays and self.images is None and self.install is None:  # scripts render the images of some
+        """ValueError if there is nothing to run, or two functions have the same title."""
+        if not self.rays and self.images is None and self.install is None:  # for some, scripts of this project render
             raise ValueError("no [[rays]] and no [images]; expected one of them, or both")
         titles = [f"{function.title}, {function.precision}" for function in self.rays]
-        if repeated := [title for title in titles if titles.count(title) > 1]:
+        repeated = [title for title in titles if titles.count(title) > 1]
+        if repeated:
             raise ValueError(f"rays: two functions have the title {repeated[0]!r}; expected one")
 
 
 def load(folder: str | Path) -> RendererFile:
-    """The renderer of a folder. ValueError, one line that names file and key; OSError where there is no such file."""
+    """The renderer of a folder. ValueError, one line that names file and key; OSError if the file cannot be read."""
     path = Path(folder) / NAME
     return parse_toml(safe_files.read_bytes(path, SIZE), RendererFile, str(path))
 
 
 def filled(command: tuple[str, ...], **values: object) -> list[str]:
-    """A command with its placeholders filled in; {python} is this interpreter and {environment} "." unless given.
+    """A command with its placeholders replaced by `values`; defaults: {python} is this interpreter, {environment} ".".
 
-    ValueError for a placeholder that is unknown, or has more to it than its name.
+    ValueError for a placeholder that is unknown, or has a format or conversion.
     """
     known = {"python": sys.executable, "environment": "."} | values
     words = []
     for word in command:
         try:
-            parts = [(text, field, more or conversion) for text, field, more, conversion in Formatter().parse(word)]
-            if wrong := [field for _, field, more in parts if field is not None and (more or field not in known)]:
+            parts = [(text, field, spec or conversion) for text, field, spec, conversion in Formatter().parse(word)]
+            wrong = [field for _, field, spec in parts if field is not None and (spec or field not in known)]
+            if wrong:
                 raise ValueError(repr(wrong[0]))
         except ValueError as error:
             expected = ", ".join(f"{{{name}}}" for name in known)

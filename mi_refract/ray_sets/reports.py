@@ -1,4 +1,4 @@
-"""Reports of a check of answers: text for a terminal, JSON for scripts, JUnit for test runners, and an HTML page."""
+"""Reports of a check of answers: text for a terminal, JSON for scripts, JUnit XML, and an HTML page."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def sentence(findings: Findings) -> str:
     elif findings.wrong or findings.tir == UNCLEAR:
         text = f"{findings.wrong} of {answers} are wrong"
     elif not findings.total("judged"):
-        text = f"{answers}, none of them a {'decidable ' if findings.total('compared') else ''}direction"
+        text = f"{answers}, none with a {'decidable ' if findings.total('compared') else ''}direction"
     elif findings.total("exact") == findings.answered:
         text = f"{answers}, all exact up to rounding"
     else:
@@ -81,10 +81,11 @@ def sentence(findings: Findings) -> str:
         else:
             text = f"{findings.right} of {answers} are right, {findings.answered - findings.right} only within the "
             text += f"error bound of the formula {findings.error_bound}; {worst}"
-            if wide := findings.total("undecidable"):
-                text += f"; {wide} rays are undecidable (error bound above 0.1 rad)"
-    others = findings.problem_count("index")
-    return text + (f"; {others} answers are for a different ratio of indices" if others else "")
+            undecidable = findings.total("undecidable")
+            if undecidable:
+                text += f"; {undecidable} rays are undecidable (error bound above 0.1 rad)"
+    different = findings.problem_count("index")
+    return text + (f"; {different} answers are for a different ratio of indices" if different else "")
 
 
 def problem_text(problem: Problem) -> str:
@@ -93,12 +94,12 @@ def problem_text(problem: Problem) -> str:
 
 
 def signal(findings: Findings) -> str:
-    """How the answers signal total internal reflection, in one line."""
+    """The signal of total internal reflection in the answers, in one line."""
     return SIGNALS[findings.tir] + ("" if findings.tir_given or findings.tir in (NONE, UNCLEAR) else " (detected)")
 
 
 def ratio(findings: Findings) -> list[str]:
-    """A line: how far the ratio that the program used is from that of the ray. None where answers have no `n_ratio`."""
+    """A line on the difference between the ratio that the program used and that of the ray; [] without `n_ratio`."""
     if not findings.ratio:
         return []
     which = f"id {findings.ratio.id}" + (f", {findings.ratio.ray}" if findings.ratio.ray else "")
@@ -107,14 +108,14 @@ def ratio(findings: Findings) -> list[str]:
 
 
 def explained(findings: Findings) -> list[str]:
-    """The mistakes that explain the answers, a line each; where none does, the nearest one, or a line that says so."""
+    """A line for each mistake that explains the answers; if none does, one line on the nearest mistake."""
 
     def line(mistake: Explanation) -> str:
         share = f"{mistake.share:.1%} of the answers on which it has an effect"
         return f"{mistake.mistake}: {mistake.text} ({share})"
 
     certain = [line(mistake) for mistake in findings.explanations if mistake.explains]
-    # Answers that do not match may be to other rays: then no mistake can be named.
+    # Answers that do not match the rays may belong to other rays: then no mistake is reported.
     if certain or not findings.explanations or findings.exit_code > 1:
         return certain
     nearest = max(findings.explanations, key=lambda mistake: mistake.share)
@@ -123,7 +124,7 @@ def explained(findings: Findings) -> list[str]:
 
 
 def grade(errors: RegimeErrors) -> str:
-    """ "exact", "right", "within bound" or "wrong"."""
+    """The grade of a regime: "exact", "right", "within bound" or "wrong"."""
     if errors.wrong:
         return "wrong"
     if errors.right < errors.rays:
@@ -132,19 +133,19 @@ def grade(errors: RegimeErrors) -> str:
 
 
 def cells(errors: RegimeErrors, ulp: float) -> dict[str, str]:
-    """The numbers of a regime as text, by the name of the column; "–" where no direction was compared."""
+    """The numbers of a regime as text, by column; "–" if no direction was compared."""
 
-    def of_directions(x: float) -> str:
+    def if_compared(x: float) -> str:
         return compact(x) if errors.compared else "–"
 
     return {
         "rays": str(errors.rays),
         "undecidable": str(errors.undecidable),
-        "worst / rad": of_directions(errors.worst),
-        **{f"{name} / ulp": of_directions(getattr(errors, name) / ulp) for name in ("worst", "p99", "mean")},
+        "worst / rad": if_compared(errors.worst),
+        **{f"{name} / ulp": if_compared(getattr(errors, name) / ulp) for name in ("worst", "p99", "mean")},
         "TIR misclassified": str(errors.tir_misclassified),
         "TIR beyond bound": str(errors.tir_beyond_bound),
-        "length error": of_directions(errors.length_error),
+        "length error": if_compared(errors.length_error),
         "error / bound": compact(errors.error_over_bound),
         **{f"m, {name}": compact(getattr(errors, f"backward_{name}")) for name in ("median", "p99", "worst", "length")},
         "right": f"{errors.right / errors.rays:.1%}",
@@ -154,23 +155,25 @@ def cells(errors: RegimeErrors, ulp: float) -> dict[str, str]:
 
 
 def summary(findings: Findings) -> RenderableType:
-    """The regimes by grade, the problems of the set, the diagnosis and the sentence, for rich's console."""
+    """The regimes by grade, the problems of the answers, the diagnosis and the result, for rich's console."""
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
     grades = Table.grid(padding=(0, 2))
     for word, style in STYLES.items():
-        if names := [errors.regime for errors in findings.regimes if grade(errors) == word]:
+        names = [errors.regime for errors in findings.regimes if grade(errors) == word]
+        if names:
             every = 1 < len(names) == len(findings.regimes)
             grades.add_row(Text(word, style=style), Text("every regime" if every else printable("; ".join(names))))
     notes = [*map(problem_text, findings.problems), *ratio(findings), signal(findings), *explained(findings)]
     notes += [MEANING] if findings.right > 0 and not findings.wrong else []
-    return Group(*[grades] * bool(findings.regimes), *(Text(printable(line)) for line in (*notes, sentence(findings))))
+    lines = [Text(printable(line)) for line in (*notes, sentence(findings))]
+    return Group(grades, *lines) if findings.regimes else Group(*lines)  # an empty grid would be a blank line
 
 
 def table(findings: Findings) -> RenderableType:
-    """A line per regime, with all its numbers, for rich's console."""
+    """A line per regime with all its numbers, for rich's console."""
     from rich.table import Table
     from rich.text import Text
 
@@ -188,7 +191,7 @@ def table(findings: Findings) -> RenderableType:
 
 
 def as_data(findings: Findings) -> dict[str, Any]:
-    """`{"exit_code", "sentence", "precision", …, "regimes": [...], "explanations": [...]}`."""
+    """The findings as JSON: `{"exit_code", "sentence", "precision", …, "regimes": [...], "explanations": [...]}`."""
     diagnosis = findings.diagnosis
     regimes = [dataclasses.asdict(x) | {"worst_ulps": x.worst / findings.ulp} for x in findings.regimes]
     return {
@@ -215,17 +218,17 @@ def as_data(findings: Findings) -> dict[str, Any]:
 def write_json(path: str | Path, checks: Mapping[str, Findings], origin: Origin) -> None:
     """Write `{"schema": 1, "exit_code", …, "functions": [{"title", …}, …]}` as strict JSON; see `as_data`.
 
-    `checks`: findings by the title of the function; the exit code is the largest. The keys of `origin` are among those
-    of the file. NaN and the infinities become words. OSError where that fails.
+    `checks`: findings by the title of the function; the exit code of the file is the largest of theirs. The keys of
+    `origin` are added at the top level. NaN and the infinities become strings. OSError if the file cannot be written.
     """
     functions = [{"title": title} | as_data(findings) for title, findings in checks.items()]
     exit_code = max(findings.exit_code for findings in checks.values())
-    made = msgspec.to_builtins(origin)
-    write_strict_json(path, {"schema": SCHEMA, "exit_code": exit_code} | made | {"functions": functions})
+    provenance = msgspec.to_builtins(origin)
+    write_strict_json(path, {"schema": SCHEMA, "exit_code": exit_code} | provenance | {"functions": functions})
 
 
 def write_junit(path: str | Path, checks: Mapping[str, Findings]) -> None:
-    """A suite per function: a case per regime, and one for the answers: an error where they do not match the rays."""
+    """Write a suite per function: a case per regime, and one for the answers: an error unless they match the rays."""
     documents.write_junit(path, "mi-refract rays", {title: _cases(findings) for title, findings in checks.items()})
 
 
@@ -252,8 +255,8 @@ def write_html(
 ) -> None:
     """Write the HTML page.
 
-    `checks`: findings by the title of the function. `context` is shown on top of each; `replay` is the command that
-    repeats the checks. OSError.
+    `checks`: findings by the title of the function. `context`: shown at the top of each. `replay`: the command that
+    repeats the checks. OSError if the file cannot be written.
     """
     content = {
         "title": "mi-refract rays",

@@ -1,9 +1,8 @@
-"""Named, replayable sets of rays over the whole domain: easy ones, and those on which formulas lose accuracy.
+"""Named, reproducible sets of rays over the whole domain: easy ones, and those on which formulas lose accuracy.
 
-In: the name of a regime, a count, a precision and a seed; the same give the same rays. Out: `Rays`, numpy arrays in
-that precision. A regime builds its rays around given normals; `make` rounds them and returns the rounded rays.
-`make_given` takes ratios of indices in place of a regime's own. No regime holds NaN or infinity, which are no
-refraction.
+Input: the name of a regime, a count, a precision and a seed; equal arguments give equal rays. Output: `Rays`, numpy
+arrays in that precision. A regime builds its rays around normals; `make` rounds them and returns the rounded rays.
+`make_given` uses given ratios of indices instead of the regime's own. No regime contains NaN or infinity.
 """
 
 from .angles import Draw, rays_at

@@ -1,4 +1,4 @@
-"""Families of rays given by the angle of incidence and the ratio k of the indices, by the names of their regimes."""
+"""Families of rays defined by the angle of incidence and the ratio k of indices, by the names of their regimes."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.random import Generator
 
 from .rays import Array, Build, Triple, either, length, log_uniform, normalised
 
-Draw = Callable[[Generator, int, float], tuple[Array, Array]]  # (rng, count, eps) to (angle of incidence, k)
-AngleAt = Callable[[Array, Generator, int, float], Array]  # (k, rng, count, eps) to angle of incidence
+Draw = Callable[[Generator, int, float], tuple[Array, Array]]  # (rng, count, eps) → (angles of incidence, k)
+AngleAt = Callable[[Array, Generator, int, float], Array]  # (k, rng, count, eps) → angles of incidence
 
 
-def _after(ratios: Callable[[Generator, int], Array], angle: AngleAt) -> Draw:
-    """Ratios, and angles that follow from them."""
+def _angles_from_ratios(ratios: Callable[[Generator, int], Array], angle: AngleAt) -> Draw:
+    """A `Draw` of ratios and of angles that depend on them."""
 
     def draw(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
         k = ratios(rng, count)
@@ -24,31 +24,32 @@ def _after(ratios: Callable[[Generator, int], Array], angle: AngleAt) -> Draw:
     return draw
 
 
-# Of these regimes the angles follow from k, also from ratios that are given; of the critical one from 1 on.
+# Regimes whose angles depend on k, the regime's own or given ratios; for the critical regime k must be ≥ 1.
 ANGLES: dict[str, AngleAt] = {
     "critical": lambda k, rng, count, eps: np.arcsin(1 / k) + log_uniform(rng, 1e-7, 1e-2, count) * either(rng, count),
     "Brewster": lambda k, rng, count, eps: np.arctan(1 / k) + log_uniform(rng, eps, 1e-2, count) * either(rng, count),
 }
 DRAWS: dict[str, Draw] = {
-    "generic": lambda rng, count, eps: (_of_cosines(rng, count), 1.5 ** either(rng, count)),
+    "generic": lambda rng, count, eps: (_uniform_cosines(rng, count), 1.5 ** either(rng, count)),
     "near-normal": lambda rng, count, eps: (log_uniform(rng, 1e-12, 1e-2, count), rng.uniform(0.4, 2.5, count)),
     "grazing": lambda rng, count, eps: (np.pi / 2 - log_uniform(rng, 1e-7, 1e-2, count), rng.uniform(0.4, 2.5, count)),
-    "critical": _after(lambda rng, count: rng.uniform(1.05, 2.5, count), ANGLES["critical"]),
-    "matched": lambda rng, count, eps: (_of_cosines(rng, count), _nearly_matched(rng, count, eps)),
+    "critical": _angles_from_ratios(lambda rng, count: rng.uniform(1.05, 2.5, count), ANGLES["critical"]),
+    "matched": lambda rng, count, eps: (_uniform_cosines(rng, count), _nearly_matched(rng, count, eps)),
     "matched, grazing": lambda rng, count, eps: (
         np.pi / 2 - log_uniform(rng, 1e-7, 1e-1, count),
         _nearly_matched(rng, count, eps),
     ),
-    "Brewster": _after(lambda rng, count: rng.uniform(0.4, 2.5, count), ANGLES["Brewster"]),
-    "k ≫ 1": _after(
+    "Brewster": _angles_from_ratios(lambda rng, count: rng.uniform(0.4, 2.5, count), ANGLES["Brewster"]),
+    "k ≫ 1": _angles_from_ratios(
         lambda rng, count: log_uniform(rng, 10, 1e6, count),
         lambda k, rng, count, eps: np.arcsin(np.minimum(1, rng.uniform(0, 1.2, count) / k)),
     ),
-    "k ≪ 1": lambda rng, count, eps: (_of_cosines(rng, count), log_uniform(rng, 1e-6, 1e-1, count)),
+    "k ≪ 1": lambda rng, count, eps: (_uniform_cosines(rng, count), log_uniform(rng, 1e-6, 1e-1, count)),
 }
 
 
-def _of_cosines(rng: Generator, count: int) -> Array:
+def _uniform_cosines(rng: Generator, count: int) -> Array:
+    """Angles whose cosines are uniform."""
     return np.arccos(rng.uniform(0, 1, count))
 
 
@@ -57,14 +58,14 @@ def _nearly_matched(rng: Generator, count: int, eps: float) -> Array:
 
 
 def mixed(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
-    """Each ray from one of the families above."""
+    """Angles and ratios, for each ray from a random one of the families above."""
     angle, k = np.stack([draw(rng, count, eps) for draw in DRAWS.values()], axis=1)
     chosen = rng.integers(0, len(DRAWS), count), np.arange(count)
     return angle[chosen], k[chosen]
 
 
 def rays_at(draw: Draw, rng: Generator, n: Array) -> Triple:
-    """Rays at the drawn angles from ±n, in a random plane of incidence."""
+    """Rays at the drawn angles from ±n, in random planes of incidence."""
     angle, k = draw(rng, len(n), float(np.finfo(n.dtype).eps))
     wide = n.astype(np.float64)
     across = np.cross(wide, rng.normal(size=n.shape))
@@ -73,5 +74,5 @@ def rays_at(draw: Draw, rng: Generator, n: Array) -> Triple:
 
 
 def drawn(name: str) -> Build:
-    """The family of rays with the drawn angles and ratios."""
+    """The `Build` of the family of this name."""
     return functools.partial(rays_at, DRAWS[name])

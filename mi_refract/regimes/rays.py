@@ -1,4 +1,4 @@
-"""Sets of rays, their exact radicand, and what several families of rays draw them with."""
+"""Sets of rays, their exact radicand, and random numbers for the families of rays."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from mi_refract.numerics import FloatExpansion, Number, Vector3, float_expansion
 
 Array = NDArray[np.floating]
 Index = NDArray[np.integer]
-# (a, n, k) of shapes (N, 3), (N, 3), (N,), not yet rounded to the precision that is wanted.
+# (a, n, k) of shapes (N, 3), (N, 3), (N,), before they are rounded to the precision of the set.
 Triple = tuple[Array, Array, Array]
-# From unit normals (N, 3) in the precision that is wanted to the rays.
+# A function of unit normals (N, 3) in the precision of the set that returns the rays.
 Build = Callable[[Generator, Array], Triple]
 
 
@@ -29,7 +29,7 @@ class Rays:
     k: Array
 
     def __getitem__(self, index: slice | Index | NDArray[np.bool_]) -> Rays:
-        """The rays that an index, a slice or a mask chooses."""
+        """The rays selected by indices, a slice or a mask."""
         return Rays(self.a[index], self.n[index], self.k[index])
 
     def __len__(self) -> int:
@@ -37,13 +37,13 @@ class Rays:
         return len(self.k)
 
     def hexed(self, i: int) -> dict[str, Any]:
-        """Ray `i` in hexadecimal floats, which replay it to the last bit."""
+        """Ray `i` in hexadecimal floats, which reproduce it bit for bit."""
         a, n = ([float(x).hex() for x in v[i]] for v in (self.a, self.n))
         return {"a": a, "n": n, "k": float(self.k[i]).hex()}
 
     @staticmethod
     def joined(parts: Sequence[Rays]) -> Rays:
-        """All rays of several sets, one after the other."""
+        """The rays of several sets in one set."""
         a, n, k = (np.concatenate([getattr(part, name) for part in parts]) for name in ("a", "n", "k"))
         return Rays(a, n, k)
 
@@ -59,14 +59,14 @@ def either(rng: Generator, count: int) -> Array:
 
 
 def normalised(v: Array) -> Array:
-    """v/|v| of (N, 3), in extended precision: rounded, it is unit up to the rounding of its components."""
+    """v/|v| for v (N, 3), in extended precision, so that only the rounding of its components changes its length."""
     wide = v.astype(np.longdouble)
     unit: Array = wide / np.sqrt((wide * wide).sum(1, keepdims=True))
     return unit
 
 
 def length(v: Array) -> Array:
-    """(N,) of (N, 3), in the precision of `v`."""
+    """(N,) the lengths of vectors (N, 3), in the precision of `v`."""
     lengths: Array = np.sqrt((v * v).sum(1))
     return lengths
 
@@ -77,11 +77,11 @@ def rounded(x: Array, precision: DTypeLike) -> Array:
 
 
 def power_of_two(rng: Generator, count: int) -> Array:
-    """(N, 1): powers of two from 2⁻¹² to 2¹²."""
+    """(N, 1) random powers of two from 2⁻¹² to 2¹²."""
     return np.exp2(rng.integers(-12, 13, count))[:, None]
 
 
-# The radicand of Snell's law, right also where its two terms cancel --------------------------------------------------
+# The radicand of Snell's law, accurate also where its terms cancel ---------------------------------------------------
 
 
 def radicand(a: Vector3, n: Vector3, k: Number) -> tuple[FloatExpansion, FloatExpansion, Number]:
@@ -99,7 +99,7 @@ def radicand(a: Vector3, n: Vector3, k: Number) -> tuple[FloatExpansion, FloatEx
 
 
 def radicand_and_gradient(a: Array, n: Array, k: Array) -> tuple[Array, Array]:
-    """D = k² c² − κ |a|²|n|² of these very numbers (N,), and its derivatives in a, n and k (N, 7). float64."""
+    """D = k² c² − κ |a|²|n|² of exactly these numbers (N,), and its derivatives in a, n and k (N, 7). float64."""
     c, d, _ = radicand(a.T, n.T, k)
     aa, nn, k2c, kappa = (a * a).sum(1), (n * n).sum(1), k * k * c[0], k * k - 1
     along_a = 2 * (k2c[:, None] * n - (kappa * nn)[:, None] * a)

@@ -17,12 +17,13 @@ from .rays import Array, Build, Rays, Triple, normalised, rounded
 
 @dataclass(frozen=True)
 class Regime:
-    """`build(rng, n)` gives (a, n, k) for unit normals `n` (N, 3), whose precision is the one wanted.
+    """A regime: `build(rng, n)` returns (a, n, k) for unit normals `n` (N, 3) in the precision of the set.
 
-    `largest_k` bounds k; `text` defines the set; `unit`: `a` and `n` are unit up to the rounding of their components,
-    as the documented formulas demand. `rests_on_denormals`: the answer is another one where those are taken for 0.
-    `any_k`: the directions stay those of the regime where other ratios take the place of its own. `angle`: those of
-    incidence follow from k; so they do from ratios that are given, which are `least_k` or more.
+    `largest_k`: bound of k. `text`: the definition of the set. `unit`: whether `a` and `n` are unit up to the rounding
+    of their components, as the documented formulas require. `rests_on_denormals`: whether the answer changes if
+    denormal numbers are flushed to 0. `any_k`: whether given ratios can replace the regime's own without a change of
+    the directions. `angle`: the function from k to the angles of incidence, if they depend on it; given ratios must
+    then be at least `least_k`.
     """
 
     build: Build
@@ -36,7 +37,7 @@ class Regime:
 
     @property
     def takes_k(self) -> bool:
-        """Whether ratios may be given."""
+        """Whether the regime accepts given ratios."""
         return self.any_k or self.angle is not None
 
 
@@ -55,7 +56,7 @@ REGIMES = {
     "critical, to the ulp": Regime(
         functools.partial(components.to_the_ulp, 0.05, 1.5),
         2.51,
-        "k in 1.05 … 2.5, the radicand of the rounded numbers as near to 0 as two ulps of one of them, both sides",
+        "k in 1.05 … 2.5, two ulps of one number or less from the critical angle, both sides",
     ),
     "critical, any k, to the ulp": Regime(
         functools.partial(components.to_the_ulp, 1e-6, 9.9e5),
@@ -75,7 +76,10 @@ REGIMES = {
     "k ≫ 1": Regime(drawn("k ≫ 1"), 1e6, "k in 10 … 1e6, k sin θ uniform in 0 … 1.2"),
     "k ≪ 1": Regime(drawn("k ≪ 1"), 0.1, "k in 1e-6 … 0.1, cosine uniform"),
     "axes, signed zeros": Regime(
-        components.zeros, 1e6, "n, and a of every other ray, with zeros of either sign; not tangential", any_k=True
+        components.zeros,
+        1e6,
+        "n, and a of about half of the rays, with zeros of either sign; not tangential",
+        any_k=True,
     ),
     "denormal": Regime(
         components.denormal,
@@ -86,7 +90,7 @@ REGIMES = {
     "on a denormal": Regime(
         components.on_a_denormal,
         1e6,
-        "n an axis, n·a a denormal number: all that keeps a from being tangential",
+        "n an axis, n·a a denormal number: if it were 0, the ray would be tangential",
         rests_on_denormals=True,
         any_k=True,
     ),
@@ -100,7 +104,7 @@ REGIMES = {
     "off unit": Regime(
         components.off_unit,
         1e6,
-        "a and n turned by a matrix in their own precision, all angles and k",
+        "a and n rotated by a matrix in their own precision, angles and ratios of all sets",
         False,
         any_k=True,
     ),
@@ -114,14 +118,14 @@ REGIMES = {
 
 
 def make_given(name: str, ratios: ArrayLike, precision: DTypeLike, seed: int = 0) -> Rays:
-    """The rays of a regime with the k `ratios` (N,), rounded to `precision`, in place of its own.
+    """The rays of a regime with the given ratios k (N,), rounded to `precision`, in place of its own.
 
-    KeyError: no such regime. ValueError: its ratios are part of it, or one is below its least.
+    KeyError for an unknown regime. ValueError for a regime that defines its own ratios, or a ratio below its least.
     """
     regime, k = REGIMES[name], rounded(np.asarray(ratios, float), precision)
     if not regime.takes_k:
-        taking = ", ".join(repr(other) for other in REGIMES if REGIMES[other].takes_k)
-        raise ValueError(f"regime {name!r}: it defines its own ratios of indices; expected one of {taking}")
+        accepting = ", ".join(repr(other) for other in REGIMES if REGIMES[other].takes_k)
+        raise ValueError(f"regime {name!r}: it defines its own ratios of indices; expected one of {accepting}")
     if (k < regime.least_k).any():
         raise ValueError(f"regime {name!r}: k = {k.min():.6g}; expected {regime.least_k:g} or more")
     angle = regime.angle
@@ -129,20 +133,24 @@ def make_given(name: str, ratios: ArrayLike, precision: DTypeLike, seed: int = 0
         rays = make(name, len(k), precision, seed)
         return Rays(rays.a, rays.n, k.astype(precision))
     rng, n = _normals(name, len(k), seed)
-    return _rounded(rays_at(lambda *given: (angle(k, *given), k), rng, n.astype(precision)), precision)
+
+    def draw(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
+        return angle(k, rng, count, eps), k
+
+    return _rounded(rays_at(draw, rng, n.astype(precision)), precision)
 
 
 def make(name: str, count: int, precision: DTypeLike, seed: int = 0, normal: ArrayLike | None = None) -> Rays:
-    """`count` rays of a regime in `precision`, float32 or float64. KeyError: no such regime.
+    """`count` rays of a regime in `precision`, float32 or float64. KeyError for an unknown regime.
 
-    `normal` takes the place of random normals, in the regimes that do not choose their own.
+    `normal`: used in place of random normals, except by regimes that choose their own.
     """
     rng, n = _normals(name, count, seed, normal)
     return _rounded(REGIMES[name].build(rng, n.astype(precision)), precision)
 
 
 def _normals(name: str, count: int, seed: int, normal: ArrayLike | None = None) -> tuple[Generator, Array]:
-    """The generator of a regime, and what it draws first."""
+    """The random generator of a regime, and its normals, which are drawn first."""
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
     if normal is not None:
         return rng, np.tile(np.asarray(normal, float), (count, 1))

@@ -1,8 +1,8 @@
-"""Rows of measurements, and the files that show them.
+"""Rows of measurements, and reports about them.
 
-In: `Row`s, made by a study or a self-test, and a `context` that all of them share. Out: `rows.json`, one offline
-HTML page, and text for the terminal (`run_report`); the pages of other rooms are made from the same parts (`documents`
-fills a template of `templates/` and writes JUnit's XML, `embedded_images` puts EXR files on a page, `plots` makes SVG).
+Input: `Row`s from a study or a self-test, and a `context` that all of them share. Output: `rows.json`, one offline HTML
+page, and text for the terminal (`run_report`). Pages of other packages are made from the same parts: `documents` fills
+a template of `templates/` and writes JUnit's XML, `embedded_images` puts EXR files on a page, `plots` makes SVG.
 Nothing is measured or judged here.
 """
 

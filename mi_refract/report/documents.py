@@ -1,6 +1,6 @@
 """Documents: HTML pages that need no network, with style, script and images inlined; and JUnit's XML.
 
-Names of files and messages of errors may hold any character: `printable` makes them fit for both.
+File names and error messages may contain any character; `printable` sanitises them for both formats.
 """
 
 from __future__ import annotations
@@ -20,26 +20,28 @@ from .embedded_images import EmbeddedImages
 if TYPE_CHECKING:
     from markupsafe import Markup
 
-HERE = Path(__file__).parent / "templates"
+TEMPLATES = Path(__file__).parent / "templates"
 
 
 def write_page(path: str | Path, template: str, content: Mapping[str, Any], images: EmbeddedImages) -> None:
-    """Write `template`, one of this package's, filled with `content`, made printable and escaped. Errors: OSError."""
+    """Write the page of `rendered` to `path`. Errors: OSError."""
     write_atomically(path, rendered(template, content, images))
 
 
 def rendered(template: str, content: Mapping[str, Any], images: EmbeddedImages) -> bytes:
-    """The page."""
+    """Return a page: one of this package's templates, filled with `content`, which is sanitised and escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
     def part(name: str) -> Markup:
-        text = (HERE / name).read_text("utf-8")
+        text = (TEMPLATES / name).read_text("utf-8")
         return Markup(f"<style>\n{text}</style>" if name.endswith(".css") else f"<script>\n{text}</script>")
 
+    def sanitised(value: object) -> object:
+        return printable_lines(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+
     options: Any = {"autoescape": True, "undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
-    options["finalize"] = lambda x: printable_lines(x) if isinstance(x, str) and not isinstance(x, Markup) else x
-    environment = Environment(loader=FileSystemLoader(HERE), **options)
+    environment = Environment(loader=FileSystemLoader(TEMPLATES), finalize=sanitised, **options)
     filters: dict[str, Any] = {"compact": compact, "words": words, "code": code}
     environment.filters |= filters
     text = environment.get_template(template).render(**content, part=part, images=images.embedded)
@@ -47,14 +49,14 @@ def rendered(template: str, content: Mapping[str, Any], images: EmbeddedImages) 
 
 
 def code(text: str) -> Markup:
-    """Escaped HTML in which words between backticks are `<code>`."""
+    """Return escaped HTML in which words between backticks are `<code>`."""
     from markupsafe import Markup, escape
 
     return Markup(re.sub("`([^`]*)`", r"<code>\1</code>", str(escape(printable_lines(text)))))
 
 
 def words(value: object) -> str:
-    """A value of the context as text: mappings and lists separated by commas."""
+    """Return a value of the context as text: items of mappings and lists separated by commas."""
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {words(item)}" for key, item in value.items())
     return ", ".join(map(words, value)) if isinstance(value, list | tuple) else str(value)
@@ -65,11 +67,10 @@ def words(value: object) -> str:
 
 @dataclass(frozen=True)
 class Case:
-    """One test case; `outcome` "" means that it passed.
+    """One test case; `outcome` "": it passed.
 
-    `group`: what JUnit calls its class. `kind`: the type of a failure or an error. `message` is one line; `details`
-    and `metrics`, each a name, a value and the bound that it may reach, are the lines below it, of a case that passed
-    its output.
+    `group`: JUnit's class name. `kind`: the type of a failure or an error. `message`: one line. `details`, and
+    `metrics` (name, value, bound or None), are further lines; for a case that passed they are its output.
     """
 
     group: str
@@ -82,11 +83,11 @@ class Case:
 
 
 def write_junit(path: str | Path, name: str, suites: Mapping[str, Sequence[Case]]) -> None:
-    """Write the suites, by name, each with the number of its cases and how they ended; `name` is that of the whole.
+    """Write the suites, by name, each with the numbers of its cases by outcome; `name`: name of the whole report.
 
     Errors: OSError.
     """
-    from xml.etree import ElementTree as xml  # not needed for pages
+    from xml.etree import ElementTree as xml  # imported late: pages do not need it
 
     root = xml.Element("testsuites", name=printable(name))
     for title, cases in suites.items():
@@ -110,6 +111,6 @@ def write_junit(path: str | Path, name: str, suites: Mapping[str, Sequence[Case]
 
 
 def _counts(cases: Sequence[Case]) -> dict[str, str]:
-    ends = Counter(case.outcome for case in cases)
-    counts = {"failures": ends["failure"], "errors": ends["error"], "skipped": ends["skipped"]}
+    outcomes = Counter(case.outcome for case in cases)
+    counts = {"failures": outcomes["failure"], "errors": outcomes["error"], "skipped": outcomes["skipped"]}
     return {key: str(count) for key, count in ({"tests": len(cases)} | counts).items()}

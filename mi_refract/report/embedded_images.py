@@ -1,4 +1,4 @@
-"""The images of a page: base64 of the deflated planes of half floats, which its script reads."""
+"""The images of a page, as base64 of deflated planes of half floats, which the page's script decodes."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from numpy.typing import NDArray
 from mi_refract.io.image_file import Pixels, block_mean, read
 
 Codes = NDArray[np.uint16]  # the bits of halves
-LARGEST = 65504.0  # of the finite halves
-LINES = 64  # that are converted at once
-# Mantissa bits given up, by twos, before an image is made smaller: at 6 a value is within 1/32 of itself.
+LARGEST = 65504.0  # the largest finite half
+LINES = 64  # image rows that are converted at once
+# Numbers of mantissa bits to clear, tried before an image is made smaller; with 6 the relative error is up to 1/32.
 ROUNDED = (0, 2, 4, 6)
 
 
 class EmbeddedImages:
-    """The images of one page, each file once. A finite value past ±65504 becomes ±65504. Errors: see `embed`."""
+    """The images of one page, each file once. A finite value beyond ±65504 becomes ±65504. Errors: see `embed`."""
 
     def __init__(self, folder: Path = Path()) -> None:
-        """`folder` is what the paths given to `embed` are relative to."""
+        """`folder`: the folder that the paths given to `embed` are relative to."""
         self.folder = folder
         self.embedded: list[dict[str, Any]] = []
         self._files: dict[str, dict[str, Any]] = {}
 
     def embed(self, path: str) -> dict[str, Any]:
-        """Key, width, height and data of an image, whole, by its path relative to the folder.
+        """Return key, width, height and data of an image at full size; `path`: relative to the folder.
 
-        Errors: FileNotFoundError where it is missing, ValueError where it is not RGB or gray; both name it.
+        Errors, with the path: FileNotFoundError if it is missing, ValueError if it is neither RGB nor gray.
         """
         if path not in self._files:
             image = read(self.folder / path)
@@ -42,15 +42,16 @@ class EmbeddedImages:
         return self._files[path]
 
     def add(self, image: dict[str, Any]) -> dict[str, Any]:
-        """Put an image that `encoded` made on the page, under a key of its own."""
+        """Add an image from `encoded` to the page, with a new key, and return it."""
         self.embedded.append(image | {"key": f"p{len(self.embedded)}"})
         return self.embedded[-1]
 
 
 def encoded(pixels: Pixels, limit: float = np.inf, scale: float = 1.0) -> dict[str, Any]:
-    """H × W × (1 or 3) pixels / `scale` as base64 of about `limit` bytes; `note` says what it took.
+    """Return H × W × (1 or 3) pixels / `scale` as base64 of at most about `limit` bytes.
 
-    Where they do not fit, by the size of some of their lines, values are rounded, then blocks of pixels averaged.
+    If they are too large, estimated from some rows, values are rounded, and then blocks of pixels are averaged; `note`
+    says so.
     """
     side, codes, bits = 1, _halves(pixels, scale), None
     while codes.nbytes * 4 / 3 > limit:  # of base64
@@ -70,26 +71,26 @@ def encoded(pixels: Pixels, limit: float = np.inf, scale: float = 1.0) -> dict[s
 
 
 def packed(text: str) -> str:
-    """Text as base64 of its deflated UTF-8, which the page's script unpacks."""
+    """Return text as base64 of its deflated UTF-8, which the page's script decodes."""
     return base64.b64encode(zlib.compress(text.encode(), 9)).decode()
 
 
 def shown(pixels: Pixels, channels: tuple[str, ...]) -> tuple[Pixels | None, str]:
-    """The part of an image that a page can show: RGB or its one channel, and its name; (None, "") for neither."""
+    """Return the part of an image that a page can show, RGB or its only channel, and its name; else (None, "")."""
     if {"R", "G", "B"} <= set(channels):
         return pixels[..., [channels.index(name) for name in "RGB"]], "RGB"
     return (pixels, channels[0]) if len(channels) == 1 else (None, "")
 
 
 def strongest(values: Pixels, width: int) -> Pixels:
-    """H × W × C values as one channel of at most `width` columns: of every block the value of largest magnitude.
+    """Return H × W × C values as one channel of at most `width` columns: the value of largest magnitude of each block.
 
-    A mean would let two errors cancel and one pixel drown. NaN is stronger than any number.
+    In a mean, errors could cancel and a single pixel would hardly show. NaN counts as larger than any number.
     """
     side = -(-values.shape[1] // width)
-    rows = min(side, len(values))  # an image of few rows is not filled up to a block of as many as columns
-    pad = [(0, -len(values) % rows), (0, -values.shape[1] % side), (0, 0)]
-    height, width, channels = (values := np.pad(values, pad)).shape
+    rows = min(side, len(values))  # blocks of an image with few rows are not padded to squares
+    values = np.pad(values, [(0, -len(values) % rows), (0, -values.shape[1] % side), (0, 0)])
+    height, width, channels = values.shape
     blocks = values.reshape(height // rows, rows, width // side, side, channels).swapaxes(1, 2)
     blocks = blocks.reshape(height // rows, width // side, -1)
     place = np.where(np.isnan(blocks), np.inf, np.abs(blocks)).argmax(-1, keepdims=True)
@@ -97,18 +98,18 @@ def strongest(values: Pixels, width: int) -> Pixels:
 
 
 def _halves(pixels: Pixels, scale: float) -> Codes:
-    """The bits of little-endian halves, of pixels / `scale`. Finite stays finite, and every NaN is the same."""
+    """Return pixels / `scale` as the bits of little-endian halves. Finite stays finite, and every NaN is the same."""
     codes = np.empty(pixels.shape, "<u2")
-    for start in range(0, len(pixels), LINES):  # the intermediates of a whole image are several times its size
-        part = pixels[start : start + LINES] / np.float32(scale)
+    for start in range(0, len(pixels), LINES):  # temporary arrays of the whole image would be several times its size
+        rows = pixels[start : start + LINES] / np.float32(scale)
         with np.errstate(over="ignore", invalid="ignore"):
-            halves = np.where(np.isinf(part), part, np.clip(part, -LARGEST, LARGEST)).astype("<f2")
+            halves = np.where(np.isinf(rows), rows, np.clip(rows, -LARGEST, LARGEST)).astype("<f2")
         codes[start : start + LINES] = np.where(np.isnan(halves), np.float16(np.nan), halves).astype("<f2").view("<u2")
     return codes
 
 
 def _rounded(codes: Codes, bits: int) -> Codes:
-    """The codes with that many low bits cleared, rounded to nearest: never from finite to infinite."""
+    """Return the codes with so many low bits cleared, rounded to nearest, but never from finite to infinite."""
     if not bits:
         return codes
     magnitude = codes & np.uint16(0x7FFF)
@@ -117,16 +118,16 @@ def _rounded(codes: Codes, bits: int) -> Codes:
 
 
 def _deflated(codes: Codes) -> bytes:
-    """High bytes, then low bytes: a tenth to a half smaller than the halves in a row.
+    """Return the deflated high bytes, then low bytes: 10 to 50 % smaller than with both bytes of a half together.
 
-    Level 4: the default's matches take five times as long on rounded noise, for a hundredth of its size.
+    Level 4, because the default level takes five times as long on rounded noise, for 1 % of its size.
     """
     planes = np.ascontiguousarray(codes).view("u1").reshape(-1, 2)[:, ::-1].T.tobytes()
     return zlib.compress(planes, 4)
 
 
 def png(rgb: NDArray[np.uint8]) -> bytes:
-    """H × W × 3 bytes as a PNG file, by the Mitsuba variant that is set."""
+    """Return H × W × 3 bytes as a PNG file, written by the present Mitsuba variant."""
     import mitsuba as mi
 
     stream = mi.MemoryStream()

@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 
 Points = Sequence[tuple[float, float]]
 
-# Stand-in colours: matplotlib writes them, `_page_svg` turns each into the style sheet's variable.
+# Placeholder colours: matplotlib writes them, and `_page_svg` replaces each by a variable of the style sheet.
 INK, MUTED, LINE = "#010203", "#010204", "#010205"
 SERIES = [f"#0102{16 + i:02x}" for i in range(12)]
 DASHED = (0, (4, 3))
-# Of a name relative to its point, in pixels: the nearest first.
+# Candidate positions of a label relative to its point, in pixels, the nearest first.
 PLACES = sorted(((x, y) for x in range(7, 130, 6) for y in range(-96, 97, 4)), key=lambda place: math.hypot(*place))
 VARIABLES = {INK: "--ink", MUTED: "--muted", LINE: "--line"} | {c: f"--c{i}" for i, c in enumerate(SERIES)}
 
 STYLE: dict[str, Any] = {
-    "svg.fonttype": "none",  # text stays text: selectable, and in the page's own font
-    "text.parse_math": False,  # a dollar sign in a name is a dollar sign
+    "svg.fonttype": "none",  # text remains text: selectable, and in the page's font
+    "text.parse_math": False,  # a dollar sign in a name is literal
     "font.size": 10,
     "axes.edgecolor": LINE,
     "axes.labelcolor": MUTED,
@@ -50,9 +50,9 @@ STYLE: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Axes:
-    """Labels and scales, "log" or "linear", of a plot; `slope` is that of a dashed guide, y ~ x^slope.
+    """Labels and scales of a plot, "log" or "linear"; `slope`: exponent of a dashed guide, y ~ x^slope.
 
-    ValueError for another scale, or a slope without two logarithmic axes.
+    ValueError for another scale, and for a slope without two logarithmic axes.
     """
 
     x: str = ""
@@ -70,22 +70,21 @@ class Axes:
 
     @property
     def logarithmic(self) -> str:
-        """The axes that are logarithmic: "", "x", "y" or "xy"."""
+        """The logarithmic axes: "", "x", "y" or "xy"."""
         return ("x" if self.x_scale == "log" else "") + ("y" if self.y_scale == "log" else "")
 
 
 def drawable(points: Points, axes: Axes) -> list[tuple[float, float]]:
-    """The points that have a place on the axes: finite, and positive where a scale is logarithmic."""
+    """Return the points that can be drawn: finite, and positive on logarithmic scales."""
     x_low, y_low = (0 if scale == "log" else -math.inf for scale in (axes.x_scale, axes.y_scale))
     return [(x, y) for x, y in points if x_low < x < math.inf and y_low < y < math.inf]
 
 
 def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str, size: tuple[float, float] = (5.3, 3.0)) -> str:
-    """One line per name, and a dashed guide of the axes' slope from the first line's start; the legend is below.
+    """Return an SVG with one line per name, a legend, and a dashed guide of the axes' slope from the first point.
 
-    Points without a place on the axes are left out. "" where nothing can be drawn.
-    `salt` makes the ids inside the SVG unique on the page; the same arguments give the same bytes. `size` is width and
-    height in inches without the legend.
+    Points that cannot be drawn are left out; "" if no point can be. `salt` makes the ids inside the SVG unique on the
+    page; the same arguments give the same bytes. `size`: width and height in inches without the legend.
     """
     lines = {name: drawable(points, axes) for name, points in curves.items()}
     if not any(lines.values()):
@@ -104,7 +103,7 @@ def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str, size: tup
                 ends, label = [y, y * (stop / start) ** axes.slope], f"slope {axes.slope:g}".replace("-", "−")
                 panel.plot([start, stop], ends, color=MUTED, linewidth=1, linestyle=DASHED, label=label)
         _ticks(panel, axes.logarithmic)
-        # Below the axes the legend covers no point; it has as many columns as its longest name leaves room for.
+        # The legend is below the axes, with as many columns as its longest name allows.
         handles, names = panel.get_legend_handles_labels()
         columns = max(1, min(len(names), int(size[0] * 72 // (5 * max(map(len, names)) + 44))))
         figure.set_size_inches(size[0], size[1] + 0.21 * math.ceil(len(names) / columns))
@@ -114,7 +113,7 @@ def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str, size: tup
 
 @dataclass
 class Scatter:
-    """A panel: points by subject, (subject, low x, high x, y) of the intervals, and the x of the floor."""
+    """A panel: points by subject, intervals as (subject, low x, high x, y), and the x of the floor."""
 
     points: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     intervals: list[tuple[str, float, float, float]] = field(default_factory=list)
@@ -122,14 +121,17 @@ class Scatter:
 
 
 def scatter_svg(panels: Mapping[str, Scatter], axes: Axes, *, floor: str, front: bool, salt: str) -> str:
-    """One panel per setting, one labelled colour per subject; `floor` names the floor's line, `front` draws the front.
+    """Return an SVG with one panel per setting and one labelled colour per subject.
 
-    The points of a subject are joined, so that its spread over the cases is one vertical stroke.
-    Points without a place on the axes are left out. "" where nothing can be drawn.
+    `floor`: label of the floor's line. `front`: draw steps along the Pareto front. The points of a subject are joined,
+    so that its spread over the cases is one vertical line. Points that cannot be drawn are left out; "" if no point
+    can be.
     """
-    places = ((x, {s: sorted(drawable(p, axes)) for s, p in panel.points.items()}) for x, panel in panels.items())
-    drawn = {setting: {s: p for s, p in subjects.items() if p} for setting, subjects in places}
-    drawn = {setting: subjects for setting, subjects in drawn.items() if subjects}
+    drawn: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for setting, scatter in panels.items():
+        by_subject = {subject: sorted(drawable(points, axes)) for subject, points in scatter.points.items()}
+        if any(by_subject.values()):
+            drawn[setting] = {subject: points for subject, points in by_subject.items() if points}
     if not drawn:
         return ""
     names = dict.fromkeys(s for subjects in drawn.values() for s in subjects)
@@ -148,39 +150,40 @@ def scatter_svg(panels: Mapping[str, Scatter], axes: Axes, *, floor: str, front:
                 if subject in subjects:
                     panel.plot([low, high], [height, height], color=colours[subject], linewidth=1)
             panel.margins(x=0.3, y=0.1)
-            every = [point for points in subjects.values() for point in points]
-            if axes.x_scale == "linear" and min(every)[0] >= 0:
+            all_points = [point for points in subjects.values() for point in points]
+            if axes.x_scale == "linear" and min(all_points)[0] >= 0:
                 panel.set_xlim(left=0)
-            if math.isfinite(least := panels[setting].floor):
-                panel.axvline(least, color=MUTED, linewidth=1, linestyle=(0, (1, 2)))
-            if front:  # steps along the front, on to the panel's edges
-                best, (_, right), (_, top) = pareto(every), panel.get_xlim(), panel.get_ylim()
+            if math.isfinite(panels[setting].floor):
+                panel.axvline(panels[setting].floor, color=MUTED, linewidth=1, linestyle=(0, (1, 2)))
+            if front:  # steps along the front, and on to the panel's edges
+                best, (_, right), (_, top) = pareto(all_points), panel.get_xlim(), panel.get_ylim()
                 xs, ys = zip((best[0][0], top), *best, (right, best[-1][1]), strict=True)
                 steps = [x for x in xs for _ in "xy"][1:], [y for y in ys for _ in "xy"][:-1]
                 panel.plot(*steps, color=MUTED, linewidth=1, zorder=1, scalex=False, scaley=False)
             _ticks(panel, axes.logarithmic)
         _printable(figure)
-        figure.draw_without_rendering()  # settles the layout that the labels' places depend on
+        figure.draw_without_rendering()  # computes the layout, on which the positions of labels depend
         for panel, (setting, subjects) in zip(grid, drawn.items(), strict=False):
-            # A subject's name is right of its highest point, that of the floor at the foot of its line: as near as it
-            # covers no line and no other name.
-            heads = {s: max(points, key=lambda p: p[1]) for s, points in subjects.items()}
-            named: list[tuple[Any, ...]] = [(s, heads[s], colours[s], "data") for s in heads]
-            named.sort(key=lambda label: -label[1][1])
-            if math.isfinite(least := panels[setting].floor):
-                named.append((floor, (least, 0), MUTED, ("data", "axes fraction")))
+            # A subject's label is right of its highest point, that of the floor at the lower end of its line, at the
+            # nearest position where it covers no line and no other label.
+            labels: list[tuple[Any, ...]] = []  # text, point, colour, coordinates of the point
+            for subject, points in subjects.items():
+                labels.append((subject, max(points, key=lambda point: point[1]), colours[subject], "data"))
+            labels.sort(key=lambda label: -label[1][1])
+            if math.isfinite(panels[setting].floor):
+                labels.append((floor, (panels[setting].floor, 0), MUTED, ("data", "axes fraction")))
             paths = [line.get_transform().transform_path(line.get_path()) for line in panel.lines]
-            inside, taken = panel.get_window_extent(), list[Any]()
+            area, boxes = panel.get_window_extent(), list[Any]()
             style = {"fontsize": 9.5, "va": "center", "textcoords": "offset pixels", "in_layout": False}
-            for name, point, colour, coordinates in named:
+            for name, point, colour, coordinates in labels:
                 text = printable_lines(name)
                 label = panel.annotate(text, point, PLACES[0], xycoords=coordinates, color=colour, **style)
                 for label.xyann in (*PLACES, PLACES[0]):
                     box = label.get_window_extent()
                     covers = any(x.intersects_bbox(box, filled=False) or box.count_contains(x.vertices) for x in paths)
-                    if not covers and not box.count_overlaps(taken) and inside.y0 < box.y0 < box.y1 < inside.y1:
+                    if not covers and not box.count_overlaps(boxes) and area.y0 < box.y0 < box.y1 < area.y1:
                         break
-                taken.append(box)
+                boxes.append(box)
         for panel in grid[len(drawn) :]:
             panel.set_visible(False)
         for panel in figure.axes[::columns]:
@@ -189,7 +192,7 @@ def scatter_svg(panels: Mapping[str, Scatter], axes: Axes, *, floor: str, front:
 
 
 def pareto(points: Points) -> list[tuple[float, float]]:
-    """The points that no other one beats or equals in both coordinates (less is better), by growing x."""
+    """Return the points that no other one beats or equals in both coordinates (smaller is better), by increasing x."""
     front: list[tuple[float, float]] = []
     for x, y in sorted(points):
         if not front or y < front[-1][1]:
@@ -199,7 +202,7 @@ def pareto(points: Points) -> list[tuple[float, float]]:
 
 @contextmanager
 def _figure(salt: str) -> Iterator[Figure]:
-    """An empty figure in the page's style, which holds as long as the context."""
+    """Yield an empty figure; within the context, matplotlib has the page's style."""
     import matplotlib
 
     style: Any = STYLE | {"svg.hashsalt": salt}
@@ -209,10 +212,11 @@ def _figure(salt: str) -> Iterator[Figure]:
         yield Figure(layout="constrained", dpi=72)
 
 
-def _ticks(panel: Panel, which: str) -> None:
+def _ticks(panel: Panel, logarithmic: str) -> None:
+    """Set the ticks of the logarithmic axes: "", "x", "y" or "xy"."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-    for name in which:
+    for name in logarithmic:
         axis = panel.xaxis if name == "x" else panel.yaxis
         low, high = sorted(axis.get_view_interval())
         axis.set_major_locator(LogLocator(subs=(1,) if high / low > 50 else (1, 2, 5), numticks=9))
@@ -221,20 +225,20 @@ def _ticks(panel: Panel, which: str) -> None:
 
 
 def _printable(figure: Figure) -> None:
-    """Make every text of the figure, names of subjects and cases among them, printable."""
+    """Sanitise every text of the figure, such as names of subjects and cases."""
     from matplotlib.text import Text
 
-    for found in figure.findobj(Text):
-        assert isinstance(found, Text)
-        found.set_text(printable_lines(found.get_text()))
+    for text in figure.findobj(Text):
+        assert isinstance(text, Text)
+        text.set_text(printable_lines(text.get_text()))
 
 
 def _page_svg(figure: Figure) -> str:
-    """The figure as an `<svg>` element for a page: no declarations, links, dates, or ids but those in use."""
+    """Return the figure as an `<svg>` element for a page, without declarations, links, dates and unused ids."""
     _printable(figure)
     buffer = io.StringIO()
-    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-    figure.savefig(buffer, format="svg", transparent=True, metadata=nothing)
+    no_metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    figure.savefig(buffer, format="svg", transparent=True, metadata=no_metadata)
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>|<style .*?</style>", "", text, flags=re.S)

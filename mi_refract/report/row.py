@@ -1,7 +1,7 @@
-"""Rows: what a measurement leaves behind, and the only thing a report reads.
+"""Rows: the results of measurements, from which all reports are made.
 
 `rows.json` is `{"schema": 1, "context": {...}, "rows": [row, ...]}`; a row is the dictionary form of `Row`
-below plus its `verdict`. `context` holds what every row shares: versions, machine, profile, start.
+below plus its `verdict`. `context`: the properties that all rows share: versions, machine, profile, start.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ SCHEMA = 1
 
 
 class Reason(str):
-    """Why a row was not run, and in `remedy` what would make it run, e.g. "`--profile full`"."""
+    """The reason why a row was not run, and in `remedy` how to run it, e.g. "`--profile full`"."""
 
     remedy: str
 
     def __new__(cls, text: str, remedy: str = "") -> Reason:
-        """`text` with a remedy."""
+        """Return `text` with a remedy."""
         reason = super().__new__(cls, text)
         reason.remedy = remedy
         return reason
@@ -35,16 +35,17 @@ class Reason(str):
 class Row:
     """One measurement: subject, case, backend, measured values and their bounds.
 
-    `values` are the numbers by metric name. `budgets` are upper bounds for some of them; a NaN breaks its budget.
-    `goals` are upper bounds for what a busy machine can spoil (times): a missed goal is shown and decides no verdict.
-    A row without values was not run: `reason` says why, and `remedy`, which a `Reason` brings, what would make it run;
-    with values, `reason` is a remark. `replay` repeats the row: seed, sizes, hex floats. `images` are EXR paths
-    relative to the output folder, by role (`reference`, `test`, `overlay`, `difference`). `curves` are named lists of
-    (x, y) points; the study's `axes` in the context say what x and y are.
+    - `values`: numbers by metric name. A row without values was not run.
+    - `budgets`: upper bounds for some of the values; NaN breaks its budget. `goals`: upper bounds for values that
+      depend on the load of the machine, such as times; a missed goal is shown and does not affect the verdict.
+    - `reason`: why the row was not run, or with values a remark. `remedy`: how to run it, from a `Reason`.
+    - `replay`: data to repeat the row: seed, sizes, hex floats.
+    - `images`: EXR paths relative to the output folder, by role (`reference`, `test`, `overlay`, `difference`).
+    - `curves`: named lists of (x, y) points; the study's `axes` in the context describe x and y.
     """
 
     study: str  # "directions"
-    subject: str  # what is judged: a formula, a plugin
+    subject: str  # a formula, a plugin
     case: str  # a regime of rays, a scene
     setting: str  # "llvm float32", a Mitsuba variant
     values: dict[str, float] = field(default_factory=dict)
@@ -57,7 +58,7 @@ class Row:
     remedy: str = ""
 
     def __post_init__(self) -> None:
-        """Check that every bound has its value, and that a row without values says why. Errors: ValueError."""
+        """Raise ValueError for a bound without a value, and for a row with neither values nor a reason."""
         unmeasured = (self.budgets.keys() | self.goals.keys()) - self.values.keys() if self.values else set()
         if unmeasured:
             raise ValueError(f"row {self.name}: a bound without a value: {sorted(unmeasured)}")
@@ -79,17 +80,17 @@ class Row:
 
     @property
     def broken(self) -> dict[str, float]:
-        """The budgets that did not hold, by metric."""
+        """The budgets that are exceeded, by metric."""
         return _exceeded(self.values, self.budgets)
 
     @property
     def missed(self) -> dict[str, float]:
-        """The goals that were not reached."""
+        """The goals that are exceeded, by metric."""
         return _exceeded(self.values, self.goals)
 
     @property
     def verdict(self) -> str:
-        """ "not run", "fail", "pass", or "info" where nothing was demanded."""
+        """ "not run", "fail", "pass", or "info" for a row without budgets."""
         if not self.values:
             return "not run"
         if self.broken:
@@ -97,33 +98,33 @@ class Row:
         return "pass" if self.budgets else "info"
 
     def as_dict(self) -> dict[str, Any]:
-        """The fields by name, and the verdict."""
+        """Return the fields by name, and the verdict."""
         return dataclasses.asdict(self) | {"verdict": self.verdict}
 
     @classmethod
     def from_dict(cls, data: object) -> Row:
-        """The row whose fields `data` holds, as JSON has them; other entries are ignored.
+        """Return the row with the fields in `data`, parsed from JSON; other entries are ignored.
 
         Errors: ValueError, one line, for a missing field or another type.
         """
         import msgspec
 
-        return msgspec.convert(data, cls, strict=False)  # not strict: NaN and the infinities are words
+        return msgspec.convert(data, cls, strict=False)  # not strict, because NaN and infinities are strings in JSON
 
     @property
     def replay_text(self) -> str:
-        """`replay` as JSON, one entry a line; "" where there is none."""
+        """`replay` as JSON, one entry a line; "" if it is empty."""
         form: Any = {"ensure_ascii": False, "default": str}
         entries = [f" {json.dumps(k, **form)}: {json.dumps(v, **form)}" for k, v in strict(self.replay).items()]
         return "{\n" + ",\n".join(entries) + "\n}" if entries else ""
 
 
 def _exceeded(values: dict[str, float], bounds: dict[str, float]) -> dict[str, float]:
-    return {m: b for m, b in bounds.items() if values and not (values[m] <= b)}  # not ≤: NaN breaks its bound
+    return {m: b for m, b in bounds.items() if values and not (values[m] <= b)}  # `not <=`: NaN exceeds its bound
 
 
 def by_study(rows: Iterable[Row]) -> dict[str, list[Row]]:
-    """The rows of each study, both in the order in which they first appear."""
+    """Return the rows by study; studies and rows keep their order."""
     studies: dict[str, list[Row]] = {}
     for row in rows:
         studies.setdefault(row.study, []).append(row)
@@ -131,22 +132,22 @@ def by_study(rows: Iterable[Row]) -> dict[str, list[Row]]:
 
 
 def as_json(rows: Iterable[Row]) -> str:
-    """The rows as strict JSON, a list. Errors: TypeError for a value JSON has no form for."""
+    """Return the rows as strict JSON, a list. Errors: TypeError for a value that JSON cannot represent."""
     return json.dumps(strict([row.as_dict() for row in rows]), indent=1, allow_nan=False)
 
 
 def write_strict_json(path: str | Path, document: object) -> None:
-    """Write the document as JSON: NaN and the infinities become words.
+    """Write the document as JSON; NaN and infinities become strings.
 
-    Errors: TypeError for a value JSON has no form for; OSError.
+    Errors: TypeError for a value that JSON cannot represent; OSError.
     """
     text = json.dumps(strict(document), indent=1, allow_nan=False)
     write_atomically(path, text + "\n")
 
 
 def strict(value: object) -> Any:
-    """`value` in the types strict JSON has: numpy's as lists and numbers, NaN and the infinities as words."""
-    if isinstance(value, float):  # numpy's float64 too, hence the conversion
+    """Return `value` in types of strict JSON: NumPy's as lists and numbers, NaN and infinities as strings."""
+    if isinstance(value, float):  # also NumPy's float64, hence the conversion
         return float(value) if math.isfinite(value) else str(float(value))
     if isinstance(value, Mapping):
         return {str(key): strict(item) for key, item in value.items()}

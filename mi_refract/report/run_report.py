@@ -1,8 +1,7 @@
-"""Rows → `rows.json`, `junit.xml`, one offline `report.html`, and a table for the terminal.
+"""Reports of rows: `rows.json`, `junit.xml`, one offline `report.html`, and a table for the terminal.
 
-Everything here lays out what the rows already say; nothing is measured, averaged or judged.
-
-`context` is what all rows share; `study_page` says which of its entries steer the page.
+Nothing is measured, averaged or judged here. `context` has the properties that all rows share; `study_page` documents
+the entries that control the page.
 """
 
 from __future__ import annotations
@@ -23,15 +22,15 @@ if TYPE_CHECKING:
 
 
 def write_json(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]) -> None:
-    """Write the document that `row.py` describes, as strict JSON: NaN and the infinities become words.
+    """Write `rows.json`, see module `row`, as strict JSON: NaN and infinities become strings.
 
-    Errors: TypeError for a value JSON has no form for; OSError.
+    Errors: TypeError for a value that JSON cannot represent; OSError.
     """
     write_strict_json(path, {"schema": SCHEMA, "context": context, "rows": [row.as_dict() for row in rows]})
 
 
 def verdict(rows: Sequence[Row]) -> str:
-    """One sentence: how many checks (budgets that were measured) passed or failed, how many rows were not run."""
+    """Return a sentence: how many checks (budgets of measured rows) passed or failed, how many rows were not run."""
     measured = sum(len(row.budgets) for row in rows if row.values)
     broken = study_page.failed_checks(rows)
     missing = sum(row.verdict == "not run" for row in rows)
@@ -45,9 +44,9 @@ def verdict(rows: Sequence[Row]) -> str:
 
 
 def write_junit(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]) -> None:
-    """One suite per study, one case per measured budget, one skipped case per row that was not run.
+    """Write JUnit's XML: a suite per study, a case per measured budget, and a skipped case per row that was not run.
 
-    Rows without a budget are left out: a case that cannot fail is no test. Errors: OSError.
+    Rows without a budget are left out, because they cannot fail. Errors: OSError.
     """
 
     def cases(row: Row) -> Iterator[documents.Case]:
@@ -70,7 +69,7 @@ def write_junit(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any
 
 
 def summary(rows: Sequence[Row], context: Mapping[str, Any] | None = None) -> RenderableType:
-    """The answers of the context's `first_page`, broken budgets, then the verdict, for rich's console."""
+    """Return the answers of the context's `first_page`, the broken budgets and the verdict, for rich's console."""
     from rich.console import Group
     from rich.padding import Padding
     from rich.text import Text
@@ -88,7 +87,7 @@ def summary(rows: Sequence[Row], context: Mapping[str, Any] | None = None) -> Re
 
 
 def goals_table(rows: Sequence[Row]) -> RenderableType:
-    """Every goal that was measured, the missed ones first, or a line that says there are none, for rich's console."""
+    """Return every measured goal, missed ones first, or a line that says there are none, for rich's console."""
     from rich.text import Text
 
     goals = [(row, metric) for row in rows if row.values for metric in row.goals]
@@ -111,10 +110,11 @@ def _bounds_table(heading: str, bound: str, bounds: Sequence[tuple[Row, str]], s
 
 
 def write_html(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any], folder: str | Path) -> None:
-    """Write one page that needs no other file; `folder` is what the rows' image paths are relative to.
+    """Write one page that needs no other file; `folder`: the folder that the rows' image paths are relative to.
 
-    Images are embedded whole, three halves a pixel (a finite value past 65504 becomes 65504), each file once.
-    Errors: FileNotFoundError or ValueError naming an image that is missing or not RGB or gray; OSError.
+    Images are embedded at full size, as half floats (a finite value beyond ±65504 becomes ±65504), each file once.
+    Errors: FileNotFoundError or ValueError, with the path, for an image that is missing or neither RGB nor gray;
+    OSError.
     """
     images = EmbeddedImages(Path(folder))
     content = study_page.prepare(rows, context, images) | {"sentence": verdict(rows)}

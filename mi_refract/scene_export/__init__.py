@@ -1,4 +1,4 @@
-"""Mitsuba scenes for other renderers, so that every renderer gets the same triangles, materials and camera.
+"""Export of Mitsuba scenes to other renderers: every renderer gets the same triangles, materials and camera.
 
 In: a Mitsuba XML file of glass, diffuse surfaces and lights. Out: a folder with the scene in another renderer's format,
 and a README.txt with the command that renders it. The command is `mi-refract scene export`; see README.md.

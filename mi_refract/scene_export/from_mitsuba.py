@@ -25,18 +25,18 @@ from .plain_scene import (
     SpotLamp,
 )
 
-LEVEL = 5  # of the tessellation: spheres of 20480 triangles, circles of 256 segments
+LEVEL = 5  # default tessellation level: spheres of 20480 triangles, circles of 256 segments
 LEVELS = range(9)
 LAMPS = ("point", "spot", "directional")
 INTEGRATORS = ("path", "refract_path", "prb", "volpath", "prbvolpath")
 
 
 def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) -> PlainScene:
-    """The scene in a file, read by the active variant. `defines` replace its `<default>`s.
+    """Return the scene in a file, read by the active variant. `defines` replace the file's `<default>`s.
 
-    `level`: of the tessellation of curved shapes; one more halves the edges. FileNotFoundError for a missing file.
-    ValueError, one line, for a file that is no scene, and for what a plain scene cannot hold: other plugins or
-    parameters, smooth normals, one-sided surfaces that are open.
+    `level`: tessellation level of curved shapes; each level halves the edges. FileNotFoundError for a missing file.
+    ValueError, one line, for an invalid scene, and for content that a plain scene cannot hold: other plugins or
+    parameters, smooth normals, open one-sided surfaces.
     """
     path = Path(path)
     if level not in LEVELS:
@@ -49,7 +49,7 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) ->
     camera: Camera | None = None
     max_depth: int | None = None
     sky: Colour | Environment | None = None
-    for child in sorted(root.children(), key=lambda child: child.kind == "Shape"):  # the camera before the shapes
+    for child in sorted(root.children(), key=lambda child: child.kind == "Shape"):  # shapes last: they need the camera
         if child.kind == "Shape":
             eye = np.array(camera.origin) if camera else None
             shapes += meshes_of_shape(child, level, MOST - sum(len(mesh.faces) for mesh in shapes), eye)
@@ -69,21 +69,21 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) ->
             lamps.append(_lamp(child))
         elif child.kind == "Emitter" and sky is None:
             sky = _sky(child)
-        elif child.kind != "BSDF":  # a named BSDF is read with the shapes that use it
+        elif child.kind != "BSDF":  # named BSDFs are read with the shapes that use them
             raise child.error(f"one {child.kind.lower()} too many", "shapes, and one sensor, integrator and sky")
     root.finish()
     if camera is None:
         raise ValueError(f"{path}: no sensor; expected a scene with one")
     if max_depth is None:
         raise ValueError(f"{path}: no integrator; expected a scene with one")
-    named = with_unique_names([*shapes, *lamps])
-    meshes = tuple(part for part in named if isinstance(part, Mesh))
-    without_size = tuple(part for part in named if isinstance(part, Lamp))
-    return PlainScene(path.stem, meshes, sky or (0.0, 0.0, 0.0), camera, max_depth, without_size)
+    objects = with_unique_names([*shapes, *lamps])
+    meshes = tuple(x for x in objects if isinstance(x, Mesh))
+    renamed_lamps = tuple(x for x in objects if isinstance(x, Lamp))
+    return PlainScene(path.stem, meshes, sky or (0.0, 0.0, 0.0), camera, max_depth, renamed_lamps)
 
 
 def _camera(sensor: Node) -> Camera:
-    """A perspective sensor. Clip planes are ignored: they are assumed to cut nothing away."""
+    """Read a perspective sensor. Clip planes are ignored: the export assumes that they remove nothing."""
     if sensor.type != "perspective":
         raise sensor.error("this sensor is not supported", "perspective")
     frame = sensor.transform()
@@ -115,7 +115,7 @@ def _camera(sensor: Node) -> Camera:
 
 
 def _rotation(emitter: Node) -> NDArray[np.float64]:
-    """(3, 3): that of `to_world`, whose shift is ignored."""
+    """Return the rotation (3, 3) in `to_world`; its translation is ignored."""
     rotation = emitter.transform()[:3, :3]
     if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-9):
         raise emitter.error("to_world is not a rotation", "a rotation")
@@ -123,16 +123,16 @@ def _rotation(emitter: Node) -> NDArray[np.float64]:
 
 
 def _lamp(emitter: Node) -> Lamp:
-    """A lamp without size. A `position` or `direction` beside a `to_world` stays unread: an error, as in Mitsuba."""
-    name, placed = emitter.props.id() or emitter.type, "to_world" in emitter.names
+    """Read a lamp without size. As in Mitsuba, `position` or `direction` beside `to_world` is an error (unread)."""
+    name, has_transform = emitter.props.id() or emitter.type, "to_world" in emitter.names
     lamp: Lamp
     if emitter.type == "directional":
-        direction = _rotation(emitter)[:, 2] if placed else emitter.point("direction", (0, 0, 1))
+        direction = _rotation(emitter)[:, 2] if has_transform else emitter.point("direction", (0, 0, 1))
         if not (length := np.linalg.norm(direction)):
             raise emitter.error("direction = 0, 0, 0", "a vector of any length but 0")
         lamp = DirectionalLamp(name, _triple(direction / length), emitter.colour("irradiance", 1.0))
     elif emitter.type == "point":
-        position = emitter.transform()[:3, 3] if placed else emitter.point("position", (0, 0, 0))
+        position = emitter.transform()[:3, 3] if has_transform else emitter.point("position", (0, 0, 0))
         lamp = PointLamp(name, _triple(position), emitter.colour("intensity", 1.0))
     else:
         direction, position = _rotation(emitter)[:, 2], emitter.transform()[:3, 3]
@@ -140,10 +140,10 @@ def _lamp(emitter: Node) -> Lamp:
         beam = emitter.value(float, "beam_width", 0.75 * cutoff)
         if not (0 < cutoff <= 180 and beam >= 0):
             raise emitter.error(f"cutoff_angle = {cutoff}, beam_width = {beam}", "angles of 0 to 180 degrees")
-        where, intensity = _triple(position), emitter.colour("intensity", 1.0)
-        lamp = SpotLamp(name, where, intensity, _triple(direction), min(beam, cutoff), cutoff)
+        intensity = emitter.colour("intensity", 1.0)
+        lamp = SpotLamp(name, _triple(position), intensity, _triple(direction), min(beam, cutoff), cutoff)
     if not emitter.value(float, "sampling_weight", 1.0) > 0:
-        raise emitter.error("sampling_weight = 0", "a positive number: Mitsuba sees no light of this lamp")
+        raise emitter.error("sampling_weight = 0", "a positive number: Mitsuba never samples this lamp")
     emitter.finish()
     return lamp
 

@@ -1,4 +1,4 @@
-"""Mitsuba's shapes as flat meshes of one material each, in the scene's coordinates."""
+"""Conversion of Mitsuba's shapes to flat meshes of one material each, in the scene's coordinates."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .tessellation import Triangles, Vertices
 
 GLASSES = ("dielectric", PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS))
 FILES = ("obj", "ply")
-# How many triangles a shape has at a level of the tessellation, and what makes them.
+# For each shape: the number of triangles at a tessellation level, and the function that makes them.
 SHAPES: dict[str, tuple[Callable[[int], int], Callable[[int], Triangles]]] = {
     "cube": (lambda level: 12, lambda level: tessellation.cube()),
     "cylinder": (lambda level: 16 << level, tessellation.cylinder),
@@ -30,16 +30,16 @@ SHAPES: dict[str, tuple[Callable[[int], int], Callable[[int], Triangles]]] = {
     "rectangle": (lambda level: 2, lambda level: tessellation.rectangle()),
     "sphere": (lambda level: 20 << 2 * level, tessellation.sphere),
 }
-ROUND = {"sphere": (1, 1, 1), "cylinder": (1, 1, 0)}  # their normals: vertices times this
-FARTHEST = 1e30  # of all coordinates: float32 holds products with directions
-MOST = 2**24  # triangles of all shapes, counted before they are made
+ROUND = {"sphere": (1, 1, 1), "cylinder": (1, 1, 0)}  # normal = vertex times this
+FARTHEST = 1e30  # largest coordinate: its products with directions fit in float32
+MOST = 2**24  # largest number of triangles in a scene, checked before they are made
 BLACK = (0.0, 0.0, 0.0)
 DEFAULT = (0.5, 0.5, 0.5)  # Mitsuba's reflectance
 
 
 @dataclass(frozen=True)
 class Surface:
-    """One material, or two in a checkerboard whose uv have these scales. `one_sided`: black from behind."""
+    """One material, or two in a checkerboard. `scales`: of the checkerboard's uv. `one_sided`: black from behind."""
 
     materials: tuple[Material, ...]
     scales: tuple[float, float] | None = None
@@ -47,21 +47,21 @@ class Surface:
 
 
 def meshes_of_shape(shape: Node, level: int, most: int = MOST, eye: Vertices | None = None) -> Iterator[Mesh]:
-    """The shape's meshes: two for a checkerboard, otherwise one.
+    """Yield the shape's meshes: two for a checkerboard, otherwise one.
 
-    ValueError for parameters that a mesh cannot have, for a surface that would be black from the camera's place `eye`
-    (3), and, before they are made, for more than `most` triangles.
+    `eye` (3): position of the camera. ValueError for unsupported parameters, for a surface that would be black from
+    `eye`, and for more than `most` triangles; these are counted before they are made.
     """
     surface, frame = _surface(shape), _frame(shape)
-    flipped = shape.value(bool, "flip_normals", False)
+    is_flipped = shape.value(bool, "flip_normals", False)
     if surface.scales:
         _check_count(shape, 2 * math.prod(max(math.ceil(2 * scale), 1) for scale in surface.scales), most)
     elif shape.type in SHAPES:
         _check_count(shape, SHAPES[shape.type][0](level), most)
     parts = _parts(shape, surface, level)
-    _check_count(shape, sum(len(faces) for _, faces in parts), most)  # a file's triangles are counted once it is read
+    _check_count(shape, sum(len(faces) for _, faces in parts), most)  # triangles of a file are known after reading it
     shape.finish()
-    if surface.one_sided and (flipped or not all(tessellation.is_closed(faces) for _, faces in parts)):
+    if surface.one_sided and (is_flipped or not all(tessellation.is_closed(faces) for _, faces in parts)):
         raise shape.error("diffuse on one side of an open surface", "its BSDF in a `twosided`, or a closed shape")
     for i, ((vertices, faces), material) in enumerate(zip(parts, surface.materials, strict=True)):
         if not len(faces):  # a checkerboard of one cell
@@ -74,13 +74,13 @@ def meshes_of_shape(shape: Node, level: int, most: int = MOST, eye: Vertices | N
             raise shape.error("diffuse on the outside only, around the camera", "its BSDF in a `twosided`")
         normals = None
         if shape.type in ROUND:
-            normals = (vertices * ROUND[shape.type]) @ frame[:3, :3].T * (-1 if flipped else 1)
+            normals = (vertices * ROUND[shape.type]) @ frame[:3, :3].T * (-1 if is_flipped else 1)
             normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        yield Mesh(f"{name}_{i}" if i else name, placed, faces[:, ::-1] if flipped else faces, material, normals)
+        yield Mesh(f"{name}_{i}" if i else name, placed, faces[:, ::-1] if is_flipped else faces, material, normals)
 
 
 def with_unique_names(parts: Iterable[Mesh | Lamp]) -> tuple[Mesh | Lamp, ...]:
-    """The meshes and lamps, renamed: letters, digits and underscores only, unique without regard to case."""
+    """Return the meshes and lamps with new names: letters, digits and underscores only, unique even ignoring case."""
     taken: set[str] = set()
     result: list[Mesh | Lamp] = []
     for part in parts:
@@ -100,7 +100,7 @@ def _check_count(shape: Node, count: int, most: int) -> None:
 
 
 def _parts(shape: Node, surface: Surface, level: int) -> tuple[Triangles, ...]:
-    """Triangles in the shape's own coordinates, one part per material."""
+    """Return triangles in the shape's own coordinates, one part per material."""
     if surface.scales:
         if shape.type != "rectangle":
             raise shape.error("a checkerboard", "one on a rectangle")
@@ -124,7 +124,7 @@ def _parts(shape: Node, surface: Surface, level: int) -> tuple[Triangles, ...]:
 
 
 def _frame(shape: Node) -> Vertices:
-    """(4, 4): from the coordinates of `_parts` to the scene's."""
+    """Return the matrix (4, 4) from the coordinates of `_parts` to the scene's."""
 
     def positive(name: str, value: float) -> float:
         if value <= 0:
@@ -141,16 +141,17 @@ def _frame(shape: Node) -> Vertices:
         length = positive("length", float(np.linalg.norm(end - start)))
         local[:3, 3] = start
         local[:3, :3] = tessellation.basis((end - start) / length) * [radius, radius, length]
-    placed = frame @ local
-    if shape.type in ("sphere", "cylinder"):  # Mitsuba stretches neither, but the second along its axis
-        squares = placed[:3, :3].T @ placed[:3, :3]
-        kept = squares.diagonal()[[0, 0, 0 if shape.type == "sphere" else 2]]
-        if not np.allclose(squares, np.diag(kept), rtol=1e-5, atol=1e-5 * squares.max()):
-            raise shape.error(f"to_world makes another shape of the {shape.type}", "one scale, turns and shifts")
-    return placed
+    combined = frame @ local
+    if shape.type in ("sphere", "cylinder"):  # Mitsuba only stretches cylinders, along their axis
+        squares = combined[:3, :3].T @ combined[:3, :3]
+        allowed = squares.diagonal()[[0, 0, 0 if shape.type == "sphere" else 2]]
+        if not np.allclose(squares, np.diag(allowed), rtol=1e-5, atol=1e-5 * squares.max()):
+            raise shape.error(f"to_world deforms the {shape.type}", "one scale, rotations and translations")
+    return combined
 
 
 def _surface(shape: Node) -> Surface:
+    """Read the BSDF and the area emitter of a shape."""
     bsdf = emitter = None
     for child in shape.children():
         if child.kind == "BSDF" and not bsdf:
@@ -172,6 +173,7 @@ def _surface(shape: Node) -> Surface:
 
 
 def _scattering(bsdf: Node) -> Surface:
+    """Read a BSDF."""
     if bsdf.type == "twosided":
         inner = list(bsdf.children())
         bsdf.finish()
@@ -188,48 +190,50 @@ def _scattering(bsdf: Node) -> Surface:
 
 
 def _glass(bsdf: Node) -> Glass:
-    """One with two numbers where these say all, and otherwise a VolumeGlass."""
+    """Read a glass: a Glass if two indices describe it, otherwise a VolumeGlass."""
     sides = {"int_ior": "bk7", "ext_ior": "air"}
     inside, outside = (read_medium(bsdf.props, name, default) for name, default in sides.items())
     sigmas = [_sigma(bsdf, side) if bsdf.type != "dielectric" else None for side in ("int", "ext")]
-    said = [
+    parameters = [
         f"{name} = {bsdf.props.get(name, default)}"
         for (name, default), medium in zip(sides.items(), (inside, outside), strict=True)
         if medium.dispersive
     ]
-    said += [name for name in bsdf.names if name.endswith(("_absorption", "_colour"))]
+    parameters += [name for name in bsdf.names if name.endswith(("_absorption", "_colour"))]
     bsdf.ignore(*sides, "formula")
     bsdf.finish()
     n_int, n_ext = (float(medium.index(media.LINES["d"])) for medium in (inside, outside))
-    if not said:
+    if not parameters:
         return Glass(n_int, n_ext)
     spectrum: tuple[float, ...] = ()
     if inside.dispersive or outside.dispersive:
         denser, other = (inside, outside) if n_int >= n_ext else (outside, inside)
         spectrum = tuple(np.asarray(media.relative_index(denser, other, np.array(WAVELENGTHS))).tolist())
         if missing := [f"{w:g} nm" for w, n in zip(WAVELENGTHS, spectrum, strict=True) if not math.isfinite(n)]:
-            raise bsdf.error(f"{', '.join(said)}: no index at {missing[0]}", "one from 400 to 700 nm")
+            raise bsdf.error(f"{', '.join(parameters)}: no index at {missing[0]}", "one from 400 to 700 nm")
         n = spectrum[LINES.index("d")]
         n_int, n_ext = (n * n_ext, n_ext) if n_int >= n_ext else (n_int, n * n_int)
-    return VolumeGlass(n_int, n_ext, ", ".join(said), spectrum, *(sigma or BLACK for sigma in sigmas))
+    return VolumeGlass(n_int, n_ext, ", ".join(parameters), spectrum, *(sigma or BLACK for sigma in sigmas))
 
 
 def _sigma(bsdf: Node, side: str) -> Colour | None:
-    """σ of a side, red, green and blue; None where the scene says none."""
+    """Return σ of a side in red, green and blue; None without absorption parameters."""
     sigma, colour, distance = f"{side}_absorption", f"{side}_colour", f"{side}_colour_distance"
     if sigma in bsdf.names:
         return bsdf.colour(sigma, None)
     if colour not in bsdf.names:
         return None
-    left, length = bsdf.colour(colour, None), bsdf.value(float, distance)
-    if not all(0 < x <= 1 for x in left) or length <= 0:
-        raise bsdf.error(f"{colour} = {left} after {distance} = {length}", "colours above 0 and up to 1, a length")
-    r, g, b = (-math.log(x) / length for x in left)
+    transmittance, length = bsdf.colour(colour, None), bsdf.value(float, distance)
+    if not all(0 < x <= 1 for x in transmittance) or length <= 0:
+        raise bsdf.error(
+            f"{colour} = {transmittance} after {distance} = {length}", "colours above 0 and up to 1, a length"
+        )
+    r, g, b = (-math.log(x) / length for x in transmittance)
     return r, g, b
 
 
 def _colours(node: Node, name: str, default: float | None) -> tuple[tuple[Colour, ...], tuple[float, float] | None]:
-    """One colour, or the two of a checkerboard and the scale of its uv."""
+    """Return one colour and None, or the two colours of a checkerboard and the scales of its uv."""
     texture = node.take(name)
     if not isinstance(texture, Node):
         return (node.colour(name, default),), None
@@ -239,5 +243,5 @@ def _colours(node: Node, name: str, default: float | None) -> tuple[tuple[Colour
     matrix = texture.transform("to_uv")
     texture.finish()
     if not (matrix == np.diag(matrix.diagonal())).all() or not (matrix[[0, 1], [0, 1]] > 0).all():
-        raise texture.error("to_uv turns or moves", "a scale")
+        raise texture.error("to_uv rotates or translates", "a scale")
     return colours, (float(matrix[0, 0]), float(matrix[1, 1]))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mi_refract import media
 
 Colour = tuple[float, float, float]
-LINES = "FdC"  # by which Abbe's number is defined
+LINES = "FdC"  # the spectral lines in the definition of Abbe's number
 WAVELENGTHS = (*(media.LINES[line] for line in LINES), *map(float, range(400, 701, 10)))  # nm
 
 
@@ -32,13 +32,14 @@ class Glass:
 
 @dataclass(frozen=True)
 class VolumeGlass(Glass):
-    """A glass whose index depends on the wavelength, or that absorbs; its two indices are those at the d line.
+    """A glass with dispersion or absorption; `int_ior` and `ext_ior` are its indices at the d line.
 
-    `said`: the parameters that say so. `spectrum`: the index of the denser medium over that of the other at
-    WAVELENGTHS; () for one number. σ of either side: light that travels t keeps exp(−σ t) of its red, green and blue.
+    `parameters`: the scene's parameters of dispersion and absorption, for messages. `spectrum`: index of the denser
+    medium divided by that of the other at WAVELENGTHS; () without dispersion. `int_sigma`, `ext_sigma`: σ in red, green
+    and blue; a path of length t transmits exp(−σ t).
     """
 
-    said: str = field(compare=False)
+    parameters: str = field(compare=False)
     spectrum: tuple[float, ...] = ()
     int_sigma: Colour = (0.0, 0.0, 0.0)
     ext_sigma: Colour = (0.0, 0.0, 0.0)
@@ -65,7 +66,7 @@ Material = Glass | Diffuse | Light  # a VolumeGlass is a Glass
 class Mesh:
     """Flat triangles of one material, counterclockwise as seen from the side of their normals. Names are unique.
 
-    `normals` (V, 3): of the sphere or the cylinder at each vertex, None where the surface itself is flat.
+    `normals` (V, 3): normals of the sphere or the cylinder at each vertex, None for other shapes.
     """
 
     name: str
@@ -75,13 +76,13 @@ class Mesh:
     normals: NDArray[np.float64] | None = None
 
     def triangles(self) -> NDArray[np.float64]:
-        """(F, 3, 3): the corners of each triangle."""
+        """Return the corners of each triangle, (F, 3, 3)."""
         return self.vertices[self.faces]
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """A lamp without size. Names of lamps and meshes are unique; directions, in which light travels, have length 1."""
+    """A lamp without size. Names of lamps and meshes are unique. Light travels along `direction`, of length 1."""
 
     name: str
 
@@ -93,7 +94,7 @@ class Lamp:
 
 @dataclass(frozen=True)
 class PointLamp(Lamp):
-    """`intensity`, per steradian, in every direction: a surface that faces it has intensity/distance² of irradiance."""
+    """A lamp of `intensity` per steradian in all directions: a facing surface's irradiance is intensity/distance²."""
 
     position: Colour
     intensity: Colour
@@ -101,7 +102,7 @@ class PointLamp(Lamp):
 
 @dataclass(frozen=True)
 class SpotLamp(PointLamp):
-    """Up to `beam_degrees` from `direction` all of `intensity`, none from `cutoff_degrees` on, linear between."""
+    """A lamp of full intensity up to `beam_degrees` from `direction`, linearly falling to 0 at `cutoff_degrees`."""
 
     direction: Colour
     beam_degrees: float
@@ -110,7 +111,7 @@ class SpotLamp(PointLamp):
 
 @dataclass(frozen=True)
 class DirectionalLamp(Lamp):
-    """Parallel light from infinitely far away. `irradiance`: of a surface at right angles to it."""
+    """Parallel light from infinitely far away. `irradiance`: on a surface perpendicular to the light."""
 
     direction: Colour
     irradiance: Colour
@@ -118,11 +119,11 @@ class DirectionalLamp(Lamp):
 
 @dataclass(frozen=True)
 class Environment:
-    """Radiance from infinitely far away by direction, (H, W, 3), interpolated linearly between columns and rows.
+    """A map (H, W, 3) of radiance from infinitely far away, interpolated linearly between columns and rows.
 
     In the map's own coordinates, with +y the zenith, the pixel in row j and column i is the radiance seen in direction
-    (sin φ sin θ, cos θ, −cos φ sin θ) with θ = π j / (H − 1), so that the first and the last row are the poles, and
-    φ = 2π (i + ½) / W. `rotation` (3, 3) is orthonormal; its columns are the map's axes in the scene's coordinates.
+    (sin φ sin θ, cos θ, −cos φ sin θ) with θ = π j / (H − 1) and φ = 2π (i + ½) / W. So the first and the last row are
+    the poles. `rotation` (3, 3) is orthonormal; its columns are the map's axes in the scene's coordinates.
     """
 
     pixels: NDArray[np.float32]
@@ -143,7 +144,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class PlainScene:
-    """A scene. `sky`: radiance from infinitely far away, 0 for none. `max_depth`: of a path, as Mitsuba counts."""
+    """A scene. `sky`: radiance from infinitely far away, 0 for none. `max_depth`: longest path, in Mitsuba's count."""
 
     name: str
     meshes: tuple[Mesh, ...]
@@ -154,5 +155,5 @@ class PlainScene:
 
     @property
     def materials(self) -> tuple[Material, ...]:
-        """Every material once, in the order of the meshes."""
+        """The distinct materials, in the order of the meshes."""
         return tuple(dict.fromkeys(mesh.material for mesh in self.meshes))

@@ -1,6 +1,7 @@
-"""Mitsuba's shapes as flat triangles in their own coordinates, counterclockwise as seen from the side of the normal.
+"""Tessellation of Mitsuba's shapes: flat triangles in the shape's coordinates, counterclockwise as seen from outside.
 
-The vertices of a curved shape lie on its surface. One `level` more halves the length of the edges.
+"Outside" is the side of the normal. The vertices of a curved shape lie on its surface. Each `level` halves the length
+of the edges.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ GOLDEN = (1 + 5**0.5) / 2
 
 @functools.cache
 def sphere(level: int) -> Triangles:
-    """The unit sphere: an icosahedron with each face divided into 4^level."""
+    """Return the unit sphere: an icosahedron with each face divided into 4^level triangles."""
     corners = np.array([[-1, GOLDEN, 0], [1, GOLDEN, 0], [-1, -GOLDEN, 0], [1, -GOLDEN, 0]])
     corners = np.concatenate([np.roll(corners, shift, axis=1) for shift in (0, 1, 2)])
     near = np.isclose(np.linalg.norm(corners[:, None] - corners, axis=-1), 2)
@@ -35,25 +36,25 @@ def sphere(level: int) -> Triangles:
         quarters = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
         triangles = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters])
     vertices, order = welded(triangles)
-    vertices.flags.writeable = order.flags.writeable = False  # the cache shares them
+    vertices.flags.writeable = order.flags.writeable = False  # the cache shares these arrays
     return vertices, order
 
 
 def welded(triangles: NDArray[np.float64]) -> Triangles:
-    """Vertices and faces of corners (F, 3, 3). Corners with the same position become one vertex."""
+    """Return the vertices and faces of triangles (F, 3, 3). Corners with the same position become one vertex."""
     vertices, index = np.unique(triangles.reshape(-1, 3) + 0.0, axis=0, return_inverse=True)
     return vertices, index.reshape(-1, 3).astype(np.int64)
 
 
 def is_closed(faces: Faces) -> bool:
-    """Whether each edge borders two faces, once in either direction. Precondition: the vertices are welded."""
+    """Return whether each edge borders two faces, once in either direction. Precondition: the vertices are welded."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     directed = {(int(a), int(b)) for a, b in edges}
     return len(directed) == len(edges) and all((b, a) in directed for a, b in directed)
 
 
 def encloses(triangles: NDArray[np.float64], point: Vertices) -> bool:
-    """Whether closed triangles (F, 3, 3) that face outward lie around a point (3): by the sum of the solid angles."""
+    """Return whether closed triangles (F, 3, 3) that face outward enclose a point (3), by the sum of solid angles."""
     a, b, c = np.moveaxis(triangles - point, 1, 0)
     x, y, z = (np.linalg.norm(p, axis=1) for p in (a, b, c))
     ab, bc, ca = ((p * q).sum(1) for p, q in ((a, b), (b, c), (c, a)))
@@ -62,7 +63,9 @@ def encloses(triangles: NDArray[np.float64], point: Vertices) -> bool:
 
 
 def basis(axis: Vertices) -> Vertices:
-    """(3, 3): orthonormal and right-handed, its last column an axis of length 1; the identity for (0, 0, 1).
+    """Return an orthonormal right-handed basis (3, 3) whose last column is `axis`, of length 1.
+
+    The basis of (0, 0, 1) is the identity.
 
     Source: Duff et al. 2017, Building an Orthonormal Basis, Revisited.
     """
@@ -74,7 +77,7 @@ def basis(axis: Vertices) -> Vertices:
 
 
 def grid(u: NDArray[np.float64], v: NDArray[np.float64], chosen: NDArray[np.bool_]) -> Triangles:
-    """Two triangles for each chosen cell [i, j] between u[i], u[i + 1], v[j], v[j + 1] in the plane z = 0."""
+    """Return two triangles for each chosen cell [i, j] between u[i], u[i + 1], v[j], v[j + 1] in the plane z = 0."""
     vertices = np.stack([*np.meshgrid(u, v, indexing="ij"), np.zeros((len(u), len(v)))], axis=-1)
     a, b, c, d = vertices[:-1, :-1], vertices[1:, :-1], vertices[1:, 1:], vertices[:-1, 1:]
     triangles = np.stack([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)], axis=2)
@@ -82,33 +85,33 @@ def grid(u: NDArray[np.float64], v: NDArray[np.float64], chosen: NDArray[np.bool
 
 
 def rectangle() -> Triangles:
-    """[−1, 1]² in the plane z = 0."""
+    """Return the square [−1, 1]² in the plane z = 0."""
     ends = np.array([-1.0, 1.0])
     return grid(ends, ends, np.ones((1, 1), bool))
 
 
 def checkerboard(scale_u: float, scale_v: float) -> tuple[Triangles, Triangles]:
-    """The two parts of the rectangle, of `color0` and of `color1`, for a checkerboard with these scales of uv."""
-    # 0, the ends of the cells, 1: a cell is half a unit of the scaled coordinate.
+    """Return the parts of the rectangle in `color0` and in `color1`, for a checkerboard with these scales of uv."""
+    # 0, the borders between cells, 1: a cell is half a unit of the scaled coordinate.
     u, v = (np.array([0, *np.arange(1, np.ceil(2 * scale)) / (2 * scale), 1.0]) for scale in (scale_u, scale_v))
-    # The middle of a cell in half units of the scaled coordinate: odd where Mitsuba's fraction is above one half.
+    # The middle of a cell, in half units of the scaled coordinate, is odd if Mitsuba's fraction is above one half.
     odd_u, odd_v = (np.floor((x[:-1] + x[1:]) * scale) % 2 == 1 for x, scale in ((u, scale_u), (v, scale_v)))
     same = odd_u[:, None] == odd_v
     return grid(2 * u - 1, 2 * v - 1, same), grid(2 * u - 1, 2 * v - 1, ~same)
 
 
 def cube() -> Triangles:
-    """[−1, 1]³."""
+    """Return the cube [−1, 1]³."""
     face, order = rectangle()
     face = face + np.array([0.0, 0.0, 1.0])
     turns = [np.roll(face, shift, axis=1) for shift in (0, 1, 2)]
-    # A half turn keeps the orientation, and takes each of the three to the face opposite.
+    # A half turn keeps the orientation, and moves each of the three faces to the opposite one.
     turns += [turn * mirror for turn, mirror in zip(turns, ([1, -1, -1], [-1, 1, -1], [-1, -1, 1]), strict=True)]
     return welded(np.concatenate([turn[order] for turn in turns]))
 
 
 def disk(level: int) -> Triangles:
-    """The unit disk in the plane z = 0."""
+    """Return the unit disk in the plane z = 0."""
     rim = _circle(level)
     i = np.arange(len(rim))
     faces = np.stack([i, (i + 1) % len(rim), np.full(len(rim), len(rim))], axis=1)
@@ -116,7 +119,7 @@ def disk(level: int) -> Triangles:
 
 
 def cylinder(level: int) -> Triangles:
-    """The open cylinder of radius 1 from z = 0 to z = 1."""
+    """Return the open cylinder of radius 1 from z = 0 to z = 1."""
     rim = _circle(level)
     count = len(rim)
     i, j = np.arange(count), (np.arange(count) + 1) % count
@@ -125,7 +128,7 @@ def cylinder(level: int) -> Triangles:
 
 
 def _circle(level: int) -> Vertices:
-    """8 · 2^level vertices."""
+    """Return 8 · 2^level vertices of the unit circle, (V, 3)."""
     segments = 8 << level
     angle = 2 * np.pi * np.arange(segments) / segments
     return np.stack([np.cos(angle), np.sin(angle), np.zeros(segments)], axis=1)

@@ -1,4 +1,4 @@
-"""What every test of a command needs."""
+"""A fixture for all tests of commands."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ import pytest
 
 @pytest.fixture(autouse=True)
 def same_process(monkeypatch):
-    """No command replaces the process of the tests."""
+    """Fail if a command restarts the process of the tests."""
     monkeypatch.setattr(os, "execv", lambda *arguments: pytest.fail(f"restarted: {arguments}"))

@@ -1,4 +1,4 @@
-"""The command line itself: help, version, errors, exit codes, what it does not import; and `mi-refract doctor`."""
+"""The command line itself: help, version, errors, exit codes, imports; and `mi-refract doctor`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_an_error_is_one_line(arguments, capfd, monkeypatch):
     assert arguments != ["nonesuch"] or err.endswith(f"'nonesuch'; expected {', '.join(app.COMMANDS)}\n")
 
 
-def test_without_a_command_the_help_is_printed_and_with_version_the_version(capfd):
+def test_help_without_a_command_and_version(capfd):
     assert app.main([]) == 2
     assert "doctor" in capfd.readouterr().out
     for main in (app.main, cli.main):
@@ -41,22 +41,22 @@ def test_without_a_command_the_help_is_printed_and_with_version_the_version(capf
         assert capfd.readouterr().out == f"{app.__version__}\n"
 
 
-def test_without_the_extra():
+def test_missing_extra_cli():
     with python("import sys; sys.modules['typer'] = None; import mi_refract.cli.app") as process:
         out, err = process.communicate(timeout=60)
     assert (process.returncode, out) == (2, "")
     assert err.splitlines()[-1] == "mi-refract needs the extra `cli`: pip install 'mi-refract[cli]'"
 
 
-def test_diff_in_a_process_of_its_own(pair):
-    """The exit code arrives, and no line of a log is wrapped."""
+def test_diff_as_a_subprocess(pair):
+    """The exit code is returned, and no line is wrapped."""
     command = [sys.executable, "-m", "mi_refract.cli", "diff", *map(str, pair)]
     done = subprocess.run(command, env=ENVIRONMENT | {"COLUMNS": "40"}, capture_output=True, text=True, timeout=300)
     assert (done.returncode, done.stderr, len(done.stdout.splitlines())) == (1, "", 4)
 
 
 @pytest.mark.parametrize("name", app.COMMANDS)
-def test_the_help_has_a_line_for_each_command_and_each_command_its_own(name, capfd):
+def test_help_lists_each_command_and_each_command_has_help(name, capfd):
     assert app.main(["--help"]) == 0
     lines = capfd.readouterr().out.splitlines()
     assert [line.split(None, 1)[1] for line in lines if line.startswith(f"  {name} ")] == [app.COMMANDS[name].help]
@@ -67,9 +67,11 @@ def test_the_help_has_a_line_for_each_command_and_each_command_its_own(name, cap
 
 
 def commands_of(command, name=""):
-    """The names of a command and of all commands below it."""
-    below = command.list_commands(None) if hasattr(command, "list_commands") else ()
-    return [name, *(y for x in below for y in commands_of(command.get_command(None, x), f"{name} {x}".strip()))]
+    """Return the names of a command and of all its subcommands."""
+    names = [name]
+    for subname in command.list_commands(None) if hasattr(command, "list_commands") else ():
+        names += commands_of(command.get_command(None, subname), f"{name} {subname}".strip())
+    return names
 
 
 COMMANDS = commands_of(typer.main.get_command(app.app))
@@ -77,7 +79,7 @@ COMMANDS = commands_of(typer.main.get_command(app.app))
 
 @pytest.fixture
 def parsed(monkeypatch, capfd):
-    """`parsed("mi-refract rays check a.csv")`: the command that it would run, after its options were checked."""
+    """`parsed("mi-refract rays check a.csv")` checks the options and returns the command that would run."""
     called = []
     monkeypatch.setattr(typer.core.TyperCommand, "invoke", lambda self, context: called.append(context.command_path))
 
@@ -85,13 +87,13 @@ def parsed(monkeypatch, capfd):
         called[:] = []
         program, *words = shlex.split(line, comments=True)
         assert (program, app.main(words)) == ("mi-refract", 0), (line, capfd.readouterr().err)
-        return called[0] if called else line  # `--keys` and the like print and end before that
+        return called[0] if called else line  # options such as `--keys` print and exit earlier
 
     return parse
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_help_ends_with_two_or_three_examples_that_are_parsed(name, capfd, parsed):
+def test_examples_at_the_end_of_the_help_parse(name, capfd, parsed):
     assert app.main([*name.split(), "--help"]) == 0
     *_, head, examples = capfd.readouterr().out.partition("\n  Examples:\n")
     examples = [line.strip() for line in examples.splitlines()]
@@ -101,14 +103,14 @@ def test_every_help_ends_with_two_or_three_examples_that_are_parsed(name, capfd,
 
 
 @pytest.mark.parametrize("path", [*READMES, *PAGES], ids=lambda path: str(path.relative_to(ROOT)))
-def test_the_command_lines_of_a_page_are_parsed(path, parsed):
+def test_command_lines_of_a_page_parse(path, parsed):
     lines = [line for block in blocks(path, "bash") for line in block.replace("\\\n", " ").splitlines()]
     for line in (line for line in lines if line.startswith("mi-refract ")):
         parsed(re.sub(r"[>|;&].*|\[[^]]*\]", "", line))
 
 
 HEAVY = ("mitsuba", "drjit", "numpy", "OpenImageIO", "matplotlib", "scipy")
-# What a comparison of two images needs none of, but for its report or another method.
+# Modules that a comparison of two images needs only for a report or another method.
 UNUSED = ("mitsuba", "drjit", "scipy", "matplotlib", "jinja2", "xml", "asyncio")
 SET = ("diff", "--method", "tolerance", "--set", "fail=0.5", "--json", "out.json")
 
@@ -116,7 +118,7 @@ SET = ("diff", "--method", "tolerance", "--set", "fail=0.5", "--json", "out.json
 @pytest.mark.parametrize(
     ("words", "unused"), [(("--help",), HEAVY), (("--version",), HEAVY), (("diff",), UNUSED), (SET, UNUSED)]
 )
-def test_a_command_imports_what_it_needs(pair, tmp_path, words, unused):
+def test_a_command_does_not_import_unused_modules(pair, tmp_path, words, unused):
     code = "import sys\nfrom mi_refract.cli import main\nmain(sys.argv[1:])\nprint([*sys.modules], file=sys.stderr)"
     files = pair if words[0] == "diff" else ()
     with python(code, *(tmp_path / x if x == "out.json" else x for x in words), *files) as process:
@@ -126,7 +128,7 @@ def test_a_command_imports_what_it_needs(pair, tmp_path, words, unused):
         assert "2 images: " in out and "'OpenImageIO'" in err
 
 
-# Of what Windows has not, all that Python's own library does without once it is imported on Linux, as does NumPy.
+# Names that Windows lacks; Python's library and NumPy, imported on Linux, work without them.
 WINDOWS = """
 import os, select, signal, subprocess, sys
 for name in ("fcntl", "grp", "pwd", "resource", "termios"):
@@ -145,7 +147,7 @@ RENDER = ("render", ROOT / "scenes/sphere.xml", "-o", "out.exr", "-D", "res=8", 
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said", "out"),
+    ("words", "code", "error", "out"),
     [
         (("--help",), 0, "", "Commands:"),
         (("diff", "IMAGES", "--json", "out.json"), 1, "", "2 images: "),
@@ -155,13 +157,13 @@ RENDER = ("render", ROOT / "scenes/sphere.xml", "-o", "out.exr", "-D", "res=8", 
     ],
     ids=lambda x: " ".join(map(str, x[:2])) if isinstance(x, tuple) else "",
 )
-def test_without_what_windows_has_not(pair, tmp_path, words, code, said, out):
+def test_without_names_that_windows_lacks(pair, tmp_path, words, code, error, out):
     words = [y for x in words for y in (pair if x == "IMAGES" else [x])]
     command = [sys.executable, "-c", WINDOWS, *map(str, words)]
     done = subprocess.run(command, env=ENVIRONMENT, cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    errors = [line for line in done.stderr.splitlines() if line.startswith("mi-refract: ")]  # beside Dr.Jit's own
-    assert (done.returncode, len(errors), "Traceback" in done.stderr) == (code, bool(said), False), done
-    assert out in done.stdout and said in done.stderr
+    errors = [line for line in done.stderr.splitlines() if line.startswith("mi-refract: ")]  # without Dr.Jit's output
+    assert (done.returncode, len(errors), "Traceback" in done.stderr) == (code, bool(error), False), done
+    assert out in done.stdout and error in done.stderr
 
 
 # doctor ---------------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""`mi-refract diff`: its options, bad input, what is printed and written, for people and for programs."""
+"""`mi-refract diff`: options, bad input, printed output, and reports."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EVIL = 'a"b<script>alert(1)<∕script>|`*[x](y)*`,:%0A::error::.exr'
 # Verdicts and options ---------------------------------------------------------------------------------------------
 
 
-def test_equal_and_different_and_nothing_is_created_or_overwritten(run, pair, tmp_path):
+def test_equal_and_different_images_and_no_files_written(run, pair, tmp_path):
     old, new = pair
     before = tree(tmp_path)
     code, out, err = run("diff", old / "equal.exr", new / "equal.exr")
@@ -43,29 +43,29 @@ def test_equal_and_different_and_nothing_is_created_or_overwritten(run, pair, tm
 def test_inconclusive_renders(run, tmp_path):
     folders = samples(tmp_path / "old", 2, noise=1.0), samples(tmp_path / "new", 2, 100, noise=1.0)
     for word, expected in {"": 3, "pass": 0, "fail": 1}.items():
-        how, junit = ["--inconclusive", word] if word else [], tmp_path / "out.xml"
-        code, out, err = run("diff", *folders, "--renders", "--method", "welch", "--junit", junit, *how)
+        option, junit = ["--inconclusive", word] if word else [], tmp_path / "out.xml"
+        code, out, err = run("diff", *folders, "--renders", "--method", "welch", "--junit", junit, *option)
         assert (code, err, out.splitlines()[-1]) == (expected, "", "1 image: 1 inconclusive")
         failures = ElementTree.parse(junit).findall(".//failure")
-        assert [each.get("type") for each in failures] == ([] if word == "pass" else ["inconclusive"])
+        assert [failure.get("type") for failure in failures] == ([] if word == "pass" else ["inconclusive"])
         assert "welch" in out
 
 
 @pytest.mark.parametrize(
     ("words", "code"),
     [
-        *((f"--method {method}", 1) for method, one in methods.METHODS.items() if not one.takes_renders),
+        *((f"--method {name}", 1) for name, method in methods.METHODS.items() if not method.takes_renders),
         ("--method tolerance --set fail=0.2 --set hard_fail=1", 0),
         ("--method tolerance --set fail_percent=100 --set hard_fail=0.01", 1),
-        ("--set spp=16", 1),  # counts where `welch` is chosen: one setting serves a folder of both
+        ("--set spp=16", 1),  # only `welch` uses it: one setting is valid for a folder of both kinds of images
         ("--set ignore=[[0,0,48,31]] --set fail=0.01", 1),
     ],
 )
-def test_methods_and_settings_in_words(run, pair, words, code):
+def test_methods_and_settings_as_options(run, pair, words, code):
     assert run("diff", *pair, *words.split())[0] == code
 
 
-def test_the_methods_are_printed_without_images(run):
+def test_methods_are_printed_without_images(run):
     code, out, err = run("diff", "--methods")
     assert (code, err) == (0, "")
     assert out.count("| `mask` |") == 1  # keys that both tables have are listed once
@@ -95,14 +95,14 @@ reason = "gone"
 
 
 @pytest.fixture
-def settled(pair):
+def pair_with_settings(pair):
     (pair[0] / "mi-refract.toml").write_text(GOOD)
     image(pair[0] / "louder-mac.exr", gain=1.1)
     return pair
 
 
-def test_in_a_repository_a_folder_inside_finds_the_settings_and_masks_above(run, folders, tmp_path):
-    """Names, `{dir}` and `{root}` are those of the whole folder; nothing above the repository is read."""
+def test_settings_and_masks_above_a_folder_are_read_within_a_repository(run, folders, tmp_path):
+    """Names, `{dir}` and `{root}` are relative to the folder of the settings; nothing above the repository is read."""
     old, new = folders
     rule = '[defaults]\naccept = ["{stem}-other{suffix}"]\n'
     rule += '[[image]]\nname = "inner/*.exr"\nreason = "masked"\nmask = "{root}/masks/{dir}/{stem}.exr"\n'
@@ -126,32 +126,34 @@ def test_in_a_repository_a_folder_inside_finds_the_settings_and_masks_above(run,
     image(new / "added" / "first.exr")
     assert run("accept", old / "added", new / "added", "--yes")[1].endswith("nothing to accept\n")
     assert "mask {root}/masks/{dir}/{stem}.exr" in run("diff", old / "inner", "--check-settings")[1]
-    assert run("diff", *calls[0], "--settings", old / "mi-refract.toml")[0] == 1  # names are those of its folder
+    assert run("diff", *calls[0], "--settings", old / "mi-refract.toml")[0] == 1  # names are relative to `inner`
     (old / "mi-refract.toml").write_text('[defaults]\nmap = { reference = "{name}", test = "{name}" }\n')
     code, _, err = run("diff", *calls[0])
     assert code == 2 and err.endswith("`map` is for whole folders; expected " + f"{old} as REFERENCE, or --settings\n")
 
 
-def test_check_settings(run, settled):
-    code, out, err = run("diff", *settled, "--check-settings")
+def test_check_settings(run, pair_with_settings):
+    code, out, err = run("diff", *pair_with_settings, "--check-settings")
     assert (code, err) == (0, "mi-refract: gone.exr: matches no image\n")
     lines = [line.split("  ") for line in out.splitlines()]
     rows = {line[0]: [cell.strip() for cell in line[1:] if cell.strip()] for line in lines}
-    how = "tolerance, fail=0.15, or louder-mac.exr, without [0, 0, 2, 2]"
-    assert rows["louder.exr"] == [how, "defaults, image[0]", "loud"]
+    resolved = "tolerance, fail=0.15, or louder-mac.exr, without [0, 0, 2, 2]"
+    assert rows["louder.exr"] == [resolved, "defaults, image[0]", "loud"]
     assert rows["equal.exr"] == ["auto", "defaults"]
-    code, out, _ = run("diff", settled[0], "--check-settings")
+    code, out, _ = run("diff", pair_with_settings[0], "--check-settings")
     assert (code, "louder-mac.exr" in out) == (0, True)
-    code, out, _ = run("diff", *settled, "equal.exr", "--check-settings")
+    code, out, _ = run("diff", *pair_with_settings, "equal.exr", "--check-settings")
     assert (code, "louder" in out) == (0, False)
-    (settled[0] / "mi-refract.toml").write_text('[[image]]\nname = "louder.exr"\nfale = 1\nreason = "loud"\n')
-    for words in ([], ["--check-settings"]):  # an entry that is wrong stops no other image
-        code, out, err = run("diff", *settled, *words)
+    (pair_with_settings[0] / "mi-refract.toml").write_text(
+        '[[image]]\nname = "louder.exr"\nfale = 1\nreason = "loud"\n'
+    )
+    for words in ([], ["--check-settings"]):  # the other images are compared in spite of a wrong entry
+        code, out, err = run("diff", *pair_with_settings, *words)
         assert (code, err.count("\n")) == (2, 1)
         assert "image[0]: unknown key `fale`; expected method" in err and "equal.exr" in out
 
 
-def test_skipped_is_reported_everywhere(run, pair, tmp_path):
+def test_every_report_contains_skipped_images(run, pair, tmp_path):
     (pair[0] / "mi-refract.toml").write_text('[[image]]\nname = "louder.exr"\nskip = true\nreason = "loud"')
     files = ["--report", tmp_path / "out.html", "--junit", tmp_path / "out.xml", "--json", tmp_path / "out.json"]
     code, out, _ = run("diff", *pair, *files, "--github")
@@ -176,11 +178,11 @@ def test_bad_images(run, pair, tmp_path, name, side):
     assert out.splitlines()[-1] == "2 images: 1 could not be compared, 1 different"
     statuses = {r["name"]: r["status"] for r in json.loads(files[0].read_text())["results"]}
     assert statuses == {"equal.exr": "error", "louder.exr": "different"}
-    assert [each.get("type") for each in ElementTree.parse(files[1]).findall(".//error")] == ["error"]
+    assert [error.get("type") for error in ElementTree.parse(files[1]).findall(".//error")] == ["error"]
     assert_refused(run("diff", pair[0] / "equal.exr", pair[1] / "equal.exr"))
 
 
-def test_whatever_one_image_does_the_reports_are_written(run, pair, tmp_path, monkeypatch):
+def test_reports_are_written_if_one_image_fails(run, pair, tmp_path, monkeypatch):
     compare = methods.compare
 
     def fail(method, one, two, **options):
@@ -193,8 +195,8 @@ def test_whatever_one_image_does_the_reports_are_written(run, pair, tmp_path, mo
     files = [tmp_path / name for name in ("out.html", "out.xml", "out.json")]
     words = [word for pair in zip(("--report", "--junit", "--json"), files, strict=True) for word in pair]
     code, out, err = run("diff", *pair, *words, "--github")
-    said = f"mi-refract: {pair[1]}/equal.exr: out of memory: Unable to allocate 9 GiB\n"
-    assert (code, err) == (2, f"{said}mi-refract: {tmp_path}/none/summary.md: No such file or directory\n")
+    message = f"mi-refract: {pair[1]}/equal.exr: out of memory: Unable to allocate 9 GiB\n"
+    assert (code, err) == (2, f"{message}mi-refract: {tmp_path}/none/summary.md: No such file or directory\n")
     assert "2 images: 1 could not be compared, 1 different" in out.splitlines()
     for text in (file.read_text() for file in files):
         assert "out of memory" in text and "louder.exr" in text
@@ -202,7 +204,7 @@ def test_whatever_one_image_does_the_reports_are_written(run, pair, tmp_path, mo
     assert "Traceback" in run("diff", *pair)[2]
 
 
-def test_images_larger_than_allowed(run, pair):
+def test_images_above_max_values(run, pair):
     names = [pair[0] / "louder.exr", pair[1] / "louder.exr"]
     for words in (["diff", *names], ["accept", *names, "--yes"], ["self-test", names[0]]):
         code, out, err = run(*words, "--max-values", 100)
@@ -244,7 +246,7 @@ BAD = {
 
 @pytest.mark.parametrize("words, message", BAD.values(), ids=BAD)
 @pytest.mark.parametrize("verb", ["diff", "accept"])
-def test_bad_words(run, pair, tmp_path, verb, words, message):
+def test_bad_arguments(run, pair, tmp_path, verb, words, message):
     if verb == "accept" and {"--renders", "--inconclusive", "--report", "--junit", "--json"} & {*words.split()}:
         pytest.skip("not one of its options")
     (tmp_path / "empty").mkdir()
@@ -258,7 +260,7 @@ def test_bad_words(run, pair, tmp_path, verb, words, message):
 
 
 @pytest.mark.parametrize(("verb", "package"), [("diff", "scipy"), ("accept", "scipy"), ("report", "jinja2")])
-def test_without_the_extra(run, pair, monkeypatch, tmp_path, verb, package):
+def test_missing_extra_diff(run, pair, monkeypatch, tmp_path, verb, package):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else find(name))
     words = ["diff", "--report", tmp_path / "out.html"] if verb == "report" else [verb]
@@ -282,8 +284,8 @@ def test_report(run, pair, tmp_path):
 
 
 @pytest.fixture
-def strange(pair):
-    """The pair with a third whose name is anything but text, added."""
+def pair_with_evil_name(pair):
+    """`pair` with an added third image whose name is hostile to every report."""
     image(pair[1] / "inner.exr")
     (pair[1] / "inner.exr").rename(pair[1] / EVIL)
     return pair
@@ -293,20 +295,20 @@ PUBLISHED = DOCS / "_static" / f"diff-report-{results_file.SCHEMA}.schema.json"
 
 
 def read_json(path):
-    """The report of `--json`, which is strict JSON, and what the published schema says and no more."""
+    """Return the report of `--json`, after checking that it is strict JSON with exactly the keys of the schema."""
     data = json.loads(path.read_text(), parse_constant=pytest.fail)
     msgspec.convert(data, results_file.Document)
     kinds = json.loads(PUBLISHED.read_text())["$defs"]
-    digests = [each["digests"] for each in data["results"] if each["digests"]]
-    numbers = [number for each in data["results"] for number in each["metrics"]]
-    parts = {"Document": [data], "Entry": data["results"], "Digests": digests, "MeasuredNumber": numbers}
-    for name, found in parts.items():
-        assert all(list(each) == list(kinds[name]["properties"]) == kinds[name]["required"] for each in found)
+    digests = [entry["digests"] for entry in data["results"] if entry["digests"]]
+    numbers = [number for entry in data["results"] for number in entry["metrics"]]
+    objects = {"Document": [data], "Entry": data["results"], "Digests": digests, "MeasuredNumber": numbers}
+    for name, items in objects.items():
+        assert all(list(x) == list(kinds[name]["properties"]) == kinds[name]["required"] for x in items)
     return data
 
 
-def test_the_published_schema_is_that_of_the_command(run):
-    """Where this fails: a key that has gone, or means something else, needs another number; a new one only the file."""
+def test_published_schema_equals_json_schema(run):
+    """If this fails: a removed or changed key needs a new schema number; a new key only needs a new file."""
     assert run("diff", "--json-schema") == (0, PUBLISHED.read_text("utf-8"), "")
     document = json.loads(PUBLISHED.read_text())["$defs"]["Document"]
     assert document["properties"]["schema"] == {"enum": [results_file.SCHEMA]}
@@ -323,23 +325,23 @@ def test_every_report_follows_the_schema(run, folders, tmp_path):
     out = tmp_path / "out.json"
     assert run("diff", old, new, "--json", out)[0] == 2
     entries = read_json(out)["results"]
-    assert {each["status"] for each in entries} == {"error", "different", "skipped"}
-    assert {each["category"] for each in entries} == {"unknown", "changed", "added", "removed"}
+    assert {entry["status"] for entry in entries} == {"error", "different", "skipped"}
+    assert {entry["category"] for entry in entries} == {"unknown", "changed", "added", "removed"}
     renders = samples(tmp_path / "a", 2), samples(tmp_path / "b", 2, 100)
     assert run("diff", *renders, "--renders", "--json", out)[0] == 3
     assert read_json(out)["results"][0]["minimum_detectable_difference"] > 0
 
 
 @pytest.mark.parametrize(("connected", "code"), [("| sleep 0", 1), (">/dev/full", 2)])
-def test_the_json_is_written_whatever_becomes_of_what_is_printed(pair, tmp_path, connected, code):
+def test_json_is_written_if_stdout_fails(pair, tmp_path, connected, code):
     words = [sys.executable, "-u", "-m", "mi_refract.cli", "diff", *pair, "--json", tmp_path / "out.json"]
     command = ["bash", "-c", f'set -o pipefail; "$@" {connected}', "bash", *map(str, words)]
     assert subprocess.run(command, env=ENVIRONMENT, capture_output=True, timeout=60).returncode == code
     assert read_json(tmp_path / "out.json")["exit_code"] == 1
 
 
-def test_json(run, strange, tmp_path):
-    old, new = strange
+def test_json(run, pair_with_evil_name, tmp_path):
+    old, new = pair_with_evil_name
     out = tmp_path / "out.json"
     assert run("diff", old, new, "--json", out)[0] == 1
     data = read_json(out)
@@ -358,8 +360,8 @@ def test_json(run, strange, tmp_path):
     assert run(*shlex.split(changed["reproduce"])[1:])[0] == 1
 
 
-def test_junit(run, strange, tmp_path):
-    old, new = strange
+def test_junit(run, pair_with_evil_name, tmp_path):
+    old, new = pair_with_evil_name
     (new / "equal.exr").unlink()
     out = tmp_path / "out.xml"
     assert run("diff", old, new, "--junit", out)[0] == 1
@@ -371,8 +373,8 @@ def test_junit(run, strange, tmp_path):
     assert "reproduce: mi-refract diff " in failures["louder.exr"].text
 
 
-def test_github(run, strange, tmp_path, monkeypatch):
-    old, new = strange
+def test_github(run, pair_with_evil_name, tmp_path, monkeypatch):
+    old, new = pair_with_evil_name
     BROKEN["empty"](new / "equal.exr")
     summary = tmp_path / "summary.md"
     summary.write_text("before\n")
@@ -409,7 +411,7 @@ def test_github(run, strange, tmp_path, monkeypatch):
         ("https://x.io/r (1)/a.html", "7", "Report: [out.html](https://x.io/r%20%281%29/a.html)\n"),
     ],
 )
-def test_the_summary_names_the_report_and_links_it_where_it_is_published(tmp_path, monkeypatch, url, run_id, words):
+def test_summary_names_the_report_and_links_to_its_address(tmp_path, monkeypatch, url, run_id, words):
     for name, value in {"SERVER_URL": "https://g", "REPOSITORY": "a/b", "RUN_ID": run_id}.items():
         monkeypatch.setenv(f"GITHUB_{name}", value)
     assert words in text_reports.markdown(Results(tmp_path, tmp_path, ()), "out.html", url)
@@ -418,14 +420,14 @@ def test_the_summary_names_the_report_and_links_it_where_it_is_published(tmp_pat
 WARNED = "fail=.05 fail_percent=99 warn=1e-6 warn_relative=0"
 
 
-def test_a_warning_is_in_every_report_and_no_failure(run, pair, tmp_path, monkeypatch):
+def test_every_report_contains_a_warning_without_a_failure(run, pair, tmp_path, monkeypatch):
     out, data, summary, page = (tmp_path / f"out.{ending}" for ending in ("xml", "json", "md", "html"))
     monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(summary))
     monkeypatch.setenv("MI_REFRACT_REPORT_URL", "https://x.io/")
-    for i in range(30):  # many equal images hide no warning
+    for i in range(30):  # many equal images do not hide the warning
         for side in pair:
             image(side / f"{i:02}.exr", shape=(4, 4, 3))
-    words = [word for each in WARNED.split() for word in ("--set", each)]
+    words = [word for setting in WARNED.split() for word in ("--set", setting)]
     files = ["--junit", out, "--json", data, "--github", "--report", page]
     code, text, _ = run("diff", *pair, "--method", "tolerance", *words, *files)
     lines = text.splitlines()
@@ -433,14 +435,13 @@ def test_a_warning_is_in_every_report_and_no_failure(run, pair, tmp_path, monkey
     assert lines[1].split()[:2] == ["equal", "louder.exr"]
     warning = "warning: 100 % of the pixels (1536 of 1536) differ by more than warn = 1e-06 (> warn_percent = 0)"
     assert warning in lines[1] and html.escape(warning) in out.read_text() and "warn_percent" in page.read_text()
-    counted = text_reports.FEW + 2
-    assert lines[counted:-1] == [
+    assert lines[text_reports.FEW + 2 : -1] == [
         f"… and {31 - text_reports.FEW} more that are equal",
         "32 images: 32 equal, 1 with a warning",
     ]
     assert lines[-1].startswith("::warning ") and warning.replace("%", "%25") in lines[-1]
     assert not ElementTree.parse(out).findall(".//failure")
-    assert [each["name"] for each in json.loads(data.read_text())["results"] if each["warning"]] == ["louder.exr"]
+    assert [entry["name"] for entry in json.loads(data.read_text())["results"] if entry["warning"]] == ["louder.exr"]
     assert summary.read_text().count("\n| equal |") == 1 and "](https://x.io/)\n" in summary.read_text()
     words[1] = "fail=.01"
     code, text, _ = run("diff", *pair, "--method", "tolerance", *words[:2], "--set", "fail_relative=0", *files)
@@ -452,7 +453,7 @@ def test_a_warning_is_in_every_report_and_no_failure(run, pair, tmp_path, monkey
     assert bound in failure.get("message") and bound in text
 
 
-def test_columns_are_aligned_and_verdicts_coloured_where_colours_are_wanted(run, pair, monkeypatch, capfd):
+def test_aligned_columns_and_coloured_verdicts(run, pair, monkeypatch, capfd):
     text_reports.print_table([("verdict", "image", "why"), ("ガラス", "球.exr", "x" * 300), ("e\u0301", "[b].exr", "")])
     lines = [line.rstrip() for line in capfd.readouterr().out.splitlines()]
     assert lines == ["verdict  image    why", f"ガラス   球.exr   {'x' * 300}", "e\u0301        [b].exr"]

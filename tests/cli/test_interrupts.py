@@ -1,4 +1,4 @@
-"""Ctrl-C ends the process of a command at once, whatever its threads do; nobody else's SIGINT changes."""
+"""Ctrl-C ends a command's process at once, whatever its threads do; callers from Python keep their own SIGINT."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from mi_refract import cli
 from validation.run.context import SCENES
 
 
-def interrupted(process, code, number=signal.SIGINT):
-    """Send the signal; it ends with this code, soon."""
+def interrupt(process, code, number=signal.SIGINT):
+    """Send the signal and check that the process ends soon, with this exit code."""
     try:
         process.send_signal(number)
         assert process.wait(timeout=30) == code, process.stderr.read()
     finally:
-        process.kill()  # or a failure would wait for it without end
+        process.kill()  # otherwise a failed assertion would wait for the process forever
 
 
-# A libLLVM is tried, which takes a minute; it says so itself.
+# The test of a libLLVM takes a minute; its process prints whether SIGINT is blocked.
 PROBING = """
 import os, sys
-os.environ.pop("DRJIT_LIBLLVM_PATH", None)  # which would be believed untried where it names no file
+os.environ.pop("DRJIT_LIBLLVM_PATH", None)  # a path without a file would be used without a test
 from mi_refract import backend, cli
 backend.candidates = lambda: ["/proc/self/exe"]
 backend._PROBE = '''
@@ -35,25 +35,25 @@ time.sleep(60)
 '''
 sys.exit(cli.main())
 """
-# And so does a program that is given rays.
+# A program that gets rays prints the same.
 PROGRAM = "import os, signal, time\nif signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, []):\n"
 PROGRAM += " os.write(2, b'free\\n')\ntime.sleep(60)"
 
 
-def test_programs_that_are_started_heed_it_and_leave_nothing(tmp_path):
+def test_child_processes_end_on_ctrl_c_and_leave_no_files(tmp_path):
     words = ["render", SCENES / "sphere.xml", "-o", tmp_path / "out.exr"]
     with python(PROBING, *words, TMPDIR=str(tmp_path), XDG_CACHE_HOME=str(tmp_path / "none")) as process:
         assert process.stdout.readline() == "free\n"
         assert [*tmp_path.iterdir()]
-        interrupted(process, 130)
+        interrupt(process, 130)
     assert not [*tmp_path.iterdir()]
     code = "import sys\nfrom mi_refract import cli\nsys.exit(cli.main())"
     with python(code, "rays", "run", "--count", "10", "--", sys.executable, "-c", PROGRAM) as process:
-        assert "free\n" in iter(process.stderr.readline, "")  # Dr.Jit may have said something of its own before
-        interrupted(process, 130)
+        assert "free\n" in iter(process.stderr.readline, "")  # after lines of Dr.Jit, if any
+        interrupt(process, 130)
 
 
-# Interrupted while a temporary folder and a temporary file are there; the thread that makes them goes on regardless.
+# Interrupted while a temporary folder and a temporary file exist; the thread that makes them continues regardless.
 UNFINISHED = """
 import sys, time
 from pathlib import Path
@@ -79,12 +79,12 @@ sys.exit(cli.main())
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_what_is_unfinished_is_removed_also_where_a_thread_makes_it_anew(number, tmp_path):
-    code = f"import signal\nsignal.signal({number:d}, signal.SIG_DFL)\n{UNFINISHED}"  # nohup has it ignored
+def test_temporary_files_are_removed_even_if_a_thread_recreates_them(number, tmp_path):
+    code = f"import signal\nsignal.signal({number:d}, signal.SIG_DFL)\n{UNFINISHED}"  # under nohup SIGHUP is ignored
     with python(code, tmp_path, TMPDIR=str(tmp_path)) as process:
         assert process.stdout.readline() == "there\n"
         assert len([*tmp_path.iterdir()]) == 2
-        interrupted(process, 128 + number, number)
+        interrupt(process, 128 + number, number)
         assert process.stderr.read() == ""
     assert not [*tmp_path.iterdir()]
 
@@ -103,12 +103,12 @@ sys.exit(cli.main())
 """
 
 
-def test_a_background_job_goes_on_where_nothing_is_rendered():
+def test_a_background_job_that_does_not_render_ignores_sigint():
     with python(BACKGROUND, "trace") as process:
         assert (process.communicate(timeout=60), process.returncode) == (("", ""), 7)
 
 
-def test_a_caller_from_python_keeps_his_own(capsys):
+def test_a_caller_from_python_keeps_its_signal_handling(capsys):
     def state():
         return signal.getsignal(signal.SIGINT), signal.pthread_sigmask(signal.SIG_BLOCK, [])
 

@@ -1,4 +1,4 @@
-"""`mi-refract rays`: what it prints, and other people's programs."""
+"""`mi-refract rays`: its output, reports and errors, with programs that answer rays."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from support.readme import DOCS, blocks, python_blocks
 
 from mi_refract.ray_sets import files, ray_set
 
-# A renderer's side of it, with nothing of ours: the comment on stderr must get through.
+# A renderer's program, without this package. Its line on stderr must be passed on.
 PROGRAM = """
 import sys, numpy as np
 rows = [line for line in sys.stdin if not line.startswith("#")][1:]
@@ -47,21 +47,21 @@ def program(tmp_path):
 
 @pytest.fixture
 def call(tmp_path, monkeypatch, run):
-    """`call("check", …)`: exit code, stdout, stderr of `mi-refract rays …` in an empty folder."""
+    """`call("check", …)`: exit code, stdout and stderr of `mi-refract rays …`, run in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return lambda *arguments: run("rays", *arguments)
 
 
 def one_line(out):
-    """What was printed, without its line ends, no line of which is too long for a terminal."""
-    assert max(map(len, out.splitlines()[1:])) <= 80  # the first begins with the name of the program
+    """Return the output as one line, after checking that its lines fit on a terminal."""
+    assert max(map(len, out.splitlines()[1:])) <= 80  # the first line begins with the name of the program
     return " ".join(out.split())
 
 
-def answer(to, lines=()):
-    b = glsl(to.rays.a, to.rays.n, to.rays.k).astype(float)
-    rows = [f"{i},{x!r},{y!r},{z!r}" for i, (x, y, z) in zip(to.ids, b.tolist(), strict=True)]
-    Path("answers.csv").write_text("\n".join([*lines, "id,bx,by,bz", *rows, ""]))
+def write_answers(rays, header=()):
+    b = glsl(rays.rays.a, rays.rays.n, rays.rays.k).astype(float)
+    rows = [f"{i},{x!r},{y!r},{z!r}" for i, (x, y, z) in zip(rays.ids, b.tolist(), strict=True)]
+    Path("answers.csv").write_text("\n".join([*header, "id,bx,by,bz", *rows, ""]))
 
 
 # export and check
@@ -70,7 +70,7 @@ def answer(to, lines=()):
 def test_export_and_check(call):
     code, out, err = call("export", *FEW, "--precision", "f64", "--seed", 3, "-o", "rays.csv")
     assert (code, out, err) == (0, "rays.csv: 120 rays, 2 regimes, f64, seed 3\n", "")
-    answer(files.read("rays.csv"))
+    write_answers(files.read("rays.csv"))
     code, out, err = call("check", "answers.csv", "--rays", "rays.csv")
     assert (code, err) == (0, "")
     assert "120 answers, all right; the largest error is" in out
@@ -81,7 +81,7 @@ def test_export_and_check(call):
     code, out, err = call("export", "--regimes")
     assert (code, err, len(out.splitlines()), "only with --regime" in out) == (0, "", 19, True)
     assert call("export", "--regime", "k >> 1", "--count", 60, "-o", "rays.csv")[0] == 0
-    answer(files.read("rays.csv"))
+    write_answers(files.read("rays.csv"))
     check = "check", "answers.csv", "--rays", "rays.csv"
     assert call(*check)[0] == 0
     code, out, _ = call(*check, "--backward-error", "8", "--report", "out.html")
@@ -92,20 +92,20 @@ def test_export_and_check(call):
     assert (code, out, err) == (2, "", "mi-refract: answers.csv: line 3 is '1,0,1'; expected 4 numbers\n")
 
 
-def test_answers_do_not_choose_the_rays(call):
-    """Right answers to one easy ray, with the header of that ray, are none to others."""
-    to = ray_set.make(["near-normal"], 1)
-    top = [line for line in files.as_csv(to).splitlines() if line.startswith("#")]
-    files.write("one.csv", to)
+def test_answers_do_not_select_the_rays(call):
+    """Right answers to one easy ray, with the header of that ray, are refused for other rays."""
+    rays = ray_set.make(["near-normal"], 1)
+    header = [line for line in files.as_csv(rays).splitlines() if line.startswith("#")]
+    files.write("one.csv", rays)
     files.write("others.csv", ray_set.make())
-    answer(to, top)
+    write_answers(rays, header)
     assert call("check", "answers.csv", "--rays", "one.csv")[0] == 0
     code, _, err = call("check", "answers.csv", "--rays", "others.csv")
-    assert (code, "the answers are to rays with the checksum 'sha256:" in err) == (2, True)
-    answer(to, [line for line in top if "checksum" not in line])
+    assert (code, "the answers belong to rays with the checksum 'sha256:" in err) == (2, True)
+    write_answers(rays, [line for line in header if "checksum" not in line])
     code, out, _ = call("check", "answers.csv", "--rays", "others.csv")
     assert (code, "12999 without an answer" in out) == (2, True)
-    answer(ray_set.make())
+    write_answers(ray_set.make())
     code, out, _ = call("check", "answers.csv")
     assert (code, out.splitlines()[0]) == (0, "answers.csv: 13000 rays, 13 regimes, f32, seed 0")
 
@@ -146,7 +146,7 @@ def test_invalid_options(call, message):
     assert not list(Path.cwd().iterdir())
 
 
-def test_what_is_not_installed_is_named_and_a_pipe_refused_before_rays_are_made(call, monkeypatch):
+def test_missing_packages_and_pipes_are_refused_before_rays_are_made(call, monkeypatch):
     find = importlib.util.find_spec
     for package, words in (("flint", ()), ("jinja2", ("--report", "out.html"))):
         with monkeypatch.context() as patch:
@@ -154,7 +154,7 @@ def test_what_is_not_installed_is_named_and_a_pipe_refused_before_rays_are_made(
             code, _, err = call(*CHECK, *words)
         assert (code, "pip install 'mi-refract[validation]'" in err) == (2, True)
     os.mkfifo("rays.csv")
-    monkeypatch.setattr(ray_set, "make", lambda *names, **how: pytest.fail("made"))
+    monkeypatch.setattr(ray_set, "make", lambda *names, **options: pytest.fail("made"))
     code, out, err = call("export", "-o", "rays.csv")
     assert (code, out, err) == (2, "", "mi-refract: rays.csv: is a pipe; expected the name of a file\n")
 
@@ -162,7 +162,7 @@ def test_what_is_not_installed_is_named_and_a_pipe_refused_before_rays_are_made(
 # run
 
 
-def test_programs_that_are_right_and_wrong_in_every_report(call, program):
+def test_right_and_wrong_programs_in_every_report(call, program):
     code, out, err = call("run", *FEW, "--json", "out.json", "--", *program)
     assert (code, err) == (0, "traced 120\n") and "120 rays, 2 regimes, f32, seed 0" in out
     assert json.loads(Path("out.json").read_text())["exit_code"] == 0
@@ -182,8 +182,8 @@ def test_programs_that_are_right_and_wrong_in_every_report(call, program):
     assert (code, out.splitlines()[-1]) == (2, "no ray was answered") and "" not in out.splitlines()
 
 
-def test_the_page_shows_what_is_printed_and_the_table_is_printed_when_it_is_wanted(call, program):
-    """All but the numbers, whose last digits depend on NumPy."""
+def test_output_equals_the_how_to_page_with_and_without_table(call, program):
+    """Numbers are masked: their last digits depend on NumPy."""
     page = DOCS / "how-to/check-a-shaders-rays.md"
     Path("my_tracer.py").write_text(python_blocks(page)[0])
     code, out, _ = call("run", "--", sys.executable, "my_tracer.py")
@@ -197,17 +197,17 @@ def test_the_page_shows_what_is_printed_and_the_table_is_printed_when_it_is_want
 
 
 @pytest.mark.parametrize("command", ["export", "check", "run"])
-def test_the_help_of_a_command_names_only_options_that_it_has(call, command):
+def test_help_names_only_options_of_the_command(call, command):
     code, out, _ = call(command, "--help")
-    has = set(re.findall("^  (?:-o, )?(--[a-z-]+)", out, re.MULTILINE))
-    assert (code, set(re.findall("--[a-z][a-z-]+", out)) - has) == (0, set())
+    options = set(re.findall("^  (?:-o, )?(--[a-z-]+)", out, re.MULTILINE))
+    assert (code, set(re.findall("--[a-z][a-z-]+", out)) - options) == (0, set())
 
 
 BAD_PROGRAMS = {
     "ended with status 3; expected": "import sys; sys.stdin.read(); print('id,bx,by,bz'); sys.exit(3)",
     "was killed by SIGSEGV; expected": "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
     "the table is empty": "pass",
-    "bytes of output; expected one answer a ray": "while True: print('id,bx,by,bz' * 1000)",
+    "bytes of output; expected one answer per ray": "while True: print('id,bx,by,bz' * 1000)",
     "the first row is 'hello'": "print('hello'); print('id,bx,by,bz')",
     "not text": "import os; os.write(1, bytes(range(256)))",
 }
@@ -229,14 +229,14 @@ time.sleep(600)
 
 
 def parent(path, rest, **streams):
-    """A program that starts CHILD, which leaves its number in `path`."""
+    """Return a command that starts CHILD, which writes its process id to `path`."""
     pipes = "".join(f", {name}=subprocess.{value}" for name, value in streams.items())
     code = f"p = subprocess.Popen([sys.executable, '-c', {CHILD!r}, {str(path)!r}]{pipes})"
     return [sys.executable, "-c", f"import os, subprocess, sys, time\n{code}\n{rest}"]
 
 
 def assert_ended(path):
-    """It does not run; a killed one may wait for whoever collects it."""
+    """Check that the child no longer runs; it may still be a zombie."""
     status, deadline = Path(f"/proc/{path.read_text()}/status"), time.monotonic() + 60
     while status.exists() and "zombie" not in status.read_text() and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -244,10 +244,10 @@ def assert_ended(path):
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="asks /proc who runs")
-def test_a_timeout_and_an_answer_end_the_whole_group(call, tmp_path):
-    """A program whose child holds on to its stdout; and one that answers, whose child let go of stdout and sleeps."""
+def test_timeout_and_answers_end_the_whole_process_group(call, tmp_path):
+    """A program whose child keeps stdout open; and one that answers, whose child has closed stdout and sleeps."""
     for rest in ("p.wait()", ""):
-        for timeout in (2, 20, 100):  # a busy machine takes its time to start two of them
+        for timeout in (2, 20, 100):  # a busy machine may take long to start two processes
             code, _, err = call("run", *FEW, "--timeout", timeout, "--", *parent(tmp_path / "child", rest))
             assert (code, f"did not finish within {timeout} s; set a longer --timeout" in err) == (2, True)
             if (tmp_path / "child").exists():
@@ -260,22 +260,22 @@ def test_a_timeout_and_an_answer_end_the_whole_group(call, tmp_path):
     assert_ended(tmp_path / "child")
 
 
-def test_answers_larger_than_a_pipe_and_the_callers_environment_and_folder(tmp_path):
-    """A program that answers before it has read everything; and one that reads nothing."""
+def test_answers_beyond_a_pipe_buffer_and_environment_and_folder(tmp_path):
+    """A program that answers before it has read all rays; and one that reads none."""
     echo = "import sys; print('id,bx,by,bz')\nfor i in range(3000): print(f'{i},0,0,{i}' + ' ' * 50)\n"
     for rest in ("sys.stdin.read()", ""):
-        found = files.answers_of([sys.executable, "-u", "-c", echo + rest], ray_set.make(["generic"], 3000))
-        np.testing.assert_array_equal(found.b[:, 2], np.arange(3000))
+        answers = files.answers_of([sys.executable, "-u", "-c", echo + rest], ray_set.make(["generic"], 3000))
+        np.testing.assert_array_equal(answers.b[:, 2], np.arange(3000))
     code = "import os; print('id,bx,by,bz'); print('0,0,0,' + os.environ['Z']); open('here', 'w')"
     env = {**os.environ, "Z": "7"}
-    found = files.answers_of([sys.executable, "-c", code], ray_set.make(["generic"], 1), cwd=tmp_path, env=env)
-    assert found.b[0, 2] == 7 and (tmp_path / "here").exists()
+    answers = files.answers_of([sys.executable, "-c", code], ray_set.make(["generic"], 1), cwd=tmp_path, env=env)
+    assert answers.b[0, 2] == 7 and (tmp_path / "here").exists()
 
 
 # Media
 
 GLASSES = ("--regime", "generic", "--count", 20, "--precision", "f64", "--seed", 4, *OF_MEDIA)
-# A program that looks up its own index, by the names of the media.
+# A program that computes its own indices, from the names of the media.
 TRACER = """
 import sys, json, numpy as np
 lines = sys.stdin.read().splitlines()
@@ -299,11 +299,11 @@ for i, row, r in zip(x[:, 0], b.tolist(), k[:, 0].tolist()):
 
 
 def test_a_lens_tracer_with_its_own_indices(call, tmp_path):
-    made = "rays.csv: 20 rays, 1 regime, f64, seed 4, 2 media at 2 wavelengths\n"
-    assert call("export", *GLASSES, "-o", "rays.csv")[:2] == (0, made)
+    summary = "rays.csv: 20 rays, 1 regime, f64, seed 4, 2 media at 2 wavelengths\n"
+    assert call("export", *GLASSES, "-o", "rays.csv")[:2] == (0, summary)
     (tmp_path / "tracer.py").write_text(TRACER)
-    for chosen in (("--rays", "rays.csv"), GLASSES):
-        words = ("run", *chosen, "--json", "out.json", "--report", "out.html", "--", sys.executable, "tracer.py")
+    for rays in (("--rays", "rays.csv"), GLASSES):
+        words = ("run", *rays, "--json", "out.json", "--report", "out.html", "--", sys.executable, "tracer.py")
         assert call(*words)[::2] == (0, "")
         assert json.loads(Path("out.json").read_text())["functions"][0]["n_ratio"]["largest"] < 1e-15
     assert "--wavelengths 486.1327,587.5618" in Path("out.html").read_text()
@@ -314,7 +314,7 @@ def test_a_lens_tracer_with_its_own_indices(call, tmp_path):
 
 
 @pytest.mark.filterwarnings("default")
-def test_an_index_beyond_the_makers_fit_is_a_warning_in_one_line(call):
+def test_an_extrapolated_index_is_a_warning_in_one_line(call):
     code, _, err = call("export", "--medium", "CDGM:D-ZF93", "--wavelengths", "2325", "-o", "r.csv")
     assert (code, err.count("\n")) == (0, 1)
     assert err.startswith("mi-refract: CDGM:D-ZF93: the index at 2325 nm is an extrapolation; ")

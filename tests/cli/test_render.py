@@ -1,4 +1,4 @@
-"""`mi-refract render`: the image, its header, what is left behind, and with which exit code."""
+"""`mi-refract render`: the image, its header, the remaining files, and exit codes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mi_refract import SCENES, backend
 from mi_refract.io.image_file import installed_version, read_exr
 from mi_refract.rendering.pass_plan import scalar_seed_of
 
-# With a wider filter, the order in which threads finish shows in the last bits.
+# With a wider filter, the last bits depend on the order in which threads finish.
 SCENE = GLASS.replace("</film>", '<rfilter type="box"/></film>')
 
 
@@ -29,17 +29,17 @@ def scene(tmp_path):
 
 @pytest.fixture
 def render(scene, run):
-    """`render("--spp", 2)`: exit code, stdout, stderr of rendering `scene` to out.exr in scalar_rgb."""
+    """`render("--spp", 2)`: exit code, stdout and stderr of rendering `scene` to out.exr in scalar_rgb."""
 
     def call(*options, scene=scene, output=None, variant="scalar_rgb"):
-        chosen = ["--variant", variant] if variant else []
-        return run("render", scene, "-o", output or scene.with_name("out.exr"), *chosen, *options)
+        words = ["--variant", variant] if variant else []
+        return run("render", scene, "-o", output or scene.with_name("out.exr"), *words, *options)
 
     return call
 
 
 def passes_by_mitsuba(scene, spp, seed=0, **parameters):
-    """Passes of one sample each, and their variance: what a short render in a scalar variant is made of."""
+    """Return mean and variance of passes of one sample, of which a short render in a scalar variant consists."""
     loaded = mi.load_file(str(scene), **parameters)
     passes = np.array(
         [np.array(mi.render(loaded, spp=1, seed=scalar_seed_of(seed, p, 48))) for p in range(spp)], np.float64
@@ -47,8 +47,8 @@ def passes_by_mitsuba(scene, spp, seed=0, **parameters):
     return passes.mean(0).astype(np.float32), passes.var(0, ddof=1)
 
 
-def test_the_image_is_mitsubas_and_the_header_says_how_it_was_made(render, scene, monkeypatch):
-    monkeypatch.setenv("FORCE_COLOR", "1")  # as CI and notebooks set it: colours, but no moving bar in a pipe
+def test_image_equals_mitsubas_and_header_has_the_provenance(render, scene, monkeypatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")  # set by CI and notebooks: colours, but no progress bar in a pipe
     code, out, err = render("--spp", 9, "--seed", 3, "-D", "bsdf=refract")
     assert (code, err) == (0, "") and "out.exr: scalar_rgb, 9 spp in 9 passes" in out
     pixels, header = read_exr(scene.with_name("out.exr"))
@@ -71,7 +71,7 @@ def test_the_image_is_mitsubas_and_the_header_says_how_it_was_made(render, scene
     }
     assert {name: header[f"mi_refract:{name}"] for name in expected} == expected
     assert header["mi_refract:render_seconds"] > 0 and header["Software"] == f"mi_refract {mi_refract.__version__}"
-    # As OpenImageIO sorts them.
+    # In the order of OpenImageIO.
     assert header["channels"] == ("R", "G", "B", "B.variance", "G.variance", "R.variance")
     again = render("--spp", 9, "--seed", 3, "-D", "bsdf=refract")
     assert again == (0, out, f"{scene.with_name('out.exr')}: complete with 9 spp\n")
@@ -83,7 +83,7 @@ def test_the_image_is_mitsubas_and_the_header_says_how_it_was_made(render, scene
 
 
 @pytest.mark.parametrize("integrator", ["path", "refract_path", "ptracer"])
-def test_light_that_is_missing_is_named_on_stderr_and_in_the_header(render, scene, integrator):
+def test_missing_light_is_reported_on_stderr_and_in_the_header(render, scene, integrator):
     lamp = '<emitter type="point"><point name="position" value="0, 4, 0"/></emitter>'
     text = SCENE.replace('<emitter type="constant"/>', lamp).replace('"path"', f'"{integrator}"')
     scene.write_text(text)
@@ -99,7 +99,7 @@ def test_light_that_is_missing_is_named_on_stderr_and_in_the_header(render, scen
 
 
 @pytest.mark.parametrize("usable", [True, False])
-def test_the_best_variant_is_the_default(render, scene, monkeypatch, needs_variant, usable):
+def test_default_variant_is_the_best(render, scene, monkeypatch, needs_variant, usable):
     if usable:
         needs_variant("llvm_ad_rgb")
     else:
@@ -173,32 +173,32 @@ def test_bad_input(render, scene, changed, options, message):
     assert [path for path in scene.parent.iterdir() if not path.is_symlink()] == [scene]
 
 
-def test_settings_replace_those_of_the_scene(render, scene):
-    """The image is that of the scene with another sampler; without the option it is another render."""
+def test_settings_option_replaces_the_scenes_settings(render, scene):
+    """The image equals that of the scene with another sampler; without the option it belongs to another render."""
     sampler = SCENE.replace('"independent"', '"stratified"')
     options = "--spp", 4, "--pass-spp", 4
     assert render(*options, "--settings", "sampler=stratified")[0] == 0
     pixels, header = read_exr(scene.with_name("out.exr"))
     assert header["mi_refract:settings"] == "sampler=stratified"
-    assert render(*options)[2] == ""  # from its first pass on
+    assert render(*options)[2] == ""  # does not resume
     assert read_exr(scene.with_name("out.exr"))[1]["mi_refract:settings"] == "the scene's own"
     scene.write_text(sampler)
     assert render(*options)[0] == 0
     np.testing.assert_array_equal(read_exr(scene.with_name("out.exr"))[0], pixels)
 
 
-def test_a_plugin_of_the_scenes_own_runs_only_where_it_is_allowed(render, scene):
-    """Then Mitsuba tries to load it, and says that it is no native code."""
+def test_a_plugin_shipped_with_a_scene_needs_allow_plugins(render, scene):
+    """If it is allowed, Mitsuba tries to load it and fails, because it is not native code."""
     scene.with_name("plugins").mkdir()
     (scene.parent / "plugins" / "evil.so").write_text("native code")
-    said = "expected those; to load native code shipped with a scene, pass --allow-plugins evil"
-    assert_refused(render("-D", "bsdf=evil"), said)
+    message = "expected those; to load native code shipped with a scene, pass --allow-plugins evil"
+    assert_refused(render("-D", "bsdf=evil"), message)
     allowed = render("-D", "bsdf=evil", "--allow-plugins", "other", "--allow-plugins", "evil")
     assert_refused(allowed, "Error while loading plugin", "plugins/evil.so")
 
 
-def test_what_fails_keeps_the_old_image(render, scene):
-    """A plugin that is not there, a rendering that is cut short, and a pipe in place of the scene."""
+def test_a_failed_render_keeps_the_old_image(render, scene):
+    """A missing plugin, a render that is cut short, and a pipe in place of the scene."""
     output = scene.with_name("out.exr")
     output.write_text("old")
     assert render("-D", "bsdf=nonesuch")[0] == 2

@@ -1,4 +1,4 @@
-"""`mi-refract render --scheduler` and `--workers`: exit codes, messages, what is kept and ended; and by TLS."""
+"""`mi-refract render --scheduler` and `--workers`: exit codes, messages, ended processes, checkpoints, TLS."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def test_misuse(render, scene, options, message, monkeypatch, tmp_path_factory):
     if "--bundle-limit" in options:
         sky = tmp_path_factory.mktemp("sky") / "a.ppm"
         sky.write_bytes(b"P6 600 600 255 " + bytes(3 * 600**2))
-        named = f'<emitter type="envmap"><string name="filename" value="{sky}"/></emitter>'
-        scene.write_text(GLASS.replace('<emitter type="constant"/>', named))
+        envmap = f'<emitter type="envmap"><string name="filename" value="{sky}"/></emitter>'
+        scene.write_text(GLASS.replace('<emitter type="constant"/>', envmap))
     if options == ("--workers", 1):
         monkeypatch.setitem(sys.modules, "distributed", None)
     assert_refused(render(*options), message)
@@ -68,7 +68,7 @@ def test_misuse(render, scene, options, message, monkeypatch, tmp_path_factory):
 
 
 def group(leader):
-    """The processes of a process group that have not ended."""
+    """Return the running processes of a process group."""
     members = []
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.NoSuchProcess, ProcessLookupError):
@@ -80,8 +80,8 @@ def group(leader):
 @pytest.mark.parametrize(
     ("number", "victim"), [(signal.SIGINT, "render"), (signal.SIGKILL, "render"), (signal.SIGKILL, "cluster")]
 )
-def test_what_ends_a_render_ends_its_workers_and_leaves_a_checkpoint(render, scene, number, victim):
-    """Ctrl-C and a lost scheduler do; a kill leaves what was written before. The workers block no signal."""
+def test_an_ended_render_ends_its_workers_and_leaves_a_checkpoint(render, scene, number, victim):
+    """Ctrl-C and a lost scheduler leave a new checkpoint, SIGKILL the files as they were. Workers block no signal."""
     preview = scene.with_name("so-far.png")
     words = ("--variant", "scalar_rgb", "--pass-spp", 1, "--workers", 1, "--spp", 100_000, "--preview", preview)
     command = [sys.executable, "-m", "mi_refract.cli", "render", scene, "-o", scene.with_name("out.exr"), *words]
@@ -108,24 +108,24 @@ def test_what_ends_a_render_ends_its_workers_and_leaves_a_checkpoint(render, sce
         return
     code, _, err = render("--time", "0.1s", "--pass-spp", 1)
     done = int(re.search(r"resuming from (\d+) spp", err)[1])
-    found, header = read_exr(scene.with_name("out.exr"))
+    pixels, header = read_exr(scene.with_name("out.exr"))
     assert code == 0 and header["mi_refract:spp"] > done > 0
     assert render("--spp", header["mi_refract:spp"], "--pass-spp", 1, output="local.exr")[0] == 0
-    np.testing.assert_array_equal(found, read_exr(scene.with_name("local.exr"))[0])
+    np.testing.assert_array_equal(pixels, read_exr(scene.with_name("local.exr"))[0])
 
 
-# TLS, with a scheduler and a worker that are started as the how-to says ----------------------------------------------
+# TLS, with a scheduler and a worker that are started as in the how-to ------------------------------------------------
 
 OWN, OTHER = Security.temporary(), Security.temporary()
 MIXED = Security.temporary()
-MIXED.tls_ca_file = OWN.tls_ca_file  # trusts the scheduler, which does not trust it
+MIXED.tls_ca_file = OWN.tls_ca_file  # trusts the scheduler, but the scheduler does not trust it
 DOUBTING = Security(**{f"tls_client_{part}": getattr(OWN, f"tls_client_{part}") for part in ("cert", "key")})
 DOUBTING.tls_ca_file = OTHER.tls_ca_file
 
 
 @pytest.fixture(scope="module")
 def scheduler(tmp_path_factory):
-    """The address of one that asks for TLS; a worker joins it."""
+    """The address of a scheduler that requires TLS and has a worker."""
     folder = tmp_path_factory.mktemp("tls")
     file = folder / "scheduler.json"
     common = ("--scheduler-file", str(file), "--host", "127.0.0.1", "--protocol", "tls")
@@ -135,17 +135,17 @@ def scheduler(tmp_path_factory):
         yield json.loads(file.read_text())["address"]
 
 
-def test_the_bits_by_tls_are_those_of_a_render_here(render, scheduler, scene, monkeypatch):
-    """Also of workers with another libLLVM, which are refused unless mixed workers are accepted."""
+def test_a_render_over_tls_has_the_bits_of_a_local_render(render, scheduler, scene, monkeypatch):
+    """Workers with another libLLVM have the same bits here, but are refused without --mixed-workers."""
     assert scheduler.startswith("tls://")
     passes = ("--spp", 20, "--pass-spp", 1)
     assert render(*passes, output="here.exr")[0] == 0
     expected = read_exr(scene.with_name("here.exr"))[0]
-    own = on_worker.facts
+    facts = on_worker.facts
     with dask.config.set(tls_settings(OWN)):
         assert render("--scheduler", scheduler, *passes)[0] == 0
         np.testing.assert_array_equal(read_exr(scene.with_name("out.exr"))[0], expected)
-        monkeypatch.setattr(on_worker, "facts", lambda variant: own(variant) | {on_worker.LLVM: "99.0"})
+        monkeypatch.setattr(on_worker, "facts", lambda variant: facts(variant) | {on_worker.LLVM: "99.0"})
         code, _, err = render("--scheduler", scheduler, *passes, "--restart")
         assert code == 2 and "is refused: libLLVM unknown, here 99.0" in err
         assert render("--scheduler", scheduler, *passes, "--mixed-workers", "--restart")[0] == 0
@@ -153,7 +153,7 @@ def test_the_bits_by_tls_are_those_of_a_render_here(render, scheduler, scene, mo
 
 
 @pytest.mark.parametrize("security, protocol", [(MIXED, "tls"), (DOUBTING, "tls"), (Security(), "tls"), (OWN, "tcp")])
-def test_who_is_not_trusted_is_refused(render, scheduler, scene, security, protocol):
+def test_untrusted_connections_are_refused(render, scheduler, scene, security, protocol):
     address = scheduler.replace("tls", protocol)
     with dask.config.set(tls_settings(security)):
         outcome = render("--scheduler", address)

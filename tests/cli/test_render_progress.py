@@ -1,4 +1,4 @@
-"""What `mi-refract render` reads and shows: quantities in the units that people write, lines, a bar, previews."""
+"""Quantities that `mi-refract render` parses, and its progress lines, bar and previews."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ NO_TIME = ["0", "0s", "-1", "1x", "", "m", "1m1h", "1e9", "nan", "inf", "10 m", 
     ("parse", "texts", "expected"),
     [(parse_share, NO_SHARE, "more than 0 %, up to 100 %"), (parse_seconds, NO_TIME, "a time of more than 0")],
 )
-def test_what_is_none(parse, texts, expected):
+def test_invalid_quantities_are_refused(parse, texts, expected):
     for text in texts:
         with pytest.raises(ValueError, match=rf"^--option .*; expected {expected}"):
             parse(text, "--option")
 
 
-def test_an_error_has_its_interval_where_there_is_one():
+def test_shown_error_has_its_interval_if_known():
     assert shown_error(RelativeError(0.0042, 0.004, 0.0044)) == "0.42 % (0.4 to 0.44 %)"
     assert shown_error(RelativeError(0.0042)) == "0.42 %"
     assert shown_error(RelativeError(0.0042, at_most=True)) == "at most 0.42 %"
@@ -53,7 +53,7 @@ def test_an_error_has_its_interval_where_there_is_one():
 
 @pytest.fixture
 def run(tmp_path, needs_variant):
-    """`run(spp=64)`: the render, and what was printed on the console's terminal, of a kind."""
+    """`run(spp=64)`: the render, and the output on a terminal of type `terminal`; "" is no terminal."""
     needs_variant("llvm_ad_rgb")
     mi.set_variant("llvm_ad_rgb")
 
@@ -67,10 +67,10 @@ def run(tmp_path, needs_variant):
     return make
 
 
-def test_a_line_now_and_then_or_a_bar(run, monkeypatch, capsys):
-    run(spp=64, pass_spp=8)  # one every 30 s, so that a log stays short: none for a render of a second
+def test_progress_lines_or_a_bar(run, monkeypatch, capsys):
+    run(spp=64, pass_spp=8)  # a line every 30 s: none for a render of a second
     assert capsys.readouterr().err == ""
-    for name in ("BETWEEN_LINES", "BETWEEN_LOOKS", "LOOK_COST"):
+    for name in ("BETWEEN_LINES", "BETWEEN_ESTIMATES", "ESTIMATE_COST"):
         monkeypatch.setattr(render_progress, name, 0.0)
     assert run(spp=64, pass_spp=8)[1] == ""
     lines = capsys.readouterr().err.splitlines()
@@ -79,18 +79,18 @@ def test_a_line_now_and_then_or_a_bar(run, monkeypatch, capsys):
     form = rf"\S+a\.exr: pass 6 of 8, \d+ s left, {error}, {number} M samples/s, 48 spp"
     assert len(lines) == 9 and re.fullmatch(form, lines[5]), lines  # after every pass, and at the end
     _, bar = run(until=0.2, pass_spp=4, terminal="xterm")
-    assert all(said in bar for said in ("━", "passes", "s left", "error", "M samples/s"))
+    assert all(text in bar for text in ("━", "passes", "s left", "error", "M samples/s"))
     assert capsys.readouterr().err == ""
-    run(spp=16, pass_spp=8, terminal="dumb")  # which cannot move its cursor
+    run(spp=16, pass_spp=8, terminal="dumb")  # it cannot move its cursor: lines
     assert len(capsys.readouterr().err.splitlines()) == 3
 
 
-def test_the_preview_is_the_image_or_a_warning(run, tmp_path, monkeypatch, capsys):
+def test_preview_is_the_image_and_a_failure_is_a_warning(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(render_progress, "BETWEEN_PREVIEWS", 0.0)
     render, _ = run(tmp_path / "a.png", spp=64, pass_spp=8)
     linear = np.clip(render.image(), 0, 1)
     expected = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    # Half a step of 8 bits, and a little for the coding of sRGB.
+    # Half a step of 8 bits, and a little for the sRGB encoding.
     np.testing.assert_allclose(read(tmp_path / "a.png").pixels, expected, atol=0.51 / 255)
     run(tmp_path / "none" / "a.png", spp=8)
     err = capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""`mi-refract scene list` and `export`: what they print, write and refuse, also where the package is installed."""
+"""`mi-refract scene list` and `export`: output, files and errors, in this checkout and from built packages."""
 
 import os
 import subprocess
@@ -17,7 +17,7 @@ SCENES = Path(app.__file__).parents[2] / "scenes"
 
 @pytest.fixture
 def export(tmp_path, monkeypatch, run):
-    """`export("prism", …)`: exit code, stdout, stderr of `mi-refract scene export …` in an empty folder."""
+    """`export("prism", …)`: exit code, stdout and stderr of `mi-refract scene export …`, run in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return lambda *words: run("scene", "export", *words)
 
@@ -32,11 +32,13 @@ def test_names_paths_levels_and_defines(export, tmp_path):
     assert code == 0 and "1650 triangles" in out
     text = (tmp_path / "sphere-mitsuba" / "scene.xml").read_text()
     assert '<integer name="width" value="17"/>' in text and 'name="max_depth" value="9"' in text
-    assert "1590 triangles" in export("sphere", "--to", "mitsuba", "--level", 0, "-o", "zero")[1]  # not the default
+    assert (
+        "1590 triangles" in export("sphere", "--to", "mitsuba", "--level", 0, "-o", "zero")[1]
+    )  # level 0 is not the default
 
 
 @pytest.mark.parametrize(
-    "words, says",
+    "words, message",
     [
         (["nowhere", "--to", "cycles"], "no such scene; expected a file, balls, "),
         (["prism", "--to", "blender"], "expected cycles, luxcore, radiance"),
@@ -51,15 +53,15 @@ def test_names_paths_levels_and_defines(export, tmp_path):
         (["full/scene.xml", "--to", "cycles"], "full/scene.xml"),
     ],
 )
-def test_refused_in_one_line(words, says, export, tmp_path):
+def test_errors_are_one_line(words, message, export, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "scene.xml").write_text("<scene version='3.0.0'><bsdf type='hair'/></scene")
     before = sorted(tmp_path.rglob("*"))
-    assert_refused(export(*words), says)
+    assert_refused(export(*words), message)
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_scenes_are_listed_with_what_they_show(run):
+def test_scenes_are_listed_with_their_titles(run):
     code, out, err = run("scene", "list")
     lines = out.splitlines()
     assert (code, err, lines[0]) == (0, "", f"in {SCENES}:")
@@ -73,7 +75,7 @@ def test_scenes_are_listed_with_what_they_show(run):
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """The wheel and the sdist of this checkout."""
+    """The wheel and the sdist built from this checkout."""
     build, folder = pytest.importorskip("hatchling.build"), tmp_path_factory.mktemp("dist")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(SCENES.parent)
@@ -81,39 +83,30 @@ def built(tmp_path_factory):
 
 
 @pytest.mark.parametrize("kind", ["wheel", "sdist"])
-def test_what_is_installed_has_scenes_and_glasses_and_runs(kind, built, tmp_path):
-    """All files of the package, and the scenes but their images."""
+def test_the_installed_package_has_scenes_and_glasses_and_runs(kind, built, tmp_path):
+    """It has all files of the package, and the scenes without their images."""
     pytest.importorskip("pip")
-    root, there = SCENES.parent, tmp_path / "there"
-    pip = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--no-deps",
-        "--no-index",
-        "--no-build-isolation",
-        "--no-compile",
-    ]
-    subprocess.run([*pip, "--target", there, built[kind]], check=True, timeout=120)
+    root, target = SCENES.parent, tmp_path / "target"
+    flags = ["--quiet", "--no-deps", "--no-index", "--no-build-isolation", "--no-compile"]
+    pip = [sys.executable, "-m", "pip", "install", *flags, "--target", target, built[kind]]
+    subprocess.run(pip, check=True, timeout=120)
     package = {str(x.relative_to(root)) for x in (root / "mi_refract").rglob("*.*") if "__pycache__" not in x.parts}
     scenes = {f"mi_refract/{x.relative_to(root)}" for kind in ("xml", "toml", "ply") for x in SCENES.rglob(f"*.{kind}")}
     assert {"mi_refract/py.typed", "mi_refract/media/glasses.json", "mi_refract/report/templates/diff.js"} <= package
-    assert package | scenes <= {str(path.relative_to(there)) for path in there.rglob("*.*")}
-    assert sum(path.stat().st_size for path in (there / "mi_refract" / "scenes").rglob("*.*")) < 300_000
-    assert not {"tests", "validation", "scenes"} & {path.name for path in there.iterdir()}
-    installed = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": str(there)}}
-    command = [there / "bin" / "mi-refract", "scene", "export", "sphere", "--to", "mitsuba", "--level", "0"]
+    assert package | scenes <= {str(path.relative_to(target)) for path in target.rglob("*.*")}
+    assert sum(path.stat().st_size for path in (target / "mi_refract" / "scenes").rglob("*.*")) < 300_000
+    assert not {"tests", "validation", "scenes"} & {path.name for path in target.iterdir()}
+    installed = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": str(target)}}
+    command = [target / "bin" / "mi-refract", "scene", "export", "sphere", "--to", "mitsuba", "--level", "0"]
     subprocess.run(command, check=True, **installed)
     assert (tmp_path / "sphere-mitsuba" / "scene.xml").is_file()
     code = "from importlib import metadata; import mi_refract as m; print(m.__file__, m.__version__); "
     code += "print(metadata.version('mi-refract'))"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, **installed).stdout
-    assert said.split() == [str(there / "mi_refract/__init__.py"), mi_refract.__version__, mi_refract.__version__]
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, **installed).stdout
+    assert out.split() == [str(target / "mi_refract/__init__.py"), mi_refract.__version__, mi_refract.__version__]
 
 
-def test_the_sdist_has_all(built):
+def test_the_sdist_has_all_files(built):
     with tarfile.open(built["sdist"]) as sdist:
         names = {name.partition("/")[2] for name in sdist.getnames()}
     root, folders = SCENES.parent, ("mi_refract", "scenes", "tests", "validation", ".ci", ".github")

@@ -1,4 +1,4 @@
-"""`mi-refract self-test`: of images, of renders, of scenes. A scene of others runs no code."""
+"""`mi-refract self-test` of images, renders and scenes. A scene cannot run its own code."""
 
 import os
 from pathlib import Path
@@ -15,12 +15,12 @@ from mi_refract.image_diff.comparison import Comparison, Verdict
 SCENE = Path(command.__file__).parents[2] / "scenes" / "sphere.xml"
 
 
-def test_renders_one_image_and_a_scene(run, tmp_path, monkeypatch):
-    """Of few trials. The exit code is 1 where a defect is missed."""
+def test_self_test_of_renders_an_image_and_a_scene(run, tmp_path, monkeypatch):
+    """With few trials. The exit code is 1 if a defect is missed."""
     full = self_test.examine
     monkeypatch.setattr(self_test, "examine", lambda renders, case: full(renders, case, trials=2, null_pairs=4))
     monkeypatch.setattr(command, "SPP", 2)
-    monkeypatch.setattr(backend, "activate", lambda *chosen: None)
+    monkeypatch.setattr(backend, "activate", lambda *variant: None)
     folder, scene = samples(tmp_path / "renders", 8, noise=0.001), tmp_path / "sphere.xml"
     scene.write_text(SCENE.read_text().replace('name="res" value="128"', 'name="res" value="24"'))
     texts = {folder: "null pairs 4", folder / "0.exr": "renders: welch needs 4 or more", scene: "renders: noise "}
@@ -53,7 +53,7 @@ def test_bad_input_is_one_line(run, pair, tmp_path):
         ([pair[0], "--allow-plugins", "evil"], "expected a scene SCENE.xml as REFERENCE"),
         ([pipe], "pipe.xml: not a regular file"),
         ([scene], "s.xml: plugin 'evil': neither Mitsuba's nor mi_refract's; expected those"),
-        # Where it is allowed Mitsuba tries to load it, and says that it is no native code.
+        # If it is allowed, Mitsuba tries to load it and fails, because it is not native code.
         ([scene, "--allow-plugins", "other", "--allow-plugins", "evil"], "Error while loading plugin"),
     ]:
         assert_refused(run("self-test", *words), message)

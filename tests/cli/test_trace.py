@@ -1,4 +1,4 @@
-"""`mi-refract trace`: what each option does, what bad input says, and what is left behind."""
+"""`mi-refract trace`: its options, the errors for bad input, and the remaining files."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def ball(tmp_path):
 
 @pytest.fixture
 def trace(ball, run):
-    """`trace("--table")`: exit code, stdout, stderr of tracing `ball`, or another scene."""
+    """`trace("--table")`: exit code, stdout and stderr of tracing `ball`, or another scene."""
     return lambda *options, scene=ball: run("trace", scene, *options)
 
 
@@ -51,7 +51,7 @@ def paths_of(result):
 
 
 @pytest.mark.parametrize("suffix", ["", ".png", ".pdf", ".SVG"])
-def test_a_line_is_printed_and_a_figure_is_drawn(trace, ball, suffix):
+def test_summary_line_and_figure(trace, ball, suffix):
     output = ball.with_name(f"image{suffix}")
     written = f"{output}: written\n" if suffix else ""
     assert trace(*(["-o", output] if suffix else [])) == (0, f"ball.toml: 7 rays, 14 hits, 7 escaped\n{written}", "")
@@ -59,7 +59,7 @@ def test_a_line_is_printed_and_a_figure_is_drawn(trace, ball, suffix):
     assert not suffix or output.read_bytes().startswith(FORMATS[suffix.lower()])
 
 
-def test_json_is_the_paths(trace, ball):
+def test_json_has_the_paths(trace, ball):
     scene = scene_file.load(ball)
     expected = tracer.trace(scene.segments[0], scene.origins, scene.directions, scene.max_depth, weights=True)
     paths = paths_of(trace("--json"))
@@ -97,12 +97,13 @@ def test_the_table(trace):
 def test_a_spot_on_a_plane(trace):
     code, out, err = trace("--plane", "-2,0")
     assert (code, err, len(out.splitlines())) == (0, "", 9)
-    one, other = (
-        json.loads(trace("--json", "--plane", at)[1])["foci"][0]["spread"]["on_plane"] for at in ("3,0", "3,5,180")
+    spot, same = (
+        json.loads(trace("--json", "--plane", plane)[1])["foci"][0]["spread"]["on_plane"]
+        for plane in ("3,0", "3,5,180")
     )
-    assert one.keys() == {"centre", "rms", "extent"}
-    assert one["centre"] == pytest.approx([3, 0], abs=1e-12)
-    assert all(other[name] == pytest.approx(value, abs=1e-12) for name, value in one.items())
+    assert spot.keys() == {"centre", "rms", "extent"}
+    assert spot["centre"] == pytest.approx([3, 0], abs=1e-12)
+    assert all(same[name] == pytest.approx(value, abs=1e-12) for name, value in spot.items())
 
 
 def test_options_override_the_file(trace, ball):
@@ -121,7 +122,7 @@ def test_options_override_the_file(trace, ball):
     "first, second, where",
     [("", "", "shape[0] and shape[1]"), ('name = "crown"', 'name = "flint"', "shape[0] 'crown' and shape[1] 'flint'")],
 )
-def test_shapes_that_do_not_fit_are_named_and_the_exit_code_is_1(trace, ball, first, second, where):
+def test_mismatched_shapes_are_named_with_exit_code_1(trace, ball, first, second, where):
     other = BALL.partition("[[shape]]")[2].partition("[[beam]]")[0].replace("1.5", "1.6")
     ball.write_text(BALL.replace("n = 1.5", f"n = 1.5\n{first}") + f"[[shape]]{other}at = [1.2, 0]\n{second}")
     code, out, err = trace()
@@ -135,7 +136,7 @@ def directions(paths):
     return np.array([path["direction"] for path in paths])
 
 
-def test_a_formula_a_backend_and_a_precision(trace, needs_variant):
+def test_formula_backend_and_precision(trace, needs_variant):
     needs_variant("llvm_ad_rgb")  # without LLVM scalar arrays are the default
     default = directions(paths_of(trace("--json")))
     for options in (("--formula", "promoted"), ("--backend", "scalar")):
@@ -187,18 +188,25 @@ def test_a_bad_scene_leaves_the_old_image(trace, ball, old, new, message):
     assert output.read_text() == "old"
 
 
-def test_without_matplotlib(trace, ball, monkeypatch):
+def test_missing_matplotlib(trace, ball, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert trace()[0] == 0
     message = "mi-refract: images need the extra `plot`: pip install 'mi-refract[plot]'\n"
     assert trace("-o", ball.with_name("image.svg")) == (2, "", message)
 
 
-def test_the_keys_of_a_scene_are_printed_without_one(run):
+def test_keys_are_printed_without_a_scene(run):
     code, out, err = run("trace", "--keys")
     assert (code, err) == (0, "")
     assert out == scene_file.reference() + "\n"
-    keys = "title", "wavelengths", "focal_length  from the front to the focus (number > 0)", "R1", "from", "scale"
+    keys = (
+        "title",
+        "wavelengths",
+        "focal_length  distance from the front to the focus (number > 0)",
+        "R1",
+        "from",
+        "scale",
+    )
     assert all(f"\n  {key} " in out or f"\n  {key}\n" in out for key in keys)
     assert '[[shape]] kind = "luneburg": ' in out and '[[beam]] kind = "fan": ' in out
     assert max(map(len, out.splitlines())) <= 80

@@ -1,4 +1,4 @@
-"""Local clusters, their workers and calls on them: who is accepted, what is lost, and what an error says."""
+"""Local clusters, their workers and calls on them: accepted and lost workers, and error messages."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ HERE = {"mitsuba": "3.9.1", LLVM: "19.1", WIDTH: "8", UNUSABLE: "", HOST: "here"
 
 @pytest.fixture(scope="module")
 def client(tmp_path_factory):
-    """Two workers; the modules of the folder that they are started from must not be taken for those that they need."""
+    """A client of two workers, started in a folder of modules that they must not import."""
     folder, before = tmp_path_factory.mktemp("start"), Path.cwd()
     for name in ("dask", "distributed", "mi_refract", "pickle"):
         (folder / f"{name}.py").write_text("raise SystemExit")
@@ -66,20 +66,20 @@ def test_misuse(options, message, monkeypatch):
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_where_processes_have_no_groups_there_are_no_workers(monkeypatch):
+def test_without_process_groups_workers_are_refused(monkeypatch):
     monkeypatch.delattr(os, "killpg")
     with pytest.raises(UsageError, match="--workers 1: Windows cannot end them"), connected(workers=1):
         pass
 
 
-def test_a_client_is_nobody_elses_default(client):
-    """A program that uses this package and Dask keeps its own."""
+def test_a_client_is_not_dasks_default(client):
+    """A program that uses both this package and Dask keeps its own default client."""
     with pytest.raises(ValueError, match="No clients"):
         distributed.default_client()
 
 
-def test_a_connection_that_is_not_encrypted_is_refused(client):
-    """Of local workers, and where the scheduler speaks TLS: Dask would take a worker's results over any connection."""
+def test_unencrypted_connections_are_refused(client):
+    """For local workers and for a TLS scheduler: Dask's default accepts a worker's results over any connection."""
 
     def refuses(client):
         with pytest.raises(RuntimeError, match="encryption required"):
@@ -91,7 +91,7 @@ def test_a_connection_that_is_not_encrypted_is_refused(client):
         refuses(other)
 
 
-def test_no_page_of_dask_is_shown(client):
+def test_dasks_pages_are_not_served(client):
     """Its HTTP servers do not use TLS: other users of this machine could read them."""
     ports = [client.run_on_scheduler(lambda dask_scheduler: dask_scheduler.http_server.port)]
     ports += client.run(lambda dask_worker: dask_worker.http_server.port).values()
@@ -125,7 +125,7 @@ def test_a_lost_scheduler_is_one_line(status, then, raised, message):
     assert str(caught.value) == message
 
 
-def test_dask_is_not_imported_before_it_is_needed():
+def test_dask_is_imported_only_when_needed():
     code = """import sys, mi_refract.cli.app, mi_refract.cli.render
 mi_refract.cli.app.main(["--help"])
 sys.exit(str([name for name in sys.modules if name.partition(".")[0] in ("dask", "distributed")]))"""
@@ -133,7 +133,7 @@ sys.exit(str([name for name in sys.modules if name.partition(".")[0] in ("dask",
         assert process.communicate()[1].splitlines()[-1] == "[]"
 
 
-# Who is accepted ------------------------------------------------------------------------------------------------------
+# Accepted workers -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -147,22 +147,22 @@ sys.exit(str([name for name in sys.modules if name.partition(".")[0] in ("dask",
         ({UNUSABLE: "llvm_ad_rgb: no libLLVM found", "mitsuba": "3"}, MIXED, ["llvm_ad_rgb: no libLLVM found"]),
     ],
 )
-def test_what_differs(change, tolerated, different):
+def test_differences_of_facts(change, tolerated, different):
     assert differences(HERE | change, HERE, tolerated) == different
     assert differences({HOST: "there"}, {"drjit": "1.5.0"}) == ["drjit unknown, here 1.5.0"]
 
 
 def test_facts_of_this_process_and_the_name_of_a_machine(variant):
-    found = on_worker.facts(variant)
-    assert found[UNUSABLE] == "" and found[HOST] == os.uname().nodename and found["Python"].startswith("3.")
+    facts = on_worker.facts(variant)
+    assert facts[UNUSABLE] == "" and facts[HOST] == os.uname().nodename and facts["Python"].startswith("3.")
     if variant.startswith("llvm"):
-        assert found[WIDTH] in ("4", "8", "16") and re.fullmatch(r"[\d.]+", found[LLVM])
+        assert facts[WIDTH] in ("4", "8", "16") and re.fullmatch(r"[\d.]+", facts[LLVM])
     assert machine(HERE | {HOST: "there"}, HERE) == "there"
     assert machine(HERE | {HOST: "there", WIDTH: "16", LLVM: "18.1"}, HERE) == "there (libLLVM 18.1; vector width 16)"
 
 
-def test_the_version_has_a_digest_of_the_sources_and_of_the_glasses(tmp_path):
-    """Of names and contents: two installations of the same version may differ in a line, or in a glass."""
+def test_version_has_a_hash_of_sources_and_glasses(tmp_path):
+    """The hash covers names and contents: two installations of one version may differ in a line or a glass."""
     copy = tmp_path / "mi_refract"
     shutil.copytree(Path(on_worker.__file__).parents[1], copy, ignore=shutil.ignore_patterns("__pycache__"))
     environment = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
@@ -197,39 +197,44 @@ MODULE = "mi_refract.cluster.on_worker"
     ],
     ids=["another version", "no package"],
 )
-def test_a_worker_that_differs_is_refused_by_name(client, lie, honest_again, different):
+def test_a_differing_worker_is_refused_with_its_name_and_differences(client, lie, honest_again, different):
     liar, honest = sorted(client.nthreads())
-    said = []
+    warnings = []
     client.run(exec, f"import {MODULE}; global own\n{lie}", workers=[liar])
     try:
-        found = accepted(client, VARIANT, warn=said.append)
+        workers = accepted(client, VARIANT, warn=warnings.append)
     finally:
         client.run(exec, honest_again, workers=[liar])
-    assert (list(found.usable), list(found.refused), said) == ([honest], [liar], [found.refused[liar]])
-    assert said[0].startswith(f"worker {liar}{different}") and "\n" not in said[0]
-    assert list(found.machines.values()) == [os.uname().nodename]
+    assert (list(workers.usable), list(workers.refused), warnings) == ([honest], [liar], [workers.refused[liar]])
+    assert warnings[0].startswith(f"worker {liar}{different}") and "\n" not in warnings[0]
+    assert list(workers.machines.values()) == [os.uname().nodename]
 
 
-def test_without_a_worker_it_ends_in_one_line(client, monkeypatch):
+def test_no_usable_worker_is_one_line(client, monkeypatch):
     with pytest.raises(NoWorkersError) as caught:
         Workers(client, VARIANT, on_worker.facts(VARIANT) | {"drjit": "9"}).wait()
     text = str(caught.value)
     assert "\n" not in text and text.count("is refused: drjit") == 2
-    assert "no worker that may work: worker tls://" in text
+    assert "no worker can work: worker tls://" in text
     assert text.endswith("expected at least one with the software and hardware of this process")
     monkeypatch.setattr(client, "nthreads", dict)
-    with pytest.raises(NoWorkersError, match="no worker that may render: no workers; expected"):
+    with pytest.raises(NoWorkersError, match="no worker can render: no workers; expected"):
         Workers(client, VARIANT, HERE, task="render").wait(nobody=0.1)
 
 
-def test_a_worker_whose_answer_is_lost_is_asked_again(client, monkeypatch):
+def test_a_worker_whose_answer_is_lost_is_queried_again(client, monkeypatch):
     lost = []
-    monkeypatch.setattr(
-        workers_module, "fetched", lambda client, future: fetched(client, future) if lost else lost.append(future) or ()
-    )
-    found = accepted(client, VARIANT)
-    until(lambda: found.look(at_once=True) or len(found.usable) == 2)
-    assert lost and not found.refused
+
+    def lose_the_first(client, future):
+        if lost:
+            return fetched(client, future)
+        lost.append(future)
+        return ()
+
+    monkeypatch.setattr(workers_module, "fetched", lose_the_first)
+    workers = accepted(client, VARIANT)
+    until(lambda: workers.look(at_once=True) or len(workers.usable) == 2)
+    assert lost and not workers.refused
 
 
 # Calls ----------------------------------------------------------------------------------------------------------------
@@ -241,39 +246,40 @@ def workers(client):
     return accepted(client, VARIANT)
 
 
-def process_of(seconds):
+def sleep_and_return_pid(seconds):
     time.sleep(seconds)
     return os.getpid()
 
 
-def half(x):
+def reciprocal(x):
+    """Return 1/(x − 3): an error for x = 3."""
     return 1 / (x - 3)
 
 
-def late():
+def raise_timeout_error():
     raise TimeoutError("of the call")
 
 
 class Slow:
-    """Takes its time to be sent."""
+    """An object whose pickling takes long."""
 
     def __reduce__(self):
         time.sleep(3 * workers_module.BETWEEN_LOOKS / 4)
         return Slow, ()
 
 
-def test_each_call_has_its_number_and_only_a_few_are_begun(workers):
-    begun = []
+def test_results_have_the_calls_index_and_few_calls_are_read_ahead(workers):
+    read = []
 
     def calls():
         for i in range(20):
-            begun.append(i)
+            read.append(i)
             yield (i + 10,)
 
-    found = results(workers, half, calls())
-    first = next(found)
-    assert len(begun) <= 2 * AHEAD + 1
-    values = {number: value for number, value, machine in [first, *found] if machine == os.uname().nodename}
+    answers = results(workers, reciprocal, calls())
+    first = next(answers)
+    assert len(read) <= 2 * AHEAD + 1
+    values = {index: value for index, value, machine in [first, *answers] if machine == os.uname().nodename}
     assert values == {i: 1 / (i + 7) for i in range(20)}
 
 
@@ -282,34 +288,34 @@ def test_a_worker_may_log_more_than_a_pipe_holds(workers):
     assert [result for _, result, _ in calls] == [140000]
 
 
-def test_an_error_of_a_call_is_its_own(workers):
-    """Also one that Dask raises, too."""
+def test_an_error_of_a_call_is_raised_unchanged(workers):
+    """Even a TimeoutError, which Dask raises, too."""
     with pytest.raises(ZeroDivisionError, match="division by zero"):
-        list(results(workers, half, [(i,) for i in range(6)]))
+        list(results(workers, reciprocal, [(i,) for i in range(6)]))
     with pytest.raises(TimeoutError, match="of the call"):
-        list(results(workers, late, [()]))
-    assert len(list(results(workers, half, [(1,)]))) == 1  # the workers are as before
+        list(results(workers, raise_timeout_error, [()]))
+    assert len(list(results(workers, reciprocal, [(1,)]))) == 1  # the workers still work
 
 
-def test_who_is_refused_gets_no_call(workers):
+def test_refused_workers_get_no_calls(workers):
     refused = sorted(workers.usable)[0]
     workers.usable.pop(refused)
     workers.refused[refused] = "made up"
-    own = workers.client.run(os.getpid, workers=[refused])[refused]
-    found = list(results(workers, process_of, [(0.1,)] * 6))
-    assert len(found) == 6 and own not in [pid for _, pid, _ in found]
+    refused_pid = workers.client.run(os.getpid, workers=[refused])[refused]
+    pids = [pid for _, pid, _ in results(workers, sleep_and_return_pid, [(0.1,)] * 6)]
+    assert len(pids) == 6 and refused_pid not in pids
 
 
-def test_what_is_not_finished_is_cancelled(workers, tmp_path):
-    found = results(workers, until, [(tmp_path.exists,), *[((tmp_path / "end").exists,)] * 3])
-    next(found)
-    found.close()
+def test_unfinished_calls_are_cancelled(workers, tmp_path):
+    answers = results(workers, until, [(tmp_path.exists,), *[((tmp_path / "end").exists,)] * 3])
+    next(answers)
+    answers.close()
     until(lambda: not any(workers.client.processing().values()), seconds=10)
-    (tmp_path / "end").touch()  # of those that have begun
+    (tmp_path / "end").touch()  # ends calls that are already running
 
 
 def test_a_slow_result_is_waited_for_and_a_lost_one_is_not(workers):
-    """Dask itself would wait until somebody has computed a lost one again: nobody does."""
+    """Dask itself would wait until a lost result is computed again, which never happens here."""
     client, address = workers.client, sorted(workers.usable)[0]
     slow, lost = (client.submit(make, workers=[address], pure=False) for make in (Slow, os.getpid))
     until(lambda: slow.done() and lost.done())
@@ -320,12 +326,12 @@ def test_a_slow_result_is_waited_for_and_a_lost_one_is_not(workers):
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_calls_of_lost_workers_are_made_again(workers, count):
-    """By another one, or where all have gone by those that come."""
-    found = results(workers, process_of, [(0.2,), (2.0,), (2.0,)])
-    next(found)
+def test_calls_of_lost_workers_are_repeated(workers, count):
+    """By the other worker, or by new workers if both are lost."""
+    answers = results(workers, sleep_and_return_pid, [(0.2,), (2.0,), (2.0,)])
+    next(answers)
     victims = sorted(workers.client.nthreads())[:count]
     for address in victims:
         kill(workers.client, address)
-    assert sorted(number for number, _, _ in found) == [1, 2]
+    assert sorted(index for index, _, _ in answers) == [1, 2]
     until(lambda: workers.look(at_once=True) or not {*victims} & {*workers.usable})

@@ -1,4 +1,4 @@
-"""READMEs and pages of the documentation: short, with links that lead somewhere, and examples that run."""
+"""READMEs and pages of the documentation: their length, their links, and their examples."""
 
 import re
 
@@ -15,16 +15,15 @@ def name(path):
 
 
 def anchors(path):
-    """Of the headings of a Markdown file, as GitHub and MyST make them."""
+    """Return the anchors of a Markdown file's headings, as GitHub and MyST make them."""
     text = re.sub(r"^```.*?^```", "", path.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
-    heads = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
-    return {
-        re.sub(r"[^\w\- ]", "", re.sub(r"\[(.*?)\]\(.*?\)", r"\1", head).lower()).replace(" ", "-") for head in heads
-    }
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    texts = [re.sub(r"\[(.*?)\]\(.*?\)", r"\1", heading).lower() for heading in headings]
+    return {re.sub(r"[^\w\- ]", "", text).replace(" ", "-") for text in texts}
 
 
 @pytest.mark.parametrize("path", READMES, ids=name)
-def test_a_readme_is_a_screen(path):
+def test_a_readme_is_short(path):
     assert len(path.read_text("utf-8").splitlines()) <= (120 if path.parent == ROOT else 60)
 
 
@@ -43,24 +42,24 @@ def test_links_lead_to_files_and_headings(path):
             file, _, anchor = link.partition("#")
             target = path.parent / file if file else path
             if target.parent.name == "python":
-                continue  # written by a build, which follows links
+                continue  # written by the site's build, which checks links itself
             assert target.exists(), link
             if anchor and "```{generated}" not in target.read_text("utf-8"):
                 assert anchor in anchors(target), link
 
 
 @pytest.mark.parametrize("path", [p for p in READMES[1:] if python_blocks(p)], ids=name)
-def test_the_python_of_a_room_s_readme_runs(path, llvm_variant):
+def test_python_in_a_readme_runs(path, llvm_variant):
     exec("\n".join(python_blocks(path)), {})
 
 
-def test_python_for_a_cluster_is_python():
+def test_python_for_a_cluster_compiles():
     codes = python_blocks(DOCS / "how-to/render-on-a-cluster.md")
     assert all(compile(code, "", "exec") for code in codes) and len(codes) == 3
 
 
 @pytest.mark.parametrize("path", [p for p in PAGES if blocks(p, "xml")], ids=name)
-def test_xml_is_part_of_a_scene(path, tmp_path):
+def test_xml_on_a_page_loads_in_a_scene(path, tmp_path):
     switch("scalar_spectral")
     (tmp_path / "glass.csv").write_text("Wavelength (nm),n\n400,1.5\n700,1.5\n")
     table = "DATA:\n  - type: tabulated nk\n    data: |\n        0.3 1.5 1e-7\n        0.9 1.5 1e-7\n"

@@ -1,4 +1,4 @@
-"""The pages of the plugins: their tables say what the plugins accept and expose; their examples are the same twice."""
+"""Pages of the plugins: their tables of parameters, and the equality of their examples in XML and Python."""
 
 import re
 from pathlib import Path
@@ -20,7 +20,7 @@ TABLES = {
     ]
     for module in (refract, refract_path)
 }
-VALUES = {  # of a row of a table, by its type
+VALUES = {  # a parameter's value by the type in its table
     "number": 0.5,
     "integer": 4,
     "boolean": True,
@@ -41,18 +41,25 @@ for plugin, rows in TABLES.items():
 
 @pytest.fixture
 def queried(monkeypatch):
-    """The names of the properties that plugins ask for."""
+    """The names of the properties that plugins read."""
     names = set()
+
+    def record(method):
+        original = getattr(mi.Properties, method)
+
+        def recording(props, name, *arguments):
+            names.add(name)
+            return original(props, name, *arguments)
+
+        monkeypatch.setattr(mi.Properties, method, recording)
+
     for method in ("get", "get_texture", "get_unbounded_texture", "__contains__", "__getitem__"):
-        ask = getattr(mi.Properties, method)
-        monkeypatch.setattr(
-            mi.Properties, method, lambda props, name, *more, ask=ask: (names.add(name), ask(props, name, *more))[1]
-        )
+        record(method)
     return names
 
 
-def shown(plugin, name, kind, exposed, folder):
-    """What `mi.traverse` shows of a parameter: whether it is differentiable, by key."""
+def differentiable_keys(plugin, name, kind, exposed, folder):
+    """Return for each key of `mi.traverse` that a parameter has whether it is differentiable."""
     glass, base = f"file:{folder}/glass.csv", name.removesuffix("_unit").removesuffix("_distance")
     scene = {"type": plugin, name: VALUES.get(kind, glass)}
     if name.endswith("_unit") or kind == "`file:…`":
@@ -64,40 +71,40 @@ def shown(plugin, name, kind, exposed, folder):
             mi.load_dict(scene)
         del scene[name]
     parameters = mi.traverse(mi.load_dict(scene))
-    begins = re.sub("`|, …", "", exposed).replace("int_ior", name) if "`" in exposed else name
-    keys = [key for key in parameters.keys() if key == begins or key.startswith(f"{begins}.")]  # noqa: SIM118
+    stem = re.sub("`|, …", "", exposed).replace("int_ior", name) if "`" in exposed else name
+    keys = [key for key in parameters.keys() if key == stem or key.startswith(f"{stem}.")]  # noqa: SIM118
     return [not parameters.flags(key) & mi.ParamFlags.NonDifferentiable for key in keys]
 
 
 @pytest.mark.parametrize("plugin", TABLES)
-def test_a_table_says_what_the_plugin_accepts_and_exposes(plugin, queried, tmp_path):
+def test_a_table_lists_what_the_plugin_accepts_and_exposes(plugin, queried, tmp_path):
     switch("scalar_spectral")
     (tmp_path / "glass.csv").write_text("Wavelength (nm),n,k\n300,1.5,1e-7\n900,1.5,1e-7\n")
     wrong = []
     for _, name, kind, *flags in [case for case in CASES if case[0] == plugin]:
-        found = shown(plugin, name, kind, flags[0], tmp_path)
-        if [x != "no" for x in flags] != [bool(found), any(found)]:
-            wrong.append((name, kind, found))
+        keys = differentiable_keys(plugin, name, kind, flags[0], tmp_path)
+        if [x != "no" for x in flags] != [bool(keys), any(keys)]:
+            wrong.append((name, kind, keys))
     assert not wrong
-    # No parameter is missing in the table. `color` is asked for to say how it is written.
-    named = {x for each, x, *_ in CASES if each == plugin}
-    assert {x for x in queried if "color" not in x} - {"raw", *VALUES["spectrum"]} <= named
+    # No parameter is missing in the table. The plugin only reads `color` to report the spelling `colour`.
+    listed = {name for other, name, *_ in CASES if other == plugin}
+    assert {x for x in queried if "color" not in x} - {"raw", *VALUES["spectrum"]} <= listed
 
 
-def test_the_defaults_are_those_of_the_tables(scalar_variant):
+def test_defaults_equal_those_in_the_tables(scalar_variant):
     assert "`bk7`, which is 1.5046" in refract.__doc__ and str(mi.load_dict({"type": "refract"})) == str(
         mi.load_dict({"type": "refract", "int_ior": 1.5046, "ext_ior": "air", "formula": "auto"})
     )
-    said = {"max_depth": -1, "rr_depth": 5, "hide_emitters": False, "split_depth": 0, "split_weight": 0.01}
-    said |= {"type": "refract_path", "deterministic": False}
-    assert str(mi.load_dict({"type": "refract_path"})) == str(mi.load_dict(said))
+    defaults = {"max_depth": -1, "rr_depth": 5, "hide_emitters": False, "split_depth": 0, "split_weight": 0.01}
+    defaults |= {"type": "refract_path", "deterministic": False}
+    assert str(mi.load_dict({"type": "refract_path"})) == str(mi.load_dict(defaults))
     cells = {name: row[2] for row in TABLES["refract_path"] for name in re.findall("`(.+?)`", row[0])}
-    for name, value in said.items():
+    for name, value in defaults.items():
         assert name == "type" or f"({str(value).lower()}" in cells[name]
 
 
 @pytest.mark.parametrize("plugin", TABLES)
-def test_the_examples_in_xml_and_as_dict_are_the_same(plugin):
+def test_examples_in_xml_and_as_dict_are_equal(plugin):
     switch("scalar_spectral")
     page = PAGES / f"{plugin}.md"
     pairs = [*zip(blocks(page, "xml"), blocks(page, "python"), strict=True)]

@@ -1,4 +1,4 @@
-"""The sources of the site without Sphinx: what the program writes into it, and the code on its pages, which runs."""
+"""Sources of the documentation site, without Sphinx: generated tables, listing, and code on the pages."""
 
 import importlib.util
 import re
@@ -18,7 +18,7 @@ PAGES = {path.relative_to(DOCS).as_posix(): path for path in PATHS}
 SPEC = importlib.util.spec_from_file_location("generated", DOCS / "generated.py")
 generated = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(generated)
-# Pages whose Python another test runs, with smaller images, or a program or a cluster beside it.
+# Pages whose Python another test runs, with smaller images, or with a program or a cluster.
 ELSEWHERE = {
     "how-to/check-a-shaders-rays.md": "cli/test_rays.py",
     "how-to/coming-from-other-image-diffs.md": "image_diff/test_other_image_diffs.py",
@@ -38,13 +38,13 @@ CALLS = {
 
 
 @pytest.mark.parametrize("call", sorted(CALLS), ids=" ".join)
-def test_what_a_page_asks_for_is_written(call):
+def test_generated_parts_of_pages_are_written(call):
     name, *arguments = call
     assert len(generated.WRITERS[name](*arguments).splitlines()) > 3
 
 
-def test_every_table_and_every_room_has_a_place():
-    assert {name for name, *_ in CALLS} == generated.WRITERS.keys() - {"room"}  # whose pages are written by the build
+def test_every_generated_table_and_module_page_is_used():
+    assert {name for name, *_ in CALLS} == generated.WRITERS.keys() - {"room"}  # the build writes pages of "room"
     listed = re.findall("^(python/.+)$", PAGES["reference/python.md"].read_text("utf-8"), re.MULTILINE)
     assert {f"reference/{page}.md" for page in listed} == generated.pages().keys()
 
@@ -59,19 +59,19 @@ def test_every_page_is_in_one_table_of_contents():
     assert sorted(x for x in listed if "/python/" not in x) == sorted(sources - {"index"})
 
 
-def test_bk7_of_mitsuba_is_shown_to_be_off():
+def test_the_error_of_mitsubas_bk7_is_listed():
     names = generated.mitsuba_names()
     assert len(names) > 20 and generated.KNOWN.keys() <= set(names)
     assert "| `bk7` | 1.5046 | 1.51680 | `SCHOTT:N-BK7` | **−0.0122** |" in generated.materials()
     assert media.index("SCHOTT:N-BK7", 1200.0) == pytest.approx(1.5046, abs=5e-4)
 
 
-def test_the_other_pages_are_in_other_tests():
+def test_other_tests_name_the_pages_in_elsewhere():
     assert all(Path(page).name in (ROOT / "tests" / test).read_text("utf-8") for page, test in ELSEWHERE.items())
 
 
 @pytest.mark.parametrize("name", [x for x, path in PAGES.items() if python_blocks(path) and x not in ELSEWHERE])
-def test_the_python_of_a_page_runs(name, tmp_path, monkeypatch, llvm_variant):
+def test_python_on_a_page_runs(name, tmp_path, monkeypatch, llvm_variant):
     (tmp_path / "scenes").symlink_to(ROOT / "scenes")
     monkeypatch.chdir(tmp_path)
     names = {}
@@ -79,7 +79,7 @@ def test_the_python_of_a_page_runs(name, tmp_path, monkeypatch, llvm_variant):
         exec(code, names)
 
 
-def test_rays_are_checked_from_python_as_the_page_says(tmp_path, monkeypatch):
+def test_checking_rays_from_python_as_on_the_page(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     before, after = python_blocks(PAGES["how-to/check-a-shaders-rays.md"])[1].split("\n...\n")
     exec(before, names := {})
@@ -90,21 +90,21 @@ def test_rays_are_checked_from_python_as_the_page_says(tmp_path, monkeypatch):
     assert names["findings"].exit_code == 0
 
 
-def named(table):
-    """What stands in backticks in the first column of a table of the page on file formats, by number."""
+def names_in_table(number):
+    """Return the names in backticks in the first column of a table on the page on file formats."""
     text = PAGES["reference/file-formats.md"].read_text("utf-8")
-    rows = re.split(r"^\|---.*$", text, flags=re.MULTILINE)[table + 1].strip().split("\n\n")[0]
+    rows = re.split(r"^\|---.*$", text, flags=re.MULTILINE)[number + 1].strip().split("\n\n")[0]
     return {name for row in rows.splitlines() for name in re.findall("`(.+?)`", row.split("|")[1])}
 
 
-def test_the_attributes_of_an_image_are_those_of_the_page(tmp_path, llvm_variant):
+def test_attributes_of_an_image_are_on_the_page(tmp_path, llvm_variant):
     render_to_exr(ROOT / "scenes/sphere.xml", tmp_path / "a.exr", defines={"res": "8"}, spp=2)
-    found = image_file.read(tmp_path / "a.exr").metadata
-    assert {name for name in found if name.startswith(("mi_refract:", "Software"))} == named(0)
+    metadata = image_file.read(tmp_path / "a.exr").metadata
+    assert {name for name in metadata if name.startswith(("mi_refract:", "Software"))} == names_in_table(0)
 
 
-def test_the_keys_of_traced_paths_are_those_of_the_page():
+def test_keys_of_traced_paths_are_on_the_page():
     scene = path_tree.with_rays(scene_file.load(ROOT / "scenes/planar/lens.toml"), 2)
     data = path_tree.as_data(scene, path_tree.follow_scene(scene))
-    assert data.keys() | {"foci"} == named(1)
-    assert data["colours"][0]["paths"][0].keys() == named(2)
+    assert data.keys() | {"foci"} == names_in_table(1)
+    assert data["colours"][0]["paths"][0].keys() == names_in_table(2)

@@ -1,4 +1,4 @@
-"""The notebooks of the site without their execution, which the site's build does: form, names, commands."""
+"""Notebooks of the site: format, names and commands. The site's build executes them."""
 
 import ast
 import inspect
@@ -18,7 +18,7 @@ each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path
 
 
 def sources(path, magic=""):
-    """The text of each code cell: of Python, or of those that begin with `%%magic`, without that line."""
+    """Return the text of each Python cell, or of each cell that begins with `%%magic`, without that line."""
     cells = [cell for cell in json.loads(path.read_text("utf-8"))["cells"] if cell["cell_type"] == "code"]
     texts = ["".join(cell["source"]) for cell in cells]
     if not magic:
@@ -27,7 +27,7 @@ def sources(path, magic=""):
 
 
 @each_notebook
-def test_a_notebook_is_valid_and_holds_no_outputs(path):
+def test_a_notebook_is_valid_without_outputs(path):
     text = path.read_text("utf-8")
     book = json.loads(text)
     assert (book["nbformat"], book["nbformat_minor"], book["metadata"]["kernelspec"]["name"]) == (4, 5, "python3")
@@ -44,20 +44,19 @@ def test_a_notebook_is_valid_and_holds_no_outputs(path):
 
 
 def resolve(node, names):
-    """The object of this package that `a` or `a.b.c` names; None for any other expression."""
+    """Return the object of this package that `a` or `a.b.c` names; None for any other expression."""
+    value = None
     if isinstance(node, ast.Name):
-        found = names.get(node.id)
+        value = names.get(node.id)
     elif isinstance(node, ast.Attribute) and (base := resolve(node.value, names)) is not None:
         assert not inspect.ismodule(base) or hasattr(base, node.attr), f"{base.__name__} has no {node.attr}"
-        found = getattr(base, node.attr, None)
-    else:
-        found = None
-    owner = found.__name__ if inspect.ismodule(found) else getattr(found, "__module__", None)
-    return found if str(owner).startswith("mi_refract") else None
+        value = getattr(base, node.attr, None)
+    module = value.__name__ if inspect.ismodule(value) else getattr(value, "__module__", None)
+    return value if str(module).startswith("mi_refract") else None
 
 
 def check_names(tree):
-    """Run the imports of this package; every name that it is asked for must exist, also those of arguments."""
+    """Run the imports of this package, and check that used names and keyword arguments of the package exist."""
     names = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and str(node.module).startswith("mi_refract"):
@@ -86,13 +85,13 @@ def test_the_names_of_the_package_in_a_notebook_exist(path):
         "from mi_refract.planar import scene_file\nscene_file.load('lens.toml', nonesuch=2)",
     ],
 )
-def test_a_name_that_does_not_exist_is_seen(code):
+def test_check_names_detects_missing_names(code):
     with pytest.raises((ImportError, AssertionError), match="nonesuch"):
         check_names(ast.parse(code))
 
 
 @each_notebook
-def test_the_commands_of_a_notebook_are_parsed(path, monkeypatch, capfd):
+def test_commands_of_a_notebook_parse(path, monkeypatch, capfd):
     monkeypatch.setattr(typer.core.TyperCommand, "invoke", lambda self, context: None)
     for script in sources(path, "bash"):
         assert subprocess.run(["bash", "-n"], input=script, text=True, timeout=60).returncode == 0
@@ -101,6 +100,6 @@ def test_the_commands_of_a_notebook_are_parsed(path, monkeypatch, capfd):
             assert app.main(words[1:]) == 0, (line, capfd.readouterr().err)
 
 
-def test_the_programs_of_the_notebooks_are_python():
+def test_programs_in_notebooks_compile():
     programs = [text for path in NOTEBOOKS for text in sources(path, "writefile")]
     assert programs and all(ast.parse(text) for text in programs)

@@ -1,4 +1,4 @@
-"""Arithmetic as CUDA's compiler may do it, on processors: x·y + z with one rounding."""
+"""Arithmetic on processors as CUDA's compiler may do it: x·y + z with one rounding."""
 
 import drjit as dr
 import pytest
@@ -6,12 +6,12 @@ import pytest
 
 @pytest.fixture
 def fused(vectorised, monkeypatch):
-    """Sums of products become `dr.fma`, and Dr.Jit's arrays say that they are CUDA's. Returns the `vectorised` setting.
+    """The `vectorised` setting, where sums of products become `dr.fma` and Dr.Jit's arrays claim to be CUDA's.
 
-    What is within one call of Dr.Jit's, such as `dr.dot`, stays as it is.
+    Operations inside a call of Dr.Jit's, such as `dr.dot`, do not change.
     """
     if vectorised.backend != "llvm":
-        pytest.skip("CUDA's own compiler does this")
+        pytest.skip("on CUDA the compiler itself fuses")
     backend_v = dr.backend_v
     monkeypatch.setattr(dr, "backend_v", lambda x: dr.JitBackend.CUDA if dr.is_jit_v(x) else backend_v(x))
     for vector in (vectorised.vector, dr.float64_array_t(vectorised.vector)):
@@ -21,7 +21,7 @@ def fused(vectorised, monkeypatch):
 
 def _fuse(vector, monkeypatch):
     number = dr.value_t(vector)
-    products = {}  # by the index of the variable, which is kept alive
+    products = {}  # (product, factors) by the index of the product, which is kept alive
     times, plus, minus, negative = number.__mul__, number.__add__, number.__sub__, number.__neg__
 
     def factors(x):
@@ -45,7 +45,7 @@ def _fuse(vector, monkeypatch):
         pair = factors(y)
         return dr.fma(negative(pair[0]), pair[1], x) if pair else minus(x, y)
 
-    def of_vectors(operation):
+    def componentwise(operation):
         def by_component(u, v):
             return vector(*(operation(x, v[i] if isinstance(v, vector) else v) for i, x in enumerate(u)))
 
@@ -53,4 +53,4 @@ def _fuse(vector, monkeypatch):
 
     for name, operation in {"mul": multiply, "rmul": multiply, "add": add, "radd": add, "sub": subtract}.items():
         monkeypatch.setattr(number, f"__{name}__", operation)
-        monkeypatch.setattr(vector, f"__{name}__", of_vectors(operation))
+        monkeypatch.setattr(vector, f"__{name}__", componentwise(operation))

@@ -1,4 +1,4 @@
-"""Budgets bound every ray: the root and its inverse, ratios to either end, the side of the surface."""
+"""Error bounds of single rays: the root and its inverse, extreme ratios, the side of the surface."""
 
 import numpy as np
 import pytest
@@ -12,18 +12,18 @@ U = 2.0**-53
 
 
 @pytest.mark.parametrize("cos_t", [0.0, 1e-12, 1e-9, 1e-3, 0.5, 1.0])
-def test_the_root_moves_by_no_more_than_its_bound_and_nearly_as_much_and_has_an_inverse(cos_t):
-    """Against the definition, in both directions."""
+def test_the_bound_of_the_root_is_tight_and_has_an_inverse(cos_t):
+    """Against the definition |√(D + e) − √D|, and `radicand_for` as the inverse."""
     for x in (1e-15, 1e-6, 1e-3, 0.3):
         e = np.linspace(-min(x, cos_t**2), x, 1001)
         with np.errstate(invalid="ignore"):
-            moved = np.abs(e / (np.sqrt(cos_t**2 + e) + cos_t))  # |√(D + e) − √D|
-        assert 0.6 * root(x, cos_t) <= np.nanmax(moved) <= root(x, cos_t) * (1 + 1e-12)
+            change = np.abs(e / (np.sqrt(cos_t**2 + e) + cos_t))  # |√(D + e) − √D|
+        assert 0.6 * root(x, cos_t) <= np.nanmax(change) <= root(x, cos_t) * (1 + 1e-12)
     for error in (0.0, 1e-12, 1e-3, 2.0):
         assert root(radicand_for(np.array(error), cos_t), cos_t) == pytest.approx(error, rel=1e-6)
 
 
-def test_a_bound_grows_with_the_ratio_where_the_ray_is_transmitted_and_open_sides_may_be_either():
+def test_a_bound_grows_with_the_ratio_of_transmitted_rays_and_allows_either_side():
     budget = Budget(10, 14, 2)
     assert budget.chord(U, 0.5, 1.0) == pytest.approx((10 + 7) * U, rel=1e-6)
     assert budget.chord(U, 100.0, 1.0) == pytest.approx((1000 + 7e4) * U, rel=1e-6)
@@ -38,8 +38,8 @@ def test_a_bound_grows_with_the_ratio_where_the_ray_is_transmitted_and_open_side
 
 @pytest.mark.parametrize("end", [SMALLEST_RATIO, LARGEST_RATIO])
 @pytest.mark.parametrize("name", FORMULAS)
-def test_bounds_hold_up_to_the_least_and_the_largest_ratio_and_there_is_no_answer_beyond(name, end, setting):
-    """A factor of two up to either end, the refracted angle uniform in its sine."""
+def test_bounds_hold_at_the_smallest_and_largest_ratio_and_other_ratios_give_nan(name, end, setting):
+    """Ratios within a factor of two of either end, with a uniform sine of the refracted angle."""
     rng, count = np.random.default_rng(6), 40 if setting.is_scalar else 4000
     n, k = rng.normal(size=(count, 3)), end * rng.uniform(*((0.5, 1) if end > 1 else (1, 2)), count)
     k[0], n = end, n / np.linalg.norm(n, axis=1, keepdims=True)
@@ -48,8 +48,8 @@ def test_bounds_hold_up_to_the_least_and_the_largest_ratio_and_there_is_no_answe
     a = sine * t / np.linalg.norm(t, axis=1, keepdims=True) - np.sqrt(1 - sine * sine) * n
     rays = regimes.Rays(*(x.astype(setting.precision) for x in (a, n, k)))
     exact, formula = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False), FORMULAS[name]
-    found = judge_formula(formula, rays, exact, setting.vector, formula.budget)
-    assert not found.wrong.any() and exact.transmitted.sum() > count / 2
+    judgement = judge_formula(formula, rays, exact, setting.vector, formula.budget)
+    assert not judgement.wrong.any() and exact.transmitted.sum() > count / 2
     beyond = regimes.Rays(rays.a, rays.n, rays.k * setting.precision(2 if end > 1 else 0.5))
     b, transmitted = evaluate(formula, beyond, setting.vector)
     assert np.isnan(b[0]).all() and not transmitted[0]

@@ -14,7 +14,7 @@ from mi_refract.regimes import REGIMES, Rays, make, radicand
 
 COUNTS = {"scalar": 25, "llvm": 1000, "cuda": 1000}
 EXACT = [name for name, formula in FORMULAS.items() if formula.budget.at_the_limit]
-# The regimes that do not choose or change their normals.
+# Regimes whose normals are arbitrary, so that a test can choose them.
 AROUND_A_NORMAL = [name for name, entry in REGIMES.items() if isinstance(entry.build, functools.partial)]
 Z = [0.0, 0.0, 1.0]
 
@@ -26,14 +26,14 @@ def certified(regime, count, precision, normal=None):
 
 
 def broken(subject, rays, exact, setting, budget):
-    """The metrics of the judgement that break their budgets."""
-    found = judge_formula(subject, rays, exact, setting.vector, budget).values()
-    return {metric: found[metric] for metric, bound in BUDGETS.items() if not found[metric] <= bound}
+    """The metrics of the judgement that exceed their budgets."""
+    values = judge_formula(subject, rays, exact, setting.vector, budget).values()
+    return {metric: values[metric] for metric, bound in BUDGETS.items() if not values[metric] <= bound}
 
 
 @pytest.mark.parametrize("regime", REGIMES)
 @pytest.mark.parametrize("name", FORMULAS)
-def test_within_its_budget_in_every_regime(name, regime, setting):
+def test_errors_are_within_the_budget_in_every_regime(name, regime, setting):
     if reason := setting.no_budget(FORMULAS[name].budget, regime):
         pytest.skip(reason)
     rays, exact = certified(regime, COUNTS[setting.backend], setting.precision)
@@ -42,15 +42,15 @@ def test_within_its_budget_in_every_regime(name, regime, setting):
 
 @pytest.mark.parametrize("regime", REGIMES)
 @pytest.mark.parametrize("name", EXACT)
-def test_within_its_budget_where_a_compiler_fuses_products_and_sums(name, regime, fused):
+def test_errors_are_within_the_budget_if_a_compiler_fuses_products_and_sums(name, regime, fused):
     if reason := fused.no_budget(FORMULAS[name].budget, regime):
         pytest.skip(reason)
     rays, exact = certified(regime, 1000, fused.precision)
     assert broken(FORMULAS[name], rays, exact, fused, FORMULAS[name].budget) == {}
 
 
-def test_the_promoted_form_decides_exactly_beyond_2_to_the_minus_49_of_its_terms(float32):
-    """Also at grazing incidence, where n·a is the rest of products that are much larger."""
+def test_the_promoted_form_decides_right_beyond_2_to_the_minus_49_of_its_terms(float32):
+    """Also at grazing incidence, where n·a is a sum of much larger products that cancel."""
     rays = make("critical, any k, to the ulp", 100_000, np.float32)
     _, exact, terms = radicand(*(x.T.astype(float) for x in (rays.a, rays.n, rays.k)))
     _, transmitted = evaluate(FORMULAS["promoted"], rays, float32.vector)
@@ -60,7 +60,7 @@ def test_the_promoted_form_decides_exactly_beyond_2_to_the_minus_49_of_its_terms
 # Edges ---------------------------------------------------------------------------------------------------------
 
 
-def one(setting, formula, a, n, k, **kwargs):
+def single_ray(setting, formula, a, n, k, **kwargs):
     """(b, transmitted) of a single ray, as a numpy array and a bool."""
     vector = setting.vector
     k = dr.value_t(vector)(k)
@@ -70,28 +70,28 @@ def one(setting, formula, a, n, k, **kwargs):
 
 @pytest.mark.parametrize("name", FORMULAS)
 @pytest.mark.parametrize("k", [0.5, 1.0, 1.5])
-def test_normal_incidence_goes_straight_through_and_a_tangential_ray_on(name, k, setting):
+def test_rays_at_normal_incidence_and_along_the_surface_keep_their_direction(name, k, setting):
     for side in (-1.0, 1.0):
-        b, transmitted = one(setting, FORMULAS[name], (0, 0, side), Z, k)
+        b, transmitted = single_ray(setting, FORMULAS[name], (0, 0, side), Z, k)
         assert (b.tolist(), transmitted) == ([0, 0, side], True)
-    b, transmitted = one(setting, FORMULAS[name], (0.6, 0.8, 0), Z, k)
+    b, transmitted = single_ray(setting, FORMULAS[name], (0.6, 0.8, 0), Z, k)
     assert (b.tolist(), transmitted) == ([setting.precision(0.6), setting.precision(0.8), 0], False)
 
 
 @pytest.mark.parametrize("name", EXACT)
-def test_the_critical_angle_is_transmitted_along_the_surface_and_the_next_ratio_is_not(name, setting):
+def test_the_critical_angle_is_transmitted_and_the_next_larger_ratio_is_reflected(name, setting):
     # sin θ = 4/5 and k = 5/4: the radicand is exactly 0.
-    b, transmitted = one(setting, FORMULAS[name], (4, 0, -3), Z, 1.25)
+    b, transmitted = single_ray(setting, FORMULAS[name], (4, 0, -3), Z, 1.25)
     assert (b.tolist(), transmitted) == ([5, 0, 0], True)
-    b, transmitted = one(setting, FORMULAS[name], (4, 0, -3), Z, np.nextafter(setting.precision(1.25), 2))
+    b, transmitted = single_ray(setting, FORMULAS[name], (4, 0, -3), Z, np.nextafter(setting.precision(1.25), 2))
     assert (b.tolist(), transmitted) == ([4, 0, 3], False)
 
 
 @pytest.mark.parametrize("axis", [(0, 0, 1), (0, -1, 0)])
 @pytest.mark.parametrize("regime", AROUND_A_NORMAL)
 @pytest.mark.parametrize("name", EXACT)
-def test_a_literal_axis_is_folded_away_and_nothing_else_changes(name, regime, axis, setting):
-    """As in a local frame. A literal normal takes shorter ways through both formulas."""
+def test_errors_are_within_the_budget_for_a_literal_normal(name, regime, axis, setting):
+    """As in a local frame: for a literal normal both formulas take fewer steps."""
     rays, exact = certified(regime, COUNTS[setting.backend], setting.precision, axis)
     assert (rays.n == axis).all()
     literal = setting.vector(*map(float, axis))
@@ -100,7 +100,7 @@ def test_a_literal_axis_is_folded_away_and_nothing_else_changes(name, regime, ax
 
 @pytest.mark.parametrize("name", EXACT)
 def test_a_matched_boundary_returns_the_same_bits(name, setting):
-    """Along an axis at any angle: there the square of the cosine loses its low part below 1e-12 in float32, and
+    """Also for a literal normal at any angle: in float32 the square of the cosine loses its low part below 1e-12, and
     underflows below 1e-19."""
     rays, count = make("generic", COUNTS[setting.backend], setting.precision, seed=3), COUNTS[setting.backend]
     cosine, axis = np.geomspace(1e-30, 1, count), setting.vector(*Z)
@@ -114,26 +114,28 @@ def test_a_matched_boundary_returns_the_same_bits(name, setting):
 
 
 @pytest.mark.parametrize("name", FORMULAS)
-def test_the_side_of_the_normal_changes_no_bit_and_powers_of_two_scale_the_answer_of_any_length(name, setting):
-    names = [regime for regime, entry in REGIMES.items() if entry.unit and "denormal" not in regime]
-    rays = Rays.joined([make(regime, COUNTS[setting.backend] // 4, setting.precision, seed=21) for regime in names])
+def test_flipped_normals_and_powers_of_two_of_lengths_change_no_bit(name, setting):
+    unit_regimes = [regime for regime, entry in REGIMES.items() if entry.unit and "denormal" not in regime]
+    rays = Rays.joined(
+        [make(regime, COUNTS[setting.backend] // 4, setting.precision, seed=21) for regime in unit_regimes]
+    )
     b, transmitted = evaluate(FORMULAS[name], rays, setting.vector)
     i, j = np.random.default_rng(22).integers(-12, 12, (2, len(rays), 1), endpoint=True)
-    others = [(0, Rays(rays.a, -rays.n, rays.k))]
-    others += [(i, Rays(np.ldexp(rays.a, i), np.ldexp(rays.n, j), rays.k))] if name in EXACT else []
-    for scale, other in others:
-        b2, same = evaluate(FORMULAS[name], other, setting.vector)
-        assert np.count_nonzero(transmitted != same) == np.count_nonzero(np.ldexp(b, scale) != b2) == 0
+    cases = [(0, Rays(rays.a, -rays.n, rays.k))]
+    cases += [(i, Rays(np.ldexp(rays.a, i), np.ldexp(rays.n, j), rays.k))] if name in EXACT else []
+    for scale, changed in cases:
+        b2, transmitted2 = evaluate(FORMULAS[name], changed, setting.vector)
+        assert np.count_nonzero(transmitted != transmitted2) == np.count_nonzero(np.ldexp(b, scale) != b2) == 0
 
 
 @pytest.mark.parametrize("name", EXACT)
-def test_a_known_contrast_is_used_where_the_ratio_has_lost_it(name, setting):
+def test_the_contrast_is_used_if_the_ratio_has_lost_it(name, setting):
     contrast = 1e-9 if setting.precision is np.float32 else 1e-17
     a = np.array([[1.0, 0.0, -1e-3]], dtype=setting.precision)
     n = np.array([Z], dtype=setting.precision)
     k = np.ones(1, dtype=setting.precision)
     exact = oracle.refract(a, n, k, contrast=np.array([contrast]), progress=False)
-    b, transmitted = one(setting, FORMULAS[name], a[0], Z, 1, contrast=contrast)
+    b, transmitted = single_ray(setting, FORMULAS[name], a[0], Z, 1, contrast=contrast)
     assert transmitted == exact.transmitted[0]
     length = math.sqrt(sum(float(x) ** 2 for x in a[0]))
     error = np.linalg.norm(b / length - exact.direction[0]) / setting.roundoff
@@ -146,18 +148,18 @@ RAY, NAN, INF = (0.6, 0, -0.8), math.nan, math.inf
 
 
 @pytest.mark.parametrize("name", FORMULAS)
-def test_what_is_no_refraction_gives_nan_and_false(name, setting):
+def test_invalid_input_gives_nan_and_false(name, setting):
     bad = [(a, Z, 1.5, {}) for a in ((NAN, 0, -1), (0, 0, INF), (0, -INF, -1), (0, 0, 0))]
     bad += [(RAY, n, 1.5, {}) for n in ((0, 0, 0), (0, NAN, 1), (0, 0, INF))]
     bad += [(RAY, Z, k, {}) for k in (0.0, -1.5, NAN, INF, 1e300, 1e-300)]
     bad += [(RAY, Z, 0.7, {"contrast": x}) for x in (NAN, INF, -1.0, -2.0) if name in EXACT]
     for a, n, k, contrast in bad:
-        b, transmitted = one(setting, FORMULAS[name], a, n, k, **contrast)
+        b, transmitted = single_ray(setting, FORMULAS[name], a, n, k, **contrast)
         assert np.isnan(b).all() and not transmitted, (a, n, k, contrast)
 
 
 @pytest.mark.parametrize("name", FORMULAS)
-def test_numbers_of_numpy_and_vectors_of_another_precision_are_taken(name, setting):
+def test_numpy_numbers_and_vectors_of_another_precision_are_accepted(name, setting):
     other = getattr(getattr(dr, setting.backend), "Array3f64" if setting.precision is np.float32 else "Array3f")
     a = setting.vector(0.6, 0, -0.8)
     b, transmitted = FORMULAS[name](a, other(0, 0, 1), np.float32(0.75))
@@ -169,7 +171,7 @@ def test_numbers_of_numpy_and_vectors_of_another_precision_are_taken(name, setti
 # Reflection, the plane, derivatives ----------------------------------------------------------------------------
 
 
-def test_reflection_turns_the_normal_part_round(setting):
+def test_reflection_reverses_the_normal_component(setting):
     rng, vector = np.random.default_rng(5), setting.vector
     for form in (reflect, reflect_sandwich) * 10:
         n, a = rng.normal(size=(2, 3))
@@ -178,7 +180,7 @@ def test_reflection_turns_the_normal_part_round(setting):
         assert b == pytest.approx(a - 2 * n * (n @ a), abs=12 * setting.roundoff * np.linalg.norm(a))
 
 
-def test_the_2d_core_obeys_snell_on_both_sides_of_a_slanted_boundary(setting):
+def test_refract_2d_obeys_snells_law_on_both_sides_of_a_slanted_boundary(setting):
     number = dr.value_t(setting.vector)
     for degrees in (10.0, 100.0, 190.0, 280.0):
         t = math.radians(degrees)
@@ -210,15 +212,15 @@ def derivative_in_the_ratio(name, setting, a, k, opaque=False):
 
 @pytest.mark.parametrize("name", FORMULAS)
 @pytest.mark.parametrize("opaque", [False, True])
-def test_derivatives_are_those_of_the_closed_form(name, opaque, vectorised):
-    """b = (k sin, 0, −√(1 − k² sin²)) at n = z; also at normal incidence, and of a normal that is a literal."""
+def test_derivatives_equal_those_of_the_closed_form(name, opaque, vectorised):
+    """b = (k sin, 0, −√(1 − k² sin²)) at n = z; also at normal incidence, and for a literal normal."""
     u, vector = vectorised.roundoff, dr.diff_array_t(vectorised.vector)
-    # Also at a matched boundary, where b is `a` to the last bit.
+    # Also at a matched boundary, where b is `a` bit for bit.
     for k in (0.7, *([1.0] if name in EXACT else [])):
-        found, _ = derivative_in_the_ratio(name, vectorised, RAY, k, opaque)
-        assert found == pytest.approx([0.6, 0, k * 0.36 / math.sqrt(1 - (k * 0.6) ** 2)], rel=0, abs=40 * u)
-    found, transmitted = derivative_in_the_ratio(name, vectorised, (0.8, 0, -0.6), 1.5, opaque)
-    assert (found.tolist(), transmitted) == ([0, 0, 0], False)
+        gradient, _ = derivative_in_the_ratio(name, vectorised, RAY, k, opaque)
+        assert gradient == pytest.approx([0.6, 0, k * 0.36 / math.sqrt(1 - (k * 0.6) ** 2)], rel=0, abs=40 * u)
+    gradient, transmitted = derivative_in_the_ratio(name, vectorised, (0.8, 0, -0.6), 1.5, opaque)
+    assert (gradient.tolist(), transmitted) == ([0, 0, 0], False)
     # ∂b_x/∂n_x = −(k cos θ_i − cos θ_t), by the formula b = k a + n (…) at n = z
     expected = {"a": [0.75, 0, 0], "n": [0.75 * 0.8 - math.sqrt(1 - 0.45**2)]}
     for moved, ray in (("a", (0, 0, -1)), ("n", RAY)):
@@ -227,5 +229,5 @@ def test_derivatives_are_those_of_the_closed_form(name, opaque, vectorised):
             dr.make_opaque(vectors["n"])
         dr.enable_grad(vectors[moved])
         dr.backward(FORMULAS[name](**vectors, k=0.75)[0].x)
-        found = np.array(dr.grad(vectors[moved])).ravel().tolist()
-        assert found[: len(expected[moved])] == pytest.approx(expected[moved], abs=40 * u)
+        gradient = np.array(dr.grad(vectors[moved])).ravel().tolist()
+        assert gradient[: len(expected[moved])] == pytest.approx(expected[moved], abs=40 * u)

@@ -1,4 +1,4 @@
-"""The slips in the documents: each printed form is shown wrong, and the corrected one right."""
+"""The errata of the documents: each printed form is wrong, and the corrected one is right."""
 
 import math
 
@@ -17,7 +17,7 @@ def numbers(b):
     return [float(x) for x in b]
 
 
-def test_004_prints_a_sine_that_is_none():
+def test_004_prints_a_wrong_sine():
     """X = k R/(1 + R²) is not k sin(atan R): at 45° the sine is √½, the printed form says ½."""
     printed = K * 1 / (1 + 1**2)
     (_, along), _ = refract_2d((math.sqrt(0.5), math.sqrt(0.5)), (0.0, 1.0), K)
@@ -25,10 +25,10 @@ def test_004_prints_a_sine_that_is_none():
     assert abs(printed - along) > 0.1
 
 
-def test_004_prints_an_intersection_that_is_off_the_boundary_and_mu_with_the_wrong_sign():
-    """The right-hand side needs the boundary's own direction: l_x + μ l_α, not l_x + μ i_α; and r_* are the ray's.
+def test_004_prints_a_wrong_intersection_and_the_wrong_sign_of_mu():
+    """The right-hand side needs the direction of the boundary: l_x + μ l_α, not l_x + μ i_α; r_* belong to the ray.
 
-    With the denominator that it shares with λ, μ = −(i_α(i_y − l_y) + i_β(l_x − i_x))/… is that of no crossing.
+    With the denominator of λ, the printed μ = −(i_α(i_y − l_y) + i_β(l_x − i_x))/… has the wrong sign.
     """
     i_s, i_d, l_s, l_d = (np.array(x) for x in ([0.0, 0.0], [1.0, 1.0], [4.0, 0.0], [0.0, 8.0]))
     lam, mu = np.linalg.solve(np.column_stack([i_d, -l_d]), l_s - i_s)
@@ -40,14 +40,14 @@ def test_004_prints_an_intersection_that_is_off_the_boundary_and_mu_with_the_wro
     assert printed == pytest.approx(-mu)
     paths = trace(Segments([l_s], [l_s + l_d], [1.0], [1.0]), [i_s], [i_d], 1)
     assert paths.points[0, 1] == pytest.approx(l_s + mu * l_d)
-    # A segment twice as long the other way is where the printed sign would see a crossing, and a missed one here.
+    # A segment in the opposite direction does not meet the ray; with the printed sign it would.
     assert trace(Segments([l_s], [l_s - l_d], [1.0], [1.0]), [i_s], [i_d], 1).hits[0, 0] == -1
 
 
-def test_004_divides_by_zero_along_the_boundary_and_loses_the_ray_to_the_sign_of_zero():
-    """R = i_β/i_α is infinite there, and ∞/(1 + ∞²) is NaN; the core multiplies it out.
+def test_004_fails_for_rays_along_the_boundary():
+    """R = i_β/i_α is infinite, and ∞/(1 + ∞²) is NaN; `refract_2d` does not divide by i_α.
 
-    There i_Bα = 0, and the printed (sign(i_Bα) √(1 − X²), sign(i_Bβ) X) is (0, k), shorter than i.
+    As i_Bα = 0, the printed (sign(i_Bα) √(1 − X²), sign(i_Bβ) X) is (0, k), shorter than i.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         r = np.float64(1.0) / np.float64(0.0)
@@ -59,7 +59,7 @@ def test_004_divides_by_zero_along_the_boundary_and_loses_the_ray_to_the_sign_of
 
 
 @pytest.mark.parametrize("name", FORMULAS)
-def test_004_excludes_indices_below_one_that_exist(name):
+def test_formulas_hold_for_indices_below_one_which_004_excludes(name):
     """Plasmas: from vacuum into n = 0.9, 30° is within the critical angle; into n = 0.75, 60° is beyond it."""
     b, transmitted = FORMULAS[name](Vector(0.5, 0, -math.sqrt(0.75)), Vector(0, 0, 1), 1 / 0.9)
     assert transmitted and b.x == pytest.approx(0.5 / 0.9, rel=1e-12)
@@ -88,7 +88,7 @@ def as_printed_000(a, n, k):
 
 @pytest.mark.parametrize(("printed", "name"), [(as_printed_002, "decomposed"), (as_printed_000, "wedge")])
 def test_000_and_002_hold_on_one_side_only(printed, name):
-    """Both assume n·a < 0: with the normal on the other side they send the ray back where it came from."""
+    """Both assume n·a < 0: with the normal on the other side they send the ray back to its own side."""
     for z in (-0.8, 0.8):
         a, n = Vector(0.6, 0, z), Vector(0, 0, 1)
         b, _ = FORMULAS[name](a, n, K)

@@ -1,4 +1,4 @@
-"""Fresnel's equations against certified answers and against their textbook form: 4u for powers, 8u for amplitudes."""
+"""Fresnel's equations against certified answers: within 4u for powers, 8u for amplitudes."""
 
 import functools
 import zlib
@@ -21,8 +21,8 @@ def log_uniform(rng, low, high, count):
     return np.exp(rng.uniform(np.log(low), np.log(high), count))
 
 
-def aside(rng, x, precision, most=4):
-    """A few ulps, or many."""
+def displaced(rng, x, precision, most=4):
+    """`x` moved by a few ulps, or by many."""
     count, x = len(x), x.astype(precision)
     many = log_uniform(rng, 1, 1e5, count) * rng.choice([-1, 1], count)
     ulps = np.where(rng.random(count) < 0.6, rng.integers(-most, most + 1, count), many)
@@ -31,12 +31,12 @@ def aside(rng, x, precision, most=4):
 
 def critical(rng, count, precision):
     k = log_uniform(rng, 1.0001, 1e6, count).astype(precision).astype(np.longdouble)
-    return aside(rng, np.sqrt((k - 1) * (k + 1)) / k, precision), k
+    return displaced(rng, np.sqrt((k - 1) * (k + 1)) / k, precision), k
 
 
 def brewster(rng, count, precision):
     k = log_uniform(rng, 1e-3, 1e3, count).astype(precision).astype(np.longdouble)
-    return aside(rng, k / np.sqrt(1 + k * k), precision, most=1), k
+    return displaced(rng, k / np.sqrt(1 + k * k), precision, most=1), k
 
 
 def matched(rng, count, precision):
@@ -56,7 +56,8 @@ DRAWS = {
     "dense": lambda rng, count, _: (rng.random(count), log_uniform(rng, 1e-6, 0.3, count)),
     **{f.__name__: f for f in (critical, brewster, matched, steep)},
 }
-# Where hill-climbing on the bits came to rest, from the worst of 10⁶ rays in each of eleven regimes: R, R, T, r_p.
+# Local maxima of the errors of R, R, T and r_p: found by hill climbing on the bits of (cos_i, k), from the worst of 10⁶
+# rays in each of eleven regimes.
 WORST = {
     "float32": [
         ("0x1.66e34ep-3", "0x1.f71f70p-1"),
@@ -87,13 +88,13 @@ def number_of(setting):
 
 
 def evaluate(setting, cos_i, k):
-    """R, T, r_s, r_p and which are transmitted."""
+    """R, T, r_s, r_p, and whether each ray is transmitted."""
 
-    def ask(c, k):
+    def all_results(c, k):
         cos_t, transmitted = fresnel.refracted_cosine(c, k)
         return *fresnel.powers(c, cos_t, transmitted, k), *fresnel.amplitudes(c, k), transmitted
 
-    return evaluated(ask, setting, cos_i, k)
+    return evaluated(all_results, setting, cos_i, k)
 
 
 def relative(x, exact, low, setting):
@@ -118,12 +119,12 @@ def test_powers_are_within_4u_and_amplitudes_within_8u(name, setting):
 
 
 @pytest.mark.parametrize("name", DRAWS)
-def test_powers_where_a_compiler_fuses_products_and_sums(name, fused):
+def test_powers_and_amplitudes_if_a_compiler_fuses_products_and_sums(name, fused):
     r, t, amplitude = errors(fused, *certified(name, fused))
     assert r <= 4 and t <= 4 and amplitude <= 8
 
 
-def test_the_worst_that_was_found(setting):
+def test_the_worst_known_rays(setting):
     columns = zip(*WORST[setting.name], strict=True)
     cos_i, k = (np.array([float.fromhex(x) for x in column], setting.precision) for column in columns)
     r, t, amplitude = errors(setting, cos_i, k, oracle.fresnel(cos_i, k))
@@ -140,7 +141,7 @@ def textbook(cos_i, k):
 
 
 @pytest.mark.parametrize("name", DRAWS)
-def test_the_oracle_of_cosines_is_the_textbook(name):
+def test_the_oracle_for_cosines_agrees_with_the_textbook(name):
     cos_i, k = DRAWS[name](np.random.default_rng(3), 50, np.float64)
     cos_i, k = np.clip(cos_i, 0, 1).astype(float), k.astype(float)
     exact = oracle.fresnel(cos_i, k)
@@ -148,16 +149,16 @@ def test_the_oracle_of_cosines_is_the_textbook(name):
         s, p = textbook(cos_i[i], k[i])
         with ctx.workprec(400):
             r = (abs(s) ** 2 + abs(p) ** 2) / 2
-            for ours, low, theirs in (
+            for high, low, expected in (
                 (exact.reflectance[i], exact.reflectance_low[i], r),
                 (exact.transmittance[i], exact.transmittance_low[i], 1 - r),
             ):
-                assert abs(arb(ours) + arb(low) - theirs) <= 2.0**-95 * abs(theirs) + 2.0**-390
-            for a, theirs in ((exact.amplitude_s[i], s), (exact.amplitude_p[i], p)):
-                assert abs(acb(a.real, a.imag) - theirs) <= 3e-16 * abs(theirs)
+                assert abs(arb(high) + arb(low) - expected) <= 2.0**-95 * abs(expected) + 2.0**-390
+            for a, expected in ((exact.amplitude_s[i], s), (exact.amplitude_p[i], p)):
+                assert abs(acb(a.real, a.imag) - expected) <= 3e-16 * abs(expected)
 
 
-def test_the_oracle_of_cosines_refuses_what_is_no_cosine():
+def test_the_oracle_for_cosines_gives_nan_for_invalid_input():
     exact = oracle.fresnel(np.array([-0.1, 1.1, np.nan, 0.5, 0.0]), np.array([1.5, 1.5, 1.5, -1.0, 1.5]))
     assert np.isnan(exact.reflectance).tolist() == [True] * 4 + [False]
     assert (exact.reflectance[4], exact.transmittance[4]) == (1, 0)
@@ -166,7 +167,7 @@ def test_the_oracle_of_cosines_refuses_what_is_no_cosine():
 # Edges ---------------------------------------------------------------------------------------------------------------
 
 
-def test_nothing_reflects_where_nothing_differs_and_a_tangential_ray_is_reflected(setting):
+def test_a_matched_boundary_does_not_reflect_and_a_tangential_ray_is_reflected(setting):
     cos_i = np.array([1.0, 0.3, 1e-12, 1e-30, 1e-76, 1e-90, 1e-140], setting.precision)
     cos_i = cos_i[cos_i > 0]
     r, t, s, p, transmitted = evaluate(setting, cos_i, np.ones_like(cos_i))
@@ -175,38 +176,37 @@ def test_nothing_reflects_where_nothing_differs_and_a_tangential_ray_is_reflecte
     k = np.array([0.5, 1.0, 1.5], setting.precision)
     r, t, s, p, transmitted = evaluate(setting, 0 * k, k)
     assert (r == 1).all() and (t == 0).all() and (s == -1).all() and (p == -1).all() and not transmitted.any()
-    # A transmitted ray with cosθt = 0 and k = 1, for the refracted cosine underflowed: no 0/0.
+    # A transmitted ray with k = 1 whose refracted cosine underflowed to 0: no 0/0.
     number = number_of(setting)
     for c in (0.02, 0.5):
         r, t = fresnel.powers(number(c), number(0.0), number(1.0) > 0, number(1.0))
         assert (to_numpy(r) == 1).all() and (to_numpy(t) == 0).all()
 
 
-def test_between_two_cosines_the_critical_angle_is_found(setting):
-    """Of a cosine and its neighbours some are transmitted, others not, as the exact numbers say."""
+def test_cosines_next_to_the_critical_angle_are_decided_right(setting):
+    """Of the rounded critical cosine and its two neighbours, those are transmitted that the exact numbers transmit."""
     k = np.array([5 / 3], setting.precision)
     exact = np.sqrt(1 - 1 / k.astype(np.longdouble) ** 2).astype(setting.precision)
-    around = np.concatenate([np.nextafter(exact, 0), exact, np.nextafter(exact, 1)]).astype(setting.precision)
-    certified = oracle.fresnel(around, np.repeat(k, 3))
-    _, t, _, _, transmitted = evaluate(setting, around, np.repeat(k, 3))
+    cosines = np.concatenate([np.nextafter(exact, 0), exact, np.nextafter(exact, 1)]).astype(setting.precision)
+    certified = oracle.fresnel(cosines, np.repeat(k, 3))
+    _, t, _, _, transmitted = evaluate(setting, cosines, np.repeat(k, 3))
     assert 0 < certified.transmitted.sum() < 3
     assert (transmitted == certified.transmitted).all() and ((t > 0) == certified.transmitted).all()
 
 
-def test_contrast_counts_where_k_has_lost_it(setting):
-    """Δn = 3e-8: float32 sees k = 1."""
+def test_the_contrast_is_used_if_k_has_lost_it(setting):
+    """For Δn = 3e-8, k rounds to 1 in float32."""
     c, k, contrast = map(number_of(setting), (0.001, 1.0, 6e-8))
     cos_t, transmitted = fresnel.refracted_cosine(c, k, contrast)
-    given = [np.array([float(to_numpy(x).ravel()[0])]) for x in (c, contrast)]
-    exact = oracle.fresnel(given[0], np.ones(1), contrast=given[1])
-    for found, expected in zip(
-        fresnel.powers(c, cos_t, transmitted, k, contrast), (exact.reflectance, exact.transmittance), strict=True
-    ):
-        assert float(to_numpy(found).ravel()[0]) == pytest.approx(expected[0], rel=1e-6)
+    rounded = [np.array([float(to_numpy(x).ravel()[0])]) for x in (c, contrast)]
+    exact = oracle.fresnel(rounded[0], np.ones(1), contrast=rounded[1])
+    powers = fresnel.powers(c, cos_t, transmitted, k, contrast)
+    for power, expected in zip(powers, (exact.reflectance, exact.transmittance), strict=True):
+        assert float(to_numpy(power).ravel()[0]) == pytest.approx(expected[0], rel=1e-6)
     assert exact.reflectance[0] > 1e-5
 
 
-def test_nan_is_neither_a_mirror_nor_a_window(setting):
+def test_nan_gives_nan(setting):
     nan, half, k = map(number_of(setting), (float("nan"), 0.5, 1.5))
     for cos_i, cos_t, ratio in ((nan, half, k), (half, nan, k), (half, half, nan)):
         for transmitted in (False, True):
@@ -215,7 +215,7 @@ def test_nan_is_neither_a_mirror_nor_a_window(setting):
         assert all(np.isnan(to_numpy(x)).all() for x in fresnel.amplitudes(cos_i, ratio))
 
 
-def test_derivatives_are_finite_wherever_they_exist_and_at_the_edges(vectorised):
+def test_derivatives_are_finite_also_at_the_edges(vectorised):
     number = dr.diff_array_t(dr.value_t(vectorised.vector))
     x = number(np.array([1, 0.3, 0, 0, 0.5, 1e-30, 0.9], vectorised.precision))
     y = number(np.array([1, 1, 1, 1.5, 1.5, 0.5, 0.7], vectorised.precision))
@@ -232,18 +232,18 @@ def test_derivatives_are_finite_wherever_they_exist_and_at_the_edges(vectorised)
 
 def matrices(c, ratio):
     cos_t, transmitted = fresnel.refracted_cosine(c, ratio)
-    found = fresnel.mueller_reflection(c, ratio), fresnel.mueller_transmission(c, cos_t, transmitted, ratio)
-    return [np.array([[to_numpy(x).ravel()[0] for x in row] for row in m], float) for m in found]
+    both = fresnel.mueller_reflection(c, ratio), fresnel.mueller_transmission(c, cos_t, transmitted, ratio)
+    return [np.array([[to_numpy(x).ravel()[0] for x in row] for row in m], float) for m in both]
 
 
 @pytest.mark.parametrize("name", ["generic", "critical", "matched"])
-def test_mueller_matrices_are_those_of_the_certified_amplitudes(name, setting):
+def test_mueller_matrices_agree_with_the_certified_amplitudes(name, setting):
     number, (cos_i, k, exact), u = number_of(setting), certified(name, setting), setting.roundoff
     for i in range(8):
         r, t = matrices(number(float(cos_i[i])), number(float(k[i])))
         s, p = exact.amplitude_s[i], exact.amplitude_p[i]
         powers, cross = (abs(s) ** 2, abs(p) ** 2), p * np.conj(s)
-        # Two amplitudes of 8u each, their product and the mean: 18u of what they are taken from.
+        # Two amplitudes with errors of 8u each, their product and the mean: 18u in total.
         assert r[0, 0] == pytest.approx(sum(powers) / 2, rel=18 * u)
         assert r[0, 1] == pytest.approx((powers[0] - powers[1]) / 2, abs=18 * u * sum(powers) / 2)
         assert r[2, 2] + 1j * r[3, 2] == pytest.approx(cross, abs=18 * u * abs(cross))
@@ -258,8 +258,8 @@ def test_mueller_matrices_are_those_of_the_certified_amplitudes(name, setting):
 
 @pytest.mark.parametrize("formula", ["promoted", "compensated"])
 @pytest.mark.parametrize("name", DRAWS)
-def test_powers_of_rays_that_are_unit_only_up_to_rounding(name, formula, float32):
-    """At all azimuths."""
+def test_powers_of_rays_whose_lengths_are_rounded(name, formula, float32):
+    """At random azimuths."""
     cos_i, k, _ = certified(name, float32)
     azimuth = np.random.default_rng(5).uniform(0, 2 * np.pi, len(k))
     sine = np.sqrt((1 - cos_i.astype(float)) * (1 + cos_i.astype(float)))
@@ -271,7 +271,7 @@ def test_powers_of_rays_that_are_unit_only_up_to_rounding(name, formula, float32
     powers = fresnel.local_powers(ray, transmitted, wide, contrast)
     dr.eval(powers, transmitted)
     r, t = map(to_numpy, powers)
-    # Off by ε ≤ 10·2⁻⁵³ of its larger term, a radicand moves T by ε/2ρ: nearer to the critical angle by more than u/2.
+    # An error ε ≤ 10·2⁻⁵³ of the radicand changes T by ε/2ρ, which exceeds u/2 only near the critical angle.
     scale = np.maximum(cos_i.astype(float) ** 2, np.abs(k.astype(float) ** 2 - 1) * sine**2)
     far = (exact.cos_t**2 > 10 * 2.0**-53 / float32.roundoff * scale) | ~exact.transmitted
     far &= np.array(transmitted) == exact.transmitted
@@ -280,12 +280,12 @@ def test_powers_of_rays_that_are_unit_only_up_to_rounding(name, formula, float32
     assert relative(t[far], exact.transmittance[far], exact.transmittance_low[far], float32) <= 2
 
 
-def test_length_of_the_ray_cancels(float32):
-    """A length off by 1e-3 changes nothing; the textbook's κ/(k cᵢ + cₜ)² would be off by twice that."""
+def test_the_length_of_the_ray_cancels(float32):
+    """An error of 1e-3 of the length changes nothing; the textbook's κ/(k cᵢ + cₜ)² would be wrong by twice that."""
     number = dr.value_t(float32.vector)
-    k, contrast, found = number(1.5), number(1.25), []
+    k, contrast, powers = number(1.5), number(1.25), []
     for length in (1.0, 1.001):
         a = float32.vector(0.28 * length, 0, 0.96 * length)
         _, transmitted = FORMULAS["promoted"](a, float32.vector(0, 0, 1), k, contrast)
-        found.append([float(to_numpy(x).ravel()[0]) for x in fresnel.local_powers(a, transmitted, k, contrast)])
-    assert found[1] == pytest.approx(found[0], rel=8 * float32.roundoff)
+        powers.append([float(to_numpy(x).ravel()[0]) for x in fresnel.local_powers(a, transmitted, k, contrast)])
+    assert powers[1] == pytest.approx(powers[0], rel=8 * float32.roundoff)

@@ -1,4 +1,4 @@
-"""`mi-refract accept`: which new images become references, which bytes are copied, and what is refused."""
+"""`mi-refract accept`: which images are copied, which bytes are copied, and which images are refused."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 import OpenImageIO
 import pytest
 import typer
-from support.diff_images import BROKEN, found, image, tree
+from support.diff_images import BROKEN, image, outcomes, tree
 from support.processes import assert_refused, python
 
 from mi_refract.image_diff import accept
@@ -33,13 +33,13 @@ def to_accept(old, new, *settings):
 
 @pytest.fixture
 def terminal(monkeypatch):
-    """`terminal(answer)`: a person at a terminal; `answer(question)` may do more than answer."""
+    """`terminal(answer)`: make stdin a terminal and call `answer(question)` to confirm; it may have side effects."""
 
-    def sit(answer):
+    def simulate(answer):
         monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
         monkeypatch.setattr(typer, "confirm", answer)
 
-    return sit
+    return simulate
 
 
 @pytest.fixture
@@ -56,11 +56,11 @@ def compared(run, pair, tmp_path):
 # What is copied ---------------------------------------------------------------------------------------------------
 
 
-def test_what_is_not_equal_is_copied_and_what_was_removed_is_kept(run, folders, monkeypatch):
+def test_accept_copies_images_that_differ_and_keeps_removed_ones(run, folders, monkeypatch):
     old, new = folders
     before, names = tree(old), ("added.exr", "inner/changed.exr")
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
-    code, out, err = run("accept", old, new)  # a script is not asked
+    code, out, err = run("accept", old, new)  # without a terminal
     assert (code, err.partition(" ")[2]) == (
         2,
         "accept asks for confirmation on a terminal; without a terminal, pass --yes\n",
@@ -71,14 +71,14 @@ def test_what_is_not_equal_is_copied_and_what_was_removed_is_kept(run, folders, 
     assert f"{new}/inner/changed.exr → {old}/inner/changed.exr\n" in out
     assert f"{new}/added.exr → {old}/added.exr (new)\n" in out and out.splitlines()[-1] == "2 accepted"
     assert tree(old) == before | {name: tree(new)[name] for name in names}
-    statuses = found(diff.diff(old, new))
+    statuses = outcomes(diff.diff(old, new))
     assert [name for name, status in statuses.items() if status != ("equal", "unchanged")] == ["removed.exr"]
     image(new / "same.exr", gain=1.1)
-    for words, said in ((["--method", "tolerance", "--set", "fail=0.2"], "nothing to accept"), ([], "1 accepted")):
-        assert run("accept", old, new, *words, "--yes")[1].splitlines()[-1] == said  # judged as by `diff`
+    for words, last_line in ((["--method", "tolerance", "--set", "fail=0.2"], "nothing to accept"), ([], "1 accepted")):
+        assert run("accept", old, new, *words, "--yes")[1].splitlines()[-1] == last_line  # compared as by `diff`
 
 
-def test_a_reference_that_is_not_there_yet(folders, tmp_path):
+def test_accept_creates_missing_references(folders, tmp_path):
     new = folders[1]
     accept.Acceptance(to_accept(tmp_path / "first", new)).run()
     assert diff.diff(tmp_path / "first", new).exit_code == 0
@@ -92,21 +92,21 @@ def test_a_reference_that_is_not_there_yet(folders, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["truncated", "empty", "text"])
-def test_a_bad_image_becomes_no_reference_and_a_bad_reference_can_be_replaced(folders, name):
+def test_unreadable_images_are_refused_and_unreadable_references_replaced(folders, name):
     old, new = folders
     for bad in ("same.exr", "added.exr"):
-        kept = (new / bad).read_bytes()
+        content = (new / bad).read_bytes()
         (new / bad).unlink()
         BROKEN[name](new / bad)
         with pytest.raises(accept.UnreadableImage, match=bad):
             to_accept(old, new)
-        (new / bad).write_bytes(kept)
+        (new / bad).write_bytes(content)
     (old / "same.exr").unlink()
     BROKEN[name](old / "same.exr")
     assert (new / "same.exr", old / "same.exr") in [(copy.new, copy.reference) for copy in to_accept(old, new)]
 
 
-def test_values_that_are_not_finite_become_no_reference(run, folders, tmp_path):
+def test_nonfinite_images_are_refused_unless_allowed(run, folders, tmp_path):
     image(folders[1] / "same.exr", value=np.inf)
     with pytest.raises(ValueError, match="not finite; to accept them, compare with --set allow_nonfinite=true"):
         to_accept(*folders)
@@ -119,8 +119,8 @@ def test_values_that_are_not_finite_become_no_reference(run, folders, tmp_path):
         list(accept.changes(diff.diff(*folders)))
 
 
-def test_accept_takes_all_or_nothing(run, pair, tmp_path):
-    """And says once why: each image that cannot be compared has a line, also by the JSON of a comparison."""
+def test_an_unreadable_image_prevents_all_copies(run, pair, tmp_path):
+    """Each image that cannot be compared has one line on stderr, also with the JSON of a comparison."""
     out = tmp_path / "out.json"
     for broken in (["equal.exr"], ["equal.exr", "louder.exr"]):
         BROKEN["truncated"](pair[1] / broken[-1])
@@ -134,18 +134,18 @@ def test_accept_takes_all_or_nothing(run, pair, tmp_path):
             assert tree(pair[0]) == before
 
 
-# What changes meanwhile -------------------------------------------------------------------------------------------
+# Files that change after the comparison ---------------------------------------------------------------------------
 
 
 def rewritten(path):
-    """Another image of the same name, with the times of the old one."""
+    """Replace the image by another one with the same name and times."""
     times = path.stat()
     image(path, gain=3.0)
     os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
 
 
 def renamed(folder):
-    """Another folder of the same name: no file in it was written since, nor renamed."""
+    """Replace the folder by another one with the same name, whose files are unchanged."""
     folder.rename(folder.with_name("before"))
     folder.with_name("other").rename(folder)
 
@@ -163,7 +163,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize(("name", "change"), CHANGES.values(), ids=CHANGES)
-def test_what_changed_since_it_was_compared_is_not_accepted(folders, tmp_path, name, change):
+def test_files_changed_since_the_comparison_are_refused(folders, tmp_path, name, change):
     old, new = folders
     image(new / "other" / "changed.exr", gain=3.0)
     image(tmp_path / "linked.exr", gain=2.0)
@@ -187,38 +187,38 @@ WHILE = {
 
 @pytest.mark.parametrize("change", WHILE.values(), ids=WHILE)
 @pytest.mark.parametrize("after", [1, 2])
-def test_what_goes_wrong_while_it_is_copied_replaces_nothing(folders, monkeypatch, change, after):
-    """After so many of the two copies were begun."""
+def test_a_failure_while_copying_replaces_nothing(folders, monkeypatch, change, after):
+    """`after`: the number of copies begun, of two."""
     copies, copy, begun = to_accept(*folders), safe_files.copy, []
 
-    def late(*paths):
+    def change_and_copy(*paths):
         begun.append(paths)
         if len(begun) == after:
             change(*folders)
         return copy(*paths)
 
-    monkeypatch.setattr(safe_files, "copy", late)
+    monkeypatch.setattr(safe_files, "copy", change_and_copy)
     names = tree(folders[0]).keys()
     with pytest.raises(OSError, match=rf"changed\.exr: {CHANGED}|No space"):
         accept.Acceptance(copies).run()
-    after_it = tree(folders[0])
-    assert after_it.keys() == names
-    assert after_it["inner/changed.exr"] != tree(folders[1])["inner/changed.exr"]
+    references = tree(folders[0])
+    assert references.keys() == names
+    assert references["inner/changed.exr"] != tree(folders[1])["inner/changed.exr"]
 
 
 def test_only_the_bytes_that_were_compared_are_copied(folders, monkeypatch):
-    """Even where what is read for the copy is not what was there before and after."""
+    """Even if the digests before and after the copy are unchanged."""
     copies, before, digest = to_accept(*folders), tree(folders[0]), accept.digest
-    kept = {copy.new: copy.compared for copy in copies}
-    monkeypatch.setattr(accept, "digest", lambda path: kept.get(path) or digest(path))
+    compared_digests = {copy.new: copy.compared for copy in copies}
+    monkeypatch.setattr(accept, "digest", lambda path: compared_digests.get(path) or digest(path))
     rewritten(folders[1] / "inner/changed.exr")
     with pytest.raises(OSError, match=rf"changed\.exr: {CHANGED}"):
         accept.Acceptance(copies).run()
     assert tree(folders[0]) == before
 
 
-def test_what_is_decoded_is_what_has_the_digest(folders, monkeypatch):
-    """Even where the file is another one only while it is decoded."""
+def test_the_digest_is_that_of_the_decoded_bytes(folders, monkeypatch):
+    """Even if the file has another content only while it is decoded."""
     path = folders[1] / "same.exr"
     image(folders[1] / "other.exr", gain=3.0)
     same, other, opened = path.read_bytes(), (folders[1] / "other.exr").read_bytes(), OpenImageIO.ImageInput.open
@@ -235,7 +235,7 @@ def test_what_is_decoded_is_what_has_the_digest(folders, monkeypatch):
 
 
 def test_no_reference_is_written_through_a_link_to_a_folder(run, folders, tmp_path):
-    """A walk does not follow such a link; neither does a name, nor the name of a variant."""
+    """Neither for a name, nor for the name of a variant."""
     old, new = folders
     image(new / "deep" / "added.exr")
     (tmp_path / "outside").mkdir()
@@ -250,7 +250,7 @@ def test_no_reference_is_written_through_a_link_to_a_folder(run, folders, tmp_pa
 
 @pytest.mark.parametrize("count", [2, 12])
 @pytest.mark.parametrize("by_json", [False, True])
-def test_an_error_in_the_middle_says_what_is_replaced_and_the_same_call_finishes(
+def test_after_an_error_replaced_files_are_listed_and_a_second_call_finishes(
     run, tmp_path, monkeypatch, count, by_json
 ):
     old, new, out = tmp_path / "old", tmp_path / "new", tmp_path / "out.json"
@@ -268,41 +268,43 @@ def test_an_error_in_the_middle_says_what_is_replaced_and_the_same_call_finishes
 
     monkeypatch.setattr(safe_files, "move_into_place", fail)
     code, _, err = run(*words)
-    left = f"{old}/01.exr" if count == 2 else f"{old}/01.exr … {old}/11.exr (11 in the order above)"
-    said = f"replaced: {old}/00.exr; not replaced: {left}; the same command again accepts these"
-    assert (code, err) == (2, f"mi-refract: {old}/01.exr: Read-only file system; {said}\n")
-    assert tree(old) == before | {"00.exr": after["00.exr"]}  # and nothing hidden
+    rest = f"{old}/01.exr" if count == 2 else f"{old}/01.exr … {old}/11.exr (11 in the order above)"
+    state = f"replaced: {old}/00.exr; not replaced: {rest}; run the same command again to accept these"
+    assert (code, err) == (2, f"mi-refract: {old}/01.exr: Read-only file system; {state}\n")
+    assert tree(old) == before | {"00.exr": after["00.exr"]}  # and no hidden files
     monkeypatch.undo()
     assert run(*words)[::2] == (0, "") and tree(old) == after
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_in_the_middle_says_what_is_replaced_and_the_same_call_finishes(run, tmp_path, number):
+def test_after_a_signal_replaced_files_are_listed_and_a_second_call_finishes(run, tmp_path, number):
     old, new, count = tmp_path / "old", tmp_path / "new", 60
     for side, gain in ((old, 1), (new, 2)):
         image(side / "000.exr", gain=gain, shape=(4, 4, 3))
         for i in range(1, count):
             shutil.copy(side / "000.exr", side / f"{i:03}.exr")
     before, after = tree(old), tree(new)
-    begun = (old / "000.exr").stat().st_ino
+    inode = (old / "000.exr").stat().st_ino
     code = "import sys; from mi_refract.cli import main; sys.exit(main())"
     with python(code, "accept", old, new, "--yes") as process:
-        while process.poll() is None and (old / "000.exr").stat().st_ino == begun:
+        while process.poll() is None and (old / "000.exr").stat().st_ino == inode:
             time.sleep(0.001)
         process.send_signal(number)
-        _, said = process.communicate()
-    left = tree(old)
-    done = [name for name in left if left[name] == after[name]]
-    assert left.keys() == before.keys()  # nothing hidden
-    if process.returncode:  # else it was done before the signal came
-        assert process.returncode == 128 + number and said.startswith("mi-refract: interrupted; ")
-        rest = count - len(done)
-        assert said.count("reference") == 1 if rest in (0, count) else f"not replaced: {old}/{len(done):03}.exr" in said
+        _, err = process.communicate()
+    references = tree(old)
+    replaced = sum(references[name] == after[name] for name in references)
+    assert references.keys() == before.keys()  # no hidden files
+    if process.returncode:  # else it ended before the signal
+        assert process.returncode == 128 + number and err.startswith("mi-refract: interrupted; ")
+        if replaced in (0, count):
+            assert err.count("reference") == 1
+        else:
+            assert f"not replaced: {old}/{replaced:03}.exr" in err
     assert run("accept", old, new, "--yes")[0] == 0 and tree(old) == after
 
 
-def test_what_cannot_be_read_has_no_digest(folders, tmp_path, monkeypatch):
-    """Nobody could say whether it changed. By a planted error: who runs as root may read everything."""
+def test_unreadable_files_have_no_digest(folders, tmp_path, monkeypatch):
+    """A change could not be detected. The error is planted, because root may read all files."""
     os.mkfifo(tmp_path / "a.exr")
     (tmp_path / "b.exr").symlink_to("/dev/null")
     for path in (tmp_path / "a.exr", tmp_path / "b.exr"):
@@ -320,12 +322,12 @@ def test_what_cannot_be_read_has_no_digest(folders, tmp_path, monkeypatch):
     assert refused.error.endswith("same.exr: Permission denied")
 
 
-def test_accept_asks_first(run, pair, terminal):
+def test_accept_asks_for_confirmation(run, pair, terminal):
     old, new = pair
-    before, asked = tree(old), []
-    terminal(asked.append)
+    before, questions = tree(old), []
+    terminal(questions.append)
     code, out, _ = run("accept", old, new)
-    assert (code, out.splitlines()[-1], asked) == (1, "nothing accepted", ["Accept 1 as the reference?"])
+    assert (code, out.splitlines()[-1], questions) == (1, "nothing accepted", ["Accept 1 as the reference?"])
     assert tree(old) == before
     terminal(lambda question: image(new / "louder.exr", value=0.1) is not None)
     code, out, err = run("accept", old, new)
@@ -346,10 +348,10 @@ def edited(path, change):
 
 
 def entry(data, name):
-    return next(each for each in data["results"] if each["name"] == name)
+    return next(result for result in data["results"] if result["name"] == name)
 
 
-def test_exactly_the_images_of_the_json_are_accepted_here_or_elsewhere(run, compared, tmp_path):
+def test_from_json_accepts_its_images_in_the_same_or_other_folders(run, compared, tmp_path):
     old, new, out = compared
     data = json.loads(out.read_text())
     assert len(entry(data, "equal.exr")["digests"]["test"]) == 64
@@ -369,7 +371,7 @@ def test_exactly_the_images_of_the_json_are_accepted_here_or_elsewhere(run, comp
     code, said, err = run("accept", *moved, "--from", out, "--yes")
     assert (code, err, said.splitlines()[-1]) == (0, "", "2 accepted")
     assert tree(moved[0]) == before | {name: tree(moved[1])[name] for name in ("louder.exr", "inner/added.exr")}
-    # What is wrong in the settings, and matches no image, keeps no image that is named from being accepted.
+    # An invalid entry of the settings that matches no image does not prevent accepting an image by name.
     (moved[0] / "mi-refract.toml").write_text('[[image]]\nname = "none.exr"\nfale = 1\nreason = "none"\n')
     image(moved[1] / "louder.exr", gain=3)
     assert run("diff", *moved, "--json", out)[0] == 2
@@ -385,7 +387,7 @@ def test_exactly_the_images_of_the_json_are_accepted_here_or_elsewhere(run, comp
 
 
 @pytest.mark.parametrize(("side", "name"), [(0, "louder.exr"), (1, "louder.exr"), (0, "inner/added.exr")])
-def test_what_changed_since_the_json_is_refused(run, compared, side, name):
+def test_from_json_refuses_files_changed_since(run, compared, side, name):
     path = compared[side] / name
     rewritten(path) if path.exists() else image(path, gain=3.0)
     before = tree(compared[0])
@@ -410,7 +412,7 @@ SPOILED = {
 
 
 @pytest.mark.parametrize(("change", "words"), SPOILED.values(), ids=SPOILED)
-def test_a_json_that_is_not_ours_is_one_line(run, compared, change, words):
+def test_from_json_reports_invalid_files_in_one_line(run, compared, change, words):
     old, _, out = compared
     out.write_bytes(change) if isinstance(change, bytes) else edited(out, change)
     before = tree(old)
@@ -419,7 +421,7 @@ def test_a_json_that_is_not_ours_is_one_line(run, compared, change, words):
 
 
 @pytest.mark.parametrize("key", ["test", "target", "reference"])
-def test_no_path_of_the_json_leads_out_of_its_folder(run, compared, tmp_path, key):
+def test_from_json_refuses_paths_outside_the_folder(run, compared, tmp_path, key):
     old, new, out = compared
     image(tmp_path / "elsewhere" / "louder.exr", gain=2.0)
     root = new if key == "test" else old
@@ -432,7 +434,7 @@ def test_no_path_of_the_json_leads_out_of_its_folder(run, compared, tmp_path, ke
     assert tree(old) | tree(new) | tree(tmp_path / "elsewhere") == before
 
 
-def test_bad_words_with_from(run, compared):
+def test_from_json_reports_invalid_arguments(run, compared):
     old, new, out = compared
     for words, message in [
         (["--from", out.with_name("none.json")], "none.json"),
@@ -448,7 +450,7 @@ def test_bad_words_with_from(run, compared):
 
 
 @pytest.mark.parametrize("by_json", [False, True])
-def test_a_variant_stands_beside_the_reference_and_replaces_what_was_compared(run, pair, tmp_path, terminal, by_json):
+def test_a_variant_is_written_beside_the_reference(run, pair, tmp_path, terminal, by_json):
     old, new = pair
     (old / "mi-refract.toml").write_text(SETTINGS)
     before, out = tree(old), tmp_path / "out.json"
@@ -461,17 +463,17 @@ def test_a_variant_stands_beside_the_reference_and_replaces_what_was_compared(ru
     assert run("diff", old, new)[0] == 0
     image(old / "louder-macos.exr", gain=2.0)
     run("diff", old, new, "--json", out)
-    kept = (old / "louder-macos.exr").read_bytes()
+    content = (old / "louder-macos.exr").read_bytes()
     terminal(lambda question: image(old / "louder-macos.exr", gain=3.0) is not None)
     code, _, err = run("accept", *words)
     assert code == 2 and f"louder-macos.exr: {CHANGED}" in err
-    (old / "louder-macos.exr").write_bytes(kept)
+    (old / "louder-macos.exr").write_bytes(content)
     assert run("accept", *words, "--yes")[0] == 0
     assert tree(old)["louder-macos.exr"] == tree(new)["louder.exr"]
 
 
 @pytest.mark.parametrize("by_json", [False, True])
-def test_a_variant_has_the_name_that_the_map_and_accept_make(run, tmp_path, by_json):
+def test_the_name_of_a_variant_follows_from_the_map_and_accept(run, tmp_path, by_json):
     old, new, out = tmp_path / "old", tmp_path / "new", tmp_path / "out.json"
     image(old / "ball.ref.exr")
     image(new / "ball.exr", gain=1.2)
@@ -499,7 +501,7 @@ NO_ACCEPT = "no template in `accept` contains macos or exactly one *; add to [de
         ("added", "macos", "inner/added.exr: has no reference yet; accept it without --as-variant first"),
     ],
 )
-def test_no_variant_where_its_name_says_nothing(run, pair, settings, name, message):
+def test_invalid_variants_are_refused(run, pair, settings, name, message):
     old, new = pair
     if settings == "added":
         image(new / "inner" / "added.exr")

@@ -1,4 +1,4 @@
-"""The action for GitHub, and the recipes of the page for GitHub, GitLab and CTest: run as they are printed."""
+"""The action for GitHub, and the documented recipes for GitHub, GitLab and CTest, run as they are printed."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ ACTION = ROOT / ".github" / "actions" / "diff"
 PAGE = DOCS / "how-to" / "compare-images-in-ci.md"
 LIST = str((ACTION / "requirements.txt").relative_to(ROOT))
 FILES = ["diff.json", "junit.xml", "report.html"]
-BASH = ["bash", "--noprofile", "--norc", "-e", "-o", "pipefail"]  # what `shell: bash` is on a runner
+BASH = ["bash", "--noprofile", "--norc", "-e", "-o", "pipefail"]  # `shell: bash` on a runner
 
 pytestmark = pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
 
-# Stands for an interpreter: what it installs is noted, and what it runs is this checkout.
+# A replacement for the interpreter, which records what it should install, and runs this checkout.
 PYTHON = """#!/bin/bash
 case "$1 $2" in
   "-m venv") mkdir -p "$3/bin"; cp "$0" "$3/bin/python"; cp "{programs}/mi-refract" "$3/bin/" ;;
@@ -44,45 +44,45 @@ def program(path, text):
 
 
 def read_yaml(text):
-    """The document; every scalar is a text, as GitHub's expressions see it."""
+    """The document, with text for every scalar, as in GitHub's expressions."""
     return yaml.load(text, yaml.BaseLoader)
 
 
 def expanded(text, values):
-    """The text with each ${{ name }} replaced; what has no value is empty, as on a runner."""
+    """The text with each ${{ name }} replaced, by an empty text if it has no value, as on a runner."""
     return re.sub(r"\$\{\{ *([\w.-]+) *\}\}", lambda match: values.get(match[1], ""), text)
 
 
 def call(words, folder, environment):
-    done = subprocess.run([*map(str, words)], cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
-    return done.returncode, done.stdout, done.stderr
+    run = subprocess.run([*map(str, words)], cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+    return run.returncode, run.stdout, run.stderr
 
 
 def run_action(inputs, workspace, temporary, environment):
-    """The steps of the action in bash, as a runner does them, without GitHub; uploading lists the files."""
+    """Run the steps of the action in bash, as a runner does, without GitHub; uploads only list the files."""
     action = read_yaml((ACTION / "action.yml").read_text("utf-8"))
     assert inputs.keys() <= action["inputs"].keys()
-    values = {f"inputs.{name}": inputs.get(name, each.get("default", "")) for name, each in action["inputs"].items()}
+    values = {f"inputs.{name}": inputs.get(name, spec.get("default", "")) for name, spec in action["inputs"].items()}
     files = {name: temporary / name.lower() for name in ("GITHUB_OUTPUT", "GITHUB_STEP_SUMMARY")}
     environment = environment | {name: str(path) for name, path in files.items()}
     environment |= {"GITHUB_ACTION_PATH": str(ACTION), "RUNNER_TEMP": str(temporary), "CI": "true"}
     job, script = SimpleNamespace(code=0, log="", artifacts={}), temporary / "step.sh"
     for step in action["runs"]["steps"]:
         files["GITHUB_OUTPUT"].write_text("")
-        given = {name: expanded(text, values) for name, text in (step.get("env") or step.get("with") or {}).items()}
+        arguments = {name: expanded(text, values) for name, text in (step.get("env") or step.get("with") or {}).items()}
         if "uses" in step:
-            root, name = Path(given["path"]), given["name"]
+            root, name = Path(arguments["path"]), arguments["name"]
             job.artifacts[name] = sorted(str(path.relative_to(root)) for path in root.rglob("*") if path.is_file())
-            written = {"artifact-url": f"https://github.test/artifacts/{name}"} if any(root.iterdir()) else {}
+            outputs = {"artifact-url": f"https://github.test/artifacts/{name}"} if any(root.iterdir()) else {}
         else:
             script.write_text(step["run"])
-            job.code, out, err = call([*BASH, script], workspace, environment | given)
+            job.code, out, err = call([*BASH, script], workspace, environment | arguments)
             job.log += out + err
-            written = dict(line.partition("=")[::2] for line in files["GITHUB_OUTPUT"].read_text().splitlines())
-        values |= {f"steps.{step['id']}.outputs.{name}": value for name, value in written.items() if "id" in step}
+            outputs = dict(line.partition("=")[::2] for line in files["GITHUB_OUTPUT"].read_text().splitlines())
+        values |= {f"steps.{step['id']}.outputs.{name}": value for name, value in outputs.items() if "id" in step}
         if job.code:
             break
-    job.outputs = {name: expanded(each["value"], values) for name, each in action["outputs"].items()}
+    job.outputs = {name: expanded(spec["value"], values) for name, spec in action["outputs"].items()}
     job.summary = files["GITHUB_STEP_SUMMARY"].read_text("utf-8")
     job.annotations = [line for line in job.log.splitlines() if re.match("::(error|warning|notice) ", line)]
     (job.folder,) = temporary.glob("mi-refract-diff.*")
@@ -107,7 +107,7 @@ def environment(programs):
 
 @pytest.fixture
 def project(tmp_path):
-    """A repository: references, and a program that renders an image that is equal, and one with another gain."""
+    """A repository with references, and a program that renders an equal image and one with another gain."""
     folder = tmp_path / "project"
     for name in ("ball.exr", "inner/other.exr"):
         image(folder / "references" / name)
@@ -116,7 +116,7 @@ def project(tmp_path):
 
 
 def set_gain(project, gain):
-    """What `render_all` will render."""
+    """Write the program `render_all`, which renders one image with this gain."""
     rendered = project.parent / "rendered"
     for name, factor in (("ball.exr", 1.0), ("inner/other.exr", gain)):
         image(rendered / name, gain=factor)
@@ -125,7 +125,7 @@ def set_gain(project, gain):
 
 @pytest.fixture
 def act(project, environment, tmp_path):
-    """`act(gain, references=…, test=…)`: the action in a job of that project, after rendering."""
+    """`act(gain, references=…, test=…)`: render, and run the action in a job of that project."""
 
     def run(gain=1.0, **inputs):
         set_gain(project, gain)
@@ -153,10 +153,10 @@ NOTHING = "::error title=mi-refract diff::nothing was compared; the log of this 
         (1.1, {"options": f"{BLIND}--inconclusive=pass"}, 0, "equal"),
         (1.1, {"settings": "some.toml"}, 0, "equal"),
         (1.1, {"references": "none/"}, 2, "error"),
-        (1.1, {"options": "--methods"}, 2, "error"),  # which compares nothing
+        (1.1, {"options": "--methods"}, 2, "error"),  # compares nothing
     ],
 )
-def test_the_verdict_the_report_and_the_new_images_of_a_job(act, project, programs, gain, inputs, code, verdict):
+def test_the_action_returns_the_verdict_and_uploads_results(act, project, programs, gain, inputs, code, verdict):
     (project / "some.toml").write_text('[[image]]\nname = "inner/*"\nmethod = "tolerance"\nfail = 0.2\nreason = "r"\n')
     job = act(gain, **inputs)
     assert (job.code, job.outputs["exit-code"], job.outputs["verdict"]) == (code, str(code), verdict)
@@ -164,7 +164,7 @@ def test_the_verdict_the_report_and_the_new_images_of_a_job(act, project, progra
         assert (job.outputs["report"], job.annotations) == ("", [NOTHING])
         assert "### mi-refract diff: nothing was compared" in job.summary
         return
-    equal = code == 0 and "options" not in inputs  # an inconclusive image that passes is not
+    equal = code == 0 and "options" not in inputs  # with options, the image is inconclusive
     assert job.artifacts == {"mi-refract-diff": FILES if equal else sorted([*FILES, "new/inner/other.exr"])}
     assert job.outputs["report"] == "https://github.test/artifacts/mi-refract-diff"
     assert "### mi-refract diff: 2 images: " in job.summary
@@ -177,8 +177,8 @@ def test_the_verdict_the_report_and_the_new_images_of_a_job(act, project, progra
     assert words[-4:] == ["--no-deps", "-r", str(ACTION / "requirements.txt"), f"{ACTION}/../../.."]
 
 
-def test_the_way_of_the_page_from_a_first_folder_to_accepted_images(act, project, programs, environment):
-    """And an image that cannot be read is an error."""
+def test_the_commands_of_the_documentation_create_and_accept_references(act, project, programs, environment):
+    """And a reference that cannot be read is an error of the action."""
     install, make, accept = blocks(PAGE, "bash")
     shutil.rmtree(project / "references")
     assert call([*BASH, "-c", install + make], project, environment)[0] == 0
@@ -196,7 +196,7 @@ def test_the_way_of_the_page_from_a_first_folder_to_accepted_images(act, project
 
 
 @pytest.mark.parametrize(("names", "code"), [(("references", "test", "settings", "options"), 2), (("artifact",), 0)])
-def test_no_input_is_a_command(act, project, names, code):
+def test_inputs_are_not_executed(act, project, names, code):
     job = act(**dict.fromkeys(names, '"; touch planted; $(touch planted) `touch planted` #'))
     assert (job.code, list(project.rglob("planted"))) == (code, [])
 
@@ -204,13 +204,13 @@ def test_no_input_is_a_command(act, project, names, code):
 @pytest.mark.parametrize(
     ("name", "word"), [("references", "--methods"), ("test", "--version"), ("settings", "--methods")]
 )
-def test_no_path_is_an_option(act, name, word):
+def test_paths_are_not_options(act, name, word):
     job = act(**{name: word})
     assert job.code == 2
     assert re.search(f"mi-refract: {word}: no such", job.log, re.IGNORECASE)
 
 
-def test_names_that_github_refuses_and_hostile_ones_are_left_out(tmp_path, capsys):
+def test_invalid_and_hostile_names_are_not_uploaded(tmp_path, capsys):
     files, new = runpy.run_path(str(ACTION / "new_images.py")), tmp_path / "far" / "new"
     (tmp_path / "a.exr").write_text("a")
     names = ["b.exr", "in/c.exr", 'quoted".exr', "../../out.exr", "gone.exr"]
@@ -225,8 +225,8 @@ def test_names_that_github_refuses_and_hostile_ones_are_left_out(tmp_path, capsy
     assert [line.split(": left out")[0] for line in lines] == [f"new_images.py: {name!r}" for name in names[2:]]
 
 
-def test_the_action_is_one_that_a_runner_can_trust_and_the_page_names_its_inputs_and_outputs():
-    """Other actions have a version, no expression stands in a script, and every step names its shell."""
+def test_the_action_is_safe_and_its_inputs_and_outputs_are_documented():
+    """Other actions are used with a version, scripts contain no expressions, and every step names its shell."""
     text = (ACTION / "action.yml").read_text("utf-8")
     action = read_yaml(text)
     for step in action["runs"]["steps"]:
@@ -240,7 +240,7 @@ def test_the_action_is_one_that_a_runner_can_trust_and_the_page_names_its_inputs
     assert not [name for name in (*action["inputs"], *action["outputs"]) if f"`{name}`" not in PAGE.read_text("utf-8")]
 
 
-def test_the_workflow_of_the_page_and_the_job_of_this_project(act, environment, tmp_path):
+def test_the_documented_workflow_and_the_job_of_this_project_work(act, environment, tmp_path):
     steps = read_yaml(blocks(PAGE, "yaml")[0])["jobs"]["images"]["steps"]
     assert [step for step in steps if "run" in step] == [{"run": "./render_all new/"}]
     last = steps[-1]
@@ -261,15 +261,15 @@ def test_the_workflow_of_the_page_and_the_job_of_this_project(act, environment, 
 
 
 @pytest.mark.parametrize(("gain", "code"), [(1.0, 0), (1.1, 1), (np.nan, 1)])
-def test_the_gitlab_job_of_the_page(project, environment, programs, gain, code):
+def test_the_documented_gitlab_job_works(project, environment, programs, gain, code):
     job = read_yaml(blocks(PAGE, "yaml")[1])["images"]
     set_gain(project, gain)
     returned, _, err = call([*BASH, "-c", "\n".join(job["script"])], project, environment)
     assert (returned, err) == (code, "")
     assert (programs / "installed").read_text().split()[-2].endswith(f"/{LIST}")
-    kept = [*job["artifacts"]["paths"], job["artifacts"]["reports"]["junit"]]
+    artifacts = [*job["artifacts"]["paths"], job["artifacts"]["reports"]["junit"]]
     assert job["artifacts"]["when"] == "always"
-    assert all((project / path).exists() for path in kept)
+    assert all((project / path).exists() for path in artifacts)
     assert sorted(path.name for path in (project / "diff").iterdir()) == FILES
     assert job["allow_failure"]["exit_codes"] == ["3"]
 
@@ -278,7 +278,7 @@ def test_the_gitlab_job_of_the_page(project, environment, programs, gain, code):
 @pytest.mark.parametrize(
     ("render", "failed"), [(1.0, []), (1.1, ["images"]), (None, ["render", "images"])], ids=["equal", "louder", "none"]
 )
-def test_the_ctest_of_the_page(project, environment, tmp_path, render, failed):
+def test_the_documented_ctest_works(project, environment, tmp_path, render, failed):
     (text,) = blocks(PAGE, "cmake")
     (project / "CMakeLists.txt").write_text(
         f"cmake_minimum_required(VERSION 3.18)\nproject(p NONE)\nenable_testing()\n{text}"

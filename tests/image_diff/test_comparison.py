@@ -1,4 +1,4 @@
-"""What every method has in common; `exact` and `paired`; no image is equal where a method could not have known."""
+"""Properties of all methods, `exact` and `paired`, and "inconclusive" if a method could not detect a difference."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def judge(method, reference, test, **options):
 
 
 def verdict(method, reference, test, **options):
-    """Of pixels, or of images."""
+    """The verdict on pixels or on images."""
     sides = (x if isinstance(x, Image) else of(x) for x in (reference, test))
     return judge(method, *sides, **options).verdict
 
@@ -49,7 +49,7 @@ def altered(value, pixels=SMOOTH, at=(3, 5, 1)):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_is_not_finite_equals_nothing_unless_it_is_allowed_and_the_same(method):
+def test_nonfinite_values_differ_unless_allowed_and_the_same(method):
     values = (np.nan, np.inf, -np.inf)
     for bad in values:
         broken, whole = altered(bad), of(SMOOTH)
@@ -64,7 +64,7 @@ def test_what_is_not_finite_equals_nothing_unless_it_is_allowed_and_the_same(met
         assert one is not two or result.reason.endswith(ONE_OF_MANY)
 
 
-def test_what_is_not_finite_is_marked_in_the_channels_of_the_first_render():
+def test_nonfinite_values_are_marked_in_the_channels_of_the_first_render():
     whole, first = of(SMOOTH), altered(np.nan, at=(3, 5, 0))
     turned, broken = (of(x.pixels[..., ::-1], ("B", "G", "R")) for x in (whole, first))
     for sides in (([whole, turned], [turned, broken]), ([whole, broken], [turned] * 2), ([first, whole], [whole] * 2)):
@@ -75,11 +75,11 @@ def test_what_is_not_finite_is_marked_in_the_channels_of_the_first_render():
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_channel_without_a_value_is_not_compared(method, bad):
-    """Allowed or not: a channel of NaN on both sides says nothing."""
-    every, green = np.full_like(SMOOTH, bad), SMOOTH.copy()
+def test_a_channel_without_finite_values_is_inconclusive(method, bad):
+    """Even if such values are allowed."""
+    all_channels, green = np.full_like(SMOOTH, bad), SMOOTH.copy()
     green[..., 1] = bad
-    for pixels, names in ((every, "R, G, B"), (green, "G")):
+    for pixels, names in ((all_channels, "R, G, B"), (green, "G")):
         result = judge(method, of(pixels), of(pixels), allow_nonfinite=True)
         assert result.verdict is INCONCLUSIVE
         assert result.reason.startswith(f"no value is finite, and nothing was compared, in {names}; ")
@@ -90,7 +90,7 @@ def test_a_channel_without_a_value_is_not_compared(method, bad):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_cannot_be_compared_is_an_error_and_channels_are_matched_by_name(method):
+def test_different_headers_are_errors_and_channels_are_matched_by_name(method):
     for other, what in (
         (of(SMOOTH[:20]), "size"),
         (of(SMOOTH[..., :2], ("R", "A")), "channels"),
@@ -112,15 +112,15 @@ def test_what_cannot_be_compared_is_an_error_and_channels_are_matched_by_name(me
     assert method == "welch" or verdict(method, SMOOTH, SMOOTH[..., ::-1]) is DIFFERENT
 
 
-def test_headers_that_say_the_same_in_other_words_are_equal():
-    said = {"PixelAspectRatio": 1.0, "Orientation": 1}
-    assert not preconditions(of(SMOOTH), of(SMOOTH, display=(0, 0, 48, 40), metadata=said))
+def test_headers_with_explicit_defaults_are_equal():
+    defaults = {"PixelAspectRatio": 1.0, "Orientation": 1}
+    assert not preconditions(of(SMOOTH), of(SMOOTH, display=(0, 0, 48, 40), metadata=defaults))
     assert not preconditions(*(of(SMOOTH, origin=(3, 4), display=display) for display in (None, (3, 4, 48, 40))))
     assert not preconditions(of(SMOOTH), of(0 * SMOOTH))
 
 
 @pytest.mark.parametrize("method", ["auto", *SINGLE])
-def test_a_channel_that_one_image_has_besides_is_a_difference_with_a_name(method):
+def test_an_additional_channel_is_a_difference_and_is_named(method):
     ramp = np.arange(40 * 48.0).reshape(40, 48)
     cases = (("l.A", 1, "l.A (opaque: 1 everywhere)"), ("Z", ramp, "Z"), ("Z", 0, "Z (0 everywhere)"))
     for name, values, words in (*cases, ("A", 0.5, "A (0.5 everywhere)")):
@@ -135,20 +135,20 @@ def test_a_channel_that_one_image_has_besides_is_a_difference_with_a_name(method
 # Methods of pixels -------------------------------------------------------------------------------------------------
 
 
-def test_exact_sees_the_last_bit():
+def test_exact_detects_the_last_bit():
     same = judge("exact", of(SMOOTH), of(SMOOTH))
     assert (same.verdict, same.reason) == (EQUAL, "every value is the same")
     result = judge("exact", of(SMOOTH), altered(np.nextafter(SMOOTH[3, 5, 1], np.float32(1))))
     assert (result.verdict, result.metrics[0].value) == (DIFFERENT, 1)
     assert result.reason.startswith("1 of ") and np.count_nonzero(result.maps["difference"]) == 1
     codes = np.round(255 * SMOOTH) / 255
-    for stored, most in (("uint8", "51 of 255 codes"), ("uint16", "13107 of 65535 codes"), ("float", "0.2")):
-        sides = (replace(each, stored=stored) for each in (of(codes), altered(codes[3, 5, 1] + 0.2, codes)))
-        reason = f"1 of 1920 pixels differ; largest difference {most} at x = 5, y = 3, channel G"
+    for stored, largest in (("uint8", "51 of 255 codes"), ("uint16", "13107 of 65535 codes"), ("float", "0.2")):
+        sides = (replace(side, stored=stored) for side in (of(codes), altered(codes[3, 5, 1] + 0.2, codes)))
+        reason = f"1 of 1920 pixels differ; largest difference {largest} at x = 5, y = 3, channel G"
         assert compare("exact", *sides).reason == reason
 
 
-def test_paired_sees_many_small_changes_at_any_brightness(rng):
+def test_paired_detects_many_small_changes_at_any_brightness(rng):
     for scale in (1e-6, 1.0, 1e6):
         assert verdict("paired", scale * SMOOTH, scale * SMOOTH * (1 + 1e-6)) is EQUAL
         result = judge("paired", of(scale * SMOOTH), of(scale * SMOOTH * 1.001))
@@ -156,13 +156,13 @@ def test_paired_sees_many_small_changes_at_any_brightness(rng):
     few = altered(0.9)
     assert verdict("paired", SMOOTH, few) is EQUAL
     assert verdict("paired", SMOOTH, few, largest=0.5) is DIFFERENT
-    # A channel of another scale hides nothing.
+    # A channel of another scale hides no change.
     pixels, depth = rng.random((64, 64, 1)) + 0.5, np.full((64, 64, 1), 1e6)
     one, two = (of(np.dstack([x, depth]), ("Y", "Z")) for x in (pixels, 1.001 * pixels))
     assert [verdict("paired", one, other) for other in (one, two)] == [EQUAL, DIFFERENT]
 
 
-def test_changes_are_of_pixels_not_of_channels():
+def test_changes_count_pixels_not_channels():
     reference = np.ones((32, 32, 3))
     test = reference.copy()
     test[0, 0] += 1e-3
@@ -170,13 +170,13 @@ def test_changes_are_of_pixels_not_of_channels():
     change = changes(reference, test, 1e-5)
     assert (change.share, change.largest) == (1 / 1024, pytest.approx(1e-3))
     assert change.mean_ratio == pytest.approx(1 + (3e-3 + 2e-6) / reference.size)
-    for bad in (np.nan, np.inf):  # equals nothing, not even itself
+    for bad in (np.nan, np.inf):  # not equal, even to themselves
         test[3, 4, 0] = bad
         change = changes(test, test, 1e-5)
         assert (change.share, change.largest, change.rms) == (1 / 1024, np.inf, np.inf)
     with pytest.raises(ValueError, match="different shapes"):
         changes(reference, reference[:, :2], 1e-5)
-    # Against black, where there is no ratio of the means, it is 1 and as much as is added.
+    # For a black reference the ratio of the means is 1 plus the mean of the test image.
     for one, two, ratio in ((2, 3, 1.5), (4, 1, 0.25), (0, 3, 4), (0, 0, 1), (-2, 1, -0.5)):
         change = changes(*(np.full((4, 4, 3), float(x)) for x in (one, two)), 1e-5)
         assert change.mean_ratio == pytest.approx(ratio)
@@ -185,13 +185,13 @@ def test_changes_are_of_pixels_not_of_channels():
 
 @pytest.mark.parametrize("method", ["tolerance", "paired", "flip"])
 @pytest.mark.parametrize("brightness", [1e3, 1e5, 1e7, 1e9])
-def test_one_firefly_in_both_hides_nothing_of_the_rest(method, brightness, rng):
+def test_a_firefly_in_both_images_hides_no_difference(method, brightness, rng):
     pixels = rng.uniform(0.1, 0.9, (48, 40, 3))
     reference, *others = (altered(brightness, x, (7, 5)) for x in (pixels, 0 * pixels, 1 - pixels))
     assert [compare(method, reference, x).verdict for x in (*others, reference)] == [DIFFERENT, DIFFERENT, EQUAL]
 
 
-def test_the_ends_of_float32_and_a_change_against_black():
+def test_largest_and_smallest_float32_values_and_black():
     for method, options in (("exact", {}), ("tolerance", {"fail": 0.0}), ("paired", {})):
         for a, b in ((3e38, 2e38), (3e38, -3e38), (1e-40, 5e-40), (0, 1e-9), (0, 5e-5)):
             assert verdict(method, *(np.full((16, 16, 3), x) for x in (a, b)), **options) is DIFFERENT
@@ -209,20 +209,20 @@ def test_the_ends_of_float32_and_a_change_against_black():
 @pytest.mark.parametrize(
     "method, options", [("tolerance", {}), ("paired", {"threshold": 2.0}), ("flip", {"local": 9.0, "patch": 1.0})]
 )
-def test_a_method_that_black_would_pass_knows_nothing(method, options):
+def test_a_method_that_accepts_black_is_inconclusive(method, options):
     dark = 0.004 * SMOOTH
     result = compare(method, of(dark), of(0.9 * dark), **options)
     assert result.verdict is INCONCLUSIVE
     assert result.reason.startswith("an all-black image would pass, too")
     for same in (dark, 0 * dark):
         assert verdict(method, same, same, **options) is EQUAL
-    black = np.zeros((128, 128, 3))  # one bright pixel is all there is
+    black = np.zeros((128, 128, 3))  # except one bright pixel
     assert verdict(method, altered(10.0, black, (7, 5)), black) is not EQUAL
 
 
 @pytest.mark.parametrize("method", ["auto", "tolerance"])
 @pytest.mark.parametrize("name, value", [("A", 1.0), ("Z", 30.0), ("layer.A", 1.0), ("depth.Z", 30.0)])
-def test_a_dim_image_against_black_beside_alpha_or_depth(method, name, value, rng):
+def test_black_instead_of_a_dim_colour_beside_alpha_or_depth_is_inconclusive(method, name, value, rng):
     dim, other = 0.0039 * rng.random((64, 64, 3)), np.full((64, 64, 1), value)
     same, black = (of(np.dstack([x, other]), (*"RGB", name)) for x in (dim, 0 * dim))
     result = compare(method, same, black)
@@ -240,8 +240,8 @@ def test_a_dim_image_against_black_beside_alpha_or_depth(method, name, value, rn
         ("paired", 1e-5, 0.5, 0.62, INCONCLUSIVE),  # far below the median
     ],
 )
-def test_a_bright_part_says_nothing_of_a_dim_one(method, dim, least, lit, expected, rng):
-    """Black is seen in the bright part, so all black would be; the dim part could be anything."""
+def test_black_in_a_dim_part_beside_a_bright_one_is_inconclusive(method, dim, least, lit, expected, rng):
+    """An all-black image is detected in the bright part, but black in the dim part is not."""
     rows = int(lit * 100)
     reference = dim * rng.random((100, 64, 3))
     reference[:rows] += least
@@ -250,10 +250,10 @@ def test_a_bright_part_says_nothing_of_a_dim_one(method, dim, least, lit, expect
     result = compare(method, of(reference), of(test))
     assert result.verdict is expected
     assert expected is EQUAL or f"in {1 - lit:.0%} of the pixels that are not black" in result.reason
-    assert verdict(method, reference, reference * (1 + 1e-6)) is EQUAL  # the same but for rounding
+    assert verdict(method, reference, reference * (1 + 1e-6)) is EQUAL  # the same except for rounding
 
 
-def test_light_between_the_rows_that_are_looked_at_first_counts(rng):
+def test_light_between_the_sampled_rows_counts(rng):
     """Black would pass in every sixteenth row."""
     reference = rng.random((64, 32, 3))
     reference[::16] = 0.001
@@ -289,12 +289,12 @@ def test_colours_of_a_layer_are_judged_together_and_others_alone():
         ("welch", {"resolution": 0.0}, "more than 0"),
         ("welch", {"hidden": float("nan")}, "0 to 1"),
         ("welch", {"pixels": "perhaps"}, "yes, no"),
-        ("auto", {"family_error": 1.0}, "less than 1"),  # of the other method, too
+        ("auto", {"family_error": 1.0}, "less than 1"),  # also of the method that auto does not choose
         ("auto", {"threshold": 0.1}, "has no option 'threshold'"),
     ],
 )
-def test_options_that_do_not_fit(method, options, match):
-    """Whatever the images are."""
+def test_invalid_options_are_errors(method, options, match):
+    """Independent of the images."""
     for image in (of(SMOOTH), altered(np.nan)):
         with pytest.raises(ValueError, match=match):
             judge(method, image, image, **options)
@@ -316,7 +316,7 @@ def test_the_number_of_images_must_fit_the_method():
 
 
 def noisy(seed, spread=0.2, width=0.5, shape=(96, 128)):
-    """A render of a few discs on waves, with noise of this spread under a Gaussian filter of this width in pixels."""
+    """A render of discs on waves, with noise of this relative spread, blurred by a Gaussian of this width in pixels."""
     rng = np.random.default_rng(7)
     y, x = np.mgrid[: shape[0], : shape[1]]
     pixels = 0.4 + 0.2 * np.sin(x / 9) * np.cos(y / 13)
@@ -362,7 +362,7 @@ TRUE_DIFFERENCES = {
 
 
 @pytest.mark.parametrize("name", OTHER_NOISE | TRUE_DIFFERENCES)
-def test_what_looks_like_other_noise_is_called_so_and_stays_different(name):
+def test_other_noise_is_named_in_the_reason_and_remains_different(name):
     sides = [of(pixels) for pixels in (OTHER_NOISE | TRUE_DIFFERENCES)[name]()]
     for method in ("auto", "flip"):
         result = compare(method, *sides)
@@ -371,7 +371,7 @@ def test_what_looks_like_other_noise_is_called_so_and_stays_different(name):
         assert ("the same image with other noise" in result.reason) == hint
 
 
-def test_the_hint_is_rare_where_it_is_false_and_usual_where_it_is_true():
-    """At most one of 100 images with other noise fails its tests, so at most two of 20: three have 1e-3."""
-    said = [differ_like_noise(noisy(i), noisy(i + 100)) for i in range(20)]
-    assert sum(said) >= 18
+def test_other_noise_is_recognised_in_almost_all_pairs():
+    """At most one of 100 pairs with other noise is not recognised; three or more of 20 have the probability 1e-3."""
+    recognised = [differ_like_noise(noisy(i), noisy(i + 100)) for i in range(20)]
+    assert sum(recognised) >= 18

@@ -1,4 +1,4 @@
-"""Two files: each of several parts or MIP levels is compared, and masks leave pixels out, in every method."""
+"""Comparison of two files with every method: several parts and MIP levels, and masks."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def levels(path, images):
         spec.tile_width = spec.tile_height = 16
         spec.attribute("openexr:levelmode", 1)
         spec.attribute("textureformat", "Plain Texture")
-        # OpenImageIO reads tiled subimages of a TIFF as levels where the header speaks of a texture.
+        # OpenImageIO reads tiled subimages of a TIFF as levels if the header says that it is a texture.
         append = "AppendMIPLevel" if path.suffix == ".exr" else "AppendSubimage"
         assert output.open(str(path), spec, *([append] if number else [])), output.geterror()
         assert output.write_image(pixels), output.geterror()
@@ -61,17 +61,17 @@ def with_change(images, number, by=0.5):
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.tif"])
-def test_every_part_and_level_is_read_within_one_limit(tmp_path, name):
+def test_all_parts_and_levels_are_read_within_one_limit(tmp_path, name):
     path, size = parts(tmp_path / name, SMALL), 8 * 8 * 3
-    found = read_parts(path, 3 * size)
-    assert [image.place for image in found] == ["part 0", "part 1", "part 2"]
-    assert all(np.array_equal(image.pixels, pixels) for image, pixels in zip(found, SMALL, strict=True))
+    images = read_parts(path, 3 * size)
+    assert [image.place for image in images] == ["part 0", "part 1", "part 2"]
+    assert all(np.array_equal(image.pixels, pixels) for image, pixels in zip(images, SMALL, strict=True))
     with pytest.raises(ValueError, match=r"8 × 8 × 3 values beside 384 .*; expected up to 575 values \(max-values\)"):
         read_parts(path, 3 * size - 1)
     assert len(read_parts(path, size, first_only=True)) == 1
-    found = read_parts(levels(path, PYRAMID))
-    assert [(image.place, image.part) for image in found] == [(f"MIP level {i}", (0, i)) for i in range(4)]
-    assert all(np.array_equal(image.pixels, pixels) for image, pixels in zip(found, PYRAMID, strict=True))
+    images = read_parts(levels(path, PYRAMID))
+    assert [(image.place, image.part) for image in images] == [(f"MIP level {i}", (0, i)) for i in range(4)]
+    assert all(np.array_equal(image.pixels, pixels) for image, pixels in zip(images, PYRAMID, strict=True))
     (first,) = read_parts(path, first_only=True)
     assert (first.place, first.part) == ("MIP level 0", (0, 0))
     with pytest.raises(ValueError, match=r"several parts or MIP levels in one file; expected one image"):
@@ -83,43 +83,43 @@ def test_every_part_and_level_is_read_within_one_limit(tmp_path, name):
 
 @pytest.mark.parametrize("method", SINGLE)
 @pytest.mark.parametrize("write, images, place", [(parts, SMALL, "part 2"), (levels, PYRAMID, "MIP level 2")])
-def test_a_change_in_any_of_them_is_different_and_placed(tmp_path, method, write, images, place):
+def test_a_changed_part_or_level_is_different_and_named(tmp_path, method, write, images, place):
     one = write(tmp_path / "a.exr", images)
     assert compared(one, write(tmp_path / "b.exr", images), method=method).status == "equal"
-    found = compared(one, write(tmp_path / "c.exr", with_change(images, 2)), method=method)
-    assert found.status == "different" and found.reason.startswith(f"{place}: ")
-    assert found.reason.endswith(f"; different: 1 of {len(images)} parts and MIP levels")
-    assert [image.pixels.shape for image in found.images.values()] == [images[2].shape] * 2
+    result = compared(one, write(tmp_path / "c.exr", with_change(images, 2)), method=method)
+    assert result.status == "different" and result.reason.startswith(f"{place}: ")
+    assert result.reason.endswith(f"; different: 1 of {len(images)} parts and MIP levels")
+    assert [image.pixels.shape for image in result.images.values()] == [images[2].shape] * 2
 
 
 @pytest.mark.parametrize("number, words", [(2, "part 2 is missing"), (1, "part 1 is missing, and 1 more")])
-def test_a_part_that_one_side_lacks_is_a_difference(tmp_path, number, words):
+def test_a_missing_or_added_part_is_a_difference(tmp_path, number, words):
     one, two = parts(tmp_path / "a.exr", SMALL), parts(tmp_path / "b.exr", SMALL[:number])
-    found = compared(one, two)
-    assert (found.status, found.reason.partition(";")[0]) == ("different", words)
+    result = compared(one, two)
+    assert (result.status, result.reason.partition(";")[0]) == ("different", words)
     assert compared(two, one).reason.startswith(words.replace("is missing", "was added"))
 
 
-def test_a_warning_names_its_place_and_the_others_are_counted(tmp_path):
+def test_a_warning_names_the_first_part_and_counts_the_others(tmp_path):
     words = ["fail=.001", "fail_percent=60", "fail_relative=0", "warn=1e-6", "warn_relative=0", "warn_percent=0"]
     flags = from_words("tolerance", words).values
     one = parts(tmp_path / "a.exr", SMALL)
-    some = [np.where(each > 0.9, each + 0.01, each) for each in SMALL]
-    found = compared(one, parts(tmp_path / "b.exr", [SMALL[0], some[1], SMALL[2]]), **flags)
-    assert found.status == "equal"
-    assert found.warning.startswith("part 1: ") and found.warning.endswith("> warn_percent = 0)")
-    found = compared(one, parts(tmp_path / "c.exr", some), **flags)
-    assert found.warning.startswith("part 0: ") and found.warning.endswith(", and in 2 more parts and MIP levels")
-    assert compared(one, parts(tmp_path / "d.exr", [some[0], SMALL[1] + 1, SMALL[2]]), **flags).warning == ""
+    changed = [np.where(pixels > 0.9, pixels + 0.01, pixels) for pixels in SMALL]
+    result = compared(one, parts(tmp_path / "b.exr", [SMALL[0], changed[1], SMALL[2]]), **flags)
+    assert result.status == "equal"
+    assert result.warning.startswith("part 1: ") and result.warning.endswith("> warn_percent = 0)")
+    result = compared(one, parts(tmp_path / "c.exr", changed), **flags)
+    assert result.warning.startswith("part 0: ") and result.warning.endswith(", and in 2 more parts and MIP levels")
+    assert compared(one, parts(tmp_path / "d.exr", [changed[0], SMALL[1] + 1, SMALL[2]]), **flags).warning == ""
 
 
-def test_what_cannot_be_compared_is_named_with_its_place(tmp_path):
+def test_an_error_names_the_part(tmp_path):
     one, two = (parts(tmp_path / f"{x}.exr", [SMALL[0], SMALL[1][..., : 3 - x]]) for x in (0, 1))
     assert compared(one, two).status == "different"  # a channel is missing
     other = parts(tmp_path / "other.tif", [SMALL[0], SMALL[1][:4]])
-    found = compared(parts(tmp_path / "one.tif", SMALL[:2]), other)
-    assert found.status == "error"
-    assert "size 8 × 4; expected 8 × 8" in found.error and found.error.endswith("(part 1)")
+    result = compared(parts(tmp_path / "one.tif", SMALL[:2]), other)
+    assert result.status == "error"
+    assert "size 8 × 4; expected 8 × 8" in result.error and result.error.endswith("(part 1)")
 
 
 def test_a_file_of_several_parts_can_be_accepted(tmp_path):
@@ -142,7 +142,7 @@ WHOLE = ((4, 10, 16, 12),)  # x = 4 … 19, y = 10 … 21
 
 @pytest.fixture
 def sides(tmp_path):
-    """Two images that differ in that rectangle only, and a mask that is black there."""
+    """Two images that differ only in the rectangle WHOLE, and a mask that is black there."""
     smooth(tmp_path / "old/a.exr")
     pixels, mask = smooth(tmp_path / "new/a.exr"), np.ones(SIZE)
     pixels[10:22, 4:20] *= 3
@@ -153,7 +153,7 @@ def sides(tmp_path):
 
 
 @pytest.mark.parametrize("method", SINGLE)
-def test_what_is_left_out_does_not_count(sides, method):
+def test_masked_pixels_are_not_compared(sides, method):
     assert compared(*sides, method=method).status == "different"
     assert compared(*sides, method=method, ignore=((4, 10, 4, 12),)).status == "different"
     for left_out in ({"mask": "{stem}_mask.exr"}, {"ignore": WHOLE}, {"ignore": ((0, 10, 10, 12), (10, 0, 10, 22))}):
@@ -170,29 +170,29 @@ def test_renders_are_masked(tmp_path):
     assert folders.diff(old, new, Settings.for_all(ignore=((0, 16, 16, 16),)), renders=True).exit_code == 0
 
 
-def test_shares_are_of_the_pixels_that_count_and_a_mask_is_shown(sides):
-    """192 of 1536 pixels differ: 12.5 %; of the 16 that count half do."""
-    only = np.zeros(SIZE)
-    only[10:12, 0:8] = 1
-    write_exr(sides[0].parent / "a_mask.exr", only)
+def test_shares_refer_to_the_compared_pixels_and_the_mask_is_a_map(sides):
+    """192 of 1536 pixels differ, 12.5 %, and 8 of the 16 pixels inside the mask."""
+    mask = np.zeros(SIZE)
+    mask[10:12, 0:8] = 1
+    write_exr(sides[0].parent / "a_mask.exr", mask)
     how = {"method": "tolerance", "fail_percent": 20.0}
     assert compared(*sides, **how).status == "equal"
-    found = compared(*sides, **how, mask="{stem}_mask.exr")
-    assert "50 % of the pixels (8 of 16)" in found.reason
-    assert found.warnings == ("the mask leaves out 99% of the pixels",)
-    assert found.comparison.maps["left out"].sum() == 1520
+    result = compared(*sides, **how, mask="{stem}_mask.exr")
+    assert "50 % of the pixels (8 of 16)" in result.reason
+    assert result.warnings == ("the mask leaves out 99% of the pixels",)
+    assert result.comparison.maps["left out"].sum() == 1520
 
 
-def test_nan_and_channels_that_are_left_out(sides):
+def test_masked_nan_and_unselected_channels_are_ignored(sides):
     pixels = read(sides[1]).pixels.copy()
     pixels[10, 5] = np.nan
     write_exr(sides[1], pixels)
     assert compared(*sides, method="exact", ignore=WHOLE).status == "equal"
-    found = compared(*sides, method="exact", channels=(("R", "R"),), ignore=WHOLE)
-    assert found.reason.endswith("; not compared: G, B")
+    result = compared(*sides, method="exact", channels=(("R", "R"),), ignore=WHOLE)
+    assert result.reason.endswith("; not compared: G, B")
 
 
-def test_rectangles_are_those_of_the_data_window(sides):
+def test_rectangles_are_relative_to_the_data_window(sides):
     one = image_file.Image(sides[0], np.ones(SIZE), ("R", "G", "B"), origin=(100, 50))
     mask = file_pair.mask_of(one, None, [(104, 60, 4, 2)])
     assert not mask[10:12, 4:8].any() and mask.sum() == 32 * 48 - 8
@@ -204,34 +204,34 @@ BAD = {
     "nan": ({"mask": "nan.exr"}, "values that are not finite"),
     "nothing left": ({"ignore": ((0, 0, 48, 32),)}, "leaves no pixel"),
     **{
-        f"outside {each}": ({"ignore": (each,)}, "expected a rectangle that overlaps")
-        for each in ((48, 0, 5, 5), (0, -10, 48, 5), (-9, 0, 4, 32), (-50, -50, 10, 10), (0, 32, 9, 9))
+        f"outside {rectangle}": ({"ignore": (rectangle,)}, "expected a rectangle that overlaps")
+        for rectangle in ((48, 0, 5, 5), (0, -10, 48, 5), (-9, 0, 4, 32), (-50, -50, 10, 10), (0, 32, 9, 9))
     },
 }
 
 
 @pytest.mark.parametrize(("values", "message"), BAD.values(), ids=BAD)
-def test_bad_masks(sides, values, message):
+def test_invalid_masks_are_errors(sides, values, message):
     smooth(sides[0].parent / "small.exr", shape=(8, 7, 3))
     smooth(sides[0].parent / "nan.exr", value=np.nan)
-    found = compared(*sides, **values)
-    assert found.status == "error" and message in found.error and "\n" not in found.error
+    result = compared(*sides, **values)
+    assert result.status == "error" and message in result.error and "\n" not in result.error
 
 
 @pytest.mark.parametrize("template", ["{stem}_mask.exr", "{root}/masks/{stem}.exr"])
-def test_a_mask_among_the_references_is_no_image(sides, template):
+def test_a_mask_in_the_folder_of_references_is_not_compared(sides, template):
     old, new = (path.parent for path in sides)
     if "root" in template:
         (old / "masks").mkdir()
         (old / "a_mask.exr").rename(old / "masks/a.exr")
     results = folders.diff(old, new, Settings.for_all(method="exact", mask=template))
-    assert ([each.name for each in results.results], results.exit_code) == (["a.exr"], 0)
+    assert ([result.name for result in results.results], results.exit_code) == (["a.exr"], 0)
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (32, 1, 3), (1, 48, 3), (8, 8, 3)])
-def test_a_new_image_of_another_size_is_not_spread_over_the_mask(sides, shape):
-    smooth(sides[0], gain=0.0)  # black all over, as the new one
+def test_a_new_image_of_another_size_is_an_error_with_a_mask(sides, shape):
+    smooth(sides[0], gain=0.0)  # black, as the new one
     smooth(sides[1], shape=shape, gain=0.0)
-    found = compared(*sides, method="exact", ignore=((0, 0, 2, 2),))
-    assert found.status == "error"
-    assert f"size {shape[1]} × {shape[0]}; expected 48 × 32" in found.error
+    result = compared(*sides, method="exact", ignore=((0, 0, 2, 2),))
+    assert result.status == "error"
+    assert f"size {shape[1]} × {shape[0]}; expected 48 × 32" in result.error

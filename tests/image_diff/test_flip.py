@@ -1,4 +1,4 @@
-"""FLIP: what a person sees is different wherever it is, and what nobody sees is equal."""
+"""`flip`: changes that a person sees are different, and changes that nobody sees are equal."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ def with_square(x, y, side, colour, codes=None):
 
 
 def edge(position, angle=0.1, samples=8, size=64):
-    """A black half-plane on white, `samples`² samples a pixel."""
+    """A black half-plane on white, with `samples`² samples a pixel."""
     offsets = (np.arange(samples) + 0.5) / samples
-    x, y = (at[..., None] + offsets - size / 2 for at in (X[:size, :size], Y[:size, :size]))
+    x, y = (indices[..., None] + offsets - size / 2 for indices in (X[:size, :size], Y[:size, :size]))
     distance = x[..., None, :] * np.cos(angle) + y[..., None] * np.sin(angle)
     return 255.0 * (distance > position).mean((-1, -2))
 
 
-def line(code, at=256):
+def line(code):
     codes = np.zeros((SIZE, SIZE))
-    codes[:, at] = code
+    codes[:, 256] = code
     return codes
 
 
@@ -83,26 +83,27 @@ CLOSE = {
 
 
 @pytest.mark.parametrize("name", [*VISIBLE, *CLOSE])
-def test_what_a_person_sees_is_different_and_what_nobody_sees_is_equal(name):
+def test_visible_changes_are_different_and_invisible_ones_equal(name):
     one, two = map(shown, (VISIBLE | CLOSE)[name])
     verdict = DIFFERENT if name in VISIBLE else EQUAL
     assert [compare("flip", *sides).verdict for sides in ((one, two), (two, one))] == [verdict] * 2
 
 
-def test_one_code_more_everywhere_is_equal_by_a_margin():
+def test_one_code_more_everywhere_is_well_below_the_bounds():
     for gray in (0, 1, 10, 20, 40, 80, 160, 254):
         result = flip(*(shown(np.full((128, 128), code)) for code in (gray, gray + 1)))
         assert result.verdict is EQUAL
         assert all(metric.value < 0.7 * metric.bound for metric in result.metrics[:2]), gray
 
 
-def test_a_change_counts_as_much_wherever_it_is_and_whatever_is_around():
+def test_the_error_of_a_change_is_independent_of_its_position_and_surroundings():
     plain = np.full((128, 128, 3), GRAY, float)
-    places = [(x, y) for x in (0, 1, 3, 60, 61, 122) for y in (0, 4, 67, 122)]
-    errors = {at: flip(shown(plain), shown(with_square(*at, 6, 120, plain))).metrics[0].value for at in places}
-    inside = [value for at, value in errors.items() if {*at} <= {60, 61, 67}]
+    errors = {}
+    for place in [(x, y) for x in (0, 1, 3, 60, 61, 122) for y in (0, 4, 67, 122)]:
+        errors[place] = flip(shown(plain), shown(with_square(*place, 6, 120, plain))).metrics[0].value
+    inside = [value for place, value in errors.items() if {*place} <= {60, 61, 67}]
     assert max(inside) == pytest.approx(min(inside), rel=1e-3)
-    assert min(errors.values()) > 0.9 * inside[0]  # at the border its halo is cut off
+    assert min(errors.values()) > 0.9 * inside[0]  # at the border its halo is clipped
     for size in (64, 256, 512):
         part = slice(256 - size // 2, 256 + size // 2)
         one, two = (shown(codes[part, part]) for codes in VISIBLE_LINES)
@@ -112,7 +113,7 @@ def test_a_change_counts_as_much_wherever_it_is_and_whatever_is_around():
 VISIBLE_LINES = VISIBLE["a line of one pixel is gone"]
 
 
-def test_windows_are_angles():
+def test_sizes_and_weights_of_windows():
     for ppd, side in ((67, 8), (33.5, 4), (134, 16), (1000, 120)):
         (height, width, weight), (_, wider, more), *_ = windows(5000, 5000, ppd)
         assert (height, width, wider) == (side, side, 2 * side)
@@ -123,9 +124,9 @@ def test_windows_are_angles():
     assert next(windows(50, 50, 1.0))[2] == pytest.approx((1 / 0.12) ** 0.5)  # a pixel of one degree
 
 
-def test_the_same_image_at_twice_the_size_and_pixels_per_degree_looks_the_same():
+def test_twice_the_size_at_twice_the_pixels_per_degree_has_the_same_error():
     one, two = VISIBLE["a cube turned from gray to yellow"]
-    small, large = ([np.kron(each[50:178, 150:278], np.ones((k, k, 1))) for each in (one, two)] for k in (1, 2))
+    small, large = ([np.kron(codes[50:178, 150:278], np.ones((k, k, 1))) for codes in (one, two)] for k in (1, 2))
     values = [
         flip(*map(shown, sides), ppd=ppd).metrics[0].value for sides, ppd in ((small, 67), (large, 134), (large, 67))
     ]
@@ -133,7 +134,7 @@ def test_the_same_image_at_twice_the_size_and_pixels_per_degree_looks_the_same()
     assert values[2] > 1.2 * values[0]
 
 
-def test_the_worst_window_is_named():
+def test_the_worst_window_is_found_and_named():
     error = np.zeros((100, 90), np.float32)
     error[30:38, 50:58] = 0.8
     worst, around = local_error(error, 67)
@@ -147,24 +148,24 @@ def test_the_worst_window_is_named():
     assert result.reason.endswith("; at least 16 codes brighter or darker in 5 × 5 pixels from x = 200, y = 100")
 
 
-def test_every_window_against_its_definition():
+def test_local_and_patch_errors_agree_with_their_definitions():
     error = np.random.default_rng(3).random((41, 29)).astype(np.float32)
     worst, _ = local_error(error, 40)
-    value, *where = max(
+    value, *window = max(
         (weight * error[y : y + h, x : x + w].mean(), x, y, w, h)
         for h, w, weight in windows(41, 29, 40)
         for y in range(42 - h)
         for x in range(30 - w)
     )
     assert worst.value == pytest.approx(value, rel=1e-5)
-    assert [worst.x, worst.y, worst.width, worst.height] == where
+    assert [worst.x, worst.y, worst.width, worst.height] == window
     side = 10  # 0.24 degrees
     smallest = {(x, y): error[y : y + side, x : x + side].min() for y in range(42 - side) for x in range(30 - side)}
     patch = patch_error(error, 40)
     assert patch.value == pytest.approx(max(smallest.values())) == smallest[patch.x, patch.y]
 
 
-def test_every_change_one_way_against_its_definition():
+def test_one_way_change_agrees_with_its_definition():
     rng = np.random.default_rng(5)
     one, two = (rng.integers(0, 256, (17, 14, 3)).astype(np.float32) for _ in range(2))
     two[3:9, 4:11] = one[3:9, 4:11] + rng.uniform(8, 30, (6, 7, 3))
@@ -182,8 +183,8 @@ def test_every_change_one_way_against_its_definition():
         assert one_way_change(one, two, ppd).value == pytest.approx(value, rel=1e-5)
 
 
-def test_an_edge_that_moves_by_half_a_pixel_is_within_the_bound_however_wide_it_is_blurred():
-    """The bound is that of a width of (side − 1)/2 pixels, in squares of every side."""
+def test_a_blurred_edge_that_moves_by_half_a_pixel_is_within_the_bound():
+    """For all widths of the blur; the bound is reached if it is (side − 1)/2 pixels, in squares of every side."""
     steps = np.arange(64.0)[None]
     for width in (0.3, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 5.0):
         for place in (31.5, 31.75, 32.0):
@@ -211,13 +212,13 @@ def test_the_bounds_are_options():
         assert flip(one, two, **{name: 1.1 * metric.value}).verdict is EQUAL
         assert flip(one, two, **{name: 0.9 * metric.value}).verdict is DIFFERENT
     one, two = (shown(codes[192:320, 192:320]) for codes in VISIBLE_LINES)
-    assert compare("flip", one, two, local=3.0).verdict is INCONCLUSIVE  # as black would be
+    assert compare("flip", one, two, local=3.0).verdict is INCONCLUSIVE  # black would pass, too
 
 
-# What the numbers of a file mean -------------------------------------------------------------------------------
+# Encodings of files ----------------------------------------------------------------------------------------------
 
 
-def test_integers_without_a_colour_space_are_for_a_display(tmp_path):
+def test_integers_without_a_colour_space_are_srgb(tmp_path):
     for names, stored, space, expected in (
         ("png jpg bmp gif webp tif tga sgi ppm", "uint8", None, "sRGB"),
         ("png tif", "uint16", None, "sRGB"),
@@ -248,7 +249,7 @@ def test_hdr_and_ldr():
     coded = [replace(image, metadata={"oiio:ColorSpace": "srgb_rec709_scene"}) for image in (bright, other)]
     for sides, hdr in (((bright, other), "no"), (coded, "auto")):
         assert [metric.value for metric in compare("flip", *sides, hdr=hdr).metrics[:4]] == [0] * 4
-    for light in (1e-3, 0.25, 1.0, 1e4):  # an image of one brightness
+    for light in (1e-3, 0.25, 1.0, 1e4):  # images of uniform brightness
         one = np.full((16, 16, 3), light)
         for gain in (1.2, 2):
             assert compare("flip", of(one), of(gain * one)).verdict is DIFFERENT
@@ -258,11 +259,11 @@ def test_hdr_and_ldr():
 # Black ---------------------------------------------------------------------------------------------------------
 
 
-def test_an_image_in_which_black_would_not_be_seen_knows_nothing():
+def test_images_in_which_black_is_not_detected_are_inconclusive():
     dark = np.full((64, 64), 8.0)
     assert compare("flip", shown(dark), shown(dark - 1)).verdict is INCONCLUSIVE
     stars = np.zeros((128, 128))
-    stars[::16, ::16] = 255  # single pixels, in the very rows that the other methods look at first
+    stars[::16, ::16] = 255  # single pixels in the rows that the other methods compare with black first
     moved = stars.copy()
     moved[32, 32] = 254
     assert compare("flip", shown(stars), shown(moved)).verdict is INCONCLUSIVE
@@ -274,7 +275,7 @@ def test_an_image_in_which_black_would_not_be_seen_knows_nothing():
 # Other channels ------------------------------------------------------------------------------------------------
 
 
-def test_what_it_does_not_look_at():
+def test_channels_that_flip_cannot_compare():
     four = of(np.dstack([SMOOTH, SMOOTH[..., :1]]))
     assert compare("flip", four, four).reason.endswith("; by flip A: identical")
     xyz = of(SMOOTH, ("X", "Y", "Z"))
@@ -283,7 +284,7 @@ def test_what_it_does_not_look_at():
     gray = of(np.dstack([SMOOTH[..., :1], np.ones((40, 48, 1))]), ("Y", "A"))
     darker = replace(gray, pixels=gray.pixels * [0.3, 1])
     assert [compare("flip", gray, other).verdict for other in (gray, darker)] == [EQUAL, DIFFERENT]
-    for name in "ZA":  # so dark that black would pass
+    for name in "ZA":  # values so dark that black would pass
         one, two = (of(np.dstack([SMOOTH, k * SMOOTH[..., :1]]), (*"RGB", name)) for k in (0.004, 0.002))
         assert [compare("flip", one, other).verdict for other in (one, two)] == [EQUAL, INCONCLUSIVE]
 
@@ -300,19 +301,19 @@ def test_what_it_does_not_look_at():
     ],
 )
 @pytest.mark.parametrize("names", [("R", "G", "B", "A"), ("Z", "B", "G", "R")])
-def test_another_channel_that_changes(change, by_flip, by_tolerance, names):
+def test_changes_of_alpha_and_depth_are_compared_by_flip_and_tolerance(change, by_flip, by_tolerance, names):
     other = SMOOTH[..., :1]
-    where, verdict = (3, by_flip) if "A" in names else (0, by_tolerance)
+    index, verdict = (3, by_flip) if "A" in names else (0, by_tolerance)
     sides = (other, change(other))
-    one, two = (of(np.insert(SMOOTH, [where], each, axis=2), names) for each in sides)
+    one, two = (of(np.insert(SMOOTH, [index], values, axis=2), names) for values in sides)
     result = compare("flip", one, two)
     assert (result.verdict, result.metrics[0].value) == (verdict, 0)
     method = "flip" if "A" in names and max(map(np.max, sides)) <= 1 else "tolerance"
-    assert f"; by {method} {names[where]}: " in result.reason
+    assert f"; by {method} {names[index]}: " in result.reason
     assert compare("flip", two, one).verdict is verdict
 
 
-def test_the_antialiasing_of_alpha_is_not_seen_but_a_hole_is():
+def test_antialiasing_of_alpha_is_equal_and_a_hole_is_different():
     alpha = [edge(0) / 255, edge(0, samples=1) / 255, np.clip(edge(0) / 255, 0, 0.5)]
     one, other, hole = (of(np.dstack([np.full((64, 64, 3), 0.5), x]), stored="uint8") for x in alpha)
     assert compare("flip", one, other).verdict is EQUAL

@@ -1,4 +1,4 @@
-"""Comparing files and folders: which image with which, a result for each whatever goes wrong, exit codes, commands."""
+"""Comparison of files and folders: pairs, results after errors, exit codes, and commands."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import OpenImageIO as oiio
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.diff_images import found, image, samples
+from support.diff_images import image, outcomes, samples
 
 from mi_refract.image_diff import folders as diff
 from mi_refract.image_diff import methods, name_patterns, pairing, text_reports
@@ -32,8 +32,8 @@ def images(folder, gains):
         image(folder / name, gain=gain)
 
 
-def test_the_worst_images_come_first(tmp_path):
-    """By how many times a number is its bound, and what one side alone has last."""
+def test_results_are_sorted_by_the_ratio_to_the_bound(tmp_path):
+    """By the largest ratio of a number to its bound; images of one side are last among those that differ."""
     old, new = tmp_path / "old", tmp_path / "new"
     for side, few in ((old, 0), (new, 7)):
         for name, columns in {"a.exr": few, "b.exr": 5 * few, "c.exr": 0, "d.exr": 2 * few}.items():
@@ -50,7 +50,7 @@ def test_the_worst_images_come_first(tmp_path):
 def test_folders_are_matched_by_name(folders):
     old, new = folders
     results = diff.diff(old, new)
-    assert found(results) == {
+    assert outcomes(results) == {
         "added.exr": ("different", "added"),
         "inner/changed.exr": ("different", "changed"),
         "removed.exr": ("different", "removed"),
@@ -71,11 +71,11 @@ def test_folders_are_matched_by_name(folders):
         "same.exr": (True, False),
     }
     assert not any(r.comparison and r.comparison.maps for r in results.results)
-    kept = {r.name: bool(r.comparison.maps) for r in diff.diff(old, new, maps=True).results if r.comparison}
-    assert kept == {"inner/changed.exr": True, "same.exr": False}
+    has_maps = {r.name: bool(r.comparison.maps) for r in diff.diff(old, new, maps=True).results if r.comparison}
+    assert has_maps == {"inner/changed.exr": True, "same.exr": False}
     changed = {"inner/changed.exr": ("different", "changed")}
-    assert found(diff.diff(old, new, names=["inner/*"])) == changed
-    assert list(found(diff.diff(old / "inner/changed.exr", new / "inner/changed.exr")).items()) == [
+    assert outcomes(diff.diff(old, new, names=["inner/*"])) == changed
+    assert list(outcomes(diff.diff(old / "inner/changed.exr", new / "inner/changed.exr")).items()) == [
         ("changed.exr", ("different", "changed"))
     ]
     with pytest.raises(ValueError, match=r"none\.exr: matches no image; expected "):
@@ -83,11 +83,11 @@ def test_folders_are_matched_by_name(folders):
     assert diff.diff(old, new, Settings((Entry("added.exr", {}),)), names=["same.exr"]).unused == ()
 
 
-# Whatever goes wrong with one -------------------------------------------------------------------------------------
+# Errors with single images ----------------------------------------------------------------------------------------
 
 
 def check_one_error(results, name, *words):
-    """That one image is an error of one line, and the others have their verdicts."""
+    """Assert that one image has an error of one line, and that the others have verdicts."""
     (bad,) = results.of(Status.ERROR)
     assert (bad.name, results.exit_code) == (name, 2)
     assert "\n" not in bad.error and all(word in bad.error for word in words), bad.error
@@ -105,15 +105,15 @@ PLANTED = [
 
 @pytest.mark.parametrize(("error", "words"), PLANTED, ids=lambda x: type(x).__name__)
 @pytest.mark.parametrize("where", ["read", "compare"])
-def test_no_error_with_one_image_ends_the_run(folders, monkeypatch, where, error, words):
+def test_an_error_with_one_image_does_not_stop_the_others(folders, monkeypatch, where, error, words):
     module, name = {"read": (image_file, "read_parts"), "compare": (methods, "compare")}[where]
-    works = getattr(module, name)
+    original = getattr(module, name)
 
     def fail(first, *more, **options):
         path = first if where == "read" else more[0][0].path
         if path.name == "same.exr":
             raise error
-        return works(first, *more, **options)
+        return original(first, *more, **options)
 
     monkeypatch.setattr(module, name, fail)
     for maps in (False, True):
@@ -128,8 +128,8 @@ def test_an_image_is_not_compared_with_itself(folders, link):
     check_one_error(diff.diff(old, new), "same.exr", "the same file")
 
 
-def test_folders_inside_that_cannot_be_read_are_not_passed_over(folders, monkeypatch):
-    """Of the errors of the system, and links: each is an error on both sides."""
+def test_subfolders_that_cannot_be_read_are_errors(folders, monkeypatch):
+    """Folders without permission and links to folders are errors on both sides."""
     for side in folders:
         (side / "linked").symlink_to(side / "inner")
     walk = os.walk
@@ -144,11 +144,11 @@ def test_folders_inside_that_cannot_be_read_are_not_passed_over(folders, monkeyp
     assert (results.exit_code, len(results.results)) == (2, 8)
 
 
-def test_images_that_are_not_compared_are_named(folders):
-    """Hidden ones are skipped, and of formats that cannot be read an error, if no setting skips them."""
+def test_hidden_images_are_skipped_and_unsupported_formats_are_errors(folders):
+    """Images of unsupported formats are skipped, too, if the settings say so."""
     old, new = folders
-    hidden, unread = (".cache/a.exr", ".hidden.exr", "inner/.b.PNG"), ("inner/photo.HEIC", "a.avif")
-    for name in (*hidden, *unread, ".a.qoi", "a.txt", "a.svg", ".exr"):
+    hidden, unsupported = (".cache/a.exr", ".hidden.exr", "inner/.b.PNG"), ("inner/photo.HEIC", "a.avif")
+    for name in (*hidden, *unsupported, ".a.qoi", "a.txt", "a.svg", ".exr"):
         (new / name).parent.mkdir(exist_ok=True)
         (new / name).write_bytes(b"")
     (new / ".cache/link").symlink_to(old)
@@ -158,15 +158,15 @@ def test_images_that_are_not_compared_are_named(folders):
     errors = {result.name: result.error for result in results.of(Status.ERROR)}
     assert errors == {
         name: f"{new / name}: OpenImageIO does not read {name[-4:].upper()}; expected a format that it reads"
-        for name in unread
+        for name in unsupported
     }
     assert (len(results.results), results.exit_code) == (9, 2)
-    skipping = Settings(tuple(Entry(name, {"skip": True, "reason": "no image"}) for name in unread))
+    skipping = Settings(tuple(Entry(name, {"skip": True, "reason": "no image"}) for name in unsupported))
     results = diff.diff(old, new, skipping)
-    assert {x.name for x in results.of(Status.SKIPPED)} == {*hidden, *unread} and not results.of(Status.ERROR)
+    assert {x.name for x in results.of(Status.SKIPPED)} == {*hidden, *unsupported} and not results.of(Status.ERROR)
 
 
-def test_links_in_a_circle_do_not_end_the_comparison(folders):
+def test_circular_links_do_not_stop_the_comparison(folders):
     old, new = folders
     (old / "a.exr").symlink_to("b.exr")
     (old / "b.exr").symlink_to("a.exr")
@@ -175,12 +175,12 @@ def test_links_in_a_circle_do_not_end_the_comparison(folders):
         statuses = {result.name: str(result.status) for result in diff.diff(old, new, settings).results}
         assert statuses["same.exr"] == "equal" and statuses["a.exr"] == statuses["b.exr"] == "different"
     image(new / "a.exr")
-    check = {result.name: result.reason for result in diff.diff(old, new).of(Status.ERROR)}
-    assert check == {"a.exr": f"{old / 'a.exr'}: Too many levels of symbolic links"}
+    errors = {result.name: result.reason for result in diff.diff(old, new).of(Status.ERROR)}
+    assert errors == {"a.exr": f"{old / 'a.exr'}: Too many levels of symbolic links"}
 
 
 @pytest.mark.parametrize("spp", [float("nan"), (4, 5, 6), (1.0, 2.0, 3.0), "many", -4, 1, 1e30, 2.5])
-def test_a_header_may_say_anything_of_its_samples(tmp_path, spp):
+def test_an_invalid_number_of_samples_in_a_header_is_an_error(tmp_path, spp):
     for side in ("old", "new"):
         image(tmp_path / side / "same.exr")
         path = tmp_path / side / "noisy.exr"
@@ -192,85 +192,87 @@ def test_a_header_may_say_anything_of_its_samples(tmp_path, spp):
         assert output.open(str(path), spec) and output.write_image(np.ones((8, 8, 2), np.float32)) and output.close()
     results = diff.diff(tmp_path / "old", tmp_path / "new")
     assert {r.name: str(r.status) for r in results.results} == {"noisy.exr": "error", "same.exr": "equal"}
-    assert "old/noisy.exr: its header names " in results.results[0].error
+    assert "old/noisy.exr: samples per pixel in its header: " in results.results[0].error
 
 
-def test_pairs_that_are_compared_at_once_have_no_more_values_than_one_may(tmp_path, monkeypatch):
-    """The large image has as many as four small ones, and is as large as allowed; then where more is allowed."""
+def test_concurrent_pairs_respect_the_limit_of_values(tmp_path, monkeypatch):
+    """The large image has as many values as four small ones. With the lower limit it is as large as allowed."""
     for side in ("old", "new"):
         for i in range(12):
             image(tmp_path / side / f"{i}.exr", shape=(8, 8, 3))
         image(tmp_path / side / "large.exr", shape=(8, 32, 3))
         (tmp_path / side / "broken.exr").write_text("none")
-    compare, lock, now, most = methods.compare, threading.Lock(), [0], [0]
+    compare, lock, current, maximum = methods.compare, threading.Lock(), 0, 0
 
-    def slowly(method, one, two, **options):
+    def compare_slowly(method, one, two, **options):
+        nonlocal current, maximum
         values = one[0].pixels.size + two[0].pixels.size
         with lock:
-            now[0] += values
-            most[0] = max(*most, *now)
+            current += values
+            maximum = max(maximum, current)
         time.sleep(0.05)
         with lock:
-            now[0] -= values
+            current -= values
         return compare(method, one, two, **options)
 
-    monkeypatch.setattr(methods, "compare", slowly)
+    monkeypatch.setattr(methods, "compare", compare_slowly)
     monkeypatch.setattr(diff, "WORKERS", 8)
     pair = 2 * 8 * 8 * 3
     for limit, least, largest in ((8 * 32 * 3, 2 * pair, 4 * pair), (10**6, 5 * pair, 11 * pair)):
-        most[0] = 0
+        maximum = 0
         results = diff.diff(tmp_path / "old", tmp_path / "new", Settings(max_values=limit))
         names = ["broken.exr", *sorted([f"{i}.exr" for i in range(12)]), "large.exr"]
         assert [r.name for r in results.results] == names
         assert {r.status for r in results.results[1:]} == {Status.EQUAL}
-        assert least <= most[0] <= largest
+        assert least <= maximum <= largest
 
 
-# Work in threads: in order, several at a time, and never more together than the bound -------------------------------
+# Work in threads ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("items", "most"), [*(([1, 5, 2, 2, 0, 7, 3, 1, 1, 1, 4, 0, 0, 6] * 3, n) for n in (5, 12, 100)), ([1, 9, 1, 9], 3)]
+    ("items", "bound"),
+    [*(([1, 5, 2, 2, 0, 7, 3, 1, 1, 1, 4, 0, 0, 6] * 3, n) for n in (5, 12, 100)), ([1, 9, 1, 9], 3)],
 )
-def test_the_bound_holds_and_the_order_too(items, most):
-    """Held from the start of the work until the answer is taken; what takes more than all is alone."""
-    lock, held, largest = threading.Lock(), 0, 0
+def test_bounded_map_keeps_order_and_bound(items, bound):
+    """An item counts from the start of its work until its result is yielded; a larger item is processed alone."""
+    lock, current, maximum = threading.Lock(), 0, 0
 
     def work(item):
-        nonlocal held, largest
+        nonlocal current, maximum
         with lock:
-            held += item
-            largest = max(largest, held)
+            current += item
+            maximum = max(maximum, current)
         time.sleep(0.002)
         return item
 
-    for item, answer in zip(items, diff.bounded_map(work, items, lambda item: item, most, 4), strict=True):
-        assert answer == item
+    for item, result in zip(items, diff.bounded_map(work, items, lambda item: item, bound, 4), strict=True):
+        assert result == item
         with lock:
-            held -= answer
-    assert largest <= max(most, *items) and (largest > max(items) or most < 12)
+            current -= result
+    assert maximum <= max(bound, *items) and (maximum > max(items) or bound < 12)
 
 
-@pytest.mark.parametrize("takes", [0, 1])
-def test_threads_work_at_the_same_time_to_the_end(takes):
+@pytest.mark.parametrize("size", [0, 1])
+def test_bounded_map_keeps_all_threads_busy(size):
     gate = threading.Barrier(4, timeout=10)
-    assert list(diff.bounded_map(lambda item: gate.wait() >= 0, range(20), lambda item: takes, 4, 4)) == [True] * 20
+    assert list(diff.bounded_map(lambda item: gate.wait() >= 0, range(20), lambda item: size, 4, 4)) == [True] * 20
 
 
-def test_an_error_is_raised_in_its_turn_and_what_has_not_begun_is_left():
-    answers = diff.bounded_map(lambda item: 6 // item, [1, 2, 0, 3], lambda item: item, 9, 2)
-    assert [next(answers), next(answers)] == [6, 3]
+def test_bounded_map_raises_errors_in_order_and_starts_no_further_items():
+    results = diff.bounded_map(lambda item: 6 // item, [1, 2, 0, 3], lambda item: item, 9, 2)
+    assert [next(results), next(results)] == [6, 3]
     with pytest.raises(ZeroDivisionError):
-        next(answers)
+        next(results)
     begun = []
 
-    def takes(item):
+    def interrupt(item):
         if item == diff.AHEAD:
             raise KeyboardInterrupt
         return 0
 
     with pytest.raises(KeyboardInterrupt):
-        list(diff.bounded_map(lambda item: begun.append(item) or time.sleep(0.3), range(10), takes, 1, 1))
+        list(diff.bounded_map(lambda item: begun.append(item) or time.sleep(0.3), range(10), interrupt, 1, 1))
     assert begun in ([], [0])
 
 
@@ -290,7 +292,7 @@ def test_an_error_is_raised_in_its_turn_and_what_has_not_begun_is_left():
         ("*", "line\nbreak.exr", True),
         ("a*ab*b", "aabb", True),
         ("a*ab*b", "aab", False),
-        ("*a" * 20 + "b", "a" * 60, False),  # at once, whatever the number of stars
+        ("*a" * 20 + "b", "a" * 60, False),  # fast for any number of stars
         (20 * "*a", "a" * 60, True),
     ],
 )
@@ -299,7 +301,7 @@ def test_patterns(pattern, name, same):
 
 
 @given(st.text("a*?[].\\\n", max_size=6), st.text("ab", max_size=3))
-def test_a_name_is_matched_by_itself_and_by_what_stands_for_its_parts(name, more):
+def test_escaped_names_and_filled_templates_match_themselves(name, more):
     assert name_patterns.matches(name_patterns.literal(name), name)
     assert name_patterns.matches(f"{name_patterns.literal(name)}*", name + more)
     values = {"stem": name}
@@ -317,19 +319,19 @@ def test_a_name_is_matched_by_itself_and_by_what_stands_for_its_parts(name, more
         ("{stem}/{stem}.exr", "a/b.exr", None),
     ],
 )
-def test_a_template_and_the_names_it_makes(template, name, values):
+def test_templates_parse_and_form_names(template, name, values):
     assert name_patterns.parsed(template, name) == values
     if values is not None:
         assert name_patterns.filled(template, values) == name
 
 
 @pytest.mark.parametrize("template", ["{root}//etc/x.png", "/etc/x.png", "{stem}//x", "../x", "{root}/../x", "", "a/"])
-def test_no_template_leaves_its_folder(template):
+def test_templates_outside_the_folder_are_refused(template):
     with pytest.raises(ValueError, match=r"mask: .*; expected a relative path inside the folder"):
         from_words("auto", [f"mask={template}"])
 
 
-def test_files_beside_a_reference(tmp_path):
+def test_templates_give_the_paths_of_masks_and_variants(tmp_path):
     target = tmp_path / "a/ball.exr"
     assert pairing.beside("{stem}_mask.png", target, tmp_path) == tmp_path / "a/ball_mask.png"
     assert pairing.beside("{root}/masks/{dir}/{stem}.png", target, tmp_path) == tmp_path / "masks/a/ball.png"
@@ -342,12 +344,12 @@ def test_files_beside_a_reference(tmp_path):
         pairing.variant(target, ComparisonSpec(accept=("{stem}-macos{suffix}",)), "icx")
 
 
-def test_references_in_a_folder_beside_the_new_images(tmp_path):
+def test_maps_pair_references_in_subfolders_with_new_images(tmp_path):
     old, new = tmp_path / "old", tmp_path / "new"
     images(old, dict.fromkeys(("a/ref/out.exr", "ref/top.exr", "a/checker.exr", "b/ref/lost.exr"), 1))
     images(new, {"a/out.exr": 1, "top.exr": 1, "c/added.exr": 1})
     results = diff.diff(old, new, OSL)
-    assert found(results) == {
+    assert outcomes(results) == {
         "a/out.exr": ("equal", "unchanged"),
         "b/lost.exr": ("different", "removed"),
         "c/added.exr": ("different", "added"),
@@ -357,7 +359,7 @@ def test_references_in_a_folder_beside_the_new_images(tmp_path):
     assert added.target == old / "c/ref/added.exr"
     images(tmp_path / "tree", {"a/ref/out.exr": 1, "a/out.exr": 1.1})  # both in one tree
     results = diff.diff(tmp_path / "tree", tmp_path / "tree", OSL)
-    assert found(results) == {"a/out.exr": ("different", "changed")}
+    assert outcomes(results) == {"a/out.exr": ("different", "changed")}
     assert results.reproduce(results.results[0]) == f"mi-refract diff {tmp_path}/tree {tmp_path}/tree a/out.exr"
     images(tmp_path / "two", {"ref/a.exr": 1, "base/a.exr": 1})  # two references of one image
     maps = (Map("ref/{name}", "{name}"), Map("base/{name}", "{name}"))
@@ -370,24 +372,24 @@ def test_references_in_a_folder_beside_the_new_images(tmp_path):
 
 @pytest.fixture
 def variants(tmp_path):
-    """An image that is equal to the second of two variants of its reference."""
+    """Folders with an image that is equal to the second of two variants of its reference."""
     images(tmp_path / "old/a", {"ball.exr": 1, "ball-mac.exr": 1.2, "ball-arm.exr": 1.4, "other.exr": 1})
     images(tmp_path / "new/a", {"ball.exr": 1.4, "other.exr": 1})
     return tmp_path / "old", tmp_path / "new"
 
 
-def test_any_variant_passes_and_is_named(variants):
+def test_an_equal_variant_passes_and_is_named(variants):
     old, new = variants
     results = diff.diff(old, new, VARIANTS)
-    assert found(results) == {"a/ball.exr": ("equal", "unchanged"), "a/other.exr": ("equal", "unchanged")}
+    assert outcomes(results) == {"a/ball.exr": ("equal", "unchanged"), "a/other.exr": ("equal", "unchanged")}
     (ball,) = [result for result in results.results if result.name == "a/ball.exr"]
     assert ball.matched == old / "a/ball-arm.exr"
     assert ball.reason.endswith("; matches ball-arm.exr")
     assert text_reports.sentence(results) == "2 images: 2 equal; 2 further references"
     files = diff.diff(old / "a/ball.exr", new / "a/ball.exr", VARIANTS)
     assert files.results[0].matched == old / "a/ball-arm.exr"
-    assert found(diff.diff(old, new))["a/ball-arm.exr"] == ("different", "removed")
-    images(old, {"a/mac/ball.exr": 1.4})  # in a folder below
+    assert outcomes(diff.diff(old, new))["a/ball-arm.exr"] == ("different", "removed")
+    images(old, {"a/mac/ball.exr": 1.4})  # in a subfolder
     for sides in ((old, new), (old / "a/ball.exr", new / "a/ball.exr")):
         results = diff.diff(*sides, Settings.for_all(accept=("mac/{name}",))).results
         assert old / "a/mac/ball.exr" in [result.matched for result in results]
@@ -401,7 +403,7 @@ INFIX = [
 
 
 @pytest.mark.parametrize(("reference", "test", "template", "first", "variant"), INFIX)
-def test_the_fields_of_accept_are_those_of_the_map(tmp_path, reference, test, template, first, variant):
+def test_templates_of_accept_have_the_fields_of_the_map(tmp_path, reference, test, template, first, variant):
     images(tmp_path, {f"old/a/{first}": 1, f"old/a/{variant}": 1.4, "new/a/ball.exr": 1.4})
     rules = Settings.for_all(accept=("{stem}.gone{suffix}", template)).rules
     settings = Settings(rules, (Map("gone/{name}", "{name}"), Map(f"{{dir}}/{reference}", f"{{dir}}/{test}")))
@@ -412,31 +414,31 @@ def test_the_fields_of_accept_are_those_of_the_map(tmp_path, reference, test, te
     assert results.unused == ("accept = '{stem}.gone{suffix}'",)
 
 
-def test_what_is_no_variant(variants):
+def test_references_that_are_not_variants_and_unreadable_variants(variants):
     old, new = variants
     results = diff.diff(old, new, Settings.for_all(accept=("{stem}*",)))
     assert {result.status for result in results.results} == {"error"}
     assert "matches the reference" in results.results[0].error
-    images(new, {"a/ball-arm.exr": 1.4})  # an image with a new one of its own
-    assert found(diff.diff(old, new, VARIANTS)) == {
+    images(new, {"a/ball-arm.exr": 1.4})  # the variant has a new image with its name
+    assert outcomes(diff.diff(old, new, VARIANTS)) == {
         "a/ball.exr": ("different", "changed"),
         "a/ball-arm.exr": ("equal", "unchanged"),
         "a/other.exr": ("equal", "unchanged"),
     }
     (new / "a/ball-arm.exr").unlink()
-    image(old / "a/ball.exr", shape=(8, 8, 3))  # cannot be compared, but a variant can
-    assert found(diff.diff(old, new, VARIANTS))["a/ball.exr"] == ("equal", "unchanged")
+    image(old / "a/ball.exr", shape=(8, 8, 3))  # the reference cannot be compared, but a variant is equal
+    assert outcomes(diff.diff(old, new, VARIANTS))["a/ball.exr"] == ("equal", "unchanged")
     (old / "a/ball-arm.exr").write_bytes(b"no image")
     ball = diff.diff(old, new, VARIANTS).results[0]
-    assert ball.status is Status.ERROR and "size 48 × 32; expected 8 × 8" in ball.error  # the reference's comes first
+    assert ball.status is Status.ERROR and "size 48 × 32; expected 8 × 8" in ball.error  # that of the reference
     images(old, {"a/ball.exr": 1, "a/ball-arm.exr": 1.1})
     (ball,) = diff.diff(old, new, VARIANTS).results[:1]
     assert (ball.status, ball.matched) == ("different", None)
     assert ball.reason.endswith("; its 2 variants differ, too")
 
 
-def test_doubt_about_a_variant_is_no_difference(tmp_path, monkeypatch):
-    """Different from the reference, but perhaps equal to the variant: nobody can say."""
+def test_an_inconclusive_variant_makes_the_result_inconclusive(tmp_path, monkeypatch):
+    """The new image differs from the reference, but may be equal to the variant."""
     images(tmp_path, {"old/a.exr": 1, "old/a-2.exr": 1, "new/a.exr": 2})
     verdicts = {"a.exr": Verdict.DIFFERENT, "a-2.exr": Verdict.INCONCLUSIVE}
     monkeypatch.setattr(
@@ -449,17 +451,17 @@ def test_doubt_about_a_variant_is_no_difference(tmp_path, monkeypatch):
 def test_a_new_image_is_never_its_own_reference(tmp_path):
     images(tmp_path, {"ball.exr": 1, "ball-new.exr": 1.5})
     settings = Settings.for_all(accept=("{stem}-*{suffix}",), method="exact")
-    assert found(diff.diff(tmp_path / "ball.exr", tmp_path / "ball-new.exr", settings))["ball.exr"][0] == "different"
+    assert outcomes(diff.diff(tmp_path / "ball.exr", tmp_path / "ball-new.exr", settings))["ball.exr"][0] == "different"
     mapped = replace(settings, maps=(Map("{stem}.exr", "{stem}-new.exr"),))
-    assert found(diff.diff(tmp_path, tmp_path, mapped))["ball-new.exr"] == ("different", "changed")
+    assert outcomes(diff.diff(tmp_path, tmp_path, mapped))["ball-new.exr"] == ("different", "changed")
     rules = (Entry("", {"accept": ("*/{name}",), "method": "exact"}),)
     deep = Settings(rules, maps=(Map("{name}", "out/{name}"),))
     image(tmp_path / "out/ball.exr", gain=1.5)
-    by_name = {each.name: each.status for each in diff.diff(tmp_path, tmp_path, deep, names=["out/ball.exr"]).results}
-    assert by_name == {"out/ball.exr": "different"}
+    results = diff.diff(tmp_path, tmp_path, deep, names=["out/ball.exr"]).results
+    assert {result.name: result.status for result in results} == {"out/ball.exr": "different"}
 
 
-# The whole --------------------------------------------------------------------------------------------------------
+# Exit codes and commands ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -487,11 +489,11 @@ def test_exit_codes(tmp_path, statuses, inconclusive, code):
         ("ball.exr", (), True, ("diff {old}/ball.exr {new}/ball.exr", "accept {old}/ball.exr {new}/ball.exr")),
         ("ball.exr", ("--set", "fail=0.01"), False, ("diff {old} {new} --set fail=0.01 ball.exr",) * 2),
         ("-a b.exr", (), False, ("diff {old} {new} -- '-a b.exr'",) * 2),
-        ("a*.exr", (), False, (r"diff {old} {new} 'a\*.exr'",) * 2),  # the name of one image, no pattern
+        ("a*.exr", (), False, (r"diff {old} {new} 'a\*.exr'",) * 2),  # the name of one image, not a pattern
         (r"\*b.exr", (), False, (r"diff {old} {new} '\\\*b.exr'",) * 2),
     ],
 )
-def test_the_commands_do_what_they_say(tmp_path, run, monkeypatch, name, flags, files, expected):
+def test_reproduce_and_accept_commands_work(tmp_path, run, monkeypatch, name, flags, files, expected):
     old, new = tmp_path / "old", tmp_path / "new"
     for side, gain in ((old, 1.0), (new, 1.2)):
         images(side, {name: gain, "ab.exr": gain})
@@ -505,7 +507,7 @@ def test_the_commands_do_what_they_say(tmp_path, run, monkeypatch, name, flags, 
     assert run(*shlex.split(commands[0])[1:])[0] == 1
     assert run("accept", "--yes", *shlex.split(commands[1])[2:])[0] == 0
     assert run(*shlex.split(commands[0])[1:])[0] == 0
-    assert [each.name for each in diff.diff(old, new).of(Status.DIFFERENT)] == ["ab.exr"]
+    assert [result.name for result in diff.diff(old, new).of(Status.DIFFERENT)] == ["ab.exr"]
     monkeypatch.chdir(tmp_path)
     images(Path(), {"-a.exr": 1, "-b.exr": 1.1})
     results = diff.diff("-a.exr", "-b.exr")
@@ -521,14 +523,14 @@ def test_renders(tmp_path):
         new = samples(tmp_path / str(first), first=first, gain=gain)
         results = diff.diff(old, new, renders=True)
         (result,) = results.results
-        assert found(results) == {"old": status}
+        assert outcomes(results) == {"old": status}
         assert (result.comparison.method, result.reference, result.test) == ("welch", old, new)
         assert results.reproduce(result) == f"mi-refract diff {old} {new} --renders"
     old, new = samples(tmp_path / "few", 2, noise=1.0), samples(tmp_path / "others", 2, 100, noise=1.0)
     assert diff.diff(old, new, renders=True).exit_code == 3
 
 
-def test_bad_renders(tmp_path):
+def test_invalid_renders_are_errors(tmp_path):
     good = samples(tmp_path / "good")
     twice = samples(tmp_path / "twice", first=100)
     (twice / "again.exr").write_bytes((twice / "3.exr").read_bytes())
@@ -541,7 +543,7 @@ def test_bad_renders(tmp_path):
         results = diff.diff(good, folder, renders=True)
         assert results.exit_code == 2 and message in results.results[0].error
     sizes = samples(tmp_path / "sizes", first=300)
-    image(sizes / "2.exr", shape=(16, 48, 3))  # such renders have no mean to show
+    image(sizes / "2.exr", shape=(16, 48, 3))  # renders of different sizes have no mean
     results = diff.diff(good, sizes, renders=True, maps=True)
     assert results.exit_code == 2 and results.results[0].error.startswith(f"{sizes / '2.exr'}: size 48 × 16")
     assert results.results[0].images.keys() == {"reference"} and results.results[0].unread

@@ -1,4 +1,4 @@
-"""The page of `mi-refract diff`: failures first, true to the pixels, nothing executable, nothing fetched."""
+"""The page of `mi-refract diff`: failures first, exact pixels, nothing from names executed, nothing fetched."""
 
 import base64
 import html
@@ -36,31 +36,31 @@ def image(path, value, shape=(4, 6, 3), channels=("R", "G", "B")):
 
 
 def results(folder):
-    """A pair that differs, one that cannot be compared, a removed image, one that is equal."""
+    """Results of a pair that cannot be compared, one that differs, a removed image, and one that is equal."""
     reference = image(folder / "reference" / "a.exr", 0.25)
     test = image(folder / "test" / "a.exr", 0.5)
     one, two = {"reference": image_file.read(reference)}, {"test": image_file.read(test)}
     p = np.linspace(0, 1, 24, dtype=np.float32).reshape(4, 6)
     metrics = (Metric("tiles that differ", 12.0, 0.0), Metric("odd", math.nan, 1.0), Metric("smallest p", 1e-9))
     maps = {"t": 8 * p - 4, "p": p, "q": p, "flags": 0 * p}
-    found = Comparison("welch", Verdict.DIFFERENT, "12 tiles differ.", metrics, 0.013, maps)
+    different = Comparison("welch", Verdict.DIFFERENT, "12 tiles differ.", metrics, 0.013, maps)
     gone = Result("gone.exr", Status.ERROR, folder / "gone.exr", test, error="gone.exr: <i>corrupt</i>", images=two)
-    changed = Result(EVIL, Status.DIFFERENT, reference, test, comparison=found, images=one | two)
+    changed = Result(EVIL, Status.DIFFERENT, reference, test, comparison=different, images=one | two)
     removed = Result("old.exr", Status.DIFFERENT, reference, None, images=one)
     same = Result("same.exr", Status.EQUAL, reference, test, comparison=EQUAL)
     return Results(folder / "reference", folder / "test", (gone, changed, removed, same))
 
 
-def written(folder, found=None):
-    html_report.write(folder / "report.html", found or results(folder), {"version": "1 & 2"}, "mi-refract diff a b")
+def written(folder, to_write=None):
+    html_report.write(folder / "report.html", to_write or results(folder), {"version": "1 & 2"}, "mi-refract diff a b")
     return (folder / "report.html").read_text("utf-8")
 
 
-def page_of(sides, place, source="", settings=folders.AS_ASKED):
-    """The page as the command writes it: each pair while its images are in memory."""
-    report = html_report.Page(place)
+def page_of(sides, path, source="", settings=folders.NO_SETTINGS):
+    """The page as the command writes it, which views each pair while its images are in memory."""
+    report = html_report.Page(path)
     report.write(folders.diff(*sides, settings, view=report.view), {}, "mi-refract diff old new", source)
-    return place.read_text("utf-8")
+    return path.read_text("utf-8")
 
 
 def roles(text):
@@ -75,7 +75,7 @@ def decoded(data):
 # The text ---------------------------------------------------------------------------------------------------------
 
 
-def test_failures_come_first_with_numbers_and_commands_and_nothing_is_fetched_or_run(tmp_path):
+def test_failures_come_first_with_numbers_and_commands_and_markup_is_escaped(tmp_path):
     text = written(tmp_path)
     places = ("<h1>4 images: ", 'id="pair-1"', 'id="pair-3"', 'id="equal"', "same.exr")
     order = [text.index(place) for place in places]
@@ -87,9 +87,9 @@ def test_failures_come_first_with_numbers_and_commands_and_nothing_is_fetched_or
     ]
     for words in (*numbers, *causes, "1 &amp; 2", "12 tiles differ.", "p-value", "mi-refract diff a b"):
         assert words in text, words
-    found = results(tmp_path)
-    for result in found.results[:2]:
-        for command in (found.reproduce(result), found.accept(result)):
+    all_results = results(tmp_path)
+    for result in all_results.results[:2]:
+        for command in (all_results.reproduce(result), all_results.accept(result)):
             assert f"<dd><code>{html.escape(command, quote=False)}</code></dd>" in text.replace("&#39;", "'")
     assert "mi-refract accept" not in text[text.index('id="equal"') : text.index("</main>")]
     assert_stands_alone(text)
@@ -107,13 +107,13 @@ def test_warnings_variants_masks_and_skipped_images_are_shown(tmp_path):
     rules = Entry("*", {"accept": ("{stem}-*.exr",), "ignore": ((0, 0, 40, 32),)}), Entry("c.exr", {"skip": True})
     text = page_of((old, new), tmp_path / "out.html", settings=Settings(rules))
     assert "matches a-macos.exr" in text and text.count("warning: the mask leaves out 83% of the pixels") == 2
-    assert '<section id="equal"><details open>' in text  # an equal image with a warning is not folded away
+    assert '<section id="equal"><details open>' in text  # the list is unfolded because of the warning
     assert "its variant differs, too" in text and "left out" in dict(roles(text))
     assert '<section id="skipped"><details>' in text and "skipped by the settings" in text
 
 
 @pytest.mark.parametrize(("source", "flags"), [("", ""), ("out.json", " --from out.json")])
-def test_names_that_mean_something_can_be_ticked(many, tmp_path, source, flags):
+def test_images_of_folders_have_tick_boxes(many, tmp_path, source, flags):
     text = page_of(many, tmp_path / "out.html", source=source)
     assert f'data-command="mi-refract accept {many[0]} {many[1]}{flags}"' in text
     names = [f"{d}/{i}.exr" for d in "ab" for i in range("ab".index(d), 6, 2)]
@@ -122,7 +122,7 @@ def test_names_that_mean_something_can_be_ticked(many, tmp_path, source, flags):
     assert 'class="tick"' not in page_of(one, tmp_path / "out.html")
 
 
-def test_a_name_that_cannot_be_shown_as_it_is_cannot_be_ticked(tmp_path):
+def test_names_with_invisible_characters_have_no_tick_box(tmp_path):
     bad = [Result(name, Status.DIFFERENT, None, tmp_path / "x") for name in ("a\u202eb.exr", "\u3164.exr", "it's.exr")]
     text = written(tmp_path, Results(tmp_path / "old", tmp_path, tuple(bad)))
     assert list(map(html.unescape, re.findall('data-word="([^"]*)"', text))) == ["'it'\"'\"'s.exr'"]
@@ -131,22 +131,22 @@ def test_a_name_that_cannot_be_shown_as_it_is_cannot_be_ticked(tmp_path):
 # The images -------------------------------------------------------------------------------------------------------
 
 
-def test_panes_of_a_pair_are_in_order_and_an_equal_one_has_none(tmp_path):
-    found = results(tmp_path)
-    text = written(tmp_path, replace(found, results=found.results[1:2]))
+def test_panes_of_a_pair_are_in_order_and_equal_pairs_have_none(tmp_path):
+    all_results = results(tmp_path)
+    text = written(tmp_path, replace(all_results, results=all_results.results[1:2]))
     names = [("reference", "light"), ("test", "light"), ("difference", "signed"), ("flip", "heat"), ("t", "signed")]
-    assert roles(text) == [*names, ("−log₁₀ q", "heat")]  # no flags: none is up
+    assert roles(text) == [*names, ("−log₁₀ q", "heat")]  # no map of flags, as none is set
     assert "compare pair paired" in text
     scale, data = re.findall(r'data-scale="([^"]*)">([^<]*)<', text)[2]
     difference = float(scale) * decoded(data).astype(float)
     assert difference == pytest.approx(0.5 - 0.25)  # positive where the test is brighter
-    text = written(tmp_path, replace(found, results=found.results[3:]))
+    text = written(tmp_path, replace(all_results, results=all_results.results[3:]))
     assert roles(text) == [] and "Image viewer" not in text
 
 
 @pytest.mark.parametrize("method", ["tolerance", "flip"])
 def test_every_file_is_read_once_and_flip_runs_once_for_verdict_and_page(tmp_path, monkeypatch, method):
-    """Also those of images without a partner, and of pairs that cannot be compared."""
+    """Also files of images that only one side has, and of pairs that cannot be compared."""
     sides = tmp_path / "old", tmp_path / "new"
     for side, value in zip(sides, (0.25, 0.5), strict=True):
         image(side / "a.exr", value)
@@ -162,21 +162,21 @@ def test_every_file_is_read_once_and_flip_runs_once_for_verdict_and_page(tmp_pat
     assert sorted(reads) == sorted(path for side in sides for path in side.iterdir())
     assert len(runs) == 1 and "flip" in dict(roles(text))
     shown = [role for role, _ in roles(text)]
-    assert (shown.count("reference"), shown.count("test")) == (3, 4)  # but for the broken one
-    assert text.count("compare pair paired") == 1  # images of two sizes are not laid over each other
-    alive = []
-    found = folders.diff(sides[0] / "a.exr", sides[1] / "a.exr", view=lambda x, _: alive.append(len(x.images)))
-    assert alive == [2] and not found.results[0].images and not found.results[0].comparison.maps
+    assert (shown.count("reference"), shown.count("test")) == (3, 4)  # all except the broken one
+    assert text.count("compare pair paired") == 1  # images of different sizes are not paired
+    viewed = []
+    after = folders.diff(sides[0] / "a.exr", sides[1] / "a.exr", view=lambda x, _: viewed.append(len(x.images)))
+    assert viewed == [2] and not after.results[0].images and not after.results[0].comparison.maps
 
 
-def test_what_cannot_be_shown_keeps_no_other_image_from_being_shown(tmp_path):
-    found = results(tmp_path)
-    flat = replace(found.results[1].images["test"], pixels=np.float32(3))
-    broken = replace(found.results[1], images={"reference": found.results[0].images["test"], "test": flat})
-    text = written(tmp_path, replace(found, results=(broken, *found.results[2:])))
+def test_an_image_that_cannot_be_shown_does_not_affect_others(tmp_path):
+    gone, changed, *others = results(tmp_path).results
+    flat = replace(changed.images["test"], pixels=np.float32(3))
+    broken = replace(changed, images={"reference": gone.images["test"], "test": flat})
+    text = written(tmp_path, replace(results(tmp_path), results=(broken, *others)))
     assert "Cannot be shown: internal error: " in text
     assert dict(roles(text)).keys() == {"reference"}  # of the removed image
-    for side, names in (("old", ["same"]), ("new", ["same", "added"])):  # too large images are not read for the page
+    for side, names in (("old", ["same"]), ("new", ["same", "added"])):  # images that are too large are not read
         for name in names:
             image(tmp_path / side / f"{name}.exr", 0.5)
     text = page_of((tmp_path / "old", tmp_path / "new"), tmp_path / "out.html", settings=Settings(max_values=71))
@@ -188,13 +188,13 @@ def test_renders_in_a_folder_are_shown_as_their_mean(tmp_path):
         for i in range(4):
             noise = np.random.default_rng([i, ord(side)]).normal(1 + (side == "t"), 0.01, (8, 8, 3))
             image(tmp_path / side / f"{i}.exr", noise.astype(np.float32))
-    found = folders.diff(tmp_path / "r", tmp_path / "t", renders=True, maps=True)
-    assert found.exit_code == 1
-    images = re.findall(r'data-channels="3" data-scale="1.0">([^<]*)<', written(tmp_path, found))
+    compared = folders.diff(tmp_path / "r", tmp_path / "t", renders=True, maps=True)
+    assert compared.exit_code == 1
+    images = re.findall(r'data-channels="3" data-scale="1.0">([^<]*)<', written(tmp_path, compared))
     assert [decoded(data).astype(float).mean() for data in images] == pytest.approx([1, 2], abs=0.01)
 
 
-def test_the_first_channel_stands_for_those_that_are_no_colours(tmp_path):
+def test_the_first_channel_is_shown_of_images_without_colours(tmp_path):
     pixels = RNG.random((3, 4, 2)).astype(np.float32)
     sides = [image(tmp_path / f"{x}.exr", pixels + x, channels=("depth.Z", "id")) for x in (0, 1)]
     (result,) = folders.diff(*sides, maps=True).results
@@ -204,8 +204,8 @@ def test_the_first_channel_stands_for_those_that_are_no_colours(tmp_path):
     np.testing.assert_allclose(shown, image_file.read(sides[0]).select([channel])[..., 0], rtol=1e-3)
 
 
-def test_a_map_is_full_of_colour_where_its_upper_hundredth_is_and_keeps_the_strongest_pixels():
-    """One pixel of 2500 is `peak` times as large as the others; the gain is in tenths of a power of ten."""
+def test_the_gain_of_a_map_follows_its_99th_percentile_and_the_strongest_pixels_remain():
+    """One pixel of 2500 is `peak` times as large as the others; the gain is the exponent of a power of ten."""
     for peak, gain in ((1.0, 0), (10.0, 1), (31.7, 1.5), (100.0, 2), (1e9, 6), (0.0, 0)):
         values = np.full((50, 50, 1), float(peak > 0), np.float32)
         values[7, 9] = -peak
@@ -219,7 +219,7 @@ def test_a_map_is_full_of_colour_where_its_upper_hundredth_is_and_keeps_the_stro
 
 
 @pytest.mark.parametrize(("rows", "kept"), [(1, 1), (512, 512), (513, 257), (1300, 434)])
-def test_a_histogram_is_of_512_rows_at_most(rows, kept):
+def test_a_histogram_uses_at_most_512_rows(rows, kept):
     p = np.linspace(0, 1, 2 * rows, dtype=np.float32).reshape(rows, 2)
     p[0, 1] = np.nan
     comparison = Comparison("welch", Verdict.DIFFERENT, "", maps={"p": p})
@@ -244,24 +244,24 @@ def test_the_bars_of_a_histogram_are_the_shares_of_the_p_values(tmp_path):
         ([("a", 1, 1), ("b", 9, None)], "different"),
     ],
 )
-def test_the_cause_is_the_number_that_is_furthest_beyond_its_bound(tmp_path, metrics, cause):
-    comparison = Comparison("x", Verdict.DIFFERENT, "", tuple(Metric(*each) for each in metrics))
+def test_the_cause_is_the_metric_with_the_largest_ratio_to_its_bound(tmp_path, metrics, cause):
+    comparison = Comparison("x", Verdict.DIFFERENT, "", tuple(Metric(*metric) for metric in metrics))
     result = Result("x", Status.DIFFERENT, tmp_path, tmp_path, comparison=comparison)
     assert html_report.cause(result) == cause
 
 
 @pytest.mark.parametrize("share", [2, 0.75])
-def test_a_finite_value_never_becomes_infinite_and_nan_stays(share):
+def test_encoding_keeps_finite_values_finite_and_nan(share):
     pixels = RNG.gamma(2, 1, (64, 64, 3)).astype(np.float32)
     pixels[0, :3] = [np.nan, np.inf, -np.inf], [1e9, -1e9, 65504], [1.0, -0.0, 65503]
-    found = encoded(pixels, share * len(encoded(pixels)["data"]))
-    assert ("within" in found["note"]) == (share < 1)
-    read = decoded(found["data"])[:9].reshape(3, 3)
-    assert np.isnan(read[0, 0]) and list(read[0, 1:]) == [np.inf, -np.inf]
-    assert np.isfinite(read[1:]).all() and abs(read[1]).min() > 6e4 and read[2, 0] == 1
+    image = encoded(pixels, share * len(encoded(pixels)["data"]))
+    assert ("within" in image["note"]) == (share < 1)
+    values = decoded(image["data"])[:9].reshape(3, 3)
+    assert np.isnan(values[0, 0]) and list(values[0, 1:]) == [np.inf, -np.inf]
+    assert np.isfinite(values[1:]).all() and abs(values[1]).min() > 6e4 and values[2, 0] == 1
 
 
-def test_what_does_not_fit_is_rounded_then_made_smaller_and_the_page_says_so():
+def test_large_images_are_rounded_then_averaged_with_a_note():
     noise = RNG.gamma(2, 1, (256, 256, 3)).astype(np.float32)
     whole = encoded(noise)
     assert whole["note"] == "" and np.array_equal(decoded(whole["data"]), noise.astype(np.float16).ravel())
@@ -277,7 +277,7 @@ def test_what_does_not_fit_is_rounded_then_made_smaller_and_the_page_says_so():
 
 
 @pytest.mark.parametrize("shape", [(1, 2**18, 3), (2**18, 1, 3)])
-def test_a_thin_image_takes_no_more_memory_than_another(shape):
+def test_encoding_a_thin_image_needs_no_more_memory(shape):
     noise = RNG.random(shape).astype(np.float32)
     tracemalloc.start()
     small = strongest(noise, 960)
@@ -309,40 +309,42 @@ def size_of(result):
 
 
 @pytest.mark.parametrize(("share", "pairs"), [(0.1, 1), (1.9, 1), (2.1, 2)])
-def test_a_pair_that_does_not_fit_keeps_its_numbers_and_is_named(tmp_path, monkeypatch, share, pairs):
-    """The first is shown, however large; a command shows the rest."""
-    found = results(tmp_path)
+def test_pairs_that_do_not_fit_keep_their_numbers_and_are_named(tmp_path, monkeypatch, share, pairs):
+    """The first pair is always shown; a command shows the rest."""
+    template = results(tmp_path)
+    changed = template.results[1]
     names = [f"-{i}.exr" for i in range(3)]
-    some = tuple(replace(found.results[1], name=name) for name in (names[0], "-0\u202e.exr", *names[1:]))
-    monkeypatch.setattr(html_report, "PAGE", share * size_of(found.results[1]))
+    four = tuple(replace(changed, name=name) for name in (names[0], "-0\u202e.exr", *names[1:]))
+    monkeypatch.setattr(html_report, "PAGE", share * size_of(changed))
     monkeypatch.setattr(html_report, "NAMED", 1)
-    text = written(tmp_path, replace(found, results=some, flags=("--method", "welch")))
+    text = written(tmp_path, replace(template, results=four, flags=("--method", "welch")))
     assert len(roles(text)) == 6 * pairs and text.count("12 tiles differ.") == 4
     assert text.count("the page is full") == 4 - pairs
-    said = re.search("Left out, because a page is limited to 15 MB: (.*?) <code>(.*?)</code>", text)
-    assert said[1] == f"images of {4 - pairs} of 4 failures. The first of them:"
-    words = ["mi-refract", "diff", f"{found.reference}", f"{found.test}", "--method", "welch", "--report", "rest.html"]
-    assert shlex.split(said[2]) == [*words, "--", names[1]]
+    left_out = re.search("Left out, because a page is limited to 15 MB: (.*?) <code>(.*?)</code>", text)
+    assert left_out[1] == f"images of {4 - pairs} of 4 failures. The first of them:"
+    paths = [str(template.reference), str(template.test)]
+    words = ["mi-refract", "diff", *paths, "--method", "welch", "--report", "rest.html"]
+    assert shlex.split(left_out[2]) == [*words, "--", names[1]]
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_page_is_the_same_in_whatever_order_results_come(many, tmp_path, monkeypatch, seed):
-    found = folders.diff(*many, maps=True)
-    monkeypatch.setattr(html_report, "PAGE", 3.5 * size_of(found.results[1]))
-    failed = found.of(Status.ERROR, Status.DIFFERENT)
+def test_the_page_is_independent_of_the_order_of_results(many, tmp_path, monkeypatch, seed):
+    compared = folders.diff(*many, maps=True)
+    monkeypatch.setattr(html_report, "PAGE", 3.5 * size_of(compared.results[1]))
+    failed = compared.of(Status.ERROR, Status.DIFFERENT)
     random.Random(seed).shuffle(failed)
     report = html_report.Page(tmp_path / "shuffled.html")
     for result in failed:
-        report.view(result, found)
-    held = sum(each.size for each in report._shown.values())
-    assert held <= 4.7 * size_of(found.results[1])  # memory does not grow with the number of failures
-    report.write(found, {}, "")
-    html_report.write(tmp_path / "ordered.html", found)
+        report.view(result, compared)
+    size = sum(shown.size for shown in report._shown.values())
+    assert size <= 4.7 * size_of(compared.results[1])  # memory does not grow with the number of failures
+    report.write(compared, {}, "")
+    html_report.write(tmp_path / "ordered.html", compared)
     assert (tmp_path / "shuffled.html").read_bytes() == (tmp_path / "ordered.html").read_bytes()
     assert "images of 3 of 7 failures" in (tmp_path / "ordered.html").read_text("utf-8")
 
 
-def test_a_page_of_thousands_is_no_larger_than_its_limit(tmp_path, monkeypatch):
+def test_a_page_of_thousands_of_images_respects_its_limit(tmp_path, monkeypatch):
     long = "a long name/" * 20
     sides = tmp_path / "a", tmp_path / "b"
     bad = [Result(f"{long}{i}.exr", Status.ERROR, None, tmp_path / "b", error="bad " * 100) for i in range(900)]
@@ -350,16 +352,16 @@ def test_a_page_of_thousands_is_no_larger_than_its_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(html_report, "LIMIT", 600_000)
     text = written(tmp_path, Results(tmp_path / "a", tmp_path, (*bad, *equal)))
     assert len(text.encode()) <= 600_000
-    listed = html.unescape(re.search("limited to 15 MB: (.*?)\\.", text)[1])
+    left_out = html.unescape(re.search("limited to 15 MB: (.*?)\\.", text)[1])
     articles, lines = text.count("<article"), len(re.findall("<tr data-text", text))
-    more = [int(each) for each in re.findall(r"… and (\d+) more", text)]
+    more = [int(count) for count in re.findall(r"… and (\d+) more", text)]
     assert articles >= 20 and lines >= articles and articles + lines + sum(more) == 1200
     assert "rest.html" not in text  # no image has a pane
-    left = f"all but a line of {900 - articles - more[0]} failures, {more[0]} failures, {more[1]} equal images"
-    assert listed == left
+    in_lines = f"details of {900 - articles - more[0]} failures"
+    assert left_out == f"{in_lines}, {more[0]} failures, {more[1]} equal images"
 
 
-def test_a_noisy_full_size_pair_stays_within_its_bytes(tmp_path):
+def test_a_noisy_pair_of_full_size_fits_on_the_page(tmp_path):
     noise = [RNG.standard_exponential((1080, 1920, 3), np.float32) for _ in "rt"]
     sides = [image(tmp_path / f"{side}.exr", pixels) for side, pixels in zip("rt", noise, strict=True)]
     text = page_of(sides, tmp_path / "out.html")
@@ -410,8 +412,8 @@ LIST = """
 
 
 @needs_chromium
-def test_the_browser_sees_a_request_and_an_error(tmp_path):
-    """What the test above would miss if it could not fail."""
+def test_the_browser_reports_planted_requests_and_errors(tmp_path):
+    """So that the tests above can fail."""
     page = tmp_path / "report.html"
     planted = "<script>fetch('https://example.invalid/x'); undefinedName()</script></body>"
     page.write_text(written(tmp_path).replace("</body>", planted), "utf-8")
@@ -421,11 +423,11 @@ def test_the_browser_sees_a_request_and_an_error(tmp_path):
 
 
 @needs_chromium
-def test_the_strip_of_names_is_searched_and_the_page_builds_the_command(many, tmp_path, run):
+def test_the_filter_works_and_the_page_builds_the_command(many, tmp_path, run):
     image(many[1] / "-dash it's.exr", 0.5)
-    found = seen(tmp_path, page_of(many, tmp_path / "out.html"), LIST)
-    words = shlex.split(found.pop("built"))
-    assert found == {
+    observed = seen(tmp_path, page_of(many, tmp_path / "out.html"), LIST)
+    words = shlex.split(observed.pop("built"))
+    assert observed == {
         "small": [32] * 7 + [4],
         "strip": ["b/1.exr", "b/3.exr", "b/5.exr"],
         "articles": ["pair-5", "pair-6", "pair-7"],
@@ -440,7 +442,7 @@ def test_the_strip_of_names_is_searched_and_the_page_builds_the_command(many, tm
         "clip": ["inset(0px 0px 0px 50%)", "inset(0px 0px 0px 52%)"],
         "requests": 0,
     }
-    names = [name for name in words[words.index("--") + 1 :] if name != "z.exr"]  # which cannot be compared
+    names = [name for name in words[words.index("--") + 1 :] if name != "z.exr"]  # z.exr cannot be compared
     before, new = tree(many[0]), tree(many[1])
     assert len(names) == 7 and run("accept", "--yes", *words[2 : -len(names) - 1], *names)[0] == 0
     assert tree(many[0]) == before | {name: new[name] for name in names}

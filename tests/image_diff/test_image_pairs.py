@@ -1,7 +1,7 @@
-"""No method calls wrong images of hard structure equal in silence, and right ones are equal.
+"""No method calls changed pictures equal, and all call pictures equal that are the same to them.
 
-Every change is made to every picture; of pictures with other channels than colours to these alone. What a method does
-not see by design is left out in `sees`.
+Every change is made to every picture; in pictures with other channels than colours, to those channels only. `sees`
+excludes changes that a method does not detect by design.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mi_refract.image_diff.methods import compare
 
 SHAPE = (32, 48)
 TILE = 16
-NOISE = 0.005  # of a render: the standard deviation of a pixel over its mean
+NOISE = 0.005  # the standard deviation of a pixel of a render over its mean
 RENDERS = 4
 Y, X = np.indices(SHAPE)
 RAMP = np.dstack([0.1 + 0.8 * (X / 47) ** k for k in (1, 2, 3)])
@@ -27,21 +27,21 @@ HUES = np.array([1.0, 0.6, 0.3])
 
 @dataclass(frozen=True)
 class Picture:
-    """Pixels, H × W × C, and `changed`: the channels that a change is made to; all where it is empty."""
+    """Pixels, H × W × C; `changed`: the channels that a change is made to; empty: all."""
 
     pixels: np.ndarray
     channels: tuple[str, ...] = ("R", "G", "B")
     changed: tuple[str, ...] = ()
 
     @property
-    def at(self):
-        """The numbers of the channels that a change is made to."""
+    def changed_indices(self):
+        """The indices of the channels that a change is made to."""
         return [self.channels.index(name) for name in self.changed or self.channels]
 
     def with_change(self, change, rng):
-        """The same with a change; None where that leaves everything as it is."""
+        """The picture with a change; None if it changes nothing."""
         pixels = self.pixels.copy()
-        pixels[..., self.at] = change(pixels[..., self.at], rng)
+        pixels[..., self.changed_indices] = change(pixels[..., self.changed_indices], rng)
         return None if np.array_equal(pixels, self.pixels, equal_nan=True) else replace(self, pixels=pixels)
 
 
@@ -120,25 +120,25 @@ CHANGES = {
 }
 
 
-# What the documentation says that `flip` does not see: single pixels, most lines that move by a pixel, faint changes;
-# and of what is a few pixels wide, changes of less than two thirds of white.
+# Changes that `flip` does not detect by its documentation: single pixels, most lines that move by a pixel, faint
+# changes; and in structures a few pixels wide, changes of less than two thirds of white.
 FAINT = ("0.5 % brighter", "a dead pixel", "a firefly", "shifted by a pixel")
 SMALL, SEEN_OF_SMALL = ("one line", "border", "single pixels", "a lamp on black"), ("inverted", "gray instead of black")
 MOVES = ("shuffled", "shifted by a pixel", "mirrored")
 
 
 def sees(method, name, change, a, b):
-    """Whether the documentation says that a method sees the change of a picture, from pixels `a` to `b`."""
+    """Whether a method detects the change of a picture from pixels `a` to `b`, by its documentation."""
     if method == "flip":
         return change not in FAINT and (name not in SMALL or change in SEEN_OF_SMALL)
-    if method == "welch":  # light that moves between fewer than some 30 pixels
+    if method == "welch":  # it does not detect light that moves between fewer than some 30 pixels
         return name != "single pixels" or change not in MOVES
     beyond = np.abs(a - b) > np.maximum(0.004, 0.001 * (np.abs(a) + np.abs(b)) / 2)
     lost = np.abs(a - b).max(-1) > 0.5 * np.maximum(np.abs(a), np.abs(b)).max(-1)
     return method == "exact" or beyond.any() or lost.mean() > 0.1
 
 
-# The same to a method --------------------------------------------------------------------------------------------
+# Changes that methods ignore -------------------------------------------------------------------------------------
 
 
 def half_floats(x, rng):
@@ -173,21 +173,21 @@ CLOSE = {
 
 
 def renders(picture, rng):
-    """Independent ones, of noise in proportion to the light."""
+    """Independent renders, with noise in proportion to the light."""
     return [image(picture, picture.pixels * sample) for sample in _samples(picture, RENDERS, rng)]
 
 
-def film(picture, rng, claimed=1.0):
-    """The mean of samples, with their variance, or so many times as much."""
-    drawn = picture.pixels * _samples(picture, 16, rng)
+def film(picture, rng):
+    """The mean of samples, with their variance."""
+    samples = picture.pixels * _samples(picture, 16, rng)
     names = (*picture.channels, *(f"{name}.variance" for name in picture.channels))
-    return of(np.dstack([drawn.mean(0), claimed * drawn.var(0, ddof=1)]), names, metadata={"mi_refract:spp": 16})
+    return of(np.dstack([samples.mean(0), samples.var(0, ddof=1)]), names, metadata={"mi_refract:spp": 16})
 
 
 def plain(picture, rng):
-    """A film that does not know its noise."""
-    made = film(picture, rng)
-    return image(picture, made.pixels[..., : len(picture.channels)], metadata=made.metadata)
+    """The mean of samples, without their variance."""
+    mean = film(picture, rng)
+    return image(picture, mean.pixels[..., : len(picture.channels)], metadata=mean.metadata)
 
 
 def _samples(picture, count, rng):
@@ -198,7 +198,7 @@ def image(picture, pixels=None, **rest):
     return of(picture.pixels if pixels is None else pixels, picture.channels, **rest)
 
 
-KNOWN = {  # what is known of the noise of both sides
+KNOWN = {  # how the noise of both sides is known
     "renders": (renders, renders),
     "both variances": (film, film),
     "the reference's": (film, plain),
@@ -206,26 +206,26 @@ KNOWN = {  # what is known of the noise of both sides
 }
 
 
-# Wrong ones of other kinds ---------------------------------------------------------------------------------------
+# Pairs constructed to deceive ------------------------------------------------------------------------------------
 
 
 def beside(values, other, *names):
-    """Two images whose colours are the same, beside other channels."""
+    """Two images with the same colours and different other channels."""
     return tuple(image(beside_colours(x, *names)) for x in (values, other))
 
 
 def claimed(rng, reference, test, part, variance):
-    """Two films of a known mean, without noise where they are black, which claim a `variance` in a part."""
+    """Two films of given means, without noise where they are black, whose variance is `variance` in a part."""
     films = []
     for mean in (reference, test):
-        drawn = mean * (1 + 0.001 * rng.standard_normal(mean.shape))
-        known = np.where(part, variance, 1e-4 * (mean > 0))
-        films.append(of(np.dstack([drawn, known]), ("Y", "Y.variance"), metadata={"mi_refract:spp": 64}))
+        noisy = mean * (1 + 0.001 * rng.standard_normal(mean.shape))
+        variances = np.where(part, variance, 1e-4 * (mean > 0))
+        films.append(of(np.dstack([noisy, variances]), ("Y", "Y.variance"), metadata={"mi_refract:spp": 64}))
     return tuple(films)
 
 
 def lit(pixels=0):
-    """Gray on the left, black on the right but for so many pixels."""
+    """Gray on the left, black on the right except for so many pixels."""
     values = np.where(X < 32, 0.5, 0.0)
     values.flat[np.flatnonzero(X >= 32)[::25][:pixels]] = 1
     return values[..., None]
@@ -277,11 +277,11 @@ WRONG = {
 
 EQUAL, INCONCLUSIVE = Verdict.EQUAL, Verdict.INCONCLUSIVE
 METHODS = ("exact", "tolerance", "flip", "welch", "auto")
-# Black would pass there: all that is not the same is inconclusive.
+# Pairs where black would pass, so that pictures that are not identical are inconclusive.
 BLIND = {(method, "dim id") for method in ("tolerance", "auto", "flip")} | {("flip", "single pixels")}
-# Of a tile: of `welch` it is not due where the minimum detectable difference is larger.
+# Relative changes of a tile. `welch` need not detect them if its minimum detectable difference is larger.
 SLIGHT = {"0.5 % brighter": 0.005, "a dead pixel": 1 / 256}
-NOISY = ("normals", "1 × 1")  # of a mean near 0, or too few pixels: equal ones may be inconclusive
+NOISY = ("normals", "1 × 1")  # a mean near 0, or too few pixels: equal pairs may be inconclusive
 
 
 def seeded(*case):
@@ -289,7 +289,7 @@ def seeded(*case):
 
 
 def sides(method, name, known, a, b):
-    """Both as images; with noise of other seeds for `welch`."""
+    """Both pictures as images; for `welch` with noise of different seeds."""
     if method != "welch":
         return image(a), image(b)
     rng = seeded(name, known)
@@ -297,7 +297,7 @@ def sides(method, name, known, a, b):
 
 
 def wrong(method, seed=0):
-    """The changes that a method must see, each with both orders of the sides."""
+    """The changes that a method must detect, each with both orders of the sides."""
     kinds = [*KNOWN] if method == "welch" else [""]
     for name, picture in PICTURES.items():
         for i, (change, by) in enumerate(CHANGES.items()):
@@ -310,7 +310,7 @@ def wrong(method, seed=0):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_is_wrong_is_not_equal(method):
+def test_changed_pictures_are_not_equal(method):
     count, missed = 0, []
     for what, change, pair in wrong(method):
         count += 1
@@ -321,15 +321,15 @@ def test_what_is_wrong_is_not_equal(method):
 
 
 @pytest.mark.parametrize("what", WRONG)
-def test_what_was_made_to_deceive_is_not_equal(what):
-    among, make = WRONG[what]
-    for method in among:
+def test_pairs_constructed_to_deceive_are_not_equal(what):
+    deceived, make = WRONG[what]
+    for method in deceived:
         pair = make(seeded(what))
         assert all(compare(method, *pair).verdict is not EQUAL for pair in (pair, pair[::-1])), method
 
 
 def right(method, seed=0):
-    """Pairs that are the same to a method, with their options and the verdicts that they may have."""
+    """Pairs that are the same to a method, with options and the allowed verdicts."""
     for name, picture in PICTURES.items():
         if method == "welch":
             for known in KNOWN:
@@ -339,8 +339,8 @@ def right(method, seed=0):
         for change, by in (IDENTICAL if method == "exact" else CLOSE).items():
             pixels = by(picture.pixels.copy(), seeded(seed, name, change))
             nan = np.isnan(pixels).any()
-            turned = -1 if change.startswith("another order") else 1
-            other = of(pixels[..., ::turned], picture.channels[::turned])
+            step = -1 if change.startswith("another order") else 1
+            other = of(pixels[..., ::step], picture.channels[::step])
             same = np.array_equal(pixels, picture.pixels) or nan
             blind = (method, name) in BLIND and not same
             yield (
@@ -352,8 +352,8 @@ def right(method, seed=0):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_is_right_is_equal(method):
-    """A false alarm of `welch` has a probability of 0.1 % a pair."""
+def test_pairs_that_are_the_same_to_a_method_are_equal(method):
+    """A false alarm of `welch` has a probability of 0.1 % per pair."""
     results = [(what, compare(method, *pair, **how), allowed) for what, pair, how, allowed in right(method)]
     assert len(results) >= 40
     assert not [(what, result.reason) for what, result, allowed in results if result.verdict not in allowed]

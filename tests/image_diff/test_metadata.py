@@ -1,4 +1,4 @@
-"""What files say besides their numbers: the table of the page, cell by cell, in two files of the same codes."""
+"""Comparison of metadata: the documented table, cell by cell, with two files of the same codes."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ CODES = np.random.default_rng(1).integers(0, 256, (8, 8, 3), np.uint8)
 GRAY, FOUR = CODES[..., :1], np.dstack([CODES, CODES[..., :1]])
 IDS = np.full((8, 8, 1), 2**24, np.uint32)
 ICC = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-OTHER_ICC = ICC[:64] + b"\0\0\0\1" + ICC[68:]  # with another rendering intent
+OTHER_ICC = ICC[:64] + b"\0\0\0\1" + ICC[68:]  # another rendering intent
 WHITE, D65 = (0.3, 0.3), (0.3127, 0.329)
 ENDINGS = {"JPEG": "jpg", "TIFF": "tif"}
 
 
-# How they are written: the same codes, and what is said of them -------------------------------------------------------
+# Writing files with the same codes and different metadata -------------------------------------------------------------
 
 
 def exr(path, *parts):
     specs = []
-    for said in parts:
+    for attributes in parts:
         spec = oiio.ImageSpec(8, 8, 3, "float")
-        for name, value in said.items():
+        for name, value in attributes.items():
             if hasattr(spec, name):
                 setattr(spec, name, value)
             elif name != "add":
@@ -55,8 +55,8 @@ def exr(path, *parts):
 def png(path, *chunks):
     Pillow.fromarray(CODES).save(path)
     data = path.read_bytes()
-    more = [struct.pack(">I", len(x)) + kind + x + struct.pack(">I", zlib.crc32(kind + x)) for kind, x in chunks]
-    path.write_bytes(data[:33] + b"".join(more) + data[33:])
+    added = [struct.pack(">I", len(x)) + kind + x + struct.pack(">I", zlib.crc32(kind + x)) for kind, x in chunks]
+    path.write_bytes(data[:33] + b"".join(added) + data[33:])
 
 
 def tiff(path, tags, pixels=CODES):
@@ -87,12 +87,12 @@ def per_100000(*values):
 
 
 def exif(tag, value, inner=False):
-    said = Pillow.Exif()
-    (said.get_ifd(0x8769) if inner else said)[tag] = value
-    return said.tobytes()
+    tags = Pillow.Exif()
+    (tags.get_ifd(0x8769) if inner else tags)[tag] = value
+    return tags.tobytes()
 
 
-# By row and column of the table: a function, and its arguments for the two files.
+# By row and column of the table: a function, and its arguments for each of the two files.
 CASES = {
     ("transfer curve", "EXR"): (exr, [{}], [{"oiio:ColorSpace": "srgb_rec709_scene"}]),
     ("transfer curve", "PNG"): (png, [(b"sRGB", b"\0")], [(b"gAMA", per_100000(1))]),
@@ -159,23 +159,23 @@ CASES = {
 
 
 def table():
-    """What the page says of each cell."""
+    """The word of each cell of the documented table."""
     text = PAGE.partition("<!-- begin: metadata -->\n")[2].partition("<!-- end: metadata -->")[0]
     (_, *names), _, *rows = (line.strip("| ").split(" | ") for line in text.splitlines())
     return {(row, name): word for row, *words in rows for name, word in zip(names, words, strict=True) if word != "–"}
 
 
-def test_every_cell_of_the_table_is_tested_and_what_is_ignored_is_listed():
+def test_the_documented_table_is_tested_and_ignored_names_are_listed():
     assert table().keys() == CASES.keys()
     assert f"```\n{metadata.WITHOUT_MEANING.strip()}\n```" in PAGE
 
 
 @pytest.mark.parametrize(("row", "name"), CASES, ids=map(" ".join, CASES))
-def test_the_table_holds(tmp_path, row, name):
+def test_the_documented_table_is_right(tmp_path, row, name):
     write, *arguments = CASES[row, name]
     paths = [tmp_path / f"{side}.{ENDINGS.get(name, name.lower())}" for side in "ab"]
-    for path, given in zip(paths, arguments, strict=True):
-        write(path, **given) if isinstance(given, dict) else write(path, *given)
+    for path, of_side in zip(paths, arguments, strict=True):
+        write(path, **of_side) if isinstance(of_side, dict) else write(path, *of_side)
     word = table()[row, name]
     for method in ["exact"] if word == "in the numbers" else SINGLE:
         (result,) = folders.diff(*paths, Settings.for_all(method=method)).results
@@ -184,7 +184,7 @@ def test_the_table_holds(tmp_path, row, name):
 
 
 @pytest.mark.parametrize("icc", [b"A" * 200, ICC[:-1], ICC[:16] + b"GRAY" + ICC[20:]])
-def test_a_profile_that_openimageio_drops_counts(tmp_path, icc):
+def test_profiles_that_openimageio_drops_are_compared(tmp_path, icc):
     chunk = b"iCCP", b"a\0\0" + zlib.compress(icc)
     for name, chunks, status in (("b.png", [], "different"), ("c.png", [chunk], "equal")):
         png(tmp_path / "a.png", chunk)
@@ -192,7 +192,7 @@ def test_a_profile_that_openimageio_drops_counts(tmp_path, icc):
         assert folders.diff(tmp_path / "a.png", tmp_path / name).results[0].status == status
 
 
-def test_what_a_user_ignores_does_not_count_and_the_rest_is_named(tmp_path):
+def test_ignored_metadata_are_not_compared_and_the_others_are_named(tmp_path):
     paths = [tmp_path / "a.exr", tmp_path / "b.exr"]
     for path, view in zip(paths, ("left", "right"), strict=True):
         exr(path, {"view": view, "a:c": view, "a:b": view, "chromaticities": (0.7, 0.3, 0.2, 0.7, 0.1, 0.05, *D65)})
@@ -206,8 +206,8 @@ def test_what_a_user_ignores_does_not_count_and_the_rest_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("ending", ["bmp", "jpg", "ppm", "sgi", "tga", "tif", "webp"])
-def test_what_a_format_says_in_other_words_is_no_difference(tmp_path, ending):
-    """Of the same codes, beside a PNG file."""
+def test_equal_images_of_different_formats_are_equal(tmp_path, ending):
+    """The same codes as in a PNG file."""
     paths = [tmp_path / "a.png", tmp_path / f"b.{ending}"]
     for path in paths:
         spec = oiio.ImageSpec(8, 8, 3, "uint8")
@@ -218,7 +218,7 @@ def test_what_a_format_says_in_other_words_is_no_difference(tmp_path, ending):
 
 
 SRGB = (*D65, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06)
-SAME = {  # as nothing, or as the first of two
+SAME = {  # metadata equivalent to none, or two equivalent ones
     "ImageMagick.png": (png, [(b"gAMA", per_100000(1 / 2.2)), (b"cHRM", per_100000(*SRGB))]),
     "CICP.png": (png, [(b"cICP", bytes([1, 13, 0, 1]))]),
     "texts.png": (png, [(b"tEXt", b"generated_by\0Mitsuba"), (b"zTXt", b"date:create\0\0" + zlib.compress(b"now"))]),
@@ -238,13 +238,13 @@ SAME = {  # as nothing, or as the first of two
 
 
 @pytest.mark.parametrize("name", SAME)
-def test_what_programs_say_of_usual_images_is_no_difference(tmp_path, name):
-    write, *said = SAME[name]
-    if len(said) == 1:
-        said.insert(0, [{}] if write in (exr, tiff) else [])
+def test_usual_metadata_of_programs_are_no_difference(tmp_path, name):
+    write, *arguments = SAME[name]
+    if len(arguments) == 1:
+        arguments.insert(0, [{}] if write in (exr, tiff) else [])
     paths = [tmp_path / f"{side}{name}" for side in "ab"]
-    for path, given in zip(paths, said, strict=True):
-        write(path, **given) if isinstance(given, dict) else write(path, *given)
+    for path, of_side in zip(paths, arguments, strict=True):
+        write(path, **of_side) if isinstance(of_side, dict) else write(path, *of_side)
     (result,) = folders.diff(*paths, Settings.for_all(method="exact")).results
     assert result.status == "equal", result.reason
 
@@ -254,7 +254,7 @@ READ_AS = {"A": "a missing alpha is read as 1", "Y": "gray is read as R = G = B"
 
 @pytest.mark.parametrize("method", ["auto", *SINGLE])
 @pytest.mark.parametrize(
-    ("one", "two", "said"),
+    ("one", "two", "assumed"),
     [
         ("RGB", "RGBA", "A"),
         ("L", "LA", "A"),
@@ -264,15 +264,15 @@ READ_AS = {"A": "a missing alpha is read as 1", "Y": "gray is read as R = G = B"
         ("P", "L", "Y"),
     ],
 )
-def test_files_of_the_same_pixels_are_equal_however_they_are_encoded(tmp_path, method, one, two, said):
+def test_gray_alpha_and_palette_files_of_the_same_pixels_are_equal(tmp_path, method, one, two, assumed):
     gray = Pillow.fromarray(GRAY[..., 0])
     for path, mode in ((tmp_path / "a.png", one), (tmp_path / "b.png", two)):
         (gray if "L" in one + two else Pillow.fromarray(CODES)).convert(mode).save(path)
     for sides in (("a.png", "b.png"), ("b.png", "a.png")):
         (result,) = folders.diff(*(tmp_path / name for name in sides), Settings.for_all(method=method)).results
         assert result.status == "equal", result.reason
-        assert result.reason.endswith("; ".join(["", *(READ_AS[name] for name in said)]))
-    for channel in (0, -1):  # another colour; a hole, where there is an alpha
+        assert result.reason.endswith("; ".join(["", *(READ_AS[name] for name in assumed)]))
+    for channel in (0, -1):  # another colour; with an alpha a hole
         pixels = np.asarray(Pillow.open(tmp_path / "b.png")).copy().reshape(8, 8, -1)
         pixels[:6, :6, channel] ^= 128
         Pillow.fromarray(pixels.squeeze()).save(tmp_path / "c.png")
@@ -280,8 +280,8 @@ def test_files_of_the_same_pixels_are_equal_however_they_are_encoded(tmp_path, m
         assert result.status in ("different", "error") and "read as" not in result.reason
 
 
-def test_ratios_of_pixels_are_the_same_to_the_digits_that_files_hold(tmp_path):
-    """4/3 with three decimals, and as whole pixels per metre; 12/11 and 59/54 of video are two."""
+def test_pixel_aspect_ratios_are_equal_within_rounding(tmp_path):
+    """4/3 with three decimals, and as whole pixels per metre; 12/11 and 59/54 of video are different."""
     metre = tmp_path / "metre.png"
     png(metre, (b"pHYs", struct.pack(">IIB", 2835, 3780, 1)))
     images = {0: image_file.read(metre)}

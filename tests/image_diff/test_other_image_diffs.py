@@ -1,4 +1,4 @@
-"""The page for users of other image diffs: its settings give the verdicts of these programs, image by image."""
+"""The documented settings for users of other image diffs give the verdicts of these programs for each image."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ WINDOW = (np.s_[30:60], np.s_[40:70])
 
 
 def changed(pixels, where=np.s_[:, :]):
-    """The plain image with other pixels in a window, as codes of 8 bits."""
+    """The plain image with other pixels in a window, as 8-bit codes."""
     image = PLAIN.copy()
     image[where] = np.clip(np.broadcast_to(pixels, PLAIN.shape)[where], 0, 255)
     return image
@@ -52,7 +52,7 @@ CASES = {
     "black": PLAIN * 0,
 }
 
-# What each program asks for, from its documentation -------------------------------------------------------------------
+# Criteria of the programs, from their documentation -------------------------------------------------------------------
 
 YIQ = np.array(
     [[0.29889531, 0.58662247, 0.11448223], [0.59597799, -0.2741761, -0.32180189], [0.21147017, -0.52261711, 0.31114694]]
@@ -60,29 +60,28 @@ YIQ = np.array(
 
 
 def yiq(a, b):
-    """The metric of pixelmatch up to version 7 and of odiff, of codes; 35215 is its largest value."""
+    """The metric of pixelmatch up to version 7 and of odiff, for codes; 35215 is its largest value."""
     return (np.square((a - b) @ YIQ.T) * (0.5053, 0.299, 0.1957)).sum(-1)
 
 
 def beyond(a, b, threshold):
-    """How many pixels pixelmatch counts, with `includeAA`."""
+    """The number of pixels that pixelmatch counts, with `includeAA`."""
     return int((yiq(a, b) > 35215 * threshold**2).sum())
 
 
 def idiff(a, b):
-    """The exit code of `idiff -fail 0.004 -failpercent 1 -hardfail 0.5`, but for warnings."""
+    """Whether `idiff -fail 0.004 -failpercent 1 -hardfail 0.5` passes, possibly with warnings."""
     one, two = (oiio.ImageBuf((x / 255).astype(np.float32)) for x in (a, b))
-    found = oiio.ImageBufAlgo.compare(one, two, 0.004, 0.0)
-    return found.nfail == 0 or (found.nfail <= 0.01 * a[..., 0].size and found.maxerror <= 0.5)
+    counts = oiio.ImageBufAlgo.compare(one, two, 0.004, 0.0)
+    return counts.nfail == 0 or (counts.nfail <= 0.01 * a[..., 0].size and counts.maxerror <= 0.5)
 
 
 def flip(a, b):
-    """The mean of FLIP's error map, by OpenImageIO."""
+    """Whether the mean of FLIP's error map, by OpenImageIO, is at most 0.02."""
     codes = [x / 255 for x in (a, b)]
-    light = [np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32) for x in codes]
-    return (
-        oiio.ImageBufAlgo.FLIP_diff(*map(oiio.ImageBuf, light), 0, 2.0, 0.18, 67.02).get_pixels()[..., 0].mean() <= 0.02
-    )
+    linear = [np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32) for x in codes]
+    error = oiio.ImageBufAlgo.FLIP_diff(*map(oiio.ImageBuf, linear), 0, 2.0, 0.18, 67.02).get_pixels()
+    return error[..., 0].mean() <= 0.02
 
 
 PROGRAMS = {
@@ -95,12 +94,12 @@ PROGRAMS = {
 
 
 def sections():
-    """The text of each section of the page by its title, and the commands in it."""
-    parts = [part.partition("\n") for part in PAGE.read_text("utf-8").split("\n## ")[1:]]
-    return {
-        title: (text, re.findall("^mi-refract diff references/ new/ (.+)$", text, re.MULTILINE))
-        for title, _, text in parts
-    }
+    """The text of each section of the page, and the commands in it, by its title."""
+    by_title = {}
+    for section in PAGE.read_text("utf-8").split("\n## ")[1:]:
+        title, _, text = section.partition("\n")
+        by_title[title] = text, re.findall("^mi-refract diff references/ new/ (.+)$", text, re.MULTILINE)
+    return by_title
 
 
 @pytest.fixture(scope="module")
@@ -121,28 +120,27 @@ def folders(tmp_path_factory):
 # Verdicts -------------------------------------------------------------------------------------------------------------
 
 
-def test_the_page_has_the_programs_that_are_tested():
+def test_the_documentation_has_the_tested_programs():
     assert {title: len(commands) for title, (_, commands) in sections().items()} == {
         title: len(criteria) for title, criteria in PROGRAMS.items()
     }
 
 
 @pytest.mark.parametrize(
-    ("program", "number"), [(name, i) for name, each in PROGRAMS.items() for i in range(len(each))]
+    ("program", "number"), [(name, i) for name, criteria in PROGRAMS.items() for i in range(len(criteria))]
 )
-def test_the_settings_of_the_page_give_the_verdict_of_the_program(run, folders, tmp_path, program, number):
+def test_documented_settings_give_the_verdicts_of_the_programs(run, folders, tmp_path, program, number):
     words = sections()[program][1][number].split()
     assert run("diff", *folders, *words, "--json", tmp_path / "out.json")[::2] == (1, "")
-    found = {
-        Path(each["name"]).stem: each["status"] for each in json.loads((tmp_path / "out.json").read_text())["results"]
-    }
+    results = json.loads((tmp_path / "out.json").read_text())["results"]
+    statuses = {Path(result["name"]).stem: result["status"] for result in results}
     passes = {name: PROGRAMS[program][number](PLAIN, pixels.clip(0, 255)) for name, pixels in CASES.items()}
-    assert found == {name: "equal" if equal else "different" for name, equal in passes.items()}
-    assert {"equal", "different"} == {*found.values()}
+    assert statuses == {name: "equal" if equal else "different" for name, equal in passes.items()}
+    assert {"equal", "different"} == {*statuses.values()}
 
 
-def test_tolerance_counts_every_pixel_that_pixelmatch_counts_from_the_limits_of_the_page_on():
-    """`fail` is the threshold: no pixel that pixelmatch counts is within it."""
+def test_tolerance_counts_every_pixel_that_pixelmatch_counts():
+    """With the same threshold as `fail`, no pixel that pixelmatch counts is within it; and the documented limits."""
     rng = np.random.default_rng(4)
     pairs = rng.integers(0, 256, (2, 200_000, 3))
     near = np.clip(pairs[0] + rng.integers(-160, 161, pairs[0].shape), 0, 255)
@@ -161,11 +159,11 @@ def test_tolerance_counts_every_pixel_that_pixelmatch_counts_from_the_limits_of_
 @pytest.mark.parametrize(
     ("option", "name"), [("mean", "mean FLIP error"), ("percentile_99", "99th percentile of the FLIP")]
 )
-def test_a_bound_of_flip_that_fails_is_named_first(option, name):
+def test_an_exceeded_bound_of_flip_is_named_first(option, name):
     one, two = (
         Image(Path("a.png"), x.astype(np.float32) / 255, tuple("RGB"), stored="uint8") for x in (PLAIN, PLAIN + 60)
     )
-    found = methods.compare("flip", one, two, local=9.0, patch=9.0, one_way=900.0, **{option: 0.1})
-    assert found.verdict is Verdict.DIFFERENT and found.reason.startswith(name)
-    assert f" > {option} = 0.1; local FLIP error" in found.reason
+    result = methods.compare("flip", one, two, local=9.0, patch=9.0, one_way=900.0, **{option: 0.1})
+    assert result.verdict is Verdict.DIFFERENT and result.reason.startswith(name)
+    assert f" > {option} = 0.1; local FLIP error" in result.reason
     assert methods.compare("flip", one, two, local=9.0, patch=9.0, one_way=900.0, **{option: 0.9}).is_equal

@@ -1,4 +1,4 @@
-"""The self-test plants what its defects are called, and fails where a method is blind or alarms at everything."""
+"""The self-test plants the named defects, and fails if a method detects nothing or always alarms."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ PADDED = np.pad(RAW, ((1, 1), (1, 1), (0, 0)), mode="edge")
 
 
 def renders(count, seed=1, spread=0.02):
-    """Independent noisy renders of one image, of a skewed distribution."""
+    """Independent renders of one image, with noise of a skewed distribution."""
     shape = spread**-2
     return IMAGE * np.random.default_rng(seed).gamma(shape, 1 / shape, (count, *IMAGE.shape))
 
@@ -51,16 +51,16 @@ EXPECTED = {
 
 
 @pytest.mark.parametrize("name", EXPECTED)
-def test_a_defect_is_what_it_is_called(name):
+def test_defects_are_planted_as_named(name):
     clean = np.stack([RAW, RAW + 1, RAW + 2])
     spoilt = DEFECTS[name].spoil(clean)
     np.testing.assert_allclose(spoilt[0], EXPECTED[name], rtol=1e-5, atol=1e-7)
-    once = name in ("NaN", "Inf", "wrong size")  # every method must see these, in one of several renders
+    once = name in ("NaN", "Inf", "wrong size")  # planted in one of the renders; every method must see these
     assert (DEFECTS[name].always_due, np.array_equal(spoilt[2], clean[2])) == (once, once)
     np.testing.assert_array_equal(clean[0], RAW)
 
 
-def test_8_bits_are_256_values_up_to_white_and_half_a_file_is_none():
+def test_8_bits_have_256_values_and_truncated_files_are_errors():
     codes = 255 * srgb_encode(DEFECTS["8 bits"].plant(RAW))
     np.testing.assert_allclose(codes, np.rint(codes), atol=2e-4)
     assert (np.abs(codes - 255 * srgb_encode(np.minimum(RAW, 1))) <= 0.501).all()
@@ -71,15 +71,15 @@ def test_8_bits_are_256_values_up_to_white_and_half_a_file_is_none():
         DEFECTS["truncated"].spoil(RAW[None])
 
 
-# What is seen ------------------------------------------------------------------------------------------------------
+# Detection ---------------------------------------------------------------------------------------------------------
 
 
-def test_what_is_due_is_seen_and_equal_pairs_alarm_nowhere():
+def test_due_defects_are_seen_and_equal_pairs_cause_no_alarm():
     rows = examined(renders(12), trials=4, null_pairs=40)
     assert not failed(rows)
     for name, defect in DEFECTS.items():
         values = rows[name].values
-        if name == "truncated":  # no method is asked of what cannot be read
+        if name == "truncated":  # no method is applied to unreadable files
             assert values == {self_test.UNREADABLE: 1, "missed": 0} and rows[name].reason == "not read"
         elif defect.always_due:
             assert rows[name].replay["due"] == list(methods.METHODS)
@@ -88,7 +88,7 @@ def test_what_is_due_is_seen_and_equal_pairs_alarm_nowhere():
             assert values["exact"] == 1
     gain = rows["gain"].values
     assert gain["size"] == pytest.approx(0.01, rel=1e-3) and gain["welch"] == 1
-    assert gain[self_test.RATIO] > 1  # 0.02/√(256 × 6) a tile: due
+    assert gain[self_test.RATIO] > 1  # the noise of a tile is 0.02/√(256 × 6), so the defect is due
     assert rows["renders"].values["noise"] == pytest.approx(0.02, rel=0.1)
     nulls = [rows[f"null pairs, {method}"] for method in methods.METHODS]
     assert {row.values["false alarms"] for row in nulls} == {0}
@@ -96,10 +96,10 @@ def test_what_is_due_is_seen_and_equal_pairs_alarm_nowhere():
     assert {row.subject for row in nulls if row.reason == self_test.IDENTICAL} == {"null pairs, exact"}
 
 
-def test_a_defect_is_as_large_as_in_the_tile_where_it_stands_out():
+def test_the_size_of_a_defect_is_that_in_the_tile_where_it_is_most_detectable():
     """Three tiles with noise, one without light, one without noise. The median noise is 0.2 of the mean."""
     mean = np.array([[[1.0], [2.0], [4.0], [0.0], [1.0]]])
-    spread = np.array([[[0.1], [0.4], [3.2], [0.5], [0.0]]])  # of two values: their deviation is √2 of it
+    spread = np.array([[[0.1], [0.4], [3.2], [0.5], [0.0]]])  # the standard deviation of the two values of `clean`
     clean = np.stack([mean + spread / np.sqrt(2), mean - spread / np.sqrt(2)])
     changes = np.array([[[-0.05], [0.1], [0.72], [9.0], [9.0]]])
     tally = self_test.Tally(detectable=[0.01, 0.02, 0.04])
@@ -109,26 +109,26 @@ def test_a_defect_is_as_large_as_in_the_tile_where_it_stands_out():
     assert sizes[self_test.RATIO] == pytest.approx(0.05 / 0.02)
     louder = self_test.sizes((changes * [[[1], [1], [2], [1], [1]]])[None], clean, {"welch": tally})
     assert (louder["size"], louder[self_test.RATIO]) == pytest.approx((0.36, 0.36 / (0.02 * 4)))
-    for pixels, known in ((clean[:1], tally), (clean, self_test.Tally()), (np.stack([mean, mean]), tally)):
-        assert self_test.sizes(changes[None], pixels, {"welch": known}) == {}
-    lit = np.array([[[2.0], [2.0], [0.0], [0.0]]])  # the noise is that of the lit pixels
+    for pixels, of_welch in ((clean[:1], tally), (clean, self_test.Tally()), (np.stack([mean, mean]), tally)):
+        assert self_test.sizes(changes[None], pixels, {"welch": of_welch}) == {}
+    lit = np.array([[[2.0], [2.0], [0.0], [0.0]]])  # `noise` is that of the lit pixels
     assert self_test.noise(np.stack([lit * 0.9, lit * 1.1])) == pytest.approx(0.2 * np.sqrt(2) / 2)
     assert self_test.noise(np.zeros((3, 2, 2, 3))) == 0
 
 
-def test_renders_are_read_in_one_order_of_channels(tmp_path):
+def test_renders_are_read_with_the_same_order_of_channels(tmp_path):
     pixels = renders(2).astype(np.float32)
     image_file.write_exr(tmp_path / "0.exr", pixels[0], ("R", "G", "B"))
     image_file.write_exr(tmp_path / "1.exr", pixels[1][..., [2, 0, 1]], ("B", "R", "G"))
     images = self_test.read_images(tmp_path)
     assert images.shape == pixels.shape
-    for image in pixels:  # of all renders one is this, in the order of either file
+    for image in pixels:  # one of the renders is equal, in the order of either file
         assert any(np.array_equal(x[..., order], image) for x in images for order in ([0, 1, 2], [1, 2, 0]))
     assert np.ptp(images.mean((1, 2)), axis=0).max() < 1e-3  # channels differ by 9e-3, renders by a few 1e-4
 
 
-def test_single_images_are_equal_but_for_their_last_bits(monkeypatch):
-    """A method that calls every changed bit a difference alarms; the same image twice would not show it."""
+def test_null_pairs_of_single_images_differ_in_their_last_bits(monkeypatch):
+    """So that a method that calls every changed bit a difference fails; with identical images it would not."""
     pixels = IMAGE.astype(np.float32)
     moved = self_test.last_bits(pixels, np.random.default_rng(1))
     steps = np.abs(moved.view(np.int32) - pixels.view(np.int32))
@@ -140,8 +140,8 @@ def test_single_images_are_equal_but_for_their_last_bits(monkeypatch):
 
 
 @pytest.mark.parametrize("method", methods.METHODS)
-def test_a_blind_method_fails(method, monkeypatch):
-    """It says of everything, NaN and other sizes included, that it is equal, and that it would have seen 1e-4."""
+def test_a_method_that_always_says_equal_fails(method, monkeypatch):
+    """It calls all images equal, even with NaN or other sizes, and reports a minimum detectable difference of 1e-4."""
     real = methods.compare
     blind = Comparison(method, Verdict.EQUAL, "", minimum_detectable=1e-4)
     monkeypatch.setattr(methods, "compare", lambda m, *sides: blind if m == method else real(m, *sides))
@@ -152,7 +152,7 @@ def test_a_blind_method_fails(method, monkeypatch):
     assert rows["NaN"].values["missed"] == 2
 
 
-def test_a_method_that_always_alarms_fails_and_so_does_one_that_is_never_sure(monkeypatch):
+def test_methods_that_always_say_different_or_inconclusive_fail(monkeypatch):
     monkeypatch.setattr(methods, "compare", lambda m, *sides: Comparison(m, Verdict.DIFFERENT, ""))
     assert failed(examined(renders(8), trials=1, null_pairs=5)) == {f"null pairs, {m}" for m in methods.METHODS}
     monkeypatch.setattr(methods, "compare", lambda m, *sides: Comparison(m, Verdict.INCONCLUSIVE, ""))
@@ -162,30 +162,30 @@ def test_a_method_that_always_alarms_fails_and_so_does_one_that_is_never_sure(mo
 
 
 @pytest.mark.parametrize(("alarms", "pairs"), [(0, 640), (2, 640), (3, 640), (10, 10)])
-def test_the_bound_is_where_so_few_alarms_have_the_probability_left(alarms, pairs):
+def test_the_bound_of_the_rate_is_the_exact_binomial_one(alarms, pairs):
     bound = self_test.Tally(seen=alarms, trials=pairs).bound
-    left = stats.binom.cdf(alarms, pairs, bound)
-    assert left == pytest.approx(1 if alarms == pairs else 1 - self_test.CONFIDENCE)
+    probability = stats.binom.cdf(alarms, pairs, bound)
+    assert probability == pytest.approx(1 if alarms == pairs else 1 - self_test.CONFIDENCE)
     assert (bound <= self_test.FALSE_ALARMS) == (alarms <= 2)
 
 
-def test_what_is_left_out():
-    """A defect that changes nothing, files that cannot be read, `welch` of fewer than two renders a side."""
+def test_rows_and_methods_that_are_left_out():
+    """A defect that changes nothing, files that cannot be read, and `welch` with fewer than two renders a side."""
     grey = np.repeat(renders(4)[:, :16, :16, :1], 3, axis=3)
-    four, three = (examined(some, trials=1, null_pairs=2) for some in (grey, grey[:3]))
+    four, three = (examined(pixels, trials=1, null_pairs=2) for pixels in (grey, grey[:3]))
     assert four["swapped channels"].verdict == "not run" and "changes nothing" in four["swapped channels"].reason
     assert four["null pairs, welch"].values["null pairs"] == 2 and "noise" in four["renders"].values
     assert "null pairs, welch" not in three and three["renders"].verdict == "not run"
-    # Of three images there are no more trials than three, however many are wanted.
+    # With three images there are at most three trials.
     assert examined(grey[:3])["gain"].replay["trials"] == 3
     several = {name for name, method in methods.METHODS.items() if method.takes_renders}
 
-    def unread():
+    def unreadable():
         raise ValueError("truncated")
 
-    for count, asked in ((2, methods.METHODS.keys()), (1, methods.METHODS.keys() - several)):
+    for count, applied in ((2, methods.METHODS.keys()), (1, methods.METHODS.keys() - several)):
         clean, other = renders(count), renders(count, seed=2)
-        trials = [self_test.Trial(clean, other, plant) for plant in (lambda clean=clean: 2 * clean, unread)]
+        trials = [self_test.Trial(clean, other, plant) for plant in (lambda clean=clean: 2 * clean, unreadable)]
         row = self_test.detection("gain", True, trials, "", "")
-        assert methods.METHODS.keys() & row.values.keys() == asked
+        assert methods.METHODS.keys() & row.values.keys() == applied
         assert row.values["exact"] == 1 and row.values["missed"] == 0

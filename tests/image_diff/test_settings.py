@@ -1,4 +1,4 @@
-"""Settings: layers of defaults, command line and entries; platforms; the file, its keys, and options in words."""
+"""Settings: layers of defaults, command line and entries; platforms; the keys of the file; the command line."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import tomllib
 
 import numpy as np
 import pytest
-from support.diff_images import found, image
+from support.diff_images import image, outcomes
 from support.processes import assert_refused
 from support.readme import DOCS, blocks
 
@@ -38,7 +38,7 @@ reason = "more glass"
 
 @pytest.fixture
 def load(tmp_path):
-    """`load(text, *words, method=…)`: the settings of a file and of these words of the command line."""
+    """`load(text, *words, method=…)`: the settings of a file with this text, and of words of the command line."""
 
     def read(text, *words, method="auto"):
         path = tmp_path / "rules.toml"
@@ -51,7 +51,7 @@ def load(tmp_path):
 # Layers -----------------------------------------------------------------------------------------------------------
 
 
-def test_later_entries_replace_what_they_set(load):
+def test_later_entries_replace_the_keys_that_they_set(load):
     chosen = load(RULES)
     options = {"fail": 0.2, "fail_relative": 0.0}
     both = ComparisonSpec("tolerance", options, "glass; more glass", entries=("image[0]", "image[1]"))
@@ -77,13 +77,13 @@ LAYERS = [
 
 
 @pytest.mark.parametrize(("text", "words", "method", "expected"), LAYERS)
-def test_defaults_come_before_the_command_line_and_that_before_entries(load, text, words, method, expected):
+def test_entries_override_the_command_line_which_overrides_defaults(load, text, words, method, expected):
     spec = load(text, *words, method=method).of("a")
     assert spec.error == ""
     assert {key: getattr(spec, key) for key in expected} == expected
 
 
-def test_options_without_a_method_are_those_that_auto_may_use(load):
+def test_options_without_a_method_are_those_of_the_methods_of_auto(load):
     chosen = load(A + "fail = 0.3\nspp = 4").of("a")
     assert (chosen.method, chosen.options) == ("auto", {"fail": 0.3, "spp": 4})
     one = image_file.named("one", np.ones((4, 4, 3)))
@@ -96,7 +96,7 @@ def test_options_without_a_method_are_those_that_auto_may_use(load):
     ("when", "here"),
     [("linux", True), ("macos", False), ("linux x86_64", True), ("linux arm64", False), (["macos", "linux"], True)],
 )
-def test_entries_for_platforms(load, monkeypatch, when, here):
+def test_entries_apply_to_their_platforms_only(load, monkeypatch, when, here):
     assert settings.this_platform() & set(settings.WORDS)
     monkeypatch.setattr(settings, "this_platform", lambda: frozenset({"linux", "x86_64"}))
     chosen = load(f"{A}when = {when!r}\nfail = 1".replace("'", '"'))
@@ -104,10 +104,10 @@ def test_entries_for_platforms(load, monkeypatch, when, here):
     assert chosen.unused(["b"]) == (["a"] if here else [])
 
 
-# What is compared by them -----------------------------------------------------------------------------------------
+# Comparisons with settings ----------------------------------------------------------------------------------------
 
 
-def test_what_is_set_is_what_is_compared_by(folders, load):
+def test_comparisons_use_the_settings(folders, load):
     for side in folders:
         image(side / "nan.exr", value=np.nan)
         image(side / "nan2.exr", value=np.nan)
@@ -118,15 +118,15 @@ def test_what_is_set_is_what_is_compared_by(folders, load):
     assert by_name["inner/changed.exr"].how.reason == "glass; more glass"
     stale = load(RULES.replace("fail = 0.2", "fail = 0.05") + '[[image]]\nname = "gone.exr"\nreason = "was noisy"\n')
     results = diff.diff(*folders, stale)
-    assert found(results)["inner/changed.exr"][0] == "different" and results.unused == ("gone.exr",)
+    assert outcomes(results)["inner/changed.exr"][0] == "different" and results.unused == ("gone.exr",)
     results = diff.diff(*folders, Settings.for_all(method="tolerance", fail=-1.0))  # out of its range
-    assert found(results)["same.exr"][0] == found(results)["inner/changed.exr"][0] == "error"
+    assert outcomes(results)["same.exr"][0] == outcomes(results)["inner/changed.exr"][0] == "error"
 
 
-def test_skipped_images_and_wrong_entries_that_match_nothing_are_reported(folders):
+def test_skipped_images_and_invalid_entries_without_images_are_reported(folders):
     rules = tuple(Entry(name, {"skip": True, "reason": "moved"}) for name in ("added.exr", "removed.exr", "inner/*"))
     results = diff.diff(*folders, Settings(rules))
-    assert found(results)["added.exr"] == ("skipped", "unknown")
+    assert outcomes(results)["added.exr"] == ("skipped", "unknown")
     assert (results.exit_code, len(results.of(Status.SKIPPED))) == (0, 3)
     assert diff.diff(*folders, Settings.for_all(skip=True)).exit_code == 2
     results = diff.diff(*folders, Settings((Entry("gone", {}, error="rules.toml: image[0]: unknown key"),)))
@@ -138,7 +138,7 @@ def test_skipped_images_and_wrong_entries_that_match_nothing_are_reported(folder
 # The file ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_pages_name_every_method_and_their_settings_are_accepted(load):
+def test_the_documentation_lists_all_methods_and_its_settings_are_valid(load):
     text = (DOCS / "how-to/compare-images.md").read_text("utf-8")
     assert all(f"| `{name}` |" in text for name in methods.METHODS)
     text = (DOCS / "how-to/coming-from-other-image-diffs.md").read_text("utf-8")
@@ -150,7 +150,7 @@ def test_the_pages_name_every_method_and_their_settings_are_accepted(load):
     assert examples[0].of("glass/caustic1.exr").method == "tolerance"
 
 
-def test_every_option_of_every_method_is_a_key_and_a_word(load):
+def test_all_options_can_be_set_in_the_file_and_on_the_command_line(load):
     for name, method in methods.METHODS.items():
         table = {option: value.default for option, value in method.options.items()}
         lines = "".join(f"{key} = {value!r}\n".replace("'", '"') for key, value in table.items())
@@ -183,7 +183,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("text", "message"), BAD.values(), ids=BAD)
-def test_bad_settings(tmp_path, text, message):
+def test_invalid_settings_are_errors_with_the_file_and_key(tmp_path, text, message):
     path = tmp_path / "rules.toml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ValueError, match=r"^[^\n]*rules\.toml: ") as error:
@@ -200,7 +200,7 @@ NO_FILES = {
 
 
 @pytest.mark.parametrize(("make", "message"), NO_FILES.values(), ids=NO_FILES)
-def test_settings_that_cannot_be_read_are_one_line(run, pair, make, message):
+def test_unreadable_settings_are_errors_in_one_line(run, pair, make, message):
     make(pair[0] / "mi-refract.toml")
     assert_refused(run("diff", *pair), message, "mi-refract.toml: ")
 
@@ -226,14 +226,14 @@ BAD_ENTRIES = {
 
 
 @pytest.mark.parametrize(("text", "message"), BAD_ENTRIES.values(), ids=BAD_ENTRIES)
-def test_an_entry_that_is_wrong_is_the_error_of_its_images(load, text, message):
+def test_an_invalid_entry_is_an_error_of_its_images_only(load, text, message):
     chosen = load(text + "\n" + B)
     assert message in re.sub(r"ignore\[\d\]", "ignore[...]", chosen.of("a").error)
     assert "\n" not in chosen.of("a").error
     assert chosen.of("b").error == "" and chosen.of("b").method == "exact"
 
 
-# Words ------------------------------------------------------------------------------------------------------------
+# The command line -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -248,7 +248,7 @@ def test_an_entry_that_is_wrong_is_the_error_of_its_images(load, text, message):
         ("auto", ["allow_nonfinite=true", "ignore=[[0, 0, 2, 2]]"], {"allow_nonfinite": True}),
     ],
 )
-def test_settings_in_words(method, words, values):
+def test_settings_on_the_command_line(method, words, values):
     layer = from_words(method, words)
     assert {key: layer.values[key] for key in values} == values
 
@@ -270,7 +270,7 @@ def test_settings_in_words(method, words, values):
         ("flip", ["method=exact"], "--set method=exact with --method; expected one of them"),
     ],
 )
-def test_bad_settings_in_words(method, words, message):
+def test_invalid_settings_on_the_command_line_are_errors(method, words, message):
     with pytest.raises(ValueError) as error:
         from_words(method, words)
     assert str(error.value).startswith(message)

@@ -1,4 +1,4 @@
-"""Comparing images without Mitsuba: all commands and fixtures, with its import refused, and in a fresh environment."""
+"""Comparison of images without Mitsuba: all commands and fixtures, with imports blocked and in a new environment."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from support.processes import ENVIRONMENT, ROOT
 LIST = ROOT / ".github" / "actions" / "diff" / "requirements.txt"
 ABSENT = ("mitsuba", "drjit", "matplotlib")
 INSTALL = "MI_REFRACT_INSTALL"
-MOST = 300e6  # bytes
+MOST = 300e6  # bytes of the environment
 
-# Imports every module of the room; its arguments are what it may not import.
+# Uses every module of the package; its arguments are the modules that it may not import.
 PROGRAM = """
 import pkgutil, sys
 
@@ -53,8 +53,8 @@ for words, code in CALLS.items():
     assert main(words.split()) == code, words
 code = pytest.main(["-q", "-p", "no:cacheprovider", "--rootdir=.", "--mi-refract-report=tests.html", "test_images.py"])
 assert code == 0, code
-room = {f"mi_refract.image_diff.{each.name}" for each in pkgutil.iter_modules(mi_refract.image_diff.__path__)}
-assert not room - set(sys.modules), room - set(sys.modules)
+modules = {f"mi_refract.image_diff.{module.name}" for module in pkgutil.iter_modules(mi_refract.image_diff.__path__)}
+assert not modules - set(sys.modules), modules - set(sys.modules)
 assert not set(ABSENT) & set(sys.modules)
 """
 TESTS = """
@@ -74,7 +74,7 @@ def test_images(assert_image_equal, assert_image_unbiased):
 
 @pytest.fixture
 def project(pair, tmp_path):
-    """A folder with all that PROGRAM compares."""
+    """A folder with the images that PROGRAM compares."""
     for name, gain in (("one", 1.0), ("two", 1.1)):
         samples(tmp_path / name, 4, int(100 * gain), gain=gain, shape=(64, 64, 3))
     (tmp_path / "old" / "mi-refract.toml").write_text('[[image]]\nname = "skipped.exr"\nskip = true\nreason = "none"\n')
@@ -87,13 +87,10 @@ def project(pair, tmp_path):
 
 def check(python, project, environment):
     environment = environment | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
-    done = subprocess.run(
-        [python, "-c", PROGRAM, *ABSENT], cwd=project, env=environment, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    assert re.search(
-        r"module named '\w+'; only commands that compare images work without it: pip install mi-refract$", done.stderr
-    )
+    run = subprocess.run([python, "-c", PROGRAM, *ABSENT], cwd=project, env=environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stdout[-3000:] + run.stderr[-3000:]
+    hint = "only commands that compare images work without it: pip install mi-refract"
+    assert re.search(rf"module named '\w+'; {hint}$", run.stderr)
 
 
 def test_every_command_and_fixture_works_without_mitsuba(project):
@@ -101,24 +98,24 @@ def test_every_command_and_fixture_works_without_mitsuba(project):
 
 
 @pytest.mark.skipif(INSTALL not in os.environ, reason=f"needs the package index and half a minute: {INSTALL}=1 runs it")
-def test_a_fresh_environment_of_the_list_is_small_and_does_all_of_it(project, tmp_path):
+def test_a_fresh_environment_with_the_requirements_is_small_and_works(project, tmp_path):
     fresh = tmp_path / "fresh"
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     subprocess.run([sys.executable, "-m", "venv", fresh], check=True)
     install = [fresh / "bin" / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     subprocess.run([*install, "--no-deps", "-r", LIST, ROOT], check=True, env=environment)
     assert sum(path.lstat().st_size for path in fresh.rglob("*")) < MOST
-    subprocess.run([*install, "pytest"], check=True, env=environment)  # of a project that has tests
+    subprocess.run([*install, "pytest"], check=True, env=environment)  # not in the requirements
     check(fresh / "bin" / "python", project, environment)
 
 
-def test_the_list_holds_what_the_extra_names_but_mitsuba():
+def test_the_requirements_are_those_of_the_extra_without_mitsuba():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     extras = project["optional-dependencies"]
-    named = [Requirement(text) for text in (*project["dependencies"], *extras["cli"], *extras["diff"])]
+    requirements = [Requirement(text) for text in (*project["dependencies"], *extras["cli"], *extras["diff"])]
     lines = [line.partition("#")[0].strip() for line in LIST.read_text("utf-8").splitlines()]
     pinned = dict(re.fullmatch(r"([\w-]+)==([\d.]+)(?:; .*)?", line).groups() for line in lines if line)
-    for requirement in named:
+    for requirement in requirements:
         if requirement.name not in (*ABSENT, "mi-refract"):
             assert requirement.specifier.contains(pinned[requirement.name]), requirement
     assert not set(pinned) & set(ABSENT)

@@ -1,4 +1,4 @@
-"""`tolerance`: the counts of OpenImageIO, `idiff`'s order of bounds, and the words that name the bound that failed."""
+"""`tolerance`: agreement with OpenImageIO's counts and `idiff`'s order of bounds, and reasons that name the bound."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ IDIFF = {"fail": 1e-6, "fail_relative": 0.0, "fail_percent": 0.0, "hard_fail": n
 IDIFF |= {"warn": 1e-6, "warn_relative": 0.0, "warn_percent": 0.0, "hard_warn": np.inf}  # idiff's own defaults
 
 
-# Beside OpenImageIO ------------------------------------------------------------------------------------------------
+# Agreement with OpenImageIO ----------------------------------------------------------------------------------------
 
 
 def random_pair(rng):
-    """Differences of exactly a threshold in float32 among them, also relative to the mean of both."""
+    """Two images. Some differences are exactly a threshold in float32, absolute or relative to the mean of both."""
     shape = *rng.integers(1, 9, 2), 3
     a = (rng.choice([1, -1, 100, 1e-3]) * rng.random(shape)).astype(np.float32)
     share = np.float32(rng.choice(THRESHOLDS[:-1])) * np.float32(rng.choice(FACTORS))
@@ -40,7 +40,7 @@ def random_pair(rng):
 
 
 def expected(counts, pixels, options):
-    """The verdict and whether there is a warning, from OpenImageIO's counts, as `idiff` asks for them."""
+    """The verdict and whether there is a warning, from OpenImageIO's counts, in the order of `idiff`."""
     single = np.float32
     if counts.nfail <= options["allow_failures"]:
         return EQUAL, False
@@ -50,26 +50,26 @@ def expected(counts, pixels, options):
     return EQUAL, bool(counts.nwarn > share["warn"] or counts.maxerror > single(options["hard_warn"]))
 
 
-def test_random_images_and_thresholds():
-    rng, seen = np.random.default_rng(7), {}
+def test_verdicts_and_metrics_agree_with_openimageio_for_random_images():
+    rng, outcomes = np.random.default_rng(7), {}
     for _ in range(2000):
         a, b = random_pair(rng)
         options = {name: float(rng.choice(THRESHOLDS)) for name in IDIFF}
         options |= {f"{x}_percent": float(rng.choice([0, 5, 12.5, 100 / 3, 50, 100])) for x in ("fail", "warn")}
         options["allow_failures"] = int(rng.choice([0, 0, 1, 3]))
         options["hard_fail"] = float(rng.choice([*THRESHOLDS, np.inf]))
-        if rng.random() < 0.4:  # what leads to a warning
+        if rng.random() < 0.4:  # so that warnings occur
             options |= {"fail": 1e-6, "fail_relative": 0.0, "fail_percent": 50.0, "hard_fail": 1.0}
         result = tolerance(image(a), image(b), **options)
         names = ("fail", "warn", "fail_relative", "warn_relative")
-        own = oiio.ImageBufAlgo.compare(oiio.ImageBuf(a), oiio.ImageBuf(b), *(options[name] for name in names))
-        key = expected(own, a[..., 0].size, options)
-        assert (result.verdict, bool(result.warning)) == key, (a, b, options, result.reason)
+        counts = oiio.ImageBufAlgo.compare(oiio.ImageBuf(a), oiio.ImageBuf(b), *(options[name] for name in names))
+        outcome = expected(counts, a[..., 0].size, options)
+        assert (result.verdict, bool(result.warning)) == outcome, (a, b, options, result.reason)
         assert all(metric.holds for metric in result.metrics) is (result.verdict is EQUAL)
-        values = [own.nfail, own.maxerror, own.meanerror, own.rms_error, own.nwarn]
+        values = [counts.nfail, counts.maxerror, counts.meanerror, counts.rms_error, counts.nwarn]
         np.testing.assert_allclose([metric.value for metric in result.metrics], values, rtol=1e-5, atol=1e-30)
-        seen[key] = seen.get(key, 0) + 1
-    assert min(seen[EQUAL, False], seen[EQUAL, True], seen[DIFFERENT, False]) > 40, seen
+        outcomes[outcome] = outcomes.get(outcome, 0) + 1
+    assert min(outcomes[EQUAL, False], outcomes[EQUAL, True], outcomes[DIFFERENT, False]) > 40, outcomes
 
 
 @pytest.mark.parametrize(
@@ -77,8 +77,8 @@ def test_random_images_and_thresholds():
     [
         ({"fail": 0.01}, 2),
         ({"fail": 0.02}, 0),
-        ({"fail": 0.02, "warn": 0.001}, 0),  # idiff asks for warnings only where a pixel fails
-        ({"fail": 0.02, "hard_fail": 0.001}, 0),  # and for hardfail
+        ({"fail": 0.02, "warn": 0.001}, 0),  # idiff tests for warnings only if a pixel fails
+        ({"fail": 0.02, "hard_fail": 0.001}, 0),  # as for hardfail
         ({"fail": 0.001, "fail_percent": 10}, 1),
         ({"fail": 0.001, "fail_percent": 10, "warn": 0.02}, 0),
         ({"fail": 0.001, "fail_percent": 10, "warn": 0.001, "warn_percent": 10}, 0),
@@ -91,8 +91,8 @@ def test_random_images_and_thresholds():
         ({}, 2),
     ],
 )
-def test_options_are_those_of_the_program_idiff(options, code, tmp_path):
-    """Two pixels of 25 differ by 0.015, one in two channels. The exit code is 1 for a warning, 2 for failure."""
+def test_options_and_exit_codes_agree_with_idiff(options, code, tmp_path):
+    """Two pixels of 25 differ by 0.015, one of them in two channels. Exit codes: 1 for a warning, 2 for a failure."""
     a = np.full((5, 5, 3), 0.5, np.float32)
     b = a.copy()
     b[1, 2, :2] += 0.015
@@ -107,23 +107,23 @@ def test_options_are_those_of_the_program_idiff(options, code, tmp_path):
         assert subprocess.run([program, *flags, *map(str, files)], capture_output=True, timeout=60).returncode == code
 
 
-def test_the_ends_of_the_thresholds():
-    """At a threshold nothing differs yet; ratios are of float32 means, percentages float32, as in `idiff`."""
+def test_values_exactly_at_the_thresholds_are_equal():
+    """As in `idiff`, ratios are relative to float32 means, and percentages are float32."""
     a, b = image(np.full((1, 5, 3), 1.5)), image(np.full((1, 5, 3), 0.5))
     assert tolerance(a, b, fail=1.0).verdict is tolerance(a, b, fail=0.999, fail_relative=1.0).verdict is EQUAL
-    tiny = [image(np.full((1, 5, 3), x, np.float32)) for x in (1e-45, 0.0)]  # whose mean is 0 in float32
+    tiny = [image(np.full((1, 5, 3), x, np.float32)) for x in (1e-45, 0.0)]  # their mean is 0 in float32
     assert tolerance(*tiny, fail=0.0, fail_relative=0.0).verdict is EQUAL
     one = b.pixels.copy()
     one[0, 0] = 1
-    # 1/5 is 20 %; the number next below it in float64 is 20 in float32.
+    # 1/5 is 20 %; the next smaller number in float64 is 20 in float32.
     for percent, verdict in ((20.0, EQUAL), (np.nextafter(20.0, 0), EQUAL), (19.99, DIFFERENT)):
         assert tolerance(b, image(one), fail_percent=float(percent)).verdict is verdict
 
 
-# Words -------------------------------------------------------------------------------------------------------------
+# Reasons and warnings ----------------------------------------------------------------------------------------------
 
 FLAT = np.full((20, 30, 3), 0.5, np.float32)
-SIX = FLAT.copy()  # of 600 pixels 6 differ, one by more
+SIX = FLAT.copy()  # 6 of 600 pixels differ, one of them by more
 SIX[3, :6, 1] += 0.02
 SIX[3, 4, 1] += 0.03
 AT = "at x = 4, y = 3, channel G"
@@ -169,14 +169,14 @@ WARN = {"fail_percent": 1.0, "warn": 0.03, "hard_warn": 0.04}
         (WARN | {"fail_percent": 0.5}, DIFFERENT, f"{DIFFER} (> fail_percent = 0.5); largest", ""),
     ],
 )
-def test_the_bound_that_failed_is_named_first_and_a_warning_is_no_failure(options, verdict, reason, warning):
+def test_the_exceeded_bound_is_named_first_and_warnings_do_not_fail(options, verdict, reason, warning):
     options = {"fail": 0.01, "fail_relative": 0.0, "fail_percent": 0.0} | options
     result = compare("tolerance", image(FLAT), image(SIX), **options)
     assert (result.verdict, result.reason[: len(reason)], result.warning) == (verdict, reason, warning)
 
 
-def test_where_black_is_accepted_is_where_it_passes_alone():
-    """A method that allows as many pixels as there are sees nothing."""
+def test_pixels_that_accept_black_are_those_that_pass_separately():
+    """`tolerance` is inconclusive if it allows all pixels to fail."""
     rng = np.random.default_rng(3)
     pixels = rng.choice([0.0, 0.003, 0.004, 0.05, 0.5], (8, 8, 3)).astype(np.float32)
     options = IDIFF | {"fail": 0.004, "hard_fail": 0.001}
@@ -191,8 +191,8 @@ def test_where_black_is_accepted_is_where_it_passes_alone():
 
 
 @pytest.mark.parametrize("by, pixels, verdict", [(0.0039, 9, EQUAL), (0.0041, 1, EQUAL), (0.0041, 2, DIFFERENT)])
-def test_the_defaults_allow_a_change_of_0_004_and_more_in_0_02_percent_of_the_pixels(by, pixels, verdict):
-    """Of 6000 pixels 1 is 0.017 %, 2 are 0.033 %."""
+def test_the_default_bounds(by, pixels, verdict):
+    """0.004, and more in 0.02 % of the pixels; of 6000 pixels 1 is 0.017 %, 2 are 0.033 %."""
     reference = np.full((60, 100, 3), 0.5)
     test = reference.copy()
     test[0, :pixels, 1] += by
@@ -203,7 +203,7 @@ def test_the_defaults_allow_a_change_of_0_004_and_more_in_0_02_percent_of_the_pi
 
 
 def lit(size, dot=1000.0, at=(7, 9), width=1, channel=slice(None)):
-    """A smooth image of mean 1 and its like with a firefly of `dot` times the mean."""
+    """A smooth image of mean 1, and the same image with a firefly of `dot` times the mean."""
     plain = np.ones((size, size, 3)) + 0.5 * np.sin(np.arange(size) / 9)[:, None, None]
     spoilt = plain.copy()
     spoilt[at[0] : at[0] + width, at[1] : at[1] + width, channel] = dot
@@ -212,8 +212,8 @@ def lit(size, dot=1000.0, at=(7, 9), width=1, channel=slice(None)):
 
 @pytest.mark.parametrize("dot, channel", [(1000.0, slice(None)), (500.0, 1), (-500.0, 1)])
 @pytest.mark.parametrize("size", [64, 71, 512])
-def test_auto_sees_one_outrageous_pixel_at_any_size(size, dot, channel):
-    """`tolerance` itself lets 0.02 % of the pixels be anything: from 71² on that is one."""
+def test_auto_detects_one_outrageous_pixel_at_any_size(size, dot, channel):
+    """`tolerance` alone allows any value in 0.02 % of the pixels, which is one pixel from 71² pixels on."""
     plain, spoilt = lit(size, dot, channel=channel)
     for sides in ((plain, spoilt), (spoilt, plain)):
         assert compare("tolerance", *sides).verdict is (EQUAL if size > 64 else DIFFERENT)
@@ -222,8 +222,8 @@ def test_auto_sees_one_outrageous_pixel_at_any_size(size, dot, channel):
         assert size == 64 or "at x = 9, y = 7" in result.reason
 
 
-def test_what_is_not_outrageous():
-    """A highlight that moves by two pixels, the edge of a lamp, white on a gray display, and what options allow."""
+def test_bright_pixels_that_are_not_outrageous_are_equal():
+    """A highlight that moves by two pixels, the edge of a lamp, white on a gray display, and pixels within options."""
     white = np.full((128, 128, 3), 0.02)
     white[60, 60] = 1.0
     for sides, options in (

@@ -1,4 +1,4 @@
-"""Images whose noise is known: variances from files and channels, films of `moment`, the method that is chosen."""
+"""Images with known noise: variances from files and channels, films of `moment`, and the choice of the method."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ BOTH = "the variance of both is known"
 
 
 def samples(seed, spp, gain=1.0, shape=25.0):
-    """Samples of a colour that is the same for all channels but for its strength, as light of one lamp is.
+    """Samples whose channels are proportional to each other, like light of one lamp.
 
     Their variance is 1/`shape` of the squared mean.
     """
@@ -45,9 +45,9 @@ def samples(seed, spp, gain=1.0, shape=25.0):
 
 
 def film(seed, passes=8, per_pass=4, names=RGB, gain=1.0, shape=100.0):
-    """As `mi-refract render` writes it: with the variance of a sample, estimated from the spread between passes."""
-    drawn = samples(seed, passes, gain, shape)[..., : len(names)]
-    pixels = np.concatenate([drawn.mean(0), drawn.var(0, ddof=1) * per_pass], -1)
+    """A film as of `mi-refract render`, with the variance of a sample, estimated from the spread between passes."""
+    means = samples(seed, passes, gain, shape)[..., : len(names)]
+    pixels = np.concatenate([means.mean(0), means.var(0, ddof=1) * per_pass], -1)
     header = {SPP: passes * per_pass, FREEDOM: passes - 1}
     return of(pixels, (*names, *(f"{name}.variance" for name in names)), metadata=header)
 
@@ -57,7 +57,7 @@ def bare(image):
 
 
 def beside(drawn):
-    """The mean of samples, and their variance as that of a file."""
+    """The mean of samples, with their variance as from a separate file."""
     return replace(of(drawn.mean(0)), variances=dict(zip(RGB, np.moveaxis(drawn.var(0, ddof=1), -1, 0), strict=True)))
 
 
@@ -79,7 +79,7 @@ def pair(tmp_path):
 
 @pytest.fixture
 def films(tmp_path):
-    """A folder of references and one of new images: "same.exr" of other seeds, "off.exr" brighter by a half."""
+    """Folders of references and new images: "same.exr" with other seeds, "off.exr" 1.5 times as bright."""
     for seed, (name, gain) in enumerate((("same.exr", 1.0), ("off.exr", 1.5))):
         written(tmp_path / "old" / name, film(seed))
         written(tmp_path / "new" / name, film(10 + seed, gain=gain))
@@ -87,7 +87,7 @@ def films(tmp_path):
 
 
 def one(*sides, maps=False, **values):
-    """The one result of a comparison of files with these settings."""
+    """The only result of a comparison with these settings."""
     (result,) = folders.diff(*sides, Settings(rules=(Entry("*", values),)), maps=maps).results
     return result
 
@@ -95,8 +95,8 @@ def one(*sides, maps=False, **values):
 # Files ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_file_says_what_channels_would(pair):
-    """On one side or on both; and it is no image of its own, unless the settings do not name it."""
+def test_a_file_with_variances_is_equivalent_to_channels(pair):
+    """On one side or on both. The file is compared as an image only if the settings do not name it."""
     old, new = pair
     result = one(old, new, **BESIDE)
     assert (result.name, result.comparison.method, result.status) == ("a.exr", "welch", Status.EQUAL)
@@ -113,8 +113,8 @@ def test_a_file_says_what_channels_would(pair):
         assert one(*sides, **BESIDE).status is Status.DIFFERENT
 
 
-def test_where_variances_are_and_what_they_are_of(pair):
-    """Elsewhere; of X, Y, Z; of a variant; hidden by a mask; and neither read nor compared by `tolerance`."""
+def test_variances_in_other_folders_of_xyz_and_with_masks(pair):
+    """`tolerance` neither reads nor compares them."""
     old, new = pair
     (old / "noise").mkdir()
     (old / "a_var.exr").rename(old / "noise/a.exr")
@@ -131,8 +131,8 @@ def test_where_variances_are_and_what_they_are_of(pair):
     assert hidden == [Status.INCONCLUSIVE, Status.EQUAL]
 
 
-def test_variants_have_variances_of_their_own(pair):
-    """And a file of these is no variant."""
+def test_variants_have_separate_variances(pair):
+    """And the file of a variance is not a variant."""
     old, new = pair
     for end in ("", "_var"):
         (old / f"a{end}.exr").rename(old / f"a-2{end}.exr")
@@ -142,9 +142,7 @@ def test_variants_have_variances_of_their_own(pair):
 
 
 @pytest.mark.parametrize(("named", "freedom"), [({FREEDOM: 5}, 5), ({}, 7)])
-def test_a_file_of_one_channel_is_for_an_image_of_one_and_its_header_says_how_well_it_is_known(
-    tmp_path, named, freedom
-):
+def test_a_variance_of_one_channel_and_its_degrees_of_freedom(tmp_path, named, freedom):
     for side, value in (("old", 1.0), ("new", 3.0)):
         (tmp_path / side).mkdir()
         write_exr(tmp_path / side / "a.exr", [[[value]]], ("Y",), {SPP: 1000, FREEDOM: 7})
@@ -155,7 +153,7 @@ def test_a_file_of_one_channel_is_for_an_image_of_one_and_its_header_says_how_we
 
 
 def test_a_variance_is_accepted_with_its_image(pair):
-    """A reference with the variance of another render would be judged wrongly for good."""
+    """Otherwise the reference would have the variance of another render from then on."""
     old, new = pair
     how = Settings(rules=(Entry("*", BESIDE),))
     drawn = samples(3, 16, gain=1.2)
@@ -165,8 +163,8 @@ def test_a_variance_is_accepted_with_its_image(pair):
         list(accept.changes(compared))
     before = (new / "a.exr").read_bytes()
     written(new / "a.exr", beside(drawn))
-    (new / "a.exr").write_bytes(before)  # a header holds the time
-    with pytest.raises(OSError, match=r"new/a_var\.exr: changed since it was compared"):  # nobody has compared it
+    (new / "a.exr").write_bytes(before)  # because the header contains the time
+    with pytest.raises(OSError, match=r"new/a_var\.exr: changed since it was compared"):  # it did not exist then
         accept.Acceptance(list(accept.changes(compared))).run()
     accept.Acceptance(list(accept.changes(folders.diff(old, new, how, to_accept=True)))).run()
     for name in ("a.exr", "a_var.exr"):
@@ -174,8 +172,8 @@ def test_a_variance_is_accepted_with_its_image(pair):
 
 
 @pytest.mark.parametrize("method", ["auto", "welch", "tolerance"])
-def test_by_the_json_what_was_compared_with_a_variance_is_not_accepted(pair, method):
-    """The file has no digest of it. A method that reads none is not hindered by the setting."""
+def test_images_with_variance_files_cannot_be_accepted_by_json(pair, method):
+    """The JSON has no digest of the variance. A method that does not read it is not affected."""
     values = {"method": method, "variance": "{stem}_var.exr"} | ({} if method == "tolerance" else {"spp": 16})
     written(pair[1] / "a.exr", of(samples(3, 16, gain=1.5).mean(0)))
     how, file = Settings(rules=(Entry("*", values),)), pair[0].parent / "out.json"
@@ -197,7 +195,7 @@ def _write(end, pixels, names=RGB, **header):
 
 HOLE = np.where(np.arange(SHAPE[1])[None, :, None] == 7, np.nan, np.ones(SHAPE))
 NEGATIVE = _write("_var", -np.ones(SHAPE))
-BAD = [  # what is changed, the settings, and what is said
+BAD = [  # a change, settings, and part of the error
     (lambda old: (old / "a_var.exr").unlink(), {}, "a_var.exr: no such file"),
     (NEGATIVE, {}, "negative in 1536 pixels, the first at x = 0, y = 0"),
     (NEGATIVE, {}, "channels = ['X', 'Y', 'Z']"),
@@ -208,7 +206,7 @@ BAD = [  # what is changed, the settings, and what is said
     (lambda old: None, {"variance": "{name}"}, "itself; expected another image"),
     (lambda old: None, {"spp_test": 1}, "samples per pixel: 1; expected `spp` or `spp_test`, 2 to 10¹⁵"),
     (lambda old: None, {"spp_reference": -3}, "spp_reference = -3; expected a number of at least 0"),
-    (lambda old: None, {"spp_test": 0}, "names 'no samples per pixel'; expected `spp` or `spp_test`"),
+    (lambda old: None, {"spp_test": 0}, "samples per pixel in its header: none; expected `spp` or `spp_test`"),
     (lambda old: None, {"channels": (("Q", "Q"),)}, "no channel 'Q'; in `channels` expected R, G"),
     *(
         (_write("", MEAN, **{FREEDOM: named}), {}, "; expected a whole number, 1 to 10¹⁵")
@@ -218,7 +216,7 @@ BAD = [  # what is changed, the settings, and what is said
 
 
 @pytest.mark.parametrize(("change", "values", "message"), BAD)
-def test_what_cannot_be_used_is_one_line_and_the_others_are_compared(pair, change, values, message):
+def test_invalid_variances_are_errors_in_one_line_of_their_image(pair, change, values, message):
     old, new = pair
     for folder, end in ((old, ""), (old, "_var"), (new, "")):
         (folder / f"b{end}.exr").write_bytes((folder / f"a{end}.exr").read_bytes())
@@ -234,17 +232,17 @@ def test_what_cannot_be_used_is_one_line_and_the_others_are_compared(pair, chang
 
 
 def moments(seed, colours=RGB, layer="nested", extra=(), spp=16):
-    """A film as Mitsuba's `moment` integrator writes it: its colours, and the moments of X, Y and Z.
+    """A film as of Mitsuba's `moment` integrator: its colours, and the moments of X, Y and Z.
 
     `extra`: names of other channels that the nested integrator writes.
     """
-    drawn = samples(seed, spp)
-    xyz = drawn @ channels.TO_XYZ.T
-    shown = {RGB: drawn, XYZ: xyz, ("Y",): xyz[..., 1:2], (*RGB, "A"): np.concatenate([drawn, drawn[..., :1] > 0], -1)}
-    parts = {name: shown[colours][..., i].mean(0) for i, name in enumerate(colours)}
-    for name, x in (*zip(XYZ, np.moveaxis(xyz, -1, 0), strict=True), *((name, drawn[..., 0]) for name in extra)):
-        parts |= {f"{layer}.{name}": x.mean(0), f"m2_{layer}.{name}": np.square(x).mean(0)}
-    return of(np.stack(list(parts.values()), -1), tuple(parts))
+    rgb = samples(seed, spp)
+    xyz = rgb @ channels.TO_XYZ.T
+    films = {RGB: rgb, XYZ: xyz, ("Y",): xyz[..., 1:2], (*RGB, "A"): np.concatenate([rgb, rgb[..., :1] > 0], -1)}
+    planes = {name: films[colours][..., i].mean(0) for i, name in enumerate(colours)}
+    for name, x in (*zip(XYZ, np.moveaxis(xyz, -1, 0), strict=True), *((name, rgb[..., 0]) for name in extra)):
+        planes |= {f"{layer}.{name}": x.mean(0), f"m2_{layer}.{name}": np.square(x).mean(0)}
+    return of(np.stack(list(planes.values()), -1), tuple(planes))
 
 
 RGBA = (*RGB, "A")
@@ -263,10 +261,10 @@ FILMS = {
 
 
 @pytest.mark.parametrize(("reference", "test"), FILMS.values(), ids=FILMS)
-def test_films_are_recognised(reference, test):
-    """An equal one is equal, nothing of it untested; one that is brighter is different, in whatever order of channels.
+def test_films_of_moments_are_recognised(reference, test):
+    """Equal films are equal without untested channels, in any order of channels; brighter films are different.
 
-    What is not finite is found.
+    Values that are not finite are reported.
     """
     result = compare("auto", reference, test, spp=16)
     assert (result.method, result.verdict) == ("welch", EQUAL), result.reason
@@ -281,13 +279,13 @@ def test_films_are_recognised(reference, test):
     assert result.verdict is DIFFERENT and "x = 6, y = 5" in result.reason
 
 
-def test_what_a_film_of_moments_cannot_be_compared_by():
-    """Infinite squares, colours that do not repeat the moments, and an output that the new image lost."""
+def test_films_of_moments_that_cannot_be_compared():
+    """Infinite squares, colours that do not repeat the moments, and an output that the new image lacks."""
     infinite, broken, test = moments(1), moments(3), moments(2)
     infinite.pixels[2, 3, infinite.channels.index("m2_nested.Y")] = np.inf
     with pytest.raises(ValueError, match=r"variance of Y is not finite at x = 3, y = 2"):
         compare("auto", infinite, test, spp=16)
-    broken.pixels[..., 2] *= 1.01  # a conversion to R, G, B that is wrong, beside moments that are right
+    broken.pixels[..., 2] *= 1.01  # a wrong conversion to R, G, B beside right moments
     result = compare("auto", test, broken, spp=16)
     assert (result.verdict, result.reason[:30]) == (INCONCLUSIVE, "not tested, without variance: ")
     more = moments(1, extra=["depth"])
@@ -298,20 +296,20 @@ def test_what_a_film_of_moments_cannot_be_compared_by():
     assert compare("auto", *sides, spp=16).verdict is EQUAL
 
 
-def test_an_alpha_has_at_most_the_variance_of_a_coin():
-    """One of a half is equal to another of as many samples, and not to one of 0.4."""
+def test_alpha_has_the_variance_of_a_binary_variable():
+    """An alpha of one half is equal to another one with as many samples, and differs from 0.4."""
     reference, test, other = (moments(seed, RGBA, spp=64) for seed in (1, 2, 3))
     for image, share, seed in ((reference, 0.5, 4), (test, 0.5, 5), (other, 0.4, 6)):
         image.pixels[..., 3] = np.random.default_rng(seed).binomial(64, share, SHAPE[:2]) / 64
     how = {"spp": 64, "resolution": 0.2}
     assert compare("auto", reference, test, **how).verdict is EQUAL
     assert compare("auto", reference, other, **how).verdict is DIFFERENT
-    reference.pixels[..., 3], other.pixels[..., 3] = 2.0, 2.5  # no alpha: nothing bounds the variance
+    reference.pixels[..., 3], other.pixels[..., 3] = 2.0, 2.5  # above 1 the variance is not bounded
     assert "without variance: A" in compare("auto", reference, other, **how).reason
 
 
-def test_channels_without_variance_are_not_equal_unseen():
-    """`variance` for R only: G is black and B tripled."""
+def test_differences_in_channels_without_variance_are_inconclusive():
+    """The variance is known for R only; G is black and B tripled."""
 
     def side(seed, *gains):
         drawn = samples(seed, 16)
@@ -324,21 +322,21 @@ def test_channels_without_variance_are_not_equal_unseen():
     assert result.reason.startswith("not tested, without variance: G, B")
     test.pixels[..., 1:3] = reference.pixels[..., 1:3]
     assert compare("auto", reference, test).verdict is EQUAL
-    reference.pixels[..., 1:3] *= 0.003  # dim, and black in the other: `tolerance` alone would pass that
+    reference.pixels[..., 1:3] *= 0.003  # dim, and black in the other image, which `fail` alone would accept
     test.pixels[..., 1:3] = 0
     assert compare("auto", reference, test).verdict is INCONCLUSIVE
 
 
 @pytest.mark.parametrize("form", ["m2_{}", "{}.m2", "variance.{}", "img.m2_{}"])
-def test_names_of_channels_of_spread(form):
+def test_names_of_channels_of_variances_and_moments(form):
     name = "img.nested.X" if form.startswith("img") else "nested.X"
     spread = form.format("nested.X")
     assert channels.spreads([name, spread]) == {name: (spread, "m2" in form)}
     assert channels.means([name, spread, "A"]) == [name, "A"]
 
 
-def test_mitsuba_names_its_channels_so(tmp_path):
-    """What the films above are made after, in the Mitsuba that is installed."""
+def test_mitsuba_writes_the_expected_channel_names(tmp_path):
+    """The films above imitate these of the installed Mitsuba."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
     path = {"type": "path"}
@@ -361,10 +359,10 @@ def test_mitsuba_names_its_channels_so(tmp_path):
 # Channels ---------------------------------------------------------------------------------------------------------
 
 
-def test_mitsubas_own_test_data(tmp_path):
-    """Variances of X, Y, Z that were written as R, G, B are negative for coloured light; as X, Y, Z they are right."""
+def test_variances_of_mitsubas_test_data_are_compared_as_xyz(tmp_path):
+    """Variances of X, Y, Z that were converted to R, G, B can be negative; converted back to X, Y, Z they are right."""
     red, other = (samples(seed, spp, shape=4.0) * (1.0, 0.05, 0.02) for seed, spp in ((1, 64), (2, 16)))
-    # Mean and variance of X, Y and Z, both converted to R, G, B, as test_renders.py does.
+    # Mean and variance of X, Y and Z, both converted to R, G, B, as in Mitsuba's test_renders.py.
     xyz, to_rgb = red @ channels.TO_XYZ.T, np.linalg.inv(channels.TO_XYZ).T
     variance = dict(zip(RGB, np.moveaxis(xyz.var(0) @ to_rgb, -1, 0), strict=True))
     written(tmp_path / "old/a.exr", of(xyz.mean(0) @ to_rgb, variances=variance))
@@ -380,8 +378,8 @@ def test_mitsubas_own_test_data(tmp_path):
 
 
 @pytest.mark.parametrize("method", ["exact", "tolerance"])
-def test_channels_of_every_method(pair, films, method):
-    """NAME.variance among them, if it is named; by their names on both sides."""
+def test_selected_channels_are_compared_by_every_method(pair, films, method):
+    """By their names on both sides, and also NAME.variance if it is selected."""
     image = read(pair[0] / "a.exr")
     write_exr(pair[1] / "a.exr", image.pixels * (1, 1, 3))
     off = read(films[0] / "off.exr")
@@ -389,7 +387,7 @@ def test_channels_of_every_method(pair, films, method):
     written(films[1] / "off.exr", off)
     write_exr(pair[1] / "turned.exr", image.pixels, ("B", "G", "a.R"))
     write_exr(pair[0] / "turned.exr", image.pixels[..., ::-1], ("R", "G", "b.B"))
-    for path, names, status, left in (
+    for path, names, status, end in (
         ("a.exr", {name: name for name in RGB}, Status.DIFFERENT, ""),
         ("a.exr", {"R": "R", "G": "G"}, Status.EQUAL, "; not compared: B"),
         ("off.exr", {"R": "R", "G": "G"}, Status.EQUAL, "; not compared: B"),
@@ -397,14 +395,14 @@ def test_channels_of_every_method(pair, films, method):
         ("turned.exr", {"R": "a.R", "b.B": "B"}, Status.EQUAL, "; not compared: G"),
     ):
         result = one(pair[0] / path, pair[1] / path, method=method, channels=tuple(names.items()))
-        assert result.status is status and result.reason.endswith(left), path
+        assert result.status is status and result.reason.endswith(end), path
 
 
 # Films with their own variance -------------------------------------------------------------------------------------
 
 
-def test_welch_is_chosen_and_reports_and_settings_say_so(films, tmp_path):
-    """A method that the settings name is used, and nothing explains it. Those that differ are accepted whole."""
+def test_welch_is_chosen_and_reported_for_images_with_variance(films, tmp_path):
+    """A method that the settings name is used and reported without a reason. Accepted images keep all channels."""
     results = folders.diff(*films, to_accept=True)
     assert {x.name: x.status for x in results.results} == {"off.exr": Status.DIFFERENT, "same.exr": Status.EQUAL}
     assert {result.method_in_words for result in results.results} == {f"welch ({BOTH})"}
@@ -425,7 +423,7 @@ def test_welch_is_chosen_and_reports_and_settings_say_so(films, tmp_path):
 
 
 def test_the_method_that_auto_chooses():
-    """A render holds its variance always: beside an image of which nothing is known, that one decides."""
+    """A render of ours always has its variance; with an image of unknown noise it is compared by `tolerance`."""
     ours, plain = film(1), bare(film(1))
     unknown, theirs = replace(plain, metadata={}), replace(ours, metadata={})
     for sides, how, expected in (
@@ -443,7 +441,7 @@ def test_the_method_that_auto_chooses():
     assert compare("auto", [plain, bare(film(2))], [bare(film(3)), bare(film(4))]).method_in_words.endswith("renders)")
 
 
-def test_the_same_image_is_equal_however_noisy_where_it_holds_its_variance():
+def test_identical_noisy_images_with_variance_are_equal():
     noisy = film(50, passes=2, shape=4.0)
     result = compare("auto", noisy, noisy)
     assert (result.verdict, result.reason) == (EQUAL, "identical in every value, variances included")
@@ -451,33 +449,33 @@ def test_the_same_image_is_equal_however_noisy_where_it_holds_its_variance():
     order = [3, 4, 5, 2, 1, 0]
     mixed = replace(noisy, pixels=noisy.pixels[..., order], channels=tuple(noisy.channels[i] for i in order))
     assert compare("auto", noisy, mixed).verdict is EQUAL
-    for channel in range(6):  # one value less, and the noise counts
+    for channel in range(6):  # if one value differs, the noise decides
         other = replace(noisy, pixels=noisy.pixels.copy())
         other.pixels[3, 4, channel] *= 1.0001
         assert compare("auto", noisy, other).verdict is INCONCLUSIVE
-    # A variance in a file beside it may be of any other render, and renders have others beside the first.
+    # A variance in a separate file may be that of another render, and for several renders the first is not enough.
     in_files = replace(bare(noisy), variances=dict(zip(RGB, np.moveaxis(noisy.pixels[..., 3:], -1, 0), strict=True)))
     assert compare("auto", in_files, in_files).verdict is INCONCLUSIVE
     low, high = (film(seed, passes=2, gain=gain, shape=4.0) for seed, gain in ((2, 1.0), (3, 9.0)))
     assert compare("welch", [noisy, low], [noisy, high]).verdict is not EQUAL
-    noisy.pixels[3, 4, 0] = np.nan  # is no more equal to itself than elsewhere
+    noisy.pixels[3, 4, 0] = np.nan  # not equal, even to itself
     assert compare("auto", noisy, noisy).verdict is DIFFERENT
     result = compare("auto", noisy, noisy, allow_nonfinite=True)
     assert result.reason == "identical in every value, variances included; not compared: 1 of 4608 values, not finite"
 
 
-def test_rounding_below_zero_is_none():
+def test_variances_below_zero_by_rounding_are_accepted():
     """m2 − m² of a constant in single precision."""
-    known = {name: np.full(SHAPE[:2], -1e-7) for name in RGB}
-    assert compare("auto", *[of(MEAN, variances=known)] * 2, spp=16).verdict is EQUAL
+    variances = {name: np.full(SHAPE[:2], -1e-7) for name in RGB}
+    assert compare("auto", *[of(MEAN, variances=variances)] * 2, spp=16).verdict is EQUAL
 
 
 @pytest.mark.parametrize("method", [*METHODS, "auto"])
-def test_a_variance_is_no_image(method):
-    """Neither another one, nor one on one side alone, nor NaN; but one without its channel is."""
+def test_channels_of_variance_are_not_compared(method):
+    """Neither different ones, nor those of one side, nor NaN; but NAME.variance without a channel NAME is compared."""
     images = [film(seed) for seed in range(60, 66)]
     other = [replace(image, pixels=image.pixels * ([1] * 3 + [7] * 3)) for image in images]
-    if method in ("auto", "welch"):  # of several renders, whose spread is the noise
+    if method in ("auto", "welch"):  # several renders, whose spread gives the noise
         assert compare(method, images[:3], other[3:], tile=32, resolution=1.0).verdict is EQUAL
         return
     other[0].pixels[1, 1, 4] = np.nan
@@ -488,7 +486,7 @@ def test_a_variance_is_no_image(method):
 
 
 @pytest.mark.parametrize("names", [RGB, ("Y",), ("dd.y.T", "nn.X")])
-def test_panes_and_the_self_test_take_the_image_without_its_variance(tmp_path, names):
+def test_the_page_and_the_self_test_ignore_channels_of_variance(tmp_path, names):
     for side, gain in (("old", 1.0), ("new", 1.5)):
         written(tmp_path / side / "a.exr", film(70, names=names, gain=gain))
     shown = html_report.shown_of(one(tmp_path / "old", tmp_path / "new", maps=True), 1e6, 1e6)

@@ -1,4 +1,4 @@
-"""`welch`: its formulas, the false alarms and the power that it states, and where it is inconclusive."""
+"""`welch`: its formulas, the rate of false alarms, the power, and when it is inconclusive."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def rng():
 
 
 def skewed(rng, shape, deviation=0.3):
-    """Noise around 1 of a skewed distribution, as light has."""
+    """Noise around 1 with a skewed distribution, like that of light."""
     return 1 + deviation * (rng.gamma(2.0, 1.0, shape) - 2) / np.sqrt(2)
 
 
@@ -53,7 +53,7 @@ def renders(rng, count, gain=1.0, shape=SHAPE, deviation=0.1, blur=0.0):
 
 
 def film(mean, variance, **header):
-    """An image with the variance of a sample in channels of its own."""
+    """An image with the variance of a sample in additional channels."""
     names = tuple("RGB") if mean.shape[-1] == 3 else ("Y",)
     metadata = {f"mi_refract:{key}": value for key, value in header.items()}
     return of(np.dstack([mean, variance]), (*names, *(f"{name}.variance" for name in names)), metadata=metadata)
@@ -67,7 +67,7 @@ def passes(rng, deviation=0.0, gain=1.0, shape=(32, 32, 3), **header):
 
 
 def bare(image):
-    """Without its channels of variance."""
+    """The image without its channels of variance."""
     names = [name for name in image.channels if "." not in name]
     return replace(image, pixels=image.select(names), channels=tuple(names))
 
@@ -82,12 +82,12 @@ def full(*values, shape=(1, 1, 1)):
 @pytest.mark.parametrize(
     "one, two, v1, f1, v2, f2",
     [
-        # A variance of n samples has n − 1 degrees of freedom; a borrowed one those of the side that knows it.
+        # A variance of n samples has n − 1 degrees of freedom; the same if the other side uses it, too.
         ((0.08, 2), (0.08, 2), 0.08 / 2, 1, 0.08 / 2, 1),
         ((0.08, 5), (0.04, 9), 0.08 / 5, 4, 0.04 / 9, 8),
         ((0.08, 10), (None, 3), 0.08 * (1 / 10 + 1 / 3), 9, 0, 1),
         ((None, 5), (0.08, 1000), 0, 1, 0.08 * (1 / 5 + 1 / 1000), 999),
-        # The header names them, in whatever type; not for a side that holds no variance.
+        # The header can give them, in any type; ignored for a side without variance.
         ((0.4, 1000, 7), (0.2, 1000), 0.4 / 1000, 7, 0.2 / 1000, 999),
         ((0.4, 1000, 7.0), (0.2, 1000, "11"), 0.4 / 1000, 7, 0.2 / 1000, 11),
         ((0.4, 1000, "7"), (None, 1000, "nonsense"), 0.8 / 1000, 7, 0, 1),
@@ -109,14 +109,14 @@ def test_t_and_p_of_one_pixel(one, two, v1, f1, v2, f2):
     # At Šidák's level of the tests of the mean and of the pixels; relative to the brighter side.
     reach = stats.t.isf((1 - 0.999**0.5) / 2, freedom) + stats.t.isf(0.01, freedom)
     assert result.minimum_detectable == pytest.approx(reach * np.sqrt(v1 + v2) / 1.1, rel=1e-4)
-    if len(one) == len(two) == 2:  # options go before the header, and those of a side before that of both
+    if len(one) == len(two) == 2:  # options override the header, and those of a side override `spp`
         other = [replace(side, metadata={"mi_refract:spp": 77}) for side in sides]
         again = welch(*other, spp=7, spp_reference=one[1], spp_test=two[1], equivalence_margin=0.0)
         assert again.maps["t"].item() == result.maps["t"].item()
 
 
 @pytest.mark.parametrize("spp", [2, 5])
-def test_second_moments_are_those_of_so_many_samples(spp, rng):
+def test_second_moments_give_unbiased_variances(spp, rng):
     """`m2` is the mean of the squares: the variance of the samples is (m2 − mean²) · spp / (spp − 1)."""
     sides, results = rng.random((2, spp, 16, 16)), []
     for form, spread in (("Y.variance", lambda x: x.var(0, ddof=1)), ("m2_Y", lambda x: np.square(x).mean(0))):
@@ -127,31 +127,31 @@ def test_second_moments_are_those_of_so_many_samples(spp, rng):
 
 
 def test_degrees_of_freedom_of_a_tile():
-    """Of 16² pixels with one variance, each known with 7; fewer where pixels correlate, and where that is a guess."""
+    """16² pixels, each with 7 degrees of freedom; fewer if pixels correlate, and if the inflation is uncertain."""
     variance, squares = from_variances(*full(1.0, 3.0, shape=(16, 16, 1)), 7.0, 16).spread(Inflation())
     assert (variance.item(), (variance**2 / squares).item()) == pytest.approx((3 / 256, 7 * 256))
     variance, squares = Side(*full(1.0, 5.0, 2.0, 4.0), freedom=6.0).spread(Inflation(3.0, 10.0))
     assert (variance.item(), squares.item()) == pytest.approx((6, 6**2 / (6 / 3) + 6**2 / 10))
 
 
-def test_renders_give_the_tiles_of_their_mean_and_variance_and_the_sums_of_their_pixels(rng):
-    """Of an image that is not square, and fills its last tiles in part."""
+def test_from_renders_agrees_with_from_variances(rng):
+    """For an image that is not square, and whose last tiles are not full."""
     one, two = rng.random((5, 20, 40, 2)), rng.random((3, 20, 40, 2))
     evidence = from_renders([*one], [*two], 16)
     assert evidence.one.area[..., 0].tolist() == [[256, 256, 128], [64, 64, 32]]
     for side, x in ((evidence.one, one), (evidence.two, two)):
-        same = from_variances(x.mean(0), x.var(0, ddof=1) / len(x), len(x) - 1.0, 16, len(x))
+        expected = from_variances(x.mean(0), x.var(0, ddof=1) / len(x), len(x) - 1.0, 16, len(x))
         for name in ("area", "mean", "variance", "squares", "freedom", "count"):
-            np.testing.assert_allclose(getattr(same, name), getattr(side, name))
-        assert same.renders is None and same.inflation() == Inflation(1.0, np.inf)
+            np.testing.assert_allclose(getattr(expected, name), getattr(side, name))
+        assert expected.renders is None and expected.inflation() == Inflation(1.0, np.inf)
     v1, v2, d = one.var(0, ddof=1), two.var(0, ddof=1), one.mean(0) - two.mean(0)
-    for i, u in enumerate((d**2 - v1 / 5 - v2 / 3, d**2 - v1 / 3 - v2 / 5)):  # the variances as they are, and exchanged
+    for i, u in enumerate((d**2 - v1 / 5 - v2 / 3, d**2 - v1 / 3 - v2 / 5)):  # the second with exchanged variances
         np.testing.assert_allclose(evidence.pixels.total[i, 0, 2], u[:16, 32:].sum((0, 1)))
         np.testing.assert_allclose(evidence.pixels.squares[i, 1, 0], np.square(u[16:, :16]).sum((0, 1)))
 
 
-def test_correlation_that_only_coarser_tiles_show_is_estimated_again(rng):
-    """Noise in blocks of 8² in tiles of 4²: those of 16² vary 4 times as much as their own tiles let expect."""
+def test_correlation_is_estimated_again_from_coarser_tiles(rng):
+    """Noise in blocks of 8² pixels, tiles of 4²: tiles of 16² vary 4 times as much as follows from those of 4²."""
     blocks = rng.standard_normal((2, 16, 32, 32, 1)).repeat(8, 2).repeat(8, 3)
     fine, coarse = itertools.islice(from_renders(*map(list, blocks), 4).levels(0.0), 2)
     per_block = 1 / 16 + 1 / 16  # the variance of a block's difference
@@ -159,8 +159,8 @@ def test_correlation_that_only_coarser_tiles_show_is_estimated_again(rng):
     assert np.square(coarse.error).mean() == pytest.approx(per_block / 4, rel=0.1)
 
 
-def test_rounding_of_a_plain_sky_says_nothing_of_the_noise_elsewhere(rng):
-    """A sum of equal samples, rounded the same in all pixels of a render: fully correlated, and 1e-7."""
+def test_rounding_of_a_plain_sky_does_not_affect_the_inflation(rng):
+    """A sum of equal samples has the same rounding in all pixels of a render: noise of 1e-7, fully correlated."""
 
     def side(sky):
         pixels = 0.6 + 0.05 * rng.normal(size=(4, 64, 64, 1))
@@ -170,13 +170,13 @@ def test_rounding_of_a_plain_sky_says_nothing_of_the_noise_elsewhere(rng):
     quiet = side(1e-7)
     assert quiet.inflation().factor > 10
     assert quiet.inflation(1e-3).factor == pytest.approx(1, abs=0.6)
-    assert side(1e-3).inflation(1e-3).factor > 10  # noise that could matter counts, correlated as it is
+    assert side(1e-3).inflation(1e-3).factor > 10  # larger correlated noise is not ignored
 
 
 # Pixels ------------------------------------------------------------------------------------------------------------
 
 
-def test_the_bound_of_the_pixels_is_the_one_derived():
+def test_the_p_value_of_pixels_is_the_derived_bound():
     sums = pixel_statistics.sums(*full(1.0, 0.75, 4.0, 0.25, shape=(1, 4, 1)), 4)
     assert (sums.total.item(), sums.squares.item()) == pytest.approx((4 * 8, 4 * 64))
     for least, correlated, p in (
@@ -189,17 +189,17 @@ def test_the_bound_of_the_pixels_is_the_one_derived():
         assert sums.p(*full(4.0, float(least)), correlated).item() == pytest.approx(p)
 
 
-def test_light_that_one_render_found_alone_is_no_difference():
-    """(h/n)² less its variance is 0. Its rounding, the same in all 256 pixels, must not add up to S = 16."""
+def test_light_that_only_one_render_found_is_no_difference():
+    """u = (h/n)² less its variance is 0. Its rounding, the same in all 256 pixels, must not add up to S = 16."""
     for value, count in itertools.product((1.0, 0.7, 1e-5), range(2, 10)):
         black, lit = (x.astype(np.float32) for x in full(0.0, value, shape=(16, 16, 1)))
         dark, one = [black] * count, [lit, *[black] * (count - 1)]
-        for sides in ((dark, one), (one[::-1], dark)):  # of equal counts: no other estimate
+        for sides in ((dark, one), (one[::-1], dark)):  # equal counts, so variances are not exchanged
             assert from_renders(*sides, 16).pixels.p(*full(256.0, 0.0), Inflation()).item() == 1
 
 
 @pytest.mark.parametrize(("lag", "factor"), [((2, 0), 2), ((0, 2), 2), ((1, -2), 2), ((3, 0), 1), ((0, 3), 1)])
-def test_pixels_count_as_neighbours_up_to_two_apart(lag, factor, rng):
+def test_pixels_correlate_up_to_a_distance_of_two(lag, factor, rng):
     """w(x) + w(x + h) has ρ = ½ at ±h, so that F = 2."""
     noise = rng.standard_normal((512, 512, 1))
     estimate = inflation(noise + np.roll(noise, lag, (0, 1)), np.full(noise.shape, 2.0), 16)
@@ -207,7 +207,7 @@ def test_pixels_count_as_neighbours_up_to_two_apart(lag, factor, rng):
     assert estimate.freedom == 512**2 / 25  # squares of 5 pixels
 
 
-def test_the_correlation_of_a_filter_is_seen_beside_a_smooth_difference(rng):
+def test_inflation_of_a_filter_is_estimated_beside_a_smooth_difference(rng):
     """F is (Σ w)²/Σ w² along each axis, and 1 for independent pixels."""
     noise, variance = rng.standard_normal((256, 256, 3)), np.ones((256, 256, 3))
     expected = 1 / np.square(gaussian_filter(np.eye(1, 101, 50)[0], 0.5)).sum() ** 2
@@ -215,7 +215,7 @@ def test_the_correlation_of_a_filter_is_seen_beside_a_smooth_difference(rng):
     for offset in (0.0, 0.5 * np.sin(np.arange(256) / 40)[:, None, None]):
         assert inflation(noise + offset, variance, 16).factor == pytest.approx(1.0, abs=0.1)
         assert inflation(wide + offset, variance / expected, 16).factor == pytest.approx(expected, rel=0.1)
-    half = (np.arange(256) < 128)[None, :, None]  # a hundred times as bright, and independent: every tile counts alike
+    half = (np.arange(256) < 128)[None, :, None]  # independent and a hundred times as bright, but weighted equally
     mixed = inflation(np.where(half, 100 * noise, wide), np.where(half, 1e4, variance / expected), 16)
     assert mixed.factor == pytest.approx((1 + expected) / 2, rel=0.1)
     assert inflation(0 * noise, variance, 16).factor == inflation(noise[:11], variance[:11], 16).factor == 1
@@ -225,7 +225,7 @@ def test_the_correlation_of_a_filter_is_seen_beside_a_smooth_difference(rng):
 
 
 def exponential(rng, share, n, m, known):
-    """A pair of n and m samples of light that one in 1/`share` finds, and the true variance of one side."""
+    """A pair of n and m samples of light that a `share` of samples finds, with the true variance of side `known`."""
     mean = 0.2 + np.linspace(0, 1, 32)[None, :, None] * np.ones((32, 32, 3))
     hits = [rng.binomial(spp, share, mean.shape) for spp in (n, m)]
     sides = [
@@ -238,7 +238,7 @@ def exponential(rng, share, n, m, known):
 
 
 def pair_of(draw, *first, **how):
-    """Draws both sides, the second with the last arguments of the first, or with its own."""
+    """A function that draws both sides, with arguments for each side, or the same ones for both."""
     return lambda rng: [draw(rng, *arguments, **how) for arguments in (first if len(first) == 2 else first * 2)]
 
 
@@ -258,8 +258,8 @@ NULLS = {
 
 
 @pytest.mark.parametrize("name", NULLS)
-def test_equal_images_are_called_different_no_more_often_than_stated(name):
-    """At a family error of 5 %; more alarms than allowed have a probability of 1e-4, in any of these cases of 1e-3."""
+def test_the_rate_of_false_alarms_is_at_most_the_family_error(name):
+    """At a family error of 5 %. More alarms than allowed have a probability of 1e-4 in a case, 1e-3 in any case."""
     count, draw = NULLS[name]
     options = {"tile": 8, "family_error": 0.05, "equivalence_margin": 0.0, "resolution": 9.0}
     seeds = np.random.SeedSequence([90, *name.encode()]).spawn(count)
@@ -269,8 +269,8 @@ def test_equal_images_are_called_different_no_more_often_than_stated(name):
 
 @pytest.mark.parametrize("deviation", [2.0, 3.0])
 @pytest.mark.parametrize("named", ["filter_radius", "filter_area"])
-def test_wide_filters_make_no_false_alarms(deviation, named):
-    """Two or more alarms of 15 at 0.1 % have probability 1e-4; 1.05 times what is promised is missed in 1 % at most."""
+def test_wide_filters_cause_no_false_alarms(deviation, named):
+    """Two or more alarms of 15 at 0.1 % have the probability 1e-4; 1.05 × the minimum is missed in at most 1 %."""
     how = {"shape": SHAPE, named: 4 * deviation if named == "filter_radius" else 4 * np.pi * deviation**2}
     alarms = missed = 0
     for rng in map(np.random.default_rng, range(15)):
@@ -283,31 +283,31 @@ def test_wide_filters_make_no_false_alarms(deviation, named):
     assert named == "filter_radius" or result.minimum_detectable < 0.25  # of 0.1 under a box
 
 
-def test_the_filter_says_whether_pixels_share_samples():
-    """Variances of filtered pixels need not be those of passes, and those of passes need no filter.
+def test_the_filter_of_the_header_decides_whether_pixels_share_samples():
+    """Variances of filtered pixels may be those of samples, and variances of passes may be without a filter.
 
-    Where the variance is one of samples and no filter is named, the correlation of pixels must not count twice.
+    If the variance is one of samples and the header names no filter, pixels are independent.
     """
     rng = np.random.default_rng(32)
     sides = [passes(rng, 0.5) for _ in range(2)]
     of_samples = {"mi_refract:variance_freedom": PASSES * PER_PASS - 1}
 
-    def promised(sides=sides, **header):
-        named = [replace(side, metadata=side.metadata | header) for side in sides]
-        return auto(*named, resolution=9.0).minimum_detectable
+    def detectable(sides=sides, **header):
+        with_header = [replace(side, metadata=side.metadata | header) for side in sides]
+        return auto(*with_header, resolution=9.0).minimum_detectable
 
     wide, box = ({"mi_refract:filter_radius": x} for x in (2.0, 0.5))
-    assert promised(**wide) == promised() > 1.3 * promised(**box)
-    assert promised(**wide, **of_samples) > 1.3 * promised(**box, **of_samples)
+    assert detectable(**wide) == detectable() > 1.3 * detectable(**box)
+    assert detectable(**wide, **of_samples) > 1.3 * detectable(**box, **of_samples)
     for known in (sides, [sides[0], bare(sides[1])], [bare(sides[0]), sides[1]]):
-        assert promised(known) > 1.3 * promised(known, **of_samples)
+        assert detectable(known) > 1.3 * detectable(known, **of_samples)
 
 
 # Sides of different numbers of samples --------------------------------------------------------------------------------
 
 
 def lit(rng, samples, base, probability, gain=1.0):
-    """A film of samples of Γ(4) noise around `base`, to which one in 1/`probability` adds 200; with its variance."""
+    """A film with its variance, of samples of Γ(4) noise around `base`; a sample adds 200 with this `probability`."""
     shape = (64, 64, 1)
     hits = rng.binomial(samples, probability, shape)
     plain = base * rng.gamma(4 * samples, 1 / (4 * samples), shape)
@@ -317,7 +317,7 @@ def lit(rng, samples, base, probability, gain=1.0):
 
 
 def lit_renders(rng, count, samples, *light):
-    # Two that hold one hit each, in the same pixel, would be the same image, as no real ones are.
+    # The gains differ slightly, because two renders with one hit each in the same pixel would be identical.
     return [bare(lit(rng, samples, *light, 1 + 1e-6 * i)) for i in range(count)]
 
 
@@ -326,7 +326,7 @@ RARE = {
     "films": lambda rng, light: (lit(rng, 1024, *light), lit(rng, 16, *light)),
     "renders": lambda rng, light: (lit_renders(rng, 64, 4, *light), lit_renders(rng, 4, 4, *light)),
     "renders of other counts": lambda rng, light: (lit_renders(rng, 8, 256, *light), lit_renders(rng, 8, 4, *light)),
-    # The side that does not know its noise has 4096 samples; the other has seen a few of its events.
+    # The side without variance has 4096 samples; the other has found a few of the events.
     "one variance": lambda rng, light: (lit(rng, 16, 1.0, 1e-3), bare(lit(rng, 4096, 1.0, 1e-3))),
 }
 
@@ -335,8 +335,8 @@ RARE = {
     "form, light",
     [*itertools.product([*RARE][:3], (FIREFLIES, LAMP, SMALLER_LAMP)), ("one variance", None)],
 )
-def test_rare_light_that_one_side_missed_is_no_difference(form, light):
-    """At 0.1 % two or more alarms of 10 pairs have probability 4.5e-5, of any of these cases below 1e-3."""
+def test_rare_light_that_one_side_missed_causes_no_alarm(form, light):
+    """At 0.1 % two or more alarms of 10 pairs have the probability 4.5e-5 in a case, below 1e-3 in any case."""
     alarms = 0
     for seed in range(10):
         sides = RARE[form](np.random.default_rng(seed), light)
@@ -350,8 +350,8 @@ def test_rare_light_that_one_side_missed_is_no_difference(form, light):
 @pytest.mark.parametrize(
     "counts, whose", [((65536, 16), "of the new image"), ((64, 64), "a side"), ((32, 64), "a side")]
 )
-def test_as_many_samples_as_it_says_decide(counts, whose):
-    """Twice the number shows 5 % in so many tiles; half of it does not."""
+def test_the_suggested_number_of_samples_decides(counts, whose):
+    """Twice the number detects 5 % in enough tiles; half of it does not."""
     rng, options = np.random.default_rng(4), {"tile": 4, "hidden": 0.0}
     result = auto(*(lit(rng, count, 1.0, 0.0) for count in counts), **options)
     words = re.search(
@@ -366,7 +366,7 @@ def test_as_many_samples_as_it_says_decide(counts, whose):
         assert auto(*sides, **options).verdict is verdict
 
 
-POWER = {  # with the deviation of the difference of the means of a tile of 64 pixels; a filter makes it √2.4 as large
+POWER = {  # standard deviation of the difference of the means of a tile of 64 pixels; a filter multiplies it by √2.4
     "renders": (0.3 * np.sqrt(2 / 6) / 8, pair_of(renders, (6,), **STACK)),
     "passes": (np.sqrt(2 / 32) / 8, pair_of(passes, ())),
     "filtered passes": (np.sqrt(2.4 * 2 / 32) / 8, pair_of(passes, (0.5,))),
@@ -375,20 +375,20 @@ POWER = {  # with the deviation of the difference of the means of a tile of 64 p
 
 
 @pytest.mark.parametrize(("deviation", "draw"), POWER.values(), ids=POWER)
-def test_a_difference_above_the_promised_one_is_seen(deviation, draw):
-    """One tile that is brighter by 1.05 times what an equal image prints: missed in 1 % at 1, so 4 of 40 in 7e-4.
+def test_differences_above_the_minimum_detectable_one_are_detected(deviation, draw):
+    """One tile is brighter by 1.05 times the minimum of an equal image, which is missed in 1 %; 4 of 40: in 7e-4.
 
-    Promised is what is missed at 4.4 σ, the level of 0.001 in some 80 tests, in 1 %: 2.3 σ more.
+    The minimum is 2.3 σ (1 % missed) above the alarm level of 4.4 σ, which is that of 0.001 in some 80 tests.
     """
     rng, how, missed = np.random.default_rng(20), {"tile": 8, "resolution": 9.0, "pixels": "no"}, 0
     for _ in range(40):
         reference, test = draw(rng)
-        promised = welch(reference, test, **how).minimum_detectable
+        minimum = welch(reference, test, **how).minimum_detectable
         for image in test if isinstance(test, list) else [test]:
-            image.pixels[8:16, 8:16, 0] *= 1 + 1.05 * promised
+            image.pixels[8:16, 8:16, 0] *= 1 + 1.05 * minimum
         result = welch(reference, test, **how)
         missed += result.verdict is not DIFFERENT
-    assert missed <= 3 and promised < 7.5 * deviation
+    assert missed <= 3 and minimum < 7.5 * deviation
     strongest = np.unravel_index(np.abs(result.maps["t"]).argmax(), result.maps["t"].shape)
     assert (strongest[0] // 8, strongest[1] // 8, strongest[2]) == (1, 1, 0)
     assert result.maps["q"][10, 10] < 0.01 < result.maps["q"][0, 0]
@@ -397,12 +397,12 @@ def test_a_difference_above_the_promised_one_is_seen(deviation, draw):
 # Verdicts ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_gain_too_small_for_a_tile_is_seen_in_the_whole_image(rng):
+def test_a_gain_too_small_for_a_tile_is_detected_in_the_whole_image(rng):
     sides = renders(rng, 8, deviation=0.3), renders(rng, 8, 1.02, deviation=0.3)
     result = welch(*sides, tile=4)
     assert result.minimum_detectable > 0.1 and np.abs(result.maps["t"]).max() < 5
     assert result.verdict is DIFFERENT
-    assert welch(*sides, equivalence_margin=0.05).verdict is not DIFFERENT  # a margin hides on purpose
+    assert welch(*sides, equivalence_margin=0.05).verdict is not DIFFERENT  # within the margin
     large = welch(*sides, tile=10**30)  # the whole image
     assert large.maps["t"].shape == SHAPE and large.metrics == welch(*sides, tile=64).metrics
     noisy = welch(renders(rng, 2, deviation=2.0), renders(rng, 2, deviation=2.0))
@@ -423,22 +423,23 @@ def test_a_gain_too_small_for_a_tile_is_seen_in_the_whole_image(rng):
     ],
     ids=["a tile", "everywhere", "in the corner"],
 )
-def test_where_and_how_much_is_said(rng, part, gain, words, noise):
+def test_the_reason_names_the_worst_tile_and_its_change(rng, part, gain, words, noise):
     sides = [renders(rng, 6, shape=(70, 80, 3), deviation=noise) for _ in range(2)]
     for image in sides[1]:
         image.pixels[part][..., 0] *= gain
     result = welch(*([replace(image, origin=(100, 5)) for image in side] for side in sides))
-    words = words if noise else words.replace("the whole image", "the 16 × 16 pixels around .*")  # of tiles alone
+    if not noise:  # only single tiles are tested
+        words = words.replace("the whole image", "the 16 × 16 pixels around .*")
     assert result.verdict is DIFFERENT and re.match(words, result.reason), result.reason
     assert re.search(r"; \d+ of \d+ tests differ: ", result.reason)
 
 
-def test_what_moves_within_a_tile_and_what_was_black_are_told_as_such(rng):
+def test_the_reason_for_changes_within_a_tile_and_for_black_references(rng):
     sides = [renders(rng, 6, deviation=0.05) for _ in range(2)]
     for image in sides[1]:
         image.pixels[:16:2, :16, 1] *= 1.2
         image.pixels[1:16:2, :16, 1] *= 0.8
-    words = "other pixels of G in the 16 × 16 pixels around (8, 8), the mean of which is the same within the noise; "
+    words = "different pixels of G in the 16 × 16 pixels around (8, 8), with the same mean within the noise; "
     assert welch(*sides).reason.startswith(words)
     for image in sides[0]:
         image.pixels[16:32, :16, 2] = 0
@@ -449,14 +450,14 @@ def test_what_moves_within_a_tile_and_what_was_black_are_told_as_such(rng):
     "size, gain, options, verdict, share",
     [
         (64, 1.0, {"family_error": 1e-5}, INCONCLUSIVE, 0.25),
-        (64, 0.9, {"family_error": 1e-5}, INCONCLUSIVE, 0.25),  # too dark, hidden by its own noise
+        (64, 0.9, {"family_error": 1e-5}, INCONCLUSIVE, 0.25),  # darker, hidden by the noise
         (24, 1.0, {}, EQUAL, 9 / 256),
         (24, 1.0, {"hidden": 0.03}, INCONCLUSIVE, 9 / 256),
         (0, 1.0, {}, EQUAL, 0),
     ],
 )
-def test_a_noisy_part_is_counted_where_the_median_tile_is_quiet(size, gain, options, verdict, share):
-    """Of 16 × 16 tiles of a gray image the first `size`² pixels are noisy, and as bright as `gain`."""
+def test_the_share_of_noisy_tiles_is_reported_if_the_median_tile_is_quiet(size, gain, options, verdict, share):
+    """In a gray image of 16 × 16 tiles, the first `size`² pixels are noisy, with the brightness `gain`."""
     rng = np.random.default_rng(3)
 
     def side(gain):
@@ -482,16 +483,16 @@ def test_a_tile_with_the_noise_of_one_pixel_is_flagged(rng):
     assert welch(*sides).verdict is INCONCLUSIVE
 
 
-def test_the_same_seed_twice_is_an_error(rng):
+def test_the_same_render_twice_is_an_error(rng):
     side = renders(rng, 3)
     with pytest.raises(ValueError, match=r"b\.exr: the same image as a\.exr; expected independent renders"):
         welch([*side, replace(side[0], path=Path("b.exr"))], renders(rng, 4))
-    black = [of(0 * side[0].pixels)] * 2  # one that finds no light is no mistake
+    black = [of(0 * side[0].pixels)] * 2  # renders that find no light may be identical
     assert welch([*black, *side], renders(rng, 4)).verdict is not EQUAL
 
 
 @pytest.mark.parametrize("scale", ["a lamp", "a channel"])
-def test_what_is_much_brighter_hides_nothing(scale, rng):
+def test_a_much_brighter_tile_or_channel_hides_no_difference(scale, rng):
     sides = [[of(np.dstack([x.pixels, 1e6 * x.pixels[..., 0]]), tuple("RGBZ")) for x in renders(rng, 8)] for _ in "ab"]
     if scale == "a lamp":
         for image in itertools.chain(*sides):
@@ -512,12 +513,12 @@ INSIDE = {
 
 @pytest.mark.parametrize("what", INSIDE)
 @pytest.mark.parametrize("variance", [False, True])
-def test_what_moves_within_the_tiles_is_seen_in_noise(what, variance, rng):
+def test_changes_within_tiles_are_detected_in_noise(what, variance, rng):
     """The means of all tiles are about the same."""
 
     def side(pixels):
-        drawn = pixels * skewed(rng, (16 if variance else 8, *SHAPE), 0.1)
-        return film(drawn.mean(0), drawn.var(0, ddof=1), spp=16) if variance else [of(x) for x in drawn]
+        samples = pixels * skewed(rng, (16 if variance else 8, *SHAPE), 0.1)
+        return film(samples.mean(0), samples.var(0, ddof=1), spp=16) if variance else [of(x) for x in samples]
 
     one, two = INSIDE[what]
     result = welch(side(one), side(two))
@@ -525,16 +526,17 @@ def test_what_moves_within_the_tiles_is_seen_in_noise(what, variance, rng):
     assert welch(side(one), side(one)).verdict is EQUAL
     if what == "stripes inverted":
         assert metric(result, "tests of tiles and channels that differ") == 0
-        part = one.copy()
-        part[16:32, 32:48, 1] = two[16:32, 32:48, 1]
-        assert welch(side(one), side(part)).verdict is DIFFERENT
-        assert welch(side(one), side(part), pixels="no").verdict is EQUAL
+        in_one_tile = one.copy()
+        in_one_tile[16:32, 32:48, 1] = two[16:32, 32:48, 1]
+        assert welch(side(one), side(in_one_tile)).verdict is DIFFERENT
+        assert welch(side(one), side(in_one_tile), pixels="no").verdict is EQUAL
 
 
 # Without noise -------------------------------------------------------------------------------------------------------
 
 
-def some(pixels, value):
+def with_pixels(pixels, value):
+    """An alpha of 1, except for so many pixels."""
     alpha = np.ones(SHAPE[:2])
     alpha[0, :pixels] = value
     return alpha
@@ -548,11 +550,11 @@ def some(pixels, value):
         (1.0005, EQUAL),  # within the margin
         (1.005, INCONCLUSIVE),  # within ten times the margin
         (1.02, DIFFERENT),
-        (some(5, 0), INCONCLUSIVE),  # 7⁻⁵ = 6e-5 is no alarm
-        (some(7, 0), DIFFERENT),  # 7⁻⁷ = 1e-6 is one of 0.001 in some hundred tests
+        (with_pixels(5, 0), INCONCLUSIVE),  # 7⁻⁵ = 6e-5 is no alarm
+        (with_pixels(7, 0), DIFFERENT),  # 7⁻⁷ = 1e-6 is an alarm at 0.001 in some hundred tests
     ],
 )
-def test_a_channel_without_noise_and_an_image_without(alpha, verdict, rng):
+def test_changes_of_channels_and_images_without_noise(alpha, verdict, rng):
     alphas = [np.broadcast_to(x, SHAPE[:2]) for x in (1.0, alpha)]
     sides = [[of(np.dstack([x.pixels, values])) for x in renders(rng, 8)] for values in alphas]
     result = welch(*sides)
@@ -565,24 +567,24 @@ def test_a_channel_without_noise_and_an_image_without(alpha, verdict, rng):
         assert metric(result, "tiles without noise that differ") == 16
 
 
-def test_without_noise_what_moves_within_a_tile_is_seen():
+def test_changes_within_tiles_are_detected_without_noise():
     board = np.where(np.indices((32, 32)).sum(0) % 2, 1.0, 0.5)[..., None] * np.ones(3)
     for pixels, verdict in ((board, EQUAL), (np.roll(board, 1, 1), DIFFERENT)):
         assert welch([of(board)] * 3, [of(pixels)] * 3).verdict is verdict
 
 
-# The variance of one side alone ------------------------------------------------------------------------------------
+# The variance of one side only -------------------------------------------------------------------------------------
 
 
 def beside(pixels, variance=None):
-    """An image whose variances come from a file."""
+    """An image whose variances are in a separate file."""
     image = of(pixels)
-    known = {} if variance is None else dict(zip(image.channels, np.moveaxis(variance, -1, 0), strict=True))
-    return replace(image, variances=known)
+    variances = {} if variance is None else dict(zip(image.channels, np.moveaxis(variance, -1, 0), strict=True))
+    return replace(image, variances=variances)
 
 
-def test_what_no_sample_of_the_reference_found_is_evidence_by_how_many_it_had():
-    """All n samples have one value, one of m others does not: k such pixels by chance once in (1 + (n − 1)/m)ᵏ."""
+def test_values_that_no_reference_sample_has_are_evidence_by_its_samples():
+    """All n samples have one value, and not all m others: k such pixels have the probability (1 + (n − 1)/m)⁻ᵏ."""
     pixels = np.ones((16, 16, 1))
     for k, verdict in ((1, INCONCLUSIVE), (2, INCONCLUSIVE), (3, DIFFERENT)):  # 11⁻² > 0.001 > 11⁻³
         wrong = pixels.copy()
@@ -594,10 +596,10 @@ def test_what_no_sample_of_the_reference_found_is_evidence_by_how_many_it_had():
 @pytest.mark.parametrize(
     ("count", "verdict"), [(1, INCONCLUSIVE), (8, INCONCLUSIVE), (64, DIFFERENT), (256, DIFFERENT)]
 )
-def test_rare_events_are_no_evidence_against_a_side_that_does_not_know_its_noise(count, verdict):
-    """A tile of 5.5 σ where σ is a quarter of the mean: so are a few paths that find a lamp, but not 64 of them.
+def test_rare_events_of_a_side_without_variance_are_no_evidence(count, verdict):
+    """A tile differs by 5.5 σ, with σ a quarter of the mean. A few paths that find a lamp can explain it, 64 cannot.
 
-    The other side is brighter in `count` pixels alone, by 5.5/`count` σ of the tile each.
+    The other side is brighter only in `count` pixels, by 5.5/`count` σ of the tile each.
     """
     mean, variance = full(1.0, 256 * 1000 * 0.25**2, shape=(16, 16, 1))
     far = mean.copy()
@@ -610,8 +612,8 @@ def test_rare_events_are_no_evidence_against_a_side_that_does_not_know_its_noise
 
 
 @pytest.mark.parametrize(("count", "verdict"), [(1, INCONCLUSIVE), (3, INCONCLUSIVE), (4, DIFFERENT), (16, DIFFERENT)])
-def test_a_tile_whose_noise_comes_from_fewer_than_four_pixels_is_no_evidence(count, verdict):
-    """`count` pixels have all the variance of a tile, nearly all on one side, and differ by 30 standard errors."""
+def test_tiles_whose_noise_comes_from_fewer_than_four_pixels_are_no_evidence(count, verdict):
+    """`count` pixels have nearly all the variance of a tile, on one side, and differ by 30 standard errors."""
     mean, variance = full(1.0, 1e-9, shape=(16, 16, 1))
     variance.flat[:count] = 1.0
     other = mean.copy()
@@ -622,8 +624,8 @@ def test_a_tile_whose_noise_comes_from_fewer_than_four_pixels_is_no_evidence(cou
 
 
 @pytest.mark.parametrize(("samples", "verdict"), [(15_000, INCONCLUSIVE), (16_000, DIFFERENT)])
-def test_the_noise_of_a_side_is_well_known_by_16_times_the_samples_of_the_other(samples, verdict):
-    """Here 16 pixels are brighter by 0.7 σ of the tile each."""
+def test_noise_is_well_known_with_16_times_the_samples_of_the_other_side(samples, verdict):
+    """16 pixels are brighter by 0.7 σ of the tile each."""
     mean, variance = full(1.0, 256 * 1000 * 0.25**2, shape=(16, 16, 1))
     far = mean.copy()
     far.flat[::16] += 2.75 * 16
@@ -642,7 +644,7 @@ def test_stacks_of_renders(rng):
     local[:, :16, 16:, 1] *= 1 + 2 * detectable
     assert compare_stacks(reference, local, 16, 1e-3).alarms == 1
     edge = test[:, :20, :20].copy()
-    edge[:, 17:, 17:] *= 2  # which fills no tile
+    edge[:, 17:, 17:] *= 2  # in a tile that is not full
     assert compare_stacks(reference[:, :20, :20], edge, 16, 1e-3).alarms == 3
     test[0, 3, 4, 0] = np.nan
     assert compare_stacks(test, test, 16, 1e-3).alarms > 0
@@ -661,7 +663,7 @@ def test_stacks_of_renders(rng):
         assert compare_stacks(*stacks, 16, 1e-3, 1e-5).alarms == alarms
 
 
-def test_relative_mse_leaves_out_the_references_own_noise(rng):
+def test_relative_mse_subtracts_the_noise_of_the_references(rng):
     references, image = skewed(rng, (32, 32, 32, 3)), skewed(rng, (32, 32, 3))
     expected = 0.3**2 / 1.01
     assert relative_mse(image, references) == pytest.approx(expected, rel=0.15)

@@ -1,4 +1,4 @@
-"""What becomes of errors and of the text of others: one line, exit code 2, and nothing that steers a terminal."""
+"""Errors are one line with exit code 2, and text from other sources is sanitised."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mi_refract import cli
 from mi_refract.io.errors import exit_code
 from mi_refract.io.text import MARK, json_text, printable, printable_lines
 
-ENVIRONMENT = processes.ENVIRONMENT | {"PYTHONUNBUFFERED": ""}  # what a test prints waits, as it does for most users
+ENVIRONMENT = processes.ENVIRONMENT | {"PYTHONUNBUFFERED": ""}  # stdout is buffered, as usual
 
 
 def raises(error):
@@ -33,14 +33,14 @@ def deep():
 
 
 @pytest.mark.parametrize(
-    ("body", "code", "said"),
+    ("body", "code", "message"),
     [(lambda verdict=verdict: verdict, verdict or 0, "") for verdict in (0, 1, 3, None)]
     + [(raises(error), code, "") for error, code in ((KeyboardInterrupt(), 130), (SystemExit(3), 3), (SystemExit(), 0))]
     + [
         (raises(ValueError("size = 0;\n  expected 1 or more")), 2, "it: size = 0; expected 1 or more"),
         (raises(OSError("folder: not writable")), 2, "it: folder: not writable"),
         (raises(FileNotFoundError(2, "No such file or directory", "a.exr")), 2, "it: a.exr: No such file or directory"),
-        (raises(BrokenPipeError(32, "Broken pipe")), 2, "it: Broken pipe"),  # of a pipe of another program
+        (raises(BrokenPipeError(32, "Broken pipe")), 2, "it: Broken pipe"),  # not of stdout
         (raises(OSError(28, "No space left on device")), 2, "it: No space left on device"),
         (raises(ModuleNotFoundError("No module named 'scipy'")), 2, "it: No module named 'scipy'"),
         (raises(MemoryError()), 2, "it: out of memory"),
@@ -51,34 +51,34 @@ def deep():
         (raises(ValueError(f"{NAME}; expected another name")), 2, "it: "),
     ],
 )
-def test_a_verdict_is_the_exit_code_and_anything_else_is_2_and_one_line(body, code, said, capsys):
+def test_exit_codes_and_one_line_per_error(body, code, message, capsys):
     assert exit_code("it", body) == code
     err = capsys.readouterr().err
-    assert err.startswith(said) and len(err.splitlines()) == bool(said) and not shows_more_than_text(err)
+    assert err.startswith(message) and len(err.splitlines()) == bool(message) and not shows_more_than_text(err)
 
 
-def test_the_traceback_is_printed_where_it_is_asked_for(capsys, monkeypatch):
+def test_the_traceback_is_printed_on_request(capsys, monkeypatch):
     monkeypatch.setenv("MI_REFRACT_TRACEBACK", "1")
     assert exit_code("it", raises(KeyError("x"))) == 2
     err = capsys.readouterr().err
     assert err.startswith("Traceback") and "raise error\nKeyError: 'x'\nit: internal error" in err
 
 
-def test_what_a_terminal_cannot_print_is_escaped(monkeypatch):
-    paper = io.BytesIO()
-    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(paper, "ascii", errors="strict"))
+def test_characters_that_stdout_cannot_encode_are_escaped(monkeypatch):
+    output = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(output, "ascii", errors="strict"))
     assert exit_code("it", lambda: print("5 × \udcff")) == 0
-    assert paper.getvalue() == b"5 \\xd7 \\udcff\n"
+    assert output.getvalue() == b"5 \\xd7 \\udcff\n"
 
 
 # Streams --------------------------------------------------------------------------------------------------------------
 
 OWN = "from mi_refract.io.errors import exit_code\nexit(exit_code('it', lambda: {}))"
-# No file takes the number of a closed stream; and what cannot be written is not the exit code of an error.
+# Prints the number of the first opened file, which must not be that of a closed stream.
 NUMBER = OWN.format("os.write(1, bytes([48 + os.open('/dev/null', os.O_RDONLY)])) and None")
 INDEX = "it: internal error: IndexError: list index out of range (MI_REFRACT_TRACEBACK=1 shows where)"
 SAID = OWN.format("print('x') or {}")
-# What the command is, how the shell connects it, its exit code, and what is left to read.
+# Each case: code or the names of images to compare, redirections of the shell, exit code, stdout, stderr.
 CASES = {
     "equal, stdout closed": (SAID.format(0), ">&-", 0, "", ""),
     "different, stdout closed": (SAID.format(1), ">&-", 1, "", ""),
@@ -108,20 +108,20 @@ def images(tmp_path_factory):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_streams_that_are_closed_full_or_not_read(case, images):
-    chosen, connected, code, out, said = CASES[case]
+def test_closed_full_and_unread_streams(case, images):
+    chosen, redirections, code, out, err = CASES[case]
     words = ["-c", chosen] if len(chosen) > 2 else ["-m", "mi_refract.cli", "diff", *(images[x] for x in chosen)]
-    # The reader of the pipe has gone before the command prints.
-    command = ["bash", "-c", f'set -o pipefail; "$@" {connected}', "bash", sys.executable, *map(str, words)]
+    # With a pipe, its reader ends before the command prints.
+    command = ["bash", "-c", f'set -o pipefail; "$@" {redirections}', "bash", sys.executable, *map(str, words)]
     environment = ENVIRONMENT | {"PYTHONUNBUFFERED": "1"} if case.startswith("unbuffered") else ENVIRONMENT
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stdout, done.stderr.strip()) == (code, out, said)
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert (run.returncode, run.stdout, run.stderr.strip()) == (code, out, err)
 
 
-# The text of others ---------------------------------------------------------------------------------------------------
+# Text from other sources ----------------------------------------------------------------------------------------------
 
 
-def test_printable_keeps_text_and_nothing_else():
+def test_printable_replaces_hidden_characters_and_keeps_text():
     evil, shown = "a\nb\x1b[31m\udcff\uffff\u2028\u202e<>&\x85", "a?b?[31m????<>&?"
     assert printable(evil) == shown.replace("?", MARK)
     text = "Σ × 10⁻³ — «glass» 日本 🙂 👩\u200d🚀 می\u200cخواهم a: b :: c # ## [x] #[y] C:\\x"
@@ -132,38 +132,38 @@ def test_printable_keeps_text_and_nothing_else():
 @pytest.mark.parametrize(
     "hidden", [BIDI, CONTROLS, "\udcff\ud800", "\u2028\u2029", "\ufeff\u200b\u2060\xad", "\U000e0041"]
 )
-def test_what_is_not_seen_is_marked(hidden):
+def test_hidden_characters_are_replaced(hidden):
     assert printable(hidden) == MARK * len(hidden)
     lines = printable_lines(f"a{hidden}\nb")
     assert lines.split("\n")[-1] == "b" and len(lines) == len(hidden) + 3
 
 
-def test_every_control_and_every_format_character_but_the_joiners_and_signs_is_marked():
-    """Of Unicode's category Cf those that are seen stay (signs of Arabic, Syriac, Kaithi, shorthand, hieroglyphs)."""
-    kept = {c for c in map(chr, range(0x110000)) if unicodedata.category(c) in ("Cc", "Cf", "Cs", "Zl", "Zp")}
-    kept = {c for c in kept if printable(c) != MARK}
-    assert {"\u200c", "\u200d"} < kept
-    signs = {c for c in kept if ord(c) in range(0x110BD, 0x1BCA4) or 0x13430 <= ord(c) < 0x13440}
-    assert {c for c in kept if ord(c) > 0x200D or ord(c) < 0x600} == signs
+def test_all_control_and_format_characters_except_joiners_and_signs_are_replaced():
+    """Visible characters of Unicode's category Cf are kept: signs of Arabic, Syriac, Kaithi, shorthand, hieroglyphs."""
+    controls = {c for c in map(chr, range(0x110000)) if unicodedata.category(c) in ("Cc", "Cf", "Cs", "Zl", "Zp")}
+    unchanged = {c for c in controls if printable(c) != MARK}
+    assert {"\u200c", "\u200d"} < unchanged
+    signs = {c for c in unchanged if ord(c) in range(0x110BD, 0x1BCA4) or 0x13430 <= ord(c) < 0x13440}
+    assert {c for c in unchanged if ord(c) > 0x200D or ord(c) < 0x600} == signs
 
 
 COMMANDS = ["##[error]x", "a ##[set-env name=X]b", "###[group]", "##vso[task.x]", "::error::x", " \t::stop-commands::x"]
 
 
 @pytest.mark.parametrize("text", [*COMMANDS, "\xa0::x"])
-def test_no_runner_takes_it_for_a_command(text):
-    shown = printable(text)
-    assert not shows_more_than_text(shown) and "##[" not in shown
-    assert printable(shown) == shown and len(shown) == len(text)
+def test_commands_to_ci_runners_are_broken(text):
+    sanitised = printable(text)
+    assert not shows_more_than_text(sanitised) and "##[" not in sanitised
+    assert printable(sanitised) == sanitised and len(sanitised) == len(text)
 
 
 @pytest.mark.parametrize("indent", [None, 2])
-def test_json_holds_every_string_and_shows_none_of_it(indent):
+def test_json_text_keeps_all_strings_and_is_safe_to_print(indent):
     value = {NAME: [NAME, "###[x]", "a##", CONTROLS, {"b": "##vso[x]"}], "###": 1.5}
     text = json_text(value, indent)
     assert json.loads(text) == value
     assert text.isascii() and not shows_more_than_text(text) and "##" not in text
     with pytest.raises(ValueError):
         json_text([float("nan")])
-    for path in Path(cli.__file__).parent.glob("*.py"):  # no command prints JSON by itself
+    for path in Path(cli.__file__).parent.glob("*.py"):  # all commands print JSON with `json_text`
         assert "json.dumps" not in path.read_text(), path

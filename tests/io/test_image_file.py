@@ -1,4 +1,4 @@
-"""Images in files: EXR round trips, every format that is read, and bad files, each of which is one line; pixels."""
+"""Images in files: EXR round trips, other formats, errors of bad files; and arithmetic on pixels."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from mi_refract.io.image_file import (
 )
 
 PIXELS = np.random.default_rng(1).random((48, 40, 3)).astype(np.float32)
-# Values that a detour over half floats, clamping or a colour transform would change.
+# Values that conversion to half floats, clamping or a colour transform would change.
 HARD = np.array([[[0.1, -2.5, 1e20], [np.inf, 1e-30, 3]], [[1, np.nan, 65505], [4, 5, 6]], [[7, 8, 9], [0, -0.0, 1]]])
 
 
 def save(path, pixels, kind="float", unassociated=False, **attributes):
-    """An image by OpenImageIO; `unassociated`: colours are not multiplied by alpha."""
+    """Write an image with OpenImageIO; `unassociated`: colours are not multiplied by alpha."""
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
     if unassociated:
         spec.attribute("oiio:UnassociatedAlpha", 1)
@@ -43,10 +43,10 @@ def save(path, pixels, kind="float", unassociated=False, **attributes):
     return path
 
 
-# EXR files that we write ----------------------------------------------------------------------------------------------
+# Writing EXR files ----------------------------------------------------------------------------------------------------
 
 
-def test_what_is_written_is_read(tmp_path):
+def test_written_exr_files_are_read_back_unchanged(tmp_path):
     metadata = {"mi_refract:scene": "a b/ü.xml", "mi_refract:spp": 7, "mi_refract:seconds": 0.25, "Software": "us"}
     write_exr(tmp_path / "a.exr", HARD, metadata=metadata | {"mi_refract:seed": 2**32 - 1})
     pixels, header = read_exr(tmp_path / "a.exr")
@@ -70,7 +70,7 @@ def test_what_is_written_is_read(tmp_path):
     + [("a.png", {}, ValueError, "a.png"), ("folder.exr", {}, IsADirectoryError, "folder.exr"),
        ("none/a.exr", {}, NotADirectoryError, "none/a.exr"), ("file/a.exr", {}, NotADirectoryError, "file/a.exr")],
 )  # fmt: skip
-def test_what_cannot_be_written(tmp_path, name, options, error, message):
+def test_invalid_images_and_paths_are_not_written(tmp_path, name, options, error, message):
     (tmp_path / "folder.exr").mkdir()
     (tmp_path / "file").touch()
     with pytest.raises(error, match=message):
@@ -80,7 +80,7 @@ def test_what_cannot_be_written(tmp_path, name, options, error, message):
 
 @pytest.mark.parametrize("side", [4, 400], ids=["within a buffer", "beyond it"])
 def test_a_full_disk_keeps_the_old_file(tmp_path, side):
-    """For which a limit on the size of files stands."""
+    """A limit on the size of files replaces a full disk."""
     path, limits = tmp_path / "a.exr", resource.getrlimit(resource.RLIMIT_FSIZE)
     path.write_text("old")
     resource.setrlimit(resource.RLIMIT_FSIZE, (200, limits[1]))
@@ -106,8 +106,8 @@ def test_formats(tmp_path, name, kind, error):
     assert image_file.count_values(tmp_path / name) == PIXELS.size
 
 
-def test_windows_alpha_and_wide_numbers_are_kept(tmp_path):
-    """And no colour is multiplied by alpha."""
+def test_windows_unassociated_alpha_and_wide_numbers_are_kept(tmp_path):
+    """Colours are not multiplied by alpha."""
     assert read(save(tmp_path / "a.exr", PIXELS, x=-3, y=5)).origin == (-3, 5)
     pixels = np.dstack([PIXELS, np.zeros((48, 40))]).astype(np.float32)
     save(tmp_path / "a.png", pixels, "uint8", unassociated=True)
@@ -139,10 +139,10 @@ def deep(path):
 
 
 def window(path, x, y):
-    """An EXR whose header says another data window."""
+    """Write an EXR whose header has another data window."""
     data = bytearray(save(path, PIXELS).read_bytes())
-    begin = data.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
-    data[begin : begin + 16] = struct.pack("<4i", 0, 0, x, y)
+    start = data.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
+    data[start : start + 16] = struct.pack("<4i", 0, 0, x, y)
     path.write_bytes(data)
 
 
@@ -164,7 +164,7 @@ BAD = {
     "black.null": lambda path: path.write_text("read as black, whatever it holds"),
     "pipe.exr": os.mkfifo,
     "header.tif": lambda path: path.write_bytes(b"II*\0\x08\0\0\0"),
-    "one row.tif": lambda path: save(path, np.ones((1, 4, 3)), "double"),  # OpenImageIO reads what lay in memory
+    "one row.tif": lambda path: save(path, np.ones((1, 4, 3)), "double"),  # OpenImageIO reads uninitialised memory
     "cmyk.psd": lambda path: path.write_bytes(struct.pack(">4sH6xHIIHH14x", b"8BPS", 1, 4, 1, 1, 8, 4) + bytes(4)),
     "a\udcff.exr": lambda path: save(path.with_name("a.exr"), PIXELS).rename(path),
 }
@@ -177,7 +177,7 @@ BAD |= {f"truncated {keep}.exr": lambda path, keep=keep: cut(save(path, PIXELS),
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_files_are_one_line_that_names_them(tmp_path, name):
+def test_errors_of_bad_files_are_one_line_with_the_path(tmp_path, name):
     path = tmp_path / name
     BAD[name](path)
     before = oiio.get_int_attribute("limits:imagesize_MB")
@@ -192,9 +192,9 @@ def test_bad_files_are_one_line_that_names_them(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.png", "a.tif", "a.gif", "a.jp2", "a.jxl", "jp2 as.png", "gif as.exr"])
-def test_the_size_is_asked_of_the_header(tmp_path, name):
-    """Of a file that ends after its header: what is read of the rest would be an error of its own."""
-    side = 592  # more than 1 MiB, in which OpenImageIO counts
+def test_the_size_is_checked_in_the_header(tmp_path, name):
+    """In a truncated file, so that reading pixels would be another error."""
+    side = 592  # more than 1 MiB, the unit of OpenImageIO's limit
     path = tmp_path / f"a.{name[:3]}" if " " in name else tmp_path / name
     save(path, np.zeros((side, side, 3), np.uint8), "uint8")
     path = path.rename(tmp_path / name)
@@ -206,8 +206,8 @@ def test_the_size_is_asked_of_the_header(tmp_path, name):
         read(path)
 
 
-def test_as_many_values_as_are_allowed_are_read(tmp_path):
-    """Of the widest numbers, 2 MiB: OpenImageIO counts bytes."""
+def test_images_with_exactly_the_allowed_number_of_values_are_read(tmp_path):
+    """Also with the widest numbers, because OpenImageIO's limit is in bytes."""
     pixels = np.zeros((300, 300, 3))
     path = save(tmp_path / "a.tif", pixels, "double")
     assert read(path, pixels.size).pixels.shape == pixels.shape
@@ -215,8 +215,8 @@ def test_as_many_values_as_are_allowed_are_read(tmp_path):
         read(path, pixels.size - 1)
 
 
-def test_twice_as_many_pages_take_twice_as_many_steps(tmp_path):
-    """Python's own, counted one by one."""
+def test_reading_pages_takes_linear_time(tmp_path):
+    """Measured by the number of Python's opcodes."""
     spec, steps = oiio.ImageSpec(1, 1, 1, "uint8"), 0
 
     def count(frame, event, _):
@@ -227,8 +227,8 @@ def test_twice_as_many_pages_take_twice_as_many_steps(tmp_path):
         steps += event == "opcode"
         return count
 
-    taken = []
-    for pages in (100, 100, 200):  # the first is not counted whole by every Python
+    counts = []
+    for pages in (100, 100, 200):  # some versions of Python do not count all opcodes of the first run
         output = oiio.ImageOutput.create("a.tif")
         for number in range(pages):
             assert output.open(str(tmp_path / "a.tif"), spec, "AppendSubimage" if number else "Create")
@@ -236,14 +236,14 @@ def test_twice_as_many_pages_take_twice_as_many_steps(tmp_path):
         output.close()
         before, steps = sys.gettrace(), 0
         sys.settrace(count)
-        found = image_file.read_parts(tmp_path / "a.tif")
+        images = image_file.read_parts(tmp_path / "a.tif")
         sys.settrace(before)
-        assert len(found) == pages
-        taken.append(steps)
-    assert taken[1] < taken[2] < 2.1 * taken[1]
+        assert len(images) == pages
+        counts.append(steps)
+    assert counts[1] < counts[2] < 2.1 * counts[1]
 
 
-def test_what_the_system_does_not_give(tmp_path):
+def test_missing_files_and_folders_are_os_errors(tmp_path):
     for reader in (read, read_exr):
         with pytest.raises(FileNotFoundError, match=r"none\.exr"):
             reader(tmp_path / "none.exr")
@@ -254,13 +254,13 @@ def test_what_the_system_does_not_give(tmp_path):
 # Pixels ---------------------------------------------------------------------------------------------------------------
 
 
-def test_the_srgb_curve_is_that_of_the_standard():
+def test_the_srgb_curve():
     linear = np.array([0.0, 0.001, 0.0031308, 0.214, 0.5, 1.0])
     assert srgb_encode(linear) == pytest.approx([0.0, 0.01292, 0.04045, 0.5, 0.735357, 1.0], abs=1e-4)
     assert srgb_decode(srgb_encode(linear)) == pytest.approx(linear, rel=1e-6)
 
 
-def test_blocks_at_the_edge_are_of_what_is_left():
+def test_blocks_at_the_edges_may_be_smaller():
     pixels = np.random.default_rng(3).random((2, 7, 5, 3))
     sums, means = block_sum(pixels, 4), block_mean(pixels[0], 4)
     assert sums.shape == (2, 2, 2, 3)
@@ -272,7 +272,7 @@ def test_blocks_at_the_edge_are_of_what_is_left():
 
 @pytest.mark.parametrize("channels", [0, 1, 2, 3, 4, 8, 9, 40])
 @pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
-def test_any_channel(channels, share):
+def test_any_channel_agrees_with_numpy(channels, share):
     flags = np.random.default_rng(channels).random((6, 7, channels)) < share
     assert np.array_equal(any_channel(flags), flags.any(-1))
     assert any_channel(flags[0]).shape == (7,)

@@ -1,4 +1,4 @@
-"""Another program ends when it should, with all that it started, and says no more than it may."""
+"""Other programs end with all processes that they started, after a timeout, a signal, or too much output."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from support.processes import until
 from mi_refract.io import process_group
 from mi_refract.io.errors import TooMuchOutputError
 
-# Leaves its number in a file, and sleeps.
+# Writes its process id to a file, and sleeps.
 SLEEPER = 'echo $$ > "$0.part"; mv "$0.part" "$0"; exec sleep 600'
 
 
 def alive(pid):
-    """Whether it runs; a killed one may wait for whoever collects it."""
+    """Whether the process is running; a zombie is not."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
@@ -31,18 +31,18 @@ def shell(text, *arguments):
     return ["sh", "-c", text, *map(str, arguments)]
 
 
-def test_what_goes_in_and_what_comes_out():
-    given = os.urandom(300_000)  # more than a pipe holds, both ways at once
-    ended = process_group.run(shell("cat; echo said >&2; exit 3"), given, 60, keep_stderr=True)
-    assert (ended.status, ended.out, ended.said) == (3, given, b"said\n")
-    many = 2**31 + 1  # more than Linux writes at a time; zeros that nobody has touched take no memory
-    assert int(process_group.run(["wc", "-c"], bytes(many), 60).out) == many
-    assert process_group.run(["true"], given, 60).out == b""
-    assert process_group.run(shell("exec <&-; sleep 0.1; echo x"), given, 60).out == b"x\n"
+def test_stdin_stdout_stderr_and_status():
+    content = os.urandom(300_000)  # larger than the buffers of both pipes
+    ended = process_group.run(shell("cat; echo said >&2; exit 3"), content, 60, keep_stderr=True)
+    assert (ended.status, ended.out, ended.err) == (3, content, b"said\n")
+    size = 2**31 + 1  # more than Linux writes at a time; zeros that are never written take no memory
+    assert int(process_group.run(["wc", "-c"], bytes(size), 60).out) == size
+    assert process_group.run(["true"], content, 60).out == b""
+    assert process_group.run(shell("exec <&-; sleep 0.1; echo x"), content, 60).out == b"x\n"
 
 
 @pytest.mark.parametrize("stream", ["1", "2"])
-def test_more_than_it_may_say(tmp_path, stream):
+def test_a_program_that_prints_too_much_is_ended(tmp_path, stream):
     endless = f'echo $$ > "$0"; while :; do echo yyyyyyyyyyyyyyyyyyyyyyyyyyyyyyyy >&{stream}; done'
     with pytest.raises(TooMuchOutputError, match="more than 20000 bytes"):
         process_group.run(shell(endless, tmp_path / "pid"), b"", 60, keep_stderr=True, most=20_000)
@@ -51,13 +51,13 @@ def test_more_than_it_may_say(tmp_path, stream):
 
 
 @pytest.mark.parametrize("timeout", [float("nan"), float("inf"), -1, 1e9])
-def test_a_timeout_that_is_no_time(timeout):
+def test_invalid_timeouts_are_errors(timeout):
     with pytest.raises(ValueError, match=r"expected 0 … 604800 s"):
         process_group.run(["true"], b"", timeout)
 
 
-@pytest.mark.parametrize("text", ["sleep 600", "exec >&-; sleep 600"], ids=["that holds stdout", "that closed it"])
-def test_a_timeout_ends_it(text):
+@pytest.mark.parametrize("text", ["sleep 600", "exec >&-; sleep 600"], ids=["stdout open", "stdout closed"])
+def test_a_program_is_ended_after_the_timeout(text):
     start = time.monotonic()
     with pytest.raises(TimeoutError, match=r"did not end within 0\.2 s"):
         process_group.run(shell(text), b"", 0.2)
@@ -68,30 +68,30 @@ PARENT = f"""
 import signal, sys
 from mi_refract.io import process_group
 from mi_refract.io.errors import TooMuchOutputError
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell ignore SIGINT
 for number in (signal.SIGTERM, signal.SIGHUP):
     signal.signal(number, signal.SIG_DFL)
 process_group.run(["sh", "-c", {SLEEPER!r}, sys.argv[1]], b"", 600)
 """
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="asks /proc who runs")
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
-def test_a_signal_to_us_ends_it_too(tmp_path, number):
-    """And has its usual effect on us."""
-    us = subprocess.Popen([sys.executable, "-c", PARENT, tmp_path / "pid"], stderr=subprocess.DEVNULL)
+def test_a_signal_to_the_caller_ends_the_program(tmp_path, number):
+    """And has its usual effect on the caller."""
+    caller = subprocess.Popen([sys.executable, "-c", PARENT, tmp_path / "pid"], stderr=subprocess.DEVNULL)
     try:
         until((tmp_path / "pid").exists)
-        us.send_signal(number)
-        assert us.wait(60) in (-number, 128 + number)
+        caller.send_signal(number)
+        assert caller.wait(60) in (-number, 128 + number)
     finally:
-        us.kill()
-        us.wait()
+        caller.kill()
+        caller.wait()
     assert not alive(int((tmp_path / "pid").read_text()))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_that_the_caller_handles_is_left_to_him(number):
+def test_signals_that_the_caller_handles_are_not_changed(number):
     before = signal.signal(number, signal.SIG_IGN)
     try:
         assert process_group.run(shell("kill -$1 $PPID; echo x", "", int(number)), b"", 60).out == b"x\n"

@@ -1,4 +1,4 @@
-"""Files and folders are replaced whole or not at all, read only as far as they go; a lock says who holds it."""
+"""Files and folders are replaced completely or not at all; temporary folders; locks; reading with a limit."""
 
 import errno
 import fcntl
@@ -21,7 +21,7 @@ from mi_refract.ray_sets import files, ray_set
 
 
 @pytest.mark.parametrize("step", ["write_bytes", "replace"])
-def test_a_failed_write_leaves_the_old_file_alone(step, tmp_path, monkeypatch):
+def test_a_failed_write_keeps_the_old_file(step, tmp_path, monkeypatch):
     path = tmp_path / "file"
     write_atomically(path, "old")
 
@@ -46,8 +46,8 @@ with temporary_folder() as folder:
 """
 
 
-def test_a_temporary_folder_whose_process_was_killed_is_removed_by_the_next_one(tmp_path, monkeypatch):
-    """That of a living process stays, and so does what only looks like one, or another host's."""
+def test_temporary_folders_of_killed_processes_are_removed(tmp_path, monkeypatch):
+    """Those of running processes and of other hosts remain, and other files and folders with similar names."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     others = [
         tmp_path / name for name in ("mi_refract_results", "mi_refract-1.part", "mi_refract-00000000-12345678.part")
@@ -55,20 +55,20 @@ def test_a_temporary_folder_whose_process_was_killed_is_removed_by_the_next_one(
     for other in others:
         other.mkdir()
     with python(HOLDING, TMPDIR=str(tmp_path)) as living, python(HOLDING, TMPDIR=str(tmp_path)) as killed:
-        kept, left = (Path(process.stdout.readline().strip()) for process in (living, killed))
+        locked, abandoned = (Path(process.stdout.readline().strip()) for process in (living, killed))
         killed.kill()
         killed.wait()
-        assert (left / "half").exists()
-        link, file = (left.with_stem(f"{left.stem}_{kind}") for kind in ("link", "file"))
+        assert (abandoned / "half").exists()
+        link, file = (abandoned.with_stem(f"{abandoned.stem}_{kind}") for kind in ("link", "file"))
         link.symlink_to(tmp_path)
         file.touch()
         with safe_files.temporary_folder() as folder:
-            assert {*tmp_path.iterdir()} == {kept, folder, link, file, *others}
+            assert {*tmp_path.iterdir()} == {locked, folder, link, file, *others}
         living.kill()
     assert not folder.exists()
 
 
-def test_a_folder_that_another_process_removes_before_it_is_locked_is_made_again(tmp_path, monkeypatch):
+def test_a_temporary_folder_removed_before_it_is_locked_is_created_again(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     real, removed = fcntl.flock, []
 
@@ -85,7 +85,7 @@ def test_a_folder_that_another_process_removes_before_it_is_locked_is_made_again
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
-def test_the_error_of_a_full_disk_names_the_file_that_did_not_fit(number, tmp_path, monkeypatch):
+def test_the_error_of_a_full_disk_names_the_file(number, tmp_path, monkeypatch):
     def full(self, content):
         raise OSError(number, "full")
 
@@ -97,7 +97,7 @@ def test_the_error_of_a_full_disk_names_the_file_that_did_not_fit(number, tmp_pa
 
 KINDS = {
     "pipe": os.mkfifo,
-    "socket": lambda path: socket.socket(socket.AF_UNIX).bind(path.name),  # a socket's name is short
+    "socket": lambda path: socket.socket(socket.AF_UNIX).bind(path.name),  # the path of a socket must be short
     "device": lambda path: path.symlink_to("/dev/null"),
     "stream": lambda path: path.symlink_to("/proc/self/fd/0"),  # to a regular file
     "folder": Path.mkdir,
@@ -107,18 +107,18 @@ KINDS = {
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 @pytest.mark.parametrize("kind", [*KINDS, "stream of a process"])
-def test_what_is_not_a_file_is_not_replaced(kind, tmp_path, monkeypatch):
+def test_pipes_devices_and_folders_are_not_replaced(kind, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "out.x" if kind in KINDS else Path("/dev/fd/1")
     KINDS.get(kind, lambda path: None)(path)
-    before = {each: each.lstat() for each in tmp_path.iterdir()}
+    before = {entry: entry.lstat() for entry in tmp_path.iterdir()}
     for write in (lambda: safe_files.writable(path, (path.suffix,)), lambda: write_atomically(path, "new")):
         with pytest.raises(OSError, match=rf"{path}: is a {kind.replace('linked ', '').split()[0]}.*; expected the"):
             write()
-    assert {each: each.lstat() for each in tmp_path.iterdir()} == before
+    assert {entry: entry.lstat() for entry in tmp_path.iterdir()} == before
 
 
-def test_a_link_to_a_file_or_to_nothing_is_replaced(tmp_path):
+def test_links_to_files_and_broken_links_are_replaced(tmp_path):
     for target in (tmp_path / "target", tmp_path / "nothing"):
         (tmp_path / "target").write_text("old")
         path = tmp_path / f"to {target.name}"
@@ -130,7 +130,7 @@ def test_a_link_to_a_file_or_to_nothing_is_replaced(tmp_path):
 
 @pytest.mark.parametrize("mode", [0o600, 0o640, 0o444, 0o700, 0o750, 0o2775, 0o555])
 @pytest.mark.parametrize("folder", [False, True])
-def test_the_mode_is_kept_and_nobody_else_may_read_meanwhile(mode, folder, tmp_path):
+def test_permissions_are_kept_during_and_after_writing(mode, folder, tmp_path):
     path = tmp_path / "out"
     path.mkdir() if folder else path.write_text("old")
     path.chmod(mode)
@@ -142,7 +142,7 @@ def test_the_mode_is_kept_and_nobody_else_may_read_meanwhile(mode, folder, tmp_p
 
 
 @pytest.mark.parametrize("folder", [False, True])
-def test_a_temporary_is_new_unguessable_and_beside_its_target(folder, tmp_path, monkeypatch):
+def test_temporary_names_are_new_random_and_beside_the_target(folder, tmp_path, monkeypatch):
     names = set()
     for _ in range(3):
         with replacing(tmp_path / "a.x", ".x", folder=folder) as temporary:
@@ -158,17 +158,17 @@ def test_a_temporary_is_new_unguessable_and_beside_its_target(folder, tmp_path, 
         pass
     assert (tmp_path / "link").is_symlink() and not [*victim.iterdir()]
     monkeypatch.undo()
-    for name in ("n" * 251 + ".txt", "é" * 120 + ".txt"):  # which leave no room for more
+    for name in ("n" * 251 + ".txt", "é" * 120 + ".txt"):  # names of nearly the maximum length
         write_atomically(tmp_path / name, "x")
         assert (tmp_path / name).read_text() == "x"
 
 
-# A text between markers, and what is packed ---------------------------------------------------------------------------
+# Text between markers -------------------------------------------------------------------------------------------------
 
 BEGIN, END = "<!-- begin: t -->", "<!-- end: t -->"
 
 
-def test_update_between_replaces_that_text_only(tmp_path):
+def test_update_between_replaces_only_the_text_between_markers(tmp_path):
     path = tmp_path / "README.md"
     path.write_bytes(b"a\r\n<!-- begin: t -->\r\nold\r\n<!-- end: t -->\r\nb\r\n")
     for _ in range(2):
@@ -178,10 +178,10 @@ def test_update_between_replaces_that_text_only(tmp_path):
 
 @pytest.mark.parametrize(
     ("document", "text", "message"),
-    [(each, "new", "expected one .*begin: t") for each in ("", BEGIN, END + BEGIN, BEGIN + BEGIN + END)]
-    + [(f"{BEGIN}\nold\n{END}\n", each, "contains its own marker") for each in (f"new\n{BEGIN}", f"{END}\nnew")],
+    [(document, "new", "expected one .*begin: t") for document in ("", BEGIN, END + BEGIN, BEGIN + BEGIN + END)]
+    + [(f"{BEGIN}\nold\n{END}\n", text, "contains its own marker") for text in (f"new\n{BEGIN}", f"{END}\nnew")],
 )
-def test_update_between_refuses_what_is_ambiguous(document, text, message, tmp_path):
+def test_update_between_refuses_ambiguous_markers(document, text, message, tmp_path):
     path = tmp_path / "README.md"
     path.write_text(document)
     with pytest.raises(ValueError, match=rf"README\.md: .*{message}"):
@@ -192,9 +192,9 @@ def test_update_between_refuses_what_is_ambiguous(document, text, message, tmp_p
 # The lock -------------------------------------------------------------------------------------------------------------
 
 
-def test_a_lock_says_who_holds_it_and_ends_with_its_process(tmp_path):
+def test_a_held_lock_names_its_holder_and_is_removed_at_the_end(tmp_path):
     path = tmp_path / "it.lock"
-    path.write_text("what a killed process left")
+    path.write_text("left by a killed process")
     with safe_files.held(path, "a run"):
         assert json.loads(path.read_text())["process"] == os.getpid()
         for content, holder in ((path.read_text(), rf"process {os.getpid()} on \S+ since \d"), ("{", "an unknown")):
@@ -206,7 +206,7 @@ def test_a_lock_says_who_holds_it_and_ends_with_its_process(tmp_path):
     assert not path.exists()
 
 
-def test_a_lock_is_not_written_through_a_link_and_keeps_nobody_out_without_locks(tmp_path, monkeypatch):
+def test_locks_do_not_follow_links_and_work_without_file_locks(tmp_path, monkeypatch):
     path, victim = tmp_path / "it.lock", tmp_path / "victim"
     victim.write_text("old")
     path.symlink_to(victim)
@@ -215,7 +215,7 @@ def test_a_lock_is_not_written_through_a_link_and_keeps_nobody_out_without_locks
     assert victim.read_text() == "old"
 
     def flock(*_):
-        raise OSError(errno.ENOSYS, "Function not implemented")  # as some file systems of networks
+        raise OSError(errno.ENOSYS, "Function not implemented")  # as on some network file systems
 
     monkeypatch.setattr(fcntl, "flock", flock)
     with safe_files.held(tmp_path / "a.lock", "a run"):
@@ -227,7 +227,7 @@ def test_a_lock_is_not_written_through_a_link_and_keeps_nobody_out_without_locks
 
 
 def peak(work):
-    """The most bytes that were allocated at once."""
+    """The maximum of the allocated bytes."""
     tracemalloc.start()
     try:
         work()
@@ -236,7 +236,7 @@ def peak(work):
         tracemalloc.stop()
 
 
-def test_the_memory_is_that_of_the_file(tmp_path):
+def test_reading_allocates_the_size_of_the_file(tmp_path):
     path, rays = tmp_path / "file", tmp_path / "rays.csv"
     path.write_bytes(b"x" * 10**6)
     assert safe_files.read_bytes(path, 2**40) == path.read_bytes()
@@ -248,15 +248,15 @@ def test_the_memory_is_that_of_the_file(tmp_path):
 
 
 @pytest.mark.parametrize("size", [0, 1, 2**20, 2**20 + 1])
-def test_a_file_that_grows_meanwhile_is_read_up_to_the_limit(size, tmp_path, monkeypatch):
+def test_a_growing_file_is_read_up_to_the_limit(size, tmp_path, monkeypatch):
     path = tmp_path / "file"
     path.write_bytes(bytes(size))
-    small = path.stat()
+    initial = path.stat()
 
     def grow(file):
-        with path.open("ab") as more:
-            more.write(b"x" * 2**21)
-        return small
+        with path.open("ab") as appended:
+            appended.write(b"x" * 2**21)
+        return initial
 
     monkeypatch.setattr(safe_files.os, "fstat", grow)
     assert safe_files.read_bytes(path, 2**23).rstrip(b"x") == bytes(size)

@@ -1,4 +1,4 @@
-"""Errors of tables that users write: one line with the path of the key, what it is, and what was expected."""
+"""Errors of tables that users write: one line with the path of the key, its value, and what was expected."""
 
 from typing import Annotated, Any, Literal
 
@@ -57,7 +57,7 @@ class Room(msgspec.Struct, forbid_unknown_fields=True):
     ],
 )
 def test_errors_say_what_was_expected(table: dict[str, Any], expected: str) -> None:
-    for _ in range(100):  # msgspec 0.22 frees a wrong pointer of some unions, which shows when it is done often
-        with pytest.raises(ValueError) as error:  # the whole text is compared
+    for _ in range(100):  # msgspec 0.22 frees a wrong pointer of some unions, which shows after many calls
+        with pytest.raises(ValueError) as error:
             convert(table, Room, "room.toml")
         assert str(error.value) == f"room.toml: {expected}"

@@ -1,5 +1,5 @@
-"""Indices of materials: formulas against the same ones for single numbers, catalogues and materials against what was
-printed elsewhere, and the one line that a scene gets for anything else."""
+"""Indices of materials: formulas against the same ones for single numbers, catalogues and materials against published
+values, and errors of one line for anything else."""
 
 import math
 import re
@@ -56,8 +56,8 @@ def spec(request):
 # Formulas --------------------------------------------------------------------------------------------------------
 
 
-def test_the_index_is_that_of_the_formula(spec):
-    """Of floats, and of arrays of numpy, which keep their shape."""
+def test_the_index_equals_the_formula(spec):
+    """For floats, and for numpy arrays, which keep their shape."""
     wavelengths = np.array([[410.0, 500.0, 505.0], [587.5618, 700.0, 899.0]])
     expected = np.array([[CLOSED[spec](w) for w in row] for row in wavelengths])
     np.testing.assert_allclose(medium(spec).index(wavelengths), expected, rtol=4e-16)
@@ -77,69 +77,69 @@ def test_arrays_of_drjit_are_evaluated_in_double_precision(spec, setting):
 
 def test_drjit_differentiates_in_the_wavelength_and_the_coefficients(spec, vectorised):
     """Against central differences, between the knots of the table."""
-    found = medium(spec)
+    glass = medium(spec)
     wide = dr.float64_array_t(dr.diff_array_t(dr.value_t(vectorised.vector)))
     for at in (450.0, 620.0):
-        w, c = wide(at), {name: wide(value) for name, value in found.coefficients.items()}
+        w, c = wide(at), {name: wide(value) for name, value in glass.coefficients.items()}
         dr.enable_grad(w, *c.values())
-        dr.backward(found.index(w, c))
+        dr.backward(glass.index(w, c))
         slope = (CLOSED[spec](at + 1e-3) - CLOSED[spec](at - 1e-3)) / 2e-3
         assert dr.grad(w)[0] == pytest.approx(slope, rel=1e-6, abs=1e-12)
-        for name, value in found.coefficients.items():
+        for name, value in glass.coefficients.items():
             step = 1e-5 * abs(value)
-            ends = [found.index(at, {name: value + sign * step}) for sign in (1, -1)]
+            ends = [glass.index(at, {name: value + sign * step}) for sign in (1, -1)]
             assert dr.grad(c[name])[0] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-5, abs=1e-10), name
 
 
-def test_of_a_table_each_knot_is_its_own_value():
-    """Also of knots that agree to nine digits."""
+def test_a_table_has_its_values_at_its_knots():
+    """Also for knots that agree in nine digits."""
     assert [media.index(TABLE, w) for w in (400.0, 500.0, 900.0)] == [1.53, 1.52, 1.5]
     close = math.nextafter(500.0, 600)
-    found = media.parse(f"table(400: 1.5, 500: 1.5, {close!r}: 1.6, 600: 1.7)")
-    assert [found.index(w) for w in (400.0, 450.0, 500.0, close, 600.0)] == [1.5, 1.5, 1.5, 1.6, 1.7]
-    assert len(found.coefficients) == 4
+    material = media.parse(f"table(400: 1.5, 500: 1.5, {close!r}: 1.6, 600: 1.7)")
+    assert [material.index(w) for w in (400.0, 450.0, 500.0, close, 600.0)] == [1.5, 1.5, 1.5, 1.6, 1.7]
+    assert len(material.coefficients) == 4
 
 
 def test_a_table_of_many_knots_is_searched_in_a_small_kernel(vectorised):
-    """Exactly: 1000 knots take 10 steps, not 1000."""
+    """The search is exact, and takes 10 steps for 1000 knots."""
     number, counts = dr.value_t(vectorised.vector), []
     for count in (4, 1000):
         knots = np.linspace(400, 800, count)
         indices = 1.5 + np.sin(knots) / 9
         pairs = zip(knots.tolist(), indices.tolist(), strict=True)
-        found = media.parse("table(" + ", ".join(f"{w!r}: {n!r}" for w, n in pairs) + ")")
+        material = media.parse("table(" + ", ".join(f"{w!r}: {n!r}" for w, n in pairs) + ")")
         at = np.linspace(400, 800, 5000).astype(np.float32)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            n = found.index(number(at))
+            n = material.index(number(at))
             dr.eval(n)
             counts.append(max(kernel.get("operation_count", 0) for kernel in dr.kernel_history()))
         expected = np.interp(at.astype(np.float64), knots, indices)
         np.testing.assert_allclose(np.array(n), expected, rtol=4e-16)
-        np.testing.assert_allclose(found.index(at), expected, rtol=4e-16)
+        np.testing.assert_allclose(material.index(at), expected, rtol=4e-16)
     assert counts[1] < 5 * counts[0]
 
 
 def test_a_value_of_a_table_may_differ_from_lane_to_lane(vectorised):
     number = dr.float64_array_t(dr.value_t(vectorised.vector))
     values = {"n_500": number(1.52, 1.6, 1.7)}
-    found = media.parse(TABLE).index(number(500, 500, 450), values)
-    np.testing.assert_allclose(found, [1.52, 1.6, (1.53 + 1.7) / 2], rtol=4e-16)
+    material = media.parse(TABLE).index(number(500, 500, 450), values)
+    np.testing.assert_allclose(material, [1.52, 1.6, (1.53 + 1.7) / 2], rtol=4e-16)
 
 
 @pytest.mark.parametrize("wavelength", [399.0, 901.0, math.nan, math.inf, -500.0, 0.0])
-def test_outside_its_range_a_medium_has_no_index(wavelength, vectorised):
-    found = media.parse("table(400: 1.53, 900: 1.5)")
-    for asked in (wavelength, np.array([500.0, wavelength])):
+def test_a_medium_has_no_index_outside_its_range(wavelength, vectorised):
+    material = media.parse("table(400: 1.53, 900: 1.5)")
+    for wavelengths in (wavelength, np.array([500.0, wavelength])):
         with pytest.raises(ValueError, match=r"no index at .* nm; expected a wavelength from 400 to 900 nm") as error:
-            found.index(asked)
+            material.index(wavelengths)
         assert "\n" not in str(error.value)
-    lanes = np.array(found.index(dr.value_t(vectorised.vector)(500.0, wavelength)))
+    lanes = np.array(material.index(dr.value_t(vectorised.vector)(500.0, wavelength)))
     assert np.isfinite(lanes[0]) and np.isnan(lanes[1])
-    assert math.isnan(found.index_or_nan(wavelength))
-    assert found.index(400.0) == 1.53 and found.index(900.0) == 1.5
+    assert math.isnan(material.index_or_nan(wavelength))
+    assert material.index(400.0) == 1.53 and material.index(900.0) == 1.5
 
 
-# What a scene may say --------------------------------------------------------------------------------------------
+# Invalid specifications ------------------------------------------------------------------------------------------
 
 BAD = {
     "cauchy(1.5, nan)": r"expected cauchy\(A, B, …\), λ in nm, up to 8, finite numbers",
@@ -164,8 +164,8 @@ BAD = {
     "table(0.4: 1.53, 0.7: 1.51)": r"the first wavelength = 0.4; expected nm; from µm write table_um\(…\)",
     "table_um(400: 1.53, 700: 1.51)": r"the first wavelength = 400; expected µm; from nm write table\(…\)",
     "hold(table(400: 1.53))": "two or more wavelengths",
-    "N-BK7": "unknown material; a glass has its maker's name: SCHOTT:N-BK7$",
-    "s-bsl7": "its maker's name: OHARA:S-BSL 7$",
+    "N-BK7": "unknown material; a glass needs the name of its manufacturer: SCHOTT:N-BK7$",
+    "s-bsl7": "the name of its manufacturer: OHARA:S-BSL 7$",
     "nan": "expected a positive finite number, or a material's name",
     "-1.5": "expected a positive finite number",
     "sellmeier(1, -0.01)": "C1 = -0.01; expected nm²",
@@ -196,14 +196,14 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize(("spec", "said"), BAD.items(), ids=map(repr, BAD))
-def test_what_is_refused_is_said_in_one_line_with_the_parameter(spec, said):
-    with pytest.raises(ValueError, match=said) as error:
+@pytest.mark.parametrize(("spec", "message"), BAD.items(), ids=map(repr, BAD))
+def test_errors_are_one_line_with_the_parameter(spec, message):
+    with pytest.raises(ValueError, match=message) as error:
         media.parse(spec, "refract: int_ior")
     assert str(error.value).startswith(f"refract: int_ior = {spec!r}") and "\n" not in str(error.value)
 
 
-def test_poles_outside_the_visible_end_the_range():
+def test_poles_outside_the_visible_limit_the_range():
     assert media.parse("sellmeier_nm(1, 0.01, 200, 9000)").valid == pytest.approx((200, 9000))
     assert math.isnan(media.parse("cauchy(1, 2000)").index_or_nan(500.0, {"A": -1.0}))
 
@@ -211,15 +211,15 @@ def test_poles_outside_the_visible_end_the_range():
 def test_the_values_of_the_page(llvm_variant):
     (code,) = python_blocks(DOCS / "how-to/dispersion-and-coloured-glass.md")
     exec(code, names := {})
-    found = re.findall(r"^(.*\S)  # (1\.\d{5}|\(.*?\))", code, re.MULTILINE)
-    assert len(found) == 4
-    for text, value in found:
+    values = re.findall(r"^(.*\S)  # (1\.\d{5}|\(.*?\))", code, re.MULTILINE)
+    assert len(values) == 4
+    for text, value in values:
         assert eval(text, names) == pytest.approx(eval(value), abs=5e-6)
 
 
 @pytest.fixture
 def named(scalar_variant):
-    """Names of Mitsuba's table are its numbers."""
+    """`media.parse` in a variant where names have the numbers of Mitsuba's table."""
     assert media.index("bk7", 500.0) == media.index("bk7", 600.0) == 1.5046
     assert media.index("air", 500.0) == 1.000277
     assert not media.parse("diamond").dispersive
@@ -235,15 +235,15 @@ def in_air(n):
     return media.Medium("glass", media.parse(n).dispersion, {"n": n}, relative_to="air")
 
 
-def test_beside_a_glass_of_a_catalogue_air_has_the_index_1(named):
+def test_next_to_a_catalogue_glass_air_has_the_index_1(named):
     glass, ciddor = in_air(1.5), media.parse("AIR:ciddor")
     pairs = (glass, named("air")), (named("air"), glass), (glass, ciddor)
     assert [ratio(*pair, 500.0) for pair in pairs] == [1.5, 1 / 1.5, 1.5]
     assert ratio(in_air(1.6), glass, 500.0) == ratio(media.parse(1.6), glass, 500.0) == 1.6 / 1.5
-    assert math.isnan(ratio(glass, ciddor, 2000.0))  # where no air is known
+    assert math.isnan(ratio(glass, ciddor, 2000.0))  # outside the range of Ciddor's formula
 
 
-def test_beside_vacuum_a_glass_of_a_catalogue_has_its_index_in_vacuum(named):
+def test_next_to_vacuum_a_catalogue_glass_has_its_index_in_vacuum(named):
     """Air at 20 °C and 101325 Pa: n − 1 = 2.71800e-4 at 633 nm, between the lines of Ciddor's table."""
     glass, water, expected = in_air(1.5), media.parse("MATERIAL:water"), 1.5 * 1.00027180
     assert ratio(glass, named("vacuum"), 633.0) == pytest.approx(expected, rel=2e-8)
@@ -251,7 +251,7 @@ def test_beside_vacuum_a_glass_of_a_catalogue_has_its_index_in_vacuum(named):
     assert ratio(glass, water, 633.0) == pytest.approx(expected / water.index(633.0), rel=2e-8)
 
 
-def test_where_a_medium_has_no_index_the_ratio_is_nan():
+def test_the_ratio_is_nan_if_a_medium_has_no_index():
     table, one = media.parse(TABLE), media.parse(1.0)
     for pair in ((table, one), (one, table), (table, media.parse("AIR:ciddor"))):
         assert math.isnan(ratio(*pair, 300.0))
@@ -276,7 +276,7 @@ def test_coefficients_of_a_ratio_may_be_arrays(vectorised):
         ("MATERIAL:diamond", LINES["D"], 2.4173, 3e-4),
     ],
 )
-def test_materials_have_the_index_that_was_printed_elsewhere(name, wavelength, n, bound):
+def test_materials_have_their_published_index(name, wavelength, n, bound):
     assert media.index(name, wavelength) == pytest.approx(n, abs=bound)
     assert media.parse(name.title()) is media.parse(name)
 
@@ -298,8 +298,8 @@ def test_materials_have_the_index_that_was_printed_elsewhere(name, wavelength, n
         ("abbe(1.5168, 64.17)", 1.51680, 64.17),
     ],
 )
-def test_n_d_and_v_d_are_those_of_the_maker(glass, n_d, v_d):
-    """Within half a unit of the fifth decimal, and 1e-6."""
+def test_n_d_and_v_d_are_those_of_the_manufacturer(glass, n_d, v_d):
+    """To half a unit of the fifth decimal plus 1e-6."""
     n = {line: media.index(glass, LINES[line]) for line in "dFC"}
     assert n["d"] == pytest.approx(n_d, abs=6e-6)
     assert (n["d"] - 1) / (n["F"] - n["C"]) == pytest.approx(v_d, abs=0.06 if ":" in glass else 1e-10)
@@ -309,36 +309,36 @@ def test_n_d_and_v_d_are_those_of_the_maker(glass, n_d, v_d):
     ("glass", "low", "high"),
     [("SCHOTT:N-BK7", 290, 2500), ("SCHOTT:F2", 320, 2500), ("HOYA:FCD515", 320, 2500)],
 )
-def test_a_glass_has_an_index_where_its_maker_prints_one_or_a_transmittance_above_0(glass, low, high):
-    """Of F2 the transmittance of 10 mm at 310 nm is printed, as 0."""
+def test_the_range_of_a_glass_is_that_of_its_printed_indices_and_transmittances(glass, low, high):
+    """For F2 the printed transmittance of 10 mm at 310 nm is 0."""
     assert media.parse(glass).valid == (low, high)
     for beyond in (low - 10.0, high + 500.0):
-        said = f"{glass}: no index at {beyond:g} nm; expected a wavelength from {low} to"
-        with pytest.raises(ValueError, match=said):
+        message = f"{glass}: no index at {beyond:g} nm; expected a wavelength from {low} to"
+        with pytest.raises(ValueError, match=message):
             media.index(glass, beyond)
 
 
 @pytest.mark.parametrize(
     ("glass", "valid", "fitted", "beyond"),
     [
-        ("CDGM:D-ZF93", (400, 2400), (404, 1014), 2325.0),  # where its index is 1.9250 and the formula gives 1.9150
+        ("CDGM:D-ZF93", (400, 2400), (404, 1014), 2325.0),  # there the index is 1.9250 and the formula gives 1.9150
         ("HOYA:BSC7", (280, 1550), (365, 1014), 1530.0),
         ("SCHOTT:N-BK7", (290, 2500), (365, 2326), 334.1),
         ("OHARA:S-BSL 7", (290, 2400), (365, 2325), 2400.0),
     ],
 )
-def test_beyond_the_makers_fit_an_index_is_a_warning(glass, valid, fitted, beyond):
-    found = media.parse(glass)
-    assert (found.valid, found.fitted, found.relative_to) == (valid, fitted, "air")
+def test_an_index_outside_the_fitted_range_is_a_warning(glass, valid, fitted, beyond):
+    material = media.parse(glass)
+    assert (material.valid, material.fitted, material.relative_to) == (valid, fitted, "air")
     for inside in fitted:
-        found.index(inside)
-    said = f"{glass}: the index at {beyond:g} nm is an extrapolation; .* {fitted[0]} to {fitted[1]} nm"
-    for asked in (beyond, [fitted[0], beyond]):
-        with pytest.warns(UserWarning, match=said):
-            found.index(asked)
+        material.index(inside)
+    message = f"{glass}: the index at {beyond:g} nm is an extrapolation; .* {fitted[0]} to {fitted[1]} nm"
+    for wavelength in (beyond, [fitted[0], beyond]):
+        with pytest.warns(UserWarning, match=message):
+            material.index(wavelength)
 
 
-def test_glasses_are_named_in_any_case_and_errors_say_what_there_is():
+def test_names_of_glasses_ignore_case_and_errors_suggest_names():
     assert media.parse("schott:n-bk7").name == "SCHOTT:N-BK7"
     assert media.parse("OHARA:S-BSL7").name == media.parse("ohara: s-bsl 7").name == "OHARA:S-BSL 7"
     text = "^int_ior = 'SCHOTT:N-BK8': unknown glass; expected one of the .*nearest: SCHOTT:N-BK7, SCHOTT:[^,]+, SCHO"
@@ -401,53 +401,57 @@ FILES = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_an_index_is_read_from_a_file(name, tmp_path, vectorised):
-    """Also where the name of the folder has a colon, of UTF-16 as Zemax writes, and in Dr.Jit arrays."""
-    (folder := tmp_path / "a:b (c)").mkdir()
+def test_reading_an_index_from_a_file(name, tmp_path, vectorised):
+    """Also in a folder with a colon in its name, in UTF-16 as Zemax writes it, and for Dr.Jit arrays."""
+    folder = tmp_path / "a:b (c)"
+    folder.mkdir()
     (folder / name.partition(":")[0]).write_text(FILES[name][0], "utf-16" if name.startswith("11.agf") else "utf-8")
-    found = media.parse(f"file:{folder}/{name}")
+    material = media.parse(f"file:{folder}/{name}")
     wavelengths = [410.0, 505.0, 700.0]
     expected = [FILES[name][1](w) for w in wavelengths]
-    np.testing.assert_allclose(found.index(np.array(wavelengths)), expected, rtol=1e-14)
-    np.testing.assert_allclose(found.index(dr.value_t(vectorised.vector)(*wavelengths)), expected, rtol=1e-14)
-    assert found.valid == ((400, 900) if FILES[name][1] is interpolated else (300, 2500))
-    assert found.relative_to == ("air" if "agf" in name.lower() else "")
+    np.testing.assert_allclose(material.index(np.array(wavelengths)), expected, rtol=1e-14)
+    np.testing.assert_allclose(material.index(dr.value_t(vectorised.vector)(*wavelengths)), expected, rtol=1e-14)
+    assert material.valid == ((400, 900) if FILES[name][1] is interpolated else (300, 2500))
+    assert material.relative_to == ("air" if "agf" in name.lower() else "")
     assert media.file_in(f"hold( file:{folder}/{name})") == f"{folder}/{name.partition(':')[0]}"
 
 
 @pytest.mark.parametrize(
-    ("said", "relative"),
+    ("conditions", "relative"),
     [("SPECS:\n    n_absolute: false\n", "air"), ("CONDITIONS:\n    n_is_absolute: true\n", "vacuum"), ("", "")],
 )
-def test_k_and_the_reference_of_an_index_are_read(said, relative, tmp_path):
+def test_reading_k_and_the_reference_medium(conditions, relative, tmp_path):
     table = "  - type: tabulated k\n    data: |\n        0.4 1e-8\n        0.8 2e-8\n"
-    page = PAGE.format("formula 2", SELLMEIER_2) + table + said
+    page = PAGE.format("formula 2", SELLMEIER_2) + table + conditions
     (tmp_path / "glass.yml").write_text(page)
-    found = media.parse("file:glass.yml", find=lambda name: tmp_path / name)
-    assert (found.relative_to, found.k, found.valid) == (relative, ((400, 800), (1e-8, 2e-8)), (300, 2500))
+    material = media.parse("file:glass.yml", find=lambda name: tmp_path / name)
+    assert (material.relative_to, material.k, material.valid) == (relative, ((400, 800), (1e-8, 2e-8)), (300, 2500))
     (tmp_path / "nk.yml").write_text(NK)
     held = media.parse(f"hold(file:{tmp_path}/nk.yml)")
     assert (held.k, held.hold) == (((400, 500, 900), (1e-7, 2e-7, 3e-7)), True)
 
 
-def test_yaml_is_an_extra_that_the_error_names(tmp_path, monkeypatch):
+def test_the_error_without_yaml_names_the_extra(tmp_path, monkeypatch):
     (tmp_path / "glass.yml").write_text(NK)
     monkeypatch.setitem(sys.modules, "yaml", None)
     with pytest.raises(ImportError, match=r"YAML needs PyYAML: pip install 'mi-refract\[yaml\]'"):
         media.parse(f"file:{tmp_path}/glass.yml")
 
 
-def test_held_beyond_its_range_an_index_is_that_of_its_end_and_a_warning(vectorised):
-    found = media.parse(f"hold({TABLE})")
+def test_hold_extends_an_index_beyond_its_range_with_a_warning(vectorised):
+    material = media.parse(f"hold({TABLE})")
     with pytest.warns(UserWarning, match="the index at 390 nm is that of the end of its range, 400 to 900 nm"):
-        assert found.index(390.0) == 1.53
-    assert np.array(found.index(dr.value_t(vectorised.vector)(390, 400, 1000))).tolist() == [1.53, 1.53, 1.5]
-    assert math.isnan(found.index_or_nan(math.nan)) and math.isnan(found.index_or_nan(-1.0))
+        assert material.index(390.0) == 1.53
+    assert np.array(material.index(dr.value_t(vectorised.vector)(390, 400, 1000))).tolist() == [1.53, 1.53, 1.5]
+    assert math.isnan(material.index_or_nan(math.nan)) and math.isnan(material.index_or_nan(-1.0))
 
 
 BAD_FILES = {
     "no.csv": (None, "No such file"),
-    "a.csv": ("wl,n\n0.4,1.5\n0.5,1.5\n", "header 'wl,n'; expected nm or µm in one name, n, and optionally k"),
+    "a.csv": (
+        "wl,n\n0.4,1.5\n0.5,1.5\n",
+        "header 'wl,n'; expected a column whose name contains nm or µm, a column n, ",
+    ),
     "b.csv": ("nm,n\n400,1.5\n", "two or more"),
     "c.csv": ("nm,n\n400,x\n500,1.5\n", "expected numbers in the columns nm, n"),
     "d.csv": ("nm,n\n400,1.5\n500\n", "expected numbers"),
@@ -456,7 +460,7 @@ BAD_FILES = {
         "expected numbers in the columns nm, n, with decimal points, and no more columns",
     ),
     "e.csv": ("nm,n\n500,1.5\n400,1.5\n", "increasing"),
-    "f.csv": ("nm,n,k\n400,1.5,-1\n500,1.5,0\n", "k = -1; expected a number ≥ 0"),
+    "f.csv": ("nm,n,k\n400,1.5,-1\n500,1.5,0\n", "k = -1; expected a finite number ≥ 0"),
     "g.csv": ("nm,n\n400,15\n500,15\n", "n = 15 at 400 nm; expected up to 10"),
     "h.txt": ("", "expected a .csv, a .yml of refractiveindex.info, or a glass of a Zemax catalogue as file:NAME.agf:"),
     "a.yml": ("just: text", "expected a page of refractiveindex.info"),
@@ -469,7 +473,7 @@ BAD_FILES = {
     "e.yml": (PAGE.format("formula 2", "0 1 0.25"), "C1: n is infinite at 500 nm"),
     "f.yml": (
         "DATA:\n  - type: tabulated n\n    data: |\n        0.4 1 1 1\n        0.5\n",
-        "a table of n; expected n, k or nk, and as",
+        "a table of n; expected n, k or nk, and a number for each",
     ),
     "g.yml": (PAGE.format("formula 2", "0 1"), "2 coefficients; expected an odd number of them"),
     "a.agf": (ZEMAX, "expected a .csv"),
@@ -480,11 +484,11 @@ BAD_FILES = {
 
 
 @pytest.mark.parametrize("name", BAD_FILES)
-def test_what_a_file_lacks_is_said_in_one_line(name, tmp_path):
-    content, said = BAD_FILES[name]
+def test_errors_of_files_are_one_line(name, tmp_path):
+    content, message = BAD_FILES[name]
     if content is not None:
         (tmp_path / name.partition(":")[0]).write_text(content, "utf-8")
     with pytest.raises(ValueError) as error:
         media.parse(f"file:{tmp_path}/{name}", "int_ior")
-    assert said in str(error.value) and "\n" not in str(error.value)
+    assert message in str(error.value) and "\n" not in str(error.value)
     assert str(error.value).startswith(f"int_ior = 'file:{tmp_path}/{name}': ")

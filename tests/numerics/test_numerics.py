@@ -1,4 +1,4 @@
-"""Arithmetic on every backend and in both precisions, against rational arithmetic, and helpers around Dr.Jit arrays."""
+"""Arithmetic on every backend in both precisions, against rational arithmetic, and helpers for Dr.Jit arrays."""
 
 from fractions import Fraction
 
@@ -40,20 +40,20 @@ def number(setting):
 
 @pytest.fixture
 def drawn(setting):
-    """Triples of numbers over many magnitudes, representable in the precision; the second pairs cancel in a dot."""
-    rng, found = np.random.default_rng(11), []
+    """Pairs of vectors over many magnitudes, representable in the precision, whose dot products cancel."""
+    rng, vectors = np.random.default_rng(11), []
     for _ in range(TRIALS):
         x, y = ((rng.normal(size=3) * 2.0 ** rng.integers(-20, 20, 3)).astype(setting.precision) for _ in range(2))
         x, y = x.tolist(), y.tolist()
         y[2] = float(setting.precision(-(x[0] * y[0] + x[1] * y[1]) / x[2]))
-        found.append((x, y))
-    return found
+        vectors.append((x, y))
+    return vectors
 
 
 # Error-free transforms -----------------------------------------------------------------------------------------------
 
 
-def test_sums_and_products_lose_nothing_and_dot_and_cross_survive_cancellation(setting, number, drawn):
+def test_sums_and_products_are_exact_and_dot_and_cross_survive_cancellation(setting, number, drawn):
     third = Fraction(setting.roundoff) ** 3
     for x, y in drawn:
         (a, b), u, v = x[:2], list(map(number, x)), list(map(number, y))
@@ -74,13 +74,13 @@ def test_sums_and_products_lose_nothing_and_dot_and_cross_survive_cancellation(s
         assert exact(error_free.dot(ones, signs).hi) == Fraction(last)
 
 
-def test_double_and_triple_words_keep_their_order(setting, number, drawn):
-    second, third = (n * Fraction(setting.roundoff) ** n_th for n, n_th in ((5, 2), (100, 3)))
+def test_errors_of_double_and_triple_words(setting, number, drawn):
+    second, third = 5 * Fraction(setting.roundoff) ** 2, 100 * Fraction(setting.roundoff) ** 3
     for (a, b, c), _ in drawn:
         x, y = DoubleWord.product(number(a), number(b)), DoubleWord.product(number(c), number(a))
         fx, fy = Fraction(a) * Fraction(b), Fraction(c) * Fraction(a)
         results = (x + y, fx + fy), (x - y, fx - fy), (x * y, fx * fy), (x * number(c), fx * Fraction(c))
-        assert all(abs(value(found) - expected) <= second * abs(expected) for found, expected in results)
+        assert all(abs(value(result) - expected) <= second * abs(expected) for result, expected in results)
         square = x * x
         assert abs(value(square.sqrt()) ** 2 - value(square)) <= 4 * second * value(square)
     rng = np.random.default_rng(12)
@@ -90,16 +90,16 @@ def test_double_and_triple_words_keep_their_order(setting, number, drawn):
         k, x2, y2, fx, fy = DoubleWord.product(u[0], u[0]) - 1, x.squared(), y.squared(), value(x), value(y)
         results = (x2, fx * fx), (x2 + y2, fx * fx + fy * fy), (x2.collected(), fx * fx)
         results += (x2.times(k), fx * fx * value(k)), (x2.times(DoubleWord(u[1])), fx * fx * value((u[1], 0)))
-        assert all(abs(value(found) - expected) <= third * abs(expected) for found, expected in results)
-        larger, left = max(fx * fx, fy * fy), abs(fx * fx - fy * fy)
-        off = abs(value((x2 - y2).double()) - (fx * fx - fy * fy))
-        assert off <= third * larger + Fraction(setting.roundoff) ** 2 * left
+        assert all(abs(value(result) - expected) <= third * abs(expected) for result, expected in results)
+        larger, difference = max(fx * fx, fy * fy), fx * fx - fy * fy
+        error = abs(value((x2 - y2).double()) - difference)
+        assert error <= third * larger + Fraction(setting.roundoff) ** 2 * abs(difference)
         assert value(TripleWord(u[0]).squared()) == value((u[0], 0)) ** 2
     root = DoubleWord(number(0.0), number(0.0)).sqrt()
     assert exact(root.hi) == exact(root.lo) == 0
 
 
-def test_a_defect_that_is_small_keeps_its_digits(setting, number, drawn):
+def test_small_defects_are_accurate(setting, number, drawn):
     u1 = Fraction(setting.roundoff)
     for x, y in drawn:
         u, v = list(map(number, x)), list(map(number, y))
@@ -107,11 +107,11 @@ def test_a_defect_that_is_small_keeps_its_digits(setting, number, drawn):
         scale = sum(abs(Fraction(a) * Fraction(b)) for a, b in zip(x, y, strict=True))
         for share, expected in ((1.0, 0), (0.5, -value(target) / 2)):
             part = DoubleWord(target.hi * share, target.lo * share)
-            found = exact(error_free.defect(part, *zip(u, v, strict=True)))
-            assert abs(found - expected) <= 2 * u1 * abs(expected) + 20 * u1**2 * scale
+            defect = exact(error_free.defect(part, *zip(u, v, strict=True)))
+            assert abs(defect - expected) <= 2 * u1 * abs(expected) + 20 * u1**2 * scale
 
 
-def test_float_expansions_multiply_exactly_divide_and_regain_what_cancels():
+def test_float_expansions_multiply_divide_and_survive_cancellation():
     rng = np.random.default_rng(3)
     x, y = rng.normal(size=(2, 200)) * np.exp2(rng.integers(-30, 30, (2, 200)))
     p, e = float_expansions.two_prod(x, y)
@@ -129,10 +129,10 @@ def test_float_expansions_multiply_exactly_divide_and_regain_what_cancels():
 
 
 @pytest.mark.parametrize("as_cuda", [False, True])
-def test_compiled_sums_add_rounded_products_and_quotients_have_all_digits(vectorised, as_cuda, monkeypatch):
-    """In one kernel with what uses them: there a compiler may fuse x·y + z, and choose instructions of 20 bits.
+def test_kernels_round_products_before_sums_and_compute_accurate_quotients(vectorised, as_cuda, monkeypatch):
+    """Within one kernel, a compiler may fuse x·y + z, and choose instructions of 20 bits.
 
-    as_cuda: what is done for CUDA changes no number elsewhere.
+    as_cuda: the steps for CUDA do not change results on other backends.
     """
     if as_cuda:
         monkeypatch.setattr(dr, "backend_v", lambda x: dr.JitBackend.CUDA)
@@ -155,32 +155,32 @@ def test_compiled_sums_add_rounded_products_and_quotients_have_all_digits(vector
 
 
 @pytest.mark.parametrize("offset", range(0, 64, 8))
-def test_numbers_start_where_they_can_be_read_at_once(offset):
+def test_aligned_copies_start_at_multiples_of_64_bytes(offset):
     values = np.arange(100.0)[offset // 8 :]
     copy = aligned(values, np.dtype(np.float32))
     assert copy.ctypes.data % 64 == 0 and copy.dtype == np.float32 and (copy == values).all()
 
 
-def test_a_kernel_serves_vectors_of_any_number_and_place(vectorised):
-    number, seen = dr.value_t(vectorised.vector), set()
+def test_one_kernel_serves_arrays_of_any_size_and_address(vectorised):
+    number, hashes = dr.value_t(vectorised.vector), set()
     for count in (30, 31, 100):
         v = np.random.default_rng(count).normal(size=(count + 1, 3)).astype(vectorised.precision)[1:]
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
-            found = 2 * from_numpy(vectorised.vector, v) + from_numpy(number, v[:, 0])
-            dr.eval(found)
-            seen.add(dr.kernel_history([dr.KernelType.JIT])[0]["hash"])
-        assert (2 * v + v[:, :1] == np.array(found).T).all()
-    assert len(seen) == 1
+            result = 2 * from_numpy(vectorised.vector, v) + from_numpy(number, v[:, 0])
+            dr.eval(result)
+            hashes.add(dr.kernel_history([dr.KernelType.JIT])[0]["hash"])
+        assert (2 * v + v[:, :1] == np.array(result).T).all()
+    assert len(hashes) == 1
 
 
-def test_quotient_by_zero_raises_on_no_backend(number):
+def test_division_by_zero_raises_on_no_backend(number):
     assert np.isinf(np.array(ieee_divide(number(1.0), number(0.0)))).all()
     assert np.isnan(np.array(ieee_divide(number(0.0), number(0.0)))).all()
 
 
 @pytest.mark.parametrize("length", [1e-18, 3e-7, 1.0, 1.9999999, 2.0, 5e9, 1e18, 0.0, np.nan, np.inf, -np.inf])
-def test_lengths_are_brought_near_one_by_a_power_of_two_and_what_has_none_is_not_given_one(length, vectorised):
+def test_scaling_to_unit_length_by_a_power_of_two(length, vectorised):
     v = vectorised.vector(0.6 * length, -0.7 * length, 0.1 * length)
     dr.make_opaque(v)
     scaled, power = scale_to_unit(v)

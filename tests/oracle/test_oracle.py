@@ -1,4 +1,4 @@
-"""The oracle against a second derivation in decimals, exact cases, its decisions to the last bit, and wrong inputs."""
+"""The oracle against a second derivation in decimals, exact cases, decisions to the last bit, and invalid input."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ oracle = pytest.importorskip("mi_refract.oracle", reason="needs python-flint", e
 
 Z = np.array([[0.0, 0.0, 1.0]])
 TINY, HUGE = 5e-324, 2.0**1023
-EXACT = 2.0**-100  # what a pair of doubles is trusted with here, relative
+EXACT = 2.0**-100  # relative error allowed for a pair of doubles
 
 
 def rays(size=40):
@@ -35,18 +35,18 @@ def skimming(rng, size):
     return a, Z.repeat(size, 0), rng.uniform(0.5, 1, size)
 
 
-def least(rng, size):
-    """Directions in multiples of the least number, normals next to the largest."""
+def denormal_directions(rng, size):
+    """Directions in multiples of the smallest number, normals near the largest."""
     a, n, k = rays(size)
     return np.round(a * 1000) * TINY, n / np.abs(n).max(1, keepdims=True) * 1e307, k
 
 
-EXTREMES = {"skimming": skimming, "least": least}
+EXTREMES = {"skimming": skimming, "denormal directions": denormal_directions}
 REGIMES = [*(name for name in regimes.REGIMES if name not in ("tangential", "exactly critical")), *EXTREMES]
 
 
-def drawn(name, size):
-    """Rays of a regime, in float32 and in float64."""
+def regime_rays(name, size):
+    """Rays of a regime, half of them in float32, half in float64."""
     if name in EXTREMES:
         return EXTREMES[name](np.random.default_rng(7), size)
     parts = [regimes.make(name, size // 2, precision, seed=7) for precision in (np.float32, np.float64)]
@@ -70,7 +70,7 @@ def dot(u, v):
 
 
 def tangent_of_refraction(sine):
-    """tan θt from sin θt = tan/√(1 + tan²), which is concave: Newton climbs and never passes the root."""
+    """tan θt from sin θt = tan/√(1 + tan²), which is concave: Newton's method increases and never passes the root."""
     tan = sine
     for _ in range(400):
         step = (sine - tan / (1 + tan**2).sqrt()) * (1 + tan**2) * (1 + tan**2).sqrt()
@@ -81,7 +81,7 @@ def tangent_of_refraction(sine):
 
 
 def decimal_snell(a, n, k):
-    """Unit b, R, 1 − R, or None under total internal reflection.
+    """(unit b, R, 1 − R), or None under total internal reflection.
 
     R = (sin²(θi−θt)/sin²(θi+θt) + tan²(θi−θt)/tan²(θi+θt)) / 2
     """
@@ -108,7 +108,7 @@ def decimal_snell(a, n, k):
 
 
 def assert_is_decimal_snell(c, a, n, ratios):
-    """Every ray of `c` is the decimal answer: b within its radius and high part nearest, R and 1 − R relative."""
+    """Check every ray of `c`: b is within its radius and its high part nearest, R and 1 − R are within EXACT."""
     for i, k in enumerate(ratios):
         answer = decimal_snell(*([Decimal(v) for v in x[i].tolist()] for x in (a, n)), k)
         assert c.transmitted[i] == (answer is not None)
@@ -122,8 +122,8 @@ def assert_is_decimal_snell(c, a, n, ratios):
 
 
 @pytest.mark.parametrize("name", REGIMES)
-def test_agrees_with_newtons_method(name):
-    a, n, k = drawn(name, 60)
+def test_the_oracle_agrees_with_newtons_method(name):
+    a, n, k = regime_rays(name, 60)
     c = oracle.refract(a, n, k)
     assert c.radius.max() <= 1e-30 and not c.undecided.any()
     with localcontext() as context:
@@ -132,7 +132,7 @@ def test_agrees_with_newtons_method(name):
 
 
 @pytest.mark.parametrize("contrast", [0.5625, 1e-20, -1e-20, 1e-100, -0.999, 1e12])
-def test_contrast_is_the_exact_k2_minus_1(contrast):
+def test_contrast_is_exactly_k2_minus_1(contrast):
     a, n, _ = rays()
     c = oracle.refract(a, n, (1 + contrast) ** 0.5, contrast=contrast)
     with localcontext() as context:
@@ -141,9 +141,9 @@ def test_contrast_is_the_exact_k2_minus_1(contrast):
 
 
 @pytest.mark.parametrize("name", REGIMES)
-def test_total_reflection_is_the_sandwich_and_k_of_1_changes_nothing(name):
-    """b = −n a n/|n|², multiplied out in fractions."""
-    a, n, _ = drawn(name, 40)
+def test_total_reflection_is_the_sandwich_product_and_k_1_changes_nothing(name):
+    """b = −n a n/|n|², computed in fractions."""
+    a, n, _ = regime_rays(name, 40)
     mirrored, through = oracle.refract(a, n, 1e300), oracle.refract(a, n, 1)
     assert (~mirrored.transmitted).sum() > len(a) / 4
     assert through.transmitted.all() and (through.reflectance == 0).all() and (through.transmittance == 1).all()
@@ -152,14 +152,14 @@ def test_total_reflection_is_the_sandwich_and_k_of_1_changes_nothing(name):
         for c, factor in ((mirrored, 2), (through, 0))[bool(mirrored.transmitted[i]) :]:
             for j, b in enumerate(pairs(c.direction[i], c.direction_low[i])):
                 expected = x[j] - factor * dot(x, u) * u[j] / dot(u, u)
-                # Squares, so that |a| needs no root: |b² − m²| ≤ (|b| + |m|) radius ≤ 3 radius.
+                # Compare squares, to avoid the root in |a|: |b² − m²| ≤ (|b| + |m|) radius ≤ 3 radius.
                 assert abs(b * b - expected**2 / dot(x, x)) <= 3 * Fraction(float(c.radius[i]))
                 assert b * expected >= 0
 
 
 @pytest.mark.parametrize("name", REGIMES)
-def test_the_side_of_n_and_powers_of_two_do_not_matter(name):
-    a, n, k = drawn(name, 40)
+def test_the_side_of_n_and_powers_of_two_change_nothing(name):
+    a, n, k = regime_rays(name, 40)
     c = oracle.refract(a, n, k)
     assert same(c, oracle.refract(a, -n, k))
     assert name == "denormal" or same(c, oracle.refract(a * 8, n / 4, k))
@@ -213,7 +213,7 @@ def test_the_critical_angle_is_decided_exactly(case):
     ("a", "length", "n"),
     [([3, 4, 0], 5, [0, 0, 7]), ([1, 2, 2], 3, [2, 1, -2]), ([1e300, 0, 0], 1e300, [0, 1e300, 0])],
 )
-def test_tangential_ray_goes_on(a, length, n, k):
+def test_tangential_rays_keep_their_direction(a, length, n, k):
     a, n = np.array([a], float), np.array([n], float)
     c = oracle.refract(a, n, k)
     assert not c.transmitted[0] and np.array_equal(c.direction, a / length)
@@ -236,15 +236,15 @@ def test_tangential_ray_goes_on(a, length, n, k):
         ([1, 0, TINY], [0, 0, 1], 1 + 2.0**-52, False, 0),
     ],
 )
-def test_the_last_bit_decides(a, n, k, transmitted, side):
-    """The signs of n·a and of the radicand where 2^±2000 meet: `side` is the side of n on which b leaves."""
+def test_decisions_are_right_to_the_last_bit(a, n, k, transmitted, side):
+    """The signs of n·a and of the radicand for numbers of 2^±2000. `side`: the side of n on which b leaves."""
     a, n = np.array([a], float), np.array([n], float)
     c = oracle.refract(a, n, k)
     assert not c.undecided[0] and c.transmitted[0] == transmitted
     assert not transmitted or np.sign(c.direction[0] @ (n[0] / np.abs(n).max())) == side
 
 
-def test_contrast_decides_where_k_is_blind():
+def test_contrast_decides_if_k_rounds_to_1():
     a = np.array([[1, 0, -1e-11]])
     outcomes = [oracle.refract(a, Z, 1, contrast=e).transmitted[0] for e in (9e-23, 1.1e-22)]
     assert outcomes == [True, False]
@@ -252,8 +252,8 @@ def test_contrast_decides_where_k_is_blind():
     assert np.isnan(oracle.refract(a, Z, 1, contrast=-1.0).direction).all()
 
 
-def test_the_margin_is_exact_where_it_matters():
-    """A near tie, an exact tie, a tangential ray, a ray that is none."""
+def test_the_relative_radicand_near_and_at_the_critical_angle():
+    """An exactly critical ray, its neighbours, a tangential ray and an invalid ray."""
     a = np.array([[4, 0, -3], [4, 0, -3], [4, 0, -3], [1, 0, 0], [np.nan, 0, 1]], np.float64)
     k = np.array([1.25, np.nextafter(1.25, 2), np.nextafter(1.25, 1), 1.25, 1.25])
     margin = oracle.relative_radicand(a, Z.repeat(5, 0), k)
@@ -267,8 +267,8 @@ def test_the_margin_is_exact_where_it_matters():
 
 
 @pytest.mark.parametrize("k", [0.7, 1.0, 1.4, 30.0])
-def test_derivatives_are_quotients_of_differences(k):
-    """Of transmitted and of totally reflected rays of any length, along a and along k; of R, which is even in k."""
+def test_derivatives_agree_with_finite_differences(k):
+    """For transmitted and totally reflected rays of any length, along a and along k; also for R."""
     (a, n, _), h = rays(30), 1e-6
     along, along_k = np.random.default_rng(5).normal(size=a.shape), 0.3
 
@@ -278,7 +278,7 @@ def test_derivatives_are_quotients_of_differences(k):
 
     certified = oracle.refract(a, n, k)
     assert (~certified.transmitted).any() == (k > 1) and certified.transmitted.any() == (k < 30)
-    # Where the answer bends little within h.
+    # Only rays whose answer is nearly linear within h.
     far = (np.abs(oracle.relative_radicand(a, n, np.full(len(a), k))) > 0.01) & (certified.cos_i > 0.05)
     exact = oracle.derivatives.derivative(a, n, k, along, along_k)
     assert far.sum() > 20
@@ -291,22 +291,22 @@ def test_derivatives_are_quotients_of_differences(k):
 
 @pytest.mark.parametrize("name", ["grazing", "critical", "k ≫ 1", "matched, grazing"])
 def test_derivatives_obey_the_derivative_of_snells_law(name):
-    """With n × b = k n × a and |b| = |a|: n × b' = k' n × a + k n × a', b·b' = a·a'; mirrored, k = 1."""
-    rng, given = np.random.default_rng(4), regimes.make(name, 60, np.float64, seed=6)
-    a, n, k, e, e_k = given.a, given.n, given.k, rng.normal(size=(60, 3)), rng.normal(size=60)
-    exact, found = oracle.refract(a, n, k), oracle.derivatives.derivative(a, n, k, e, e_k)
+    """From n × b = k n × a and |b| = |a|: n × b' = k' n × a + k n × a', b·b' = a·a'; mirrored, k = 1."""
+    rng, sample = np.random.default_rng(4), regimes.make(name, 60, np.float64, seed=6)
+    a, n, k, e, e_k = sample.a, sample.n, sample.k, rng.normal(size=(60, 3)), rng.normal(size=60)
+    exact, b_prime = oracle.refract(a, n, k), oracle.derivatives.derivative(a, n, k, e, e_k)
     ratio, change = (np.where(exact.transmitted, x, y)[:, None] for x, y in ((k, 1), (e_k, 0)))
     b = exact.direction * np.linalg.norm(a, axis=1, keepdims=True)
-    size = np.maximum(1, np.linalg.norm(found, axis=1) * np.maximum(1, k))
-    across = np.cross(n, found) - change * np.cross(n, a) - ratio * np.cross(n, e)
+    size = np.maximum(1, np.linalg.norm(b_prime, axis=1) * np.maximum(1, k))
+    across = np.cross(n, b_prime) - change * np.cross(n, a) - ratio * np.cross(n, e)
     assert (np.linalg.norm(across, axis=1) <= 1e-13 * size).all()
-    assert (np.abs((b * found).sum(1) - (a * e).sum(1)) <= 1e-13 * size).all()
+    assert (np.abs((b * b_prime).sum(1) - (a * e).sum(1)) <= 1e-13 * size).all()
 
 
-def test_there_is_no_derivative_at_the_critical_angle_and_none_of_a_tangential_ray():
+def test_derivatives_are_nan_at_the_critical_angle_and_for_tangential_rays():
     a = np.array([[4.0, 0, 3.0]] * 2 + [[1.0, 0, 0]])  # k² sin² = 1 for k = 5/4
-    found = oracle.derivatives.derivative(a, Z.repeat(3, 0), np.array([1.25, 1.25 + 1e-9, 1.5]), a, 0.0)
-    assert np.isnan(found).all(1).tolist() == np.isnan(found).any(1).tolist() == [True, False, True]
+    result = oracle.derivatives.derivative(a, Z.repeat(3, 0), np.array([1.25, 1.25 + 1e-9, 1.5]), a, 0.0)
+    assert np.isnan(result).all(1).tolist() == np.isnan(result).any(1).tolist() == [True, False, True]
 
 
 # Arguments -----------------------------------------------------------------------------------------------------------
@@ -325,14 +325,14 @@ def test_invalid_rays_are_nan(bad, dtype):
     assert not c.undecided.any()
 
 
-def test_single_is_its_exact_double_and_many_rays_are_each_ray():
+def test_float32_is_exact_and_rays_do_not_affect_each_other():
     a, n = (x.astype(np.float32) for x in rays()[:2])
     c = oracle.refract(a, n, 1.5)
     assert same(c, oracle.refract(a.astype(float), n.astype(float), np.full(len(a), 1.5, np.float32)))
     assert not same(c, oracle.refract(a, n, np.nextafter(np.float32(1.5), np.float32(2))))
     a, n, k = rays(2500)
     c = oracle.refract(a, n, k)
-    a[1::2] = 0  # invalid neighbours must not shift the rest
+    a[1::2] = 0  # invalid neighbours must not affect the others
     d = oracle.refract(a, n, k, fresnel=False)
     assert np.array_equal(c.direction_low[::2], d.direction_low[::2]) and np.isnan(d.direction[1::2]).all()
     assert np.array_equal(c.cos_t[::2], d.cos_t[::2])
@@ -340,7 +340,7 @@ def test_single_is_its_exact_double_and_many_rays_are_each_ray():
     assert len(oracle.refract(a[:0], n[:0], k[:0])) == 0
 
 
-def test_the_working_precision_of_others_is_left_alone():
+def test_the_working_precision_of_flint_is_restored():
     from flint import ctx
 
     before = ctx.prec, ctx.cap
@@ -352,13 +352,13 @@ def test_the_working_precision_of_others_is_left_alone():
 @pytest.mark.parametrize(
     ("count", "progress", "terminal"), [(10**5, 1, 1), (10**5, 1, 0), (10**5, 0, 1), (10**4, 1, 1)]
 )
-def test_a_bar_is_shown_on_a_terminal_for_many_rays(count, progress, terminal, monkeypatch, capsys):
+def test_a_progress_bar_is_shown_on_a_terminal_for_many_rays(count, progress, terminal, monkeypatch, capsys):
     monkeypatch.setenv("TERM", "xterm")  # a dumb terminal shows no bar
     monkeypatch.setattr(sys.stderr, "isatty", lambda: bool(terminal))
     nothing = np.zeros((count, 3))  # invalid rays, which take no time
     assert len(oracle.refract(nothing, nothing, 1.5, progress=bool(progress))) == count
-    shown = capsys.readouterr()
-    assert ("oracle" in shown.err) == (count == 10**5 and bool(progress and terminal)) and not shown.out
+    output = capsys.readouterr()
+    assert ("oracle" in output.err) == (count == 10**5 and bool(progress and terminal)) and not output.out
 
 
 V = np.ones((5, 3))
@@ -372,22 +372,22 @@ V = np.ones((5, 3))
         *(("k is", (V, V, k)) for k in (np.ones(4), V, "1.5", 1j)),
     ],
 )
-def test_wrong_shapes_and_dtypes_are_one_line(name, arguments):
+def test_errors_of_shapes_and_dtypes_are_one_line(name, arguments):
     with pytest.raises(ValueError, match=rf"^oracle: {name} .*; expected [^\n]*$"):
         oracle.refract(*arguments)
 
 
-def test_missing_flint_says_what_to_install(monkeypatch):
+def test_the_error_without_flint_names_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "flint", None)
     spec = importlib.util.spec_from_file_location("oracle_without_flint", oracle.__file__)
     with pytest.raises(ImportError, match=r"python-flint: pip install 'mi-refract\[validation\]'$"):
         spec.loader.exec_module(importlib.util.module_from_spec(spec))
 
 
-def test_imports_nothing_of_ours():
+def test_the_oracle_imports_no_other_code_of_this_package():
     for file in Path(oracle.__file__).parent.glob("*.py"):
         tree = ast.parse(file.read_text())
         imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
         names = {getattr(node, "module", None) or alias.name for node in imports for alias in node.names}
         assert not any(name.startswith(("mi_refract", "drjit", "mitsuba")) for name in names), file
-        assert all(getattr(node, "level", 0) <= 1 for node in imports), file  # 1: its own room
+        assert all(getattr(node, "level", 0) <= 1 for node in imports), file  # 1: its own folder

@@ -1,4 +1,4 @@
-"""Figures of planar scenes: read back pixel by pixel, for what matplotlib was told to draw, and their geometry."""
+"""Figures of planar scenes: the pixels, the objects that matplotlib draws, and the geometry behind them."""
 
 from __future__ import annotations
 
@@ -28,9 +28,13 @@ CROWD = scene(ball(1.4), beam(5000, 0.999), (1, 0), view=(-3, 4, -2.5, 2.5), bra
 
 @pytest.fixture
 def drawn():
-    """`drawn(scene)`: the figure."""
+    """`drawn(scene)`: the figure of a scene."""
+
+    def draw(scene, dpi=100):
+        return drawing.build_figure(scene, follow_scene(scene), dpi)
+
     with matplotlib.rc_context(drawing.STYLE):
-        yield lambda given, dpi=100: drawing.build_figure(given, follow_scene(given), dpi)
+        yield draw
 
 
 def pixels_of(figure):
@@ -45,7 +49,7 @@ def pixel(figure, place):
 
 
 def rays_of(figure):
-    """The collection of rays, which lies over that of the boundaries."""
+    """The collection of rays, which is drawn above that of the boundaries."""
     return max(figure.axes[0].findobj(LineCollection), key=lambda c: c.zorder)
 
 
@@ -53,10 +57,10 @@ def labels_of(figure):
     return [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
 
 
-def test_the_path_is_where_it_was_traced_and_media_are_tinted_and_named(drawn):
+def test_rays_are_drawn_where_they_were_traced_and_media_are_tinted_and_labelled(drawn):
     inner = replace(SLANTED.regions[0], outline=SLAB / 2, indices=(1.25,))
-    given = replace(SLANTED, regions=(*SLANTED.regions, inner))
-    figure, paths = drawn(given), follow_scene(given)[0].paths
+    nested = replace(SLANTED, regions=(*SLANTED.regions, inner))
+    figure, paths = drawn(nested), follow_scene(nested)[0].paths
     pixels, across = pixels_of(figure), np.array([-0.37, 0.93])
     corners = [*paths.points[0, :3], paths.points[0, 2] + 0.6 * paths.directions[0]]
     for (a, b), t in itertools.product(itertools.pairwise(corners), (0.2, 0.5, 0.8)):
@@ -71,15 +75,15 @@ def test_the_path_is_where_it_was_traced_and_media_are_tinted_and_named(drawn):
     assert labels_of(figure) == ["n = 1", "n = 1.25", "n = 1.5"]
 
 
-def test_of_many_media_a_few_are_named(drawn):
+def test_the_legend_shows_a_few_of_many_media(drawn):
     layers = tuple(replace(SLANTED.regions[0], indices=(1 + i / 20, 1 + i / 25)) for i in range(1, 21))
     light = Light(("red", "blue"))
     labels = labels_of(drawn(replace(SLANTED, regions=layers, index=(1.0, 1.0), light=light, segments=(GLASS, GLASS))))
-    assert len(labels) == drawing.NAMED
+    assert len(labels) == drawing.LEGEND_SIZE
     assert (labels[0], labels[-1]) == ("n = 1", "n = 1.8 – 2")
 
 
-def test_media_of_nearly_the_same_index_have_tints_of_their_own(drawn):
+def test_media_of_nearly_the_same_index_have_different_tints(drawn):
     media = tuple(replace(SLANTED.regions[0], indices=(n,)) for n in (1.45, 1.48))
     tints = [
         np.array(patch.get_facecolor())
@@ -88,17 +92,17 @@ def test_media_of_nearly_the_same_index_have_tints_of_their_own(drawn):
     assert np.abs(tints[2] - tints[1]).max() > 0.1 < np.abs(tints[1] - tints[0]).max()
 
 
-def test_opacity_is_the_root_of_the_power(drawn):
-    given = replace(SLANTED, branches=1)
-    weights = follow_scene(given)[0].paths.weights
-    opacities = np.sort(rays_of(drawn(given)).get_colors()[:, 3])
+def test_opacity_is_the_square_root_of_the_power(drawn):
+    branched = replace(SLANTED, branches=1)
+    weights = follow_scene(branched)[0].paths.weights
+    opacities = np.sort(rays_of(drawn(branched)).get_colors()[:, 3])
     np.testing.assert_allclose(opacities, np.sort([*weights[0, :3], weights[1, 1], *weights[2, 2:4]]) ** 0.5, rtol=1e-6)
 
 
-def test_colours_part_at_the_first_boundary_and_must_be_known(drawn):
+def test_colours_separate_at_the_first_boundary_and_an_unknown_colour_is_an_error(drawn):
     segments, region = (polygon(SLAB, 1.4), polygon(SLAB, 1.6)), replace(SLANTED.regions[0], indices=(1.4, 1.6))
-    given = replace(SLANTED, segments=segments, light=Light(("red", "blue")), index=(1.0, 1.0), regions=(region,))
-    collection = rays_of(drawn(given))
+    coloured = replace(SLANTED, segments=segments, light=Light(("red", "blue")), index=(1.0, 1.0), regions=(region,))
+    collection = rays_of(drawn(coloured))
     colours = {tuple(rgb) for rgb in collection.get_colors()[:, :3].tolist()}
     assert colours == {to_rgb(name) for name in ("red", "blue", drawing.WHITE)}
     assert len(collection.get_segments()) == 1 + 2 + 2
@@ -106,11 +110,11 @@ def test_colours_part_at_the_first_boundary_and_must_be_known(drawn):
         drawn(replace(SLANTED, light=Light(("ultraviolent",))))
 
 
-def test_a_crowd_is_a_density_the_right_way_up(drawn):
-    """Its darkest pixels are on the caustic, whose cusp is the paraxial focus."""
+def test_many_rays_are_drawn_as_a_density_the_right_way_up(drawn):
+    """The darkest pixels are on the caustic, whose cusp is the paraxial focus."""
     figure = drawn(CROWD, dpi=60)
     (image,) = figure.axes[0].findobj(AxesImage)
-    figure.draw_without_rendering()  # would move what is not settled
+    figure.draw_without_rendering()  # would move anything whose layout is not final
     opacity = np.asarray(image.get_array())[..., 3] / 255
     box = figure.axes[0].get_window_extent()
     assert opacity.shape == (round(box.height), round(box.width))
@@ -121,15 +125,15 @@ def test_a_crowd_is_a_density_the_right_way_up(drawn):
     assert opacity[0, -1] < 0.2 < 0.9 < opacity.max() < 1
     figure = drawn(replace(CROWD, origins=CROWD.origins + np.array([0, 1.5])), dpi=60)
     above, below = (pixels_of(figure)[pixel(figure, (-2.5, y))[::-1]] for y in (1.5, -1.5))
-    assert above[1] < 0.8 and below.min() > 0.97  # one reflection inside reaches it
+    assert above[1] < 0.8 and below.min() > 0.97  # light reflected once inside reaches the upper place
 
 
 @pytest.mark.parametrize("event, mark", [(Event.MAX_DEPTH, "o"), (Event.MEDIUM_MISMATCH, "x")])
-def test_paths_that_end_otherwise_are_marked(drawn, event, mark):
+def test_paths_that_do_not_escape_are_marked(drawn, event, mark):
     square = polygon([(0, -1), (1, -1), (1, 1), (0, 1)], 1.5)
-    given = scene(replace(square, n_left=np.array([1.5, 1.4, 1.5, 1.5])), [[-1.0, 0.1]], (1, 0), view=VIEW)
-    given = given if event == Event.MEDIUM_MISMATCH else replace(given, segments=(square,), max_depth=1)
-    panel = drawn(given).axes[0]
+    ending = scene(replace(square, n_left=np.array([1.5, 1.4, 1.5, 1.5])), [[-1.0, 0.1]], (1, 0), view=VIEW)
+    ending = ending if event == Event.MEDIUM_MISMATCH else replace(ending, segments=(square,), max_depth=1)
+    panel = drawn(ending).axes[0]
     (line,) = [line for line in panel.lines if line.get_marker() == mark]
     np.testing.assert_allclose(line.get_xydata(), [[0 if event == Event.MAX_DEPTH else 1, 0.1]], atol=1e-12)
     note = {
@@ -137,13 +141,13 @@ def test_paths_that_end_otherwise_are_marked(drawn, event, mark):
         Event.MEDIUM_MISMATCH: "× shape[0] overlap, share part of an edge",
     }[event]
     assert note in panel.get_xlabel().replace("\n", " ")
-    clean = drawn(replace(given, segments=(square,), max_depth=5)).axes[0]
+    clean = drawn(replace(ending, segments=(square,), max_depth=5)).axes[0]
     assert {line.get_marker() for line in clean.lines} == {"+"}
     assert note not in clean.get_xlabel().replace("\n", " ")
 
 
 @pytest.mark.parametrize("suffix, start", [(".svg", b"<?xml"), (".png", b"\x89PNG"), (".pdf", b"%PDF")])
-def test_the_same_scene_gives_the_same_bytes_whatever_the_users_style(suffix, start):
+def test_the_same_scene_gives_the_same_bytes_for_any_user_style(suffix, start):
     content = drawing.draw(SLANTED, follow_scene(SLANTED), suffix)
     assert content.startswith(start)
     with matplotlib.rc_context({"axes.facecolor": "black", "font.size": 30, "svg.hashsalt": "mine"}):
@@ -151,7 +155,7 @@ def test_the_same_scene_gives_the_same_bytes_whatever_the_users_style(suffix, st
         assert matplotlib.rcParams["font.size"] == 30
 
 
-def test_thousands_of_rays_are_a_small_file():
+def test_thousands_of_rays_make_a_small_file():
     content = drawing.draw(CROWD, follow_scene(CROWD), ".svg")
     assert len(content) < 2_000_000
     assert content.count(b"<image") == 1 and content.count(b"<path") < 500
@@ -159,14 +163,14 @@ def test_thousands_of_rays_are_a_small_file():
 
 @pytest.mark.parametrize("view", [(0, 1, 0, 100), (0, 1e-9, 0, 1e-9), (0, 1e6, 0, 1)])
 def test_views_of_any_shape(view):
-    given = replace(SLANTED, view=view)
-    assert drawing.draw(given, follow_scene(given), ".png")
+    viewed = replace(SLANTED, view=view)
+    assert drawing.draw(viewed, follow_scene(viewed), ".png")
 
 
 # Geometry ------------------------------------------------------------------------------------------------------
 
 
-def test_lines_end_at_the_views_edge():
+def test_lines_are_clipped_to_the_view():
     lines = np.array([[-4, 0, 6, 0], [0, -3, 0, 0.5], [-3, -2, 0, 1], [-4, 2, 6, 2], [-3, 0, 0, 3], [0, 0, np.nan, 0]])
     a, b, inside = drawing.clip(lines[:, :2], lines[:, 2:], WIDE)
     assert inside.tolist() == [True, True, True, False, False, False]
@@ -174,28 +178,30 @@ def test_lines_end_at_the_views_edge():
     np.testing.assert_allclose(np.hstack([a, b])[:3], expected, atol=1e-15)
 
 
-def test_every_leg_is_there_once():
-    """In a slab: the ray to it, the way through, the ray out, and the same for what is reflected. And of colours."""
+def test_legs_contain_no_duplicates():
+    """Every path has a leg before, inside and behind a slab; paths share their common legs, colours the first leg."""
     legs = drawing.legs(follow_scene(scene(GLASS, [[-1.0, 0]], (1, 0), branches=1)), WIDE)
     ends = {tuple(np.round([*a, *b], 12) + 0.0) for a, b in zip(legs.start, legs.end, strict=True)}
-    assert len(legs.start) == 6  # the two that come back lie on one another
+    assert len(legs.start) == 6  # the two reflected paths lie on one another outside
     assert ends == {(-1, 0, 0, 0), (0, 0, 1, 0), (1, 0, 3, 0), (0, 0, -2, 0), (1, 0, 0, 0)}
-    given = scene((ball(1.5), ball(1.6)), beam(4, 0.5, x=-1.5), (1, 0), colours=("red", "blue"))
-    legs = drawing.legs(follow_scene(given), WIDE)
+    coloured = scene((ball(1.5), ball(1.6)), beam(4, 0.5, x=-1.5), (1, 0), colours=("red", "blue"))
+    legs = drawing.legs(follow_scene(coloured), WIDE)
     numbers, counts = np.unique(legs.colour, return_counts=True)
     assert dict(zip(numbers.tolist(), counts.tolist(), strict=True)) == {drawing.SHARED: 4, 0: 8, 1: 8}
     assert (legs.start[legs.colour == drawing.SHARED, 0] == -1.5).all()
 
 
-def test_the_default_view_holds_everything():
-    given = scene(ball(1.5), beam(3, 0.5, x=-9), (1, 0))
+def test_the_default_view_contains_all_boundaries():
+    ball_scene = scene(ball(1.5), beam(3, 0.5, x=-9), (1, 0))
     far = 1 + 2 * drawing.MARGIN
-    np.testing.assert_allclose(drawing.around(given, follow_scene(given), np.empty((0, 2))), (-far, far, -far, far))
+    np.testing.assert_allclose(
+        drawing.around(ball_scene, follow_scene(ball_scene), np.empty((0, 2))), (-far, far, -far, far)
+    )
 
 
 @pytest.mark.parametrize(("n", "focus"), [(1.5, 1.5), (1.1, 5.5), (1.01, None), (2.5, None)])
-def test_a_focus_is_marked_and_the_view_holds_it_unless_it_is_far_away(drawn, n, focus):
-    """n/(2 (n − 1)) from the centre of a ball, for rays near its axis; inside a ball of n > 2."""
+def test_a_near_focus_is_marked_and_inside_the_view(drawn, n, focus):
+    """The focus of rays near the axis of a ball is n/(2 (n − 1)) from its centre, inside the ball for n > 2."""
     panel = drawn(scene(ball(n), beam(9, 0.01), (1, 0))).axes[0]
     marks = [line.get_xydata() for line in panel.lines if line.get_marker() == "D"]
     assert ("◇ focus" in panel.get_xlabel()) is bool(marks) is (focus is not None)
@@ -206,20 +212,20 @@ def test_a_focus_is_marked_and_the_view_holds_it_unless_it_is_far_away(drawn, n,
         np.testing.assert_allclose(marks, [[[focus, 0]]], atol=1e-3)
 
 
-def test_rays_that_do_not_come_together_have_no_focus():
-    """A fan from the middle of a ball, and rays that a slab leaves parallel or crossing all over the place."""
+def test_rays_that_do_not_converge_have_no_focus():
+    """A fan from the centre of a ball, and rays that are parallel or cross in many places behind a slab."""
     fan = np.array([(1, y) for y in np.linspace(-0.3, 0.3, 9)])
     crossing = np.array([(1, y) for y in (0.2, -0.1, 0.3, -0.3)])
-    for given in (
+    for unfocused in (
         scene(ball(1.5), np.zeros((9, 2)), fan),
         scene(GLASS, beam(5, 1.0), (1, 0)),
         scene(GLASS, beam(4, 1.0), crossing),
     ):
-        assert not len(focal_points.foci(given, follow_scene(given)))
+        assert not len(focal_points.foci(unfocused, follow_scene(unfocused)))
 
 
-def test_density_is_length_where_the_line_is():
-    """The length in pixels, up to the last pixel at either end; for each line alone."""
+def test_density_is_the_length_of_the_line_in_each_pixel():
+    """The sum over the pixels is the line's length, up to a pixel at either end."""
 
     def density(start, end, *view):
         line = drawing.Legs(np.array([start], float), np.array([end], float), np.array([4.0]), np.zeros(1, int))
@@ -237,7 +243,7 @@ def test_density_is_length_where_the_line_is():
     np.testing.assert_allclose(density((-1, -2), (1, 3), (-1, 1, -2, 3), 20, 50), pixels.T, atol=1e-12)
 
 
-def test_arcs_are_round_and_pieces_are_joined():
+def test_boundaries_become_joined_polylines_on_their_arcs():
     (circle,) = drawing.curves(ball(1.5), 9)
     assert circle.shape == (4 * 8 + 1, 2)
     np.testing.assert_allclose(np.hypot(*circle.T), 1, atol=1e-15)

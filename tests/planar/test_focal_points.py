@@ -1,4 +1,4 @@
-"""Focal points and spots, against bundles of lines whose focus is known, and systems whose focal length is."""
+"""Focal points and spots, against lines with a known focus and systems with a known focal length."""
 
 from __future__ import annotations
 
@@ -25,40 +25,40 @@ def unit(angles):
 FAN = unit(np.radians([20, 31, 35, 47]))
 
 
-def groups(made, plane=None):
-    return focal_points.groups(made, follow_scene(made), plane)
+def groups(traced_scene, plane=None):
+    return focal_points.groups(traced_scene, follow_scene(traced_scene), plane)
 
 
 @pytest.mark.parametrize(
-    ("at", "distance", "directions", "apart"),
+    ("at", "distance", "directions", "tolerance"),
     [
         (AT, 5.0, FAN, 1e-14),
         (AT, -5.0, FAN, 1e-14),
-        # 1e-5 rad apart: 1024 away they are as near to one another as rounding lets them be.
+        # Lines 1e-5 rad apart, from a distance of 1024: the error comes from the rounding of the origins.
         (np.array([1000.0, 0.3]), 1024.0, unit(1e-5 * np.array([-1.0, -0.3, 0.45, 1.0])), 2e-11),
     ],
 )
-def test_rays_through_a_point_keep_their_digits(at, distance, directions, apart):
+def test_the_focus_of_rays_through_a_point_is_that_point_to_rounding(at, distance, directions, tolerance):
     spread = focal_points.spread(at - distance * directions, directions)
     assert spread.virtual is (distance < 0)
-    np.testing.assert_allclose([spread.focus, spread.spot], [at, at], rtol=0, atol=apart)
-    assert spread.rms < spread.largest < min(apart, 1e-14)
+    np.testing.assert_allclose([spread.focus, spread.spot], [at, at], rtol=0, atol=tolerance)
+    assert spread.rms < spread.largest < min(tolerance, 1e-14)
 
 
 def test_rays_that_have_no_focus_or_no_spot():
     parallel = focal_points.spread(beam(5, 1.0), np.tile([1.0, 0], (5, 1)))
     assert (parallel.focus, parallel.virtual) == (None, False)
     assert (parallel.rms, parallel.largest) == (pytest.approx(math.sqrt(0.5)), 1.0)
-    one = focal_points.spread(AT[None], FAN[:1])
-    assert (one.rays, one.focus, one.spot, one.rms) == (1, None, None, None)
-    around = unit([0, math.pi / 2, 3.0])
-    every_way = focal_points.spread(AT + 2 * around, around)
-    np.testing.assert_allclose(every_way.focus, AT, atol=1e-14)
-    assert every_way.virtual and every_way.spot is None
+    single = focal_points.spread(AT[None], FAN[:1])
+    assert (single.rays, single.focus, single.spot, single.rms) == (1, None, None, None)
+    directions = unit([0, math.pi / 2, 3.0])
+    diverging = focal_points.spread(AT + 2 * directions, directions)
+    np.testing.assert_allclose(diverging.focus, AT, atol=1e-14)
+    assert diverging.virtual and diverging.spot is None
 
 
-def test_the_spot_is_the_smallest():
-    """Of lines in disorder; the plane is moved along the mean direction and must not find a smaller one."""
+def test_no_other_plane_has_a_smaller_spot():
+    """For random lines: moving the plane along the mean direction makes the RMS radius larger."""
     rng = np.random.default_rng(5)
     directions, origins = unit(rng.uniform(-0.4, 0.6, 30)), rng.normal(size=(30, 2)) * [0.1, 1.0]
     spread = focal_points.spread(origins, directions)
@@ -79,8 +79,8 @@ def test_the_spot_is_the_smallest():
     assert all(squares(focus + step) > squares(focus) for step in 1e-3 * np.array([(1, 0), (-1, 0), (0, 1), (0, -1)]))
 
 
-def test_the_ball_has_its_marginal_and_paraxial_foci_and_a_mirror_of_half_its_radius():
-    """Where a ray at height h meets the axis of the unit ball: by the law of sines in the last triangle."""
+def test_a_ball_has_its_known_marginal_and_paraxial_foci_and_mirror_focal_length():
+    """A ray at height h meets the axis of the unit ball at h / sin(2 (asin h − asin(h/n))), by the law of sines."""
     n, half = 1.5, 0.7
     direct, mirror, _ = groups(scene(ball(n), beam(101, half), (1, 0), branches=1))
     spread, turn = direct.spread, 2 * (math.asin(half) - math.asin(half / n))
@@ -94,19 +94,21 @@ def test_the_ball_has_its_marginal_and_paraxial_foci_and_a_mirror_of_half_its_ra
     assert off.spread.focus and (off.spread.marginal, off.spread.paraxial) == (None, None)
 
 
-def test_groups_are_by_colour_beam_and_reflections():
+def test_rays_are_grouped_by_colour_beam_and_reflections():
     origins, beams = np.concatenate([beam(3, 0.3), beam(2, 0.1, y=0.5), [[-3, 2.0]]]), np.array([0, 0, 0, 1, 1, 1])
-    made = groups(scene((ball(1.5), ball(1.6)), origins, (1, 0), beams=beams, colours=("red", "blue"), branches=1))
-    named = [(g.colour, g.beam, g.reflect, g.spread.rays) for g in made]
-    rays = {0: 3, 1: 2}  # the sixth meets nothing
-    assert named == [(c, b, bits, rays[b]) for c in ("red", "blue") for b in (0, 1) for bits in (0, 1, 2)]
-    lines = focal_points.table(made).splitlines()
-    assert len(lines) == 13 + 1 + 13  # two tables and a line between
+    ray_groups = groups(
+        scene((ball(1.5), ball(1.6)), origins, (1, 0), beams=beams, colours=("red", "blue"), branches=1)
+    )
+    keys = [(g.colour, g.beam, g.reflect, g.spread.rays) for g in ray_groups]
+    rays = {0: 3, 1: 2}  # the sixth ray meets no boundary
+    assert keys == [(c, b, bits, rays[b]) for c in ("red", "blue") for b in (0, 1) for bits in (0, 1, 2)]
+    lines = focal_points.table(ray_groups).splitlines()
+    assert len(lines) == 13 + 1 + 13  # two tables and a blank line between them
     assert lines[0].split()[:3] == ["colour", "beam", "reflected"]
     assert lines[3].split()[:4] == ["red", "0", "1", "3"]
 
 
-def test_a_slab_only_moves_a_beam():
+def test_a_slab_is_afocal():
     (group,) = groups(scene(polygon(SLAB, 1.5), beam(5, 1.0, x=-2), (1, 0.3)))
     assert (group.spread.focus, group.spread.marginal, group.spread.paraxial) == (None, None, None)
     assert group.spread.cardinal == Cardinal(afocal=True)
@@ -119,7 +121,7 @@ def test_a_slab_only_moves_a_beam():
 
 
 def cardinal(segments, half, turn=0.0, at=(0.0, 0.0)):
-    """The points of a system along x, which is turned by `turn` degrees and moved, and the spread of its first beam."""
+    """The cardinal points and the spread of a system along x, turned by `turn` degrees and moved to `at`."""
     rotation = affine(turn)
     start, end, control = (x @ rotation.T + at for x in (segments.start, segments.end, segments.control))
     segments = Segments(start, end, segments.n_left, segments.n_right, control, segments.weight)
@@ -129,8 +131,8 @@ def cardinal(segments, half, turn=0.0, at=(0.0, 0.0)):
 
 @pytest.mark.parametrize("turn", [0.0, 33.3])
 @pytest.mark.parametrize("curvature", [(0.02, -0.03), (0.05, 0.01), (-0.04, 0.0)])
-def test_a_thick_lens_has_the_focal_length_of_its_makers_formula(curvature, turn):
-    """And n = n' on both sides, its principal points at f (n − 1) t c / n from its faces."""
+def test_a_thick_lens_has_the_focal_length_of_the_lensmakers_formula(curvature, turn):
+    """Its principal points are at f (n − 1) t c / n from its faces, c the curvature of the other face."""
     (c1, c2), t, n = curvature, 8.0, 1.6
     points, spread = cardinal(shapes.lens(curvature, t, radius=4.0).between(n, 1.0), 3.0, turn=turn, at=(2.0, 1.0))
     f = 1 / ((n - 1) * (c1 - c2 + (n - 1) * t * c1 * c2 / n))
@@ -143,8 +145,8 @@ def test_a_thick_lens_has_the_focal_length_of_its_makers_formula(curvature, turn
     np.testing.assert_allclose(places, along[:, None] * affine(turn)[:, 0] + (2.0, 1.0), atol=1e-11)
 
 
-def test_a_boundary_between_two_media_has_a_focal_length_in_each():
-    """f = n' R/(n' − n) behind it, n R/(n' − n) before."""
+def test_a_boundary_has_a_focal_length_in_each_of_its_media():
+    """f = n' R/(n' − n) behind it and n R/(n' − n) before it."""
     n, behind, radius = 1.33, 1.6, 5.0
     arc = shapes.polyline([(1.0, 3.0), (1.0, -3.0)], [2 * math.degrees(math.asin(3.0 / radius))]).between(behind, n)
     points, _ = cardinal(arc, 1.0)
@@ -155,23 +157,23 @@ def test_a_boundary_between_two_media_has_a_focal_length_in_each():
 
 
 @pytest.mark.parametrize("turn", [0.0, 33.3])
-def test_an_afocal_system_says_so(turn):
-    """Kepler's telescope: the back focus of one lens is the front focus of the next."""
+def test_keplers_telescope_is_afocal(turn):
+    """The back focus of one lens is the front focus of the next."""
     lens = shapes.lens((0.05, -0.05), 3.0, radius=3.0)
-    one, _ = cardinal(lens.between(1.5, 1.0), 1.0)
-    apart = one.back_focus[0] - one.front_focus[0]
+    single, _ = cardinal(lens.between(1.5, 1.0), 1.0)
+    distance = single.back_focus[0] - single.front_focus[0]
 
-    def telescope(apart):
-        return together(lens.between(1.5, 1.0), lens.mapped(affine(), (apart, 0.0)).between(1.5, 1.0))
+    def telescope(distance):
+        return together(lens.between(1.5, 1.0), lens.mapped(affine(), (distance, 0.0)).between(1.5, 1.0))
 
-    points, spread = cardinal(telescope(apart), 0.5, turn=turn)
+    points, spread = cardinal(telescope(distance), 0.5, turn=turn)
     assert points == Cardinal(afocal=True) and spread.paraxial is None
-    off, _ = cardinal(telescope(apart + 1e-6), 0.5)
-    assert off.focal_length == pytest.approx(-(one.focal_length**2) / 1e-6, rel=1e-6)
+    defocused, _ = cardinal(telescope(distance + 1e-6), 0.5)
+    assert defocused.focal_length == pytest.approx(-(single.focal_length**2) / 1e-6, rel=1e-6)
 
 
-def test_rays_from_a_point_have_the_image_of_that_point():
-    """1/b = 1/f − 1/a from the principal points; the lens does not change."""
+def test_rays_from_a_point_meet_in_its_image():
+    """1/b = 1/f − 1/a, from the principal points; the focal length is that for parallel rays."""
     lens = shapes.lens((0.05, -0.05), 3.0, radius=3.0).between(1.5, 1.0)
     parallel, _ = cardinal(lens, 1.0)
     (group,) = groups(scene(lens, np.tile([-50.0, 0.0], (4, 1)), unit(np.radians([-2, -1, 1, 2]))))
@@ -181,8 +183,8 @@ def test_rays_from_a_point_have_the_image_of_that_point():
     assert group.spread.cardinal.focal_length == pytest.approx(parallel.focal_length, rel=1e-13)
 
 
-def test_the_double_gauss_has_the_image_distance_that_code_v_printed():
-    """Its last thickness is the paraxial one, printed in 16 digits; the focal length is that of a trace of y and u."""
+def test_the_double_gauss_has_the_image_distance_of_code_v():
+    """Its last thickness is the paraxial image distance in 16 digits; the focal length is from a paraxial trace."""
     path = Path(__file__).parents[2] / "validation" / "reference" / "double_gauss_codev.json"
     surfaces = json.loads(path.read_text())["prescription"]
     parts, place, n, y, u = [], 0.0, 1.0, 1.0, 0.0
@@ -202,7 +204,7 @@ def test_the_double_gauss_has_the_image_distance_that_code_v_printed():
 
 
 def test_a_spot_on_a_plane():
-    """Of rays through a point: 2 tan θ from it on an upright plane 2 behind it, 1/tan θ on a level one."""
+    """Rays through a point are at 2 tan θ on a vertical plane 2 behind it, at 1/tan θ on a horizontal plane 1 above."""
     tangent = np.array([-0.2, 0.1, 0.3])
     d = unit(np.arctan(tangent))
     spot = focal_points.spot(AT - 3 * d, d, Plane((AT[0] + 2, 7.0)))
@@ -214,10 +216,10 @@ def test_a_spot_on_a_plane():
     assert focal_points.spot(AT - d, [(1.0, 0.0)] * 3, Plane((0.0, 0.0), 90.0)) is None
 
 
-def test_a_plane_at_the_smallest_spot_has_that_spot():
-    made = scene(ball(1.5), beam(11, 0.5), (1, 0))
-    (first,) = groups(made)
-    (group,) = groups(made, Plane(first.spread.spot))
+def test_a_plane_through_the_smallest_spot_has_that_spot():
+    ball_scene = scene(ball(1.5), beam(11, 0.5), (1, 0))
+    (first,) = groups(ball_scene)
+    (group,) = groups(ball_scene, Plane(first.spread.spot))
     assert group.spread.on_plane.rms == pytest.approx(first.spread.rms, rel=1e-9)
     assert group.spread.on_plane.extent == pytest.approx(2 * first.spread.largest, rel=1e-9)
     assert focal_points.table([group]).splitlines()[-2].split()[-6:] == ["on", "the", "plane", "at", "rms", "extent"]

@@ -1,4 +1,4 @@
-"""The strokes name every segment that a ray may cross: the paths are those of trying all, to the last bit."""
+"""The mesh finds every segment that a ray may cross: the paths equal those of testing all segments, bit for bit."""
 
 import re
 
@@ -9,7 +9,7 @@ from support.planar_scenes import polygon, star, together
 from mi_refract.planar import Event, Segments, trace
 
 RAYS = 600
-WAYS = "brute", "mesh"
+METHODS = "brute", "mesh"
 
 
 def round_places(count):
@@ -18,7 +18,7 @@ def round_places(count):
 
 
 def lattice(count=5):
-    """Squares cut in two along a diagonal, half of them of another medium than their other half, in air."""
+    """Squares in air, cut along a diagonal; the two halves have random media."""
     rng = np.random.default_rng(3)
     below, above = np.ones((2, count + 2, count + 2))
     below[1:-1, 1:-1], above[1:-1, 1:-1] = rng.choice([1.0, 1.33, 1.5, 2.4], (2, count, count))
@@ -33,19 +33,19 @@ def lattice(count=5):
 
 
 def slivers(count=30):
-    """Triangles whose long sides are within the margin of the strokes for half of their length, around a square."""
+    """Narrow triangles: for half of their length, the long sides are within the margin of the strokes."""
     tips = round_places(count)
     aside = 4e-6 * np.column_stack([-tips[:, 1], tips[:, 0]])
     return together(*(polygon([t, 0.2 * t - a, 0.2 * t + a][::-1], 1.3) for t, a in zip(tips, aside, strict=True)))
 
 
 def far(segments):
-    """The same elsewhere: float32 has there but a thousandth of its extent."""
+    """The segments moved to 2¹³, where the steps of float32 are a thousandth of the figure."""
     return Segments(segments.start + 2.0**13, segments.end + 2.0**13, segments.n_left, segments.n_right)
 
 
 def slab(top):
-    """With the outside of its upper side facing what lies above."""
+    """A slab below y = `top`."""
     return polygon([(1, top), (0, top), (0, top - 0.1), (1, top - 0.1)])
 
 
@@ -59,21 +59,21 @@ def from_afar(segments, rng):
 
 
 def along_the_wall(segments, rng):
-    """Inside a circle, at 10⁻⁶ to 0.1 of the wall's direction."""
+    """Rays inside a circle, at 10⁻⁶ to 0.1 rad from the wall's direction."""
     angle, grazing = rng.uniform(0, 2 * np.pi, RAYS), 10 ** rng.uniform(-6, -1, RAYS)
     away = angle - grazing
     return 0.999999 * np.column_stack([np.cos(angle), np.sin(angle)]), np.column_stack([-np.sin(away), np.cos(away)])
 
 
 def across(segments, rng):
-    """Through places near the segments' starts, at all angles."""
+    """Rays through places near the segments' starts, at all angles."""
     i, share = rng.integers(0, len(segments), RAYS), 10 ** rng.uniform(-5, 0, (RAYS, 1))
     directions = rng.normal(size=(RAYS, 2))
     return segments.start[i] * (1 - share) + segments.end[i] * share - directions, directions
 
 
 def within_segments(segments, rng):
-    """From places on the segments, their ends among them, along them, and from others on the same line."""
+    """Rays along the segments, from places on them, their ends included, and from others on the same line."""
     i, share = rng.integers(0, len(segments), RAYS), rng.choice([-2, -1, 0, 0.3, 0.7, 1], (RAYS, 1))
     e = segments.end[i] - segments.start[i]
     return segments.start[i] + share * e, e
@@ -106,21 +106,21 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_paths_are_those_of_trying_all(vectorised, case):
+def test_mesh_and_brute_give_the_same_paths(vectorised, case):
     segments, make = CASES[case]
     rays = make(segments, np.random.default_rng(11))
     options = {"precision": vectorised.name, "backend": vectorised.backend, "weights": True}
-    brute, mesh = (trace(segments, *rays, 10, method=method, **options) for method in WAYS)
+    brute, mesh = (trace(segments, *rays, 10, method=method, **options) for method in METHODS)
     for name in ("hits", "events", "points", "directions", "indices", "polarised"):
         assert np.array_equal(getattr(brute, name), getattr(mesh, name), equal_nan=True), name
     assert not (brute.events == Event.MEDIUM_MISMATCH).any()
     assert (brute.hits >= 0).sum() > RAYS / 4
 
 
-def test_scalar_variants_have_strokes_too():
+def test_the_mesh_works_on_the_scalar_backend():
     segments = polygon(round_places(200))
     origins, directions = from_afar(segments, np.random.default_rng(2))
-    brute, mesh = (trace(segments, origins[:5], directions[:5], 3, method=m, backend="scalar") for m in WAYS)
+    brute, mesh = (trace(segments, origins[:5], directions[:5], 3, method=m, backend="scalar") for m in METHODS)
     assert np.array_equal(brute.points, mesh.points, equal_nan=True)
     assert (brute.hits >= 0).sum() >= 5
 
@@ -134,7 +134,7 @@ def test_scalar_variants_have_strokes_too():
         (together(slab(0.5), slab(0.6 + 1.5e-6)), "'mesh': segments 0 and 6; expected straight segments"),
     ],
 )
-def test_what_strokes_cannot_tell_apart_is_refused(segments, message):
+def test_mesh_rejects_segments_that_it_cannot_separate(segments, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         trace(segments, [(0.5, 3)], [(0, -1)], 2, method="mesh")
     assert trace(segments, [(0.5, 3)], [(0, -1)], 2).hits[0, 0] >= 0

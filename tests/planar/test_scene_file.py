@@ -1,4 +1,4 @@
-"""Scene files: what a file says and cannot say, colours, shapes that touch, the scenes that ship, and their page."""
+"""Scene files: valid and invalid content, colours, shapes that touch, the shipped scenes, and the how-to page."""
 
 import math
 import re
@@ -25,7 +25,7 @@ def paths(scene, colour=0, **options):
 
 
 def last_legs(traced):
-    """Where the last legs start."""
+    """The starts of the last legs."""
     count = (traced.hits >= 0).sum(1)
     return traced.points[np.arange(len(count)), count]
 
@@ -42,16 +42,16 @@ def read(tmp_path):
     return read
 
 
-# The scenes that ship ---------------------------------------------------------------------------------------------
+# Shipped scenes -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", sorted(SCENES.glob("*.toml")), ids=lambda path: path.stem)
-def test_scenes_load_and_all_rays_find_their_way_out(path, needs_variant, variant):
-    """On scalar numbers, which take a minute for a double rainbow, rays of the first and of the last colour."""
+def test_shipped_scenes_load_and_all_rays_escape(path, needs_variant, variant):
+    """The scalar backend, which takes a minute for a double rainbow, traces only the first and the last colour."""
     scene = load(path)
     colours = range(len(scene.segments)) if variant == "llvm_ad_rgb" else {0, len(scene.segments) - 1}
     if path.stem == "luneburg":
-        needs_variant("llvm_ad_rgb")  # a second a ray on scalar numbers
+        needs_variant("llvm_ad_rgb")  # a second per ray on the scalar backend
     assert len(scene.segments) == len(scene.light.names) == len(scene.index)
     assert len(scene.origins) == len(scene.directions) == len(scene.beams)
     assert np.abs(np.hypot(*scene.directions.T) - 1).max() <= 2 * ULP
@@ -65,7 +65,7 @@ def test_scenes_load_and_all_rays_find_their_way_out(path, needs_variant, varian
         assert np.dot(x, np.roll(y, -1)) > np.dot(y, np.roll(x, -1))
 
 
-def test_the_scenes_are_those_of_the_document():
+def test_lens_and_box_are_those_of_the_document():
     """The lens: |y + 40| = k + c r² / (1 + √(1 − (1 + K) c² r²)), x = 4 r. The box: one or four reflections."""
     lens, box = load(SCENES / "lens.toml"), load(SCENES / "box.toml")
     x, y = lens.regions[0].outline.T
@@ -79,15 +79,15 @@ def test_the_scenes_are_those_of_the_document():
 
 
 @pytest.mark.parametrize("index", ["", "index = 1.1\n"])
-def test_the_ellipse_focuses_to_rounding_in_any_medium(read, index):
+def test_the_ellipse_focuses_to_rounding_in_any_medium_around_it(read, index):
     traced = paths(read(index + (SCENES / "ellipse.toml").read_text()))
     (x, y), (u, v) = last_legs(traced).T, traced.directions.T
     assert np.abs(x * v - y * u).max() <= 8 * ULP * 4
 
 
-def test_the_achromat_unites_three_colours():
+def test_the_achromat_focuses_three_colours_together():
     scene = load(SCENES / "doublet.toml")
-    assert len(scene.segments[0]) == 10  # 12 pieces of two lenses, the surface between them once
+    assert len(scene.segments[0]) == 10  # 12 pieces of two lenses, which share the surface between them
     rays, foci = np.abs(scene.origins[:, 1]) > 1, []
     for colour in range(3):
         traced = paths(scene, colour)
@@ -122,7 +122,7 @@ BEAMS = """beam = [
 SCENE = HEAD + SHAPES + BEAMS
 
 
-def test_a_scene_is_read_as_it_is_written(read):
+def test_a_scene_has_the_values_of_its_file(read):
     scene = read(SCENE)
     assert (scene.title, scene.light.names, scene.index) == ("A disc", ("red", "blue"), (1.0, 1.1))
     assert (scene.max_depth, scene.branches, scene.view) == (5, 1, (-2.0, 2.0, -1.5, 1.5))
@@ -145,7 +145,7 @@ DISC = '[[shape]]\nkind = "circle"\nradius = 1\nn = 1.5\n'
 RAY = "[[beam]]\nkind = 'rays'\norigins = [[0, 3]]\ndirections = [0]\n"
 
 
-def test_what_is_not_said_of_a_scene_and_round_numbers(read):
+def test_defaults_and_whole_numbers_of_rays(read):
     scene = read(DISC + RAY)
     assert (scene.max_depth, scene.branches, scene.index, scene.view) == (16, 0, (1.0,), None)
     assert (scene.title, scene.path.name) == ("scene", "scene.toml")
@@ -154,7 +154,7 @@ def test_what_is_not_said_of_a_scene_and_round_numbers(read):
     assert scene.origins.tolist() == [[j, 1] for count in range(2, 200) for j in range(count)]
 
 
-BAD = [  # what is replaced, by what: the place and what was found or expected
+BAD = [  # replaced text, replacement, part of the error
     ("max_depth = 5", "max_depths = 5", "unknown key `max_depths`; expected title, index"),
     ("radius = 2,", 'radius = "2",', "shape[0].radius: text; expected a number"),
     ("radius = 2,", "radius = nan,", "shape[0].radius: nan; expected a finite number"),
@@ -175,13 +175,13 @@ BAD = [  # what is replaced, by what: the place and what was found or expected
     ('"disc", at', '"disc", outside = 1, at', "shape[1].within: 'disc', but `outside` is set"),
     ("scale = [1, 0.5]", "scale = [1, 0]", "shape[0]: scale: (1.0, 0.0); expected numbers of size"),
     ("radii = [1, 2]", "radii = [1, 1e99], scale = 99", "expected up to ±1e+100"),
-    ("radii = [1, 2]", "radii = [1e-20, 2e-20]", "shape[2]: it shrinks to a point beside coordinates of 9; expected"),
-    ("facets = 20", "facets = 3", "shape[2].facets: 3, for 4 arcs"),
+    ("radii = [1, 2]", "radii = [1e-20, 2e-20]", "shape[2]: too small, rounding makes it a point; expected"),
+    ("facets = 20", "facets = 3", "shape[2].facets: 3 for 4 arcs"),
     ("count = 3", "count = 0", "beam[1].count: expected a whole number >= 1"),
     ("direction = [3, 4]", "direction = [0, 0]", "beam[0].direction: [0, 0]; expected degrees, or"),
     ("origins = [[0, 1]", "origins = [[0, 1e101]", "beam[2]: 1e+101; expected up to ±1e+100"),
     ("[-90, 90]", "[-1e308, 1e308]", "beam[1].angles: [-1e+308, 1e+308]"),
-    ("[180, [0, -1e300]]", "[180]", "beam[2]: directions: 1, for 2 origins"),
+    ("[180, [0, -1e300]]", "[180]", "beam[2]: directions: 1 for 2 origins"),
     ("shape = [", "shape = 3 # [", "expected TOML"),
     ("max_depth = 5", "max_depth = .5", "max_depth = .5: numbers have a digit on either side of the point, as 0.8"),
     ("max_depth = 5", "index = [ 1., 2]", "index = [ 1., 2]: numbers have a digit on either side of the point"),
@@ -219,7 +219,7 @@ BAD_GLASSES = [
 @pytest.mark.parametrize(
     "scene, old, new, expected", [(SCENE, *case) for case in BAD] + [(GLASSES, *case) for case in BAD_GLASSES]
 )
-def test_what_a_file_cannot_be_is_one_line_with_file_and_key(read, tmp_path, scene, old, new, expected):
+def test_errors_name_file_and_key_in_one_line(read, tmp_path, scene, old, new, expected):
     assert old in scene
     with pytest.raises(ValueError) as caught:
         read(scene.replace(old, new, 1))
@@ -249,11 +249,11 @@ LENS = DISC.replace('"circle"', '"lens"') + "thickness = 1\ncurvature = [1, -1]\
 
 @pytest.mark.parametrize(
     "text, expected",
-    [  # what a scene asks for is counted before it is made
+    [  # sizes are checked before memory is allocated
         (BALL + FAN, "shape[0]: 5000000 or more pieces; expected at most 4194304"),
         ('colours = ["red", "blue"]\n' + BALL + FAN, "shape[0]: 10000000 or more pieces"),
         (DISC + FAN * 17, "beam[16].count: 17000000 rays in this beam and those before it; expected up to 16777216"),
-        (LENS.replace("radius = 1", "radius = 2"), "shape[0].radius = 2: a surface is smaller"),
+        (LENS.replace("radius = 1", "radius = 2"), "shape[0].radius = 2: larger than a surface"),
         (LENS.replace("radius = 1\n", "").replace("-1", "2"), "shape[0].curvature = [1.0, 2.0]: the surfaces never"),
         (
             LENS.replace("curvature", "R1 = 1\ncurvature"),
@@ -262,13 +262,13 @@ LENS = DISC.replace('"circle"', '"lens"') + "thickness = 1\ncurvature = [1, -1]\
         (LENS.replace("curvature = [1, -1]", "R1 = 1"), "shape[0]: curvature, R1, R2; expected either `curvature`, or"),
     ],
 )
-def test_what_is_too_much_or_no_shape_names_its_key(read, text, expected):
+def test_errors_of_sizes_and_shapes_name_their_key(read, text, expected):
     with pytest.raises(ValueError, match=r"^[^\n]*$") as caught:
         read(text)
     assert expected in str(caught.value)
 
 
-def test_a_lens_has_curvatures_or_radii_of_curvature(read):
+def test_a_lens_accepts_curvatures_or_radii(read):
     curvatures, radii = (
         read(LENS.replace("curvature = [1, -1]", keys)) for keys in ("curvature = [0.25, 0]", "R1 = 4\nR2 = 0")
     )
@@ -286,7 +286,7 @@ PLAUSIBLE = {
 
 
 def toml(value):
-    """As a TOML value."""
+    """The text of a TOML value."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key} = {toml(item)}" for key, item in value.items()) + "}"
     if isinstance(value, list):
@@ -300,7 +300,7 @@ def toml(value):
     kind=strategies.sampled_from(scene_file.AnyShape.__args__),
     changes=strategies.lists(strategies.tuples(strategies.integers(0, 20), VALUES), max_size=2),
 )
-def test_whatever_the_values_a_file_is_a_scene_or_one_line(tmp_path_factory, kind, changes):
+def test_any_values_give_a_scene_or_an_error_of_one_line(tmp_path_factory, kind, changes):
     fields = [
         name for name in kind.__struct_fields__ if name not in ("within", "outside", "facets", "arcs", "R1", "R2")
     ]
@@ -312,7 +312,7 @@ def test_whatever_the_values_a_file_is_a_scene_or_one_line(tmp_path_factory, kin
         scene = load(path)
     except ValueError as error:
         assert re.fullmatch(rf"{re.escape(str(path))}: shape\[0\][^\n]+", str(error)), error
-        assert changes, "the plausible values are a scene"
+        assert changes, "the plausible values must be a valid scene"
     else:
         assert all(np.isfinite(region.outline).all() for region in scene.regions)
 
@@ -334,41 +334,41 @@ ALONG = '{kind = "boundary", points = [[1.3, -0.9], [1.3, 1.1]], n_left = 1.5, n
 
 
 def media_of(scene):
-    """The indices on both sides of its boundaries."""
+    """The indices on both sides of the scene's boundaries."""
     return sorted(zip(scene.segments[0].n_left.tolist(), scene.segments[0].n_right.tolist(), strict=True))
 
 
 @pytest.mark.parametrize(
     "first, second", [("0.3", "2.3"), ("0.1", "2.1"), ("-0.7", "1.3"), ("0.3", "2.3000000000000003")]
 )
-def test_shapes_that_share_an_edge_are_cemented_there(read, first, second):
+def test_shapes_that_share_an_edge_are_cemented(read, first, second):
     scene = read(TWO.format(first=first, second=second, more=""))
     assert media_of(scene) == [(1.5, 1.1)] * 3 + [(1.5, 1.7)] + [(1.7, 1.1)] * 3
     assert paths(scene, weights=True).indices[:, :4].tolist() == [[1.1, 1.5, 1.7, 1.1]] * 5
 
 
-def test_only_what_rounding_keeps_apart_is_made_one(read):
+def test_only_gaps_within_rounding_are_closed(read):
     scene = read(TWO.format(first="0.3", second="2.300000001", more=""))
     assert media_of(scene) == [(1.5, 1.1)] * 4 + [(1.7, 1.1)] * 4
     assert paths(scene, weights=True).indices[0, :5].tolist() == [1.1, 1.5, 1.1, 1.7, 1.1]
 
 
-def test_a_shape_may_touch_what_it_lies_in_and_must_not_contradict_it(read):
+def test_a_shape_may_touch_the_one_around_it_with_the_same_index_outside(read):
     inner = [(1.3, 1.1), (1.3, 1.5), (1.3, 1.7), (1.5, 1.1), (1.5, 1.1), (1.7, 1.1), (1.7, 1.1), (1.7, 1.1)]
     assert media_of(read(TWO.format(first="0.3", second="2.3", more=INNER))) == inner
     for more, expected in (
         (
             INNER.replace(', within = "left"', ""),
-            r"shape\[2\]: along shape\[0\] 'left' there is index 1.5; expected 1.1",
+            r"shape\[2\]: the index along shape\[0\] 'left' is 1.5; expected 1.1",
         ),
-        (AGAIN, r"shape\[2\]: along shape\[0\] 'left' there is index 1.5; expected 1.1"),
-        (ALONG, r"shape\[2\]: it runs along shape\[0\] 'left'"),
+        (AGAIN, r"shape\[2\]: the index along shape\[0\] 'left' is 1.5; expected 1.1"),
+        (ALONG, r"shape\[2\]: runs along shape\[0\] 'left'"),
     ):
         with pytest.raises(ValueError, match=expected):
             read(TWO.format(first="0.3", second="2.3", more=more))
 
 
-def test_curves_with_the_same_ends_are_not_the_same_and_a_repeated_corner_is_no_edge(read):
+def test_arcs_with_the_same_ends_are_separate_and_a_repeated_corner_is_ignored(read):
     shape = '[[shape]]\nkind = "polygon"\npoints = {}\n{}\n'
     ends = "[[0, -1], [0, 1]]"
     moon, disc = shape.format(ends, "arcs = [90, -45]\nn = 1.5"), shape.format(ends, "arcs = [45, 60]\nn = 1.6")
@@ -385,47 +385,47 @@ def test_a_material_has_the_index_of_each_wavelength(read):
     assert scene.regions[-1].indices == pytest.approx(expected, rel=1e-15)
     assert [segments.n_left[-1] for segments in scene.segments] == pytest.approx(expected, rel=1e-15)
     assert scene.light.names == ("486.133 nm", "587.562 nm")
-    given = [read(GLASSES.replace("[1, 1.1]", "1").replace("[1.5, 1.6]", "1.5"), x).light for x in ([450.0], 36)]
-    assert [x.wavelengths for x in given] == [(450.0,), tuple(np.linspace(380, 730, 36))]
+    lights = [read(GLASSES.replace("[1, 1.1]", "1").replace("[1.5, 1.6]", "1.5"), x).light for x in ([450.0], 36)]
+    assert [x.wavelengths for x in lights] == [(450.0,), tuple(np.linspace(380, 730, 36))]
     plain = read(SCENE.replace("n = 1.3", f'n = "{CAUCHY}"'))  # without wavelengths: the d line
     assert plain.regions[-1].indices == pytest.approx((1.5 + 4000 / media.LINES["d"] ** 2,) * 2, rel=1e-15)
 
 
-def test_a_file_of_an_index_is_looked_for_beside_the_scene(read, tmp_path):
+def test_an_index_file_is_relative_to_the_scene_file(read, tmp_path):
     (tmp_path / "glass.csv").write_text("nm,n\n480,1.6\n580,1.5\n")
     with pytest.warns(UserWarning, match="587.562 nm is that of the end of its range"):
         scene = read(GLASSES.replace(CAUCHY, "hold(file:glass.csv)"))
     assert scene.regions[-1].indices == pytest.approx((1.6 - 6.1327e-3, 1.5), rel=1e-9)
 
 
-def test_what_is_measured_against_vacuum_is_made_relative_to_air():
+def test_indices_relative_to_vacuum_are_converted_to_air():
     indices = Light(("", ""), (500.0, 600.0)).indices("MATERIAL:water", "n")
     expected = [media.index("MATERIAL:water", w) / media.LABORATORY_AIR.index(w) for w in (500.0, 600.0)]
     assert indices == pytest.approx(expected, rel=1e-15)
     assert Light().indices("AIR:ciddor", "n") == (1.0,)
 
 
-def test_words_that_are_wavelengths_and_others():
+def test_parsing_the_wavelengths_option():
     for text, expected in {"450.5, 600": [450.5, 600.0], "450": [450.0], "32": 32, "550": [550.0]}.items():
-        assert light.parsed(text) == expected  # 550 is more than MOST: no number of them
+        assert light.parsed(text) == expected  # 550 exceeds MOST, so it is a wavelength
     for text in ("", "red", "1", "nan", "450,", "-450", "inf"):
         with pytest.raises(ValueError, match="expected wavelengths in nm, such as"):
             light.parsed(text)
 
 
-def test_a_figure_of_wavelengths_that_nobody_sees_would_be_black():
+def test_invisible_wavelengths_are_an_error():
     with pytest.raises(ValueError, match="wavelengths: none of 1000 nm is visible; expected some from 360 to 830 nm"):
         light.linear_srgb(of_wavelengths([1000.0]))
 
 
 @pytest.mark.parametrize("power", ["flat", "D65"])
 def test_colours_are_those_of_the_standard_observer(power):
-    """CIE 1931 x̄, ȳ, z̄ at 450, 550 and 600 nm; XYZ to linear sRGB of IEC 61966-2-1; all together are white."""
+    """CIE 1931 x̄, ȳ, z̄ at 450, 550 and 600 nm; XYZ to linear sRGB of IEC 61966-2-1; the sum is white."""
     xyz = np.array([(0.3362, 0.038, 1.77211), (0.43345, 0.99495, 0.00875), (1.0622, 0.631, 0.0008)])
     to_rgb = [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
-    chosen = of_wavelengths([450.0, 550.0, 600.0], power)
-    expected = xyz @ np.transpose(to_rgb) * np.array(chosen.powers)[:, None]
-    assert light.linear_srgb(chosen) == pytest.approx(expected / expected.sum(0), rel=0.01, abs=0.01)
+    colours = of_wavelengths([450.0, 550.0, 600.0], power)
+    expected = xyz @ np.transpose(to_rgb) * np.array(colours.powers)[:, None]
+    assert light.linear_srgb(colours) == pytest.approx(expected / expected.sum(0), rel=0.01, abs=0.01)
 
 
 def test_daylight_has_the_powers_of_cie():
@@ -437,7 +437,7 @@ def test_daylight_has_the_powers_of_cie():
 # The how-to page ---------------------------------------------------------------------------------------------------
 
 
-def test_the_python_of_the_page_runs_and_its_scene_is_one(read, tmp_path, monkeypatch, capsys):
+def test_the_code_and_the_scene_of_the_page_work(read, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scenes").symlink_to(SCENES.parent)
     (toml_text,) = blocks(PAGE, "toml")

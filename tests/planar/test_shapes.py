@@ -47,7 +47,7 @@ MAPS = {
 }
 
 
-def around(outline, p):
+def winding_number(outline, p):
     """How often a closed outline runs around p, counter-clockwise."""
     x, y = (outline - p).T
     turn = np.diff(np.unwrap(np.arctan2(y, x), axis=0), append=np.nan)[:-1].sum()
@@ -56,7 +56,7 @@ def around(outline, p):
 
 
 def assert_closed(curve: Curve):
-    """Every vertex is once a start and once an end, to the last bit, and the inside is on the left of every piece."""
+    """Check that every vertex is one start and one end, bit for bit, and that the inside is left of every piece."""
     assert curve.closed
     starts, ends = ({tuple(p) for p in places.tolist()} for places in (curve.start, curve.end))
     assert starts == ends
@@ -68,11 +68,11 @@ def assert_closed(curve: Curve):
     left = 1e-3 * np.stack([-ahead[:, 1], ahead[:, 0]], 1)
     step = max(1, len(curve) // 40)
     for p, aside in zip(middle[::step], left[::step], strict=True):
-        assert (around(outline, p + aside), around(outline, p - aside)) == (1, 0)
+        assert (winding_number(outline, p + aside), winding_number(outline, p - aside)) == (1, 0)
 
 
 @pytest.mark.parametrize("curve", SHAPES.values(), ids=SHAPES)
-def test_shapes_are_closed_with_their_inside_on_the_left_under_any_map(curve):
+def test_mapped_shapes_are_closed_with_their_inside_on_the_left(curve):
     for matrix, at in MAPS.values():
         assert_closed(curve.mapped(matrix, at))
     with pytest.raises(AssertionError):
@@ -80,7 +80,7 @@ def test_shapes_are_closed_with_their_inside_on_the_left_under_any_map(curve):
 
 
 @pytest.mark.parametrize("curvature, conic, radius", SURFACES)
-def test_surfaces_lie_on_their_conic(curvature, conic, radius):
+def test_lens_surfaces_lie_on_their_conics(curvature, conic, radius):
     curve = shapes.lens((curvature, curvature), 1.0, radius=radius, conic=(conic, conic))
     front = points(curve.between(1, 1), 100)[:2]
     assert off_conic(front, curvature, conic).max() <= 4 * ULP * radius
@@ -94,12 +94,12 @@ def test_surfaces_lie_on_their_conic(curvature, conic, radius):
 
 
 @pytest.mark.parametrize("rx, ry", [(1, 1), (3, 0.5), (1e-3, 1e3)])
-def test_ellipses_lie_on_theirs(rx, ry):
+def test_ellipses_satisfy_their_equation(rx, ry):
     x, y = points(shapes.ellipse(rx, ry).between(1, 1), 100).reshape(-1, 2).T
     assert np.abs(np.hypot(x / rx, y / ry) - 1).max() <= 4 * ULP
 
 
-def test_arcs_turn_by_what_they_are_told():
+def test_arcs_turn_by_the_given_angle():
     for turn in (-350, -90, 45, 90.5, 180, 270):
         curve = shapes.polyline([(1, 2), (4, 3)], [turn])
         chord, along = np.array([3, 1]), points(curve.between(1, 1), 90).reshape(-1, 2)
@@ -114,18 +114,18 @@ def test_arcs_turn_by_what_they_are_told():
         assert np.abs(np.hypot(*(along - centre).T) - radius).max() <= 1e-14 * radius * 10
 
 
-def test_a_map_of_a_curve_is_a_map_of_its_points():
+def test_mapping_a_curve_maps_its_points():
     lens = shapes.lens((0.02, -0.3), 5, radius=2.5, conic=(-1.5, 0.4))
     for matrix, at in MAPS.values():
         expected = lens.outline(9) @ np.asarray(matrix).T + at
-        found = lens.mapped(matrix, at)
-        found = found if np.linalg.det(matrix) > 0 else found.reversed()
-        assert np.abs(found.outline(9) - expected).max() <= 8 * ULP * np.abs(expected).max()
-        assert found.straight.tolist() == lens.straight.tolist()
+        mapped = lens.mapped(matrix, at)
+        mapped = mapped if np.linalg.det(matrix) > 0 else mapped.reversed()
+        assert np.abs(mapped.outline(9) - expected).max() <= 8 * ULP * np.abs(expected).max()
+        assert mapped.straight.tolist() == lens.straight.tolist()
 
 
-def test_a_mirrored_boundary_keeps_what_is_on_either_side():
-    """The left of the x axis is y > 0; seen in a mirror on the y axis it still is, so the direction stays."""
+def test_a_mirrored_boundary_keeps_its_sides():
+    """The left of the x axis is y > 0. Mirrored at the y axis it still is, so the boundary keeps its direction."""
     boundary = shapes.polyline([(1, 0), (2, 0)])
     assert boundary.mapped(affine(0, (-1, 1))).vertices.tolist() == [[-2, 0], [-1, 0]]
     assert boundary.mapped(affine(0, (1, -1))).vertices.tolist() == [[2, 0], [1, 0]]
@@ -143,7 +143,7 @@ def test_quarter_turns_are_exact():
 # Facets -----------------------------------------------------------------------------------------------------------
 
 
-def test_facets_are_as_many_as_asked_for_and_lie_on_the_curve():
+def test_facets_have_the_given_number_and_lie_on_the_curve():
     for facets in (4, 6, 1001):
         polygon = shapes.circle(2).faceted(facets)
         assert len(polygon) == facets
@@ -152,7 +152,7 @@ def test_facets_are_as_many_as_asked_for_and_lie_on_the_curve():
     sides = np.hypot(*(shapes.circle(1).faceted(8).end - shapes.circle(1).faceted(8).start).T)
     assert np.ptp(sides) <= 4 * ULP
     rimmed = shapes.lens((0.02, -0.03), 5, radius=9)
-    assert len(rimmed.faceted(40)) == 42  # and two straight rims
+    assert len(rimmed.faceted(40)) == 42  # plus two straight rims
     hyperbola = shapes.lens((0.5, 0.5), 1.0, radius=4, conic=(-3, -3)).faceted(30)
     assert off_conic(hyperbola.vertices[:16], 0.5, -3).max() <= 4 * ULP * 4
 
@@ -166,7 +166,7 @@ def test_pointed_lenses_end_where_their_surfaces_meet():
         ((0.03, 0.02), (0, 0), 2),
         ((0, -0.05), (0, 0), 3),
         ((0.1, 0.0), (-1, 0), 2),
-        ((0.3, 0.05), (-3, -1), 1),  # meet again at r = 24
+        ((0.3, 0.05), (-3, -1), 1),  # the surfaces meet again at r = 24
     ):
         curve = shapes.lens(curvature, thickness, conic=conic)
         z, r = curve.vertices[0]
@@ -177,23 +177,23 @@ def test_pointed_lenses_end_where_their_surfaces_meet():
 
 
 def test_a_surface_reaches_as_far_as_it_exists():
-    """1/(c √(1 + K)) is rounded: what the sag then takes the root of may be a little below 0."""
+    """1/(c √(1 + K)) is rounded, so the argument of the root in the sag may be slightly below 0."""
     for c in np.linspace(0.01, 3, 200):
         for conic in (0, -0.3, 1.9):
             radius = 1 / (c * math.sqrt(1 + conic))
             hemisphere = shapes.lens((c, c), 1, radius=radius, conic=(conic, conic))
             assert off_conic(hemisphere.vertices[0], c, conic) <= 8 * ULP * radius
-            with pytest.raises(ValueError, match="a surface is smaller"):
+            with pytest.raises(ValueError, match="larger than a surface"):
                 shapes.lens((c, c), 1, radius=radius * (1 + 1e-14), conic=(conic, conic))
 
 
 IMPOSSIBLE = [
     *((lambda c=c, t=t: shapes.lens(c, t), "curvature.*never meet") for c, t in (((0.02, 0.03), 1), ((0, 0), 1))),
     (lambda: shapes.lens((0.1, -0.5), 20.5), "curvature.*never meet"),  # but their far halves do
-    (lambda: shapes.lens((0.02, -0.02), 1, radius=60), "radius = 60: a surface is smaller; expected at most 50"),
+    (lambda: shapes.lens((0.02, -0.02), 1, radius=60), "radius = 60: larger than a surface; expected at most 50"),
     (
         lambda: shapes.lens((0.02, -0.02), 1, radius=20),
-        "radius = 20: the surfaces meet within it; expected at most 7.05",
+        "radius = 20: the surfaces meet inside it; expected at most 7.05",
     ),
     (lambda: shapes.ellipse_lens(1.0, 4, 1.5, 1), "expected n > 1, 0 < thickness < 4"),
     (lambda: shapes.ellipse_lens(1.5, 4, 4, 1), "expected n > 1, 0 < thickness < 4"),
@@ -201,7 +201,7 @@ IMPOSSIBLE = [
     (lambda: shapes.polygon([(0, 0), (1, 1), (2, 2)]), "no area"),
     (lambda: shapes.polygon([(0, 0), (1, 0), (0, 1)], [0, 0]), "arcs: 2 for 3 pieces"),
     (lambda: shapes.polygon([(0, 0), (1, 0), (0, 1)], [0, 360, 0]), "above -360"),
-    (lambda: shapes.circle(2).faceted(3), "facets: 3, for 4 arcs"),
+    (lambda: shapes.circle(2).faceted(3), "facets: 3 for 4 arcs"),
     (lambda: shapes.rectangle(1, 1).faceted(100), "for 0 arcs"),
     *((lambda m=m: shapes.circle(1).mapped(m), "determinant") for m in (np.zeros((2, 2)), [[math.nan, 0], [0, 1]])),
     (lambda: shapes.polyline([(1, 0), (2, 0)]).mapped([[1, 2], [2, 4]]), "determinant"),
@@ -209,6 +209,6 @@ IMPOSSIBLE = [
 
 
 @pytest.mark.parametrize("make, match", IMPOSSIBLE)
-def test_impossible_shapes_are_refused(make, match):
+def test_impossible_shapes_are_errors(make, match):
     with pytest.raises(ValueError, match=match):
         make()

@@ -1,4 +1,4 @@
-"""The planar system on every backend and precision: crossings, vertices, starts, media, arcs, and bad input."""
+"""The planar tracer on every backend and precision: crossings, vertices, starts, media, arcs, and bad input."""
 
 import dataclasses
 import math
@@ -16,7 +16,7 @@ REFRACTED, REFLECTED, ESCAPED = Event.REFRACTED, Event.REFLECTED, Event.ESCAPED
 MISMATCH, MAX_DEPTH = Event.MEDIUM_MISMATCH, Event.MAX_DEPTH
 
 
-def test_a_slab_shifts_a_ray_as_snells_law_says(follow, setting):
+def test_a_slab_shifts_a_ray_by_snells_law(follow, setting):
     angle, n, width = 0.7, 1.5, 2.0
     slab = polygon([(0, -50), (width, -50), (width, 50), (0, 50)], n)
     d = np.array([math.cos(angle), math.sin(angle)])
@@ -29,27 +29,27 @@ def test_a_slab_shifts_a_ray_as_snells_law_says(follow, setting):
     assert np.isnan(paths.points[0, 3:]).all()
 
 
-def test_beyond_the_critical_angle_rays_are_reflected_and_nothing_is_lost(follow):
+def test_total_reflection_in_a_light_guide_loses_no_power(follow):
     paths = follow(polygon([(0, 0), (60, 0), (60, 1), (0, 1)]), (-1, 0.5), (1, 0.5), max_depth=100)
     hits, events = story(paths)
     assert hits[0] == 3 and events.count(REFLECTED) >= 10
-    # The last face may end the path by reflection on and on in the corner's prism; what counts is the guide.
+    # At the end face, the path may be trapped by reflections in the corner: check the guide before it.
     guided = paths.weights[0, 1 : events.index(REFLECTED) + 10]
     assert (guided == guided[0]).all()
 
 
-def test_the_formulas_agree(follow, setting):
+def test_all_formulas_give_the_same_paths(follow, setting):
     o, d = np.array([(-1, y) for y in (0.21, 0.43, 0.77)]), np.array([(1, 0.3), (1, -0.2), (1, 0.1)])
-    plain = follow(polygon(SQUARE), o, d)
+    planar = follow(polygon(SQUARE), o, d)
     for name, formula in FORMULAS.items():
-        other = follow(polygon(SQUARE), o, d, formula=name)
-        assert (other.hits == plain.hits).all(), name
+        paths = follow(polygon(SQUARE), o, d, formula=name)
+        assert (paths.hits == planar.hits).all(), name
         bound = 40 * formula.budget.chord(setting.roundoff, 1.5, 0.5)
-        assert np.nanmax(np.abs(other.points - plain.points)) <= bound, name
+        assert np.nanmax(np.abs(paths.points - planar.points)) <= bound, name
 
 
 @pytest.mark.parametrize("method", ["brute", "mesh"])
-def test_another_scene_of_a_kind_needs_no_other_kernel(vectorised, method):
+def test_scenes_of_the_same_kind_share_their_kernels(vectorised, method):
     def kernels(corners, radius, rays, depth):
         angle = np.linspace(0, 2 * np.pi, corners, endpoint=False)
         segments = polygon(radius * np.column_stack([np.cos(angle), np.sin(angle)]))
@@ -68,8 +68,8 @@ def test_another_scene_of_a_kind_needs_no_other_kernel(vectorised, method):
 # Vertices ------------------------------------------------------------------------------------------------------
 
 
-def test_a_ray_through_a_shared_vertex_crosses_once(follow):
-    """Of a zigzag from far left to far right, air above, glass below; no figure of many tips leaks either."""
+def test_a_ray_through_a_shared_vertex_crosses_one_segment(follow):
+    """The boundary is a zigzag from far left to far right with air above and glass below."""
     rng = np.random.default_rng(7)
     x = np.concatenate([[-100], np.sort(rng.uniform(-1, 1, 20)), [100]])
     places = np.column_stack([x, np.concatenate([[0], rng.uniform(-0.01, 0.01, 20), [0]])])
@@ -81,8 +81,8 @@ def test_a_ray_through_a_shared_vertex_crosses_once(follow):
     assert (paths.indices[:, 1] == np.float32(1.5)).all()
 
 
-def test_a_closed_outline_is_left_as_often_as_it_is_entered(follow):
-    """Rays at vertices of a star, tips and notches among them, end in the medium where they began, or within it."""
+def test_rays_enter_and_leave_a_closed_outline_equally_often(follow):
+    """Rays aimed at the tips and notches of a star end outside in air, or are trapped inside."""
     figure, rng = star(60), np.random.default_rng(3)
     origins = rng.normal(size=(200, 2)) * 0.3 + [3, 0]
     paths = follow(figure, origins, figure.start[rng.integers(0, 60, 200)] - origins, max_depth=40)
@@ -93,15 +93,16 @@ def test_a_closed_outline_is_left_as_often_as_it_is_entered(follow):
 
 
 TIP, UNIT = polygon([(0, 0), (1, 0.5), (0, 1)]), polygon(SQUARE)
-TURNED = Segments(UNIT.start, UNIT.end, [1.5, 1, 1.5, 1.5], [1, 1.5, 1, 1])  # its right side is turned round
+TURNED = Segments(UNIT.start, UNIT.end, [1.5, 1, 1.5, 1.5], [1, 1.5, 1, 1])  # its right side has the wrong direction
 INNER = polygon([(0.25, 0.25), (0.75, 0.25), (0.75, 0.75), (0.25, 0.75)], 1.33, outside=1.5)
-# Below one segment with 1.0 above it, on the right, too, where the medium is 1.3: a vertex inside a segment.
+# A vertex inside a segment: index 1.5 below, 1.0 above on the left, and 1.3 above on the right, where the horizontal
+# segment has 1.0.
 WHOLE = Segments([(-9, 0), (0, 0)], [(9, 0), (0, 9)], np.ones(2), [1.5, 1.3])
 # Three media about (0, 0): 1.5 below, 1.0 above on the left, 1.3 above on the right.
 JUNCTION = Segments(np.zeros((3, 2)), [(-9, 0), (9, 0), (0, 9)], [1.5, 1.3, 1.0], [1.0, 1.5, 1.3])
-STORIES = {  # segments, ray and options; the segments that it meets, its events, the indices of its media
-    "up along a tip it is displaced to the right, and misses": (TIP, (1, -1), (0, 1), {}, [], [ESCAPED], None),
-    "down along it it enters": (TIP, (1, 2), (0, -1), {}, [1, 0], [REFRACTED, REFRACTED, ESCAPED], None),
+STORIES = {  # segments, origin, direction, options; expected hits, events, indices of the media
+    "up along a tip: displaced to the right, it misses": (TIP, (1, -1), (0, 1), {}, [], [ESCAPED], None),
+    "down along a tip: it enters": (TIP, (1, 2), (0, -1), {}, [1, 0], [REFRACTED, REFRACTED, ESCAPED], None),
     "along a side on its right": (UNIT, (-1, 0), (1, 0), {}, [], [ESCAPED], None),
     "along a side on its left": (UNIT, (2, 0), (-1, 0), {}, [1, 3], [REFRACTED, REFRACTED, ESCAPED], None),
     "media within media": (
@@ -110,19 +111,19 @@ STORIES = {  # segments, ray and options; the segments that it meets, its events
     ),
     "the first boundary gives the medium": (UNIT, (0.5, 0.5), (1, 0), {}, [1], [REFRACTED, ESCAPED], [1.5, 1]),
     "or n_start": (UNIT, (0.5, 0.5), (1, 0), {"n_start": 1.5}, [1], [REFRACTED, ESCAPED], [1.5, 1]),
-    "n_start is not what lies there": (UNIT, (0.5, 0.5), (1, 0), {"n_start": 1.25}, [1], [MISMATCH], [1.25]),
+    "n_start contradicts the first boundary": (UNIT, (0.5, 0.5), (1, 0), {"n_start": 1.25}, [1], [MISMATCH], [1.25]),
     "no boundary, no medium": (UNIT, (2, 2), (1, 0), {}, [], [ESCAPED], [math.nan]),
-    "turned round": (TURNED, (-1, 0.5), (1, 0), {}, [3, 1], [REFRACTED, MISMATCH], [1, 1.5]),
+    "a side with the wrong direction": (TURNED, (-1, 0.5), (1, 0), {}, [3, 1], [REFRACTED, MISMATCH], [1, 1.5]),
     "a junction from straight above": (JUNCTION, (0, 2), (0, -1), {}, [0], [REFRACTED, ESCAPED], [1, 1.5]),
     "a vertex in a segment": (WHOLE, (3, 1), (-0.1, -1), {"n_start": 1.3}, [0], [MISMATCH], [1.3]),
-    "its other side": (WHOLE, (-3, 1), (0.1, -1), {}, [0], [REFRACTED, ESCAPED], [1, 1.5]),
+    "a vertex in a segment, other side": (WHOLE, (-3, 1), (0.1, -1), {}, [0], [REFRACTED, ESCAPED], [1, 1.5]),
     "max_depth": (UNIT, (-1, 0.5), (1, 0), {"max_depth": 1}, [3], [REFRACTED, MAX_DEPTH], [1, 1.5]),
     "max_depth and nothing ahead": (
         *(UNIT, (-1, 0.5), (1, 0), {"max_depth": 2}, [3, 1], [REFRACTED, REFRACTED, ESCAPED]),
         [1, 1.5, 1],
     ),
     **{
-        f"points only are no boundary, {method}": (
+        f"only segments of length zero, {method}": (
             *(together(*[polygon([(0.5, 0.5)])] * 60), (0, 0), (1, 1), {"method": method}, [], [ESCAPED]),
             [math.nan],
         )
@@ -132,42 +133,42 @@ STORIES = {  # segments, ray and options; the segments that it meets, its events
 
 
 @pytest.mark.parametrize("case", STORIES)
-def test_a_ray_meets(follow, setting, case):
+def test_a_ray_through_vertices_and_media(follow, setting, case):
     segments, origin, direction, options, hits, events, indices = STORIES[case]
     paths = follow(segments, origin, direction, **options)
     assert story(paths) == (hits, events)
     if indices:
         rounded = np.array(indices, setting.name)
         assert np.array_equal(paths.indices[0, : len(indices)], rounded, equal_nan=True)
-    if 0 in direction and (segments is UNIT or segments is TURNED):  # it goes straight on, from side to side
+    if 0 in direction and (segments is UNIT or segments is TURNED):  # the ray is perpendicular to the sides
         across = direction.index(0)
         places = paths.points[0, : len(hits) + 1]
         assert (places[:, across] == origin[across]).all() and np.isin(places[1:, 1 - across], (0, 1)).all()
         assert paths.directions[0].tolist() == list(direction)
-    if events[-1] == MISMATCH:  # it ends there, as it came
+    if events[-1] == MISMATCH:  # the path ends with the direction that it arrived with
         assert paths.directions[0] == pytest.approx(np.array(direction) / math.hypot(*direction), abs=1e-7)
         assert np.isfinite(paths.points[0, len(hits)]).all() and not np.isfinite(paths.points[0, len(hits) + 1 :]).any()
 
 
-def test_a_segment_of_length_zero_is_no_boundary(follow):
+def test_segments_of_length_zero_are_ignored(follow):
     dots = polygon([(0.5, 0.5)], n=9.0)
     o, d = np.array([(-1, 0.25), (0.5, -1), (-1, -0.5), (-1, 0.5)]), np.array([(1, 0.1), (0, 1), (1, 1), (1, 0)])
     plain, dotted = (follow(segments, o, d) for segments in (UNIT, together(UNIT, dots)))
-    for one, other in zip(dataclasses.astuple(plain), dataclasses.astuple(dotted), strict=True):
-        assert np.array_equal(one, other, equal_nan=True)
+    for expected, values in zip(dataclasses.astuple(plain), dataclasses.astuple(dotted), strict=True):
+        assert np.array_equal(values, expected, equal_nan=True)
 
 
-def test_a_ray_that_starts_on_a_segment_has_not_met_it(follow):
+def test_a_ray_does_not_meet_the_segment_that_it_starts_on(follow):
     square = polygon([(0, 0), (0.9, 0.1), (1, 1.1), (0.2, 0.8)])
     share = np.repeat([0.1, 1 / 3, 0.7], 4)[:, None]
     a, e = np.tile(square.start, (3, 1)), np.tile(square.end - square.start, (3, 1))
     inward = np.column_stack([-e[:, 1], e[:, 0]])
-    within, outward = (follow(square, a + share * e, way) for way in (inward, -inward))
+    within, outward = (follow(square, a + share * e, direction) for direction in (inward, -inward))
     assert (within.hits[:, 0] != np.tile(np.arange(4), 3)).all() and (within.indices[:, 0] == 1.5).all()
     assert (outward.events[:, 0] == ESCAPED).all()
 
 
-def test_at_a_junction_boundaries_are_crossed_one_after_the_other(follow):
+def test_a_ray_through_a_junction_crosses_its_boundaries_in_order(follow):
     angle = np.linspace(0, 2 * np.pi, 41)[:-1] + 0.05
     origins = 2 * np.column_stack([np.cos(angle), np.sin(angle)])
     paths = follow(JUNCTION, origins, -origins, max_depth=8)
@@ -175,7 +176,7 @@ def test_at_a_junction_boundaries_are_crossed_one_after_the_other(follow):
     assert (paths.events == ESCAPED).any(axis=1).all()
 
 
-def test_bits_say_where_a_ray_is_reflected(follow):
+def test_reflect_bits_choose_the_boundaries_that_reflect(follow):
     paths = follow(UNIT, [(-1, 0.5)] * 4, [(1, 0)] * 4, max_depth=6, reflect=[0, 1, 2, 6])
     stories = [story(paths, i) for i in range(4)]
     assert stories == [
@@ -189,8 +190,8 @@ def test_bits_say_where_a_ray_is_reflected(follow):
     assert [paths.weights[i, len(stories[i][0])] for i in range(4)] == pytest.approx(powers, rel=1e-6)
 
 
-def test_a_ray_along_a_side_goes_on_on_the_side_that_it_is_on(follow):
-    """Rounding hides the sign of its cosine: such rays were within by their medium and outside by their direction."""
+def test_a_ray_along_a_side_stays_on_its_side(follow):
+    """Rounding may hide the sign of its cosine: then its medium would be inside and its direction outside."""
     square = np.array(SQUARE, float) - 0.5
     for turn in np.radians(np.arange(0, 90, 1.1)):
         c, s = math.cos(turn), math.sin(turn)
@@ -198,8 +199,8 @@ def test_a_ray_along_a_side_goes_on_on_the_side_that_it_is_on(follow):
         along = figure.end - figure.start
         along = np.concatenate([along, -along])
         paths = follow(figure, np.concatenate([figure.start, figure.end]) - along, along, max_depth=1, n_start=1.0)
-        met = paths.events[:, 0] == REFRACTED
-        side, d = (figure.end - figure.start)[paths.hits[met, 0]], paths.directions[met]
+        refracted = paths.events[:, 0] == REFRACTED
+        side, d = (figure.end - figure.start)[paths.hits[refracted, 0]], paths.directions[refracted]
         assert (side[:, 0] * d[:, 1] - side[:, 1] * d[:, 0] > 0).all()
 
 
@@ -207,7 +208,7 @@ def test_a_ray_along_a_side_goes_on_on_the_side_that_it_is_on(follow):
 
 
 def arcs_of_circle(turn, count=4):
-    """Arcs of a circle of glass, the first of which starts at the angle `turn`."""
+    """A circle of glass made of arcs, the first of which starts at the angle `turn`."""
     half = math.pi / count
     angle = turn + 2 * half * np.arange(count)
     start, control = (np.column_stack([np.cos(x), np.sin(x)]) for x in (angle, angle + half))
@@ -215,7 +216,7 @@ def arcs_of_circle(turn, count=4):
     return Segments(start, np.roll(start, -1, axis=0), *media, control / math.cos(half), weight)
 
 
-def test_a_ball_turns_a_ray_by_twice_the_difference_of_angles(follow, setting):
+def test_a_ball_turns_a_ray_by_twice_the_difference_of_its_angles(follow, setting):
     height = np.array([-0.95, -0.5, -0.1, 0.0, 0.3, 0.8])
     paths = follow(ball(), np.column_stack([-3 + 0 * height, height]), np.tile([1.0, 0.0], (6, 1)))
     assert (paths.events[:, :3] == [REFRACTED, REFRACTED, ESCAPED]).all()
@@ -225,28 +226,28 @@ def test_a_ball_turns_a_ray_by_twice_the_difference_of_angles(follow, setting):
 
 
 @pytest.mark.parametrize("grazing", [0.5, 1e-2, 1e-3])
-def test_inside_a_ball_a_ray_turns_by_the_same_angle_each_time(follow, setting, grazing):
-    """Chords of angle 2 α, many of them within one arc; none is skipped, none leaks at the joints."""
+def test_each_reflection_inside_a_ball_turns_a_ray_by_the_same_angle(follow, setting, grazing):
+    """Chords of angle 2 α, many of them within one arc; no reflection is skipped, and no ray leaks at the joints."""
     count = 500
     start = np.array([math.cos(0.3), math.sin(0.3)]) * math.cos(grazing)
     paths = follow(ball(), start, (-math.sin(0.3), math.cos(0.3)), max_depth=count)
     assert story(paths)[1] == [REFLECTED] * count + [MAX_DEPTH]
     assert paths.weights == pytest.approx(1, abs=4 * count * setting.roundoff)
     angle = np.unwrap(np.arctan2(*paths.points[0, 1:, ::-1].T))
-    # A chord's own error: u of the place over the grazing angle, and that of the angle adds up as the rays go on.
+    # The error of a chord is u of the place over the grazing angle; the error of the angle grows with their number.
     bound = 60 * count**0.5 * setting.roundoff / grazing
     assert np.diff(angle.astype(float)) == pytest.approx(2 * grazing, abs=bound)
 
 
-def test_an_arc_is_met_by_rays_that_miss_its_chord(follow):
-    """A ray at height 0.99 over the ball's top arc crosses that arc twice and the chord never."""
+def test_rays_that_miss_the_chord_of_an_arc_meet_the_arc(follow):
+    """A ray at height 0.99 crosses the ball's top arc twice, but not its chord."""
     paths = follow(arcs_of_circle(-math.pi / 4), (-3, 0.99), (1, 0), formula="promoted")
     assert story(paths)[0][0] == 1
     assert paths.points[0, 1] == pytest.approx([-math.sqrt(1 - 0.99**2), 0.99], abs=1e-6)
 
 
-def test_arcs_that_meet_in_a_tip_are_met_in_order(follow):
-    """A lens of two arcs, rays at its rim: each enters before it leaves, whichever arc is listed first."""
+def test_arcs_that_meet_in_a_tip_are_crossed_in_order(follow):
+    """Rays aimed at the rim of a lens of two arcs enter before they leave, whichever arc is listed first."""
     for order in ([0, 1], [1, 0]):
         start, end = np.array([(0.0, 1.0), (0.0, -1.0)]), np.array([(0.0, -1.0), (0.0, 1.0)])
         control, weight = np.array([(-0.5, 0.0), (0.5, 0.0)]), np.full(2, 0.8)
@@ -261,10 +262,10 @@ def test_arcs_that_meet_in_a_tip_are_met_in_order(follow):
 
 @pytest.mark.parametrize("inside", [False, True])
 @pytest.mark.parametrize("swapped", [False, True])
-def test_balls_that_touch_are_met_in_order_by_a_ray_through_that_point(follow, inside, swapped):
-    """Their arcs have one direction there; which way each bends says which comes first, whichever is listed first.
+def test_a_ray_through_the_contact_of_two_balls_crosses_them_in_order(follow, inside, swapped):
+    """The arcs have the same direction there: their curvatures decide, whichever ball is listed first.
 
-    A figure that is turned is off by rounding, and still in order.
+    Rotations test this with rounded coordinates.
     """
     one, other = ball(), ball(1.3)
     x, size, around = (0.5, 0.5, 1.5) if inside else (2.0, 1.0, 1.0)
@@ -284,40 +285,41 @@ def test_balls_that_touch_are_met_in_order_by_a_ray_through_that_point(follow, i
 
 @pytest.mark.parametrize("count", [3, 4, 8])
 def test_rays_from_joint_to_joint_of_a_circle_stay_on_it(follow, setting, count):
-    """Within 1e-14 of a joint the next point was on the right arc at a wrong place, or on none."""
+    """A ray that starts within 1e-14 of a joint meets the right arc at the right place."""
     for turn in np.radians([0, 20, 33.3, 71]):
         circle = arcs_of_circle(turn, count)
         chord = np.radians(np.array([15, 40, 60, 75, 110, 160, 179]))
         joint = np.repeat(np.arange(count), len(chord))
         angle = turn + 2 * math.pi / count * joint - np.tile(chord, count)
         origins = 0.9 * np.column_stack([np.cos(angle), np.sin(angle)]) + 0.1 * circle.start[joint]
-        # Bits that ask for reflection where it would not be total.
+        # The bits request reflection where it would not be total.
         paths = follow(circle, origins, circle.start[joint] - origins, max_depth=4, reflect=0xFFFF)
         assert (paths.events == [REFLECTED] * 4 + [MAX_DEPTH]).all()
         exact = angle[:, None] + np.tile(chord, count)[:, None] * np.arange(1, 5)
         off = np.arctan2(paths.points[:, 1:, 1], paths.points[:, 1:, 0]) - exact
         off = np.abs((off + math.pi) % (2 * math.pi) - math.pi)
-        # 8u of each direction, which turns those behind it by twice as much: 8u (1 + 3 + 5 + 7), and the angle by twice
-        # that; and 64u for angles up to 6π in double precision.
+        # A direction has an error of 8u and turns those behind it by twice that: 8u (1 + 3 + 5 + 7), and the angle by
+        # twice this sum; plus 64u for angles up to 6π in double precision.
         assert (off <= 320 * setting.roundoff / np.sin(np.tile(chord, count) / 2)[:, None]).all()
 
 
-def test_straight_segments_among_arcs_decide_as_alone_do(follow):
-    """To the last bit: at vertices and anywhere; the first segment of the other figure is an arc."""
+def test_straight_segments_give_the_same_hits_among_arcs(follow):
+    """Bit for bit, for rays at vertices and random rays; in the second figure the first segment is an arc."""
     rng, plain = np.random.default_rng(5), star(30)
     mixed = dataclasses.replace(plain, control=(plain.start + plain.end) / 2, weight=np.ones(30))
     mixed.control[0] += 1e-3 * (plain.end[0] - plain.start[0])[::-1] * [-1, 1]
     origins, vertices = rng.normal(size=(100, 2)), plain.start[rng.integers(0, 30, 50)]
     directions = np.concatenate([rng.normal(size=(50, 2)), vertices - origins[50:]])
-    one, other = (follow(x, origins, directions) for x in (plain, mixed))
-    same = (one.hits != 0).all(1) & (other.hits != 0).all(1)
-    assert same.sum() > len(same) / 2
+    lines, arcs = (follow(segments, origins, directions) for segments in (plain, mixed))
+    without_arc = (lines.hits != 0).all(1) & (arcs.hits != 0).all(1)
+    assert without_arc.sum() > len(without_arc) / 2
     for name in ("hits", "events", "points", "directions"):
-        assert np.array_equal(getattr(one, name)[same], getattr(other, name)[same], equal_nan=True), name
+        expected, values = getattr(lines, name)[without_arc], getattr(arcs, name)[without_arc]
+        assert np.array_equal(values, expected, equal_nan=True), name
 
 
 @pytest.mark.parametrize(("control", "weight"), [((0.5, 0.0), 2.0), ((0.3, 0.0), 1.0)])
-def test_a_straight_piece_may_run_along_itself_at_any_pace(follow, setting, control, weight):
+def test_a_straight_segment_may_have_any_control_point_on_it(follow, setting, control, weight):
     piece = Segments([(0, 0)], [(1, 0)], [1.5], [1.0], [control], [weight])
     assert follow(piece, (0.2, 1), (0, -1)).points[0, 1] == pytest.approx([0.2, 0], abs=4 * setting.roundoff)
 
@@ -346,7 +348,7 @@ BAD_ARGUMENTS = [
     ({"max_depth": 2**32}, "1 rays, max_depth = 4294967296; expected a product below 2³²"),
     ({"origins": [(0.0, math.nan)]}, "origins[0, 1] = nan; expected finite"),
     ({"origins": [(0.0, 1e101)]}, "origins, relative to the segments: 1e+101; expected up to ±1.1259e+15"),
-    ({"end": [(1e-300, 0.0)]}, "segments: within 1.5e-300 of each other; expected 1e-100 or more"),
+    ({"end": [(1e-300, 0.0)]}, "segments: their box is 1.5e-300 wide; expected 1e-100 or more"),
     ({"control": [(0.5, 1e101)], "weight": [1.0]}, "segments.control: 1e+101; expected up to ±1e+100"),
     ({"directions": [(0.0, 0.0)]}, "directions[0] = (0, 0); expected a direction"),
     ({"directions": [(0.0, 1.0)] * 2}, "directions: shape (2, 2); expected (1, 2)"),
@@ -360,7 +362,7 @@ BAD_ARGUMENTS = [
 
 
 @pytest.mark.parametrize(("change", "message"), BAD_SEGMENTS + BAD_ARGUMENTS)
-def test_bad_input_is_named_in_one_line(change, message):
+def test_errors_name_the_bad_input_in_one_line(change, message):
     arguments = {"origins": [(0.5, 1.0)], "directions": [(0.0, -1.0)], "max_depth": 2}
     names = GOOD.keys() | {"control", "weight"}
     with pytest.raises(ValueError) as error:
@@ -374,12 +376,12 @@ def test_arcs_may_share_their_ends():
         assert len(Segments(**TWICE, control=control, weight=weight)) == 2
 
 
-def test_float32_has_a_range_of_its_own(needs_variant):
+def test_float32_has_its_own_range(needs_variant):
     needs_variant("llvm_ad_rgb")
     bad = [({"end": [(1e16, 0.0)]}, -1.0, r"segments.end: 1e\+16; expected up to ±1e\+15")]
-    bad += [({"n_left": [1e-20]}, -1.0, "segments: the index 1e-20; expected at least 1e-15")]
-    bad += [({"end": [(1e-20, 0.0)]}, -1.0, "segments: within 1.5e-20 of each other; expected 1e-15 or more")]
-    # Rays from there started behind the boundaries.
+    bad += [({"n_left": [1e-20]}, -1.0, "segments: index 1e-20; expected at least 1e-15")]
+    bad += [({"end": [(1e-20, 0.0)]}, -1.0, "segments: their box is 1.5e-20 wide; expected 1e-15 or more")]
+    # From there, rounding would let rays start behind the boundaries.
     beyond = r"origins, relative to the segments: \S+; expected up to ±2.09715e\+06"
     bad += [({}, -1e8, beyond), ({"start": [(0.0, 1e9)], "end": [(1.0, 1e9)]}, 0.0, beyond)]
     for change, y, message in bad:
@@ -387,13 +389,13 @@ def test_float32_has_a_range_of_its_own(needs_variant):
             trace(Segments(**GOOD | change), [(0.5, y)], [(0.0, 1.0)], 2, precision="float32", backend="llvm")
 
 
-@pytest.mark.parametrize(("asked", "llvm"), [("scalar", True), ("scalar", False), (None, False)])
-def test_scalar_arrays_refuse_float32_because_they_compute_in_double(monkeypatch, asked, llvm):
-    """Asked for by name, or chosen because LLVM cannot run here."""
+@pytest.mark.parametrize(("backend", "llvm"), [("scalar", True), ("scalar", False), (None, False)])
+def test_the_scalar_backend_rejects_float32(monkeypatch, backend, llvm):
+    """Scalar arrays compute in double, whether the backend is requested or chosen because LLVM cannot run here."""
     usable = {"scalar": True, "llvm": llvm, "cuda": False}
     monkeypatch.setattr(array_backend, "detect", lambda: {name: Backend(name, u, "why") for name, u in usable.items()})
     with pytest.raises(ValueError) as error:
-        trace(UNIT, [(0, 0)], [(0, 1)], 1, backend=asked, precision="float32")
+        trace(UNIT, [(0, 0)], [(0, 1)], 1, backend=backend, precision="float32")
     message = "precision = 'float32': scalar arrays compute in double; expected float64, or a compiled backend (llvm, "
     assert str(error.value) == f"{message}cuda){'' if llvm else '; llvm cannot run here: why'}"
 
@@ -412,12 +414,12 @@ def test_a_scene_may_be_small(follow, setting):
 
 
 def test_a_scene_may_be_far_from_0(follow, setting):
-    """Where float32 has steps of 0.125: differences of coordinates are exact, and only they count."""
+    """At 2²⁰ the steps of float32 are 0.125. Only differences of coordinates matter, and they are exact."""
     triangle, origin = np.array([(0, 0), (1, 0), (0.25, 1)]), np.array([-1, 0.125])
     plain, far = (follow(polygon(triangle + x), origin + x, (1, 0.17)) for x in (0.0, 2.0**20))
     assert story(far) == story(plain)
     assert far.directions == pytest.approx(plain.directions, abs=16 * setting.roundoff)
 
 
-def test_no_rays_are_no_paths(follow):
+def test_no_rays_give_no_paths(follow):
     assert follow(UNIT, np.zeros((0, 2)), np.zeros((0, 2)), max_depth=3).points.shape == (0, 4, 2)

@@ -1,4 +1,4 @@
-"""Ray sets and their files: exact and replayable; what was edited, damaged or forged is one line of error."""
+"""Ray sets and their files are exact and reproducible; edited, damaged or forged files give an error of one line."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ SMALL = {"names": ("generic", "k ≪ 1", "k ≫ 1", "denormal"), "count": 300, "
 AIR = dataclasses.replace(media.parse(1.0), relative_to="air")
 
 
-def refused(path, message, read=files.read):
-    """Assert that the error is one line that names the file."""
+def assert_refused(path, message, read=files.read):
+    """Assert that reading fails with an error of one line that names the file."""
     with pytest.raises(ValueError) as caught, np.errstate(all="ignore"):
         read(path)
     text = str(caught.value)
@@ -44,12 +44,12 @@ def refused(path, message, read=files.read):
 # Rays ----------------------------------------------------------------------------------------------------------------
 
 
-def test_the_rays_are_the_regimes_own_and_normals_face_them():
-    made = ray_set.make(["Brewster", "grazing"], 50, "f64", 3, two_sided=True)
-    assert made.header["regimes"] == {"Brewster": [0, 49], "grazing": [50, 99]}
-    expected, part = regimes.make("grazing", 50, np.float64, 3), made.rays[made.regime == "grazing"]
+def test_sets_contain_the_rays_of_the_regimes_and_normals_face_them():
+    two_regimes = ray_set.make(["Brewster", "grazing"], 50, "f64", 3, two_sided=True)
+    assert two_regimes.header["regimes"] == {"Brewster": [0, 49], "grazing": [50, 99]}
+    expected, grazing = regimes.make("grazing", 50, np.float64, 3), two_regimes.rays[two_regimes.regime == "grazing"]
     for name in "ank":
-        np.testing.assert_array_equal(getattr(part, name), getattr(expected, name))
+        np.testing.assert_array_equal(getattr(grazing, name), getattr(expected, name))
     for options in ({"names": ("generic", "grazing", "on a denormal", "tangential")}, {"count": 200, **ALL}):
         either, facing = (ray_set.make(**{"count": 50} | options, two_sided=x).rays for x in (True, False))
         side = [float_expansions.dot(r.n.T.astype(float), r.a.T.astype(float))[0] for r in (either, facing)]
@@ -58,7 +58,7 @@ def test_the_rays_are_the_regimes_own_and_normals_face_them():
         np.testing.assert_array_equal(facing.a, either.a)
 
 
-def test_the_program_on_the_page_is_right_and_its_table_has_every_mistake(tmp_path):
+def test_the_program_of_the_page_is_right_and_its_table_lists_every_mistake(tmp_path):
     (tmp_path / "my_tracer.py").write_text(python_blocks(PAGE)[0])
     rays = ray_set.make(count=50)
     answers = files.answers_of([sys.executable, str(tmp_path / "my_tracer.py")], rays)
@@ -70,38 +70,38 @@ def test_the_program_on_the_page_is_right_and_its_table_has_every_mistake(tmp_pa
 
 @pytest.mark.parametrize("precision, ending", FORMATS)
 @pytest.mark.parametrize("options", [SMALL, {"names": ("generic", "critical"), "count": 40, "seed": 5, **ALL}])
-def test_every_bit_returns(tmp_path, precision, ending, options):
-    """A reader of CSV in float64 and one in the set's precision both have the very number, and lose nothing of k."""
-    made = ray_set.make(**options, precision=precision)
-    path = files.write(tmp_path / f"rays.{ending}", made)
-    found = files.read(path)
+def test_files_keep_every_bit(tmp_path, precision, ending, options):
+    """Readers of CSV in float64 and in the set's precision both get the exact numbers, and the exact k."""
+    rays = ray_set.make(**options, precision=precision)
+    path = files.write(tmp_path / f"rays.{ending}", rays)
+    rays_read = files.read(path)
     for name in "ank":
-        one, other = getattr(found.rays, name), getattr(made.rays, name)
-        assert (one.tobytes(), one.dtype) == (other.tobytes(), other.dtype)
-    assert (found.header, list(found.regime), found.ids.tolist()) == (
-        made.header,
-        list(made.regime),
-        list(range(len(made))),
+        values, expected = getattr(rays_read.rays, name), getattr(rays.rays, name)
+        assert (values.tobytes(), values.dtype) == (expected.tobytes(), expected.dtype)
+    assert (rays_read.header, list(rays_read.regime), rays_read.ids.tolist()) == (
+        rays.header,
+        list(rays.regime),
+        list(range(len(rays))),
     )
-    np.testing.assert_array_equal(found.numbers, made.numbers)
+    np.testing.assert_array_equal(rays_read.numbers, rays.numbers)
     for seed in (5, 6):
-        again = files.write(tmp_path / f"again.{ending}", ray_set.make(**options | {"seed": seed}, precision=precision))
-        assert (again.read_bytes() == path.read_bytes()) == (seed == 5)
+        path2 = files.write(tmp_path / f"again.{ending}", ray_set.make(**options | {"seed": seed}, precision=precision))
+        assert (path2.read_bytes() == path.read_bytes()) == (seed == 5)
     if ending == "csv":
         rows = [line.split(",") for line in path.read_text().splitlines() if not line.startswith("#")]
         text = np.array(rows[1:])
-        for dtype in (np.float64, made.rays.a.dtype):
-            np.testing.assert_array_equal(text[:, 1:7].astype(dtype), np.hstack([made.rays.a, made.rays.n]))
-        n_from, n_to = text[:, 7:9].astype(made.rays.k.dtype).T
-        np.testing.assert_array_equal(n_from / n_to, made.rays.k)
+        for dtype in (np.float64, rays.rays.a.dtype):
+            np.testing.assert_array_equal(text[:, 1:7].astype(dtype), np.hstack([rays.rays.a, rays.rays.n]))
+        n_from, n_to = text[:, 7:9].astype(rays.rays.k.dtype).T
+        np.testing.assert_array_equal(n_from / n_to, rays.rays.k)
         assert min(n_from.min(), n_to.min()) >= 1
     if options is SMALL:
-        denormal = made.rays.n[made.regime == "denormal"]
+        denormal = rays.rays.n[rays.regime == "denormal"]
         assert (np.signbit(denormal) & (denormal == 0)).any()
         assert ((denormal != 0) & (np.abs(denormal) < np.finfo(denormal.dtype).tiny)).any()
 
 
-# Of a set that is written here: what is drawn may differ in the last bit of NumPy's functions.
+# Of a set written out in the test: random rays may differ in the last bit of NumPy's functions.
 CHECKSUM = "sha256:e12027e60442a09b7176e9ca4925ed2885a1a663c062d16d2b3e4a925c4284ad"
 WRITTEN = {
     "csv": "7436b4d65d4057d13c466b85879e7eca53dc17bd28eccd58730d5611c645ded2",
@@ -110,14 +110,13 @@ WRITTEN = {
 
 
 @pytest.mark.parametrize("ending", WRITTEN)
-def test_a_set_is_what_it_was(tmp_path, ending):
-    """Byte for byte."""
+def test_files_do_not_change_between_versions(tmp_path, ending):
     a, n = np.array([[0.6, 0, 0.8], [0, -1, 0]]), np.array([[0, 0, -1.0], [0, 1, 0]])
     rays = Rays(*(x.astype(np.float32) for x in (a, n, np.array([0.6666667, 1.5]))))
     top = ray_set.make(["generic"], 2).header | {"version": "0"}
-    made = ray_set.with_checksum(RaySet(rays, np.arange(2), top))
-    assert made.header["checksum"] == CHECKSUM
-    path = files.write(tmp_path / f"rays.{ending}", made)
+    rays_set = ray_set.with_checksum(RaySet(rays, np.arange(2), top))
+    assert rays_set.header["checksum"] == CHECKSUM
+    path = files.write(tmp_path / f"rays.{ending}", rays_set)
     assert hashlib.sha256(path.read_bytes()).hexdigest() == WRITTEN[ending]
 
 
@@ -131,24 +130,24 @@ def test_paths_that_cannot_be_written(tmp_path, name):
 # Media ---------------------------------------------------------------------------------------------------------------
 
 
-def of_ray(rays, row):
-    """(from, to) by name, and the wavelength, as a reader of the file finds them."""
+def medium_of_ray(rays, row):
+    """(from, to, wavelength) of a ray, as a reader of the file gets them."""
     wavelength, pair = rays.numbers[row, 9:]
     return (*rays.header["media"][int(pair)], wavelength)
 
 
 @pytest.mark.parametrize("precision", ray_set.PRECISIONS)
 @pytest.mark.parametrize("name", header.TAKE_RATIOS)
-def test_k_is_the_ratio_of_the_media_and_every_combination_occurs(name, precision):
+def test_k_is_the_ratio_of_the_media_in_every_combination(name, precision):
     rays, dtype = ray_set.make([name], 12, precision, **ALL), ray_set.PRECISIONS[precision]
     for row in range(len(rays)):
-        left, entered, wavelength = of_ray(rays, row)
+        left, entered, wavelength = medium_of_ray(rays, row)
         pair = [AIR if medium == "air" else media.parse(medium) for medium in (left, entered)]
         assert rays.rays.k[row] == dtype(media.relative_index(*pair, wavelength))
     sides = [(medium, "air") for medium in MEDIA] + ([("air", x) for x in MEDIA] if name != "critical" else [])
     expected = {(*side, dtype(wavelength)) for side, wavelength in itertools.product(sides, WAVELENGTHS)}
-    assert {of_ray(rays, row) for row in range(12)} == expected
-    if name not in ("critical", "Brewster"):  # they aim at the angles of the medium
+    assert {medium_of_ray(rays, row) for row in range(12)} == expected
+    if name not in ("critical", "Brewster"):  # their angles depend on the medium
         with_media, without = (ray_set.make([name], 24, "f64", 7, two_sided=True, **x).rays for x in (ALL, {}))
         np.testing.assert_array_equal(with_media.a, without.a)
         np.testing.assert_array_equal(with_media.n, without.n)
@@ -156,29 +155,29 @@ def test_k_is_the_ratio_of_the_media_and_every_combination_occurs(name, precisio
 
 
 def test_columns_defaults_and_descriptions(tmp_path):
-    thin = ray_set.make(["critical"], 4, media=("0.9",), wavelengths=(500.0,))  # critical from outside
-    assert {of_ray(thin, row)[:2] for row in range(4)} == {("air", "0.9")}
-    made = ray_set.make(["generic"], 12, "f64", **ALL)
-    lines = files.as_csv(made).splitlines()
+    thin = ray_set.make(["critical"], 4, media=("0.9",), wavelengths=(500.0,))  # total reflection occurs in the air
+    assert {medium_of_ray(thin, row)[:2] for row in range(4)} == {("air", "0.9")}
+    glasses = ray_set.make(["generic"], 12, "f64", **ALL)
+    lines = files.as_csv(glasses).splitlines()
     top = lines.index("id,ax,ay,az,nx,ny,nz,n_from,n_to,wavelength,medium")
     order = itertools.product(range(2), ("486.1327", "587.5618"), range(3))
     assert [line.split(",")[-2:] for line in lines[top + 1 :]] == [[x, str(2 * i + turned)] for turned, x, i in order]
-    with np.load(files.write(tmp_path / "rays.npz", ray_set.make(["generic"], 12, **ALL))) as found:
-        assert (found["wavelength"].dtype, found["medium"].dtype) == (np.float32, np.int64)
-        assert found["medium"].tolist() == [0, 2, 4] * 2 + [1, 3, 5] * 2
-    assert header.described(made.header, 2) == f"{WATER} to air at 486.1327 nm"
-    assert header.described(made.header, 10) == f"air to {FLINT} at 587.5618 nm"
+    with np.load(files.write(tmp_path / "rays.npz", ray_set.make(["generic"], 12, **ALL))) as arrays:
+        assert (arrays["wavelength"].dtype, arrays["medium"].dtype) == (np.float32, np.int64)
+        assert arrays["medium"].tolist() == [0, 2, 4] * 2 + [1, 3, 5] * 2
+    assert header.described(glasses.header, 2) == f"{WATER} to air at 486.1327 nm"
+    assert header.described(glasses.header, 10) == f"air to {FLINT} at 587.5618 nm"
     assert header.described(thin.header | {"x": 1}, 0) and header.described({}, 2) == ""
     names = ("generic", "near-normal", "grazing", "critical", "Brewster", "axes, signed zeros", "denormal")
     rays = ray_set.make(count=12, media=list(MEDIA), wavelengths=np.array(WAVELENGTHS))
     assert tuple(rays.header["regimes"]) == ray_set.default(MEDIA) == names
     assert rays.header == ray_set.make(count=12, **ALL).header
-    specs = tuple(f"1.{i}" for i in range(10, 74))  # as many as there may be
+    specs = tuple(f"1.{i}" for i in range(10, 74))  # the largest number allowed
     rays = ray_set.make(["generic"], 2 * 64 * 64, media=specs, wavelengths=tuple(range(400, 464)))
     assert len(np.unique(rays.numbers[:, 9:], axis=0)) == len(rays)
 
 
-def test_a_glass_is_the_same_in_any_case_and_an_unknown_one_has_nearest_names():
+def test_names_of_glasses_ignore_case_and_unknown_ones_get_suggestions():
     lower, upper = (
         ray_set.make(["generic"], 4, media=(x,), wavelengths=(587.5618,)) for x in ("schott:n-bk7", "SCHOTT:N-BK7")
     )
@@ -233,7 +232,7 @@ def test_invalid_sets(message):
     assert message in text and "\n" not in text and len(text) < 800
 
 
-# What was edited or forged -------------------------------------------------------------------------------------------
+# Edited and forged files ---------------------------------------------------------------------------------------------
 
 FOUR = ray_set.make(["generic", "critical"], 2)
 WITH_MEDIA = ray_set.make(["generic"], 12, "f64", **ALL)
@@ -278,10 +277,10 @@ EDITS = {
 
 
 @pytest.mark.parametrize("text, edit, message", EDITS.values(), ids=EDITS)
-def test_an_edited_file_is_refused(tmp_path, text, edit, message):
+def test_edited_files_are_refused(tmp_path, text, edit, message):
     assert edit(text) != text
     (tmp_path / "rays.csv").write_text(edit(text))
-    refused(tmp_path / "rays.csv", message)
+    assert_refused(tmp_path / "rays.csv", message)
 
 
 @pytest.mark.parametrize("ending", ["csv", "npz"])
@@ -289,7 +288,7 @@ def test_an_edited_file_is_refused(tmp_path, text, edit, message):
 def test_a_truncated_file_is_refused(tmp_path, ending, keep):
     path = files.write(tmp_path / f"rays.{ending}", ray_set.make(count=200))
     path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
-    refused(path, "expected")
+    assert_refused(path, "expected")
 
 
 def npz_of(path, rays, text):
@@ -343,8 +342,8 @@ OF_MEDIA = {
     ("rays", "message", "changes"),
     [(rays, *case) for rays, table in ((FOUR, HEADERS), (WITH_MEDIA, OF_MEDIA)) for case in table.items()],
 )
-def test_a_header_that_is_not_ours_is_refused(tmp_path, rays, message, changes):
-    """In CSV with a checksum that fits, where it is not refused for what it says; in .npz, too."""
+def test_forged_headers_are_refused(tmp_path, rays, message, changes):
+    """In CSV with a checksum that matches, and in .npz; a valid header with a matching checksum is accepted."""
     top = {key: value for key, value in (rays.header | changes).items() if value is not None}
     forged = ray_set.with_checksum(dataclasses.replace(rays, header={**rays.header, "seed": 9}))
     assert files.read(files.write(tmp_path / "rays.csv", forged)).header["seed"] == 9
@@ -352,13 +351,13 @@ def test_a_header_that_is_not_ours_is_refused(tmp_path, rays, message, changes):
     lines = [f"# {key}: {json.dumps(value)}" for key, value in (top | {"checksum": checksum}).items()]
     rows = files.as_csv(rays).split("\n")[len(rays.header) :]
     (tmp_path / "rays.csv").write_text("\n".join([*lines, *rows]))
-    refused(tmp_path / "rays.csv", message)
-    refused(npz_of(tmp_path / "rays.npz", rays, json.dumps(top)), message)
+    assert_refused(tmp_path / "rays.csv", message)
+    assert_refused(npz_of(tmp_path / "rays.npz", rays, json.dumps(top)), message)
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "1" * 10_000, '{"format": NaN}', "7"])
-def test_an_array_header_of_any_json(tmp_path, text):
-    refused(npz_of(tmp_path / "rays.npz", FOUR, text), "not a file of rays")
+def test_array_headers_of_other_json_are_refused(tmp_path, text):
+    assert_refused(npz_of(tmp_path / "rays.npz", FOUR, text), "not a file of rays")
 
 
 @pytest.mark.parametrize("name", "ank")
@@ -369,16 +368,16 @@ def test_rays_without_refraction_are_refused(tmp_path, name, value):
     with np.errstate(all="ignore"):
         rays = dataclasses.replace(FOUR.rays, **{name: changed})
         files.write(path, ray_set.with_checksum(RaySet(rays, FOUR.ids, FOUR.header)))
-    if name != "k" and value == -1.5:  # a vector of any length is one
+    if name != "k" and value == -1.5:  # vectors may have any length
         assert len(files.read(path)) == 4
-    else:  # NaN is equal to nothing
+    else:  # NaN is not equal to itself, so the numbers do not match
         invalid = "ray 2 is invalid: zero or non-finite vector, or index ≤ 0"
-        refused(path, "checksum does not match" if np.isnan(value) else invalid)
+        assert_refused(path, "checksum does not match" if np.isnan(value) else invalid)
 
 
 @pytest.mark.parametrize("wrong, factor", [(7, 1 + 5e-6), (0, 1 + 3e-5), (7, 1 - 3e-5), (11, 1.5)])
-def test_ratios_that_are_not_those_of_the_media(tmp_path, wrong, factor):
-    """With a checksum that fits: a program would be blamed for its index."""
+def test_ratios_must_be_those_of_the_media(tmp_path, wrong, factor):
+    """Also with a checksum that matches: else a program would be blamed for its index."""
     k = WITH_MEDIA.rays.k.copy()
     k[wrong] *= factor
     rays = dataclasses.replace(WITH_MEDIA, rays=dataclasses.replace(WITH_MEDIA.rays, k=k))
@@ -386,20 +385,20 @@ def test_ratios_that_are_not_those_of_the_media(tmp_path, wrong, factor):
     if abs(factor - 1) < 1e-5:
         assert len(files.read(path)) == 12
     else:
-        refused(path, f"rays.csv: ray {wrong} has n_from / n_to = ")
-        refused(path, f", {header.described(rays.header, wrong)}")
+        assert_refused(path, f"rays.csv: ray {wrong} has n_from / n_to = ")
+        assert_refused(path, f", {header.described(rays.header, wrong)}")
 
 
 # Answers -------------------------------------------------------------------------------------------------------------
 
 
-def test_answers_as_people_write_them():
+def test_spellings_of_csv_answers():
     text = "\ufeff# seed: 3\r\n# by: us\r\n\r\nid, bx, by, bz, transmitted\r\n# a remark\r\n4, 1, 2.5e-3, -0, 1\r\n"
     text += "2,nan,-nan(ind),-NaN(0x7ff),0\r\n  \n\r\n0 ,inf,-INF,+1.5,1 # right\r\n"
-    for found in (files.parse_answers(text[1:]), files.parse_answers(text.encode())):
-        assert (found.header, found.ids.tolist()) == ({"seed": 3, "by": "us"}, [4, 2, 0])
-        np.testing.assert_array_equal(found.b, [[1, 2.5e-3, 0], [np.nan] * 3, [np.inf, -np.inf, 1.5]])
-        assert found.transmitted.tolist() == [True, False, True]
+    for answers in (files.parse_answers(text[1:]), files.parse_answers(text.encode())):
+        assert (answers.header, answers.ids.tolist()) == ({"seed": 3, "by": "us"}, [4, 2, 0])
+        np.testing.assert_array_equal(answers.b, [[1, 2.5e-3, 0], [np.nan] * 3, [np.inf, -np.inf, 1.5]])
+        assert answers.transmitted.tolist() == [True, False, True]
     assert files.parse_answers("id,bx,by,bz\n1,2,3,4").transmitted is None
     assert files.parse_answers("id,bx,by,bz\n").b.shape == (0, 3)
 
@@ -425,16 +424,16 @@ TABLES = {
 
 
 @pytest.mark.parametrize("message", TABLES)
-def test_tables_that_are_refused(tmp_path, message):
+def test_invalid_tables_are_refused(tmp_path, message):
     text = TABLES[message]
     with pytest.raises(ValueError) as caught:
         files.parse_answers(text, "answers.csv")
     assert str(caught.value).startswith("answers.csv: ") and message in str(caught.value)
     (tmp_path / "a.csv").write_bytes(text if isinstance(text, bytes) else text.encode())
-    refused(tmp_path / "a.csv", message, files.read_answers)
+    assert_refused(tmp_path / "a.csv", message, files.read_answers)
 
 
-def test_a_line_of_nan_takes_no_time():
+def test_a_long_line_of_nan_is_parsed_fast():
     start = time.process_time()
     with pytest.raises(ValueError, match="line 2 is '1,nan"):
         files.parse_answers(TOP + "1," + "nan(" * 200_000 + "\n")
@@ -443,7 +442,7 @@ def test_a_line_of_nan_takes_no_time():
 
 @pytest.mark.parametrize("names", [(), ("transmitted",), ("n_ratio",), ("transmitted", "n_ratio")])
 @pytest.mark.parametrize("ending", ["csv", "npz"])
-def test_answers_in_any_format_with_any_columns_and_not_more_than_rays_need(tmp_path, ending, names):
+def test_answers_in_any_format_with_any_columns_up_to_a_limit_of_rows(tmp_path, ending, names):
     ids, b, path = np.array([3, 0, 4, 1, 2]), np.arange(15.0).reshape(5, 3), tmp_path / f"a.{ending}"
     columns = {"transmitted": np.array([1, 0, 1, 1, 0]), "n_ratio": np.array([0.5, 1, 2, 4, 8])}
     more = {name: columns[name] for name in names}
@@ -452,18 +451,18 @@ def test_answers_in_any_format_with_any_columns_and_not_more_than_rays_need(tmp_
     else:
         rows = np.column_stack([ids, b, *more.values()]).tolist()
         path.write_text("\n".join([",".join([TOP.strip(), *more]), *(",".join(map(repr, row)) for row in rows), ""]))
-    found = files.read_answers(path, most=5)
-    np.testing.assert_array_equal(found.ids, ids)
-    np.testing.assert_array_equal(found.b, b)
+    answers = files.read_answers(path, most=5)
+    np.testing.assert_array_equal(answers.ids, ids)
+    np.testing.assert_array_equal(answers.b, b)
     for name in columns:
-        column = getattr(found, name)
+        column = getattr(answers, name)
         assert (column is not None) == (name in names) and (column is None or column.tolist() == columns[name].tolist())
-    refused(path, "4", lambda path: files.read_answers(path, most=4))
+    assert_refused(path, "4", lambda path: files.read_answers(path, most=4))
     os.truncate(path, 2**40)
-    refused(path, "1099511627776 bytes", files.read_answers)
+    assert_refused(path, "1099511627776 bytes", files.read_answers)
 
 
-def test_what_is_not_a_file(tmp_path):
+def test_paths_that_are_not_regular_files(tmp_path):
     (tmp_path / "a.csv").mkdir()
     for name in ("a.csv", "b.npz"):
         with pytest.raises(OSError) as caught:
@@ -472,8 +471,8 @@ def test_what_is_not_a_file(tmp_path):
     os.mkfifo(tmp_path / "c.csv")
     (tmp_path / "d.npz").symlink_to("/dev/zero")
     for name in ("c.csv", "d.npz"):
-        refused(tmp_path / name, "not a regular file", files.read_answers)
-    refused(tmp_path / "e.txt", "expected a file name that ends in .csv or .npz", files.read_answers)
+        assert_refused(tmp_path / name, "not a regular file", files.read_answers)
+    assert_refused(tmp_path / "e.txt", "expected a file name that ends in .csv or .npz", files.read_answers)
     code = "import sys; sys.modules['flint'] = None; import mi_refract.ray_sets.files"  # reading needs no oracle
     subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, check=True)
 
@@ -482,7 +481,7 @@ def test_what_is_not_a_file(tmp_path):
 
 
 def npz(path, method=zipfile.ZIP_DEFLATED, **members):
-    """Two answers, with other members: arrays, or bytes as they are."""
+    """An archive of two answers with other members: arrays, or the raw bytes of a member."""
     raw = {name: content for name, content in members.items() if isinstance(content, bytes)}
     arrays = {"id": np.arange(2), "b": np.zeros((2, 3))} | {k: v for k, v in members.items() if k not in raw}
     np.savez(path, **arrays)
@@ -502,7 +501,7 @@ def npy(shape, dtype="<f8", content=b""):
 
 B = "an .npz file with id, b"
 MEMBERS = {
-    "complex": (np.zeros((2, 3), complex), "b holds complex128, not real numbers"),
+    "complex": (np.zeros((2, 3), complex), "b contains complex128, not real numbers"),
     "objects": (np.array([print, None], dtype=object), "Object arrays cannot be loaded"),
     "a row more": (np.zeros((3, 3)), "id has 2 rows, b has 3 rows"),
     "wide": (np.zeros((2, 4)), "b has the shape (2, 4)"),
@@ -519,32 +518,32 @@ MEMBERS = {
 
 
 @pytest.mark.parametrize("b, message", MEMBERS.values(), ids=MEMBERS)
-def test_arrays_that_are_no_answers(tmp_path, b, message):
-    refused(npz(tmp_path / "a.npz", b=b), message, files.read_answers)
+def test_invalid_arrays_are_refused(tmp_path, b, message):
+    assert_refused(npz(tmp_path / "a.npz", b=b), message, files.read_answers)
 
 
-def test_archives_that_are_no_answers(tmp_path):
+def test_invalid_archives_are_refused(tmp_path):
     path = tmp_path / "a.npz"
     for top, message in ((np.array("x" * 2**19), "header has 2097280 bytes"), (np.zeros(3), "header is float64")):
-        refused(npz(path, header=top), message, files.read_answers)
+        assert_refused(npz(path, header=top), message, files.read_answers)
     np.savez(path, id=np.arange(2))
-    refused(path, "there is no b; expected an .npz file with id, b", files.read_answers)
-    refused(npz(path, zipfile.ZIP_BZIP2), "id is compressed by method 12", files.read_answers)
+    assert_refused(path, "there is no b; expected an .npz file with id, b", files.read_answers)
+    assert_refused(npz(path, zipfile.ZIP_BZIP2), "id is compressed by method 12", files.read_answers)
     data = bytearray(npz(path).read_bytes())
     for signature, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
         at = -1
         while (at := data.find(signature, at + 1)) >= 0:
             data[at + offset] |= 1
     path.write_bytes(data)
-    refused(path, "is encrypted", files.read_answers)
-    # What else is in a file may have 16 MB.
+    assert_refused(path, "is encrypted", files.read_answers)
+    # Other content of a file may have 16 MB.
     assert len(files.read_answers(npz(path, zipfile.ZIP_STORED, more=bytes(12 << 20)), most=2).ids) == 2
     npz(path, zipfile.ZIP_STORED, more=bytes(20 << 20))
-    refused(path, "bytes", lambda path: files.read_answers(path, most=2))
+    assert_refused(path, "bytes", lambda path: files.read_answers(path, most=2))
 
 
-def test_a_bomb_is_not_unpacked(tmp_path):
-    """40 million rows of zeros in less than 1 MB, in an array that is asked for and in one that is not."""
+def test_a_zip_bomb_is_not_unpacked(tmp_path):
+    """40 million rows of zeros in less than 1 MB, in an array that is read and in one that is not."""
     path = tmp_path / "a.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as new:
         for name in ("id", "else"):
@@ -554,14 +553,14 @@ def test_a_bomb_is_not_unpacked(tmp_path):
                     stream.write(bytes(1_000_000))
         new.writestr("b.npy", npy((2, 3), content=bytes(48)))
     tracemalloc.start()
-    refused(path, "id has 40000128 bytes, more than", lambda path: files.read_answers(path, most=1000))
+    assert_refused(path, "id has 40000128 bytes, more than", lambda path: files.read_answers(path, most=1000))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 4e6
 
 
-def test_a_damaged_archive_is_one_line(tmp_path):
-    """Every third byte changed in turn: an answer or one line, never another exception. The last bit counts."""
+def test_errors_of_damaged_archives_are_one_line(tmp_path):
+    """Each third byte is changed in turn: never another exception. A change of the last bit is detected."""
     path = npz(tmp_path / "a.npz")
     data, refusals = path.read_bytes(), 0
     for at in range(0, len(data), 3):
@@ -578,4 +577,4 @@ def test_a_damaged_archive_is_one_line(tmp_path):
     data = bytearray(path.read_bytes())
     data[data.find(b"\x93NUMPY", info.header_offset) + info.file_size - 1] ^= 1
     path.write_bytes(data)
-    refused(path, "Bad CRC-32 for file 'n_to.npy'")
+    assert_refused(path, "Bad CRC-32 for file 'n_to.npy'")

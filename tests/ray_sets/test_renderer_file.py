@@ -1,4 +1,4 @@
-"""A folder with `mi-refract-renderer.toml` is a renderer."""
+"""Renderers described by `mi-refract-renderer.toml`."""
 
 import json
 import re
@@ -17,17 +17,17 @@ TITLED = f'title = "T"\n{RAYS}'
 
 @pytest.fixture
 def folder(tmp_path):
-    """`folder(toml)`: a folder with such a file."""
+    """`folder(toml)`: a folder with a renderer file of this text."""
 
-    def made(text):
+    def make(text):
         (tmp_path / "mine").mkdir(exist_ok=True)
         (tmp_path / "mine" / renderer_file.NAME).write_text(text)
         return tmp_path / "mine"
 
-    return made
+    return make
 
 
-def test_the_page_s_program_is_compiled_and_right(folder, run):
+def test_the_program_of_the_page_compiles_and_is_right(folder, run):
     (program,), (text,) = (blocks(DOCS / "how-to/describe-a-renderer.md", language) for language in ("c", "toml"))
     assert len(program.splitlines()) <= 20
     if not shutil.which("cc"):
@@ -42,7 +42,7 @@ def test_the_page_s_program_is_compiled_and_right(folder, run):
     assert status == 1 and "eta inverted" in out
 
 
-def test_what_a_file_says(folder):
+def test_the_content_of_a_file(folder):
     text = f"""title = "T"
 licence = "L"
 {RAYS}total_internal_reflection = "nan"
@@ -57,13 +57,13 @@ command = ["{{python}}", "{{scene}}", "{{spp}}", "{{seed}}", "{{image}}"]
 spp = {{ sphere = 64 }}
 deviation = {{ prism = "no dispersion" }}
 """
-    found = renderer_file.load(folder(text))
-    (call,) = found.rays
-    assert (found.title, found.licence, call.tir, call.gives_up) == ("T", "L", "nan", 1e-6)
-    assert [call.recorded_range(x) for x in ("random", "near-critical", "x")] == [(1e-6, 1e-6), (1e-4, 2e-4), None]
-    assert call.deviations == {"random": "rounds η"}
-    assert found.images.spp == {"sphere": 64} and found.images.deviations == {"prism": "no dispersion"}
-    words = renderer_file.filled(found.images.command, scene="/s", spp=4, seed=1, image="i.exr")
+    renderer = renderer_file.load(folder(text))
+    (function,) = renderer.rays
+    assert (renderer.title, renderer.licence, function.tir, function.gives_up) == ("T", "L", "nan", 1e-6)
+    assert [function.recorded_range(x) for x in ("random", "near-critical", "x")] == [(1e-6, 1e-6), (1e-4, 2e-4), None]
+    assert function.deviations == {"random": "rounds η"}
+    assert renderer.images.spp == {"sphere": 64} and renderer.images.deviations == {"prism": "no dispersion"}
+    words = renderer_file.filled(renderer.images.command, scene="/s", spp=4, seed=1, image="i.exr")
     assert words == [sys.executable, "/s", "4", "1", "i.exr"]
 
 
@@ -92,13 +92,13 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("said", REFUSED)
-def test_a_file_that_is_none_is_refused_in_a_line(folder, said):
-    where = folder(REFUSED[said])
+@pytest.mark.parametrize("message", REFUSED)
+def test_errors_of_invalid_files_are_one_line(folder, message):
+    where = folder(REFUSED[message])
     with pytest.raises(ValueError) as caught:
         renderer_file.load(where)
     text = str(caught.value)
-    assert text.startswith(f"{where / renderer_file.NAME}: ") and said in text and "\n" not in text
+    assert text.startswith(f"{where / renderer_file.NAME}: ") and message in text and "\n" not in text
 
 
 PROGRAM = python_blocks(DOCS / "how-to/check-a-shaders-rays.md")[0]
@@ -112,16 +112,16 @@ INVERTED = PROGRAM.replace("rows[:, 7:8] / rows[:, 8:9]", "rows[:, 8:9] / rows[:
         (("wrong", "right"), "auto", (), 1),
         (("right", "wrong"), "zero", (), 1),
         (("right",), "nan", (), 1),
-        (("right",), "nan", ("--tir", "zero"), 0),  # an option goes before the declaration
+        (("right",), "nan", ("--tir", "zero"), 0),  # the option overrides the file
         (("none", "right"), "auto", (), 2),
         (("right",), "auto", ("--precision", "f64"), 2),
         (("right",), "auto", ("--", "true"), 2),
     ],
 )
-def test_every_function_of_a_renderer_is_checked_and_reported_and_a_known_deviation_excuses_nothing(
+def test_every_function_is_checked_and_reported_and_known_deviations_still_fail(
     folder, run, tmp_path, programs, signal, option, expected
 ):
-    """The functions answer zeros under total internal reflection."""
+    """The functions signal total internal reflection by zeros."""
     text = "title = 'T'\n"
     for i, name in enumerate(programs):
         text += f"[[rays]]\ntitle = 'function {i}'\nprecision = 'f32'\ncommand = ['{{python}}', '{name}.py']\n"
@@ -138,8 +138,8 @@ def test_every_function_of_a_renderer_is_checked_and_reported_and_a_known_deviat
     assert ("known deviation of function" in out and ": critical: inverts k" in out) == ("wrong" in programs)
     assert ("zero vector, which is not the signal" in out) == (signal == "nan" and not option)
     if option and expected:
-        said = {"--precision": "no function in f64", "--": "expected one of them"}
-        assert said[option[0]] in err and err.count("\n") == 1
+        errors = {"--precision": "no function in f64", "--": "expected one of them"}
+        assert errors[option[0]] in err and err.count("\n") == 1
     assert data.exists() == (expected < 2)
     if data.exists():
         document, html = json.loads(data.read_text()), page.read_text()

@@ -1,4 +1,4 @@
-"""The reports of a check: the sentence for every kind of result, JSON, JUnit and the HTML page."""
+"""Reports of a check: the sentence for every kind of result, JSON, JUnit XML and the HTML page."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def regime(name="generic", worst=2e-7, **changes):
     return RegimeErrors(name, worst=worst, **dict.fromkeys(ERRORS, 0.0), **counts, replay={})
 
 
-def found(*regimes, problems=(), explanations=(), tir="zero", tir_given=False):
+def findings(*regimes, problems=(), explanations=(), tir="zero", tir_given=False):
     return Findings("f32", 2.0**-23, "decomposed", tir, tir_given, regimes, problems, explanations, {})
 
 
@@ -56,67 +56,67 @@ NEAREST = f"nearest of the common mistakes, no explanation: {HANDEDNESS}"
 
 
 @pytest.mark.parametrize(
-    ("result", "code", "said", "lines"),
+    ("result", "code", "sentence", "lines"),
     [
-        (found(), 2, "no ray was answered", []),
-        (found(*TWO), 0, SOME_RIGHT, []),
-        (found(*TWO, regime("k", math.nan, rays=0, compared=0, judged=0, right=0)), 0, SOME_RIGHT, []),
-        (found(*(replace(x, right=10) for x in TWO)), 0, f"20 answers, all right; {LARGEST}", []),
+        (findings(), 2, "no ray was answered", []),
+        (findings(*TWO), 0, SOME_RIGHT, []),
+        (findings(*TWO, regime("k", math.nan, rays=0, compared=0, judged=0, right=0)), 0, SOME_RIGHT, []),
+        (findings(*(replace(x, right=10) for x in TWO)), 0, f"20 answers, all right; {LARGEST}", []),
         (
-            found(regime(undecidable=2), TWO[1]),
+            findings(regime(undecidable=2), TWO[1]),
             0,
             f"{SOME_RIGHT}; 2 rays are undecidable (error bound above 0.1 rad)",
             [],
         ),
-        (found(regime(exact=10)), 0, "10 answers, all exact up to rounding", []),
-        (found(regime(wrong=2), explanations=(NEVER,)), 1, "2 of 10 answers are wrong", [NONE_OF_THEM]),
-        (found(regime(), tir=UNCLEAR), 1, "0 of 10 answers are wrong", []),
+        (findings(regime(exact=10)), 0, "10 answers, all exact up to rounding", []),
+        (findings(regime(wrong=2), explanations=(NEVER,)), 1, "2 of 10 answers are wrong", [NONE_OF_THEM]),
+        (findings(regime(), tir=UNCLEAR), 1, "0 of 10 answers are wrong", []),
         (
-            found(regime(wrong=2), explanations=(LIKELY, CERTAIN)),
+            findings(regime(wrong=2), explanations=(LIKELY, CERTAIN)),
             1,
             "2 of 10 answers are wrong: eta inverted",
             [LINE],
         ),
-        (found(regime(wrong=2), explanations=(CERTAIN, CERTAIN)), 1, "2 of 10 answers are wrong", [LINE, LINE]),
+        (findings(regime(wrong=2), explanations=(CERTAIN, CERTAIN)), 1, "2 of 10 answers are wrong", [LINE, LINE]),
         (
-            found(regime(wrong=2), explanations=(NEVER, LIKELY)),
+            findings(regime(wrong=2), explanations=(NEVER, LIKELY)),
             1,
             "2 of 10 answers are wrong",
             [NEAREST],
         ),
-        (found(regime(), problems=(MISSING,)), 2, MISMATCH, []),
+        (findings(regime(), problems=(MISSING,)), 2, MISMATCH, []),
         (
-            found(regime(wrong=2), problems=(MISSING,), explanations=(LIKELY,)),
+            findings(regime(wrong=2), problems=(MISSING,), explanations=(LIKELY,)),
             2,
             f"{MISMATCH}; 2 of them are wrong",
             [],
         ),
-        (found(regime(judged=0)), 1, "10 answers, none of them a decidable direction", []),
-        (found(regime(compared=0, judged=0)), 1, "10 answers, none of them a direction", []),
+        (findings(regime(judged=0)), 1, "10 answers, none with a decidable direction", []),
+        (findings(regime(compared=0, judged=0)), 1, "10 answers, none with a direction", []),
     ],
 )
-def test_the_sentence_and_the_explanations(result, code, said, lines):
-    assert (result.exit_code, reports.sentence(result), reports.explained(result)) == (code, said, lines)
+def test_sentence_and_explanations(result, code, sentence, lines):
+    assert (result.exit_code, reports.sentence(result), reports.explained(result)) == (code, sentence, lines)
 
 
-def test_a_problem_a_signal_and_a_grade():
+def test_texts_of_problems_signals_and_grades():
     assert reports.problem_text(MISSING) == "3 without an answer: ids 1, 5, 8"
     cases = [(tir, declared) for tir in ("zero", NONE, UNCLEAR) for declared in (False, True)]
-    signals = [reports.signal(found(tir=tir, tir_given=declared)) for tir, declared in cases]
+    signals = [reports.signal(findings(tir=tir, tir_given=declared)) for tir, declared in cases]
     assert [text.endswith(" (detected)") for text in signals] == [True] + [False] * 5
     assert signals[1] == "total internal reflection is signalled by the zero vector"
     cases = {}, {"right": 10}, {"right": 10, "exact": 10}, {"wrong": 1, "right": 10}
     assert [reports.grade(regime(**x)) for x in cases] == ["within bound", "right", "exact", "wrong"]
 
 
-def test_json_junit_and_a_page_that_stands_alone(tmp_path):
-    """Of a set that is right, and of one that is wrong and incomplete."""
+def test_json_junit_and_html(tmp_path):
+    """Of right answers, and of answers that are wrong and incomplete. The page needs no other file."""
     hostile = "<script>alert(1)</script> & \x1b"
-    to = ray_set.make(("generic", "k ≫ 1", "critical"), 60)
-    right = check_answers.check(to, Answers(to.ids, glsl(to.rays.a, to.rays.n, to.rays.k)))
-    b = glsl(to.rays.a, to.rays.n, 1 / to.rays.k)
+    rays = ray_set.make(("generic", "k ≫ 1", "critical"), 60)
+    right = check_answers.check(rays, Answers(rays.ids, glsl(rays.rays.a, rays.rays.n, rays.rays.k)))
+    b = glsl(rays.rays.a, rays.rays.n, 1 / rays.rays.k)
     b[:5] = np.nan
-    wrong = check_answers.check(to, Answers(to.ids[:-2], b[:-2]))
+    wrong = check_answers.check(rays, Answers(rays.ids[:-2], b[:-2]))
     for result, code, diagnosis, failures, errors in ((right, 0, None, 0, 0), (wrong, 2, "eta inverted", 3, 1)):
         title = "a & b \x1b[31m <program>"
         reports.write_json(tmp_path / "out.json", {title: result}, origin(["rays"], None))
@@ -147,7 +147,7 @@ def test_json_junit_and_a_page_that_stands_alone(tmp_path):
             assert (words in text) == (result is wrong)
 
 
-def test_every_report_has_the_ratio(tmp_path):
+def test_every_report_contains_the_ratio_difference(tmp_path):
     rays = ray_set.make(["generic"], 12, **ALL)
     k = rays.rays.k.copy()
     k[4] *= np.float32(1.001)
@@ -166,8 +166,8 @@ def test_every_report_has_the_ratio(tmp_path):
 
 @needs_chromium
 def test_a_browser_reports_no_error(tmp_path):
-    to = ray_set.make(("generic",), 60)
-    result = check_answers.check(to, Answers(to.ids, glsl(to.rays.a, to.rays.n, 1 / to.rays.k)))
+    rays = ray_set.make(("generic",), 60)
+    result = check_answers.check(rays, Answers(rays.ids, glsl(rays.rays.a, rays.rays.n, 1 / rays.rays.k)))
     reports.write_html(tmp_path / "out.html", {"answers": result})
-    dom, said = browse(tmp_path / "out.html", tmp_path / "profile")
-    assert said == [] and reports.sentence(result) in dom
+    dom, messages = browse(tmp_path / "out.html", tmp_path / "profile")
+    assert messages == [] and reports.sentence(result) in dom

@@ -1,4 +1,4 @@
-"""Each regime is what its text says, in exact arithmetic where the text is exact, and can be made again."""
+"""Each regime agrees with its text, in exact arithmetic if the text is exact, and is reproducible."""
 
 from fractions import Fraction
 
@@ -41,22 +41,22 @@ def roundoff(precision):
 
 
 @pytest.mark.parametrize("regime", REGIMES)
-def test_rays_are_refractions_within_the_bounds_of_the_regime_and_those_of_their_seed(regime, precision):
+def test_rays_are_valid_within_the_bounds_of_their_regime_and_reproducible(regime, precision):
     rays, entry = make(regime, COUNT, precision, seed=1), REGIMES[regime]
     assert {x.dtype.type for x in (rays.a, rays.n, rays.k)} == {precision}
     assert (rays.a.shape, rays.n.shape, rays.k.shape) == ((COUNT, 3), (COUNT, 3), (COUNT,))
     assert all(np.isfinite(x).all() for x in (rays.a, rays.n, rays.k))
     assert rays.a.any(axis=1).all() and rays.n.any(axis=1).all()
     assert rays.k.min() >= 0.999e-6 and rays.k.max() <= entry.largest_k
-    # √3/2 u by rounding, and what the last ulps of "to the ulp" add.
-    off = max(np.abs(lengths(rays.a) - 1).max(), np.abs(lengths(rays.n) - 1).max()) / roundoff(precision)
-    assert (off <= 1.5) == entry.unit
+    # √3/2 u from rounding, plus the last ulps of "to the ulp".
+    length_error = max(np.abs(lengths(rays.a) - 1).max(), np.abs(lengths(rays.n) - 1).max()) / roundoff(precision)
+    assert (length_error <= 1.5) == entry.unit
     same, other = make(regime, COUNT, precision, 1), make(regime, COUNT, precision, 2)
     assert all(getattr(rays, x).tobytes() == getattr(same, x).tobytes() for x in "ank")
     assert (rays.a != other.a).any() and (rays.k != other.k).any()
 
 
-def test_regimes_have_rays_of_their_own_and_an_unknown_one_is_refused(precision):
+def test_regimes_differ_and_an_unknown_one_is_an_error(precision):
     assert len({make(regime, 8, precision).a.tobytes() for regime in REGIMES}) == len(REGIMES)
     with pytest.raises(KeyError):
         make("nowhere", 1, precision)
@@ -77,7 +77,7 @@ def test_regimes_have_rays_of_their_own_and_an_unknown_one_is_refused(precision)
         ("lengths", lambda rays: lengths(rays.n), 1e-18, 1e18),
     ],
 )
-def test_the_range_is_that_of_the_text_and_is_filled(regime, quantity, low, high, precision):
+def test_quantities_fill_the_range_in_the_text(regime, quantity, low, high, precision):
     values = quantity(make(regime, 4000, precision, seed=2)).astype(float)
     slack = 8 * roundoff(precision)
     assert (values >= low * (1 - slack)).all() and (values <= high * (1 + slack) + slack).all()
@@ -85,8 +85,8 @@ def test_the_range_is_that_of_the_text_and_is_filled(regime, quantity, low, high
     assert values.min() <= (1e-3 * high if low == 0 else 2 * low)
 
 
-def test_what_is_exact_is_exact(precision):
-    """Tangential, critical, on both sides of a denormal cosine; in many directions, not for want of components."""
+def test_exact_regimes_are_exact(precision):
+    """Tangential rays, critical rays and denormal cosines of both signs, in many directions without zeros."""
     rays = make("tangential", COUNT, precision, seed=3)
     assert all(c == 0 for c, _, _ in exactly(rays)) and rays.a.all(axis=1).sum() > COUNT / 4
     rays = make("exactly critical", COUNT, precision, seed=3)
@@ -99,22 +99,23 @@ def test_what_is_exact_is_exact(precision):
 
 
 @pytest.mark.parametrize("regime", ["critical, to the ulp", "critical, any k, to the ulp"])
-def test_to_the_ulp_lies_on_both_sides_as_near_as_the_numbers_permit(regime, precision):
+def test_rays_to_the_ulp_are_on_both_sides_as_near_as_numbers_permit(regime, precision):
     rays, u = make(regime, 4000, precision, seed=3), roundoff(precision)
     margin = np.array([float(d / terms) for _, d, terms in exactly(rays)])
     assert 0.4 < np.mean(margin < 0) < 0.6
     near = np.abs(margin)
-    # A ray that is merely rounded is off by u: half are far nearer, and some are past u², below any double-word sum.
+    # The margin of rays that are only rounded is u. Half of these are far nearer, and some reach u², the limit of
+    # double-word sums.
     assert np.quantile(near, 0.5) < (16 * u if "any" in regime else u / 64)
     assert near.min() < 4 * u * u
-    # For the rays that k brings to the boundary, some k of those next to it decides otherwise.
+    # For rays whose k was adjusted, a neighbouring k changes the decision.
     rays = rays[np.arange(300)]
     ulps = (np.arange(-4, 5)[:, None] * np.spacing(rays.k)).astype(precision)
     signs = [np.sign(oracle.relative_radicand(rays.a, rays.n, rays.k + step)) for step in ulps]
     assert "any" in regime or (np.ptp(signs, axis=0) == 2).mean() > 0.95
 
 
-def test_components_are_zeros_of_either_sign_denormal_or_off_unit_by_a_few_ulps_only(precision):
+def test_zeros_denormal_components_and_lengths_off_unit(precision):
     rays = make("axes, signed zeros", COUNT, precision, seed=3)
     for v in (rays.a, rays.n):
         assert np.signbit(v[v == 0]).any() and not np.signbit(v[v == 0]).all()
@@ -128,7 +129,7 @@ def test_components_are_zeros_of_either_sign_denormal_or_off_unit_by_a_few_ulps_
     assert all(1.5 < np.abs(lengths(v) - 1).max() / roundoff(precision) < 12 for v in (rays.a, rays.n))
 
 
-def test_a_given_normal_takes_the_place_of_the_random_ones(precision):
+def test_a_given_normal_replaces_the_random_ones(precision):
     rays = make("critical, to the ulp", 50, precision, normal=(0, -1, 0))
     assert (rays.n == (0, -1, 0)).all()
     assert np.abs(oracle.relative_radicand(rays.a, rays.n, rays.k)).max() < 200 * roundoff(precision)
@@ -138,7 +139,7 @@ def test_a_given_normal_takes_the_place_of_the_random_ones(precision):
 
 
 @pytest.mark.parametrize("regime", [name for name, entry in REGIMES.items() if not entry.rests_on_denormals])
-def test_the_radicand_in_sums_of_floats_is_right_to_its_bound(regime, precision):
+def test_the_radicand_in_sums_of_floats_is_within_its_bound(regime, precision):
     rays, bound = make(regime, 150, precision, seed=9), Fraction(2) ** -140
     c, d, terms = radicand(rays.a.T.astype(float), rays.n.T.astype(float), rays.k.astype(float))
     for i, (exact_c, exact_d, larger) in enumerate(exactly(rays)):
@@ -148,7 +149,7 @@ def test_the_radicand_in_sums_of_floats_is_right_to_its_bound(regime, precision)
         assert [abs(x[i]) for x in d] == sorted((abs(x[i]) for x in d), reverse=True)
 
 
-def test_the_derivatives_of_the_radicand_are_its_differences_and_normalised_is_unit():
+def test_derivatives_of_the_radicand_and_normalised_vectors():
     rays = make("critical", 40, np.float64, seed=5)
     d, along = radicand_and_gradient(rays.a, rays.n, rays.k)
     for j in range(7):
@@ -160,11 +161,11 @@ def test_the_derivatives_of_the_radicand_are_its_differences_and_normalised_is_u
     assert np.abs(lengths(v) - 1).max() <= 0.5 * 3**0.5 * 2.0**-53
 
 
-# Ratios that are given -----------------------------------------------------------------------------------------------
+# Given ratios -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", GIVEN)
-def test_ratios_that_are_given_take_the_place_of_the_regimes_own(name, precision):
+def test_given_ratios_replace_the_regimes_own(name, precision):
     ratios = np.linspace(1.1, 2.4, COUNT)
     rays, own = make_given(name, ratios, precision, 3), make(name, COUNT, precision, 3)
     np.testing.assert_array_equal(rays.k, ratios.astype(precision))
@@ -172,13 +173,13 @@ def test_ratios_that_are_given_take_the_place_of_the_regimes_own(name, precision
     same = [np.array_equal(getattr(rays, vector), getattr(own, vector)) for vector in "an"]
     assert same == [REGIMES[name].any_k, True]
     if angle := {"critical": np.arcsin, "Brewster": np.arctan}.get(name):
-        off = (np.arctan2(sine(rays), cosine(rays)) - angle(1 / rays.k.astype(float))).astype(float)
-        assert np.abs(off).max() < 1e-2 + 1e-6
-        assert min((off > 0).mean(), (off < 0).mean()) > 0.3
-        assert (np.abs(off) > 1e-4).any() and (np.abs(off) < 1e-5).any()
+        error = (np.arctan2(sine(rays), cosine(rays)) - angle(1 / rays.k.astype(float))).astype(float)
+        assert np.abs(error).max() < 1e-2 + 1e-6
+        assert min((error > 0).mean(), (error < 0).mean()) > 0.3
+        assert (np.abs(error) > 1e-4).any() and (np.abs(error) < 1e-5).any()
 
 
-def test_ratios_that_no_regime_takes():
+def test_given_ratios_that_are_not_accepted():
     for name in set(REGIMES) - set(GIVEN):
         with pytest.raises(
             ValueError, match=r"it defines its own ratios of indices; expected one of 'generic', .*'tangential'$"

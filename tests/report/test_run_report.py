@@ -1,4 +1,4 @@
-"""The report says what the rows say: nothing lost on the way, nothing executable, nothing fetched."""
+"""Reports of rows are complete, execute nothing from names, and fetch nothing."""
 
 import base64
 import dataclasses
@@ -90,7 +90,7 @@ def test_json_keeps_every_row_and_is_strict(tmp_path):
         ({"case": "x", "values": {"y": 1.0}, "budgets": {"worst": 1.0}}, "a bound without a value: ['worst']"),
     ],
 )
-def test_a_row_that_cannot_be_is_an_error_in_one_line(fields, complaint):
+def test_invalid_rows_are_errors_in_one_line(fields, complaint):
     with pytest.raises(ValueError, match=re.escape(complaint)) as caught:
         Row.from_dict({"study": "s", "subject": "x", "setting": "", **fields})
     assert "\n" not in str(caught.value)
@@ -117,7 +117,7 @@ def test_junit_counts_budgets_and_leaves_out_rows_that_cannot_fail(tmp_path):
     assert [case.get("name") for case in goals] == ["promoted / generic / llvm float32: worst"]  # not the goal
 
 
-def test_every_ending_is_counted_in_its_suite_and_in_all(tmp_path):
+def test_junit_counts_outcomes_per_suite_and_in_total(tmp_path):
     cases = [
         documents.Case("g", "passed"),
         documents.Case("g", "failed", "failure", "why", ["one", "two"], "different"),
@@ -144,7 +144,7 @@ def printed(table):
     return console.export_text()
 
 
-def test_the_terminal_shows_answers_then_what_is_broken_and_takes_names_literally():
+def test_the_terminal_shows_answers_then_broken_budgets_with_literal_names():
     page = {"answers": [{"question": "Is it [red]right?", "text": "`No`.", "state": "no", "study": "speed"}]}
     rows = [*ROWS, dataclasses.replace(BAD, subject="[red]x")]
     text = printed(run_report.summary(rows, {"first_page": page}))
@@ -169,7 +169,7 @@ def test_the_terminal_shows_answers_then_what_is_broken_and_takes_names_literall
         ([], "Nothing was checked"),
     ],
 )
-def test_the_sentence(rows, sentence, tmp_path):
+def test_the_verdict_of_all_rows(rows, sentence, tmp_path):
     assert run_report.verdict(rows) == sentence
     assert f"<h1>{sentence}</h1>" in html(tmp_path, rows)
 
@@ -177,7 +177,7 @@ def test_the_sentence(rows, sentence, tmp_path):
 # HTML
 
 
-def test_html_asks_for_nothing_and_runs_no_name(tmp_path):
+def test_html_fetches_nothing_and_escapes_names(tmp_path):
     write_exr(tmp_path / "a.exr", np.zeros((2, 2, 3)))
     text = html(tmp_path, [*ROWS, dataclasses.replace(INFO, case="again", images={'"><script>': "a.exr"})])
     assert_stands_alone(text)
@@ -186,7 +186,7 @@ def test_html_asks_for_nothing_and_runs_no_name(tmp_path):
     assert "<script>alert" not in text and '"><script>' not in text
 
 
-def test_html_says_everything_each_time_the_same_and_offers_the_rows_of_every_section(tmp_path):
+def test_html_is_complete_reproducible_and_contains_the_rows_of_each_section(tmp_path):
     text = html(tmp_path)
     assert text == html(tmp_path)
     order = [text.index(f'id="{section}"') for section in ("failures", "study-1", "missing")]
@@ -203,8 +203,8 @@ def test_html_says_everything_each_time_the_same_and_offers_the_rows_of_every_se
         assert json.loads(zlib.decompress(base64.b64decode(data))) == rows
 
 
-def test_rows_that_share_no_metric_have_tables_of_their_own(tmp_path):
-    """`c` shares one with `a` and one with `d`; nobody does with `b`; `e` was not run."""
+def test_rows_that_share_no_metric_have_separate_tables(tmp_path):
+    """`c` shares a metric with `a` and one with `d`; `b` shares none with them; `e` was not run."""
     values = {"a": {"x": 1.0}, "b": {"y": 2.0}, "c": {"x": 3.0, "z": 4.0}, "d": {"z": 5.0}, "e": {}}
     rows = [Row("study", name, "case", "here", x, reason="" if x else "lost") for name, x in values.items()]
     text = html(tmp_path, [*rows, Row("study", "e", "other case", "here", {"y": 6.0})], {})
@@ -213,7 +213,7 @@ def test_rows_that_share_no_metric_have_tables_of_their_own(tmp_path):
     assert ["".join(re.findall(r">([a-e])<", body)) for _, _, body in tables] == ["acd", "be"]
 
 
-def test_matrix_marks_a_row_whose_other_metric_broke(tmp_path):
+def test_the_matrix_marks_rows_whose_other_metric_broke(tmp_path):
     rows = [
         Row("directions", s, c, "llvm", {"worst": 1e-8, "misjudged": 0.0}, {"misjudged": 0.0})
         for s, c in itertools.product("abc", "xyz")
@@ -231,7 +231,7 @@ def test_matrix_marks_a_row_whose_other_metric_broke(tmp_path):
     assert re.search(r'<td class="not-run" [^>]*title="lost">not run<', text)
 
 
-def test_colours_run_over_what_means_something_and_mark_what_is_beyond(tmp_path):
+def test_the_colour_scale_and_numbers_beyond_it(tmp_path):
     values = itertools.cycle([1e-12, 1.0, 1e4, 1e8, 2e69, INF])
     rows = [Row("s", s, c, "", {"error": next(values)}) for s, c in itertools.product("abc", "xyz")]
     shown = html(tmp_path, rows, {"studies": {"s": {"scale": (1.0, 1e8)}}})
@@ -245,8 +245,8 @@ def test_colours_run_over_what_means_something_and_mark_what_is_beyond(tmp_path)
     assert '<span>1</span><i></i><span>1e8</span><i class="beyond">' in shown
 
 
-def test_what_would_not_fit_beside_each_other_is_put_below(tmp_path):
-    """More cases than fit beside each other are the lines of a matrix; more metrics have a second table."""
+def test_wide_matrices_are_transposed_and_wide_tables_split(tmp_path):
+    """Too many cases for the columns become the lines of a matrix; too many metrics get a second table."""
     rows = [Row("s", s, f"case {i}", "", {"x": 1.0 + i}) for s in "abc" for i in range(20)]
     head = re.search(r'class="matrix".*?<thead>(.*?)</thead>', html(tmp_path, rows, {}), re.S)[1]
     assert re.findall("<th>(.*?)</th>", head) == ["a", "b", "c"]
@@ -274,7 +274,7 @@ def test_images_are_embedded_exactly_and_once(tmp_path):
     np.testing.assert_array_equal(halves[1], expected[..., :1])
 
 
-def test_an_image_that_cannot_be_shown_is_an_error_and_the_old_page_stays(tmp_path):
+def test_an_image_that_cannot_be_shown_is_an_error_and_keeps_the_old_page(tmp_path):
     before = html(tmp_path)
     (tmp_path / "text.exr").write_text("no image")
     write_exr(tmp_path / "two.exr", np.zeros((2, 2, 2)), names=("R", "G"))
@@ -284,14 +284,14 @@ def test_an_image_that_cannot_be_shown_is_an_error_and_the_old_page_stays(tmp_pa
     assert (tmp_path / "report.html").read_text("utf-8") == before
 
 
-def test_curves_keep_the_guide_and_literal_names():
+def test_curves_have_a_guide_and_literal_names():
     axes = Axes("seconds", "relMSE", slope=-1)
     svg = curves_svg({"$x$": [(1, 1e-2), (10, 1e-3)]}, axes, salt="s")
     assert "slope −1" in svg and ">$x$</text>" in svg and "var(--c0)" in svg
     assert ">seconds</text>" in svg and ">relMSE</text>" in svg
     assert curves_svg({"x": [(1, 0), (NAN, 1)]}, axes, salt="s") == ""
     svg = curves_svg({f"line {i}": [(1, i + 1), (2, i + 1)] for i in range(12)}, axes, salt="s")
-    style = (documents.HERE / "report.css").read_text("utf-8")
+    style = (documents.TEMPLATES / "report.css").read_text("utf-8")
     values = [re.findall(rf"{name}: (#\w+)", style) for name in set(re.findall(r"--c\d+", svg))]
     assert len({light for light, _ in values}) == len({dark for _, dark in values}) == 12
     for wrong in ({"x_scale": "cubic"}, {"slope": 2, "y_scale": "linear"}):
@@ -303,7 +303,7 @@ def test_curves_keep_the_guide_and_literal_names():
     ("scales", "left_out"),
     [({}, 2), ({"x_scale": "linear"}, 1), ({"y_scale": "linear"}, 1), ({"x_scale": "linear", "y_scale": "linear"}, 0)],
 )
-def test_what_has_no_place_depends_on_the_scales_a_study_asks_for(scales, left_out, tmp_path):
+def test_points_that_cannot_be_drawn_depend_on_the_scales(scales, left_out, tmp_path):
     axes = {"x": "height", "y": "turn", **scales}
     row = dataclasses.replace(INFO, curves={"a": [(-1.0, 1.0), (1.0, -1.0), (1.0, 1.0), (2.0, 3.0)]})
     text = html(tmp_path, [row], {"studies": {"speed": {"axes": axes}}})
@@ -312,11 +312,11 @@ def test_what_has_no_place_depends_on_the_scales_a_study_asks_for(scales, left_o
     assert "slope" not in text
 
 
-def test_a_scatter_shows_front_floor_and_intervals_where_asked(tmp_path):
+def test_a_scatter_shows_front_floor_and_intervals_on_request(tmp_path):
     def paths(**more):
         scatter = {"study": "s", "x": "time", "y": "worst", **more}
         text = html(tmp_path, rows, {"scatter": [scatter, {**scatter, "x": "absent"}]})
-        assert text.count('class="plot wide"') == 1  # what no row has measured is not drawn
+        assert text.count('class="plot wide"') == 1  # a metric that no row has is not drawn
         return text.count("<path"), text
 
     rows = [
@@ -327,15 +327,15 @@ def test_a_scatter_shows_front_floor_and_intervals_where_asked(tmp_path):
     plain, text = paths()
     assert ">copy</text>" not in text
     assert paths(front=True)[0] == plain + 1
-    assert pareto([(2, 5), (1, 9), (3, 5), (1, 8), (4, 1), (5, 2)]) == [(1, 8), (2, 5), (4, 1)]  # not beaten by any
+    assert pareto([(2, 5), (1, 9), (3, 5), (1, 8), (4, 1), (5, 2)]) == [(1, 8), (2, 5), (4, 1)]
     floored, text = paths(floor="copy")
     assert floored == plain + 1 and ">copy</text>" in text
     wide = paths(interval=["low", "high"])[1]
     assert wide.count("<path") == plain and wide != text
 
 
-def test_no_line_of_a_scatter_goes_through_a_name():
-    """Points close to each other, the floor's line among them, and the front's right of the last one."""
+def test_no_line_of_a_scatter_crosses_a_label():
+    """Points close to each other with the floor's line between them, and the front right of the last point."""
     points = {name: [(1 + 0.01 * i, 10.0**i)] for i, name in enumerate(["first", "second", "third"])}
     panel = Scatter(points | {"last": [(2.0, 0.1)]}, [("last", 1.9, 2.1, 0.1)], floor=1.03)
     svg = scatter_svg({"here": panel}, Axes("x", "y", "linear"), floor="floor", front=True, salt="s")
@@ -344,7 +344,7 @@ def test_no_line_of_a_scatter_goes_through_a_name():
     assert len(names) == 5, svg
     for d in re.findall(r'<path d="(M[^"z]*)" clip-path="[^"]*" style="[^"]*stroke: var\(--(?!line)', svg):
         corners = [tuple(map(float, pair)) for pair in re.findall(r"([\d.]+) ([\d.]+)", d)]
-        for (x0, y0), (x1, y1) in itertools.pairwise(corners):  # upright or level
+        for (x0, y0), (x1, y1) in itertools.pairwise(corners):  # vertical or horizontal segments
             for name, (x, y) in names.items():
                 across = max(min(x0, x1), x) < min(max(x0, x1), x + 5 * len(name))
                 assert not (across or x <= x0 == x1 <= x + 5 * len(name)) or not (
@@ -352,7 +352,7 @@ def test_no_line_of_a_scatter_goes_through_a_name():
                 ), (name, d)
 
 
-def test_an_overlay_stands_beside_the_other_images_in_a_fixed_order(tmp_path):
+def test_images_of_a_row_have_a_fixed_order(tmp_path):
     write_exr(tmp_path / "a.exr", np.zeros((2, 2, 3)))
     images = dict.fromkeys(("overlay", "extra", "difference", "test", "reference"), "a.exr")
     text = html(tmp_path, [dataclasses.replace(GOOD, images=images)])
@@ -381,7 +381,7 @@ def test_compact(value, text):
     assert compact(value) == text
 
 
-def test_a_broken_budget_never_looks_kept():
+def test_a_value_beyond_its_budget_is_distinguishable_from_it():
     assert distinguishable(1.3001e-5, 1.3e-5) == ("1.3001e-5", "1.3e-5")
     value, budget = distinguishable(math.nextafter(1.0, 2), 1.0)
     assert value != budget
@@ -401,7 +401,7 @@ PAGE = {
 }
 
 
-def test_what_is_broken_comes_before_the_answers_and_they_before_the_studies_and_what_was_not_run(tmp_path):
+def test_the_order_of_failures_answers_studies_and_missing_rows(tmp_path):
     write_exr(tmp_path / "a.exr", np.full((4, 4, 3), 0.5))
     both = {"worst": 1.0, "p99": 1.0}
     broken = [dataclasses.replace(GOOD, values=both, budgets=dict.fromkeys(both, 0.5), case=str(i)) for i in range(5)]
@@ -428,7 +428,7 @@ def test_what_is_broken_comes_before_the_answers_and_they_before_the_studies_and
         ({"answers": [], "plot": {**PAGE["plot"], "row": "none"}}, "there is no row 'none'"),
     ],
 )
-def test_a_first_page_that_cannot_be_shown_is_an_error(tmp_path, page, complaint):
+def test_invalid_first_pages_are_errors(tmp_path, page, complaint):
     with pytest.raises(ValueError, match=complaint):
         html(tmp_path, [CURVES], {"first_page": page})
 
@@ -456,7 +456,7 @@ PROBE = """
 
 
 @needs_chromium
-def test_the_page_works_from_a_file(tmp_path):
+def test_the_page_works_in_a_browser_from_a_file(tmp_path):
     for role, value in (("reference", 0.25), ("test", 0.5), ("difference", -1.0)):
         pixels = np.full((2, 2, 3), value)
         pixels[0, 1, 1] = NAN

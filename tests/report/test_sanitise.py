@@ -1,4 +1,4 @@
-"""What others wrote, in every form of a report: no character that is not seen, and markup is text."""
+"""Names and messages from other sources are sanitised in every report: no hidden characters, and markup is text."""
 
 import contextlib
 import dataclasses
@@ -32,7 +32,7 @@ def printed(table):
     return capture.get()
 
 
-def said(write, *arguments, **options):
+def output_of(write, *arguments, **options):
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(out):
         write(*arguments, **options)
     return out.getvalue()
@@ -41,25 +41,30 @@ def said(write, *arguments, **options):
 @pytest.fixture
 def results(tmp_path):
     how = ComparisonSpec("exact", {}, NAME)
-    said = Comparison("exact", Verdict.DIFFERENT, NAME, (Metric(NAME, 2.0, 1.0),))
-    found = [Result(NAME, Status.ERROR, tmp_path, tmp_path, how, error=NAME)]
-    found += [Result(NAME, Status.DIFFERENT, None, tmp_path, how)]
-    found += [Result(NAME, status, tmp_path, tmp_path, how, said) for status in (Status.INCONCLUSIVE, Status.EQUAL)]
-    return Results(tmp_path / "old", tmp_path / NAME.replace("/", ""), tuple(found), unused=(NAME,))
+    comparison = Comparison("exact", Verdict.DIFFERENT, NAME, (Metric(NAME, 2.0, 1.0),))
+    error = Result(NAME, Status.ERROR, tmp_path, tmp_path, how, error=NAME)
+    added = Result(NAME, Status.DIFFERENT, None, tmp_path, how)
+    inconclusive, equal = (
+        Result(NAME, status, tmp_path, tmp_path, how, comparison) for status in (Status.INCONCLUSIVE, Status.EQUAL)
+    )
+    all_results = (error, added, inconclusive, equal)
+    return Results(tmp_path / "old", tmp_path / NAME.replace("/", ""), all_results, unused=(NAME,))
 
 
 def findings():
-    """Of one wrong answer, in a set whose regime and ids were named by somebody else."""
+    """Findings of one wrong answer, in a set whose regime has a hostile name."""
     fields = {field.name: 1 for field in dataclasses.fields(check_answers.RegimeErrors)}
     regime = check_answers.RegimeErrors(**fields | {"regime": NAME, "replay": {NAME: NAME}})
     problems = (check_answers.Problem("unknown", 1, NAME),)
-    why = (Explanation(NAME, NAME, 1.0, 0.1, True),)
-    return check_answers.Findings("f32", 2.0**-23, NAME, "zero", True, (regime,), problems, why, {"seed": NAME})
+    explanations = (Explanation(NAME, NAME, 1.0, 0.1, True),)
+    return check_answers.Findings(
+        "f32", 2.0**-23, NAME, "zero", True, (regime,), problems, explanations, {"seed": NAME}
+    )
 
 
 FORMS = {
-    "terminal": lambda results, path: said(text_reports.print_results, results),
-    "GitHub": lambda results, path: said(results_file.write_github, results).replace("::", ""),
+    "terminal": lambda results, path: output_of(text_reports.print_results, results),
+    "GitHub": lambda results, path: output_of(results_file.write_github, results).replace("::", ""),
     "Markdown": lambda results, path: text_reports.markdown(results),
     "JUnit": lambda results, path: results_file.write(results, origin([], None), path) or path.read_text(),
     "HTML": lambda results, path: html_report.write(path, results, {NAME: [NAME]}, NAME) or path.read_text(),
@@ -73,19 +78,19 @@ FORMS = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_names_reasons_and_errors_of_images_and_of_rays(form, results, tmp_path):
+def test_reports_of_images_and_rays_are_sanitised(form, results, tmp_path):
     text = FORMS[form](results, tmp_path / "out")
     assert "task.x" in text
     assert shows_more_than_text(text) == []
     assert "<script>&" not in text or form.startswith(("terminal", "GitHub"))
 
 
-def test_json_holds_every_name(results, tmp_path):
+def test_json_keeps_hostile_names(results, tmp_path):
     results_file.write(results, origin([], None), data=tmp_path / "out.json")
     assert json.loads((tmp_path / "out.json").read_bytes())["results"][0]["name"] == NAME
 
 
-def test_names_of_rows_and_what_other_programs_said(tmp_path):
+def test_reports_of_rows_are_sanitised(tmp_path):
     row = Row(NAME, NAME, NAME, NAME, {NAME: 2.0}, budgets={NAME: 1.0}, reason=NAME, replay={NAME: NAME})
     curve = dataclasses.replace(row, curves={NAME: [(1.0, 1.0), (2.0, 3.0)]}, subject="other")
     absent = Row(NAME, "absent", NAME, NAME, reason=NAME)
@@ -99,18 +104,18 @@ def test_names_of_rows_and_what_other_programs_said(tmp_path):
     assert shows_more_than_text(printed(run_report.summary(rows))) == []
 
 
-def test_plots():
+def test_plots_are_sanitised():
     name = "::x\x1b[31m\u202e##[error]<b>&"
-    drawn = plots.curves_svg({name: [(1, 1), (2, 2)]}, plots.Axes(name, name), salt="x")
+    curves = plots.curves_svg({name: [(1, 1), (2, 2)]}, plots.Axes(name, name), salt="x")
     panels = {name: plots.Scatter({name: [(1, 1), (2, 2)]}, [], 1.0)}
-    scattered = plots.scatter_svg(panels, plots.Axes(name, name), floor=name, front=True, salt="y")
-    for svg in (drawn, scattered):
+    scatter = plots.scatter_svg(panels, plots.Axes(name, name), floor=name, front=True, salt="y")
+    for svg in (curves, scatter):
         assert svg.count("error]") > 2
         assert shows_more_than_text(svg) == []
         ElementTree.fromstring(svg)
 
 
-def test_a_planar_scene_with_a_hostile_title(tmp_path):
+def test_planar_figures_are_sanitised(tmp_path):
     path = tmp_path / "##[error]\u202e.toml"
     title = "title = '::x::<b>&'".replace("'", '"').replace("<b>", r"\u001b[31m\u202e##[error]<b>") + "\n"
     text = title + (processes.ROOT / "scenes/planar/lens.toml").read_text().replace("title", "# title")

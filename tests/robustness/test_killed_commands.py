@@ -1,10 +1,11 @@
-"""Killed commands and full disks: what is left is old or new, never half, and the same command again ends well.
+"""Killed commands and full disks: every file is old or new, never torn, and the same command then finishes.
 
-Each command runs once undisturbed. Then it gets a signal at random times within that time, each time where the last one
-left off, and runs with a random limit on the size of files (`ulimit -f`), as on a full disk. After each of these every
-file must be the old or the new one. The signal ends the command, SIGINT with exit code 130 and with nothing temporary
-left; with the limit the exit code is 2 with one line. Or the command has its own exit code, where the signal was late
-or the files fit. At last it runs to its end: with its exit code, and with nothing temporary left.
+Each command runs once undisturbed. Then it runs repeatedly in the same folder: with a signal at a random time within
+the first run's duration, or with a random limit on the size of files (`ulimit -f`), as on a full disk. After each run,
+every file must be the old or the new one. The signal ends the command; after SIGINT the exit code is 130 and no
+temporary file remains. With the limit the exit code is 2, with one line. If the signal comes too late, or the files
+fit, the command has its own exit code. The last run is undisturbed: it ends with the command's exit code, and no
+temporary file remains.
 """
 
 from __future__ import annotations
@@ -72,12 +73,12 @@ sys.exit(errors.exit_code("validation", body))
 
 @dataclass(frozen=True)
 class Command:
-    """`words` for Python, FOLDER is the folder; `outputs`: its files, by glob."""
+    """A command. `words`: arguments of Python, with FOLDER for the folder; `outputs`: glob of its output files."""
 
     words: tuple[str, ...]
     outputs: str
     code: int
-    content: Callable[[Path], Any] = Path.read_bytes  # what must be the same in a file after every run
+    content: Callable[[Path], Any] = Path.read_bytes  # the content of a file that is compared
 
 
 def image(path, seed):
@@ -85,7 +86,7 @@ def image(path, seed):
 
 
 def prepare(folder):
-    """Old outputs of the commands, and what they read: two folders of six images."""
+    """Write old outputs of the commands, and their inputs: two folders of six images."""
     for side, first in (("old", 0), ("new", 100)):
         (folder / side).mkdir(parents=True)
         for i in range(6):
@@ -94,10 +95,12 @@ def prepare(folder):
     image(folder / "out.exr", 0)
 
 
-def whole_page(path):
-    """Which page it is: the old one, or a new one with an end, whose commands name the folder."""
+def page_state(path):
+    """Return the text of the old page, or "new" for a complete new one (its text names the folder), or "torn"."""
     text = path.read_text()
-    return text if text == OLD else "new" if text.rstrip().endswith("</html>") else "torn"
+    if text == OLD:
+        return text
+    return "new" if text.rstrip().endswith("</html>") else "torn"
 
 
 OURS = ("-m", "mi_refract.cli")
@@ -105,7 +108,7 @@ RENDER = ("render", str(ROOT / "scenes" / "sphere.xml"), "-o", "FOLDER/out.exr",
 DIFF = ("diff", "FOLDER/old", "FOLDER/new", "--report", "FOLDER/out.html")
 COMMANDS = {
     "accept": Command((*OURS, "accept", "FOLDER/old", "FOLDER/new", "--yes"), "old/*", 0),
-    "diff --report": Command((*OURS, *DIFF), "out.html", 1, whole_page),
+    "diff --report": Command((*OURS, *DIFF), "out.html", 1, page_state),
     "validation": Command(("-c", VALIDATION, "FOLDER/report"), "report/*.*", 0),
     "render": Command(
         (*OURS, *RENDER, "--pass-spp", "1", "--restart"), "out.exr", 0,
@@ -114,8 +117,11 @@ COMMANDS = {
 }  # fmt: skip
 
 
-def ended(command, folder, kill=None, number=signal.SIGKILL, size=None):
-    """Exit code (−9: by SIGKILL) and stderr of the command, with a signal after `kill` s."""
+def run(command, folder, kill=None, number=signal.SIGKILL, size=None):
+    """Run the command and return its exit code (−9: by SIGKILL) and stderr.
+
+    `kill`: seconds until the signal `number`; `size`: limit on the size of files in bytes.
+    """
     words = [word.replace("FOLDER", str(folder)) for word in command.words]
     limit = resource.RLIM_INFINITY if size is None else size
     start = [sys.executable, *(("-c", LIMITED, str(limit)) if size is not None else ()), *words]
@@ -126,19 +132,19 @@ def ended(command, folder, kill=None, number=signal.SIGKILL, size=None):
             if kill is not None:
                 time.sleep(kill)
                 process.send_signal(number)
-            _, said = process.communicate(timeout=HANG)
+            _, err = process.communicate(timeout=HANG)
         finally:
             process.kill()
-    return process.returncode, said.decode(errors="replace")
+    return process.returncode, err.decode(errors="replace")
 
 
 def temporary(folder):
-    """What only a command that is still running may have there."""
+    """Return the temporary files in a folder, which only a running command may have."""
     return {path for path in folder.rglob("*") if path.name.startswith(".") or path.name == "validation.lock"}
 
 
 def state(command, folder):
-    """The contents of its outputs, or why they cannot be read, by name."""
+    """Return the contents of the command's outputs by name; for an unreadable file, the error."""
     contents = {}
     for path in set(folder.glob(command.outputs)) - temporary(folder):
         try:
@@ -149,46 +155,46 @@ def state(command, folder):
 
 
 def torn(contents, *known):
-    """Names of the files that are in none of the known states."""
+    """Return the names of the files that have none of the known contents."""
     return [name for name, content in contents.items() if not any(content == files.get(name) for files in known)]
 
 
 def ends_well(command, folder, after, number):
-    """The signal comes after so many seconds; it ends the command as it should, or comes too late."""
+    """Send the signal after `after` seconds; return whether it ends the command correctly, or comes too late."""
     before = temporary(folder)
-    code, said = ended(command, folder, kill=after, number=number)
+    code, err = run(command, folder, kill=after, number=number)
     if code == command.code:
         return True
     if number != signal.SIGINT:
-        return code in (-number, 128 + number)  # a render that keeps what it has says 128 + number
-    # Python itself was not there yet, or interrupted as it should be, and by no traceback of ours.
-    ours = code == 130 or (code == -number and "mi_refract.cli.app" not in said)
-    return "Fatal Python error: init" in said or (ours and temporary(folder) <= before)
+        return code in (-number, 128 + number)  # 128 + number: the command handled the signal
+    # Python was still starting, or the command was interrupted without a traceback of this package.
+    interrupted = code == 130 or (code == -number and "mi_refract.cli.app" not in err)
+    return "Fatal Python error: init" in err or (interrupted and temporary(folder) <= before)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_killed_command_leaves_whole_files_and_ends_well_when_started_again(name, tmp_path):
+def test_a_killed_command_leaves_whole_files_and_finishes_when_run_again(name, tmp_path):
     command, rng = COMMANDS[name], random.Random(0)
     old, new = tmp_path / "undisturbed", tmp_path / "killed"
     for folder in (old, new):
         prepare(folder)
     before, start = state(command, old), time.perf_counter()
-    assert ended(command, old)[0] == command.code
-    took, after = time.perf_counter() - start, state(command, old)
+    assert run(command, old)[0] == command.code
+    duration, after = time.perf_counter() - start, state(command, old)
     for i in range(max(4, settings.default.max_examples // 50)):
         if i % 2:
-            code, said = ended(command, new, size=rng.choice((0, 100, 1000, rng.randrange(60_000))))
-            lines = [line for line in said.splitlines() if not line.startswith("validation: task ")]  # the progress
-            assert code == command.code or (code == errors.MISUSE and len(lines) == 1), said
+            code, err = run(command, new, size=rng.choice((0, 100, 1000, rng.randrange(60_000))))
+            lines = [line for line in err.splitlines() if not line.startswith("validation: task ")]  # no progress
+            assert code == command.code or (code == errors.MISUSE and len(lines) == 1), err
         else:
-            number, moment = SIGNALS[i // 2 % len(SIGNALS)], rng.uniform(0, took)
+            number, moment = SIGNALS[i // 2 % len(SIGNALS)], rng.uniform(0, duration)
             assert ends_well(command, new, moment, number), (number, moment)
-            for left in temporary(new):  # by SIGKILL, or by a signal before the first line of ours
-                left.unlink() if left.is_file() else shutil.rmtree(left)
+            for path in temporary(new):  # left by SIGKILL, or by a signal before the first line of this package
+                path.unlink() if path.is_file() else shutil.rmtree(path)
         assert not torn(state(command, new), before, after)
-    if name == "accept":  # so that something is left to do
+    if name == "accept":  # restore one old image: otherwise there is nothing to accept
         first = next(path for path in new.glob(command.outputs) if path.name in before)
         first.write_bytes(before[first.name])
-    assert ended(command, new)[0] == command.code
+    assert run(command, new)[0] == command.code
     assert state(command, new).keys() == after.keys() and not temporary(new)
     assert not torn(state(command, new), after)

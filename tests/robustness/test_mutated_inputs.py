@@ -1,7 +1,7 @@
-"""Mutated inputs: every parser answers garbage with an error in one line, or with the right content.
+"""Mutated inputs: every parser either refuses garbage with an error of one line, or reads the right content.
 
-`pytest tests/robustness --hypothesis-profile=long` tries a thousand inputs of each parser, anew each time. The input
-that hangs or ends the process is the file `mutated.*` in the folder of the test.
+`pytest tests/robustness --hypothesis-profile=long` tries a thousand inputs per parser, others in each run. An input
+that hangs or kills the process remains as the file `mutated.*` in the folder of the test.
 """
 
 import contextlib
@@ -38,12 +38,12 @@ from mi_refract.rendering import scene_files
 from mi_refract.scene_export import from_mitsuba, targets
 
 SCENES = Path(__file__).parents[2] / "scenes"
-LONGEST, HANG = 10.0, 60.0  # CPU seconds of one input; seconds after which the process ends
-ADDRESSES = 12 << 30  # bytes of address space beyond what is used: a reader may ask for the most it accepts
-MEMORY = 2 << 30  # bytes that an input may take: the largest film is accepted
-HEADER = 700  # bytes of an EXR file in front of its pixels
-FAR = 1e-3  # radians: no bound of a generic ray in float32 excuses as much
-PIXELS = 64  # of a film that is rendered
+LONGEST, HANG = 10.0, 60.0  # limit for one input in CPU seconds; seconds after which the process is ended
+ADDRESSES = 12 << 30  # additional address space in bytes: a reader may allocate the largest size that it accepts
+MEMORY = 2 << 30  # additional memory for one input in bytes: the largest film is accepted
+HEADER = 700  # size of an EXR file's header in bytes
+FAR = 1e-3  # radians: larger than the error bound of every generic ray in float32
+PIXELS = 64  # films of up to this many pixels are rendered
 
 # Mutations -----------------------------------------------------------------------------------------------------------
 
@@ -63,50 +63,50 @@ ELEMENTS = [
 ELEMENTS = [part[0] * n + part[1] * n for part in (x.split(b"|") for x in ELEMENTS) for n in (1, 2, 40)]
 ELEMENTS.append(b'<include filename="mutated.xml"/>')
 TOKEN = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?|[A-Za-z_][\w.]*|\"[^\"\n]*\"|^.*\n", re.MULTILINE)
-XML_TOKEN = re.compile(rb'(?<==")[^"]*(?=")|(?=<[a-z])')  # values of attributes, and before an element
+XML_TOKEN = re.compile(rb'(?<==")[^"]*(?=")|(?=<[a-z])')  # values of attributes, and places in front of an element
 
 
 @st.composite
 def mutated(draw, good, head=None, tokens=TOKEN, words=WORDS):
-    """One of `good` with one to four pieces replaced: of the first `head` bytes, three times out of four."""
+    """Return one of `good` with one to four pieces replaced, three of four times within the first `head` bytes."""
     data = draw(st.sampled_from(good))
     for _ in range(draw(st.integers(1, 4))):
-        near = min(len(data), head if head and draw(st.integers(0, 3)) else len(data))
-        start = draw(st.integers(0, near))
-        spans = [found.span() for found in tokens.finditer(data, 0, near)] or [(start, start)]
+        end = min(len(data), head if head and draw(st.integers(0, 3)) else len(data))
+        start = draw(st.integers(0, end))
+        spans = [match.span() for match in tokens.finditer(data, 0, end)] or [(start, start)]
         if draw(st.booleans()):
             start, stop = draw(st.sampled_from(spans))
         else:
-            stop = start + draw(st.integers(0, 12) | st.just(near))
-        copied = slice(*draw(st.sampled_from(spans)))
-        copies = st.sampled_from([b"", data[copied], data[copied] * 50])
-        new = draw(st.sampled_from(words) | st.binary(max_size=8) | copies)
-        data = data[:start] + new + data[stop:]
+            stop = start + draw(st.integers(0, 12) | st.just(end))
+        token = data[slice(*draw(st.sampled_from(spans)))]
+        copies = st.sampled_from([b"", token, token * 50])
+        piece = draw(st.sampled_from(words) | st.binary(max_size=8) | copies)
+        data = data[:start] + piece + data[stop:]
     return data
 
 
 @st.composite
 def mutated_member(draw, good):
-    """Of a zip archive, whose checksums are right."""
+    """Return a zip archive with one mutated member and right checksums."""
     with zipfile.ZipFile(io.BytesIO(good)) as old:
         members = {name: old.read(name) for name in old.namelist()}
-    chosen = draw(st.sampled_from(sorted(members)))
-    members[chosen] = draw(mutated([members[chosen]], head=128))
+    mutated_name = draw(st.sampled_from(sorted(members)))
+    members[mutated_name] = draw(mutated([members[mutated_name]], head=128))
     with zipfile.ZipFile(buffer := io.BytesIO(), "w") as new:
-        for name, content in members.items():
-            new.writestr(name, content)
+        for member, content in members.items():
+            new.writestr(member, content)
     return buffer.getvalue()
 
 
 def inputs(suffix, good):
-    """Garbage like the good contents of files with this suffix."""
+    """Return a strategy for mutations of the good contents of files with this suffix."""
     plain = mutated(good, HEADER if suffix == ".exr" else None)
-    if suffix == ".xml":  # most of it is still XML
+    if suffix == ".xml":  # most of these are still XML
         return plain | mutated(good, tokens=XML_TOKEN, words=XML_WORDS + ELEMENTS)
     return plain | mutated_member(good[0]) if suffix == ".npz" else plain
 
 
-# Parsers: suffix, good contents, and a function that raises one line, or returns what is wrong with accepting the file
+# Parsers: suffix, good contents, and a function that raises an error, or returns why accepting the file was wrong
 
 SETTINGS = b"""[[image]]
 name = "glass/caustic*.exr"
@@ -138,7 +138,8 @@ MESH = """<scene version="3.0.0">
 SMALL = {"res": "4", "bsdf": "dielectric", "max_depth": "8"}
 
 
-def of_files(folder):
+def file_parsers(folder):
+    """Return the parsers of files other than scenes."""
     rays = ray_set.make(("generic",), 6)
     for name in ("rays.csv", "rays.npz"):
         files.write(folder / name, rays)
@@ -159,14 +160,14 @@ def of_files(folder):
         return None if same else "other rays than those that were exported"
 
     def answers(path):
-        """Those that `rays check` calls right."""
+        """Read answers; return an error if `rays check` accepts wrong ones."""
         read = files.read_answers(path)
         if check_answers.check(rays, read).exit_code:
             return None
         if sorted(read.ids.tolist()) != rays.ids.tolist():
             return "exit code 0 for other ids"
-        away = np.linalg.norm(read.b[np.argsort(read.ids)] - b, axis=1)
-        return None if (away < FAR).all() else f"exit code 0 for a direction that is {away.max():g} away"
+        error = np.linalg.norm(read.b[np.argsort(read.ids)] - b, axis=1)
+        return None if (error < FAR).all() else f"exit code 0 for a direction with an error of {error.max():g}"
 
     def equal(path):
         (result,) = folders.diff(image, path).results
@@ -179,7 +180,7 @@ def of_files(folder):
         shutil.copy(path, folder / "renderer" / renderer_file.NAME)
         renderer_file.load(folder / "renderer")
 
-    def of(name):
+    def contents(name):
         return [(folder / name).read_bytes()]
 
     planar = [(SCENES / "planar" / f"{name}.toml").read_bytes() for name in ("lens", "nested", "prism", "doublet")]
@@ -187,18 +188,18 @@ def of_files(folder):
         "planar scene, TOML": (".toml", planar, lambda path: scene_file.load(path) and None),
         "diff settings, TOML": (".toml", [SETTINGS], lambda path: settings.load(path) and None),
         "renderer, TOML": (".toml", [RENDERER], renderer),
-        "rays, CSV": (".csv", of("rays.csv"), same_rays),
-        "rays, NPZ": (".npz", of("rays.npz"), same_rays),
-        "answers, CSV": (".csv", of("answers.csv"), answers),
-        "answers, NPZ": (".npz", of("answers.npz"), answers),
-        "image, EXR": (".exr", of("image.exr"), equal),
+        "rays, CSV": (".csv", contents("rays.csv"), same_rays),
+        "rays, NPZ": (".npz", contents("rays.npz"), same_rays),
+        "answers, CSV": (".csv", contents("answers.csv"), answers),
+        "answers, NPZ": (".npz", contents("answers.npz"), answers),
+        "image, EXR": (".exr", contents("image.exr"), equal),
     }
 
 
-def of_scenes(folder):
-    """Scenes and their meshes, read as `render` and `scene export` read them, up to the first sample.
+def scene_parsers(folder):
+    """Return the parsers of scenes and meshes, as `render` and `scene export` read them, up to the first sample.
 
-    Beside them there is a false plugin for every word of the good ones; Mitsuba says so where it opens one.
+    The folder has a false plugin for every word of the good scenes: loading one is an error.
     """
     shutil.copytree(SCENES / "meshes", folder / "meshes")
     shutil.copy(SCENES / "lamps.exr", folder)
@@ -211,20 +212,21 @@ def of_scenes(folder):
     for name in words | scene_parser.known_plugins():
         (folder / "plugins" / f"{name}.so").write_text("native code")
 
-    def by_turns(path):
-        """Every other scene as it is, whose film is made; the others small, and so they are rendered."""
-        return rendered(path, SMALL if path.stat().st_size % 2 else {})
+    def render_scene(path):
+        """Read files of even size unchanged, and only make the film; read the others with small films, and render."""
+        return render(path, SMALL if path.stat().st_size % 2 else {})
 
     mesh, sky = [(SCENES / "meshes" / "prism.ply").read_bytes()], [(SCENES / "lamps.exr").read_bytes()]
     return {
-        "scene, XML": (".xml", scenes, by_turns),
-        "scene to export, XML": (".xml", scenes, exported),
-        "sky, EXR": (".exr", sky, lambda path: rendered(folder / "sky.xml", SMALL)),
-        "mesh, PLY": (".ply", mesh, lambda path: rendered(folder / "mesh.xml", {})),
+        "scene, XML": (".xml", scenes, render_scene),
+        "scene to export, XML": (".xml", scenes, export),
+        "sky, EXR": (".exr", sky, lambda path: render(folder / "sky.xml", SMALL)),
+        "mesh, PLY": (".ply", mesh, lambda path: render(folder / "mesh.xml", {})),
     }
 
 
-def rendered(path, defines):
+def render(path, defines):
+    """Load the scene; render it if its film is small, otherwise only prepare the film."""
     import mitsuba as mi
 
     scene = scene_files.load_scene(path, defines)
@@ -239,10 +241,10 @@ def rendered(path, defines):
     return None
 
 
-def exported(path):
-    """The scene is written for one of the targets, by turns."""
+def export(path):
+    """Export the scene to one of the targets, which the size of the file selects."""
     plain = from_mitsuba.load(path, level=1)
-    names = [name for name in targets.TARGETS if name != "povray"]  # which has glass and lights only
+    names = [name for name in targets.TARGETS if name != "povray"]  # POV-Ray supports glass and lights only
     targets.TARGETS[names[path.stat().st_size % len(names)]](plain)
     numbers = [*dataclasses.astuple(plain.camera), *(x for m in plain.materials for x in dataclasses.astuple(m))]
     return None if np.isfinite(np.hstack(numbers)).all() else "a number that is not finite"
@@ -253,7 +255,7 @@ def exported(path):
 
 @contextlib.contextmanager
 def limited():
-    """The process ends where an input hangs, and has no more than ADDRESSES."""
+    """Within this context, end the process if an input hangs, and limit its address space."""
     used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     before = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (used + ADDRESSES, before[1]))
@@ -266,23 +268,23 @@ def limited():
 
 
 def outcome(read, path):
-    """Of an input: read or refused; an AssertionError for a finding."""
+    """Read an input; return "read" or "refused". AssertionError if the parser is at fault."""
     began, memory = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     try:
         with limited():
-            wrong = read(path)
+            fault = read(path)
     except Exception as error:
         message = errors.describe(error)
         assert not message.startswith("internal error"), message
         assert not isinstance(error, ValueError) or "\n" not in str(error), f"several lines: {error}"
         assert "Error while loading plugin" not in str(error), f"a plugin of the scene's own was opened: {error}"
-        wrong, found = None, "refused"
+        fault, result = None, "refused"
     else:
-        found = "read"
-    assert not wrong, wrong
+        result = "read"
+    assert not fault, fault
     assert 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory) <= MEMORY
     assert time.process_time() - began < LONGEST
-    return found
+    return result
 
 
 @pytest.fixture(scope="module")
@@ -293,7 +295,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def parsers(folder):
     switch("scalar_rgb")
-    return of_files(folder) | of_scenes(folder)
+    return file_parsers(folder) | scene_parsers(folder)
 
 
 KINDS = (
@@ -305,7 +307,7 @@ KINDS = (
 
 @pytest.mark.usefixtures("scalar_variant")
 @pytest.mark.parametrize("name", KINDS)
-def test_garbage_is_answered_in_one_line(name, parsers, folder):
+def test_garbage_is_refused_in_one_line_or_read_correctly(name, parsers, folder):
     suffix, good, read = parsers[name]
     path, outcomes = folder / f"mutated{suffix}", Counter()
     for content in good:

@@ -1,9 +1,10 @@
 """Exports are written completely or not at all; read as the renderers would read them, they are the same scene.
 
-The film is not square, the camera's `up` is not at right angles to where it looks, and the sky's map has no symmetry.
+The film is not square, the camera's `up` is not perpendicular to its direction, and the map of the sky is asymmetric.
 """
 
 import dataclasses
+import functools
 import json
 import os
 import re
@@ -51,9 +52,9 @@ def plain(*materials, sky=(0.5, 0.25, 1.0), depth=12):
 
 @pytest.fixture
 def sky():
-    """A map with no two pixels alike and no symmetry, turned."""
-    turned = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], float)
-    return Environment(np.random.default_rng(4).random((5, 8, 3)).astype(np.float32), turned)
+    """A rotated map without equal pixels or symmetry."""
+    rotation = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], float)
+    return Environment(np.random.default_rng(4).random((5, 8, 3)).astype(np.float32), rotation)
 
 
 # --- the folder ------------------------------------------------------------------------------------------
@@ -64,13 +65,12 @@ def test_every_target_writes_its_folder(target, sky, tmp_path):
     """With a sky of one colour, with a map, and without any mesh."""
     scenes = [plain(GLASS, LAMP), plain(GLASS, LAMP, sky=sky), plain(sky=sky)]
     for i, scene in enumerate(scenes):
-        written = targets.write(scene, target, tmp_path / f"{i}")
-        assert sorted(written) == sorted((tmp_path / f"{i}").iterdir()) and (
-            i == 2 or all(map(os.path.getsize, written))
-        )
+        paths = targets.write(scene, target, tmp_path / f"{i}")
+        assert sorted(paths) == sorted((tmp_path / f"{i}").iterdir())
+        assert i == 2 or all(map(os.path.getsize, paths))
         text = (tmp_path / f"{i}" / "README.txt").read_text()
         assert scene.name in text and all(len(line) <= 140 for line in text.splitlines())
-        if (tmp_path / f"{i}" / "sky.exr").exists():  # without a date: the same scene gives the same bytes
+        if (tmp_path / f"{i}" / "sky.exr").exists():  # a fixed date: the same scene gives the same bytes
             assert image_file.read(tmp_path / f"{i}" / "sky.exr").metadata["DateTime"] == "1970:01:01 00:00:00"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0", "1", "2"]
     page = (DOCS / "how-to/export-a-scene.md").read_text("utf-8")
@@ -82,17 +82,17 @@ REFUSED = [(x, y) for x in LAMPS for y in targets.TARGETS if x.kind not in targe
 
 
 @pytest.mark.parametrize("lamp, target", REFUSED)
-def test_a_lamp_that_a_target_does_not_hold_is_refused(lamp, target, tmp_path):
-    """It is not dropped: 4 targets hold no lamp without size, Cycles no spot."""
+def test_a_target_refuses_lamps_that_it_does_not_hold(lamp, target, tmp_path):
+    """They are not dropped silently: 4 targets hold no lamps without size, Cycles no spots."""
     assert len(REFUSED) == 4 * 3 + 1
     scene = dataclasses.replace(plain(GLASS), lamps=(lamp,))
-    what = f"a scene: bulb: a {lamp.kind} lamp is not exported to {target}; expected area lamps, an environment, or"
-    with pytest.raises(ValueError, match=rf"^{what} --to (cycles or )?mitsuba or obj\+json or gltf$"):
+    text = f"a scene: bulb: a {lamp.kind} lamp is not exported to {target}; expected area lamps, an environment, or"
+    with pytest.raises(ValueError, match=rf"^{text} --to (cycles or )?mitsuba or obj\+json or gltf$"):
         targets.write(scene, target, tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
 
-def test_what_is_there_stays_and_an_empty_folder_is_taken(tmp_path):
+def test_existing_files_are_kept_and_an_empty_folder_is_used(tmp_path):
     for name in ("full", "there"):
         (tmp_path / name).mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
@@ -114,7 +114,7 @@ def test_what_is_there_stays_and_an_empty_folder_is_taken(tmp_path):
     assert (tmp_path / "there" / "scene.rad").is_file() and (tmp_path / "link").is_symlink()
 
 
-def test_nothing_stays_of_half_an_export(tmp_path, monkeypatch):
+def test_a_failed_export_leaves_no_files(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(os, "access", lambda path, mode: False)
         with pytest.raises(PermissionError, match="not writable"):
@@ -133,7 +133,7 @@ def test_nothing_stays_of_half_an_export(tmp_path, monkeypatch):
     assert len(written) == 3 and not list(tmp_path.iterdir())
 
 
-# --- read as the renderers read it ------------------------------------------------------------------------
+# --- exports as the renderers read them -------------------------------------------------------------------
 
 SINGLE = 2.0**-24
 MAP = np.random.default_rng(8).random((5, 8, 3)).astype(np.float32)
@@ -165,43 +165,43 @@ SCENE = """<scene version="3.0.0">
 
 @pytest.mark.parametrize("target", READERS)
 @pytest.mark.parametrize("sky", [COLOUR, TURNED], ids=["colour", "map"])
-def test_the_export_has_mitsubas_rays_surfaces_indices_lights_and_sky(
+def test_an_export_has_mitsubas_rays_surfaces_indices_lights_and_sky(
     target, sky, tmp_path, monkeypatch, scalar_variant
 ):
-    """Mitsuba's rays are in float32: an error of a few roundoffs in each of its transforms.
+    """Mitsuba's rays are in float32: each of its transforms has an error of a few roundoffs.
 
-    Triangles are counterclockwise from outside; an index is that inside over the one outside. A map of the sky is
-    resampled to cells of 1/16: where it bends by at most 2 per texel, linear cells err by 1/32 an axis.
+    Triangles are counterclockwise from outside; an index is the index inside over that outside. A map of the sky is
+    resampled to cells of 1/16: where its slope changes by at most 2 per texel, linear cells err by 1/32 per axis.
     """
     image_file.write_exr(tmp_path / "map.exr", MAP)
     path = tmp_path / "scene.xml"
-    text = SCENE.replace('"1.1"', '"1.3"') if target == "gltf" else SCENE  # which has no index below 1
+    text = SCENE.replace('"1.1"', '"1.3"') if target == "gltf" else SCENE  # glTF has no index below 1
     path.write_text(text % (sky if target == "povray" else sky + PATCH))
-    given = from_mitsuba.load(path, level=1)
-    targets.write(given, target, tmp_path / "export")
+    plain_scene = from_mitsuba.load(path, level=1)
+    targets.write(plain_scene, target, tmp_path / "export")
     original = mi.load_file(str(path), parallel=False, optimize=False)
-    found = READERS[target](tmp_path / "export", monkeypatch)
+    export = READERS[target](tmp_path / "export", monkeypatch)
 
-    assert found.size == (16, 9) and found.depth == 7
-    places = [(0, 0), (1, 0), (0, 1), (1, 1), *np.random.default_rng(3).random((12, 2))]
-    for x, y in (np.clip(place, 1e-6, 1 - 1e-6) for place in places):
+    assert export.size == (16, 9) and export.depth == 7
+    points = [(0, 0), (1, 0), (0, 1), (1, 1), *np.random.default_rng(3).random((12, 2))]
+    for x, y in (np.clip(point, 1e-6, 1 - 1e-6) for point in points):
         ray, _ = original.sensors()[0].sample_ray(0, 0.5, mi.Point2f(x, y), mi.Point2f(0.5))
-        origin, direction = found.ray(x, y)
+        origin, direction = export.ray(x, y)
         np.testing.assert_allclose(direction / np.linalg.norm(direction), ray.d, atol=64 * SINGLE)
         # Mitsuba's rays start at the near clip plane.
         assert np.linalg.norm(np.cross(np.subtract(ray.o, origin), ray.d)) < 64 * SINGLE * np.linalg.norm(origin)
 
-    assert sorted(found.triangles) == sorted(mesh.name for mesh in given.meshes)
-    for mesh in given.meshes:
-        np.testing.assert_allclose(found.triangles[mesh.name], mesh.triangles(), atol=8 * SINGLE)
+    assert sorted(export.triangles) == sorted(mesh.name for mesh in plain_scene.meshes)
+    for mesh in plain_scene.meshes:
+        np.testing.assert_allclose(export.triangles[mesh.name], mesh.triangles(), atol=8 * SINGLE)
     for name in ("ball", "pearl"):
         (bsdf,) = (shape.bsdf() for shape in original.shapes() if shape.id() == name)
-        centre = np.mean(found.triangles[name], axis=(0, 1))
-        assert (np.linalg.det(np.subtract(found.triangles[name], centre)) > 0).all()
-        assert found.indices[name] == pytest.approx(float(re.search(r"eta = ([\d.]+)", str(bsdf))[1]), rel=1e-5)
-    assert found.indices.keys() == {"ball", "pearl"} and found.lights.keys() == {"lamp"}
-    assert list(found.lights["lamp"]) == [1, 2, 3]
-    colours = {name: list(colour) for name, colour in found.colours.items()}
+        centre = np.mean(export.triangles[name], axis=(0, 1))
+        assert (np.linalg.det(np.subtract(export.triangles[name], centre)) > 0).all()
+        assert export.indices[name] == pytest.approx(float(re.search(r"eta = ([\d.]+)", str(bsdf))[1]), rel=1e-5)
+    assert export.indices.keys() == {"ball", "pearl"} and export.lights.keys() == {"lamp"}
+    assert list(export.lights["lamp"]) == [1, 2, 3]
+    colours = {name: list(colour) for name, colour in export.colours.items()}
     assert colours == ({} if target == "povray" else {"patch": [0.1, 0.2, 0.3]})
 
     directions = np.random.default_rng(5).normal(size=(200, 3))
@@ -212,10 +212,10 @@ def test_the_export_has_mitsubas_rays_surfaces_indices_lights_and_sky(
         si.wi = -mi.Vector3f(direction)
         expected.append(list(original.environment().eval(si)))
     tolerance = 1e-5 if sky == COLOUR else 0.5 * np.ptp(MAP) / 16
-    np.testing.assert_allclose(found.sky(directions), expected, atol=tolerance)
+    np.testing.assert_allclose(export.sky(directions), expected, atol=tolerance)
 
 
-LIT = {
+EMITTERS = {
     "bulb": """<emitter type="point" id="bulb"><point name="position" x="3" y="2" z="1"/>
       <rgb name="intensity" value="3, 2, 0.5"/></emitter>""",
     "soft": """<emitter type="spot" id="soft">
@@ -233,37 +233,41 @@ LIT = {
 
 
 @pytest.mark.parametrize("target", targets.HOLD_LAMPS)
-def test_lamps_without_size_light_what_mitsubas_light(target, tmp_path, monkeypatch, scalar_variant):
-    """At random places, from the same side with the same irradiance; but for the edge of a cone in glTF."""
-    lit = {name: text for name, text in LIT.items() if text.split('"')[1] in targets.HOLD_LAMPS[target]}
-    (tmp_path / "scene.xml").write_text(SCENE.replace('"1.1"', '"1.3"') % "".join([COLOUR, *lit.values()]))
+def test_lamps_without_size_give_mitsubas_irradiance(target, tmp_path, monkeypatch, scalar_variant):
+    """At random points the direction and the irradiance are equal, except at the edge of a spot in glTF."""
+    emitters = {name: text for name, text in EMITTERS.items() if text.split('"')[1] in targets.HOLD_LAMPS[target]}
+    (tmp_path / "scene.xml").write_text(SCENE.replace('"1.1"', '"1.3"') % "".join([COLOUR, *emitters.values()]))
     targets.write(from_mitsuba.load(tmp_path / "scene.xml", level=0), target, tmp_path / "new")
 
-    def mitsubas(path):
-        def lit(emitter, point):
-            here = mi.Interaction3f(0, 0, mi.Color0f(), mi.Point3f(point))
-            found, weight = emitter.sample_direction(here, [0.5, 0.5])
-            return np.array(found.d), np.array(weight)
+    def mitsubas_lamps(path):
+        """Return for each lamp a function of a point: the direction to the lamp, and the irradiance."""
 
-        made = mi.load_file(str(path), parallel=False, optimize=False).emitters()
-        return {each.id(): lambda point, each=each: lit(each, point) for each in made if each.id() in LIT}
+        def irradiance(emitter, point):
+            interaction = mi.Interaction3f(0, 0, mi.Color0f(), mi.Point3f(point))
+            sample, weight = emitter.sample_direction(interaction, [0.5, 0.5])
+            return np.array(sample.d), np.array(weight)
 
-    expected = mitsubas(tmp_path / "scene.xml")
-    mine = target == "mitsuba"
-    found = mitsubas(tmp_path / "new" / "scene.xml") if mine else READERS[target](tmp_path / "new", monkeypatch).lamps
-    assert found.keys() == expected.keys() == lit.keys()
+        loaded = mi.load_file(str(path), parallel=False, optimize=False).emitters()
+        return {x.id(): functools.partial(irradiance, x) for x in loaded if x.id() in EMITTERS}
+
+    expected = mitsubas_lamps(tmp_path / "scene.xml")
+    if target == "mitsuba":
+        lamps = mitsubas_lamps(tmp_path / "new" / "scene.xml")
+    else:
+        lamps = READERS[target](tmp_path / "new", monkeypatch).lamps
+    assert lamps.keys() == expected.keys() == emitters.keys()
     edges = {"soft": ((1, -5, -9), 20, 35), "sharp": ((5, 0, -2), 49.95, 50)} if target == "gltf" else {}
-    for name, lamp in found.items():
+    for name, lamp in lamps.items():
         axis, low, high = edges.get(name, ((0, 0, 1), 0, 0))
         for point in np.random.default_rng(6).normal(size=(300, 3)) * 4:
-            (way, light), (expected_way, expected_light) = lamp(point), expected[name](point)
-            np.testing.assert_allclose(way, expected_way, atol=64 * SINGLE)
-            if not low < np.degrees(np.arccos(-way @ axis / np.linalg.norm(axis))) < high:
+            (direction, light), (expected_direction, expected_light) = lamp(point), expected[name](point)
+            np.testing.assert_allclose(direction, expected_direction, atol=64 * SINGLE)
+            if not low < np.degrees(np.arccos(-direction @ axis / np.linalg.norm(axis))) < high:
                 np.testing.assert_allclose(light, expected_light, rtol=1e-4, atol=1e-7)
 
 
-def test_the_plain_scene_renders_equal_and_another_index_would_be_seen(tmp_path):
-    """False alarms: 0.001 by the family error of `welch`; the seeds are fixed."""
+def test_renders_of_an_export_are_equal_and_another_index_is_detected(tmp_path):
+    """False alarms have the family error of `welch`, 0.001; the seeds are fixed."""
 
     def renders(path, first, **defines):
         scene = mi.load_file(str(path), optimize=False, parallel=False, **defines)
@@ -281,30 +285,28 @@ def test_the_plain_scene_renders_equal_and_another_index_would_be_seen(tmp_path)
 
 
 @pytest.mark.parametrize("target", ["povray", "gltf"])
-def test_glass_whose_normals_point_inward_is_the_same_glass(target):
+def test_glass_with_inward_normals_is_exported_as_the_same_glass(target):
     vertices, faces = tessellation.sphere(1)
-    outward, inward = (
-        Mesh("ball", vertices, faces, Glass(1.5, 1.0)),
-        Mesh("ball", vertices, faces[:, ::-1], Glass(1.0, 1.5)),
-    )
-    one, two = (
+    outward = Mesh("ball", vertices, faces, Glass(1.5, 1.0))
+    inward = Mesh("ball", vertices, faces[:, ::-1], Glass(1.0, 1.5))
+    exports = [
         targets.TARGETS[target](PlainScene("ball", (mesh,), (1.0, 1.0, 1.0), CAMERA, 8)) for mesh in (outward, inward)
-    )
-    assert one == two
+    ]
+    assert exports[0] == exports[1]
 
 
 def test_povray(tmp_path):
-    """What it does not follow is refused; black surfaces; indices relative to what is outside."""
+    """Unsupported surfaces are refused; black surfaces; indices relative to the outermost medium."""
     pane = Mesh("pane", *tessellation.rectangle(), GLASS)
     (grey,) = plain(Diffuse((0.5, 0.0, 0.0))).meshes
     apart = Mesh("apart", BALL[0] - 9, BALL[1], Glass(1.5, 1.33))
-    for mesh, words in (
+    for mesh, message in (
         (pane, "pane: glass with an open"),
         (grey, "ball_0: a diffuse surface"),
         (apart, "apart: ext_ior = 1.33; no medium has that index; expected 1"),
     ):
         meshes = mesh, Mesh("ball", *BALL, GLASS)
-        with pytest.raises(ValueError, match=words):
+        with pytest.raises(ValueError, match=message):
             targets.write(PlainScene("bad", meshes, (1.0, 1.0, 1.0), CAMERA, 8), "povray", tmp_path / "new")
     assert not list(tmp_path.iterdir())
     make = targets.TARGETS["povray"]
@@ -312,23 +314,23 @@ def test_povray(tmp_path):
     front = "texture { pigment { rgb <%s> } finish { ambient 0 diffuse 0 emission 1 } }"
     assert text.count(front % "1.0, 2.0, 3.0") == text.count(front % "0.0, 0.0, 0.0") == 1
     assert text.count("interior_texture { pigment { rgb 0 } finish { ambient 0 diffuse 0 } }") == 2
-    two = Mesh("in", *BALL, Glass(1.2, 1.6)), Mesh("out", 2 * BALL[0], BALL[1], Glass(1.6, 1.25))
-    text = make(PlainScene("two", two, (1.0, 1.0, 1.0), CAMERA, 300))["scene.pov"]
+    nested = Mesh("in", *BALL, Glass(1.2, 1.6)), Mesh("out", 2 * BALL[0], BALL[1], Glass(1.6, 1.25))
+    text = make(PlainScene("nested", nested, (1.0, 1.0, 1.0), CAMERA, 300))["scene.pov"]
     assert [float(part.split()[0]) for part in text.split(b"interior { ior ")[1:]] == [1.2 / 1.25, 1.6 / 1.25]
     assert b"max_trace_level 256" in text
 
 
-# --- the scripts of exports: each seed once, and a plain path tracer -----------------------------------------
+# --- the scripts of exports ----------------------------------------------------------------------------------
 
 
-def written(target, folder, depth=12):
+def write_export(target, folder, depth=12):
     targets.write(plain(GLASS, GREY, LAMP, depth=depth), target, folder)
     return folder
 
 
 @pytest.mark.parametrize("words, seeds", [((), [1]), (("--seeds", "4", "2", "--threads", "2"), [4, 2])])
-def test_cycles_is_a_plain_path_tracer_of_each_seed(words, seeds, tmp_path, monkeypatch, capsys):
-    bpy = fake_bpy.run(written("cycles", tmp_path / "new"), monkeypatch, *words)
+def test_cycles_renders_each_seed_as_a_plain_path_tracer(words, seeds, tmp_path, monkeypatch, capsys):
+    bpy = fake_bpy.run(write_export("cycles", tmp_path / "new"), monkeypatch, *words)
     files = [str(tmp_path / "new" / f"seed{seed}.exr") for seed in seeds]
     assert bpy.rendered == list(zip(seeds, files, strict=True)) and capsys.readouterr().out.split() == files
     bpy.ops.wm.read_factory_settings.assert_called_once_with(use_empty=True)
@@ -347,13 +349,13 @@ def test_cycles_is_a_plain_path_tracer_of_each_seed(words, seeds, tmp_path, monk
     assert cycles.min_light_bounces == cycles.max_bounces == 10
     lens = bpy.data.cameras.made["camera"]
     assert 0 < lens.clip_start <= 1e-3 and lens.clip_end >= 1e6
-    deep = fake_bpy.run(written("cycles", tmp_path / "deep", depth=5000), monkeypatch).context.scene.cycles
-    assert deep.max_bounces == deep.transmission_bounces == 1024  # its limit
+    deep = fake_bpy.run(write_export("cycles", tmp_path / "deep", depth=5000), monkeypatch).context.scene.cycles
+    assert deep.max_bounces == deep.transmission_bounces == 1024  # Blender's limit
 
 
 @pytest.mark.parametrize("words, seeds", [((), [1]), (("--seeds", "4", "2", "--threads", "3", "--spp", "9"), [4, 2])])
-def test_luxcore_renders_each_seed_into_a_file_of_its_own(words, seeds, tmp_path, monkeypatch, capsys):
-    folder, sessions, waits = written("luxcore", tmp_path / "new"), [], []
+def test_luxcore_renders_each_seed_into_its_own_file(words, seeds, tmp_path, monkeypatch, capsys):
+    folder, sessions, waits = write_export("luxcore", tmp_path / "new"), [], []
 
     class Properties(dict):
         def __init__(self, name):
@@ -363,14 +365,18 @@ def test_luxcore_renders_each_seed_into_a_file_of_its_own(words, seeds, tmp_path
             self.update([pair])
 
     class Session:
-        """A render that has ended when it was asked three times."""
+        """A render that has finished when HasDone is called the third time."""
 
         def __init__(self, config):
             self.config, self.calls = config, []
             sessions.append(self)
 
         def __getattr__(self, name):
-            return lambda: self.calls.append(name) or (self.calls.count("HasDone") > 2 if name == "HasDone" else self)
+            def call():
+                self.calls.append(name)
+                return self.calls.count("HasDone") > 2 if name == "HasDone" else self
+
+            return call
 
     lux = mock.MagicMock(Properties=Properties, Property=lambda key, value: (key, value), RenderSession=Session)
     lux.RenderConfig = lambda config, scene: config
@@ -382,43 +388,44 @@ def test_luxcore_renders_each_seed_into_a_file_of_its_own(words, seeds, tmp_path
     files = [str(tmp_path / "out" / f"seed{seed}.exr") for seed in seeds]
     assert capsys.readouterr().out.split() == files and 0 < max(waits) < 1
     for session, seed, file in zip(sessions, seeds, files, strict=True):
-        own = {"batch.haltspp": 9 if words else 256, "renderengine.seed": seed, "film.outputs.0.filename": file}
-        assert session.config == {"name": "scene.cfg"} | own | ({"native.threads.count": 3} if words else {})
-        done = ["HasDone", "UpdateStats"] * 2
-        assert session.calls == ["Start", *done, "HasDone", "Stop", "GetFilm", "Save"]
+        expected = {"name": "scene.cfg", "renderengine.seed": seed, "film.outputs.0.filename": file}
+        expected |= {"batch.haltspp": 9, "native.threads.count": 3} if words else {"batch.haltspp": 256}
+        assert session.config == expected
+        waiting = ["HasDone", "UpdateStats"] * 2
+        assert session.calls == ["Start", *waiting, "HasDone", "Stop", "GetFilm", "Save"]
     assert lux.Scene.return_value.Parse.call_args.args == ({"name": "scene.scn"},)
 
 
-def test_raysect_weighs_no_ray_and_takes_a_band_and_a_dispersion(tmp_path, monkeypatch):
-    """Its image has rows from the lowest; its lamps are black from behind."""
-    folder = written("raysect", tmp_path / "new")
+def test_raysect_has_equal_weights_bands_and_dispersion(tmp_path, monkeypatch):
+    """The rows of a PFM image start at the lowest; lamps are black from behind."""
+    folder = write_export("raysect", tmp_path / "new")
     _, script = fake_raysect.run(folder, monkeypatch)
     pixels = np.arange(2 * 3 * 3, dtype=np.float32).reshape(2, 3, 3)
     (tmp_path / "image.pfm").write_bytes(script["pfm"](pixels))
     assert (image_file.read(tmp_path / "image.pfm").pixels == pixels).all()
     assert script["Camera"]((2, 1))._generate_rays(0, 0) == [("ray", 1.0)]
     lamp, ray = script["Light"]("bright"), types.SimpleNamespace(new_spectrum=lambda: "black")
-    seen = [lamp.evaluate_surface("world", ray, "lamp", "place", exiting, "more") for exiting in (False, True)]
-    assert seen == ["bright", "black"]
+    emitted = [lamp.evaluate_surface("world", ray, "lamp", "place", exiting, "more") for exiting in (False, True)]
+    assert emitted == ["bright", "black"]
     scene = json.loads((folder / "scene.json").read_text())
     for band, bins in ((None, 3), ([656.0, 656.5], 1)):
-        made = script["camera"]("world", scene, types.SimpleNamespace(spp=5, band=band), "pipeline")
-        assert (made.spectral_rays, made.spectral_bins, made.pixel_samples) == (1, bins, 5)
-        assert [made.min_wavelength, made.max_wavelength] == (band or [400, 700])
+        camera = script["camera"]("world", scene, types.SimpleNamespace(spp=5, band=band), "pipeline")
+        assert (camera.spectral_rays, camera.spectral_bins, camera.pixel_samples) == (1, bins, 5)
+        assert [camera.min_wavelength, camera.max_wavelength] == (band or [400, 700])
     entry = {"int_ior": 1.5, "ext_ior": 1.25}
     assert script["glass"](entry) == ("glass", 1.5, 1, 1.25)
     assert script["glass"](entry | {"schott": "SF11"})[1] == "of SF11"
 
 
 @pytest.mark.parametrize("size", [1.0, 100.0])
-def test_raysect_gets_a_scene_whose_largest_coordinate_is_a_half(size, tmp_path, monkeypatch):
-    """That of the camera, or of a mesh: both are scaled."""
+def test_raysect_scales_the_largest_coordinate_to_a_half(size, tmp_path, monkeypatch):
+    """The largest coordinate is the camera's or a mesh's: both are scaled."""
     mesh = Mesh("ball", size * BALL[0], BALL[1], GLASS)
     targets.write(PlainScene("scaled", (mesh,), (1.0, 1.0, 1.0), CAMERA, 8), "raysect", tmp_path / "new")
-    made, script = fake_raysect.run(tmp_path / "new", monkeypatch)
+    fake, script = fake_raysect.run(tmp_path / "new", monkeypatch)
     scene = json.loads((tmp_path / "new" / "scene.json").read_text())
     script["build"](scene, tmp_path / "new")
-    place = script["camera"]("world", scene, types.SimpleNamespace(spp=1, band=None), "pipeline").transform[:3, 3]
+    origin = script["camera"]("world", scene, types.SimpleNamespace(spp=1, band=None), "pipeline").transform[:3, 3]
     unit = 0.5 / max(9.0, np.abs(mesh.vertices).max())
-    np.testing.assert_allclose(place, np.multiply(unit, CAMERA.origin), rtol=4 * SINGLE)
-    np.testing.assert_allclose(made.meshes["ball"].triangles, unit * mesh.triangles(), rtol=4 * SINGLE)
+    np.testing.assert_allclose(origin, np.multiply(unit, CAMERA.origin), rtol=4 * SINGLE)
+    np.testing.assert_allclose(fake.meshes["ball"].triangles, unit * mesh.triangles(), rtol=4 * SINGLE)

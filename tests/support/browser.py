@@ -1,4 +1,4 @@
-"""Pages: that they stand alone; and a real browser, where there is one: what a page's own script did to it."""
+"""Checks of HTML pages: that they need no other files, and the effects of their scripts in a real browser."""
 
 import html
 import json
@@ -13,14 +13,14 @@ needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PAT
 
 
 def assert_stands_alone(text):
-    """It fetches nothing, and no id is there twice."""
+    """Check that a page fetches nothing and has unique ids."""
     assert not re.findall(r"https?:|@import|url\((?!#)|\bsrc=|<link|<iframe", text)
     ids = re.findall(r'\bid="([^"]*)"', text)
     assert len(ids) == len(set(ids))
 
 
 def browse(page, profile):
-    """The page's DOM after its scripts ran, and whatever the console said."""
+    """Return the page's DOM after its scripts ran, and the lines of the browser's console."""
     flags = ["--headless", "--no-sandbox", "--no-first-run", "--dump-dom", "--enable-logging=stderr"]
     flags += ["--window-size=1280,900", "--virtual-time-budget=10000", f"--user-data-dir={profile}", page.as_uri()]
     flags += [f"--disable-{x}" for x in ("background-networking", "component-update", "sync", "gpu", "dev-shm-usage")]
@@ -42,9 +42,10 @@ END = """  root.dataset.seen = JSON.stringify(seen);
 
 
 def seen(folder, text, script):
-    """What a script leaves in `seen` that runs after those of the page; none of them failed, and the console is empty.
+    """Run a script after the page's own scripts and return its variable `seen`.
 
-    It has `$(selector)`, `active()`, the element with the focus, and `press(key)`.
+    The script can use `$(selector)`, `active()` (the element with the focus) and `press(key)`. No script may fail, and
+    the console must stay empty.
     """
     page = folder / "report.html"
     page.write_text(text.replace("</body>", f"{BEGIN}{script}{END}"), "utf-8")

@@ -1,4 +1,4 @@
-"""Dask workers of the tests: started once a module, killed, and made to lie."""
+"""Dask workers for tests: checked, killed, added, and started as programs."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from mi_refract.cluster.workers import Workers
 
 
 def accepted(client: Any, variant: str, **options: Any) -> Workers:
-    """The workers of a client that are like this process, after all have answered."""
+    """Return the workers of a client after all have reported their facts; usable are those like this process."""
     workers = Workers(client, variant, facts(variant), **options)
     workers.wait()
     return workers
 
 
 def kill(client: Any, address: str) -> None:
-    """End a worker's process with SIGKILL; its nanny starts another one."""
+    """Kill a worker's process with SIGKILL; its nanny starts another one."""
     pid = client.run(os.getpid, workers=[address])[address]
     os.kill(pid, signal.SIGKILL)
 
 
 @contextlib.contextmanager
 def joined(client: Any) -> Iterator[subprocess.Popen[bytes]]:
-    """One more worker of one thread, without a nanny, for the scheduler of a client of `connected(workers=…)`."""
+    """Add a single-threaded worker without a nanny to the scheduler of a client of `connected(workers=…)`."""
     with program(
         "worker", client.scheduler.address, "--nthreads", "1", "--no-nanny", security=client.security
     ) as process:
@@ -39,17 +39,17 @@ def joined(client: Any) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def tls_settings(security: Any) -> dict[str, str]:
-    """Of Dask's configuration: authority, certificates and keys, as text or files."""
-    found = {"distributed.comm.tls.ca-file": security.tls_ca_file}
+    """Return settings of Dask's configuration: authority, certificates and keys, as text or files."""
+    settings = {"distributed.comm.tls.ca-file": security.tls_ca_file}
     for role in ("client", "scheduler", "worker"):
         for part in ("cert", "key"):
-            found[f"distributed.comm.tls.{role}.{part}"] = getattr(security, f"tls_{role}_{part}")
-    return found
+            settings[f"distributed.comm.tls.{role}.{part}"] = getattr(security, f"tls_{role}_{part}")
+    return settings
 
 
 @contextlib.contextmanager
 def program(*words: str, security: Any) -> Iterator[subprocess.Popen[bytes]]:
-    """`dask WORDS`, which takes its TLS settings from the environment; killed at the end."""
+    """Run `dask WORDS` with TLS settings in its environment; kill it on exit."""
     variables = {
         "DASK_" + name.upper().replace(".", "__").replace("-", "_"): value
         for name, value in tls_settings(security).items()

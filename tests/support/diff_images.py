@@ -1,4 +1,4 @@
-"""Small images in files for the tests of `mi-refract diff`, good and bad."""
+"""Small image files, good and bad, for tests of `mi-refract diff`."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ SIZE = (32, 48, 3)
 
 
 def of(pixels, channels=None, **rest):
-    """An image in memory, of R, G, B, or of Y where there is one channel."""
+    """Return an image in memory with channels R, G, B, or Y for one channel."""
     pixels = np.asarray(pixels, np.float32)
     names = ("Y",) if pixels.shape[-1] == 1 else tuple("RGBA"[: pixels.shape[-1]])
     return Image(Path("a.exr"), pixels, channels or names, **rest)
 
 
-def metric(found, begin):
-    """The value of the metric whose name begins so."""
-    return next(each.value for each in found.metrics if each.name.startswith(begin))
+def metric(comparison, prefix):
+    """Return the value of the first metric whose name begins with a prefix."""
+    return next(metric.value for metric in comparison.metrics if metric.name.startswith(prefix))
 
 
 def image(path, seed=0, *, gain=1.0, noise=0.0, shape=SIZE, value=None, channels=("R", "G", "B")):
-    """An image written to `path`: the same smooth one for every seed, but for `noise` (σ over mean). Its pixels."""
+    """Write a smooth image to `path` and return its pixels. `seed` only changes the noise; `noise`: σ over mean."""
     path.parent.mkdir(parents=True, exist_ok=True)
     x = np.linspace(0.2, 1.0, shape[1])[None, :, None] * np.ones(shape)
     pixels = gain * x * (1 + noise * np.random.default_rng(seed).standard_normal(shape))
@@ -36,15 +36,15 @@ def image(path, seed=0, *, gain=1.0, noise=0.0, shape=SIZE, value=None, channels
     return pixels
 
 
-def samples(folder, count=6, first=0, **how):
-    """Independent renders of that image in a folder."""
+def samples(folder, count=6, first=0, **options):
+    """Write independent renders of that image to a folder; `first` is the first seed. Return the folder."""
     for i in range(count):
-        image(folder / f"{i}.exr", first + i, **{"noise": 0.1, **how})
+        image(folder / f"{i}.exr", first + i, **{"noise": 0.1, **options})
     return folder
 
 
 def cut(path, keep):
-    """Keep so many bytes of a file (negative: all but so many), or that share of them."""
+    """Truncate a file to `keep` bytes; a negative number is removed from the end, a float is a share of the file."""
     data = path.read_bytes()
     path.write_bytes(data[: keep if isinstance(keep, int) else int(keep * len(data))])
 
@@ -66,45 +66,47 @@ BROKEN = {
 
 
 def tree(folder):
-    """Every file with what it holds."""
+    """Return the contents of every file in a folder by its path."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def found(results):
-    """Status and category by name."""
+def outcomes(results):
+    """Return status and category of the results by name."""
     return {result.name: (str(result.status), str(result.category)) for result in results.results}
 
 
-# Files that OpenImageIO does not write --------------------------------------------------------------------------------
+# Files that OpenImageIO cannot write ----------------------------------------------------------------------------------
 
 
 TIFF_TYPES = {1: "B", 2: "B", 3: "H", 4: "I", 5: "I", 7: "B", 12: "d"}
 
 
 def tiff(path, pixels, tags=None):
-    """An uncompressed TIFF of H × W × C pixels of any type; `tags`: more of them, or others, as (type, values)."""
+    """Write an uncompressed TIFF of H × W × C pixels of any type; `tags`: further or changed tags, (type, values)."""
     height, width, count = pixels.shape
     kind, data = {"u": 1, "i": 2, "f": 3}[pixels.dtype.kind], pixels.tobytes()
     entries = {256: (4, [width]), 257: (4, [height]), 258: (3, [8 * pixels.itemsize] * count), 259: (3, [1])}
     entries |= {262: (3, [2 if count > 2 else 1]), 273: (4, [0]), 277: (3, [count]), 278: (4, [height])}
     entries |= {279: (4, [len(data)]), 339: (3, [kind] * count)} | (tags or {})
     values = {tag: struct.pack(f"<{len(x)}{TIFF_TYPES[t]}", *x) for tag, (t, x) in entries.items()}
-    at = 8 + 2 + 12 * len(entries) + 4
-    values[273] = struct.pack("<I", at + sum(len(value) for value in values.values() if len(value) > 4))
-    directory, behind = struct.pack("<H", len(entries)), b""
+    end = 8 + 2 + 12 * len(entries) + 4  # of the directory
+    values[273] = struct.pack("<I", end + sum(len(value) for value in values.values() if len(value) > 4))
+    directory, long_values = struct.pack("<H", len(entries)), b""
     for tag in sorted(entries):
-        long = len(values[tag]) > 4
-        value = struct.pack("<I", at + len(behind)) if long else values[tag].ljust(4, b"\0")
-        behind += values[tag] if long else b""
-        directory += (
-            struct.pack("<HHI", tag, entries[tag][0], len(entries[tag][1]) // (1 + (entries[tag][0] == 5))) + value
-        )
-    path.write_bytes(b"II*\0" + struct.pack("<I", 8) + directory + bytes(4) + behind + data)
+        field, numbers = entries[tag]
+        if len(values[tag]) > 4:
+            value = struct.pack("<I", end + len(long_values))
+            long_values += values[tag]
+        else:
+            value = values[tag].ljust(4, b"\0")
+        count = len(numbers) // 2 if field == 5 else len(numbers)  # a rational has two numbers
+        directory += struct.pack("<HHI", tag, field, count) + value
+    path.write_bytes(b"II*\0" + struct.pack("<I", 8) + directory + bytes(4) + long_values + data)
     return path
 
 
 def exr_of_integers(path, pixels, channels):
-    """An EXR of uint32: one of float32 whose header is changed."""
+    """Write an EXR of uint32, by changing the header of one of float32."""
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "float")
     spec.channelnames = channels
     spec.attribute("compression", "none")

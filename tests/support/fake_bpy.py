@@ -1,4 +1,4 @@
-"""Enough of Blender's Python to run the script of a Cycles export, and to see what it would have rendered."""
+"""A fake of Blender's Python that runs the script of a Cycles export and records what it would render."""
 
 import runpy
 import sys
@@ -9,7 +9,7 @@ import numpy as np
 
 
 class Vector(np.ndarray):
-    """mathutils.Vector, and mathutils.Matrix of rows."""
+    """`mathutils.Vector`, and `mathutils.Matrix` of rows."""
 
     def __new__(cls, values):
         return np.array(values, float).view(cls)
@@ -21,7 +21,7 @@ class Vector(np.ndarray):
         return Vector(np.cross(self, other))
 
     def to_track_quat(self, track, up):
-        """A rotation that takes −z to this direction."""
+        """Return a rotation from −z to this direction."""
         assert (track, up) == ("-Z", "Y")
         back = -self.normalized()
         right = Vector(np.cross(np.eye(3)[np.argmin(np.abs(back))], back)).normalized()
@@ -41,7 +41,7 @@ class Vector(np.ndarray):
 
 
 class Sockets(dict):
-    """Inputs or outputs of a node, by name or number; each is made when it is asked for."""
+    """Inputs or outputs of a node by name or number, created on first access."""
 
     def __init__(self, node):
         super().__init__()
@@ -67,18 +67,18 @@ class Tree:
         return node
 
     def source(self, node, key):
-        """The node, and its output, that feeds an input."""
-        found = self.sources[id(node), key]
-        return found.node, found.key
+        """Return the node and the output that are linked to an input."""
+        socket = self.sources[id(node), key]
+        return socket.node, socket.key
 
     def only(self, kind):
-        """The only node of a kind."""
+        """Return the only node of a kind."""
         (node,) = (node for node in self.made if node.kind == kind)
         return node
 
 
-def named(**attributes):
-    """A collection of Blender's: `new(name, …)` makes and keeps an item."""
+def collection(**attributes):
+    """Return a collection as Blender has: `new(name, …)` creates an item and stores it in `made`."""
     made = {}
 
     def new(name, *arguments):
@@ -89,21 +89,21 @@ def named(**attributes):
 
 
 def installed(monkeypatch):
-    """Blender's `bpy`, for scripts to import; `rendered`: seeds and files."""
+    """Install a fake `bpy` for scripts to import, and return it; `bpy.rendered`: seeds and files."""
     bpy = mock.MagicMock(rendered=[])
     scene = bpy.context.scene
     bpy.ops.render.render = lambda write_still: bpy.rendered.append((scene.cycles.seed, scene.render.filepath))
-    bpy.data.materials, bpy.data.worlds = named(node_tree=Tree), named(node_tree=Tree)
-    bpy.data.meshes, bpy.data.cameras = named(materials=list, from_pydata=mock.Mock), named()
-    bpy.data.lights = named(kind=lambda kind: kind)
-    bpy.data.objects = named(data=lambda data: data)
+    bpy.data.materials, bpy.data.worlds = collection(node_tree=Tree), collection(node_tree=Tree)
+    bpy.data.meshes, bpy.data.cameras = collection(materials=list, from_pydata=mock.Mock), collection()
+    bpy.data.lights = collection(kind=lambda kind: kind)
+    bpy.data.objects = collection(data=lambda data: data)
     monkeypatch.setitem(sys.modules, "bpy", bpy)
     monkeypatch.setitem(sys.modules, "mathutils", SimpleNamespace(Vector=Vector, Matrix=Vector))
     return bpy
 
 
 def run(folder, monkeypatch, *words):
-    """Run the script of an export with these options; `bpy` as the script leaves it."""
+    """Run the script of an export with these options and return `bpy`."""
     bpy = installed(monkeypatch)
     monkeypatch.setattr(sys, "argv", ["render.py", "--spp", "3", "--out", str(folder), *words])
     runpy.run_path(str(folder / "render.py"))["main"]()

@@ -1,4 +1,4 @@
-"""Small scenes of glass, their renders, samples of a boundary, and what tests say of these."""
+"""Small scenes of glass, their renders, samples of a boundary, and comparisons of them."""
 
 from types import SimpleNamespace
 
@@ -16,12 +16,12 @@ PLACE = mi.ScalarTransform4f
 
 
 def sky():
-    """Smooth light that is different in every direction."""
+    """Return a smooth environment that differs in every direction."""
     return {"type": "envmap", "bitmap": mi.Bitmap(SKY)}
 
 
 def camera(size=24, fov=30, origin=(0, 0, 5), target=(0, 0, 0), kind="perspective", **film):
-    """Independent pixels."""
+    """Return a camera with a box filter, so that pixels are independent."""
     film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}} | film
     place = PLACE().look_at([*origin], [*target], [0, 1, 0])
     lens = {"fov": fov} if kind == "perspective" else {}
@@ -29,26 +29,26 @@ def camera(size=24, fov=30, origin=(0, 0, 5), target=(0, 0, 0), kind="perspectiv
 
 
 def glass_ball(size=24, **parts):
-    """A glass ball at the origin, seen from 5 radii away, and other parts."""
+    """Load a glass ball at the origin, seen from 5 radii away, with other `parts`."""
     ball = {"type": "sphere", "bsdf": GLASS}
     return mi.load_dict({"type": "scene", "sensor": camera(size), "ball": ball} | parts)
 
 
 def render(scene, spp=16, seed=0, **parameters):
-    """By `refract_path` with these parameters, or by another `type`."""
-    method = mi.load_dict({"type": "refract_path", "max_depth": 16} | parameters)
-    return np.array(mi.render(scene, integrator=method, spp=spp, seed=seed), dtype=float)
+    """Render with `refract_path` and these parameters, or with another `type` of integrator."""
+    integrator = mi.load_dict({"type": "refract_path", "max_depth": 16} | parameters)
+    return np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed), dtype=float)
 
 
 def equal_means(theirs, ours, alpha=1e-4):
-    """Whether means of independent renders are within chance; `alpha` is the rate of false alarms."""
+    """Test whether independent renders have equal means; `alpha` is the rate of false alarms."""
     theirs, ours = (np.array(x).reshape(len(x), -1).mean(axis=1) for x in (theirs, ours))
     deviation = np.sqrt(theirs.var(ddof=1) / len(theirs) + ours.var(ddof=1) / len(ours))
     return abs(theirs.mean() - ours.mean()) <= t.ppf(1 - alpha / 2, len(ours) - 1) * deviation + 1e-6 * theirs.mean()
 
 
 def refusal(call, *arguments, **parameters):
-    """The text of the error that a call raises; Dr.Jit and Mitsuba wrap those of plugins."""
+    """Return the text of the error that a call raises, unwrapped from the errors of Dr.Jit and Mitsuba."""
     with pytest.raises((ValueError, RuntimeError)) as caught:
         call(*arguments, **parameters)
     error = caught.value
@@ -58,13 +58,13 @@ def refusal(call, *arguments, **parameters):
 
 
 def parameter(params, name):
-    """The key that has this in it."""
+    """Return the only key that contains a name."""
     (key,) = [key for key in [*params.keys()] if name in key]
     return key
 
 
 def attached(node, *names):
-    """The parameters of a scene or a plugin, and the keys of those with these names, which are differentiated."""
+    """Enable gradients of the parameters with these names; return all parameters of a scene or plugin, and the keys."""
     params = mi.traverse(node)
     keys = [parameter(params, name) for name in names]
     for key in keys:
@@ -77,12 +77,12 @@ def attached(node, *names):
 
 
 def vector(x):
-    """The numbers of a Dr.Jit array or of a number."""
+    """Return a number or a Dr.Jit array as a flat numpy array."""
     return np.array(x, dtype=float).ravel()
 
 
 def surface(wi=(0, 0, 1), wavelengths=(450.0, 700.0, 550.0, 600.0), u=0.5):
-    """A point of a surface; no literals, so that one kernel serves every direction."""
+    """Return a surface interaction. `wi` is opaque to Dr.Jit, so that one kernel serves every direction."""
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi, si.uv = mi.Vector3f(*map(float, wi)), mi.Point2f(u, 0.5)
     dr.make_opaque(si.wi)
@@ -91,10 +91,13 @@ def surface(wi=(0, 0, 1), wavelengths=(450.0, 700.0, 550.0, 600.0), u=0.5):
     return si
 
 
-def sampled(bsdf, wi, sample1, context=None, sample2=(0.5, 0.5), **where):
-    """A sample, its numbers as numpy has them; `weight` without polarisation, `mueller` with it. Else as `surface`."""
+def sampled(bsdf, wi, sample1, context=None, sample2=(0.5, 0.5), **options):
+    """Sample a BSDF and return the sample in numpy: `weight` without polarisation, `mueller` with it.
+
+    `options`: those of `surface`.
+    """
     number = dr.opaque(mi.Float, sample1)
-    bs, weight = bsdf.sample(context or mi.BSDFContext(), surface(wi, **where), number, [*sample2])
-    found = {"wo": vector(bs.wo), "weight": vector(mi.unpolarized_spectrum(weight)), "mueller": np.array(weight)}
+    bs, weight = bsdf.sample(context or mi.BSDFContext(), surface(wi, **options), number, [*sample2])
+    arrays = {"wo": vector(bs.wo), "weight": vector(mi.unpolarized_spectrum(weight)), "mueller": np.array(weight)}
     scalars = {"pdf": bs.pdf, "eta": bs.eta, "component": bs.sampled_component, "type": bs.sampled_type}
-    return SimpleNamespace(**found, **{name: vector(x)[0] for name, x in scalars.items()})
+    return SimpleNamespace(**arrays, **{name: vector(x)[0] for name, x in scalars.items()})

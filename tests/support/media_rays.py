@@ -1,4 +1,4 @@
-"""Media that need no catalogue, and answers of a program to rays that pass between them and air."""
+"""Media without a catalogue, and a program's answers to rays between these media and air."""
 
 import numpy as np
 from support.ray_programs import glsl
@@ -11,9 +11,9 @@ ALL = {"media": MEDIA, "wavelengths": WAVELENGTHS}
 
 
 def answered(to, ratio=None, direction=None, said=True):
-    """Answers of a program that uses `ratio` (N,), by default that of the rays, and says so.
+    """Return answers of a program that uses the index ratio `ratio` (N,), by default the rays' own.
 
-    `direction`: the ratio that its directions are for, if another.
+    `direction`: the ratio that it uses for directions, if it differs. `said`: whether the answers contain `ratio`.
     """
     k = to.rays.k if ratio is None else ratio
     b = glsl(to.rays.a, to.rays.n, (k if direction is None else direction).astype(to.rays.k.dtype))

@@ -1,4 +1,4 @@
-"""Planar scenes made by hand, for tests: a slab, a ball of exact arcs, a box."""
+"""Planar scenes for tests: polygons, a slab, a ball of exact arcs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SLAB = np.array([(0, -50), (1, -50), (1, 50), (0, 50)], float)
 
 
 def polygon(points, n=1.5, outside=1.0):
-    """Counter-clockwise: the inside is on the left."""
+    """Return the segments of a counter-clockwise polygon: the inside is on the left."""
     start = np.array(points, float)
     return Segments(start, np.roll(start, -1, axis=0), np.full(len(start), n), np.full(len(start), outside))
 
@@ -35,19 +35,19 @@ def star(count, seed=1, n=1.7):
 
 
 def story(paths, i=0):
-    """Of a path: the segments it meets, and its events."""
+    """Return the segments that path i hits, and its events."""
     hits, events = paths.hits[i], paths.events[i]
     return hits[hits >= 0].tolist(), [Event(e) for e in events if e != Event.NONE]
 
 
 def ball(n=1.5):
-    """The unit circle, of four arcs."""
+    """Return the unit circle, made of four arcs."""
     start, control = CORNERS[::2], CORNERS[1::2]
     return Segments(start, np.roll(start, -1, axis=0), np.full(4, n), np.ones(4), control, np.full(4, math.sqrt(0.5)))
 
 
-def scene(segments, origins, directions, **given):
-    """Rays through `segments`, a tuple of them for several colours, around which there is vacuum."""
+def scene(segments, origins, directions, **overrides):
+    """Return a scene of rays and `segments` in vacuum; a tuple of segments has one entry per colour."""
     segments = segments if isinstance(segments, tuple) else (segments,)
     origins = np.array(origins, float)
     directions = np.broadcast_to(np.array(directions, float), origins.shape)
@@ -57,7 +57,7 @@ def scene(segments, origins, directions, **given):
         "path": Path("test.toml"),
         "title": "A test",
         "shape_names": ("shape[0]",) * len(segments[0]),
-        "light": Light(given.pop("colours", ("",) * len(segments))),
+        "light": Light(overrides.pop("colours", ("",) * len(segments))),
         "regions": (Region(outline, tuple(s.n_left[0] for s in segments)),),
         "index": (1.0,) * len(segments),
         "beams": np.zeros(len(origins), int),
@@ -65,9 +65,9 @@ def scene(segments, origins, directions, **given):
         "branches": 0,
         "view": None,
     }
-    return PlanarScene(segments=segments, origins=origins, directions=directions, **default | given)
+    return PlanarScene(segments=segments, origins=origins, directions=directions, **default | overrides)
 
 
 def beam(count, half, x=-3.0, y=0.0):
-    """Origins of parallel rays."""
+    """Return the origins of parallel rays."""
     return np.column_stack([np.full(count, x), y + np.linspace(-half, half, count)])

@@ -1,4 +1,4 @@
-"""Python code in a process of its own that imports the package from this checkout; what a command that fails prints."""
+"""Python subprocesses that import the package from this checkout, and checks of a command's output."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(N
 
 
 def python(code: str, *arguments: object, **environment: str) -> subprocess.Popen[str]:
-    """Start `python -c code arguments`, with variables of the environment added; its output is text in pipes."""
+    """Start `python -c code arguments` with additional environment variables; its output is text in pipes."""
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, arguments)],
         env=ENVIRONMENT | environment,
@@ -26,14 +26,14 @@ def python(code: str, *arguments: object, **environment: str) -> subprocess.Pope
 
 
 def assert_refused(outcome: tuple[int, str, str], *messages: object) -> None:
-    """Of the fixture `run`: exit code 2, and nothing printed but one line on stderr that holds the messages."""
+    """Check an outcome of the fixture `run`: exit code 2, and only one line on stderr, which contains the messages."""
     code, out, err = outcome
     assert (code, out, err.count("\n")) == (2, "", 1) and err.startswith("mi-refract: ")
     assert all(str(message) in err for message in messages), err
 
 
 def until(reached: Callable[[], Any], seconds: float = 60.0) -> None:
-    """Wait until something is so; a failure after `seconds`."""
+    """Wait until `reached()` is true; fail after `seconds`."""
     deadline = time.monotonic() + seconds
     while not reached():
         assert time.monotonic() < deadline

@@ -1,4 +1,4 @@
-"""Refraction by the textbook in numpy, and the same with one mistake each: `f(a, n, k) -> b`."""
+"""Textbook refraction in numpy, and versions with one mistake each: `f(a, n, k) -> b`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def unit(v):
 
 
 def glsl(a, n, k):
-    """GLSL's: one-sided, and the zero vector under total internal reflection."""
+    """Return GLSL's `refract`: one-sided, with the zero vector for total internal reflection."""
     k, c = k[:, None], dot(n, a)
     radicand = 1 - k * k * (1 - c * c)
     return np.where(radicand < 0, 0, k * a - (k * c + np.sqrt(np.maximum(radicand, 0))) * n).astype(a.dtype)
@@ -41,7 +41,7 @@ def with_mirror(a, n, k):
 
 
 def with_tangent(a, n, k):
-    """k times the tangent, as Mitsuba's `refract` has it."""
+    """Return k times the tangent for total internal reflection, as Mitsuba's `refract` does."""
     b = glsl(a, n, k)
     return np.where(b.any(1, keepdims=True), b, k[:, None] * (a - dot(n, a) * n))
 
@@ -51,7 +51,7 @@ def with_normals_made_unit(a, n, k):
 
 
 def by_angle(change):
-    """Code that computes with angles; `change` is the mistake in it."""
+    """Return refraction computed with angles; `change` contains the mistake."""
 
     def refract(a, n, k):
         c = np.clip(-dot(n, a), -1, 1)
@@ -79,13 +79,13 @@ def mirror_x(v):
 GOOD = {"zero": glsl, "nan": with_nan, "reflected": with_mirror, "tangent": with_tangent}
 
 
-# By the name of the mistake.
 def not_squared(a, n, k):
     k, c = k[:, None], dot(n, a)
     radicand = 1 - k * (1 - c * c)
     return np.where(radicand < 0, 0, k * a - (k * c + np.sqrt(np.abs(radicand))) * n)
 
 
+# Programs by the name of their mistake.
 BAD = {
     "eta inverted": [
         lambda a, n, k: glsl(a, n, 1 / k),
@@ -120,7 +120,7 @@ BAD = {
 
 
 def _with_root(radicand, tangent):
-    """b = k t − √R n of a radicand and a tangent t, both functions of (a, n, k, n·a, n × a)."""
+    """Return b = k t − √R n for a radicand R and a tangent t, both functions of (a, n, k, n·a, n × a)."""
 
     def refract(a, n, k):
         terms = a, n, k[:, None], dot(n, a), np.cross(n, a)

@@ -26,10 +26,10 @@ BALL, SMALL = SCENES / "sphere.xml", {"res": "8"}
 
 
 def rendering(output, seed=0, scene=BALL, defines=SMALL, restart=False, **limits):
-    """A render of 8 × 8 pixels."""
+    """Return a new or resumed render of 8 × 8 pixels."""
     return resume(Job(scene, defines, seed), output, Limits(**limits), restart=restart)
 
 
 def pixels(path):
-    """Of an EXR file."""
+    """Return the pixels of an EXR file."""
     return read_exr(path)[0]

@@ -1,4 +1,4 @@
-"""Caustics: the quadrature of their energy, scenes that have some, and defects that the study must detect."""
+"""Caustics: the quadrature of their energy, their scenes, and defects that the study must detect."""
 
 import dataclasses
 import math
@@ -34,8 +34,8 @@ def context(tmp_path, llvm_variant, monkeypatch):
 
 
 @pytest.mark.parametrize("key", ON_AXIS, ids=str)
-def test_parts_of_a_ray_are_those_of_the_planar_tracer(key):
-    """Where light that has met 1 to 5 boundaries meets the floor, and its share of both waves."""
+def test_the_quadrature_follows_rays_as_the_planar_tracer_does(key):
+    """Where light meets the floor after 1 to 5 boundaries, and the shares of both polarisations."""
     setup, _ = ON_AXIS[key]
     curves = {
         "ball": planar.shapes.circle(1.0).mapped(np.eye(2), (0, caustic_energy.BALL_HEIGHT)),
@@ -66,7 +66,7 @@ def test_parts_of_a_ray_are_those_of_the_planar_tracer(key):
     assert checked >= 30
 
 
-def test_no_light_is_lost_and_the_power_on_a_disk_is_known_so_well():
+def test_the_quadrature_conserves_energy_and_its_error_bound_holds():
     for setup, radius in ON_AXIS.values():
         at = setup.widest * np.array([0.1, 0.5, 0.8])
         np.testing.assert_allclose(sum(part.shares for part in caustic_energy.parts(setup, at, 60)), 1, rtol=1e-12)
@@ -78,14 +78,14 @@ def test_no_light_is_lost_and_the_power_on_a_disk_is_known_so_well():
 
 
 @pytest.mark.parametrize("body", [*caustic_scenes.BODIES][2:])
-def test_bodies_have_a_caustic_and_show_glass(body, llvm_variant):
+def test_scenes_show_a_caustic_and_glass(body, llvm_variant):
     truth = caustics.reference(body, POINT, dataclasses.replace(SMALL, renders=2))
     assert truth.caustic.sum() >= 8 and (truth.caustic <= truth.without_glass).all()
     assert (~truth.without_glass).any() or body == "pool"  # below its surface
 
 
 def test_lamps_have_the_same_irradiance_below_the_body(scalar_variant):
-    """Of a surface that faces them; a square whose side is 0.7 of its distance has less, as its corners are farther."""
+    """On a surface that faces them. A square lamp of side 0.7 has less, since its corners are farther away."""
     points, place = (np.arange(8) + 0.5) / 8, dr.zeros(mi.SurfaceInteraction3f)
     for lamp in caustic_scenes.LAMPS:
         scene = mi.load_dict({"type": "scene", "lamp": caustic_scenes.lamp_of(lamp)})
@@ -94,7 +94,7 @@ def test_lamps_have_the_same_irradiance_below_the_body(scalar_variant):
         assert irradiance == pytest.approx(1, rel=0.25 if lamp == "square 0.7" else 0.02)
 
 
-def test_above_a_black_floor_noise_is_of_the_lamp_that_is_seen_in_glass(context, monkeypatch):
+def test_above_a_black_floor_the_noise_comes_from_the_lamp_seen_in_glass(context, monkeypatch):
     monkeypatch.setattr(caustic_scenes, "FLOOR", caustics.NEARLY_BLACK)
     monkeypatch.setattr(caustics, "NOISE_RENDERS", 1)
     monkeypatch.setitem(caustics.EXTENTS, "standard", dataclasses.replace(SMALL, spp=256))
@@ -111,7 +111,7 @@ LAMPS = {
 
 
 @pytest.mark.parametrize(("body", "factor"), [("ball", 1), ("lens", 1.1)])
-def test_the_power_below_facets_is_right_where_we_are_the_other_renderer(context, monkeypatch, body, factor):
+def test_the_study_of_other_renderers_measures_the_power_of_our_own(context, monkeypatch, body, factor):
     def draw(plain, lamp, folder):
         targets.write(plain, "mitsuba", folder / "scene")
         path = folder / "scene" / "scene.xml"
@@ -130,7 +130,7 @@ def test_the_power_below_facets_is_right_where_we_are_the_other_renderer(context
 
 
 @pytest.mark.parametrize(("index", "verdict"), [(1.5, "pass"), (1.56, "fail")])
-def test_the_energy_of_another_index_is_wrong(context, monkeypatch, index, verdict):
+def test_the_energy_with_another_index_fails(context, monkeypatch, index, verdict):
     glass = caustic_scenes.glass
     monkeypatch.setattr(caustic_scenes, "glass", lambda bsdf: glass(bsdf, index))
     monkeypatch.setitem(caustics.EXTENTS, "standard", dataclasses.replace(SMALL, energy_spp=128))
@@ -140,8 +140,8 @@ def test_the_energy_of_another_index_is_wrong(context, monkeypatch, index, verdi
     assert unaimed.verdict == "not run" and "does not aim" in unaimed.reason
 
 
-def test_light_that_is_missing_is_an_alarm_and_noise_no_pass(context, monkeypatch):
-    """Of a point lamp `path` finds no caustic; the sum of classes has other seeds than the reference."""
+def test_missing_light_raises_an_alarm_and_noise_does_not_pass(context, monkeypatch):
+    """`path` finds no caustic of a point lamp; the sum of classes has other seeds than the reference."""
     monkeypatch.setattr(caustics, "HOLDING", (BUILTIN, BY_CLASS, FROM_LAMPS))
     path, by_class, ours = caustics.image_rows(context, "lens", POINT, (BUILTIN, BY_CLASS, FROM_LAMPS))
     assert path.broken[WELCH_ALARMS] == 0 and path.values["light missing"] > 0.5

@@ -1,4 +1,4 @@
-"""CI fails where little ran: too few passed cases, no libLLVM, an install that failed."""
+"""CI fails if too few cases passed, without libLLVM, and after a failed installation."""
 
 import os
 import re
@@ -18,7 +18,7 @@ REPORT = """<testsuites><testsuite><testcase name="a"/><testcase name="b"><prope
 </testsuite></testsuites>"""
 
 
-def test_only_cases_that_passed_count_and_what_cannot_be_counted_is_not_enough(tmp_path, capsys):
+def test_only_passed_cases_count_and_unreadable_reports_fail(tmp_path, capsys):
     report = tmp_path / "report.xml"
     for text, least, code in (
         *((REPORT, least, code) for least, code in (("1", 0), ("2", 0), ("3", 1), ("many", 2))),
@@ -30,8 +30,7 @@ def test_only_cases_that_passed_count_and_what_cannot_be_counted_is_not_enough(t
     assert "expected FILE.xml CASES" in capsys.readouterr().err
 
 
-def test_no_step_of_ci_goes_on_after_a_failure():
-    """And each run of tests or budgets is counted."""
+def test_ci_stops_at_the_first_failure_and_counts_every_run():
     text = (ROOT / ".ci" / "run").read_text()
     assert "set -eu" in text
     steps = [line for line in text.splitlines() if not line.startswith(("#", "[", "  #"))]
@@ -41,14 +40,17 @@ def test_no_step_of_ci_goes_on_after_a_failure():
     assert "bash .ci/run" in (ROOT / ".github" / "workflows" / "ci.yml").read_text()
 
 
-def test_the_address_of_the_repository_and_the_names_of_templates_are_one():
+def test_the_address_of_the_repository_is_the_same_everywhere():
     urls = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]
     files = [ROOT / "CITATION.cff", *(x for x in (ROOT / ".github").glob("**/*.*") if x.suffix in (".md", ".yml"))]
-    found = {url for path in files for url in re.findall(r"https://github\.com/mi[-_]refract/[\w-]+", path.read_text())}
-    assert found == {urls["Source"]}
+    pattern = r"https://github\.com/mi[-_]refract/[\w-]+"
+    assert {url for path in files for url in re.findall(pattern, path.read_text())} == {urls["Source"]}
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert (citation["repository-code"], citation["url"]) == (urls["Source"], urls["Documentation"])
-    assert "version" not in citation  # it stands in one place
+    assert "version" not in citation  # it is in the package only
+
+
+def test_issue_templates_have_names_descriptions_and_labels():
     for path in (ROOT / ".github" / "ISSUE_TEMPLATE").glob("[!c]*.yml"):
         template = yaml.safe_load(path.read_text())
         assert {"name", "description", "body"} <= {*template} and all(
@@ -58,8 +60,8 @@ def test_the_address_of_the_repository_and_the_names_of_templates_are_one():
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
 @pytest.mark.parametrize("apt", ["fails", "absent"])
-def test_setup_fails_where_llvm_is_needed_and_there_is_none(apt, tmp_path):
-    """In a copy, so that no .venv is touched; before it looks for Python."""
+def test_setup_fails_if_llvm_is_required_but_missing(apt, tmp_path):
+    """Runs a copy of the script, so that no .venv is changed."""
     (tmp_path / ".ci").mkdir()
     shutil.copy(ROOT / ".ci" / "setup", tmp_path / ".ci" / "setup")
     stubs = {"ldconfig": "exit 0", "sudo": "exit 1", "timeout": 'shift; "$@"', "env": 'shift; "$@"'}
@@ -67,11 +69,10 @@ def test_setup_fails_where_llvm_is_needed_and_there_is_none(apt, tmp_path):
     for name, body in stubs.items():
         (tmp_path / name).write_text(f"#!/bin/bash\n{body}\n")
         (tmp_path / name).chmod(0o755)
-    given = {name: value for name, value in os.environ.items() if name != "DRJIT_LIBLLVM_PATH"}
-    given |= {"PATH": f"{tmp_path}:{os.environ['PATH']}", "MI_REFRACT_NEEDS_LLVM": "1"}
-    done = subprocess.run(
-        ["bash", str(tmp_path / ".ci" / "setup"), "test"], env=given, capture_output=True, text=True, timeout=30
-    )
+    environment = {name: value for name, value in os.environ.items() if name != "DRJIT_LIBLLVM_PATH"}
+    environment |= {"PATH": f"{tmp_path}:{os.environ['PATH']}", "MI_REFRACT_NEEDS_LLVM": "1"}
+    command = ["bash", str(tmp_path / ".ci" / "setup"), "test"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=30)
     assert done.returncode == 1
     assert "apt-get install libllvm19" in done.stderr.splitlines()[-1]
     assert not (tmp_path / ".venv").exists()

@@ -1,4 +1,4 @@
-"""The command of the validation: it resumes, refuses misuse in one line, and writes the tables of the documentation."""
+"""The command of the validation: resuming, misuse, and the tables of the documentation."""
 
 import dataclasses
 import functools
@@ -23,7 +23,7 @@ from validation import runner, tables
 from validation.diff import planted_defects, visible_changes
 from validation.efficiency import caustic_scenes
 from validation.reference.standard_numbers import NUMBERS
-from validation.renders import gradients
+from validation.renders import gradients, thin_panes
 from validation.run import render_methods
 from validation.run.context import SCENES, beyond_builtin, here
 from validation.stability import layered_paths
@@ -34,7 +34,7 @@ from validation.suite.renderers import SYSTEMS
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
 MODULES = ("stability.optical_chains", "stability.layered_paths")
-THERE = runner.OnCluster(MODULES, "quick", "scalar_rgb")
+WORKERS = runner.OnCluster(MODULES, "quick", "scalar_rgb")
 FILES = {"rows.json", "junit.xml", "report.html"}
 
 
@@ -44,28 +44,28 @@ def context(tmp_path, scalar_variant):
 
 
 def row(**changes):
-    made = Row("directions", "promoted", "all regimes", "scalar float64", {"worst / u": 0.5}, replay={"rays": 3})
-    return dataclasses.replace(made, **changes)
+    default = Row("directions", "promoted", "all regimes", "scalar float64", {"worst / u": 0.5}, replay={"rays": 3})
+    return dataclasses.replace(default, **changes)
 
 
 # Running and resuming ------------------------------------------------------------------------------------------------
 
 
-class Recorded:
-    """Workers of a test: they run the tasks here, from the last to the first."""
+class FakeWorkers:
+    """Workers that run the tasks in this process, from the last to the first."""
 
     def __init__(self, tasks, order):
         self.tasks, self.order = tasks, order
 
     def run(self, work, context):
         for number, name in reversed(work):
-            self.order.append(f"there: {name}")
+            self.order.append(f"worker: {name}")
             yield number, runner.timed(self.tasks[number])
 
 
-@pytest.mark.parametrize("elsewhere", [False, True])
-def test_an_interrupted_run_goes_on_where_it_stopped_and_what_is_timed_runs_here_in_the_end(context, elsewhere):
-    calls, fails = [], ["a" if elsewhere else "b"]
+@pytest.mark.parametrize("on_workers", [False, True])
+def test_an_interrupted_run_resumes(context, on_workers):
+    calls, fails = [], ["a" if on_workers else "b"]
 
     def work(name):
         calls.append(name)
@@ -74,14 +74,14 @@ def test_an_interrupted_run_goes_on_where_it_stopped_and_what_is_timed_runs_here
         return [row(subject=f"{name}{i}") for i in range(2)]
 
     tasks = [Task(name, functools.partial(work, name)) for name in "ab"]
-    workers = Recorded(tasks, []) if elsewhere else None
+    workers = FakeWorkers(tasks, []) if on_workers else None
     with pytest.raises(KeyboardInterrupt):
         runner.run(tasks, context, workers)
     fails.clear()
     rows, spent = runner.run(tasks, context, workers)
-    assert [row.subject for row in rows] == ["a0", "a1", "b0", "b1"]  # in the order of the tasks, kept or not
+    assert [row.subject for row in rows] == ["a0", "a1", "b0", "b1"]  # in the order of the tasks
     assert [(task["task"], task["CPU seconds"] >= 0) for task in spent] == [("a", True), ("b", True)]
-    assert calls == (["b", "a", "a"] if elsewhere else ["a", "b", "b"])
+    assert calls == (["b", "a", "a"] if on_workers else ["a", "b", "b"])
     runner.run(tasks, dataclasses.replace(context, profile=dataclasses.replace(context.profile, rays=17)))
     assert len(calls) == 5
     runner.run(tasks, context)
@@ -89,14 +89,17 @@ def test_an_interrupted_run_goes_on_where_it_stopped_and_what_is_timed_runs_here
     runner.forget(context)
     runner.run(tasks, context)
     assert len(calls) == 7
+
+
+def test_timed_tasks_run_last_and_not_on_workers(context):
     order = []
     tasks = [Task(n, lambda n=n: order.append(n) or [row(subject=n)], timed=n == "y") for n in "xyz"]
-    rows, _ = runner.run(tasks, context, Recorded(tasks, order))
+    rows, _ = runner.run(tasks, context, FakeWorkers(tasks, order))
     assert [row.subject for row in rows] == ["x", "y", "z"]
-    assert order == ["there: z", "z", "there: x", "x", "y"]
+    assert order == ["worker: z", "z", "worker: x", "x", "y"]
 
 
-def test_rows_are_used_again_for_the_same_sources_only(context, tmp_path, monkeypatch):
+def test_saved_rows_are_used_for_the_same_sources_only(context, tmp_path, monkeypatch):
     names = ("package/room/a.py", "validation/room/b.py", "validation/room/c.json", "scenes/planar/d.toml")
     for name in names:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -113,23 +116,23 @@ def test_rows_are_used_again_for_the_same_sources_only(context, tmp_path, monkey
         assert len(calls) == count, name
 
 
-def test_the_rows_of_workers_are_those_of_a_run_here(context, tmp_path):
+def test_workers_return_the_same_rows_as_this_process(context, tmp_path):
     work = runner.tasks([importlib.import_module(f"validation.{name}").STUDY for name in MODULES], context)
-    alone, _ = runner.run(work, dataclasses.replace(context, out=tmp_path / "alone"))
+    local, _ = runner.run(work, dataclasses.replace(context, out=tmp_path / "local"))
     with connected(workers=1) as client, dask.config.set(tls_settings(client.security)):
-        there = dataclasses.replace(THERE, target=ClusterTarget(client.scheduler.address))
-        rows, spent = runner.run(work, context, there)
-    assert rows == alone and len(rows) > 10
+        workers = dataclasses.replace(WORKERS, target=ClusterTarget(client.scheduler.address))
+        rows, spent = runner.run(work, context, workers)
+    assert rows == local and len(rows) > 10
     assert [task["task"] for task in spent] == [task.name for task in work]
     assert all(task["machine"] == os.uname().nodename for task in spent)
-    unreachable = dataclasses.replace(THERE, target=ClusterTarget("tcp://127.0.0.1:9"))
-    kept, _ = runner.run(work, context, unreachable)
-    facts = runner.facts("scalar_rgb")  # what a worker must have the same
+    unreachable = dataclasses.replace(WORKERS, target=ClusterTarget("tcp://127.0.0.1:9"))
+    saved, _ = runner.run(work, context, unreachable)
+    facts = runner.facts("scalar_rgb")  # these must be equal on a worker
     assert facts["validation"] == runner.sources()[:8] and set(runner.PACKAGES) < facts.keys()
-    assert [json.dumps(row.as_dict()) for row in kept] == [json.dumps(row.as_dict()) for row in alone]
+    assert [json.dumps(row.as_dict()) for row in saved] == [json.dumps(row.as_dict()) for row in local]
 
 
-def test_a_worker_sends_files_and_errors_as_they_are(monkeypatch, scalar_variant):
+def test_a_worker_returns_files_and_raises_errors(monkeypatch, scalar_variant):
     def writes(context):
         (context.out / "images").mkdir()
         (context.out / "images/a.exr").write_bytes(b"pixels")
@@ -142,11 +145,11 @@ def test_a_worker_sends_files_and_errors_as_they_are(monkeypatch, scalar_variant
     monkeypatch.setattr(runner, "import_module", lambda name: types.SimpleNamespace(STUDY=study))
     monkeypatch.setattr(runner.on_worker, "scratch_folder", lambda: None)
     monkeypatch.setattr(runner.on_worker, "in_variant", lambda variant, call: call())
-    there = dataclasses.replace(THERE, modules=("one",))
-    (rows, _), files = there.on_worker("writes")
+    workers = dataclasses.replace(WORKERS, modules=("one",))
+    (rows, _), files = workers.on_worker("writes")
     assert files == {"images/a.exr": b"pixels"} and rows[0].images == {"test": "images/a.exr"}
     with pytest.raises(ValueError, match="a scene is wrong; expected others"):
-        there.on_worker("fails")
+        workers.on_worker("fails")
 
 
 # The command ---------------------------------------------------------------------------------------------------------
@@ -154,7 +157,7 @@ def test_a_worker_sends_files_and_errors_as_they_are(monkeypatch, scalar_variant
 
 @pytest.fixture
 def validate(tmp_path, monkeypatch):
-    """`validate(work)`: the exit code of a validation whose only task does this work."""
+    """`validate(work)`: the exit code of a validation whose only task runs `work`."""
 
     def run(work):
         study = Study("directions", "A study", "What it asks.", {}, lambda context: [Task("a task", work)])
@@ -175,7 +178,7 @@ def test_the_exit_code_follows_the_budgets(validate, tmp_path, budget, code):
     assert context["replay"] == "python -m validation robustness --profile quick"
 
 
-def test_an_interruption_says_how_to_go_on_and_two_validations_do_not_share_a_folder(validate, tmp_path, capsys):
+def test_an_interruption_prints_how_to_resume_and_two_validations_do_not_share_a_folder(validate, tmp_path, capsys):
     def interrupted():
         raise KeyboardInterrupt
 
@@ -185,8 +188,8 @@ def test_an_interruption_says_how_to_go_on_and_two_validations_do_not_share_a_fo
     second = ["robustness", "--out", str(tmp_path)]
     assert validate(lambda: codes.append(command.main(second)) or [row()]) == 0
     assert codes == [2] and {path.name for path in tmp_path.iterdir()} == FILES
-    (said,) = [line for line in capsys.readouterr().err.splitlines() if "is already running" in line]
-    assert f"{tmp_path}: a validation is already running in process {os.getpid()} on " in said
+    (message,) = [line for line in capsys.readouterr().err.splitlines() if "is already running" in line]
+    assert f"{tmp_path}: a validation is already running in process {os.getpid()} on " in message
 
 
 @pytest.mark.parametrize(
@@ -215,30 +218,31 @@ def test_misuse_is_one_line_and_exit_code_2(arguments, words, capsys, tmp_path):
 # The documentation ----------------------------------------------------------------------------------------------------
 
 
-def test_the_accuracy_table_holds_the_rows_and_nothing_else():
+def test_the_accuracy_table_holds_the_measured_rows_only():
     values = {"worst chord": 4.97e-8, "worst / u": 0.834, "time / plain": 1.05}
     values |= {"time / copy": 1.01, "time / copy, low": 0.98, "time / copy, high": 1.2}
     rows = [row(setting="llvm float32", values=values | {"TIR misclassified": 3.0}, replay={"rays": 28000})]
     rows.append(row(setting="llvm float64", values=values, replay={"rays": 28000}))
-    floor = [dataclasses.replace(r, subject="copy", values={"time / copy": 1.0}, replay={}) for r in rows]
-    lines = tables.accuracy([*rows, *floor]).splitlines()
+    copies = [dataclasses.replace(r, subject="copy", values={"time / copy": 1.0}, replay={}) for r in rows]
+    lines = tables.accuracy([*rows, *copies]).splitlines()
     assert len(lines) == 6
     single = ["4.97e-8", "0.834", "3", "1.01 (0.98–1.2)", "1.05"]
     expected = ["`promoted`", "this project", *single, "4.97e-8", "0.834", "1.01 (0.98–1.2)"]
     assert [cell.strip() for cell in lines[-1].split("|")][1:-1] == expected
     values |= {"TIR misclassified": 1469.0}  # without a budget
-    of = {"case": "on a denormal", "values": values, "budgets": {}, "replay": {"count": 4000}}
-    denormal = [dataclasses.replace(r, **of) for r in rows]
+    changes = {"case": "on a denormal", "values": values, "budgets": {}, "replay": {"count": 4000}}
+    denormal = [dataclasses.replace(r, **changes) for r in rows]
     lines = tables.accuracy([*rows, *denormal]).splitlines()
     assert len(lines) == 7 and "in 17 of the 18 regimes" in lines[0] and "1469 of 4000" in lines[-1]
     assert lines[-1].startswith("| every one, `on a denormal` | denormal numbers are taken for 0 |")
 
 
-# What each table must name.
+# Words that each table must contain.
 NAMED = {
     "accuracy": [*FORMULAS, "on a denormal"],
     "on a GPU": [*FORMULAS, "ns per ray"],
     "renders": [path.stem for path in SCENES.glob("*.xml") if not beyond_builtin(path)],
+    "panes": [f"{1000 * thickness:g} mm at {x:g} m" for thickness, x in thin_panes.PANES],
     "paths": layered_paths.plugins(),
     "efficiency": [method.name for method in render_methods.METHODS],
     "caustics": [*caustic_scenes.BODIES, *caustic_scenes.LAMPS],
@@ -264,7 +268,7 @@ NAMED = {
 
 
 @pytest.mark.parametrize("marker", tables.TABLES)
-def test_a_page_holds_its_table_which_is_not_written_from_a_run_that_measured_too_little(marker):
+def test_pages_hold_their_tables_and_incomplete_runs_do_not_write_them(marker):
     table = tables.TABLES[marker]
     assert table.study in command.ROOMS
     tables.check([table.study])

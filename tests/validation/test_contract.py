@@ -1,6 +1,6 @@
-"""What every study must keep to: tasks and rows have names of their own, bounds have reasons and exclude something.
+"""Rules for all studies: tasks and rows have unique names, bounds have reasons and are not too wide.
 
-Rows are those of the studies whose quick form takes a second or two; the validation itself runs all of them.
+Rows are those of studies whose quick form takes a second or two; the validation itself runs all studies.
 """
 
 import functools
@@ -40,7 +40,7 @@ RUN = (
 # Studies and tasks ---------------------------------------------------------------------------------------------------
 
 
-def test_every_study_is_in_a_room_and_described():
+def test_every_study_is_listed_and_described():
     root = Path(command.__file__).parent
     modules = {".".join(path.relative_to(root).with_suffix("").parts): path.read_text() for path in root.glob("*/*.py")}
     assert {name for name, text in modules.items() if "\nSTUDY = " in text} == set(MODULES)
@@ -49,44 +49,49 @@ def test_every_study_is_in_a_room_and_described():
     assert all(study.title and study.text and study.terms for study in STUDIES.values())
 
 
-# A task that reaches one of them measures a time. What `Camera` measures is not judged by those that are not `timed`.
+# A task that may call one of these measures a time. `Camera` measures times too, which other tasks ignore.
 CLOCKS = {"perf_counter", "process_time", "kernel_timing.interval", "scaling.run"}
 NOT_JUDGED = "render_methods.Camera.__call__"
 
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
-def test_tasks_have_different_names_and_those_that_time_something_say_so(variant, needs_variant):
+def test_tasks_have_unique_names_and_all_that_measure_times_are_timed(variant, needs_variant):
     needs_variant(variant)
     for profile in profiles(variant):
         tasks = runner.tasks(list(STUDIES.values()), here(profile, Path(), variant))
-        assert {task.name for task in tasks if not task.timed and reached(task.run) & CLOCKS} == set()
-        assert any(reached(task.run) & CLOCKS for task in tasks if task.timed)
-    twice = Study("s", "", "", {}, lambda context: [Task("a", list), Task("a", list)])
-    with pytest.raises(ValueError, match="two tasks are called 'a'; expected different names"):
-        runner.tasks([twice], here("quick", Path(), variant))
+        assert {task.name for task in tasks if not task.timed and reachable(task.run) & CLOCKS} == set()
+        assert any(reachable(task.run) & CLOCKS for task in tasks if task.timed)
+    duplicate = Study("s", "", "", {}, lambda context: [Task("a", list), Task("a", list)])
+    with pytest.raises(ValueError, match="two tasks have the name 'a'; expected unique names"):
+        runner.tasks([duplicate], here("quick", Path(), variant))
 
 
-def reached(start):
-    """Clocks, and functions of the validation (module.name), that `start` may call, by the names in their code."""
-    found, left = set(), [start]
-    while left:
-        this = left.pop()
-        if isinstance(this, functools.partial):
-            left += [this.func, *this.args]
-        elif isinstance(this, Study):
-            left.append(this.again)
-        elif inspect.isclass(this):
-            left += vars(this).values()
-        elif isinstance(this := inspect.unwrap(this) if callable(this) else None, types.FunctionType):
-            name = f"{this.__module__.rpartition('.')[2]}.{this.__qualname__}"
-            if this.__module__.startswith(("validation", __name__)) and name not in found | {NOT_JUDGED}:
-                names = names_in(this.__code__)
-                found |= {name} | names & CLOCKS
-                modules = [x for x in this.__globals__.values() if inspect.ismodule(x)]
-                scopes = [this.__globals__, *(vars(x) for x in modules if x.__name__.startswith("validation"))]
-                left += [scope[name] for scope in scopes for name in names & scope.keys()]
-                left += [cell.cell_contents for cell in this.__closure__ or ()]
-    return found
+def reachable(start):
+    """Clocks and functions of the validation (module.name) that `start` may call, by the names in their code."""
+    reached, queue = set(), [start]
+    while queue:
+        item = queue.pop()
+        if isinstance(item, functools.partial):
+            queue += [item.func, *item.args]
+            continue
+        if isinstance(item, Study):
+            queue.append(item.again)
+            continue
+        if inspect.isclass(item):
+            queue += vars(item).values()
+            continue
+        function = inspect.unwrap(item) if callable(item) else None
+        if not isinstance(function, types.FunctionType):
+            continue
+        name = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}"
+        if function.__module__.startswith(("validation", __name__)) and name not in reached | {NOT_JUDGED}:
+            names = names_in(function.__code__)
+            reached |= {name} | names & CLOCKS
+            modules = [x for x in function.__globals__.values() if inspect.ismodule(x)]
+            scopes = [function.__globals__, *(vars(x) for x in modules if x.__name__.startswith("validation"))]
+            queue += [scope[name] for scope in scopes for name in names & scope.keys()]
+            queue += [cell.cell_contents for cell in function.__closure__ or ()]
+    return reached
 
 
 def names_in(code):
@@ -94,7 +99,7 @@ def names_in(code):
     return set(code.co_names).union(*map(names_in, inner))
 
 
-def test_why_cuda_does_not_run_says_what_it_needs():
+def test_rows_without_cuda_say_what_it_needs():
     machine = here("quick", Path(), "scalar_rgb")
     absent = [setting.reason for setting in settings(machine) if setting.backend == "cuda" and not setting.vector]
     absent += [reason for name, reason in machine.variants.items() if name.startswith("cuda") and reason]
@@ -105,50 +110,50 @@ def test_why_cuda_does_not_run_says_what_it_needs():
 
 # Seeds ---------------------------------------------------------------------------------------------------------------
 
-# Their random draws decide no verdict on errors: times, noise of several seeds of their own, or a sampled defect.
-OTHERWISE = {
+# Studies that need no other seeds: their random draws decide no verdict on errors.
+NOT_REPEATED = {
     "renders.against_dielectric": "eight seeds a side, compared by a test with a stated probability of alarm",
-    "renders.colours": "images are shown; no figure has a bound",
+    "renders.colours": "images are shown; no value has a bound",
     "renders.unused_features": "times and equality to the last bit",
-    "efficiency.error_against_time": "several seeds a method, with intervals",
+    "efficiency.error_against_time": "several seeds per method, with intervals",
     "efficiency.changing_indices": "times",
-    "efficiency.chosen_settings": "several seeds a method, with intervals",
-    "efficiency.caustics": "eight seeds a side, and six of each time",
+    "efficiency.chosen_settings": "several seeds per method, with intervals",
+    "efficiency.caustics": "eight seeds a side, and six per time",
     "efficiency.scaling": "times",
     "planar.times": "times",
-    "diff.planted_defects": "trials with seeds of their own",
+    "diff.planted_defects": "each trial has a different seed",
     "diff.times": "times",
-    "suite.caustic_energies": "two seeds, where a renderer is random; a level is compared",
+    "suite.caustic_energies": "two seeds if a renderer is random; only a level is compared",
     "suite.exports": "several seeds a side",
     "suite.rendered_images": "several seeds a side",
-    "suite.standard_numbers": "eight seeds an image; of glasses, which rays they are does not matter",
+    "suite.standard_numbers": "eight seeds per image; indices of glasses do not depend on the rays",
     "media.renders": "sixteen seeds a side in the furnace, eight by Welch's test; the rest is times and closed forms",
-    "robustness.code_mutants": "each mutant is a case of its own, and the study is longer in full",
+    "robustness.code_mutants": "each mutant is a case; the profile full has more of them",
     "ground_truth.standard_numbers": "one number is drawn, in sixteen sets of samples; the rest has no noise",
     "ground_truth.traced_bodies": "bodies are fixed; the rainbow's seeds are its sample",
 }
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_a_study_that_draws_is_repeated_with_other_seeds_or_says_why_not(name):
-    assert OTHERWISE.keys() <= STUDIES.keys()
+def test_randomised_studies_are_repeated_with_other_seeds_or_have_a_reason(name):
+    assert NOT_REPEATED.keys() <= STUDIES.keys()
     source = Path(importlib.import_module(f"validation.{name}").__file__).read_text()
     draws = any(word in source for word in ("default_rng", "regimes.make(", "seed=", "SEED"))
-    assert STUDIES[name].again is not None or name in OTHERWISE or not draws
-    assert STUDIES[name].again is None or name not in OTHERWISE
+    assert STUDIES[name].again is not None or name in NOT_REPEATED or not draws
+    assert STUDIES[name].again is None or name not in NOT_REPEATED
 
 
-def drawn(context):
-    """A bound that holds for the study's own seed and for no other."""
+def rows_of_one_seed(context):
+    """A row whose bound holds for the study's own seed only."""
     value, own = np.random.default_rng(seeds.current(5)).random(), np.random.default_rng(5).random()
     return [Row("s", "x", "case", "", {"error": abs(value - own)}, {"error": 1e-9})]
 
 
 @pytest.mark.parametrize(("profile", "count"), [("quick", 0), ("standard", 3), ("full", 10)])
-def test_a_bound_that_only_its_own_seed_holds_fails(profile, count, tmp_path):
+def test_a_bound_that_holds_for_one_seed_only_fails(profile, count, tmp_path):
     context = here(profile, tmp_path, "scalar_rgb")
-    assert drawn(context)[0].verdict == "pass"
-    tasks = repeated.tasks(Study("s", "S", "", {}, lambda context: [], again=drawn), context)
+    assert rows_of_one_seed(context)[0].verdict == "pass"
+    tasks = repeated.tasks(Study("s", "S", "", {}, lambda context: [], again=rows_of_one_seed), context)
     assert len(tasks) == count
     for task in tasks:
         summary, broken = task.run()
@@ -157,7 +162,7 @@ def test_a_bound_that_only_its_own_seed_holds_fails(profile, count, tmp_path):
     assert seeds.current(5) == 5
 
 
-def test_a_repetition_that_checks_nothing_fails_and_one_of_what_cannot_be_run_is_not_run():
+def test_a_repetition_without_checks_fails_and_one_that_cannot_run_is_not_run():
     def again(**row):
         study = Study("s", "S", "", {}, lambda c: [], again=lambda c: [Row("s", "x", "y", "", **row)])
         return repeated.rows_of(study, here("quick", Path(), "scalar_rgb"), 1)
@@ -173,8 +178,8 @@ DRAWN = "directions.bsdf_samples", "planar.closed_paths", "stability.energy", "s
 
 
 @pytest.mark.parametrize("name", DRAWN)
-def test_what_is_repeated_depends_on_the_seed(name, tmp_path, llvm_variant):
-    """But for a row or two whose worst error is one ulp either way."""
+def test_repetitions_depend_on_the_seed(name, tmp_path, llvm_variant):
+    """Except for a few rows whose worst error is one ulp for any seed."""
 
     def rows(shift):
         with seeds.shifted(shift):
@@ -185,14 +190,14 @@ def test_what_is_repeated_depends_on_the_seed(name, tmp_path, llvm_variant):
 
 
 @pytest.mark.parametrize("name", ["directions.per_formula", "stability.derivatives"])
-def test_where_nothing_is_compiled_scalars_are_repeated_or_the_row_is_not_run(name, scalar_context, monkeypatch):
+def test_repetitions_on_scalar_variants(name, scalar_context, monkeypatch):
     context = scalar_context(rays=80, scalar_rays=2)
     absent = {key: replace(backend, usable=False, reason="absent") for key, backend in context.backends.items()}
     (row,) = repeated.rows_of(STUDIES[name], replace(context, backends=absent), 1)
     assert row.verdict == ("not run" if name == "stability.derivatives" else "pass")
 
 
-def test_what_is_drawn_is_kept_by_seed():
+def test_random_draws_are_cached_by_seed():
     calls = []
     draw = seeds.cached(lambda x: calls.append(x) or seeds.current(x))
     with seeds.shifted(1):
@@ -203,15 +208,15 @@ def test_what_is_drawn_is_kept_by_seed():
 # Rows and bounds -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.filterwarnings("ignore:.*is an extrapolation")  # wavelengths are drawn beyond the fit of a glass
+@pytest.mark.filterwarnings("ignore:.*is an extrapolation")  # some wavelengths are outside the fit of a glass
 @pytest.mark.parametrize("name", RUN)
-def test_a_study_holds_its_bounds_none_of_which_is_a_hundred_times_too_wide(name, tmp_path, llvm_variant, monkeypatch):
+def test_studies_pass_and_no_bound_is_a_hundred_times_too_wide(name, tmp_path, llvm_variant, monkeypatch):
     monkeypatch.setattr(glass_catalogs, "CATALOGS", ("SCHOTT",))  # each takes a second
     tasks = STUDIES[name].tasks(here("quick", tmp_path, "llvm_ad_rgb"))
-    made = [(task, row) for task in tasks for row in task.run()]
-    silent = [row.name for task, row in made if not (row.bounds or row.reason or task.timed)]
-    assert [x for x in silent if x.split(" / ")[1] not in STUDIES[name].records] == []
-    rows = STUDIES[name].summarise([row for _, row in made])
+    rows_by_task = [(task, row) for task in tasks for row in task.run()]
+    unexplained = [row for task, row in rows_by_task if not (row.bounds or row.reason or task.timed)]
+    assert [row.name for row in unexplained if row.subject not in STUDIES[name].records] == []
+    rows = STUDIES[name].summarise([row for _, row in rows_by_task])
     assert {row.study for row in rows} <= {STUDIES[name].name, "self-test"}
     assert [name for name, count in Counter(row.name for row in rows).items() if count > 1] == []
     assert [(row.name, row.broken) for row in rows if row.verdict == "fail"] == []
@@ -227,15 +232,20 @@ def test_a_study_holds_its_bounds_none_of_which_is_a_hundred_times_too_wide(name
 
 
 def limits_in(value):
+    if isinstance(value, limits.Limit):
+        return [value]
     nested = value.values() if isinstance(value, dict) else ()
-    return [value] if isinstance(value, limits.Limit) else [limit for each in nested for limit in limits_in(each)]
+    return [limit for inner in nested for limit in limits_in(inner)]
 
 
-def test_a_limit_is_a_number_with_a_reason_and_on_noise_lets_no_defect_hide_that_it_is_for():
-    """An index off by INDEX_SEEN moves the rainbow; one code of an 8-bit image is the least that is seen in white."""
+def test_limits_are_finite_and_positive_and_have_reasons():
     every = [limit for name, value in vars(limits).items() if name.isupper() for limit in limits_in(value)]
     assert len(every) > 50
     assert [limit for limit in every if not (limit.reason and math.isfinite(limit) and limit > 0)] == []
+
+
+def test_limits_of_noise_are_below_the_defects_that_they_must_reveal():
+    """INDEX_SEEN moves the rainbow; one code of an 8-bit image is the least visible change of white."""
     moved = abs(rainbow.angle(rainbow.INDEX + limits.INDEX_SEEN) - rainbow.angle())
     assert moved / 11 < limits.RAINBOW_RESOLVED < moved / 9
     assert (1 - srgb_decode(np.array(254 / 255))) / 2 > limits.FURNACE_CHANNEL
@@ -245,8 +255,8 @@ def bounded(subject, case, value, bound=1.0, study="energy", metric="error"):
     return Row(study, subject, case, "", {metric: value}, {metric: bound})
 
 
-def test_bounds_far_above_the_errors_are_listed_and_must_be_explained():
-    """Far in one case of two: the bound is the other's. Far in every case: an explanation, or the row fails."""
+def test_bounds_far_above_the_errors_must_be_explained():
+    """A bound may be far above the errors of one case of two. Far above those of all, it needs an explanation."""
     near = [bounded("x", "easy", 0.001), bounded("x", "hard", 0.5), bounded("x", "never", 0.0, bound=0.0)]
     (row,) = tightness.rows(near)
     assert (row.values["checks"], row.values["far from the bound"], row.verdict) == (2, 1, "pass")

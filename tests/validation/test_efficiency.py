@@ -1,4 +1,4 @@
-"""Efficiency, scaling and times: figures of known errors, intervals, and every planted defect seen."""
+"""Efficiency, scaling and times: values of known errors, intervals, and detection of planted defects."""
 
 import dataclasses
 import math
@@ -34,24 +34,24 @@ def context(tmp_path, llvm_variant, monkeypatch):
 # The error against time ---------------------------------------------------------------------------------------------
 
 
-def test_errors_are_those_that_were_put_in():
-    """The variance of the reference is not the method's error: both are 1, that of a mean of 4 is 1/4."""
+def test_errors_of_known_images():
+    """The variance of the reference is subtracted: the method's is 1, that of the reference, a mean of 4, is 1/4."""
     mean = np.full((40, 50, 3), 2.0)
     image = mean + 0.1
-    image[0, 0] += 100  # one pixel of 2000, all of the worst 0.1 % but one
-    found = error_against_time.errors(image, mean, np.zeros_like(mean))
-    assert found["MSE"] == pytest.approx(0.01 + (100.1**2 - 0.01) / 2000)
-    assert (found["MSE, trimmed"], found["relMSE, trimmed"]) == pytest.approx((0.01, 0.01 / 4.01))
+    image[0, 0] += 100  # one pixel of 2000; the worst 0.1 % are two
+    errors = error_against_time.errors(image, mean, np.zeros_like(mean))
+    assert errors["MSE"] == pytest.approx(0.01 + (100.1**2 - 0.01) / 2000)
+    assert (errors["MSE, trimmed"], errors["relMSE, trimmed"]) == pytest.approx((0.01, 0.01 / 4.01))
     rng = np.random.default_rng(5)
     references, image = rng.normal(size=(4, 100, 100, 3)), rng.normal(size=(100, 100, 3))
-    own = references.var(0, ddof=1) / 4
-    found = error_against_time.errors(image, references.mean(0), own)["MSE"]  # 1 within 5 of its standard errors
-    assert found == pytest.approx(1, abs=5 * math.sqrt((2 * 1.25**2 + 2 / 16 / 3) / 30000))
-    assert error_against_time.errors(image, references.mean(0), 0 * own)["MSE"] > 1.2
+    variance = references.var(0, ddof=1) / 4
+    mse = error_against_time.errors(image, references.mean(0), variance)["MSE"]  # 1 within 5 standard errors
+    assert mse == pytest.approx(1, abs=5 * math.sqrt((2 * 1.25**2 + 2 / 16 / 3) / 30000))
+    assert error_against_time.errors(image, references.mean(0), 0 * variance)["MSE"] > 1.2
 
 
-def test_efficiency_is_not_bought_with_bias_and_more_samples_have_less_error(context):
-    """Same seeds as the built-in, so agreement does not depend on the run; shorter paths are biased, and found."""
+def test_biased_methods_fail_and_more_samples_reduce_the_error(context):
+    """Same seeds as the built-in, so agreement does not depend on the run; shorter paths are biased."""
     methods = (BUILTIN, METHODS[1], SHORT)
     rows = {row.subject: row for row in error_against_time.scene_rows(context, SCENES / "balls.xml", methods)}
     assert (rows[METHODS[1].name].verdict, rows[SHORT.name].verdict) == ("pass", "fail")
@@ -67,26 +67,26 @@ def test_efficiency_is_not_bought_with_bias_and_more_samples_have_less_error(con
 
 @pytest.mark.parametrize(("noise", "seconds", "best"), [(2.0, 1.0, 1), (0.5, 1.0, 0), (0.5, 5.0, 1)])
 def test_the_best_sampler_has_the_least_variance_and_time(monkeypatch, noise, seconds, best):
-    """The first one's noise and time are given, the other's are 1; the first image of each took forever."""
+    """The first sampler has the given noise and time, the other 1 and 1; the first image of each takes 1e9 s."""
 
-    def look(path, resolution, sampler, extent):
+    def camera(path, resolution, sampler, extent):
         first = sampler == error_against_time.STRATIFIED[0]
-        shots = iter([1e9] + 3 * [seconds if first else 1.0])
+        times = iter([1e9] + 3 * [seconds if first else 1.0])
         rng = np.random.default_rng(1)
-        return lambda spp, seed: (rng.normal(size=(8, 8, 3)) * (noise if first else 1.0), next(shots))
+        return lambda spp, seed: (rng.normal(size=(8, 8, 3)) * (noise if first else 1.0), next(times))
 
-    monkeypatch.setattr(error_against_time, "builtin_camera", look)
+    monkeypatch.setattr(error_against_time, "builtin_camera", camera)
     assert error_against_time.best_sampler(SCENES / "balls.xml", 8, SMALL) == error_against_time.STRATIFIED[best]
 
 
-def test_images_grow_until_their_time_can_be_told(context, monkeypatch):
+def test_images_grow_until_they_take_long_enough(context, monkeypatch):
     monkeypatch.setattr(error_against_time, "LARGEST", 64)
     path = SCENES / "furnace.xml"
     sizes = [error_against_time.resolution_of(path, dataclasses.replace(SMALL, seconds=s)) for s in (0.0, 1e-9, 1e9)]
     assert sizes == [32, 32, 64]
 
 
-def test_a_method_renders_to_the_depth_of_the_scene_or_to_another(scalar_variant):
+def test_methods_render_to_the_depth_of_the_scene_or_a_given_one(scalar_variant):
     for depth, options in ((48, {}), (7, {"max_depth": 7})):
         camera = render_methods.camera(SCENES / "nested.xml", BUILTIN, 4, **options)
         assert f"max_depth = {depth}" in str(camera.integrator)
@@ -95,21 +95,21 @@ def test_a_method_renders_to_the_depth_of_the_scene_or_to_another(scalar_variant
 @pytest.mark.parametrize(
     ("scene", "words"), [("furnace", "no noise"), ("mirage", "stairs"), ("slab", "the profile standard measures balls")]
 )
-def test_what_is_left_out_has_its_reason(context, monkeypatch, scene, words):
+def test_scenes_that_are_left_out_have_a_reason(context, monkeypatch, scene, words):
     measured = ("balls",) if scene == "slab" else ()
     monkeypatch.setitem(error_against_time.EXTENTS, "standard", dataclasses.replace(SMALL, scenes=measured))
     (row,) = error_against_time.scene_rows(context, SCENES / f"{scene}.xml")
     assert row.verdict == "not run" and row.reason.startswith("left out: ") and words in row.reason
 
 
-def test_goals_go_to_the_best_that_splits_on_glass_and_to_the_best_elsewhere():
+def test_the_best_method_has_a_goal_and_on_glass_only_the_best_that_splits():
     subjects = [error_against_time.Subject(method, "multijitter") for method in METHODS]
     costs = zip((s.name for s in subjects), (1.0, 1.0, 0.1, 0.5, 0.3, 0.4), strict=True)
-    found = {name: {4: error_against_time.Measured([1.0], {"MSE": [cost]}, [])} for name, cost in costs}
-    glass = error_against_time.goals_of(subjects, found, only_glass=True)
+    measured = {name: {4: error_against_time.Measured([1.0], {"MSE": [cost]}, [])} for name, cost in costs}
+    glass = error_against_time.goals_of(subjects, measured, only_glass=True)
     assert glass[subjects[4].name] == limits.ONLY_GLASS and glass[subjects[2].name] == {"time / built-in": 0.8}
     assert subjects[1].name not in glass and glass[subjects[3].name] == {}
-    mixed = error_against_time.goals_of(subjects, found, only_glass=False)
+    mixed = error_against_time.goals_of(subjects, measured, only_glass=False)
     assert mixed[subjects[2].name] == limits.MIXED and not any(mixed[s.name] for s in subjects[3:])
 
 
@@ -132,13 +132,13 @@ def test_every_knob_makes_an_image(knob, scalar_variant):
     assert image.shape == (4, 4, 3) and np.isfinite(image).all() and image.any()
 
 
-def test_a_process_is_measured_by_itself_or_says_why_not(context, tmp_path):
-    """Kernels that were there give no first image; six hundred megabytes here are none of its own."""
+def test_scaling_measures_its_own_process_or_raises(context, tmp_path):
+    """Cached kernels give no first image; 600 MB in the parent process do not count."""
     job = scaling.Job("llvm_ad_rgb", "glasses", 2, METHODS[1].name, 8, 1, 2)
-    ballast = np.ones(600_000_000, np.uint8)
+    parent_memory = np.ones(600_000_000, np.uint8)
     cold, warm = (scaling.run(job, str(tmp_path)) for _ in range(2))
     assert cold["first image"] > 0 and math.isnan(warm["first image"]) and 0 < cold["arrays MB"] < 1
-    assert ballast.all() and (math.isnan(cold["process MB"]) or cold["process MB"] < 600)
+    assert parent_memory.all() and (math.isnan(cold["process MB"]) or cold["process MB"] < 600)
     with pytest.raises(RuntimeError, match=r"glasses = 2: exit code 1: .*"):
         scaling.run(dataclasses.replace(job, variant="scalar_rgb", resolution=-8), str(tmp_path))
 
@@ -147,16 +147,16 @@ def test_a_process_is_measured_by_itself_or_says_why_not(context, tmp_path):
 
 
 @pytest.mark.parametrize("count", [9, 11, 21])
-def test_the_interval_of_a_median_covers_it_19_times_in_20(count):
-    """The exact coverage of the ranks that it takes; one rank further in it would be less than 95 %."""
-    found = kernel_timing.interval("t", list(map(float, range(1, count + 1))))
-    rank = int(found["t, low"])
-    assert (found["t"], found["t, high"]) == ((count + 1) / 2, count + 1 - rank)
+def test_the_interval_of_a_median_has_95_percent_coverage(count):
+    """The exact coverage of its ranks; a narrower interval would have less than 95 %."""
+    values = kernel_timing.interval("t", list(map(float, range(1, count + 1))))
+    rank = int(values["t, low"])
+    assert (values["t"], values["t, high"]) == ((count + 1) / 2, count + 1 - rank)
     assert 1 - 2 * binom.cdf(rank - 1, count, 0.5) >= 0.95 > 1 - 2 * binom.cdf(rank, count, 0.5)
 
 
-def test_a_ratio_is_that_of_one_round_and_every_second_round_runs_backwards():
-    """A machine that is twice as slow in some rounds does not move a ratio; the first round is thrown away."""
+def test_ratios_are_formed_within_a_round_and_every_second_round_runs_backwards():
+    """A machine that is twice as slow in some rounds does not change a ratio; the first round is not counted."""
     load, calls = [1.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 1.0], []
     assert set(kernel_timing.ratio("t", [3.0 * x for x in load], load).values()) == {3.0}
 
@@ -168,9 +168,7 @@ def test_a_ratio_is_that_of_one_round_and_every_second_round_runs_backwards():
     assert "".join(calls) == "abbaabba" and seconds == {"a": [4, 5, 8], "b": [3, 6, 7]}
 
 
-def test_a_slow_subject_is_seen_on_every_backend_that_runs_and_goals_are_those_of_the_table(
-    tmp_path, variant, monkeypatch
-):
+def test_slow_subjects_are_detected_on_all_backends(tmp_path, variant, monkeypatch):
     def slow(a, n, k):
         if not dr.is_jit_v(a):
             time.sleep(2e-3)
@@ -194,27 +192,27 @@ def test_a_slow_subject_is_seen_on_every_backend_that_runs_and_goals_are_those_o
     for setting in settings(context):
         if setting.vector is None:
             continue
-        found = kernel_timing.measure(on_gpu if setting.backend == "cuda" else context, setting)
-        assert set(found) == {"copy", "decomposed", "slow"} and found["slow"]["time / plain, low"] > 1.5
-        assert found["decomposed"]["time / plain"] == found["copy"]["time / copy"] == 1
-        assert ("ns per ray" in found["slow"]) == (setting.backend == "cuda")
+        values = kernel_timing.measure(on_gpu if setting.backend == "cuda" else context, setting)
+        assert set(values) == {"copy", "decomposed", "slow"} and values["slow"]["time / plain, low"] > 1.5
+        assert values["decomposed"]["time / plain"] == values["copy"]["time / copy"] == 1
+        assert ("ns per ray" in values["slow"]) == (setting.backend == "cuda")
         if not setting.is_scalar:
-            assert found["slow"]["operations"] > found["decomposed"]["operations"]
-            assert found["slow"]["compile ms"] > 1  # NaN where a cache had the kernel
+            assert values["slow"]["operations"] > values["decomposed"]["operations"]
+            assert values["slow"]["compile ms"] > 1  # NaN if the kernel was cached
 
 
 # Settings that a pilot chooses ---------------------------------------------------------------------------------------
 
 
 def test_a_pilot_that_chooses_badly_misses_its_goals(context, monkeypatch):
-    """Where all is glass the scene's own settings cost ten times as much as splitting."""
+    """In a scene of glass only, the scene's own settings cost ten times as much as splitting."""
     small = chosen_settings.Extent(("balls",), 24, 16, 2, samplers=("multijitter",), depths=(3,))
     monkeypatch.setitem(chosen_settings.EXTENTS, "standard", small)
     (row,) = chosen_settings.scene_rows(context, "balls")
     assert "split_depth=3" in row.reason and row.values["equal-time MSE / independent"] < 0.5
     assert row.values["equal-time MSE / best by hand"] == pytest.approx(1 + row.values[chosen_settings.SHARE])
     monkeypatch.setattr(pilot, "LOST", math.inf)
-    monkeypatch.setattr(pilot, "MARGIN", math.inf)  # all are alike
+    monkeypatch.setattr(pilot, "MARGIN", math.inf)  # all settings count as equal
     monkeypatch.setattr(pilot, "SURELY", math.inf)
     (worse,) = chosen_settings.scene_rows(context, "balls")
     assert "split_depth" not in worse.reason and "equal-time MSE / best by hand" in worse.missed
@@ -223,6 +221,6 @@ def test_a_pilot_that_chooses_badly_misses_its_goals(context, monkeypatch):
 
 
 @pytest.mark.parametrize("name", chosen_settings.OTHERS)
-def test_scenes_beside_the_scene_files_can_be_read_from_their_files(name, tmp_path, llvm_variant):
+def test_other_scenes_can_be_written_and_loaded(name, tmp_path, llvm_variant):
     path, defines = chosen_settings.scene_file(name, "refract", 8, tmp_path)
     assert len(load_parsed(parse_scene(path, defines)).shapes()) > 1

@@ -1,4 +1,4 @@
-"""Glasses and an achromat by other ray tracers: another index is no other direction or trace, and the reverse."""
+"""Glasses and an achromat by other ray tracers: wrong indices and wrong directions or traces are told apart."""
 
 import dataclasses
 from pathlib import Path
@@ -24,11 +24,11 @@ SOME = ("SCHOTT:N-BK7", "SCHOTT:F2", "SUMITA:K-BK7")
 
 @pytest.fixture
 def rays():
-    return glasses.given(SOME)
+    return glasses.rays_for(SOME)
 
 
-def of_f2(rays):
-    """The rays that pass through F2."""
+def through_f2(rays):
+    """Mask of the rays that pass through F2."""
     pairs = glasses.header.columns(rays.header, rays.ids)[:, 1].astype(int)
     return np.array(["SCHOTT:F2" in pair for pair in rays.header["media"]])[pairs]
 
@@ -41,9 +41,9 @@ def judged(rays, answers, others=(), tir="zero"):
     return glasses.rows("A", GlassCatalogue("", SOME, tir, dict(others)), rays, answers)
 
 
-def test_indices_and_directions_are_told_apart(rays):
-    """F2 is off by 1e-12, which no direction in doubt would show; a direction for another index has no other index."""
-    k, f2 = rays.rays.k, of_f2(rays)
+def test_wrong_indices_and_wrong_directions_are_told_apart(rays):
+    """An index of F2 off by 1e-12 breaks the row of F2 only; directions for other indices break no row of a glass."""
+    k, f2 = rays.rays.k, through_f2(rays)
     right = judged(rays, answered(rays))
     assert [(row.case, row.verdict) for row in right] == [(case, "pass") for case in (*glasses.REGIMES, *SOME)]
     assert broken(judged(rays, answered(rays, np.where(f2, k * (1 + 1e-12), k)))) == {"SCHOTT:F2": {glasses.INDEX_OFF}}
@@ -52,17 +52,17 @@ def test_indices_and_directions_are_told_apart(rays):
     off = broken(judged(rays, answered(rays, direction=k * (1 + 1e-12))))
     assert off["generic"] == {"wrong", ERROR_OVER_BOUND} and not set(SOME) & set(off)
     assert broken(judged(rays, answered(rays), tir="nan")) == {"critical": {"other TIR signal"}}
-    given = answered(rays)
-    without = dataclasses.replace(given, ids=given.ids[~f2], b=given.b[~f2], n_ratio=given.n_ratio[~f2])
-    lost = broken(judged(rays, without))
-    assert lost.pop("SCHOTT:F2") == {glasses.INDEX_OFF}
-    assert set(lost) == set(glasses.REGIMES) and all("unfit" in x for x in lost.values())
+    complete = answered(rays)
+    without_f2 = dataclasses.replace(complete, ids=complete.ids[~f2], b=complete.b[~f2], n_ratio=complete.n_ratio[~f2])
+    incomplete = broken(judged(rays, without_f2))
+    assert incomplete.pop("SCHOTT:F2") == {glasses.INDEX_OFF}
+    assert set(incomplete) == set(glasses.REGIMES) and all("unfit" in x for x in incomplete.values())
 
 
 @pytest.mark.parametrize(("off", "fails"), [(1e-4, False), (1.05e-4, True), (0.9e-4, True), (0.0, True)])
-def test_a_known_difference_is_a_missed_goal_as_long_as_it_is_what_it_was(off, fails, rays):
+def test_a_recorded_difference_misses_a_goal_and_a_changed_one_fails(off, fails, rays):
     k = rays.rays.k
-    answers = answered(rays, np.where(of_f2(rays), k * (1 + off), k))
+    answers = answered(rays, np.where(through_f2(rays), k * (1 + off), k))
     rows = judged(rays, answers, {"SCHOTT:F2": OtherIndex(1.00e-4, "another edition")})
     (row,) = (row for row in rows if row.case == "SCHOTT:F2")
     assert (row.verdict == "fail") == fails and row.reason.endswith("another edition")
@@ -81,8 +81,8 @@ table.write(rays, np.where(d < 0, 0, k * a - (k * c + np.sqrt(np.abs(d))) * n), 
 """
 
 
-def test_a_program_is_judged_for_its_own_index_and_a_broken_one_fails(tmp_path):
-    """Every glass has n = 1.5: all directions are right, and no index is."""
+def test_directions_are_judged_for_the_programs_own_index_and_broken_programs_fail(tmp_path):
+    """All glasses have n = 1.5: all directions are right, and all indices wrong."""
 
     def rows_of(text):
         (tmp_path / "program.py").write_text(text)
@@ -92,17 +92,17 @@ def test_a_program_is_judged_for_its_own_index_and_a_broken_one_fails(tmp_path):
     assert all(row.reason.startswith("a program 1.0") for row in rows) and set(broken(rows)) == set(SOME)
     (f2,) = (row for row in rows if row.case == "SCHOTT:F2")
     assert f2.values[glasses.INDEX_OFF] == pytest.approx(media.index("SCHOTT:F2", media.LINES["g"]) / 1.5 - 1, rel=1e-6)
-    for text, verdict, said in (
+    for text, verdict, reason in (
         (PROGRAM.replace("1.5)", "1 / 0)"), "fail", "division by zero"),
         (PROGRAM.replace("table.w", "rays.between_glasses = False; table.w"), "fail", "no column n_ratio"),
         ("import sys; sys.exit(77)", "not run", "cannot run here: "),
     ):
         (row,) = rows_of(text)
-        assert row.verdict == verdict and said in row.reason and "\n" not in row.reason
+        assert row.verdict == verdict and reason in row.reason and "\n" not in row.reason
 
 
 @pytest.mark.parametrize("name", CATALOGUES)
-def test_systems_that_are_installed_answer_for_their_indices(name):
+def test_installed_systems_pass(name):
     catalogue = CATALOGUES[name]
     assert (SCRIPTS / catalogue.script).is_file() and set(catalogue.others) <= set(catalogue.glasses) <= set(GLASSES)
     if reason := environments.absent(SYSTEMS[name]):
@@ -112,10 +112,10 @@ def test_systems_that_are_installed_answer_for_their_indices(name):
     assert {row.case for row in rows if row.missed} <= set(catalogue.others)
 
 
-# CDGM has published two formulas: Sellmeier's, in the catalogue for Zemax of 2022, and a power series in its
+# CDGM has published two formulas: Sellmeier's, in its catalogue for Zemax of 2022, and a power series in its
 # spreadsheet. Sumita has changed two glasses since its catalogue of 2017, whose coefficients are those of λ⁰, λ², λ⁻²,
-# …, in µm. raysect has Schott's catalogue of 2000; of N-BK7 only C1 = 6000.69867 nm² is another. Last: an index that
-# the other catalogue prints, and its line.
+# …, in µm. raysect has Schott's catalogue of 2000; its N-BK7 differs only in C1 = 6000.69867 nm². The last two columns:
+# an index that the other catalogue prints, and its line.
 GIR79 = {0: 3.3195074, 2: -0.0085801253, -2: 0.039978521, -4: 0.0014465322, -6: -3.0453007e-05, -8: 7.8005005e-06}
 SFLDN3 = {0: 3.2503692, 2: -0.013195714, -2: 0.049790724, -4: 0.0022430157, -6: -7.7567761e-06, -8: 2.1169316e-05}
 OTHER_CATALOGUES = [
@@ -129,15 +129,15 @@ OTHER_CATALOGUES = [
 
 
 @pytest.mark.parametrize(("system", "glass", "coefficients", "printed", "line"), OTHER_CATALOGUES)
-def test_the_recorded_difference_is_that_of_the_other_catalogue(system, glass, coefficients, printed, line):
-    def there(w):
+def test_recorded_differences_are_those_of_the_other_catalogue(system, glass, coefficients, printed, line):
+    def other_index(w):
         if isinstance(coefficients, dict):
             return sum(x * (w / 1000) ** power for power, x in coefficients.items()) ** 0.5
         return media.index(f"sellmeier({', '.join(map(str, coefficients))})", w)
 
-    off = max(abs(there(w) / media.index(glass, w) - 1) for w in glasses.WAVELENGTHS)
+    off = max(abs(other_index(w) / media.index(glass, w) - 1) for w in glasses.WAVELENGTHS)
     assert off == pytest.approx(CATALOGUES[system].others[glass].recorded, rel=5e-3)
-    assert round(there(media.LINES[line]), 5) == printed
+    assert round(other_index(media.LINES[line]), 5) == printed
 
 
 # The achromat --------------------------------------------------------------------------------------------------------
@@ -146,8 +146,8 @@ NS = 1.0, 1.5168, 1.62, 1.0
 LENS = exact_lens.ACHROMAT
 
 
-def test_the_exact_trace_is_that_of_matrices_near_the_axis_and_its_weights_those_of_small_changes():
-    """The rest is spherical aberration, and falls as the height's square. A bent surface has another curvature."""
+def test_the_exact_trace_is_paraxial_near_the_axis_and_its_sensitivities_are_right():
+    """The difference from the paraxial focus is spherical aberration, which is quadratic in the height."""
     focus = 8.5 + back_focal_distance(LENS, NS)
     off = [float(crossing(LENS, NS, h, exact_lens.START).place) / focus - 1 for h in (1e-6, 1.0, 0.5)]
     assert abs(off[0]) < 1e-12 and off[1] / off[2] == pytest.approx(4, rel=1e-2)
@@ -159,15 +159,15 @@ def test_the_exact_trace_is_that_of_matrices_near_the_axis_and_its_weights_those
     assert exact.moves["turn"][2] == pytest.approx(distance**2 / height + height, rel=2e-2)
 
 
-def traced(given=None, own=None, indices=None):
-    """The rows of a system that traces as the planar trace, unless otherwise said."""
+def traced(same_indices=None, own_glasses=None, indices=None):
+    """The rows of a system that traces like the planar trace, except for the given rays and indices."""
     ours, known = lenses.planar()
-    given = ours if given is None else given
-    rays = {lenses.GIVEN: given, lenses.OWN: given if own is None else own}
-    return lenses.answered("A", lenses.Answer("A 1.0", known if indices is None else indices, rays))
+    same_indices = ours if same_indices is None else same_indices
+    rays = {lenses.GIVEN: same_indices, lenses.OWN: same_indices if own_glasses is None else own_glasses}
+    return lenses.answer_rows("A", lenses.Answer("A 1.0", known if indices is None else indices, rays))
 
 
-def test_another_trace_is_no_other_index_and_another_index_no_other_trace():
+def test_wrong_traces_and_other_indices_are_told_apart():
     ours, known = lenses.planar()
     rows = traced()
     assert [(row.verdict, row.reason) for row in rows] == [("pass", "A 1.0")] * 4
@@ -177,17 +177,23 @@ def test_another_trace_is_no_other_index_and_another_index_no_other_trace():
     one[3, :, 1] *= 1 + 1e-12  # at one wavelength
     for rays in (moved, one, ours.astype(np.float32).astype(float)):
         assert list(broken(traced(rays)).values()) == [{ERROR_OVER_BOUND}] * 4
-    indices = known * [[1], [1 + 1e-8]]  # F2 of another maker, traced rightly: the focus says by how much
-    places = [[crossing(LENS, (1.0, *n, 1.0), h, exact_lens.START).place for h in lenses.HEIGHTS] for n in indices.T]
-    own = np.array([[[float(place), 0.0, 1.0, 0.1] for place in each] for each in places])
-    rows = traced(own=own, indices=indices)
+    indices = known * [[1], [1 + 1e-8]]  # F2 of another maker, traced correctly
+    own = [
+        [
+            [float(crossing(LENS, (1.0, *n, 1.0), height, exact_lens.START).place), 0.0, 1.0, 0.1]
+            for height in lenses.HEIGHTS
+        ]
+        for n in indices.T
+    ]
+    rows = traced(own_glasses=np.array(own), indices=indices)
     assert broken(rows) == {f"{lenses.OWN}, height {h:g}": {lenses.INDEX_OFF} for h in lenses.HEIGHTS}
     assert all(row.values[lenses.FOCUS_OFF] > 1e-9 for row in rows if row.case.startswith(lenses.OWN))
-    assert set.union(*broken(traced(own=own)).values()) == {ERROR_OVER_BOUND}  # said to be those of the file's glass
+    # The same rays with the indices of the file are a wrong trace.
+    assert set.union(*broken(traced(own_glasses=np.array(own))).values()) == {ERROR_OVER_BOUND}
 
 
 @pytest.mark.parametrize(
-    ("body", "said"),
+    ("body", "reason"),
     [
         ("raise RuntimeError('out of glass')", "out of glass"),
         ("print('[]')", "no answer"),
@@ -200,7 +206,7 @@ def test_another_trace_is_no_other_index_and_another_index_no_other_trace():
         ("sys.exit(77)", "cannot run here: "),
     ],
 )
-def test_a_broken_program_fails_for_its_reason(body, said, tmp_path):
+def test_broken_lens_programs_fail_with_the_reason(body, reason, tmp_path):
     (tmp_path / "program.py").write_text(f"import json, sys\nlens = json.load(sys.stdin)\n{body}\n")
     (row,) = lenses.system_rows(System("a", "A", lens=("{python}", str(tmp_path / "program.py"))), QUICK)
-    assert row.verdict == ("not run" if "77" in body else "fail") and said in row.reason and "\n" not in row.reason
+    assert row.verdict == ("not run" if "77" in body else "fail") and reason in row.reason and "\n" not in row.reason

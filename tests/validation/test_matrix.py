@@ -1,4 +1,4 @@
-"""The matrix of systems and checks: what it takes from the rows of other studies; as a table, a page and JSON."""
+"""The matrix of systems and checks, from the rows of other studies; as a table, a page and JSON."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def image(subject="B", verdict="equal", differing=0.0, budgets=(("tests that dif
     return Row(rendered_images.NAME, subject, "prism", "64²", values, dict(budgets), reason="why", replay=replay)
 
 
-def test_numbers_and_verdicts_are_those_of_the_rows_and_stand_before_them():
+def test_the_summary_has_the_numbers_and_verdicts_of_its_rows_and_precedes_them():
     other = Row("directions", "x", "y", "z", {"v": 1.0})
-    of_studies = [ray(), ray(case="near-critical", wrong=3.0), image(), image(verdict="different", differing=2.0)]
-    of_studies.append(image(verdict="different", differing=2.0, budgets=()))
-    rows = matrix.with_summary([other, *of_studies])
-    assert rows[0] == other and rows[6:] == of_studies and matrix.with_summary([other]) == [other]
+    summarised = [ray(), ray(case="near-critical", wrong=3.0), image(), image(verdict="different", differing=2.0)]
+    summarised.append(image(verdict="different", differing=2.0, budgets=()))
+    rows = matrix.with_summary([other, *summarised])
+    assert rows[0] == other and rows[6:] == summarised and matrix.with_summary([other]) == [other]
     right, wrong, equal, different, known = rows[1:6]
     assert (right.study, right.subject, right.case, right.values[matrix.OFF]) == ("matrix", "A, f32", "random", 1e-6)
     assert [row.verdict for row in rows[1:6]] == ["pass", "fail", "pass", "fail", "pass"]
@@ -43,7 +43,7 @@ def test_numbers_and_verdicts_are_those_of_the_rows_and_stand_before_them():
     assert known.missed == {"differs": 0.0}
 
 
-def test_a_missed_goal_is_shown_beside_the_number_and_fails_nothing():
+def test_a_missed_goal_is_shown_but_does_not_fail():
     goals = {per_ray.OFF_RECORDED: limits.RECORDED}
     rows = [ray(values=ONE | {"off the recorded": 3.67}, goals=goals)]
     rows += [ray("B", values=ONE | {"off the recorded": 2.9}, goals=goals)]
@@ -64,48 +64,50 @@ def test_a_missed_goal_is_shown_beside_the_number_and_fails_nothing():
 # The page ----------------------------------------------------------------------------------------------------------
 
 
-def stored(case, backward, title="A", verdict="pass", **more):
+def stored_rays(case, backward, title="A", verdict="pass", **more):
     values = {per_ray.BACKWARD: backward, "worst rad": 1e-7}
     row = {"study": per_ray.NAME, "subject": title, "case": case, "setting": "f32", "values": values}
     return row | {"verdict": verdict, "reason": "said", "replay": REPLAY} | more
 
 
-def seen(title, verdict, row="pass"):
+def stored_image(title, verdict, row="pass"):
     cell = {"study": rendered_images.NAME, "subject": title, "case": "sphere", "setting": "64²"}
     cell |= {"values": {"mean difference": 1e-4}, "replay": {"verdict": verdict}}
     return cell | {"verdict": row, "reason": f"{verdict}: why"}
 
 
-def test_systems_are_in_the_order_of_how_far_they_are_from_right():
-    rows = [stored("random", 3.0, "far"), stored("random", 1.0, "near"), stored(LARGE, 900.0, "near")]
-    rows += [stored("random", 0.5, "wrong", "fail"), stored("random", 1.0, "both"), stored(LARGE, 2.0, "both")]
-    page = matrix.of_rows([*rows, stored("random", "inf", "none")])
-    assert [each["system"] for each in page["rays"]] == ["both", "near", "far", "none", "wrong"]
-    said = {each["system"]: each["sentence"] for each in page["rays"]}
-    assert said["far"] == "right in every set; known" and said["wrong"] == "wrong: random; known"
-    assert said["near"] == f"exact only for inputs more than 8 roundings off: {LARGE} (up to 900); known"
-    images = matrix.of_rows([seen("A", "equal"), seen("B", "inconclusive"), seen("C", "different", "fail")])["images"]
-    assert [(each["system"], each["wrong"]) for each in images] == [("A", False), ("B", False), ("C", True)]
-    assert [each["sentence"].partition(":")[0] for each in images][1:] == ["inconclusive", "different"]
+def test_systems_are_sorted_by_their_errors():
+    rows = [stored_rays("random", 3.0, "far"), stored_rays("random", 1.0, "near"), stored_rays(LARGE, 900.0, "near")]
+    rows += [stored_rays("random", 0.5, "wrong", "fail")]
+    rows += [stored_rays("random", 1.0, "both"), stored_rays(LARGE, 2.0, "both")]
+    systems = matrix.of_rows([*rows, stored_rays("random", "inf", "none")])["rays"]
+    assert [system["system"] for system in systems] == ["both", "near", "far", "none", "wrong"]
+    sentences = {system["system"]: system["sentence"] for system in systems}
+    assert sentences["far"] == "right in every set; known" and sentences["wrong"] == "wrong: random; known"
+    assert sentences["near"] == f"exact only for inputs more than 8 roundings off: {LARGE} (up to 900); known"
+    rows = [stored_image("A", "equal"), stored_image("B", "inconclusive"), stored_image("C", "different", "fail")]
+    renderers = matrix.of_rows(rows)["images"]
+    assert [(x["system"], x["wrong"]) for x in renderers] == [("A", False), ("B", False), ("C", True)]
+    assert [x["sentence"].partition(":")[0] for x in renderers][1:] == ["inconclusive", "different"]
 
 
-def test_the_command_writes_the_page_and_the_data_or_says_that_there_are_no_rows(tmp_path, capsys):
+def test_the_command_writes_page_and_data_or_reports_missing_rows(tmp_path, capsys):
     html, data = tmp_path / "p.html", tmp_path / "p.json"
     words = ["renderers", "--page", str(html), "--json", str(data), "--out", str(tmp_path)]
     contents = (None, "no such file"), ("{", "no rows of a"), ('{"rows": [{"study": "x"}]}', "of other sys")
-    for content, said in contents:
+    for content, message in contents:
         if content:
             (tmp_path / "rows.json").write_text(content)
         assert command.main(words) == 2
-        assert said in capsys.readouterr().err and not html.exists()
-    rows = [stored("random", 1.0), stored("random", math.nan, "<b>", "fail")]
-    rows += [seen("R", "equal"), seen("I", "inconclusive")]
-    rows.append(stored("every set", 0.0, "absent", "not run", values={}, reason="install it"))
+        assert message in capsys.readouterr().err and not html.exists()
+    rows = [stored_rays("random", 1.0), stored_rays("random", math.nan, "<b>", "fail")]
+    rows += [stored_image("R", "equal"), stored_image("I", "inconclusive")]
+    rows.append(stored_rays("every set", 0.0, "absent", "not run", values={}, reason="install it"))
     (tmp_path / "rows.json").write_text(json.dumps({"rows": rows}).replace("NaN", '"nan"'))
     assert command.main(words) == 0
-    found = json.loads(data.read_text())
-    assert [each["system"] for each in found["rays"]] == ["A", "<b>"] and found["schema"] == 1
-    assert found["not_run"] == [{"system": "absent", "precision": "f32", "reason": "install it"}]
+    written = json.loads(data.read_text())
+    assert [system["system"] for system in written["rays"]] == ["A", "<b>"] and written["schema"] == 1
+    assert written["not_run"] == [{"system": "absent", "precision": "f32", "reason": "install it"}]
     page = html.read_text()
     assert "&lt;b&gt;" in page and "install it" in page and "src=" not in page
     assert '<td class="missed">inconclusive: +0.01%</td>' in page and '<td class="pass">equal: +0.01%</td>' in page

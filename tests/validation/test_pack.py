@@ -1,4 +1,4 @@
-"""The reference pack: the same bytes again, complete, usable without our package; and the way back from answers."""
+"""The reference pack: reproducible, complete, usable without our package; and results from answers to it."""
 
 import hashlib
 import json
@@ -29,7 +29,7 @@ SINGLE = ("-DREAL=float", "-DU=0x1p-24")
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory):
-    """An archive that a process of its own wrote."""
+    """An archive, written by another process."""
     pytest.importorskip("trimesh", reason="glTF needs trimesh")
     if reason := backend.usable_variants()["llvm_ad_rgb"]:
         pytest.skip(f"a pack is rendered in llvm_ad_rgb: {reason}")
@@ -48,7 +48,7 @@ def archive(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def unpacked(archive, tmp_path_factory):
-    """Its folder, not to be changed."""
+    """The unpacked archive, which tests must not change."""
     folder = tmp_path_factory.mktemp("unpacked")
     zipfile.ZipFile(archive).extractall(folder)
     return next(folder.iterdir())
@@ -56,14 +56,14 @@ def unpacked(archive, tmp_path_factory):
 
 @pytest.fixture
 def pack(unpacked, tmp_path, monkeypatch):
-    """A copy of it, the working folder."""
+    """A copy of the unpacked archive, as working folder."""
     shutil.copytree(unpacked, tmp_path / "pack")
     monkeypatch.chdir(tmp_path / "pack")
     return tmp_path / "pack"
 
 
 def compiled(source, *options):
-    """The path of a C program, compiled here."""
+    """Compile a C program and return its path."""
     if not shutil.which("gcc"):
         pytest.skip("no gcc in PATH")
     words = ["gcc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-O2", *options, "-o", "program", source, "-lm"]
@@ -71,7 +71,7 @@ def compiled(source, *options):
     return "./program"
 
 
-def test_the_same_versions_give_the_same_bytes_with_progress(archive, tmp_path, capfd, llvm_variant):
+def test_packs_are_reproducible_and_writing_reports_progress(archive, tmp_path, capfd, llvm_variant):
     assert validation.main([*QUICK, str(tmp_path)]) == 0
     (path,) = tmp_path.iterdir()
     assert path.name == archive.name and path.read_bytes() == archive.read_bytes()
@@ -119,7 +119,7 @@ def test_images_have_variances_and_looks_have_16_bits(unpacked):
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 @pytest.mark.parametrize("mistake", [("", ""), ("ray.n_from / (REAL)ray.n_to", "ray.n_to / (REAL)ray.n_from")])
-def test_a_program_in_c_is_judged_as_by_us(pack, run, precision, mistake):
+def test_the_c_program_judges_as_rays_check_does(pack, run, precision, mistake):
     source = pack / "programs" / "check_rays.c"
     text = source.read_text()
     code = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
@@ -131,11 +131,11 @@ def test_a_program_in_c_is_judged_as_by_us(pack, run, precision, mistake):
     (pack.parent / "answers.csv").write_bytes(done.stdout)
     out = pack.parent / "out.json"
     status = run("rays", "check", pack.parent / "answers.csv", "--rays", f"rays/{precision}.csv", "--json", out)[0]
-    (found,) = json.loads(out.read_text())["functions"]
+    (ours,) = json.loads(out.read_text())["functions"]
     wrong, within, right = map(int, re.findall(r"\d+", done.stderr.decode()))
     assert (status, done.returncode) == (1, 1) if mistake[0] else (0, 0)
-    assert (wrong, within, right) == (found["wrong"], 104 - found["wrong"] - found["right"], found["right"])
-    # Of another number of rays, or of another set, there is no verdict.
+    assert (wrong, within, right) == (ours["wrong"], 104 - ours["wrong"] - ours["right"], ours["right"])
+    # Rays and certified answers of different sets or numbers fail.
     Path("few.csv").write_text("".join(Path(f"rays/{precision}.csv").read_text().splitlines(keepends=True)[:40]))
     for names in (
         ("rays/f32.csv", "README.md"),
@@ -153,7 +153,7 @@ def test_the_program_of_the_readme_reads_the_rays(pack):
     assert len(out.splitlines()) == 104 and out.startswith("ray 0: k = ")
 
 
-def test_the_javascript_of_the_readme_answers_rightly(pack, run):
+def test_the_javascript_of_the_readme_is_right(pack, run):
     if not shutil.which("node"):
         pytest.skip("no node in PATH")
     (text,) = blocks(pack / "README.md", "js")
@@ -169,12 +169,12 @@ def test_the_glsl_of_the_readme_compiles(pack):
     assert subprocess.run(["glslangValidator", "read.comp"], timeout=60).returncode == 0
 
 
-# The way back ---------------------------------------------------------------------------------------------------------
+# Results from answers -------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def answers(pack):
-    """A folder with right answers to the rays of f64, and images like the pack's."""
+    """A folder with right answers to the f64 rays, and copies of the pack's images."""
     folder = pack.parent / "mine"
     shutil.copytree(pack / "images", folder / "my_images")
     with np.load("rays/certified-f64.npz") as exact:
@@ -184,7 +184,7 @@ def answers(pack):
     return folder
 
 
-def test_results_name_pack_and_answers_and_can_be_repeated(pack, answers, run):
+def test_results_name_pack_and_answers_and_are_reproducible(pack, answers, run):
     page, texts = DOCS / "how-to/use-the-reference-pack.md", []
     commands = [line for block in blocks(page, "bash") for line in block.splitlines() if line.startswith("mi-refract ")]
     shutil.copytree(answers, ".", dirs_exist_ok=True)
@@ -194,26 +194,26 @@ def test_results_name_pack_and_answers_and_can_be_repeated(pack, answers, run):
             texts.append(Path(line.split()[-1]).read_text())
     assert len(commands) == 2 and texts[0] == texts[1] and texts[2] == texts[3]
     index = hashlib.sha256(Path(INDEX).read_bytes()).hexdigest()
-    of_rays, of_images = json.loads(texts[0]), json.loads(texts[2])
-    assert of_rays["pack"] == {"version": of_rays["version"], "sha256": index, "path": "rays/f64.csv"}
-    assert [of_rays["command"], of_images["command"]] == commands
-    assert (of_images["version"], of_images["pack"]) == (of_rays["version"], of_rays["pack"] | {"path": "images"})
+    rays, images = json.loads(texts[0]), json.loads(texts[2])
+    assert rays["pack"] == {"version": rays["version"], "sha256": index, "path": "rays/f64.csv"}
+    assert [rays["command"], images["command"]] == commands
+    assert (images["version"], images["pack"]) == (rays["version"], rays["pack"] | {"path": "images"})
     digest = hashlib.sha256(Path("answers.csv").read_bytes()).hexdigest()
-    assert of_rays["functions"][0]["answers_sha256"] == digest
-    for entry in msgspec.convert(of_images, results_file.Document).results:
+    assert rays["functions"][0]["answers_sha256"] == digest
+    for entry in msgspec.convert(images, results_file.Document).results:
         assert entry.digests.test == hashlib.sha256(Path(entry.test).read_bytes()).hexdigest()
-    # `run` judges the same bytes, and outside of a pack there is none.
+    # `rays run` judges the same bytes; outside of a pack, results name no pack.
     command = (sys.executable, "-c", "print(open('answers.csv').read(), end='')")
     assert run("rays", "run", "--rays", "rays/f64.csv", "--json", "r.json", "--", *command)[0] == 0
     again = json.loads(Path("r.json").read_text())
-    assert (again["functions"][0]["answers_sha256"], again["pack"]) == (digest, of_rays["pack"])
+    assert (again["functions"][0]["answers_sha256"], again["pack"]) == (digest, rays["pack"])
     shutil.copy("rays/f64.csv", pack.parent)
     assert run("rays", "check", "answers.csv", "--rays", pack.parent / "f64.csv", "--json", "r.json")[0] == 0
     assert json.loads(Path("r.json").read_text())["pack"] is None
 
 
 def edited(name, change=lambda text: text + b" "):
-    """What changes a file of the pack."""
+    """Return a function that changes a file of the pack."""
 
     def edit(pack, answers):
         (pack / name).write_bytes(change((pack / name).read_bytes()))
@@ -225,7 +225,7 @@ def of_another_pack(pack, answers):
     (answers / INDEX).write_bytes((pack / INDEX).read_bytes().replace(b'"quick": true', b'"quick": false'))
 
 
-BAD = {  # by what the error says
+BAD = {  # error message → the defect
     "numbers/standard_numbers.csv: damaged or edited: its SHA-256": edited("numbers/standard_numbers.csv"),
     "looks/prism.png: damaged or edited": edited("looks/prism.png", lambda text: text[:-9]),
     "scene.xml: missing, or not a file": lambda pack, _: (pack / "scenes/prism/mitsuba/scene.xml").unlink(),
@@ -243,7 +243,7 @@ BAD = {  # by what the error says
 
 
 @pytest.mark.parametrize("message", BAD)
-def test_a_pack_that_is_not_as_it_was_published_is_refused(message, pack, answers, run):
+def test_changed_packs_are_rejected(message, pack, answers, run):
     BAD[message](pack, answers)
     out = pack.parent / "out.json"
     for words in (
@@ -251,12 +251,12 @@ def test_a_pack_that_is_not_as_it_was_published_is_refused(message, pack, answer
         ("diff", "images", answers / "my_images"),
         ("diff", "images/prism.exr", answers / "my_images/prism.exr"),
     ):
-        code, said, error = run(*words, "--json", out)
-        assert (code, said, error.count("\n")) == (2, "", 1) and message in error
+        code, printed, error = run(*words, "--json", out)
+        assert (code, printed, error.count("\n")) == (2, "", 1) and message in error
         assert not out.exists()
 
 
-def test_references_that_are_not_the_pack_s_are_refused(pack, answers, run):
+def test_references_added_to_a_pack_are_rejected(pack, answers, run):
     shutil.copy("images/prism.exr", "images/added.exr")
     code, _, error = run("diff", "images", answers / "my_images")
     assert (code, "images/added.exr: not a file of the pack" in error) == (2, True)
@@ -266,22 +266,22 @@ def test_no_image_is_accepted_into_a_pack(pack, answers, run):
     shutil.copy("images/prism.exr", answers / "my_images/sphere.exr")
     code, _, error = run("accept", "images", answers / "my_images", "--yes")
     assert (code, "images: in a reference pack" in error) == (2, True)
-    assert run("diff", "images", answers / "my_images")[0] == 1  # the pack is whole
+    assert run("diff", "images", answers / "my_images")[0] == 1  # the pack is unchanged
 
 
-def test_a_copy_of_the_index_says_what_answers_are_to_and_makes_no_pack_of_them(pack, answers, run):
+def test_a_copy_of_the_index_beside_answers_names_their_pack_but_is_no_pack(pack, answers, run):
     shutil.copy(INDEX, answers)
     assert run("diff", "images", answers / "my_images", "--json", "to_the_pack.json")[0] == 0
     assert run("diff", answers / "my_images", "images", "--json", "to_mine.json")[0] == 0
-    found = [json.loads(Path(f"{name}.json").read_text())["pack"] for name in ("to_the_pack", "to_mine")]
-    assert found[0]["path"] == "images" and found[1] is None
+    packs = [json.loads(Path(f"{name}.json").read_text())["pack"] for name in ("to_the_pack", "to_mine")]
+    assert packs[0]["path"] == "images" and packs[1] is None
 
 
-def test_answers_to_the_rays_of_another_pack_are_refused(pack, answers, run):
+def test_answers_to_the_rays_of_another_pack_are_rejected(pack, answers, run):
     text = (answers / "answers.csv").read_text()
     (answers / "answers.csv").write_text(f"# checksum: sha256:{'0' * 64}\n{text}")
     code, _, error = run("rays", "check", answers / "answers.csv", "--rays", "rays/f64.csv", "--json", "r.json")
-    assert (code, "the answers are to rays with the checksum" in error) == (2, True) and not Path("r.json").exists()
+    assert (code, "the answers belong to rays with the checksum" in error) == (2, True) and not Path("r.json").exists()
 
 
 # The command ----------------------------------------------------------------------------------------------------------
@@ -296,7 +296,7 @@ def test_answers_to_the_rays_of_another_pack_are_refused(pack, answers, run):
         (("-o", ".", "--quik"), "No such option: --quik"),
     ],
 )
-def test_misuse_of_the_command(words, message, tmp_path, monkeypatch, capfd):
+def test_misuse_is_one_line_and_exit_code_2(words, message, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     Path("file").write_text("")
     assert validation.main(["pack", *words]) == 2
@@ -305,10 +305,13 @@ def test_misuse_of_the_command(words, message, tmp_path, monkeypatch, capfd):
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_ctrl_c_leaves_nothing(tmp_path, needs_variant):
+def test_ctrl_c_leaves_no_files(tmp_path, needs_variant):
     needs_variant("llvm_ad_rgb")
     pytest.importorskip("trimesh", reason="glTF needs trimesh")
-    words = [sys.executable, "-m", "validation", "pack", "-o", tmp_path]
+    module = "runpy.run_module('validation', run_name='__main__', alter_sys=True)"
+    # The background jobs of a shell ignore SIGINT.
+    code = f"import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); {module}"
+    words = [sys.executable, "-c", code, "pack", "-o", tmp_path]
     with subprocess.Popen(words, cwd=ROOT, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True) as started:
         assert "1 of 12: rays in f32" in started.stderr.readline()
         started.send_signal(signal.SIGINT)

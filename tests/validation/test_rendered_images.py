@@ -1,4 +1,4 @@
-"""Images by other renderers: what is said of one that agrees, of one that does not, and of one that is not there."""
+"""Images by other renderers: verdicts on renderers that agree, that differ, and that are not installed."""
 
 import dataclasses
 import re
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.usefixtures("llvm_variant")
 
 @pytest.fixture
 def context(tmp_path, monkeypatch):
-    """Of the full profile, where everything is installed and images are small."""
+    """A context of the profile `full`, with all renderers reported as installed, and small images."""
     monkeypatch.setattr(environments, "absent", lambda system: "")
     monkeypatch.setitem(rendered_images.SIZES, "full", SMALL)
     monkeypatch.setitem(spectral_lines.SIZES, "full", Size(32, 64, 4, 0.3))
@@ -42,7 +42,7 @@ NOT_DRAWN = [(environments.Unable("no browser"), "not run"), (environments.Broke
 
 
 def denser(plain):
-    """Another index: Mitsuba's own glass in a scene that is a little different."""
+    """The scene with another index of its glass."""
     glasses = [
         dataclasses.replace(x.material, int_ior=2.0) if isinstance(x.material, Glass) else x.material
         for x in plain.meshes
@@ -57,7 +57,7 @@ def wider(plain):
 
 @pytest.fixture
 def judged(context, monkeypatch):
-    """`judged(change)`: the row of a renderer that draws the prism so changed by Mitsuba's `dielectric`."""
+    """`judged(change)`: the row of a renderer that renders the changed prism by Mitsuba's `dielectric`."""
 
     def judge(change=lambda plain: plain, title="Radiance", draw=None):
         path = IMAGE_RENDERERS["Mitsuba, volpath"].draw
@@ -70,7 +70,7 @@ def judged(context, monkeypatch):
     return judge
 
 
-def test_the_same_scene_is_equal_another_one_is_not_and_noise_that_hides_it_is_no_pass(judged, monkeypatch):
+def test_verdicts_on_equal_different_and_noisy_images(judged, monkeypatch):
     row = judged()
     assert (row.verdict, row.replay["verdict"], row.missed) == ("pass", "equal", {})
     assert row.values["RMSE / noise"] == pytest.approx(1, abs=0.1)
@@ -78,10 +78,10 @@ def test_the_same_scene_is_equal_another_one_is_not_and_noise_that_hides_it_is_n
     for change in (denser, wider):
         row = judged(change)
         assert (row.verdict, row.replay["verdict"]) == ("fail", "different") and row.values["tests that differ"] > 0
-    assert judged(draw=IMAGE_RENDERERS[rendered_images.PTRACER].draw).verdict == "fail"  # sees nothing through glass
-    assert judged(title=THREE).broken == {"not seen to differ": 0.0}  # who is known to differ must be seen to
-    seen = judged(denser, THREE)
-    assert seen.verdict == "pass" and rendered_images.WHY[THREE] in seen.reason
+    assert judged(draw=IMAGE_RENDERERS[rendered_images.PTRACER].draw).verdict == "fail"  # its glass is black
+    assert judged(title=THREE).broken == {"not seen to differ": 0.0}  # a known difference must be detected
+    row = judged(denser, THREE)
+    assert row.verdict == "pass" and rendered_images.WHY[THREE] in row.reason
     monkeypatch.setitem(rendered_images.SIZES, "full", dataclasses.replace(SMALL, wanted=1e-3))
     row = judged()
     assert row.replay["verdict"] == "inconclusive" and row.missed[INCONCLUSIVE] == 0
@@ -90,20 +90,20 @@ def test_the_same_scene_is_equal_another_one_is_not_and_noise_that_hides_it_is_n
     assert INCONCLUSIVE not in judged(denser).missed
 
 
-def test_what_does_not_render_or_is_not_finite_is_never_a_pass(judged, monkeypatch):
-    def spoilt(*given):
-        drawn = IMAGE_RENDERERS["Mitsuba, volpath"].draw(*given)
-        drawn[0].pixels[3, 4] = np.nan
-        return drawn
+def test_failed_renders_and_nan_never_pass(judged, monkeypatch):
+    def draw_nan(*arguments):
+        images = IMAGE_RENDERERS["Mitsuba, volpath"].draw(*arguments)
+        images[0].pixels[3, 4] = np.nan
+        return images
 
-    row = judged(draw=spoilt)
+    row = judged(draw=draw_nan)
     assert row.verdict == "fail" and "NaN" in row.reason
     for error, verdict in (*NOT_DRAWN, (ValueError("a diffuse surface"), "not run")):
         row = judged(draw=raising(error))
         assert row.verdict == verdict and str(error) in row.reason
-    monkeypatch.setattr(environments, "absent", lambda system: "the command that brings it")
-    row = judged(draw=raising(AssertionError("asked all the same")))
-    assert (row.verdict, row.reason) == ("not run", "the command that brings it")
+    monkeypatch.setattr(environments, "absent", lambda system: "the command that installs it")
+    row = judged(draw=raising(AssertionError("it was run")))
+    assert (row.verdict, row.reason) == ("not run", "the command that installs it")
 
 
 NO_VALIDATOR = environments.absent(SYSTEMS[exports.VALIDATOR])
@@ -119,7 +119,7 @@ DEFECTS = {
 
 
 @pytest.mark.parametrize("title", [title for title in IMAGE_RENDERERS if title not in exports.LEFT_OUT])
-def test_an_export_is_rendered_as_mitsuba_renders_the_scene(title, tmp_path):
+def test_installed_renderers_render_the_exports_as_mitsuba_does(title, tmp_path):
     if reason := environments.absent(SYSTEMS[IMAGE_RENDERERS[title].system]):
         pytest.skip(f"{title}: {reason}")
     (row,) = exports.rows(Context(PROFILES["full"], tmp_path, "llvm_ad_rgb", {}, {}), title)
@@ -127,15 +127,15 @@ def test_an_export_is_rendered_as_mitsuba_renders_the_scene(title, tmp_path):
 
 
 @pytest.mark.parametrize("defect", DEFECTS)
-def test_a_defect_of_an_export_is_seen(defect, monkeypatch, tmp_path):
-    """Also with an eighth of the samples: noise makes the allowance larger."""
+def test_defects_of_an_export_are_detected(defect, monkeypatch, tmp_path):
+    """With an eighth of the samples, for which the allowance is larger."""
     if reason := environments.absent(SYSTEMS["radiance"]):
         pytest.skip(reason)
     make, (name, pattern, new) = targets.TARGETS["radiance"], DEFECTS[defect]
 
     def files(plain):
-        made = make(plain)
-        return made | {name: re.sub(pattern, new, made[name].decode()).encode()}
+        exported = make(plain)
+        return exported | {name: re.sub(pattern, new, exported[name].decode()).encode()}
 
     monkeypatch.setitem(targets.TARGETS, "radiance", files)
     monkeypatch.setattr(exports, "THEIRS", {title: spp // 8 for title, spp in exports.THEIRS.items()})
@@ -147,25 +147,26 @@ def renders(seed, mean=1.0, noise=0.02):
     return mean + noise * np.random.default_rng(seed).normal(size=(4, 9, 16, 3))
 
 
-def test_what_is_allowed_is_noise_and_one_percent(context, monkeypatch):
+def test_the_allowance_of_exports_is_noise_and_one_percent(context, monkeypatch):
     over = lambda *pair: exports.compared(*pair)[exports.OVER]  # noqa: E731
     assert max(over(renders(1), renders(2)), over(renders(1), renders(2, mean=1.008))) < 1
     assert over(renders(1), renders(2, mean=1.06)) > 1
     values = exports.compared(renders(1, noise=0.1), renders(2, noise=0.1))
     assert values[exports.OVER] < 1 and values[exports.NOISE] > limits.EXPORT_NOISE
-    spoilt = renders(2)
-    spoilt[0, 3, 4] = np.nan
+    with_nan = renders(2)
+    with_nan[0, 3, 4] = np.nan
     monkeypatch.setattr(exports, "reference", lambda shown: renders(1))
-    for draw, verdict in ((lambda title: spoilt, "fail"), *((raising(error), verdict) for error, verdict in NOT_DRAWN)):
+    draws = (lambda title: with_nan, "fail"), *((raising(error), verdict) for error, verdict in NOT_DRAWN)
+    for draw, verdict in draws:
         monkeypatch.setattr(exports, "drawn", draw)
         assert [row.verdict for row in exports.rows(context, "Radiance")] == [verdict]
 
 
-def test_the_scene_is_not_symmetric():
-    """Otherwise what is mirrored or upside down would look the same: differences above what is allowed."""
+def test_the_scene_of_exports_is_not_symmetric():
+    """A mirrored or rotated image differs by more than is allowed."""
     image = exports.reference("no patch")
-    for other in (image[:, ::-1], image[:, :, ::-1], image[:, ::-1, ::-1]):
-        assert exports.compared(image, other)[exports.OVER] > 2
+    for mirrored in (image[:, ::-1], image[:, :, ::-1], image[:, ::-1, ::-1]):
+        assert exports.compared(image, mirrored)[exports.OVER] > 2
 
 
 @pytest.mark.skipif(NO_VALIDATOR != "", reason=NO_VALIDATOR)
@@ -180,8 +181,8 @@ def test_the_scene_is_not_symmetric():
         ("furnace", b"", b"", "not run"),
     ],
 )
-def test_khronos_validator_sees_a_value_out_of_range(scene, old, new, verdict, context, monkeypatch, tmp_path):
-    """A scene that glTF cannot hold says so."""
+def test_khronos_validator_detects_invalid_gltf(scene, old, new, verdict, context, monkeypatch, tmp_path):
+    """A scene that glTF cannot represent is not run, with the reason."""
     for name in ("meshes", f"{scene}.xml") if scene != "lamps" else ():
         (tmp_path / name).symlink_to(exports.SCENES / name)
     make = targets.TARGETS["gltf"]
@@ -198,10 +199,10 @@ def test_khronos_validator_sees_a_value_out_of_range(scene, old, new, verdict, c
 
 
 def stripe(seed, noise, shift, line):
-    """Four renders of a bright stripe, at a place of the line's own."""
-    rng, place = np.random.default_rng(seed), 9 + shift + {"C": 0, "d": 4, "F": 12}[line]
-    pixels = (0.1 + (np.abs(np.arange(32) - place) < 3)) * (1 + noise * rng.normal(size=(4, 32, 32)))
-    return [image_file.named(f"{seed} {i}", each[..., None].astype(np.float32)) for i, each in enumerate(pixels)]
+    """Four renders of a bright stripe, at a different position for each line."""
+    rng, position = np.random.default_rng(seed), 9 + shift + {"C": 0, "d": 4, "F": 12}[line]
+    images = (0.1 + (np.abs(np.arange(32) - position) < 3)) * (1 + noise * rng.normal(size=(4, 32, 32)))
+    return [image_file.named(f"{seed} {i}", image[..., None].astype(np.float32)) for i, image in enumerate(images)]
 
 
 @pytest.mark.parametrize(
@@ -213,7 +214,7 @@ def stripe(seed, noise, shift, line):
         (0.01, {"C": 4, "F": -8}, ["fail", "pass", "fail", "fail", "fail"]),  # as if dispersion were left out
     ],
 )
-def test_the_same_at_each_line_passes_and_a_mixture_is_seen(noise, shifts, verdicts, context, monkeypatch):
+def test_equal_lines_pass_and_shifted_or_mixed_lines_fail(noise, shifts, verdicts, context, monkeypatch):
     monkeypatch.setattr(spectral_lines, "ours", lambda line, size: stripe(1, noise, 0, line))
     monkeypatch.setattr(spectral_lines, "theirs", lambda line, size: stripe(2, noise, shifts.get(line, 0), line))
     rows = [row for task in spectral_lines.tasks(context) for row in task.run()]
@@ -224,8 +225,8 @@ def test_the_same_at_each_line_passes_and_a_mixture_is_seen(noise, shifts, verdi
         assert spectral_lines.line_rows(context, "C")[0].verdict == verdict
 
 
-def test_the_scene_is_grey_its_glass_raysects_and_another_index_is_seen(needs_variant):
-    """Indices as raysect 0.9 gave them; another index is another image. The sky is as bright as it is in each line."""
+def test_the_scene_of_spectral_lines_is_grey_has_raysects_glass_and_differs_between_lines(needs_variant):
+    """Indices are those of raysect 0.9. The sky has its radiance in each line."""
     plain = spectral_lines.plain(16)
     colours = [mesh.material.reflectance for mesh in plain.meshes if isinstance(mesh.material, Diffuse)]
     colours += [mesh.material.radiance for mesh in plain.meshes if isinstance(mesh.material, Light)]

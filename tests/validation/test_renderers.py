@@ -1,4 +1,4 @@
-"""Other systems: what is wrong with one of them never passes, and what is absent says what would bring it."""
+"""Other systems: wrong answers never pass, and absent systems report the command that installs them."""
 
 import ast
 import dataclasses
@@ -30,10 +30,10 @@ from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 from validation.suite.renderers.system import SCRIPTS, SYSTEMS_FOLDER, Install, join
 
 QUICK, FULL = (Context(PROFILES[name], Path(), "llvm_ad_rgb", {}, {}) for name in ("quick", "full"))
-# The figures of those who write down GLSL's formula.
+# The recorded errors of GLSL's formula.
 PYGLM = next(call for call in SYSTEMS["pyglm"].calls if call.precision == "f64")
 RECORDED = {name: list(PYGLM.recorded_range(name)) for name in PYGLM.recorded}
-# What every program below does right unless `before` or `after` spoil it.
+# A correct program, unless `before` or `after` plant a defect.
 PROGRAM = f"""
 import os, sys, time
 sys.path.insert(0, {str(SCRIPTS)!r})
@@ -53,7 +53,7 @@ DEFECTS = {
     "no direction": ("", "b[7] = np.nan", "wrong", ""),
     "a set left out": ("", "rays.ids, b = rays.ids[:40], b[:40]", "unfit", ""),
     "an id missing": ("", "rays.ids, b = rays.ids[1:], b[1:]", "unfit", "id 0"),
-    "told by NaN": ("", "b = np.where(d < 0, np.nan, b)", "other TIR signal", ""),
+    "signalled by NaN": ("", "b = np.where(d < 0, np.nan, b)", "other TIR signal", ""),
     "exception": (
         "raise RuntimeError('out of glass')",
         "",
@@ -69,17 +69,17 @@ DEFECTS = {
 
 @pytest.fixture
 def few(monkeypatch):
-    """Sets of forty rays, of those that other systems are asked."""
+    """Sets of forty rays each."""
     smaller = {name: dataclasses.replace(kind, count=40) for name, kind in per_ray.SETS.items()}
     monkeypatch.setattr(per_ray, "SETS", smaller)
-    per_ray.given.cache_clear()
+    per_ray.all_rays.cache_clear()
     yield
-    per_ray.given.cache_clear()
+    per_ray.all_rays.cache_clear()
 
 
 @pytest.fixture
 def rows_of(few, tmp_path):
-    """`rows_of(before, after)`: what the study makes of such a program."""
+    """`rows_of(before, after)`: the rows of such a program."""
 
     def run(before="", after="", recorded=RECORDED, gives_up=0.0):
         path = tmp_path / "program.py"
@@ -98,7 +98,7 @@ def test_right_answers_pass_and_a_small_error_of_the_normal_fails(rows_of):
     assert [(row.case, row.verdict) for row in rows] == [(name, "pass") for name in per_ray.SETS]
     assert all(row.reason == "a program 1.0; total internal reflection: zero" for row in rows)
     assert all("worst rad" in row.values for row in rows if row.case != TOTAL)
-    rays = per_ray.given("f64")
+    rays = per_ray.all_rays("f64")
     exact = oracle.refract(rays.rays.a, rays.rays.n, rays.rays.k, fresnel=False, progress=False)
     through = {name: exact.transmitted[rays.regime == name].mean() for name in per_ray.SETS}
     assert (through["grazing"], through[TOTAL]) == (1, 0) and through["near-critical"] > 0.9
@@ -107,8 +107,8 @@ def test_right_answers_pass_and_a_small_error_of_the_normal_fails(rows_of):
     assert {row.case for row in off if row.verdict == "fail"} >= {"random", "grazing"}
 
 
-def test_a_length_counts_as_a_direction_does(rows_of):
-    """Right directions, and lengths that the bound of a textbook's formula allows where k is large."""
+def test_errors_of_length_count_as_backward_errors(rows_of):
+    """Right directions, with lengths that the bound of the textbook formula allows for large k."""
     wide = "k, a, n = (x.astype(np.longdouble) for x in (k, a, n))"
     unit = "a, n = (x / np.sqrt((x * x).sum(1, keepdims=True)) for x in (a, n))"
     for factor, missed in ((0, set()), (1e-10, {LARGE})):
@@ -118,17 +118,17 @@ def test_a_length_counts_as_a_direction_does(rows_of):
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-def test_the_random_rays_are_those_of_before_any_result(precision):
-    """None is left out: rays near the critical angle stay where they were drawn."""
+def test_the_random_rays_never_changed(precision):
+    """No ray is left out, not even near the critical angle."""
     count, dtype = 10_000, PRECISIONS[precision]
     rng = np.random.default_rng([2040, 0])
     n = regimes.normalised(rng.normal(size=(count, 3))).astype(dtype)
     cosine, k = rng.uniform(0, 1, count), 1.5 ** rng.choice([-1.0, 1.0], count)
     across = np.cross(n.astype(float), rng.normal(size=n.shape))
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    rays = per_ray.given(precision)
+    rays = per_ray.all_rays(precision)
     rays = rays.rays[rays.regime == per_ray.RANDOM]
-    behind = (rays.a * n).sum(1, keepdims=True) > 0  # there the normal is turned: all face the ray
+    behind = (rays.a * n).sum(1, keepdims=True) > 0  # these normals are reversed to face the ray
     np.testing.assert_array_equal(rays.n, np.where(behind, -n, n))
     np.testing.assert_array_equal(rays.k, k.astype(dtype))
     tolerance, sine = 8 * np.finfo(dtype).eps, np.sqrt(1 - cosine**2)
@@ -151,17 +151,17 @@ def test_frames_are_rotations_onto_the_normal(monkeypatch):
 
 
 @pytest.mark.parametrize("name", DEFECTS)
-def test_a_broken_program_fails_for_its_reason(name, rows_of, monkeypatch):
+def test_broken_programs_fail_with_the_reason(name, rows_of, monkeypatch):
     before, after, metric, reason = DEFECTS[name]
     if name == "hangs":
         monkeypatch.setattr(environments, "TIMEOUT", 2.0)
     rows = rows_of(before, after)
     assert any(metric in row.broken for row in rows) and reason in rows[0].reason and "\n" not in rows[0].reason
-    if metric in ("unanswered", "unfit"):  # answers to other rays say nothing of any set
+    if metric in ("unanswered", "unfit"):  # unfit answers fail every set
         assert {row.verdict for row in rows} == {"fail"} and (len(rows) == 1) == (metric == "unanswered")
 
 
-def test_what_a_system_gives_up_is_counted_and_recorded_errors_are_goals_on_both_sides(rows_of):
+def test_given_up_rays_are_counted_and_recorded_errors_are_two_sided_goals(rows_of):
     early = "", "b[np.abs(d[:, 0]) < 1e-4] = 0"
     assert any(row.verdict == "fail" for row in rows_of(*early, gives_up=1e-5))
     rows = rows_of(*early, gives_up=1.01e-4)
@@ -169,26 +169,27 @@ def test_what_a_system_gives_up_is_counted_and_recorded_errors_are_goals_on_both
     for value in (1e-2, 1e-30):
         rows = [row for row in rows_of(recorded=dict.fromkeys(RECORDED, value)) if row.case in RECORDED]
         assert all(row.missed == {per_ray.OFF_RECORDED: limits.RECORDED} and row.verdict == "pass" for row in rows)
-    assert [per_ray.off(x, 2, 4) for x in (1, 2, 3, 4, 8)] == [2, 1, 1, 1, 2]
-    assert per_ray.off(0, 2, 4) == np.inf and np.isnan(per_ray.off(np.nan, 2, 4))
+    assert [per_ray.off_recorded(x, 2, 4) for x in (1, 2, 3, 4, 8)] == [2, 1, 1, 1, 2]
+    assert per_ray.off_recorded(0, 2, 4) == np.inf and np.isnan(per_ray.off_recorded(np.nan, 2, 4))
 
 
-def test_every_recorded_error_of_mitsuba_is_a_goal():
-    """So a goal that is missed cannot be taken away."""
+def test_all_errors_of_mitsuba_are_recorded():
+    """A missed goal cannot be removed unnoticed."""
     for call in SYSTEMS["mitsuba"].calls:
         assert set(call.recorded) == set(per_ray.SETS) - {TOTAL, LARGE}, call.title
 
 
-def test_what_is_absent_large_or_cannot_run_here_is_not_run_and_programs_run_without_our_environment(
-    rows_of, tmp_path, monkeypatch
-):
-    (row,) = rows_of("print('no driver', file=sys.stderr); sys.exit(77)")
-    assert (row.verdict, row.reason) == ("not run", "cannot run here: no driver")
+def test_programs_run_without_our_environment(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(SCRIPTS))
-    asked = "import os, sys; print(os.environ.get('PYTHONPATH'), sys.stdin.read())"
-    assert environments.run([sys.executable, "-c", asked], given="rays") == "None rays\n"
+    program = "import os, sys; print(os.environ.get('PYTHONPATH'), sys.stdin.read())"
+    assert environments.run([sys.executable, "-c", program], stdin="rays") == "None rays\n"
     with pytest.raises(environments.Unable, match="no no-such-program in PATH"):
         environments.ask(System("a", "A"), ("no-such-program",))
+
+
+def test_absent_large_and_unable_systems_are_not_run(rows_of, tmp_path, monkeypatch):
+    (row,) = rows_of("print('no driver', file=sys.stderr); sys.exit(77)")
+    assert (row.verdict, row.reason) == ("not run", "cannot run here: no driver")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     (row,) = per_ray.call_rows(SYSTEMS["pyglm"], PYGLM, FULL)
     assert (row.verdict, row.reason) == ("not run", "python -m validation renderers --install pyglm")
@@ -200,8 +201,8 @@ def test_what_is_absent_large_or_cannot_run_here_is_not_run_and_programs_run_wit
 @pytest.mark.parametrize(
     "name", [name for name, x in SYSTEMS.items() if x.calls and (not x.install or x.install.small)]
 )
-def test_small_systems_that_are_installed_are_right(name, few, needs_variant):
-    """Those of a driver may find none."""
+def test_installed_small_systems_pass(name, few, needs_variant):
+    """Systems that need a graphics driver may not find one."""
     if reason := environments.absent(SYSTEMS[name]):
         pytest.skip(reason)
     if name == "mi_refract":
@@ -213,25 +214,25 @@ def test_small_systems_that_are_installed_are_right(name, few, needs_variant):
 
 
 def unscaled(a, n, k):
-    """k a − (k c + √(1 − k²(1 − c²))) n of vectors of any length."""
+    """Return k a − (k c + √(1 − k²(1 − c²))) n without normalisation."""
     k, c = k[:, None], (a * n).sum(1, keepdims=True)
     return k * a - (k * c + np.sqrt(1 - k * k * (1 - c * c))) * n
 
 
-# What is said of vectors of other lengths, as the answer to a ray `a` of the length l, and to a normal of that length.
+# Text in the table → the answers to a ray `a` of the length l, and to a normal of that length.
 LENGTHS = {
-    "takes vectors of any length as they are": (
+    "uses vectors of any length without normalising them": (
         lambda a, n, k, length: unscaled(length * a, n, k),
         lambda a, n, k, length: unscaled(a, length * n, k),
     ),
-    "takes the index that a ray leaves from its speed 1/n, not from the medium": (
+    "derives the index of the medium that a ray leaves from its speed 1/n": (
         lambda a, n, k, length: unscaled(a, n, k / length),
     ),
 }
 
 
 @pytest.mark.parametrize("name", [name for name, system in SYSTEMS.items() if any(x.lengths for x in system.calls)])
-def test_vectors_of_other_lengths_are_treated_as_the_table_says(name):
+def test_systems_treat_vectors_of_other_lengths_as_stated(name):
     assert all(call.lengths in LENGTHS for call in SYSTEMS[name].calls if call.lengths)
     if reason := environments.absent(SYSTEMS[name]):
         pytest.skip(reason)
@@ -239,25 +240,25 @@ def test_vectors_of_other_lengths_are_treated_as_the_table_says(name):
     n = np.where((a * n).sum(1, keepdims=True) > 0, -n, n)
     k, length = np.full(40, 1 / 1.5), 1.1
     for call in (call for call in SYSTEMS[name].calls if call.lengths):
-        for place, meaning in enumerate(LENGTHS[call.lengths]):
-            given = (length * a, n) if place == 0 else (a, length * n)
-            rows = np.c_[np.arange(40), *given, np.ones(40), np.full(40, 1.5)].tolist()
-            text = "\n".join(["id,ax,ay,az,nx,ny,nz,n_from,n_to", *(f"{i:.0f},{str(x)[1:-1]}" for i, *x in rows)])
+        for i, expected in enumerate(LENGTHS[call.lengths]):
+            vectors = (length * a, n) if i == 0 else (a, length * n)
+            rows = np.c_[np.arange(40), *vectors, np.ones(40), np.full(40, 1.5)].tolist()
+            text = "\n".join(["id,ax,ay,az,nx,ny,nz,n_from,n_to", *(f"{id_:.0f},{str(x)[1:-1]}" for id_, *x in rows)])
             try:
-                found = parse_answers(environments.ask(SYSTEMS[name], call.command, text), call.title).b
-            except environments.Unable as why:
-                pytest.skip(f"cannot run here: {why}")
-            np.testing.assert_allclose(found, meaning(a, n, k, length), atol=1e-5 if call.precision == "f32" else 1e-12)
+                b = parse_answers(environments.ask(SYSTEMS[name], call.command, text), call.title).b
+            except environments.Unable as error:
+                pytest.skip(f"cannot run here: {error}")
+            np.testing.assert_allclose(b, expected(a, n, k, length), atol=1e-5 if call.precision == "f32" else 1e-12)
 
 
 # The table of systems ------------------------------------------------------------------------------------------
 
 
-def test_every_system_has_a_place_a_licence_scripts_and_packages_pinned_by_hashes():
-    drawing = {renderer.system for renderer in IMAGE_RENDERERS.values()}
+def test_every_system_has_a_use_a_licence_scripts_and_packages_pinned_by_hashes():
+    image_systems = {renderer.system for renderer in IMAGE_RENDERERS.values()}
     for name, system in SYSTEMS.items():
         assert name == system.name and name.isidentifier() and system.licence and system.title
-        assert system.calls or name in drawing or name == exports.VALIDATOR
+        assert system.calls or name in image_systems or name == exports.VALIDATOR
         for words in (*(call.command for call in system.calls), system.lens):
             assert all((system.folder / word).resolve().is_file() for word in words[1:2])
         install = system.install
@@ -266,16 +267,16 @@ def test_every_system_has_a_place_a_licence_scripts_and_packages_pinned_by_hashe
             lines = [line for line in lines if line and not line.startswith("#")]
             assert all(re.match(r"[\w.-]+==[\w.]+( ; [^#]+?)?( +--hash=sha256:[0-9a-f]{64})+$", line) for line in lines)
             pinned = {line.split()[0].lower() for line in lines}
-            assert "==" in install.pip[0] and {each.lower() for each in install.pip if "==" in each} <= pinned
+            assert "==" in install.pip[0] and {word.lower() for word in install.pip if "==" in word} <= pinned
         if install and install.npm:
-            asked = json.loads((environments.locked(system) / "package.json").read_text())["dependencies"]
-            assert {f"{name}@{version}" for name, version in asked.items()} == {*install.npm}
+            dependencies = json.loads((environments.locked(system) / "package.json").read_text())["dependencies"]
+            assert {f"{name}@{version}" for name, version in dependencies.items()} == {*install.npm}
             packages = json.loads((environments.locked(system) / "package-lock.json").read_text())["packages"]
-            assert packages.pop("")["dependencies"] == asked
-            assert all(each["integrity"].startswith("sha512-") for each in packages.values())
+            assert packages.pop("")["dependencies"] == dependencies
+            assert all(package["integrity"].startswith("sha512-") for package in packages.values())
 
 
-def test_scripts_import_nothing_of_ours_and_we_nothing_of_theirs():
+def test_scripts_and_this_project_do_not_import_each_other():
     def imported(path):
         nodes = list(ast.walk(ast.parse(path.read_text())))
         names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
@@ -287,14 +288,14 @@ def test_scripts_import_nothing_of_ours_and_we_nothing_of_theirs():
     theirs |= {"MaterialX", "batoid", "slangpy", "wgpu"}
     scripts = {*SCRIPTS.glob("*.py"), *(root / "mi_refract" / "scene_export" / "targets").glob("render_*.py")}
     assert len(scripts) > 9
-    for path in scripts - {SCRIPTS / "own_rays.py"}:  # this package is what it runs
+    for path in scripts - {SCRIPTS / "own_rays.py"}:  # it runs this package
         assert not imported(path) & {"mi_refract", "validation"}, path.name
     ours = {*(root / "mi_refract").rglob("*.py"), *(root / "validation").rglob("*.py")}
     for path in ours - scripts:
         assert not imported(path) & (theirs | {path.stem for path in scripts}), path.name
 
 
-def test_cycles_reads_a_gltf_export_with_the_settings_of_its_own_one(tmp_path, monkeypatch):
+def test_cycles_renders_a_gltf_export_with_the_settings_of_its_own_export(tmp_path, monkeypatch):
     pytest.importorskip("trimesh")
     bpy, camera = fake_bpy.installed(monkeypatch), SimpleNamespace(type="CAMERA", data=SimpleNamespace(clip_end=100))
     bpy.data.objects = [SimpleNamespace(type="MESH"), camera]
@@ -316,15 +317,15 @@ def test_cycles_reads_a_gltf_export_with_the_settings_of_its_own_one(tmp_path, m
     scene = bpy.context.scene
     assert scene.camera is camera and camera.data.clip_end >= 1e6
     assert (scene.cycles.samples, scene.cycles.max_bounces) == (3, plain.max_depth - 2)
-    assert not bpy.data.meshes.made  # they are the importer's
+    assert not bpy.data.meshes.made  # the importer makes the meshes
 
 
 # Installing ----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
-def elsewhere(tmp_path, monkeypatch):
-    """Another cache, and other locks for the system `thing`."""
+def own_cache(tmp_path, monkeypatch):
+    """A temporary cache and temporary locks, also of the system `thing`."""
     locks = tmp_path / "locks"
     (locks / "thing").mkdir(parents=True)
     for name in ("thing.txt", "thing/package.json", "thing/package-lock.json"):
@@ -341,7 +342,7 @@ def thing(**needs):
 
 
 @pytest.mark.parametrize(
-    ("needs", "said"),
+    ("needs", "message"),
     [
         ({"pip": ("mi-refract-no-such-thing==1",)}, "mi-refract-no-such-thing==1"),
         ({"pip": ("numpy",), "python": "2.7"}, "needs Python 2.7; expected a python2.7 in PATH"),
@@ -349,8 +350,8 @@ def thing(**needs):
         ({"apt": ("mi-refract-no-such-thing",), "program": "no-such-program"}, "apt-get"),
     ],
 )
-def test_an_installation_that_fails_is_one_line_and_leaves_the_system_absent(
-    needs, said, elsewhere, monkeypatch, capsys, tmp_path
+def test_a_failed_installation_prints_one_line_and_leaves_the_system_absent(
+    needs, message, own_cache, monkeypatch, capsys, tmp_path
 ):
     monkeypatch.setitem(SYSTEMS, "thing", thing(**needs))
     for name in ("npm", "apt-get", "sudo"):
@@ -362,11 +363,11 @@ def test_an_installation_that_fails_is_one_line_and_leaves_the_system_absent(
     assert lines == [[name, "absent" if system.install else "installed"] for name, system in SYSTEMS.items()]
     assert command.main(["renderers", "--install", "thing"]) == 1
     first, second = capsys.readouterr().err.strip().splitlines()
-    assert first.startswith("thing: ") and second.startswith("validation renderers: thing: ") and said in second
+    assert first.startswith("thing: ") and second.startswith("validation renderers: thing: ") and message in second
     assert environments.absent(SYSTEMS["thing"])
 
 
-def test_another_version_of_a_distribution_is_absent_and_not_installed(elsewhere, monkeypatch, capsys, tmp_path):
+def test_another_version_of_a_distribution_is_absent_and_not_installed(own_cache, monkeypatch, capsys, tmp_path):
     def program(name, text):
         (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
         (tmp_path / name).chmod(0o755)
@@ -374,9 +375,9 @@ def test_another_version_of_a_distribution_is_absent_and_not_installed(elsewhere
     monkeypatch.setenv("PATH", f"{tmp_path}:/bin")
     install = SYSTEMS["povray"].install
     assert install.apt == (f"povray=1:{install.version}-*",)
-    for version, here in (("3.7.0.10.unofficial", True), ("3.7.0.8", False)):
+    for version, present in (("3.7.0.10.unofficial", True), ("3.7.0.8", False)):
         program("povray", f"echo POV-Ray {version} >&2")
-        assert bool(environments.absent(SYSTEMS["povray"])) != here
+        assert bool(environments.absent(SYSTEMS["povray"])) != present
     program("apt-get", "echo \"E: Version '1:3.7.0.10-*' for 'povray' was not found\" >&2; exit 100")
     program("sudo", 'shift; exec "$@"')
     program("apt-cache", "echo 'povray | 1:3.7.0.8-5 | http://deb.debian.org/debian bullseye/main amd64 Packages'")
@@ -385,29 +386,29 @@ def test_another_version_of_a_distribution_is_absent_and_not_installed(elsewhere
     assert "'1:3.7.0.10-*' for 'povray' was not found; this distribution has povray 1:3.7.0.8-5" in line
 
 
-def test_an_installation_is_made_once_and_anew_for_another_version(elsewhere, monkeypatch):
-    done = []
-    monkeypatch.setattr(environments, "run", lambda command, **options: done.append(command) or "")
+def test_a_system_is_installed_once_and_again_for_another_version(own_cache, monkeypatch):
+    commands = []
+    monkeypatch.setattr(environments, "run", lambda command, **options: commands.append(command) or "")
     first, second = (thing(pip=(f"a=={i}",)) for i in (1, 2))
-    for system, commands in ((first, 2), (first, 2), (second, 4)):
+    for system, count in ((first, 2), (first, 2), (second, 4)):
         environments.install(system)
-        assert len(done) == commands and not environments.absent(system)
+        assert len(commands) == count and not environments.absent(system)
     assert environments.absent(first)
-    assert all({"--require-hashes", "--only-binary", "--no-deps"} < {*given} for given in done[1::2])
-    assert all(given[-2:] == ("--requirement", str(environments.locked(first))) for given in done[1::2])
+    assert all({"--require-hashes", "--only-binary", "--no-deps"} < {*words} for words in commands[1::2])
+    assert all(words[-2:] == ("--requirement", str(environments.locked(first))) for words in commands[1::2])
     marker = environments.folder(second) / "installed.json"
-    whole = marker.read_text()
+    complete = marker.read_text()
     for text in ('["no such"]', "{", ""):
         marker.write_text(text)
         assert environments.absent(second)
-    marker.write_text(whole)
+    marker.write_text(complete)
     environments.locked(first).write_text("another lock")
     assert environments.absent(second)
     environments.install(thing(npm=("a@1",)))
-    assert done[-1][:2] == ("npm", "ci") and "--ignore-scripts" in done[-1]
+    assert commands[-1][:2] == ("npm", "ci") and "--ignore-scripts" in commands[-1]
 
 
-# `--renderer FOLDER`: a stranger's renderer -----------------------------------------------------------------------
+# `--renderer FOLDER` ----------------------------------------------------------------------------------------------
 
 TOML = """title = "Mine"
 [[rays]]
@@ -430,12 +431,12 @@ mi.Bitmap(mi.render(mi.load_file(f"{scene}/scene.xml", bsdf="dielectric"), spp=i
 
 
 @pytest.fixture
-def mine(tmp_path):
-    """`mine(toml, before)`: the folder of a renderer; the tables are as they were when the test ends."""
+def renderer(tmp_path):
+    """`renderer(toml, after)`: the folder of a renderer. After the test, the tables are restored."""
     tables = SYSTEMS, IMAGE_RENDERERS
-    before = [dict(table) for table in tables]
+    saved = [dict(table) for table in tables]
 
-    def made(toml=TOML, after=""):
+    def write(toml=TOML, after=""):
         folder = tmp_path / "mine"
         folder.mkdir(exist_ok=True)
         (folder / renderer_file.NAME).write_text(toml)
@@ -443,24 +444,24 @@ def mine(tmp_path):
         (folder / "render.py").write_text(RENDER)
         return folder
 
-    yield made
-    for now, then in zip(tables, before, strict=True):
-        now.clear()
-        now.update(then)
+    yield write
+    for table, copy in zip(tables, saved, strict=True):
+        table.clear()
+        table.update(copy)
 
 
-def test_a_renderer_that_joins_is_judged_as_every_other_one(mine, few, monkeypatch, needs_variant, tmp_path):
-    """By its rays and images; a known deviation is shown and must be seen."""
+def test_a_users_renderer_is_judged_by_rays_and_images(renderer, few, monkeypatch, needs_variant, tmp_path):
+    """A known deviation is reported and must be detected."""
     needs_variant("llvm_ad_rgb")
     deviation = '[[rays.deviation]]\nregime = "grazing"\nreason = "lies flat"\n'
-    rendered_images.join(join(mine(TOML + deviation + IMAGES)))
+    rendered_images.join(join(renderer(TOML + deviation + IMAGES)))
     context = Context(PROFILES["quick"], tmp_path, "llvm_ad_rgb", {}, {})
     (task,) = (task for task in per_ray.tasks(context) if "Mine" in task.name)
     rows = {row.case: row for row in task.run()}
     flat = rows.pop("grazing")
     assert {row.verdict for row in rows.values()} == {"pass"} and flat.replay["version"] == "a program 1.0"
     assert flat.broken == {"not seen to deviate": 0.0} and "known to deviate: lies flat" in flat.reason
-    mine(TOML + deviation + IMAGES, "b[np.abs(c[:, 0]) < 0.02] = a[np.abs(c[:, 0]) < 0.02]")
+    renderer(TOML + deviation + IMAGES, "b[np.abs(c[:, 0]) < 0.02] = a[np.abs(c[:, 0]) < 0.02]")
     flat = {row.case: row for row in task.run()}["grazing"]
     assert flat.verdict == "pass" and flat.values["wrong"] > 0
     monkeypatch.setitem(rendered_images.SIZES, "quick", rendered_images.Size(16, 64, 1, 0.5))
@@ -468,10 +469,9 @@ def test_a_renderer_that_joins_is_judged_as_every_other_one(mine, few, monkeypat
     assert row.verdict == "pass" and row.replay["verdict"] in ("equal", "inconclusive") and row.replay["spp"] == 64
 
 
-def test_a_renderer_that_joins_comes_first_in_the_report_and_what_was_not_measured_is_said_once(
-    mine, few, monkeypatch, tmp_path, capsys
-):
-    folder, out = mine(), tmp_path / "out"
+def test_a_users_renderer_is_first_in_the_report(renderer, few, monkeypatch, tmp_path, capsys):
+    """What was not measured is listed once."""
+    folder, out = renderer(), tmp_path / "out"
     SYSTEMS.clear()
     SYSTEMS["other"] = System("other", "Other", calls=(RaysCommand("another program", "f64", ("false",), "zero"),))
     monkeypatch.setitem(command.ROOMS, "suite", ("matrix", "per_ray"))
@@ -485,14 +485,14 @@ def test_a_renderer_that_joins_comes_first_in_the_report_and_what_was_not_measur
     assert (first["question"], first["state"]) == ("Your renderer: Mine, refract, f64", "yes")
     assert first["text"].startswith("exact only for inputs more than 8 roundings off: k ≫ 1 (")
     assert ["Not measured" in answer["question"] + answer["text"] for answer in others] == [False, True]
-    said = capsys.readouterr().out
-    assert said.startswith("Your renderer: Mine") and said.count("Not measured") == 1
-    found = matrix.of_rows(row for row in document["rows"] if row["study"] == "per_ray")["rays"]
-    assert found[-1]["sentence"].startswith("no answers: ended with status 1")
+    printed = capsys.readouterr().out
+    assert printed.startswith("Your renderer: Mine") and printed.count("Not measured") == 1
+    systems = matrix.of_rows(row for row in document["rows"] if row["study"] == "per_ray")["rays"]
+    assert systems[-1]["sentence"].startswith("no answers: ended with status 1")
 
 
 @pytest.mark.parametrize(
-    ("toml", "said"),
+    ("toml", "message"),
     [
         (TOML + IMAGES.replace("mitsuba", "vray"), "images.export: 'vray'; expected "),
         (TOML + IMAGES.replace("sphere", "teapot"), "images.spp, images.deviation: 'teapot'; expected sphere"),
@@ -500,9 +500,9 @@ def test_a_renderer_that_joins_comes_first_in_the_report_and_what_was_not_measur
         (None, "'pyglm' is already the name of a renderer"),
     ],
 )
-def test_what_cannot_join_is_misuse_in_a_line(toml, said, mine, tmp_path, capsys):
+def test_an_invalid_renderer_is_an_error_in_one_line(toml, message, renderer, tmp_path, capsys):
     shutil.copytree(SYSTEMS_FOLDER / "pyglm", tmp_path / "pyglm")
-    folder = mine(toml) if toml else tmp_path / "pyglm"
+    folder = renderer(toml) if toml else tmp_path / "pyglm"
     assert command.main(["suite", "--renderer", str(folder), "--out", str(tmp_path / "out")]) == 2
     err = capsys.readouterr().err
-    assert said in err and err.count("\n") == 1
+    assert message in err and err.count("\n") == 1

@@ -1,4 +1,4 @@
-"""The studies of renders and of media: they hold what they measure to its budget, and see planted defects."""
+"""The studies of renders and media pass, and they detect planted defects."""
 
 import dataclasses
 import functools
@@ -40,7 +40,7 @@ def small(scalar_context):
 
 
 def defective(props):
-    """A plugin whose index is off by one part in a hundred."""
+    """A plugin whose index is off by 1 %."""
     plugin = refract.plugin_class(mi.scalar_rgb)(props)
     params = mi.traverse(plugin)
     params["eta"] = 1.01 * float(plugin.eta[0])
@@ -54,7 +54,7 @@ def tinted(props):
 
 
 @pytest.mark.parametrize(("plugin", "verdict"), [("refract", "pass"), ("refract_defect", "fail")])
-def test_renders_agree_and_see_an_index_that_is_off(small, plugin, verdict):
+def test_renders_agree_and_a_wrong_index_is_detected(small, plugin, verdict):
     mi.register_bsdf("refract_defect", defective)
     (row,) = against_dielectric._compare(small, SCENES / "sphere.xml", plugin)
     assert row.verdict == verdict, row.values
@@ -64,26 +64,26 @@ def test_renders_agree_and_see_an_index_that_is_off(small, plugin, verdict):
     assert set(row.curves) == ({"refract", "dielectric"} if plugin == "refract" else set())
 
 
-def test_what_is_the_same_is_not_tested_by_chance_and_still_compared(small):
-    """The furnace has no noise: no Welch test, but an image that is off fails; and NaN is no image at all."""
+def test_images_without_noise_are_compared_without_a_statistical_test(small):
+    """The furnace has no noise: no Welch test, but a wrong image fails. Images with NaN need the test."""
     mi.register_bsdf("refract_tinted", tinted)
     right, wrong = (
         against_dielectric._compare(small, SCENES / "furnace.xml", p)[0] for p in ("refract", "refract_tinted")
     )
     assert right.verdict == "pass" and right.reason.startswith("left out: Welch's test")
     assert "Welch alarms" not in right.values and not right.curves
-    assert not right.images and wrong.images  # of one colour there is nothing to see
+    assert not right.images and wrong.images  # an image of one colour is not shown
     assert {"|mean ratio − 1|", "changed share"} <= set(wrong.broken)
     quiet, noisy = np.ones((4, 8, 8, 3)), np.random.default_rng(1).random((4, 8, 8, 3))
     assert against_dielectric._budgets("nested", "").keys() == {"|mean ratio − 1|", "Welch alarms"}
     assert against_dielectric._budgets("nested", "left out").keys() == {"|mean ratio − 1|", "changed share"}
     assert against_dielectric._budgets("mirage", "left out") == {}
-    assert "bit for bit" in against_dielectric.no_question(noisy, noisy)
-    assert "independent seeds" in against_dielectric.no_question(quiet + 1e-7, quiet)
-    assert against_dielectric.no_question(quiet * np.nan, quiet) == against_dielectric.no_question(noisy, quiet) == ""
+    assert "bit for bit" in against_dielectric.why_no_welch(noisy, noisy)
+    assert "independent seeds" in against_dielectric.why_no_welch(quiet + 1e-7, quiet)
+    assert against_dielectric.why_no_welch(quiet * np.nan, quiet) == against_dielectric.why_no_welch(noisy, quiet) == ""
 
 
-def test_colours_are_shown_where_the_spectral_variant_runs(small, needs_variant, monkeypatch):
+def test_colours_are_shown_in_spectral_variants(small, needs_variant, monkeypatch):
     path = SCENES / "rainbow_drop.xml"
     (row,) = colours.scene_rows(small, path)
     assert (row.values, row.reason) == ({}, colours.SCALAR)
@@ -95,8 +95,8 @@ def test_colours_are_shown_where_the_spectral_variant_runs(small, needs_variant,
     assert mi.variant() == "scalar_rgb"
 
 
-def test_a_scene_is_loaded_in_the_same_order_every_time(small):
-    """Loading with Mitsuba's defaults gives one of two images, about one time in four the other one."""
+def test_a_scene_gives_the_same_image_every_time_it_is_loaded(small):
+    """With Mitsuba's defaults, about one load in four gives a second image."""
     scenes = [render_methods.opened(SCENES / "diamond.xml", "dielectric", 8) for _ in range(12)]
     images = [render_methods.Camera(scene)(1, seed=0)[0] for scene in scenes]
     assert all((image == images[0]).all() for image in images)
@@ -116,10 +116,10 @@ def failing(rows):
     return {row.case for row in rows if row.verdict == "fail"}
 
 
-# What a scene does not use -------------------------------------------------------------------------------------------
+# Unused features -----------------------------------------------------------------------------------------------------
 
 
-def test_a_feature_that_is_not_asked_for_is_not_computed(context):
+def test_unused_features_are_not_computed(context):
     rows = by_case(unused_features.operation_rows(context))
     assert {row.verdict for row in rows.values()} <= {"pass", "info"}
     assert rows["dispersion"].values["added"] > 0
@@ -127,14 +127,14 @@ def test_a_feature_that_is_not_asked_for_is_not_computed(context):
         assert rows[f"{lobe}, a bitmap"].values["added"] > rows[f"{lobe}, a number"].values["added"] > 0
 
 
-def test_a_plugin_that_computes_what_nobody_asks_for_is_seen(context, monkeypatch):
-    """Both lobes in radiance mode, whatever it is asked for; and the direction by the wavelength, for everybody."""
+def test_a_plugin_that_computes_unused_features_is_detected(context, monkeypatch):
+    """It computes both lobes in radiance mode for every context, and directions by wavelength for every integrator."""
     plugin = refract.plugin_class(mi.llvm_ad_rgb)
 
-    def sample(self, asked, si, sample1, sample2, active=True):
-        bs, weight = plugin.sample(self, asked, si, sample1, sample2, active)
-        other, wasted = plugin.sample(self, mi.BSDFContext(), si, sample1, sample2, active)
-        bs.pdf = bs.pdf + 1e-9 * (other.pdf + other.eta + wasted.x)
+    def sample(self, bsdf_context, si, sample1, sample2, active=True):
+        bs, weight = plugin.sample(self, bsdf_context, si, sample1, sample2, active)
+        unused, unused_weight = plugin.sample(self, mi.BSDFContext(), si, sample1, sample2, active)
+        bs.pdf = bs.pdf + 1e-9 * (unused.pdf + unused.eta + unused_weight.x)
         return bs, weight
 
     mi.register_bsdf("refract", type("Planted", (plugin,), {"sample": sample}))  # in this variant only
@@ -146,11 +146,11 @@ def test_a_plugin_that_computes_what_nobody_asks_for_is_seen(context, monkeypatc
         refract.register(mi.llvm_ad_rgb)
     assert (by_case(rows)["polarised"].verdict, by_case(rows)["polarised"].reason) == ("not run", "no")
     assert failing(rows) == {"reflection only", "transmission only", "importance mode"}
-    monkeypatch.setattr(refract, "is_followed", lambda asked: True)
+    monkeypatch.setattr(refract, "is_followed", lambda context: True)
     assert failing(unused_features.wavelength_rows(context)) == {"dispersion, by `path`"}
 
 
-def test_glasses_share_a_kernel_and_neither_an_edit_nor_a_step_compiles(context, monkeypatch):
+def test_glasses_share_a_kernel_and_edits_and_gradient_steps_compile_nothing(context, monkeypatch):
     monkeypatch.setattr(unused_features, "GLASSES", (5,))
     (row,) = unused_features.rows_of_glasses(context, unused_features.PLUGIN)
     assert row.verdict == "pass"
@@ -159,20 +159,20 @@ def test_glasses_share_a_kernel_and_neither_an_edit_nor_a_step_compiles(context,
     original = refract.set_ratio
 
     def literal(self, eta):
-        """The index is a literal, another one in each kernel."""
+        """Make the index a literal, which differs in each kernel."""
         original(self, eta)
         off = float(np.random.default_rng().uniform(0, 1e-9))
         faces = ((type(x), float(dr.detach(x)[0])) for x in (self.k_inner, self.k_outer))
         self.k_inner, self.k_outer = (number(x + off) for number, x in faces)
 
     monkeypatch.setattr(refract, "set_ratio", literal)
-    monkeypatch.setattr(unused_features, "STEPS", 2)  # each of which compiles
+    monkeypatch.setattr(unused_features, "STEPS", 2)  # each step compiles
     (row,) = unused_features.rows_of_glasses(context, unused_features.PLUGIN)
     assert set(row.broken) == {"operations, over two glasses", "compiled"}
     assert failing(unused_features.optimisation_rows(context))
 
 
-def test_a_first_image_is_one_that_no_cache_knows(context):
+def test_the_first_image_is_not_cached(context):
     for _ in range(2):
         with alone(unused_features.PLUGIN, 1) as balls:
             first, later = (kernels(balls.image) for _ in range(2))
@@ -181,29 +181,29 @@ def test_a_first_image_is_one_that_no_cache_knows(context):
         assert all(entry["cache_hit"] for entry in later)
 
 
-def test_a_frozen_image_that_does_not_follow_an_edit_is_seen(context, monkeypatch):
+def test_a_stale_frozen_image_is_detected(context, monkeypatch):
     monkeypatch.setattr(unused_features, "GLASSES", (3,))
     (row,) = unused_features.frozen_rows(context)
     assert row.verdict == "pass"
-    # The built-in's index is a number that Dr.Jit does not see: its frozen image is stale.
+    # The built-in's index is a constant in the frozen function: its image is stale.
     stale = {"off after an edit": row.values["off after an edit, dielectric"]}
     assert stale["off after an edit"] > 0.01
     assert dataclasses.replace(row, values=row.values | stale).broken.keys() == stale.keys()
 
 
-def test_scalar_variants_have_calls_and_say_why_they_have_no_kernels(scalar_context):
-    none, calls = (row for task in unused_features.tasks(scalar_context()) for row in task.run())
-    assert (none.verdict, none.reason) == ("not run", unused_features.SCALAR)
+def test_scalar_variants_time_calls_and_give_the_reason_for_no_kernels(scalar_context):
+    kernels, calls = (row for task in unused_features.tasks(scalar_context()) for row in task.run())
+    assert (kernels.verdict, kernels.reason) == ("not run", unused_features.SCALAR)
     assert calls.values["call / dielectric"] > 1
 
 
 # `refract_path` ------------------------------------------------------------------------------------------------------
 
 
-def test_a_wrapper_that_is_split_as_if_it_were_glass_is_seen(llvm_variant, monkeypatch):
-    """One that refuses a lobe, beside other BSDFs; and one of two glasses, as a change that must not be seen."""
-    glass, some = path_loop.BOUNDARIES, ("blend of itself", "flat normal map")
-    changes = {name: change for name, change in invisible_changes.changes().items() if name in some}
+def test_wrappers_that_are_split_like_glass_are_detected(llvm_variant, monkeypatch):
+    """A wrapper that rejects a lobe, by the study of neighbours; a blend of glasses, by that of invisible changes."""
+    glass, names = path_loop.BOUNDARIES, ("blend of itself", "flat normal map")
+    changes = {name: change for name, change in invisible_changes.changes().items() if name in names}
     monkeypatch.setattr(invisible_changes, "changes", lambda: changes)
     monkeypatch.setattr(invisible_changes, "WAYS", {})
     monkeypatch.setattr(path_loop, "BOUNDARIES", {*glass, "NormalMap"})
@@ -215,8 +215,8 @@ def test_a_wrapper_that_is_split_as_if_it_were_glass_is_seen(llvm_variant, monke
     assert len(rows) == 2 and [row.case.split(": ")[1] for row in rows if row.broken] == ["blend of itself"]
 
 
-def test_a_direction_that_stays_attached_is_seen(context, monkeypatch):
-    """Rough metal fails, glass does not: after its lobes the direction is attached in any case."""
+def test_an_attached_direction_is_detected(context, monkeypatch):
+    """Rough metal fails; glass does not, since the directions of its lobes are attached anyway."""
     metal, glass = gradients.QUICK  # both pass without the defect, see test_contract.py
     monkeypatch.setattr(
         path_loop, "at_fixed_direction", lambda v, context, si, bsdf, bs, w, d, active, own: (w, d, bs.pdf)
@@ -227,8 +227,8 @@ def test_a_direction_that_stays_attached_is_seen(context, monkeypatch):
 
 
 @pytest.mark.parametrize("detached", ["direction", "index"])
-def test_a_derivative_that_is_detached_is_seen(detached, context, monkeypatch):
-    """The refracted direction alone is what `path` leaves out; without the index nothing is left."""
+def test_detached_derivatives_are_detected(detached, context, monkeypatch):
+    """Detaching the refracted direction gives the derivative of `path`; detaching the index gives none."""
     if detached == "index":
         monkeypatch.setattr(refract, "differentiated", lambda value: False)
     else:
@@ -242,8 +242,8 @@ def test_a_derivative_that_is_detached_is_seen(detached, context, monkeypatch):
 @pytest.mark.parametrize(
     ("off", "verdict"), [(0, "right"), (0.05, "biased"), (-0.5, "biased"), (-1, "missing: it is 0")]
 )
-def test_a_verdict_is_the_same_for_every_seed(off, verdict):
-    """Of derivatives that scatter by 3 % from render to render, and differences by 1 %."""
+def test_verdicts_on_derivatives_do_not_depend_on_the_seed(off, verdict):
+    """For derivatives with 3 % of noise per render, and differences with 1 %."""
     case, rng = gradients.CASES["`eta`"], np.random.default_rng(7)
     for _ in range(100):
         draws = (1 + off) * (1 + 0.03 * rng.normal(size=64)), 1 + 0.01 * rng.normal(size=64)
@@ -254,7 +254,7 @@ def test_a_verdict_is_the_same_for_every_seed(off, verdict):
     )
 
 
-def test_a_parameter_that_nothing_differentiates_is_refused(llvm_variant):
+def test_parameters_without_derivatives_are_rejected(llvm_variant):
     for key, text in (
         ("film.size", "no integrator differentiates 'sensor.film.size'; expected"),
         ("near_clip", "no integrator differentiates 'sensor.near_clip'; expected"),
@@ -264,13 +264,13 @@ def test_a_parameter_that_nothing_differentiates_is_refused(llvm_variant):
             gradients.Images(replace(gradients.CASES["`eta`"], key=key))
 
 
-def test_the_derivative_in_a_coefficient_of_dispersion_is_that_of_differences(context):
+def test_the_derivative_in_a_coefficient_of_dispersion_is_right(context):
     (row,) = gradients.rows(context, "`int_ior_B`")
     assert row.verdict == "pass" and row.values["at most"] < 0.05
 
 
 class OneSeed(KeyedMultijitter):
-    """Rows and columns are permuted by the seed of the cells, changed by constants: as this package once did."""
+    """Permutes rows and columns by the seed of the cells, changed by constants: a defect that this package once had."""
 
     def next_2d(self, sampler, key):
         v, (permutation, noise) = self.v, self.v.sample_tea_32(self.pixel, key)
@@ -285,7 +285,7 @@ class OneSeed(KeyedMultijitter):
 
 
 class Unpermuted(KeyedMultijitter):
-    """The samples of a pixel in the same order in every dimension."""
+    """Has the samples of a pixel in the same order in every dimension."""
 
     def next_1d(self, sampler, key):
         noise = self._unit(self.v.sample_tea_32(self.lane, key)[0])
@@ -301,7 +301,7 @@ class Unpermuted(KeyedMultijitter):
         (Unpermuted, 16, {"one", "one and one"}),
     ],
 )
-def test_numbers_that_do_not_fill_the_square_are_seen(llvm_variant, source, count, failing):
+def test_numbers_that_are_not_uniform_are_detected(llvm_variant, source, count, failing):
     rows = random_numbers.rows(llvm_variant, (count,), 1, source)
     assert {row.case.split(",")[0] for row in rows if row.broken} == failing
 
@@ -324,8 +324,8 @@ def spectral(needs_variant):
 
 @READS
 @pytest.mark.parametrize("catalog", glass_catalogs.CATALOGS)
-def test_indices_are_those_of_the_catalogue_and_another_unit_is_found(catalog, monkeypatch):
-    """Off by 1e-6, which moves n by 3e-8: far below a printed digit."""
+def test_indices_are_those_of_the_catalogue_and_a_wrong_unit_is_detected(catalog, monkeypatch):
+    """A unit off by 1e-6 changes n by 3e-8, far below a printed digit."""
     row = catalogs.catalog_row(catalog)
     assert row.verdict == "pass" and row.values["glasses"] > 100
     assert catalog not in catalogs.CONSISTENT or row.values["missing"] == 0
@@ -335,7 +335,7 @@ def test_indices_are_those_of_the_catalogue_and_another_unit_is_found(catalog, m
 
 
 @READS
-def test_a_glass_with_the_numbers_of_another_is_found(monkeypatch):
+def test_a_glass_with_the_numbers_of_another_is_detected(monkeypatch):
     table, glasses = catalogs.tables("SCHOTT")
     glasses["N-BK7"] = replace(glasses["N-BK7"], lines=glasses["F2"].lines, v_d=glasses["F2"].v_d)
     monkeypatch.setattr(catalogs, "tables", lambda catalog: (table, glasses))
@@ -346,13 +346,13 @@ def test_a_glass_with_the_numbers_of_another_is_found(monkeypatch):
 
 
 @READS
-def test_the_packages_file_is_what_is_written_of_the_makers_tables(tmp_path):
+def test_the_packages_file_is_written_from_the_makers_tables(tmp_path):
     catalogs.write(tmp_path / "glasses.json")
     assert (tmp_path / "glasses.json").read_bytes() == glass_catalogs.FILE.read_bytes()
 
 
-def test_a_wrong_index_is_found_in_directions(spectral, monkeypatch):
-    """One that is rounded to float32, and one that is off by 1e-14."""
+def test_wrong_indices_are_detected_in_directions(spectral, monkeypatch):
+    """An index rounded to float32, and one off by 1e-14."""
     for row in ray_directions.rows(HERE, GLASS):
         assert row.verdict in ("pass", "not run"), (row.name, row.broken)
     at, index = index_parameter.DispersiveRatio.at, dispersion.Terms.index
@@ -362,16 +362,16 @@ def test_a_wrong_index_is_found_in_directions(spectral, monkeypatch):
     assert ray_directions.index_row(media.parse(GLASS), GLASS).verdict == "fail"
 
 
-def test_through_mitsubas_intersections_the_achromat_shifts_alike(spectral, monkeypatch):
-    """Within 1 % of the shift between the wavelengths; with the index of the d line for all there is none."""
+def test_the_achromat_has_its_focal_shifts_through_mitsubas_intersections(spectral, monkeypatch):
+    """Within 1 % of the shift between the wavelengths; if all have the index of the d line, there is no shift."""
     for followed, verdict in ((True, "pass"), (False, "fail")):
-        monkeypatch.setattr(refract, "is_followed", lambda asked, followed=followed: followed)
+        monkeypatch.setattr(refract, "is_followed", lambda context, followed=followed: followed)
         row = closed_forms.mitsuba_row(HERE)
         assert row.verdict == verdict and (row.values["off / chromatic shift"] < 0.01) == followed
 
 
-def test_an_index_that_is_off_moves_prism_bows_and_focus(monkeypatch):
-    """By 1e-12 the bows; the prism's closed form takes the index of the scene, and its incidence with it."""
+def test_wrong_indices_are_detected_by_prism_rainbows_and_focus(monkeypatch):
+    """An index of the scene off by 1e-12 fails the rainbows; the prism's closed form uses the index of the scene."""
     rows = closed_forms.prism_row, lambda: closed_forms.bow_row(1), lambda: closed_forms.bow_row(2)
     rows = *rows, closed_forms.achromat_row
     index, trace = light.Light.indices, closed_forms.traced
@@ -387,8 +387,8 @@ def test_an_index_that_is_off_moves_prism_bows_and_focus(monkeypatch):
     assert [row().verdict for row in rows] == ["fail"] * 4
 
 
-def test_a_weight_that_is_taken_twice_colours_the_furnace(spectral, monkeypatch):
-    """At both boundaries that a path goes through."""
+def test_a_weight_applied_twice_colours_the_furnace(spectral, monkeypatch):
+    """At both boundaries of a path."""
     step = path_loop.PathLoop._next
 
     def twice(self, s, si, bsdf, bs, weight, active):
@@ -400,8 +400,8 @@ def test_a_weight_that_is_taken_twice_colours_the_furnace(spectral, monkeypatch)
     assert row.broken
 
 
-def test_media_that_absorb_more_are_found(spectral, monkeypatch):
-    """A slab by 1e-5, and a scene against `volpath` by a tenth, which moves its mean by 2 to 4 %: p < 1e-28."""
+def test_media_that_absorb_too_much_are_detected(spectral, monkeypatch):
+    """By 1e-5 in a slab; by a tenth in a scene against `volpath`, which changes its mean by 2 to 4 %: p < 1e-28."""
     monkeypatch.setattr(renders, "SIZE", 24)
     scenes = [functools.partial(renders.volpath_rows, name=name) for name in ("nested", "matt inside")]
     for factor, rows in ((1.00001, renders.slab_rows), *((1.1, rows) for rows in scenes)):

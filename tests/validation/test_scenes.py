@@ -1,9 +1,9 @@
-"""Do the scenes in `scenes/` show what they say they show?
+"""The scenes in `scenes/` show what their comments say.
 
-All in `scalar_rgb`, the built-in `dielectric` standing in for `$bsdf`: a scene is judged here, not a BSDF. Scenes that
-show dispersion or absorption, which `dielectric` lacks, are loaded with `refract` and rendered by `refract_path`; their
-colours are looked for in `llvm_ad_spectral`.
-Seeds are fixed, so a test that passes once passes until the scene, Mitsuba or the check changes.
+All in `scalar_rgb` with the built-in `dielectric` as `$bsdf`: the tests judge scenes, not a BSDF. Scenes with
+dispersion or absorption, which `dielectric` lacks, are loaded with `refract` and rendered by `refract_path`; their
+colours are tested in `llvm_ad_spectral`. Seeds are fixed, so a test that passes once passes until the scene, Mitsuba or
+the test changes.
 """
 
 import re
@@ -20,7 +20,7 @@ from validation.run.context import SCENES, beyond_builtin
 NAMES = ["balls", "diamond", "fibre", "furnace", "glasses64", "lightpipe", "matched"]
 NAMES += ["mirage", "nested", "prism", "slab", "sphere"]
 DISPERSIVE = ["diamond_fire", "dispersive_prism", "rainbow_drop", "spectrum_on_screen"]
-BEYOND = [*DISPERSIVE, "green_bottle"]  # what `dielectric` cannot render
+BEYOND = [*DISPERSIVE, "green_bottle"]  # scenes that `dielectric` cannot render
 EVERY = sorted(NAMES + BEYOND)
 DEFAULTS = {"bsdf": "refract", "sampler": "independent", "spp": "64", "res": "128"}
 each_scene = pytest.mark.parametrize("name", EVERY)
@@ -28,9 +28,9 @@ pytestmark = pytest.mark.usefixtures("scalar_variant")
 
 
 def load(scene, **parameters):
-    """A scene by its name or its path."""
+    """Load a scene by its name or its path."""
     path = scene if isinstance(scene, Path) else SCENES / f"{scene}.xml"
-    # optimize=False: Mitsuba would merge meshes of equal BSDFs, and their ids with them.
+    # optimize=False: Mitsuba would merge meshes of equal BSDFs, and lose their ids.
     bsdf = "refract" if path.stem in BEYOND else "dielectric"
     return mi.load_file(str(path), optimize=False, **{"bsdf": bsdf, "res": 16, "spp": 4} | parameters)
 
@@ -40,7 +40,7 @@ def rendered(scene, **parameters):
 
 
 def edited(tmp_path, name, old, new, count=-1):
-    """A copy of scene `name` with `old` replaced: the place where defects are planted."""
+    """Write a copy of scene `name` with `old` replaced, to plant a defect."""
     text = (SCENES / f"{name}.xml").read_text()
     assert old in text
     (tmp_path / "meshes").symlink_to(SCENES / "meshes")
@@ -52,8 +52,8 @@ def edited(tmp_path, name, old, new, count=-1):
 
 
 @each_scene
-def test_file_has_the_common_form(name):
-    """A comment that says what the scene exercises, the common parameters, and a `$bsdf` with both of its media."""
+def test_scene_files_have_the_common_form(name):
+    """A comment on the purpose of the scene, the common parameters, and every `$bsdf` with both of its media."""
     paths = list(SCENES.glob("*.xml"))
     assert sorted(p.stem for p in paths) == EVERY
     assert sorted(p.stem for p in paths if beyond_builtin(p)) == sorted(BEYOND)
@@ -72,7 +72,7 @@ def test_file_has_the_common_form(name):
 
 
 def iors(path):
-    """[(int_ior, ext_ior)] of a scene's `$bsdf`s by id, and the BSDF id of each glass shape.
+    """Return (int_ior, ext_ior) of a scene's `$bsdf`s by id, and of each glass shape by id.
 
     An index is a number, or the text of a dispersive material.
     """
@@ -100,8 +100,8 @@ def iors(path):
 
 
 @each_scene
-def test_loads_at_the_size_of_the_notes_and_renders_and_media_nest(name):
-    """The ray offset is absolute: a scene a hundred times smaller leaks at its edges."""
+def test_scenes_load_render_and_have_nested_media(name):
+    """The size matters: the ray offset is absolute, so a scene a hundred times smaller leaks at its edges."""
     scene = load(name, spp=16)
     box = scene.bbox()
     assert 30 < np.linalg.norm(box.max - box.min) < 3000
@@ -122,10 +122,10 @@ def test_parameters_reach_the_scene():
 
 
 def test_furnace_is_white_and_shows_a_loss(tmp_path):
-    """Each path's weight is 1 up to the rounding of η² in and 1/η² out, so this is no estimate with a variance.
+    """Each path has the weight 1, up to the rounding of η² in and 1/η² out, so the image has no noise.
 
-    It fails only by a path longer than max_depth = 128. Of 8.4e6 paths none was longer than 32 (95 %: fewer than
-    3.6e-7), so for another seed 1024 paths raise a false alarm with probability below 4e-4.
+    Only a path longer than max_depth = 128 makes it fail. Of 8.4e6 paths none was longer than 32 (95 %: fewer than
+    3.6e-7), so 1024 paths with another seed raise a false alarm with probability below 4e-4.
     """
     loss = '<bsdf type="$bsdf" id="core"><float name="specular_transmittance" value="0.999"/>'
     lossy = edited(tmp_path, "furnace", '<bsdf type="$bsdf" id="core">', loss)
@@ -133,13 +133,13 @@ def test_furnace_is_white_and_shows_a_loss(tmp_path):
     assert white < 1e-5 and grey > 1e-4
 
 
-# --- media: a straight line must leave each medium it is in -----------------------------------------------
+# --- media: a straight line must leave each medium that it enters -----------------------------------------
 
 
 def medium_faults(path, lines=200):
-    """Crossings at which the index on the near side is not that of the medium the line is in.
+    """Count crossings at which the index on the near side is not that of the medium that the line is in.
 
-    Straight lines suffice: whether surfaces nest does not depend on how light bends. Opaque shapes are ignored.
+    Straight lines suffice: whether surfaces nest does not depend on refraction. Opaque shapes are ignored.
     """
     scene, (_, media) = load(path), iors(path)
     glass = [s for s in scene.shapes() if s.id() in media]
@@ -176,8 +176,11 @@ def medium_faults(path, lines=200):
         ("fibre", '<translate z="41.573"/>', '<translate z="41.613"/>'),
     ],
 )
-def test_a_wrong_boundary_is_seen_and_indices_are_what_the_scenes_are_named_after(tmp_path, name, old, new):
+def test_wrong_boundaries_are_detected(tmp_path, name, old, new):
     assert medium_faults(edited(tmp_path, name, old, new)) > 0
+
+
+def test_the_indices_of_glasses64_and_matched():
     media, shapes = iors(SCENES / "glasses64.xml")
     assert sorted(i for i, _ in media.values()) == pytest.approx([1.30 + 0.02 * k for k in range(64)], abs=1e-6)
     assert len(shapes) == 64
@@ -208,17 +211,17 @@ def read_ply(path):
 
 
 def solid(name):
-    """Vertices and triangles of a solid; vertices with bitwise equal coordinates are one vertex."""
+    """Return vertices and triangles of a solid; vertices with bitwise equal coordinates are merged."""
     parts = [(m[0] == "-", *read_ply(SCENES / "meshes" / m.lstrip("-"))) for m in SOLIDS[name]]
     points = np.concatenate([v for _, v, _ in parts])
     starts = np.cumsum([0] + [len(v) for _, v, _ in parts[:-1]])
-    faces = [o + (f[:, ::-1] if turn else f) for o, (turn, _, f) in zip(starts, parts, strict=True)]
+    faces = [start + (f[:, ::-1] if turn else f) for start, (turn, _, f) in zip(starts, parts, strict=True)]
     vertices, index = np.unique(points, axis=0, return_inverse=True)
     return vertices, index.reshape(-1)[np.concatenate(faces)]
 
 
 @pytest.mark.parametrize("name", SOLIDS)
-def test_solid_is_closed(name):
+def test_solids_are_closed(name):
     v, f = solid(name)
     edges = Counter((int(a), int(b)) for t in f for a, b in zip(t, np.roll(t, -1), strict=True))
     assert set(edges.values()) == {1} and all((b, a) in edges for a, b in edges)  # each edge has its opposite
@@ -230,7 +233,7 @@ def test_solid_is_closed(name):
 
 
 def internal_reflections(path, rays=40):
-    """Total internal reflections of camera rays that enter a pipe's end, until they leave the pipes."""
+    """Count the total internal reflections of camera rays that enter a pipe's end, until they leave the pipes."""
     scene, counts = load(path), []
     rng = np.random.default_rng(5)
     eta = iors(path)[0]["glass"]
@@ -256,7 +259,7 @@ def internal_reflections(path, rays=40):
 def test_light_pipe_reflects_fifty_times(tmp_path):
     counts = internal_reflections(SCENES / "lightpipe.xml")
     assert counts.min() >= 50
-    assert counts.max() < 160 / 2  # so that what the far end reflects comes back within max_depth
+    assert counts.max() < 160 / 2  # what the far end reflects returns within max_depth
     assert internal_reflections(edited(tmp_path, "lightpipe", 'z="70"/>', 'z="62"/>')).min() < 50
 
 
@@ -265,18 +268,18 @@ def test_light_pipe_reflects_fifty_times(tmp_path):
 
 @pytest.fixture(params=["llvm_ad_spectral", "llvm_ad_rgb"])
 def colours(request, needs_variant):
-    """A variant in which colours are bent by their wavelengths, and one in which they are not."""
+    """Set a spectral or an RGB variant; return whether it shows dispersion."""
     needs_variant(request.param)
     mi.set_variant(request.param)
     return request.param.endswith("spectral")
 
 
-def test_the_prism_and_the_screen_show_the_colours_in_order(colours):
-    """In RGB they are in one place. On the prism from the left, where light is bent most: blue, green, red.
+def test_prism_and_screen_show_the_colours_in_order(colours):
+    """On the prism, from the left (largest deviation): blue, green, red. In RGB they are at one position.
 
     On the screen red minus green is −3.5 ± 0.35 columns, blue minus green 5.9 ± 0.4: bounds are four deviations away.
     """
-    # The spectrum alone: the lamp that is seen directly is at the left, and what lies on the table below.
+    # The spectrum only: the lamp that is seen directly is to the left, the table below.
     columns = rendered("dispersive_prism", res=64, spp=64)[14:36, 14:40].clip(0, None).mean(0)
     strong = columns * (columns > 0.5 * columns.max(0))
     red, green, blue = np.average(np.mgrid[0:26, 0:3][0] / 26, axis=0, weights=strong)
@@ -293,9 +296,9 @@ def test_the_prism_and_the_screen_show_the_colours_in_order(colours):
 
 
 @pytest.mark.parametrize("name", DISPERSIVE)
-def test_colours_are_in_spectral_variants_only(name, colours):
+def test_spectral_variants_show_colours_and_rgb_does_not(name, colours):
     image = rendered(name, res=64, spp=64)
-    bright = image[image.max(2) > 0.3]  # lamps are white, the sky is dark
+    bright = image[image.max(2) > 0.3]  # leaves out the dark sky; lamps are white
     colourful = (bright.max(-1) - bright.min(-1)).sum() / bright.sum()
     assert colourful > 0.3 if colours else colourful < 0.15
 
@@ -314,7 +317,7 @@ def test_the_rainbow_is_red_at_its_borders_and_blue_between(needs_variant):
 
 
 def test_thick_glass_is_darker(needs_variant):
-    """The stopper is solid, the wall of the neck below it is thin; both are seen before the sky."""
+    """The stopper is solid, the wall of the neck below it is thin; both are in front of the sky."""
     needs_variant("llvm_ad_rgb")
     mi.set_variant("llvm_ad_rgb")
     image = rendered("green_bottle", res=64, spp=16)

@@ -1,4 +1,4 @@
-"""The table of standard numbers against other forms and prints; and errors planted in what is measured of each."""
+"""The table of standard numbers against other formulas and printed values; and planted errors in their measurement."""
 
 import csv
 import dataclasses
@@ -35,7 +35,7 @@ def value(name):
 
 # The table -------------------------------------------------------------------------------------------------------
 
-# To the digits that are in circulation.
+# Values with their well-known digits.
 KNOWN = {
     "slab, n = 1.52, 0°": 0.91832,
     "slab, n = 1.52, 30°": 0.91596,
@@ -54,12 +54,12 @@ KNOWN = {
 
 
 @pytest.mark.parametrize("name", KNOWN)
-def test_a_number_has_the_digits_that_are_in_circulation(name):
+def test_numbers_have_their_well_known_digits(name):
     decimals = len(repr(KNOWN[name]).partition(".")[2])
     assert round(value(name), decimals) == KNOWN[name]
 
 
-def test_the_table_is_plain_data_with_unique_names_and_every_number_says_where_it_is_from():
+def test_the_table_is_plain_data_and_every_number_has_a_source():
     rows = table.rows()
     assert len(rows) == len(NUMBERS) >= 18
     assert json.loads(json.dumps(rows, allow_nan=False)) == rows
@@ -70,7 +70,7 @@ def test_the_table_is_plain_data_with_unique_names_and_every_number_says_where_i
     assert {row["kind"] for row in rows} == set(table.KINDS)
 
 
-def test_an_index_is_measured_of_a_glass_that_the_plugin_knows_and_glTFs_sample_is_only_quoted():
+def test_measured_indices_are_of_glasses_that_the_plugin_knows_and_glTFs_sample_is_only_quoted():
     glasses = {number.medium.format(**number.given) for number in NUMBERS.values() if number.kind == "index"}
     assert glasses == {*(f"SCHOTT:{name}" for name in table.GLASSES), "abbe(2.42, 55.0)"}
     page = (DOCS / "reference/standard-numbers.md").read_text()
@@ -78,13 +78,13 @@ def test_an_index_is_measured_of_a_glass_that_the_plugin_knows_and_glTFs_sample_
 
 
 @pytest.mark.parametrize("name", [name for name, number in NUMBERS.items() if number.printed])
-def test_a_law_gives_the_printed_digits_but_for_the_glass_that_no_slab_is(name):
+def test_laws_give_the_printed_digits_except_for_the_fitted_glass(name):
     row = NUMBERS[name].as_dict()
     within = 0.0021 if row["fitted"] else row["printed_half_unit"] * (1 + 1e-9)
     assert abs(row["off_print"]) <= within and row["off_print"] == row["value"] - row["printed_value"]
 
 
-def test_the_glass_of_the_cie_is_the_polynomial_and_its_absorption_the_least_square():
+def test_the_glass_of_the_cie_is_its_polynomial_and_its_absorbance_is_the_least_squares_fit():
     cosines = np.cos(np.deg2rad(np.arange(0, 90, 10)))
     polynomial = np.polynomial.polynomial.polyval(cosines, table.CIE_POLYNOMIAL)
     assert [f"{x:.4f}" for x in polynomial] == list(table.CIE_PRINTED)
@@ -99,28 +99,28 @@ def test_the_glass_of_the_cie_is_the_polynomial_and_its_absorption_the_least_squ
     assert misses(best) < min(misses(best - 1e-5), misses(best + 1e-5))
 
 
-def test_plates_are_the_sum_of_all_paths_and_a_pile_of_clear_ones_is_stokes_formula():
-    cases: list[dict[str, Any]] = [
+def test_plates_are_the_sum_of_all_paths_and_clear_piles_obey_stokes_formula():
+    piles: list[dict[str, Any]] = [
         {"n": 1.52, "incidence": 60.0},
         {"n": 1.52, "incidence": 70.0, "absorbance": 0.3},
         {"n": 1.7, "incidence": 45.0, "count": 3},
         {"n": 1.52, "incidence": 60.0, "together": True, "count": 2},
     ]
-    for given in cases:
-        passed, left = table.paths_through(150, **given)
-        assert passed.sum(0) == pytest.approx(table.polarised_plates(**given), abs=1e-13) and left.max() < 1e-13
+    for pile in piles:
+        passed, left = table.paths_through(150, **pile)
+        assert passed.sum(0) == pytest.approx(table.polarised_plates(**pile), abs=1e-13) and left.max() < 1e-13
     r, _ = table.reflectances(1.7, 45.0)
     assert table.polarised_plates(1.7, 45.0, 3) == pytest.approx((1 - r) / (1 + 5 * r), abs=1e-16)
-    # Where each boundary passes the mean less passes, but straight through the same.
+    # If each boundary transmits the mean of both polarisations, less is transmitted, except at normal incidence.
     assert value("slab without polarisation, n = 1.52, 60°") < value("slab, n = 1.52, 60°") - 0.01
     assert table.plates(n=1.52, incidence=0.0, together=True) == table.plates(n=1.52, incidence=0.0)
 
 
-def test_the_rhomb_retards_by_90_degrees_at_two_incidences_and_the_largest_is_between_them():
+def test_the_rhomb_retards_by_90_degrees_at_two_incidences_and_most_between_them():
     gentle, steep = (table.retarding_incidence(1.51, 45, steep) for steep in (False, True))
     for incidence, minutes in ((gentle, 48 * 60 + 37), (steep, 54 * 60 + 37)):
         assert abs(float(incidence) * 60 - minutes) < 0.6
-        # From the amplitudes themselves, complex beyond the critical angle.
+        # From the amplitudes, which are complex beyond the critical angle.
         i = math.radians(float(incidence))
         beyond = 1j * math.sqrt((1.51 * math.sin(i)) ** 2 - 1)
         s = (1.51 * math.cos(i) - beyond) / (1.51 * math.cos(i) + beyond)
@@ -137,7 +137,7 @@ def test_the_package_has_the_indices_of_the_table():
             assert media.index(number.medium, number.given["nm"]) == pytest.approx(number.value, rel=1e-15)
 
 
-def test_diffuse_shares_add_up_and_share_etendue():
+def test_diffuse_shares_add_up_to_1_and_conserve_etendue():
     for n in (1.5, 1.333):
         shares = {
             (side, what): value(f"diffuse {what}, n = {n:g}, from {side}")
@@ -149,65 +149,65 @@ def test_diffuse_shares_add_up_and_share_etendue():
         assert shares["inside", "transmittance"] * n * n == pytest.approx(shares["outside", "transmittance"], abs=1e-15)
 
 
-# What is measured ------------------------------------------------------------------------------------------------
+# Measurements ----------------------------------------------------------------------------------------------------
 
 
 def altered(number, bound):
-    """Another number of the same name, whose value is two bounds away; what its law is given says by how much."""
+    """The number with another index or wavelength, so that its value is two bounds away."""
     name = next(name for name in ("n", "n_d", "nm") if name in number.given)
     step = 2 * bound / number.slope(name)
     return dataclasses.replace(number, given={**number.given, name: number.given[name] + step})
 
 
-def seen(number, measured, bound):
-    """Whether the row of a number that was measured of something else fails."""
+def fails(number, measured, bound):
+    """Whether the row of a number fails with another measurement."""
     return study.row(number, dataclasses.replace(measured, bound=bound), "refract", "").broken == {"error / bound": 1.0}
 
 
-def measured_and_altered(numbers, samples=0):
-    """Each number is within its bound, and beyond it where the plugin is given something else by two bounds' worth."""
-    found = study.measure(numbers, samples)
-    rows = [study.row(number, found[number.name], "refract", "") for number in numbers]
+def check_bounds(numbers, samples=0):
+    """Assert that each number is within its bound, and beyond it if the plugin gets an altered number."""
+    measured = study.measure(numbers, samples)
+    rows = [study.row(number, measured[number.name], "refract", "") for number in numbers]
     assert [(row.case, row.broken) for row in rows if row.verdict != "pass"] == []
-    wrong = study.measure([altered(number, found[number.name].bound) for number in numbers], samples)
-    assert [x.name for x in numbers if not seen(x, wrong[x.name], found[x.name].bound)] == []
+    wrong = study.measure([altered(number, measured[number.name].bound) for number in numbers], samples)
+    assert [x.name for x in numbers if not fails(x, wrong[x.name], measured[x.name].bound)] == []
 
 
 SCALAR = [kind for kind in table.KINDS if kind != "double Gauss"]
 
 
 @pytest.mark.parametrize("kind", SCALAR)
-def test_every_number_is_within_its_bound_and_twice_that_is_seen(kind, needs_variant):
+def test_numbers_are_within_their_bounds_and_twice_that_is_detected(kind, needs_variant):
     numbers = [number for number in NUMBERS.values() if number.kind == kind and number.given.get("count", 1) == 1]
     for variant in dict.fromkeys(study.SCALAR[study.need(number)] for number in numbers):
         needs_variant(variant)
         with under(variant):
-            measured_and_altered([number for number in numbers if study.SCALAR[study.need(number)] == variant])
+            check_bounds([number for number in numbers if study.SCALAR[study.need(number)] == variant])
 
 
 @pytest.mark.parametrize(("need", "count"), [("polarised", 2), ("plain", 4)])
-def test_piles_are_within_their_bounds_and_twice_that_is_seen(need, count, needs_variant):
+def test_piles_are_within_their_bounds_and_twice_that_is_detected(need, count, needs_variant):
     needs_variant(study.COMPILED[need])
     numbers = [x for x in NUMBERS.values() if x.given.get("count") == count and study.need(x) == need]
     with under(study.COMPILED[need]):
-        measured_and_altered(numbers, 1 << 14)
+        check_bounds(numbers, 1 << 14)
 
 
-def test_the_double_gauss_is_within_its_bounds_and_another_glass_by_twice_that_is_seen(scalar_context, monkeypatch):
+def test_the_double_gauss_is_within_its_bounds_and_twice_that_is_detected(scalar_context, monkeypatch):
     numbers = [number for number in NUMBERS.values() if number.kind == "double Gauss"]
-    found, glass, share = study.measure(numbers), bench.glass, 1e-6
-    assert [x.name for x in numbers if study.row(x, found[x.name], "refract", "").verdict != "pass"] == []
+    measured, glass, share = study.measure(numbers), bench.glass, 1e-6
+    assert [x.name for x in numbers if study.row(x, measured[x.name], "refract", "").verdict != "pass"] == []
     denser = optical_systems.double_gauss_data()["prescription"]
     path = optical_systems.double_gauss([[c, d, n * (1 + share * (n > 1))] for c, d, n in denser]).path()
     changed = [abs(float(table.behind_the_lens(path, **x.given)) - x.value) / share for x in numbers]
-    more = max(2 * found[x.name].bound / change for x, change in zip(numbers, changed, strict=True))
+    more = max(2 * measured[x.name].bound / change for x, change in zip(numbers, changed, strict=True))
     monkeypatch.setattr(bench, "glass", lambda plugin, *n: glass(plugin, *(x * (1 + more * (x > 1)) for x in n)))
     wrong = study.measure(numbers)
-    assert [x.name for x in numbers if not seen(x, wrong[x.name], found[x.name].bound)] == []
+    assert [x.name for x in numbers if not fails(x, wrong[x.name], measured[x.name].bound)] == []
 
 
 LENS = [(1, lambda path: table.behind_the_lens(path, 1, 0)), (5, lambda path: table.behind_the_lens(path, 5, 1))]
-TRACED = {  # a bench, and what is read of its rays
+TRACED = {  # a bench, and the readings of its rays
     "prism": lambda: study.angle_read(NUMBERS["prism of 60°, n = 1.5"]),
     "drop": lambda: study.angle_read(NUMBERS["rainbow of order 2, n = 1.3333"]),
     "double Gauss": lambda: (bench.benches()["double Gauss"], LENS),
@@ -215,7 +215,7 @@ TRACED = {  # a bench, and what is read of its rays
 
 
 @pytest.mark.parametrize("name", TRACED)
-def test_independent_roundings_stay_within_the_bound_of_a_ray_and_are_not_far_from_it(name):
+def test_independent_roundings_come_near_the_bound_of_a_ray_but_not_beyond(name):
     case, readings = TRACED[name]()
     bounds, rng, sizes = study.read_bounds(case, readings), np.random.default_rng(3), case.roundings()
     exact, ratios = case.system.path(), []
@@ -232,14 +232,14 @@ def test_independent_roundings_stay_within_the_bound_of_a_ray_and_are_not_far_fr
     assert 0.2 < max(ratios) < 1
 
 
-def test_a_bound_that_would_hold_whatever_comes_fails():
+def test_a_bound_that_tests_nothing_fails():
     for number in NUMBERS.values():
         if "n" in number.given and not study.noisy(number):
             wide = study.Measured(number.value, 2e-3 * number.slope("n") * number.given["n"])
             assert study.row(number, wide, "refract", "").broken == {"index seen": limits.STANDARD_SEEN}
 
 
-def test_a_run_has_a_row_for_each_number_of_a_variant_and_says_why_where_there_is_none(tmp_path):
+def test_a_run_has_a_row_per_number_of_a_variant_or_the_reason_for_none(tmp_path):
     context = here("quick", tmp_path, "scalar_rgb")
     rows = [row for task in study.STUDY.tasks(context) if task.name.endswith("spectral") for row in task.run()]
     assert {row.case for row in rows} == {x.name for x in NUMBERS.values() if "nm" in x.given}
@@ -252,7 +252,7 @@ def test_a_run_has_a_row_for_each_number_of_a_variant_and_says_why_where_there_i
 
 
 def program(share=0.0):
-    """A textbook's formula as a program that answers rays; the denser index is off by a share of it."""
+    """The textbook formula as a program that answers rays; the denser index has the relative error `share`."""
 
     def refract(rays):
         k = rays.rays.k[:, None].astype(float)
@@ -266,12 +266,12 @@ def program(share=0.0):
 
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
-def test_a_textbooks_formula_is_within_the_bounds_of_rays_and_an_index_off_by_twice_them_is_seen(precision):
+def test_the_textbook_formula_is_within_the_bounds_of_rays_and_twice_that_is_detected(precision):
     call, numbers = RaysCommand("textbook", precision, ("program",)), others.of_kind(*others.RAYS)
 
     def rows(share):
-        found = others.measure(numbers, call, program(share))
-        return {x.name: others.row(x, "textbook", precision, *found[x.name], "") for x in numbers}
+        measured = others.measure(numbers, call, program(share))
+        return {x.name: others.row(x, "textbook", precision, *measured[x.name], "") for x in numbers}
 
     right, tiny = rows(0.0), 1e-4 if precision == "f32" else 1e-9
     assert [name for name, row in right.items() if row.verdict != "pass"] == []
@@ -282,7 +282,7 @@ def test_a_textbooks_formula_is_within_the_bounds_of_rays_and_an_index_off_by_tw
 
 
 def boundary(precision, share=0.0):
-    """Fresnel's equations as a program that answers what is reflected; the denser index is off by a share of it."""
+    """Fresnel's equations as a program that returns reflectances; the denser index has the relative error `share`."""
     real = np.float32 if precision == "f32" else np.float64
 
     def reflect(rays):
@@ -296,12 +296,12 @@ def boundary(precision, share=0.0):
 
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
-def test_fresnels_equations_are_within_the_bounds_of_a_boundary_and_an_index_off_by_twice_them_is_seen(precision):
+def test_fresnels_equations_are_within_the_bounds_of_a_boundary_and_twice_that_is_detected(precision):
     numbers = others.reflected(("p", "phase"))
 
     def rows(share):
-        found = others.measure_reflected(numbers, precision, boundary(precision, share))
-        return {x.name: others.row(x, "a program", precision, *found[x.name], "") for x in numbers}
+        measured = others.measure_reflected(numbers, precision, boundary(precision, share))
+        return {x.name: others.row(x, "a program", precision, *measured[x.name], "") for x in numbers}
 
     assert {x.kind for x in numbers} == {"Brewster's angle", "retardation", "diffuse"}
     right, tiny = rows(0.0), 1e-4 if precision == "f32" else 1e-9
@@ -313,7 +313,7 @@ def test_fresnels_equations_are_within_the_bounds_of_a_boundary_and_an_index_off
         assert share < 20 * tiny and rows(share)[name].broken == {"error / bound": 1.0}, name
 
 
-def test_a_program_that_answers_reflectances_is_asked_and_one_that_leaves_some_out_fails(tmp_path, monkeypatch):
+def test_programs_of_reflectances_pass_and_missing_answers_fail(tmp_path, monkeypatch):
     title, *rest = others.FRESNEL
     context = here("quick", tmp_path, "scalar_rgb")
     rows = others.fresnel_rows(title, context)
@@ -330,15 +330,15 @@ def test_a_program_that_answers_reflectances_is_asked_and_one_that_leaves_some_o
     assert all(row.verdict == "not run" for name in rest for row in others.fresnel_rows(name, context))
 
 
-def test_an_index_of_a_catalogue_is_the_printed_one_and_another_or_none_is_seen():
+def test_catalogue_indices_are_the_printed_ones_and_other_or_missing_ones_fail():
     numbers = [x for x in others.of_kind("index") if x.medium.startswith("SCHOTT:")]
     media, lines = list(dict.fromkeys(x.medium for x in numbers)), list(table.LINES.values())
     rays = ray_set.make(["generic"], 40, "f64", 0, media=media, wavelengths=lines)
 
     def broken(ratio):
         answers = Answers(rays.ids, rays.rays.a, n_ratio=ratio)
-        found = others.indices(rays, answers, numbers)
-        return [others.row(x, "catalogue", "f64", n, 5e-6, "").broken for x, n in zip(numbers, found, strict=True)]
+        used = others.indices(rays, answers, numbers)
+        return [others.row(x, "catalogue", "f64", n, 5e-6, "").broken for x, n in zip(numbers, used, strict=True)]
 
     k = rays.rays.k
     assert broken(k) == [{}] * 9
@@ -346,12 +346,15 @@ def test_an_index_of_a_catalogue_is_the_printed_one_and_another_or_none_is_seen(
     assert broken(None) == [{"error / bound": 1.0}] * 9
 
 
-def test_images_means_have_students_bound_and_the_plates_are_closed_and_lit_from_behind():
+def test_means_of_images_have_students_bound():
     rng, number = np.random.default_rng(7), NUMBERS["slab without polarisation, n = 1.52, 60°"]
     means = rng.binomial(1 << 16, number.value, others.SEEDS) / (1 << 16)
-    value, bound = others.of_means(means)
+    value, bound = others.mean_and_bound(means)
     assert others.row(number, "x", "", value, bound, "").verdict == "pass" and bound < 0.01
     assert others.row(number, "x", "", value + 2 * bound, bound, "").broken == {"error / bound": 1.0}
+
+
+def test_plates_are_closed_and_lit_from_behind():
     scene = others.plate_scene(NUMBERS["4 slabs without polarisation, n = 1.52, 0°"])
     *plates, lamp = scene.meshes
     for plate in plates:
@@ -366,7 +369,7 @@ def test_images_means_have_students_bound_and_the_plates_are_closed_and_lit_from
     )
 
 
-def test_the_tables_of_the_documentation_have_every_number_that_was_measured():
+def test_the_tables_of_the_documentation_have_all_measured_numbers():
     numbers = [NUMBERS["slab, n = 1.52, 0°"], NUMBERS["index of F2, line d"]]
     own = [study.row(x, study.Measured(x.value, 1e-6), "refract", "llvm_ad_mono") for x in numbers]
     lines = tables.numbers(own).splitlines()[-2:]

@@ -1,9 +1,9 @@
-"""Run time of a comparison, beside that of reading the files, and of its HTML page; and the memory of both.
+"""Run times of comparisons, of reading the files, and of writing the HTML page; and the memory of a comparison.
 
 The images are smooth, with the noise of 16 samples per pixel, in zip-compressed EXR files. All subjects run once per
-round; medians over the rounds are reported, with 95 % intervals. Times depend on the machine, so they have goals and no
-budgets; the start of Python and its imports count "from the shell" only. The size of the page has a budget. Memory
-is the peak of a process that compares and writes the page.
+round; the rows have medians over the rounds, with 95 % intervals. Times depend on the machine, so they have goals
+instead of budgets; only times "from the shell" include the start of Python and its imports. The size of the page has a
+budget. Memory is the peak of a process that compares and writes the page.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ from validation.run.context import Context
 from validation.study import Study, Task, about
 
 TERMS = {
-    "seconds": "median, of reading and judging, or of writing the page; low, high: its 95 % interval",
+    "seconds": "median time to read and compare, or to write the page; low, high: its 95 % interval",
     "time / reading": "median of the rounds' ratios to reading the same files; low, high: its 95 % interval",
-    "time / libraries": "the same, to a process that imports OpenImageIO and NumPy, and nothing else",
+    "time / libraries": "the same for the ratio to a process that only imports OpenImageIO and NumPy",
     "MB of page": "size of the HTML file",
     "MB of memory": "the largest resident set of the whole process",
-    "8 + 8": "renders of one image, as many a side",
-    AUTO: "tolerance here: the images say nothing of their noise",
+    "8 + 8": "8 renders of one image on each side",
+    AUTO: "tolerance here: the images have no information on their noise",
 }
 SHELL, LIBRARIES = "from the shell", "import the libraries"
 NAME = "diff_times"
 SEED = 2034
-SPP, GAIN = 16, 1.05  # the noise of the renders; how much brighter a quarter of the other image is
-SMALL, RENDERS = 256, 8  # pixels a side of the small images; renders a side
+SPP, GAIN = 16, 1.05  # the noise of the renders; the gain of a quarter of the other image
+SMALL, RENDERS = 256, 8  # width and height of the small images in pixels; renders per side
 MEGABYTE = 1e6
 
 
 @dataclass(frozen=True)
 class Size:
-    """The size of the large images, the number of pairs in the folder of small ones, and the rounds."""
+    """Size of the large images, number of pairs in the folder of small images, number of rounds."""
 
     height: int
     width: int
@@ -70,7 +70,7 @@ print([line.split()[1] for line in open("/proc/self/status") if line.startswith(
 
 @dataclass(frozen=True)
 class Subject:
-    """What is timed, on which images, and the subject to whose time its own is a `ratio`; "" for none."""
+    """A timed function, its images, and the subject `beside` for the `ratio` of times; "" for none."""
 
     case: str
     run: Callable[[], object]
@@ -79,12 +79,12 @@ class Subject:
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task: its subjects take turns."""
+    """Return one task: its subjects take turns."""
     return [Task("diff, times", functools.partial(measure, SIZES[context.profile.name], context.variant), timed=True)]
 
 
 def measure(size: Size, setting: str) -> list[Row]:
-    """A row per subject, one of the size of the page, and one of the memory of the process with the most."""
+    """Return a row per subject, a row of the page's size, and a row of the memory of the largest comparison."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         write(root, size)
@@ -105,14 +105,14 @@ def measure(size: Size, setting: str) -> list[Row]:
         rows.append(Row(NAME, "size of the page", subjects["page"].case, setting, page, budgets))
         case = subjects["welch"].case
         if not Path("/proc/self/status").exists():
-            return [*rows, Row(NAME, "memory", case, setting, reason="this system does not say a process's peak")]
+            return [*rows, Row(NAME, "memory", case, setting, reason="this system does not report peak memory")]
         words = ["diff", str(root / "a"), str(root / "b"), "--renders", "--report", str(root / "welch.html")]
         memory = {"MB of memory": 1024 * json.loads(python("-c", PROCESS, *words).split()[-1]) / MEGABYTE}
         return [*rows, Row(NAME, "memory", case, setting, memory, {"MB of memory": limits.MEMORY_MEGABYTES})]
 
 
 def write(root: Path, size: Size) -> None:
-    """`a`, `b`: renders of one image; `many_a`, `many_b`: small images that are the same but for last bits."""
+    """Write `a`, `b`: renders of one image; and `many_a`, `many_b`: small images that differ in last bits only."""
     rng = np.random.default_rng(SEED)
     y, x = np.mgrid[: size.height, : size.width]
     smooth = ((0.4 + 0.3 * np.sin(x / 90) * np.cos(y / 70))[..., None] * [1, 0.8, 0.6]).astype(np.float32)
@@ -132,7 +132,7 @@ def write(root: Path, size: Size) -> None:
 
 
 def subjects_of(root: Path, size: Size) -> dict[str, Subject]:
-    """Reading alone; the verdict of each method, and of a folder; and the page of the image that differs."""
+    """Return the subjects: reading alone; the verdict of each method and of a folder; the page of a different image."""
     a, b = root / "a", root / "b"
     one = f"{size.width} × {size.height}"
     several, many = f"{one}, {RENDERS} + {RENDERS}", f"{size.pairs} pairs of {SMALL}²"
@@ -164,9 +164,9 @@ def subjects_of(root: Path, size: Size) -> dict[str, Subject]:
 
 
 def python(*words: str) -> str:
-    """What Python prints. Byte code is kept, as where the package is installed; OSError where it fails."""
-    kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-    done = subprocess.run([sys.executable, *words], env=kept, capture_output=True, text=True)
+    """Run Python and return its output, with cached byte code as in an installed package. OSError if it fails."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    done = subprocess.run([sys.executable, *words], env=environment, capture_output=True, text=True)
     if done.returncode:
         raise OSError(f"diff, times: {done.stderr.strip()}")
     return done.stdout

@@ -1,14 +1,14 @@
-"""Where the bounds of `flip` stand: changes that nobody sees, and changes that a person sees at once.
+"""The bounds of `flip` between changes that nobody sees and changes that a person sees at once.
 
-The images are shapes of random colours, some of them a pixel wide, drawn with 16 samples a pixel and rounded to 8-bit
-sRGB. Changes that nobody sees are what other machines, formats and samplers do to an image; changes that a person sees
-are small and faint ones of their kind. "error / bound" is the largest of the local FLIP error, of the error throughout
-a patch and of the change one way, each over its bound: `flip` calls images equal up to 1. The bounds of FLIP errors
-stand where the largest of the first and the smallest of the second leave room on both sides; that of the change one
-way is computed.
+The images are shapes of random colours, some of them a pixel wide, drawn with 16 samples per pixel and rounded to 8-bit
+sRGB. Changes that nobody sees are those of other machines, formats and samplers; changes that a person sees are small
+and faint ones of their kind. "error / bound" is the largest of the local FLIP error, the error throughout a patch and
+the change one way, each divided by its bound: `flip` calls images equal up to 1. The bounds of FLIP errors lie between
+the largest error of unseen changes and the smallest of seen ones, with a margin on both sides; the bound of the change
+one way is computed.
 
-The last rows state what `flip` does not see: how many of 255 codes a gray square must change by, and how far a black
-edge on white must move, to be different. These are records of what the bounds mean, not measurements of people.
+The last rows show what `flip` does not detect: by how many of 255 codes a gray square must change, and how far a black
+edge on white must move, to be different. They record what the bounds mean; they are not measurements of people.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ from validation.study import Study, Task, about
 
 NAME = "visible_changes"
 SEED = 2027
-TRIALS = {"quick": 20, "standard": 300, "full": 2000}  # of 300, none may be called different: the bound is 0.99 %
-SIZE, SHAPES, SAMPLES = 96, 14, 4  # pixels a side; shapes; the square root of the samples a pixel
+TRIALS = {"quick": 20, "standard": 300, "full": 2000}  # none of 300 may be called different: the bound is 0.99 %
+SIZE, SHAPES, SAMPLES = 96, 14, 4  # width and height in pixels; shapes; the square root of the samples per pixel
 MEASURED = LOCAL, THROUGHOUT, ONE_WAY = "local FLIP error", "FLIP error throughout a patch", "change one way, in codes"
 ERROR = "error / bound"
 ALARMS, MISSED, BOUND = "called different", "missed", "bound"
 CODES, PIXELS = "codes of 255", "pixels"
 SETTING, LIMIT, EDGE = "67 pixels per degree", "limit", "edge"
-SQUARES = (1, 2, 3, 4, 8, 16, 32, 64, 128)  # pixels a side, of what is recorded
-GRAY, WIDE = 100, 160  # codes of their background, pixels of that image
+SQUARES = (1, 2, 3, 4, 8, 16, 32, 64, 128)  # widths of the recorded squares in pixels
+GRAY, WIDE = 100, 160  # codes of their background, width of the image in pixels
 TERMS = {
-    ERROR: "largest of the changes that nobody sees, smallest of those that a person sees",
-    LOCAL: "mean in the worst window, its median over the trials",
-    THROUGHOUT: "exceeded in all of 0.24 degrees, its median over the trials",
-    ONE_WAY: "of a 3 × 3 square, or its like of a wider one, its median over the trials",
+    ERROR: "largest for changes that nobody sees, smallest for changes that a person sees",
+    LOCAL: "mean in the worst window; median over the trials",
+    THROUGHOUT: "the error that all pixels of a patch of 0.24 degrees exceed; median over the trials",
+    ONE_WAY: "change of a 3 × 3 square, or the equivalent of a wider one; median over the trials",
     BOUND: f"{CONFIDENCE:.0%} upper bound of the share that is called different, exact binomial (Clopper and Pearson)",
-    CODES: "the smallest change of a gray square that is called different; none where even white is not",
-    PIXELS: "the smallest move of a black edge on white that is called different, in quarters of a pixel",
+    CODES: "the smallest change of a gray square that is called different; none if even white is not",
+    PIXELS: "the smallest shift of a black edge on white that is called different, in quarters of a pixel",
 }
 
 
@@ -65,7 +65,7 @@ DISK, BOX, BAR = range(3)  # a bar is one pixel wide
 
 
 def scene(rng: Rng) -> list[Shape]:
-    """The shapes of an image; the first one covers it."""
+    """Return the random shapes of an image; the first one covers the image."""
     shapes: list[Shape] = [(BOX, SIZE / 2, SIZE / 2, 2.0 * SIZE, 0.0, rng.uniform(0, 255, 3))]
     for _ in range(SHAPES):
         x, y, radius = rng.uniform(0, SIZE), rng.uniform(0, SIZE), 8 * np.exp(rng.normal(0, 0.6))
@@ -74,7 +74,7 @@ def scene(rng: Rng) -> list[Shape]:
 
 
 def drawn(shapes: list[Shape], samples: int = SAMPLES, turn: float = 0.0, shift: float = 0.0) -> Pixels:
-    """The image in codes, of `samples`² samples a pixel on a grid that is turned within the pixel and shifted."""
+    """Return the image in codes, from `samples`² samples per pixel on a grid that is rotated and shifted."""
     grid = (np.arange(samples) + 0.5) / samples - 0.5
     dx, dy = (x.ravel() for x in np.meshgrid(grid, grid))
     dx, dy = dx * np.cos(turn) - dy * np.sin(turn) + 0.5 + shift, dx * np.sin(turn) + dy * np.cos(turn) + 0.5
@@ -90,13 +90,13 @@ def drawn(shapes: list[Shape], samples: int = SAMPLES, turn: float = 0.0, shift:
 
 
 def shown(codes: Pixels, rounded: bool = True) -> Image:
-    """Codes as an image for a display."""
+    """Return codes as an image for a display."""
     codes = np.clip(np.round(codes) if rounded else codes, 0, 255) / 255
     return Image(Path("codes.png"), codes.astype(np.float32), ("R", "G", "B"), stored="uint8")
 
 
 def light(codes: Pixels) -> Image:
-    """Codes as stops: an HDR image of 6 stops."""
+    """Return codes as an HDR image of 6 stops."""
     return Image(Path("light.exr"), np.exp2(codes / 255 * 6 - 3).astype(np.float32), ("R", "G", "B"))
 
 
@@ -104,7 +104,7 @@ def light(codes: Pixels) -> Image:
 
 
 def of_codes(change: Callable[[Rng, Pixels], Pixels], most: float = 255, rounded: bool = True) -> Change:
-    """The codes of a scene, up to `most`, and what they are changed to."""
+    """Return a maker of pairs: the codes of a scene, up to `most`, before and after a change."""
 
     def make(rng: Rng) -> Pair:
         codes = np.clip(drawn(scene(rng)), 0, most)
@@ -113,12 +113,12 @@ def of_codes(change: Callable[[Rng, Pixels], Pixels], most: float = 255, rounded
     return make
 
 
-def redrawn(**how: Any) -> Change:
-    """A scene drawn twice, once otherwise."""
+def redrawn(**options: Any) -> Change:
+    """Return a maker of pairs: a scene drawn twice, once with options of `drawn`."""
 
     def make(rng: Rng) -> Pair:
         shapes = scene(rng)
-        return shown(drawn(shapes)), shown(drawn(shapes, **how))
+        return shown(drawn(shapes)), shown(drawn(shapes, **options))
 
     return make
 
@@ -129,7 +129,7 @@ def _half_floats(rng: Rng) -> Pair:
 
 
 def _soft_edge(rng: Rng) -> Pair:
-    """A black half-plane on white, blurred by up to three pixels, and moved by half a pixel in any direction."""
+    """Return a blurred black half-plane on white (up to three pixels), and the same moved by half a pixel."""
     rows, columns = np.mgrid[:SIZE, :SIZE]
     angle, width = rng.uniform(0, np.pi), 0.3 * 10 ** rng.uniform(0, 1)
     distance = columns * np.cos(angle) + rows * np.sin(angle) - rng.uniform(0.3, 0.7) * SIZE
@@ -138,13 +138,13 @@ def _soft_edge(rng: Rng) -> Pair:
 
 
 def _noise(rng: Rng) -> Pair:
-    """A quarter of the image with gray noise."""
+    """Return two images with different gray noise in a quarter of the width and height."""
     codes, x, y = somewhere(rng)
     noisy = []
     for _ in range(2):
-        more = rng.normal(0, 25, (SIZE // 4, SIZE // 4, 1))
+        noise = rng.normal(0, 25, (SIZE // 4, SIZE // 4, 1))
         noisy.append(codes.copy())
-        noisy[-1][int(y) - SIZE // 8 :, int(x) - SIZE // 8 :][: SIZE // 4, : SIZE // 4] += more
+        noisy[-1][int(y) - SIZE // 8 :, int(x) - SIZE // 8 :][: SIZE // 4, : SIZE // 4] += noise
     return shown(noisy[0]), shown(noisy[1])
 
 
@@ -166,13 +166,13 @@ def _jpeg(rng: Rng, quality: int = 98, subsampling: str = "4:4:4") -> Pair:
 
 
 def somewhere(rng: Rng) -> tuple[Pixels, float, float]:
-    """The codes of a scene, and a place at least 28 pixels from the border."""
+    """Return the codes of a scene, and a position at least 28 pixels from the border."""
     x, y = rng.uniform(28, SIZE - 28, 2)
     return drawn(scene(rng)), x, y
 
 
 def patched(image: Pixels, x: float, y: float, side: int, colour: Pixels | float) -> Pixels:
-    """The image with a square of one colour around that place."""
+    """Return the image with a square of one colour around a position."""
     image = image.copy()
     left, top = int(x) - side // 2, int(y) - side // 2
     image[top : top + side, left : left + side] = colour
@@ -247,53 +247,54 @@ def _lit_surface(rng: Rng) -> Pair:
     return one, two
 
 
-KINDS: dict[str, tuple[str, Change, bool | None]] = {  # a pair of each, and whether a person sees it; None: in part
+# By kind: a description, a maker of pairs, and whether a person sees the change; None: in some images.
+KINDS: dict[str, tuple[str, Change, bool | None]] = {
     "last bits": (
         "relative 2⁻²³",
         of_codes(lambda rng, x: x * (1 + rng.choice([-1, 1], x.shape) * 2.0**-23), rounded=False),
         False,
     ),
-    "one code": ("everywhere one more of 255", of_codes(lambda rng, x: np.round(x) + 1, most=254), False),
+    "one code": ("one more of 255 everywhere", of_codes(lambda rng, x: np.round(x) + 1, most=254), False),
     "dithering": (
         "rounded with and without noise of half a code",
         of_codes(lambda rng, x: x + rng.uniform(-0.5, 0.5, x.shape)),
         False,
     ),
-    "other antialiasing": ("the 16 samples on a grid that is turned", redrawn(turn=0.46), False),
+    "other antialiasing": ("the 16 samples on a rotated grid", redrawn(turn=0.46), False),
     "less antialiasing": ("4 samples instead of 16", redrawn(samples=2), False),
-    "a quarter pixel": ("the camera moved by this distance", redrawn(shift=0.25), False),
+    "a quarter pixel": ("the camera moved by a quarter pixel", redrawn(shift=0.25), False),
     "JPEG": ("quality 98, without subsampling of the colours", _jpeg, False),
     "JPEG, subsampled": (
-        "quality 95, with the colours of 2 × 2 pixels; seen at some saturated lines",
+        "quality 95, with one colour per 2 × 2 pixels; seen at some saturated lines",
         functools.partial(_jpeg, quality=95, subsampling="4:2:0"),
         None,
     ),
     "half a pixel": (
-        "an edge from black to white, blurred by 0.3 to 3 pixels, moved by this distance",
+        "an edge from black to white, blurred by 0.3 to 3 pixels, moved by half a pixel",
         _soft_edge,
         False,
     ),
-    "noise": ("of 25 codes in a quarter of the width and height, of other seeds", _noise, False),
+    "noise": ("noise of 25 codes in a quarter of the width and height, with other seeds", _noise, False),
     "half floats": ("an HDR image of 6 stops, rounded to 11 bits", _half_floats, False),
     "no antialiasing": ("1 sample instead of 16; seen in some images", redrawn(samples=1), None),
     "colour of an object": (
-        "A box of 0.12 to 0.18 degrees, 140 codes more of red or green, with or without another primary, or of all.",
+        "A box of 0.12 to 0.18 degrees with 140 codes more of red or green, alone or with other primaries.",
         _recoloured,
         True,
     ),
     "highlight": (
-        "Of a standard deviation of 0.05 to 0.07 degrees and 140 to 180 codes, on dark gray; gone.",
+        "A missing highlight on dark gray, with a standard deviation of 0.05 to 0.07 degrees and 140 to 180 codes.",
         _highlight,
         True,
     ),
     "moved object": ("A box of 0.12 to 0.24 degrees and a contrast of 180 codes, by three pixels.", _moved, True),
-    "line": ("A line of one pixel and 0.3 degrees, of a contrast of 225 to 255 codes; gone.", _line, True),
-    "dot": ("5 to 7 pixels wide, of a contrast of 45 to 80 codes of gray; added.", _dot, True),
-    "facet": ("A triangle of 12 pixels a side, 25 to 40 codes brighter, among shapes.", _facet, True),
+    "line": ("A missing line of 1 pixel by 0.3 degrees, with a contrast of 225 to 255 codes.", _line, True),
+    "dot": ("An additional dot, 5 to 7 pixels wide, with a contrast of 45 to 80 codes of gray.", _dot, True),
+    "facet": ("A triangle with sides of 12 pixels, 25 to 40 codes brighter, among shapes.", _facet, True),
     "brighter surface": ("A surface of 0.3 to 0.6 degrees, 14 to 20 codes brighter.", _surface, True),
-    "light on a surface": ("HDR: a surface of 0.3 to 0.6 degrees in a quarter more light.", _lit_surface, True),
+    "light on a surface": ("HDR: a surface of 0.3 to 0.6 degrees with a quarter more light.", _lit_surface, True),
     "blue of an object": (
-        "A box of 0.12 to 0.18 degrees, 140 codes more of blue alone, for which the eye is the least sharp.",
+        "A box of 0.12 to 0.18 degrees with 140 codes more of blue only, for which the eye has the least acuity.",
         functools.partial(_recoloured, blue=True),
         None,
     ),
@@ -305,7 +306,7 @@ CASES = {False: "not seen", True: "seen", None: "seen in part"}
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task for the kinds, one for the record."""
+    """Return one task for the kinds of changes, and one for the limits."""
     count = TRIALS[context.profile.name]
     return [
         Task("visible changes", lambda: [kind_row(name, count) for name in KINDS]),
@@ -314,19 +315,19 @@ def tasks(context: Context) -> list[Task]:
 
 
 def errors(pair: Pair) -> tuple[float, ...]:
-    """The local FLIP error, the error throughout a patch, the change one way, and the largest over their bounds."""
+    """Return local FLIP error, error throughout a patch, change one way, and the largest ratio to their bounds."""
     metrics = {metric.name: metric for metric in flip.flip(*pair).metrics if metric.name in MEASURED}
-    values = [metrics[name].value if name in metrics else 0.0 for name in MEASURED]  # HDR: none one way
+    values = [metrics[name].value if name in metrics else 0.0 for name in MEASURED]  # HDR has no change one way
     return *values, max(metric.value / (metric.bound or np.nan) for metric in metrics.values())
 
 
 def kind_row(name: str, count: int) -> Row:
-    """What `flip` finds in pairs of one kind."""
+    """Return the row of `flip`'s errors in pairs of one kind."""
     text, make, due = KINDS[name]
-    own = np.random.SeedSequence((seeds.current(SEED), list(KINDS).index(name))).spawn(count)
-    *measured, error = np.array([errors(make(np.random.default_rng(seed))) for seed in own]).T
+    trial_seeds = np.random.SeedSequence((seeds.current(SEED), list(KINDS).index(name))).spawn(count)
+    *measured, error = np.array([errors(make(np.random.default_rng(seed))) for seed in trial_seeds]).T
     different = int((error > 1).sum())
-    values = {name: float(np.median(each)) for name, each in zip(MEASURED, measured, strict=True)}
+    values = {name: float(np.median(x)) for name, x in zip(MEASURED, measured, strict=True)}
     values[ALARMS] = different / count
     budgets: dict[str, float] = {}
     if due:
@@ -341,20 +342,20 @@ def kind_row(name: str, count: int) -> Row:
 
 
 def limit_rows() -> list[Row]:
-    """The smallest changes that are called different: of gray squares by their side, and of an edge."""
+    """Return rows of the smallest changes that are called different: of gray squares by width, and of an edge."""
     plain, white = np.full((WIDE, WIDE, 3), float(GRAY)), (BOX, SIZE / 2, SIZE / 2, 4.0 * SIZE, 0.0, np.full(3, 255.0))
 
     def square(side: int, codes: int) -> Pair:
         return shown(plain), shown(patched(plain, WIDE / 2, WIDE / 2, side, GRAY + codes))
 
     def edge(quarters: int) -> Pair:
-        """A black half-plane on white, at the angle where a move by a pixel makes the largest error of those tried."""
-        places = (SIZE / 2 - 2 * SIZE + x for x in (0.0, quarters / 4))
-        one, two = (shown(drawn([white, (BOX, x, SIZE / 2, 2.0 * SIZE, 0.4, np.zeros(3))])) for x in places)
-        return one, two
+        """Return a moved black half-plane on white, at the angle with the largest error of all tried angles."""
+        positions = (SIZE / 2 - 2 * SIZE + x for x in (0.0, quarters / 4))
+        before, after = (shown(drawn([white, (BOX, x, SIZE / 2, 2.0 * SIZE, 0.4, np.zeros(3))])) for x in positions)
+        return before, after
 
     def smallest(make: Callable[[int], Pair], most: int) -> float:
-        """The smallest number up to `most` for which the pair is different; NaN where there is none."""
+        """Return the smallest number up to `most` for which the pair is different; NaN for none."""
         low, high = 0, most + 1
         while high - low > 1:
             middle = (low + high) // 2

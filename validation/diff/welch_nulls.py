@@ -1,13 +1,12 @@
-"""Pairs that differ by noise only, by `welch`: how often it calls them different, and what it sees beside them.
+"""Pairs that differ by noise only: how often `welch` calls them different, and which planted differences it detects.
 
-Light is normal, lognormal, of Pareto's law, or a base to which rare samples add 200 times as much (fireflies), or of
-rare samples alone (a lamp). The sides have equal numbers of samples, or either side has up to 1000 times as many. Their
-noise is known on both sides or on one, from samples, from passes under filters of up to 3 pixels, or from several
-renders. Pairs of renders of a scene have a ball of glass and a small lamp, whose light comes through the glass by
-chance.
+Light is normal, lognormal, Pareto-distributed, a base to which rare samples add 200 times as much (fireflies), or rare
+samples alone (a lamp). The sides have equal numbers of samples, or one side has up to 1000 times as many. The noise is
+known on both sides or on one, from samples, from passes with filters of up to 3 pixels, or from several renders. Pairs
+of renders of a scene have a ball of glass and a small lamp, whose light passes the glass by chance.
 
-`welch` states a false alarm in 0.1 % of pairs, and the difference of a tile that it sees with a probability of 99 %.
-Such differences are planted, and those that it sees with 50 %.
+`welch` claims false alarms in 0.1 % of pairs, and reports the difference of a tile that it detects with a probability
+of 99 %. Such differences are planted, and differences that it detects with a probability of 50 %.
 
 `python -m validation diff --profile standard`
 """
@@ -44,9 +43,9 @@ SEED = 2036
 TERMS = {
     "alarms": "pairs that are called different; the bound allows for 0.1 % of them",
     "undecided": "pairs that are called inconclusive",
-    "missed": "planted differences that are not seen, of those that are said to be seen with a probability of 99 %",
-    "missed at half": "the same with a probability of 50 %",
-    "undecided differences": "planted ones of 99 % that are seen, but called inconclusive",
+    "missed": "undetected planted differences, of a size with a claimed probability of detection of 99 %",
+    "missed at half": "the same with a claimed probability of 50 %",
+    "undecided differences": "planted differences (99 %) that are detected, but called inconclusive",
 }
 WELCH = METHODS["welch"].options
 TILE, FAMILY_ERROR, MARGIN = (WELCH[name].default for name in ("tile", "family_error", "equivalence_margin"))
@@ -54,13 +53,13 @@ PASSES = 8
 Array = NDArray[np.floating[Any]]
 Rng = np.random.Generator
 Side = Image | list[Image]
-Draw = Callable[[Rng, int], tuple[Array, Array]]  # of each pixel: the mean of n samples x, and Σ(x − mean)²
+Draw = Callable[[Rng, int], tuple[Array, Array]]  # returns per pixel the mean of n samples x, and Σ(x − mean)²
 
 
 def rare(rng: Rng, n: int, probability: float, base: float = 1.0) -> tuple[Array, Array]:
-    """Normal noise of σ = base/2, and `probability` of 200 more.
+    """Draw normal noise of σ = base/2, where a sample has 200 more with `probability`.
 
-    Drawn by the samples with and without: their means, and Σ(x − mean)² of either, which is χ².
+    Samples with and without are drawn as two groups, by their means and by Σ(x − mean)², which is χ²-distributed.
     """
     hits = rng.binomial(n, probability, (64, 64, 1))
     groups = []
@@ -72,14 +71,14 @@ def rare(rng: Rng, n: int, probability: float, base: float = 1.0) -> tuple[Array
 
 
 def drawn(rng: Rng, n: int, law: Callable[[Rng, tuple[int, ...]], Array]) -> tuple[Array, Array]:
-    """Samples that are drawn one by one."""
+    """Draw all samples one by one."""
     x = law(rng, (n, 32, 32, 1))
     mean = x.mean(0)
     return mean, np.square(np.subtract(x, mean, out=x), out=x).sum(0)
 
 
 def lognormal(rng: Rng, shape: tuple[int, ...]) -> Array:
-    """Lognormal light of σ = 1.5."""
+    """Draw lognormal samples with σ = 1.5."""
     return np.asarray(np.exp(1.5 * rng.standard_normal(shape, np.float32), dtype=np.float64))
 
 
@@ -94,11 +93,11 @@ LIGHT: dict[str, Draw] = {
 
 @dataclass(frozen=True)
 class Form:
-    """What is known of both sides.
+    """The information on the noise of both sides.
 
-    `kind`: "samples" for films with the variance of their samples, "passes" for that between passes, "renders" for
-    several of them, "unnamed" for renders that do not say how many samples they have. `deviation`: of a Gaussian
-    filter. `known`: which sides hold a variance.
+    `kind`: "samples" for films with the variance of their samples, "passes" for the variance between passes, "renders"
+    for several renders, "unnamed" for renders without a number of samples. `deviation`: σ of a Gaussian filter in
+    pixels. `known`: which sides have a variance.
     """
 
     kind: str
@@ -106,7 +105,7 @@ class Form:
     known: tuple[bool, bool] = (True, True)
 
     def pair(self, draw: Draw, rng: Rng, *counts: int) -> list[Side]:
-        """Both sides, of so many samples each."""
+        """Draw both sides with these numbers of samples."""
         if self.kind == "unnamed":
             counts = tuple(np.clip(counts, 16, 256))
         if self.kind == "samples":
@@ -121,12 +120,12 @@ class Form:
         return self.sides([(stack, 0.0) for stack in stacks], counts)
 
     def sides(self, drawn: Sequence[tuple[Array, Any]], counts: Sequence[int]) -> list[Side]:
-        """Both sides, of their means and Σ(x − mean)²; or of stacks of images, of so many samples in all."""
+        """Return both sides, from means and Σ(x − mean)² or from stacks of images. `counts`: samples of each side."""
         weights = gaussian_filter(np.eye(1, 101, 50)[0], self.deviation) if self.deviation else np.ones(1)
         area = float(1 / np.square(weights).sum() ** 2)  # (Σw)²/Σw² of the filter, along both axes
         sides: list[Side] = []
         for (x, squares), n, known in zip(drawn, counts, self.known, strict=True):
-            if self.kind in ("renders", "unnamed"):  # no two are the same, as no real ones are
+            if self.kind in ("renders", "unnamed"):  # real renders are never equal, so these differ a little
                 header = {SPP: n // len(x)} if self.kind == "renders" else {}
                 sides.append([image(render * (1 + 1e-6 * i), header) for i, render in enumerate(x)])
             elif self.kind == "samples":
@@ -138,7 +137,7 @@ class Form:
 
 
 def image(mean: Array, header: dict[str, Any], variance: Array | None = None) -> Image:
-    """An image, with its variance where that is known."""
+    """Return an image, with its variance if given."""
     names = tuple("RGB"[: mean.shape[-1]])
     if variance is not None:
         names, mean = (*names, *(f"{name}.variance" for name in names)), np.concatenate([mean, variance], -1)
@@ -158,9 +157,9 @@ FORMS = {
     "renders without samples": Form("unnamed"),
 }
 COUNTS = ((64, 64), (256, 64), (64, 1024), (1024, 16), (16, 4096), (8000, 8), (8, 8000))
-# Of all of these `quick` has some.
+# The light, counts and forms of the profile `quick`.
 QUICK_LIGHT, QUICK_COUNTS, QUICK_FORMS = ("fireflies 0.001",), ((1024, 16), (16, 4096)), tuple(FORMS)[:4]
-PAIRS, PLANTED = {"quick": 8, "standard": 6, "full": 60}, {"quick": 16, "standard": 100, "full": 1000}  # a case
+PAIRS, PLANTED = {"quick": 8, "standard": 6, "full": 60}, {"quick": 16, "standard": 100, "full": 1000}  # per case
 POWER = {
     "variances": ((64, 64), (4096, 64)),
     "variance of the reference": ((4096, 64), (64, 64)),
@@ -170,12 +169,12 @@ POWER = {
 
 
 def generator(*case: str | int) -> Rng:
-    """Random numbers of its own for each pair."""
+    """Return a random generator for one pair."""
     return np.random.default_rng([current(SEED), *(x if isinstance(x, int) else zlib.crc32(x.encode()) for x in case)])
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per light, of the scene, and of the power."""
+    """Return one task per light, one for the scene, and one for the power."""
     quick, pairs = context.profile.quick, PAIRS[context.profile.name]
     runs = {light: functools.partial(null_rows, light, quick, pairs) for light in (QUICK_LIGHT if quick else LIGHT)}
     runs |= {} if quick else {"scene": functools.partial(scene_rows, context, pairs)}
@@ -184,7 +183,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def null_rows(light: str, quick: bool, pairs: int) -> list[Row]:
-    """A row per form, over all counts."""
+    """Return a row per form, over all counts."""
     counts = [(*pair, i) for pair in (QUICK_COUNTS if quick else COUNTS) for i in range(pairs)]
     rows = []
     for form in QUICK_FORMS if quick else FORMS:
@@ -194,7 +193,7 @@ def null_rows(light: str, quick: bool, pairs: int) -> list[Row]:
 
 
 def null_row(form: str, light: str, results: list[Comparison], setting: str = "") -> Row:
-    """The row of pairs that are equal."""
+    """Return the row of equal pairs."""
     counts = {verdict: float(sum(x.verdict is verdict for x in results)) for verdict in Verdict}
     values = {"pairs": float(len(results)), "alarms": counts[Verdict.DIFFERENT]}
     values["undecided"] = counts[Verdict.INCONCLUSIVE]
@@ -203,14 +202,14 @@ def null_row(form: str, light: str, results: list[Comparison], setting: str = ""
 
 
 def at_most(count: int, probability: float) -> float:
-    """The number of events that is exceeded with a probability of `limits.NULL_ALARM` only."""
+    """Return the number of events that chance exceeds with a probability of `limits.NULL_ALARM` only."""
     return float(stats.binom.ppf(1 - limits.NULL_ALARM, count, probability))
 
 
 def scene_rows(context: Context, pairs: int) -> list[Row]:
-    """A ball of glass on a floor below a small lamp, which paths through the ball meet by chance only.
+    """Return rows of renders of a glass ball on a floor below a small lamp, which paths hit by chance only.
 
-    The same passes as films with variances on both sides or on one, and as renders.
+    The same passes are used as films with variances on both sides or on one, and as renders.
     """
     if context.scalar:
         return [Row(NAME, "every form", "scene", context.variant, reason="scalar variants would render for long")]
@@ -241,9 +240,10 @@ def scene_rows(context: Context, pairs: int) -> list[Row]:
 
 
 def power_rows(pairs: int) -> list[Row]:
-    """Rows of pairs, one tile of normal noise brighter by what the pair without that says."""
+    """Return rows of the power: one tile of each pair is brightened by the difference that `welch` claims to detect."""
     threshold = stats.norm.isf(tile_statistics.sidak(FAMILY_ERROR, 2 * (16 + 1)) / 2)
-    share = threshold / (threshold + stats.norm.isf(tile_statistics.MISSED))  # of what is seen with 99 %, with 50 %
+    # The difference detected with 50 %, over that detected with 99 %.
+    share = threshold / (threshold + stats.norm.isf(tile_statistics.MISSED))
     rows = []
     for form, n, m in [(form, n, m) for form, counts in POWER.items() for n, m in counts]:
         values = {"pairs": float(pairs), "missed": 0.0, "missed at half": 0.0, "undecided differences": 0.0}
@@ -260,7 +260,7 @@ def power_rows(pairs: int) -> list[Row]:
 
 
 def brighter(side: Any, by: float) -> Any:
-    """The side with one tile brighter by a share of the mean, which is 1."""
+    """Return a side with one tile brightened by this difference."""
     if isinstance(side, list):
         return [brighter(x, by) for x in side]
     pixels = side.pixels.copy()
@@ -269,16 +269,16 @@ def brighter(side: Any, by: float) -> Any:
 
 
 def seen(result: Comparison) -> bool:
-    """Whether any test of a difference is an alarm."""
+    """Return whether any test of a difference is an alarm."""
     return not all(metric.holds for metric in result.metrics if metric.bound == 0)
 
 
 def summarise(rows: list[Row]) -> list[Row]:
-    """The rows, and one of all pairs."""
-    mine = [row.values for row in rows if row.study == NAME and "alarms" in row.values]
-    if not mine:
+    """Append a row of all pairs."""
+    parts = [row.values for row in rows if row.study == NAME and "alarms" in row.values]
+    if not parts:
         return rows
-    values = {name: sum(x[name] for x in mine) for name in ("pairs", "alarms", "undecided")}
+    values = {name: sum(x[name] for x in parts) for name in ("pairs", "alarms", "undecided")}
     bounds = {"alarms": at_most(int(values["pairs"]), FAMILY_ERROR)}
     return [*rows, Row(NAME, "every form", "every light", "", values, bounds)]
 

@@ -1,6 +1,6 @@
-"""Samples: `refract` against `dielectric`, one `bsdf.sample` at a time, in every variant that Mitsuba's wheel offers.
+"""Samples: `refract` against `dielectric`, one `bsdf.sample` at a time, in every variant of Mitsuba's wheel.
 
-Rays come from outside and from inside, with both lobes and with each alone, for radiance and for importance. Where both
+Rays come from outside and from inside, with both lobes and with each alone, for radiance and for importance. If both
 plugins chose the same lobe, their directions, densities, weights and relative indices are compared entry by entry.
 """
 
@@ -23,12 +23,13 @@ from validation.study import Study, Task, about
 
 NAME = "samples"
 TERMS = {
-    "lobe flips": "rays for which the two plugins chose different lobes; the budget is what chance exceeds once in 10⁶",
-    "wo / bound, pdf / bound, weight / bound": "the largest difference on a ray over the bound for that ray, which the "
-    "cancelling radicand of the built-in determines: near the critical angle it is wide, elsewhere a few roundings",
-    "wo, pdf, eta, weight": "differences of the sample's entries: the largest, and that of the 99th percentile. "
-    "Those of Mueller matrices are multiplied by the smaller cos²θ, because the built-in recomputes the cosine of wi "
-    "from wo by Snell's law, and divides by its square the digits that are lost in this",
+    "lobe flips": "rays for which the two plugins chose different lobes; chance exceeds the budget once in 10⁶ runs",
+    "wo / bound, pdf / bound, weight / bound": "the largest difference on a ray, divided by the bound for that ray, "
+    "which the cancelling radicand of the built-in determines: it is wide near the critical angle, elsewhere a few "
+    "roundings",
+    "wo, pdf, eta, weight": "differences of the sample's entries: the largest, and the 99th percentile. Differences of "
+    "Mueller matrices are multiplied by the smaller cos²θ, because the built-in recomputes the cosine of wi from wo by "
+    "Snell's law, and divides the rounding error of this by the square of the cosine",
 }
 SEED = 2027
 INT_IOR, EXT_IOR = 1.5, 1.0
@@ -38,7 +39,7 @@ QUANTITIES = ("wo", "pdf", "eta", "weight")
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per variant of Mitsuba's wheel; in the profile `quick` that of the run."""
+    """Return one task per variant of Mitsuba's wheel; `quick` has the run's variant only."""
     variants = {context.variant: None} if context.profile.quick else context.variants
     return [
         Task(f"samples: {variant}", functools.partial(_variant_rows, context, variant, reason))
@@ -78,8 +79,8 @@ def _mode_row(mode: Any, count: int, variant: str) -> Row:
         same = x["type"] == y["type"]
         flips += int((~same).sum())
         for name in QUANTITIES:
-            # A lobe that cannot be (transmission under total internal reflection) has weight 0 and no direction. On
-            # CUDA the built-in's weight may be a rounding error there.
+            # An impossible lobe (transmission under total internal reflection) has weight 0 and no direction. On CUDA
+            # the built-in's weight may be a rounding error there.
             possible = np.minimum(*(np.abs(sample["weight"]).max(1) for sample in (x, y))) > 0
             used = same & possible if name == "wo" else same
             difference = np.nan_to_num(np.abs(x[name] - y[name]).max(1), nan=np.inf)
@@ -104,38 +105,39 @@ def _mode_row(mode: Any, count: int, variant: str) -> Row:
 
 
 def bounds(wi: np.ndarray) -> dict[str, np.ndarray]:
-    """How far the two plugins may be apart on each ray (N, 3), from either side: of wo, pdf and weight.
+    """Return bounds of the differences of wo, pdf and weight between the two plugins, for each ray `wi` (N, 3).
 
-    wo: the a-priori bound of a form whose radicand cancels, and that of `refract`. With ρ that form's error of
-    y = cosθt, at y' = max(y − ρ, 0), and c = |cosθi|: T_s = 4kcy/(kc + y)² and T_p = 4kcy/(c + ky)², so
+    wo: the a-priori bound of a form with a cancelling radicand, plus that of `refract`. Let ρ be the error of
+    y = cosθt in that form, y' = max(y − ρ, 0), and c = |cosθi|. T_s = 4kcy/(kc + y)² and T_p = 4kcy/(c + ky)², so
 
         |δR| ≤ 2kcρ [1/(kc + y')² + 1/(c + ky')²] + 16u,
 
-    as |∂T_s/∂y| ≤ 4kc/(kc + y)², likewise T_p. Each built-in amplitude is a quotient of two sums, 5u, its square 11u,
-    their mean 12u; `refract`'s R is right to u; |wi| is 1 to u, and |∂R/∂ log c| ≤ 1; 1 − R is rounded: 16u. A weight
-    is that, or a constant, times at most 1 or k², of which either plugin rounds 2.5 factors: 5u.
+    because |∂T_s/∂y| ≤ 4kc/(kc + y)², and likewise T_p. The 16u: each built-in amplitude is a quotient of two sums, 5u,
+    its square 11u, their mean 12u; the error of `refract`'s R is u; |wi| is 1 up to u, with |∂R/∂ log c| ≤ 1; 1 − R is
+    rounded. A weight is R, 1 − R or a constant, times at most 1 or k², where either plugin rounds 2.5 factors: 5u.
     """
     z = wi[:, 2].astype(np.float32).astype(float)
     c, k = np.abs(z), np.where(z > 0, EXT_IOR / INT_IOR, INT_IOR / EXT_IOR)
     radicand = 1 - k * k * (1 - c * c)
     y, transmitted = np.sqrt(np.maximum(radicand, 0)), radicand > 0
     form = cancelling(2)
-    # Where the radicand's error may turn a decision, y is off by its root, also under total internal reflection.
+    # If the radicand's error may change the decision, the error of y is its root, even for total internal reflection.
     near = transmitted | (-radicand <= form.radicand_error_bound(U, k))
-    off = np.where(near, form.of_root(U, k, y, near), 0)
-    low = np.maximum(y - off, 0)
-    chord = form.of_terms(U, k, transmitted) + off + ROUNDING.chord(U, k, y, transmitted)
+    rho = np.where(near, form.of_root(U, k, y, near), 0)
+    low = np.maximum(y - rho, 0)
+    chord = form.of_terms(U, k, transmitted) + rho + ROUNDING.chord(U, k, y, transmitted)
     with np.errstate(divide="ignore"):
-        power = 2 * k * c * off * (1 / (k * c + low) ** 2 + 1 / (c + k * low) ** 2)
+        power = 2 * k * c * rho * (1 / (k * c + low) ** 2 + 1 / (c + k * low) ** 2)
     pdf = np.minimum(power, 1) + 16 * U
     return {"wo": chord, "pdf": pdf, "weight": np.maximum(1, k * k) * (pdf + 5 * U)}
 
 
 def most_flips(expected: float) -> float:
-    """The number of lobe flips that chance exceeds with probability `limits.SAMPLE_FLIPS` at most.
+    """Return the number of lobe flips that chance exceeds with probability `limits.SAMPLE_FLIPS` at most.
 
-    A ray flips where its random number is between the two densities: with probability |δR|, `expected` in all. A sum
-    of independent rare events exceeds a number no more often than Poisson's with its mean does (Hoeffding 1956).
+    A ray flips if its random number is between the two densities: with probability |δR|, in total `expected`. The
+    number of independent rare events exceeds a value at most as often as a Poisson variable of the same mean does
+    (Hoeffding 1956).
     """
     return float(stats.poisson.isf(limits.SAMPLE_FLIPS, expected))
 

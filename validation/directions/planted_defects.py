@@ -1,8 +1,8 @@
-"""Planted defects: each formula with one mistake in it, which the check of the directions must detect.
+"""Planted defects: each formula with one mistake, which the check of directions must detect.
 
-The mistakes are those printed in the documents, and common ones. Each spoilt formula is checked against the bound of
-the formula it was made from, on the same regimes of rays. A defect that no ray detects has escaped. The control is the
-formula without a defect: no ray may fail it.
+The mistakes are misprints of the documents, and common ones. Each formula with a defect is checked against the original
+formula's bound, on the same regimes of rays. A defect that no ray detects has escaped. The control is the formula
+without a defect: no ray may fail.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from validation.study import Study, Task, about
 NAME = "planted_defects"
 SEED = 2028
 COUNT, SCALAR_COUNT = 400, 20  # rays per regime
-# Rare defects show on one ray in a hundred of this regime: of 6400 rays none does with a probability of e⁻⁵⁰.
+# Rare defects show on one ray in a hundred of this regime: the probability that none of 6400 rays shows one is e⁻⁵⁰.
 RARE_REGIME, MORE = "critical, to the ulp", 16
 EXACT = tuple(name for name in FORMULAS if name not in DOCUMENTED)
 
@@ -43,9 +43,9 @@ Answer = tuple[Any, Any]  # b and transmitted
 
 @dataclass(frozen=True)
 class Mutant:
-    """`answer(formula, a, n, k)` is that of the formula with the defect; `of` are the formulas to which it applies.
+    """A defect. `answer(formula, a, n, k)` evaluates a formula with the defect; `of`: the formulas that can have it.
 
-    `rare`: it shows on too few rays to be looked for on scalar arrays, which cost a call per operation.
+    `rare`: the defect shows on too few rays for scalar arrays, which cost a Python call per operation.
     """
 
     text: str
@@ -54,7 +54,7 @@ class Mutant:
     rare: bool = False
 
     def make(self, formula: Any) -> Subject:
-        """The formula with the defect."""
+        """Return the formula with the defect."""
         return functools.partial(self.answer, formula)
 
 
@@ -62,13 +62,13 @@ class Mutant:
 
 
 def _after(change: Callable[..., Answer]) -> Callable[[Any, Any, Any, Any], Answer]:
-    """The formula, and a change of its b and `transmitted`: `change(b, transmitted, a, n, k)`."""
+    """Return a defect that applies `change(b, transmitted, a, n, k)` to a formula's answer."""
     return lambda f, *ray: change(*f(*ray), *ray)
 
 
 def _one_sided(b: Any, transmitted: Any, a: Any, n: Any, k: Any) -> Answer:
-    along = dr.dot(n, b)
-    return dr.select(transmitted, b - n * (along + dr.abs(along)), b), transmitted
+    normal_part = dr.dot(n, b)
+    return dr.select(transmitted, b - n * (normal_part + dr.abs(normal_part)), b), transmitted
 
 
 def _slipped_cross(b: Any, transmitted: Any, a: Any, n: Any, k: Any) -> Answer:
@@ -111,7 +111,7 @@ def _printed_002(f: Any, a: Any, n: Any, k: Any) -> Answer:
 
 
 def _printed_004(f: Any, a: Any, n: Any, k: Any) -> Answer:
-    """X = k R/(1 + R²) with R = sin/cos, in the plane of incidence."""
+    """Return X = k R/(1 + R²) with R = sin/cos, in the plane of incidence."""
     c = dr.dot(n, a)
     tangent = a - n * c
     x = k * dr.abs(c) * dr.norm(tangent)  # R/(1 + R²) = sin cos
@@ -121,16 +121,17 @@ def _printed_004(f: Any, a: Any, n: Any, k: Any) -> Answer:
 
 MUTANTS = {
     "control": Mutant("the formula as it is", lambda f, a, n, k: f(a, n, k)),
-    "swapped k": Mutant("n_to / n_from for n_from / n_to", lambda f, a, n, k: f(a, n, 1 / k)),
-    "k off": Mutant("a ratio that is off by 2⁻¹⁰", lambda f, a, n, k: f(a, n, k * (1 + 2.0**-10))),
+    "swapped k": Mutant("n_to / n_from instead of n_from / n_to", lambda f, a, n, k: f(a, n, 1 / k)),
+    "k off": Mutant("a ratio with an error of 2⁻¹⁰", lambda f, a, n, k: f(a, n, k * (1 + 2.0**-10))),
     "flipped normal": Mutant(
-        "the root with the wrong sign: the refracted ray comes back",
+        "the root with the wrong sign: the refracted ray stays on the side of the incident ray",
         _after(lambda b, t, a, n, k: (dr.select(t, b - n * (2 * dr.dot(n, b)), b), t)),
     ),
     "one-sided": Mutant("the root without the sign of n·a", _after(_one_sided)),
     "slipped cross product": Mutant("n × a with a wrong sign in one component", _after(_slipped_cross)),
     "no mirror": Mutant(
-        "total internal reflection lets the ray pass", _after(lambda b, t, a, n, k: (dr.select(t, b, a), t))
+        "total internal reflection returns the incident direction",
+        _after(lambda b, t, a, n, k: (dr.select(t, b, a), t)),
     ),
     "always transmitted": Mutant("`transmitted` is True for every ray", _after(lambda b, t, *_: (b, t | True))),
     "never transmitted": Mutant("`transmitted` is False for every ray", _after(lambda b, t, *_: (b, t & False))),
@@ -139,7 +140,7 @@ MUTANTS = {
     "002 as printed": Mutant("N·L < 0 assumed", _printed_002, ("decomposed",)),
     "004 as printed": Mutant("X = k R/(1 + R²)", _printed_004, ("rotated",)),
     "one ulp": Mutant(
-        "the result times 1 + 2u", _after(lambda b, t, *_: (b * (1 + 2 * dr.epsilon(type(b))), t)), EXACT
+        "the result multiplied by 1 + 2u", _after(lambda b, t, *_: (b * (1 + 2 * dr.epsilon(type(b))), t)), EXACT
     ),
     "unit normal assumed": Mutant(
         "the division by n² left out", _after(lambda b, t, a, n, k: (b * dr.dot(n, n), t)), EXACT
@@ -152,12 +153,12 @@ MUTANTS = {
     ),
     "no fma": Mutant("x y + z rounded twice", _patched(dr, "fma", lambda x, y, z: x * y + z), ("compensated",)),
     "truncated radicand": Mutant(
-        "its low part dropped",
+        "the radicand without its low part",
         _patched(error_free.TripleWord, "double", lambda x: error_free.DoubleWord(x.hi, 0 * x.hi)),
         ("compensated",),
     ),
     "radicand of second order": Mutant(
-        "sums of first order rounded",
+        "the radicand with rounded sums of first order",
         _patched(error_free.TripleWord, "collected", lambda x: error_free.TripleWord(x.hi, (sum(x.first),), 0 * x.hi)),
         ("compensated",),
         rare=True,
@@ -165,7 +166,7 @@ MUTANTS = {
 }
 TERMS = {name: mutant.text for name, mutant in MUTANTS.items()} | {
     "rays that see it": "rays whose error exceeds their bound, or whose decision is wrong beyond the margin",
-    "escaped": "1 where no ray sees the defect",
+    "escaped": "1 if no ray detects the defect",
 }
 
 
@@ -173,14 +174,14 @@ TERMS = {name: mutant.text for name, mutant in MUTANTS.items()} | {
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task, in single precision where it is compiled, else in what there is."""
-    every = running(context)
-    setting = next((s for s in every if s.precision is np.float32), every[0])
+    """Return one task, in single precision if a compiled backend runs, otherwise in the first setting that runs."""
+    available = running(context)
+    setting = next((s for s in available if s.precision is np.float32), available[0])
     return [Task(f"planted defects: {setting.label}", functools.partial(rows, setting))]
 
 
 def rows(setting: Setting) -> list[Row]:
-    """Every mutant of every formula."""
+    """Return the rows of every mutant of every formula."""
     sample = draw(SCALAR_COUNT if setting.is_scalar else COUNT, setting.precision)
     return [row(name, formula, setting, sample) for name in MUTANTS for formula in MUTANTS[name].of]
 
@@ -189,21 +190,21 @@ RARE = "shows on one ray in a hundred; scalar arrays compute too few"
 
 
 def row(name: str, formula: str, setting: Setting, sample: Sample) -> Row:
-    """How one mutant of a formula did."""
+    """Return the row of one mutant of a formula."""
     if MUTANTS[name].rare and setting.is_scalar:
         return Row(NAME, name, formula, setting.label, reason=RARE)
-    found = sample.judge(name, formula, setting.vector)
-    seen = int(found.wrong.sum())
-    values = {"rays that see it": float(seen), "escaped": float(seen == 0), **found.values()}
+    judgement = sample.judge(name, formula, setting.vector)
+    count = int(judgement.wrong.sum())
+    values = {"rays that see it": float(count), "escaped": float(count == 0), **judgement.values()}
     budgets = {"rays that see it": 0.0} if name == "control" else {"escaped": 0.0}
-    remark = sample.strongest(found) if seen else ""
-    replay = {"seed": seeds.current(SEED), "rays": len(found.wrong)}
+    remark = sample.strongest(judgement) if count else ""
+    replay = {"seed": seeds.current(SEED), "rays": len(judgement.wrong)}
     return Row(NAME, name, formula, setting.label, values, budgets, reason=remark, replay=replay)
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Rays of all regimes in one set; `regime` names each ray's own, `unit` says whether its vectors are unit."""
+    """Rays of all regimes in one set. `regime`: each ray's regime; `unit`: whether its vectors are unit."""
 
     rays: Rays
     exact: oracle.Certified
@@ -211,34 +212,35 @@ class Sample:
     unit: np.ndarray
 
     def judge(self, mutant: str, formula: str, vector: Any) -> Judgement:
-        """Check a mutant against the bound of the formula it was made from, on the rays that this formula accepts."""
-        spoilt, budget = MUTANTS[mutant].make(FORMULAS[formula]), FORMULAS[formula].budget
+        """Check a mutant against the original formula's bound, on the rays that this formula accepts."""
+        function, budget = MUTANTS[mutant].make(FORMULAS[formula]), FORMULAS[formula].budget
         if budget.at_the_limit:
-            return judge_formula(spoilt, self.rays, self.exact, vector, budget)
+            return judge_formula(function, self.rays, self.exact, vector, budget)
         fields = {field.name: getattr(self.exact, field.name)[self.unit] for field in dataclasses.fields(self.exact)}
         exact = oracle.Certified(**fields)
-        return judge_formula(spoilt, self.rays[self.unit], exact, vector, budget)
+        return judge_formula(function, self.rays[self.unit], exact, vector, budget)
 
-    def strongest(self, found: Judgement) -> str:
-        """ "regime, metric value": a wrong decision before a wrong direction, where most rays see it."""
-        metric, mask = (MISCLASSIFIED_FAR, found.far) if found.far.any() else (ERROR_OVER_BOUND, found.wrong)
+    def strongest(self, judgement: Judgement) -> str:
+        """Return the regime in which most rays detect the defect, and its metric: wrong decisions before errors."""
+        wrong_decision = judgement.far.any()
+        metric, mask = (MISCLASSIFIED_FAR, judgement.far) if wrong_decision else (ERROR_OVER_BOUND, judgement.wrong)
         names = self.regime if len(mask) == len(self.regime) else self.regime[self.unit]
         regime = max(dict.fromkeys(names), key=lambda name: int(mask[names == name].sum()))
-        there = names == regime
-        value = mask[there].sum() if metric == MISCLASSIFIED_FAR else found.share[there].max()
+        in_regime = names == regime
+        value = mask[in_regime].sum() if wrong_decision else judgement.share[in_regime].max()
         return f"caught by {regime}: {metric} {compact(float(value))}"
 
 
 @seeds.cached
 def draw(count: int, precision: type) -> Sample:
-    """`count` rays of every regime that is one on every backend, and normal incidence along the axes.
+    """Return `count` rays of every regime without denormal numbers, and rays of normal incidence along the axes.
 
-    Of the regime of rare defects MORE times as many, where they are looked for.
+    The regime of rare defects has MORE times as many rays, except on scalar arrays.
     """
     entries = {name: entry for name, entry in regimes.REGIMES.items() if not entry.rests_on_denormals}
     counts = dict.fromkeys(entries, count) | ({} if count == SCALAR_COUNT else {RARE_REGIME: MORE * count})
     parts = {name: regimes.make(name, n, precision, seeds.current(SEED)) for name, n in counts.items()}
-    # From either side, into the denser and the thinner medium.
+    # Along the axes, from either side, into the denser and the thinner medium.
     n: np.ndarray = np.tile(np.eye(3, dtype=precision), (4, 1))
     side = np.repeat([[1.0], [-1.0]], 6, axis=0)
     k = np.tile(np.repeat([0.75, 1.5], 3), 2)

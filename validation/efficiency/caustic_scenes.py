@@ -1,7 +1,7 @@
-"""Scenes of caustics: glass, water or a mirror over a matt floor, and one lamp; and a disk below glass on an axis.
+"""Scenes of caustics: glass, water or a mirror over a matt floor with one lamp, and a disk below glass on an axis.
 
-Bodies are about 1 in size; the floor is y = 0, and the lamp at DISTANCE from the point of the floor below the body. All
-lamps have the same irradiance there, 1 W/m², so that images of different lamps are alike.
+Bodies are about 1 in size. The floor is y = 0, and the lamp is at DISTANCE from the point of the floor below the body.
+All lamps have the same irradiance there, 1 W/m², so that images of different lamps are comparable.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ Array = NDArray[np.float64]
 
 DISTANCE = 6.0
 TOWARDS = np.array([2.0, 6.0, -1.0]) / math.sqrt(41)  # from the floor below the body to the lamp
-SMALL = 0.05  # of the distance: a side up to which a lamp is small
+SMALL = 0.05  # largest side of a small lamp, over the distance
 SIDES = (0.01, 0.05, 0.2, 0.7)  # of square lamps, over the distance
 
 
 def square(side: float) -> Nodes:
-    """A square that faces the body, of this side over the distance."""
+    """Return a square lamp that faces the body; `side`: over the distance."""
     import mitsuba as mi
 
     place = mi.ScalarTransform4f().look_at([*(DISTANCE * TOWARDS)], [0, 0, 0], [0, 0, 1]).scale(side * DISTANCE / 2)
@@ -50,7 +50,7 @@ def square(side: float) -> Nodes:
 
 
 def spot() -> Nodes:
-    """A cone of light around the body."""
+    """Return a spot lamp around the body."""
     import mitsuba as mi
 
     place = mi.ScalarTransform4f().look_at([*(DISTANCE * TOWARDS)], [0, 0, 0], [0, 0, 1])
@@ -65,7 +65,7 @@ ZERO_SIZE: dict[str, Callable[[], Nodes]] = {
 
 
 def side_of(lamp: str) -> float:
-    """The side of a lamp by its name, over its distance; 0 for lamps of no size."""
+    """Return a lamp's side over its distance; 0 for lamps without size."""
     return 0.0 if lamp in ZERO_SIZE else float(lamp.split()[-1])
 
 
@@ -73,7 +73,7 @@ LAMPS = (*(f"square {side}" for side in SIDES), *ZERO_SIZE)
 
 
 def lamp_of(name: str) -> Nodes:
-    """The lamp of this name."""
+    """Return the lamp of this name."""
     return ZERO_SIZE[name]() if name in ZERO_SIZE else square(side_of(name))
 
 
@@ -81,12 +81,15 @@ def lamp_of(name: str) -> Nodes:
 
 
 def grid_mesh(points: Array, bsdf: Nodes, normals: Array | None = None) -> Any:
-    """A mesh of rows × columns points (… × 3); triangles of no area are left out. Normals point to their right side."""
+    """Return a mesh of rows × columns points (… × 3), without triangles of zero area.
+
+    A face normal is (step to the next column) × (step to the next row).
+    """
     import mitsuba as mi
 
     rows, columns = points.shape[:2]
-    at = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (x.ravel() for x in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]))
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (x.ravel() for x in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
     faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
     vertices = points.reshape(-1, 3)
     p, q, r = (vertices[faces[:, i]] for i in range(3))
@@ -100,7 +103,7 @@ def grid_mesh(points: Array, bsdf: Nodes, normals: Array | None = None) -> Any:
 
 
 def revolved(profile: Array, bsdf: Nodes, turns: int, normals: Array | None = None) -> Any:
-    """A mesh of a profile (N × 2: distance from the y axis, y) that runs clockwise around glass to its right."""
+    """Return the surface of revolution of a profile (N × 2: distance from the y axis, y), with glass on its right."""
     angle = np.linspace(0, 2 * np.pi, turns + 1)
     angle[-1] = 0
 
@@ -113,31 +116,31 @@ def revolved(profile: Array, bsdf: Nodes, turns: int, normals: Array | None = No
 # Bodies --------------------------------------------------------------------------------------------------------
 
 
-BLACK = "diffuse"  # in place of the plugin of glass: the body shows nothing but its shadow
+BLACK = "diffuse"  # in place of the plugin of glass: the body is black and casts a shadow
 
 
 def surface(bsdf: str, **boundary: Any) -> Nodes:
-    """A boundary of these parameters by a plugin, or BLACK."""
+    """Return a boundary of a plugin with these parameters, or a black surface."""
     return {"type": BLACK, "reflectance": 0.0} if bsdf == BLACK else {"type": bsdf} | boundary
 
 
 def glass(bsdf: str, int_ior: float = 1.5, ext_ior: float = 1.0) -> Nodes:
-    """A boundary of two media by a plugin."""
+    """Return a boundary of two media by a plugin."""
     return surface(bsdf, int_ior=int_ior, ext_ior=ext_ior)
 
 
 def ball(bsdf: str) -> Nodes:
-    """A glass ball over the floor."""
+    """Return a glass ball over the floor."""
     return {"ball": {"type": "sphere", "center": [0, 1.2, 0], "bsdf": glass(bsdf)}}
 
 
 def lens(bsdf: str) -> Nodes:
-    """A plano-convex lens over the floor, whose focus is below it."""
+    """Return a plano-convex lens over the floor; its focus is below the floor."""
     return {"lens": revolved(caustic_energy.lens_profile(24, 1.2, scale=1.8), glass(bsdf), 72)}
 
 
 def water_glass(bsdf: str) -> Nodes:
-    """A tumbler of water: boundaries of glass and air, glass and water, water and air."""
+    """Return a tumbler of water: boundaries of glass and air, glass and water, water and air."""
     import mitsuba as mi
 
     place = mi.ScalarTransform4f().translate([0, 0.01, 0]).scale(1 / 45)
@@ -146,7 +149,7 @@ def water_glass(bsdf: str) -> Nodes:
 
 
 def diamond(bsdf: str) -> Nodes:
-    """A round brilliant that stands on its tip."""
+    """Return a round brilliant that stands on its tip."""
     import mitsuba as mi
 
     place = mi.ScalarTransform4f().translate([0, 0.9, 0]).scale(1 / 50)
@@ -154,13 +157,13 @@ def diamond(bsdf: str) -> Nodes:
 
 
 def ply(name: str, place: Any, bsdf: Nodes) -> Nodes:
-    """A mesh of the scene files, in facets."""
+    """Return a mesh of the scene files, with flat facets."""
     filename = str(SCENES / "meshes" / f"{name}.ply")
     return {"type": "ply", "filename": filename, "face_normals": True, "to_world": place, "bsdf": bsdf}
 
 
 def ring(bsdf: str) -> Nodes:
-    """A polished ring of gold that lies on the floor; its caustic is of reflected light alone."""
+    """Return a polished ring of gold on the floor; its caustic is of reflected light only."""
     angle = np.linspace(0, -2 * np.pi, 49)
     normals = np.stack([np.cos(angle), np.sin(angle)], 1)
     band = np.array([[1.0, 0.26]]) + np.array([[0.06, 0.25]]) * normals
@@ -170,7 +173,7 @@ def ring(bsdf: str) -> Nodes:
 
 
 def pool(bsdf: str) -> Nodes:
-    """Water with waves, with normals of the waves; the camera is below its surface."""
+    """Return a water surface with waves and their normals; the camera is below it."""
     side, height, waves = np.linspace(-8, 8, 161), 2.6, ((1.1, 0.7, 0.3), (-0.6, 1.5, 1.9), (2.1, -1.2, 4.0))
     z, x = np.meshgrid(side, side, indexing="ij")
     y, slope_x, slope_z = np.full_like(x, height), np.zeros_like(x), np.zeros_like(x)
@@ -181,7 +184,7 @@ def pool(bsdf: str) -> Nodes:
         slope_z += size * b * np.cos(a * x + b * z + phase)
     normals = np.stack([-slope_x, np.ones_like(x), -slope_z], -1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    points = np.stack([x, y, z], -1)[::-1]  # so that triangles face up
+    points = np.stack([x, y, z], -1)[::-1]  # triangles face up
     return {"water": grid_mesh(points, glass(bsdf, 1.333), normals[::-1])}
 
 
@@ -194,11 +197,11 @@ BODIES: dict[str, Callable[[str], Nodes]] = {
     "pool": pool,
 }
 CAMERA, BELOW_WATER = [0.0, 5.0, 8.0], [0.0, 1.9, 4.5]
-FLOOR = 0.5  # its reflectance
+FLOOR = 0.5  # reflectance
 
 
 def scene(body: str, lamp: str, bsdf: str, resolution: int, floor: float = FLOOR) -> Any:
-    """A body and a lamp of these names, loaded; its glass by the plugin `bsdf`; `floor`: its reflectance."""
+    """Load a body and a lamp by name. `bsdf`: the plugin of the glass; `floor`: reflectance of the floor."""
     import mitsuba as mi
 
     view = sensor(resolution, *((70, BELOW_WATER) if body == "pool" else (24, CAMERA)), target=(0.0, 0.4, 0.0))
@@ -212,7 +215,7 @@ def scene(body: str, lamp: str, bsdf: str, resolution: int, floor: float = FLOOR
 
 
 def disk_scene(body: str, lamp: str, bsdf: str, resolution: int) -> tuple[Any, Array]:
-    """A body over its disk, loaded, and by pixel the power on the disk over the radiance of the image, in m² sr."""
+    """Load a body over its disk; return the scene and, per pixel, power on the disk over radiance, in m² sr."""
     import mitsuba as mi
 
     setup, radius = ON_AXIS[body, lamp]

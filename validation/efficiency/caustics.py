@@ -1,17 +1,20 @@
-"""Caustics: light that has left glass, or a mirror, and meets a matt surface that the camera sees.
+"""Caustics: light that glass or a mirror focuses on a matt surface that the camera sees.
 
-`path` finds such light only where a path from the matt surface happens to meet the lamp, and light of lamps of no size
-never. *Energy*: what reaches a disk below a ball and below a plano-convex lens, both on the axis of the lamp, against a
-converged quadrature of the rays in a plane through that axis (`validation/reference/caustic_energy.py`). *Images*: six
-bodies over a matt floor and lamps of growing size, of the same irradiance, against the sum of two of Mitsuba's
-integrators that share no path: what is seen on surfaces that scatter by `ptracer`, what is seen in glass by `path`. All
-methods have the sampler `independent`, and as many samples. MSE × time is compared with that of path + dielectric, of
-the whole image and where the caustic is seen: in pixels that see no glass, and have more than a quarter of their light
-by it. Where `path` has met no lamp its error is too small, so these ratios are upper bounds. What small lamps light
-through glass and is seen through glass again stays noise in all methods, and is not compared; the reference has that
-noise, too, so the MSE of a whole image with a very small lamp says little. *Noise by class*: which paths make the
-noise that is left with small lamps. Of what is seen in glass, L S+ E is what is left over a nearly black floor,
-L D (S|D)* S E has the noise with a point lamp, and L S+ D (S|D)* S E has the rest.
+`path` finds such light only if a path from the matt surface hits the lamp by chance, and never for lamps without size.
+
+*Energy*: the power on a disk below a ball and below a plano-convex lens, both on the axis of the lamp, against a
+converged quadrature over rays in a plane through that axis (`validation/reference/caustic_energy.py`).
+
+*Images*: six bodies over a matt floor, with lamps of several sizes and the same irradiance. The reference is the sum of
+two of Mitsuba's integrators that share no path: `ptracer` for what is seen on scattering surfaces, `path` for what is
+seen in glass. All methods have the sampler `independent` and as many samples. MSE × time is relative to path +
+dielectric, for the whole image and for the caustic: pixels that see no glass and receive more than a quarter of their
+light through it. If `path` hit no lamp, its error is underestimated, so these ratios are upper bounds. What a small
+lamp lights through glass and is seen through glass again is noise in all methods and is not compared. The reference has
+this noise too, so the MSE of a whole image with a very small lamp says little.
+
+*Noise by class*: the classes of paths that the noise with small lamps comes from. Of what is seen in glass, L S+ E is
+measured with a nearly black floor, L D (S|D)* S E with a point lamp, and L S+ D (S|D)* S E is the rest.
 """
 
 from __future__ import annotations
@@ -54,43 +57,42 @@ ENERGY_OF, OFF, NOISE, MISSING = "energy: ", "energy off", "standard error", "li
 TERMS = {
     EQUAL_TIME: "MSE × time over that of path + dielectric with the same sampler and as many samples; low, high: its "
     "95 % interval over the rounds",
-    EQUAL_TIME_CAUSTIC: "the same of the pixels where the caustic is seen",
+    EQUAL_TIME_CAUSTIC: "the same for the pixels of the caustic",
     TIME_OVER_BUILTIN: "at equal samples per pixel; low, high: its 95 % interval",
     "MSE": "mean over pixels and channels of the squared error",
-    MISSING: "of the pixels where the caustic is seen: 1 − the mean of the images over that of the reference",
-    WELCH_ALARMS: "tiles and channels, and the caustic and all else, whose mean differs from the reference's; at most "
-    "one row in 500 by chance; of small lamps in pixels that see no glass",
-    DETECTABLE: "of the mean over the caustic, or over all else, where it is larger",
+    MISSING: "for the pixels of the caustic: 1 − the mean of the images over that of the reference",
+    WELCH_ALARMS: "tiles and channels, and the caustic and the rest, whose mean differs from the reference's; at most "
+    "one row in 500 by chance; for small lamps in pixels that see no glass",
+    DETECTABLE: "of the mean over the caustic or over the rest, whichever is larger",
     OFF: "|power on the disk over the exact one − 1|",
     NOISE: "of the power over the exact one",
-    "quadrature": "bound of the error of the exact power, relative",
-    SEEN: "share in the noise (variance, all pixels and channels): of what is seen outside glass",
-    LIT: "of surfaces that the lamp lights straight, seen in glass",
-    MIRRORED: "of the lamp itself, seen in glass: found by paths that meet it",
-    CAST: "of caustics seen in glass: neither end can be connected",
+    "quadrature": "bound of the relative error of the exact power",
+    SEEN: "share of the noise (variance, all pixels and channels) from what is seen outside glass",
+    LIT: "share from surfaces lit directly by the lamp and seen in glass",
+    MIRRORED: "share from the lamp itself, seen in glass: found by paths that hit it",
+    CAST: "share from caustics seen in glass: neither end can be connected",
 }
-# What is rendered: integrator settings, and the BSDF of glass. `ptracer` stands for the sum of two integrators.
+# Methods: integrator settings, and the BSDF of glass. `ptracer` stands for the sum of two integrators.
 BY_CLASS = Method("path + ptracer", "ptracer", DIELECTRIC)
 METHODS = (BUILTIN, Method(OURS, OURS, PLUGIN, {"caustics": "path"}), FROM_LAMPS, BY_CLASS)
-HOLDING = FROM_LAMPS, BY_CLASS  # the caustics of lamps of any size
-# Of a disk: the image is a caustic and nothing else.
+HOLDING = FROM_LAMPS, BY_CLASS  # methods that render caustics of lamps of any size
+# Methods for the disk, whose image holds nothing but the caustic.
 ENERGY = replace(FROM_LAMPS, parameters={"caustics": "lamp", "light_paths": 4.0}), BY_CLASS
 DEPTH, TILE, SHARE = 12, 8, 0.25
-FIRST_REFERENCE = 1000  # seed: no method has seen any from here on
-NOT_AIMED = 8
-MORE = {"diamond": 4, "ring": 8}  # times the samples that are tested: the caustic is dim, or on few pixels
-NOISE_RENDERS, NEARLY_BLACK = 4, 1e-6  # of the noise by class: times the rounds; the reflectance of a floor
-BOUNDARIES = 6  # that light which counts for the energy of a caustic may meet
+FIRST_REFERENCE = 1000  # first seed of the references; methods have smaller seeds
+NOT_AIMED = 8  # factor of the samples of `ptracer` in parallel light, which it does not aim
+MORE = {"diamond": 4, "ring": 8}  # factor of the tested samples: the caustic is dim, or on few pixels
+NOISE_RENDERS, NEARLY_BLACK = 4, 1e-6  # for the noise by class: renders per round; reflectance of the black floor
+BOUNDARIES = 6  # the most boundaries of light that counts for the energy of a caustic
 
 
 @dataclass(frozen=True)
 class Extent:
     """How much is measured.
 
-    Images: `spp` of each of `rounds` timed renders, six being the fewest that have a 95 % interval; `checked_spp` of
-    each of `renders` whose mean is tested, and of as many references, times MORE. `lamps` of the ball, and
-    `other_lamps` of all other bodies. Energy: `energy_spp` of each of `renders`; `ptracer`, which does not aim parallel
-    light at the body, has NOT_AIMED times as many.
+    Images: `rounds` timed renders of `spp` each (at least six for a 95 % interval), and `renders` whose mean is tested,
+    of `checked_spp` × MORE each, as are the references. `lamps`: for the ball; `other_lamps`: for all other bodies.
+    Energy: `renders` of `energy_spp` each; × NOT_AIMED for `ptracer` in parallel light, which it does not aim.
     """
 
     resolution: int
@@ -103,11 +105,11 @@ class Extent:
     renders: int = 8
 
     def checked(self, body: str) -> int:
-        """Samples per pixel of renders that are tested, and of references."""
+        """Return the samples per pixel of tested renders and of references."""
         return self.checked_spp * MORE.get(body, 1)
 
     def cases(self) -> list[tuple[str, str]]:
-        """Bodies with lamps."""
+        """Return the pairs of body and lamp."""
         first, *others = scenes.BODIES
         return [(first, x) for x in self.lamps] + [(body, x) for body in others for x in self.other_lamps]
 
@@ -121,31 +123,31 @@ EXTENTS = {
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per body on an axis, and one per body and lamp."""
+    """Return one task per body on an axis, and one per body and lamp."""
     if context.scalar:
         return [Task(NAME, lambda: [Row(NAME, "every method", "every scene", context.variant, reason=SCALAR)])]
     extent = EXTENTS[context.profile.name]
-    found = [
+    made = [
         Task(f"{NAME}: energy, {body}, {lamp}", functools.partial(energy_rows, context, body, lamp))
         for body, lamp in caustic_energy.ON_AXIS
     ]
     for body, lamp in extent.cases():
         run = functools.partial(image_rows, context, body, lamp)
-        found.append(Task(f"{NAME}: {body}, {lamp}", run, timed=True))
+        made.append(Task(f"{NAME}: {body}, {lamp}", run, timed=True))
     left_out = len(scenes.BODIES) * len(scenes.LAMPS) - len(extent.cases())
     if left_out:
         reason = Reason(f"left out: {left_out} bodies and lamps", "`--profile full`")
-        found.append(
+        made.append(
             Task(f"{NAME}: others", lambda: [Row(NAME, "every method", "others", context.variant, reason=reason)])
         )
-    return found
+    return made
 
 
 # Integrators ---------------------------------------------------------------------------------------------------
 
 
 def seen_in_glass(nested: Any = None) -> Any:
-    """An integrator: what `nested` sees where a ray first meets a delta lobe, else 0; without `nested` 1 there."""
+    """Return an integrator for pixels that see a delta lobe first: `nested` there (or 1 without it), 0 elsewhere."""
 
     class SeenInGlass(mi.SamplingIntegrator):
         def sample(
@@ -160,22 +162,22 @@ def seen_in_glass(nested: Any = None) -> Any:
 
 
 class SumOfClasses:
-    """A scene by two integrators that share no path: `ptracer` connects only vertices that scatter to the camera."""
+    """A scene by two integrators that share no path: `ptracer` connects only scattering vertices to the camera."""
 
     def __init__(self, scene: Any, max_depth: int) -> None:
-        """`scene` as Mitsuba loaded it."""
+        """Set up both integrators for a loaded scene."""
         depth = {"max_depth": max_depth, "rr_depth": max_depth}
         methods = mi.load_dict({"type": "ptracer"} | depth), seen_in_glass(mi.load_dict({"type": "path"} | depth))
         self.scene, self.parts = scene, [Camera(scene, method) for method in methods]
 
     def __call__(self, spp: int, seed: int) -> tuple[np.ndarray, float]:
-        """The image and the seconds that both took."""
+        """Return the image and the seconds that both integrators took."""
         (scattered, first), (in_glass, second) = (part(spp, seed) for part in self.parts)
         return scattered + in_glass, first + second
 
 
 def camera_of(scene: Any, method: Method, max_depth: int = DEPTH) -> Camera | SumOfClasses:
-    """A loaded scene by a method."""
+    """Return the camera of a loaded scene by a method."""
     if method == BY_CLASS:
         return SumOfClasses(scene, max_depth)
     return Camera(scene, mi.load_dict(method.plugin(max_depth)))
@@ -185,20 +187,20 @@ def camera_of(scene: Any, method: Method, max_depth: int = DEPTH) -> Camera | Su
 
 
 def energy_rows(context: Context, body: str, lamp: str, methods: tuple[Method, ...] = ENERGY) -> list[Row]:
-    """A row for each method: the power on the disk against the quadrature."""
+    """Return a row per method: the power on the disk against the quadrature."""
     extent, rows = EXTENTS[context.profile.name], []
     setup, radius = caustic_energy.ON_AXIS[body, lamp]
     exact, step = caustic_energy.flux(setup, radius, BOUNDARIES)
     for method in methods:
         row = functools.partial(Row, NAME, method.name, f"{ENERGY_OF}{body}, {lamp}", context.variant)
         if method == BY_CLASS and lamp == caustic_energy.POINT:
-            rows.append(row(reason="ptracer does not aim: measured with a spot, which has the same light"))
+            rows.append(row(reason="ptracer does not aim; it is measured with a spot, which has the same light"))
             continue
         spp = extent.energy_spp * (NOT_AIMED if method == BY_CLASS and lamp == caustic_energy.PARALLEL else 1)
         scene, weights = scenes.disk_scene(body, lamp, method.bsdf, extent.resolution)
-        look = camera_of(scene, method, BOUNDARIES + 2)
-        shots = [look(spp, seed)[0] for seed in range(extent.renders)]
-        ratios = [float((image.mean(-1) * weights).sum() / exact) for image in shots]
+        camera = camera_of(scene, method, BOUNDARIES + 2)
+        images = [camera(spp, seed)[0] for seed in range(extent.renders)]
+        ratios = [float((image.mean(-1) * weights).sum() / exact) for image in images]
         values = {
             OFF: abs(statistics.fmean(ratios) - 1),
             NOISE: statistics.stdev(ratios) / math.sqrt(len(ratios)),
@@ -216,7 +218,7 @@ def energy_rows(context: Context, body: str, lamp: str, methods: tuple[Method, .
 
 @dataclass(frozen=True)
 class Reference:
-    """Independent renders of a case, and its pixels (height × width): those that see no glass, and the caustic."""
+    """Independent renders of a case, and masks (height × width) of pixels that see no glass and of the caustic."""
 
     renders: np.ndarray
     without_glass: np.ndarray
@@ -224,19 +226,19 @@ class Reference:
 
 
 def reference(body: str, lamp: str, extent: Extent) -> Reference:
-    """The reference by the sum of Mitsuba's two integrators."""
+    """Render the reference by the sum of Mitsuba's two integrators."""
     scene, black = (scenes.scene(body, lamp, bsdf, extent.resolution) for bsdf in (DIELECTRIC, scenes.BLACK))
-    look = SumOfClasses(scene, DEPTH)
-    renders = np.stack([look(extent.checked(body), seed=FIRST_REFERENCE + i)[0] for i in range(extent.renders)])
+    camera = SumOfClasses(scene, DEPTH)
+    renders = np.stack([camera(extent.checked(body), seed=FIRST_REFERENCE + i)[0] for i in range(extent.renders)])
     without_glass = Camera(scene, seen_in_glass())(64, seed=0)[0].max(-1) == 0
     direct = camera_of(black, BUILTIN)(extent.checked(body), seed=0)[0].mean(-1)
-    # Of a render that is none of them: pixels that their noise had chosen would be too bright in them.
-    light = look(extent.checked(body), seed=FIRST_REFERENCE - 1)[0].mean(-1)
+    # Another render selects the pixels: pixels selected by the noise of the references would be too bright in them.
+    light = camera(extent.checked(body), seed=FIRST_REFERENCE - 1)[0].mean(-1)
     return Reference(renders, without_glass, without_glass & (light - direct > SHARE * light))
 
 
 def image_rows(context: Context, body: str, lamp: str, methods: tuple[Method, ...] = METHODS) -> list[Row]:
-    """A row per method, of which the first is the built-in; of a small lamp one more, of the noise by class."""
+    """Return a row per method, of which the first is the built-in; for small lamps also one of the noise by class."""
     extent = EXTENTS[context.profile.name]
     truth = reference(body, lamp, extent)
     loaded = {m.bsdf: scenes.scene(body, lamp, m.bsdf, extent.resolution) for m in methods}
@@ -246,8 +248,8 @@ def image_rows(context: Context, body: str, lamp: str, methods: tuple[Method, ..
         of_caustic = (x[truth.caustic][:, None] for x in (image, mean, own))
         return {EQUAL_TIME: errors(image, mean, own)["MSE"], EQUAL_TIME_CAUSTIC: errors(*of_caustic)["MSE"]}
 
-    found = measure(cameras, truth.renders, (extent.spp,), extent.rounds, figures)
-    measured = {name: by_spp[extent.spp] for name, by_spp in found.items()}
+    all_measured = measure(cameras, truth.renders, (extent.spp,), extent.rounds, figures)
+    measured = {name: by_spp[extent.spp] for name, by_spp in all_measured.items()}
     side, case, rows = scenes.side_of(lamp), f"{body}, {lamp}", []
     small = 0 < side <= scenes.SMALL
     compared = truth.without_glass[..., None] | (not small)
@@ -258,8 +260,8 @@ def image_rows(context: Context, body: str, lamp: str, methods: tuple[Method, ..
             images = np.stack([cameras[method.name](extent.checked(body), seed=i)[0] for i in range(extent.renders)])
             values |= _tested(truth.renders * compared, images * compared, truth.caustic)
             budgets = {WELCH_ALARMS: 0.0} | ({} if method == BY_CLASS else {DETECTABLE: limits.CAUSTIC_DETECTABLE})
-        dark, light = (x[:, truth.caustic].mean() for x in (images, truth.renders))
-        values[MISSING] = float(1 - dark / light)
+        test_mean, reference_mean = (x[:, truth.caustic].mean() for x in (images, truth.renders))
+        values[MISSING] = float(1 - test_mean / reference_mean)
         goals = limits.CAUSTICS if holds and small and method != BY_CLASS else {}
         replay: dict[str, Any] = {"method": method.plugin(DEPTH), "body": body, "lamp": lamp}
         replay |= {"resolution": extent.resolution, "spp": extent.spp, "rounds": extent.rounds}
@@ -274,38 +276,41 @@ def image_rows(context: Context, body: str, lamp: str, methods: tuple[Method, ..
 
 
 def noise_row(context: Context, body: str, lamp: str, without_glass: np.ndarray) -> Row:
-    """Shares of classes of paths in the noise of FROM_LAMPS: their covariances with the image, over its variance."""
+    """Return the row of the noise of FROM_LAMPS by class of paths: covariances with the image, over its variance."""
     extent = EXTENTS[context.profile.name]
     renders = NOISE_RENDERS * extent.rounds
 
     def images(lamp: str, floor: float) -> np.ndarray:
-        look = camera_of(scenes.scene(body, lamp, FROM_LAMPS.bsdf, extent.resolution, floor), FROM_LAMPS)
-        return np.stack([look(extent.spp, seed)[0] for seed in range(renders)])
+        camera = camera_of(scenes.scene(body, lamp, FROM_LAMPS.bsdf, extent.resolution, floor), FROM_LAMPS)
+        return np.stack([camera(extent.spp, seed)[0] for seed in range(renders)])
 
-    every = images(lamp, scenes.FLOOR)
-    apart = every - every.mean(0)
-    whole = np.square(apart).sum()
+    all_paths = images(lamp, scenes.FLOOR)
+    deviation = all_paths - all_paths.mean(0)
+    total = np.square(deviation).sum()
 
     def share(part: np.ndarray, pixels: np.ndarray) -> float:
-        return float(((part - part.mean(0)) * apart)[:, pixels].sum() / whole)
+        return float(((part - part.mean(0)) * deviation)[:, pixels].sum() / total)
 
-    # The same paths as in `every`: a floor that is black would need fewer random numbers.
-    values = {SEEN: share(every, without_glass), MIRRORED: share(images(lamp, NEARLY_BLACK), ~without_glass)}
-    values[LIT] = float(images(caustic_energy.POINT, scenes.FLOOR).var(0)[~without_glass].sum() * renders / whole)
+    # With a nearly black floor the paths are the same; a black floor would need fewer random numbers.
+    values = {SEEN: share(all_paths, without_glass), MIRRORED: share(images(lamp, NEARLY_BLACK), ~without_glass)}
+    values[LIT] = float(images(caustic_energy.POINT, scenes.FLOOR).var(0)[~without_glass].sum() * renders / total)
     values[CAST] = 1 - sum(values.values())
     replay = {"method": FROM_LAMPS.plugin(DEPTH), "body": body, "lamp": lamp, "resolution": extent.resolution}
     replay |= {"spp": extent.spp, "renders": renders}
-    reason = f"of {FROM_LAMPS.name}: most is of {max(values, key=lambda name: values[name])}"
+    reason = f"of {FROM_LAMPS.name}: most comes from {max(values, key=lambda name: values[name])}"
     return Row(NAME, BY_PART, f"{body}, {lamp}", context.variant, values, reason=reason, replay=replay)
 
 
 def _tested(references: np.ndarray, images: np.ndarray, caustic: np.ndarray) -> dict[str, float]:
-    """Welch's test of tiles, and of two means: over the caustic, and over all else. The latter say what is seen."""
-    how = limits.WELCH_ERROR, limits.WELCH_MARGIN
-    tiles = tile_statistics.compare_stacks(references, images, TILE, *how)
+    """Return the values of Welch's test of tiles, and of the means over the caustic and over the rest.
+
+    The two means give the detectable difference.
+    """
+    levels = limits.WELCH_ERROR, limits.WELCH_MARGIN
+    tiles = tile_statistics.compare_stacks(references, images, TILE, *levels)
     inside = caustic[..., None]
     reference, test = (np.concatenate([x * inside, x * ~inside], 2) for x in (references, images))
-    means = tile_statistics.compare_stacks(reference, test, len(caustic), *how)
+    means = tile_statistics.compare_stacks(reference, test, len(caustic), *levels)
     return {
         WELCH_ALARMS: float(tiles.alarms + means.alarms),
         SMALLEST_P: min(tiles.smallest_p, means.smallest_p),
@@ -314,7 +319,7 @@ def _tested(references: np.ndarray, images: np.ndarray, caustic: np.ndarray) -> 
 
 
 def _times(test: Measured, builtin: Measured, side: float) -> dict[str, float]:
-    """Errors, times, and their products over the built-in's: of a lamp of no size that has no meaning."""
+    """Return errors and times, and their products over the built-in's, which mean nothing for lamps without size."""
     values = kernel_timing.ratio(TIME_OVER_BUILTIN, test.seconds, builtin.seconds)
     for metric, name in ((EQUAL_TIME, "MSE"), (EQUAL_TIME_CAUSTIC, "MSE, caustic")):
         values |= kernel_timing.ratio(metric, test.cost(metric), builtin.cost(metric)) if side else {}

@@ -1,9 +1,9 @@
 """Indices that change: a new scene for each image, an edit among many glasses, a sweep.
 
-`dielectric` has its index in the kernel, so a new one is a compilation; `refract` reads it from memory. A new scene is
-timed from its dictionary to its image, an edit from the number to the image, a sweep over all its images. Everything
-else has been compiled before. The two take turns, every second round in the reverse order, each alone in memory, as
-Dr.Jit compiles the code of all plugins that are alive; no index is met twice.
+`dielectric` has its index in the kernel, so a new index needs a compilation; `refract` reads it from memory. A new
+scene is timed from its dictionary to its image, an edit from the number to the image, a sweep over all its images.
+Everything else is compiled before. The two plugins alternate, every second round in reverse order, each alone in
+memory, since Dr.Jit compiles the code of all plugins in memory. No index is used twice.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ NAME = "changing indices"
 TERMS = {
     TIME_OVER_BUILTIN: f"of `{PLUGIN}` by `{OURS}`, over `{BUILTIN.bsdf}` by `{BUILTIN.integrator}`; the median over "
     "the rounds; low, high: its 95 % interval",
-    "ms": "median time of what is measured",
+    "ms": "median time in milliseconds",
 }
 SIDES = {OURS: PLUGIN, BUILTIN.integrator: BUILTIN.bsdf}
 ROUNDS, DEPTH = 9, 8
-MANY = {"quick": 64, "standard": 300, "full": 300}  # glasses, of which one is edited
-SWEEP = 12  # indices
+MANY = {"quick": 64, "standard": 300, "full": 300}  # number of glasses, of which one is edited
+SWEEP = 12  # number of indices
 
 
 def tasks(context: Context) -> list[Task]:
-    """One a way to change an index."""
+    """Return one task per way to change an index."""
     if context.scalar:
         return [Task(NAME, lambda: [Row(NAME, OURS, "every way", context.variant, reason="nothing is compiled")])]
     many = MANY[context.profile.name]
@@ -51,7 +51,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def rows(context: Context, way: str, clock: Callable[[Callable[[], float], str], float]) -> list[Row]:
-    """The one row of a way."""
+    """Return the row of a way to change an index."""
     fresh = functools.partial(np.random.default_rng().uniform, 1.2, 1.9)
     seconds = kernel_timing.rounds({name: name for name in SIDES}, functools.partial(clock, fresh), ROUNDS)
     values = kernel_timing.ratio(TIME_OVER_BUILTIN, *seconds.values())
@@ -61,20 +61,20 @@ def rows(context: Context, way: str, clock: Callable[[Callable[[], float], str],
 
 
 def new_scene(fresh: Callable[[], float], side: str) -> float:
-    """Seconds from a dictionary to its image, after another scene's."""
+    """Return the seconds from a dictionary to its image, after an image of another scene."""
     with alone(SIDES[side], 1, integrator=side, max_depth=DEPTH) as before:
         dr.eval(before.image())
-    kept = []
+    in_memory = []  # until the time is taken
 
     def image() -> Any:
-        kept.append(Balls(SIDES[side], 1, integrator=side, max_depth=DEPTH, least=fresh()))
-        return kept[0].image()
+        in_memory.append(Balls(SIDES[side], 1, integrator=side, max_depth=DEPTH, least=fresh()))
+        return in_memory[0].image()
 
     return seconds_of(image)
 
 
 def edits(count: int, times: int, fresh: Callable[[], float], side: str) -> float:
-    """Seconds of so many edits of one of `count` glasses, each with its image."""
+    """Return the seconds of `times` edits of one of `count` glasses, each with its image."""
     with alone(SIDES[side], count, integrator=side, max_depth=DEPTH) as balls:
         dr.eval(balls.image())
 

@@ -1,10 +1,10 @@
-"""Settings that a pilot chooses: their error × time over that of the best by hand, and over Mitsuba's defaults.
+"""Settings that a pilot chooses: their error × time over that of the best settings by hand and of Mitsuba's defaults.
 
-`mi-refract render --settings auto` measures a few candidates before it renders. Here its choice is rendered
-beside settings by hand. Every other round selects those with the least error × time, and the rounds between measure how
-much that is: the least of many would be too small in the rounds that select it. All rounds have seeds of their own; the
-error is the variance over them, as all settings have the same expected image. Times are those of whole images. The
-pilot's share of the render is included, its compilation not.
+`mi-refract render --settings auto` measures a few candidates before it renders. This study renders its choice and many
+settings by hand. Every other round selects the settings with the least error × time, and the rounds between measure
+them: the least of many in the same rounds would be too small. Each round has a different seed. The error is the
+variance over the rounds, since all settings have the same expected image. Times are those of whole images. The pilot's
+share of the render is included, its compilation is not.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ NAME = "chosen settings"
 EVERY = "every scene"
 SHARE = "pilot / render"
 TERMS = {
-    EQUAL_TIME_HAND: "MSE × time over the least of all settings by hand, pilot included; low, high: its 95 % interval",
+    EQUAL_TIME_HAND: "MSE × time, pilot included, over that of the best settings by hand; low, high: 95 % interval",
     EQUAL_TIME_DEFAULTS: f"the same over `path`, `{DIELECTRIC}` and `independent`, Mitsuba's defaults",
     SHARE: "time of the pilot over that of the render",
 }
@@ -55,7 +55,7 @@ TERMS = {
 
 @dataclass(frozen=True)
 class Extent:
-    """How much is measured: `scenes`, () for all; images of `resolution`², `spp`, twice `rounds` of them."""
+    """How much is measured: `scenes` (() is all), and twice `rounds` images of `resolution`² pixels and `spp`."""
 
     scenes: tuple[str, ...]
     resolution: int
@@ -70,33 +70,34 @@ EXTENTS = {
     "standard": Extent(("balls", "slab", "ball, square 0.05"), 128),
     "full": Extent((), 192, samplers=("multijitter", "stratified", "ldsampler", "orthogonal", "independent")),
 }
-# Documentation-like scenes and caustics, beside the scene files.
+# Scenes in addition to the scene files: typical ones and caustics.
 CAUSTICS = tuple((body, f"square {side}") for body in ("ball", "glass of water", "diamond") for side in (0.05, 0.7))
 OTHERS = ("cornell box", "cornell box, glass", "materials", *(", ".join(case) for case in CAUSTICS))
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per scene."""
+    """Return one task per scene."""
     if context.scalar:
         return [Task(NAME, lambda: [Row(NAME, "auto", EVERY, context.variant, reason=SCALAR)])]
     extent = EXTENTS[context.profile.name]
     every = [path.stem for path in sorted(SCENES.glob("*.xml")) if not beyond_builtin(path)] + [*OTHERS]
-    found = [
+    made = [
         Task(f"{NAME}: {name}", functools.partial(scene_rows, context, name), timed=True)
         for name in every
         if not extent.scenes or name in extent.scenes
     ]
-    if left_out := len(every) - len(found):
+    left_out = len(every) - len(made)
+    if left_out:
         reason = Reason(f"left out: {left_out} scenes", "`--profile full`")
-        found.append(Task(f"{NAME}: others", lambda: [Row(NAME, "auto", "others", context.variant, reason=reason)]))
-    return found
+        made.append(Task(f"{NAME}: others", lambda: [Row(NAME, "auto", "others", context.variant, reason=reason)]))
+    return made
 
 
 # Scenes --------------------------------------------------------------------------------------------------------
 
 
 def other_scene(name: str, bsdf: str, resolution: int) -> dict[str, Any]:
-    """One of OTHERS, for `mi.load_dict`, with `path` and `independent`."""
+    """Return a scene of OTHERS, for `mi.load_dict`, with `path` and `independent`."""
     flat = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(6)
     gray = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
     floor = {"type": "rectangle", "to_world": flat, "bsdf": gray}
@@ -125,7 +126,7 @@ def _ball(center: list[float], radius: float, bsdf: dict[str, Any]) -> dict[str,
 
 
 def scene_file(name: str, bsdf: str, resolution: int, folder: Path) -> tuple[Path, dict[str, str]]:
-    """A scene as a file, and values of its defaults; one of OTHERS is written to the folder."""
+    """Return a scene's file and the values of its defaults. A scene of OTHERS is written to the folder."""
     if name not in OTHERS:
         return SCENES / f"{name}.xml", {"bsdf": bsdf, "res": str(resolution)}
     path = folder / f"{name} {bsdf}.xml"
@@ -138,13 +139,13 @@ def scene_file(name: str, bsdf: str, resolution: int, folder: Path) -> tuple[Pat
 
 
 def full(settings: Settings) -> Settings:
-    """The settings, and the defaults of those that are not set."""
-    every = {"sampler": "independent", "integrator": "path"} | settings
-    return (DEFAULTS if every["integrator"] == OURS else {}) | every
+    """Return settings with all defaults filled in."""
+    with_defaults = {"sampler": "independent", "integrator": "path"} | settings
+    return (DEFAULTS if with_defaults["integrator"] == OURS else {}) | with_defaults
 
 
 def by_hand(extent: Extent, figures: dict[str, Any]) -> list[Settings]:
-    """All settings by hand of a scene that a pilot has figures of: split and with lamps where it has tried that."""
+    """Return all settings by hand of a scene; with splitting and lamps if the pilot has tried them (`figures`)."""
     tried = "".join(figures["costs"])
     depths, lamps = (
         extent.depths if "split_depth" in tried else (0,),
@@ -153,28 +154,28 @@ def by_hand(extent: Extent, figures: dict[str, Any]) -> list[Settings]:
     integrators: list[Settings] = [{"integrator": "path"}]
     for depth, caustics in itertools.product(depths, lamps):
         integrators.append({"integrator": OURS, "split_depth": str(depth), "caustics": caustics})
-    return [{"sampler": sampler, **each} for sampler in extent.samplers for each in integrators]
+    return [{"sampler": sampler, **integrator} for sampler in extent.samplers for integrator in integrators]
 
 
 def costs(cameras: dict[str, Camera], spp: int, rounds: int) -> dict[str, list[float]]:
-    """Squared error × seconds, round by round; the error is that from the mean of all rounds."""
-    shots: dict[str, list[tuple[np.ndarray, float]]] = {name: [] for name in cameras}
+    """Return squared error × seconds by round; the error is the deviation from the mean of all rounds."""
+    renders: dict[str, list[tuple[np.ndarray, float]]] = {name: [] for name in cameras}
     order = list(cameras)
     for seed in range(rounds + 1):
         for name in order:
-            shots[name].append(cameras[name](spp, seed * len(order) + order.index(name)))
+            renders[name].append(cameras[name](spp, seed * len(order) + order.index(name)))
         order.reverse()
-    found = {}
-    for name, (_, *kept) in shots.items():  # the first image compiles
-        images = np.stack([image for image, _ in kept])
+    cost = {}
+    for name, (_, *warm) in renders.items():  # the first image compiles
+        images = np.stack([image for image, _ in warm])
         squares = np.square(images - images.mean(0)).reshape(rounds, -1).mean(1) * rounds / (rounds - 1)
-        seconds = statistics.median(seconds for _, seconds in kept)
-        found[name] = [float(square) * seconds for square in squares]
-    return found
+        seconds = statistics.median(seconds for _, seconds in warm)
+        cost[name] = [float(square) * seconds for square in squares]
+    return cost
 
 
 def scene_rows(context: Context, name: str) -> list[Row]:
-    """The row of a scene."""
+    """Return the row of a scene."""
     extent, folder = EXTENTS[context.profile.name], context.out / "scenes"
     folder.mkdir(parents=True, exist_ok=True)
     row = functools.partial(Row, NAME, "auto", name, context.variant)
@@ -182,19 +183,19 @@ def scene_rows(context: Context, name: str) -> list[Row]:
     render = resume(Job(path, defines, settings=AUTO), folder / "auto.exr", Limits(spp=extent.spp), restart=True)
     chosen, figures = full(parse_settings(render.progress.identity[SETTINGS])), render.progress.identity[PILOT]
     del render
-    every = {settings_text(each): each for each in (*by_hand(extent, figures), chosen)}
+    by_text = {settings_text(settings): settings for settings in (*by_hand(extent, figures), chosen)}
     cameras = {
-        each: Camera(load_parsed(with_settings(parse_scene(path, defines), settings)))
-        for each, settings in every.items()
+        text: Camera(load_parsed(with_settings(parse_scene(path, defines), settings)))
+        for text, settings in by_text.items()
     }
     cameras[BUILTIN.name] = Camera(load_parsed(parse_scene(*default)))
-    found = costs(cameras, extent.spp, 2 * extent.rounds)
-    if max(found[BUILTIN.name]) < limits.NOISE**2:
-        return [row(reason="left out: no noise, so nothing to choose by")]
-    best = min(every, key=lambda each: statistics.fmean(found[each][::2]))
-    auto = [cost * (1 + figures["share"]) for cost in found[settings_text(chosen)][1::2]]
-    values = kernel_timing.ratio(EQUAL_TIME_HAND, auto, found[best][1::2])
-    values |= kernel_timing.ratio(EQUAL_TIME_DEFAULTS, auto, found[BUILTIN.name][1::2])
+    cost_of = costs(cameras, extent.spp, 2 * extent.rounds)
+    if max(cost_of[BUILTIN.name]) < limits.NOISE**2:
+        return [row(reason="left out: the image has no noise to compare settings by")]
+    best = min(by_text, key=lambda text: statistics.fmean(cost_of[text][::2]))
+    auto = [cost * (1 + figures["share"]) for cost in cost_of[settings_text(chosen)][1::2]]
+    values = kernel_timing.ratio(EQUAL_TIME_HAND, auto, cost_of[best][1::2])
+    values |= kernel_timing.ratio(EQUAL_TIME_DEFAULTS, auto, cost_of[BUILTIN.name][1::2])
     values |= {SHARE: figures["share"]}
     replay: dict[str, Any] = {"scene": name, "chosen": settings_text(chosen), "best by hand": best}
     replay |= {"resolution": extent.resolution, "spp": extent.spp, "rounds": extent.rounds}
@@ -202,12 +203,12 @@ def scene_rows(context: Context, name: str) -> list[Row]:
 
 
 def summarise(rows: list[Row]) -> list[Row]:
-    """All rows, and the median over the scenes of what is gained over Mitsuba's defaults."""
-    mine = [row for row in rows if row.study == NAME and EQUAL_TIME_DEFAULTS in row.values]
-    if len(mine) < 2:
+    """Return all rows, with one added that holds the medians over the scenes."""
+    measured = [row for row in rows if row.study == NAME and EQUAL_TIME_DEFAULTS in row.values]
+    if len(measured) < 2:
         return rows
-    values = {metric: statistics.median(row.values[metric] for row in mine) for metric in limits.CHOSEN}
-    return [*rows, Row(NAME, "auto", EVERY, mine[0].setting, values, {}, limits.CHOSEN_MEDIAN)]
+    values = {metric: statistics.median(row.values[metric] for row in measured) for metric in limits.CHOSEN}
+    return [*rows, Row(NAME, "auto", EVERY, measured[0].setting, values, {}, limits.CHOSEN_MEDIAN)]
 
 
 STUDY = Study(NAME, "Settings that a pilot chooses", about(__doc__), TERMS, tasks, summarise=summarise)

@@ -1,10 +1,9 @@
 """Efficiency: the error of an image against render time, by integrator, BSDF and sampler.
 
 The reference is the mean of independent renders by the built-in (path + dielectric with the better of its stratified
-samplers) at the largest number of samples per pixel measured here; the variance of that mean is subtracted from the
-error. All methods render the same seed once per round; a ratio is formed within a round, and the median over the rounds
-is reported. A method must not be faster by being biased: the run fails if the mean of its images differs from the
-built-in's.
+samplers) at the largest number of samples per pixel. The variance of that mean is subtracted from the error. All
+methods render the same seed once per round. Ratios are formed within a round; their median over the rounds is reported.
+A method must not gain time by bias: the run fails if the mean of its images differs from the built-in's.
 """
 
 from __future__ import annotations
@@ -38,19 +37,19 @@ from validation.study import Study, Task, about
 TERMS = {
     TIME_OVER_BUILTIN: "at equal samples per pixel and the same sampler; low, high: its 95 % interval over the rounds",
     "MSE": "mean over pixels and channels of the squared error; relMSE: over reference² + 0.01",
-    "MSE, trimmed": "without the 0.1 % of pixels where the squared error, or the relative one, is largest",
+    "MSE, trimmed": "without the 0.1 % of pixels with the largest squared error, absolute or relative",
     EQUAL_TIME: "MSE × time over that of path + dielectric with the same sampler: 1 / relative efficiency",
-    EQUAL_TIME_DEFAULTS: "the same over that of path + dielectric with `independent`, Mitsuba's default",
+    EQUAL_TIME_DEFAULTS: "the same over path + dielectric with `independent`, Mitsuba's default sampler",
     WELCH_ALARMS: "tiles and channels whose mean differs from the reference's; at most one method in 1000 by chance",
 }
 AXES = {"x": "seconds", "y": "RMSE", "slope": -0.5}
 NAME = "efficiency"
-SCALAR = "needs a compiled variant: a scalar one's time is that of Python"
+SCALAR = "needs a compiled variant: in a scalar one, Python dominates the time"
 INDEPENDENT, STRATIFIED = "independent", ("multijitter", "orthogonal")
 EPSILON, WORST = 0.01, 1e-3
 TILE = 16
-FIRST_REFERENCE = 1000  # seed: no method has seen any from here on
-MEASURED = (*METHODS, FROM_LAMPS)  # in scenes without lamps the last is `refract_path` as it is
+FIRST_REFERENCE = 1000  # first seed of the references; methods have smaller seeds
+MEASURED = (*METHODS, FROM_LAMPS)  # in scenes without lamps, FROM_LAMPS renders like `refract_path`
 METRICS = ("MSE", "MSE, trimmed", "relMSE", "relMSE, trimmed")
 
 
@@ -58,8 +57,8 @@ METRICS = ("MSE", "MSE, trimmed", "relMSE", "relMSE, trimmed")
 class Extent:
     """How much is measured.
 
-    `spp` are squares of primes: every sampler takes them as they are. Six rounds are the fewest that have a 95 %
-    interval. The resolution is doubled, up to `LARGEST`, until the built-in takes `seconds`. `scenes`: () is all.
+    `spp` are squares of primes, which no sampler rounds. At least six rounds are needed for a 95 % interval. The
+    resolution is doubled, up to `LARGEST`, until the built-in takes `seconds`. `scenes`: () is all.
     """
 
     spp: tuple[int, ...]
@@ -80,37 +79,37 @@ LARGEST = 512
 
 @dataclass(frozen=True)
 class Subject:
-    """A method with a sampler, named only where it is not the scene's best stratified one."""
+    """A method with a sampler; the name has the sampler only if it is `independent`."""
 
     method: Method
     sampler: str
 
     @property
     def name(self) -> str:
-        """As it stands in the rows."""
+        """The subject of its rows."""
         return self.method.name + (f", {INDEPENDENT}" if self.sampler == INDEPENDENT else "")
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Seconds and figures by round of one subject at one number of samples; its images at the most samples."""
+    """One subject at one number of samples: seconds and figures by round; images only at the largest number."""
 
     seconds: list[float]
     figures: dict[str, list[float]]
     images: list[np.ndarray]
 
     def cost(self, metric: str) -> list[float]:
-        """Error times seconds, by round: half of it takes half of the time."""
+        """Return error × seconds by round."""
         return [error * seconds for error, seconds in zip(self.figures[metric], self.seconds, strict=True)]
 
 
-Found = dict[str, dict[int, Measured]]  # by subject and samples per pixel
+BySubject = dict[str, dict[int, Measured]]  # by subject and samples per pixel
 Shoot = Callable[[int, int], tuple[np.ndarray, float]]  # samples per pixel and seed → image, seconds; as `Camera`
 Figures = Callable[[np.ndarray, np.ndarray, np.ndarray], dict[str, float]]  # image, reference, its variance → errors
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per scene that the built-in can render."""
+    """Return one task per scene that the built-in can render."""
     paths = [path for path in sorted(SCENES.glob("*.xml")) if not beyond_builtin(path)]
     return [
         Task(f"efficiency: {path.stem}", functools.partial(scene_rows, context, path), timed=True) for path in paths
@@ -118,10 +117,10 @@ def tasks(context: Context) -> list[Task]:
 
 
 def scene_rows(context: Context, path: Path, methods: tuple[Method, ...] = MEASURED) -> list[Row]:
-    """A row per method and sampler, and one of the curves; a single one with the reason where nothing is measured."""
+    """Return a row per method and sampler and one of the curves, or one row with the reason why there are none."""
     extent = EXTENTS[context.profile.name]
     reason = ""
-    if context.variant.startswith("scalar"):
+    if context.scalar:
         reason = SCALAR
     elif extent.scenes and path.stem not in extent.scenes:
         text = f"left out: the profile {context.profile.name} measures {', '.join(extent.scenes)}"
@@ -129,10 +128,10 @@ def scene_rows(context: Context, path: Path, methods: tuple[Method, ...] = MEASU
     elif path.stem in NO_REFERENCE:
         reason = f"left out: {NO_REFERENCE[path.stem]}"
     else:
-        look = builtin_camera(path, extent.resolution, INDEPENDENT, extent)
-        noise = float(np.abs(look(1, seed=0)[0] - look(1, seed=1)[0]).max())
+        builtin = builtin_camera(path, extent.resolution, INDEPENDENT, extent)
+        noise = float(np.abs(builtin(1, seed=0)[0] - builtin(1, seed=1)[0]).max())
         if noise < limits.NOISE:
-            reason = f"left out: no noise, so no error against time: two seeds differ by {noise:.1e} at most"
+            reason = f"left out: no noise, so no error against time (two seeds differ by at most {noise:.1e})"
     if reason:
         return [Row(NAME, "every method", path.stem, context.variant, reason=reason)]
     return _measured_rows(context, path, extent, methods)
@@ -146,10 +145,10 @@ def _measured_rows(context: Context, path: Path, extent: Extent, methods: tuple[
     subjects = builtins + [Subject(m, sampler) for m in methods if m != BUILTIN]
     spp = extent.spp[-1]
     cameras = {s.name: camera(path, s.method, resolution, sampler=s.sampler, spp=spp) for s in subjects}
-    look = cameras[builtins[1].name]
-    references = np.stack([look(spp, seed=FIRST_REFERENCE + i)[0] for i in range(extent.references)])
+    builtin = cameras[builtins[1].name]
+    references = np.stack([builtin(spp, seed=FIRST_REFERENCE + i)[0] for i in range(extent.references)])
     measured = measure(cameras, references, extent.spp, extent.rounds, errors)
-    goals = goals_of(subjects, measured, scene_features.inspect(look.scene).only_glass)
+    goals = goals_of(subjects, measured, scene_features.inspect(builtin.scene).only_glass)
     replay = {
         "scene": path.name,
         "resolution": resolution,
@@ -159,13 +158,13 @@ def _measured_rows(context: Context, path: Path, extent: Extent, methods: tuple[
         "reference seeds from": FIRST_REFERENCE,
         "sampler": sampler,
     }
-    about_sampler = f"the best stratified sampler here: {sampler}"
+    remark = f"the best stratified sampler here: {sampler}"
     for subject in subjects:
         values = _values(subject, builtins, measured, references)
-        budgets = {} if subject.method == BUILTIN else {WELCH_ALARMS: 0.0}  # the reference is the built-in's own
-        own = replay | {"method": subject.method.plugin(-1)}
-        mine = goals.get(subject.name, {})
-        rows.append(Row(NAME, subject.name, path.stem, context.variant, values, budgets, mine, about_sampler, own))
+        budgets = {} if subject.method == BUILTIN else {WELCH_ALARMS: 0.0}  # the reference is by the built-in itself
+        subject_replay = replay | {"method": subject.method.plugin(-1)}
+        row = functools.partial(Row, NAME, subject.name, path.stem, context.variant)
+        rows.append(row(values, budgets, goals.get(subject.name, {}), remark, subject_replay))
     curves = {
         name: [
             (statistics.median(m.seconds), math.sqrt(max(statistics.fmean(m.figures["MSE"]), 0)))  # RMSE
@@ -173,79 +172,83 @@ def _measured_rows(context: Context, path: Path, extent: Extent, methods: tuple[
         ]
         for name, by_spp in measured.items()
     }
-    own_variance = {"reference variance": float(references.var(0, ddof=1).mean() / len(references))}
-    every = (NAME, "every method", path.stem, context.variant)
-    rows.append(Row(*every, own_variance, {}, {}, about_sampler, replay, {}, curves))
+    values = {"reference variance": float(references.var(0, ddof=1).mean() / len(references))}
+    row = functools.partial(Row, NAME, "every method", path.stem, context.variant)
+    rows.append(row(values, reason=remark, replay=replay, curves=curves))
     return rows
 
 
 def builtin_camera(path: Path, resolution: int, sampler: str, extent: Extent) -> Camera:
-    """The scene for the built-in, which chooses sampler and resolution."""
+    """Return the built-in's camera of a scene, by which sampler and resolution are chosen."""
     return camera(path, BUILTIN, resolution, sampler=sampler, spp=extent.spp[-1])
 
 
 def resolution_of(path: Path, extent: Extent) -> int:
-    """The image size at which the fixed cost of a render is negligible beside that of its samples."""
+    """Return the image size at which the fixed cost of a render is negligible compared to that of its samples."""
     resolution = extent.resolution
     while resolution < LARGEST and extent.seconds:
-        look = builtin_camera(path, resolution, INDEPENDENT, extent)
-        if min(look(extent.spp[-1], seed=i)[1] for i in range(2)) >= extent.seconds:
+        builtin = builtin_camera(path, resolution, INDEPENDENT, extent)
+        if min(builtin(extent.spp[-1], seed=i)[1] for i in range(2)) >= extent.seconds:
             break
         resolution *= 2
     return resolution
 
 
 def best_sampler(path: Path, resolution: int, extent: Extent, seeds: int = 3) -> str:
-    """The stratified sampler with which the built-in has the least variance × time."""
+    """Return the stratified sampler with which the built-in has the least variance × time."""
     costs = {}
     for sampler in STRATIFIED:
-        look = builtin_camera(path, resolution, sampler, extent)
-        shots = [look(extent.spp[-1], seed=FIRST_REFERENCE - 1 - i) for i in range(seeds + 1)][1:]
-        variance = np.stack([image for image, _ in shots]).var(0, ddof=1).mean()
-        costs[sampler] = float(variance) * statistics.median(seconds for _, seconds in shots)
+        builtin = builtin_camera(path, resolution, sampler, extent)
+        renders = [builtin(extent.spp[-1], seed=FIRST_REFERENCE - 1 - i) for i in range(seeds + 1)]
+        warm = renders[1:]  # the first image compiles
+        variance = np.stack([image for image, _ in warm]).var(0, ddof=1).mean()
+        costs[sampler] = float(variance) * statistics.median(seconds for _, seconds in warm)
     return min(costs, key=lambda sampler: costs[sampler])
 
 
 def measure(
     cameras: Mapping[str, Shoot], references: np.ndarray, spps: tuple[int, ...], count: int, figures_of: Figures
-) -> Found:
-    """`Measured` by subject and samples per pixel. A round has an image of each, every second one in reverse order.
+) -> BySubject:
+    """Measure all subjects: `count` rounds with one image of each, every second round in reverse order.
 
-    `count`: of rounds; the first image of each is thrown away: it compiles. `figures_of`: as `errors`.
+    One more image of each, the first, compiles and is not measured. `figures_of`: such as `errors`.
     """
-    mean, own = references.mean(0), references.var(0, ddof=1) / len(references)
-    found: Found = {name: {} for name in cameras}
+    mean, variance = references.mean(0), references.var(0, ddof=1) / len(references)
+    measured: BySubject = {name: {} for name in cameras}
     for spp in spps:
-        shots: dict[str, list[tuple[np.ndarray, float]]] = {name: [] for name in cameras}
+        renders: dict[str, list[tuple[np.ndarray, float]]] = {name: [] for name in cameras}
         order = list(cameras)
         for seed in range(count + 1):
             for name in order:
-                shots[name].append(cameras[name](spp, seed))
+                renders[name].append(cameras[name](spp, seed))
             order.reverse()
-        for name, (_, *rounds) in shots.items():
-            by_round = [figures_of(image, mean, own) for image, _ in rounds]
+        for name, (_, *rounds) in renders.items():
+            by_round = [figures_of(image, mean, variance) for image, _ in rounds]
             figures = {metric: [figure[metric] for figure in by_round] for metric in by_round[0]}
-            kept = [image for image, _ in rounds] if spp == spps[-1] else []
-            found[name][spp] = Measured([seconds for _, seconds in rounds], figures, kept)
-    return found
+            images = [image for image, _ in rounds] if spp == spps[-1] else []
+            measured[name][spp] = Measured([seconds for _, seconds in rounds], figures, images)
+    return measured
 
 
-def errors(image: np.ndarray, mean: np.ndarray, own: np.ndarray) -> dict[str, float]:
-    """MSE and relMSE against `mean`, of which `own` is the variance, with and without the worst pixels."""
+def errors(image: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> dict[str, float]:
+    """Return MSE and relMSE against `mean`, minus its `variance`, with and without the worst pixels."""
     squared = np.square(image - mean)
-    found: dict[str, float] = {}
+    values: dict[str, float] = {}
     for metric, scale in (("MSE", np.ones_like(mean)), ("relMSE", np.square(mean) + EPSILON)):
         by_pixel = (squared / scale).mean(-1).ravel()
-        less = by_pixel - (own / scale).mean(-1).ravel()
-        kept = np.argsort(by_pixel)[: by_pixel.size - math.ceil(WORST * by_pixel.size)]
-        found |= {metric: float(less.mean()), f"{metric}, trimmed": float(less[kept].mean())}
-    return found
+        unbiased = by_pixel - (variance / scale).mean(-1).ravel()
+        trimmed = np.argsort(by_pixel)[: by_pixel.size - math.ceil(WORST * by_pixel.size)]
+        values |= {metric: float(unbiased.mean()), f"{metric}, trimmed": float(unbiased[trimmed].mean())}
+    return values
 
 
-def _values(subject: Subject, builtins: list[Subject], found: Found, references: np.ndarray) -> dict[str, float]:
-    """Values at the most samples per pixel. `builtins`: path + dielectric with `independent`, and the best sampler."""
-    spp = max(found[subject.name])
-    test, default, best = (found[s.name][spp] for s in (subject, *builtins))
+def _values(subject: Subject, builtins: list[Subject], measured: BySubject, references: np.ndarray) -> dict[str, float]:
+    """Return the values of a row, at the most samples per pixel.
+
+    `builtins`: path + dielectric with `independent`, and with the best sampler.
+    """
+    spp = max(measured[subject.name])
+    test, default, best = (measured[s.name][spp] for s in (subject, *builtins))
     same = default if subject == builtins[0] else best
     values = kernel_timing.ratio(EQUAL_TIME, test.cost("MSE"), same.cost("MSE"))
     values |= kernel_timing.ratio(EQUAL_TIME_DEFAULTS, test.cost("MSE"), default.cost("MSE"))
@@ -255,23 +258,28 @@ def _values(subject: Subject, builtins: list[Subject], found: Found, references:
     for metric in METRICS[1:]:
         ratios = [t / s for t, s in zip(test.cost(metric), same.cost(metric), strict=True)]
         values[f"equal-time {metric}"] = statistics.median(ratios)
-    asked = TILE, limits.WELCH_ERROR, limits.WELCH_MARGIN
-    agreed = tile_statistics.compare_stacks(references, np.stack(test.images), *asked)
+    tiles = tile_statistics.compare_stacks(
+        references, np.stack(test.images), TILE, limits.WELCH_ERROR, limits.WELCH_MARGIN
+    )
     return values | {
-        WELCH_ALARMS: float(agreed.alarms),
-        SMALLEST_P: agreed.smallest_p,
-        DETECTABLE: agreed.minimum_detectable(),
+        WELCH_ALARMS: float(tiles.alarms),
+        SMALLEST_P: tiles.smallest_p,
+        DETECTABLE: tiles.minimum_detectable(),
     }
 
 
-def goals_of(subjects: list[Subject], found: Found, only_glass: bool) -> dict[str, dict[str, float]]:
-    """Goals by subject: of the best of our methods at equal time, on glass alone of the best that splits; of time."""
+def goals_of(subjects: list[Subject], measured: BySubject, only_glass: bool) -> dict[str, dict[str, float]]:
+    """Return the goals by subject.
+
+    The best of our methods has a goal at equal time: in scenes of glass only the best one that splits. There, our
+    method without parameters has a goal for its time.
+    """
     ours = [s for s in subjects if s.method.integrator == OURS]
-    rivals = [s for s in ours if s.method.parameters or not only_glass]
+    candidates = [s for s in ours if s.method.parameters or not only_glass]
     goals: dict[str, dict[str, float]] = {s.name: {} for s in ours}
-    if rivals:
-        spp = max(found[rivals[0].name])
-        best = min(rivals, key=lambda s: statistics.median(found[s.name][spp].cost("MSE")))
+    if candidates:
+        spp = max(measured[candidates[0].name])
+        best = min(candidates, key=lambda s: statistics.median(measured[s.name][spp].cost("MSE")))
         goals[best.name] |= limits.ONLY_GLASS if only_glass else limits.MIXED
     for subject in ours:
         if only_glass and not subject.method.parameters:

@@ -34,10 +34,10 @@ from validation.run.render_methods import BUILTIN, METHODS, Camera, Method, came
 from validation.study import Study, Task, about
 
 TERMS = {
-    "first image": "seconds, with nothing compiled before; / built-in: over those of path + dielectric",
-    "render": "seconds of a later image, the kernels in memory",
+    "first image": "seconds, including compilation; / built-in: over those of path + dielectric",
+    "render": "seconds of a later image, with the kernels in memory",
     "after an edit": "seconds of the image after an edit of one index of refraction",
-    "arrays MB": "peak of the memory that Dr.Jit reports for arrays; process MB: peak of the whole process",
+    "arrays MB": "peak memory of Dr.Jit's arrays; process MB: peak memory of the whole process",
 }
 AXES = {"x": "size", "y": "seconds", "slope": None}
 NAME = "scaling"
@@ -48,9 +48,9 @@ TIMES = ("first image", "render", "after an edit")
 
 @dataclass(frozen=True)
 class Knob:
-    """What grows: `make(method, size, resolution)` is the camera, `quick` and `full` are the sizes.
+    """A property that grows: `make(method, size, resolution)` returns the camera; `quick` and `full` are the sizes.
 
-    `every`: also with the methods that split, which differ from each other by their kernels only.
+    `every`: also measure the methods that split, which differ by their kernels only.
     """
 
     make: Callable[[Method, int, int], Camera]
@@ -61,7 +61,7 @@ class Knob:
 
 @dataclass(frozen=True)
 class Job:
-    """One process: `renders` images after the first."""
+    """One process; `renders`: the number of images after the first."""
 
     variant: str
     knob: str
@@ -76,7 +76,7 @@ class Job:
 
 
 def _glasses(method: Method, size: int, resolution: int) -> Camera:
-    """Balls in a square, each of its own index from 1.3 to 2.5, in surroundings of radiance 1."""
+    """Return a square of balls, each with its own index from 1.3 to 2.5, in an environment of radiance 1."""
     side = math.ceil(math.sqrt(size))
     parts = {
         f"ball_{i}": {
@@ -91,7 +91,7 @@ def _glasses(method: Method, size: int, resolution: int) -> Camera:
 
 
 def _triangles(method: Method, size: int, resolution: int) -> Camera:
-    """A ball of BK7 of about `size` triangles."""
+    """Return a ball of BK7 with about `size` triangles."""
     import mitsuba as mi
 
     vertices, faces = ball_mesh(size)
@@ -102,7 +102,7 @@ def _triangles(method: Method, size: int, resolution: int) -> Camera:
 
 
 def ball_mesh(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a closed unit sphere of `size` triangles, facing out: the hull of Fibonacci points."""
+    """Return vertices and outward triangles of a unit sphere of `size` triangles: the hull of Fibonacci points."""
     count = size // 2 + 2
     i = np.arange(count) + 0.5
     z, turn = 1 - 2 * i / count, np.pi * (1 + math.sqrt(5)) * i
@@ -141,40 +141,39 @@ KNOBS = {
 
 
 def measure(job: Job) -> dict[str, float]:
-    """Measured in this process: seconds of the first image, later ones, one after an edit; most bytes held."""
+    """Measure in this process: seconds of the first image, of later ones, and after an edit; peak memory in MB."""
     import mitsuba as mi
 
     import mi_refract  # noqa: F401  its plugins
 
     mi.set_variant(job.variant)
     method = next(method for method in METHODS if method.name == job.method)
-    look = KNOBS[job.knob].make(method, job.size, job.resolution)
+    camera = KNOBS[job.knob].make(method, job.size, job.resolution)
     spp = job.size if job.knob == "spp" else job.spp
-    first, *later = [look(spp, seed)[1] for seed in range(1 + job.renders)]
+    first, *later = [camera(spp, seed)[1] for seed in range(1 + job.renders)]
     arrays = dr.detail.malloc_watermark(dr.backend_v(mi.Float))
-    found = {"first image": first, "render": statistics.median(later), "arrays MB": arrays / 1e6}
-    parameters = mi.traverse(look.scene)
+    values = {"first image": first, "render": statistics.median(later), "arrays MB": arrays / 1e6}
+    parameters = mi.traverse(camera.scene)
     name = next(name for name in parameters.keys() if name.endswith("eta"))  # noqa: SIM118  no dictionary
     parameters[name] = parameters[name] * 1.01
     parameters.update()
-    found["after an edit"] = look(spp, seed=0)[1]
-    # The peak of the process; `getrusage` would not do: a child inherits its parent's.
+    values["after an edit"] = camera(spp, seed=0)[1]
+    # The peak of this process; in `getrusage` a child inherits the peak of its parent.
     status = Path("/proc/self/status")
     lines = status.read_text().splitlines() if status.exists() else []
-    return found | {
-        "process MB": next((1.024e-3 * float(x.split()[1]) for x in lines if x.startswith("VmHWM:")), math.nan)
-    }
+    values["process MB"] = next((1.024e-3 * float(x.split()[1]) for x in lines if x.startswith("VmHWM:")), math.nan)
+    return values
 
 
 def run(job: Job, home: str) -> dict[str, float]:
-    """`measure` in a process whose kernels go to the folder `home`; no first image (NaN) where it compiled nothing.
+    """Run `measure` in a process with the kernel cache in the folder `home`; NaN as first image if nothing compiled.
 
-    Dr.Jit keeps compiled kernels below the home folder and has no other switch; CUDA and OptiX have their own.
-    RuntimeError, with the last line of what the process said, where it fails.
+    Dr.Jit's cache is below the home folder, which is the only way to move it; CUDA and OptiX have their own variables.
+    RuntimeError, with the last line on stderr, if the process fails.
     """
     before = _files(home)
     environment = dict.fromkeys(("HOME", "CUDA_CACHE_PATH", "OPTIX_CACHE_PATH"), home)
-    environment["PYTHONUSERBASE"] = site.getuserbase()  # packages may be below the home folder, too
+    environment["PYTHONUSERBASE"] = site.getuserbase()  # packages may be below the home folder too
     done = subprocess.run(
         [sys.executable, "-m", "validation.efficiency.scaling", json.dumps(vars(job))],
         cwd=SCENES.parent,
@@ -187,8 +186,8 @@ def run(job: Job, home: str) -> dict[str, float]:
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
         raise RuntimeError(f"{job.method}, {job.knob} = {job.size}: exit code {done.returncode}: {last}")
-    found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
-    return found if _files(home) > before else found | {"first image": math.nan}
+    values: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return values if _files(home) > before else values | {"first image": math.nan}
 
 
 def _files(folder: str) -> int:
@@ -199,23 +198,23 @@ def _files(folder: str) -> int:
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per knob; in the profile `quick` the number of glasses only."""
+    """Return one task per knob; in the profile `quick`, only the number of glasses."""
     knobs = ("glasses",) if context.profile.quick else tuple(KNOBS)
     return [Task(f"scaling: {name}", functools.partial(knob_rows, context, name), timed=True) for name in knobs]
 
 
 def knob_rows(context: Context, knob: str, methods: tuple[Method, ...] = METHODS) -> list[Row]:
-    """A row per size and method, and the curves of all of them."""
-    if context.variant.startswith("scalar"):
+    """Return a row per size and method, and rows with the curves."""
+    if context.scalar:
         return [Row(NAME, "every method", knob, context.variant, reason=SCALAR)]
     if not KNOBS[knob].every:
         methods = tuple(method for method in methods if not method.parameters)
     sizes = KNOBS[knob].full if context.profile.name == "full" else KNOBS[knob].quick
     by_size = {size: _size_rows(context, knob, size, methods) for size in sizes}
-    rows = [row for found in by_size.values() for row in found]
+    rows = [row for of_size in by_size.values() for row in of_size]
     for metric in TIMES[:2] if len(sizes) > 1 else ():
         curves = {
-            method.name: [(float(size), found[i].values[metric]) for size, found in by_size.items()]
+            method.name: [(float(size), of_size[i].values[metric]) for size, of_size in by_size.items()]
             for i, method in enumerate(methods)
         }
         processes = {"processes": float(_processes(context))}
@@ -224,7 +223,7 @@ def knob_rows(context: Context, knob: str, methods: tuple[Method, ...] = METHODS
 
 
 def _size_rows(context: Context, knob: str, size: int, methods: tuple[Method, ...]) -> list[Row]:
-    """Rows in the order of the methods, the built-in first; medians over processes that take turns."""
+    """Return a row per method, of which the first is the built-in: medians over processes that alternate."""
     full = context.profile.name == "full"
     resolution, renders = (128, 5) if full else (64, 3)
     jobs = {m.name: Job(context.variant, knob, size, m.name, resolution, 16, renders) for m in methods}
@@ -235,7 +234,11 @@ def _size_rows(context: Context, knob: str, size: int, methods: tuple[Method, ..
             with tempfile.TemporaryDirectory() as home:
                 measured[name].append(run(jobs[name], home))
         order.reverse()
-    rows, medians = [], {n: {m: statistics.median(v[m] for v in runs) for m in runs[0]} for n, runs in measured.items()}
+    medians = {
+        name: {metric: statistics.median(values[metric] for values in runs) for metric in runs[0]}
+        for name, runs in measured.items()
+    }
+    rows = []
     for name, values in medians.items():
         goals: dict[str, float] = {}
         if name != BUILTIN.name:

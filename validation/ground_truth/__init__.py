@@ -1,4 +1,4 @@
-"""Is the plugin right through Mitsuba's own intersections, where the answer is known?
+"""Is the plugin right with Mitsuba's own intersections, for bodies with known answers?
 
 In: bodies with closed-form answers, CODE V's trace of a double Gauss, a rendered rainbow, a table of published and
 closed-form numbers. Out: rows with each error divided by a bound on the sum of all rounding errors on the way.

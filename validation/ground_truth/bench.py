@@ -1,23 +1,23 @@
-"""Optical systems in a scene of Mitsuba: what it makes of the rays, and what its float32 may make of them.
+"""Optical systems as scenes in Mitsuba: traced rays, and bounds on Mitsuba's rounding errors in float32.
 
-Mitsuba has a system turned by ASKEW; its intersections and its samples, of the lobe that is asked for, are turned back
-in extended precision. A ray goes on along itself, STEP further: Mitsuba's own way, which is measured beside it, sets it
-off along the normal by 1500 ε (1 + |p|), and that is more than everything else here.
+Mitsuba gets a system rotated by ASKEW; its intersections and its samples of the requested lobe are rotated back in
+extended precision. Behind a boundary a ray continues STEP further along itself. Mitsuba's own offset, which is measured
+for comparison, moves it along the normal by 1500 ε (1 + |p|), more than all other errors here.
 
-The bound is of first order. Each boundary is given its share of roundings; what a change of any of them does to the
-answer is taken from differences of the exact path, and all of them add up. In units of u = 2⁻²⁴:
+The bound is of first order. Each boundary has a number of roundings; the effect of each on the answer comes from
+differences of the exact path, and all effects are added. In units of u = 2⁻²⁴:
 
-- FIRST: the first ray's direction and origin, rounded: 1u of each component.
-- INTO: wi, three dot products of unit vectors, 3u each, √3 · 3u in all; a frame that Gram-Schmidt leaves orthogonal and
-  unit to 7u turns by half of that.
-- NORMAL: of a face, edges between turned corners (6u each), their product (3u), its length (2u), the turn's own entries
-  (2u); or a given normal by the inverse of a turn (6u), product and length (5u), interpolated (5u). A sphere's is off
-  by less; and by its place's error over its radius.
-- PLACE, of the largest length S in play: the ray's way, a coordinate, the shape's extent. A sphere: nearest point to
-  the centre (2u), half the difference of squares (2.5u) and its root (3u), way and place (2u), back on the sphere (4u);
-  its own place, the step onward and the next vertex (4u); of an instance, the ray and the place turned (12u) and no own
-  place. A triangle, by Möller and Trumbore: a numerator 7u and the denominator 6u in two directions (√2 · 13u), its
-  inverse (1u), corners (3u), interpolation (3u), the step (1u). All over cos θ.
+- FIRST: rounding of the first ray's direction and origin: 1u of each component.
+- INTO: wi, three dot products of unit vectors, 3u each, √3 · 3u in all; Gram-Schmidt leaves a frame that is orthogonal
+  and unit up to 7u, which rotates by half of that.
+- NORMAL: of a face, edges between rotated corners (6u each), their product (3u), its length (2u), the rotation's own
+  entries (2u); or a given normal by the inverse of a rotation (6u), product and length (5u), interpolation (5u). The
+  error of a sphere's normal is smaller, plus the position's error over the radius.
+- PLACE, relative to the largest length S: the ray's length, a coordinate, the shape's extent. A sphere: nearest point
+  to the centre (2u), half the difference of squares (2.5u) and its root (3u), distance and position (2u), projection
+  onto the sphere (4u); its own position, the step and the next vertex (4u); for an instance, the rotated ray and
+  position (12u) instead of its own position. A triangle, by Möller and Trumbore: a numerator 7u and the denominator 6u
+  in two directions (√2 · 13u), its inverse (1u), corners (3u), interpolation (3u), the step (1u). All over cos θ.
 - ONWARD: wo by the formula (1u), three sums of products (√3 · 3u), the frame again (3.5u).
 """
 
@@ -45,7 +45,7 @@ APEX = closed_forms.HALF_TURN / 3
 
 @dataclass(frozen=True)
 class Bench:
-    """A system, and its scenes: `scenes(plugin)`, one a boundary or one for all, shapes by name for Mitsuba.
+    """A system and its scenes in Mitsuba: `scenes(plugin)`, one per boundary or one for all, as shapes by name.
 
     `nm`: wavelength of the rays, in a spectral variant.
     """
@@ -55,7 +55,7 @@ class Bench:
     nm: float | None = None
 
     def roundings(self) -> dict[tuple[int, str], Array]:
-        """How far each value may be off: N × 1, of places in mm."""
+        """Return the rounding error of each value, N × 1; for positions in mm."""
         system, one = self.system, np.ones((len(self.system.origins), 1))
         sizes = {(-1, "place"): FIRST * length(system.origins), (-1, "onward"): FIRST * one}
         for j, (start, p, n, a, _) in enumerate(system.walk()):
@@ -67,9 +67,9 @@ class Bench:
         return {key: U * size for key, size in sizes.items()}
 
     def effects(self, changes: Callable[[Path], Answers]) -> Iterator[tuple[float, Answers]]:
-        """For each value: how many roundings of at most 1u are in its size, and size/NUDGE |change|, by answer.
+        """Yield for each value its number of roundings of 1u, and their effect size/NUDGE |change|, by answer.
 
-        `changes`: by answer, of a path with one value moved by NUDGE.
+        `changes`: returns the changes of the answers for a path with one value perturbed by NUDGE.
         """
         for (boundary, what), size in self.roundings().items():
             for way in range(3 if what == "place" else 2):
@@ -79,7 +79,7 @@ class Bench:
 
     @functools.cached_property
     def bounds(self) -> Answers:
-        """Bounds of the norm of each answer's deviation, N × A: roundings, and what was printed."""
+        """Bounds on the norm of each answer's deviation, N × A, from roundings here and in the printed numbers."""
         system = self.system
         exact = system.off(system.path())
 
@@ -91,7 +91,7 @@ class Bench:
 
     @property
     def index_seen(self) -> float:
-        """The least error, relative, of the index of the denser side everywhere that takes an answer to its bound."""
+        """The smallest relative error of the denser sides' indices that moves an answer to its bound."""
 
         def denser(j: int, what: str, x: Any, axis: Any) -> Any:
             if what != "index" or x == 1:
@@ -105,7 +105,7 @@ class Bench:
         return 1 / max(float(ratio.max()) for ratio in ratios)
 
     def traced(self, plugin: str, spawned: bool = False) -> Path:
-        """The path by Mitsuba, in its present variant. `spawned`: rays go on as Mitsuba would have them."""
+        """Trace with Mitsuba in its current variant. `spawned`: with Mitsuba's own ray offset."""
         import mitsuba as mi
 
         system = self.system
@@ -113,23 +113,23 @@ class Bench:
         scenes *= len(system.boundaries) // len(scenes)
         origins, directions = ((x @ system.turn).astype(np.float32) for x in (system.origins, system.directions))
         if dr.is_jit_v(mi.Float):
-            found = _through(scenes, system.boundaries, origins.T, directions.T, spawned, self.nm)
-            found = np.moveaxis(found, 2, 3)
+            vectors = _through(scenes, system.boundaries, origins.T, directions.T, spawned, self.nm)
+            vectors = np.moveaxis(vectors, 2, 3)
         else:
             rays = zip(origins, directions, strict=True)
-            found = np.stack([_through(scenes, system.boundaries, o, d, spawned, self.nm) for o, d in rays], axis=2)
-        places, directions = found
+            vectors = np.stack([_through(scenes, system.boundaries, o, d, spawned, self.nm) for o, d in rays], axis=2)
+        places, directions = vectors
         return Path(places @ system.turn.T, unit(directions @ system.turn.T))
 
     def deviations(self, path: Path) -> Answers:
-        """The norm of each answer's deviation, N × A; a ray that did not get there is off by infinity."""
+        """Return the norm of each answer's deviation, N × A; infinity for a ray that misses a boundary."""
         return {name: np.nan_to_num(length(x)[..., 0], nan=np.inf) for name, x in self.system.off(path).items()}
 
 
 def _through(
     scenes: list[Any], boundaries: tuple[Boundary, ...], o: Array, d: Array, spawned: bool, nm: float | None = None
 ) -> Array:
-    """Places and directions behind the boundaries, 2 × B × 3 (× N); one kernel where there are any."""
+    """Return positions and directions behind the boundaries, 2 × B × 3 (× N); in one kernel, except on CUDA."""
     import mitsuba as mi
 
     ray, places, directions = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), [], []
@@ -138,17 +138,17 @@ def _through(
         if nm is not None:
             ray.wavelengths = type(ray.wavelengths)(nm)
         si = scene.ray_intersect(ray)
-        met = si.is_valid()
-        if met is False:  # a scalar variant has no BSDF to ask then, and ends the process
+        hit = si.is_valid()
+        if hit is False:  # in a scalar variant sampling without a hit would crash the process
             return np.full((2, len(boundaries), 3), np.nan)
-        sampling.component = int(boundary.k is not None)  # of both plugins: 0 reflects, 1 transmits
+        sampling.component = int(boundary.k is not None)  # in both plugins 0 reflects, 1 transmits
         onward = si.to_world(si.bsdf().sample(sampling, si, 0.5, [0.5, 0.5])[0].wo)
-        onward = dr.select(met, onward, dr.nan)
+        onward = dr.select(hit, onward, dr.nan)
         places.append(si.p)
         directions.append(onward)
         ray = si.spawn_ray(onward) if spawned else mi.Ray3f(dr.fma(STEP, onward, si.p), onward)
         ray.o.z -= boundary.thickness
-        if dr.backend_v(ray.o) == dr.JitBackend.CUDA:  # OptiX traces the rays of a kernel in one scene
+        if dr.backend_v(ray.o) == dr.JitBackend.CUDA:  # with OptiX a kernel can trace one scene only
             dr.eval(ray, places, directions)
     dr.eval(places, directions)
     return np.array([[np.array(x, np.longdouble) for x in vectors] for vectors in (places, directions)])
@@ -158,13 +158,13 @@ def _through(
 
 
 def glass(plugin: str, inside: Any, outside: Any = 1.0) -> dict[str, Any]:
-    """Mitsuba's dictionary of a glass by its two indices; a text stays one."""
+    """Return Mitsuba's dictionary of a glass by its two indices; text is passed on unchanged."""
     inside = inside if isinstance(inside, str) else float(inside)
     return {"type": plugin, "int_ior": inside, "ext_ior": float(outside)}
 
 
 def _placed(scale: Any = 1.0) -> Any:
-    """Mitsuba's transform of a shape: stretched along the axes, then turned by ASKEW."""
+    """Return Mitsuba's transform of a shape: scaled along the axes, then rotated by ASKEW."""
     import mitsuba as mi
 
     matrix = np.eye(4)
@@ -183,9 +183,9 @@ def _ellipsoid(plugin: str) -> list[dict[str, Any]]:
 
 
 def _double_gauss(plugin: str) -> list[dict[str, Any]]:
-    """A scene for each surface, a whole sphere or a rectangle, whose origin is the vertex.
+    """Return a scene per surface, a whole sphere or a rectangle; the surface's vertex is the origin.
 
-    The side to which its normal points is the outside: of a sphere that bulges towards the light, the light's.
+    The outside is the side of the normal: for a sphere that is convex towards the light, the side of the light.
     """
     import mitsuba as mi
 
@@ -202,18 +202,18 @@ def _double_gauss(plugin: str) -> list[dict[str, Any]]:
 
 
 def prism(plugin: str, index: Any = BK7) -> list[dict[str, Any]]:
-    """The scene of a prism of 60°."""
+    """Return the scene of a prism of 60°."""
     mesh = {"type": "ply", "filename": str(SCENES / "meshes" / "prism.ply"), "face_normals": True}
     return [{"prism": mesh | {"to_world": _placed(), "bsdf": glass(plugin, index)}}]
 
 
 def ball(plugin: str, index: Any = BK7) -> list[dict[str, Any]]:
-    """The scene of a ball around the origin."""
+    """Return the scene of a ball around the origin."""
     return [{"ball": {"type": "sphere", "radius": optical_systems.RADIUS, "bsdf": glass(plugin, index)}}]
 
 
 def benches() -> dict[str, Bench]:
-    """All of them, by name."""
+    """Return all benches by name."""
     down = np.linspace(0.3, 0.6, optical_systems.RAYS)
     least = optical_systems.prism(
         APEX, closed_forms.least_deviated(APEX, BK7) + 0 * optical_systems.degrees(0, 1), down

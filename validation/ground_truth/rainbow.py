@@ -1,10 +1,10 @@
 """The rainbow of one drop, rendered: sunlight traced onto a screen, and the angle of its bright edge.
 
 A disk of parallel light illuminates a drop; a camera beside the drop looks back at a screen ten million radii away, on
-which particle tracing gathers the light that left the drop. At this distance a place on the image is an angle, to 3e-7.
-Near the least deflection D₀ a ray is deflected by D = D₀ + a δ² + …, where δ is the distance between its entry and that
-of the stationary ray. The light C(D) that is deflected by less than D comes from two intervals of δ, in which the odd
-powers of δ cancel. Hence
+which particle tracing collects the light that left the drop. At this distance a position in the image is an angle, up
+to 3e-7. Near the minimum deflection D₀ a ray is deflected by D = D₀ + a δ² + …, where δ is the distance of its entry
+from that of the stationary ray. The light C(D) that is deflected by less than D comes from two intervals of δ, in which
+the odd powers of δ cancel. Hence
 
     C² = s (D − D₀) + q (D − D₀)² + …
 
@@ -23,22 +23,22 @@ from validation.reference import closed_forms
 from validation.reference.optical_systems import Array
 
 INDEX = np.longdouble(1.333)
-SIZE = 1536  # pixels across the image, which holds 90 degrees: 0.041 degrees each at the edge
-SCREEN = 1e7  # radii of the drop
-DARK, LIT = (136.5, 137.7), 140.0  # degrees: a part of the dark band, and where the measured part ends
+SIZE = 1536  # width of the image in pixels, for 90 degrees: 0.041 degrees per pixel at the edge
+SCREEN = 1e7  # distance of the screen in radii of the drop
+DARK, LIT = (136.5, 137.7), 140.0  # degrees: a part of the dark band, and the end of the measured part
 STEP = 0.01  # degrees
-# Degrees behind the edge. Nearer, pixels blur it: theirs is σ² = 0.041²/12, and C² is less by s σ²/4(D − D₀).
-# Farther, the cubic term counts.
+# The fitted interval in degrees behind the edge. Nearer, pixels blur the edge: with σ² = 0.041²/12, C² is smaller by
+# s σ²/4(D − D₀). Farther, the cubic term matters.
 WINDOW = 0.1, 1.0
 
 
 def angle(index: Any = INDEX) -> float:
-    """D₀ in degrees."""
+    """Return D₀ in degrees."""
     return float(np.rad2deg(closed_forms.deflection(closed_forms.rainbow_incidence(index, 1), index, 1)))
 
 
 def images(glass: dict[str, Any], seeds: int) -> list[Array]:
-    """SIZE × SIZE, of a light path per pixel and seed: a drop of a glass plugin's dictionary, its sun, the screen."""
+    """Render images of SIZE × SIZE pixels, with one light path per pixel and seed, of a drop of this glass."""
     import mitsuba as mi
 
     move = mi.ScalarTransform4f
@@ -51,7 +51,7 @@ def images(glass: dict[str, Any], seeds: int) -> list[Array]:
     scene: Any = mi.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": "ptracer", "max_depth": 5, "rr_depth": 5},  # in, within, out, and the screen
+            "integrator": {"type": "ptracer", "max_depth": 5, "rr_depth": 5},  # in, inside, out, and the screen
             "drop": {"type": "sphere", "bsdf": glass},
             "sun": sun | {"bsdf": {"type": "diffuse", "reflectance": 0.0}},
             "screen": {"type": "rectangle", "to_world": far, "bsdf": {"type": "diffuse"}},
@@ -63,7 +63,7 @@ def images(glass: dict[str, Any], seeds: int) -> list[Array]:
 
 @functools.cache
 def _bins() -> tuple[Array, Array, Array]:
-    """Upper ends of the bins of deflection; which pixels are in any of them, and in which."""
+    """Return the upper ends of the bins of deflection, which pixels are in a bin, and the bins of these pixels."""
     ends = np.arange(DARK[0], LIT, STEP) + STEP
     x = (np.arange(SIZE) + 0.5) / (SIZE / 2) - 1
     deflection = 180 - np.rad2deg(np.arctan(np.hypot(x[:, None], x)))
@@ -73,17 +73,17 @@ def _bins() -> tuple[Array, Array, Array]:
 
 
 def edge(image: Array) -> float:
-    """Degrees; NaN where there is none."""
+    """Return the angle of the rainbow's edge in degrees; NaN without an edge."""
     ends, inside, at = _bins()
     light = np.bincount(at, image[inside], len(ends))
     gathered = np.cumsum(light - light[ends <= DARK[1]].mean())
-    found = float(ends[light.argmax()])
+    estimate = float(ends[light.argmax()])
     for _ in range(3):
-        there = (ends > found + WINDOW[0]) & (ends < found + WINDOW[1])
-        square = np.maximum(gathered[there], 0) ** 2
+        window = (ends > estimate + WINDOW[0]) & (ends < estimate + WINDOW[1])
+        square = np.maximum(gathered[window], 0) ** 2
         if len(square) < 3 or not square.all():
             return float("nan")
         square /= square.max()
-        # Counts have variances like themselves: that of C² is like C³, of D accordingly.
-        found = float(np.polyfit(square, ends[there], 2, w=square**-0.75)[-1])
-    return found
+        # The variance of a count is the count: that of C² is proportional to C³, and that of D accordingly.
+        estimate = float(np.polyfit(square, ends[window], 2, w=square**-0.75)[-1])
+    return estimate

@@ -1,28 +1,28 @@
 """Standard numbers: published and closed-form values, measured through `refract` in Mitsuba.
 
-The numbers are those of `validation/reference/standard_numbers.py`, each with its law, its source and, where a source
-prints it, its digits. Plates are rendered: by `refract_path`, both lobes followed at twelve boundaries and nothing
-behind them, so that there is no noise; a pile of four by Mitsuba's `path`, with noise. In polarised variants; where
-each boundary passes the mean of both polarisations, in one without. Prisms, drops and the double Gauss are traced, as
-in the ground truth. The rhomb is a body of Mitsuba's, and its retardation δ is read from the Mueller matrix of the ray
-through it, whose last element is cos δ. Brewster's and the critical angle are found by trying angles, the diffuse
-shares by the BSDF's probabilities at the nodes of a quadrature, indices by the ratio that a sample of it returns.
+The numbers are those of `validation/reference/standard_numbers.py`, each with its law, its source and, if a source
+prints it, its digits. Plates are rendered by `refract_path` without noise: both lobes are followed at twelve
+boundaries, and paths end behind them. A pile of four plates is rendered by Mitsuba's `path`, with noise. The variants
+are polarised, except for numbers in which each boundary transmits the mean of both polarisations. Prisms, drops and the
+double Gauss are traced as in the ground truth. The rhomb is a shape in Mitsuba; its retardation δ follows from the
+Mueller matrix of a ray through it, whose last element is cos δ. Brewster's and the critical angle are searched, diffuse
+shares come from the BSDF's probabilities at the nodes of a quadrature, indices from the ratio that a sample returns.
 
-The error is divided by its bound, in which all roundings to float32 add up at their worst but where it says otherwise;
+The error is divided by its bound, the sum of all rounding errors of float32 at their worst, unless stated otherwise;
 u = 2⁻²⁴.
 
-- Plates. The ray's direction turns by 39u at each boundary (see `ground_truth/bench.py`), twelve times; of each
-  polarisation the transmittance changes by so much times its slope. A weight is off by 45u a boundary with Mueller
-  matrices: 16u for the products of amplitudes, four rotations and a product of 5u each, 4u for lobes. Without, by 8u.
-  A path counts as often as it meets boundaries. What passes after more than twelve is missing. In an
-  absorbing plate Mitsuba sets a ray off along the normal, which makes its way shorter by sin²θ of that offset.
-- Four plates: Student's t over 16 sets of samples, which chance exceeds once in ten thousand runs, and these roundings.
-- Rays: the roundings of `ground_truth/bench.py`, in each component, as independent ones: their sum exceeds
-  √(2 ln(2/p) Σ c²), where c is the largest effect of each, with a probability p (Hoeffding), once in ten thousand runs.
+- Plates. The ray's direction rotates by 39u at each boundary (see `ground_truth/bench.py`), twelve times; the
+  transmittance of each polarisation changes by this times its slope. The error of a weight is 45u per boundary with
+  Mueller matrices: 16u for the products of amplitudes, four rotations and a product of 5u each, 4u for lobes. Without
+  them it is 8u. A path counts once per boundary that it meets. The light after more than twelve boundaries is missing.
+  In an absorbing plate Mitsuba's offset along the normal shortens a ray by sin²θ of the offset.
+- Four plates: Student's t over 16 sets of samples, which chance exceeds once in ten thousand runs, plus these errors.
+- Rays: the rounding errors of `ground_truth/bench.py` in each component, as independent ones. With c the largest effect
+  of each, their sum exceeds √(2 ln(2/p) Σ c²) with a probability p (Hoeffding), here once in ten thousand runs.
 - Retardation: 39u three times, times its slope, and four weights over sin δ.
 - Brewster's and the critical angle: 8u for the sines and cosines of a direction, 2u for the ratio of indices.
 - Diffuse shares: `limits.DIFFUSE`. Indices: 3u for the ratio, and the rounded wavelength; for glTF's formula, half a
-  unit of the last digit of the three constants that it prints.
+  unit of the last printed digit of its three constants.
 """
 
 from __future__ import annotations
@@ -56,30 +56,30 @@ from .bench import FIRST, INTO, NORMAL, ONWARD, Bench, U, glass
 NAME = "standard numbers"
 MEASURED, EXACT, PRINTED, BOUND, SECONDS = "measured", "exact", "printed", "bound", "seconds"
 INDEX_SEEN = "index seen"
-# In the profile `quick` and where nothing is compiled: one variant has polarisation and wavelengths.
 COMPILED = {"plain": "llvm_ad_mono", "spectral": "llvm_ad_spectral", "polarised": "llvm_ad_mono_polarized"}
+# Variants of the profile `quick`, and of runs without a compiled variant: one has polarisation and wavelengths.
 SCALAR = {"plain": "scalar_rgb", "spectral": "scalar_spectral", "polarised": "scalar_spectral_polarized"}
 TERMS = dict(table.KINDS) | {
     EXACT: "the law in extended precision",
-    PRINTED: "as the source prints it, where one in hand does",
-    BOUND: "of |measured − exact|",
+    PRINTED: "the printed number, if an available source prints it",
+    BOUND: "the bound on |measured − exact|",
     INDEX_SEEN: "the relative error of the index that moves the number to its bound",
-    SECONDS: "of the measurement, shared by what one render measures",
+    SECONDS: "time of the measurement, divided among the numbers that one render measures",
 }
-BOUNDARIES = 12  # of a path through plates: 4096 paths are the most that a sample splits into
-THICKNESS, HALF_SIZE, FAR = 200.0, 6000.0, 1e4  # of plates, which stand as far apart as they are thick
+BOUNDARIES = 12  # on a path through plates: a sample splits into at most 4096 paths
+THICKNESS, HALF_SIZE, FAR = 200.0, 6000.0, 1e4  # of plates, whose distance equals their thickness
 TURN = NORMAL + INTO + ONWARD
 WEIGHT, PLAIN_WEIGHT = 45.0, 8.0
-SAMPLES = {"standard": 1 << 18, "full": 1 << 22}  # of a pile of four plates
+SAMPLES = {"standard": 1 << 18, "full": 1 << 22}  # for a pile of four plates
 SETS = 16
-NM = 550.0  # in variants that need a wavelength
+NM = 550.0  # for variants that need a wavelength
 ANGLE, RATIO = 8.0, 2.0
-SMALL = 1e-7  # of the difference quotients in extended precision
+SMALL = 1e-7  # step of difference quotients in extended precision
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What the plugin makes of a number, and by how much it may differ from the law."""
+    """The plugin's value of a number, and the bound on its difference from the law."""
 
     value: float
     bound: float
@@ -87,12 +87,12 @@ class Measured:
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per variant of Mitsuba; piles of plates, which take thousands of paths, where something is compiled."""
+    """Return one task per variant. Piles of plates, which take thousands of paths, need a compiled variant."""
     return [Task(f"{NAME}: {need}", functools.partial(rows, need, context), timed=True) for need in COMPILED]
 
 
 def rows(needed: str, context: Context) -> list[Row]:
-    """A row per number that is measured in a variant."""
+    """Return a row per number that is measured in a variant."""
     scalar = context.profile.quick or context.scalar
     numbers = [number for number in table.NUMBERS.values() if need(number) == needed]
     numbers = [number for number in numbers if not (scalar and number.given.get("count", 1) > 1)]
@@ -100,53 +100,53 @@ def rows(needed: str, context: Context) -> list[Row]:
     if (reason := context.variants.get(variant, "not in this wheel")) is not None:
         return [Row(NAME, PLUGIN, number.name, variant, reason=reason) for number in numbers]
     with under(variant):
-        found = measure(numbers, SAMPLES.get(context.profile.name, 0))
-    return [row(number, found[number.name], PLUGIN, variant) for number in numbers]
+        results = measure(numbers, SAMPLES.get(context.profile.name, 0))
+    return [row(number, results[number.name], PLUGIN, variant) for number in numbers]
 
 
 def noisy(number: StandardNumber) -> bool:
-    """Whether it is measured with noise: twelve boundaries of such a pile leave too much light within."""
+    """Return whether a number is measured with noise: after twelve boundaries of such a pile too much light is left."""
     return number.given.get("count", 1) > 2
 
 
-def row(number: StandardNumber, found: Measured, subject: str, setting: str) -> Row:
-    """The error over its bound."""
-    read = number.print_reading
-    values = {MEASURED: found.value, EXACT: number.value} | ({PRINTED: read[0]} if read else {})
-    error = abs(found.value - number.value)
-    values |= {BOUND: found.bound, ERROR_OVER_BOUND: error / found.bound, SECONDS: found.seconds}
+def row(number: StandardNumber, result: Measured, subject: str, setting: str) -> Row:
+    """Return the row of a number, with its error over its bound."""
+    printed = number.print_reading
+    values = {MEASURED: result.value, EXACT: number.value} | ({PRINTED: printed[0]} if printed else {})
+    error = abs(result.value - number.value)
+    values |= {BOUND: result.bound, ERROR_OVER_BOUND: error / result.bound, SECONDS: result.seconds}
     remark = "; ".join(filter(None, (number.source, number.fitted and f"fitted: {number.fitted}")))
     budgets, replay = {ERROR_OVER_BOUND: limits.STANDARD}, {"law": number.formula, **number.given}
     if "n" in number.given and not noisy(number):
-        values[INDEX_SEEN] = found.bound / (number.slope("n") * number.given["n"])
+        values[INDEX_SEEN] = result.bound / (number.slope("n") * number.given["n"])
         budgets[INDEX_SEEN] = limits.STANDARD_SEEN
     return Row(NAME, subject, number.name, setting, values, budgets, reason=remark, replay=replay)
 
 
 def need(number: StandardNumber) -> str:
-    """What its variant of Mitsuba must have."""
+    """Return what a number's variant of Mitsuba must have."""
     if "nm" in number.given:
         return "spectral"
     return "polarised" if number.kind in ("transmittance", "retardation", "Brewster's angle") else "plain"
 
 
 def measure(numbers: Sequence[StandardNumber], samples: int = 0) -> dict[str, Measured]:
-    """The numbers in the present variant, by name. `samples`: of light through a pile of plates."""
-    made: dict[str, Measured] = {}
+    """Measure numbers in the current variant; return them by name. `samples`: for a pile of plates."""
+    results: dict[str, Measured] = {}
     groups: dict[tuple[Any, ...], list[StandardNumber]] = {}
     for number in numbers:
         groups.setdefault((number.kind, *_together(number)), []).append(number)
     for (kind, *_), group in groups.items():
         start = time.perf_counter()
-        found = MEASURES[kind](group, samples)
+        answers = MEASURES[kind](group, samples)
         seconds = (time.perf_counter() - start) / len(group)
-        pairs = zip(group, found, strict=True)
-        made |= {x.name: Measured(float(value), float(bound), seconds) for x, (value, bound) in pairs}
-    return made
+        pairs = zip(group, answers, strict=True)
+        results |= {x.name: Measured(float(value), float(bound), seconds) for x, (value, bound) in pairs}
+    return results
 
 
 def _together(number: StandardNumber) -> tuple[Any, ...]:
-    """Numbers for which this is the same are measured by one render."""
+    """Return a key: numbers with the same key are measured by one render."""
     if number.kind.startswith("transmittance"):
         return tuple(number.given.get(name) for name in ("n", "count", "absorbance"))
     return () if number.kind == "double Gauss" else (number.name,)
@@ -159,7 +159,7 @@ Answers = list[tuple[Any, Any]]  # value and bound of each number of a group
 
 
 def transmittances(group: Sequence[StandardNumber], samples: int) -> Answers:
-    """One plate or pile at the angles of all numbers: what its integrator sees of a lamp of radiance 1 behind it."""
+    """Measure one plate or pile at the angles of all numbers: the radiance of a lamp of radiance 1 behind it."""
     import mitsuba as mi
 
     noise = noisy(group[0])
@@ -169,63 +169,60 @@ def transmittances(group: Sequence[StandardNumber], samples: int) -> Answers:
     scene: Any = mi.load_dict(_plates(group[0]) | {"integrator": integrator})
     angles = np.deg2rad([number.given["incidence"] for number in group])
     d = np.stack([np.sin(angles), 0 * angles, np.cos(angles)])
-    seen = _radiances(scene, np.repeat(d, samples if noise else 1, axis=1)).reshape(
-        len(group), SETS if noise else 1, -1
-    )
-    means, chance = seen.mean(2), np.zeros(len(group))
+    radiances = _radiances(scene, np.repeat(d, samples if noise else 1, axis=1))
+    means, chance = radiances.reshape(len(group), SETS if noise else 1, -1).mean(2), np.zeros(len(group))
     if noise:
         from scipy import stats
 
         chance = stats.t.isf(limits.FALSE_ALARM / 2, SETS - 1) * means.std(1, ddof=1) / math.sqrt(SETS)
-    return [
-        (mean, plates_bound(number) + more) for number, mean, more in zip(group, means.mean(1), chance, strict=True)
-    ]
+    bounds = [plates_bound(number) + x for number, x in zip(group, chance, strict=True)]
+    return list(zip(means.mean(1), bounds, strict=True))
 
 
 def _radiances(scene: Any, d: np.ndarray) -> np.ndarray:
-    """Radiances by the scene's integrator, of rays along d (3 × N) that meet the first plate on the axis."""
+    """Return the integrator's radiances of rays along d (3 × N) that hit the first plate on the axis."""
     import mitsuba as mi
 
     o, sampler = np.array([[0], [0], [-THICKNESS / 2]]) - THICKNESS * d, mi.load_dict({"type": "independent"})
     vectorised = dr.is_jit_v(mi.Float)
     sampler.seed(0, d.shape[1] if vectorised else 1)
 
-    def seen(o: Any, d: Any) -> Any:
+    def radiance(o: Any, d: Any) -> Any:
         ray: Any = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
         if mi.is_spectral:
             ray.wavelengths = type(ray.wavelengths)(NM)
         return np.array(scene.integrator().sample(scene, sampler, ray)[0], float)
 
     if vectorised:
-        return np.asarray(seen(o, d).reshape(-1, d.shape[1])[0])
-    return np.array([seen(*ray).ravel()[0] for ray in zip(o.T, d.T, strict=True)])
+        return np.asarray(radiance(o, d).reshape(-1, d.shape[1])[0])
+    return np.array([radiance(*ray).ravel()[0] for ray in zip(o.T, d.T, strict=True)])
 
 
 def plates_bound(number: StandardNumber) -> float:
-    """See the module."""
+    """Return the bound for plates: see the module."""
     polarised = number.kind == "transmittance"
     given: dict[str, Any] = {**number.given, "together": not polarised}
 
     def slope(name: str) -> float:
-        """Σ |∂T/∂given|/count: no polarisation makes up for the other."""
+        """Return Σ |∂T/∂given|/count: errors of the polarisations do not cancel."""
         ends = [table.polarised_plates(**{**given, name: np.longdouble(given[name]) + x}) for x in (SMALL, -SMALL)]
         return float(np.abs(ends[0] - ends[1]).mean() / (2 * SMALL))
 
-    passed, left = table.paths_through(BOUNDARIES, **given)
-    met = np.arange(1, BOUNDARIES + 1) @ passed + BOUNDARIES * left
+    leaving, remaining = table.paths_through(BOUNDARIES, **given)
+    boundaries = np.arange(1, BOUNDARIES + 1) @ leaving + BOUNDARIES * remaining
     total = slope("incidence") * math.degrees(FIRST + BOUNDARIES * TURN) * U + slope("n") * given["n"] * RATIO * U
-    total += (WEIGHT if polarised else PLAIN_WEIGHT) * U * float(met.mean())
+    total += (WEIGHT if polarised else PLAIN_WEIGHT) * U * float(boundaries.mean())
     if not noisy(number):
-        total += float((table.polarised_plates(**given) - passed.sum(0)).mean())
+        total += float((table.polarised_plates(**given) - leaving.sum(0)).mean())
     if "absorbance" in given:
         sine = math.sin(math.radians(given["incidence"])) / given["n"]
-        way = OFFSET * (1 + 4 * THICKNESS) / THICKNESS * sine**2 + BOUNDARIES * bench.PLACE * U
-        total += slope("absorbance") * given["absorbance"] * way
+        shortening = OFFSET * (1 + 4 * THICKNESS) / THICKNESS * sine**2 + BOUNDARIES * bench.PLACE * U
+        total += slope("absorbance") * given["absorbance"] * shortening
     return float(total)
 
 
 def _plates(number: StandardNumber) -> dict[str, Any]:
-    """Plates across z, the first one around the origin, and a lamp behind them."""
+    """Return plates perpendicular to z, the first one around the origin, and a lamp behind them."""
     import mitsuba as mi
 
     move, given = mi.ScalarTransform4f, number.given
@@ -245,36 +242,36 @@ def _plates(number: StandardNumber) -> dict[str, Any]:
 # Rays ------------------------------------------------------------------------------------------------------------
 
 
-Readings = Sequence[tuple[int, Callable[[optical_systems.Path], Any]]]  # the number of a ray, and what is read of it
+Readings = Sequence[tuple[int, Callable[[optical_systems.Path], Any]]]  # index of a ray, function that reads its path
 
 
 def traced_angle(group: Sequence[StandardNumber], samples: int) -> Answers:
-    """The deviation by a prism, or the angle of a rainbow."""
+    """Measure the deviation by a prism, or the angle of a rainbow."""
     return _read(*angle_read(*group))
 
 
 def angle_read(number: StandardNumber) -> tuple[Bench, Readings]:
-    """The prism or the drop with its ray, and the angle as it is read of a path."""
+    """Return the prism or the drop with its ray, and the function that reads the angle from a path."""
     make, angle = (prism_bench, table.deviated) if number.kind == "deviation" else (drop_bench, table.from_antisolar)
     case = make(number)
     return case, [(0, lambda path: angle(case.system.directions, path.directions[-1])[0])]
 
 
 def double_gauss(group: Sequence[StandardNumber], samples: int) -> Answers:
-    """Through the lens of the ground truth."""
-    places = [(number.given["ray"], number.given["slope"]) for number in group]
-    readings = [(round(at[0]), lambda path, at=at: table.behind_the_lens(path, *at)) for at in places]
+    """Measure rays through the lens of the ground truth."""
+    keys = [(number.given["ray"], number.given["slope"]) for number in group]
+    readings = [(round(key[0]), functools.partial(table.behind_the_lens, ray=key[0], slope=key[1])) for key in keys]
     return _read(bench.benches()["double Gauss"], readings)
 
 
 def _read(case: Bench, readings: Readings) -> Answers:
-    """What each reading, of one ray, makes of the path traced; and what roundings do to it."""
+    """Return for each reading its value for the traced path, and its bound."""
     path = case.traced(PLUGIN)
     return list(zip([read(path) for _, read in readings], read_bounds(case, readings), strict=True))
 
 
 def read_bounds(case: Bench, readings: Readings) -> list[float]:
-    """Bounds by Hoeffding's inequality: Σ effect²/count is that of the squares of single roundings."""
+    """Return bounds by Hoeffding's inequality: Σ effect²/count sums the squares of single roundings."""
     exact, squares = case.system.path(), [0.0] * len(readings)
 
     def changes(moved: optical_systems.Path) -> optical_systems.Answers:
@@ -287,13 +284,13 @@ def read_bounds(case: Bench, readings: Readings) -> list[float]:
 
 
 def prism_bench(number: StandardNumber) -> Bench:
-    """The bench of a prism, by the index, or by the name of the glass and the wavelength."""
+    """Return the bench of a prism with an index, or with a named glass and a wavelength."""
     medium, nm = number.medium or number.given["n"], number.given.get("nm")
     return Bench(table.prism([number]), lambda plugin: bench.prism(plugin, medium), nm)
 
 
 def drop_bench(number: StandardNumber) -> Bench:
-    """A ball of that index."""
+    """Return the bench of a ball with the number's index."""
     return Bench(table.drop([number]), lambda plugin: bench.ball(plugin, number.given["n"]))
 
 
@@ -301,7 +298,7 @@ def drop_bench(number: StandardNumber) -> Bench:
 
 
 def retardation(group: Sequence[StandardNumber], samples: int) -> Answers:
-    """Through a rhomb whose end faces stand across the ray, so that it meets the long ones at its acute angle."""
+    """Measure a rhomb: its end faces are perpendicular to the ray, which hits the long faces at the acute angle."""
     import mitsuba as mi
 
     (number,) = group
@@ -333,14 +330,14 @@ def retardation(group: Sequence[StandardNumber], samples: int) -> Answers:
 
 
 def brewster(group: Sequence[StandardNumber], samples: int) -> Answers:
-    """Where the last element of the Mueller matrix, r_s r_p, changes its sign."""
+    """Measure the angle at which the last element of the Mueller matrix, r_s r_p, changes its sign."""
     (number,) = group
-    found = _crossing(number.given["n"], lambda bsdf, wi: _sampled(bsdf, wi, 0)["weight"][:, -1])
-    return [(found, _angle_bound(number))]
+    angle = _crossing(number.given["n"], lambda bsdf, wi: _sampled(bsdf, wi, 0)["weight"][:, -1])
+    return [(angle, _angle_bound(number))]
 
 
 def critical(group: Sequence[StandardNumber], samples: int) -> Answers:
-    """The angle from which on nothing is transmitted."""
+    """Measure the angle beyond which nothing is transmitted."""
     import mitsuba as mi
 
     (number,) = group
@@ -356,14 +353,14 @@ def _angle_bound(number: StandardNumber) -> float:
 
 
 def _sampled(bsdf: Any, wi: np.ndarray, lobe: int) -> dict[str, np.ndarray]:
-    """One lobe; both of them by the random number 0 and 1 − u."""
+    """Sample one lobe, 0 or 1, by the random number 0 or 1 − u."""
     import mitsuba as mi
 
     return sample_all(bsdf, mi.BSDFContext(), wi, np.full(len(wi), lobe * (1 - 2 * U)))
 
 
 def _crossing(ratio: float, sign: Callable[[Any, Any], np.ndarray]) -> float:
-    """The angle, in degrees, at which `sign(bsdf, wi)` changes; from inside where the ratio n_to/n_from is below 1."""
+    """Return the angle in degrees at which `sign(bsdf, wi)` changes; from inside if `ratio` = n_to/n_from < 1."""
     import mitsuba as mi
 
     bsdf: Any = mi.load_dict(glass(PLUGIN, max(ratio, 1 / ratio)))
@@ -380,7 +377,7 @@ def _crossing(ratio: float, sign: Callable[[Any, Any], np.ndarray]) -> float:
 
 
 def diffuse(group: Sequence[StandardNumber], samples: int) -> Answers:
-    """Probabilities of the lobe at the nodes; inside, 1 − 1/n² of all light is beyond the critical angle."""
+    """Measure probabilities of the lobe at the nodes; inside, 1 − 1/n² of all light is beyond the critical angle."""
     import mitsuba as mi
 
     (number,) = group
@@ -395,7 +392,7 @@ def diffuse(group: Sequence[StandardNumber], samples: int) -> Answers:
 
 
 def index(group: Sequence[StandardNumber], samples: int) -> Answers:
-    """The ratio of indices of a sample straight through, at the wavelength."""
+    """Measure the ratio of indices of a sample at normal incidence, at the wavelength."""
     import mitsuba as mi
 
     (number,) = group

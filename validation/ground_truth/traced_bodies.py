@@ -1,11 +1,11 @@
 """Ground truth: rays and a render in Mitsuba, against closed forms and CODE V's printed results.
 
 Rays are intersected with Mitsuba's shapes and refracted by the plugin's own samples, boundary by boundary, through
-bodies whose answer is known. Their errors are divided by a worst-case bound on what float32 may do on the way
-(`validation/ground_truth/bench.py`). The double Gauss is read from
-`validation/reference/double_gauss_codev.json`: CODE V's listing, as ray-optics (BSD-3-Clause) has it. The rainbow is
-measured on an image (`validation/ground_truth/rainbow.py`); its error is divided by a bound that chance exceeds once in
-ten thousand runs. The built-in `dielectric` is shown for comparison, without budgets.
+bodies whose answers are known. Their errors are divided by a worst-case bound on the rounding errors of float32
+(`validation/ground_truth/bench.py`). The double Gauss comes from `validation/reference/double_gauss_codev.json`: CODE
+V's listing in ray-optics (BSD-3-Clause). The rainbow is measured on an image (`validation/ground_truth/rainbow.py`);
+its error is divided by a bound that chance exceeds once in ten thousand runs. The built-in `dielectric` is shown for
+comparison, without budgets.
 """
 
 from __future__ import annotations
@@ -31,26 +31,27 @@ from .bench import Bench, benches, glass
 BUILTIN = "dielectric"
 PLUGINS = PLUGIN, BUILTIN
 TERMS = {
-    "slab": "a block of BK7 50 mm thick, rays at 1 … 85°: moved aside by 50 mm sin(i − r)/cos r, direction restored",
-    "prism, least deviation": "of scenes/prism.xml, 2 asin(n sin(A/2)) − A, A = 60°, anywhere on its side",
+    "slab": "a block of BK7, 50 mm thick, with rays at 1 … 85°: it shifts them by 50 mm × sin(i − r)/cos r and keeps "
+    "their directions",
+    "prism, least deviation": "the prism of scenes/prism.xml, 2 asin(n sin(A/2)) − A, A = 60°, anywhere on its side",
     "prism, 32 … 85°": "the same at these incidences: i + asin(n sin(A − r)) − A",
-    "aplanatic ball": "R = 50 mm: rays that aim at n R behind its centre all meet R/n behind it",
-    "ellipsoid lens": "an ellipsoid of eccentricity 1/n, half axis 50 mm, and a sphere around its far focus, where "
-    "rays along the axis, to 80° of eccentric anomaly, all meet",
-    "drop, one reflection": "index 1.333, R = 50 mm, rays at 2 … 80°, reflected once within: deflected by π + 2i − 4r",
+    "aplanatic ball": "R = 50 mm: all rays aimed at the point n R behind its centre meet at R/n behind it",
+    "ellipsoid lens": "an ellipsoid of eccentricity 1/n, half axis 50 mm, and a sphere around its far focus, where all "
+    "rays along the axis meet, up to 80° of eccentric anomaly",
+    "drop, one reflection": "index 1.333, R = 50 mm, rays at 2 … 80°, one inner reflection: deflected by π + 2i − 4r",
     "drop, two reflections": "the same with two reflections: 2π + 2i − 6r",
-    "double Gauss": "CODE V's: places and tangents of nine rays at its eleven surfaces, as it prints them",
-    "shift, place, miss / mm": "largest distance from where the ray should be; of a miss, of its line from the focus",
+    "double Gauss": "CODE V's printed positions and tangents of nine rays at its eleven surfaces",
+    "shift, place, miss / mm": "largest distance from the right position; for a miss, of the ray's line from the focus",
     "direction / °": "largest |d − exact|, as an angle",
     "tangent": "largest deviation of (dx/dz, dy/dz)",
-    ERROR_OVER_BOUND: "largest of all of these over its own bound: the sum of the effects of every rounding on the "
-    "way, and, for the double Gauss, the rounding of its printed numbers; for the rainbow, the number of standard "
-    "errors that Student's t exceeds once in ten thousand runs, and the blur of pixels",
-    "index seen": "the smallest relative error of all indices that moves a ray to its bound; large values would mean "
-    "that the bound tests nothing",
-    "…, spawned": "the same with Mitsuba's ray offset along the normal, as in a render: the same for any plugin",
+    ERROR_OVER_BOUND: "largest of these errors over its own bound: the sum of the effects of every rounding on the "
+    "way and, for the double Gauss, the rounding of its printed numbers; for the rainbow, the standard errors that "
+    "Student's t exceeds once in ten thousand runs, plus the blur of pixels",
+    "index seen": "the smallest relative error of all indices that moves a ray to its bound; if it is large, the bound "
+    "tests nothing",
+    "…, spawned": "the same with Mitsuba's ray offset along the normal, as in a render: equal for any plugin",
     "rainbow": "D₀ = π + 2i − 4r, cos i = √((n² − 1)/3), sin r = sin i / n: 137.92° for n = 1.333",
-    "standard error / °": "of the mean over renders with seeds of their own",
+    "standard error / °": "standard error of the mean over renders with different seeds",
 }
 AXES = {"x": "surface", "y": "mm, or tangent", "x_scale": "linear", "y_scale": "log", "slope": None}
 NAME = "ground_truth"
@@ -62,12 +63,12 @@ UNITS = {"direction": math.degrees(1)}
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per variant, and one for the rainbow; in the profile `quick` the variant of the run."""
+    """Return one task per variant, and one for the rainbow; `quick` has the run's variant only."""
     variants = (context.variant,) if context.profile.quick else VARIANTS
     rays = [Task(f"ground truth: {name}", functools.partial(variant_rows, context, name)) for name in variants]
     if context.profile.quick:
         return rays
-    reason = "Mitsuba's wheel has no variant in double precision; of formulas in float64 see Stability"
+    reason = "Mitsuba's wheel has no variant in double precision; for formulas in float64 see Stability"
     double = Row(NAME, PLUGIN, "every body", "double precision", reason=reason)
     bow = Task("ground truth: rainbow", functools.partial(bow_rows, context))
     return [*rays, Task("ground truth: double precision", lambda: [double]), bow]
@@ -77,7 +78,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def variant_rows(context: Context, variant: str) -> list[Row]:
-    """A row per body and plugin in a variant of Mitsuba."""
+    """Return a row per body and plugin in a variant of Mitsuba."""
     reason = context.variants.get(variant, f"this Mitsuba has no variant {variant}")
     if reason is not None:
         return [Row(NAME, PLUGIN, "every body", variant, reason=reason)]
@@ -86,7 +87,7 @@ def variant_rows(context: Context, variant: str) -> list[Row]:
 
 
 def bench_row(name: str, bench: Bench, plugin: str, setting: str) -> Row:
-    """A plugin through a body: deviations of each answer, over their bounds."""
+    """Return the row of a plugin in a body: deviations of each answer, over their bounds."""
     off, spawned = (bench.deviations(bench.traced(plugin, spawned=spawned)) for spawned in (False, True))
     values = {LABELS[answer]: float(x.max()) * UNITS.get(answer, 1) for answer, x in off.items()}
     values[ERROR_OVER_BOUND] = max(float((x / bench.bounds[answer]).max()) for answer, x in off.items())
@@ -106,14 +107,14 @@ def bench_row(name: str, bench: Bench, plugin: str, setting: str) -> Row:
 
 
 def bow_rows(context: Context) -> list[Row]:
-    """The rainbow of either plugin."""
+    """Return the rows of the rainbow of either plugin."""
     if context.variant.startswith("scalar"):
         reason = "takes millions of light paths: needs a compiled variant"
         return [Row(NAME, PLUGIN, "rainbow", context.variant, reason=reason)]
     seeds = RENDERS[context.profile.name]
     about, size = {"index": float(rainbow.INDEX), "seeds": seeds, "resolution": rainbow.SIZE}, rainbow.SIZE // 4
     images = {plugin: rainbow.images(glass(plugin, rainbow.INDEX), seeds) for plugin in PLUGINS}
-    shown = {}  # their mean in squares of 4 pixels, 1 at its brightest
+    shown = {}  # the mean image in squares of 4 pixels, with a maximum of 1
     for plugin in PLUGINS:
         mean = np.mean(images[plugin], axis=0).reshape(size, 4, size, 4).mean((1, 3))
         grey = np.repeat(mean[..., None] / mean.max(), 3, axis=2)
@@ -125,7 +126,7 @@ def bow_rows(context: Context) -> list[Row]:
 def bow_row(
     plugin: str, setting: str, images: list[Array], replay: dict[str, Any], shown: dict[str, str] | None = None
 ) -> Row:
-    """Student's t of the mean of the edges; pixels may add their blur."""
+    """Return the row of the mean of the edges, with a bound by Student's t plus the blur of pixels."""
     from scipy import stats
 
     edges = np.array([rainbow.edge(image) for image in images])

@@ -1,7 +1,7 @@
-"""Is light refracted by its wavelength, and absorbed on its way, as the materials say?
+"""Do dispersion and absorption agree with the data of the materials?
 
-In: the makers' catalogues of glass, closed forms, the certified oracle, and renders through the plugin and the
-integrator. Out: rows with errors of indices, of directions and of images, each beside its bound.
+In: the makers' catalogues of glass, closed forms, the certified oracle, and renders with the plugin and the integrator.
+Out: rows with errors of indices, directions and images, and their bounds.
 """
 
 __all__ = ["catalogs", "closed_forms", "ray_directions", "renders"]

@@ -1,14 +1,14 @@
-"""Glasses of the makers' catalogues, at the spectral lines for which an index is printed.
+"""Glasses of the makers' catalogues, at the spectral lines with printed indices.
 
-The package has the coefficients of the makers' formulas in one file; the makers' own spreadsheets, which it was made
-from, are read here through the package `opticalglass`. Makers print coefficients of a formula and, beside them, indices
-with five or six decimals. Of each glass the formula is evaluated with the coefficients of the file, and by
-`opticalglass` with those of the spreadsheet; both must agree to rounding. Schott's and Hikari's formulas give all of
-their printed indices. Those of the other makers miss many of their own by a few units of the fifth decimal: the row
-says of how many glasses, and by how much. V_d is compared with the printed one.
+The package has the coefficients of the makers' formulas in one file. It was made from the makers' spreadsheets, which
+are read here by the package `opticalglass`. Makers print the coefficients of a formula and also indices with five or
+six decimals. The formula of each glass is evaluated with the coefficients of the file, and by `opticalglass` with those
+of the spreadsheet; both must agree up to rounding. The formulas of Schott and Hikari give all of their printed indices.
+Those of the other makers miss many printed indices by a few units of the fifth decimal: the row gives the number of
+such glasses and the largest difference. V_d is compared with the printed one.
 
-`python -c 'from validation.media import catalogs; catalogs.write()'` makes the file anew, after a new edition of
-`opticalglass`; SOURCES says which documents its spreadsheets are.
+`python -c 'from validation.media import catalogs; catalogs.write()'` writes the file again, after a new edition of
+`opticalglass`; SOURCES names the documents that its spreadsheets come from.
 """
 
 from __future__ import annotations
@@ -31,14 +31,15 @@ from validation.limits import CATALOG_FORMULA, PRINTED_INDEX
 from validation.run.context import Context
 from validation.study import Study, Task, about
 
-READERS = "opticalglass", "pandas"  # what the spreadsheets are read with
+READERS = "opticalglass", "pandas"  # packages that read the spreadsheets
 ABSENT = "{} is not installed: bash .ci/setup validation"
-CONSISTENT = "SCHOTT", "HIKARI"  # whose formulas give all of their printed indices
-# nm. Hoya prints its formula's own numbers beyond the t line: there no glass is off by more than the last digit, within
-# it a third are. Schott's fit begins at the i line: of what it prints below, most is off by 1e-5 to 4e-5.
+CONSISTENT = "SCHOTT", "HIKARI"  # makers whose formulas give all of their printed indices
+# Range of the fit, in nm. Hoya prints values of its formula beyond the t line: there no glass is off by more than the
+# last digit, below the t line a third of them are. Schott's fit starts at the i line: most of the indices printed for
+# shorter wavelengths are off by 1e-5 to 4e-5.
 FITTED = {"HOYA": (365.0, 1014.0), "SCHOTT": (365.0, 2326.0)}
 ANY = (0.0, math.inf)
-# The spreadsheets of opticalglass 1.1.1, as they name and date themselves.
+# The spreadsheets of opticalglass 1.1.1, with the names and dates that they contain.
 SOURCES = {
     "CDGM": "CDGM, optical glass, spreadsheet of September 2018",
     "HIKARI": "Hikari, general catalog data, revision of 2020-04-01",
@@ -48,30 +49,29 @@ SOURCES = {
     "SUMITA": "Sumita, optical glass data, version 12.00.05 of 2020-07-29",
 }
 TERMS = {
-    "glasses": "of the catalogue, with a formula",
-    "formula error": "largest difference from the index that `opticalglass` gives for the spreadsheet, relative",
+    "glasses": "number of glasses of the catalogue with a formula",
+    "formula error": "largest relative difference from the index that `opticalglass` gives for the spreadsheet",
     "largest miss": "largest difference of an index from the printed one",
-    "missing": "glasses of which a printed index is missed by more than half a unit of the fifth decimal and 1e-6",
+    "missing": "glasses with a printed index that is missed by more than half a unit of the fifth decimal plus 1e-6",
     "V_d off": "largest difference of V_d from the printed one",
 }
 
 
 @dataclass(frozen=True)
 class Printed:
-    """What a maker prints of a glass. `here`: the entry of the package's file that it makes."""
+    """What a maker prints of a glass. `entry`: its entry in the package's file."""
 
-    here: glass_catalogs.Glass
+    entry: glass_catalogs.Glass
     lines: dict[str, float]  # n at spectral lines
     v_d: float
-    name: str  # as opticalglass has it
+    name: str  # in opticalglass
 
 
 def tables(catalog: str) -> tuple[Any, dict[str, Printed]]:
-    """A maker's spreadsheet: `opticalglass`'s object of it, and all glasses by name.
+    """Return a maker's spreadsheet as `opticalglass`'s object, and all its glasses by name.
 
-    A glass has an index at wavelengths between those for which its maker prints an index, or a transmittance above 0.
-    The formula is fitted in the range of the printed indices (Ohara's technical information, 2.3, says so), or less
-    where FITTED says.
+    A glass is valid between the wavelengths for which its maker prints an index or a transmittance above 0. Its formula
+    is fitted in the range of the printed indices (Ohara's technical information, 2.3), or in the part in FITTED.
     """
     module: Any = importlib.import_module(f"opticalglass.{catalog.lower()}")
     with warnings.catch_warnings():
@@ -98,39 +98,40 @@ def tables(catalog: str) -> tuple[Any, dict[str, Printed]]:
 
 
 def _finite(series: Any) -> dict[Any, float]:
-    """The entries that are numbers, by column: a line's letter or a wavelength in nm."""
+    """Return the entries that are finite numbers, by column: a line's letter or a wavelength in nm."""
     pandas: Any = importlib.import_module("pandas")
     numbers = pandas.to_numeric(series, errors="coerce")
     return {column: float(x) for column, x in numbers.items() if math.isfinite(x)}
 
 
 def write(path: Path = glass_catalogs.FILE) -> None:
-    """Write the package's file of glasses: a line per glass, sorted."""
+    """Write the package's file of glasses, one line per glass, sorted."""
 
     def numbers(values: tuple[float, ...]) -> list[float]:
         return [int(x) if x == int(x) else x for x in values]
 
     parts = []
     for catalog, source in SOURCES.items():
-        glasses = {name: [*map(numbers, printed.here)] for name, printed in tables(catalog)[1].items()}
+        glasses = {name: [*map(numbers, printed.entry)] for name, printed in tables(catalog)[1].items()}
         lines = [f"  {json.dumps(name)}: {json.dumps(glasses[name])}" for name in sorted(glasses)]
         parts.append(f' "{catalog}": {{"source": {json.dumps(source)}, "glasses": {{\n' + ",\n".join(lines) + "}}")
     path.write_text("{\n" + ",\n".join(parts) + "\n}\n", "utf-8")
 
 
 def rows(context: Context) -> list[Row]:
-    """One per catalogue."""
-    if absent := [name for name in READERS if find_spec(name) is None]:
+    """Return one row per catalogue."""
+    absent = [name for name in READERS if find_spec(name) is None]
+    if absent:
         return [Row(STUDY.name, "catalogues", "printed lines", "", reason=ABSENT.format(absent[0]))]
     return [catalog_row(catalog) for catalog in glass_catalogs.CATALOGS]
 
 
 def catalog_row(catalog: str) -> Row:
-    """Every glass that has a formula, at every line that is printed."""
+    """Return the row of all glasses with a formula, at all printed lines."""
     table, glasses = tables(catalog)
     misses, errors, v_d = dict[str, float](), list[float](), list[float]()
     for name, printed in glasses.items():
-        if printed.here.coefficients:
+        if printed.entry.coefficients:
             medium, other = media.parse(f"{catalog}:{name}"), table.create_glass(printed.name, catalog)
             n: dict[str, Any] = {line: medium.index(LINES[line]) for line in {*printed.lines, *"dFC"}}
             errors += [abs(n[line] / float(other.calc_rindex(LINES[line])) - 1) for line in printed.lines]
@@ -147,7 +148,7 @@ def catalog_row(catalog: str) -> Row:
 
 
 def tasks(context: Context) -> list[Task]:
-    """One."""
+    """Return the one task of the study."""
     return [Task("catalogues of glass", lambda: rows(context))]
 
 

@@ -1,9 +1,9 @@
 """Refracted directions at the index of a wavelength, ray by ray, against the certified oracle.
 
-Every material is asked at random wavelengths of its range. In float32 the BSDF is sampled as `refract_path` samples it;
-in float64 a formula is called with the ratio of indices. The certified answer is that of the same ratio in float64.
-What rounding does to the index is stated apart: the formula of dispersion is evaluated again in ball arithmetic, and in
-float32 the ratio that scales the ray's part along the surface is rounded, which moves the direction by up to u.
+Each material is evaluated at random wavelengths of its range. In float32 the BSDF is sampled as by `refract_path`; in
+float64 a formula is called with the ratio of indices. The certified answer is for the same ratio in float64. Rounding
+errors of the index are reported separately: the dispersion formula is evaluated again in ball arithmetic. In float32,
+the ratio that scales the ray's tangential component is rounded, which changes the direction by up to u.
 """
 
 from __future__ import annotations
@@ -43,24 +43,24 @@ MATERIALS = (
     "SCHOTT:N-BK7",
 )
 TERMS = {
-    "worst / u": "the largest distance of a direction from the certified one, in roundoffs u of the precision",
-    "with the ratio in float32": "the same with what the ratio's rounding adds; the other figures leave it out",
+    "worst / u": "the largest distance of a direction from the certified one, in units of the roundoff u",
+    "with the ratio in float32": "the same, including the rounding of the ratio, which the other metrics exclude",
     "error / bound": "the largest ratio of a direction's error to the formula's a-priori bound for that ray",
-    "TIR misclassified, beyond its bound": "rays",
-    "index error / u": "of the index, relative, in u = 2⁻⁵³; what rounding its coefficients has done is not counted",
+    "TIR misclassified, beyond its bound": "number of rays",
+    "index error / u": "relative error of the index in u = 2⁻⁵³, without the rounding of its coefficients",
 }
 
 
-SUBJECTS = {N_SF11: "sellmeier(…), N-SF11", MATERIALS[3]: "table(…)"}  # of texts that are long
+SUBJECTS = {N_SF11: "sellmeier(…), N-SF11", MATERIALS[3]: "table(…)"}  # short names of long texts
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per material."""
+    """Return one task per material."""
     return [Task(f"{NAME}: {spec}", functools.partial(rows, context, spec)) for spec in MATERIALS]
 
 
 def rows(context: Context, spec: str) -> list[Row]:
-    """Rows of the index, of the BSDF, and of a formula in each setting with float64."""
+    """Of the index, of the BSDF, and of a formula in each setting with float64."""
     row = functools.partial(Row, NAME, SUBJECTS.get(spec, spec))
     medium, count = media.parse(spec), context.profile.rays
     missing = context.variants.get(SPECTRAL, "not in this wheel")
@@ -77,10 +77,13 @@ def rows(context: Context, spec: str) -> list[Row]:
 
 
 class Drawn:
-    """Rays of a medium at random wavelengths in nm: unit wi (count, 3), from both sides; exactly float32 both."""
+    """Random rays of a medium: unit wi (count, 3) from both sides, and wavelengths in nm; both are exact in float32.
+
+    `rays`: the same rays with k = n_from/n_to in float64.
+    """
 
     def __init__(self, medium: Medium, count: int) -> None:
-        """`rays`: the same, with k = n_from/n_to in float64."""
+        """Draw `count` rays."""
         rng = np.random.default_rng(seeds.current(SEED))
         wi = rng.normal(size=(count, 3))
         self.wi = (wi / np.linalg.norm(wi, axis=1, keepdims=True)).astype(np.float32).astype(float)
@@ -93,7 +96,7 @@ class Drawn:
 
 
 def judged(b: np.ndarray, transmitted: np.ndarray, rays: Rays, formula: str, u: float) -> dict[str, float]:
-    """The values of a row."""
+    """Return the values of a row."""
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
     verdict = judge(b, transmitted, RayBounds(rays, exact, FORMULAS[formula].budget, u), exact.transmitted)
     compared = verdict.compared & exact.transmitted
@@ -101,18 +104,18 @@ def judged(b: np.ndarray, transmitted: np.ndarray, rays: Rays, formula: str, u: 
 
 
 def sampled_row(medium: Medium, spec: str, count: int) -> Row:
-    """`refract` as `refract_path` samples it, in float32."""
+    """Return the row of `refract`, sampled as by `refract_path`, in float32."""
     import mitsuba as mi
 
     drawn = Drawn(medium, count)
     with under(SPECTRAL):
         bsdf = mi.load_dict({"type": "refract", "int_ior": spec, "ext_ior": 1.0})
-        asked = followed_context()
-        asked.component = 1
+        bsdf_context = followed_context()
+        bsdf_context.component = 1
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wi = mi.Vector3f(drawn.wi.T.astype(np.float32))
         si.wavelengths = type(si.wavelengths)(mi.Float(drawn.wavelengths.astype(np.float32)))
-        bs, weight = bsdf.sample(asked, si, 0.5, [0.5, 0.5])
+        bs, weight = bsdf.sample(bsdf_context, si, 0.5, [0.5, 0.5])
         b, transmitted = np.array(bs.wo, float).T.astype(np.longdouble), np.array(weight, float)[0] > 0
     k = drawn.rays.k
     rounding = (k.astype(np.float32).astype(float) - k)[:, None] * drawn.rays.a * [1, 1, 0]
@@ -123,7 +126,7 @@ def sampled_row(medium: Medium, spec: str, count: int) -> Row:
 
 
 def index_row(medium: Medium, spec: str) -> Row:
-    """The formula of dispersion against the same one in ball arithmetic."""
+    """Return the row of the dispersion formula against the same formula in ball arithmetic."""
     from flint import arb
 
     wavelengths = Drawn(medium, 200).wavelengths.tolist()
@@ -133,7 +136,7 @@ def index_row(medium: Medium, spec: str) -> Row:
 
 
 def exact_index(medium: Medium, wavelength: float) -> Any:
-    """N in ball arithmetic, from the coefficients as they are in float64."""
+    """Return the index in ball arithmetic, from the float64 coefficients."""
     from flint import arb, ctx
 
     ctx.prec = 200

@@ -1,9 +1,9 @@
-"""Renders with dispersive glass, and with glass that absorbs.
+"""Renders with dispersive glass, and with absorbing glass.
 
-In a white furnace a dispersive ball is not seen: each channel is that of the light alone. Absorption is compared with
-Mitsuba's `volpath`, whose dielectric boundaries enclose a homogeneous medium with an albedo of 0, by Welch's test on
-tiles of independent renders; a slab with exp(−σ d) in the deterministic mode. The time of dispersion is over that of
-the same scene with the index of its d line, and that of absorption over the same without it, both with as many samples.
+In a white furnace a dispersive ball is invisible: each channel is that of the light alone. Absorption is compared with
+Mitsuba's `volpath`, where dielectric boundaries enclose a homogeneous medium of albedo 0, by Welch's test on tiles of
+independent renders. A slab is compared with exp(−σ d) in the deterministic mode. The time of dispersion is over that of
+the same scene with the index of its d line, the time of absorption over that without it, with equally many samples.
 """
 
 from __future__ import annotations
@@ -35,45 +35,45 @@ SIZE, DETECTABLE_IMAGE = 48, "detectable difference, image"
 SEEDS = {"quick": 8, "standard": 8, "full": 16}
 DETECTED = "detectable per channel"
 TERMS = {
-    "off white": "largest difference of a channel's mean from that of the light, relative",
-    DETECTED: "five standard deviations of a channel's mean, relative: what would have been seen",
+    "off white": "largest relative difference of a channel's mean from that of the light",
+    DETECTED: "the detectable difference: five standard errors of a channel's mean, relative",
     "off / detectable": "the former over the latter",
-    "slab": "largest difference from exp(−σ d), relative",
-    "time / without": "median over warm renders in turn",
+    "slab": "largest relative difference from exp(−σ d)",
+    "time / without": "median over alternating warm renders",
     WELCH_ALARMS: "tiles and channels whose means differ; at most one image in 1000 by chance",
     DETECTABLE: "relative difference of a tile's mean that would have been an alarm, median over tiles",
-    DETECTABLE_IMAGE: "the same of the mean of the whole image, median over channels",
+    DETECTABLE_IMAGE: "the same for the mean of the whole image, median over channels",
 }
 METHODS: dict[str, dict[str, Any]] = {"by chance": {}, "both lobes": {"split_depth": 2}}
 Nodes = dict[str, Any]
 
 
 def scene(resolution: int, parts: Nodes, integrator: Nodes) -> Any:
-    """Parts around the origin, seen from 5 units away, in light from everywhere."""
+    """Return a scene of parts around the origin, seen from 5 units away, in a constant environment."""
     eye, light = sensor(resolution, 30, [0, 1, 5]), {"type": "constant"}
     return mi.load_dict({"type": "scene", "sensor": eye, "integrator": integrator, "light": light} | parts)
 
 
 def ours(**parameters: Any) -> Nodes:
-    """Our integrator."""
+    """Return the description of `refract_path`."""
     return {"type": OURS, "max_depth": 32, "rr_depth": 32} | parameters
 
 
 def glass(n: Any, outside: Any = 1.0, **absorption: Any) -> Nodes:
-    """Our boundary."""
+    """Return the description of a `refract` boundary."""
     return {"type": "refract", "int_ior": n, "ext_ior": outside} | absorption
 
 
 def furnace_rows(context: Context, variant: str, method: str) -> list[Row]:
-    """A ball of dense flint around a ball of water."""
+    """Return the row of a ball of dense flint around a ball of water."""
     if reason := context.variants.get(variant, "not in this wheel"):
         return [Row(NAME, "furnace", method, variant, reason=reason)]
     drop = {"type": "sphere", "radius": 0.5, "bsdf": glass("cauchy(1.3237, 3170)", N_SF11)}
     parts = {"ball": {"type": "sphere", "bsdf": glass(N_SF11)}, "drop": drop}
     spp = {"quick": 256, "standard": 1024, "full": 4096}[context.profile.name]
     with under(variant):
-        seen, empty = Camera(scene(32, parts, ours(rr_depth=10_000, **METHODS[method]))), Camera(scene(32, {}, ours()))
-        means = np.stack([seen(spp, seed)[0].mean((0, 1)) for seed in range(16)])
+        balls, empty = Camera(scene(32, parts, ours(rr_depth=10_000, **METHODS[method]))), Camera(scene(32, {}, ours()))
+        means = np.stack([balls(spp, seed)[0].mean((0, 1)) for seed in range(16)])
         white = np.stack([empty(4 * spp, 100 + seed)[0].mean((0, 1)) for seed in range(16)])
     error = np.sqrt((means.var(0, ddof=1) + white.var(0, ddof=1)) / 16)
     off = np.abs(means.mean(0) / white.mean(0) - 1)
@@ -85,12 +85,12 @@ def furnace_rows(context: Context, variant: str, method: str) -> list[Row]:
 
 
 def rgb(sigma: Sequence[float]) -> Nodes:
-    """A colour."""
+    """Return the description of a colour."""
     return {"type": "rgb", "value": list(sigma)}
 
 
 def absorbing_parts(name: str, absorbing: bool) -> Nodes:
-    """The scene by its name, of our boundaries, or of Mitsuba's with media on their sides."""
+    """Return a scene by its name: with `refract` (`absorbing`), or with `dielectric` and media on its sides."""
 
     def shape(inside: Sequence[float], outside: Sequence[float] = (), n: float = 1.5) -> Nodes:
         around = 1.5 if outside else 1.0
@@ -101,7 +101,7 @@ def absorbing_parts(name: str, absorbing: bool) -> Nodes:
         return {"bsdf": {"type": "dielectric", "int_ior": n, "ext_ior": around}} | mediums
 
     def medium(sigma: Sequence[float]) -> Nodes:
-        """Mitsuba takes colours up to 1 here, and a factor of all of them."""
+        """Return a homogeneous medium; Mitsuba takes a colour up to 1 and a scale."""
         most = max(sigma)
         return {"type": "homogeneous", "albedo": 0.0, "sigma_t": rgb([x / most for x in sigma]), "scale": most}
 
@@ -120,7 +120,7 @@ def absorbing_parts(name: str, absorbing: bool) -> Nodes:
 
 
 def volpath_rows(context: Context, name: str) -> list[Row]:
-    """Welch's test on tiles of 8² pixels, and on the whole image, whose mean has little noise."""
+    """Return the row of Welch's test against `volpath`, on tiles of 8² pixels and on the whole image."""
     count, spp = SEEDS[context.profile.name], {"quick": 64, "standard": 256, "full": 1024}[context.profile.name]
     volpath = {"type": "volpath", "max_depth": 64, "rr_depth": 64}
     test, reference = (
@@ -139,7 +139,7 @@ def volpath_rows(context: Context, name: str) -> list[Row]:
 
 
 def slab_rows(context: Context) -> list[Row]:
-    """The row of a slab without reflections: its index is that outside. Sides of 1 to 4 units, σ of 0.05 to 8."""
+    """Return the row of slabs of 1 to 4 units, σ of 0.05 to 8, without reflections: the index is that around them."""
     film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}, "component_format": "float32"}
     place = mi.ScalarTransform4f().look_at([0.1, 0.2, 5], [0.1, 0.2, 4], [0, 1, 0]).scale(1e-3)
     straight = {"type": "orthographic", "to_world": place, "film": film | {"pixel_format": "rgb"}}
@@ -148,14 +148,14 @@ def slab_rows(context: Context) -> list[Row]:
         for sigma in (0.05, 0.5, 2.0, 8.0 / thickness):
             sides = mi.ScalarTransform4f().scale([20, 20, thickness / 2])
             slab = {"type": "cube", "to_world": sides, "bsdf": glass(1.0, int_absorption=sigma)}
-            made = scene(1, {"slab": slab}, ours(deterministic=True))
-            left = float(np.array(mi.render(made, sensor=mi.load_dict(straight), spp=1))[0, 0, 0])
-            worst = max(worst, abs(left / math.exp(-sigma * thickness) - 1))
+            loaded = scene(1, {"slab": slab}, ours(deterministic=True))
+            transmittance = float(np.array(mi.render(loaded, sensor=mi.load_dict(straight), spp=1))[0, 0, 0])
+            worst = max(worst, abs(transmittance / math.exp(-sigma * thickness) - 1))
     return [Row(NAME, "slab", "exp(−σ d)", context.variant, {"slab": worst}, {"slab": SLAB_ABSORPTION})]
 
 
 def time_rows(context: Context) -> list[Row]:
-    """What dispersion and absorption add to the time of a render."""
+    """Return the rows of the times with dispersion and with absorption, over those without."""
     plain, rows = glass(float(media.index(N_SF11, media.LINES["d"]))), []
     kinds: dict[str, tuple[str, Nodes, float]] = {
         "dispersion": ("llvm_ad_spectral", glass(N_SF11), DISPERSION_TIME),
@@ -182,15 +182,15 @@ def time_rows(context: Context) -> list[Row]:
 
 
 def tasks(context: Context) -> list[Task]:
-    """Furnaces, comparisons with `volpath`, a slab, times."""
+    """Return the tasks: furnaces, comparisons with `volpath`, a slab, times."""
     if context.scalar:
         return [Task(NAME, lambda: [Row(NAME, "all", "all", context.variant, reason="needs a compiled variant")])]
-    work = functools.partial
+    partial = functools.partial
     variants = ("llvm_ad_spectral", "llvm_ad_spectral_polarized", "cuda_ad_spectral")
-    furnaces = {f"furnace {v}, {m}": work(furnace_rows, context, v, m) for v in variants for m in METHODS}
-    scenes = {name: work(volpath_rows, context, name) for name in ("sphere", "nested", "matt inside")}
-    every = furnaces | scenes | {"slab": work(slab_rows, context)}
-    timed = Task(f"{NAME}: times", work(time_rows, context), timed=True)
+    furnaces = {f"furnace {v}, {m}": partial(furnace_rows, context, v, m) for v in variants for m in METHODS}
+    scenes = {name: partial(volpath_rows, context, name) for name in ("sphere", "nested", "matt inside")}
+    every = furnaces | scenes | {"slab": partial(slab_rows, context)}
+    timed = Task(f"{NAME}: times", partial(time_rows, context), timed=True)
     return [*(Task(f"{NAME}: {name}", rows) for name, rows in every.items()), timed]
 
 

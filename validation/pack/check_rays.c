@@ -1,9 +1,9 @@
-/* Checks one function of refraction against this pack; put your own in the place of `refract`.
+/* Checks one function of refraction against this pack; replace `refract` with your own.
 
        cc -O2 -o check_rays programs/check_rays.c -lm
        ./check_rays rays/f64.csv rays/certified-f64.csv > answers.csv
 
-   Of single precision: cc -DREAL=float -DU=0x1p-24, and the files of f32. */
+   For single precision: cc -DREAL=float -DU=0x1p-24, and the files of f32. */
 #include <stdio.h>
 #include "judge.h"
 #ifndef REAL
@@ -11,7 +11,7 @@
 #define U 0x1p-53
 #endif
 
-static int refract(const REAL *a, const REAL *n, REAL k, REAL *b) { /* 0 where all is reflected */
+static int refract(const REAL *a, const REAL *n, REAL k, REAL *b) { /* returns 0 for total internal reflection */
     REAL c = a[0] * n[0] + a[1] * n[1] + a[2] * n[2], d = 1 - k * k * (1 - c * c);
     REAL f = k * c + (REAL)sqrt(d > 0 ? d : 0);
     for (int i = 0; i < 3; i++)
@@ -19,7 +19,7 @@ static int refract(const REAL *a, const REAL *n, REAL k, REAL *b) { /* 0 where a
     return d >= 0;
 }
 
-static int row(FILE *file, double *numbers, int count) { /* the next row of numbers; 0 at the end */
+static int row(FILE *file, double *numbers, int count) { /* reads the next row of numbers; returns 0 at the end */
     char line[1000];
     for (int used, read, at; fgets(line, sizeof line, file);) {
         for (used = read = 0; read < count && sscanf(line + used, "%lf%n", numbers + read, &at) == 1; read++)

@@ -1,4 +1,4 @@
-"""`python -m validation pack -o FOLDER [--quick]`: writes the reference pack."""
+"""`python -m validation pack -o FOLDER [--quick]` writes the reference pack."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ app = command_line.application()
 
 
 def main(arguments: list[str]) -> int:
-    """Run the command line; the exit code."""
+    """Run the command and return its exit code."""
     return command_line.exit_code(app, NAME, arguments)
 
 
 @app.command()
 def _command(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="The folder of the archive.")],
-    quick: Annotated[bool, typer.Option("--quick", help="Few rays and small images: to see what a pack is.")] = False,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Folder for the archive.")],
+    quick: Annotated[bool, typer.Option("--quick", help="Few rays and small images, for a first look.")] = False,
 ) -> None:
-    """Write the reference pack, one zip file that needs nothing of ours: scenes, images, rays, standard numbers."""
+    """Write the reference pack: scenes, images, rays and standard numbers, in one zip file that needs no mi_refract."""
     safe_files.check_parent(output / "pack" if output.exists() else output)
     if not all(map(importlib.util.find_spec, ("flint", "jinja2", "trimesh"))):
         raise ValueError("a pack needs the extra `validation`: pip install 'mi-refract[validation]'")
@@ -39,15 +39,15 @@ def _command(
 
     from . import contents
 
-    known = runner.facts(variant)
-    made_with = {name: known[name] for name in sorted(known) if name not in ("host", "cannot run", "other renderers")}
-    made = contents.Contents(contents.QUICK if quick else contents.FULL)
-    parts = made.parts()
+    facts = runner.facts(variant)
+    made_with = {name: facts[name] for name in sorted(facts) if name not in ("host", "cannot run", "other renderers")}
+    pack = contents.Contents(contents.QUICK if quick else contents.FULL)
+    parts = pack.parts()
     for number, (name, make) in enumerate(parts):
         print(printable(f"{NAME}: {number + 1} of {len(parts)}: {name}"), file=sys.stderr, flush=True)
         make()
     made_with |= {"variant": variant, "trimesh": installed_version("trimesh")}
-    files = made.whole(__version__, quick, made_with)
+    files = pack.whole(__version__, quick, made_with)
     top = f"mi-refract-pack-{__version__}{'-quick' if quick else ''}"
     output.mkdir(exist_ok=True)
     path = output / f"{top}.zip"

@@ -1,4 +1,4 @@
-"""The files of the pack, by path: each is made from fixed seeds, in a fixed order, without a date."""
+"""The files of the pack: made from fixed seeds, in a fixed order, without dates."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ from . import structs
 
 Files = dict[str, bytes]
 HERE = Path(__file__).parent
-TARGETS = {"mitsuba": "mitsuba", "obj+json": "obj", "gltf": "gltf"}  # of `scene export`, and their folder in the pack
-BEYOND_GLTF = ("furnace", "matched", "nested")  # glass within glass, or beside it
-# Samples per pixel: 3 % of noise or less, and a few minutes on two cores for all. The other scenes hold more than
-# triangles of glass with one index can say, or take as long as all of these.
+TARGETS = {"mitsuba": "mitsuba", "obj+json": "obj", "gltf": "gltf"}  # target of `scene export` → folder in the pack
+BEYOND_GLTF = ("furnace", "matched", "nested")  # scenes with glass within or in contact with other glass
+# Samples per pixel: at most 3 % of noise, and a few minutes on two cores for all scenes. The other scenes cannot be
+# represented as triangles of glass with one index, or take as long as all of these.
 SPP = {
     "balls": 1024,
     "diamond": 512,
@@ -54,38 +54,40 @@ SEED = 0
 UNREPEATABLE = ("mi_refract:render_seconds", "mi_refract:machines", "mi_refract:scene")
 COLUMNS = {
     "id": "of the ray",
-    "transmitted": "1, or 0 where all is reflected",
-    "bx, by, bz (b)": "the exact direction after the surface, of length 1; where all is reflected the mirror direction",
+    "transmitted": "1, or 0 for total internal reflection",
+    "bx, by, bz (b)": "the exact direction after the surface, a unit vector; for total internal reflection, the mirror "
+    "direction",
     "bx_low, by_low, bz_low (b_low)": "the rest of the exact direction: b + b_low has 106 bits",
-    "cos_t": "the cosine of the angle of refraction; 0 where all is reflected",
+    "cos_t": "the cosine of the angle of refraction; 0 for total internal reflection",
     "angle_limit": "radians: an answer farther from the exact direction is wrong",
-    "length_limit": "an answer is wrong whose length differs from both 1 and |a| by more, relative",
-    "decided": "1 where an answer is wrong that does not know whether the ray is transmitted; 0 where it may err",
-    "plane_limit": "of k times the error of a direction across the plane of incidence, or off the roots below",
-    "radicand_limit": "by which cos² of the angle of refraction may be off, before its root is taken",
-    "side_open": "1 where a ray is so near to the surface that it may be taken for one from the other side",
+    "length_limit": "an answer is wrong if its length differs by more, relative, from both 1 and |a|",
+    "decided": "1 if an answer with the wrong `transmitted` is wrong; 0 if rounding errors may change it",
+    "plane_limit": "limit of k × the error of a direction, across the plane of incidence or beyond what radicand_limit "
+    "allows",
+    "radicand_limit": "largest error of cos² of the angle of refraction, before its root is taken",
+    "side_open": "1 if a ray is so close to the surface that rounding errors may put it on the other side",
 }
 
 
-ABOUT = {  # of a file whose path begins so
-    "rays/limits": "what the columns of certified answers are, and the limits of all answers",
+ABOUT = {  # start of a path → what the file is
+    "rays/limits": "the columns of certified answers, and the limits of all answers",
     "rays/certified": "exact answers to the rays, with the limits of each",
     "rays/": "rays: directions, normals, indices",
     "numbers/": "standard numbers: published or in closed form",
     "scenes/": "a scene as flat triangles, in the format of its folder",
     "images/images": "how the images were made",
     "images/": "reference image, linear, with the variance of a sample in NAME.variance",
-    "looks/": "the reference image for a look: sRGB, 16 bits",
+    "looks/": "the reference image for viewing: sRGB, 16 bits",
     "schemas/": "JSON Schema of the JSON files that name it",
     "programs/": "a program in C that checks refraction against the rays",
     "README.md": "how to use the pack",
-    "LICENSE": "the licence of all of it",
+    "LICENSE": "the licence of the pack",
 }
 
 
 @dataclass(frozen=True)
 class Size:
-    """Scenes, rays of each regime, pixels of each side of an image, level of curved shapes, and a divisor of SPP."""
+    """Scenes, rays per regime, pixels per side of an image, subdivision of curved shapes, and a divisor of SPP."""
 
     scenes: tuple[str, ...] = tuple(SPP)
     rays: int = ray_set.COUNT
@@ -99,7 +101,7 @@ FULL, QUICK = Size(), Size(("balls", "nested", "prism"), rays=8, pixels=16, leve
 
 @dataclass
 class Contents:
-    """The files that were made so far; of the images and of the rays of a precision, what joins them."""
+    """The files made so far, and the entries of `rays/limits.json` and `images/images.json`."""
 
     size: Size
     files: Files = field(default_factory=dict)
@@ -107,19 +109,19 @@ class Contents:
     images: dict[str, structs.ReferenceImage] = field(default_factory=dict)
 
     def parts(self) -> list[tuple[str, Callable[[], None]]]:
-        """What the pack holds, part by part: a name, and a function that makes its files."""
-        made = [(f"rays in {x}", functools.partial(self.add_rays, x)) for x in ("f32", "f64")]
+        """Return the parts of the pack: a name, and a function that makes the part's files."""
+        rays = [(f"rays in {x}", functools.partial(self.add_rays, x)) for x in ("f32", "f64")]
         scenes = [(f"scene {name}", functools.partial(self.add_scene, name)) for name in self.size.scenes]
-        return [*made, ("standard numbers", self.add_numbers), *scenes]
+        return [*rays, ("standard numbers", self.add_numbers), *scenes]
 
     def add_rays(self, precision: str) -> None:
-        """The rays of `mi-refract rays export`, their certified answers, and the limits of any answer to each."""
-        made = ray_set.make(count=self.size.rays, precision=precision)
-        exact = oracle.refract(made.rays.a, made.rays.n, made.rays.k, fresnel=False, progress=False)
+        """Add the rays of `mi-refract rays export`, their certified answers, and the limits of answers to each ray."""
+        rays = ray_set.make(count=self.size.rays, precision=precision)
+        exact = oracle.refract(rays.rays.a, rays.rays.n, rays.rays.k, fresnel=False, progress=False)
         budget = FORMULAS[LOOSEST].budget
-        bounds = RayBounds(made.rays, exact, budget, made.roundoff, normalised=True)
+        bounds = RayBounds(rays.rays, exact, budget, rays.roundoff, normalised=True)
         columns: dict[str, NDArray[Any]] = {
-            "id": made.ids,
+            "id": rays.ids,
             "transmitted": exact.transmitted.astype(np.int64),
             "b": exact.direction,
             "b_low": exact.direction_low,
@@ -138,27 +140,27 @@ class Contents:
             names += [f"b{axis}{name[1:]}" for axis in "xyz"] if name in ("b", "b_low") else [name]
         row = ",".join("%d" if name in ("id", "transmitted", "decided", "side_open") else "%r" for name in names)
         table = np.column_stack(list(columns.values())).tolist()
-        lines = [f"# rays: {made.header['checksum']}", ",".join(names), *(row % tuple(x) for x in table), ""]
+        lines = [f"# rays: {rays.header['checksum']}", ",".join(names), *(row % tuple(x) for x in table), ""]
         with temporary_folder() as folder:
-            npz = ray_files.write(folder / "rays.npz", made).read_bytes()
-        of_rays = {f"rays/{precision}.csv": ray_files.as_csv(made).encode(), f"rays/{precision}.npz": npz}
+            npz = ray_files.write(folder / "rays.npz", rays).read_bytes()
+        ray_contents = {f"rays/{precision}.csv": ray_files.as_csv(rays).encode(), f"rays/{precision}.npz": npz}
         certified = {
             f"rays/certified-{precision}.csv": "\n".join(lines).encode(),
             f"rays/certified-{precision}.npz": ray_files.npz(columns),
         }
-        self.files |= of_rays | certified
+        self.files |= ray_contents | certified
         self.limits[precision] = structs.RaysOfPrecision(
-            u=made.roundoff,
-            rays=list(of_rays),
+            u=rays.roundoff,
+            rays=list(ray_contents),
             certified=list(certified),
-            checksum=made.header["checksum"],
-            regimes=made.header["regimes"],
+            checksum=rays.header["checksum"],
+            regimes=rays.header["regimes"],
             error_bound=LOOSEST,
             backward_error_limit=TEXTBOOK_BACKWARD,
         )
 
     def add_numbers(self) -> None:
-        """The table of standard numbers, as JSON and as CSV, where a cell may hold JSON."""
+        """Add the table of standard numbers, as JSON and as CSV, with JSON in the cells of mappings."""
         rows, text = standard_numbers.rows(), io.StringIO()
         writer = csv.DictWriter(text, rows[0], lineterminator="\n")
         writer.writeheader()
@@ -169,25 +171,26 @@ class Contents:
         self.files["numbers/standard_numbers.csv"] = text.getvalue().encode()
 
     def add_scene(self, name: str) -> None:
-        """A scene as flat triangles in each format, and its image, rendered from those triangles."""
+        """Add a scene as flat triangles in each format, and its image, rendered from those triangles."""
         plain = from_mitsuba.load(SCENES / f"{name}.xml", level=self.size.level, res=str(self.size.pixels))
-        for target, place in TARGETS.items():
+        for target, subfolder in TARGETS.items():
             if target == "gltf" and name in BEYOND_GLTF:
                 continue
             for file, content in targets.TARGETS[target](plain).items():
-                self.files[f"scenes/{name}/{place}/{file}"] = content
+                self.files[f"scenes/{name}/{subfolder}/{file}"] = content
         path, spp = f"scenes/{name}/mitsuba/scene.xml", max(2, SPP[name] // self.size.less)
-        # Mitsuba alone can render it; -D bsdf=refract has our plugin render it.
-        own, other = (f'<default name="bsdf" value="{plugin}"/>'.encode() for plugin in ("refract", "dielectric"))
+        # By default Mitsuba's own plugin renders the scene; -D bsdf=refract selects this package's plugin.
+        own, builtin = (f'<default name="bsdf" value="{plugin}"/>'.encode() for plugin in ("refract", "dielectric"))
         if self.files[path].count(own) != 1:
             raise ValueError(f"{path}: expected {own.decode()}")
-        self.files[path] = self.files[path].replace(own, other)
+        self.files[path] = self.files[path].replace(own, builtin)
         with temporary_folder() as folder:
             for file, content in self.files.items():
                 if Path(file).parent == Path(path).parent:
                     (folder / Path(file).name).write_bytes(content)
-            render_to_exr(folder / "scene.xml", folder / "made.exr", defines={"bsdf": "refract"}, spp=spp, seed=SEED)
-            image = image_file.read(folder / "made.exr")
+            rendered = folder / "rendered.exr"
+            render_to_exr(folder / "scene.xml", rendered, defines={"bsdf": "refract"}, spp=spp, seed=SEED)
+            image = image_file.read(rendered)
             header = {key: x for key, x in image.metadata.items() if key.startswith("mi_refract:") or key == "Software"}
             header = {key: x for key, x in header.items() if key not in UNREPEATABLE} | {"mi_refract:scene": path}
             image_file.write_exr(folder / "image.exr", image.pixels, image.channels, header | NO_DATE)
@@ -198,12 +201,12 @@ class Contents:
         self.images[name] = structs.ReferenceImage(path, spp, SEED, float(f"{noise:.3g}"))
 
     def whole(self, version: str, quick: bool, made_with: dict[str, str]) -> Files:
-        """All files of the pack: those of the parts, what joins them, texts, schemas, index and digests."""
+        """Return all files of the pack: those of the parts, their summaries, texts, schemas, index and digests."""
         import jinja2
 
         limits = structs.Limits(COLUMNS, self.limits)
-        joined = {"images/images.json": self.images, "rays/limits.json": limits}
-        files = self.files | {path: as_json(msgspec.to_builtins(value)) for path, value in joined.items()}
+        summaries = {"images/images.json": self.images, "rays/limits.json": limits}
+        files = self.files | {path: as_json(msgspec.to_builtins(value)) for path, value in summaries.items()}
         files |= structs.schemas() | {f"programs/{x}": (HERE / x).read_bytes() for x in ("check_rays.c", "judge.h")}
         files["LICENSE"] = HERE.parents[1].joinpath("LICENSE").read_bytes()
         template = jinja2.Template((HERE / "readme.md.j2").read_text("utf-8"), undefined=jinja2.StrictUndefined)
@@ -212,18 +215,18 @@ class Contents:
         ).encode()
         entries = {}
         for path in sorted(files):
-            content = next(text for begin, text in ABOUT.items() if path.startswith(begin))
+            description = next(text for start, text in ABOUT.items() if path.startswith(start))
             digest = hashlib.sha256(files[path]).hexdigest()
-            entries[path] = reference_pack.PackedFile(digest, content, structs.schema_path(path))
+            entries[path] = reference_pack.PackedFile(digest, description, structs.schema_path(path))
         index = reference_pack.PackIndex(reference_pack.FORMAT, version, quick, made_with, entries)
         files[reference_pack.INDEX] = as_json(msgspec.to_builtins(index))
-        for path, content_ in files.items():
-            structs.check(path, content_)
+        for path, content in files.items():
+            structs.check(path, content)
         return files | {reference_pack.SUMS: reference_pack.sums(files[reference_pack.INDEX], entries).encode()}
 
 
 def png(image: Image, folder: Path) -> bytes:
-    """The colours as a PNG file of 16 bits, sRGB; what is brighter than 1 is white."""
+    """Return the colours as a PNG file, sRGB, 16 bits; values above 1 are clipped."""
     import OpenImageIO as oiio
 
     pixels = np.ascontiguousarray(srgb_encode(np.clip(image.select("RGB"), 0, 1)), np.float32)
@@ -235,16 +238,16 @@ def png(image: Image, folder: Path) -> bytes:
 
 
 def as_json(value: Any) -> bytes:
-    """Strict JSON, for people to read too."""
+    """Return strict JSON, indented."""
     return (json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
 def archive(files: Files, top: str) -> bytes:
-    """A zip file of these, sorted, in the folder `top`; without dates, and the same on every system."""
+    """Return a zip file of the files, sorted, in the folder `top`; without dates, and the same on every system."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as target:
         for path in sorted(files):
-            entry = zipfile.ZipInfo(f"{top}/{path}")  # of 1980
+            entry = zipfile.ZipInfo(f"{top}/{path}")  # its default date is 1980-01-01
             entry.compress_type, entry.create_system, entry.external_attr = zipfile.ZIP_DEFLATED, 3, 0o644 << 16
             target.writestr(entry, files[path], compresslevel=9)
     return buffer.getvalue()

@@ -7,30 +7,30 @@ typedef struct {                                                       /* a row 
     double angle_limit, length_limit, decided, plane_limit, radicand_limit, side_open;
 } Certified;
 typedef enum { WRONG, WITHIN_BOUND, RIGHT } Verdict;
-typedef long double Real;                                               /* exact to 1e-19 where it has 80 bits */
+typedef long double Real;                                               /* has a roundoff of 1e-19 if 80 bits wide */
 
 static const double BACKWARD_LIMIT = 8;                                 /* in units of roundoff u */
 
 static Real dot(const Real *p, const Real *q) { return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]; }
 
-static Real cross(const Real *p, const Real *q, Real *r) {              /* r = p × q; its length */
+static Real cross(const Real *p, const Real *q, Real *r) {              /* r = p × q; returns |r| */
     for (int i = 0; i < 3; i++)
         r[i] = p[(i + 1) % 3] * q[(i + 2) % 3] - p[(i + 2) % 3] * q[(i + 1) % 3];
     return sqrtl(dot(r, r));
 }
 
-static Real unit(const double *v, Real *r) {                            /* r = v/|v|; |v| */
+static Real unit(const double *v, Real *r) {                            /* r = v/|v|; returns |v| */
     Real wide[3] = {v[0], v[1], v[2]}, length = sqrtl(dot(wide, wide));
     for (int i = 0; i < 3; i++)
         r[i] = wide[i] / length;
     return length;
 }
 
-/* The least relative change of a, n and k for which the answer is exact. All vectors are unit. */
+/* Returns the least relative change of a, n and k for which the answer is exact. All vectors are unit. */
 static Real backward_error(const Real *a, const Real *n, Real k, const Real *b, int transmitted) {
     Real axis[3], w[3], defect[3];
     Real cosine = dot(a, n), sine = cross(n, a, axis), e = k * sine;
-    if (!transmitted) {                                                 /* until the decision is the other one */
+    if (!transmitted) {                                                 /* the change that makes the ray transmitted */
         Real step = fabsl(1 - e * e) / (2 * e * (2 * k * fabsl(cosine) + e));
         return fminl(step, fabsl(asinl(1 / k) - atan2l(sine, fabsl(cosine))) / 2);
     }
@@ -38,7 +38,7 @@ static Real backward_error(const Real *a, const Real *n, Real k, const Real *b, 
         w[i] = k * a[i] - b[i];                                         /* Snell's law: n × w = 0 */
     Real size = cross(n, w, defect), gamma = fabsl(dot(n, w));
     Real along = sine > 0 ? fabsl(dot(defect, axis)) / sine : 0, across = sqrtl(fmaxl(size * size - along * along, 0));
-    Real worst = -dot(n, b) * ((cosine > 0) - (cosine < 0));            /* on the wrong side n must turn by so much */
+    Real worst = -dot(n, b) * ((cosine > 0) - (cosine < 0));            /* b on the wrong side: n must turn this far */
     for (int i = 0; i <= 32; i++) {
         Real turn = i * acosl(-1) / 64, x = cosl(turn), y = sinl(turn);
         worst = fmaxl(worst, (along * x + across * y) / (k * sqrtl(cosine * cosine * x * x + y * y) + gamma + e * x));
@@ -46,7 +46,7 @@ static Real backward_error(const Real *a, const Real *n, Real k, const Real *b, 
     return worst;
 }
 
-/* Whether rounding of a textbook's formula can give the direction b, where its error bound is too wide to tell. */
+/* Returns whether the textbook formula with rounding errors can give b; for rays with wide error bounds. */
 static int possible(const Real *a, const Real *n, Real k, const Real *b, const Certified *limits) {
     Real t[3], rest[3], off[3], cosine = dot(a, n), sign = cosine < 0 ? -1 : 1, onward = sign * dot(b, n);
     for (int i = 0; i < 3; i++)
@@ -66,12 +66,12 @@ static int possible(const Real *a, const Real *n, Real k, const Real *b, const C
     return error <= limits->plane_limit && e * along + root * onward > 0;
 }
 
-/* `b`, `transmitted`: the answer; b does not count where all is reflected. `u`: 0x1p-24 of f32, 0x1p-53 of f64. */
+/* `b`, `transmitted`: the answer; b is ignored if not transmitted. `u`: 0x1p-24 for f32, 0x1p-53 for f64. */
 static Verdict judge(const Ray *ray, const Certified *certified, const double *b, int transmitted, double u) {
-    Real a[3], n[3], found[3], exact[3], axis[3], k = (Real)ray->n_from / ray->n_to;
-    Real of_a = unit(ray->a, a), length = unit(b, found), off = fminl(fabsl(length - 1), fabsl(length / of_a - 1));
+    Real a[3], n[3], unit_b[3], exact[3], axis[3], k = (Real)ray->n_from / ray->n_to;
+    Real of_a = unit(ray->a, a), length = unit(b, unit_b), off = fminl(fabsl(length - 1), fabsl(length / of_a - 1));
     unit(ray->n, n);
-    if (transmitted && (!(length > 0 && length < HUGE_VAL) || !possible(a, n, k, found, certified)))
+    if (transmitted && (!(length > 0 && length < HUGE_VAL) || !possible(a, n, k, unit_b, certified)))
         return WRONG;
     if (transmitted != certified->transmitted) {
         if (certified->decided)
@@ -79,7 +79,7 @@ static Verdict judge(const Ray *ray, const Certified *certified, const double *b
     } else if (transmitted) {
         for (int i = 0; i < 3; i++)
             exact[i] = (Real)certified->b[i] + certified->b_low[i];
-        Real angle = atan2l(cross(found, exact, axis), dot(found, exact));
+        Real angle = atan2l(cross(unit_b, exact, axis), dot(unit_b, exact));
         if (!(angle <= certified->angle_limit && off <= certified->length_limit))
             return WRONG;
     }
@@ -87,5 +87,5 @@ static Verdict judge(const Ray *ray, const Certified *certified, const double *b
         return RIGHT;
     if (transmitted && !(off * (2 + off) / (4 * (2 * k + 1)) <= BACKWARD_LIMIT * u)) /* of the length: |b|² − 1 */
         return WITHIN_BOUND;
-    return backward_error(a, n, k, found, transmitted) <= BACKWARD_LIMIT * u ? RIGHT : WITHIN_BOUND;
+    return backward_error(a, n, k, unit_b, transmitted) <= BACKWARD_LIMIT * u ? RIGHT : WITHIN_BOUND;
 }

@@ -1,4 +1,4 @@
-"""The JSON files of the pack as structs, of which their schemas are written; what does not fit is not packed."""
+"""The JSON files of the pack as structs, which give their schemas; every file is checked against them."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ class _Strict(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class RaysOfPrecision(_Strict):
-    """Rays of one precision, what certifies them, and the limits of answers."""
+    """Rays of one precision, their certified answers, and the limits of answers."""
 
-    u: Annotated[float, _doc("roundoff: half an ulp of 1")]
+    u: Annotated[float, _doc("unit roundoff: half an ulp of 1")]
     rays: Annotated[list[str], _doc("the same rays in two formats")]
     certified: Annotated[list[str], _doc("the exact answers with the limits of each ray, in two formats")]
-    checksum: Annotated[str, _doc("of the rays, as their header has it")]
+    checksum: Annotated[str, _doc("of the rays, as in their header")]
     regimes: Annotated[dict[str, tuple[int, int]], _doc("first and last id of each regime")]
     error_bound: Annotated[str, _doc("the formula whose error bound gives angle_limit, length_limit, decided")]
-    backward_error_limit: Annotated[float, _doc("in u, of direction, decision and length of an answer that is right")]
+    backward_error_limit: Annotated[float, _doc("in u: of direction, decision and length of a right answer")]
 
 
 class Limits(_Strict):
     """rays/limits.json."""
 
-    columns: Annotated[dict[str, str], _doc("what the columns of certified answers are")]
+    columns: Annotated[dict[str, str], _doc("meaning of the columns of certified answers")]
     precisions: dict[str, RaysOfPrecision]
 
 
@@ -49,35 +49,35 @@ class ReferenceImage(_Strict):
     scene: Annotated[str, _doc("the file that was rendered, with -D bsdf=refract")]
     spp: Annotated[int, _doc("samples per pixel; divide NAME.variance by it for the variance of the pixel")]
     seed: int
-    relative_rmse: Annotated[float, _doc("of the noise: root of the mean variance of a pixel, over the mean")]
+    relative_rmse: Annotated[float, _doc("noise: root of the mean variance of a pixel, over the mean of the image")]
 
 
 class StandardNumber(_Strict):
     """A row of numbers/standard_numbers.json."""
 
     name: str
-    kind: Annotated[str, _doc("what is asked")]
+    kind: Annotated[str, _doc("the quantity")]
     unit: Annotated[str, _doc("°, mm or empty")]
     value: Annotated[float, _doc("by the law, rounded once")]
-    printed: Annotated[str, _doc("as the source has it; empty where nothing is printed")]
+    printed: Annotated[str, _doc("as printed in the source; empty if it prints no value")]
     printed_value: float | None
-    printed_half_unit: Annotated[float | None, _doc("half of its last digit")]
-    given: Annotated[dict[str, float], _doc("all that the law needs; angles in degrees, wavelengths in nm")]
+    printed_half_unit: Annotated[float | None, _doc("half a unit of the last printed digit")]
+    given: Annotated[dict[str, float], _doc("the parameters of the law; angles in degrees, wavelengths in nm")]
     law: str
     source: str
-    fitted: Annotated[str, _doc("what was fitted to what; empty where all is given")]
+    fitted: Annotated[str, _doc("which parameter was fitted to what; empty if none was")]
     off_print: Annotated[float | None, _doc("value − printed_value")]
 
 
 class Sky(_Strict):
-    """One of the two keys."""
+    """The sky: one of the two keys."""
 
-    environment: Annotated[str, _doc("the file of a map by longitude and latitude")] = ""
+    environment: Annotated[str, _doc("the file of a latitude-longitude map")] = ""
     radiance: Colour = (0.0, 0.0, 0.0)
 
 
 class Glass(_Strict, tag="glass", tag_field="type"):
-    """A smooth boundary; triangles are counterclockwise as seen from the medium of ext_ior."""
+    """A smooth boundary; triangles are counterclockwise seen from the medium of ext_ior."""
 
     int_ior: float
     ext_ior: float
@@ -90,7 +90,7 @@ class Diffuse(_Strict, tag="diffuse", tag_field="type"):
 
 
 class Light(_Strict, tag="light", tag_field="type"):
-    """A surface that emits where its triangles are counterclockwise, and is black from behind."""
+    """A surface that emits on the side from which its triangles are counterclockwise; the back is black."""
 
     radiance: Colour
 
@@ -106,14 +106,14 @@ class Scene(_Strict):
     """scene.json beside scene.obj."""
 
     name: str
-    max_depth: Annotated[int, _doc("segments of a path from the camera")]
+    max_depth: Annotated[int, _doc("the most segments of a path from the camera")]
     camera: Camera
     sky: Sky
     materials: dict[str, Glass | Diffuse | Light]
     meshes: dict[str, Object]
 
 
-# By the pattern of their paths, the name of the schema and the type.
+# Pattern of paths → name of the schema, and type.
 KINDS: dict[str, tuple[str, Any]] = {
     INDEX: ("index", PackIndex),
     "rays/limits.json": ("limits", Limits),
@@ -124,7 +124,7 @@ KINDS: dict[str, tuple[str, Any]] = {
 
 
 def schema_path(path: str) -> str:
-    """Where the schema of a JSON file is, or a URL; "" of other files. ValueError for a JSON file without one."""
+    """Return the path or URL of a JSON file's schema; "" for other files. ValueError for a JSON file without one."""
     if path.endswith(".gltf"):
         return "https://github.com/KhronosGroup/glTF/blob/main/specification/2.0/schema/glTF.schema.json"
     if path.endswith(".schema.json"):
@@ -138,14 +138,14 @@ def schema_path(path: str) -> str:
 
 
 def check(path: str, content: bytes) -> None:
-    """msgspec.ValidationError where a JSON file is not what its schema says."""
+    """Raise msgspec.ValidationError if a JSON file does not conform to its schema."""
     for pattern, (_, kind) in KINDS.items():
         if fnmatch(path, pattern):
             msgspec.json.decode(content, type=kind)
 
 
 def schemas() -> dict[str, bytes]:
-    """The files of all schemas, by path."""
+    """Return the files of all schemas, by path."""
     return {
         f"schemas/{name}.schema.json": json_text({"$schema": DRAFT} | msgspec.json.schema(kind), 1).encode() + b"\n"
         for name, kind in KINDS.values()

@@ -1,12 +1,12 @@
 """Planar: `planar.trace` against an independent retrace, on every scene file.
 
-The retrace follows each path again in extended precision, by other formulas (implicit curves and momenta). A ray whose
-path meets other boundaries, or ends in another way, takes a "wrong path". For the others every point and the last
-direction are compared, and their errors divided by a bound on rounding: at each boundary a few roundings of the largest
-coordinate so far and of the angle, the turn of a facet by its rounded ends, and 1/cos behind the boundary, all carried
-on to first order (`validation/planar/rounding.py`). Rays are those of the file, in each of its colours, and random
-ones near them; the profile `quick` takes at most 100 of the file's, in the first colour.
-`clutter` are random scenes of bodies of every kind, nested and turned. At the end the formulas are compared by name.
+The retrace computes each path again in extended precision, by other formulas (implicit curves and momenta). A ray whose
+path meets other boundaries, or ends in another way, takes a "wrong path". For the other rays every point and the last
+direction are compared, and their errors are divided by a bound on rounding errors. Each boundary adds a few roundings
+of the largest coordinate so far and of the angle, the rotation of a facet by its rounded ends, and 1/cos behind the
+boundary, all propagated to first order (`validation/planar/rounding.py`). The rays are those of the file, in each of
+its colours, and random ones near them; the profile `quick` has at most 100 of the file's, in the first colour.
+`clutter` means random scenes of bodies of every kind, nested and rotated. The last rows compare the formulas by name.
 """
 
 from __future__ import annotations
@@ -38,32 +38,32 @@ from .rounding import growth, undecided
 DIFFERENCE, BOUNDARIES = "difference", "boundaries"
 NEAREST, ITS_BOUND = "error nearest its bound", "that bound"
 TERMS = {
-    DIFFERENCE: "largest distance of a point from the retrace, over the extent of the scene, and |d − exact|",
-    ERROR_OVER_BOUND: "largest error of any point or last direction over its bound on rounding errors",
-    NEAREST: "the error, of a point over the extent or of a direction, that comes nearest to its bound",
-    ITS_BOUND: "the bound of that very point or direction: the ratio of the two is the largest of any",
-    WRONG_PATH: "rays that meet other boundaries than they should, or end another way",
-    WRONG_PATH_FAR: "those of them that rounding cannot explain: they pass every vertex of their boundaries at more "
-    "than their bound, touch no curve, and are not at the critical angle",
-    BOUNDARIES: "largest number that a ray meets",
+    DIFFERENCE: "largest distance of a point from the retrace, over the extent of the scene, or |d − exact|",
+    ERROR_OVER_BOUND: "largest error of any point or last direction, divided by its bound on rounding errors",
+    NEAREST: "the error of the point (over the extent) or direction with the largest ratio of error to bound",
+    ITS_BOUND: "the bound of that point or direction",
+    WRONG_PATH: "rays that meet other boundaries than they should, or end in another way",
+    WRONG_PATH_FAR: "wrong paths that rounding cannot explain: their distance from every vertex of their boundaries "
+    "exceeds their bound, they touch no curve, and they are not at the critical angle",
+    BOUNDARIES: "largest number of boundaries on a path",
 }
 NAME = "planar"
 FOLDER = SCENES / "planar"
 SEED = 2031
-RAYS = {"quick": 100, "standard": 250, "full": 2000}  # scattered around the file's own
+RAYS = {"quick": 100, "standard": 250, "full": 2000}  # number of random rays around the file's own
 SCALAR_RAYS = 2
-SIDE, DEPTH = 3, 30  # of clutter: bodies in a row, boundaries on a path
-CLUTTER = {"standard": (12, 100), "full": (100, 500)}  # scenes, and rays in each
+SIDE, DEPTH = 3, 30  # clutter: bodies in a row, boundaries on a path
+CLUTTER = {"standard": (12, 100), "full": (100, 500)}  # number of scenes, and rays in each
 SCALAR_CLUTTER = (2, 5)
-SPREAD = 1e-2  # of the extent, and in radians
+SPREAD = 1e-2  # of random rays: shifts in units of the extent, rotations in radians
 GROWN = {ERROR_OVER_BOUND: limits.GROWN, WRONG_PATH_FAR: 0.0}
-TRACE = "trace"  # the subject of its rows: `planar.trace` with the default formula
-SHOWN = "lens"  # the scene of the formulas
+TRACE = "trace"  # subject of the rows of `planar.trace` with the default formula
+SHOWN = "lens"  # the scene in which formulas are compared
 
 
 @dataclass(frozen=True)
 class Case:
-    """Rays to follow through `segments`. `known`: their paths, in place of the independent retrace."""
+    """Rays to trace through `segments`. `known`: their exact paths, instead of the independent retrace."""
 
     name: str
     segments: Segments
@@ -75,22 +75,22 @@ class Case:
 
     @functools.cached_property
     def exact(self) -> Retraced:
-        """The paths, by the independent retrace where they are not known."""
+        """The exact paths: known, or by the independent retrace."""
         rays = self.segments, self.origins, self.directions, self.max_depth
         return self.known or retrace(*rays, reflect=self.reflect)
 
     @functools.cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """Bounds of the errors of points and directions, over u."""
+        """The bounds on errors of points and directions, in units of u."""
         return growth(self.exact, self.segments)
 
     @property
     def extent(self) -> float:
-        """The diagonal around the segments."""
+        """The diagonal of the segments' bounding box."""
         return _extent(self.segments)
 
     def trace(self, setting: Setting, formula: str | None = None) -> Paths:
-        """The paths by `planar.trace` in a setting, by the default formula or another one."""
+        """Return the paths by `planar.trace` in a setting, with the default formula or another one."""
         tracer = Tracer(self.segments, formula=formula, precision=setting.name, backend=setting.backend)
         return tracer(self.origins, self.directions, self.max_depth, reflect=self.reflect)
 
@@ -100,7 +100,7 @@ def _extent(segments: Segments) -> float:
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per backend and precision."""
+    """Return one task per backend and precision."""
     return by_setting(context, NAME, "planar", "every scene", setting_rows)
 
 
@@ -112,7 +112,7 @@ def by_setting(
     rows: Callable[[Context, Setting], list[Row]],
     timed: bool = False,
 ) -> list[Task]:
-    """A task per backend and precision: `rows`, or one row, of the case `every`, that says why it cannot run."""
+    """Return a task per backend and precision: `rows`, or one row of case `every` with the reason why it cannot run."""
 
     def run(setting: Setting) -> list[Row]:
         absent = setting.vector is None
@@ -122,7 +122,10 @@ def by_setting(
 
 
 def setting_rows(context: Context, setting: Setting) -> list[Row]:
-    """Rows of every scene in a setting: in every colour, or three of its wavelengths; on scalar arrays in one."""
+    """Return the rows of every scene in a setting, for every colour or three wavelengths of a file.
+
+    Scalar arrays have one colour.
+    """
     rays = SCALAR_RAYS if setting.is_scalar else RAYS[context.profile.name]
     if context.profile.quick:
         return [row([case_of(FOLDER / f"{SHOWN}.toml", rays)], setting)]
@@ -139,7 +142,7 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
 
 
 def drawn_rows(context: Context) -> list[Row]:
-    """Every scene and a third of the random ones."""
+    """Return the rows of every scene file and of a third of the random scenes."""
     rows, (scenes, rays) = [], CLUTTER["standard"]
     for setting in running(context):
         count, random = (SCALAR_RAYS, SCALAR_CLUTTER) if setting.is_scalar else (RAYS["quick"], (scenes // 3, rays))
@@ -149,9 +152,9 @@ def drawn_rows(context: Context) -> list[Row]:
 
 
 def row(cases: list[Case], setting: Setting, formula: str | None = None) -> Row:
-    """Cases of one scene in a setting: sums of the counts, and the worst of the other metrics.
+    """Return the row of a scene's cases in a setting: sums of the counts, and the worst of the other metrics.
 
-    NaN stays: no ray of a case kept to its path.
+    NaN is kept: it means that all rays of a case took a wrong path.
     """
     name, counts = cases[0].name, (WRONG_PATH, WRONG_PATH_FAR)
     parts = [judge(case.trace(setting, formula), case, setting.roundoff) for case in cases]
@@ -159,33 +162,34 @@ def row(cases: list[Case], setting: Setting, formula: str | None = None) -> Row:
     nearest = max(parts, key=lambda part: part[ERROR_OVER_BOUND])
     values |= {key: nearest[key] for key in (NEAREST, ITS_BOUND)}
     replay = {"scene": name, "cases": len(cases), "rays": sum(len(case.origins) for case in cases)}
-    # Among so many bodies as in clutter errors may grow beyond any fixed bound: their own one counts.
+    # In clutter errors may grow beyond any fixed bound: only their own bound counts.
     bounds = GROWN if name == "clutter" else budgets(setting)
     replay["seed"] = seeds.current(SEED)
     return Row(NAME, formula or TRACE, name, setting.label, values, bounds, replay=replay)
 
 
 def budgets(setting: Setting) -> dict[str, float]:
-    """The budgets: what rounding may have grown to, in float64 equality, too."""
+    """Return the budgets: bounds on rounding errors, and in float64 also equality with the retrace."""
     exact = {DIFFERENCE: limits.PLANAR_EQUAL, WRONG_PATH: 0.0} if setting.precision is np.float64 else {}
     return GROWN | exact
 
 
 @seeds.cached
 def case_of(path: Path, count: int, colour: int | None = None) -> Case:
-    """A colour of a scene file: refracted wherever possible, and reflected once where the file has branches.
+    """Return the rays of a scene file in one colour, refracted wherever possible, and `count` random rays around them.
 
-    None: the first colour with at most `count` of the file's rays; else all of them. `count` are scattered around them.
+    If the file has branches, the rays are also reflected once. Without a `colour`, the first colour is used with at
+    most `count` of the file's rays.
     """
     scene, rng = load(path), np.random.default_rng(seeds.current(SEED))
     segments, total = scene.segments[colour or 0], len(scene.origins)
     own = np.linspace(0, total - 1, min(count, total) if colour is None else total).round().astype(int)
-    chosen = rng.integers(0, total, count)
-    shift, turn = SPREAD * _extent(segments) * rng.uniform(-1, 1, (count, 2)), SPREAD * rng.uniform(-1, 1, count)
-    x, y = scene.directions[chosen].T
-    turned = np.stack([x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn)], 1)
+    centres = rng.integers(0, total, count)
+    shift, angle = SPREAD * _extent(segments) * rng.uniform(-1, 1, (count, 2)), SPREAD * rng.uniform(-1, 1, count)
+    x, y = scene.directions[centres].T
+    rotated = np.stack([x * np.cos(angle) - y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle)], 1)
     rays = np.concatenate(
-        [np.hstack([scene.origins, scene.directions])[own], np.hstack([scene.origins[chosen] + shift, turned])]
+        [np.hstack([scene.origins, scene.directions])[own], np.hstack([scene.origins[centres] + shift, rotated])]
     )
     masks = [0] + [1 << j for j in range(min(2, scene.max_depth))] * bool(scene.branches)
     origins, directions = np.hsplit(np.tile(rays, (len(masks), 1)), 2)
@@ -197,25 +201,26 @@ def case_of(path: Path, count: int, colour: int | None = None) -> Case:
 
 @seeds.cached
 def clutter(scenes: int, rays: int) -> list[Case]:
-    """Bodies of every kind, nested and turned, and rays through them; a third are reflected at some of the first three.
+    """Return random scenes of bodies of every kind, nested and rotated, and rays through them.
 
-    A square of bodies, 1 apart, in air; every second one holds another.
+    The bodies form a square grid of spacing 1 in air; about half of them contain another body. A third of the rays may
+    be reflected at some of their first three boundaries.
     """
     cases = []
     for rng in (np.random.default_rng((seeds.current(SEED), number)) for number in range(scenes)):
         parts: list[tuple[Curve, float, float]] = []
-        for place in np.ndindex(SIDE, SIDE):
+        for position in np.ndindex(SIDE, SIDE):
             size, n, inner = rng.uniform(0.2, 0.45), *rng.uniform(1.1, 2.5, 2)
-            nest = affine(rng.uniform(0, 360))
-            parts.append((_outline(rng, size).mapped(nest, place), n, 1.0))
+            rotation = affine(rng.uniform(0, 360))
+            parts.append((_outline(rng, size).mapped(rotation, position), n, 1.0))
             if rng.random() < 0.5:
-                # Any of the outlines holds a circle of a tenth of its size around its origin.
-                parts.append((shapes.circle(0.1 * size).mapped(nest, place), inner, n))
+                # Every outline contains a circle of a tenth of its size around its origin.
+                parts.append((shapes.circle(0.1 * size).mapped(rotation, position), inner, n))
         names = ("start", "end", "control", "weight")
         start, end, control, weight = (np.concatenate([getattr(c, name) for c, _, _ in parts]) for name in names)
         left, right = (np.concatenate([np.full(len(part[0]), part[side]) for part in parts]) for side in (1, 2))
-        turn = rng.uniform(0, 2 * np.pi, rays)
-        directions = np.stack([np.cos(turn), np.sin(turn)], 1)
+        angle = rng.uniform(0, 2 * np.pi, rays)
+        directions = np.stack([np.cos(angle), np.sin(angle)], 1)
         origins = rng.uniform(-0.3, SIDE - 0.7, (rays, 2)) - 5 * directions
         reflect = rng.integers(0, 8, rays) * (rng.random(rays) < 1 / 3)
         cases.append(
@@ -239,28 +244,29 @@ def _outline(rng: np.random.Generator, size: float) -> Curve:
 
 
 def judge(paths: Paths, case: Case, u: float, offset: float = 0.0) -> dict[str, float]:
-    """What became of the rays, against the retrace; u: the roundoff, `offset`: as in `growth`.
+    """Return the metrics of paths against the retrace. u: the roundoff, `offset`: as in `growth`.
 
-    NaN where no ray kept to its boundaries.
+    Errors are NaN if all rays took a wrong path.
     """
     exact = case.exact
     points, directions = (u * x for x in (growth(exact, case.segments, offset) if offset else case.bounds))
-    off = np.hypot(*(paths.points - exact.points).transpose(2, 0, 1)).astype(float)
-    # A point that is missing differs by infinity: only what the retrace does not have may be NaN.
-    off = np.where(np.isnan(exact.points[..., 0]), 0, np.nan_to_num(off, nan=np.inf))
-    turned = np.nan_to_num(np.hypot(*(unit(paths.directions) - exact.directions).T).astype(float), nan=np.inf)
+    distance = np.hypot(*(paths.points - exact.points).transpose(2, 0, 1)).astype(float)
+    # A missing point counts as infinitely far: only points that the retrace does not have may be NaN.
+    distance = np.where(np.isnan(exact.points[..., 0]), 0, np.nan_to_num(distance, nan=np.inf))
+    chord = np.nan_to_num(np.hypot(*(unit(paths.directions) - exact.directions).T).astype(float), nan=np.inf)
     ends = exact.last(directions)
-    ratios = np.column_stack([off / points, turned / ends])
+    ratios = np.column_stack([distance / points, chord / ends])
     ratio = np.nanmax(ratios, axis=1)
     same = paths.hits == exact.hits
-    # Of two segments that share a vertex either is right there, if it does the same to the ray.
+    # At a shared vertex either of two segments is right, if the rest of the path agrees.
     touching = 2.0**-50 * np.abs([case.segments.start, case.segments.end]).max()
     same |= at_shared_vertex(paths.hits, exact, case.segments, touching) & (ratio <= 1)[:, None]
     wrong = ~same.all(1) | (paths.events != exact.events).any(1)
     near = undecided(exact, paths, case.segments, points, directions)
     values = dict.fromkeys([ERROR_OVER_BOUND, NEAREST, ITS_BOUND, DIFFERENCE], float("nan"))
     if not wrong.all():
-        errors, bounds = (np.column_stack([x / case.extent, y])[~wrong] for x, y in ((off, turned), (points, ends)))
+        pairs = (distance, chord), (points, ends)
+        errors, bounds = (np.column_stack([x / case.extent, y])[~wrong] for x, y in pairs)
         at = np.unravel_index(np.nanargmax(errors / bounds), errors.shape)
         values |= {NEAREST: float(errors[at]), ITS_BOUND: float(bounds[at])}
         values |= {ERROR_OVER_BOUND: float(ratio[~wrong].max()), DIFFERENCE: float(errors.max())}
@@ -269,16 +275,16 @@ def judge(paths: Paths, case: Case, u: float, offset: float = 0.0) -> dict[str, 
 
 
 def at_shared_vertex(hits: Array, exact: Retraced, segments: Segments, near: Any) -> Array:
-    """Where (N × D) an exact path passes, but for `near`, a vertex that its segment and that of `hits` share."""
+    """Return where (N × D) an exact path passes within `near` of a vertex shared by its segment and that of `hits`."""
     ours, theirs = ([np.asarray(x)[ids] for x in (segments.start, segments.end)] for ids in (hits, exact.hits))
-    there = np.zeros(hits.shape, bool)
+    shared = np.zeros(hits.shape, bool)
     for vertex, own in itertools.product(theirs, ours):
-        there |= (vertex == own).all(2) & (np.hypot(*(exact.points[:, 1:] - vertex).transpose(2, 0, 1)) <= near)
-    return there & (hits >= 0) & (exact.hits >= 0)
+        shared |= (vertex == own).all(2) & (np.hypot(*(exact.points[:, 1:] - vertex).transpose(2, 0, 1)) <= near)
+    return shared & (hits >= 0) & (exact.hits >= 0)
 
 
 def unit(d: Any) -> Array:
-    """Directions (N × 2) in extended precision, of length 1."""
+    """Return directions (N × 2) in extended precision, normalised."""
     d = np.asarray(d, np.longdouble)
     return np.asarray(d / np.hypot(*d.T)[:, None])
 

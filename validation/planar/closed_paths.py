@@ -1,9 +1,9 @@
 """Planar, closed answers: paths whose end is known in closed form.
 
-In a box mirror images unfold a path of total reflections into a straight line; the corners are whole numbers, though no
-side is along an axis. An ellipse of eccentricity 1/n focuses rays along its axis into its far focus; a circle around
-that focus lets them leave the glass unrefracted. A ball refracts rays from a point R/n from its centre as though they
-came from n R. A prism of apex A deviates rays by i + asin(n sin(A − asin(sin i/n))) − A, a drop by
+In a box, mirror images unfold a path of total reflections into a straight line; the corners are whole numbers, but no
+side is along an axis. An ellipse of eccentricity 1/n focuses rays along its axis into its far focus; rays leave the
+glass unrefracted through a circle around that focus. A ball refracts rays from a point at distance R/n from its centre
+as if they came from n R. A prism of apex A deviates rays by i + asin(n sin(A − asin(sin i/n))) − A, a drop by
 π + 2 asin b − 4 asin(b/n) for its first rainbow.
 """
 
@@ -32,10 +32,10 @@ from . import against_retrace
 from .against_retrace import Case, budgets, by_setting, judge, unit
 
 TERMS = against_retrace.TERMS | {
-    "error": "largest deviation from the closed answer: of a line from the point that it should meet, over the "
-    "distance to it; of a direction, |d − exact|",
+    "error": "largest deviation from the closed answer: the distance of a line from the point that it should meet, "
+    "over the distance to that point; or |d − exact| of a direction",
     "error / u": "the same in units of roundoff",
-    "box": "total internal reflections in a box of index 1.5, by their number; answers from mirror images",
+    "box": "total internal reflections in a box of index 1.5, by their number; exact paths from mirror images",
 }
 NAME = "planar_closed"
 SEED = 2032
@@ -45,9 +45,9 @@ INDEX, FOCAL_LENGTH = 1.5, 9.0
 
 @dataclass(frozen=True)
 class Closed:
-    """A case, and where its paths end: in unit `directions` (N × 2), or on lines through `point`.
+    """A case whose paths end in unit `directions` (N × 2), or on lines through `point`.
 
-    `reach`: how far from the last boundary the point is, at most, and what errors are given over.
+    `reach`: largest distance of the point from the last boundary; errors are divided by it.
     """
 
     case: Case
@@ -56,7 +56,7 @@ class Closed:
     reach: float = 1.0
 
     def error(self, paths: Paths) -> Array:
-        """|d − exact| (N), or the distance of the last line from the point, over `reach`."""
+        """Return |d − exact| (N), or the distance of the last line from the point, over `reach`."""
         d = unit(paths.directions)
         if self.directions is not None:
             return np.asarray(np.hypot(*(d - self.directions).T))
@@ -65,13 +65,13 @@ class Closed:
 
     @property
     def bound(self) -> Array:
-        """The bound of that error, over u."""
+        """The bound of that error, in units of u."""
         point, direction = map(self.case.exact.last, self.case.bounds)
         return direction if self.directions is not None else point / self.reach + direction
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per backend and precision."""
+    """Return one task per backend and precision."""
     return by_setting(context, NAME, "planar, closed", "every answer", _setting_rows)
 
 
@@ -86,12 +86,12 @@ def _box_rows(context: Context, setting: Setting) -> list[Row]:
 
 
 def drawn_rows(context: Context) -> list[Row]:
-    """The boxes: only their rays are random."""
+    """Return the rows of boxes: only their rays are random."""
     return [row for setting in running(context) for row in _box_rows(context, setting)]
 
 
 def row(setting: Setting, name: str, answer: Closed | Case) -> Row:
-    """A case against its exact paths, and against the closed answer where that is not the path itself."""
+    """Return the row of a case against its exact paths, and of `Closed` against the closed answer."""
     case = answer if isinstance(answer, Case) else answer.case
     paths, bounds = case.trace(setting), budgets(setting)
     values = judge(paths, case, setting.roundoff)
@@ -106,16 +106,16 @@ def row(setting: Setting, name: str, answer: Closed | Case) -> Row:
 
 # The box -------------------------------------------------------------------------------------------------------
 
-SIDES = np.array([[6.0, 8.0], [-4.0, 3.0]])  # at right angles, 10 and 5 long
+SIDES = np.array([[6.0, 8.0], [-4.0, 3.0]])  # perpendicular, 10 and 5 long
 
 
 @seeds.cached
 def box(count: int, rays: int) -> Case:
-    """`count` total internal reflections of each ray; origins and directions exact in float32."""
+    """Return rays with `count` total internal reflections; origins and directions are exact in float32."""
     corners = np.array([[0, 0], SIDES[0], SIDES.sum(0), SIDES[1]])
     segments = Segments(corners, np.roll(corners, -1, 0), np.full(4, INDEX), np.ones(4))
     rng = np.random.default_rng(seeds.current(SEED))
-    # Angles of incidence of 43 to 47°, beyond the critical 41.8° at all four walls.
+    # Angles of incidence of 43 to 47° at all four walls, above the critical angle of 41.8°.
     angle = math.atan2(8, 6) + np.deg2rad(45 + rng.uniform(-2, 2, rays) + 90 * rng.integers(0, 4, rays))
     origins = (rng.uniform(0.1, 0.9, (rays, 2)) @ SIDES).astype(np.float32).astype(float)
     directions = np.stack([np.cos(angle), np.sin(angle)], 1).astype(np.float32).astype(float)
@@ -124,10 +124,13 @@ def box(count: int, rays: int) -> Case:
 
 
 def unfold(origins: Array, directions: Array, count: int) -> Retraced:
-    """The path of mirror images, in extended precision: in the coordinates along SIDES the walls are whole numbers."""
+    """Return the paths by mirror images, in extended precision.
+
+    In coordinates along SIDES the walls are at whole numbers.
+    """
     size2 = (SIDES**2).sum(1)
     x, v = (np.asarray(a, np.longdouble) @ SIDES.T / size2 for a in (origins, directions))
-    # When each ray's line meets the walls of either pair; then all in order.
+    # The times at which each ray's line meets the walls of either pair; then all in order.
     walls = np.where(v > 0, 1, 0)[:, None] + np.sign(v)[:, None] * np.arange(count)[None, :, None]
     times = ((walls - x[:, None]) / v[:, None]).reshape(len(x), -1)
     order = np.argsort(times, axis=1)[:, :count]
@@ -136,7 +139,7 @@ def unfold(origins: Array, directions: Array, count: int) -> Retraced:
     folded = np.abs((straight + 1) % 2 - 1)
     flips = np.stack([np.cumsum(axis == i, axis=1) % 2 for i in (0, 1)], 2)
     legs = np.concatenate([v[:, None], v[:, None] * (1 - 2 * flips)], 1) @ SIDES
-    # Walls by id: 0 and 2 along the first side, 1 and 3 along the second; whole numbers fold to 0 and 1.
+    # Ids of walls: 0 and 2 along the first side, 1 and 3 along the second; whole numbers fold to 0 and 1.
     hits = np.where(axis == 1, np.where(wall % 2 == 0, 0, 2), np.where(wall % 2 == 0, 3, 1)).astype(np.int32)
     outward = SIDES[axis] / np.sqrt(size2)[axis][..., None] * np.where(wall % 2 == 0, 1, -1)[..., None]
     events = np.full((len(x), count + 1), Event.REFLECTED, np.uint8)
@@ -156,7 +159,7 @@ def unfold(origins: Array, directions: Array, count: int) -> Retraced:
 
 
 def _case(curve: Curve, index: float, origins: Array, directions: Array, depth: int, reflect: int = 0) -> Case:
-    """Rays to follow through a body of an index in air."""
+    """Return rays to trace through a body of an index in air."""
     return Case("", curve.between(index, 1.0), origins, directions, depth, np.full(len(origins), reflect))
 
 
@@ -169,33 +172,39 @@ def _unit_at(angle: Array) -> Array:
 
 
 def ellipse_lens(rays: int) -> Closed:
-    """Index 3/2, focal length 9, aperture 3."""
+    """Return an elliptic lens of index 3/2, focal length 9 and aperture 3, with rays along its axis."""
     curve = shapes.ellipse_lens(INDEX, FOCAL_LENGTH, thickness=4.0, radius=3.0)
     height = 2.9 * np.linspace(-1, 1, 2 * (rays // 2))
     return Closed(_case(curve, INDEX, *_along_x(height), depth=2), reach=FOCAL_LENGTH)
 
 
 def ball(rays: int) -> Closed:
-    """Radius 1, from the point 1/n left of the centre to the right; the virtual image is n left of it."""
-    turn = np.deg2rad(np.linspace(-50, 50, 2 * (rays // 2)))
-    origins = np.tile([-1 / INDEX, 0.0], (len(turn), 1))
-    case = _case(shapes.circle(1.0), INDEX, origins, _unit_at(turn), depth=1)
+    """Return an aplanatic ball of radius 1 with rays to the right from a point 1/n left of its centre.
+
+    The virtual image is n left of the centre.
+    """
+    angle = np.deg2rad(np.linspace(-50, 50, 2 * (rays // 2)))
+    origins = np.tile([-1 / INDEX, 0.0], (len(angle), 1))
+    case = _case(shapes.circle(1.0), INDEX, origins, _unit_at(angle), depth=1)
     return Closed(case, point=(-INDEX, 0.0), reach=1 + INDEX)
 
 
 def rainbow(rays: int) -> Closed:
-    """A drop of index 4/3, its rays reflected once within."""
+    """Return a drop of index 4/3 with rays that are reflected once inside."""
     n, b = 4 / 3, 0.98 * np.linspace(-1, 1, 2 * (rays // 2))
     case = _case(shapes.circle(1.0), n, *_along_x(b), depth=3, reflect=2)
     return Closed(case, _unit_at(-closed.deflection(np.arcsin(b.astype(np.longdouble)), n, 1)))
 
 
 def prism(rays: int) -> Closed:
-    """Apex 60°, from 32° of incidence (nearly total reflection within) to 85°; the least deviation is at 48.6°."""
+    """Return a prism of apex 60° with incidence from 32° (nearly total reflection inside) to 85°.
+
+    The minimum of deviation is at 48.6°.
+    """
     curve, apex = shapes.prism(60.0, 2.0), closed.HALF_TURN / 3
     i = np.deg2rad(np.linspace(32, 85, rays)).astype(np.longdouble)
     directions = _unit_at(i - apex / 2).astype(float)
-    # Through a place on the left side, high enough that all leave by the right one.
+    # Through a point on the left side, high enough that all rays leave through the right side.
     origins = 0.75 * curve.vertices[2] + 0.25 * curve.vertices[0] - directions
     exact = _unit_at(i - apex / 2 - closed.deviation(i, apex, INDEX))
     return Closed(_case(curve, INDEX, origins, directions, depth=2), exact)

@@ -1,7 +1,7 @@
-"""How far rounding errors move a path, and the rays for which rounding decides what they meet.
+"""Bounds on the rounding errors of a path, and the rays for which rounding decides which boundary they meet.
 
-Let a ray be displaced by h across itself (to its left) and turned by φ. Behind a boundary, and L farther on, it is
-displaced and turned by
+Let a ray be displaced by h across itself (to its left) and rotated by φ. Behind a boundary, and L farther on, it is
+displaced and rotated by
 
     h' = h d'_n/d_n + L φ',    φ' = g φ − (1 − g) κ h/d_n,    g = n d_n/(n' d'_n)
 
@@ -10,9 +10,9 @@ for a reflection. Each boundary adds, in units of ROUNDINGS · u,
 
     to h: S (1 + |d'_n/d_n| + |d × d'|/|d_n|)          to φ: 1 + |g| + 1/|d'_n| + |1 − g| S/ℓ
 
-S is the largest coordinate so far, of the path and of the segments it met: coordinates are rounded to u S. So are the
-ends of a segment of length ℓ, which turns it by S/ℓ. 1/|d'_n| comes from a cosine computed as √(1 − X²). The sum of the
-magnitudes is a bound as long as the path meets the right boundaries.
+S is the largest coordinate so far, of the path and of the segments on it: coordinates have rounding errors of u S. The
+rounded ends of a segment of length ℓ rotate it by S/ℓ. 1/|d'_n| comes from a cosine computed as √(1 − X²). The sum of
+the magnitudes is a bound as long as the path meets the right boundaries.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ ROUNDINGS = 2  # of the operands, and of the result
 
 
 def growth(path: Retraced, segments: Segments, offset: float = 0.0) -> tuple[Array, Array]:
-    """Bounds of the errors of points and of the legs' directions (N × (D+1) each), over u; NaN after the end.
+    """Return bounds on the errors of points and of the legs' directions in units of u, N × (D+1); NaN after the end.
 
-    `offset`: how far rays are moved along the normal behind a boundary, over u (1 + max |p|).
+    `offset`: the shift of rays along the normal behind a boundary, in units of u (1 + max |p|).
     """
     g, h_factor, phi_factor = (x.astype(float) for x in transfer(path))
     unit, size = float(ROUNDINGS), _sizes(path, segments)
@@ -43,32 +43,32 @@ def growth(path: Retraced, segments: Segments, offset: float = 0.0) -> tuple[Arr
     leg = np.hypot(*np.diff(path.points, axis=1).transpose(2, 0, 1)).astype(float)
     points, directions = np.full((2, *path.points.shape[:2]), np.nan)
     points[:, 0], directions[:, 0] = unit * size[:, 0], unit
-    none = np.zeros(len(points))
-    # One column per rounding so far: what it has become.
-    h, phi = np.stack([points[:, 0], none], 1), np.stack([none, directions[:, 0]], 1)
-    for j, met in enumerate((path.hits >= 0).T):
-        if not met.any():
+    zero = np.zeros(len(points))
+    # One column per rounding so far: its propagated effect.
+    h, phi = np.stack([points[:, 0], zero], 1), np.stack([zero, directions[:, 0]], 1)
+    for j, has_hit in enumerate((path.hits >= 0).T):
+        if not has_hit.any():
             break
         h = h + leg[:, j, None] * phi
         reach = (np.abs(h).sum(1) + unit * size[:, j + 1] * (1 + cos[:, j])) / cos[:, j]
-        points[:, j + 1] = np.where(met, reach, np.nan)
+        points[:, j + 1] = np.where(has_hit, reach, np.nan)
         phi = g[:, j, None] * phi + phi_factor[:, j, None] * h
-        h = np.column_stack([h_factor[:, j, None] * h, added_h[:, j], none])
-        phi = np.column_stack([phi, none, unit * added_phi[:, j]])
-        directions[:, j + 1] = np.where(met, np.abs(phi).sum(1), np.nan)
+        h = np.column_stack([h_factor[:, j, None] * h, added_h[:, j], zero])
+        phi = np.column_stack([phi, zero, unit * added_phi[:, j]])
+        directions[:, j + 1] = np.where(has_hit, np.abs(phi).sum(1), np.nan)
     return points, directions
 
 
 def transfer(path: Retraced) -> tuple[Array, Array, Array]:
-    """g, and what h and φ take from h (N × D each)."""
+    """Return g, and the factors with which h enters h' and φ' (N × D each)."""
     before, behind = ((legs * path.normals).sum(2) for legs in (path.legs[:, :-1], path.legs[:, 1:]))
-    # A ray that ends where it is contradicted goes on as it came.
+    # A ray that ends at a medium mismatch counts as unchanged there.
     g = np.nan_to_num(path.indices[:, :-1] * before / (path.indices[:, 1:] * behind), nan=1)
     return g, behind / before, (g - 1) * path.curvatures / before
 
 
 def _sizes(path: Retraced, segments: Segments) -> Array:
-    """The largest coordinate so far, N × (D+1); of the path and of the segments it met."""
+    """Return the largest coordinate so far, N × (D+1), of the path and of the segments on it."""
     largest = np.max([np.abs(x).max(1) for x in (segments.start, segments.end, segments.control)], axis=0)
     own = np.abs(path.points).max(2)
     own[:, 1:] = np.maximum(own[:, 1:], np.where(path.hits >= 0, largest[path.hits], np.nan))
@@ -76,10 +76,10 @@ def _sizes(path: Retraced, segments: Segments) -> Array:
 
 
 def undecided(exact: Retraced, paths: Paths, segments: Segments, points: Array, directions: Array) -> Array:
-    """Which rays (N) may take a wrong path, by the bounds of the errors of their points and directions.
+    """Return which rays (N) may take a wrong path, from the error bounds of their points and directions.
 
-    At a vertex, where they touch a curve, and at the critical angle. A ray meets a curve between h and −h from its top
-    where its cosine is less than √(2 |κ| h); by φ off, it is refracted or not where |1 − k² sin²θ| is less than 2 k φ.
+    These are rays at a vertex, rays that touch a curve, and rays at the critical angle. A ray within h of a curve's top
+    has a cosine below √(2 |κ| h); an error of φ changes the decision on refraction if |1 − k² sin²θ| is below 2 k φ.
     """
     h, kappa = points[:, 1:], np.abs(exact.curvatures)
     cos = (exact.legs[:, :-1] * exact.normals).sum(2)
@@ -91,18 +91,18 @@ def undecided(exact: Retraced, paths: Paths, segments: Segments, points: Array, 
         at = np.where(exact.hits >= 0, clearance, np.nan) <= h
         at |= cos**2 <= 2 * kappa * h
         at |= np.abs(1 - (k * sine) ** 2) <= 2 * k * (directions[:, :-1] + kappa * h)
-    # Where a path first meets another boundary than it should, and only just.
-    other = paths.hits != exact.hits
-    rays = np.flatnonzero(other.any(1))
-    first = other[rays].argmax(1)
-    met = paths.hits[rays, first] >= 0
-    rays, first = rays[met], first[met]
-    place, d = paths.points[rays, first + 1], exact.legs[rays, first]
-    way = place - exact.points[rays, first]
-    normal, curvature = Curves(segments).normal(place.astype(np.longdouble), paths.hits[rays, first])
-    near = points[rays, first] + np.hypot(*way.T) * directions[rays, first]
+    # Paths whose first wrong boundary is a curve that they only touch.
+    differs = paths.hits != exact.hits
+    rays = np.flatnonzero(differs.any(1))
+    first = differs[rays].argmax(1)
+    has_hit = paths.hits[rays, first] >= 0
+    rays, first = rays[has_hit], first[has_hit]
+    point, d = paths.points[rays, first + 1], exact.legs[rays, first]
+    leg = point - exact.points[rays, first]
+    normal, curvature = Curves(segments).normal(point.astype(np.longdouble), paths.hits[rays, first])
+    near = points[rays, first] + np.hypot(*leg.T) * directions[rays, first]
     touching = np.zeros(len(paths.hits), bool)
-    touching[rays] = ((d * normal).sum(1) ** 2 <= 2 * np.abs(curvature) * near) & (np.abs(_cross(d, way)) <= near)
+    touching[rays] = ((d * normal).sum(1) ** 2 <= 2 * np.abs(curvature) * near) & (np.abs(_cross(d, leg)) <= near)
     return at.any(1) | touching
 
 

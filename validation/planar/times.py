@@ -1,10 +1,10 @@
 """Planar, times: paths through the lens of document 004, against the number of segments.
 
-Parallel rays cross two boundaries each; beyond a thousand segments there are more lenses, and each ray goes through one
-of them. The time of a path is that of `Tracer.__call__`, from arrays of rays to arrays of points, per ray. Methods and
-sizes run in turn; medians over the rounds are reported, with 95 % intervals. Times depend on the machine, so they have
-goals and no budgets; that both methods return the same bits is a budget. If the cost grows like log M, each doubling of
-the number of segments M adds the same: this is fitted by a line through the cost against log₂ M.
+Parallel rays cross two boundaries each; beyond a thousand segments there are more lenses, and each ray crosses one of
+them. The time of a path is the time of `Tracer.__call__`, from arrays of rays to arrays of points, per ray. Methods and
+sizes run in turn; the rows have medians over the rounds, with 95 % intervals. Times depend on the machine, so they have
+goals instead of budgets; equal bits of both methods are a budget. If the cost grows like log M, each doubling of the
+number of segments M adds the same time: a line is fitted through the cost against log₂ M.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from .against_retrace import by_setting
 PER_PATH = "µs per path"
 TERMS = {
     PER_PATH: "median time of a path of two boundaries; low, high: its 95 % interval",
-    "ms to compile": "time of the first call less that of a later one; 0 where the kernel was in the cache",
-    "ms to set up": "once for the segments: tables, and the mesh",
+    "ms to compile": "time of the first call minus that of a later one; 0 if the kernel was in the cache",
+    "ms to set up": "time to build the tables and the mesh, once per set of segments",
     "differing": "paths that differ between the two methods in any bit",
     "per doubling": "time that twice as many segments add, over the time at a thousand; from a thousand on",
-    "most over a thousand": "time per path with the most segments over that with a thousand",
+    "most over a thousand": "time per path with the most segments, over the time with a thousand",
     "shuffled": "rays in random order; otherwise lens by lens, from one side of each to the other",
     "M": "number of segments; the original program has 1172",
 }
@@ -48,13 +48,13 @@ SIZES = (10, 100, 1000, 10_000, 100_000, 1_000_000)
 BRUTE_SIZES = (0, 10, 100, 1000)
 ROUNDS = {"quick": 6, "standard": 7, "full": 21}
 MESH, SHUFFLED, BRUTE = "mesh", "mesh, shuffled", "brute"
-# The method, whether rays are shuffled, and how many times fewer of them there are.
+# The method, whether rays are shuffled, and the divisor of their number.
 METHODS = {MESH: (MESH, False, 1), SHUFFLED: (MESH, True, 16), BRUTE: (BRUTE, False, 64)}
 BOUNDARIES = 2
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per backend and precision."""
+    """Return one task per backend and precision."""
     return by_setting(context, NAME, "planar, times", "every size", _setting_rows, timed=True)
 
 
@@ -65,14 +65,14 @@ def _setting_rows(context: Context, setting: Setting) -> list[Row]:
 
 @dataclass(frozen=True)
 class Field:
-    """`side`² copies of the lens; their middles are whole multiples of `pitch` (2,)."""
+    """A grid of `side`² copies of the lens; their centres are whole multiples of `pitch` (2,)."""
 
     segments: Segments
     side: int
     pitch: Array
 
     def beam(self, count: int, shuffled: bool) -> tuple[Array, Array]:
-        """Rays along the axis of any of the lenses, all over the aperture in which they meet two boundaries of it."""
+        """Return rays along the axes of random lenses, over the aperture in which rays cross two boundaries."""
         rng = np.random.default_rng(SEED)
         lens = np.sort(rng.integers(0, self.side**2, count))
         x = rng.uniform(-6, 6, count)
@@ -83,7 +83,7 @@ class Field:
 
 @functools.cache
 def field(size: int) -> Field:
-    """About `size` segments, on lenses of a thousand; 0: the one lens, of as many chords as the original."""
+    """Return about `size` segments, on lenses of a thousand; 0: one lens with as many chords as the original."""
     side = max(1, round(math.sqrt(size / 1000)))
     lens = shapes.lens((0.04, -0.04), 16.4, conic=(1.9, 1.9), vertex=-8.2).mapped(affine(90, (1, 4)))
     curve = lens.faceted(size // side**2 if size else ORIGINAL)
@@ -95,7 +95,7 @@ def field(size: int) -> Field:
 
 
 def measure(context: Context, setting: Setting, sizes: tuple[int, ...]) -> list[Row]:
-    """A row per method and size, and the curves."""
+    """Return a row per method and size, and a row of the curves."""
     count = context.profile.scalar_rays if setting.is_scalar else context.profile.streamed_rays // 4
     pairs = [(m, s) for s in (0, *sizes) for m in METHODS if m != BRUTE or s in BRUTE_SIZES]
     tracers = functools.cache(functools.partial(_tracer, setting))
@@ -118,42 +118,42 @@ def _row(setting: Setting, run: Run, brute: Run | None) -> Row:
 
 
 def _tracer(setting: Setting, method: str, size: int) -> tuple[Tracer, float]:
-    """The tracer, and the seconds that it took."""
+    """Return a tracer, and the seconds to build it."""
     segments, precision, start = field(size).segments, np.dtype(setting.precision).name, time.perf_counter()
     tracer = Tracer(segments, precision=precision, backend=setting.backend, method=method)
     return tracer, time.perf_counter() - start
 
 
 class Run:
-    """A tracer called once; `values`: its setup time, and later measurements."""
+    """A tracer that was called once; `values`: its setup time, and later measurements."""
 
     def __init__(self, tracers: Callable[[str, int], tuple[Tracer, float]], method: str, size: int, count: int) -> None:
-        """`tracers(method, size)` is a tracer with the seconds that it took; `count` rays, fewer for slow methods."""
-        kind, shuffled, fewer = METHODS[method]
+        """`tracers(method, size)` returns a tracer and the seconds to build it. `count`: rays of fast methods."""
+        kind, shuffled, divisor = METHODS[method]
         self.method, self.size = method, size
-        self.rays = field(size).beam(max(count // fewer, 1), shuffled)
+        self.rays = field(size).beam(max(count // divisor, 1), shuffled)
         self.tracer, seconds = tracers(kind, size)
         self.values = {"ms to set up": seconds * 1e3}
         self.first = self.clock()
 
     def take(self, seconds: list[float]) -> None:
-        """The times of later calls."""
+        """Set `values` from the times of later calls."""
         self.values = kernel_timing.interval(PER_PATH, [t / len(self.rays[0]) * 1e6 for t in seconds]) | self.values
         self.values["ms to compile"] = 1e3 * max(0.0, self.first - float(np.median(seconds)))
 
     def paths(self) -> Paths:
-        """All of its rays, traced."""
+        """Trace all rays."""
         return self.tracer(*self.rays, BOUNDARIES)
 
     def clock(self) -> float:
-        """Seconds to trace them."""
+        """Return the seconds to trace all rays."""
         start = time.perf_counter()
         self.paths()
         return time.perf_counter() - start
 
 
 def differing(some: Paths, others: Paths) -> int:
-    """Rays of which a point, a direction, a hit or an event is not the same to the bit."""
+    """Return the number of rays with a point, a direction, a hit or an event that differs in any bit."""
     same = np.ones(len(some.hits), bool)
     for name in ("points", "directions", "hits", "events"):
         x, y = (np.ascontiguousarray(getattr(paths, name)) for paths in (some, others))
@@ -163,7 +163,7 @@ def differing(some: Paths, others: Paths) -> int:
 
 
 def _growth_row(setting: Setting, runs: list[Run]) -> Row:
-    """µs per path against the number of segments, method by method."""
+    """Return the row of µs per path against the number of segments, by method."""
     curves = {
         method: [(float(run.size), run.values[PER_PATH]) for run in runs if run.method == method and run.size]
         for method in METHODS

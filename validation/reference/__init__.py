@@ -1,6 +1,6 @@
-"""Answers that share no code with the package: closed forms, slower arithmetic, printed traces.
+"""Reference answers that share no code with the package: closed forms, slower arithmetic, printed traces.
 
-In: rays, scenes or parameters. Out: directions, paths and powers to compare with.
+In: rays, scenes or parameters. Out: directions, paths and powers for comparison.
 """
 
 __all__ = [

@@ -1,15 +1,15 @@
-"""How much light a lamp on the axis of a convex body of glass sends through it, to a disk below on the same axis.
+"""The power that a lamp on the axis of a convex body of glass sends through the body to a disk below, on the same axis.
 
-Everything is symmetric about the axis, so rays stay in a plane (x, z) through it. A ray meets the body once: there it
-splits into a reflected part, which goes on outside, and one within; wherever that meets the boundary, a part leaves and
-a part stays. What has left does not come back, as the body is convex. So the power through a disk of radius r is
+Everything is symmetric about the axis, so rays stay in a plane (x, z) through it. A ray that hits the body splits into
+a reflected part outside and a refracted part inside. At each further boundary one part leaves and one part stays
+inside. Light that has left does not come back, because the body is convex. So the power through a disk of radius r is
 
     Φ(r) = 2π I ∫ sin θ Σ_m w_m(θ) [|x_m(θ)| ≤ r] dθ          lamp at a point, intensity I = 1 W/sr
     Φ(r) = 2π E ∫ x Σ_m w_m(x) [|x_m(x)| ≤ r] dx              parallel light, irradiance E = 1 W/m²
 
-where w_m is the product of the powers at the m boundaries met and x_m the place where that part meets the floor. The
-integral is a sum over midpoints, off by less than a term at each of its jumps. Fresnel's powers are those of
-unpolarised light at every boundary, as renderers without polarisation have them, or followed for each wave.
+where w_m is the product of the powers at m boundaries and x_m is where this part hits the floor. The integral is a sum
+over midpoints, with an error of less than one term at each of its jumps. Fresnel's powers are those of unpolarised
+light at every boundary, as in renderers without polarisation, or tracked for either wave.
 """
 
 from __future__ import annotations
@@ -33,18 +33,16 @@ class Ball(NamedTuple):
     radius: float
 
     def span(self, p: Array, d: Array) -> tuple[Array, Array]:
-        """The distances between which rays from `p` along `d` (N × 2) are inside; from infinity where they miss."""
+        """Return the distances at which rays from `p` along `d` (N × 2) enter and leave; ∞ as entry without a hit."""
         q = p - [0, self.z]
-        along, root = -(q * d).sum(1), self.radius**2 - (q[:, 0] * d[:, 1] - q[:, 1] * d[:, 0]) ** 2
+        middle, root = -(q * d).sum(1), self.radius**2 - (q[:, 0] * d[:, 1] - q[:, 1] * d[:, 0]) ** 2
         half = np.sqrt(np.maximum(root, 0))
-        return np.where(root > 0, along - half, np.inf), along + half
+        return np.where(root > 0, middle - half, np.inf), middle + half
 
     def normal(self, p: Array) -> Array:
-        """Outward, of places on it."""
+        """Return the outward normals at points on the sphere."""
         q = p - [0, self.z]
-        return np.asarray(
-            q / np.hypot(*q.T)[:, None]
-        )  # over the radius its length, and that of directions, would drift
+        return np.asarray(q / np.hypot(*q.T)[:, None])  # q/radius would let the lengths of directions drift
 
 
 class Above(NamedTuple):
@@ -59,16 +57,16 @@ class Above(NamedTuple):
         return np.where(d[:, 1] > 0, t, -np.inf), np.where(d[:, 1] > 0, np.inf, t)
 
     def normal(self, p: Array) -> Array:
-        """Outward."""
+        """Return the outward normals."""
         return np.broadcast_to([0.0, -1.0], p.shape)
 
 
 @dataclass(frozen=True)
 class Setup:
-    """A body, the intersection of `parts`, of the index `eta` in air, over the floor z = 0.
+    """A body of index `eta` in air, the intersection of `parts`, above the floor z = 0.
 
-    `lamp`: the height of a point lamp; None: parallel light from above. `widest`: the angle from the axis, or for
-    parallel light the distance, beyond which no ray meets the body.
+    `lamp`: height of a point lamp; None: parallel light from above. `widest`: the angle from the axis, or for parallel
+    light the distance, beyond which no ray hits the body.
     """
 
     parts: tuple[Ball | Above, ...]
@@ -78,50 +76,51 @@ class Setup:
 
 
 class Part(NamedTuple):
-    """What leaves of N rays after so many boundaries: where it meets the floor (N), its share of the s and p waves."""
+    """The light of N rays that leaves after a number of boundaries: position on the floor, shares of the s, p waves."""
 
-    x: Array
+    x: Array  # N
     shares: Array  # 2 × N
 
 
 def flux(setup: Setup, radius: float, most: int = 2, steps: int = STEPS) -> tuple[float, float]:
-    """Φ of a disk of this radius, in W, of paths that meet up to `most` boundaries; and by how much it may be off.
+    """Return Φ of a disk of this radius in W, for paths of up to `most` boundaries, and a bound on its error.
 
-    That is the largest of the terms of each part, four times: for the two jumps that a part may have at either end.
+    The bound is four times the largest term of each part: a part may have two jumps at either end.
     """
     step = float(setup.widest) / steps
-    at = np.asarray(step * (np.arange(steps) + 0.5), np.float64)
-    ring = 2 * np.pi * step * (at if setup.lamp is None else np.sin(at))
-    terms = [(ring * shares.mean(0))[np.abs(x) <= radius] for x, shares in parts(setup, at, most)]
+    midpoints = np.asarray(step * (np.arange(steps) + 0.5), np.float64)
+    ring = 2 * np.pi * step * (midpoints if setup.lamp is None else np.sin(midpoints))
+    terms = [(ring * shares.mean(0))[np.abs(x) <= radius] for x, shares in parts(setup, midpoints, most)]
     return float(sum(x.sum() for x in terms)), float(sum(4 * x.max(initial=0) for x in terms))
 
 
 def parts(setup: Setup, at: Array, most: int, polarised: bool = False) -> Iterator[Part]:
-    """Rays at the angles or distances `at` (N): a `Part` after 1, 2, … `most` boundaries."""
-    none = np.zeros_like(at)
+    """Yield the `Part` after 1, 2, … `most` boundaries, of rays at the angles or distances `at` (N)."""
+    zero = np.zeros_like(at)
     if setup.lamp is None:
-        p, d = np.stack([at, none + 1e3], 1), np.stack([none, none - 1], 1)
+        p, d = np.stack([at, zero + 1e3], 1), np.stack([zero, zero - 1], 1)
     else:
-        p, d = np.stack([none, none + setup.lamp], 1), np.stack([np.sin(at), -np.cos(at)], 1)
+        p, d = np.stack([zero, zero + setup.lamp], 1), np.stack([np.sin(at), -np.cos(at)], 1)
     shares = np.ones((2, len(at)))
-    for met in range(1, most + 1):
+    for number in range(1, most + 1):
+        entering = number == 1
         starts, ends = np.array([part.span(p, d) for part in setup.parts]).swapaxes(0, 1)
-        way, which = (starts.max(0), starts.argmax(0)) if met == 1 else (ends.min(0), ends.argmin(0))
-        hit = np.isfinite(way) & ((starts.max(0) < ends.min(0)) | (met > 1))
-        p = p + np.where(hit, way, 0)[:, None] * d
+        distance, which = (starts.max(0), starts.argmax(0)) if entering else (ends.min(0), ends.argmin(0))
+        hit = np.isfinite(distance) & ((starts.max(0) < ends.min(0)) | (not entering))
+        p = p + np.where(hit, distance, 0)[:, None] * d
         normals = np.array([part.normal(p) for part in setup.parts])[which, np.arange(len(p))]
-        mirrored, refracted, powers = boundary(d, normals, 1 / setup.eta if met == 1 else setup.eta)
+        mirrored, refracted, powers = boundary(d, normals, 1 / setup.eta if entering else setup.eta)
         reflected = powers if polarised else np.broadcast_to(powers.mean(0), powers.shape)
-        away, inside = (mirrored, refracted) if met == 1 else (refracted, mirrored)
-        out, kept = (reflected, 1 - reflected) if met == 1 else (1 - reflected, reflected)
-        yield Part(_floor(p, away), np.where(hit, shares * out, 0))
-        shares, d = np.where(hit, shares * kept, 0), inside
+        leaving, inside = (mirrored, refracted) if entering else (refracted, mirrored)
+        out_share, in_share = (reflected, 1 - reflected) if entering else (1 - reflected, reflected)
+        yield Part(_floor(p, leaving), np.where(hit, shares * out_share, 0))
+        shares, d = np.where(hit, shares * in_share, 0), inside
 
 
 def boundary(d: Array, normal: Array, k: float) -> tuple[Array, Array, Array]:
-    """Mirrored and refracted directions (N × 2) and the reflected powers of the s and p waves (2 × N).
+    """Return reflected and refracted directions (N × 2) and the reflected powers of the s and p waves (2 × N).
 
-    k: index left over index entered. Where light is totally reflected the powers are 1 and the direction means nothing.
+    k: index before over index behind. For total reflection the powers are 1 and the refracted direction has no meaning.
     """
     c = (d * normal).sum(1, keepdims=True)
     inner = 1 - k * k * (1 - c * c)
@@ -132,7 +131,7 @@ def boundary(d: Array, normal: Array, k: float) -> tuple[Array, Array, Array]:
 
 
 def _floor(p: Array, d: Array) -> Array:
-    """Where rays meet z = 0; infinity where they go up."""
+    """Return where rays hit z = 0; infinity for rays that go up."""
     down = d[:, 1] < 0
     return np.where(down, p[:, 0] - d[:, 0] * p[:, 1] / np.where(down, d[:, 1], -1), np.inf)
 
@@ -141,29 +140,29 @@ def _floor(p: Array, d: Array) -> Array:
 
 POINT, SPOT, PARALLEL = "point", "spot", "directional"
 LENS_RADIUS, LENS_APERTURE = 1.0, 0.6
-TOP, BALL_HEIGHT, LENS_HEIGHT = 4.5, 2.5, 2.7  # of lamps, of the ball's centre and the flat side of the lens
+TOP, BALL_HEIGHT, LENS_HEIGHT = 4.5, 2.5, 2.7  # heights of lamps, of the ball's centre, of the lens's flat side
 _BALL = (Ball(BALL_HEIGHT, 1.0),)
 _LENS = (Ball(LENS_HEIGHT - math.sqrt(LENS_RADIUS**2 - LENS_APERTURE**2), LENS_RADIUS), Above(LENS_HEIGHT))
 _WIDEST = {"ball": math.asin(1 / (TOP - BALL_HEIGHT)), "lens": math.atan(LENS_APERTURE / (TOP - LENS_HEIGHT))}
-ON_AXIS = {  # by body and lamp: the quadrature's setup, and the radius of a disk in the shadow, around the caustic
+ON_AXIS = {  # by body and lamp: the setup of the quadrature, and the radius of a disk around the caustic, in the shadow
     **{("ball", lamp): (Setup(_BALL, TOP, _WIDEST["ball"]), 1.5) for lamp in (POINT, SPOT)},
     ("ball", PARALLEL): (Setup(_BALL, None, 1.0), 0.9),
     **{("lens", lamp): (Setup(_LENS, TOP, _WIDEST["lens"]), 1.2) for lamp in (POINT, SPOT)},
     ("lens", PARALLEL): (Setup(_LENS, None, LENS_APERTURE), 0.5),
 }
-REFLECTANCE = 0.02  # of the disk: light that comes back to it is 0.02 of what glass reflects of it
-_ELEVATION, FIELD = math.radians(30), 10.0  # of a camera that looks at the middle of the disk, in radians and degrees
+REFLECTANCE = 0.02  # of the disk: the glass returns little of the disk's own light to it
+_ELEVATION, FIELD = math.radians(30), 10.0  # of a camera that looks at the centre of the disk, in radians and degrees
 VIEWPOINT = 20 * np.array([0, math.sin(_ELEVATION), math.cos(_ELEVATION)])  # y is up
 
 
 def ball_profile(rings: int) -> Array:
-    """The ball from its top to its bottom: distance from the axis, height (rings + 1 × 2)."""
+    """Return the ball's profile from top to bottom: distance from the axis, height (rings + 1 × 2)."""
     angle = np.linspace(0, np.pi, rings + 1)
     return np.stack([np.sin(angle), BALL_HEIGHT + np.cos(angle)], 1)
 
 
 def lens_profile(rings: int, bottom: float = LENS_HEIGHT, scale: float = 1.0) -> Array:
-    """The plano-convex lens, flat below at `bottom`, as `ball_profile`; its size is multiplied by `scale`."""
+    """Return the profile of the plano-convex lens, as `ball_profile`: flat side at `bottom`, size times `scale`."""
     angle = np.linspace(0, math.asin(LENS_APERTURE / LENS_RADIUS), rings + 1)
     centre = bottom - scale * math.sqrt(LENS_RADIUS**2 - LENS_APERTURE**2)
     cap = np.stack([scale * LENS_RADIUS * np.sin(angle), centre + scale * LENS_RADIUS * np.cos(angle)], 1)
@@ -171,9 +170,9 @@ def lens_profile(rings: int, bottom: float = LENS_HEIGHT, scale: float = 1.0) ->
 
 
 def power_by_radiance(resolution: int) -> Array:
-    """Power on the disk over radiance, in m² sr, by pixel of a square image from VIEWPOINT.
+    """Return for each pixel of a square image from VIEWPOINT the power on the disk over its radiance, in m² sr.
 
-    A pixel is a square of side a at distance 1; rays through it, d = x + y + forward, meet the floor at t d, in an area
+    A pixel is a square of side a at distance 1; rays through it, d = x + y + forward, hit the floor at t d, in an area
     of a² t²/|d_y|.
     """
     half = math.tan(math.radians(FIELD / 2))

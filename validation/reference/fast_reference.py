@@ -1,12 +1,13 @@
-"""A second exact answer, a thousand times faster than the certified one; it finds the rays worth certifying.
+"""A second exact answer, a thousand times faster than the certified one, to find the rays worth certifying.
 
-Snell's law for the exact inputs in unevaluated sums of floats (`numerics.float_expansions`), for float32 and float64
-alike, by none of the arithmetic of the formulas it checks:
+It evaluates Snell's law for the exact inputs in unevaluated sums of floats (`numerics.float_expansions`), for float32
+and float64, without the arithmetic of the formulas that it checks:
 
-    b = k a + n (s √D − k c)/n²,   b = a − 2 c n/n² under total internal reflection
+    b = k a + n (s √D − k c)/n²,   b = a − 2 c n/n² for total internal reflection
     c = n·a,   D = c² − (k² − 1)|n×a|²,   s = sign(c)
 
-D is right to 2⁻¹⁴⁰ of its terms, so √D to 2⁻⁷⁰ of theirs at the critical angle itself; all else to 2⁻⁹⁰ k |a|.
+The error of D is 2⁻¹⁴⁰ of its terms, so that of √D is 2⁻⁷⁰ of their roots at the critical angle itself; all other
+errors are 2⁻⁹⁰ k |a|.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from mi_refract.formulas import Budget
 from mi_refract.numerics import float_expansions
 from mi_refract.regimes import Rays
 
-# The screen's own resolution. Below it, and where a component of float64 is denormal and decides, it has guessed.
+# The screen's resolution of the radicand. Below it, and if a denormal component of float64 decides, it is doubtful.
 RESOLUTION = 2.0**-140
 _UNDERFLOW = 2.0**-900
 
@@ -30,8 +31,8 @@ _UNDERFLOW = 2.0**-900
 class Screen:
     """The answers for `rays` as vectors of type `vector`, a Dr.Jit 3-vector of a vectorised backend.
 
-    `relative_radicand`: D/(c² + |κ||n×a|²), within a factor of 2 of the oracle's; `cos_i`: |n·a|/|n||a| and `cos_t`
-    to a few u of float64; `doubtful`: transmission was not resolved.
+    `relative_radicand`: D/(c² + |κ||n×a|²), within a factor of 2 of the oracle's. `cos_i`: |n·a|/|n||a|, and `cos_t`,
+    with errors of a few u of float64. `doubtful`: whether transmission is unresolved.
     """
 
     def __init__(self, rays: Rays, vector: Any) -> None:
@@ -40,7 +41,7 @@ class Screen:
         self._inputs = arrays(rays, vector)
         dr.eval(self._inputs)
         wide: Any = dr.float64_array_t(vector)
-        # Widened here: Dr.Jit's threads take denormal numbers for 0.
+        # Widened in numpy: Dr.Jit's threads flush denormal numbers to 0.
         a, n, k = (x.astype(np.float64) for x in (rays.a, rays.n, rays.k))
         self._a, wide_n, wide_k = arrays(Rays(a, n, k), wide)
         solved = _solve(self._a, wide_n, wide_k)
@@ -54,7 +55,7 @@ class Screen:
         self.doubtful = np.array(unresolved) | tiny & (c < _UNDERFLOW)
 
     def judge(self, subject: Subject) -> tuple[np.ndarray, np.ndarray]:
-        """(chord error in u, infinite where it is NaN; whether the decision differs) of every ray."""
+        """Return the chord error in u, infinite for NaN, and whether the decision differs, of every ray."""
         b, transmitted = subject(*self._inputs)
         error = dr.norm((type(self._a)(b) - self._high) - self._low) / dr.norm(self._a)
         error, wrong = dr.select(dr.isfinite(error), error, dr.inf), transmitted != self._transmitted
@@ -62,7 +63,7 @@ class Screen:
         return np.array(error) / self.roundoff, np.array(wrong)
 
     def bound(self, budget: Budget) -> np.ndarray:
-        """The bound of every ray's chord in u, as if it were unit to the last bit."""
+        """Return the bound on every ray's chord in u, as for exactly unit vectors."""
         k, transmitted = self.rays.k.astype(np.float64), np.array(self._transmitted)
         return np.asarray(budget.chord(self.roundoff, k, self.cos_t, transmitted, cos_i=self.cos_i) / self.roundoff)
 

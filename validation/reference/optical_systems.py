@@ -1,9 +1,9 @@
-"""Optical systems with closed answers: rays, the boundaries that they meet, and how far a path is from the answer.
+"""Optical systems with closed-form answers: rays, their boundaries, and the difference between a path and the answer.
 
-One description has three tracers: Snell's law in extended precision, where anything may be moved a little on the way;
-a formula that refracts at each boundary; and Mitsuba (`validation/ground_truth/bench.py`). Places and closed forms are
-in extended precision: they are geometry, not refraction. Lengths are in mm, of the order of 100; bodies are of BK7 in
-air unless stated otherwise. A system is turned by ASKEW for whatever traces it, so that no axis is special.
+Each system has three tracers: Snell's law in extended precision, which can perturb every value on the way; a formula
+that refracts at each boundary; and Mitsuba (`validation/ground_truth/bench.py`). Positions and closed forms are in
+extended precision: they are geometry, not refraction. Lengths are in mm, of the order of 100; bodies are of BK7 in air
+unless stated otherwise. Formulas and Mitsuba get a system rotated by ASKEW, so that no axis is special.
 
 Closed forms: `closed_forms`, and Born and Wolf, Principles of Optics, 4.2.3 (aplanatic points); Descartes, La
 Dioptrique, 1637 (ellipsoid).
@@ -26,57 +26,57 @@ from . import closed_forms
 Array = NDArray[Any]
 Refract = Callable[[Array, Array, Any], Array]  # (a, n, k) → b; a, n, b: N × 3, k = n_from/n_to
 Answers = dict[str, Array]  # by name, N × A × components; directions in radians
-Moved = Callable[[int, str, Any, Any], Any]  # number of the boundary, name of the value, value, its axis → value
+Moved = Callable[[int, str, Any, Any], Any]  # index of the boundary, name of the value, value, its axis → value
 
 RAYS = 32
 BK7 = np.longdouble(1.5168)  # a crown glass
 WATER = np.longdouble(1.333)
-SIDE, RADIUS, BUBBLE, THICKNESS = 60, 50.0, 5.0, 50  # of the prism's section, balls, the small ball, the slab
+SIDE, RADIUS, BUBBLE, THICKNESS = 60, 50.0, 5.0, 50  # sizes of the prism's section, balls, the small ball, the slab
 PRINT = File(__file__).with_name("double_gauss_codev.json")
-# What printing rounds to: see "digits" in the file.
+# Rounding of the printed numbers: see "digits" in the file.
 TANGENT, POSITION = 5e-7, 2.3e-6
 FIELDS = {0.0: 0.0, 0.176327: 10.0, 0.249328: 14.0}  # printed tangent: degrees
-NUDGE = 1e-8  # mm, radians, and share of an index
+NUDGE = 1e-8  # perturbation of a value: mm, radians, or share of an index
 
 
 # Vectors -------------------------------------------------------------------------------------------------------
 
 
 def dot(x: Array, y: Array) -> Array:
-    """Dot products of vectors (… × 3), as … × 1."""
+    """Return the dot product of vectors (… × 3), as … × 1."""
     return np.asarray((x * y).sum(-1, keepdims=True))
 
 
 def length(x: Array) -> Array:
-    """Lengths of vectors (… × 3), as … × 1."""
+    """Return the length of vectors (… × 3), as … × 1."""
     return np.sqrt(dot(x, x))
 
 
 def unit(x: Array) -> Array:
-    """Vectors (… × 3) of length 1."""
+    """Return vectors (… × 3), normalised."""
     return x / length(x)
 
 
 def vectors(*components: Any) -> Array:
-    """Three components of any shapes as (N, 3) in extended precision."""
+    """Return three components of any shapes as (N, 3) in extended precision."""
     return np.stack(np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, np.longdouble)) for x in components)), axis=-1)
 
 
 def degrees(first: float, last: float, count: int = RAYS) -> Array:
-    """`count` angles from `first` to `last`, in radians, in extended precision."""
+    """Return `count` angles from `first` to `last` degrees, in radians and extended precision."""
     return np.deg2rad(np.linspace(first, last, count).astype(np.longdouble))
 
 
 def snell(a: Array, n: Array, k: Any) -> Array:
-    """The law in extended precision, from its well-conditioned form. No total internal reflection: NaN there."""
+    """Return the refracted directions by the law's well-conditioned form; NaN for total internal reflection."""
     k = np.asarray(k, np.longdouble).reshape(-1, 1)
     c, w = dot(n, a), np.cross(n, a)
-    along = np.copysign(np.sqrt(c * c - (k - 1) * (k + 1) * dot(w, w)), c)
-    return np.asarray((k * np.cross(w, n) + along * n) / dot(n, n))
+    root = np.copysign(np.sqrt(c * c - (k - 1) * (k + 1) * dot(w, w)), c)
+    return np.asarray((k * np.cross(w, n) + root * n) / dot(n, n))
 
 
 def across(x: Array, way: int) -> Array:
-    """One of two unit vectors at right angles to each vector and to each other."""
+    """Return one of two unit vectors that are perpendicular to each vector and to each other."""
     smallest = np.eye(3, dtype=np.longdouble)[np.abs(x).argmin(axis=1)]
     aside = unit(np.cross(x, smallest))
     return np.cross(unit(x), aside) if way else aside
@@ -91,20 +91,20 @@ ASKEW = np.concatenate([_X, _Y, np.cross(_X, _Y)])
 
 @dataclass(frozen=True)
 class Plane:
-    """Through `point`, with a unit `normal` (1 × 3, or one for each ray)."""
+    """A plane through `point` with a unit `normal` (1 × 3, or one for each ray)."""
 
     point: Array
     normal: Array
     bend = 0.0
 
     def meet(self, p: Array, d: Array) -> tuple[Array, Array]:
-        """Where rays from `p` along `d` (N × 3) meet it, and the unit normals there."""
+        """Return where rays from `p` along `d` (N × 3) hit the plane, and the unit normals there."""
         return p + d * (dot(self.normal, self.point - p) / dot(self.normal, d)), np.broadcast_to(self.normal, p.shape)
 
 
 @dataclass(frozen=True)
 class Ball:
-    """An ellipsoid along the axes, or a sphere; `far`: met from within."""
+    """An ellipsoid along the axes, or a sphere; `far`: hit from inside."""
 
     centre: Array
     axes: Array
@@ -112,11 +112,11 @@ class Ball:
 
     @property
     def bend(self) -> float:
-        """The most that its normal turns a mm."""
+        """The largest rotation of the normal in radians per mm."""
         return float(self.axes.max() / self.axes.min() ** 2)
 
     def meet(self, p: Array, d: Array) -> tuple[Array, Array]:
-        """Where rays from `p` along `d` (N × 3) meet it, and the unit normals there; NaN where they miss."""
+        """Return where rays from `p` along `d` (N × 3) hit it, and the unit normals there; NaN without a hit."""
         q, e = (p - self.centre) / self.axes, d / self.axes
         b, square = dot(q, e), dot(e, e)
         with np.errstate(invalid="ignore"):
@@ -127,9 +127,9 @@ class Ball:
 
 @dataclass(frozen=True)
 class Boundary:
-    """`k` = n_from/n_to, one for all rays or one for each; None: reflected. `size`: its extent from the origin, mm.
+    """A boundary. `k` = n_from/n_to, for all rays or for each; None: reflection. `size`: extent from the origin, mm.
 
-    Behind it, places count from `thickness` further along z.
+    Behind it, the origin of coordinates is `thickness` further along z.
     """
 
     surface: Plane | Ball
@@ -140,7 +140,7 @@ class Boundary:
 
 @dataclass(frozen=True)
 class Path:
-    """N rays at B boundaries: places, and unit directions behind each, B × N × 3."""
+    """N rays at B boundaries: their positions, and their unit directions behind each boundary, B × N × 3."""
 
     places: Array
     directions: Array
@@ -150,8 +150,8 @@ class Path:
 class System:
     """Rays (N × 3, extended precision) and the boundaries that they meet one after the other.
 
-    `off(path)`: by answer, what the path says less the closed form. `printed`: how far from the truth the other side of
-    that may itself be, by answer.
+    `off(path)`: the difference between path and closed form, by answer. `printed`: the rounding error of the closed
+    form's own numbers, by answer. `turn`: the rotation for formulas and Mitsuba.
     """
 
     origins: Array
@@ -164,9 +164,9 @@ class System:
     def walk(
         self, refract: Refract = snell, moved: Moved = lambda j, what, x, axis: x
     ) -> Iterator[tuple[Array, Array, Array, Array, Array]]:
-        """For each boundary: where the rays come from, place, normal, directions before and behind.
+        """Yield at each boundary: previous position, position, normal, directions before and behind.
 
-        `moved` may disturb the values "into", "normal", "index", "onward" and "place" of each boundary; −1: the start.
+        `moved` may perturb the values "into", "normal", "index", "onward" and "place" of each boundary; −1: the start.
         """
         b = moved(-1, "onward", self.directions, self.directions)
         p = moved(-1, "place", self.origins, b)
@@ -183,7 +183,7 @@ class System:
             p = p - vectors(0, 0, boundary.thickness)
 
     def steps(self) -> Generator[tuple[Array, Array, Array], Array, Path]:
-        """Yields a, n and k wherever a ray is refracted, is sent b, and returns the path."""
+        """Yield a, n and k at each refraction, receive b, and return the path."""
         p, b = self.origins, self.directions
         places, directions = [], []
         for boundary in self.boundaries:
@@ -195,25 +195,25 @@ class System:
         return Path(np.array(places), np.array(directions))
 
     def path(self, refract: Refract = snell, moved: Moved = lambda j, what, x, axis: x) -> Path:
-        """The path by Snell's law in extended precision, or by a formula, in the coordinates of the system."""
+        """Return the path by Snell's law in extended precision, or by a formula, in the system's coordinates."""
         steps = list(self.walk(refract, moved))
         return Path(np.array([p for _, p, _, _, _ in steps]), np.array([unit(b) for _, _, _, _, b in steps]))
 
     def errors(self, refract: Refract, moved: Moved = lambda j, what, x, axis: x) -> Array:
-        """N × m: all answers less those of the exact path, by a formula that gets them turned askew."""
+        """Return the errors of all answers (N × m) of a formula, which gets rotated vectors, against the exact path."""
 
-        def turned(a: Array, n: Array, k: Any) -> Array:
+        def rotated(a: Array, n: Array, k: Any) -> Array:
             return refract(a @ self.turn, n @ self.turn, k) @ self.turn.T
 
-        found, exact = (self.off(path) for path in (self.path(turned, moved), self.path()))
-        return np.concatenate([(found[name] - x).reshape(len(x), -1) for name, x in exact.items()], axis=1)
+        answers, exact = (self.off(path) for path in (self.path(rotated, moved), self.path()))
+        return np.concatenate([(answers[name] - x).reshape(len(x), -1) for name, x in exact.items()], axis=1)
 
     @functools.cached_property
     def condition(self) -> Array:
-        """(N,): by how many u the answer is off, if the first a and every n, k and b were off by u, to first order.
+        """The first-order error of the answer in u, (N,), if the first a and every n, k and b err by u.
 
-        The sum over all of them of the norm of the derivative, from differences of the exact path; a, n and b move at
-        right angles to themselves, for their length is not asked for.
+        It is the sum of the norms of all derivatives, from differences of the exact path. a, n and b are perturbed
+        perpendicular to themselves, because their lengths do not matter.
         """
         total = np.zeros(len(self.origins), np.longdouble)
         for j, boundary in enumerate(self.boundaries):
@@ -224,7 +224,7 @@ class System:
 
 
 def nudged(boundary: int, what: str, way: int) -> Moved:
-    """Moves one value by NUDGE: an index by a share, a vector across its axis (0, 1) or along it (2)."""
+    """Return a function that perturbs one value by NUDGE: an index relatively, a vector across (0, 1) or along (2)."""
 
     def moved(j: int, name: str, x: Any, axis: Any) -> Any:
         if (j, name) != (boundary, what):
@@ -242,7 +242,7 @@ def _direction(after: Array) -> Callable[[Path], Answers]:
 
 
 def slab(last: float = 89) -> System:
-    """A plane-parallel plate: moved aside by its thickness times sin(i − r)/cos r, the direction restored; 1 … 89°."""
+    """A plane-parallel plate: it shifts rays by its thickness × sin(i − r)/cos r and keeps directions; 1 … 89°."""
     inward, i = vectors(0, 0, 1), degrees(1, last)
     a = vectors(np.sin(i), 0, np.cos(i))
     shift = THICKNESS * closed_forms.lateral_shift(i, BK7)[:, None] * unit(inward - dot(inward, a) * a)
@@ -257,7 +257,7 @@ def slab(last: float = 89) -> System:
 
 
 def round_trip() -> System:
-    """Into a denser medium and out of it through a parallel face: the direction is restored.
+    """Into a denser medium and out of it through a parallel face: the final direction is the first.
 
     Rays at 1 … 89.9°, each with its own index between 1.0001 and 4.
     """
@@ -269,7 +269,7 @@ def round_trip() -> System:
 
 
 def prism(apex: Any, i: Array, down: Any = 0.4, index: Any = BK7) -> System:
-    """A prism deviates by i + asin(n sin(A − r)) − A. Rays come onto its left side, the share `down` from the apex."""
+    """A prism, which deviates by i + asin(n sin(A − r)) − A; rays hit its left side at the share `down`."""
     half = apex / 2
     height, angle = SIDE * np.cos(half), i - half
     top = vectors(0, 2 * height / 3, 0)
@@ -281,7 +281,7 @@ def prism(apex: Any, i: Array, down: Any = 0.4, index: Any = BK7) -> System:
 
 
 def least_deviated() -> System:
-    """Prisms of 10 … 80° at their least deviation, 2 asin(n sin(A/2)) − A."""
+    """Prisms of 10 … 80° at minimum deviation, 2 asin(n sin(A/2)) − A."""
     apex = 2 * degrees(5, 40)
     return prism(apex, closed_forms.least_deviated(apex, BK7))
 
@@ -295,15 +295,15 @@ def ball(far: bool = False) -> Ball:
 
 
 def _miss(path: Path, focus: Array) -> Answers:
-    """How far the last line misses a point."""
+    """Return the vector from the last line to a point."""
     to, b = focus - path.places[-1], path.directions[-1]
     return {"miss": (to - dot(to, b) * b)[:, None]}
 
 
 def aplanatic() -> System:
-    """A ball of radius R: rays that aim at n R behind its centre all meet R/n behind it."""
+    """A ball of radius R: all rays aimed at the point n R behind its centre meet at R/n behind it."""
     angle, around = degrees(100, 179), degrees(0, 3000)
-    towards = angle - closed_forms.refracted(angle, BK7)  # the angle at the centre; the sines are as R to R/n
+    towards = angle - closed_forms.refracted(angle, BK7)  # the angle at the centre; the ratio of the sines is n
     radius = np.sin(towards)
     p = RADIUS * vectors(radius * np.cos(around), radius * np.sin(around), np.cos(towards))
     a = unit(RADIUS * vectors(0, 0, BK7) - p)
@@ -312,7 +312,7 @@ def aplanatic() -> System:
 
 
 def weierstrass() -> System:
-    """A ball's aplanatic points: rays from R/n within it leave as if from n R, all of them; 91 … 179° to the axis."""
+    """A ball's aplanatic points: all rays from R/n inside leave as if from n R; 91 … 179° to the axis."""
     angle, around = degrees(91, 179), degrees(0, 3000)
     towards = angle - closed_forms.refracted(angle, BK7)
     radius = np.sin(towards)
@@ -323,9 +323,9 @@ def weierstrass() -> System:
 
 
 def ellipsoid(last: float = 89) -> System:
-    """An ellipsoid of eccentricity 1/n, and a sphere around its far focus: rays along the axis all meet there.
+    """An ellipsoid of eccentricity 1/n, and a sphere around its far focus, where all rays along the axis meet.
 
-    To 89° of eccentric anomaly.
+    Up to 89° of eccentric anomaly.
     """
     e, anomaly, around = 1 / BK7, degrees(1, last), degrees(0, 3000)
     minor = np.sqrt((1 - e) * (1 + e))
@@ -335,12 +335,12 @@ def ellipsoid(last: float = 89) -> System:
         Boundary(Ball(vectors(0, 0, 0), axes), 1 / BK7, RADIUS),
         Boundary(Ball(focus, BUBBLE * vectors(1, 1, 1)), BK7, RADIUS),
     )
-    along = np.broadcast_to(vectors(0, 0, 1), place.shape)
-    return System(place - 40 * along, along, boundaries, lambda path: _miss(path, focus))
+    a = np.broadcast_to(vectors(0, 0, 1), place.shape)
+    return System(place - 40 * a, a, boundaries, lambda path: _miss(path, focus))
 
 
 def drop(order: int, i: Array, index: Any = WATER) -> System:
-    """A drop with `order` reflections inside, rays at incidences `i`: deflected by mπ + 2i − 2(m + 1) r."""
+    """A drop with `order` inner reflections and rays at incidences `i`, deflected by mπ + 2i − 2(m + 1) r."""
     a, p, d = vectors(0 * i, 0, 1), RADIUS * vectors(np.sin(i), 0, -np.cos(i)), closed_forms.deflection(i, index, order)
     surfaces = [(ball(), 1 / index), *[(ball(far=True), None)] * order, (ball(far=True), index)]
     boundaries = tuple(Boundary(surface, k, RADIUS) for surface, k in surfaces)
@@ -348,7 +348,7 @@ def drop(order: int, i: Array, index: Any = WATER) -> System:
 
 
 def rainbow(order: int) -> System:
-    """The rainbow of a drop of water: rays at the stationary angle, D = mπ + 2i − 2(m + 1) r, from red to violet."""
+    """The rainbow of a drop of water: rays at the stationary D = mπ + 2i − 2(m + 1) r, from red to violet."""
     index = np.linspace(1.331, 1.344, RAYS).astype(np.longdouble)
     return drop(order, closed_forms.rainbow_incidence(index, order), index)
 
@@ -358,13 +358,13 @@ def rainbow(order: int) -> System:
 
 @functools.cache
 def double_gauss_data() -> dict[str, Any]:
-    """A double Gauss and nine rays through it, as CODE V prints them; lengths in mm."""
+    """Return a double Gauss and nine rays through it, as CODE V prints them; lengths in mm."""
     data: dict[str, Any] = json.loads(PRINT.read_text())
     return data
 
 
 def double_gauss(prescription: Any = None) -> System:
-    """CODE V's double Gauss: places and tangents of nine rays at its eleven surfaces, as it prints them.
+    """CODE V's double Gauss: the printed positions and tangents of nine rays at its eleven surfaces.
 
     The vertex of each surface is an origin.
     """
@@ -391,13 +391,13 @@ def double_gauss(prescription: Any = None) -> System:
 
 
 def off_print(refract: Refract, prescription: Any = None) -> float:
-    """The largest deviation from the print, over what printing rounds to: 1 is within the print."""
+    """Return the largest deviation from the printed numbers, divided by their rounding: up to 1 they agree."""
     system = double_gauss(prescription)
     off = system.off(system.path(refract))
     return float(max(np.abs(off["place"]).max() / POSITION, np.abs(off["tangent"]).max() / TANGENT))
 
 
-# For formulas; Mitsuba has some others.
+# The systems for formulas; Mitsuba has some others.
 SYSTEMS: dict[str, Callable[[], System]] = {
     "slab": functools.cache(slab),
     "round trip": functools.cache(round_trip),

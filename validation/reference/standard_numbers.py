@@ -1,33 +1,33 @@
-"""Standard numbers of refraction: published or closed-form values that any renderer can be checked against.
+"""Standard numbers of refraction: published or closed-form values to check any renderer against.
 
-`NUMBERS` is the table, by name. A `StandardNumber` has a law that is evaluated here, in extended precision, by nothing
-of the package; the digits that a source prints, where one in hand does; what is given and what is fitted. `rows()` is
-the same as plain data, one dictionary a number, all of them with the keys
+`NUMBERS` is the table, by name. A `StandardNumber` has a law that is evaluated here in extended precision, without code
+of the package; the digits that a source prints, if an available source prints any; the given and the fitted parameters.
+`rows()` returns the same as plain data, one dictionary per number, with the keys
 
 | key | content |
 |---|---|
-| `name`, `kind`, `unit` | unique name; what is asked, a key of `KINDS`; "°", "mm" or "" |
+| `name`, `kind`, `unit` | unique name; the quantity, a key of `KINDS`; "°", "mm" or "" |
 | `value` | float64, rounded once |
-| `printed`, `printed_value`, `printed_half_unit` | as its source has it; as a number; half of its last digit |
-| `given` | name → number: all that the law needs; angles in degrees, wavelengths in nm |
-| `law`, `source`, `fitted` | formula; where law and digits are from; what was fitted to what, "" where all is given |
+| `printed`, `printed_value`, `printed_half_unit` | the source's digits; their number; half a unit of the last digit |
+| `given` | name → number: all parameters of the law; angles in degrees, wavelengths in nm |
+| `law`, `source`, `fitted` | formula; source of the law and the digits; what was fitted to what, "" for nothing |
 | `off_print` | value − printed_value |
 
-where nothing is printed "" or null; all of it is as `json.dumps` takes it.
+For numbers that no source prints, the values are "" or null. All values can be passed to `json.dumps`.
 
-**Slabs.** Light is unpolarised when it arrives. What a boundary passes is polarised, so the transmittance is the mean
-of those of both polarisations. A renderer without polarisation takes the mean at each boundary; that is another number,
-and the same at normal incidence only.
+**Slabs.** Incident light is unpolarised. Light behind a boundary is polarised, so the transmittance is the mean over
+both polarisations. A renderer without polarisation takes the mean at each boundary: another number, which is the same
+at normal incidence only.
 
-**CIE 171:2006, 5.5 and 5.10, clear glass of 6 mm.** As it is quoted, the report defines the directional transmittance
-by the polynomial of Tregenza and Sharples' algorithm 2.34; the values are `CIE_POLYNOMIAL`'s. They were fitted: they
-rise from 0° to 20°, as no plane slab's do. So the index 1.52 is given (Radiance's for window glass), the absorption of
-the glass is fitted here, by least squares to the nine printed values, and `off_print` says by how much each is missed:
-by 0.0021 or less. A renderer is compared with `value`.
+**CIE 171:2006, 5.5 and 5.10, clear glass of 6 mm.** As quoted, the report defines the directional transmittance by the
+polynomial of Tregenza and Sharples' algorithm 2.34; the values are those of `CIE_POLYNOMIAL`. The polynomial is a fit:
+its values rise from 0° to 20°, unlike those of any plane slab. So the index 1.52 is given (Radiance's for window
+glass), the absorption of the glass is fitted here to the nine printed values by least squares, and `off_print` has the
+residual of each: at most 0.0021. A renderer is compared with `value`.
 
-Left out, for want of a source or of a derivation: the illuminances of the CIE's cases, which are the sky's and the
-room's; and measured indices of water by wavelength. And the sample of GLSL in KHR_materials_dispersion, which is not
-normative: three indices, no index by wavelength that a glass could have.
+Left out, for lack of a source or a derivation: the illuminances of the CIE's cases, which depend on the sky and the
+room; and measured indices of water by wavelength. Also left out: the sample GLSL code of KHR_materials_dispersion,
+which is not normative: its three indices are not those of a glass at any wavelengths.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ import numpy as np
 
 from . import closed_forms, optical_systems
 
-STEP = 1e-6  # of the difference quotients, relative or in degrees; extended precision leaves 1e-13 of them
+STEP = 1e-6  # step of difference quotients, relative or in degrees; rounding errors are 1e-13 in extended precision
 CIE_INDEX = 1.52
 CIE_POLYNOMIAL = -0.028378, 3.156075, -3.058376, -1.428919, 4.014235, -1.775827  # of powers of the cosine, from 0
 CIE_PRINTED = "0.8788", "0.8796", "0.8799", "0.8759", "0.8661", "0.8476", "0.8018", "0.6828", "0.4233"  # 0, 10, … 80°
 LINES = {"C": 656.2725, "d": 587.5618, "F": 486.1327}  # nm
-# B1, B2, B3, and C1, C2, C3 in µm², and n at C, d and F, of the data sheets.
+# B1, B2, B3, then C1, C2, C3 in µm², and n at C, d and F, from the data sheets.
 GLASSES = {
     "N-BK7": (
         (1.03961212, 0.231792344, 1.01046945, 0.00600069867, 0.0200179144, 103.560653),
@@ -62,22 +62,22 @@ GLASSES = {
     ),
 }
 KINDS = {
-    "transmittance": "of plane-parallel plates in air, from air to air, all reflections within counted",
-    "transmittance, unpolarised": "the same where each boundary passes the mean of both polarisations",
-    "deviation": "of a ray through a prism at its least",
-    "rainbow": "angle from the point opposite to the sun",
-    "Brewster's angle": "of incidence, at which nothing of the light in the plane of incidence is reflected",
-    "critical angle": "of incidence, beyond which all is reflected",
-    "retardation": "of one polarisation against the other by total internal reflections",
-    "diffuse": "share of light of equal radiance from all directions that a plane boundary reflects or passes",
-    "index": "of a glass at a wavelength, over that of air",
-    "double Gauss": "a ray of CODE V's trace, behind the last surface: mm, or the slope dy/dz",
+    "transmittance": "transmittance of plane-parallel plates in air, from air to air, with all inner reflections",
+    "transmittance, unpolarised": "the same if each boundary transmits the mean of both polarisations",
+    "deviation": "minimum deviation of a ray through a prism",
+    "rainbow": "angle between the rainbow and the antisolar point",
+    "Brewster's angle": "angle of incidence at which no light polarised in the plane of incidence is reflected",
+    "critical angle": "angle of incidence beyond which all light is reflected",
+    "retardation": "phase difference between the polarisations after total internal reflections",
+    "diffuse": "share of light of equal radiance from all directions that a plane boundary reflects or transmits",
+    "index": "index of a glass at a wavelength, divided by that of air",
+    "double Gauss": "a ray of CODE V's trace behind the last surface: mm, or the slope dy/dz",
 }
 
 
 @dataclass(frozen=True)
 class StandardNumber:
-    """`law(**given)` is the number; `printed`: as its source has it, "" where no source in hand prints it."""
+    """A number, `law(**given)`. `printed`: the source's digits, "" if no available source prints it."""
 
     name: str
     kind: str
@@ -88,8 +88,8 @@ class StandardNumber:
     printed: str = ""
     fitted: str = ""
     unit: str = ""
-    half_unit: float | None = None  # of the last printed digit, where it is not what the digits say
-    medium: str = ""  # of an index by wavelength: the text that the plugin is given, with `given` in it
+    half_unit: float | None = None  # half a unit of the last printed digit, if it does not follow from the digits
+    medium: str = ""  # of an index by wavelength: the plugin's parameter, a format string for `given`
 
     @functools.cached_property
     def value(self) -> float:
@@ -97,39 +97,37 @@ class StandardNumber:
         return float(self.at())
 
     def at(self, **other: float) -> Any:
-        """The law in extended precision, with some of what is given replaced."""
+        """Return the law in extended precision, with some of the given values replaced."""
         return np.longdouble(self.law(**{**self.given, **other}))
 
     def slope(self, name: str) -> float:
-        """|∂value/∂given|, of angles per degree: by central differences."""
-        step = STEP * max(1.0, abs(self.given[name]))
-        return float(abs(self.at(**{name: self.given[name] + step}) - self.at(**{name: self.given[name] - step}))) / (
-            2 * step
-        )
+        """Return |∂value/∂given|, for angles per degree, by central differences."""
+        x, step = self.given[name], STEP * max(1.0, abs(self.given[name]))
+        return float(abs(self.at(**{name: x + step}) - self.at(**{name: x - step}))) / (2 * step)
 
     @property
     def print_reading(self) -> tuple[float, float] | None:
-        """What is printed, as a number, and half a unit of its last digit."""
+        """The printed number, and half a unit of its last digit; None without one."""
         if not self.printed:
             return None
         return float(self.printed), self.half_unit or 0.5 * 10.0 ** -len(self.printed.partition(".")[2])
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data: see the module."""
-        read, half = self.print_reading or (None, None)
+        """Return plain data: see the module."""
+        printed_value, half_unit = self.print_reading or (None, None)
         return {
             "name": self.name,
             "kind": self.kind,
             "unit": self.unit,
             "value": self.value,
             "printed": self.printed,
-            "printed_value": read,
-            "printed_half_unit": half,
+            "printed_value": printed_value,
+            "printed_half_unit": half_unit,
             "given": {name: float(x) for name, x in self.given.items()},
             "law": self.formula,
             "source": self.source,
             "fitted": self.fitted,
-            "off_print": None if read is None else self.value - read,
+            "off_print": None if printed_value is None else self.value - printed_value,
         }
 
 
@@ -145,7 +143,7 @@ def _degrees(radians: Any) -> Any:
 
 
 def reflectances(n: Any, incidence: Any) -> tuple[np.ndarray, Any]:
-    """R_s and R_p of a boundary to an index n, and the cosine behind it; incidence in degrees."""
+    """Return R_s and R_p of a boundary to an index n, and the cosine behind it; incidence in degrees."""
     angle, n = _radians(incidence), np.longdouble(n)
     outside, within = np.cos(angle), np.sqrt(1 - (np.sin(angle) / n) ** 2)
     s, p = (outside - n * within) / (outside + n * within), (n * outside - within) / (n * outside + within)
@@ -153,93 +151,93 @@ def reflectances(n: Any, incidence: Any) -> tuple[np.ndarray, Any]:
 
 
 def polarised_plates(n: Any, incidence: Any, count: float = 1, absorbance: Any = 0.0, together: bool = False) -> Any:
-    """Transmittance of `count` parallel plates in air for s and p.
+    """Return the transmittance of `count` parallel plates in air for s and p.
 
-    One plate: T = (1 − R)² a/(1 − R² a²), R' = R + a² R (1 − R)²/(1 − R² a²), a = exp(−σ d/cosθ_t), with the absorbance
-    σ d straight through it. Two that stand one behind the other: T = T₁ T₂/(1 − R₁' R₂'), R' = R₁' + T₁² R₂'/(1 − R₁'
-    R₂'). Without absorption count plates pass (1 − R)/(1 + (2 count − 1) R). `together`: one entry, for a renderer in
-    which R is the mean of both polarisations at each boundary.
+    One plate: T = (1 − R)² a/(1 − R² a²), R' = R + a² R (1 − R)²/(1 − R² a²), a = exp(−σ d/cosθ_t), where the
+    absorbance σ d is that at normal incidence. Two plates in series: T = T₁ T₂/(1 − R₁' R₂'), R' = R₁' + T₁² R₂'/(1 −
+    R₁' R₂'). Without absorption count plates transmit (1 − R)/(1 + (2 count − 1) R). `together`: one entry, for a
+    renderer in which R is the mean of both polarisations at each boundary.
     """
     r, a = _boundary(n, incidence, absorbance, together)
-    through, back = (1 - r) ** 2 * a / (1 - (r * a) ** 2), r + a * a * r * (1 - r) ** 2 / (1 - (r * a) ** 2)
-    t, b = through, back
+    one_t, one_r = (1 - r) ** 2 * a / (1 - (r * a) ** 2), r + a * a * r * (1 - r) ** 2 / (1 - (r * a) ** 2)
+    all_t, all_r = one_t, one_r
     for _ in range(round(count) - 1):
-        t, b = t * through / (1 - b * back), b + t * t * back / (1 - b * back)
-    return t
+        all_t, all_r = all_t * one_t / (1 - all_r * one_r), all_r + all_t * all_t * one_r / (1 - all_r * one_r)
+    return all_t
 
 
 def _boundary(n: Any, incidence: Any, absorbance: Any, together: bool) -> tuple[np.ndarray, np.ndarray]:
-    """R, and what a way through a plate leaves."""
+    """Return R, and the share of light that one passage through a plate transmits."""
     r, within = reflectances(n, incidence)
     r = r.mean(keepdims=True) if together else r
     return r, np.exp(-np.longdouble(absorbance) / within) + 0 * r
 
 
 def paths_through(most: int, **given: Any) -> tuple[np.ndarray, np.ndarray]:
-    """What leaves plates as of `polarised_plates` after 1 … `most` boundaries; and what is still on its way then.
+    """Return the light that leaves the plates of `polarised_plates` after 1 … `most` boundaries, and the light left.
 
-    Boundary by boundary: at the one of number i, of 2 count, light goes on to i + 1 or i − 1.
+    The light is propagated from boundary to boundary: from boundary i of 2 count to i + 1 or i − 1.
     """
     r, a = _boundary(given["n"], given["incidence"], given.get("absorbance", 0.0), given.get("together", False))
-    last, passed = 2 * round(given.get("count", 1)), []
-    onward, back = np.zeros((2, last, len(r)), np.longdouble)
-    onward[0] = 1
+    boundaries, leaving = 2 * round(given.get("count", 1)), []
+    forward, backward = np.zeros((2, boundaries, len(r)), np.longdouble)
+    forward[0] = 1
     for _ in range(most):
-        after, before = np.zeros_like(onward), np.zeros_like(back)
+        next_forward, next_backward = np.zeros_like(forward), np.zeros_like(backward)
         leaves = np.zeros_like(r)
-        for i in range(last):
-            ahead, behind = (1 - r) * onward[i] + r * back[i], r * onward[i] + (1 - r) * back[i]
+        for i in range(boundaries):
+            ahead, behind = (1 - r) * forward[i] + r * backward[i], r * forward[i] + (1 - r) * backward[i]
             glass_ahead = i % 2 == 0
-            if i + 1 < last:
-                after[i + 1] = ahead * (a if glass_ahead else 1)
+            if i + 1 < boundaries:
+                next_forward[i + 1] = ahead * (a if glass_ahead else 1)
             else:
                 leaves = ahead
             if i > 0:
-                before[i - 1] = behind * (1 if glass_ahead else a)
-        onward, back = after, before
-        passed.append(leaves)
-    return np.array(passed), (onward + back).sum(0)
+                next_backward[i - 1] = behind * (1 if glass_ahead else a)
+        forward, backward = next_forward, next_backward
+        leaving.append(leaves)
+    return np.array(leaving), (forward + backward).sum(0)
 
 
 def plates(**given: Any) -> Any:
-    """The mean of both polarisations of `polarised_plates`."""
+    """Return the mean over both polarisations of `polarised_plates`."""
     return polarised_plates(**given).mean()
 
 
 def deviation(n: Any, apex: Any) -> Any:
-    """2 asin(n sin(A/2)) − A, in degrees."""
+    """Return the minimum deviation 2 asin(n sin(A/2)) − A, in degrees."""
     angle = _radians(apex)
     return _degrees(2 * closed_forms.least_deviated(angle, np.longdouble(n)) - angle)
 
 
 def rainbow(n: Any, order: float) -> Any:
-    """The angle from the antisolar point, in degrees, after `order` reflections, 1 or 2."""
+    """Return the angle from the antisolar point in degrees, after `order` reflections, 1 or 2."""
     n = np.longdouble(n)
-    turn = closed_forms.deflection(closed_forms.rainbow_incidence(n, order), n, order)
-    return abs(_degrees(turn) - 180)
+    deflection = closed_forms.deflection(closed_forms.rainbow_incidence(n, order), n, order)
+    return abs(_degrees(deflection) - 180)
 
 
 def brewster(n: Any) -> Any:
-    """atan n, in degrees; `n`: of the medium behind over that in front."""
+    """Return atan n in degrees; `n`: index of the medium behind over that in front."""
     return _degrees(np.arctan(np.longdouble(n)))
 
 
 def critical(n: Any) -> Any:
-    """asin 1/n, in degrees; `n`: of the denser over the rarer medium."""
+    """Return asin 1/n in degrees; `n`: index of the denser over that of the thinner medium."""
     return _degrees(np.arcsin(1 / np.longdouble(n)))
 
 
 def retardation(n: Any, incidence: Any, reflections: float) -> Any:
-    """Degrees of retardation by `reflections` total reflections, tan(δ/2) = cosθ √(sin²θ − n⁻²)/sin²θ each."""
+    """Return the retardation of total reflections, tan(δ/2) = cosθ √(sin²θ − n⁻²)/sin²θ each, in degrees."""
     angle, n = _radians(incidence), np.longdouble(n)
     sine2 = np.sin(angle) ** 2
     return _degrees(2 * reflections * np.arctan(np.cos(angle) * np.sqrt(sine2 - 1 / n**2) / sine2))
 
 
 def retarding_incidence(n: Any, each: Any, steep: bool) -> Any:
-    """Where one reflection retards by `each` degrees: with t = tan(each/2), (1 + t²) x² − (1 + n⁻²) x + n⁻² = 0.
+    """Return the incidence in degrees at which one reflection retards by `each` degrees.
 
-    x = sin²θ; the smaller or, if `steep`, the larger root. In degrees.
+    With t = tan(each/2) and x = sin²θ, (1 + t²) x² − (1 + n⁻²) x + n⁻² = 0: the smaller or, if `steep`, larger root.
     """
     t2, m = np.tan(_radians(each) / 2) ** 2, 1 / np.longdouble(n) ** 2
     half = np.sqrt((1 + m) ** 2 - 4 * (1 + t2) * m)
@@ -248,20 +246,20 @@ def retarding_incidence(n: Any, each: Any, steep: bool) -> Any:
 
 
 def diffuse(n: float, outside: float, passed: float) -> Any:
-    """R or, where `passed` is 1, T of diffuse light from outside, where `outside` is 1, or from inside."""
+    """Return R, or T if `passed` is 1, of diffuse light from outside if `outside` is 1, otherwise from inside."""
     reflected = closed_forms.hemispherical(float(n))["outside" if outside else "inside"]
     return 1 - reflected if passed else reflected
 
 
 def sellmeier(coefficients: tuple[float, ...], nm: Any) -> Any:
-    """n² = 1 + Σ B λ²/(λ² − C), λ in µm."""
+    """Return n from n² = 1 + Σ B λ²/(λ² − C), λ in µm."""
     x = (np.longdouble(nm) / 1000) ** 2
     b, c = (np.array(half, np.longdouble) for half in (coefficients[:3], coefficients[3:]))
     return np.sqrt(1 + (b * x / (x - c)).sum())
 
 
 def khronos(n_d: Any, abbe: Any, nm: Any) -> Any:
-    """max(n_d + (n_d − 1)/V_d (523655/λ² − 1.5168), 1): the normative formula."""
+    """Return max(n_d + (n_d − 1)/V_d (523655/λ² − 1.5168), 1), the normative formula."""
     n_d = np.longdouble(n_d)
     return max(n_d + (n_d - 1) / abbe * (523655 / np.longdouble(nm) ** 2 - np.longdouble("1.5168")), 1)
 
@@ -272,27 +270,27 @@ def _lens() -> Any:
 
 
 def behind_the_lens(path: optical_systems.Path, ray: float, slope: float) -> Any:
-    """y in mm of a ray's path behind the last surface or, where `slope` is 1, dy/dz."""
+    """Return y in mm, or dy/dz if `slope` is 1, of a ray behind the last surface."""
     y, b = path.places[-1][round(ray), 1], path.directions[-1][round(ray)]
     return b[1] / b[2] if slope else y
 
 
 def lens(ray: float, slope: float) -> Any:
-    """The same of a ray through the double Gauss, by Snell's law in extended precision."""
+    """Return y or dy/dz of a ray behind the double Gauss, by Snell's law in extended precision."""
     return behind_the_lens(_lens(), ray, slope)
 
 
 @functools.cache
 def cie_absorbance() -> float:
-    """σ d of the glass of CIE 171's case, by Gauss and Newton: least squares of the nine printed transmittances."""
+    """Return σ d of the glass of CIE 171's case: a least-squares fit to the nine transmittances, by Gauss–Newton."""
     printed, angles, x = np.array(CIE_PRINTED, float), range(0, 90, 10), 0.04
     for _ in range(8):
-        at = [
+        middle, above, below = (
             np.array([plates(n=CIE_INDEX, incidence=angle, absorbance=x + h) for angle in angles], float)
             for h in (0, 1e-5, -1e-5)
-        ]
-        slope = (at[1] - at[2]) / 2e-5
-        x += float(slope @ (printed - at[0]) / (slope @ slope))
+        )
+        slope = (above - below) / 2e-5
+        x += float(slope @ (printed - middle) / (slope @ slope))
     return round(x, 8)
 
 
@@ -300,7 +298,7 @@ def cie_absorbance() -> float:
 
 
 def prism(numbers: Sequence[StandardNumber]) -> optical_systems.System:
-    """A prism with a ray for each number of its kind, at the incidence of the least deviation."""
+    """Return a prism with a ray for each number of its kind, at the incidence of minimum deviation."""
     apex = _radians([number.given["apex"] for number in numbers])
     index = np.array([_index(number) for number in numbers])
     return optical_systems.prism(apex, closed_forms.least_deviated(apex, index), index=index)
@@ -313,18 +311,18 @@ def _index(number: StandardNumber) -> Any:
 
 
 def drop(numbers: Sequence[StandardNumber]) -> optical_systems.System:
-    """A drop with a ray for each rainbow of one order, at the incidence at which the deflection is stationary."""
+    """Return a drop with a ray for each rainbow of one order, at the incidence of stationary deflection."""
     index, order = np.array([number.given["n"] for number in numbers], np.longdouble), numbers[0].given["order"]
     return optical_systems.drop(round(order), closed_forms.rainbow_incidence(index, order), index)
 
 
 def deviated(a: Any, b: Any) -> Any:
-    """The angles between directions (N × 3) in the plane x = 0, clockwise, in degrees."""
+    """Return the clockwise angles between directions (N × 3) in the plane x = 0, in degrees."""
     return _degrees(np.arctan2(a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1], a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]))
 
 
 def from_antisolar(a: Any, b: Any) -> Any:
-    """The angles from the point opposite to the sun, which shines along a, of light that left along b; in degrees."""
+    """Return the angles from the antisolar point in degrees, for sunlight along a that leaves along b."""
     return _degrees(np.arctan2(optical_systems.length(np.cross(a, b))[:, 0], -optical_systems.dot(a, b)[:, 0]))
 
 
@@ -361,10 +359,8 @@ def _table() -> Iterator[StandardNumber]:
         law = functools.partial(plates, together=True)
         given = {"n": 1.52, "incidence": angle, "count": count}
         slabs = "slab" if count == 1 else f"{count} slabs"
-        name, text = (
-            f"{slabs} without polarisation, n = 1.52, {angle:g}°",
-            f"{pile.split(',')[0]}, R the mean of s and p",
-        )
+        name = f"{slabs} without polarisation, n = 1.52, {angle:g}°"
+        text = f"{pile.split(',')[0]}, R the mean of s and p"
         yield StandardNumber(name, "transmittance, unpolarised", law, given, text, PILE)
     for angle, printed in zip(range(0, 90, 10), CIE_PRINTED, strict=True):
         given = {"n": CIE_INDEX, "incidence": float(angle), "absorbance": cie_absorbance()}
@@ -446,5 +442,5 @@ NUMBERS: dict[str, StandardNumber] = {number.name: number for number in _table()
 
 
 def rows() -> list[dict[str, Any]]:
-    """The table as plain data: see the module."""
+    """Return the table as plain data: see the module."""
     return [number.as_dict() for number in NUMBERS.values()]

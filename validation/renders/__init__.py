@@ -1,4 +1,4 @@
-"""Does `refract` render the images of `dielectric`, as fast, and at no cost for features that a scene does not use?
+"""Does `refract` render the same images as `dielectric`, as fast, and do unused features cost nothing?
 
 In: the scenes of `scenes/`, with either plugin. Out: rows with differences, significance, times and kernel sizes, and
 the images as EXR files.
@@ -12,5 +12,6 @@ __all__ = [
     "neighbours",
     "random_numbers",
     "rendering_passes",
+    "thin_panes",
     "unused_features",
 ]

@@ -1,12 +1,12 @@
 """Renders: scenes with `refract` and with `dielectric`, with the same and with independent seeds, and times.
 
-Scenes that show dispersion or absorption are left out: `dielectric` has neither.
+Scenes with dispersion or absorption are left out, since `dielectric` has neither.
 
 With the same seed both plugins use the same random numbers, so the images agree except where a last bit changes the
 choice between reflection and refraction. Independent seeds are compared by Welch's t-test on tiles. The error of an
-image is relMSE against the mean of the built-in's other renders, minus the variance of that mean. Times are of warm
-renders of at least 0.1 s, the plugins in turn; in shorter ones the half millisecond that Mitsuba needs per render to
-trace a plugin written in Python would matter.
+image is its relMSE against the mean of the built-in's other renders, minus the variance of that mean. Times are of
+alternating warm renders of at least 0.1 s; in shorter ones the half millisecond that Mitsuba needs per render to trace
+a plugin written in Python would matter.
 """
 
 from __future__ import annotations
@@ -46,24 +46,24 @@ NAME = "renders"
 TIME = TIME_OVER_DIELECTRIC
 TERMS = {
     "reference, test, difference": "dielectric, refract, refract − dielectric: means over the same seeds",
-    CHANGED_SHARE: "pixels of which any channel differs by more than 1e-5, same seeds",
+    CHANGED_SHARE: "pixels with a channel that differs by more than 1e-5, same seeds",
     WELCH_ALARMS: "tiles and channels whose means differ, independent seeds; at most one image in 1000 by chance",
     DETECTABLE: "relative difference of a tile's mean that would have been an alarm, median over tiles",
-    TIME: "median over alternating warm renders, a goal, not a budget, because a busy machine spoils "
-    "it; with a name: of the plugin with that formula; low, high: the 95 % interval",
+    TIME: "median over alternating warm renders; a goal, not a budget, because a busy machine disturbs it; with a "
+    "name: of the plugin with that formula; low, high: the 95 % interval",
 }
 AXES = {"x": "seconds", "y": "relMSE", "slope": -1}  # relMSE is a variance
-# Paths in these scenes are short: a difference in the last bit stays one, unless it flips the choice of a lobe.
+# Paths in these scenes are short: a difference in the last bit stays small, unless it changes the choice of a lobe.
 SHORT_PATHS = {"sphere", "slab", "prism", "furnace"}
 CHANGED = 1e-5
-UNIFORM = 1e-3  # images of one colour are not shown
+UNIFORM = 1e-3  # images with a smaller range are not shown
 TILE = 16
 CURVE_SEEDS = 2
-TIMED = 0.1  # seconds of a render whose time counts
+TIMED = 0.1  # seconds: the shortest render that is timed
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per scene and plugin of ours."""
+    """Return one task per scene and plugin of this package."""
     plugins = [PLUGIN] + [f"{PLUGIN}_{name}" for name in FORMULAS if context.profile.every_formula]
     return [
         Task(f"renders: {path.stem}, {plugin}", functools.partial(_compare, context, path, plugin), timed=True)
@@ -78,14 +78,15 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
     test, reference = (
         np.stack([camera(profile.spp, seed)[0] for seed in range(profile.pairs)]) for camera in cameras.values()
     )
-    half, left_out = profile.pairs // 2, no_question(test, reference)
-    # Same seeds, image by image; then independent ones.
+    half, left_out = profile.pairs // 2, why_no_welch(test, reference)
+    # Images of the same seeds, pixel by pixel; then Welch's test of images of independent seeds.
     pairs = pixelwise.changes(reference.reshape(-1, *reference.shape[2:]), test.reshape(-1, *test.shape[2:]), CHANGED)
     values = {CHANGED_SHARE: pairs.share, "largest change": pairs.largest, "RMSE": pairs.rms}
     values |= {MEANS_DIFFER: abs(pairs.mean_ratio - 1)}
     if not left_out:
-        welch = test[:half], reference[half:]
-        tiles = tile_statistics.compare_stacks(*welch[::-1], TILE, limits.WELCH_ERROR, limits.WELCH_MARGIN)
+        tiles = tile_statistics.compare_stacks(
+            reference[half:], test[:half], TILE, limits.WELCH_ERROR, limits.WELCH_MARGIN
+        )
         values |= {WELCH_ALARMS: float(tiles.alarms), SMALLEST_P: tiles.smallest_p}
         values |= {DETECTABLE: tiles.minimum_detectable()}
     times, goals = _timed(context, path, plugin, cameras)
@@ -99,14 +100,14 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
     }
     images, folder, means = {}, Path("images") / scene, (test.mean(0), reference.mean(0))
     (context.out / folder).mkdir(parents=True, exist_ok=True)
-    shown = (("reference", means[1]), ("test", means[0]), ("difference", means[0] - means[1]))
-    for role, image in () if np.ptp(means) <= UNIFORM else shown:
-        images[role] = str(folder / (f"{BUILTIN}.exr" if role == "reference" else f"{plugin} {role}.exr"))
-        pixels = image.astype(np.float32)
-        image_file.write_exr(context.out / images[role], pixels, metadata=replay | {"role": role})
+    if np.ptp(means) > UNIFORM:
+        for role, image in (("reference", means[1]), ("test", means[0]), ("difference", means[0] - means[1])):
+            images[role] = str(folder / (f"{BUILTIN}.exr" if role == "reference" else f"{plugin} {role}.exr"))
+            pixels = image.astype(np.float32)
+            image_file.write_exr(context.out / images[role], pixels, metadata=replay | {"role": role})
     curves: dict[str, list[tuple[float, float]]] = {}
     if plugin == PLUGIN and reference.std(0).max() >= CHANGED and scene not in NO_REFERENCE:
-        # relMSE against seconds at growing samples per pixel, both in turn; seeds the reference has not seen.
+        # relMSE against seconds at growing samples per pixel, alternating; with seeds that the reference does not have.
         for spp, name in itertools.product(profile.curve_spp, cameras):
             points = [cameras[name](spp, seed=profile.pairs + i) for i in range(CURVE_SEEDS)]
             error = statistics.fmean(tile_statistics.relative_mse(image, reference) for image, _ in points)
@@ -126,32 +127,32 @@ def _budgets(scene: str, left_out: str) -> dict[str, float]:
 def _timed(
     context: Context, path: Path, plugin: str, cameras: dict[str, Camera]
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Values "time / dielectric" of the plugin, and by name of others; and the goals for those that have one."""
+    """Return the values "time / dielectric" of the plugin and of other forms, and the goals of those that have one."""
     import mitsuba as mi
 
-    # Both forms at the rounding limit are timed, whichever of them is the default; `quick` saves kernels.
+    # The default times both forms at the rounding limit; `quick` saves their kernels.
     profile = context.profile
     others = RIGHT_PLUGINS if plugin == PLUGIN and not profile.quick else []
     cameras = cameras | {name: Camera(opened(path, name, profile.resolution)) for name in others}
     _, seconds = cameras[BUILTIN](profile.spp, seed=0)
     spp = profile.spp
-    if dr.is_jit_v(mi.Float):  # a scalar plugin costs calls per sample: no number of them outweighs those
+    if dr.is_jit_v(mi.Float):  # a scalar plugin costs calls per sample: more samples do not reduce their share
         spp *= 2 ** max(0, math.ceil(math.log2(TIMED / seconds)))
     times = kernel_timing.rounds(cameras, lambda camera: camera(spp, seed=0)[1], profile.repeats)
     metrics = {plugin: TIME} | {name: f"{TIME}, {name.removeprefix(PLUGIN + '_')}" for name in others}
     values = {"timed renders": float(profile.repeats), "timed spp": float(spp)}
     for name, metric in metrics.items():
         values |= kernel_timing.ratio(metric, times[name], times[BUILTIN])
-    # A Python plugin costs a call per operation in scalar variants: its time is demanded of compiled ones only.
-    demanded = [] if context.variant.startswith("scalar") else metrics.values()
-    return values, dict.fromkeys(demanded, limits.RENDER_TIME)
+    # In scalar variants a Python plugin costs a call per operation, so only compiled variants have goals.
+    with_goal = [] if context.scalar else metrics.values()
+    return values, dict.fromkeys(with_goal, limits.RENDER_TIME)
 
 
-def no_question(test: np.ndarray, reference: np.ndarray) -> str:
-    """Why Welch's test is not applied, because the images are the same without statistics; "" where it is."""
+def why_no_welch(test: np.ndarray, reference: np.ndarray) -> str:
+    """Return why the images need no Welch's test; "" if they need it."""
     if np.array_equal(test, reference):
         return "left out: Welch's test, because images of the same seed are identical bit for bit"
-    if reference.std(0).max() < CHANGED and test.std(0).max() < CHANGED:  # two conditions: NaN is below nothing
+    if reference.std(0).max() < CHANGED and test.std(0).max() < CHANGED:  # false for NaN
         return "left out: Welch's test and error against time, because independent seeds give the same image"
     return ""
 

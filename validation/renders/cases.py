@@ -1,4 +1,4 @@
-"""What the studies of `refract_path` share: one task a case, each under its variant of Mitsuba, and parts of scenes."""
+"""Shared by the studies of `refract_path`: one task per case, under the case's variant of Mitsuba, and scene parts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BLACK = {"type": "diffuse", "reflectance": 0.0}
 
 @dataclass(frozen=True)
 class Case:
-    """`rows()`, called under `variant`, measures it. `title`: no other case of the study has it."""
+    """One case of a study: `rows()` measures it under `variant`. `title` is unique within the study."""
 
     title: str
     variant: str
@@ -40,49 +40,51 @@ def study(
     cases: Callable[[Context], Iterable[Case]],
     timed: Callable[[Context], Iterable[Case]] = lambda context: (),
 ) -> Study:
-    """A study with a task for each case, all of them repeated with other seeds but those that are `timed`."""
+    """Return a study with a task per case; all but the `timed` cases are repeated with other seeds."""
 
     def rows(context: Context, case: Case) -> list[Row]:
         if reason := context.variants.get(case.variant):
             return [Row(name, OURS, case.title, case.variant, reason=reason)]
-        gc.collect()  # Dr.Jit compiles every plugin that is alive
+        gc.collect()  # Dr.Jit compiles every plugin in memory
         with under(case.variant):
             return case.rows()
 
     def tasks(context: Context) -> list[Task]:
         if context.scalar:
-            reason = "scalar variants have no derivatives and no numbers of split paths, and would render for hours"
+            reason = "scalar variants have no derivatives and no random numbers of split paths, and take hours"
             return [Task(name, lambda: [Row(name, OURS, "every case", context.variant, reason=reason)])]
         return [Task(f"{name}: {case.title}", functools.partial(rows, context, case)) for case in cases(context)]
 
     def every(context: Context) -> list[Task]:
-        clocks = () if context.scalar else timed(context)
-        return tasks(context) + [Task(f"{name}: {c.title}", functools.partial(rows, context, c), True) for c in clocks]
+        timed_cases = () if context.scalar else timed(context)
+        return tasks(context) + [
+            Task(f"{name}: {case.title}", functools.partial(rows, context, case), timed=True) for case in timed_cases
+        ]
 
     return Study(name, title, about(doc), terms, every, again=by_tasks(tasks))
 
 
 def variants(context: Context) -> tuple[str, str, str]:
-    """The RGB, spectral and polarised variants of the run's backend."""
+    """Return the RGB, spectral and polarised variants of the run's backend."""
     family = context.variant.removesuffix("rgb")
     return context.variant, f"{family}spectral", f"{family}spectral_polarized"
 
 
 def bitmap(pixels: Any, **parameters: Any) -> Nodes:
-    """A texture of numbers, height × width (× channels)."""
+    """Return a texture of numbers, height × width (× channels)."""
     pixels = np.asarray(pixels, np.float32)
     image = mi.Bitmap(pixels if pixels.ndim == 3 else pixels[..., None])
     return {"type": "bitmap", "bitmap": image, "raw": True} | parameters
 
 
 def flat(value: Any, size: int = 1) -> Nodes:
-    """A bitmap of one value, a number or three."""
+    """Return a bitmap of one value, a number or three."""
     return bitmap(np.ones((size, size, 3)) * np.asarray(value))
 
 
 def environment(pixels: Any) -> Nodes:
-    """Light from all directions, height × width × 3."""
+    """Return an environment map, height × width × 3."""
     return {"type": "envmap", "bitmap": mi.Bitmap(np.asarray(pixels, np.float32))}
 
 
-TURNED = [0.5 + 0.5 * np.sin(0.35), 0.5, 0.5 + 0.5 * np.cos(0.35)]  # a normal map: by 20 degrees
+TURNED = [0.5 + 0.5 * np.sin(0.35), 0.5, 0.5 + 0.5 * np.cos(0.35)]  # a normal map that tilts normals by 20 degrees

@@ -1,7 +1,7 @@
-"""Colours: scenes that show dispersion or absorption, in a spectral variant, by `refract_path`.
+"""Colours: scenes with dispersion or absorption, in a spectral variant, by `refract_path`.
 
-`dielectric` has neither, and no other integrator follows them: the images are shown, and nothing is demanded of them
-here. What the plugins make of light of several wavelengths is judged by tests.
+`dielectric` has neither, and no other integrator supports them: the images are shown without a budget. Tests check how
+the plugins treat light of several wavelengths.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from validation.study import Study, Task, about
 NAME = "colours"
 COLOUR = "colour"
 TERMS = {
-    COLOUR: "per pixel the largest channel minus the smallest, over the sum of all channels; of the whole image",
-    "noise": "of the image: the root of the mean squared error of its pixels by chance, over its mean",
+    COLOUR: "sum over the pixels of the largest channel minus the smallest, over the sum of all channels",
+    "noise": "root mean square of the pixels' standard errors, over the mean of the image",
 }
-REPEATED = 4  # renders with each of the profile's seeds: the light of one wavelength has more noise than that of three
-NOISE, MOST = 0.05, 16  # where images have more noise than this, up to so many times as many renders are taken
+REPEATED = 4  # times as many renders as the profile's: single wavelengths have more noise than RGB
+NOISE, MOST = 0.05, 16  # noise up to which more renders are added, up to 16 times as many
 SCALAR = "needs a compiled variant: in a scalar one an image takes hours"
 SHOWN = "shown, not judged: no other renderer here has dispersion and absorption"
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per scene that the built-in cannot render."""
+    """Return one task per scene that the built-in cannot render."""
     paths = [path for path in context.scenes if beyond_builtin(path)]
     return [Task(f"colours: {path.stem}", functools.partial(scene_rows, context, path)) for path in paths]
 
 
 def scene_rows(context: Context, path: Path) -> list[Row]:
-    """One row with the image; with the reason where the spectral variant does not run."""
+    """Return one row with the image, or with the reason why the spectral variant does not run."""
     variant = context.variant.replace("_rgb", "_spectral")
     reason = SCALAR if context.scalar else context.variants.get(variant, "not in this wheel")
     if reason:
@@ -63,7 +63,7 @@ def scene_rows(context: Context, path: Path) -> list[Row]:
 
 
 def _mean(camera: Camera, spp: int, count: int, most: int) -> tuple[np.ndarray, float, int]:
-    """The mean of at least `count` renders, up to `most` times as many; its noise, and how many there are."""
+    """Return the mean of `count` to `count × most` renders, its noise, and the number of renders."""
     total = squares = np.zeros(())
     for seed in range(count * most):
         render = camera(spp, seed=seed)[0].astype(float)

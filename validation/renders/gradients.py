@@ -1,19 +1,15 @@
 """Derivatives of images by `refract_path` and by Mitsuba's integrators, against finite differences of converged images.
 
-A parameter's derivative is that of Σ W I over the pixels I, in backward mode; the truth is Σ W D of central differences
-D = (4 D(h) − D(2h))/3, whose four images by `refract_path` have the same random numbers. W is a D of a seed of its own,
-so that nothing cancels. `off` is their ratio − 1, with an interval by Student's t over the seeds of both (Welch's
-degrees of freedom), widened by what is left of the step's truncation. The derivative is
-
-- right: the interval holds 0 and ends within ± 5 %;
-- biased: the interval leaves 0 out;
-- missing: the same where the scene has an edge that moves, in the image or in the view of a matt surface, as only
-  `prb_projective` samples edges; or it is 0, infinite or an error.
-
-While none of this holds, the seeds are doubled; a row that is still undecided at the end fails. A right derivative is
-called biased, or one that is off by more than 5 % right, once in 10⁵ rows by chance, all looks together. Where the
-scene has no such edge, `refract_path` must be right. The profile `standard` asks all integrators for the parameters of
-the table in the documentation, `full` for all parameters.
+The derivative with respect to a parameter is that of Σ W I over the pixels I, in backward mode. The truth is Σ W D with
+central differences D = (4 D(h) − D(2h))/3, whose four images by `refract_path` have the same random numbers. W is a D
+with a different seed, so that nothing cancels. `off` is the ratio of the two − 1. Its interval is by Student's t over
+the seeds of both (Welch's degrees of freedom), widened by the remaining truncation of the step. The derivative is right
+if the interval contains 0 and ends within ± 5 %, and biased if the interval does not contain 0. It is missing if it is
+0, infinite or an error, or if it is biased in a scene with a moving edge, in the image or in the view of a matt
+surface: only `prb_projective` samples edges. As long as none of this holds, the number of seeds is doubled; a row that
+stays undecided fails. With all looks together, one row in 10⁵ calls a right derivative biased, or a derivative that is
+off by more than 5 % right. `refract_path` must be right in all scenes without such an edge. The profile `standard`
+measures all integrators for the parameters of the table in the documentation, `full` for all parameters.
 
 `python -m validation renders`
 """
@@ -45,7 +41,7 @@ from .cases import GLASS, MATT, Nodes, bitmap, environment
 
 NAME = "gradients"
 INTEGRATORS = ("path", "prb", "volpath", "prb_projective", OURS)
-LOOKS = (8, 16, 32, 64)  # seeds, until the verdict is there
+LOOKS = (8, 16, 32, 64)  # numbers of seeds, until there is a verdict
 ROUNDS, SEED = 6, 2037
 SIZE = 16
 VARIANCE, TIME = "variance", "time / image"
@@ -53,18 +49,19 @@ RIGHT, BIASED, MISSING = "right", "biased", "missing"
 ERROR = "an error: "
 TERMS = {
     "off": "|gradient / differences − 1|",
-    "interval": "half the width of its interval, which leaves the truth out once in 10⁵ rows; what would be seen",
+    "interval": "half the width of its interval, which misses the truth once in 10⁵ rows: the detectable error",
     "at most": "off + interval",
     "off / interval": "above 1 the derivative is biased",
     "error": "standard error of gradient − differences",
     "gradient": "Σ W g in backward mode; differences: Σ W D of finite differences",
-    VARIANCE: "of the derivative by one path, over the square of `differences`: of N paths it is this / N",
-    "seeds": "renders with seeds of their own, at the end",
-    "undecided": "1 where the derivative is neither right nor biased with the largest number of seeds",
-    "truncation": "what the step of finite differences changes in D(h), relative",
+    VARIANCE: "of the derivative by one path, over the square of `differences`; N paths have 1 / N of it",
+    "seeds": "number of seeds, one per render, at the verdict",
+    "undecided": "1 if the derivative is neither right nor biased with the largest number of seeds",
+    "truncation": "relative change of D(h) by the step of finite differences",
     "forward": "forward mode minus backward mode, over `error`",
-    "right by path only": "1 where `path` gives the derivative and `refract_path` does not",
-    TIME: "backward mode over an image by `path`, as many samples, in turn; median of the rounds, with 95 % interval",
+    "right by path only": "1 if `path` gives the derivative and `refract_path` does not",
+    TIME: "backward mode over an image by `path` with as many samples, alternating; median of the rounds, 95 % "
+    "interval",
 }
 ROUGH, ROUGH_GLASS = {"type": "roughconductor", "alpha": 0.2}, {"type": "roughdielectric", "alpha": 0.5, "int_ior": 2.2}
 PRINCIPLED = {"type": "principled", "metallic": 1.0, "roughness": 0.4}
@@ -78,43 +75,43 @@ BK7 = "sellmeier(1.03961212, 0.231792344, 1.01046945, 6000.69867, 20017.9144, 10
 
 
 def scene(fov: float, **parts: Any) -> Nodes:
-    """A camera before the origin."""
+    """Return a scene of `parts` with a camera in front of the origin."""
     return {"type": "scene", "sensor": sensor(SIZE, fov, [0.3, 0.5, 4], (0.1, 0, 0))} | parts
 
 
 def waves(low: float, high: float, channels: int = 3) -> Nodes:
-    """A texture without edges."""
+    """Return a texture without edges."""
     u, v = np.meshgrid(*[np.linspace(0, 2 * np.pi, 8)] * 2)
     pixels = np.stack([0.5 + 0.25 * (np.sin(u + i) + np.sin(v + 2 * i)) for i in range(channels)], axis=2)
     return bitmap(low + (high - low) * pixels)
 
 
 def sky() -> Nodes:
-    """Stripes without edges."""
+    """Return an environment map of stripes without edges."""
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 64), np.linspace(0, np.pi, 32))
     stripes = [np.exp(np.sin(v) * (np.sin(u + i) + 1.5 * np.sin(3 * u + i))) for i in (0, 2, 4)]
     return environment(np.stack(stripes, axis=2))
 
 
 def ball(fov: float = 12, **glass: Any) -> Nodes:
-    """A ball that fills the view; it has no edge that is seen from within."""
+    """Return a ball that fills the view; seen from within, it has no edge."""
     return scene(fov, ball={"type": "sphere", "bsdf": GLASS | glass}, light=sky())
 
 
 def core(bsdf: Nodes, glass: Nodes = GLASS, **more: Any) -> Nodes:
-    """A ball that fills the view, around the centre of one of glass."""
+    """Return a ball of `bsdf` inside a ball of glass that fills the view."""
     inner = {"type": "sphere", "radius": 0.6, "bsdf": bsdf}
     return scene(8, ball={"type": "sphere", "bsdf": glass}, core=inner, **{"light": sky()} | more)
 
 
 def plane(bsdf: Nodes, light: Nodes | None = None, **more: Nodes) -> Nodes:
-    """A scene of a plane that fills the view."""
+    """Return a plane that fills the view."""
     wide = mi.ScalarTransform4f().rotate([1, 0, 0], -30).scale(9)
     return scene(20, plane={"type": "rectangle", "to_world": wide, "bsdf": bsdf}, light=light or sky(), **more)
 
 
 def mesh(bsdf: Nodes) -> Nodes:
-    """A plane whose normals vary from vertex to vertex."""
+    """Return a plane whose normals vary from vertex to vertex."""
     props = mi.Properties()
     props["bsdf"] = mi.load_dict(bsdf)
     corners = np.array([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]])
@@ -124,32 +121,32 @@ def mesh(bsdf: Nodes) -> Nodes:
 
 
 def room(floor: Nodes = MATT, light: Nodes | None = None, **glass: Any) -> Nodes:
-    """A ball on a floor: for parameters that move nothing."""
+    """Return a ball on a floor, for parameters that do not move edges."""
     flat = mi.ScalarTransform4f().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(6)
     floor = {"type": "rectangle", "to_world": flat, "bsdf": floor}
     return scene(30, ball={"type": "sphere", "bsdf": GLASS | glass}, floor=floor, light=light or sky())
 
 
 def lamp(x: float, y: float, z: float, size: float) -> Nodes:
-    """A square that faces the origin."""
+    """Return a square lamp that faces the origin."""
     facing = mi.ScalarTransform4f().look_at([x, y, z], [0, 0, 0], [0, 1, 0.1]).scale(size)
     return {"type": "rectangle", "to_world": facing, "emitter": {"type": "area", "radiance": 5.0}}
 
 
 def screen(radiance: Nodes) -> Nodes:
-    """A lamp with a texture, behind a plane of glass."""
+    """Return a textured lamp behind a plane of glass."""
     light = {"type": "area", "radiance": radiance}
     behind = mi.ScalarTransform4f().translate([0, 0, -3]).scale(9)
     return plane(GLASS, screen={"type": "rectangle", "to_world": behind, "emitter": light})
 
 
 def checkers() -> Nodes:
-    """A texture of edges."""
+    """Return a texture with edges."""
     return {"type": "checkerboard", "to_uv": mi.ScalarTransform4f().scale(7)}
 
 
 def blend(other: Nodes) -> Nodes:
-    """Some of it, and some of a dark surface."""
+    """Return a blend of `other` and a dark surface."""
     return {"type": "blendbsdf", "weight": 0.4, "a": {"type": "diffuse", "reflectance": 0.1}, "b": other}
 
 
@@ -157,12 +154,12 @@ def blend(other: Nodes) -> Nodes:
 
 
 def entries(numbers: Any, first: int, count: int, x: Any) -> Any:
-    """`x` added to `count` numbers of an array."""
+    """Return `numbers` with `x` added to `count` of them, from `first`."""
     place = dr.arange(mi.UInt32, dr.width(numbers))
     return numbers + dr.select((place >= first) & (place < first + count), x, 0)
 
 
-# The parameter at x, by what it was: a texel of 66 columns, the height of the third vertex.
+# Kind of change: the value at x, from x and the value before. "texel": of a map of 66 columns; "vertex": the third one.
 CHANGES: dict[str, Callable[[Any, Any], Any]] = {
     "value": lambda x, before: type(before)(x),
     "times": lambda x, before: before * x,
@@ -177,9 +174,9 @@ CHANGES: dict[str, Callable[[Any, Any], Any]] = {
 
 @dataclass(frozen=True)
 class Gradient:
-    """The parameter whose name ends with `key` is that of CHANGES[change] at x = `at`.
+    """The derivative in x, at x = `at`, of the scene `make()` whose parameter ending in `key` is CHANGES[change](x).
 
-    `step`: h. `excluded`: why `refract_path` cannot have this derivative.
+    `step`: h. `excluded`: why `refract_path` cannot compute this derivative.
     """
 
     make: Callable[[], Nodes]
@@ -194,7 +191,7 @@ class Gradient:
 
 PIXEL = "an edge moves in the image"
 VERTEX = "an edge moves in the view of a matt surface"
-GRAZING = "rays that graze glass have derivatives of any size: the noise does not fall with more samples"
+GRAZING = "rays that graze glass have unbounded derivatives: the noise does not fall with more samples"
 DELTA = "the choice of a delta lobe has no derivative"
 # fmt: off
 CASES = {
@@ -256,10 +253,10 @@ QUICK = ("`alpha` of `roughconductor`", "`eta`")
 
 
 class Images:
-    """The images of a case, and their derivatives in its parameter."""
+    """The images of a case, and their derivatives with respect to its parameter."""
 
     def __init__(self, case: Gradient) -> None:
-        """ValueError where the scene has no such parameter, or one of integers, which nothing differentiates."""
+        """Load the scene. ValueError if it has no such parameter, or one that cannot be differentiated (integers)."""
         self.case, self.scene = case, mi.load_dict(case.make(), parallel=False, optimize=False)
         self.params = mi.traverse(self.scene)
         keys = [key for key in self.params.keys() if key.endswith(case.key)]  # noqa: SIM118  no dictionary
@@ -267,19 +264,19 @@ class Images:
             raise ValueError(f"{NAME}: {len(keys)} parameters end with {case.key!r}; expected one")
         (self.key,) = keys
         self.before = dr.detach(self.params[self.key])
-        probe = type(self.before)(self.before)  # Mitsuba's flag denies it of a camera's place, which has them
+        probe = type(self.before)(self.before)  # Mitsuba's flag is wrong for the position of a camera
         dr.enable_grad(probe)
         if not dr.grad_enabled(probe):
             raise ValueError(f"{NAME}: no integrator differentiates {self.key!r}; expected a differentiable parameter")
 
     def set(self, x: Any) -> None:
-        """The parameter as it is at `x`."""
+        """Set the parameter to its value at `x`."""
         self.params[self.key] = CHANGES[self.case.change](x, self.before)
         self.params.update()
 
     @contextmanager
     def attached(self) -> Iterator[Any]:
-        """The parameter, for a while: Dr.Jit differentiates all plugins that are in memory."""
+        """Attach the parameter for a while, and yield x. Dr.Jit would differentiate all plugins in memory."""
         x = dr.opaque(mi.Float, self.case.at)
         dr.enable_grad(x)
         self.set(x)
@@ -289,11 +286,11 @@ class Images:
             self.set(dr.opaque(mi.Float, self.case.at))
 
     def image(self, method: Any, seed: int) -> np.ndarray:
-        """The image without derivatives."""
+        """Return an image, without derivatives."""
         return np.array(mi.render(self.scene, integrator=method, spp=self.case.spp, seed=seed), float)
 
     def differences(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """D and D(h), as images."""
+        """Return D and D(h) as images."""
         method = integrator(OURS, split_depth=2)
 
         def at(x: float) -> np.ndarray:
@@ -305,13 +302,13 @@ class Images:
         return (4 * near - far) / 3, near
 
     def forward(self, method: Any, seed: int) -> np.ndarray:
-        """The derivative of the image."""
+        """Return the derivative of the image by forward mode."""
         with self.attached() as x:
-            dr.forward(x, dr.ADFlag.ClearEdges)  # Mitsuba's forward mode begins at the parameters of the scene
+            dr.forward(x, dr.ADFlag.ClearEdges)  # Mitsuba's forward mode starts at the parameters of the scene
             return np.array(method.render_forward(self.scene, params=x, spp=self.case.spp, seed=seed), float)
 
     def backward(self, method: Any, weights: np.ndarray, seed: int) -> float:
-        """The derivative of the mean of the weighted pixels."""
+        """Return the derivative of the mean of the weighted pixels by backward mode."""
         grad_in = mi.TensorXf((weights / weights.size).astype(np.float32))
         with self.attached() as x:
             method.render_backward(self.scene, params=x, grad_in=grad_in, spp=self.case.spp, seed=seed)
@@ -319,27 +316,27 @@ class Images:
 
 
 def integrator(name: str, **parameters: int) -> Any:
-    """An integrator with these parameters, depth 6, no Russian roulette; no guiding, whose octree takes seconds."""
+    """Return an integrator of depth 6 without Russian roulette, and without guiding, whose octree takes seconds."""
     guiding = {"guiding": "none"} if name == "prb_projective" else {}
     return mi.load_dict({"type": name, "max_depth": 6, "rr_depth": 100} | guiding | parameters)
 
 
 def all_cases(context: Context) -> Iterator[cases.Case]:
-    """Two in the profile `quick`; else all."""
+    """Yield all cases; in the profile `quick`, two."""
     for title in QUICK if context.profile.quick else CASES:
         variant = cases.variants(context)[CASES[title].spectral]
         yield cases.Case(title, variant, functools.partial(rows, context, title))
 
 
 def timed_cases(context: Context) -> Iterator[cases.Case]:
-    """The times of those of the table; none in the profile `quick`."""
+    """Yield the times of the cases of the table; none in the profile `quick`."""
     for title in () if context.profile.quick else TABLE:
         variant = cases.variants(context)[CASES[title].spectral]
         yield cases.Case(f"{title}: {TIME}", variant, functools.partial(times, variant, title))
 
 
 def rows(context: Context, title: str) -> list[Row]:
-    """A row of each integrator that is asked for the derivative, `refract_path` last."""
+    """Return a row per integrator that computes the derivative, `refract_path` last."""
     case, variant, seed = CASES[title], cases.variants(context)[CASES[title].spectral], current(SEED)
     every = not context.profile.quick and (title in TABLE or context.profile.name == "full")
     images, made = Images(case), list[Row]()
@@ -377,9 +374,9 @@ def rows(context: Context, title: str) -> list[Row]:
 def judged(
     gradient: Callable[[int], float], difference: Callable[[int], float], case: Gradient
 ) -> tuple[dict[str, float], str]:
-    """The values of a row, and RIGHT, BIASED or MISSING with the reason; "" where that is still undecided.
+    """Return the values of a row, and its verdict: RIGHT, BIASED, MISSING with the reason, or "" if undecided.
 
-    `gradient`, `difference`: Σ W g and Σ W D of the render number i.
+    `gradient(i)`, `difference(i)`: Σ W g and Σ W D of render i.
     """
     values = dict[str, float]()
     for count in LOOKS:
@@ -398,35 +395,38 @@ def judged(
 
 
 def first_cause(error: BaseException) -> str:
-    """The first sentence of the error from which others came, as Mitsuba wraps those of plugins and loops."""
+    """Return the first sentence of the original error: Mitsuba wraps errors of plugins and loops in others."""
     while error.__cause__:
         error = error.__cause__
     return re.split(r"[.!] |\n", str(error))[0]
 
 
 def compared(gradients: list[float], differences: list[float], spp: int) -> dict[str, float]:
-    """The values of a row, of what every seed gave. The error of the ratio − 1 is that of first order in both."""
+    """Return the values of a row from the results of all seeds. The error of the ratio is of first order in both."""
     from scipy.special import stdtrit
 
     count, g, expected = len(gradients), float(np.mean(gradients)), float(np.mean(differences))
     variance = float(np.var(gradients, ddof=1))
-    parts = [variance / count, float(np.var(differences, ddof=1)) * (g / expected) ** 2 / count]
-    freedom = (count - 1) * sum(parts) ** 2 / sum(part**2 for part in parts)
-    quantile = -stdtrit(freedom, limits.GRADIENT_ALARM / len(LOOKS) / 2)
-    off, interval = abs(g / expected - 1), float(quantile * sum(parts) ** 0.5 / abs(expected)) + limits.STEP
-    values = {
+    squared_errors = [variance / count, float(np.var(differences, ddof=1)) * (g / expected) ** 2 / count]
+    error = sum(squared_errors) ** 0.5
+    degrees_of_freedom = (count - 1) * sum(squared_errors) ** 2 / sum(x**2 for x in squared_errors)
+    quantile = -stdtrit(degrees_of_freedom, limits.GRADIENT_ALARM / len(LOOKS) / 2)
+    off, interval = abs(g / expected - 1), float(quantile * error / abs(expected)) + limits.STEP
+    return {
         "off": off,
         "interval": interval,
         "at most": off + interval,
         "off / interval": off / interval,
         "seeds": float(count),
+        "gradient": g,
+        "differences": expected,
+        "error": error,
+        VARIANCE: variance * spp * SIZE**2 / expected**2,
     }
-    values |= {"gradient": g, "differences": expected, "error": sum(parts) ** 0.5}
-    return values | {VARIANCE: variance * spp * SIZE**2 / expected**2}
 
 
 def times(variant: str, title: str) -> list[Row]:
-    """A row of each integrator: its backward mode over an image by `path`."""
+    """Return a row per integrator: the time of backward mode over that of an image by `path`."""
     images, weights = Images(CASES[title]), np.ones((SIZE, SIZE, 3))
     image, path = functools.partial(images.image, seed=SEED), integrator("path")
     works: dict[str, Callable[[], Any]] = {"image": lambda: image(path)}
@@ -435,7 +435,7 @@ def times(variant: str, title: str) -> list[Row]:
     def clock(work: Callable[[], Any]) -> float:
         start = time.perf_counter()
         try:
-            work()  # reads a number, and so waits
+            work()  # returns numbers, so the kernels have finished
         except RuntimeError:
             return float("nan")
         return time.perf_counter() - start

@@ -1,10 +1,10 @@
-"""Changes that must not change an image: a part that is not seen, a wrapper that does nothing, another way to render.
+"""Changes that must not change an image: a part that is out of view, a wrapper without effect, another way to render.
 
-A part of a scene is left out where it is not needed. So an image may not depend on what else is in the scene, on how
-its numbers are written, or on what calls the integrator. Each change is made in scenes of glass only and of glass and
-matt surfaces, with and without splitting. Where the same random numbers are drawn the images are the same bits;
-otherwise both are compared by Welch's test of the whole image and of its tiles, and where the change keeps the
-stratification, by their noise.
+`refract_path` leaves out features that a scene does not need. An image must not depend on what else is in the scene, on
+how its numbers are written, or on what calls the integrator. Each change is made in scenes of glass only and of glass
+and matt surfaces, with and without splitting. If both images have the same random numbers, they are equal bit for bit.
+Otherwise they are compared by Welch's test of the whole image and of its tiles, and by their noise if the change keeps
+the stratification.
 
 `python -m validation renders`
 """
@@ -30,19 +30,19 @@ from .cases import BLACK, GLASS, TURNED, Case, Nodes, bitmap, environment, flat,
 
 TERMS = {
     "alarms": "tiles, and the whole image, that Welch's test calls different",
-    "same bits": "1 where both images have the same bits, so that no test was needed",
-    "detectable": "relative difference of the whole image's mean that the test finds with probability 1/2",
+    "same bits": "1 if both images are equal bit for bit, so that no test was needed",
+    "detectable": "relative difference of the whole image's mean that the test detects with probability 1/2",
     "noise": "variance between renders over that of the unchanged scene",
 }
 NAME, SEED = "invisible changes", 2031
 SIZE, TILE, RENDERS = 16, 8, 8
-SPP = {"matt": 256, "dispersive": 64}  # caustics and colours are noise; 16 for the others
+SPP = {"matt": 256, "dispersive": 64}  # caustics and colours have more noise; 16 for the others
 
 
 def scenes(spectral: bool) -> dict[str, Nodes]:
-    """Scenes by name, for `mi.load_dict`; each has a `ball`, which the changes are made to."""
+    """Return the scenes by name, for `mi.load_dict`; each has a `ball`, to which the changes are made."""
     place = mi.ScalarTransform4f
-    stripes = 0.6 + 0.4 * np.sin(np.arange(32) * 2 * np.pi / 32 * 5 + 0.3)  # so that directions matter
+    stripes = 0.6 + 0.4 * np.sin(np.arange(32) * 2 * np.pi / 32 * 5 + 0.3)  # makes directions matter
     sky = environment((stripes[None, :, None] + np.linspace(0, 0.7, 16)[:, None, None]) * np.ones(3))
     ball = {"type": "sphere", "bsdf": dict(GLASS)}
     pane = {"type": "cube", "to_world": place().translate([0.8, 0, -2]).scale([0.7, 1, 0.2]), "bsdf": dict(GLASS)}
@@ -72,7 +72,7 @@ BEHIND, DARK = [0, 0, 90], {"type": "area", "radiance": 1e-20}
 
 
 def changed(scene: Nodes, change: str) -> Nodes:
-    """The scene with a change of `changes`."""
+    """Return the scene with a change of `changes`."""
     ball = scene["ball"]
     added, wrapper, parameter = changes()[change]
     if added:
@@ -90,7 +90,7 @@ def changed(scene: Nodes, change: str) -> Nodes:
 
 
 def changes() -> dict[str, tuple[Nodes, Nodes, Nodes]]:
-    """What is far away, a wrapper of the ball's BSDF, and its parameters, which `refract` itself must have."""
+    """Return by name: an object far away, a wrapper of the ball's BSDF, or parameters of its `refract`."""
     return {
         "matt ball far away": ({"type": "sphere", "center": BEHIND}, {}, {}),
         "dark lamp": ({"type": "sphere", "center": BEHIND, "bsdf": {"type": "null"}, "emitter": DARK}, {}, {}),
@@ -107,15 +107,15 @@ def changes() -> dict[str, tuple[Nodes, Nodes, Nodes]]:
     }
 
 
-# Other ways to render the same scene: what is around the integrator, and its parameters.
+# Other ways to render the same scene: an integrator around ours, and parameters of ours.
 WAYS: dict[str, tuple[Nodes | None, Nodes]] = {
     "moment": ({"type": "moment"}, {}),
     "aov": ({"type": "aov", "aovs": "d:depth"}, {}),
     "passes": (None, {"samples_per_pass": 4}),
 }
 WRAPPED = {"mask of opacity 1", "blend of itself", "flat normal map", "flat bump map"}
-# Absorption is not within a wrapper, a table not beside a texture, a raw bitmap has no spectrum. A bump map around a
-# normal map turns the tangent that the normals refer to, by `path` as well.
+# Changes that a scene cannot have. Wrappers do not support absorption, a table excludes a texture, and a raw bitmap has
+# no spectrum. A bump map around a normal map rotates the tangent that the normals refer to, in `path` too.
 IMPOSSIBLE = {
     "absorbing": {*WRAPPED, "absorption 1e-30"},
     "normal map": {"texture as tint", "texture as index", "absorption 1e-30", "flat bump map"},
@@ -125,7 +125,7 @@ IMPOSSIBLE = {
 
 
 def cases(context: Context) -> Iterator[Case]:
-    """One per variant and scene; the profile `quick` renders in the variant of the run only."""
+    """Yield one case per variant, scene and split depth; in the profile `quick`, in the variant of the run only."""
     quick = context.profile.quick
     for variant in variants(context)[: 1 if quick else 3]:
         names = ["glass", "matt", "absorbing", "normal map", *(["dispersive"] if "spectral" in variant else [])]
@@ -136,10 +136,10 @@ def cases(context: Context) -> Iterator[Case]:
 
 
 def rows(variant: str, name: str, depth: int) -> list[Row]:
-    """One row a change of one scene."""
+    """Return one row per change of one scene."""
 
     def images(scene: Any, around: Nodes | None, first: int, **parameters: Any) -> Any:
-        """Independent renders, one a seed."""
+        """Return independent renders with the seeds `first`, `first` + 1, …"""
         inner = {"type": OURS, "max_depth": 8, "rr_depth": 100, "split_depth": depth} | parameters
         method = mi.load_dict(around | {"inner": inner} if around else inner)
         renders = [mi.render(scene, integrator=method, spp=spp, seed=first + i) for i in range(RENDERS)]
@@ -149,7 +149,9 @@ def rows(variant: str, name: str, depth: int) -> list[Row]:
     left_out = IMPOSSIBLE.get(name, set()) | (IMPOSSIBLE["spectral"] if spectral else set())
     unchanged = mi.load_dict(scenes(spectral)[name], parallel=False, optimize=False)
     expected = images(unchanged, None, seed)
-    for change in (change for change in (*changes(), *WAYS) if change not in left_out):
+    for change in (*changes(), *WAYS):
+        if change in left_out:
+            continue
         scene, (around, parameters) = unchanged, WAYS.get(change, (None, {}))
         if change not in WAYS:
             scene = mi.load_dict(changed(scenes(spectral)[name], change), parallel=False, optimize=False)
@@ -164,18 +166,18 @@ def rows(variant: str, name: str, depth: int) -> list[Row]:
 
 
 def compared(expected: Any, render: Callable[[int], Any], seed: int) -> dict[str, float]:
-    """The values of a row: of the same seeds, or of other ones where the bits differ."""
-    same = render(seed)
-    bits = bool((same == expected).all())
-    other = same if bits else render(seed + 1000)
-    alarms, means = float(not np.isfinite(other).all()), [x.mean(axis=(1, 2)) for x in (expected, other)]
-    for tile in (SIZE, TILE) if not bits else ():
-        alarms += tile_statistics.compare_stacks(expected, other, tile, limits.INVISIBLE_ALARM, 1e-5).alarms
+    """Return the values of a row: with the same seeds, or with other seeds if these images differ."""
+    same_seeds = render(seed)
+    same_bits = bool((same_seeds == expected).all())
+    test = same_seeds if same_bits else render(seed + 1000)
+    alarms, means = float(not np.isfinite(test).all()), [x.mean(axis=(1, 2)) for x in (expected, test)]
+    for tile in (SIZE, TILE) if not same_bits else ():
+        alarms += tile_statistics.compare_stacks(expected, test, tile, limits.INVISIBLE_ALARM, 1e-5).alarms
     error = np.sqrt(sum(x.var(axis=0, ddof=1) / RENDERS for x in means))
-    detectable = 0.0 if bits else float((4.5 * error / expected.mean()).max())
-    noise = [np.var(x, axis=0, ddof=1).mean() for x in (expected, other)]
+    detectable = 0.0 if same_bits else float((4.5 * error / expected.mean()).max())
+    noise = [np.var(x, axis=0, ddof=1).mean() for x in (expected, test)]
     ratio = float(noise[1] / noise[0]) if noise[0] else 1.0
-    return {"alarms": alarms, "same bits": float(bits), "detectable": detectable, "noise": ratio}
+    return {"alarms": alarms, "same bits": float(same_bits), "detectable": detectable, "noise": ratio}
 
 
-STUDY = study(NAME, "Changes that must not be seen", __doc__, TERMS, cases)
+STUDY = study(NAME, "Changes that must not be visible", __doc__, TERMS, cases)

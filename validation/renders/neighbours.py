@@ -1,13 +1,13 @@
-"""Every BSDF of Mitsuba beside, around and within glass: does `refract_path` render what `path` renders?
+"""All BSDFs of Mitsuba beside, around and within glass: does `refract_path` render what `path` renders?
 
-Each BSDF is taken alone and in every wrapper that Mitsuba lets it into. What `refract_path` leaves out is decided by
-the features of a scene, so BSDFs share an image only where each of them alone has the same features: none hides what
-another one lacks. The mean of many independent pixels with few samples each is compared with one well sampled image by
-`path`: a bias at a count of samples stays, however many pixels there are. Tested are the mean of each BSDF over all
-settings, that of each setting over all BSDFs, and every one of both. Random numbers depend on the count and the split
-depth, lobes on the BSDF: two BSDFs are rendered with every count, the others with one for each split depth. Spectral
-and polarised wrappers take `diffuse` and the BSDFs of delta lobes, which alone are split. `path` renders null lobes as
-`volpath` does, so it is the reference for all.
+Each BSDF is tested alone and in every wrapper that Mitsuba allows. The features of a scene decide what `refract_path`
+leaves out, so BSDFs share an image only if each of them alone has the same features. The mean of many independent
+pixels with few samples each is compared with one image of many samples by `path`: more pixels reduce the noise, but not
+a bias that depends on the sample count. There is a test for the mean of each BSDF over all settings, of each setting
+over all BSDFs, and of each BSDF in each setting. Random numbers depend on the sample count and the split depth, lobes
+on the BSDF: two BSDFs are rendered with every count, the others with one count per split depth. In spectral and
+polarised variants, only `diffuse` and the BSDFs with delta lobes are tested; only delta lobes are split. `path` renders
+null lobes as `volpath` does, so it is the reference for all.
 
 `python -m validation renders`
 """
@@ -35,15 +35,15 @@ from validation.run.seeds import current
 from .cases import BLACK, GLASS, TURNED, Case, Nodes, bitmap, flat, study, variants
 
 TERMS = {
-    "alarms": "means that differ by more than noise does but once in 10⁸ tests: of all, of one setting, of one cell",
+    "alarms": "means that differ by more than noise does once in 10⁸ tests: of all, of one setting, or of one cell",
     "difference": "of the mean over all settings, or over all BSDFs, relative to that of `path`",
-    "detectable": "relative difference of that mean that its test finds with probability 1/2",
-    "detectable, each": "the same, the worst, of one BSDF in one setting",
+    "detectable": "relative difference of that mean that its test detects with probability 1/2",
+    "detectable, each": "the largest such difference of one BSDF in one setting",
 }
 NAME = "neighbours"
 SEED = 2041
 SIGMAS = statistics.NormalDist().inv_cdf(1 - limits.NEIGHBOUR_ALARM / 2)
-ROUNDING = 1e-5  # relative, of the mean of a float32 image: where nothing is left to chance there is no other error
+ROUNDING = 1e-5  # relative rounding error of the mean of a float32 image, for images without noise
 TURN, ROUGH, MIXED = {"theta": 30.0}, {"alpha": 0.3}, {"roughness": 0.4, "spec_trans": 0.5}
 DELTA: dict[str, Nodes] = {name: {} for name in ("dielectric", "thindielectric", "null", "circular")}
 DELTA |= {"conductor": {"specular_reflectance": 0.8}, "polarizer": TURN, "retarder": TURN, "refract": GLASS}
@@ -69,44 +69,44 @@ SETTINGS: dict[str, Settings] = {
     "normalmap": ((0, 4), (1, 2), (3, 32)),
 }
 COUNTS = (2, 4, 8, 16, 32, 64, 25)
-# Parameters, and samples of a cell by `path`, as many as in all settings together by `refract_path`. Alpha is compared
-# where emitters are hidden, else colours.
+# Parameters, and samples of a cell by `path`; all settings of `refract_path` together have as many. If emitters are
+# hidden, alpha is compared, otherwise colours.
 LONG, SHORT = {"max_depth": 6, "rr_depth": 3}, {"max_depth": 2, "hide_emitters": True}
 WAYS = {"": (LONG, 320_000), "every count": (LONG, 4_000_000), "alpha": (SHORT, 320_000)}
-# Of the profile `quick`, with 4 samples and one split.
+# In the profile `quick`, with 4 samples and one split.
 QUICK = {"alone": ("diffuse", "dielectric"), "blendbsdf": ("dielectric",), "normalmap": ("refract",)}
 
 
-# Scenes of one BSDF with glass, as cells of one scene. Bars, a grille before the lamp and a sky of hard blocks give
-# structure in every random number.
-WIDE = 6  # cells beside each other
+# Scenes of one BSDF with glass, as cells of one scene. Bars, a grille before the lamp and a sky of hard blocks make the
+# image depend on every random number.
+WIDE = 6  # cells per row
 
 
 def uneven(shape: tuple[int, int], low: float, high: float, grain: int = 1) -> Nodes:
-    """A bitmap of two values in blocks without an order: hard edges at every scale."""
+    """Return a bitmap of random blocks of two values: hard edges at every scale."""
     blocks = np.random.default_rng(3).random(shape) < 0.5
     return bitmap(np.kron(np.where(blocks, high, low), np.ones((grain, grain)))[..., None] * np.ones(3))
 
 
 def bars(place: Any, spans: Iterable[tuple[float, float]], name: str) -> Nodes:
-    """Black bars across the square [-1, 1]² of `place`, each from and to a place in x."""
+    """Return black bars across the square [-1, 1]² transformed by `place`; `spans`: their ranges of x."""
     parts = [mi.ScalarTransform4f().translate([(a + b) / 2, 0, 0]).scale([(b - a) / 2, 1, 1]) for a, b in spans]
     bar = {"type": "rectangle", "bsdf": BLACK}
     return {f"{name}{i}": bar | {"to_world": place @ part} for i, part in enumerate(parts)}
 
 
 def lights(variant: str) -> Nodes:
-    """A lamp behind a grille, and a sky: in spectral variants without polarisation the same in all directions."""
+    """Return a lamp behind a grille, and a sky, which is uniform in spectral variants without polarisation."""
     place = mi.ScalarTransform4f
     down = place().translate([0, 0, 12]).rotate([1, 0, 0], 180).scale(8)
     spans = [(-1, -0.5), (0, 0.25), (0.5, 0.625), (0.75, 0.8125), (0.9375, 0.96875)]  # edges at every scale
-    found = {"lamp": {"type": "rectangle", "to_world": down, "emitter": {"type": "area", "radiance": 0.8}}}
-    found |= bars(place().translate([0, 0, -0.1]) @ down, spans, "down")
-    found |= bars(place().translate([0, 0, -0.2]) @ down @ place().rotate([0, 0, 1], 90), spans, "across")
+    nodes = {"lamp": {"type": "rectangle", "to_world": down, "emitter": {"type": "area", "radiance": 0.8}}}
+    nodes |= bars(place().translate([0, 0, -0.1]) @ down, spans, "down")
+    nodes |= bars(place().translate([0, 0, -0.2]) @ down @ place().rotate([0, 0, 1], 90), spans, "across")
     if variant.endswith("spectral"):
-        return found | {"sky": {"type": "constant", "radiance": 0.4}}
+        return nodes | {"sky": {"type": "constant", "radiance": 0.4}}
     sky = {"type": "envmap", "bitmap": uneven((64, 128), 0.3, 0.8, grain=4)["bitmap"]}
-    return found | {"sky": sky | {"to_world": place().rotate([1, 0.3, 0.2], 70)}}
+    return nodes | {"sky": sky | {"to_world": place().rotate([1, 0.3, 0.2], 70)}}
 
 
 def _ball(bsdf: Nodes, radius: float, *center: float) -> Nodes:
@@ -119,19 +119,19 @@ def _plate(bsdf: Nodes, angle: float, width: float, x: float, y: float) -> Nodes
 
 
 def beside(bsdf: Nodes, x: float, y: float) -> Nodes:
-    """A plate seen from its side, as a turned normal then refuses a lobe; a ball of glass; bars before both."""
+    """Return a plate at an angle at which a tilted normal rejects a lobe, a ball of glass, and bars before both."""
     over = mi.ScalarTransform4f().translate([x, y, 1.2]).scale(0.48)
-    found = bars(over, [(-0.8, -0.6), (0.1, 0.2), (0.7, 0.9)], "bar")
-    return found | {"plate": _plate(bsdf, 65, 1.1, x, y), "ball": _ball(GLASS, 0.2, x + 0.1, y, 0.5)}
+    nodes = bars(over, [(-0.8, -0.6), (0.1, 0.2), (0.7, 0.9)], "bar")
+    return nodes | {"plate": _plate(bsdf, 65, 1.1, x, y), "ball": _ball(GLASS, 0.2, x + 0.1, y, 0.5)}
 
 
 def around(bsdf: Nodes, x: float, y: float) -> Nodes:
-    """A ball around one of glass."""
+    """Return a ball around a ball of glass."""
     return {"outer": _ball(bsdf, 0.46, x, y, 0), "inner": _ball(GLASS, 0.22, x, y, 0.1)}
 
 
 def within(bsdf: Nodes, x: float, y: float) -> Nodes:
-    """A plate in a block of glass: all its light has come through the boundary."""
+    """Return a plate in a block of glass: all its light comes through the boundary."""
     block = mi.ScalarTransform4f().translate([x, y, 0]).scale([0.49, 0.49, 0.3])
     return {"block": {"type": "cube", "to_world": block, "bsdf": GLASS}, "plate": _plate(bsdf, 10, 0.48, x, y)}
 
@@ -140,18 +140,18 @@ CELLS = (beside, around, within)
 
 
 def scene(bsdfs: Iterable[Nodes], variant: str) -> Any:
-    """The cells of all BSDFs, one after the other in rows of `WIDE`."""
-    found: Nodes = {"type": "scene"} | lights(variant)
+    """Return a scene with the cells of all BSDFs, in rows of `WIDE`."""
+    nodes: Nodes = {"type": "scene"} | lights(variant)
     for i, bsdf in enumerate(bsdfs):
-        found[f"bsdf{i}"] = bsdf | {"id": f"bsdf{i}"}
+        nodes[f"bsdf{i}"] = bsdf | {"id": f"bsdf{i}"}
         for j, cell in enumerate(CELLS, len(CELLS) * i):
             parts = cell({"type": "ref", "id": f"bsdf{i}"}, j % WIDE + 0.5, j // WIDE + 0.5)
-            found |= {f"{name} {j}": part for name, part in parts.items()}
-    return mi.load_dict(found, parallel=False, optimize=False)
+            nodes |= {f"{name} {j}": part for name, part in parts.items()}
+    return mi.load_dict(nodes, parallel=False, optimize=False)
 
 
 def measured(view: Any, bsdfs: int, method: Nodes, spp: int, samples: float, seed: int) -> Any:
-    """Mean and squared standard error by BSDF and cell, of two renders with as many pixels as needed."""
+    """Return means and squared standard errors (2 × BSDFs × cells) of two renders with at least `samples` per cell."""
     tall, pixels = -(-bsdfs * len(CELLS) // WIDE), max(8, round((samples / 2 / spp) ** 0.5))
     film = {"type": "hdrfilm", "width": WIDE * pixels, "height": tall * pixels, "rfilter": {"type": "box"}}
     place = mi.ScalarTransform4f().look_at([WIDE / 2, tall / 2, 3], [WIDE / 2, tall / 2, 0], [0, 1, 0])
@@ -167,7 +167,7 @@ def measured(view: Any, bsdfs: int, method: Nodes, spp: int, samples: float, see
 
 
 def cases(context: Context) -> Iterator[Case]:
-    """One per variant and wrapper; the profile `quick` renders a few BSDFs in the variant of the run."""
+    """Yield one case per variant and wrapper; in the profile `quick`, a few BSDFs in the variant of the run."""
     rgb = context.variant
     settings: list[Any] = [(rgb, wrapper, names, ((1, 4),), "") for wrapper, names in QUICK.items()]
     if not context.profile.quick:
@@ -187,8 +187,8 @@ def cases(context: Context) -> Iterator[Case]:
 
 
 def rows(variant: str, wrapper: str, names: tuple[str, ...], settings: Settings, way: str = "") -> list[Row]:
-    """A row for each BSDF, and one for each setting; those that Mitsuba refuses in its own words."""
-    groups: dict[Any, dict[str, Nodes]] = {}  # of BSDFs whose scenes have the same features
+    """Return a row per BSDF and per setting. BSDFs that Mitsuba rejects are not run, with Mitsuba's message."""
+    groups: dict[Any, dict[str, Nodes]] = {}  # features of a scene → its BSDFs
     title, seed, (parameters, samples) = f"{wrapper}, {way}" if way else wrapper, current(SEED), WAYS[way]
     row, table = functools.partial(Row, NAME, OURS), list[Row]()
     for name in names:
@@ -200,7 +200,7 @@ def rows(variant: str, wrapper: str, names: tuple[str, ...], settings: Settings,
             table.append(row(f"{title}: {name}", variant, reason=f"Mitsuba: {reason}"))
     parts = []
     for group in groups.values():
-        gc.collect()  # Dr.Jit compiles every BSDF that is alive
+        gc.collect()  # Dr.Jit compiles every BSDF in memory
         measure = functools.partial(measured, scene(group.values(), variant), len(group))
         expected = measure({"type": "path"} | parameters, 64, samples, seed + 5000)
         ours = [
@@ -217,12 +217,12 @@ def rows(variant: str, wrapper: str, names: tuple[str, ...], settings: Settings,
 
 
 def judged(test: Any, noise: Any, expected: Any, uncertain: Any) -> dict[str, float]:
-    """The values of a row, of the means and squared standard errors by setting, BSDF and cell."""
+    """Return the values of a row from the means and squared standard errors by setting, BSDF and cell."""
     cells = test - expected, noise + uncertain, expected + 0 * test
-    each = tuple(x.sum(-1) for x in cells)
+    each_bsdf = tuple(x.sum(-1) for x in cells)
     whole = cells[0].mean(0).sum(), noise.sum() / len(test) ** 2 + uncertain.sum(), expected.sum()
     alarms, detectable = 0, []
-    for difference, variance, mean in (cells, each, whole):
+    for difference, variance, mean in (cells, each_bsdf, whole):
         error = np.sqrt(variance + np.square(ROUNDING * mean))
         alarms += int(np.count_nonzero(~(np.abs(difference) <= SIGMAS * error)))
         detectable.append(float((SIGMAS * error / mean).max()))

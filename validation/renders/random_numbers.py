@@ -1,8 +1,8 @@
-"""The random numbers of split paths: uniform at every sample count, alone and in pairs, and stratified as promised.
+"""The random numbers of split paths: are they uniform at every sample count, alone and in pairs, and stratified?
 
-One sample is taken at random from each pixel. These are independent, so the counts of equal cells are multinomial and
-Pearson's chi-square holds exactly in the limit, whatever the stratification. Pairs are of two keys: what one boundary
-draws says nothing of what the next one draws. Numbers of 20 keys are pooled.
+One sample is taken at random from each pixel. These samples are independent, so the counts of equal cells are
+multinomial, and Pearson's chi-square test is valid for large counts, whatever the stratification. Pairs have numbers of
+two keys: the numbers of one boundary must be independent of those of the next one. Numbers of 20 keys are pooled.
 
 `python -m validation renders`
 """
@@ -32,17 +32,17 @@ NAME, SEED = "random numbers", 2040
 TERMS = {
     "alarms": "chi-square tests whose p-value is below the study's false-alarm rate over the number of its tests",
     "tests": "chi-square tests of this row",
-    "least p": "smallest p-value, times the number of tests of this row; of the order of 1 where nothing is wrong",
-    "not stratified": "pixels in which a stratum holds no sample or two",
+    "least p": "smallest p-value, times the number of tests of this row; of the order of 1 for correct numbers",
+    "not stratified": "pixels with a stratum that does not hold exactly one sample",
 }
 KEYS, SEEDS, LANES, CELLS = 20, 5, 2**16, 32
 QUICK = (1, 4, 7, 16, 32, 64, 100, 256)
-TESTS = 300 * SEEDS * 6  # of the whole study: the kinds are those of `histograms`
-EDGE = 2.0**-20  # nearer to an edge a float32 may round to either side
+TESTS = 300 * SEEDS * 6  # in the whole study: counts × seeds × kinds of `histograms`
+EDGE = 2.0**-20  # closer to an edge, a float32 may round to either side
 
 
 def cases(context: Context) -> Iterator[Case]:
-    """Counts from 1 to 300; in the profile `quick` a few, one seed."""
+    """Yield one case per 30 sample counts from 1 to 300; in the profile `quick`, one of a few counts and one seed."""
     quick = context.profile.quick
     for counts in [QUICK] if quick else [range(first, first + 30) for first in range(1, 301, 30)]:
         work = functools.partial(rows, context.variant, counts, 1 if quick else SEEDS)
@@ -50,7 +50,7 @@ def cases(context: Context) -> Iterator[Case]:
 
 
 def rows(variant: str, counts: Sequence[int], seeds: int, source: Any = KeyedMultijitter) -> list[Row]:
-    """One row per kind of number; `source` makes them, as `KeyedMultijitter` does."""
+    """Return one row per kind of number; `source` generates them, as `KeyedMultijitter` does."""
     from scipy.stats import chi2
 
     p, unstratified = defaultdict[str, list[float]](list), Counter[str]()
@@ -59,9 +59,9 @@ def rows(variant: str, counts: Sequence[int], seeds: int, source: Any = KeyedMul
         for kind, histogram, broken in histograms(source, count, current(SEED) + seed):
             pooled[kind] = pooled.get(kind, 0) + histogram
             unstratified[kind] += broken
-        for kind, seen in pooled.items():
-            expected = seen.sum() / seen.size
-            p[kind].append(float(chi2.sf(((seen - expected) ** 2).sum() / expected, seen.size - 1)))
+        for kind, observed in pooled.items():
+            expected = observed.sum() / observed.size
+            p[kind].append(float(chi2.sf(((observed - expected) ** 2).sum() / expected, observed.size - 1)))
     budgets, replay = {"alarms": 0.0, "not stratified": 0.0}, {"seed": current(SEED), "keys": KEYS}
     row, table = functools.partial(Row, NAME, OURS), list[Row]()
     for kind, tests in p.items():
@@ -73,7 +73,7 @@ def rows(variant: str, counts: Sequence[int], seeds: int, source: Any = KeyedMul
 
 
 def histograms(make: Any, count: int, seed: int) -> Iterator[tuple[str, Any, int]]:
-    """Kind, occupied cells of one sample per pixel, pixels that are not stratified; once a key."""
+    """Yield, per key: a kind, the counts of cells of one sample per pixel, and the pixels that are not stratified."""
     pixels = max(LANES // count, 1)
     sampler = mi.load_dict({"type": "independent", "sample_count": count})
     sampler.seed(seed, pixels * count)
@@ -102,13 +102,13 @@ def histograms(make: Any, count: int, seed: int) -> Iterator[tuple[str, Any, int
 
 
 def cells(x: Any, y: Any = None) -> Any:
-    """Numbers in each of 32² cells: of the interval or of the square."""
+    """Return the count of each of 32² cells, of the interval or of the square."""
     cell = (x * CELLS**2).astype(int) if y is None else (x * CELLS).astype(int) * CELLS + (y * CELLS).astype(int)
     return np.bincount(cell, minlength=CELLS**2)
 
 
 def torn(rows: int, y: Any, columns: int = 1, x: Any = 0.0) -> int:
-    """Pixels, one a line, some of whose `rows` × `columns` strata do not hold one sample each."""
+    """Return the number of pixels (rows of `y`, `x`) whose `rows` × `columns` strata do not hold one sample each."""
     stratum = np.floor(y * rows) * columns + np.floor(x * columns)
     suspects = (np.sort(stratum, axis=1) != np.arange(rows * columns)).any(axis=1)
     at_edge = [(np.abs(a * n - np.round(a * n)) < EDGE * n) & (n > 1) for a, n in ((y, rows), (x + 0 * y, columns))]

@@ -1,12 +1,12 @@
-"""Renders in passes: is their estimated error right, do they stop where they should, and what do passes cost?
+"""Renders in passes: is their estimated error correct, do they stop at the requested error, and what do passes cost?
 
-Small renders, each with its own seed, end by `--until` at the error that 12 passes have on average: there an estimate
-ends a render by chance. Their true error is measured against a render of a hundred times as many samples. With 95 %
-probability it is below the error asked for, by the method's own claim. The budget is the largest count that has a
-probability of more than 0.001 then, so that the study fails by chance once in 1000 runs.
+Small renders, each with its own seed, stop by `--until` at the average error of 12 passes, where chance decides when
+the estimate stops a render. Their true error is measured against a render with a hundred times as many samples. The
+method claims that it is below the requested error with 95 % probability. The budget is the largest number of
+exceptions that then has a probability above 0.001, so the study fails by chance once in 1000 runs.
 
-One call of `mi.render` and as many samples in passes take turns; the ratio is of processor time. A render in passes
-ends with a file of its image and variance. The second ratio is that to a call whose image is written, too.
+Times are CPU times of a render in passes over one call of `mi.render` with as many samples, alternating. A render in
+passes writes a file with its image and variance; the second ratio is to a call with the time to write its image.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ from validation.study import Study, Task, about
 
 ONE_CALL, WRITTEN = "time of passes / one call", "time of passes / one call, written"
 TERMS = {
-    "renders": "small ones, each with its own seed",
-    "beyond": "renders whose true error is above the one they ended by",
-    "outside": "renders whose true error is outside the interval that they state",
-    "stated / true": "the mean of the squared errors that are stated, over that of the true ones",
-    "passes": "that a render took on average",
-    ONE_CALL: "processor time; median of alternating pairs; low, high: their extremes",
-    WRITTEN: "the same, to one call and the time to write its image; median",
+    "renders": "number of small renders, each with its own seed",
+    "beyond": "renders whose true error is above the requested one",
+    "outside": "renders whose true error is outside their estimated interval",
+    "stated / true": "the mean of the estimated squared errors, over that of the true ones",
+    "passes": "mean number of passes of a render",
+    ONE_CALL: "CPU time; median of alternating pairs; low, high: their extremes",
+    WRITTEN: "the same, over one call and the time to write its image; median",
 }
 NAME = "passes"
 COUNTS = {"quick": 20, "standard": 100, "full": 500}  # renders of each scene
 STILLS = ("sphere", "nested")
 RESOLUTION, PASS_SPP = 24, 2
-REFERENCE = 100  # times the samples of 12 passes: 1 % of their squared error
+REFERENCE = 100  # times the samples of 12 passes: it adds 1 % to their squared error
 PAIRS = {"quick": 0, "standard": 7, "full": 9}
 TIMED_SPP = {"quick": (), "standard": (64, 256), "full": (64, 256, 1024)}
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per scene for the errors, and one for the time."""
+    """Return one task per scene for the errors, and one per sample count for the time."""
     if context.variant.startswith("scalar"):
         reason = "scalar variants render by `mi.render`, a hundred times as slowly"
         return [Task(NAME, lambda: [Row(NAME, "until", "scenes", context.variant, reason=reason)])]
@@ -63,7 +63,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def error_rows(context: Context, name: str, seed: int = 0) -> list[Row]:
-    """One row: how often the errors of many renders are what they say."""
+    """Return one row: how often the true errors of many renders agree with the estimated ones."""
     from scipy.stats import binom
 
     count, table = COUNTS[context.profile.name], []
@@ -71,43 +71,42 @@ def error_rows(context: Context, name: str, seed: int = 0) -> list[Row]:
     with under(context.variant), tempfile.TemporaryDirectory() as folder:
 
         def render(seed: int, **ends: Any) -> Any:
-            """One render of it from its first pass to its end."""
+            """Return a finished render of the scene."""
             job = Job(SCENES / f"{name}.xml", defines, seed)
-            whole: Any = resume(job, Path(folder) / "image.exr", Limits(**ends), restart=True)
-            whole.run()
-            return whole
+            finished: Any = resume(job, Path(folder) / "image.exr", Limits(**ends), restart=True)
+            finished.run()
+            return finished
 
         reference = render(2**31 + seed, spp=12 * PASS_SPP * REFERENCE, pass_spp=64).image()
-        twelve = render(2**31 + seed + 1, spp=96 * PASS_SPP, pass_spp=PASS_SPP).error()
-        asked = twelve.value * math.sqrt(96 / 12)
+        error_of_96_passes = render(2**31 + seed + 1, spp=96 * PASS_SPP, pass_spp=PASS_SPP).error()
+        requested = error_of_96_passes.value * math.sqrt(96 / 12)
         seeds = range(seed * count + 1, (seed + 1) * count + 1)
-        for one in (render(seed, until=asked, pass_spp=PASS_SPP) for seed in seeds):
+        for one in (render(seed, until=requested, pass_spp=PASS_SPP) for seed in seeds):
             stated = one.error()
             true = math.sqrt(np.mean((one.image() - reference) ** 2)) / abs(reference.mean())
             table.append((true, stated.value, stated.low, stated.high, one.progress.passes))
     true, stated, low, high, passes = np.array(table).T
     values = {
         "renders": float(count),
-        "beyond": float((true > asked).sum()),
+        "beyond": float((true > requested).sum()),
         "outside": float(((true < low) | (true > high)).sum()),
         "stated / true": float((stated**2).mean() / (true**2).mean()),
         "passes": float(passes.mean()),
     }
-    # Of so many renders the largest number that may be beyond.
-    most = float(binom.ppf(1 - limits.STOPPED_WRONGLY, count, 1 - LEVEL))
-    replay = {"scene": name, "resolution": RESOLUTION, "asked": asked, "seeds": [seeds[0], seeds[-1]]}
-    budgets = {"beyond": most, "outside": most}
+    allowed = float(binom.ppf(1 - limits.STOPPED_WRONGLY, count, 1 - LEVEL))
+    replay = {"scene": name, "resolution": RESOLUTION, "asked": requested, "seeds": [seeds[0], seeds[-1]]}
+    budgets = {"beyond": allowed, "outside": allowed}
     return [Row(NAME, "--until", name, context.variant, values, budgets, replay=replay)]
 
 
 def time_rows(context: Context, spp: int) -> list[Row]:
-    """One row: processor time of a render in passes over that of one call."""
+    """Return one row: CPU time of a render in passes over that of one call."""
     import mitsuba as mi
 
-    def timed(work: Callable[..., Any], *arguments: Any, **named: Any) -> tuple[float, Any]:
+    def timed(work: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
         start = time.process_time()
-        made = work(*arguments, **named)
-        return time.process_time() - start, made
+        result = work(*arguments)
+        return time.process_time() - start, result
 
     def image_of(scene: Any) -> np.ndarray:
         return np.array(mi.render(scene, spp=spp))

@@ -1,9 +1,9 @@
-"""Panes of glass far from the origin, in even light: how much of it is seen.
+"""Thin panes: is a pane of glass far from the origin invisible in uniform light?
 
-A pane in light of radiance 1 from everywhere is invisible: each ray carries 1, whether it was reflected or refracted. A
-ray that starts beyond the other side of the pane never leaves the glass, and carries 1/n² of the light. Mitsuba starts
-rays 9e-5 (1 + the largest coordinate) beside the surface that they leave; `refract_path` starts those of delta lobes
-nearer to it (`plugins/ray_origins`).
+A pane in a constant environment of radiance 1 is invisible: each ray carries 1, reflected or refracted. A ray that
+starts beyond the other side of the pane never leaves the glass, and carries 1/n² of the light. Mitsuba starts rays at
+9e-5 (1 + the largest coordinate) from the surface that they leave; `refract_path` starts those of delta lobes closer to
+it (`plugins/ray_origins`).
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from validation.study import Study, Task, about
 
 NAME = "thin panes"
 OFF = "mean radiance off"
-TERMS = {OFF: "from 1, in magnitude; 1 − 1/1.5² = 0.556 where no ray leaves the glass"}
-# Thickness and place along x, in metres; the pane is 2 m wide.
+TERMS = {OFF: "|mean radiance − 1|; 1 − 1/1.5² = 0.556 if no ray leaves the glass"}
+# Thickness and position along x, in metres; the pane is 2 m wide.
 PANES = ((4e-3, 0.0), (4e-3, 10.0), (1e-3, 12.0), (4e-3, 100.0), (1e-4, 12.0))
 SPP, RESOLUTION = 16, 64
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per method."""
+    """Return one task per method that does not split."""
     return [
         Task(f"{NAME}: {method.name}", functools.partial(method_rows, context, method))
         for method in METHODS
@@ -36,7 +36,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def method_rows(context: Context, method: Method) -> list[Row]:
-    """A row per pane."""
+    """Return a row per pane."""
     import mitsuba as mi
 
     resolution, rows = 8 if context.scalar else RESOLUTION, []

@@ -1,9 +1,9 @@
-"""What a scene does not use: the cost of each feature in a kernel, of many glasses, and of an edit of the index.
+"""Unused features: what each feature costs in a kernel, and what many glasses and edits of an index cost.
 
-A feature that is not used must not be in the kernel: the plugin's `sample` is traced alone, with and without it, and
-Dr.Jit's operations are counted. Renders show glass balls side by side under a sky with spots, each with its own index.
-Dr.Jit compiles the code of every plugin that is alive, so each scene is measured alone. The times of a first image and
-of an edit are in the study `scaling`.
+A feature that is not used must not be in the kernel: the plugin's `sample` is traced alone, with and without the
+feature, and Dr.Jit's operations are counted. Renders show glass balls side by side under a sky with spots, each with
+its own index. Dr.Jit compiles the code of every plugin in memory, so each scene is measured alone. The times of a first
+image and of an edit are in the study `scaling`.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from validation.study import Study, Task, about
 from .cases import flat
 
 TERMS = {
-    "operations": "Dr.Jit's count for the whole kernel; of `sample` alone, or of a render",
+    "operations": "Dr.Jit's count for the whole kernel of `sample` alone, or of a render",
     "added": "operations in addition to those of the plain plugin, in radiance mode, with both lobes",
-    "compiled": "kernels compiled (in no cache) in all images after the first",
+    "compiled": "kernels compiled (not from a cache) for all images after the first",
     "call": "seconds of one call of `sample`, over the built-in's",
     "frozen": "time of an image under `dr.freeze`, over that of the same image traced again; warm",
-    "off after an edit": "largest difference of the two after an edit of an index: 0 unless the frozen one is stale",
+    "off after an edit": "largest difference of the two after an edit of an index; large if the frozen image is stale",
 }
 NAME = "features"
 RAYS = 1024
@@ -46,14 +46,14 @@ CALLS = 2000
 STEPS = 4  # of an optimisation
 SPECTRAL, DISPERSIVE = "llvm_ad_spectral", "cauchy(1.5, 4000)"
 SCALAR = "scalar variants have no kernels"
-RECORDED = "recorded: what a feature costs that is used"
-BOTH = ((PLUGIN, ""), (BUILTIN, f", {BUILTIN}"))  # and what is added to the names of its values
+RECORDED = "recorded: the cost of a feature that is used"
+BOTH = ((PLUGIN, ""), (BUILTIN, f", {BUILTIN}"))  # plugins, and the suffix of the names of their values
 
 _row = functools.partial(Row, NAME, PLUGIN)
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per kind; in the profile `quick` those without scenes of many glasses."""
+    """Return one task per kind of measurement; in the profile `quick`, those without scenes of many glasses."""
     calls = Task("features: scalar calls", scalar_rows, timed=True)
     if context.variant.startswith("scalar"):
         return [Task("features", lambda: [_row("kernels", context.variant, reason=SCALAR)]), calls]
@@ -68,11 +68,11 @@ def tasks(context: Context) -> list[Task]:
 
 
 def operations(
-    plugin: str, parameters: dict[str, Any] | None = None, differentiate: bool = False, asked: Any = None
+    plugin: str, parameters: dict[str, Any] | None = None, differentiate: bool = False, bsdf_context: Any = None
 ) -> float:
-    """The operations of a kernel that computes all that `sample` returns, of directions and samples in memory.
+    """Return the operations of a kernel that computes all results of `sample` from directions and samples in memory.
 
-    `asked`: the context; by default both lobes, in radiance mode, by an integrator that follows no wavelengths.
+    `bsdf_context`: by default both lobes, in radiance mode, by an integrator that does not follow wavelengths.
     """
     import mitsuba as mi
 
@@ -89,22 +89,22 @@ def operations(
         waves = [dr.linspace(mi.Float, low, low + 90, RAYS) for low in range(400, 760, 90)]
         si.wavelengths = type(si.wavelengths)(*waves)
     dr.eval(si.wi, si.uv, si.wavelengths, sample)
-    work = functools.partial(bsdf.sample, asked or mi.BSDFContext(), si, sample, [0, 0])
+    work = functools.partial(bsdf.sample, bsdf_context or mi.BSDFContext(), si, sample, [0, 0])
     return float(max(entry["operation_count"] for entry in kernels(work)))
 
 
 def wavelength_rows(context: Context) -> list[Row]:
-    """What glass pays for dispersion and absorption that it has not, and dispersive glass where nobody follows it."""
+    """Return rows of dispersion and absorption: no cost for glass without them, or if the integrator ignores them."""
     if reason := context.variants.get(SPECTRAL, "not in this wheel"):
         return [_row("dispersion", SPECTRAL, reason=reason)]
     dispersive, follow = {"int_ior": DISPERSIVE}, followed_context()
     with under(SPECTRAL):
         plain = operations(PLUGIN)
         counts = {
-            "no dispersion": operations(PLUGIN, asked=follow),
+            "no dispersion": operations(PLUGIN, bsdf_context=follow),
             "dispersion, by `path`": operations(PLUGIN, dispersive),
-            "dispersion": operations(PLUGIN, dispersive, asked=follow),
-            "absorption": operations(PLUGIN, {"int_absorption": 0.5}, asked=follow),
+            "dispersion": operations(PLUGIN, dispersive, bsdf_context=follow),
+            "absorption": operations(PLUGIN, {"int_absorption": 0.5}, bsdf_context=follow),
         }
     return [
         _row(
@@ -120,19 +120,19 @@ def wavelength_rows(context: Context) -> list[Row]:
 
 
 def scalar_rows() -> list[Row]:
-    """Time of a call of `sample` in a scalar variant: a plugin in Python, against the built-in's C++."""
+    """Return one row: the time of a call of `sample` in a scalar variant, in Python, over the built-in's in C++."""
     import mitsuba as mi
 
     with under("scalar_rgb"):
         si: Any = dr.zeros(mi.SurfaceInteraction3f)
         si.wi = mi.Vector3f(0.6, 0, 0.8)
-        asked = mi.BSDFContext()
+        bsdf_context = mi.BSDFContext()
         bsdfs = {name: mi.load_dict({"type": name, "int_ior": 1.5, "ext_ior": 1.0}) for name in (PLUGIN, BUILTIN)}
 
         def clock(name: str) -> float:
             bsdf, start = bsdfs[name], time.process_time()
             for _ in range(CALLS):
-                bsdf.sample(asked, si, 0.5, [0, 0])
+                bsdf.sample(bsdf_context, si, 0.5, [0, 0])
             return time.process_time() - start
 
         seconds = kernel_timing.rounds({name: name for name in bsdfs}, clock, PAIRS)
@@ -141,21 +141,23 @@ def scalar_rows() -> list[Row]:
 
 
 def operation_rows(context: Context) -> list[Row]:
-    """One row a feature, with the built-in's own where it has it; then those of `wavelength_rows`."""
+    """Return one row per feature, with the built-in's operations if it has the feature; then `wavelength_rows`."""
     import mitsuba as mi
 
     plain = {plugin: operations(plugin) for plugin in (PLUGIN, BUILTIN)}
 
-    def row(case: str, less: Any = None, ours_only: bool = False, variant: str = context.variant, **asked: Any) -> Row:
-        """`less`: a context with fewer features, of which the plugin must drop at least as many as the built-in."""
+    def row(
+        case: str, less: Any = None, ours_only: bool = False, variant: str = context.variant, **options: Any
+    ) -> Row:
+        """`less`: a context with fewer lobes; the plugin must save at least as many operations as the built-in."""
         values: dict[str, float] = {}
         for plugin, name in BOTH[: 1 if ours_only else 2]:
             with under(variant):
-                count = operations(plugin, asked=less, **asked)
+                count = operations(plugin, bsdf_context=less, **options)
             values |= {f"operations{name}": count, f"added{name}": count - plain[plugin]}
         budgets = {"added": values[f"added, {BUILTIN}"]} if less else {}
         goals = {"operations": plain[BUILTIN]} if case == "plain" else {}
-        replay = {"rays": RAYS} | {key: str(value) for key, value in asked.items()}
+        replay = {"rays": RAYS} | {key: str(value) for key, value in options.items()}
         remark = "" if budgets or goals else RECORDED
         return _row(case, variant, values, budgets, goals, remark, replay)
 
@@ -177,15 +179,16 @@ def operation_rows(context: Context) -> list[Row]:
 
 
 def glass_rows(context: Context) -> list[Row]:
-    """The kernel of a render for growing numbers of glasses, and what an edit compiles; also of the built-in.
+    """Return rows of the kernel of a render for growing numbers of glasses, and of what an edit compiles.
 
-    Compared to two: a plugin that is the only one is called directly, which saves the six operations of a choice.
+    Of both plugins. Counts are relative to two glasses: a single plugin is called directly, which saves the six
+    operations of a choice.
     """
     return [row for plugin in (PLUGIN, BUILTIN) for row in rows_of_glasses(context, plugin)]
 
 
 def rows_of_glasses(context: Context, plugin: str) -> list[Row]:
-    """The rows of one of them."""
+    """Return the rows of one plugin."""
     rows = []
     with alone(plugin, 2) as balls:
         two = size_of(balls)
@@ -200,7 +203,7 @@ def rows_of_glasses(context: Context, plugin: str) -> list[Row]:
 
 
 def optimisation_rows(context: Context) -> list[Row]:
-    """Gradient steps on an index. The first compiles, with a derivative for the first time; then nothing does."""
+    """Return one row of gradient steps on an index: the first compiles its derivative, later ones must not compile."""
     with alone(PLUGIN, 1, integrator="volpath", max_depth=3) as balls:
         before = float(balls.params[balls.eta][0])
         first, *later = (compiled(functools.partial(step, balls)) for _ in range(STEPS))
@@ -210,7 +213,7 @@ def optimisation_rows(context: Context) -> list[Row]:
 
 
 def step(balls: Balls) -> Any:
-    """One step of gradient descent on the mean of an image."""
+    """Take one step of gradient descent on the mean of an image."""
     import mitsuba as mi
 
     params, key = balls.params, balls.eta
@@ -223,7 +226,7 @@ def step(balls: Balls) -> Any:
 
 
 def frozen_rows(context: Context) -> list[Row]:
-    """The steady state of many glasses is tracing each anew; a frozen function replays what was traced."""
+    """Return one row: the time of a frozen function, which replays what was traced, over tracing many glasses again."""
     import mitsuba as mi
 
     count = GLASSES[-1]
@@ -232,7 +235,7 @@ def frozen_rows(context: Context) -> list[Row]:
         with alone(plugin, count) as balls:
             replay, seed = functools.partial(balls.frozen(), balls.params), dr.opaque(mi.UInt32, 0)
             subjects = {"frozen": functools.partial(replay, seed), "traced": balls.image}
-            for _ in range(2):  # from two calls Dr.Jit knows what varies
+            for _ in range(2):  # Dr.Jit needs two calls to learn what varies
                 dr.eval(replay(seed))
             seconds = kernel_timing.rounds(subjects, seconds_of, PAIRS)
             values |= kernel_timing.ratio(f"frozen / traced{name}", seconds["frozen"], seconds["traced"])
@@ -244,4 +247,4 @@ def frozen_rows(context: Context) -> list[Row]:
     return [_row(case, context.variant, values, budgets, replay={"glasses": count})]
 
 
-STUDY = Study(NAME, "What a scene does not use", about(__doc__), TERMS, tasks, records=(BUILTIN,))
+STUDY = Study(NAME, "Unused features", about(__doc__), TERMS, tasks, records=(BUILTIN,))

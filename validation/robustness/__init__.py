@@ -1,6 +1,6 @@
-"""What tests do when our code is mutated. Garbage inputs and killed commands are tests (`tests/robustness`).
+"""Do the tests detect mutations of the package's code? Garbage inputs and killed commands are tests: tests/robustness.
 
-In: a seed and a number of mutants. Out: rows, which name each mutant that no test notices.
+In: a seed and a number of mutants. Out: rows, which name each mutant that no test detects.
 """
 
 __all__ = ["code_mutants"]

@@ -1,9 +1,9 @@
-"""Mutants of our own code: a line is changed as by a slip, and a test must notice.
+"""Mutants of the package's code: a line gets a small mistake, which a test must detect.
 
-Lines of all rooms are drawn with a seed. Each gets one change that cosmic-ray would make there, in a private copy of
-the source tree, where the tests of its room run until one fails (`cosmic-ray.toml`). A mutant that all of them pass has
-survived: a test is missing, or the change cannot be observed, which `explained_mutants.json` says in one line. A test
-that kills a mutant must pass without it.
+Lines of all subpackages are drawn with a seed. Each line gets one change by cosmic-ray, in a private copy of the source
+tree; the tests of its subpackage run there until one fails (`cosmic-ray.toml`). A mutant that passes all of them has
+survived: a test is missing, or the change cannot be observed, for a reason in `explained_mutants.json`. A test that
+kills a mutant must pass without the mutant.
 
 `python -m validation.robustness.code_mutants COUNT [SEED]` prints each outcome, and at the end the counts as JSON.
 """
@@ -39,24 +39,24 @@ from validation.study import Study, Task, about
 
 ROOT = Path(__file__).parents[2]
 CONFIG = Path(__file__).with_name("cosmic-ray.toml")
-COPIED = ("mi_refract", "tests", "validation", "scenes", ".ci", ".github")  # and the files beside them
+COPIED = ("mi_refract", "tests", "validation", "scenes", ".ci", ".github")  # and the files in the root folder
 COUNTS = {"quick": 3, "standard": 20, "full": 220}
-SEED = 0  # a new one for each release
+SEED = 0  # each release gets a new one
 ALL = "all rooms"
 COMMANDS = {"image_diff": "diff", "ray_sets": "rays", "scene_export": "scene", "rendering": "render", "planar": "trace"}
 TERMS = {
     "mutants": "changes of a line, one at a time",
-    "killed": "changes that a test noticed, or that never ended",
-    "survived": "changes that all tests passed",
-    "explained": "those of them that cannot be observed, each for a recorded reason",
-    "score": "killed or explained, of all",
-    "unexplained": "neither killed nor explained, of all",
+    "killed": "changes that a test detected, or that never ended",
+    "survived": "changes that passed all tests",
+    "explained": "survivors that cannot be observed, each for a recorded reason",
+    "score": "share of mutants that are killed or explained",
+    "unexplained": "share of mutants that are neither killed nor explained",
 }
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """`operator` of cosmic-ray, where it applies for the `occurrence`-th time in `path`; `line` becomes another one."""
+    """A change by an `operator` of cosmic-ray at its `occurrence` in `path`; `line` becomes another line."""
 
     path: str  # from the root: "mi_refract/plugins/refract.py"
     operator: str
@@ -67,26 +67,25 @@ class Mutant:
 
     @property
     def room(self) -> str:
-        """The package, or the module, that it is in."""
+        """The subpackage, or the module, of the changed line."""
         return Path(self.path).parts[1].removesuffix(".py")
 
     @property
     def reason(self) -> str:
-        """Why it cannot be observed; "" where nothing says so. Numbers of lines do not matter."""
+        """The reason why the change cannot be observed; "" without one. Line numbers do not matter."""
         entries = json.loads(Path(__file__).with_name("explained_mutants.json").read_text("utf-8"))
         key = {"file": self.path, "operator": self.operator, "line": self.line, "becomes": self.becomes}
         return next((entry["reason"] for entry in entries if entry.items() >= key.items()), "")
 
     def __str__(self) -> str:
-        """Where it is, and what changes."""
+        """The place, and the change."""
         return f"{self.path}:{self.number}: {self.operator}: {self.line} → {self.becomes}"
 
 
 def sample(root: Path, count: int, seed: int) -> list[Mutant]:
-    """A mutant of each of the first `count` lines that have one: a smaller sample begins a larger one.
+    """Return a mutant of each of the first `count` lines that have one; a smaller sample begins a larger one.
 
-    The order is that of a hash of the seed, the file and the text of the line: an edit changes what is drawn from the
-    lines that it changes, and nothing else.
+    Lines are ordered by a hash of the seed, the file and the line's text: an edit only affects the lines it changes.
     """
     drawn = []
     for path in sorted((root / "mi_refract").rglob("*.py")):
@@ -101,39 +100,39 @@ def sample(root: Path, count: int, seed: int) -> list[Mutant]:
         places = _places((root / name).read_text("utf-8")).get(number, [])
         kinds = sorted({operator.partition("_")[0] for operator, _ in places})
         rng = random.Random(digest)
-        rng.shuffle(kinds)  # a binary operator has eleven replacements: the kind of change is drawn before the change
-        chosen = (rng.choice([x for x in places if x[0].partition("_")[0] == kind]) for kind in kinds)
-        yield from filter(None, (_mutant(root, name, number, *place) for place in chosen))
+        rng.shuffle(kinds)  # kinds first: a binary operator has eleven replacements, which would dominate
+        candidates = (rng.choice([x for x in places if x[0].partition("_")[0] == kind]) for kind in kinds)
+        yield from filter(None, (_mutant(root, name, number, *candidate) for candidate in candidates))
 
     lines = (next(of_line(*line), None) for line in sorted(drawn))
     return list(itertools.islice(filter(None, lines), count))
 
 
 def every(root: Path, name: str) -> list[Mutant]:
-    """All mutants of a file."""
+    """Return all mutants of a file."""
     places = _places((root / name).read_text("utf-8"))
-    mutants = (_mutant(root, name, number, *place) for number, here in places.items() for place in here)
+    mutants = (_mutant(root, name, number, *place) for number, of_line in places.items() for place in of_line)
     return [mutant for mutant in mutants if mutant]
 
 
 @functools.cache
 def _places(source: str) -> dict[int, list[tuple[str, int]]]:
-    """Operators and occurrences by line; without the operators that take arguments."""
+    """Return operators and their occurrences by line number, without operators that take arguments."""
     from cosmic_ray.ast import ast_nodes, get_ast
     from cosmic_ray.operators.provider import OperatorProvider
 
     nodes: list[Any] = list(ast_nodes(get_ast(source)))
     provider = OperatorProvider()
-    found: dict[int, list[tuple[str, int]]] = {}
+    places: dict[int, list[tuple[str, int]]] = {}
     for name in sorted(name for name in provider if not provider[name].arguments()):
         starts = (start for node in nodes for start, _ in provider[name]().mutation_positions(node))
         for occurrence, (number, _) in enumerate(starts):
-            found.setdefault(number, []).append((name, occurrence))
-    return found
+            places.setdefault(number, []).append((name, occurrence))
+    return places
 
 
 def _mutant(root: Path, name: str, number: int, operator: str, occurrence: int) -> Mutant | None:
-    """The mutant; None where it does not compile, or cannot change what the module does."""
+    """Return the mutant; None if it does not compile, or cannot change the module's behaviour."""
     from cosmic_ray.mutating import mutate_code
     from cosmic_ray.operators.provider import OperatorProvider
 
@@ -141,7 +140,7 @@ def _mutant(root: Path, name: str, number: int, operator: str, occurrence: int) 
     changed = str(mutate_code(source, OperatorProvider()[operator](), occurrence))
 
     def behaviour(source: str) -> str:
-        """The module without annotations, `__all__` and imports for annotations; "" where it does not compile."""
+        """Return the module without annotations, `__all__` and imports for annotations; "" if it does not compile."""
         try:
             tree = ast.parse(source)
         except SyntaxError:
@@ -163,7 +162,7 @@ def _mutant(root: Path, name: str, number: int, operator: str, occurrence: int) 
 
 
 def guards(root: Path, path: str) -> list[str]:
-    """The tests of a file: those named after it, then those of its room and of its command, then that of structure."""
+    """Return the tests of a file: those named after it, of its subpackage, of its command, and of the structure."""
     room, stem = Path(path).parts[1].removesuffix(".py"), Path(path).stem
     tests = root / "tests"
     places = [*sorted(tests.rglob(f"test_{stem}.py")), tests / room, tests / f"test_{room}.py"]
@@ -172,7 +171,7 @@ def guards(root: Path, path: str) -> list[str]:
 
 
 def examine(mutants: Iterable[Mutant], root: Path = ROOT) -> Iterator[tuple[Mutant, bool]]:
-    """Whether each was killed. ValueError where a test that fails does so without a mutant, too."""
+    """Yield each mutant and whether it was killed. ValueError if a test fails without a mutant, too."""
     from cosmic_ray.config import load_config
     from cosmic_ray.mutating import mutate_and_test
     from cosmic_ray.testing import TestOutcome, run_tests
@@ -193,7 +192,7 @@ def examine(mutants: Iterable[Mutant], root: Path = ROOT) -> Iterator[tuple[Muta
                 if result.worker_outcome is not WorkerOutcome.NORMAL:
                     raise ValueError(f"{mutant}: not tested: {(result.output or '')[-300:]}")
                 if result.is_killed:
-                    # Where no test is named, it hung, or pytest could not start: then all must pass without it.
+                    # Without a named test, tests hung or pytest did not start: then all must pass without the mutant.
                     test = re.search(r"^(?:FAILED|ERROR) ([^\s\[]+)", result.output or "", re.MULTILINE)
                     tests = test[1] if test else tests
                     if tests not in passed:
@@ -203,25 +202,26 @@ def examine(mutants: Iterable[Mutant], root: Path = ROOT) -> Iterator[tuple[Muta
             yield mutant, result.is_killed
 
 
-def rows(found: Sequence[tuple[Mutant, bool]], seed: int) -> list[Row]:
-    """A row per room, and one for all, which has the bound: a room may have three mutants."""
-    made = []
-    for room in dict.fromkeys([ALL, *sorted(mutant.room for mutant, _ in found)]):
-        here = [(mutant, killed) for mutant, killed in found if room in (ALL, mutant.room)]
-        survived = [mutant for mutant, killed in here if not killed]
+def rows(outcomes: Sequence[tuple[Mutant, bool]], seed: int) -> list[Row]:
+    """Return a row per subpackage, and one for all with the bound: a subpackage may have only a few mutants."""
+    result = []
+    for room in dict.fromkeys([ALL, *sorted(mutant.room for mutant, _ in outcomes)]):
+        of_room = [(mutant, killed) for mutant, killed in outcomes if room in (ALL, mutant.room)]
+        count = len(of_room)
+        survived = [mutant for mutant, killed in of_room if not killed]
         missed = [str(mutant) for mutant in survived if not mutant.reason]
-        values: dict[str, float] = {"mutants": len(here), "killed": len(here) - len(survived)}
+        values: dict[str, float] = {"mutants": count, "killed": count - len(survived)}
         values |= {"survived": len(survived), "explained": len(survived) - len(missed)}
-        values |= {"score": 1 - len(missed) / len(here), "unexplained": len(missed) / len(here)}
-        replay: dict[str, Any] = {"seed": seed, "command": f"python -m {MODULE} {len(found)} {seed}"}
+        values |= {"score": 1 - len(missed) / count, "unexplained": len(missed) / count}
+        replay: dict[str, Any] = {"seed": seed, "command": f"python -m {MODULE} {len(outcomes)} {seed}"}
         replay |= {"survivors": missed} if missed else {}
         budgets = {"unexplained": UNEXPLAINED} if room == ALL else {}
-        made.append(Row(STUDY.name, room, "mutated code", "", values, budgets, replay=replay))
-    return made
+        result.append(Row(STUDY.name, room, "mutated code", "", values, budgets, replay=replay))
+    return result
 
 
 def missing(root: Path = ROOT) -> str:
-    """Why there is nothing to measure with; "" where there is."""
+    """Return why mutants cannot be tested here; "" if they can."""
     if not (root / "tests").is_dir():
         return "no folder of tests beside the package: run it in a checkout"
     absent = [name for name in ("cosmic_ray", "pytest") if find_spec(name) is None]
@@ -229,7 +229,7 @@ def missing(root: Path = ROOT) -> str:
 
 
 def tasks(context: Context) -> list[Task]:
-    """All mutants in one task, which runs alone."""
+    """Return one task for all mutants, which runs alone."""
 
     def measured() -> list[Row]:
         if reason := missing():
@@ -247,19 +247,19 @@ app = command_line.application()
 @app.command()
 def main(
     count: Annotated[int, typer.Argument(min=1, help="Number of mutants.")],
-    seed: Annotated[int, typer.Argument(min=0, help="What chooses the lines.")] = SEED,
+    seed: Annotated[int, typer.Argument(min=0, help="Seed that selects the lines.")] = SEED,
 ) -> int:
-    """Mutate lines of the package, and run its tests; exit code 1 where more survive than may."""
+    """Mutate lines of the package, and run its tests. Exit code 1: more mutants survive than allowed."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # removes the copy
     if reason := missing():
         raise ValueError(reason)
-    found = []
+    outcomes = []
     for mutant, killed in examine(sample(ROOT, count, seed)):
-        found.append((mutant, killed))
+        outcomes.append((mutant, killed))
         print(f"{'killed' if killed else mutant.reason or 'SURVIVED'}: {mutant}", file=sys.stderr, flush=True)
-    made = rows(found, seed)
-    print(json.dumps({row.subject: row.values | row.replay for row in made}, indent=1))
-    return int(any(row.verdict == "fail" for row in made))
+    results = rows(outcomes, seed)
+    print(json.dumps({row.subject: row.values | row.replay for row in results}, indent=1))
+    return int(any(row.verdict == "fail" for row in results))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""What all studies share: the context of a run, timing, arrays and precisions, cameras, names of metrics, the headline.
+"""Code that all studies share: a run's context, timing, arrays and precisions, cameras, names of metrics, the headline.
 
-In: what runs on this machine. Out: profiles, settings, times and images, of which the studies make rows; and the
-sentences of the report's first page, made from the rows.
+In: the backends and variants of this machine. Out: profiles, settings, times and images for the rows of studies; and
+the sentences of the report's first page, made from the rows.
 """
 
 __all__ = [

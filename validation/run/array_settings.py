@@ -1,4 +1,4 @@
-"""The backends and precisions in which formulas are measured, and Mitsuba's own functions beside them."""
+"""The backends and precisions in which formulas are measured, and Mitsuba's own functions for comparison."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from .context import Context
 BUILTIN = "mi.fresnel + mi.refract"
 DOCUMENTED = tuple(name for name, formula in FORMULAS.items() if not formula.budget.at_the_limit)
 RIGHT_PLUGINS = tuple(f"{PLUGIN}_{name}" for name in FORMULAS if name not in (*DOCUMENTED, AUTOMATIC))
-PLAIN = "decomposed"  # the common form, which the built-in shares: its radicand cancels as the built-in's does
+PLAIN = "decomposed"  # the common form: its radicand cancels, as that of the built-in does
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A backend in a precision: `vector` is its 3-vector type, `None` where it cannot run, for `reason`.
+    """A backend in a precision. `vector`: its 3-vector type; None if it cannot run, for `reason`.
 
-    `mitsuba` is the variant whose functions take these arrays, where there is one.
+    `mitsuba`: the variant whose functions take these arrays, if any.
     """
 
     backend: str
@@ -37,7 +37,7 @@ class Setting:
 
     @classmethod
     def of(cls, backend: str, precision: str) -> Setting:
-        """The setting of a backend that runs, in "float32" or "float64"."""
+        """Return the setting of a backend that runs, in "float32" or "float64"."""
         name = {"float32": "Array3f", "float64": "Array3f64"}[precision]
         return cls(backend, np.dtype(precision).type, getattr(getattr(dr, backend), name))
 
@@ -48,7 +48,7 @@ class Setting:
 
     @property
     def label(self) -> str:
-        """As in the rows: "llvm float32"."""
+        """The label in rows, such as "llvm float32"."""
         return f"{self.backend} {self.name}"
 
     @property
@@ -63,55 +63,55 @@ class Setting:
 
     @functools.cached_property
     def flushes(self) -> bool:
-        """Whether sums take denormal numbers for 0: Dr.Jit's threads do, and float32 on CUDA. Tested, not assumed."""
+        """Whether sums flush denormal numbers to 0, as in Dr.Jit's threads and in float32 on CUDA. This is tested."""
         if self.is_scalar:
             return False
         least = dr.value_t(self.vector)(np.full(1 << 16, np.finfo(self.precision).smallest_subnormal))
         return not np.array(least + least > 0).all()
 
     def no_budget(self, budget: Budget, regime: str) -> str:
-        """Why a formula has no budget in a regime; "" where it is."""
+        """Return why a formula has no budget in a regime; "" if it has one."""
         entry = REGIMES[regime]
         if entry.rests_on_denormals and self.flushes:
-            return "no budget: this backend takes denormal numbers for 0"
+            return "no budget: this backend flushes denormal numbers to 0"
         return "" if entry.unit or budget.at_the_limit else "no budget: a and n are not unit"
 
     @property
     def subjects(self) -> dict[str, Subject]:
-        """Every formula, and Mitsuba's functions where they exist in this precision."""
+        """Every formula, and Mitsuba's functions if they exist in this precision."""
         formulas: dict[str, Subject] = dict(FORMULAS)
         return formulas | ({BUILTIN: functools.partial(builtin, variant=self.mitsuba)} if self.mitsuba else {})
 
 
 def settings(context: Context) -> list[Setting]:
-    """Every backend and precision; the profile `quick` leaves scalar arrays out where compiled ones run."""
-    found = [] if context.profile.quick and not context.scalar else [Setting.of("scalar", "float64")]
+    """Return every backend and precision; `quick` has scalar arrays only if no compiled backend runs."""
+    result = [] if context.profile.quick and not context.scalar else [Setting.of("scalar", "float64")]
     for backend in ("llvm", "cuda"):
         entry = context.backends[backend]
         for precision in (np.float32, np.float64):
             if not entry.usable:
-                found.append(Setting(backend, precision, reason=entry.reason))
+                result.append(Setting(backend, precision, reason=entry.reason))
                 continue
             variant, running = f"{backend}_ad_rgb", Setting.of(backend, np.dtype(precision).name)
             has_functions = precision is np.float32 and context.variants[variant] is None
-            found.append(replace(running, mitsuba=variant) if has_functions else running)
-    return found
+            result.append(replace(running, mitsuba=variant) if has_functions else running)
+    return result
 
 
 def running(context: Context) -> list[Setting]:
-    """The settings that run here."""
+    """Return the settings that run here."""
     return [setting for setting in settings(context) if setting.vector is not None]
 
 
 def budget_of(subject: str) -> Budget:
-    """The budget of a subject: its own, or that of the common form."""
+    """Return the budget of a subject: its own, or that of the common form."""
     return FORMULAS[subject if subject in FORMULAS else PLAIN].budget
 
 
 def builtin(a: Any, n: Any, k: Any, variant: str | None = None) -> tuple[Any, Any]:
-    """Mitsuba's own functions, those of the present variant or of another one.
+    """Refract with Mitsuba's own functions, in the current variant or another one.
 
-    The normal is turned so that they need no reciprocal of k.
+    The normal is oriented so that the functions need no reciprocal of k.
     """
     import mitsuba
 

@@ -1,4 +1,4 @@
-"""`bsdf.sample` of many rays at once, in any variant of Mitsuba; and rays that go on from where they meet a surface."""
+"""`bsdf.sample` for many rays at once, in any variant of Mitsuba; and rays that continue from an interaction."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ import numpy as np
 
 
 def sample_all(bsdf: Any, context: Any, wi: np.ndarray, sample1: np.ndarray) -> dict[str, np.ndarray]:
-    """`bsdf.sample` for every ray: arrays (N, entries) of wo, pdf, eta, weight, and (N,) of the sampled type."""
+    """Call `bsdf.sample` for every ray; return arrays (N, entries) of wo, pdf, eta, weight, and (N,) of the type."""
     import mitsuba as mi
 
-    def ask(w: Any, s: Any, count: int) -> dict[str, np.ndarray]:
+    def sample(w: Any, s: Any, count: int) -> dict[str, np.ndarray]:
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wi = mi.Vector3f(w)
         bs, weight = bsdf.sample(context, si, s, [0, 0])
-        found = {"wo": bs.wo, "pdf": bs.pdf, "eta": bs.eta, "weight": weight, "type": bs.sampled_type}
-        return {name: _lanes(np.array(x, dtype=float), count) for name, x in found.items()}
+        entries = {"wo": bs.wo, "pdf": bs.pdf, "eta": bs.eta, "weight": weight, "type": bs.sampled_type}
+        return {name: _lanes(np.array(x, dtype=float), count) for name, x in entries.items()}
 
     if dr.is_jit_v(mi.Float):
-        found = ask(wi.T, mi.Float(sample1), len(wi))
+        arrays = sample(wi.T, mi.Float(sample1), len(wi))
     else:
-        each = [ask(w, float(s), 1) for w, s in zip(wi, sample1, strict=True)]
-        found = {name: np.concatenate([x[name] for x in each]) for name in each[0]}
-    return found | {"type": found["type"][:, 0]}
+        parts = [sample(w, float(s), 1) for w, s in zip(wi, sample1, strict=True)]
+        arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return arrays | {"type": arrays["type"][:, 0]}
 
 
 OFFSET = 1500 * 2.0**-24  # Mitsuba's RayEpsilon in float32
 
 
 def along_the_ray(si: Any, d: Any) -> Any:
-    """A ray from the interaction along `d`, moved along itself by as much as `spawn_ray` moves it along the normal."""
+    """Return a ray from the interaction along `d`, moved along itself by the distance of `spawn_ray`'s offset."""
     import mitsuba as mi
 
     ray: Any = mi.Ray3f(si.p, d)
@@ -40,6 +40,6 @@ def along_the_ray(si: Any, d: Any) -> Any:
 
 
 def _lanes(x: np.ndarray, count: int) -> np.ndarray:
-    """(count, entries) from an array that has the lanes last (or none, in scalar variants)."""
+    """Return (count, entries) from an array with the lanes last (or none, in scalar variants)."""
     lanes = x if x.ndim and x.shape[-1] in (1, count) and count > 1 else x[..., None]
     return np.broadcast_to(lanes, (*lanes.shape[:-1], count)).reshape(-1, count).T

@@ -1,4 +1,4 @@
-"""Scenes of glass balls side by side under a sky with spots, each ball with its own index."""
+"""Scenes of glass balls side by side under a random sky, each ball with its own index."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ SEED = 2026
 class Balls:
     """A scene of `count` glass balls of different indices with one plugin.
 
-    Without a `max_depth` it is one that no path reaches, and that no cache has seen.
+    The default of `max_depth` is random and larger than any path, so that no cache has its kernels.
     """
 
     def __init__(
         self, plugin: str, count: int, integrator: str = "path", max_depth: int = 0, least: float = 1.3
     ) -> None:
-        """Load it, for an integrator to a depth. `least`: the smallest index, which is the first ball's."""
+        """Load the scene with an integrator and its depth. `least`: the smallest index, that of the first ball."""
         import mitsuba as mi
 
         side = int(np.ceil(np.sqrt(count)))
-        sky = np.random.default_rng(SEED).random((8, 16, 3)).astype(np.float32)  # a constant one shows no index
+        sky = np.random.default_rng(SEED).random((8, 16, 3)).astype(np.float32)  # a constant sky would hide the indices
         fresh = int(np.random.default_rng().integers(1 << 20, 1 << 30))
         scene: dict[str, Any] = {
             "type": "scene",
@@ -48,13 +48,13 @@ class Balls:
         self.eta = next(name for name in self.params.keys() if name.endswith(".eta"))  # noqa: SIM118
 
     def image(self, seed: int = 0) -> Any:
-        """A render of 4 samples per pixel."""
+        """Render with 4 samples per pixel."""
         import mitsuba as mi
 
         return mi.render(self.scene, spp=4, seed=seed)
 
     def frozen(self) -> Callable[[Any, Any], Any]:
-        """(params, seed) -> the image, traced once and replayed from then on. The scene must be in its closure."""
+        """Return a frozen function (params, seed) → image: traced once, then replayed; its closure holds the scene."""
         import mitsuba as mi
 
         scene = self.scene
@@ -73,7 +73,7 @@ class Balls:
 
 @contextmanager
 def alone(plugin: str, count: int, **more: Any) -> Iterator[Balls]:
-    """Balls, and none of them left afterwards."""
+    """Yield balls, and free them afterwards."""
     gc.collect()
     balls = Balls(plugin, count, **more)
     yield balls
@@ -83,12 +83,12 @@ def alone(plugin: str, count: int, **more: Any) -> Iterator[Balls]:
 
 
 def compiled(work: Callable[[], Any]) -> float:
-    """How many kernels no cache in memory had."""
+    """Return the number of kernels that no cache in memory had."""
     return float(sum(not entry["cache_hit"] for entry in kernels(work)))
 
 
 def seconds_of(work: Callable[[], Any]) -> float:
-    """Seconds until what `work` returns is evaluated."""
+    """Return the seconds until the result of `work` is evaluated."""
     start = time.perf_counter()
     dr.eval(work())
     dr.sync_thread()
@@ -96,5 +96,5 @@ def seconds_of(work: Callable[[], Any]) -> float:
 
 
 def size_of(balls: Balls) -> float:
-    """Operations of the largest kernel of a render."""
+    """Return the number of operations of a render's largest kernel."""
     return float(max(entry["operation_count"] for entry in kernels(balls.image)))

@@ -1,7 +1,7 @@
-"""The first screen of the report: five questions about `refract`, answered from the rows of a run.
+"""The first page of the report: five questions about `refract`, answered from the rows of a run.
 
 In: rows. Out: sentences with numbers, one image and one plot (`first_page`), for the report and the terminal. The
-sentences are in `headline.j2`, beside this file. Studies are named without importing them.
+template of the sentences is `headline.j2` in this folder. Studies are referred to by name, without importing them.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ PLOTTED = {
 
 
 def first_page(rows: Sequence[Row], profile: str = "") -> FirstPage:
-    """The questions and their answers, the images of the scene in which the plugins differ, and error against time."""
+    """Return questions and answers, an image of a scene in which the plugins differ, and a plot of error and time."""
     directions, renders, paths = (select(rows, study) for study in (DIRECTIONS, RENDERS, PATHS))
     ours = select(renders, subject=PLUGIN)
     judged = [row for row in (*directions, *select(rows, GROUND_TRUTH)) if row.subject in (*OURS, PLUGIN)]
@@ -54,7 +54,7 @@ def first_page(rows: Sequence[Row], profile: str = "") -> FirstPage:
         "count": len(rows),
         "quick": profile == "quick",
     }
-    questions: dict[str, tuple[str, Sequence[Row], str]] = {  # the rows that decide the state, and the study to link to
+    questions: dict[str, tuple[str, Sequence[Row], str]] = {  # question, rows that decide the state, study to link to
         "right": ("Is `refract` right?", judged, DIRECTIONS),
         "trusted": (
             "How far can each formula be trusted?",
@@ -90,14 +90,14 @@ def first_page(rows: Sequence[Row], profile: str = "") -> FirstPage:
 def select(
     rows: Sequence[Row], study: str = "", subject: str = "", case: str = "", metric: str = "", setting: str = ""
 ) -> list[Row]:
-    """The rows that have all of these, where not ""; `setting` is a part of theirs."""
-    asked = {name: x for name, x in (("study", study), ("subject", subject), ("case", case)) if x}
-    chosen = (row for row in rows if setting in row.setting and (not metric or metric in row.values))
-    return [row for row in chosen if all(getattr(row, name) == x for name, x in asked.items())]
+    """Return the rows with these fields; "" matches all rows, and `setting` may be a part of the row's setting."""
+    fields = {name: x for name, x in (("study", study), ("subject", subject), ("case", case)) if x}
+    candidates = (row for row in rows if setting in row.setting and (not metric or metric in row.values))
+    return [row for row in candidates if all(getattr(row, name) == x for name, x in fields.items())]
 
 
 def _texts(facts: dict[str, Any]) -> dict[str, str]:
-    """The answer to each question; "" where nothing was measured."""
+    """Return the answer to each question; "" if nothing was measured."""
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(undefined=StrictUndefined)
@@ -107,21 +107,21 @@ def _texts(facts: dict[str, Any]) -> dict[str, str]:
     names = {"plugin": PLUGIN, "builtin": BUILTIN, "integrator": INTEGRATOR, "rounded": ROUNDED, "layers": LAYERS}
     context = template.new_context(facts | names | {"shallow": SHALLOW, "m": metrics, "most": most, "rays": rays})
     texts = {name: "".join(block(context)) for name, block in template.blocks.items()}
-    return {name: re.sub(r"[ \n]+", " ", text).strip() for name, text in texts.items()}  # not the no-break space
+    return {name: re.sub(r"[ \n]+", " ", text).strip() for name, text in texts.items()}  # keeps no-break spaces
 
 
 def most(rows: Sequence[Row], metric: str) -> float:
-    """The largest value of a metric that all rows have; NaN where one of them is."""
+    """Return the largest value of a metric that all rows have; NaN if a value is NaN."""
     return float(np.max([row.values[metric] for row in rows]))
 
 
 def rays(rows: Sequence[Row]) -> int:
-    """The largest number of rays that a row was measured with."""
+    """Return the largest number of rays of a row."""
     return max(int(row.replay.get("rays", 0)) for row in rows)
 
 
 def _directions(rows: Sequence[Row]) -> dict[str, Any]:
-    """Rows of the formulas by precision, on LLVM where it ran, else on CUDA, else on scalars."""
+    """Return facts on the formulas by precision, from LLVM if it ran, otherwise from CUDA or scalar arrays."""
 
     def overall(precision: str, case: str = EVERYTHING) -> dict[str, Row]:
         return {
@@ -130,15 +130,15 @@ def _directions(rows: Sequence[Row]) -> dict[str, Any]:
             for row in select(rows, case=case, metric=metrics.WORST_ANGLE, setting=f"{kind} {precision}")
         }
 
-    every = {"single precision": overall("float32"), "double precision": overall("float64")}
-    precisions = {name: formulas for name, formulas in every.items() if formulas}
-    narrowest: dict[str, Row] = next(iter(precisions.values()), {})
-    common = overall("float32" if every["single precision"] else "float64", COMMON)
-    textbook = [row for name, row in narrowest.items() if name not in (*OURS, BUILTIN_FORMULA)]
+    both = {"single precision": overall("float32"), "double precision": overall("float64")}
+    precisions = {name: formulas for name, formulas in both.items() if formulas}
+    lowest: dict[str, Row] = next(iter(precisions.values()), {})
+    common = overall("float32" if both["single precision"] else "float64", COMMON)
+    textbook = [row for name, row in lowest.items() if name not in (*OURS, BUILTIN_FORMULA)]
     return {
-        "best": [narrowest[name] for name in OURS if name in narrowest],
+        "best": [lowest[name] for name in OURS if name in lowest],
         "precisions": precisions,
-        "ours": [name for name in OURS if precisions and all(name in each for each in precisions.values())],
+        "ours": [name for name in OURS if precisions and all(name in formulas for formulas in precisions.values())],
         "textbook": textbook,
         "worst": max(textbook, key=lambda row: row.values[metrics.WORST_ANGLE], default=None),
         "common": [common[row.subject] for row in textbook if row.subject in common],
@@ -147,7 +147,7 @@ def _directions(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def by_scene(methods: Sequence[Row], splits: bool) -> dict[str, float]:
-    """MSE × time of `refract_path` over the built-in's: as it is, or at the best `split_depth` of each scene."""
+    """Return by scene MSE × time of `refract_path` over the built-in's, without or with the best `split_depth`."""
     best: dict[str, float] = {}
     for row in select(methods, metric=metrics.EQUAL_TIME):
         if row.subject.startswith(f"{INTEGRATOR}, split") if splits else row.subject == INTEGRATOR:
@@ -156,7 +156,7 @@ def by_scene(methods: Sequence[Row], splits: bool) -> dict[str, float]:
 
 
 def equal_time(methods: Sequence[Row]) -> list[str]:
-    """Sentences about all scenes: the smallest, the median and the largest of `by_scene`."""
+    """Return sentences on the smallest, the median and the largest value of `by_scene`."""
     sentences = []
     for splits, how in ((False, "without splitting"), (True, "with the best `split_depth` of each scene")):
         if values := [*by_scene(methods, splits).values()]:
@@ -166,7 +166,7 @@ def equal_time(methods: Sequence[Row]) -> list[str]:
 
 
 def _renders(ours: Sequence[Row], methods: Sequence[Row]) -> dict[str, Any]:
-    """Times and differences of `refract` and `dielectric`; errors at equal time of `refract_path`."""
+    """Return times and differences of `refract` and `dielectric`, and errors at equal time of `refract_path`."""
     times = [row.values[metrics.TIME_OVER_DIELECTRIC] for row in select(ours, metric=metrics.TIME_OVER_DIELECTRIC)]
     compared = select(ours, metric=metrics.CHANGED_SHARE)
     return {
@@ -179,7 +179,7 @@ def _renders(ours: Sequence[Row], methods: Sequence[Row]) -> dict[str, Any]:
 
 
 def _paths(rows: Sequence[Row], traced: Sequence[Row]) -> dict[str, Any]:
-    """Light paths lost in the mirage, or errors after a thousand layers of air."""
+    """Return the lost light paths in the mirage, and errors after a thousand layers of air."""
     mirage = {row.subject: row for row in select(traced, case=f"{MIRAGE}: path", metric=metrics.WRONG_PATH)}
     contrasts, indices = (
         select(rows, case=f"mirage askew, {LAYERS} layers, {kind}", metric=SHALLOW) for kind in ("contrasts", "indices")
@@ -193,7 +193,7 @@ def _paths(rows: Sequence[Row], traced: Sequence[Row]) -> dict[str, Any]:
 
 
 def remedies(rows: Sequence[Row]) -> dict[str, int]:
-    """How many rows were not run, by what would make them run, most first; "" for other reasons, last."""
+    """Return the number of rows that were not run by their remedy, largest first; "" for other reasons, last."""
     missing = [row for row in rows if row.verdict == "not run"]
     counts = Counter(row.remedy for row in missing)
     installs = [name for name in counts if name.startswith(INSTALL)]
@@ -205,25 +205,29 @@ def remedies(rows: Sequence[Row]) -> dict[str, int]:
 
 
 def _image(ours: Sequence[Row], paths: Sequence[Row]) -> ShownRow | None:
-    """The two plugins beside exact paths; else the scene in which the plugins differ most, else the first one."""
+    """Return the image of both plugins and exact paths, otherwise of the scene in which the plugins differ most."""
     for row in (row for row in paths if EXACT in row.images):
         off, builtin_off = (percent(row.values[metric]) for metric in (metrics.OFF_EXACT, metrics.BUILTIN_OFF_EXACT))
-        said = f"beside exact paths, {builtin_off} of the pixels of `{BUILTIN}` are wrong, {off} of those of `{PLUGIN}`"
+        shares = f"{builtin_off} of the pixels of `{BUILTIN}` are wrong, {off} of those of `{PLUGIN}`"
         labels = {"reference": BUILTIN, "test": PLUGIN, EXACT: "exact paths"}
-        return {"row": row.name, "labels": labels, "caption": f"Scene `{MIRAGE}`: {said}; {LINES}."}
+        return {
+            "row": row.name,
+            "labels": labels,
+            "caption": f"Scene `{MIRAGE}`: beside exact paths, {shares}; {LINES}.",
+        }
     pairs = [row for row in ours if {"reference", "test"} <= row.images.keys()]
     if not pairs:
         return None
     row = max(pairs, key=lambda row: row.values.get(metrics.WELCH_ALARMS, 0))
-    said = "the two differ" if row.values.get(metrics.WELCH_ALARMS) else "the same up to noise"
+    text = "the two differ" if row.values.get(metrics.WELCH_ALARMS) else "the same up to noise"
     if row.case == MIRAGE and row.values.get(metrics.WELCH_ALARMS):
-        said = f"`{PLUGIN}` keeps the edges that `{BUILTIN}` breaks into stairs; {LINES}"
+        text = f"`{PLUGIN}` keeps the edges that `{BUILTIN}` breaks into stairs; {LINES}"
     labels = {"reference": BUILTIN, "test": PLUGIN}
-    return {"row": row.name, "labels": labels, "caption": f"Scene `{row.case}`: {said}."}
+    return {"row": row.name, "labels": labels, "caption": f"Scene `{row.case}`: {text}."}
 
 
 def _plot(rows: Sequence[Row]) -> ShownRow | None:
-    """Error against time of the methods, in the scene of median gain; else of the two plugins, in the first scene."""
+    """Return the plot of error against time, of all methods in the scene of median gain or of the two plugins."""
     gains = by_scene(select(rows, EFFICIENCY), splits=True)
     median = sorted(gains, key=lambda scene: gains[scene])[len(gains) // 2] if gains else ""
     choices = ((EFFICIENCY, METHODS, PLOTTED, False), (RENDERS, PLUGIN, {BUILTIN: BUILTIN, PLUGIN: PLUGIN}, True))
@@ -238,19 +242,19 @@ def _plot(rows: Sequence[Row]) -> ShownRow | None:
 
 
 def degrees(radians: float) -> str:
-    """An angle in degrees: 90°, 1.9 × 10⁻⁴°."""
+    """Return an angle in degrees: 90°, 1.9 × 10⁻⁴°."""
     mantissa, _, exponent = compact(math.degrees(radians), 2).partition("e")
     power = f"\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}10{exponent.translate(SUPERSCRIPTS)}" if exponent else ""
     return f"{mantissa}{power}°"
 
 
 def percent(share: float) -> str:
-    """A share in percent, small ones in plain digits: 6.5 %, 0.00022 %."""
+    """Return a share in percent, in plain digits: 6.5 %, 0.00022 %."""
     value = 100 * share
     digits = max(1 - math.floor(math.log10(value)), 0) if 0 < value < 10 else 0
     return f"{value:.{digits}f} %"
 
 
 def span(values: Sequence[float], digits: int) -> str:
-    """The smallest and the largest: 0.97 to 1.10."""
+    """Return the smallest and the largest value: 0.97 to 1.10."""
     return " to ".join(dict.fromkeys(f"{value:.{digits}f}" for value in (min(values), max(values))))

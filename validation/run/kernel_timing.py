@@ -1,8 +1,8 @@
-"""Kernel times of the formulas, which stream rays from memory, and the time to compile each kernel.
+"""Kernel times of the formulas, which stream rays from memory, and the compile time of each kernel.
 
-All subjects run once per round. A ratio is formed within a round; the median over the rounds is reported, with a
-confidence interval of at least 95 % from order statistics. On a CPU only ratios are reported: to a copy of the same
-bytes, which is the lower limit set by memory, and to the plain formula. On a GPU there are ns per ray, too.
+All subjects run once per round. Ratios are formed within a round; rows have the median over the rounds, with a
+confidence interval of at least 95 % from order statistics. On a CPU the rows only have ratios: to a copy of the same
+bytes, which is the lower limit set by memory, and to the plain formula. On a GPU they also have ns per ray.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from .context import Context
 
 COPY = "copy"
 SEED = 2026
-DIFFERENT = 1 << 16  # rays; the rest of a stream repeats them
+DIFFERENT = 1 << 16  # number of different rays; the rest of a stream repeats them
 TERMS = {
-    TIME_OVER_COPY: "median time of a ray over that of copying its bytes, streaming; low, high: its 95 % interval",
+    TIME_OVER_COPY: "median time of a streamed ray over that of copying its bytes; low, high: its 95 % interval",
     TIME_OVER_PLAIN: f"the same over the time of `{PLAIN}`",
     "operations": "Dr.Jit's count for the whole kernel",
-    "compile ms": "code generation and compilation of the kernel, by Dr.Jit's record, with a literal no cache can know",
+    "compile ms": "time of code generation and compilation in Dr.Jit's record, with a new literal that no cache has",
 }
 
 
 def copy(a: Any, n: Any, k: Any) -> tuple[Any, Any]:
-    """Reads and writes the bytes that a formula reads and writes, with almost no computation."""
+    """Read and write the bytes that a formula reads and writes, with almost no computation."""
     return a + n * k, k > 0
 
 
 def measure(context: Context, setting: Setting) -> dict[str, dict[str, float]]:
-    """Values by subject of the setting, and of the copy, on generic rays."""
+    """Return values by subject of the setting, and of the copy, on generic rays."""
     subjects = {COPY: copy, **setting.subjects}
     count = context.profile.scalar_rays if setting.is_scalar else context.profile.streamed_rays
     rays = regimes.make("generic", min(count, DIFFERENT), setting.precision, SEED)[np.arange(count) % DIFFERENT]
@@ -62,19 +62,19 @@ def measure(context: Context, setting: Setting) -> dict[str, dict[str, float]]:
             return float(sum(kernel["execution_time"] for kernel in kernels(lambda: subject(*streamed)))) / 1e3
 
     seconds = rounds(subjects, clock, context.profile.repeats)
-    found: dict[str, dict[str, float]] = {}
+    values: dict[str, dict[str, float]] = {}
     for name, subject in subjects.items():
-        found[name] = ratio(TIME_OVER_COPY, seconds[name], seconds[COPY])
-        found[name] |= ratio(TIME_OVER_PLAIN, seconds[name], seconds[PLAIN])
+        values[name] = ratio(TIME_OVER_COPY, seconds[name], seconds[COPY])
+        values[name] |= ratio(TIME_OVER_PLAIN, seconds[name], seconds[PLAIN])
         if setting.backend == "cuda":
-            found[name] |= interval("ns per ray", [s / count * 1e9 for s in seconds[name]])
+            values[name] |= interval("ns per ray", [s / count * 1e9 for s in seconds[name]])
         if not setting.is_scalar:
-            found[name] |= _kernel(subject, streamed)
-    return found
+            values[name] |= _kernel(subject, streamed)
+    return values
 
 
 def goals(subject: str, setting: Setting) -> dict[str, float]:
-    """What times ought to be: nine tenths of the copy's throughput for a documented formula, else its own goal."""
+    """Return goals for times: nine tenths of the copy's throughput for a documented formula, otherwise its own goal."""
     if setting.is_scalar or subject not in FORMULAS:
         return {}
     if (goal := FORMULAS[subject].time_goal) is None:
@@ -83,7 +83,7 @@ def goals(subject: str, setting: Setting) -> dict[str, float]:
 
 
 def rounds(subjects: dict[str, Any], clock: Callable[[Any], float], repeats: int) -> dict[str, list[float]]:
-    """Seconds by subject, every second round in the reverse order; the first round is thrown away."""
+    """Return seconds by subject. Every second round is in reverse order; the first round is discarded."""
     seconds: dict[str, list[float]] = {name: [] for name in subjects}
     order = list(subjects)
     for _ in range(repeats + 1):
@@ -94,12 +94,12 @@ def rounds(subjects: dict[str, Any], clock: Callable[[Any], float], repeats: int
 
 
 def ratio(metric: str, times: list[float], others: list[float]) -> dict[str, float]:
-    """The median of times over others, round by round, and its interval."""
+    """Return the median of times over others, round by round, and its interval."""
     return interval(metric, [t / o for t, o in zip(times, others, strict=True)])
 
 
 def interval(metric: str, x: list[float]) -> dict[str, float]:
-    """The median and the order statistics around it: P(median outside) ≤ 2 P(Binomial(n, ½) < rank) ≤ 5 %."""
+    """Return the median and order statistics around it: P(median outside) ≤ 2 P(Binomial(n, ½) < rank) ≤ 5 %."""
     from scipy.stats import binom
 
     rank = max(int(binom.ppf(0.025, len(x), 0.5)), 1)
@@ -108,18 +108,18 @@ def interval(metric: str, x: list[float]) -> dict[str, float]:
 
 
 def _kernel(subject: Subject, inputs: Any) -> dict[str, float]:
-    """Operations of the kernel, and ms to compile it anew: k is multiplied by a literal that was never used before."""
+    """Return the operations of the kernel, and its compile time in ms: k is multiplied by a new literal."""
     a, n, k = inputs
     operations = max(kernel["operation_count"] for kernel in kernels(lambda: subject(a, n, k)))
     literal = 1 + float(np.random.default_rng().integers(1, 1 << 22)) * 2.0**-23
-    found = kernels(lambda: subject(a, n, k * type(k)(literal)))
-    fresh = all(not kernel["cache_hit"] for kernel in found)
-    compiled = sum(kernel["codegen_time"] + kernel["backend_time"] for kernel in found)
-    return {"operations": float(operations), "compile ms": compiled if fresh else float("nan")}
+    launched = kernels(lambda: subject(a, n, k * type(k)(literal)))
+    is_new = all(not kernel["cache_hit"] for kernel in launched)
+    compiled = sum(kernel["codegen_time"] + kernel["backend_time"] for kernel in launched)
+    return {"operations": float(operations), "compile ms": compiled if is_new else float("nan")}
 
 
 def kernels(work: Callable[[], Any]) -> list[dict[str, Any]]:
-    """Dr.Jit's record of the kernels that `work` launches."""
+    """Return Dr.Jit's record of the kernels that `work` launches."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         dr.eval(work())

@@ -1,17 +1,17 @@
-"""Names of metrics that several studies or the written tables use.
+"""Names of metrics that several studies or generated tables use.
 
-A table that asks for a name that is not here fails when it is imported, not after the run.
+A table with a wrong name fails at import, not after the run.
 """
 
 from mi_refract.accuracy import BUDGETS
 
-# Directions, per ray: the judge's own names.
+# Directions, per ray: names of the judge.
 ERROR_OVER_BOUND, MISCLASSIFIED_FAR = BUDGETS
 MISCLASSIFIED = "TIR misclassified"
 WORST_CHORD = "worst chord"
 WORST_IN_U = "worst / u"
 WORST_ANGLE = "worst rad"
-ROUNDINGS = 1.0, 2.0**53  # between which an error in u means something: one rounding, and no right digit of a double
+ROUNDINGS = 1.0, 2.0**53  # meaningful range of an error in u: from one rounding to a double without a right digit
 # Times
 TIME_OVER_COPY = "time / copy"
 TIME_OVER_PLAIN = "time / plain"
@@ -36,10 +36,10 @@ EQUAL_TIME_HAND = "equal-time MSE / best by hand"
 
 
 def low(metric: str) -> str:
-    """The lower end of the 95 % interval of a metric."""
+    """Return the name of the lower end of a metric's 95 % interval."""
     return f"{metric}, low"
 
 
 def high(metric: str) -> str:
-    """The upper end of the 95 % interval of a metric."""
+    """Return the name of the upper end of a metric's 95 % interval."""
     return f"{metric}, high"

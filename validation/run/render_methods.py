@@ -1,4 +1,4 @@
-"""The methods of rendering that are compared (an integrator and a BSDF each), and the camera used for timing."""
+"""The compared methods of rendering (an integrator and a BSDF each), and the camera for timing."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Method:
     parameters: dict[str, float | str] = field(default_factory=dict)
 
     def plugin(self, max_depth: int) -> dict[str, Any]:
-        """The dictionary for `mi.load_dict`; without Russian roulette, as in the scene files."""
+        """Return the dictionary for `mi.load_dict`, without Russian roulette, as in the scene files."""
         return {"type": self.integrator, "max_depth": max_depth, "rr_depth": max_depth, **self.parameters}
 
 
@@ -46,14 +46,14 @@ FROM_LAMPS = Method(f"{OURS}, caustics from lamps", OURS, PLUGIN, {"caustics": "
 
 
 class Camera:
-    """A loaded scene: renders images as numpy arrays and says how long each took."""
+    """A loaded scene that renders images as numpy arrays and measures the time of each."""
 
     def __init__(self, scene: Any, integrator: Any = None) -> None:
-        """`scene` as Mitsuba loaded it; `integrator`: another one than its own."""
+        """`scene`: loaded by Mitsuba; `integrator`: replaces the scene's own."""
         self.scene, self.integrator = scene, integrator
 
     def __call__(self, spp: int, seed: int) -> tuple[np.ndarray, float]:
-        """The image (height × width × 3) and the seconds that it took."""
+        """Render; return the image (height × width × 3) and the seconds."""
         import mitsuba as mi
 
         start = time.perf_counter()
@@ -66,7 +66,7 @@ class Camera:
 
 @contextmanager
 def under(variant: str) -> Iterator[None]:
-    """Another variant of Mitsuba for a while."""
+    """Use another variant of Mitsuba within this context."""
     import mitsuba as mi
 
     before: Any = mi.variant()
@@ -78,14 +78,14 @@ def under(variant: str) -> Iterator[None]:
 
 
 def opened(path: Path, bsdf: str, resolution: int, **parameters: Any) -> Any:
-    """A scene file with its glass; the same seed means the same image."""
+    """Load a scene file with a glass; the same seed gives the same image."""
     import mitsuba as mi
 
     return mi.load_file(str(path), **scene_files.REPRODUCIBLE, bsdf=bsdf, res=resolution, **parameters)
 
 
 def camera(path: Path, method: Method, resolution: int, **parameters: Any) -> Camera:
-    """A scene file by a method, to the file's own depth where `parameters` have none."""
+    """Return a camera of a scene file for a method, to the file's own depth unless `parameters` have one."""
     import mitsuba as mi
 
     defaults = {node.attrib["name"]: node.attrib["value"] for node in ET.parse(path).getroot().iter("default")}
@@ -97,7 +97,7 @@ def camera(path: Path, method: Method, resolution: int, **parameters: Any) -> Ca
 def sensor(
     size: int, fov: float, origin: list[float], target: tuple[float, float, float] = (0, 0, 0)
 ) -> dict[str, Any]:
-    """A perspective camera of `size`² independent pixels, for `mi.load_dict`."""
+    """Return a perspective camera of `size`² independent pixels, for `mi.load_dict`."""
     import mitsuba as mi
 
     film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}}
@@ -106,7 +106,7 @@ def sensor(
 
 
 def save_image(folder: Path, name: str, image: np.ndarray, about: dict[str, Any]) -> str:
-    """Write an EXR under `folder`; its path relative to that."""
+    """Write an EXR under `folder`, and return its path relative to the folder."""
     target = Path("images") / f"{name}.exr"
     (folder / target).parent.mkdir(parents=True, exist_ok=True)
     image_file.write_exr(folder / target, image.astype(np.float32), metadata=about)

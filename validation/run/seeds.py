@@ -1,4 +1,4 @@
-"""Seeds of the randomised studies: their own, and others that `validation.repeated` asks for."""
+"""Seeds of the randomised studies: their own, and others for `validation.repeated`."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from contextvars import ContextVar
 from typing import Any, TypeVar
 
 T = TypeVar("T")
-STEP = 10_007  # between two seeds: no study has numbers of its own that come near
+STEP = 10_007  # between two seeds of a study: larger than any range of seeds that a study uses
 _SHIFT: ContextVar[int] = ContextVar("shift", default=0)
 
 
 def current(seed: int) -> int:
-    """The seed to draw with where a study's own is `seed`."""
+    """Return the current seed for a study whose own seed is `seed`."""
     return seed + STEP * _SHIFT.get()
 
 
 @contextmanager
 def shifted(by: int) -> Iterator[None]:
-    """Every study draws with its seed number `by`; 0 is its own."""
+    """Within this context, every study uses its seed number `by`; 0 is its own seed."""
     token = _SHIFT.set(by)
     try:
         yield
@@ -29,13 +29,13 @@ def shifted(by: int) -> Iterator[None]:
 
 
 def cached(function: Callable[..., T]) -> Callable[..., T]:
-    """As `functools.cache`, of what is drawn: what one seed gave is not the answer for another."""
+    """As `functools.cache`, with separate results for each shift of the seeds."""
     by_shift = functools.cache(lambda _, *args, **kwargs: function(*args, **kwargs))
 
     @functools.wraps(function)
-    def found(*args: Any, **kwargs: Any) -> T:
+    def wrapper(*args: Any, **kwargs: Any) -> T:
         result: T = by_shift(_SHIFT.get(), *args, **kwargs)
         return result
 
-    vars(found)["cache_clear"] = by_shift.cache_clear
-    return found
+    vars(wrapper)["cache_clear"] = by_shift.cache_clear
+    return wrapper

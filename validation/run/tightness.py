@@ -1,8 +1,8 @@
-"""Bounds far above the errors: budgets that are more than 100 times the largest error seen.
+"""Bounds far above the errors: budgets that are more than 100 times the largest measured error.
 
-A row per study: how many of its checks are that far from their bound, and for each subject and metric the largest share
-of the bound that any case uses. Where one case comes near, the bound is that of the hardest case. Where none does, the
-row must say what the bound still excludes: `EXCLUDES`.
+There is a row per study: the number of checks that are so far from their bound, and for each subject and metric the
+largest share of the bound that any case uses. If one case comes near, the bound is that of the hardest case. If no case
+does, the row must state what the bound still excludes: `EXCLUDES`.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from mi_refract.io.text import compact
 from mi_refract.report.row import Row, by_study
 
 NAME = "bounds"
-LOOSE = 100.0  # a bound over the largest error
-SHOWN = 12  # subjects and metrics that a row names, the loosest first
+LOOSE = 100.0  # a bound is loose if it exceeds the largest error by this factor
+SHOWN = 12  # number of subjects and metrics in a row's remark, the loosest first
 ABOUT = {
     "title": "Bounds and errors",
     "text": " ".join(__doc__.partition("\n")[2].replace("`EXCLUDES`", "the remark").split()),
     "terms": {
-        "checks": "budgets that were measured and are not 0, of all rows of the study",
-        "far from the bound": f"those of them with a bound more than {LOOSE:g} times the largest error",
-        "share": "the part that they are",
-        "loose in every case": "subjects and metrics of which no case comes nearer to its bound than that",
-        "unexplained": "those of them of which nothing says what their bound still excludes",
+        "checks": "measured budgets other than 0, in all rows of the study",
+        "far from the bound": f"checks with a bound more than {LOOSE:g} times the error",
+        "share": "share of these checks",
+        "loose in every case": "subjects and metrics in which no case comes nearer to its bound",
+        "unexplained": "loose subjects and metrics without a statement of what their bound still excludes",
     },
 }
 DIFFUSE = "roundings of thousands of nodes average out; 12.5 u = 7.5e-7 excludes an index off by 1e-6"
@@ -38,7 +38,7 @@ UNSEEN = (
     *("last bits", "one code", "dithering", "other antialiasing", "less antialiasing"),
     *("a quarter pixel", "half a pixel", "JPEG", "noise", "half floats"),
 )
-# By study and metric, for bounds that no case comes near: the subjects of which this is known, and what is excluded.
+# By study and metric, for bounds that no case comes near: the subjects, and what the bound excludes.
 EXCLUDES: dict[tuple[str, str], tuple[tuple[str, ...], str]] = {
     **{("energy", f"{at}: {x} / u"): (("powers",), DIFFUSE) for at in ("inside", "outside") for x in ("R", "1 − R")},
     ("paths", "pixels off, control"): (("refract",), "no lobe flipped; more than 1 pixel of 1000 is another path"),
@@ -58,31 +58,33 @@ EXCLUDES: dict[tuple[str, str], tuple[tuple[str, ...], str]] = {
 
 
 def excluded(study: str, subject: str, metric: str) -> str:
-    """What a bound far above the errors still excludes; "" where nothing says so."""
+    """Return what a bound far above the errors still excludes; "" if that is not stated."""
     subjects, text = EXCLUDES.get((study, metric), ((), ""))
     return text if subject in subjects else ""
 
 
-def rows(found: Iterable[Row]) -> list[Row]:
-    """A row per study that has budgets other than 0."""
-    made = []
-    for study, members in by_study(found).items():
+def rows(measured: Iterable[Row]) -> list[Row]:
+    """Return a row per study that has budgets other than 0."""
+    result = []
+    for study, members in by_study(measured).items():
         shares: dict[tuple[str, str], list[float]] = {}  # by subject and metric: value over bound of every case
         for row in members:
             for metric, bound in row.budgets.items() if row.values else ():
                 if bound > 0 and math.isfinite(row.values[metric]):
                     shares.setdefault((row.subject, metric), []).append(row.values[metric] / bound)
         checks = sum(map(len, shares.values()))
-        far = {key: count for key, used in shares.items() if (count := sum(LOOSE * x < 1 for x in used))}
+        counts = {key: sum(LOOSE * x < 1 for x in used) for key, used in shares.items()}
+        far = {key: count for key, count in counts.items() if count}
         loose = {key for key, count in far.items() if count == len(shares[key])}
-        said = []
+        remarks = []
         for key in sorted(far, key=lambda key: max(shares[key])):
             text = f"{', '.join(key)}: {far[key]} of {len(shares[key])} rows"
             if key in loose:
-                said.append(f"{text}; excludes: {excluded(study, *key) or 'not stated'}")
+                remarks.append(f"{text}; excludes: {excluded(study, *key) or 'not stated'}")
             else:
-                said.append(f"{text}, others use up to {compact(max(shares[key]), 2)} of it")
-        more = [f"and {len(said) - SHOWN} more subjects and metrics, listed in `replay`"] if len(said) > SHOWN else []
+                remarks.append(f"{text}, others use up to {compact(max(shares[key]), 2)} of it")
+        hidden = len(remarks) - SHOWN
+        more = [f"and {hidden} more subjects and metrics, listed in `replay`"] if hidden > 0 else []
         values = {
             "checks": float(checks),
             "far from the bound": float(sum(far.values())),
@@ -91,7 +93,7 @@ def rows(found: Iterable[Row]) -> list[Row]:
             "unexplained": float(sum(not excluded(study, *key) for key in loose)),
         }
         case, budgets = f"more than {LOOSE:g} times the largest error", {"unexplained": 0.0}
-        reason, replay = "; ".join(said[:SHOWN] + more), {"far from their bounds": said}
+        reason, replay = "; ".join(remarks[:SHOWN] + more), {"far from their bounds": remarks}
         if shares:
-            made.append(Row(NAME, study, case, "", values, budgets, reason=reason, replay=replay))
-    return made
+            result.append(Row(NAME, study, case, "", values, budgets, reason=reason, replay=replay))
+    return result

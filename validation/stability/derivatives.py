@@ -1,11 +1,11 @@
-"""Derivatives by automatic differentiation, of directions and of the reflectance, against certified ones.
+"""Derivatives of directions and of the reflectance by automatic differentiation, against certified derivatives.
 
-Measured are ∂b/∂a along two unit vectors perpendicular to `a`, in the plane of incidence and across it; k ∂b/∂k; and
-η ∂R/∂η, which is −k ∂R/∂k. The error is relative, or absolute where the derivative is below 1 (below R). At the
-critical angle the derivatives diverge as 1/cosθt. The condition of ∂b, 1 + k² sinθi (sinθi + 2 cosθi)/cos²θt, is the
-change of the derivative, in u and to first order, that inputs off by u may cause; the étendue's has 1/12 cosθi more.
-That of ∂R/∂η is the sum of the magnitudes of its terms, over the larger of their sum and R, which rounds to u of it.
-`condition_of` derives the limits.
+The study measures ∂b/∂a along two unit vectors perpendicular to `a`, in the plane of incidence and across it; k ∂b/∂k;
+and η ∂R/∂η, which is −k ∂R/∂k. The error is relative, or absolute if the derivative is below 1 (below R for ∂R/∂η). At
+the critical angle the derivatives diverge as 1/cosθt. The condition of ∂b, 1 + k² sinθi (sinθi + 2 cosθi)/cos²θt, is
+the change of the derivative, in u and to first order, that input errors of u can cause; the condition of the étendue is
+larger by 1/12 cosθi. The condition of ∂R/∂η is the sum of the magnitudes of its terms, divided by the larger of
+|∂R/∂η| and R, because R itself has a rounding error of u R. `condition_of` derives the limits.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ NAME = "derivatives"
 AXES = {"x": "cos²θt, transmitted", "y": "largest error of k ∂b/∂k", "x_scale": "log", "y_scale": "log"}
 TERMS = {
     "∂b/∂k": "times k: the change of the direction with the relative index",
-    "∂b/∂a in the plane": "along the unit vector at right angles to `a` in the plane of incidence",
-    "∂b/∂a across it": "along the unit vector at right angles to that plane",
-    "étendue": "|∂b/∂a × ∂b/∂a'| cosθt, which is k² cosθi: n² cosθ dΩ is the same on both sides; relative",
+    "∂b/∂a in the plane": "along the unit vector perpendicular to `a` in the plane of incidence",
+    "∂b/∂a across it": "along the unit vector perpendicular to that plane",
+    "étendue": "relative error of |∂b/∂a × ∂b/∂a'| cosθt, which is k² cosθi: n² cosθ dΩ is the same on both sides",
     "∂R/∂η": "times η, of `fresnel.powers` with the cosine of `fresnel.refracted_cosine`",
-    "error": "the largest",
-    "error / condition": "the largest, in units of condition · u",
-    "not finite": "rays whose derivative is computed as NaN or infinite, though it exists",
+    "error": "the largest error",
+    "error / condition": "the largest error, in units of condition · u",
+    "not finite": "rays whose derivative exists but is computed as NaN or infinite",
 }
 SEED = 2029
 BINS = np.geomspace(1e-9, 1, 19)
@@ -51,10 +51,10 @@ Array = np.ndarray
 
 @dataclass(frozen=True)
 class Inputs:
-    """Rays, two directions at right angles to each, and the certified answers."""
+    """Rays, two directions perpendicular to each ray, and the certified answers."""
 
     rays: regimes.Rays
-    along: dict[str, Array]  # by derivative: (N, 3), in the precision of the rays
+    along: dict[str, Array]  # directions of ∂b/∂a by name: (N, 3), in the precision of the rays
     exact: dict[str, Array]
     certified: oracle.Certified
     condition: Array
@@ -62,35 +62,35 @@ class Inputs:
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per backend and precision."""
+    """Return one task per backend and precision."""
     return [Task(f"derivatives: {s.label}", functools.partial(setting_rows, context, s)) for s in settings(context)]
 
 
 def setting_rows(context: Context, setting: Setting) -> list[Row]:
-    """Every formula and the reflectance in a setting."""
+    """Return the rows of all formulas and of the reflectance in a setting."""
     reason = "Dr.Jit differentiates compiled arrays only" if setting.is_scalar else setting.reason
     if reason:
         return [Row(NAME, name, "all", setting.label, reason=reason) for name in (*FORMULAS, "powers")]
-    given = inputs(context.profile.rays // 40, setting.precision)
+    samples = inputs(context.profile.rays // 40, setting.precision)
     rows, curves = [], {}
     for name, formula in FORMULAS.items():
-        found, curves[name] = formula_rows(name, formula, given, setting)
-        rows += found
-    curves["condition · u"] = binned(given, given.condition * setting.roundoff)
-    values = {"condition · u": float(given.condition.max()) * setting.roundoff}
+        measured, curves[name] = formula_rows(name, formula, samples, setting)
+        rows += measured
+    curves["condition · u"] = binned(samples, samples.condition * setting.roundoff)
+    values = {"condition · u": float(samples.condition.max()) * setting.roundoff}
     problem = Row(NAME, "the problem", "∂b/∂k", setting.label, values, curves=curves)
-    return [*rows, problem, reflectance_row(given, setting)]
+    return [*rows, problem, reflectance_row(samples, setting)]
 
 
 def drawn_rows(context: Context) -> list[Row]:
-    """The rows with budgets, and those that are not run."""
-    every = [row for setting in settings(context) for row in setting_rows(context, setting)]
-    return [row for row in every if row.budgets or not row.values]
+    """Return the rows with budgets and the rows that are not run."""
+    rows = [row for setting in settings(context) for row in setting_rows(context, setting)]
+    return [row for row in rows if row.budgets or not row.values]
 
 
 @seeds.cached
 def inputs(count: int, precision: type) -> Inputs:
-    """Unit rays of all regimes that have derivatives: neither tangential nor exactly critical."""
+    """Return unit rays of all regimes, without rays that have no derivatives (tangential or exactly critical)."""
     names = [name for name, regime in regimes.REGIMES.items() if regime.unit and not regime.rests_on_denormals]
     parts = [regimes.make(name, count, precision, seeds.current(SEED)) for name in names]
     a, n, k = (np.concatenate([getattr(part, x) for part in parts]) for x in ("a", "n", "k"))
@@ -99,109 +99,113 @@ def inputs(count: int, precision: type) -> Inputs:
     across = np.cross(n.astype(np.longdouble), wide)
     normal = (np.abs(across).max(1) == 0)[:, None]
     across = np.where(normal, np.cross(wide, np.roll(wide, 1, axis=1)), across)
-    for _ in range(2):  # near the normal rounding has left some of `a` in it
+    for _ in range(2):  # near the normal, rounding leaves a component along `a`
         across /= lengths(across)[:, None]
         across -= (across * wide).sum(1, keepdims=True) * wide
     within: Any = np.cross(across, wide)
     along = {"∂b/∂a in the plane": within.astype(precision), "∂b/∂a across it": across.astype(precision)}
     exact = {name: derivatives.derivative(a, n, k, e, 0.0) for name, e in along.items()}
     exact["∂b/∂k"] = derivatives.derivative(a, n, k, np.zeros_like(a), k)
-    every = Inputs(regimes.Rays(a, n, k), along, exact, certified, condition_of(certified, k), np.repeat(names, count))
-    measured: Inputs = only(every, np.isfinite(exact["∂b/∂k"]).all(1))
+    samples = Inputs(
+        regimes.Rays(a, n, k), along, exact, certified, condition_of(certified, k), np.repeat(names, count)
+    )
+    measured: Inputs = only(samples, np.isfinite(exact["∂b/∂k"]).all(1))
     return measured
 
 
-def only(given: Any, kept: np.ndarray) -> Any:
-    """Rays, certified answers or all of `Inputs`, of a mask (N,)."""
-    if isinstance(given, dict):
-        return {name: only(x, kept) for name, x in given.items()}
-    return type(given)(**only(vars(given), kept)) if hasattr(given, "__dict__") else given[kept]
+def only(data: Any, mask: np.ndarray) -> Any:
+    """Return the entries of a mask (N,), for an array, a dict, rays, certified answers or `Inputs`."""
+    if isinstance(data, dict):
+        return {name: only(x, mask) for name, x in data.items()}
+    return type(data)(**only(vars(data), mask)) if hasattr(data, "__dict__") else data[mask]
 
 
 def forward(function: Callable[[Any], Any], x: Any, direction: Any) -> tuple[Any, Any]:
-    """`function(x)` and its derivative along `direction`."""
+    """Return `function(x)` and its derivative along `direction`."""
     dr.enable_grad(x)
     y = function(x)
     dr.set_grad(x, direction)
-    found = dr.forward_to(y)
-    return dr.detach(y), found
+    derivative = dr.forward_to(y)
+    return dr.detach(y), derivative
 
 
-def differentiate(formula: Any, given: Inputs, setting: Setting) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The derivatives of b, (N, 3) in extended precision, and which rays were transmitted."""
+def differentiate(formula: Any, samples: Inputs, setting: Setting) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Return the derivatives of b, (N, 3) in extended precision, and which rays were transmitted, (N,)."""
     vector: Any = dr.diff_array_t(setting.vector)
-    rays = given.rays
+    rays = samples.rays
     number = dr.value_t(vector)
-    (a, n, k), found = arrays(rays, vector), {}
-    for name, e in given.along.items():
-        found[name] = forward(lambda a: formula(a, n, k)[0], vector(a), from_numpy(vector, e))[1]
-    found["∂b/∂k"] = forward(lambda k: formula(a, n, k)[0], number(k), k)[1]
+    (a, n, k), results = arrays(rays, vector), {}
+    for name, e in samples.along.items():
+        results[name] = forward(lambda a: formula(a, n, k)[0], vector(a), from_numpy(vector, e))[1]
+    results["∂b/∂k"] = forward(lambda k: formula(a, n, k)[0], number(k), k)[1]
     transmitted = np.array(formula(a, n, k)[1])
-    return {name: np.array(x).T.astype(np.longdouble) for name, x in found.items()}, transmitted
+    return {name: np.array(x).T.astype(np.longdouble) for name, x in results.items()}, transmitted
 
 
 def formula_rows(
-    name: str, formula: Any, given: Inputs, setting: Setting
+    name: str, formula: Any, samples: Inputs, setting: Setting
 ) -> tuple[list[Row], list[tuple[float, float]]]:
-    """A row per derivative of a formula, and the curve of ∂b/∂k against cos²θt."""
-    found, transmitted = differentiate(formula, given, setting)
-    right, rows = transmitted == given.certified.transmitted, []
+    """Return a row per derivative of a formula, and the curve of ∂b/∂k against cos²θt."""
+    results, transmitted = differentiate(formula, samples, setting)
+    certified = samples.certified
+    right, rows = transmitted == certified.transmitted, []
     curve: list[tuple[float, float]] = []
     rounded_once = name == "promoted" and setting.precision is np.float32
     most = (limits.ROUNDED_DERIVATIVE, limits.ROUNDED_ETENDUE) if rounded_once else (limits.DERIVATIVE, limits.ETENDUE)
     at_limit = FORMULAS[name].budget.at_the_limit
-    budgets, of_area = ({"error / condition": x, "not finite": 0.0} if at_limit else {} for x in most)
-    for case, exact in given.exact.items():
-        error = lengths(found[case] - exact) / np.maximum(1, lengths(exact))
-        rows.append(row(name, case, error, given, setting, right, budgets))
-        curve = binned(given, np.where(right, error, 0)) if case == "∂b/∂k" else curve
-    area = np.cross(found["∂b/∂a in the plane"], found["∂b/∂a across it"])
-    cos_t, k = given.certified.cos_t, given.rays.k.astype(np.longdouble)
-    # Rounded, the two directions are off right angles to `a` by u, and the derivatives by u b: the part along b is not.
-    through, along_b = right & given.certified.transmitted, (area * given.certified.direction).sum(1)
+    budgets, etendue_budgets = ({"error / condition": x, "not finite": 0.0} if at_limit else {} for x in most)
+    for case, exact in samples.exact.items():
+        error = lengths(results[case] - exact) / np.maximum(1, lengths(exact))
+        rows.append(row(name, case, error, samples, setting, right, budgets))
+        curve = binned(samples, np.where(right, error, 0)) if case == "∂b/∂k" else curve
+    area = np.cross(results["∂b/∂a in the plane"], results["∂b/∂a across it"])
+    cos_t, k = certified.cos_t, samples.rays.k.astype(np.longdouble)
+    # The two rounded directions are perpendicular to `a` only up to u, and the derivatives have errors of u b: only the
+    # component of the area along b is free of these errors.
+    through, along_b = right & certified.transmitted, (area * certified.direction).sum(1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        error = np.abs(np.abs(along_b) * cos_t / (k * k * given.certified.cos_i) - 1)
-    # At grazing incidence what crosses the surface is known to u/cosθi.
-    steep = dataclasses.replace(given, condition=given.condition + 1 / (12 * given.certified.cos_i))
-    rows.append(row(name, "étendue", error, steep, setting, through, of_area))
+        error = np.abs(np.abs(along_b) * cos_t / (k * k * certified.cos_i) - 1)
+    # At grazing incidence the flux through the surface has a relative error of u/cosθi.
+    steep = dataclasses.replace(samples, condition=samples.condition + 1 / (12 * certified.cos_i))
+    rows.append(row(name, "étendue", error, steep, setting, through, etendue_budgets))
     return rows, curve
 
 
 def row(
-    subject: str, case: str, error: Array, given: Inputs, setting: Setting, right: Array, budgets: dict[str, float]
+    subject: str, case: str, error: Array, samples: Inputs, setting: Setting, right: Array, budgets: dict[str, float]
 ) -> Row:
-    """The worst error of a derivative, relative and over the condition of its ray."""
+    """Return the row of a derivative: its worst relative error, and its worst error over the ray's condition."""
     finite = np.isfinite(error)
     used = right & finite
-    over = np.where(used, error, 0) / (given.condition * setting.roundoff)
+    over = np.where(used, error, 0) / (samples.condition * setting.roundoff)
     worst = int(np.argmax(over))
     values = {
         "error / condition": float(over[worst]),
         "error": float(error[used].max(initial=0)),
         "not finite": float((right & ~finite).sum()),
     }
-    a, n = ([float(x).hex() for x in v[worst]] for v in (given.rays.a, given.rays.n))
-    ray = {"regime": str(given.regime[worst]), "a": a, "n": n, "k": float(given.rays.k[worst]).hex()}
+    a, n = ([float(x).hex() for x in v[worst]] for v in (samples.rays.a, samples.rays.n))
+    ray = {"regime": str(samples.regime[worst]), "a": a, "n": n, "k": float(samples.rays.k[worst]).hex()}
     replay = {"seed": seeds.current(SEED), "rays": len(error), "worst": ray}
     return Row(NAME, subject, case, setting.label, values, budgets, replay=replay)
 
 
-def binned(given: Inputs, y: np.ndarray) -> list[tuple[float, float]]:
-    """The largest y of the transmitted rays in each bin of cos²θt."""
-    cos2 = given.certified.cos_t**2
+def binned(samples: Inputs, y: np.ndarray) -> list[tuple[float, float]]:
+    """Return the largest y of the transmitted rays in each bin of cos²θt."""
+    cos2 = samples.certified.cos_t**2
     bins = [
-        given.certified.transmitted & (cos2 >= low) & (cos2 < 2 * high) & np.isfinite(y) & (y > 0)
+        samples.certified.transmitted & (cos2 >= low) & (cos2 < 2 * high) & np.isfinite(y) & (y > 0)
         for low, high in itertools.pairwise(BINS)
     ]
     centres = np.sqrt(BINS[:-1] * BINS[1:])
     return [(float(x), float(y[inside].max())) for x, inside in zip(centres, bins, strict=True) if inside.any()]
 
 
-def reflectance_row(given: Inputs, setting: Setting) -> Row:
-    """The row of exact cosines: those of the rays, rounded."""
+def reflectance_row(samples: Inputs, setting: Setting) -> Row:
+    """Return the row of ∂R/∂η. The rays' cosines are rounded, and the exact derivatives are those at these cosines."""
     number = dr.value_t(dr.diff_array_t(setting.vector))
-    k: Any = given.rays.k
-    cos_i: Any = given.certified.cos_i.astype(setting.precision)
+    k: Any = samples.rays.k
+    cos_i: Any = samples.certified.cos_i.astype(setting.precision)
     exact = derivatives.derivative_of_powers(cos_i, k, 0.0, k)
     cosine, certified = number(cos_i), oracle.fresnel(cos_i, k)
 
@@ -209,31 +213,31 @@ def reflectance_row(given: Inputs, setting: Setting) -> Row:
         cos_t, transmitted = fresnel.refracted_cosine(cosine, k)
         return fresnel.powers(cosine, cos_t, transmitted, k)[0]
 
-    r, found = (np.array(x).astype(np.longdouble) for x in forward(reflectance, number(k), number(k)))
+    r, derivative = (np.array(x).astype(np.longdouble) for x in forward(reflectance, number(k), number(k)))
     size = np.maximum(np.maximum(np.abs(exact), r), np.finfo(setting.precision).tiny)
-    # Where every term is 0, so must be their sum: any error is infinitely many conditions, and "not finite" stays 0.
+    # If every term is 0, so is the derivative: the condition is tiny, and any error counts as very many conditions.
     condition = np.maximum(size_of_powers(certified, cos_i, k) / size, np.finfo(float).tiny)
     with np.errstate(invalid="ignore"):
-        error = np.abs(found - exact) / size
+        error = np.abs(derivative - exact) / size
     exists = np.isfinite(exact)
     budgets = {"error / condition": limits.REFLECTANCE[setting.name], "not finite": 0.0}
-    given = dataclasses.replace(given, condition=condition)  # that of the rounded cosines
-    return row("powers", "∂R/∂η", error, given, setting, exists, budgets)
+    samples = dataclasses.replace(samples, condition=condition)  # at the rounded cosines
+    return row("powers", "∂R/∂η", error, samples, setting, exists, budgets)
 
 
 # Conditions -------------------------------------------------------------------------------------------------------
 
 
 def condition_of(certified: oracle.Certified, k: np.ndarray) -> np.ndarray:
-    """C = 1 + k² sinθi (sinθi + 2 cosθi)/cos²θt: what k and both directions, off by u, change log cosθt by.
+    """Return C = 1 + k² sinθi (sinθi + 2 cosθi)/cos²θt, the change of log cosθt in u if k and both directions err by u.
 
-    How far rounding may move a derivative, and so the constants in `limits` that go with this condition, with that of
-    the étendue, C + 1/12 cosθi, and with `size_of_powers`:
+    The following bounds the rounding errors of derivatives. It derives the constants in `limits` for this condition,
+    for the condition of the étendue, C + 1/12 cosθi, and for `size_of_powers`.
 
-    Notation: c = cosθi, s = sinθi, y = cosθt, D = y² = c² − κ s², e the input's direction, a prime d/dε. Forward
-    differentiation evaluates a sum of products with rounded factors. Sums of two words stay free of errors, as their
-    derivatives pass the same steps; a product costs u of its size. In units of u, for a form at the rounding limit,
-    whose values D, y and b are right to u:
+    Notation: c = cosθi, s = sinθi, y = cosθt, D = y² = c² − κ s², e is the direction of the derivative, and a prime is
+    d/dε. Forward differentiation evaluates a sum of products with rounded factors. Sums of two words have no errors,
+    because their derivatives take the same steps; a product has an error of u times its size. In units of u, for a form
+    at the rounding limit, whose values D, y and b have errors of at most u:
 
         c′ = n·e                  δc′ ≤ 1 + 4|c′|                       Σ|nᵢeᵢ| ≤ 1
         w′ = n × e                δw′ ≤ √2 + 2|w′|                      Σ(|nⱼeₖ| + |nₖeⱼ|)² ≤ 2
@@ -252,26 +256,26 @@ def condition_of(certified: oracle.Certified, k: np.ndarray) -> np.ndarray:
     (c + 7.4|κ|s)/y + 5.42k + 4k ≤ 17.9 CM. **∂b/∂k**: no δc′, no δw′, less. The certified derivative is a double, 1
     more: DERIVATIVE = 29 ≥ error/(C M u).
 
-    **Étendue**, (v × w)·b = k²c/y of v = ∂b/∂a in the plane and w = k across it. Errors along the surface, τ relative,
-    and ν along n, in units of u, move its logarithm by y²(τ_v + τ_w) + k²s²τ_w + (s y/c) ν_v; ν_w moves it by none.
-    With τ_v ≤ √2/c + 4 + 4/y, τ_w ≤ √2 + 8, ν_v ≤ δr′ + 4kc/y:
+    **Étendue**, (v × w)·b = k²c/y with v = ∂b/∂a in the plane and |w| = k across it. Relative errors τ along the
+    surface and errors ν along n, in units of u, change its logarithm by y²(τ_v + τ_w) + k²s²τ_w + (s y/c) ν_v; ν_w has
+    no effect. With τ_v ≤ √2/c + 4 + 4/y, τ_w ≤ √2 + 8, ν_v ≤ δr′ + 4kc/y:
 
         (√2 y² + 1.42|κ|s²)/c + 4y² + 4y + 9.42 + s(1 + 6s) + 6|κ|s² + 8k²s² + 4ks
 
-    y² + k²s² = 1 and |κ|s² ≤ 1, so at most 2.84/c + 8 + 4√2 + 9.42 + 7 + 6 = 2.84/c + 36.1. Both e are off unit by √3/2
-    each; cosines and b are doubles, 3 more: 40.8 + 2.84/c ≤ 41 (C + 1/12c). Here a small k does not hide in M.
+    y² + k²s² = 1 and |κ|s² ≤ 1, so at most 2.84/c + 8 + 4√2 + 9.42 + 7 + 6 = 2.84/c + 36.1. The length of either e errs
+    by √3/2; cosines and b are doubles, 3 more: 40.8 + 2.84/c ≤ 41 (C + 1/12c). Here M does not hide a small k.
 
     **The promoted form in float32** computes all of this with 2⁻⁵³ and rounds v and w once: |δb′| ≤ u|b′|, 1.01 with
-    what is left of float64; the étendue 2 + √3 of it.
+    the errors of float64; the étendue 2 + √3 of it.
 
-    **∂R/∂η** of R = A/(A + B), A = κ²(p² + q²), B = 2kp(d_s² + d_p²), p = cy, q = ks², where log y changes with log k
-    by Y = −k²s²/y². k ∂R/∂k = RT(α − β), and the sum of its terms' magnitudes is
+    **∂R/∂η** with R = A/(A + B), A = κ²(p² + q²), B = 2kp(d_s² + d_p²), p = cy, q = ks². The derivative of log y with
+    respect to log k is Y = −k²s²/y². k ∂R/∂k = RT(α − β), and the sum of its terms' magnitudes is
 
         S = RT [4k²/|κ| + (2p²|Y| + 2q²)/(p² + q²) + 1 + |Y| + 2(d_s(kc + y|Y|) + d_p ky(1 + |Y|))/(d_s² + d_p²)].
 
     In float64: Y by D′ (6 roundings) and √ (13); five steps of double words to A′ or B′, 13; T A′ − R B′ over A + B, 8;
-    and the rounded y, which enters p, d_s, d_p, R, T with powers of 8.2 at most: 48.2 u S. In float32 all but y, y′ and
-    the result is exact to 2⁻²⁹: 8.2 + 1 + 1, and less than 0.3 for what 1/T ≤ 1e6 makes of 2⁻⁵³.
+    and the rounded y, which enters p, d_s, d_p, R, T with powers of 8.2 at most: 48.2 u S. In float32 everything but y,
+    y′ and the result is exact to 2⁻²⁹: 8.2 + 1 + 1, and less than 0.3 for 2⁻⁵³ magnified by 1/T ≤ 1e6.
     """
     sin_i = np.sqrt((1 - certified.cos_i) * (1 + certified.cos_i))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -280,7 +284,7 @@ def condition_of(certified: oracle.Certified, k: np.ndarray) -> np.ndarray:
 
 
 def size_of_powers(certified: oracle.Certified, cos_i: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """S of `condition_of`, (N,); 0 under total internal reflection and at k = 1, where the derivative is exactly 0."""
+    """Return S of `condition_of`, (N,); 0 for total internal reflection and at k = 1, where the derivative is 0."""
     wide: Any = np.longdouble
     c, k, y = cos_i.astype(wide), k.astype(wide), certified.cos_t.astype(wide)
     r, t = (getattr(certified, name).astype(wide) for name in ("reflectance", "transmittance"))

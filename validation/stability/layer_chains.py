@@ -1,16 +1,17 @@
-"""Chains of plane boundaries with closed answers: the layers of a mirage, and the walls of a light pipe.
+"""Chains of plane boundaries with closed-form answers: the layers of a mirage, and the walls of a light pipe.
 
-Everything exact is in extended precision. With c = cos θ₀, s = sin θ₀ and κ_j = (n_0/n_j)² − 1, n sin θ is conserved:
+Exact values are in extended precision. With c = cos θ₀, s = sin θ₀ and κ_j = (n_0/n_j)² − 1, n sin θ is conserved:
 
     cos²θ_j = c² − κ_j s²;   the ray turns back at the first boundary whose far side has κ_j > c²/s²
     ∂(cos θ_e)/cos θ_e = Σ (n_i/n_e)² (cos θ_i / cos²θ_e) ε_i     ε_i: error of the direction in layer i, in radians
     ∂(cos θ_e)/cos θ_e = tan²θ_e Σ δ_i                             δ_i: relative error of the ratio at boundary i
 
-A ray that turns leaves through the top with the cosine it came with: there e = 0, and the sums go down and up.
+A ray that turns leaves through the top with the cosine with which it entered: e = 0, and the sums go down and up.
 
-Ratios of rounded indices err together: their product is the ratio of the first index to the last. Neighbours in
-float32 are n and n + mε, ε = 2⁻²³; their quotients are rounded to 1 ± mε, off by mε(n − 1), over the whole mirage by
-3e-5 · 3e-4, less than u. So |Σ δ| ≤ 3u: the first index, the last, and all quotients; of a ray that turned, ≤ u.
+Errors of the ratios of rounded indices are correlated: the product of the ratios is the ratio of the first index to the
+last. Neighbours in float32 are n and n + mε, ε = 2⁻²³; their quotient rounds to 1 ± mε, with an error of mε(n − 1).
+Over the whole mirage this is 3e-5 · 3e-4, less than u. So |Σ δ| ≤ 3u: from the first index, the last, and all
+quotients; for a ray that turns, ≤ u.
 """
 
 from __future__ import annotations
@@ -36,18 +37,19 @@ SEED = 7  # of the rays in the light pipe
 EXACT_RATIO = 2.0**-23  # 1 + this is the first float32 after 1
 FEEDS = {
     "ratios": "each k rounded once; in float32, neighbours 3e-8 apart have k = 1, and the ray is not refracted",
-    "reciprocals": "each k as 1/η of a rounded η = n_to/n_from; the same have k = 1 + 2⁻²³, four times too much",
-    "indices": "each k as a quotient of rounded indices, as scenes give them",
-    "contrasts": "each k rounded once, and with it k² − 1 from double precision",
+    "reciprocals": "each k as 1/η of a rounded η = n_to/n_from; the same neighbours have k − 1 = 2⁻²³, four times too "
+    "large",
+    "indices": "each k as a quotient of rounded indices, as in scene files",
+    "contrasts": "each k rounded once, with k² − 1 from double precision",
 }
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Boundaries 0 … count − 1, each met after the one before, as given to a formula.
+    """Boundaries 0 … count − 1 in the order in which a ray meets them, as a formula gets them.
 
     `normals` (rays or 1, count or 1, 3). `k` (2 count): n_from/n_to on the way down, then on the way up. `contrasts`:
-    k² − 1 likewise, or None. `turns`: a mirrored ray goes back up; else it goes on, as between the walls of a pipe.
+    k² − 1 likewise, or None. `turns`: whether a reflected ray goes back up, or on to the next boundary, as in a pipe.
     """
 
     normals: Array
@@ -57,14 +59,16 @@ class Chain:
 
     @property
     def count(self) -> int:
-        """How many layers there are."""
+        """The number of boundaries."""
         return len(self.k) // 2
 
 
 @dataclass(frozen=True)
 class Carried:
-    """Where the rays are in the end: `b` (N, 3), extended precision; `place` (N,) the boundary they would meet next,
-    −1 above the top; `passed` (N,) how often they were transmitted."""
+    """Rays after a chain: the direction `b` (N, 3) in extended precision, `place` and `passed` (N,).
+
+    `place`: the next boundary, −1 above the top. `passed`: the number of transmissions.
+    """
 
     b: Array
     place: Array
@@ -72,32 +76,39 @@ class Carried:
 
 
 def carry(subject: Subject, chain: Chain, a: Array, stop: Array, setting: Setting) -> Carried:
-    """Rays `a` (N, 3) from the top to boundary `stop` (N,), or back out of the top, by one formula; one launch."""
+    """Trace rays `a` (N, 3) with one formula from the top to boundary `stop` (N,), or back out of the top.
+
+    Compiled backends launch one kernel.
+    """
     if dr.is_jit_v(setting.vector):
         return _compiled(subject, chain, a, stop, setting)
     normals: Array = np.asarray(chain.normals, setting.precision)
     k = chain.k.astype(setting.precision).tolist()
     contrasts = None if chain.contrasts is None else chain.contrasts.astype(np.float64).tolist()
 
-    def boundary(mine: list[Any], place: int, way: int) -> tuple[Any, ...]:
-        here = place if way > 0 else place + chain.count
-        known = () if contrasts is None else (contrasts[here],)
-        return mine[place if len(mine) > 1 else 0], k[here], *known
+    def boundary(ray_normals: list[Any], place: int, way: int) -> tuple[Any, ...]:
+        index = place if way > 0 else place + chain.count
+        contrast = () if contrasts is None else (contrasts[index],)
+        return ray_normals[place if len(ray_normals) > 1 else 0], k[index], *contrast
 
-    found = []
+    results = []
     for i, ray in enumerate(a):
-        mine = [setting.vector(n) for n in normals[i if len(normals) > 1 else 0]]
+        ray_normals = [setting.vector(n) for n in normals[i if len(normals) > 1 else 0]]
         start = (setting.vector(ray.astype(setting.precision)), 0, 1, 0, 2 * chain.count + 2)
-        b, place, _, passed, _ = _follow(subject, functools.partial(boundary, mine), chain.turns, int(stop[i]), start)
-        found.append(([*b], place, passed))
-    b, place, passed = zip(*found, strict=True)
+        of_ray = functools.partial(boundary, ray_normals)
+        b, place, _, passed, _ = _follow(subject, of_ray, chain.turns, int(stop[i]), start)
+        results.append(([*b], place, passed))
+    b, place, passed = zip(*results, strict=True)
     return Carried(np.array(b, np.longdouble), np.array(place), np.array(passed))
 
 
 def _follow(
     subject: Subject, boundary: Callable[..., tuple[Any, ...]], turns: Any, stop: Any, start: tuple[Any, ...]
 ) -> tuple[Any, ...]:
-    """The loop both kinds of arrays share: (a, place, way ±1, passed, steps left) until the ray is out or at `stop`."""
+    """Loop over boundaries until the ray is out of the chain or at `stop`, for scalar and compiled arrays.
+
+    The state is (a, place, way ±1, passed, steps left).
+    """
 
     def inside(a: Any, place: Any, way: Any, passed: Any, left: Any) -> Any:
         return (place >= 0) & (place < stop) & (left > 0)
@@ -111,7 +122,7 @@ def _follow(
 
 
 def _compiled(subject: Subject, chain: Chain, a: Array, stop: Array, setting: Setting) -> Carried:
-    """Everything that tells one chain from another is data, so that each formula is compiled once."""
+    """As `carry`, on a compiled backend. Chains differ in data only, so each formula is compiled once."""
     vector, number = setting.vector, dr.value_t(setting.vector)
     integer: Any = dr.int32_array_t(number)
     rows, columns, _ = chain.normals.shape
@@ -121,19 +132,19 @@ def _compiled(subject: Subject, chain: Chain, a: Array, stop: Array, setting: Se
     count, stride = dr.opaque(integer, chain.count), dr.opaque(integer, int(columns > 1))
     turns, limit = dr.opaque(dr.mask_t(integer), chain.turns), 2 * chain.count + 2
     start = (vector(a.astype(setting.precision).T), *(dr.opaque(integer, x, len(a)) for x in (0, 1, 0, limit)))
-    # numpy's memory may be aligned or not, and be transposed: each is another kernel, unless it is copied first.
+    # Unaligned or transposed memory of numpy would be another kernel each: index arithmetic copies it.
     rays = np.arange(len(a)) if rows > 1 else np.zeros(len(a))
     first, end = (integer(x.astype(np.int32)) + start[1] for x in (rays * columns, stop))
     dr.eval(start, first, end)
 
     def boundary(place: Any, way: Any) -> tuple[Any, ...]:
-        here = dr.select(way > 0, place, place + count)
-        known = () if contrasts is None else (dr.gather(wide, contrasts, here),)
-        return dr.gather(vector, normals, first + stride * place), dr.gather(number, k, here), *known
+        index = dr.select(way > 0, place, place + count)
+        contrast = () if contrasts is None else (dr.gather(wide, contrasts, index),)
+        return dr.gather(vector, normals, first + stride * place), dr.gather(number, k, index), *contrast
 
-    def detached(*given: Any) -> tuple[Any, ...]:
-        # Mitsuba's functions return arrays that carry derivatives, and the state of the loop must keep its type.
-        return dr.detach(subject(*given), preserve_type=False)
+    def detached(*arguments: Any) -> tuple[Any, ...]:
+        # Mitsuba's functions return arrays with derivatives; the loop's state must keep its type.
+        return dr.detach(subject(*arguments), preserve_type=False)
 
     b, place, _, passed, _ = _follow(detached, boundary, turns, end, start)
     dr.eval(b, place, passed)
@@ -145,10 +156,10 @@ def _compiled(subject: Subject, chain: Chain, a: Array, stop: Array, setting: Se
 
 @dataclass(frozen=True)
 class Layers:
-    """Plane layers 0 … count whose index falls from one to the next; all arrays in extended precision.
+    """Plane layers 0 … count of decreasing index; all arrays in extended precision.
 
-    `index` (count + 1,); `kappa` (count + 1,): (n_0/n_j)² − 1; `steps` (count,): (n_j/n_(j+1))² − 1. `exact`: float32
-    holds the ratios on the way down.
+    `index` (count + 1,); `kappa` (count + 1,): (n_0/n_j)² − 1; `steps` (count,): (n_j/n_(j+1))² − 1. `exact`: the
+    ratios on the way down are exact in float32.
     """
 
     index: Array
@@ -158,11 +169,11 @@ class Layers:
 
     @property
     def count(self) -> int:
-        """How many boundaries there are."""
+        """The number of boundaries."""
         return len(self.steps)
 
     def chain(self, normal: Array, feed: str, precision: type) -> Chain:
-        """The numbers that a formula is given for each boundary; `feed`: one of FEEDS."""
+        """Return the numbers that a formula gets at each boundary; `feed`: one of FEEDS."""
         index = self.index.astype(precision) if feed == "indices" else self.index
         k = np.concatenate([index[:-1] / index[1:], index[1:] / index[:-1]])
         if feed == "reciprocals":
@@ -171,20 +182,20 @@ class Layers:
         return Chain(normal.reshape(1, 1, 3), k, contrasts)
 
     def cosine(self, c2: Array, s2: Array, layer: Array) -> Array:
-        """cos θ of rays with cos²θ₀ = c2 in `layer`; 0 where they do not arrive."""
+        """Return cos θ in `layer` of rays with cos²θ₀ = c2; 0 for rays that do not reach it."""
         return np.asarray(np.sqrt(np.maximum(c2 - self.kappa[layer] * s2, 0)))
 
     def turning(self, c2: Array, s2: Array) -> Array:
-        """The layer in which a ray turns; `count` where it passes through all of them."""
+        """Return the layer in which a ray turns; `count` for rays that pass all layers."""
         return np.searchsorted(self.kappa[1:], c2 / s2, side="right")
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays into `layers`, each up to its boundary `stop`, and what must become of them.
+    """Rays that enter `layers`, each traced up to its boundary `stop`, and their exact answers.
 
-    Arrays (N,), extended precision. `passes`: it gets there; else it turns in layer `last` and leaves by the top.
-    `end`: its cosine where it ends. `sine2`: sin²θ₀; `cosines`: Σ (n_i/n_0)² cos θ_i over layers 0 … last.
+    Arrays (N,) in extended precision. `passes`: the ray reaches `stop`; otherwise it turns in layer `last` and leaves
+    through the top. `end`: its final cosine. `sine2`: sin²θ₀; `cosines`: Σ (n_i/n_0)² cos θ_i over layers 0 … last.
     """
 
     layers: Layers
@@ -198,11 +209,11 @@ class Rays:
     cosines: Array
 
     def fed(self, feed: str, precision: type) -> Fed:
-        """The same rays, with the layers as given to a formula in `precision`; `feed`: one of FEEDS."""
-        each = {"ratios": 1, "reciprocals": 2}.get(feed, 0)  # a reciprocal is rounded twice
-        all_down = 3 if feed == "indices" else each * self.last * (not self.layers.exact)
-        turned = 1 if feed == "indices" else each * self.last * (2 - self.layers.exact)
-        # Down into layers 1 … last; turned, also the mirror direction in the last, and up into last − 1 … 0.
+        """Return the rays with the layers as a formula in `precision` gets them; `feed`: one of FEEDS."""
+        roundings = {"ratios": 1, "reciprocals": 2}.get(feed, 0)  # per boundary: a reciprocal is rounded twice
+        all_down = 3 if feed == "indices" else roundings * self.last * (not self.layers.exact)
+        turned = 1 if feed == "indices" else roundings * self.last * (2 - self.layers.exact)
+        # Down into layers 1 … last; for rays that turn, also the reflection in the last, and up into last − 1 … 0.
         outputs = np.where(self.passes, self.cosines, 2 * self.cosines) - np.sqrt(1 - self.sine2)
         squeeze = 1 + np.where(self.passes, self.layers.kappa[self.last], 0)
         condition = (outputs + np.where(self.passes, all_down, turned) * self.sine2) * squeeze / self.end**2
@@ -212,8 +223,11 @@ class Rays:
 
 @dataclass(frozen=True)
 class Fed:
-    """`condition` (N,): of ln cos θ where a ray ends, the sums at the head of this module with every ε and every δ 1.
-    `height` (N,): how many layers too high or too low it turns then. Both are to first order."""
+    """Rays, their layers as a formula gets them, and conditions to first order.
+
+    `condition` (N,): condition of ln cos θ at the end of a ray, the sums in this module's docstring with every ε and
+    every δ 1. `height` (N,): the corresponding error of the turning layer, in layers.
+    """
 
     rays: Rays
     feed: str
@@ -223,7 +237,7 @@ class Fed:
 
 
 def enter(layers: Layers, degrees: Array, stop: Array, plane: Array, precision: type) -> Rays:
-    """Rays at these angles to the normal plane[0], towards plane[1]; normal and rays rounded to `precision`."""
+    """Return rays at these angles to the normal plane[0], towards plane[1]; rays and normal are in `precision`."""
     normal, radians = plane[0].astype(precision), np.deg2rad(np.asarray(degrees, np.longdouble))[:, None]
     a = (np.cos(radians) * plane[0] + np.sin(radians) * plane[1]).astype(precision)
     c2, s2 = cosine(a, normal) ** 2, sine2(a, normal)
@@ -233,34 +247,34 @@ def enter(layers: Layers, degrees: Array, stop: Array, plane: Array, precision: 
     end = np.where(passes, layers.cosine(c2, s2, last), np.sqrt(c2))
     cosines, everywhere = np.zeros(len(a), np.longdouble), np.arange(layers.count + 1)
     for c in np.unique(c2):
-        here = c2 == c
-        weighted = layers.cosine(c, s2[here][0], everywhere) / (1 + layers.kappa)
-        cosines[here] = np.cumsum(weighted)[last[here]]
+        same = c2 == c
+        weighted = layers.cosine(c, s2[same][0], everywhere) / (1 + layers.kappa)
+        cosines[same] = np.cumsum(weighted)[last[same]]
     return Rays(layers, normal, a, stop, passes, last, end, s2, cosines)
 
 
 def cosine(b: Array, normal: Array) -> Array:
-    """|cos| of the angle between each b (N, 3) and the normal, whatever their lengths."""
+    """Return |cos| of the angle between each b (N, 3) and the normal, of any lengths."""
     b, normal = b.astype(np.longdouble), normal.astype(np.longdouble)
     return np.asarray(np.abs(b @ normal) / np.sqrt((b * b).sum(1) * (normal @ normal)))
 
 
 def sine2(b: Array, normal: Array) -> Array:
-    """sin² of the same angle."""
+    """Return sin² of the angle between each b (N, 3) and the normal, of any lengths."""
     b, normal = b.astype(np.longdouble), normal.astype(np.longdouble)
     return np.asarray((np.cross(normal, b) ** 2).sum(1) / ((b * b).sum(1) * (normal @ normal)))
 
 
 @functools.cache
 def air(count: int) -> Layers:
-    """n_j = TOP − j MIRAGE/count: the air above a hot road, 3e-8 a layer for a thousand of them."""
+    """Return the air above a hot road: n_j = TOP − j MIRAGE/count, steps of 3e-8 for a thousand layers."""
     j, top, step = np.arange(count + 1).astype(np.longdouble), np.longdouble(TOP), np.longdouble(MIRAGE) / count
     index = top - j * step
     return Layers(index, j * step * (2 * top - j * step) / index**2, step * (index[:-1] + index[1:]) / index[1:] ** 2)
 
 
 def exact_ratios(count: int) -> Layers:
-    """n_j/n_(j+1) = 1 + 2⁻²³, which float32 holds: nothing is lost before a formula begins."""
+    """Return layers with n_j/n_(j+1) = 1 + 2⁻²³, which is exact in float32: the inputs have no errors."""
     growth = np.arange(count + 1) * np.log1p(np.longdouble(EXACT_RATIO))
     step = np.longdouble(EXACT_RATIO) * (2 + np.longdouble(EXACT_RATIO))
     return Layers(TOP * np.exp(-growth), np.expm1(2 * growth), np.full(count, step), exact=True)
@@ -270,26 +284,26 @@ def exact_ratios(count: int) -> Layers:
 
 
 def frame(precision: type) -> Array:
-    """Three rows that are orthogonal exactly, as rounded to `precision`, and unit to half an ulp."""
+    """Return three rows in `precision` that are exactly orthogonal, and unit up to half an ulp."""
     return np.longdouble(precision(1) / precision(3)) * np.array([[1, 2, 2], [2, 1, -2], [2, -2, 1]], np.longdouble)
 
 
 @seeds.cached
 def pipe(reflections: int, rays: int, index: float, precision: type) -> tuple[Array, Chain, Array]:
-    """(a, chain, exact direction in the end) in a square pipe with the axes `frame`: walls ±0, ±1, length 2.
+    """Return (a, chain, exact final direction) of rays in a square pipe whose axes are the rows of `frame`.
 
-    Unfolded, the ray is straight and meets the walls of either pair at equal distances: each meeting changes the
-    sign of one component, and nothing else.
+    The pipe is along axis 2. In the unfolded pipe the ray is straight and meets the walls of a pair at equal distances:
+    each reflection only changes the sign of one component.
     """
     rng, axes = np.random.default_rng(seeds.current(SEED)), frame(precision)
     across = rng.uniform(0.05, 0.6, (rays, 2)) * rng.choice([-1, 1], (rays, 2))
     local = np.column_stack([across, np.sqrt(1 - (across**2).sum(1))])
     a: Array = (local @ axes).astype(precision)
     components = a.astype(np.longdouble) @ axes[:2].T
-    met = (np.arange(reflections) + 0.5)[None, :, None] / np.abs(components)[:, None, :]
-    order = np.argsort(met.reshape(rays, -1), axis=1)[:, :reflections] % 2
-    before = np.where(order == 1, np.cumsum(order == 1, axis=1), np.cumsum(order == 0, axis=1)) - 1
-    outward = np.sign(np.take_along_axis(components, order, axis=1)) * (-1.0) ** before
+    distances = (np.arange(reflections) + 0.5)[None, :, None] / np.abs(components)[:, None, :]
+    order = np.argsort(distances.reshape(rays, -1), axis=1)[:, :reflections] % 2
+    earlier = np.where(order == 1, np.cumsum(order == 1, axis=1), np.cumsum(order == 0, axis=1)) - 1
+    outward = np.sign(np.take_along_axis(components, order, axis=1)) * (-1.0) ** earlier
     chain = Chain(outward[..., None] * axes[order], np.full(2 * reflections, index), turns=False)
     times = np.stack([(order == wall).sum(1) for wall in (0, 1)], axis=1)
     flipped = np.where(times % 2 == 1, 2 * components, 0) / (axes[:2] ** 2).sum(1)

@@ -2,10 +2,9 @@
 
 A ray is traced through Mitsuba's scene with the plugin's own samples, transmitted wherever possible, and compared with
 a path of straight segments and Snell's law in double precision. Both include Mitsuba's ray offset: in the mirage it
-moves rays by more than any other error, but it turns none. Every solid lies inside the one before it, so each boundary
-separates two absolute indices; layers cannot be much thinner than Mitsuba's ray offset, or it would skip them. The
-images show the mirage through a telescope and to the
-naked eye, and the fibre.
+shifts rays by more than any other error, but does not change their directions. Every solid lies inside the one before
+it, so each boundary separates two absolute indices. Layers cannot be much thinner than Mitsuba's ray offset, which
+would skip them. The images show the mirage through a telescope and to the naked eye, and the fibre.
 """
 
 from __future__ import annotations
@@ -37,19 +36,20 @@ from validation.study import Study, Task, about
 INDICES, RATIOS = "exact, indices in float32", "exact, ratios in float32"
 DIRECTION, MEDIAN_DIRECTION, PLACE = "direction", "median direction", "place"
 TERMS = {
-    "direction": "largest |d − exact| anywhere on a path, over the sine of the angle at which it enters",
+    "direction": "largest |d − exact| anywhere on a path, divided by the sine of the angle of entry",
     "direction / condition": "the same, divided by the factor by which a decreasing cosine magnifies any error",
-    PLACE: "largest distance from the exact path, over that path's own extent across the layers",
-    INDICES: "Snell's law in double precision for the indices rounded to float32, which the built-in starts from",
-    RATIOS: "the same for the ratio of every two neighbours rounded to float32, which the other formulas start from",
+    PLACE: "largest distance from the exact path, divided by the exact path's extent across the layers",
+    INDICES: "Snell's law in double precision for indices rounded to float32, the inputs of the built-in",
+    RATIOS: "the same for ratios of neighbours rounded to float32, the inputs of the other formulas",
     WRONG_PATH: "rays that meet a wrong number of boundaries",
     "ray offset": "the place error if the exact path had no ray offset: the same for every plugin",
-    "pixels off": "pixels of which a channel differs by more than 0.1 from the built-in's, same seed",
+    "pixels off": "share of pixels with a channel that differs by more than 0.1 from the built-in's image, same seed",
     "pixels off, control": "the same between two formulas at the rounding limit: caused by flipped lobes alone",
     "exact (image)": "the image by Snell's and Fresnel's laws in double precision, with Mitsuba's ray offset",
-    OFF_EXACT: "pixels of which a channel differs by more than 0.1 from that image, by other random numbers",
-    BUILTIN_OFF_EXACT: "the same of the built-in's image",
-    "off exact / built-in": "the one over the other",
+    OFF_EXACT: "share of pixels with a channel that differs by more than 0.1 from the exact image, which uses other "
+    "random numbers",
+    BUILTIN_OFF_EXACT: "the same for the built-in's image",
+    "off exact / built-in": "the ratio of these two shares",
 }
 AXES = {"x": "distance, or mrad of entry", "y": "deviation", "x_scale": "linear", "y_scale": "log"}
 NAME = "paths"
@@ -59,7 +59,7 @@ SEED = 2028
 RAYS = 64
 VISIBLE = 0.1
 EXACT_SPP = 64
-# The images: a scene, what its parameters are, and the name of the view.
+# The images: a scene, its parameters, and the name of the view.
 VIEWS: tuple[tuple[str, dict[str, str], str], ...] = (
     ("mirage", {}, "mirage, telescope"),
     ("mirage", {"fov": "1.3"}, "mirage, naked eye"),
@@ -74,8 +74,8 @@ VIEWS: tuple[tuple[str, dict[str, str], str], ...] = (
 class Layers:
     """Media 0 (outermost) to N: medium k has `indices[k]` and lies between the boundaries k − 1 and k.
 
-    A boundary is the plane y = `boundaries[k]`, or, where `round`, the cylinder of that radius around the z axis.
-    `axis`: the coordinate along which light travels, toward `end`, where paths are cut off. Lengths in scene units.
+    A boundary is the plane y = `boundaries[k]` or, if `round`, the cylinder of that radius around the z axis. `axis`:
+    the coordinate along which light travels, toward `end`, where paths are cut off. Lengths are in scene units.
     """
 
     scene: str
@@ -86,17 +86,17 @@ class Layers:
     end: float
 
     def normal(self, p: np.ndarray) -> np.ndarray:
-        """The outward normal of the boundary at `p`."""
+        """Return the outward normal of the boundary at `p`."""
         return np.array([p[0], p[1], 0.0]) / math.hypot(p[0], p[1]) if self.round else np.array([0.0, 1.0, 0.0])
 
     def distance(self, p: np.ndarray, d: np.ndarray, boundary: int, inward: bool) -> float:
-        """Distance from `p` along `d` to a boundary, met from outside where `inward`; infinite where there is none."""
+        """Return the distance from `p` along `d` to a boundary, met from outside if `inward`; inf without a hit."""
         if not 0 <= boundary < len(self.boundaries):
             return math.inf
         if not self.round:
             return (self.boundaries[boundary] - p[1]) / d[1] if inward == (d[1] < 0) else math.inf
         a, b = d[:2] @ d[:2], p[:2] @ d[:2]
-        # b² − a c by Lagrange's identity: what is left is no difference of large terms.
+        # b² − a c by Lagrange's identity, without cancellation of large terms.
         root2 = a * self.boundaries[boundary] ** 2 - (p[0] * d[1] - p[1] * d[0]) ** 2
         if root2 < 0 or (inward and b >= 0):
             return math.inf
@@ -113,15 +113,15 @@ class Path:
     media: tuple[int, ...]
 
     def segments(self) -> np.ndarray:
-        """Starts, directions and ends, M × 3 × 3."""
+        """Return starts, directions and ends, M × 3 × 3."""
         return np.stack([self.starts, self.directions, self.ends], 1)
 
     def cosines(self, layers: Layers) -> np.ndarray:
-        """|d · n| of every segment, n the normal where it starts."""
+        """Return |d · n| of every segment, with the normal n at its start."""
         return np.abs([d @ layers.normal(p) for p, d in zip(self.starts, self.directions, strict=True)])
 
     def at(self, layers: Layers, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(segments, points) where the coordinate along the axis has the values `along`."""
+        """Return the segments and the points whose coordinate along the axis has the values `along`."""
         axis = layers.axis
         forward = math.copysign(1.0, self.directions[0, axis])
         segment = np.searchsorted(forward * self.ends[:-1, axis], forward * along)
@@ -130,11 +130,11 @@ class Path:
 
 
 def exact_path(layers: Layers, p: np.ndarray, d: np.ndarray, medium: int, offset: float = OFFSET) -> Path:
-    """The path of a ray that starts at `p` in `medium`, toward `d`: straight, and by Snell's law at each boundary.
+    """Return the path of a ray from `p` in `medium` toward `d`, with Snell's law at each boundary.
 
-    With P = n d the tangential part of P is conserved and P_n² changes by n'² − n² = (n' − n)(n' + n); where that
-    would make it negative, P_n is reversed. In double precision: c = P_n/n is right to 2⁻⁵² n/P_n. Mitsuba's ray
-    offset is part of the path, unless `offset` = 0.
+    With P = n d the tangential part of P is conserved and P_n² changes by n'² − n² = (n' − n)(n' + n); if that makes it
+    negative, P_n is reversed. In double precision c = P_n/n has an error of 2⁻⁵² n/P_n. The path includes Mitsuba's ray
+    offset, unless `offset` = 0.
     """
     p, momentum = np.array(p, float), np.array(d, float)
     momentum *= layers.indices[medium] / np.linalg.norm(momentum)
@@ -164,17 +164,17 @@ def exact_path(layers: Layers, p: np.ndarray, d: np.ndarray, medium: int, offset
 # The scenes ----------------------------------------------------------------------------------------------------
 
 POOL = 100.0  # half the length of the warm air
-STEP = 0.02  # by which a solid is smaller than the one around it, where no light passes
+STEP = 0.02  # a solid is smaller than the one around it by this, on sides without light
 
 
 def _read(scene: str) -> Layers:
-    """The layers that a scene file holds: BSDFs to_1, to_2, …, and boxes layer_i from the top, or cylinders shell_i."""
+    """Read the layers of a scene file: BSDFs to_1, to_2, …, and boxes layer_i from the top, or cylinders shell_i."""
     root = ET.parse(SCENES / f"{scene}.xml").getroot()
 
     def values(path: str, name: str = "value") -> list[float]:
-        """The values of every element within those of the layers, by its path from the root."""
-        named = [x for x in root.iterfind(path.partition("/")[0]) if (x.get("id") or "").startswith(prefixes)]
-        return [float(y.attrib[name]) for x in named for y in x.iterfind(path.partition("/")[2])]
+        """Return an attribute of every element with this path from the root, within the elements of the layers."""
+        layers = [x for x in root.iterfind(path.partition("/")[0]) if (x.get("id") or "").startswith(prefixes)]
+        return [float(y.attrib[name]) for x in layers for y in x.iterfind(path.partition("/")[2])]
 
     prefixes = ("to_", "layer_", "shell_")
     indices = (values("bsdf/*[@name='ext_ior']")[0], *values("bsdf/*[@name='int_ior']"))
@@ -196,7 +196,7 @@ MIRAGE, FIBRE = LAYERS.values()
 
 @dataclass(frozen=True)
 class Bundle:
-    """Rays by origin and direction (R × 3, exact in float32) in `media`, and which one the curves show."""
+    """Rays: origins and directions (R × 3, exact in float32), their media, and the index of the ray in the curves."""
 
     origins: np.ndarray
     directions: np.ndarray
@@ -204,26 +204,26 @@ class Bundle:
     shown: int
 
     def exact(self, layers: Layers, offset: float = OFFSET) -> list[Path]:
-        """The exact paths through layers, with Mitsuba's ray offset or another one."""
+        """Return the exact paths of the rays through layers, with Mitsuba's ray offset or another one."""
         rays = zip(self.origins, self.directions, self.media, strict=True)
         return [exact_path(layers, p, d, int(medium), offset) for p, d, medium in rays]
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per scene for the paths, one per view for the images; `quick` has the paths of the mirage."""
-    scenes, seen = ((MIRAGE,), ()) if context.profile.quick else ((MIRAGE, FIBRE), VIEWS)
+    """Return one task per scene for the paths and one per view for the images; `quick` has the mirage's paths only."""
+    scenes, views = ((MIRAGE,), ()) if context.profile.quick else ((MIRAGE, FIBRE), VIEWS)
     paths = [(layers.scene, functools.partial(path_rows, context, layers)) for layers in scenes]
-    views = [(f"image of the {view[2]}", functools.partial(view_rows, context, *view)) for view in seen]
-    return [Task(f"paths: {name}", work) for name, work in paths + views]
+    images = [(f"image of the {view[2]}", functools.partial(view_rows, context, *view)) for view in views]
+    return [Task(f"paths: {name}", work) for name, work in paths + images]
 
 
 def drawn_rows(context: Context) -> list[Row]:
-    """The paths through the fibre, whose rays are random; those of the mirage are not."""
+    """Return the paths through the fibre, whose rays are random; those of the mirage are not."""
     return path_rows(context, FIBRE)
 
 
 def plugins() -> list[str]:
-    """The built-in, `refract`, and `refract` with each formula."""
+    """Return the names of the built-in, of `refract`, and of `refract` with each formula."""
     return [BUILTIN, PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS)]
 
 
@@ -231,7 +231,7 @@ def plugins() -> list[str]:
 
 
 def bundle(layers: Layers) -> Bundle:
-    """Into the mirage at 0.15 to 9 thousandths of a radian; into the fibre anywhere, at angles that it guides."""
+    """Return rays into the mirage at 0.15 to 9 mrad, or into the fibre at random places and guided angles."""
     if layers is MIRAGE:
         sine = np.geomspace(1.5e-4, 9e-3, RAYS)
         directions = np.stack([np.sqrt(1 - sine**2), -sine, 0 * sine], 1)
@@ -242,8 +242,8 @@ def bundle(layers: Layers) -> Bundle:
         media = rng.integers(2, len(layers.indices) - 1, RAYS)
         edges = np.array([*layers.boundaries, 0.0])
         radius, n = (edges[media - 1] + edges[media]) / 2, np.array(layers.indices)[media]
-        turn = rng.uniform(0, 2 * np.pi, RAYS)
-        origins = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(RAYS, -layers.end)], 1)
+        polar = rng.uniform(0, 2 * np.pi, RAYS)
+        origins = np.stack([radius * np.cos(polar), radius * np.sin(polar), np.full(RAYS, -layers.end)], 1)
         sine = rng.uniform(0.1, 0.9, RAYS) * np.sqrt(n**2 - layers.indices[1] ** 2) / n
         azimuth = rng.uniform(0, 2 * np.pi, RAYS)
         directions = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), -np.sqrt(1 - sine**2)], 1)
@@ -252,34 +252,34 @@ def bundle(layers: Layers) -> Bundle:
 
 
 def trace(scene: Any, layers: Layers, rays: Bundle, steps: int) -> np.ndarray:
-    """Start, direction and end of each segment as Mitsuba has it, S × 3 × R × 3; NaN after the end of a path.
+    """Return start, direction and end of each segment in Mitsuba, S × 3 × R × 3; NaN after the end of a path.
 
-    The sample 1 − 2⁻²⁴ reflects only where the reflectance is 1: total internal reflection.
+    The sample 1 − 2⁻²⁴ reflects only if the reflectance is 1: total internal reflection.
     """
     import mitsuba as mi
 
     sampling, axis, sign, count = mi.BSDFContext(), layers.axis, math.copysign(1.0, layers.end), len(rays.media)
-    found = dr.full(mi.Float, dr.nan, steps * 9 * count)
+    segments = dr.full(mi.Float, dr.nan, steps * 9 * count)
     ray = mi.Ray3f(mi.Point3f(rays.origins.T), mi.Vector3f(rays.directions.T))
 
     def step(i: Any, active: Any, ray: Any) -> tuple[Any, Any, Any]:
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
         for j, x in enumerate((*ray.o, *ray.d, *si.p)):
-            dr.scatter(found, x, (i * 9 + j) * count + dr.arange(mi.UInt32, count), active)
+            dr.scatter(segments, x, (i * 9 + j) * count + dr.arange(mi.UInt32, count), active)
         active &= (sign * si.p[axis] < sign * layers.end) & ~si.shape.is_emitter()
         bs, _ = si.bsdf().sample(sampling, si, 1 - 2.0**-24, [0.5, 0.5], active)
         return i + 1, active, si.spawn_ray(si.to_world(bs.wo))
 
     start = dr.zeros(mi.UInt32, count), dr.full(mi.Bool, True, count), ray
-    # One symbolic loop: each step would trace the callables of all media anew.
+    # One symbolic loop: otherwise each step would trace the callables of all media again.
     dr.while_loop(start, lambda i, active, ray: active & (i < steps), step)
-    return np.moveaxis(np.array(found, float).reshape(steps, 3, 3, count), 2, 3)
+    return np.moveaxis(np.array(segments, float).reshape(steps, 3, 3, count), 2, 3)
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """One traced path at the middle of each segment, which no ray offset separates from the exact one."""
+    """Errors of a traced path at the middle of each segment, where the ray offset does not separate the paths."""
 
     along: np.ndarray
     direction: np.ndarray
@@ -289,10 +289,10 @@ class Deviation:
 
 
 def deviation(layers: Layers, exact: Path, segments: np.ndarray) -> Deviation:
-    """`segments`: starts, directions and ends, S × 3 × 3, as far as they are finite.
+    """Return the deviation of `segments` (starts, directions and ends, S × 3 × 3) from the exact path; NaN is skipped.
 
-    A cosine c' behind a boundary obeys c' dc' = c dc: so what is off by ε at the entry is off by ε sin α / c' there,
-    α the angle between ray and layers at the entry.
+    A cosine c' behind a boundary obeys c' dc' = c dc: an error of ε at the entry becomes ε sin α / c' there, where α is
+    the angle between ray and layers at the entry.
     """
     starts, d, ends = segments[np.isfinite(segments).all((1, 2))].swapaxes(0, 1)
     d = d / np.linalg.norm(d, axis=1)[:, None]
@@ -314,41 +314,41 @@ def deviation(layers: Layers, exact: Path, segments: np.ndarray) -> Deviation:
 
 
 def path_rows(context: Context, layers: Layers) -> list[Row]:
-    """A row of every plugin and of exact arithmetic with rounded inputs, and rows of curves."""
+    """Return a row per plugin, rows of exact arithmetic with rounded inputs, and rows of curves."""
     if context.variant.startswith("scalar"):
         return [Row(NAME, plugin, layers.scene, context.variant, reason=SCALAR) for plugin in plugins()]
     import mitsuba as mi
 
     rays = bundle(layers)
     exact = rays.exact(layers)
-    found: dict[str, list[Deviation]] = {}
+    deviations: dict[str, list[Deviation]] = {}
     for plugin in plugins():
         scene = mi.load_file(str(SCENES / f"{layers.scene}.xml"), **scene_files.REPRODUCIBLE, bsdf=plugin)
         segments = trace(scene, layers, rays, 4 * max(len(path.media) for path in exact))
-        found[plugin] = [deviation(layers, path, segments[:, :, i]) for i, path in enumerate(exact)]
-    # The errors of the inputs alone: indices, or their ratios, rounded to float32 as a plugin may get them.
+        deviations[plugin] = [deviation(layers, path, segments[:, :, i]) for i, path in enumerate(exact)]
+    # The errors of the inputs alone: indices, or their ratios, rounded to float32.
     n = np.array(layers.indices)
     ratios = (n[1:] / n[:-1]).astype(np.float32).astype(float)
     for name, x in ((INDICES, n.astype(np.float32).astype(float)), (RATIOS, n[0] * np.cumprod([1.0, *ratios]))):
         others = rays.exact(dataclasses.replace(layers, indices=tuple(x.tolist())))
-        found[name] = [deviation(layers, p, q.segments()) for p, q in zip(exact, others, strict=True)]
+        deviations[name] = [deviation(layers, p, q.segments()) for p, q in zip(exact, others, strict=True)]
     replay = {"scene": f"{layers.scene}.xml", "rays": RAYS, "seed": seeds.current(SEED), "shown": rays.shown}
     rows = [
         _path_row(layers, name, exact, parts, setting=context.variant, replay=replay | {"plugin": name})
-        for name, parts in found.items()
+        for name, parts in deviations.items()
     ]
-    # How far the ray offset moves the exact paths; the median, as some turn elsewhere without it.
+    # The shift of the exact paths by the ray offset; the median, as some rays turn at another layer without it.
     plain = zip(rays.exact(layers, offset=0.0), exact, strict=True)
     offset = {"ray offset": float(np.median([deviation(layers, p, q.segments()).place.max() for p, q in plain]))}
     row = functools.partial(Row, NAME, "every plugin", setting=context.variant, values=offset, replay=replay)
-    return rows + [row(case=f"{layers.scene}: {case}", curves=x) for case, x in _curves(rays, found).items()]
+    return rows + [row(case=f"{layers.scene}: {case}", curves=x) for case, x in _curves(rays, deviations).items()]
 
 
-def _curves(rays: Bundle, found: dict[str, list[Deviation]]) -> dict[str, dict[str, list[tuple[float, float]]]]:
-    """Curves by case and plugin: along the path that is shown, and at the end of every path."""
+def _curves(rays: Bundle, deviations: dict[str, list[Deviation]]) -> dict[str, dict[str, list[tuple[float, float]]]]:
+    """Return curves by case and plugin: along the path that is shown, and at the end of every path."""
     entry = 1e3 * np.hypot(rays.directions[:, 1], rays.directions[:, 0] if rays.media.any() else 0)
     curves: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    for plugin, parts in found.items():
+    for plugin, parts in deviations.items():
         shown, end = parts[rays.shown], np.array([part.direction[-1] for part in parts])
         for case, x, y in (
             ("direction along a path", shown.along, shown.direction),
@@ -360,26 +360,27 @@ def _curves(rays: Bundle, found: dict[str, list[Deviation]]) -> dict[str, dict[s
 
 
 def _path_row(layers: Layers, name: str, exact: list[Path], parts: list[Deviation], **row: Any) -> Row:
-    """Of the forms at the rounding limit: no ray takes a wrong path; in the mirage the direction is bounded a priori.
+    """Return the row of a plugin's paths, with budgets for forms at the rounding limit.
 
-    A boundary rounds the cosine twice (b, and to world coordinates), u each; κ is off by u, and all of them together
-    are no more than sin² α: (2 m + 1) u after m boundaries. A curved boundary adds the rounding of the intersection.
+    No ray may take a wrong path; in the mirage the direction is bounded a priori. A boundary rounds the cosine twice
+    (b, and to world coordinates), by u each. Each κ errs by u of itself, and the sum of all κ is at most sin² α:
+    (2 m + 1) u after m boundaries. A curved boundary adds the rounding error of the intersection.
     """
     directions, places = ([float(getattr(part, x).max()) for part in parts] for x in ("direction", "place"))
-    met = [len(path.media) - 1 for path in exact]
+    boundaries = [len(path.media) - 1 for path in exact]
     values = {
         DIRECTION: max(directions),
         "direction / condition": float(max(part.conditioned.max() for part in parts)),
         MEDIAN_DIRECTION: float(np.median(directions)),
         PLACE: max(places),
         "median place": float(np.median(places)),
-        WRONG_PATH: float(sum(part.boundaries != m for part, m in zip(parts, met, strict=True))),
+        WRONG_PATH: float(sum(part.boundaries != m for part, m in zip(parts, boundaries, strict=True))),
     }
     formula = FORMULAS.get(name.removeprefix(f"{PLUGIN}_"))
     budgets: dict[str, float] = {}
     if name == PLUGIN or (formula and formula.budget.at_the_limit):
         budgets = {WRONG_PATH: 0.0}
-        budgets |= {} if layers.round else {"direction / condition": (2 * max(met) + 1) * limits.PATH_BOUNDARY}
+        budgets |= {} if layers.round else {"direction / condition": (2 * max(boundaries) + 1) * limits.PATH_BOUNDARY}
     return Row(NAME, name, f"{layers.scene}: path", values=values, budgets=budgets, **row)
 
 
@@ -387,7 +388,7 @@ def _path_row(layers: Layers, name: str, exact: list[Path], parts: list[Deviatio
 
 
 def view_rows(context: Context, scene: str, parameters: dict[str, Any], name: str) -> list[Row]:
-    """`refract` and the built-in, image against image; and what flipped lobes alone do, as a control."""
+    """Return the row of `refract`'s image against the built-in's, with the effect of flipped lobes as a control."""
     if context.variant.startswith("scalar"):
         return [Row(NAME, PLUGIN, f"{name}: image", context.variant, reason=SCALAR)]
     profile, right, exact = context.profile, RIGHT_PLUGINS[0], name == VIEWS[0][-1]
@@ -413,10 +414,10 @@ def view_rows(context: Context, scene: str, parameters: dict[str, Any], name: st
 
 
 def exact_image(layers: Layers, scene: Any, spp: int) -> np.ndarray:
-    """Plane layers seen by the scene's camera, by Snell's and Fresnel's laws in double precision.
+    """Render plane layers through the scene's camera, by Snell's and Fresnel's laws in double precision.
 
-    Random numbers choose between reflection and refraction. With P = n d as in `exact_path`, of the s wave
-    R = ((P_n − P'_n)/(P_n + P'_n))²; that of the p wave differs by the step of the index, up to 7e-6 of it.
+    Random numbers choose between reflection and refraction. With P = n d as in `exact_path`, R of the s wave is
+    ((P_n − P'_n)/(P_n + P'_n))²; R of the p wave differs by the relative step of the index, at most 7e-6.
     """
     import mitsuba as mi
     from mitsuba.ad.integrators.common import ADIntegrator
@@ -448,11 +449,11 @@ def exact_image(layers: Layers, scene: Any, spp: int) -> np.ndarray:
     start = mi.Point3d(ray.o), layers.indices[0] * dr.normalize(mi.Vector3d(ray.d)), dr.zeros(mi.Int32, width)
     state: Any = *start, generator(width), dr.full(mi.Bool, True, width)
     p, momentum, medium, *_ = dr.while_loop(state, lambda *state: state[-1], step)
-    # In the innermost medium there is the road; out of the others, into air, light passes through upright faces.
-    left = medium < count
-    p = dr.select(left, p + momentum * ((POOL + STEP - p.x) / momentum.x), p)
+    # The road is in the innermost medium; light leaves the other media into air through upright faces.
+    leaves = medium < count
+    p = dr.select(leaves, p + momentum * ((POOL + STEP - p.x) / momentum.x), p)
     squares = layers.indices[0] ** 2 - dr.square(momentum.y) - dr.square(momentum.z)
-    momentum.x = dr.select(left, dr.sqrt(squares), momentum.x)
+    momentum.x = dr.select(leaves, dr.sqrt(squares), momentum.x)
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(p), mi.Vector3f(dr.normalize(momentum))))
     radiance = np.array(si.emitter(scene).eval(si), float).T
     return np.asarray(radiance.reshape(*sensor.film().crop_size()[::-1], spp, 3).mean(2))

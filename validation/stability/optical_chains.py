@@ -1,9 +1,9 @@
 """Stability: formulas applied at one boundary after another, against closed-form answers.
 
-A formula gets inputs rounded to its precision, and its output goes to the next boundary; the geometry between them is
-in extended precision. Each error is also shown divided by condition · u: the error, to first order, that the answer may
-have if every input and every direction were off by u, the roundoff. Up to 1 the error is that of the problem: rounding
-the exact answers could cause it. Above 1 it is that of the formula. Mitsuba's functions exist in float32 only.
+A formula gets inputs rounded to its precision, and its output is the input at the next boundary; the geometry between
+them is in extended precision. Each error is also shown divided by condition · u, the first-order error of the answer if
+every input and every direction erred by the roundoff u. Up to 1, rounding the exact values at each boundary could cause
+the error. Above 1, the formula causes it. Mitsuba's functions exist in float32 only.
 """
 
 from __future__ import annotations
@@ -44,30 +44,30 @@ PROBLEM = "the problem"
 
 
 def definition(make: Callable[[], optical_systems.System]) -> str:
-    """An optical system in words."""
+    """Return the description of an optical system."""
     return " ".join((getattr(make, "func", make).__doc__ or "").split())
 
 
 TERMS = {
-    "error / condition": "the worst error over condition · u of its ray",
-    "error": "the worst error; of a mirage, relative, of the cosine where the ray ends; of directions, in radians",
-    **{f"{angle}°": f"the same of the ray that enters at {angle}°" for angle in PASSING},
-    MISCLASSIFIED: "rays that turned back where they must pass or the reverse, and missed total internal reflections",
-    "turning height": "distance of the layer in which a ray turned from the right one, over all layers",
+    "error / condition": "the worst error, divided by condition · u of its ray",
+    "error": "the worst error: in a mirage, the relative error of the final cosine; for directions, in radians",
+    **{f"{angle}°": f"the same for the ray that enters at {angle}°" for angle in PASSING},
+    MISCLASSIFIED: "rays that turned back but must pass, or the reverse, and missed total internal reflections",
+    "turning height": "distance between the layer in which a ray turned and the right one, over the number of layers",
     "length drift": "relative change of the length of the direction",
-    "over print": "the largest deviation from CODE V's printed numbers, over their rounding",
-    "mirage": "air of index 1.0003 at the top and 3e-5 less at the bottom, in layers; entered at 88 … 89.95°, the last "
-    "three turn. Upright: the normal is an axis; askew: it is none",
-    "exact ratios": "250 layers of ratio 1 + 2⁻²³, which float32 holds exactly: the inputs have no error",
+    "over print": "the largest deviation from CODE V's printed numbers, divided by their rounding",
+    "mirage": "layers of air, of index 1.0003 at the top and 3e-5 less at the bottom; rays enter at 88 … 89.95°, and "
+    "the last three turn. Upright: the normal is an axis; askew: it is not",
+    "exact ratios": "250 layers of ratio 1 + 2⁻²³, which is exact in float32: the inputs have no error",
     **FEEDS,
     PROBLEM: f"condition · u of the ray that enters at {SEEN_AT}°, with the error of every formula layer by layer",
-    "light pipe": f"total internal reflections in a square pipe of index {CORE}, askew; only signs should change",
+    "light pipe": f"total internal reflections in an askew square pipe of index {CORE}; only signs should change",
 } | {name: definition(make) for name, make in optical_systems.SYSTEMS.items()}
 
 
 @dataclass(frozen=True)
 class Extent:
-    """How much a backend does: scalar arrays cost a Python call per operation."""
+    """The amount of work for a backend: scalar arrays need a Python call per operation."""
 
     layers: tuple[int, ...]
     planes: tuple[str, ...]
@@ -78,7 +78,7 @@ class Extent:
 
 
 def extent(context: Context, setting: Setting) -> Extent:
-    """How much is done in a setting."""
+    """Return the amount of work in a setting."""
     if not setting.is_scalar and context.profile.quick:
         return Extent((1000,), ("askew",), 1000, PASSING + TURNING, True)
     if not setting.is_scalar:
@@ -90,26 +90,26 @@ def extent(context: Context, setting: Setting) -> Extent:
 
 
 def settings(context: Context) -> list[Setting]:
-    """The settings of the directions, and scalar float32 for Mitsuba alone: Dr.Jit's own scalars are double."""
+    """Return the settings of the directions, and scalar float32 for Mitsuba only: Dr.Jit's scalars are doubles."""
     return [Setting("scalar", np.float32, dr.scalar.Array3f, mitsuba="scalar_rgb"), *backends.settings(context)]
 
 
 def tasks(context: Context) -> list[Task]:
-    """Chains and systems in every setting; in the profile `quick` chains in the first one that runs, float32 if any."""
-    every, both = settings(context), {"chains": chain_rows, "systems": system_rows}
+    """Return tasks for chains and systems in every setting; `quick` has chains in the first setting that runs."""
+    chosen, parts = settings(context), {"chains": chain_rows, "systems": system_rows}
     if context.profile.quick:
-        every = [s for s in every if s.vector is not None and not (s.is_scalar and s.precision is np.float32)][:1]
-        both = {"chains": chain_rows}
+        chosen = [s for s in chosen if s.vector is not None and not (s.is_scalar and s.precision is np.float32)][:1]
+        parts = {"chains": chain_rows}
     return [
         Task(f"stability: {setting.label}, {name}", functools.partial(rows, context, setting))
-        for setting in every
-        for name, rows in both.items()
+        for setting in chosen
+        for name, rows in parts.items()
         if setting.vector is not None or name == "chains"
     ]
 
 
 def drawn_rows(context: Context) -> list[Row]:
-    """The light pipes: only their rays are random."""
+    """Return the rows of light pipes: only their rays are random."""
     return [
         pipe_row(name, subject, setting, extent(context, setting))
         for setting in backends.running(context)
@@ -119,12 +119,12 @@ def drawn_rows(context: Context) -> list[Row]:
 
 
 def subjects(context: Context, setting: Setting) -> dict[str, Subject]:
-    """The subjects of the setting that run there."""
+    """Return the setting's subjects that can run in it."""
     return {name: subject for name, subject in setting.subjects.items() if name not in absent(context, setting)}
 
 
 def absent(context: Context, setting: Setting) -> dict[str, str]:
-    """Why a formula, or Mitsuba's functions, are not measured in a setting."""
+    """Return the reasons why formulas or Mitsuba's functions are not measured in a setting, by name."""
     if setting.vector is None:
         return dict.fromkeys([*FORMULAS, backends.BUILTIN], setting.reason)
     if setting.precision is np.float64:
@@ -138,55 +138,55 @@ def absent(context: Context, setting: Setting) -> dict[str, str]:
 
 
 def chain_rows(context: Context, setting: Setting) -> list[Row]:
-    """Mirages, exact ratios and the light pipe of a setting."""
+    """Return the rows of mirages, exact ratios and the light pipe in a setting."""
     rows = [Row(NAME, name, "all", setting.label, reason=why) for name, why in absent(context, setting).items()]
     if setting.vector is None:
         return rows
-    how, found = extent(context, setting), subjects(context, setting)
+    how, tested = extent(context, setting), subjects(context, setting)
     for count in how.layers:
         for plane in how.planes:
             case = f"mirage {plane}, {count} layers"
-            rows += mirage_rows(found, case, air(count), PLANES[plane], setting, how)
-    rows += mirage_rows(found, "exact ratios askew, 250 layers", exact_ratios(250), PLANES["askew"], setting, how)
-    return [*rows, *(pipe_row(name, subject, setting, how) for name, subject in found.items())]
+            rows += mirage_rows(tested, case, air(count), PLANES[plane], setting, how)
+    rows += mirage_rows(tested, "exact ratios askew, 250 layers", exact_ratios(250), PLANES["askew"], setting, how)
+    return [*rows, *(pipe_row(name, subject, setting, how) for name, subject in tested.items())]
 
 
 def at_limit(name: str) -> bool:
-    """Whether a subject is a form at the rounding limit: those take a contrast, and have budgets."""
+    """Whether a subject is a form at the rounding limit: only these take a contrast and have budgets."""
     return name in FORMULAS and FORMULAS[name].takes_contrast
 
 
 def mirage_rows(
-    found: dict[str, Subject], case: str, layers: Layers, plane: Array, setting: Setting, how: Extent
+    tested: dict[str, Subject], case: str, layers: Layers, plane: Array, setting: Setting, how: Extent
 ) -> list[Row]:
-    """A row per formula and per way to feed it, and one of the problem with the curves of all of them.
+    """Return a row per formula and feed, and a row per feed of the problem with the curves of all formulas.
 
-    There is one way where float32 holds the ratios exactly, and there are two in float64, where all agree.
+    Ratios that are exact in float32 have one feed; float64 has two, as the others agree.
     """
-    drawn = how.curves and plane is PLANES["askew"]
-    seen = np.unique(np.geomspace(1, layers.count, 25).astype(int)) if drawn else np.array([], int)
-    degrees = np.concatenate([how.angles, np.full(len(seen), SEEN_AT)])
-    stop = np.concatenate([np.full(len(how.angles), layers.count), seen])
+    has_curves = how.curves and plane is PLANES["askew"]
+    stops = np.unique(np.geomspace(1, layers.count, 25).astype(int)) if has_curves else np.array([], int)
+    degrees = np.concatenate([how.angles, np.full(len(stops), SEEN_AT)])
+    stop = np.concatenate([np.full(len(how.angles), layers.count), stops])
     rays = enter(layers, degrees, stop, plane, setting.precision)
     rows = []
     feeds = ["ratios"] if layers.exact else [*FEEDS] if setting.precision is np.float32 else ["ratios", "contrasts"]
     for feed in feeds:
         fed, curves = rays.fed(feed, setting.precision), {}
-        for name, subject in found.items():
+        for name, subject in tested.items():
             if feed != "contrasts" or at_limit(name):
                 row, error = mirage_row(name, subject, case, fed, setting, how)
                 rows.append(row)
                 curves[name] = error[len(how.angles) :]
-        if drawn:  # the condition of the problem in u, and the error of every formula, by the number of layers
+        if has_curves:  # condition · u and the error of every formula, by the number of layers
             curves["condition · u"] = (fed.condition * setting.roundoff).astype(float)[len(how.angles) :]
-            lines = {name: list(zip(seen.tolist(), y.tolist(), strict=True)) for name, y in curves.items()}
+            lines = {name: list(zip(stops.tolist(), y.tolist(), strict=True)) for name, y in curves.items()}
             values = {"condition · u": lines["condition · u"][-1][1]}
             rows.append(Row(NAME, PROBLEM, f"{case}, {fed.feed}", setting.label, values, curves=lines))
     return rows
 
 
 def mirage_row(name: str, subject: Subject, case: str, fed: Fed, setting: Setting, how: Extent) -> tuple[Row, Array]:
-    """The row, and the relative error of the cosine of every ray: 1 where it turned or passed wrongly."""
+    """Return the row, and the relative error of every ray's cosine: 1 if it wrongly turned or passed."""
     rays, final = fed.rays, slice(0, len(how.angles))
     count = rays.layers.count
     carried = carry(subject, fed.chain, rays.a, rays.stop, setting)
@@ -210,13 +210,13 @@ def mirage_row(name: str, subject: Subject, case: str, fed: Fed, setting: Settin
     return Row(NAME, name, f"{case}, {fed.feed}", setting.label, values, budgets, reason=remark, replay=replay), error
 
 
-NOTHING = "no budget: with every input and output off by u, these rays may go anywhere"
+NOTHING = "no budget: if every input and output errs by u, these rays may take any path"
 
 
 def mirage_budgets(fed: Fed, u: float, final: slice) -> dict[str, float]:
-    """Of a form at the rounding limit, as far as the problem leaves anything to demand: each of them can be broken.
+    """Return the budgets of a form at the rounding limit, without budgets that the problem's condition makes void.
 
-    Where its bound reaches as far as the decision, a ray may be misclassified.
+    A ray may be misclassified if its error bound includes the decision.
     """
     rays, height = fed.rays, limits.MIRAGE * u * fed.height + 1
     count = rays.layers.count
@@ -233,13 +233,13 @@ def mirage_budgets(fed: Fed, u: float, final: slice) -> dict[str, float]:
 
 
 def pipe_row(name: str, subject: Subject, setting: Setting, how: Extent) -> Row:
-    """Total internal reflections in a square pipe."""
+    """Return the row of total internal reflections in a square pipe."""
     rays = 2 if setting.is_scalar else PIPE_RAYS
     a, chain, exact = pipe(how.reflections, rays, CORE, setting.precision)
     carried = carry(subject, chain, a, np.full(rays, how.reflections), setting)
     lengths = [np.sqrt((x.astype(np.longdouble) ** 2).sum(1)) for x in (carried.b, a)]
     chord = np.sqrt(((carried.b - exact) ** 2).sum(1)) / lengths[1]
-    values = {  # every reflection passes on what is wrong with the direction, and adds its own: at most u each
+    values = {  # every reflection keeps the error of the direction and adds at most u
         "error / condition": worst(chord / (how.reflections * setting.roundoff)),
         "error": worst(chord),
         MISCLASSIFIED: float(carried.passed.sum()),
@@ -255,29 +255,29 @@ def pipe_row(name: str, subject: Subject, setting: Setting, how: Extent) -> Row:
 
 
 class Refractor:
-    """A formula as a system calls it: inputs rounded to the setting's precision. Counts what it did not transmit."""
+    """A formula as a system calls it, with inputs rounded to the setting's precision; counts reflected rays."""
 
     def __init__(self, subject: Subject, setting: Setting) -> None:
         """`subject` is evaluated in the arrays of the setting."""
         self.subject, self.setting, self.mirrored = subject, setting, 0
 
     def __call__(self, a: Array, n: Array, k: Any) -> Array:
-        """The directions behind a boundary: `a`, `n` N × 3, k a number or N."""
-        given = np.broadcast_arrays(a, n, np.reshape(k, (-1, 1)))
-        a, n, k = (x.astype(self.setting.precision) for x in given)
+        """Return the directions behind a boundary: `a`, `n` N × 3, k a number or N."""
+        arrays = np.broadcast_arrays(a, n, np.reshape(k, (-1, 1)))
+        a, n, k = (x.astype(self.setting.precision) for x in arrays)
         b, transmitted = evaluate(self.subject, regimes.Rays(a, n, k[:, 0]), self.setting.vector)
         self.mirrored += int((~transmitted).sum())
         return b
 
 
 def system_rows(context: Context, setting: Setting) -> list[Row]:
-    """Every optical system with every subject of a setting."""
-    found = subjects(context, setting).items()
-    return [system_row(name, subject, case, setting) for case in optical_systems.SYSTEMS for name, subject in found]
+    """Return a row per optical system and subject of a setting."""
+    tested = subjects(context, setting).items()
+    return [system_row(name, subject, case, setting) for case in optical_systems.SYSTEMS for name, subject in tested]
 
 
 def system_row(name: str, subject: Subject, case: str, setting: Setting) -> Row:
-    """The errors of a subject at the end of a system."""
+    """Return the row of a subject's errors at the end of a system."""
     system, refractor = optical_systems.SYSTEMS[case](), Refractor(subject, setting)
     error = np.sqrt((system.errors(refractor) ** 2).sum(1))
     values = {
@@ -285,12 +285,12 @@ def system_row(name: str, subject: Subject, case: str, setting: Setting) -> Row:
         "error": worst(error),
         MISCLASSIFIED: float(refractor.mirrored),
     }
-    # The condition counts u for every rounding. Inputs take √3/2 of it, a form at the rounding limit 0.8724, or 1.005
-    # where a length has left 1: that half a hundredth is not granted.
+    # The condition counts u for every rounding. Inputs use √3/2 of it, a form at the rounding limit 0.8724, or 1.005
+    # for directions that are not unit: the excess of 0.005 is not granted.
     budgets = {"error / condition": limits.SYSTEM, MISCLASSIFIED: 0.0} if at_limit(name) else {}
     if case == "double Gauss":
         values["over print"] = optical_systems.off_print(Refractor(subject, setting))
-        # Angles stay below 45°, where a surface costs any formula 20u, and 11 · 20 · 2⁻⁵³ is far below the print.
+        # Below 45° any formula errs by at most 20u per surface, and 11 · 20 · 2⁻⁵³ is far below the printed rounding.
         budgets |= {"over print": limits.PRINT} if setting.precision is np.float64 else {}
     replay = {"definition": definition(optical_systems.SYSTEMS[case]), "rays": len(error)}
     return Row(NAME, name, case, setting.label, values, budgets, replay=replay)

@@ -1,6 +1,6 @@
 """How large are the errors of other renderers and libraries, ray by ray and in images of the same scenes?
 
-In: rays and plain scenes, given to the programs of `renderers/`. Out: rows per system and check, and a matrix of them.
+In: rays and plain scenes for the programs of `renderers/`. Out: rows per system and check, and a matrix of them.
 """
 
 __all__ = [

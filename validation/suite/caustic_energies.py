@@ -1,10 +1,10 @@
 """Caustics by others: the power on a disk below a ball and a plano-convex lens of glass, by photons and by paths.
 
-A point lights the ball, and parallel light the lens, both of the study of caustics, in triangles. A renderer's unit of
-light is its own, so the sum over the image is divided by that of the same disk without glass, whose power is known. The
-answer is a quadrature of the rays in a plane through the axis. It is the level that is compared: facets change the
-power below the ball by 1 %, POV-Ray and Radiance estimate a density from photons, and LuxCore traces paths from both
-ends.
+The ball is lit by a point lamp, the lens by parallel light. Both bodies are those of the study of caustics, made of
+triangles. Renderers have different units of light, so the sum over the image is divided by that of the same disk
+without glass, whose power is known. The exact power is a quadrature over rays in a plane through the axis. The bound
+tests the level only: facets change the power below the ball by 1 %, and POV-Ray and Radiance estimate a density from
+photons. LuxCore traces paths from both ends.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ NAME = "caustics by others"
 OFF, SPREAD = "energy off", "spread"
 TERMS = {
     OFF: "|power on the disk over the exact one − 1|",
-    SPREAD: "largest over smallest power of the renders − 1, where they are random",
+    SPREAD: "largest over smallest power of the renders − 1, if they are random",
 }
-LAMPS = {"ball": POINT, "lens": PARALLEL}  # with both of which no rim of a caustic is near that of the disk
+LAMPS = {"ball": POINT, "lens": PARALLEL}  # with these lamps, no rim of a caustic is near the rim of the disk
 PROFILES = {"ball": caustic_energy.ball_profile, "lens": caustic_energy.lens_profile}
 BOUNDARIES, RESOLUTION, RINGS, TURNS = 6, 64, 96, 288
 SEEDS = (1, 2)
@@ -48,14 +48,14 @@ REFLECTANCE = caustic_energy.REFLECTANCE
 
 @dataclass(frozen=True)
 class Renderer:
-    """`draw(plain, lamp, folder)`: images of a scene with a lamp of this kind."""
+    """`draw(plain, lamp, folder)` renders images of a scene with a lamp of this kind."""
 
     system: str
     draw: Callable[[PlainScene, str, Path], list[Image]]
 
 
 def plain_scene(body: str, glass: bool) -> PlainScene:
-    """The disk of a body, and the body above it."""
+    """Return the disk below a body, and the body itself if `glass`."""
     radius = ON_AXIS[body, LAMPS[body]][1]
     flat = revolved("disk", np.array([[0, 0], [radius, 0], [0, 0]]), Diffuse((REFLECTANCE,) * 3))
     meshes = [dataclasses.replace(flat, faces=flat.faces[:TURNS])]  # its upper side
@@ -67,17 +67,17 @@ def plain_scene(body: str, glass: bool) -> PlainScene:
 
 
 def revolved(name: str, profile: np.ndarray, material: Glass | Diffuse) -> Mesh:
-    """A closed mesh of a profile (N × 2: distance from the y axis, y) from the top of the axis to its bottom."""
+    """Return the closed surface of revolution of a profile (N × 2: distance from the y axis, y), from top to bottom."""
     turn = 2 * np.pi * np.arange(TURNS) / TURNS
     rings = [np.stack([r * np.cos(turn), np.full(TURNS, y), -r * np.sin(turn)], 1) for r, y in profile[1:-1]]
     top, bottom = ([[0, profile[i, 1], 0]] for i in (0, -1))
-    here = np.arange(TURNS)
-    after, last = (here + 1) % TURNS, 1 + len(rings) * TURNS
-    faces = [np.stack([0 * here, 1 + here, 1 + after], 1)]
+    this = np.arange(TURNS)
+    following, last = (this + 1) % TURNS, 1 + len(rings) * TURNS
+    faces = [np.stack([0 * this, 1 + this, 1 + following], 1)]
     for start in range(1, last - TURNS, TURNS):
-        a, b, c, d = start + here, start + after, start + TURNS + after, start + TURNS + here
+        a, b, c, d = start + this, start + following, start + TURNS + following, start + TURNS + this
         faces += [np.stack([a, d, c], 1), np.stack([a, c, b], 1)]
-    faces.append(np.stack([last - TURNS + after, last - TURNS + here, np.full(TURNS, last)], 1))
+    faces.append(np.stack([last - TURNS + following, last - TURNS + this, np.full(TURNS, last)], 1))
     return Mesh(name, np.concatenate([top, *rings, bottom]), np.concatenate(faces), material)
 
 
@@ -85,7 +85,7 @@ def revolved(name: str, profile: np.ndarray, material: Glass | Diffuse) -> Mesh:
 
 
 def luxcore(plain: PlainScene, lamp: str, folder: Path) -> list[Image]:
-    """Images by LuxCore's bidirectional tracer."""
+    """Render by LuxCore's bidirectional path tracer."""
     kind = {POINT: f'type = "point"\nposition = 0 {TOP} 0', PARALLEL: 'type = "sharpdistant"\ndirection = 0 -1 0'}[lamp]
 
     def edit(scene: Path) -> None:
@@ -99,7 +99,7 @@ def luxcore(plain: PlainScene, lamp: str, folder: Path) -> list[Image]:
 
 
 def radiance(plain: PlainScene, lamp: str, folder: Path) -> list[Image]:
-    """Images by Radiance's photon map of caustics."""
+    """Render by Radiance with a caustic photon map."""
     kind = {
         POINT: f"void light lamp 0 0 3 1e4 1e4 1e4\nlamp sphere place 0 0 4 0 {TOP} 0 0.01\n",
         PARALLEL: "void light lamp 0 0 3 1 1 1\nlamp source place 0 0 4 0 1 0 0.5\n",
@@ -119,7 +119,7 @@ def radiance(plain: PlainScene, lamp: str, folder: Path) -> list[Image]:
 
 
 def povray(plain: PlainScene, lamp: str, folder: Path) -> list[Image]:
-    """Images by POV-Ray's photons, all alike. The disk is written here: the export has no diffuse surfaces."""
+    """Render by POV-Ray with photons, once: it has no seeds. The disk is added here: the export is of glass only."""
     disk, *glass = plain.meshes
     kind = {
         POINT: f"<0, {TOP}, 0> rgb 1e6 fade_distance 0.01 fade_power 2",
@@ -150,7 +150,7 @@ RENDERERS = {
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per renderer and body."""
+    """Return one task per renderer and body."""
     return [
         Task(f"{NAME}: {title}, {body}", functools.partial(rows, context, title, body))
         for title in RENDERERS
@@ -159,7 +159,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def rows(context: Context, title: str, body: str) -> list[Row]:
-    """A renderer's power on the disk below a body: one row."""
+    """Return one row: a renderer's power on the disk below a body."""
     renderer, lamp = RENDERERS[title], LAMPS[body]
     system, (setup, radius) = SYSTEMS[renderer.system], ON_AXIS[body, lamp]
     row = functools.partial(Row, NAME, title, f"{body}, {lamp}", f"{RESOLUTION}²")
@@ -170,11 +170,11 @@ def rows(context: Context, title: str, body: str) -> list[Row]:
             images = renderer.draw(plain_scene(body, glass), lamp, Path(folder))
         return [float((image.pixels.mean(-1, dtype=np.float64) * weights).sum()) for image in images]
 
-    why = environments.why_not(system, context.profile.name)
-    found, nothing = environments.attempt(row, why, LOST, lambda: (sums(glass=True), sums(glass=False)))
-    if found is None:
-        return nothing
-    caustic, plain = found
+    reason = environments.why_not(system, context.profile.name)
+    both, no_answer = environments.attempt(row, reason, LOST, lambda: (sums(glass=True), sums(glass=False)))
+    if both is None:
+        return no_answer
+    caustic, plain = both
     direct = 2 * math.pi * (1 - TOP / math.hypot(TOP, radius)) if lamp == POINT else math.pi * radius**2
     exact, _ = caustic_energy.flux(setup, radius, BOUNDARIES)
     power = direct * statistics.fmean(caustic) / statistics.fmean(plain)

@@ -1,13 +1,13 @@
-"""Exports: what is written for another renderer, rendered by it on 16 × 9 pixels, is Mitsuba's image of the same scene.
+"""Exports: does another renderer make Mitsuba's image of a scene from the exported files?
 
-Nothing in the scene is symmetric: four balls of different glass under a turned sky, a lamp and a coloured patch (which
-POV-Ray is not given: it has glass and lights only), for Cycles also a point and a directional lamp, a tilted camera, a
-film that is not square. The renderers read what users get: the exported files, and the options in the exported
-README.txt. The images are some renders a side; their RMSE may be twice what the spread between renders predicts, and
-1 % of the mean. A camera, a sky or an index that is wrong exceeds that many times.
+Each renderer renders 16 × 9 pixels from what users get: the exported files, with the options of the exported
+README.txt. Nothing in the scene is symmetric: four balls of different glass under a rotated sky, a lamp, a coloured
+patch (not for POV-Ray, whose export holds glass and lights only), for Cycles also a point and a directional lamp, a
+tilted camera, and a film that is not square. Both sides are means of several renders. Their RMSE may be twice what the
+spread between renders predicts plus 1 % of the mean. A wrong camera, sky or index exceeds that many times over.
 
-Khronos' `gltf-validator` reads the glTF export of each scene of `scenes/` that glTF can hold, and of one with lamps
-without size and a unit sphere, whose vertices are its normals.
+Khronos' `gltf-validator` checks the glTF export of each scene of `scenes/` that glTF can represent, and of a scene with
+lamps without size and a unit sphere with vertex normals.
 """
 
 from __future__ import annotations
@@ -44,34 +44,29 @@ from .renderers import SYSTEMS, environments
 from .renderers.system import SCRIPTS
 
 NAME = "exports"
-SEEDS = range(1, RENDERS + 1)  # of the other renderer's
+SEEDS = range(1, RENDERS + 1)  # of the other renderer
 SPP, SIZE = 512, (16, 9)
 OVER, NOISE = "RMSE / allowed", "noise / mean"
 ERRORS, WARNINGS = "errors", "warnings"
 VALIDATOR, LEVEL = "gltf_validator", 2
 TERMS = {
-    OVER: "of the two means by pixel and channel; allowed: twice the noise that the spread between renders predicts, "
-    "and 1 % of the mean",
+    OVER: "RMSE of the two means over pixels and channels; allowed: twice the noise that the spread between renders "
+    "predicts, plus 1 % of the mean",
     NOISE: "the predicted noise of the difference of the two means",
-    ERRORS: "of both files, `scene.glb` and `scene.gltf`; so are the warnings, a goal",
+    ERRORS: "in both files, `scene.glb` and `scene.gltf`, as for the warnings, which have a goal",
 }
-# What is in the scene for a renderer, if not all but lamps without size.
+# Variants of the scene. Other renderers get it with the patch and without lamps without size.
 SHOWN = {"POV-Ray": "no patch", "Cycles": "lamps", "Cycles, glTF": "lamps"}
 LEFT_OUT = {
-    THREE: "it counts the light of the sky twice, see the study of images; without MIS it is here",
+    THREE: "it counts the light of the sky twice, see the study of images; its variant without MIS is tested here",
     RASTER: "it traces no paths, see the study of images",
 } | {title: "it is the reference" for title, renderer in IMAGE_RENDERERS.items() if renderer.system == "mitsuba"}
-THEIRS = {
-    "POV-Ray": 256,
-    "Cycles": 512,
-    "Cycles, glTF": 512,
-    "LuxCore": 1024,
-    "Radiance": 512,
-}  # samples a pixel and render; others 256
+# Samples per pixel and render; 256 for the other renderers.
+THEIRS = {"POV-Ray": 256, "Cycles": 512, "Cycles, glTF": 512, "LuxCore": 1024, "Radiance": 512}
 
 
 def scene(shown: str = "") -> PlainScene:
-    """The balls of `balls`, seen from another place, with a lamp and a patch. `shown`: one of SHOWN."""
+    """Return the balls of `balls` from another viewpoint, with a lamp and a patch. `shown`: a value of SHOWN."""
     balls = from_mitsuba.load(SCENES / "balls.xml", level=2)
     camera = Camera((30.0, 15.0, 240.0), (3.0, -4.0, 0.0), (0.3, 1.0, 0.2), 48.0, *SIZE)
     extra = [_quad("lamp", (-100.0, 22.0), (-72.0, 50.0), Light((3.0, 2.0, 1.0)))]
@@ -83,44 +78,45 @@ def scene(shown: str = "") -> PlainScene:
 
 
 def lit() -> PlainScene:
-    """A unit sphere of glass, and a lamp without size of each kind."""
+    """Return a unit sphere of glass, and one lamp of each kind without size."""
     vertices, faces = tessellation.sphere(LEVEL)
     ball, place, ahead = Mesh("ball", vertices, faces, Glass(1.5, 1.0), vertices), (1.0, 2.0, 3.0), (0.0, 0.6, -0.8)
-    lamps = PointLamp("point", place, place), DirectionalLamp("sun", ahead, place)
-    spots = (SpotLamp(f"spot{beam:g}", place, place, ahead, beam, 30.0) for beam in (0.0, 20.0, 30.0))
+    intensity = place
+    lamps = PointLamp("point", place, intensity), DirectionalLamp("sun", ahead, intensity)
+    spots = (SpotLamp(f"spot{beam:g}", place, intensity, ahead, beam, 30.0) for beam in (0.0, 20.0, 30.0))
     camera = Camera((0.0, 0.0, 9.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, *SIZE)
     return PlainScene("lamps", (ball,), (0.0, 0.0, 0.0), camera, 8, (*lamps, *spots))
 
 
 def _quad(name: str, low: tuple[float, float], high: tuple[float, float], material: Material) -> Mesh:
-    """A rectangle in the plane z = 0 that faces +z."""
+    """Return a rectangle in the plane z = 0 that faces +z."""
     corners = [(low[0], low[1], 0.0), (high[0], low[1], 0.0), (high[0], high[1], 0.0), (low[0], high[1], 0.0)]
     return Mesh(name, np.array(corners), np.array([(0, 1, 2), (0, 2, 3)]), material)
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per renderer."""
+    """Return one task per renderer, and one for the glTF validator."""
     titles = [title for title in IMAGE_RENDERERS if title not in LEFT_OUT]
-    made = [Task(f"exports: {title}", functools.partial(rows, context, title)) for title in titles]
-    return [*made, Task(f"exports: {SYSTEMS[VALIDATOR].title}", functools.partial(validated, context))]
+    images = [Task(f"exports: {title}", functools.partial(rows, context, title)) for title in titles]
+    return [*images, Task(f"exports: {SYSTEMS[VALIDATOR].title}", functools.partial(validated, context))]
 
 
 def rows(context: Context, title: str) -> list[Row]:
-    """A renderer against `refract`: one row."""
+    """Return one row: a renderer against `refract`."""
     system = SYSTEMS[IMAGE_RENDERERS[title].system]
     row = functools.partial(Row, NAME, title, "balls", f"{SIZE[0]} × {SIZE[1]}")
     lost = "not rendered", float(len(SEEDS))
-    theirs, nothing = environments.attempt(row, why_not(system, context), lost, lambda: drawn(title))
+    theirs, no_answer = environments.attempt(row, why_not(system, context), lost, lambda: drawn(title))
     if theirs is None:
-        return nothing
+        return no_answer
     values, budgets = compared(reference(SHOWN.get(title, "")), theirs), {OVER: 1.0, NOISE: limits.EXPORT_NOISE}
     replay = {"renderer": system.source, "spp": THEIRS.get(title, 256), "reference spp": SPP, "seeds": [*SEEDS]}
     return [row(values, budgets, replay=replay)]
 
 
 def validated(context: Context) -> list[Row]:
-    """What Khronos' validator says of the glTF exports: a row per scene; not run, where glTF cannot hold it."""
-    system, result = SYSTEMS[VALIDATOR], []
+    """Return a row per scene: the messages of Khronos' validator on its glTF export. Not run if glTF cannot hold it."""
+    system, made = SYSTEMS[VALIDATOR], []
     paths = sorted(SCENES.glob("*.xml"))
     scenes = {path.stem: functools.partial(from_mitsuba.load, path, level=LEVEL) for path in paths} | {"lamps": lit}
     for name, load in scenes.items():
@@ -129,24 +125,24 @@ def validated(context: Context) -> list[Row]:
         def counts(load: Callable[[], PlainScene] = load) -> dict[str, float]:
             with tempfile.TemporaryDirectory() as folder:
                 try:
-                    made = targets.write(load(), "gltf", Path(folder) / "scene")
-                except ValueError as why:
-                    raise environments.Unable(str(why)) from None
-                files = [str(file) for file in made if file.suffix in (".glb", ".gltf")]
+                    written = targets.write(load(), "gltf", Path(folder) / "scene")
+                except ValueError as error:
+                    raise environments.Unable(str(error)) from None
+                files = [str(file) for file in written if file.suffix in (".glb", ".gltf")]
                 command = ("node", str(SCRIPTS / "validate_gltf.mjs"), "{environment}")
-                said = [line.split() for line in environments.ask(system, command, "\n".join(files)).splitlines()]
-            if len(said) != len(files) or not files:
-                raise ValueError(f"{len(said)} answers to {len(files)} files; expected one to each")
-            return {name: float(sum(int(line[i]) for line in said)) for i, name in enumerate((ERRORS, WARNINGS))}
+                lines = [line.split() for line in environments.ask(system, command, "\n".join(files)).splitlines()]
+            if len(lines) != len(files) or not files:
+                raise ValueError(f"{len(lines)} answers for {len(files)} files; expected one per file")
+            return {name: float(sum(int(line[i]) for line in lines)) for i, name in enumerate((ERRORS, WARNINGS))}
 
-        lost = ERRORS, 1.0
-        values, nothing = environments.attempt(row, environments.why_not(system, context.profile.name), lost, counts)
-        result += nothing if values is None else [row(values, {ERRORS: 0.0}, {WARNINGS: 0.0})]
-    return result
+        reason, lost = environments.why_not(system, context.profile.name), (ERRORS, 1.0)
+        values, no_answer = environments.attempt(row, reason, lost, counts)
+        made += no_answer if values is None else [row(values, {ERRORS: 0.0}, {WARNINGS: 0.0})]
+    return made
 
 
 def drawn(title: str) -> np.ndarray:
-    """Renders by another renderer: renders × height × width × 3."""
+    """Return images by another renderer: renders × height × width × 3."""
     with tempfile.TemporaryDirectory() as folder:
         images = IMAGE_RENDERERS[title].draw(scene(SHOWN.get(title, "")), Path(folder), THEIRS.get(title, 256), SEEDS)
     return np.stack([image.pixels for image in images]).astype(np.float64)
@@ -154,12 +150,12 @@ def drawn(title: str) -> np.ndarray:
 
 @functools.cache
 def reference(shown: str) -> np.ndarray:
-    """Renders by this plugin, in the present variant: renders × height × width × 3."""
+    """Return images by this plugin in the current variant: renders × height × width × 3."""
     return np.stack(by_plugin(scene(shown), SPP)).astype(np.float64)
 
 
 def compared(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
-    """The numbers of a pair; a value that is not finite makes both of them NaN, which breaks a budget."""
+    """Return the values of a row. A pixel that is not finite makes them NaN, which breaks the budget."""
     noise = float(np.sqrt(sum((side.var(0, ddof=1) / len(side)).mean() for side in (ours, theirs))))
     rmse = float(np.sqrt(np.square(theirs.mean(0) - ours.mean(0)).mean()))
     mean = float(ours.mean())

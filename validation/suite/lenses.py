@@ -1,11 +1,11 @@
 """The focal shift of an achromat by lens designers' ray tracers, with the same indices and with those of their glasses.
 
-The achromat of `scenes/planar/achromat.toml`, of N-BK7 and F2, at its six wavelengths: where rays close to the axis and
-at the edge cross the axis, by rayoptics' and optiland's sequential traces, in float64, and by the planar trace of this
-package. Each is compared with a trace in 80 decimals for the very indices that it used, so that an error of the trace
-is told from another index. Given the same indices, what is left is rounding; its bound is that of first order, with
-every rounding at its worst. Then each system takes the glasses by name from its own catalogue, and the indices are
-compared as well.
+The achromat is that of `scenes/planar/achromat.toml`, made of N-BK7 and F2, at its six wavelengths. The sequential
+traces of rayoptics and optiland (float64) and the planar trace of this package compute where rays close to the axis and
+at the edge cross the axis. Each is compared with a trace in 80 decimals for the indices that it used, so that different
+indices do not count as errors of the trace. With the same indices, only rounding errors remain; the bound adds all of
+them at their worst, to first order. In a second case each system takes the glasses by name from its own catalogue, and
+the indices are compared as well.
 """
 
 from __future__ import annotations
@@ -33,35 +33,39 @@ NAME = "achromat by others"
 FILE = SCENES / "planar" / "achromat.toml"
 GLASSES = ("SCHOTT", "N-BK7"), ("SCHOTT", "F2")
 RADIUS = 12.5  # the rim of the lens in the file
-HEIGHTS = (1e-3, 10.0)  # close to the axis, and at the edge
+HEIGHTS = (1e-3, 10.0)  # distances of the rays from the axis: close to it, and at the edge
 GIVEN, OWN = "same indices", "own glasses"
 U = 2.0**-53
 OFF, INDEX_OFF, FOCUS_OFF, SHIFT_OFF = "relative error", "index off", "focus off", "shift off"
 TERMS = {
-    OFF: "of the distance from the first vertex to the crossing, from the exact trace for its indices; the largest",
+    OFF: "the largest relative error of the distance from the first vertex to the crossing, against the exact trace",
     ERROR_OVER_BOUND: "the largest error over the bound of its ray",
     INDEX_OFF: "the largest relative difference between the system's index of a glass and that of the file",
-    FOCUS_OFF: "by how much the system's crossing differs from that of the planar trace, relative, the largest",
-    SHIFT_OFF: "by how much its focal shifts differ from those of the planar trace, over the largest shift",
-    "unanswered": "1 where the program crashed, hung or gave no numbers",
-    GIVEN: "all systems have the indices that `mi_refract.media` gives the file",
-    OWN: "each system looks the glasses up by their names",
+    FOCUS_OFF: "the largest relative difference between the system's crossing and that of the planar trace",
+    SHIFT_OFF: "the largest difference between its focal shifts and those of the planar trace, over the largest shift",
+    "unanswered": "1 if the program crashed, hung or returned no numbers",
+    GIVEN: "all systems use the indices of `mi_refract.media`",
+    OWN: "each system looks up the glasses by name",
 }
 
 
-# The sine after a surface is k sin + γ sin_n: γ = k cos − cos_t is off by up to 7u and a normal's sine by 1u of itself.
+# The sine after a surface is k sin + γ sin_n. The relative errors of γ = k cos − cos_t and of a normal's sine are up to
+# 7u and 1u.
 THEIRS = Rounding(8.0, 8.0, 0.0, (1.0, 1.0, 1.0))
 
 
-# An arc is kept by its ends and its control point, each of them rounded: a curvature as its sag is. The gradient of its
-# conic has the axis where rounding puts it, so a normal may turn by a few u on the axis, too.
+# An arc is stored as its ends and its control point, each rounded, so its curvature has the relative error of its sag.
+# The axis of its conic is rounded as well, so a normal on the axis may turn by a few u.
 SAGS = [abs(c) * RADIUS**2 / 2 for c in ACHROMAT.curvatures]
 OURS = Rounding(0.0, 0.0, 16.0, [4 * (v + sag) / sag for v, sag in zip(ACHROMAT.vertices, SAGS, strict=True)])
 
 
 @dataclass(frozen=True)
 class Answer:
-    """Indices by glass and wavelength; rays [z, y, dz, dy] after the lens by wavelength and height, for each case."""
+    """A system's version, indices (glasses, wavelengths), and by case rays [z, y, dz, dy] after the lens.
+
+    Rays have the shape (wavelengths, heights, 4).
+    """
 
     system: str
     indices: np.ndarray
@@ -69,42 +73,42 @@ class Answer:
 
 
 def tasks(context: Context) -> list[Task]:
-    """One for the planar trace, and one per system that traces lenses."""
+    """Return one task for the planar trace, and one per system that traces lenses."""
     others = [system for system in SYSTEMS.values() if system.lens]
     own = Task("achromat: the planar trace", planar_rows)
     return [own, *(Task(f"achromat: {s.title}", functools.partial(system_rows, s, context)) for s in others)]
 
 
 def planar_rows() -> list[Row]:
-    """How far this package's own trace is from the exact one."""
+    """Return a row per height: the error of this package's planar trace."""
     rays, indices = planar()
     return [_row("planar trace", GIVEN, i, rays, indices, OURS) for i in range(len(HEIGHTS))]
 
 
 def system_rows(system: System, context: Context) -> list[Row]:
-    """Two rows per case, or one that says why there are none."""
+    """Return a row per case and height, or one row with the reason why there are none."""
     row = functools.partial(Row, NAME, system.title, "every ray", "float64")
 
     def answer() -> Answer:
         return parsed(environments.ask(system, system.lens, json.dumps(question())))
 
     reason = environments.why_not(system, context.profile.name)
-    given, nothing = environments.attempt(row, reason, ("unanswered", 1), answer)
-    return nothing if given is None else answered(system.title, given)
+    answer_or_none, no_answer = environments.attempt(row, reason, ("unanswered", 1), answer)
+    return no_answer if answer_or_none is None else answer_rows(system.title, answer_or_none)
 
 
-def answered(title: str, answer: Answer) -> list[Row]:
-    """The rows of an answer."""
+def answer_rows(title: str, answer: Answer) -> list[Row]:
+    """Return the rows of an answer."""
     ours, indices = planar()
     index_off = float(np.abs(answer.indices / indices - 1).max())
     rows = []
     for i in range(len(HEIGHTS)):
         for case in (GIVEN, OWN):
             used = indices if case == GIVEN else answer.indices
-            found, own = on_axis(answer.rays[case][:, i]), on_axis(ours[:, i])
+            their_crossings, our_crossings = on_axis(answer.rays[case][:, i]), on_axis(ours[:, i])
             row = _row(title, case, i, answer.rays[case], used, THEIRS)
-            shifts, expected = (x - x[wavelengths().index(LINES["d"])] for x in (found, own))
-            values = {FOCUS_OFF: float(np.abs(found / own - 1).max())}
+            shifts, expected = (x - x[wavelengths().index(LINES["d"])] for x in (their_crossings, our_crossings))
+            values = {FOCUS_OFF: float(np.abs(their_crossings / our_crossings - 1).max())}
             values[SHIFT_OFF] = float(np.abs(shifts - expected).max() / np.abs(expected).max())
             budgets = {}
             if case == OWN:
@@ -115,11 +119,11 @@ def answered(title: str, answer: Answer) -> list[Row]:
 
 
 def _row(title: str, case: str, i: int, rays: np.ndarray, indices: np.ndarray, rounding: Rounding) -> Row:
-    """Rays at the height number `i` against the exact trace for these indices; the focal shifts of each wavelength."""
-    height, found = HEIGHTS[i], on_axis(rays[:, i])
+    """Return the row of rays at height `HEIGHTS[i]`: errors against the exact trace for these indices; focal shifts."""
+    height, crossings = HEIGHTS[i], on_axis(rays[:, i]).tolist()
     exact = [crossing(ACHROMAT, (1.0, *n, 1.0), height, START) for n in indices.T.tolist()]
-    off = [float(abs(Decimal(x) - e.place)) for x, e in zip(found.tolist(), exact, strict=True)]
-    at = dict(zip(wavelengths(), found.tolist(), strict=True))
+    off = [float(abs(Decimal(x) - e.place)) for x, e in zip(crossings, exact, strict=True)]
+    at = dict(zip(wavelengths(), crossings, strict=True))
     values = {
         OFF: max(x / float(e.place) for x, e in zip(off, exact, strict=True)),
         ERROR_OVER_BOUND: max(x / bound(ACHROMAT, e, rounding, U) for x, e in zip(off, exact, strict=True)),
@@ -133,28 +137,27 @@ def _row(title: str, case: str, i: int, rays: np.ndarray, indices: np.ndarray, r
 
 @functools.cache
 def planar() -> tuple[np.ndarray, np.ndarray]:
-    """Rays (wavelengths, heights, 4) by the planar trace, as of `Answer`, and indices (glasses, wavelengths)."""
+    """Return rays (wavelengths, heights, 4) by the planar trace, as in `Answer`, and indices (glasses, wavelengths)."""
     scene = scene_file.load(FILE)
     rays = []
     for segments in scene.segments:
         origins = np.array([[START, height] for height in HEIGHTS])
         directions = np.tile([1.0, 0.0], (len(HEIGHTS), 1))
-        asked = replace(
-            scene, segments=(segments,), origins=origins, directions=directions, beams=np.zeros(len(HEIGHTS), int)
-        )
-        (found,) = follow_scene(asked)
-        order = np.argsort(found.rays)
-        rays.append(np.concatenate([found.tips, found.paths.directions], axis=1)[order])
+        beams = np.zeros(len(HEIGHTS), int)
+        one_wavelength = replace(scene, segments=(segments,), origins=origins, directions=directions, beams=beams)
+        (traced,) = follow_scene(one_wavelength)
+        order = np.argsort(traced.rays)
+        rays.append(np.concatenate([traced.tips, traced.paths.directions], axis=1)[order])
     return np.array(rays), np.array([region.indices for region in scene.regions])
 
 
 def wavelengths() -> tuple[float, ...]:
-    """The wavelengths of the file, in nm."""
+    """Return the wavelengths of the file, in nm."""
     return scene_file.load(FILE).light.wavelengths
 
 
 def question() -> dict[str, object]:
-    """What a script of a system reads."""
+    """Return what a system's script reads on stdin, as JSON."""
     return {
         "curvatures": ACHROMAT.curvatures,
         "thicknesses": ACHROMAT.thicknesses,
@@ -167,7 +170,7 @@ def question() -> dict[str, object]:
 
 
 def parsed(text: str) -> Answer:
-    """What a script wrote. ValueError, one line, for anything else than finite numbers of the right count."""
+    """Parse a script's output. ValueError, one line, unless it holds finite numbers in the expected shapes."""
     rays_shape, indices_shape = (len(wavelengths()), len(HEIGHTS), 4), (len(GLASSES), len(wavelengths()))
     try:
         data = json.loads(text)
@@ -179,7 +182,7 @@ def parsed(text: str) -> Answer:
     shapes = [x.shape for x in (indices, *rays.values())]
     if shapes != [indices_shape, rays_shape, rays_shape]:
         raise ValueError(f"numbers of shape {shapes}; expected {indices_shape}, and {rays_shape} twice")
-    if not all(np.isfinite(each).all() for each in (indices, *rays.values())):
+    if not all(np.isfinite(x).all() for x in (indices, *rays.values())):
         raise ValueError("a number that is not finite; expected the rays after the lens")
     return Answer(system, indices, rays)
 

@@ -1,8 +1,8 @@
 """Suite: every system against every check, from the rows of the studies "Per ray" and "Images".
 
 For rays, a number is the largest angle to the certified direction in radians; for images, the relative difference of
-the means. A cell fails where the study that it comes from fails. Each row also gives the version, and where the system
-does not do what it should, or what `refract` does.
+the means. A cell fails if a row of its study fails. The remark of a row gives the version, and how the system differs
+from its specification or from `refract`.
 """
 
 from __future__ import annotations
@@ -35,30 +35,29 @@ OFF, FAILED = "off by", "failed checks"
 TERMS = {
     OFF: "rays: the largest angle, in radians, without misclassified rays; images: |test / reference − 1| of the means",
     BACKWARD: per_ray.TERMS[BACKWARD],
-    FAILED: "number of broken budgets in the row that this comes from",
+    FAILED: "number of broken budgets in the row of that study",
     RECORDED: per_ray.TERMS[RECORDED],
-    OFF_RECORDED: "the error over the one recorded earlier, or the reverse if that is larger; a goal, which fails no "
-    "run",
-    INCONCLUSIVE: "1 where noise hides what the images are compared for: no pass, whatever the mean says",
-    "differs": "1 where the images are different and this is known of the system; see its remark",
+    OFF_RECORDED: "the error over the one recorded earlier, or the reciprocal if that is larger; a goal",
+    INCONCLUSIVE: "1 if noise could hide a relevant difference: not a pass, whatever the means are",
+    "differs": "1 if the images are different and this is known of the system; see its remark",
 }
 CHECKS = {per_ray.NAME: tuple(per_ray.SETS), rendered_images.NAME: tuple(rendered_images.SCENES)}
 TEXT = (
-    "Rays: the largest angle in radians, and the largest backward error in u: the answers are exact for inputs off by "
-    f"that many\nroundings, and right up to {RIGHT:g}, a goal; what misses it is bold. Images: share of the mean. "
-    "✓: every ray\nwithin its bound; ✗: a bound is broken, and the run fails. To be within a factor of "
-    f"{limits.RECORDED:g} of the error recorded\nearlier is a goal: what misses it says "
-    '"× recorded", or "recorded /" where the error is smaller, and fails nothing.'
+    "Rays: the largest angle in radians, and the largest backward error m in u: the answers are exact for inputs off "
+    f"by m\nroundings. m up to {RIGHT:g} is right, a goal; larger m are bold. Images: relative difference of means. "
+    "✓: all rays are\nwithin their bounds; ✗: a bound is broken, and the run fails. Another goal is an error within a "
+    f"factor of {limits.RECORDED:g} of the\none recorded earlier; otherwise the cell says "
+    '"× recorded", or "recorded /" if the error is smaller. A missed goal fails nothing.'
 )
 
 
 def tasks(context: Context) -> list[Task]:
-    """None: see `summary`."""
+    """Return no tasks: the rows are made by `summary`."""
     return []
 
 
 def summary(rows: Iterable[Row]) -> list[Row]:
-    """A row per system, precision and check; one that was not run says why for each of its checks."""
+    """Return a row per system, precision and check. A system that was not run has the reason in all its checks."""
     return [cell for row in rows if row.study in CHECKS for cell in _cells(row)]
 
 
@@ -83,15 +82,15 @@ def _cells(row: Row) -> list[Row]:
 
 
 def with_summary(rows: list[Row]) -> list[Row]:
-    """The rows of a run, with the summary before the rows it is made from."""
+    """Return the rows of a run, with the summary inserted before the rows it is made from."""
     place = next((i for i, row in enumerate(rows) if row.study in CHECKS), len(rows))
     return [*rows[:place], *summary(rows), *rows[place:]]
 
 
 def table(rows: list[Row]) -> tuple[str, list[str], list[list[str]]]:
-    """The matrix as a table of the documentation: the text above it, its head, and its lines.
+    """Return the matrix as a table of the documentation: the text above it, its heading, and its lines.
 
-    ValueError where no system was run.
+    ValueError if no system was run.
     """
     systems: dict[str, dict[str, Row]] = {}
     for row in rows:
@@ -123,16 +122,16 @@ def _text(row: Row | None) -> str:
 
 # The page ----------------------------------------------------------------------------------------------------------
 #
-# Every system against every check, and what it gets wrong in a sentence, from the `rows.json` of a validation. Systems
-# are in the order of how far they are from right: those with a wrong answer last, and otherwise by their largest
-# backward error, where k is large last of all: few are right there.
+# Every system against every check, and a sentence on its errors, from the `rows.json` of a validation. Systems are
+# sorted by their largest backward error, except that of large k, where few are right: it breaks ties. Systems with a
+# wrong answer are last.
 
 MADE_BY = "python -m validation suite"
-Stored = dict[str, Any]  # a row of rows.json, or what is made of some
+Stored = dict[str, Any]  # a row of rows.json, or a summary of rows
 
 
 def read(folder: Path) -> Stored:
-    """The matrix of the validation whose report is in a folder. ValueError or OSError where there is none."""
+    """Return the matrix of the validation whose report is in `folder`. ValueError or OSError if there is none."""
     path, expected = folder / "rows.json", f"expected the folder of {MADE_BY} --out {folder}"
     try:
         rows = [row for row in json.loads(path.read_text("utf-8"))["rows"] if row["study"] in CHECKS]
@@ -146,48 +145,49 @@ def read(folder: Path) -> Stored:
 
 
 def of_rows(rows: Iterable[Stored]) -> Stored:
-    """`{"schema": 1, "rays": [...], "images": [...], "not_run": [...]}` of the rows of both studies."""
+    """Return `{"schema": 1, "rays": [...], "images": [...], "not_run": [...]}` from the rows of both studies."""
     systems: dict[tuple[str, ...], list[Stored]] = {}
     for row in rows:
         precision = row["setting"] if row["study"] == per_ray.NAME else ""
         systems.setdefault((row["study"], row["subject"], precision), []).append(row)
     rays, images, not_run = list[Stored](), list[Stored](), list[Stored]()
     for (study, title, precision), cells in systems.items():
-        about = {"system": title} | ({"precision": precision} if precision else {})
-        if not (ran := [cell for cell in cells if cell["values"]]):
-            not_run.append(about | {"reason": cells[0]["reason"]})
+        label = {"system": title} | ({"precision": precision} if precision else {})
+        measured = [cell for cell in cells if cell["values"]]
+        if not measured:
+            not_run.append(label | {"reason": cells[0]["reason"]})
         elif study == per_ray.NAME:
-            rays.append(about | _of_rays(ran))
+            rays.append(label | _of_rays(measured))
         else:
-            images.append(about | _of_images(ran))
+            images.append(label | _of_images(measured))
     rays.sort(key=_distance)
     images.sort(key=lambda image: (image["wrong"], image["system"]))
     return {"schema": 1, "rays": rays, "images": images, "not_run": not_run}
 
 
-def answers(rows: Iterable[Row], joined: Iterable[System]) -> list[Answer]:
-    """How the renderers that joined the suite did, for the first page: by function, and for the images."""
-    titles = {title for system in joined for title in (system.title, *(call.title for call in system.calls))}
-    own = of_rows(row.as_dict() for row in rows if row.study in CHECKS and row.subject in titles)
+def answers(rows: Iterable[Row], own_renderers: Iterable[System]) -> list[Answer]:
+    """Return the results of the renderers given with --renderer, for the first page: by function, and for images."""
+    titles = {title for system in own_renderers for title in (system.title, *(call.title for call in system.calls))}
+    results = of_rows(row.as_dict() for row in rows if row.study in CHECKS and row.subject in titles)
     made: list[Answer] = []
     for kind in ("rays", "images", "not_run"):
-        for found in own[kind]:
-            name = ", ".join(found[key] for key in ("system", "precision") if key in found)
-            text = found["reason"] if kind == "not_run" else found["sentence"]
-            state: State = "not measured" if kind == "not_run" else "no" if found["wrong"] else "yes"
+        for result in results[kind]:
+            name = ", ".join(result[key] for key in ("system", "precision") if key in result)
+            text = result["reason"] if kind == "not_run" else result["sentence"]
+            state: State = "not measured" if kind == "not_run" else "no" if result["wrong"] else "yes"
             made.append({"question": f"Your renderer: {name}", "text": text, "state": state, "study": NAME})
     return made
 
 
 def _of_rays(cells: list[Stored]) -> Stored:
-    """What a function of refraction got wrong, and its numbers by set."""
+    """Return a sentence on the errors of a function of refraction, and its numbers by set."""
     sets = {}
     for cell in cells:
         backward, worst = cell["values"].get(BACKWARD), cell["values"].get(WORST_ANGLE)
         right = isinstance(backward, (int, float)) and backward <= RIGHT
         verdict = "wrong" if cell["verdict"] == "fail" else "right" if right else "within bound"
         sets[cell["case"]] = {"verdict": verdict, "backward_error": backward, "worst_angle": worst}
-    about = {name: cells[0]["replay"].get(name, "") for name in ("version", "total internal reflection", "remark")}
+    remarks = {name: cells[0]["replay"].get(name, "") for name in ("version", "total internal reflection", "remark")}
     wrong = [name for name, x in sets.items() if x["verdict"] == "wrong"]
     within = {name: x["backward_error"] for name, x in sets.items() if x["verdict"] == "within bound"}
     off = [f"{name} (up to {compact(m) if isinstance(m, (int, float)) else m or '–'})" for name, m in within.items()]
@@ -195,12 +195,12 @@ def _of_rays(cells: list[Stored]) -> Stored:
     if not sets.keys() & per_ray.SETS:
         parts = [f"no answers: {cells[0]['reason']}"]
     parts += [f"exact only for inputs more than {RIGHT:g} roundings off: {', '.join(off)}"] if off else []
-    sentence = "; ".join([*(parts or ["right in every set"]), *filter(None, [about["remark"]])])
-    return about | {"wrong": bool(wrong), "sentence": sentence, "sets": sets}
+    sentence = "; ".join([*(parts or ["right in every set"]), *filter(None, [remarks["remark"]])])
+    return remarks | {"wrong": bool(wrong), "sentence": sentence, "sets": sets}
 
 
 def _of_images(cells: list[Stored]) -> Stored:
-    """What differs in the images of a renderer, and its numbers by scene."""
+    """Return a sentence on the differences in the images of a renderer, and its numbers by scene."""
     scenes = {
         cell["case"]: {
             "verdict": cell["replay"].get("verdict", "not rendered"),
@@ -222,12 +222,12 @@ def _distance(system: Stored) -> tuple[bool, float, float, str]:
 
 
 def write_json(path: Path, stored: Stored) -> None:
-    """Strict JSON. OSError."""
+    """Write strict JSON. OSError."""
     write_atomically(path, json.dumps(strict(stored), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def write_html(path: Path, stored: Stored) -> None:
-    """One page that needs no network. OSError."""
+    """Write one HTML page that needs no network. OSError."""
     images = f", {len(stored['images'])} renderers by images" if stored["images"] else ""
     content = {
         "title": "Refraction by other systems",

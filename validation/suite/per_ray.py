@@ -1,14 +1,14 @@
 """Per ray: the refraction of other programs, each in a process of its own, against the certified answer.
 
-A program reads rays as CSV and answers with directions, as for `mi-refract rays run`. Each answer should be the exact
-refraction, in direction and in length, of inputs within 8 roundings of those given (a goal), and must be within the
+A program reads rays as CSV and returns directions, as for `mi-refract rays run`. Each answer should be the exact
+refraction, in direction and in length, of inputs within 8 roundings of the given ones (a goal). It must be within the
 bound of the textbook formula for that ray, in the program's precision. A second goal: the worst error is within a
-factor of 3 of the one recorded earlier, on rays of the same kinds, or for later programs on these very rays at the
-default seed. A missed goal is shown and fails no run: the worst of some thousand rays depends on which they are. The
-set "random" was fixed before any result. After the first results its rays near the critical angle were left out, for
-chance decides how near they come, and it was made twice as large: that is the set "random, apart". The goal is the same
-for both. The set "near-critical" was never changed. An installed program fails if it crashes, hangs, or answers rays of
-no set. One that is not installed, or reports that it cannot run on this machine, is not run.
+factor of 3 of the one recorded earlier, on rays of the same kinds, or, for programs added later, on these rays at the
+default seed. A missed goal is shown but fails no run: the worst of some thousand rays depends on the sample. The set
+"random" was fixed before any result. After the first results, the set "random, apart" was added, with twice as many
+rays and without those near the critical angle, because chance decides how near these come. The goal is the same for
+both. The set "near-critical" was never changed. An installed program fails if it crashes, hangs, or answers unknown
+rays. A program that is not installed, or reports that it cannot run on this machine, is not run.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ BACKWARD = "backward error / u"
 OTHER_SIGNAL = "other TIR signal"
 RANDOM, APART, CRITICAL, GRAZING = "random", "random, apart", "near-critical", "grazing"
 MATCHED, TOTAL, LARGE = "η ≈ 1", "total reflection", "k ≫ 1"
-LEFT_OUT = 4e-4  # cos²θ_t in size, up to which rays are not in the set APART
+LEFT_OUT = 4e-4  # |cos²θ_t| up to which rays are not in the set APART
 
 
 @dataclass(frozen=True)
 class Set:
-    """`count` rays of a kind: `draw` gives their angles from the normal and k, as in `regimes`.
+    """`count` rays of one kind: `draw` returns their angles of incidence and k, as in `regimes`.
 
-    `stream`: beside the seed, what the random generator begins with.
+    `stream`: seeds the random generator, together with the seed of the run.
     """
 
     count: int
@@ -60,7 +60,7 @@ class Set:
     stream: int
 
 
-Angles = tuple[np.ndarray, np.ndarray]  # of incidence, and k
+Angles = tuple[np.ndarray, np.ndarray]  # angles of incidence, and k
 
 
 def _random(rng: np.random.Generator, count: int, eps: float) -> Angles:
@@ -111,23 +111,23 @@ SETS = {
 TERMS = {name: f"{rays.count} rays: {rays.text}" for name, rays in SETS.items()} | {
     WORST_ANGLE: "the largest angle to the certified direction, without misclassified rays",
     RECORDED: "the largest such angle recorded earlier for this system",
-    OFF_RECORDED: "the ratio of the two, taken above 1; 1 inside a recorded range",
+    OFF_RECORDED: "the ratio of the two, or its reciprocal if that is larger; 1 inside a recorded range",
     ERROR_OVER_BOUND: "the largest error of a ray over its a-priori bound, that of the textbook formula",
-    BACKWARD: "the largest one: each direction, and each length, is exact for inputs perturbed by that many roundings",
-    "median backward error / u": "the median of those of the directions",
+    BACKWARD: "the largest m such that each direction, and each length, is exact for inputs perturbed by m roundings",
+    "median backward error / u": "the median over the directions",
     "p99 backward error / u": "exceeded by one answer in 100",
     MISCLASSIFIED: "rays whose total internal reflection was misclassified",
     "wrong": "rays beyond the bound, misclassified although the bound decides them, or without a direction",
-    "given up": "rays left out: so near to the critical angle that the system treats them as totally reflected",
-    "not seen to deviate": "1 where every answer is right and the system is known to be wrong there",
-    "unfit": "answers that are missing, duplicate, or to rays of no set",
-    OTHER_SIGNAL: "1 where the program signals total internal reflection in another way than was recorded",
+    "given up": "rays left out: so near the critical angle that the system treats them as totally reflected",
+    "not seen to deviate": "1 if every answer is right although the system is known to be wrong in this set",
+    "unfit": "answers that are missing, duplicate, or for unknown rays",
+    OTHER_SIGNAL: "1 if the program signals total internal reflection in another way than recorded",
     "unanswered": "rays without an answer, because the program crashed, hung or printed none",
 }
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per function of each system."""
+    """Return one task per function of each system."""
     return [
         Task(f"per ray: {call.title}, {call.precision}", functools.partial(call_rows, system, call, context))
         for system in SYSTEMS.values()
@@ -136,27 +136,27 @@ def tasks(context: Context) -> list[Task]:
 
 
 def call_rows(system: System, call: RaysCommand, context: Context) -> list[Row]:
-    """A row per set of rays, or one with the reason why there is none."""
-    rays, reason = given(call.precision), environments.why_not(system, context.profile.name)
+    """Return a row per set of rays, or one row with the reason why there are none."""
+    rays, reason = all_rays(call.precision), environments.why_not(system, context.profile.name)
     row = functools.partial(Row, NAME, call.title, "every set", call.precision)
 
     def answer() -> Answers:
         return parse_answers(environments.ask(system, call.command, as_csv(rays)), call.title)
 
-    answers, nothing = environments.attempt(row, reason, ("unanswered", len(rays)), answer)
-    return nothing if answers is None else rows(call, rays, answers)
+    answers, no_answer = environments.attempt(row, reason, ("unanswered", len(rays)), answer)
+    return no_answer if answers is None else rows(call, rays, answers)
 
 
 @seeds.cached
-def given(precision: str) -> RaySet:
-    """All sets, one after the other."""
+def all_rays(precision: str) -> RaySet:
+    """Return the rays of all sets, one set after the other."""
     parts, ids, first = [], {}, 0
     dtype = PRECISIONS[precision]
     for name, kind in SETS.items():
         rng = np.random.default_rng([seeds.current(SEED), kind.stream])
         normal: np.ndarray = regimes.normalised(rng.normal(size=(kind.count, 3))).astype(dtype)
         a, n, k = (x.astype(dtype) for x in regimes.rays_at(kind.draw, rng, normal))
-        # As `mi-refract rays export` writes them: a program need not know rays from behind.
+        # As written by `mi-refract rays export`: the normal faces the ray, which not every program can ensure itself.
         parts.append(ray_set.facing(regimes.Rays(a, n, k)))
         ids[name] = [first, first + kind.count - 1]
         first += kind.count
@@ -165,7 +165,7 @@ def given(precision: str) -> RaySet:
 
 
 def rows(call: RaysCommand, rays: RaySet, answers: Answers) -> list[Row]:
-    """One per set. Where no ray of it was answered, all that can be said is that it was not."""
+    """Return a row per set. If no ray of a set was answered, its row only says so."""
     left_out = absolute_radicand(rays.rays) < call.gives_up
     findings = check_answers.check(rays[~left_out], answers[~np.isin(answers.ids, rays.ids[left_out])])
     version = str(answers.header.get("system", ""))
@@ -173,10 +173,10 @@ def rows(call: RaysCommand, rays: RaySet, answers: Answers) -> list[Row]:
     mistake = [findings.diagnosis.text] if findings.diagnosis else []
     signal = f"total internal reflection: {findings.tir}"
     remark = "; ".join(filter(None, (version, signal, call.lengths, call.remark, *problems, *mistake)))
-    answered = {regime.regime: regime for regime in findings.regimes}
+    errors_of = {regime.regime: regime for regime in findings.regimes}
     made = []
     for name, kind in SETS.items():
-        errors = answered.get(name)
+        errors = errors_of.get(name)
         values = {"unfit": float(findings.problem_count(*UNFIT))}
         budgets, goals = {"unfit": 0.0, "wrong": 0.0}, {}
         if errors is None:
@@ -190,14 +190,14 @@ def rows(call: RaysCommand, rays: RaySet, answers: Answers) -> list[Row]:
                 "wrong": float(errors.wrong),
                 "median backward error / u": errors.backward_median,
                 "p99 backward error / u": errors.backward_p99,
-                # np.maximum: NaN stays.
+                # np.maximum keeps NaN.
                 BACKWARD: float(np.maximum(errors.backward_worst, errors.backward_length)),
             }
             budgets[ERROR_OVER_BOUND], goals[BACKWARD] = 1.0, RIGHT
             if name == TOTAL:
                 values[OTHER_SIGNAL], budgets[OTHER_SIGNAL] = float(findings.tir != call.tir), 0.0
             if recorded := call.recorded_range(name):
-                values |= {RECORDED: recorded[1], OFF_RECORDED: off(errors.worst, *recorded)}
+                values |= {RECORDED: recorded[1], OFF_RECORDED: off_recorded(errors.worst, *recorded)}
                 goals[OFF_RECORDED] = limits.RECORDED
             if name in call.deviations:
                 values["not seen to deviate"] = float(errors.wrong == 0)
@@ -218,8 +218,8 @@ def rows(call: RaysCommand, rays: RaySet, answers: Answers) -> list[Row]:
     return made
 
 
-def off(worst: float, low: float, high: float) -> float:
-    """The factor by which `worst` is outside `low` … `high`, 1 where it is inside; NaN stays NaN."""
+def off_recorded(worst: float, low: float, high: float) -> float:
+    """Return the factor by which `worst` is outside `low` … `high`, 1 if it is inside; NaN stays NaN."""
     if not worst > 0:
         return math.inf if worst == 0 else math.nan
     return max(worst / high, low / worst, 1.0)

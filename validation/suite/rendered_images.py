@@ -1,13 +1,13 @@
 """Images: the same plain scene rendered by this plugin and by other renderers, compared by Welch's t-test.
 
-Both sides have the same flat triangles, the same camera, a box filter, and several independent renders; the glossary
-says how each renderer's model differs from Mitsuba's. `refract` is rendered with Mitsuba's `path`. The scene
-`environment` has the balls of `balls` under a smooth sky without symmetry, whose map is turned. In the scene `furnace`,
-a ball on a floor that absorbs nothing under a sky of radiance 1, nothing should be visible. The scene `caustic` is the
-floor where a ball focuses a lamp, seen without glass, as light tracing can. Mitsuba's own integrators are among the
-renderers, with `dielectric`. A verdict is "equal",
-"different", or "inconclusive": noise would hide a relevant difference, or only tiles differ about which a t-test knows
-little. The profile `full` also runs the large renderers that are installed.
+Both sides have the same flat triangles, the same camera, a box filter, and several independent renders. The glossary
+says how each renderer's model differs from Mitsuba's. `refract` is rendered with Mitsuba's `path`; Mitsuba's other
+integrators, with `dielectric`, are among the other renderers. The scene `environment` has the balls of `balls` under a
+smooth sky without symmetry, whose map is rotated. The scene `furnace` has a ball on a floor that absorbs nothing, under
+a sky of radiance 1: nothing should be visible. The scene `caustic` shows the floor where a ball focuses a lamp; no
+glass is in view, so that light tracing can render it. The verdict is "equal", "different", or "inconclusive": noise
+could hide a relevant difference, or the only tiles that differ are ones about which a t-test can say little. The
+profile `full` also runs the large renderers that are installed.
 """
 
 from __future__ import annotations
@@ -43,26 +43,26 @@ NAME = "images"
 DETECTABLE_IMAGE = "detectable difference, image"
 INCONCLUSIVE = "inconclusive"
 TERMS = {
-    "tests that differ": "of tiles of 16² pixels by channel, blocks of tiles, and the whole image; of pairs that are "
-    "equal, one in 10,000 has any",
-    "tiles that differ without noise": "of those where neither side has noise",
-    DETECTABLE: "relative to the tile's mean, median over the tiles; of the image: of its mean",
-    INCONCLUSIVE: "1 where no difference is seen, but noise would hide one that is wanted to be seen",
-    MEAN_DIFFERENCE: "of the image's mean, relative: what the other renderer has more",
-    "RMSE / noise": "of the two means by pixel, over what the spread between renders predicts: 1 for equal images "
-    "whose noise is all in that spread, which it is not for a fixed grid of samples",
+    "tests that differ": "tests of tiles of 16² pixels by channel, of blocks of tiles and of the whole image that find "
+    "a difference; one in 10,000 pairs of equal images has any",
+    "tiles that differ without noise": "among the tiles without noise on either side",
+    DETECTABLE: "relative to the tile's mean, median over the tiles; for the image: relative to its mean",
+    INCONCLUSIVE: "1 if no difference was found, but noise could hide a relevant one",
+    MEAN_DIFFERENCE: "mean of the other renderer's image over that of the reference − 1",
+    "RMSE / noise": "RMSE of the two means over what the spread between renders predicts: 1 for equal images, unless a "
+    "renderer samples a fixed grid, whose error is not in that spread",
     "reference, test, difference": f"`{PLUGIN}`, the other renderer, test − reference: means over the renders",
 } | {f"{title}, assumed": " ".join(renderer.assumed) for title, renderer in IMAGE_RENDERERS.items()}
-RENDERS = 4  # a side
-OURS = 1000  # the first seed of the reference's
-LEVEL = 4  # of the spheres: facets that can be seen, so that both sides must shade them flat
+RENDERS = 4  # per side
+OURS = 1000  # the first seed of the reference
+LEVEL = 4  # of the spheres' subdivision: facets are visible, so both sides must shade them flat
 LOST = "not rendered", float(RENDERS)
-COMPILED = "needs a compiled variant: millions of samples"
+COMPILED = "needs a compiled variant: it takes millions of samples"
 
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """`spp` of each reference render; a renderer's own spp is divided by `less`; `wanted`: difference to be seen."""
+    """`spp` of each reference render; other renderers' spp are divided by `less`; `wanted`: detectable difference."""
 
     resolution: int
     spp: int
@@ -75,7 +75,7 @@ SIZES = {"quick": Size(64, 64, 32, 0.1), "standard": Size(64, 64, 32, 0.1), "ful
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """`known`: the renderers that are known to disagree on it; the suite must see it. `more`: times the spp here."""
+    """`known`: renderers known to differ, which the study must detect. `more`: factor of the reference's spp."""
 
     load: Callable[[int], PlainScene]
     known: tuple[str, ...] = ()
@@ -87,12 +87,12 @@ def _scene(name: str, resolution: int) -> PlainScene:
 
 
 def environment(resolution: int) -> PlainScene:
-    """The balls under the turned sky."""
+    """Return the balls under the rotated sky."""
     return dataclasses.replace(_scene("balls", resolution), name="environment", sky=askew())
 
 
 def furnace(resolution: int) -> PlainScene:
-    """The ball on a white floor that absorbs nothing, in a white sky: a correct image is 1 everywhere."""
+    """Return the ball on a white floor that absorbs nothing, in a white sky: a correct image is 1 everywhere."""
     plain, white = _scene("sphere", resolution), (1.0, 1.0, 1.0)
 
     def bright(mesh: Mesh) -> Mesh:
@@ -103,21 +103,22 @@ def furnace(resolution: int) -> PlainScene:
 
 
 def caustic(resolution: int) -> PlainScene:
-    """The floor beside the ball's shadow, where its lamp is focused. No glass is in the image, and no sky shines."""
+    """Return the floor beside the ball's shadow, where its lamp is focused: no glass in view, and a black sky."""
     plain = _scene("sphere", resolution)
 
-    def higher(mesh: Mesh) -> Mesh:
-        lifted = isinstance(mesh.material, Glass)
-        return dataclasses.replace(mesh, vertices=mesh.vertices + np.array([0, 30, 0])) if lifted else mesh
+    def lifted(mesh: Mesh) -> Mesh:
+        if not isinstance(mesh.material, Glass):
+            return mesh
+        return dataclasses.replace(mesh, vertices=mesh.vertices + np.array([0, 30, 0]))
 
     origin, target = (140.0, 60.0, 40.0), (42.0, 0.0, 9.0)
     camera = dataclasses.replace(plain.camera, origin=origin, target=target, fov_x_degrees=20.0)
-    meshes = tuple(map(higher, plain.meshes))
+    meshes = tuple(map(lifted, plain.meshes))
     return dataclasses.replace(plain, name="caustic", meshes=meshes, sky=(0.0, 0.0, 0.0), camera=camera)
 
 
 def askew() -> Environment:
-    """A smooth sky without symmetry, turned about two axes."""
+    """Return a smooth sky without symmetry, rotated about two axes."""
     height, width = 64, 128
     theta, phi = np.pi * np.arange(height) / (height - 1), 2 * np.pi * (np.arange(width) + 0.5) / width
     t, p = np.meshgrid(theta, phi, indexing="ij")
@@ -138,18 +139,18 @@ SCENES = {
     "furnace": Scene(furnace, (THREE,)),
     "caustic": Scene(caustic, more=4),
 }
-# What makes a renderer disagree.
+# Why a renderer is known to differ.
 WHY = {
-    THREE: "its shadow rays to the sky pass straight through glass, beside the refracted rays that find the same sky, "
-    "so that this light counts twice; see the same without multiple importance sampling (MIS)",
-    RASTER: "a surface that emits lights nothing, the sky has no shadows, and a ray is refracted once, at the first "
-    "surface, and shows what the image without glass has thicknessFactor farther",
-    PTRACER: "no path from a lamp is joined with the camera behind smooth glass, so that the ball is black",
+    THREE: "its shadow rays to the sky pass straight through glass, and its refracted rays find the same sky, so this "
+    "light counts twice; see the row without multiple importance sampling (MIS)",
+    RASTER: "emitting surfaces light nothing, the sky casts no shadows, and a ray is refracted only once: it shows the "
+    "image without glass at the distance thicknessFactor behind the first surface",
+    PTRACER: "a path from a lamp cannot be joined with the camera through smooth glass, so the ball is black",
 }
 
 
 def join(system: System) -> None:
-    """Make a system that renders by a command the first one of the study. ValueError for an unknown export or scene."""
+    """Put a system with a command for images in front of the others. ValueError for an unknown export or scene."""
     images, where = system.images, f"{system.folder}: images."
     if images is None:
         return
@@ -162,7 +163,7 @@ def join(system: System) -> None:
         raise ValueError(
             f"{system.folder}: title: {system.title!r} is the title of another renderer; expected a unique title"
         )
-    assumed, draw = images.assumed or ("not said.",), functools.partial(by_command, system)
+    assumed, draw = images.assumed or ("not stated.",), functools.partial(by_command, system)
     others = dict(IMAGE_RENDERERS)
     IMAGE_RENDERERS.clear()
     IMAGE_RENDERERS.update({system.title: ImageRenderer(system.name, draw, images.spp, assumed)} | others)
@@ -170,13 +171,15 @@ def join(system: System) -> None:
 
 
 def known_to_differ(title: str, scene: str) -> str:
-    """Why a renderer disagrees on a scene; "" where it is not known to."""
+    """Return why a renderer is known to differ on a scene; "" if it is not."""
+    if title in SCENES[scene].known:
+        return WHY[title]
     images = SYSTEMS[IMAGE_RENDERERS[title].system].images
-    return WHY[title] if title in SCENES[scene].known else images.deviations.get(scene, "") if images else ""
+    return images.deviations.get(scene, "") if images else ""
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per renderer and scene."""
+    """Return one task per renderer and scene."""
     return [
         Task(f"images: {title}, {scene}", functools.partial(pair_rows, context, title, scene))
         for title, renderer in IMAGE_RENDERERS.items()
@@ -185,13 +188,12 @@ def tasks(context: Context) -> list[Task]:
 
 
 def why_not(system: System, context: Context) -> str:
-    """Why the images of a renderer are not compared in this run; "" where they are."""
-    compiled = not context.variant.startswith("scalar")
-    return environments.why_not(system, context.profile.name) or ("" if compiled else COMPILED)
+    """Return why the images of a renderer are not compared in this run; "" if they are."""
+    return environments.why_not(system, context.profile.name) or (COMPILED if context.scalar else "")
 
 
 def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
-    """A renderer against `refract` in a scene: one row."""
+    """Return one row: a renderer against `refract` in a scene."""
     renderer, size = IMAGE_RENDERERS[title], SIZES[context.profile.name]
     row = functools.partial(Row, NAME, title, scene, f"{size.resolution}²")
     seeds, spp = range(1, RENDERS + 1), max(renderer.spp[scene] // size.less, 1)
@@ -200,14 +202,14 @@ def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
         with tempfile.TemporaryDirectory() as folder:
             try:
                 return renderer.draw(SCENES[scene].load(size.resolution), Path(folder), spp, seeds)
-            except ValueError as why:  # a scene that the renderer's format cannot hold
-                raise environments.Unable(str(why)) from None
+            except ValueError as error:  # a scene that the renderer's format cannot represent
+                raise environments.Unable(str(error)) from None
 
-    theirs, nothing = environments.attempt(row, why_not(SYSTEMS[renderer.system], context), LOST, draw)
+    theirs, no_answer = environments.attempt(row, why_not(SYSTEMS[renderer.system], context), LOST, draw)
     if theirs is None:
-        return nothing
+        return no_answer
     ours, known = reference(scene, size), known_to_differ(title, scene)
-    # Not their pixels: some of the renderers sample every pixel on one grid, whatever the seed.
+    # Single pixels are not tested: some renderers sample every pixel on one grid, whatever the seed.
     comparison = compare("welch", ours, theirs, family_error=limits.SUITE_ERROR, resolution=size.wanted, pixels="no")
     values = measured(comparison, *(np.stack([image.pixels for image in side]) for side in (ours, theirs)))
     goals, budgets = {INCONCLUSIVE: 0.0}, {"tests that differ": 0.0, "tiles that differ without noise": 0.0}
@@ -226,13 +228,13 @@ def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
 
 @functools.cache
 def reference(scene: str, size: Size) -> list[Image]:
-    """Images by this plugin, in the present variant."""
+    """Return images by this plugin in the current variant."""
     renders = by_plugin(SCENES[scene].load(size.resolution), SCENES[scene].more * size.spp)
     return [image_file.named(f"{PLUGIN} {scene} {i}", pixels) for i, pixels in enumerate(renders)]
 
 
 def by_plugin(plain: PlainScene, spp: int) -> list[np.ndarray]:
-    """RENDERS images, each height × width × 3, of a scene by this plugin as it is exported for Mitsuba."""
+    """Return RENDERS images, height × width × 3, by this plugin of a scene's export for Mitsuba."""
     with tempfile.TemporaryDirectory() as folder:
         targets.write(plain, "mitsuba", Path(folder) / "scene")
         camera = Camera(scene_files.load_scene(Path(folder) / "scene" / "scene.xml", {"bsdf": PLUGIN}))
@@ -240,7 +242,7 @@ def by_plugin(plain: PlainScene, spp: int) -> list[np.ndarray]:
 
 
 def measured(comparison: Comparison, ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
-    """The numbers of a pair; `ours` and `theirs` are renders × height × width × 3."""
+    """Return the values of a row; `ours` and `theirs` are renders × height × width × 3."""
     metrics = {metric.name: metric.value for metric in comparison.metrics}
     noise = sum(side.var(0, ddof=1).mean() / len(side) for side in (ours.astype(float), theirs.astype(float)))
     rmse = np.sqrt(np.square(theirs.mean(0) - ours.mean(0)).mean())
@@ -256,14 +258,20 @@ def measured(comparison: Comparison, ours: np.ndarray, theirs: np.ndarray) -> di
 
 
 def _saved(context: Context, title: str, scene: str, ours: Sequence[Image], theirs: Sequence[Image]) -> dict[str, str]:
-    """Both means and their difference, as EXR files below the output folder."""
+    """Write both means and their difference as EXR files below the output folder; return their paths by role."""
     folder = Path("images") / NAME / scene
     (context.out / folder).mkdir(parents=True, exist_ok=True)
-    one, two = (np.stack([image.pixels for image in side]).mean(0, dtype=np.float64) for side in (ours, theirs))
-    shown = {"reference": (PLUGIN, one), "test": (title, two), "difference": (f"{title} difference", two - one)}
-    for name, image in shown.values():
+    reference_mean, test_mean = (
+        np.stack([image.pixels for image in side]).mean(0, dtype=np.float64) for side in (ours, theirs)
+    )
+    images = {
+        "reference": (PLUGIN, reference_mean),
+        "test": (title, test_mean),
+        "difference": (f"{title} difference", test_mean - reference_mean),
+    }
+    for name, image in images.values():
         image_file.write_exr(context.out / folder / f"{name}.exr", image.astype(np.float32))
-    return {role: str(folder / f"{name}.exr") for role, (name, _) in shown.items()}
+    return {role: str(folder / f"{name}.exr") for role, (name, _) in images.items()}
 
 
 STUDY = Study(NAME, "Images", about(__doc__), TERMS, tasks)

@@ -1,8 +1,9 @@
-"""Small mistakes: what the error bound of a textbook's formula lets pass, and whether backward errors see it.
+"""Small mistakes: do backward errors detect mistakes that the error bound of the textbook formula lets pass?
 
-The textbook's formula answers rays of the regime in which a mistake matters, once as it is and once with the mistake.
-An answer within the bound passes as "as good as a textbook's formula"; it is right if it is the exact refraction of
-inputs within the roundings that this formula itself is off by, at most; a mistake is seen if some answer is not.
+The textbook formula answers rays of the regime in which a mistake matters, once correctly and once with the mistake.
+An answer within the bound passes as "as good as the textbook formula". It is right if it is the exact refraction of
+inputs perturbed by no more roundings than the textbook formula itself needs. A mistake is detected if any answer is
+above that.
 """
 
 from __future__ import annotations
@@ -29,31 +30,31 @@ SEED, COUNT = 2041, 2000
 TERMS = {
     "passed before": "share of the answers that are within the error bound",
     "seen": f"share of the answers whose backward error, of direction or length, is above {RIGHT:g} u",
-    "m, median": "of the backward errors, in u",
-    "m, worst": "the largest of them",
-    "m, worst, without": "the largest one without the mistake",
-    "not seen": "1 where no backward error is above what rounding leaves of the formula without the mistake",
+    "m, median": "median of the backward errors, in u",
+    "m, worst": "the largest backward error, in u",
+    "m, worst, without": "the largest one without the mistake, in u",
+    "not seen": "1 if no backward error is above what rounding causes without the mistake",
 }
 Vectors = np.ndarray
-Answer = Callable[[Vectors, Vectors, Vectors], Vectors]  # a, n (N, 3) and k (N, 1) of one precision to b
+Answer = Callable[[Vectors, Vectors, Vectors], Vectors]  # a, n (N, 3) and k (N, 1) of one precision → b
 
 
 def textbook(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
-    """b = k a − (k c + √(1 − k² (1 − c²))) n with c = n·a < 0; zero under total internal reflection."""
+    """Return b = k a − (k c + √(1 − k² (1 − c²))) n with c = n·a < 0; zero under total internal reflection."""
     c = _dot(n, a)
     radicand = 1 - k * k * (1 - c * c)
     return np.where(radicand < 0, 0, k * a - (k * c + np.sqrt(np.maximum(radicand, 0))) * n)
 
 
 def tilted(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
-    """n off by 1e-6 rad, within the plane of incidence."""
+    """Return the answer for n off by 1e-6 rad within the plane of incidence."""
     t = a - _dot(n, a) * n
     n = n + n.dtype.type(1e-6) * t / np.sqrt(_dot(t, t))
     return textbook(a, n / np.sqrt(_dot(n, n)), k)
 
 
 def by_angles(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
-    """The angles of incidence and refraction, through acos and asin in float32."""
+    """Return the answer from the angles of incidence and refraction, by acos and asin in float32."""
     incident = np.arccos(np.minimum(-_dot(n, a), 1).astype(np.float32))
     sine = k * np.sin(incident).astype(k.dtype)
     refracted = np.arcsin(np.minimum(sine, 1).astype(np.float32)).astype(k.dtype)
@@ -62,7 +63,7 @@ def by_angles(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
 
 
 def rounded_contrast(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
-    """κ = k² − 1 in float32, in b = k (a − c n) − √(c² − κ (1 − c²)) n."""
+    """Return b = k (a − c n) − √(c² − κ (1 − c²)) n with κ = k² − 1 in float32."""
     single, c = k.astype(np.float32), _dot(n, a)
     contrast = (single * single - 1).astype(k.dtype)
     across = np.cross(n, a)
@@ -76,7 +77,7 @@ def _dot(x: Vectors, y: Vectors) -> Vectors:
 
 @dataclass(frozen=True)
 class Mistake:
-    """`regime`: where it matters. `harmless`: in this precision no error beyond rounding, and why."""
+    """`regime`: where the mistake matters. `harmless`: a precision in which it is no error beyond rounding, and why."""
 
     answer: Answer
     regime: str
@@ -99,7 +100,7 @@ MISTAKES = {
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per mistake and precision."""
+    """Return one task per mistake and precision."""
     return [
         Task(f"{NAME}: {name}, {precision}", functools.partial(rows, name, precision))
         for name in MISTAKES
@@ -108,7 +109,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def rows(name: str, precision: str) -> list[Row]:
-    """One."""
+    """Return one row: the answers of the textbook formula with a mistake."""
     mistake = MISTAKES[name]
     rays = ray_set.make([mistake.regime], COUNT, precision, seeds.current(SEED))
 

@@ -1,12 +1,13 @@
-"""A dispersive prism by raysect, line by line of the spectrum, against the same by `refract_path`.
+"""A dispersive prism by raysect and by `refract_path`, at three lines of the spectrum.
 
-Both render `dispersive_prism` in SF11, in the light of the lines C, d and F alone: a lamp seen through a prism, at
-another place in each of them. Each computes the index itself: raysect by the Sellmeier formula of its own library of
-glasses, where a ray of one narrow bin has the index of that bin; here by `int_ior` = "sellmeier(…)" in a spectral
-variant, where the film sees the same band, 1 nm wide. Lamps, sky and table are grey. The images are compared by Welch's
-t-test, tiles and pixels. As a control, raysect's image at one line is compared with ours at another: that must be seen.
-The models differ in how they sample: `refract_path` samples the lamps and the sky, raysect meets them by chance; see
-the study of images for the rest. The index varies by 1e-4 in a band, evenly about its middle, in both.
+Both render `dispersive_prism` in SF11 in the light of one of the lines C, d and F: a lamp seen through a prism, at a
+different position for each line. Both compute the index themselves: raysect by the Sellmeier formula of its own library
+of glasses, for rays of one narrow bin of wavelengths; `refract_path` by `int_ior` = "sellmeier(…)" in a spectral
+variant, with a film that is sensitive to the same band, 1 nm wide. In both, the index varies by 1e-4 within the band,
+evenly about its middle. Lamps, sky and table are grey. The images are compared by Welch's t-test of tiles and pixels.
+As a control, raysect's image at one line is compared with ours at another line; this difference must be detected.
+`refract_path` samples the lamps and the sky, raysect hits them by chance; see the study of images for other
+differences.
 """
 
 from __future__ import annotations
@@ -42,23 +43,23 @@ from .renderers.image_renderers import IMAGE_RENDERERS
 
 NAME = "spectral lines"
 OTHER, SCENE, VARIANT = "raysect", "dispersive_prism.xml", "llvm_ad_spectral"
-GLASS = "SF11"  # of Schott's catalogue of 2000: B1, B2, B3, then C1, C2, C3 in nm²
+GLASS = "SF11"  # of Schott's catalogue of 2000; INDEX: B1, B2, B3, then C1, C2, C3 in nm²
 INDEX = "sellmeier(1.73848403, 0.311168974, 1.17490871, 13606.8604, 61596.0463, 121922711)"
 WANTED = "C", "d", "F"
-HALF, EDGE = 0.5, 0.01  # nm: half of the band, and how far its response falls to 0
+HALF, EDGE = 0.5, 0.01  # nm: half the width of the band, and the width of the edges of its response
 SIZES = {"quick": Size(64, 128, 4, 0.1), "standard": Size(64, 128, 4, 0.1), "full": Size(128, 2048, 1, 0.01)}
-THEIR_SPP = 1024  # divided by a size's `less`; with 768 noise hid 1 % in 6 to 9 % of the tiles, and 10 % is too much
-DIMMED = 0.1  # lamps: what raysect finds of them by chance on the table is noise
+THEIR_SPP = 1024  # divided by a size's `less`; at 768, noise hid 1 % in 6 to 9 % of the tiles, and 10 % is too much
+DIMMED = 0.1  # factor of the lamps: raysect hits them by chance, so their light on the table is noise
 MIXED = "lines mixed up"
 NOT_SEEN, DIFFERENT = "not seen to differ", "different"
 SHOWN = {name: TERMS[name] for name in ("tests that differ", "tiles that differ without noise", DETECTABLE)} | {
-    DIFFERENT: "1 where tiles or their pixels differ",
-    NOT_SEEN: "1 where the wrong line passes",
+    DIFFERENT: "1 if tiles or pixels differ",
+    NOT_SEEN: "1 if the wrong line passes",
 }
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per line, and the control."""
+    """Return one task per line, and the control."""
     lines = [Task(f"{NAME}: {line}", functools.partial(line_rows, context, line)) for line in WANTED]
     return [*lines, Task(f"{NAME}: {MIXED}", functools.partial(mixed_rows, context))]
 
@@ -68,24 +69,25 @@ def _why_not(context: Context) -> str:
 
 
 def line_rows(context: Context, line: str) -> list[Row]:
-    """Equal within the noise, which hides at most 1 % of the image's mean."""
+    """Return one row: equal within noise that can hide at most 1 % of the image's mean."""
     size = SIZES[context.profile.name]
     row = functools.partial(Row, NAME, OTHER, line, f"{size.resolution}²")
-    images, nothing = environments.attempt(row, _why_not(context), LOST, lambda: (ours(line, size), theirs(line, size)))
+    reason = _why_not(context)
+    images, no_answer = environments.attempt(row, reason, LOST, lambda: (ours(line, size), theirs(line, size)))
     if images is None:
-        return nothing
-    found, values = compared(*images, size)
-    values[DIFFERENT] = float(found.verdict is Verdict.DIFFERENT)
+        return no_answer
+    comparison, values = compared(*images, size)
+    values[DIFFERENT] = float(comparison.verdict is Verdict.DIFFERENT)
     budgets = {DIFFERENT: 0.0, "tests that differ": 0.0, "tiles that differ without noise": 0.0}
     budgets |= {DETECTABLE_IMAGE: float(limits.LINE_DETECTABLE)}
     goals = {INCONCLUSIVE: 0.0, DETECTABLE: size.wanted}
-    replay = {"verdict": str(found.verdict), "nm": LINES[line], "reference spp": size.spp}
+    replay = {"verdict": str(comparison.verdict), "nm": LINES[line], "reference spp": size.spp}
     replay |= {"spp": THEIR_SPP // size.less}
-    return [row(values, budgets, goals, f"{found.verdict}: {found.reason}", replay)]
+    return [row(values, budgets, goals, f"{comparison.verdict}: {comparison.reason}", replay)]
 
 
 def mixed_rows(context: Context) -> list[Row]:
-    """Raysect's image at a line against ours at the next one."""
+    """Return a row per pair of lines: raysect's image at one line against ours at another."""
     size = SIZES[context.profile.name]
     row = functools.partial(Row, NAME, MIXED, setting=f"{size.resolution}²")
     if reason := _why_not(context):
@@ -93,26 +95,26 @@ def mixed_rows(context: Context) -> list[Row]:
     rows = []
     for line, other in (("C", "d"), ("F", "d")):
         try:
-            found, _ = compared(ours(other, size), theirs(line, size), size)
-        except (environments.Unable, environments.Broken, OSError) as why:
-            rows.append(row(case=line, reason=" ".join(str(why).split())))
+            comparison, _ = compared(ours(other, size), theirs(line, size), size)
+        except (environments.Unable, environments.Broken, OSError) as error:
+            rows.append(row(case=line, reason=" ".join(str(error).split())))
             continue
-        values = {NOT_SEEN: float(found.verdict is not Verdict.DIFFERENT)}
-        rows.append(row(case=f"{line} for {other}", values=values, budgets={NOT_SEEN: 0.0}, reason=found.reason))
+        values = {NOT_SEEN: float(comparison.verdict is not Verdict.DIFFERENT)}
+        rows.append(row(case=f"{line} for {other}", values=values, budgets={NOT_SEEN: 0.0}, reason=comparison.reason))
     return rows
 
 
 def compared(one: list[Image], two: list[Image], size: Size) -> tuple[Comparison, dict[str, float]]:
-    """The comparison by Welch's t-test, pixels too, as both sides' are independent; and the numbers of the row."""
-    found = compare("welch", one, two, family_error=limits.SUITE_ERROR, resolution=size.wanted, pixels="yes")
-    return found, measured(found, *(np.stack([image.pixels for image in side]) for side in (one, two)))
+    """Compare two sides by Welch's t-test, with single pixels (independent on both sides); return it and its values."""
+    comparison = compare("welch", one, two, family_error=limits.SUITE_ERROR, resolution=size.wanted, pixels="yes")
+    return comparison, measured(comparison, *(np.stack([image.pixels for image in side]) for side in (one, two)))
 
 
 # The two renderers -------------------------------------------------------------------------------------------------
 
 
 def plain(resolution: int) -> PlainScene:
-    """The scene without colours, in the vacuum, with dimmer lamps. The prism's index is set by each renderer."""
+    """Return the scene without colours, in vacuum, with dimmer lamps. Each renderer sets the prism's index itself."""
 
     def grey(mesh: Mesh) -> Mesh:
         match mesh.material:
@@ -127,14 +129,14 @@ def plain(resolution: int) -> PlainScene:
     text = re.sub(r'<string name="int_ior" [^>]*/>', '<float name="int_ior" value="1.5"/>', text)
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / SCENE).write_text(text)
-        given = from_mitsuba.load(Path(folder) / SCENE, res=str(resolution))
-    assert isinstance(given.sky, tuple)
-    return dataclasses.replace(given, meshes=tuple(map(grey, given.meshes)), sky=(given.sky[1],) * 3)
+        coloured = from_mitsuba.load(Path(folder) / SCENE, res=str(resolution))
+    assert isinstance(coloured.sky, tuple)
+    return dataclasses.replace(coloured, meshes=tuple(map(grey, coloured.meshes)), sky=(coloured.sky[1],) * 3)
 
 
 @functools.cache
 def theirs(line: str, size: Size) -> list[Image]:
-    """Raysect's renders at a line."""
+    """Return raysect's renders at a line."""
 
     def dispersive(folder: Path) -> None:
         document = json.loads((folder / "scene.json").read_text())
@@ -151,29 +153,29 @@ def theirs(line: str, size: Size) -> list[Image]:
 
 @functools.cache
 def ours(line: str, size: Size) -> list[Image]:
-    """Renders by `refract_path` at a line."""
+    """Return renders by `refract_path` at a line."""
     with tempfile.TemporaryDirectory() as folder, under(VARIANT):
         file = Path(folder) / "scene" / "scene.xml"
         targets.write(plain(size.resolution), "mitsuba", file.parent)
         file.write_text(spectral(file.read_text(), LINES[line]))
         camera = Camera(scene_files.load_scene(file, {"bsdf": "refract"}))
-        # The film adds up what it sees over its band.
+        # The film integrates over its band.
         images = [camera(size.spp, OURS + seed)[0][..., :1] / (2 * HALF + EDGE) for seed in range(RENDERS)]
     return [image_file.named(f"{line} {i}", image.astype(np.float32)) for i, image in enumerate(images)]
 
 
 def spectral(text: str, wavelength: float) -> str:
-    """The scene's XML with our integrator, the dispersive glass, grey light and a film that sees one band."""
+    """Return the scene's XML with our integrator, the dispersive glass, grey light and a film for one band."""
     knots = zip((-HALF - EDGE, -HALF, HALF, HALF + EDGE), (0, 1, 1, 0), strict=True)
     band = ", ".join(f"{wavelength + side:.8g}:{value}" for side, value in knots)
-    for pattern, by, times in (
+    for pattern, replacement, times in (
         (r'<integrator type="[^"]*"', '<integrator type="refract_path"', 1),
         (r'<float name="int_ior" value="[^"]*"\s*/>', f'<string name="int_ior" value="{INDEX}"/>', 1),
         (r'<film type="hdrfilm">', f'<film type="specfilm"><spectrum name="band" value="{band}"/>', 1),
         (r'<string name="pixel_format" value="rgb"/>', "", 1),
         (r'<rgb name="(\w+)" value="([^,"]*), [^"]*"/>', r'<spectrum name="\1" value="\2"/>', 4),
     ):
-        text, count = re.subn(pattern, by, text)
+        text, count = re.subn(pattern, replacement, text)
         if count != times:
             raise ValueError(f"{pattern!r} occurs {count} times; expected {times}")
     return text

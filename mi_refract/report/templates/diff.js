@@ -3,7 +3,7 @@
 const search = document.querySelector("input[type=search]");
 const visible = (element) => !element.hidden;
 
-// All words must be in a name, its verdict or its cause. What the filter finds in a folded list unfolds it.
+// All words must occur in a name, its verdict or its cause. A folded list with a match is unfolded.
 function filter(text) {
   const words = text.toLowerCase().split(/\s+/).filter(Boolean);
   for (const each of all("[data-text]")) each.hidden = !words.every((word) => each.dataset.text.includes(word));
@@ -22,7 +22,7 @@ function setFilter(text) {
   filter(text);
 }
 
-// The command. Words are quoted for a shell already; after -- none is an option.
+// The command. Its words are already quoted for a shell; after -- no word is an option.
 const form = document.querySelector(".accepting");
 function build() {
   const words = all(".tick input:checked").map((box) => box.dataset.word);
@@ -51,7 +51,7 @@ function clear() {
   build();
 }
 
-// Each name in the strip has a small copy of its image.
+// Each name in the navigation bar gets a small copy of its image.
 root.addEventListener("painted", () => {
   for (const link of all("nav a[data-text]")) {
     const panes = document.querySelector(link.hash), source = panes.querySelector("[data-role=test] canvas") ?? panes.querySelector("canvas");
@@ -64,7 +64,7 @@ root.addEventListener("painted", () => {
   }
 });
 
-// Keys: x ticks the failure under the strip of names.
+// Keys: x ticks the failure below the navigation bar.
 function tick() {
   const under = (article) => article.getBoundingClientRect().bottom > 130;
   all(".failure").filter(visible).find(under)?.querySelector(".tick input")?.click();

@@ -1,5 +1,5 @@
 "use strict";
-// Pixels stay half floats: exposure is one table of 65536 codes, and painting is a look-up.
+// Pixels are half floats: exposure is a table of 65536 codes, and painting is a look-up.
 const root = document.documentElement;
 addEventListener("error", (e) => (root.dataset.error = e.message));
 addEventListener("unhandledrejection", (e) => (root.dataset.error = String(e.reason)));
@@ -11,10 +11,10 @@ const halves = Float32Array.from({ length: 65536 }, (_, code) => {
   return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : 2 ** -24 * fraction);
 });
 const sRGB = (v) => 255 * (v <= 0.0031308 ? 12.92 * v : 1.055 * v ** (1 / 2.4) - 0.055);
-const NOT_A_NUMBER = [255, 0, 255]; // magenta, wherever it is
+const NOT_A_NUMBER = [255, 0, 255]; // magenta, in images and maps
 const linear = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
 const unit = (v) => Math.min(Math.max(v, 0), 1);
-// Two tables of tones: for images of light, and for those whose file holds sRGB codes.
+// Two tables of tones: for images of linear light, and for images of sRGB codes.
 const tones = { light: new Uint8ClampedArray(65536), code: new Uint8ClampedArray(65536) };
 const expose = (ev) => halves.forEach((v, code) => {
   tones.light[code] = sRGB(unit(v * 2 ** ev));
@@ -51,7 +51,7 @@ const light = (tone) => (r, g, b, out, o) => {
   out[o + 2] = tone[b];
 };
 
-// The channel that differs most speaks for the pixel: a mean would let two errors cancel.
+// A pixel shows the channel that differs most, because in a mean errors could cancel.
 function strongest(r, g, b) {
   let v = halves[r];
   if (Math.abs(halves[g]) > Math.abs(v)) v = halves[g];
@@ -64,7 +64,7 @@ function deviation(gain, signed) {
     for (let c = 0; c < 3; c++) out[o + c] = signed ? EQUAL + (end[c] - EQUAL) * size : 255 * size;
   };
 }
-// Black, violet, orange, pale yellow: lighter is more, in print too.
+// Black, violet, orange, pale yellow: lightness increases with the value, also in print.
 const HEAT = [[0, 0, 4], [81, 18, 124], [183, 55, 121], [252, 137, 97], [252, 253, 191]];
 function heat(gain) {
   return (r, g, b, out, o) => {
@@ -84,7 +84,7 @@ function paintAll(which = () => true) {
   for (const canvas of all(".pane canvas").filter(which)) isMap(canvas) ? paintMap(canvas) : paint(canvas, light(tones[paneOf(canvas).dataset.paint]));
 }
 
-// Every study has the same bar; they move together.
+// Every study has an exposure slider; they move together.
 let exposure = 0;
 function setExposure(ev) {
   exposure = Math.min(Math.max(ev, -8), 8);
@@ -120,7 +120,7 @@ function setSplit(percent) {
   root.style.setProperty("--split", split + "%");
 }
 
-// The next failure or image below the bars that stay on top, or the one before.
+// The next or previous failure or image below the fixed bars.
 function go(step) {
   const places = all(".failure, .compare:not(.failure *)").filter((place) => !place.hidden), top = 120;
   const offset = (place) => place.getBoundingClientRect().top - top;
@@ -144,7 +144,7 @@ const KEYS = {
 };
 
 const shown = (v) => (Number.isFinite(v) && v !== 0 && Math.abs(v) < 1e-3 ? v.toExponential(2) : Number.isFinite(v) ? +v.toPrecision(4) + "" : String(v));
-const LARGEST = 0x7bff; // stands for itself and all beyond it
+const LARGEST = 0x7bff; // this value or any larger one
 const reading = (code, scale) => ((code & 0x7fff) !== LARGEST ? "" : code > LARGEST ? "≤ " : "≥ ") + shown(halves[code] * scale);
 function probe(figure, x, y) {
   figure.toggleAttribute("data-probed", x !== undefined);
@@ -197,7 +197,7 @@ function listen() {
   });
 }
 
-// Sideways: says on which sides a table goes on.
+// Marks the sides on which a table can be scrolled further.
 function markScroll(box) {
   const right = box.scrollWidth - box.clientWidth - box.scrollLeft > 2;
   box.dataset.more = [box.scrollLeft > 2 && "left", right && "right"].filter(Boolean).join(" ");
@@ -210,7 +210,7 @@ function watchScrolls() {
   }
 }
 
-// The rows of a section, from the page itself; where that fails, the link leads to rows.json beside it.
+// The rows of a section, from this page; if that fails, the link leads to rows.json beside it.
 async function unpacked(id) {
   const deflated = Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
   return new Response(new Blob([deflated]).stream().pipeThrough(new DecompressionStream("deflate"))).blob();

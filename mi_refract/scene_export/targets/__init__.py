@@ -1,7 +1,7 @@
-"""The formats that a plain scene is written in: `write(plain, "radiance", folder)`.
+"""The export formats of a plain scene: `write(plain, "radiance", folder)`.
 
-Each format has a function that returns the export's files by name. `COMMANDS` is the text that says how to render;
-`ASSUMPTIONS` says where the renderer's model differs from Mitsuba's.
+Each format has a function that returns the export's files by name. `COMMANDS` is the text on how to render;
+`ASSUMPTIONS` lists where the renderer's model differs from Mitsuba's.
 """
 
 from __future__ import annotations
@@ -28,17 +28,18 @@ TARGETS: dict[str, Callable[[PlainScene], Files]] = {
     "obj+json": scene_json.obj_files,
     "gltf": gltf.files,
 }
-HOLD_VOLUMES = ("gltf",)  # dispersion and absorption
-# Lamps without size: glTF has no falloff of its own for a spot's edge, which its README.txt says; Blender has another.
+HOLD_VOLUMES = ("gltf",)  # targets with dispersion and absorption
+# Targets with lamps without size. glTF leaves the falloff at a spot's edge to the renderer, as its README.txt says;
+# Blender's spots have another falloff.
 ALL_LAMPS = ("point", "spot", "directional")
 HOLD_LAMPS = {"cycles": ("point", "directional"), "mitsuba": ALL_LAMPS, "obj+json": ALL_LAMPS, "gltf": ALL_LAMPS}
 
 
 def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write the files of a target into a new or an empty folder, all of them or none. Returns their paths, sorted.
+    """Write the files of a target into a new or empty folder, all of them or none. Return their paths, sorted.
 
-    ValueError for an unknown target, or a scene that the target's format cannot hold. OSError for a folder that holds
-    files, or cannot be written.
+    ValueError for an unknown target, or a scene that the target's format cannot hold. OSError for a folder that
+    contains files or cannot be written.
     """
     if target not in TARGETS:
         raise ValueError(f"target {target!r}: unknown; expected {', '.join(TARGETS)}")
@@ -52,13 +53,13 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
     for mesh in plain.meshes:
         if isinstance(mesh.material, VolumeGlass) and target not in HOLD_VOLUMES:
             expected = f"one number for all wavelengths and no absorption, or --to {' or '.join(HOLD_VOLUMES)}"
-            raise ValueError(f"{plain.name}: {mesh.name}: {mesh.material.said}; expected {expected}")
+            raise ValueError(f"{plain.name}: {mesh.name}: {mesh.material.parameters}; expected {expected}")
     for lamp in plain.lamps:
         if lamp.kind not in HOLD_LAMPS.get(target, ()):
-            what = f"a {lamp.kind} lamp is not exported to {target}"
-            able = [name for name, kinds in HOLD_LAMPS.items() if lamp.kind in kinds]
-            expected = f"area lamps, an environment, or --to {' or '.join(able)}"
-            raise ValueError(f"{plain.name}: {lamp.name}: {what}; expected {expected}")
+            fault = f"a {lamp.kind} lamp is not exported to {target}"
+            supporting = [name for name, kinds in HOLD_LAMPS.items() if lamp.kind in kinds]
+            expected = f"area lamps, an environment, or --to {' or '.join(supporting)}"
+            raise ValueError(f"{plain.name}: {lamp.name}: {fault}; expected {expected}")
     files = TARGETS[target](plain)
     with safe_files.replacing(place, folder=True) as temporary:
         for name, content in files.items():

@@ -12,13 +12,13 @@ pip install pyluxcore==2.11.2
 python render.py --spp 256 --seeds 1 2 3 4 --out .
 """
 ASSUMPTIONS = (
-    "path.pathdepth.* is Mitsuba's max_depth. There is no Russian roulette before it, no clamping, no light tracing.",
-    "A box filter of one pixel. LuxCore's film is one row off, so the screen window is moved down by one row.",
-    "A map of the sky is resampled: in LuxCore the zenith is +z, longitudes run the other way, and no row is centred "
-    "on a pole.",
+    "path.pathdepth.* is Mitsuba's max_depth. Russian roulette starts at that depth; no clamping, no light tracing.",
+    "A box filter of one pixel. LuxCore's film is one row off, so the screen window is shifted down by one row.",
+    "A map of the sky is resampled: in LuxCore the zenith is +z, longitudes increase in the other direction, and no "
+    "row is centred on a pole.",
     "Radiance is scaled by the square of the index at a boundary, as in Mitsuba.",
 )
-# RANDOM: the samples of two seeds are independent, and so are their renders.
+# RANDOM: with this sampler the renders of two seeds are independent.
 CONFIG = """renderengine.type = "PATHCPU"
 sampler.type = "RANDOM"
 scene.file = "scene.scn"
@@ -40,9 +40,9 @@ batch.haltspp = 256
 
 
 def files(plain: PlainScene) -> Files:
-    """The files of the export, by name."""
+    """Return the export's files by name."""
     camera, names = plain.camera, material_names(plain)
-    height, row = camera.height / camera.width, 2 / camera.width  # of the screen window, which is 2 wide
+    height, row = camera.height / camera.width, 2 / camera.width  # in a screen window of width 2
     view = {
         "lookat.orig": camera.origin,
         "lookat.target": camera.target,
@@ -55,7 +55,7 @@ def files(plain: PlainScene) -> Files:
     }
     lines = ['scene.camera.type = "perspective"', *(f"scene.camera.{key} = {numbers(view[key])}" for key in view)]
     if isinstance(plain.sky, Environment):
-        # Without "clamp" LuxCore interpolates between the two poles.
+        # Without "clamp" LuxCore interpolates from one pole to the other.
         sky = {"type": '"infinite"', "file": '"sky.exr"', "gamma": "1", "storage": '"float"', "wrap": '"clamp"'}
     elif any(plain.sky):
         sky = {"type": '"constantinfinite"', "color": numbers(plain.sky)}
@@ -65,19 +65,25 @@ def files(plain: PlainScene) -> Files:
     for material, name in names.items():
         if isinstance(material, Glass):
             inside, outside = numbers([material.int_ior]), numbers([material.ext_ior])
-            look = ['type = "glass"', "kr = 1 1 1", "kt = 1 1 1", f"interiorior = {inside}", f"exteriorior = {outside}"]
+            properties = [
+                'type = "glass"',
+                "kr = 1 1 1",
+                "kt = 1 1 1",
+                f"interiorior = {inside}",
+                f"exteriorior = {outside}",
+            ]
         elif isinstance(material, Light):
-            look = ['type = "matte"', "kd = 0 0 0", f"emission = {numbers(material.radiance)}"]
+            properties = ['type = "matte"', "kd = 0 0 0", f"emission = {numbers(material.radiance)}"]
         else:
-            look = ['type = "matte"', f"kd = {numbers(material.reflectance)}"]
-        lines += [f"scene.materials.{name}.{line}" for line in look]
+            properties = ['type = "matte"', f"kd = {numbers(material.reflectance)}"]
+        lines += [f"scene.materials.{name}.{line}" for line in properties]
     for mesh in plain.meshes:
         lines.append(f'scene.objects.{mesh.name}.ply = "{mesh.name}.ply"')
         lines.append(f'scene.objects.{mesh.name}.material = "{names[mesh.material]}"')
-    own = {
+    contents = {
         "scene.scn": ("\n".join(lines) + "\n").encode(),
         "scene.cfg": CONFIG.format(camera=plain.camera, depth=plain.max_depth).encode(),
         "render.py": resources(__package__).joinpath("render_luxcore.py").read_bytes(),
         "README.txt": readme(plain, "LuxCore", COMMANDS, ASSUMPTIONS),
     }
-    return ply_files(plain) | sky_exr(plain, ((1, 0, 0), (0, 1, 0), (0, 0, 1))) | own
+    return ply_files(plain) | sky_exr(plain, ((1, 0, 0), (0, 1, 0), (0, 0, 1))) | contents

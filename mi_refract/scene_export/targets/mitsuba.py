@@ -63,7 +63,7 @@ SHAPE = """
 
 
 def files(plain: PlainScene) -> Files:
-    """The files of the export, by name."""
+    """Return the export's files by name."""
     camera = plain.camera
     vectors = {name: numbers(getattr(camera, name), ", ") for name in ("origin", "target", "up")}
     shapes = []
@@ -77,30 +77,30 @@ def files(plain: PlainScene) -> Files:
         else:
             plugin = f'<emitter type="area">{_rgb("radiance", material.radiance)}</emitter>'
         shapes.append(SHAPE.format(name=quoteattr(mesh.name), file=quoteattr(f"{mesh.name}.ply"), plugin=plugin))
-    sky, own = "", {}
+    sky, contents = "", {}
     if isinstance(plain.sky, Environment):
-        turn = np.eye(4)
-        turn[:3, :3] = plain.sky.rotation
-        sky = f'\n    <emitter type="envmap"><string name="filename" value="sky.exr"/>{_to_world(turn)}</emitter>'
-        own = {"sky.exr": exr(plain.sky.pixels)}
+        to_world = np.eye(4)
+        to_world[:3, :3] = plain.sky.rotation
+        sky = f'\n    <emitter type="envmap"><string name="filename" value="sky.exr"/>{_to_world(to_world)}</emitter>'
+        contents = {"sky.exr": exr(plain.sky.pixels)}
     elif any(plain.sky):
         sky = f'\n    <emitter type="constant">{_rgb("radiance", plain.sky)}</emitter>'
-    more = {"shapes": "\n".join(shapes), "sky": sky, "lamps": "".join(map(_lamp, plain.lamps))}
-    text = SCENE.format(camera=camera, max_depth=plain.max_depth, **more, **vectors)
-    own |= {"scene.xml": text.encode(), "README.txt": readme(plain, "Mitsuba", COMMANDS, ())}
-    return ply_files(plain) | own
+    parts = {"shapes": "\n".join(shapes), "sky": sky, "lamps": "".join(map(_lamp, plain.lamps))}
+    text = SCENE.format(camera=camera, max_depth=plain.max_depth, **parts, **vectors)
+    contents |= {"scene.xml": text.encode(), "README.txt": readme(plain, "Mitsuba", COMMANDS, ())}
+    return ply_files(plain) | contents
 
 
 def _lamp(lamp: Lamp) -> str:
-    said = _to_world(frame(lamp))
+    body = _to_world(frame(lamp))
     if isinstance(lamp, PointLamp):
-        said += _rgb("intensity", lamp.intensity)
+        body += _rgb("intensity", lamp.intensity)
     if isinstance(lamp, DirectionalLamp):
-        said += _rgb("irradiance", lamp.irradiance)
+        body += _rgb("irradiance", lamp.irradiance)
     if isinstance(lamp, SpotLamp):
         angles = {"cutoff_angle": lamp.cutoff_degrees, "beam_width": lamp.beam_degrees}
-        said += "".join(f'<float name="{name}" value="{angle!r}"/>' for name, angle in angles.items())
-    return f'\n    <emitter type="{lamp.kind}" id={quoteattr(lamp.name)}>{said}</emitter>'
+        body += "".join(f'<float name="{name}" value="{angle!r}"/>' for name, angle in angles.items())
+    return f'\n    <emitter type="{lamp.kind}" id={quoteattr(lamp.name)}>{body}</emitter>'
 
 
 def _to_world(matrix: Array) -> str:

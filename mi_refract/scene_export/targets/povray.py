@@ -1,4 +1,4 @@
-"""POV-Ray: glass and lights only, because POV-Ray follows no light between diffuse surfaces."""
+"""POV-Ray: glass and lights only, because POV-Ray traces no light between diffuse surfaces."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from .shared_files import LIGHT_INSIDE, Files, numbers, outermost_index, outward
 COMMANDS = """
 povray +Iscene.pov +Oimage.exr +FE +W{width} +H{height} -A -D File_Gamma=1.0 Declare=dx=0.5 Declare=dy=0.5
 
-0 <= dx, dy < 1 is the place of the only sample in each pixel. The mean of images with random dx and dy is a box filter.
+0 <= dx, dy < 1 is the position of the only sample in each pixel. To apply a box filter, average images with random dx
+and dy.
 """
 ASSUMPTIONS = (
-    "max_trace_level counts as Mitsuba's max_depth does, up to 256. At a boundary both rays are followed, until the "
-    "share of one is below 1e-7 (adc_bailout).",
+    "max_trace_level counts as Mitsuba's max_depth does, up to 256. At a boundary POV-Ray traces both rays until the "
+    "share of a ray is below 1e-7 (adc_bailout).",
     "A ray is inside a body after an odd number of intersections with its surface. So glass must be closed, and nested "
     "bodies must not touch.",
     "A map of the sky is resampled: POV-Ray shows its first column in direction +x.",
@@ -29,14 +30,14 @@ BAILOUT = "1e-7"
 
 
 def files(plain: PlainScene) -> Files:
-    """The files of the export, by name. ValueError for open glass and for diffuse surfaces."""
+    """Return the export's files by name. ValueError for open glass and for diffuse surfaces."""
     for mesh in plain.meshes:
         place = f"{plain.name}: {mesh.name}"
         if isinstance(mesh.material, Glass) and not is_closed(mesh.faces):
             raise ValueError(f"{place}: glass with an open surface; POV-Ray needs a closed surface")
         if isinstance(mesh.material, Diffuse) and any(mesh.material.reflectance):
             raise ValueError(f"{place}: a diffuse surface; the export to POV-Ray supports glass and lights only")
-    # POV-Ray assumes that the outermost medium has index 1: indices are relative to that one.
+    # In POV-Ray the outermost medium has index 1: indices are relative to it.
     plain = outward(plain)
     outside = outermost_index(plain)
     media = {outside, *(mesh.material.int_ior for mesh in plain.meshes if isinstance(mesh.material, Glass))}
@@ -54,16 +55,16 @@ def files(plain: PlainScene) -> Files:
     )
     # Right-handed: Right points right in the image. Shifted by (dx − ½, dy − ½) pixels.
     camera = plain.camera
-    ahead = np.subtract(camera.target, camera.origin)
-    ahead = ahead / np.linalg.norm(ahead)
-    right = np.cross(ahead, camera.up)
+    forward = np.subtract(camera.target, camera.origin)
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, camera.up)
     right *= 2 * math.tan(math.radians(camera.fov_x_degrees) / 2) / np.linalg.norm(right)
-    up = np.cross(right, ahead) * camera.height / camera.width
+    up = np.cross(right, forward) * camera.height / camera.width
     view = (
         "#ifndef (dx) #declare dx = 0.5; #end\n#ifndef (dy) #declare dy = 0.5; #end\n"
         f"#declare Right = {_vector(right)};\n#declare Up = {_vector(up)};\n"
         f"camera {{ perspective location {_vector(camera.origin)} right Right up Up\n"
-        f"  direction {_vector(ahead)} + Right*(dx - 0.5)/{camera.width} - Up*(dy - 0.5)/{camera.height} }}\n"
+        f"  direction {_vector(forward)} + Right*(dx - 0.5)/{camera.width} - Up*(dy - 0.5)/{camera.height} }}\n"
     )
     commands = COMMANDS.format(width=camera.width, height=camera.height)
     return sky_exr(plain, ((1, 0, 0), (0, 0, 1), (0, 1, 0))) | {
@@ -80,15 +81,15 @@ def _mesh(mesh: Mesh, outside: float) -> str:
     vertices = ",\n".join(map(_vector, mesh.vertices))
     # Counterclockwise in these right-handed coordinates is clockwise in POV-Ray's.
     faces = ",\n".join(f"<{c}, {b}, {a}>" for a, b, c in mesh.faces.tolist())
-    dark, material = "ambient 0 diffuse 0", mesh.material
+    no_reflection, material = "ambient 0 diffuse 0", mesh.material
     if isinstance(material, Glass):
-        finish = f"finish {{ {dark} reflection {{ 0, 1 fresnel on }} conserve_energy }}"
-        look = f"texture {{ pigment {{ rgbt 1 }} {finish} }} interior {{ ior {material.int_ior / outside!r} }}"
+        finish = f"finish {{ {no_reflection} reflection {{ 0, 1 fresnel on }} conserve_energy }}"
+        appearance = f"texture {{ pigment {{ rgbt 1 }} {finish} }} interior {{ ior {material.int_ior / outside!r} }}"
     else:
         colour = material.radiance if isinstance(material, Light) else (0.0, 0.0, 0.0)
-        front = f"texture {{ pigment {{ rgb {_vector(colour)} }} finish {{ {dark} emission 1 }} }}"
-        look = f"{front} interior_texture {{ pigment {{ rgb 0 }} finish {{ {dark} }} }}"
+        front = f"texture {{ pigment {{ rgb {_vector(colour)} }} finish {{ {no_reflection} emission 1 }} }}"
+        appearance = f"{front} interior_texture {{ pigment {{ rgb 0 }} finish {{ {no_reflection} }} }}"
     return (
         f"mesh2 {{ // {mesh.name}\n  vertex_vectors {{ {len(mesh.vertices)},\n{vertices} }}\n"
-        f"  face_indices {{ {len(mesh.faces)},\n{faces} }}\n  {look}\n}}\n"
+        f"  face_indices {{ {len(mesh.faces)},\n{faces} }}\n  {appearance}\n}}\n"
     )

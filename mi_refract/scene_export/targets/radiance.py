@@ -1,4 +1,4 @@
-"""Radiance, used as a path tracer that finds lights by chance only."""
+"""Radiance, used as a path tracer without shadow rays."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ image.f32 holds {height} rows of {width} pixels of 3 float32, the top row first.
 """
 SOURCE = "sky source everywhere 0 0 4 0 0 1 360\n"
 ASSUMPTIONS = (
-    "At a boundary both rays are followed while their share is above 0.01 (-lw). Below it, Russian roulette (a "
-    "negative -lr) decides, without bias.",
-    "-lr and -ab count reflections, Mitsuba's max_depth counts refractions, too: Radiance has light that Mitsuba cuts "
-    "off. Where that matters, raise Mitsuba's max_depth: `nested` gains 0.2 % of its mean from 48 to 400.",
-    "Lights and sky are `glow` of radius 0: Radiance sends them no shadow rays, so that caustics are complete.",
+    "At a boundary Radiance traces both rays while their share is above 0.01 (-lw). Below it, Russian roulette (a "
+    "negative -lr) ends rays, without bias.",
+    "-lr and -ab count reflections only; Mitsuba's max_depth also counts refractions. So Radiance has light that "
+    "Mitsuba cuts off. If that matters, raise Mitsuba's max_depth: `nested` gains 0.2 % of its mean from 48 to 400.",
+    "Lights and sky are `glow` of radius 0: Radiance traces no shadow rays to them, so caustics are complete.",
 )
 
 
 def files(plain: PlainScene) -> Files:
-    """The files of the export, by name."""
+    """Return the export's files by name."""
     maps: Files = {}
     if isinstance(plain.sky, Environment):
         height, width = plain.sky.pixels.shape[:2]
@@ -57,9 +57,9 @@ def files(plain: PlainScene) -> Files:
         )
         for mesh in plain.meshes
     ]
-    ahead, wide = np.subtract(camera.target, camera.origin), math.tan(math.radians(camera.fov_x_degrees) / 2)
-    fov_y = math.degrees(2 * math.atan(wide * camera.height / camera.width))
-    where = f"-vp {numbers(camera.origin)} -vd {numbers(ahead)} -vu {numbers(camera.up)}"
+    forward, half_width = np.subtract(camera.target, camera.origin), math.tan(math.radians(camera.fov_x_degrees) / 2)
+    fov_y = math.degrees(2 * math.atan(half_width * camera.height / camera.width))
+    view = f"-vp {numbers(camera.origin)} -vd {numbers(forward)} -vu {numbers(camera.up)}"
     materials = ""
     for material, name in names.items():
         if isinstance(material, Glass):  # an interface names the medium behind the normal first
@@ -70,6 +70,6 @@ def files(plain: PlainScene) -> Files:
             materials += f"void glow {name} 0 0 4 {numbers(material.radiance)} 0\n"
     return maps | {
         "scene.rad": "\n".join([materials, *meshes, sky]).encode(),
-        "camera.vf": f"VIEW= -vtv {where} -vh {camera.fov_x_degrees!r} -vv {fov_y!r}\n".encode(),
+        "camera.vf": f"VIEW= -vtv {view} -vh {camera.fov_x_degrees!r} -vv {fov_y!r}\n".encode(),
         "README.txt": readme(plain, "Radiance", commands, ASSUMPTIONS),
     }

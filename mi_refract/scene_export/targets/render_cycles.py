@@ -1,8 +1,8 @@
-"""Render `scene.json` by Cycles: `python render.py --spp 256 --seeds 1 2 3 4 --out .`
+"""Render `scene.json` with Cycles: `python render.py --spp 256 --seeds 1 2 3 4 --out .`
 
-It writes one `seedN.exr` per seed. A Python with bpy runs this script; mi_refract never imports it. The settings make
-Cycles a plain path tracer: box filter, no clamping, no blurred caustics, no adaptive sampling, no denoising, one limit
-of depth.
+It writes one `seedN.exr` per seed. Run this script with a Python that has bpy; mi_refract never imports it. The
+settings make Cycles a plain path tracer: box filter, no clamping, no blurred caustics, no adaptive sampling, no
+denoising, one depth limit.
 """
 
 import argparse
@@ -38,7 +38,7 @@ def main():
 
 
 def build(plain, folder):
-    """Make Blender's objects from `scene.json` and the files beside it."""
+    """Create Blender's objects from `scene.json` and the files in its folder."""
     materials = {name: material(name, entry) for name, entry in plain["materials"].items()}
     for name, entry in plain["meshes"].items():
         vertices, faces = triangles(folder / entry["file"])
@@ -53,7 +53,7 @@ def build(plain, folder):
 
 
 def triangles(path):
-    """Vertices and faces of a binary PLY file of float32 positions and triangles."""
+    """Return the vertices and faces of a binary PLY file of float32 positions and triangles."""
     header, _, data = path.read_bytes().partition(b"end_header\n")
     vertices, faces = (int(count) for count in re.findall(rb"element \w+ (\d+)", header))
     corners = np.frombuffer(data, [("count", "u1"), ("index", "<i4", 3)], faces, vertices * 12)
@@ -61,18 +61,18 @@ def triangles(path):
 
 
 def material(name, entry):
-    """A material of Blender's from an entry of "materials"."""
-    made = bpy.data.materials.new(name)
-    made.use_nodes = True
-    nodes, links = made.node_tree.nodes, made.node_tree.links
+    """Create a Blender material from an entry of "materials"."""
+    result = bpy.data.materials.new(name)
+    result.use_nodes = True
+    nodes, links = result.node_tree.nodes, result.node_tree.links
     nodes.clear()
     surface = SHADERS[entry["type"]](nodes, links, entry)
     links.new(surface, nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
-    return made
+    return result
 
 
 def glass(nodes, links, entry):
-    """The output of a smooth glass."""
+    """Return the shader output of a smooth glass."""
     node = nodes.new("ShaderNodeBsdfGlass")
     node.inputs["Color"].default_value = (1, 1, 1, 1)
     node.inputs["Roughness"].default_value = 0
@@ -81,7 +81,7 @@ def glass(nodes, links, entry):
 
 
 def diffuse(nodes, links, entry):
-    """The output of a Lambertian surface."""
+    """Return the shader output of a Lambertian surface."""
     node = nodes.new("ShaderNodeBsdfDiffuse")
     node.inputs["Color"].default_value = (*entry["reflectance"], 1)
     node.inputs["Roughness"].default_value = 0
@@ -89,7 +89,7 @@ def diffuse(nodes, links, entry):
 
 
 def light(nodes, links, entry):
-    """The output of a surface that emits on the side of its normal and is black from behind."""
+    """Return the shader output of a surface that emits on the side of its normal and is black from behind."""
     front, back, mix = (nodes.new(f"ShaderNode{kind}") for kind in ("Emission", "BsdfDiffuse", "MixShader"))
     front.inputs["Color"].default_value = (*entry["radiance"], 1)
     front.inputs["Strength"].default_value = 1
@@ -104,40 +104,40 @@ SHADERS = {"glass": glass, "diffuse": diffuse, "light": light}
 
 
 def lamp(entry):
-    """Place a lamp without size. Blender's power of a point is 4π times the intensity, that of a sun the irradiance."""
+    """Add a lamp without size. In Blender a point's power is 4π × intensity, a sun's strength is its irradiance."""
     directional = entry["type"] == "directional"
-    made = bpy.data.lights.new(entry["name"], "SUN" if directional else "POINT")
-    made.color, made.energy = entry["irradiance" if directional else "intensity"], 1 if directional else 4 * math.pi
-    placed = bpy.data.objects.new(entry["name"], made)
-    if directional:  # it shines along its −z
-        made.angle = 0
-        placed.matrix_world = Vector(entry["direction"]).to_track_quat("-Z", "Y").to_matrix().to_4x4()
+    data = bpy.data.lights.new(entry["name"], "SUN" if directional else "POINT")
+    data.color, data.energy = entry["irradiance" if directional else "intensity"], 1 if directional else 4 * math.pi
+    item = bpy.data.objects.new(entry["name"], data)
+    if directional:  # a sun emits along its −z
+        data.angle = 0
+        item.matrix_world = Vector(entry["direction"]).to_track_quat("-Z", "Y").to_matrix().to_4x4()
     else:
-        made.shadow_soft_size = 0
-        placed.matrix_world = Matrix.Translation(Vector(entry["position"]))
-    bpy.context.scene.collection.objects.link(placed)
+        data.shadow_soft_size = 0
+        item.matrix_world = Matrix.Translation(Vector(entry["position"]))
+    bpy.context.scene.collection.objects.link(item)
 
 
 def world(sky, folder):
     """Set the sky: a map or one colour."""
-    made = bpy.data.worlds.new("sky")
-    made.use_nodes = True
-    bpy.context.scene.world = made
-    nodes = made.node_tree.nodes
+    blender_world = bpy.data.worlds.new("sky")
+    blender_world.use_nodes = True
+    bpy.context.scene.world = blender_world
+    nodes, links = blender_world.node_tree.nodes, blender_world.node_tree.links
     nodes.clear()
     background = nodes.new("ShaderNodeBackground")
     if "environment" in sky:
         image = nodes.new("ShaderNodeTexEnvironment")
         image.image = bpy.data.images.load(str(folder / sky["environment"]))
         image.image.colorspace_settings.name = "Non-Color"
-        made.node_tree.links.new(image.outputs[0], background.inputs["Color"])
+        links.new(image.outputs[0], background.inputs["Color"])
     else:
         background.inputs["Color"].default_value = (*sky["radiance"], 1)
-    made.node_tree.links.new(background.outputs[0], nodes.new("ShaderNodeOutputWorld").inputs["Surface"])
+    links.new(background.outputs[0], nodes.new("ShaderNodeOutputWorld").inputs["Surface"])
 
 
 def camera(entry):
-    """Place the camera."""
+    """Add the camera."""
     origin, target, up = (Vector(entry[key]) for key in ("origin", "target", "up"))
     back = (origin - target).normalized()
     right = up.cross(back).normalized()
@@ -145,11 +145,11 @@ def camera(entry):
     lens.sensor_fit = "HORIZONTAL"
     lens.angle = math.radians(entry["fov_x_degrees"])
     lens.clip_start, lens.clip_end = 1e-3, 1e6
-    placed = bpy.data.objects.new("camera", lens)
+    item = bpy.data.objects.new("camera", lens)
     axes = Matrix((right, back.cross(right), back)).transposed().to_4x4()
-    placed.matrix_world = Matrix.Translation(origin) @ axes
-    bpy.context.scene.collection.objects.link(placed)
-    bpy.context.scene.camera = placed
+    item.matrix_world = Matrix.Translation(origin) @ axes
+    bpy.context.scene.collection.objects.link(item)
+    bpy.context.scene.camera = item
 
 
 def settings(plain, options):

@@ -1,6 +1,6 @@
-"""Render `scene.cfg` by LuxCore: `python render.py --spp 256 --seeds 1 2 3 4 --out .`
+"""Render `scene.cfg` with LuxCore: `python render.py --spp 256 --seeds 1 2 3 4 --out .`
 
-It writes one `seedN.exr` per seed. A Python with pyluxcore runs this script; mi_refract never imports it.
+It writes one `seedN.exr` per seed. Run this script with a Python that has pyluxcore; mi_refract never imports it.
 """
 
 import argparse
@@ -30,10 +30,10 @@ def main():
 def render(options, seed, path):
     """Render `scene.cfg` with this seed into a file."""
     config = pyluxcore.Properties("scene.cfg")
-    own = {"batch.haltspp": options.spp, "renderengine.seed": seed, "film.outputs.0.filename": str(path)}
+    overrides = {"batch.haltspp": options.spp, "renderengine.seed": seed, "film.outputs.0.filename": str(path)}
     if options.threads:
-        own["native.threads.count"] = options.threads
-    for key, value in own.items():
+        overrides["native.threads.count"] = options.threads
+    for key, value in overrides.items():
         config.Set(pyluxcore.Property(key, value))
     scene = pyluxcore.Scene()
     scene.Parse(pyluxcore.Properties("scene.scn"))

@@ -1,9 +1,9 @@
-"""Render `scene.json` by raysect: `python render.py --spp 256 --seeds 1 2 3 4 --out .`
+"""Render `scene.json` with raysect: `python render.py --spp 256 --seeds 1 2 3 4 --out .`
 
-It writes one `seedN.pfm` per seed. A Python with raysect runs this script; mi_refract never imports it. A ray of
-raysect carries a spectrum, here of three bins: red, green and blue. Glass has one index for all of them, so that a path
-is the same for the three. With `--band FROM TO` (nm) a ray has one bin, which the image shows three times, and a glass
-that has an entry "schott" in `scene.json` is that of raysect's library, with its index in the band.
+It writes one `seedN.pfm` per seed. Run this script with a Python that has raysect; mi_refract never imports it. A ray
+of raysect carries a spectrum, here of three bins: red, green and blue. Glass has the same index in all three, so they
+share a path. With `--band FROM TO` (nm) a ray has one bin, which the image repeats in its three channels, and a glass
+with an entry "schott" in `scene.json` is that of raysect's library, with its index in the band.
 """
 
 import argparse
@@ -24,13 +24,14 @@ from raysect.optical.material import Dielectric, Lambert, UniformSurfaceEmitter
 from raysect.optical.observer import FullFrameSampler2D, PinholeCamera, SpectralRadiancePipeline2D
 from raysect.primitive import Mesh, Sphere
 
-# raysect meets triangles in float32 and starts the next ray 1e-6 beside them: a scene must not be much larger than 1.
+# raysect intersects triangles in float32 and offsets the next ray by 1e-6: a scene must not be much larger than 1.
 SIZE, FAR = 0.5, 10.0  # the largest coordinate after scaling, and the radius of the sky
-BINS, STEP = (400.0, 500.0, 600.0, 700.0), 1e-6  # of red, green and blue: no colour is meant
+# Borders in nm of the bins for red, green and blue, which stand for no colours; half the width of a step between bins.
+BINS, STEP = (400.0, 500.0, 600.0, 700.0), 1e-6
 
 
 def main():
-    """Render once per seed, each in a process of its own."""
+    """Render once per seed, in parallel processes."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--spp", type=int, default=256)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
@@ -45,7 +46,7 @@ def main():
 
 
 def image(task):
-    """Render one image; its path."""
+    """Render one image and return its path."""
     options, seed = task
     folder = Path(__file__).resolve().parent
     plain = json.loads((folder / "scene.json").read_text())
@@ -60,18 +61,18 @@ def image(task):
 
 
 def pfm(pixels):
-    """A portable float map, whose first row is the lowest."""
+    """Return the bytes of a portable float map, whose first row is the lowest."""
     height, width, _ = pixels.shape
     return f"PF\n{width} {height}\n-1.0\n".encode() + pixels[::-1].astype("<f4").tobytes()
 
 
 def build(plain, folder):
-    """The world of `scene.json` and the files beside it."""
+    """Create the world from `scene.json` and the files in its folder."""
     world, unit = World(), scale(plain, folder)
     materials = {name: MATERIALS[entry["type"]](entry) for name, entry in plain["materials"].items()}
     for name, entry in plain["meshes"].items():
         vertices, faces = triangles(folder / entry["file"])
-        # Open, although it may be closed: whether a place is inside is asked for absorption only.
+        # closed=False is enough: raysect needs to know what is inside a mesh only for absorption.
         mesh = Mesh(vertices * unit, faces, smoothing=False, closed=False, parent=world, name=name)
         mesh.material = materials[entry["material"]]
     sky = plain["sky"]
@@ -81,13 +82,13 @@ def build(plain, folder):
 
 
 def scale(plain, folder):
-    """What makes the largest coordinate of the scene SIZE."""
+    """Return the factor that scales the largest coordinate of the scene to SIZE."""
     parts = [triangles(folder / entry["file"])[0] for entry in plain["meshes"].values()]
     return SIZE / np.abs(np.concatenate([[plain["camera"]["origin"]], *parts])).max()
 
 
 def triangles(path):
-    """Vertices and faces of a binary PLY file of float32 positions and triangles."""
+    """Return the vertices and faces of a binary PLY file of float32 positions and triangles."""
     header, _, data = path.read_bytes().partition(b"end_header\n")
     vertices, faces = (int(count) for count in re.findall(rb"element \w+ (\d+)", header))
     corners = np.frombuffer(data, [("count", "u1"), ("index", "<i4", 3)], faces, vertices * 12)
@@ -95,31 +96,31 @@ def triangles(path):
 
 
 def per_bin(colour):
-    """A spectrum that is constant within each bin."""
-    places = [BINS[0], *(edge + side for edge in BINS[1:-1] for side in (-STEP, STEP)), BINS[-1]]
-    return InterpolatedSF(places, np.repeat(colour, 2))
+    """Return a spectrum that is constant within each bin."""
+    wavelengths = [BINS[0], *(edge + side for edge in BINS[1:-1] for side in (-STEP, STEP)), BINS[-1]]
+    return InterpolatedSF(wavelengths, np.repeat(colour, 2))
 
 
 class Light(UniformSurfaceEmitter):
-    """Emits on the side of its normals, and is black from behind."""
+    """A surface that emits on the side of its normals and is black from behind."""
 
     def evaluate_surface(self, world, ray, primitive, hit_point, exiting, *others):
-        """As the base class asks it."""
+        """Override the base class."""
         if exiting:
             return ray.new_spectrum()
         return super().evaluate_surface(world, ray, primitive, hit_point, exiting, *others)
 
 
 class Map(UniformSurfaceEmitter):
-    """A sky by direction, linear between the pixels of the map."""
+    """A sky from a map of directions, linear between the map's pixels."""
 
     def __init__(self, sky, folder):
-        """The map of `scene.json`."""
+        """`sky`: the entry of `scene.json`."""
         super().__init__(ConstantSF(1))
         self.pixels = np.load(folder / sky["environment"]).astype(float)
 
     def evaluate_surface(self, world, ray, *others):
-        """As the base class asks it."""
+        """Override the base class."""
         d, spectrum = ray.direction.normalise(), ray.new_spectrum()
         rows, columns = self.pixels.shape[:2]
         row = max(0.0, min(rows - 1.0, math.acos(max(-1.0, min(1.0, d.y))) / math.pi * rows - 0.5))
@@ -133,7 +134,7 @@ class Map(UniformSurfaceEmitter):
 
 
 def glass(entry):
-    """A smooth boundary that absorbs nothing."""
+    """Return a smooth boundary without absorption."""
     index = schott(entry["schott"]).index if "schott" in entry else ConstantSF(entry["int_ior"])
     return Dielectric(index, ConstantSF(1), ConstantSF(entry["ext_ior"]))
 
@@ -146,30 +147,30 @@ MATERIALS = {
 
 
 class Camera(PinholeCamera):
-    """A pinhole camera whose rays count the same; raysect's weighs them by the cosine to where it looks."""
+    """A pinhole camera with equal weights; raysect's own weighs a ray by its cosine to the viewing direction."""
 
     def _generate_rays(self, *place):
         return [(ray, 1.0) for ray, _ in super()._generate_rays(*place)]
 
 
 def camera(world, plain, options, pipeline):
-    """A pinhole; without roulette and importance sampling, raysect is a plain path tracer."""
+    """Return the pinhole camera; without roulette and importance sampling, raysect is a plain path tracer."""
     entry = plain["camera"]
     width, height = entry["width"], entry["height"]
-    wide = math.tan(math.radians(entry["fov_x_degrees"]) / 2)
-    made = Camera((width, height), parent=world, pipelines=[pipeline], frame_sampler=FullFrameSampler2D())
-    made.fov = math.degrees(2 * math.atan(wide * max(1, height / width)))  # of the longer side
+    half_width = math.tan(math.radians(entry["fov_x_degrees"]) / 2)
+    result = Camera((width, height), parent=world, pipelines=[pipeline], frame_sampler=FullFrameSampler2D())
+    result.fov = math.degrees(2 * math.atan(half_width * max(1, height / width)))  # of the longer side
     origin, target = (np.array(entry[key]) for key in ("origin", "target"))
     place = origin * scale(plain, Path(__file__).resolve().parent)
-    made.transform = translate(*place) * rotate_basis(Vector3D(*(target - origin)), Vector3D(*entry["up"]))
-    made.pixel_samples, made.quiet, made.render_engine = options.spp, True, SerialEngine()
+    result.transform = translate(*place) * rotate_basis(Vector3D(*(target - origin)), Vector3D(*entry["up"]))
+    result.pixel_samples, result.quiet, result.render_engine = options.spp, True, SerialEngine()
     band = options.band or (BINS[0], BINS[-1])
-    made.min_wavelength, made.max_wavelength = 1.0, band[1]
-    made.min_wavelength = band[0]
-    made.spectral_rays, made.spectral_bins = 1, 1 if options.band else len(BINS) - 1
-    made.ray_extinction_prob, made.ray_importance_sampling = 0.0, False
-    made.ray_extinction_min_depth, made.ray_max_depth = 1, plain["max_depth"]
-    return made
+    result.min_wavelength, result.max_wavelength = 1.0, band[1]
+    result.min_wavelength = band[0]
+    result.spectral_rays, result.spectral_bins = 1, 1 if options.band else len(BINS) - 1
+    result.ray_extinction_prob, result.ray_importance_sampling = 0.0, False
+    result.ray_extinction_min_depth, result.ray_max_depth = 1, plain["max_depth"]
+    return result
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ pip install bpy==5.0.1          (Python 3.11)
 python render.py --spp 256 --seeds 1 2 3 4 --out .
 """
 CYCLES_ASSUMPTIONS = (
-    "max_bounces and every other limit of bounces are Mitsuba's max_depth - 2. min_light_bounces is so, too, and "
+    "max_bounces and every other bounce limit are Mitsuba's max_depth - 2. min_light_bounces has the same value, which "
     "switches Russian roulette off.",
     "A box filter of one pixel, no clamping, no blurred caustics (blur_glossy = 0), light_sampling_threshold = 0, no "
     "adaptive sampling, no denoising.",
@@ -39,7 +39,7 @@ CYCLES_ASSUMPTIONS = (
 
 
 def cycles_files(plain: PlainScene) -> Files:
-    """The files of the export, by name."""
+    """Return the export's files by name."""
     return (
         json_and_ply(plain)
         | sky_exr(plain, ((-1, 0, 0), (0, 1, 0), (0, 0, 1)))
@@ -58,22 +58,23 @@ python render.py --spp 256 --seeds 1 2 3 4 --out .
 """
 RAYSECT_ASSUMPTIONS = (
     "A ray carries a spectrum of three bins, which are red, green and blue; an index is the same for all of them.",
-    "ray_max_depth is Mitsuba's max_depth. Russian roulette (extinction) and importance sampling are off: a lamp and "
-    "the sky are met by chance.",
-    "raysect's pinhole camera weighs a ray by the cosine to where it looks; here it does not.",
-    "At a smooth boundary reflection or transmission is chosen by Fresnel's R, as in Mitsuba; at the critical angle "
-    "itself light is reflected.",
-    "Coordinates are scaled so that the largest is 0.5: raysect meets triangles in float32 and starts rays 1e-6 beside "
-    "them.",
-    "The sky is a sphere that emits, 20 times as large as the scene. A map of it is resampled: no row is "
-    "centred on a pole.",
+    "ray_max_depth is Mitsuba's max_depth. Russian roulette (extinction) and importance sampling are off: rays hit "
+    "lamps and the sky by chance.",
+    "raysect's own pinhole camera weighs a ray by its cosine to the viewing direction; the camera of render.py does "
+    "not.",
+    "At a smooth boundary Fresnel's R is the probability of reflection, as in Mitsuba; at the critical angle itself "
+    "light is reflected.",
+    "Coordinates are scaled so that the largest is 0.5: raysect intersects triangles in float32 and offsets new rays "
+    "by 1e-6.",
+    "The sky is an emitting sphere, 20 times as large as the scene. A map of the sky is resampled: no row is centred "
+    "on a pole.",
     "A light emits on one side and is black from behind.",
     LIGHT_INSIDE,
 )
 
 
 def raysect_files(plain: PlainScene) -> Files:
-    """The files of the export, by name."""
+    """Return the export's files by name."""
     files = json_and_ply(plain, sky_file="sky.npy")
     if isinstance(plain.sky, Environment):
         file = io.BytesIO()
@@ -85,13 +86,13 @@ def raysect_files(plain: PlainScene) -> Files:
     }
 
 
-# Programs without a target of their own: Wavefront OBJ, and everything else as JSON -----------------------------------
+# Other programs: Wavefront OBJ, and everything else as JSON --------------------------------------------------------
 
 OBJ_COMMANDS = """
 scene.obj    the triangles, one object per mesh
-scene.mtl    the materials as far as Wavefront's format can say them
+scene.mtl    the materials, as far as Wavefront's format can describe them
 scene.json   camera, sky, lamps, max_depth, all materials, and the material of each object by name
-sky.exr      only where the sky is a map, by longitude and latitude
+sky.exr      the sky by longitude and latitude; only for a sky that is a map
 """
 OBJ_ASSUMPTIONS = (
     "Coordinates are right-handed. Triangles are counterclockwise as seen from the medium of a glass's ext_ior, and "
@@ -101,17 +102,17 @@ OBJ_ASSUMPTIONS = (
     "max_depth counts the segments of a path from the camera: 2 is light, one surface, camera.",
     "sky.exr: +y is the zenith. The pixel in row j of H and column i of W has its centre at theta = pi (j + 1/2) / H, "
     "phi = 2 pi (i + 1/2) / W, and is seen in direction (sin(phi) sin(theta), cos(theta), -cos(phi) sin(theta)).",
-    "lamps have no size. The intensity of a point is per steradian: a surface that faces it has intensity / distance^2 "
-    "of irradiance. That of a spot is whole up to beam_degrees from its direction, 0 from cutoff_degrees on, and "
-    "linear in the angle between. The irradiance of a directional lamp is that of a surface at right angles to its "
-    "light. Light travels along direction.",
-    "Your program may scale radiance by the square of the index at a boundary, or not: the images differ only where a "
+    "lamps have no size. The intensity of a point is per steradian: the irradiance of a surface that faces it is "
+    "intensity / distance^2. A spot has its full intensity up to beam_degrees from its direction, none beyond "
+    "cutoff_degrees, and is linear in the angle between. The irradiance of a directional lamp is measured on a surface "
+    "perpendicular to its light. Light travels along direction.",
+    "Your program may or may not scale radiance by the square of the index at a boundary: the images differ only if a "
     "camera, a light or a diffuse surface is inside glass.",
 )
 
 
 def obj_files(plain: PlainScene) -> Files:
-    """The files of the export, by name."""
+    """Return the export's files by name."""
     names, lines, first = material_names(plain), ["mtllib scene.mtl\n"], 1  # OBJ counts vertices through all objects
     for mesh in plain.meshes:
         lines.append(f"o {mesh.name}\nusemtl {names[mesh.material]}\n")

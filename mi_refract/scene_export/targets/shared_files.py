@@ -1,4 +1,4 @@
-"""Files that several targets write: meshes, maps of the sky, `scene.json`, README.txt."""
+"""Files that several targets share: meshes, maps of the sky, `scene.json`, README.txt."""
 
 from __future__ import annotations
 
@@ -30,28 +30,29 @@ from ..tessellation import basis, is_closed
 
 Files = dict[str, bytes]  # contents by name
 Array = NDArray[np.float64]
-# Of a map of the sky by longitude and latitude: the direction that a renderer shows at the left edge and half way down,
-# that a quarter of the width to the right, and that in the top row.
+# Axes of a map of the sky by longitude and latitude: the directions at the left edge at half height, a quarter of the
+# width to the right of it, and in the top row.
 Axes = tuple[tuple[int, int, int], tuple[int, int, int], tuple[int, int, int]]
 OWN_AXES: Axes = (0, 0, -1), (1, 0, 0), (0, 1, 0)  # Mitsuba's
-# Other renderers place texels at their centres, Mitsuba places its first and last row at the poles. Between its texels
-# a map is linear. A finer map reproduces that, except in those of its cells that a texel of the first map divides.
+# Factor of the resolution of a resampled map. Other renderers place texels at their centres; Mitsuba places its first
+# and last row at the poles. A map is linear between its texels. A finer map reproduces this, except in cells that
+# contain a texel of the original map.
 FINER = 16
 LIGHT_INSIDE = (
-    "Radiance is not scaled by the square of the index inside glass. The image is the same as long as camera, lights "
-    "and diffuse surfaces are all in the outermost medium."
+    "Radiance is not scaled by the square of the index inside glass. The image is the same if camera, lights and "
+    "diffuse surfaces are all in the outermost medium."
 )
 
 
 def numbers(values: Iterable[float], separator: str = " ") -> str:
-    """The numbers as the shortest decimals that read back exactly in float64."""
+    """Return the numbers as the shortest decimals that read back exactly in float64."""
     return separator.join(repr(float(value)) for value in values)
 
 
 def readme(
     plain: PlainScene, target: str, commands: str, assumptions: Sequence[str], shading: str = "flat-shaded "
 ) -> bytes:
-    """README.txt: the commands that render the scene, and the differences between the models."""
+    """Return README.txt: the commands that render the scene, and the differences between the models."""
     camera = plain.camera
     lines = [
         f"{plain.name}: {len(plain.meshes)} {shading}meshes of {sum(len(m.faces) for m in plain.meshes)} triangles,",
@@ -72,12 +73,12 @@ def readme(
 
 
 def material_names(plain: PlainScene) -> dict[Material, str]:
-    """A name for each material."""
+    """Return a name for each material."""
     return {material: f"material{number}" for number, material in enumerate(plain.materials)}
 
 
 def turned(mesh: Mesh) -> Mesh:
-    """The same boundary, of glass, seen from its other side: with normals the other way and the media exchanged."""
+    """Return the same glass boundary with opposite normals and exchanged media."""
     assert isinstance(mesh.material, Glass)
     material = dataclasses.replace(mesh.material, int_ior=mesh.material.ext_ior, ext_ior=mesh.material.int_ior)
     if isinstance(material, VolumeGlass):
@@ -87,23 +88,23 @@ def turned(mesh: Mesh) -> Mesh:
 
 
 def outward(plain: PlainScene) -> PlainScene:
-    """The same scene, with all closed glass turned so that its normals point outward: `int_ior` is inside."""
+    """Return the same scene, with all closed glass turned so that normals point outward and `int_ior` is inside."""
 
     def inside_out(mesh: Mesh) -> bool:
-        closed = isinstance(mesh.material, Glass) and is_closed(mesh.faces)
-        return closed and float(np.linalg.det(mesh.triangles()).sum()) < 0
+        closed_glass = isinstance(mesh.material, Glass) and is_closed(mesh.faces)
+        return closed_glass and float(np.linalg.det(mesh.triangles()).sum()) < 0
 
     return dataclasses.replace(plain, meshes=tuple(turned(mesh) if inside_out(mesh) else mesh for mesh in plain.meshes))
 
 
 def outermost_index(plain: PlainScene) -> float:
-    """The index of the medium around all glass, all of it `outward`; 1 without glass."""
+    """Return the index of the medium around all glass, after `outward`; 1 without glass."""
     glasses = [(mesh.vertices[:, 0].max(), mesh.material) for mesh in plain.meshes if isinstance(mesh.material, Glass)]
     return max(glasses, key=lambda glass: glass[0])[1].ext_ior if glasses else 1.0
 
 
 def ply_files(plain: PlainScene) -> Files:
-    """A PLY file per mesh: binary, little-endian, float32, without normals."""
+    """Return a PLY file per mesh: binary, little-endian, float32, without normals."""
     files = {}
     for mesh in plain.meshes:
         header = (
@@ -118,7 +119,7 @@ def ply_files(plain: PlainScene) -> Files:
 
 
 def scene_json(plain: PlainScene, where: Mapping[str, Mapping[str, str]], sky_file: str = "sky.exr") -> bytes:
-    """The text of `scene.json`. `where`: by mesh, where its triangles are; `sky_file`: the file of a map."""
+    """Return `scene.json`. `where`: the location of each mesh's triangles, by mesh; `sky_file`: the file of a map."""
     names = material_names(plain)
     document = {
         "name": plain.name,
@@ -137,13 +138,16 @@ def scene_json(plain: PlainScene, where: Mapping[str, Mapping[str, str]], sky_fi
 
 
 def json_and_ply(plain: PlainScene, sky_file: str = "sky.exr") -> Files:
-    """`scene.json`, and the PLY files that it names."""
+    """Return `scene.json` and the PLY files that it names."""
     where = {mesh.name: {"file": f"{mesh.name}.ply"} for mesh in plain.meshes}
     return {"scene.json": scene_json(plain, where, sky_file)} | ply_files(plain)
 
 
 def frame(lamp: Lamp) -> Array:
-    """(4, 4): orthonormal axes, the third where the lamp shines, if anywhere, and its place, if it has one."""
+    """Return a lamp's frame (4, 4): the third axis is the direction of its light, the translation is its position.
+
+    A lamp without a direction has the identity's axes; one without a position has no translation.
+    """
     matrix = np.eye(4)
     if isinstance(lamp, SpotLamp | DirectionalLamp):
         matrix[:3, :3] = basis(np.array(lamp.direction))
@@ -156,7 +160,7 @@ def frame(lamp: Lamp) -> Array:
 
 
 def exr(pixels: NDArray[np.floating]) -> bytes:
-    """An OpenEXR file of pixels (H, W, 3)."""
+    """Return the bytes of an OpenEXR file of pixels (H, W, 3)."""
     with temporary_folder() as folder:
         path = folder / "map.exr"
         write_exr(path, pixels, metadata=NO_DATE)
@@ -164,24 +168,24 @@ def exr(pixels: NDArray[np.floating]) -> bytes:
 
 
 def sky_exr(plain: PlainScene, axes: Axes) -> Files:
-    """`sky.exr` where the sky is a map, resampled for a renderer with these axes."""
+    """Return `sky.exr`, resampled for a renderer with these axes; no file unless the sky is a map."""
     if not isinstance(plain.sky, Environment):
         return {}
     return {"sky.exr": exr(longitude_latitude(plain.sky, axes))}
 
 
 def longitude_latitude(environment: Environment, axes: Axes) -> NDArray[np.float32]:
-    """(H, W, 3): the map for a renderer with these axes, and all its pixels at their centres."""
+    """Return the map (H, W, 3) for a renderer with these axes, whose pixels are at their centres."""
     height = FINER * (environment.pixels.shape[0] - 1)
     width = FINER * environment.pixels.shape[1]
     v, u = ((np.arange(count) + 0.5) / count for count in (height, width))
     theta, phi = np.pi * v[:, None], 2 * np.pi * u
-    along = np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta) + 0 * phi
-    return radiance(environment, np.stack(along, axis=-1) @ np.array(axes, float)).astype(np.float32)
+    directions = np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta) + 0 * phi
+    return radiance(environment, np.stack(directions, axis=-1) @ np.array(axes, float)).astype(np.float32)
 
 
 def radiance(environment: Environment, directions: Array) -> Array:
-    """(…, 3): the radiance in these directions of the scene (…, 3), of any length but 0."""
+    """Return the radiance (…, 3) in these directions of the scene (…, 3), of any length but 0."""
     x, y, z = np.moveaxis(directions @ environment.rotation, -1, 0)
     pixels = environment.pixels.astype(float)
     height, width = pixels.shape[:2]

@@ -1,7 +1,7 @@
-"""Other renderers and libraries that really run, each in a process and an environment of its own.
+"""Other renderers and libraries, each run in its own process and environment.
 
-In: rays as CSV, or a plain scene. Out: directions, or images. What runs there is a script of scripts/ that imports
-nothing of this project; a script that cannot run on this machine says why in a line on stderr and exits with 77.
+In: rays as CSV, or a plain scene. Out: directions, or images. Each is run by a script of scripts/, which imports
+nothing of this project. A script that cannot run on this machine prints the reason on stderr and exits with 77.
 """
 
 from .system import SYSTEMS, System

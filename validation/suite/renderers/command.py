@@ -1,6 +1,6 @@
 """`python -m validation renderers [--list | --install NAME,… | --page OUT.html]`: the other renderers.
 
-Exit code 0; 1 where an installation failed, with a line on stderr for each; 2 for misuse.
+Exit code: 0; 1 if an installation fails, with one line on stderr for each; 2 for misuse.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ app = command_line.application()
 
 
 def main(arguments: list[str]) -> int:
-    """Run the command line; the exit code."""
+    """Run the command and return its exit code."""
     return command_line.exit_code(app, NAME, arguments)
 
 
@@ -59,11 +59,11 @@ def _write(page: Path | None, data: Path | None, out: Path) -> int:
         for path, suffixes in ((page, (".html", ".htm")), (data, (".json",))):
             if path:
                 writable(path, suffixes)
-        found = matrix.read(out)
+        results = matrix.read(out)
         if page:
-            matrix.write_html(page, found)
+            matrix.write_html(page, results)
         if data:
-            matrix.write_json(data, found)
+            matrix.write_json(data, results)
     except (ValueError, OSError) as error:
         return command_line.misuse(NAME, str(error))
     return 0
@@ -82,8 +82,8 @@ def _install(system: System) -> int:
 def _line(system: System) -> str:
     draws = any(renderer.system == system.name for renderer in IMAGE_RENDERERS.values())
     able = {"rays": system.calls, "images": draws, "lenses": system.lens}
-    does = " and ".join(word for word, can in able.items() if can) or "exports"
+    inputs = " and ".join(word for word, can in able.items() if can) or "exports"
     state = "absent" if environments.absent(system) else "installed"
     size = system.install.megabytes if system.install else 0
     name = f"{system.name:{max(map(len, SYSTEMS))}}"
-    return f"{name} {state:9} {does:16} {size:5} MB  {system.source}  [{system.licence}]"
+    return f"{name} {state:9} {inputs:16} {size:5} MB  {system.source}  [{system.licence}]"

@@ -1,4 +1,4 @@
-"""The environments of the other renderers: where they are, how they are made, and how a program in one is run."""
+"""The environments of the other renderers: their folders, their installation, and running programs in them."""
 
 from __future__ import annotations
 
@@ -20,36 +20,36 @@ from mi_refract.report.row import Reason, Row
 from .system import LOCKS, SCRIPTS, System
 
 COMMAND = "python -m validation renderers --install"
-CANNOT = 77  # the exit code of a script that cannot run on this machine
-TIMEOUT = 600.0  # seconds; a busy machine is slow, a program that hangs is slower
-_INSTALLING, _ASKING = 3600.0, 60.0
+CANNOT = 77  # exit code of a script that cannot run on this machine
+TIMEOUT = 600.0  # seconds: enough on a busy machine; a program that takes longer hangs
+_INSTALL_TIMEOUT, _QUERY_TIMEOUT = 3600.0, 60.0  # seconds
 _FOREIGN = ("PYTHONPATH", "PYTHONHOME", "PYTHONSTARTUP", "VIRTUAL_ENV")
 T = TypeVar("T")
 
 
 class Unable(Exception):
-    """A program that cannot run on this machine; the text says why."""
+    """A program cannot run on this machine; the message is the reason."""
 
 
 class Broken(Exception):
-    """A program that should run, and crashed or hung; the text says how."""
+    """A program that should run crashed or hung; the message says how."""
 
 
-# Where they are --------------------------------------------------------------------------------------------------
+# Folders and versions --------------------------------------------------------------------------------------------
 
 
 def folder(system: System) -> Path:
-    """`$XDG_CACHE_HOME/mi_refract/renderers/<name>`, there or not."""
+    """Return `$XDG_CACHE_HOME/mi_refract/renderers/<name>`, which need not exist."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mi_refract" / "renderers" / system.name
 
 
 def absent(system: System) -> str:
-    """ "" where the system is installed in its pinned version; otherwise the command that installs it."""
+    """Return the command that installs the system; "" if it is installed in its pinned version."""
     install, present = system.install, True
     try:
         if install and install.apt:
-            ended = process_group.run([install.program, "--version"], b"", _ASKING, keep_stderr=True)
-            present = install.version in (ended.out + ended.said).decode(errors="replace")
+            ended = process_group.run([install.program, "--version"], b"", _QUERY_TIMEOUT, keep_stderr=True)
+            present = install.version in (ended.out + ended.err).decode(errors="replace")
         elif install:
             present = json.loads((folder(system) / "installed.json").read_text()) == _mark(system)
     except (OSError, ValueError, TimeoutError, TooMuchOutputError):
@@ -58,7 +58,7 @@ def absent(system: System) -> str:
 
 
 def why_not(system: System, profile: str) -> str:
-    """Why the system is not run in this profile: it is absent, or too large; "" where it is run."""
+    """Return why the system is not run in this profile (it is absent, or too large); "" if it is run."""
     if reason := absent(system):
         return reason
     if system.install and not system.install.small and profile != "full":
@@ -67,7 +67,7 @@ def why_not(system: System, profile: str) -> str:
 
 
 def _mark(system: System) -> list[str]:
-    """What is installed: another version of the table or of the lock is another mark."""
+    """Return what an installation is made from: packages and the lock's hash. Another version gives another mark."""
     assert system.install
     if system.install.npm:
         words, lock = f"Npm(packages={system.install.npm!r})", locked(system) / "package-lock.json"
@@ -77,109 +77,109 @@ def _mark(system: System) -> list[str]:
 
 
 def locked(system: System) -> Path:
-    """The packages with their hashes, of all that may be installed: a file for pip, a folder for npm."""
+    """Return the lock, with the hashes of all packages that may be installed: a file for pip, a folder for npm."""
     return LOCKS / (system.name if system.install and system.install.npm else f"{system.name}.txt")
 
 
 def python(system: System) -> str:
-    """The interpreter that the system's scripts are for."""
+    """Return the Python interpreter that runs the system's scripts."""
     return str(folder(system) / "bin" / "python") if system.install and system.install.pip else sys.executable
 
 
-# Making them -----------------------------------------------------------------------------------------------------
+# Installation ----------------------------------------------------------------------------------------------------
 
 
 def install(system: System) -> None:
-    """Make the environment anew, unless it is there. OSError, one line, where that fails."""
+    """Install the system unless its pinned version is installed. OSError, one line, if that fails."""
     if not absent(system):
         return
     needs, where = system.install, folder(system)
     assert needs
 
-    def do(*command: str) -> None:
+    def execute(*command: str) -> None:
         try:
-            run(command, timeout=_INSTALLING)
+            run(command, timeout=_INSTALL_TIMEOUT)
         except (Broken, Unable) as error:
             raise OSError(f"{system.name}: {' '.join(command)}: {error}") from None
 
     if needs.apt:
         root = [] if os.geteuid() == 0 else ["sudo", "-n"]
         try:
-            do(*root, "apt-get", "install", "-y", "-qq", "--no-install-recommends", *needs.apt)
+            execute(*root, "apt-get", "install", "-y", "-qq", "--no-install-recommends", *needs.apt)
         except OSError as error:
             try:
                 names = [package.partition("=")[0] for package in needs.apt]
-                listed = run(["apt-cache", "madison", *names], timeout=_ASKING).splitlines()
+                lines = run(["apt-cache", "madison", *names], timeout=_QUERY_TIMEOUT).splitlines()
             except (Broken, Unable):
-                listed = []
-            versions = sorted({" ".join("".join(line.split("|")[:2]).split()) for line in listed})
+                lines = []
+            versions = sorted({" ".join("".join(line.split("|")[:2]).split()) for line in lines})
             raise OSError(f"{error}; this distribution has {', '.join(versions) or 'none'}") from None
         return
     if not locked(system).exists():
-        raise OSError(f"{system.name}: its packages have no lock; expected {locked(system)}")
+        raise OSError(f"{system.name}: no lock of its packages; expected {locked(system)}")
     shutil.rmtree(where, ignore_errors=True)
     where.mkdir(parents=True)
     if needs.npm:
         for name in ("package.json", "package-lock.json"):
             shutil.copy(locked(system) / name, where)
-        do("npm", "ci", "--ignore-scripts", "--silent", "--no-audit", "--no-fund", "--prefix", str(where))
+        execute("npm", "ci", "--ignore-scripts", "--silent", "--no-audit", "--no-fund", "--prefix", str(where))
     else:
-        # This environment's pip for the other one: to make one there costs more than most of what it would install.
         own = f"{sys.version_info[0]}.{sys.version_info[1]}"
         interpreter = sys.executable if needs.python in ("", own) else shutil.which(f"python{needs.python}")
         if interpreter is None:
             raise OSError(f"{system.name}: needs Python {needs.python}; expected a python{needs.python} in PATH")
-        do(interpreter, "-m", "venv", "--without-pip", str(where))
+        # The pip of this environment installs into the other: a pip there would cost more than most of the packages.
+        execute(interpreter, "-m", "venv", "--without-pip", str(where))
         pip = [sys.executable, "-m", "pip", "--python", python(system), "install"]
         options = ["--quiet", "--disable-pip-version-check", "--no-input", "--no-compile", "--no-deps"]
-        # To build a package would run, and fetch, code without a hash.
+        # Wheels only: building a package would fetch and run code without a hash.
         safe = ["--require-hashes", "--only-binary", ":all:"]
-        do(*pip, *options, *safe, "--requirement", str(locked(system)))
+        execute(*pip, *options, *safe, "--requirement", str(locked(system)))
     write_atomically(where / "installed.json", json.dumps(_mark(system)))
 
 
-# Running in them ---------------------------------------------------------------------------------------------------
+# Running programs ----------------------------------------------------------------------------------------------------
 
 
 def script(system: System, name: str, *arguments: str) -> list[str]:
-    """The command that runs a script of scripts/ in the system's environment."""
+    """Return the command that runs a script of scripts/ in the system's environment."""
     return [python(system), str(SCRIPTS / name), *arguments]
 
 
 def ask(
     system: System,
     command: tuple[str, ...],
-    given: str = "",
+    stdin: str = "",
     timeout: float | None = None,
     values: Mapping[str, object] | None = None,
 ) -> str:
-    """What a command of the system's file, filled in with `values`, answers to `given` on its stdin.
+    """Run a command of the system's file, filled in with `values`, and return its output.
 
-    Errors as of `run`. Unable also where its program is none of this machine.
+    Errors as of `run`. Unable also if the program is not on this machine.
     """
     words = renderer_file.filled(command, python=python(system), environment=folder(system), **(values or {}))
     if os.sep not in words[0] and not shutil.which(words[0]):
         raise Unable(f"no {words[0]} in PATH")
-    return run(words, given, timeout, system.folder)
+    return run(words, stdin, timeout, system.folder)
 
 
-def run(command: Sequence[str], given: str = "", timeout: float | None = None, where: Path | None = None) -> str:
-    """The output of a program with `given` on its stdin; all its processes have ended when this returns.
+def run(command: Sequence[str], stdin: str = "", timeout: float | None = None, where: Path | None = None) -> str:
+    """Run a program in the folder `where` and return its output; all its processes have ended then.
 
-    Unable: it exits with CANNOT, for the reason that is its last line on stderr. Broken: it is not there, exits with
-    another code than 0, is killed, prints no text, or runs for longer than `timeout` seconds (TIMEOUT by default).
+    Unable: it exits with CANNOT; the reason is its last line on stderr. Broken: it does not exist, exits with a code
+    other than 0, is killed, prints bytes that are not text, or runs longer than `timeout` seconds (default TIMEOUT).
     """
     own = {name: value for name, value in os.environ.items() if name not in _FOREIGN}
     own |= {"PYTHONNOUSERSITE": "1", "PYTHONUTF8": "1"}
     limit = TIMEOUT if timeout is None else timeout
     try:
-        ended = process_group.run(command, given.encode(), limit, keep_stderr=True, cwd=where, env=own)
+        ended = process_group.run(command, stdin.encode(), limit, keep_stderr=True, cwd=where, env=own)
     except (TimeoutError, TooMuchOutputError) as error:
         raise Broken(str(error)) from None
     except OSError as error:
         raise Broken(f"{command[0]}: {error.strerror}") from None
-    lines = [line.strip() for line in ended.said.decode(errors="replace").splitlines() if line.strip()]
-    last = lines[-1] if lines else "no word on stderr"  # which names the error
+    lines = [line.strip() for line in ended.err.decode(errors="replace").splitlines() if line.strip()]
+    last = lines[-1] if lines else "nothing on stderr"  # the last line names the error
     if ended.status == CANNOT:
         raise Unable(last)
     if ended.status:
@@ -193,10 +193,10 @@ def run(command: Sequence[str], given: str = "", timeout: float | None = None, w
 def attempt(
     row: Callable[..., Row], reason: str, lost: tuple[str, float], answer: Callable[[], T]
 ) -> tuple[T | None, list[Row]]:
-    """What `answer` returns, and no row; or None, and the one row that says why the system gives no answer.
+    """Return what `answer` returns, and no rows; or None, and one row with the reason why there is no answer.
 
-    That row fails, with the metric and the number `lost`, where the program is broken or what it says is none
-    (ValueError, OSError); it is not run for a `reason` that is not "" (see `why_not`), or where it cannot run here.
+    That row is not run if `reason` is not "" (see `why_not`) or if the program cannot run on this machine. It fails,
+    with the metric and the number `lost`, if the program is broken or its answer is invalid (ValueError, OSError).
     """
     if reason:
         return None, [row(reason=reason)]

@@ -1,4 +1,4 @@
-"""Renderers that render a plain scene: several independent images of it, each in a process of its own.
+"""The renderers of images: each renders several independent images of a plain scene, in a process of its own.
 
 An image is height × width × 3, linear, row 0 at the top.
 """
@@ -26,8 +26,8 @@ from validation.run.render_methods import Camera
 from . import environments
 from .system import SCRIPTS, SYSTEMS, System
 
-HOURS = 4 * 3600.0  # after which a renderer hangs
-PASS = 2048  # samples a pixel
+HOURS = 4 * 3600.0  # seconds: a renderer that takes longer hangs
+PASS = 2048  # samples per pixel
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -35,8 +35,8 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 class ImageRenderer:
     """`draw(plain, folder, spp, seeds)` writes the scene into an empty folder and renders one image per seed.
 
-    `spp`: by scene of the study, the samples a pixel and image that make a difference of 1 % visible where four
-    images are judged; `assumed`: in what the models differ.
+    `spp`: scene of the study → samples per pixel and image, enough to detect a difference of 1 % with four images.
+    `assumed`: how the renderer's model differs.
     """
 
     system: str
@@ -46,7 +46,7 @@ class ImageRenderer:
 
 
 def unedited(scene: Path) -> None:
-    """The files as they were exported."""
+    """Leave the files as they were exported."""
 
 
 def by_script(
@@ -59,7 +59,7 @@ def by_script(
     edit: Callable[[Path], None] = unedited,
     more: Sequence[str] = (),
 ) -> list[Image]:
-    """Images by the script that is exported with the scene, after `edit(folder)` of its files, with `more` options."""
+    """Render by the script that is exported with the scene, after `edit(folder)`, with `more` options."""
     targets.write(plain, target, folder / "scene")
     edit(folder / "scene")
     program = [environments.python(SYSTEMS[target]), "render.py", "--spp", str(spp), "--out", str(folder)]
@@ -68,20 +68,20 @@ def by_script(
 
 
 def by_command(system: System, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-    """Images by the command of the system's own file."""
+    """Render by the command of the system's `mi-refract-renderer.toml`."""
     if system.images is None:
-        raise ValueError(f"{system.name}: no [images]; expected a system that renders by a command")
+        raise ValueError(f"{system.name}: no [images]; expected a system with a command for images")
     targets.write(plain, system.images.export, folder / "scene")
     for seed in seeds:
-        at = {"scene": folder / "scene", "image": folder / f"seed{seed}.exr", "spp": spp, "seed": seed}
-        environments.ask(system, system.images.command, timeout=HOURS, values=at)
+        values = {"scene": folder / "scene", "image": folder / f"seed{seed}.exr", "spp": spp, "seed": seed}
+        environments.ask(system, system.images.command, timeout=HOURS, values=values)
     return [_rgb(image_file.read(folder / f"seed{seed}.exr")) for seed in seeds]
 
 
 def radiance_images(
     plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int], edit: Callable[[Path], None] = unedited
 ) -> list[Image]:
-    """Images by rtrace with the options of README.txt, after `edit(folder)` of the exported files."""
+    """Render by Radiance's rtrace with the options of README.txt, after `edit(folder)` of the exported files."""
     targets.write(plain, "radiance", folder / "scene")
     edit(folder / "scene")
     sizes = map(str, (plain.camera.width, plain.camera.height, spp, *seeds))
@@ -93,10 +93,10 @@ def radiance_images(
 def povray_images(
     plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int], edit: Callable[[Path], None] = unedited
 ) -> list[Image]:
-    """The same image for every seed, for it has no noise: the means over grids of samples, √spp on a side of a pixel.
+    """Render by POV-Ray: means over a grid of samples, √spp per side of a pixel, the same image for every seed.
 
-    Random grids would not do: they move all pixels together, and a tile knows nothing of its noise then. The exported
-    files are edited by `edit(folder)`.
+    The image has no noise. POV-Ray's random grids would move all pixels together, so a test of tiles could not estimate
+    their noise. `edit(folder)` edits the exported files.
     """
     side, camera = math.isqrt(spp), plain.camera
     width, height = side * camera.width, side * camera.height
@@ -112,7 +112,7 @@ def povray_images(
 
 
 def _three(mode: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-    """Path traced with multiple importance sampling of the sky ("mis"), as it comes, or "none"; or "raster"."""
+    """Render by three.js: path traced with ("mis", its default) or without ("none") MIS of the sky, or "raster"."""
     chromium, node = next(filter(None, map(shutil.which, BROWSERS)), None), shutil.which("node")
     if not (chromium and node):
         raise environments.Unable("no node or no Chromium in PATH")
@@ -125,24 +125,23 @@ def _three(mode: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence
 
 
 def _cycles_gltf(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-    """Images by Blender's importer of glTF, with the settings of the export to Cycles."""
+    """Render by Cycles the glTF export as Blender imports it, with the settings of the export to Cycles."""
     targets.write(plain, "cycles", folder / "cycles")
     _write_gltf(plain, folder / "scene")
-    words = map(
-        str, (folder / "scene", folder / "cycles" / "render.py", "--spp", spp, "--out", folder, "--seeds", *seeds)
-    )
-    environments.run(environments.script(SYSTEMS["cycles"], "gltf_by_cycles.py", *words), timeout=HOURS)
+    words = (folder / "scene", folder / "cycles" / "render.py", "--spp", spp, "--out", folder, "--seeds", *seeds)
+    command = environments.script(SYSTEMS["cycles"], "gltf_by_cycles.py", *map(str, words))
+    environments.run(command, timeout=HOURS)
     return [_rgb(image_file.read(folder / f"seed{seed}.exr")) for seed in seeds]
 
 
 def _write_gltf(plain: PlainScene, folder: Path) -> None:
-    """Write glTF with facets for normals, as the other side has them."""
+    """Export to glTF without vertex normals: Mitsuba's side has flat facets."""
     meshes = tuple(dataclasses.replace(mesh, normals=None) for mesh in plain.meshes)
     targets.write(dataclasses.replace(plain, meshes=meshes), "gltf", folder)
 
 
 def _mitsuba(integrator: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-    """Images by another integrator of Mitsuba, with `dielectric`, in this process and the present variant."""
+    """Render by another integrator of Mitsuba, with `dielectric`, in this process and the current variant."""
     targets.write(plain, "mitsuba", folder / "scene")
     parameters = {"bsdf": "dielectric", "integrator": integrator}
     camera = Camera(scene_files.load_scene(folder / "scene" / "scene.xml", parameters))
@@ -150,7 +149,7 @@ def _mitsuba(integrator: str, plain: PlainScene, folder: Path, spp: int, seeds: 
 
 
 def mean(camera: Camera, spp: int, seed: int) -> np.ndarray:
-    """An image of so many samples, at most PASS of them at a time: more would need gigabytes."""
+    """Return an image of `spp` samples, rendered in passes of at most PASS: more would need gigabytes."""
     passes = -(-spp // PASS)
     images = [camera(-(-spp // passes), 1000 * seed + i)[0][..., :3] for i in range(passes)]
     return np.asarray(np.mean(images, axis=0).astype(np.float32))
@@ -166,28 +165,28 @@ def _rgb(image: Image) -> Image:
 
 
 THREE = (
-    "It reads the export to glTF, by three's GLTFLoader, with facets for normals, as the other side has them.",
-    "A glass has one index, the quotient of the two; radiance is not scaled by the square of the index.",
+    "It reads the glTF export by three's GLTFLoader, with flat facets, as on Mitsuba's side.",
+    "A glass has one index, the ratio of the two; radiance is not scaled by the square of the index.",
     "The tent filter of its pixels is replaced by a box.",
-    "Its Russian roulette is off, and its random numbers are those of a seed (PCG): its strata are the same in all "
-    "pixels. MIS is its multiple importance sampling of the sky, on by default.",
-    "A diffuse surface is its Disney lobe at roughness 0 and index 1, which is Lambert's; a lamp is a front that emits "
-    "and a black back.",
+    "Its Russian roulette is off. Its random numbers come from a seed (PCG) instead of its strata, which are the same "
+    "in all pixels. MIS is its multiple importance sampling of the sky, on by default.",
+    "A diffuse surface is its Disney lobe at roughness 0 and index 1, which is Lambert's; a lamp is a surface with an "
+    "emitting front and a black back.",
     "bounces and transmissiveBounces are Mitsuba's max_depth.",
 )
 RASTER = (
     THREE[0],
-    "It is a rasteriser: no light between surfaces. Each pixel is the mean of a grid of samples, without noise.",
+    "It is a rasteriser: surfaces do not light each other. Each pixel is the mean of a grid of samples, without noise.",
 )
 CYCLES_GLTF = (
-    "It reads the export to glTF, by Blender's importer, with facets for normals, as the other side has them.",
+    "It reads the glTF export by Blender's importer, with flat facets, as on Mitsuba's side.",
     *scene_json.CYCLES_ASSUMPTIONS,
 )
 MITSUBA = ("Mitsuba's `dielectric` in the same variant and scene file; no Russian roulette.",)
 PTRACER = (
     *MITSUBA,
-    "Paths begin at lamps, and their last vertex is joined with the camera: what is seen in or through smooth glass "
-    "stays black. A caustic on a diffuse surface that is seen directly is there.",
+    "Paths start at lamps, and their last vertex is joined with the camera: whatever is seen in or through smooth "
+    "glass stays black. Caustics on diffuse surfaces that are seen directly are rendered.",
 )
 POVRAY = ("Each pixel is the mean of a grid of 8 × 8 samples, without noise.", *povray.ASSUMPTIONS)
 
@@ -195,7 +194,7 @@ POVRAY = ("Each pixel is the mean of a grid of 8 × 8 samples, without noise.", 
 def _renderer(
     system: str, draw: Callable[..., list[Image]], assumed: Sequence[str], *spp: int, **more: int
 ) -> ImageRenderer:
-    """`spp`: of the scenes sphere, prism and environment; `more`: of others."""
+    """Return a renderer. `spp`: for the scenes sphere, prism and environment; `more`: for other scenes."""
     return ImageRenderer(system, draw, dict(zip(("sphere", "prism", "environment"), spp, strict=False)) | more, assumed)
 
 
@@ -209,7 +208,7 @@ IMAGE_RENDERERS: dict[str, ImageRenderer] = {
     "Radiance": _renderer("radiance", radiance_images, radiance.ASSUMPTIONS, 960, 448, 24),
     "Cycles": _renderer("cycles", _cycles, scene_json.CYCLES_ASSUMPTIONS, 512, 128, 32),
     "Cycles, glTF": _renderer("cycles", _cycles_gltf, CYCLES_GLTF, 512, 128, 32),
-    # furnace: a scene without lamps, which raysect meets by chance
+    # Of these, furnace has no lamps, which raysect hits by chance only.
     "raysect": _renderer("raysect", _raysect, scene_json.RAYSECT_ASSUMPTIONS, 2048, 768, 256, furnace=128),
     "LuxCore": _renderer("luxcore", _luxcore, luxcore.ASSUMPTIONS, 1280, 1024, 576),
     "POV-Ray": _renderer("povray", povray_images, POVRAY, 64, 64, 64),

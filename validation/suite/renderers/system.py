@@ -1,9 +1,9 @@
-"""The table of other renderers and libraries: one folder of systems/ for each, with its `mi-refract-renderer.toml`.
+"""The table of other renderers and libraries: each has a folder in systems/ with a `mi-refract-renderer.toml`.
 
-The file says how to install the system, how its functions are run, and how it behaved; its keys are those of
-`mi_refract.ray_sets.renderer_file`. A script that it names is in scripts/, a lock of its packages in locks/, and what
-renders images, where that takes more than a command, in `image_renderers`. Programs under the GPL are run, never
-imported nor redistributed.
+The file says how to install the system, how to run its functions, and which errors were recorded; its keys are those of
+`mi_refract.ray_sets.renderer_file`. Its scripts are in scripts/, the lock of its packages in locks/. If rendering
+images takes more than a command, the code is in `image_renderers`. Programs under the GPL are run, never imported or
+redistributed.
 """
 
 from __future__ import annotations
@@ -23,35 +23,35 @@ SCRIPTS, LOCKS, SYSTEMS_FOLDER = (Path(__file__).parent / name for name in ("scr
 
 
 class Install(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [install]: one of pip, npm and apt."""
+    """The table [install], with one of pip, npm and apt."""
 
     megabytes: Annotated[int, Meta(ge=1, le=100_000)]  # on disk
-    pip: tuple[Text, ...] = ()  # packages of PyPI, in an environment of their own; what they need is in the lock
-    python: str = ""  # the one version of Python that there are wheels for, as "3.11"
-    npm: tuple[Text, ...] = ()  # packages of npm, in a folder of their own with `node_modules`
+    pip: tuple[Text, ...] = ()  # packages of PyPI, for an environment of their own; the lock has their dependencies
+    python: str = ""  # the only Python version with wheels, such as "3.11"
+    npm: tuple[Text, ...] = ()  # packages of npm, for a folder of their own with `node_modules`
     apt: tuple[Text, ...] = ()  # packages of the distribution, as PACKAGE=VERSION, with * for the distribution's part
-    program: str = ""  # of apt: the program, found wherever it is in PATH
-    version: str = ""  # of apt: what the program says of itself
-    small: bool = False  # fit for every run
+    program: str = ""  # for apt: the program's name in PATH
+    version: str = ""  # for apt: the version that the program prints
+    small: bool = False  # runs in every profile, not only in `full`
 
     def __post_init__(self) -> None:
-        """ValueError for none of them, or several."""
+        """Raise ValueError unless exactly one of pip, npm and apt is given."""
         if sum(map(bool, (self.pip, self.npm, self.apt))) != 1:
             raise ValueError("expected one of pip, npm and apt")
 
     @property
     def source(self) -> str:
-        """The command that installs it, in its pinned version."""
+        """The command that installs the pinned version."""
         tool = "pip" if self.pip else "npm" if self.npm else "apt-get"
         return f"{tool} install {' '.join(self.pip or self.npm or self.apt)}"
 
 
 @dataclass(frozen=True)
 class System:
-    """Another renderer or library. `install` is None where nothing must be installed.
+    """Another renderer or library. `install` is None if nothing must be installed.
 
-    `folder`: where its commands run. `calls`: its functions of refraction. `images`: how it renders, where a command
-    does. `lens`: the command that traces a lens with it.
+    `folder`: where its commands run. `calls`: its functions of refraction. `images`: its command for images, if any.
+    `lens`: its command that traces a lens.
     """
 
     name: str
@@ -65,19 +65,19 @@ class System:
 
     @property
     def source(self) -> str:
-        """How to install it."""
+        """The command that installs the system, or where it comes from."""
         if self.install:
             return self.install.source
         return "with this package" if SYSTEMS_FOLDER in (self.folder, self.folder.parent) else str(self.folder)
 
 
 def load(folder: Path) -> System:
-    """The system of a folder with a `mi-refract-renderer.toml`. Errors as of `renderer_file.load`."""
-    known = renderer_file.load(folder)
+    """Return the system of a folder with a `mi-refract-renderer.toml`. Errors as of `renderer_file.load`."""
+    file = renderer_file.load(folder)
     where = f"{folder / renderer_file.NAME}: install"
-    install = None if known.install is None else convert(known.install, Install, where)
+    install = None if file.install is None else convert(file.install, Install, where)
     name = folder.resolve().name
-    return System(name, known.title, known.licence, install, known.rays, known.lens, known.images, folder)
+    return System(name, file.title, file.licence, install, file.rays, file.lens, file.images, folder)
 
 
 SYSTEMS: dict[str, System] = {
@@ -86,7 +86,7 @@ SYSTEMS: dict[str, System] = {
 
 
 def join(folder: Path) -> System:
-    """Make the renderer of a folder the first of the table. ValueError where one has its name, or as of `load`."""
+    """Put the renderer of a folder in front of the table. ValueError if its name is taken, or as of `load`."""
     system = load(folder)
     if system.name in SYSTEMS:
         raise ValueError(f"{folder}: {system.name!r} is already the name of a renderer; rename the folder")

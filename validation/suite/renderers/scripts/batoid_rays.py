@@ -1,9 +1,9 @@
-"""batoid's `Plane.refract` in double precision: each ray meets a plane of its own, turned to have the ray's normal.
+"""batoid's `Plane.refract` in double precision: each ray meets its own plane, rotated to have the ray's normal.
 
-batoid turns the ray into the frame of that plane, where the normal is (0, 0, 1), and answers in it; turning back is
-done here. Its rays have a velocity of 1/index. With `glasses` the media are the only glasses by name that it has, those
-of one telescope: `apochromats/donsoptikz1.yaml` calls the media of its lenses by Schott's names; batoid reads them as
-`SellmeierMedium` and looks up the index by each ray's wavelength.
+batoid transforms the ray to the frame of that plane, where the normal is (0, 0, 1), and answers in this frame; this
+script transforms it back. Its rays have a velocity of 1/index. With `glasses` the media are its only named glasses:
+`apochromats/donsoptikz1.yaml`, a telescope, has lenses of Schott's glasses. batoid reads them as `SellmeierMedium` and
+looks up the index by each ray's wavelength.
 """
 
 import sys
@@ -18,7 +18,7 @@ LENSES = {"SCHOTT:N-LAK10": "L1", "SCHOTT:N-BK7": "L3"}
 
 
 def refract(a, frame, n_from, n_to, left, entered, wavelength):
-    """The direction behind a plane through the origin; of NaN where batoid says that the ray failed."""
+    """Return the direction behind a plane through the origin; NaN if batoid marks the ray as failed."""
     ray = batoid.RayVector(*-a, *(a / n_from), wavelength=wavelength)
     batoid.Plane().refract(ray, left, entered, coordSys=batoid.CoordSys(rot=frame))
     return np.full(3, np.nan) if ray.failed[0] else frame @ ray.v[0] * n_to

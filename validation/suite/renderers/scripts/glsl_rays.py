@@ -1,4 +1,4 @@
-"""The driver's own `refract()` in a compute shader, through EGL, for float32 or with the argument `float64`."""
+"""The OpenGL driver's `refract()` in a compute shader, through EGL, in float32, or float64 with that argument."""
 
 import sys
 

@@ -1,6 +1,6 @@
-"""Cycles on a glTF scene as Blender's importer makes it: `python gltf_by_cycles.py FOLDER RENDER.py --spp 256 --out .`
+"""Render a glTF scene, as Blender imports it, by Cycles: `python gltf_by_cycles.py FOLDER RENDER.py --spp 256 --out .`
 
-FOLDER: a glTF export. RENDER.py: that of a Cycles export of the same scene, for its settings and depth.
+FOLDER: a glTF export. RENDER.py: the script of a Cycles export of the same scene, for its settings and depth.
 """
 
 import importlib.util
@@ -16,7 +16,7 @@ spec.loader.exec_module(cycles)
 
 
 def build(plain, _):
-    """What the importer makes of the file, and the sky beside it."""
+    """Import the glTF file, and add the sky, which is a file beside it."""
     bpy.ops.import_scene.gltf(filepath=str(folder / "scene.glb"), export_import_convert_lighting_mode="COMPAT")
     sky = {"environment": "sky.exr"} if (folder / "sky.exr").exists() else {"radiance": (0, 0, 0)}
     cycles.world(sky, folder)

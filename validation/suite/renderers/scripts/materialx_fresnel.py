@@ -1,6 +1,7 @@
 """MaterialX's `mx_fresnel_dielectric_polarized`, and phases by its `mx_fresnel_conductor_phase_polarized` with κ = 0.
 
-Of its library of GLSL, in a compute shader of float32 through EGL. The phase of the s wave is that of −r_s.
+Both are from its library of GLSL, run in a compute shader of float32 through EGL. Its phase of the s wave is that of
+−r_s.
 """
 
 import re
@@ -18,9 +19,9 @@ text = library.read_text()
 parts = ["#define mx_atan atan\nfloat mx_square(float x) { return x * x; }\nvec3 mx_square(vec3 x) { return x * x; }"]
 parts += [re.search(rf"^\w+ {name}\(.*?^\}}", text, re.DOTALL | re.MULTILINE).group() for name in (POWERS, PHASES)]
 rays = table.Rays("float32")
-given = "-dot(a, n), 1.0", "1.0 / ray[7 * i + 6]"
-call = f"""vec3 p, s; {PHASES}({given[0]}, vec3({given[1]}), vec3(0.0), p, s);
-    b = vec3({POWERS}(-dot(a, n), {given[1]}), p.x - s.x)"""
+eta = "1.0 / ray[7 * i + 6]"
+call = f"""vec3 p, s; {PHASES}(-dot(a, n), 1.0, vec3({eta}), vec3(0.0), p, s);
+    b = vec3({POWERS}(-dot(a, n), {eta}), p.x - s.x)"""
 b, renderer, _ = opengl.refract(rays, "float32", call, "\n".join(parts))
 phase = np.angle(-np.exp(1j * b[:, 2].astype(float)))
 table.write_fresnel(f"MaterialX {version('MaterialX')}, GLSL by {renderer}", s=b[:, 1], p=b[:, 0], phase=phase)

@@ -1,4 +1,4 @@
-"""MaterialX's node `refract`, as its generator writes it in GLSL, in a compute shader of float32 through EGL."""
+"""MaterialX's node `refract`, in the GLSL of its generator, in a compute shader of float32 through EGL."""
 
 import re
 from importlib.metadata import version
@@ -10,7 +10,7 @@ from MaterialX import PyMaterialXGenGlsl, PyMaterialXGenShader
 
 
 def generated():
-    """The function of the node, out of the fragment shader for a graph that is this node."""
+    """Return the node's function from the fragment shader that is generated for a graph of this node."""
     graph, folders = mx.createDocument(), mx.getDefaultDataSearchPath()
     mx.loadLibraries(mx.getDefaultDataLibraryFolders(), folders, graph)
     node = graph.addNodeInstance(graph.getNodeDef("ND_refract_vector3"), "refracted")

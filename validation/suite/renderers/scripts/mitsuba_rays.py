@@ -1,4 +1,4 @@
-"""Mitsuba's own code in float32: `mi.fresnel` with `mi.refract`, or with the argument `dielectric` that BSDF."""
+"""Mitsuba's code in float32: `mi.fresnel` with `mi.refract`; with the argument `dielectric`, this BSDF."""
 
 import sys
 
@@ -16,7 +16,7 @@ def functions(a, n, n_from, n_to):
 
 
 def dielectric(a, n, n_from, n_to):
-    """Its transmitted lobe, in the frame that Mitsuba builds around the normal."""
+    """Sample the transmitted lobe in the frame that Mitsuba builds around the normal."""
     bsdf = mi.load_dict({"type": "dielectric", "int_ior": float(n_to), "ext_ior": float(n_from)})
     si, context = mi.SurfaceInteraction3f(), mi.BSDFContext()
     si.sh_frame = mi.Frame3f(mi.Vector3f(n))

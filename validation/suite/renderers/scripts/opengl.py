@@ -1,4 +1,4 @@
-"""A function of GLSL that refracts, in a compute shader through EGL. Exits with 77 where there is no OpenGL 4.3."""
+"""Runs a refraction function of GLSL in a compute shader, through EGL. Exits with 77 without OpenGL 4.3."""
 
 import sys
 
@@ -26,16 +26,16 @@ void main() {
 
 
 def refract(rays, precision, call, functions=""):
-    """(N, 3), the driver and its version. `call`: a statement that sets b for a, n and the ratio ray[7 * i + 6].
+    """Return b (N, 3), the driver and its version.
 
-    `functions`: what it calls.
+    `call`: a GLSL statement that sets b from a, n and the ratio ray[7 * i + 6]. `functions`: GLSL that it needs.
     """
     number, vector = {"float32": ("float", "vec3"), "float64": ("double", "dvec3")}[precision]
     source = SOURCE.replace("FUNCTIONS", functions).replace("CALL", call)
     try:
         context = moderngl.create_context(standalone=True, backend="egl", require=430)
         shader = context.compute_shader(source.replace("FLOAT", number).replace("VEC3", vector))
-    except Exception as error:  # of whatever kind: libraries that are missing, a driver that is too old
+    except Exception as error:  # any kind: missing libraries, a driver that is too old
         print(f"no {precision} in OpenGL 4.3 by EGL ({error}); Debian: libegl1 libgl1-mesa-dri", file=sys.stderr)
         sys.exit(77)
     rows = context.buffer(np.column_stack([rays.a, rays.n, rays.k]).astype(precision).tobytes())

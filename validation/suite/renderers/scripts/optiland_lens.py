@@ -1,6 +1,6 @@
 """optiland's sequential trace of a centred lens, with given indices and with those of its own materials.
 
-In and out as JSON: see `validation.suite.lenses`. Materials are those of optiland's copy of refractiveindex.info.
+In and out: JSON, see `validation.suite.lenses`. The materials come from optiland's copy of refractiveindex.info.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ from optiland.rays import RealRays
 
 
 def traced(lens, materials, wavelength):
-    """[z, y, dz, dy] after the last surface of a ray at each height, z from the first vertex."""
+    """Return [z, y, dz, dy] after the last surface for a ray at each height, with z from the first vertex."""
     optic = Optic()
     optic.surfaces.add(index=0, thickness=-lens["start"])
     steps = [*lens["thicknesses"], 100.0]

@@ -1,6 +1,6 @@
-"""`RealRays.refract` of optiland, a lens designer's ray tracer in double precision; with `glasses` between its own.
+"""optiland's `RealRays.refract`, in double precision. With `glasses`: between its own glasses.
 
-The catalogue is always said: `Material("F2")` alone is Hikari's F2, not Schott's.
+The catalogue is always given, since `Material("F2")` alone is Hikari's F2, not Schott's.
 """
 
 import functools

@@ -1,4 +1,4 @@
-"""A formula of this package in float32 or float64, on compiled arrays: scalar ones compute in double precision."""
+"""A formula of this package in float32 or float64, on compiled arrays; scalar arrays would use double precision."""
 
 import sys
 

@@ -1,6 +1,6 @@
-"""`glm.refract` for vectors of float32, or with the argument `float64` of float64.
+"""`glm.refract` in float32, or float64 with that argument.
 
-Components are given one by one: PyGLM 2.8.3 takes those of a list through float32, for `dvec3` too.
+Components are passed one by one, because PyGLM 2.8.3 converts those of a list to float32, for `dvec3` too.
 """
 
 import sys

@@ -1,7 +1,7 @@
 """Render `scene.rad` by Radiance's rtrace: `python radiance_images.py FOLDER OUT WIDTH HEIGHT SPP SEED…`
 
-Run by the Python that has pyradiance, with the options of README.txt, after mkpmap where that is in it. The rays of
-every pixel are random within it; one `seedN.f32` per seed: rows from the top, three float32 a pixel.
+Needs pyradiance. Takes the options of rtrace, and of mkpmap if it is there, from README.txt. The rays of a pixel are
+random within it. Writes one `seedN.f32` per seed: rows from the top, three float32 per pixel.
 """
 
 import os
@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-# Beside the exported options: nothing is remembered or sampled, so that Radiance is a path tracer.
+# In addition to the exported options: without ambient values and caches, Radiance is a path tracer.
 RTRACE = "-ov -av 0 0 0 -dj 0 -st 0 -ss 1"
-BATCH = 2**20  # rays a process: its random numbers depend on the second in which it begins
+BATCH = 2**20  # rays per process; a process has its own random numbers, seeded by the second in which it starts
 
 
 def main():
@@ -46,7 +46,7 @@ def main():
 
 
 def rays(view, within):
-    """Origin and direction of a ray a pixel, H × W × 6, rows from the top; `within`: (x, y) in it, 0 to 1."""
+    """Return origin and direction of one ray per pixel, H × W × 6, rows from the top; `within`: (x, y) in [0, 1]²."""
     words = view.split()
     origin, ahead, up = (np.array(words[words.index(key) + 1 :][:3], float) for key in ("-vp", "-vd", "-vu"))
     wide, tall = (np.tan(np.radians(float(words[words.index(key) + 1])) / 2) for key in ("-vh", "-vv"))
@@ -61,7 +61,7 @@ def rays(view, within):
 
 
 def traced(rtrace, bundle):
-    """The radiance of each ray, float64."""
+    """Return the radiance of each ray, float64."""
     done = subprocess.run(rtrace, input=bundle.astype("<f8").tobytes(), stdout=-1, check=True)
     return np.frombuffer(done.stdout, "<f4").reshape(*bundle.shape[:-1], 3).astype(float)
 

@@ -1,9 +1,9 @@
-"""Radiance's `rtrace`: every ray meets a ring of its own between the two media, and `-otdW` prints what follows.
+"""Radiance's `rtrace`: every ray meets its own ring between the two media, and `-otdW` prints the rays that follow.
 
 With `fresnel` the answer is the weight of the reflected ray.
 
-A ring takes its normal as given, where a polygon would compute one from its corners. The rings are far apart, and so
-small that no ray meets another one's.
+A ring has a given normal; a polygon would compute one from its corners. The rings are far apart and so small that no
+ray meets another ray's ring.
 """
 
 import os
@@ -18,18 +18,18 @@ import pyradiance
 import table
 
 RADIUS, START = 1e-5, 1e-2
-OPTIONS = ["-w", "-h", "-fdd", "-lr", "1", "-lw", "0", "-otdW"]  # children of rays only, however weak
-RECORD = 48  # bytes: a direction and a weight of three channels
+OPTIONS = ["-w", "-h", "-fdd", "-lr", "1", "-lw", "0", "-otdW"]  # only direct children of the rays, however weak
+RECORD = 48  # bytes: a direction and a weight, three numbers each
 FOLDER = Path(pyradiance.__file__).parent
 # An interface: colour and index of its inside, then of its outside, where the ring's normal points. Rays come from the
-# inside: there rtrace divides n_from by n_to, and from the outside it takes the reciprocal of the other ratio.
+# inside, for which rtrace divides n_from by n_to; from the outside it would take the reciprocal of the other ratio.
 RING = """void interface m{i}\n0\n0\n8 1 1 1 {n_from!r} 1 1 1 {n_to!r}
 m{i} ring r{i}\n0\n0\n8 {x!r} {y!r} {z!r} {nx!r} {ny!r} {nz!r} 0 {radius}\n"""
 
 
-def run(command, *arguments, given=None):
+def run(command, *arguments, stdin=None):
     program = [str(FOLDER / "bin" / command), *arguments]
-    return subprocess.run(program, input=given, stdout=subprocess.PIPE, check=True).stdout
+    return subprocess.run(program, input=stdin, stdout=subprocess.PIPE, check=True).stdout
 
 
 def scene(rays, centres):
@@ -41,12 +41,11 @@ def scene(rays, centres):
 
 
 def answers(out, rays):
-    """The child on the far side of each ray's ring, else the reflected one where it carries all; NaN where is neither.
+    """Return each ray's child behind its ring, or the reflected child if its weight is 1, or NaN; and the weight of the
+    reflected child, or NaN.
 
-    And the weight of the reflected child, NaN where there is none.
-
-    `-t` prints children before their parent, with a tab before each of them in binary output, too. A ray's own record
-    is the one that is unturned and of weight 1.
+    `-t` prints children before their parent, each after a tab, in binary output too. A ray's own record has its
+    direction and weight 1.
     """
     b, weights, position = np.full((len(rays), 3), np.nan), np.full(len(rays), np.nan), 0
     for i, (a, n) in enumerate(zip(rays.a, rays.n, strict=True)):
@@ -78,7 +77,7 @@ with tempfile.TemporaryDirectory() as folder:
     (Path(folder) / "scene.rad").write_text(scene(rays, centres))
     (Path(folder) / "scene.oct").write_bytes(run("oconv", f"{folder}/scene.rad"))
     starts = np.concatenate([centres - START * rays.a, rays.a], axis=1)
-    out = run("rtrace", *OPTIONS, f"{folder}/scene.oct", given=starts.tobytes())
+    out = run("rtrace", *OPTIONS, f"{folder}/scene.oct", stdin=starts.tobytes())
 system, (b, weights) = f"Radiance, pyradiance {version('pyradiance')}", answers(out, rays)
 if sys.argv[1:] == ["fresnel"]:
     table.write_fresnel(system, mean=weights)

@@ -1,6 +1,6 @@
 """rayoptics' sequential trace of a centred lens, with given indices and with those of its own glasses.
 
-In and out as JSON: see `validation.suite.lenses`. Glasses are those of opticalglass, which rayoptics looks them up in.
+In and out: JSON, see `validation.suite.lenses`. The glasses come from opticalglass, which rayoptics uses.
 """
 
 import json
@@ -17,7 +17,7 @@ AXIS = np.array([0.0, 0.0, 1.0])
 
 
 def traced(lens, indices, height, wavelength):
-    """[z, y, dz, dy] after the last surface, z from the first vertex."""
+    """Return [z, y, dz, dy] after the last surface, with z from the first vertex."""
     object_plane = Surface("Obj", interact_mode="dummy")
     surfaces = [object_plane, *(Surface(profile=Spherical(c=c)) for c in lens["curvatures"])]
     steps = [-lens["start"], *lens["thicknesses"], 0.0]

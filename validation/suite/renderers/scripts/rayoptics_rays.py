@@ -1,6 +1,6 @@
-"""`bend` of rayoptics, a lens designer's ray tracer in double precision, ray by ray; its exception becomes NaN.
+"""rayoptics' `bend`, in double precision, ray by ray; its exception becomes NaN.
 
-With `glasses` between glasses and air, with the indices of opticalglass, by catalogue and name.
+With `glasses`: between glasses and air, with the indices of opticalglass, by catalogue and name.
 """
 
 import functools

@@ -1,9 +1,9 @@
-"""raysect's `Dielectric`, whose own code bends each ray and hands the next one to `spawn_daughter`, where it is kept.
+"""raysect's `Dielectric`: it refracts each ray and passes the next one to `spawn_daughter`, which records it here.
 
-It chooses reflection or transmission by chance. With `transmission_only` it spawns no ray under total internal
-reflection; then it is asked again without, and spawns the reflected one. With `glasses` the media are those of its
-library, Schott's catalogue of 2000. A ray of raysect has the mean of the index over its range of wavelengths, 375 to
-785 nm if nothing else is said. Here the range is as narrow as rounding allows, and the ratio is that of the means.
+It chooses reflection or transmission at random. With `transmission_only` it spawns no ray under total internal
+reflection; it is then called again without this option and spawns the reflected ray. With `glasses` the media are those
+of its library, Schott's catalogue of 2000. A ray uses the mean of the index over its range of wavelengths, by default
+375 to 785 nm. Here the range is as narrow as rounding allows, and the ratio is that of the means.
 """
 
 import functools
@@ -18,12 +18,12 @@ from raysect.optical.material import Dielectric
 from raysect.primitive import Box
 
 HERE, PLACE = Point3D(0, 0, 0), AffineMatrix3D()
-HALF = 1e-6  # nm, of the range
+HALF = 1e-6  # nm: half the range of wavelengths
 EMPTY, BODY = World(), Box()
 
 
 class Kept(Ray):
-    """A ray that remembers its daughter's direction."""
+    """A ray that records its daughter's direction."""
 
     daughter = None
 
@@ -47,7 +47,7 @@ def refract(*ray):
 
 
 def bent(a, n, left, entered, wavelengths, transmission_only):
-    """The daughter's direction, or None. The normal points against the ray, so that it enters the medium."""
+    """Return the daughter's direction, or None. The normal faces the ray, so the ray enters the medium."""
     glass = Dielectric(entered, ConstantSF(1), left, transmission_only)
     ray, normal = Kept(HERE, Vector3D(*a), *wavelengths), Normal3D(*n)
     crossing = Intersection(ray, 0.0, BODY, HERE, HERE, HERE, normal, False, PLACE, PLACE)

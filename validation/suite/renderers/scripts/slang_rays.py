@@ -1,4 +1,4 @@
-"""Slang's `refract` on slangpy's CPU device, which compiles it by g++: for float32, or with `float64` for double."""
+"""Slang's `refract` on slangpy's CPU device, which compiles it with g++, in float32, or float64 with that argument."""
 
 import shutil
 import sys
@@ -28,7 +28,7 @@ rays = table.Rays(precision)
 if not shutil.which("g++"):
     print("no g++ for Slang's CPU target; Debian: g++", file=sys.stderr)
     sys.exit(77)
-slangpy.Logger.get().remove_all_outputs()  # it warns on stdout
+slangpy.Logger.get().remove_all_outputs()  # it would print warnings on stdout
 device = slangpy.Device(type=slangpy.DeviceType.cpu)
 source = SOURCE.replace("FLOAT", {"float32": "float", "float64": "double"}[precision])
 module = device.load_module_from_source("refraction", source)

@@ -1,8 +1,8 @@
-// Render scene.glb, with sky.exr around it where there is one, by three-gpu-pathtracer or by three itself in a headless browser, WebGL2
-// on the processor:
+// Render scene.glb, and the sky sky.exr if it exists, by three-gpu-pathtracer or three in a headless browser, with WebGL2
+// on the CPU:
 //   node three_images.mjs NPM_FOLDER CHROMIUM SCENE_FOLDER OUT_FOLDER WIDTH HEIGHT SPP MODE SEED…
-// One seedN.f32 per seed: rows from the top, three float32 a pixel. MODE: mis with multiple importance
-// sampling of the sky, as the path tracer comes, none without; raster by three's rasteriser, the same for all seeds.
+// Writes one seedN.f32 per seed: rows from the top, three float32 per pixel. MODE: mis (with multiple importance
+// sampling of the sky, the path tracer's default), none (without), or raster (three's rasteriser; seeds do not matter).
 import { createServer } from "node:http";
 import { existsSync } from "node:fs";
 import { readFile, writeFile } from "node:fs/promises";
@@ -11,7 +11,7 @@ import { extname, join, resolve } from "node:path";
 
 const [npm, chromium, scene, out, width, height, spp, mode, ...seeds] = process.argv.slice(2);
 const puppeteer = createRequire(join(resolve(npm), "package.json"))("puppeteer-core");
-const PATIENCE = 3_600_000; // ms: a busy machine is slow
+const TIMEOUT = 3_600_000; // ms: enough on a busy machine
 const page = new URL("three_images.html", import.meta.url);
 const types = { ".js": "text/javascript", ".html": "text/html", ".json": "application/json" };
 const roots = { "/modules/": join(npm, "node_modules"), "/scene/": scene };
@@ -33,17 +33,17 @@ const browser = await puppeteer.launch({
   executablePath: chromium,
   args: ["--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"],
   env: { ...process.env, LIBGL_ALWAYS_SOFTWARE: "1" },
-  timeout: PATIENCE,
-  protocolTimeout: PATIENCE,
+  timeout: TIMEOUT,
+  protocolTimeout: TIMEOUT,
 });
 try {
   const tab = await browser.newPage();
-  tab.setDefaultTimeout(PATIENCE);
+  tab.setDefaultTimeout(TIMEOUT);
   tab.on("console", (message) => console.error(message.text()));
   tab.on("pageerror", (error) => console.error(error.message));
   await tab.goto(`http://127.0.0.1:${server.address().port}/`);
   if (!(await tab.evaluate(() => document.createElement("canvas").getContext("webgl2") !== null))) {
-    console.error("no WebGL2 in this browser; Debian has it in libegl1 and libgl1-mesa-dri");
+    console.error("no WebGL2 in this browser; Debian: libegl1 libgl1-mesa-dri");
     process.exitCode = 77;
     throw undefined;
   }

@@ -1,5 +1,5 @@
-// What Khronos' gltf-validator says of glTF files:  node validate_gltf.mjs NPM_FOLDER < PATHS, one a line
-// A line for each: the numbers of errors and of warnings, and the first message of either.
+// Run Khronos' gltf-validator on glTF files:  node validate_gltf.mjs NPM_FOLDER < PATHS, one per line
+// Prints a line per file: the numbers of errors and warnings, and the first message.
 import { readFileSync } from "node:fs";
 import { readFile } from "node:fs/promises";
 import { createRequire } from "node:module";

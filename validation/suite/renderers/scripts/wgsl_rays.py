@@ -1,4 +1,4 @@
-"""WGSL's `refract` in a compute shader of wgpu on the first Vulkan adapter: f32, or with `float64` the f64 of naga."""
+"""WGSL's `refract` in a compute shader of wgpu on the first Vulkan adapter: f32, or naga's f64 with `float64`."""
 
 import sys
 from importlib.metadata import version
@@ -25,7 +25,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
 
 
 def refract(device, rows, name):
-    """(N, 7) of ray, normal and ratio to (N, 3)."""
+    """Return b (N, 3) for rows (N, 7) of ray, normal and ratio."""
     usage = wgpu.BufferUsage.STORAGE | wgpu.BufferUsage.COPY_SRC
     rays = device.create_buffer_with_data(data=rows, usage=usage)
     answers = device.create_buffer(size=3 * len(rows) * rows.itemsize, usage=usage)
@@ -50,7 +50,7 @@ try:
         adapter for adapter in wgpu.gpu.enumerate_adapters_sync() if adapter.info.get("backend_type") == "Vulkan"
     ]
     device = adapters[0].request_device_sync(required_features=features)
-except Exception as error:  # of whatever kind: no loader, no adapter, one without such numbers
+except Exception as error:  # any kind: no loader, no adapter, or one without this precision
     print(f"no {precision} by Vulkan ({error!r}); Debian: mesa-vulkan-drivers libvulkan1", file=sys.stderr)
     sys.exit(77)
 b = refract(device, np.column_stack([rays.a, rays.n, rays.k]).astype(precision), name)
