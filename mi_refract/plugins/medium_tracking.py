@@ -33,7 +33,7 @@ from mi_refract.numerics import (
 )
 
 from .absorption import BEYOND, HERE, absorbing_parameter
-from .scene_features import all_shapes, check_attributes, children, nested, plugin_number, shape_name
+from .scene_features import all_shapes, check_shapes, children, nested, plugin_number, shape_name
 
 TOLERANCE = 1e-3  # relative: one side may give σ as a number and the other one as a colour
 STRAY = 0.01  # the largest share of wrong crossings of a shape that is not an error
@@ -193,9 +193,9 @@ def absorbs_only(v: Variant, medium: MediumPlugin) -> bool:
 def check_integrator(scene: Scene) -> None:
     """ValueError if a BSDF absorbs and the scene's integrator is not `refract_path`, and does not call only that.
 
-    ValueError also for mesh attributes that Mitsuba does not read correctly; see `check_attributes`.
+    ValueError also for shapes that Mitsuba renders wrong; see `check_shapes`.
     """
-    check_attributes(scene)
+    check_shapes(scene)
 
     def follows_media(integrator: Any) -> bool:
         called = [child for child in children(integrator) if hasattr(child, "aov_names")]

@@ -43,6 +43,7 @@ CONSTANT_TEXTURES = {
 PERTURBING = {"BumpMap", "NormalMap"}  # they change the shading normal of the interaction
 # BSDFs that can be split: one reflected and one refracted direction, selected by a threshold of `sample1`.
 BOUNDARIES = {"Refract", "SmoothDielectric"}
+CURVES = {"BSplineCurve", "LinearCurve"}
 # BSDFs that make no random choice if both lobes of `BOUNDARIES` are followed.
 DETERMINISTIC = BOUNDARIES | {"SmoothConductor", "TwoSidedBRDF"}
 # BSDFs that use only the shading normal of an interaction, as `RayFlags.ShadingFrame` gives it: no tangent, no (u, v).
@@ -64,7 +65,7 @@ class SceneFeatures:
     """Facts about a scene. `unknown`: the names of plugins that are not known, which count as needing everything."""
 
     smooth: bool  # some BSDF has a lobe that is not a delta lobe, so emitter sampling is useful
-    delta_perturbed: str  # a plugin that may change the shading normal in a BSDF with delta lobes, or ""
+    delta_perturbed: str  # a plugin that may change the shading normal in a BSDF with delta lobes (not null), or ""
     sampleable: bool  # some emitter can be sampled
     lamps: bool  # some emitter other than the environment can be sampled
     area: bool  # some shape emits
@@ -160,7 +161,7 @@ def inspect(scene: Scene) -> SceneFeatures:
     perturbed = (
         name
         for of_shape in bsdfs_of_shapes
-        if of_shape and of_shape[0].flags() & +mi.BSDFFlags.Delta
+        if of_shape and of_shape[0].flags() & (+mi.BSDFFlags.DeltaReflection | +mi.BSDFFlags.DeltaTransmission)
         for name in map(bsdf_name, of_shape)
         if name not in KNOWN - PERTURBING
     )
@@ -248,11 +249,11 @@ def differentiated(scene: Scene) -> bool:
     return any(attached(value) for _, value in mi.traverse(scene))
 
 
-def check_attributes(scene: Scene) -> None:
-    """ValueError for mesh attributes that Mitsuba does not read correctly.
+def check_shapes(scene: Scene) -> None:
+    """ValueError for shapes that Mitsuba renders wrong.
 
-    An attribute that a texture of `refract` reads and its shape lacks would be 0. An attribute that a lamp emits would
-    be read in the first face wherever a point on the lamp is sampled.
+    A mesh attribute that a texture of `refract` reads and its shape lacks would be 0. An attribute that a lamp emits
+    would be read in the first face wherever a point on the lamp is sampled. Rays within a curve do not meet it.
     """
     shapes = all_shapes(scene)
     for i, shape in enumerate(shapes):
@@ -263,6 +264,11 @@ def check_attributes(scene: Scene) -> None:
                 "reads in one face only where it samples a lamp; expected a bitmap, or sampling_weight = 0"
             )
         for bsdf in nested(shape.bsdf()):
+            if bsdf_name(bsdf) in BOUNDARIES and shape.class_name() in CURVES:
+                raise ValueError(
+                    f"refract_path: {shape_name(shapes, i)} is a {shape.class_name()} of glass, which rays do not "
+                    "meet from within; expected a mesh"
+                )
             for name in mesh_attributes(bsdf) if bsdf_name(bsdf) == "Refract" else []:
                 if not dr.all(shape.has_attribute(name)):
                     raise ValueError(

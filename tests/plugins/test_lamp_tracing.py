@@ -184,6 +184,9 @@ AGREE = {
         ball={"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 1.2]).scale(1.7), "bsdf": GLASS},
         more={"type": "cube", "to_world": mi.ScalarTransform4f().translate([-6, -5, 0.6]).scale(0.4), "bsdf": GLASS},
     ),
+    "bumps behind a mask": agree(
+        more=floor({"type": "mask", "opacity": 0.6, "bsdf": bumps(WHITE)}) | {"to_world": SHEET}, **IN_GLASS
+    ),
     "leaves over a floor": agree(more=floor(LEAF) | {"to_world": SHEET}, **IN_GLASS),
     "instance": agree(group=GROUP, ball=INSTANCE),
 }

@@ -8,7 +8,7 @@ import pytest
 from support.glass_scenes import BLACK, PLACE, camera, sampled
 from support.variants import switch
 
-from mi_refract.plugins import inspect, missing_light
+from mi_refract.plugins import check_integrator, inspect, missing_light
 from mi_refract.plugins.scene_features import EITHER
 from validation.run.context import SCENES
 
@@ -117,6 +117,31 @@ def test_the_list_of_plugins_that_use_one_random_number(name, bsdf, scalar_varia
     used = differ((x, (0.3, 0.6)) for x in grid), differ((0.3, (x, 1 - x)) for x in grid)
     assert all(used) == both
     assert ("both_numbers" in facts(part={"type": "sphere", "bsdf": bsdf})) == both
+
+
+def test_shapes_that_mitsuba_merges_are_as_large_as_before(rgb_variant):
+    shapes = {
+        "pane": {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 30).scale(1e4)},
+        "cube": {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.01)},
+    }
+    glass = {"type": "ref", "id": "glass"}
+    parts = {"type": "scene", "glass": {"type": "dielectric"}} | {
+        name: shapes[name] | {"bsdf": glass} for name in shapes
+    }
+    merged, apart = (mi.load_dict(parts, optimize=merge) for merge in (True, False))
+    assert len(merged.shapes()) < len(apart.shapes())
+    assert inspect(merged).delta_extent == inspect(apart).delta_extent
+
+
+@pytest.mark.parametrize("kind", ["bsplinecurve", "linearcurve"])
+def test_a_curve_of_glass_is_an_error(kind, llvm_variant, tmp_path):
+    (tmp_path / "fibre.txt").write_text("\n".join(f"{x} 0 0 0.3" for x in range(4)))
+    fibre = {"type": kind, "filename": str(tmp_path / "fibre.txt"), "bsdf": {"type": "dielectric"}}
+    made = mi.load_dict(
+        {"type": "scene", "fibre": fibre, "integrator": {"type": "refract_path"}, "sensor": {"type": "perspective"}}
+    )
+    with pytest.raises(ValueError, match=r"'fibre' is a .*Curve of glass.*; expected a mesh"):
+        check_integrator(made)
 
 
 EVERYTHING = {"both_numbers", "smooth", "null", "textured", "dispersive", "absorbing"}
