@@ -94,8 +94,7 @@ def of_lengths(b: Array, rays: Rays, reflected: NDArray[np.bool_]) -> Array:
     """
     k, length = np.where(reflected, 1, rays.k.astype(np.longdouble)), lengths(b)
     off = np.fmin(np.abs(length**2 - 1), np.abs((length / lengths(rays.a)) ** 2 - 1))
-    error: Array = (off / (4 * (2 * k + 1))).astype(float)
-    return error
+    return np.asarray((off / (4 * (2 * k + 1))).astype(float))
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
@@ -106,12 +105,10 @@ def of_decisions(rays: Rays) -> Array:
     e = k * sine
     step = absolute_radicand(rays) / (2 * e * (2 * k * cosine + e))
     turn = np.abs(np.arcsin(1 / k) - np.arctan2(sine, cosine)) / 2  # NaN where k < 1
-    nearest: Array = np.fmin(step, turn).astype(float)
-    return nearest
+    return np.asarray(np.fmin(step, turn).astype(float))
 
 
 def _unit(v: Array) -> Array:
     wide = v.astype(np.longdouble)
     wide = wide / np.abs(wide).max(1, keepdims=True, initial=0)  # squares of the least numbers would be 0
-    unit: Array = wide / lengths(wide)[:, None]
-    return unit
+    return np.asarray(wide / lengths(wide)[:, None])

@@ -76,8 +76,7 @@ def relative_radicand(rays: Rays) -> Array:
 
 def lengths(v: Array) -> Array:
     """(N,) of (N, 3), in extended precision."""
-    length: Array = np.sqrt((v.astype(np.longdouble) ** 2).sum(1))
-    return length
+    return np.asarray(np.sqrt((v.astype(np.longdouble) ** 2).sum(1)))
 
 
 # Bounds and verdict ---------------------------------------------------------------------------------------------------
@@ -164,8 +163,7 @@ class RayBounds:
             return above
         u = self.u[some]
         above[some] = absolute_radicand(rays) > self.budget.radicand_error_bound(u, self.k[some])
-        decided: Flags = above & ~self.side_open
-        return decided
+        return np.asarray(above & ~self.side_open)
 
 
 @dataclass(frozen=True)
@@ -196,14 +194,12 @@ class Judgement:
     @functools.cached_property
     def far(self) -> Flags:
         """Misclassified although the radicand exceeds the bound on its error; or undecided by the oracle."""
-        far: Flags = self.bounds.decided_of(self.misjudged) | self.bounds.exact.undecided
-        return far
+        return np.asarray(self.bounds.decided_of(self.misjudged) | self.bounds.exact.undecided)
 
     @functools.cached_property
     def wrong(self) -> Flags:
         """The rays that break the bound."""
-        wrong: Flags = ~(self.share <= 1) | self.far | self.blank
-        return wrong
+        return np.asarray(~(self.share <= 1) | self.far | self.blank)
 
     def meets(self, budget: Budget) -> Flags:
         """The answers that keep the bound of another budget."""
@@ -213,8 +209,7 @@ class Judgement:
     def crossed(self) -> Flags:
         """The rays whose answer is on the other side of the surface, where the bound leaves the side open."""
         exact = self.bounds.exact
-        crossed: Flags = self.bounds.side_open & self.compared & exact.transmitted & (self.error > exact.cos_t)
-        return crossed
+        return np.asarray(self.bounds.side_open & self.compared & exact.transmitted & (self.error > exact.cos_t))
 
     @property
     @np.errstate(over="ignore", invalid="ignore")

@@ -58,8 +58,7 @@ class JudgedAnswers:
 
     def backward_within(self, most: float) -> Flags:
         """Whether the backward errors of direction, or decision, and length are at most this, in u."""
-        within: Flags = np.maximum(self.backward, self.backward_length) <= most
-        return within
+        return np.asarray(np.maximum(self.backward, self.backward_length) <= most)
 
     @property
     def wrong(self) -> Flags:

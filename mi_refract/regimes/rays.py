@@ -61,14 +61,12 @@ def either(rng: Generator, count: int) -> Array:
 def normalised(v: Array) -> Array:
     """v/|v| of (N, 3), in extended precision: rounded, it is unit up to the rounding of its components."""
     wide = v.astype(np.longdouble)
-    unit: Array = wide / np.sqrt((wide * wide).sum(1, keepdims=True))
-    return unit
+    return np.asarray(wide / np.sqrt((wide * wide).sum(1, keepdims=True)))
 
 
 def length(v: Array) -> Array:
     """(N,) of (N, 3), in the precision of `v`."""
-    lengths: Array = np.sqrt((v * v).sum(1))
-    return lengths
+    return np.asarray(np.sqrt((v * v).sum(1)))
 
 
 def rounded(x: Array, precision: DTypeLike) -> Array:
