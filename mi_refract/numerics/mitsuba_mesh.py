@@ -18,6 +18,16 @@ def arrays(mesh: Any) -> tuple[NDArray[Any], NDArray[np.uint32]]:
     return np.array(mesh.vertex_positions_buffer()).reshape(-1, 3), np.array(mesh.faces_buffer()).reshape(-1, 3)
 
 
+def bounding_box(shape: Any) -> Any:
+    """The bounding box of a shape. Mitsuba's box of a mesh that it has merged from several shapes omits rectangles."""
+    import mitsuba as mi
+
+    if shape.class_name() != "Mesh":
+        return shape.bbox()
+    vertices, _ = arrays(shape)
+    return mi.ScalarBoundingBox3f(*([*map(float, ends(0))] for ends in (vertices.min, vertices.max)))
+
+
 def has_normals(mesh: Any) -> bool:
     """Whether the mesh has normals of vertices, between which it interpolates."""
     return bool(mesh.has_vertex_normals())

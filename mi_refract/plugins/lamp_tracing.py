@@ -34,6 +34,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refract.numerics import (
+    BSDF,
     Count,
     Emitter,
     Interaction,
@@ -56,7 +57,7 @@ from .medium_tracking import THROUGH
 from .path_loop import PathLoop
 from .refract import DISPERSED, followed_context
 from .sampling import IndependentNumbers, KeyedMultijitter
-from .scene_features import KNOWN, KNOWN_SHAPES, all_shapes, bsdf_name, children, nested
+from .scene_features import KNOWN, KNOWN_SHAPES, PERTURBING, all_shapes, bsdf_name, children, mesh_attributes, nested
 
 MOST_TARGETS = 16  # spheres at which directions are aimed
 MARGIN = 1 + 1e-4  # of a sphere's radius: rounding must not leave its rim out
@@ -66,6 +67,8 @@ DEFENSIVE = 0.1  # share of the light paths that all lamps have alike, whatever 
 SENSORS = {"PerspectiveCamera", "ThinLensCamera", "OrthographicCamera"}
 AREA, PLACE, DIRECTION = range(3)  # kinds of lamps
 KINDS = {"AreaLight": AREA, "PointLight": PLACE, "SpotLight": PLACE, "DirectionalEmitter": DIRECTION}  # TRACED_LAMPS
+# Hair and thin slabs are models that are not reciprocal, measured BSDFs interpolate otherwise in wi than in wo.
+ONE_WAY = PERTURBING | {"Hair", "Measured", "MeasuredPolarized", "PrincipledThin"}
 LOBES = mi.BSDFFlags
 
 
@@ -77,6 +80,11 @@ def refused_lamps(scene: Scene) -> str:
     shapes = [lamp.get_shape() for lamp in lamps if lamp.class_name() == "AreaLight"]
     if any(shape.is_mesh() and mitsuba_mesh.is_smooth(shape) for shape in shapes):
         return "the normals of an area lamp are not those of its faces"
+    # Mitsuba's position samples there have the normal of the other side.
+    if any(shape.class_name() == "Cylinder" and dr.all(dr.det(matrix_of(shape, "to_world")) < 0) for shape in shapes):
+        return "an area lamp on a mirrored Cylinder"
+    if any(map(mesh_attributes, lamps)):
+        return "an area lamp emits an attribute of its mesh"
     # Mitsuba has the same matrix for light that comes from the lamp, whose order it would turn around.
     if mi.is_polarized and any(
         bsdf_name(bsdf) == "LinearRetarder" for shape in all_shapes(scene) for bsdf in nested(shape.bsdf())
@@ -97,8 +105,38 @@ def refused_sensor(sensor: Sensor) -> str:
 
 def by_area(lamp: Emitter) -> bool:
     """Whether points on a lamp are sampled by its area, though its radiance varies."""
-    exact = lamp.class_name() != "AreaLight" or lamp.get_shape().class_name() in ("Disk", "Rectangle", "Sphere")
-    return not exact and any(x.is_spatially_varying() for x in children(lamp) if hasattr(x, "is_spatially_varying"))
+    if lamp.class_name() != "AreaLight":
+        return False
+    textures = [x for x in children(lamp) if hasattr(x, "is_spatially_varying") and x.is_spatially_varying()]
+    exact = lamp.get_shape().class_name() in ("Disk", "Rectangle")
+    matrices = (matrix_of(texture, "to_uv") for texture in textures)  # of which Mitsuba takes no notice
+    moved = (x is not None and bool(dr.any(x != dr.identity(type(x)), axis=None)) for x in matrices)
+    return bool(textures) and (not exact or any(moved))
+
+
+def matrix_of(node: mi.Object, name: str) -> Any:
+    """A transform that a plugin shows, as a matrix of its own; None where it has none."""
+    parameters = mi.traverse(node)  # a transform is part of them, and does not keep them alive
+    return type(parameters[name].matrix)(parameters[name].matrix) if name in parameters else None
+
+
+def is_one_way(bsdf: BSDF) -> bool:
+    """Whether a BSDF, or one within it, may not have the same value for light that goes the other way."""
+    return not {*map(bsdf_name, nested(bsdf))} <= KNOWN - ONE_WAY
+
+
+def outward(lamp: Emitter) -> tuple[float, ...]:
+    """Of a lamp on a sphere the centre, and the sign of its normal there; else 0.
+
+    Mitsuba's samples of positions on a sphere that is turned or mirrored have the normal of another place.
+    """
+    if lamp.class_name() != "AreaLight" or (shape := lamp.get_shape()).class_name() != "Sphere":
+        return 0.0, 0.0, 0.0, 0.0
+    ball = bounding_sphere(shape)
+    x, y, z = ball.center
+    si = shape.ray_intersect(mi.Ray3f(mi.Point3f(x + 2 * ball.radius, y, z), mi.Vector3f(-1, 0, 0)))
+    sign: Any = dr.slice(si.sh_frame.n.x)
+    return x, y, z, float(sign)
 
 
 def lit(lamp: Emitter) -> bool:
@@ -130,10 +168,7 @@ def targets(scene: Scene) -> list[Sphere]:
 
 def bounding_sphere(shape: Shape) -> Sphere:
     """About the middle of its bounding box; with an infinite radius, or NaN, where its bounds are not known."""
-    box = shape.bbox()
-    if not box.valid():  # of rectangles that Mitsuba has merged into a mesh
-        vertices, _ = mitsuba_mesh.arrays(shape)
-        box = mi.ScalarBoundingBox3f(*([*map(float, ends(0))] for ends in (vertices.min, vertices.max)))
+    box = mitsuba_mesh.bounding_box(shape)
     half = [float(x) / 2 for x in box.extents()]
     radius = half[0] if shape.class_name() == "Sphere" else math.hypot(*half)
     return Sphere(tuple(map(float, box.center())), radius * MARGIN)
@@ -152,35 +187,38 @@ def merged(spheres: list[Sphere], most: int) -> list[Sphere]:
     return merged(ordered[:half], most // 2) + merged(ordered[half:], most - most // 2)
 
 
+class Table:
+    """Numbers by an index."""
+
+    def __init__(self, v: Variant, values: Iterable[float]) -> None:
+        """`v`: the variant's module."""
+        self.v, self.values = v, v.Float([*values]) if dr.is_jit_v(v.Float) else [*values]
+        dr.make_opaque(self.values)
+
+    def __getitem__(self, index: Count) -> Number:
+        """At each lane's index; of no derivative."""
+        return dr.gather(self.v.Float, self.values, index) if dr.is_jit_v(self.v.Float) else self.values[int(index)]
+
+
 class Aim:
     """Directions from points toward spheres, and places on a plane behind which the spheres are."""
 
     def __init__(self, v: Variant, spheres: list[Sphere], odds: list[list[float]]) -> None:
         """`v`: the variant's module. `odds`: for each lamp the probability of each sphere."""
-        self.v, self.count, self.vectorised = v, len(spheres), dr.is_jit_v(v.Float)
-        self.x, self.y, self.z = (self._table(s.center[i] for s in spheres) for i in range(3))
-        self.radius = self._table(s.radius for s in spheres)
-        self.odds = self._table(p for row in odds for p in row)
-
-    def _table(self, values: Iterable[float]) -> Any:
-        numbers: Any = [float(x) for x in values]
-        if self.vectorised:
-            numbers = self.v.Float(numbers)
-            dr.make_opaque(numbers)
-        return numbers
-
-    def _at(self, table: Any, index: Count) -> Any:
-        return dr.gather(self.v.Float, table, index) if self.vectorised else table[int(index)]
+        self.v, self.count = v, len(spheres)
+        self.x, self.y, self.z = (Table(v, (s.center[i] for s in spheres)) for i in range(3))
+        self.radius = Table(v, (s.radius for s in spheres))
+        self.odds = Table(v, (p for row in odds for p in row))
 
     def sphere(self, j: Count) -> tuple[Vector3, Number]:
         """Centre and radius."""
-        return self.v.Point3f(self._at(self.x, j), self._at(self.y, j), self._at(self.z, j)), self._at(self.radius, j)
+        return self.v.Point3f(self.x[j], self.y[j], self.z[j]), self.radius[j]
 
     def choose(self, lamp: Count, sample: Number) -> Count:
         """A sphere for a light path of a lamp."""
         chosen, below = self.v.UInt32(0), self.v.Float(0)
         for j in range(self.count - 1):
-            below += self._at(self.odds, lamp * self.count + j)
+            below += self.odds[lamp * self.count + j]
             chosen = dr.select(sample >= below, self.v.UInt32(j + 1), chosen)
         return chosen
 
@@ -198,7 +236,7 @@ class Aim:
             # The sine squared: a cosine does not resolve a narrow cone.
             within = (dr.squared_norm(dr.cross(other, d)) <= other_sine2) & (dr.dot(other, d) > 0)
             inside = (chosen == j) | (other_sine2 > 1) | within
-            share = self._at(self.odds, lamp * self.count + j) / (2 * math.pi * _one_minus_cosine(other_sine2))
+            share = self.odds[lamp * self.count + j] / (2 * math.pi * _one_minus_cosine(other_sine2))
             density += dr.select(inside, share, 0)
         return d, density
 
@@ -222,7 +260,7 @@ class Aim:
             other, other_radius = self.sphere(j)
             apart = dr.squared_norm(dr.cross(p - other, d))
             inside = (chosen == j) | (apart <= dr.square(other_radius))
-            share = self._at(self.odds, lamp * self.count + j) / (math.pi * dr.square(other_radius))
+            share = self.odds[lamp * self.count + j] / (math.pi * dr.square(other_radius))
             density += dr.select(inside, share, 0)
         return p, density
 
@@ -267,6 +305,7 @@ class LampTracer:
         self.vectorised = loop.vectorised
         self.context = followed_context()
         self.context.mode = mi.TransportMode.Importance
+        self.one_way = loop.ranges(is_one_way)
         self.camera, self.camera_medium = Camera(v, sensor), camera_medium
         # Not `scene.bbox()`, which leaves out rectangles that Mitsuba has merged into a mesh.
         (bounds,) = merged([bounding_sphere(shape) for shape in scene.shapes()], 1)
@@ -281,6 +320,7 @@ class LampTracer:
         self.pointers = dr.gather(v.EmitterPtr, scene.emitters_dr(), v.UInt32(indices)) if self.vectorised else None
         # By a texture Mitsuba samples no mesh right whose (u, v) overlap, nor a cylinder that is turned. One call a
         # shape: a call of a pointer is traced for shapes that cannot be sampled, too.
+        self.round = [Table(v, column) for column in zip(*map(outward, self.lamps), strict=True)]
         self.by_area = [i for i, lamp in enumerate(self.lamps) if by_area(lamp)]
         spheres = targets(scene)
         odds = [self._odds(lamp, spheres) for lamp in self.lamps]
@@ -302,7 +342,7 @@ class LampTracer:
             place = lamp.bbox().center()
             squares = [(s.radius, math.dist(s.center, map(float, place))) for s in spheres]
             sizes = [float(_one_minus_cosine(2.0 if r >= x else (r / x) ** 2)) for r, x in squares]
-        return [size / sum(sizes) for size in sizes]
+        return [DEFENSIVE / len(sizes) + (1 - DEFENSIVE) * size / sum(sizes) for size in sizes]
 
     def _pilot(self) -> tuple[list[float], int]:
         """The power of each lamp toward the spheres as some light paths estimate it, and their number."""
@@ -347,6 +387,8 @@ class LampTracer:
                     own = self.lamps[i].get_shape().sample_position(time, on_lamp, this)
                     ps, place = dr.select(this, own, ps), dr.select(this, _quotient(1, own.pdf), place)
             toward, q = self.aim.direction(lamp, chosen, ps.p, aimed)
+            x, y, z, sign = (column[lamp] for column in self.round)
+            ps.n = dr.select(sign == 0, ps.n, sign * dr.normalize(ps.p - v.Point3f(x, y, z)))
             si = v.SurfaceInteraction3f(ps, wavelengths)
             si.shape = emitter.get_shape()
             si.wi = si.to_local(toward)
@@ -427,8 +469,9 @@ class LampTracer:
         # Shading normals n: |n·wi| |geometric·wo| / (|n·wo| |geometric·wi|).
         geometric = _quotient(dr.abs(dr.dot(si.n, si.to_world(bs.wo))), dr.abs(dr.dot(si.n, s.ray.d)))
         weight = weight * (geometric * _quotient(dr.abs(si.wi.z), dr.abs(bs.wo.z)))
-        if features.perturbed:
-            bs.wo, weight = self._own_normal(si, bsdf, bs, weight, s.ray.d, numbers, key + 1, active_next)
+        own = active_next & (s.depth > 0) & self._is_one_way(bsdf)
+        if self.one_way if self.vectorised else own:
+            weight = self._seen(si, bsdf, bs, weight, s.ray.d, numbers, key + 1, own)
         ray = loop.spawn_ray(si, bs)
         throughput = loop.times(weight, s.throughput)
         if features.dispersion:
@@ -465,22 +508,29 @@ class LampTracer:
         s.skipped = dr.dot(ray.o - si.p, ray.d)
         return throughput
 
-    def _own_normal(
+    def _is_one_way(self, bsdf: Any) -> Mask:
+        return self.loop.is_of(self.one_way, bsdf) if self.vectorised else is_one_way(bsdf)
+
+    def _seen(
         self, si: Interaction, bsdf: Any, bs: Any, weight: Spectrum, arriving: Vector3, numbers: Any, key: Count,
         active: Mask,
-    ) -> tuple[Vector3, Spectrum]:  # fmt: skip
-        """Direction and weight where the shading normal is the BSDF's own: evaluated as path tracing does.
+    ) -> Spectrum:  # fmt: skip
+        """The weight of a sample, and its direction, of a BSDF that is evaluated as path tracing does.
 
         Light may go there where the BSDF samples nothing for light that comes from the lamp. So one half of the
         directions are those of a sample, and the other half all alike.
         """
-        own = active & (mi.has_flag(bsdf.flags(), LOBES.Delta) ^ True)
         choice, x, y = numbers.independent(key, 3)
-        wo = dr.select(choice < 0.5, bs.wo, self.v.warp.square_to_uniform_sphere(self.v.Point2f(x, y)))
-        density = (bsdf.pdf(self.context, si, wo, own) + 1 / (4 * math.pi)) / 2
-        cosines = _quotient(dr.abs(dr.dot(si.n, si.to_world(wo))), dr.abs(dr.dot(si.n, arriving)))
-        value = self._radiance(si, bsdf, wo, own) * (cosines / density)
-        return dr.select(own, wo, bs.wo), dr.select(own, value, weight)
+        sampled = choice < 0.5
+        delta = active & sampled & mi.has_flag(bs.sampled_type, LOBES.Delta)
+        smooth = active & (delta ^ True)
+        bs.wo = dr.select(smooth & (sampled ^ True), self.v.warp.square_to_uniform_sphere(self.v.Point2f(x, y)), bs.wo)
+        density = (bsdf.pdf(self.context, si, bs.wo, smooth) + 1 / (4 * math.pi)) / 2
+        cosines = _quotient(dr.abs(dr.dot(si.n, si.to_world(bs.wo))), dr.abs(dr.dot(si.n, arriving)))
+        value = self._radiance(si, bsdf, bs.wo, smooth) * (cosines / density)
+        side = dr.select(si.wi.z * bs.wo.z > 0, +LOBES.DiffuseReflection, +LOBES.DiffuseTransmission)
+        bs.sampled_type = dr.select(smooth, side, bs.sampled_type)
+        return dr.select(smooth, value, dr.select(delta, 2, 1) * weight)
 
     def _radiance(self, si: Interaction, bsdf: Any, wo: Vector3, active: Mask) -> Spectrum:
         """The BSDF times the cosine of wi, for light along −wi that leaves along wo, as path tracing evaluates it."""

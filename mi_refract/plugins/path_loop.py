@@ -74,7 +74,6 @@ class PathFeatures:
     absorption: bool  # some medium absorbs
     null: bool  # a BSDF may have a null lobe
     caustics_apart: bool = False  # `lamp_tracing` adds its paths, which are left out here
-    perturbed: bool = False  # a BSDF may have a shading normal of its own
     delta_extent: float = math.inf  # of the largest shape with delta lobes; see `ray_origins`
 
     @property
@@ -210,8 +209,8 @@ class PathLoop:
         # so they must not trace rays: what a ray meets is evaluated at once.
         self.evaluated = self.vectorised and not dr.flag(dr.JitFlag.SymbolicLoops)
         self.branch = branch_type(v, features.dispersion, features.absorption)
-        self.boundaries = self._ranges(lambda bsdf: bsdf_name(bsdf) in BOUNDARIES) if features.split_depth else []
-        self.own_odds = self._ranges(has_own_odds) if self.evaluated else []
+        self.boundaries = self.ranges(lambda bsdf: bsdf_name(bsdf) in BOUNDARIES) if features.split_depth else []
+        self.own_odds = self.ranges(has_own_odds) if self.evaluated else []
 
     def refuse(self) -> None:
         """ValueError where the absorption that the paths met was contradictory."""
@@ -395,7 +394,7 @@ class PathLoop:
             weight = si.to_world_mueller(weight, -bs.wo, si.wi)
         ray = self.spawn_ray(si, bs)
         if dr.grad_enabled(weight, ray.d):
-            own_odds = self._is_of(self.own_odds, bsdf)
+            own_odds = self.is_of(self.own_odds, bsdf)
             weight, ray.d, bs.pdf = at_fixed_direction(v, self.context, si, bsdf, bs, weight, ray.d, active, own_odds)
         throughput, optional = self.times(s.throughput, weight), dict[str, Any]()
         if self.features.dispersion:
@@ -483,7 +482,7 @@ class PathLoop:
         lost = dr.max(self.v.unpolarized_spectrum(throughput)) * dr.square(eta)
         s.truncated = dr.select(where, s.truncated + lost, s.truncated)
 
-    def _ranges(self, wanted: Callable[[BSDF], bool]) -> list[tuple[Count, Count]]:
+    def ranges(self, wanted: Callable[[BSDF], bool]) -> list[tuple[Count, Count]]:
         """The numbers of the shapes' BSDFs that are wanted, as ranges: first, and one after the last.
 
         Mitsuba numbers BSDFs as they are loaded. Opaque: another scene is other data, not another kernel.
@@ -499,7 +498,7 @@ class PathLoop:
                 ranges.append([number, number + 1])
         return [(dr.opaque(v.UInt32, first), dr.opaque(v.UInt32, last)) for first, last in ranges]
 
-    def _is_of(self, ranges: list[tuple[Count, Count]], bsdf: BSDF) -> Mask:
+    def is_of(self, ranges: list[tuple[Count, Count]], bsdf: BSDF) -> Mask:
         """Whether the number of a BSDF is in one of the ranges."""
         number, inside = dr.reinterpret_array(self.v.UInt32, bsdf), self.v.Bool(False)
         for first, last in ranges:
@@ -510,4 +509,4 @@ class PathLoop:
         """Whether a BSDF is known to have one reflected and one refracted direction, and no others."""
         if not self.vectorised:
             return bsdf_name(bsdf) in BOUNDARIES
-        return self._is_of(self.boundaries, bsdf)
+        return self.is_of(self.boundaries, bsdf)

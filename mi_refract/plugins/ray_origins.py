@@ -12,12 +12,13 @@ where E is the extent of the largest shape with such lobes. No ray met its own p
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 
-from mi_refract.numerics import Interaction, Mask, Ray, Shape, Variant, Vector3
+from mi_refract.numerics import Interaction, Mask, Ray, Shape, Variant, Vector3, mitsuba_mesh
 
 # The points of hits on these are known that well: on `QUADRICS` as measured on processors; CUDA has code of its own.
 MESHES = {"BlenderMesh", "Cube", "Mesh", "OBJMesh", "PLYMesh", "SerializedMesh"}
@@ -25,36 +26,54 @@ QUADRICS = {"Disk", "Rectangle", "Sphere"}
 MITSUBA, OURS = 1500, 32
 
 
-def extent_of(shapes: Iterable[Shape]) -> float:
+class Size(NamedTuple):
+    """Sizes of the bounding box of a shape: the largest, the smallest that is not flat, and its largest coordinate."""
+
+    extent: float
+    thickness: float
+    place: float
+
+
+def size_of(shape: Shape) -> Size | None:
+    """None where it is not known, or where points on the shape are not known well enough."""
+    name = shape.class_name()
+    if name not in (MESHES if "cuda" in str(mi.variant()) else MESHES | QUADRICS):
+        return None
+    if name == "Mesh" and dr.flag(dr.JitFlag.FreezingScope):  # its vertices cannot be read
+        return None
+    box = mitsuba_mesh.bounding_box(shape)
+    if not box.valid():
+        return None
+    low, high = [*box.min], [*box.max]
+    place = max(*map(abs, low), *map(abs, high))
+    sizes = [y - x for x, y in zip(low, high, strict=True)]
+    flat = name in ("Disk", "Rectangle")
+    thick = [size for size in sizes if size > 2 * mi.math.RayEpsilon / MITSUBA * place and not flat]
+    return Size(max(sizes), min(thick, default=math.inf), place)
+
+
+def extent_of(sizes: Sequence[Size | None]) -> float:
     """E in powers of two, so that similar scenes have the same kernel; ∞ where rays start as Mitsuba's do."""
-    shapes = list(shapes)
-    boxes = [shape.bbox() for shape in shapes]
-    exact = MESHES if "cuda" in str(mi.variant()) else MESHES | QUADRICS
-    if not boxes or not all(box.valid() for box in boxes) or not {s.class_name() for s in shapes} <= exact:
-        return math.inf
-    extent = max(float(size) for box in boxes for size in box.extents())
+    extent = max((math.inf if size is None else size.extent for size in sizes), default=math.inf)
     return 2.0 ** math.ceil(math.log2(extent)) if 0 < extent < math.inf else math.inf
 
 
-def too_thin(shape: Shape, extent: float) -> str:
-    """What is wrong with a shape that rays step over, as far as its bounding box tells; "" where nothing is.
+def too_thin(size: Size | None, extent: float) -> str:
+    """What is wrong with a shape that rays step over, as far as its bounding box shows; "" where nothing is.
 
     `extent`: E, as in `spawn_ray`.
     """
-    box = shape.bbox()
-    if not box.valid() or shape.class_name() in ("Disk", "Rectangle"):
+    if size is None:
         return ""
-    u, place = 2.0**-24, max(abs(float(x)) for corner in (box.min, box.max) for x in corner)
-    distance = min(OURS * (extent + place), MITSUBA * (1 + place)) * u
-    thickness = min((size for size in map(float, box.extents()) if size > 2 * u * place), default=math.inf)  # else flat
-    if thickness >= distance:
+    distance = min(OURS / MITSUBA * (extent + size.place), 1 + size.place) * mi.math.RayEpsilon
+    if size.thickness >= distance:
         return ""
-    return f"is {thickness:.3g} thick, and rays start {distance:.3g} beside its surface, so its light is lost"
+    return f"is {size.thickness:.3g} thick, and rays start {distance:.3g} beside its surface, so its light is lost"
 
 
 def spawn_ray(v: Variant, si: Interaction, d: Vector3, extent: float, delta: Mask) -> Ray:
     """The ray from a surface in the direction d. `extent`: E; `delta`: whether d is that of a delta lobe."""
-    if delta is False or extent == math.inf:
+    if extent == math.inf:
         return si.spawn_ray(d)
     u, size = v.math.RayEpsilon / MITSUBA, dr.max(dr.abs(si.p))
     distance = dr.fma(size, OURS * u, OURS * extent * u)

@@ -319,7 +319,6 @@ def integrator_class(v: Variant) -> type:
                 absorption=needs.absorbing or needs.media or self.camera is not None,
                 null=needs.null,
                 caustics_apart=self.apart,
-                perturbed=needs.perturbed,
                 delta_extent=needs.delta_extent,
             )
 

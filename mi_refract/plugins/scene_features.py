@@ -73,7 +73,6 @@ class SceneFeatures:
     only_glass: bool  # every BSDF has delta lobes only
     textured: bool  # a BSDF or a light may vary over its surface, or with its tangent
     null: bool  # some BSDF has a null lobe
-    perturbed: bool  # some BSDF may have a shading normal of its own
     dispersive: bool  # some BSDF refracts by wavelength
     absorbing: bool  # some BSDF has an absorbing medium on one side
     media: bool  # some shape, sensor or emitter has a medium of Mitsuba's
@@ -170,17 +169,17 @@ def inspect(scene: Scene) -> SceneFeatures:
     deltas = {bsdf_name(bsdf) for bsdf in bsdfs if not bsdf.flags() & +lobes.Smooth}
     lamps = [shape.emitter() for shape in shapes if shape.is_emitter()]
     points = [emitter for emitter in emitters if emitter.flags() & +mi.EmitterFlags.Delta]
-    with_delta = [
-        i
+    glass = {  # and mirrors
+        i: functools.reduce(operator.or_, (bsdf.flags() for bsdf in inner))
         for i, inner in enumerate(within)
         if any(bsdf.flags() & +lobes.Delta or bsdf_name(bsdf) not in KNOWN for bsdf in inner)
-    ]
-    delta_extent = math.inf if opaque else ray_origins.extent_of(shapes[i] for i in with_delta)
+    }
+    sizes = {i: ray_origins.size_of(shapes[i]) for i in glass}
+    delta_extent = math.inf if opaque else ray_origins.extent_of([*sizes.values()])
     thin = (
         f"{shape_name(shapes, i)} {text}"
-        for i in with_delta
-        if any(bsdf.flags() & +lobes.DeltaTransmission for bsdf in within[i])
-        and (text := ray_origins.too_thin(shapes[i], delta_extent))
+        for i, flags_of_all in glass.items()
+        if flags_of_all & +lobes.DeltaTransmission and (text := ray_origins.too_thin(sizes[i], delta_extent))
     )
     shape_media = any(shape.interior_medium() or shape.exterior_medium() for shape in shapes)
     return SceneFeatures(
@@ -203,7 +202,6 @@ def inspect(scene: Scene) -> SceneFeatures:
         or not deltas <= WITHOUT_TANGENT
         or not {lamp.class_name() for lamp in lamps} <= PLAIN_LAMPS,
         null=everything or bool(flags & +lobes.Null),
-        perturbed=everything or bool(names & PERTURBING),
         dispersive=everything or any(getattr(bsdf, "dispersive", False) for bsdf in bsdfs),  # no plugin of Mitsuba's is
         absorbing=everything or any(getattr(bsdf, "absorbing", False) for bsdf in bsdfs),
         media=shape_media or any(end.get_medium() for end in (*emitters, *scene.sensors())),
@@ -251,9 +249,19 @@ def differentiated(scene: Scene) -> bool:
 
 
 def check_attributes(scene: Scene) -> None:
-    """ValueError where a texture of `refract` is an attribute that its shape does not have: Mitsuba takes it for 0."""
+    """ValueError for attributes of meshes that Mitsuba does not read right.
+
+    One that a texture of `refract` names and the shape does not have is 0 there. One that a lamp emits is read in the
+    first face wherever a point on the lamp is sampled.
+    """
     shapes = all_shapes(scene)
     for i, shape in enumerate(shapes):
+        lamp = shape.emitter()
+        if lamp is not None and lamp.sampling_weight() > 0 and (found := mesh_attributes(lamp)):
+            raise ValueError(
+                f"refract_path: {shape_name(shapes, i)} emits the attribute {found[0]!r} of its mesh, which Mitsuba "
+                "reads in one face only where it samples a lamp; expected a bitmap, or sampling_weight = 0"
+            )
         for bsdf in nested(shape.bsdf()):
             for name in mesh_attributes(bsdf) if bsdf_name(bsdf) == "Refract" else []:
                 if not dr.all(shape.has_attribute(name)):
@@ -263,9 +271,9 @@ def check_attributes(scene: Scene) -> None:
                     )
 
 
-def mesh_attributes(bsdf: BSDF) -> list[str]:
-    """The names of the attributes of meshes that its textures read."""
-    names, textures = list[str](), children(bsdf)
+def mesh_attributes(node: mi.Object) -> list[str]:
+    """The names of the attributes of meshes that the textures of a BSDF or a lamp read."""
+    names, textures = list[str](), children(node)
     while textures:
         texture = textures.pop()
         textures += children(texture)

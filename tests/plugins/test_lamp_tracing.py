@@ -14,6 +14,7 @@ from support.variants import switch
 import mi_refract  # noqa: F401
 from mi_refract.numerics import mitsuba_mesh
 from mi_refract.plugins.film import Splats
+from mi_refract.plugins.lamp_tracing import is_one_way
 
 FALSE_ALARM = 1e-4
 SIZE = 16
@@ -47,9 +48,12 @@ def floor(bsdf=None):
     return {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(4), "bsdf": bsdf}
 
 
+def texture(pixels, **parameters):
+    return {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.asarray(pixels, np.float32))} | parameters
+
+
 def noise(*shape):
-    bitmap = mi.Bitmap(np.random.default_rng(0).random(shape).astype(np.float32))
-    return {"type": "bitmap", "raw": True, "bitmap": bitmap}
+    return texture(np.random.default_rng(0).random(shape))
 
 
 def bumps(bsdf):
@@ -106,10 +110,11 @@ def difference(a, b):
     return np.abs(t).max() / least
 
 
-PARTS = {"group", "sensor", "floor", "ball", "lamp", "more", "sky", "bsdf"} | {f"b{i}" for i in range(40)}
+PARTS = {"group", "glass", "sensor", "floor", "ball", "lamp", "more", "sky", "bsdf"} | {f"b{i}" for i in range(40)}
 ROW = {f"b{i}": ball(center=(-2 + 0.5 * (i % 8), -1.2 + 0.5 * (i // 8), 0.5), radius=0.24) for i in range(40)}
 IN_GLASS = {"lamp": glow((0, 0, 1.2), 0.5)}  # all light passes glass
 WHITE = {"type": "diffuse", "reflectance": 0.9}
+LEAF = {"type": "mask", "opacity": 0.6, "bsdf": {"type": "principledthin", "spec_trans": 0.3, "diff_trans": 1.0}}
 WALL = {
     "type": "rectangle",
     "to_world": mi.ScalarTransform4f().translate([-1.6, 0, 1]).rotate([0, 1, 0], 90).scale(2),
@@ -122,6 +127,13 @@ INSTANCE = {"type": "instance", "group": {"type": "ref", "id": "group"}} | {
     "to_world": mi.ScalarTransform4f().translate([0, 0, 1.2]).scale([0.8, 0.6, 1.0])
 }
 TUBE = {"type": "cylinder", "p0": [-1, 0, 4], "p1": [1, 0, 4], "radius": 0.2}
+SHEET = mi.ScalarTransform4f().translate([0, 0, 0.3]).scale(1.5)
+BALL_LAMP = {
+    "type": "sphere",
+    "to_world": mi.ScalarTransform4f().translate([1, 0, 4]).rotate([0, 1, 0], 130).scale(0.5),
+}
+HALF = texture([[[1], [0]]], filter_type="nearest", to_uv=mi.ScalarTransform3f().translate([0.5, 0]))
+GLASS = {"type": "ref", "id": "glass"}
 CROP = {"width": 40, "height": 30, "crop_width": 16, "crop_height": 16, "crop_offset_x": 14, "crop_offset_y": 9}
 
 
@@ -164,6 +176,15 @@ AGREE = {
     "more spheres than targets": agree(ball=floor(), **ROW),
     "textured lamp": agree(lamp=lamp() | TEXTURED),
     "textured lamp, turned": agree(lamp=TUBE | TEXTURED),
+    "textured ball, turned": agree(lamp=BALL_LAMP | TEXTURED),
+    "texture that is moved": agree(lamp=lamp() | {"emitter": {"type": "area", "radiance": HALF}}),
+    "ball lamp, turned": agree(lamp=BALL_LAMP | {"emitter": {"type": "area", "radiance": 8.0}}),
+    "pane that is merged with a cube": agree(
+        glass={"type": "dielectric"},
+        ball={"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 1.2]).scale(1.7), "bsdf": GLASS},
+        more={"type": "cube", "to_world": mi.ScalarTransform4f().translate([-6, -5, 0.6]).scale(0.4), "bsdf": GLASS},
+    ),
+    "leaves over a floor": agree(more=floor(LEAF) | {"to_world": SHEET}, **IN_GLASS),
     "instance": agree(group=GROUP, ball=INSTANCE),
 }
 
@@ -190,6 +211,13 @@ SUN = {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0}
 def test_a_far_lamp_is_directional(llvm_variant):
     lamps = ((point(4e3), range(8)), (SUN, range(100, 108)))
     images = [tiles(scene({"lamp": each}, caustics="lamp", max_depth=3), 64, seeds) for each, seeds in lamps]
+    assert difference(*images) < 1
+
+
+def test_a_small_glass_is_not_missed_beside_a_large_one(llvm_variant):
+    sea = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([2e3, 0, -1]).scale(1e3)}
+    parts = ({"lamp": SUN, "more": sea | {"bsdf": {"type": "dielectric"}}}, {"lamp": SUN})
+    images = [tiles(scene(each, caustics="lamp"), 64, range(first, first + 8)) for first, each in enumerate(parts)]
     assert difference(*images) < 1
 
 
@@ -233,6 +261,22 @@ def tilted_lamp():
     return mitsuba_mesh.make(mi, corners, faces, normals, properties=properties)
 
 
+def coloured_lamp(**parameters):
+    corners, faces = np.array([[-1, -1, 3], [1, -1, 3], [1, 1, 3], [-1, 1, 3]], np.float32), [[0, 2, 1], [0, 3, 2]]
+    radiance = {"type": "mesh_attribute", "name": "face_colour"}
+    properties = mi.Properties()
+    properties["emitter"] = mi.load_dict({"type": "area", "radiance": radiance} | parameters)
+    mesh = mitsuba_mesh.make(mi, corners, np.uint32(faces), properties=properties)
+    mesh.add_attribute("face_colour", 3, [0, 0, 0, 8, 8, 8])
+    return mesh
+
+
+def test_a_lamp_that_emits_an_attribute_cannot_be_sampled(llvm_variant):
+    loaded = scene({"lamp": coloured_lamp()})
+    with pytest.raises(ValueError, match=r"emits the attribute 'face_colour' of its mesh.*; expected a bitmap, or"):
+        loaded.integrator().render(loaded, spp=1)
+
+
 MEDIUM = {"type": "homogeneous", "albedo": 0.0, "sigma_t": 0.1}
 REFUSED = {
     "a lamp of another kind": (lambda: {"lamp": {"type": "projector", "irradiance": noise(2, 2, 3)}}, "Projector"),
@@ -240,6 +284,11 @@ REFUSED = {
     "a camera of another kind": (lambda: {"sensor": {"type": "irradiancemeter", "film": FILM}}, "Irradiance"),
     "a border": (lambda: {"sensor": camera(film={"sample_border": True})}, "sample_border"),
     "a medium": (lambda: {"ball": ball() | {"interior": MEDIUM}}, "media"),
+    "a mirrored cylinder": (
+        lambda: {"lamp": TUBE | {"to_world": mi.ScalarTransform4f().scale([-1, 1, 1]), "emitter": {"type": "area"}}},
+        "mirrored Cylinder",
+    ),
+    "an attribute": (lambda: {"lamp": coloured_lamp(sampling_weight=0.0), "more": lamp()}, "attribute of its mesh"),
     "glass with bumps": (lambda: {"ball": ball(bumps({"type": "refract"}))}, "BumpMap"),
 }
 FILM = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}}
@@ -306,3 +355,31 @@ def test_a_retarder_turns_light_another_way_from_the_lamp(needs_variant):
     loaded = scene(parts, caustics="lamp")
     with pytest.raises(ValueError, match="a retarder"):
         loaded.integrator().render(loaded, spp=1)
+
+
+ROUGH = {"roughness": 0.4, "spec_trans": 0.5, "anisotropic": 0.5}
+RECIPROCAL = {
+    "diffuse": {},
+    "roughconductor": {"alpha_u": 0.1, "alpha_v": 0.5},
+    "roughdielectric": {"alpha": 0.4},
+    "plastic": {"nonlinear": True},
+    "roughplastic": {"nonlinear": True, "alpha": 0.3},
+    "pplastic": {"alpha": 0.3},
+    "principled": ROUGH | {"clearcoat": 1.0, "spec_tint": 0.5},
+    "principledthin": ROUGH | {"diff_trans": 1.0, "flatness": 0.5},
+    "hair": {},
+}
+
+
+@pytest.mark.parametrize("name", RECIPROCAL)
+def test_a_bsdf_has_the_same_value_both_ways_or_is_known_not_to(name, llvm_variant):
+    bsdf = mi.load_dict({"type": name} | RECIPROCAL[name])
+    wi, wo = (mi.warp.square_to_uniform_sphere(mi.Point2f(np.random.default_rng(i).random((2, 4096)))) for i in (0, 1))
+    values = []
+    for mode, arrives, leaves in ((mi.TransportMode.Importance, wi, wo), (mi.TransportMode.Radiance, wo, wi)):
+        context, si = mi.BSDFContext(mode), dr.zeros(mi.SurfaceInteraction3f, 4096)
+        si.wi, si.n, si.sh_frame = arrives, mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
+        values.append(np.array(bsdf.eval(context, si, leaves) / dr.abs(leaves.z)))
+    # Directions whose half vector is along the surface are known badly.
+    alike = np.isclose(*values, rtol=0.01, atol=1e-5).mean() > 0.99
+    assert alike == (not is_one_way(bsdf))

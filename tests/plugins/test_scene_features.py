@@ -123,7 +123,7 @@ def test_plugins_that_take_either_number_have_been_tried(name, bsdf, scalar_vari
     assert ("both_numbers" in facts(part={"type": "sphere", "bsdf": bsdf})) == both
 
 
-EVERYTHING = {"both_numbers", "smooth", "null", "textured", "dispersive", "absorbing", "perturbed"}
+EVERYTHING = {"both_numbers", "smooth", "null", "textured", "dispersive", "absorbing"}
 
 
 def test_what_is_not_known_needs_everything(scalar_variant):
@@ -335,3 +335,12 @@ def test_glass_that_rays_step_over_is_named(thickness, place, others, thin, scal
     pane = {"type": "cube", "id": "pane", "to_world": at, "bsdf": others.get("bsdf", GLASS)}
     found = needs(pane=pane, **{name: part for name, part in others.items() if name != "bsdf"}).thin
     assert thin in found and bool(thin) == bool(found)
+
+
+def test_the_size_of_merged_meshes_is_that_of_all_parts(llvm_variant):
+    """Mitsuba's bounding box of such a mesh omits rectangles."""
+    part = '<shape type="{}"><transform name="to_world"><scale value="{}"/></transform><ref id="glass"/></shape>'
+    parts = [part.format("cube", 1), part.format("rectangle", 20), part.format("rectangle", 10)]
+    scene = mi.load_string(f'<scene version="3.0.0"><bsdf type="refract" id="glass"/>{"".join(parts)}</scene>')
+    assert [shape.class_name() for shape in scene.shapes()] == ["Mesh"]
+    assert inspect(scene).delta_extent == 64
