@@ -213,8 +213,7 @@ class Judgement:
     def crossed(self) -> Flags:
         """Whether a direction is on the wrong side of the surface where the bound allows it."""
         exact = self.bounds.exact
-        crossed: Flags = self.bounds.side_open & self.compared & exact.transmitted & (self.error > exact.cos_t)
-        return crossed
+        return np.asarray(self.bounds.side_open & self.compared & exact.transmitted & (self.error > exact.cos_t))
 
     @property
     @np.errstate(over="ignore", invalid="ignore")

@@ -209,8 +209,7 @@ def _codes(image: Image) -> Pixels:
     white = 127.5 if image.channels == (ALPHA,) else 255.0
     is_coded = encoding(image) == "sRGB"
     values = (np.nan_to_num(image.select(_colours(image))) if is_coded else _linear(image)).clip(0, 1)
-    codes: Pixels = white * (values if is_coded else srgb_encode(values))
-    return codes
+    return np.asarray(white * (values if is_coded else srgb_encode(values)))
 
 
 def _colours(image: Image) -> tuple[str, ...]:

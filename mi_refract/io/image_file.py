@@ -414,8 +414,7 @@ def block_sum(pixels: Pixels, side: int) -> Pixels:
     Blocks at the right and lower edge may be smaller.
     """
     rows, columns = np.arange(0, pixels.shape[-3], side), np.arange(0, pixels.shape[-2], side)
-    sums: Pixels = np.add.reduceat(np.add.reduceat(pixels, rows, -3), columns, -2)
-    return sums
+    return np.asarray(np.add.reduceat(np.add.reduceat(pixels, rows, -3), columns, -2))
 
 
 def block_area(height: int, width: int, side: int) -> Pixels:

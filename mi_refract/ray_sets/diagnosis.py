@@ -53,8 +53,7 @@ def refract(a: Array, n: Array, k: Array) -> Array:
     k, c = k[:, None], (a * n).sum(1, keepdims=True)
     across = np.cross(n, a)
     root = np.sqrt(c * c - (k * k - 1) * (across * across).sum(1, keepdims=True))
-    b: Array = k * a + n * (np.copysign(root, c) - k * c)
-    return b
+    return np.asarray(k * a + n * (np.copysign(root, c) - k * c))
 
 
 # The answers of each mistake ---------------------------------------------------------------------------------------

@@ -84,8 +84,7 @@ class RaySet:
 def in_regime(header: Header, name: str, ids: Ids) -> NDArray[np.bool_]:
     """(N,) whether each id is in the range of a regime."""
     first, last = header["regimes"][name]
-    inside: NDArray[np.bool_] = (ids >= first) & (ids <= last)
-    return inside
+    return np.asarray((ids >= first) & (ids <= last))
 
 
 @dataclass(frozen=True)

@@ -61,8 +61,7 @@ def either(rng: Generator, count: int) -> Array:
 def normalised(v: Array) -> Array:
     """v/|v| for v (N, 3), in extended precision, so that only the rounding of its components changes its length."""
     wide = v.astype(np.longdouble)
-    unit: Array = wide / np.sqrt((wide * wide).sum(1, keepdims=True))
-    return unit
+    return np.asarray(wide / np.sqrt((wide * wide).sum(1, keepdims=True)))
 
 
 def length(v: Array) -> Array:
