@@ -40,6 +40,7 @@ not smooth, are not in them. A render that is differentiated does not split.
 from __future__ import annotations
 
 import math
+import threading
 from typing import Any
 
 import drjit as dr
@@ -59,6 +60,7 @@ INTEGRATOR = "refract_path"  # its name in Mitsuba
 MOST_PATHS = 4096  # that one sample may split into
 DEEPEST = 64  # split_depth: memory is set aside in every lane
 UNLIMITED = 2**32 - 1
+ONE_THREAD = threading.Lock()  # Mitsuba renders the blocks of a scalar render in several threads
 
 
 def read_count(props: Properties, name: str, default: int, least: int) -> int:
@@ -222,9 +224,15 @@ def integrator_class(v: Variant) -> type:
             return dr.select(end.valid_ray, end.result, 0), end.valid_ray, [end.truncated][: len(self.aov_names())]
 
         def path_loop(self, scene: Scene, sampler: Sampler) -> PathLoop:
-            """The loop of a pass of a render, or of one sample of it in a scalar variant."""
-            if not vectorised and (loop := next((loop for loop in self.loops if loop.scene is scene), None)):
-                return loop
+            """The loop of a pass of a render. In scalar variants all samples of a render share one."""
+            if vectorised:
+                return self.new_loop(scene, sampler)
+            with ONE_THREAD:
+                loop = next((loop for loop in self.loops if loop.scene is scene), None)
+                return loop or self.new_loop(scene, sampler)
+
+        def new_loop(self, scene: Scene, sampler: Sampler) -> PathLoop:
+            """A loop for the scene as it is now."""
             needs = self.scene_features(scene)
             features = self.path_features(needs)
             count = min(self.samples_per_pass, sampler.sample_count()) if vectorised else 1

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import gc
 import math
+import sys
 
 import drjit as dr
 import mitsuba as mi
@@ -325,12 +326,17 @@ def test_parameters_and_their_defaults_are_written_out(scalar_variant):
 
 
 def test_samples_of_a_scalar_render_share_their_loop(scalar_variant, monkeypatch):
-    """Which is half of the time of a sample. An image of one block is rendered by one thread."""
+    """Making it takes half of the time of a sample. Each block is rendered by a thread of its own."""
     made, start = [], path_loop.PathLoop.__init__
     monkeypatch.setattr(path_loop.PathLoop, "__init__", lambda self, *more: made.append(self) or start(self, *more))
-    for count in (1, 2):
-        render(glass_ball(4, sky=LIT), 4, split_depth=1)
-        assert len(made) == count
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)  # threads interrupt each other as often as possible
+    try:
+        for count in range(1, 21):
+            render(glass_ball(8, sky=LIT), 1, split_depth=1, block_size=2)
+            assert len(made) == count
+    finally:
+        sys.setswitchinterval(interval)
     assert made[0].branch is made[1].branch  # making a class takes ten times as long as a sample
 
 
