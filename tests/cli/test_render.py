@@ -94,7 +94,7 @@ def test_missing_light_is_reported_on_stderr_and_in_the_header(render, scene, in
     else:
         assert (code, err) == (0, f"mi-refract: {scene}: missing {missing}\n")
         cast = "light of PointLight that delta lobes (glass, mirrors) cast on other surfaces is black"
-        path_class, where = ("S E", " where such lobes show it") if integrator == "refract_path" else ("E", "")
+        path_class, where = ("S E", " where it is seen through such lobes") if integrator == "refract_path" else ("E", "")
         assert missing.startswith(f"L S+ D (S|D)* {path_class}: {cast}{where}; expected ")
 
 

@@ -142,7 +142,7 @@ def test_json_junit_and_html(tmp_path):
         text = (tmp_path / "out.html").read_text()
         assert_stands_alone(text)
         assert "<script>alert" not in text and reports.sentence(result) in text
-        assert text.count('<tr class="replay">') == 3 and "m up to 8, of the length too;" in text
+        assert text.count('<tr class="replay">') == 3 and "m up to 8, also for the length;" in text
         for words in ("Diagnosis", "2 without an answer", "eta inverted"):
             assert (words in text) == (result is wrong)
 
