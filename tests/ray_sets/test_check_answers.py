@@ -697,7 +697,7 @@ def test_invalid_options_and_answers(work, message):
         work(rays, answers.b)
 
 
-# The ratio of indices that a program used------------------------------------------------------------------------------
+# The ratio of indices that a program used -----------------------------------------------------------------------------
 
 
 def changed_ratios(rays, factor, rows=slice(None)):
