@@ -12,7 +12,8 @@ others. In a render with `caustics` = `lamp` each class of paths belongs to one 
 
 So the lamps' part has the paths whose first vertex is S and whose last one is D, and path tracing leaves out what it
 finds of them: radiance of a lamp that a ray meets after a delta lobe, on a path whose first lobe was none. Light of the
-environment is path tracing's alone.
+environment is path tracing's alone. With `auto` only lamps of zero size are traced: path tracing finds none of their
+paths in the last row, and all paths of the other lamps.
 
 A light path starts at a point on a lamp, in a direction aimed at the bounding sphere of a shape with delta lobes. With
 the probability p_j of sphere j, whose cone has the solid angle ω_j as seen from that point, a direction has the density
@@ -72,9 +73,14 @@ ONE_WAY = PERTURBING | {"Hair", "Measured", "MeasuredPolarized", "PrincipledThin
 LOBES = mi.BSDFFlags
 
 
-def refused_lamps(scene: Scene) -> str:
-    """Why the lamps of a scene cannot be traced; "" where they can be."""
-    lamps = [lamp for lamp in scene.emitters() if not lamp.is_environment()]
+def has_area(lamp: Emitter) -> bool:
+    """Whether a lamp is neither the environment nor of zero size."""
+    return not lamp.is_environment() and not lamp.flags() & +mi.EmitterFlags.Delta
+
+
+def refused_lamps(scene: Scene, every: bool) -> str:
+    """Why the lamps of a scene, or only those of zero size, cannot be traced; "" where they can be."""
+    lamps = [lamp for lamp in scene.emitters() if not lamp.is_environment() and (every or not has_area(lamp))]
     if untraced := {lamp.class_name() for lamp in lamps} - KINDS.keys():
         return f"it traces area, point, spot and directional lamps, not {min(untraced)}"
     shapes = [lamp.get_shape() for lamp in lamps if lamp.class_name() == "AreaLight"]
@@ -311,7 +317,12 @@ class LampTracer:
         (bounds,) = merged([bounding_sphere(shape) for shape in scene.shapes()], 1)
         self.size, self.center = 2 * bounds.radius, v.Point3f(*bounds.center)
         emitters = scene.emitters()
-        indices = [i for i, lamp in enumerate(emitters) if not lamp.is_environment() and lit(lamp)]
+        every = loop.features.caustics_apart
+        indices = [
+            i
+            for i, lamp in enumerate(emitters)
+            if not lamp.is_environment() and (every or not has_area(lamp)) and lit(lamp)
+        ]
         self.lamps = [emitters[i] for i in indices]
         kinds = [KINDS[lamp.class_name()] for lamp in self.lamps]
         self.kinds: Any = v.UInt32(kinds) if self.vectorised else kinds

@@ -73,7 +73,8 @@ class PathFeatures:
     dispersion: bool  # the refraction of some boundary depends on the wavelength
     absorption: bool  # some medium absorbs
     null: bool  # a BSDF may have a null lobe
-    caustics_apart: bool = False  # `lamp_tracing` renders caustics, so this loop skips them
+    lamps_traced: bool = False  # `lamp_tracing` renders caustics of lamps of zero size, at least
+    caustics_apart: bool = False  # and of area lamps, so this loop skips them
     delta_extent: float = math.inf  # extent of the largest shape with delta lobes; see `ray_origins`
 
     @property

@@ -27,8 +27,8 @@ camera sees directly, along `light_paths` paths for each sample of the camera (`
 small; with lamps nearly as large as the scene error × time was up to 2.4 of that of `path`. It takes area, point, spot
 and directional lamps, and perspective, thin-lens and orthographic cameras. In scenes with media of Mitsuba's, in
 frozen functions, within another integrator and where a parameter of the scene is differentiated it is an error. `auto`
-means `lamp` where a lamp is a point, a spot or directional and lamps can be traced, else `path`: so derivatives are
-those of the image by path tracing. What is missing is named in a warning, once a scene (`SceneFeatures.missing`).
+traces light from points, spots and directional lamps only, and from none where `lamp` would be an error: so derivatives
+are those of the image by path tracing. What is missing is named in a warning, once a scene (`SceneFeatures.missing`).
 
 Rays of delta lobes start nearer to the surface that they leave than those of `path` (`ray_origins`): glass may be as
 thin as 2e-6 of its size and its largest coordinate. A thinner shape is named in a warning (`SceneFeatures.thin`).
@@ -161,7 +161,7 @@ def integrator_class(v: Variant) -> type:
             self.begin_render(sensor)
             try:
                 image = super().render(scene, sensor, seed, spp, develop, evaluate)
-                if any(loop.features.caustics_apart for loop in self.loops):
+                if any(loop.features.lamps_traced for loop in self.loops):
                     image = self.add_caustics(scene, sensor, seed, spp, develop)
                 self.end_render()
             finally:
@@ -200,7 +200,7 @@ def integrator_class(v: Variant) -> type:
 
             `lamp_tracing.lamp_image` says what it is. `paths`: of light, where they are not those of `spp`.
             """
-            loop = next((loop for loop in self.loops if loop.features.caustics_apart), None)
+            loop = next((loop for loop in self.loops if loop.features.lamps_traced), None)
             if loop is None:
                 return None
             tracer = lamp_tracing.LampTracer(loop, sensor, lambda ray: self.camera_medium(scene, ray, None))
@@ -265,10 +265,15 @@ def integrator_class(v: Variant) -> type:
             return sigma, way
 
         def caustics_of(self, scene: Scene, sensor: Sensor) -> str:
-            """What `caustics` means in a render: "path" or "lamp". ValueError where it cannot be."""
+            """What `caustics` means in a render: "path", "lamp" or, if only some lamps are traced, "auto".
+
+            ValueError if it is impossible.
+            """
             self.begin_render(sensor)
             try:
-                return "lamp" if self.traces_lamps(scene, inspect(scene)) else "path"
+                if not self.traces_lamps(scene, inspect(scene)):
+                    return "path"
+                return self.caustics if any(map(lamp_tracing.has_area, scene.emitters())) else "lamp"
             finally:
                 self.rendering = False
 
@@ -287,7 +292,7 @@ def integrator_class(v: Variant) -> type:
                 "the scene has media": needs.media,
                 f"a {needs.delta_perturbed} has delta lobes": bool(needs.delta_perturbed),
                 self.unconnected: bool(self.unconnected),
-                (lamps := "" if frozen else lamp_tracing.refused_lamps(scene)): bool(lamps),
+                (lamps := "" if frozen else lamp_tracing.refused_lamps(scene, self.caustics == "lamp")): bool(lamps),
             }
             reason = next((text for text, found in reasons.items() if found), "")
             if reason and self.caustics == "lamp":
@@ -326,7 +331,8 @@ def integrator_class(v: Variant) -> type:
                 dispersion=needs.dispersive,
                 absorption=needs.absorbing or needs.media or self.camera is not None,
                 null=needs.null,
-                caustics_apart=self.apart,
+                lamps_traced=self.apart,
+                caustics_apart=self.apart and self.caustics == "lamp",
                 delta_extent=needs.delta_extent,
             )
 

@@ -231,8 +231,8 @@ def missing_light(scene: Scene) -> dict[str, str]:
         name, _, parameters = str(integrator).partition("[")
         if name in SHADOW_RAYS and (depth := re.search(r"max_depth = (-?\d+)", parameters)):
             may_trace = integrator is scene.integrator() and hasattr(integrator, "caustics_of")
-            caustics = integrator.caustics_of(scene, scene.sensors()[0]) if may_trace else "path"
-            missing |= features.missing(caustics, int(depth[1]), volumes=SHADOW_RAYS[name])
+            by_path = not may_trace or integrator.caustics_of(scene, scene.sensors()[0]) == "path"
+            missing |= features.missing("path" if by_path else "lamp", int(depth[1]), volumes=SHADOW_RAYS[name])
     return missing
 
 

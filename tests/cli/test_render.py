@@ -94,8 +94,10 @@ def test_missing_light_is_reported_on_stderr_and_in_the_header(render, scene, in
     else:
         assert (code, err) == (0, f"mi-refract: {scene}: missing {missing}\n")
         cast = "light of PointLight that delta lobes (glass, mirrors) cast on other surfaces is black"
-        path_class, where = ("S E", " where it is seen through such lobes") if integrator == "refract_path" else ("E", "")
-        assert missing.startswith(f"L S+ D (S|D)* {path_class}: {cast}{where}; expected ")
+        if integrator == "path":
+            assert missing.startswith(f"L S+ D (S|D)* E: {cast}; expected ")
+        else:
+            assert missing.startswith(f"L S+ D (S|D)* S E: {cast} where it is seen through such lobes; expected ")
 
 
 @pytest.mark.parametrize("usable", [True, False])

@@ -351,6 +351,15 @@ def test_by_default_lamps_are_traced_that_path_tracing_cannot_find(
     np.testing.assert_array_equal(*images)
 
 
+def test_by_default_only_lamps_of_zero_size_are_traced(llvm_variant):
+    dark = {"glow": glow((-1, 0, 3)), "point": point() | {"intensity": 1e-12}}
+    by_path, default = (np.array(mi.render(scene(dark, **x), spp=4)) for x in ({"caustics": "path"}, {}))
+    np.testing.assert_allclose(default, by_path, rtol=1e-6, atol=1e-10)  # the same samples, and as little noise
+    both = {"glow": glow((-1, 0, 3)), "point": point()}
+    every, zero_size = (tiles(scene(both, **x), 64, range(a, a + 8)) for a, x in ((0, {"caustics": "lamp"}), (8, {})))
+    assert difference(every, zero_size) < 1
+
+
 def test_a_retarder_turns_light_another_way_from_the_lamp(needs_variant):
     needs_variant("llvm_ad_mono_polarized")
     switch("llvm_ad_mono_polarized")
