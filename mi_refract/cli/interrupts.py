@@ -26,7 +26,7 @@ def end_at_once(*, even_if_ignored: bool) -> None:
 
     Call it in the main thread, before numpy, Mitsuba or Dr.Jit is imported: the threads that they start inherit the
     blocked signals. A signal that the caller ignores, such as SIGINT in a shell's background job or SIGHUP under
-    `nohup`, stays ignored. With `even_if_ignored`, it ends the process.
+    `nohup`, stays ignored. With `even_if_ignored`, SIGINT ends the process even then.
     """
     if not hasattr(signal, "pthread_sigmask"):
         return

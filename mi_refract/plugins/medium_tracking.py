@@ -12,6 +12,7 @@ error. An absorbing sheet that is thinner than that distance (`ray_origins`) is 
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import drjit as dr
@@ -40,8 +41,8 @@ STRAY = 0.01  # the largest share of wrong crossings of a shape that is not an e
 FEW = 2  # so many wrong crossings are not an error either, unless they are half of the crossings
 NEVER = 2**32 - 1  # the depth of a shape's first wrong crossing, if none exists
 # The share of the way from a ray's origin back to the surface that is searched for another surface. Rounding moves a
-# point by up to an eighth of this distance (`ray_origins`).
-SEARCHED = 3 / 4
+# point by up to an eighth of this distance (`ray_origins`), or by a thousandth of Mitsuba's, which is larger.
+SEARCHED, SEARCHED_FAR = 3 / 4, 1 - 1 / 64
 # A null lobe does not change the medium. Rough and diffuse transmission do.
 THROUGH = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DiffuseTransmission
 
@@ -53,9 +54,10 @@ class Crossings:
     thin that the ray starts beyond it.
     """
 
-    def __init__(self, v: Variant, scene: Scene) -> None:
-        """`v`: the variant's module."""
+    def __init__(self, v: Variant, scene: Scene, thinnest: str) -> None:
+        """`v`: the variant's module. `thinnest`: how thick a sheet must be, for messages."""
         self.v, self.vectorised, self.shapes = v, dr.is_jit_v(v.Float), all_shapes(scene)
+        self.thinnest = thinnest
         self.tally: dict[int, list[int]] = {}  # scalar variants: position of the shape in the scene → its counts
         self.positions: dict[int, int] = {}  # Mitsuba's number of a shape → its position
         self.counts: list[Any] = []  # compiled variants: four arrays, indexed by the number of the shape
@@ -99,7 +101,7 @@ class Crossings:
             if contradicts(crossed, stepped_over):
                 raise ValueError(
                     f"refract_path: {name} absorbs, and is so thin that rays miss one of its sides; expected a sheet "
-                    "thicker than 1e-5 of its size and its largest coordinate: move the scene to the origin"
+                    f"thicker than {self.thinnest}: move the scene to the origin"
                 )
             if contradicts(crossed, wrong) and (cause is None or depth < first):
                 first, cause = depth, name
@@ -115,10 +117,13 @@ class Crossings:
 class MediumTracker:
     """Absorption that the BSDFs declare, for one render."""
 
-    def __init__(self, v: Variant, scene: Scene) -> None:
-        """`v`: the variant's module."""
+    def __init__(self, v: Variant, scene: Scene, extent: float) -> None:
+        """`v`: the variant's module. `extent`: that of the shapes with delta lobes; ∞ if rays start as Mitsuba's do."""
         self.v, self.scene, self.vectorised = v, scene, dr.is_jit_v(v.Float)
-        self.crossings = Crossings(v, scene)
+        near = extent < math.inf
+        self.searched = SEARCHED if near else SEARCHED_FAR
+        thinnest = "1e-5 of its size and its largest coordinate" if near else "1e-4 of 1 + its largest coordinate"
+        self.crossings = Crossings(v, scene, thinnest)
 
     def cross(
         self, sigma: Spectrum, depth: Count, si: Interaction, bs: BSDFSample, bsdf: BSDF, ray: Ray, active: Mask
@@ -142,7 +147,7 @@ class MediumTracker:
         length = dr.norm(back)
         absorbs = through & (dr.max(beyond) > 0) & (length > 0)
         ray_back = v.Ray3f(ray.o, back / dr.select(length > 0, length, 1), ray.time, ray.wavelengths)
-        ray_back.maxt = length * SEARCHED
+        ray_back.maxt = length * self.searched
         thin = absorbs & self.scene.ray_test(dr.detach(ray_back), absorbs)
         self.crossings.add(si.shape, depth, through, through & (dr.max(excess) > 0), thin)
         return dr.select(through, beyond, sigma)

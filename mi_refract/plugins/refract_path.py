@@ -31,7 +31,8 @@ traces light from points, spots and directional lamps only, and from none where 
 are those of the image by path tracing. What is missing is named in a warning, once a scene (`SceneFeatures.missing`).
 
 Rays of delta lobes start nearer to the surface that they leave than those of `path` (`ray_origins`): glass may be as
-thin as 2e-6 of its size and its largest coordinate. A thinner shape is named in a warning (`SceneFeatures.thin`).
+thin as 4e-6 of the largest shape with such lobes and 2e-6 of its own largest coordinate together. A thinner shape is
+named in a warning (`SceneFeatures.thin`).
 
 Derivatives are attached: rays move with the index. Edges that move across a pixel, or in the view of a surface that is
 not smooth, are not in them. A render that is differentiated does not split.
@@ -239,7 +240,9 @@ def integrator_class(v: Variant) -> type:
             numbers: Any = SceneSampler()
             if vectorised and features.split_depth:
                 numbers = KeyedMultijitter(v, seeds_of(v, sampler), sampler.wavefront_size(), count)
-            media = (ShapeMedia(v) if needs.shape_media else MediumTracker(v, scene)) if features.absorption else None
+            media: ShapeMedia | MediumTracker | None = None
+            if features.absorption:
+                media = ShapeMedia(v) if needs.shape_media else MediumTracker(v, scene, features.delta_extent)
             loop = PathLoop(v, scene, features, numbers, media)
             if self.rendering:
                 self.loops.append(loop)

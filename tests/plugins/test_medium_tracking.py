@@ -255,7 +255,7 @@ def test_a_twosided_wall_beside_an_absorbing_slab_is_no_error(rgb_variant):
 )
 def test_a_small_share_of_wrong_crossings_is_no_error(crossed, wrong, contradicts, scalar_variant):
     slab = scene(slab=box(matched()))
-    crossings = medium_tracking.Crossings(mi.scalar_rgb, slab)
+    crossings = medium_tracking.Crossings(mi.scalar_rgb, slab, "1 mm")
     for i in range(crossed):
         crossings.add(slab.shapes()[0], 1, True, i < wrong, False)
     if contradicts:
@@ -293,6 +293,15 @@ def test_an_absorbing_sheet_that_rays_step_over_is_an_error(at, thickness, stepp
         assert "'pane' absorbs, and is so thin that rays miss one of its sides" in refused(at + 5.0, pane=pane)
     else:
         assert radiance(at + 5.0, pane=pane) == pytest.approx(math.exp(-100 * thickness), rel=2e-2)
+
+
+def test_a_sheet_that_rays_step_over_is_an_error_too_where_they_start_as_those_of_mitsuba(rgb_variant):
+    """With a cylinder of glass in the scene, all rays start 9e-5 × (1 + the largest coordinate) from the surface."""
+    rod = {"type": "cylinder", "p0": [15, 0, 0], "p1": [16, 0, 0], "bsdf": matched()}
+    pane = box(matched(int_absorption=100.0), 1e-4, 12, id="pane")
+    text = refused(17.0, pane=pane, rod=rod)
+    assert "'pane' absorbs, and is so thin that rays miss one of its sides" in text
+    assert "thicker than 1e-4 of 1 + its largest coordinate" in text
 
 
 @pytest.mark.parametrize("order", [("inner", "outer", "far"), ("far", "inner", "outer"), ("outer", "far", "inner")])

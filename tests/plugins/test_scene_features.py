@@ -1,6 +1,7 @@
 """The features that a scene needs, in every variant; unknown plugins need all of them."""
 
 import dataclasses
+import math
 
 import mitsuba as mi
 import numpy as np
@@ -131,6 +132,12 @@ def test_shapes_that_mitsuba_merges_are_as_large_as_before(rgb_variant):
     merged, apart = (mi.load_dict(parts, optimize=merge) for merge in (True, False))
     assert len(merged.shapes()) < len(apart.shapes())
     assert inspect(merged).delta_extent == inspect(apart).delta_extent
+
+
+def test_a_mesh_without_vertices_has_no_size(scalar_variant):
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict({"type": "dielectric"})
+    assert needs(empty=mi.Mesh("empty", 0, 0, props=properties)).delta_extent == math.inf
 
 
 @pytest.mark.parametrize("kind", ["bsplinecurve", "linearcurve"])
