@@ -260,13 +260,13 @@ def check_shapes(scene: Scene) -> None:
         lamp = shape.emitter()
         if lamp is not None and lamp.sampling_weight() > 0 and (names := mesh_attributes(lamp)):
             raise ValueError(
-                f"refract_path: {shape_name(shapes, i)} emits the attribute {names[0]!r} of its mesh, which Mitsuba "
+                f"{shape_name(shapes, i)} emits the attribute {names[0]!r} of its mesh, which Mitsuba "
                 "reads in one face only where it samples a lamp; expected a bitmap, or sampling_weight = 0"
             )
         for bsdf in nested(shape.bsdf()):
             if bsdf_name(bsdf) in BOUNDARIES and shape.class_name() in CURVES:
                 raise ValueError(
-                    f"refract_path: {shape_name(shapes, i)} is a {shape.class_name()} of glass, which rays do not "
+                    f"{shape_name(shapes, i)} is a {shape.class_name()} of glass, which rays do not "
                     "meet from within; expected a mesh"
                 )
             for name in mesh_attributes(bsdf) if bsdf_name(bsdf) == "Refract" else []:
