@@ -20,15 +20,15 @@ def arrays(mesh: Any) -> tuple[NDArray[Any], NDArray[np.uint32]]:
 
 def bounding_box(shape: Any) -> Any:
     """The bounding box of a shape. Mitsuba's box of a mesh that it has merged from several shapes omits rectangles."""
-    import mitsuba as mi
     import numpy as np
 
+    box = shape.bbox()
     if shape.class_name() != "Mesh":
-        return shape.bbox()
+        return box
     vertices = np.array(shape.vertex_positions_buffer()).reshape(-1, 3)
     if not len(vertices):
-        return mi.ScalarBoundingBox3f()  # which is not valid
-    return mi.ScalarBoundingBox3f(*([*map(float, ends(0))] for ends in (vertices.min, vertices.max)))
+        return type(box)()  # which is not valid
+    return type(box)(*([*map(float, ends(0))] for ends in (vertices.min, vertices.max)))
 
 
 def has_normals(mesh: Any) -> bool:
