@@ -55,7 +55,7 @@ from .index_parameter import warn_once
 from .medium_tracking import MediumTracker, ShapeMedia, check_media, extinction
 from .path_loop import PathFeatures, PathLoop
 from .sampling import KeyedMultijitter, SceneSampler, seeds_of
-from .scene_features import CAST, SceneFeatures, check_shapes, differentiated, inspect
+from .scene_features import CAST, CURVES, SceneFeatures, all_shapes, check_shapes, differentiated, inspect
 
 INTEGRATOR = "refract_path"  # its name in Mitsuba
 MOST_PATHS = 4096  # that one sample may split into
@@ -350,7 +350,8 @@ def integrator_class(v: Variant) -> type:
                 warnings.append(f"{needs.thin}; expected a thicker shape, or one nearer to the origin")
             for text in warnings if (needs, self.apart) != before else ():
                 mi.Log(mi.LogLevel.Warn, f"{INTEGRATOR}: {text}")  # type: ignore[operator]
-            check_shapes(scene)
+            if needs.textured or CURVES & {shape.class_name() for shape in all_shapes(scene)}:
+                check_shapes(scene)
             if needs.absorbing or needs.media:
                 check_media(v, scene)
             mi.Log(mi.LogLevel.Info, f"{INTEGRATOR}: left out: {self.left_out()}")  # type: ignore[operator]
