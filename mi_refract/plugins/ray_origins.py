@@ -4,10 +4,10 @@ Mitsuba's `spawn_ray` starts a ray 1500 (1 + |p|) u from the surface, where |p| 
 and u = 2⁻²⁴ in float32: 9 mm at 100 m. A ray that enters a pane of 4 mm then starts behind the pane, and its light
 never leaves the glass. So this module starts the rays of delta lobes at the distance
 
-    min(32 (E + |p|), 1500 (1 + |p|)) u,
+    min(32 (E + |p| + t), 1500 (1 + |p|)) u,
 
-where E is the extent of the largest shape with such lobes. At 8 (E + |p|) u no ray was found to hit its own plane
-again.
+where E is the extent of the largest shape with such lobes, and t the length of the ray that has hit the surface: the
+error of a point on a sphere or disk grows with t.
 """
 
 from __future__ import annotations
@@ -21,9 +21,8 @@ import mitsuba as mi
 
 from mi_refract.numerics import Interaction, Mask, Ray, Shape, Variant, Vector3, mitsuba_mesh
 
-# Points of hits on these shapes are that accurate. For `QUADRICS` this was measured on CPUs; CUDA has its own code.
-MESHES = {"BlenderMesh", "Cube", "Mesh", "OBJMesh", "PLYMesh", "SerializedMesh"}
-QUADRICS = {"Disk", "Rectangle", "Sphere"}
+# Shapes whose points are accurate enough: from 8 (E + |p| + t) u on, no ray was found to hit its own surface again.
+ACCURATE = {"BlenderMesh", "Cube", "Mesh", "OBJMesh", "PLYMesh", "SerializedMesh", "Disk", "Rectangle", "Sphere"}
 MITSUBA, OURS = 1500, 32
 
 
@@ -38,7 +37,7 @@ class Size(NamedTuple):
 def size_of(shape: Shape) -> Size | None:
     """Return the size of a shape; None if it is unknown, or if points on the shape are not accurate enough."""
     name = shape.class_name()
-    if name not in (MESHES if "cuda" in str(mi.variant()) else MESHES | QUADRICS):
+    if name not in ACCURATE:
         return None
     if name == "Mesh" and dr.flag(dr.JitFlag.FreezingScope):  # its vertices cannot be read
         return None
@@ -66,7 +65,8 @@ def too_thin(size: Size | None, extent: float) -> str:
     distance = min(OURS / MITSUBA * (extent + size.place), 1 + size.place) * mi.math.RayEpsilon
     if size.thickness >= distance:
         return ""
-    return f"is {size.thickness:.3g} thick, but rays start {distance:.3g} from its surface, so its light is lost"
+    place = f"{distance:.3g} or more from its surface"
+    return f"is {size.thickness:.3g} thick, but rays start {place}, so its light is lost"
 
 
 def spawn_ray(v: Variant, si: Interaction, d: Vector3, extent: float, delta: Mask) -> Ray:
@@ -74,10 +74,8 @@ def spawn_ray(v: Variant, si: Interaction, d: Vector3, extent: float, delta: Mas
     if extent == math.inf:
         return si.spawn_ray(d)
     u, size = v.math.RayEpsilon / MITSUBA, dr.max(dr.abs(si.p))
-    distance = dr.fma(size, OURS * u, OURS * extent * u)
     far = (1 + size) * v.math.RayEpsilon
-    if OURS * extent > MITSUBA:  # otherwise distance ≤ far everywhere
-        distance = dr.minimum(distance, far)
+    distance = dr.minimum(dr.fma(size + si.t, OURS * u, OURS * extent * u), far)
     if delta is not True:
         distance = dr.select(delta, distance, far)
     offset = dr.detach(dr.mulsign(distance, dr.dot(si.n, d)))

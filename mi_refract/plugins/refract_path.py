@@ -31,8 +31,9 @@ traces light from points, spots and directional lamps only, and from none where 
 are those of the image by path tracing. What is missing is named in a warning, once a scene (`SceneFeatures.missing`).
 
 Rays of delta lobes start nearer to the surface that they leave than those of `path` (`ray_origins`): glass may be as
-thin as 4e-6 of the largest shape with such lobes and 2e-6 of its own largest coordinate together. A thinner shape is
-named in a warning (`SceneFeatures.thin`).
+thin as 4e-6 of the largest shape with such lobes and 2e-6 of its own largest coordinate together, or 2e-6 of the length
+of a ray that enters it, where that is more. A shape of less than the former is named in a warning
+(`SceneFeatures.thin`).
 
 Derivatives are attached: rays move with the index. Edges that move across a pixel, or in the view of a surface that is
 not smooth, are not in them. A render that is differentiated does not split.

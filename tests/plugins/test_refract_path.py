@@ -132,26 +132,33 @@ WHITE_FLOOR = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 1
 
 
 @pytest.mark.parametrize(
-    ("shape", "scale", "place"),
+    ("shape", "scale", "place", "far"),
     [
-        ("cube", (1, 1, 5e-5), (0, 0, 0)),
-        ("cube", (1, 1, 5e-4), (12, 0, 0)),
-        ("cube", (1, 1, 2e-3), (100, 30, 5)),
-        ("cube", (1, 1, 1), (0, 0, 1000)),
-        ("cube", (1000, 1000, 1000), (1, 2, 3)),
-        ("sphere", (1e-4, 1e-4, 1e-4), (0, 0, 0)),
-        ("sphere", (1000, 1000, 1000), (0, 0, 1000)),
+        ("cube", (1, 1, 5e-5), (0, 0, 0), 4),
+        ("cube", (1, 1, 5e-4), (12, 0, 0), 4),
+        ("cube", (1, 1, 2e-3), (100, 30, 5), 4),
+        ("cube", (1, 1, 1), (0, 0, 1000), 4),
+        ("cube", (1000, 1000, 1000), (1, 2, 3), 4),
+        ("sphere", (1e-4, 1e-4, 1e-4), (0, 0, 0), 4),
+        ("sphere", (1000, 1000, 1000), (0, 0, 1000), 4),
+        ("cube", (1, 1, 1), (0, 0, 0), 2000),
+        ("sphere", (1, 1, 1), (0, 0, 0), 300),
+        ("sphere", (1, 1, 1), (0, 0, 0), 2000),
     ],
 )
 @pytest.mark.parametrize("floor", [False, True])
-def test_glass_in_even_light_is_invisible_however_thin_and_far_from_the_origin(shape, scale, place, floor, rgb_variant):
-    """Each boundary is met once: a ray that steps over one, or meets it again, carries 1.5² times too much or less."""
+def test_glass_in_even_light_is_invisible_however_thin_and_far(shape, scale, place, far, floor, rgb_variant):
+    """Each boundary is met once: a ray that steps over one, or meets it again, carries 1.5² times too much or less.
+
+    `far`: distance of the camera, in sizes of the shape.
+    """
     at = PLACE().translate([*place]).rotate([0.48, 0.6, 0.64], 40)
     parts = {"glass": {"type": shape, "to_world": at.scale([*scale]), "bsdf": GLASS}, "sky": {"type": "constant"}}
-    far = max(scale)
+    size = max(scale)
     if floor:
-        parts["floor"] = WHITE_FLOOR | {"to_world": at.translate([0, 0, -4 * far]).scale(20 * far)}
-    eye = camera(16, origin=at @ mi.ScalarPoint3f(0.3 * far, 0.2 * far, 4 * far), target=place)
+        parts["floor"] = WHITE_FLOOR | {"to_world": at.translate([0, 0, -4 * size]).scale(20 * size)}
+    origin = at @ mi.ScalarPoint3f(0.3 * size, 0.2 * size, far * size)
+    eye = camera(16, origin=origin, target=place, fov=math.degrees(2 * math.atan(1 / far)))
     count = 16 if dr.is_jit_v(mi.Float) else 1
     image = render(mi.load_dict({"type": "scene", "sensor": eye} | parts), count, max_depth=-1, rr_depth=1000)
     assert image == pytest.approx(1, abs=1e-3)

@@ -354,7 +354,7 @@ def test_refract_path_warns_once_a_scene_about_missing_light(logged, scalar_vari
     ("thickness", "place", "others", "thin"),
     [
         (1e-3, 12, {}, ""),
-        (1e-5, 12, {}, "'pane' is 1e-05 thick, but rays start 2.86e-05 from its surface"),
+        (1e-5, 12, {}, "'pane' is 1e-05 thick, but rays start 2.86e-05 or more from its surface"),
         (1e-5, 0, {}, ""),
         # In a scene with a cylinder rays start as in Mitsuba.
         (1e-3, 12, {"pipe": {"type": "cylinder", "bsdf": GLASS}}, "'pane' is 0.001 thick, but rays start 0.00125"),
