@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+MOST_FACES = 2**14
+
 
 def arrays(mesh: Any) -> tuple[NDArray[Any], NDArray[np.uint32]]:
     """The vertices (V, 3) of a mesh in Mitsuba's precision, and its faces (F, 3) as numbers of vertices."""
@@ -29,6 +31,25 @@ def bounding_box(shape: Any) -> Any:
     if not len(vertices):
         return type(box)()  # which is not valid
     return type(box)(*([*map(float, ends(0))] for ends in (vertices.min, vertices.max)))
+
+
+def sliver_length(mesh: Any) -> float:
+    """The length L²/h that is exceeded on a thousandth of the surface; L: longest edge of a face, h: its height on it.
+
+    The error of the distance at which a ray hits a face grows with it. Of a large mesh some faces stand for all.
+    """
+    import numpy as np
+
+    vertices, faces = arrays(mesh)
+    faces = faces[:: len(faces) // MOST_FACES + 1]
+    p, q, r = (vertices[faces[:, i]].astype(float) for i in range(3))
+    longest = np.max([np.linalg.norm(edge, axis=1) for edge in (q - p, r - q, p - r)], axis=0)
+    areas = np.linalg.norm(np.cross(q - p, r - p), axis=1)
+    hit = areas > 0
+    lengths, areas = longest[hit] ** 3 / areas[hit], areas[hit]
+    order = np.argsort(-lengths)
+    exceeding = np.cumsum(areas[order])
+    return float(lengths[order][np.searchsorted(exceeding, 1e-3 * exceeding[-1])]) if len(order) else 0.0
 
 
 def has_normals(mesh: Any) -> bool:

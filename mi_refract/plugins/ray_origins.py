@@ -7,7 +7,8 @@ never leaves the glass. So this module starts the rays of delta lobes at the dis
     min(32 (E + |p| + t), 1500 (1 + |p|)) u,
 
 where E is the extent of the largest shape with such lobes, and t the length of the ray that has hit the surface: the
-error of a point on a sphere or disk grows with t.
+error of a point on a sphere or disk grows with t. Where faces of a mesh are long and narrow, with the longest edge L
+and the height h on it, hits err by up to u/8 L²/h. So E is L²/(64 h) where that is more.
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ MITSUBA, OURS = 1500, 32
 
 
 class Size(NamedTuple):
-    """Sizes of the bounding box of a shape: the largest, the smallest that is not flat, and its largest coordinate."""
+    """Sizes of a shape: its own E; of its bounding box the least extent that is not flat, and the place."""
 
     extent: float
     thickness: float
-    place: float
+    place: float  # its largest coordinate
 
 
 def size_of(shape: Shape) -> Size | None:
@@ -39,7 +40,8 @@ def size_of(shape: Shape) -> Size | None:
     name = shape.class_name()
     if name not in ACCURATE:
         return None
-    if name == "Mesh" and dr.flag(dr.JitFlag.FreezingScope):  # its vertices cannot be read
+    vertices = shape.is_mesh() and not dr.flag(dr.JitFlag.FreezingScope)  # while it is recorded, none can be read
+    if shape.is_mesh() and not vertices and name != "Cube":
         return None
     box = mitsuba_mesh.bounding_box(shape)
     if not box.valid():
@@ -49,7 +51,8 @@ def size_of(shape: Shape) -> Size | None:
     sizes = [y - x for x, y in zip(low, high, strict=True)]
     flat = name in ("Disk", "Rectangle")
     thick = [size for size in sizes if size > 2 * mi.math.RayEpsilon / MITSUBA * place and not flat]
-    return Size(max(sizes), min(thick, default=math.inf), place)
+    narrow = mitsuba_mesh.sliver_length(shape) / 64 if vertices else 0
+    return Size(max(*sizes, narrow), min(thick, default=math.inf), place)
 
 
 def extent_of(sizes: Sequence[Size | None]) -> float:

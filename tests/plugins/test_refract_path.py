@@ -15,6 +15,7 @@ from support.glass_scenes import BLACK, GLASS, PLACE, SKY, camera, equal_means, 
 from support.variants import switch
 
 from mi_refract.image_diff import pixelwise, tile_statistics
+from mi_refract.numerics import mitsuba_mesh
 from mi_refract.plugins import path_loop, refract_path, sampling, scene_features
 from mi_refract.rendering import scene_files
 from validation.run.context import SCENES
@@ -128,6 +129,19 @@ def test_nothing_to_see_is_black(rgb_variant):
     assert (render(glass_ball(sky=LIT), 2, max_depth=0) == 0).all()
 
 
+def fans(to_world, corners=2048):
+    """A disk of glass whose faces are a thousand times as long as they are high."""
+    angle, number = 2 * np.pi * np.arange(corners) / corners, np.arange(corners)
+    ring = np.c_[np.cos(angle), np.sin(angle)]
+    vertices = np.r_[np.c_[ring, 0 * angle - 0.5], np.c_[ring, 0 * angle + 0.5]]
+    first, i, j = 0 * number, number, (number + 1) % corners
+    faces = np.r_[np.c_[first, j, i], np.c_[first, i, j] + corners, np.c_[i, j, j + corners]]
+    faces = np.r_[faces, np.c_[i, j + corners, i + corners]]
+    matrix, glass = np.array(to_world.matrix), mi.Properties()
+    glass["bsdf"] = mi.load_dict(GLASS)
+    return mitsuba_mesh.make(mi, vertices @ matrix[:3, :3].T + matrix[:3, 3], faces, properties=glass)
+
+
 WHITE_FLOOR = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 1.0}}
 
 
@@ -144,6 +158,8 @@ WHITE_FLOOR = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 1
         ("cube", (1, 1, 1), (0, 0, 0), 2000),
         ("sphere", (1, 1, 1), (0, 0, 0), 300),
         ("sphere", (1, 1, 1), (0, 0, 0), 2000),
+        ("cube", (1, 1, 3e-4), (0, 0, 0), 1000),
+        ("fans", (1, 1, 1), (0, 0, 0), 4),
     ],
 )
 @pytest.mark.parametrize("floor", [False, True])
@@ -153,7 +169,9 @@ def test_glass_in_even_light_is_invisible_however_thin_and_far(shape, scale, pla
     `far`: distance of the camera, in sizes of the shape.
     """
     at = PLACE().translate([*place]).rotate([0.48, 0.6, 0.64], 40)
-    parts = {"glass": {"type": shape, "to_world": at.scale([*scale]), "bsdf": GLASS}, "sky": {"type": "constant"}}
+    to_world = at.scale([*scale])
+    glass = fans(to_world) if shape == "fans" else {"type": shape, "to_world": to_world, "bsdf": GLASS}
+    parts = {"glass": glass, "sky": {"type": "constant"}}
     size = max(scale)
     if floor:
         parts["floor"] = WHITE_FLOOR | {"to_world": at.translate([0, 0, -4 * size]).scale(20 * size)}
