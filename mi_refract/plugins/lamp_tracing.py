@@ -20,8 +20,9 @@ the probability p_j of sphere j, whose cone has the solid angle ω_j as seen fro
 
     q = Σ p_j / ω_j    over the spheres that it meets,
 
-so where spheres overlap no light is counted twice. A directional lamp has disks in the place of cones. Adjoint BSDFs,
-with the correction for shading normals: Veach 1997, section 5.3.2.
+so where spheres overlap no light is counted twice. A directional lamp has disks in the place of cones. Light of a lamp
+far away starts just before the spheres, as float32 would not find them from the lamp; a ray back to the lamp tests what
+is between. Adjoint BSDFs, with the correction for shading normals: Veach 1997, section 5.3.2.
 """
 
 from __future__ import annotations
@@ -61,6 +62,7 @@ from .sampling import IndependentNumbers, KeyedMultijitter
 from .scene_features import KNOWN, KNOWN_SHAPES, PERTURBING, all_shapes, bsdf_name, children, mesh_attributes, nested
 
 MOST_TARGETS = 16  # spheres at which directions are aimed
+FAR = 8  # a lamp so many times as far away as the spheres is far
 MARGIN = 1 + 1e-4  # of a sphere's radius: rounding must not leave its rim out
 LANES = 2**24  # light paths at a time
 PILOT, MOST_PILOT = 256, 2**14  # light paths by which the power of a lamp is estimated, and of all
@@ -206,8 +208,19 @@ class Table:
         return dr.gather(self.v.Float, self.values, index) if dr.is_jit_v(self.v.Float) else self.values[int(index)]
 
 
+@dataclass(frozen=True)
+class Line:
+    """A line from a lamp through a sphere."""
+
+    p: Vector3  # a point near the sphere
+    d: Vector3
+    density: Number
+    way: Number  # from the lamp to p
+    back: Number  # from p back to where it has not met any sphere
+
+
 class Aim:
-    """Directions from points toward spheres, and places on a plane behind which the spheres are."""
+    """Lines from lamps through spheres."""
 
     def __init__(self, v: Variant, spheres: list[Sphere], odds: list[list[float]]) -> None:
         """`v`: the variant's module. `odds`: for each lamp the probability of each sphere."""
@@ -228,47 +241,55 @@ class Aim:
             chosen = dr.select(sample >= below, self.v.UInt32(j + 1), chosen)
         return chosen
 
-    def direction(self, lamp: Count, chosen: Count, o: Vector3, sample: Point2) -> tuple[Vector3, Number]:
-        """A direction from `o` toward the sphere that was chosen, and its density q."""
-        v = self.v
-        axis, sine2 = self._cone(chosen, o)
+    def from_point(self, lamp: Count, chosen: Count, o: Vector3, sample: Point2) -> Line:
+        """A line from `o` toward the sphere that was chosen; its density is one of directions."""
+        v, (center, radius) = self.v, self.sphere(chosen)
+        sine2 = self._sine2(chosen, o)
         height = sample.x * _one_minus_cosine(sine2)  # 1 − cos, which in a narrow cone is below the steps of a cosine
         around = dr.sincos(2 * math.pi * sample.y)
-        r = dr.safe_sqrt(height * (2 - height))
-        d = v.Frame3f(axis).to_world(v.Vector3f(r * around[1], r * around[0], 1 - height))
-        density = v.Float(0)
+        r, cosine = dr.safe_sqrt(height * (2 - height)), 1 - height
+        distance, outside = dr.norm(center - o), sine2 <= 1
+        frame = v.Frame3f(dr.select(outside, (center - o) / dr.select(outside, distance, 1), v.Vector3f(0, 0, 1)))
+        d = frame.to_world(v.Vector3f(r * around[1], r * around[0], cosine))
+        # Where the line is nearest to the centre: o + way d, but without the rounding errors of a long way.
+        sideways = v.Vector3f(cosine * r * around[1], cosine * r * around[0], -dr.square(r))
+        p = dr.select(outside, center + distance * frame.to_world(sideways), o + radius * d)
+        way, back, density = dr.select(outside, distance * cosine, radius), v.Float(0), v.Float(0)
         for j in range(self.count):
-            other, other_sine2 = self._cone(j, o)
-            # The sine squared: a cosine does not resolve a narrow cone.
-            within = (dr.squared_norm(dr.cross(other, d)) <= other_sine2) & (dr.dot(other, d) > 0)
-            inside = (chosen == j) | (other_sine2 > 1) | within
+            other_sine2 = self._sine2(j, o)
+            around_lamp = other_sine2 > 1
+            met, behind = self._meets(j, p, d)
+            inside = (chosen == j) | around_lamp | (met & (behind < way))
             share = self.odds[lamp * self.count + j] / (2 * math.pi * _one_minus_cosine(other_sine2))
             density += dr.select(inside, share, 0)
-        return d, density
+            back = dr.select(inside, dr.maximum(back, behind + self.radius[j]), back)
+        return Line(v.Point3f(p), d, density, way, back)
 
-    def _cone(self, j: Count, o: Vector3) -> tuple[Vector3, Number]:
-        """Axis and squared sine of the half angle of the cone from `o` about sphere j; from within it, 2."""
-        center, radius = self.sphere(j)
-        apart = center - o
-        distance2 = dr.squared_norm(apart)
-        outside = distance2 > dr.square(radius)
-        axis = dr.select(outside, apart * dr.rsqrt(distance2), self.v.Vector3f(0, 0, 1))
-        return axis, dr.select(outside, dr.square(radius) / distance2, 2)
-
-    def place(self, lamp: Count, chosen: Count, d: Vector3, sample: Point2) -> tuple[Vector3, Number]:
-        """A point on the disk of the chosen sphere that is perpendicular to `d`, and its density."""
+    def from_infinity(self, lamp: Count, chosen: Count, d: Vector3, sample: Point2) -> Line:
+        """A line in the direction d through the sphere that was chosen; its density is one of places."""
         v = self.v
         center, radius = self.sphere(chosen)
         disk = v.warp.square_to_uniform_disk_concentric(sample)
         p = center + v.Frame3f(d).to_world(v.Vector3f(disk.x * radius, disk.y * radius, 0))
-        density = v.Float(0)
+        back, density = v.Float(0), v.Float(0)
         for j in range(self.count):
-            other, other_radius = self.sphere(j)
-            apart = dr.squared_norm(dr.cross(p - other, d))
-            inside = (chosen == j) | (apart <= dr.square(other_radius))
-            share = self.odds[lamp * self.count + j] / (math.pi * dr.square(other_radius))
-            density += dr.select(inside, share, 0)
-        return p, density
+            met, behind = self._meets(j, p, d)
+            inside = (chosen == j) | met
+            density += dr.select(inside, self.odds[lamp * self.count + j] / (math.pi * dr.square(self.radius[j])), 0)
+            back = dr.select(inside, dr.maximum(back, behind + self.radius[j]), back)
+        return Line(v.Point3f(p), d, density, v.Float(dr.inf), back)
+
+    def _meets(self, j: Count, p: Vector3, d: Vector3) -> tuple[Mask, Number]:
+        """Whether sphere j is on the line through p, and how far behind p its centre is."""
+        center, radius = self.sphere(j)
+        return dr.squared_norm(dr.cross(p - center, d)) <= dr.square(radius), dr.dot(p - center, d)
+
+    def _sine2(self, j: Count, o: Vector3) -> Number:
+        """Squared sine of the half angle of the cone from `o` about sphere j; from within it, 2."""
+        center, radius = self.sphere(j)
+        distance2 = dr.squared_norm(center - o)
+        outside = distance2 > dr.square(radius)
+        return dr.select(outside, dr.square(radius) / dr.select(outside, distance2, 1), 2)
 
 
 def _quotient(a: Number, b: Number) -> Number:
@@ -313,9 +334,6 @@ class LampTracer:
         self.context.mode = mi.TransportMode.Importance
         self.one_way = loop.ranges(is_one_way)
         self.camera, self.camera_medium = Camera(v, sensor), camera_medium
-        # Not `scene.bbox()`, which leaves out rectangles that Mitsuba has merged into a mesh.
-        (bounds,) = merged([bounding_sphere(shape) for shape in scene.shapes()], 1)
-        self.size, self.center = 2 * bounds.radius, v.Point3f(*bounds.center)
         emitters = scene.emitters()
         every = loop.features.caustics_apart
         indices = [
@@ -353,7 +371,8 @@ class LampTracer:
             place = lamp.bbox().center()
             squares = [(s.radius, math.dist(s.center, map(float, place))) for s in spheres]
             sizes = [float(_one_minus_cosine(2.0 if r >= x else (r / x) ** 2)) for r, x in squares]
-        return [DEFENSIVE / len(sizes) + (1 - DEFENSIVE) * size / sum(sizes) for size in sizes]
+        total = sum(sizes) or 1.0
+        return [DEFENSIVE / len(sizes) + (1 - DEFENSIVE) * size / total for size in sizes]
 
     def _pilot(self) -> tuple[list[float], int]:
         """The power of each lamp toward the spheres as some light paths estimate it, and their number."""
@@ -363,15 +382,18 @@ class LampTracer:
         numbers: Any = KeyedMultijitter(v, v.UInt32(0), count, count) if self.vectorised else IndependentNumbers(v, 0)
         sums = [0.0] * len(self.lamps)
         for _ in range(1 if self.vectorised else count):
-            lamps, _, light = self._emitted(numbers, v.Bool(True))
+            lamps, _, light, _ = self._emitted(numbers, v.Bool(True))
             powers = dr.sum(v.unpolarized_spectrum(light))
             # Added in a fixed order: the bits of an image depend on the sums.
             for lamp, power in np.broadcast(np.ravel(lamps), np.ravel(powers)):
                 sums[lamp] += float(power) if math.isfinite(power) else 0
         return sums, count
 
-    def _emitted(self, numbers: Any, active: Mask) -> tuple[Count, Ray, Spectrum]:
-        """A ray from a lamp toward a sphere, and its radiant power over the density of all that was chosen."""
+    def _emitted(self, numbers: Any, active: Mask) -> tuple[Count, Ray, Spectrum, Number]:
+        """A lamp, a ray from it toward a sphere, its power over the density of all that was chosen, and the way to it.
+
+        A ray from far away starts before the spheres, after a `way` from the lamp: from the lamp it would miss them.
+        """
         v, camera = self.v, self.camera.sensor
         time = camera.shutter_open()
         if camera.shutter_open_time() > 0:
@@ -386,8 +408,9 @@ class LampTracer:
         kind = dr.gather(v.UInt32, self.kinds, lamp) if self.vectorised else self.kinds[int(lamp)]
         chosen = self.aim.choose(lamp, numbers.next_1d(None, 2))
         on_lamp, aimed = numbers.next_2d(None, 1), numbers.next_2d(None, 3)
-        reference.p, reference.time, reference.wavelengths = self.center, time, wavelengths
-        origin, d, density, power = v.Point3f(0), v.Vector3f(0, 0, 1), v.Float(1), v.Spectrum(0)
+        reference.time, reference.wavelengths = time, wavelengths
+        origin, power, zero = v.Point3f(0), v.Spectrum(0), v.Float(0)
+        line = Line(v.Point3f(0), v.Vector3f(0, 0, 1), zero, zero, zero)
 
         here = active & (kind == AREA)
         if AREA in self.any and (self.vectorised or here):
@@ -397,47 +420,48 @@ class LampTracer:
                 if self.vectorised or this:
                     own = self.lamps[i].get_shape().sample_position(time, on_lamp, this)
                     ps, place = dr.select(this, own, ps), dr.select(this, _quotient(1, own.pdf), place)
-            toward, q = self.aim.direction(lamp, chosen, ps.p, aimed)
+            toward = self.aim.from_point(lamp, chosen, ps.p, aimed)
             x, y, z, sign = (column[lamp] for column in self.round)
             ps.n = dr.select(sign == 0, ps.n, sign * dr.normalize(ps.p - v.Point3f(x, y, z)))
             si = v.SurfaceInteraction3f(ps, wavelengths)
             si.shape = emitter.get_shape()
-            si.wi = si.to_local(toward)
+            si.wi = si.to_local(toward.d)
             radiance = emitter.eval(si, here)
-            origin = dr.select(here, si.spawn_ray(toward).o, origin)
-            d, density = dr.select(here, toward, d), dr.select(here, q, density)
+            line, origin = dr.select(here, toward, line), dr.select(here, si.spawn_ray(toward.d).o, origin)
             power = dr.select(here, radiance * (place * dr.abs(si.wi.z)), power)
         here = active & (kind == PLACE)
         if PLACE in self.any and (self.vectorised or here):
             ds, _ = emitter.sample_direction(reference, on_lamp, here)
-            toward, q = self.aim.direction(lamp, chosen, ds.p, aimed)
-            reference.p = ds.p + toward  # at a distance of 1 the irradiance is the intensity
-            _, intensity = emitter.sample_direction(reference, on_lamp, here)
-            origin, d, density = (dr.select(here, *x) for x in ((ds.p, origin), (toward, d), (q, density)))
-            power = dr.select(here, intensity, power)
+            toward = self.aim.from_point(lamp, chosen, ds.p, aimed)
+            reference.p = toward.p
+            _, irradiance = emitter.sample_direction(reference, on_lamp, here)
+            line, origin = dr.select(here, toward, line), dr.select(here, ds.p, origin)
+            power = dr.select(here, irradiance * dr.squared_norm(toward.p - ds.p), power)
         here = active & (kind == DIRECTION)
         if DIRECTION in self.any and (self.vectorised or here):
-            reference.p = self.center
             ds, irradiance = emitter.sample_direction(reference, on_lamp, here)
-            p, q = self.aim.place(lamp, chosen, -ds.d, aimed)
-            origin = dr.select(here, p + ds.d * self.size, origin)
-            d, density = dr.select(here, -ds.d, d), dr.select(here, q, density)
+            line = dr.select(here, self.aim.from_infinity(lamp, chosen, -ds.d, aimed), line)
             power = dr.select(here, irradiance, power)
-        power = power * dr.select(density > 0, 1 / (density * probability), 0)
-        return lamp, v.Ray3f(origin, d, time, wavelengths), power * v.Spectrum(weight)
+        power = power * dr.select(line.density > 0, 1 / (line.density * probability), 0)
+        # No delta lobe is before that place: what the way meets there is dark behind.
+        far = active & (line.way > FAR * line.back)
+        way = dr.select(far, line.way - line.back, 0)
+        if self.vectorised or far:
+            origin = dr.select(far, line.p - line.back * line.d, origin)
+            before = v.Ray3f(origin, -line.d, way * (1 - v.math.ShadowEpsilon), time, wavelengths)
+            power = dr.select(self.scene.ray_test(before, far), 0, power)
+        return lamp, v.Ray3f(origin, line.d, time, wavelengths), power * v.Spectrum(weight), way
 
     def trace(self, numbers: Any, splat: Callable[..., None]) -> None:
         """Light paths, one a lane: `splat(place on the film, value, wavelengths, active)` for each connection."""
         v, features = self.v, self.features
-        lamp, ray, power = self._emitted(numbers, v.Bool(True))
+        _, ray, power, way = self._emitted(numbers, v.Bool(True))
         s = LightPath(ray, power, v.UInt32(0), dr.max(v.unpolarized_spectrum(power)) > 0)
         if features.dispersion:
             s.wavelength_count = v.Float(dr.size_v(v.UnpolarizedSpectrum))
         if features.absorption:
             s.sigma, s.known = v.UnpolarizedSpectrum(0), v.Bool(False)
-            # Light of a directional lamp comes from infinity.
-            kind = dr.gather(v.UInt32, self.kinds, lamp) if self.vectorised else self.kinds[int(lamp)]
-            s.unattenuated, s.skipped = dr.select(kind == DIRECTION, v.Float(dr.inf), 0), v.Float(0)
+            s.unattenuated, s.skipped = v.Float(way), v.Float(0)
         start = dr.max(v.unpolarized_spectrum(power))
 
         def vertex(s: LightPath) -> tuple[LightPath]:

@@ -168,6 +168,9 @@ AGREE = {
         more=ball({"type": "refract", "ext_absorption": 0.3}, (2, 0, 0.6), 0.4),
         camera_absorption=0.3,
     ),
+    "far lamp in air that absorbs": agree(
+        ball=ball({"type": "refract", "ext_absorption": 0.04}), lamp=lamp((6, 0, 28), 5.0, 30.0), camera_absorption=0.04
+    ),
     "lamps and a sky": agree(more=glow((-2, 0, 2), 0.3, 3.0), sky={"type": "constant", "radiance": 0.1}),
     "bumps": agree(floor=floor(bumps(WHITE)), more=WALL | {"bsdf": bumps(WHITE)}, **IN_GLASS),
     "smooth normals, mirror": agree(ball="polyhedron", bsdf={"type": "conductor"}),
@@ -209,12 +212,30 @@ def point(height=5.0, **parameters):
 
 
 SUN = {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0}
+OBLIQUE = SUN | {"direction": [-0.3, 0.2, -1.0]}
+FAR_AWAY = mi.ScalarTransform4f().look_at([3e6, -2e6, 1e7], [0, 0, 0], [0, 1, 0])
+PLAIN = floor({"type": "diffuse", "reflectance": 0.0}) | {
+    "to_world": mi.ScalarTransform4f().translate([0, 0, -1]).scale(1e7)
+}
+ALIKE = {
+    "a far point": (SUN, {"lamp": point(4e3)}),
+    "a farther spot": (OBLIQUE, {"lamp": {"type": "spot", "to_world": FAR_AWAY, "intensity": 1.13e14}}),
+    "a large plain": (OBLIQUE, {"lamp": OBLIQUE, "more": PLAIN}),
+}
 
 
-def test_a_far_lamp_is_directional(llvm_variant):
-    lamps = ((point(4e3), range(8)), (SUN, range(100, 108)))
-    images = [tiles(scene({"lamp": each}, caustics="lamp", max_depth=3), 64, seeds) for each, seeds in lamps]
+@pytest.mark.parametrize("name", ALIKE)
+def test_a_far_lamp_is_directional_and_other_shapes_may_be_far(name, llvm_variant):
+    sun, other = ALIKE[name]
+    every = [({"lamp": sun}, range(8)), (other, range(100, 108))]
+    images = [tiles(scene(parts, caustics="lamp", max_depth=4), 64, seeds) for parts, seeds in every]
     assert difference(*images) < 1
+
+
+@pytest.mark.parametrize("lamp", [SUN, point(4e3)])
+def test_a_roof_takes_the_light_of_a_far_lamp_away(lamp, llvm_variant):
+    roof = {"type": "disk", "to_world": mi.ScalarTransform4f().translate([0, 0, 100]).scale(40)}
+    assert not tiles(scene({"lamp": lamp, "more": roof}, caustics="lamp", max_depth=3), 16, [0]).any()
 
 
 def test_a_small_glass_is_not_missed_beside_a_large_one(llvm_variant):
@@ -228,6 +249,13 @@ def test_a_point_lamp_of_weight_0_is_off(llvm_variant):
     off, on = point(sampling_weight=0.0), point(4.0)
     images = [tiles(scene(parts, caustics="lamp"), 4, [0]) for parts in ({"lamp": on, "more": off}, {"lamp": on})]
     np.testing.assert_allclose(*images, rtol=1e-5)
+
+
+@pytest.mark.parametrize("lamp", [point(), SUN])
+def test_glass_of_no_size_casts_no_light(lamp, llvm_variant):
+    parts = {"lamp": lamp, "ball": ball(radius=1e-30)}
+    images = [tiles(scene(parts, caustics=caustics), 4, [0]) for caustics in ("lamp", "path")]
+    np.testing.assert_array_equal(*images)
 
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian", "lanczos"])
