@@ -410,16 +410,18 @@ class Pilot:
 
     def _trace_lamps(self, integrator: Any) -> None:
         """Measure the lamps' part of the image."""
-        scene, seconds = self.renderer.scene, list[float]()
-        paths = min(max(int(self.samples / 8), LIGHT_PATHS), TIMED)
+        scene, most = self.renderer.scene, min(max(int(self.samples / 8), LIGHT_PATHS), TIMED)
+        seconds = dict[int, float]()
         with self._one_thread():
-            # The first trace compiles. If the cache of kernels is empty, the second one compiles once more.
-            for _ in range(3):
+            # The first trace compiles. If the cache of kernels is empty, the second one compiles once more. So does the
+            # first one of another size.
+            for paths in (most, most, 1, 1, most):
                 before = self.clock()
                 light, variance = integrator.caustic_image(
                     scene, scene.sensors()[0], self.renderer.seed, 1, self.renderer.channels, squares=True, paths=paths
                 )
-                seconds.append(self.clock() - before)
-        self._lamp_seconds = seconds[-1]
+                seconds[paths] = self.clock() - before
+        self._lamp_seconds = sum(seconds.values())
         variance, light = (float(np.nan_to_num(x).mean()) for x in (variance, light))
-        self._lamps = Lamps(variance * paths, light, self._lamp_seconds / paths)
+        fixed_seconds = min(seconds[1], 0.8 * seconds[most])
+        self._lamps = Lamps(variance * most, light, (seconds[most] - fixed_seconds) / most)
