@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.glass_scenes import BLACK, PLACE, attached, camera, glass_ball, parameter, sampled, sky, vector
+from support.glass_scenes import BLACK, GLASS, PLACE, attached, camera, glass_ball, parameter, sampled, sky, vector
 from support.variants import switch
 
 VIEWS = 3
@@ -140,6 +140,19 @@ def test_a_moving_edge_seen_from_a_matt_surface_is_a_warning(matt, llvm_variant,
     dr.backward(dr.mean(mi.render(scene, params, integrator=method, spp=1), axis=None))
     assert np.isfinite(grad(params, key))
     assert sum("derivatives leave out edges of area lights that move" in text for text in logged) == matt
+
+
+@pytest.mark.parametrize("name", ["instance.to_world", "ball.to_world"])
+def test_a_derivative_in_the_place_of_an_instance_is_a_warning(name, llvm_variant, logged):
+    group = {"type": "shapegroup", "ball": {"type": "sphere", "bsdf": GLASS}}
+    instance = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    parts = {"sensor": camera(12, 20), "sky": sky(), "group": group, "instance": instance}
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "refract_path", "max_depth": 5}} | parts)
+    params, (key,) = attached(scene, name)
+    dr.backward(loss(scene, params, spp=1))
+    missing = name.startswith("instance")
+    assert (np.abs(vector(dr.grad(params[key].matrix))).max() < 1e-6) == missing
+    assert sum("does not differentiate to_world of an instance" in text for text in logged) == missing
 
 
 def test_differentiating_a_deterministic_render_is_an_error(llvm_variant):
