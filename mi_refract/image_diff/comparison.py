@@ -179,6 +179,16 @@ def shared_channels(reference: Image, test: Image) -> tuple[Image, Image, str]:
     return only(reference, shared), only(test, shared), f"channels {word}: {', '.join(names)}{value}"
 
 
+def groups(names: Sequence[str]) -> dict[str, list[str]]:
+    """Return groups of channels that are judged together: the colours of each layer; every other channel separately."""
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        layer, dot, last = name.rpartition(".")
+        together = last in ("R", "G", "B", "X", "Y") or (last == "Z" and dot)  # a layer's X, Y, Z are a vector
+        groups.setdefault(layer + dot if together else name, []).append(name)
+    return groups
+
+
 def only(image: Image, names: Sequence[str]) -> Image:
     """Return the image with these channels only."""
     return replace(image, pixels=image.select(names), channels=tuple(names))

@@ -50,10 +50,10 @@ Model RenderTime Software Time cycles.* dc:* generatedBy hdr:CAPDATE hdr:GMT hdr
 thumbnail_* tiff:XMLPacket xmp:* xmpMM:*
 BlenderMultiChannel Camera ExposureTime FNumber Frame FrameRange Lens Marker Note Scene Strip aux:* crs:* png:text:*
 MSE estimatedVariance husk:* renderTimeSeconds samplesPerPixel vrayInfo/*
-CompressionQuality FramesPerSecond bmp:version compression gif:* jpeg:subsampling oiio:BitsPerSample oiio:RowsPerChunk
-openexr:chunkCount openexr:dwaCompressionLevel openexr:levelmode openexr:lineOrder openexr:roundingmode planarconfig
-png:iDOT pnm:bigendian pnm:binary targa:version tiff:BitsPerSample tiff:Compression tiff:PlanarConfiguration
-tiff:Predictor tiff:RowsPerStrip tiff:zipquality
+CompressionQuality FramesPerSecond bmp:bitsperpixel bmp:version compression gif:* jpeg:subsampling oiio:BitsPerSample
+oiio:RowsPerChunk openexr:chunkCount openexr:dwaCompressionLevel openexr:levelmode openexr:lineOrder
+openexr:roundingmode planarconfig png:iDOT pnm:bigendian pnm:binary targa:version tiff:BitsPerSample tiff:Compression
+tiff:PlanarConfiguration tiff:Predictor tiff:RowsPerStrip tiff:zipquality
 ICCProfile:* hdr:exposure name oiio:AverageColor oiio:ConstantColor oiio:LoopCount oiio:Movie oiio:SHA-1
 oiio:subimages tiff:ColorSpace colorInteropID tiff:PageNumber tiff:PhotometricInterpretation tiff:UnassociatedAlpha
 tiff:subfiletype Orientation PixelAspectRatio ResolutionUnit XResolution YResolution
@@ -87,6 +87,8 @@ def _compared_metadata(image: Image, ignored: tuple[str, ...]) -> dict[str, str]
     values = {name: _text(value) for name, value in image.metadata.items() if name not in texts} | {SPACE: space}
     if any(name.rpartition(".")[2] == "A" for name in image.channels):
         values.setdefault(ALPHA, "0")
+    else:
+        values.pop(ALPHA, None)
     return {
         name: text
         for name, text in values.items()

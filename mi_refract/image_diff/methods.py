@@ -28,6 +28,7 @@ from .comparison import (
     aligned,
     as_shown,
     finite,
+    groups,
     identical_as_shown,
     nonfinite_result,
     only,
@@ -289,16 +290,6 @@ def _compare_finite(method: str, a: Image, b: Image, options: Options) -> Compar
 
 
 # Would black pass? -----------------------------------------------------------------------------------------------
-
-
-def groups(names: Sequence[str]) -> dict[str, list[str]]:
-    """Return groups of channels that are judged together: the colours of each layer; every other channel separately."""
-    groups: dict[str, list[str]] = {}
-    for name in names:
-        layer, dot, last = name.rpartition(".")
-        together = last in ("R", "G", "B", "X", "Y") or (last == "Z" and dot)  # a layer's X, Y, Z are a vector
-        groups.setdefault(layer + dot if together else name, []).append(name)
-    return groups
 
 
 def blind_to(method: Method, a: Image, b: Image, options: Options) -> str:

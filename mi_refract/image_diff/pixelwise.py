@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mi_refract.io.image_file import Image, Pixels, any_channel
 from mi_refract.io.text import compact, distinguishable
 
-from .comparison import Comparison, Metric, Verdict, counted, place, verdict_of
+from .comparison import Comparison, Metric, Verdict, counted, groups, place, verdict_of
 from .tile_statistics import median_nonblack, same_shape
 
 CODES = {"uint8": 255, "uint16": 65535}  # the integer for the value 1, by the file's type
@@ -93,10 +93,13 @@ def paired(
     """Renders of the same random numbers: the share of changed pixels and the largest change.
 
     A change is relative to the reference's value, or to the median of its channel without black pixels if that is
-    larger.
+    larger; in a black channel, to that of the other colours of its layer, or else of the new image.
     """
     a, b = reference.pixels, test.pixels
-    scale = _scale(a, b)
+    scale = np.empty(a.shape)
+    for names in groups(reference.channels).values():
+        numbers = [reference.channels.index(name) for name in names]
+        scale[..., numbers] = _scale(a[..., numbers], b[..., numbers])
     measured = changes(a / scale, b / scale, threshold)
     share = measured.share * a[..., 0].size / counted(reference)
     metrics = (
@@ -116,7 +119,7 @@ def paired_accepts(a: Pixels, b: Pixels, options: Mapping[str, Any]) -> NDArray[
 
 
 def _scale(a: Pixels, b: Pixels) -> Pixels:
-    """Return the value that changes are relative to, at every pixel and channel; above 0."""
+    """Return the value that changes are relative to, at every pixel and channel of a group; above 0."""
     medians = median_nonblack(np.abs(a))
     floors = np.where(medians > 0, medians, medians.mean() or median_nonblack(np.abs(b)).mean() or 1.0)
     return np.maximum(np.abs(a), floors)

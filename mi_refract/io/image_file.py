@@ -307,6 +307,8 @@ def _image(
     metadata = {attribute.name: attribute.value for attribute in spec.extra_attribs} | hidden
     if "ICCProfile" in metadata:
         metadata.pop(PNG_PROFILE, None)  # kept if OpenImageIO drops the profile because of errors in it
+    if (across := metadata.get("XResolution")) and (down := metadata.get("YResolution")):  # all that it reports of BMP
+        metadata.setdefault("PixelAspectRatio", down / across)
     types = [str(channel_type) for channel_type in (spec.channelformats or [spec.format] * spec.nchannels)]
     if reason := _misread_reason(format_name, set(types), metadata, spec.height):
         raise ImageError(f"{path}: {reason}")
@@ -332,8 +334,8 @@ def _misread_reason(format_name: str, types: set[str], metadata: Metadata, rows:
         return "integers of 64 bits; expected up to 32"
     if format_name == "tiff" and "double" in types and rows == 1:  # OpenImageIO 2.4 to 3.2 reads uninitialised memory
         return "one row of 64-bit numbers in a TIFF file; expected several rows, or 32 bits"
-    if metadata.get("tiff:PhotometricInterpretation") == 0 and not types <= {"uint8", "uint16"}:
-        return "0 is white in a TIFF file of more than 16 bits; expected 0 as black"  # 8 and 16 bits are inverted
+    if metadata.get("tiff:PhotometricInterpretation") == 0 and not types <= {"uint8"}:
+        return "0 is white in a TIFF file of more than 8 bits; expected 0 as black"  # up to 8 bits are inverted
     space = metadata.get("tiff:ColorSpace", metadata.get("jpeg:ColorSpace"))
     return f"colours in {space}, which OpenImageIO converts with loss; expected R, G, B" if space in CONVERTED else ""
 

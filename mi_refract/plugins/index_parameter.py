@@ -54,10 +54,13 @@ def parameter_type(v: Variant) -> ArrayType:
 
 
 def one_number(name: str, value: Number) -> Number:
-    """Return the value of a parameter of type `parameter_type`; ValueError if an edit gave it several entries."""
+    """Return the value of a parameter of type `parameter_type`; ValueError if an edit gave it several entries.
+
+    It is not read: numbers cannot be read while a function is recorded.
+    """
     if len(value) != 1:
         raise ValueError(f"{PLUGIN}: {name} has {len(value)} entries; expected one number")
-    return value[0]
+    return value if dr.is_jit_v(value) else value[0]
 
 
 class DispersiveRatio:
@@ -110,8 +113,8 @@ class DispersiveRatio:
     def changed(self, keys: Collection[str]) -> None:
         """Read the edited coefficients; those that were not edited keep their double precision."""
         for key in [key for key in self.shown if not keys or key in keys]:
-            number = one_number(key, self.shown[key])
-            self.exact[key] = self.wide(dr.detach(self.shown[key]) if dr.is_jit_v(self.shown[key]) else number)
+            shown = one_number(key, self.shown[key])
+            self.exact[key] = self.wide(dr.detach(shown))
             if key in self.places:
                 values, position = self.places[key]
                 dr.scatter(self.exact[values], self.exact[key], position)

@@ -195,8 +195,8 @@ def parameters_changed(self: Refract, keys: Collection[str]) -> None:
             set_ratio(self, dr.select((eta >= SMALLEST_RATIO) & (eta <= LARGEST_RATIO), eta, dr.nan))
             return
         # The number is read back, so that an edit compiles no kernel. An unedited one keeps its double precision.
-        before: Any = dr.slice(self.k_inner)
-        before, number = float(before), float(one_number("eta", self.eta))
+        values: Any = dr.slice(self.k_inner), dr.slice(one_number("eta", self.eta))
+        before, number = map(float, values)
         edited = dr.scalar.Array1f(before)[0] != number
         set_ratio(self, checked("eta", number) if edited else before)
 

@@ -351,6 +351,13 @@ def integrator_class(v: Variant) -> type:
                 warnings.append(f"{needs.thin}; expected a thicker shape, or one nearer to the origin")
             for text in warnings if (needs, self.apart) != before else ():
                 mi.Log(mi.LogLevel.Warn, f"{INTEGRATOR}: {text}")  # type: ignore[operator]
+            attached = vectorised and not dr.flag(dr.JitFlag.SymbolicLoops)
+            instances = [shape for shape in scene.shapes() if attached and shape.class_name() == "Instance"]
+            if any(dr.grad_enabled(mi.traverse(instance)["to_world"]) for instance in instances):
+                warn_once(
+                    f"{INTEGRATOR}: Mitsuba does not differentiate to_world of an instance; expected that of the "
+                    "shapes in its group"
+                )
             if needs.textured or CURVES & {shape.class_name() for shape in all_shapes(scene)}:
                 check_shapes(scene)
             if needs.absorbing or needs.media:

@@ -238,15 +238,8 @@ def missing_light(scene: Scene) -> dict[str, str]:
 
 def differentiated(scene: Scene) -> bool:
     """Whether a parameter of the scene is differentiated, also while derivatives are suspended, as in `mi.render`."""
-
-    def attached(value: Any) -> bool:
-        if not dr.is_diff_v(value):
-            return False
-        if dr.is_tensor_v(value):
-            return attached(value.array)
-        return any(map(attached, value)) if dr.depth_v(value) > 1 else value.index_ad != 0
-
-    return any(attached(value) for _, value in mi.traverse(scene))
+    with dr.resume_grad():
+        return any(dr.grad_enabled(value) for _, value in mi.traverse(scene))
 
 
 def check_shapes(scene: Scene) -> None:

@@ -10,8 +10,8 @@ import pytest
 from scipy import ndimage
 from support.diff_images import of
 
-from mi_refract.image_diff.comparison import Verdict, preconditions
-from mi_refract.image_diff.methods import METHODS, choice, compare, groups
+from mi_refract.image_diff.comparison import Verdict, groups, preconditions
+from mi_refract.image_diff.methods import METHODS, choice, compare
 from mi_refract.image_diff.pixel_statistics import differ_like_noise
 from mi_refract.image_diff.pixelwise import changes
 from mi_refract.io.image_file import Image

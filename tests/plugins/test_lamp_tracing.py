@@ -361,6 +361,7 @@ def test_another_integrator_cannot_have_lamps_traced_nor_a_derivative(llvm_varia
         ("point", None, 2, "path"),  # no caustic is so short
         ("point", "bsdf.eta", 16, "path"),
         ("point", "reflectance.value", 16, "path"),
+        ("point", "ball.to_world", 16, "path"),
         ("area", None, 16, "path"),
     ],
 )
