@@ -9,6 +9,8 @@ never leaves the glass. So this module starts the rays of delta lobes at the dis
 where E is the extent of the largest shape with such lobes, and t the length of the ray that has hit the surface: the
 error of a point on a sphere or disk grows with t. Where faces of a mesh are long and narrow, with the longest edge L
 and the height h on it, hits err by up to u/8 L²/h. So E is L²/(64 h) where that is more.
+
+Rays of other lobes start at Mitsuba's distance, or nearer where that could be within glass just above the surface.
 """
 
 from __future__ import annotations
@@ -80,6 +82,8 @@ def spawn_ray(v: Variant, si: Interaction, d: Vector3, extent: float, delta: Mas
     far = (1 + size) * v.math.RayEpsilon
     distance = dr.minimum(dr.fma(size + si.t, OURS * u, OURS * extent * u), far)
     if delta is not True:
-        distance = dr.select(delta, distance, far)
+        # If the ray before was shorter than `far`, `far` may be beyond the surface that it has left.
+        before = dr.minimum(far, dr.fma(0.5 * dr.abs(si.wi.z), si.t, distance))
+        distance = dr.select(delta, distance, before)
     offset = dr.detach(dr.mulsign(distance, dr.dot(si.n, d)))
     return v.Ray3f(dr.fma(offset, dr.detach(si.n), si.p), d, si.time, si.wavelengths)

@@ -182,6 +182,16 @@ def test_glass_in_even_light_is_invisible_however_thin_and_far(shape, scale, pla
     assert image == pytest.approx(1, abs=1e-3)
 
 
+@pytest.mark.parametrize("gap", [0, 1e-5, 1e-4])
+def test_glass_just_above_a_floor_is_invisible(gap, rgb_variant):
+    """A ray from the floor starts below the glass: one that starts within it carries 1.5² times too much."""
+    cube = {"type": "cube", "to_world": PLACE().translate([0, 0, 1 + gap]), "bsdf": GLASS}
+    parts = {"glass": cube, "floor": WHITE_FLOOR | {"to_world": PLACE().scale(2)}, "sky": {"type": "constant"}}
+    scene = mi.load_dict({"type": "scene", "sensor": camera(16, origin=(1.5, -1, 6), target=(0, 0, 1))} | parts)
+    image = render(scene, 16 if dr.is_jit_v(mi.Float) else 1, max_depth=-1, rr_depth=1000)
+    assert image == pytest.approx(1, abs=1e-3)
+
+
 # Splitting -----------------------------------------------------------------------------------------------------
 
 
