@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-MOST_FACES = 2**14
+MOST_FACES = 2**14  # of a mesh that `sliver_length` reads
 
 
 def arrays(mesh: Any) -> tuple[NDArray[Any], NDArray[np.uint32]]:

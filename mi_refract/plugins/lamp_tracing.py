@@ -443,7 +443,7 @@ class LampTracer:
             line = dr.select(here, self.aim.from_infinity(lamp, chosen, -ds.d, aimed), line)
             power = dr.select(here, irradiance, power)
         power = power * dr.select(line.density > 0, 1 / (line.density * probability), 0)
-        # No delta lobe is before that place: what the way meets there is dark behind.
+        # Between the lamp and this origin there are no delta lobes, so any surface there blocks the light.
         far = active & (line.way > FAR * line.back)
         way = dr.select(far, line.way - line.back, 0)
         if self.vectorised or far:

@@ -42,8 +42,8 @@ def size_of(shape: Shape) -> Size | None:
     name = shape.class_name()
     if name not in ACCURATE:
         return None
-    vertices = shape.is_mesh() and not dr.flag(dr.JitFlag.FreezingScope)  # while it is recorded, none can be read
-    if shape.is_mesh() and not vertices and name != "Cube":
+    readable = not dr.flag(dr.JitFlag.FreezingScope)  # vertices, unless a function is being recorded
+    if shape.is_mesh() and not readable and name != "Cube":
         return None
     box = mitsuba_mesh.bounding_box(shape)
     if not box.valid():
@@ -53,7 +53,7 @@ def size_of(shape: Shape) -> Size | None:
     sizes = [y - x for x, y in zip(low, high, strict=True)]
     flat = name in ("Disk", "Rectangle")
     thick = [size for size in sizes if size > 2 * mi.math.RayEpsilon / MITSUBA * place and not flat]
-    narrow = mitsuba_mesh.sliver_length(shape) / 64 if vertices else 0
+    narrow = mitsuba_mesh.sliver_length(shape) / 64 if shape.is_mesh() and readable else 0
     return Size(max(*sizes, narrow), min(thick, default=math.inf), place)
 
 
@@ -82,8 +82,8 @@ def spawn_ray(v: Variant, si: Interaction, d: Vector3, extent: float, delta: Mas
     far = (1 + size) * v.math.RayEpsilon
     distance = dr.minimum(dr.fma(size + si.t, OURS * u, OURS * extent * u), far)
     if delta is not True:
-        # If the ray before was shorter than `far`, `far` may be beyond the surface that it has left.
-        before = dr.minimum(far, dr.fma(0.5 * dr.abs(si.wi.z), si.t, distance))
-        distance = dr.select(delta, distance, before)
+        # If the ray that has hit is short, `far` may be beyond the surface that it left: go at most half the way back.
+        nearer = dr.minimum(far, dr.fma(0.5 * dr.abs(si.wi.z), si.t, distance))
+        distance = dr.select(delta, distance, nearer)
     offset = dr.detach(dr.mulsign(distance, dr.dot(si.n, d)))
     return v.Ray3f(dr.fma(offset, dr.detach(si.n), si.p), d, si.time, si.wavelengths)
