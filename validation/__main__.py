@@ -83,7 +83,8 @@ def _command(
         list[str] | None,
         typer.Argument(
             metavar="STUDY",
-            help=f"Studies to run: {', '.join(ROOMS)}. Default: all studies; in the profile quick, a selection.",
+            help=f"Studies to run: {', '.join(ROOMS)}, or a part of one, such as renders.gradients. Default: all "
+            "studies; in the profile quick, a selection.",
         ),
     ] = None,
     profile: Annotated[
@@ -113,8 +114,7 @@ def _command(
     """Measure the formulas and the plugin against certified answers, and write the report."""
     names, target = studies or [], ClusterTarget(scheduler, workers)
     own_renderers: list[System] = []
-    if unknown := [name for name in names if name not in ROOMS]:
-        raise ValueError(f"unknown study {unknown[0]!r}; expected {', '.join(ROOMS)}")
+    chosen = modules(names, profile)
     if profile not in PROFILES:
         raise ValueError(f"unknown profile {profile!r}; expected {', '.join(PROFILES)}")
     if write_tables and profile == "quick":
@@ -128,7 +128,7 @@ def _command(
     if not os.access(out, os.W_OK):
         raise ValueError(f"--out {out}: not writable; expected a writable folder")
     if renderers:
-        if names and "suite" not in names:
+        if not any(name.startswith("suite.") for name in chosen):
             raise ValueError(f"--renderer {renderers[0]} is used by the study `suite` only; add `suite`")
         if target.given:
             raise ValueError(f"--renderer {renderers[0]} cannot be sent to workers; remove --workers or --scheduler")
@@ -148,11 +148,21 @@ def _command(
 
 
 def modules(studies: list[str], profile: str) -> list[str]:
-    """Return the modules below `validation` whose studies are run."""
+    """Return the modules below `validation` whose studies are run.
+
+    `studies`: folders ("renders") or single modules of them ("renders.gradients"). ValueError, one line, for another
+    name.
+    """
     if profile == "quick" and not studies:
         return list(QUICK)
-    rooms = dict.fromkeys(studies or ROOMS)
-    return [f"{room.replace('-', '_')}.{module}" for room in rooms for module in ROOMS[room]]
+    every = {f"{room}.{module}": f"{room.replace('-', '_')}.{module}" for room in ROOMS for module in ROOMS[room]}
+    chosen: list[str] = []
+    for study in studies or ROOMS:
+        found = [path for name, path in every.items() if name == study or name.startswith(f"{study}.")]
+        if not found:
+            raise ValueError(f"unknown study {study!r}; expected {', '.join(ROOMS)}, or a part, as {next(iter(every))}")
+        chosen += found
+    return list(dict.fromkeys(chosen))
 
 
 def _run(

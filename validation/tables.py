@@ -47,7 +47,7 @@ NUMBERS_PAGE = ".github/docs/reference/standard-numbers.md"
 
 
 class Table(NamedTuple):
-    """A table of the file `path`, between its markers. `study`: the command-line name of the study that measures it.
+    """A table of the file `path`, between its markers. `study`: the command-line name of what measures it.
 
     `make` returns the Markdown; None if the table stays as it is, because it needs another machine. It raises
     ValueError, one line, if the rows lack what the table needs.
@@ -69,8 +69,10 @@ def check(studies: list[str]) -> None:
 
 
 def chosen(studies: list[str]) -> dict[str, Table]:
-    """Return the tables of these studies; without any, all tables except those of other renderers."""
-    return {name: t for name, t in TABLES.items() if (t.study in studies if studies else t.study != "suite")}
+    """Return the tables of these studies or parts; without any, all tables except those of other renderers."""
+    if not studies:
+        return {name: table for name, table in TABLES.items() if not table.study.startswith("suite")}
+    return {name: t for name, t in TABLES.items() if any(f"{t.study}.".startswith(f"{study}.") for study in studies)}
 
 
 def write(rows: list[Row], context: Context, studies: list[str]) -> None:
@@ -81,9 +83,10 @@ def write(rows: list[Row], context: Context, studies: list[str]) -> None:
     for marker, table in chosen(studies).items():
         if text := table.make(rows):
             update_between(ROOT / table.path, marker, text)
-    if any(row.study == against_dielectric.NAME and row.images for row in rows):
+    with_images = {row.study for row in rows if row.images}
+    if {against_dielectric.NAME, colours.NAME} <= with_images:
         write_atomically(GALLERY, gallery(rows, context))
-    if any(row.study == caustics.NAME and row.images for row in rows):
+    if caustics.NAME in with_images:
         write_atomically(CAUSTICS, caustic_pairs(rows, context))
 
 
@@ -487,22 +490,22 @@ def numbers_elsewhere(rows: list[Row]) -> str:
 
 
 TABLES = {
-    "accuracy": Table("README.md", "directions", accuracy),
-    "on a GPU": Table(f"{PAGES}/what-each-formula-costs.md", "directions", on_a_gpu),
-    "renders": Table(f"{PAGES}/refract-and-dielectric.md", "renders", renders),
-    "panes": Table(f"{PAGES}/refract-and-dielectric.md", "renders", panes),
-    "derivatives": Table(f"{PAGES}/which-derivatives-are-correct.md", "renders", derivatives),
-    "paths": Table(f"{PAGES}/refract-and-dielectric.md", "stability", paths),
-    "efficiency": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency", efficiency),
-    "changing": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency", changing),
-    "settings": Table(".github/docs/how-to/render-for-hours.md", "efficiency", settings),
-    "caustics": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency", caustics_from_lamps),
-    "caustics by others": Table(f"{PAGES}/what-each-formula-costs.md", "suite", caustics_by_others),
+    "accuracy": Table("README.md", "directions.per_formula", accuracy),
+    "on a GPU": Table(f"{PAGES}/what-each-formula-costs.md", "directions.per_formula", on_a_gpu),
+    "renders": Table(f"{PAGES}/refract-and-dielectric.md", "renders.against_dielectric", renders),
+    "panes": Table(f"{PAGES}/refract-and-dielectric.md", "renders.thin_panes", panes),
+    "derivatives": Table(f"{PAGES}/which-derivatives-are-correct.md", "renders.gradients", derivatives),
+    "paths": Table(f"{PAGES}/refract-and-dielectric.md", "stability.layered_paths", paths),
+    "efficiency": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency.error_against_time", efficiency),
+    "changing": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency.changing_indices", changing),
+    "settings": Table(".github/docs/how-to/render-for-hours.md", "efficiency.chosen_settings", settings),
+    "caustics": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency.caustics", caustics_from_lamps),
+    "caustics by others": Table(f"{PAGES}/what-each-formula-costs.md", "suite.caustic_energies", caustics_by_others),
     "planar": Table(f"{PAGES}/how-accurate-planar-paths-are.md", "planar", planar),
-    "defects": Table(f"{PAGES}/what-image-methods-detect.md", "diff", seen),
-    "visible": Table(f"{PAGES}/how-tolerance-and-flip-decide.md", "diff", visible),
-    "standard numbers": Table(NUMBERS_PAGE, "ground-truth", numbers),
-    "standard numbers by others": Table(NUMBERS_PAGE, "suite", numbers_elsewhere),
+    "defects": Table(f"{PAGES}/what-image-methods-detect.md", "diff.planted_defects", seen),
+    "visible": Table(f"{PAGES}/how-tolerance-and-flip-decide.md", "diff.visible_changes", visible),
+    "standard numbers": Table(NUMBERS_PAGE, "ground-truth.standard_numbers", numbers),
+    "standard numbers by others": Table(NUMBERS_PAGE, "suite.standard_numbers", numbers_elsewhere),
     "suite": Table(
         f"{PAGES}/what-the-validation-shows.md",
         "suite",
