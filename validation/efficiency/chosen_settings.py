@@ -1,10 +1,10 @@
 """Settings that a pilot chooses: their error × time over that of the best settings by hand and of Mitsuba's defaults.
 
 `mi-refract render --settings auto` measures a few candidates before it renders. This study renders its choice and many
-settings by hand. Every other round selects the settings with the least error × time, and the rounds between measure
-them: the least of many in the same rounds would be too small. Each round has a different seed. The error is the
-variance over the rounds, since all settings have the same expected image. Times are those of whole images. The pilot's
-share of the render is included, its compilation is not.
+settings by hand. The first rounds select the settings by hand with the least error × time. Further rounds, with other
+seeds, measure these, the choice and Mitsuba's defaults: the least of many in the same rounds would be too small. The
+error is the variance over the rounds, since all settings have the same expected image. Times are those of whole images.
+The pilot's share of the render is included, its compilation is not.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ TERMS = {
 
 @dataclass(frozen=True)
 class Extent:
-    """How much is measured: `scenes` (() is all), and twice `rounds` images of `resolution`² pixels and `spp`."""
+    """How much is measured: `scenes` (() is all), and `rounds` images of `resolution`² pixels and `spp` each time."""
 
     scenes: tuple[str, ...]
     resolution: int
@@ -157,13 +157,13 @@ def by_hand(extent: Extent, figures: dict[str, Any]) -> list[Settings]:
     return [{"sampler": sampler, **integrator} for sampler in extent.samplers for integrator in integrators]
 
 
-def costs(cameras: dict[str, Camera], spp: int, rounds: int) -> dict[str, list[float]]:
+def costs(cameras: dict[str, Camera], spp: int, rounds: int, first_seed: int = 0) -> dict[str, list[float]]:
     """Return squared error × seconds by round; the error is the deviation from the mean of all rounds."""
     renders: dict[str, list[tuple[np.ndarray, float]]] = {name: [] for name in cameras}
-    order = list(cameras)
-    for seed in range(rounds + 1):
+    order, seeds = list(cameras), itertools.count(first_seed)
+    for _ in range(rounds + 1):
         for name in order:
-            renders[name].append(cameras[name](spp, seed * len(order) + order.index(name)))
+            renders[name].append(cameras[name](spp, next(seeds)))
         order.reverse()
     cost = {}
     for name, (_, *warm) in renders.items():  # the first image compiles
@@ -189,13 +189,15 @@ def scene_rows(context: Context, name: str) -> list[Row]:
         for text, settings in by_text.items()
     }
     cameras[BUILTIN.name] = Camera(load_parsed(parse_scene(*default)))
-    cost_of = costs(cameras, extent.spp, 2 * extent.rounds)
+    cost_of = costs(cameras, extent.spp, extent.rounds)
     if max(cost_of[BUILTIN.name]) < limits.NOISE**2:
         return [row(reason="left out: the image has no noise to compare settings by")]
-    best = min(by_text, key=lambda text: statistics.fmean(cost_of[text][::2]))
-    auto = [cost * (1 + figures["share"]) for cost in cost_of[settings_text(chosen)][1::2]]
-    values = kernel_timing.ratio(EQUAL_TIME_HAND, auto, cost_of[best][1::2])
-    values |= kernel_timing.ratio(EQUAL_TIME_DEFAULTS, auto, cost_of[BUILTIN.name][1::2])
+    best = min(by_text, key=lambda text: statistics.fmean(cost_of[text]))
+    compared = {text: cameras[text] for text in (best, settings_text(chosen), BUILTIN.name)}
+    cost_of = costs(compared, extent.spp, extent.rounds, first_seed=(extent.rounds + 1) * len(cameras))
+    auto = [cost * (1 + figures["share"]) for cost in cost_of[settings_text(chosen)]]
+    values = kernel_timing.ratio(EQUAL_TIME_HAND, auto, cost_of[best])
+    values |= kernel_timing.ratio(EQUAL_TIME_DEFAULTS, auto, cost_of[BUILTIN.name])
     values |= {SHARE: figures["share"]}
     replay: dict[str, Any] = {"scene": name, "chosen": settings_text(chosen), "best by hand": best}
     replay |= {"resolution": extent.resolution, "spp": extent.spp, "rounds": extent.rounds}
