@@ -20,8 +20,10 @@ from mi_refract.ray_sets import renderer_file
 from mi_refract.ray_sets.files import parse_answers
 from mi_refract.ray_sets.header import PRECISIONS
 from mi_refract.ray_sets.renderer_file import RaysCommand
+from mi_refract.report.row import Row
 from validation import __main__ as command
 from validation import limits
+from validation.run import headline
 from validation.run.context import PROFILES, Context
 from validation.suite import exports, matrix, per_ray, rendered_images
 from validation.suite.per_ray import LARGE, TOTAL
@@ -364,7 +366,8 @@ def test_a_failed_installation_prints_one_line_and_leaves_the_system_absent(
     assert command.main(["renderers", "--install", "thing"]) == 1
     first, second = capsys.readouterr().err.strip().splitlines()
     assert first.startswith("thing: ") and second.startswith("validation renderers: thing: ") and message in second
-    assert environments.absent(SYSTEMS["thing"])
+    row = Row("rays", "thing", "all", "", reason=environments.why_not(SYSTEMS["thing"], "quick"))
+    assert headline.remedies([row, row]) == {"other renderers, by `python -m validation renderers --install thing`": 2}
 
 
 def test_another_version_of_a_distribution_is_absent_and_not_installed(own_cache, monkeypatch, capsys, tmp_path):

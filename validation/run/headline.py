@@ -28,7 +28,8 @@ GROUND_TRUTH, RENDERS, EFFICIENCY, PATHS = "ground_truth", "renders", "efficienc
 PLUGIN, BUILTIN, INTEGRATOR, METHODS = "refract", "dielectric", "refract_path", "every method"
 MIRAGE, EXACT, ROUNDED = "mirage", "exact", "exact, indices in float32"
 LAYERS, SHALLOW = 1000, "89.55°"
-INSTALL = "other renderers, by `python -m validation renderers --install "
+INSTALL = "python -m validation renderers --install"
+ABSENT = f"other renderers, by `{INSTALL} "  # the remedy of rows of a renderer that is not installed, without its name
 NOT_MEASURED = "Not measured in this run"
 LEAD = "`refract` is this project's drop-in replacement for Mitsuba's material of smooth glass, `dielectric`."
 LINES = "its thin lines are right, light along a layer of air"
@@ -196,10 +197,10 @@ def remedies(rows: Sequence[Row]) -> dict[str, int]:
     """Return the number of rows that were not run by their remedy, largest first; "" for other reasons, last."""
     missing = [row for row in rows if row.verdict == "not run"]
     counts = Counter(row.remedy for row in missing)
-    installs = [name for name in counts if name.startswith(INSTALL)]
+    installs = [name for name in counts if name.startswith(ABSENT)]
     if installs:
-        names = sorted({name.removeprefix(INSTALL).rstrip("`") for name in installs})
-        counts[f"{INSTALL}{','.join(names)}`"] = sum(counts.pop(name) for name in installs)
+        names = sorted({name.removeprefix(ABSENT).rstrip("`") for name in installs})
+        counts[f"{ABSENT}{','.join(names)}`"] = sum(counts.pop(name) for name in installs)
     others = counts.pop("", 0)
     return dict(counts.most_common()) | ({"": others} if others else {})
 

@@ -16,10 +16,10 @@ from mi_refract.io.errors import MissingExtraError, TooMuchOutputError
 from mi_refract.io.safe_files import write_atomically
 from mi_refract.ray_sets import renderer_file
 from mi_refract.report.row import Reason, Row
+from validation.run.headline import ABSENT, INSTALL
 
 from .system import LOCKS, SCRIPTS, System
 
-COMMAND = "python -m validation renderers --install"
 CANNOT = 77  # exit code of a script that cannot run on this machine
 TIMEOUT = 600.0  # seconds: enough on a busy machine; a program that takes longer hangs
 _INSTALL_TIMEOUT, _QUERY_TIMEOUT = 3600.0, 60.0  # seconds
@@ -54,7 +54,7 @@ def absent(system: System) -> str:
             present = json.loads((folder(system) / "installed.json").read_text()) == _mark(system)
     except (OSError, ValueError, TimeoutError, TooMuchOutputError):
         present = False
-    return "" if present else f"{COMMAND} {system.name}"
+    return "" if present else Reason(f"{INSTALL} {system.name}", f"{ABSENT}{system.name}`")
 
 
 def why_not(system: System, profile: str) -> str:
