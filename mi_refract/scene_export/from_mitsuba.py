@@ -90,8 +90,9 @@ def _camera(sensor: Node) -> Camera:
     width = height = 0
     for child in sensor.children():
         if child.kind == "Film":
-            if filters := [kernel for kernel in child.children() if kernel.type != "box"]:
-                raise filters[0].error("a reconstruction filter", "box")
+            kernel = next((kernel.type for kernel in child.children()), "gaussian, by default")
+            if (child.type, kernel) != ("hdrfilm", "box"):
+                raise child.error(f"a film with the filter {kernel}", "an hdrfilm with an rfilter box")
             child.ignore("pixel_format", "component_format", "file_format")
             width, height = child.value(int, "width", 768), child.value(int, "height", 576)
             if min(width, height) < 1:
@@ -99,6 +100,8 @@ def _camera(sensor: Node) -> Camera:
             child.finish()
         elif child.kind != "Sampler":
             raise child.error(f"a {child.kind.lower()} of a sensor", "a film and a sampler")
+    if not width:
+        raise sensor.error("no film", "an hdrfilm with an rfilter box")
     sensor.ignore("near_clip", "far_clip", "focus_distance")
     axes, origin = frame[:3, :3] / np.linalg.norm(frame[:3, :3], axis=0), frame[:3, 3]
     (x, y, z), (to_x, to_y, to_z), (up_x, up_y, up_z) = np.stack([origin, origin + axes[:, 2], axes[:, 1]]).tolist()
