@@ -38,7 +38,13 @@ Inconclusive = enum.StrEnum("Inconclusive", {"PASS": "pass", "FAIL": "fail"})  #
 Names = Annotated[
     list[str] | None, typer.Argument(metavar="NAME", help="Only these images: paths in the folders (wildcards: * ?).")
 ]
-Method = Annotated[str, typer.Option(help=f"Comparison method: {'|'.join((AUTO, *METHODS))}; see --methods.")]
+Method = Annotated[
+    str,
+    typer.Option(
+        help=f"Comparison method: {'|'.join((AUTO, *METHODS))} (--methods). Default: that of the settings, or {AUTO}.",
+        show_default=False,
+    ),
+]
 Set = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Set a key of [defaults], except map, for all images."),
@@ -66,7 +72,7 @@ def diff(
         typer.Argument(metavar="TEST", help="The image or folder to compare; optional with --check-settings."),
     ] = None,
     names: Names = None,
-    method: Method = AUTO,
+    method: Method = "",
     options: Set = None,
     settings: File = None,
     max_values: MaxValues = MAX_VALUES,
@@ -158,7 +164,7 @@ def accept(
     ] = None,
     test: Annotated[Path | None, typer.Argument(metavar="TEST", help="As for diff.")] = None,
     names: Names = None,
-    method: Method = AUTO,
+    method: Method = "",
     options: Set = None,
     settings: File = None,
     max_values: MaxValues = MAX_VALUES,
@@ -180,11 +186,11 @@ def accept(
 
         if (reference is None) != (test is None):
             raise ValueError(f"{reference}: only one path; with --from, give both folders before the names, or none")
-        if options or method != AUTO:
+        if options or method:
             raise ValueError("--from repeats an earlier comparison; do not combine it with --method or --set")
         results = results_file.read(source, reference, test)
         results = replace(results, results=tuple(pairing.named(results.results, names or [])))
-        resolved = _settings(results.reference, results.test, AUTO, [], settings, max_values)
+        resolved = _settings(results.reference, results.test, "", [], settings, max_values)
         results = results_file.with_settings(results, resolved)
         text_reports.print_errors(results)
     elif reference is None or test is None:
@@ -233,7 +239,7 @@ def _settings(
     # The folder of references may not exist yet.
     folder = reference if reference.is_dir() or test.is_dir() else reference.parent
     path = file or nearest(folder)
-    flags = ["--method", method] if method != AUTO else []
+    flags = ["--method", method] if method else []
     for word in words:
         flags += ["--set", word]
     flags += ["--max-values", str(max_values)] if max_values != MAX_VALUES else []

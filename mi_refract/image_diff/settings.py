@@ -337,8 +337,11 @@ def load(path: str | Path, command_line: Entry | None = None, max_values: int = 
 
 
 def from_words(method: str, words: Sequence[str]) -> Entry:
-    """Return the layer of the command line, from `--method` and each `--set KEY=VALUE`. ValueError if invalid."""
-    if method not in ACCEPTED:
+    """Return the layer of the command line, from `--method` ("": not given) and each `--set KEY=VALUE`.
+
+    ValueError if invalid.
+    """
+    if method and method not in ACCEPTED:
         raise ValueError(f"--method {method}; expected {', '.join(ACCEPTED)}")
     table: dict[str, Any] = {}
     for word in words:
@@ -346,10 +349,10 @@ def from_words(method: str, words: Sequence[str]) -> Entry:
         if not equals or key in table:
             raise ValueError(f"--set {word}; expected KEY=VALUE, each key once")
         table[key] = _parsed_value(key, value)
-    if method != AUTO and "method" in table:
+    if method and "method" in table:
         raise ValueError(f"--set method={table['method']} with --method; expected one of them")
     values = _checked_values(table, Keys, "--set", method)
-    return Entry("", values if method == AUTO else {"method": method, **values}, COMMAND_LINE)
+    return Entry("", {"method": method, **values} if method else values, COMMAND_LINE)
 
 
 def _parsed_value(key: str, text: str) -> Any:

@@ -40,7 +40,7 @@ reason = "more glass"
 def load(tmp_path):
     """`load(text, *words, method=…)`: the settings of a file with this text, and of words of the command line."""
 
-    def read(text, *words, method="auto"):
+    def read(text, *words, method=""):
         path = tmp_path / "rules.toml"
         path.write_text(text)
         return settings.load(path, from_words(method, words))
@@ -63,16 +63,18 @@ def test_later_entries_replace_the_keys_that_they_set(load):
 
 DEFAULTS = '[defaults]\nmethod = "tolerance"\nfail = 0.1\nfail_percent = 1\nvariance = "d.exr"\nchannels = ["R"]\n'
 LAYERS = [
-    (DEFAULTS, [], "auto", {"method": "tolerance", "options": {"fail": 0.1, "fail_percent": 1.0}, "variance": "d.exr"}),
-    (DEFAULTS, ["fail=0.2"], "auto", {"options": {"fail": 0.2, "fail_percent": 1.0}}),
-    (DEFAULTS, ["variance=c.exr", "channels=G=B"], "auto", {"variance": "c.exr", "channels": (("G", "B"),)}),
+    (DEFAULTS, [], "", {"method": "tolerance", "options": {"fail": 0.1, "fail_percent": 1.0}, "variance": "d.exr"}),
+    (DEFAULTS, ["fail=0.2"], "", {"options": {"fail": 0.2, "fail_percent": 1.0}}),
+    (DEFAULTS, ["variance=c.exr", "channels=G=B"], "", {"variance": "c.exr", "channels": (("G", "B"),)}),
     (DEFAULTS + A + "fail = 0.3", ["fail=0.2"], "tolerance", {"options": {"fail": 0.3, "fail_percent": 1.0}}),
-    (DEFAULTS + A + 'variance = "{stem}.exr"', ["variance=c.exr"], "auto", {"variance": "{stem}.exr"}),
+    (DEFAULTS + A + 'variance = "{stem}.exr"', ["variance=c.exr"], "", {"variance": "{stem}.exr"}),
+    (DEFAULTS, [], "auto", {"method": "auto"}),
+    ('[defaults]\nmethod = "flip"', ["ppd=60"], "", {"method": "flip", "options": {"ppd": 60.0}}),
     (DEFAULTS, [], "exact", {"method": "exact", "options": {}}),  # options of another method are dropped
-    (DEFAULTS + A + 'method = "paired"\nlargest = 3', [], "auto", {"method": "paired", "options": {"largest": 3.0}}),
-    (A + 'method = "exact"', ["fail=0.2"], "auto", {"method": "exact", "options": {}}),
+    (DEFAULTS + A + 'method = "paired"\nlargest = 3', [], "", {"method": "paired", "options": {"largest": 3.0}}),
+    (A + 'method = "exact"', ["fail=0.2"], "", {"method": "exact", "options": {}}),
     (A + "allow_nonfinite = true", [], "exact", {"method": "exact", "options": {"allow_nonfinite": True}}),
-    (A + "allow_nonfinite = false", ["allow_nonfinite=true"], "auto", {"options": {"allow_nonfinite": False}}),
+    (A + "allow_nonfinite = false", ["allow_nonfinite=true"], "", {"options": {"allow_nonfinite": False}}),
 ]
 
 
@@ -239,13 +241,13 @@ def test_an_invalid_entry_is_an_error_of_its_images_only(load, text, message):
 @pytest.mark.parametrize(
     ("method", "words", "values"),
     [
-        ("auto", [], {}),
+        ("", [], {}),
         ("welch", ["tile=8", "equivalence_margin=1", "pixels=no"], {"tile": 8, "pixels": "no"}),
         ("tolerance", ["fail=inf"], {"method": "tolerance", "fail": np.inf}),
-        ("auto", ["channels=X, nested.Y=Y"], {"channels": (("X", "X"), ("nested.Y", "Y"))}),
-        ("auto", ['channels=["X"]'], {"channels": (("X", "X"),)}),
-        ("auto", ["variance={stem}_var.exr"], {"variance": "{stem}_var.exr"}),
-        ("auto", ["allow_nonfinite=true", "ignore=[[0, 0, 2, 2]]"], {"allow_nonfinite": True}),
+        ("", ["channels=X, nested.Y=Y"], {"channels": (("X", "X"), ("nested.Y", "Y"))}),
+        ("", ['channels=["X"]'], {"channels": (("X", "X"),)}),
+        ("", ["variance={stem}_var.exr"], {"variance": "{stem}_var.exr"}),
+        ("", ["allow_nonfinite=true", "ignore=[[0, 0, 2, 2]]"], {"allow_nonfinite": True}),
     ],
 )
 def test_settings_on_the_command_line(method, words, values):
@@ -263,10 +265,10 @@ def test_settings_on_the_command_line(method, words, values):
         ("tolerance", ["fale=1"], "--set: unknown key `fale`; expected method"),
         ("tolerance", ["fail=much"], "--set: fail: text; expected a number"),
         ("tolerance", ["fail=nan"], "--set: fail: nan; expected a number"),
-        ("auto", ["accept=x"], "--set: accept: text; expected a list [ … ]"),
+        ("", ["accept=x"], "--set: accept: text; expected a list [ … ]"),
         ("welch", ["tile=1.5"], "--set: tile: a number; expected a whole number"),
-        ("auto", ["variance=../a.exr"], "--set: variance: '../a.exr'; expected a relative path"),
-        *(("auto", [f"channels={text}"], "--set: channels") for text in ("", "X,", "X,X", "a=X,b=X", "=X", "X=")),
+        ("", ["variance=../a.exr"], "--set: variance: '../a.exr'; expected a relative path"),
+        *(("", [f"channels={text}"], "--set: channels") for text in ("", "X,", "X,X", "a=X,b=X", "=X", "X=")),
         ("flip", ["method=exact"], "--set method=exact with --method; expected one of them"),
     ],
 )
