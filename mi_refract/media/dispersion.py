@@ -29,6 +29,11 @@ NANOMETRES = 1000  # in a µm
 TABLE_VALUES = "values"  # optional coefficient of a table: all its values in one array
 
 
+def nanometres(micrometres: float) -> float:
+    """The wavelength in nm, rounded to 15 digits: so the decimal 0.3597 becomes the same number as 359.7."""
+    return float(f"{NANOMETRES * micrometres:.15g}")
+
+
 def where(condition: Mask, x: Number, y: Number) -> Number:
     """`x` where the condition is True, else `y`; for any kind of number."""
     if any(map(dr.is_array_v, (condition, x, y))):

@@ -18,7 +18,7 @@ from mi_refract.io import safe_files
 from mi_refract.io.errors import MissingExtraError
 from mi_refract.io.text import parse_number
 
-from .dispersion import NANOMETRES, Medium, Terms, power_series, table
+from .dispersion import NANOMETRES, Medium, Terms, nanometres, power_series, table
 
 LARGEST = 2**24  # largest size of a file in bytes
 PREFIX = "file:"
@@ -83,13 +83,13 @@ def _csv(text: str) -> Medium:
         expected = "a column whose name contains nm or µm, a column n, and optionally k, as in 'nm,n,k'"
         raise ValueError(f"header {','.join(header)!r}; expected {expected}")
     column, unit = units[0]
-    factor = 1 if unit[1] else NANOMETRES
+    in_nm = float if unit[1] else nanometres
     expected = f"expected numbers in the columns {', '.join(header)}, with decimal points, and no more columns"
     if any(len(row) != len(header) for row in rows):  # such as 400;1,52
         raise ValueError(expected)
     try:
         values = [
-            [factor * parse_number(row[column]), *(parse_number(row[header.index(x)]) for x in "nk" if x in header)]
+            [in_nm(parse_number(row[column])), *(parse_number(row[header.index(x)]) for x in "nk" if x in header)]
             for row in rows[1:]
         ]
     except ValueError:
@@ -141,9 +141,9 @@ def _refractiveindex_info(text: str) -> Medium:
 def _entry(kind: list[str], entry: dict[str, Any]) -> Medium:
     if kind[0] == "tabulated":
         rows = [[parse_number(x) for x in line.split()] for line in entry["data"].splitlines() if line.strip()]
-        return _tabulated(kind[1], [[NANOMETRES * row[0], *row[1:]] for row in rows])
+        return _tabulated(kind[1], [[nanometres(row[0]), *row[1:]] for row in rows])
     c = [parse_number(x) for x in str(entry["coefficients"]).split()]
-    low, high = (NANOMETRES * parse_number(x) for x in str(entry.get("wavelength_range") or entry["range"]).split())
+    low, high = (nanometres(parse_number(x)) for x in str(entry.get("wavelength_range") or entry["range"]).split())
     if not len(c) % 2:
         raise ValueError(f"{len(c)} coefficients; expected an odd number of them")
     first, number, pairs = c[0], kind[1], list(zip(c[1::2], c[2::2], strict=True))
@@ -181,7 +181,7 @@ def _zemax(text: str, glass: str) -> Medium:
     lines = glasses[glass.lower()]
     try:
         number, c = int(float(lines["NM"][1])), [parse_number(x) for x in lines["CD"]]
-        low, high = (NANOMETRES * parse_number(x) for x in lines["LD"][:2])
+        low, high = (nanometres(parse_number(x)) for x in lines["LD"][:2])
     except (KeyError, IndexError, ValueError):
         raise ValueError(f"glass {glass}: expected a formula, and lines CD and LD of numbers") from None
     if number in AGF_SELLMEIER:

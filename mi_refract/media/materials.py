@@ -39,7 +39,19 @@ from mi_refract.io.text import parse_number
 from mi_refract.numerics import Number
 
 from . import glass_catalogs, index_files
-from .dispersion import ANY, CONSTANT, Abbe, Coefficients, Dispersion, Medium, Terms, sellmeier, table
+from .dispersion import (
+    ANY,
+    CONSTANT,
+    NANOMETRES,
+    Abbe,
+    Coefficients,
+    Dispersion,
+    Medium,
+    Terms,
+    nanometres,
+    sellmeier,
+    table,
+)
 
 VISIBLE = 360.0, 830.0  # nm: the range in which the eye, and Mitsuba, respond to light
 MICROMETRES = 1.0  # nm², …: a smaller coefficient is probably in µm², …, as catalogues print it
@@ -214,7 +226,7 @@ def _formula(text: str, label: str) -> Medium:
             f"{label}; expected {', '.join(f'{known}(…)' for known in FORMULAS_OF_N)}, or with _um, such as table_um(…)"
         )
     name, arguments = call[1], call[3]
-    unit, nanometres = ("µm", 1000.0) if call[2] else ("nm", 1.0)
+    unit, scale = ("µm", NANOMETRES) if call[2] else ("nm", 1)
 
     def numbers(counts: Sequence[int], expected: str) -> list[float]:
         try:
@@ -240,7 +252,7 @@ def _formula(text: str, label: str) -> Medium:
         for i, x in enumerate(values[1:], 1):
             if not call[2] and 0 < abs(x) < MICROMETRES:
                 raise wrong_unit(CAUCHY_NAMES[i], x, POWERS_OF_UNITS[i], f"1e{6 * i}")
-        coefficients = {CAUCHY_NAMES[i]: x * nanometres ** (2 * i) for i, x in enumerate(values)}
+        coefficients = {CAUCHY_NAMES[i]: x * scale ** (2 * i) for i, x in enumerate(values)}
         form = Terms(1, powers=tuple((letter, -2 * i) for i, letter in enumerate(coefficients)))
     elif name == "abbe":
         n_d, v_d = numbers([2], "abbe(n_d, V_d)")
@@ -258,7 +270,7 @@ def _formula(text: str, label: str) -> Medium:
         except ValueError:
             raise ValueError(f"{label}; expected table(400: 1.53, 500: 1.52, …), wavelengths in nm") from None
         try:
-            form, coefficients = table([(w * nanometres, n) for w, n in pairs])
+            form, coefficients = table([(nanometres(w) if call[2] else w, n) for w, n in pairs])
         except ValueError as error:
             raise ValueError(f"{label}: {error}") from None
         valid = form.knots[0], form.knots[-1]
@@ -275,7 +287,7 @@ def _formula(text: str, label: str) -> Medium:
                 raise wrong_unit(f"{letter}{i}", x, power, factor)
         if call[2] and min(poles) > LONGEST_POLE:
             raise wrong_unit("C1", poles[0], power)
-        form, coefficients = sellmeier([*values[: len(poles)], *(x * nanometres**2 for x in poles)], squared)
+        form, coefficients = sellmeier([*values[: len(poles)], *(x * scale**2 for x in poles)], squared)
     return _checked(Medium(text, form, coefficients, valid), label)
 
 

@@ -416,6 +416,24 @@ def test_reading_an_index_from_a_file(name, tmp_path, vectorised):
     assert media.file_in(f"hold( file:{folder}/{name})") == f"{folder}/{name.partition(':')[0]}"
 
 
+ENDS = {
+    "a.csv": "wl_µm,n\n0.3597,1.5\n1.001,1.4\n",
+    "a.yml": NK.replace("0.4 ", "0.3597 ").replace("0.9 ", "1.001 "),
+    "b.yml": PAGE.format("formula 2", SELLMEIER_2).replace("0.3 2.5", "0.3597 1.001"),
+    "a.agf:X-1": FILES["1.agf:x-1"][0].replace("0.3 2.5", "0.3597 1.001"),
+}
+
+
+@pytest.mark.parametrize("name", ["", *ENDS])
+def test_a_range_in_micrometres_contains_its_ends(name, tmp_path):
+    """In float64, 1000 · 0.3597 is more than 359.7, and 1000 · 1.001 is less than 1001."""
+    if name:
+        (tmp_path / name.partition(":")[0]).write_text(ENDS[name], "utf-8")
+    material = media.parse(f"file:{tmp_path}/{name}" if name else "table_um(0.3597: 1.5, 1.001: 1.4)")
+    assert material.valid == (359.7, 1001)
+    assert np.isfinite(material.index(np.array([359.7, 1001.0]))).all()
+
+
 @pytest.mark.parametrize(
     ("conditions", "relative"),
     [("SPECS:\n    n_absolute: false\n", "air"), ("CONDITIONS:\n    n_is_absolute: true\n", "vacuum"), ("", "")],
