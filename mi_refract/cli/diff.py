@@ -246,6 +246,9 @@ def _settings(
     flags += ["--settings", str(file)] if file else []
     layer = from_words(method, words)
     settings = load(path, layer, max_values) if path else Settings((layer,), max_values=max_values)
+    for_all = replace(settings, rules=tuple(rule for rule in settings.rules if not rule.pattern))
+    if error := for_all.of("").error:  # in the layers of all images: one error, not one an image
+        raise ValueError(error)
     above = folder.resolve().relative_to(path.parent.resolve()) if path and not file else Path()
     if path and above.parts and settings.maps:
         raise ValueError(f"{path}: `map` is for whole folders; expected {path.parent} as REFERENCE, or --settings")
