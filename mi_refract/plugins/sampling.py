@@ -135,25 +135,45 @@ class NonConstantEmitters:
 
     def __init__(self, v: Variant, scene: Scene) -> None:
         """`v`: the variant's module."""
-        self.v, emitters = v, scene.emitters()
+        self.v, self.vectorised, emitters = v, dr.is_jit_v(v.Float), scene.emitters()
         lamps = [i for i, emitter in enumerate(emitters) if not emitter.is_environment()]
-        weights = [float(emitters[i].sampling_weight()) for i in lamps]
-        self.total, self.vectorised = sum(weights), dr.is_jit_v(v.Float)
+        weights = [0.0 if emitter.is_environment() else float(emitter.sampling_weight()) for emitter in emitters]
+        self.total = sum(weights)
         if not self.total:  # then `sample` and `pdf` are not called
             return
-        if self.vectorised:
-            self.pointers = dr.gather(v.EmitterPtr, scene.emitters_dr(), v.UInt32(lamps))
-        else:
-            self.pointers = [emitters[i] for i in lamps]
-        self.choice = v.DiscreteDistribution(weights) if len(lamps) > 1 else None
+        self.only = lamps[0] if len(lamps) == 1 else None
+        self.emitters = scene.emitters_dr() if self.vectorised else emitters
+        if self.only is None and self.vectorised:
+            # Not of the list, nor a DiscreteDistribution: a frozen function cannot record their memory.
+            lit = dr.select(self.emitters.is_environment(), 0, self.emitters.sampling_weight())
+            self.last, self.sums = len(emitters) - 1, dr.cumsum(lit)
+        elif self.only is None:
+            self.choice = v.DiscreteDistribution(weights)
+
+    def _choose(self, x: Number, active: Mask) -> tuple[Count, Number, Number]:
+        """Return the number of a lamp among the emitters, its probability, and x as a new number in [0, 1)."""
+        v = self.v
+        if self.only is not None:
+            return v.UInt32(self.only), v.Float(1), x
+        if not self.vectorised:
+            index, x, probability = self.choice.sample_reuse_pmf(x, active)
+            return index, probability, x
+
+        def sum_at(index: Count, active: Mask) -> Number:
+            return dr.gather(v.Float, self.sums, index, active)
+
+        x = x * sum_at(v.UInt32(self.last), active)
+        index = dr.binary_search(0, self.last, lambda i: sum_at(i, active) <= x)
+        below = sum_at(index - 1, active & (index > 0))
+        weight = sum_at(index, active) - below
+        x = dr.select(active, (x - below) / dr.select(active, weight, 1), 0)
+        return index, weight / self.total, dr.minimum(x, ONE)
 
     def sample(self, si: Interaction, sample: Point2, active: Mask) -> tuple[Interaction, Spectrum]:
         """Return a direction sample as `SceneEmitters.sample` does."""
-        v, index, probability = self.v, self.v.UInt32(0), 1.0
-        if self.choice:
-            index, x, probability = self.choice.sample_reuse_pmf(sample.x, active)
-            sample = v.Point2f(x, sample.y)
-        emitter = dr.gather(v.EmitterPtr, self.pointers, index, active) if self.vectorised else self.pointers[index]
+        v, (index, probability, x) = self.v, self._choose(sample.x, active)
+        sample = v.Point2f(x, sample.y)
+        emitter = dr.gather(v.EmitterPtr, self.emitters, index, active) if self.vectorised else self.emitters[index]
         ds, radiance = emitter.sample_direction(si, sample, active)
         ds.pdf *= probability
         return ds, radiance / probability

@@ -387,3 +387,17 @@ def test_a_frozen_render_follows_edits_of_index_and_reflectance(split_depth, llv
         assert before is None or abs(mean / before - 1) > 0.002
         before = mean
     assert image.n_recordings <= 2
+
+
+@pytest.mark.parametrize("weights", [(1.0,), (1.0, 0.0, 3.0)])
+def test_lamps_in_an_even_sky_can_be_frozen(weights, llvm_variant, no_collection):
+    parts = {"wall": {"type": "rectangle", "to_world": PLACE().translate([0, 0, -2]).scale(9)}}
+    for i, weight in enumerate(weights):
+        emitter = {"type": "area", "radiance": 1.0 + i, "sampling_weight": weight}
+        where = PLACE().translate([2 * i - 2, 2, 1]).rotate([0, 1, 0], 180).scale(0.5)
+        parts[f"lamp {i}"] = {"type": "rectangle", "to_world": where, "emitter": emitter}
+    scene = glass_ball(8, integrator={"type": "refract_path", "max_depth": 4}, sky={"type": "constant"}, **parts)
+    params, image = mi.traverse(scene), recorded(scene)
+    for seed in range(3):
+        frozen = np.array(image(params, dr.opaque(mi.UInt32, seed)))
+        assert frozen == pytest.approx(np.array(mi.render(scene, spp=4, seed=mi.UInt32(seed))), abs=1e-5)
