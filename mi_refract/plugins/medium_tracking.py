@@ -34,6 +34,7 @@ from mi_refract.numerics import (
 )
 
 from .absorption import BEYOND, HERE, absorbing_parameter
+from .index_parameter import warn_once
 from .scene_features import all_shapes, check_shapes, children, nested, plugin_number, shape_name
 
 TOLERANCE = 1e-3  # relative: one side may give σ as a number and the other one as a colour
@@ -185,6 +186,7 @@ def absorbs_only(v: Variant, medium: MediumPlugin) -> bool:
     if not medium.is_homogeneous():
         return False
     if dr.flag(dr.JitFlag.FreezingScope):  # while a frozen function is recorded, values cannot be read
+        warn_once("refract_path: a frozen function cannot tell whether a medium scatters; expected an albedo of 0")
         return True
     mei = dr.zeros(v.MediumInteraction3f)
     visible = [(mi.MI_CIE_MIN + (mi.MI_CIE_MAX - mi.MI_CIE_MIN) * i / 64,) for i in range(65)]
