@@ -59,7 +59,7 @@ class Extent:
 
     scenes: tuple[str, ...]
     resolution: int
-    spp: int = 64
+    spp: int = 49  # the square of a prime, which no sampler rounds: `orthogonal` would render 121 for 64
     rounds: int = 6
     samplers: tuple[str, ...] = ("multijitter", "ldsampler", "independent")
     depths: tuple[int, ...] = (0, 3)
