@@ -111,11 +111,16 @@ def test_pipes_devices_and_folders_are_not_replaced(kind, tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "out.x" if kind in KINDS else Path("/dev/fd/1")
     KINDS.get(kind, lambda path: None)(path)
-    before = {entry: entry.lstat() for entry in tmp_path.iterdir()}
+
+    def entries():  # without the time of access: reading a link changes it
+        stats = {entry: entry.lstat() for entry in tmp_path.iterdir()}
+        return {entry: (stat.st_mode, stat.st_ino, stat.st_size, stat.st_mtime_ns) for entry, stat in stats.items()}
+
+    before = entries()
     for write in (lambda: safe_files.writable(path, (path.suffix,)), lambda: write_atomically(path, "new")):
         with pytest.raises(OSError, match=rf"{path}: is a {kind.replace('linked ', '').split()[0]}.*; expected the"):
             write()
-    assert {entry: entry.lstat() for entry in tmp_path.iterdir()} == before
+    assert entries() == before
 
 
 def test_links_to_files_and_broken_links_are_replaced(tmp_path):
