@@ -117,7 +117,7 @@ SQUARE = f"square {scenes.SMALL}"
 EXTENTS = {
     "quick": Extent(32, 256, 3072, 128, (SQUARE,)),
     "standard": Extent(48, 144, 4096, 128, scenes.LAMPS, (SQUARE,)),
-    "full": Extent(48, 256, 4096, 256, scenes.LAMPS, scenes.LAMPS),
+    "full": Extent(64, 256, 4096, 256, scenes.LAMPS, scenes.LAMPS),
 }
 
 
