@@ -91,6 +91,12 @@ def _command(
         str, typer.Option(help=f"How much is measured: {', '.join(f'{k} ({v})' for k, v in PROFILES.items())}.")
     ] = "quick",
     out: Annotated[Path, typer.Option(help="Folder of the report.")] = Path("out"),
+    variant: Annotated[
+        str | None,
+        typer.Option(
+            help="Variant of Mitsuba that renders, such as cuda_ad_rgb. Default: llvm_ad_rgb if it runs here."
+        ),
+    ] = None,
     write_tables: Annotated[
         bool, typer.Option("--write-tables", help="Also write the tables of the documentation and the gallery.")
     ] = False,
@@ -141,7 +147,7 @@ def _command(
     target.check()
     try:
         with safe_files.held(out / LOCK, "a validation"):
-            return _run(names, profile, out, write_tables, goals, target, own_renderers)
+            return _run(names, profile, out, variant, write_tables, goals, target, own_renderers)
     except KeyboardInterrupt:
         print("validation: interrupted; run the same command again to resume", file=sys.stderr)
         raise
@@ -169,6 +175,7 @@ def _run(
     names: list[str],
     profile: str,
     out: Path,
+    preferred: str | None,
     write_tables: bool,
     goals: bool,
     target: ClusterTarget,
@@ -184,7 +191,7 @@ def _run(
     from .run import headline, tightness
 
     start = time.perf_counter()
-    variant = backend.activate(may_restart=True)
+    variant = backend.activate(preferred, may_restart=True)
     print(printable(f"validation: {backend.summary()}"), file=sys.stderr)
     if write_tables:  # imported and checked before the run
         from . import tables
@@ -204,9 +211,10 @@ def _run(
         from validation.suite import matrix
 
         first_page["answers"] = [*matrix.answers(rows, own_renderers), *first_page["answers"]]
+    chosen_variant = [f"--variant {preferred}"] if preferred else []
     about = runner.describe(context, time.perf_counter() - start)
     about |= {
-        "replay": " ".join(["python -m validation", *names, f"--profile {profile}"]),
+        "replay": " ".join(["python -m validation", *names, f"--profile {profile}", *chosen_variant]),
         "studies": {study.name: study.described for study in studies} | {tightness.NAME: tightness.ABOUT},
         "scatter": [scatter for study in studies for scatter in study.scatter],
         "first_page": first_page,

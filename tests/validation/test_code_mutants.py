@@ -80,19 +80,23 @@ def test_the_same_seed_gives_the_same_sample_and_an_edit_changes_it_where_it_is(
     assert kept == [(mutant.line, mutant.becomes) for mutant in samples[0]]
 
 
+def summary(outcomes, seed=0):
+    return code_mutants.summarise([code_mutants.row_of(*outcome) for outcome in outcomes], seed)
+
+
 def test_too_many_survivors_fail_and_explained_ones_do_not():
     mutant = Mutant(PATH, "AddNot", 0, 1, "if a:", "if not a:")
     entries = json.loads((code_mutants.CONFIG.parent / "explained_mutants.json").read_text())
     entry = entries[0]
     unobservable = Mutant(entry["file"], entry["operator"], 0, 1, entry["line"], entry["becomes"])
     survivors = [(mutant, False)] + [(unobservable, False)] * 4
-    every, room, _ = code_mutants.rows(survivors + [(mutant, True)] * 15, seed=7)
+    every, room, _ = summary(survivors + [(mutant, True)] * 15, seed=7)
     counts = {"mutants": 20, "killed": 15, "survived": 5, "explained": 4}
     assert every.values == {**counts, "score": 0.95, "unexplained": 0.05}
     assert (every.verdict, room.verdict, room.subject) == ("pass", "info", "accuracy")
     assert every.replay["survivors"] == [f"{PATH}:1: AddNot: if a: → if not a:"]
     assert every.replay["command"] == "python -m validation.robustness.code_mutants 20 7"
-    assert code_mutants.rows([(mutant, False), *survivors, *[(mutant, True)] * 14], seed=0)[0].verdict == "fail"
+    assert summary([(mutant, False), *survivors, *[(mutant, True)] * 14])[0].verdict == "fail"
 
 
 def test_explanations_say_why_a_mutant_cannot_be_observed():

@@ -159,10 +159,10 @@ def test_a_worker_returns_files_and_raises_errors(monkeypatch, scalar_variant):
 def validate(tmp_path, monkeypatch):
     """`validate(work)`: the exit code of a validation whose only task runs `work`."""
 
-    def run(work):
+    def run(work, *options):
         study = Study("directions", "A study", "What it asks.", {}, lambda context: [Task("a task", work)])
         monkeypatch.setattr(command, "import_module", lambda name: types.SimpleNamespace(STUDY=study))
-        return command.main(["robustness", "--out", str(tmp_path)])  # a room of one study
+        return command.main(["robustness", "--out", str(tmp_path), *options])  # a room of one study
 
     return run
 
@@ -176,6 +176,14 @@ def test_the_exit_code_follows_the_budgets(validate, tmp_path, budget, code):
     assert written["rows"][0]["verdict"] == ("pass" if code == 0 else "fail")
     assert context["versions"]["mitsuba"] == mi.__version__
     assert context["replay"] == "python -m validation robustness --profile quick"
+
+
+def test_a_variant_renders_instead_of_the_default_and_a_replay_names_it(validate, tmp_path):
+    variants = []
+    assert validate(lambda: variants.append(mi.variant()) or [row()], "--variant", "scalar_spectral") == 0
+    context = json.loads((tmp_path / "rows.json").read_text())["context"]
+    assert variants == [context["variant"]] == ["scalar_spectral"]
+    assert context["replay"] == "python -m validation robustness --profile quick --variant scalar_spectral"
 
 
 def test_an_interruption_prints_how_to_resume_and_two_validations_do_not_share_a_folder(validate, tmp_path, capsys):
@@ -205,6 +213,7 @@ def test_a_part_of_a_study_runs_alone_and_only_once():
     [
         (["refractions"], "unknown study 'refractions'; expected directions, stability, renders, efficiency, media"),
         (["renders.colors"], "unknown study 'renders.colors'; expected directions"),
+        (["--variant", "llvm_rgb"], "variant 'llvm_rgb': unknown; expected scalar_rgb"),
         (["renders."], "unknown study 'renders.'; expected directions"),
         (["--profile", "slow"], "unknown profile 'slow'; expected quick, standard, full"),
         (["--out", __file__], "File exists; expected a writable folder"),

@@ -22,7 +22,7 @@ import signal
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import chdir
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -41,6 +41,7 @@ ROOT = Path(__file__).parents[2]
 CONFIG = Path(__file__).with_name("cosmic-ray.toml")
 COPIED = ("mi_refract", "tests", "validation", "scenes", ".ci", ".github")  # and the files in the root folder
 COUNTS = {"quick": 3, "standard": 20, "full": 220}
+PART = 10  # mutants of a task: an interrupted run keeps the results of finished tasks
 SEED = 0  # each release gets a new one
 ALL = "all rooms"
 COMMANDS = {"image_diff": "diff", "ray_sets": "rays", "scene_export": "scene", "rendering": "render", "planar": "trace"}
@@ -202,17 +203,28 @@ def examine(mutants: Iterable[Mutant], root: Path = ROOT) -> Iterator[tuple[Muta
             yield mutant, result.is_killed
 
 
-def rows(outcomes: Sequence[tuple[Mutant, bool]], seed: int) -> list[Row]:
-    """Return a row per subpackage, and one for all with the bound: a subpackage may have only a few mutants."""
-    result = []
-    for room in dict.fromkeys([ALL, *sorted(mutant.room for mutant, _ in outcomes)]):
-        of_room = [(mutant, killed) for mutant, killed in outcomes if room in (ALL, mutant.room)]
-        count = len(of_room)
-        survived = [mutant for mutant, killed in of_room if not killed]
-        missed = [str(mutant) for mutant in survived if not mutant.reason]
-        values: dict[str, float] = {"mutants": count, "killed": count - len(survived)}
-        values |= {"survived": len(survived), "explained": len(survived) - len(missed)}
-        values |= {"score": 1 - len(missed) / count, "unexplained": len(missed) / count}
+def row_of(mutant: Mutant, killed: bool) -> Row:
+    """Return the row of one mutant, for `summarise`."""
+    values = {"killed": float(killed), "explained": float(not killed and bool(mutant.reason))}
+    return Row(STUDY.name, mutant.room, str(mutant), "", values)
+
+
+def summarise(rows: list[Row], seed: int = SEED) -> list[Row]:
+    """Replace the rows of mutants by one per subpackage, and one for all.
+
+    Only the row for all has a bound: a subpackage may have only a few mutants.
+    """
+    outcomes = [row for row in rows if row.study == STUDY.name and row.values]
+    result = [row for row in rows if row not in outcomes]
+    for room in dict.fromkeys([ALL, *sorted(row.subject for row in outcomes)] if outcomes else []):
+        of_room = [row for row in outcomes if room in (ALL, row.subject)]
+        count, killed, explained = (
+            len(of_room),
+            *(sum(row.values[x] for row in of_room) for x in ("killed", "explained")),
+        )
+        missed = [row.case for row in of_room if not any(row.values.values())]
+        values: dict[str, float] = {"mutants": count, "killed": killed, "survived": count - killed}
+        values |= {"explained": explained, "score": 1 - len(missed) / count, "unexplained": len(missed) / count}
         replay: dict[str, Any] = {"seed": seed, "command": f"python -m {MODULE} {len(outcomes)} {seed}"}
         replay |= {"survivors": missed} if missed else {}
         budgets = {"unexplained": UNEXPLAINED} if room == ALL else {}
@@ -229,18 +241,22 @@ def missing(root: Path = ROOT) -> str:
 
 
 def tasks(context: Context) -> list[Task]:
-    """Return one task for all mutants, which runs alone."""
+    """Return tasks of PART mutants each. They run alone: on a busy machine, a test may fail for lack of time."""
+    if reason := missing():
+        return [Task("code mutants", lambda: [Row(STUDY.name, ALL, "mutated code", "", reason=reason)])]
+    count = COUNTS[context.profile.name]
 
-    def measured() -> list[Row]:
-        if reason := missing():
-            return [Row(STUDY.name, ALL, "mutated code", "", reason=reason)]
-        return rows(list(examine(sample(ROOT, COUNTS[context.profile.name], SEED))), SEED)
+    def measured(first: int) -> list[Row]:
+        return [row_of(*outcome) for outcome in examine(sample(ROOT, count, SEED)[first : first + PART])]
 
-    return [Task("code mutants", measured, timed=True)]
+    return [
+        Task(f"code mutants: from {first + 1} of {count}", functools.partial(measured, first), timed=True)
+        for first in range(0, count, PART)
+    ]
 
 
 MODULE = "validation.robustness.code_mutants"
-STUDY = Study("code mutants", "Mutants of our own code", about(__doc__), TERMS, tasks)
+STUDY = Study("code mutants", "Mutants of our own code", about(__doc__), TERMS, tasks, summarise=summarise)
 app = command_line.application()
 
 
@@ -257,7 +273,7 @@ def main(
     for mutant, killed in examine(sample(ROOT, count, seed)):
         outcomes.append((mutant, killed))
         print(f"{'killed' if killed else mutant.reason or 'SURVIVED'}: {mutant}", file=sys.stderr, flush=True)
-    results = rows(outcomes, seed)
+    results = summarise([row_of(*outcome) for outcome in outcomes], seed)
     print(json.dumps({row.subject: row.values | row.replay for row in results}, indent=1))
     return int(any(row.verdict == "fail" for row in results))
 
