@@ -95,10 +95,11 @@ class KeyedMultijitter:
         return v.Point2f(self._placed(column, x, self.columns), self._placed(row, y, self.rows))
 
     def independent(self, key: Count, count: int) -> list[Number]:
-        """Return `count` ≤ 4 numbers in [0, 1) without stratification, in a quarter of the time."""
+        """Return `count` ≤ 4 numbers in [0, 1) without stratification, in a fraction of the time."""
         v = self.v
-        words = [x for i in range(0, count, 2) for x in v.sample_tea_32(self.lane ^ self.pixel, key + i)]
-        return [self._unit(word) for word in words[:count]]
+        # Lanes and keys are small numbers in a row. After 4 rounds, the default, numbers of two keys are dependent.
+        calls = [v.sample_tea_32(self.lane, self.pixel + key + i, rounds=8) for i in range(0, count, 2)]
+        return [self._unit(word) for words in calls for word in words][:count]
 
     def _unit(self, word: Count) -> Number:
         """Return the upper 24 bits as a number in [0, 1)."""

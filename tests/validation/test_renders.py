@@ -292,10 +292,19 @@ class Unpermuted(KeyedMultijitter):
         return self._placed(self.v.Float(self.index), noise, self.count)
 
 
+class Dependent(KeyedMultijitter):
+    """Too few rounds of the hash."""
+
+    def independent(self, key, count):
+        calls = [self.v.sample_tea_32(self.lane ^ self.pixel, key + i, rounds=4) for i in range(0, count, 2)]
+        return [self._unit(word) for words in calls for word in words]
+
+
 @pytest.mark.parametrize(
     ("source", "count", "failing"),
     [
         (KeyedMultijitter, 16, set()),
+        (Dependent, 16, {"light, one vertex", "light, two vertices"}),
         (OneSeed, 4, {"two"}),
         (OneSeed, 64, {"two"}),
         (Unpermuted, 16, {"one", "one and one"}),

@@ -4,6 +4,8 @@ One sample is taken at random from each pixel. These samples are independent, so
 multinomial, and Pearson's chi-square test is valid for large counts, whatever the stratification. Pairs have numbers of
 two keys: the numbers of one boundary must be independent of those of the next one. Numbers of 20 keys are pooled.
 
+Light paths have numbers without stratification, four per key. All samples of these are counted.
+
 `python -m validation renders`
 """
 
@@ -37,7 +39,7 @@ TERMS = {
 }
 KEYS, SEEDS, LANES, CELLS = 20, 5, 2**16, 32
 QUICK = (1, 4, 7, 16, 32, 64, 100, 256)
-TESTS = 300 * SEEDS * 6  # in the whole study: counts × seeds × kinds of `histograms`
+TESTS = 300 * SEEDS * 9  # in the whole study: counts × seeds × kinds of `histograms`
 EDGE = 2.0**-20  # closer to an edge, a float32 may round to either side
 
 
@@ -78,13 +80,14 @@ def histograms(make: Any, count: int, seed: int) -> Iterator[tuple[str, Any, int
     sampler = mi.load_dict({"type": "independent", "sample_count": count})
     sampler.seed(seed, pixels * count)
     seeds = seeds_of(mi, sampler)
-    source, random, before = make(mi, seeds, pixels * count, count), np.random.default_rng(seed), [np.empty(0)] * 3
+    source, random = make(mi, seeds, pixels * count, count), np.random.default_rng(seed)
+    before = light_before = [np.empty(0)] * 3
     pick = np.arange(pixels), np.zeros(pixels, int)
     for key in range(KEYS):
         if key % 2 == 0:
             pick = np.arange(pixels), random.integers(0, count, pixels)
-        keys = mi.UInt32(2 * key), mi.UInt32(2 * key + 1)
-        dr.make_opaque(keys)  # the next key is new data, not a new kernel
+        keys, vertex = (mi.UInt32(2 * key), mi.UInt32(2 * key + 1)), mi.UInt32(4 * key)
+        dr.make_opaque(keys, vertex)  # the next key is new data, not a new kernel
         numbers = source.next_1d(sampler, keys[0]), source.next_2d(sampler, keys[1])
         dr.eval(numbers)
         z = np.array(numbers[0], float).reshape(pixels, count)
@@ -99,6 +102,12 @@ def histograms(make: Any, count: int, seed: int) -> Iterator[tuple[str, Any, int
             for kind, (first, second) in pairs.items():
                 yield kind, cells(before[first], now[second]), 0
         before = now
+        light = np.array(source.independent(vertex, 4), float)
+        yield "light", cells(light[key % 4]), 0
+        yield "light, one vertex", cells(light[0], light[1 + key % 3]), 0
+        if key % 2:
+            yield "light, two vertices", cells(light_before[0], light[0]), 0
+        light_before = light
 
 
 def cells(x: Any, y: Any = None) -> Any:
