@@ -79,8 +79,9 @@ METHODS = (BUILTIN, Method(OURS, OURS, PLUGIN, {"caustics": "path"}), FROM_LAMPS
 ENERGY = replace(FROM_LAMPS, parameters={"caustics": "lamp", "light_paths": 4.0}), BY_CLASS
 DEPTH, TILE, SHARE = 12, 8, 0.25
 FIRST_REFERENCE = 1000  # first seed of the references; methods have smaller seeds
-NOT_AIMED = 8  # factor of the samples of `ptracer` in parallel light, which it does not aim
-MORE = {"diamond": 4, "ring": 8}  # factor of the tested samples: the caustic is dim, or on few pixels
+NOT_AIMED = 8  # factor of the samples of `ptracer` for lamps that it does not aim
+# Factors of the tested samples: the caustic is dim or on few pixels, or the light seen in the water is noisy.
+MORE = {"diamond": 4, "ring": 8, "pool, square 0.2": 16}
 NOISE_RENDERS, NEARLY_BLACK = 4, 1e-6  # for the noise by class: renders per round; reflectance of the black floor
 BOUNDARIES = 6  # the most boundaries of light that counts for the energy of a caustic
 
@@ -90,7 +91,8 @@ class Extent:
     """How much is measured.
 
     Images: `rounds` timed renders of `spp` each (at least six for a 95 % interval), and `renders` of the tested method,
-    of `checked_spp` × MORE each, as are the references. `lamps`: for the ball; `other_lamps`: for all other bodies.
+    of `checked_spp` × MORE each, as are the references. `unaimed`: factor of the light paths of references for lamps
+    that `ptracer` does not aim. `lamps`: for the ball; `other_lamps`: for all other bodies.
     Energy: `renders` of `energy_spp` each; × NOT_AIMED for `ptracer` in parallel light, which it does not aim.
     """
 
@@ -102,10 +104,11 @@ class Extent:
     other_lamps: tuple[str, ...] = ()
     rounds: int = 6
     renders: int = 8
+    unaimed: int = 1
 
-    def checked(self, body: str) -> int:
+    def checked(self, body: str, lamp: str) -> int:
         """Return the samples per pixel of tested renders and of references."""
-        return self.checked_spp * MORE.get(body, 1)
+        return self.checked_spp * MORE.get(f"{body}, {lamp}", MORE.get(body, 1))
 
     def cases(self) -> list[tuple[str, str]]:
         """Return the pairs of body and lamp."""
@@ -117,7 +120,7 @@ SQUARE = f"square {scenes.SMALL}"
 EXTENTS = {
     "quick": Extent(32, 256, 3072, 128, (SQUARE,)),
     "standard": Extent(48, 144, 4096, 128, scenes.LAMPS, (SQUARE,)),
-    "full": Extent(64, 256, 4096, 256, scenes.LAMPS, scenes.LAMPS),
+    "full": Extent(64, 256, 4096, 256, scenes.LAMPS, scenes.LAMPS, unaimed=NOT_AIMED),
 }
 
 
@@ -163,16 +166,20 @@ def seen_in_glass(nested: Any = None) -> Any:
 class SumOfClasses:
     """A scene by two integrators that share no path: `ptracer` connects only scattering vertices to the camera."""
 
-    def __init__(self, scene: Any, max_depth: int) -> None:
-        """Set up both integrators for a loaded scene."""
+    def __init__(self, scene: Any, max_depth: int, light_images: int = 1) -> None:
+        """Set up both integrators for a loaded scene. `light_images`: the number of images by `ptracer` per image."""
+        self.light_images = light_images
         depth = {"max_depth": max_depth, "rr_depth": max_depth}
         methods = mi.load_dict({"type": "ptracer"} | depth), seen_in_glass(mi.load_dict({"type": "path"} | depth))
         self.scene, self.parts = scene, [Camera(scene, method) for method in methods]
 
     def __call__(self, spp: int, seed: int) -> tuple[np.ndarray, float]:
         """Return the image and the seconds that both integrators took."""
-        (scattered, first), (in_glass, second) = (part(spp, seed) for part in self.parts)
-        return scattered + in_glass, first + second
+        from_lamps, of_path = self.parts
+        count = self.light_images
+        scattered, seconds = zip(*(from_lamps(spp, seed * count + i) for i in range(count)), strict=True)
+        in_glass, more = of_path(spp, seed)
+        return np.mean(scattered, axis=0) + in_glass, sum(seconds) + more
 
 
 def camera_of(scene: Any, method: Method, max_depth: int = DEPTH) -> Camera | SumOfClasses:
@@ -227,12 +234,14 @@ class Reference:
 def reference(body: str, lamp: str, extent: Extent) -> Reference:
     """Render the reference by the sum of Mitsuba's two integrators."""
     scene, black = (scenes.scene(body, lamp, bsdf, extent.resolution) for bsdf in (DIELECTRIC, scenes.BLACK))
-    camera = SumOfClasses(scene, DEPTH)
-    renders = np.stack([camera(extent.checked(body), seed=FIRST_REFERENCE + i)[0] for i in range(extent.renders)])
+    spp = extent.checked(body, lamp)
+    aimed = lamp not in (caustic_energy.POINT, caustic_energy.PARALLEL)
+    camera = SumOfClasses(scene, DEPTH, light_images=1 if aimed else extent.unaimed)
+    renders = np.stack([camera(spp, seed=FIRST_REFERENCE + i)[0] for i in range(extent.renders)])
     without_glass = Camera(scene, seen_in_glass())(64, seed=0)[0].max(-1) == 0
-    direct = camera_of(black, BUILTIN)(extent.checked(body), seed=0)[0].mean(-1)
+    direct = camera_of(black, BUILTIN)(spp, seed=0)[0].mean(-1)
     # Another render selects the pixels: pixels selected by the noise of the references would be too bright in them.
-    light = camera(extent.checked(body), seed=FIRST_REFERENCE - 1)[0].mean(-1)
+    light = camera(spp, seed=FIRST_REFERENCE - 1)[0].mean(-1)
     return Reference(renders, without_glass, without_glass & (light - direct > SHARE * light))
 
 
@@ -261,7 +270,8 @@ def image_rows(
         values, budgets = _times(measured[method.name], measured[methods[0].name], side), dict[str, float]()
         images, goals = np.stack(measured[method.name].images), dict[str, float]()
         if method == tested:
-            images = np.stack([cameras[method.name](extent.checked(body), seed=i)[0] for i in range(extent.renders)])
+            spp = extent.checked(body, lamp)
+            images = np.stack([cameras[method.name](spp, seed=i)[0] for i in range(extent.renders)])
             values |= _tested(truth.renders * compared, images * compared, truth.caustic)
             budgets = {WELCH_ALARMS: 0.0, DETECTABLE: limits.CAUSTIC_DETECTABLE}
             goals = limits.CAUSTICS if small else {}
@@ -269,7 +279,7 @@ def image_rows(
         values[MISSING] = float(1 - test_mean / reference_mean)
         replay: dict[str, Any] = {"method": method.plugin(DEPTH), "body": body, "lamp": lamp}
         replay |= {"resolution": extent.resolution, "spp": extent.spp, "rounds": extent.rounds}
-        replay |= {"renders": extent.renders, "spp of renders and references": extent.checked(body)}
+        replay |= {"renders": extent.renders, "spp of renders and references": extent.checked(body, lamp)}
         replay |= {"reference seeds from": FIRST_REFERENCE, "pixels of the caustic": int(truth.caustic.sum())}
         shown = {"reference": truth.renders.mean(0), "test": measured[method.name].images[0]}
         paths = {role: save_image(context.out, f"{case} {method.name} {role}", x, {}) for role, x in shown.items()}
