@@ -176,7 +176,8 @@ def at_fixed_direction(
     value, pdf = bsdf.eval_pdf(context, si, wo, smooth)
     if v.is_polarized:
         value = si.to_world_mueller(value, -wo, si.wi)
-    smooth &= pdf > 0
+    # A sample along the surface has the density 0, but after rounding it may be above the surface.
+    smooth &= (bs.pdf > 0) & (pdf > 0)
     value = value / dr.detach(dr.select(smooth, pdf, 1))
     return dr.select(smooth, value, weight), dr.select(smooth, dr.detach(d), d), dr.select(smooth, pdf, bs.pdf)
 

@@ -5,6 +5,7 @@ The tests run in `scalar_rgb`: the loop is the same in every variant, and nothin
 
 import math
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -177,3 +178,18 @@ def test_a_max_depth_of_minus_one_is_no_limit(max_depth, lit):
     parts = parts | {name: parts[name] | {"bsdf": {"type": "twosided", "a": mirror}} for name in ("lower", "upper")}
     radiance, _ = follow(parts, [], (0, 0, 1 / 128), max_depth=max_depth, rr_depth=10**6)
     assert radiance == pytest.approx(1 if lit else 0)
+
+
+def test_a_sample_along_the_surface_has_the_weight_0_also_in_renders_that_are_differentiated(llvm_variant):
+    """Its direction may be above the surface after rounding; the derivative of its cosine over it would be 10⁷."""
+    random = np.random.default_rng(2041)
+    si = mi.SurfaceInteraction3f()
+    si.sh_frame = mi.Frame3f(mi.Normal3f(dr.normalize(mi.Vector3f(random.normal(size=(3, 1000))))))
+    si.wi = mi.Vector3f(0, 0, 1)
+    bsdf, context = mi.load_dict({"type": "diffuse"}), mi.BSDFContext()
+    bs, weight = bsdf.sample(context, si, 0.5, mi.Point2f(0, 0.5))
+    assert dr.all(bs.wo.z == 0) and dr.all(weight == 0, axis=None)
+    d = si.to_world(bs.wo)
+    assert dr.any(si.to_local(d).z > 0)
+    weight, *_ = path_loop.at_fixed_direction(mi, context, si, bsdf, bs, weight, d, True, False)
+    assert dr.all(weight == 0, axis=None)

@@ -291,7 +291,7 @@ class Images:
 
     def differences(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """Return D and D(h) as images."""
-        method = integrator(OURS, split_depth=2)
+        method = integrator(OURS, split_depth=2, caustics="path")  # as a differentiated render has it
 
         def at(x: float) -> np.ndarray:
             self.set(dr.opaque(mi.Float, x))
@@ -315,7 +315,7 @@ class Images:
             return float(dr.grad(x)[0])
 
 
-def integrator(name: str, **parameters: int) -> Any:
+def integrator(name: str, **parameters: int | str) -> Any:
     """Return an integrator of depth 6 without Russian roulette, and without guiding, whose octree takes seconds."""
     guiding = {"guiding": "none"} if name == "prb_projective" else {}
     return mi.load_dict({"type": name, "max_depth": 6, "rr_depth": 100} | guiding | parameters)
