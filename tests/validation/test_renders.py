@@ -304,7 +304,7 @@ class Dependent(KeyedMultijitter):
     ("source", "count", "failing"),
     [
         (KeyedMultijitter, 16, set()),
-        (Dependent, 16, {"light, one vertex", "light, two vertices"}),
+        (Dependent, 16, {"light at one vertex", "light at two vertices"}),
         (OneSeed, 4, {"two"}),
         (OneSeed, 64, {"two"}),
         (Unpermuted, 16, {"one", "one and one"}),

@@ -104,9 +104,9 @@ def histograms(make: Any, count: int, seed: int) -> Iterator[tuple[str, Any, int
         before = now
         light = np.array(source.independent(vertex, 4), float)
         yield "light", cells(light[key % 4]), 0
-        yield "light, one vertex", cells(light[0], light[1 + key % 3]), 0
+        yield "light at one vertex", cells(light[0], light[1 + key % 3]), 0
         if key % 2:
-            yield "light, two vertices", cells(light_before[0], light[0]), 0
+            yield "light at two vertices", cells(light_before[0], light[0]), 0
         light_before = light
 
 
