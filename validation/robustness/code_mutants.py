@@ -218,10 +218,8 @@ def summarise(rows: list[Row], seed: int = SEED) -> list[Row]:
     result = [row for row in rows if row not in outcomes]
     for room in dict.fromkeys([ALL, *sorted(row.subject for row in outcomes)] if outcomes else []):
         of_room = [row for row in outcomes if room in (ALL, row.subject)]
-        count, killed, explained = (
-            len(of_room),
-            *(sum(row.values[x] for row in of_room) for x in ("killed", "explained")),
-        )
+        count = len(of_room)
+        killed, explained = (sum(row.values[metric] for row in of_room) for metric in ("killed", "explained"))
         missed = [row.case for row in of_room if not any(row.values.values())]
         values: dict[str, float] = {"mutants": count, "killed": killed, "survived": count - killed}
         values |= {"explained": explained, "score": 1 - len(missed) / count, "unexplained": len(missed) / count}
