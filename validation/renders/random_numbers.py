@@ -81,7 +81,7 @@ def histograms(make: Any, count: int, seed: int) -> Iterator[tuple[str, Any, int
     sampler.seed(seed, pixels * count)
     seeds = seeds_of(mi, sampler)
     source, random = make(mi, seeds, pixels * count, count), np.random.default_rng(seed)
-    before = light_before = [np.empty(0)] * 3
+    before, light_before = [np.empty(0)] * 3, np.empty(0)
     pick = np.arange(pixels), np.zeros(pixels, int)
     for key in range(KEYS):
         if key % 2 == 0:
@@ -102,7 +102,7 @@ def histograms(make: Any, count: int, seed: int) -> Iterator[tuple[str, Any, int
             for kind, (first, second) in pairs.items():
                 yield kind, cells(before[first], now[second]), 0
         before = now
-        light = np.array(source.independent(vertex, 4), float)
+        light: Any = np.array(source.independent(vertex, 4), float)
         yield "light", cells(light[key % 4]), 0
         yield "light at one vertex", cells(light[0], light[1 + key % 3]), 0
         if key % 2:
