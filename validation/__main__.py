@@ -94,7 +94,7 @@ def _command(
     variant: Annotated[
         str | None,
         typer.Option(
-            help="Variant of Mitsuba that renders, such as cuda_ad_rgb. Default: llvm_ad_rgb if it runs here."
+            help="cuda_ad_rgb, llvm_ad_rgb or scalar_rgb, which renders. Default: llvm_ad_rgb if it runs here."
         ),
     ] = None,
     write_tables: Annotated[
@@ -123,6 +123,8 @@ def _command(
     chosen = modules(names, profile)
     if profile not in PROFILES:
         raise ValueError(f"unknown profile {profile!r}; expected {', '.join(PROFILES)}")
+    if variant and not variant.endswith("_rgb"):  # studies of spectra and polarisation choose their variants themselves
+        raise ValueError(f"--variant {variant}: studies render in RGB; expected cuda_ad_rgb, llvm_ad_rgb or scalar_rgb")
     if write_tables and profile == "quick":
         raise ValueError(
             "--write-tables needs more than the profile 'quick'; expected --profile standard or --profile full"

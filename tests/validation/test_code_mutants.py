@@ -1,6 +1,7 @@
 """Mutants of our own code: planted ones are killed or survive as they must, and too many survivors fail."""
 
 import json
+import types
 
 import pytest
 
@@ -115,3 +116,13 @@ def test_the_tests_of_a_module_come_first_and_without_any_nothing_is_run(tmp_pat
     assert files == ["tests/io/test_image_file.py", "tests/io", "tests/test_rooms.py"]
     assert "tests/cli/test_diff.py" in code_mutants.guards(code_mutants.ROOT, "mi_refract/image_diff/pairing.py")
     assert code_mutants.missing(tmp_path) == "no folder of tests beside the package: run it in a checkout"
+
+
+def test_the_tasks_of_a_run_examine_every_mutant_once(monkeypatch):
+    context = types.SimpleNamespace(profile=types.SimpleNamespace(name="full"))
+    mutants = [Mutant(PATH, "AddNot", i, 1, "if a:", "if not a:") for i in range(220)]
+    examined = []
+    monkeypatch.setattr(code_mutants, "sample", lambda root, count, seed: mutants[:count])
+    monkeypatch.setattr(code_mutants, "examine", lambda part: examined.extend(part) or [(x, True) for x in part])
+    rows = [row for task in code_mutants.tasks(context) for row in task.run()]
+    assert examined == mutants and code_mutants.summarise(rows)[0].values["killed"] == len(mutants)

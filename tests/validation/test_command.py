@@ -180,10 +180,10 @@ def test_the_exit_code_follows_the_budgets(validate, tmp_path, budget, code):
 
 def test_a_variant_renders_instead_of_the_default_and_a_replay_names_it(validate, tmp_path):
     variants = []
-    assert validate(lambda: variants.append(mi.variant()) or [row()], "--variant", "scalar_spectral") == 0
+    assert validate(lambda: variants.append(mi.variant()) or [row()], "--variant", "scalar_rgb") == 0
     context = json.loads((tmp_path / "rows.json").read_text())["context"]
-    assert variants == [context["variant"]] == ["scalar_spectral"]
-    assert context["replay"] == "python -m validation robustness --profile quick --variant scalar_spectral"
+    assert variants == [context["variant"]] == ["scalar_rgb"]
+    assert context["replay"] == "python -m validation robustness --profile quick --variant scalar_rgb"
 
 
 def test_an_interruption_prints_how_to_resume_and_two_validations_do_not_share_a_folder(validate, tmp_path, capsys):
@@ -214,6 +214,7 @@ def test_a_part_of_a_study_runs_alone_and_only_once():
         (["refractions"], "unknown study 'refractions'; expected directions, stability, renders, efficiency, media"),
         (["renders.colors"], "unknown study 'renders.colors'; expected directions"),
         (["--variant", "llvm_rgb"], "variant 'llvm_rgb': unknown; expected scalar_rgb"),
+        (["--variant", "llvm_ad_spectral"], "--variant llvm_ad_spectral: studies render in RGB; expected cuda_ad_rgb"),
         (["renders."], "unknown study 'renders.'; expected directions"),
         (["--profile", "slow"], "unknown profile 'slow'; expected quick, standard, full"),
         (["--out", __file__], "File exists; expected a writable folder"),

@@ -243,9 +243,10 @@ def tasks(context: Context) -> list[Task]:
     if reason := missing():
         return [Task("code mutants", lambda: [Row(STUDY.name, ALL, "mutated code", "", reason=reason)])]
     count = COUNTS[context.profile.name]
+    drawn = functools.cache(lambda: sample(ROOT, count, SEED))  # takes a minute; all parts of a run share it
 
     def measured(first: int) -> list[Row]:
-        return [row_of(*outcome) for outcome in examine(sample(ROOT, count, SEED)[first : first + PART])]
+        return [row_of(*outcome) for outcome in examine(drawn()[first : first + PART])]
 
     return [
         Task(f"code mutants: from {first + 1} of {count}", functools.partial(measured, first), timed=True)
