@@ -91,14 +91,15 @@ def flip(
     treat_as_hdr = is_hdr(reference, test, hdr)
     error = flip_map(reference, test, treat_as_hdr, ppd)
     (worst, around), patch_window = local_error(error, ppd), patch_error(error, ppd)
+    compared = error if reference.mask is None else error[reference.mask]
     one_way_window = one_way_change(_codes(reference), _codes(test), ppd) if not treat_as_hdr else NOWHERE
     metrics = (
         Metric("local FLIP error", worst.value, local),
         Metric("FLIP error throughout a patch", patch_window.value, patch),
         *([] if treat_as_hdr else [Metric("change one way, in codes", one_way_window.value, one_way)]),
         Metric("largest FLIP error", float(error.max()), largest),
-        Metric("mean FLIP error", float(error.mean()), mean),
-        Metric("99th percentile of the FLIP error", float(np.percentile(error, 99)), percentile_99),
+        Metric("mean FLIP error", float(compared.mean()), mean),
+        Metric("99th percentile of the FLIP error", float(np.percentile(compared, 99)), percentile_99),
     )
     reason = f"local FLIP error {worst.value:.3g}, largest {error.max():.3g} ({'HDR' if treat_as_hdr else 'LDR'})"
     if worst.value:
@@ -122,7 +123,7 @@ def views(image: Image, options: Options) -> Iterator[Image]:
     light = block_mean(_linear(image), side).sum(-1)
     y, x = (side * int(i) for i in np.unravel_index(int(light.argmax()), light.shape))
     rows, columns = (slice(max(start - around, 0), start + side + around) for start in (y, x))
-    yield replace(image, pixels=image.pixels[rows, columns])
+    yield replace(image, pixels=image.pixels[rows, columns], mask=None)
     yield image
 
 

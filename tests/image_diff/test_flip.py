@@ -215,6 +215,19 @@ def test_the_bounds_are_options():
     assert compare("flip", one, two, local=3.0).verdict is INCONCLUSIVE  # black would pass, too
 
 
+def test_the_mean_and_the_share_are_those_of_the_pixels_inside_the_mask():
+    codes, mask = np.full((48, 48), 100.0), np.zeros((48, 48), bool)
+    one, mask[:8], codes[3] = shown(codes), True, 140
+    two = shown(codes)
+    error = flip(one, two).maps["flip"][mask]
+    expected = {"mean": float(error.mean()), "percentile_99": float(np.percentile(error, 99))}
+    sides = [replace(image, mask=mask) for image in (one, two)]
+    assert [metric.value for metric in flip(*sides).metrics[-2:]] == pytest.approx([*expected.values()])
+    for name, value in expected.items():
+        assert compare("flip", *sides, **{name: 1.1 * value}).verdict is EQUAL
+        assert flip(*sides, **{name: 0.9 * value}).verdict is DIFFERENT
+
+
 # Encodings of files ----------------------------------------------------------------------------------------------
 
 
