@@ -70,9 +70,9 @@ def means(channels: Sequence[str]) -> list[str]:
 
 
 def without_variances(image: Image, named: Collection[str] = ()) -> Image:
-    """Return the image without its channels NAME.variance of channels NAME, except those in `named`."""
-    removed = {VARIANCES[0].format(name) for name in image.channels} - set(named)
-    names = tuple(name for name in image.channels if name not in removed)
+    """Return the image with the channels in `named`; if that is empty, without its NAME.variance of channels NAME."""
+    removed = {VARIANCES[0].format(name) for name in image.channels}
+    names = tuple(name for name in image.channels if (name in named if named else name not in removed))
     return image if names == image.channels else replace(image, pixels=image.select(names), channels=names)
 
 

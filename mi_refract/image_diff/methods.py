@@ -162,8 +162,8 @@ def compare(
 
     "auto" is `welch` if variances are known, see `choice`, else `tolerance`; options of the other one are accepted and
     not used. With "auto", one `outrageous` pixel makes images different by `tolerance`, unless `hard_fail` or
-    `allow_failures` is set. `welch` reads the channels NAME.variance of single images; other methods ignore them,
-    except those in `named`.
+    `allow_failures` is set. `named`: the channels to compare; empty: all, except NAME.variance beside NAME. `welch`
+    also reads the variances of single images from their other channels.
 
     The verdict is INCONCLUSIVE if a method calls the images equal but would also call a black image equal, or one with
     a group of channels black, or accepts many pixels that change by half; if channels whose variance `welch` does not

@@ -379,7 +379,7 @@ def test_variances_of_mitsubas_test_data_are_compared_as_xyz(tmp_path):
 
 @pytest.mark.parametrize("method", ["exact", "tolerance"])
 def test_selected_channels_are_compared_by_every_method(pair, films, method):
-    """By their names on both sides, and also NAME.variance if it is selected."""
+    """By their names on both sides; variances and second moments only if they are selected."""
     image = read(pair[0] / "a.exr")
     write_exr(pair[1] / "a.exr", image.pixels * (1, 1, 3))
     off = read(films[0] / "off.exr")
@@ -387,7 +387,11 @@ def test_selected_channels_are_compared_by_every_method(pair, films, method):
     written(films[1] / "off.exr", off)
     write_exr(pair[1] / "turned.exr", image.pixels, ("B", "G", "a.R"))
     write_exr(pair[0] / "turned.exr", image.pixels[..., ::-1], ("R", "G", "b.B"))
+    for root, squares in zip(pair, (2, 3), strict=True):
+        write_exr(root / "moment.exr", image.pixels * (1, 1, squares), ("G", "R", "m2_R"))
     for path, names, status, end in (
+        ("moment.exr", {"R": "R"}, Status.EQUAL, "; not compared: G, m2_R"),
+        ("moment.exr", {"R": "R", "m2_R": "m2_R"}, Status.DIFFERENT, "; not compared: G"),
         ("a.exr", {name: name for name in RGB}, Status.DIFFERENT, ""),
         ("a.exr", {"R": "R", "G": "G"}, Status.EQUAL, "; not compared: B"),
         ("off.exr", {"R": "R", "G": "G"}, Status.EQUAL, "; not compared: B"),
