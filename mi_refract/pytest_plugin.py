@@ -127,16 +127,16 @@ def assert_image_unbiased(request: pytest.FixtureRequest) -> Callable[..., Compa
 
         from mi_refract.image_diff.file_pair import read_renders
 
+        def rendered(name: str, renderer: Renderer, first: int) -> list[ReadImage]:
+            # Each image is copied at once: the next render may be in the same file or array.
+            return [_image(f"{name} {i}", renderer(i)) for i in range(first, first + runs)]
+
         first = seed + REFERENCE_SEED
-        references = [reference(i) for i in range(first, first + runs)] if callable(reference) else Path(reference)
-        renders = [render(i) for i in range(seed, seed + runs)]
+        references = rendered("reference", reference, first) if callable(reference) else Path(reference)
+        tests = rendered("test", render, seed)
 
         def sides() -> tuple[list[ReadImage], list[ReadImage]]:
-            if isinstance(references, Path):
-                reference_images = read_renders(references)
-            else:
-                reference_images = [_image(f"reference {first + i}", image) for i, image in enumerate(references)]
-            return reference_images, [_image(f"test {seed + i}", image) for i, image in enumerate(renders)]
+            return read_renders(references) if isinstance(references, Path) else references, tests
 
         return _require_equal(request, "welch", sides, options)
 

@@ -96,6 +96,23 @@ def test_errors_of_render_functions_are_raised_and_seeds_are_distinct(assert_ima
     assert not set(seeds["test"]) & set(seeds["reference"])
 
 
+@pytest.mark.parametrize("in_file", [False, True])
+def test_renders_in_the_same_array_or_file_are_distinguished(assert_image_unbiased, tmp_path, in_file):
+    buffer = np.empty_like(IMAGE)
+
+    def reused(gain):
+        def render_again(seed):
+            buffer[:] = render(seed, gain)
+            image_file.write_exr(tmp_path / "a.exr", buffer)
+            return tmp_path / "a.exr" if in_file else buffer
+
+        return render_again
+
+    assert_image_unbiased(reused(1), reused(1))
+    with pytest.raises(pytest.fail.Exception, match="welch: different: "):
+        assert_image_unbiased(reused(2), reused(1))
+
+
 def test_the_plugin_works_from_a_conftest(pytester):
     """In a separate process, because a run in this process would import extension modules twice, which fails."""
     pytester.makeconftest('pytest_plugins = ["mi_refract.pytest_plugin"]')
