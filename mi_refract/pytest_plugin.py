@@ -104,7 +104,15 @@ def assert_image_equal(request: pytest.FixtureRequest) -> Callable[..., Comparis
         __tracebackhide__ = True
         if request.config.getoption(ACCEPT, False) and isinstance(reference, str | os.PathLike):
             _accept(Path(reference), test, method, options)
-        return _require_equal(request, method, lambda: (_image("reference", reference), _image("test", test)), options)
+
+        def sides() -> tuple[ReadImage, ReadImage]:
+            images = _image("reference", reference), _image("test", test)
+            are_files = all(isinstance(side, str | os.PathLike) for side in (reference, test))
+            if are_files and Path(reference).samefile(test):
+                raise ValueError(f"{test}: the same file as the reference {reference}; expected two different files")
+            return images
+
+        return _require_equal(request, method, sides, options)
 
     return check
 

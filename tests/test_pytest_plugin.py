@@ -23,9 +23,10 @@ def test_equal_images_pass(assert_image_equal, assert_image_unbiased, tmp_path):
     assert assert_image_equal(IMAGE, IMAGE).method == "tolerance"
     assert_image_equal(IMAGE + 1e-5, IMAGE, "tolerance")
     assert_image_equal(IMAGE[..., 0], IMAGE[..., 0], "exact")
-    image_file.write_exr(tmp_path / "image.exr", IMAGE)
+    for name in ("image.exr", "copy.exr"):
+        image_file.write_exr(tmp_path / name, IMAGE)
     assert_image_equal(IMAGE, tmp_path / "image.exr", "paired")
-    assert_image_equal(str(tmp_path / "image.exr"), tmp_path / "image.exr", "exact")
+    assert_image_equal(str(tmp_path / "image.exr"), tmp_path / "copy.exr", "exact")
     assert assert_image_unbiased(render, render).method == "welch"
     (tmp_path / "renders").mkdir()
     for i in range(8):
@@ -65,6 +66,14 @@ def test_different_images_fail_with_a_reason(assert_image_equal, tmp_path, monke
         with pytest.raises(pytest.fail.Exception, match=reason):
             assert_image_equal(*sides, method, **options)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_file_is_not_compared_with_itself(assert_image_equal, tmp_path):
+    image_file.write_exr(tmp_path / "a.exr", IMAGE)
+    (tmp_path / "link.exr").symlink_to("a.exr")
+    for name in ("a.exr", "link.exr"):
+        with pytest.raises(pytest.fail.Exception, match=r"could not compare: .*: the same file as the reference"):
+            assert_image_equal(str(tmp_path / name), tmp_path / "a.exr")
 
 
 def test_biased_and_inconclusive_renders_fail(assert_image_unbiased, tmp_path):
