@@ -334,6 +334,8 @@ def _misread_reason(format_name: str, types: set[str], metadata: Metadata, rows:
         return "integers of 64 bits; expected up to 32"
     if format_name == "tiff" and "double" in types and rows == 1:  # OpenImageIO 2.4 to 3.2 reads uninitialised memory
         return "one row of 64-bit numbers in a TIFF file; expected several rows, or 32 bits"
+    if format_name == "tiff" and metadata.get("oiio:BitsPerSample") == 24:  # read with the bytes in the wrong order
+        return "numbers of 24 bits in a TIFF file; expected 16 or 32"
     if metadata.get("tiff:PhotometricInterpretation") == 0 and not types <= {"uint8"}:
         return "0 is white in a TIFF file of more than 8 bits; expected 0 as black"  # up to 8 bits are inverted
     space = metadata.get("tiff:ColorSpace", metadata.get("jpeg:ColorSpace"))

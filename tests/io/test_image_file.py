@@ -165,6 +165,7 @@ BAD = {
     "pipe.exr": os.mkfifo,
     "header.tif": lambda path: path.write_bytes(b"II*\0\x08\0\0\0"),
     "one row.tif": lambda path: save(path, np.ones((1, 4, 3)), "double"),  # OpenImageIO reads uninitialised memory
+    "24 bits.tif": lambda path: tiff(path, np.zeros((1, 6, 1), np.uint8), {256: (4, [2]), 258: (3, [24])}),
     "cmyk.psd": lambda path: path.write_bytes(struct.pack(">4sH6xHIIHH14x", b"8BPS", 1, 4, 1, 1, 8, 4) + bytes(4)),
     "a\udcff.exr": lambda path: save(path.with_name("a.exr"), PIXELS).rename(path),
 }
