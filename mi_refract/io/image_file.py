@@ -165,6 +165,8 @@ def read_parts(
         for part in _parts(source):
             images.append(_image(path, source, kind, part, (max_values, values), hidden_metadata))
             values += images[-1].pixels.size
+            if part[1] and images[-1].pixels.shape == images[-2].pixels.shape:
+                raise ImageError(f"{path}: a RIP map, of which OpenImageIO reads some levels only; expected MIP levels")
             if first_only:
                 break
         if not images:

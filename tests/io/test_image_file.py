@@ -146,6 +146,29 @@ def window(path, x, y):
     path.write_bytes(data)
 
 
+def rip_map(path):
+    """Write an EXR of 2 × 2 pixels with its four levels, without compression."""
+    box, zeros = struct.pack("<4i", 0, 0, 1, 1), bytes(8)
+    attributes = {
+        "channels chlist": b"Y\0" + struct.pack("<4i", 2, 0, 1, 1) + b"\0",
+        "compression compression": b"\0",
+        "dataWindow box2i": box,
+        "displayWindow box2i": box,
+        "lineOrder lineOrder": b"\0",
+        "pixelAspectRatio float": struct.pack("<f", 1),
+        "screenWindowCenter v2f": zeros,
+        "screenWindowWidth float": struct.pack("<f", 1),
+        "tiles tiledesc": struct.pack("<IIB", 16, 16, 2),
+    }
+    data = struct.pack("<4sI", b"\x76\x2f\x31\x01", 2 | 0x200)
+    for name, value in attributes.items():
+        data += name.replace(" ", "\0").encode() + b"\0" + struct.pack("<I", len(value)) + value
+    data += b"\0"
+    tiles = [struct.pack("<4iI", 0, 0, x, y, size := 16 >> (x + y)) + bytes(size) for y in (0, 1) for x in (0, 1)]
+    starts = [len(data) + 32 + sum(map(len, tiles[:i])) for i in range(4)]
+    path.write_bytes(data + struct.pack("<4Q", *starts) + b"".join(tiles))
+
+
 POINTER = f"version https://git-lfs.github.com/spec/v1\noid sha256:{64 * '4'}\nsize 12345\n"
 BAD = {
     "empty.exr": lambda path: path.write_bytes(b""),
@@ -190,6 +213,12 @@ def test_errors_of_bad_files_are_one_line_with_the_path(tmp_path, name):
         assert not name.startswith("truncated") or "corrupt" in text or "not an EXR file" in text
         assert ("run `git lfs pull` to fetch it" in text) is (name == "pointer.tif")
     assert oiio.get_int_attribute("limits:imagesize_MB") == before
+
+
+def test_a_rip_map_is_refused(tmp_path):
+    rip_map(tmp_path / "a.exr")
+    with pytest.raises(ValueError, match=r"a\.exr: a RIP map, of which OpenImageIO reads some levels only; expected"):
+        image_file.read_parts(tmp_path / "a.exr")
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.png", "a.tif", "a.gif", "a.jp2", "a.jxl", "jp2 as.png", "gif as.exr"])
