@@ -48,7 +48,9 @@ CODED = re.compile(r"srgb|gamma|^g\d\d")  # OpenImageIO's names of colour spaces
 LINEAR = re.compile(r"^lin|linear|^aces|^raw$|^data$")
 INTEGERS = ("uint8", "uint16")  # a file of these types that names no colour space is encoded for a display
 DARKER = 4.0  # two stops: light twice as bright as a nearly white pixel is nearly white, too
-DUST = 2.0**-24  # relative to the bright luminance of both images, without fireflies; below it a pixel counts as black
+# Relative to the bright luminance of both images, without fireflies: below it, a pixel counts as black. Where the other
+# image is not black, it is light beside a much brighter one, such as a room beside the sun, and not a rounding error.
+DUST, FAINTEST = 2.0**-24, 2.0**-48
 BRIGHT = 0.999  # the quantile of the luminances that counts as bright
 WINDOW, OCTAVES = 0.12, 7  # degrees: the side of the smallest window; number of windows, each twice as wide
 SURFACE = 0.24  # degrees: the side of the window of `patch_error`
@@ -174,8 +176,10 @@ def _luminances(images: Sequence[Pixels]) -> tuple[float, float]:
 
     light = [pixels @ LUMINANCE for pixels in images]
     line = max(float(rank_filter(x, -3, 3, mode="constant").max()) for x in light)
-    black = DUST * max(line, *(float(np.quantile(x, BRIGHT)) for x in light))
-    median = min((float(np.median(x[x > black])) for x in light if (x > black).any()), default=0.18)
+    bright = max(line, *(float(np.quantile(x, BRIGHT)) for x in light))
+    in_both = np.minimum(light[0], light[1]) > FAINTEST * bright
+    visible = [x[in_both | (x > DUST * bright)] for x in light]
+    median = min((float(np.median(x)) for x in visible if x.size), default=0.18)
     lit = [x[x > 0] for x in light if (x > 0).any()]
     return max(line, *(float(np.quantile(x, BRIGHT)) for x in lit), 0.0) or 2.0, median
 

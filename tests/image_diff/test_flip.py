@@ -269,6 +269,18 @@ def test_hdr_and_ldr():
         assert compare("flip", of(one), of(1.01 * one)).verdict is EQUAL
 
 
+def test_a_room_beside_the_sun_is_seen_and_rounding_errors_beside_black_are_not():
+    room = 20 * (0.5 + SMOOTH)
+    for change, verdict in ((3, DIFFERENT), (1 + 1e-6, EQUAL)):
+        one, two = room.copy(), change * room
+        one[3:6, 3:6] = two[3:6, 3:6] = 1.6e9
+        assert compare("flip", of(one), of(two)).verdict is verdict
+    one = np.zeros_like(SMOOTH)
+    two = 20 * SMOOTH
+    one[3:6, 3:6] = two[3:6, 3:6] = 1.6e9
+    assert compare("flip", of(one), of(two)).verdict is EQUAL
+
+
 # Black ---------------------------------------------------------------------------------------------------------
 
 
