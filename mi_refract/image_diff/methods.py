@@ -217,7 +217,7 @@ def _compare(
     if takes_renders:
         result = function(*compared, allow_nonfinite=allow_nonfinite, **options)
         if single and result.is_equal and (untested := channels.untested(one, two)):
-            by_tolerance = compare("tolerance", *untested, allow_nonfinite=allow_nonfinite)
+            by_tolerance = compare(AUTO, *untested, allow_nonfinite=allow_nonfinite, ignore_metadata=["*"])
             if not by_tolerance.is_equal:
                 doubt = f"not tested, without variance: {', '.join(untested[0].channels)}: {by_tolerance.reason}"
                 return result.but(Verdict.INCONCLUSIVE, doubt)

@@ -308,6 +308,22 @@ def test_alpha_has_the_variance_of_a_binary_variable():
     assert "without variance: A" in compare("auto", reference, other, **how).reason
 
 
+def test_channels_without_variance_are_compared_as_by_auto():
+    """One firefly among 6144 pixels; metadata count by the options of the whole comparison."""
+
+    def side(drawn, view):
+        pixels = np.dstack([drawn.mean(0)[..., :1], drawn.var(0, ddof=1)[..., :1], MEAN[..., :1]])
+        header = {SPP: len(drawn), "view": view}
+        return of(np.tile(pixels, (2, 2, 1)), ("R", "R.variance", "albedo"), metadata=header, stored="float")
+
+    reference, test = side(samples(1, 64, shape=100.0), "left"), side(samples(2, 64, shape=100.0), "right")
+    assert compare("auto", reference, test, ignore_metadata=["view"]).verdict is EQUAL
+    assert compare("auto", reference, test).verdict is DIFFERENT
+    test.pixels[5, 6, 2] = 1e6
+    result = compare("auto", reference, test, ignore_metadata=["view"])
+    assert result.verdict is INCONCLUSIVE and "albedo: one pixel is far too bright" in result.reason
+
+
 def test_differences_in_channels_without_variance_are_inconclusive():
     """The variance is known for R only; G is black and B tripled."""
 
