@@ -79,12 +79,13 @@ def without_variances(image: Image, named: Collection[str] = ()) -> Image:
 def selected(image: Image, names: Mapping[str, str]) -> Image:
     """Return the image with these channels under new names, and with their variances. `names`: new names by old ones.
 
-    If the image has R, G, B and not X, Y, Z, these are computed from R, G, B. Its variances from a file are converted
-    in the same way: they are assumed to be variances of X, Y, Z that were converted to R, G, B like a colour, as in
-    Mitsuba's test data. (Variances of X, Y, Z do not follow from those of R, G, B, whose correlations are not known.)
+    If the image has R, G, B and not X, Y, Z, these are computed from R, G, B; Z without X or Y is a depth, and is not.
+    The variances from a file are converted in the same way: they are assumed to be variances of X, Y, Z that were
+    converted to R, G, B like a colour, as in Mitsuba's test data. (Variances of X, Y, Z do not follow from those of R,
+    G, B, whose correlations are not known.)
     ValueError for a channel that does not exist.
     """
-    if set(names) & set(XYZ) and not set(XYZ) & set(image.channels) and set(RGB) <= set(image.channels):
+    if set(names) & {"X", "Y"} and not set(XYZ) & set(image.channels) and set(RGB) <= set(image.channels):
         converted = dict(image.variances)
         if set(RGB) <= set(converted):
             colour = np.stack([converted[name] for name in RGB], -1).astype(np.float64) @ TO_XYZ.T

@@ -208,6 +208,7 @@ BAD = [  # a change, settings, and part of the error
     (lambda old: None, {"spp_reference": -3}, "spp_reference = -3; expected a number of at least 0"),
     (lambda old: None, {"spp_test": 0}, "samples per pixel in its header: none; expected `spp` or `spp_test`"),
     (lambda old: None, {"channels": (("Q", "Q"),)}, "no channel 'Q'; in `channels` expected R, G"),
+    (lambda old: None, {"channels": (("R", "R"), ("Z", "Z"))}, "no channel 'Z'; in `channels` expected R, G"),
     *(
         (_write("", MEAN, **{FREEDOM: named}), {}, "; expected a whole number, 1 to 10¹⁵")
         for named in (0, -1, 2.5, "many", "7\n8", float("nan"), 10**16)
