@@ -162,9 +162,15 @@ class Results:
         return [result for result in self.results if result.status in statuses]
 
     @property
+    def error(self) -> str:
+        """Why nothing was compared; "" if anything was, or could not be."""
+        all_skipped = len(self.of(Status.SKIPPED)) == len(self.results)
+        return "all images are skipped; expected at least one to compare" if all_skipped else ""
+
+    @property
     def exit_code(self) -> int:
         """2: an image could not be compared, or all were skipped; 1: different; 3: inconclusive; 0: all equal."""
-        if self.of(Status.ERROR) or len(self.of(Status.SKIPPED)) == len(self.results):
+        if self.of(Status.ERROR) or self.error:
             return 2
         if self.of(Status.DIFFERENT):
             return 1

@@ -123,7 +123,8 @@ def write(results: Results, origin: Origin, junit: Path | None = None, data: Pat
     """Write JUnit's XML to `junit`, and the JSON to `data`. OSError if a file cannot be written.
 
     JUnit has a case for each image: "different" is a failure, "inconclusive" is one unless it passes by the option
-    --inconclusive, and an image that could not be compared is an error. The JSON is a `Document`, with `origin`.
+    --inconclusive, and an image that could not be compared is an error; if all are skipped, that is one more. The JSON
+    is a `Document`, with `origin`.
     """
     if data:
         document = Document(
@@ -140,6 +141,8 @@ def write(results: Results, origin: Origin, junit: Path | None = None, data: Pat
         write_strict_json(data, msgspec.to_builtins(document))
     if junit:
         cases = [_junit_case(result, results) for result in results.results]
+        if results.error:
+            cases.append(documents.Case("", "all images", "error", results.error))
         documents.write_junit(junit, "mi-refract diff", {str(results.test): cases})
 
 
@@ -149,6 +152,8 @@ def write_github(results: Results, report: str = "", url: str = "") -> None:
     `text_reports.markdown` with `report` and `url` is appended to the file $GITHUB_STEP_SUMMARY. OSError if it cannot
     be written.
     """
+    if results.error:
+        print(f"::error title=mi-refract diff::{results.error}")
     for result in results.results:
         if result.warning or result.status in FAILED:
             file, title = result.test or result.reference or result.name, f"{result.name}: {result.word}"

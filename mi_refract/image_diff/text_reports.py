@@ -51,9 +51,9 @@ def print_results(results: Results) -> None:
 
 
 def print_errors(results: Results) -> None:
-    """Print a line on stderr for each image that could not be compared."""
-    for result in results.of(Status.ERROR):
-        print(f"mi-refract: {printable(result.error)}", file=sys.stderr)
+    """Print a line on stderr for each image that could not be compared, and if all are skipped."""
+    for error in [result.error for result in results.of(Status.ERROR)] + [results.error] * bool(results.error):
+        print(f"mi-refract: {printable(error)}", file=sys.stderr)
 
 
 def print_table(rows: Rows, styles: Mapping[str, str] | None = None) -> None:

@@ -160,6 +160,10 @@ def test_every_report_contains_skipped_images(run, pair, tmp_path):
     assert code == 0 and "1 equal, 1 skipped" in out and "::" not in out
     assert '<skipped message="skipped by the settings [loud]"' in (tmp_path / "out.xml").read_text()
     assert '"skipped": 1' in (tmp_path / "out.json").read_text()
+    code, out, err = run("diff", *pair, "louder.exr", *files, "--github")
+    reason = "all images are skipped; expected at least one to compare"
+    assert (code, err) == (2, f"mi-refract: {reason}\n") and f"::error title=mi-refract diff::{reason}\n" in out
+    assert f'<error message="{reason}" />' in (tmp_path / "out.xml").read_text()
 
 
 # Bad input --------------------------------------------------------------------------------------------------------
