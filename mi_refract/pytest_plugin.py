@@ -71,6 +71,7 @@ class Compared:
 
 
 COMPARED = pytest.StashKey[Compared]()
+ACCEPTED = pytest.StashKey[dict[Path, str]]()  # the SHA-256 of each reference that was accepted in this run
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -103,7 +104,7 @@ def assert_image_equal(request: pytest.FixtureRequest) -> Callable[..., Comparis
     def check(test: Image, reference: Image, method: str = "auto", **options: Any) -> Comparison:
         __tracebackhide__ = True
         if request.config.getoption(ACCEPT, False) and isinstance(reference, str | os.PathLike):
-            _accept(Path(reference), test, method, options)
+            _accept(Path(reference), test, method, options, request.config.stash.setdefault(ACCEPTED, {}))
 
         def sides() -> tuple[ReadImage, ReadImage]:
             images = _image("reference", reference), _image("test", test)
@@ -151,8 +152,8 @@ def assert_image_unbiased(request: pytest.FixtureRequest) -> Callable[..., Compa
     return check
 
 
-def _accept(reference: Path, test: Image, method: str, options: dict[str, Any]) -> None:
-    """Copy the image to the path of the reference, unless they are equal."""
+def _accept(reference: Path, test: Image, method: str, options: dict[str, Any], accepted: dict[Path, str]) -> None:
+    """Copy the image to the path of the reference, unless they are equal, or another image is among the `accepted`."""
     __tracebackhide__ = True
     from mi_refract.image_diff import accept, folders
     from mi_refract.image_diff.settings import Settings
@@ -164,7 +165,11 @@ def _accept(reference: Path, test: Image, method: str, options: dict[str, Any]) 
                 image, test = image_file.named("test", test), folder / "test.exr"
                 image_file.write_exr(test, image.pixels, image.channels)
             settings = Settings.for_all(method=method, **options)
-            accept.Acceptance(list(accept.changes(folders.diff(reference, test, settings, to_accept=True)))).run()
+            copies = list(accept.changes(folders.diff(reference, test, settings, to_accept=True)))
+            for copy in copies:
+                if accepted.setdefault(copy.reference.resolve(), copy.compared) != copy.compared:
+                    raise ValueError(f"{copy.reference}: also the reference of another image; expected one of its own")
+            accept.Acceptance(copies).run()
     except (ValueError, OSError) as error:
         pytest.fail(f"could not accept: {error}", pytrace=False)
 

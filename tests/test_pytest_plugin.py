@@ -182,6 +182,21 @@ def test_options_write_a_page_and_accept_images(pytester):
     assert after == before | {"old.exr": before["test.exr"], "new.exr": after["new.exr"]}
 
 
+def test_a_reference_is_not_accepted_for_two_images(pytester):
+    pytester.makeconftest('pytest_plugins = ["mi_refract.pytest_plugin"]')
+    pytester.makepyfile("""
+        import numpy as np
+        import pytest
+
+        @pytest.mark.parametrize("value", [1, 1.001, 2])
+        def test_new(assert_image_equal, value):
+            assert_image_equal(np.full((8, 8, 3), value), "new.exr", "tolerance")
+    """)
+    result = pytester.runpytest_subprocess("-p", "no:cacheprovider", "--mi-refract-accept")
+    result.assert_outcomes(passed=2, failed=1)
+    result.stdout.fnmatch_lines(["could not accept: *new.exr: also the reference of another image; expected *"])
+
+
 def test_the_page_shows_all_images_of_a_test(request, assert_image_equal, tmp_path):
     """Even if their metrics are equal."""
     from mi_refract.pytest_plugin import COMPARED, Compared  # pytest imports it first
