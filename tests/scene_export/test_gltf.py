@@ -265,6 +265,13 @@ def test_a_wide_floor_does_not_move_the_near_plane_or_a_lamps_back(tmp_path):
     assert np.abs(model.meshes["lamp-back"][0][:, 2] - model.meshes["lamp"][0][:, 2]).max() < 1e-3
 
 
+def test_the_camera_does_not_move_a_mesh_of_any_name(tmp_path):
+    names = ("camera", "world", "lens")
+    targets.write(plain(Mesh(name, *PANE, Diffuse((0.5, 0.5, 0.5))) for name in names), "gltf", tmp_path)
+    nodes = {node["name"]: node for node in glb(tmp_path / "scene.glb").tree["nodes"]}
+    assert not any({"matrix", "camera"} & nodes[name].keys() for name in names)
+
+
 def test_missing_trimesh(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     with pytest.raises(ImportError, match=r"^glTF needs trimesh: pip install 'mi-refract\[gltf\]'$"):

@@ -91,7 +91,9 @@ def files(plain: PlainScene) -> Files:
     axes = np.stack([right, np.cross(right, forward), -forward], axis=1)
     to_world = np.eye(4)
     to_world[:3, :3], to_world[:3, 3] = axes / np.linalg.norm(axes, axis=0), camera.origin
-    scene.camera = trimesh.scene.Camera("camera", fov=(1.0, 1.0))  # its angles are replaced below
+    # No mesh may have the name of the camera's node: the names of meshes have no hyphen, except in "-back". The angles
+    # are replaced below.
+    scene.camera = trimesh.scene.Camera("camera-node", fov=(1.0, 1.0))
     scene.camera_transform = to_world
     half_height = math.tan(math.radians(camera.fov_x_degrees) / 2) * camera.height / camera.width
     corners = np.concatenate([mesh.triangles() for mesh in meshes]) if meshes else np.empty((0, 3, 3))
