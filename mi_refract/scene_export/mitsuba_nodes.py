@@ -8,11 +8,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.io.image_file import one_line
-from mi_refract.plugins import scene_parser
+from mi_refract.plugins import index_parameter, scene_parser
 
 from .plain_scene import Colour
 
@@ -87,13 +88,16 @@ class Node:
         value = self.take(name, default)
         if isinstance(value, Node):
             raise self.error(f"{name} is a {value.type}", "a colour")
-        uniform = re.fullmatch(r"Properties\.Spectrum\[uniform=([^\]]+)\]", str(value))
+        shown, knots = value, index_parameter.read_knots(value)
+        if knots and not knots[0]:  # a uniform spectrum: of a lamp it is light of equal energy, which is not white
+            variant: Any = mi.scalar_rgb
+            value = knots[1][0] * np.array(variant.xyz_to_srgb([1.0] * 3) if self.kind == "Emitter" else 1.0)
         try:
-            r, g, b = (float(x) for x in np.broadcast_to(np.array(uniform[1] if uniform else value, float), 3))
+            r, g, b = (float(x) for x in np.broadcast_to(np.array(value, float), 3))
         except (TypeError, ValueError):
             r = g = b = math.nan
         if not all(0 <= x < math.inf for x in (r, g, b)):
-            raise self.error(f"{name} = {value}", "an RGB colour of finite numbers, at least 0")
+            raise self.error(f"{name} = {shown}", "an RGB colour of finite numbers, at least 0")
         return r, g, b
 
     def transform(self, name: str = "to_world") -> NDArray[np.float64]:

@@ -211,10 +211,26 @@ def test_disagreements_detect_a_difference(old, new, tmp_path):
     assert disagreements(original(SCENES / "prism.xml"), other) > 0.004
 
 
+@pytest.mark.parametrize("value", ["0.75", "0.123456789"])
+def test_a_uniform_spectrum_is_tinted_as_a_lamp_and_grey_as_a_reflectance(value, scene):
+    """In RGB, light of equal energy at all wavelengths is (1.20, 0.95, 0.91); Mitsuba's own colours, to float32."""
+    light, grey = (f'<spectrum name="{name}" value="{value}"/>' for name in ("radiance", "reflectance"))
+    lights = '<rgb name="radiance" value="0.5, 0.25, 1"/>', light, '<rgb name="radiance" value="2"/>', light
+    path = scene(*lights, 'type="cube" id="box">', f'type="cube" id="box"><bsdf type="diffuse">{grey}</bsdf>')
+    plain, si, mitsuba_scene = from_mitsuba.load(path, level=0), mi.SurfaceInteraction3f(), original(path)
+    si.wi = mi.Vector3f(0, 0, 1)
+    _, box, lamp = plain.meshes
+    (emitter,) = (shape.emitter() for shape in mitsuba_scene.shapes() if shape.is_emitter())
+    (bsdf,) = (shape.bsdf() for shape in mitsuba_scene.shapes() if shape.id() == "box")
+    expected = [mitsuba_scene.environment().eval(si), emitter.eval(si), bsdf.eval_diffuse_reflectance(si)]
+    np.testing.assert_allclose(
+        [plain.sky, lamp.material.radiance, box.material.reflectance], np.array(expected), rtol=1e-6
+    )
+
+
 def test_grey_colours_and_the_smallest_map_and_image(scene, tmp_path):
     """A map of 2 × 2 pixels, partly black; an image of one pixel."""
     for text, colour in (
-        ('<spectrum name="radiance" value="0.75"/>', (0.75, 0.75, 0.75)),
         ('<rgb name="radiance" value="0.75"/>', (0.75, 0.75, 0.75)),
         ('<float name="radiance" value="0"/>', (0, 0, 0)),
         ("", (1, 1, 1)),
