@@ -228,6 +228,18 @@ def test_a_uniform_spectrum_is_tinted_as_a_lamp_and_grey_as_a_reflectance(value,
     )
 
 
+@pytest.mark.parametrize("size", [1e-7, 1e-3, 1e3, 1e6, 1e12])
+def test_clip_planes_hide_nothing_at_any_scale(size, scene, tmp_path):
+    path = scene(
+        *('origin="0,1,-40" target="0,0,0"', f'origin="0,0,{-4 * size!r}" target="0,0,0"'),
+        *('id="ball">', f'id="ball"><float name="radius" value="{size!r}"/>'),
+    )
+    exported_scene = exported(from_mitsuba.load(path, level=1), tmp_path / "plain")
+    ray, _ = exported_scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
+    ball = exported_scene.ray_intersect(ray)
+    assert ball.is_valid() and ball.p.z == pytest.approx(-size, rel=0.3)
+
+
 def test_grey_colours_and_the_smallest_map_and_image(scene, tmp_path):
     """A map of 2 × 2 pixels, partly black; an image of one pixel."""
     for text, colour in (

@@ -39,6 +39,8 @@ SCENE = """<scene version="3.0.0">
         </transform>
         <float name="fov" value="{camera.fov_x_degrees!r}"/>
         <string name="fov_axis" value="x"/>
+        <float name="near_clip" value="1e-9"/>
+        <float name="far_clip" value="1e30"/>
         <sampler type="independent">
             <integer name="sample_count" value="$spp"/>
         </sampler>
