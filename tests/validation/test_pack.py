@@ -118,7 +118,14 @@ def test_images_have_variances_and_looks_have_16_bits(unpacked):
 
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
-@pytest.mark.parametrize("mistake", [("", ""), ("ray.n_from / (REAL)ray.n_to", "ray.n_to / (REAL)ray.n_from")])
+@pytest.mark.parametrize(
+    "mistake",
+    [
+        ("", ""),
+        ("ray.n_from / (REAL)ray.n_to", "ray.n_to / (REAL)ray.n_from"),
+        ("k * a[i] - f * n[i]", "(k * a[i] - f * n[i]) / k"),  # of the length 1/k
+    ],
+)
 def test_the_c_program_judges_as_rays_check_does(pack, run, precision, mistake):
     source = pack / "programs" / "check_rays.c"
     text = source.read_text()

@@ -70,6 +70,7 @@ static int possible(const Real *a, const Real *n, Real k, const Real *b, const C
 static Verdict judge(const Ray *ray, const Certified *certified, const double *b, int transmitted, double u) {
     Real a[3], n[3], unit_b[3], exact[3], axis[3], k = (Real)ray->n_from / ray->n_to;
     Real of_a = unit(ray->a, a), length = unit(b, unit_b), off = fminl(fabsl(length - 1), fabsl(length / of_a - 1));
+    Real of_square = fminl(fabsl(length * length - 1), fabsl(length * length / (of_a * of_a) - 1));
     unit(ray->n, n);
     if (transmitted && (!(length > 0 && length < HUGE_VAL) || !possible(a, n, k, unit_b, certified)))
         return WRONG;
@@ -85,7 +86,7 @@ static Verdict judge(const Ray *ray, const Certified *certified, const double *b
     }
     if (!transmitted && !certified->transmitted)
         return RIGHT;
-    if (transmitted && !(off * (2 + off) / (4 * (2 * k + 1)) <= BACKWARD_LIMIT * u)) /* of the length: |b|² − 1 */
+    if (transmitted && !(of_square / (4 * (2 * k + 1)) <= BACKWARD_LIMIT * u)) /* the backward error of the length */
         return WITHIN_BOUND;
     return backward_error(a, n, k, unit_b, transmitted) <= BACKWARD_LIMIT * u ? RIGHT : WITHIN_BOUND;
 }
