@@ -36,16 +36,23 @@ class Light:
         return len(self.names)
 
     def indices(
-        self, spec: str | float | Sequence[float], where: str, find: Callable[[str], Path] = Path
+        self,
+        spec: str | float | Sequence[float],
+        where: str,
+        find: Callable[[str], Path] = Path,
+        only_one: bool = False,
     ) -> tuple[float, ...]:
         """The index of a medium for each colour. `spec`: one number for all colours, one for each, or a material.
 
         A material's index is relative to air; for colours without wavelengths it is the index at the d line.
-        `find`: returns the path of a file that `spec` names.
+        `find`: returns the path of a file that `spec` names. `only_one`: refuse a number for each colour.
         ValueError for another count of numbers, as for `media.parse`, and for a wavelength out of the material's range.
         """
         if not isinstance(spec, str):
             numbers = tuple(np.ravel(spec).tolist())
+            if only_one and len(numbers) > 1:
+                text = f"{len(numbers)} numbers, for the wavelengths of the file"
+                raise ValueError(f"{where}: {text}; expected 1, or a material, for other wavelengths")
             if len(numbers) not in (1, len(self)):
                 raise ValueError(f"{where}: {len(numbers)} numbers; expected 1, or one for each of {len(self)} colours")
             return numbers * (len(self) // len(numbers))

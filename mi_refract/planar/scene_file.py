@@ -328,6 +328,8 @@ class PlanarScene:
 def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> PlanarScene:
     """Read a scene file. `wavelengths`: in nm, or their number; they replace those of the file.
 
+    With other wavelengths than the file's, an index must be one number or a material.
+
     ValueError, one line that names file and key (shapes and beams count from 0), for an invalid scene; OSError for a
     file that cannot be read.
     """
@@ -335,6 +337,7 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; expected a scene file")
     table = parse_toml(safe_files.read_bytes(path, SIZE), SceneTable, str(path))
+    are_others = wavelengths not in (None, table.wavelengths)
     if wavelengths is None:
         wavelengths = table.wavelengths
     try:
@@ -343,7 +346,7 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
         if wavelengths is None and table.light != "flat":
             raise ValueError(f"light: {table.light!r} without wavelengths; expected `wavelengths` that it weights")
         light = Light(tuple(table.colours or [""])) if wavelengths is None else of_wavelengths(wavelengths, table.light)
-        indices = functools.partial(light.indices, find=path.parent.joinpath)
+        indices = functools.partial(light.indices, find=path.parent.joinpath, only_one=are_others)
         index = indices(table.index, "index")
         parts = _parts(table.shape, index, indices)
         rays, (segments, shapes) = _rays(table.beam), boundaries(parts)

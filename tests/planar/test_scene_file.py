@@ -405,6 +405,14 @@ def test_indices_relative_to_vacuum_are_converted_to_air():
     assert Light().indices("AIR:ciddor", "n") == (1.0,)
 
 
+@pytest.mark.parametrize("others", [[587.5618, 486.1327], [450.0, 550.0], 2])
+def test_indices_for_the_wavelengths_of_the_file_are_not_those_of_others(others, read):
+    """Those of the file itself may be named again."""
+    assert read(GLASSES, [486.1327, 587.5618]).index == read(GLASSES).index
+    with pytest.raises(ValueError, match=r": 2 numbers, for the wavelengths of the file; expected 1, or a material"):
+        read(GLASSES, others)
+
+
 def test_parsing_the_wavelengths_option():
     for text, expected in {"450.5, 600": [450.5, 600.0], "450": [450.0], "32": 32, "550": [550.0]}.items():
         assert light.parsed(text) == expected  # 550 exceeds MOST, so it is a wavelength
