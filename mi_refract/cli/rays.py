@@ -166,7 +166,11 @@ def run(
     ] = None,
     file: Annotated[
         Path | None,
-        typer.Option("--rays", metavar="FILE", help="Read the rays from this exported file; do not generate rays."),
+        typer.Option(
+            "--rays",
+            metavar="FILE",
+            help="Read the rays from this exported file; with --renderer, for the functions of its precision.",
+        ),
     ] = None,
     regime: Regime = None,
     regimes: Regimes = False,
@@ -202,21 +206,24 @@ def run(
             if getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE":
                 option = f"--{name.replace('_', '-')}"
                 raise ValueError(f"--rays {file} and {option}: both choose the rays; expected one of them")
+    given = files.read(file) if file else None
     calls: list[tuple[list[str], str, str, str, dict[str, str]]]
     if renderer:
         from mi_refract.ray_sets import renderer_file
 
         if command:
             raise ValueError(f"--renderer {renderer} and {command[0]}; expected one of them")
-        functions = [x for x in renderer_file.load(renderer).rays if precision in (None, x.precision)]
+        wanted = {precision or "", given.precision if given else ""} - {""}
+        functions = [x for x in renderer_file.load(renderer).rays if wanted <= {x.precision}]
         if not functions:
-            raise ValueError(f"{renderer}: no function{f' in {precision}' if precision else ''}; expected [[rays]]")
+            in_both = f" in {' and '.join(sorted(wanted))}" if wanted else ""
+            raise ValueError(f"{renderer}: no function{in_both}; expected [[rays]]")
         calls = [(renderer_file.filled(x.command), x.title, x.precision, x.tir, x.deviations) for x in functions]
     else:
         calls = [(command or [], shlex.join(command or []), precision or ray_set.PRECISION, "auto", {})]
     checks = {}
     for words, title, format_, declared, deviations in calls:
-        rays = files.read(file) if file else _make_rays(regime, count, format_, seed, two_sided, medium, wavelengths)
+        rays = given or _make_rays(regime, count, format_, seed, two_sided, medium, wavelengths)
         with as_exceptions():
             answers = files.answers_of(words, rays, timeout=timeout, cwd=renderer)
         checks[f"{title}, {format_}" if renderer else title] = check_and_print(rays, answers, title, declared)

@@ -152,3 +152,25 @@ def test_every_function_is_checked_and_reported_and_known_deviations_still_fail(
         links = re.findall('href="#([^"]+)"', html)
         assert ("check-2" in links) == (len(titles) == 2)
         assert [html.count(f'id="{link}"') for link in links] == [1] * len(links)
+
+
+@pytest.mark.parametrize(
+    ("precision", "option", "titles"),
+    [("f32", (), ["single, f32"]), ("f64", (), ["double, f64"]), ("f64", ("--precision", "f32"), None)],
+)
+def test_a_file_of_rays_is_for_the_functions_of_its_precision(folder, run, tmp_path, precision, option, titles):
+    """The program rounds to float32: that is right for the first function, and wrong for the second."""
+    functions = {"single": "f32", "double": "f64"}
+    text = "".join(
+        f"[[rays]]\ntitle = '{title}'\nprecision = '{x}'\ncommand = ['{{python}}', 'right.py']\n"
+        for title, x in functions.items()
+    )
+    where, rays, data = folder(f"title = 'T'\n{text}"), tmp_path / "rays.csv", tmp_path / "out.json"
+    (where / "right.py").write_text(PROGRAM)
+    run("rays", "export", "--precision", precision, "--regime", "generic", "--count", 20, "-o", rays)
+    status, out, err = run("rays", "run", "--renderer", where, "--rays", rays, "--json", data, *option)
+    if titles is None:
+        assert status == 2 and "no function in f32 and f64" in err and err.count("\n") == 1
+    else:
+        assert status == (precision == "f64"), out + err
+        assert [x["title"] for x in json.loads(data.read_text())["functions"]] == titles
