@@ -228,14 +228,18 @@ def write_json(path: str | Path, checks: Mapping[str, Findings], origin: Origin)
 
 
 def write_junit(path: str | Path, checks: Mapping[str, Findings]) -> None:
-    """Write a suite per function: a case per regime, and one for the answers: an error unless they match the rays."""
+    """Write a suite per function: a case per regime, and one for the answers: an error unless they match the rays.
+
+    The case of the answers also fails if no direction was judged.
+    """
     documents.write_junit(path, "mi-refract rays", {title: _cases(findings) for title, findings in checks.items()})
 
 
 def _cases(findings: Findings) -> list[documents.Case]:
     answers = documents.Case("answers", "complete and understood")
-    if not findings.answered or findings.problems or findings.tir == UNCLEAR:
-        lines = [*map(problem_text, findings.problems), *ratio(findings), signal(findings)]
+    undecided = [] if findings.total("judged") else [sentence(findings)]
+    if undecided or findings.problems or findings.tir == UNCLEAR:
+        lines = [*map(problem_text, findings.problems), *undecided, *ratio(findings), signal(findings)]
         outcome: Literal["error", "failure"] = "error" if findings.exit_code == 2 else "failure"
         answers = documents.Case(answers.group, answers.name, outcome, lines[0], lines)
     cases = [answers]

@@ -95,8 +95,11 @@ NEAREST = f"nearest of the common mistakes, no explanation: {HANDEDNESS}"
         (findings(regime(compared=0, judged=0)), 1, "10 answers, none with a direction", []),
     ],
 )
-def test_sentence_and_explanations(result, code, sentence, lines):
+def test_sentence_and_explanations(result, code, sentence, lines, tmp_path):
     assert (result.exit_code, reports.sentence(result), reports.explained(result)) == (code, sentence, lines)
+    reports.write_junit(tmp_path / "out.xml", {"answers": result})
+    failed = [x.tag for x in ElementTree.parse(tmp_path / "out.xml").iter() if x.tag in ("failure", "error")]
+    assert ("error" in failed, bool(failed)) == (code == 2, code > 0)
 
 
 def test_texts_of_problems_signals_and_grades():
