@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .scene_file import PlanarScene
+from .scene_file import PlanarScene, spaced
 from .segments import REFLECT_BITS, Array, Event, Paths, Segments
 from .tracer import Tracer
 
@@ -129,6 +129,8 @@ def follow_scene(scene: PlanarScene, *, most: int = MOST, **how: Any) -> tuple[B
 def with_rays(scene: PlanarScene, count: int) -> PlanarScene:
     """The scene with `count` rays in each beam of two rays or more; their origins and angles are interpolated.
 
+    A single ray is in the middle, as in a scene file.
+
     ValueError for more rays than `follow` accepts.
     """
     sizes = np.bincount(scene.beams).tolist()
@@ -137,11 +139,11 @@ def with_rays(scene: PlanarScene, count: int) -> PlanarScene:
     for beam in np.unique(scene.beams):
         origins, directions = scene.origins[scene.beams == beam], scene.directions[scene.beams == beam]
         old = np.arange(len(origins))
-        new = np.linspace(0, old[-1], count) if len(old) > 1 else old
+        new = spaced(0, old[-1], count) if len(old) > 1 else old
         angles = np.interp(new, old, np.unwrap(np.arctan2(directions[:, 1], directions[:, 0])))
         fan = scene.fans[beam] if scene.fans else None
         if fan and len(old) > 1:  # the direction of rotation is unknown from rays 180° or more apart
-            angles = np.radians(np.linspace(fan[0], fan[1], len(new)))
+            angles = np.radians(spaced(fan[0], fan[1], len(new)))
         places = np.column_stack([np.interp(new, old, x) for x in origins.T])
         parts.append((places, np.column_stack([np.cos(angles), np.sin(angles)]), np.full(len(new), beam)))
     origins, directions, beams = (np.concatenate(columns) for columns in zip(*parts, strict=True))

@@ -222,7 +222,7 @@ class Rays(Beam, tag="rays", kw_only=True):
 AnyBeam = Parallel | Fan | Rays
 
 
-def _spread(first: Array | float, last: Array | float, count: int) -> Array:
+def spaced(first: Array | float, last: Array | float, count: int) -> Array:
     """`count` evenly spaced values from the first to the last; a single one in the middle. Whole numbers stay exact."""
     if count == 1:
         return np.array([(first + last) / 2])
@@ -411,10 +411,10 @@ def _rays(tables: Sequence[AnyBeam]) -> tuple[Array, Array, NDArray[np.intp]]:
             with np.errstate(all="ignore"):
                 match beam:
                     case Parallel():
-                        origins = _spread(np.array(beam.start), np.array(beam.to), beam.count)
+                        origins = spaced(np.array(beam.start), np.array(beam.to), beam.count)
                         directions = np.broadcast_to(_unit_vector("direction", beam.direction), origins.shape)
                     case Fan():
-                        origins, angles = np.broadcast_to(beam.at, (beam.count, 2)), _spread(*beam.angles, beam.count)
+                        origins, angles = np.broadcast_to(beam.at, (beam.count, 2)), spaced(*beam.angles, beam.count)
                         if not np.isfinite(angles).all():
                             raise ValueError(f"angles: {list(beam.angles)}; expected a finite difference")
                         directions = np.array([unit(angle) for angle in angles])

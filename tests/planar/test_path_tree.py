@@ -124,6 +124,7 @@ def test_added_rays_of_a_fan_keep_its_sense_of_rotation(angles, count):
     """Also where the file's rays are 180° or more apart."""
     fan_scene = scene(ball(1.5), np.zeros((count, 2)), fan(np.linspace(*angles, count)), fans=(angles,))
     assert with_rays(fan_scene, 7).directions == pytest.approx(fan(np.linspace(*angles, 7)), abs=1e-12)
+    assert with_rays(fan_scene, 1).directions == pytest.approx(fan([np.mean(angles)]), abs=1e-12)  # as in a scene file
 
 
 # Walls ---------------------------------------------------------------------------------------------------------
