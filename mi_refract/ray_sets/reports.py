@@ -138,6 +138,10 @@ def cells(errors: RegimeErrors, ulp: float) -> dict[str, str]:
     def if_compared(x: float) -> str:
         return compact(x) if errors.compared else "–"
 
+    def share(count: int) -> str:
+        """Rounded down: 100 % are all answers."""
+        return f"{1000 * count // errors.rays / 10:.1f}%"
+
     return {
         "rays": str(errors.rays),
         "undecidable": str(errors.undecidable),
@@ -148,8 +152,8 @@ def cells(errors: RegimeErrors, ulp: float) -> dict[str, str]:
         "length error": if_compared(errors.length_error),
         "error / bound": compact(errors.error_over_bound),
         **{f"m, {name}": compact(getattr(errors, f"backward_{name}")) for name in ("median", "p99", "worst", "length")},
-        "right": f"{errors.right / errors.rays:.1%}",
-        "exact": f"{errors.exact / errors.rays:.1%}",
+        "right": share(errors.right),
+        "exact": share(errors.exact),
         "wrong": str(errors.wrong),
     }
 

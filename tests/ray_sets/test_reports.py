@@ -110,6 +110,8 @@ def test_texts_of_problems_signals_and_grades():
     assert signals[1] == "total internal reflection is signalled by the zero vector"
     cases = {}, {"right": 10}, {"right": 10, "exact": 10}, {"wrong": 1, "right": 10}
     assert [reports.grade(regime(**x)) for x in cases] == ["within bound", "right", "exact", "wrong"]
+    shares = [reports.cells(regime(rays=10_000, right=x, exact=x - 1), 1.0) for x in (10_000, 9_999, 9_990)]
+    assert [(x["right"], x["exact"]) for x in shares] == [("100.0%", "99.9%"), ("99.9%", "99.9%"), ("99.9%", "99.8%")]
 
 
 def test_json_junit_and_html(tmp_path):
