@@ -108,7 +108,9 @@ def radiance(folder, monkeypatch):
     half_width, half_height = (np.tan(np.radians(float(words[words.index(name) + 1])) / 2) for name in ("-vh", "-vv"))
     width, height, *depths = readme(folder, r"-x (\d+) -y (\d+) -pa 0 [^$]*?-ab (\d+) [^$]*?-lr -(\d+) ")
     assert depths[0] == depths[1]
-    scene = Scene((width, height), depths[0], pinhole(*view.values(), half_width, half_height), plain_sky((0, 0, 0)))
+    scene = Scene(
+        (width, height), depths[0] + 1, pinhole(*view.values(), half_width, half_height), plain_sky((0, 0, 0))
+    )
     surfaces = {}
     for line in filter(None, (folder / "scene.rad").read_text().splitlines()):
         modifier, kind, name, *rest = line.split()

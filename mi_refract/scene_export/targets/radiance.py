@@ -12,7 +12,7 @@ from .shared_files import Files, material_names, numbers, readme
 COMMANDS = """
 oconv scene.rad > scene.oct
 vwrays -fd -x {width} -y {height} -pa 0 -pj 1 -c 1024 -vf camera.vf |
-    rtrace -h -w -u+ -fdf -ab {depth} -aa 0 -ad 1 -as 0 -lr -{depth} -lw 1e-2 \\
+    rtrace -h -w -u+ -fdf -ab {bounces} -aa 0 -ad 1 -as 0 -lr -{limit} -lw 1e-2 \\
     scene.oct | total -if3 -of -m -1024 > image.f32
 
 RAYPATH must name both this folder and Radiance's lib. 1024 is the number of samples per pixel.
@@ -22,8 +22,9 @@ SOURCE = "sky source everywhere 0 0 4 0 0 1 360\n"
 ASSUMPTIONS = (
     "At a boundary Radiance traces both rays while their share is above 0.01 (-lw). Below it, Russian roulette (a "
     "negative -lr) ends rays, without bias.",
-    "-lr and -ab count reflections only; Mitsuba's max_depth also counts refractions. So Radiance has light that "
-    "Mitsuba cuts off. If that matters, raise Mitsuba's max_depth: `nested` gains 0.2 % of its mean from 48 to 400.",
+    "-lr and -ab are Mitsuba's max_depth - 1. They count reflections only; max_depth also counts refractions. So "
+    "Radiance has light that Mitsuba cuts off. If that matters, raise Mitsuba's max_depth: `nested` gains 0.2 % of its "
+    "mean from 48 to 400.",
     "Lights and sky are `glow` of radius 0: Radiance traces no shadow rays to them, so caustics are complete.",
 )
 
@@ -49,7 +50,9 @@ def files(plain: PlainScene) -> Files:
     else:
         sky = f"void glow sky 0 0 4 {numbers(plain.sky)} 0\n{SOURCE}" if any(plain.sky) else ""
     camera, names = plain.camera, material_names(plain)
-    commands = COMMANDS.format(width=camera.width, height=camera.height, depth=plain.max_depth)
+    # A path of N segments has N − 1 reflections. -lr 0 would not limit them.
+    reflections = plain.max_depth - 1
+    commands = COMMANDS.format(width=camera.width, height=camera.height, bounces=reflections, limit=max(reflections, 1))
     meshes = [
         "".join(
             f"{names[mesh.material]} polygon {mesh.name}.{i} 0 0 9 {numbers(corners.ravel())}\n"
