@@ -49,7 +49,7 @@ def files(plain: PlainScene) -> Files:
         "up": camera.up,
         "fieldofview": [camera.fov_x_degrees],
         "screenwindow": [-1, 1, -height - row, height - row],
-        "cliphither": [1e-3],
+        "cliphither": [1e-9],
         "clipyon": [1e6],
         "autofocus.enable": [0],
     }
