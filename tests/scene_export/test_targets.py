@@ -328,6 +328,18 @@ def write_export(target, folder, depth=12):
     return folder
 
 
+@pytest.mark.parametrize("target", ["cycles", "luxcore"])
+def test_a_target_that_always_samples_lights_refuses_paths_of_one_segment(target, tmp_path):
+    with pytest.raises(ValueError, match=f"^a scene: max_depth = 1; expected 2 or more, the least of {target}$"):
+        write_export(target, tmp_path / "new", depth=1)
+    write_export("radiance", tmp_path / "new", depth=1)
+
+
+def test_luxcore_hides_nothing_near_the_camera(tmp_path):
+    text = (write_export("luxcore", tmp_path / "new") / "scene.scn").read_text()
+    assert 0 < float(re.search(r"cliphither = (\S+)", text)[1]) <= 1e-9
+
+
 @pytest.mark.parametrize("words, seeds", [((), [1]), (("--seeds", "4", "2", "--threads", "2"), [4, 2])])
 def test_cycles_renders_each_seed_as_a_plain_path_tracer(words, seeds, tmp_path, monkeypatch, capsys):
     bpy = fake_bpy.run(write_export("cycles", tmp_path / "new"), monkeypatch, *words)

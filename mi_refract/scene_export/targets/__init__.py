@@ -33,6 +33,7 @@ HOLD_VOLUMES = ("gltf",)  # targets with dispersion and absorption
 # Blender's spots have another falloff.
 ALL_LAMPS = ("point", "spot", "directional")
 HOLD_LAMPS = {"cycles": ("point", "directional"), "mitsuba": ALL_LAMPS, "obj+json": ALL_LAMPS, "gltf": ALL_LAMPS}
+LEAST_DEPTH = {"cycles": 2, "luxcore": 2}  # these always sample lights at the first surface; other targets: 1
 
 
 def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> list[Path]:
@@ -54,6 +55,8 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
         if isinstance(mesh.material, VolumeGlass) and target not in HOLD_VOLUMES:
             expected = f"one number for all wavelengths and no absorption, or --to {' or '.join(HOLD_VOLUMES)}"
             raise ValueError(f"{plain.name}: {mesh.name}: {mesh.material.parameters}; expected {expected}")
+    if plain.max_depth < LEAST_DEPTH.get(target, 1):
+        raise ValueError(f"{plain.name}: max_depth = {plain.max_depth}; expected 2 or more, the least of {target}")
     for lamp in plain.lamps:
         if lamp.kind not in HOLD_LAMPS.get(target, ()):
             fault = f"a {lamp.kind} lamp is not exported to {target}"
