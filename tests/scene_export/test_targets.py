@@ -360,7 +360,7 @@ def test_cycles_renders_each_seed_as_a_plain_path_tracer(words, seeds, tmp_path,
     assert (render.use_compositing, render.use_sequencer) == (False, False)
     assert cycles.min_light_bounces == cycles.max_bounces == 10
     lens = bpy.data.cameras.made["camera"]
-    assert 0 < lens.clip_start <= 1e-3 and lens.clip_end >= 1e6
+    assert 0 < lens.clip_start <= 1e-6 and lens.clip_end >= 1e6
     deep = fake_bpy.run(write_export("cycles", tmp_path / "deep", depth=5000), monkeypatch).context.scene.cycles
     assert deep.max_bounces == deep.transmission_bounces == 1024  # Blender's limit
 
