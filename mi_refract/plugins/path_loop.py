@@ -65,6 +65,7 @@ class PathFeatures:
     deterministic: bool
     emitter_sampling: bool
     lamps_only: bool  # emitter sampling excludes the environment, which is constant
+    lamps_at_infinity: bool  # some emitter that is sampled has no position
     area: bool  # some shape emits
     environment: bool  # an environment emitter exists
     first_number: bool  # BSDF sampling uses `sample1`
@@ -323,14 +324,20 @@ class PathLoop:
             active_em &= ds.pdf != 0
             if not dr.grad_enabled(bsdf_value):  # a value of 0 needs a shadow ray only for its derivative
                 active_em &= dr.max(dr.abs(v.unpolarized_spectrum(bsdf_value))) > 0
-            active_em = active_em & (scene.ray_test(si.spawn_ray_to(ds.p), active_em) ^ True)
+            shadow_ray = si.spawn_ray_to(ds.p)
+            if features.lamps_at_infinity:
+                # Mitsuba places such a light beyond the scene's bounding box, in which merged rectangles are missing,
+                # and later edits, too. So these shadow rays have no end.
+                at_infinity = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+                shadow_ray = dr.select(at_infinity, si.spawn_ray(ds.d), shadow_ray)
+            active_em = active_em & (scene.ray_test(shadow_ray, active_em) ^ True)
             if self.evaluated:
                 dr.eval(active_em)
             if v.is_polarized:
                 bsdf_value = si.to_world_mueller(bsdf_value, -wo, si.wi)
             if features.absorption:
-                at_infinity = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-                emitter_weight = self.attenuated(emitter_weight, s.sigma, dr.select(at_infinity, dr.inf, ds.dist))
+                way = dr.select(at_infinity, dr.inf, ds.dist) if features.lamps_at_infinity else ds.dist
+                emitter_weight = self.attenuated(emitter_weight, s.sigma, way)
             contribution = self.times(self.times(s.throughput, bsdf_value), emitter_weight)
             contribution *= dr.select(ds.delta, 1, power_heuristic(ds.pdf, bsdf_pdf))
             s.result = dr.select(active_em, s.result + contribution, s.result)

@@ -327,6 +327,7 @@ def integrator_class(v: Variant) -> type:
                 self.deterministic,
                 emitter_sampling=needs.smooth and (needs.lamps if needs.plain_environment else needs.sampleable),
                 lamps_only=needs.plain_environment,
+                lamps_at_infinity=needs.lamps_at_infinity,
                 area=needs.area,
                 environment=needs.environment,
                 first_number=needs.both_numbers or not (needs.smooth or self.deterministic),

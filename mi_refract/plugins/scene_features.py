@@ -52,6 +52,7 @@ WITHOUT_TANGENT = DETERMINISTIC | {"BlendBSDF", "MaskBSDF", "Null", "ThinDielect
 EITHER = DETERMINISTIC | {"Null", "RoughConductor", "SmoothDiffuse", "ThinDielectric"}
 TRACED_LAMPS = {"AreaLight", "DirectionalEmitter", "PointLight", "SpotLight"}  # emitters that `lamp_tracing` supports
 CAST = "L S+ D (S|D)* E"  # the class of paths of caustics; see `SceneFeatures.missing`
+CONSTANT = "ConstantBackgroundEmitter"
 BEAM = "DirectionalArea"  # the emitter of zero size that shadow rays do not find: its `sample_direction` returns 0
 # Integrators that find lamps of zero size only by shadow rays, by their names in `str` → `volumes` of `missing`.
 SHADOW_RAYS = {
@@ -68,6 +69,7 @@ class SceneFeatures:
     delta_perturbed: str  # a plugin that may change the shading normal in a BSDF with delta lobes (not null), or ""
     sampleable: bool  # some emitter can be sampled
     lamps: bool  # some emitter other than the environment can be sampled
+    lamps_at_infinity: bool  # some emitter other than a constant environment has no position
     area: bool  # some shape emits
     environment: bool  # an environment emitter exists
     plain_environment: bool  # the environment has the same radiance in all directions
@@ -189,9 +191,12 @@ def inspect(scene: Scene) -> SceneFeatures:
         delta_perturbed=next(perturbed, ""),
         sampleable=bool(emitters),  # Mitsuba raises an error if all emitters have the weight 0
         lamps=any(not emitter.is_environment() and emitter.sampling_weight() > 0 for emitter in emitters),
+        lamps_at_infinity=any(
+            emitter.flags() & +mi.EmitterFlags.Infinite and emitter.class_name() != CONSTANT for emitter in emitters
+        ),
         area=bool(unknown_shapes or lamps),
         environment=sky is not None,
-        plain_environment=sky is not None and sky.class_name() == "ConstantBackgroundEmitter",
+        plain_environment=sky is not None and sky.class_name() == CONSTANT,
         both_numbers=everything or bool(names - EITHER),
         only_glass=not (everything or flags & +(lobes.Smooth | lobes.Delta1D)),
         textured=everything

@@ -97,6 +97,24 @@ def test_other_numbers_give_the_same_mean(name, parameters, llvm_variant):
     assert equal_means(theirs, ours)
 
 
+@pytest.mark.parametrize("light", [LIT, {"type": "directional", "direction": [0.1, 0, -1]}], ids=lambda x: x["type"])
+@pytest.mark.parametrize("change", ["merged", "moved"])
+def test_shadows_of_surfaces_that_mitsubas_bounds_leave_out(light, change, rgb_variant):
+    """A wide lid above the camera takes all light, though Mitsuba's shadow rays end below it."""
+    far, near = PLACE().translate([0, 0, 50]).scale(1e5), PLACE().translate([0, 9, 0]).scale(0.1)
+    sheet, matt = {"type": "rectangle", "bsdf": {"type": "ref", "id": "matt"}}, {"type": "diffuse", "id": "matt"}
+    floor, lid = (sheet | {"to_world": x} for x in (PLACE().scale(3), far if change == "merged" else near))
+    parts = {"sensor": camera(8), "matt": matt, "light": light, "floor": floor, "lid": lid}
+    scene = mi.load_dict({"type": "scene"} | parts, optimize=change == "merged")
+    assert len(scene.shapes()) == (1 if change == "merged" else 2)
+    if change == "moved":
+        assert render(scene).mean() > 0.05
+        params = mi.traverse(scene)
+        params["lid.to_world"] = mi.Transform4f(far)
+        params.update()
+    assert by_path(scene).mean() > 0.05 > 1e3 * render(scene).mean()
+
+
 def lamps():
     """A wall in a constant sky and three lamps before it, one of them small and bright, one that has no surface."""
     parts = {
