@@ -641,6 +641,7 @@ class Camera:
             active = active & (ds.pdf > 0)
         active &= (place.x >= 0) & (place.x < 1) & (place.y >= 0) & (place.y < 1)
         ray, _ = self.sensor.sample_ray(si.time, 0, place, aperture, active)
+        ray.wavelengths = si.wavelengths
         far = dr.dot(si.p - ray.o, ray.d)
         active &= (importance > 0) & (far > 0) & (far <= ray.maxt)
         return v.Point2f(place.x * self.width, place.y * self.height), ray, importance, active

@@ -207,6 +207,18 @@ def test_lamp_tracing_has_the_image_of_path_tracing(name, llvm_variant, tmp_path
     assert difference(*images) < 1
 
 
+def test_air_around_camera_and_lamp_absorbs_each_wavelength_by_its_own(llvm_spectral):
+    from scipy import stats
+
+    air = {"type": "irregular", "wavelengths": "360, 540, 560, 830", "values": "0, 0, 0.6, 0.6"}
+    tinted = ball({"type": "refract", "ext_absorption": air}, (2, 0, 0.6), 0.4)
+    parts, images = {"ball": ball({"type": "conductor"}), "more": tinted}, []
+    for caustics, first in (("path", 0), ("lamp", 100)):
+        loaded = scene(parts, caustics=caustics, camera_absorption=air, max_depth=4)
+        images.append([np.array(mi.render(loaded, spp=64, seed=first + i)).mean((0, 1)) for i in range(16)])
+    assert (stats.ttest_ind(*images).pvalue > FALSE_ALARM / 3).all()
+
+
 def point(height=5.0, **parameters):
     return {"type": "point", "position": [0, 0, height], "intensity": height**2} | parameters
 
