@@ -84,7 +84,8 @@ def read_absorption(plugin: str, props: Properties, side: str) -> Absorption | N
         return _from_k(plugin, name, value, props.get(f"{sigma}_unit", None))
     expected = "a number or a spectrum " + ("above 0 and up to 1" if length else "≥ 0, and finite")
     values = read_values(plugin, props, name, expected, bool(length), textures=False)
-    if not type(value).__name__.endswith("Color3d") or length or not any(values):
+    is_colour = type(value).__name__.endswith("Color3d")
+    if not (is_colour and mi.is_spectral) or length or not any(values):
         return Absorption(name, props.get_unbounded_texture(name), 1.0, float(length))
     # Mitsuba converts RGB colours up to 1 only to a spectrum, and those up to 1/2 to a smooth one. So scale them.
     factor, scaled = 2 * max(values), mi.Properties()

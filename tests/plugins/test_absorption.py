@@ -102,6 +102,16 @@ def rgb(*value):
     return {"type": "rgb", "value": [*value]}
 
 
+def test_an_edit_of_an_rgb_colour_means_what_the_scene_does(rgb_variant):
+    bsdf = load(int_absorption=rgb(0.5, 2, 4))
+    params = mi.traverse(bsdf)
+    key = "int_absorption.value"
+    assert vector(params[key]) == pytest.approx([0.5, 2, 4])
+    params[key] = mi.Color3f(3, 1, 0.25)
+    params.update()
+    assert vector(bsdf.eval_attribute(BEYOND, surface(), True)) == pytest.approx([3, 1, 0.25])
+
+
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
