@@ -97,7 +97,8 @@ def write_preview(path: Path, rendering: LongRender) -> None:
     image = rendering.image()
     if image is None:
         return
-    linear = np.clip(np.nan_to_num(image[..., : 3 if image.shape[-1] >= 3 else 1]), 0, 1)
+    colours = 3 if rendering.renderer.colours >= 3 else 1
+    linear = np.clip(np.nan_to_num(image[..., :colours]), 0, 1)
     rgb = np.broadcast_to(np.rint(255 * srgb_encode(linear)), (*linear.shape[:2], 3)).astype(np.uint8)
     try:
         write_atomically(path, png(rgb))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -95,3 +96,14 @@ def test_preview_is_the_image_and_a_failure_is_a_warning(run, tmp_path, monkeypa
     run(tmp_path / "none" / "a.png", spp=8)
     err = capsys.readouterr().err
     assert "no preview" in err and err.startswith("mi-refract: ") and (tmp_path / "a.exr").exists()
+
+
+@pytest.mark.parametrize(
+    ("colours", "expected"),
+    [(1, [0.5, 0.5, 0.5]), (3, [0.5, 0.2, 0.8]), (4, [0.5, 0.2, 0.8])],  # Y, n.X, … or R, G, B, A or S1, S2, …
+)
+def test_a_preview_shows_the_colours_only(tmp_path, colours, expected):
+    image, renderer = np.tile([0.5, 0.2, 0.8, 1.0], (2, 3, 1)), SimpleNamespace(colours=colours)
+    render_progress.write_preview(tmp_path / "a.png", SimpleNamespace(image=lambda: image, renderer=renderer))
+    encoded = render_progress.srgb_encode(np.array(expected))
+    np.testing.assert_allclose(read(tmp_path / "a.png").pixels[0, 0], encoded, atol=0.51 / 255)
