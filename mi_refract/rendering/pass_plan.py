@@ -3,12 +3,13 @@
     seed(s, p) = s ⊕ mix(p),    mix: the finaliser of MurmurHash3 on 32 bits, a bijection with mix(0) = 0
 
 s is the seed of the render, p the number of the pass. All passes of one render have different seeds, and so have passes
-of the same number in renders of different seeds. Pass 0 has the seed s. In scalar variants Mitsuba gives pixel k of N
-the random numbers of sequence seed · N + k, modulo 2³². There
+of the same number in renders of different seeds. Pass 0 has the seed s. In scalar variants Mitsuba gives pixel k of B
+the random numbers of sequence seed · N + k, modulo 2³². N is the number of pixels of the film, B that of all blocks
+that cover it, of up to BLOCK² pixels each. There
 
-    seed(s, p) = (mix(s) + p) mod M,    M = ⌊2³²/N⌋
+    seed(s, p) = (mix(s) + p ⌈B/N⌉) mod M,    M = ⌊2³²/N⌋
 
-so that no two of up to M passes share a sequence. Two renders may have some passes in common, by chance.
+so that no two of up to M/⌈B/N⌉ passes share a sequence. Two renders may have some passes in common, by chance.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ LEAST_LANES, LEAST_SPP = 2**21, 4
 LARGE_LANES, MANY = 2**23, 16
 # Size of the first passes if the error ends the render: such a pass takes about 24 ms, so eight of them are soon done.
 FIRST_LANES = 2**15
+BLOCK = 32  # pixels: the side of Mitsuba's largest blocks in scalar variants
 FEW = 8  # passes: the spread of fewer is a poor estimate
 MASK = 2**32 - 1
 
@@ -32,14 +34,15 @@ def seed_of(seed: int, number: int) -> int:
     return seed ^ _mix(number)
 
 
-def scalar_seed_of(seed: int, number: int, pixels: int) -> int:
+def scalar_seed_of(seed: int, number: int, width: int, height: int) -> int:
     """Return the same for scalar variants and a film of so many pixels. ValueError if passes would repeat."""
-    most = (MASK + 1) // pixels
-    if number >= most:
+    pixels, in_blocks = width * height, -(-width // BLOCK) * -(-height // BLOCK) * BLOCK**2
+    seeds, step = (MASK + 1) // pixels, -(-in_blocks // pixels)
+    if number >= (most := seeds // step):
         raise ValueError(
             f"pass {number} of {pixels} pixels; scalar variants support up to {most}; use a larger --pass-spp"
         )
-    return (_mix(seed) + number) % most
+    return (_mix(seed) + number * step) % seeds
 
 
 def _mix(x: int) -> int:

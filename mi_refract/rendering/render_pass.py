@@ -91,8 +91,8 @@ class PassRenderer:
                 total, weights = _rendered(self.scene, spp, seed_of(self.seed, number))
             else:
                 border = 2 * film.rfilter().border_size() if film.sample_border() else 0
-                count = (self.size[0] + border) * (self.size[1] + border)
-                total, weights = _rendered(self.scene, spp, scalar_seed_of(self.seed, number, count))
+                size = (length + border for length in self.size)
+                total, weights = _rendered(self.scene, spp, scalar_seed_of(self.seed, number, *size))
         if self.expected is None or weights is None:
             return PassSums(spp, 1, total, np.zeros_like(total), within, colours=self.colours)
         total, weights = total / self.expected, weights / self.expected

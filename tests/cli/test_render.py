@@ -42,7 +42,7 @@ def passes_by_mitsuba(scene, spp, seed=0, **parameters):
     """Return mean and variance of passes of one sample, of which a short render in a scalar variant consists."""
     loaded = mi.load_file(str(scene), **parameters)
     passes = np.array(
-        [np.array(mi.render(loaded, spp=1, seed=scalar_seed_of(seed, p, 48))) for p in range(spp)], np.float64
+        [np.array(mi.render(loaded, spp=1, seed=scalar_seed_of(seed, p, 8, 6))) for p in range(spp)], np.float64
     )
     return passes.mean(0).astype(np.float32), passes.var(0, ddof=1)
 

@@ -40,11 +40,14 @@ def test_the_seeds_of_passes_differ_within_a_render_and_between_consecutive_seed
 
 
 def test_the_seeds_of_scalar_variants_are_consecutive():
-    most = 2**32 // 3000
-    assert [scalar_seed_of(0, p, 3000) for p in (0, 1, most - 1)] == [0, 1, most - 1]
-    assert scalar_seed_of(1, 5, 3000) == (0x514E28B7 + 5) % most
-    with pytest.raises(ValueError, match="scalar variants support up to"):
-        scalar_seed_of(0, most, 3000)
+    most = 2**32 // (96 * 32)
+    assert [scalar_seed_of(0, p, 96, 32) for p in (0, 1, most - 1)] == [0, 1, most - 1]
+    assert scalar_seed_of(1, 5, 96, 32) == (0x514E28B7 + 5) % most
+    assert scalar_seed_of(1, 5, 40, 24) == (0x514E28B7 + 5 * 3) % (2**32 // 960)  # 2 blocks have 2048 pixels
+    for size, passes in (((96, 32), most), ((40, 24), 2**32 // 960 // 3)):
+        scalar_seed_of(0, passes - 1, *size)
+        with pytest.raises(ValueError, match=f"scalar variants support up to {passes}"):
+            scalar_seed_of(0, passes, *size)
 
 
 @pytest.mark.parametrize("pixels", [1, 48, 64 * 64, 512 * 512, 1920 * 1080, 3840 * 2160, 2**24, 2**26])

@@ -31,7 +31,7 @@ def scene_of(tmp_path, rfilter="box", pixel_format="rgb", more=(), **defines):
 
 def mitsuba_image(scene, number, spp, seed=3):
     """Return all channels of a pass as rendered by `mi.render`."""
-    pass_seed = seed_of(seed, number) if dr.is_jit_v(mi.Float) else scalar_seed_of(seed, number, 256)
+    pass_seed = seed_of(seed, number) if dr.is_jit_v(mi.Float) else scalar_seed_of(seed, number, 16, 16)
     mi.render(scene, spp=spp, seed=pass_seed)
     image = np.array(scene.sensors()[0].film().bitmap())
     return image.reshape(*image.shape[:2], -1)
@@ -195,6 +195,18 @@ def test_passes_of_scalar_variants_share_no_random_numbers(tmp_path):
     assert not np.array_equal(renderer.render(1105, 1).total, renderer.render(2867, 1).total)
     with pytest.raises(ValueError, match="pass 1048576 of 4096 pixels; scalar variants support up to 1048576"):
         renderer.render(2**20, 1)
+
+
+@pytest.mark.parametrize(("width", "height"), [(64, 48), (33, 33), (9, 5)])
+def test_passes_of_scalar_variants_share_no_random_numbers_in_blocks_beyond_the_film(width, height, scalar_variant):
+    film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
+    place = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    sensor = {"type": "orthographic", "to_world": place, "film": film, "sampler": {"type": "independent"}}
+    integrator = {"type": "aov", "aovs": "place:uv"}  # the place of a sample in its pixel: two random numbers
+    scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, "wall": {"type": "rectangle"}})
+    renderer = pass_renderer(scene, 0)
+    one, other = (renderer.render(i, 1).total[..., -2:].reshape(-1, 2) * width % 1 for i in (0, 1))
+    assert (np.abs(one[:, None] - other).max(-1) > 1e-5).all()
 
 
 # The samples of a pass ------------------------------------------------------------------------------------------------
