@@ -23,7 +23,7 @@ from mi_refract.io.image_file import Metadata
 from mi_refract.numerics import Ray, Sampler, Scene, Spectrum
 from mi_refract.plugins.film import STEP, expected_weights, film_colours, filter_weights
 
-from .pass_plan import FEW, scalar_seed_of, seed_of
+from .pass_plan import BLOCK, FEW, scalar_seed_of, seed_of
 from .pass_sums import Doubles, PassSums
 from .sample_sums import Film, image_sums
 
@@ -148,19 +148,23 @@ def quiet() -> Iterator[None]:
 
 
 def _rendered(scene: Scene, spp: int, seed: int) -> tuple[Doubles, Doubles | None]:
-    """Return Σ w v and Σ w by `mi.render`, which runs in one thread if the order of threads would change sums."""
+    """Return Σ w v and Σ w by `mi.render`, which runs in one thread if the order of threads would change sums.
+
+    In scalar variants it has fewer threads than there are blocks, or Mitsuba makes smaller blocks, which have other
+    random numbers.
+    """
     film = scene.sensors()[0].film()
     box = film.rfilter().is_box_filter()
-    threads = dr.thread_count()
-    one_thread = dr.is_jit_v(mi.Float) or not box
-    if one_thread:
-        _set_threads(1)
+    threads, blocks = dr.thread_count(), math.prod(-(-int(length) // BLOCK) for length in film.crop_size())
+    most = 1 if dr.is_jit_v(mi.Float) or not box else max(1, blocks - 1)
+    if most < threads:
+        _set_threads(most)
     try:
         mi.render(scene, spp=spp, seed=seed)
         if scene.integrator().should_stop():  # by its `timeout`, or by a signal that Mitsuba handled
             raise InterruptedError("the rendering was stopped before its last sample")
     finally:
-        if one_thread:
+        if most < threads:
             _set_threads(threads)
     mean = np.array(film.bitmap(), np.float64)  # the return value of `aov` has fewer channels
     mean = mean.reshape(*mean.shape[:2], -1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -40,10 +41,12 @@ def render(scene, run):
 
 def passes_by_mitsuba(scene, spp, seed=0, **parameters):
     """Return mean and variance of passes of one sample, of which a short render in a scalar variant consists."""
-    loaded = mi.load_file(str(scene), **parameters)
+    loaded, threads = mi.load_file(str(scene), **parameters), dr.thread_count()
+    dr.set_thread_count(1)
     passes = np.array(
         [np.array(mi.render(loaded, spp=1, seed=scalar_seed_of(seed, p, 8, 6))) for p in range(spp)], np.float64
     )
+    dr.set_thread_count(threads)
     return passes.mean(0).astype(np.float32), passes.var(0, ddof=1)
 
 

@@ -32,7 +32,10 @@ def scene_of(tmp_path, rfilter="box", pixel_format="rgb", more=(), **defines):
 def mitsuba_image(scene, number, spp, seed=3):
     """Return all channels of a pass as rendered by `mi.render`."""
     pass_seed = seed_of(seed, number) if dr.is_jit_v(mi.Float) else scalar_seed_of(seed, number, 16, 16)
+    threads = dr.thread_count()
+    dr.set_thread_count(threads if dr.is_jit_v(mi.Float) else 1)
     mi.render(scene, spp=spp, seed=pass_seed)
+    dr.set_thread_count(threads)
     image = np.array(scene.sensors()[0].film().bitmap())
     return image.reshape(*image.shape[:2], -1)
 
@@ -195,6 +198,18 @@ def test_passes_of_scalar_variants_share_no_random_numbers(tmp_path):
     assert not np.array_equal(renderer.render(1105, 1).total, renderer.render(2867, 1).total)
     with pytest.raises(ValueError, match="pass 1048576 of 4096 pixels; scalar variants support up to 1048576"):
         renderer.render(2**20, 1)
+
+
+@pytest.mark.parametrize("res", ["24", "40", "64"])
+def test_the_bits_of_scalar_variants_do_not_depend_on_the_number_of_threads(tmp_path, scalar_variant, res):
+    renderer, threads = pass_renderer(scene_of(tmp_path, res=res), 3), dr.thread_count()
+    images = []
+    for count in (1, 2, 9):
+        dr.set_thread_count(count)
+        images.append(renderer.render(0, 1).total)
+        assert dr.thread_count() == count
+    dr.set_thread_count(threads)
+    np.testing.assert_array_equal(images[1:], images[:1] * 2)
 
 
 @pytest.mark.parametrize(("width", "height"), [(64, 48), (33, 33), (9, 5)])
