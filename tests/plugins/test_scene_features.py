@@ -39,7 +39,7 @@ def test_a_ball_alone_needs_nothing(typical_variant):
     assert facts() == facts(ball={"type": "sphere", "bsdf": BLACK}) == {"only_glass"}
 
 
-SUN = {"sampleable", "lamps"}
+SMALL, DISTANT = {"sampleable", "lamps"}, {"sampleable", "lamps_at_infinity"}
 LIT = {"sampleable", "lamps", "area"}
 
 
@@ -60,10 +60,10 @@ LIT = {"sampleable", "lamps", "area"}
         (LAMP | {"bsdf": {"type": "null"}}, LIT | {"null"}),
         (LAMP | {"bsdf": {"type": "diffuse"}}, LIT | {"smooth"}),
         ({"type": "constant"}, {"sampleable", "environment", "plain_environment"}),
-        ({"type": "envmap", "bitmap": mi.Bitmap(np.ones((2, 4, 3), np.float32))}, {"sampleable", "environment"}),
-        ({"type": "point"}, SUN),
-        ({"type": "directional"}, SUN),
-        (LAMP | {"emitter": {"type": "directionalarea"}}, SUN | {"area"}),
+        ({"type": "envmap", "bitmap": mi.Bitmap(np.ones((2, 4, 3), np.float32))}, {"environment", *DISTANT}),
+        ({"type": "point"}, SMALL),
+        ({"type": "directional"}, SMALL | DISTANT),
+        (LAMP | {"emitter": {"type": "directionalarea"}}, SMALL | {"area"}),
     ],
 )
 def test_each_part_adds_only_the_features_that_it_needs(part, expected, scalar_variant):
