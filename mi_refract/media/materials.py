@@ -214,8 +214,9 @@ def _parse_text(text: str, label: str, find: Callable[[str], Path]) -> Medium:
             raise ValueError(f"{label}: unknown material; {advice}") from None
         expected = str(error).partition("choices are:")[2] or "the names of Mitsuba's table"
         raise ValueError(f"{label}: unknown material; expected {expected.strip()}") from None
-    absolute = "vacuum" if text in ("air", "vacuum") else ""
-    return Medium(text, CONSTANT, {"n": float(f"{single:.7g}")}, relative_to=absolute, is_air=text == "air")
+    name = text.lower()  # the table ignores case
+    absolute = "vacuum" if name in ("air", "vacuum") else ""
+    return Medium(text, CONSTANT, {"n": float(f"{single:.7g}")}, relative_to=absolute, is_air=name == "air")
 
 
 def _formula(text: str, label: str) -> Medium:
