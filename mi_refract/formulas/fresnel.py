@@ -12,7 +12,7 @@ of the incident vector cancels. Signs follow Verdet's convention, as in Mitsuba.
 Optics, 1.5; R : T, from cos(θᵢ ± θₜ) = P ∓ Q and r_p/r_s = −(P − Q)/(P + Q): this project.
 
 float32 is computed in float64 and rounded once; float64 is computed in double words. Arguments are Dr.Jit numbers of
-one precision and any backend, or Python floats, which are float64. NaN gives NaN. Precondition: k from 2⁻²⁰ to 2²⁰; in
+one precision and any backend, or Python numbers, which are float64. NaN gives NaN. Precondition: k from 2⁻²⁰ to 2²⁰; in
 float64 cosines above 1e-150, or 0.
 """
 
@@ -205,7 +205,7 @@ def transmitted_powers(cos_i: Number, cos_t: Number, transmitted: Mask, k: Numbe
     d_s, d_p = (dr.select(transmitted, d, 1) for d in (dr.fma(ratio, c, y), dr.fma(ratio, y, c)))
     power = 4 * ratio * (c * y)
     pairs = (d_s, d_s), (d_p, d_p), (d_s, d_p)
-    t_s, t_p, interference = (dr.select(transmitted, number(power / (x * y)), 0) for x, y in pairs)
+    t_s, t_p, interference = (number(dr.select(transmitted, power / (x * y), 0 * power)) for x, y in pairs)
     return t_s, t_p, interference
 
 

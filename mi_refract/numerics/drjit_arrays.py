@@ -130,12 +130,16 @@ def ieee_quotients(kind: ArrayType) -> contextlib.AbstractContextManager[None]:
 
 
 def computed_in_float64(function: Callable[..., Result]) -> Callable[..., Result]:
-    """`function` called within `ieee_quotients` of float64; its first argument: a number or vector of any precision."""
+    """`function` called within `ieee_quotients` of float64; its first argument: a number or vector of any precision.
+
+    Integers become float64, as results have the type of that argument.
+    """
 
     @functools.wraps(function)
     def with_ieee_quotients(x: Any, *args: Any, **kwargs: Any) -> Result:
-        with ieee_quotients(dr.float64_array_t(type(x))):
-            return function(x, *args, **kwargs)
+        wide: Any = dr.float64_array_t(type(x))
+        with ieee_quotients(wide):
+            return function(wide(x) if dr.is_integral_v(x) else x, *args, **kwargs)
 
     return with_ieee_quotients
 

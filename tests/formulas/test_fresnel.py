@@ -210,9 +210,22 @@ def test_nan_gives_nan(setting):
     nan, half, k = map(number_of(setting), (float("nan"), 0.5, 1.5))
     for cos_i, cos_t, ratio in ((nan, half, k), (half, nan, k), (half, half, nan)):
         for transmitted in (False, True):
-            assert all(np.isnan(np.array(x, float)).all() for x in fresnel.powers(cos_i, cos_t, transmitted, ratio))
+            for powers in (fresnel.powers, fresnel.transmitted_powers):
+                assert all(np.isnan(np.array(x, float)).all() for x in powers(cos_i, cos_t, transmitted, ratio))
     for cos_i, ratio in ((nan, k), (half, nan)):
         assert all(np.isnan(to_numpy(x)).all() for x in fresnel.amplitudes(cos_i, ratio))
+
+
+@pytest.mark.parametrize("cos_i", [0, 1])
+def test_integers_are_float64(cos_i):
+    for k in (2, 0.5):
+        cosine = fresnel.refracted_cosine(cos_i, k)
+        assert cosine == fresnel.refracted_cosine(float(cos_i), k)
+        for powers in (fresnel.powers, fresnel.transmitted_powers):
+            assert powers(cos_i, *cosine, k) == powers(float(cos_i), *cosine, k)
+        for r, expected in zip(fresnel.amplitudes(cos_i, k), fresnel.amplitudes(float(cos_i), k), strict=True):
+            assert dr.all(r == expected)
+    assert fresnel.powers(1, 1, True, 1.5) == pytest.approx((0.04, 0.96))
 
 
 def test_derivatives_are_finite_also_at_the_edges(vectorised):
