@@ -184,13 +184,17 @@ def traverse(self: Refract, cb: mi.TraversalCallback) -> None:
 
 def parameters_changed(self: Refract, keys: Collection[str]) -> None:
     """Read the edited parameters. ValueError for a value that is not an index."""
+    # Numbers cannot be read while a function is recorded. Light is lost if the value is not an index.
+    frozen = dr.is_jit_v(self.eta) and dr.flag(dr.JitFlag.FreezingScope)
     if self.varying:
         self.varying.changed(keys)
         if isinstance(self.varying, DispersiveRatio):
-            set_ratio(self, self.varying.at(self.wide(LINES["d"])))
+            eta = dr.detach(self.varying.at(self.wide(LINES["d"])))
+            if not frozen:
+                checked("int_ior / ext_ior", float(dr.slice(eta)))
+            set_ratio(self, eta)
     elif not keys or "eta" in keys:
-        if dr.is_jit_v(self.eta) and dr.flag(dr.JitFlag.FreezingScope):
-            # Numbers cannot be read while a function is recorded. Light is lost if the value is not an index.
+        if frozen:
             eta = self.wide(dr.detach(self.eta))
             set_ratio(self, dr.select((eta >= SMALLEST_RATIO) & (eta <= LARGEST_RATIO), eta, dr.nan))
             return

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.glass_scenes import PLACE, attached, camera, render, sampled, sky, surface
+from support.glass_scenes import PLACE, attached, camera, refusal, render, sampled, sky, surface
 
 from mi_refract import media
 from mi_refract.image_diff import pixelwise
@@ -231,6 +231,13 @@ def test_coefficients_are_parameters(spectral_variant):
         bent = sampled(bsdf, tilted(0.5), REFRACTED, context)
         assert bent.wo[0] == pytest.approx(-math.sin(0.5) / (1.5 + 40000 / wavelength**2) * 1.1, rel=1e-6)
     assert f"int_ior = {GLASS}" in str(bsdf)
+
+
+@pytest.mark.parametrize("value", [-40.0, 1e9, math.nan, math.inf])
+def test_an_edit_of_a_coefficient_to_no_index_is_an_error(each_variant, value):
+    params = mi.traverse(load())
+    params["int_ior_A"] = value
+    assert "refract: int_ior / ext_ior = " in refusal(params.update)
 
 
 def test_directions_have_derivatives_in_the_coefficients(llvm_spectral):
