@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
@@ -152,11 +153,15 @@ def differentiated(x: Number | Vector3) -> bool:
 def scale_to_unit(v: Vector3) -> tuple[Vector3, Number]:
     """(v / p, p) with the power of two p for which the largest component of v / p is in [1, 2). Exact.
 
-    Only for Dr.Jit arrays of float32, whose squares could over- or underflow. The range of every other type suffices
-    for lengths of 1e-18 to 1e18, and p is the literal 1.
+    Only for vectors of float32, whose squares could over- or underflow. The range of float64 suffices for lengths of
+    1e-18 to 1e18, and p is the literal 1.
     """
-    if dr.type_v(v) != dr.VarType.Float32 or not dr.is_jit_v(v):
+    if dr.type_v(v) != dr.VarType.Float32:
         return v, 1
+    if not dr.is_jit_v(v):
+        largest = max(map(abs, v))
+        power = math.ldexp(1, math.frexp(largest)[1] - 1) if 0 < largest < math.inf else 1.0
+        return v / power, power
     number: Any = dr.value_t(type(v))
     bits, reinterpret = dr.uint32_array_t(number), _reinterpret
     x, y, z = (reinterpret(bits, dr.detach(v_i)) & 0x7FFFFFFF for v_i in v)  # ordered as |v_i| are

@@ -129,6 +129,18 @@ def test_flipped_normals_and_powers_of_two_of_lengths_change_no_bit(name, settin
 
 
 @pytest.mark.parametrize("name", EXACT)
+@pytest.mark.parametrize(("i", "j"), [(-59, -59), (-59, 59), (59, -59), (59, 59)])
+def test_lengths_of_1e_18_to_1e18_change_no_bit(name, i, j, setting):
+    cases = [(setting.vector, setting.precision), *([(dr.scalar.Array3f, np.float32)] if setting.is_scalar else [])]
+    for vector, precision in cases:
+        rays = make("generic", COUNTS[setting.backend], precision, seed=23)
+        b, transmitted = evaluate(FORMULAS[name], rays, vector)
+        stretched = Rays(np.ldexp(rays.a, i), np.ldexp(rays.n, j), rays.k)
+        b2, transmitted2 = evaluate(FORMULAS[name], stretched, vector)
+        assert (transmitted == transmitted2).all() and (np.ldexp(b, i) == b2).all()
+
+
+@pytest.mark.parametrize("name", EXACT)
 def test_the_contrast_is_used_if_the_ratio_has_lost_it(name, setting):
     contrast = 1e-9 if setting.precision is np.float32 else 1e-17
     a = np.array([[1.0, 0.0, -1e-3]], dtype=setting.precision)
