@@ -18,7 +18,8 @@
 After a distance t in a medium, exp(−σ t) of the light is left; σ = 4πk/λ, and a colour, above 0 and up to 1, is
 exp(−σ t). Only `refract_path` renders absorption. A ratio of indices outside 2⁻²⁰ … 2²⁰ is an error; if an edit of a
 texture makes such a ratio, its light is lost. `auto` is the fastest formula that is right to the last bit. An edit of
-`eta` compiles no kernel. `refract_<formula>` is the same plugin with that formula.
+`eta` compiles no kernel. Coefficients of a dispersive material are exposed for λ in nm, also where its text or file has
+µm. `refract_<formula>` is the same plugin with that formula.
 
 With integrators other than `refract_path`, and in RGB and mono variants, a dispersive index is its value at the d line.
 """
