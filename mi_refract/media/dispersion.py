@@ -215,9 +215,9 @@ class Medium:
         """n at a wavelength.
 
         `wavelength`: in nm; a float, a numpy array of any shape, or a Dr.Jit array; the result has its shape.
-        `coefficients`: values that replace some of the medium's own, for derivatives. Outside `valid` without `hold`,
-        or if n is not a positive number: NaN for Dr.Jit arrays, ValueError for floats and numpy arrays. For these there
-        is a warning outside `fitted`, and outside `valid` with `hold`.
+        `coefficients`: values that replace some of the medium's own, for derivatives; ValueError for other names.
+        Outside `valid` without `hold`, or if n is not a positive number: NaN for Dr.Jit arrays, ValueError for floats
+        and numpy arrays. For these there is a warning outside `fitted`, and outside `valid` with `hold`.
         """
         n = self.index_or_nan(wavelength, coefficients)
         if not dr.is_array_v(wavelength):
@@ -240,7 +240,7 @@ class Medium:
         return n
 
     def index_or_nan(self, wavelength: Number, coefficients: Coefficients | None = None) -> Number:
-        """As `index`, with NaN instead of an error for every type."""
+        """As `index`, with NaN for every type where there is no index."""
         compiled = dr.is_array_v(wavelength)
         if compiled:
             wide: Any = dr.float64_array_t(type(wavelength))
@@ -253,6 +253,10 @@ class Medium:
         if self.hold:
             x = dr.clip(x, *self.valid) if compiled else np.clip(x, *self.valid)
         valid &= (x >= self.valid[0]) & (x <= self.valid[1])
-        n = self.dispersion.index(where(valid, x, math.nan), {**self.coefficients, **(coefficients or {})})
+        values = {**self.coefficients, **(coefficients or {})}
+        if unknown := values.keys() - self.coefficients.keys() - {TABLE_VALUES}:
+            known = ", ".join([*self.coefficients][:12])
+            raise ValueError(f"{self.name}: unknown coefficient {min(unknown)}; expected {known}")
+        n = self.dispersion.index(where(valid, x, math.nan), values)
         n = where((n > 0) & (n < math.inf), n, math.nan)
         return n if compiled or dr.is_array_v(n) or n.ndim else float(n)

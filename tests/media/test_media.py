@@ -91,6 +91,12 @@ def test_drjit_differentiates_in_the_wavelength_and_the_coefficients(spec, vecto
             assert dr.grad(c[name])[0] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-5, abs=1e-10), name
 
 
+def test_a_coefficient_of_another_name_is_an_error(vectorised):
+    for wavelength in (500.0, np.array([500.0]), dr.value_t(vectorised.vector)(500)):
+        with pytest.raises(ValueError, match=r"cauchy.*: unknown coefficient b; expected A, B"):
+            media.parse("cauchy(1.5, 3000)").index(wavelength, {"b": 4000.0})
+
+
 def test_a_table_has_its_values_at_its_knots():
     """Also for knots that agree in nine digits."""
     assert [media.index(TABLE, w) for w in (400.0, 500.0, 900.0)] == [1.53, 1.52, 1.5]
