@@ -227,7 +227,8 @@ def inspect(scene: Scene) -> SceneFeatures:
 def missing_light(scene: Scene) -> dict[str, str]:
     """Return the light that the scene's integrator, and those that it calls, miss; see `SceneFeatures.missing`.
 
-    Only `path`, `refract_path`, `prb`, `prb_projective`, `volpath`, `volpathmis` and `prbvolpath` are examined.
+    Only `path`, `refract_path`, `prb`, `prb_projective`, `volpath`, `volpathmis` and `prbvolpath` are examined. Whether
+    `refract_path` traces lamps is asked for the first sensor; without a sensor none is traced.
     """
     features, integrators, missing = inspect(scene), [scene.integrator()], dict[str, str]()
     while integrators:
@@ -235,7 +236,7 @@ def missing_light(scene: Scene) -> dict[str, str]:
         integrators += [child for child in children(integrator) if hasattr(child, "aov_names")]
         name, _, parameters = str(integrator).partition("[")
         if name in SHADOW_RAYS and (depth := re.search(r"max_depth = (-?\d+)", parameters)):
-            may_trace = integrator is scene.integrator() and hasattr(integrator, "caustics_of")
+            may_trace = integrator is scene.integrator() and hasattr(integrator, "caustics_of") and scene.sensors()
             by_path = not may_trace or integrator.caustics_of(scene, scene.sensors()[0]) == "path"
             missing |= features.missing("path" if by_path else "lamp", int(depth[1]), volumes=SHADOW_RAYS[name])
     return missing

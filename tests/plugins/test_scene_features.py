@@ -277,6 +277,12 @@ def test_missing_light_lists_the_classes_of_paths(lamp, bsdf, others, missing, s
     assert {*missing_light(under_a_pane(lamp, bsdf, **others))} == missing
 
 
+def test_missing_light_needs_no_sensor(scalar_variant):
+    parts = {"ball": {"type": "sphere", "bsdf": GLASS}, "floor": {"type": "rectangle"}, "lamp": POINT}
+    for integrator in ("path", "refract_path"):
+        assert {*missing_light(mi.load_dict({"type": "scene", "integrator": {"type": integrator}} | parts))} == {CAST}
+
+
 def test_missing_light_gives_reason_and_remedy(scalar_variant):
     scene = under_a_pane(POINT, {"type": "mask", "nested": GLASS})
     (text,) = missing_light(scene).values()
