@@ -192,7 +192,8 @@ def parameters_changed(self: Refract, keys: Collection[str]) -> None:
         if isinstance(self.varying, DispersiveRatio):
             eta = dr.detach(self.varying.at(self.wide(LINES["d"])))
             if not frozen:
-                checked("int_ior / ext_ior", float(dr.slice(eta)))
+                number: Any = dr.slice(eta)
+                checked("int_ior / ext_ior", float(number))
             set_ratio(self, eta)
     elif not keys or "eta" in keys:
         if frozen:
