@@ -175,7 +175,9 @@ def test_wrong_traces_and_other_indices_are_told_apart():
     moved, one = ours.copy(), ours.copy()
     moved[..., 0] += 1e-10
     one[3, :, 1] *= 1 + 1e-12  # at one wavelength
-    for rays in (moved, one, ours.astype(np.float32).astype(float)):
+    lost = ours.copy()
+    lost[3] = 0.0  # a ray without a direction crosses the axis nowhere
+    for rays in (moved, one, ours.astype(np.float32).astype(float), lost):
         assert list(broken(traced(rays)).values()) == [{ERROR_OVER_BOUND}] * 4
     indices = known * [[1], [1 + 1e-8]]  # F2 of another maker, traced correctly
     own = [

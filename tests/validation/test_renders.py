@@ -409,6 +409,12 @@ def test_a_weight_applied_twice_colours_the_furnace(spectral, monkeypatch):
     assert row.broken
 
 
+def test_a_slab_without_a_number_fails(llvm_variant, monkeypatch):
+    monkeypatch.setattr(renders.mi, "render", lambda *_, **__: np.full((1, 1, 3), np.nan))
+    (row,) = renders.slab_rows(HERE)
+    assert row.broken
+
+
 def test_media_that_absorb_too_much_are_detected(spectral, monkeypatch):
     """By 1e-5 in a slab; by a tenth in a scene against `volpath`, which changes its mean by 2 to 4 %: p < 1e-28."""
     monkeypatch.setattr(renders, "SIZE", 24)

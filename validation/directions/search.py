@@ -66,7 +66,8 @@ def _rows(context: Context, name: str, setting: Setting) -> list[Row]:
     worst = certify(name, FORMULAS[name], herd, setting)
     chords = [ray for ray in worst if ray.objective == "chord"]
     far = [ray.line() for ray in worst if ray.objective == "decision" and ray.share > 0]
-    values = {ERROR_OVER_BOUND: max((ray.share for ray in chords), default=0.0), MISCLASSIFIED_FAR: float(len(far))}
+    values = {ERROR_OVER_BOUND: float(np.max([ray.share for ray in chords], initial=0.0))}
+    values |= {MISCLASSIFIED_FAR: float(len(far))}
     values["rays tried"] = float(generations * CHILDREN * len(herd))
     worst_lines = [ray.line() for ray in sorted(chords, key=lambda ray: -ray.share)[:3]]
     sizes = {"seed": seeds.current(SEED), "sample": sample, "generations": generations}

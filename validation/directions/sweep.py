@@ -63,7 +63,8 @@ def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     for name in DOCUMENTED:  # one row over all regimes
         parts = [row for row in rows if row.subject == name]
         worst = max(parts, key=lambda row: row.values[ERROR_OVER_BOUND])
-        values = {m: max(row.values[m] for row in parts) for m in (WORST_IN_U, ERROR_OVER_BOUND, "screen off")}
+        metrics = WORST_IN_U, ERROR_OVER_BOUND, "screen off"
+        values = {m: float(np.max([row.values[m] for row in parts])) for m in metrics}
         counts = (MISCLASSIFIED, MISCLASSIFIED_FAR, "rays", "certified")
         values |= {m: sum(row.values[m] for row in parts) for m in counts}
         case = "all regimes of unit vectors"

@@ -72,7 +72,7 @@ def prism_row() -> Row:
         along = np.array([math.cos(half), math.sin(half)])
         face = np.array([-15.0, 34.64101615137755 * 2 / 3 - 15.0 * math.sqrt(3)])  # on the left face
         errors.append(angle(traced(scene, face - 20 * along, along), half))
-    return Row(NAME, "prism", "minimum deviation", "float64", {"error": max(errors)}, {"error": PRISM_ANGLE})
+    return Row(NAME, "prism", "minimum deviation", "float64", {"error": float(np.max(errors))}, {"error": PRISM_ANGLE})
 
 
 def bow_row(reflections: int) -> Row:
@@ -84,7 +84,7 @@ def bow_row(reflections: int) -> Row:
         incidence = closed.rainbow_incidence(n, reflections)
         turn = float(closed.deflection(incidence, n, reflections))  # clockwise, for a ray above the axis
         errors.append(angle(traced(scene, [-16.0, math.sin(incidence)], [1.0, 0.0]), turn, bits))
-    return Row(NAME, "drop", case, "float64", {"error": max(errors)}, {"error": BOW_ANGLE})
+    return Row(NAME, "drop", case, "float64", {"error": float(np.max(errors))}, {"error": BOW_ANGLE})
 
 
 def achromat_row() -> Row:
@@ -96,7 +96,7 @@ def achromat_row() -> Row:
         ray = traced(replace(scene, segments=scene.segments[i : i + 1]), [START, HEIGHT], [1.0, 0.0])
         focal[wavelength] = float(on_axis(np.concatenate([ray.tips, ray.paths.directions], axis=1))[0])
         errors.append(abs(focal[wavelength] / expected - 1))
-    values = {"distance": max(errors), f"at {LINES['d']:g} nm": focal[LINES["d"]]}
+    values = {"distance": float(np.max(errors)), f"at {LINES['d']:g} nm": focal[LINES["d"]]}
     values |= {f"shift at {w:g} nm": x - focal[LINES["d"]] for w, x in focal.items() if w != LINES["d"]}
     return Row(NAME, "achromat", "focal distance", "float64", values, {"distance": FOCAL_DISTANCE})
 
@@ -145,7 +145,7 @@ def mitsuba_row(context: Context) -> Row:
             ray.wavelengths = wavelengths
         dr.eval(ray)
         off = np.abs(np.array(si.p.x - si.p.y * ray.d.x / ray.d.y, float) - expected)
-    share = max(x / bound(ACHROMAT, e, MITSUBA, 2.0**-24) for x, e in zip(off, exact, strict=True))
+    share = np.max([x / bound(ACHROMAT, e, MITSUBA, 2.0**-24) for x, e in zip(off, exact, strict=True)])
     values = {"off": float(off.max()), "off / chromatic shift": float(off.max() / np.ptp(expected))}
     values, budgets = values | {ERROR_OVER_BOUND: float(share)}, {ERROR_OVER_BOUND: LENS_TRACE}
     return Row(NAME, "achromat", case, SPECTRAL, values, budgets, replay={"height": MARGIN})

@@ -111,9 +111,10 @@ def bound(lens: Lens, exact: Crossing, rounding: Rounding, u: float) -> float:
 
 
 def on_axis(rays: np.ndarray) -> np.ndarray:
-    """Return z where rays [z, y, dz, dy] (N, 4) cross the axis."""
+    """Return z where rays [z, y, dz, dy] (N, 4) cross the axis; infinite or NaN for a ray that does not."""
     z, y, dz, dy = rays.T
-    return np.asarray(z - y * dz / dy)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(z - y * dz / dy)
 
 
 def _traced(

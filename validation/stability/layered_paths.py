@@ -370,7 +370,7 @@ def _path_row(layers: Layers, name: str, exact: list[Path], parts: list[Deviatio
     boundaries = [len(path.media) - 1 for path in exact]
     values = {
         DIRECTION: max(directions),
-        "direction / condition": float(max(part.conditioned.max() for part in parts)),
+        "direction / condition": float(np.max([part.conditioned.max() for part in parts])),
         MEDIAN_DIRECTION: float(np.median(directions)),
         PLACE: max(places),
         "median place": float(np.median(places)),

@@ -125,8 +125,8 @@ def _row(title: str, case: str, i: int, rays: np.ndarray, indices: np.ndarray, r
     off = [float(abs(Decimal(x) - e.place)) for x, e in zip(crossings, exact, strict=True)]
     at = dict(zip(wavelengths(), crossings, strict=True))
     values = {
-        OFF: max(x / float(e.place) for x, e in zip(off, exact, strict=True)),
-        ERROR_OVER_BOUND: max(x / bound(ACHROMAT, e, rounding, U) for x, e in zip(off, exact, strict=True)),
+        OFF: float(np.max([x / float(e.place) for x, e in zip(off, exact, strict=True)])),
+        ERROR_OVER_BOUND: float(np.max([x / bound(ACHROMAT, e, rounding, U) for x, e in zip(off, exact, strict=True)])),
         f"at {LINES['d']:g} nm": at[LINES["d"]],
     }
     values |= {f"shift at {w:g} nm": x - at[LINES["d"]] for w, x in at.items() if w != LINES["d"]}
