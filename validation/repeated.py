@@ -6,6 +6,7 @@ A bound is derived for every ray, so it must hold for every seed, not only for t
 from __future__ import annotations
 
 import functools
+import re
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -57,6 +58,11 @@ def rows_of(study: Study, context: Context, shift: int) -> list[Row]:
     replay = {"seeds": f"each {STEP * shift} above the study's own", "profile": context.profile.name}
     budgets = {"broken": 0.0, "nothing checked": 0.0}
     return [Row(study.name, "every subject", case, "", values, budgets, replay=replay), *broken]
+
+
+def own_case(case: str) -> str:
+    """Return the case of a row without its other seed; "" for the row of all cases with another seed."""
+    return re.sub(r"(, )?other seed \d+$", "", case)
 
 
 def share(value: float, bound: float) -> float:

@@ -11,7 +11,7 @@ from mi_refract.report.row import Row
 from validation import __main__ as command
 from validation import limits
 from validation.suite import matrix, per_ray, rendered_images
-from validation.suite.per_ray import LARGE
+from validation.suite.per_ray import CRITICAL, LARGE
 
 REPLAY = {"version": "A 1.0", "total internal reflection": "zero", "remark": "known"}
 ONE = {"worst rad": 1e-6}
@@ -59,6 +59,20 @@ def test_a_missed_goal_is_shown_but_does_not_fail():
     for study, checks in matrix.CHECKS.items():
         absent = matrix.summary([Row(study, "A", "every set", "f32", reason="pip install it")])
         assert [(cell.case, cell.verdict) for cell in absent] == [(case, "not run") for case in checks]
+
+
+def test_other_seeds_are_no_systems_and_fail_the_checks_that_they_break():
+    every = Row(per_ray.NAME, "every subject", "other seed 12", "", {"broken": 1.0}, {"broken": 0.0})
+    skipped = Row(per_ray.NAME, "every subject", "other seed 2", "", reason="pip install it")
+    rows = [ray(), ray(case=CRITICAL), every, skipped, ray(case=f"{CRITICAL}, other seed 12", wrong=3.0)]
+    (line,) = matrix.table(matrix.summary(rows))[2]
+    assert line[0] == "A, f32" and [
+        name for name, cell in zip(per_ray.SETS, line[1:], strict=False) if "✗" in cell
+    ] == [CRITICAL]
+    stored = matrix.of_rows(row.as_dict() for row in rows)
+    (system,) = stored["rays"]
+    assert {name for name, x in system["sets"].items() if x["verdict"] == "wrong"} == {CRITICAL}
+    assert len(system["sets"]) == 2 and not stored["not_run"]
 
 
 # The page ----------------------------------------------------------------------------------------------------------

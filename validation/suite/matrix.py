@@ -20,7 +20,7 @@ from mi_refract.report.documents import write_page
 from mi_refract.report.embedded_images import EmbeddedImages
 from mi_refract.report.row import Row, strict
 from mi_refract.report.study_page import Answer, State, phrase
-from validation import limits
+from validation import limits, repeated
 from validation.run.context import Context
 from validation.run.metrics import DETECTABLE, MEAN_DIFFERENCE, WORST_ANGLE
 from validation.study import Study, Task, about
@@ -58,11 +58,11 @@ def tasks(context: Context) -> list[Task]:
 
 def summary(rows: Iterable[Row]) -> list[Row]:
     """Return a row per system, precision and check. A system that was not run has the reason in all its checks."""
-    return [cell for row in rows if row.study in CHECKS for cell in _cells(row)]
+    return [cell for row in rows if row.study in CHECKS for cell in _cells(row, repeated.own_case(row.case))]
 
 
-def _cells(row: Row) -> list[Row]:
-    cases = (row.case,) if row.case in CHECKS[row.study] else CHECKS[row.study]
+def _cells(row: Row, case: str) -> list[Row]:
+    cases = (case,) if case in CHECKS[row.study] else CHECKS[row.study] if case else ()
     system = f"{row.subject}, {row.setting}" if row.study == per_ray.NAME else row.subject
     if not row.values:
         return [Row(NAME, system, case, "", reason=row.reason) for case in cases]
@@ -147,7 +147,9 @@ def read(folder: Path) -> Stored:
 def of_rows(rows: Iterable[Stored]) -> Stored:
     """Return `{"schema": 1, "rays": [...], "images": [...], "not_run": [...]}` from the rows of both studies."""
     systems: dict[tuple[str, ...], list[Stored]] = {}
-    for row in rows:
+    for row in ({**row, "case": repeated.own_case(row["case"])} for row in rows):
+        if not row["case"]:
+            continue
         precision = row["setting"] if row["study"] == per_ray.NAME else ""
         systems.setdefault((row["study"], row["subject"], precision), []).append(row)
     rays, images, not_run = list[Stored](), list[Stored](), list[Stored]()
