@@ -16,7 +16,7 @@ from validation.run.context import PROFILES, Context
 from validation.suite import exports, matrix, rendered_images, spectral_lines
 from validation.suite.rendered_images import INCONCLUSIVE, THREE, Size
 from validation.suite.renderers import SYSTEMS, environments
-from validation.suite.renderers.image_renderers import IMAGE_RENDERERS, ImageRenderer
+from validation.suite.renderers.image_renderers import IMAGE_RENDERERS, ImageRenderer, NoExport
 
 SMALL = Size(48, 32, 1, 0.2)
 pytestmark = pytest.mark.usefixtures("llvm_variant")
@@ -98,7 +98,8 @@ def test_failed_renders_and_nan_never_pass(judged, monkeypatch):
 
     row = judged(draw=draw_nan)
     assert row.verdict == "fail" and "NaN" in row.reason
-    for error, verdict in (*NOT_DRAWN, (ValueError("a diffuse surface"), "not run")):
+    answers = (NoExport("a diffuse surface"), "not run"), (ValueError("no image: channels Y"), "fail")
+    for error, verdict in (*NOT_DRAWN, *answers):
         row = judged(draw=raising(error))
         assert row.verdict == verdict and str(error) in row.reason
     monkeypatch.setattr(environments, "absent", lambda system: "the command that installs it")

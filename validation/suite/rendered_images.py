@@ -35,7 +35,7 @@ from validation.run.context import Context
 from validation.run.metrics import DETECTABLE, MEAN_DIFFERENCE
 from validation.run.render_methods import Camera
 from validation.study import Study, Task, about
-from validation.suite.renderers.image_renderers import IMAGE_RENDERERS, ImageRenderer, by_command, mean
+from validation.suite.renderers.image_renderers import IMAGE_RENDERERS, ImageRenderer, NoExport, by_command, mean
 
 from .renderers import SYSTEMS, System, environments
 
@@ -202,7 +202,7 @@ def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
         with tempfile.TemporaryDirectory() as folder:
             try:
                 return renderer.draw(SCENES[scene].load(size.resolution), Path(folder), spp, seeds)
-            except ValueError as error:  # a scene that the renderer's format cannot represent
+            except NoExport as error:
                 raise environments.Unable(str(error)) from None
 
     theirs, no_answer = environments.attempt(row, why_not(SYSTEMS[renderer.system], context), LOST, draw)
