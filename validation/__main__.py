@@ -151,7 +151,8 @@ def _command(
         with safe_files.held(out / LOCK, "a validation"):
             return _run(names, profile, out, variant, write_tables, goals, target, own_renderers)
     except KeyboardInterrupt:
-        print("validation: interrupted; run the same command again to resume", file=sys.stderr)
+        resumes = "" if own_renderers else "; run the same command again to resume"
+        print(f"validation: interrupted{resumes}", file=sys.stderr)
         raise
 
 
@@ -200,6 +201,8 @@ def _run(
 
         tables.check(names)
     context = here(profile, out, variant)
+    if own_renderers:  # their programs may have changed since an interruption
+        runner.forget(context)
     chosen = modules(names, profile)
     studies: list[Study] = [import_module(f"validation.{name}").STUDY for name in chosen]
     workers = runner.OnCluster(tuple(chosen), profile, variant, target) if target.given else None

@@ -137,14 +137,14 @@ def installed() -> list[str]:
 
 
 def sources() -> str:
-    """Return a digest of all sources that rows depend on: the package, the validation, scenes and tests."""
+    """Return a digest of all files that rows depend on: the package, the validation, scenes and tests."""
     digest = hashlib.sha256()
     folder = Path(__file__).parent
-    groups = [Path(mi_refract.__file__).parent.rglob("*.py"), SCENES.rglob("*")]
-    groups += [folder.rglob(f"*.{kind}") for kind in ("py", "json", "toml", "j2")]
+    groups = [place.rglob("*") for place in (Path(mi_refract.__file__).parent, folder, SCENES)]
     groups.append(folder.with_name("tests").rglob("*.py"))  # they must detect the mutants of our code
     for path in sorted(path for group in groups for path in group if path.is_file()):
-        digest.update(path.read_bytes())
+        if path.suffix != ".pyc":
+            digest.update(path.read_bytes())
     return digest.hexdigest()
 
 

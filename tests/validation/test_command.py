@@ -28,9 +28,9 @@ from validation.run import render_methods
 from validation.run.context import SCENES, beyond_builtin, here
 from validation.stability import layered_paths
 from validation.study import Study, Task
-from validation.suite import caustic_energies
+from validation.suite import caustic_energies, rendered_images
 from validation.suite import standard_numbers as by_others
-from validation.suite.renderers import SYSTEMS
+from validation.suite.renderers import SYSTEMS, system
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
 MODULES = ("stability.optical_chains", "stability.layered_paths")
@@ -100,7 +100,8 @@ def test_timed_tasks_run_last_and_not_on_workers(context):
 
 
 def test_saved_rows_are_used_for_the_same_sources_only(context, tmp_path, monkeypatch):
-    names = ("package/room/a.py", "validation/room/b.py", "validation/room/c.json", "scenes/planar/d.toml")
+    names = ("package/room/a.py", "package/room/glasses.json", "validation/room/b.py", "validation/room/c.json")
+    names = (*names, "validation/room/scripts/e.mjs", "scenes/planar/d.toml")
     for name in names:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("old")
@@ -198,6 +199,26 @@ def test_an_interruption_prints_how_to_resume_and_two_validations_do_not_share_a
     assert codes == [2] and {path.name for path in tmp_path.iterdir()} == FILES
     (message,) = [line for line in capsys.readouterr().err.splitlines() if "is already running" in line]
     assert f"{tmp_path}: a validation is already running in process {os.getpid()} on " in message
+
+
+def test_after_an_interruption_an_own_renderer_is_measured_anew(tmp_path, monkeypatch, capsys):
+    """Its program may have changed."""
+    calls, interrupted = [], [True]
+
+    def stop():
+        if interrupted.pop():
+            raise KeyboardInterrupt
+        return [row()]
+
+    every = [Task("rays", lambda: calls.append(1) or [row()]), Task("images", stop)]
+    study = Study("per_ray", "A study", "What it asks.", {}, lambda context: every)
+    monkeypatch.setattr(command, "import_module", lambda name: types.SimpleNamespace(STUDY=study))
+    monkeypatch.setattr(system, "join", lambda folder: system.System("mine", "Mine"))
+    monkeypatch.setattr(rendered_images, "join", lambda own: None)
+    arguments = ["suite.matrix", "--out", str(tmp_path), "--renderer", "mine"]
+    assert command.main(arguments) == 130 and "resume" not in capsys.readouterr().err
+    interrupted.append(False)
+    assert command.main(arguments) == 0 and len(calls) == 2
 
 
 def test_a_part_of_a_study_runs_alone_and_only_once():
