@@ -2,9 +2,11 @@
 
 import dataclasses
 import functools
+import math
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from unittest import mock
 
 import drjit as dr
 import mitsuba as mi
@@ -26,6 +28,7 @@ from validation.renders import (
     invisible_changes,
     neighbours,
     random_numbers,
+    rendering_passes,
     unused_features,
 )
 from validation.run import render_methods
@@ -213,6 +216,19 @@ def test_wrappers_that_are_split_like_glass_are_detected(llvm_variant, monkeypat
     monkeypatch.setattr(path_loop, "BOUNDARIES", {*glass, "BlendBSDF"})
     rows = invisible_changes.rows("llvm_ad_rgb", "glass", 2)
     assert len(rows) == 2 and [row.case.split(": ")[1] for row in rows if row.broken] == ["blend of itself"]
+
+
+@pytest.mark.parametrize(("pixel", "verdict"), [(1.001, "pass"), (math.nan, "fail")])
+def test_renders_in_passes_without_a_number_fail(context, monkeypatch, pixel, verdict):
+    def resume(job, *_, **__):
+        render = mock.Mock(image=lambda: np.full((2, 2, 3), 1.0 if job.seed >= 2**31 else pixel))
+        render.error.return_value = mock.Mock(value=1e-3, low=0.5e-3, high=2e-3)
+        render.progress.passes = 12
+        return render
+
+    monkeypatch.setattr(rendering_passes, "resume", resume)
+    (row,) = rendering_passes.error_rows(context, "sphere")
+    assert row.verdict == verdict
 
 
 def test_an_attached_direction_is_detected(context, monkeypatch):

@@ -88,8 +88,8 @@ def error_rows(context: Context, name: str, seed: int = 0) -> list[Row]:
     true, stated, low, high, passes = np.array(table).T
     values = {
         "renders": float(count),
-        "beyond": float((true > requested).sum()),
-        "outside": float(((true < low) | (true > high)).sum()),
+        "beyond": float((~(true <= requested)).sum()),  # also NaN
+        "outside": float((~((true >= low) & (true <= high))).sum()),
         "stated / true": float((stated**2).mean() / (true**2).mean()),
         "passes": float(passes.mean()),
     }
