@@ -352,6 +352,8 @@ def test_means_of_images_have_students_bound():
     value, bound = others.mean_and_bound(means)
     assert others.row(number, "x", "", value, bound, "").verdict == "pass" and bound < 0.01
     assert others.row(number, "x", "", value + 2 * bound, bound, "").broken == {"error / bound": 1.0}
+    black = others.mean_and_bound(np.zeros(others.SEEDS))
+    assert black == (0, 0) and others.row(number, "x", "", *black, "").broken == {"error / bound": 1.0}
 
 
 def test_plates_are_closed_and_lit_from_behind():

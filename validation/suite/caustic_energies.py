@@ -177,8 +177,10 @@ def rows(context: Context, title: str, body: str) -> list[Row]:
     caustic, plain = both
     direct = 2 * math.pi * (1 - TOP / math.hypot(TOP, radius)) if lamp == POINT else math.pi * radius**2
     exact, _ = caustic_energy.flux(setup, radius, BOUNDARIES)
-    power = direct * statistics.fmean(caustic) / statistics.fmean(plain)
-    values = {OFF: abs(power / exact - 1)} | ({SPREAD: max(caustic) / min(caustic) - 1} if len(caustic) > 1 else {})
+    with np.errstate(divide="ignore", invalid="ignore"):  # images may be black
+        power = float(np.divide(direct * statistics.fmean(caustic), statistics.fmean(plain)))
+        spread = float(np.divide(max(caustic), min(caustic))) - 1
+    values = {OFF: abs(power / exact - 1)} | ({SPREAD: spread} if len(caustic) > 1 else {})
     replay = {"renderer": system.source, "power": power, "exact power": exact, "seeds": [*SEEDS]}
     return [row(values, {OFF: limits.CAUSTIC_LEVEL}, replay=replay)]
 

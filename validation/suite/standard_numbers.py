@@ -128,7 +128,8 @@ def row(number: StandardNumber, subject: str, setting: str, measured: float, bou
     printed = number.print_reading if number.kind == "index" else None
     exact = printed[0] if printed else number.value
     values = {MEASURED: float(measured), EXACT: exact, BOUND: float(bound)}
-    values[ERROR_OVER_BOUND] = abs(values[MEASURED] - exact) / values[BOUND]
+    with np.errstate(divide="ignore", invalid="ignore"):  # black images have a bound of 0
+        values[ERROR_OVER_BOUND] = float(np.divide(abs(values[MEASURED] - exact), values[BOUND]))
     return Row(NAME, subject, number.name, setting, values, {ERROR_OVER_BOUND: limits.STANDARD}, reason=remark)
 
 
