@@ -12,6 +12,7 @@ from mi_refract import backend, planar
 from mi_refract.io import image_file
 from mi_refract.rendering import scene_files
 from mi_refract.scene_export import targets
+from validation import limits
 from validation.efficiency import caustic_scenes, caustics
 from validation.efficiency.caustics import BY_CLASS, Extent
 from validation.reference import caustic_energy
@@ -124,6 +125,21 @@ def test_the_study_of_other_renderers_measures_the_power_of_our_own(context, mon
     (row,) = caustic_energies.rows(context, "ours", body)
     assert row.verdict == ("pass" if factor == 1 else "fail")
     assert row.values[caustic_energies.OFF] == pytest.approx(factor - 1, abs=0.02)
+
+
+def test_black_images_of_other_renderers_fail(context, monkeypatch):
+    draw = lambda *_: [image_file.named("black", np.zeros((64, 64, 3), np.float32))] * 2  # noqa: E731
+    monkeypatch.setitem(caustic_energies.RENDERERS, "black", caustic_energies.Renderer("mitsuba", draw))
+    (row,) = caustic_energies.rows(context, "black", "ball")
+    assert row.broken.keys() == {caustic_energies.OFF}
+
+
+def test_a_reference_without_a_caustic_fails():
+    rng = np.random.default_rng(3)
+    references, images = 1 + 0.01 * rng.normal(size=(2, 4, 16, 16, 3))
+    for pixels, passes in ((rng.random((16, 16)) < 0.3, True), (np.zeros((16, 16), bool), False)):
+        detectable = caustics._tested(references, images, pixels)[DETECTABLE]
+        assert (detectable <= limits.CAUSTIC_DETECTABLE) == passes
 
 
 # Defects -------------------------------------------------------------------------------------------------------------

@@ -328,7 +328,7 @@ def _tested(references: np.ndarray, images: np.ndarray, caustic: np.ndarray) -> 
     return {
         WELCH_ALARMS: float(tiles.alarms + means.alarms),
         SMALLEST_P: min(tiles.smallest_p, means.smallest_p),
-        DETECTABLE: float(np.nanmax(means.levels[0].detectable(means.threshold))),
+        DETECTABLE: float(np.max(means.levels[0].detectable(means.threshold))),  # NaN if either part is black
     }
 
 
