@@ -231,6 +231,16 @@ def test_renders_in_passes_without_a_number_fail(context, monkeypatch, pixel, ve
     assert row.verdict == verdict
 
 
+def test_glass_that_cannot_be_loaded_is_not_left_out(llvm_variant, monkeypatch):
+    monkeypatch.setattr(neighbours, "measured", lambda *_, **__: np.ones((2, 1, len(neighbours.CELLS))))
+    names, settings = ("diffuse", "refract_wedge"), ((0, 4),)
+    judged = neighbours.rows("llvm_ad_rgb", "twosided", names, settings)
+    assert {row.verdict for row in judged if row.case.endswith("refract_wedge")} == {"not run"}
+    monkeypatch.setitem(neighbours.BSDFS, "refract_wedge", {"formula": "none"})
+    with pytest.raises(RuntimeError, match="`formula` cannot be set"):
+        neighbours.rows("llvm_ad_rgb", "alone", names, settings)
+
+
 def test_an_attached_direction_is_detected(context, monkeypatch):
     """Rough metal fails; glass does not, since the directions of its lobes are attached anyway."""
     metal, glass = gradients.QUICK  # both pass without the defect, see test_contract.py
