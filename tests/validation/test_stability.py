@@ -17,6 +17,7 @@ from validation import limits
 from validation.reference import closed_forms, optical_systems
 from validation.run.array_settings import BUILTIN
 from validation.run.context import PROFILES, SCALAR_PROFILES, Context
+from validation.run.metrics import MISCLASSIFIED, MISCLASSIFIED_FAR
 from validation.stability import derivatives, energy, layered_paths, optical_chains
 from validation.stability.layer_chains import air, enter
 from validation.stability.layered_paths import FIBRE, MIRAGE
@@ -114,7 +115,26 @@ def test_a_budget_that_no_answer_could_break_is_none():
     assert (lost.verdict, lost.reason) == ("info", optical_chains.NOTHING)
     assert row(np.float64, (89.4,)).broken.keys() == {"error / condition"}
     held = row(np.float64, (89.4, 89.8))
-    assert held.broken.keys() == held.budgets.keys() == {"error / condition", "TIR misclassified", "turning height"}
+    assert held.broken.keys() == held.budgets.keys() == {"error / condition", MISCLASSIFIED_FAR, "turning height"}
+
+
+def test_a_decided_ray_may_not_turn_although_others_may():
+    """Of ratios in float32 five of seven rays may take any path, but not that of 88 degrees."""
+
+    def mirrored(a, n, k, contrast=None):
+        b, transmitted = promoted(a, n, k, contrast)
+        steep = dr.abs(dr.dot(a, n)) > 0.03
+        return dr.select(steep, a - n * (2 * dr.dot(a, n)), b), transmitted & ~steep
+
+    setting = compiled("float32")
+    how = optical_chains.Extent((1000,), ("upright",), 1000, DEGREES, False)
+    fed = enter(air(1000), np.array(DEGREES), np.full(7, 1000), UPRIGHT, np.float32).fed("ratios", np.float32)
+    right, wrong = (
+        optical_chains.mirage_row("promoted", subject, "mirage", fed, setting, how)[0]
+        for subject in (promoted, mirrored)
+    )
+    assert right.verdict == "pass" and right.values[MISCLASSIFIED] <= wrong.values[MISCLASSIFIED] <= 4
+    assert wrong.broken == {MISCLASSIFIED_FAR: 0.0}
 
 
 # Systems: closed answers ---------------------------------------------------------------------------------------------

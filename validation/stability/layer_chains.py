@@ -218,7 +218,8 @@ class Rays:
         squeeze = 1 + np.where(self.passes, self.layers.kappa[self.last], 0)
         condition = (outputs + np.where(self.passes, all_down, turned) * self.sine2) * squeeze / self.end**2
         height = 2 * (self.cosines + all_down * self.sine2) / (self.layers.steps[0] * self.sine2)
-        return Fed(self, feed, self.layers.chain(self.normal, feed, precision), condition, height)
+        growth = 2.0 * roundings * (not self.layers.exact) / float(self.layers.steps[0])
+        return Fed(self, feed, self.layers.chain(self.normal, feed, precision), condition, height, growth)
 
 
 @dataclass(frozen=True)
@@ -226,7 +227,8 @@ class Fed:
     """Rays, their layers as a formula gets them, and conditions to first order.
 
     `condition` (N,): condition of ln cos θ at the end of a ray, the sums in this module's docstring with every ε and
-    every δ 1. `height` (N,): the corresponding error of the turning layer, in layers.
+    every δ 1. `height` (N,): the corresponding error of the turning layer, in layers; `growth`: by how much each layer
+    beyond the exact one adds to it.
     """
 
     rays: Rays
@@ -234,6 +236,7 @@ class Fed:
     chain: Chain
     condition: Array
     height: Array
+    growth: float
 
 
 def enter(layers: Layers, degrees: Array, stop: Array, plane: Array, precision: type) -> Rays:

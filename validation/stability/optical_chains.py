@@ -26,7 +26,7 @@ from validation.run import array_settings as backends
 from validation.run import seeds
 from validation.run.array_settings import Setting
 from validation.run.context import Context
-from validation.run.metrics import MISCLASSIFIED
+from validation.run.metrics import MISCLASSIFIED, MISCLASSIFIED_FAR
 from validation.study import Study, Task, about
 
 from .energy import worst
@@ -53,6 +53,7 @@ TERMS = {
     "error": "the worst error: in a mirage, the relative error of the final cosine; for directions, in radians",
     **{f"{angle}°": f"the same for the ray that enters at {angle}°" for angle in PASSING},
     MISCLASSIFIED: "rays that turned back but must pass, or the reverse, and missed total internal reflections",
+    MISCLASSIFIED_FAR: "such rays whose error bound does not include the decision",
     "turning height": "distance between the layer in which a ray turned and the right one, over the number of layers",
     "length drift": "relative change of the length of the direction",
     "over print": "the largest deviation from CODE V's printed numbers, divided by their rounding",
@@ -200,6 +201,7 @@ def mirage_row(name: str, subject: Subject, case: str, fed: Fed, setting: Settin
         "error / condition": worst(over_condition[final][right[final]]),
         "error": worst(error[final]),
         MISCLASSIFIED: float((~right)[final].sum()),
+        MISCLASSIFIED_FAR: float((~right & ~undecided(fed, setting.roundoff))[final].sum()),
         "turning height": worst((np.abs(turned - rays.last) / count)[final][~rays.passes[final]]),
         "length drift": worst(np.abs(length - 1)[final]),
     } | {f"{angle}°": float(e) for angle, e in zip(how.angles, error, strict=False) if angle in PASSING}
@@ -214,22 +216,29 @@ NOTHING = "no budget: if every input and output errs by u, these rays may take a
 
 
 def mirage_budgets(fed: Fed, u: float, final: slice) -> dict[str, float]:
-    """Return the budgets of a form at the rounding limit, without budgets that the problem's condition makes void.
-
-    A ray may be misclassified if its error bound includes the decision.
-    """
-    rays, height = fed.rays, limits.MIRAGE * u * fed.height + 1
-    count = rays.layers.count
-    doubtful = np.where(rays.passes, fed.condition * u > limits.FIRST_ORDER, rays.last + height >= count)[final]
-    heights = (height / count)[final][~rays.passes[final]]
+    """Return the budgets of a form at the rounding limit, without budgets that the problem's condition makes void."""
+    rays = fed.rays
+    heights = (turning_error(fed, u) / rays.layers.count)[final][~rays.passes[final]]
     budgets = {}
     if (fed.condition[final] * u <= limits.FIRST_ORDER).any():
         budgets["error / condition"] = limits.MIRAGE
-    if not doubtful.all():
-        budgets[MISCLASSIFIED] = float(doubtful.sum())
+    if not undecided(fed, u)[final].all():
+        budgets[MISCLASSIFIED_FAR] = 0.0
     if len(heights) and worst(heights) < 1:
         budgets["turning height"] = worst(heights)
     return budgets
+
+
+def undecided(fed: Fed, u: float) -> Array:
+    """Return the rays that may be misclassified, because their error bound includes the decision."""
+    turned = fed.rays.last + turning_error(fed, u) >= fed.rays.layers.count
+    return np.where(fed.rays.passes, fed.condition * u > limits.FIRST_ORDER, turned)
+
+
+def turning_error(fed: Fed, u: float) -> Array:
+    """Return the bound on the error of the layer in which a ray turns, in layers: e = x + 1 + growth e."""
+    share = 1 - limits.MIRAGE * u * fed.growth  # at 0 or below, rounding may hide every layer
+    return np.asarray((limits.MIRAGE * u * fed.height + 1) / share if share > 0 else np.full(len(fed.height), np.inf))
 
 
 def pipe_row(name: str, subject: Subject, setting: Setting, how: Extent) -> Row:
