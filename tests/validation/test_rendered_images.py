@@ -224,6 +224,7 @@ def test_equal_lines_pass_and_shifted_or_mixed_lines_fail(noise, shifts, verdict
     for error, verdict in NOT_DRAWN:
         monkeypatch.setattr(spectral_lines, "theirs", raising(error))
         assert spectral_lines.line_rows(context, "C")[0].verdict == verdict
+        assert {row.verdict for row in spectral_lines.mixed_rows(context)} == {verdict}
 
 
 def test_the_scene_of_spectral_lines_is_grey_has_raysects_glass_and_differs_between_lines(needs_variant):

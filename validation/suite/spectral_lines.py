@@ -88,19 +88,20 @@ def line_rows(context: Context, line: str) -> list[Row]:
 
 def mixed_rows(context: Context) -> list[Row]:
     """Return a row per pair of lines: raysect's image at one line against ours at another."""
-    size = SIZES[context.profile.name]
-    row = functools.partial(Row, NAME, MIXED, setting=f"{size.resolution}²")
-    if reason := _why_not(context):
-        return [row(case="every line", reason=reason)]
-    rows = []
+    size, reason, rows = SIZES[context.profile.name], _why_not(context), list[Row]()
     for line, other in (("C", "d"), ("F", "d")):
-        try:
-            comparison, _ = compared(ours(other, size), theirs(line, size), size)
-        except (environments.Unable, environments.Broken, OSError) as error:
-            rows.append(row(case=line, reason=" ".join(str(error).split())))
+        row = functools.partial(Row, NAME, MIXED, f"{line} for {other}", f"{size.resolution}²")
+
+        def both(line: str = line, other: str = other) -> tuple[list[Image], list[Image]]:
+            return ours(other, size), theirs(line, size)
+
+        images, no_answer = environments.attempt(row, reason, (NOT_SEEN, 1.0), both)
+        if images is None:
+            rows += no_answer
             continue
+        comparison, _ = compared(*images, size)
         values = {NOT_SEEN: float(comparison.verdict is not Verdict.DIFFERENT)}
-        rows.append(row(case=f"{line} for {other}", values=values, budgets={NOT_SEEN: 0.0}, reason=comparison.reason))
+        rows.append(row(values, {NOT_SEEN: 0.0}, reason=comparison.reason))
     return rows
 
 
