@@ -248,6 +248,15 @@ def test_a_run_has_a_row_per_number_of_a_variant_or_the_reason_for_none(tmp_path
     assert {(row.verdict, row.reason) for row in study.rows("spectral", absent)} == {("not run", "absent")}
 
 
+def test_piles_of_plates_are_not_run_in_scalar_variants_and_say_so(tmp_path, monkeypatch):
+    exact = lambda numbers, _: {x.name: study.Measured(x.value, 1e-6) for x in numbers}  # noqa: E731
+    monkeypatch.setattr(study, "measure", exact)
+    needs = {need: study.rows(need, here("quick", tmp_path, "scalar_rgb")) for need in study.COMPILED}
+    assert {row.case for rows in needs.values() for row in rows} == NUMBERS.keys()
+    left_out = {row.case for rows in needs.values() for row in rows if row.verdict == "not run" and row.remedy}
+    assert left_out == {x.name for x in NUMBERS.values() if x.given.get("count", 1) > 1} != set()
+
+
 # By others -------------------------------------------------------------------------------------------------------
 
 

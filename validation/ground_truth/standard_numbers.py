@@ -39,7 +39,7 @@ import numpy as np
 
 from mi_refract.plugins import PLUGIN
 from mi_refract.plugins.refract import followed_context
-from mi_refract.report.row import Row
+from mi_refract.report.row import Reason, Row
 from validation import limits
 from validation.reference import closed_forms, optical_systems
 from validation.reference import standard_numbers as table
@@ -92,16 +92,22 @@ def tasks(context: Context) -> list[Task]:
 
 
 def rows(needed: str, context: Context) -> list[Row]:
-    """Return a row per number that is measured in a variant."""
+    """Return a row per number that needs a variant; scalar variants do not measure piles of plates."""
     scalar = context.profile.quick or context.scalar
     numbers = [number for number in table.NUMBERS.values() if need(number) == needed]
-    numbers = [number for number in numbers if not (scalar and number.given.get("count", 1) > 1)]
     variant = (SCALAR if scalar else COMPILED)[needed]
     if (reason := context.variants.get(variant, "not in this wheel")) is not None:
         return [Row(NAME, PLUGIN, number.name, variant, reason=reason) for number in numbers]
+    feasible = [number for number in numbers if not (scalar and number.given.get("count", 1) > 1)]
     with under(variant):
-        results = measure(numbers, SAMPLES.get(context.profile.name, 0))
-    return [row(number, results[number.name], PLUGIN, variant) for number in numbers]
+        results = measure(feasible, SAMPLES.get(context.profile.name, 0))
+    pile = Reason("a pile of plates takes thousands of paths", "`--profile standard` with a compiled variant")
+    return [
+        row(number, results[number.name], PLUGIN, variant)
+        if number.name in results
+        else Row(NAME, PLUGIN, number.name, variant, reason=pile)
+        for number in numbers
+    ]
 
 
 def noisy(number: StandardNumber) -> bool:
