@@ -111,6 +111,13 @@ def test_bounds_elsewhere_fail(monkeypatch, local, patch, one_way, failed):
     assert {visible_changes.kind_row(name, 2).verdict for name in failed} == {"fail"}
 
 
+@pytest.mark.parametrize("name", ["one code", "line"])
+def test_errors_without_a_number_fail(name, monkeypatch):
+    assert visible_changes.kind_row(name, 2).verdict == "pass"
+    monkeypatch.setattr(visible_changes, "errors", lambda pair: (0.0, 0.0, 0.0, np.nan))
+    assert visible_changes.kind_row(name, 2).verdict == "fail"
+
+
 @pytest.mark.parametrize("defect", [False, True])
 def test_a_side_that_does_not_know_its_noise_is_seen(defect, monkeypatch):
     """Each side's noise taken at its word, as `welch` once did."""

@@ -318,7 +318,7 @@ def errors(pair: Pair) -> tuple[float, ...]:
     """Return local FLIP error, error throughout a patch, change one way, and the largest ratio to their bounds."""
     metrics = {metric.name: metric for metric in flip.flip(*pair).metrics if metric.name in MEASURED}
     values = [metrics[name].value if name in metrics else 0.0 for name in MEASURED]  # HDR has no change one way
-    return *values, max(metric.value / (metric.bound or np.nan) for metric in metrics.values())
+    return *values, float(np.max([metric.value / (metric.bound or np.nan) for metric in metrics.values()]))
 
 
 def kind_row(name: str, count: int) -> Row:
@@ -326,7 +326,7 @@ def kind_row(name: str, count: int) -> Row:
     text, make, due = KINDS[name]
     trial_seeds = np.random.SeedSequence((seeds.current(SEED), list(KINDS).index(name))).spawn(count)
     *measured, error = np.array([errors(make(np.random.default_rng(seed))) for seed in trial_seeds]).T
-    different = int((error > 1).sum())
+    different = int((error > 1 if due else ~(error <= 1)).sum())  # NaN fails either way
     values = {name: float(np.median(x)) for name, x in zip(MEASURED, measured, strict=True)}
     values[ALARMS] = different / count
     budgets: dict[str, float] = {}
