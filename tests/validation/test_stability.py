@@ -331,10 +331,17 @@ def unsafe(a, n, k):
     return b + n * dr.sqrt(k - dr.detach(k)), transmitted
 
 
+def undeclared(a, n, k):
+    """The right direction with the derivative of another one where light is transmitted, which it denies."""
+    b, transmitted = promoted(a, n, k)
+    return dr.replace_grad(b, dr.select(transmitted, 1.1 * b, b)), transmitted & False
+
+
 def test_wrong_derivatives_are_seen(monkeypatch):
     setting = compiled("float32")
     given = derivatives.inputs(20, setting.precision)
-    for wrong, metric in ((regraded(promoted, 1.00001), "error / condition"), (unsafe, "not finite")):
+    wrong_ones = (regraded(promoted, 1.00001), "error / condition"), (unsafe, "not finite")
+    for wrong, metric in (*wrong_ones, (undeclared, MISCLASSIFIED_FAR)):
         rows, _ = derivatives.formula_rows("promoted", wrong, given, setting)
         assert all(metric in row.broken for row in rows if row.case == "∂b/∂k")
     short = derivatives.only(given, given.rays.k < 1e-3)  # where an absolute error would hide that of the étendue

@@ -13,15 +13,16 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from mi_refract import oracle, regimes
-from mi_refract.accuracy import arrays, lengths
+from mi_refract.accuracy import RayBounds, arrays, lengths
 from mi_refract.formulas import FORMULAS, fresnel
 from mi_refract.numerics import from_numpy
 from mi_refract.oracle import derivatives
@@ -30,6 +31,7 @@ from validation import limits
 from validation.run import seeds
 from validation.run.array_settings import DOCUMENTED, Setting, settings
 from validation.run.context import Context
+from validation.run.metrics import MISCLASSIFIED_FAR
 from validation.study import Study, Task, about
 
 NAME = "derivatives"
@@ -43,6 +45,7 @@ TERMS = {
     "error": "the largest error",
     "error / condition": "the largest error, in units of condition · u",
     "not finite": "rays whose derivative exists but is computed as NaN or infinite",
+    MISCLASSIFIED_FAR: "rays that are not compared, although the formula must classify them correctly",
 }
 SEED = 2029
 BINS = np.geomspace(1e-9, 1, 19)
@@ -154,9 +157,13 @@ def formula_rows(
     most = (limits.ROUNDED_DERIVATIVE, limits.ROUNDED_ETENDUE) if rounded_once else (limits.DERIVATIVE, limits.ETENDUE)
     at_limit = FORMULAS[name].budget.at_the_limit
     budgets, etendue_budgets = ({"error / condition": x, "not finite": 0.0} if at_limit else {} for x in most)
+    # Rays with a wrong decision are not compared.
+    far = RayBounds(samples.rays, certified, FORMULAS[name].budget, setting.roundoff).decided_of(~right)
+    counts = {MISCLASSIFIED_FAR: float(far.sum())}
+    budgets |= {MISCLASSIFIED_FAR: 0.0} if at_limit else {}
     for case, exact in samples.exact.items():
         error = lengths(results[case] - exact) / np.maximum(1, lengths(exact))
-        rows.append(row(name, case, error, samples, setting, right, budgets))
+        rows.append(row(name, case, error, samples, setting, right, budgets, counts))
         curve = binned(samples, np.where(right, error, 0)) if case == "∂b/∂k" else curve
     area = np.cross(results["∂b/∂a in the plane"], results["∂b/∂a across it"])
     cos_t, k = certified.cos_t, samples.rays.k.astype(np.longdouble)
@@ -172,9 +179,19 @@ def formula_rows(
 
 
 def row(
-    subject: str, case: str, error: Array, samples: Inputs, setting: Setting, right: Array, budgets: dict[str, float]
+    subject: str,
+    case: str,
+    error: Array,
+    samples: Inputs,
+    setting: Setting,
+    right: Array,
+    budgets: dict[str, float],
+    counts: Mapping[str, float] = MappingProxyType({}),
 ) -> Row:
-    """Return the row of a derivative: its worst relative error, and its worst error over the ray's condition."""
+    """Return the row of a derivative: its worst relative error, and its worst error over the ray's condition.
+
+    `right`: the rays that count. `counts`: further values.
+    """
     finite = np.isfinite(error)
     used = right & finite
     over = np.where(used, error, 0) / (samples.condition * setting.roundoff)
@@ -183,6 +200,7 @@ def row(
         "error / condition": float(over[worst]),
         "error": float(error[used].max(initial=0)),
         "not finite": float((right & ~finite).sum()),
+        **counts,
     }
     a, n = ([float(x).hex() for x in v[worst]] for v in (samples.rays.a, samples.rays.n))
     ray = {"regime": str(samples.regime[worst]), "a": a, "n": n, "k": float(samples.rays.k[worst]).hex()}
