@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.io.image_file import one_line
-from mi_refract.plugins import index_parameter, scene_parser
+from mi_refract.plugins import scene_parser
 
 from .plain_scene import Colour
 
@@ -88,10 +88,10 @@ class Node:
         value = self.take(name, default)
         if isinstance(value, Node):
             raise self.error(f"{name} is a {value.type}", "a colour")
-        shown, knots = value, index_parameter.read_knots(value)
-        if knots and not knots[0]:  # a uniform spectrum: of a lamp it is light of equal energy, which is not white
-            variant: Any = mi.scalar_rgb
-            value = knots[1][0] * np.array(variant.xyz_to_srgb([1.0] * 3) if self.kind == "Emitter" else 1.0)
+        shown = value
+        if type(value).__name__ == "Spectrum" and value.is_uniform():
+            variant: Any = mi.scalar_rgb  # a lamp has light of equal energy, which is not white
+            value = value.values[0] * np.array(variant.xyz_to_srgb([1.0] * 3) if self.kind == "Emitter" else 1.0)
         try:
             r, g, b = (float(x) for x in np.broadcast_to(np.array(value, float), 3))
         except (TypeError, ValueError):
