@@ -46,7 +46,7 @@ def compare_renders(
     reference: Sequence[Image],
     test: Sequence[Image],
     *,
-    allow_nonfinite: bool = False,
+    allow_nonfinite: bool,
     tile: Annotated[int, "side of a tile in pixels", Range(lambda x: x >= 1, "a positive whole number")] = 16,
     family_error: Annotated[
         float,

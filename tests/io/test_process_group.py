@@ -90,6 +90,26 @@ def test_a_signal_to_the_caller_ends_the_program(tmp_path, number):
     assert not alive(int((tmp_path / "pid").read_text()))
 
 
+EARLY = """
+import os, subprocess, time
+class Popen(subprocess.Popen):
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        while not os.path.exists(sys.argv[1]):
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+subprocess.Popen = Popen
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+def test_a_signal_while_the_program_starts_ends_it_too(tmp_path):
+    code = PARENT.replace("process_group.run", f"{EARLY}process_group.run")
+    caller = subprocess.run([sys.executable, "-c", code, tmp_path / "pid"], capture_output=True, timeout=60)
+    assert caller.returncode in (-signal.SIGINT, 128 + signal.SIGINT)
+    assert not alive(int((tmp_path / "pid").read_text()))
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_signals_that_the_caller_handles_are_not_changed(number):
     before = signal.signal(number, signal.SIG_IGN)

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.glass_scenes import GLASS, PLACE
+from support.variants import switch
 
 from mi_refract.plugins import path_loop, sampling
 from mi_refract.rendering.scene_files import REPRODUCIBLE
@@ -193,3 +194,20 @@ def test_a_sample_along_the_surface_has_the_weight_0_also_in_renders_that_are_di
     assert dr.any(si.to_local(d).z > 0)
     weight, *_ = path_loop.at_fixed_direction(mi, context, si, bsdf, bs, weight, d, True, False)
     assert dr.all(weight == 0, axis=None)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_mono_polarized"])
+def test_a_differentiated_sample_has_the_weight_of_the_sample(variant, needs_variant):
+    """Also as a Mueller matrix of the world's frame."""
+    needs_variant(variant)
+    switch(variant)
+    random = np.random.default_rng(2042)
+    si = mi.SurfaceInteraction3f()
+    si.sh_frame = mi.Frame3f(mi.Normal3f(dr.normalize(mi.Vector3f(random.normal(size=(3, 1000))))))
+    si.wi = dr.normalize(mi.Vector3f(0.6, 0.3, 0.8))
+    bsdf, context = mi.load_dict({"type": "roughconductor", "alpha": 0.3}), mi.BSDFContext()
+    bs, weight = bsdf.sample(context, si, 0.5, mi.Point2f(random.random((2, 1000))))
+    expected = si.to_world_mueller(weight, -bs.wo, si.wi) if "polarized" in variant else weight
+    d = si.to_world(bs.wo)
+    found, *_ = path_loop.at_fixed_direction(mi, context, si, bsdf, bs, expected, d, True, False)
+    np.testing.assert_allclose(np.array(found), np.array(expected), rtol=1e-3, atol=1e-4)

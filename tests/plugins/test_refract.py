@@ -288,6 +288,12 @@ def test_the_index_of_an_rgb_texture_is_its_luminance(needs_variant):
     assert "its texture contains 0;" in refusal(load, int_ior=black)
 
 
+def test_numbers_beside_an_rgb_colour_are_checked_in_spectral_variants(spectral_variant):
+    """The colour itself is not checked there."""
+    checkers = {"type": "checkerboard", "color0": {"type": "rgb", "value": [0.9, 0.9, 0.9]}, "color1": 0.0}
+    assert "its texture contains 0;" in refusal(load, int_ior=checkers)
+
+
 # Errors --------------------------------------------------------------------------------------------------------
 
 TOO_FAR = "int_ior / ext_ior = {}; expected a ratio from"

@@ -346,8 +346,15 @@ def test_the_time_limit_of_a_render_includes_its_pilot(tmp_path, llvm, monkeypat
     assert render.progress.passes == 1 and render.ended_by == "--time 60 s"
 
 
-def test_a_scene_keeps_an_integrator_other_than_path(tmp_path, llvm):
-    (tmp_path / "a.xml").write_text(re.sub("<integrator.*/integrator>", '<integrator type="depth"/>', GLASS))
+@pytest.mark.parametrize("integrator", ["depth", "refract_path"])
+def test_a_scene_keeps_an_integrator_other_than_path(tmp_path, llvm, integrator):
+    """Also the one without noise."""
+    flag = '<boolean name="deterministic" value="true"/>' * (integrator == "refract_path")
+    own = f'<integrator type="{integrator}">{flag}</integrator>'
+    scene = re.sub("<integrator.*/integrator>", own, GLASS).replace(
+        "</transform></shape>", '</transform><bsdf type="conductor"/></shape>'
+    )
+    (tmp_path / "a.xml").write_text(scene)
     render = resume(Job(tmp_path / "a.xml", settings=AUTO), tmp_path / "a.exr", Limits(spp=4))
     costs = render.progress.identity["pilot"]["costs"]
     assert [*costs] == [OWN, "sampler=multijitter"]

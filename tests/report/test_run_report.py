@@ -352,6 +352,13 @@ def test_no_line_of_a_scatter_crosses_a_label():
                 ), (name, d)
 
 
+def test_a_scatter_has_a_panel_per_setting():
+    """In rows of two: the last place of an odd number stays empty. An empty panel would have ticks from 0.0 to 1.0."""
+    panels = {name: Scatter({"one": [(10.0, 20.0), (30.0, 40.0)]}, []) for name in ("llvm", "cuda", "scalar")}
+    svg = scatter_svg(panels, Axes("x", "y", "linear"), floor="floor", front=False, salt="s")
+    assert svg.count(">one</text>") == 3 and not re.search(r">0\.\d</text>", svg)
+
+
 def test_images_of_a_row_have_a_fixed_order(tmp_path):
     write_exr(tmp_path / "a.exr", np.zeros((2, 2, 3)))
     images = dict.fromkeys(("overlay", "extra", "difference", "test", "reference"), "a.exr")
