@@ -104,9 +104,13 @@ def _read(process: subprocess.Popen[bytes], deadline: float, most: int) -> tuple
         threading.Thread(target=pump, args=pipe_and_output, daemon=True).start()
     size, open_pipes = 0, len(pumps)
     while open_pipes:
+        # A signal that another thread receives does not wake this one, which handles it: so wait a second at most.
+        remaining = deadline - time.monotonic()
         try:
-            output, chunk = chunks.get(timeout=max(0, deadline - time.monotonic()))
+            output, chunk = chunks.get(timeout=min(max(0, remaining), 1))
         except queue.Empty:
+            if remaining > 1:
+                continue
             raise subprocess.TimeoutExpired(process.args, deadline) from None
         output.append(chunk)
         if not chunk:

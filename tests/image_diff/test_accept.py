@@ -295,10 +295,11 @@ def test_after_a_signal_replaced_files_are_listed_and_a_second_call_finishes(run
     replaced = sum(references[name] == after[name] for name in references)
     assert references.keys() == before.keys()  # no hidden files
     if process.returncode:  # else it ended before the signal
-        assert process.returncode == 128 + number and err.startswith("mi-refract: interrupted; ")
-        if replaced in (0, count):
+        assert process.returncode == 128 + number
+        assert err.startswith("mi-refract: interrupted; ") or (err == "" and replaced == count)  # all was done before
+        if err and replaced in (0, count):
             assert err.count("reference") == 1
-        else:
+        elif err:
             assert f"not replaced: {old}/{replaced:03}.exr" in err
     assert run("accept", old, new, "--yes")[0] == 0 and tree(old) == after
 

@@ -90,21 +90,33 @@ def test_a_signal_to_the_caller_ends_the_program(tmp_path, number):
     assert not alive(int((tmp_path / "pid").read_text()))
 
 
-EARLY = """
+STARTED = "while not os.path.exists(sys.argv[1]):\n            time.sleep(0.01)"
+UNUSUAL = {
+    "while the program starts": f"""
 import os, subprocess, time
 class Popen(subprocess.Popen):
     def __init__(self, *arguments, **options):
         super().__init__(*arguments, **options)
-        while not os.path.exists(sys.argv[1]):
-            time.sleep(0.01)
+        {STARTED}
         os.kill(os.getpid(), signal.SIGINT)
 subprocess.Popen = Popen
-"""
+""",
+    "in another thread": f"""
+import os, threading, time
+class Other(threading.Thread):
+    def run(self):
+        {STARTED}
+        time.sleep(0.5)
+        signal.pthread_kill(self.ident, signal.SIGINT)
+Other(daemon=True).start()
+""",
+}
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
-def test_a_signal_while_the_program_starts_ends_it_too(tmp_path):
-    code = PARENT.replace("process_group.run", f"{EARLY}process_group.run")
+@pytest.mark.parametrize("signalled", UNUSUAL.values(), ids=[*UNUSUAL])
+def test_a_signal_at_an_unusual_place_ends_the_program_too(tmp_path, signalled):
+    code = PARENT.replace("process_group.run", f"{signalled}process_group.run")
     caller = subprocess.run([sys.executable, "-c", code, tmp_path / "pid"], capture_output=True, timeout=60)
     assert caller.returncode in (-signal.SIGINT, 128 + signal.SIGINT)
     assert not alive(int((tmp_path / "pid").read_text()))
