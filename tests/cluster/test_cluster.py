@@ -222,6 +222,19 @@ def test_no_usable_worker_is_one_line(client, monkeypatch):
         Workers(client, VARIANT, HERE, task="render").wait(nobody=0.1)
 
 
+def test_new_workers_are_awaited_for_two_minutes_after_all_have_gone(monkeypatch):
+    clock = [1000.0]
+    monkeypatch.setattr(workers_module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    nobody = SimpleNamespace(status="running", scheduler=SimpleNamespace(address="tcp://here"), nthreads=dict)
+    workers = Workers(nobody, VARIANT, HERE)
+    workers.machines["tcp://lost"] = "there"
+    for clock[0] in (1000.0, 1119.0):
+        workers.look()
+    clock[0] = 1121.0
+    with pytest.raises(NoWorkersError, match="^tcp://here: all workers have gone; expected new ones within 120 s$"):
+        workers.look()
+
+
 def test_a_worker_whose_answer_is_lost_is_queried_again(client, monkeypatch):
     lost = []
 
