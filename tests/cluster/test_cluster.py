@@ -231,7 +231,7 @@ def test_new_workers_are_awaited_for_two_minutes_after_all_have_gone(monkeypatch
     for clock[0] in (1000.0, 1119.0):
         workers.look()
     clock[0] = 1121.0
-    with pytest.raises(NoWorkersError, match="^tcp://here: all workers have gone; expected new ones within 120 s$"):
+    with pytest.raises(NoWorkersError, match=r"^tcp://here: all workers have gone; expected new ones within 120 s$"):
         workers.look()
 
 
