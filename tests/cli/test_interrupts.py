@@ -47,7 +47,8 @@ def test_child_processes_end_on_ctrl_c_and_leave_no_files(tmp_path):
         assert [*tmp_path.iterdir()]
         interrupt(process, 130)
     assert not [*tmp_path.iterdir()]
-    code = "import sys\nfrom mi_refract import cli\nsys.exit(cli.main())"
+    heeded = "import signal\nsignal.signal(signal.SIGINT, signal.SIG_DFL)\n"  # a job in the background ignores it
+    code = f"{heeded}import sys\nfrom mi_refract import cli\nsys.exit(cli.main())"
     with python(code, "rays", "run", "--count", "10", "--", sys.executable, "-c", PROGRAM) as process:
         assert "free\n" in iter(process.stderr.readline, "")  # after lines of Dr.Jit, if any
         interrupt(process, 130)
