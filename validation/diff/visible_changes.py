@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import functools
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -306,12 +306,14 @@ CASES = {False: "not seen", True: "seen", None: "seen in part"}
 
 
 def tasks(context: Context) -> list[Task]:
-    """Return one task for the kinds of changes, and one for the limits."""
-    count = TRIALS[context.profile.name]
-    return [
-        Task("visible changes", lambda: [kind_row(name, count) for name in KINDS]),
-        Task("visible changes, limits", limit_rows),
-    ]
+    """Return one task per kind of change, so that an interrupted run keeps finished ones, and one for the limits."""
+    kinds = [Task(f"{NAME}: {name}", functools.partial(kind_rows, context, (name,))) for name in KINDS]
+    return [*kinds, Task(f"{NAME}, limits", limit_rows)]
+
+
+def kind_rows(context: Context, names: Iterable[str] = tuple(KINDS)) -> list[Row]:
+    """Return the rows of these kinds, with as many pairs as the profile asks for."""
+    return [kind_row(name, TRIALS[context.profile.name]) for name in names]
 
 
 def errors(pair: Pair) -> tuple[float, ...]:
@@ -373,6 +375,6 @@ STUDY = Study(
     about(__doc__),
     TERMS,
     tasks,
-    again=lambda context: tasks(context)[0].run(),
+    again=kind_rows,
     records=(EDGE, *(f"square of {side} pixels" for side in SQUARES)),
 )
