@@ -152,8 +152,11 @@ def assert_image_unbiased(request: pytest.FixtureRequest) -> Callable[..., Compa
     return check
 
 
-def _accept(reference: Path, test: Image, method: str, options: dict[str, Any], accepted: dict[Path, str]) -> None:
-    """Copy the image to the path of the reference, unless they are equal, or another image is among the `accepted`."""
+def _accept(reference: Path, test: Image, method: str, options: dict[str, Any], digests: dict[Path, str]) -> None:
+    """Copy the image to the path of the reference, unless they are equal.
+
+    `digests`: the SHA-256 of each reference that this run has accepted; another image for one of them is an error.
+    """
     __tracebackhide__ = True
     from mi_refract.image_diff import accept, folders
     from mi_refract.image_diff.settings import Settings
@@ -167,7 +170,7 @@ def _accept(reference: Path, test: Image, method: str, options: dict[str, Any], 
             settings = Settings.for_all(method=method, **options)
             copies = list(accept.changes(folders.diff(reference, test, settings, to_accept=True)))
             for copy in copies:
-                if accepted.setdefault(copy.reference.resolve(), copy.compared) != copy.compared:
+                if digests.setdefault(copy.reference.resolve(), copy.compared) != copy.compared:
                     raise ValueError(f"{copy.reference}: also the reference of another image; expected one of its own")
             accept.Acceptance(copies).run()
     except (ValueError, OSError) as error:
