@@ -382,9 +382,9 @@ class PathLoop:
             if differentiated:
                 rr_prob = dr.select(rr_prob > 0, rr_prob, 0.5)
             rr_active = active_next & (s.depth >= features.rr_depth)
-            rr_end = rr_active & (self.numbers.next_1d(s.sampler, key + 3) >= rr_prob)
+            survives = self.numbers.next_1d(s.sampler, key + 3) < rr_prob  # false for NaN, so that its path ends
             s.throughput = dr.select(rr_active, s.throughput * dr.rcp(rr_prob), s.throughput)
-            active_next = active_next & (rr_end ^ True)
+            active_next = active_next & ((rr_active ^ True) | survives)
 
         s.active = self._pop(s, active_next) if features.split_depth else active_next
         return (s,)

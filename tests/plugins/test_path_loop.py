@@ -126,6 +126,15 @@ def test_roulette_ignores_the_share_of_a_branch():
     assert radiance == pytest.approx(SLANTED * RADIANCE / 0.95, rel=1e-5)
 
 
+def test_roulette_ends_a_path_whose_throughput_is_not_a_number():
+    """Without an end, a render between mirrors would never return."""
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((1, 1, 3), np.nan, np.float32)), "raw": True}
+    mirror = {"type": "twosided", "a": {"type": "conductor", "material": "none", "specular_reflectance": texture}}
+    numbers = FixedNumbers()
+    follow({str(z): sheet(z, bsdf=mirror) for z in (0, 2)}, numbers, max_depth=50, rr_depth=1)
+    assert len(numbers.keys) == 1
+
+
 @pytest.mark.parametrize(
     ("bsdf", "point", "alpha"),
     [
