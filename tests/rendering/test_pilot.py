@@ -120,7 +120,9 @@ def test_the_second_batch_omits_losers_and_is_skipped_without_time():
     choose(pilot)
     assert pilot.batches[4:] == [(PLAIN, 1), (DEEP, 1), (LAMPS, 1)]
     short = made_up({}, seconds=64 * 2 * (3 + 1))  # enough for the three first batches and one more, not for three more
-    assert choose(short).figures["seconds"] == 64 * 2 * 3 and {number for _, number in short.batches} == {0}
+    figures = choose(short).figures
+    assert figures["seconds"] == 64 * 2 * 3 and {number for _, number in short.batches} == {0}
+    assert figures["share"] == pytest.approx(3 / 4 * 0.05)  # 3 of the 4 batches that take 5 % of the render
 
 
 def test_the_interval_of_a_ratio_contains_it_with_95_percent():
