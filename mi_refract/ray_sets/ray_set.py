@@ -77,8 +77,8 @@ class RaySet:
     def numbers(self) -> Array:
         """(N, 9) float64: id, a, n, n_from, n_to; with media (N, 11): wavelength, medium."""
         rays, media_columns = self.rays, headers.columns(self.header, self.ids).T
-        numbers = np.column_stack([self.ids, rays.a, rays.n, *indices(rays.k), *media_columns])
-        return numbers.astype(np.float64, copy=False)
+        numbers = [self.ids, rays.a, rays.n, *indices(rays.k), *media_columns]
+        return np.column_stack(numbers).astype(np.float64)
 
 
 def in_regime(header: Header, name: str, ids: Ids) -> NDArray[np.bool_]:

@@ -164,6 +164,7 @@ def test_all_options_can_be_set_in_the_file_and_on_the_command_line(load):
 BAD = {
     "no name": ('[[image]]\nreason = "r"', "image[0]: object missing required field `name`"),
     "name": ('[[image]]\nname = ""', "image[0]: name: expected"),
+    "table": ('[default]\nmethod = "exact"', "unknown key `default`; expected defaults, image"),
     "defaults": ("[defaults]\nfale = 1", "defaults: unknown key `fale`; expected method"),
     "map": ('[defaults]\nmap = {reference = "{dir}/{name}", test = "{name}"}', "map: expected the same fields"),
     "half a map": ('[defaults]\nmap = {reference = "{dir}/ref/{name}"}', "map: object missing required field `test`"),

@@ -131,6 +131,18 @@ def test_variances_in_other_folders_of_xyz_and_with_masks(pair):
     assert hidden == [Status.INCONCLUSIVE, Status.EQUAL]
 
 
+def test_two_renders_need_no_variance_beside_them(tmp_path):
+    """It is no error, though two tell too little of their noise."""
+    for seed, side in enumerate(("old", "new")):
+        (tmp_path / side).mkdir()
+        for i in range(2):
+            write_exr(tmp_path / side / f"{i}.exr", samples(2 * seed + i, 16).mean(0), RGB)
+    sides = tmp_path / "old", tmp_path / "new"
+    settings = Settings(rules=(Entry("*", BESIDE),))
+    (result,) = folders.diff(*sides, settings, renders=True).results
+    assert result.status is Status.INCONCLUSIVE
+
+
 def test_variants_have_separate_variances(pair):
     """And the file of a variance is not a variant."""
     old, new = pair

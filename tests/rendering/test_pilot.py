@@ -348,6 +348,13 @@ def test_the_time_limit_of_a_render_includes_its_pilot(tmp_path, llvm, monkeypat
     assert render.progress.passes == 1 and render.ended_by == "--time 60 s"
 
 
+def test_samplers_that_do_not_support_the_samples_of_a_pass_are_no_candidates(tmp_path, llvm):
+    """Of those that Mitsuba has, only the scene's own, `independent`, has passes of 5 samples."""
+    (tmp_path / "a.xml").write_text(GLASS)
+    render = resume(Job(tmp_path / "a.xml", settings=AUTO), tmp_path / "a.exr", Limits(spp=10, pass_spp=5))
+    assert not any("sampler" in name for name in render.progress.identity["pilot"]["costs"])
+
+
 @pytest.mark.parametrize("integrator", ["depth", "refract_path"])
 def test_a_scene_keeps_an_integrator_other_than_path(tmp_path, llvm, integrator):
     """Also the one without noise."""

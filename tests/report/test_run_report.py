@@ -289,6 +289,7 @@ def test_curves_have_a_guide_and_literal_names():
     svg = curves_svg({"$x$": [(1, 1e-2), (10, 1e-3)]}, axes, salt="s")
     assert "slope −1" in svg and ">$x$</text>" in svg and "var(--c0)" in svg
     assert ">seconds</text>" in svg and ">relMSE</text>" in svg
+    assert not re.search(r"#[0-9a-f]{6}", svg)  # every colour is one of the page's, which may be dark
     assert curves_svg({"x": [(1, 0), (NAN, 1)]}, axes, salt="s") == ""
     svg = curves_svg({f"line {i}": [(1, i + 1), (2, i + 1)] for i in range(12)}, axes, salt="s")
     style = (documents.TEMPLATES / "report.css").read_text("utf-8")
