@@ -68,7 +68,7 @@ def print_table(rows: Rows, styles: Mapping[str, str] | None = None) -> None:
         table.add_row(Text(first, style=(styles or {}).get(first, "")), *map(Text, others))
     console = Console(width=None if sys.stdout.isatty() else 100_000)  # lines of a log are not wrapped
     with console.capture() as capture:
-        console.print(table, highlight=False)
+        console.print(table)
     print("\n".join(map(str.rstrip, capture.get().splitlines())))
 
 
