@@ -64,11 +64,12 @@ def test_the_traceback_is_printed_on_request(capsys, monkeypatch):
     assert err.startswith("Traceback") and "raise error\nKeyError: 'x'\nit: internal error" in err
 
 
-def test_characters_that_stdout_cannot_encode_are_escaped(monkeypatch):
+@pytest.mark.parametrize(("errors", "expected"), [("strict", b"5 \\xd7 \\udcff\n"), ("replace", b"5 ? ?\n")])
+def test_characters_that_stdout_cannot_encode_are_escaped_or_treated_as_the_user_has_set(monkeypatch, errors, expected):
     output = io.BytesIO()
-    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(output, "ascii", errors="strict"))
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(output, "ascii", errors=errors))
     assert exit_code("it", lambda: print("5 × \udcff")) == 0
-    assert output.getvalue() == b"5 \\xd7 \\udcff\n"
+    assert output.getvalue() == expected
 
 
 # Streams --------------------------------------------------------------------------------------------------------------
