@@ -29,7 +29,6 @@ from .sample_sums import Film, image_sums
 
 # A single thread is the caller's own, which keeps denormals. Other threads flush them to 0, so bits would differ.
 LEAST_THREADS = 2
-COLOURS = ("R", "G", "B", "X", "Y", "Z")
 
 
 @dataclass(frozen=True)
@@ -64,8 +63,9 @@ class PassRenderer:
 
     @property
     def colours(self) -> int:
-        """Number of channels, from the first on, that are colours; that of all channels if none is in COLOURS."""
-        return sum(name in COLOURS for name in self.channels) or len(self.channels)
+        """Number of channels, from the first on, that are colours: neither the opacity nor of the integrator's AOVs."""
+        of_film = self.channels[: len(self.channels) - len(self.scene.integrator().aov_names())]
+        return sum(name != "A" for name in of_film)
 
     def rounded(self, spp: int) -> int:
         """Return `spp` as the scene's sampler rounds it up."""

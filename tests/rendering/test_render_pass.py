@@ -9,6 +9,7 @@ import pytest
 from support.processes import python
 from support.renders import SCENES
 
+from mi_refract.rendering.end_conditions import relative_error
 from mi_refract.rendering.pass_plan import FEW, scalar_seed_of, seed_of
 from mi_refract.rendering.render_pass import pass_renderer
 from mi_refract.rendering.sample_sums import Film, image_sums
@@ -130,6 +131,39 @@ def test_the_header_contains_radius_and_area_of_the_filter(needs_variant, varian
     header = pass_renderer(scene, 0).filter_header
     assert header["mi_refract:filter_radius"] == radius
     assert header["mi_refract:filter_area"] == pytest.approx(area, rel=0.01)
+
+
+BANDS = {  # of a specfilm, one of them with the name of a colour
+    name: {"type": "spectrum", "value": [(low, 0), (low + 100, 1), (low + 200, 0)]}
+    for name, low in (("green", 430), ("R", 530))
+}
+
+
+@pytest.mark.parametrize(
+    ("film", "colours"),
+    [({"type": "specfilm"} | BANDS, 2)]
+    + [({"type": "hdrfilm", "pixel_format": x}, n) for x, n in (("rgba", 3), ("xyz", 3), ("luminance_alpha", 1))],
+)
+def test_aovs_and_opacity_do_not_count_in_the_error_of_an_image(needs_variant, film, colours):
+    """The depth of a wall far away has a large mean and little noise."""
+    needs_variant("scalar_spectral")
+    mi.set_variant("scalar_spectral")
+    path = {"type": "path", "max_depth": 3}
+
+    def error(integrator):
+        small = film | {"width": 4, "height": 4, "filter": {"type": "box"}}
+        sensor = {"type": "perspective", "fov": 0.1, "film": small}
+        wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 1000]).rotate([0, 1, 0], 180)}
+        scene = {"type": "scene", "integrator": integrator, "sensor": sensor, "sky": {"type": "constant"}, "wall": wall}
+        renderer = pass_renderer(mi.load_dict(scene, parallel=False, optimize=False), 3)
+        sums = renderer.render(0, 2)
+        sums.add(renderer.render(1, 2))
+        assert renderer.colours == colours
+        return relative_error(sums).value
+
+    expected = error(path)
+    assert expected > 0.01
+    assert error({"type": "aov", "aovs": "d:depth", "nested": path}) == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
