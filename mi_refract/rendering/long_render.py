@@ -34,7 +34,7 @@ from mi_refract.plugins.scene_parser import ParsedScene
 from . import checkpoint, rendered_file
 from .checkpoint import PASS, PILOT, SETTINGS, CheckpointWriter, Identity, Progress
 from .end_conditions import Limits, RelativeError, needed_spp, reached, relative_error, require_interval
-from .pass_plan import FIRST_LANES, LANES, PassPlan, next_stop, plan_passes
+from .pass_plan import FEW, FIRST_LANES, LANES, PassPlan, next_stop, plan_passes
 from .pass_sums import ARITY, PassSums
 from .pilot import Pilot, choose, lines_of
 from .render_pass import PassRenderer, pass_renderer
@@ -104,8 +104,12 @@ def resume(
         renderer = pass_renderer(scene, job.seed)
     if has_checkpoint and progress.rest is not None and (spp is None or progress.done < spp):
         progress.rest = None  # it was the last pass, with fewer samples: a full pass replaces it
-    if image is not None and spp is not None and image.done > (_plan(renderer, spp, limits).total or 0):
-        progress = Progress(progress.identity)
+    if image is not None:
+        too_many = spp is not None and image.done > (_plan(renderer, spp, limits).total or 0)
+        # The file lacks Σ w, which few samples may leave near 0: a refined image would keep the error of that mean.
+        too_few = renderer.expected is not None and image.done < FEW and (spp is None or image.done < spp)
+        if too_many or too_few:
+            progress = Progress(progress.identity)
     pass_spp = progress.identity.get(PASS) if progress.tree.passes else None
     if pass_spp and limits.pass_spp not in (None, pass_spp):
         expected = f"expected --pass-spp {pass_spp}, or --restart"

@@ -276,6 +276,20 @@ def test_a_finished_image_of_the_same_render_is_refined(tmp_path, llvm):
     assert rendering(output, scene=scene, spp=10).progress.done == 16
 
 
+@pytest.mark.parametrize(("rfilter", "spp", "kept"), [("lanczos", 1, 0), ("lanczos", 8, 8), ("box", 1, 1)])
+def test_an_image_of_few_samples_under_a_wide_filter_is_not_refined(tmp_path, rfilter, spp, kept):
+    """Σ w, which the file lacks, may be near 0: then one sample would leave a bright pixel in the refined image."""
+    scene, output = changed(tmp_path, ('"box"', f'"{rfilter}"')), tmp_path / "a.exr"
+    rendering(output, scene=scene, spp=spp).run()
+    assert rendering(output, scene=scene, spp=spp).progress.done == spp
+    assert rendering(output, scene=scene, spp=None, seconds=1.0).progress.done == kept
+    render = rendering(output, scene=scene, spp=12)
+    assert render.progress.done == kept
+    render.run()
+    if not kept:
+        assert_same_as_fresh(output, scene, spp=12)
+
+
 @pytest.mark.parametrize("spp", [6, 32, 40])
 def test_the_same_command_again_renders_nothing_and_changes_nothing(tmp_path, llvm, spp, monkeypatch):
     output = tmp_path / "a.exr"
