@@ -7,6 +7,7 @@ and parameters in the parsed scene, not in its file. Parameters that the old and
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -118,9 +119,17 @@ def _find(nodes: list[Node], *kinds: str) -> int | None:
     """
     parent = 0
     for kind in kinds:
-        children = (value for _, type_, value in nodes[parent][3] if type_ == "ResolvedReference")
-        number = next((child for child in children if nodes[child][0] == kind), None)
+        number = next((child for child in _children(nodes, parent) if nodes[child][0] == kind), None)
         if number is None:
             return None
         parent = number
     return parent
+
+
+def _children(nodes: list[Node], parent: int) -> Iterator[int]:
+    """Yield the numbers of the nodes in a node, with those in shapes: a scene's sensors include those of its shapes."""
+    for _, type_, child in nodes[parent][3]:
+        if type_ == "ResolvedReference":
+            yield child
+            if nodes[child][0] == "Shape":
+                yield from _children(nodes, child)

@@ -194,6 +194,17 @@ def test_a_sampler_is_added_to_a_sensor_without_one(tmp_path):
 
 
 @pytest.mark.usefixtures("scalar_variant")
+@pytest.mark.parametrize("first", ["shape", "sensor"])
+def test_the_sampler_of_the_first_sensor_is_replaced_also_in_a_shape(tmp_path, first):
+    meter = '<shape type="rectangle"><sensor type="irradiancemeter"><sampler type="independent"/></sensor></shape>'
+    camera = '<sensor type="perspective"><sampler type="orthogonal"/></sensor>'
+    sensors = meter + camera if first == "shape" else camera + meter
+    (tmp_path / "a.xml").write_text(f'<scene version="3.0.0"><integrator type="path"/>{sensors}</scene>')
+    parsed = with_settings(parse_scene(tmp_path / "a.xml"), {"sampler": "stratified"})
+    assert ["Stratified" in str(sensor.sampler()) for sensor in load_parsed(parsed).sensors()] == [True, False]
+
+
+@pytest.mark.usefixtures("scalar_variant")
 def test_only_a_sampler_of_the_same_plugin_keeps_its_own_parameters(tmp_path):
     own = '<sampler type="multijitter"><boolean name="jitter" value="false"/></sampler>'
     (tmp_path / "a.xml").write_text(GLASS.replace('<sampler type="independent">', own[:-10] + "<!-- -->"))
