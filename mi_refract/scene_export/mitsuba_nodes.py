@@ -101,7 +101,7 @@ class Node:
         return r, g, b
 
     def transform(self, name: str = "to_world") -> NDArray[np.float64]:
-        """Return a transform, (4, 4). ValueError unless it is affine, with a positive determinant."""
+        """Return a transform, (4, 4). ValueError unless it is affine, with a positive determinant and its inverse."""
         value = self.take(name)
         if value is not None and not hasattr(value, "matrix"):
             raise self.error(f"{name} = {value}", "a transform")
@@ -109,6 +109,10 @@ class Node:
         affine = np.isfinite(matrix).all() and (matrix[3] == [0, 0, 0, 1]).all()
         if not affine or not np.linalg.det(matrix[:3, :3]) > 0:
             raise self.error(f"{name} mirrors or flattens", "an affine transform with a positive determinant")
+        # Mitsuba transposes a rotation to invert it. Some of its shapes use the matrix, others the inverse.
+        inverse = matrix[:3, :3].T if value is None else np.array(value.inverse_transpose)[:3, :3].T
+        if not np.allclose(inverse @ matrix[:3, :3], np.eye(3), atol=1e-6):
+            raise self.error(f"{name} has a wrong inverse in Mitsuba", "rotations about axes of length 1")
         return matrix
 
 

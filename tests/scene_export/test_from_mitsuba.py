@@ -325,6 +325,7 @@ REFUSED = {
     "sdfgrid": ('type="cube"', 'type="sdfgrid"'),
     "mirrors": ('<translate x="3"/>', '<scale x="-1"/>'),
     "mirrors or flattens": ('<translate x="3"/>', '<scale x="0"/>'),
+    "rotations about axes of length 1": ('<translate x="3"/>', '<rotate x="1" y="1" angle="45"/>'),
     "to_world deforms the sphere": (BALL, f'{BALL}<transform name="to_world"><scale x="2" y="1" z="1"/></transform>'),
     "to_world deforms the cylinder": (
         'type="cube" id="box"><transform name="to_world"><translate x="3"/></transform>',
