@@ -15,12 +15,13 @@ from .pass_plan import FEW
 from .pass_sums import PassSums
 
 VARIANCE = "{}.variance"
+NOTHING = "nothing"  # a single sample, or a single pass whose samples are not kept
 SAMPLES = "samples: an upper bound where the sampler stratifies them"
 
 
 def header(progress: Progress, sums: PassSums, metadata: Metadata, ended_by: str) -> Metadata:
     """Return `metadata` and the entries on the passes. `sums`: of all passes of `progress`."""
-    source = "nothing" if not sums.freedom else "passes" if sums.within is None else SAMPLES
+    source = NOTHING if not sums.freedom else "passes" if sums.within is None else SAMPLES
     return metadata | {
         "mi_refract:spp": sums.spp,
         "mi_refract:passes": sums.passes,
@@ -67,7 +68,9 @@ def read(output: Path, channels: tuple[str, ...], identity: Identity) -> Progres
         if changes(image_identity, identity) or not 1 <= passes <= spp or len(contrasts) != passes - 1:
             return None
         mean = image.select(channels).astype(np.float64)
-        variance = image.select([VARIANCE.format(name) for name in channels]) if spp > 1 else np.zeros(())
+        variance = np.zeros(())
+        if variance_from != NOTHING:
+            variance = image.select([VARIANCE.format(name) for name in channels])
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
     variance = np.broadcast_to(variance.astype(np.float64), mean.shape)

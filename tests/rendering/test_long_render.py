@@ -276,6 +276,17 @@ def test_a_finished_image_of_the_same_render_is_refined(tmp_path, llvm):
     assert rendering(output, scene=scene, spp=10).progress.done == 16
 
 
+@pytest.mark.parametrize(("pass_spp", "variance"), [(8, "nothing"), (4, "passes")])
+def test_an_image_without_a_variance_is_kept_and_refined(tmp_path, pass_spp, variance):
+    """Scalar variants do not keep samples, so a single pass has no variance."""
+    output = tmp_path / "a.exr"
+    assert rendering(output, spp=8, pass_spp=pass_spp).run()["mi_refract:variance_from"] == variance
+    assert rendering(output, spp=8, pass_spp=pass_spp).progress.done == 8
+    rendering(output, spp=16, pass_spp=pass_spp).run()
+    rendering(tmp_path / "b.exr", spp=16, pass_spp=pass_spp).run()
+    np.testing.assert_allclose(pixels(output)[..., :3], pixels(tmp_path / "b.exr")[..., :3], rtol=3e-7)
+
+
 @pytest.mark.parametrize(("rfilter", "spp", "kept"), [("lanczos", 1, 0), ("lanczos", 8, 8), ("box", 1, 1)])
 def test_an_image_of_few_samples_under_a_wide_filter_is_not_refined(tmp_path, rfilter, spp, kept):
     """Σ w, which the file lacks, may be near 0: then one sample would leave a bright pixel in the refined image."""
