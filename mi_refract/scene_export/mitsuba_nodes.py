@@ -111,7 +111,7 @@ class Node:
             raise self.error(f"{name} mirrors or flattens", "an affine transform with a positive determinant")
         # Mitsuba transposes a rotation to invert it. Some of its shapes use the matrix, others the inverse.
         inverse = matrix[:3, :3].T if value is None else np.array(value.inverse_transpose)[:3, :3].T
-        if not np.allclose(inverse @ matrix[:3, :3], np.eye(3), atol=1e-6):
+        if not np.allclose(matrix[:3, :3] @ inverse, np.eye(3), atol=1e-5):  # an axis of six digits is exact enough
             raise self.error(f"{name} has a wrong inverse in Mitsuba", "rotations about axes of length 1")
         return matrix
 
