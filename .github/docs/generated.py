@@ -204,13 +204,15 @@ def escaped(text: str) -> str:
 
 def planar_keys() -> str:
     """The keys of a planar scene."""
-    shared, parts = scene_file.Solid, [key_table("key", scene_file.SceneTable)]
-    parts += ["## Every `[[shape]]`", "Beside its kind and the keys of that kind:", key_table("key", shared)]
+    parts = [key_table("key", scene_file.SceneTable)]
+    for title, kind, listed in scene_file.SHARED:
+        parts += [f"## {title.replace('[[shape]]', '`[[shape]]`')}", "Beside its kind and the keys of that kind:"]
+        parts.append(key_table("key", kind, listed))
     for table, kinds in (("shape", scene_file.AnyShape), ("beam", scene_file.AnyBeam)):
         parts.append(f"## `[[{table}]]`")
         for kind in kinds.__args__:
             about = (inspect.getdoc(kind) or "").partition("\n")[0]
-            parts += [f'### `kind = "{kind.__struct_config__.tag}"`', about, key_table("key", kind, shared)]
+            parts += [f'### `kind = "{kind.__struct_config__.tag}"`', about, key_table("key", kind, scene_file.Solid)]
     return "\n\n".join(parts)
 
 

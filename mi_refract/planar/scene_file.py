@@ -182,6 +182,12 @@ def _curves(shape: AnyShape, n: dict[str, Indices]) -> list[tuple[Curve, Indices
 
 
 AnyShape = Polygon | Rectangle | Prism | Circle | Ellipse | Lens | EllipseLens | Luneburg | Boundary
+# The keys that kinds share: the title of their list, a struct that has them, and one whose keys are in other lists.
+SHARED: tuple[tuple[str, type[Struct], type[Struct]], ...] = (
+    ("Every [[shape]]", Shape, Struct),
+    ("Every [[shape]] but `boundary`", Inside, Shape),
+    ("Every [[shape]] but `boundary` and `luneburg`", Solid, Inside),
+)
 
 # Beams ------------------------------------------------------------------------------------------------------------
 
@@ -270,7 +276,9 @@ class SceneTable(Struct, kw_only=True, forbid_unknown_fields=True):
 
 def reference() -> str:
     """All kinds and keys as text, for `mi-refract trace --keys`."""
-    lists = [key_list("A scene:", SceneTable), key_list("Every [[shape]], which has a kind and its keys:", Solid)]
+    lists = [key_list("A scene:", SceneTable)]
+    for title, kind, listed in SHARED:
+        lists.append(key_list(f"{title}, beside its kind and the keys of that kind:", kind, listed))
     for table, kinds in (("[[shape]]", AnyShape), ("[[beam]]", AnyBeam)):
         for kind in get_args(kinds):
             summary = (kind.__doc__ or "").partition("\n")[0]

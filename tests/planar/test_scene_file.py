@@ -3,6 +3,7 @@
 import math
 import re
 from pathlib import Path
+from typing import get_args
 
 import hypothesis
 import numpy as np
@@ -226,6 +227,19 @@ def test_errors_name_file_and_key_in_one_line(read, tmp_path, scene, old, new, e
     message = str(caught.value)
     assert message.startswith(f"{tmp_path / 'scene.toml'}: ") and "\n" not in message and len(message) < 400
     assert expected in message
+
+
+@pytest.mark.parametrize("kind", [x.__struct_config__.tag for x in get_args(scene_file.AnyShape)])
+def test_the_lists_of_keys_are_those_that_a_shape_takes(read, kind):
+    listed = set()
+    for text in scene_file.reference().split("\n\n"):
+        title, _, keys = text.partition(":\n") if text.startswith("Every") else text.partition("\n")
+        of_all = title.startswith("Every") and f"`{kind}`" not in title
+        if of_all or title.startswith(f'[[shape]] kind = "{kind}"'):
+            listed |= set(re.findall(r"^  (\w+)", keys, re.MULTILINE))
+    with pytest.raises(ValueError) as caught:
+        read(f"[[shape]]\nkind = '{kind}'\nunknown = 1")
+    assert listed == set(str(caught.value).partition("expected ")[2].split(", "))
 
 
 def test_files_that_cannot_be_read(tmp_path):
