@@ -22,7 +22,7 @@
 | `hold(…)` | around any of these: outside its range the index is that at the range's end |
 
 Numbers in the wrong unit or order cause an error that suggests the right one: `cauchy(1.5046, 0.0042)`,
-`abbe(64.2, 1.517)`, an index above 10.
+`abbe(64.2, 1.517)`, a formula or file with an index above 10.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def parse(spec: float | str, name: str = "", find: Callable[[str], Path] = Path)
     """The medium for `spec`: a number, or a text of the module's table.
 
     ValueError, with `name` (that of the parameter) and the expected values, for anything else; for an n that is not
-    positive, or above 10, at a wavelength from 360 to 830 nm; and for numbers that are not finite.
+    positive at a wavelength from 360 to 830 nm, or in a formula or file above 10; and for numbers that are not finite.
 
     find: returns the path of a file from its name in the text.
     """

@@ -209,6 +209,12 @@ def test_errors_are_one_line_with_the_parameter(spec, message):
     assert str(error.value).startswith(f"refract: int_ior = {spec!r}") and "\n" not in str(error.value)
 
 
+def test_only_formulas_and_files_are_limited_to_an_index_of_10():
+    assert media.index("12", 500.0) == media.index(12, 500.0) == 12
+    with pytest.raises(ValueError, match="expected up to 10 in 360 … 830 nm"):
+        media.parse("cauchy(12)")
+
+
 def test_poles_outside_the_visible_limit_the_range():
     assert media.parse("sellmeier_nm(1, 0.01, 200, 9000)").valid == pytest.approx((200, 9000))
     assert math.isnan(media.parse("cauchy(1, 2000)").index_or_nan(500.0, {"A": -1.0}))
