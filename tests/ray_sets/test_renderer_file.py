@@ -174,3 +174,21 @@ def test_a_file_of_rays_is_for_the_functions_of_its_precision(folder, run, tmp_p
     else:
         assert status == (precision == "f64"), out + err
         assert [x["title"] for x in json.loads(data.read_text())["functions"]] == titles
+
+
+def test_rays_run_uses_only_the_keys_that_the_page_names(folder, run):
+    unused = """gives_up = 0.5
+lengths = "refused"
+remark = "R"
+recorded = { generic = 1e-3 }
+[images]
+export = "mitsuba"
+command = ["none"]
+spp = { sphere = 64 }
+"""
+    outputs = []
+    for text in ("", unused):
+        where = folder(TITLED.replace("./r", "{python}").replace('"]', '", "right.py"]') + text)
+        (where / "right.py").write_text(f"print('# system: S 1')\n{PROGRAM}")
+        outputs.append(run("rays", "run", "--renderer", where, "--regime", "generic", "--count", 20))
+    assert outputs[0] == outputs[1] and outputs[0][0] == 0 and "S 1" not in outputs[0][1]
