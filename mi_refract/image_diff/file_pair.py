@@ -159,7 +159,7 @@ def _compare_parts(
 def mask_of(
     reference: Image, path: Path | None, rectangles: Sequence[Rectangle], max_values: int = MAX_VALUES
 ) -> Mask | None:
-    """Return the pixels to compare: white pixels of the mask at `path`, outside of the rectangles; None without both.
+    """Return the pixels to compare: where the mask at `path` is WHITE, outside of the rectangles; None without both.
 
     OSError if the mask cannot be read; ValueError if it has another size, if a rectangle does not overlap the image,
     and if no pixel is left.

@@ -225,7 +225,10 @@ class Keys(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     ] = ()
     mask: Annotated[
         str | None,
-        Meta(description="an image beside the reference: only white pixels are compared; {root}: the top folder"),
+        Meta(
+            description="an image beside the reference: pixels are compared where a colour of it is at least 0.5, "
+            "alpha not counted; {root}: the top folder"
+        ),
     ] = None
     ignore: Annotated[
         tuple[Rectangle, ...],

@@ -8,7 +8,7 @@ import pytest
 from support.diff_images import image as smooth
 from support.diff_images import samples
 
-from mi_refract.image_diff import accept, file_pair, folders
+from mi_refract.image_diff import accept, file_pair, folders, settings
 from mi_refract.image_diff.methods import METHODS
 from mi_refract.image_diff.settings import Settings, from_words
 from mi_refract.io import image_file
@@ -181,6 +181,16 @@ def test_shares_refer_to_the_compared_pixels_and_the_mask_is_a_map(sides):
     assert "50 % of the pixels (8 of 16)" in result.reason
     assert result.warnings == ("the mask leaves out 99% of the pixels",)
     assert result.comparison.maps["left out"].sum() == 1520
+
+
+def test_a_pixel_is_compared_where_a_colour_of_the_mask_is_at_least_a_half(tmp_path):
+    """Alpha is not a colour."""
+    colours = np.zeros((1, 6, 4), np.float32)
+    colours[0, :, 0], colours[0, 4, 1], colours[0, :, 3] = (0, 0.49, 0.5, 1, 0, 0), 0.5, 1
+    write_exr(tmp_path / "mask.exr", colours, tuple("RGBA"))
+    one = image_file.Image(tmp_path / "a.exr", colours, tuple("RGBA"))
+    assert file_pair.mask_of(one, tmp_path / "mask.exr", ()).tolist() == [[False, False, True, True, True, False]]
+    assert "where a colour of it is at least 0.5, alpha not counted" in settings.key_tables()
 
 
 def test_masked_nan_and_unselected_channels_are_ignored(sides):
