@@ -192,12 +192,15 @@ def test_a_medium_without_an_index_at_the_d_line_is_an_error_in_rgb_variants(rgb
         load("table(600: 1.5, 700: 1.4)")
 
 
-def test_a_medium_whose_range_excludes_visible_light_is_an_error(spectral_variant):
+def test_a_medium_whose_range_excludes_visible_light_is_an_error(spectral_variant, logged):
+    """A share of the colour of white light of up to 0.1 % is a warning."""
     form = r"int_ior: .* from {} to {} nm: {} of the colour lies outside; expected at least 380 … 716 nm, or hold\(…\)"
     for low, high, lost in ((420, 830, "5.1%"), (400, 700, "0.5%"), (390, 710, "0.15%"), (600, 605, "100%")):
         with pytest.raises(RuntimeError, match=form.format(low, high, lost)):
             load(f"table({low}: 1.5, {high}: 1.4)")
-    load("table(380: 1.5, 716: 1.4)")
+    for low, high, lost in ((380, 716, "0.059%"), (385, 716, "0.082%")):
+        load(f"table({low}: 1.5, {high}: 1.4)")
+        assert f"from {low} to {high} nm; other light ({lost} of the colour) is lost" in logged[-1]
 
 
 def test_hold_extends_the_index_at_the_ends_with_a_warning(spectral_variant, logged):
