@@ -128,7 +128,7 @@ def integrator_class(v: Variant) -> type:
             self.split_depth, self.split_weight = read_split(props, self.deterministic)
             self.caustics, self.light_paths = read_caustics(props)
             self.camera = read_absorption(INTEGRATOR, props, "camera")
-            self.samples_per_pass = props.get("samples_per_pass", UNLIMITED)
+            self.samples_per_pass = read_count(props, "samples_per_pass", UNLIMITED, 1)
             # Not the scene, which holds its integrator: a circle cannot be frozen.
             self.needs: SceneFeatures | None = None  # of the scene rendered last
             self.rendering = False  # between `begin_render` and `end_render`

@@ -339,6 +339,7 @@ def test_what_is_left_out_is_not_in_the_kernel_and_is_said(llvm_variant, monkeyp
         ({"max_depth": True}, "max_depth = True"),
         ({"max_depth": "deep"}, "max_depth = 'deep'"),
         ({"rr_depth": 0}, "rr_depth = 0; expected an integer ≥ 1"),
+        ({"samples_per_pass": 0}, "samples_per_pass = 0; expected an integer ≥ 1"),
         ({"split_depth": -1}, "split_depth = -1; expected an integer ≥ 0"),
         (
             {"split_depth": 13, "split_weight": 0.0},
