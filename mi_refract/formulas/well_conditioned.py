@@ -70,6 +70,14 @@ def _along_axis(a: Vector3, axis: tuple[int, int], scale: Number, along: Number)
     return type(a)(*((along if sign > 0 else -along) if i == index else a[i] * scale for i in range(3)))
 
 
+def _root(x: Number) -> Any:
+    """√x, 0 for x < 0, with a derivative that is finite at 0 and right for every x > 0.
+
+    That of `dr.safe_sqrt` is 0 for x < 2⁻⁵², which is every radicand if the vectors are short.
+    """
+    return dr.select(x > 0, dr.sqrt(dr.select(x > 0, x, 1)), 0 * x) if differentiated(x) else dr.safe_sqrt(x)
+
+
 class LocalCosines(NamedTuple):
     """Cosines of a ray at a boundary whose normal is an axis, times |a|, in float64."""
 
@@ -90,9 +98,8 @@ def local_cosines(x: Number, y: Number, z: Number, contrast: Number) -> LocalCos
     sin2 = dr.fma(x, x, y * y)
     # z² is exact; κ (x² + y²) has an error of 1·2⁻⁵³ each for a square, the sum and the product.
     radicand = dr.fma(z, z, -contrast * sin2)
-    # For a radicand below 0 the root is not used, and |x| takes fewer operations than max(x, 0). The derivative of
-    # `safe_sqrt` at 0 is finite.
-    cos_t = dr.safe_sqrt(radicand) if differentiated(radicand) else dr.sqrt(dr.abs(radicand))
+    # For a radicand below 0 the root is not used, and |x| takes fewer operations than max(x, 0).
+    cos_t = _root(radicand) if differentiated(radicand) else dr.sqrt(dr.abs(radicand))
     return LocalCosines(sin2, dr.abs(z), radicand, cos_t)
 
 
@@ -133,7 +140,7 @@ def refract_promoted(
     # Errors in 2⁻⁵³: 4 of c²; of κ w² 2 from w, 3 from the squares and their sum, 1 from the product.
     radicand = dr.fma(c, c, -kappa * dr.dot(w, w))
     transmitted = (radicand >= 0) & (c != 0)
-    along, scale = dr.select(transmitted, dr.mulsign(dr.safe_sqrt(radicand), c), -c), dr.select(transmitted, k2, 1)
+    along, scale = dr.select(transmitted, dr.mulsign(_root(radicand), c), -c), dr.select(transmitted, k2, 1)
     # For κ = 0, b = a bit for bit: √(c²) is |c| exactly, so the factor of n is 0. The same holds for c = 0.
     # Otherwise k a + n (…) cancels with an error of 5.5k·2⁻⁵³ |a|, which is 0.011u for k = 2²⁰ (LARGEST_RATIO).
     return type(a)(dr.fma(m, ieee_divide(dr.fma(-scale, c, along), dr.dot(m, m)), d * scale)), transmitted

@@ -243,3 +243,13 @@ def test_derivatives_equal_those_of_the_closed_form(name, opaque, vectorised):
         dr.backward(FORMULAS[name](**vectors, k=0.75)[0].x)
         gradient = np.array(dr.grad(vectors[moved])).ravel().tolist()
         assert gradient[: len(expected[moved])] == pytest.approx(expected[moved], abs=40 * u)
+
+
+@pytest.mark.parametrize("name", EXACT)
+@pytest.mark.parametrize("opaque", [False, True])
+@pytest.mark.parametrize("length", [1e-17, 1e-9, 1e-6, 1e17])
+def test_derivatives_are_right_for_any_length_of_the_ray(name, opaque, length, vectorised):
+    """∂b/∂k grows like the length."""
+    gradient, transmitted = derivative_in_the_ratio(name, vectorised, np.multiply(RAY, length).tolist(), 0.7, opaque)
+    expected = [0.6, 0, 0.7 * 0.36 / math.sqrt(1 - 0.42**2)]
+    assert transmitted and gradient / length == pytest.approx(expected, rel=0, abs=40 * vectorised.roundoff)
