@@ -120,6 +120,8 @@ def read_values(
 
 def _from_k(plugin: str, name: str, text: Any, unit: Any) -> Absorption:
     """Return σ = 4πk/λ, with k from a file. ValueError names the parameter."""
+    import numpy as np
+
     label = f"{plugin}: {name}"
     medium = media.parse(text, label, find_file) if isinstance(text, str) else None
     if not medium or not medium.k:
@@ -130,14 +132,12 @@ def _from_k(plugin: str, name: str, text: Any, unit: Any) -> Absorption:
     knots, k = medium.k
     effect = "has the absorption of the range's end"
     check_range(f"{label} = {text!r} has k", (knots[0], knots[-1]), medium.hold, effect)
-    # Outside the range k has its value at the range's end.
-    wavelengths, values = [*knots], [*k]
-    if knots[0] > mi.MI_CIE_MIN:
-        wavelengths, values = [mi.MI_CIE_MIN, *wavelengths], [k[0], *values]
-    if knots[-1] < mi.MI_CIE_MAX:
-        wavelengths, values = [*wavelengths, mi.MI_CIE_MAX], [*values, k[-1]]
+    # k is linear between its knots, and outside them it has its value at the range's end. Mitsuba's spectrum is linear
+    # in σ, so it needs steps of 1 nm, where k/λ differs from a line by at most 1/4λ² < 2e-6. It is in float32.
+    visible = np.arange(mi.MI_CIE_MIN, mi.MI_CIE_MAX + 1)
+    inner = [w for w in knots if mi.MI_CIE_MIN < w < mi.MI_CIE_MAX]
+    wavelengths = np.unique(np.float32([*visible, *inner])).astype(float)
+    values = 4e9 * math.pi * unit * np.interp(wavelengths, knots, k) / wavelengths
     sigma = mi.Properties()
-    sigma[name] = _parsed.Spectrum(
-        wavelengths, [4e9 * math.pi * x / w * unit for w, x in zip(wavelengths, values, strict=True)]
-    )
+    sigma[name] = _parsed.Spectrum(wavelengths.tolist(), values.tolist())
     return Absorption(name, sigma.get_unbounded_texture(name), 1.0, 0.0)

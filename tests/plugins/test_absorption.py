@@ -58,6 +58,15 @@ def test_a_file_with_k_gives_4_pi_k_over_wavelength(each_variant, tmp_path, logg
     assert "k from 400 to 700 nm; other light (0.5% of the colour) has the absorption of the range's end" in text
 
 
+@pytest.mark.parametrize("wavelengths", [(360, 830), (300, 900), (360.00001, 400, 400.000001, 830)])
+def test_k_is_linear_between_the_wavelengths_of_a_file(wavelengths, tmp_path, spectral_variant):
+    """σ is not: between 360 and 830 nm a line in σ is off by up to 18 %."""
+    (tmp_path / "k.csv").write_text("nm,n,k\n" + "".join(f"{w},1.5,{w * 1e-9 + 1e-6}\n" for w in wavelengths))
+    absorption = sigma(int_absorption=f"hold(file:{tmp_path}/k.csv)", int_absorption_unit=1e-3)
+    expected = [4e6 * math.pi * (1e-6 / w + 1e-9) for w in WAVELENGTHS]
+    assert absorption == pytest.approx(expected, rel=1e-5)
+
+
 @pytest.mark.parametrize(
     ("k", "parameters", "warns"),
     [(1e-6, {}, True), (1e-8, {}, False), (1e-6, {"int_absorption": 0.5}, False), (0, {}, False)],
