@@ -192,6 +192,15 @@ def test_reflection_reverses_the_normal_component(setting):
         assert b == pytest.approx(a - 2 * n * (n @ a), abs=12 * setting.roundoff * np.linalg.norm(a))
 
 
+@pytest.mark.parametrize("form", [reflect, reflect_sandwich])
+@pytest.mark.parametrize("normal", [(0, 0, 1), [0, 0, 1], np.array([0.0, 0.0, 1.0])])
+def test_the_normal_may_be_a_sequence(form, normal, vectorised):
+    """Three rays, one normal: its components are not those of the rays."""
+    a = vectorised.vector([0.5, 0.25, 0], [0, 0.5, 0.25], [-0.75, -0.5, 0.25])
+    b = form(a, normal)
+    assert type(b) is type(a) and dr.all(b == type(a)(a.x, a.y, -a.z), axis=None)
+
+
 def test_refract_2d_obeys_snells_law_on_both_sides_of_a_slanted_boundary(setting):
     number = dr.value_t(setting.vector)
     for degrees in (10.0, 100.0, 190.0, 280.0):
