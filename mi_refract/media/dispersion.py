@@ -185,9 +185,10 @@ def sellmeier(values: Sequence[float], squared: bool = False) -> tuple[Terms, di
 def power_series(power: int, terms: Iterable[tuple[float, float]]) -> tuple[Terms, dict[str, float]]:
     """n or n² (`power` 1 or 2) = Σ a λ^p, from pairs (a, p) for λ in µm. Coefficients a0, a2, a_2, … for λ in nm."""
     totals: dict[float, float] = {}
-    for a, p in terms:
+    for a, exact in terms:
+        p = float(f"{exact:.15g}")  # so that different powers have different names
         totals[p] = totals.get(p, 0.0) + a
-    names = {p: f"a{p:g}".replace("-", "_").replace(".", "_") for p in totals}
+    names = {p: f"a{p:.15g}".replace("-", "_").replace(".", "_") for p in totals}
     form = Terms(power, powers=tuple((name, p) for p, name in names.items()))
     return form, {names[p]: a / NANOMETRES**p for p, a in totals.items()}
 

@@ -403,6 +403,10 @@ FILES = {
         PAGE.format("formula 5", "1.5 0.004 -2 1e-3 -3.5"),
         powers((1.5, 0), (4e-3, -2), (1e-3, -3.5), exponent=1),
     ),
+    "5.yml": (  # powers that agree in six digits
+        PAGE.format("formula 5", "1.5 0.004 -1.0000001 1e-3 -1.0000002"),
+        powers((1.5, 0), (4e-3, -1.0000001), (1e-3, -1.0000002), exponent=1),
+    ),
     "6.yml": (PAGE.format("formula 6", "0 0.05792105 238.0185 0.00167917 57.362"), gas),
     "1.agf:x-1": (ZEMAX.format(1, "2.27 -0.01 0.0105 1e-4 0 0"), SCHOTT_1992),
     "2.agf:X-1": (ZEMAX.format(2, f"{B[0]} {C[0]} {B[1]} {C[1]} {B[2]} {C[2]} 0 0"), bk7),
