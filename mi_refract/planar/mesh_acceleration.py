@@ -125,16 +125,19 @@ class MeshAcceleration:
         return negated(exists) | (at.r < near_a) | (at.s < near_b)
 
     def _find_crowded(self, a: Array, b: Array, vertices: Vertices) -> tuple[int, int] | None:
-        """Two segments that share no vertex, one less than SHORTEST from the middle or a quarter of the other."""
+        """Two segments that share no vertex, one less than SHORTEST from the middle or a quarter of the other.
+
+        Seen from that distance, the first stroke is then not that of the segment itself.
+        """
         arrays, e = self.arrays, b - a
         normals = np.column_stack([-e[:, 1], e[:, 0]]) / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), 1e-300)
         for share, d in itertools.product((0.25, 0.5, 0.75), (normals, -normals)):
-            places, directions = arrays.table(a + share * e + OFFSET * d), arrays.table(d)
+            places, directions = arrays.table(a + share * e + SHORTEST * d), arrays.table(-d)
 
             def query(lane: Index, scatter: Scatter, places: Table = places, directions: Table = directions) -> None:
                 place, direction = arrays.gather(places, lane), arrays.gather(directions, lane)
                 hit, t, stroke = self._next_stroke(place, direction, arrays.mask(True))
-                scatter("nearby", 0, stroke, hit & (t < SHORTEST))
+                scatter("nearby", 0, stroke, hit & (t < SHORTEST + OFFSET))
 
             strokes = arrays.run(len(a), {"nearby": (arrays.index, NOWHERE, (1, len(a)))}, query)["nearby"][0]
             near = np.flatnonzero(strokes < len(a))

@@ -132,6 +132,10 @@ def test_the_mesh_works_on_the_scalar_backend():
         (Segments([(0, 0)], [(1, 0)], [1.5], [1.0], [(0.5, 0.5)], [1.0]), "'mesh': arcs; expected straight segments"),
         (together(slab(0.5), slab(0.6 + 1e-6)), "'mesh': segments 0 and 6; expected straight segments"),
         (together(slab(0.5), slab(0.6 + 1.5e-6)), "'mesh': segments 0 and 6; expected straight segments"),
+        *(
+            (together(slab(0.5), slab(0.6 + gap)), "'mesh': segments 0 and 6; expected straight segments")
+            for gap in (1e-12, 1e-9, 1e-8, 1e-7, 3e-7)
+        ),
     ],
 )
 def test_mesh_rejects_segments_that_it_cannot_separate(segments, message):
