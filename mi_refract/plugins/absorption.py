@@ -136,7 +136,7 @@ def _from_k(plugin: str, name: str, text: Any, unit: Any) -> Absorption:
     # in σ, so it needs steps of 1 nm, where k/λ differs from a line by at most 1/4λ² < 2e-6. It is in float32.
     visible = np.arange(mi.MI_CIE_MIN, mi.MI_CIE_MAX + 1)
     inner = [w for w in knots if mi.MI_CIE_MIN < w < mi.MI_CIE_MAX]
-    wavelengths = np.unique(np.float32([*visible, *inner])).astype(float)
+    wavelengths = np.unique(np.array([*visible, *inner], np.float32)).astype(float)
     values = 4e9 * math.pi * unit * np.interp(wavelengths, knots, k) / wavelengths
     sigma = mi.Properties()
     sigma[name] = _parsed.Spectrum(wavelengths.tolist(), values.tolist())

@@ -68,12 +68,10 @@ def read(output: Path, channels: tuple[str, ...], identity: Identity) -> Progres
         if changes(image_identity, identity) or not 1 <= passes <= spp or len(contrasts) != passes - 1:
             return None
         mean = image.select(channels).astype(np.float64)
-        variance = np.zeros(())
-        if variance_from != NOTHING:
-            variance = image.select([VARIANCE.format(name) for name in channels])
+        names = [VARIANCE.format(name) for name in channels]
+        variance = np.zeros_like(mean) if variance_from == NOTHING else image.select(names).astype(np.float64)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
-    variance = np.broadcast_to(variance.astype(np.float64), mean.shape)
     # `within` and `between` give the variance in the file; with a wide filter every pixel gets the expected weight.
     within = variance * (spp - passes) if variance_from == SAMPLES and passes < FEW else None
     progress.base = PassSums(
