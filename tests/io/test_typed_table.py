@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from msgspec import Meta
 
-from mi_refract.io.typed_table import convert
+from mi_refract.io.typed_table import convert, key_table
 
 
 class Ball(msgspec.Struct, forbid_unknown_fields=True, tag_field="kind", tag="ball"):
@@ -61,3 +61,20 @@ def test_errors_say_what_was_expected(table: dict[str, Any], expected: str) -> N
         with pytest.raises(ValueError) as error:
             convert(table, Room, "room.toml")
         assert str(error.value) == f"room.toml: {expected}"
+
+
+def test_keys_are_described_in_words() -> None:
+    class Thing(msgspec.Struct):
+        place: Annotated[tuple[float, float], Meta(description="where it is")]
+        colour: Literal["red", "blue"] | None = None
+        sizes: Annotated[tuple[Annotated[int, Meta(ge=1, le=9)], ...], Meta(description="of its parts")] = (3,)
+        named: dict[str, Ball] = {}
+
+    assert key_table("key", Thing).splitlines() == [
+        "| key | type | meaning |",
+        "|---|---|---|",
+        "| `place` | [number, number] | where it is |",
+        "| `colour` | `blue`, `red` |  |",
+        "| `sizes` | list of whole number ≥ 1, ≤ 9 | of its parts; default [3] |",
+        "| `named` | table |  |",
+    ]
