@@ -145,7 +145,7 @@ def scatter_svg(panels: Mapping[str, Scatter], axes: Axes, *, floor: str, front:
             panel.set(xscale=axes.x_scale, yscale=axes.y_scale, title=setting, xlabel=axes.x)
             for subject, points in subjects.items():
                 x, y = zip(*points, strict=True)
-                panel.plot(x, y, color=colours[subject], marker="o", markersize=4.5, linewidth=1)
+                panel.plot(x, y, color=colours[subject], marker="o", markersize=4.5)
             for subject, low, high, height in panels[setting].intervals:
                 if subject in subjects:
                     panel.plot([low, high], [height, height], color=colours[subject], linewidth=1)
