@@ -10,6 +10,8 @@ import sys
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from PIL import Image as PillowImage
+from PIL import ImageCms
 from support.diff_images import cut, exr_of_integers, tiff
 
 from mi_refract.io import image_file
@@ -25,6 +27,7 @@ from mi_refract.io.image_file import (
     write_exr,
 )
 
+SRGB_PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 PIXELS = np.random.default_rng(1).random((48, 40, 3)).astype(np.float32)
 # Values that conversion to half floats, clamping or a colour transform would change.
 HARD = np.array([[[0.1, -2.5, 1e20], [np.inf, 1e-30, 3]], [[1, np.nan, 65505], [4, 5, 6]], [[7, 8, 9], [0, -0.0, 1]]])
@@ -306,3 +309,10 @@ def test_any_channel_agrees_with_numpy(channels, share):
     flags = np.random.default_rng(channels).random((6, 7, channels)) < share
     assert np.array_equal(any_channel(flags), flags.any(-1))
     assert any_channel(flags[0]).shape == (7,)
+
+
+@pytest.mark.parametrize(("icc", "name"), [(SRGB_PROFILE, "ICCProfile"), (b"no profile", image_file.PNG_PROFILE)])
+def test_a_profile_is_read_once_also_if_openimageio_drops_it(tmp_path, icc, name):
+    PillowImage.new("RGB", (2, 2)).save(tmp_path / "a.png", icc_profile=icc)
+    metadata = read(tmp_path / "a.png").metadata
+    assert [key for key in metadata if key in ("ICCProfile", image_file.PNG_PROFILE)] == [name]

@@ -142,3 +142,10 @@ def test_mesh_rejects_segments_that_it_cannot_separate(segments, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         trace(segments, [(0.5, 3)], [(0, -1)], 2, method="mesh")
     assert trace(segments, [(0.5, 3)], [(0, -1)], 2).hits[0, 0] >= 0
+
+
+def test_mesh_separates_segments_that_are_far_enough_apart():
+    """A quarter more than the least distance, 2⁻¹⁸ of half the extent."""
+    segments = together(slab(0.5), slab(0.6 + 1.25 * 2.0**-18 / 2))
+    brute, mesh = (trace(segments, [(0.5, 3)], [(0, -1)], 4, method=method) for method in METHODS)
+    assert np.array_equal(brute.points, mesh.points, equal_nan=True) and mesh.hits[0].tolist() == brute.hits[0].tolist()
