@@ -284,6 +284,13 @@ def test_missing_files_and_folders_are_os_errors(tmp_path):
             reader(tmp_path)
 
 
+@pytest.mark.parametrize(("icc", "name"), [(SRGB_PROFILE, "ICCProfile"), (b"no profile", image_file.PNG_PROFILE)])
+def test_a_profile_is_read_once_also_if_openimageio_drops_it(tmp_path, icc, name):
+    PillowImage.new("RGB", (2, 2)).save(tmp_path / "a.png", icc_profile=icc)
+    metadata = read(tmp_path / "a.png").metadata
+    assert [key for key in metadata if key in ("ICCProfile", image_file.PNG_PROFILE)] == [name]
+
+
 # Pixels ---------------------------------------------------------------------------------------------------------------
 
 
@@ -309,10 +316,3 @@ def test_any_channel_agrees_with_numpy(channels, share):
     flags = np.random.default_rng(channels).random((6, 7, channels)) < share
     assert np.array_equal(any_channel(flags), flags.any(-1))
     assert any_channel(flags[0]).shape == (7,)
-
-
-@pytest.mark.parametrize(("icc", "name"), [(SRGB_PROFILE, "ICCProfile"), (b"no profile", image_file.PNG_PROFILE)])
-def test_a_profile_is_read_once_also_if_openimageio_drops_it(tmp_path, icc, name):
-    PillowImage.new("RGB", (2, 2)).save(tmp_path / "a.png", icc_profile=icc)
-    metadata = read(tmp_path / "a.png").metadata
-    assert [key for key in metadata if key in ("ICCProfile", image_file.PNG_PROFILE)] == [name]
