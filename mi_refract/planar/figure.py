@@ -123,7 +123,7 @@ def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> 
     ink = MOON if scene.light.wavelengths else INK
     style: dict[str, Any] = {"colors": ink, "capstyle": "round", "zorder": 1.5}
     style["linewidths"] = 0.7 * max(min(1.0, 8 / len(outlines)), 0.15)
-    panel.add_collection(LineCollection(outlines, rasterized=many, **style), autolim=False)
+    panel.add_collection(LineCollection(outlines, rasterized=many, **style))
     panel.plot(0, 0, "+", color=MUTED, markersize=5, markeredgewidth=0.6, zorder=1.4, scalex=False, scaley=False)
     _draw_rays(panel, scene, legs(traced, view))
     marks = {mark: np.concatenate([x.tips[x.end == event] for x in traced]) for event, mark in MARKS.items()}
@@ -229,7 +229,7 @@ def _draw_rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
         rgba = np.column_stack([np.array([colours[c] for c in lines.colour[order]]), opacity])
         strokes = list(np.stack([lines.start, lines.end], axis=1)[order])
         style: dict[str, Any] = {"colors": rgba, "linewidths": 0.4 + 0.8 * room, "zorder": 2}
-        panel.add_collection(LineCollection(strokes, **style), autolim=False)
+        panel.add_collection(LineCollection(strokes, **style))
 
 
 def _draw_density(panel: Axes, lines: Legs, colours: dict[int, Array], *, light: bool) -> None:

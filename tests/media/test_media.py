@@ -210,7 +210,7 @@ def test_errors_are_one_line_with_the_parameter(spec, message):
 
 
 def test_only_formulas_and_files_are_limited_to_an_index_of_10():
-    assert media.index("12", 500.0) == media.index(12, 500.0) == 12
+    assert media.index("12", 500.0) == media.index(12, 500.0) == media.index("12", 0.5) == 12
     with pytest.raises(ValueError, match="expected up to 10 in 360 … 830 nm"):
         media.parse("cauchy(12)")
 

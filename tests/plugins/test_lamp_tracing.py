@@ -288,6 +288,19 @@ def test_an_image_scales_with_its_lamps(factor, llvm_variant):
     np.testing.assert_allclose(other / factor, one, rtol=1e-5)
 
 
+def test_roulette_ends_light_paths(llvm_variant):
+    """With the same random numbers: if no path ended early, both images would have the same bits."""
+    images = []
+    for rr_depth in (1, 6):
+        loaded = scene({}, caustics="lamp", rr_depth=rr_depth)
+        integrator, sensor = loaded.integrator(), loaded.sensors()[0]
+        integrator.begin_render(sensor)
+        integrator.path_loop(loaded, sensor.sampler())
+        images.append(integrator.caustic_image(loaded, sensor, 0, 16, ("R", "G", "B"))[0])
+        integrator.end_render()
+    assert images[0].any() and (images[0] != images[1]).any()
+
+
 def test_light_from_infinity_does_not_pass_air_that_absorbs(llvm_variant):
     parts = {"lamp": SUN, "ball": ball({"type": "refract", "ext_absorption": 1e-3})}
     assert tiles(scene(parts, caustics="lamp", camera_absorption=1e-3), 4, [0]).max() == 0

@@ -3,13 +3,16 @@
 import html
 import json
 import re
+import resource
 import shutil
 import subprocess
 
 import pytest
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PATH: the page's script was not run")
+LIMITED = resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
+MISSING = "no Chromium on PATH" if CHROMIUM is None else "Chromium needs unlimited address space" if LIMITED else ""
+needs_chromium = pytest.mark.skipif(MISSING != "", reason=f"{MISSING}: the page's script was not run")
 
 
 def assert_stands_alone(text):
