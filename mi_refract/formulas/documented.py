@@ -49,7 +49,7 @@ def contract(n: Vector3, bivector: Vector3) -> Vector3:
 
 def reflect(a: Vector3, n: Vector3) -> Vector3:
     """b = a − 2 n (n·a). Source: document 000, "Reflection". Unit `n`; shapes (3,) and (3,) to (3,)."""
-    n = type(a)(n)  # a tuple times a number of N entries would be N entries, not a vector
+    n = n if dr.is_array_v(n) else type(a)(n)  # a tuple times a number of N entries would be N entries, not a vector
     return a - n * (2 * dr.dot(n, a))
 
 
@@ -59,7 +59,7 @@ def reflect_sandwich(a: Vector3, n: Vector3) -> Vector3:
     (n·a) n + (n∧a) n, and (n∧a) n = −n ⌋ (n∧a) because n anticommutes with a bivector that contains it.
     Source: document 000, boxed form of "Reflection". Unit `n`; shapes (3,) and (3,) to (3,).
     """
-    n = type(a)(n)
+    n = n if dr.is_array_v(n) else type(a)(n)
     return contract(n, wedge(n, a)) - n * dr.dot(n, a)
 
 

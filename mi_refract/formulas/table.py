@@ -50,6 +50,9 @@ class Formula:
         is known more accurately than from k. Invalid input gives NaN and False without an error: `a` or `n` zero or not
         finite, `k` outside 2⁻²⁰ … 2²⁰, `contrast` not finite or not above −1.
         """
+        if dr.is_jit_v(a) and any(dr.is_diff_v(x) for x in (n, k, contrast) if x is not None):
+            differentiable: Any = dr.diff_array_t(type(a))
+            a = differentiable(a)  # it may have a type without derivatives
         n, k = type(a)(n), as_component(a, k)
         scale: Any = 1
         if self.scales:

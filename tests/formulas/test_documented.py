@@ -262,3 +262,19 @@ def test_derivatives_are_right_for_any_length_of_the_ray(name, opaque, length, v
     gradient, transmitted = derivative_in_the_ratio(name, vectorised, np.multiply(RAY, length).tolist(), 0.7, opaque)
     expected = [0.6, 0, 0.7 * 0.36 / math.sqrt(1 - 0.42**2)]
     assert transmitted and gradient / length == pytest.approx(expected, rel=0, abs=40 * vectorised.roundoff)
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+@pytest.mark.parametrize("differentiated", ["n", "k"])
+def test_rays_of_a_type_without_derivatives_have_those_of_the_others(name, differentiated, vectorised):
+    vector = dr.diff_array_t(vectorised.vector)
+    arguments = {"n": vector(0, 0, 1), "k": dr.value_t(vector)(0.75)}
+    dr.enable_grad(arguments[differentiated])
+    b = [FORMULAS[name](kind(0.6, 0, -0.8), **arguments)[0].x for kind in (vector, vectorised.vector)]
+    gradients = []
+    for x in b:
+        dr.backward(x)
+        gradients.append(np.array(dr.grad(arguments[differentiated])))
+        dr.clear_grad(arguments[differentiated])
+    assert gradients[0].any()
+    np.testing.assert_array_equal(*gradients)
