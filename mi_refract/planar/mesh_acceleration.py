@@ -127,7 +127,7 @@ class MeshAcceleration:
     def _find_crowded(self, a: Array, b: Array, vertices: Vertices) -> tuple[int, int] | None:
         """Two segments that share no vertex, one less than SHORTEST from the middle or a quarter of the other.
 
-        Seen from that distance, the first stroke is then not that of the segment itself.
+        A ray toward a segment, from that distance, then meets the stroke of another segment first.
         """
         arrays, e = self.arrays, b - a
         normals = np.column_stack([-e[:, 1], e[:, 0]]) / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), 1e-300)

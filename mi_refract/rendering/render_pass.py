@@ -63,7 +63,7 @@ class PassRenderer:
 
     @property
     def colours(self) -> int:
-        """Number of channels, from the first on, that are colours: neither the opacity nor of the integrator's AOVs."""
+        """Number of channels, from the first on, that are colours: all but the opacity and the integrator's AOVs."""
         of_film = self.channels[: len(self.channels) - len(self.scene.integrator().aov_names())]
         return sum(name != "A" for name in of_film)
 

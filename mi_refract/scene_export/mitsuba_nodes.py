@@ -101,7 +101,7 @@ class Node:
         return r, g, b
 
     def transform(self, name: str = "to_world") -> NDArray[np.float64]:
-        """Return a transform, (4, 4). ValueError unless it is affine, with a positive determinant and its inverse."""
+        """Return a transform, (4, 4). ValueError unless affine, with a positive determinant and a right inverse."""
         value = self.take(name)
         if value is not None and not hasattr(value, "matrix"):
             raise self.error(f"{name} = {value}", "a transform")

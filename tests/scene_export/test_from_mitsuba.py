@@ -367,6 +367,11 @@ def test_unsupported_content_is_refused(message, scene):
     assert "\n" not in text and ("expected" in text or "scene.xml" in text)
 
 
+def test_an_axis_of_six_digits_is_exact_enough_under_any_scale(scene):
+    axis = '<scale x="1000" y="0.001"/><rotate x="0.267261" y="0.534522" z="0.801784" angle="37"/>'
+    assert from_mitsuba.load(scene('<translate x="3"/>', axis)).meshes
+
+
 def test_other_errors(scene):
     with pytest.raises(FileNotFoundError):
         from_mitsuba.load("none.xml")
