@@ -50,8 +50,7 @@ Set = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Set a key of [defaults], except map, for all images."),
 ]
 File = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.toml", help=f"Settings of images. Default: {FILE} beside or above them."),
+    Path | None, typer.Option(metavar="FILE.toml", help=f"Settings of images. Default: {FILE} beside or above them.")
 ]
 MaxValues = Annotated[
     int, typer.Option("--max-values", metavar="N", min=1, help="Largest image to read: width × height × channels.")

@@ -50,8 +50,7 @@ def _print_regimes(is_set: bool) -> None:
 Regime = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="NAME",
-        help="Regime of the rays, see --regimes; may be repeated. Default: all regimes of unit vectors.",
+        metavar="NAME", help="Regime of the rays, see --regimes; may be repeated. Default: all regimes of unit vectors."
     ),
 ]
 Count = Annotated[int, typer.Option(min=1, help="Number of rays per regime.")]
@@ -63,14 +62,12 @@ TwoSided = Annotated[
 Medium = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="SPEC",
-        help="Material of one side, such as SCHOTT:N-BK7; the other side is air. May be repeated.",
+        metavar="SPEC", help="Material of one side, such as SCHOTT:N-BK7; the other side is air. May be repeated."
     ),
 ]
 Wavelengths = Annotated[str | None, typer.Option(metavar="NM,…", help="Wavelengths in nm, with --medium.")]
 Tir = Annotated[
-    str,
-    typer.Option(help="How answers signal total internal reflection: auto, zero, nan, reflected, tangent or flag."),
+    str, typer.Option(help="How answers signal total internal reflection: auto, zero, nan, reflected, tangent or flag.")
 ]
 Formula = Annotated[
     str | None,

@@ -13,27 +13,9 @@ from mi_refract.io.image_file import Image, Pixels
 from mi_refract.io.text import distinguishable
 
 from .channels import SPP, Estimate, estimates, has_variance, samples, spreads
-from .comparison import (
-    Comparison,
-    Metric,
-    Range,
-    Verdict,
-    aligned,
-    finite,
-    nonfinite_result,
-    one_of,
-    preconditions,
-)
+from .comparison import Comparison, Metric, Range, Verdict, aligned, finite, nonfinite_result, one_of, preconditions
 from .pixel_statistics import Inflation, inflation, rarity_exponent, sums
-from .tile_statistics import (
-    GROWTH,
-    Evidence,
-    OneSided,
-    TileTests,
-    from_renders,
-    from_variances,
-    with_silent_pixels,
-)
+from .tile_statistics import GROWTH, Evidence, OneSided, TileTests, from_renders, from_variances, with_silent_pixels
 
 # A side with so many times the samples of the other has 16 · 11 rare events where the other has 11, see `OneSided.p`,
 # so that their variance is known to 1/√(16 · 11), 8 %.
