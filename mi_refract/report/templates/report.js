@@ -21,12 +21,16 @@ const expose = (ev) => halves.forEach((v, code) => {
   tones.code[code] = sRGB(unit(linear(unit(v)) * 2 ** ev));
 });
 
+// The inflated text of an element, as a Response.
+function inflated(id) {
+  const deflated = Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
+  return new Response(new Blob([deflated]).stream().pipeThrough(new DecompressionStream("deflate")));
+}
+
 const images = {};
 async function load(id) {
-  const { textContent, dataset } = document.getElementById(id);
-  const deflated = Uint8Array.from(atob(textContent), (c) => c.charCodeAt(0));
-  const stream = new Blob([deflated]).stream().pipeThrough(new DecompressionStream("deflate"));
-  const planes = new Uint8Array(await new Response(stream).arrayBuffer());
+  const { dataset } = document.getElementById(id);
+  const planes = new Uint8Array(await inflated(id).arrayBuffer());
   const codes = new Uint16Array(planes.length / 2);
   for (let i = 0, low = codes.length; i < codes.length; i++) codes[i] = (planes[i] << 8) | planes[low + i];
   images[id] = { codes, channels: +dataset.channels, scale: +dataset.scale };
@@ -211,13 +215,9 @@ function watchScrolls() {
 }
 
 // The rows of a section, from this page; if that fails, the link leads to rows.json beside it.
-async function unpacked(id) {
-  const deflated = Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
-  return new Response(new Blob([deflated]).stream().pipeThrough(new DecompressionStream("deflate"))).blob();
-}
 async function save(link) {
   const made = document.createElement("a");
-  made.href = URL.createObjectURL(new Blob([await unpacked(link.dataset.rows)], { type: "application/json" }));
+  made.href = URL.createObjectURL(new Blob([await inflated(link.dataset.rows).blob()], { type: "application/json" }));
   made.download = link.download;
   made.click();
   URL.revokeObjectURL(made.href);
