@@ -12,9 +12,9 @@ import numpy as np
 
 from mi_refract.io import image_file, safe_files
 from mi_refract.io.errors import describe
+from mi_refract.io.safe_files import digest
 
 from . import pairing
-from .folders import digest
 from .results import FAILED, Result, Results
 
 FEW = 10  # names in a message

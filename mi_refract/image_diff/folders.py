@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import hashlib
 import os
-import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -18,6 +16,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from mi_refract.io import errors, image_file, safe_files
 from mi_refract.io.image_file import Image, one_line
+from mi_refract.io.safe_files import digest
 
 from . import file_pair, pairing
 from .results import FAILED, Result, Results, Status
@@ -235,11 +234,3 @@ def _judge(result: Result, roots: tuple[Path, Path], read: Read, read_one: file_
         raise first_error
     inconclusive = [result for result in judged if result.status is Status.INCONCLUSIVE]
     return (inconclusive or judged)[0]
-
-
-def digest(path: Path | None) -> str:
-    """Return the SHA-256 of a file's bytes, or "" if there is no file. Errors: those of `safe_files.opened`."""
-    if path is None or not path.exists():
-        return ""
-    with safe_files.opened(path, sys.maxsize) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

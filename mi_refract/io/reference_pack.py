@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shlex
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -99,9 +98,8 @@ def of_references(reference: Path, answers: Path | None = None) -> PackReference
     for name, file in index.files.items():
         if not (root / name).is_file():
             raise ValueError(f"{root / name}: missing, or not a file; {EXPECTED}")
-        with safe_files.opened(root / name, sys.maxsize) as stream:
-            if hashlib.file_digest(stream, "sha256").hexdigest() != file.sha256:
-                raise ValueError(f"{root / name}: damaged or edited: its SHA-256 is not that of {INDEX}; {EXPECTED}")
+        if safe_files.digest(root / name) != file.sha256:
+            raise ValueError(f"{root / name}: damaged or edited: its SHA-256 is not that of {INDEX}; {EXPECTED}")
     if safe_files.read_bytes(root / SUMS, MOST) != sums(text, index.files).encode():
         raise ValueError(f"{root / SUMS}: not the digests of {INDEX}: one of the two was edited; {EXPECTED}")
     for entry in [place] if place.is_file() else sorted(place.rglob("*")):

@@ -337,3 +337,11 @@ def copy(source: str | os.PathLike[str], target: Path, most: int = sys.maxsize) 
             digest.update(chunk)
             target_file.write(chunk)
     return digest.hexdigest()
+
+
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a regular file, or "" if there is no file. Errors: those of `opened`."""
+    if not path.exists():
+        return ""
+    with opened(path, sys.maxsize) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
