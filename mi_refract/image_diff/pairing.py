@@ -58,11 +58,8 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
         return [_with_variants(pair, [path for path in others if not path.samefile(test)])]
     old, old_errors, old_hidden = images_in(reference) if has_reference else ({}, [], [])
     new, new_errors, new_hidden = images_in(test)
-    for folder, empty in (
-        (reference, has_reference and not old and not old_errors),
-        (test, not new and not new_errors),
-    ):
-        if empty:
+    for folder, content in ((reference, old or old_errors or not has_reference), (test, new or new_errors)):
+        if not content:
             raise ValueError(f"{folder}: contains no image; expected at least one")
     if settings.maps:
         pairs = _mapped(old, new, settings.maps)

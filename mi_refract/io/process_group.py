@@ -147,11 +147,8 @@ def _signals_raise() -> Iterator[Callable[[], None]]:
 
     previous: dict[signal.Signals, Any] = {}
     if threading.current_thread() is threading.main_thread():
-        for number in {
-            signal.SIGINT,
-            signal.SIGTERM,
-            getattr(signal, "SIGHUP", signal.SIGINT),
-        }:  # Windows has no SIGHUP
+        hangup = getattr(signal, "SIGHUP", signal.SIGINT)  # Windows has none
+        for number in {signal.SIGINT, signal.SIGTERM, hangup}:
             if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
                 previous[number] = signal.signal(number, handle)
     try:

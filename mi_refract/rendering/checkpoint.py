@@ -24,7 +24,7 @@ import numpy as np
 from mi_refract.io.errors import CheckpointError
 from mi_refract.io.safe_files import opened, replacing
 
-from .pass_sums import ARITY, ARRAYS, Doubles, PassSums, PassTree
+from .pass_sums import ARITY, ARRAYS, Doubles, PassSums, PassTree, added
 from .render_settings import AUTO
 
 Identity = dict[str, Any]  # everything that the bits of a render depend on, by name
@@ -91,13 +91,7 @@ class Progress:
     def sums(self) -> PassSums | None:
         """Return the sums of all passes, which share no memory with this object; None before the first pass."""
         with self.lock:
-            total = self.base.copy() if self.base else None
-            for sums in (self.tree.sums(), self.rest):
-                if total is not None and sums is not None:
-                    total.add(sums)
-                elif sums is not None:
-                    total = sums.copy()
-            return total
+            return added((self.base, self.tree.sums(), self.rest))
 
 
 def path_of(output: Path) -> Path:

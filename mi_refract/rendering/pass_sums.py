@@ -6,6 +6,7 @@ node of the next level. So the bits of the result do not depend on where and whe
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -165,13 +166,18 @@ class PassTree:
 
     def sums(self) -> PassSums | None:
         """Return the sums of all passes, which share no memory with the tree; None without passes."""
-        total: PassSums | None = None
-        for sums in reversed(self.levels):
-            if sums is not None and total is not None:
-                total.add(sums)
-            elif sums is not None:
-                total = sums.copy()
-        return total
+        return added(reversed(self.levels))
+
+
+def added(nodes: Iterable[PassSums | None]) -> PassSums | None:
+    """Return the sums of consecutive nodes, which share no memory with them; None without a node."""
+    total: PassSums | None = None
+    for sums in nodes:
+        if sums is not None and total is not None:
+            total.add(sums)
+        elif sums is not None:
+            total = sums.copy()
+    return total
 
 
 def aligned_nodes(first: int, stop: int, largest: int) -> list[tuple[int, int]]:
