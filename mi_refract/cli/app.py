@@ -26,6 +26,16 @@ from mi_refract import __version__
 from mi_refract.io.errors import exit_code
 from mi_refract.io.text import printable
 
+# Options of several commands.
+Define = Annotated[
+    list[str] | None,
+    typer.Option("-D", metavar="NAME=VALUE", help="Replace the value of a <default>; may be repeated."),
+]
+AllowPlugins = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME", help="Also allow this plugin, which ships with the scene; may be repeated."),
+]
+
 
 class Command(NamedTuple):
     """Where a command is defined, and its line in the help."""

@@ -27,7 +27,7 @@ from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.safe_files import writable
 from mi_refract.io.text import printable
 
-from .app import shows
+from .app import AllowPlugins, shows
 from .interrupts import last_act
 
 RENDERS, SPP = 16, 16  # number of renders of a scene in the self-test, and their samples per pixel
@@ -270,10 +270,6 @@ def _progress() -> Iterator[Callable[[int, int], None]]:
 
 Images = Annotated[
     Path, typer.Argument(metavar="REFERENCE", help="An image, a folder of renders of one image, or a scene.")
-]
-AllowPlugins = Annotated[
-    list[str] | None,
-    typer.Option(metavar="NAME", help="Also allow this plugin, which ships with the scene; may be repeated."),
 ]
 
 

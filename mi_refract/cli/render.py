@@ -22,6 +22,7 @@ from mi_refract.io.text import printable
 from mi_refract.rendering import scene_files
 
 from . import interrupts
+from .app import AllowPlugins, Define
 from .doctor import activate
 from .render_progress import parse_seconds, parse_share, shown, shown_error
 
@@ -32,10 +33,7 @@ if TYPE_CHECKING:  # this import loads Mitsuba
 def render(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.xml", help="The scene, in Mitsuba's XML.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT.exr", help="The image to write.")],
-    define: Annotated[
-        list[str] | None,
-        typer.Option("-D", metavar="NAME=VALUE", help="Replace the value of a <default>; may be repeated."),
-    ] = None,
+    define: Define = None,
     variant: Annotated[
         str | None, typer.Option(help="Mitsuba variant. Default: llvm_ad_rgb where it runs, else scalar_rgb.")
     ] = None,
@@ -72,14 +70,7 @@ def render(
     preview: Annotated[
         Path | None, typer.Option(metavar="X.png", help="Write a preview of the current image every 10 seconds.")
     ] = None,
-    allow_plugins: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--allow-plugins",
-            metavar="NAME",
-            help="Also allow this plugin, which ships with the scene; may be repeated.",
-        ),
-    ] = None,
+    allow_plugins: AllowPlugins = None,
     scheduler: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS", help="Render on the workers of this Dask scheduler: tcp://host:8786."),

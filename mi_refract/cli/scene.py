@@ -12,6 +12,7 @@ from mi_refract import SCENES
 from mi_refract.io.text import printable
 from mi_refract.rendering import scene_files
 
+from .app import Define
 from .doctor import activate
 
 app = typer.Typer(help="Write scenes for other renderers.", add_completion=False, rich_markup_mode=None)
@@ -47,10 +48,7 @@ def export(
     level: Annotated[
         int | None, typer.Option(help="Subdivision of curved shapes, 0 to 8; each level halves the edges. Default: 5.")
     ] = None,
-    define: Annotated[
-        list[str] | None,
-        typer.Option("-D", metavar="NAME=VALUE", help="Replace the value of a <default>; may be repeated."),
-    ] = None,
+    define: Define = None,
 ) -> None:
     """Write a Mitsuba scene for another renderer, as triangles.
 
