@@ -167,11 +167,10 @@ def shows(text: Callable[[], str]) -> Callable[[bool], None]:
     return callback
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run `arguments`, by default the command line, and return the exit code. Warnings are one line on stderr."""
+def main(arguments: list[str]) -> int:
+    """Run `arguments` and return the exit code. Warnings are one line on stderr."""
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: print(printable(f"mi-refract: {message}"), file=sys.stderr)
-        words = sys.argv[1:] if arguments is None else arguments
         # `obj`: reports show the command line that made them.
-        run = functools.partial(app, words, prog_name="mi-refract", standalone_mode=False, obj=words)
+        run = functools.partial(app, arguments, prog_name="mi-refract", standalone_mode=False, obj=arguments)
         return exit_code("mi-refract", run, (KeyboardInterrupt, typer.Abort))

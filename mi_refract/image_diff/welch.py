@@ -234,10 +234,8 @@ def _verdict(tests: TileTests, resolution: float, hidden: float) -> tuple[Verdic
     if tests.levels[0].silent.all():
         return Verdict.EQUAL, "no noise, and no tile differs beyond the margin"
     visible, share = tests.minimum_detectable(), tests.hidden_share(resolution)
-    smallest, hidden_ones = (
-        f"one of {_percent(visible)}",
-        f"one of {_percent(resolution)} in {_percent(share)} of the tiles",
-    )
+    smallest = f"one of {_percent(visible)}"
+    hidden_ones = f"one of {_percent(resolution)} in {_percent(share)} of the tiles"
     if not visible <= resolution or share > hidden:
         where = f"{smallest} in the median tile" + (f", and {hidden_ones}" if share else "")
         return Verdict.INCONCLUSIVE, f"no difference is seen, but noise hides {where}"
