@@ -176,8 +176,7 @@ class PixelSums:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             s2 = np.where(total <= 0, 0.0, 2 * self.exponent * np.square(total) / (inflation.factor * squares))
         exponent = s2 if np.isinf(inflation.freedom) else inflation.freedom * np.log1p(s2 / inflation.freedom)
-        bound: Array = np.exp(-exponent / 2).max(0)
-        return bound
+        return np.asarray(np.exp(-exponent / 2).max(0))
 
 
 def sums(

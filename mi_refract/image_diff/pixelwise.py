@@ -114,8 +114,7 @@ def paired(
 
 def paired_accepts(a: Pixels, b: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
     """Return the pixels, H × W, of two images, H × W × C, that `paired` calls unchanged."""
-    unchanged: NDArray[np.bool_] = (np.abs(b - a) / _scale(a, b) <= options["threshold"]).all(-1)
-    return unchanged
+    return np.asarray((np.abs(b - a) / _scale(a, b) <= options["threshold"]).all(-1))
 
 
 def _scale(a: Pixels, b: Pixels) -> Pixels:

@@ -33,8 +33,7 @@ class Film:
     @property
     def reach(self) -> int:
         """Number of pixels on each side that a sample reaches."""
-        radius: float = self.rfilter.radius()
-        return math.ceil(radius - 0.5)
+        return math.ceil(float(self.rfilter.radius()) - 0.5)
 
     def pixels(self) -> tuple[Any, Any]:
         """Return x and y of all pixels."""
