@@ -107,14 +107,6 @@ def selected(image: Image, names: Mapping[str, str]) -> Image:
     return replace(image, pixels=pixels, channels=tuple(new_names.values()), variances=variances)
 
 
-def chosen(images: Sequence[Image], names: Names, side: int) -> list[Image]:
-    """Return the images with these channels only, under the reference's names; unchanged if `names` is empty.
-
-    `side`: 0 for images of the reference, 1 for new ones.
-    """
-    return [selected(image, {pair[side]: pair[0] for pair in names}) if names else image for image in images]
-
-
 # Films of the moment integrator -------------------------------------------------------------------------------------
 
 

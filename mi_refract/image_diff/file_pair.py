@@ -82,7 +82,8 @@ def compare(
                 raise ValueError(f"variance = {how.variance!r}: names {variance_path} itself; expected another image")
             if variance_path.exists():
                 renders = [channels.with_file(renders[0], read(variance_path, how.max_values))]
-        selected.append(channels.chosen(renders, how.channels, side))
+        names = {pair[side]: pair[0] for pair in how.channels}  # new names, those of the reference, by old ones
+        selected.append([channels.selected(image, names) if names else image for image in renders])
     reference, test = selected
     if how.reads_variance and not (len(reference) > 1 or channels.has_variance(reference[0])):
         variance_path = pairing.beside(how.variance, path, roots[0], how.above)

@@ -304,8 +304,8 @@ def test_films_of_moments_that_cannot_be_compared():
     more = moments(1, extra=["depth"])
     with pytest.raises(ValueError, match="or `channels`: those to compare"):
         compare("auto", more, test, spp=16)
-    names = tuple((f"nested.{name}", f"nested.{name}") for name in XYZ)
-    sides = (channels.chosen([image], names, side)[0] for side, image in enumerate((more, test)))
+    names = {f"nested.{name}": f"nested.{name}" for name in XYZ}
+    sides = (channels.selected(image, names) for image in (more, test))
     assert compare("auto", *sides, spp=16).verdict is EQUAL
 
 
