@@ -25,7 +25,7 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from .io.safe_files import temporary_folder
+from .io.safe_files import temporary_folder, write_atomically
 
 CHOICE = "DRJIT_LIBLLVM_PATH"  # the library that Dr.Jit tries first
 OWN_CHOICE = "MI_REFRACT_LIBLLVM"  # has the same value if this module, not the user, chose the library
@@ -290,15 +290,9 @@ def _try(path: str) -> Library:
     defect, lasting = _probe("llvm", {CHOICE: path})
     if key and lasting:
         stored[key] = defect
-        # Replace the file in one step. If it cannot be written, the next process tries the library again.
-        with contextlib.suppress(OSError, RuntimeError):
+        with contextlib.suppress(OSError, RuntimeError):  # then the next process tries the library again
             _cache_file().parent.mkdir(parents=True, exist_ok=True)
-            temporary = _cache_file().with_name(f"backend.json.{os.getpid()}")
-            try:
-                temporary.write_text(json.dumps(dict(list(stored.items())[-50:]), indent=1))
-                temporary.replace(_cache_file())
-            finally:
-                temporary.unlink(missing_ok=True)
+            write_atomically(_cache_file(), json.dumps(dict(list(stored.items())[-50:]), indent=1))
     return Library(path, defect)
 
 
