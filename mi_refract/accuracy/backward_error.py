@@ -43,7 +43,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_refract.regimes import Array, Rays
+from mi_refract.regimes import Array, Rays, normalised
 
 from .judge import absolute_radicand, lengths
 
@@ -57,7 +57,7 @@ def of_directions(b: Array, rays: Rays, reflected: NDArray[np.bool_] | None = No
     `reflected`: (N,) whether b is a mirror direction: then k = 1, and b is on the side that the ray comes from.
     """
     reflected = np.zeros(len(rays), bool) if reflected is None else reflected
-    a, n, b, k = _unit(rays.a), _unit(rays.n), _unit(b), rays.k.astype(np.longdouble)
+    a, n, b, k = unit(rays.a), unit(rays.n), unit(b), rays.k.astype(np.longdouble)
     cosine, axis, one = (n * a).sum(1), np.cross(n, a), np.ones_like(k)
     w, mirror = k[:, None] * a - b, a - 2 * cosine[:, None] * n
     gamma = (n * w).sum(1)
@@ -104,7 +104,7 @@ def of_lengths(b: Array, rays: Rays, reflected: NDArray[np.bool_]) -> Array:
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
 def of_decisions(rays: Rays) -> Array:
     """(N,) the backward errors of wrong decisions: the distance to inputs on the other side of the critical angle."""
-    a, n, k = _unit(rays.a), _unit(rays.n), rays.k.astype(np.longdouble)
+    a, n, k = unit(rays.a), unit(rays.n), rays.k.astype(np.longdouble)
     sine, cosine = lengths(np.cross(n, a)), np.abs((n * a).sum(1))
     e = k * sine
     step = absolute_radicand(rays) / (2 * e * (2 * k * cosine + e))
@@ -113,8 +113,8 @@ def of_decisions(rays: Rays) -> Array:
     return result
 
 
-def _unit(v: Array) -> Array:
+def unit(v: Array) -> Array:
+    """Vectors (N, 3) of length 1, in extended precision."""
     wide = v.astype(np.longdouble)
-    wide = wide / np.abs(wide).max(1, keepdims=True, initial=0)  # else squares of the smallest numbers would be 0
-    unit: Array = wide / lengths(wide)[:, None]
-    return unit
+    # Divided by the largest component first, else the squares of the smallest numbers would be 0.
+    return normalised(wide / np.abs(wide).max(1, keepdims=True, initial=0))

@@ -167,11 +167,8 @@ def possible(b: Array, bounds: RayBounds, rows: Index, signal: str = "") -> Flag
 
     `signal`: "tangent" or "reflected" if the directions signal total internal reflection; "" for transmitted ones.
     """
-    # The components of b and of `a` along t, along m, and across both, in extended precision. The vectors are first
-    # divided by their largest component, as the squares of the smallest numbers would be 0.
-    vectors = (v[rows].astype(np.longdouble) for v in (bounds.rays.a, bounds.rays.n, b))
-    vectors = (v / np.abs(v).max(1, keepdims=True, initial=0) for v in vectors)
-    a, n, b = (v / lengths(v)[:, None] for v in vectors)
+    # The components of b and of `a` along t, along m, and across both, in extended precision.
+    a, n, b = (backward_error.unit(v[rows]) for v in (bounds.rays.a, bounds.rays.n, b))
     c = (a * n).sum(1, keepdims=True)
     m, tangent = np.where(c < 0, -n, n), a - c * n
     sine, cosine = lengths(tangent), np.abs(c[:, 0])
