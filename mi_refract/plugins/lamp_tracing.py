@@ -504,7 +504,8 @@ class LampTracer:
         # Shading normals n: |n·wi| |geometric·wo| / (|n·wo| |geometric·wi|).
         geometric = _quotient(dr.abs(dr.dot(si.n, si.to_world(bs.wo))), dr.abs(dr.dot(si.n, s.ray.d)))
         weight = weight * (geometric * _quotient(dr.abs(si.wi.z), dr.abs(bs.wo.z)))
-        own = active_next & (s.depth > 0) & self._is_one_way(bsdf)
+        one_way = loop.is_of(self.one_way, bsdf) if self.vectorised else is_one_way(bsdf)
+        own = active_next & (s.depth > 0) & one_way
         if self.one_way if self.vectorised else own:
             weight = self._seen(si, bsdf, bs, weight, s.ray.d, numbers, key + 1, own)
         ray = loop.spawn_ray(si, bs)
@@ -542,9 +543,6 @@ class LampTracer:
         s.sigma = self.loop.media.cross(s.sigma, s.depth, si, bs, bsdf, ray, active)
         s.skipped = dr.dot(ray.o - si.p, ray.d)
         return throughput
-
-    def _is_one_way(self, bsdf: Any) -> Mask:
-        return self.loop.is_of(self.one_way, bsdf) if self.vectorised else is_one_way(bsdf)
 
     def _seen(
         self, si: Interaction, bsdf: Any, bs: Any, weight: Spectrum, arriving: Vector3, numbers: Any, key: Count,

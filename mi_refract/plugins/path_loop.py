@@ -444,7 +444,8 @@ class PathLoop:
     ) -> Spectrum:  # fmt: skip
         """Push the other lobe where the path splits; return the throughput of the sampled lobe."""
         features, p = self.features, dr.detach(bs.pdf)
-        at_boundary = active & s.specular_so_far & self._is_boundary(bsdf)
+        is_boundary = self.is_of(self.boundaries, bsdf) if self.vectorised else bsdf_name(bsdf) in BOUNDARIES
+        at_boundary = active & s.specular_so_far & is_boundary
         s.specular_so_far = s.specular_so_far & mi.has_flag(bs.sampled_type, LOBES.Delta)
         split = at_boundary & (s.depth <= features.split_depth)
         split = split & (s.share * dr.minimum(p, 1 - p) > features.split_weight)
@@ -515,9 +516,3 @@ class PathLoop:
         for first, last in ranges:
             inside |= (number >= first) & (number < last)
         return inside
-
-    def _is_boundary(self, bsdf: BSDF) -> Mask:
-        """Whether a BSDF has one reflected and one refracted direction, and no others."""
-        if not self.vectorised:
-            return bsdf_name(bsdf) in BOUNDARIES
-        return self.is_of(self.boundaries, bsdf)
