@@ -14,7 +14,7 @@ Draw = Callable[[Generator, int, float], tuple[Array, Array]]  # (rng, count, ep
 AngleAt = Callable[[Array, Generator, int, float], Array]  # (k, rng, count, eps) → angles of incidence
 
 
-def _angles_from_ratios(ratios: Callable[[Generator, int], Array], angle: AngleAt) -> Draw:
+def angles_from_ratios(ratios: Callable[[Generator, int], Array], angle: AngleAt) -> Draw:
     """A `Draw` of ratios and of angles that depend on them."""
 
     def draw(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
@@ -33,14 +33,14 @@ DRAWS: dict[str, Draw] = {
     "generic": lambda rng, count, eps: (_uniform_cosines(rng, count), 1.5 ** either(rng, count)),
     "near-normal": lambda rng, count, eps: (log_uniform(rng, 1e-12, 1e-2, count), rng.uniform(0.4, 2.5, count)),
     "grazing": lambda rng, count, eps: (np.pi / 2 - log_uniform(rng, 1e-7, 1e-2, count), rng.uniform(0.4, 2.5, count)),
-    "critical": _angles_from_ratios(lambda rng, count: rng.uniform(1.05, 2.5, count), ANGLES["critical"]),
+    "critical": angles_from_ratios(lambda rng, count: rng.uniform(1.05, 2.5, count), ANGLES["critical"]),
     "matched": lambda rng, count, eps: (_uniform_cosines(rng, count), _nearly_matched(rng, count, eps)),
     "matched, grazing": lambda rng, count, eps: (
         np.pi / 2 - log_uniform(rng, 1e-7, 1e-1, count),
         _nearly_matched(rng, count, eps),
     ),
-    "Brewster": _angles_from_ratios(lambda rng, count: rng.uniform(0.4, 2.5, count), ANGLES["Brewster"]),
-    "k ≫ 1": _angles_from_ratios(
+    "Brewster": angles_from_ratios(lambda rng, count: rng.uniform(0.4, 2.5, count), ANGLES["Brewster"]),
+    "k ≫ 1": angles_from_ratios(
         lambda rng, count: log_uniform(rng, 10, 1e6, count),
         lambda k, rng, count, eps: np.arcsin(np.minimum(1, rng.uniform(0, 1.2, count) / k)),
     ),

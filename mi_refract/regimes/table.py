@@ -11,7 +11,7 @@ from numpy.random import Generator
 from numpy.typing import ArrayLike, DTypeLike
 
 from . import components
-from .angles import ANGLES, AngleAt, drawn, rays_at
+from .angles import ANGLES, AngleAt, angles_from_ratios, drawn, rays_at
 from .rays import Array, Build, Rays, Triple, normalised, rounded
 
 
@@ -128,15 +128,11 @@ def make_given(name: str, ratios: ArrayLike, precision: DTypeLike, seed: int = 0
         raise ValueError(f"regime {name!r}: it defines its own ratios of indices; expected one of {accepting}")
     if (k < regime.least_k).any():
         raise ValueError(f"regime {name!r}: k = {k.min():.6g}; expected {regime.least_k:g} or more")
-    angle = regime.angle
-    if angle is None:
+    if regime.angle is None:
         rays = make(name, len(k), precision, seed)
         return Rays(rays.a, rays.n, k.astype(precision))
     rng, n = _normals(name, len(k), seed)
-
-    def draw(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
-        return angle(k, rng, count, eps), k
-
+    draw = angles_from_ratios(lambda rng, count: k, regime.angle)
     return _rounded(rays_at(draw, rng, n.astype(precision)), precision)
 
 
