@@ -1,6 +1,6 @@
 """TOML and JSON tables that users write, converted to `msgspec.Struct`s, with checks of keys, types and limits.
 
-A field of a struct is a key. Its annotation is the type, `Annotated[float, Meta(gt=0, description="…")]` adds limits
+A field of a struct is a key. Its annotation is the type, `Annotated[float, Meta(gt=0), doc("…")]` adds limits
 and the meaning, and a default makes it optional. The documentation's tables of keys are generated from these structs.
 Do not put a `pattern` for texts into a union with a list: msgspec 0.22 then frees a wrong pointer at exit.
 """
@@ -129,6 +129,11 @@ def _check_finite(value: Any, path: str, infinite: bool) -> None:
         items = value.items() if isinstance(value, dict) else enumerate(value)
         for key, item in items:
             _check_finite(item, f"{path}[{key}]" if isinstance(value, list) else f"{path}.{key}", infinite)
+
+
+def doc(meaning: str) -> msgspec.Meta:
+    """Return the annotation that gives a key its meaning in the documentation."""
+    return msgspec.Meta(description=meaning)
 
 
 def key_table(title: str, kind: type[msgspec.Struct], shared: type[msgspec.Struct] = msgspec.Struct) -> str:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mi_refract.io import safe_files
 from mi_refract.io.text import printable
-from mi_refract.io.typed_table import key_list, parse_toml
+from mi_refract.io.typed_table import doc, key_list, parse_toml
 
 from . import shapes
 from .curves import Curve, affine, unit
@@ -41,12 +41,8 @@ Points = Annotated[list[Point], Meta(min_length=1)]
 Box = tuple[float, float, float, float]
 Direction = float | Point
 Count = Annotated[int, Meta(ge=1, le=1_000_000)]
-Arcs = Annotated[list[float] | None, Meta(description="degrees by which each piece turns left, as an arc; 0: straight")]
+Arcs = Annotated[list[float] | None, doc("degrees by which each piece turns left, as an arc; 0: straight")]
 Index = Positive | Annotated[list[Positive], Meta(min_length=1)] | Annotated[str, Meta(min_length=1)]
-
-
-def _doc(meaning: str) -> Meta:
-    return Meta(description=meaning)
 
 
 # Shapes -----------------------------------------------------------------------------------------------------------
@@ -55,10 +51,10 @@ def _doc(meaning: str) -> Meta:
 class Shape(Struct, forbid_unknown_fields=True, tag_field="kind"):
     """The keys that all shapes have."""
 
-    scale: Annotated[float | Point, _doc("first, stretch the shape by this factor, or by two along x and y")] = 1.0
-    rotate: Annotated[float, _doc("then, turn it counter-clockwise, in degrees")] = 0.0
-    at: Annotated[Point, _doc("then, move its origin to this point")] = (0.0, 0.0)
-    facets: Annotated[Count | None, _doc("number of chords that replace the arcs of a curve")] = None
+    scale: Annotated[float | Point, doc("first, stretch the shape by this factor, or by two along x and y")] = 1.0
+    rotate: Annotated[float, doc("then, turn it counter-clockwise, in degrees")] = 0.0
+    at: Annotated[Point, doc("then, move its origin to this point")] = (0.0, 0.0)
+    facets: Annotated[Count | None, doc("number of chords that replace the arcs of a curve")] = None
 
     def __post_init__(self) -> None:
         """ValueError for a scale that is 0 or out of range."""
@@ -69,60 +65,60 @@ class Shape(Struct, forbid_unknown_fields=True, tag_field="kind"):
 class Inside(Shape):
     """A shape that lies in a medium."""
 
-    outside: Annotated[Index | None, _doc("index around the shape; by default that of the scene")] = None
-    within: Annotated[Text | None, _doc("instead of `outside`: the name of an earlier shape around this one")] = None
+    outside: Annotated[Index | None, doc("index around the shape; by default that of the scene")] = None
+    within: Annotated[Text | None, doc("instead of `outside`: the name of an earlier shape around this one")] = None
 
 
 class Solid(Inside, kw_only=True):
     """A closed curve around one medium."""
 
-    n: Annotated[Index, _doc('index inside: one for all colours, one for each, or a material such as "SCHOTT:N-BK7"')]
-    name: Annotated[Text | None, _doc("a name for `within` of later shapes")] = None
+    n: Annotated[Index, doc('index inside: one for all colours, one for each, or a material such as "SCHOTT:N-BK7"')]
+    name: Annotated[Text | None, doc("a name for `within` of later shapes")] = None
 
 
 class Polygon(Solid, tag="polygon", kw_only=True):
     """A closed chain of straight pieces and arcs of circles."""
 
-    points: Annotated[Points, _doc("the corners")]
+    points: Annotated[Points, doc("the corners")]
     arcs: Arcs = None
 
 
 class Rectangle(Solid, tag="rectangle", kw_only=True):
     """A rectangle around its origin."""
 
-    width: Annotated[Positive, _doc("size along x")]
-    height: Annotated[Positive, _doc("size along y")]
+    width: Annotated[Positive, doc("size along x")]
+    height: Annotated[Positive, doc("size along y")]
 
 
 class Prism(Solid, tag="prism", kw_only=True):
     """A triangle with two equal sides, its apex up, its centroid at the origin."""
 
-    side: Annotated[Positive, _doc("length of the two equal sides")]
-    apex: Annotated[float, Meta(gt=0, lt=180), _doc("the angle between the equal sides, in degrees")] = 60.0
+    side: Annotated[Positive, doc("length of the two equal sides")]
+    apex: Annotated[float, Meta(gt=0, lt=180), doc("the angle between the equal sides, in degrees")] = 60.0
 
 
 class Circle(Solid, tag="circle", kw_only=True):
     """A circle around its origin."""
 
-    radius: Annotated[Positive, _doc("radius of the circle")]
+    radius: Annotated[Positive, doc("radius of the circle")]
 
 
 class Ellipse(Solid, tag="ellipse", kw_only=True):
     """An ellipse around its origin."""
 
-    radii: Annotated[tuple[Positive, Positive], _doc("half axes along x and y")]
+    radii: Annotated[tuple[Positive, Positive], doc("half axes along x and y")]
 
 
 class Lens(Solid, tag="lens", kw_only=True):
     """Two conic surfaces z = c r² / (1 + √(1 − (1 + K) c² r²)) on the x axis, with a rim between them."""
 
-    curvature: Annotated[Point | None, _doc("c of front and back, positive if the centre lies toward +x")] = None
-    R1: Annotated[float | None, _doc("radius of curvature of the front, 1/c; 0: flat")] = None
-    R2: Annotated[float | None, _doc("radius of curvature of the back; R1 and R2 replace `curvature`")] = None
-    conic: Annotated[Point, _doc("conic constants K of front and back")] = (0.0, 0.0)
-    thickness: Annotated[Positive, _doc("thickness on the axis")]
-    radius: Annotated[Positive | None, _doc("half the aperture; by default, where the surfaces meet")] = None
-    vertex: Annotated[float, _doc("x of the point where the front meets the axis")] = 0.0
+    curvature: Annotated[Point | None, doc("c of front and back, positive if the centre lies toward +x")] = None
+    R1: Annotated[float | None, doc("radius of curvature of the front, 1/c; 0: flat")] = None
+    R2: Annotated[float | None, doc("radius of curvature of the back; R1 and R2 replace `curvature`")] = None
+    conic: Annotated[Point, doc("conic constants K of front and back")] = (0.0, 0.0)
+    thickness: Annotated[Positive, doc("thickness on the axis")]
+    radius: Annotated[Positive | None, doc("half the aperture; by default, where the surfaces meet")] = None
+    vertex: Annotated[float, doc("x of the point where the front meets the axis")] = 0.0
 
     def __post_init__(self) -> None:
         """ValueError unless the curvatures are given in exactly one way."""
@@ -135,25 +131,25 @@ class Lens(Solid, tag="lens", kw_only=True):
 class EllipseLens(Solid, tag="ellipse_lens", kw_only=True):
     """Focuses rays along x into its origin: an ellipse of eccentricity outside/n (first colour), and a circle."""
 
-    focal_length: Annotated[Positive, _doc("distance from the front to the focus")]
-    thickness: Annotated[Positive, _doc("thickness on the axis")]
-    radius: Annotated[Positive, _doc("half the aperture")]
+    focal_length: Annotated[Positive, doc("distance from the front to the focus")]
+    thickness: Annotated[Positive, doc("thickness on the axis")]
+    radius: Annotated[Positive, doc("half the aperture")]
 
 
 class Luneburg(Inside, tag="luneburg", kw_only=True):
     """A ball in concentric layers of index outside × √(2 − (r/radius)²)."""
 
-    radius: Annotated[Positive, _doc("radius of the outermost layer")]
-    layers: Annotated[int, Meta(ge=1, le=10_000), _doc("number of layers")]
+    radius: Annotated[Positive, doc("radius of the outermost layer")]
+    layers: Annotated[int, Meta(ge=1, le=10_000), doc("number of layers")]
 
 
 class Boundary(Shape, tag="boundary", kw_only=True):
     """An open chain of straight pieces and arcs of circles between two media."""
 
-    points: Annotated[Points, _doc("the vertices")]
+    points: Annotated[Points, doc("the vertices")]
     arcs: Arcs = None
-    n_left: Annotated[Index, _doc("index on the left, seen along the boundary")]
-    n_right: Annotated[Index, _doc("index on the right")]
+    n_left: Annotated[Index, doc("index on the left, seen along the boundary")]
+    n_right: Annotated[Index, doc("index on the right")]
 
 
 def _curves(shape: AnyShape, n: dict[str, Indices]) -> list[tuple[Curve, Indices, Indices]]:
@@ -199,25 +195,25 @@ class Beam(Struct, forbid_unknown_fields=True, tag_field="kind"):
 class Parallel(Beam, tag="parallel", kw_only=True):
     """Parallel rays from a line."""
 
-    start: Annotated[Point, _doc("start of the first ray")] = field(name="from")
-    to: Annotated[Point, _doc("start of the last ray")]
-    direction: Annotated[Direction, _doc("direction of all rays: degrees, or [x, y] that is not [0, 0]")]
-    count: Annotated[Count, _doc("number of rays; a single ray starts in the middle")]
+    start: Annotated[Point, doc("start of the first ray")] = field(name="from")
+    to: Annotated[Point, doc("start of the last ray")]
+    direction: Annotated[Direction, doc("direction of all rays: degrees, or [x, y] that is not [0, 0]")]
+    count: Annotated[Count, doc("number of rays; a single ray starts in the middle")]
 
 
 class Fan(Beam, tag="fan", kw_only=True):
     """Rays from a point."""
 
-    at: Annotated[Point, _doc("start of all rays")]
-    angles: Annotated[Point, _doc("directions of the first and of the last ray, in degrees")]
-    count: Annotated[Count, _doc("number of rays; a single ray has the middle direction")]
+    at: Annotated[Point, doc("start of all rays")]
+    angles: Annotated[Point, doc("directions of the first and of the last ray, in degrees")]
+    count: Annotated[Count, doc("number of rays; a single ray has the middle direction")]
 
 
 class Rays(Beam, tag="rays", kw_only=True):
     """Rays one by one."""
 
-    origins: Annotated[Points, _doc("starts of the rays")]
-    directions: Annotated[list[Direction], _doc("a direction for each start, as for `parallel`")]
+    origins: Annotated[Points, doc("starts of the rays")]
+    directions: Annotated[list[Direction], doc("a direction for each start, as for `parallel`")]
 
     def __post_init__(self) -> None:
         """ValueError for another number of directions than of origins."""
@@ -257,16 +253,16 @@ Wavelengths = Annotated[int, Meta(ge=2, le=MOST)] | Annotated[list[Nanometres], 
 class SceneTable(Struct, kw_only=True, forbid_unknown_fields=True):
     """A scene file."""
 
-    title: Annotated[Text | None, _doc("title of the figure; by default the file's name")] = None
-    index: Annotated[Index, _doc("index of the medium around all shapes; values as for `n` of a shape")] = 1.0
-    colours: Annotated[Names | None, _doc("names of colours that matplotlib knows")] = None
-    wavelengths: Annotated[Wavelengths | None, _doc("nm, or how many from 380 to 730; replace `colours`")] = None
-    light: Annotated[Literal["flat", "D65"], _doc("powers of the wavelengths: equal, or those of daylight")] = "flat"
-    max_depth: Annotated[int, Meta(ge=1, le=100_000), _doc("largest number of boundaries that a ray meets")] = 16
-    branches: Annotated[int, Meta(ge=0, le=8), _doc("largest number of partial reflections on a path")] = 0
-    view: Annotated[Box | None, _doc("x0, x1, y0, y1 of the figure; by default it shows all shapes")] = None
-    shape: Annotated[list[AnyShape], Meta(min_length=1), _doc("[[shape]]: boundaries between media")]
-    beam: Annotated[list[AnyBeam], Meta(min_length=1), _doc("[[beam]]: rays to follow")]
+    title: Annotated[Text | None, doc("title of the figure; by default the file's name")] = None
+    index: Annotated[Index, doc("index of the medium around all shapes; values as for `n` of a shape")] = 1.0
+    colours: Annotated[Names | None, doc("names of colours that matplotlib knows")] = None
+    wavelengths: Annotated[Wavelengths | None, doc("nm, or how many from 380 to 730; replace `colours`")] = None
+    light: Annotated[Literal["flat", "D65"], doc("powers of the wavelengths: equal, or those of daylight")] = "flat"
+    max_depth: Annotated[int, Meta(ge=1, le=100_000), doc("largest number of boundaries that a ray meets")] = 16
+    branches: Annotated[int, Meta(ge=0, le=8), doc("largest number of partial reflections on a path")] = 0
+    view: Annotated[Box | None, doc("x0, x1, y0, y1 of the figure; by default it shows all shapes")] = None
+    shape: Annotated[list[AnyShape], Meta(min_length=1), doc("[[shape]]: boundaries between media")]
+    beam: Annotated[list[AnyBeam], Meta(min_length=1), doc("[[beam]]: rays to follow")]
 
     def __post_init__(self) -> None:
         """ValueError for an empty view."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from mi_refract import media
 from mi_refract.io.text import parse_number
-from mi_refract.io.typed_table import convert
+from mi_refract.io.typed_table import convert, doc
 from mi_refract.regimes import REGIMES, Array
 
 Ids = NDArray[np.int64]
@@ -53,30 +53,26 @@ Wavelengths = Annotated[list[Wavelength], Meta(min_length=1, max_length=MOST_MED
 Pairs = Annotated[list[tuple[MediumName, MediumName]], Meta(min_length=2, max_length=2 * MOST_MEDIA)]
 
 
-def _doc(meaning: str) -> Meta:
-    return Meta(description=meaning)
-
-
 class RaysHeader(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The keys of a header. The keys of media are all present or all absent."""
 
-    format: Annotated[Literal["mi_refract rays 1"], _doc("the format, and its version")]
-    version: Annotated[Text, _doc("version of mi_refract that wrote the file")]
-    precision: Annotated[Literal["f32", "f64"], _doc("precision of all numbers except `id`")]
-    seed: Annotated[int, Meta(ge=0, le=2**63 - 1), _doc("seed of the random rays")]
-    count: Annotated[int, Meta(ge=1, le=2**63 - 1), _doc("number of rays of each regime")]
-    two_sided: Annotated[bool, _doc("whether normals may be on either side of the surface")]
-    a: Annotated[Text, _doc("meaning of `ax, ay, az`, for readers")]
-    n: Annotated[Text, _doc("meaning of `nx, ny, nz`, for readers")]
-    indices: Annotated[Text, _doc("their meaning, for readers")] = msgspec.field(name="n_from, n_to")
-    answer: Annotated[Text, _doc("the columns of an answer, for readers")]
-    regimes: Annotated[dict[Text, tuple[int, int]], _doc("first and last id of each regime")]
-    checksum: Annotated[str, Meta(pattern="^sha256:[0-9a-f]{64}$"), _doc("checksum of header and rays")]
-    columns_of_media: Annotated[MediumName | UnsetType, _doc("only with media: their meaning, for readers")] = (
+    format: Annotated[Literal["mi_refract rays 1"], doc("the format, and its version")]
+    version: Annotated[Text, doc("version of mi_refract that wrote the file")]
+    precision: Annotated[Literal["f32", "f64"], doc("precision of all numbers except `id`")]
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1), doc("seed of the random rays")]
+    count: Annotated[int, Meta(ge=1, le=2**63 - 1), doc("number of rays of each regime")]
+    two_sided: Annotated[bool, doc("whether normals may be on either side of the surface")]
+    a: Annotated[Text, doc("meaning of `ax, ay, az`, for readers")]
+    n: Annotated[Text, doc("meaning of `nx, ny, nz`, for readers")]
+    indices: Annotated[Text, doc("their meaning, for readers")] = msgspec.field(name="n_from, n_to")
+    answer: Annotated[Text, doc("the columns of an answer, for readers")]
+    regimes: Annotated[dict[Text, tuple[int, int]], doc("first and last id of each regime")]
+    checksum: Annotated[str, Meta(pattern="^sha256:[0-9a-f]{64}$"), doc("checksum of header and rays")]
+    columns_of_media: Annotated[MediumName | UnsetType, doc("only with media: their meaning, for readers")] = (
         msgspec.field(name="wavelength, medium", default=UNSET)
     )
-    media: Annotated[Pairs | UnsetType, _doc("only with media: pairs [from, to] for the column `medium`")] = UNSET
-    wavelengths: Annotated[Wavelengths | UnsetType, _doc("only with media: wavelengths in nm")] = UNSET
+    media: Annotated[Pairs | UnsetType, doc("only with media: pairs [from, to] for the column `medium`")] = UNSET
+    wavelengths: Annotated[Wavelengths | UnsetType, doc("only with media: wavelengths in nm")] = UNSET
 
     def __post_init__(self) -> None:
         """ValueError if only some of the keys of media are present."""

@@ -14,7 +14,7 @@ import msgspec
 from msgspec import Meta
 
 from mi_refract.io import safe_files
-from mi_refract.io.typed_table import key_table, parse_toml
+from mi_refract.io.typed_table import doc, key_table, parse_toml
 
 NAME = "mi-refract-renderer.toml"
 SIZE = 2**20  # largest size of the file in bytes
@@ -25,38 +25,35 @@ Command = Annotated[tuple[Text, ...], Meta(min_length=1)]
 class Deviation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A regime in which a function is known to be wrong."""
 
-    regime: Annotated[str, Meta(min_length=1, description="a regime, or a set of rays of the study")]
-    reason: Annotated[str, Meta(min_length=1, description="the reason")]
+    regime: Annotated[Text, doc("a regime, or a set of rays of the study")]
+    reason: Annotated[Text, doc("the reason")]
 
 
 class RaysCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A function of refraction. `command` contains its placeholders, as in the file."""
 
-    title: Annotated[str, Meta(min_length=1, description="name of the function in reports")]
-    precision: Annotated[Literal["f32", "f64"], Meta(description="the precision of its answers")]
+    title: Annotated[Text, doc("name of the function in reports")]
+    precision: Annotated[Literal["f32", "f64"], doc("the precision of its answers")]
     command: Annotated[
-        Command, Meta(description="reads rays on stdin and writes answers to stdout, as CSV; runs in the file's folder")
+        Command, doc("reads rays on stdin and writes answers to stdout, as CSV; runs in the file's folder")
     ]
     tir: Annotated[
         Literal["auto", "zero", "nan", "reflected", "tangent", "flag"],
-        Meta(description="how the function signals total internal reflection"),
+        doc("how the function signals total internal reflection"),
     ] = msgspec.field(name="total_internal_reflection", default="auto")
     gives_up: Annotated[
         float,
-        Meta(
-            ge=0,
-            description="rays with cos²θ_t below this are totally reflected, according to the renderer's documentation",
-        ),
+        Meta(ge=0),
+        doc("rays with cos²θ_t below this are totally reflected, according to the renderer's documentation"),
     ] = 0.0
-    lengths: Annotated[str, Meta(description="how it handles vectors that are not unit")] = ""
-    remark: Annotated[str, Meta(description="further remarks")] = ""
+    lengths: Annotated[str, doc("how it handles vectors that are not unit")] = ""
+    remark: Annotated[str, doc("further remarks")] = ""
     recorded: Annotated[
         dict[str, float | list[float]],  # msgspec 0.22 misreads limits within a union with a list
-        Meta(description="largest angle in radians in an earlier run, by set of rays: a number, or [from, to]"),
+        doc("largest angle in radians in an earlier run, by set of rays: a number, or [from, to]"),
     ] = {}
     deviation: Annotated[
-        tuple[Deviation, ...],
-        Meta(description="`[[rays.deviation]]`: regimes in which it is known to be wrong, and why"),
+        tuple[Deviation, ...], doc("`[[rays.deviation]]`: regimes in which it is known to be wrong, and why")
     ] = ()
 
     def __post_init__(self) -> None:
@@ -83,17 +80,14 @@ class RaysCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class ImagesCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How to render an image with a renderer."""
 
-    export: Annotated[str, Meta(min_length=1, description="a target of `mi-refract scene export`")]
-    command: Annotated[
-        Command, Meta(description="renders {scene} with {spp} samples per pixel and the seed {seed} into {image}")
-    ]
+    export: Annotated[Text, doc("a target of `mi-refract scene export`")]
+    command: Annotated[Command, doc("renders {scene} with {spp} samples per pixel and the seed {seed} into {image}")]
     spp: Annotated[
-        dict[str, Annotated[int, Meta(ge=1)]],
-        Meta(description="samples per pixel by scene; other scenes are not rendered"),
+        dict[str, Annotated[int, Meta(ge=1)]], doc("samples per pixel by scene; other scenes are not rendered")
     ]
-    assumed: Annotated[tuple[Text, ...], Meta(description="how its model differs from Mitsuba's")] = ()
-    deviations: Annotated[dict[str, Text], Meta(description="scenes on which it is known to differ, and why")] = (
-        msgspec.field(name="deviation", default_factory=dict)
+    assumed: Annotated[tuple[Text, ...], doc("how its model differs from Mitsuba's")] = ()
+    deviations: Annotated[dict[str, Text], doc("scenes on which it is known to differ, and why")] = msgspec.field(
+        name="deviation", default_factory=dict
     )
 
     def __post_init__(self) -> None:
@@ -104,14 +98,13 @@ class ImagesCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class RendererFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A renderer. `install` is the table of the file, unchecked."""
 
-    title: Annotated[str, Meta(min_length=1, description="name of the renderer in reports")]
-    licence: Annotated[str, Meta(description="its licence")] = ""
-    rays: Annotated[tuple[RaysCommand, ...], Meta(description="`[[rays]]`: functions that answer rays")] = ()
-    images: Annotated[ImagesCommand | None, Meta(description="`[images]`: how it renders a scene")] = None
-    lens: Annotated[tuple[Text, ...], Meta(description="a command that traces a lens, for the study `lenses`")] = ()
+    title: Annotated[Text, doc("name of the renderer in reports")]
+    licence: Annotated[str, doc("its licence")] = ""
+    rays: Annotated[tuple[RaysCommand, ...], doc("`[[rays]]`: functions that answer rays")] = ()
+    images: Annotated[ImagesCommand | None, doc("`[images]`: how it renders a scene")] = None
+    lens: Annotated[tuple[Text, ...], doc("a command that traces a lens, for the study `lenses`")] = ()
     install: Annotated[
-        dict[str, Any] | None,
-        Meta(description="`[install]`: how to install it; only for the renderers of this project"),
+        dict[str, Any] | None, doc("`[install]`: how to install it; only for the renderers of this project")
     ] = None
 
     def __post_init__(self) -> None:
