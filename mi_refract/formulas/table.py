@@ -82,10 +82,7 @@ class Formula:
 FORMULAS = {
     "wedge": Formula(refract_wedge, "000, boxed", "b = k n(n∧a) + s n √(a² + k²(n∧a)²)", budget=cancelling(1)),
     "wedge_contrast": Formula(
-        refract_wedge_contrast,
-        "000, last form",
-        "b = k n(n∧a) + s n √((n·a)² + (n∧a)²(k² − 1))",
-        budget=CONTRASTING,
+        refract_wedge_contrast, "000, last form", "b = k n(n∧a) + s n √((n·a)² + (n∧a)²(k² − 1))", budget=CONTRASTING
     ),
     "cross": Formula(refract_cross, "001, eq. 6", "t = n×c + s √(1 − ‖c‖²) n, c = k (i×n)", budget=cancelling(1)),
     "decomposed": Formula(

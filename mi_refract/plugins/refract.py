@@ -140,10 +140,7 @@ def read_parameters(self: Refract, props: Properties, formula: str = "auto") -> 
     self.eta = parameter_type(v)(eta)
     set_ratio(self, checked("int_ior / ext_ior", eta))
     both_sides = FLAGS.FrontSide | FLAGS.BackSide
-    self.m_components = [
-        FLAGS.DeltaReflection | both_sides,
-        FLAGS.DeltaTransmission | both_sides | FLAGS.NonSymmetric,
-    ]
+    self.m_components = [FLAGS.DeltaReflection | both_sides, FLAGS.DeltaTransmission | both_sides | FLAGS.NonSymmetric]
     self.m_flags = self.m_components[0] | self.m_components[1]
     textured = self.textures or isinstance(self.varying, TexturedRatio)
     # Mesh attributes that textures read. Only `sample` knows the shape; scalar variants raise if the shape lacks one.
@@ -338,13 +335,7 @@ def other_rays(self: Refract, si: Interaction, ray: Ray) -> list[OtherRay]:
 
 
 def mueller(
-    self: Refract,
-    ctx: Context,
-    si: Interaction,
-    bs: BSDFSample,
-    ray: Ray,
-    selected_r: Mask,
-    others: list[OtherRay],
+    self: Refract, ctx: Context, si: Interaction, bs: BSDFSample, ray: Ray, selected_r: Mask, others: list[OtherRay]
 ) -> Spectrum:
     """Return the Mueller matrix of the selected lobe, rotated to the implicit Stokes bases of both directions.
 

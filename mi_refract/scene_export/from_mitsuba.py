@@ -13,17 +13,7 @@ from mi_refract.io.image_file import read_exr
 
 from .meshes_from_shapes import MOST, meshes_of_shape, with_unique_names
 from .mitsuba_nodes import Node, SceneFile
-from .plain_scene import (
-    Camera,
-    Colour,
-    DirectionalLamp,
-    Environment,
-    Lamp,
-    Mesh,
-    PlainScene,
-    PointLamp,
-    SpotLamp,
-)
+from .plain_scene import Camera, Colour, DirectionalLamp, Environment, Lamp, Mesh, PlainScene, PointLamp, SpotLamp
 
 LEVEL = 5  # default tessellation level: spheres of 20480 triangles, circles of 256 segments
 LEVELS = range(9)

@@ -6,17 +6,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from ..plain_scene import (
-    Colour,
-    Diffuse,
-    DirectionalLamp,
-    Environment,
-    Glass,
-    Lamp,
-    PlainScene,
-    PointLamp,
-    SpotLamp,
-)
+from ..plain_scene import Colour, Diffuse, DirectionalLamp, Environment, Glass, Lamp, PlainScene, PointLamp, SpotLamp
 from .shared_files import Array, Files, exr, frame, numbers, ply_files, readme
 
 COMMANDS = "mi-refract render scene.xml -o image.exr --spp 1024        (-D bsdf=dielectric for Mitsuba's own glass)"
