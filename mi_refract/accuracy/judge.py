@@ -267,7 +267,7 @@ def judge(
 Subject: TypeAlias = Callable[[Vector3, Vector3, Number], tuple[Vector3, Mask]]
 
 
-def evaluate(subject: Subject, rays: Rays, vector: ArrayType) -> tuple[Array, NDArray[np.bool_]]:
+def evaluate(subject: Subject, rays: Rays, vector: ArrayType) -> tuple[Array, Flags]:
     """(b, transmitted) for all rays, (N, 3) in extended precision and (N,).
 
     `vector`: the 3-vector type of Dr.Jit to compute with. With scalar types the subject is called for each ray.

@@ -13,17 +13,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mi_refract import oracle
 from mi_refract.accuracy import lengths
 from mi_refract.regimes import Array, Rays
 
-from .judged_answers import F32, Flags, JudgedAnswers, Table
+from .judged_answers import F32, Index, JudgedAnswers, Table
 from .ray_set import indices
-from .tir_signal import unit
-
-Index = NDArray[np.intp]
+from .tir_signal import Flags, unit
 
 VISIBLE, SAME = 0.1, 5e-3  # radians
 MOST, ALL = 0.9, 0.99  # shares of the answers that a mistake and a loss of precision must explain

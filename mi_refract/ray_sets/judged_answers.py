@@ -26,9 +26,8 @@ from mi_refract.regimes import Array, Rays
 
 from . import tir_signal
 from .header import PRECISIONS
-from .tir_signal import LOOSEST, ComparedAnswers
+from .tir_signal import LOOSEST, ComparedAnswers, Flags
 
-Flags = NDArray[np.bool_]
 Index = NDArray[np.intp]
 Table = NDArray[np.void]  # a row for each ray, with named columns
 
