@@ -62,15 +62,15 @@ from .sampling import IndependentNumbers, KeyedMultijitter
 from .scene_features import KNOWN, KNOWN_SHAPES, PERTURBING, all_shapes, bsdf_name, children, mesh_attributes, nested
 
 MOST_TARGETS = 16  # spheres at which directions are aimed
-FAR = 8  # a lamp so many times as far away as the spheres is far
+FAR = 8  # a lamp is far if `Line.way` is more than this many times `Line.back`
 MARGIN = 1 + 1e-4  # of a sphere's radius: rounding must not leave its rim out
 LANES = 2**24  # light paths at a time
-PILOT, MOST_PILOT = 256, 2**14  # light paths by which the power of a lamp is estimated, and of all
-DEFENSIVE = 0.1  # share of the light paths that all lamps have alike, whatever the estimate says
+PILOT, MOST_PILOT = 256, 2**14  # light paths that estimate the power of a lamp, and of all lamps
+DEFENSIVE = 0.1  # share of the light paths that is divided equally, whatever the estimate
 SENSORS = {"PerspectiveCamera", "ThinLensCamera", "OrthographicCamera"}
 AREA, PLACE, DIRECTION = range(3)  # kinds of lamps
 KINDS = {"AreaLight": AREA, "PointLight": PLACE, "SpotLight": PLACE, "DirectionalEmitter": DIRECTION}  # TRACED_LAMPS
-# Hair and thin slabs are models that are not reciprocal, measured BSDFs interpolate otherwise in wi than in wo.
+# The models of hair and thin slabs are not reciprocal; measured BSDFs interpolate wi and wo in different ways.
 ONE_WAY = PERTURBING | {"Hair", "Measured", "MeasuredPolarized", "PrincipledThin"}
 LOBES = mi.BSDFFlags
 
@@ -81,7 +81,7 @@ def has_area(lamp: Emitter) -> bool:
 
 
 def refused_lamps(scene: Scene, every: bool) -> str:
-    """Why the lamps of a scene, or only those of zero size, cannot be traced; "" where they can be."""
+    """Why the lamps of a scene, with `every` or else only those of zero size, cannot be traced; "" if they can be."""
     lamps = [lamp for lamp in scene.emitters() if not lamp.is_environment() and (every or not has_area(lamp))]
     if untraced := {lamp.class_name() for lamp in lamps} - KINDS.keys():
         return f"it traces area, point, spot and directional lamps, not {min(untraced)}"
@@ -93,7 +93,7 @@ def refused_lamps(scene: Scene, every: bool) -> str:
         return "an area lamp on a mirrored Cylinder"
     if any(map(mesh_attributes, lamps)):
         return "an area lamp emits an attribute of its mesh"
-    # Mitsuba has the same matrix for light that comes from the lamp, whose order it would turn around.
+    # Mitsuba returns the same matrix for light from the lamp, but its factors would have to be in reverse order.
     if mi.is_polarized and any(
         bsdf_name(bsdf) == "LinearRetarder" for shape in all_shapes(scene) for bsdf in nested(shape.bsdf())
     ):
@@ -103,7 +103,7 @@ def refused_lamps(scene: Scene, every: bool) -> str:
 
 
 def refused_sensor(sensor: Sensor) -> str:
-    """Why light cannot be traced to a sensor; "" where it can be."""
+    """Why light cannot be traced to a sensor; "" if it can be."""
     if sensor.class_name() not in SENSORS:
         return f"it traces light to perspective, thinlens and orthographic cameras, not {sensor.class_name()}"
     if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special) or sensor.film().sample_border():
@@ -117,13 +117,13 @@ def by_area(lamp: Emitter) -> bool:
         return False
     textures = [x for x in children(lamp) if hasattr(x, "is_spatially_varying") and x.is_spatially_varying()]
     exact = lamp.get_shape().class_name() in ("Disk", "Rectangle")
-    matrices = (matrix_of(texture, "to_uv") for texture in textures)  # of which Mitsuba takes no notice
+    matrices = (matrix_of(texture, "to_uv") for texture in textures)  # which Mitsuba ignores
     moved = (x is not None and bool(dr.any(x != dr.identity(type(x)), axis=None)) for x in matrices)
     return bool(textures) and (not exact or any(moved))
 
 
 def matrix_of(node: mi.Object, name: str) -> Any:
-    """A transform that a plugin shows, as a matrix of its own; None where it has none."""
+    """A copy of the matrix of a transform that a plugin exposes; None if it exposes none."""
     parameters = mi.traverse(node)  # a transform is part of them, and does not keep them alive
     return type(parameters[name].matrix)(parameters[name].matrix) if name in parameters else None
 
@@ -134,9 +134,9 @@ def is_one_way(bsdf: BSDF) -> bool:
 
 
 def outward(lamp: Emitter) -> tuple[float, ...]:
-    """Of a lamp on a sphere the centre, and the sign of its normal there; else 0.
+    """The centre of a lamp on a sphere, and the sign of its normal; 0 for other lamps.
 
-    Mitsuba's samples of positions on a sphere that is turned or mirrored have the normal of another place.
+    Mitsuba's samples of positions on a turned or mirrored sphere have the normal of another place.
     """
     if lamp.class_name() != "AreaLight" or (shape := lamp.get_shape()).class_name() != "Sphere":
         return 0.0, 0.0, 0.0, 0.0
@@ -148,7 +148,7 @@ def outward(lamp: Emitter) -> tuple[float, ...]:
 
 
 def lit(lamp: Emitter) -> bool:
-    """Whether path tracing would find light of a lamp that is not in the environment: one of zero size is sampled."""
+    """Whether path tracing would find light of a lamp; a lamp of zero size is found only by emitter sampling."""
     return KINDS[lamp.class_name()] == AREA or lamp.sampling_weight() > 0
 
 
@@ -164,7 +164,7 @@ class Sphere:
 
 
 def targets(scene: Scene) -> list[Sphere]:
-    """Spheres, up to MOST_TARGETS, that bound every shape with a delta lobe, and every one that is not known."""
+    """Up to MOST_TARGETS spheres that bound all shapes that have a delta lobe or are unknown."""
 
     def is_target(shape: Shape) -> bool:
         names = {bsdf_name(bsdf): bsdf.flags() for bsdf in nested(shape.bsdf())}
@@ -175,7 +175,7 @@ def targets(scene: Scene) -> list[Sphere]:
 
 
 def bounding_sphere(shape: Shape) -> Sphere:
-    """About the middle of its bounding box; with an infinite radius, or NaN, where its bounds are not known."""
+    """A sphere around the bounding box of a shape; the radius is infinite or NaN if the bounds are unknown."""
     box = mitsuba_mesh.bounding_box(shape)
     half = [float(x) / 2 for x in box.extents()]
     radius = half[0] if shape.class_name() == "Sphere" else math.hypot(*half)
@@ -183,7 +183,7 @@ def bounding_sphere(shape: Shape) -> Sphere:
 
 
 def merged(spheres: list[Sphere], most: int) -> list[Sphere]:
-    """`most` spheres, at most, that bound these: halves along the axis on which the centres lie farthest apart."""
+    """Up to `most` spheres that bound these: halves along the axis on which the centres are farthest apart."""
     if len(spheres) <= most:
         return spheres
     columns = list(zip(*(s.center for s in spheres), strict=True))
@@ -196,7 +196,7 @@ def merged(spheres: list[Sphere], most: int) -> list[Sphere]:
 
 
 class Table:
-    """Numbers by an index."""
+    """Numbers that are read by index."""
 
     def __init__(self, v: Variant, values: Iterable[float]) -> None:
         """`v`: the variant's module."""
@@ -204,7 +204,7 @@ class Table:
         dr.make_opaque(self.values)
 
     def __getitem__(self, index: Count) -> Number:
-        """At each lane's index; of no derivative."""
+        """The number at each lane's index, without a derivative."""
         return dr.gather(self.v.Float, self.values, index) if dr.is_jit_v(self.v.Float) else self.values[int(index)]
 
 
@@ -230,11 +230,11 @@ class Aim:
         self.odds = Table(v, (p for row in odds for p in row))
 
     def sphere(self, j: Count) -> tuple[Vector3, Number]:
-        """Centre and radius."""
+        """The centre and the radius of sphere j."""
         return self.v.Point3f(self.x[j], self.y[j], self.z[j]), self.radius[j]
 
     def choose(self, lamp: Count, sample: Number) -> Count:
-        """A sphere for a light path of a lamp."""
+        """Choose the sphere at which a light path of a lamp is aimed."""
         chosen, below = self.v.UInt32(0), self.v.Float(0)
         for j in range(self.count - 1):
             below += self.odds[lamp * self.count + j]
@@ -242,7 +242,7 @@ class Aim:
         return chosen
 
     def from_point(self, lamp: Count, chosen: Count, o: Vector3, sample: Point2) -> Line:
-        """A line from `o` toward the sphere that was chosen; its density is one of directions."""
+        """A line from `o` toward the chosen sphere; its density is per solid angle."""
         v, (center, radius) = self.v, self.sphere(chosen)
         sine2 = self._sine2(chosen, o)
         height = sample.x * _one_minus_cosine(sine2)  # 1 − cos, which in a narrow cone is below the steps of a cosine
@@ -266,7 +266,7 @@ class Aim:
         return Line(v.Point3f(p), d, density, way, back)
 
     def from_infinity(self, lamp: Count, chosen: Count, d: Vector3, sample: Point2) -> Line:
-        """A line in the direction d through the sphere that was chosen; its density is one of places."""
+        """A line in the direction d through the chosen sphere; its density is per area."""
         v = self.v
         center, radius = self.sphere(chosen)
         disk = v.warp.square_to_uniform_disk_concentric(sample)
@@ -298,7 +298,7 @@ def _quotient(a: Number, b: Number) -> Number:
 
 
 def _one_minus_cosine(sine2: Number) -> Number:
-    """1 − cos of an angle, of its squared sine; 2, a whole sphere, where that is above 1."""
+    """1 − cos of an angle from its squared sine; 2, for a whole sphere, if that is above 1."""
     return dr.select(sine2 > 1, 2, sine2 / (1 + dr.safe_sqrt(1 - sine2)))
 
 
@@ -323,10 +323,10 @@ class LightPath:
 
 
 class LampTracer:
-    """The lamps' part of an image; see the module docstring."""
+    """Renders the lamps' part of an image; see the module docstring."""
 
     def __init__(self, loop: PathLoop, sensor: Sensor, camera_medium: Callable[[Ray], tuple[Spectrum, Number]]) -> None:
-        """`loop`: that of path tracing. `camera_medium`: σ at the camera, and the way from there to a ray's origin."""
+        """`loop`: of path tracing. `camera_medium`: returns σ at the camera, and the way from it to a ray's origin."""
         v, scene = loop.v, loop.scene
         self.v, self.scene, self.loop, self.features = v, scene, loop, loop.features
         self.vectorised = loop.vectorised
@@ -347,8 +347,8 @@ class LampTracer:
         dr.make_opaque(self.kinds)
         self.any = set(kinds)
         self.pointers = dr.gather(v.EmitterPtr, scene.emitters_dr(), v.UInt32(indices)) if self.vectorised else None
-        # By a texture Mitsuba samples no mesh right whose (u, v) overlap, nor a cylinder that is turned. One call a
-        # shape: a call of a pointer is traced for shapes that cannot be sampled, too.
+        # With a varying texture Mitsuba samples meshes with overlapping (u, v) and turned cylinders wrongly. They are
+        # called directly: a call through a pointer is also traced for shapes that cannot be sampled.
         self.round = [Table(v, column) for column in zip(*map(outward, self.lamps), strict=True)]
         self.by_area = [i for i, lamp in enumerate(self.lamps) if by_area(lamp)]
         spheres = targets(scene)
@@ -375,7 +375,7 @@ class LampTracer:
         return [DEFENSIVE / len(sizes) + (1 - DEFENSIVE) * size / total for size in sizes]
 
     def _pilot(self) -> tuple[list[float], int]:
-        """The power of each lamp toward the spheres as some light paths estimate it, and their number."""
+        """The power of each lamp toward the spheres, estimated by some light paths, and the number of these paths."""
         import numpy as np
 
         v, count = self.v, min(PILOT, MOST_PILOT // len(self.lamps) + 1) * len(self.lamps)
@@ -392,7 +392,7 @@ class LampTracer:
     def _emitted(self, numbers: Any, active: Mask) -> tuple[Count, Ray, Spectrum, Number]:
         """A lamp, a ray from it toward a sphere, its power over the density of all that was chosen, and the way to it.
 
-        A ray from far away starts before the spheres, after a `way` from the lamp: from the lamp it would miss them.
+        A ray of a far lamp starts just before the spheres, a `way` from the lamp; from the lamp it would miss them.
         """
         v, camera = self.v, self.camera.sensor
         time = camera.shutter_open()
@@ -453,7 +453,7 @@ class LampTracer:
         return lamp, v.Ray3f(origin, line.d, time, wavelengths), power * v.Spectrum(weight), way
 
     def trace(self, numbers: Any, splat: Callable[..., None]) -> None:
-        """Light paths, one a lane: `splat(place on the film, value, wavelengths, active)` for each connection."""
+        """Trace a light path per lane: `splat(place on the film, value, wavelengths, active)` for each connection."""
         v, features = self.v, self.features
         _, ray, power, way = self._emitted(numbers, v.Bool(True))
         s = LightPath(ray, power, v.UInt32(0), dr.max(v.unpolarized_spectrum(power)) > 0)
@@ -532,7 +532,7 @@ class LampTracer:
     def _cross(
         self, s: LightPath, si: Interaction, bs: Any, bsdf: Any, ray: Ray, throughput: Spectrum, active: Mask
     ) -> Spectrum:
-        """Take over the medium beyond a boundary; what it declares on this side is that of the way so far."""
+        """Enter the medium beyond a boundary. The medium on this side, which it declares, is that of the way so far."""
         through = active & ((bs.sampled_type & THROUGH) != 0)
         first = through & (s.known ^ True)
         if self.vectorised or (first and bsdf.has_attribute(HERE, first)):
@@ -548,10 +548,10 @@ class LampTracer:
         self, si: Interaction, bsdf: Any, bs: Any, weight: Spectrum, arriving: Vector3, numbers: Any, key: Count,
         active: Mask,
     ) -> Spectrum:  # fmt: skip
-        """The weight of a sample, and its direction, of a BSDF that is evaluated as path tracing does.
+        """The weight of a sample of a BSDF, evaluated as in path tracing; the direction in `bs` may change.
 
-        Light may go there where the BSDF samples nothing for light that comes from the lamp. So one half of the
-        directions are those of a sample, and the other half all alike.
+        Light may leave in directions that the BSDF never samples for light from the lamp. So half of the directions
+        are those of samples, and the other half are uniform.
         """
         choice, x, y = numbers.independent(key, 3)
         sampled = choice < 0.5
@@ -646,9 +646,9 @@ class Camera:
 
 
 def lamp_image(tracer: LampTracer, seed: int, paths: int, channels: tuple[str, ...], *, squares: bool = False) -> Any:
-    """The lamps' part of an image, of so many light paths: H × W × colours, and the variance of it.
+    """The lamps' part of an image from `paths` light paths, H × W × colours, and its variance.
 
-    Both in float64. The variance is None without `squares`.
+    Both are in float64. The variance is None without `squares`.
     """
     v, camera = tracer.v, tracer.camera
     pixels = camera.width * camera.height

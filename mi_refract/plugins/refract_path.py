@@ -75,7 +75,7 @@ def read_count(props: Properties, name: str, default: int, least: int) -> int:
 
 
 def read_flag(props: Properties, name: str) -> bool:
-    """A Boolean parameter, False where it is absent. ValueError with its name and what is expected."""
+    """A Boolean parameter; False if it is absent. ValueError with its name and what is expected."""
     value = props.get(name, False)
     if not isinstance(value, bool):
         raise ValueError(f"{INTEGRATOR}: {name} = {value!r}; expected true or false")
@@ -113,7 +113,7 @@ def integrator_class(v: Variant) -> type:
     vectorised = dr.is_jit_v(v.Float)
 
     def to_camera(sensor: Sensor) -> Any:
-        """The transform from world to camera, whose rays leave the plane z = 0; None where they start at the sensor."""
+        """The transform from world to camera, where rays start in the plane z = 0; None if they start at the sensor."""
         return sensor.world_transform().inverse() if isinstance(sensor, v.ProjectiveCamera) else None
 
     class RefractPath(v.SamplingIntegrator):  # type: ignore[misc]
@@ -139,13 +139,13 @@ def integrator_class(v: Variant) -> type:
             self.loops: list[PathLoop] = []  # of this render: one a pass; in scalar variants one in all
 
         def begin_render(self, sensor: Sensor) -> None:
-            """Call this before `sample` where `render` is not called; else each sample inspects the scene anew."""
+            """Call this before `sample` if `render` is not called; otherwise each sample inspects the scene again."""
             self.loops, self.rendering = [], True
             self.near = to_camera(sensor)
             self.unconnected = lamp_tracing.refused_sensor(sensor)
 
         def end_render(self) -> None:
-            """Call this after the samples were evaluated. ValueError where absorption was contradictory."""
+            """Call this after the samples were evaluated. ValueError if absorption was inconsistent."""
             loops, self.loops, self.rendering = self.loops, [], False
             for loop in loops:
                 loop.refuse()
@@ -177,8 +177,7 @@ def integrator_class(v: Variant) -> type:
                 sampler.set_sample_count(spp)
             number: Any = dr.slice(seed)
             caustic = self.caustic_image(scene, sensor, int(number), int(sampler.sample_count()), ("R", "G", "B"))
-            # Colours on a film are sums; those of the samples' weights, by which it divides them, are its last channel
-            # before others.
+            # A film holds sums of colours, and after them and alpha the sum of weights by which it divides them.
             block, sums = film.create_block(), film.develop(True)
             weight = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
             values = block.tensor().numpy()
@@ -198,9 +197,9 @@ def integrator_class(v: Variant) -> type:
             squares: bool = False,
             paths: int = 0,
         ) -> Any:
-            """The lamps' part of the image of a render that has begun; None where path tracing has all of it.
+            """The result of `lamp_tracing.lamp_image` for a render that has begun; None if no lamps are traced.
 
-            `lamp_tracing.lamp_image` says what it is. `paths`: of light, where they are not those of `spp`.
+            `paths`: number of light paths; by default it follows from `spp`.
             """
             loop = next((loop for loop in self.loops if loop.features.lamps_traced), None)
             if loop is None:
@@ -271,7 +270,7 @@ def integrator_class(v: Variant) -> type:
         def caustics_of(self, scene: Scene, sensor: Sensor) -> str:
             """What `caustics` means in a render: "path", "lamp" or, if only some lamps are traced, "auto".
 
-            ValueError if it is impossible.
+            ValueError if the scene does not allow `caustics` = `lamp`.
             """
             self.begin_render(sensor)
             try:
@@ -282,7 +281,7 @@ def integrator_class(v: Variant) -> type:
                 self.rendering = False
 
         def traces_lamps(self, scene: Scene, needs: SceneFeatures) -> bool:
-            """Whether lamps are traced in this render. ValueError where `caustics` = `lamp` and they cannot be."""
+            """Whether lamps are traced in this render. ValueError if `caustics` = `lamp` and they cannot be."""
             self.untraced = ""
             if self.caustics == "path" or not (needs.lamps and needs.smooth and (needs.delta or needs.null)):
                 return False
@@ -305,7 +304,7 @@ def integrator_class(v: Variant) -> type:
             return not reason
 
         def path_features(self, needs: SceneFeatures) -> PathFeatures:
-            """The features that are traced for a scene. ValueError where `deterministic` is set and impossible."""
+            """The features that are traced for a scene. ValueError if `deterministic` is set and impossible."""
             # Local memory has no derivatives, and the evaluated loops that derivatives need have no local memory.
             symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
             if self.deterministic and needs.chance:
@@ -383,5 +382,5 @@ def integrator_class(v: Variant) -> type:
 
 
 def register(variant: Variant) -> None:
-    """Make `refract_path` known to one variant, given its module. Registering again is harmless."""
+    """Register `refract_path` in one variant, given its module. Registering again is harmless."""
     variant.register_integrator(INTEGRATOR, integrator_class(variant))
