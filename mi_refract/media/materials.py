@@ -70,10 +70,9 @@ LONGEST_POLE = 1000.0  # µm²: in Sellmeier's formula of a glass, at least one 
 
 def _air(name: str, constant: float, terms: tuple[tuple[float, float], ...], valid: tuple[float, float]) -> Medium:
     """10⁸ (n − 1) = constant + Σ k/(k₀ − σ²), σ = 1/λ in µm⁻¹: k/(k₀ − σ²) = (k/k₀) λ²/(λ² − 1/k₀)."""
-    pairs = tuple((f"B{i}", f"C{i}") for i in range(1, len(terms) + 1))
-    values = {b: 1e-8 * k / k_0 for (b, _), (k, k_0) in zip(pairs, terms, strict=True)}
-    values |= {c: 1e6 / k_0 for (_, c), (_, k_0) in zip(pairs, terms, strict=True)}
-    return Medium(name, Terms(1, 1 + 1e-8 * constant, resonances=pairs), values, valid, "vacuum", is_air=True)
+    form, values = sellmeier([*(1e-8 * k / k_0 for k, k_0 in terms), *(1e6 / k_0 for _, k_0 in terms)])
+    form = replace(form, power=1, constant=1 + 1e-8 * constant)
+    return Medium(name, form, values, valid, "vacuum", is_air=True)
 
 
 MATERIALS = {
