@@ -81,8 +81,8 @@ def files(plain: PlainScene) -> Files:
     backs = [_back(mesh, offsets[mesh.name]) for mesh in lights]
     exported = [*_with_hollows(plain, meshes), *(back for back in backs if back)]
     materials = list(dict.fromkeys(mesh.material for mesh in exported))
-    camera, extras = plain.camera, {"max_depth": plain.max_depth, "width": plain.camera.width}
-    scene = trimesh.Scene(metadata=extras | {"height": camera.height})
+    camera = plain.camera
+    scene = trimesh.Scene(metadata={"max_depth": plain.max_depth, "width": camera.width, "height": camera.height})
     for mesh in map(_with_normals, exported):
         geometry = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False)
         scene.add_geometry(geometry, node_name=mesh.name, geom_name=mesh.name)
@@ -170,7 +170,7 @@ def _around_glass(plain: PlainScene, mesh: Mesh, outside: float) -> Mesh:
             raise ValueError(f"{place}: {material.parameters}: {fault}; expected no absorption there")
         if material.spectrum and not 0 < _abbe(material) < math.inf:
             raise ValueError(f"{place}: {material.parameters}; expected an index that falls with the wavelength")
-    return replace(mesh, material=material)
+    return mesh
 
 
 def _with_hollows(plain: PlainScene, meshes: Sequence[Mesh]) -> list[Mesh]:
