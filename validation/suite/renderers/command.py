@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from mi_refract.io import errors
 from mi_refract.io.safe_files import writable
 from validation.run import command_line
 
@@ -41,32 +42,29 @@ def _command(
 ) -> int:
     """List or install the other renderers and libraries, or write a page of their results."""
     if page or data:
-        return _write(page, data, out)
+        _write(page, data, out)
+        return 0
     wanted = [name.strip() for name in install.split(",") if name.strip()]
     if unknown := [name for name in wanted if name not in SYSTEMS]:
-        return command_line.misuse(NAME, f"unknown system {unknown[0]!r}; expected {', '.join(SYSTEMS)}")
+        raise ValueError(f"unknown system {unknown[0]!r}; expected {', '.join(SYSTEMS)}")
     if listed and wanted:
-        return command_line.misuse(NAME, "--list with --install; expected one of them")
+        raise ValueError("--list with --install; expected one of them")
     if not wanted:
         print("\n".join(_line(system) for system in SYSTEMS.values()))
     return max([_install(SYSTEMS[name]) for name in wanted], default=0)
 
 
-def _write(page: Path | None, data: Path | None, out: Path) -> int:
+def _write(page: Path | None, data: Path | None, out: Path) -> None:
     from validation.suite import matrix
 
-    try:
-        for path, suffixes in ((page, (".html", ".htm")), (data, (".json",))):
-            if path:
-                writable(path, suffixes)
-        results = matrix.read(out)
-        if page:
-            matrix.write_html(page, results)
-        if data:
-            matrix.write_json(data, results)
-    except (ValueError, OSError) as error:
-        return command_line.misuse(NAME, str(error))
-    return 0
+    for path, suffixes in ((page, (".html", ".htm")), (data, (".json",))):
+        if path:
+            writable(path, suffixes)
+    results = matrix.read(out)
+    if page:
+        matrix.write_html(page, results)
+    if data:
+        matrix.write_json(data, results)
 
 
 def _install(system: System) -> int:
@@ -74,7 +72,7 @@ def _install(system: System) -> int:
     try:
         environments.install(system)
     except OSError as error:
-        command_line.misuse(NAME, str(error))
+        print(f"{NAME}: {errors.describe(error)}", file=sys.stderr)
         return 1
     return 0
 
