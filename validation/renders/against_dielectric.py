@@ -23,7 +23,6 @@ import numpy as np
 
 from mi_refract.formulas import FORMULAS
 from mi_refract.image_diff import pixelwise, tile_statistics
-from mi_refract.io import image_file
 from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation import limits
@@ -39,7 +38,7 @@ from validation.run.metrics import (
     WELCH_ALARMS,
 )
 from validation.run.render_methods import DIELECTRIC as BUILTIN
-from validation.run.render_methods import Camera, opened
+from validation.run.render_methods import Camera, opened, save_image
 from validation.study import Study, Task, about
 
 NAME = "renders"
@@ -98,13 +97,11 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
         "spp": profile.spp,
         "seeds": profile.pairs,
     }
-    images, folder, means = {}, Path("images") / scene, (test.mean(0), reference.mean(0))
-    (context.out / folder).mkdir(parents=True, exist_ok=True)
+    images, means = {}, (test.mean(0), reference.mean(0))
     if not np.ptp(means) <= UNIFORM:  # NaN is shown
         for role, image in (("reference", means[1]), ("test", means[0]), ("difference", means[0] - means[1])):
-            images[role] = str(folder / (f"{BUILTIN}.exr" if role == "reference" else f"{plugin} {role}.exr"))
-            pixels = image.astype(np.float32)
-            image_file.write_exr(context.out / images[role], pixels, metadata=replay | {"role": role})
+            name = BUILTIN if role == "reference" else f"{plugin} {role}"
+            images[role] = save_image(context.out, f"{scene}/{name}", image, replay | {"role": role})
     curves: dict[str, list[tuple[float, float]]] = {}
     if plugin == PLUGIN and reference.std(0).max() >= CHANGED and scene not in NO_REFERENCE:
         # relMSE against seconds at growing samples per pixel, alternating; with seeds that the reference does not have.

@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from mi_refract.io import image_file
 from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation.run.context import Context, beyond_builtin
-from validation.run.render_methods import Camera, opened, under
+from validation.run.render_methods import Camera, opened, save_image, under
 from validation.study import Study, Task, about
 
 NAME = "colours"
@@ -55,11 +54,9 @@ def scene_rows(context: Context, path: Path) -> list[Row]:
         "spp": profile.spp,
         "seeds": seeds,
     }
-    name = Path("images") / path.stem / f"{PLUGIN} spectral.exr"
-    (context.out / name.parent).mkdir(parents=True, exist_ok=True)
-    image_file.write_exr(context.out / name, image.astype(np.float32), metadata=replay)
+    shown = save_image(context.out, f"{path.stem}/{PLUGIN} spectral", image, replay)
     values = {COLOUR: float((image.max(2) - image.min(2)).sum() / image.sum()), "noise": noise}
-    return [Row(NAME, PLUGIN, path.stem, variant, values, reason=SHOWN, replay=replay, images={"test": str(name)})]
+    return [Row(NAME, PLUGIN, path.stem, variant, values, reason=SHOWN, replay=replay, images={"test": shown})]
 
 
 def _mean(camera: Camera, spp: int, count: int, most: int) -> tuple[np.ndarray, float, int]:

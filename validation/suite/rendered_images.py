@@ -33,7 +33,7 @@ from validation import limits
 from validation.run.context import SCENES as FOLDER
 from validation.run.context import Context
 from validation.run.metrics import DETECTABLE, MEAN_DIFFERENCE
-from validation.run.render_methods import Camera
+from validation.run.render_methods import Camera, save_image
 from validation.study import Study, Task, about
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS, ImageRenderer, NoExport, by_command, mean
 
@@ -259,8 +259,6 @@ def measured(comparison: Comparison, ours: np.ndarray, theirs: np.ndarray) -> di
 
 def _saved(context: Context, title: str, scene: str, ours: Sequence[Image], theirs: Sequence[Image]) -> dict[str, str]:
     """Write both means and their difference as EXR files below the output folder; return their paths by role."""
-    folder = Path("images") / NAME / scene
-    (context.out / folder).mkdir(parents=True, exist_ok=True)
     reference_mean, test_mean = (
         np.stack([image.pixels for image in side]).mean(0, dtype=np.float64) for side in (ours, theirs)
     )
@@ -269,9 +267,7 @@ def _saved(context: Context, title: str, scene: str, ours: Sequence[Image], thei
         "test": (title, test_mean),
         "difference": (f"{title} difference", test_mean - reference_mean),
     }
-    for name, image in images.values():
-        image_file.write_exr(context.out / folder / f"{name}.exr", image.astype(np.float32))
-    return {role: str(folder / f"{name}.exr") for role, (name, _) in images.items()}
+    return {role: save_image(context.out, f"{NAME}/{scene}/{name}", x, {}) for role, (name, x) in images.items()}
 
 
 STUDY = Study(NAME, "Images", about(__doc__), TERMS, tasks)
