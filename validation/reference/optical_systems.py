@@ -210,16 +210,20 @@ class System:
 
     @functools.cached_property
     def condition(self) -> Array:
-        """The first-order error of the answer in u, (N,), if the first a and every n, k and b err by u.
+        """The first-order error of the answer in u, (N,), if the first a and every n, k and b err by u."""
+        return self.condition_of(lambda moved: self.errors(snell, moved))
 
-        It is the sum of the norms of all derivatives, from differences of the exact path. a, n and b are perturbed
-        perpendicular to themselves, because their lengths do not matter.
+    def condition_of(self, changes: Callable[[Moved], Array]) -> Array:
+        """Return the first-order change in u, (N,), if the first a and every n, k and b err by u.
+
+        It is the sum of the norms of all derivatives: `changes(moved)` returns the changes (N × m) of the exact path.
+        a, n and b are perturbed perpendicular to themselves, because their lengths do not matter.
         """
-        total = np.zeros(len(self.origins), np.longdouble)
+        total: Array = np.zeros(1, np.longdouble)
         for j, boundary in enumerate(self.boundaries):
             for what in (*["into"] * (j == 0), "normal", "index", "onward") if boundary.k is not None else ():
-                moved = [self.errors(snell, nudged(j, what, way)) for way in range(1 if what == "index" else 2)]
-                total += np.sqrt(sum((x**2).sum(1) for x in moved)) / NUDGE
+                moved = [changes(nudged(j, what, way)) for way in range(1 if what == "index" else 2)]
+                total = total + np.sqrt(sum((x**2).sum(1) for x in moved)) / NUDGE
         return total
 
 
