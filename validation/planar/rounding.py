@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 
 from mi_refract.planar import Paths, Segments
-from validation.reference.planar_retrace import Array, Curves, Retraced
+from validation.reference.planar_retrace import Array, Curves, Retraced, cross
 
 ROUNDINGS = 2  # of the operands, and of the result
 
@@ -35,10 +35,10 @@ def growth(path: Retraced, segments: Segments, offset: float = 0.0) -> tuple[Arr
     before, behind = path.legs[:, :-1], path.legs[:, 1:]
     cos, cos_behind = (np.abs((d * path.normals).sum(2)) for d in (before, behind))
     length = np.hypot(*(np.asarray(segments.end) - segments.start).T)[path.hits]
-    added_h = (size[:, 1:] * (1 + (cos_behind + np.abs(_cross(before, behind))) / cos)).astype(float)
+    added_h = (size[:, 1:] * (1 + (cos_behind + np.abs(cross(before, behind))) / cos)).astype(float)
     added_phi = (1 + np.abs(g) + 1 / cos_behind + np.abs(1 - g) * size[:, 1:] / length).astype(float)
     cos = cos.astype(float)
-    shift = (1 + np.abs(path.points[:, 1:]).max(2)) * np.abs(_cross(path.normals, path.legs[:, 1:]))
+    shift = (1 + np.abs(path.points[:, 1:]).max(2)) * np.abs(cross(path.normals, path.legs[:, 1:]))
     added_h = unit * added_h + offset * shift.astype(float)
     leg = np.hypot(*np.diff(path.points, axis=1).transpose(2, 0, 1)).astype(float)
     points, directions = np.full((2, *path.points.shape[:2]), np.nan)
@@ -84,7 +84,7 @@ def undecided(exact: Retraced, paths: Paths, segments: Segments, points: Array, 
     h, kappa = points[:, 1:], np.abs(exact.curvatures)
     cos = (exact.legs[:, :-1] * exact.normals).sum(2)
     behind = np.where(cos > 0, *(np.asarray(n)[exact.hits] for n in (segments.n_left, segments.n_right)))
-    k, sine = exact.indices[:, :-1] / behind, np.abs(_cross(exact.normals, exact.legs[:, :-1]))
+    k, sine = exact.indices[:, :-1] / behind, np.abs(cross(exact.normals, exact.legs[:, :-1]))
     ends = [np.asarray(x)[exact.hits] for x in (segments.start, segments.end)]
     clearance = np.min([np.hypot(*(exact.points[:, 1:] - end).transpose(2, 0, 1)) for end in ends], axis=0)
     with np.errstate(invalid="ignore"):
@@ -102,9 +102,5 @@ def undecided(exact: Retraced, paths: Paths, segments: Segments, points: Array, 
     normal, curvature = Curves(segments).normal(point.astype(np.longdouble), paths.hits[rays, first])
     near = points[rays, first] + np.hypot(*leg.T) * directions[rays, first]
     touching = np.zeros(len(paths.hits), bool)
-    touching[rays] = ((d * normal).sum(1) ** 2 <= 2 * np.abs(curvature) * near) & (np.abs(_cross(d, leg)) <= near)
+    touching[rays] = ((d * normal).sum(1) ** 2 <= 2 * np.abs(curvature) * near) & (np.abs(cross(d, leg)) <= near)
     return at.any(1) | touching
-
-
-def _cross(a: Array, b: Array) -> Array:
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

@@ -117,7 +117,8 @@ def _bend(d: Array, normal: Array, near: Array, far: Array, forced: Array) -> tu
     return momentum / np.hypot(*momentum.T)[:, None], through
 
 
-def _cross(a: Array, b: Array) -> Array:
+def cross(a: Array, b: Array) -> Array:
+    """Return the cross products of vectors (… × 2)."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
@@ -138,9 +139,8 @@ class Curves:
         self.place = np.full(len(chord), -1)  # index in `arcs`
         self.place[self.arcs] = np.arange(len(self.arcs))
         self.control = control[self.arcs].astype(np.longdouble)
-        area = _cross(
-            chord[self.arcs], self.control - self.start[self.arcs]
-        )  # twice the area; > 0 with the control point on the left
+        # Twice the area; > 0 with the control point on the left.
+        area = cross(chord[self.arcs], self.control - self.start[self.arcs])
         self.w4 = 4 * np.asarray(segments.weight)[self.arcs].astype(np.longdouble) ** 2
         # ∇τ₀, ∇τ₁, ∇τ₂ (3 × arcs × 2): each is the opposite edge, rotated by 90°.
         corners = self.start[self.arcs], self.control, self.end[self.arcs]
@@ -157,7 +157,7 @@ class Curves:
             return np.full(len(p), np.inf), np.full(len(p), -1)
         p, d = p[:, None], d[:, None]
         # Ties: points on the ray count as points on its left.
-        sides = [_cross(d, ends - p) for ends in (self.start, self.end)]
+        sides = [cross(d, ends - p) for ends in (self.start, self.end)]
         parted = (sides[0] >= 0) != (sides[1] >= 0)
         with np.errstate(all="ignore"):
             share = sides[0] / (sides[0] - sides[1])
