@@ -111,7 +111,7 @@ def _cells(row: Row | None, metrics: Iterable[str], intervals: bool = True) -> l
     def cell(metric: str) -> str:
         if row is None or metric not in row.values:
             return "–"
-        ends = [compact(row.values[end]) for end in (m.low(metric), m.high(metric)) if end in row.values]
+        ends = [compact(row.values[end]) for end in (f"{metric}, low", f"{metric}, high") if end in row.values]
         return compact(row.values[metric]) + (f" ({'–'.join(ends)})" if ends and intervals else "")
 
     return [cell(metric) for metric in metrics]
@@ -435,9 +435,8 @@ def visible(rows: list[Row]) -> str:
     """Return the errors of FLIP for changes that a person does not see and for those that a person sees."""
     study, missing = visible_changes, "visible changes were planted"
     measured = _measured(rows, study.NAME)
-    kinds = [
-        r for r in measured if r.case != study.LIMIT and r.subject in (*study.KINDS, study.EDGE)
-    ]  # not other seeds
+    # Without other seeds.
+    kinds = [row for row in measured if row.case != study.LIMIT and row.subject in (*study.KINDS, study.EDGE)]
     metrics = (*study.MEASURED, study.ERROR)
     cells = [
         [row.subject, row.reason, row.case, *_cells(row, metrics), f"{row.values[study.ALARMS]:.1%}"] for row in kinds

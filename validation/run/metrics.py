@@ -33,13 +33,3 @@ EQUAL_TIME = "equal-time MSE"
 EQUAL_TIME_CAUSTIC = "equal-time MSE, caustic"
 EQUAL_TIME_DEFAULTS = "equal-time MSE / independent"
 EQUAL_TIME_HAND = "equal-time MSE / best by hand"
-
-
-def low(metric: str) -> str:
-    """Return the name of the lower end of a metric's 95 % interval."""
-    return f"{metric}, low"
-
-
-def high(metric: str) -> str:
-    """Return the name of the upper end of a metric's 95 % interval."""
-    return f"{metric}, high"
