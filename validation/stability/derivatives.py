@@ -202,8 +202,7 @@ def row(
         "not finite": float((right & ~finite).sum()),
         **counts,
     }
-    a, n = ([float(x).hex() for x in v[worst]] for v in (samples.rays.a, samples.rays.n))
-    ray = {"regime": str(samples.regime[worst]), "a": a, "n": n, "k": float(samples.rays.k[worst]).hex()}
+    ray = {"regime": str(samples.regime[worst])} | samples.rays.hexed(worst)
     replay = {"seed": seeds.current(SEED), "rays": len(error), "worst": ray}
     return Row(NAME, subject, case, setting.label, values, budgets, replay=replay)
 
