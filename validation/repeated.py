@@ -43,10 +43,8 @@ def rows_of(study: Study, context: Context, shift: int) -> list[Row]:
     If the study could run nothing, return one row that is not run, with the reason of the study's rows.
     """
     assert study.again is not None
-    with (
-        shifted(shift),
-        tempfile.TemporaryDirectory() as folder,
-    ):  # the report shows images of the study's own seed only
+    # The report shows images of the study's own seed only.
+    with shifted(shift), tempfile.TemporaryDirectory() as folder:
         rows = [replace(row, images={}) for row in study.again(replace(context, out=Path(folder)))]
     measured, case = [row for row in rows if row.values], f"other seed {shift}"
     if rows and not measured:

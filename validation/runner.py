@@ -176,10 +176,8 @@ class OnCluster:
         The first error of a task is raised. ConnectionError, one line, if no worker is accepted; stderr names refused
         workers.
         """
-        from mi_refract.cluster.workers import Workers
-
         with connection.connected(self.target.scheduler, self.target.workers) as client:
-            workers = Workers(client, self.variant, facts(self.variant), warn=_log, facts=__name__)
+            workers = calls.Workers(client, self.variant, facts(self.variant), warn=_log, facts=__name__)
             workers.wait()
             results = calls.results(workers, OnCluster.on_worker, [(self, name) for _, name in work])
             for number, ((rows, spent), files), machine in results:

@@ -139,9 +139,8 @@ def tasks(context: Context) -> list[Task]:
     left_out = len(scenes.BODIES) * len(scenes.LAMPS) - len(extent.cases())
     if left_out:
         reason = Reason(f"left out: {left_out} bodies and lamps", "`--profile full`")
-        made.append(
-            Task(f"{NAME}: others", lambda: [Row(NAME, "every method", "others", context.variant, reason=reason)])
-        )
+        row = Row(NAME, "every method", "others", context.variant, reason=reason)
+        made.append(Task(f"{NAME}: others", lambda: [row]))
     return made
 
 

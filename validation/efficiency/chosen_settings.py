@@ -147,10 +147,8 @@ def full(settings: Settings) -> Settings:
 def by_hand(extent: Extent, figures: dict[str, Any]) -> list[Settings]:
     """Return all settings by hand of a scene; with splitting and lamps if the pilot has tried them (`figures`)."""
     tried = "".join(figures["costs"])
-    depths, lamps = (
-        extent.depths if "split_depth" in tried else (0,),
-        ("path", "lamp") if "lamp" in tried else ("path",),
-    )
+    depths = extent.depths if "split_depth" in tried else (0,)
+    lamps = ("path", "lamp") if "lamp" in tried else ("path",)
     integrators: list[Settings] = [{"integrator": "path"}]
     for depth, caustics in itertools.product(depths, lamps):
         integrators.append({"integrator": OURS, "split_depth": str(depth), "caustics": caustics})

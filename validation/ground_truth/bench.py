@@ -215,9 +215,8 @@ def ball(plugin: str, index: Any = BK7) -> list[dict[str, Any]]:
 def benches() -> dict[str, Bench]:
     """Return all benches by name."""
     down = np.linspace(0.3, 0.6, optical_systems.RAYS)
-    least = optical_systems.prism(
-        APEX, closed_forms.least_deviated(APEX, BK7) + 0 * optical_systems.degrees(0, 1), down
-    )
+    incidence = np.full(optical_systems.RAYS, closed_forms.least_deviated(APEX, BK7))
+    least = optical_systems.prism(APEX, incidence, down)
 
     def slab(plugin: str) -> list[dict[str, Any]]:
         block = {"type": "cube", "to_world": _placed([60, 60, optical_systems.THICKNESS / 2])}
