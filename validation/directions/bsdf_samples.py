@@ -19,6 +19,7 @@ from validation import limits, repeated
 from validation.run import seeds
 from validation.run.bsdf_sampling import sample_all
 from validation.run.context import Context
+from validation.run.render_methods import under
 from validation.study import Study, Task, about
 
 NAME = "samples"
@@ -52,12 +53,9 @@ def _variant_rows(context: Context, variant: str, reason: str | None) -> list[Ro
 
     if reason is not None:
         return [Row(NAME, "refract − dielectric", "all", variant, reason=reason)]
-    mi.set_variant(variant)
-    try:
+    with under(variant):
         count = context.profile.rays if dr.is_jit_v(mi.Float) else context.profile.scalar_rays
         return [_mode_row(getattr(mi.TransportMode, name), count, variant) for name in ("Radiance", "Importance")]
-    finally:
-        mi.set_variant(context.variant)
 
 
 def _mode_row(mode: Any, count: int, variant: str) -> Row:
