@@ -157,14 +157,9 @@ def by_hand(extent: Extent, figures: dict[str, Any]) -> list[Settings]:
 
 def costs(cameras: dict[str, Camera], spp: int, rounds: int, first_seed: int = 0) -> dict[str, list[float]]:
     """Return squared error × seconds by round; the error is the deviation from the mean of all rounds."""
-    renders: dict[str, list[tuple[np.ndarray, float]]] = {name: [] for name in cameras}
-    order, seeds = list(cameras), itertools.count(first_seed)
-    for _ in range(rounds + 1):
-        for name in order:
-            renders[name].append(cameras[name](spp, next(seeds)))
-        order.reverse()
-    cost = {}
-    for name, (_, *warm) in renders.items():  # the first image compiles
+    seeds, cost = itertools.count(first_seed), {}
+    renders = kernel_timing.rounds(cameras, lambda camera: camera(spp, next(seeds)), rounds)
+    for name, warm in renders.items():
         images = np.stack([image for image, _ in warm])
         squares = np.square(images - images.mean(0)).reshape(rounds, -1).mean(1) * rounds / (rounds - 1)
         seconds = statistics.median(seconds for _, seconds in warm)

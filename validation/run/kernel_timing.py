@@ -10,7 +10,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
 import numpy as np
@@ -24,6 +24,7 @@ from validation.run.metrics import TIME_OVER_COPY, TIME_OVER_PLAIN
 from .array_settings import PLAIN, Setting
 from .context import Context
 
+T = TypeVar("T")
 COPY = "copy"
 SEED = 2026
 DIFFERENT = 1 << 16  # number of different rays; the rest of a stream repeats them
@@ -82,15 +83,15 @@ def goals(subject: str, setting: Setting) -> dict[str, float]:
     return {TIME_OVER_PLAIN: goal} if setting.label == "llvm float32" else {}
 
 
-def rounds(subjects: dict[str, Any], clock: Callable[[Any], float], repeats: int) -> dict[str, list[float]]:
-    """Return seconds by subject. Every second round is in reverse order; the first round is discarded."""
-    seconds: dict[str, list[float]] = {name: [] for name in subjects}
+def rounds(subjects: dict[str, Any], clock: Callable[[Any], T], repeats: int) -> dict[str, list[T]]:
+    """Return what `clock` returns, by subject. Every second round is in reverse order; the first is discarded."""
+    results: dict[str, list[T]] = {name: [] for name in subjects}
     order = list(subjects)
     for _ in range(repeats + 1):
         for name in order:
-            seconds[name].append(clock(subjects[name]))
+            results[name].append(clock(subjects[name]))
         order.reverse()
-    return {name: times[1:] for name, times in seconds.items()}
+    return {name: of_subject[1:] for name, of_subject in results.items()}
 
 
 def ratio(metric: str, times: list[float], others: list[float]) -> dict[str, float]:
