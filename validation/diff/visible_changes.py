@@ -36,6 +36,7 @@ NAME = "visible_changes"
 SEED = 2027
 TRIALS = {"quick": 20, "standard": 300, "full": 2000}  # none of 300 may be called different: the bound is 0.99 %
 SIZE, SHAPES, SAMPLES = 96, 14, 4  # width and height in pixels; shapes; the square root of the samples per pixel
+ROWS, COLUMNS = np.mgrid[:SIZE, :SIZE]
 MEASURED = LOCAL, THROUGHOUT, ONE_WAY = "local FLIP error", "FLIP error throughout a patch", "change one way, in codes"
 ERROR = "error / bound"
 ALARMS, MISSED, BOUND = "called different", "missed", "bound"
@@ -78,8 +79,7 @@ def drawn(shapes: list[Shape], samples: int = SAMPLES, turn: float = 0.0, shift:
     grid = (np.arange(samples) + 0.5) / samples - 0.5
     dx, dy = (x.ravel() for x in np.meshgrid(grid, grid))
     dx, dy = dx * np.cos(turn) - dy * np.sin(turn) + 0.5 + shift, dx * np.sin(turn) + dy * np.cos(turn) + 0.5
-    rows, columns = np.mgrid[:SIZE, :SIZE]
-    x, y = columns[..., None] + dx, rows[..., None] + dy
+    x, y = COLUMNS[..., None] + dx, ROWS[..., None] + dy
     codes = np.zeros((*x.shape, 3))
     for kind, left, top, radius, angle, colour in shapes:
         cos, sin = np.cos(angle), np.sin(angle)
@@ -130,9 +130,8 @@ def _half_floats(rng: Rng) -> Pair:
 
 def _soft_edge(rng: Rng) -> Pair:
     """Return a blurred black half-plane on white (up to three pixels), and the same moved by half a pixel."""
-    rows, columns = np.mgrid[:SIZE, :SIZE]
     angle, width = rng.uniform(0, np.pi), 0.3 * 10 ** rng.uniform(0, 1)
-    distance = columns * np.cos(angle) + rows * np.sin(angle) - rng.uniform(0.3, 0.7) * SIZE
+    distance = COLUMNS * np.cos(angle) + ROWS * np.sin(angle) - rng.uniform(0.3, 0.7) * SIZE
     one, two = (shown(255 * ndtr((distance - x) / width)[..., None] * np.ones(3)) for x in (0.0, 0.5))
     return one, two
 
@@ -189,10 +188,9 @@ def _recoloured(rng: Rng, blue: bool = False) -> Pair:
 
 def _highlight(rng: Rng) -> Pair:
     sigma, height, gray = rng.uniform(3.3, 4.7), rng.uniform(140, 180), rng.uniform(30, 75)
-    rows, columns = np.mgrid[:SIZE, :SIZE]
     image, x, y = somewhere(rng)
     plain = patched(image, x, y, 40, gray)
-    more = height * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2))
+    more = height * np.exp(-((COLUMNS - x) ** 2 + (ROWS - y) ** 2) / (2 * sigma**2))
     return shown(plain + more[..., None]), shown(plain)
 
 
@@ -223,18 +221,16 @@ def _dot(rng: Rng) -> Pair:
     radius, more, gray = rng.uniform(2.3, 3.5), rng.uniform(45, 80), rng.uniform(60, 140)
     image, x, y = somewhere(rng)
     plain = patched(image, x, y, 40, gray)
-    rows, columns = np.mgrid[:SIZE, :SIZE]
-    cover = np.clip(radius + 0.5 - np.hypot(columns - int(x), rows - int(y)), 0, 1)
+    cover = np.clip(radius + 0.5 - np.hypot(COLUMNS - int(x), ROWS - int(y)), 0, 1)
     return shown(plain), shown(plain + rng.choice([-1, 1]) * more * cover[..., None])
 
 
 def _facet(rng: Rng) -> Pair:
     more = rng.uniform(25, 40)
     image, x, y = somewhere(rng)
-    rows, columns = np.mgrid[:SIZE, :SIZE]
     inside = np.ones((SIZE, SIZE), bool)
     for angle in rng.uniform(0, 2 * np.pi) + np.array([0, 2, 4]) * np.pi / 3:
-        inside &= (columns - x) * np.cos(angle) + (rows - y) * np.sin(angle) < 3.5
+        inside &= (COLUMNS - x) * np.cos(angle) + (ROWS - y) * np.sin(angle) < 3.5
     plain = np.clip(image, 0, 215)
     return shown(plain), shown(plain + more * inside[..., None])
 
