@@ -258,8 +258,13 @@ def traced_angle(group: Sequence[StandardNumber], samples: int) -> Answers:
 
 def angle_read(number: StandardNumber) -> tuple[Bench, Readings]:
     """Return the prism or the drop with its ray, and the function that reads the angle from a path."""
-    make, angle = (prism_bench, table.deviated) if number.kind == "deviation" else (drop_bench, table.from_antisolar)
-    case = make(number)
+    if number.kind == "deviation":
+        medium = number.medium or number.given["n"]  # a glass by name, or an index
+        angle, nm = table.deviated, number.given.get("nm")
+        case = Bench(table.prism([number]), lambda plugin: bench.prism(plugin, medium), nm)
+    else:
+        angle = table.from_antisolar
+        case = Bench(table.drop([number]), lambda plugin: bench.ball(plugin, number.given["n"]))
     return case, [(0, lambda path: angle(case.system.directions, path.directions[-1])[0])]
 
 
@@ -287,17 +292,6 @@ def read_bounds(case: Bench, readings: Readings) -> list[float]:
         for i, (ray, _) in enumerate(readings):
             squares[i] += float(effect[str(i)][ray, 0]) ** 2 / count
     return [math.sqrt(2 * math.log(2 / limits.FALSE_ALARM) * square) for square in squares]
-
-
-def prism_bench(number: StandardNumber) -> Bench:
-    """Return the bench of a prism with an index, or with a named glass and a wavelength."""
-    medium, nm = number.medium or number.given["n"], number.given.get("nm")
-    return Bench(table.prism([number]), lambda plugin: bench.prism(plugin, medium), nm)
-
-
-def drop_bench(number: StandardNumber) -> Bench:
-    """Return the bench of a ball with the number's index."""
-    return Bench(table.drop([number]), lambda plugin: bench.ball(plugin, number.given["n"]))
 
 
 # The BSDF --------------------------------------------------------------------------------------------------------
