@@ -27,7 +27,8 @@ from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED, WORST_ANGLE
 from validation.study import Study, Task, about
 
-from .per_ray import OFF_RECORDED, RECORDED, off_recorded
+from . import per_ray
+from .per_ray import OFF_RECORDED, OTHER_SIGNAL, RECORDED, off_recorded
 from .renderers import SYSTEMS, System, environments
 from .renderers.glass_catalogues import CATALOGUES, GlassCatalogue
 
@@ -41,11 +42,7 @@ TERMS = {
     RECORDED: "that difference as recorded earlier, for a program with other data",
     OFF_RECORDED: "the ratio of the two, or its reciprocal if that is larger",
     WORST_ANGLE: "the largest angle to the certified direction for the ratio used, without misclassified rays",
-    ERROR_OVER_BOUND: "the largest error of a ray over its a-priori bound, that of the textbook formula",
-    MISCLASSIFIED: "rays whose total internal reflection was misclassified",
-    "wrong": "rays beyond the bound, misclassified although the bound decides them, or without a direction",
-    "unfit": "answers that are missing, duplicate, or for unknown rays",
-    "other TIR signal": "1 if the program signals total internal reflection in another way than recorded",
+    **{name: per_ray.TERMS[name] for name in (ERROR_OVER_BOUND, MISCLASSIFIED, "wrong", "unfit", OTHER_SIGNAL)},
     "unanswered": "rays without an answer, because the program crashed, hung, or returned no indices",
 }
 
@@ -96,8 +93,7 @@ def rows(title: str, catalogue: GlassCatalogue, rays: RaySet, answers: Answers) 
         values |= {MISCLASSIFIED: float(errors.tir_misclassified), "wrong": float(errors.wrong)}
         budgets |= {ERROR_OVER_BOUND: 1.0}
         if name == "critical":
-            values["other TIR signal"] = float(findings.tir != catalogue.tir)
-            budgets["other TIR signal"] = 0.0
+            values[OTHER_SIGNAL], budgets[OTHER_SIGNAL] = float(findings.tir != catalogue.tir), 0.0
         text, worst_ray = f"{version}; total internal reflection: {findings.tir}", {"worst": errors.replay}
         made.append(Row(NAME, title, name, "f64", values, budgets, reason=text, replay=worst_ray))
     assert answers.n_ratio is not None
