@@ -38,18 +38,14 @@ COPY_TIME = limit(1 / 0.9, "over the time of a copy: nine tenths of the throughp
 PRINTED_INDEX = limit(
     5e-6 + 1e-6, "half a unit of the fifth decimal, plus 1e-6 because the printed coefficients are rounded too"
 )
-INDEX_ROUNDING = limit(
-    16.0, "u: a sum of at most five terms with three roundings each, all but one of one sign; a root"
-)
+INDEX_ROUNDING = limit(16.0, "u: a sum of up to five terms with three roundings each, all but one of one sign; a root")
 # Each direction adds 8 u to the angle. The deviation is stationary: an input off by x changes it by O(x²).
 PRISM_ANGLE = limit(
     64 * 2.0**-53, "radians: two boundaries of 8u each, the condition 1/cos θ below 2, and sines of the expected angle"
 )
 # A direction that is off by ε changes the next angle of incidence by up to 2ε, and so on: 8u (1 + 3 + 5 + 7), plus 2u
 # for each point.
-BOW_ANGLE = limit(
-    160 * 2.0**-53, "radians: four boundaries of 8u, whose errors the next ones amplify, and their points"
-)
+BOW_ANGLE = limit(160 * 2.0**-53, "radians: four boundaries of 8u, amplified by the next ones, and their points")
 FOCAL_DISTANCE = limit(5.4e-10, "relative: (h/R)² at h = 1e-3 and the smallest R = 43; aberration is tenths of that")
 FURNACE_CHANNEL = limit(3e-3, "relative, in each channel: the deviation from white that must be detected")
 PANE = limit(1e-3, "relative: one ray in 500 may pass between two faces at the edges of a pane")
@@ -73,9 +69,7 @@ SAMPLE_MUELLER = limit(6, "errors of the radicand: one on each side of the bound
 # as long as √(1 − 2x) ≥ 0.025, that is for condition · u ≤ 0.487.
 MIRAGE = limit(2.0, "error of the cosine over condition · u, as long as condition · u ≤ FIRST_ORDER")
 FIRST_ORDER = limit(0.487, "condition · u up to which the bound of first order holds")
-LIGHT_PIPE = limit(
-    1.0, "each total internal reflection keeps the accumulated error and adds at most u: only signs change"
-)
+LIGHT_PIPE = limit(1.0, "each total reflection keeps the accumulated error and adds at most u: only signs change")
 SYSTEM = limit(
     1.0, "the condition counts u per rounding; rounded inputs use √3/2 of it, forms at the rounding limit 0.8724"
 )
@@ -86,27 +80,19 @@ POWER_SUM = limit(4.0, "u, of R + T − 1: R · 4u + T · 4u")
 AMPLITUDE = limit(8.0, "u, relative, of r_s, r_p and exp(iφ) of the phase φ")
 # The compensated form's error is smaller, since κ of a float32 k up to 2²³ is exactly a pair.
 RADICAND = limit(10 * 2.0**-53, "over the larger term of a float32 radicand: the error of the promoted form")
-RECIPROCITY = limit(
-    3.0, "u, of T forward over T backward: two roundings of T, and that of 1/k, which changes T by u at most"
-)
+RECIPROCITY = limit(3.0, "u, of T forward over T backward: two roundings of T, and one of 1/k, which adds up to u")
 DIFFUSE = limit(12.5, "u: two cosines of a node, k and κ change R by 2.12u each, in addition to the 4u of R itself")
 WHITE_FURNACE = limit(2.0**-23, "an ulp of 1: the weights of both lobes add up to R + T")
 IN_AND_OUT = limit(6.0, "u: k² and 1/k², each with k rounded and squared, 3u")
 INDEX_SQUARED = limit(3.0, "u: k rounded and squared")
 
 # Over condition · u of a form at the rounding limit; derived in `stability.derivatives.condition_of`.
-DERIVATIVE = limit(
-    29.0, "error over condition · u: every product of the differentiated form rounded, each at its worst"
-)
-ETENDUE = limit(
-    41.0, "relative, over condition · u, the condition with 1/12 cosθi: both derivatives, and both directions"
-)
+DERIVATIVE = limit(29.0, "error over condition · u: all products of the differentiated form rounded, at their worst")
+ETENDUE = limit(41.0, "relative, over condition · u, with 1/12 cosθi added: both derivatives, both directions")
 ROUNDED_DERIVATIVE = limit(1.01, "error over condition · u of what is computed in float64 and rounded once to float32")
 ROUNDED_ETENDUE = limit(3.8, "relative, over condition · u: two vectors rounded, 2, and two directions off unit, √3")
 REFLECTANCE = {
-    "float32": limit(
-        10.5, "of the sum of magnitudes S: the rounded cosine 8.2, its derivative, the result; float64 0.3"
-    ),
+    "float32": limit(10.5, "of the sum of magnitudes S: rounded cosine 8.2, its derivative, the result; float64 0.3"),
     "float64": limit(50.0, "of the sum of magnitudes S: 48.2 roundings of cosine, powers, products and quotient"),
 }
 
@@ -144,9 +130,7 @@ ONLY_GLASS = {
 MIXED = {EQUAL_TIME: limit(0.8, "over the built-in with the same sampler, in scenes with matt surfaces too")}
 CAUSTICS = {
     EQUAL_TIME: limit(0.4, "over the built-in with the same sampler, for small lamps"),
-    EQUAL_TIME_CAUSTIC: limit(
-        0.05, "over the built-in, within the caustic: paths from the camera rarely hit small lamps"
-    ),
+    EQUAL_TIME_CAUSTIC: limit(0.05, "over the built-in, in the caustic: paths from the camera rarely hit small lamps"),
 }
 CHOSEN = {
     EQUAL_TIME_HAND: limit(1.1, "over the best settings by hand: what a pilot of 5 % of the render can resolve"),
@@ -160,9 +144,7 @@ CAUSTIC_ENERGY = limit(
 CAUSTIC_LEVEL = limit(0.05, "relative: photon density is estimated over neighbourhoods, and facets change the power")
 CAUSTIC_NOISE = limit(1.25e-3, "relative standard error of an energy: a quarter of CAUSTIC_ENERGY")
 CAUSTIC_DETECTABLE = limit(0.01, "of the mean over the caustic: with more noise a wrong caustic could pass")
-NOISE = limit(
-    1e-5, "of float32 images: below it independent seeds give the same image, so there is no error to compare"
-)
+NOISE = limit(1e-5, "of float32 images: below it independent seeds give the same image, so there is no error")
 SCALING = {
     ("glasses", 64): {"first image / built-in": FIRST_IMAGE[64], "after an edit / built-in": EDIT},
     ("glasses", 1000): {"first image / built-in": FIRST_IMAGE[1000]},
@@ -205,12 +187,8 @@ NULL_ALARM = limit(1e-7, "probability that chance breaks a bound: 1e-4 for 1000 
 
 BODY = limit(1.0, "error over the sum of the largest effects of all roundings along the path")
 STANDARD = limit(1.0, "error of a standard number over its bound, whose terms the study derives")
-STANDARD_SEEN = limit(
-    1e-3, "relative, of an index: two crown glasses of the table, 1.52 and 1.5168, differ by twice that"
-)
-INDEX_SEEN = limit(
-    1e-4, "relative: an index off by this must move a ray to its bound; otherwise the bound tests nothing"
-)
+STANDARD_SEEN = limit(1e-3, "relative, of an index: crown glasses of 1.52 and 1.5168 in the table differ by twice that")
+INDEX_SEEN = limit(1e-4, "relative: an index off by this must move a ray to its bound, or the bound tests nothing")
 FALSE_ALARM = limit(1e-4, "probability that noise, or a sum of independent roundings, exceeds its bound by chance")
 RAINBOW_RESOLVED = limit(0.0145 / 10, "degrees, standard error: INDEX_SEEN moves the rainbow by 0.0145")
 # Pixels may move the edge: σ²/4(D − D₀) at 0.1 degrees is 3.5e-4. The fitted parabola multiplies this by 1.7 at D₀:
