@@ -7,8 +7,6 @@ of renders of a scene have a ball of glass and a small lamp, whose light passes 
 
 `welch` claims false alarms in 0.1 % of pairs, and reports the difference of a tile that it detects with a probability
 of 99 %. Such differences are planted, and differences that it detects with a probability of 50 %.
-
-`python -m validation diff --profile standard`
 """
 
 from __future__ import annotations

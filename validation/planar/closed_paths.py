@@ -124,10 +124,7 @@ def box(count: int, rays: int) -> Case:
 
 
 def unfold(origins: Array, directions: Array, count: int) -> Retraced:
-    """Return the paths by mirror images, in extended precision.
-
-    In coordinates along SIDES the walls are at whole numbers.
-    """
+    """Return the paths by mirror images, in longdouble. In coordinates along SIDES the walls are at whole numbers."""
     size2 = (SIDES**2).sum(1)
     x, v = (np.asarray(a, np.longdouble) @ SIDES.T / size2 for a in (origins, directions))
     # The times at which each ray's line meets the walls of either pair; then all in order.

@@ -10,8 +10,6 @@ surface: only `prb_projective` samples edges. As long as none of this holds, the
 stays undecided fails. With all looks together, one row in 10⁵ calls a right derivative biased, or a derivative that is
 off by more than 5 % right. `refract_path` must be right in all scenes without such an edge. The profile `standard`
 measures all integrators for the parameters of the table in the documentation, `full` for all parameters.
-
-`python -m validation renders`
 """
 
 from __future__ import annotations

@@ -5,8 +5,6 @@ how its numbers are written, or on what calls the integrator. Each change is mad
 and matt surfaces, with and without splitting. If both images have the same random numbers, they are equal bit for bit.
 Otherwise they are compared by Welch's test of the whole image and of its tiles, and by their noise if the change keeps
 the stratification.
-
-`python -m validation renders`
 """
 
 from __future__ import annotations

@@ -8,8 +8,6 @@ over all BSDFs, and of each BSDF in each setting. Random numbers depend on the s
 on the BSDF: two BSDFs are rendered with every count, the others with one count per split depth. In spectral and
 polarised variants, only `diffuse` and the BSDFs with delta lobes are tested; only delta lobes are split. `path` renders
 null lobes as `volpath` does, so it is the reference for all.
-
-`python -m validation renders`
 """
 
 from __future__ import annotations

@@ -5,8 +5,6 @@ multinomial, and Pearson's chi-square test is valid for large counts, whatever t
 two keys: the numbers of one boundary must be independent of those of the next one. Numbers of 20 keys are pooled.
 
 Light paths have numbers without stratification, four per key. All samples of these are counted.
-
-`python -m validation renders`
 """
 
 from __future__ import annotations
