@@ -138,14 +138,11 @@ def _row(title: str, case: str, i: int, rays: np.ndarray, indices: np.ndarray, r
 @functools.cache
 def planar() -> tuple[np.ndarray, np.ndarray]:
     """Return rays (wavelengths, heights, 4) by the planar trace, as in `Answer`, and indices (glasses, wavelengths)."""
-    scene = scene_file.load(FILE)
-    rays = []
+    origins, directions = np.array([[START, height] for height in HEIGHTS]), np.tile([1.0, 0.0], (len(HEIGHTS), 1))
+    beams = np.zeros(len(HEIGHTS), int)
+    scene, rays = replace(scene_file.load(FILE), origins=origins, directions=directions, beams=beams), []
     for segments in scene.segments:
-        origins = np.array([[START, height] for height in HEIGHTS])
-        directions = np.tile([1.0, 0.0], (len(HEIGHTS), 1))
-        beams = np.zeros(len(HEIGHTS), int)
-        one_wavelength = replace(scene, segments=(segments,), origins=origins, directions=directions, beams=beams)
-        (traced,) = follow_scene(one_wavelength)
+        (traced,) = follow_scene(replace(scene, segments=(segments,)))
         order = np.argsort(traced.rays)
         rays.append(np.concatenate([traced.tips, traced.paths.directions], axis=1)[order])
     return np.array(rays), np.array([region.indices for region in scene.regions])
