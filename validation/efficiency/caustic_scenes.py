@@ -15,17 +15,7 @@ from numpy.typing import NDArray
 
 from mi_refract.numerics import mitsuba_mesh
 from validation.reference import caustic_energy
-from validation.reference.caustic_energy import (
-    BALL_HEIGHT,
-    FIELD,
-    ON_AXIS,
-    PARALLEL,
-    POINT,
-    REFLECTANCE,
-    SPOT,
-    TOP,
-    VIEWPOINT,
-)
+from validation.reference.caustic_energy import ON_AXIS, PARALLEL, POINT, REFLECTANCE, SPOT, TOP
 from validation.run.context import SCENES
 from validation.run.render_methods import sensor
 
@@ -219,7 +209,7 @@ def disk_scene(body: str, lamp: str, bsdf: str, resolution: int) -> tuple[Any, A
     import mitsuba as mi
 
     setup, radius = ON_AXIS[body, lamp]
-    solid: Any = {"type": "sphere", "center": [0, BALL_HEIGHT, 0], "bsdf": glass(bsdf)}
+    solid: Any = {"type": "sphere", "center": [0, caustic_energy.BALL_HEIGHT, 0], "bsdf": glass(bsdf)}
     if body == "lens":
         solid = revolved(caustic_energy.lens_profile(128), glass(bsdf), 384)
     beam = math.degrees(setup.widest) + 1
@@ -231,6 +221,6 @@ def disk_scene(body: str, lamp: str, bsdf: str, resolution: int) -> tuple[Any, A
     }
     flat = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(radius)
     disk = {"type": "disk", "to_world": flat, "bsdf": {"type": "diffuse", "reflectance": REFLECTANCE}}
-    view = sensor(resolution, FIELD, [*VIEWPOINT])
+    view = sensor(resolution, caustic_energy.FIELD, [*caustic_energy.VIEWPOINT])
     parts = {"sensor": view, "disk": disk, "body": solid, "lamp": lamps[lamp]}
     return mi.load_dict({"type": "scene"} | parts), caustic_energy.power_by_radiance(resolution)

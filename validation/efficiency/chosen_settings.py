@@ -23,14 +23,7 @@ from mi_refract.plugins import PLUGIN
 from mi_refract.rendering.checkpoint import PILOT, SETTINGS
 from mi_refract.rendering.end_conditions import Limits
 from mi_refract.rendering.long_render import Job, resume
-from mi_refract.rendering.render_settings import (
-    AUTO,
-    DEFAULTS,
-    Settings,
-    parse_settings,
-    settings_text,
-    with_settings,
-)
+from mi_refract.rendering.render_settings import AUTO, DEFAULTS, Settings, parse_settings, settings_text, with_settings
 from mi_refract.rendering.scene_files import load_parsed, parse_scene
 from mi_refract.report.row import Reason, Row
 from validation import limits
