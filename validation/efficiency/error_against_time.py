@@ -17,21 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refract.image_diff import tile_statistics
 from mi_refract.plugins import scene_features
 from mi_refract.report.row import Reason, Row
 from validation import limits
 from validation.run import kernel_timing
 from validation.run.context import NO_REFERENCE, SCENES, Context, beyond_builtin
-from validation.run.metrics import (
-    DETECTABLE,
-    EQUAL_TIME,
-    EQUAL_TIME_DEFAULTS,
-    SMALLEST_P,
-    TIME_OVER_BUILTIN,
-    WELCH_ALARMS,
-)
-from validation.run.render_methods import BUILTIN, FROM_LAMPS, METHODS, OURS, Camera, Method, camera
+from validation.run.metrics import EQUAL_TIME, EQUAL_TIME_DEFAULTS, TIME_OVER_BUILTIN, WELCH_ALARMS
+from validation.run.render_methods import BUILTIN, FROM_LAMPS, METHODS, OURS, Camera, Method, camera, welch_values
 from validation.study import Study, Task, about
 
 TERMS = {
@@ -258,14 +250,7 @@ def _values(subject: Subject, builtins: list[Subject], measured: BySubject, refe
     for metric in METRICS[1:]:
         ratios = [t / s for t, s in zip(test.cost(metric), same.cost(metric), strict=True)]
         values[f"equal-time {metric}"] = statistics.median(ratios)
-    tiles = tile_statistics.compare_stacks(
-        references, np.stack(test.images), TILE, limits.WELCH_ERROR, limits.WELCH_MARGIN
-    )
-    return values | {
-        WELCH_ALARMS: float(tiles.alarms),
-        SMALLEST_P: tiles.smallest_p,
-        DETECTABLE: tiles.minimum_detectable(),
-    }
+    return values | welch_values(references, np.stack(test.images), TILE)
 
 
 def goals_of(subjects: list[Subject], measured: BySubject, only_glass: bool) -> dict[str, dict[str, float]]:

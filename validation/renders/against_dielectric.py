@@ -29,16 +29,9 @@ from validation import limits
 from validation.run import kernel_timing
 from validation.run.array_settings import RIGHT_PLUGINS
 from validation.run.context import NO_REFERENCE, Context
-from validation.run.metrics import (
-    CHANGED_SHARE,
-    DETECTABLE,
-    MEANS_DIFFER,
-    SMALLEST_P,
-    TIME_OVER_DIELECTRIC,
-    WELCH_ALARMS,
-)
+from validation.run.metrics import CHANGED_SHARE, DETECTABLE, MEANS_DIFFER, TIME_OVER_DIELECTRIC, WELCH_ALARMS
 from validation.run.render_methods import DIELECTRIC as BUILTIN
-from validation.run.render_methods import Camera, opened, save_image
+from validation.run.render_methods import Camera, opened, save_image, welch_values
 from validation.study import Study, Task, about
 
 NAME = "renders"
@@ -83,11 +76,7 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
     values = {CHANGED_SHARE: pairs.share, "largest change": pairs.largest, "RMSE": pairs.rms}
     values |= {MEANS_DIFFER: abs(pairs.mean_ratio - 1)}
     if not left_out:
-        tiles = tile_statistics.compare_stacks(
-            reference[half:], test[:half], TILE, limits.WELCH_ERROR, limits.WELCH_MARGIN
-        )
-        values |= {WELCH_ALARMS: float(tiles.alarms), SMALLEST_P: tiles.smallest_p}
-        values |= {DETECTABLE: tiles.minimum_detectable()}
+        values |= welch_values(reference[half:], test[:half], TILE)
     times, goals = _timed(context, path, plugin, cameras)
     replay: dict[str, Any] = {
         "scene": path.name,

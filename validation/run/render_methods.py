@@ -1,4 +1,4 @@
-"""The compared methods of rendering (an integrator and a BSDF each), and the camera for timing."""
+"""The compared methods of rendering (an integrator and a BSDF each), the camera for timing, and Welch's test."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ import numpy as np
 from mi_refract.io import image_file
 from mi_refract.plugins import PLUGIN
 from mi_refract.rendering import scene_files
+from validation import limits
+
+from .metrics import DETECTABLE, SMALLEST_P, WELCH_ALARMS
 
 DIELECTRIC = "dielectric"
 OURS = "refract_path"
@@ -103,6 +106,14 @@ def sensor(
     film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}}
     view = mi.ScalarTransform4f().look_at(origin, [*target], [0, 1, 0])
     return {"type": "perspective", "fov": fov, "to_world": view, "film": film, "sampler": {"type": "independent"}}
+
+
+def welch_values(reference: np.ndarray, test: np.ndarray, tile: int) -> dict[str, float]:
+    """Return the values of Welch's test of the tiles of two stacks of independent renders."""
+    from mi_refract.image_diff import tile_statistics
+
+    tiles = tile_statistics.compare_stacks(reference, test, tile, limits.WELCH_ERROR, limits.WELCH_MARGIN)
+    return {WELCH_ALARMS: float(tiles.alarms), SMALLEST_P: tiles.smallest_p, DETECTABLE: tiles.minimum_detectable()}
 
 
 def save_image(folder: Path, name: str, image: np.ndarray, about: dict[str, Any]) -> str:
