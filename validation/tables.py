@@ -143,11 +143,10 @@ def accuracy(rows: list[Row]) -> str:
     }
     rays = max((row.replay["rays"] for row in by_name.values()), default=0)
     denormal = [name for name, regime in REGIMES.items() if regime.rests_on_denormals]
+    counted = _measured(rows, per_formula.NAME, [m.MISCLASSIFIED])
     without_budget = {
         (row.case, row.setting): row
-        for row in sorted(
-            _measured(rows, per_formula.NAME, [m.MISCLASSIFIED]), key=lambda row: row.values[m.MISCLASSIFIED]
-        )
+        for row in sorted(counted, key=lambda row: row.values[m.MISCLASSIFIED])
         if row.case in denormal and not row.budgets and row.subject in FORMULAS
     }
     outside = [name for name in denormal if (name, "llvm float32") in without_budget]
@@ -527,18 +526,14 @@ def gallery(rows: list[Row], context: Context) -> bytes:
 
 def caustic_pairs(rows: list[Row], context: Context) -> bytes:
     """Return a PNG of all bodies and lamps, at equal irradiance: `path` above, with lamps traced below."""
-    by_method = [
-        {
-            row.case: row.images["test"]
-            for row in rows
-            if row.images and (row.study, row.subject) == (caustics.NAME, name)
-        }
-        for name in (BUILTIN.name, FROM_LAMPS.name)
+    paths: dict[str, dict[str, str]] = {}  # by case and method
+    for row in rows:
+        if row.study == caustics.NAME and row.images:
+            paths.setdefault(row.case, {})[row.subject] = row.images["test"]
+    pairs = [
+        np.concatenate([image_file.read_exr(context.out / by_method[x.name])[0] for x in (BUILTIN, FROM_LAMPS)])
+        for by_method in paths.values()
     ]
-    above, below = (
-        [image_file.read_exr(context.out / images[case])[0] for case in by_method[0]] for images in by_method
-    )
-    pairs = [np.concatenate(pair) for pair in zip(above, below, strict=True)]
     return _sheet([pair.repeat(2, 0).repeat(2, 1) for pair in pairs], 6)
 
 

@@ -99,10 +99,8 @@ class Bench:
             return x * (1 + optical_systems.NUDGE) if x > 1 else x / (1 + optical_systems.NUDGE)
 
         exact, wrong = self.system.off(self.system.path()), self.system.off(self.system.path(moved=denser))
-        ratios = [
-            length(x - exact[name])[..., 0] / optical_systems.NUDGE / self.bounds[name] for name, x in wrong.items()
-        ]
-        return 1 / max(float(ratio.max()) for ratio in ratios)
+        moved = {name: length(x - exact[name])[..., 0] / optical_systems.NUDGE for name, x in wrong.items()}
+        return 1 / max(float((x / self.bounds[name]).max()) for name, x in moved.items())
 
     def traced(self, plugin: str, spawned: bool = False) -> Path:
         """Trace with Mitsuba in its current variant. `spawned`: with Mitsuba's own ray offset."""

@@ -305,11 +305,8 @@ def retardation(group: Sequence[StandardNumber], samples: int) -> Answers:
     angle = math.radians(number.given["incidence"])
     matrix = np.eye(4)
     matrix[0, 0], matrix[0, 2] = 2 * math.tan(angle), 1 / math.tan(angle)
-    shape = {
-        "type": "cube",
-        "to_world": mi.ScalarTransform4f(matrix.tolist()),
-        "bsdf": glass(PLUGIN, number.given["n"]),
-    }
+    place = mi.ScalarTransform4f(matrix.tolist())
+    shape = {"type": "cube", "to_world": place, "bsdf": glass(PLUGIN, number.given["n"])}
     scene: Any = mi.load_dict({"type": "scene", "rhomb": shape})
     d = np.array([math.sin(angle), 0, -math.cos(angle)])
     start = np.array([-matrix[0, 0], 0, 0]) - 2 * d

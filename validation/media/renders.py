@@ -114,9 +114,8 @@ def absorbing_parts(name: str, absorbing: bool) -> Nodes:
         "nested": {"ball": ball, "inner": inner},
         "matt inside": {"box": {"type": "cube"} | shape(SIGMA), "matt": matt},
     }
-    return scenes[name] | {
-        "wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(3)}
-    }
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(3)}
+    return scenes[name] | {"wall": wall}
 
 
 def volpath_rows(context: Context, name: str) -> list[Row]:
@@ -168,10 +167,8 @@ def time_rows(context: Context) -> list[Row]:
             continue
         size, metric = 128 if context.profile.quick else 256, "time / without"
         with under(variant):
-            balls = {"with": bsdf, "without": plain}
-            cameras = {
-                x: Camera(scene(size, {"ball": {"type": "sphere", "bsdf": y}}, ours())) for x, y in balls.items()
-            }
+            balls = {x: {"type": "sphere", "bsdf": y} for x, y in (("with", bsdf), ("without", plain))}
+            cameras = {x: Camera(scene(size, {"ball": ball}, ours())) for x, ball in balls.items()}
 
             def clock(camera: Camera) -> float:
                 return statistics.median(camera(16, 0)[1] for _ in range(3))

@@ -210,9 +210,8 @@ class Contents:
         files |= structs.schemas() | {f"programs/{x}": (HERE / x).read_bytes() for x in ("check_rays.c", "judge.h")}
         files["LICENSE"] = HERE.parents[1].joinpath("LICENSE").read_bytes()
         template = jinja2.Template((HERE / "readme.md.j2").read_text("utf-8"), undefined=jinja2.StrictUndefined)
-        files["README.md"] = (
-            template.render(version=version, images=self.images, beyond_gltf=BEYOND_GLTF) + "\n"
-        ).encode()
+        text = template.render(version=version, images=self.images, beyond_gltf=BEYOND_GLTF)
+        files["README.md"] = f"{text}\n".encode()
         entries = {}
         for path in sorted(files):
             description = next(text for start, text in ABOUT.items() if path.startswith(start))

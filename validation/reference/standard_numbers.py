@@ -349,9 +349,8 @@ APEX = 60.0
 def _table() -> Iterator[StandardNumber]:
     one, pile = "(1 − R)/(1 + R), mean of s and p", "(1 − R)/(1 + (2m − 1) R), m plates, mean of s and p"
     for angle in (0.0, 30.0, 45.0, 60.0):
-        yield StandardNumber(
-            f"slab, n = 1.52, {angle:g}°", "transmittance", plates, {"n": 1.52, "incidence": angle}, one, PILE
-        )
+        given = {"n": 1.52, "incidence": angle}
+        yield StandardNumber(f"slab, n = 1.52, {angle:g}°", "transmittance", plates, given, one, PILE)
     for angle in (0.0, 45.0):
         given = {"n": 1.52, "incidence": angle, "count": 2}
         yield StandardNumber(f"2 slabs, n = 1.52, {angle:g}°", "transmittance", plates, given, pile, PILE)
@@ -366,14 +365,11 @@ def _table() -> Iterator[StandardNumber]:
         given = {"n": CIE_INDEX, "incidence": float(angle), "absorbance": cie_absorbance()}
         fit = "σ d, by least squares to the nine printed values; the index is given"
         text = "(1 − R)² a/(1 − R² a²), a = exp(−σ d/cosθ_t), mean of s and p"
-        yield StandardNumber(
-            f"CIE 171 clear glass, {angle}°", "transmittance", plates, given, text, CIE, printed=printed, fitted=fit
-        )
+        name = f"CIE 171 clear glass, {angle}°"
+        yield StandardNumber(name, "transmittance", plates, given, text, CIE, printed=printed, fitted=fit)
     for n in (1.5, 1.5168, 1.52):
-        text = "2 asin(n sin(A/2)) − A"
-        yield StandardNumber(
-            f"prism of 60°, n = {n:g}", "deviation", deviation, {"n": n, "apex": APEX}, text, PRISM, unit="°"
-        )
+        name, given, text = f"prism of 60°, n = {n:g}", {"n": n, "apex": APEX}, "2 asin(n sin(A/2)) − A"
+        yield StandardNumber(name, "deviation", deviation, given, text, PRISM, unit="°")
     for line, nm in LINES.items():
         law = functools.partial(_prism_of_glass, GLASSES["N-BK7"][0])
         text, source = "2 asin(n(λ) sin(A/2)) − A, Sellmeier's n(λ)", f"{PRISM}; {SCHOTT}"
@@ -387,14 +383,12 @@ def _table() -> Iterator[StandardNumber]:
             yield StandardNumber(name, "rainbow", rainbow, {"n": n, "order": order}, text, BOW, unit="°")
     for where, n in (("air to n = 1.5", 1.5), ("n = 1.5 to air", 1 / 1.5)):
         source = "Brewster 1815 (Phil. Trans. 105, 125); Born and Wolf, Principles of Optics, 1.5.3"
-        yield StandardNumber(
-            f"Brewster's angle, {where}", "Brewster's angle", brewster, {"n": n}, "atan n", source, unit="°"
-        )
+        name = f"Brewster's angle, {where}"
+        yield StandardNumber(name, "Brewster's angle", brewster, {"n": n}, "atan n", source, unit="°")
     for n in (1.5, 1.3333):
         source = "Born and Wolf, Principles of Optics, 1.5.4"
-        yield StandardNumber(
-            f"critical angle, n = {n:g} to air", "critical angle", critical, {"n": n}, "asin 1/n", source, unit="°"
-        )
+        name = f"critical angle, n = {n:g} to air"
+        yield StandardNumber(name, "critical angle", critical, {"n": n}, "asin 1/n", source, unit="°")
     law_text = "2m atan(cosθ √(sin²θ − n⁻²)/sin²θ), m reflections"
     for steep, near in ((False, "48°37′"), (True, "54°37′")):
         given = {"n": 1.51, "incidence": float(retarding_incidence(1.51, 45, steep)), "reflections": 2.0}
@@ -409,9 +403,8 @@ def _table() -> Iterator[StandardNumber]:
                 side, what = "outside" if outside else "inside", "transmittance" if passed else "reflectance"
                 given = {"n": n, "outside": float(outside), "passed": float(passed)}
                 text = "see validation.reference.closed_forms.hemispherical; 1 − R_i = (1 − R_e)/n², T = 1 − R"
-                yield StandardNumber(
-                    f"diffuse {what}, n = {n:g}, from {side}", "diffuse", diffuse, given, text, DIFFUSE
-                )
+                name = f"diffuse {what}, n = {n:g}, from {side}"
+                yield StandardNumber(name, "diffuse", diffuse, given, text, DIFFUSE)
     for glass, (coefficients, printed_at) in GLASSES.items():
         for line, printed in printed_at.items():
             law, text = functools.partial(sellmeier, coefficients), "n² = 1 + Σ B λ²/(λ² − C)"

@@ -211,11 +211,8 @@ def _image(ours: Sequence[Row], paths: Sequence[Row]) -> ShownRow | None:
         off, builtin_off = (percent(row.values[metric]) for metric in (metrics.OFF_EXACT, metrics.BUILTIN_OFF_EXACT))
         shares = f"{builtin_off} of the pixels of `{BUILTIN}` are wrong, {off} of those of `{PLUGIN}`"
         labels = {"reference": BUILTIN, "test": PLUGIN, EXACT: "exact paths"}
-        return {
-            "row": row.name,
-            "labels": labels,
-            "caption": f"Scene `{MIRAGE}`: beside exact paths, {shares}; {LINES}.",
-        }
+        caption = f"Scene `{MIRAGE}`: beside exact paths, {shares}; {LINES}."
+        return {"row": row.name, "labels": labels, "caption": caption}
     pairs = [row for row in ours if {"reference", "test"} <= row.images.keys()]
     if not pairs:
         return None

@@ -182,9 +182,8 @@ def _read(scene: str) -> Layers:
         (first, *_) = root.iterfind("shape/point[@name='p1']")
         return Layers(scene, indices, tuple(radii), True, 2, round(1 - float(first.attrib["value"].split(",")[2]), 3))
     heights = zip(values("shape/*/translate", "y"), values("shape/*/scale", "y"), strict=True)
-    return Layers(
-        scene, indices, tuple(round(y + half, 4) for y, half in heights), False, 0, POOL - STEP * len(indices)
-    )
+    boundaries = tuple(round(y + half, 4) for y, half in heights)
+    return Layers(scene, indices, boundaries, False, 0, POOL - STEP * len(indices))
 
 
 LAYERS = {scene: _read(scene) for scene in ("mirage", "fibre")}
