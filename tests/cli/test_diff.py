@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 
 import msgspec
 import pytest
-from support.diff_images import BROKEN, image, samples, tree
+from support.diff_images import BROKEN, SINGLE, image, samples, tree
 from support.processes import ENVIRONMENT, assert_refused
 from support.readme import DOCS
 
@@ -54,7 +54,7 @@ def test_inconclusive_renders(run, tmp_path):
 @pytest.mark.parametrize(
     ("words", "code"),
     [
-        *((f"--method {name}", 1) for name, method in methods.METHODS.items() if not method.takes_renders),
+        *((f"--method {name}", 1) for name in SINGLE),
         ("--method tolerance --set fail=0.2 --set hard_fail=1", 0),
         ("--method tolerance --set fail_percent=100 --set hard_fail=0.01", 1),
         ("--set spp=16", 1),  # only `welch` uses it: one setting is valid for a folder of both kinds of images

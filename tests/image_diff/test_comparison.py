@@ -8,17 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import ndimage
-from support.diff_images import of
+from support.diff_images import DIFFERENT, EQUAL, INCONCLUSIVE, SINGLE, SMOOTH, of
 
-from mi_refract.image_diff.comparison import Verdict, groups, preconditions
+from mi_refract.image_diff.comparison import groups, preconditions
 from mi_refract.image_diff.methods import METHODS, choice, compare
 from mi_refract.image_diff.pixel_statistics import differ_like_noise
 from mi_refract.image_diff.pixelwise import changes
 from mi_refract.io.image_file import Image
 
-SMOOTH = np.dstack([np.linspace(0.1, 0.9, 48 * 40).reshape(40, 48) ** k for k in (1, 2, 3)]).astype(np.float32)
-EQUAL, DIFFERENT, INCONCLUSIVE = Verdict.EQUAL, Verdict.DIFFERENT, Verdict.INCONCLUSIVE
-SINGLE = [name for name, method in METHODS.items() if not method.takes_renders]
 ONE_OF_MANY = "; not compared: 1 of 5760 values, not finite"
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from support.diff_images import SINGLE, samples
 from support.diff_images import image as smooth
-from support.diff_images import samples
 
 from mi_refract.image_diff import accept, file_pair, folders, settings
-from mi_refract.image_diff.methods import METHODS
 from mi_refract.image_diff.settings import Settings, from_words
 from mi_refract.io import image_file
 from mi_refract.io.image_file import read, read_parts, write_exr
@@ -17,7 +16,6 @@ from mi_refract.io.image_file import read, read_parts, write_exr
 RNG = np.random.default_rng(4)
 SMALL = [RNG.random((8, 8, 3), np.float32) for _ in range(3)]
 PYRAMID = [RNG.random((side, side, 3), np.float32) for side in (8, 4, 2, 1)]
-SINGLE = [name for name, method in METHODS.items() if not method.takes_renders]
 
 
 def compared(one, two, **how):

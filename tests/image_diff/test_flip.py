@@ -5,18 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 from scipy.special import ndtr
-from support.diff_images import of
+from support.diff_images import DIFFERENT, EQUAL, INCONCLUSIVE, SMOOTH, of, save
 
-from mi_refract.image_diff.comparison import Verdict
 from mi_refract.image_diff.flip import encoding, flip, local_error, one_way_change, patch_error, windows
 from mi_refract.image_diff.methods import compare
 from mi_refract.io import image_file
 
-SMOOTH = np.dstack([np.linspace(0.1, 0.9, 48 * 40).reshape(40, 48) ** k for k in (1, 2, 3)]).astype(np.float32)
-EQUAL, DIFFERENT, INCONCLUSIVE = Verdict.EQUAL, Verdict.DIFFERENT, Verdict.INCONCLUSIVE
 GRAY, SIZE = 76, 512
 Y, X = np.mgrid[:SIZE, :SIZE]
 
@@ -242,11 +238,7 @@ def test_integers_without_a_colour_space_are_srgb(tmp_path):
         ("tif exr", "float", "srgb_rec709_scene", "sRGB"),
     ):
         for path in (tmp_path / f"a.{name}" for name in names.split()):
-            spec = oiio.ImageSpec(8, 8, 3, stored)
-            if space:
-                spec.attribute("oiio:ColorSpace", space)
-            output = oiio.ImageOutput.create(str(path))
-            assert output.open(str(path), spec) and output.write_image(SMOOTH[:8, :8]) and output.close()
+            save(path, SMOOTH[:8, :8], stored, {"oiio:ColorSpace": (space,)} if space else {})
             assert encoding(image_file.read(path)) == expected, (path, stored, space)
     assert encoding(image_file.named("reference", SMOOTH)) == "linear"  # an array
 

@@ -10,11 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.diff_images import image, outcomes, samples
+from support.diff_images import image, outcomes, samples, save
 
 from mi_refract.image_diff import folders as diff
 from mi_refract.image_diff import methods, name_patterns, pairing, text_reports
@@ -183,13 +182,10 @@ def test_circular_links_do_not_stop_the_comparison(folders):
 def test_an_invalid_number_of_samples_in_a_header_is_an_error(tmp_path, spp):
     for side in ("old", "new"):
         image(tmp_path / side / "same.exr")
-        path = tmp_path / side / "noisy.exr"
-        spec = oiio.ImageSpec(8, 8, 2, "float")
-        spec.channelnames = ("Y", "Y.variance")
         kind = f"{'int' if type(spp[0]) is int else 'float'}[3]" if isinstance(spp, tuple) else ""
-        spec.attribute("mi_refract:spp", *([kind] if kind else []), spp)
-        output = oiio.ImageOutput.create(str(path))
-        assert output.open(str(path), spec) and output.write_image(np.ones((8, 8, 2), np.float32)) and output.close()
+        attributes = {"mi_refract:spp": (*([kind] if kind else []), spp)}
+        names = ("Y", "Y.variance")
+        save(tmp_path / side / "noisy.exr", np.ones((8, 8, 2), np.float32), "float", attributes, channelnames=names)
     results = diff.diff(tmp_path / "old", tmp_path / "new")
     assert {r.name: str(r.status) for r in results.results} == {"noisy.exr": "error", "same.exr": "equal"}
     assert "old/noisy.exr: samples per pixel in its header: " in results.results[0].error

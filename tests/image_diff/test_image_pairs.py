@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from support.diff_images import of
+from support.diff_images import EQUAL, INCONCLUSIVE, of
 
-from mi_refract.image_diff.comparison import Verdict
 from mi_refract.image_diff.methods import compare
 
 SHAPE = (32, 48)
@@ -282,7 +281,6 @@ WRONG = {
 
 # The tests ---------------------------------------------------------------------------------------------------------
 
-EQUAL, INCONCLUSIVE = Verdict.EQUAL, Verdict.INCONCLUSIVE
 METHODS = ("exact", "tolerance", "flip", "paired", "welch", "auto")
 # Pairs where black would pass, so that pictures that are not identical are inconclusive.
 BLIND = {(method, "dim id") for method in ("tolerance", "auto", "flip")} | {("flip", "single pixels")}

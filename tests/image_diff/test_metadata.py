@@ -11,17 +11,15 @@ import pytest
 from PIL import Image as Pillow
 from PIL import ImageCms
 from PIL.TiffImagePlugin import IFDRational
-from support.diff_images import exr_of_integers
+from support.diff_images import SINGLE, exr_of_integers, save
 from support.diff_images import tiff as write_tiff
 from support.readme import DOCS
 
 from mi_refract.image_diff import comparison, folders, metadata
-from mi_refract.image_diff.methods import METHODS
 from mi_refract.image_diff.settings import Settings
 from mi_refract.io import image_file
 
 PAGE = (DOCS / "reference/image-metadata.md").read_text("utf-8")
-SINGLE = [name for name, method in METHODS.items() if not method.takes_renders]
 CODES = np.random.default_rng(1).integers(0, 256, (8, 8, 3), np.uint8)
 GRAY, FOUR = CODES[..., :1], np.dstack([CODES, CODES[..., :1]])
 IDS = np.full((8, 8, 1), 2**24, np.uint32)
@@ -214,9 +212,7 @@ def test_equal_images_of_different_formats_are_equal(tmp_path, ending):
     """The same codes as in a PNG file."""
     paths = [tmp_path / "a.png", tmp_path / f"b.{ending}"]
     for path in paths:
-        spec = oiio.ImageSpec(8, 8, 3, "uint8")
-        output = oiio.ImageOutput.create(str(path))
-        assert output.open(str(path), spec) and output.write_image(np.full((8, 8, 3), 255, np.uint8)) and output.close()
+        save(path, np.full((8, 8, 3), 255, np.uint8), "uint8")
     (result,) = folders.diff(*paths, Settings.for_all(method="exact")).results
     assert result.status == "equal", result.reason
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from support.diff_images import save
 from support.readme import DOCS
 
 from mi_refract.image_diff import methods
@@ -110,10 +111,7 @@ def folders(tmp_path_factory):
         for side, codes in (("references", PLAIN), ("new", pixels)):
             path = root / side / f"{name}.png"
             path.parent.mkdir(exist_ok=True)
-            output = oiio.ImageOutput.create(str(path))
-            assert output.open(str(path), oiio.ImageSpec(128, 96, 3, "uint8"))
-            assert output.write_image(codes.clip(0, 255).astype(np.uint8))
-            output.close()
+            save(path, codes.clip(0, 255).astype(np.uint8), "uint8")
     return root / "references", root / "new"
 
 

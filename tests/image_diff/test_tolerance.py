@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from support.diff_images import DIFFERENT, EQUAL, INCONCLUSIVE
 from support.diff_images import of as image
 
-from mi_refract.image_diff.comparison import Verdict, passes_black
+from mi_refract.image_diff.comparison import passes_black
 from mi_refract.image_diff.methods import compare
 from mi_refract.image_diff.pixelwise import tolerance, tolerance_accepts
 from mi_refract.io import image_file
 
 THRESHOLDS = (0.0, 1e-6, 1 / 255, 0.004, 0.01, 0.1, 1.0)
 FACTORS = (1, 1, 1, 0.5, 2, 1 + 6e-8, 1 - 6e-8, 1 + 1e-6)
-EQUAL, DIFFERENT, INCONCLUSIVE = Verdict.EQUAL, Verdict.DIFFERENT, Verdict.INCONCLUSIVE
 IDIFF = {"fail": 1e-6, "fail_relative": 0.0, "fail_percent": 0.0, "hard_fail": np.inf, "allow_failures": 0}
 IDIFF |= {"warn": 1e-6, "warn_relative": 0.0, "warn_percent": 0.0, "hard_warn": np.inf}  # idiff's own defaults
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import stats
-from support.diff_images import of
+from support.diff_images import DIFFERENT, EQUAL, INCONCLUSIVE, of
 
 from mi_refract.image_diff import (
     accept,
@@ -21,14 +21,12 @@ from mi_refract.image_diff import (
     text_reports,
 )
 from mi_refract.image_diff.channels import FREEDOM, SPP
-from mi_refract.image_diff.comparison import Verdict
 from mi_refract.image_diff.methods import METHODS, choice, compare
 from mi_refract.image_diff.results import Category, Status
 from mi_refract.image_diff.settings import Entry, Settings, load
 from mi_refract.io.image_file import read, write_exr
 from mi_refract.io.reference_pack import origin
 
-EQUAL, DIFFERENT, INCONCLUSIVE = Verdict.EQUAL, Verdict.DIFFERENT, Verdict.INCONCLUSIVE
 RGB, XYZ = channels.RGB, channels.XYZ
 BESIDE = {"variance": "{stem}_var.exr", "spp_reference": 64, "spp_test": 16}
 SHAPE = (32, 48, 3)

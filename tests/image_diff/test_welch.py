@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.ndimage import gaussian_filter
-from support.diff_images import metric, of
+from support.diff_images import DIFFERENT, EQUAL, INCONCLUSIVE, metric, of
 
 from mi_refract.image_diff import pixel_statistics
-from mi_refract.image_diff.comparison import Verdict
 from mi_refract.image_diff.methods import compare
 from mi_refract.image_diff.pixel_statistics import Inflation, inflation
 from mi_refract.image_diff.tile_statistics import (
@@ -27,7 +26,6 @@ from mi_refract.image_diff.tile_statistics import (
     relative_mse,
 )
 
-EQUAL, DIFFERENT, INCONCLUSIVE = Verdict.EQUAL, Verdict.DIFFERENT, Verdict.INCONCLUSIVE
 SHAPE = (64, 64, 3)
 PASSES, PER_PASS = 8, 4
 welch, auto = partial(compare, "welch"), partial(compare, "auto")

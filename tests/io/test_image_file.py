@@ -12,7 +12,7 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image as PillowImage
 from PIL import ImageCms
-from support.diff_images import cut, exr_of_integers, tiff
+from support.diff_images import cut, exr_of_integers, save, tiff
 
 from mi_refract.io import image_file
 from mi_refract.io.image_file import (
@@ -29,21 +29,9 @@ from mi_refract.io.image_file import (
 
 SRGB_PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 PIXELS = np.random.default_rng(1).random((48, 40, 3)).astype(np.float32)
+UNASSOCIATED = {"oiio:UnassociatedAlpha": (1,)}  # colours are not multiplied by alpha
 # Values that conversion to half floats, clamping or a colour transform would change.
 HARD = np.array([[[0.1, -2.5, 1e20], [np.inf, 1e-30, 3]], [[1, np.nan, 65505], [4, 5, 6]], [[7, 8, 9], [0, -0.0, 1]]])
-
-
-def save(path, pixels, kind="float", unassociated=False, **attributes):
-    """Write an image with OpenImageIO; `unassociated`: colours are not multiplied by alpha."""
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
-    if unassociated:
-        spec.attribute("oiio:UnassociatedAlpha", 1)
-    for name, value in attributes.items():
-        setattr(spec, name, value)
-    output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), spec), output.geterror()
-    assert output.write_image(pixels) and output.close()
-    return path
 
 
 # Writing EXR files ----------------------------------------------------------------------------------------------------
@@ -113,7 +101,7 @@ def test_windows_unassociated_alpha_and_wide_numbers_are_kept(tmp_path):
     """Colours are not multiplied by alpha."""
     assert read(save(tmp_path / "a.exr", PIXELS, x=-3, y=5)).origin == (-3, 5)
     pixels = np.dstack([PIXELS, np.zeros((48, 40))]).astype(np.float32)
-    save(tmp_path / "a.png", pixels, "uint8", unassociated=True)
+    save(tmp_path / "a.png", pixels, "uint8", UNASSOCIATED)
     np.testing.assert_allclose(read(tmp_path / "a.png").pixels, pixels, atol=1 / 509)
     ids = np.uint32([[[2**24, 5]], [[2**24 + 1, 2**32 - 1]]])
     np.testing.assert_array_equal(read(exr_of_integers(tmp_path / "a.exr", ids, ["id1", "id2"])).pixels, ids)
@@ -121,7 +109,7 @@ def test_windows_unassociated_alpha_and_wide_numbers_are_kept(tmp_path):
     wide = np.array([[[1.0]], [[1 + 2.0**-40]]])
     path = save(tmp_path / "a.tif", wide, "double")
     np.testing.assert_array_equal(read(path).pixels, wide)
-    save(path, np.float32([[[1, 1, 1, 0.5]]]), unassociated=True)
+    save(path, np.float32([[[1, 1, 1, 0.5]]]), attributes=UNASSOCIATED)
     assert read(path).pixels[0, 0, 0] == 1
 
 

@@ -8,9 +8,14 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 
+from mi_refract.image_diff.comparison import Verdict
+from mi_refract.image_diff.methods import METHODS
 from mi_refract.io.image_file import Image, write_exr
 
 SIZE = (32, 48, 3)
+SMOOTH = np.dstack([np.linspace(0.1, 0.9, 48 * 40).reshape(40, 48) ** k for k in (1, 2, 3)]).astype(np.float32)
+EQUAL, DIFFERENT, INCONCLUSIVE = Verdict.EQUAL, Verdict.DIFFERENT, Verdict.INCONCLUSIVE
+SINGLE = [name for name, method in METHODS.items() if not method.takes_renders]
 
 
 def of(pixels, channels=None, **rest):
@@ -75,6 +80,19 @@ def outcomes(results):
     return {result.name: (str(result.status), str(result.category)) for result in results.results}
 
 
+def save(path, pixels, kind="float", attributes=None, **fields):
+    """Write an image with OpenImageIO; `attributes`: arguments of `ImageSpec.attribute` by name."""
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
+    for name, arguments in (attributes or {}).items():
+        spec.attribute(name, *arguments)
+    for name, value in fields.items():
+        setattr(spec, name, value)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec), output.geterror()
+    assert output.write_image(pixels) and output.close()
+    return path
+
+
 # Files that OpenImageIO cannot write ----------------------------------------------------------------------------------
 
 
@@ -107,12 +125,7 @@ def tiff(path, pixels, tags=None):
 
 def exr_of_integers(path, pixels, channels):
     """Write an EXR of uint32, by changing the header of one of float32."""
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "float")
-    spec.channelnames = channels
-    spec.attribute("compression", "none")
-    output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), spec) and output.write_image(pixels.astype(np.uint32).view(np.float32))
-    assert output.close()
+    save(path, pixels.astype(np.uint32).view(np.float32), attributes={"compression": ("none",)}, channelnames=channels)
     data = path.read_bytes()
     for name in channels:
         entry = name.encode() + b"\0" + struct.pack("<i", 2)
