@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -52,22 +51,24 @@ def needs_variant() -> Callable[[str], None]:
 
 
 # The variant of a test by the fixture that the test requests; of several fixtures the first one here counts.
-FIXED = {"llvm": "llvm_ad_rgb", "llvm_variant": "llvm_ad_rgb", "llvm_spectral": "llvm_ad_spectral"}
+FIXED = {"llvm_variant": "llvm_ad_rgb", "llvm_spectral": "llvm_ad_spectral"}
 FIXED |= {"scalar_variant": "scalar_rgb", "scalar_context": "scalar_rgb"}
 
 
 @pytest.fixture(autouse=True)
 def variant(request: pytest.FixtureRequest) -> str:
-    """The variant of the test: its parameter, otherwise the best that runs here; it is set before the test."""
+    """The variant of the test: its parameter, otherwise the best that runs here; it is set before the test.
+
+    If it cannot run, the test is skipped.
+    """
     parameters = request.node.callspec.params if hasattr(request.node, "callspec") else {}
     fixed = [name for fixture, name in FIXED.items() if fixture in request.fixturenames]
-    name: str = parameters.get("each_variant", [*fixed, VARIANT][0])
-    if USABLE[name]:  # the requested fixture skips the test
-        return VARIANT
-    if name != VARIANT or "mitsuba" in sys.modules:
-        from support.variants import switch
+    name: str = getattr(request, "param", parameters.get("each_variant", [*fixed, VARIANT][0]))
+    if reason := USABLE[name]:
+        pytest.skip(f"{name}: {reason}")
+    from support.variants import switch  # imports Mitsuba, before which `activate` must choose a libLLVM
 
-        switch(name)
+    switch(name)
     return name
 
 
@@ -77,9 +78,13 @@ def scalar_variant() -> None:
 
 
 @pytest.fixture
-def llvm_variant(needs_variant: Callable[[str], None]) -> None:
-    """Run the test in `llvm_ad_rgb`, which `variant` sets; skip it if that cannot run."""
-    needs_variant("llvm_ad_rgb")
+def llvm_variant() -> None:
+    """Run the test in `llvm_ad_rgb`, which `variant` sets, also in a file that uses `scalar_variant`."""
+
+
+@pytest.fixture
+def llvm_spectral() -> None:
+    """Run the test in `llvm_ad_spectral`, which `variant` sets."""
 
 
 # Subsets of the variants, by fixture.

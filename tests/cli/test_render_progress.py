@@ -6,7 +6,6 @@ import io
 import re
 from types import SimpleNamespace
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from rich.console import Console
@@ -53,10 +52,8 @@ def test_shown_error_has_its_interval_if_known():
 
 
 @pytest.fixture
-def run(tmp_path, needs_variant):
+def run(tmp_path, llvm_variant):
     """`run(spp=64)`: the render, and the output on a terminal of type `terminal`; "" is no terminal."""
-    needs_variant("llvm_ad_rgb")
-    mi.set_variant("llvm_ad_rgb")
 
     def make(preview=None, terminal="", **limits):
         render, text = rendering(tmp_path / "a.exr", restart=True, **limits), io.StringIO()

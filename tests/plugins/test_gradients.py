@@ -14,7 +14,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.glass_scenes import BLACK, GLASS, PLACE, attached, camera, glass_ball, parameter, sampled, sky, vector
-from support.variants import switch
 
 VIEWS = 3
 NUMBER = {"int_ior": 1.5, "specular_transmittance": 0.7, "specular_reflectance": 0.5}
@@ -54,11 +53,11 @@ WAYS = ("backward", "backward without update", "forward")
 
 
 @pytest.mark.parametrize(("forward", "update"), [(False, True), (False, False), (True, True)], ids=WAYS)
-@pytest.mark.parametrize(("variant", "integrator", "glass", "name"), CASES, ids=lambda x: x if type(x) is str else "")
-def test_every_view_has_its_gradient(variant, integrator, glass, name, forward, update, needs_variant):
+@pytest.mark.parametrize(
+    ("variant", "integrator", "glass", "name"), CASES, indirect=["variant"], ids=lambda x: x if type(x) is str else ""
+)
+def test_every_view_has_its_gradient(variant, integrator, glass, name, forward, update):
     """One `enable_grad` serves all views, although `backward` frees its graph. Bound: the order of sums."""
-    needs_variant(variant)
-    switch(variant)
 
     def gradients(views):
         scene = load(integrator, **glass)
@@ -230,11 +229,9 @@ def test_probabilities_of_lobes_are_detached(name, bsdf, llvm_variant):
     assert backward == expected and vector(dr.grad(image))[0] == expected
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
-def test_prb_projective_equals_prb_if_no_edge_moves(variant, needs_variant):
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"], indirect=True)
+def test_prb_projective_equals_prb_if_no_edge_moves(variant):
     """Its first part equals `prb`, with the same random numbers. It does not support polarised variants."""
-    needs_variant(variant)
-    switch(variant)
     gradients = []
     for integrator in ("prb", "prb_projective"):
         scene = load(integrator, **NUMBER)

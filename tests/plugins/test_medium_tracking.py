@@ -7,7 +7,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.glass_scenes import GLASS, PLACE, attached, camera, equal_means, refusal
-from support.variants import switch
 
 from mi_refract.plugins import medium_tracking
 from validation.run.context import SCENES
@@ -166,11 +165,9 @@ def test_the_distance_to_the_near_plane_absorbs_too(kind, near, rgb_variant):
     assert pixel == pytest.approx(math.exp(-0.7 * 5), rel=1e-4)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_spectral_polarized"])
-def test_tinted_glass_equals_that_of_volpath(variant, needs_variant):
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_spectral_polarized"], indirect=True)
+def test_tinted_glass_equals_that_of_volpath(variant):
     """Compares independent renders; one false alarm in 10,000 for each colour."""
-    needs_variant(variant)
-    switch(variant)
     tint = {"type": "homogeneous", "albedo": 0.0, "sigma_t": {"type": "rgb", "value": [0.2, 0.5, 1.0]}}
     tinted, renders = scene(slab=box(GLASS, interior=tint), integrator=CHANCE), []
     for seed, method in enumerate(({"type": "refract_path", "split_depth": 2}, {"type": "volpath", "max_depth": 64})):

@@ -10,7 +10,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.glass_scenes import GLASS, PLACE
-from support.variants import switch
 
 from mi_refract.plugins import path_loop, sampling
 from mi_refract.rendering.scene_files import REPRODUCIBLE
@@ -205,11 +204,9 @@ def test_a_sample_along_the_surface_has_the_weight_0_also_in_renders_that_are_di
     assert dr.all(weight == 0, axis=None)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_mono_polarized"])
-def test_a_differentiated_sample_has_the_weight_of_the_sample(variant, needs_variant):
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_mono_polarized"], indirect=True)
+def test_a_differentiated_sample_has_the_weight_of_the_sample(variant):
     """Also as a Mueller matrix of the world's frame."""
-    needs_variant(variant)
-    switch(variant)
     random = np.random.default_rng(2042)
     si = mi.SurfaceInteraction3f()
     si.sh_frame = mi.Frame3f(mi.Normal3f(dr.normalize(mi.Vector3f(random.normal(size=(3, 1000))))))

@@ -277,9 +277,7 @@ def test_a_missing_mesh_attribute_is_an_error(llvm_variant, nested, logged):
             mi.render(scene, spp=1)
 
 
-def test_the_index_of_an_rgb_texture_is_its_luminance(needs_variant):
-    needs_variant("llvm_ad_rgb")
-    mi.set_variant("llvm_ad_rgb")
+def test_the_index_of_an_rgb_texture_is_its_luminance(llvm_variant):
     green, black = (
         {"type": "bitmap", "bitmap": mi.Bitmap(np.full((1, 1, 3), colour, np.float32)), "raw": True}
         for colour in ([0.0, 2.0, 0.0], [0.0, 0.0, 0.0])

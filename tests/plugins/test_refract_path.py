@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2_contingency
 from support.glass_scenes import BLACK, GLASS, PLACE, SKY, camera, equal_means, glass_ball, parameter, refusal, render
-from support.variants import switch
 
 from mi_refract.image_diff import pixelwise, tile_statistics
 from mi_refract.numerics import mitsuba_mesh
@@ -417,11 +416,10 @@ MAPPED = {"type": "normalmap", "normalmap": NORMAL_MAP, "b": {"type": "conductor
         ("llvm_ad_spectral_polarized", "disk", POLARIZER),
         ("llvm_ad_spectral_polarized", "cube", POLARIZER),
     ],
+    indirect=["variant"],
 )
-def test_what_needs_a_tangent_has_it_in_a_scene_of_glass_only(variant, shape, bsdf, needs_variant):
+def test_what_needs_a_tangent_has_it_in_a_scene_of_glass_only(variant, shape, bsdf):
     """A matt ball out of sight changes nothing: with it a hit has all its parts."""
-    needs_variant(variant)
-    switch(variant)
     second = {"type": "sphere", "center": [0, 0, -3], "bsdf": GLASS}
     if bsdf is POLARIZER:  # light that is polarised by another one behind it
         behind = PLACE().translate([0, 0, -3]).scale(3)

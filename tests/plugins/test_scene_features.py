@@ -185,10 +185,8 @@ def test_a_spectrum_from_rgb_is_never_exactly_black(reflectance, black):
     assert ("smooth" in facts(part=sphere("diffuse", reflectance=reflectance))) != black
 
 
-@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
-def test_features_of_our_scenes(variant, needs_variant):
-    needs_variant(variant)
-    switch(variant)
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
+def test_features_of_our_scenes(variant):
     scenes = {path.stem: inspect(mi.load_file(str(path), res=4)) for path in SCENES.glob("*.xml")}
     assert {name for name, scene in scenes.items() if scene.only_glass} == GLASS_ONLY
     assert {name for name, scene in scenes.items() if not scene.environment} == {"fibre", "mirage"}

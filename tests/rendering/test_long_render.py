@@ -83,7 +83,7 @@ def test_the_header_in_the_documentations_example_renders_the_same_image_again(t
     np.testing.assert_array_equal(image, pixels(tmp_path / "b.exr"))
 
 
-def test_the_variance_of_many_passes_is_from_their_spread(tmp_path, llvm):
+def test_the_variance_of_many_passes_is_from_their_spread(tmp_path, llvm_variant):
     render = rendering(tmp_path / "a.exr", spp=60, pass_spp=4)
     header = render.run()
     image = read(tmp_path / "a.exr")
@@ -95,7 +95,7 @@ def test_the_variance_of_many_passes_is_from_their_spread(tmp_path, llvm):
     assert header["mi_refract:variance_from"] == "passes"
 
 
-def test_the_variance_of_few_passes_is_from_their_samples(tmp_path, llvm):
+def test_the_variance_of_few_passes_is_from_their_samples(tmp_path, llvm_variant):
     header = rendering(tmp_path / "a.exr", spp=30, pass_spp=8).run()
     assert (header["mi_refract:passes"], header["mi_refract:variance_freedom"]) == (4, 29)
     assert header["mi_refract:variance_from"] == "samples: an upper bound where the sampler stratifies them"
@@ -108,7 +108,7 @@ def test_the_variance_of_few_passes_is_from_their_samples(tmp_path, llvm):
 
 
 @pytest.mark.parametrize(("spp", "pass_spp"), [(64, 64), (16, 1)])
-def test_equal_renders_with_a_wide_filter_compare_as_equal(tmp_path, llvm, spp, pass_spp):
+def test_equal_renders_with_a_wide_filter_compare_as_equal(tmp_path, llvm_variant, spp, pass_spp):
     """Neighbours share samples, also in files whose variance has as many degrees of freedom as samples.
 
     With a family error of 20 %, more than 6 of 10 pairs are different once in 1157 runs.
@@ -123,7 +123,7 @@ def test_equal_renders_with_a_wide_filter_compare_as_equal(tmp_path, llvm, spp, 
     assert verdicts.count(Verdict.DIFFERENT) <= 6
 
 
-def test_non_finite_pixels_are_counted(tmp_path, llvm, monkeypatch):
+def test_non_finite_pixels_are_counted(tmp_path, llvm_variant, monkeypatch):
     render = rendering(tmp_path / "a.exr", spp=64, pass_spp=4)
     original = type(render.renderer).render
 
@@ -152,7 +152,7 @@ def test_invalid_options_are_refused_before_the_rendering(tmp_path, monkeypatch,
     assert "\n" not in str(error.value) and not list(tmp_path.iterdir())
 
 
-def test_a_render_without_noise_ends_early_unless_it_is_black(tmp_path, llvm):
+def test_a_render_without_noise_ends_early_unless_it_is_black(tmp_path, llvm_variant):
     for name, emitter in (("light", '<emitter type="constant"/>'), ("dark", "")):
         (tmp_path / f"{name}.xml").write_text(SKY.format(emitter))
     ended = "no noise: the samples of every pixel agree"
@@ -174,7 +174,7 @@ def test_a_render_without_noise_ends_early_unless_it_is_black(tmp_path, llvm):
     assert len(render.warnings) == 1 and "the image is still black" in render.warnings[0]
 
 
-def test_a_render_ends_at_the_first_limit_that_it_reaches(tmp_path, llvm):
+def test_a_render_ends_at_the_first_limit_that_it_reaches(tmp_path, llvm_variant):
     for _ in range(2):  # the second time from the finished image
         render = rendering(tmp_path / "a.exr", until=0.1, pass_spp=2)
         assert render.run()["mi_refract:passes"] in (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)  # only at a stop
@@ -192,7 +192,7 @@ def test_a_render_ends_at_the_first_limit_that_it_reaches(tmp_path, llvm):
     assert rendering(tmp_path / "e.exr", scene=scene, spp=8, pass_spp=4).run()["mi_refract:spp"] == 8
 
 
-def test_passes_grow_by_no_more_than_the_error_needs(tmp_path, llvm):
+def test_passes_grow_by_no_more_than_the_error_needs(tmp_path, llvm_variant):
     """The final error is at least 2/3 of its limit, and a resumed render has the same bits."""
     limits, sizes = {"until": 0.02}, []
     options = {"defines": {"res": "64"}, "restart": True}
@@ -214,7 +214,7 @@ def test_passes_grow_by_no_more_than_the_error_needs(tmp_path, llvm):
     assert not checkpoint.path_of(tmp_path / "c.exr").exists()
 
 
-def test_an_image_without_finite_pixels_is_an_error_of_until(tmp_path, llvm):
+def test_an_image_without_finite_pixels_is_an_error_of_until(tmp_path, llvm_variant):
     nan = '<emitter type="constant"><rgb name="radiance" value="nan"/></emitter>'
     (tmp_path / "a.xml").write_text(SKY.format(nan))
     for limits in ({"until": 0.1}, {"until_tile": 0.1, "pass_spp": 4}):
@@ -225,7 +225,7 @@ def test_an_image_without_finite_pixels_is_an_error_of_until(tmp_path, llvm):
     assert header["mi_refract:nonfinite_pixels"] == 64 and header["mi_refract:spp"] == 40
 
 
-def test_a_resumed_render_estimates_its_error_only_at_stops(tmp_path, llvm, monkeypatch):
+def test_a_resumed_render_estimates_its_error_only_at_stops(tmp_path, llvm_variant, monkeypatch):
     """After 9 passes the next stop is at 12: an estimate that is evaluated often is too small at some time."""
     rendering(tmp_path / "a.exr", spp=18, pass_spp=2).run()
     stops = set()
@@ -243,7 +243,7 @@ def test_a_resumed_render_estimates_its_error_only_at_stops(tmp_path, llvm, monk
 
 
 @pytest.mark.parametrize("passes", [1, 7, 8, 9, 20])
-def test_a_checkpoint_resumes_with_the_same_bits(tmp_path, llvm, passes):
+def test_a_checkpoint_resumes_with_the_same_bits(tmp_path, llvm_variant, passes):
     output = tmp_path / "a.exr"
     stopped_after(rendering(output, spp=90, pass_spp=4), passes)
     assert checkpoint.path_of(output).exists() and not output.exists()
@@ -254,7 +254,7 @@ def test_a_checkpoint_resumes_with_the_same_bits(tmp_path, llvm, passes):
     assert_same_as_fresh(output, spp=90, pass_spp=4)
 
 
-def test_a_finished_image_of_the_same_render_is_refined(tmp_path, llvm):
+def test_a_finished_image_of_the_same_render_is_refined(tmp_path, llvm_variant):
     output, pass_counts = tmp_path / "a.exr", []
     output.write_bytes(b"no EXR")
     assert rendering(output, spp=8).progress.done == 0
@@ -302,7 +302,7 @@ def test_an_image_of_few_samples_under_a_wide_filter_is_not_refined(tmp_path, rf
 
 
 @pytest.mark.parametrize("spp", [6, 32, 40])
-def test_the_same_command_again_renders_nothing_and_changes_nothing(tmp_path, llvm, spp, monkeypatch):
+def test_the_same_command_again_renders_nothing_and_changes_nothing(tmp_path, llvm_variant, spp, monkeypatch):
     output = tmp_path / "a.exr"
     rendering(output, spp=spp, pass_spp=4).run()
     content, render = output.read_bytes(), rendering(output, spp=spp, pass_spp=4)
@@ -311,14 +311,14 @@ def test_the_same_command_again_renders_nothing_and_changes_nothing(tmp_path, ll
     assert output.read_bytes() == content
 
 
-def test_a_last_pass_that_the_sampler_rounds_up_is_kept(tmp_path, llvm):
+def test_a_last_pass_that_the_sampler_rounds_up_is_kept(tmp_path, llvm_variant):
     scene = changed(tmp_path, ('value="independent"', 'value="stratified"'))
     stopped_after(rendering(tmp_path / "a.exr", scene=scene, spp=6, pass_spp=4), 2)
     rendering(tmp_path / "a.exr", scene=scene, spp=6, pass_spp=4).run()
     assert_same_as_fresh(tmp_path / "a.exr", scene, spp=6, pass_spp=4)
 
 
-def test_a_checkpoint_of_another_render_is_refused_with_the_difference(tmp_path, llvm, monkeypatch):
+def test_a_checkpoint_of_another_render_is_refused_with_the_difference(tmp_path, llvm_variant, monkeypatch):
     """Files that the scene names are part of the scene."""
     texture = '<bsdf type="diffuse"><texture type="bitmap" name="reflectance"><string name="filename" value="a.ppm"/>'
     size = '<transform name="to_world"><scale value="1"/></transform>'
@@ -371,7 +371,7 @@ def forged(header=None, nodes=None, sums=lambda sums: sums):
 KINDS = ["total", "between", "within"]
 
 
-def test_sums_of_other_machines_are_checked(tmp_path, llvm):
+def test_sums_of_other_machines_are_checked(tmp_path, llvm_variant):
     render = rendering(tmp_path / "a.exr", spp=16, pass_spp=4)
 
     def other_machine(first, stop, last, offset, spp):
@@ -404,7 +404,7 @@ DAMAGE = {
 }
 
 
-def test_a_damaged_checkpoint_is_refused(tmp_path, llvm):
+def test_a_damaged_checkpoint_is_refused(tmp_path, llvm_variant):
     stopped_after(rendering(tmp_path / "a.exr", spp=64, pass_spp=4), 3)
     path = checkpoint.path_of(tmp_path / "a.exr")
     whole = path.read_bytes()
@@ -424,7 +424,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path, llvm):
     assert_refused()
 
 
-def test_every_flipped_bit_of_a_checkpoint_is_detected(tmp_path, llvm):
+def test_every_flipped_bit_of_a_checkpoint_is_detected(tmp_path, llvm_variant):
     render = rendering(tmp_path / "a.exr", spp=64, pass_spp=4)
     stopped_after(render, 3)
     path, shape = render.checkpoints.path, (8, 8, 3)
@@ -447,7 +447,7 @@ def write_to_full_disk(*_):
 
 # The last pass is the only one, comes after others, and is replaced by a full pass.
 @pytest.mark.parametrize(("spp", "resumed_spp"), [(3, 3), (11, 11), (11, 16)])
-def test_the_last_pass_is_kept_if_the_image_cannot_be_written(tmp_path, llvm, monkeypatch, spp, resumed_spp):
+def test_the_last_pass_is_kept_if_the_image_cannot_be_written(tmp_path, llvm_variant, monkeypatch, spp, resumed_spp):
     output = tmp_path / "a.exr"
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
         patch.setattr(rendered_file, "write", write_to_full_disk)
@@ -458,7 +458,7 @@ def test_the_last_pass_is_kept_if_the_image_cannot_be_written(tmp_path, llvm, mo
     assert_same_as_fresh(output, spp=resumed_spp, pass_spp=4)
 
 
-def test_a_checkpoint_that_cannot_be_written_is_a_warning(tmp_path, llvm, monkeypatch, capfd):
+def test_a_checkpoint_that_cannot_be_written_is_a_warning(tmp_path, llvm_variant, monkeypatch, capfd):
     render, write, exists = rendering(tmp_path / "a.exr", spp=32, pass_spp=4), checkpoint.write, []
     render.checkpoints.interval = 0.0
     monkeypatch.setattr(checkpoint, "write", write_to_full_disk)
@@ -477,7 +477,7 @@ def test_a_checkpoint_that_cannot_be_written_is_a_warning(tmp_path, llvm, monkey
     assert "checkpoint not written: No space left" in capfd.readouterr().err
 
 
-def test_a_second_render_into_the_same_file_is_refused(tmp_path, llvm):
+def test_a_second_render_into_the_same_file_is_refused(tmp_path, llvm_variant):
     first, second = (rendering(tmp_path / "a.exr", spp=16, pass_spp=4) for _ in range(2))
     message, errors = r"a\.exr: a render is already running in process \d+ .* file", []
 
@@ -496,7 +496,7 @@ def test_a_second_render_into_the_same_file_is_refused(tmp_path, llvm):
 
 
 @pytest.mark.parametrize("took", [1, 8, 12, 19, 24, 40])
-def test_checkpoints_are_25_s_or_one_pass_apart(tmp_path, llvm, monkeypatch, took):
+def test_checkpoints_are_25_s_or_one_pass_apart(tmp_path, llvm_variant, monkeypatch, took):
     """Only passes move the clock, each by `took` seconds."""
     clock, checkpoint_seconds = [0.0], [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
@@ -555,7 +555,7 @@ def ended_by(number, output, spp, variant="llvm_ad_rgb", handler="default"):
             process.kill()  # otherwise a failed test would wait forever
 
 
-def test_a_render_that_sigkill_ends_resumes_with_the_same_bits(tmp_path, llvm):
+def test_a_render_that_sigkill_ends_resumes_with_the_same_bits(tmp_path, llvm_variant):
     output, limits = tmp_path / "a.exr", {"spp": 400, "pass_spp": 4}
     assert ended_by(signal.SIGKILL, output, 400)[0] == -signal.SIGKILL
     ended_by(signal.SIGKILL, output, 400)  # this render may finish before the signal
@@ -571,10 +571,9 @@ def test_a_render_that_sigkill_ends_resumes_with_the_same_bits(tmp_path, llvm):
     ("number", "variant", "handler"),
     [(number, "llvm_ad_rgb", "default") for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
     + [(signal.SIGINT, "scalar_rgb", "ignored")],
+    indirect=["variant"],
 )
-def test_a_signal_leaves_a_checkpoint(tmp_path, needs_variant, number, variant, handler):
-    needs_variant(variant)
-    mi.set_variant(variant)
+def test_a_signal_leaves_a_checkpoint(tmp_path, number, variant, handler):
     output, spp = tmp_path / "a.exr", 4800 if variant.startswith("llvm") else 100_000
     code, err = ended_by(number, output, spp, variant, handler)
     assert code == 128 + number, err

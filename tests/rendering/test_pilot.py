@@ -229,7 +229,7 @@ def header_and_pixels(output, **options):
     return header, pixels(output)
 
 
-def test_chosen_settings_split_at_glass_and_give_the_bits_of_the_same_settings_by_name(tmp_path, llvm):
+def test_chosen_settings_split_at_glass_and_give_the_bits_of_the_same_settings_by_name(tmp_path, llvm_variant):
     """Only glass makes noise in this scene, and splitting has a hundredth of the variance."""
     header, chosen = header_and_pixels(tmp_path / "a.exr", spp=16, settings=AUTO)
     settings = header["mi_refract:settings"]
@@ -248,7 +248,7 @@ def test_chosen_settings_split_at_glass_and_give_the_bits_of_the_same_settings_b
     assert pack(again.parsed).nodes == with_settings(parse_scene(BALLS, GLASS_ONLY), parse_settings(settings)).nodes
 
 
-def test_a_checkpoint_keeps_the_chosen_settings(tmp_path, llvm):
+def test_a_checkpoint_keeps_the_chosen_settings(tmp_path, llvm_variant):
     class Stop(Exception):
         pass
 
@@ -278,7 +278,7 @@ def test_a_checkpoint_keeps_the_chosen_settings(tmp_path, llvm):
         render_with(AUTO)
 
 
-def test_the_time_of_light_paths_excludes_compilation(tmp_path, llvm, monkeypatch):
+def test_the_time_of_light_paths_excludes_compilation(tmp_path, llvm_variant, monkeypatch):
     """The second trace compiles again if Dr.Jit's cache of kernels is empty."""
     lamp = '<shape type="rectangle"><emitter type="area"/></shape>'
     (tmp_path / "a.xml").write_text(GLASS.replace('<emitter type="constant"/>', lamp))
@@ -308,7 +308,7 @@ UNMEASURABLE = {
 
 
 @pytest.mark.parametrize("scene, message", UNMEASURABLE.values(), ids=UNMEASURABLE)
-def test_a_scene_that_a_pilot_cannot_measure_is_an_error(tmp_path, llvm, scene, message):
+def test_a_scene_that_a_pilot_cannot_measure_is_an_error(tmp_path, llvm_variant, scene, message):
     (tmp_path / "a.xml").write_text(scene)
     with pytest.raises(ValueError) as error:
         resume(Job(tmp_path / "a.xml", settings=AUTO), tmp_path / "a.exr")
@@ -330,7 +330,7 @@ UNSUITABLE_SAMPLERS = {
 
 
 @pytest.mark.parametrize("sampler, message", UNSUITABLE_SAMPLERS.values(), ids=UNSUITABLE_SAMPLERS)
-def test_a_sampler_whose_noise_cannot_be_measured_is_an_error(tmp_path, llvm, sampler, message):
+def test_a_sampler_whose_noise_cannot_be_measured_is_an_error(tmp_path, llvm_variant, sampler, message):
     class Fixed(mi.Sampler):
         pass
 
@@ -343,7 +343,7 @@ def test_a_sampler_whose_noise_cannot_be_measured_is_an_error(tmp_path, llvm, sa
         resume(job, tmp_path / "a.exr", Limits(spp=4, pass_spp=4))
 
 
-def test_the_time_limit_of_a_render_includes_its_pilot(tmp_path, llvm, monkeypatch):
+def test_the_time_limit_of_a_render_includes_its_pilot(tmp_path, llvm_variant, monkeypatch):
     """Each reading of the clock moves it by a second, and the pilot exceeds the limit: one pass is rendered."""
     clock = itertools.count()
     monkeypatch.setattr(time, "monotonic", lambda: float(next(clock)))
@@ -359,7 +359,7 @@ def test_the_time_limit_of_a_render_includes_its_pilot(tmp_path, llvm, monkeypat
     assert render.progress.passes == 1 and render.ended_by == "--time 60 s"
 
 
-def test_samplers_that_do_not_support_the_samples_of_a_pass_are_no_candidates(tmp_path, llvm):
+def test_samplers_that_do_not_support_the_samples_of_a_pass_are_no_candidates(tmp_path, llvm_variant):
     """Of those that Mitsuba has, only the scene's own, `independent`, has passes of 5 samples."""
     (tmp_path / "a.xml").write_text(GLASS)
     render = resume(Job(tmp_path / "a.xml", settings=AUTO), tmp_path / "a.exr", Limits(spp=10, pass_spp=5))
@@ -367,7 +367,7 @@ def test_samplers_that_do_not_support_the_samples_of_a_pass_are_no_candidates(tm
 
 
 @pytest.mark.parametrize("integrator", ["depth", "refract_path"])
-def test_a_scene_keeps_an_integrator_other_than_path(tmp_path, llvm, integrator):
+def test_a_scene_keeps_an_integrator_other_than_path(tmp_path, llvm_variant, integrator):
     """Also the one without noise."""
     flag = '<boolean name="deterministic" value="true"/>' * (integrator == "refract_path")
     own = f'<integrator type="{integrator}">{flag}</integrator>'

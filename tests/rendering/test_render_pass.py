@@ -66,11 +66,9 @@ IMAGES = [  # every kind of variant, filter and format
 ]
 
 
-@pytest.mark.parametrize(("variant", "rfilter", "pixel_format", "options"), IMAGES)
-def test_a_pass_is_mitsubas_image(tmp_path, needs_variant, variant, rfilter, pixel_format, options):
+@pytest.mark.parametrize(("variant", "rfilter", "pixel_format", "options"), IMAGES, indirect=["variant"])
+def test_a_pass_is_mitsubas_image(tmp_path, variant, rfilter, pixel_format, options):
     """Also with `refract_path`, which seeds its splits, or passes would not be independent."""
-    needs_variant(variant)
-    mi.set_variant(variant)
     scene = scene_of(tmp_path, rfilter, pixel_format, **options)
     if "integrator" in options:
         scene.integrator().split_depth = 3
@@ -87,12 +85,10 @@ def test_a_pass_is_mitsubas_image(tmp_path, needs_variant, variant, rfilter, pix
         assert expected.shape[:2] == (5, 7) and expected.shape[2] > 6
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"])
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
 @pytest.mark.parametrize("rfilter", ["gaussian", "lanczos"])
-def test_a_wide_filters_sums_are_those_of_mitsubas_film(tmp_path, needs_variant, variant, rfilter):
+def test_a_wide_filters_sums_are_those_of_mitsubas_film(tmp_path, variant, rfilter):
     """Totals and weights are separate, because a mean of their quotients over passes would be biased."""
-    needs_variant(variant)
-    mi.set_variant(variant)
     scene = scene_of(tmp_path, rfilter)
     renderer = pass_renderer(scene, 3)
     sums = renderer.render(0, 2)
@@ -104,7 +100,7 @@ def test_a_wide_filters_sums_are_those_of_mitsubas_film(tmp_path, needs_variant,
 
 
 @pytest.mark.parametrize("rfilter", ["gaussian", "lanczos", "tent"])
-def test_the_mean_weight_of_a_wide_filter_is_spp_in_every_pixel(tmp_path, llvm, rfilter):
+def test_the_mean_weight_of_a_wide_filter_is_spp_in_every_pixel(tmp_path, llvm_variant, rfilter):
     """Also at the border, which fewer samples reach."""
     renderer = pass_renderer(scene_of(tmp_path, rfilter), 3)
     weights = np.array([renderer.render(number, 4).weights for number in range(64)])
@@ -114,16 +110,14 @@ def test_the_mean_weight_of_a_wide_filter_is_spp_in_every_pixel(tmp_path, llvm, 
     assert np.ptp(renderer.expected) > 0.1
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"])
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
 @pytest.mark.parametrize(
     ("rfilter", "radius", "area"),
     [({"type": "box"}, 0.5, 1.0), ({"type": "tent", "radius": 3.0}, 3.0, (3 * 1.5) ** 2)]
     + [({"type": "gaussian", "stddev": x}, 4 * x, 4 * np.pi * x**2) for x in (1.0, 3.0)],
 )
-def test_the_header_contains_radius_and_area_of_the_filter(needs_variant, variant, rfilter, radius, area):
+def test_the_header_contains_radius_and_area_of_the_filter(variant, rfilter, radius, area):
     """The area is (∫∫w)²/∫∫w². Of a Gaussian it is that of an infinite one; Mitsuba's ends at 4 standard deviations."""
-    needs_variant(variant)
-    mi.set_variant(variant)
     film = {"type": "hdrfilm", "width": 4, "height": 4, "filter": rfilter}
     scene = mi.load_dict(
         {"type": "scene", "integrator": {"type": "path"}, "sensor": {"type": "perspective", "film": film}}
@@ -168,7 +162,7 @@ def test_aovs_and_opacity_do_not_count_in_the_error_of_an_image(needs_variant, f
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
 @pytest.mark.parametrize("spp", [7, 8])
-def test_the_bits_do_not_depend_on_the_number_of_threads(tmp_path, llvm, rfilter, spp):
+def test_the_bits_do_not_depend_on_the_number_of_threads(tmp_path, llvm_variant, rfilter, spp):
     renderer, threads = pass_renderer(scene_of(tmp_path, rfilter, res="64"), 3), dr.thread_count()
     try:
         renders = []
@@ -198,7 +192,7 @@ print(pass_renderer(scene, 0).render(0, 4).total.sum())
 """
 
 
-def test_a_render_in_one_thread_flushes_denormals_as_in_several(llvm):
+def test_a_render_in_one_thread_flushes_denormals_as_in_several(llvm_variant):
     """The caller's own thread keeps denormals in a process that has rendered nothing before."""
     totals = []
     for count in (1, 3):
@@ -207,7 +201,7 @@ def test_a_render_in_one_thread_flushes_denormals_as_in_several(llvm):
     assert totals[0] == totals[1]
 
 
-def test_an_integrator_with_its_own_render_method_runs_in_one_thread(tmp_path, llvm, monkeypatch):
+def test_an_integrator_with_its_own_render_method_runs_in_one_thread(tmp_path, llvm_variant, monkeypatch):
     scene = scene_of(tmp_path, "gaussian", integrator="ptracer")
     renderer, threads = pass_renderer(scene, 3), dr.thread_count()
     assert not renderer.moments
@@ -262,7 +256,7 @@ def test_passes_of_scalar_variants_share_no_random_numbers_in_blocks_beyond_the_
 
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
-def test_the_variance_within_passes_is_that_between_passes(tmp_path, llvm, rfilter):
+def test_the_variance_within_passes_is_that_between_passes(tmp_path, llvm_variant, rfilter):
     """Averaged over pixels, and compared with the variance between 64 passes."""
     renderer = pass_renderer(scene_of(tmp_path, rfilter), 3)
     passes = [renderer.render(number, 16) for number in range(64)]
@@ -275,7 +269,7 @@ def test_the_variance_within_passes_is_that_between_passes(tmp_path, llvm, rfilt
 
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
-def test_equal_samples_have_no_second_moment(llvm, rfilter):
+def test_equal_samples_have_no_second_moment(llvm_variant, rfilter):
     film = {"type": "hdrfilm", "width": 8, "height": 8, "filter": {"type": rfilter}}
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.1, 0.7, 0.3]}}
     sensor = {"type": "perspective", "film": film}
@@ -294,7 +288,7 @@ def sums_of(samples, *, squares=True):
 
 @pytest.mark.parametrize("spp", [1, 2, 3, 4, 6, 7, 8, 12, 16])
 @pytest.mark.parametrize("channels", [1, 3, 5])
-def test_sums_and_squares_are_accurate(llvm, spp, channels):
+def test_sums_and_squares_are_accurate(llvm_variant, spp, channels):
     """They are within n roundings of their terms, also if the first sample, from which all are subtracted, is far off.
 
     Samples are read 1, 2, 4 or 8 at a time.
@@ -315,7 +309,7 @@ def test_sums_and_squares_are_accurate(llvm, spp, channels):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("number", [0, 3])
-def test_a_non_finite_sample_affects_only_its_pixel_and_channel(llvm, value, number):
+def test_a_non_finite_sample_affects_only_its_pixel_and_channel(llvm_variant, value, number):
     samples = np.ones((HEIGHT, WIDTH, 8, 3), np.float32)
     samples[1, 2, number, 1] = value
     total, _, within = sums_of(samples)

@@ -303,9 +303,7 @@ def test_spectral_variants_show_colours_and_rgb_does_not(name, colours):
     assert colourful > 0.3 if colours else colourful < 0.15
 
 
-def test_the_rainbow_is_red_at_its_borders_and_blue_between(needs_variant):
-    needs_variant("llvm_ad_spectral")
-    mi.set_variant("llvm_ad_spectral")
+def test_the_rainbow_is_red_at_its_borders_and_blue_between(llvm_spectral):
     image = rendered("rainbow_drop", res=96, spp=256)
     y, x = np.mgrid[:96, :96] + 0.5 - 48
     ring = (np.hypot(x, y) / 1.5).astype(int)
@@ -316,10 +314,8 @@ def test_the_rainbow_is_red_at_its_borders_and_blue_between(needs_variant):
     assert (red > blue)[middle + 1 : middle + 4].any() and (red > blue)[middle - 4 : middle].any()
 
 
-def test_thick_glass_is_darker(needs_variant):
+def test_thick_glass_is_darker(llvm_variant):
     """The stopper is solid, the wall of the neck below it is thin; both are in front of the sky."""
-    needs_variant("llvm_ad_rgb")
-    mi.set_variant("llvm_ad_rgb")
     image = rendered("green_bottle", res=64, spp=16)
     stopper, neck = image[3:7, 29:36].mean((0, 1)), image[10:15, 29:36].mean((0, 1))
     assert (stopper < neck).all() and stopper[0] < 0.5 * neck[0]
