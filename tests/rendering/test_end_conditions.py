@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 from scipy.stats import binom
+from support.renders import leaf, tree_of
 
 from mi_refract.rendering.end_conditions import RelativeError, relative_error, require_interval, worst_tile
 from mi_refract.rendering.pass_plan import next_stop
@@ -28,18 +29,6 @@ def noisy(kind, truth, spp):
     return truth * RNG.binomial(spp, 0.05, SIZE[:2])[..., None] / (spp * 0.05)
 
 
-def leaf(image, spp=4):
-    image = image.astype(np.float32).astype(np.float64)
-    return PassSums(spp, 1, image * spp, np.zeros_like(image))
-
-
-def sums_of(images, spp=4):
-    tree = PassTree()
-    for image in images:
-        tree.add(leaf(image, spp))
-    return tree.sums()
-
-
 def true_error(sums, truth):
     return math.sqrt(np.mean((sums.mean - truth) ** 2)) / truth.mean()
 
@@ -48,7 +37,7 @@ def true_error(sums, truth):
 def test_the_estimated_error_is_right_on_average(kind):
     truth, squares = RNG.uniform(0.2, 2, SIZE), []
     for _ in range(60):
-        sums = sums_of(noisy(kind, truth, 4) for _ in range(16))
+        sums = tree_of(noisy(kind, truth, 4) for _ in range(16)).sums()
         squares.append((relative_error(sums).value ** 2, true_error(sums, truth) ** 2))
     estimated, true = np.mean(squares, 0)
     # Both are means of 60 over at least 144 pixels: standard errors of 1.5 % for rare samples, with a kurtosis of 20.
@@ -111,13 +100,13 @@ def test_the_interval_is_the_prediction_interval_of_one_more_contrast(contrasts,
 
 def test_the_error_of_one_pass_or_a_black_image_and_the_interval_of_two_passes_are_unknown():
     assert math.isnan(relative_error(leaf(np.ones(SIZE))).value)
-    assert math.isnan(relative_error(sums_of([np.zeros(SIZE)] * 9)).value)
-    two = relative_error(sums_of(noisy("normal", np.ones(SIZE), 4) for _ in range(2)))
+    assert math.isnan(relative_error(tree_of([np.zeros(SIZE)] * 9).sums()).value)
+    two = relative_error(tree_of(noisy("normal", np.ones(SIZE), 4) for _ in range(2)).sums())
     assert two.value > 0 and math.isnan(two.high) and not two.high <= 1 and not RelativeError(math.nan).high <= 1
 
 
 def test_there_is_no_interval_without_scipy(monkeypatch):
-    nine = sums_of(noisy("normal", np.ones(SIZE), 4) for _ in range(9))
+    nine = tree_of(noisy("normal", np.ones(SIZE), 4) for _ in range(9)).sums()
     require_interval()
     monkeypatch.setitem(sys.modules, "scipy.stats", None)
     assert relative_error(nine).value > 0 and math.isnan(relative_error(nine).high)
@@ -129,7 +118,7 @@ def test_there_is_no_interval_without_scipy(monkeypatch):
 def test_non_finite_pixels_are_left_out():
     images = [noisy("normal", np.ones(SIZE), 4) for _ in range(32)]
     images[3][0, 0, 0], images[3][1, 1] = np.nan, np.inf
-    sums = sums_of(images)
+    sums = tree_of(images).sums()
     assert relative_error(sums).value == pytest.approx(1 / math.sqrt(128), rel=0.1)
     assert worst_tile(sums) == pytest.approx(1 / math.sqrt(128), rel=0.2)
 
@@ -146,5 +135,5 @@ def test_the_worst_tile_leaves_out_one_percent_of_the_tiles(side, truth, noise, 
     image[:16, :16] = truth
     for (height, width), value in reversed(noise.items()):
         deviation[:height, :width] = value
-    sums = sums_of(RNG.normal(image, deviation) for _ in range(16))
+    sums = tree_of(RNG.normal(image, deviation) for _ in range(16)).sums()
     assert worst_tile(sums) == pytest.approx(expected, rel=0.1)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from support.processes import python
 from support.readme import DOCS, python_blocks
-from support.renders import BALL, SCENES, pixels, rendering
+from support.renders import BALL, SCENES, pixels, rendering, stopped_after
 
 from mi_refract.cluster import on_worker
 from mi_refract.image_diff.comparison import Verdict
@@ -32,19 +32,6 @@ SKY = """<scene version="3.0.0"><integrator type="path"/><sensor type="perspecti
 <integer name="width" value="8"/><integer name="height" value="8"/></film></sensor>{}</scene>"""
 
 pytestmark = pytest.mark.usefixtures("scalar_variant")
-
-
-class Stop(Exception):
-    pass
-
-
-def stopped_after(render, passes):
-    def watch(render):
-        if render.progress.passes == passes:
-            raise Stop
-
-    with pytest.raises(Stop):
-        render.run(watch)
 
 
 def changed(tmp_path, *replacements):

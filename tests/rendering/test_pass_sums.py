@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.renders import leaf, tree_of
 
 from mi_refract.rendering.pass_plan import LANES, PassPlan, next_stop, plan_passes, scalar_seed_of, seed_of, usual_spp
 from mi_refract.rendering.pass_sums import ARITY, PassSums, PassTree, aligned_nodes
@@ -109,23 +110,11 @@ def test_stops_grow_in_steps_of_a_third_to_a_half():
 # Sums -----------------------------------------------------------------------------------------------------------------
 
 
-def leaf(image, spp=4, within=None):
-    image = np.asarray(image, np.float32).astype(np.float64)
-    return PassSums(spp, 1, image * spp, np.zeros_like(image), within, colours=min(3, image.shape[-1]))
-
-
 def fold(nodes):
     sums = nodes[0].copy()
     for node in nodes[1:]:
         sums.add(node)
     return sums
-
-
-def tree_of(images):
-    tree = PassTree()
-    for image in images:
-        tree.add(leaf(image))
-    return tree
 
 
 def test_a_tree_has_the_mean_variance_and_contrasts_of_its_passes():

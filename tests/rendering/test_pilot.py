@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.renders import BALL, GLASS, SCENES, pixels
+from support.renders import BALL, GLASS, SCENES, pixels, stopped_after
 
 from mi_refract.io.errors import CheckpointError
 from mi_refract.plugins import lamp_tracing
@@ -249,18 +249,11 @@ def test_chosen_settings_split_at_glass_and_give_the_bits_of_the_same_settings_b
 
 
 def test_a_checkpoint_keeps_the_chosen_settings(tmp_path, llvm_variant):
-    class Stop(Exception):
-        pass
-
-    def stop(render):
-        raise Stop
-
     def render_with(settings, restart=False):
         limits = Limits(spp=32, pass_spp=16)
         return resume(Job(BALLS, GLASS_ONLY, settings=settings), tmp_path / "a.exr", limits, restart=restart)
 
-    with pytest.raises(Stop):
-        render_with(AUTO).run(stop)
+    stopped_after(render_with(AUTO), 1)
     resumed = render_with(AUTO)
     assert resumed.progress.passes == 1
     settings = resumed.progress.identity["settings"]
@@ -272,8 +265,7 @@ def test_a_checkpoint_keeps_the_chosen_settings(tmp_path, llvm_variant):
     image = pixels(tmp_path / "a.exr")
     render_with(settings, restart=True).run()
     np.testing.assert_array_equal(pixels(tmp_path / "a.exr"), image)
-    with pytest.raises(Stop):
-        render_with(OWN, restart=True).run(stop)
+    stopped_after(render_with(OWN, restart=True), 1)
     with pytest.raises(CheckpointError, match=f"settings was {OWN}, is auto; pass --restart"):
         render_with(AUTO)
 

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+import pytest
+
 from mi_refract.io.image_file import read_exr
 from mi_refract.rendering.end_conditions import Limits
 from mi_refract.rendering.long_render import Job, resume
+from mi_refract.rendering.pass_sums import PassSums, PassTree
 
 SCENES = Path(__file__).parents[2] / "scenes"
 # 8 × 6 pixels of a sphere of glass and a cube.
@@ -33,3 +37,31 @@ def rendering(output, seed=0, scene=BALL, defines=SMALL, restart=False, **limits
 def pixels(path):
     """Return the pixels of an EXR file."""
     return read_exr(path)[0]
+
+
+class Stop(Exception):
+    """Raised to end a render."""
+
+
+def stopped_after(render, passes):
+    """Run a render, and end it after so many passes."""
+
+    def watch(render):
+        if render.progress.passes == passes:
+            raise Stop
+
+    with pytest.raises(Stop):
+        render.run(watch)
+
+
+def leaf(image, spp=4, within=None):
+    """Return the sums of one pass with this image."""
+    image = np.asarray(image, np.float32).astype(np.float64)
+    return PassSums(spp, 1, image * spp, np.zeros_like(image), within, colours=min(3, image.shape[-1]))
+
+
+def tree_of(images):
+    tree = PassTree()
+    for image in images:
+        tree.add(leaf(image))
+    return tree
