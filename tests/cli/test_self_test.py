@@ -1,18 +1,17 @@
 """`mi-refract self-test` of images, renders and scenes. A scene cannot run its own code."""
 
 import os
-from pathlib import Path
 
 import numpy as np
 from support.diff_images import image, samples
 from support.processes import assert_refused
 
-from mi_refract import backend
+from mi_refract import SCENES, backend
 from mi_refract.cli import diff as command
 from mi_refract.image_diff import methods, self_test
 from mi_refract.image_diff.comparison import Comparison, Verdict
 
-SCENE = Path(command.__file__).parents[2] / "scenes" / "sphere.xml"
+SCENE = SCENES / "sphere.xml"
 
 
 def test_self_test_of_renders_an_image_and_a_scene(run, tmp_path, monkeypatch):

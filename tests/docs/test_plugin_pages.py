@@ -1,17 +1,16 @@
 """Pages of the plugins: their tables of parameters, and the equality of their examples in XML and Python."""
 
 import re
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.readme import blocks
+from support.readme import DOCS, blocks
 from support.variants import switch
 
 from mi_refract.plugins import refract, refract_path
 
-PAGES = Path(__file__).parents[2] / ".github/docs/reference"
+PAGES = DOCS / "reference"
 TABLES = {
     module.__name__.rpartition(".")[2]: [
         [cell.strip() for cell in line.strip("|").split("|")]

@@ -105,10 +105,7 @@ def test_a_matched_boundary_returns_the_same_bits(name, setting):
     rays, count = make("generic", COUNTS[setting.backend], setting.precision, seed=3), COUNTS[setting.backend]
     cosine, axis = np.geomspace(1e-30, 1, count), setting.vector(*Z)
     low = np.stack([np.sqrt(1 - cosine**2), 0 * cosine, -cosine], 1).astype(setting.precision)
-    for a, formula in (
-        (rays.a, FORMULAS[name]),
-        (low, lambda x, _, k: FORMULAS[name].unchecked(x, axis, k)),
-    ):
+    for a, formula in ((rays.a, FORMULAS[name]), (low, lambda x, _, k: FORMULAS[name].unchecked(x, axis, k))):
         b, transmitted = evaluate(formula, Rays(a, rays.n, np.ones_like(rays.k)), setting.vector)
         assert transmitted.all() and (b.astype(setting.precision) == a).all()
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import yaml
 from support.diff_images import image
-from support.processes import ENVIRONMENT
+from support.processes import ENVIRONMENT, executable
 from support.readme import DOCS, ROOT, blocks
 
 ACTION = ROOT / ".github" / "actions" / "diff"
@@ -36,11 +36,6 @@ case "$1 $2" in
   *) exec "{python}" "$@" ;;
 esac
 """
-
-
-def program(path, text):
-    path.write_text(text)
-    path.chmod(0o755)
 
 
 def read_yaml(text):
@@ -94,9 +89,9 @@ def programs(tmp_path):
     """A folder for PATH: `python3` and `pip` that install nothing, and `mi-refract`."""
     folder = tmp_path / "programs"
     folder.mkdir()
-    program(folder / "python3", PYTHON.format(programs=folder, python=sys.executable))
-    program(folder / "pip", f'#!/bin/bash\nprintf "%s\\n" "$@" >>"{folder}/installed"\n')
-    program(folder / "mi-refract", f'#!/bin/bash\nexec "{sys.executable}" -m mi_refract.cli "$@"\n')
+    executable(folder / "python3", PYTHON.format(programs=folder, python=sys.executable))
+    executable(folder / "pip", f'#!/bin/bash\nprintf "%s\\n" "$@" >>"{folder}/installed"\n')
+    executable(folder / "mi-refract", f'#!/bin/bash\nexec "{sys.executable}" -m mi_refract.cli "$@"\n')
     return folder
 
 
@@ -120,7 +115,7 @@ def set_gain(project, gain):
     rendered = project.parent / "rendered"
     for name, factor in (("ball.exr", 1.0), ("inner/other.exr", gain)):
         image(rendered / name, gain=factor)
-    program(project / "render_all", f'#!/bin/bash\nmkdir -p "$1" && cp -r "{rendered}"/* "$1"\n')
+    executable(project / "render_all", f'#!/bin/bash\nmkdir -p "$1" && cp -r "{rendered}"/* "$1"\n')
 
 
 @pytest.fixture
@@ -284,7 +279,7 @@ def test_the_documented_ctest_works(project, environment, tmp_path, render, fail
         f"cmake_minimum_required(VERSION 3.18)\nproject(p NONE)\nenable_testing()\n{text}"
     )
     if render is None:
-        program(project / "render_all", "#!/bin/bash\nexit 1\n")
+        executable(project / "render_all", "#!/bin/bash\nexit 1\n")
     else:
         set_gain(project, render)
     build = tmp_path / "build"

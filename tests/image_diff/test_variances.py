@@ -10,16 +10,7 @@ import pytest
 from scipy import stats
 from support.diff_images import DIFFERENT, EQUAL, INCONCLUSIVE, of
 
-from mi_refract.image_diff import (
-    accept,
-    channels,
-    folders,
-    html_report,
-    pairing,
-    results_file,
-    self_test,
-    text_reports,
-)
+from mi_refract.image_diff import accept, channels, folders, html_report, pairing, results_file, self_test, text_reports
 from mi_refract.image_diff.channels import FREEDOM, SPP
 from mi_refract.image_diff.methods import METHODS, choice, compare
 from mi_refract.image_diff.results import Category, Status

@@ -330,8 +330,7 @@ RARE = {
 
 
 @pytest.mark.parametrize(
-    "form, light",
-    [*itertools.product([*RARE][:3], (FIREFLIES, LAMP, SMALLER_LAMP)), ("one variance", None)],
+    "form, light", [*itertools.product([*RARE][:3], (FIREFLIES, LAMP, SMALLER_LAMP)), ("one variance", None)]
 )
 def test_rare_light_that_one_side_missed_causes_no_alarm(form, light):
     """At 0.1 % two or more alarms of 10 pairs have the probability 4.5e-5 in a case, below 1e-3 in any case."""

@@ -319,8 +319,7 @@ def test_n_d_and_v_d_are_those_of_the_manufacturer(glass, n_d, v_d):
 
 
 @pytest.mark.parametrize(
-    ("glass", "low", "high"),
-    [("SCHOTT:N-BK7", 290, 2500), ("SCHOTT:F2", 320, 2500), ("HOYA:FCD515", 320, 2500)],
+    ("glass", "low", "high"), [("SCHOTT:N-BK7", 290, 2500), ("SCHOTT:F2", 320, 2500), ("HOYA:FCD515", 320, 2500)]
 )
 def test_the_range_of_a_glass_is_that_of_its_printed_indices_and_transmittances(glass, low, high):
     """For F2 the printed transmittance of 10 mm at 310 nm is 0."""

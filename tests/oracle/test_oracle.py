@@ -210,8 +210,7 @@ def test_the_critical_angle_is_decided_exactly(case):
 
 @pytest.mark.parametrize("k", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize(
-    ("a", "length", "n"),
-    [([3, 4, 0], 5, [0, 0, 7]), ([1, 2, 2], 3, [2, 1, -2]), ([1e300, 0, 0], 1e300, [0, 1e300, 0])],
+    ("a", "length", "n"), [([3, 4, 0], 5, [0, 0, 7]), ([1, 2, 2], 3, [2, 1, -2]), ([1e300, 0, 0], 1e300, [0, 1e300, 0])]
 )
 def test_tangential_rays_keep_their_direction(a, length, n, k):
     a, n = np.array([a], float), np.array([n], float)

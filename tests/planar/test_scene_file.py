@@ -2,21 +2,20 @@
 
 import math
 import re
-from pathlib import Path
 from typing import get_args
 
 import hypothesis
 import numpy as np
 import pytest
 from hypothesis import strategies
-from support.readme import DOCS, blocks, python_blocks
+from support.readme import DOCS, ROOT, blocks, python_blocks
 
 from mi_refract import media
 from mi_refract.planar import Event, light, scene_file, trace
 from mi_refract.planar.light import Light, of_wavelengths
 from mi_refract.planar.scene_file import load
 
-SCENES = Path(__file__).parents[2] / "scenes" / "planar"
+SCENES = ROOT / "scenes" / "planar"
 PAGE = DOCS / "how-to/trace-rays-in-two-dimensions.md"
 ULP = 2.0**-52
 
@@ -371,10 +370,7 @@ def test_a_shape_may_touch_the_one_around_it_with_the_same_index_outside(read):
     inner = [(1.3, 1.1), (1.3, 1.5), (1.3, 1.7), (1.5, 1.1), (1.5, 1.1), (1.7, 1.1), (1.7, 1.1), (1.7, 1.1)]
     assert media_of(read(TWO.format(first="0.3", second="2.3", more=INNER))) == inner
     for more, expected in (
-        (
-            INNER.replace(', within = "left"', ""),
-            r"shape\[2\]: the index along shape\[0\] 'left' is 1.5; expected 1.1",
-        ),
+        (INNER.replace(', within = "left"', ""), r"shape\[2\]: the index along shape\[0\] 'left' is 1.5; expected 1.1"),
         (AGAIN, r"shape\[2\]: the index along shape\[0\] 'left' is 1.5; expected 1.1"),
         (ALONG, r"shape\[2\]: runs along shape\[0\] 'left'"),
     ):

@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.glass_scenes import GLASS, attached, camera, refusal, sampled, surface, vector
+from support.glass_scenes import GLASS, attached, camera, refusal, rgb, sampled, surface, vector
 
 from mi_refract.plugins import check_integrator
 from mi_refract.plugins.absorption import BEYOND, HERE
@@ -105,10 +105,6 @@ def test_absorption_is_differentiable(llvm_variant):
     params, (key,) = attached(bsdf, "int_colour.value")
     dr.backward(bsdf.eval_attribute(BEYOND, surface(), True).x)
     assert dr.grad(params[key])[0] == pytest.approx(-1 / 0.25 / 2)
-
-
-def rgb(*value):
-    return {"type": "rgb", "value": [*value]}
 
 
 def test_an_edit_of_an_rgb_colour_means_what_the_scene_does(rgb_variant):

@@ -63,19 +63,8 @@ def bumps(bsdf):
 def polyhedron(tmp_path):
     """Few faces with the normals of a sphere."""
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32) / 3**0.5
-    faces = [
-        [0, 1, 3],
-        [0, 3, 2],
-        [4, 6, 7],
-        [4, 7, 5],
-        [0, 4, 5],
-        [0, 5, 1],
-        [2, 3, 7],
-        [2, 7, 6],
-        [0, 2, 6],
-        [0, 6, 4],
-    ]
-    faces += [[1, 5, 7], [1, 7, 3]]
+    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5]]
+    faces += [[0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
     mesh = mi.Mesh("cube", len(corners), len(faces), has_vertex_normals=True)
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = (0.8 * corners + np.float32([0, 0, 1.2])).ravel()

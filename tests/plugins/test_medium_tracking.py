@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.glass_scenes import GLASS, PLACE, attached, camera, equal_means, refusal
+from support.glass_scenes import GLASS, PLACE, attached, camera, equal_means, refusal, rgb
 
 from mi_refract.plugins import medium_tracking
 from validation.run.context import SCENES
@@ -72,7 +72,7 @@ LEFT = {
     "0.3": ({"slab": box(matched(int_absorption=0.3))}, 0.3 * THICKNESS),
     "40": ({"slab": box(matched(int_absorption=40.0))}, 40.0 * THICKNESS),
     "colours": (
-        {"slab": box(matched(int_absorption={"type": "rgb", "value": [0.1, 0.5, 2.0]}))},
+        {"slab": box(matched(int_absorption=rgb(0.1, 0.5, 2.0)))},
         np.array([0.1, 0.5, 2.0]) * THICKNESS,
     ),
     "colour": ({"slab": box(matched(int_colour=0.25, int_colour_distance=1.0))}, THICKNESS * math.log(4)),
@@ -85,10 +85,7 @@ LEFT = {
     ),
     "camera inside, medium": (INSIDE | {"height": 0.5, "sensor": {"medium": CLEAR}}, 1.05),
     "medium of a shape": ({"slab": FILLED}, 0.7 * THICKNESS),
-    "medium within null": (
-        {"slab": box({"type": "null"}, interior=CLEAR), "integrator": CHANCE},
-        0.7 * THICKNESS,
-    ),
+    "medium within null": ({"slab": box({"type": "null"}, interior=CLEAR), "integrator": CHANCE}, 0.7 * THICKNESS),
     # A ball of glass in the medium that declares none: as in `volpath` the medium fills it.
     "glass in a medium": ({"slab": FILLED, "ball": box(matched(), 0.5)}, 0.7 * THICKNESS),
     "medium, camera inside": ({"height": 0.5, "sensor": {"medium": CLEAR}, "slab": FILLED}, 1.05),
@@ -168,7 +165,7 @@ def test_the_distance_to_the_near_plane_absorbs_too(kind, near, rgb_variant):
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_spectral_polarized"], indirect=True)
 def test_tinted_glass_equals_that_of_volpath(variant):
     """Compares independent renders; one false alarm in 10,000 for each colour."""
-    tint = {"type": "homogeneous", "albedo": 0.0, "sigma_t": {"type": "rgb", "value": [0.2, 0.5, 1.0]}}
+    tint = {"type": "homogeneous", "albedo": 0.0, "sigma_t": rgb(0.2, 0.5, 1.0)}
     tinted, renders = scene(slab=box(GLASS, interior=tint), integrator=CHANCE), []
     for seed, method in enumerate(({"type": "refract_path", "split_depth": 2}, {"type": "volpath", "max_depth": 64})):
         integrator = mi.load_dict(method)
@@ -188,10 +185,6 @@ VARIES = {"type": "heterogeneous", "albedo": 0.0, "sigma_t": {"type": "constvolu
 MASKED = {"slab": box({"type": "mask", "opacity": 0.5, "bsdf": matched(int_absorption=0.2)}, id="masked")}
 UNFOLLOWED = "the interior medium of 'slab' scatters or varies"
 CLASH = "'slab' has an interior medium in a scene whose BSDFs absorb"
-
-
-def rgb(*value):
-    return {"type": "rgb", "value": [*value]}
 
 
 def with_medium(medium, **parameters):

@@ -2,16 +2,15 @@
 
 import os
 import re
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from support.processes import python
 
+from mi_refract import SCENES
 from mi_refract.plugins import scene_parser
 
-SCENES = Path(__file__).parents[2] / "scenes"
 SENSOR = '<sensor type="perspective"/>'
 
 pytestmark = pytest.mark.usefixtures("scalar_variant")

@@ -78,12 +78,7 @@ NEAREST = f"nearest of the common mistakes, no explanation: {HANDEDNESS}"
             [LINE],
         ),
         (findings(regime(wrong=2), explanations=(CERTAIN, CERTAIN)), 1, "2 of 10 answers are wrong", [LINE, LINE]),
-        (
-            findings(regime(wrong=2), explanations=(NEVER, LIKELY)),
-            1,
-            "2 of 10 answers are wrong",
-            [NEAREST],
-        ),
+        (findings(regime(wrong=2), explanations=(NEVER, LIKELY)), 1, "2 of 10 answers are wrong", [NEAREST]),
         (findings(regime(), problems=(MISSING,)), 2, MISMATCH, []),
         (
             findings(regime(wrong=2), problems=(MISSING,), explanations=(LIKELY,)),

@@ -232,11 +232,7 @@ def test_formulas_in_a_scene_are_those_of_its_refract_bsdfs(bsdf, formulas):
         ("", {"res": "8193"}, "a film of 8193 × 8193 pixels; expected 1 to 67108864"),
         (ABSORPTION, {}, "refract: int_absorption; expected the integrator refract_path, or no absorption"),
         (ABSORPTION, {"integrator": "refract_path"}, ""),
-        (
-            ATTRIBUTE,
-            {},
-            "refract: 'ball' has no attribute 'vertex_n', which a texture of its BSDF reads; expected",
-        ),
+        (ATTRIBUTE, {}, "refract: 'ball' has no attribute 'vertex_n', which a texture of its BSDF reads; expected"),
     ],
 )
 def test_errors_of_a_scene_name_its_file_and_the_problem(tmp_path, parameter, defines, message):

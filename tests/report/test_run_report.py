@@ -13,6 +13,7 @@ import zlib
 import numpy as np
 import pytest
 from support.browser import assert_stands_alone, needs_chromium, seen
+from support.diff_images import save
 
 from mi_refract.io.text import compact, distinguishable, printable
 from mi_refract.report import documents, run_report
@@ -55,14 +56,7 @@ def html(folder, rows=ROWS, context=CONTEXT):
 
 
 def write_exr(path, pixels, names=("R", "G", "B")):
-    import OpenImageIO as oiio
-
-    height, width, channels = pixels.shape
-    spec = oiio.ImageSpec(width, height, channels, oiio.FLOAT)
-    spec.channelnames = names
-    image = oiio.ImageBuf(spec)
-    image.set_pixels(oiio.ROI(), np.ascontiguousarray(pixels, np.float32))
-    assert image.write(str(path)), image.geterror()
+    save(path, np.ascontiguousarray(pixels, np.float32), channelnames=names)
 
 
 # JSON

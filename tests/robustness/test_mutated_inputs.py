@@ -26,7 +26,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.variants import switch
 
-from mi_refract import oracle
+from mi_refract import SCENES, oracle
 from mi_refract.image_diff import folders, settings
 from mi_refract.image_diff.results import Status
 from mi_refract.io import errors, image_file
@@ -37,7 +37,6 @@ from mi_refract.ray_sets import check_answers, files, ray_set, renderer_file
 from mi_refract.rendering import scene_files
 from mi_refract.scene_export import from_mitsuba, targets
 
-SCENES = Path(__file__).parents[2] / "scenes"
 LONGEST, HANG = 10.0, 60.0  # limit for one input in CPU seconds; seconds after which the process is ended
 ADDRESSES = 12 << 30  # additional address space in bytes: a reader may allocate the largest size that it accepts
 MEMORY = 2 << 30  # additional memory for one input in bytes: the largest film is accepted

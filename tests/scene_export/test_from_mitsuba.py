@@ -6,18 +6,17 @@ surface of the same material at the same place and on the same side; rays that h
 
 import itertools
 import re
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_refract import SCENES
 from mi_refract.io import image_file
 from mi_refract.scene_export import from_mitsuba, meshes_from_shapes, targets, tessellation
 from mi_refract.scene_export.mitsuba_nodes import SceneFile
 from mi_refract.scene_export.plain_scene import Diffuse, DirectionalLamp, Glass, Light, PointLamp, SpotLamp
 
-SCENES = Path(__file__).parents[2] / "scenes"
 PLANE = ["diamond", "lightpipe", "nested", "prism", "slab"]  # scenes without curved surfaces
 # Scenes that other targets than glTF, or all, refuse because their image would differ; and the message.
 NO_PLAIN_SCENE = {

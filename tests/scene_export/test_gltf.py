@@ -2,7 +2,6 @@
 
 import re
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from support.scene_readers import cone, glb, punctual
 from mi_refract.scene_export import from_mitsuba, targets, tessellation
 from mi_refract.scene_export.plain_scene import Camera, Diffuse, Glass, Light, Mesh, PlainScene
 
-SCENES = Path(__file__).parents[2] / "scenes"
 pytestmark = pytest.mark.usefixtures("scalar_variant")
 SINGLE = 2.0**-24
 SCENE = """<scene version="3.0.0"><integrator type="path"><integer name="max_depth" value="7"/></integrator>

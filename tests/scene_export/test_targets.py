@@ -21,6 +21,7 @@ from support import fake_bpy, fake_raysect
 from support.readme import DOCS
 from support.scene_readers import READERS
 
+from mi_refract import SCENES
 from mi_refract.image_diff import methods
 from mi_refract.image_diff.comparison import Verdict
 from mi_refract.io import image_file
@@ -38,7 +39,6 @@ from mi_refract.scene_export.plain_scene import (
     SpotLamp,
 )
 
-SCENES = Path(__file__).parents[2] / "scenes"
 CAMERA = Camera((0.0, 0.0, 9.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, 8, 4)
 BALL = tessellation.sphere(0)
 UP = (0.0, 0.0, 1.0)

@@ -15,6 +15,11 @@ SKY = (AROUND[None, :, None] + DOWN[:, None, None]).astype(np.float32) * np.ones
 PLACE = mi.ScalarTransform4f
 
 
+def rgb(*value):
+    """Return a colour or spectrum by its red, green and blue."""
+    return {"type": "rgb", "value": [*value]}
+
+
 def sky():
     """Return a smooth environment that differs in every direction."""
     return {"type": "envmap", "bitmap": mi.Bitmap(SKY)}

@@ -25,6 +25,12 @@ def python(code: str, *arguments: object, **environment: str) -> subprocess.Pope
     )
 
 
+def executable(path: Path, text: str) -> None:
+    """Write a program."""
+    path.write_text(text)
+    path.chmod(0o755)
+
+
 def assert_refused(outcome: tuple[int, str, str], *messages: object) -> None:
     """Check an outcome of the fixture `run`: exit code 2, and only one line on stderr, which contains the messages."""
     code, out, err = outcome

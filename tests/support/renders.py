@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from mi_refract import SCENES
 from mi_refract.io.image_file import read_exr
 from mi_refract.rendering.end_conditions import Limits
 from mi_refract.rendering.long_render import Job, resume
 from mi_refract.rendering.pass_sums import PassSums, PassTree
 
-SCENES = Path(__file__).parents[2] / "scenes"
 # 8 × 6 pixels of a sphere of glass and a cube.
 GLASS = """<scene version="3.0.0">
   <default name="bsdf" value="refract"/>

@@ -6,12 +6,11 @@ import runpy
 import shutil
 import subprocess
 import tomllib
-from pathlib import Path
 
 import pytest
 import yaml
+from support.processes import ROOT, executable
 
-ROOT = Path(__file__).parents[2]
 MINIMUM = runpy.run_path(str(ROOT / ".ci" / "minimum"))["main"]
 REPORT = """<testsuites><testsuite><testcase name="a"/><testcase name="b"><properties/></testcase>
 <testcase name="c"><skipped/></testcase><testcase name="d"><failure/></testcase><testcase name="e"><error/></testcase>
@@ -67,8 +66,7 @@ def test_setup_fails_if_llvm_is_required_but_missing(apt, tmp_path):
     stubs = {"ldconfig": "exit 0", "sudo": "exit 1", "timeout": 'shift; "$@"', "env": 'shift; "$@"'}
     stubs |= {"apt-get": "exit 100"} if apt == "fails" else {"id": "echo 1"}
     for name, body in stubs.items():
-        (tmp_path / name).write_text(f"#!/bin/bash\n{body}\n")
-        (tmp_path / name).chmod(0o755)
+        executable(tmp_path / name, f"#!/bin/bash\n{body}\n")
     environment = {name: value for name, value in os.environ.items() if name != "DRJIT_LIBLLVM_PATH"}
     environment |= {"PATH": f"{tmp_path}:{os.environ['PATH']}", "MI_REFRACT_NEEDS_LLVM": "1"}
     command = ["bash", str(tmp_path / ".ci" / "setup"), "test"]

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from support import fake_bpy
+from support.processes import executable
 
 from mi_refract import oracle, regimes
 from mi_refract.io import image_file
@@ -357,8 +358,7 @@ def test_a_failed_installation_prints_one_line_and_leaves_the_system_absent(
 ):
     monkeypatch.setitem(SYSTEMS, "thing", thing(**needs))
     for name in ("npm", "apt-get", "sudo"):
-        (tmp_path / name).write_text("#!/bin/sh\necho working\necho nothing of that name >&2\nexit 1\n")
-        (tmp_path / name).chmod(0o755)
+        executable(tmp_path / name, "#!/bin/sh\necho working\necho nothing of that name >&2\nexit 1\n")
     monkeypatch.setenv("PATH", str(tmp_path))
     assert command.main(["renderers"]) == 0
     lines = [line.split()[:2] for line in capsys.readouterr().out.splitlines()]
@@ -372,8 +372,7 @@ def test_a_failed_installation_prints_one_line_and_leaves_the_system_absent(
 
 def test_another_version_of_a_distribution_is_absent_and_not_installed(own_cache, monkeypatch, capsys, tmp_path):
     def program(name, text):
-        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
-        (tmp_path / name).chmod(0o755)
+        executable(tmp_path / name, f"#!/bin/sh\n{text}\n")
 
     monkeypatch.setenv("PATH", f"{tmp_path}:/bin")
     install = SYSTEMS["povray"].install
