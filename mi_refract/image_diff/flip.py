@@ -120,7 +120,13 @@ def flip(
 
 
 def views(image: Image, options: Options) -> Iterator[Image]:
-    """Yield the part of the image around the brightest window, where black is detected first, and the whole image."""
+    """Yield the part of the image around the brightest window, where black is detected first, and the whole image.
+
+    With a bound of the mean or of the 99th percentile only the whole image: both are larger in the brightest part.
+    """
+    if min(options["mean"], options["percentile_99"]) < 1:
+        yield image
+        return
     side, around = max(1, round(WINDOW * options["ppd"])), max(1, round(AROUND * options["ppd"]))
     light = block_mean(_linear(image), side).sum(-1)
     y, x = (side * int(i) for i in np.unravel_index(int(light.argmax()), light.shape))

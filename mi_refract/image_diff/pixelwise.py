@@ -201,12 +201,13 @@ def outrageous(reference: Image, test: Image, fail: float) -> str:
     """Return where a pixel of one image is outrageous; "" if none is.
 
     It is brighter than TIMES_AROUND times the other image within NEAR pixels, and than TIMES_MEAN times the mean of the
-    other image. Differences up to `fail` are ignored. Both images are finite and have the same channels in the same
+    other image's compared pixels. Differences up to `fail` are ignored. Both images are finite and have the same channels in the same
     order.
     """
     for image, other in ((test, reference), (reference, test)):
         size, bright = np.abs(other.pixels), np.abs(image.pixels)
-        candidates = bright > np.maximum(TIMES_MEAN * size.mean((0, 1), dtype=np.float64), size + fail)
+        mean = size.sum((0, 1), dtype=np.float64) / counted(reference)  # excluded pixels are 0
+        candidates = bright > np.maximum(TIMES_MEAN * mean, size + fail)
         if not candidates.any():
             continue
         from scipy.ndimage import maximum_filter

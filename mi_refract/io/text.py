@@ -68,7 +68,7 @@ def compact(value: float, digits: int = 3) -> str:
         return str(float(value))
     if value == int(value) and abs(value) < 1e5:
         return str(int(value))
-    if 1e3 <= abs(value) < 1e5:
+    if abs(value) < 1e5 and abs(float(f"{value:.{digits}g}")) >= 1e3:
         return f"{value:.{max(digits - 4, 0)}f}"
     if 1e-2 <= abs(value) < 1e3:
         return f"{value:.{digits}g}"

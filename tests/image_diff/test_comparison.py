@@ -257,6 +257,18 @@ def test_light_between_the_sampled_rows_counts(rng):
     assert verdict("tolerance", reference, reference + 1e-5) is EQUAL
 
 
+@pytest.mark.parametrize(
+    "method, options",
+    [("tolerance", {}), ("paired", {"changed": 5e-4}), ("flip", {"local": 9.0, "patch": 1.0, "mean": 0.005})],
+)
+def test_a_single_light_that_is_lost_is_not_equal_wherever_it_is(method, options):
+    """Its share of the whole image is allowed to differ, so black would pass; its share of some rows is larger."""
+    for top in range(13, 19):
+        reference = np.zeros((256, 256, 3))
+        reference[top : top + 3, 100:103] = 1
+        assert verdict(method, reference, 0 * reference, **options) is INCONCLUSIVE, top
+
+
 def test_colours_of_a_layer_are_judged_together_and_others_alone():
     names = ("R", "G", "B", "A", "Z", "ao", "n.X", "n.Y", "n.Z", "s.R", "s.G", "s.B", "s.A", "s.id")
     expected = [["R", "G", "B"], ["A"], ["Z"], ["ao"], ["n.X", "n.Y", "n.Z"], ["s.R", "s.G", "s.B"], ["s.A"], ["s.id"]]

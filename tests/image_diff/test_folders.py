@@ -531,8 +531,11 @@ def test_invalid_renders_are_errors(tmp_path):
     twice = samples(tmp_path / "twice", first=100)
     (twice / "again.exr").write_bytes((twice / "3.exr").read_bytes())
     (tmp_path / "empty").mkdir()
+    for name in ("1.exr", "2.exr"):
+        image(tmp_path / "nan" / name, value=np.nan)
     for folder, message in [
         (twice, "expected renders with different seeds"),
+        (tmp_path / "nan", "expected renders with different seeds"),
         (samples(tmp_path / "one", 1, 200), "one"),
         (tmp_path / "empty", "empty: contains no image"),
     ]:

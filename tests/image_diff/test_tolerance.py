@@ -235,3 +235,14 @@ def test_bright_pixels_that_are_not_outrageous_are_equal():
         (lit(128), {"allow_failures": 1}),
     ):
         assert compare("auto", *sides, **options).verdict is EQUAL
+
+
+def test_an_outrageous_pixel_is_one_among_the_pixels_inside_the_mask():
+    """A dot of 12 times the mean inside the mask, which is 1200 times that of all pixels."""
+    plain, mask = np.zeros((1000, 1000, 3)), np.zeros((1000, 1000), bool)
+    mask[:100, :100], plain[:100, :100] = True, 0.05
+    for dot, verdict in ((0.6, EQUAL), (6.0, DIFFERENT)):
+        spoilt = plain.copy()
+        spoilt[50, 50] = dot
+        assert compare("auto", *(image(x[:100, :100]) for x in (plain, spoilt))).verdict is verdict
+        assert compare("auto", *(image(x, mask=mask) for x in (plain, spoilt))).verdict is verdict

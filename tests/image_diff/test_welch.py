@@ -484,6 +484,9 @@ def test_the_same_render_twice_is_an_error(rng):
     side = renders(rng, 3)
     with pytest.raises(ValueError, match=r"b\.exr: the same image as a\.exr; expected independent renders"):
         welch([*side, replace(side[0], path=Path("b.exr"))], renders(rng, 4))
+    one, two, three, four, five = (of(np.where(np.arange(3) == 0, np.nan, x.pixels)) for x in renders(rng, 5))
+    with pytest.raises(ValueError, match=r"the same image as a\.exr; expected independent renders"):
+        welch([one, two, one], [three, four, five], allow_nonfinite=True)
     black = [of(0 * side[0].pixels)] * 2  # renders that find no light may be identical
     assert welch([*black, *side], renders(rng, 4)).verdict is not EQUAL
 
