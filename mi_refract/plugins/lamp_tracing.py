@@ -53,6 +53,7 @@ from mi_refract.numerics import (
     mitsuba_mesh,
 )
 
+from . import ray_origins
 from .absorption import HERE
 from .film import Splats, expected_weights, film_colours
 from .medium_tracking import THROUGH
@@ -346,6 +347,8 @@ class LampTracer:
         self.kinds: Any = v.UInt32(kinds) if self.vectorised else kinds
         dr.make_opaque(self.kinds)
         self.any = set(kinds)
+        shapes = [lamp.get_shape() for lamp, kind in zip(self.lamps, kinds, strict=True) if kind == AREA]
+        self.extent = ray_origins.extent_of([ray_origins.size_of(shape) for shape in shapes])
         self.pointers = dr.gather(v.EmitterPtr, scene.emitters_dr(), v.UInt32(indices)) if self.vectorised else None
         # With a varying texture Mitsuba samples meshes with overlapping (u, v) and turned cylinders wrongly. They are
         # called directly: a call through a pointer is also traced for shapes that cannot be sampled.
@@ -427,7 +430,8 @@ class LampTracer:
             si.shape = emitter.get_shape()
             si.wi = si.to_local(toward.d)
             radiance = emitter.eval(si, here)
-            line, origin = dr.select(here, toward, line), dr.select(here, si.spawn_ray(toward.d).o, origin)
+            ray = ray_origins.spawn_ray(v, si, toward.d, self.extent, True)
+            line, origin = dr.select(here, toward, line), dr.select(here, ray.o, origin)
             power = dr.select(here, radiance * (place * dr.abs(si.wi.z)), power)
         here = active & (kind == PLACE)
         if PLACE in self.any and (self.vectorised or here):
@@ -585,7 +589,9 @@ class LampTracer:
         d = -camera_ray.d
         value = self._radiance(si, bsdf, si.to_local(d), active)
         active &= dr.max(dr.abs(v.unpolarized_spectrum(value))) > 0
-        active &= self.scene.ray_test(si.spawn_ray_to(camera_ray.o), active) ^ True
+        active &= (
+            self.scene.ray_test(ray_origins.ray_to(v, si, camera_ray.o, self.features.delta_extent), active) ^ True
+        )
         value = loop.times(value, s.throughput) * (
             importance * _quotient(dr.abs(dr.dot(si.n, d)), dr.abs(dr.dot(si.n, s.ray.d)))
         )

@@ -324,12 +324,14 @@ class PathLoop:
             active_em &= ds.pdf != 0
             if not dr.grad_enabled(bsdf_value):  # a value of 0 needs a shadow ray only for its derivative
                 active_em &= dr.max(dr.abs(v.unpolarized_spectrum(bsdf_value))) > 0
-            shadow_ray = si.spawn_ray_to(ds.p)
+            shadow_ray = ray_origins.ray_to(v, si, ds.p, features.delta_extent)
+            shadow_ray.maxt *= 1 - v.math.ShadowEpsilon
             if features.lamps_at_infinity:
                 # Mitsuba places such a light beyond the scene's bounding box, in which merged rectangles are missing,
                 # and later edits, too. So these shadow rays have no end.
                 at_infinity = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-                shadow_ray = dr.select(at_infinity, si.spawn_ray(ds.d), shadow_ray)
+                endless = ray_origins.spawn_ray(v, si, ds.d, features.delta_extent, False)
+                shadow_ray = dr.select(at_infinity, endless, shadow_ray)
             active_em = active_em & (scene.ray_test(shadow_ray, active_em) ^ True)
             if self.evaluated:
                 dr.eval(active_em)

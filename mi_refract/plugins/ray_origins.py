@@ -10,7 +10,8 @@ where E is the extent of the largest shape with such lobes, and t the length of 
 error of a point on a sphere or disk grows with t. Where faces of a mesh are long and narrow, with the longest edge L
 and the height h on it, hits err by up to u/8 L²/h. So E is L²/(64 h) where that is more.
 
-Rays of other lobes start at Mitsuba's distance, or nearer where that could be within glass just above the surface.
+Rays of other lobes, and rays to lamps and to the camera, start at Mitsuba's distance, or nearer where that could be
+within or beyond glass just above the surface.
 """
 
 from __future__ import annotations
@@ -87,3 +88,12 @@ def spawn_ray(v: Variant, si: Interaction, d: Vector3, extent: float, delta: Mas
         distance = dr.select(delta, distance, nearer)
     offset = dr.detach(dr.mulsign(distance, dr.dot(si.n, d)))
     return v.Ray3f(dr.fma(offset, dr.detach(si.n), si.p), d, si.time, si.wavelengths)
+
+
+def ray_to(v: Variant, si: Interaction, p: Vector3, extent: float) -> Ray:
+    """Return the ray from a surface that ends at the point p. `extent`: E."""
+    ray = spawn_ray(v, si, p - si.p, extent, False)
+    ray.d = p - ray.o
+    ray.maxt = dr.norm(ray.d)
+    ray.d /= ray.maxt
+    return ray

@@ -229,8 +229,8 @@ def sample(
 
     At a dispersive boundary a path of `refract_path` has N wavelengths (4). Reflected light keeps all of them, as their
     direction is the same. Refracted light has the direction of the first one, the hero, and the others end. Let R_i be
-    the reflectance of wavelength i, 0 without an index, R̄ the mean of R_i, and T the transmittance of the hero. The
-    probabilities of reflection and refraction are
+    the reflectance of wavelength i, R̄ the mean of R_i, and T the transmittance of the hero; R_i and T are 0 for a
+    wavelength without an index. The probabilities of reflection and refraction are
 
         P = R̄ / (R̄ + T),    1 − P = T / (R̄ + T)
 
@@ -256,10 +256,11 @@ def sample(
     # --- The lobe ---
     odds_r, odds_t = ray.r, ray.t
     if by_wavelength:
-        hero_r, hero_t = (v.Float(ieee_divide(x, ray.r + ray.t)) for x in (ray.r, ray.t))
+        hero_r, hero_t = (dr.select(active, v.Float(ieee_divide(x, ray.r + ray.t)), 0) for x in (ray.r, ray.t))
         reflectances = hero_r, *(other.r for other in others)
         odds_r, odds_t = self.wide(sum(reflectances)) / len(reflectances), self.wide(hero_t)
-    total = odds_r + odds_t
+        active = hit & (odds_r + odds_t > 0)  # other wavelengths are reflected even if the hero has no index
+    total = dr.select(active, odds_r + odds_t, 1) if by_wavelength else odds_r + odds_t
     # sample1 < P, without waiting for the division. Not ≤: an index-matched boundary must not reflect if sample1 = 0.
     selected_r = (self.wide(sample1) * total < odds_r if both else v.Bool(has_r)) & active
     selected_t = (selected_r ^ True) & active

@@ -126,6 +126,17 @@ GLASS = {"type": "ref", "id": "glass"}
 CROP = {"width": 40, "height": 30, "crop_width": 16, "crop_height": 16, "crop_offset_x": 14, "crop_offset_y": 9}
 
 
+AFAR = mi.ScalarTransform4f().look_at([0, -20, 10], [-0.3, 0, 0], [0, 0, 1])
+WINDOW = mi.ScalarTransform4f().translate([0, 0, 0.02]).scale([1, 1, 0.002])
+AT_100 = mi.ScalarTransform4f().translate([100, 0, 0])
+
+
+def pane(height):
+    """4 mm thick, at x = 100. A ray starts 9 mm from a surface there, by Mitsuba's rule."""
+    to_world = AT_100.translate([0, 0, height]).scale([0.6, 0.6, 0.002])
+    return {"type": "cube", "bsdf": {"type": "refract"}, "to_world": to_world}
+
+
 def agree(**parts):
     """Parts of a scene, and parameters of the integrator."""
     integrator = {name: parts.pop(name) for name in [*parts] if name not in PARTS}
@@ -178,6 +189,16 @@ AGREE = {
     ),
     "bumps behind a mask": agree(
         more=floor({"type": "mask", "opacity": 0.6, "bsdf": bumps(WHITE)}) | {"to_world": SHEET}, **IN_GLASS
+    ),
+    "window before the camera": agree(
+        sensor=camera(to_world=AFAR, fov=5, near_clip=0.01),
+        more={"type": "cube", "bsdf": {"type": "refract"}, "to_world": AFAR @ WINDOW},
+    ),
+    "cover glass of a lamp, far from the origin": agree(
+        sensor=camera(to_world=AT_100.look_at([1.2, -1.2, 0.6], [0, 0, 0], [0, 0, 1]), fov=10),
+        floor=floor() | {"to_world": AT_100.scale(0.5)},
+        lamp=lamp((100, 0, 1), 0.4),
+        ball=pane(0.996),
     ),
     "leaves over a floor": agree(more=floor(LEAF) | {"to_world": SHEET}, **IN_GLASS),
     "instance": agree(group=GROUP, ball=INSTANCE),
@@ -244,6 +265,15 @@ def test_a_small_glass_is_not_missed_beside_a_large_one(llvm_variant):
     parts = ({"lamp": SUN, "more": sea | {"bsdf": {"type": "dielectric"}}}, {"lamp": SUN})
     images = [tiles(scene(each, caustics="lamp"), 64, range(first, first + 8)) for first, each in enumerate(parts)]
     assert difference(*images) < 1
+
+
+@pytest.mark.parametrize("caustics", ["path", "lamp"])
+def test_a_point_lamp_does_not_shine_past_a_pane_just_above_the_floor(caustics, llvm_variant):
+    """What it casts through the pane and is seen through it is missing, here as at the origin."""
+    bulb = {"type": "point", "position": [100, 0, 1], "intensity": 5.0}
+    view = camera(to_world=AT_100.look_at([1.2, -1.2, 1], [0, 0, 0], [0, 0, 1]), fov=10)
+    parts = {"sensor": view, "lamp": bulb, "ball": pane(0.004), "floor": floor() | {"to_world": AT_100.scale(0.5)}}
+    assert dr.all(mi.render(scene(parts, caustics=caustics), spp=16) == 0, axis=None)
 
 
 def test_a_point_lamp_of_weight_0_is_off(llvm_variant):

@@ -209,6 +209,27 @@ def test_glass_just_above_a_floor_is_invisible(gap, rgb_variant):
     assert image == pytest.approx(1, abs=1e-3)
 
 
+def test_a_lamp_lights_a_floor_once_through_glass_just_above_it(llvm_variant):
+    """Pane of 4 mm at 100 m: a shadow ray that starts beyond it finds the lamp, and so does the path through it.
+
+    Light is doubled then. The standard errors of both images are below 3 %.
+    """
+    at = PLACE().translate([100, 0, 0])
+    parts = {
+        "sensor": camera(16, origin=(101.2, -1.2, 1), target=(100, 0, 0), fov=10),
+        "floor": WHITE_FLOOR | {"to_world": at.scale(0.5)},
+        "pane": {"type": "cube", "to_world": at.translate([0, 0, 0.004]).scale([0.6, 0.6, 0.002]), "bsdf": GLASS},
+    }
+    lamp = {"type": "rectangle", "to_world": at.translate([0, 0, 1]).rotate([1, 0, 0], 180).scale(0.4)}
+
+    def mean(sampling_weight):
+        emitter = {"type": "area", "radiance": 10.0, "sampling_weight": sampling_weight}
+        scene = {"type": "scene", "sky": {"type": "constant", "radiance": 1e-6}, "lamp": lamp | {"emitter": emitter}}
+        return render(mi.load_dict(scene | parts), 256, max_depth=16).mean()
+
+    assert mean(1.0) == pytest.approx(mean(0.0), rel=0.2)
+
+
 # Splitting -----------------------------------------------------------------------------------------------------
 
 
