@@ -45,7 +45,7 @@ def read_renders(folder: Path, max_values: int = MAX_VALUES) -> list[Image]:
         images = list(pool.map(read, paths.values()))
     by_digest: dict[bytes, Image] = {}
     for image in images:
-        other = by_digest.setdefault(hashlib.sha256(np.ascontiguousarray(image.pixels)).digest(), image)
+        other = by_digest.setdefault(hashlib.sha256(image.pixels.tobytes()).digest(), image)
         if other is not image:
             raise ValueError(f"{image.path}: the same pixels as {other.path}; expected renders with different seeds")
     return images

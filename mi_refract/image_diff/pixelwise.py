@@ -201,8 +201,8 @@ def outrageous(reference: Image, test: Image, fail: float) -> str:
     """Return where a pixel of one image is outrageous; "" if none is.
 
     It is brighter than TIMES_AROUND times the other image within NEAR pixels, and than TIMES_MEAN times the mean of the
-    other image's compared pixels. Differences up to `fail` are ignored. Both images are finite and have the same channels in the same
-    order.
+    other image's compared pixels. Differences up to `fail` are ignored. Both images are finite and have the same
+    channels in the same order.
     """
     for image, other in ((test, reference), (reference, test)):
         size, bright = np.abs(other.pixels), np.abs(image.pixels)
