@@ -71,7 +71,7 @@ class Compared:
 
 
 COMPARED = pytest.StashKey[Compared]()
-ACCEPTED = pytest.StashKey[dict[Path, str]]()  # the SHA-256 of each reference that was accepted in this run
+ACCEPTED = pytest.StashKey[dict[Path, str]]()  # the SHA-256 of each reference that an image of this run is or equals
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -155,7 +155,8 @@ def assert_image_unbiased(request: pytest.FixtureRequest) -> Callable[..., Compa
 def _accept(reference: Path, test: Image, method: str, options: dict[str, Any], digests: dict[Path, str]) -> None:
     """Copy the image to the path of the reference, unless they are equal.
 
-    `digests`: the SHA-256 of each reference that this run has accepted; another image for one of them is an error.
+    `digests`: the SHA-256 of each reference that an image of this run has become or equals; a copy of another image
+    over one of them is an error.
     """
     __tracebackhide__ = True
     from mi_refract.image_diff import accept, folders
@@ -169,6 +170,8 @@ def _accept(reference: Path, test: Image, method: str, options: dict[str, Any], 
                 image_file.write_exr(test, image.pixels, image.channels)
             settings = Settings.for_all(method=method, **options)
             copies = list(accept.changes(folders.diff(reference, test, settings, to_accept=True)))
+            if not copies:
+                digests.setdefault(reference.resolve(), safe_files.digest(reference))
             for copy in copies:
                 if digests.setdefault(copy.reference.resolve(), copy.compared) != copy.compared:
                     raise ValueError(f"{copy.reference}: also the reference of another image; expected one of its own")

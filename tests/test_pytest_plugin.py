@@ -4,6 +4,7 @@ import re
 from types import SimpleNamespace
 
 import numpy as np
+import OpenImageIO  # noqa: F401  # it loads only once, and pytester removes the modules that a test imports
 import pytest
 from support.processes import python
 from support.readme import DOCS, python_blocks
@@ -182,7 +183,11 @@ def test_options_write_a_page_and_accept_images(pytester):
     assert after == before | {"old.exr": before["test.exr"], "new.exr": after["new.exr"]}
 
 
-def test_a_reference_is_not_accepted_for_two_images(pytester):
+@pytest.mark.parametrize("exists", [False, True])
+def test_a_reference_is_not_accepted_for_two_images(pytester, exists):
+    """Neither if the first image becomes the reference, nor if it equals the reference."""
+    if exists:
+        image_file.write_exr(pytester.path / "new.exr", np.ones((8, 8, 3)))
     pytester.makeconftest('pytest_plugins = ["mi_refract.pytest_plugin"]')
     pytester.makepyfile("""
         import numpy as np
