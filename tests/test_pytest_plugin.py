@@ -4,8 +4,9 @@ import re
 from types import SimpleNamespace
 
 import numpy as np
-import OpenImageIO  # noqa: F401  # it loads only once, and pytester removes the modules that a test imports
+import OpenImageIO  # noqa: F401  it loads only once, and pytester removes the modules that a test imports
 import pytest
+from support.diff_images import save
 from support.processes import python
 from support.readme import DOCS, python_blocks
 
@@ -152,6 +153,9 @@ def test_changed(assert_image_equal):
 def test_equal(assert_image_equal):
     assert_image_equal(np.zeros((8, 8, 3)), "zero.exr")
 
+def test_equal_to_a_png(assert_image_equal):
+    assert_image_equal(np.zeros((8, 8, 3)), "zero.png")
+
 def test_two_arrays(assert_image_equal):
     assert_image_equal(np.ones((8, 8, 3)), np.zeros((8, 8, 3)))
 
@@ -164,20 +168,22 @@ def test_options_write_a_page_and_accept_images(pytester):
     pytester.makeconftest('pytest_plugins = ["mi_refract.pytest_plugin"]')
     name = f"{pytester.makepyfile(TESTS).name}::test_"
     for file, value in {"old": 0, "test": 1, "zero": 0}.items():
-        image_file.write_exr(pytester.path / f"{file}.exr", np.full((8, 8, 3), value, np.float32), ("R", "G", "B"))
+        pixels = np.full((8, 8, 3), value, np.float32)
+        image_file.write_exr(pytester.path / f"{file}.exr", pixels, metadata={"view": "left"})
+    save(pytester.path / "zero.png", np.zeros((8, 8, 3)), "uint8")
     before = {path.name: path.read_bytes() for path in pytester.path.glob("*.exr")}
 
     def run(*words):
         return pytester.runpytest_subprocess("-p", "no:cacheprovider", *words)
 
-    run("--mi-refract-report", "out.html").assert_outcomes(passed=1, failed=4)
+    run("--mi-refract-report", "out.html").assert_outcomes(passed=2, failed=4)
     page = (pytester.path / "out.html").read_text("utf-8")
-    assert "5 images: 2 could not be compared, 2 different, 1 equal" in page
+    assert "6 images: 2 could not be compared, 2 different, 2 equal" in page
     assert f"pytest {name}changed" in page and f"pytest --mi-refract-accept {name}changed" in page
     assert page.count('data-role="difference"') == 2
     assert {path.name: path.read_bytes() for path in pytester.path.glob("*.exr")} == before  # nothing is written
     accepted = run("--mi-refract-accept")
-    accepted.assert_outcomes(passed=3, failed=2)
+    accepted.assert_outcomes(passed=4, failed=2)
     accepted.stdout.fnmatch_lines(["could not accept: unknown key 'fial'; expected *"])
     after = {path.name: path.read_bytes() for path in pytester.path.glob("*.exr")}
     assert after == before | {"old.exr": before["test.exr"], "new.exr": after["new.exr"]}
