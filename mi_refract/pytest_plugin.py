@@ -7,7 +7,7 @@ test.
 
 `--mi-refract-accept` copies images that are not equal over their references, as `mi-refract accept` does, if both are
 files, or if the reference is an EXR file and the image an array. `--mi-refract-report OUT.html` writes the page of
-`mi-refract diff` about all comparisons. Without these options nothing is written.
+`mi-refract diff` about all comparisons. Both need a run in one process. Without these options nothing is written.
 """
 
 from __future__ import annotations
@@ -75,13 +75,15 @@ ACCEPTED = pytest.StashKey[dict[Path, str]]()  # the SHA-256 of each reference t
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Create the page. UsageError if the tests run in several processes, or if the page cannot be written."""
+    """Create the page. UsageError for an option in several processes, and if the page cannot be written."""
+    several = config.getoption("numprocesses", None) or hasattr(config, "workerinput")
+    for option in (ACCEPT, REPORT):
+        if several and config.getoption(option, None):
+            raise pytest.UsageError(f"{option}: the tests run in several processes; expected -n 0")
     if path := config.getoption(REPORT, None):
         from mi_refract.image_diff.html_report import Page
         from mi_refract.io.safe_files import writable
 
-        if config.getoption("numprocesses", None) or hasattr(config, "workerinput"):
-            raise pytest.UsageError(f"{REPORT}: the tests run in several processes; expected -n 0")
         try:
             config.stash[COMPARED] = Compared(Page(writable(path, (".html", ".htm"))))
         except (ValueError, OSError) as error:

@@ -239,11 +239,16 @@ def test_the_page_shows_the_mean_of_renders(request, assert_image_unbiased, tmp_
 
 
 @pytest.mark.parametrize(
-    ("words", "message"), [(["out.txt"], "expected a file name that ends in"), (["out.html", "-n2"], "expected -n 0")]
+    ("words", "message"),
+    [
+        (["--mi-refract-report", "out.txt"], "expected a file name that ends in"),
+        (["--mi-refract-report", "out.html", "-n2"], "--mi-refract-report: .*; expected -n 0"),
+        (["--mi-refract-accept", "-n2"], "--mi-refract-accept: .*; expected -n 0"),
+    ],
 )
-def test_a_page_that_cannot_be_written_is_a_usage_error(pytester, words, message):
+def test_a_page_that_cannot_be_written_and_several_processes_are_usage_errors(pytester, words, message):
     with pytest.raises(pytest.UsageError, match=message):
-        pytester.parseconfigure("-p", "mi_refract.pytest_plugin", "--mi-refract-report", *words)
+        pytester.parseconfigure("-p", "mi_refract.pytest_plugin", *words)
 
 
 def test_the_plugin_imports_no_renderer():
