@@ -15,7 +15,7 @@ from mi_refract.io.errors import describe
 from mi_refract.io.safe_files import digest
 
 from . import pairing
-from .results import FAILED, Result, Results
+from .results import FAILED, Result, Results, Status
 
 FEW = 10  # names in a message
 
@@ -49,7 +49,8 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
     are not finite, if its format differs from the suffix of the reference, or if the reference would be outside of its
     folder.
     """
-    targets = {result.target for result in results.results} if variant else set()
+    equal = [result for result in results.of(Status.EQUAL) if not result.matched]
+    targets = {result.target for result in (results.results if variant else equal)}
     for result in results.of(*FAILED):
         if result.error and (result.test is None or result.digests is None):
             raise UnreadableImage(result, result.error)

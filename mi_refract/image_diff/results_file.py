@@ -229,7 +229,7 @@ def _escaped(text: object) -> str:
 
 
 def read(path: str | Path, reference: Path | None = None, test: Path | None = None) -> Results:
-    """Return the results in a JSON file; those that are not equal have their paths and digests.
+    """Return the results in a JSON file; all have the path of their reference, those that are not equal all paths.
 
     `reference`, `test`: by default the paths in the file. ValueError for a file that `--json` did not write, of another
     version, written with `--renders`, or with a path outside of the two folders; OSError if it cannot be read.
@@ -252,15 +252,16 @@ def read(path: str | Path, reference: Path | None = None, test: Path | None = No
     results = []
     for number, entry in enumerate(document.results):
         where = f"{path}: results[{number}]"
-        if entry.status not in FAILED:
-            results.append(Result(entry.name, entry.status, None, None))
-            continue
-        old_image = _mapped_path(f"{where}.reference", entry.reference, before[0], now[0]) if entry.reference else None
-        new_image = _mapped_path(f"{where}.test", entry.test, before[1], now[1]) if entry.test else None
         without_target = entry.target == "."  # an invalid entry of the settings that matches no image
         target = Path() if without_target else _mapped_path(f"{where}.target", entry.target, before[0], now[0])
         # If two files were compared, the variants are beside the reference.
         roots = (before[0].parent, now[0].parent) if entry.target == str(before[0]) else (before[0], now[0])
+        if entry.status not in FAILED:
+            matched = _mapped_path(f"{where}.matched", entry.matched, *roots) if entry.matched else None
+            results.append(Result(entry.name, entry.status, None, None, target=target, matched=matched))
+            continue
+        old_image = _mapped_path(f"{where}.reference", entry.reference, before[0], now[0]) if entry.reference else None
+        new_image = _mapped_path(f"{where}.test", entry.test, before[1], now[1]) if entry.test else None
         variants = tuple(_mapped_path(f"{where}.variants", path, *roots) for path in entry.variants)
         digests = None
         if entry.digests is not None:

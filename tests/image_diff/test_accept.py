@@ -134,6 +134,32 @@ def test_an_unreadable_image_prevents_all_copies(run, pair, tmp_path):
             assert tree(pair[0]) == before
 
 
+@pytest.mark.parametrize("gain", [1.0, 1.3])
+@pytest.mark.parametrize("by_json", [False, True])
+def test_a_reference_of_two_images_is_replaced_only_if_one_is_named(run, tmp_path, gain, by_json):
+    """Also if the other one equals the reference, but not if it equals a variant."""
+    old, new, out = tmp_path / "old", tmp_path / "new", tmp_path / "out.json"
+    for path, value in ((old / "a.exr", 1.0), (new / "cpu/a.exr", gain), (new / "gpu/a.exr", 1.5)):
+        image(path, gain=value)
+    maps = [f'{{ reference = "{{stem}}.exr", test = "{folder}/{{stem}}.exr" }}' for folder in ("cpu", "gpu")]
+    settings = f"[defaults]\nmap = [{', '.join(maps)}]\n"
+    (old / "mi-refract.toml").write_text(settings)
+    before = tree(old)
+    run("diff", old, new, "--json", out)
+    words = [old, new, *["--from", out] * by_json, "--yes"]
+    code, _, err = run("accept", *words)
+    assert code == 2 and err.startswith(f"mi-refract: {old}/a.exr: also the reference of another image; expected ")
+    assert tree(old) == before
+    assert run("accept", old, new, "gpu/a.exr", *words[2:])[0] == 0
+    assert tree(old)["a.exr"] == tree(new)["gpu/a.exr"]
+    (old / "mi-refract.toml").write_text(settings + 'accept = ["{stem}-*.exr"]\n')
+    shutil.copy(new / "cpu/a.exr", old / "a-cpu.exr")
+    image(new / "gpu/a.exr", gain=1.7)
+    run("diff", old, new, "--json", out)
+    assert run("accept", *words)[0] == 0
+    assert tree(old)["a.exr"] == tree(new)["gpu/a.exr"]
+
+
 # Files that change after the comparison ---------------------------------------------------------------------------
 
 
