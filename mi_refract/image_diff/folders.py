@@ -145,7 +145,7 @@ def _compare_pair(result: Result, results: Results, *, keep: bool, digests: bool
     `keep`: a result that is not equal keeps its images and maps, as far as they can be read. Each file is read once.
     """
     how = result.how
-    result = replace(result, error=result.error or how.error)
+    result = replace(result, error=pairing.error_of(result, results.reference))
 
     decoded: dict[Path, str] | None = {} if digests else None  # the digests of the files that were read
 

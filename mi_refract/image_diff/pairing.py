@@ -148,8 +148,8 @@ def wrong_entries(settings: Settings, pairs: Sequence[Result]) -> list[Result]:
 def error_of(pair: Result, reference: Path) -> str:
     """Return why the pair cannot be compared, as far as that is known without reading images; "" if it can be."""
     mask = _mask_of(pair, reference if reference.is_dir() else reference.parent)
-    missing = f"{mask}: no such file; expected a mask" if mask and pair.reference and not mask.exists() else ""
-    return pair.error or pair.how.error or missing
+    is_missing = mask and pair.reference and pair.test and not mask.exists()
+    return pair.error or pair.how.error or (f"{mask}: no such file; expected a mask" if is_missing else "")
 
 
 def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> list[Result]:

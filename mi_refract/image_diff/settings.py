@@ -145,8 +145,8 @@ class Settings:
     def of(self, name: str) -> ComparisonSpec:
         """Return the settings of the image of this name, from all layers that match it; a later layer wins.
 
-        `error` is set if a layer is invalid, if two tables with the same pattern contradict each other, or if the
-        method does not have an option.
+        `error` is set if a layer is invalid, if two tables with the same pattern contradict each other, if the method
+        does not have an option, or if its value is out of range.
         """
         path = (self.above / name).as_posix()
         layers = [rule for rule in self.rules if not rule.pattern or matches(rule.pattern, path)]
@@ -179,6 +179,11 @@ class Settings:
             expected = ", ".join(sorted(options_of(method) - COMMON_OPTIONS)) or "none"
             error = f"{set_by[option]}: {option}: not an option of {method}; expected {expected}"
             return replace(spec, error=error)
+        try:
+            for option in sorted(options.keys() - COMMON_OPTIONS):
+                _options(method)[option].checked(method, options[option])
+        except ValueError as wrong:
+            return replace(spec, error=f"{set_by[option]}: {wrong}")
         merged.pop("reason", None)
         return replace(spec, **merged, options=options)
 

@@ -160,6 +160,24 @@ def test_a_reference_of_two_images_is_replaced_only_if_one_is_named(run, tmp_pat
     assert tree(old)["a.exr"] == tree(new)["gpu/a.exr"]
 
 
+SETTINGS_ERRORS = {
+    "range": ("fail = -1", "image[0]: auto: fail = -1.0; expected a number of at least 0"),
+    "mask": ('mask = "none.png"', "none.png: no such file; expected a mask"),
+}
+
+
+@pytest.mark.parametrize("by_json", [False, True])
+@pytest.mark.parametrize(("key", "message"), SETTINGS_ERRORS.values(), ids=SETTINGS_ERRORS)
+def test_images_that_the_settings_do_not_let_compare_are_not_accepted(run, pair, tmp_path, key, message, by_json):
+    old, new = pair
+    (old / "mi-refract.toml").write_text(f'[[image]]\nname = "louder.exr"\nreason = "none"\n{key}\n')
+    before, out = tree(old), tmp_path / "out.json"
+    assert run("diff", old, new, "--json", out)[0] == 2
+    code, said, err = run("accept", *(["--from", out] if by_json else pair), "--yes")
+    assert code == 2 and "→" not in said and message in err and err.count("\n") == 1
+    assert tree(old) == before
+
+
 # Files that change after the comparison ---------------------------------------------------------------------------
 
 

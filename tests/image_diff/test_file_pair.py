@@ -208,7 +208,7 @@ def test_rectangles_are_relative_to_the_data_window(sides):
 
 BAD = {
     "size": ({"mask": "small.exr"}, "small.exr: 7 × 8; expected a mask of 48 × 32"),
-    "missing": ({"mask": "none.exr"}, "none.exr: No such file"),
+    "missing": ({"mask": "none.exr"}, "none.exr: no such file; expected a mask"),
     "nan": ({"mask": "nan.exr"}, "values that are not finite"),
     "nothing left": ({"ignore": ((0, 0, 48, 32),)}, "leaves no pixel"),
     **{
