@@ -214,13 +214,14 @@ def with_file(image: Image, file: Image) -> Image:
     return replace(image, variances={name: file.select([name])[..., 0] for name in names})
 
 
-def estimates(reference: Image, test: Image, spp: tuple[int, int], allow_nonfinite: bool) -> tuple[Estimate, Estimate]:
+def estimates(reference: Image, test: Image, spp: tuple[int, int]) -> tuple[Estimate, Estimate]:
     """Return the estimates of both sides, with the channels of `matched`. `spp`: of each side; 0: from its header.
 
-    ValueError for variances that are negative or not finite, and if the samples per pixel are not known.
+    ValueError for variances that are negative, or not finite at a finite mean, and if the samples per pixel are not
+    known.
     """
     reference, test = matched(reference, test)
-    return _estimate(reference, "reference", spp[0], allow_nonfinite), _estimate(test, "test", spp[1], allow_nonfinite)
+    return _estimate(reference, "reference", spp[0]), _estimate(test, "test", spp[1])
 
 
 def untested(reference: Image, test: Image) -> list[Image]:
@@ -232,7 +233,7 @@ def untested(reference: Image, test: Image) -> list[Image]:
     return [selected(image, {name: name for name in names}) for image in sides] if names else []
 
 
-def _estimate(image: Image, side: str, spp: int, allow_nonfinite: bool) -> Estimate:
+def _estimate(image: Image, side: str, spp: int) -> Estimate:
     names, pairs, spp = means(image.channels), spreads(image.channels), samples(image, side, spp)
     mean = image.select(names).astype(np.float64)
     variance = np.full(mean.shape, np.nan)
@@ -259,7 +260,7 @@ def _estimate(image: Image, side: str, spp: int, allow_nonfinite: bool) -> Estim
         else:
             continue
         unknown = ~np.isfinite(v)
-        if (wrong := unknown & np.isfinite(m)).any() and not allow_nonfinite:
+        if (wrong := unknown & np.isfinite(m)).any():
             raise ValueError(
                 f"{image.path}: its variance of {name} is not finite {_first(image, wrong)}; expected finite values"
             )

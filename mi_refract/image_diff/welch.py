@@ -83,7 +83,7 @@ def compare_renders(
     identical = identical and np.array_equal(one.pixels, two.select(one.channels), equal_nan=True)
     set_spp = spp_reference or spp, spp_test or spp
     if single:
-        known = estimates(reference[0], test[0], set_spp, allow_nonfinite)
+        known = estimates(reference[0], test[0], set_spp)
         reference, test = [known[0].image], [known[1].image]
     for image in (*reference[1:], *test):
         if reason := preconditions(reference[0], image, allow_nonfinite):

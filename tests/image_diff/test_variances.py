@@ -285,8 +285,9 @@ def test_films_of_moments_that_cannot_be_compared():
     """Infinite squares, colours that do not repeat the moments, and an output that the new image lacks."""
     infinite, broken, test = moments(1), moments(3), moments(2)
     infinite.pixels[2, 3, infinite.channels.index("m2_nested.Y")] = np.inf
-    with pytest.raises(ValueError, match=r"variance of Y is not finite at x = 3, y = 2"):
-        compare("auto", infinite, test, spp=16)
+    for allowed in (False, True):  # an unknown noise is not one of 0
+        with pytest.raises(ValueError, match=r"variance of Y is not finite at x = 3, y = 2"):
+            compare("auto", infinite, test, spp=16, allow_nonfinite=allowed)
     broken.pixels[..., 2] *= 1.01  # a wrong conversion to R, G, B beside right moments
     result = compare("auto", test, broken, spp=16)
     assert (result.verdict, result.reason[:30]) == (INCONCLUSIVE, "not tested, without variance: ")
