@@ -161,11 +161,12 @@ class Tally:
 def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, setting: str) -> Row:
     """Return the row of a defect: the share of trials in which each method saw it.
 
-    "missed" counts the trials in which a method missed the defect although it had to see it.
+    "missed" counts the trials in which a method missed the defect although it had to see it. Trials in which the defect
+    changes nothing are left out.
     """
     several = 2 * len(trials[0].other) >= RENDERS
     tallies = {method: Tally() for method in METHODS if several or not METHODS[method].takes_renders}
-    changes, clean_tiles, unreadable = [], [], 0
+    changes, clean_tiles, unreadable, unchanged = [], [], 0, 0
     replay: dict[str, Any] = {"trials": len(trials), "renders a side": len(trials[0].clean)}
     for trial in trials:
         try:
@@ -174,13 +175,16 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
             unreadable += 1
             continue
         if np.array_equal(spoilt[0], trial.clean[0]):
-            return Row(STUDY, name, case, setting, reason="left out: it changes nothing in these images")
+            unchanged += 1
+            continue
         for method, tally in tallies.items():
             tally.compare(method, trial.other if METHODS[method].takes_renders else trial.clean, spoilt)
         if not always_due:
             clean_tiles.append([block_mean(image, TILE) for image in trial.clean])
             changes.append(np.mean([block_mean(image, TILE) for image in spoilt], 0) - np.mean(clean_tiles[-1], 0))
-    if unreadable == len(trials):
+    if unchanged == len(trials):
+        return Row(STUDY, name, case, setting, reason="left out: it changes nothing in these images")
+    if unreadable + unchanged == len(trials):
         values = {UNREADABLE: 1.0, "missed": 0.0}
         return Row(STUDY, name, case, setting, values, {"missed": 0.0}, reason="not read", replay=replay)
     size = sizes(np.array(changes), np.concatenate(clean_tiles), tallies) if clean_tiles else {}

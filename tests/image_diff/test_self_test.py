@@ -178,6 +178,9 @@ def test_rows_and_methods_that_are_left_out():
     assert "null pairs, welch" not in three and three["renders"].verdict == "not run"
     # With three images there are at most three trials.
     assert examined(grey[:3])["gain"].replay["trials"] == 3
+    # A black render leaves out its own trials only.
+    with_black = np.concatenate([np.zeros_like(grey[:1]), grey])
+    assert examined(with_black, null_pairs=2)["gain"].values["exact"] == 1
     several = {name for name, method in methods.METHODS.items() if method.takes_renders}
 
     def unreadable():
@@ -189,3 +192,5 @@ def test_rows_and_methods_that_are_left_out():
         row = self_test.detection("gain", True, trials, "", "")
         assert methods.METHODS.keys() & row.values.keys() == applied
         assert row.values["exact"] == 1 and row.values["missed"] == 0
+        same = [self_test.Trial(clean, other, plant) for plant in (lambda clean=clean: clean, unreadable)]
+        assert self_test.detection("gain", True, same, "", "").reason == "not read"
