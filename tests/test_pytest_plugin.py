@@ -57,6 +57,9 @@ def test_the_documented_test_passes(assert_image_equal, assert_image_unbiased, t
         (IMAGE[:-1], "auto", {}, "could not compare: "),
         ("missing.exr", "auto", {}, "could not compare: .*missing.exr"),  # the reference is not created
         (["no numbers"], "auto", {}, "could not compare: "),
+        (np.full((4, 4), 2**53 + 1), "exact", {}, "could not compare: .*: int64 up to ±9007199254740993; expected "),
+        (np.full((4, 4), 2**64 - 1, np.uint64), "exact", {}, "could not compare: .*; expected integers up to 2⁵³"),
+        (np.full((4, 4), -(2**63)), "exact", {}, "could not compare: .*; expected integers up to 2⁵³"),
         (IMAGE, "telepathy", {}, "could not compare: method 'telepathy'; expected "),
         (IMAGE, "exact", {"threshold": 1}, "could not compare: "),
     ],

@@ -32,6 +32,7 @@ TEXT = image_headers.TEXT  # prefix of the names of metadata that are texts of a
 MAX_VALUES = 2**28  # width × height × channels of an image: 1 GiB as float32
 # Types that are not read as float32. OpenImageIO rounds integers to float32 when it converts them to any other type.
 WIDE = {"double": "double", "uint": "uint", "int": "int"}
+EXACT = 2**53  # float64 represents all integers up to it
 CONVERTED = ("CMYK", "YCbCrK", "CIELAB", "ICCLAB", "ITULAB", "LOGL", "LOGLUV")  # colour spaces converted to R, G, B
 MOST_HEADERS = 2**28  # bytes of a file beside 8 for each value
 OPTION = " (max-values)"  # for errors: the option that changes the limit
@@ -257,11 +258,13 @@ def named(name: str, pixels: ArrayLike) -> Image:
     """Return an image of an array, H × W × C or H × W, with a name instead of a file.
 
     Three or four channels are called R, G, B (, A), others channel0, channel1 … Integers are not scaled. ValueError for
-    another shape, or for values that are not numbers.
+    another shape, for values that are not numbers, and for integers beyond ±EXACT.
     """
     pixels = np.asarray(pixels)
     if pixels.ndim not in (2, 3) or not pixels.size or pixels.dtype.kind not in "fiu":
         raise ValueError(f"{name}: {pixels.dtype} {pixels.shape}; expected numbers, height × width × channels")
+    if pixels.dtype.kind in "iu" and (largest := max(int(pixels.max()), -int(pixels.min()))) > EXACT:
+        raise ValueError(f"{name}: {pixels.dtype} up to ±{largest}; expected integers up to 2⁵³")
     pixels = pixels.reshape(*pixels.shape[:2], -1).astype(np.result_type(pixels.dtype, np.float32))
     count = pixels.shape[2]
     channels = tuple("RGBA"[:count]) if 3 <= count <= 4 else tuple(f"channel{i}" for i in range(count))
