@@ -76,9 +76,12 @@ def parsed(template: str, name: str) -> dict[str, str] | None:
     pattern, end, earlier = "", 0, set[str]()
     for part in _FIELD.finditer(template):
         field, slash = part.groups()
-        group = f"(?P={field})" if field in earlier else f"(?P<{field}>{FIELDS[field]})"
+        group = f"(?P<{field}>{FIELDS[field]})"
         pattern += re.escape(template[end : part.start()])
-        pattern += f"(?:{group}/)?" if field == "dir" and slash else group + slash
+        if field in earlier:  # the same value; none if the first is empty
+            pattern += f"(?({field})(?P={field}){slash})"
+        else:
+            pattern += f"(?:{group}/)?" if field == "dir" and slash else group + slash
         end = part.end()
         earlier.add(field)
     match = re.fullmatch(pattern + re.escape(template[end:]), name)

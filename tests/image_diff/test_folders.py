@@ -313,6 +313,11 @@ def test_escaped_names_and_filled_templates_match_themselves(name, more):
         ("{dir}/{stem}.png", "a.b.png", {"dir": "", "stem": "a.b"}),
         ("{stem}_ref{suffix}", "a_ref.exr", {"stem": "a", "suffix": ".exr"}),
         ("{stem}/{stem}.exr", "a/b.exr", None),
+        ("{dir}/ref/{dir}/{name}", "a/ref/a/out.exr", {"dir": "a", "name": "out.exr"}),
+        ("{dir}/ref/{dir}/{name}", "ref/out.exr", {"dir": "", "name": "out.exr"}),
+        ("{dir}/ref/{dir}/{name}", "a/ref/out.exr", None),
+        ("{dir}/ref/{dir}/{name}", "ref/a/out.exr", None),
+        ("{dir}/ref/{dir}/{name}", "ref/ref/ref/out.exr", {"dir": "ref", "name": "out.exr"}),
     ],
 )
 def test_templates_parse_and_form_names(template, name, values):
