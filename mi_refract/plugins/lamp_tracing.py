@@ -589,9 +589,8 @@ class LampTracer:
         d = -camera_ray.d
         value = self._radiance(si, bsdf, si.to_local(d), active)
         active &= dr.max(dr.abs(v.unpolarized_spectrum(value))) > 0
-        active &= (
-            self.scene.ray_test(ray_origins.ray_to(v, si, camera_ray.o, self.features.delta_extent), active) ^ True
-        )
+        ray = ray_origins.ray_to(v, si, camera_ray.o, self.features.delta_extent)
+        active &= self.scene.ray_test(ray, active) ^ True
         value = loop.times(value, s.throughput) * (
             importance * _quotient(dr.abs(dr.dot(si.n, d)), dr.abs(dr.dot(si.n, s.ray.d)))
         )

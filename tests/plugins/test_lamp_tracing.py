@@ -268,9 +268,9 @@ def test_a_small_glass_is_not_missed_beside_a_large_one(llvm_variant):
 
 
 @pytest.mark.parametrize("caustics", ["path", "lamp"])
-def test_a_point_lamp_does_not_shine_past_a_pane_just_above_the_floor(caustics, llvm_variant):
-    """What it casts through the pane and is seen through it is missing, here as at the origin."""
-    bulb = {"type": "point", "position": [100, 0, 1], "intensity": 5.0}
+@pytest.mark.parametrize("bulb", [{"type": "point", "position": [100, 0, 1]}, SUN], ids=["point", "directional"])
+def test_no_light_passes_by_a_pane_just_above_the_floor(bulb, caustics, llvm_variant):
+    """What a lamp of no size casts through the pane and is seen through it is missing, here as at the origin."""
     view = camera(to_world=AT_100.look_at([1.2, -1.2, 1], [0, 0, 0], [0, 0, 1]), fov=10)
     parts = {"sensor": view, "lamp": bulb, "ball": pane(0.004), "floor": floor() | {"to_world": AT_100.scale(0.5)}}
     assert dr.all(mi.render(scene(parts, caustics=caustics), spp=16) == 0, axis=None)
