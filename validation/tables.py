@@ -126,7 +126,7 @@ def accuracy(rows: list[Row]) -> str:
     """Return, for each formula, the worst error over the regimes with a budget, misclassified rays and times.
 
     In float32 and float64. Regimes that need denormal numbers have no budget, because these are flushed to 0; each of
-    them has a row of its own, of the formula that misclassifies most rays.
+    them has a row of its own, of the formula of `FORMULAS` that misclassifies most rays.
     """
     columns = {
         "float32: worst chord": m.WORST_CHORD,
@@ -141,7 +141,6 @@ def accuracy(rows: list[Row]) -> str:
         for row in _measured(rows, per_formula.NAME, [m.WORST_CHORD])
         if row.case == per_formula.ALL and row.setting in ("llvm float32", "llvm float64")
     }
-    rays = max((row.replay["rays"] for row in by_name.values()), default=0)
     denormal = [name for name, regime in REGIMES.items() if regime.rests_on_denormals]
     counted = _measured(rows, per_formula.NAME, [m.MISCLASSIFIED])
     without_budget = {
@@ -151,21 +150,22 @@ def accuracy(rows: list[Row]) -> str:
     }
     outside = [name for name in denormal if (name, "llvm float32") in without_budget]
     text = (
-        f"Worst over {rays:,} rays in {len(REGIMES) - len(outside)} of the {len(REGIMES)} regimes; u = 2⁻²⁴ or 2⁻⁵³; "
-        "times are medians over copying the same bytes\n"
-        f"and over `{PLAIN}`, with their 95 % intervals."
+        f"Worst over the rays of those of the {len(REGIMES)} regimes in which the formula has an error bound; "
+        "u = 2⁻²⁴ or 2⁻⁵³; times are\n"
+        f"medians over copying the same bytes and over `{PLAIN}`, with their 95 % intervals."
     )
     lines = []
-    for subject in dict.fromkeys(subject for subject, _ in by_name):
-        cells = [f"`{subject}`", FORMULAS[subject].source if subject in FORMULAS else "Mitsuba 3"]
+    drawn = {row.subject: f"{row.replay['rays']:,} in {row.replay['regimes']}" for row in by_name.values()}
+    for subject, rays in drawn.items():
+        cells = [f"`{subject}`", FORMULAS[subject].source if subject in FORMULAS else "Mitsuba 3", rays]
         cells += _cells(by_name.get((subject, "llvm float32")), columns.values())
         lines.append(cells + _cells(by_name.get((subject, "llvm float64")), wide))
     for name in outside:
-        single, double = (without_budget.get((name, f"llvm {precision}")) for precision in ("float32", "float64"))
-        cells = [f"every one, `{name}`", "denormal numbers are taken for 0", *_cells(single, columns.values())]
-        cells[4] += f" of {single.replay['count']}" if single else ""
+        single, double = without_budget[name, "llvm float32"], without_budget.get((name, "llvm float64"))
+        cells = [f"worst of `FORMULAS`, `{name}`", "denormal numbers are taken for 0"]
+        cells += [f"{single.replay['count']:,} in 1", *_cells(single, columns.values())]
         lines.append(cells + _cells(double, wide))
-    heading = ["formula", "source", *columns, "float64: worst chord", "in u", "time / copy"]
+    heading = ["formula", "source", "rays in regimes", *columns, "float64: worst chord", "in u", "time / copy"]
     return _table(text, heading, lines, "directions were measured on LLVM")
 
 

@@ -260,22 +260,24 @@ def test_misuse_is_one_line_and_exit_code_2(arguments, words, capsys, tmp_path):
 
 
 def test_the_accuracy_table_holds_the_measured_rows_only():
-    values = {"worst chord": 4.97e-8, "worst / u": 0.834, "time / plain": 1.05}
+    values = {"worst chord": 4.97e-8, "worst / u": 0.834, "time / plain": 1.05, "TIR misclassified": 3.0}
     values |= {"time / copy": 1.01, "time / copy, low": 0.98, "time / copy, high": 1.2}
-    rows = [row(setting="llvm float32", values=values | {"TIR misclassified": 3.0}, replay={"rays": 28000})]
-    rows.append(row(setting="llvm float64", values=values, replay={"rays": 28000}))
+    replay = {"rays": 68000, "regimes": 17}
+    rows = [row(setting=f"llvm {x}", values=values, replay=replay) for x in ("float32", "float64")]
+    rows.append(dataclasses.replace(rows[0], subject="wedge", replay={"rays": 52000, "regimes": 13}))
     copies = [dataclasses.replace(r, subject="copy", values={"time / copy": 1.0}, replay={}) for r in rows]
     lines = tables.accuracy([*rows, *copies]).splitlines()
-    assert len(lines) == 6
+    assert len(lines) == 7
     single = ["4.97e-8", "0.834", "3", "1.01 (0.98–1.2)", "1.05"]
-    expected = ["`promoted`", "this project", *single, "4.97e-8", "0.834", "1.01 (0.98–1.2)"]
-    assert [cell.strip() for cell in lines[-1].split("|")][1:-1] == expected
-    values |= {"TIR misclassified": 1469.0}  # without a budget
-    changes = {"case": "on a denormal", "values": values, "budgets": {}, "replay": {"count": 4000}}
+    expected = ["`promoted`", "this project", "68,000 in 17", *single, "4.97e-8", "0.834", "1.01 (0.98–1.2)"]
+    assert [cell.strip() for cell in lines[-2].split("|")][1:-1] == expected
+    assert lines[-1].startswith("| `wedge` | 000, boxed | 52,000 in 13 |")
+    changes = {"case": "on a denormal", "values": values | {"TIR misclassified": 1469.0}}
+    changes |= {"budgets": {}, "replay": {"count": 4000}}
     denormal = [dataclasses.replace(r, **changes) for r in rows]
     lines = tables.accuracy([*rows, *denormal]).splitlines()
-    assert len(lines) == 7 and "in 17 of the 18 regimes" in lines[0] and "1469 of 4000" in lines[-1]
-    assert lines[-1].startswith("| every one, `on a denormal` | denormal numbers are taken for 0 |")
+    assert len(lines) == 8 and "| 1469 |" in lines[-1]
+    assert lines[-1].startswith("| worst of `FORMULAS`, `on a denormal` |") and "| 4,000 in 1 |" in lines[-1]
 
 
 # Words that each table must contain.

@@ -177,7 +177,8 @@ def summary(name: str, parts: list[Row], setting: Setting, times: dict[str, floa
         needed = {c: max(row.replay["needed"][c] for row in parts) for c in constants}
         slack = {f"slack, {c}": x / max(needed[c], 1e-3 * x) for c, x in constants.items() if x}
         values, budgets = values | slack, dict.fromkeys(slack, limits.SLACK)
-    replay = {"rays": sum(row.replay["count"] for row in parts), "seed": seeds.current(SEED)}
+    rays = sum(row.replay["count"] for row in parts)
+    replay = {"rays": rays, "regimes": len(parts), "seed": seeds.current(SEED)}
     goals = kernel_timing.goals(name, setting)
     return Row(NAME, name, ALL, setting.label, values | times, budgets, goals, replay=replay)
 
