@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import version
+from importlib.metadata import distributions, version
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +60,7 @@ def run(
     """
     store = context.out / "unfinished"
     store.mkdir(parents=True, exist_ok=True)
-    about = repr((context.profile, context.variant, installed(), describe(context, 0))) + sources()
+    about = _state(context)
     files = [store / f"{hashlib.sha256((about + task.name).encode()).hexdigest()[:24]}.json" for task in tasks]
     finished: dict[int, Finished] = {}
 
@@ -129,6 +129,14 @@ def describe(context: Context, seconds: float) -> dict[str, Any]:
         | {name: version(name) for name in ("mitsuba", "drjit", "numpy", "OpenImageIO", "python-flint")},
         "machine": {"processor": processor, "system": platform.platform(), "python": platform.python_version()},
     }
+
+
+def _state(context: Context) -> str:
+    """Return what rows depend on, and whether they are "not run": saved rows of another state are not used."""
+    packages = sorted(f"{package.name} {package.version}" for package in distributions())
+    programs = [shutil.which(program) for program in environments.PROGRAMS]
+    runs_here = context.backends, context.variants, packages, installed(), programs
+    return repr((context.profile, *runs_here, describe(context, 0))) + sources()
 
 
 def installed() -> list[str]:

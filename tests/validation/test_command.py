@@ -14,6 +14,7 @@ import pytest
 from support.dask_workers import tls_settings
 
 from mi_refract import FORMULAS
+from mi_refract.backend import Backend
 from mi_refract.cluster.connection import ClusterTarget, connected
 from mi_refract.image_diff import self_test
 from mi_refract.image_diff.methods import METHODS
@@ -115,6 +116,25 @@ def test_saved_rows_are_used_for_the_same_sources_only(context, tmp_path, monkey
         for _ in range(2):
             runner.run([Task("a task", lambda: calls.append(1) or [row()])], context)
         assert len(calls) == count, name
+
+
+def test_saved_rows_are_used_if_the_machine_can_run_the_same_only(context, tmp_path, monkeypatch):
+    calls = []
+
+    def used(context):
+        runner.run([Task("a task", lambda: calls.append(1) or [row()])], context)
+        return len(calls)
+
+    assert used(context) == used(context) == 1
+    backends = context.backends | {"cuda": Backend("cuda", True, "another GPU")}
+    assert used(dataclasses.replace(context, backends=backends)) == 2
+    assert used(dataclasses.replace(context, variants=context.variants | {"llvm_ad_rgb": "broken"})) == 3
+    (tmp_path / "a_package-1.0.dist-info").mkdir()
+    (tmp_path / "a_package-1.0.dist-info/METADATA").write_text("Name: a-package\nVersion: 1.0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert used(context) == 4
+    monkeypatch.setattr(runner.shutil, "which", lambda name: f"/another/{name}")
+    assert used(context) == used(context) == 5
 
 
 def test_workers_return_the_same_rows_as_this_process(context, tmp_path):

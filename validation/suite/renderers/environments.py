@@ -20,6 +20,8 @@ from validation.run.headline import ABSENT, INSTALL
 
 from .system import LOCKS, SCRIPTS, System
 
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+PROGRAMS = (*BROWSERS, "node", "g++")  # that renderers look for in PATH
 CANNOT = 77  # exit code of a script that cannot run on this machine
 TIMEOUT = 600.0  # seconds: enough on a busy machine; a program that takes longer hangs
 _INSTALL_TIMEOUT, _QUERY_TIMEOUT = 3600.0, 60.0  # seconds

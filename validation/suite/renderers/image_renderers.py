@@ -28,7 +28,6 @@ from .system import SCRIPTS, SYSTEMS, System
 
 HOURS = 4 * 3600.0  # seconds: a renderer that takes longer hangs
 PASS = 2048  # samples per pixel
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 @dataclass(frozen=True)
@@ -125,7 +124,7 @@ def povray_images(
 
 def _three(mode: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
     """Render by three.js: path traced with ("mis", its default) or without ("none") MIS of the sky, or "raster"."""
-    chromium, node = next(filter(None, map(shutil.which, BROWSERS)), None), shutil.which("node")
+    chromium, node = next(filter(None, map(shutil.which, environments.BROWSERS)), None), shutil.which("node")
     if not (chromium and node):
         raise environments.Unable("no node or no Chromium in PATH")
     _write_gltf(plain, folder / "scene")
