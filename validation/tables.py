@@ -6,6 +6,7 @@ Rows are selected by the constants of the studies, so a removed study or metric 
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
@@ -118,8 +119,13 @@ def _cells(row: Row | None, metrics: Iterable[str], intervals: bool = True) -> l
 
 
 def _replay(rows: list[Row], template: str) -> str:
-    """Return the template, filled with the `replay` and the `setting` of the first row."""
-    return template.format_map({**rows[0].replay, "setting": rows[0].setting}) if rows else ""
+    """Return the template, filled with the `replay` and the `setting` of the rows: all values if they differ."""
+
+    def filled(field: re.Match[str]) -> str:
+        texts = {field[0].format_map({**row.replay, "setting": row.setting}) for row in rows}
+        return " or ".join(sorted(texts, key=lambda text: (len(text), text)))  # numbers by size
+
+    return re.sub(r"\{[^}]*\}²?", filled, template) if rows else ""
 
 
 def accuracy(rows: list[Row]) -> str:

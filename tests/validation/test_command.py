@@ -27,6 +27,7 @@ from validation.reference.standard_numbers import NUMBERS
 from validation.renders import gradients, thin_panes
 from validation.run import render_methods
 from validation.run.context import SCENES, beyond_builtin, here
+from validation.run.metrics import EQUAL_TIME, EQUAL_TIME_DEFAULTS
 from validation.stability import layered_paths
 from validation.study import Study, Task
 from validation.suite import caustic_energies, rendered_images
@@ -298,6 +299,17 @@ def test_the_accuracy_table_holds_the_measured_rows_only():
     lines = tables.accuracy([*rows, *denormal]).splitlines()
     assert len(lines) == 8 and "| 1469 |" in lines[-1]
     assert lines[-1].startswith("| worst of `FORMULAS`, `on a denormal` |") and "| 4,000 in 1 |" in lines[-1]
+
+
+def test_a_table_states_every_size_of_its_images():
+    sizes = {"sphere": 512, "balls": 128, "prism": 512}
+    replay, values = {"spp": 25, "rounds": 8, "sampler": "multijitter"}, {EQUAL_TIME: 1.0, EQUAL_TIME_DEFAULTS: 0.5}
+    rows = [
+        Row("efficiency", method, scene, "llvm_ad_rgb", values, replay=replay | {"resolution": size})
+        for scene, size in sizes.items()
+        for method in (render_methods.BUILTIN.name, render_methods.OURS)
+    ]
+    assert tables.efficiency(rows).startswith("128² or 512² pixels, 25 spp, 8 rounds, llvm_ad_rgb.\n")
 
 
 # Words that each table must contain.
