@@ -218,6 +218,18 @@ def test_wrappers_that_are_split_like_glass_are_detected(llvm_variant, monkeypat
     assert len(rows) == 2 and [row.case.split(": ")[1] for row in rows if row.broken] == ["blend of itself"]
 
 
+def test_a_detectable_difference_is_detected_with_probability_one_half():
+    """Within four standard errors of 200 trials, in gray images."""
+    rng, size = np.random.default_rng(1), invisible_changes.SIZE
+
+    def values(gain):
+        sides = rng.normal([1, 1 + gain], 0.5, (invisible_changes.RENDERS, size, size, 2)).repeat(3, -1)
+        return invisible_changes.compared(sides[..., :3], lambda seed: sides[..., 3:], 0)
+
+    detectable = np.mean([values(0.0)["detectable"] for _ in range(20)])
+    assert np.mean([values(detectable)["alarms"] > 0 for _ in range(200)]) == pytest.approx(0.5, abs=0.14)
+
+
 @pytest.mark.parametrize(("pixel", "verdict"), [(1.001, "pass"), (math.nan, "fail")])
 def test_renders_in_passes_without_a_number_fail(context, monkeypatch, pixel, verdict):
     def resume(job, *_, **__):

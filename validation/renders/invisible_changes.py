@@ -16,6 +16,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from scipy import special
 
 from mi_refract.image_diff import tile_statistics
 from mi_refract.report.row import Row
@@ -168,11 +169,12 @@ def compared(expected: Any, render: Callable[[int], Any], seed: int) -> dict[str
     same_seeds = render(seed)
     same_bits = bool((same_seeds == expected).all())
     test = same_seeds if same_bits else render(seed + 1000)
-    alarms, means = float(not np.isfinite(test).all()), [x.mean(axis=(1, 2)) for x in (expected, test)]
-    for tile in (SIZE, TILE) if not same_bits else ():
-        alarms += tile_statistics.compare_stacks(expected, test, tile, limits.INVISIBLE_ALARM, 1e-5).alarms
-    error = np.sqrt(sum(x.var(axis=0, ddof=1) / RENDERS for x in means))
-    detectable = 0.0 if same_bits else float((4.5 * error / expected.mean()).max())
+    alarms, detectable = float(not np.isfinite(test).all()), 0.0
+    for tile in (TILE, SIZE) if not same_bits else ():
+        tests = tile_statistics.compare_stacks(expected, test, tile, limits.INVISIBLE_ALARM, 1e-5)
+        alarms, whole = alarms + tests.alarms, tests.levels[0]
+        reach = -special.stdtrit(whole.freedom, tests.threshold / 2) * whole.error
+        detectable = float((whole.allowed + reach).max() / expected.mean())  # of the last, the whole image
     noise = [np.var(x, axis=0, ddof=1).mean() for x in (expected, test)]
     ratio = float(noise[1] / noise[0]) if noise[0] else 1.0
     return {"alarms": alarms, "same bits": float(same_bits), "detectable": detectable, "noise": ratio}
