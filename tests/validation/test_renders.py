@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import math
 from dataclasses import replace
 from importlib.util import find_spec
@@ -399,13 +400,17 @@ def test_the_packages_file_is_written_from_the_makers_tables(tmp_path):
 
 
 def test_wrong_indices_are_detected_in_directions(spectral, monkeypatch):
-    """An index rounded to float32, and one off by 1e-14."""
+    """An index rounded to float32, one off by 1e-14, and one that is NaN at one wavelength of many."""
     for row in ray_directions.rows(HERE, GLASS):
         assert row.verdict in ("pass", "not run"), (row.name, row.broken)
     at, index = index_parameter.DispersiveRatio.at, dispersion.Terms.index
     monkeypatch.setattr(index_parameter.DispersiveRatio, "at", lambda *x: mi.Float64(mi.Float(at(*x))))
     assert "error / bound" in ray_directions.sampled_row(media.parse(GLASS), GLASS, 4000).broken
     monkeypatch.setattr(dispersion.Terms, "index", lambda *x: index(*x) * (1 + 1e-14))
+    assert ray_directions.index_row(media.parse(GLASS), GLASS).verdict == "fail"
+    monkeypatch.undo()
+    index, off = media.Medium.index, itertools.chain([1.0] * 9, [math.nan], itertools.repeat(1.0))
+    monkeypatch.setattr(media.Medium, "index", lambda *x: index(*x) * next(off))
     assert ray_directions.index_row(media.parse(GLASS), GLASS).verdict == "fail"
 
 

@@ -131,7 +131,7 @@ def index_row(medium: Medium, spec: str) -> Row:
 
     wavelengths = Drawn(medium, 200).wavelengths.tolist()
     errors = [abs(float(exact_index(medium, w) / arb(medium.index(w)) - 1)) for w in wavelengths]
-    values = {"index error / u": max(errors) / 2.0**-53}
+    values = {"index error / u": float(np.max(errors)) / 2.0**-53}
     return Row(NAME, SUBJECTS.get(spec, spec), "index", "float64", values, {"index error / u": INDEX_ROUNDING})
 
 
