@@ -43,7 +43,8 @@ class Answer(TypedDict):
     """A question, and the answer that the rows give.
 
     `state`: "yes" if every budget behind the answer held, "no" if one did not, "plain" if there is none, "not measured"
-    if no row answers the question. `study`: the section to link to; NOT_RUN: the list of rows that were not run; or "".
+    if no row answers the question, or noise hides the answer. `study`: the section to link to; NOT_RUN: the list of
+    rows that were not run; or "".
     """
 
     question: str

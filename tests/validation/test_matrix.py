@@ -12,6 +12,7 @@ from validation import __main__ as command
 from validation import limits
 from validation.suite import matrix, per_ray, rendered_images
 from validation.suite.per_ray import CRITICAL, LARGE
+from validation.suite.renderers import System
 
 REPLAY = {"version": "A 1.0", "total internal reflection": "zero", "remark": "known"}
 ONE = {"worst rad": 1e-6}
@@ -22,9 +23,9 @@ def ray(subject="A", case="random", precision="f32", values=ONE, wrong=0.0, goal
     return Row(per_ray.NAME, subject, case, precision, values, {"wrong": 0.0}, dict(goals), reason, REPLAY)
 
 
-def image(subject="B", verdict="equal", differing=0.0, budgets=(("tests that differ", 0.0),)):
+def image(subject="B", verdict="equal", differing=0.0, budgets=(("tests that differ", 0.0),), case="prism"):
     values, replay = {"mean difference": -0.02, "tests that differ": differing}, {"verdict": verdict, "renderer": "B 3"}
-    return Row(rendered_images.NAME, subject, "prism", "64²", values, dict(budgets), reason="why", replay=replay)
+    return Row(rendered_images.NAME, subject, case, "64²", values, dict(budgets), reason="why", replay=replay)
 
 
 def test_the_summary_has_the_numbers_and_verdicts_of_its_rows_and_precedes_them():
@@ -73,6 +74,23 @@ def test_other_seeds_are_no_systems_and_fail_the_checks_that_they_break():
     (system,) = stored["rays"]
     assert {name for name, x in system["sets"].items() if x["verdict"] == "wrong"} == {CRITICAL}
     assert len(system["sets"]) == 2 and not stored["not_run"]
+
+
+@pytest.mark.parametrize(
+    ("rows", "state"),
+    [
+        ([image()], "yes"),
+        ([image(verdict="inconclusive")], "not measured"),
+        ([image(verdict="inconclusive"), image(case="sphere")], "yes"),
+        ([image(verdict="inconclusive", differing=2.0)], "no"),
+        ([ray("B")], "yes"),
+        ([ray("B", wrong=3.0)], "no"),
+        ([Row(rendered_images.NAME, "B", "every scene", "64²", reason="pip install it")], "not measured"),
+    ],
+)
+def test_the_first_page_says_yes_of_a_users_renderer_only_if_a_check_was_conclusive(rows, state):
+    (answer,) = matrix.answers([*rows, ray("another")], [System("b", "B")])
+    assert answer["state"] == state and answer["question"].startswith("Your renderer: B")
 
 
 # The page ----------------------------------------------------------------------------------------------------------

@@ -176,7 +176,9 @@ def answers(rows: Iterable[Row], own_renderers: Iterable[System]) -> list[Answer
         for result in results[kind]:
             name = ", ".join(result[key] for key in ("system", "precision") if key in result)
             text = result["reason"] if kind == "not_run" else result["sentence"]
-            state: State = "not measured" if kind == "not_run" else "no" if result["wrong"] else "yes"
+            verdicts = {scene["verdict"] for scene in result.get("scenes", {}).values()}
+            unknown = kind == "not_run" or verdicts == {INCONCLUSIVE}
+            state: State = "no" if result.get("wrong") else "not measured" if unknown else "yes"
             made.append({"question": f"Your renderer: {name}", "text": text, "state": state, "study": NAME})
     return made
 
