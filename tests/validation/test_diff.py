@@ -134,7 +134,7 @@ def test_a_side_that_does_not_know_its_noise_is_seen(defect, monkeypatch):
 
 def test_what_is_timed(tmp_path):
     """An image that differs is what the page shows; the folder's images are equal for what `auto` tests."""
-    small = times.Size(48, 64, 2, 1)
+    small = times.Size(48, 64, 2, 6)
     times.write(tmp_path, small)
     one, other, many = tmp_path / "a/0.exr", tmp_path / "b/0.exr", (tmp_path / "many_a", tmp_path / "many_b")
     assert folders.diff(one, other, Settings.for_all(method="tolerance")).exit_code == 1

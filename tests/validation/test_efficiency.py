@@ -146,13 +146,15 @@ def test_scaling_measures_its_own_process_or_raises(context, tmp_path):
 # Times ----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", [9, 11, 21])
+@pytest.mark.parametrize("count", [6, 9, 11, 21])
 def test_the_interval_of_a_median_has_95_percent_coverage(count):
     """The exact coverage of its ranks; a narrower interval would have less than 95 %."""
     values = kernel_timing.interval("t", list(map(float, range(1, count + 1))))
     rank = int(values["t, low"])
     assert (values["t"], values["t, high"]) == ((count + 1) / 2, count + 1 - rank)
     assert 1 - 2 * binom.cdf(rank - 1, count, 0.5) >= 0.95 > 1 - 2 * binom.cdf(rank, count, 0.5)
+    with pytest.raises(ValueError, match="t: 5 values; expected at least 6 for an interval of 95 %"):
+        kernel_timing.interval("t", [1.0] * 5)
 
 
 def test_ratios_are_formed_within_a_round_and_every_second_round_runs_backwards():
@@ -206,7 +208,7 @@ def test_slow_subjects_are_detected_on_all_backends(tmp_path, variant, monkeypat
 
 def test_a_pilot_that_chooses_badly_misses_its_goals(context, monkeypatch):
     """In a scene of glass only, the scene's own settings cost ten times as much as splitting."""
-    small = chosen_settings.Extent(("balls",), 24, 16, 2, samplers=("multijitter",), depths=(3,))
+    small = chosen_settings.Extent(("balls",), 24, 16, 6, samplers=("multijitter",), depths=(3,))
     monkeypatch.setitem(chosen_settings.EXTENTS, "standard", small)
     (row,) = chosen_settings.scene_rows(context, "balls")
     assert "split_depth=3" in row.reason and row.values["equal-time MSE / independent"] < 0.5

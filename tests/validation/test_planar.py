@@ -214,7 +214,7 @@ def test_walls_do_what_segments_do_and_wrong_walls_are_seen(llvm_variant):
 
 def test_methods_that_differ_in_a_bit_are_seen(scalar_context, monkeypatch):
     context = scalar_context(scalar_rays=4)
-    monkeypatch.setitem(times.ROUNDS, context.profile.name, 1)
+    monkeypatch.setitem(times.ROUNDS, context.profile.name, 6)
 
     def verdicts():
         return {row.case: row.verdict for row in times.measure(context, SCALAR, (10,)) if row.budgets}

@@ -100,10 +100,15 @@ def ratio(metric: str, times: list[float], others: list[float]) -> dict[str, flo
 
 
 def interval(metric: str, x: list[float]) -> dict[str, float]:
-    """Return the median and order statistics around it: P(median outside) ≤ 2 P(Binomial(n, ½) < rank) ≤ 5 %."""
+    """Return the median and order statistics around it: P(median outside) ≤ 2 P(Binomial(n, ½) < rank) ≤ 5 %.
+
+    ValueError for fewer than six values: their extremes have less than 95 %.
+    """
     from scipy.stats import binom
 
-    rank = max(int(binom.ppf(0.025, len(x), 0.5)), 1)
+    rank = int(binom.ppf(0.025, len(x), 0.5))
+    if rank == 0:
+        raise ValueError(f"{metric}: {len(x)} values; expected at least 6 for an interval of 95 %")
     ordered = sorted(x)
     return {metric: statistics.median(x), f"{metric}, low": ordered[rank - 1], f"{metric}, high": ordered[-rank]}
 
