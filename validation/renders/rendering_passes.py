@@ -3,7 +3,8 @@
 Small renders, each with its own seed, stop by `--until` at the average error of 12 passes, where chance decides when
 the estimate stops a render. Their true error is measured against a render with a hundred times as many samples. The
 method claims that it is below the requested error with 95 % probability. The budget is the largest number of
-exceptions that then has a probability above 0.001, so the study fails by chance once in 1000 runs.
+exceptions that then has a probability above 0.001. There are two such budgets in each of two scenes, so the study fails
+by chance at most once in 250 runs.
 
 Times are CPU times of a render in passes over one call of `mi.render` with as many samples, alternating. A render in
 passes writes a file with its image and variance; the second ratio is to a call with the time to write its image.
