@@ -122,6 +122,10 @@ def resume(
     if has_checkpoint and planned is not None and progress.done > planned:
         expected = f"expected --spp {progress.done} or more, or --restart"
         raise ValueError(f"{saved}: already holds {progress.done} samples per pixel; {expected}")
+    last = math.inf if plan.passes is None else progress.first + plan.passes
+    if not renderer.jitter and last > max(1, progress.passes):
+        expected = "expected jitter, or one pass from the start: --spp N --pass-spp N"
+        raise ValueError(f"{job.scene}: the sampler has no jitter, so all passes have points on one grid; {expected}")
     progress.identity[PASS] = plan.spp
     return LongRender(job, path, limits, parsed, scene, renderer, spp, plan, progress, pilot_seconds)
 

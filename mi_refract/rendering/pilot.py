@@ -264,10 +264,8 @@ class Pilot:
         if not renderer.moments:
             expected = "an integrator of samples, a film without a border, and a JIT variant such as llvm_ad_rgb"
             raise ValueError(f"{what}: samples cannot be rendered one by one; expected {expected}")
-        unknown = self.own["sampler"] not in SAMPLERS
-        fixed = not unknown and "jitter = 0" in str(renderer.scene.sensors()[0].sampler())  # its error is not noise
-        if unknown or fixed:
-            problem = f"the scene's sampler is {self.own['sampler']}{' without jitter' * fixed}"
+        if self.own["sampler"] not in SAMPLERS or not renderer.jitter:  # without jitter its error is not noise
+            problem = f"the scene's sampler is {self.own['sampler']}{' without jitter' * (not renderer.jitter)}"
             raise ValueError(f"{what}: {problem}; expected {', '.join(SAMPLERS)}, with jitter, or settings by name")
         total = plan(renderer.rounded).total
         # The pilot takes as much time as rendering so many samples.

@@ -67,6 +67,12 @@ class PassRenderer:
         of_film = self.channels[: len(self.channels) - len(self.scene.integrator().aov_names())]
         return sum(name != "A" for name in of_film)
 
+    @property
+    def jitter(self) -> bool:
+        """Whether the sampler's points are random in their strata. Otherwise those of all passes are on one grid."""
+        sampler = self.scene.sensors()[0].sampler()  # one written in Python may lack `to_string`
+        return type(sampler) is not mi.Sampler or "jitter = 0" not in str(sampler)
+
     def rounded(self, spp: int) -> int:
         """Return `spp` as the scene's sampler rounds it up."""
         return set_spp(self.scene.sensors()[0].sampler().clone(), spp)

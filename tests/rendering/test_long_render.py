@@ -26,6 +26,7 @@ from mi_refract.io.image_file import read, read_exr
 from mi_refract.rendering import checkpoint, long_render, rendered_file
 from mi_refract.rendering.end_conditions import Limits
 from mi_refract.rendering.long_render import Job, render_to_exr, resume
+from mi_refract.rendering.render_pass import PassRenderer
 
 SCENE = SCENES / "nested.xml"
 SKY = """<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"><film type="hdrfilm">
@@ -159,6 +160,26 @@ def test_a_render_without_noise_ends_early_unless_it_is_black(tmp_path, llvm_var
     render = resume(Job(tmp_path / "dark.xml"), tmp_path / "a.exr", Limits(until=0.1, pass_spp=1))
     stopped_after(render, 13)
     assert len(render.warnings) == 1 and "the image is still black" in render.warnings[0]
+
+
+@pytest.mark.parametrize("sampler", ["stratified", "multijitter", "orthogonal"])
+def test_a_sampler_without_jitter_renders_a_single_pass(tmp_path, llvm_variant, monkeypatch, sampler):
+    """Its points are on one grid in all passes, so their spread lacks the error of the grid."""
+    no_jitter = f'<sampler type="{sampler}"><boolean name="jitter" value="false"/>'
+    output, scene = tmp_path / "a.exr", changed(tmp_path, ('<sampler type="$sampler">', no_jitter))
+    more = [{"spp": 50, "pass_spp": 25}, {"seconds": 9.0}, {"until": 0.1}]
+    for limits in more:
+        with pytest.raises(ValueError, match=r"scene.xml: the sampler has no jitter, .*; expected jitter, or one pass"):
+            rendering(output, scene=scene, **limits)
+    assert rendering(output, scene=scene, spp=25, pass_spp=25).run()["mi_refract:passes"] == 1
+    for limits in more:
+        with pytest.raises(ValueError, match="no jitter"):
+            rendering(output, scene=scene, **limits)
+    assert rendering(output, scene=scene, spp=25, pass_spp=25).end() == "25 spp"
+    with monkeypatch.context() as earlier:
+        earlier.setattr(PassRenderer, "jitter", True)
+        rendering(output, scene=scene, **more[0]).run()
+    assert rendering(output, scene=scene, **more[0]).end() == "50 spp"
 
 
 def test_a_render_ends_at_the_first_limit_that_it_reaches(tmp_path, llvm_variant):
