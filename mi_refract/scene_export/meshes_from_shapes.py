@@ -70,13 +70,18 @@ def meshes_of_shape(shape: Node, level: int, most: int = MOST, eye: Vertices | N
         placed = vertices @ frame[:3, :3].T + frame[:3, 3]
         if not (np.abs(placed) <= FARTHEST).all():
             raise shape.error(f"coordinates beyond {FARTHEST:g}", "finite ones, up to that")
-        if surface.one_sided and eye is not None and tessellation.encloses(placed[faces], eye):
-            raise shape.error("diffuse on the outside only, around the camera", "its BSDF in a `twosided`")
         normals = None
         if shape.type in ROUND:
             normals = (vertices * ROUND[shape.type]) @ frame[:3, :3].T * (-1 if is_flipped else 1)
             normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        yield Mesh(f"{name}_{i}" if i else name, placed, faces[:, ::-1] if is_flipped else faces, material, normals)
+        faces = faces[:, ::-1] if is_flipped else faces
+        mesh = Mesh(f"{name}_{i}" if i else name, placed, faces, material, normals)
+        if surface.one_sided and eye is not None:
+            is_inward = mesh.volume() < 0
+            if tessellation.encloses(placed[faces[:, ::-1] if is_inward else faces], eye) != is_inward:
+                seen = "inside only, seen from outside" if is_inward else "outside only, around the camera"
+                raise shape.error(f"diffuse on the {seen}", "its BSDF in a `twosided`")
+        yield mesh
 
 
 def with_unique_names(parts: Iterable[Mesh | Lamp]) -> tuple[Mesh | Lamp, ...]:

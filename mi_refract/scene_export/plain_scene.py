@@ -79,6 +79,10 @@ class Mesh:
         """Return the corners of each triangle, (F, 3, 3)."""
         return self.vertices[self.faces]
 
+    def volume(self) -> float:
+        """Return the volume inside a closed mesh, below 0 if its normals point inward."""
+        return float(np.linalg.det(self.triangles()).sum() / 6)
+
 
 @dataclass(frozen=True)
 class Lamp:

@@ -389,16 +389,27 @@ def test_smooth_normals_are_refused(scene, tmp_path):
     assert len(from_mitsuba.load(scene(BALL, flat)).meshes[0].faces) == 8
 
 
-def test_a_room_with_diffuse_walls_may_enclose_the_camera(scene, tmp_path):
+@pytest.mark.parametrize(
+    "order, size, refused",
+    [
+        ((2, 1, 0), 99, ""),  # a room
+        ((0, 1, 2), 9, ""),
+        ((0, 1, 2), 99, "diffuse on the outside only, around the camera; expected"),
+        ((2, 1, 0), 9, "diffuse on the inside only, seen from outside; expected"),
+    ],
+)
+def test_a_camera_sees_the_diffuse_side_of_a_closed_mesh(order, size, refused, scene, tmp_path):
     vertices, faces = tessellation.cube()
-    for name, order in (("room", (2, 1, 0)), ("block", (0, 1, 2))):
-        lines = [f"v {x} {y} {z}" for x, y, z in 99 * vertices] + [f"f {a} {b} {c}" for a, b, c in faces[:, order] + 1]
-        (tmp_path / f"{name}.obj").write_text("\n".join(lines))
-    box, flat = 'type="cube" id="box">' + MOVED, '<boolean name="face_normals" value="true"/>'
-    room = f'type="obj" id="box"><string name="filename" value="room.obj"/>{flat}'
-    assert from_mitsuba.load(scene(box, room), level=0).meshes[1].vertices.max() == 99
-    with pytest.raises(ValueError, match="around the camera"):
-        from_mitsuba.load(scene(box, room.replace("room", "block")))
+    lines = [f"v {x} {y} {z}" for x, y, z in size * vertices] + [f"f {a} {b} {c}" for a, b, c in faces[:, order] + 1]
+    (tmp_path / "box.obj").write_text("\n".join(lines))
+    flat = '<boolean name="face_normals" value="true"/>'
+    obj = f'type="obj" id="box"><string name="filename" value="box.obj"/>{flat}'
+    path = scene('type="cube" id="box">' + MOVED, obj)
+    if refused:
+        with pytest.raises(ValueError, match=refused):
+            from_mitsuba.load(path)
+        path = scene('type="cube" id="box">' + MOVED, f'{obj}<bsdf type="twosided"><bsdf type="diffuse"/></bsdf>')
+    assert from_mitsuba.load(path, level=0).meshes[1].vertices.max() == size
 
 
 @pytest.mark.parametrize("last, smooth", [(3, False), (10**9, False), (2**32 - 1, False), (10**9, True)])

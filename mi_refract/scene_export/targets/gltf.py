@@ -177,8 +177,8 @@ def _with_hollows(plain: PlainScene, meshes: Sequence[Mesh]) -> list[Mesh]:
     """Return the meshes, with each hollow merged into the glass around it: in glTF one mesh bounds a volume."""
     bodies = {mesh.name: mesh for mesh in meshes}
     glasses = [mesh for mesh in meshes if isinstance(mesh.material, Glass)]
-    solids = sorted((mesh for mesh in glasses if _volume(mesh) > 0), key=_volume)
-    for hollow in (mesh for mesh in glasses if _volume(mesh) <= 0):
+    solids = sorted((mesh for mesh in glasses if mesh.volume() > 0), key=Mesh.volume)
+    for hollow in (mesh for mesh in glasses if mesh.volume() <= 0):
         del bodies[hollow.name]
         candidates = (mesh for mesh in solids if mesh.material == hollow.material)
         solid = next((mesh for mesh in candidates if encloses(mesh.triangles(), hollow.vertices[0])), None)
@@ -201,10 +201,6 @@ def _with_normals(mesh: Mesh) -> Mesh:
         return mesh
     normals, faces = np.repeat(_facet_normals(mesh), 3, axis=0), np.arange(mesh.faces.size).reshape(-1, 3)
     return replace(mesh, vertices=mesh.triangles().reshape(-1, 3), faces=faces, normals=normals)
-
-
-def _volume(mesh: Mesh) -> float:
-    return float(np.linalg.det(mesh.triangles()).sum() / 6)
 
 
 def _back(lamp: Mesh, offset: float) -> Mesh | None:
@@ -241,7 +237,7 @@ def _material(name: str, material: Material, meshes: Iterable[Mesh]) -> dict[str
         n = material.int_ior / material.ext_ior
         parts = [mesh for mesh in meshes if mesh.material == material]
         surface = sum(np.linalg.norm(_areas(mesh), axis=1).sum() for mesh in parts)
-        volume: dict[str, Any] = {"thicknessFactor": float(4 * sum(map(_volume, parts)) / surface)}
+        volume: dict[str, Any] = {"thicknessFactor": float(4 * sum(map(Mesh.volume, parts)) / surface)}
         entry["extensions"] = {
             "KHR_materials_transmission": {"transmissionFactor": 1.0},
             "KHR_materials_ior": {"ior": n},

@@ -91,8 +91,7 @@ def outward(plain: PlainScene) -> PlainScene:
     """Return the same scene, with all closed glass turned so that normals point outward and `int_ior` is inside."""
 
     def inside_out(mesh: Mesh) -> bool:
-        closed_glass = isinstance(mesh.material, Glass) and is_closed(mesh.faces)
-        return closed_glass and float(np.linalg.det(mesh.triangles()).sum()) < 0
+        return isinstance(mesh.material, Glass) and is_closed(mesh.faces) and mesh.volume() < 0
 
     return dataclasses.replace(plain, meshes=tuple(turned(mesh) if inside_out(mesh) else mesh for mesh in plain.meshes))
 
