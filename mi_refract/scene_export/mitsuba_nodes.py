@@ -126,7 +126,7 @@ class SceneFile:
         """
         self.path = path
         try:
-            self.state = scene_parser.parse(path, defines, "scalar_rgb").state
+            self.parsed = scene_parser.parse(path, defines, "scalar_rgb")
         except OSError:
             raise
         except Exception as error:
@@ -135,10 +135,8 @@ class SceneFile:
 
     def node(self, index: int) -> Node:
         """Return the node with this index; 0 is the scene."""
-        return Node(self, self.state.nodes[index])
+        return Node(self, self.parsed.state.nodes[index])
 
     def resolve(self, name: str) -> Path:
-        """Return the path of a file that the scene names, relative to its folder. ValueError for pipes and devices."""
-        path = self.path.parent / name
-        scene_parser.require_file(path)
-        return path
+        """Return the path of a file that the scene names, where Mitsuba finds it."""
+        return self.parsed.named[name]

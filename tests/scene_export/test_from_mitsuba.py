@@ -13,6 +13,7 @@ import pytest
 
 from mi_refract import SCENES
 from mi_refract.io import image_file
+from mi_refract.rendering.scene_files import load_scene
 from mi_refract.scene_export import from_mitsuba, meshes_from_shapes, targets, tessellation
 from mi_refract.scene_export.mitsuba_nodes import SceneFile
 from mi_refract.scene_export.plain_scene import Diffuse, DirectionalLamp, Glass, Light, PointLamp, SpotLamp
@@ -387,6 +388,20 @@ def test_smooth_normals_are_refused(scene, tmp_path):
         from_mitsuba.load(scene(BALL, ply))
     flat = f'{ply}<boolean name="face_normals" value="true"/>'
     assert len(from_mitsuba.load(scene(BALL, flat)).meshes[0].faces) == 8
+
+
+@pytest.mark.parametrize("folder", ["more", "."])
+def test_a_file_is_the_one_that_mitsuba_finds(folder, scene, tmp_path):
+    """Mitsuba looks in the folders of `<path>` before that of the scene."""
+    (tmp_path / "more").mkdir()
+    for place, size in ((tmp_path / "more", 3), (tmp_path, 1)):
+        lines = [f"v 0 0 {size}", f"v {size} 0 0", f"v 0 {size} 0", "f 1 2 3"]
+        (place / "m.obj").write_text("\n".join(lines))
+        image_file.write_exr(place / "sky.exr", np.full((2, 2, 3), size, np.float32))
+    mesh = 'type="obj"><string name="filename" value="m.obj"/><boolean name="face_normals" value="true"/>'
+    path = scene(BALL, mesh, CONSTANT, f'<path value="{folder}"/>{SKY}')
+    plain, found = from_mitsuba.load(path, level=0), load_scene(path).shapes()[0]
+    assert plain.meshes[0].vertices.max() == found.bbox().max.x == plain.sky.pixels.max()
 
 
 @pytest.mark.parametrize(
