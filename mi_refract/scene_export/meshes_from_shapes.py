@@ -197,7 +197,8 @@ def _scattering(bsdf: Node) -> Surface:
 def _glass(bsdf: Node) -> Glass:
     """Read a glass: a Glass if two indices describe it, otherwise a VolumeGlass."""
     sides = {"int_ior": "bk7", "ext_ior": "air"}
-    inside, outside = (read_medium(bsdf.props, name, default) for name, default in sides.items())
+    with scene_parser.folders(*bsdf.scene.parsed.folders):
+        inside, outside = (read_medium(bsdf.props, name, default) for name, default in sides.items())
     sigmas = [_sigma(bsdf, side) if bsdf.type != "dielectric" else None for side in ("int", "ext")]
     parameters = [
         f"{name} = {bsdf.props.get(name, default)}"

@@ -398,10 +398,12 @@ def test_a_file_is_the_one_that_mitsuba_finds(folder, scene, tmp_path):
         lines = [f"v 0 0 {size}", f"v {size} 0 0", f"v 0 {size} 0", "f 1 2 3"]
         (place / "m.obj").write_text("\n".join(lines))
         image_file.write_exr(place / "sky.exr", np.full((2, 2, 3), size, np.float32))
+        (place / "glass.csv").write_text(f"Wavelength (nm),n\n360,{size}\n830,{size}\n")
     mesh = 'type="obj"><string name="filename" value="m.obj"/><boolean name="face_normals" value="true"/>'
-    path = scene(BALL, mesh, CONSTANT, f'<path value="{folder}"/>{SKY}')
+    path = scene(BALL, mesh, CONSTANT, f'<path value="{folder}"/>{SKY}', "water", "file:glass.csv")
     plain, found = from_mitsuba.load(path, level=0), load_scene(path).shapes()[0]
     assert plain.meshes[0].vertices.max() == found.bbox().max.x == plain.sky.pixels.max()
+    assert plain.meshes[0].material.int_ior == pytest.approx(found.bbox().max.x)
 
 
 @pytest.mark.parametrize(
