@@ -17,6 +17,9 @@ from .segments import Array
 
 # 1 − (1 + K) c² r² counts as 0 up to this size: at the rim of a half sphere rounding of c = 1/R makes it differ from 0.
 FLAT = 8 * 2.0**-53
+# Surfaces that do not overlap at the rim may meet this close to it, in units of the radius. Where they touch, rounding
+# moves the root of a quadratic equation by about √2⁻⁵³; between two such points they overlap by the square of that.
+CLOSE = 1e-6
 
 
 def polyline(points: ArrayLike, arcs: Sequence[float] | None = None) -> Curve:
@@ -136,18 +139,19 @@ def lens(
     surface through (`vertex` + `thickness`, 0). Without a radius the lens ends where the surfaces meet.
     ValueError if a surface does not reach the rim, or the surfaces meet before it, or they never meet.
     """
+    tip, tip_radius = _tip(curvature, thickness, conic)
     if radius is None:
-        rim, radius = _tip(curvature, thickness, conic)
-        rims = [vertex + rim] * 2
+        if math.isinf(tip_radius):
+            raise ValueError(f"curvature = {list(curvature)}: the surfaces never meet; expected a radius")
+        radius, rims = tip_radius, [vertex + tip] * 2
     else:
         depths = [float(sag(radius, c, k)) for c, k in zip(curvature, conic, strict=True)]
         rims = [vertex + depths[0], vertex + thickness + depths[1]]
     if math.isnan(rims[0] + rims[1]):
         radii = (1 / (abs(c) * math.sqrt(1 + k)) for c, k in zip(curvature, conic, strict=True) if c and k > -1)
         raise ValueError(f"radius = {radius:g}: larger than a surface; expected at most {min(radii, default=0):g}")
-    if rims[1] < rims[0]:
-        largest = _tip(curvature, thickness, conic)[1]
-        text = f"the surfaces meet inside it; expected at most {largest:g}, or no radius"
+    if rims[1] < rims[0] or tip_radius < (1 - CLOSE) * radius:
+        text = f"the surfaces meet inside it; expected at most {min(tip_radius, radius):g}, or no radius"
         raise ValueError(f"radius = {radius:g}: {text}")
     front = _surface(vertex, rims[0], radius, curvature[0], conic[0])
     back = _surface(vertex + thickness, rims[1], radius, curvature[1], conic[1])
@@ -155,7 +159,7 @@ def lens(
 
 
 def _tip(curvature: Sequence[float], thickness: float, conic: Sequence[float]) -> tuple[float, float]:
-    """(z, r) of the point nearest to the axis where the surfaces meet; ValueError if they never meet.
+    """(z, r) of the point nearest to the axis where the surfaces meet; r is infinite if they never meet.
 
     The front obeys c r² = 2 z − c (1 + K) z², the back the same with z − thickness for z. Eliminating r² leaves a
     quadratic equation in z.
@@ -166,15 +170,13 @@ def _tip(curvature: Sequence[float], thickness: float, conic: Sequence[float]) -
     else:
         terms = [c1 * c2 * (k2 - k1), 2 * (c2 - c1 - c1 * c2 * k2 * t), 2 * c1 * t + c1 * c2 * k2 * t * t]
         places = [float(z.real) for z in np.roots(terms) if z.imag == 0] if np.isfinite(terms).all() else []
-    tips = []
+    tips = [(math.inf, math.nan)]
     for z in places:
         c, k, depth = (c1, k1, z) if abs(c1) >= abs(c2) else (c2, k2, z - t)
         square = 2 * depth / c - k * depth * depth if c else 0.0
         # Keep only points on the near half of both conics, which the sag describes.
         if square > 0 and 1 - c1 * k1 * z >= -FLAT and 1 - c2 * k2 * (z - t) >= -FLAT:
             tips.append((math.sqrt(square), z))
-    if not tips:
-        raise ValueError(f"curvature = {list(curvature)}: the surfaces never meet; expected a radius")
     radius, z = min(tips)
     return z, radius
 

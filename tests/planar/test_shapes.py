@@ -176,6 +176,21 @@ def test_pointed_lenses_end_where_their_surfaces_meet():
         assert off_conic(np.array([z - thickness, r]), curvature[1], conic[1]) <= 8 * ULP * r
 
 
+def test_surfaces_may_touch_at_the_rim_but_not_before():
+    """A hyperbola and a parabola have the least gap at equal slopes, where 6 = √(1 + 2 c² r²) for the hyperbola."""
+    conic = (-3, -1)
+    for c in np.linspace(0.01, 3, 200):
+        curvature, touching = (c, c / 6), math.sqrt(35 / 2) / c
+        front, back = (float(shapes.sag(touching, *surface)) for surface in zip(curvature, conic, strict=True))
+        thickness = front - back
+        while thickness + back < front:  # by rounding
+            thickness = math.nextafter(thickness, math.inf)
+        assert shapes.lens(curvature, thickness, radius=touching, conic=conic).closed
+        assert shapes.lens(curvature, thickness * 1.001, radius=2 * touching, conic=conic).closed
+        with pytest.raises(ValueError, match="the surfaces meet inside it; expected at most"):
+            shapes.lens(curvature, thickness * 0.999, radius=2 * touching, conic=conic)
+
+
 def test_a_surface_reaches_as_far_as_it_exists():
     """1/(c √(1 + K)) is rounded, so the argument of the root in the sag may be slightly below 0."""
     for c in np.linspace(0.01, 3, 200):
@@ -194,6 +209,10 @@ IMPOSSIBLE = [
     (
         lambda: shapes.lens((0.02, -0.02), 1, radius=20),
         "radius = 20: the surfaces meet inside it; expected at most 7.05",
+    ),
+    (
+        lambda: shapes.lens((0.3, 0.05), 1, radius=30, conic=(-3, -1)),  # they part again at 23.97
+        "radius = 30: the surfaces meet inside it; expected at most 3.47",
     ),
     (lambda: shapes.ellipse_lens(1.0, 4, 1.5, 1), "expected n > 1, 0 < thickness < 4"),
     (lambda: shapes.ellipse_lens(1.5, 4, 4, 1), "expected n > 1, 0 < thickness < 4"),
