@@ -68,7 +68,7 @@ def render(
         bool, typer.Option("--restart", help="Start over; ignore any checkpoint or existing image.")
     ] = False,
     preview: Annotated[
-        Path | None, typer.Option(metavar="X.png", help="Write a preview of the current image every 10 seconds.")
+        Path | None, typer.Option(metavar="X.png", help="Write a preview of the image every 10 seconds and at the end.")
     ] = None,
     allow_plugins: AllowPlugins = None,
     scheduler: Annotated[

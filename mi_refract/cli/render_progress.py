@@ -61,7 +61,7 @@ def shown(console: Console, rendering: LongRender, preview: Path | None) -> Iter
                 print(printable(f"{render.output}: {text}"), file=sys.stderr, flush=True)
             last_line = time.monotonic()
             between_lines = max(between_lines, ESTIMATE_COST * (last_line - now))
-        if preview is not None and now - last_preview >= BETWEEN_PREVIEWS:
+        if preview is not None and (render.ended_by or now - last_preview >= BETWEEN_PREVIEWS):
             last_preview = now
             write_preview(preview, render)
         warn()

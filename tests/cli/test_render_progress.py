@@ -83,8 +83,9 @@ def test_progress_lines_or_a_bar(run, monkeypatch, capsys):
     assert len(capsys.readouterr().err.splitlines()) == 3
 
 
-def test_preview_is_the_image_and_a_failure_is_a_warning(run, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(render_progress, "BETWEEN_PREVIEWS", 0.0)
+@pytest.mark.parametrize("seconds", [0.0, 1e9])
+def test_preview_is_the_image_and_a_failure_is_a_warning(run, tmp_path, monkeypatch, capsys, seconds):
+    monkeypatch.setattr(render_progress, "BETWEEN_PREVIEWS", seconds)
     render, _ = run(tmp_path / "a.png", spp=64, pass_spp=8)
     linear = np.clip(render.image(), 0, 1)
     expected = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
