@@ -18,7 +18,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from mi_refract.io.image_file import srgb_encode
+from mi_refract.io.image_file import TO_XYZ, srgb_encode
 from mi_refract.io.safe_files import write_atomically
 from mi_refract.io.text import parse_number, printable
 from mi_refract.rendering.end_conditions import RelativeError
@@ -98,7 +98,10 @@ def write_preview(path: Path, rendering: LongRender) -> None:
     if image is None:
         return
     colours = 3 if rendering.renderer.colours >= 3 else 1
-    linear = np.clip(np.nan_to_num(image[..., :colours]), 0, 1)
+    linear = np.nan_to_num(image[..., :colours], posinf=1e38, neginf=-1e38)  # the matrix may not overflow
+    if rendering.renderer.channels[:3] == ("X", "Y", "Z"):
+        linear = linear @ np.linalg.inv(TO_XYZ).T
+    linear = np.clip(linear, 0, 1)
     rgb = np.broadcast_to(np.rint(255 * srgb_encode(linear)), (*linear.shape[:2], 3)).astype(np.uint8)
     try:
         write_atomically(path, png(rgb))

@@ -20,13 +20,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_refract.io.image_file import Image, Pixels
+from mi_refract.io.image_file import TO_XYZ, Image, Pixels
 
 from .pixel_statistics import RADIUS
 
 RGB, XYZ = ("R", "G", "B"), ("X", "Y", "Z")
-# Linear sRGB to CIE XYZ, as Mitsuba converts it.
-TO_XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
 # Two films of half floats differ by at most this share by rounding, 2⁻¹¹ each, less than the margin of a comparison.
 ROUNDED = 2.0**-10
 SMALLEST = 2.0**-24  # the smallest half float, and the absolute error of half floats near 0

@@ -396,6 +396,9 @@ def installed_version(distribution: str) -> str:
 
 # Arithmetic on pixels -------------------------------------------------------------------------------------------------
 
+# Linear sRGB to CIE XYZ, as Mitsuba converts it.
+TO_XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
+
 
 def srgb_encode(linear: Pixels) -> Pixels:
     """Return the sRGB code, 0 to 1, of linear light of at least 0, elementwise (IEC 61966-2-1)."""

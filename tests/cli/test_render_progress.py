@@ -6,6 +6,7 @@ import io
 import re
 from types import SimpleNamespace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from rich.console import Console
@@ -97,11 +98,20 @@ def test_preview_is_the_image_and_a_failure_is_a_warning(run, tmp_path, monkeypa
 
 
 @pytest.mark.parametrize(
-    ("colours", "expected"),
-    [(1, [0.5, 0.5, 0.5]), (3, [0.5, 0.2, 0.8]), (4, [0.5, 0.2, 0.8])],  # Y, n.X, … or R, G, B, A or S1, S2, …
+    ("names", "colours", "expected"),
+    [
+        (["Y", "n.X", "n.Y", "n.Z"], 1, [0.5, 0.5, 0.5]),
+        ("RGBA", 3, [0.5, 0.2, 0.8]),
+        ("XYZA", 3, mi.scalar_rgb.xyz_to_srgb([0.5, 0.2, 0.8])),
+        (["S1", "S2", "S3", "S4"], 4, [0.5, 0.2, 0.8]),
+    ],
 )
-def test_a_preview_shows_the_colours_only(tmp_path, colours, expected):
-    image, renderer = np.tile([0.5, 0.2, 0.8, 1.0], (2, 3, 1)), SimpleNamespace(colours=colours)
+def test_a_preview_shows_the_colours_only(tmp_path, names, colours, expected):
+    image = np.tile([0.5, 0.2, 0.8, 1.0], (2, 3, 1))
+    image[1, 2] = np.inf
+    renderer = SimpleNamespace(colours=colours, channels=tuple(names))
     render_progress.write_preview(tmp_path / "a.png", SimpleNamespace(image=lambda: image, renderer=renderer))
-    encoded = render_progress.srgb_encode(np.array(expected))
-    np.testing.assert_allclose(read(tmp_path / "a.png").pixels[0, 0], encoded, atol=0.51 / 255)
+    encoded = render_progress.srgb_encode(np.clip(np.array(expected), 0, 1))
+    shown = read(tmp_path / "a.png").pixels
+    np.testing.assert_allclose(shown[0, 0], encoded, atol=0.51 / 255)
+    np.testing.assert_array_equal(shown[1, 2], 1)
