@@ -141,11 +141,17 @@ def test_absorption_and_a_hollow(index, ball, hollow, export):
     assert entry["thicknessFactor"] == pytest.approx(4 * volume / surface, rel=1e-5)
 
 
-def test_an_open_lamp_is_black_from_behind(export):
-    """The back is less than a pixel behind the front, but more than roundoff of float32. A closed lamp has no back."""
+def test_an_open_or_inward_lamp_is_black_from_behind(export):
+    """The back is less than a pixel behind the front, but more than roundoff of float32.
+
+    A closed lamp has a back only if it faces inward.
+    """
     shapes = f'<shape type="rectangle" id="lamp">{LAMP}</shape><shape type="cube" id="box">{LAMP}</shape>'
+    shapes += f'<shape type="cube" id="room"><boolean name="flip_normals" value="true"/>{LAMP}</shape>'
     model, _ = export(ior("ext", 1), shapes)
-    assert set(model.meshes) == {"ball", "lamp", "lamp-back", "box"}
+    assert set(model.meshes) == {"ball", "lamp", "lamp-back", "box", "room", "room-back"}
+    vertices, normals, _, material = model.meshes["room-back"]
+    assert material["emissiveFactor"] == [0, 0, 0] and ((vertices * normals).sum(1) > 1 + 100 * SINGLE).all()
     front, back = model.meshes["lamp"], model.meshes["lamp-back"]
     assert front[3]["emissiveFactor"] == [0.125, 0.25, 1]
     assert extensions(model, "lamp")["emissive_strength"] == {"emissiveStrength": 4}

@@ -45,8 +45,8 @@ ASSUMPTIONS = (
     "Indices are relative to the medium around all glass, {outside!r}, because glTF has 1 there.",
     "thicknessFactor is 4 V/S, the mean chord of a convex body. A path tracer only uses that it is not 0.",
     "A radiance of 1 is one candela per square metre in glTF, and a unit of the scene is one metre.",
-    "An open light has a black surface {offset:.3g} behind it: renderers disagree on how the back of a one-sided light "
-    "looks.",
+    "A light that is open or faces inward has a black surface {offset:.3g} behind it: renderers disagree on how the "
+    "back of a one-sided light looks.",
     "Diffuse surfaces have specularFactor = 0 and ior = 1. A renderer that ignores both gives them a glossy coat.",
     LIGHT_INSIDE,
 )
@@ -204,8 +204,8 @@ def _with_normals(mesh: Mesh) -> Mesh:
 
 
 def _back(lamp: Mesh, offset: float) -> Mesh | None:
-    """Return a black surface behind a light; None for a closed light, whose back is invisible."""
-    if is_closed(lamp.faces):
+    """Return a black surface behind a light; None for a closed light that faces outward: its back is invisible."""
+    if is_closed(lamp.faces) and lamp.volume() > 0:
         return None
     front = _with_normals(lamp)
     assert front.normals is not None
