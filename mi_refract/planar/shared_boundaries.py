@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from .curves import Curve
 from .segments import Array, Segments
 
-# Points are merged if both coordinates differ by at most this share of the largest coordinate.
+# Points are merged if both coordinates differ by at most this share of the largest coordinate, and weights likewise.
 NEAR = 2.0**-44
 
 Indices = tuple[float, ...]  # refractive index of a medium for each colour
@@ -49,7 +49,8 @@ def boundaries(parts: list[Part]) -> tuple[tuple[Segments, ...], tuple[str, ...]
         if not count:
             limit = f"{NEAR:.0e} of the largest coordinate, {np.abs(vertices).max():g}"
             raise ValueError(f"{part.where}: too small, rounding makes it a point; expected a size above {limit}")
-    places = np.stack([np.minimum(first, last), np.maximum(first, last), control_ids], axis=1)
+    _, weight_ids = _merged(weight[:, None])
+    places = np.stack([np.minimum(first, last), np.maximum(first, last), control_ids, weight_ids], axis=1)
     _, originals, place_ids = np.unique(places, axis=0, return_index=True, return_inverse=True)
     original = originals[place_ids]  # for each piece, the number of the first piece at the same place
     for j in np.flatnonzero((original != np.arange(len(owner))) & keep):

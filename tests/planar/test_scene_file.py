@@ -386,6 +386,20 @@ def test_arcs_with_the_same_ends_are_separate_and_a_repeated_corner_is_ignored(r
     assert len(read(shape.format("[[0, 0], [1, 0], [1, 1], [0, 0]]", "n = 1.5") + RAY).segments[0]) == 3
 
 
+@pytest.mark.parametrize("turn", [50, 60, 75, 85])
+def test_arcs_with_the_same_ends_and_tangents_coincide_only_with_equal_weights(read, turn):
+    """Stretched arcs of circles that turn by other angles are other arcs. Weights that differ by rounding are equal."""
+    shape = '[[shape]]\nkind = "polygon"\npoints = [[0, -1], [0, 1]]\n'
+    outer = f'{shape}arcs = [{turn}, 0]\nscale = [{1 / math.tan(math.radians(turn / 2))}, 1]\nn = 1.5\nname = "a"\n'
+    inner = f'{shape}arcs = [90, 0]\nn = 1.6\nwithin = "a"\n'
+    assert media_of(read(outer + inner + RAY)) == [(1.5, 1.0), (1.6, 1.0), (1.6, 1.5)]
+    x, y = 1 - math.cos(math.radians(turn)), math.sin(math.radians(turn))
+    lens = f'[[shape]]\nkind = "lens"\nR1 = 1\nR2 = 0\nthickness = 1\nradius = {y}\nn = 1.5\nname = "a"\n'
+    front = f'[[shape]]\nkind = "polygon"\npoints = [[{x}, {y}], [{x}, {-y}]]\narcs = [{2 * turn}, 0]\n'
+    scene = read(f'{lens}{front}n = 1.6\nwithin = "a"\n{RAY}')
+    assert media_of(scene) == [(1.5, 1.0)] * 4 + [(1.6, 1.0)] * 2 + [(1.6, 1.5)]
+
+
 # Colours ----------------------------------------------------------------------------------------------------------
 
 
