@@ -118,7 +118,7 @@ class RayBounds:
     @functools.cached_property
     def unit(self) -> Any:
         """Whether |a| is 1, up to the rounding of its components."""
-        return self.normalised or np.abs(lengths(self.rays.a) - 1) <= UNIT * self.roundoff
+        return np.abs(lengths(self.rays.a) - 1) <= UNIT * self.roundoff
 
     @property
     def side_open(self) -> Flags:

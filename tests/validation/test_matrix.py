@@ -7,6 +7,7 @@ import math
 
 import pytest
 
+from mi_refract.ray_sets.renderer_file import ImagesCommand, RaysCommand
 from mi_refract.report.row import Row
 from validation import __main__ as command
 from validation import limits
@@ -84,12 +85,15 @@ def test_other_seeds_are_no_systems_and_fail_the_checks_that_they_break():
         ([image(verdict="inconclusive"), image(case="sphere")], "yes"),
         ([image(verdict="inconclusive", differing=2.0)], "no"),
         ([ray("B")], "yes"),
+        ([ray("B"), ray("B", precision="f64", wrong=3.0), image("C", differing=2.0)], "yes"),  # of another system
         ([ray("B", wrong=3.0)], "no"),
         ([Row(rendered_images.NAME, "B", "every scene", "64²", reason="pip install it")], "not measured"),
     ],
 )
 def test_the_first_page_says_yes_of_a_users_renderer_only_if_a_check_was_conclusive(rows, state):
-    (answer,) = matrix.answers([*rows, ray("another")], [System("b", "B")])
+    own = System("b", "B", calls=(RaysCommand("B", "f32", ("b",)),), images=ImagesCommand("mitsuba", ("b",), {}))
+    others = [System("c", "C", calls=(RaysCommand("D", "f32", ("c",)),))]
+    (answer,) = matrix.answers([*rows, ray("another")], [own, *others])
     assert answer["state"] == state and answer["question"].startswith("Your renderer: B")
 
 
@@ -112,10 +116,14 @@ def test_systems_are_sorted_by_their_errors():
     rows = [stored_rays("random", 3.0, "far"), stored_rays("random", 1.0, "near"), stored_rays(LARGE, 900.0, "near")]
     rows += [stored_rays("random", 0.5, "wrong", "fail")]
     rows += [stored_rays("random", 1.0, "both"), stored_rays(LARGE, 2.0, "both")]
+    flat = stored_rays("grazing", 9.0, "flat")
+    flat["values"]["wrong"] = 3.0
+    rows.append(flat | {"replay": REPLAY | {"known to deviate": "lies flat"}})
     systems = matrix.of_rows([*rows, stored_rays("random", "inf", "none")])["rays"]
-    assert [system["system"] for system in systems] == ["both", "near", "far", "none", "wrong"]
+    assert [system["system"] for system in systems] == ["both", "near", "far", "flat", "none", "wrong"]
     sentences = {system["system"]: system["sentence"] for system in systems}
     assert sentences["far"] == "right in every set; known" and sentences["wrong"] == "wrong: random; known"
+    assert sentences["flat"] == "known to deviate: grazing (lies flat); known"
     assert sentences["near"] == f"exact only for inputs more than 8 roundings off: {LARGE} (up to 900); known"
     rows = [stored_image("A", "equal"), stored_image("B", "inconclusive"), stored_image("C", "different", "fail")]
     renderers = matrix.of_rows(rows)["images"]

@@ -26,7 +26,7 @@ from validation import __main__ as command
 from validation import limits
 from validation.run import headline
 from validation.run.context import PROFILES, Context
-from validation.suite import exports, matrix, per_ray, rendered_images
+from validation.suite import exports, matrix, per_ray, rendered_images, standard_numbers
 from validation.suite.per_ray import LARGE, TOTAL
 from validation.suite.renderers import SYSTEMS, System, environments
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
@@ -84,10 +84,10 @@ def few(monkeypatch):
 def rows_of(few, tmp_path):
     """`rows_of(before, after)`: the rows of such a program."""
 
-    def run(before="", after="", recorded=RECORDED, gives_up=0.0):
+    def run(before="", after="", recorded=RECORDED, gives_up=0.0, tir="zero"):
         path = tmp_path / "program.py"
         path.write_text(PROGRAM.format(before=before, after=after))
-        call = RaysCommand("a program", "f64", ("{python}", str(path)), "zero", gives_up, recorded=recorded)
+        call = RaysCommand("a program", "f64", ("{python}", str(path)), tir, gives_up, recorded=recorded)
         return per_ray.call_rows(System("a", "A"), call, QUICK)
 
     return run
@@ -101,6 +101,7 @@ def test_right_answers_pass_and_a_small_error_of_the_normal_fails(rows_of):
     assert [(row.case, row.verdict) for row in rows] == [(name, "pass") for name in per_ray.SETS]
     assert all(row.reason == "a program 1.0; total internal reflection: zero" for row in rows)
     assert all("worst rad" in row.values for row in rows if row.case != TOTAL)
+    assert {row.verdict for row in rows_of(tir="auto")} == {"pass"}
     rays = per_ray.all_rays("f64")
     exact = oracle.refract(rays.rays.a, rays.rays.n, rays.rays.k, fresnel=False, progress=False)
     through = {name: exact.transmitted[rays.regime == name].mean() for name in per_ray.SETS}
@@ -408,6 +409,14 @@ def test_a_system_is_installed_once_and_again_for_another_version(own_cache, mon
     assert environments.absent(second)
     environments.install(thing(npm=("a@1",)))
     assert commands[-1][:2] == ("npm", "ci") and "--ignore-scripts" in commands[-1]
+
+
+def test_an_answer_to_an_unknown_ray_is_no_measured_number(tmp_path):
+    path = tmp_path / "program.py"
+    path.write_text(PROGRAM.format(before="", after="rays.ids = (*rays.ids[1:], '99999')"))
+    call = RaysCommand("a program", "f64", ("{python}", str(path)), "zero")
+    (row,) = standard_numbers.ray_rows(System("a", "A"), call, QUICK)
+    assert row.verdict == "fail" and "an answer to the ray" in row.reason
 
 
 # `--renderer FOLDER` ----------------------------------------------------------------------------------------------

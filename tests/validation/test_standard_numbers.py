@@ -290,6 +290,19 @@ def test_the_textbook_formula_is_within_the_bounds_of_rays_and_twice_that_is_det
     assert [name for name, row in rows(share).items() if row.broken != {"error / bound": 1.0}] == []
 
 
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_a_direction_along_the_surface_is_a_signal_of_total_reflection(precision):
+    def refract(rays):
+        answers, a, n = program()(rays), rays.rays.a.astype(float), rays.rays.n.astype(float)
+        along = a - (a * n).sum(1, keepdims=True) * n
+        along = (along / np.linalg.norm(along, axis=1, keepdims=True)).astype(rays.rays.a.dtype)
+        return dataclasses.replace(answers, b=np.where(np.isnan(answers.b), along, answers.b))
+
+    call, numbers = RaysCommand("clamped", precision, ("program",)), others.of_kind("critical angle")
+    measured = others.measure(numbers, call, refract)
+    assert {others.row(x, "clamped", precision, *measured[x.name], "").verdict for x in numbers} == {"pass"}
+
+
 def boundary(precision, share=0.0):
     """Fresnel's equations as a program that returns reflectances; the denser index has the relative error `share`."""
     real = np.float32 if precision == "f32" else np.float64

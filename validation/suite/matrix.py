@@ -169,8 +169,13 @@ def of_rows(rows: Iterable[Stored]) -> Stored:
 
 def answers(rows: Iterable[Row], own_renderers: Iterable[System]) -> list[Answer]:
     """Return the results of the renderers given with --renderer, for the first page: by function, and for images."""
-    titles = {title for system in own_renderers for title in (system.title, *(call.title for call in system.calls))}
-    results = of_rows(row.as_dict() for row in rows if row.study in CHECKS and row.subject in titles)
+    own = {(per_ray.NAME, call.title, call.precision) for system in own_renderers for call in system.calls}
+    own |= {(rendered_images.NAME, system.title, "") for system in own_renderers if system.images}
+
+    def key(row: Row) -> tuple[str, str, str]:
+        return row.study, row.subject, row.setting if row.study == per_ray.NAME else ""
+
+    results = of_rows(row.as_dict() for row in rows if key(row) in own)
     made: list[Answer] = []
     for kind in ("rays", "images", "not_run"):
         for result in results[kind]:
@@ -185,17 +190,21 @@ def answers(rows: Iterable[Row], own_renderers: Iterable[System]) -> list[Answer
 
 def _of_rays(cells: list[Stored]) -> Stored:
     """Return a sentence on the errors of a function of refraction, and its numbers by set."""
-    sets = {}
+    sets, deviations = {}, []
     for cell in cells:
         backward, worst = cell["values"].get(BACKWARD), cell["values"].get(WORST_ANGLE)
         right = isinstance(backward, (int, float)) and backward <= RIGHT
         verdict = "wrong" if cell["verdict"] == "fail" else "right" if right else "within bound"
+        if verdict != "wrong" and cell["values"].get("wrong"):
+            verdict = "deviates"
+            deviations.append(f"{cell['case']} ({cell['replay'].get('known to deviate', '')})")
         sets[cell["case"]] = {"verdict": verdict, "backward_error": backward, "worst_angle": worst}
     remarks = {name: cells[0]["replay"].get(name, "") for name in ("version", "total internal reflection", "remark")}
     wrong = [name for name, x in sets.items() if x["verdict"] == "wrong"]
     within = {name: x["backward_error"] for name, x in sets.items() if x["verdict"] == "within bound"}
     off = [f"{name} (up to {compact(m) if isinstance(m, (int, float)) else m or '–'})" for name, m in within.items()]
     parts = [f"wrong: {', '.join(wrong)}"] if wrong else []
+    parts += [f"known to deviate: {', '.join(deviations)}"] if deviations else []
     if not sets.keys() & per_ray.SETS:
         parts = [f"no answers: {cells[0]['reason']}"]
     parts += [f"exact only for inputs more than {RIGHT:g} roundings off: {', '.join(off)}"] if off else []

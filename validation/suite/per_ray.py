@@ -194,7 +194,7 @@ def rows(call: RaysCommand, rays: RaySet, answers: Answers) -> list[Row]:
                 BACKWARD: float(np.maximum(errors.backward_worst, errors.backward_length)),
             }
             budgets[ERROR_OVER_BOUND], goals[BACKWARD] = 1.0, RIGHT
-            if name == TOTAL:
+            if name == TOTAL and call.tir != "auto":
                 values[OTHER_SIGNAL], budgets[OTHER_SIGNAL] = float(findings.tir != call.tir), 0.0
             if recorded := call.recorded_range(name):
                 values |= {RECORDED: recorded[1], OFF_RECORDED: off_recorded(errors.worst, *recorded)}
@@ -202,7 +202,7 @@ def rows(call: RaysCommand, rays: RaySet, answers: Answers) -> list[Row]:
             if name in call.deviations:
                 values["not seen to deviate"] = float(errors.wrong == 0)
                 budgets = {"unfit": 0.0, "not seen to deviate": 0.0}
-        deviates = f"; known to deviate: {call.deviations[name]}" if name in call.deviations else ""
+        deviation = call.deviations.get(name, "")
         if call.gives_up:
             values["given up"] = float(left_out[rays.regime == name].sum())
         replay = {
@@ -213,7 +213,9 @@ def rows(call: RaysCommand, rays: RaySet, answers: Answers) -> list[Row]:
             "version": version,
             "total internal reflection": findings.tir,
             "remark": call.remark,
+            "known to deviate": deviation,
         }
+        deviates = f"; known to deviate: {deviation}" if deviation else ""
         made.append(Row(NAME, call.title, name, call.precision, values, budgets, goals, remark + deviates, replay))
     return made
 

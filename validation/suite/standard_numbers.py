@@ -36,6 +36,7 @@ from mi_refract.ray_sets.files import as_csv, parse_answers
 from mi_refract.ray_sets.header import PRECISIONS
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.ray_sets.renderer_file import RaysCommand
+from mi_refract.ray_sets.tir_signal import ALONG
 from mi_refract.report.row import Row
 from mi_refract.scene_export.plain_scene import Camera, Glass, Light, Mesh, PlainScene
 from validation import limits
@@ -143,7 +144,7 @@ def ray_rows(system: System, call: RaysCommand, context: Context) -> list[Row]:
     versions: list[str] = []
 
     def refract(rays: RaySet) -> Answers:
-        answers = parse_answers(environments.ask(system, call.command, as_csv(rays)), call.title)
+        answers = _known(parse_answers(environments.ask(system, call.command, as_csv(rays)), call.title), rays)
         versions.append(str(answers.header.get("system", "")))
         return answers
 
@@ -153,6 +154,13 @@ def ray_rows(system: System, call: RaysCommand, context: Context) -> list[Row]:
     if measured is None:
         return no_answer
     return [row(x, call.title, call.precision, *measured[x.name], versions[0]) for x in numbers]
+
+
+def _known(answers: Answers, rays: RaySet) -> Answers:
+    """Return the answers. ValueError if one is to no ray of the set."""
+    if (unknown := answers.ids[~np.isin(answers.ids, rays.ids)]).size:
+        raise ValueError(f"an answer to the ray {unknown[0]}; expected rays from {rays.ids[0]} to {rays.ids[-1]}")
+    return answers
 
 
 def measure(numbers: Sequence[StandardNumber], call: RaysCommand, refract: Refract) -> dict[str, tuple[float, float]]:
@@ -258,7 +266,9 @@ def critical_angles(
     answers = refract(as_ray_set(rays, call.precision))
     passed = np.zeros(len(angle), bool)
     length = np.linalg.norm(answers.b, axis=1)
-    through = (answers.b * -rays.n[answers.ids]).sum(1) > 0
+    # Less is along the surface, which signals total reflection. The nearest ray of the grid has cos θ_t ≈ √(8 u).
+    along = ALONG * roundoff * np.maximum(1, k[answers.ids])
+    through = (answers.b * -rays.n[answers.ids]).sum(1) > along
     passed[answers.ids] = through & (length > 0.5) & (True if answers.transmitted is None else answers.transmitted)
     measured = {}
     for number, transmitted in zip(numbers, np.split(passed, len(numbers)), strict=True):
@@ -393,7 +403,7 @@ def glass_rows(system: System, catalogue: GlassCatalogue, context: Context) -> l
 
     def answer() -> Answers:
         text = environments.run(environments.script(system, catalogue.script, "glasses"), as_csv(rays))
-        return parse_answers(text, system.title)
+        return _known(parse_answers(text, system.title), rays)
 
     lost, reason = ("unanswered", float(len(numbers))), environments.why_not(system, context.profile.name)
     answers, no_answer = environments.attempt(no_row, reason, lost, answer)
