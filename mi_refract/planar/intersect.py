@@ -42,13 +42,19 @@ def cross(a: Vector2, b: Vector2) -> Number:
     return dr.fma(a.x, b.y, -(a.y * b.x))
 
 
+def norm_1(v: Vector2) -> Number:
+    """|v.x| + |v.y|."""
+    return dr.abs(v.x) + dr.abs(v.y)
+
+
 @dataclass
 class Ray:
     """A ray from `p` along the unit vector `d`.
 
     own: the segment that it starts on, at start + r (end − start) with r = 1 − s; NOWHERE if it starts on none.
     left: whether it leaves to the left of that segment.
-    slack: a boundary up to this distance from `p` is not ahead; 0 for a ray that starts on a segment.
+    rounding: a boundary that is closer to `p` than this share of the coordinates, and of the vectors from `p` to the
+    boundary's ends, is not ahead; 0 for a ray that starts on a segment.
     """
 
     p: Vector2
@@ -57,7 +63,7 @@ class Ray:
     s: Number
     r: Number
     left: Mask
-    slack: Number
+    rounding: Number
 
 
 @dataclass
@@ -137,7 +143,7 @@ class LineSegments:
         (s, r), e = self._shares(ray), b - a
         own = type(vertices)(*(dr.select(ray.own != NOWHERE, v, NOWHERE) for v in vertices))
         # f of both ends: if the ray leaves to the left, the segment starts on its left and ends on its right.
-        size = dr.maximum(dr.abs(cross(ray.d, e)), SIGN * (dr.abs(e.x) + dr.abs(e.y)))
+        size = dr.maximum(dr.abs(cross(ray.d, e)), SIGN * norm_1(e))
         size = dr.select(ray.left, size, -size)
         return Start(own, (-e * r, e * s), (size * r, -size * s))
 
@@ -185,8 +191,12 @@ class LineSegments:
         # The crossing lies between the ends: it is ahead if both ends are, and behind if both are. This decides for a
         # ray along the segment, where the sign of `reach` is noise.
         t_a, t_b = dr.dot(to_a, ray.d), dr.dot(to_b, ray.d)
-        beyond = (dr.maximum(t_a, t_b) > 0) & (reach > ray.slack * (dr.abs(e.x) + dr.abs(e.y)))
-        ahead = (a_left != b_left) & ((dr.minimum(t_a, t_b) > ray.slack) | beyond) & (i != ray.own)
+        # The rounding of `reach` is below 4u times its two products. So a start a little above a long level segment is
+        # not on it.
+        noise = ray.rounding * (norm_1(ray.p) * norm_1(e) + dr.abs(to_end.x * e.y) + dr.abs(to_end.y * e.x))
+        beyond = (dr.maximum(t_a, t_b) > 0) & (reach > noise)
+        after = dr.minimum(t_a, t_b) > ray.rounding * (norm_1(ray.p) + norm_1(to_end))
+        ahead = (a_left != b_left) & (after | beyond) & (i != ray.own)
         near = ieee_divide(dr.minimum(dr.abs(f_a), dr.abs(f_b)), scale)
         s, r = (dr.select(0.5 * scale > dr.abs(f), near, 1 - near) for f in (f_b, f_a))
         distance = dr.dot(dr.fma(e, r, to_a), ray.d)  # λ; reach/scale is noise at grazing incidence
@@ -243,7 +253,7 @@ class ConicArcs(LineSegments):
         If the ends are on different sides of a ray that leaves to the left, the arc starts on the left. If rounding
         contradicts that, the sign of the smaller value is changed.
         """
-        sizes = [dr.maximum(dr.abs(cross(ray.d, v)), SIGN * (dr.abs(v.x) + dr.abs(v.y))) for v in chords]
+        sizes = [dr.maximum(dr.abs(cross(ray.d, v)), SIGN * norm_1(v)) for v in chords]
         a_left, b_left = (cross(ray.d, v) <= 0 for v in chords)
         wrong = (a_left != b_left) & (a_left != ray.left)
         smaller = sizes[0] < sizes[1]
@@ -300,7 +310,7 @@ class ConicArcs(LineSegments):
         left, vector = at_shared(tuple(lefts)), at_shared(start.vectors)
         outward, bend = at_shared(start.outward), at_shared(start.bends)
         own, other = dr.select(left, outward, -outward), dr.select(left, hit.along, hit.into)
-        near = dr.abs(hit.distance) <= 64 * self.arrays.roundoff * (dr.abs(vector.x) + dr.abs(vector.y))
+        near = dr.abs(hit.distance) <= 64 * self.arrays.roundoff * norm_1(vector)
         near &= (shared[0] | shared[1]) & (dr.dot(own, other) > 0) & ((bend != 0) | (hit.bend != 0))
         behind = self._turned(other, own, (hit.bend, dr.select(left, bend, -bend)), dr.select(left, -1, 1))
         return dr.select(near, negated(behind), ahead)
@@ -313,10 +323,11 @@ class ConicArcs(LineSegments):
         size = s + r
         s, r = ieee_divide(s, size), ieee_divide(r, size)
         to_a, to_c, to_b = vectors
-        vector = (to_a * (s * s) + to_c * (2 * w * s * r) + to_b * (r * r)) * dr.rcp(_total(w, s, r))
+        vector = _mean(to_a, to_c, to_b, w, s, r)
         e = _tangent(to_a, to_c, to_b, w, s, r)
         distance = dr.dot(vector, ray.d)
-        ahead = distance * dr.abs(cross(ray.d, e)) > ray.slack * (dr.abs(e.x) + dr.abs(e.y))
+        noise = ray.rounding * (norm_1(ray.p) + _mean(norm_1(to_a), norm_1(to_c), norm_1(to_b), w, s, r))
+        ahead = distance * dr.abs(cross(ray.d, e)) > noise * norm_1(e)
         return Hit(distance, i, s, r, to_left, *ends), ahead & (distance > 0)
 
     def _before(self, hit: Hit, best: Hit) -> Mask:
@@ -355,6 +366,11 @@ class ConicArcs(LineSegments):
 def _total(w: Number, s: Number, r: Number) -> Number:
     """s² + 2 w s r + r²."""
     return dr.fma(2 * w * s, r, dr.fma(s, s, r * r))
+
+
+def _mean(a: Any, c: Any, b: Any, w: Number, s: Number, r: Number) -> Any:
+    """The place on the arc, or the mean of other values with the same weights."""
+    return (a * (s * s) + c * (2 * w * s * r) + b * (r * r)) * dr.rcp(_total(w, s, r))
 
 
 def _chord(a: Vector2, c: Vector2, b: Vector2, w: Number, s: Number, r: Number) -> Vector2:

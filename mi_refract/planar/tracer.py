@@ -212,9 +212,8 @@ class Tracer:
         a, b = (low - p) * inverse, (high - p) * inverse
         enter, leave = dr.max(dr.minimum(a, b)), dr.min(dr.maximum(a, b))
         p = dr.select((enter > 0) & (enter < leave), dr.fma(d, enter, p), p)
-        slack = 4 * arrays.roundoff * (dr.abs(p.x) + dr.abs(p.y))
-        half = arrays.number(0.5)
-        ray = Ray(p, d, arrays.index(NOWHERE), half, half, arrays.mask(False), slack)
+        half, rounding = arrays.number(0.5), arrays.number(4 * arrays.roundoff)
+        ray = Ray(p, d, arrays.index(NOWHERE), half, half, arrays.mask(False), rounding)
         return PathState(ray, index, arrays.vector(1, 1), arrays.index(0), self._new_search(-BACK), arrays.mask(True))
 
     def _new_search(self, distance: float) -> SearchState:

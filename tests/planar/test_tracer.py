@@ -168,6 +168,28 @@ def test_a_ray_does_not_meet_the_segment_that_it_starts_on(follow):
     assert (outward.events[:, 0] == ESCAPED).all()
 
 
+@pytest.mark.parametrize("weight", [None, 0.5, 1.0, 2.0])
+def test_a_ray_does_not_meet_the_boundary_that_it_starts_on_at_the_coordinate_origin(follow, weight):
+    """There only the ends of the boundary are rounded; each boundary goes exactly through (0, 0)."""
+    ends, angle = np.random.default_rng(1).integers(-127, 128, (2, 20, 2)) / 128, np.linspace(-1, 1, 21)
+    for a, b in ends.swapaxes(0, 1):
+        if weight is None:
+            a /= 3  # a rounded number
+            boundary, along = Segments([-a], [a], [1.5], [1.0]), np.array([-a[1], a[0]]) / np.hypot(*a)
+            turned = np.column_stack([np.cos(angle), np.sin(angle)])
+            directions = turned @ np.array([along, (-along[1], along[0])])
+            directions = np.concatenate([directions, -directions])
+        else:  # no other place of the arc is on a line along a + b
+            boundary = Segments([a], [b], [1.5], [1.0], [-(a + b) / (2 * weight)], [weight])
+            directions = np.array([a + b, -a - b])
+        assert (follow(boundary, np.zeros_like(directions), directions).events[:, 0] == ESCAPED).all()
+
+
+def test_a_ray_meets_a_long_level_boundary_that_it_starts_close_to(follow):
+    ground = Segments([(-1000, 0)], [(1000, 0)], [1.0], [1.5])
+    assert story(follow(ground, (0, 1e-5), (0.5, -1)))[1] == [REFRACTED, ESCAPED]
+
+
 def test_a_ray_through_a_junction_crosses_its_boundaries_in_order(follow):
     angle = np.linspace(0, 2 * np.pi, 41)[:-1] + 0.05
     origins = 2 * np.column_stack([np.cos(angle), np.sin(angle)])
