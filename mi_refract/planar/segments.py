@@ -57,7 +57,7 @@ class Segments:
     weight: Array = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        """Convert all fields to float64 and check them."""
+        """Copy all fields to float64 arrays and check them."""
         if not len(self.start):
             raise ValueError("segments: none; expected at least one")
         if (self.control is None) != (self.weight is None):
@@ -67,7 +67,7 @@ class Segments:
             values = getattr(self, name)
             if values is None:
                 values = (self.start + self.end) / 2 if name == "control" else np.ones(shape)
-            values = finite_array(f"segments.{name}", values, shape)
+            values = finite_array(f"segments.{name}", values, shape).copy()
             object.__setattr__(self, name, values)
             if len(shape) == 1 and not (values > 0).all():
                 i = int(np.argmin(values > 0))

@@ -398,6 +398,15 @@ def test_arcs_may_share_their_ends():
         assert len(Segments(**TWICE, control=control, weight=weight)) == 2
 
 
+def test_segments_do_not_change_with_the_arrays_that_they_were_made_from():
+    arrays = {key: np.array(x) for key, x in (GOOD | {"control": [(0.5, 0.25)], "weight": [0.5]}).items()}
+    segments = Segments(**arrays)
+    kept = {key: x.copy() for key, x in vars(segments).items() if key in arrays}
+    for x in arrays.values():
+        x += 1.0
+    assert all(np.array_equal(getattr(segments, key), x) for key, x in kept.items())
+
+
 def test_float32_has_its_own_range(needs_variant):
     needs_variant("llvm_ad_rgb")
     bad = [({"end": [(1e16, 0.0)]}, -1.0, r"segments.end: 1e\+16; expected up to ±1e\+15")]
