@@ -49,7 +49,7 @@ class Light:
         ValueError for another count of numbers, as for `media.parse`, and for a wavelength out of the material's range.
         """
         if not isinstance(spec, str):
-            numbers = tuple(np.ravel(spec).tolist())
+            numbers = tuple(media.parse(n, where).coefficients["n"] for n in np.ravel(spec).tolist())
             if only_one and len(numbers) > 1:
                 text = f"{len(numbers)} numbers, for the wavelengths of the file"
                 raise ValueError(f"{where}: {text}; expected 1, or a material, for other wavelengths")

@@ -163,6 +163,7 @@ BAD = [  # replaced text, replacement, part of the error
     ('title = "A disc"', 'title = " "', "title: expected text that is not blank"),
     ('name = "disc"', 'name = ""', "shape[0].name: expected text that is not blank"),
     ("view = ", 'light = "D65"\nview = ', "light: 'D65' without wavelengths; expected"),
+    ("n = 1.3", "n = 517642", "shape[2].n = 517642.0; expected an index; the code of a glass is a text: '517642'"),
     ("n = 1.3", "n = [1, 2, 3]", "shape[2].n: 3 numbers; expected 1, or one for each of 2"),
     ('colours = ["red", "blue"]', "", "index: 2 numbers; expected 1, or one for each of 1"),
     ('["red", "blue"]', "[]", "colours: expected a list [ … ] of length >= 1"),
