@@ -17,6 +17,9 @@ from .segments import Array
 VISIBLE = 380.0, 730.0  # nm: the range of a given number of wavelengths
 SHORTEST, LONGEST = 100.0, 100_000.0  # nm
 MOST = 256  # wavelengths
+# Wavelengths can be white together if the least channel of their sum is above this share of the largest one. To balance
+# more would change their hues: 450 and 550 nm would need 90 times their red. For the lines F, d and C it is 0.2.
+BALANCED = 1 / 8
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,8 @@ def parsed(text: str) -> list[float] | int:
 def linear_srgb(light: Light) -> Array:
     """The colour that the eye sees for each wavelength (C × 3, linear sRGB; negative if a screen cannot show it).
 
-    All of them together are (1, 1, 1): white. ValueError if none is visible.
+    All of them together are (1, 1, 1), white, if they are near it; otherwise, the largest channel of their sum is 1.
+    ValueError if none is visible.
     """
     import mitsuba as mi
 
@@ -124,4 +128,6 @@ def linear_srgb(light: Light) -> Array:
         raise ValueError(
             f"wavelengths: none of {', '.join(light.names[:3])} is visible; expected some from 360 to 830 nm"
         )
-    return rgb / np.where(total > 0, total, np.abs(total).max() or 1)
+    largest = total.max()
+    rgb /= total if total.min() > BALANCED * largest else largest
+    return rgb

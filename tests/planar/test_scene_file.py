@@ -452,13 +452,24 @@ def test_invisible_wavelengths_are_an_error():
 
 
 @pytest.mark.parametrize("power", ["flat", "D65"])
-def test_colours_are_those_of_the_standard_observer(power):
-    """CIE 1931 x̄, ȳ, z̄ at 450, 550 and 600 nm; XYZ to linear sRGB of IEC 61966-2-1; the sum is white."""
-    xyz = np.array([(0.3362, 0.038, 1.77211), (0.43345, 0.99495, 0.00875), (1.0622, 0.631, 0.0008)])
+@pytest.mark.parametrize(
+    ("wavelengths", "white"),
+    [([450, 550, 600], True), ([450], False), ([590], False), ([450, 460], False), ([450, 550], False)],
+)
+def test_colours_are_those_of_the_standard_observer(wavelengths, white, power):
+    """CIE 1931 x̄, ȳ, z̄; XYZ to linear sRGB of IEC 61966-2-1; the sum is white, or keeps its hue."""
+    xyz = {450: (0.3362, 0.038, 1.77211), 460: (0.2908, 0.06, 1.6692), 550: (0.43345, 0.99495, 0.00875)}
+    xyz |= {590: (1.0263, 0.757, 0.0011), 600: (1.0622, 0.631, 0.0008)}
     to_rgb = [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
-    colours = of_wavelengths([450.0, 550.0, 600.0], power)
-    expected = xyz @ np.transpose(to_rgb) * np.array(colours.powers)[:, None]
-    assert light.linear_srgb(colours) == pytest.approx(expected / expected.sum(0), rel=0.01, abs=0.01)
+    colours = of_wavelengths([float(w) for w in wavelengths], power)
+    expected = np.array([xyz[w] for w in wavelengths]) @ np.transpose(to_rgb) * np.array(colours.powers)[:, None]
+    total = expected.sum(0)
+    assert light.linear_srgb(colours) == pytest.approx(expected / (total if white else total.max()), rel=0.01, abs=0.01)
+
+
+def test_the_lines_of_an_achromat_are_white_together():
+    lines = of_wavelengths([media.LINES[line] for line in "FdC"])
+    assert light.linear_srgb(lines).sum(0) == pytest.approx(1)
 
 
 def test_daylight_has_the_powers_of_cie():
