@@ -210,7 +210,8 @@ def _draw_rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
     from matplotlib.colors import to_rgb
 
     if scene.light.wavelengths:  # light adds up, while lines would cover each other
-        _draw_density(panel, lines, {SHARED: np.ones(3)} | dict(enumerate(linear_srgb(scene.light))), light=True)
+        rgb = linear_srgb(scene.light)
+        _draw_density(panel, lines, {SHARED: rgb.sum(axis=0)} | dict(enumerate(rgb)), light=True)
         return
     colours = {}
     for number, name in [(SHARED, WHITE), *enumerate(scene.light.names)]:

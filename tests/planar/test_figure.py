@@ -14,9 +14,10 @@ from matplotlib.colors import to_rgb
 from matplotlib.image import AxesImage
 from support.planar_scenes import SLAB, ball, beam, polygon, scene
 
+from mi_refract.io.image_file import srgb_encode
 from mi_refract.planar import Event, focal_points
 from mi_refract.planar import figure as drawing
-from mi_refract.planar.light import Light
+from mi_refract.planar.light import Light, linear_srgb, of_wavelengths
 from mi_refract.planar.path_tree import follow_scene
 
 VIEW = (-2.0, 2.0, -1.5, 1.5)
@@ -222,6 +223,19 @@ def test_rays_that_do_not_converge_have_no_focus():
         scene(GLASS, beam(4, 1.0), crossing),
     ):
         assert not len(focal_points.foci(unfocused, follow_scene(unfocused)))
+
+
+@pytest.mark.parametrize("wavelengths", [[640.0, 660.0], [450.0, 460.0], [450.0, 550.0, 610.0]])
+def test_legs_that_all_wavelengths_share_have_the_colour_of_their_sum(drawn, wavelengths):
+    light = of_wavelengths(wavelengths)
+    glasses = tuple(ball(1.5 - 0.01 * i) for i in range(len(light)))
+    figure = drawn(scene(glasses, beam(20, 0.3), (1, 0), light=light, view=(-3, 3, -2, 2)))
+    (image,) = figure.axes[0].findobj(AxesImage)
+    pixels = np.asarray(image.get_array())
+    before = pixels[:, : pixels.shape[1] // 4]
+    red, green, blue = before[before[..., 3] > 0][0, :3] / 255
+    expected = np.clip(linear_srgb(light).sum(0), 0, None)
+    assert srgb_encode(expected / expected.max()) == pytest.approx([red, green, blue], abs=1 / 255)
 
 
 def test_density_is_the_length_of_the_line_in_each_pixel():
