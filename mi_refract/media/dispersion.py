@@ -216,7 +216,8 @@ class Medium:
         """n at a wavelength.
 
         `wavelength`: in nm; a float, a numpy array of any shape, or a Dr.Jit array; the result has its shape.
-        `coefficients`: values that replace some of the medium's own, for derivatives; ValueError for other names.
+        `coefficients`: values that replace some of the medium's own, for derivatives; ValueError for other names. With
+        a Dr.Jit array among them the result is one, and a numpy array of wavelengths has at most one dimension.
         Outside `valid` without `hold`, or if n is not a positive number: NaN for Dr.Jit arrays, ValueError for floats
         and numpy arrays. For these there is a warning outside `fitted`, and outside `valid` with `hold`.
         """
@@ -242,9 +243,10 @@ class Medium:
 
     def index_or_nan(self, wavelength: Number, coefficients: Coefficients | None = None) -> Number:
         """As `index`, with NaN for every type where there is no index."""
-        compiled = dr.is_array_v(wavelength)
-        if compiled:
-            wide: Any = dr.float64_array_t(type(wavelength))
+        values = {**self.coefficients, **(coefficients or {})}
+        compiled = [type(x) for x in (wavelength, *values.values()) if dr.is_array_v(x)]
+        if compiled:  # also for coefficients alone: numpy's operators would lose their derivatives
+            wide: Any = dr.float64_array_t(compiled[0])
             x = wide(wavelength)
         else:
             import numpy as np
@@ -254,10 +256,9 @@ class Medium:
         if self.hold:
             x = dr.clip(x, *self.valid) if compiled else np.clip(x, *self.valid)
         valid &= (x >= self.valid[0]) & (x <= self.valid[1])
-        values = {**self.coefficients, **(coefficients or {})}
         if unknown := values.keys() - self.coefficients.keys() - {TABLE_VALUES}:
             known = ", ".join([*self.coefficients][:12])
             raise ValueError(f"{self.name}: unknown coefficient {min(unknown)}; expected {known}")
         n = self.dispersion.index(where(valid, x, math.nan), values)
         n = where((n > 0) & (n < math.inf), n, math.nan)
-        return n if compiled or dr.is_array_v(n) or n.ndim else float(n)
+        return n if compiled or n.ndim else float(n)

@@ -91,6 +91,19 @@ def test_drjit_differentiates_in_the_wavelength_and_the_coefficients(spec, vecto
             assert dr.grad(c[name])[0] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-5, abs=1e-10), name
 
 
+def test_coefficients_of_drjit_are_differentiated_at_wavelengths_of_numpy(spec, vectorised):
+    glass = medium(spec)
+    wide = dr.float64_array_t(dr.diff_array_t(dr.value_t(vectorised.vector)))
+    for at in (450.0, np.array([450.0, 620.0])):
+        c = {name: wide(value) for name, value in glass.coefficients.items()}
+        dr.enable_grad(*c.values())
+        dr.backward(dr.sum(glass.index(at, c)))
+        for name, value in glass.coefficients.items():
+            step = 1e-5 * abs(value)
+            ends = [np.sum(glass.index(at, {name: value + sign * step})) for sign in (1, -1)]
+            assert dr.grad(c[name])[0] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-5, abs=1e-10), name
+
+
 def test_a_coefficient_of_another_name_is_an_error(vectorised):
     for wavelength in (500.0, np.array([500.0]), dr.value_t(vectorised.vector)(500)):
         with pytest.raises(ValueError, match=r"cauchy.*: unknown coefficient b; expected A, B"):
