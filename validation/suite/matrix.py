@@ -169,8 +169,8 @@ def of_rows(rows: Iterable[Stored]) -> Stored:
 
 def answers(rows: Iterable[Row], own_renderers: Iterable[System]) -> list[Answer]:
     """Return the results of the renderers given with --renderer, for the first page: by function, and for images."""
-    own = {(per_ray.NAME, call.title, call.precision) for system in own_renderers for call in system.calls}
-    own |= {(rendered_images.NAME, system.title, "") for system in own_renderers if system.images}
+    own = {(rendered_images.NAME, system.title, "") for system in own_renderers if system.images}
+    own |= {(per_ray.NAME, call.title, str(call.precision)) for system in own_renderers for call in system.calls}
 
     def key(row: Row) -> tuple[str, str, str]:
         return row.study, row.subject, row.setting if row.study == per_ray.NAME else ""
