@@ -460,21 +460,23 @@ class TileTests:
         return float(-np.expm1(self.p.size * np.log1p(-min(self.p.min(), 1 - 1e-16)))) if self.p.size else 1.0
 
     def minimum_detectable(self, level: int = 0) -> float:
-        """Return the smallest relative difference detected in the median tile of a level; NaN if no tile has noise."""
-        detectable = self.levels[level].detectable(self.threshold)
-        return float(np.nanmedian(detectable)) if np.isfinite(detectable).any() else np.nan
+        """Return the smallest relative difference detected in the median tile of a level, in the worst channel.
+
+        NaN if no tile has light and noise.
+        """
+        return max(_known_medians(self.levels[level].detectable(self.threshold)), default=np.nan)
 
     def hidden_share(self, resolution: float) -> float:
-        """Return the share of lit tiles whose noise hides a difference of `resolution`, in the worst channel."""
+        """Return the share of the lit tiles whose noise hides a difference of `resolution`, of the worst channel."""
         finest = self.levels[0]
-        hidden = (finest.detectable(self.threshold) > resolution).sum((0, 1)).max()
-        return float(hidden / max(finest.lit.any(-1).sum(), 1))
+        hidden = (finest.detectable(self.threshold) > resolution).sum((0, 1))
+        return float((hidden / np.maximum(finest.lit.sum((0, 1)), 1)).max())
 
     def quieter(self, resolution: float, hidden: float) -> float:
-        """Return the factor on the noise's variance at which `resolution` is detected in the median and most tiles.
+        """Return the factor on the noise's variance at which every channel's median and most tiles show `resolution`.
 
-        `hidden`: the share of tiles in which it may be missed. The factor is at most 1; NaN without light or noise; 0
-        if the difference is not detected even without noise.
+        `hidden`: the share of a channel's lit tiles in which it may be missed. The factor is at most 1; NaN without
+        light or noise; 0 if the difference is not detected even without noise.
         """
         finest = self.levels[0]
         excess = np.maximum(resolution * finest.mean - finest.allowed, 0)
@@ -484,10 +486,16 @@ class TileTests:
                 reach = replace(finest, freedom=finest.freedom / factor).reach(self.threshold)
                 factor = np.sqrt(factor * np.minimum(np.square(excess / reach), 1))
         factors = np.sort(factor.reshape(-1, finest.mean.shape[-1]), 0)  # NaN, of tiles without light, is last
-        allowed = int(hidden * max(finest.lit.any(-1).sum(), 1))
-        if not np.isfinite(factors).any():
-            return np.nan
-        return float(np.nanmin([1.0, np.nanmedian(factors), *factors[min(allowed, len(factors) - 1)]]))
+        allowed = np.minimum(hidden * finest.lit.sum((0, 1)), len(factors) - 1).astype(int)
+        of_most = np.take_along_axis(factors, allowed[None], 0).ravel()
+        medians = _known_medians(factors)
+        return float(np.nanmin([1.0, *medians, *of_most])) if medians else np.nan
+
+
+def _known_medians(values: Array) -> list[float]:
+    """Return the median of each channel of … × C values, without NaN; no median of a channel of NaN only."""
+    channels = values.reshape(-1, values.shape[-1]).T
+    return [float(np.nanmedian(x)) for x in channels if not np.isnan(x).all()]
 
 
 # Stacks of renders ---------------------------------------------------------------------------------------------

@@ -43,7 +43,7 @@ def compare_renders(
     ] = 0.05,
     hidden: Annotated[
         float,
-        "share of the tiles, in any channel, whose noise may hide such a difference",
+        "share of the tiles with light, of any one channel, whose noise may hide such a difference",
         Range(lambda x: 0 <= x <= 1, "0 to 1"),
     ] = 0.1,
     pixels: Annotated[

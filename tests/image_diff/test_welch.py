@@ -470,6 +470,31 @@ def test_the_share_of_noisy_tiles_is_reported_if_the_median_tile_is_quiet(size, 
     assert share or "of the tiles" not in result.reason
 
 
+@pytest.mark.parametrize(("deviation", "verdict"), [(6.0, INCONCLUSIVE), (0.005, EQUAL)])
+def test_other_channels_do_not_change_how_much_noise_hides(deviation, verdict, rng):
+    """The light of Y is in 4 of 64 tiles; the channels beside it are lit everywhere and quiet, plain, or black."""
+
+    def side(quiet):
+        pixels = np.zeros((4, 64, 64, 4))
+        pixels[:, :16, :16, :1] = skewed(rng, (4, 16, 16, 1), deviation)
+        pixels[..., 1:3] = skewed(rng, (4, 64, 64, 2), 0.005) if quiet else 1.0
+        return [of(x, ("Y", "albedo.X", "albedo.Y", "alpha.Y")) for x in pixels]
+
+    def measured(images):
+        result = welch(*images, tile=8)
+        share = metric(result, "share of the tiles whose noise hides a difference of 0.05")
+        samples = re.search(r"about ([0-9,]+) renders", result.reason)
+        return result.verdict, share, result.minimum_detectable, samples and float(samples[1].replace(",", ""))
+
+    for quiet in (True, False):
+        sides = [side(quiet) for _ in "ab"]
+        beside = measured(sides)
+        alone = measured([[of(x.pixels[..., :1], ("Y",)) for x in images] for images in sides])
+        assert beside[:2] == alone[:2] == (verdict, float(verdict is INCONCLUSIVE))
+        assert beside[2] == pytest.approx(alone[2], rel=0.3)  # there are more tests
+        assert beside[3] == (pytest.approx(alone[3], rel=0.5) if alone[3] else None)
+
+
 def test_a_tile_with_the_noise_of_one_pixel_is_flagged(rng):
     sides = [renders(rng, 8, deviation=0.0) for _ in range(2)]
     for image in itertools.chain(*sides):
