@@ -227,10 +227,9 @@ def _compare(
         if reason := preconditions(a, b, allow_nonfinite):
             result = nonfinite_result(method, reason, *aligned(a, b))
         else:
-            a, b = _finite_pair(a, b)
-            result = _compare_finite(method, a, b, options)
+            result = _compare_by_steps(method, a, b, options)
             may_be_noise = method in NOT_FOR_NOISE and result.verdict is Verdict.DIFFERENT
-            if may_be_noise and pixel_statistics.differ_like_noise(a.pixels, b.pixels):
+            if may_be_noise and pixel_statistics.differ_like_noise(*(x.pixels for x in _finite_pair(a, b))):
                 result = replace(result, reason=f"{result.reason}; {OTHER_NOISE}")
         if unshared:
             reason = f"{unshared}; the other channels: {result.reason}"
@@ -247,23 +246,32 @@ def _compare(
 
 
 def _finite_pair(reference: Image, test: Image) -> tuple[Image, Image]:
-    """Return both images with the channels in the reference's order, and 0 for values that are not finite."""
-    a, b = (finite(pixels) for pixels in aligned(reference, test))
-    return replace(reference, pixels=a), replace(test, pixels=b, channels=reference.channels)
+    """Return both images with the channels in the reference's order, and 0 for values that are not finite.
+
+    Both have the same values that are not finite. The mask then also excludes the pixels without a finite value, unless
+    it would exclude all.
+    """
+    a, b = aligned(reference, test)
+    is_finite, mask = np.isfinite(a), reference.mask
+    if not is_finite.all():
+        compared = any_channel(is_finite) if mask is None else any_channel(is_finite) & mask
+        mask = compared if compared.any() else mask
+    one, two = replace(reference, pixels=finite(a), mask=mask), replace(test, pixels=finite(b), mask=mask)
+    return one, replace(two, channels=reference.channels)
 
 
-def _compare_finite(method: str, a: Image, b: Image, options: Options) -> Comparison:
+def _compare_by_steps(method: str, a: Image, b: Image, options: Options) -> Comparison:
     """Return the result of a method, and of `tolerance` for the channels that the method does not compare.
 
-    INCONCLUSIVE if black would pass. Both images are finite and have the same channels in the same order.
+    INCONCLUSIVE if black would pass. Both images have the same channels; values that are not finite are not compared.
     """
     looks_at = METHODS[method].looks_at
-    groups_of_method = looks_at(a, b) if looks_at else [list(a.channels)]
+    groups_of_method = looks_at(*_finite_pair(a, b)) if looks_at else [list(a.channels)]
     others = [name for name in a.channels if not any(name in group for group in groups_of_method)]
     steps = [(method, group) for group in groups_of_method] + ([("tolerance", others)] if others else [])
     result: Comparison | None = None
     for by, names in steps:
-        one, two = only(a, names), only(b, names)
+        one, two = _finite_pair(only(a, names), only(b, names))
         options_of_step = options if by == method else {}
         if result and np.array_equal(one.pixels, two.pixels):
             comparison = Comparison(by, Verdict.EQUAL, "identical")

@@ -86,6 +86,30 @@ def test_a_channel_without_finite_values_is_inconclusive(method, bad):
     assert method == "welch" or verdict(method, green, other, allow_nonfinite=True) is DIFFERENT
 
 
+FLIP_MEAN = {"mean": 0.05, "local": 1.0, "patch": 1.0, "one_way": 999.0}
+
+
+@pytest.mark.parametrize(
+    ("method", "names", "options"),
+    [
+        ("tolerance", "Y", {"fail_percent": 5.0}),
+        ("paired", "Y", {"changed": 0.05}),
+        ("flip", "Y", FLIP_MEAN),
+        ("flip", "YA", FLIP_MEAN),  # separately
+    ],
+)
+def test_shares_refer_to_the_pixels_with_a_finite_value(method, names, options):
+    """A quarter of an object of 16 × 16 pixels, in an image that is infinite elsewhere, becomes half as bright."""
+    one = np.full((300, 300, len(names)), np.inf, np.float32)
+    one[100:116, 200:216], one[..., 1:] = 1, 1
+    two = one.copy()
+    two[100:104, 200:216, 0] = 0.5
+    sides = [of(x, tuple(names)) for x in (one, two)]
+    crops = [of(x[100:116, 200:216], tuple(names)) for x in (one, two)]
+    assert verdict(method, *crops, **options) is DIFFERENT
+    assert verdict(method, *sides, allow_nonfinite=True, **options) is DIFFERENT
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_different_headers_are_errors_and_channels_are_matched_by_name(method):
     for other, what in (
