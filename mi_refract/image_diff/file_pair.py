@@ -90,8 +90,8 @@ def compare(
         variance_path = pairing.beside(how.variance, path, roots[0], how.above)
         raise FileNotFoundError(f"{variance_path}: no such file; expected a variance")
     mask_path = pairing.beside(how.mask, result.target, roots[0], how.above) if how.mask else None
-    if (mask_path or how.ignore) and reference[-1].place:
-        raise ValueError(f"{path}: has several parts or MIP levels; masks are supported for single images only")
+    if (mask_path or how.ignore or how.reads_variance) and reference[-1].place:
+        raise ValueError(f"{path}: several parts or MIP levels; for masks and `variance` expected a single image")
     mask = mask_of(reference[0], mask_path, how.ignore, how.max_values)
     if mask is not None:
         for images in selected:

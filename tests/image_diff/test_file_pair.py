@@ -120,6 +120,17 @@ def test_an_error_names_the_part(tmp_path):
     assert "size 8 × 4; expected 8 × 8" in result.error and result.error.endswith("(part 1)")
 
 
+@pytest.mark.parametrize("how", [{"mask": "m.exr"}, {"ignore": ((0, 0, 2, 2),)}, {"variance": "v.exr"}], ids=str)
+def test_masks_and_variances_need_single_images(tmp_path, how):
+    for name in ("m", "v"):
+        write_exr(tmp_path / f"{name}.exr", np.ones((8, 8, 3)))
+    result = compared(parts(tmp_path / "a.exr", SMALL), parts(tmp_path / "b.exr", SMALL), **how)
+    assert (result.status, result.error) == (
+        "error",
+        f"{tmp_path / 'a.exr'}: several parts or MIP levels; for masks and `variance` expected a single image",
+    )
+
+
 def test_a_file_of_several_parts_can_be_accepted(tmp_path):
     old, new = (tmp_path / side for side in ("old", "new"))
     for side, images in ((old, SMALL), (new, with_change(SMALL, 2))):
