@@ -159,10 +159,11 @@ def compare(
 ) -> Comparison:
     """Compare two images, or two sequences of renders of one image, by a method of the table.
 
-    "auto" is `welch` if variances are known, see `choice`, else `tolerance`; options of the other one are accepted and
-    not used. With "auto", one `outrageous` pixel makes images different by `tolerance`, unless `hard_fail` or
-    `allow_failures` is set. `named`: the channels to compare; empty: all, except NAME.variance beside NAME. `welch`
-    also reads the variances of single images from their other channels.
+    "auto" is `welch` if variances are known, see `choice`, else `tolerance`. Options of the other one are accepted;
+    those of `tolerance` are also used for channels without variance beside others that have one. With "auto", one
+    `outrageous` pixel makes images different by `tolerance`, unless `hard_fail` or `allow_failures` is set. `named`:
+    the channels to compare; empty: all, except NAME.variance beside NAME. `welch` also reads the variances of single
+    images from their other channels.
 
     The verdict is INCONCLUSIVE if a method calls the images equal but would also call a black image equal, or one with
     a group of channels black, or accepts many pixels that change by half; if channels whose variance `welch` does not
@@ -187,7 +188,6 @@ def compare(
     if by_auto:
         has_spp = any(options.get(name) for name in ("spp", "spp_reference", "spp_test"))
         method, chosen_because = choice(*sides, spp=has_spp)
-        options = {name: value for name, value in options.items() if name in METHODS[method].options}
     result = replace(_compare(method, sides, allow_nonfinite, named, options), chosen=chosen_because)
     some_pixels_differ = by_auto and method == "tolerance" and result.is_equal and result.metrics[0].value > 0
     if some_pixels_differ and not options.keys() & DECIDING:
@@ -202,7 +202,9 @@ def compare(
 def _compare(
     method: str, sides: list[list[Image]], allow_nonfinite: bool, named: Collection[str], options: Options
 ) -> Comparison:
+    """Return the result of a method. `options`: of the method, and of the one that compares the untested channels."""
     takes_renders, function = METHODS[method].takes_renders, METHODS[method].function
+    all_options, options = options, {name: options[name] for name in options if name in METHODS[method].options}
     if not all(sides):
         raise ValueError(f"{method}: no image on one side; expected at least one")
     means = [[channels.without_variances(image, named) for image in side] for side in sides]
@@ -211,12 +213,14 @@ def _compare(
     one, two = compared[0][0], compared[1][0]
     if single and (reading := identical_as_shown(one, two)):
         alike = [[as_shown(one, two.channels)], [as_shown(two, one.channels)]]
-        result = _compare(method, alike, allow_nonfinite, named, options)
+        result = _compare(method, alike, allow_nonfinite, named, all_options)
         return replace(result, reason=f"{result.reason}; {reading}")
     if takes_renders:
         result = function(*compared, allow_nonfinite=allow_nonfinite, **options)
         if single and result.is_equal and (untested := channels.untested(one, two)):
-            by_tolerance = compare(AUTO, *untested, allow_nonfinite=allow_nonfinite, ignore_metadata=["*"])
+            by_tolerance = compare(
+                AUTO, *untested, allow_nonfinite=allow_nonfinite, ignore_metadata=["*"], **all_options
+            )
             if not by_tolerance.is_equal:
                 doubt = f"not tested, without variance: {', '.join(untested[0].channels)}: {by_tolerance.reason}"
                 return result.but(Verdict.INCONCLUSIVE, doubt)

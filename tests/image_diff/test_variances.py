@@ -312,7 +312,7 @@ def test_alpha_has_the_variance_of_a_binary_variable():
 
 
 def test_channels_without_variance_are_compared_as_by_auto():
-    """One firefly among 6144 pixels; metadata count by the options of the whole comparison."""
+    """One firefly among 6144 pixels, or a small difference; metadata count by the options of the whole comparison."""
 
     def side(drawn, view):
         pixels = np.dstack([drawn.mean(0)[..., :1], drawn.var(0, ddof=1)[..., :1], MEAN[..., :1]])
@@ -325,6 +325,9 @@ def test_channels_without_variance_are_compared_as_by_auto():
     test.pixels[5, 6, 2] = 1e6
     result = compare("auto", reference, test, ignore_metadata=["view"])
     assert result.verdict is INCONCLUSIVE and "albedo: one pixel is far too bright" in result.reason
+    test.pixels[..., 2] = reference.pixels[..., 2] + np.float32(0.003)
+    for options, verdict in (({}, EQUAL), ({"fail": 0.001}, INCONCLUSIVE)):
+        assert compare("auto", reference, test, ignore_metadata=["view"], **options).verdict is verdict
 
 
 def test_differences_in_channels_without_variance_are_inconclusive():
