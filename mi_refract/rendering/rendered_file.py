@@ -72,9 +72,15 @@ def read(output: Path, channels: tuple[str, ...], identity: Identity) -> Progres
         variance = np.zeros_like(mean) if variance_from == NOTHING else image.select(names).astype(np.float64)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
-    # `within` and `between` give the variance in the file; with a wide filter every pixel gets the expected weight.
-    within = variance * (spp - passes) if variance_from == SAMPLES and passes < FEW else None
-    progress.base = PassSums(
-        spp, passes, mean * spp, variance * (passes - 1), within, contrasts=contrasts, colours=int(identity["colours"])
-    )
+    # `within` and `between` give the variance in the file. From samples it may be a bound; contrasts are not, and give
+    # the mean of `between`. With a wide filter every pixel gets the expected weight.
+    within, of_between, colours = None, passes - 1.0, int(identity["colours"])
+    if variance_from == SAMPLES and passes < FEW:
+        of_colours = variance[..., :colours]
+        finite = of_colours[np.isfinite(of_colours)]
+        if finite.any():
+            of_between = float(np.clip(np.nansum(contrasts) / finite.mean(), 0, spp - 1))
+        within = variance * (spp - 1 - of_between)
+    between = variance * of_between
+    progress.base = PassSums(spp, passes, mean * spp, between, within, contrasts=contrasts, colours=colours)
     return progress

@@ -284,6 +284,19 @@ def test_a_finished_image_of_the_same_render_is_refined(tmp_path, llvm_variant):
     assert rendering(output, scene=scene, spp=10).progress.done == 16
 
 
+def test_a_bound_of_the_variance_does_not_remain_in_a_refined_image(tmp_path, llvm_variant):
+    """The samples of 4 passes are stratified; with 8 passes, the variance is from the spread between them."""
+    how = {"scene": changed(tmp_path, ('value="independent"', 'value="stratified"')), "pass_spp": 16}
+
+    def variance(name, passes):
+        header = rendering(tmp_path / name, spp=16 * passes, **how).run()
+        of_colours = read(tmp_path / name).select([f"{name}.variance" for name in "RGB"])
+        return header["mi_refract:variance_from"], float(of_colours.mean(dtype=np.float64))
+
+    (_, bound), refined, fresh = variance("a.exr", 4), variance("a.exr", 8), variance("b.exr", 8)
+    assert refined == ("passes", pytest.approx(fresh[1], rel=1e-5)) and bound > 1.5 * fresh[1]
+
+
 @pytest.mark.parametrize(("pass_spp", "variance"), [(8, "nothing"), (4, "passes")])
 def test_an_image_without_a_variance_is_kept_and_refined(tmp_path, pass_spp, variance):
     """Scalar variants do not keep samples, so a single pass has no variance."""
