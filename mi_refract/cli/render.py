@@ -46,7 +46,8 @@ def render(
     until_tile: Annotated[
         str | None,
         typer.Option(
-            metavar="SHARE", help="Stop when the 99th-percentile relative error over 16 × 16 tiles is below this."
+            metavar="SHARE",
+            help="Stop when the 99th-percentile relative error over 16 × 16 tiles that are not black is below this.",
         ),
     ] = None,
     duration: Annotated[

@@ -93,7 +93,10 @@ def require_interval() -> None:
 
 
 def worst_tile(sums: PassSums) -> float:
-    """Return the relative error of tiles of TILE² pixels that a share LEFT_OUT of them exceeds; NaN if unknown."""
+    """Return the relative error of tiles of TILE² pixels that a share LEFT_OUT of them exceeds; NaN if unknown.
+
+    Black tiles, without any variance, are left out: they say nothing about the others.
+    """
     variance = sums.variance
     if variance is None:
         return math.nan
@@ -103,7 +106,7 @@ def worst_tile(sums: PassSums) -> float:
     if not image_mean > 0:
         return math.nan
     errors = np.sqrt(squared) / np.maximum(means, DARK * image_mean)
-    return float(np.nanquantile(errors, 1 - LEFT_OUT, method="higher"))
+    return float(np.nanquantile(errors[(means > 0) | (squared > 0)], 1 - LEFT_OUT, method="higher"))
 
 
 def _tile_means(values: Doubles) -> Doubles:

@@ -137,3 +137,11 @@ def test_the_worst_tile_leaves_out_one_percent_of_the_tiles(side, truth, noise, 
         deviation[:height, :width] = value
     sums = tree_of(RNG.normal(image, deviation) for _ in range(16)).sums()
     assert worst_tile(sums) == pytest.approx(expected, rel=0.1)
+
+
+def test_black_tiles_are_left_out():
+    """Of 1024 tiles only 8 have light."""
+    image = np.zeros((512, 512, 1))
+    image[:16, :128] = 1
+    sums = tree_of(RNG.normal(image, 0.1 * image) for _ in range(16)).sums()
+    assert worst_tile(sums) == pytest.approx(0.1 / 4, rel=0.1)
