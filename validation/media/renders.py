@@ -41,7 +41,7 @@ TERMS = {
     "slab": "largest relative difference from exp(−σ d)",
     "time / without": "median over alternating warm renders",
     WELCH_ALARMS: "tiles and channels whose means differ; at most one image in 1000 by chance",
-    DETECTABLE: "relative difference of a tile's mean that would have been an alarm, median over tiles",
+    DETECTABLE: "relative difference of a tile's mean that would have been an alarm, median over tiles, worst channel",
     DETECTABLE_IMAGE: "the same for the mean of the whole image, median over channels",
 }
 METHODS: dict[str, dict[str, Any]] = {"by chance": {}, "both lobes": {"split_depth": 2}}

@@ -46,7 +46,7 @@ TERMS = {
     "tests that differ": "tests of tiles of 16² pixels by channel, of blocks of tiles and of the whole image that find "
     "a difference; one in 10,000 pairs of equal images has any",
     "tiles that differ without noise": "among the tiles without noise on either side",
-    DETECTABLE: "relative to the tile's mean, median over the tiles; for the image: relative to its mean",
+    DETECTABLE: "relative to the tile's mean, median over tiles, worst channel; for the image: relative to its mean",
     INCONCLUSIVE: "1 if no difference was found, but noise could hide a relevant one",
     MEAN_DIFFERENCE: "mean of the other renderer's image over that of the reference − 1",
     "RMSE / noise": "RMSE of the two means over what the spread between renders predicts: 1 for equal images, unless a "
