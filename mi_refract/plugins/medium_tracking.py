@@ -31,6 +31,7 @@ from mi_refract.numerics import (
     Shape,
     Spectrum,
     Variant,
+    Vector3,
 )
 
 from .absorption import BEYOND, HERE, absorbing_parameter
@@ -153,6 +154,10 @@ class MediumTracker:
         self.crossings.add(si.shape, depth, through, through & (dr.max(excess) > 0), thin)
         return dr.select(through, beyond, sigma)
 
+    def toward(self, sigma: Spectrum, si: Interaction, d: Vector3, active: Mask) -> Spectrum:
+        """Return σ along a shadow ray, which does not cross the boundary."""
+        return sigma
+
 
 class ShapeMedia:
     """Absorption by the media of the shapes (`interior`, `exterior`), which are followed as `volpath` does."""
@@ -164,11 +169,15 @@ class ShapeMedia:
     def cross(
         self, sigma: Spectrum, depth: Count, si: Interaction, bs: BSDFSample, bsdf: BSDF, ray: Ray, active: Mask
     ) -> Spectrum:
-        """Return σ along `ray`, the next ray: that of the medium on its side if the shape has media, else `sigma`."""
+        """Return σ along `ray`, the next ray."""
+        return self.toward(sigma, si, ray.d, active)
+
+    def toward(self, sigma: Spectrum, si: Interaction, d: Vector3, active: Mask) -> Spectrum:
+        """Return σ in the direction d: that of the medium on its side if the shape has media, else `sigma`."""
         transition = active & si.is_medium_transition()
         if not self.vectorised and not transition:
             return sigma
-        medium = si.target_medium(ray.d)
+        medium = si.target_medium(d)
         if not self.vectorised and medium is None:
             return self.v.UnpolarizedSpectrum(0)
         return dr.select(transition, extinction(self.v, medium, si.wavelengths, transition), sigma)

@@ -339,7 +339,8 @@ class PathLoop:
                 bsdf_value = si.to_world_mueller(bsdf_value, -wo, si.wi)
             if features.absorption:
                 way = dr.select(at_infinity, dr.inf, ds.dist) if features.lamps_at_infinity else ds.dist
-                emitter_weight = self.attenuated(emitter_weight, s.sigma, way)
+                sigma = self.media.toward(s.sigma, si, ds.d, active_em)
+                emitter_weight = self.attenuated(emitter_weight, sigma, way)
             contribution = self.times(self.times(s.throughput, bsdf_value), emitter_weight)
             contribution *= dr.select(ds.delta, 1, power_heuristic(ds.pdf, bsdf_pdf))
             s.result = dr.select(active_em, s.result + contribution, s.result)
