@@ -28,6 +28,7 @@ from mi_refract.numerics import (
     Number,
     Ray,
     Scene,
+    Sensor,
     Shape,
     Spectrum,
     Variant,
@@ -223,8 +224,8 @@ def check_integrator(scene: Scene) -> None:
         raise ValueError(f"refract: {name}; expected the integrator refract_path, or no absorption")
 
 
-def check_media(v: Variant, scene: Scene) -> None:
-    """ValueError for a medium that `refract_path` cannot follow.
+def check_media(v: Variant, scene: Scene, sensor: Sensor | None = None) -> None:
+    """ValueError for a medium that `refract_path` cannot follow. `sensor`: as in `inspect`.
 
     These are: a medium of a sensor or a shape that scatters or varies; a medium of a shape in a scene whose BSDFs
     absorb; and an absorbing BSDF nested in another one, which hides its attributes.
@@ -235,8 +236,8 @@ def check_media(v: Variant, scene: Scene) -> None:
             expected = f"a homogeneous medium with an albedo of 0{alternative}"
             raise ValueError(f"refract_path: {owner} scatters or varies; expected {expected}")
 
-    for sensor in scene.sensors():
-        check("the sensor's medium", sensor.get_medium())
+    for view in filter(None, (*scene.sensors(), sensor)):
+        check("the sensor's medium", view.get_medium())
     shapes = all_shapes(scene)
     absorbing = [any(absorbing_parameter(bsdf) for bsdf in nested(shape.bsdf())) for shape in shapes]
     for i, shape in enumerate(shapes):

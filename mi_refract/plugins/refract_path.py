@@ -132,7 +132,8 @@ def integrator_class(v: Variant) -> type:
             # Not the scene, which holds its integrator: a circle cannot be frozen.
             self.needs: SceneFeatures | None = None  # of the scene rendered last
             self.rendering = False  # between `begin_render` and `end_render`
-            self.near: Any = None  # `to_camera` of the sensor of this render
+            self.sensor: Sensor | None = None  # of this render
+            self.near: Any = None  # its `to_camera`
             self.apart = False  # lamps are traced in the scene rendered last
             self.unconnected = ""  # why that sensor's lamps cannot be traced
             self.untraced = ""  # why no lamps were traced in the scene rendered last, though `caustics` = `auto`
@@ -141,14 +142,19 @@ def integrator_class(v: Variant) -> type:
         def begin_render(self, sensor: Sensor) -> None:
             """Call this before `sample` if `render` is not called; otherwise each sample inspects the scene again."""
             self.loops, self.rendering = [], True
-            self.near = to_camera(sensor)
+            self.sensor, self.near = sensor, to_camera(sensor)
             self.unconnected = lamp_tracing.refused_sensor(sensor)
 
         def end_render(self) -> None:
             """Call this after the samples were evaluated. ValueError if absorption was inconsistent."""
-            loops, self.loops, self.rendering = self.loops, [], False
+            loops = self.loops
+            self.forget()
             for loop in loops:
                 loop.refuse()
+
+        def forget(self) -> None:
+            """End a render."""
+            self.loops, self.rendering, self.sensor = [], False, None
 
         def render(
             self,
@@ -167,7 +173,7 @@ def integrator_class(v: Variant) -> type:
                     image = self.add_caustics(scene, sensor, seed, spp, develop)
                 self.end_render()
             finally:
-                self.loops, self.rendering = [], False
+                self.forget()
             return image
 
         def add_caustics(self, scene: Scene, sensor: Sensor, seed: Any, spp: int, develop: bool) -> Any:
@@ -274,11 +280,11 @@ def integrator_class(v: Variant) -> type:
             """
             self.begin_render(sensor)
             try:
-                if not self.traces_lamps(scene, inspect(scene)):
+                if not self.traces_lamps(scene, inspect(scene, sensor)):
                     return "path"
                 return self.caustics if any(map(lamp_tracing.has_area, scene.emitters())) else "lamp"
             finally:
-                self.rendering = False
+                self.forget()
 
         def traces_lamps(self, scene: Scene, needs: SceneFeatures) -> bool:
             """Whether lamps are traced in this render. ValueError if `caustics` = `lamp` and they cannot be."""
@@ -342,7 +348,7 @@ def integrator_class(v: Variant) -> type:
 
         def scene_features(self, scene: Scene) -> SceneFeatures:
             """The features of the scene as it is now: an edit of the scene can change them."""
-            before, self.needs = (self.needs, self.apart), (needs := inspect(scene))
+            before, self.needs = (self.needs, self.apart), (needs := inspect(scene, self.sensor))
             self.apart = self.traces_lamps(scene, needs)
             missing = needs.missing("lamp" if self.apart else "path", self.max_depth)
             untraced = f"; its lamps are not traced: {self.untraced}" if self.untraced else ""
@@ -361,7 +367,7 @@ def integrator_class(v: Variant) -> type:
             if needs.textured or CURVES & {shape.class_name() for shape in all_shapes(scene)}:
                 check_shapes(scene)
             if needs.absorbing or needs.media:
-                check_media(v, scene)
+                check_media(v, scene, self.sensor)
             mi.Log(mi.LogLevel.Info, f"{INTEGRATOR}: left out: {self.left_out()}")  # type: ignore[operator]
             return needs
 

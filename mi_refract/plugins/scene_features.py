@@ -19,7 +19,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refract.numerics import BSDF, Scene, Shape, Variant
+from mi_refract.numerics import BSDF, Scene, Sensor, Shape, Variant
 
 from . import ray_origins
 
@@ -145,8 +145,11 @@ class SceneFeatures:
         return {name: text for name, exists, edges, text in classes if exists and scatters and edges <= limit}
 
 
-def inspect(scene: Scene) -> SceneFeatures:
-    """Return the features of a Mitsuba scene as it is now; an edit of its parameters can change them."""
+def inspect(scene: Scene, sensor: Sensor | None = None) -> SceneFeatures:
+    """Return the features of a Mitsuba scene as it is now; an edit of its parameters can change them.
+
+    `sensor`: one that views the scene and may not be part of it.
+    """
     shapes, emitters, sky = all_shapes(scene), scene.emitters(), scene.environment()
     unknown_shapes = [shape.class_name() for shape in shapes if shape.class_name() not in KNOWN_SHAPES]
     bsdfs_of_shapes = [[] if _black(shape.bsdf()) else [*nested(shape.bsdf())] for shape in shapes]
@@ -211,7 +214,7 @@ def inspect(scene: Scene) -> SceneFeatures:
         null=everything or bool(flags & +lobes.Null),
         dispersive=everything or any(getattr(bsdf, "dispersive", False) for bsdf in bsdfs),  # no Mitsuba plugin is
         absorbing=everything or any(getattr(bsdf, "absorbing", False) for bsdf in bsdfs),
-        media=shape_media or any(endpoint.get_medium() for endpoint in (*emitters, *scene.sensors())),
+        media=shape_media or any(x.get_medium() for x in (*emitters, *scene.sensors(), sensor) if x is not None),
         shape_media=shape_media,
         refracting=everything or bool(flags & +lobes.Transmission),
         delta=everything or bool(flags & +(lobes.DeltaReflection | lobes.DeltaTransmission)),

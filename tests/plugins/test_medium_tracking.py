@@ -98,6 +98,14 @@ def test_a_slab_transmits_exp_of_minus_sigma_d(case, rgb_variant):
     assert radiance(**parts) == pytest.approx(np.exp(-np.array(depth)), rel=1e-5, abs=1e-30)
 
 
+def test_the_medium_of_a_sensor_outside_the_scene_counts(rgb_variant):
+    wall = {"type": "rectangle", "emitter": {"type": "area", "radiance": 1.0}}
+    apart = mi.load_dict({"type": "scene", "integrator": {"type": "refract_path"}, "wall": wall})
+    clear, opaque = (mi.load_dict(camera(1, 1, (0, 0, 2)) | {"medium": medium}) for medium in (CLEAR, SCATTERS))
+    assert np.array(mi.render(apart, sensor=clear, spp=4)) == pytest.approx(math.exp(-1.4), rel=1e-3)
+    assert "the sensor's medium scatters or varies" in refusal(mi.render, apart, sensor=opaque, spp=4)
+
+
 def test_multiple_reflections_in_a_slab_are_absorbed(rgb_variant):
     """R + T² a/(1 − R a), a = exp(−σ d), with R and T at normal incidence."""
     a, r = math.exp(-0.3 * THICKNESS), 0.04

@@ -41,7 +41,7 @@ def test_where_nothing_is_left_out_the_numbers_and_the_image_are_those_of_path(
     if name == "nested" and not each_variant.endswith("rgb"):
         pytest.skip("RGB variants stand for the others")
 
-    def everything(scene):
+    def everything(scene, sensor):
         changed = {"both_numbers": True, "plain_environment": False, "delta_extent": math.inf}
         return dataclasses.replace(scene_features.inspect(scene), **changed)
 
@@ -347,7 +347,7 @@ def test_what_is_left_out_is_not_in_the_kernel_and_is_said(llvm_variant, monkeyp
     assert "emitter sampling (every BSDF has delta lobes only)" in said
     assert theirs - lean > 250
     full = dataclasses.replace(scene_features.inspect(scene), smooth=True)
-    monkeypatch.setattr(refract_path, "inspect", lambda scene: full)
+    monkeypatch.setattr(refract_path, "inspect", lambda scene, sensor: full)
     assert operations(scene)[0] > lean + 0.6 * (theirs - lean)
 
 
