@@ -160,17 +160,21 @@ def power_heuristic(a: Number, b: Number) -> Number:
 
 def at_fixed_direction(
     v: Variant, context: Any, si: Interaction, bsdf: BSDF, bs: BSDFSample, weight: Spectrum, d: Vector3, active: Mask,
-    own_odds: Mask,
+    own_odds: Mask, masked: Mask,
 ) -> tuple[Spectrum, Vector3, Number]:  # fmt: skip
     """Return weight, world direction and density of a BSDF sample, with the derivatives that an estimator needs.
 
     The direction of a delta lobe moves with the parameters, but its probability p must be detached: the derivative of
     the weight f/p is f'/p. The direction ω of any other lobe is detached: d/dx ∫ f dω = ∫ f'(ω)/p(ω) p(ω) dω, where
     ω and p are not differentiated. `own_odds`: lanes in which the BSDF's weight of a delta lobe has the derivative f'/p
-    already, although p is attached.
+    already, although p is attached. `masked`: lanes of a `mask`, in which this is so for the factor of p that the
+    opacity is.
     """
     if dr.grad_enabled(bs.pdf):
-        odds = dr.select(active & (bs.pdf > 0) & (own_odds ^ True), bs.pdf, 1)
+        opacity = 1 - v.unpolarized_spectrum(bsdf.eval_null_transmission(si, masked))[0]
+        opacity = dr.select(masked & (opacity > 0), opacity, 1)  # of 0 only the null lobe is sampled
+        nested_odds = dr.select(mi.has_flag(bs.sampled_type, LOBES.Null), 1, bs.pdf / opacity)
+        odds = dr.select(active & (bs.pdf > 0) & (own_odds ^ True), dr.select(masked, nested_odds, bs.pdf), 1)
         weight = weight * (odds / dr.detach(odds))
     smooth = active & mi.has_flag(bs.sampled_type, LOBES.Smooth)
     wo = si.to_local(dr.detach(d))
@@ -184,7 +188,9 @@ def at_fixed_direction(
 
 
 def has_own_odds(bsdf: BSDF) -> bool:
-    """Whether a BSDF contains a `mask` whose opacity may be differentiated; see `at_fixed_direction`."""
+    """Whether a BSDF hides a `mask` whose opacity may be differentiated; see `at_fixed_direction`."""
+    if bsdf_name(bsdf) == "MaskBSDF":
+        return False
     masks = [inner for inner in nested(bsdf) if bsdf_name(inner) == "MaskBSDF"]
     textures = (child for mask in masks for child in children(mask) if hasattr(child, "is_spatially_varying"))
     opacities = (value for mask in masks for key, value in mi.traverse(mask) if key.startswith("opacity"))
@@ -214,6 +220,7 @@ class PathLoop:
         self.branch = branch_type(v, features.dispersion, features.absorption)
         self.boundaries = self.ranges(lambda bsdf: bsdf_name(bsdf) in BOUNDARIES) if features.split_depth else []
         self.own_odds = self.ranges(has_own_odds) if self.evaluated else []
+        self.masks = self.ranges(lambda bsdf: bsdf_name(bsdf) == "MaskBSDF") if self.evaluated else []
 
     def refuse(self) -> None:
         """ValueError if the absorption along the paths was inconsistent; see `Crossings.refuse`."""
@@ -406,8 +413,8 @@ class PathLoop:
             weight = si.to_world_mueller(weight, -bs.wo, si.wi)
         ray = self.spawn_ray(si, bs)
         if dr.grad_enabled(weight, ray.d):
-            own_odds = self.is_of(self.own_odds, bsdf)
-            weight, ray.d, bs.pdf = at_fixed_direction(v, self.context, si, bsdf, bs, weight, ray.d, active, own_odds)
+            masks = (self.is_of(ranges, bsdf) for ranges in (self.own_odds, self.masks))
+            weight, ray.d, bs.pdf = at_fixed_direction(v, self.context, si, bsdf, bs, weight, ray.d, active, *masks)
         throughput, optional = self.times(s.throughput, weight), dict[str, Any]()
         if self.features.dispersion:
             # The first wavelength represents all that end here; each wavelength is the first one equally often.

@@ -202,15 +202,18 @@ def test_tints_have_the_derivatives_of_refract_path(integrator, name, llvm_varia
     assert abs(ours.mean() - theirs.mean()) < 5.36 * error
 
 
-@pytest.mark.parametrize("bsdf", ["plastic", "mask"])
+SHEET = {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.full((4, 4, 1), 0.6, np.float32))}
+
+
+@pytest.mark.parametrize("opacity", [None, 0.6, SHEET], ids=["plastic", "mask", "textured mask"])
 @pytest.mark.parametrize("name", ["diffuse_reflectance", "specular_reflectance"])
-def test_probabilities_of_lobes_are_detached(name, bsdf, llvm_variant):
+def test_probabilities_of_lobes_are_detached(name, opacity, llvm_variant):
     """`plastic` selects a lobe by its colours. The derivative of an image that is linear in a colour is I(1) − I(0).
 
     With 12² · 256 paths, of which the lobe gets at least a tenth, 5 % is seven standard deviations.
     """
     plastic = {"type": "plastic", "diffuse_reflectance": 0.4, "specular_reflectance": 0.5}
-    ball = {"type": "sphere", "bsdf": plastic if bsdf == "plastic" else {"type": "mask", "opacity": 0.6, "b": plastic}}
+    ball = {"type": "sphere", "bsdf": {"type": "mask", "opacity": opacity, "b": plastic} if opacity else plastic}
     method = {"type": "refract_path", "max_depth": 2}
     scene = mi.load_dict({"type": "scene", "integrator": method, "view": camera(12, 20), "sky": sky(), "ball": ball})
     params, (key,) = attached(scene, name)

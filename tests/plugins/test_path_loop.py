@@ -200,7 +200,7 @@ def test_a_sample_along_the_surface_has_the_weight_0_also_in_renders_that_are_di
     assert dr.all(bs.wo.z == 0) and dr.all(weight == 0, axis=None)
     d = si.to_world(bs.wo)
     assert dr.any(si.to_local(d).z > 0)
-    weight, *_ = path_loop.at_fixed_direction(mi, context, si, bsdf, bs, weight, d, True, False)
+    weight, *_ = path_loop.at_fixed_direction(mi, context, si, bsdf, bs, weight, d, True, False, False)
     assert dr.all(weight == 0, axis=None)
 
 
@@ -215,5 +215,5 @@ def test_a_differentiated_sample_has_the_weight_of_the_sample(variant):
     bs, weight = bsdf.sample(context, si, 0.5, mi.Point2f(random.random((2, 1000))))
     expected = si.to_world_mueller(weight, -bs.wo, si.wi) if "polarized" in variant else weight
     d = si.to_world(bs.wo)
-    found, *_ = path_loop.at_fixed_direction(mi, context, si, bsdf, bs, expected, d, True, False)
+    found, *_ = path_loop.at_fixed_direction(mi, context, si, bsdf, bs, expected, d, True, False, False)
     np.testing.assert_allclose(np.array(found), np.array(expected), rtol=1e-3, atol=1e-4)
