@@ -269,6 +269,10 @@ def integrator_class(v: Variant) -> type:
                     raise ValueError(
                         f"{INTEGRATOR}: the camera is in an absorbing medium; expected one sensor in the scene"
                     )
+                if (self.sensor or sensors[0]).class_name() == "BatchSensor":  # whose near planes are not known
+                    raise ValueError(
+                        f"{INTEGRATOR}: the cameras of a batch are in an absorbing medium; expected one camera a render"
+                    )
                 if (place := self.near if self.rendering else to_camera(sensors[0])) is not None:
                     way = (place @ ray.o).z / (place @ ray.d).z
             return sigma, way

@@ -170,6 +170,14 @@ def test_the_distance_to_the_near_plane_absorbs_too(kind, near, rgb_variant):
     assert pixel == pytest.approx(math.exp(-0.7 * 5), rel=1e-4)
 
 
+def test_a_batch_of_cameras_in_an_absorbing_medium_is_an_error(rgb_variant):
+    """Which of its cameras a ray is of, and so the distance to the near plane, is not known."""
+    batch = {"type": "batch", "first": camera(1), "second": camera(1), "film": camera(2)["film"]}
+    method = {"type": "refract_path", "camera_absorption": 1.0}
+    text = refusal(mi.render, mi.load_dict({"type": "scene", "integrator": method, "view": batch}), spp=1)
+    assert text.endswith("the cameras of a batch are in an absorbing medium; expected one camera a render")
+
+
 ROUGH = {"type": "roughdielectric", "alpha": 0.3}
 LAMP = sheet({"type": "diffuse"}, -3) | {"to_world": PLACE().translate([0, 0, -3]), "emitter": {"type": "area"}}
 
