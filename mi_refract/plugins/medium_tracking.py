@@ -64,8 +64,11 @@ class Crossings:
         self.tally: dict[int, list[int]] = {}  # scalar variants: position of the shape in the scene → its counts
         self.positions: dict[int, int] = {}  # Mitsuba's number of a shape → its position
         self.counts: list[Any] = []  # compiled variants: four arrays, indexed by the number of the shape
-        # Counts that a frozen function writes could not be read.
-        if self.vectorised and not dr.flag(dr.JitFlag.FreezingScope):
+        if self.vectorised and dr.flag(dr.JitFlag.FreezingScope):  # what such a function counts could not be read
+            warn_once(
+                "refract_path: a frozen function cannot tell whether absorption is consistent; expected that it is"
+            )
+        elif self.vectorised:
             for i, shape in enumerate(self.shapes):
                 self.positions[plugin_number(v, v.ShapePtr(shape))] = i
             # The last entry counts all shapes that `all_shapes` does not return.

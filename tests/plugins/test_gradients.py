@@ -403,8 +403,16 @@ def test_lamps_in_an_even_sky_can_be_frozen(weights, llvm_variant, no_collection
         assert frozen == pytest.approx(np.array(mi.render(scene, spp=4, seed=mi.UInt32(seed))), abs=1e-5)
 
 
-def test_a_frozen_render_says_that_it_cannot_tell_whether_a_medium_scatters(llvm_variant, no_collection, logged):
-    ball = {"type": "sphere", "bsdf": GLASS, "interior": {"type": "homogeneous", "albedo": 0.5, "sigma_t": 2.0}}
+@pytest.mark.parametrize(
+    ("parts", "warning"),
+    [
+        ({"interior": {"type": "homogeneous", "albedo": 0.5, "sigma_t": 2.0}}, "whether a medium scatters"),
+        ({"bsdf": GLASS | {"ext_absorption": 0.5}}, "whether absorption is consistent"),
+    ],
+    ids=["medium", "absorption"],
+)
+def test_a_frozen_render_says_what_it_cannot_tell(parts, warning, llvm_variant, no_collection, logged):
+    ball = {"type": "sphere", "bsdf": GLASS} | parts
     scene = glass_ball(8, integrator={"type": "refract_path", "max_depth": 8}, sky={"type": "constant"}, ball=ball)
     recorded(scene)(mi.traverse(scene), dr.opaque(mi.UInt32, 0))
-    assert sum("a frozen function cannot tell whether a medium scatters" in text for text in logged) == 1
+    assert sum(f"a frozen function cannot tell {warning}" in text for text in logged) == 1
