@@ -100,6 +100,14 @@ class DispersiveRatio:
         inside, outside = self.sides.values()
         return media.relative_index(inside, outside, wavelength, *coefficients)
 
+    def visible(self) -> list[float]:
+        """Return some wavelengths of visible light that both media have an index for."""
+        import numpy as np
+
+        ranges = [(mi.MI_CIE_MIN, mi.MI_CIE_MAX), *(side.valid for side in self.sides.values() if not side.hold)]
+        first, last = max(low for low, _ in ranges), min(high for _, high in ranges)
+        return np.linspace(first, last, 33).tolist() if first <= last else []
+
     @property
     def differentiated(self) -> bool:
         """Whether derivatives of a coefficient are tracked."""

@@ -154,6 +154,22 @@ def checked(name: str, eta: float) -> float:
     return eta
 
 
+def checked_ratio(self: Refract) -> float:
+    """Return the ratio of dispersive media at the d line.
+
+    ValueError if it is not a ratio of indices there, or in spectral variants at another visible wavelength.
+    """
+    import numpy as np
+
+    wavelengths = [LINES["d"], *(self.varying.visible() if self.v.is_spectral else ())]
+    lanes = [self.wide(wavelengths)] if dr.is_jit_v(self.wide) else wavelengths
+    ratios = np.concatenate([np.array(dr.detach(self.varying.at(lane)), float).ravel() for lane in lanes])
+    at_d_line = checked("int_ior / ext_ior", float(ratios[0]))
+    for wavelength, ratio in zip(wavelengths[1:], ratios[1:], strict=True):
+        checked(f"int_ior / ext_ior at {wavelength:.4g} nm", float(ratio))
+    return at_d_line
+
+
 def set_ratio(self: Refract, eta: Number) -> None:
     """Set k of both sides, in float64. They are opaque, so that an edit changes the data of a kernel and not its code.
 
@@ -187,11 +203,7 @@ def parameters_changed(self: Refract, keys: Collection[str]) -> None:
     if self.varying:
         self.varying.changed(keys)
         if isinstance(self.varying, DispersiveRatio):
-            eta = dr.detach(self.varying.at(self.wide(LINES["d"])))
-            if not frozen:
-                number: Any = dr.slice(eta)
-                checked("int_ior / ext_ior", float(number))
-            set_ratio(self, eta)
+            set_ratio(self, dr.detach(self.varying.at(self.wide(LINES["d"]))) if frozen else checked_ratio(self))
     elif not keys or "eta" in keys:
         if frozen:
             eta = self.wide(dr.detach(self.eta))

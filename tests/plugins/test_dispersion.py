@@ -243,6 +243,16 @@ def test_an_edit_of_a_coefficient_to_no_index_is_an_error(each_variant, value):
     assert "refract: int_ior / ext_ior = " in refusal(params.update)
 
 
+def test_an_edit_to_no_index_at_another_visible_wavelength_is_an_error(spectral_variant):
+    """n = 1.5 − 4e5/λ² is positive from 517 nm on. Wavelengths outside the range of a table do not count."""
+    params = mi.traverse(load())
+    params["int_ior_B"] = -4e5
+    assert "refract: int_ior / ext_ior at 360 nm = nan; expected a ratio from" in refusal(params.update)
+    params = mi.traverse(load("table(380: 1.5, 780: 1.6)"))
+    params["int_ior_n_780"] = 1.7
+    params.update()
+
+
 def test_directions_have_derivatives_in_the_coefficients(llvm_spectral):
     """A coefficient with two entries is an error."""
     bsdf = load()
