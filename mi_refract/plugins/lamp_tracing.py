@@ -28,7 +28,7 @@ is between. Adjoint BSDFs, with the correction for shading normals: Veach 1997, 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,7 +60,18 @@ from .medium_tracking import THROUGH
 from .path_loop import PathLoop
 from .refract import DISPERSED, followed_context
 from .sampling import IndependentNumbers, KeyedMultijitter
-from .scene_features import KNOWN, KNOWN_SHAPES, PERTURBING, all_shapes, bsdf_name, children, mesh_attributes, nested
+from .scene_features import (
+    KNOWN,
+    KNOWN_SHAPES,
+    PERTURBING,
+    all_shapes,
+    bsdf_name,
+    children,
+    mesh_attributes,
+    nested,
+    shape_groups,
+    shapes_of,
+)
 
 MOST_TARGETS = 16  # spheres at which directions are aimed
 FAR = 8  # a lamp is far if `Line.way` is more than this many times `Line.back`
@@ -172,12 +183,35 @@ def targets(scene: Scene) -> list[Sphere]:
         unknown = shape.class_name() not in KNOWN_SHAPES or not names.keys() <= KNOWN
         return unknown or any(flags & +LOBES.Delta for flags in names.values())
 
-    return merged([bounding_sphere(shape) for shape in scene.shapes() if is_target(shape)], MOST_TARGETS)
+    edited = edited_groups(scene)
+    return merged([bounding_sphere(shape, edited) for shape in scene.shapes() if is_target(shape)], MOST_TARGETS)
 
 
-def bounding_sphere(shape: Shape) -> Sphere:
-    """A sphere around the bounding box of a shape; the radius is infinite or NaN if the bounds are unknown."""
+def edited_groups(scene: Scene) -> list[Any]:
+    """The bounding boxes of the shape groups that have changed since they were loaded."""
+    boxes = []
+    for group in shape_groups(scene):
+        box = type(group.bbox())()
+        for shape in shapes_of(group):
+            box.expand(mitsuba_mesh.bounding_box(shape))
+        if box.valid() and box != group.bbox():
+            boxes.append(box)
+    return boxes
+
+
+def bounding_sphere(shape: Shape, edited: Sequence[Any] = ()) -> Sphere:
+    """A sphere around the bounding box of a shape; the radius is infinite or NaN if the bounds are unknown.
+
+    Mitsuba's box of an instance is that of its group when that was loaded, and it does not expose the group. So the box
+    is extended by all groups that were `edited`.
+    """
     box = mitsuba_mesh.bounding_box(shape)
+    if edited and shape.class_name() == "Instance":
+        import numpy as np
+
+        to_world = np.array(mi.traverse(shape)["to_world"].matrix).reshape(4, 4)
+        for corner in (group.corner(i) for group in edited for i in range(8)):
+            box.expand((to_world[:3, :3] @ np.array(corner) + to_world[:3, 3]).tolist())
     half = [float(x) / 2 for x in box.extents()]
     radius = half[0] if shape.class_name() == "Sphere" else math.hypot(*half)
     return Sphere(tuple(map(float, box.center())), radius * MARGIN)

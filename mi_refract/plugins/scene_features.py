@@ -293,8 +293,17 @@ def mesh_attributes(node: mi.Object) -> list[str]:
 
 def all_shapes(scene: Scene) -> list[Shape]:
     """Return the shapes of a scene, and those in its shape groups, which `scene.shapes()` omits."""
-    groups = [child for child in children(scene) if child.class_name() == "ShapeGroupPlugin"]
-    return [*scene.shapes(), *(child for group in groups for child in children(group) if hasattr(child, "bsdf"))]
+    return [*scene.shapes(), *(shape for group in shape_groups(scene) for shape in shapes_of(group))]
+
+
+def shape_groups(scene: Scene) -> list[Any]:
+    """Return the shape groups of a scene."""
+    return [child for child in children(scene) if child.class_name() == "ShapeGroupPlugin"]
+
+
+def shapes_of(group: mi.Object) -> list[Shape]:
+    """Return the shapes in a shape group."""
+    return [child for child in children(group) if hasattr(child, "bsdf")]
 
 
 def shape_name(shapes: list[Shape], position: int) -> str:

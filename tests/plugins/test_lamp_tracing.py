@@ -267,6 +267,23 @@ def test_a_small_glass_is_not_missed_beside_a_large_one(llvm_variant):
     assert difference(*images) < 1
 
 
+def test_lamps_aim_at_an_instance_also_after_an_edit_of_its_group(llvm_variant):
+    """The group's ball moves to where it is in the other scenes; the instance is turned, and 9 units away."""
+
+    def instances(x):
+        group = {"type": "shapegroup", "id": "group", "inner": ball(center=(0, x, 0), radius=0.4)}
+        place = mi.ScalarTransform4f().translate([-9, 0, 1.2]).rotate([0, 0, 1], -90).scale(2)
+        instance = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": place}
+        return scene({"lamp": SUN, "ball": group, "more": instance}, caustics="lamp")
+
+    edited = instances(0.5)
+    params = mi.traverse(edited)
+    params[parameter(params, "inner.to_world")] = mi.ScalarTransform4f().translate([0, 4.5, 0]).scale(0.4)
+    params.update()
+    images = [tiles(each, 64, range(first, first + 16)) for each, first in ((edited, 0), (instances(4.5), 100))]
+    assert difference(*images) < 1
+
+
 @pytest.mark.parametrize("caustics", ["path", "lamp"])
 @pytest.mark.parametrize("bulb", [{"type": "point", "position": [100, 0, 1]}, SUN], ids=["point", "directional"])
 def test_no_light_passes_by_a_pane_just_above_the_floor(bulb, caustics, llvm_variant):
