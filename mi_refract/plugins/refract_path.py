@@ -300,7 +300,8 @@ def integrator_class(v: Variant) -> type:
             symbolic, frozen = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops), dr.flag(dr.JitFlag.FreezingScope)
             reasons = {
                 "another integrator calls it": not self.rendering,
-                "the render is differentiated": not symbolic or (not frozen and differentiated(scene)),
+                "the render is differentiated": not symbolic
+                or (not frozen and any(map(differentiated, filter(None, (scene, self.sensor))))),
                 "a frozen function": frozen,
                 "the scene has media": needs.media,
                 f"a {needs.delta_perturbed} has delta lobes": bool(needs.delta_perturbed),

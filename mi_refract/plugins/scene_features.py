@@ -245,10 +245,10 @@ def missing_light(scene: Scene) -> dict[str, str]:
     return missing
 
 
-def differentiated(scene: Scene) -> bool:
-    """Whether a parameter of the scene is differentiated, also while derivatives are suspended, as in `mi.render`."""
+def differentiated(node: mi.Object) -> bool:
+    """Whether a parameter of a plugin is differentiated, also while derivatives are suspended, as in `mi.render`."""
     with dr.resume_grad():
-        return any(dr.grad_enabled(value) for _, value in mi.traverse(scene))
+        return any(dr.grad_enabled(value) for _, value in mi.traverse(node))
 
 
 def check_shapes(scene: Scene) -> None:

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.glass_scenes import parameter
+from support.glass_scenes import attached, parameter, refusal
 from support.variants import switch
 
 import mi_refract  # noqa: F401
@@ -413,6 +413,14 @@ def test_another_integrator_cannot_have_lamps_traced_nor_a_derivative(llvm_varia
     while errors[-1].__cause__ is not None:
         errors.append(errors[-1].__cause__)
     assert any("the render is differentiated" in str(error) for error in errors)
+
+
+def test_no_lamps_are_traced_where_a_sensor_outside_the_scene_is_differentiated(llvm_variant):
+    view, loaded = mi.load_dict(camera()), scene({})
+    params, _ = attached(view, "x_fov")
+    method = mi.load_dict({"type": "refract_path", "caustics": "lamp"})
+    text = refusal(mi.render, loaded, params, sensor=view, integrator=method, spp=1)
+    assert "the render is differentiated" in text
 
 
 @pytest.mark.parametrize(
