@@ -10,8 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
+from mi_refract.formulas import FORMULAS
 from mi_refract.io.text import compact
+from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row, by_study
+
+from .metrics import CHANGED_SHARE
 
 NAME = "bounds"
 LOOSE = 100.0  # a bound is loose if it exceeds the largest error by this factor
@@ -27,6 +31,7 @@ ABOUT = {
         "unexplained": "loose subjects and metrics without a statement of what their bound still excludes",
     },
 }
+PLUGINS = (PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS))
 DIFFUSE = "roundings of thousands of nodes average out; 12.5 u = 7.5e-7 excludes an index off by 1e-6"
 PAIRS = (
     *("every form", "variances", "variance of the reference", "variance of the new image", "reference", "new image"),
@@ -44,6 +49,7 @@ EXCLUDES: dict[tuple[str, str], tuple[tuple[str, ...], str]] = {
     ("paths", "pixels off, control"): (("refract",), "no lobe flipped; more than 1 pixel of 1000 is another path"),
     ("samples", "eta worst"): (("refract − dielectric",), "equal to the last bit; an index off by 2e-7, an ulp of 1.5"),
     ("samples", "lobe flips"): (("refract − dielectric",), "none flipped; a density off by 1e-2 on a thousand rays"),
+    ("renders", CHANGED_SHARE): (PLUGINS, "a few pixels with another lobe; more than 1 pixel of 1000 is another path"),
     ("features", "off after an edit"): (("refract",), "equal to the last bit; an index off by 1e-5"),
     ("gradients", "forward"): (("refract_path",), "the same seeds: a mode off by a twentieth of the standard error"),
     ("passes", "beyond"): (("--until",), "the claim of 5 %: 14 of 100; most renders end a pass or more below it"),
