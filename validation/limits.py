@@ -80,7 +80,7 @@ POWER_SUM = limit(4.0, "u, of R + T − 1: R · 4u + T · 4u")
 AMPLITUDE = limit(8.0, "u, relative, of r_s, r_p and exp(iφ) of the phase φ")
 # The compensated form's error is smaller, since κ of a float32 k up to 2²³ is exactly a pair.
 RADICAND = limit(10 * 2.0**-53, "over the larger term of a float32 radicand: the error of the promoted form")
-RECIPROCITY = limit(3.0, "u, of T forward over T backward: two roundings of T, and one of 1/k, which adds up to u")
+RECIPROCITY = limit(3.0, "u, of T forward over T backward: two roundings of T, and one of 1/k, at most u")
 DIFFUSE = limit(12.5, "u: two cosines of a node, k and κ change R by 2.12u each, in addition to the 4u of R itself")
 WHITE_FURNACE = limit(2.0**-23, "an ulp of 1: the weights of both lobes add up to R + T")
 IN_AND_OUT = limit(6.0, "u: k² and 1/k², each with k rounded and squared, 3u")
@@ -88,7 +88,7 @@ INDEX_SQUARED = limit(3.0, "u: k rounded and squared")
 
 # Over condition · u of a form at the rounding limit; derived in `stability.derivatives.condition_of`.
 DERIVATIVE = limit(29.0, "error over condition · u: all products of the differentiated form rounded, at their worst")
-ETENDUE = limit(41.0, "relative, over condition · u, with 1/12 cosθi added: both derivatives, both directions")
+ETENDUE = limit(41.0, "relative, over condition · u, with 1/(12 cosθi) added: both derivatives, both directions")
 ROUNDED_DERIVATIVE = limit(1.01, "error over condition · u of what is computed in float64 and rounded once to float32")
 ROUNDED_ETENDUE = limit(3.8, "relative, over condition · u: two vectors rounded, 2, and two directions off unit, √3")
 REFLECTANCE = {

@@ -156,9 +156,9 @@ def accuracy(rows: list[Row]) -> str:
     }
     outside = [name for name in denormal if (name, "llvm float32") in without_budget]
     text = (
-        f"Worst over the rays of those of the {len(REGIMES)} regimes in which the formula has an error bound; "
-        "u = 2⁻²⁴ or 2⁻⁵³; times are\n"
-        f"medians over copying the same bytes and over `{PLAIN}`, with their 95 % intervals."
+        f"The worst ray, and the number of misclassified ones, in those of the {len(REGIMES)} regimes in which the "
+        "formula has an\nerror bound, and in a regime without one (last row); u = 2⁻²⁴ or 2⁻⁵³; times are medians over "
+        f"copying the same bytes\nand over `{PLAIN}`, with their 95 % intervals."
     )
     lines = []
     drawn = {row.subject: f"{row.replay['rays']:,} in {row.replay['regimes']}" for row in by_name.values()}
@@ -168,7 +168,7 @@ def accuracy(rows: list[Row]) -> str:
         lines.append(cells + _cells(by_name.get((subject, "llvm float64")), wide))
     for name in outside:
         single, double = without_budget[name, "llvm float32"], without_budget.get((name, "llvm float64"))
-        cells = [f"worst of `FORMULAS`, `{name}`", "denormal numbers are taken for 0"]
+        cells = [f"most misclassified of `FORMULAS`, `{name}`", "denormal numbers are taken for 0"]
         cells += [f"{single.replay['count']:,} in 1", *_cells(single, columns.values())]
         lines.append(cells + _cells(double, wide))
     heading = ["formula", "source", "rays in regimes", *columns, "float64: worst chord", "in u", "time / copy"]

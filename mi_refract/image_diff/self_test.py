@@ -50,7 +50,7 @@ TERMS = {
     DETECTABLE: "smallest relative difference that `welch` would have seen in a tile, median over the trials",
     RATIO: "above 1 the defect must be seen; tiles noisier than the median one have a larger minimum",
     "missed": "trials in which a method missed a defect that it must see, see the introduction",
-    UNREADABLE: "share of the trials with a file that cannot be read, an error whatever the method",
+    UNREADABLE: "share of the trials whose file cannot be read, an error whatever the method",
     "bound": f"{CONFIDENCE:.0%} upper bound of a rate, exact binomial (Clopper and Pearson)",
     "noise": "standard deviation of a pixel over its mean, median over the image",
 }
@@ -182,6 +182,7 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
         if not always_due:
             clean_tiles.append([block_mean(image, TILE) for image in trial.clean])
             changes.append(np.mean([block_mean(image, TILE) for image in spoilt], 0) - np.mean(clean_tiles[-1], 0))
+    replay["trials"] -= unchanged
     if unchanged == len(trials):
         return Row(STUDY, name, case, setting, reason="left out: it changes nothing in these images")
     if unreadable + unchanged == len(trials):

@@ -151,7 +151,8 @@ def lens(
         radii = (1 / (abs(c) * math.sqrt(1 + k)) for c, k in zip(curvature, conic, strict=True) if c and k > -1)
         raise ValueError(f"radius = {radius:g}: larger than a surface; expected at most {min(radii, default=0):g}")
     if rims[1] < rims[0] or tip_radius < (1 - CLOSE) * radius:
-        text = f"the surfaces meet inside it; expected at most {min(tip_radius, radius):g}, or no radius"
+        most = f"at most {tip_radius:g}" if tip_radius < radius else "a smaller one"
+        text = f"the surfaces meet inside it; expected {most}, or no radius"
         raise ValueError(f"radius = {radius:g}: {text}")
     front = _surface(vertex, rims[0], radius, curvature[0], conic[0])
     back = _surface(vertex + thickness, rims[1], radius, curvature[1], conic[1])

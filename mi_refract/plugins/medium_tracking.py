@@ -66,7 +66,8 @@ class Crossings:
         self.counts: list[Any] = []  # compiled variants: four arrays, indexed by the number of the shape
         if self.vectorised and dr.flag(dr.JitFlag.FreezingScope):  # what such a function counts could not be read
             warn_once(
-                "refract_path: a frozen function cannot tell whether absorption is consistent; expected that it is"
+                "refract_path: a frozen function cannot tell whether absorption is consistent; "
+                "render the scene once without dr.freeze to check it"
             )
         elif self.vectorised:
             for i, shape in enumerate(self.shapes):

@@ -167,8 +167,8 @@ def at_fixed_direction(
     The direction of a delta lobe moves with the parameters, but its probability p must be detached: the derivative of
     the weight f/p is f'/p. The direction ω of any other lobe is detached: d/dx ∫ f dω = ∫ f'(ω)/p(ω) p(ω) dω, where
     ω and p are not differentiated. `own_odds`: lanes in which the BSDF's weight of a delta lobe has the derivative f'/p
-    already, although p is attached. `masked`: lanes of a `mask`, in which this is so for the factor of p that the
-    opacity is.
+    already, although p is attached. `masked`: lanes of `is_opaque_mask`, in which this is so for the factor of p that
+    the opacity is.
     """
     if dr.grad_enabled(bs.pdf):
         opacity = 1 - v.unpolarized_spectrum(bsdf.eval_null_transmission(si, masked))[0]
@@ -187,9 +187,15 @@ def at_fixed_direction(
     return dr.select(smooth, value, weight), dr.select(smooth, dr.detach(d), d), dr.select(smooth, pdf, bs.pdf)
 
 
+def is_opaque_mask(bsdf: BSDF) -> bool:
+    """Whether a BSDF is a `mask` around one without a null lobe: then 1 − `eval_null_transmission` is its opacity."""
+    _, *inner = nested(bsdf)
+    return bsdf_name(bsdf) == "MaskBSDF" and not any(x.flags() & +LOBES.Null for x in inner)
+
+
 def has_own_odds(bsdf: BSDF) -> bool:
     """Whether a BSDF hides a `mask` whose opacity may be differentiated; see `at_fixed_direction`."""
-    if bsdf_name(bsdf) == "MaskBSDF":
+    if is_opaque_mask(bsdf):
         return False
     masks = [inner for inner in nested(bsdf) if bsdf_name(inner) == "MaskBSDF"]
     textures = (child for mask in masks for child in children(mask) if hasattr(child, "is_spatially_varying"))
@@ -220,7 +226,7 @@ class PathLoop:
         self.branch = branch_type(v, features.dispersion, features.absorption)
         self.boundaries = self.ranges(lambda bsdf: bsdf_name(bsdf) in BOUNDARIES) if features.split_depth else []
         self.own_odds = self.ranges(has_own_odds) if self.evaluated else []
-        self.masks = self.ranges(lambda bsdf: bsdf_name(bsdf) == "MaskBSDF") if self.evaluated else []
+        self.masks = self.ranges(is_opaque_mask) if self.evaluated else []
 
     def refuse(self) -> None:
         """ValueError if the absorption along the paths was inconsistent; see `Crossings.refuse`."""

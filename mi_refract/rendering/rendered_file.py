@@ -78,8 +78,8 @@ def read(output: Path, channels: tuple[str, ...], identity: Identity) -> Progres
     if variance_from == SAMPLES and passes < FEW:
         of_colours = variance[..., :colours]
         finite = of_colours[np.isfinite(of_colours)]
-        if finite.any():
-            of_between = float(np.clip(np.nansum(contrasts) / finite.mean(), 0, spp - 1))
+        if finite.any() and (of_samples := float(finite.mean())) > 0:
+            of_between = float(np.clip(np.nansum(contrasts) / of_samples, 0, spp - 1))
         within = variance * (spp - 1 - of_between)
     between = variance * of_between
     progress.base = PassSums(spp, passes, mean * spp, between, within, contrasts=contrasts, colours=colours)

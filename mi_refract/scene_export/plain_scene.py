@@ -81,7 +81,8 @@ class Mesh:
 
     def volume(self) -> float:
         """Return the volume inside a closed mesh, below 0 if its normals point inward."""
-        return float(np.linalg.det(self.triangles()).sum() / 6)
+        triangles = self.triangles()
+        return float(np.linalg.det(triangles - triangles[:1, :1]).sum() / 6)  # far from the origin it would be rounding
 
 
 @dataclass(frozen=True)

@@ -232,6 +232,19 @@ def test_probabilities_of_lobes_are_detached(name, opacity, llvm_variant):
     assert backward == expected and vector(dr.grad(image))[0] == expected
 
 
+def test_a_null_lobe_within_a_mask_is_not_its_opacity(llvm_variant):
+    """A thin pane that reflects an even sky before black: the image does not depend on what it transmits."""
+    pane = {"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0, "specular_transmittance": 0.5}
+    masked = {"type": "mask", "opacity": 0.6, "b": pane}
+    wall = {"type": "rectangle", "to_world": PLACE().translate([0, 0, -1]).scale(50), "bsdf": BLACK}
+    parts = {"pane": {"type": "rectangle", "bsdf": masked}, "wall": wall, "sky": {"type": "constant"}}
+    method = {"type": "refract_path", "max_depth": 3}
+    scene = mi.load_dict({"type": "scene", "integrator": method, "view": camera(12, 2)} | parts)
+    params, (opacity, transmittance) = attached(scene, "opacity.value", "specular_transmittance.value")
+    dr.backward(loss(scene, params, 0, 256))
+    assert grad(params, opacity) > 0 and abs(grad(params, transmittance)) < 1e-6
+
+
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"], indirect=True)
 def test_prb_projective_equals_prb_if_no_edge_moves(variant):
     """Its first part equals `prb`, with the same random numbers. It does not support polarised variants."""

@@ -287,7 +287,7 @@ def test_lamps_aim_at_an_instance_also_after_an_edit_of_its_group(llvm_variant):
 @pytest.mark.parametrize("caustics", ["path", "lamp"])
 @pytest.mark.parametrize("bulb", [{"type": "point", "position": [100, 0, 1]}, SUN], ids=["point", "directional"])
 def test_no_light_passes_by_a_pane_just_above_the_floor(bulb, caustics, llvm_variant):
-    """What a lamp of no size casts through the pane and is seen through it is missing, here as at the origin."""
+    """A lamp of no size: its light on the floor comes and is seen through the pane, so it is in no image."""
     view = camera(to_world=AT_100.look_at([1.2, -1.2, 1], [0, 0, 0], [0, 0, 1]), fov=10)
     parts = {"sensor": view, "lamp": bulb, "ball": pane(0.004), "floor": floor() | {"to_world": AT_100.scale(0.5)}}
     assert dr.all(mi.render(scene(parts, caustics=caustics), spp=16) == 0, axis=None)

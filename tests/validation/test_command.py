@@ -119,7 +119,7 @@ def test_saved_rows_are_used_for_the_same_sources_only(context, tmp_path, monkey
         assert len(calls) == count, name
 
 
-def test_saved_rows_are_used_if_the_machine_can_run_the_same_only(context, tmp_path, monkeypatch):
+def test_saved_rows_are_used_only_if_the_machine_can_run_the_same(context, tmp_path, monkeypatch):
     calls = []
 
     def used(context):
@@ -288,7 +288,7 @@ def test_the_accuracy_table_holds_the_measured_rows_only():
     rows.append(dataclasses.replace(rows[0], subject="wedge", replay={"rays": 52000, "regimes": 13}))
     copies = [dataclasses.replace(r, subject="copy", values={"time / copy": 1.0}, replay={}) for r in rows]
     lines = tables.accuracy([*rows, *copies]).splitlines()
-    assert len(lines) == 7
+    assert len(lines) == 8
     single = ["4.97e-8", "0.834", "3", "1.01 (0.98–1.2)", "1.05"]
     expected = ["`promoted`", "this project", "68,000 in 17", *single, "4.97e-8", "0.834", "1.01 (0.98–1.2)"]
     assert [cell.strip() for cell in lines[-2].split("|")][1:-1] == expected
@@ -296,9 +296,12 @@ def test_the_accuracy_table_holds_the_measured_rows_only():
     changes = {"case": "on a denormal", "values": values | {"TIR misclassified": 1469.0}}
     changes |= {"budgets": {}, "replay": {"count": 4000}}
     denormal = [dataclasses.replace(r, **changes) for r in rows]
+    fewer = values | {"TIR misclassified": 7.0, "worst chord": 0.25}
+    denormal += [dataclasses.replace(r, subject="cross", values=fewer) for r in denormal]
     lines = tables.accuracy([*rows, *denormal]).splitlines()
-    assert len(lines) == 8 and "| 1469 |" in lines[-1]
-    assert lines[-1].startswith("| worst of `FORMULAS`, `on a denormal` |") and "| 4,000 in 1 |" in lines[-1]
+    assert len(lines) == 9 and "of the 18 regimes" in lines[0]
+    assert lines[-1].startswith("| most misclassified of `FORMULAS`, `on a denormal` |")
+    assert "| 4,000 in 1 | 4.97e-8 |" in lines[-1] and "| 1469 |" in lines[-1]
 
 
 def test_a_table_states_every_size_of_its_images():

@@ -257,9 +257,7 @@ def test_glass_that_cannot_be_loaded_is_not_left_out(llvm_variant, monkeypatch):
 def test_an_attached_direction_is_detected(context, monkeypatch):
     """Rough metal fails; glass does not, since the directions of its lobes are attached anyway."""
     metal, glass = gradients.QUICK  # both pass without the defect, see test_contract.py
-    monkeypatch.setattr(
-        path_loop, "at_fixed_direction", lambda v, context, si, bsdf, bs, w, d, active, own: (w, d, bs.pdf)
-    )
+    monkeypatch.setattr(path_loop, "at_fixed_direction", lambda v, context, si, bsdf, bs, w, d, *_: (w, d, bs.pdf))
     (attached,), (through,) = (gradients.rows(replace(context, profile=PROFILES["quick"]), x) for x in (metal, glass))
     assert "off / interval" in attached.broken and attached.values["off"] > 0.05
     assert through.verdict == "pass"

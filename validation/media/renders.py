@@ -41,8 +41,9 @@ TERMS = {
     "slab": "largest relative difference from exp(−σ d)",
     "time / without": "median over alternating warm renders",
     WELCH_ALARMS: "tiles and channels whose means differ; at most one image in 1000 by chance",
-    DETECTABLE: "relative difference of a tile's mean that would have been an alarm, median over tiles, worst channel",
-    DETECTABLE_IMAGE: "the same for the mean of the whole image, median over channels",
+    DETECTABLE: "relative difference of a tile's mean that is detected with a probability of 99 %, median over tiles, "
+    "worst channel",
+    DETECTABLE_IMAGE: "the same for the mean of the whole image",
 }
 METHODS: dict[str, dict[str, Any]] = {"by chance": {}, "both lobes": {"split_depth": 2}}
 Nodes = dict[str, Any]

@@ -40,7 +40,8 @@ TERMS = {
     "reference, test, difference": "dielectric, refract, refract − dielectric: means over the same seeds",
     CHANGED_SHARE: "pixels with a channel that differs by more than 1e-5, same seeds",
     WELCH_ALARMS: "tiles and channels whose means differ, independent seeds; at most one image in 1000 by chance",
-    DETECTABLE: "relative difference of a tile's mean that would have been an alarm, median over tiles, worst channel",
+    DETECTABLE: "relative difference of a tile's mean that is detected with a probability of 99 %, median over tiles, "
+    "worst channel",
     TIME: "median over alternating warm renders; a goal, not a budget, because a busy machine disturbs it; with a "
     "name: of the plugin with that formula; low, high: the 95 % interval",
 }

@@ -174,7 +174,7 @@ def compared(expected: Any, render: Callable[[int], Any], seed: int) -> dict[str
         tests = tile_statistics.compare_stacks(expected, test, tile, limits.INVISIBLE_ALARM, 1e-5)
         alarms, whole = alarms + tests.alarms, tests.levels[0]
         reach = -special.stdtrit(whole.freedom, tests.threshold / 2) * whole.error
-        detectable = float((whole.allowed + reach).max() / expected.mean())  # of the last, the whole image
+        detectable = float((whole.allowed + reach).max() / expected.mean())  # that of SIZE, the last, remains
     noise = [np.var(x, axis=0, ddof=1).mean() for x in (expected, test)]
     ratio = float(noise[1] / noise[0]) if noise[0] else 1.0
     return {"alarms": alarms, "same bits": float(same_bits), "detectable": detectable, "noise": ratio}

@@ -124,7 +124,7 @@ def _text(row: Row | None) -> str:
 #
 # Every system against every check, and a sentence on its errors, from the `rows.json` of a validation. Systems are
 # sorted by their largest backward error, except that of large k, where few are right: it breaks ties. Systems with a
-# wrong answer are last.
+# wrong answer that is not a known deviation are last.
 
 MADE_BY = "python -m validation suite"
 Stored = dict[str, Any]  # a row of rows.json, or a summary of rows

@@ -266,7 +266,8 @@ def critical_angles(
     answers = refract(as_ray_set(rays, call.precision))
     passed = np.zeros(len(angle), bool)
     length = np.linalg.norm(answers.b, axis=1)
-    # Less is along the surface, which signals total reflection. The nearest ray of the grid has cos θ_t ≈ √(8 u).
+    # A direction with a smaller cosine is along the surface, which signals total reflection. The nearest ray of the
+    # grid has cos θ_t ≈ √(8 u).
     along = ALONG * roundoff * np.maximum(1, k[answers.ids])
     through = (answers.b * -rays.n[answers.ids]).sum(1) > along
     passed[answers.ids] = through & (length > 0.5) & (True if answers.transmitted is None else answers.transmitted)
