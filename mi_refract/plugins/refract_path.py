@@ -6,7 +6,7 @@
 | `hide_emitters` | boolean | as in `path` (false) |
 | `samples_per_pass`, `block_size` | integer | as in `path` |
 | `timeout` | number | as in `path`: seconds, in scalar variants (-1: no limit) |
-| `split_depth` | integer | both lobes are followed at so many boundaries, counted from the camera (0) |
+| `split_depth` | integer | both lobes are followed at boundaries among so many first surfaces of delta lobes (0) |
 | `split_weight` | number | a lobe whose share of the light would be smaller is not followed (0.01) |
 | `deterministic` | boolean | no lobe is chosen by chance; lobes with a share below `split_weight` are dropped (false) |
 | `caustics` | word | `path`, `lamp` or `auto`: how light through glass onto other surfaces is found (`auto`) |
