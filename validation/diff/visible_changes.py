@@ -79,13 +79,16 @@ def drawn(shapes: list[Shape], samples: int = SAMPLES, turn: float = 0.0, shift:
     grid = (np.arange(samples) + 0.5) / samples - 0.5
     dx, dy = (x.ravel() for x in np.meshgrid(grid, grid))
     dx, dy = dx * np.cos(turn) - dy * np.sin(turn) + 0.5 + shift, dx * np.sin(turn) + dy * np.cos(turn) + 0.5
-    x, y = COLUMNS[..., None] + dx, ROWS[..., None] + dy
-    codes = np.zeros((*x.shape, 3))
-    for kind, left, top, radius, angle, colour in shapes:
+    background, *others = shapes
+    codes = np.tile(background[-1], (SIZE, SIZE, samples**2, 1))
+    for kind, left, top, radius, angle, colour in others:
+        reach = 1.25 * radius + 3  # hypot(1, 0.7) radius or hypot(radius, 0.5), and to the corner of a sample's pixel
+        near = tuple(slice(max(0, int(at - reach)), max(0, int(at + reach))) for at in (top, left))
+        x, y = COLUMNS[near][..., None] + dx - left, ROWS[near][..., None] + dy - top
         cos, sin = np.cos(angle), np.sin(angle)
-        u, v = (x - left) * cos + (y - top) * sin, (y - top) * cos - (x - left) * sin
+        u, v = x * cos + y * sin, y * cos - x * sin
         box = (np.abs(u) < radius) & (np.abs(v) < (0.7 * radius if kind == BOX else 0.5))
-        codes[u * u + v * v < radius**2 if kind == DISK else box] = colour
+        codes[near][u * u + v * v < radius**2 if kind == DISK else box] = colour
     return np.asarray(codes.mean(2))
 
 
