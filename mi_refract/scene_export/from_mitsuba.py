@@ -94,7 +94,8 @@ def _camera(sensor: Node) -> Camera:
         raise sensor.error("no film", "an hdrfilm with an rfilter box")
     sensor.ignore("near_clip", "far_clip", "focus_distance")
     axes, origin = frame[:3, :3] / np.linalg.norm(frame[:3, :3], axis=0), frame[:3, 3]
-    (x, y, z), (to_x, to_y, to_z), (up_x, up_y, up_z) = np.stack([origin, origin + axes[:, 2], axes[:, 1]]).tolist()
+    # As far away as the coordinates are large: Cycles and LuxCore compute target − origin from points in float32.
+    target = origin + max(1.0, np.linalg.norm(origin)) * axes[:, 2]
     fov, axis = sensor.value(float, "fov"), sensor.value(str, "fov_axis", "x")
     if not 0 < fov < 180:
         raise sensor.error(f"fov = {fov}", "an angle of 0 to 180 degrees")
@@ -104,7 +105,7 @@ def _camera(sensor: Node) -> Camera:
         raise sensor.error(f"fov_axis = {axis!r}", ", ".join(lengths))
     fov_x = math.degrees(2 * math.atan(math.tan(math.radians(fov) / 2) * width / lengths[axis]))
     sensor.finish()
-    return Camera((x, y, z), (to_x, to_y, to_z), (up_x, up_y, up_z), fov_x, width, height)
+    return Camera(_triple(origin), _triple(target), _triple(axes[:, 1]), fov_x, width, height)
 
 
 def _rotation(emitter: Node) -> NDArray[np.float64]:

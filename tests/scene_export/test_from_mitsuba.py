@@ -131,6 +131,15 @@ def test_field_of_view(scene, axis, tmp_path):
         np.testing.assert_allclose(*rays, atol=1e-6)
 
 
+@pytest.mark.parametrize("distance", [1e-3, 1e2, 1e5, 1e9])
+def test_the_direction_of_a_camera_survives_float32(distance, scene):
+    """Cycles and LuxCore compute it from points in float32."""
+    origin = distance * np.array([0.61, -0.7, 0.37])
+    camera = from_mitsuba.load(scene("0,1,-40", ", ".join(map(repr, origin.tolist()))), level=0).camera
+    direction = np.subtract(camera.target, camera.origin, dtype=np.float32)
+    np.testing.assert_allclose(direction / np.linalg.norm(direction), -origin / np.linalg.norm(origin), atol=2**-22)
+
+
 def hit(scene, ray):
     """Return seven numbers of a ray's hit: the point, a code, and the index ratio, a colour or a radiance.
 
