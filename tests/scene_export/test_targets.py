@@ -10,6 +10,7 @@ import os
 import re
 import runpy
 import sys
+import tracemalloc
 import types
 from pathlib import Path
 from unittest import mock
@@ -282,6 +283,21 @@ def test_renders_of_an_export_are_equal_and_another_index_is_detected(tmp_path):
     assert material in text
     path.write_text(text.replace(material, '<float name="int_ior" value="1.8"/>'))
     assert methods.compare("welch", first, renders(path, 100), tile=16).verdict == Verdict.DIFFERENT
+
+
+def test_a_map_is_resampled_in_strips_up_to_a_size(monkeypatch):
+    """16 times finer at once, a map of 1024 × 512 needed 31 GB."""
+    axes, rng = targets.shared_files.OWN_AXES, np.random.default_rng(7)
+    maps = [Environment(rng.random((*size, 3), np.float32), np.eye(3)) for size in ((33, 64), (2, 4000), (2, 20000))]
+    tracemalloc.start()
+    resampled = targets.shared_files.longitude_latitude(maps[0], axes)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert resampled.shape == (512, 1024, 3) and peak < 80e6
+    monkeypatch.setattr(targets.shared_files, "STRIP", 2**30)
+    assert (resampled == targets.shared_files.longitude_latitude(maps[0], axes)).all()
+    sizes = [targets.shared_files.longitude_latitude(x, axes).shape[:2] for x in maps[1:]]
+    assert sizes == [(4, 16000), (1, 20000)]
 
 
 @pytest.mark.parametrize("target", ["povray", "gltf"])

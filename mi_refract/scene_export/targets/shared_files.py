@@ -38,6 +38,8 @@ OWN_AXES: Axes = (0, 0, -1), (1, 0, 0), (0, 1, 0)  # Mitsuba's
 # and last row at the poles. A map is linear between its texels. A finer map reproduces this, except in cells that
 # contain a texel of the original map.
 FINER = 16
+LARGEST = 16384  # longest side of a finer map: a common limit of textures, and 1.6 GB; a longer original keeps its size
+STRIP = 2**18  # texels that are computed at a time: intermediate results of 60 MB
 LIGHT_INSIDE = (
     "Radiance is not scaled by the square of the index inside glass. The image is the same if camera, lights and "
     "diffuse surfaces are all in the outermost medium."
@@ -175,18 +177,22 @@ def sky_exr(plain: PlainScene, axes: Axes) -> Files:
 
 def longitude_latitude(environment: Environment, axes: Axes) -> NDArray[np.float32]:
     """Return the map (H, W, 3) for a renderer with these axes, whose pixels are at their centres."""
-    height = FINER * (environment.pixels.shape[0] - 1)
-    width = FINER * environment.pixels.shape[1]
-    v, u = ((np.arange(count) + 0.5) / count for count in (height, width))
-    theta, phi = np.pi * v[:, None], 2 * np.pi * u
-    directions = np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta) + 0 * phi
-    return radiance(environment, np.stack(directions, axis=-1) @ np.array(axes, float)).astype(np.float32)
+    rows, columns = environment.pixels.shape[:2]
+    finer = max(1, min(FINER, LARGEST // max(rows, columns)))
+    height, width = finer * (rows - 1), finer * columns
+    result, strip = np.empty((height, width, 3), np.float32), max(1, STRIP // width)
+    phi = 2 * np.pi * ((np.arange(width) + 0.5) / width)
+    for top in range(0, height, strip):
+        theta = np.pi * ((np.arange(top, min(top + strip, height))[:, None] + 0.5) / height)
+        directions = np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta) + 0 * phi
+        result[top : top + strip] = radiance(environment, np.stack(directions, axis=-1) @ np.array(axes, float))
+    return result
 
 
 def radiance(environment: Environment, directions: Array) -> Array:
     """Return the radiance (…, 3) in these directions of the scene (…, 3), of any length but 0."""
     x, y, z = np.moveaxis(directions @ environment.rotation, -1, 0)
-    pixels = environment.pixels.astype(float)
+    pixels = environment.pixels
     height, width = pixels.shape[:2]
     column = np.arctan2(x, -z) / (2 * np.pi) * width - 0.5
     row = np.arctan2(np.hypot(x, z), y) / np.pi * (height - 1)
