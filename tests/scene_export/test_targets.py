@@ -351,9 +351,10 @@ def test_a_target_that_always_samples_lights_refuses_paths_of_one_segment(target
     write_export("radiance", tmp_path / "new", depth=1)
 
 
-def test_luxcore_hides_nothing_near_the_camera(tmp_path):
+def test_luxcore_hides_nothing_near_the_camera_or_far_from_it(tmp_path):
     text = (write_export("luxcore", tmp_path / "new") / "scene.scn").read_text()
     assert 0 < float(re.search(r"cliphither = (\S+)", text)[1]) <= 1e-9
+    assert float(re.search(r"clipyon = (\S+)", text)[1]) >= 1e30  # the largest coordinate of an export
 
 
 @pytest.mark.parametrize("words, seeds", [((), [1]), (("--seeds", "4", "2", "--threads", "2"), [4, 2])])
@@ -376,7 +377,7 @@ def test_cycles_renders_each_seed_as_a_plain_path_tracer(words, seeds, tmp_path,
     assert (render.use_compositing, render.use_sequencer) == (False, False)
     assert cycles.min_light_bounces == cycles.max_bounces == 10
     lens = bpy.data.cameras.made["camera"]
-    assert 0 < lens.clip_start <= 1e-6 and lens.clip_end >= 1e6
+    assert 0 < lens.clip_start <= 1e-6 and lens.clip_end >= 1e30
     deep = fake_bpy.run(write_export("cycles", tmp_path / "deep", depth=5000), monkeypatch).context.scene.cycles
     assert deep.max_bounces == deep.transmission_bounces == 1024  # Blender's limit
 

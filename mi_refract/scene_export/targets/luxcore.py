@@ -50,7 +50,7 @@ def files(plain: PlainScene) -> Files:
         "fieldofview": [camera.fov_x_degrees],
         "screenwindow": [-1, 1, -height - row, height - row],
         "cliphither": [1e-9],
-        "clipyon": [1e6],
+        "clipyon": [1e30],
         "autofocus.enable": [0],
     }
     lines = ['scene.camera.type = "perspective"', *(f"scene.camera.{key} = {numbers(view[key])}" for key in view)]

@@ -144,7 +144,7 @@ def camera(entry):
     lens = bpy.data.cameras.new("camera")
     lens.sensor_fit = "HORIZONTAL"
     lens.angle = math.radians(entry["fov_x_degrees"])
-    lens.clip_start, lens.clip_end = 1e-6, 1e6  # Blender has no smaller start
+    lens.clip_start, lens.clip_end = 1e-6, 1e30  # Blender has no smaller start
     item = bpy.data.objects.new("camera", lens)
     axes = Matrix((right, back.cross(right), back)).transposed().to_4x4()
     item.matrix_world = Matrix.Translation(origin) @ axes
