@@ -216,6 +216,18 @@ def test_an_export_has_mitsubas_rays_surfaces_indices_lights_and_sky(
     np.testing.assert_allclose(export.sky(directions), expected, atol=tolerance)
 
 
+@pytest.mark.parametrize("target", READERS)
+@pytest.mark.parametrize("fov", [0.2, 175.0])
+def test_narrow_and_wide_fields_of_view(target, fov, tmp_path, monkeypatch):
+    """Blender's `Camera.angle` is limited to 0.367 … 172.85 degrees."""
+    scene = dataclasses.replace(plain(GLASS), camera=dataclasses.replace(CAMERA, fov_x_degrees=fov))
+    targets.write(scene, target, tmp_path / "new")
+    ray = READERS[target](tmp_path / "new", monkeypatch).ray
+    left, right = (ray(x, 0.5)[1] for x in (0, 1))
+    angle = np.arctan2(np.linalg.norm(np.cross(left, right)), np.dot(left, right))
+    assert np.degrees(angle) == pytest.approx(fov, rel=1e-6)
+
+
 EMITTERS = {
     "bulb": """<emitter type="point" id="bulb"><point name="position" x="3" y="2" z="1"/>
       <rgb name="intensity" value="3, 2, 0.5"/></emitter>""",

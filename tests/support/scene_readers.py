@@ -250,7 +250,8 @@ def cycles(folder, monkeypatch):
     scene, data = bpy.context.scene, bpy.data
     matrix, lens = scene.camera.matrix_world, scene.camera.data
     assert lens is data.cameras.made["camera"] and lens.sensor_fit == "HORIZONTAL"
-    size, half_width = (scene.render.resolution_x, scene.render.resolution_y), np.tan(lens.angle / 2)
+    assert lens.sensor_width >= 1 and lens.lens >= 1, "Blender's limits"
+    size, half_width = (scene.render.resolution_x, scene.render.resolution_y), lens.sensor_width / (2 * lens.lens)
 
     def ray(x, y):
         local = np.array([(2 * x - 1) * half_width, (1 - 2 * y) * half_width * size[1] / size[0], -1])

@@ -143,7 +143,9 @@ def camera(entry):
     right = up.cross(back).normalized()
     lens = bpy.data.cameras.new("camera")
     lens.sensor_fit = "HORIZONTAL"
-    lens.angle = math.radians(entry["fov_x_degrees"])
+    # Not by `lens.angle`, which Blender limits to 0.367 … 172.85 degrees; the least width and focal length are 1.
+    ratio = 2 * math.tan(math.radians(entry["fov_x_degrees"]) / 2)  # of the sensor's width to the focal length
+    lens.sensor_width, lens.lens = max(1, ratio), max(1, 1 / ratio)
     lens.clip_start, lens.clip_end = 1e-6, 1e30  # Blender has no smaller start
     item = bpy.data.objects.new("camera", lens)
     axes = Matrix((right, back.cross(right), back)).transposed().to_4x4()
