@@ -458,6 +458,16 @@ def test_raysect_has_equal_weights_bands_and_dispersion(tmp_path, monkeypatch):
     assert script["glass"](entry | {"schott": "SF11"})[1] == "of SF11"
 
 
+def test_raysect_does_not_scale_a_scene_of_size_0(tmp_path, monkeypatch):
+    """A sky, seen from the origin."""
+    camera = dataclasses.replace(CAMERA, origin=(0.0, 0.0, 0.0), target=(0.0, 0.0, -1.0))
+    targets.write(dataclasses.replace(plain(), camera=camera), "raysect", tmp_path / "new")
+    _, script = fake_raysect.run(tmp_path / "new", monkeypatch)
+    scene = json.loads((tmp_path / "new" / "scene.json").read_text())
+    place = script["camera"]("world", scene, types.SimpleNamespace(spp=1, band=None), "pipeline").transform[:3, 3]
+    assert place.tolist() == [0, 0, 0]
+
+
 @pytest.mark.parametrize("size", [1.0, 100.0])
 def test_raysect_scales_the_largest_coordinate_to_a_half(size, tmp_path, monkeypatch):
     """The largest coordinate is the camera's or a mesh's: both are scaled."""

@@ -82,9 +82,9 @@ def build(plain, folder):
 
 
 def scale(plain, folder):
-    """Return the factor that scales the largest coordinate of the scene to SIZE."""
+    """Return the factor that scales the largest coordinate of the scene, 1 if all are 0, to SIZE."""
     parts = [triangles(folder / entry["file"])[0] for entry in plain["meshes"].values()]
-    return SIZE / np.abs(np.concatenate([[plain["camera"]["origin"]], *parts])).max()
+    return SIZE / (np.abs(np.concatenate([[plain["camera"]["origin"]], *parts])).max() or 1.0)
 
 
 def triangles(path):
