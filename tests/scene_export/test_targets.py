@@ -394,8 +394,9 @@ def test_cycles_renders_each_seed_as_a_plain_path_tracer(words, seeds, tmp_path,
     assert deep.max_bounces == deep.transmission_bounces == 1024  # Blender's limit
 
 
-@pytest.mark.parametrize("words, seeds", [((), [1]), (("--seeds", "4", "2", "--threads", "3", "--spp", "9"), [4, 2])])
+@pytest.mark.parametrize("words, seeds", [((), [1]), (("--seeds", "4", "0", "--threads", "3", "--spp", "9"), [4, 0])])
 def test_luxcore_renders_each_seed_into_its_own_file(words, seeds, tmp_path, monkeypatch, capsys):
+    """LuxCore takes a seed of 0 for 1, so it gets the next number."""
     folder, sessions, waits = write_export("luxcore", tmp_path / "new"), [], []
 
     class Properties(dict):
@@ -429,7 +430,7 @@ def test_luxcore_renders_each_seed_into_its_own_file(words, seeds, tmp_path, mon
     files = [str(tmp_path / "out" / f"seed{seed}.exr") for seed in seeds]
     assert capsys.readouterr().out.split() == files and 0 < max(waits) < 1
     for session, seed, file in zip(sessions, seeds, files, strict=True):
-        expected = {"name": "scene.cfg", "renderengine.seed": seed, "film.outputs.0.filename": file}
+        expected = {"name": "scene.cfg", "renderengine.seed": seed + 1, "film.outputs.0.filename": file}
         expected |= {"batch.haltspp": 9, "native.threads.count": 3} if words else {"batch.haltspp": 256}
         assert session.config == expected
         waiting = ["HasDone", "UpdateStats"] * 2
