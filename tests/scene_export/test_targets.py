@@ -328,12 +328,13 @@ def test_povray(tmp_path):
     pane = Mesh("pane", *tessellation.rectangle(), GLASS)
     (grey,) = plain(Diffuse((0.5, 0.0, 0.0))).meshes
     apart = Mesh("apart", BALL[0] - 9, BALL[1], Glass(1.5, 1.33))
+    drop = Mesh("drop", BALL[0] + 9, BALL[1], Glass(1.33, 1.25))
     for mesh, message in (
         (pane, "pane: glass with an open"),
         (grey, "ball_0: a diffuse surface"),
-        (apart, "apart: ext_ior = 1.33; no medium has that index; expected 1"),
+        (apart, "apart: ext_ior = 1.33; expected 1.25, the index of the medium around it"),
     ):
-        meshes = mesh, Mesh("ball", *BALL, GLASS)
+        meshes = mesh, Mesh("ball", *BALL, GLASS), drop
         with pytest.raises(ValueError, match=message):
             targets.write(PlainScene("bad", meshes, (1.0, 1.0, 1.0), CAMERA, 8), "povray", tmp_path / "new")
     assert not list(tmp_path.iterdir())

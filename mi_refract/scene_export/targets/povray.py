@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from ..plain_scene import Diffuse, Environment, Glass, Light, Mesh, PlainScene
-from ..tessellation import is_closed
+from ..tessellation import encloses, is_closed
 from .shared_files import LIGHT_INSIDE, Files, numbers, outermost_index, outward, readme, sky_exr
 
 COMMANDS = """
@@ -40,11 +40,15 @@ def files(plain: PlainScene) -> Files:
     # In POV-Ray the outermost medium has index 1: indices are relative to it.
     plain = outward(plain)
     outside = outermost_index(plain)
-    media = {outside, *(mesh.material.int_ior for mesh in plain.meshes if isinstance(mesh.material, Glass))}
-    for mesh in plain.meshes:  # POV-Ray has one index per body
-        if isinstance(mesh.material, Glass) and mesh.material.ext_ior not in media:
-            text = f"{plain.name}: {mesh.name}: ext_ior = {mesh.material.ext_ior}; no medium has that index"
-            raise ValueError(f"{text}; expected {' or '.join(map(str, sorted(media)))}")
+    # POV-Ray has one index per body. The medium around a body is the smallest other body that encloses it.
+    meshes = sorted(plain.meshes, key=Mesh.volume)
+    bodies = [(mesh, glass) for mesh in meshes if isinstance(glass := mesh.material, Glass)]
+    for mesh, glass in bodies:
+        others = (x for body, x in bodies if body is not mesh and encloses(body.triangles(), mesh.vertices[0]))
+        around = next((other.int_ior for other in others), outside)
+        if glass.ext_ior != around:
+            text = f"{plain.name}: {mesh.name}: ext_ior = {glass.ext_ior}"
+            raise ValueError(f"{text}; expected {around}, the index of the medium around it")
     if isinstance(plain.sky, Environment):
         sky = 'sky_sphere { pigment { image_map { exr "sky.exr" gamma 1.0 map_type 1 interpolate 2 } } }\n'
     else:
