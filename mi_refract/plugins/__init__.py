@@ -26,12 +26,13 @@ import mitsuba  # noqa: E402, F401
 from .index_parameter import PLUGIN, read_ior, read_medium  # noqa: E402
 from .medium_tracking import check_integrator  # noqa: E402
 from .refract_path import INTEGRATOR  # noqa: E402
-from .scene_features import SceneFeatures, inspect, missing_light  # noqa: E402
+from .scene_features import SceneFeatures, all_shapes, inspect, missing_light  # noqa: E402
 
 __all__ = [
     "INTEGRATOR",
     "PLUGIN",
     "SceneFeatures",
+    "all_shapes",
     "check_integrator",
     "film",
     "inspect",

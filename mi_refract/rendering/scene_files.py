@@ -93,7 +93,9 @@ def load_scene(
 
 def formulas_in(scene: Scene) -> list[str]:
     """Return the formulas of the `refract` BSDFs in a scene, sorted; "promoted (auto)" if the plugin chose it."""
-    texts = (str(shape.bsdf()) for shape in scene.shapes())
+    from mi_refract.plugins import all_shapes
+
+    texts = (str(shape.bsdf()) for shape in all_shapes(scene))
     return sorted({name for text in texts for name in re.findall(r"Refract\[.*?formula = (.+?),\n", text, re.DOTALL)})
 
 

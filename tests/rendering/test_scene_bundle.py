@@ -226,6 +226,15 @@ def test_formulas_in_a_scene_are_those_of_its_refract_bsdfs(bsdf, formulas):
     assert formulas_in(load_scene(NESTED, {"res": "8", "bsdf": bsdf})) == formulas
 
 
+def test_formulas_in_a_scene_include_those_of_instances(tmp_path):
+    (tmp_path / "scene.xml").write_text(
+        ABSORBING.replace("PARAMETER", '<string name="formula" value="cross"/>')
+        .replace('<shape type="sphere"', '<shape type="shapegroup" id="group"><shape type="sphere"')
+        .replace("</scene>", '</shape><shape type="instance"><ref id="group"/></shape></scene>')
+    )
+    assert formulas_in(load_scene(tmp_path / "scene.xml")) == ["cross"]
+
+
 @pytest.mark.parametrize(
     ("parameter", "defines", "message"),
     [
