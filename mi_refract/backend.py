@@ -2,7 +2,8 @@
 
 Mitsuba's wheel does not contain libLLVM, and not every libLLVM works: Dr.Jit rejects LLVM 14, and LLVM 15 and 16 abort
 the process (without an exception) in the first kernel that computes a minimum. So each library is first tried in a
-separate process, and the result is stored in `$XDG_CACHE_HOME/mi_refract/backend.json`.
+separate process. If it works or crashes, this is stored in `$XDG_CACHE_HOME/mi_refract/backend.json`; an error may have
+another cause, such as a limit of memory, and the next process tries again.
 
 Dr.Jit loads a libLLVM when it is imported, and no other one later. So call `activate` before Dr.Jit is imported; this
 module needs only the standard library. Afterwards, a change of the library needs a new process, as started by
@@ -297,7 +298,7 @@ def _try(path: str) -> Library:
 
 
 def _probe(name: str, environment: dict[str, str]) -> tuple[str, bool]:
-    """(defect, lasting) of a backend, tried in a separate process. A lasting defect would occur again."""
+    """(defect, lasting) of a backend, tried in a separate process. A lasting result would occur again."""
     with temporary_folder() as folder:
         # With an empty kernel cache, so that the kernels are compiled.
         own = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "DRJIT_CACHE_DIR": str(folder)}
@@ -327,13 +328,13 @@ def _probe(name: str, environment: dict[str, str]) -> tuple[str, bool]:
     # Report Dr.Jit's own message if it rejected the library, else the last line.
     lines = [line.strip() for line in result.stderr.splitlines() if line.strip()] or ["no answer"]
     if "libcuda.so.1: cannot open" in lines[-1]:
-        return "no NVIDIA driver: libcuda.so.1 not found", True
+        return "no NVIDIA driver: libcuda.so.1 not found", False
     if lines[-1] != "refused":
-        return lines[-1][:200], True
+        return lines[-1][:200], False
     # "jit_find_library(): Unable to load "x": x: invalid ELF header!", "jit_llvm_init(): ... too old. The Dr.Jit ..."
     message = next((line for line in lines[:-1] if name in line or name == "llvm"), "no message")
     message = re.sub(r'^(\w+\(\): )?(Unable to load "[^"]*": [^:]*: )?', "", message)
-    return f"refused by Dr.Jit: {message.split('. ')[0].rstrip('.! ')[:200]}", True
+    return f"refused by Dr.Jit: {message.split('. ')[0].rstrip('.! ')[:200]}", False
 
 
 # Stored results ------------------------------------------------------------------------------------------------

@@ -71,7 +71,7 @@ def probed(tmp_path, monkeypatch):
     monkeypatch.setenv(backend.CHOICE, str(library))
     monkeypatch.delenv(backend.OWN_CHOICE, raising=False)
 
-    def probe(code="import sys; sys.exit('is made up')"):
+    def probe(code="import os; os.abort()"):
         (modules / "drjit.py").write_text(f"open({str(log)!r}, 'a').write('1')\n{code}")
         (entry,) = backend.libraries()
         assert entry.path == str(library) and entry.works == (not entry.defect)
@@ -81,7 +81,7 @@ def probed(tmp_path, monkeypatch):
 
 
 WORKS = "print('works'); import os, sys; sys.stdout.flush(); os._exit(0)"
-MADE_UP = "is made up"
+CRASH = "ends the process in Dr.Jit's kernels (SIGABRT)"
 
 
 @pytest.mark.parametrize(
@@ -104,11 +104,12 @@ def test_files_that_are_not_llvm_are_defective(tmp_path, content, defect, monkey
         ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "SIGSEGV", True),
         ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "SIGKILL", False),
         ("import time; print('works', flush=True); time.sleep(60)", "longer than", False),
-        ("raise RuntimeError('first\\nsecond')", "second", True),
-        ("import os; os._exit(0)", "no answer", True),
+        ("raise RuntimeError('first\\nsecond')", "second", False),
+        ("import sys; sys.exit('refused')", "refused by Dr.Jit: no message", False),
+        ("import os; os._exit(0)", "no answer", False),
         (WORKS, "", True),
     ],
-    ids=["abort", "segmentation fault", "killed", "hangs", "raises", "silent", "works"],
+    ids=["abort", "segmentation fault", "killed", "hangs", "raises", "refused", "silent", "works"],
 )
 def test_lasting_results_of_a_probe_are_stored(probed, monkeypatch, code, defect, lasting):
     monkeypatch.setattr(backend, "TIMEOUT", 3.0 if "sleep" in code else 60.0)
@@ -123,7 +124,7 @@ def test_lasting_results_of_a_probe_are_stored(probed, monkeypatch, code, defect
 
 @pytest.mark.parametrize("change", ["content", "time", "drjit"])
 def test_changes_cause_a_new_probe(probed, monkeypatch, change):
-    assert probed() == probed() == (MADE_UP, 1)
+    assert probed() == probed() == (CRASH, 1)
     library = Path(os.environ[backend.CHOICE])
     if change == "content":
         state = library.stat()
@@ -141,14 +142,14 @@ def test_a_damaged_cache_counts_as_empty(probed, content, tmp_path):
     cache = tmp_path / "cache" / "mi_refract" / "backend.json"
     cache.parent.mkdir(parents=True)
     cache.write_text(content)
-    assert probed() == probed() == (MADE_UP, 1)
-    assert list(json.loads(cache.read_text()).values()) == [MADE_UP] and list(cache.parent.iterdir()) == [cache]
+    assert probed() == probed() == (CRASH, 1)
+    assert list(json.loads(cache.read_text()).values()) == [CRASH] and list(cache.parent.iterdir()) == [cache]
 
 
 def test_a_cache_that_cannot_be_written(probed, monkeypatch, tmp_path):
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert [probed(), probed()] == [(MADE_UP, 1), (MADE_UP, 2)]
+    assert [probed(), probed()] == [(CRASH, 1), (CRASH, 2)]
 
 
 # Choice
@@ -158,7 +159,7 @@ def test_the_users_choice_is_the_only_candidate(probed):
     probed()
     here = backend.llvm()
     assert not here.usable
-    assert here.reason.startswith(f"{backend.CHOICE}={os.environ[backend.CHOICE]}: {MADE_UP}; expected ")
+    assert here.reason.startswith(f"{backend.CHOICE}={os.environ[backend.CHOICE]}: {CRASH}; expected ")
 
 
 def test_the_packages_own_choice_and_no_library(probed, monkeypatch):
@@ -167,7 +168,7 @@ def test_the_packages_own_choice_and_no_library(probed, monkeypatch):
     monkeypatch.setenv(backend.OWN_CHOICE, library)
     monkeypatch.setattr(backend, "candidates", lambda: [library, library])
     assert [entry.path for entry in backend.libraries()] == [library, library]
-    assert backend.llvm().reason.startswith(f"libLLVM 19.1: {MADE_UP}; libLLVM 19.1: ")
+    assert backend.llvm().reason.startswith(f"libLLVM 19.1: {CRASH}; libLLVM 19.1: ")
     backend.llvm.cache_clear()
     monkeypatch.setattr(backend, "candidates", list)
     here = backend.llvm()
