@@ -226,7 +226,7 @@ def _loaded() -> set[str] | None:
         maps = Path("/proc/self/maps").read_text()
     except OSError:
         return None
-    return {os.path.realpath(path) for path in re.findall(r"(/\S*)$", maps, re.MULTILINE) if _version(path) is not None}
+    return {os.path.realpath(path) for path in re.findall(r"(/.*)$", maps, re.MULTILINE) if _version(path) is not None}
 
 
 def _set_library(backend: Backend) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import mmap
 import os
 import subprocess
 import sys
@@ -48,6 +49,19 @@ def test_candidates_are_sorted_by_version_and_have_llvms_c_interface(tmp_path, m
         (tmp_path / name).touch()
     monkeypatch.setenv("LD_LIBRARY_PATH", str(tmp_path))
     assert [Path(path).name for path in backend.candidates() if path.startswith(str(tmp_path))] == versions
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="the system does not list loaded files")
+@pytest.mark.parametrize("folder", ["lib", "Jane Doe"])
+def test_a_library_that_is_loaded_is_the_first_candidate(folder, tmp_path, monkeypatch):
+    place = tmp_path / folder
+    place.mkdir()
+    for version in ("99", "100"):
+        (place / f"libLLVM.so.{version}").write_text("mapped")
+    monkeypatch.setenv("LD_LIBRARY_PATH", str(place))
+    with (place / "libLLVM.so.99").open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ):
+        found = [Path(path).name for path in backend.candidates() if path.startswith(str(place))]
+    assert found == ["libLLVM.so.99", "libLLVM.so.100"]
 
 
 def test_candidates_on_windows_come_from_path(tmp_path, monkeypatch):
