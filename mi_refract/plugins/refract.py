@@ -5,7 +5,7 @@
 | `int_ior`, `ext_ior` | number, name | index inside (`bk7`, which is 1.5046) and outside (`air`) | `eta` | yes |
 | | dispersive material | a text of `mi_refract.media`, such as `SCHOTT:N-BK7` | `int_ior_B1`, … | yes |
 | | spectrum | index by wavelength, in spectral variants | `int_ior_n_360`, … | yes |
-| | texture | index by point; a missing mesh attribute is an error of `refract_path`, else a warning | yes | yes |
+| | texture | index by point; a missing mesh attribute is an error, or a warning (below) | yes | yes |
 | `eta` | number | int_ior / ext_ior, only by `mi.traverse` | yes | yes |
 | `specular_reflectance`, `specular_transmittance` | number, spectrum, texture | tint of the lobe, ≥ 0 (1) | yes | yes |
 | `int_absorption`, `ext_absorption` | number, spectrum | σ of the medium on that side, per length (0) | yes | yes |
@@ -22,6 +22,9 @@ texture makes such a ratio, its light is lost. `auto` is the fastest formula tha
 µm. `refract_<formula>` is the same plugin with that formula.
 
 With integrators other than `refract_path`, and in RGB and mono variants, a dispersive index is its value at the d line.
+
+With integrators other than `refract_path`, absorption and a missing mesh attribute are errors in scalar variants, and
+in the others if Dr.Jit evaluates loops and calls; in symbolic ones, the default, they are warnings.
 """
 
 from __future__ import annotations
