@@ -2,8 +2,8 @@
 
 Mitsuba's wheel does not contain libLLVM, and not every libLLVM works: Dr.Jit rejects LLVM 14, and LLVM 15 and 16 abort
 the process (without an exception) in the first kernel that computes a minimum. So each library is first tried in a
-separate process. If it works or crashes, this is stored in `$XDG_CACHE_HOME/mi_refract/backend.json`; an error may have
-another cause, such as a limit of memory, and the next process tries again.
+separate process. That it works, crashes or is too old is stored in `$XDG_CACHE_HOME/mi_refract/backend.json`. Other
+errors may have another cause, such as a limit of memory, so the next process tries again.
 
 Dr.Jit loads a libLLVM when it is imported, and no other one later. So call `activate` before Dr.Jit is imported; this
 module needs only the standard library. Afterwards, a change of the library needs a new process, as started by
@@ -334,7 +334,7 @@ def _probe(name: str, environment: dict[str, str]) -> tuple[str, bool]:
     # "jit_find_library(): Unable to load "x": x: invalid ELF header!", "jit_llvm_init(): ... too old. The Dr.Jit ..."
     message = next((line for line in lines[:-1] if name in line or name == "llvm"), "no message")
     message = re.sub(r'^(\w+\(\): )?(Unable to load "[^"]*": [^:]*: )?', "", message)
-    return f"refused by Dr.Jit: {message.split('. ')[0].rstrip('.! ')[:200]}", False
+    return f"refused by Dr.Jit: {message.split('. ')[0].rstrip('.! ')[:200]}", "too old" in message
 
 
 # Stored results ------------------------------------------------------------------------------------------------

@@ -120,10 +120,11 @@ def test_files_that_are_not_llvm_are_defective(tmp_path, content, defect, monkey
         ("import time; print('works', flush=True); time.sleep(60)", "longer than", False),
         ("raise RuntimeError('first\\nsecond')", "second", False),
         ("import sys; sys.exit('refused')", "refused by Dr.Jit: no message", False),
+        ("import sys; sys.exit('jit_llvm_init(): LLVM is too old.\\nrefused')", "LLVM is too old", True),
         ("import os; os._exit(0)", "no answer", False),
         (WORKS, "", True),
     ],
-    ids=["abort", "segmentation fault", "killed", "hangs", "raises", "refused", "silent", "works"],
+    ids=["abort", "segmentation fault", "killed", "hangs", "raises", "refused", "too old", "silent", "works"],
 )
 def test_lasting_results_of_a_probe_are_stored(probed, monkeypatch, code, defect, lasting):
     monkeypatch.setattr(backend, "TIMEOUT", 3.0 if "sleep" in code else 60.0)
