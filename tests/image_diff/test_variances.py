@@ -11,7 +11,7 @@ from scipy import stats
 from support.diff_images import DIFFERENT, EQUAL, INCONCLUSIVE, of
 
 from mi_refract.image_diff import accept, channels, folders, html_report, pairing, results_file, self_test, text_reports
-from mi_refract.image_diff.channels import FREEDOM, SPP
+from mi_refract.image_diff.channels import AREA, FILTER, FREEDOM, SPP
 from mi_refract.image_diff.methods import METHODS, choice, compare
 from mi_refract.image_diff.results import Category, Status
 from mi_refract.image_diff.settings import Entry, Settings, load
@@ -151,6 +151,21 @@ def test_a_variance_of_one_channel_and_its_degrees_of_freedom(tmp_path, named, f
     how = {"variance": "{stem}_var.exr", "equivalence_margin": 0.0, "maps": True}
     p = 2 * stats.t.sf(2 / np.sqrt(0.5), 2 * freedom)
     assert one(tmp_path / "old", tmp_path / "new", **how).comparison.maps["p"].item() == pytest.approx(p, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("of_image", "of_file", "shared"),
+    [
+        ({FILTER: 2.0}, {FREEDOM: 5, FILTER: 0.5}, 1.0),
+        ({AREA: 9.0}, {FREEDOM: 5, AREA: 4.0}, 4.0),
+        ({FILTER: 0.5}, {FREEDOM: 5}, None),
+        ({FILTER: 0.5}, {FILTER: 4.0}, 1.0),
+    ],
+)
+def test_degrees_of_freedom_in_a_file_replace_the_filter_of_its_image_as_well(of_image, of_file, shared):
+    image, variance = (of(np.ones((4, 4, 1)), metadata=header) for header in (of_image, of_file))
+    estimate, _ = channels.estimates(channels.with_file(image, variance), image, (64, 64))
+    assert estimate.shared == shared
 
 
 def test_a_variance_is_accepted_with_its_image(pair):

@@ -146,10 +146,12 @@ def test_a_thick_lens_has_the_focal_length_of_the_lensmakers_formula(curvature, 
 
 
 def test_a_boundary_has_a_focal_length_in_each_of_its_media():
-    """f = n' R/(n' − n) behind it and n R/(n' − n) before it."""
+    """f = n' R/(n' − n) behind it and n R/(n' − n) before it; the numerical aperture contains n'."""
     n, behind, radius = 1.33, 1.6, 5.0
     arc = shapes.polyline([(1.0, 3.0), (1.0, -3.0)], [2 * math.degrees(math.asin(3.0 / radius))]).between(behind, n)
-    points, _ = cardinal(arc, 1.0)
+    points, spread = cardinal(arc, 1.0)
+    angle = math.asin(1 / radius) - math.asin(n / behind / radius)
+    assert spread.aperture == pytest.approx(behind * math.sin(angle), rel=1e-13)
     sag = radius - math.sqrt(radius**2 - 9)
     assert points.focal_length == points.back_focal_length == pytest.approx(behind * radius / (behind - n), rel=1e-13)
     assert points.front_focal_length == pytest.approx(-n * radius / (behind - n), rel=1e-13)

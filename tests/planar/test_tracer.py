@@ -444,10 +444,15 @@ def test_a_scene_may_be_small(follow, setting):
     assert small.points[0, :3] / size == pytest.approx(plain.points[0, :3], abs=16 * setting.roundoff)
 
 
-def test_a_scene_may_be_far_from_0(follow, setting):
+@pytest.mark.parametrize("shape", [polygon([(0, 0), (1, 0), (0.25, 1)]), ball()], ids=["triangle", "ball"])
+def test_a_scene_may_be_far_from_0(follow, setting, shape):
     """At 2²⁰ the steps of float32 are 0.125. Only differences of coordinates matter, and they are exact."""
-    triangle, origin = np.array([(0, 0), (1, 0), (0.25, 1)]), np.array([-1, 0.125])
-    plain, far = (follow(polygon(triangle + x), origin + x, (1, 0.17)) for x in (0.0, 2.0**20))
+
+    def path(x):
+        moved = {name: getattr(shape, name) + x for name in ("start", "end", "control")}
+        return follow(dataclasses.replace(shape, **moved), np.array([-2, 0.125]) + x, (1, 0.17))
+
+    plain, far = path(0.0), path(2.0**20)
     assert story(far) == story(plain)
     assert far.directions == pytest.approx(plain.directions, abs=16 * setting.roundoff)
 
