@@ -204,10 +204,10 @@ def counted(image: Image) -> int:
     return image.pixels[..., 0].size if image.mask is None else int(image.mask.sum())
 
 
-def passes_black(method: Callable[..., Comparison], views: Iterable[Image], options: Mapping[str, Any]) -> bool:
-    """Return whether a method with these options calls black different from none of these images."""
-    black = ((image, replace(image, pixels=np.zeros_like(image.pixels))) for image in views)
-    return all(method(*pair, **options).verdict is not Verdict.DIFFERENT for pair in black)
+def passes_black(method: Callable[..., Comparison], views: Iterable[tuple[Image, Mapping[str, Any]]]) -> bool:
+    """Return whether a method calls black different from none of these images, each with its options."""
+    black = ((image, replace(image, pixels=np.zeros_like(image.pixels)), options) for image, options in views)
+    return all(method(a, b, **options).verdict is not Verdict.DIFFERENT for a, b, options in black)
 
 
 def nonfinite_result(method: str, reason: str, *pixels: Pixels) -> Comparison:

@@ -119,20 +119,20 @@ def flip(
     return Comparison("flip", verdict_of(metrics), reason, metrics, maps={"flip": error, "local": around})
 
 
-def views(image: Image, options: Options) -> Iterator[Image]:
+def views(image: Image, options: Options) -> Iterator[tuple[Image, Options]]:
     """Yield the part of the image around the brightest window, where black is detected first, and the whole image.
 
     With a bound of the mean or of the 99th percentile only the whole image: both are larger in the brightest part.
     """
     if min(options["mean"], options["percentile_99"]) < 1:
-        yield image
+        yield image, options
         return
     side, around = max(1, round(WINDOW * options["ppd"])), max(1, round(AROUND * options["ppd"]))
     light = block_mean(_linear(image), side).sum(-1)
     y, x = (side * int(i) for i in np.unravel_index(int(light.argmax()), light.shape))
     rows, columns = (slice(max(start - around, 0), start + side + around) for start in (y, x))
-    yield replace(image, pixels=image.pixels[rows, columns], mask=None)
-    yield image
+    yield replace(image, pixels=image.pixels[rows, columns], mask=None), options
+    yield image, options
 
 
 def looks_at(reference: Image, test: Image) -> list[list[str]]:

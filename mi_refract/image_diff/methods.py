@@ -75,8 +75,8 @@ class Method:
 
     - `function(reference, test, **options)`: takes one image a side, with the same channels in the same order and
       finite values. If `takes_renders`, it takes a sequence of independent renders a side, unchanged.
-    - `views(image, options)`: yields the parts of an image that are compared with black, the whole image last. None:
-      black never passes.
+    - `views(image, options)`: yields the parts of an image that are compared with black and the options for that, the
+      whole image last. If black is detected in a part, it is in the whole image. None: black never passes.
     - `accepts(pixels, others, options)`: returns the pixels in which `others` pass, H × W. None: pixels and groups of
       channels are not judged separately.
     - `looks_at(reference, test)`: returns groups of channels, each of which is compared separately. Channels in no
@@ -84,7 +84,7 @@ class Method:
     """
 
     function: Callable[..., Comparison]
-    views: Callable[[Image, Options], Iterable[Image]] | None = None
+    views: Callable[[Image, Options], Iterable[tuple[Image, Options]]] | None = None
     accepts: Callable[[Pixels, Pixels, Options], NDArray[np.bool_]] | None = None
     takes_renders: bool = False
     looks_at: Callable[[Image, Image], list[list[str]]] | None = None
@@ -106,14 +106,14 @@ class Method:
         }
 
 
-def _whole(image: Image, options: Options) -> tuple[Image]:
+def _whole(image: Image, options: Options) -> tuple[tuple[Image, Options]]:
     """Return the image alone: the share of pixels that may differ is one of all pixels, not of a part of them."""
-    return (image,)
+    return ((image, options),)
 
 
 METHODS = {
     "exact": Method(pixelwise.exact),
-    "tolerance": Method(pixelwise.tolerance, _whole, pixelwise.tolerance_accepts),
+    "tolerance": Method(pixelwise.tolerance, pixelwise.tolerance_views, pixelwise.tolerance_accepts),
     "paired": Method(pixelwise.paired, _whole, pixelwise.paired_accepts),
     "welch": Method(welch.compare_renders, takes_renders=True),
     "flip": Method(flip.flip, flip.views, looks_at=flip.looks_at),
@@ -320,7 +320,7 @@ def blind_to(method: Method, a: Image, b: Image, options: Options) -> str:
         if np.array_equal(one.pixels, two.pixels):
             continue
         in_channels = f" in {', '.join(names)}," if len(separate) > 1 else ""
-        if passes_black(method.function, method.views(one, options), options):
+        if passes_black(method.function, method.views(one, options)):
             return f"an all-black image would pass, too,{in_channels} with these options"
         if method.accepts is None:
             continue

@@ -9,8 +9,8 @@ image.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from .comparison import Comparison, Metric, Verdict, counted, groups, place, ver
 from .tile_statistics import median_nonblack, same_shape
 
 CODES = {"uint8": 255, "uint16": 65535}  # the integer for the value 1, by the file's type
+ROW_STEP = 16
 BLOCK = 2**16  # pixels whose ratios are computed at once, in float64
 # A pixel is outrageous above both of these. A detail that moves by NEAR pixels is not outrageous. Nor is any value of a
 # display, up to white, if the mean is more than a hundredth of white.
@@ -219,6 +220,14 @@ def outrageous(reference: Image, test: Image, fail: float) -> str:
             pixel = f"{compact(float(excess.max()))} at {place(excess, reference)}, of {image.path}"
             return f"{pixel}; the other image has at most {compact(float(around[y, x].max()))} within {NEAR} pixels"
     return ""
+
+
+def tolerance_views(image: Image, options: Mapping[str, Any]) -> Iterator[tuple[Image, Mapping[str, Any]]]:
+    """Yield every ROW_STEP-th row, in which as many pixels may differ as in the whole image, and the whole image."""
+    most = max(options["allow_failures"], _max_count(options["fail_percent"], counted(image)))
+    rows = replace(image, pixels=image.pixels[::ROW_STEP], mask=None)
+    yield rows, {**options, "allow_failures": most, "fail_percent": 0.0}
+    yield image, options
 
 
 def tolerance_accepts(a: Pixels, b: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:

@@ -15,7 +15,7 @@ from support.diff_images import of as image
 
 from mi_refract.image_diff.comparison import passes_black
 from mi_refract.image_diff.methods import compare
-from mi_refract.image_diff.pixelwise import tolerance, tolerance_accepts
+from mi_refract.image_diff.pixelwise import tolerance, tolerance_accepts, tolerance_views
 from mi_refract.io import image_file
 
 THRESHOLDS = (0.0, 1e-6, 1 / 255, 0.004, 0.01, 0.1, 1.0)
@@ -182,12 +182,29 @@ def test_pixels_that_accept_black_are_those_that_pass_separately():
     options = IDIFF | {"fail": 0.004, "hard_fail": 0.001}
     accepted = tolerance_accepts(pixels, 0 * pixels, options)
     for y, x in np.ndindex(8, 8):
-        assert accepted[y, x] == passes_black(tolerance, [image(pixels[y : y + 1, x : x + 1])], options)
+        assert accepted[y, x] == passes_black(tolerance, [(image(pixels[y : y + 1, x : x + 1]), options)])
     bright, other = (image(np.full((3, 3, 3), x)) for x in (0.5, 0.4))
     assert compare("tolerance", bright, other, allow_failures=8).verdict is DIFFERENT
     result = compare("tolerance", bright, other, allow_failures=9)
     assert result.verdict is INCONCLUSIVE
     assert result.reason.startswith("an all-black image would pass, too, with ")
+
+
+def test_black_that_is_detected_in_some_rows_is_detected_in_the_whole_image():
+    rng, detected = np.random.default_rng(4), 0
+    for _ in range(1000):
+        shape, values = (*rng.integers(1, 50, 2), 1), [0.001, 0.01, 1.0, 100.0, -1.0]
+        pixels = np.where(rng.random(shape) < rng.choice([0.01, 0.1, 0.5, 1]), rng.choice(values, shape), 0)
+        mask = rng.random(shape[:2]) < rng.choice([0.1, 0.9]) if rng.random() < 0.5 else None
+        masked = image(pixels if mask is None else pixels * mask[..., None], mask=mask)
+        options = IDIFF | {"fail": 0.004, "hard_fail": float(rng.choice([np.inf, 0.5, 10]))}
+        options["fail_percent"] = float(rng.choice([0, 0.02, 1, 5, 50, 100]))
+        options["allow_failures"] = int(rng.choice([0, 1, 5, 50]))
+        rows, whole = tolerance_views(masked, options)
+        passes = passes_black(tolerance, [whole])
+        assert passes_black(tolerance, [rows, whole]) == passes
+        detected += not passes_black(tolerance, [rows])
+    assert detected > 100
 
 
 @pytest.mark.parametrize("by, pixels, verdict", [(0.0039, 9, EQUAL), (0.0041, 1, EQUAL), (0.0041, 2, DIFFERENT)])
