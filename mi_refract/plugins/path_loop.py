@@ -223,6 +223,10 @@ class PathLoop:
         # Derivatives need evaluated loops. The kernels of the reverse sweep may run after the scene was freed, so they
         # must not trace rays: intersections are evaluated at once.
         self.evaluated = self.vectorised and not dr.flag(dr.JitFlag.SymbolicLoops)
+        self.lamp_extent = math.inf
+        if features.hide_emitters:
+            lamps = [shape for shape in all_shapes(scene) if shape.is_emitter()]
+            self.lamp_extent = ray_origins.extent_of([ray_origins.size_of(shape) for shape in lamps])
         self.branch = branch_type(v, features.dispersion, features.absorption)
         self.boundaries = self.ranges(lambda bsdf: bsdf_name(bsdf) in BOUNDARIES) if features.split_depth else []
         self.own_odds = self.ranges(has_own_odds) if self.evaluated else []
@@ -283,7 +287,8 @@ class PathLoop:
                 active = active & si.is_valid() & operator.ne(si.shape.emitter(), None)
             else:
                 active = False
-            ray.o = dr.select(active, si.spawn_ray(ray.d).o, ray.o)
+            beyond = ray_origins.spawn_ray(self.v, si, ray.d, self.lamp_extent, True)
+            ray.o = dr.select(active, beyond.o, ray.o)
             return ray, active
 
         return dr.while_loop((self.v.Ray3f(ray), active), lambda _, active: active, step)[0]

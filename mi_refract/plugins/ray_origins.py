@@ -11,7 +11,8 @@ error of a point on a sphere or disk grows with t. Where faces of a mesh are lon
 and the height h on it, hits err by up to u/8 L²/h. So E is L²/(64 h) where that is more.
 
 Rays of other lobes, and rays to lamps and to the camera, start at Mitsuba's distance, or nearer where that could be
-within or beyond glass just above the surface.
+within or beyond glass just above the surface. Rays past lamps that are hidden start like those of delta lobes, with the
+E of the lamps: a ray that meets its lamp again is moved again.
 """
 
 from __future__ import annotations

@@ -508,6 +508,18 @@ def test_at_the_last_vertex_what_is_transparent_is_so(bsdf, rgb_variant):
     assert alpha == pytest.approx(opacity, abs=16 * np.sqrt(opacity * (1 - opacity) / 64 / spp))
 
 
+@pytest.mark.parametrize("shape", ["rectangle", "cube"])
+def test_hidden_lamps_do_not_hide_a_wall_4_mm_behind_them(shape, rgb_variant):
+    """At 100 m Mitsuba's distance is 9 mm."""
+    place = PLACE().translate([0, 0, 100])
+    lamp = {"type": shape, "to_world": place @ PLACE().scale(0.5), "emitter": {"type": "area"}}
+    behind = place @ PLACE().translate([0, 0, -0.004 - (0.5 if shape == "cube" else 0)])
+    wall = {"type": "rectangle", "to_world": behind, "bsdf": {"type": "diffuse"}}
+    view = camera(8, pixel_format="rgba", origin=(0, 0, 104), target=(0, 0, 100), fov=10)
+    scene = mi.load_dict({"type": "scene", "sensor": view, "lamp": lamp, "wall": wall})
+    assert (render(scene, 4, hide_emitters=True)[..., 3] == 1).all()
+
+
 ROUGH = {  # rough metal is in the study `gradients`
     "rough glass": ({"type": "roughdielectric", "alpha": 0.3}, "alpha.value", 0.3),
     "grey": ({"type": "diffuse", "reflectance": 0.0}, "reflectance.value", 0.0),
