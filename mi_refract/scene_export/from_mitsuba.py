@@ -159,6 +159,8 @@ def _sky(emitter: Node) -> Colour | Environment:
             raise emitter.error(str(error), "an OpenEXR file") from None
         if pixels.shape[2] != 3 or min(pixels.shape[:2]) < 2 or not np.isfinite(pixels).all() or (pixels < 0).any():
             raise emitter.error(f"{path}: {pixels.shape[1]} × {pixels.shape[0]} × {pixels.shape[2]}", "finite RGB")
+        if len(pixels) == 2:
+            pixels = pixels[[0, 1, 1]]  # as Mitsuba does
         sky = Environment(scale * pixels, _rotation(emitter))
     else:
         raise emitter.error("this emitter is not supported", f"constant, envmap, {', '.join(LAMPS)}, area on a shape")

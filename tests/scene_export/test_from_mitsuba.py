@@ -260,7 +260,7 @@ def test_grey_colours_and_the_smallest_map_and_image(scene, tmp_path):
     pixels = np.array([[[0, 0.25, 0.5], [3, 4, 5]], [[6, 7, 8], [0, 0, 0]]], np.float32)
     image_file.write_exr(tmp_path / "sky.exr", pixels)
     plain = from_mitsuba.load(scene(CONSTANT, SKY, FILM, FILM.replace("16", "1").replace("8", "1")))
-    np.testing.assert_array_equal(plain.sky.pixels, pixels)
+    np.testing.assert_array_equal(plain.sky.pixels, pixels[[0, 1, 1]])
     assert (plain.camera.width, plain.camera.height) == (1, 1)
 
 

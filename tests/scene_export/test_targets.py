@@ -165,16 +165,20 @@ SCENE = """<scene version="3.0.0">
 
 
 @pytest.mark.parametrize("target", READERS)
-@pytest.mark.parametrize("sky", [COLOUR, TURNED], ids=["colour", "map"])
+@pytest.mark.parametrize(
+    ("sky", "pixels"),
+    [(COLOUR, MAP), (TURNED, MAP), (TURNED, MAP[:2, :1].repeat(8, 1))],
+    ids=["colour", "map", "zenith and horizon"],
+)
 def test_an_export_has_mitsubas_rays_surfaces_indices_lights_and_sky(
-    target, sky, tmp_path, monkeypatch, scalar_variant
+    target, sky, pixels, tmp_path, monkeypatch, scalar_variant
 ):
     """Mitsuba's rays are in float32: each of its transforms has an error of a few roundoffs.
 
     Triangles are counterclockwise from outside; an index is the index inside over that outside. A map of the sky is
     resampled to cells of 1/16: where its slope changes by at most 2 per texel, linear cells err by 1/32 per axis.
     """
-    image_file.write_exr(tmp_path / "map.exr", MAP)
+    image_file.write_exr(tmp_path / "map.exr", pixels)
     path = tmp_path / "scene.xml"
     text = SCENE.replace('"1.1"', '"1.3"') if target == "gltf" else SCENE  # glTF has no index below 1
     path.write_text(text % (sky if target == "povray" else sky + PATCH))
@@ -362,6 +366,19 @@ def test_a_target_that_always_samples_lights_refuses_paths_of_one_segment(target
     with pytest.raises(ValueError, match=f"^a scene: max_depth = 1; expected 2 or more, the least of {target}$"):
         write_export(target, tmp_path / "new", depth=1)
     write_export("radiance", tmp_path / "new", depth=1)
+
+
+@pytest.mark.parametrize(("target", "farthest"), targets.FARTHEST.items())
+def test_coordinates_beyond_the_ends_of_rays_are_refused(target, farthest, tmp_path):
+    def scene(size, distance):
+        camera = dataclasses.replace(CAMERA, origin=(0.0, 0.0, distance))
+        ball = Mesh("ball", size / np.abs(BALL[0]).max() * BALL[0], BALL[1], GLASS)
+        return dataclasses.replace(plain(), meshes=(ball,), camera=camera)
+
+    targets.write(scene(0.9 * farthest, 0.9 * farthest), target, tmp_path / "near")
+    for i, sizes in enumerate([(1.1 * farthest, 1), (1, 1.1 * farthest)]):
+        with pytest.raises(ValueError, match=rf"a coordinate of 1\.1e\+\d+; expected up to 1e\+\d+ for {target}$"):
+            targets.write(scene(*sizes), target, tmp_path / f"{i}")
 
 
 def test_luxcore_hides_nothing_near_the_camera_or_far_from_it(tmp_path):

@@ -6,9 +6,12 @@ Each format has a function that returns the export's files by name. `COMMANDS` i
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
+
+import numpy as np
 
 from mi_refract.io import safe_files
 
@@ -34,6 +37,7 @@ HOLD_VOLUMES = ("gltf",)  # targets with dispersion and absorption
 ALL_LAMPS = ("point", "spot", "directional")
 HOLD_LAMPS = {"cycles": ("point", "directional"), "mitsuba": ALL_LAMPS, "obj+json": ALL_LAMPS, "gltf": ALL_LAMPS}
 LEAST_DEPTH = {"cycles": 2, "luxcore": 2}  # these always sample lights at the first surface; other targets: 1
+FARTHEST = {"povray": 1e6, "radiance": 1e9}  # largest coordinates: rays of these end after 1e7 and 1e10 units
 
 
 def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> list[Path]:
@@ -57,6 +61,12 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
             raise ValueError(f"{plain.name}: {mesh.name}: {mesh.material.parameters}; expected {expected}")
     if plain.max_depth < LEAST_DEPTH.get(target, 1):
         raise ValueError(f"{plain.name}: max_depth = {plain.max_depth}; expected 2 or more, the least of {target}")
+    bound = FARTHEST.get(target, math.inf)
+    for name, points in [("camera", plain.camera.origin), *((mesh.name, mesh.vertices) for mesh in plain.meshes)]:
+        if (largest := float(np.abs(points).max())) > bound:
+            raise ValueError(
+                f"{plain.name}: {name}: a coordinate of {largest:g}; expected up to {bound:g} for {target}"
+            )
     for lamp in plain.lamps:
         if lamp.kind not in HOLD_LAMPS.get(target, ()):
             fault = f"a {lamp.kind} lamp is not exported to {target}"
