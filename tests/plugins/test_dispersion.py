@@ -89,6 +89,15 @@ def test_wavelengths_have_their_reflectances_if_the_first_is_totally_reflected(s
     assert reflected.weight == pytest.approx(powers, rel=2e-3)
 
 
+@pytest.mark.parametrize(("angle", "side"), [(0.0, 1), (math.atan(1.6), 1), (1.3, 1), (0.3, -1), (0.68, -1)])
+def test_reflected_light_has_the_mueller_matrix_of_each_wavelength(angle, side, spectral_variant):
+    """At 0.68 rad inside, 450 nm are totally reflected, the others partly. In variants without polarisation: powers."""
+    dispersive, *constant = (sample(load(x), tilted(angle, side), REFLECTED) for x in (GLASS, *map(n, WAVELENGTHS)))
+    found, *expected = ((x.pdf * x.mueller).reshape(-1, len(WAVELENGTHS)) for x in (dispersive, *constant))
+    for i, of_this_index in enumerate(expected):
+        assert found[:, i] == pytest.approx(of_this_index[:, i], rel=1e-3, abs=1e-5)
+
+
 OIL = "table(360: 1.52, 500: 1.5, 600: 1.5, 830: 1.49)"  # from 500 to 600 nm the index of the glass beside it
 PAIRS = {
     "equal": ("cauchy(1.5, 4000)", "cauchy(1.5, 4000)"),
