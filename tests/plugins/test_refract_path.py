@@ -128,6 +128,21 @@ def lamps():
     return parts
 
 
+@pytest.mark.parametrize("shape", ["sphere", "rectangle"])
+def test_hidden_lamps_in_a_row_are_looked_past(shape, rgb_variant):
+    """A closed lamp has two surfaces. Equal means, one false alarm in 10,000."""
+    glow = {"type": shape, "emitter": {"type": "area", "radiance": 9.0}}
+    parts = {f"lamp {z}": glow | {"to_world": PLACE().translate([0, 0, z]).scale(0.6)} for z in (1, 3)}
+    wall = {"type": "rectangle", "to_world": PLACE().translate([0, 0, -2]).scale(4)}
+    bulb = {"type": "point", "position": [3, 0, 0], "intensity": 9.0}
+    scene = mi.load_dict({"type": "scene", "sensor": camera(4, 12), "wall": wall, "bulb": bulb} | parts)
+    theirs, ours = (
+        [method(scene, 16, first + i, max_depth=2, hide_emitters=True) for i in range(8)]
+        for method, first in ((by_path, 0), (render, 100))
+    )
+    assert np.mean(theirs) > 0.05 and equal_means(theirs, ours)
+
+
 @pytest.mark.parametrize("split_depth", [0, 2])
 def test_lamps_are_chosen_by_their_weights_and_the_sky_is_met(split_depth, typical_variant):
     """Welch's test on one tile, one false alarm in 1000."""
