@@ -13,6 +13,7 @@ from support.variants import switch
 
 import mi_refract  # noqa: F401
 from mi_refract.numerics import mitsuba_mesh
+from mi_refract.plugins import lamp_tracing
 from mi_refract.plugins.film import Splats
 from mi_refract.plugins.lamp_tracing import is_one_way
 
@@ -324,17 +325,61 @@ def test_an_image_scales_with_its_lamps(factor, llvm_variant):
     np.testing.assert_allclose(other / factor, one, rtol=1e-5)
 
 
+def caustic(seed=0, paths=0, **integrator):
+    """The lamps' part of an image of 16 spp; `paths`: number of light paths, by default that of the integrator."""
+    loaded = scene({}, caustics="lamp", **integrator)
+    method, sensor = loaded.integrator(), loaded.sensors()[0]
+    method.begin_render(sensor)
+    method.path_loop(loaded, sensor.sampler())
+    image = method.caustic_image(loaded, sensor, seed, 16, ("R", "G", "B"), paths=paths)[0]
+    method.end_render()
+    assert image.any()
+    return image
+
+
 def test_roulette_ends_light_paths(llvm_variant):
     """With the same random numbers: if no path ended early, both images would have the same bits."""
-    images = []
-    for rr_depth in (1, 6):
-        loaded = scene({}, caustics="lamp", rr_depth=rr_depth)
-        integrator, sensor = loaded.integrator(), loaded.sensors()[0]
-        integrator.begin_render(sensor)
-        integrator.path_loop(loaded, sensor.sampler())
-        images.append(integrator.caustic_image(loaded, sensor, 0, 16, ("R", "G", "B"))[0])
-        integrator.end_render()
-    assert images[0].any() and (images[0] != images[1]).any()
+    assert (caustic(rr_depth=1) != caustic()).any()
+
+
+def test_light_paths_are_so_many_for_each_sample(llvm_variant):
+    np.testing.assert_array_equal(caustic(light_paths=0.5), caustic(paths=8 * SIZE**2))
+
+
+def test_seeds_and_chunks_have_different_light_paths(rgb_variant, monkeypatch):
+    """The second half of the light paths is not the first one again."""
+    half = 4 * SIZE**2 if dr.is_jit_v(mi.Float) else 100
+    first = caustic(paths=half)
+    assert (caustic(1, paths=half) != first).any()
+    monkeypatch.setattr(lamp_tracing, "LANES", half)
+    assert not np.allclose(caustic(paths=2 * half), first)
+
+
+AIR = {"type": "refract", "int_ior": 1.0, "ext_ior": 1.0}
+TINTED_AIR = AIR | {"int_absorption": 0.3, "ext_absorption": 0.3}
+STRAIGHT = {  # the variant, the ball, parameters of camera and integrator, light paths at a time
+    "scalar": ("scalar_rgb", AIR, {}, {"light_paths": 0.5}, 2**24),
+    "in chunks": ("llvm_ad_rgb", AIR, {}, {}, 512),
+    "absorption before the near plane": (
+        "llvm_ad_rgb", TINTED_AIR, {"near_clip": 3.0}, {"camera_absorption": 0.3}, 2**24,
+    ),
+    "dispersive": ("llvm_ad_spectral", AIR | {"int_ior": "table(360: 1, 830: 1)"}, {}, {}, 2**24),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("variant", "bsdf", "view", "parameters", "lanes"), STRAIGHT.values(), ids=STRAIGHT, indirect=["variant"]
+)
+def test_a_ball_of_the_index_of_air_changes_nothing(variant, bsdf, view, parameters, lanes, monkeypatch):
+    """The camera sees only floor behind the ball from the lamp; the reference, with the ball away, has little noise."""
+    monkeypatch.setattr(lamp_tracing, "LANES", lanes)
+    spp = 1 if variant.startswith("scalar") else 16
+    made, reference = (
+        scene({"lamp": point(), "sensor": camera(**view), "ball": ball(bsdf, center, 0.4)}, **parameters)
+        for center in ((0, 0, 3), (0, 0, -9))
+    )
+    expected = tiles(reference, 4 * spp, [100])
+    assert expected.all() and difference(tiles(made, spp, range(8)), np.repeat(expected, 8, 0)) < 1
 
 
 def test_light_from_infinity_does_not_pass_air_that_absorbs(llvm_variant):
