@@ -230,6 +230,30 @@ def test_air_around_camera_and_lamp_absorbs_each_wavelength_by_its_own(llvm_spec
     assert (stats.ttest_ind(*images).pvalue > FALSE_ALARM / 3).all()
 
 
+@pytest.mark.parametrize("variant", ["llvm_ad_mono_polarized"], indirect=True)
+def test_polarised_light_that_glass_reflects_has_the_image_of_path_tracing(variant):
+    """Polariser, pane near Brewster's angle, plastic near its own, all turned: every matrix and its place counts."""
+    pane, to_lamp, to_floor = map(np.array, ([0.5, 4, 2], [-0.63, 0.68, -0.37], [-0.11, -0.89, -0.44]))
+
+    def facing(place, direction, size):
+        target = mi.ScalarPoint3f(*(place + direction))
+        return mi.ScalarTransform4f().look_at(mi.ScalarPoint3f(*place), target, [0, 0, 1]).scale(size)
+
+    plastic = floor({"type": "pplastic", "diffuse_reflectance": 0.1, "alpha": 0.3})
+    parts = {
+        "floor": plastic | {"to_world": mi.ScalarTransform4f().rotate([0, 0, 1], 35).scale(4)},
+        "ball": floor({"type": "refract"}) | {"to_world": facing(pane, to_lamp + to_floor, 1.0)},
+        "lamp": lamp() | {"to_world": facing(pane + 2 * to_lamp, -to_lamp, 0.5)},
+        "more": floor({"type": "polarizer", "theta": {"type": "spectrum", "value": 90.0}})
+        | {"to_world": facing(pane + 1.5 * to_lamp, -to_lamp, 0.8)},
+    }
+    images = [
+        tiles(scene(parts, caustics=caustics, light_paths=2.0), 64, range(first, first + 16))
+        for caustics, first in (("path", 0), ("lamp", 100))
+    ]
+    assert images[0].all() and difference(*images) < 1
+
+
 def point(height=5.0, **parameters):
     return {"type": "point", "position": [0, 0, height], "intensity": height**2} | parameters
 
