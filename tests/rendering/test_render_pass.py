@@ -269,6 +269,26 @@ def test_the_variance_within_passes_is_that_between_passes(tmp_path, llvm_varian
 
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
+def test_lamps_that_are_traced_are_in_the_image_and_the_variance_of_passes(llvm_variant, rfilter):
+    """The camera sees only floor that a point lamp lights through a ball."""
+    view, place = mi.ScalarTransform4f().look_at([0, -6, 3], [0, 0, 0], [0, 0, 1]), mi.ScalarTransform4f().scale(4)
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb", "filter": {"type": rfilter}}
+    parts = {"sensor": {"type": "perspective", "fov": 16, "to_world": view, "film": film}}
+    parts["ball"] = {"type": "sphere", "center": [0, 0, 3], "radius": 0.8, "bsdf": {"type": "refract"}}
+    parts |= {"lamp": {"type": "point", "position": [0, 0, 5]}, "floor": {"type": "rectangle", "to_world": place}}
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "refract_path", "light_paths": 0.02}} | parts)
+    renderers = [pass_renderer(scene, seed) for seed in range(3, 9)]
+    for number in (0, 5):
+        image = renderers[0].render(number, 13).mean
+        assert image.any()
+        np.testing.assert_allclose(image, mitsuba_image(scene, number, 13), **CLOSE)
+    passes = [renderer.render(number, 16) for renderer in renderers for number in range(4)]
+    between = 16 * np.var([sums.mean for sums in passes], 0, ddof=1).mean()
+    # Stratified light paths have less noise than independent ones, of which `within` is the variance: 1.4, 1.7 times.
+    assert 0.9 * between < np.mean([sums.within / 15 for sums in passes]) < 2.5 * between
+
+
+@pytest.mark.parametrize("rfilter", ["box", "gaussian"])
 def test_equal_samples_have_no_second_moment(llvm_variant, rfilter):
     film = {"type": "hdrfilm", "width": 8, "height": 8, "filter": {"type": rfilter}}
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.1, 0.7, 0.3]}}
