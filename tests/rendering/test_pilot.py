@@ -289,6 +289,25 @@ def test_the_time_of_light_paths_excludes_compilation(tmp_path, llvm_variant, mo
     assert 0 < passes.seconds < 2 * 0.25 * 16 / LIGHT_PATHS
 
 
+def test_the_variance_of_traced_lamps_is_that_of_the_images_of_passes(tmp_path, llvm_variant):
+    lamp = '<emitter type="point"><point name="position" value="3, 1, -4"/></emitter>'
+    wall = '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="180"/><scale value="4"/>'
+    text = GLASS.replace('<emitter type="constant"/>', lamp).replace('<translate x="1" y="1.5"/>', '<translate z="3"/>')
+    (tmp_path / "a.xml").write_text(text.replace('<shape type="cube"><transform name="to_world">', wall))
+    parsed, settings = parse_scene(tmp_path / "a.xml"), {"integrator": "refract_path", "caustics": "lamp"}
+    renderer = pass_renderer(load_parsed(parsed), 0)
+    pilot = Pilot(parsed, renderer, lambda rounded: plan_passes(48, 16, None, rounded, moments=True))
+    found = pilot.measure(settings, 0, 8).lamp_variance
+    scene = load_parsed(with_settings(parsed, settings))
+    integrator, sensor = scene.integrator(), scene.sensors()[0]
+    integrator.begin_render(sensor)
+    integrator.path_loop(scene, sensor.sampler())
+    images = [integrator.caustic_image(scene, sensor, seed, 16, ("R", "G", "B"))[0] for seed in range(32)]
+    integrator.end_render()
+    # Stratified light paths have less noise than independent ones, whose variance the pilot measures.
+    assert 0.5 < found / np.var(images, 0, ddof=1).mean() < 20
+
+
 DARK = GLASS.replace('<emitter type="constant"/>', "")
 UNMEASURABLE = {
     "no light": (DARK, "auto: the pilot sees no light; expected some"),
