@@ -279,9 +279,9 @@ def test_lamps_that_are_traced_are_in_the_image_and_the_variance_of_passes(llvm_
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "refract_path", "light_paths": 0.02}} | parts)
     renderers = [pass_renderer(scene, seed) for seed in range(3, 9)]
     for number in (0, 5):
-        image = renderers[0].render(number, 13).mean
+        image = renderers[0].render(number, 16).mean
         assert image.any()
-        np.testing.assert_allclose(image, mitsuba_image(scene, number, 13), **CLOSE)
+        np.testing.assert_allclose(image, mitsuba_image(scene, number, 16), **CLOSE)
     passes = [renderer.render(number, 16) for renderer in renderers for number in range(4)]
     between = 16 * np.var([sums.mean for sums in passes], 0, ddof=1).mean()
     # Stratified light paths have less noise than independent ones, of which `within` is the variance: 1.4, 1.7 times.
