@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from os.path import realpath  # `Path.resolve` raises RuntimeError for links in a circle
 from pathlib import Path
@@ -55,7 +55,8 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
         deep = any("/" in template for template in pair.how.accept)
         entries = reference.parent.rglob("*") if deep else reference.parent.iterdir()
         others = sorted(path for path in entries if path.is_file() and path != reference)
-        return [_with_variants(pair, [path for path in others if not path.samefile(test)])]
+        pair = _with_variants(pair, [path for path in others if not path.samefile(test)])
+        return [_without(_auxiliary(pair, (reference.parent, test.parent)), pair)]
     old, old_errors, old_hidden = images_in(reference) if has_reference else ({}, [], [])
     new, new_errors, new_hidden = images_in(test)
     for folder, content in ((reference, old or old_errors or not has_reference), (test, new or new_errors)):
@@ -67,20 +68,13 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
         pairs = [_pair(name, old.get(name), new.get(name), Path(name)) for name in sorted(old | new)]
     pairs = [replace(pair, how=how_of(settings, pair.name, pair.target)) for pair in pairs]
     pairs = [replace(pair, target=reference / pair.target) for pair in pairs]
-    auxiliary: set[Path] = set()  # masks and variances of other images: they are not compared
-    for pair in pairs:
-        sides = [(path, root) for path, root in ((pair.reference, reference), (pair.test, test)) if path]
-        mask = _mask_of(pair, reference)
-        files = {mask} if mask else set()
-        if pair.how.reads_variance:
-            files |= {beside(pair.how.variance, path, root, pair.how.above) for path, root in sides}
-        auxiliary |= files - {pair.reference, pair.test}
-    pairs = [pair for pair in pairs if not {pair.reference, pair.test} - {None} <= auxiliary]
     # A variant without a new image of its own is not a removed reference. Where references and new images share a
     # folder, a new image is no variant.
     with_new, tests = {pair.target for pair in pairs if pair.test}, {realpath(x.test) for x in pairs if x.test}
-    others = [path for path in old.values() if path not in auxiliary | with_new and realpath(path) not in tests]
+    others = [path for path in old.values() if path not in with_new and realpath(path) not in tests]
     pairs = [_with_variants(pair, others) for pair in pairs]
+    auxiliary = set[Path]().union(*(_auxiliary(pair, (reference, test)) for pair in pairs))
+    pairs = [_without(auxiliary, pair) for pair in pairs if not {pair.reference, pair.test} - {None} <= auxiliary]
     variants = {path for pair in pairs for path in pair.variants}
     pairs = [pair for pair in pairs if pair.test or pair.target not in variants]
     if not pairs and not old_errors and not new_errors:
@@ -184,6 +178,21 @@ def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> 
 def _mask_of(pair: Result, root: Path) -> Path | None:
     """Return the path of the mask of a pair, or None; `root`: the folder of the references."""
     return beside(pair.how.mask, pair.target, root, pair.how.above) if pair.how.mask else None
+
+
+def _auxiliary(pair: Result, roots: tuple[Path, Path]) -> set[Path]:
+    """Return the mask and the variances of a pair and of its variants: they are not compared."""
+    mask = _mask_of(pair, roots[0])
+    files = {mask} if mask else set()
+    if pair.how.reads_variance:
+        images = [(path, roots[0]) for path in (pair.target, *pair.variants)]
+        images += [(pair.test, roots[1])] if pair.test else []
+        files |= {beside(pair.how.variance, path, root, pair.how.above) for path, root in images}
+    return files - {pair.reference, pair.test}
+
+
+def _without(auxiliary: Collection[Path], pair: Result) -> Result:
+    return replace(pair, variants=tuple(path for path in pair.variants if path not in auxiliary))
 
 
 def _with_variants(pair: Result, others: Sequence[Path]) -> Result:

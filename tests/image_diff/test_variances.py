@@ -133,13 +133,18 @@ def test_two_renders_need_no_variance_beside_them(tmp_path):
 
 
 def test_variants_have_separate_variances(pair):
-    """And the file of a variance is not a variant."""
+    """And the files of variances and masks are not variants, also if their settings are those of one image."""
     old, new = pair
     for end in ("", "_var"):
         (old / f"a{end}.exr").rename(old / f"a-2{end}.exr")
     written(old / "a.exr", beside(samples(4, 64, gain=1.5)))
-    result = one(old, new, accept=("{stem}-*.exr",), **BESIDE)
-    assert (result.status, result.matched, result.variants) == (Status.EQUAL, old / "a-2.exr", (old / "a-2.exr",))
+    (old / "a_var.exr").rename(old / "a-var.exr")
+    (old / "a-2_var.exr").rename(old / "a-2-var.exr")
+    write_exr(old / "a-mask.exr", np.ones(SHAPE))
+    how = BESIDE | {"variance": "{stem}-var.exr", "mask": "{stem}-mask.exr", "accept": ("{stem}-*.exr",)}
+    for pattern, *sides in (("*", old, new), ("a.exr", old, new), ("a.exr", old / "a.exr", new / "a.exr")):
+        (result,) = folders.diff(*sides, Settings(rules=(Entry(pattern, how),))).results
+        assert (result.status, result.matched, result.variants) == (Status.EQUAL, old / "a-2.exr", (old / "a-2.exr",))
 
 
 @pytest.mark.parametrize(("named", "freedom"), [({FREEDOM: 5}, 5), ({}, 7)])
