@@ -81,7 +81,7 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
         if target.suffix.lower() != result.test.suffix.lower():
             raise ValueError(f"{target}: expected a name that ends in {result.test.suffix}, as {result.test} does")
         copies = [Copy(result.test, target, compared, result.digests.get(target, ""))]
-        if result.how.reads_variance:  # copied before the image, so that an interrupted call can be repeated
+        if result.how.variance:  # copied before the image, so that an interrupted call can be repeated
             how, sides = result.how, zip((result.test, target), reversed(results.roots), strict=True)
             source, old = (pairing.beside(how.variance, path, root, how.above) for path, root in sides)
             if source.exists():

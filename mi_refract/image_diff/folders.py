@@ -198,7 +198,7 @@ def _compare_pair(result: Result, results: Results, *, keep: bool, digests: bool
 def _digests(result: Result, roots: tuple[Path, Path], decoded: Mapping[Path, str]) -> dict[Path, str]:
     """Return the digests of all files of a result; those in `decoded` are not computed again."""
     paths = [result.reference, result.test, *result.variants]
-    if result.how.reads_variance:
+    if result.how.variance:
         sides = zip((result.target, result.test), roots, strict=True)
         paths += [pairing.beside(result.how.variance, path, root, result.how.above) for path, root in sides if path]
     return {path: decoded.get(path) or digest(path) for path in paths if path}

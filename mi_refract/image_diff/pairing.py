@@ -184,7 +184,7 @@ def _auxiliary(pair: Result, roots: tuple[Path, Path]) -> set[Path]:
     """Return the mask and the variances of a pair and of its variants: they are not compared."""
     mask = _mask_of(pair, roots[0])
     files = {mask} if mask else set()
-    if pair.how.reads_variance:
+    if pair.how.variance:
         images = [(path, roots[0]) for path in (pair.target, *pair.variants)]
         images += [(pair.test, roots[1])] if pair.test else []
         files |= {beside(pair.how.variance, path, root, pair.how.above) for path, root in images}

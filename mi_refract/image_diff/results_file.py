@@ -206,7 +206,7 @@ def _json_entry(result: Result, results: Results) -> Entry:
         method_why=comparison.chosen if comparison else "",
         options=dict(how.options),
         channels=list(how.channels),
-        variance=how.variance if how.reads_variance else "",
+        variance=how.variance,
         mask=how.mask,
         ignore=list(how.ignore),
         why_so=how.reason,
@@ -300,7 +300,7 @@ def with_settings(results: Results, settings: Settings) -> Results:
         inside = result.target.is_relative_to(results.reference)
         target = result.target.relative_to(results.reference) if inside else Path()
         how = pairing.how_of(settings, result.name, target)
-        if result.status in FAILED and (result.how.variance or how.reads_variance):
+        if result.status in FAILED and (result.how.variance or how.variance):
             raise ValueError(f"{result.name}: its variance is in a separate file; accept it without --from")
         updated.append(replace(result, how=replace(how, options=result.how.options)))
     return replace(results, results=tuple(updated))
