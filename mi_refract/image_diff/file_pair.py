@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,18 +31,22 @@ ReadOne = Callable[[Path, int], Image]  # the arguments: path, maximum number of
 Mask = NDArray[np.bool_]  # H × W; True where a pixel is compared
 
 
-def read_renders(folder: Path, max_values: int = MAX_VALUES) -> list[Image]:
-    """Return the renders in a folder. Errors: those of `image_file.read`, and ValueError for two identical renders."""
+def read_renders(folder: Path, max_values: int = MAX_VALUES, left_out: Collection[Path] = ()) -> list[Image]:
+    """Return the renders in a folder, except the paths `left_out`.
+
+    Errors: those of `image_file.read`, and ValueError for two identical renders.
+    """
     from concurrent.futures import ThreadPoolExecutor  # not needed for files
 
-    paths, failed, _ = pairing.images_in(folder)
+    images_in_folder, failed, _ = pairing.images_in(folder)
     if failed:
         raise OSError(failed[0][1])
+    paths = [path for path in images_in_folder.values() if path not in left_out]
     if not paths:
         raise ValueError(f"{folder}: contains no image; expected several renders of one image")
     read = functools.partial(image_file.read, max_values=max_values)
     with ThreadPoolExecutor(THREADS) as pool:
-        images = list(pool.map(read, paths.values()))
+        images = list(pool.map(read, paths))
     by_digest: dict[bytes, Image] = {}
     for image in images:
         other = by_digest.setdefault(hashlib.sha256(image.pixels.tobytes()).digest(), image)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from os.path import realpath  # `Path.resolve` raises RuntimeError for links in a circle
 from pathlib import Path
@@ -180,15 +180,24 @@ def _mask_of(pair: Result, root: Path) -> Path | None:
     return beside(pair.how.mask, pair.target, root, pair.how.above) if pair.how.mask else None
 
 
-def _auxiliary(pair: Result, roots: tuple[Path, Path]) -> set[Path]:
-    """Return the mask and the variances of a pair and of its variants: they are not compared."""
-    mask = _mask_of(pair, roots[0])
+def auxiliary(pair: Result, references: Path, images: Iterable[tuple[Path, Path]]) -> set[Path]:
+    """Return the mask of a pair and the variances of images: files that are not compared.
+
+    `references`: the folder of the references; `images`: paths, each with the folder of its side.
+    """
+    mask = _mask_of(pair, references)
     files = {mask} if mask else set()
     if pair.how.variance:
-        images = [(path, roots[0]) for path in (pair.target, *pair.variants)]
-        images += [(pair.test, roots[1])] if pair.test else []
-        files |= {beside(pair.how.variance, path, root, pair.how.above) for path, root in images}
-    return files - {pair.reference, pair.test}
+        variances = ((path, beside(pair.how.variance, path, root, pair.how.above)) for path, root in images)
+        files |= {variance for path, variance in variances if variance != path}
+    return files
+
+
+def _auxiliary(pair: Result, roots: tuple[Path, Path]) -> set[Path]:
+    """Return the mask and the variances of a pair and of its variants."""
+    images = [(path, roots[0]) for path in (pair.target, *pair.variants)]
+    images += [(pair.test, roots[1])] if pair.test else []
+    return auxiliary(pair, roots[0], images) - {pair.reference, pair.test}
 
 
 def _without(auxiliary: Collection[Path], pair: Result) -> Result:

@@ -133,6 +133,20 @@ def test_two_renders_need_no_variance_beside_them(tmp_path):
     assert result.status is Status.INCONCLUSIVE
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_variances_and_masks_in_folders_of_renders_are_no_renders(tmp_path, count):
+    for side, gain, first in (("old", 1.0, 0), ("new", 1.2, 10)):
+        for i in range(count):
+            written(tmp_path / side / f"{i}.exr", beside(samples(first + i, 64, gain)))
+    write_exr(tmp_path / "old/mask.exr", np.ones(SHAPE))
+    values = {"variance": "{stem}_var.exr", "mask": "{root}/mask.exr", "spp": 64}
+    (result,) = folders.diff(
+        tmp_path / "old", tmp_path / "new", Settings.for_all(**values), renders=True, maps=True
+    ).results
+    assert result.reason.startswith("20 % brighter")
+    assert result.images["reference"].pixels.mean() == pytest.approx(MEAN.mean(), rel=0.01)
+
+
 def test_variants_have_separate_variances(pair):
     """And the files of variances and masks are not variants, also if their settings are those of one image."""
     old, new = pair
