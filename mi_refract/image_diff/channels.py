@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from mi_refract.io.image_file import TO_XYZ, Image, Pixels
 
+from .comparison import require_window
 from .pixel_statistics import RADIUS
 
 RGB, XYZ = ("R", "G", "B"), ("X", "Y", "Z")
@@ -193,11 +194,10 @@ def with_file(image: Image, file: Image) -> Image:
     """Return the image with the variances of its channels from another file, by their names.
 
     If both have one channel, the names may differ. Degrees of freedom in the file's header replace those of the image's
-    header. ValueError if the file has another size, none of the channels, or invalid degrees of freedom.
+    header. ValueError if the file has another size or shows another part of the frame, has none of the channels, or
+    invalid degrees of freedom.
     """
-    if file.pixels.shape[:2] != image.pixels.shape[:2]:
-        (height, width), wrong = image.pixels.shape[:2], file.pixels.shape[:2]
-        raise ValueError(f"{file.path}: {wrong[1]} × {wrong[0]}; expected a variance image of {width} × {height}")
+    require_window(file, image, "variance image")
     if FREEDOM in file.metadata:
         header = {FREEDOM: _freedom(file), **{name: file.metadata.get(name, "") for name in (FILTER, AREA)}}
         image = replace(image, metadata=image.metadata | header)

@@ -237,6 +237,19 @@ def _located(image: Image, values: Pixels, marked: NDArray[np.bool_]) -> str:
     return f"{image.path}: {counts}, the first at {place(marked, image)}"
 
 
+def require_window(file: Image, image: Image, kind: str) -> None:
+    """Raise ValueError unless a file, such as a mask, has the size of the image and shows the same part of the frame.
+
+    `kind`: of the file, for the error. A file that is a whole frame, such as a PNG file, may lie on a part of another.
+    """
+    size, part = HEADER["size"], HEADER["data window"]
+    if size(file) != size(image):
+        raise ValueError(f"{file.path}: {size(file)}; expected a {kind} of {size(image)}")
+    is_frame = file.origin == (0, 0) and file.display in (None, (0, 0, *file.pixels.shape[1::-1]))
+    if file.origin != image.origin and not is_frame:
+        raise ValueError(f"{file.path}: data window {part(file)}; expected that of {image.path}: {part(image)}")
+
+
 HEADER: dict[str, Callable[[Image], str]] = {  # properties that must be equal, as text
     "size": lambda image: f"{image.pixels.shape[1]} × {image.pixels.shape[0]}",
     "channels": lambda image: ", ".join(sorted(image.channels)),

@@ -20,7 +20,7 @@ from mi_refract.io import image_file
 from mi_refract.io.image_file import MAX_VALUES, Image
 
 from . import channels, methods, pairing
-from .comparison import Comparison, Verdict
+from .comparison import Comparison, Verdict, require_window
 from .results import Result, Status
 from .settings import ComparisonSpec, Rectangle
 
@@ -167,8 +167,8 @@ def mask_of(
 ) -> Mask | None:
     """Return the pixels to compare: where the mask at `path` is WHITE, outside of the rectangles; None without both.
 
-    OSError if the mask cannot be read; ValueError if it has another size, if a rectangle does not overlap the image,
-    and if no pixel is left.
+    OSError if the mask cannot be read; ValueError if it has another size or shows another part of the frame, if a
+    rectangle does not overlap the image, and if no pixel is left.
     """
     if path is None and not rectangles:
         return None
@@ -176,9 +176,7 @@ def mask_of(
     compared: Mask = np.ones((height, width), bool)
     if path is not None:
         image = image_file.read(path, max_values)
-        if image.pixels.shape[:2] != (height, width):
-            size = f"{image.pixels.shape[1]} × {image.pixels.shape[0]}"
-            raise ValueError(f"{path}: {size}; expected a mask of {width} × {height}")
+        require_window(image, reference, "mask")
         colours = image.select([name for name in image.channels if name != "A"] or image.channels)
         if not np.isfinite(colours).all():
             raise ValueError(f"{path}: values that are not finite; expected a mask from 0 to 1")

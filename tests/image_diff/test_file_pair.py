@@ -217,6 +217,31 @@ def test_rectangles_are_relative_to_the_data_window(sides):
     assert not mask[10:12, 4:8].any() and mask.sum() == 32 * 48 - 8
 
 
+def crop(path, pixels, x, y):
+    """Write a part, from (x, y) on, of a frame of 64 × 64 pixels."""
+    spec = oiio.ImageSpec(*pixels.shape[1::-1], 3, "float")
+    spec.x, spec.y, spec.full_width, spec.full_height = x, y, 64, 64
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec) and output.write_image(pixels.astype(np.float32)) and output.close()
+
+
+def test_masks_and_variances_of_another_part_of_the_frame_are_refused(sides):
+    """A mask without a frame of its own, such as a PNG file, belongs to the part that the image shows."""
+    old, _ = sides
+    mask = old.parent / "a_mask.exr"
+    pixels = read(mask).pixels
+    for path in sides:
+        crop(path, read(path).pixels, 8, 4)
+    assert compared(*sides, mask="{stem}_mask.exr").status == "equal"
+    crop(mask, pixels, 8, 4)
+    assert compared(*sides, mask="{stem}_mask.exr").status == "equal"
+    for x, y in ((0, 0), (8, 5)):
+        crop(mask, pixels, x, y)
+        for how in ({"mask": "{stem}_mask.exr"}, {"variance": "{stem}_mask.exr", "spp": 4}):
+            error = compared(*sides, **how).error
+            assert error == f"{mask}: data window from x = {x}, y = {y}; expected that of {old}: from x = 8, y = 4"
+
+
 BAD = {
     "size": ({"mask": "small.exr"}, "small.exr: 7 × 8; expected a mask of 48 × 32"),
     "missing": ({"mask": "none.exr"}, "none.exr: no such file; expected a mask"),
