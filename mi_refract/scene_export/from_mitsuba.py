@@ -6,6 +6,7 @@ import math
 import os
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +19,7 @@ from .plain_scene import Camera, Colour, DirectionalLamp, Environment, Lamp, Mes
 LEVEL = 5  # default tessellation level: spheres of 20480 triangles, circles of 256 segments
 LEVELS = range(9)
 LAMPS = ("point", "spot", "directional")
+SKY = "at least 2 × 2 pixels of R, G, B or X, Y, Z, finite and as Rec. 709 not negative"
 INTEGRATORS = ("path", "refract_path", "prb", "volpath", "prbvolpath")
 
 
@@ -154,11 +156,17 @@ def _sky(emitter: Node) -> Colour | Environment:
     elif emitter.type == "envmap":
         path, scale = emitter.scene.resolve(emitter.value(str, "filename")), emitter.value(float, "scale", 1.0)
         try:
-            pixels = read_exr(path)[0]
+            pixels, header = read_exr(path)
         except (OSError, ValueError) as error:
             raise emitter.error(str(error), "an OpenEXR file") from None
-        if pixels.shape[2] != 3 or min(pixels.shape[:2]) < 2 or not np.isfinite(pixels).all() or (pixels < 0).any():
-            raise emitter.error(f"{path}: {pixels.shape[1]} × {pixels.shape[0]} × {pixels.shape[2]}", "finite RGB")
+        names = header["channels"]
+        has_colours = {*names} in ({*"RGB"}, {*"XYZ"})
+        if has_colours:  # as Mitsuba reads them: X, Y, Z and other primaries become Rec. 709
+            bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
+            pixels = np.array(bitmap)
+        if not has_colours or min(pixels.shape[:2]) < 2 or not np.isfinite(pixels).all() or (pixels < 0).any():
+            size = f"{pixels.shape[1]} × {pixels.shape[0]} pixels of {', '.join(names)}"
+            raise emitter.error(f"{path}: {size}", SKY)
         if len(pixels) == 2:
             pixels = pixels[[0, 1, 1]]  # as Mitsuba does
         sky = Environment(scale * pixels, _rotation(emitter))

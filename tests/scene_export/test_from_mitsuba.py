@@ -9,6 +9,7 @@ import re
 
 import mitsuba as mi
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 from mi_refract import SCENES
@@ -264,14 +265,31 @@ def test_grey_colours_and_the_smallest_map_and_image(scene, tmp_path):
     assert (plain.camera.width, plain.camera.height) == (1, 1)
 
 
+PRIMARIES = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)  # of ACES
+
+
+@pytest.mark.parametrize("channels, primaries", [("RGB", ()), ("XYZ", ()), ("RGB", PRIMARIES)])
+def test_the_sky_has_the_colours_that_mitsuba_reads(channels, primaries, scene, tmp_path):
+    spec = oiio.ImageSpec(4, 3, 3, "float")
+    spec.channelnames = tuple(channels)
+    if primaries:
+        spec.attribute("chromaticities", "float[8]", primaries)
+    output = oiio.ImageOutput.create(str(tmp_path / "sky.exr"))
+    pixels = np.random.default_rng(0).uniform(0.8, 1, (3, 4, 3)).astype(np.float32)
+    assert output.open(str(tmp_path / "sky.exr"), spec) and output.write_image(pixels) and output.close()
+    envmap = mi.load_dict({"type": "envmap", "filename": str(tmp_path / "sky.exr")})
+    expected = np.array(mi.traverse(envmap)["data"])[:, 1:5]  # between columns that Mitsuba repeats
+    np.testing.assert_allclose(from_mitsuba.load(scene(CONSTANT, SKY)).sky.pixels, expected, rtol=1e-5)
+
+
 MAPS = {
-    "4 × 1 × 3; expected finite RGB": np.ones((1, 4, 3)),
-    "1 × 4 × 3; expected finite RGB": np.ones((4, 1, 3)),
-    "4 × 4 × 1; expected finite RGB": np.ones((4, 4, 1)),
-    "4 × 4 × 4; expected finite RGB": np.ones((4, 4, 4)),
-    "2 × 2 × 3; expected finite RGB": np.full((2, 2, 3), np.nan),
-    "3 × 3 × 3; expected finite RGB": np.full((3, 3, 3), -1e-3),
-    "5 × 5 × 3; expected finite RGB": np.full((5, 5, 3), np.inf),
+    "4 × 1 pixels of R, G, B; expected at least 2 × 2": np.ones((1, 4, 3)),
+    "1 × 4 pixels of R, G, B; expected at least 2 × 2": np.ones((4, 1, 3)),
+    "4 × 4 pixels of R; expected": np.ones((4, 4, 1)),
+    "4 × 4 pixels of R, G, B, A; expected": np.ones((4, 4, 4)),
+    "2 × 2 pixels of R, G, B; expected .* finite": np.full((2, 2, 3), np.nan),
+    "3 × 3 pixels of R, G, B; expected .* not negative": np.full((3, 3, 3), -1e-3),
+    "5 × 5 pixels of R, G, B; expected .* finite": np.full((5, 5, 3), np.inf),
     "expected an OpenEXR file": b"no image",
     "; expected an OpenEXR file": None,
 }
@@ -284,7 +302,7 @@ def test_an_invalid_map_of_the_sky_is_refused(message, scene, tmp_path):
         (tmp_path / "sky.exr").write_bytes(content)
     elif content is not None:
         image_file.write_exr(tmp_path / "sky.exr", content.astype(np.float32), "RGBA"[: content.shape[2]])
-    with pytest.raises(ValueError, match=rf"^[^\n]*scene\.xml: envmap[^\n]*sky\.exr[^\n]*{message}$"):
+    with pytest.raises(ValueError, match=rf"^[^\n]*scene\.xml: envmap[^\n]*sky\.exr[^\n]*{message}[^\n]*$"):
         from_mitsuba.load(scene(CONSTANT, SKY))
 
 
