@@ -252,9 +252,13 @@ def beside(template: str, target: Path, root: Path, above: Path = Path()) -> Pat
 
     `root`: the compared folder; `above`: its path relative to the folder of the settings.
     """
-    top = root.joinpath(*[".."] * len(above.parts))
-    base, rest = (top, template[len(ROOT) :]) if template.startswith(ROOT) else (target.parent, template)
-    return base / name_patterns.filled(rest, name_patterns.fields((above / target.relative_to(root)).as_posix()))
+    values = name_patterns.fields((above / target.relative_to(root)).as_posix())
+    path = Path(name_patterns.filled(template.removeprefix(ROOT), values))
+    if not template.startswith(ROOT):
+        return target.parent / path
+    if path.is_relative_to(above):  # without "..", so that it equals the path that a search of the folder finds
+        return root / path.relative_to(above)
+    return root.joinpath(*[".."] * len(above.parts), path)
 
 
 # Folders ------------------------------------------------------------------------------------------------------------

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import OpenImageIO as oiio
 import pytest
@@ -284,6 +287,9 @@ def test_a_mask_in_the_folder_of_references_is_not_compared(sides, template):
         (old / "masks").mkdir()
         (old / "a_mask.exr").rename(old / "masks/a.exr")
     results = folders.diff(old, new, Settings.for_all(method="exact", mask=template))
+    assert ([result.name for result in results.results], results.exit_code) == (["a.exr"], 0)
+    of_parent = Settings.for_all(method="exact", mask=template.replace("{root}", "{root}/{dir}"))
+    results = folders.diff(old, new, replace(of_parent, above=Path("old")))
     assert ([result.name for result in results.results], results.exit_code) == (["a.exr"], 0)
 
 
