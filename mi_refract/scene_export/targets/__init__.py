@@ -62,8 +62,11 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
     if plain.max_depth < LEAST_DEPTH.get(target, 1):
         raise ValueError(f"{plain.name}: max_depth = {plain.max_depth}; expected 2 or more, the least of {target}")
     bound = FARTHEST.get(target, math.inf)
-    for name, points in [("camera", plain.camera.origin), *((mesh.name, mesh.vertices) for mesh in plain.meshes)]:
-        if (largest := float(np.abs(points).max())) > bound:
+    for name, points in [
+        ("camera", np.array(plain.camera.origin)),
+        *((mesh.name, mesh.vertices) for mesh in plain.meshes),
+    ]:
+        if (largest := float(np.abs(points).max(initial=0))) > bound:
             raise ValueError(
                 f"{plain.name}: {name}: a coordinate of {largest:g}; expected up to {bound:g} for {target}"
             )
