@@ -2,8 +2,8 @@
 
 Mitsuba's wheel does not contain libLLVM, and not every libLLVM works: Dr.Jit rejects LLVM 14, and LLVM 15 and 16 abort
 the process (without an exception) in the first kernel that computes a minimum. So each library is first tried in a
-separate process. That it works, crashes or is too old is stored in `$XDG_CACHE_HOME/mi_refract/backend.json`. Other
-errors may have another cause, such as a limit of memory, so the next process tries again.
+separate process. The results "works", "crashes" and "too old" are stored in `$XDG_CACHE_HOME/mi_refract/backend.json`.
+Any other error, such as too little memory, may pass, so the next process tries again.
 
 Dr.Jit loads a libLLVM when it is imported, and no other one later. So call `activate` before Dr.Jit is imported; this
 module needs only the standard library. Afterwards, a change of the library needs a new process, as started by
@@ -288,7 +288,7 @@ def _try(path: str) -> Library:
     key = state and f"{os.path.realpath(path)}, {state.st_mtime_ns}, {state.st_size}, {machine}"
     if key in stored:
         return Library(path, stored[key])
-    defect, lasting = _probe("llvm", {CHOICE: path})
+    defect, lasting = not no_memory and _probe("llvm", {CHOICE: path})
     if key and lasting:
         stored[key] = defect
         with contextlib.suppress(OSError, RuntimeError):  # then the next process tries the library again
@@ -320,7 +320,8 @@ def _probe(name: str, environment: dict[str, str]) -> tuple[str, bool]:
         except OSError as error:
             return f"no process could be started: {error.strerror}", False
     if result.returncode < 0:
-        lasting = result.returncode not in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT)
+        no_memory = re.search("out of memory|bad_alloc|annot allocate", result.stderr)
+        lasting = not no_memory and result.returncode not in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT)
         name = {s.value: s.name for s in signal.Signals}.get(-result.returncode, f"signal {-result.returncode}")
         return f"ends the process in Dr.Jit's kernels ({name})", lasting
     if result.returncode == 0 and result.stdout.endswith("works\n"):

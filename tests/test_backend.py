@@ -115,6 +115,11 @@ def test_files_that_are_not_llvm_are_defective(tmp_path, content, defect, monkey
     "code, defect, lasting",
     [
         ("import os; os.abort()", "SIGABRT", True),
+        (
+            "import os, sys; sys.stderr.write('LLVM ERROR: out of memory'); sys.stderr.flush(); os.abort()",
+            "SIGABRT",
+            False,
+        ),
         ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "SIGSEGV", True),
         ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "SIGKILL", False),
         ("import time; print('works', flush=True); time.sleep(60)", "longer than", False),
@@ -124,7 +129,18 @@ def test_files_that_are_not_llvm_are_defective(tmp_path, content, defect, monkey
         ("import os; os._exit(0)", "no answer", False),
         (WORKS, "", True),
     ],
-    ids=["abort", "segmentation fault", "killed", "hangs", "raises", "refused", "too old", "silent", "works"],
+    ids=[
+        "abort",
+        "out of memory",
+        "segmentation fault",
+        "killed",
+        "hangs",
+        "raises",
+        "refused",
+        "too old",
+        "silent",
+        "works",
+    ],
 )
 def test_lasting_results_of_a_probe_are_stored(probed, monkeypatch, code, defect, lasting):
     monkeypatch.setattr(backend, "TIMEOUT", 3.0 if "sleep" in code else 60.0)

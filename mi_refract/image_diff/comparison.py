@@ -240,7 +240,7 @@ def _located(image: Image, values: Pixels, marked: NDArray[np.bool_]) -> str:
 def require_window(file: Image, image: Image, kind: str) -> None:
     """Raise ValueError unless a file, such as a mask, has the size of the image and shows the same part of the frame.
 
-    `kind`: of the file, for the error. A file that is a whole frame, such as a PNG file, may lie on a part of another.
+    `kind`: of the file, for the error. A file that is a whole frame, such as a PNG file, has no place of its own.
     """
     size, part = HEADER["size"], HEADER["data window"]
     if size(file) != size(image):

@@ -155,7 +155,7 @@ def _compare_pair(result: Result, results: Results, *, keep: bool, digests: bool
         try:
             if results.renders:
                 images = ((image, path) for image in pairing.images_in(path)[0].values())
-                left_out = pairing.auxiliary(result, results.reference, images)
+                left_out = pairing.files_beside(result, results.reference, images)
                 return file_pair.read_renders(path, how.max_values, left_out)
             return image_file.read_parts(path, how.max_values, decoded)
         except Exception as error:  # any error: `_judge` raises it again

@@ -56,7 +56,7 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
         entries = reference.parent.rglob("*") if deep else reference.parent.iterdir()
         others = sorted(path for path in entries if path.is_file() and path != reference)
         pair = _with_variants(pair, [path for path in others if not path.samefile(test)])
-        return [_without(_auxiliary(pair, (reference.parent, test.parent)), pair)]
+        return [_without(pair, _files_beside(pair, (reference.parent, test.parent)))]
     old, old_errors, old_hidden = images_in(reference) if has_reference else ({}, [], [])
     new, new_errors, new_hidden = images_in(test)
     for folder, content in ((reference, old or old_errors or not has_reference), (test, new or new_errors)):
@@ -73,8 +73,8 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
     with_new, tests = {pair.target for pair in pairs if pair.test}, {realpath(x.test) for x in pairs if x.test}
     others = [path for path in old.values() if path not in with_new and realpath(path) not in tests]
     pairs = [_with_variants(pair, others) for pair in pairs]
-    auxiliary = set[Path]().union(*(_auxiliary(pair, (reference, test)) for pair in pairs))
-    pairs = [_without(auxiliary, pair) for pair in pairs if not {pair.reference, pair.test} - {None} <= auxiliary]
+    others_files = set[Path]().union(*(_files_beside(pair, (reference, test)) for pair in pairs))
+    pairs = [_without(pair, others_files) for pair in pairs if not {pair.reference, pair.test} - {None} <= others_files]
     variants = {path for pair in pairs for path in pair.variants}
     pairs = [pair for pair in pairs if pair.test or pair.target not in variants]
     if not pairs and not old_errors and not new_errors:
@@ -180,7 +180,7 @@ def _mask_of(pair: Result, root: Path) -> Path | None:
     return beside(pair.how.mask, pair.target, root, pair.how.above) if pair.how.mask else None
 
 
-def auxiliary(pair: Result, references: Path, images: Iterable[tuple[Path, Path]]) -> set[Path]:
+def files_beside(pair: Result, references: Path, images: Iterable[tuple[Path, Path]]) -> set[Path]:
     """Return the mask of a pair and the variances of images: files that are not compared.
 
     `references`: the folder of the references; `images`: paths, each with the folder of its side.
@@ -193,15 +193,16 @@ def auxiliary(pair: Result, references: Path, images: Iterable[tuple[Path, Path]
     return files
 
 
-def _auxiliary(pair: Result, roots: tuple[Path, Path]) -> set[Path]:
+def _files_beside(pair: Result, roots: tuple[Path, Path]) -> set[Path]:
     """Return the mask and the variances of a pair and of its variants."""
     images = [(path, roots[0]) for path in (pair.target, *pair.variants)]
     images += [(pair.test, roots[1])] if pair.test else []
-    return auxiliary(pair, roots[0], images) - {pair.reference, pair.test}
+    return files_beside(pair, roots[0], images) - {pair.reference, pair.test}
 
 
-def _without(auxiliary: Collection[Path], pair: Result) -> Result:
-    return replace(pair, variants=tuple(path for path in pair.variants if path not in auxiliary))
+def _without(pair: Result, files: Collection[Path]) -> Result:
+    """Return the pair without the variants that are such files."""
+    return replace(pair, variants=tuple(path for path in pair.variants if path not in files))
 
 
 def _with_variants(pair: Result, others: Sequence[Path]) -> Result:

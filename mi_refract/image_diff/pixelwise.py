@@ -23,7 +23,7 @@ from .comparison import Comparison, Metric, Verdict, counted, groups, place, ver
 from .tile_statistics import median_nonblack, same_shape
 
 CODES = {"uint8": 255, "uint16": 65535}  # the integer for the value 1, by the file's type
-ROW_STEP = 16
+ROW_STEP = 16  # black is first looked for in every such row
 BLOCK = 2**16  # pixels whose ratios are computed at once, in float64
 # A pixel is outrageous above both of these. A detail that moves by NEAR pixels is not outrageous. Nor is any value of a
 # display, up to white, if the mean is more than a hundredth of white.

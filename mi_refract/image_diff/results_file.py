@@ -293,7 +293,7 @@ def _mapped_path(where: str, text: str, before: Path, now: Path) -> Path:
 def with_settings(results: Results, settings: Settings) -> Results:
     """Return the results with `settings`; of the settings in the JSON only `allow_nonfinite` is kept.
 
-    ValueError for an image with a variance in a separate file, because the JSON has no digest of it.
+    ValueError for an image whose settings name a variance file, because the JSON has no digest of it.
     """
     updated = []
     for result in results.results:
@@ -301,6 +301,8 @@ def with_settings(results: Results, settings: Settings) -> Results:
         target = result.target.relative_to(results.reference) if inside else Path()
         how = pairing.how_of(settings, result.name, target)
         if result.status in FAILED and (result.how.variance or how.variance):
-            raise ValueError(f"{result.name}: its variance is in a separate file; accept it without --from")
+            raise ValueError(
+                f"{result.name}: `variance` is set, and the JSON has no digest of such files; accept it without --from"
+            )
         updated.append(replace(result, how=replace(how, options=result.how.options)))
     return replace(results, results=tuple(updated))

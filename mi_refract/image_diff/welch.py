@@ -149,7 +149,8 @@ def _checked_counts(
 ) -> tuple[tuple[int, int], str]:
     """Return the samples per pixel of all renders of each side, or else the number of renders, and the unit.
 
-    ValueError for fewer than 2 renders a side, and for the same whole render twice: it would halve the measured noise.
+    ValueError for fewer than 2 renders a side, and for the same render twice, unless a mask leaves
+    pixels out: it would halve the measured noise.
     """
     if min(len(reference), len(test)) < 2:
         raise ValueError(
@@ -157,7 +158,8 @@ def _checked_counts(
             "with its variance, in channels such as m2_R or R.variance, or in a file (`variance`)"
         )
     for side in (reference, test):
-        if side[0].mask is not None or all(_identical(side[0], image) for image in side):
+        masked = side[0].mask is not None and not side[0].mask.all()
+        if masked or all(_identical(side[0], image) for image in side):
             continue  # renders without noise may be the same, and so may what a mask leaves of others
         for a, b in itertools.combinations(side, 2):
             if _identical(a, b) and (a.pixels != a.pixels[0, 0]).any():  # black ones may be the same

@@ -224,7 +224,7 @@ class PathLoop:
         # must not trace rays: intersections are evaluated at once.
         self.evaluated = self.vectorised and not dr.flag(dr.JitFlag.SymbolicLoops)
         self.lamp_extent = math.inf
-        if features.hide_emitters:
+        if features.hide_emitters and features.area:
             lamps = [shape for shape in all_shapes(scene) if shape.is_emitter()]
             self.lamp_extent = ray_origins.extent_of([ray_origins.size_of(shape) for shape in lamps])
         self.branch = branch_type(v, features.dispersion, features.absorption)
@@ -287,8 +287,9 @@ class PathLoop:
                 active = active & si.is_valid() & operator.ne(si.shape.emitter(), None)
             else:
                 active = False
-            beyond = ray_origins.spawn_ray(self.v, si, ray.d, self.lamp_extent, True)
-            ray.o = dr.select(active, beyond.o, ray.o)
+            near = ray_origins.spawn_ray(self.v, si, ray.d, self.lamp_extent, True).o
+            beyond = dr.select(si.t > 0, near, si.spawn_ray(ray.d).o)  # farther if the last step had no effect
+            ray.o = dr.select(active, beyond, ray.o)
             return ray, active
 
         return dr.while_loop((self.v.Ray3f(ray), active), lambda _, active: active, step)[0]

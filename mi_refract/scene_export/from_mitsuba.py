@@ -20,6 +20,7 @@ LEVEL = 5  # default tessellation level: spheres of 20480 triangles, circles of 
 LEVELS = range(9)
 LAMPS = ("point", "spot", "directional")
 SKY = "at least 2 × 2 pixels of R, G, B or X, Y, Z, finite and as Rec. 709 not negative"
+CONVERSION = 1e-5  # relative error of Mitsuba's conversion to Rec. 709: its matrices have 7 digits
 INTEGRATORS = ("path", "refract_path", "prb", "volpath", "prbvolpath")
 
 
@@ -157,13 +158,15 @@ def _sky(emitter: Node) -> Colour | Environment:
         path, scale = emitter.scene.resolve(emitter.value(str, "filename")), emitter.value(float, "scale", 1.0)
         try:
             pixels, header = read_exr(path)
-        except (OSError, ValueError) as error:
+            names = header["channels"]
+            has_colours = {*names} in ({*"RGB"}, {*"XYZ"})
+            if has_colours:  # as Mitsuba reads them: X, Y, Z and other primaries become Rec. 709
+                bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
+                pixels = np.array(bitmap)
+                rounding = CONVERSION * np.abs(pixels).max(-1, keepdims=True)
+                pixels[(-rounding < pixels) & (pixels < 0)] = 0
+        except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: Mitsuba's
             raise emitter.error(str(error), "an OpenEXR file") from None
-        names = header["channels"]
-        has_colours = {*names} in ({*"RGB"}, {*"XYZ"})
-        if has_colours:  # as Mitsuba reads them: X, Y, Z and other primaries become Rec. 709
-            bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
-            pixels = np.array(bitmap)
         if not has_colours or min(pixels.shape[:2]) < 2 or not np.isfinite(pixels).all() or (pixels < 0).any():
             size = f"{pixels.shape[1]} × {pixels.shape[0]} pixels of {', '.join(names)}"
             raise emitter.error(f"{path}: {size}", SKY)

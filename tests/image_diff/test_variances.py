@@ -216,7 +216,7 @@ def test_images_with_variance_files_cannot_be_accepted_by_json(pair, method):
     how, file = Settings(rules=(Entry("*", values),)), pair[0].parent / "out.json"
     results_file.write(folders.diff(*pair, how, to_accept=True), origin([], None), data=file)
     for now in (how, Settings.for_all(method="tolerance")):
-        with pytest.raises(ValueError, match="its variance is in a separate file; accept it without --from"):
+        with pytest.raises(ValueError, match="JSON has no digest of such files; accept it without --from"):
             results_file.with_settings(results_file.read(file), now)
 
 

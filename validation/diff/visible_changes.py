@@ -82,7 +82,7 @@ def drawn(shapes: list[Shape], samples: int = SAMPLES, turn: float = 0.0, shift:
     background, *others = shapes
     codes = np.tile(background[-1], (SIZE, SIZE, samples**2, 1))
     for kind, left, top, radius, angle, colour in others:
-        reach = 1.25 * radius + 3  # hypot(1, 0.7) radius or hypot(radius, 0.5), and to the corner of a sample's pixel
+        reach = 1.25 * radius + 3  # from its centre: ≥ hypot(1, 0.7) radius, ≥ hypot(radius, 0.5)
         near = tuple(slice(max(0, int(at - reach)), max(0, int(at + reach))) for at in (top, left))
         x, y = COLUMNS[near][..., None] + dx - left, ROWS[near][..., None] + dy - top
         cos, sin = np.cos(angle), np.sin(angle)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable
 
@@ -43,9 +44,12 @@ def files(plain: PlainScene) -> Files:
     # POV-Ray has one index per body. The medium around a body is the smallest other body that encloses it.
     meshes = sorted(plain.meshes, key=Mesh.volume)
     bodies = [(mesh, glass) for mesh in meshes if isinstance(glass := mesh.material, Glass)]
-    for mesh, glass in bodies:
-        others = (x for body, x in bodies if body is not mesh and encloses(body.triangles(), mesh.vertices[0]))
-        around = next((other.int_ior for other in others), outside)
+    boxes = [(mesh.vertices.min(0), mesh.vertices.max(0)) for mesh, _ in bodies]
+    for i, (mesh, glass) in enumerate(bodies):
+        low, high = boxes[i]
+        around_it = ((boxes[j][0] <= low).all() and (high <= boxes[j][1]).all() for j in range(i + 1, len(bodies)))
+        larger = itertools.compress(bodies[i + 1 :], around_it)
+        around = next((x.int_ior for body, x in larger if encloses(body.triangles(), mesh.vertices[0])), outside)
         if glass.ext_ior != around:
             text = f"{plain.name}: {mesh.name}: ext_ior = {glass.ext_ior}"
             raise ValueError(f"{text}; expected {around}, the index of the medium around it")

@@ -30,7 +30,7 @@ def main():
 def render(options, seed, path):
     """Render `scene.cfg` with this seed into a file."""
     config = pyluxcore.Properties("scene.cfg")
-    # LuxCore takes a seed of 0 for 1.
+    # LuxCore takes a seed of 0 for 1: both would be the same render.
     overrides = {"batch.haltspp": options.spp, "renderengine.seed": seed + 1, "film.outputs.0.filename": str(path)}
     if options.threads:
         overrides["native.threads.count"] = options.threads
