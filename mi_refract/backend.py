@@ -288,7 +288,7 @@ def _try(path: str) -> Library:
     key = state and f"{os.path.realpath(path)}, {state.st_mtime_ns}, {state.st_size}, {machine}"
     if key in stored:
         return Library(path, stored[key])
-    defect, lasting = not no_memory and _probe("llvm", {CHOICE: path})
+    defect, lasting = _probe("llvm", {CHOICE: path})
     if key and lasting:
         stored[key] = defect
         with contextlib.suppress(OSError, RuntimeError):  # then the next process tries the library again

@@ -507,8 +507,9 @@ def test_a_tile_with_the_noise_of_one_pixel_is_flagged(rng):
 
 def test_the_same_render_twice_is_an_error(rng):
     side = renders(rng, 3)
-    with pytest.raises(ValueError, match=r"b\.exr: the same image as a\.exr; expected independent renders"):
-        welch([*side, replace(side[0], path=Path("b.exr"))], renders(rng, 4))
+    for mask in (None, np.ones(side[0].pixels.shape[:2], bool)):
+        with pytest.raises(ValueError, match=r"b\.exr: the same image as a\.exr; expected independent renders"):
+            welch([replace(x, mask=mask) for x in (*side, replace(side[0], path=Path("b.exr")))], renders(rng, 4))
     one, two, three, four, five = (of(np.where(np.arange(3) == 0, np.nan, x.pixels)) for x in renders(rng, 5))
     with pytest.raises(ValueError, match=r"the same image as a\.exr; expected independent renders"):
         welch([one, two, one], [three, four, five], allow_nonfinite=True)
