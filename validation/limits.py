@@ -48,7 +48,9 @@ PRISM_ANGLE = limit(
 BOW_ANGLE = limit(160 * 2.0**-53, "radians: four boundaries of 8u, amplified by the next ones, and their points")
 FOCAL_DISTANCE = limit(5.4e-10, "relative: (h/R)² at h = 1e-3 and the smallest R = 43; aberration is tenths of that")
 FURNACE_CHANNEL = limit(3e-3, "relative, in each channel: the deviation from white that must be detected")
-PANE = limit(1e-3, "relative: one ray in 500 may pass between two faces at the edges of a pane")
+# A ray is lost at most where it meets a face within two ulp of the diagonal between its triangles: at 100 m within
+# 1.5e-5 m on either side, on √2 of 1.4 × 1.4 m, for two faces: 6e-5 of the rays. Each is off by at most n² − 1 = 1.25.
+PANE = limit(1e-4, "relative: rays at the diagonals of the faces may pass between two triangles")
 ABSORPTION_SEEN = limit(0.01, "relative: a difference of an image's mean from `volpath` that must be detected")
 SLAB_ABSORPTION = limit(2e-6, "relative: σ d up to 8 in float32, a path length off by 2u: 16u, and the exponential")
 DISPERSION_TIME = limit(1.25, "over the same scene with the index of the d line and as many samples")
