@@ -72,7 +72,7 @@ def run(
         write_atomically(files[number], json.dumps({"spent": spent, "rows": [row.as_dict() for row in rows]}))
         finished[number] = result
 
-    work = [(i, task.name) for i, task in enumerate(tasks) if not task.timed and not _saved(files[i])]
+    work = [(i, task.name) for i, task in enumerate(tasks) if not task.timed and not _saved(files[i], context.out)]
     if workers and work:
         for i, result in workers.run(work, context):
             announce(tasks[i])
@@ -80,7 +80,7 @@ def run(
     for i, task in enumerate(tasks):
         if i not in finished:
             announce(task)
-            save(i, _saved(files[i]) or timed(task))
+            save(i, _saved(files[i], context.out) or timed(task))
     results = [finished[i] for i in range(len(tasks))]
     return [row for rows, _ in results for row in rows], [spent for _, spent in results]
 
@@ -97,13 +97,15 @@ def timed(task: Task) -> Finished:
     return rows, {"task": task.name, "seconds": round(seconds, 2), "CPU seconds": round(cpu, 2)}
 
 
-def _saved(file: Path) -> Finished | None:
-    """Return the saved rows and times of a finished task; None if the file is missing or unreadable."""
+def _saved(file: Path, folder: Path) -> Finished | None:
+    """Return the saved rows and times of a finished task; None without a readable file and all images in `folder`."""
     try:
         record = json.loads(file.read_text())
-        return [Row.from_dict(data) for data in record["rows"]], dict(record["spent"])
+        rows, spent = [Row.from_dict(data) for data in record["rows"]], dict(record["spent"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
+    complete = all((folder / image).is_file() for row in rows for image in row.images.values())
+    return (rows, spent) if complete else None
 
 
 def forget(context: Context) -> None:

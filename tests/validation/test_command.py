@@ -93,6 +93,15 @@ def test_an_interrupted_run_resumes(context, on_workers):
     assert len(calls) == 7
 
 
+def test_a_task_whose_image_is_gone_runs_again(context, tmp_path):
+    image = tmp_path / "image.exr"
+    task = Task("a", lambda: image.write_bytes(b"") or [row(images={"test": image.name})])
+    for _ in range(2):
+        runner.run([task], context)
+        assert image.is_file()
+        image.unlink()
+
+
 def test_timed_tasks_run_last_and_not_on_workers(context):
     order = []
     tasks = [Task(n, lambda n=n: order.append(n) or [row(subject=n)], timed=n == "y") for n in "xyz"]
