@@ -101,7 +101,7 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
             error = statistics.fmean(tile_statistics.relative_mse(image, reference) for image, _ in points)
             curves.setdefault(name, []).append((statistics.median(seconds for _, seconds in points), error))
     z = math.sqrt(2 * math.log(2 / limits.NULL_ALARM))
-    chance = z * pairs.rms / math.sqrt(reference[..., 0].size) / reference.mean()
+    chance = z * pairs.rms / math.sqrt(reference[..., 0].size) / float(reference.mean())
     budgets, remark = _budgets(scene, left_out, chance), NO_REFERENCE.get(scene, left_out)
     row = functools.partial(Row, NAME, plugin, scene, context.variant)
     return [row(values | times, budgets, goals, remark, replay, images, curves)]
