@@ -221,7 +221,7 @@ def check(
         row = int(np.argmax(differences))
         id_, tolerance = int(rays.ids[row]), SAME if has_media(header) else SAME_ULPS * ulp
         ratio = RatioDifference(float(differences[row]), id_, described(header, id_), tolerance)
-        different_ratio = differences > tolerance
+        different_ratio = ~(differences <= tolerance)
     masks = {kind: table[kind] for kind in ("non-finite", "zero", "impossible")} | {"index": different_ratio}
     problem_ids |= {kind: rays.ids[mask] for kind, mask in masks.items()}
     problems = []

@@ -56,6 +56,12 @@ DEFECTS = {
     "no direction": ("", "b[7] = np.nan", "wrong", ""),
     "a set left out": ("", "rays.ids, b = rays.ids[:40], b[:40]", "unfit", ""),
     "an id missing": ("", "rays.ids, b = rays.ids[1:], b[1:]", "unfit", "id 0"),
+    "no refraction, by its own ratio": (
+        "",
+        "print('id,bx,by,bz,n_ratio'); [print(i, *v, 1, sep=',') for i, v in zip(rays.ids, a.tolist())]; sys.exit(0)",
+        "unfit",
+        "index id",
+    ),
     "signalled by NaN": ("", "b = np.where(d < 0, np.nan, b)", "other TIR signal", ""),
     "exception": (
         "raise RuntimeError('out of glass')",

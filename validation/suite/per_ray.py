@@ -120,7 +120,7 @@ TERMS = {name: f"{rays.count} rays: {rays.text}" for name, rays in SETS.items()}
     "wrong": "rays beyond the bound, misclassified although the bound decides them, or without a direction",
     "given up": "rays left out: so near the critical angle that the system treats them as totally reflected",
     "not seen to deviate": "1 if every answer is right although the system is known to be wrong in this set",
-    "unfit": "answers that are missing, duplicate, or for unknown rays",
+    "unfit": "answers that are missing, duplicate, for unknown rays, or for a ratio of indices that was not given",
     OTHER_SIGNAL: "1 if the program signals total internal reflection in another way than recorded",
     "unanswered": "rays without an answer, because the program crashed, hung or printed none",
 }
@@ -177,7 +177,7 @@ def rows(call: RaysCommand, rays: RaySet, answers: Answers) -> list[Row]:
     made = []
     for name, kind in SETS.items():
         errors = errors_of.get(name)
-        values = {"unfit": float(findings.problem_count(*UNFIT))}
+        values = {"unfit": float(findings.problem_count(*UNFIT, "index"))}
         budgets, goals = {"unfit": 0.0, "wrong": 0.0}, {}
         if errors is None:
             values["wrong"] = math.nan
