@@ -8,12 +8,13 @@ import pytest
 
 from mi_refract.report.row import Reason, Row
 from mi_refract.report.study_page import STATES
-from validation.directions import per_formula
+from validation.directions import bsdf_samples, per_formula, search, sweep
 from validation.efficiency import error_against_time
-from validation.ground_truth import traced_bodies
+from validation.ground_truth import standard_numbers, traced_bodies
 from validation.renders import against_dielectric
 from validation.run import headline, metrics
 from validation.stability import layered_paths, optical_chains
+from validation.suite import matrix
 
 WORST = {"worst rad": 5e-8, "worst / u": 0.9, "TIR misclassified": 0.0, "TIR misclassified, beyond its bound": 0.0}
 DECIDED = {"TIR misclassified, beyond its bound": 0.0}
@@ -24,6 +25,8 @@ DOUBLE = dataclasses.replace(OURS, setting="llvm float64", values={**WORST, "wor
 RENDER = {"changed share": 0.01, "|mean ratio − 1|": 1e-6, "Welch alarms": 0.0, "time / dielectric": 1.1}
 SPHERE = Row("renders", "refract", "sphere", "llvm_ad_rgb", RENDER, {"Welch alarms": 0.0})
 MIRAGE = dataclasses.replace(SPHERE, case="mirage", values={**RENDER, "Welch alarms": 7.0}, budgets={})
+SAME_SEEDS = {"changed share": 1.0, "|mean ratio − 1|": 0.5}
+DARK = dataclasses.replace(SPHERE, case="furnace", values=SAME_SEEDS, budgets={"changed share": 1e-3})
 FAST = [
     Row("efficiency", f"refract_path{split}", scene, "llvm_ad_rgb", {"equal-time MSE": value})
     for split, *values in (("", 0.7, 0.9, 1.1), (", split 1", 0.9, 0.8, 1.3), (", split 3", 0.055, 1.0, 1.2))
@@ -63,6 +66,8 @@ def test_the_names_are_those_of_the_studies():
         layered_paths: headline.PATHS,
     }
     assert all(name == study.NAME for study, name in named.items()) and per_formula.ALL == headline.EVERYTHING
+    judges = per_formula, sweep, search, bsdf_samples, traced_bodies, standard_numbers
+    assert tuple(study.NAME for study in judges) == headline.JUDGES and headline.SUMMARY == matrix.NAME
     known = {headline.COMMON, metrics.WORST_IN_U, metrics.MISCLASSIFIED, metrics.MISCLASSIFIED_FAR}
     assert known <= per_formula.TERMS.keys()
     assert metrics.EQUAL_TIME in error_against_time.TERMS
@@ -84,6 +89,9 @@ BODY = Row("ground_truth", "refract", "prism", "llvm_ad_rgb", {"error / bound": 
         ([OURS, DOUBLE, TEXTBOOK], 0, "yes", ["Yes.", "1,000 rays", "2.9\u00a0×\u00a010⁻⁶°"], ["classified on"]),
         ([OURS, DOUBLE, TEXTBOOK], 1, "yes", ["5.7\u00a0×\u00a010⁻¹⁵° in double", "90° (`cross`)", "7 % of these"], []),
         ([SPOILT], 0, "no", ["No: a check failed.", "on 3 of them"], ["Yes"]),
+        ([SPOILT], 1, "no", ["`promoted`, this project's own, broke a bound"], ["trusted"]),
+        ([OURS, dataclasses.replace(SPOILT, study="sweep")], 0, "no", ["No: a check failed."], ["Yes"]),
+        ([OURS, dataclasses.replace(SPOILT, study="sweep")], 1, "no", ["broke a bound"], ["trusted"]),
         ([dataclasses.replace(OURS, values=WORST | {"worst / u": 2.0})], 0, "yes", ["Yes."], ["no more than rounding"]),
         ([BODY], 0, "yes", ["Yes.", "Through 1 bodies", "all its rays stay within"], ["direction"]),
         ([dataclasses.replace(BODY, values={"error / bound": 2.0})], 0, "no", ["No:", "some of its rays leave"], []),
@@ -95,8 +103,9 @@ BODY = Row("ground_truth", "refract", "prism", "llvm_ad_rgb", {"error / bound": 
         ([SPHERE, *FAST[:1]], 2, "plain", ["splitting is 0.70 of that of `path`."], ["`split_depth`"]),
         ([SPHERE, MIRAGE, *TRACED], 3, "yes", ["1 of 2 scenes they do not differ", "In `mirage`, 1.0 % of"], []),
         ([SPHERE, MIRAGE, *TRACED], 3, "yes", ["follows all 64 exact", "`dielectric` loses 11", "even exact"], []),
+        ([SPHERE, DARK], 3, "no", ["1 of 2 scenes they do not differ", "In `furnace`, 100 %"], []),
         ([MIRAGE, *LAYERS], 3, "plain", ["In `mirage`", "0.010 %, Mitsuba's by 50 %"], ["do not differ"]),
-        ([OURS], 4, "plain", ["Everything was run."], []),
+        ([OURS], 4, "plain", ["Everything that was asked for was run."], []),
     ],
 )  # fmt: skip
 def test_what_is_said_and_what_is_not(rows, question, state, present, absent):
@@ -119,6 +128,9 @@ def test_what_was_not_run_is_counted_by_what_would_make_it_run():
     text = answer_to(4, OURS, ABSENT, ABSENT, RENDERER, other)["text"]
     assert text.startswith("4 of 5 measurements: 2 need an NVIDIA GPU")
     assert f"1 needs other renderers, by `{INSTALL}`;" in text and text.endswith("1 has other reasons.")
+    repeated = [cell for cell in matrix.summary([RENDERER]) if cell.study == matrix.NAME]
+    assert len(repeated) > 1 and {cell.remedy for cell in repeated} == {RENDERER.remedy}
+    assert answer_to(4, OURS, RENDERER, *repeated)["text"].startswith("1 of 2 measurements")
     assert answer_to(4, OURS, ABSENT, ABSENT)["text"].startswith("2 of 3 measurements need an NVIDIA GPU")
     second = dataclasses.replace(RENDERER, remedy=RENDERER.remedy.replace("pyglm", "batoid"))
     both = "2 of 2 measurements need other renderers, by `python -m validation renderers --install batoid,pyglm`"
@@ -138,7 +150,12 @@ def test_the_image_is_of_the_scene_that_differs_and_the_plot_of_methods_in_turn(
     seen = Row("paths", "refract", "mirage, telescope: image", "llvm_ad_rgb", exact, images=images | {"exact": "c.exr"})
     shown = headline.first_page([*rows, seen])["image"]
     assert shown["row"] == seen.name and shown["labels"]["exact"] == "exact paths"
-    assert "1.8 % of the pixels of `dielectric` are wrong, 0.33 % of those of `refract`" in shown["caption"]
+    assert "1.8 % of the pixels of `dielectric` are wrong, 0.33 % of those of `refract`; its" in shown["caption"]
+    wrong = dataclasses.replace(seen, budgets={"off exact": 1e-3})
+    assert "0.33 % of those of `refract`." in headline.first_page([wrong])["image"]["caption"]
+    dark = dataclasses.replace(DARK, images=images)
+    assert headline.first_page([rows[0], dark])["image"]["caption"] == "Scene `furnace`: the two differ."
+    assert headline.first_page(rows[:1])["image"]["caption"] == "Scene `sphere`: the same up to noise."
     plot = headline.first_page([*rows, *methods, *FAST])["plot"]
     assert plot["labels"] == {"path + refract": "refract"} and plot["row"] == methods[1].name  # of median gain
     assert {answer["state"] for answer in page["answers"]} <= set(STATES)

@@ -26,6 +26,11 @@ DIRECTIONS, EVERYTHING, COMMON = "directions", "all regimes", "generic"
 OURS, BUILTIN_FORMULA = ("compensated", "promoted"), "mi.fresnel + mi.refract"
 GROUND_TRUTH, RENDERS, EFFICIENCY, PATHS = "ground_truth", "renders", "efficiency", "paths"
 PLUGIN, BUILTIN, INTEGRATOR, METHODS = "refract", "dielectric", "refract_path", "every method"
+SUMMARY = "matrix"  # a study that repeats rows of others
+# Studies that judge formulas, those that judge `refract`, and their subjects.
+FORMULAS_IN = (DIRECTIONS, "sweep", "search")
+JUDGES = (*FORMULAS_IN, "samples", GROUND_TRUTH, "standard numbers")
+JUDGED = (*OURS, PLUGIN, f"{PLUGIN} − {BUILTIN}")
 MIRAGE, EXACT, ROUNDED = "mirage", "exact", "exact, indices in float32"
 LAYERS, SHALLOW = 1000, "89.55°"
 INSTALL = "python -m validation renderers --install"
@@ -46,20 +51,22 @@ def first_page(rows: Sequence[Row], profile: str = "") -> FirstPage:
     """Return questions and answers, an image of a scene in which the plugins differ, and a plot of error and time."""
     directions, renders, paths = (select(rows, study) for study in (DIRECTIONS, RENDERS, PATHS))
     ours = select(renders, subject=PLUGIN)
-    judged = [row for row in (*directions, *select(rows, GROUND_TRUTH)) if row.subject in (*OURS, PLUGIN)]
+    judged = [row for row in rows if row.study in JUDGES and row.subject in JUDGED]
     facts = _directions(directions) | _renders(ours, select(rows, EFFICIENCY)) | _paths(rows, paths)
+    own = [row for row in rows if row.study != SUMMARY]
     facts |= {
         "bodies": select(rows, GROUND_TRUTH, PLUGIN, metric=metrics.ERROR_OVER_BOUND),
         "failed": any(row.verdict == "fail" for row in judged),
-        "remedies": remedies(rows),
-        "count": len(rows),
+        "broken": any(row.verdict == "fail" for row in judged if row.subject in OURS),
+        "remedies": remedies(own),
+        "count": len(own),
         "quick": profile == "quick",
     }
     questions: dict[str, tuple[str, Sequence[Row], str]] = {  # question, rows that decide the state, study to link to
         "right": ("Is `refract` right?", judged, DIRECTIONS),
         "trusted": (
             "How far can each formula be trusted?",
-            [row for row in directions if row.subject != BUILTIN_FORMULA],
+            [row for row in rows if row.study in FORMULAS_IN and row.subject != BUILTIN_FORMULA],
             DIRECTIONS,
         ),
         "fast": ("Is it as fast as `dielectric`?", [], EFFICIENCY if facts["equal_time"] else RENDERS),
@@ -174,9 +181,14 @@ def _renders(ours: Sequence[Row], methods: Sequence[Row]) -> dict[str, Any]:
         "times": times,
         "median": statistics.median(times) if times else 0.0,
         "equal_time": equal_time(methods),
-        "same": [row for row in compared if not row.values.get(metrics.WELCH_ALARMS)],
-        "differing": [row for row in compared if row.values.get(metrics.WELCH_ALARMS)],
+        "same": [row for row in compared if not differ(row)],
+        "differing": [row for row in compared if differ(row)],
     }
+
+
+def differ(row: Row) -> bool:
+    """Return whether the images of a row differ: by noise alone they do not, and a check that fails is no noise."""
+    return row.verdict == "fail" or bool(row.values.get(metrics.WELCH_ALARMS))
 
 
 def _paths(rows: Sequence[Row], traced: Sequence[Row]) -> dict[str, Any]:
@@ -208,18 +220,17 @@ def remedies(rows: Sequence[Row]) -> dict[str, int]:
 def _image(ours: Sequence[Row], paths: Sequence[Row]) -> ShownRow | None:
     """Return the image of both plugins and exact paths, otherwise of the scene in which the plugins differ most."""
     for row in (row for row in paths if EXACT in row.images):
-        off, builtin_off = (percent(row.values[metric]) for metric in (metrics.OFF_EXACT, metrics.BUILTIN_OFF_EXACT))
-        shares = f"{builtin_off} of the pixels of `{BUILTIN}` are wrong, {off} of those of `{PLUGIN}`"
+        off, builtin_off = (row.values[metric] for metric in (metrics.OFF_EXACT, metrics.BUILTIN_OFF_EXACT))
+        shares = f"{percent(builtin_off)} of the pixels of `{BUILTIN}` are wrong, {percent(off)} of those of `{PLUGIN}`"
         labels = {"reference": BUILTIN, "test": PLUGIN, EXACT: "exact paths"}
-        caption = f"Scene `{MIRAGE}`: beside exact paths, {shares}; {LINES}."
+        lines = "" if row.verdict == "fail" else f"; {LINES}"
+        caption = f"Scene `{MIRAGE}`: beside exact paths, {shares}{lines}."
         return {"row": row.name, "labels": labels, "caption": caption}
     pairs = [row for row in ours if {"reference", "test"} <= row.images.keys()]
     if not pairs:
         return None
-    row = max(pairs, key=lambda row: row.values.get(metrics.WELCH_ALARMS, 0))
-    text = "the two differ" if row.values.get(metrics.WELCH_ALARMS) else "the same up to noise"
-    if row.case == MIRAGE and row.values.get(metrics.WELCH_ALARMS):
-        text = f"`{PLUGIN}` keeps the edges that `{BUILTIN}` breaks into stairs; {LINES}"
+    row = max(pairs, key=lambda row: (row.verdict == "fail", row.values.get(metrics.WELCH_ALARMS, 0)))
+    text = "the two differ" if differ(row) else "the same up to noise"
     labels = {"reference": BUILTIN, "test": PLUGIN}
     return {"row": row.name, "labels": labels, "caption": f"Scene `{row.case}`: {text}."}
 

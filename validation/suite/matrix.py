@@ -65,7 +65,7 @@ def _cells(row: Row, case: str) -> list[Row]:
     cases = (case,) if case in CHECKS[row.study] else CHECKS[row.study] if case else ()
     system = f"{row.subject}, {row.setting}" if row.study == per_ray.NAME else row.subject
     if not row.values:
-        return [Row(NAME, system, case, "", reason=row.reason) for case in cases]
+        return [Row(NAME, system, case, "", reason=row.reason, remedy=row.remedy) for case in cases]
     values, goals = {FAILED: float(len(row.broken))}, {}
     if row.study == rendered_images.NAME:
         verdict = row.replay.get("verdict")
