@@ -42,6 +42,10 @@ class CheckpointError(MiRefractError, ValueError):
     """A checkpoint is damaged, or belongs to a different render."""
 
 
+class ExportError(MiRefractError, ValueError):
+    """A scene has a part that the export, or the format of its target, cannot represent."""
+
+
 class TooMuchOutputError(MiRefractError, ValueError):
     """Another program printed more than allowed."""
 

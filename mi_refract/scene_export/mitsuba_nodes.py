@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_refract.io.errors import ExportError
 from mi_refract.io.image_file import one_line
 from mi_refract.plugins import scene_parser
 
@@ -63,9 +64,9 @@ class Node:
             verb, pronoun = ("is", "it") if len(self.unread) == 1 else ("are", "them")
             raise self.error(f"{names} {verb} not supported", f"a scene without {pronoun}")
 
-    def error(self, what: str, expected: str) -> ValueError:
+    def error(self, what: str, expected: str) -> ExportError:
         """Return the error that names the file, the plugin, the fault and the expected content."""
-        return ValueError(" ".join(f"{self.scene.path}: {self}: {what}; expected {expected}".split()))
+        return ExportError(" ".join(f"{self.scene.path}: {self}: {what}; expected {expected}".split()))
 
     def value(self, kind: type[Kind], name: str, default: Kind | None = None) -> Kind:
         """Return a parameter of this type. ValueError if it is missing, of another type, or not finite."""

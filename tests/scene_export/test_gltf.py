@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support.scene_readers import cone, glb, punctual
 
+from mi_refract.io.errors import ExportError
 from mi_refract.scene_export import from_mitsuba, targets, tessellation
 from mi_refract.scene_export.plain_scene import Camera, Diffuse, Glass, Light, Mesh, PlainScene
 
@@ -211,7 +212,7 @@ PARTS = {
 @pytest.mark.parametrize("message", PARTS)
 def test_a_glass_or_lamp_that_gltf_cannot_hold_is_refused(message, export, tmp_path):
     """The error is one line, and nothing is written."""
-    with pytest.raises(ValueError, match=rf"^[^\n]*{re.escape(message)}[^\n]*$"):
+    with pytest.raises(ExportError, match=rf"^[^\n]*{re.escape(message)}[^\n]*$"):
         export(PARTS[message])
     assert not (tmp_path / "new").exists()
 
@@ -243,7 +244,7 @@ def plain(meshes):
 
 @pytest.mark.parametrize("message", MESHES)
 def test_a_mesh_that_gltf_cannot_hold_is_refused(message, tmp_path):
-    with pytest.raises(ValueError, match=rf"^a scene: {re.escape(message)}[^\n]*$"):
+    with pytest.raises(ExportError, match=rf"^a scene: {re.escape(message)}[^\n]*$"):
         targets.write(plain(MESHES[message]), "gltf", tmp_path / "new")
     assert not (tmp_path / "new").exists()
 

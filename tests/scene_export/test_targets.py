@@ -26,6 +26,7 @@ from mi_refract import SCENES
 from mi_refract.image_diff import methods
 from mi_refract.image_diff.comparison import Verdict
 from mi_refract.io import image_file
+from mi_refract.io.errors import ExportError
 from mi_refract.scene_export import from_mitsuba, targets, tessellation
 from mi_refract.scene_export.plain_scene import (
     Camera,
@@ -88,7 +89,7 @@ def test_a_target_refuses_lamps_that_it_does_not_hold(lamp, target, tmp_path):
     assert len(REFUSED) == 4 * 3 + 1
     scene = dataclasses.replace(plain(GLASS), lamps=(lamp,))
     text = f"a scene: bulb: a {lamp.kind} lamp is not exported to {target}; expected area lamps, an environment, or"
-    with pytest.raises(ValueError, match=rf"^{text} --to (cycles or )?mitsuba or obj\+json or gltf$"):
+    with pytest.raises(ExportError, match=rf"^{text} --to (cycles or )?mitsuba or obj\+json or gltf$"):
         targets.write(scene, target, tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
@@ -339,7 +340,7 @@ def test_povray(tmp_path):
         (apart, "apart: ext_ior = 1.33; expected 1.25, the index of the medium around it"),
     ):
         meshes = mesh, Mesh("ball", *BALL, GLASS), drop
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(ExportError, match=message):
             targets.write(PlainScene("bad", meshes, (1.0, 1.0, 1.0), CAMERA, 8), "povray", tmp_path / "new")
     assert not list(tmp_path.iterdir())
     make = targets.TARGETS["povray"]
@@ -363,7 +364,7 @@ def write_export(target, folder, depth=12):
 
 @pytest.mark.parametrize("target", ["cycles", "luxcore"])
 def test_a_target_that_always_samples_lights_refuses_paths_of_one_segment(target, tmp_path):
-    with pytest.raises(ValueError, match=f"^a scene: max_depth = 1; expected 2 or more, the least of {target}$"):
+    with pytest.raises(ExportError, match=f"^a scene: max_depth = 1; expected 2 or more, the least of {target}$"):
         write_export(target, tmp_path / "new", depth=1)
     write_export("radiance", tmp_path / "new", depth=1)
 
@@ -377,7 +378,7 @@ def test_coordinates_beyond_the_ends_of_rays_are_refused(target, farthest, tmp_p
 
     targets.write(scene(0.9 * farthest, 0.9 * farthest), target, tmp_path / "near")
     for i, sizes in enumerate([(1.1 * farthest, 1), (1, 1.1 * farthest)]):
-        with pytest.raises(ValueError, match=rf"a coordinate of 1\.1e\+\d+; expected up to 1e\+\d+ for {target}$"):
+        with pytest.raises(ExportError, match=rf"a coordinate of 1\.1e\+\d+; expected up to 1e\+\d+ for {target}$"):
             targets.write(scene(*sizes), target, tmp_path / f"{i}")
 
 

@@ -9,6 +9,7 @@ import pytest
 from mi_refract import media
 from mi_refract.image_diff.comparison import Verdict
 from mi_refract.io import image_file
+from mi_refract.io.errors import ExportError
 from mi_refract.scene_export import targets
 from mi_refract.scene_export.plain_scene import Diffuse, Glass, Light
 from validation import limits
@@ -16,7 +17,7 @@ from validation.run.context import PROFILES, Context
 from validation.suite import exports, matrix, rendered_images, spectral_lines
 from validation.suite.rendered_images import INCONCLUSIVE, THREE, Size
 from validation.suite.renderers import SYSTEMS, environments
-from validation.suite.renderers.image_renderers import IMAGE_RENDERERS, ImageRenderer, NoExport
+from validation.suite.renderers.image_renderers import IMAGE_RENDERERS, ImageRenderer
 
 SMALL = Size(48, 32, 1, 0.2)
 pytestmark = pytest.mark.usefixtures("llvm_variant")
@@ -98,7 +99,7 @@ def test_failed_renders_and_nan_never_pass(judged, monkeypatch):
 
     row = judged(draw=draw_nan)
     assert row.verdict == "fail" and "NaN" in row.reason
-    answers = (NoExport("a diffuse surface"), "not run"), (ValueError("no image: channels Y"), "fail")
+    answers = (ExportError("a diffuse surface"), "not run"), (ValueError("no image: channels Y"), "fail")
     for error, verdict in (*NOT_DRAWN, *answers):
         row = judged(draw=raising(error))
         assert row.verdict == verdict and str(error) in row.reason
@@ -241,3 +242,13 @@ def test_the_scene_of_spectral_lines_is_grey_has_raysects_glass_and_differs_betw
     for images in one.values():
         assert images[0].pixels[0, 0, 0] == pytest.approx(plain.sky[0], rel=1e-3)
     assert spectral_lines.compared(one["C"], one["F"], size)[0].verdict is Verdict.DIFFERENT
+
+
+def test_an_error_of_an_export_is_not_taken_for_a_scene_that_its_format_cannot_hold(context, monkeypatch, tmp_path):
+    def broken(plain):
+        raise ValueError("operands could not be broadcast together")
+
+    monkeypatch.setitem(targets.TARGETS, "gltf", broken)
+    monkeypatch.setattr(exports, "SCENES", tmp_path)
+    monkeypatch.setattr(environments, "why_not", lambda system, profile: "")
+    assert {row.verdict for row in exports.validated(context)} == {"fail"}

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mi_refract.io.errors import ExportError
 from mi_refract.report.row import Row
 from mi_refract.scene_export import from_mitsuba, targets, tessellation
 from mi_refract.scene_export.plain_scene import (
@@ -126,7 +127,7 @@ def validated(context: Context) -> list[Row]:
             with tempfile.TemporaryDirectory() as folder:
                 try:
                     written = targets.write(load(), "gltf", Path(folder) / "scene")
-                except ValueError as error:
+                except ExportError as error:
                     raise environments.Unable(str(error)) from None
                 files = [str(file) for file in written if file.suffix in (".glb", ".gltf")]
                 command = ("node", str(SCRIPTS / "validate_gltf.mjs"), "{environment}")

@@ -23,6 +23,7 @@ import numpy as np
 from mi_refract.image_diff.comparison import Comparison, Verdict
 from mi_refract.image_diff.methods import compare
 from mi_refract.io import image_file
+from mi_refract.io.errors import ExportError
 from mi_refract.io.image_file import Image
 from mi_refract.plugins import PLUGIN
 from mi_refract.rendering import scene_files
@@ -35,7 +36,7 @@ from validation.run.context import Context
 from validation.run.metrics import DETECTABLE, MEAN_DIFFERENCE
 from validation.run.render_methods import Camera, save_image
 from validation.study import Study, Task, about
-from validation.suite.renderers.image_renderers import IMAGE_RENDERERS, ImageRenderer, NoExport, by_command, mean
+from validation.suite.renderers.image_renderers import IMAGE_RENDERERS, ImageRenderer, by_command, mean
 
 from .renderers import SYSTEMS, System, environments
 
@@ -202,7 +203,7 @@ def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
         with tempfile.TemporaryDirectory() as folder:
             try:
                 return renderer.draw(SCENES[scene].load(size.resolution), Path(folder), spp, seeds)
-            except NoExport as error:
+            except ExportError as error:
                 raise environments.Unable(str(error)) from None
 
     theirs, no_answer = environments.attempt(row, why_not(SYSTEMS[renderer.system], context), LOST, draw)

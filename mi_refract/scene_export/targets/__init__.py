@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_refract.io import safe_files
+from mi_refract.io.errors import ExportError
 
 from ..plain_scene import PlainScene, VolumeGlass
 from . import gltf, luxcore, mitsuba, povray, radiance, scene_json, shared_files
@@ -43,8 +44,8 @@ FARTHEST = {"povray": 1e6, "radiance": 1e9}  # largest coordinates: rays of thes
 def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> list[Path]:
     """Write the files of a target into a new or empty folder, all of them or none. Return their paths, sorted.
 
-    ValueError for an unknown target, or a scene that the target's format cannot hold. OSError for a folder that
-    contains files or cannot be written.
+    ExportError for a scene that the target's format cannot hold, ValueError for an unknown target. OSError for a folder
+    that contains files or cannot be written.
     """
     if target not in TARGETS:
         raise ValueError(f"target {target!r}: unknown; expected {', '.join(TARGETS)}")
@@ -58,16 +59,16 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
     for mesh in plain.meshes:
         if isinstance(mesh.material, VolumeGlass) and target not in HOLD_VOLUMES:
             expected = f"one number for all wavelengths and no absorption, or --to {' or '.join(HOLD_VOLUMES)}"
-            raise ValueError(f"{plain.name}: {mesh.name}: {mesh.material.parameters}; expected {expected}")
+            raise ExportError(f"{plain.name}: {mesh.name}: {mesh.material.parameters}; expected {expected}")
     if plain.max_depth < LEAST_DEPTH.get(target, 1):
-        raise ValueError(f"{plain.name}: max_depth = {plain.max_depth}; expected 2 or more, the least of {target}")
+        raise ExportError(f"{plain.name}: max_depth = {plain.max_depth}; expected 2 or more, the least of {target}")
     bound = FARTHEST.get(target, math.inf)
     for name, points in [
         ("camera", np.array(plain.camera.origin)),
         *((mesh.name, mesh.vertices) for mesh in plain.meshes),
     ]:
         if (largest := float(np.abs(points).max(initial=0))) > bound:
-            raise ValueError(
+            raise ExportError(
                 f"{plain.name}: {name}: a coordinate of {largest:g}; expected up to {bound:g} for {target}"
             )
     for lamp in plain.lamps:
@@ -75,7 +76,7 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
             fault = f"a {lamp.kind} lamp is not exported to {target}"
             supporting = [name for name, kinds in HOLD_LAMPS.items() if lamp.kind in kinds]
             expected = f"area lamps, an environment, or --to {' or '.join(supporting)}"
-            raise ValueError(f"{plain.name}: {lamp.name}: {fault}; expected {expected}")
+            raise ExportError(f"{plain.name}: {lamp.name}: {fault}; expected {expected}")
     files = TARGETS[target](plain)
     with safe_files.replacing(place, folder=True) as temporary:
         for name, content in files.items():

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mi_refract import __version__
-from mi_refract.io.errors import MissingExtraError
+from mi_refract.io.errors import ExportError, MissingExtraError
 
 from ..plain_scene import (
     LINES,
@@ -71,7 +71,7 @@ def files(plain: PlainScene) -> Files:
     for lamp in plain.lamps:
         if isinstance(lamp, SpotLamp) and lamp.cutoff_degrees > 90:
             angle = f"cutoff_angle = {lamp.cutoff_degrees:g} degrees"
-            raise ValueError(f"{plain.name}: {lamp.name}: {angle}; expected at most 90 degrees, the limit of glTF")
+            raise ExportError(f"{plain.name}: {lamp.name}: {angle}; expected at most 90 degrees, the limit of glTF")
     plain = outward(plain)
     outside = outermost_index(plain)
     oriented = (_around_glass(plain, mesh, outside) for mesh in plain.meshes)
@@ -147,29 +147,29 @@ def _around_glass(plain: PlainScene, mesh: Mesh, outside: float) -> Mesh:
     """
     material, place = mesh.material, f"{plain.name}: {mesh.name}"
     if isinstance(material, Diffuse) and max(material.reflectance) > 1:
-        raise ValueError(f"{place}: reflectance = {material.reflectance}; expected at most 1 in glTF")
+        raise ExportError(f"{place}: reflectance = {material.reflectance}; expected at most 1 in glTF")
     if not isinstance(material, Glass):
         return mesh
     if not is_closed(mesh.faces):
-        raise ValueError(f"{place}: glass with an open surface; expected a closed one: glTF's volumes are bounded")
+        raise ExportError(f"{place}: glass with an open surface; expected a closed one: glTF's volumes are bounded")
     if not math.isclose(material.ext_ior, outside, rel_tol=1e-12):  # a hollow of the glass, or another glass
         mesh = turned(mesh)
         material = mesh.material
         assert isinstance(material, Glass)
     if not math.isclose(material.ext_ior, outside, rel_tol=1e-12):
         media = f"media of {material.int_ior!r} and {material.ext_ior!r} touch"
-        raise ValueError(
+        raise ExportError(
             f"{place}: {media}; expected the medium around all glass, {outside!r}, on one side, as in glTF"
         )
     if material.int_ior < outside:
         index = f"index {material.int_ior!r} is below {outside!r}, that of the medium around all glass"
-        raise ValueError(f"{place}: {index}; expected at least that: glTF requires ior >= 1")
+        raise ExportError(f"{place}: {index}; expected at least that: glTF requires ior >= 1")
     if isinstance(material, VolumeGlass):
         if any(material.ext_sigma):
             fault = "the medium around all glass absorbs"
-            raise ValueError(f"{place}: {material.parameters}: {fault}; expected no absorption there")
+            raise ExportError(f"{place}: {material.parameters}: {fault}; expected no absorption there")
         if material.spectrum and not 0 < _abbe(material) < math.inf:
-            raise ValueError(f"{place}: {material.parameters}; expected an index that falls with the wavelength")
+            raise ExportError(f"{place}: {material.parameters}; expected an index that falls with the wavelength")
     return mesh
 
 
@@ -183,7 +183,7 @@ def _with_hollows(plain: PlainScene, meshes: Sequence[Mesh]) -> list[Mesh]:
         candidates = (mesh for mesh in solids if mesh.material == hollow.material)
         solid = next((mesh for mesh in candidates if encloses(mesh.triangles(), hollow.vertices[0])), None)
         if solid is None:
-            raise ValueError(f"{plain.name}: {hollow.name}: a hollow; expected the same glass around it")
+            raise ExportError(f"{plain.name}: {hollow.name}: a hollow; expected the same glass around it")
         outer, inner = _with_normals(bodies[solid.name]), _with_normals(hollow)
         assert outer.normals is not None and inner.normals is not None
         bodies[solid.name] = replace(

@@ -8,6 +8,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from mi_refract.io.errors import ExportError
+
 from ..plain_scene import Diffuse, Environment, Glass, Light, Mesh, PlainScene
 from ..tessellation import encloses, is_closed
 from .shared_files import LIGHT_INSIDE, Files, numbers, outermost_index, outward, readme, sky_exr
@@ -35,9 +37,9 @@ def files(plain: PlainScene) -> Files:
     for mesh in plain.meshes:
         place = f"{plain.name}: {mesh.name}"
         if isinstance(mesh.material, Glass) and not is_closed(mesh.faces):
-            raise ValueError(f"{place}: glass with an open surface; POV-Ray needs a closed surface")
+            raise ExportError(f"{place}: glass with an open surface; POV-Ray needs a closed surface")
         if isinstance(mesh.material, Diffuse) and any(mesh.material.reflectance):
-            raise ValueError(f"{place}: a diffuse surface; the export to POV-Ray supports glass and lights only")
+            raise ExportError(f"{place}: a diffuse surface; the export to POV-Ray supports glass and lights only")
     # In POV-Ray the outermost medium has index 1: indices are relative to it.
     plain = outward(plain)
     outside = outermost_index(plain)
@@ -52,7 +54,7 @@ def files(plain: PlainScene) -> Files:
         around = next((x.int_ior for body, x in larger if encloses(body.triangles(), mesh.vertices[0])), outside)
         if glass.ext_ior != around:
             text = f"{plain.name}: {mesh.name}: ext_ior = {glass.ext_ior}"
-            raise ValueError(f"{text}; expected {around}, the index of the medium around it")
+            raise ExportError(f"{text}; expected {around}, the index of the medium around it")
     if isinstance(plain.sky, Environment):
         sky = 'sky_sphere { pigment { image_map { exr "sky.exr" gamma 1.0 map_type 1 interpolate 2 } } }\n'
     else:

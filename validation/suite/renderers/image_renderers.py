@@ -44,18 +44,6 @@ class ImageRenderer:
     assumed: Sequence[str]
 
 
-class NoExport(ValueError):
-    """The renderer's format cannot represent the scene; the message says why."""
-
-
-def export(plain: PlainScene, target: str, folder: Path) -> None:
-    """Write the scene into a folder. Errors: NoExport; otherwise as of `targets.write`."""
-    try:
-        targets.write(plain, target, folder)
-    except ValueError as error:
-        raise NoExport(str(error)) from None
-
-
 def unedited(scene: Path) -> None:
     """Leave the files as they were exported."""
 
@@ -71,7 +59,7 @@ def by_script(
     more: Sequence[str] = (),
 ) -> list[Image]:
     """Render by the script that is exported with the scene, after `edit(folder)`, with `more` options."""
-    export(plain, target, folder / "scene")
+    targets.write(plain, target, folder / "scene")
     edit(folder / "scene")
     program = [environments.python(SYSTEMS[target]), "render.py", "--spp", str(spp), "--out", str(folder)]
     environments.run([*program, *more, "--seeds", *map(str, seeds)], timeout=HOURS, where=folder / "scene")
@@ -82,7 +70,7 @@ def by_command(system: System, plain: PlainScene, folder: Path, spp: int, seeds:
     """Render by the command of the system's `mi-refract-renderer.toml`."""
     if system.images is None:
         raise ValueError(f"{system.name}: no [images]; expected a system with a command for images")
-    export(plain, system.images.export, folder / "scene")
+    targets.write(plain, system.images.export, folder / "scene")
     for seed in seeds:
         values = {"scene": folder / "scene", "image": folder / f"seed{seed}.exr", "spp": spp, "seed": seed}
         environments.ask(system, system.images.command, timeout=HOURS, values=values)
@@ -93,7 +81,7 @@ def radiance_images(
     plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int], edit: Callable[[Path], None] = unedited
 ) -> list[Image]:
     """Render by Radiance's rtrace with the options of README.txt, after `edit(folder)` of the exported files."""
-    export(plain, "radiance", folder / "scene")
+    targets.write(plain, "radiance", folder / "scene")
     edit(folder / "scene")
     sizes = map(str, (plain.camera.width, plain.camera.height, spp, *seeds))
     words = str(folder / "scene"), str(folder), *sizes
@@ -112,7 +100,7 @@ def povray_images(
     side, camera = math.isqrt(spp), plain.camera
     width, height = side * camera.width, side * camera.height
     finer = dataclasses.replace(plain, camera=dataclasses.replace(camera, width=width, height=height))
-    export(finer, "povray", folder / "scene")
+    targets.write(finer, "povray", folder / "scene")
     edit(folder / "scene")
     lines = (folder / "scene" / "README.txt").read_text().splitlines()
     command = next(line.split() for line in lines if line.split()[:1] == ["povray"])
@@ -137,7 +125,7 @@ def _three(mode: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence
 
 def _cycles_gltf(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
     """Render by Cycles the glTF export as Blender imports it, with the settings of the export to Cycles."""
-    export(plain, "cycles", folder / "cycles")
+    targets.write(plain, "cycles", folder / "cycles")
     _write_gltf(plain, folder / "scene")
     words = (folder / "scene", folder / "cycles" / "render.py", "--spp", spp, "--out", folder, "--seeds", *seeds)
     command = environments.script(SYSTEMS["cycles"], "gltf_by_cycles.py", *map(str, words))
@@ -148,12 +136,12 @@ def _cycles_gltf(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]
 def _write_gltf(plain: PlainScene, folder: Path) -> None:
     """Export to glTF without vertex normals: Mitsuba's side has flat facets."""
     meshes = tuple(dataclasses.replace(mesh, normals=None) for mesh in plain.meshes)
-    export(dataclasses.replace(plain, meshes=meshes), "gltf", folder)
+    targets.write(dataclasses.replace(plain, meshes=meshes), "gltf", folder)
 
 
 def _mitsuba(integrator: str, plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
     """Render by another integrator of Mitsuba, with `dielectric`, in this process and the current variant."""
-    export(plain, "mitsuba", folder / "scene")
+    targets.write(plain, "mitsuba", folder / "scene")
     parameters = {"bsdf": "dielectric", "integrator": integrator}
     camera = Camera(scene_files.load_scene(folder / "scene" / "scene.xml", parameters))
     return [image_file.named(f"seed {seed}", mean(camera, spp, seed)) for seed in seeds]
