@@ -101,18 +101,19 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
             error = statistics.fmean(tile_statistics.relative_mse(image, reference) for image, _ in points)
             curves.setdefault(name, []).append((statistics.median(seconds for _, seconds in points), error))
     z = math.sqrt(2 * math.log(2 / limits.NULL_ALARM))
-    chance = z * pairs.rms / math.sqrt(reference[..., 0].size) / float(reference.mean())
-    budgets, remark = _budgets(scene, left_out, chance), NO_REFERENCE.get(scene, left_out)
+    allowed = limits.WELCH_MARGIN + z * pairs.rms / math.sqrt(reference[..., 0].size) / float(reference.mean())
+    if not context.scalar:  # scalar renders have so few samples that chance may exceed MEANS
+        allowed = min(allowed, limits.MEANS)
+    budgets, remark = _budgets(scene, left_out, allowed), NO_REFERENCE.get(scene, left_out)
     row = functools.partial(Row, NAME, plugin, scene, context.variant)
     return [row(values | times, budgets, goals, remark, replay, images, curves)]
 
 
-def _budgets(scene: str, left_out: str, chance: float) -> dict[str, float]:
-    """Return the budgets of a scene. `chance`: the most by which chance makes the means differ, relative."""
+def _budgets(scene: str, left_out: str, means: float) -> dict[str, float]:
+    """Return the budgets of a scene. `means`: the most by which rounding and chance make the means differ, relative."""
     if scene in NO_REFERENCE:
         return {}
-    budgets = {MEANS_DIFFER: min(limits.MEANS, limits.WELCH_MARGIN + chance)}
-    budgets |= {} if left_out else {WELCH_ALARMS: 0.0}
+    budgets = {MEANS_DIFFER: means} | ({} if left_out else {WELCH_ALARMS: 0.0})
     return budgets | ({CHANGED_SHARE: limits.CHANGED} if left_out or scene in SHORT_PATHS else {})
 
 
