@@ -99,7 +99,7 @@ REFLECTANCE = {
 }
 
 PATH_BOUNDARY = limit(2.0**-24, "of the direction, times 2 m + 1 after m boundaries: each rounds the cosine twice")
-OFF_EXACT = limit(1.0, "over the built-in's count: where the two images differ, `refract` is the correct one")
+OFF_EXACT = limit(0.5, "over the built-in's count: where the two images differ, `refract` is mostly the correct one")
 FLIPPED = limit(1e-3, "of the pixels: a last bit changes the choice between reflection and refraction")
 
 # Renders -------------------------------------------------------------------------------------------------------
@@ -192,7 +192,7 @@ STANDARD = limit(1.0, "error of a standard number over its bound, whose terms th
 STANDARD_SEEN = limit(1e-3, "relative, of an index: crown glasses of 1.52 and 1.5168 in the table differ by twice that")
 INDEX_SEEN = limit(1e-4, "relative: an index off by this must move a ray to its bound, or the bound tests nothing")
 FALSE_ALARM = limit(1e-4, "probability that noise, or a sum of independent roundings, exceeds its bound by chance")
-RAINBOW_RESOLVED = limit(0.0145 / 10, "degrees, standard error: INDEX_SEEN moves the rainbow by 0.0145")
+RAINBOW_RESOLVED = limit(0.0145 / 10, "degrees, standard error: an index off by 1e-4 moves the rainbow by 0.0145")
 # Pixels may move the edge: σ²/4(D − D₀) at 0.1 degrees is 3.5e-4. The fitted parabola multiplies this by 1.7 at D₀:
 # 6e-4, which images without noise confirm.
 RAINBOW_BLUR = limit(1e-3, "degrees by which the size of the pixels may move the edge of the rainbow")
@@ -218,7 +218,7 @@ EXPORT_SYSTEMATIC = limit(
     "edge crosses the pixel along the grid, in a tenth of the pixels; a resampled sky by less",
 )
 EXPORT_NOISE = limit(0.02, "of the image's mean: more noise could hide a defect")
-EXPORT_SIGMAS = limit(2.0, "RMSE over predicted noise: the mean of squares of 144 pixels exceeds 4 once in 10⁶⁰ times")
+EXPORT_SIGMAS = limit(2.0, "RMSE over noise: in 144 pixels of equal noise the mean square exceeds 4 once in 10⁵² times")
 
 # Changes that must not be visible
 INVISIBLE_ALARM = limit(1e-6, "probability of any false alarm of a test: 1e-3 in a run of 500 rows with two tests each")
