@@ -36,6 +36,7 @@ from validation.run import render_methods
 from validation.run.context import PROFILES, SCENES, Context
 from validation.run.glass_balls import alone
 from validation.run.kernel_timing import kernels
+from validation.run.seeds import STEP
 
 
 @pytest.fixture
@@ -249,6 +250,19 @@ def test_renders_in_passes_without_a_number_fail(context, monkeypatch, pixel, ve
     monkeypatch.setattr(rendering_passes, "resume", resume)
     (row,) = rendering_passes.error_rows(context, "sphere")
     assert row.verdict == verdict
+
+
+def test_no_two_images_of_neighbours_have_a_seed_in_common(llvm_variant, monkeypatch):
+    """The errors of BSDFs that do not share an image are independent, as their variances are added."""
+    seeds = []
+
+    def render(view, sensor, seed, **_):
+        seeds.append(seed)
+        return np.ones((*sensor.film().size()[::-1], 4))
+
+    monkeypatch.setattr(neighbours.mi, "render", render)
+    assert neighbours.rows("llvm_ad_rgb", "alone", ("diffuse", "plastic", "refract"), ((0, 4), (1, 4)))
+    assert len(seeds) == len({*seeds}) > 12 and max(seeds) - min(seeds) < STEP
 
 
 def test_glass_that_cannot_be_loaded_is_not_left_out(llvm_variant, monkeypatch):

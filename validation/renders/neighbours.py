@@ -201,14 +201,15 @@ def rows(variant: str, wrapper: str, names: tuple[str, ...], settings: Settings,
                 raise
             reason = str(error).rpartition("[")[2].partition("] ")[2].partition("\n")[0]
             table.append(row(f"{title}: {name}", variant, reason=f"Mitsuba: {reason}"))
+    seeds = itertools.count(seed, 2)  # each image has seeds of its own: the errors of different groups are added
     parts = []
     for group in groups.values():
         gc.collect()  # Dr.Jit compiles every BSDF in memory
         measure = functools.partial(measured, scene(group.values(), variant), len(group))
-        expected = measure({"type": "path"} | parameters, 64, samples, seed + 5000)
+        expected = measure({"type": "path"} | parameters, 64, samples, next(seeds))
         ours = [
-            measure({"type": OURS, "split_depth": depth} | parameters, spp, samples / len(settings), seed + 2 * i)
-            for i, (depth, spp) in enumerate(settings)
+            measure({"type": OURS, "split_depth": depth} | parameters, spp, samples / len(settings), next(seeds))
+            for depth, spp in settings
         ]
         parts.append((*np.stack(ours, 1), *expected))
     test, noise, means, uncertain = (np.concatenate(part, -2) for part in zip(*parts, strict=True))
