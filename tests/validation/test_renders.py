@@ -265,14 +265,19 @@ def test_no_two_images_of_neighbours_have_a_seed_in_common(llvm_variant, monkeyp
     assert len(seeds) == len({*seeds}) > 12 and max(seeds) - min(seeds) < STEP
 
 
-def test_glass_that_cannot_be_loaded_is_not_left_out(llvm_variant, monkeypatch):
+@pytest.mark.parametrize(("wrapper", "name"), [("alone", "refract_wedge"), ("alone", "hair"), ("twosided", "plastic")])
+def test_only_bsdfs_that_mitsuba_is_known_to_reject_are_left_out(llvm_variant, monkeypatch, wrapper, name):
     monkeypatch.setattr(neighbours, "measured", lambda *_, **__: np.ones((2, 1, len(neighbours.CELLS))))
     names, settings = ("diffuse", "refract_wedge"), ((0, 4),)
     judged = neighbours.rows("llvm_ad_rgb", "twosided", names, settings)
     assert {row.verdict for row in judged if row.case.endswith("refract_wedge")} == {"not run"}
-    monkeypatch.setitem(neighbours.BSDFS, "refract_wedge", {"formula": "none"})
-    with pytest.raises(RuntimeError, match="`formula` cannot be set"):
-        neighbours.rows("llvm_ad_rgb", "alone", names, settings)
+    broken = mock.Mock(side_effect=RuntimeError("a defect"))
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="a defect"):
+        patch.setattr(neighbours, "inspect", broken)
+        neighbours.rows("llvm_ad_rgb", wrapper, (name,), settings)
+    monkeypatch.setitem(neighbours.BSDFS, name, {"formula": "none"})
+    with pytest.raises(RuntimeError, match="formula"):
+        neighbours.rows("llvm_ad_rgb", wrapper, (name,), settings)
 
 
 def test_an_attached_direction_is_detected(context, monkeypatch):
