@@ -61,7 +61,10 @@ def run(
     store = context.out / "unfinished"
     store.mkdir(parents=True, exist_ok=True)
     about = _state(context)
-    files = [store / f"{hashlib.sha256((about + task.name).encode()).hexdigest()[:24]}.json" for task in tasks]
+    files = [store / f"{_digest((about + task.name).encode())}.json" for task in tasks]
+    # One record for all tasks: some write the same image. Runs of another state write to the same paths.
+    images = store / f"images {_digest(about.encode())}.json"
+    digests: dict[str, str] = _read(images)
     finished: dict[int, Finished] = {}
 
     def announce(task: Task) -> None:
@@ -69,10 +72,15 @@ def run(
 
     def save(number: int, result: Finished) -> None:
         rows, spent = result
+        digests.update(_images(rows, context.out))
+        write_atomically(images, json.dumps(digests))
         write_atomically(files[number], json.dumps({"spent": spent, "rows": [row.as_dict() for row in rows]}))
         finished[number] = result
 
-    work = [(i, task.name) for i, task in enumerate(tasks) if not task.timed and not _saved(files[i], context.out)]
+    def saved(number: int) -> Finished | None:
+        return _saved(files[number], context.out, digests)
+
+    work = [(i, task.name) for i, task in enumerate(tasks) if not task.timed and not saved(i)]
     if workers and work:
         for i, result in workers.run(work, context):
             announce(tasks[i])
@@ -80,7 +88,7 @@ def run(
     for i, task in enumerate(tasks):
         if i not in finished:
             announce(task)
-            save(i, _saved(files[i], context.out) or timed(task))
+            save(i, saved(i) or timed(task))
     results = [finished[i] for i in range(len(tasks))]
     return [row for rows, _ in results for row in rows], [spent for _, spent in results]
 
@@ -97,15 +105,31 @@ def timed(task: Task) -> Finished:
     return rows, {"task": task.name, "seconds": round(seconds, 2), "CPU seconds": round(cpu, 2)}
 
 
-def _saved(file: Path, folder: Path) -> Finished | None:
-    """Return the saved rows and times of a finished task; None without a readable file and all images in `folder`."""
+def _saved(file: Path, folder: Path, digests: dict[str, str]) -> Finished | None:
+    """Return the saved rows and times of a finished task; None without them, or if an image in `folder` is another."""
+    record = _read(file)
     try:
-        record = json.loads(file.read_text())
         rows, spent = [Row.from_dict(data) for data in record["rows"]], dict(record["spent"])
+        return (rows, spent) if _images(rows, folder).items() <= digests.items() else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    complete = all((folder / image).is_file() for row in rows for image in row.images.values())
-    return (rows, spent) if complete else None
+
+
+def _images(rows: Sequence[Row], folder: Path) -> dict[str, str]:
+    """Return the digests of the images of rows, by path."""
+    return {path: _digest((folder / path).read_bytes()) for row in rows for path in row.images.values()}
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:24]
+
+
+def _read(file: Path) -> Any:
+    """Return the contents of a JSON file, or an empty dictionary if it cannot be read."""
+    try:
+        return json.loads(file.read_text())
+    except (OSError, ValueError):
+        return {}
 
 
 def forget(context: Context) -> None:

@@ -93,13 +93,24 @@ def test_an_interrupted_run_resumes(context, on_workers):
     assert len(calls) == 7
 
 
-def test_a_task_whose_image_is_gone_runs_again(context, tmp_path):
-    image = tmp_path / "image.exr"
-    task = Task("a", lambda: image.write_bytes(b"") or [row(images={"test": image.name})])
-    for _ in range(2):
-        runner.run([task], context)
-        assert image.is_file()
-        image.unlink()
+def test_a_task_runs_again_only_if_its_image_is_gone_or_of_another_run(context, tmp_path):
+    image, calls = tmp_path / "image.exr", []
+
+    def work(name):
+        calls.append(name)
+        image.write_text(f"{name}, {len(calls)}")
+        return [row(images={"reference": image.name})]
+
+    tasks = [Task(name, functools.partial(work, name)) for name in "ab"]  # both write the reference
+    other = dataclasses.replace(context, profile=dataclasses.replace(context.profile, rays=17))
+    runs = [(context, "ab"), (context, ""), (other, "ab"), (other, ""), (context, "a"), (other, "a"), (context, "a")]
+    for number, (state, expected) in enumerate(runs):
+        before = len(calls)
+        runner.run(tasks, state)
+        assert calls[before:] == [*expected], number
+    image.unlink()
+    runner.run(tasks, context)
+    assert calls[-2:] == ["a", "a"] and image.is_file()
 
 
 def test_timed_tasks_run_last_and_not_on_workers(context):
