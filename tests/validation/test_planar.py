@@ -144,12 +144,25 @@ def test_what_is_missing_is_not_equal_and_a_wrong_path_far_from_every_vertex_is_
     assert judged(as_paths(case.exact, hits=hits), case, 2.0**-24)[WRONG_PATH_FAR] == 1
 
 
+def test_what_rounding_may_decide_later_does_not_excuse_a_path_that_leaves_the_box_before():
+    """In float32 a bound of 2000 reflections reaches a corner: later than a path that leaves at its fourth boundary."""
+    case, u = closed_paths.box(2000, 4), 2.0**-24
+    for ends, far in ((3, 1), (1990, 0)):
+        events, hits = case.exact.events.copy(), case.exact.hits.copy()
+        events[0, ends:], hits[0, ends:] = Event.NONE, -1
+        events[0, ends] = Event.ESCAPED
+        for changes in ({"events": events, "hits": hits}, {"events": events}):
+            row = judged(as_paths(case.exact, **changes), case, u)
+            assert (row[WRONG_PATH], row[WRONG_PATH_FAR]) == (1, far)
+
+
 @pytest.mark.parametrize(("beyond", "far"), [(-1e-9, False), (1e-9, False), (1e-3, True)])
-def test_rounding_may_decide_what_touches_a_circle_and_at_the_critical_angle(beyond, far):
-    """A path that passes by, judged by one that meets the circle, or the reverse: right within 1e-6 of the top."""
-    ball, plane = shapes.circle(1.0).between(1.5, 1.0), Segments([(-9, 0)], [(9, 0)], [1.0], [1.5])
-    case = against_retrace.Case("", ball, np.array([[-3, 1 + beyond]]), np.array([[1.0, 0]]), 4, np.zeros(1, int))
-    other = retrace(ball, [[-3, 1 - 1e-9 if beyond > 0 else 1 + 1e-9]], case.directions, 4)
+@pytest.mark.parametrize("curve", [shapes.circle(1.0), shapes.circle(1.0).faceted(4)])
+def test_rounding_may_decide_what_touches_a_body_and_at_the_critical_angle(curve, beyond, far):
+    """A path that passes a circle or a square's corner, judged by one that meets it, or the reverse."""
+    body, plane = curve.between(1.5, 1.0), Segments([(-9, 0)], [(9, 0)], [1.0], [1.5])
+    case = against_retrace.Case("", body, np.array([[-3, 1 + beyond]]), np.array([[1.0, 0]]), 4, np.zeros(1, int))
+    other = retrace(body, [[-3, 1 - 1e-9 if beyond > 0 else 1 + 1e-9]], case.directions, 4)
     angle = np.arcsin(1 / 1.5) + abs(beyond)
     d = np.array([[np.sin(angle), np.cos(angle)]])
     reflected = against_retrace.Case("", plane, np.array([[0.1, -1]]), d, 1, np.zeros(1, int))

@@ -43,8 +43,8 @@ TERMS = {
     NEAREST: "the error of the point (over the extent) or direction with the largest ratio of error to bound",
     ITS_BOUND: "the bound of that point or direction",
     WRONG_PATH: "rays that meet other boundaries than they should, or end in another way",
-    WRONG_PATH_FAR: "wrong paths that rounding cannot explain: their distance from every vertex of their boundaries "
-    "exceeds their bound, they touch no curve, and they are not at the critical angle",
+    WRONG_PATH_FAR: "wrong paths that rounding cannot explain: up to the first boundary that differs, their distance "
+    "from every vertex exceeds their bound, they touch no curve, and they are not at the critical angle",
     BOUNDARIES: "largest number of boundaries on a path",
 }
 NAME = "planar"

@@ -76,11 +76,15 @@ def _sizes(path: Retraced, segments: Segments) -> Array:
 
 
 def undecided(exact: Retraced, paths: Paths, segments: Segments, points: Array, directions: Array) -> Array:
-    """Return which rays (N) may take a wrong path, from the error bounds of their points and directions.
+    """Return which wrong paths (N) rounding may cause, from the error bounds of the exact points and directions.
 
-    These are rays at a vertex, rays that touch a curve, and rays at the critical angle. A ray within h of a curve's top
-    has a cosine below √(2 |κ| h); an error of φ changes the decision on refraction if |1 − k² sin²θ| is below 2 k φ.
+    Up to the first boundary or event that differs, their rays meet a vertex, touch a curve, or are at the critical
+    angle. A ray within h of a curve's top has a cosine below √(2 |κ| h); an error of φ changes the decision on
+    refraction if |1 − k² sin²θ| is below 2 k φ.
     """
+    differs = paths.events != exact.events
+    differs[:, :-1] |= paths.hits != exact.hits
+    first = differs.argmax(1)
     h, kappa = points[:, 1:], np.abs(exact.curvatures)
     cos = (exact.legs[:, :-1] * exact.normals).sum(2)
     behind = np.where(cos > 0, *(np.asarray(n)[exact.hits] for n in (segments.n_left, segments.n_right)))
@@ -91,16 +95,19 @@ def undecided(exact: Retraced, paths: Paths, segments: Segments, points: Array, 
         at = np.where(exact.hits >= 0, clearance, np.nan) <= h
         at |= cos**2 <= 2 * kappa * h
         at |= np.abs(1 - (k * sine) ** 2) <= 2 * k * (directions[:, :-1] + kappa * h)
-    # Paths whose first wrong boundary is a curve that they only touch.
-    differs = paths.hits != exact.hits
-    rays = np.flatnonzero(differs.any(1))
-    first = differs[rays].argmax(1)
-    has_hit = paths.hits[rays, first] >= 0
-    rays, first = rays[has_hit], first[has_hit]
+    at &= np.arange(at.shape[1]) <= first[:, None]
+    # Paths whose first wrong boundary is a curve that they only touch, or one that the exact ray passes at its end.
+    rays = np.flatnonzero(differs[:, :-1].any(1))
+    rays = rays[paths.hits[rays, first[rays]] >= 0]
+    first = first[rays]
     point, d = paths.points[rays, first + 1], exact.legs[rays, first]
     leg = point - exact.points[rays, first]
     normal, curvature = Curves(segments).normal(point.astype(np.longdouble), paths.hits[rays, first])
     near = points[rays, first] + np.hypot(*leg.T) * directions[rays, first]
-    touching = np.zeros(len(paths.hits), bool)
-    touching[rays] = ((d * normal).sum(1) ** 2 <= 2 * np.abs(curvature) * near) & (np.abs(cross(d, leg)) <= near)
-    return at.any(1) | touching
+    passed = (d * normal).sum(1) ** 2 <= 2 * np.abs(curvature) * near
+    for vertices in (segments.start, segments.end):
+        to = np.asarray(vertices)[paths.hits[rays, first]] - exact.points[rays, first]
+        passed |= np.abs(cross(d, to)) <= points[rays, first] + np.hypot(*to.T) * directions[rays, first]
+    result = at.any(1)
+    result[rays] |= passed & (np.abs(cross(d, leg)) <= near)
+    return result
