@@ -9,7 +9,8 @@ other last bits for one that does not. `exact` detects those, so it compares an 
 
 A row fails if a method misses a defect that it must see. Every method must see values that are not finite, another
 size, and a file that cannot be read; `exact` must see any changed bit; and a method that models the noise must see
-defects larger than the minimum detectable difference that it reports.
+defects larger than the minimum detectable difference that it reports, and all of them if the renders have noise and it
+reports none.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from .channels import without_variances
 from .comparison import Verdict
 from .file_pair import read_renders
 from .methods import METHODS
+from .tile_statistics import DARK, median_nonblack
 
 STUDY = "self-test"
 TILE = METHODS["welch"].options["tile"].default
@@ -48,7 +50,7 @@ IDENTICAL = "the pairs are identical bit for bit"
 TERMS = {
     "size": "of a defect: relative change of a tile's mean, in the tile where it is largest compared with the noise",
     DETECTABLE: "smallest relative difference that `welch` would have seen in a tile, median over the trials",
-    RATIO: "above 1 the defect must be seen; tiles noisier than the median one have a larger minimum",
+    RATIO: "above 1 or NaN the defect must be seen; tiles noisier than the median one have a larger minimum",
     "missed": "trials in which a method missed a defect that it must see, see the introduction",
     UNREADABLE: "share of the trials whose file cannot be read, an error whatever the method",
     "bound": f"{CONFIDENCE:.0%} upper bound of a rate, exact binomial (Clopper and Pearson)",
@@ -189,7 +191,7 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
         values = {UNREADABLE: 1.0, "missed": 0.0}
         return Row(STUDY, name, case, setting, values, {"missed": 0.0}, reason="not read", replay=replay)
     size = sizes(np.array(changes), np.concatenate(clean_tiles), tallies) if clean_tiles else {}
-    is_large = size.get(RATIO, 0.0) > 1
+    is_large = not size.get(RATIO, 0.0) <= 1  # also NaN
     due = [m for m in tallies if always_due or m == "exact" or (is_large and METHODS[m].takes_renders)]
     values = {method: tally.seen / tally.trials for method, tally in tallies.items()}
     values |= {"missed": float(sum(tallies[m].trials - tallies[m].seen for m in due)), **size}
@@ -199,20 +201,21 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
 def sizes(changes: Pixels, clean: Pixels, tallies: dict[str, Tally]) -> dict[str, float]:
     """Return the size of a defect in the tile and channel where its change is largest relative to the noise.
 
-    The minimum detectable difference is reported for the median tile; it grows with the noise of a tile.
+    The minimum detectable difference is reported for the median tile; it grows with the noise of a tile. It is NaN if
+    none was reported. Without noise in a tile with light there is none, and no size.
     """
-    reported = [x for method, tally in tallies.items() if METHODS[method].takes_renders for x in tally.detectable]
-    if not reported or len(clean) < 2:
+    several = [tally for method, tally in tallies.items() if METHODS[method].takes_renders]
+    if not several or len(clean) < 2:
         return {}
-    mean, deviation = clean.mean(0), clean.std(0, ddof=1)
-    noisy = (mean != 0) & (deviation > 0)
+    mean, deviation = np.abs(clean.mean(0)), clean.std(0, ddof=1)
+    noisy = (mean > DARK * median_nonblack(mean)) & (np.ptp(clean, 0) > 0)
     if not noisy.any():
         return {}
-    relative, noise = np.abs(changes.mean(0))[noisy] / np.abs(mean[noisy]), deviation[noisy] / np.abs(mean[noisy])
-    detectable = float(np.median(reported))
+    relative, noise = np.abs(changes.mean(0))[noisy] / mean[noisy], deviation[noisy] / mean[noisy]
+    detectable = float(np.median([x for tally in several for x in tally.detectable] or np.nan))
     # A tile with less noise than the median one counts as that noisy: with few renders its noise may be low by chance.
-    ratio = relative / (detectable * np.maximum(noise / np.median(noise), 1))
-    return {"size": float(relative[ratio.argmax()]), RATIO: float(ratio.max()), DETECTABLE: detectable}
+    share = relative / np.maximum(noise / np.median(noise), 1)
+    return {"size": float(relative[share.argmax()]), RATIO: float(share.max() / detectable), DETECTABLE: detectable}
 
 
 def false_alarms(

@@ -109,8 +109,12 @@ def test_the_size_of_a_defect_is_that_in_the_tile_where_it_is_most_detectable():
     assert sizes[self_test.RATIO] == pytest.approx(0.05 / 0.02)
     louder = self_test.sizes((changes * [[[1], [1], [2], [1], [1]]])[None], clean, {"welch": tally})
     assert (louder["size"], louder[self_test.RATIO]) == pytest.approx((0.36, 0.36 / (0.02 * 4)))
-    for pixels, of_welch in ((clean[:1], tally), (clean, self_test.Tally()), (np.stack([mean, mean]), tally)):
-        assert self_test.sizes(changes[None], pixels, {"welch": of_welch}) == {}
+    unknown = self_test.sizes(changes[None], clean, {"welch": self_test.Tally()})
+    assert np.isnan(unknown[self_test.RATIO]) and unknown["size"] == pytest.approx(0.05)
+    equal, only_dark = np.stack([0.1 * mean] * 6), np.stack([mean, mean])
+    only_dark[0, 0, 3] = 1e-4
+    for pixels, method in ((clean[:1], "welch"), (clean, "exact"), (equal, "welch"), (only_dark, "welch")):
+        assert self_test.sizes(changes[None], pixels, {method: tally}) == {}
     lit = np.array([[[2.0], [2.0], [0.0], [0.0]]])  # `noise` is that of the lit pixels
     assert self_test.noise(np.stack([lit * 0.9, lit * 1.1])) == pytest.approx(0.2 * np.sqrt(2) / 2)
     assert self_test.noise(np.zeros((3, 2, 2, 3))) == 0
@@ -150,6 +154,15 @@ def test_a_method_that_always_says_equal_fails(method, monkeypatch):
     expected = {"exact": set(DEFECTS) - {"truncated"}, "welch": always | {"gain", "shift", "8 bits", "firefly"}}
     assert failed(rows) >= expected.get(method, always)
     assert rows["NaN"].values["missed"] == 2
+
+
+def test_a_method_that_reports_no_detectable_difference_of_noise_must_see_all_defects(monkeypatch):
+    real = methods.compare
+    blind = Comparison("welch", Verdict.INCONCLUSIVE, "")
+    monkeypatch.setattr(methods, "compare", lambda m, *sides: blind if m == "welch" else real(m, *sides))
+    assert failed(examined(renders(8), trials=1, null_pairs=1)) == set(DEFECTS) - {"truncated"}
+    without_noise = examined(np.stack([IMAGE] * 8), trials=1, null_pairs=1)
+    assert failed(without_noise) == {name for name in DEFECTS if DEFECTS[name].always_due} - {"truncated"}
 
 
 def test_methods_that_always_say_different_or_inconclusive_fail(monkeypatch):

@@ -132,6 +132,20 @@ def test_a_side_that_does_not_know_its_noise_is_seen(defect, monkeypatch):
     assert any(row.broken for row in rows) is defect
 
 
+@pytest.mark.parametrize(
+    ("factor", "broken"),
+    [(1, set()), (np.nan, {"missed"}), (np.inf, {"missed"}), (10, {"seen at half"}), (0.1, {"missed"})],
+)
+def test_a_wrong_minimum_detectable_difference_fails_in_every_profile(factor, broken, monkeypatch):
+    right = tile_statistics.TileTests.minimum_detectable
+    monkeypatch.setattr(welch_nulls, "POWER", {"variances": ((64, 64),)})
+    monkeypatch.setattr(
+        tile_statistics.TileTests, "minimum_detectable", lambda self, level=0: factor * right(self, level)
+    )
+    (row,) = welch_nulls.power_rows(min(welch_nulls.PLANTED.values()))
+    assert row.broken.keys() == broken | ({"missed at half"} if "missed" in broken else set())
+
+
 def test_what_is_timed(tmp_path):
     """An image that differs is what the page shows; the folder's images are equal for what `auto` tests."""
     small = times.Size(48, 64, 2, 6)

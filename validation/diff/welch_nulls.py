@@ -6,12 +6,14 @@ known on both sides or on one, from samples, from passes with filters of up to 3
 of renders of a scene have a ball of glass and a small lamp, whose light passes the glass by chance.
 
 `welch` claims false alarms in 0.1 % of pairs, and reports the difference of a tile that it detects with a probability
-of 99 %. Such differences are planted, and differences that it detects with a probability of 50 %.
+of 99 %. Such differences are planted, and differences that it detects with a probability of 50 %: too many of these
+missed, or too many seen, would mean that the reported difference is too small or too large.
 """
 
 from __future__ import annotations
 
 import functools
+import math
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -43,6 +45,7 @@ TERMS = {
     "undecided": "pairs that are called inconclusive",
     "missed": "undetected planted differences, of a size with a claimed probability of detection of 99 %",
     "missed at half": "the same with a claimed probability of 50 %",
+    "seen at half": "the others of these",
     "undecided differences": "planted differences (99 %) that are detected, but called inconclusive",
 }
 WELCH = METHODS["welch"].options
@@ -157,7 +160,9 @@ FORMS = {
 COUNTS = ((64, 64), (256, 64), (64, 1024), (1024, 16), (16, 4096), (8000, 8), (8, 8000))
 # The light, counts and forms of the profile `quick`.
 QUICK_LIGHT, QUICK_COUNTS, QUICK_FORMS = ("fireflies 0.001",), ((1024, 16), (16, 4096)), tuple(FORMS)[:4]
-PAIRS, PLANTED = {"quick": 8, "standard": 6, "full": 60}, {"quick": 16, "standard": 100, "full": 1000}  # per case
+PAIRS = {"quick": 8, "standard": 6, "full": 60}  # per case
+# Per case. In `quick` the fewest with which half of them can break a bound: 2⁻ⁿ ≤ NULL_ALARM.
+PLANTED = {"quick": math.ceil(-math.log2(limits.NULL_ALARM)), "standard": 100, "full": 1000}
 POWER = {
     "variances": ((64, 64), (4096, 64)),
     "variance of the reference": ((4096, 64), (64, 64)),
@@ -238,21 +243,28 @@ def scene_rows(context: Context, pairs: int) -> list[Row]:
 
 
 def power_rows(pairs: int) -> list[Row]:
-    """Return rows of the power: one tile of each pair is brightened by the difference that `welch` claims to detect."""
-    threshold = stats.norm.isf(tile_statistics.sidak(FAMILY_ERROR, 2 * (16 + 1)) / 2)
-    # The difference detected with 50 %, over that detected with 99 %.
-    share = threshold / (threshold + stats.norm.isf(tile_statistics.MISSED))
+    """Return rows of the power: one tile of each pair is brightened by the difference that `welch` claims to detect.
+
+    The claimed difference is m + (t(1 − p/2) + t(1 − MISSED)) · error, with the margin m and the p of an alarm. With
+    p = 2 MISSED it is m + 2 t(1 − MISSED) · error, and half of that above m is what 99 % need more than 50 %.
+    """
+    tests = 2 * (16 + 1)  # of the mean and of the pixels, in 16 tiles and in the image
+    often = 1 - (1 - 2 * tile_statistics.MISSED) ** tests
     rows = []
     for form, n, m in [(form, n, m) for form, counts in POWER.items() for n, m in counts]:
         values = {"pairs": float(pairs), "missed": 0.0, "missed at half": 0.0, "undecided differences": 0.0}
         for i in range(pairs):
             one, two = FORMS[form].pair(LIGHT["normal"], generator("power", form, n, m, i), n, m)
-            least = compare("welch", one, two).minimum_detectable
-            full, half = (compare("welch", one, brighter(two, x)) for x in (least, MARGIN + (least - MARGIN) * share))
+            least, double = (
+                compare("welch", one, two, family_error=error).minimum_detectable for error in (FAMILY_ERROR, often)
+            )
+            full, half = (compare("welch", one, brighter(two, x)) for x in (least, least - (double - MARGIN) / 2))
             values["missed"] += not seen(full)
             values["missed at half"] += not seen(half)
             values["undecided differences"] += seen(full) and full.verdict is Verdict.INCONCLUSIVE
-        bounds = {"missed": at_most(pairs, tile_statistics.MISSED), "missed at half": at_most(pairs, 0.5)}
+        values["seen at half"] = pairs - values["missed at half"]
+        bounds = {"missed": at_most(pairs, tile_statistics.MISSED)}
+        bounds |= dict.fromkeys(("missed at half", "seen at half"), at_most(pairs, 0.5))
         rows.append(Row(NAME, form, f"power, {n} : {m}", "", values, bounds))
     return rows
 
@@ -267,8 +279,9 @@ def brighter(side: Any, by: float) -> Any:
 
 
 def seen(result: Comparison) -> bool:
-    """Return whether any test of a difference is an alarm."""
-    return not all(metric.holds for metric in result.metrics if metric.bound == 0)
+    """Return whether any test of a difference is an alarm; images with planted NaN or infinity are not tested."""
+    is_tested = math.isfinite(result.minimum_detectable)
+    return is_tested and not all(metric.holds for metric in result.metrics if metric.bound == 0)
 
 
 def summarise(rows: list[Row]) -> list[Row]:
