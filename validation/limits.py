@@ -120,6 +120,9 @@ EDIT = limit(
 FROZEN = limit(1e-5, "of a pixel: the order in which samples are summed")
 
 STOPPED_WRONGLY = limit(1e-3, "probability of more renders above the error that they stopped at, if each has below 5 %")
+STOPPED_ALIKE = limit(
+    0.95, "share of the renders: half of them are expected, and all of 20 by chance once in 7000 runs"
+)
 PASSES_TIME = limit(1.03, "over one call of `mi.render`: every pass is traced anew and its samples are read back")
 
 # Efficiency ----------------------------------------------------------------------------------------------------

@@ -239,17 +239,27 @@ def test_a_detectable_difference_is_detected_with_probability_one_half():
     assert np.mean([values(detectable)["alarms"] > 0 for _ in range(200)]) == pytest.approx(0.5, abs=0.14)
 
 
-@pytest.mark.parametrize(("pixel", "verdict"), [(1.001, "pass"), (math.nan, "fail")])
-def test_renders_in_passes_without_a_number_fail(context, monkeypatch, pixel, verdict):
+@pytest.mark.parametrize(
+    ("pixel", "second_stop", "broken"),
+    [(1.001, 16, set()), (math.nan, 16, {"beyond", "outside"}), (1.001, 12, {rendering_passes.ALIKE})],
+)
+def test_renders_in_passes_without_a_number_or_a_choice_of_the_stop_fail(
+    context, monkeypatch, pixel, second_stop, broken
+):
     def resume(job, *_, **__):
         render = mock.Mock(image=lambda: np.full((2, 2, 3), 1.0 if job.seed >= 2**31 else pixel))
         render.error.return_value = mock.Mock(value=1e-3, low=0.5e-3, high=2e-3)
-        render.progress.passes = 12
+        render.progress.passes = second_stop if job.seed % 2 else 12
         return render
 
     monkeypatch.setattr(rendering_passes, "resume", resume)
     (row,) = rendering_passes.error_rows(context, "sphere")
-    assert row.verdict == verdict
+    assert row.broken.keys() == broken
+
+
+def test_the_requested_error_leaves_the_stop_to_chance(context):
+    (row,) = rendering_passes.error_rows(replace(context, profile=PROFILES["quick"]), "sphere")
+    assert row.verdict == "pass" and 12 < row.values["passes"] < 16
 
 
 def test_no_two_images_of_neighbours_have_a_seed_in_common(llvm_variant, monkeypatch):
