@@ -108,6 +108,6 @@ def undecided(exact: Retraced, paths: Paths, segments: Segments, points: Array, 
     for vertices in (segments.start, segments.end):
         to = np.asarray(vertices)[paths.hits[rays, first]] - exact.points[rays, first]
         passed |= np.abs(cross(d, to)) <= points[rays, first] + np.hypot(*to.T) * directions[rays, first]
-    result = at.any(1)
+    result: Array = np.any(at, axis=1)
     result[rays] |= passed & (np.abs(cross(d, leg)) <= near)
     return result
