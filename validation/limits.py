@@ -48,9 +48,9 @@ PRISM_ANGLE = limit(
 BOW_ANGLE = limit(160 * 2.0**-53, "radians: four boundaries of 8u, amplified by the next ones, and their points")
 FOCAL_DISTANCE = limit(5.4e-10, "relative: (h/R)² at h = 1e-3 and the smallest R = 43; aberration is tenths of that")
 FURNACE_CHANNEL = limit(3e-3, "relative, in each channel: the deviation from white that must be detected")
-# A ray is lost at most where it meets a face within two ulp of the diagonal between its triangles: at 100 m within
-# 1.5e-5 m on either side, on √2 of 1.4 × 1.4 m, for two faces: 6e-5 of the rays. Each is off by at most n² − 1 = 1.25.
-PANE = limit(1e-4, "relative: rays at the diagonals of the faces may pass between two triangles")
+# At 100 m two ulp are 1.5e-5 m. A strip of that width on either side of a diagonal, √2 · 1.4 m long, is 3e-5 of a view
+# of 1.4 × 1.4 m, and a pane has two faces.
+PANE = limit(6e-5, "of the rays: so close to the diagonal of a face that they may pass between its two triangles")
 ABSORPTION_SEEN = limit(0.01, "relative: a difference of an image's mean from `volpath` that must be detected")
 SLAB_ABSORPTION = limit(2e-6, "relative: σ d up to 8 in float32, a path length off by 2u: 16u, and the exponential")
 DISPERSION_TIME = limit(1.25, "over the same scene with the index of the d line and as many samples")
@@ -99,12 +99,12 @@ REFLECTANCE = {
 }
 
 PATH_BOUNDARY = limit(2.0**-24, "of the direction, times 2 m + 1 after m boundaries: each rounds the cosine twice")
-OFF_EXACT = limit(0.5, "over the built-in's count: where the two images differ, `refract` is mostly the correct one")
+OFF_EXACT = limit(0.5, "over the built-in's count: `refract` has at most a third of the pixels that only one has wrong")
 FLIPPED = limit(1e-3, "of the pixels: a last bit changes the choice between reflection and refraction")
 
 # Renders -------------------------------------------------------------------------------------------------------
 
-MEANS = limit(1e-4, "relative, of the means of two images of the same random numbers")
+MEANS = limit(1e-4, "relative, of the means of two images of the same random numbers, in compiled variants")
 CHANGED = limit(1e-3, "of the pixels, same seeds: a last bit changes the choice of the lobe")
 WELCH_ERROR = limit(1e-3, "probability of any alarm in an image of equal renders, by Šidák's correction")
 WELCH_MARGIN = limit(1e-5, "relative: means of float32 images that differ by less count as equal")
@@ -120,9 +120,7 @@ EDIT = limit(
 FROZEN = limit(1e-5, "of a pixel: the order in which samples are summed")
 
 STOPPED_WRONGLY = limit(1e-3, "probability of more renders above the error that they stopped at, if each has below 5 %")
-STOPPED_ALIKE = limit(
-    0.95, "share of the renders: half of them are expected, and all of 20 by chance once in 7000 runs"
-)
+STOPPED_ALIKE = limit(0.95, "share of the renders: half are expected, and all of 20 by chance once in 7000 cases")
 PASSES_TIME = limit(1.03, "over one call of `mi.render`: every pass is traced anew and its samples are read back")
 
 # Efficiency ----------------------------------------------------------------------------------------------------

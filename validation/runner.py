@@ -106,7 +106,7 @@ def timed(task: Task) -> Finished:
 
 
 def _saved(file: Path, folder: Path, digests: dict[str, str]) -> Finished | None:
-    """Return the saved rows and times of a finished task; None without them, or if an image in `folder` is another."""
+    """Return the saved rows and times of a finished task; None without them, or if an image in `folder` has changed."""
     record = _read(file)
     try:
         rows, spent = [Row.from_dict(data) for data in record["rows"]], dict(record["spent"])

@@ -9,8 +9,8 @@ other last bits for one that does not. `exact` detects those, so it compares an 
 
 A row fails if a method misses a defect that it must see. Every method must see values that are not finite, another
 size, and a file that cannot be read; `exact` must see any changed bit; and a method that models the noise must see
-defects larger than the minimum detectable difference that it reports, and all of them if the renders have noise and it
-reports none.
+defects larger than the minimum detectable difference that it reports, and all defects if it reports no such difference
+although the renders have noise.
 """
 
 from __future__ import annotations
@@ -202,7 +202,7 @@ def sizes(changes: Pixels, clean: Pixels, tallies: dict[str, Tally]) -> dict[str
     """Return the size of a defect in the tile and channel where its change is largest relative to the noise.
 
     The minimum detectable difference is reported for the median tile; it grows with the noise of a tile. It is NaN if
-    none was reported. Without noise in a tile with light there is none, and no size.
+    none was reported. The result is empty if no tile with light has noise.
     """
     several = [tally for method, tally in tallies.items() if METHODS[method].takes_renders]
     if not several or len(clean) < 2:
@@ -214,8 +214,10 @@ def sizes(changes: Pixels, clean: Pixels, tallies: dict[str, Tally]) -> dict[str
     relative, noise = np.abs(changes.mean(0))[noisy] / mean[noisy], deviation[noisy] / mean[noisy]
     detectable = float(np.median([x for tally in several for x in tally.detectable] or np.nan))
     # A tile with less noise than the median one counts as that noisy: with few renders its noise may be low by chance.
-    share = relative / np.maximum(noise / np.median(noise), 1)
-    return {"size": float(relative[share.argmax()]), RATIO: float(share.max() / detectable), DETECTABLE: detectable}
+    at_median_noise = relative / np.maximum(noise / np.median(noise), 1)
+    largest = at_median_noise.argmax()
+    ratio = float(at_median_noise[largest] / detectable)
+    return {"size": float(relative[largest]), RATIO: ratio, DETECTABLE: detectable}
 
 
 def false_alarms(

@@ -43,7 +43,7 @@ class CheckpointError(MiRefractError, ValueError):
 
 
 class ExportError(MiRefractError, ValueError):
-    """A scene has a part that the export, or the format of its target, cannot represent."""
+    """A scene has content that an export does not support, or that the format of its target cannot hold."""
 
 
 class TooMuchOutputError(MiRefractError, ValueError):

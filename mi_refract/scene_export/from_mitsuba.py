@@ -28,8 +28,8 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) ->
     """Return the scene in a file, read by the active variant. `defines` replace the file's `<default>`s.
 
     `level`: tessellation level of curved shapes; each level halves the edges. FileNotFoundError for a missing file.
-    ValueError, one line, for an invalid scene, and for content that a plain scene cannot hold: other plugins or
-    parameters, smooth normals, open one-sided surfaces.
+    ExportError, one line, for content that a plain scene cannot hold: other plugins or parameters, smooth normals, open
+    one-sided surfaces. ValueError, one line, for an invalid scene and for files that cannot be read.
     """
     path = Path(path)
     if level not in LEVELS:
@@ -166,7 +166,7 @@ def _sky(emitter: Node) -> Colour | Environment:
                 rounding = CONVERSION * np.abs(pixels).max(-1, keepdims=True)
                 pixels[(-rounding < pixels) & (pixels < 0)] = 0
         except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: Mitsuba's
-            raise emitter.error(str(error), "an OpenEXR file") from None
+            raise ValueError(str(emitter.error(str(error), "an OpenEXR file"))) from None
         if not has_colours or min(pixels.shape[:2]) < 2 or not np.isfinite(pixels).all() or (pixels < 0).any():
             size = f"{pixels.shape[1]} × {pixels.shape[0]} pixels of {', '.join(names)}"
             raise emitter.error(f"{path}: {size}", SKY)

@@ -121,7 +121,7 @@ def _parts(shape: Node, surface: Surface, level: int) -> tuple[Triangles, ...]:
                 scene_parser.check_faces(path)
             mesh = mi.load_dict({"type": shape.type, "filename": str(path.absolute()), "face_normals": flat})
     except RuntimeError as error:
-        raise shape.error(f"{path}: {error}", "a mesh that Mitsuba reads") from None
+        raise ValueError(str(shape.error(f"{path}: {error}", "a mesh that Mitsuba reads"))) from None
     if mitsuba_mesh.has_normals(mesh):
         raise shape.error("smooth normals", "face_normals = true")
     vertices, faces = mitsuba_mesh.arrays(mesh)

@@ -170,6 +170,8 @@ def test_rounding_may_decide_what_touches_a_body_and_at_the_critical_angle(curve
     for paths, judge in ((as_paths(other), case), (through, reflected)):
         row = judged(paths, judge, 2.0**-24)
         assert (row[WRONG_PATH], row[WRONG_PATH_FAR]) == (1, far)
+    past = as_paths(reflected.exact, hits=np.full_like(reflected.exact.hits, -1))
+    assert judged(past, reflected, 2.0**-24)[WRONG_PATH_FAR] == 1  # the critical angle hides no boundary
 
 
 def test_either_segment_is_right_at_their_vertex():

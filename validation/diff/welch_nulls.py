@@ -45,7 +45,7 @@ TERMS = {
     "undecided": "pairs that are called inconclusive",
     "missed": "undetected planted differences, of a size with a claimed probability of detection of 99 %",
     "missed at half": "the same with a claimed probability of 50 %",
-    "seen at half": "the others of these",
+    "seen at half": "the rest of these, which are detected",
     "undecided differences": "planted differences (99 %) that are detected, but called inconclusive",
 }
 WELCH = METHODS["welch"].options
@@ -161,7 +161,7 @@ COUNTS = ((64, 64), (256, 64), (64, 1024), (1024, 16), (16, 4096), (8000, 8), (8
 # The light, counts and forms of the profile `quick`.
 QUICK_LIGHT, QUICK_COUNTS, QUICK_FORMS = ("fireflies 0.001",), ((1024, 16), (16, 4096)), tuple(FORMS)[:4]
 PAIRS = {"quick": 8, "standard": 6, "full": 60}  # per case
-# Per case. In `quick` the fewest with which half of them can break a bound: 2⁻ⁿ ≤ NULL_ALARM.
+# Per case. In `quick` the fewest with which a bound at 50 % can break: all n are missed with a probability of 2⁻ⁿ.
 PLANTED = {"quick": math.ceil(-math.log2(limits.NULL_ALARM)), "standard": 100, "full": 1000}
 POWER = {
     "variances": ((64, 64), (4096, 64)),
@@ -246,19 +246,21 @@ def power_rows(pairs: int) -> list[Row]:
     """Return rows of the power: one tile of each pair is brightened by the difference that `welch` claims to detect.
 
     The claimed difference is m + (t(1 − p/2) + t(1 − MISSED)) · error, with the margin m and the p of an alarm. With
-    p = 2 MISSED it is m + 2 t(1 − MISSED) · error, and half of that above m is what 99 % need more than 50 %.
+    p = 2 MISSED it is m + 2 t(1 − MISSED) · error. Half of its excess over m is t(1 − MISSED) · error, the difference
+    between what is detected with 99 % and with 50 %.
     """
     tests = 2 * (16 + 1)  # of the mean and of the pixels, in 16 tiles and in the image
-    often = 1 - (1 - 2 * tile_statistics.MISSED) ** tests
+    error_at_twice_missed = 1 - (1 - 2 * tile_statistics.MISSED) ** tests
     rows = []
     for form, n, m in [(form, n, m) for form, counts in POWER.items() for n, m in counts]:
         values = {"pairs": float(pairs), "missed": 0.0, "missed at half": 0.0, "undecided differences": 0.0}
         for i in range(pairs):
             one, two = FORMS[form].pair(LIGHT["normal"], generator("power", form, n, m, i), n, m)
-            least, double = (
-                compare("welch", one, two, family_error=error).minimum_detectable for error in (FAMILY_ERROR, often)
+            least, twice = (
+                compare("welch", one, two, family_error=error).minimum_detectable
+                for error in (FAMILY_ERROR, error_at_twice_missed)
             )
-            full, half = (compare("welch", one, brighter(two, x)) for x in (least, least - (double - MARGIN) / 2))
+            full, half = (compare("welch", one, brighter(two, x)) for x in (least, least - (twice - MARGIN) / 2))
             values["missed"] += not seen(full)
             values["missed at half"] += not seen(half)
             values["undecided differences"] += seen(full) and full.verdict is Verdict.INCONCLUSIVE

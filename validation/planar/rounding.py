@@ -78,13 +78,16 @@ def _sizes(path: Retraced, segments: Segments) -> Array:
 def undecided(exact: Retraced, paths: Paths, segments: Segments, points: Array, directions: Array) -> Array:
     """Return which wrong paths (N) rounding may cause, from the error bounds of the exact points and directions.
 
-    Up to the first boundary or event that differs, their rays meet a vertex, touch a curve, or are at the critical
-    angle. A ray within h of a curve's top has a cosine below √(2 |κ| h); an error of φ changes the decision on
-    refraction if |1 − k² sin²θ| is below 2 k φ.
+    Their rays meet a vertex where the first boundary or event differs; or they touch a curve or are at the critical
+    angle, there or before: both may turn a ray by more than its bound. What happens at the critical angle cannot change
+    which boundary was met there. A ray within h of a curve's top has a cosine below √(2 |κ| h); an error of φ changes
+    the decision on refraction if |1 − k² sin²θ| is below 2 k φ.
     """
+    other_hit = paths.hits != exact.hits
     differs = paths.events != exact.events
-    differs[:, :-1] |= paths.hits != exact.hits
+    differs[:, :-1] |= other_hit
     first = differs.argmax(1)
+    since = np.arange(other_hit.shape[1]) - first[:, None]  # number of boundaries since the first difference
     h, kappa = points[:, 1:], np.abs(exact.curvatures)
     cos = (exact.legs[:, :-1] * exact.normals).sum(2)
     behind = np.where(cos > 0, *(np.asarray(n)[exact.hits] for n in (segments.n_left, segments.n_right)))
@@ -92,13 +95,12 @@ def undecided(exact: Retraced, paths: Paths, segments: Segments, points: Array, 
     ends = [np.asarray(x)[exact.hits] for x in (segments.start, segments.end)]
     clearance = np.min([np.hypot(*(exact.points[:, 1:] - end).transpose(2, 0, 1)) for end in ends], axis=0)
     with np.errstate(invalid="ignore"):
-        at = np.where(exact.hits >= 0, clearance, np.nan) <= h
-        at |= cos**2 <= 2 * kappa * h
-        at |= np.abs(1 - (k * sine) ** 2) <= 2 * k * (directions[:, :-1] + kappa * h)
-    at &= np.arange(at.shape[1]) <= first[:, None]
-    # Paths whose first wrong boundary is a curve that they only touch, or one that the exact ray passes at its end.
-    rays = np.flatnonzero(differs[:, :-1].any(1))
-    rays = rays[paths.hits[rays, first[rays]] >= 0]
+        at = (np.where(exact.hits >= 0, clearance, np.nan) <= h) & (since == 0)
+        at |= (cos**2 <= 2 * kappa * h) & (since <= 0)
+        critical = np.abs(1 - (k * sine) ** 2) <= 2 * k * (directions[:, :-1] + kappa * h)
+        at |= critical & (since <= 0) & ~other_hit
+    # Paths whose first wrong boundary is a curve that they only touch, or a segment past whose end the exact ray runs.
+    rays = np.flatnonzero(((since == 0) & other_hit & (paths.hits >= 0)).any(1))
     first = first[rays]
     point, d = paths.points[rays, first + 1], exact.legs[rays, first]
     leg = point - exact.points[rays, first]

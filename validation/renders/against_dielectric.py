@@ -3,11 +3,12 @@
 Scenes with dispersion or absorption are left out, since `dielectric` has neither.
 
 With the same seed both plugins use the same random numbers, so the images agree except where a last bit changes the
-choice between reflection and refraction. Such changes have either sign, so the means differ by chance only:
-|Σ x| > z √(Σ x²) has a probability of at most 2 exp(−z²/2) by Hoeffding's inequality. Independent seeds are compared by
-Welch's t-test on tiles. The error of an image is its relMSE against the mean of the built-in's other renders, minus the
-variance of that mean. Times are of alternating warm renders of at least 0.1 s; in shorter ones the half millisecond
-that Mitsuba needs per render to trace a plugin written in Python would matter.
+choice between reflection and refraction. Let x be the changes of the pixels, independent under the box filter of the
+scenes, and of either sign with equal probability. Then |Σ x| > z √(Σ x²) has a probability of at most 2 exp(−z²/2), by
+Hoeffding's inequality. Independent seeds are compared by Welch's t-test on tiles. The error of an image is its relMSE
+against the mean of the built-in's other renders, minus the variance of that mean. Times are of alternating warm renders
+of at least 0.1 s; in shorter ones the half millisecond that Mitsuba needs per render to trace a plugin written in
+Python would matter.
 """
 
 from __future__ import annotations
@@ -101,7 +102,8 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
             error = statistics.fmean(tile_statistics.relative_mse(image, reference) for image, _ in points)
             curves.setdefault(name, []).append((statistics.median(seconds for _, seconds in points), error))
     z = math.sqrt(2 * math.log(2 / limits.NULL_ALARM))
-    allowed = limits.WELCH_MARGIN + z * pairs.rms / math.sqrt(reference[..., 0].size) / float(reference.mean())
+    chance, mean = z * pairs.rms / math.sqrt(reference[..., 0].size), float(reference.mean())
+    allowed = limits.WELCH_MARGIN + (chance / mean if mean else 0)
     if not context.scalar:  # scalar renders have so few samples that chance may exceed MEANS
         allowed = min(allowed, limits.MEANS)
     budgets, remark = _budgets(scene, left_out, allowed), NO_REFERENCE.get(scene, left_out)

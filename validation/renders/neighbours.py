@@ -57,7 +57,7 @@ WRAPPERS: dict[str, Callable[[Nodes], Nodes]] = {
     "bumpmap": lambda bsdf: {"type": "bumpmap", "arbitrary": uneven((8, 8), 0.0, 0.1), "b": bsdf},
     "normalmap": lambda bsdf: {"type": "normalmap", "normalmap": flat(TURNED), "b": bsdf},
 }
-# What Mitsuba rejects: files that are missing here, and in `twosided` all but these BSDFs.
+# Mitsuba rejects BSDFs that need a file, which is missing here; `twosided` takes only those of OPAQUE.
 NEEDS_FILE = ("measured", "measured_polarized")
 OPAQUE = ("conductor", "diffuse", "plastic", "pplastic", "roughconductor", "roughplastic")
 Settings = tuple[tuple[int, int], ...]  # split depth, samples per pixel

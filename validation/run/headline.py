@@ -54,10 +54,12 @@ def first_page(rows: Sequence[Row], profile: str = "") -> FirstPage:
     judged = [row for row in rows if row.study in JUDGES and row.subject in JUDGED]
     facts = _directions(directions) | _renders(ours, select(rows, EFFICIENCY)) | _paths(rows, paths)
     own = [row for row in rows if row.study != SUMMARY]
+    broken = [name for name in OURS if any(row.verdict == "fail" for row in judged if row.subject == name)]
     facts |= {
         "bodies": select(rows, GROUND_TRUTH, PLUGIN, metric=metrics.ERROR_OVER_BOUND),
         "failed": any(row.verdict == "fail" for row in judged),
-        "broken": any(row.verdict == "fail" for row in judged if row.subject in OURS),
+        "broken": broken,
+        "ours": [name for name in facts["ours"] if name not in broken],
         "remedies": remedies(own),
         "count": len(own),
         "quick": profile == "quick",
@@ -187,7 +189,7 @@ def _renders(ours: Sequence[Row], methods: Sequence[Row]) -> dict[str, Any]:
 
 
 def differ(row: Row) -> bool:
-    """Return whether the images of a row differ: by noise alone they do not, and a check that fails is no noise."""
+    """Return whether the images of a row differ by more than noise, or a check of the row failed."""
     return row.verdict == "fail" or bool(row.values.get(metrics.WELCH_ALARMS))
 
 

@@ -62,7 +62,7 @@ LEAST_NEAR = 1e-6  # near plane of a camera that lies on a surface
 
 
 def files(plain: PlainScene) -> Files:
-    """Return the export's files by name. ValueError for what glTF cannot hold, MissingExtraError without trimesh."""
+    """Return the export's files by name. ExportError for what glTF cannot hold, MissingExtraError without trimesh."""
     try:
         import trimesh
         from trimesh.exchange import gltf
@@ -143,7 +143,7 @@ def files(plain: PlainScene) -> Files:
 def _around_glass(plain: PlainScene, mesh: Mesh, outside: float) -> Mesh:
     """Return the mesh; glass is turned so that its normals point out of the glass, into the outermost medium.
 
-    ValueError for a material that glTF cannot hold.
+    ExportError for a material that glTF cannot hold.
     """
     material, place = mesh.material, f"{plain.name}: {mesh.name}"
     if isinstance(material, Diffuse) and max(material.reflectance) > 1:

@@ -33,7 +33,7 @@ BAILOUT = "1e-7"
 
 
 def files(plain: PlainScene) -> Files:
-    """Return the export's files by name. ValueError for open glass and for diffuse surfaces."""
+    """Return the export's files by name. ExportError for open glass and for diffuse surfaces."""
     for mesh in plain.meshes:
         place = f"{plain.name}: {mesh.name}"
         if isinstance(mesh.material, Glass) and not is_closed(mesh.faces):
