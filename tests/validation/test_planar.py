@@ -156,6 +156,17 @@ def test_what_rounding_may_decide_later_does_not_excuse_a_path_that_leaves_the_b
             assert (row[WRONG_PATH], row[WRONG_PATH_FAR]) == (1, far)
 
 
+def test_a_vertex_excuses_only_what_is_met_there():
+    """A ray through a square, 1e-9 below its corner, that ends in another way behind it."""
+    square, direction = shapes.circle(1.0).faceted(4).between(1.5, 1.0), np.array([[1.0, 0]])
+    case = against_retrace.Case("", square, np.array([[-3, 1 - 1e-9]]), direction, 4, np.zeros(1, int))
+    events, end = case.exact.events.copy(), case.exact.met[0]
+    assert end > 0 and events[0, end] == Event.ESCAPED
+    events[0, end] = Event.MEDIUM_MISMATCH
+    row = judged(as_paths(case.exact, events=events), case, 2.0**-24)
+    assert (row[WRONG_PATH], row[WRONG_PATH_FAR]) == (1, 1)
+
+
 @pytest.mark.parametrize(("beyond", "far"), [(-1e-9, False), (1e-9, False), (1e-3, True)])
 @pytest.mark.parametrize("curve", [shapes.circle(1.0), shapes.circle(1.0).faceted(4)])
 def test_rounding_may_decide_what_touches_a_body_and_at_the_critical_angle(curve, beyond, far):
