@@ -103,9 +103,7 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
             curves.setdefault(name, []).append((statistics.median(seconds for _, seconds in points), error))
     z = math.sqrt(2 * math.log(2 / limits.NULL_ALARM))
     chance, mean = z * pairs.rms / math.sqrt(reference[..., 0].size), float(reference.mean())
-    allowed = limits.WELCH_MARGIN + (chance / mean if mean else 0)
-    if not context.scalar:  # scalar renders have so few samples that chance may exceed MEANS
-        allowed = min(allowed, limits.MEANS)
+    allowed = min(limits.MEANS, limits.WELCH_MARGIN + (chance / mean if mean else 0))
     budgets, remark = _budgets(scene, left_out, allowed), NO_REFERENCE.get(scene, left_out)
     row = functools.partial(Row, NAME, plugin, scene, context.variant)
     return [row(values | times, budgets, goals, remark, replay, images, curves)]

@@ -44,7 +44,8 @@ def method_rows(context: Context, method: Method) -> list[Row]:
 
     resolution, rows = 8 if context.scalar else RESOLUTION, []
     rays = SPP * resolution**2
-    allowed = float(stats.poisson.isf(limits.NULL_ALARM, limits.PANE * rays)) * MOST_OFF / rays
+    lost = float(stats.poisson.isf(limits.NULL_ALARM, limits.PANE_RAYS * rays))
+    allowed = min(limits.PANE, lost * MOST_OFF / rays)
     for thickness, x in PANES:
         turned = mi.ScalarTransform4f().translate([x, 0, 0]).rotate([0.48, 0.6, 0.64], 40)
         pane = {"type": "cube", "to_world": turned.scale([1, 1, thickness / 2]), "bsdf": {"type": method.bsdf}}
