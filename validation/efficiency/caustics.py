@@ -317,17 +317,19 @@ def noise_row(context: Context, body: str, lamp: str, without_glass: np.ndarray)
 def _tested(references: np.ndarray, images: np.ndarray, caustic: np.ndarray) -> dict[str, float]:
     """Return the values of Welch's test of tiles, and of the means over the caustic and over the rest.
 
-    The two means give the detectable difference.
+    The two means give the detectable difference, NaN without light in the caustic. The rest of a pool may be black: all
+    light on its floor comes through the water, and that of a small lamp is not compared in pixels that see the water.
     """
     levels = limits.WELCH_ERROR, limits.WELCH_MARGIN
     tiles = tile_statistics.compare_stacks(references, images, TILE, *levels)
     inside = caustic[..., None]
-    reference, test = (np.concatenate([x * inside, x * ~inside], 2) for x in (references, images))
+    parts = (inside, ~inside) if ((references + images) * ~inside).any() else (inside,)
+    reference, test = (np.concatenate([x * part for part in parts], 2) for x in (references, images))
     means = tile_statistics.compare_stacks(reference, test, len(caustic), *levels)
     return {
         WELCH_ALARMS: float(tiles.alarms + means.alarms),
         SMALLEST_P: min(tiles.smallest_p, means.smallest_p),
-        DETECTABLE: float(np.max(means.levels[0].detectable(means.threshold))),  # NaN if either part is black
+        DETECTABLE: float(np.max(means.levels[0].detectable(means.threshold))),
     }
 
 

@@ -60,6 +60,7 @@ EXCLUDES: dict[tuple[str, str], tuple[tuple[str, ...], str]] = {
     ("self-test", "welch"): (("other sampler",), "no alarm: another sampler is no defect"),
     ("welch_nulls", "alarms"): (PAIRS, "no alarm among the pairs of a row; 1 of 8 fails, and 1 of 200 of all pairs"),
     ("welch_nulls", "missed"): (PAIRS, "none of the planted differences; 1 of 10 fails"),
+    ("code mutants", "unexplained"): (("all rooms",), "none unexplained; more than 1 of 20 fails"),
     ("visible_changes", "called different"): (UNSEEN, "none of these pairs; one of a hundred fails"),
 }
 
