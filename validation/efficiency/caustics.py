@@ -63,7 +63,7 @@ TERMS = {
     MISSING: "for the pixels of the caustic: 1 − the mean of the images over that of the reference",
     WELCH_ALARMS: "tiles and channels, and the caustic and the rest, whose mean differs from the reference's; at most "
     "one row in 500 by chance; for small lamps in pixels that see no glass",
-    DETECTABLE: "of the mean over the caustic or over the rest, whichever is larger",
+    DETECTABLE: "of the mean over the caustic or over the rest, whichever is larger, if the rest has light",
     OFF: "|power on the disk over the exact one − 1|",
     NOISE: "of the power over the exact one",
     "quadrature": "bound of the relative error of the exact power",
@@ -317,19 +317,19 @@ def noise_row(context: Context, body: str, lamp: str, without_glass: np.ndarray)
 def _tested(references: np.ndarray, images: np.ndarray, caustic: np.ndarray) -> dict[str, float]:
     """Return the values of Welch's test of tiles, and of the means over the caustic and over the rest.
 
-    The two means give the detectable difference, NaN without light in the caustic. The rest of a pool may be black: all
-    light on its floor comes through the water, and that of a small lamp is not compared in pixels that see the water.
+    The two means give the detectable difference: NaN without light in the caustic, and of the caustic only if the rest
+    has no light. All light on the floor of the pool comes through water, and little is seen in the water itself.
     """
     levels = limits.WELCH_ERROR, limits.WELCH_MARGIN
     tiles = tile_statistics.compare_stacks(references, images, TILE, *levels)
     inside = caustic[..., None]
-    parts = (inside, ~inside) if ((references + images) * ~inside).any() else (inside,)
-    reference, test = (np.concatenate([x * part for part in parts], 2) for x in (references, images))
+    reference, test = (np.concatenate([x * inside, x * ~inside], 2) for x in (references, images))
     means = tile_statistics.compare_stacks(reference, test, len(caustic), *levels)
+    of_caustic, of_rest = np.moveaxis(means.levels[0].detectable(means.threshold), 1, 0)
     return {
         WELCH_ALARMS: float(tiles.alarms + means.alarms),
         SMALLEST_P: min(tiles.smallest_p, means.smallest_p),
-        DETECTABLE: float(np.max(means.levels[0].detectable(means.threshold))),
+        DETECTABLE: float(np.where(np.isnan(of_rest), of_caustic, np.maximum(of_caustic, of_rest)).max()),
     }
 
 
