@@ -32,7 +32,6 @@ from .ray_directions import N_SF11
 NAME = "dispersion and absorption"
 SIGMA, CORE = (0.2, 0.6, 1.5), (1.0, 0.1, 0.3)
 SIZE, DETECTABLE_IMAGE = 48, "detectable difference, image"
-SEEDS = {"quick": 8, "standard": 16, "full": 16}
 DETECTED = "detectable per channel"
 TERMS = {
     "off white": "largest relative difference of a channel's mean from that of the light",
@@ -121,7 +120,7 @@ def absorbing_parts(name: str, absorbing: bool) -> Nodes:
 
 def volpath_rows(context: Context, name: str) -> list[Row]:
     """Return the row of Welch's test against `volpath`, on tiles of 8² pixels and on the whole image."""
-    count, spp = SEEDS[context.profile.name], {"quick": 64, "standard": 512, "full": 1024}[context.profile.name]
+    count, spp = (8, 64) if context.profile.quick else (16, 1024)
     volpath = {"type": "volpath", "max_depth": 64, "rr_depth": 64}
     test, reference = (
         np.stack([camera(spp, first + seed)[0] for seed in range(count)])
