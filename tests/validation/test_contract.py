@@ -127,7 +127,7 @@ NOT_REPEATED = {
     "suite.exports": "several seeds a side",
     "suite.rendered_images": "several seeds a side",
     "suite.standard_numbers": "eight seeds per image; indices of glasses do not depend on the rays",
-    "media.renders": "sixteen seeds a side in the furnace, eight by Welch's test; the rest is times and closed forms",
+    "media.renders": "sixteen seeds a side in the furnace and by Welch's test; the rest is times and closed forms",
     "robustness.code_mutants": "each mutant is a case; the profile full has more of them",
     "ground_truth.standard_numbers": "one number is drawn, in sixteen sets of samples; the rest has no noise",
     "ground_truth.traced_bodies": "bodies are fixed; the rainbow's seeds are its sample",
