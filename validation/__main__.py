@@ -54,7 +54,7 @@ QUICK = (
     "diff.planted_defects",
 )
 LOCK = "validation.lock"  # exists in the report's folder during a run
-PROFILES = {"quick": "a minute and a half", "standard": "2.5 hours", "full": "a day"}
+PROFILES = {"quick": "a minute and a half", "standard": "2.5 hours", "full": "many hours"}
 
 app = command_line.application()
 
