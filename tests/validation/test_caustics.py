@@ -134,12 +134,15 @@ def test_black_images_of_other_renderers_fail(context, monkeypatch):
     assert row.broken.keys() == {caustic_energies.OFF}
 
 
-def test_a_reference_without_a_caustic_fails_and_one_without_other_light_passes():
+def test_a_reference_without_a_caustic_fails_and_one_without_expected_light_elsewhere():
     rng = np.random.default_rng(3)
     references, images = 1 + 0.01 * rng.normal(size=(2, 4, 16, 16, 3))
     some, none = rng.random((16, 16)) < 0.3, np.zeros((16, 16), bool)
-    for pixels, passes in ((some, True), (~none, True), (none, False)):
-        detectable = caustics._tested(references, images, pixels)[DETECTABLE]
+    for pixels, rest_is_lit, passes in (
+        *((some, True, True), (none, True, False), (none, False, False)),
+        *((~none, True, False), (~none, False, True)),
+    ):
+        detectable = caustics._tested(references, images, pixels, rest_is_lit)[DETECTABLE]
         assert (detectable <= limits.CAUSTIC_DETECTABLE) == passes
 
 

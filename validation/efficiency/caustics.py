@@ -63,7 +63,7 @@ TERMS = {
     MISSING: "for the pixels of the caustic: 1 − the mean of the images over that of the reference",
     WELCH_ALARMS: "tiles and channels, and the caustic and the rest, whose mean differs from the reference's; at most "
     "one row in 500 by chance; for small lamps in pixels that see no glass",
-    DETECTABLE: "of the mean over the caustic or over the rest, whichever is larger, if the rest has light",
+    DETECTABLE: "of the mean over the caustic or over the rest, whichever is larger; the rest may be black in the pool",
     OFF: "|power on the disk over the exact one − 1|",
     NOISE: "of the power over the exact one",
     "quadrature": "bound of the relative error of the exact power",
@@ -223,11 +223,15 @@ def energy_rows(context: Context, body: str, lamp: str, methods: tuple[Method, .
 
 @dataclass(frozen=True)
 class Reference:
-    """Independent renders of a case, and masks (height × width) of pixels that see no glass and of the caustic."""
+    """Independent renders of a case, and masks (height × width) of pixels that see no glass and of the caustic.
+
+    `direct`: whether light also reaches the camera without glass.
+    """
 
     renders: np.ndarray
     without_glass: np.ndarray
     caustic: np.ndarray
+    direct: bool
 
 
 def reference(body: str, lamp: str, extent: Extent) -> Reference:
@@ -241,7 +245,7 @@ def reference(body: str, lamp: str, extent: Extent) -> Reference:
     direct = camera_of(black, BUILTIN)(spp, seed=0)[0].mean(-1)
     # Another render selects the pixels: pixels selected by the noise of the references would be too bright in them.
     light = camera(spp, seed=FIRST_REFERENCE - 1)[0].mean(-1)
-    return Reference(renders, without_glass, without_glass & (light - direct > SHARE * light))
+    return Reference(renders, without_glass, without_glass & (light - direct > SHARE * light), bool(direct.any()))
 
 
 def image_rows(
@@ -265,13 +269,14 @@ def image_rows(
     side, case, rows = scenes.side_of(lamp), f"{body}, {lamp}", []
     small = 0 < side <= scenes.SMALL
     compared = truth.without_glass[..., None] | (not small)
+    rest_is_lit = truth.direct or side > scenes.SMALL  # all light on the floor of the pool comes through water
     for method in methods:
         values, budgets = _times(measured[method.name], measured[methods[0].name], side), dict[str, float]()
         images, goals = np.stack(measured[method.name].images), dict[str, float]()
         if method == tested:
             spp = extent.checked(body, lamp)
             images = np.stack([cameras[method.name](spp, seed=i)[0] for i in range(extent.renders)])
-            values |= _tested(truth.renders * compared, images * compared, truth.caustic)
+            values |= _tested(truth.renders * compared, images * compared, truth.caustic, rest_is_lit)
             budgets = {WELCH_ALARMS: 0.0, DETECTABLE: limits.CAUSTIC_DETECTABLE}
             goals = limits.CAUSTICS if small else {}
         test_mean, reference_mean = (x[:, truth.caustic].mean() for x in (images, truth.renders))
@@ -314,11 +319,10 @@ def noise_row(context: Context, body: str, lamp: str, without_glass: np.ndarray)
     return Row(NAME, BY_PART, f"{body}, {lamp}", context.variant, values, reason=reason, replay=replay)
 
 
-def _tested(references: np.ndarray, images: np.ndarray, caustic: np.ndarray) -> dict[str, float]:
+def _tested(references: np.ndarray, images: np.ndarray, caustic: np.ndarray, rest_is_lit: bool) -> dict[str, float]:
     """Return the values of Welch's test of tiles, and of the means over the caustic and over the rest.
 
-    The two means give the detectable difference: NaN without light in the caustic, and of the caustic only if the rest
-    has no light. All light on the floor of the pool comes through water, and little is seen in the water itself.
+    The two means give the detectable difference: NaN if either has no light, except for the rest without `rest_is_lit`.
     """
     levels = limits.WELCH_ERROR, limits.WELCH_MARGIN
     tiles = tile_statistics.compare_stacks(references, images, TILE, *levels)
@@ -326,10 +330,12 @@ def _tested(references: np.ndarray, images: np.ndarray, caustic: np.ndarray) -> 
     reference, test = (np.concatenate([x * inside, x * ~inside], 2) for x in (references, images))
     means = tile_statistics.compare_stacks(reference, test, len(caustic), *levels)
     of_caustic, of_rest = np.moveaxis(means.levels[0].detectable(means.threshold), 1, 0)
+    if not rest_is_lit:
+        of_rest = np.where(np.isnan(of_rest), of_caustic, of_rest)
     return {
         WELCH_ALARMS: float(tiles.alarms + means.alarms),
         SMALLEST_P: min(tiles.smallest_p, means.smallest_p),
-        DETECTABLE: float(np.where(np.isnan(of_rest), of_caustic, np.maximum(of_caustic, of_rest)).max()),
+        DETECTABLE: float(np.maximum(of_caustic, of_rest).max()),
     }
 
 
