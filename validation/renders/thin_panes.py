@@ -42,7 +42,7 @@ def method_rows(context: Context, method: Method) -> list[Row]:
     """Return a row per pane."""
     import mitsuba as mi
 
-    resolution, rows = 8 if context.scalar else RESOLUTION, []
+    resolution, rows = RESOLUTION // 2 if context.scalar else RESOLUTION, []
     rays = SPP * resolution**2
     lost = float(stats.poisson.isf(limits.NULL_ALARM, limits.PANE_RAYS * rays))
     allowed = min(limits.PANE, lost * MOST_OFF / rays)
