@@ -14,7 +14,7 @@ from flint import arb, ctx
 
 HALF_TURN = np.arccos(np.longdouble(-1))
 # Number of nodes for diffuse light. The integrand's branch point, at μ = √(1 − n²), is 0.02 from the interval for
-# n = 1.0003: the relative error of Gauss's quadrature is then 1.3^−2m < 10⁻²⁶.
+# n = 1.0003: the relative error of Gauss's quadrature is then 1.248^−2m < 10⁻²¹.
 GRADE = 112
 BITS = 240
 
