@@ -278,8 +278,9 @@ def efficiency(rows: list[Row]) -> str:
         for scene, by_name in scenes.items()
     ]
     text = _replay(measured, "{resolution}² pixels, {spp} spp, {rounds} rounds, {setting}.")
-    text += "".join(f"\n{sentence}" for sentence in headline.equal_time(measured))
-    left_out = [row.case for row in rows if row.study == error_against_time.NAME and not row.values]
+    of_study = [row for row in rows if row.study == error_against_time.NAME]
+    text += "".join(f"\n{sentence}" for sentence in headline.equal_time(of_study))
+    left_out = [row.case for row in of_study if not row.values]
     text += f"\nNot measured: {', '.join(left_out)}." if left_out else ""
     heading = ["scene", "sampler", f"`{BUILTIN.name}`, over `independent`", *(f"`{name}`" for name in methods)]
     return _table(text, heading, cells, "efficiencies were measured")
