@@ -65,6 +65,16 @@ def test_biased_methods_fail_and_more_samples_reduce_the_error(context):
     assert builtin["equal-time MSE / independent"] < 1 and control["Welch alarms"] == 0
 
 
+@pytest.mark.parametrize(("bias", "alarms"), [(0.0, False), (0.01, True)])
+def test_a_small_bias_of_a_whole_noisy_image_is_an_alarm(bias, alarms):
+    """1 % is 9.6 standard errors of the image's mean, 1.6 of a tile's. False alarms: 1 in 1000."""
+    rng = np.random.default_rng(7)
+    references, images = (x + 0.2 * rng.normal(size=(n, 96, 96, 3)) for x, n in ((1.0, 12), (1.0 - bias, 6)))
+    values = render_methods.welch_values_with_whole(references, images, 16)
+    assert (values["Welch alarms"] > 0) == alarms
+    assert values["detectable difference, image"] < 0.01 < values["minimum detectable difference"]
+
+
 @pytest.mark.parametrize(("noise", "seconds", "best"), [(2.0, 1.0, 1), (0.5, 1.0, 0), (0.5, 5.0, 1)])
 def test_the_best_sampler_has_the_least_variance_and_time(monkeypatch, noise, seconds, best):
     """The first sampler has the given noise and time, the other 1 and 1; the first image of each takes 1e9 s."""
@@ -103,9 +113,13 @@ def test_scenes_that_are_left_out_have_a_reason(context, monkeypatch, scene, wor
 
 
 def test_the_best_method_has_a_goal_and_on_glass_only_the_best_that_splits():
+    """The best at 4 samples per pixel, which is the worst at 9."""
     subjects = [error_against_time.Subject(method, "multijitter") for method in METHODS]
     costs = zip((s.name for s in subjects), (1.0, 1.0, 0.1, 0.5, 0.3, 0.4), strict=True)
-    measured = {name: {4: error_against_time.Measured([1.0], {"MSE": [cost]}, [])} for name, cost in costs}
+    measured = {
+        name: {spp: error_against_time.Measured([1.0], {"MSE": [mse]}, []) for spp, mse in ((4, cost), (9, 1 - cost))}
+        for name, cost in costs
+    }
     glass = error_against_time.goals_of(subjects, measured, only_glass=True)
     assert glass[subjects[4].name] == limits.ONLY_GLASS and glass[subjects[2].name] == {"time / built-in": 0.8}
     assert subjects[1].name not in glass and glass[subjects[3].name] == {}

@@ -34,7 +34,7 @@ from validation.run.render_methods import BUILTIN, DIELECTRIC, OURS, Camera, sen
 from validation.study import Study, Task, about
 
 from . import caustic_scenes
-from .error_against_time import SCALAR
+from .error_against_time import SCALAR, why_no_error
 
 NAME = "chosen settings"
 EVERY = "every scene"
@@ -175,9 +175,9 @@ def scene_rows(context: Context, name: str) -> list[Row]:
         for text, settings in by_text.items()
     }
     cameras[BUILTIN.name] = Camera(load_parsed(parse_scene(*default)))
+    if reason := why_no_error(cameras[BUILTIN.name]):
+        return [row(reason=reason)]
     cost_of = costs(cameras, extent.spp, extent.rounds)
-    if max(cost_of[BUILTIN.name]) < limits.NOISE**2:
-        return [row(reason="left out: the image has no noise to compare settings by")]
     best = min(by_text, key=lambda text: statistics.fmean(cost_of[text]))
     compared = {text: cameras[text] for text in (best, settings_text(chosen), BUILTIN.name)}
     cost_of = costs(compared, extent.spp, extent.rounds, first_seed=(extent.rounds + 1) * len(cameras))

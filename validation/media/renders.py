@@ -18,20 +18,19 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refract import media
-from mi_refract.image_diff import tile_statistics
 from mi_refract.report.row import Row
 from validation.limits import ABSORPTION_SEEN, ABSORPTION_TIME, DISPERSION_TIME, FURNACE_CHANNEL, SLAB_ABSORPTION
 from validation.run import kernel_timing
 from validation.run.context import Context
-from validation.run.metrics import DETECTABLE, SMALLEST_P, WELCH_ALARMS
-from validation.run.render_methods import OURS, Camera, sensor, under
+from validation.run.metrics import DETECTABLE, DETECTABLE_IMAGE, WELCH_ALARMS
+from validation.run.render_methods import OURS, Camera, sensor, under, welch_values_with_whole
 from validation.study import Study, Task, about
 
 from .ray_directions import N_SF11
 
 NAME = "dispersion and absorption"
 SIGMA, CORE = (0.2, 0.6, 1.5), (1.0, 0.1, 0.3)
-SIZE, DETECTABLE_IMAGE = 48, "detectable difference, image"
+SIZE = 48
 DETECTED = "detectable per channel"
 TERMS = {
     "off white": "largest relative difference of a channel's mean from that of the light",
@@ -129,9 +128,7 @@ def volpath_rows(context: Context, name: str) -> list[Row]:
             (Camera(scene(SIZE, absorbing_parts(name, False), volpath)), 0),
         )
     )
-    tiles, image = (tile_statistics.compare_stacks(reference, test, tile, 5e-4, 1e-5) for tile in (8, SIZE))
-    values = {WELCH_ALARMS: float(tiles.alarms + image.alarms), SMALLEST_P: min(tiles.smallest_p, image.smallest_p)}
-    values |= {DETECTABLE: tiles.minimum_detectable(), DETECTABLE_IMAGE: image.minimum_detectable()}
+    values = welch_values_with_whole(reference, test, tile=8)
     budgets = {WELCH_ALARMS: 0.0} | ({} if context.profile.quick else {DETECTABLE_IMAGE: ABSORPTION_SEEN})
     replay = {"spp": spp, "seeds": count, "resolution": SIZE}
     return [Row(NAME, "volpath", name, context.variant, values, budgets, replay=replay)]

@@ -18,7 +18,7 @@ from mi_refract.plugins import PLUGIN
 from mi_refract.rendering import scene_files
 from validation import limits
 
-from .metrics import DETECTABLE, SMALLEST_P, WELCH_ALARMS
+from .metrics import DETECTABLE, DETECTABLE_IMAGE, SMALLEST_P, WELCH_ALARMS
 
 DIELECTRIC = "dielectric"
 OURS = "refract_path"
@@ -108,12 +108,23 @@ def sensor(
     return {"type": "perspective", "fov": fov, "to_world": view, "film": film, "sampler": {"type": "independent"}}
 
 
-def welch_values(reference: np.ndarray, test: np.ndarray, tile: int) -> dict[str, float]:
+def welch_values(
+    reference: np.ndarray, test: np.ndarray, tile: int, error: float = limits.WELCH_ERROR
+) -> dict[str, float]:
     """Return the values of Welch's test of the tiles of two stacks of independent renders."""
     from mi_refract.image_diff import tile_statistics
 
-    tiles = tile_statistics.compare_stacks(reference, test, tile, limits.WELCH_ERROR, limits.WELCH_MARGIN)
+    tiles = tile_statistics.compare_stacks(reference, test, tile, error, limits.WELCH_MARGIN)
     return {WELCH_ALARMS: float(tiles.alarms), SMALLEST_P: tiles.smallest_p, DETECTABLE: tiles.minimum_detectable()}
+
+
+def welch_values_with_whole(reference: np.ndarray, test: np.ndarray, tile: int) -> dict[str, float]:
+    """Return the same for the tiles and the whole image, with as many false alarms in both together."""
+    error, sizes = limits.WELCH_ERROR / 2, (tile, max(reference.shape[1:3]))
+    tiles, whole = (welch_values(reference, test, size, error) for size in sizes)
+    values = {WELCH_ALARMS: tiles[WELCH_ALARMS] + whole[WELCH_ALARMS]}
+    values |= {SMALLEST_P: min(tiles[SMALLEST_P], whole[SMALLEST_P])}
+    return values | {DETECTABLE: tiles[DETECTABLE], DETECTABLE_IMAGE: whole[DETECTABLE]}
 
 
 def save_image(folder: Path, name: str, image: np.ndarray, about: dict[str, Any]) -> str:

@@ -33,7 +33,7 @@ from mi_refract.scene_export.plain_scene import Diffuse, Environment, Glass, Lig
 from validation import limits
 from validation.run.context import SCENES as FOLDER
 from validation.run.context import Context
-from validation.run.metrics import DETECTABLE, MEAN_DIFFERENCE
+from validation.run.metrics import DETECTABLE, DETECTABLE_IMAGE, MEAN_DIFFERENCE
 from validation.run.render_methods import Camera, save_image
 from validation.study import Study, Task, about
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS, ImageRenderer, by_command, mean
@@ -41,7 +41,6 @@ from validation.suite.renderers.image_renderers import IMAGE_RENDERERS, ImageRen
 from .renderers import SYSTEMS, System, environments
 
 NAME = "images"
-DETECTABLE_IMAGE = "detectable difference, image"
 INCONCLUSIVE = "inconclusive"
 TERMS = {
     "tests that differ": "tests of tiles of 16² pixels by channel, of blocks of tiles and of the whole image that find "

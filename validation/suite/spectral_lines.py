@@ -33,11 +33,11 @@ from mi_refract.scene_export.plain_scene import Diffuse, Glass, Light, Mesh, Pla
 from validation import limits
 from validation.run.context import SCENES as FOLDER
 from validation.run.context import Context
-from validation.run.metrics import DETECTABLE
+from validation.run.metrics import DETECTABLE, DETECTABLE_IMAGE
 from validation.run.render_methods import Camera, under
 from validation.study import Study, Task, about
 
-from .rendered_images import DETECTABLE_IMAGE, INCONCLUSIVE, LOST, OURS, RENDERS, TERMS, Size, measured, why_not
+from .rendered_images import INCONCLUSIVE, LOST, OURS, RENDERS, TERMS, Size, measured, why_not
 from .renderers import SYSTEMS, environments
 from .renderers.image_renderers import IMAGE_RENDERERS
 
