@@ -71,9 +71,10 @@ class Inflation:
     """The variance of tile means relative to that for independent pixels, at least 1; `freedom`: degrees of freedom.
 
     Pixels under a wide filter correlate. With few tiles the estimate is uncertain, which t-tests take into account.
+    `factor`: one for all tiles, or one for each.
     """
 
-    factor: float = 1.0
+    factor: Array | float = 1.0
     freedom: float = np.inf
 
 

@@ -45,6 +45,7 @@ MISSED = 0.01  # probability with which the minimum detectable difference is mis
 HOLLOW = 0.01  # pixels that scatter by less than this share of the stated variance do not show that noise
 FAR = 10.0  # multiple of the margin by which a pixel without noise must differ, see `with_silent_pixels`
 UNSEEN = 1e-3  # relative to the margin: a tile with less noise than this is left out of `Side.inflation`
+UNEVEN = 2.0  # standard errors by which the spread of the tiles' inflations must exceed that of chance
 WORKERS = 2
 
 Flags = NDArray[np.bool_]
@@ -92,13 +93,36 @@ class Side:
         all pixels of a render and says nothing about the correlation in other tiles. Such a tile differs beyond the
         margin by 1000 σ of independent pixels or not at all.
         """
+        ratios, tiles = self._ratios(margin)
+        if not tiles:
+            return self.correlated
+        return Inflation(max(1.0, float(ratios.mean())), self.freedom * tiles)
+
+    def _ratios(self, margin: float) -> tuple[Array, int]:
+        """Return the inflation by tile and channel, of those with noise, and the number of these tiles."""
         noisy = self.variance > np.square(UNSEEN * margin * self.mean)
         if self.renders is None or not noisy.any():
-            return self.correlated
-        between = self.renders.var(0, ddof=1)[noisy] / len(self.renders)
+            return np.zeros(0), 0
         # The channels of a tile may have the same noise, so a tile counts once, not once per channel.
-        freedom = self.freedom * int(noisy.any(-1).sum())
-        return Inflation(max(1.0, float((between / self.variance[noisy]).mean())), freedom)
+        return self.between[noisy] / self.variance[noisy], int(noisy.any(-1).sum())
+
+    @property
+    def between(self) -> Array:
+        """The same as `variance`, from the sums of each render, so that pixels may correlate."""
+        assert self.renders is not None
+        return np.asarray(self.renders.var(0, ddof=1) / len(self.renders))
+
+    def uneven(self, margin: float) -> bool:
+        """Return whether the inflation differs between tiles or channels, as where a part of an image is denoised.
+
+        With one inflation, d times the ratios over it are χ²-distributed with d degrees of freedom. So the square of
+        their coefficient of variation is 2/d, which N tiles show with a relative standard error of √((2 + 12/d)/N).
+        """
+        ratios, tiles = self._ratios(margin)
+        if tiles < 2 or not ratios.any():
+            return False
+        excess = ratios.var() / ratios.mean() ** 2 * self.freedom / 2 - 1
+        return bool(excess > UNEVEN * np.sqrt((2 + 12 / self.freedom) / tiles))
 
 
 def from_variances(mean: Array, variance: Array, freedom: float, tile: int, count: Array | float = 1.0) -> Side:
@@ -169,9 +193,11 @@ class Evidence:
         blocks as long as there are POOLED of them: these show correlation over larger distances.
         """
         tile, one, two, pixels = self.tile, self.one, self.two, self.pixels
-        inflations = one.inflation(margin), two.inflation(margin)
+        inflations, uneven = (one.inflation(margin), two.inflation(margin)), one.uneven(margin) or two.uneven(margin)
         while True:
             level = compare_tiles(one, two, margin, inflations)
+            if uneven:
+                level = _with_own_noise(level, one, two, pixels)
             if pixels:
                 p = pixels.p(one.area, np.square(level.allowed), max(inflations))
                 hollow = self._p_by_scatter(level, one, two, pixels, max(inflations).factor)
@@ -186,7 +212,7 @@ class Evidence:
                 inflations = max(inflations[0], one.inflation(margin)), max(inflations[1], two.inflation(margin))
 
     @staticmethod
-    def _p_by_scatter(level: Level, one: Side, two: Side, pixels: PixelSums, factor: float) -> Array:
+    def _p_by_scatter(level: Level, one: Side, two: Side, pixels: PixelSums, factor: Array | float) -> Array:
         """Return the p-value of no difference of a tile beyond the margin, by the scatter of its pixels' differences d.
 
         It is 1 where Σd² is at least HOLLOW times the sum of the stated variances: there the pixels show that noise.
@@ -251,6 +277,8 @@ class Level:
       means differ beyond the margin. `heavy`: tiles whose noise comes from a few pixels only.
     - `shown`: p-value of no difference beyond the margin, with the noise that the pixels show; 0: not tested.
     - `hollow`: the same where the pixels do not show the stated noise; 1 where they do.
+    - `own`, `own_pixels`: the same, and that of no pixel beyond the margin, where the inflation is uneven and the own
+      noise of the tile between renders is larger than that by the mean inflation; 0 elsewhere.
     - `of_pixels`: p-value of no pixel beyond the margin; `of_silent`: the same for silent tiles. None: not tested.
     """
 
@@ -268,6 +296,8 @@ class Level:
     difference: Array
     shown: Array | float = 0.0
     hollow: Array | float = 1.0
+    own: Array | float = 0.0
+    own_pixels: Array | float = 0.0
     of_pixels: Array | None = None
     of_silent: Array | None = None
 
@@ -333,6 +363,27 @@ def compare_tiles(
     return Level(t, p, p_beyond, silent, off, few & ~silent, mean, allowed, error, freedom, m1, difference)
 
 
+def _with_own_noise(level: Level, one: Side, two: Side, pixels: PixelSums | None) -> Level:
+    """Return the level with tests by each tile's own noise between renders, where that is the larger."""
+    from scipy import special
+
+    freedoms, ratio = (one.freedom, two.freedom), one.count / two.count
+    v1, v2 = one.between / one.area**2, two.between / two.area**2
+    exchange = ratio * v1 + v2 / ratio > v1 + v2
+    v1, v2 = np.where(exchange, ratio * v1, v1), np.where(exchange, v2 / ratio, v2)
+    variance = v1 + v2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        freedom = variance**2 / (v1**2 / freedoms[0] + v2**2 / freedoms[1])
+        t = np.maximum(np.abs(level.difference) - level.allowed, 0) / np.sqrt(variance)
+        factor = np.fmax(one.between / one.variance, two.between / two.variance)
+    larger = ~level.silent & (variance > np.square(level.error))
+    level = replace(level, own=np.where(larger, 2 * special.stdtr(freedom, -t), 0.0))
+    if not pixels:
+        return level
+    p = pixels.p(one.area, np.square(level.allowed), Inflation(factor, min(freedoms)))
+    return replace(level, own_pixels=np.where(larger, p, 0.0))
+
+
 def with_silent_pixels(level: Level, a: Array, b: Array, margin: float, tile: int, odds: Array | float = 7.0) -> Level:
     """Return the level of single tiles with tests of the pixels of silent tiles.
 
@@ -374,7 +425,8 @@ class Alarms(NamedTuple):
 
     - `tiles`: tests of the means of tiles.
     - `doubtful`: the same of tiles that are heavy-tailed, or that do not differ by the noise which their pixels show;
-      also of tiles that differ only by that noise, where it is far below the stated one.
+      also of tiles that differ only by that noise, where it is far below the stated one; also tests of tiles and of
+      their pixels that do not differ by the own noise of the tile between renders.
     - `pixels`: tests of the pixels of a tile.
     - `silent_far`: silent tiles and channels of the finest level with so many pixels so far beyond the margin that they
       are alarms.
@@ -414,11 +466,14 @@ class TileTests:
         untested = 1.0
         flags = []
         for level in self.levels:
-            doubtful = level.heavy | (level.shown > self.threshold)
+            doubtful = level.heavy | (level.shown > self.threshold) | (level.own > self.threshold)
+            pixels = np.full(level.p.shape, untested) if level.of_pixels is None else level.of_pixels
+            own = level.own_pixels > self.threshold
+            means = np.where(level.silent, untested, np.where(doubtful, level.beyond, level.hollow))
             p = {
                 "tiles": np.where(doubtful | level.silent, untested, level.beyond),
-                "doubtful": np.where(level.silent, untested, np.where(doubtful, level.beyond, level.hollow)),
-                "pixels": np.full(level.p.shape, untested) if level.of_pixels is None else level.of_pixels,
+                "doubtful": np.where(own, np.minimum(means, pixels), means),
+                "pixels": np.where(own, untested, pixels),
                 "silent_far": np.full(level.p.shape, untested) if level.of_silent is None else level.of_silent,
             }
             off = level.off & (level is self.levels[0])

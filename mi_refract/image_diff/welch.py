@@ -72,8 +72,9 @@ def compare_renders(
     p₍ᵢ₎ N/i made monotonic, the smallest of the channels. `flags`: 1 heavy-tailed, 2 no noise.
 
     EQUAL, however noisy, if both images contain their variance and are identical in every value of every channel.
-    INCONCLUSIVE if the only tiles that differ are unsuited to a t-test (their noise comes from a few pixels, or they
-    have no noise and differ by little or in a few pixels), or if the noise hides differences of `resolution`; then the
+    INCONCLUSIVE if the only tiles that differ are unsuited to a t-test (their noise comes from a few pixels, or their
+    pixels share more noise than those of the rest of the image, or they have no noise and differ by little or in a few
+    pixels), or if the noise hides differences of `resolution`; then the
     reason gives the number of samples that would decide. ValueError for fewer renders, the same render twice, and
     images that cannot be compared.
     """
@@ -231,7 +232,9 @@ def _verdict(tests: TileTests, resolution: float, hidden: float) -> tuple[Verdic
     if differing := ", ".join(f"{count} {name}" for name, count in counts.items() if count):
         return Verdict.DIFFERENT, f"{sum(counts.values())} of {tests.p.size} tests differ: {differing}"
     if silent or doubtful:
-        where = f"{silent} without noise, {doubtful} heavy-tailed or noisier than their pixels show"
+        where = (
+            f"{silent} without noise, {doubtful} heavy-tailed, or with other noise than their pixels or renders show"
+        )
         return Verdict.INCONCLUSIVE, f"only tiles that are unsuited to a t-test differ: {where}"
     if tests.levels[0].silent.all():
         return Verdict.EQUAL, "no noise, and no tile differs beyond the margin"

@@ -50,6 +50,14 @@ def renders(rng, count, gain=1.0, shape=SHAPE, deviation=0.1, blur=0.0):
     return [of(gain * x) for x in blurred(skewed(rng, (count, *shape), deviation), blur)]
 
 
+def partly_denoised(rng, count, gain=1.0):
+    """Renders of 8 × 8 tiles, one of which has a single value, as if denoised; another has a gain."""
+    light = skewed(rng, (count, 64, 64, 1), 0.1)
+    light[:, :8, :8] = light[:, :1, :1]
+    light[:, 48:56, 48:56] *= gain
+    return [of(x) for x in light]
+
+
 def film(mean, variance, **header):
     """An image with the variance of a sample in additional channels."""
     names = tuple("RGB") if mean.shape[-1] == 3 else ("Y",)
@@ -246,6 +254,8 @@ NULLS = {
     "two against four": (100, pair_of(renders, (2,), (4,), **STACK)),
     "filtered renders": (40, pair_of(renders, (8,), **STACK, blur=1.0)),
     "few filtered renders": (40, pair_of(renders, (2,), shape=(16, 16, 3), deviation=0.3, blur=1.0)),
+    "partly denoised renders": (100, pair_of(partly_denoised, (4,))),
+    "more of them": (40, pair_of(partly_denoised, (8,))),
     "passes": (100, pair_of(passes, ())),
     "filtered passes": (100, pair_of(passes, (0.5,))),
     "one variance": (100, lambda rng: exponential(rng, 1.0, 1000, 300, 0)),
@@ -263,6 +273,11 @@ def test_the_rate_of_false_alarms_is_at_most_the_family_error(name):
     seeds = np.random.SeedSequence([90, *name.encode()]).spawn(count)
     alarms = sum(welch(*draw(np.random.default_rng(seed)), **options).verdict is DIFFERENT for seed in seeds)
     assert alarms <= stats.binom.isf(1e-4, count, 0.05)
+
+
+def test_a_difference_beside_a_denoised_part_is_detected(rng):
+    """10 % are 11 standard errors of the tile."""
+    assert welch(partly_denoised(rng, 8), partly_denoised(rng, 8, gain=1.1), tile=8).verdict is DIFFERENT
 
 
 @pytest.mark.parametrize("deviation", [2.0, 3.0])

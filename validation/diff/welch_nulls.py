@@ -2,8 +2,9 @@
 
 Light is normal, lognormal, Pareto-distributed, a base to which rare samples add 200 times as much (fireflies), or rare
 samples alone (a lamp). The sides have equal numbers of samples, or one side has up to 1000 times as many. The noise is
-known on both sides or on one, from samples, from passes with filters of up to 3 pixels, or from several renders. Pairs
-of renders of a scene have a ball of glass and a small lamp, whose light passes the glass by chance.
+known on both sides or on one, from samples, from passes with filters of up to 3 pixels, or from several renders, also
+with a tile that is denoised. Pairs of renders of a scene have a ball of glass and a small lamp, whose light passes the
+glass by chance.
 
 `welch` claims false alarms in 0.1 % of pairs, and reports the difference of a tile that it detects with a probability
 of 99 %. Such differences are planted, and differences that it detects with a probability of 50 %: too many of these
@@ -98,17 +99,21 @@ class Form:
 
     `kind`: "samples" for films with the variance of their samples, "passes" for the variance between passes, "renders"
     for several renders, "unnamed" for renders without a number of samples. `deviation`: σ of a Gaussian filter in
-    pixels. `known`: which sides have a variance.
+    pixels. `known`: which sides have a variance. `denoised`: one tile has the value of one of its pixels, in at least
+    four renders: fewer do not show that noise, see the documentation of `welch`.
     """
 
     kind: str
     deviation: float = 0.0
     known: tuple[bool, bool] = (True, True)
+    denoised: bool = False
 
     def pair(self, draw: Draw, rng: Rng, *counts: int) -> list[Side]:
         """Draw both sides with these numbers of samples."""
         if self.kind == "unnamed":
             counts = tuple(np.clip(counts, 16, 256))
+        if self.denoised:
+            counts = tuple(np.maximum(counts, 16))
         if self.kind == "samples":
             return self.sides([draw(rng, n) for n in counts], counts)
         stacks = []
@@ -117,6 +122,8 @@ class Form:
             stack = np.stack([draw(rng, n // count)[0] for _ in range(count)])
             if self.deviation:
                 stack = gaussian_filter(stack, (0, self.deviation, self.deviation, 0), mode="wrap")
+            if self.denoised:
+                stack[:, :TILE, :TILE] = stack[:, :1, :1]
             stacks.append(stack)
         return self.sides([(stack, 0.0) for stack in stacks], counts)
 
@@ -155,6 +162,7 @@ FORMS = {
     "passes of one, filter of 1": Form("passes", 1.0, (True, False)),
     "renders": Form("renders"),
     "renders, filter of 2": Form("renders", 2.0),
+    "renders, a tile denoised": Form("renders", denoised=True),
     "renders without samples": Form("unnamed"),
 }
 COUNTS = ((64, 64), (256, 64), (64, 1024), (1024, 16), (16, 4096), (8000, 8), (8, 8000))
