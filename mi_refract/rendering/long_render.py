@@ -102,8 +102,6 @@ def resume(
         gc.collect()  # as in `_choose`
         scene = load_parsed(parsed, job.allow_plugins)
         renderer = pass_renderer(scene, job.seed)
-    if has_checkpoint and progress.rest is not None and (spp is None or progress.done < spp):
-        progress.rest = None  # it was the last pass, with fewer samples: a full pass replaces it
     if image is not None:
         too_many = spp is not None and image.done > (_plan(renderer, spp, limits).total or 0)
         # The file lacks Σ w, which few samples may leave near 0: a refined image would keep the error of that mean.
@@ -122,6 +120,8 @@ def resume(
     if has_checkpoint and planned is not None and progress.done > planned:
         expected = f"expected --spp {progress.done} or more, or --restart"
         raise ValueError(f"{saved}: already holds {progress.done} samples per pixel; {expected}")
+    if progress.rest is not None and (progress.tree.passes, progress.rest.spp) != (plan.full_passes, plan.rest):
+        progress.rest = None  # the plan has another pass in its place
     last = math.inf if plan.passes is None else progress.first + plan.passes
     if not renderer.jitter and last > max(1, progress.passes):
         expected = "expected jitter, or one pass from the start: --spp N --pass-spp N"

@@ -466,17 +466,25 @@ def write_to_full_disk(*_):
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-# The last pass is the only one, comes after others, and is replaced by a full pass.
-@pytest.mark.parametrize(("spp", "resumed_spp"), [(3, 3), (11, 11), (11, 16)])
-def test_the_last_pass_is_kept_if_the_image_cannot_be_written(tmp_path, llvm_variant, monkeypatch, spp, resumed_spp):
+# The last pass is the only one, comes after others, is replaced by a full pass, and by passes of another size.
+@pytest.mark.parametrize(
+    ("spp", "resumed", "kept"),
+    [
+        (3, {"spp": 3, "pass_spp": 4}, 3),
+        (11, {"spp": 11, "pass_spp": 4}, 11),
+        (11, {"spp": 16, "pass_spp": 4}, 8),
+        (3, {"spp": 3, "pass_spp": 2}, 0),
+    ],
+)
+def test_the_last_pass_is_kept_if_the_image_cannot_be_written(tmp_path, llvm_variant, monkeypatch, spp, resumed, kept):
     output = tmp_path / "a.exr"
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
         patch.setattr(rendered_file, "write", write_to_full_disk)
         rendering(output, spp=spp, pass_spp=4).run()
-    render = rendering(output, spp=resumed_spp, pass_spp=4)
-    assert render.progress.done == (spp if resumed_spp == spp else 8)
+    render = rendering(output, **resumed)
+    assert render.progress.done == kept
     render.run()
-    assert_same_as_fresh(output, spp=resumed_spp, pass_spp=4)
+    assert_same_as_fresh(output, **resumed)
 
 
 def test_a_checkpoint_that_cannot_be_written_is_a_warning(tmp_path, llvm_variant, monkeypatch, capfd):
