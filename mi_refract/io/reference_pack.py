@@ -85,7 +85,8 @@ def of_references(reference: Path, answers: Path | None = None) -> PackReference
     another format, if a reference is not a file of the pack, or if `answers` are in a folder with the INDEX of another
     pack. OSError if a file cannot be read.
     """
-    places = reference.absolute(), reference.resolve()  # a link inside a pack is a file of that pack
+    # A link inside a pack is a file of that pack. A path with `..` is only where it leads.
+    places = [place for place in (reference.absolute(), reference.resolve()) if ".." not in place.parts]
     packs = ((place, folder) for place in places for folder in (place, *place.parents) if _is_pack(folder))
     place, root = next(packs, (None, None))
     if place is None or root is None:

@@ -215,8 +215,13 @@ def test_results_name_pack_and_answers_and_are_reproducible(pack, answers, run):
     again = json.loads(Path("r.json").read_text())
     assert (again["functions"][0]["answers_sha256"], again["pack"]) == (digest, rays["pack"])
     shutil.copy("rays/f64.csv", pack.parent)
-    assert run("rays", "check", "answers.csv", "--rays", pack.parent / "f64.csv", "--json", "r.json")[0] == 0
-    assert json.loads(Path("r.json").read_text())["pack"] is None
+    for path, expected in (
+        (pack.parent / "f64.csv", None),
+        ("../f64.csv", None),
+        ("images/../rays/f64.csv", rays["pack"]),
+    ):
+        assert run("rays", "check", "answers.csv", "--rays", path, "--json", "r.json")[0] == 0
+        assert json.loads(Path("r.json").read_text())["pack"] == expected
 
 
 def edited(name, change=lambda text: text + b" "):
