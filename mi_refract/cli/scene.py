@@ -63,7 +63,7 @@ def export(
         names = sorted(path.stem for path in SCENES.glob("*.xml"))
         raise FileNotFoundError(f"{scene}: no such scene; expected {', '.join(['a file', *names])}")
     folder = output or Path(f"{path.stem}-{to}")
-    plain = from_mitsuba.load(path, level=from_mitsuba.LEVEL if level is None else level, **defines)
+    plain = from_mitsuba.load(path, level=from_mitsuba.LEVEL if level is None else level, defines=defines)
     written = targets.write(plain, to, folder)
     triangles = sum(len(mesh.faces) for mesh in plain.meshes)
     summary = f"{len(written)} files, {triangles} triangles; {folder / 'README.txt'} says how to render them"

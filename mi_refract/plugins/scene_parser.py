@@ -38,6 +38,7 @@ OURS = (PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS), INTEGRATOR)
 PYTHON = ("direct_projective", "flat_sensor", "prb", "prb_basic", "prb_projective", "prbvolpath", "volprim_rf_basic")
 BUILT_IN = ("scene",)  # not "rgb" and "spectrum": as the type of a plugin they crash the process
 NEEDED = {"bitmap": "filename", "blendbsdf": "weight"}  # parameters without which Mitsuba reads invalid memory
+TAKEN = ("config", "filename")  # parameters of mi.parser.parse_file, which cannot be names of defines
 DEPTH = 32  # of nested plugins: Mitsuba instantiates them by recursion
 LOBES = 2**16  # of a BSDF if every BSDF in it were two-sided: each of two references to a BSDF doubles them
 VALUES = 2**29  # of an image that a scene reads: 16384 × 8192 × 4
@@ -136,10 +137,12 @@ def parse(path: Path, defines: Mapping[str, str] | None = None, variant: str = "
     """Parse a scene file.
 
     `defines`: values that replace those of `<default>` elements. `variant`: of Mitsuba; by default the current one.
-    ValueError for circular references, plugins nested too deeply, and a pipe or a device instead of the scene or of a
-    file that a plugin names; Mitsuba hangs if one is included or read as a spectrum. OSError for a file that cannot be
-    read. Errors from Mitsuba if it cannot parse the file.
+    ValueError for names in TAKEN, circular references, plugins nested too deeply, and a pipe or a device instead of the
+    scene or of a file that a plugin names; Mitsuba hangs if one is included or read as a spectrum. OSError for a file
+    that cannot be read. Errors from Mitsuba if it cannot parse the file.
     """
+    if taken := [name for name in TAKEN if name in (defines or {})]:
+        raise ValueError(f"define {taken[0]!r}: reserved by Mitsuba's parser; expected any name except {TAKEN}")
     config = _config(variant)
     require_file(path)
     with folders(path.parent) as resolver:

@@ -16,7 +16,6 @@ if TYPE_CHECKING:  # they import Dr.Jit and Mitsuba
     from mi_refract.numerics import Scene
     from mi_refract.plugins.scene_parser import ParsedScene
 
-TAKEN = ("config", "filename")  # parameters of mi.parser.parse_file, which cannot be names of defines
 REPRODUCIBLE: Any = {"parallel": False, "optimize": False}  # options for mi.load_file, as in `ParsedScene.load`
 PIXELS = 2**26  # most pixels of an image; four channels of them are 1 GiB
 
@@ -49,8 +48,6 @@ def parse_scene(path: str | os.PathLike[str], defines: Mapping[str, str] | None 
     if not path.exists() or path.is_dir():
         ours = (SCENES / path.name).with_suffix(".xml")
         raise FileNotFoundError(f"{path}: no such scene file" + f"; the package has {ours}" * ours.is_file())
-    if taken := [name for name in TAKEN if name in defines]:
-        raise ValueError(f"define {taken[0]!r}: reserved by Mitsuba's parser; expected any name except {TAKEN}")
     with _in_one_line(path):
         return scene_parser.parse(path, defines)
 

@@ -1,9 +1,10 @@
-"""Read a Mitsuba XML file as a plain scene: `load("scenes/prism.xml", res="64")`."""
+"""Read a Mitsuba XML file as a plain scene: `load("scenes/prism.xml", defines={"res": "64"})`."""
 
 from __future__ import annotations
 
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 import mitsuba as mi
@@ -24,19 +25,20 @@ CONVERSION = 1e-5  # relative error of Mitsuba's conversion to Rec. 709: its mat
 INTEGRATORS = ("path", "refract_path", "prb", "volpath", "prbvolpath")
 
 
-def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) -> PlainScene:
-    """Return the scene in a file, read by the active variant. `defines` replace the file's `<default>`s.
+def load(path: str | os.PathLike[str], *, level: int = LEVEL, defines: Mapping[str, str] | None = None) -> PlainScene:
+    """Return the scene in a file, read by the active variant.
 
-    `level`: tessellation level of curved shapes; each level halves the edges. FileNotFoundError for a missing file.
-    ExportError, one line, for content that a plain scene cannot hold: other plugins or parameters, smooth normals, open
-    one-sided surfaces. ValueError, one line, for an invalid scene and for files that cannot be read.
+    `level`: tessellation level of curved shapes; each level halves the edges. `defines`: values that replace those of
+    the file's `<default>`s. FileNotFoundError for a missing file. ExportError, one line, for content that a plain scene
+    cannot hold: other plugins or parameters, smooth normals, open one-sided surfaces. ValueError, one line, for an
+    invalid scene and for files that cannot be read.
     """
     path = Path(path)
     if level not in LEVELS:
         raise ValueError(f"level = {level}; expected a whole number from {LEVELS[0]} to {LEVELS[-1]}")
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such scene file")
-    root = SceneFile(path, defines).node(0)
+    root = SceneFile(path, defines or {}).node(0)
     shapes: list[Mesh] = []
     lamps: list[Lamp] = []
     camera: Camera | None = None

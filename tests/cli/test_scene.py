@@ -48,6 +48,7 @@ def test_names_paths_levels_and_defines(export, tmp_path):
         (["prism", "--to", "cycles", "-o", "no/where"], "not a folder"),
         (["prism", "--to", "cycles", "-o", "full"], "already contains files"),
         (["prism", "--to", "cycles", "-D", "nothing=1"], "nothing"),
+        (["prism", "--to", "cycles", "-D", "config=1"], "define 'config': reserved by Mitsuba's parser; expected"),
         (["prism", "--to", "cycles", "--level", "20"], "expected a whole number from 0 to 8"),
         (["prism"], "--to"),
         (["full/scene.xml", "--to", "cycles"], "full/scene.xml"),

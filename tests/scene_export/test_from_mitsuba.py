@@ -76,8 +76,9 @@ def test_load(scene):
     assert (plain.name, plain.max_depth, len(plain.materials)) == ("scene", 5, 3)
     assert (plain.camera.width, plain.camera.height, plain.camera.origin) == (16, 8, (0, 1, -40))
     for name in ("dielectric", "refract_promoted"):
-        assert from_mitsuba.load(scene(), bsdf=name).meshes[0].material == Glass(1.333, 1.000277)
-    assert from_mitsuba.load(scene('value="5"', 'value="$depth"'), depth="1").max_depth == 1
+        assert from_mitsuba.load(scene(), defines={"bsdf": name}).meshes[0].material == Glass(1.333, 1.000277)
+    level = from_mitsuba.load(scene('value="5"', 'value="$level"'), level=0, defines={"level": "1"})
+    assert level.max_depth == 1
     path_with_names = scene('<shape type="cube"', '<shape name="second" type="cube"', "<bsdf", '<bsdf name="glass"')
     assert [mesh.name for mesh in from_mitsuba.load(path_with_names, level=0).meshes] == ["ball", "box", "rectangle"]
     text = "".join(f'<shape type="sphere" id="{name}"><bsdf type="$bsdf"/></shape>' for name in ("a b", "A.b"))
@@ -410,7 +411,7 @@ def test_other_errors(scene):
     with pytest.raises(ValueError, match=r"level = 9; expected a whole number from 0 to 8$"):
         from_mitsuba.load(scene(), level=9)
     with pytest.raises(ValueError, match="oops"):
-        from_mitsuba.load(scene(), oops="1")
+        from_mitsuba.load(scene(), defines={"oops": "1"})
 
 
 def test_smooth_normals_are_refused(scene, tmp_path):

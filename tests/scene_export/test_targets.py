@@ -293,7 +293,7 @@ def test_renders_of_an_export_are_equal_and_another_index_is_detected(tmp_path):
         return [image_file.named(f"seed {seed}", np.array(mi.render(scene, spp=64, seed=seed))) for seed in seeds]
 
     path = tmp_path / "plain" / "scene.xml"
-    targets.write(from_mitsuba.load(SCENES / "prism.xml", level=0, res="32"), "mitsuba", path.parent)
+    targets.write(from_mitsuba.load(SCENES / "prism.xml", level=0, defines={"res": "32"}), "mitsuba", path.parent)
     first = renders(SCENES / "prism.xml", 0, res="32")
     assert methods.compare("welch", first, renders(path, 100), tile=16).verdict == Verdict.EQUAL
     text, material = path.read_text(), '<float name="int_ior" value="1.5168"/>'

@@ -172,7 +172,7 @@ class Contents:
 
     def add_scene(self, name: str) -> None:
         """Add a scene as flat triangles in each format, and its image, rendered from those triangles."""
-        plain = from_mitsuba.load(SCENES / f"{name}.xml", level=self.size.level, res=str(self.size.pixels))
+        plain = from_mitsuba.load(SCENES / f"{name}.xml", level=self.size.level, defines={"res": str(self.size.pixels)})
         for target, subfolder in TARGETS.items():
             if target == "gltf" and name in BEYOND_GLTF:
                 continue

@@ -83,7 +83,7 @@ class Scene:
 
 
 def _scene(name: str, resolution: int) -> PlainScene:
-    return from_mitsuba.load(FOLDER / f"{name}.xml", level=LEVEL, res=str(resolution))
+    return from_mitsuba.load(FOLDER / f"{name}.xml", level=LEVEL, defines={"res": str(resolution)})
 
 
 def environment(resolution: int) -> PlainScene:

@@ -130,7 +130,7 @@ def plain(resolution: int) -> PlainScene:
     text = re.sub(r'<string name="int_ior" [^>]*/>', '<float name="int_ior" value="1.5"/>', text)
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / SCENE).write_text(text)
-        coloured = from_mitsuba.load(Path(folder) / SCENE, res=str(resolution))
+        coloured = from_mitsuba.load(Path(folder) / SCENE, defines={"res": str(resolution)})
     assert isinstance(coloured.sky, tuple)
     return dataclasses.replace(coloured, meshes=tuple(map(grey, coloured.meshes)), sky=(coloured.sky[1],) * 3)
 
