@@ -18,7 +18,7 @@ from mi_refract.formulas import TEXTBOOK_BACKWARD
 from mi_refract.io import reference_pack
 from mi_refract.io.image_file import versions
 from mi_refract.io.safe_files import writable
-from mi_refract.io.text import printable
+from mi_refract.io.text import parse_number, printable
 from mi_refract.ray_sets import files, ray_set
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.regimes import REGIMES
@@ -294,7 +294,7 @@ def _make_rays(
 ) -> RaySet:
     """Generate the rays that these options select. In names of regimes, `>>` and `<<` stand for ≫ and ≪."""
     try:
-        in_nm = tuple(map(float, wavelengths.split(","))) if wavelengths is not None else ()
+        in_nm = tuple(map(parse_number, wavelengths.split(","))) if wavelengths is not None else ()
     except ValueError:
         raise ValueError(f"--wavelengths {wavelengths}; expected numbers in nm, such as 486.1327,587.5618") from None
     names = [name.replace(">>", "≫").replace("<<", "≪") for name in regime or []] or None

@@ -57,8 +57,8 @@ def trace(
     if output:
         safe_files.writable(output, figure.FORMATS)
         figure.require_matplotlib()
-    screen = focal_points.plane(plane) if plane else None
-    loaded = scene_file.load(scene, light.parsed(wavelengths) if wavelengths else None)
+    screen = None if plane is None else focal_points.plane(plane)
+    loaded = scene_file.load(scene, None if wavelengths is None else light.parsed(wavelengths))
     branches = loaded.branches if branches is None else branches
     loaded = replace(loaded, branches=branches, max_depth=max_depth or loaded.max_depth)
     if rays:

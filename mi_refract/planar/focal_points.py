@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_refract.io.text import parse_number
+
 from .curves import unit
 from .path_tree import Branches
 from .scene_file import PlanarScene
@@ -47,7 +49,7 @@ class Plane:
 def plane(text: str) -> Plane:
     """The plane from the text of the option --plane: X,Y or X,Y,DEGREES. ValueError for anything else."""
     try:
-        x, y, degrees = map(float, f"{text},0".split(",")[: max(3, text.count(",") + 1)])
+        x, y, degrees = map(parse_number, f"{text},0".split(",")[: max(3, text.count(",") + 1)])
     except ValueError:
         x = y = degrees = math.nan
     if not all(map(math.isfinite, (x, y, degrees))):

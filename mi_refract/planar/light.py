@@ -11,6 +11,7 @@ import numpy as np
 
 from mi_refract import media
 from mi_refract.backend import activate
+from mi_refract.io.text import parse_number
 
 from .segments import Array
 
@@ -99,7 +100,7 @@ def parsed(text: str) -> list[float] | int:
     """Wavelengths in nm separated by commas, or their number. ValueError for anything else."""
     expected = f"expected wavelengths in nm, such as 486.1,587.6, or their number, from 2 to {MOST}"
     try:
-        numbers = [float(part) for part in text.split(",")]
+        numbers = [parse_number(part) for part in text.split(",")]
     except ValueError:
         raise ValueError(f"--wavelengths {text}: {expected}") from None
     if len(numbers) == 1 and text.strip().isdigit() and 2 <= numbers[0] <= MOST:

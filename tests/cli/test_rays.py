@@ -133,6 +133,7 @@ BAD_OPTIONS = {
     "1 media and 0 wavelengths; expected neither": ("run", "--medium", CROWN, "--", "true"),
     "--wavelengths F,d; expected numbers in nm": ("run", "--medium", CROWN, "--wavelengths", "F,d", "--", "true"),
     "--wavelengths ; expected numbers in nm": ("run", "--medium", CROWN, "--wavelengths", "", "--", "true"),
+    "--wavelengths 5_00; expected numbers in nm": ("run", "--medium", CROWN, "--wavelengths", "5_00", "--", "true"),
     "regime 'k ≫ 1' defines its own ratios": ("run", *OF_MEDIA, "--regime", "k >> 1", "--", "true"),
     "Missing command": (),
 }

@@ -150,6 +150,10 @@ def test_formula_backend_and_precision(trace, needs_variant):
 
 BAD = {
     "no plane": (("--plane", "here"), "--plane here; expected X,Y or X,Y,DEGREES, finite numbers"),
+    "empty plane": (("--plane", ""), "--plane ; expected X,Y"),
+    "digits of a plane": (("--plane", "1_0,0"), "--plane 1_0,0; expected X,Y"),
+    "empty wavelengths": (("--wavelengths", ""), "--wavelengths : expected wavelengths in nm"),
+    "digits of wavelengths": (("--wavelengths", "4_86.1,58_7.6"), "4_86.1,58_7.6: expected wavelengths in nm"),
     "suffix": (("-o", "{}/image.gif"), "expected a file name that ends in .svg or .png or .pdf"),
     "no folder": (("-o", "{}/none/image.svg"), "is not a folder"),
     "folder": (("-o", "{}/folder.svg"), "is a folder"),
