@@ -90,7 +90,7 @@ def resume(
     if has_checkpoint := saved.exists() and not restart:
         progress = checkpoint.read(saved, identity, (*renderer.size[::-1], len(renderer.channels)))
     elif not restart:
-        image = rendered_file.read(path, renderer.channels, identity)
+        image = rendered_file.read(path, renderer.channels, renderer.size, identity)
         progress = image or progress
     pilot_seconds, start = None, time.monotonic()
     if progress.identity[SETTINGS] == AUTO:

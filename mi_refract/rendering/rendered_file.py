@@ -51,10 +51,11 @@ def nonfinite_pixels(sums: PassSums) -> int:
     return int((~np.isfinite(sums.total).all(-1)).sum())
 
 
-def read(output: Path, channels: tuple[str, ...], identity: Identity) -> Progress | None:
-    """Return the progress of a finished image, for refining it; None if there is no image of this identity.
+def read(output: Path, channels: tuple[str, ...], size: tuple[int, int], identity: Identity) -> Progress | None:
+    """Return the progress of a finished image, for refining it; None if there is no image of this size and identity.
 
-    The sums have the precision of the file, float32.
+    `size`: width and height. The sums have the precision of the file, float32. An image that was edited in place, with
+    its metadata kept, is taken for the written one.
     """
     try:
         image = image_file.read(output, image_file.MAX_VALUES * 4)
@@ -68,6 +69,8 @@ def read(output: Path, channels: tuple[str, ...], identity: Identity) -> Progres
         if changes(image_identity, identity) or not 1 <= passes <= spp or len(contrasts) != passes - 1:
             return None
         mean = image.select(channels).astype(np.float64)
+        if mean.shape[1::-1] != size:
+            return None
         names = [VARIANCE.format(name) for name in channels]
         variance = np.zeros_like(mean) if variance_from == NOTHING else image.select(names).astype(np.float64)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):

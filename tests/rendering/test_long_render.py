@@ -22,7 +22,7 @@ from support.renders import BALL, SCENES, pixels, rendering, stopped_after
 from mi_refract.cluster import on_worker
 from mi_refract.image_diff.comparison import Verdict
 from mi_refract.image_diff.methods import compare
-from mi_refract.io.image_file import read, read_exr
+from mi_refract.io.image_file import read, read_exr, write_exr
 from mi_refract.rendering import checkpoint, long_render, rendered_file
 from mi_refract.rendering.end_conditions import Limits
 from mi_refract.rendering.long_render import Job, render_to_exr, resume
@@ -320,6 +320,14 @@ def test_an_image_of_few_samples_under_a_wide_filter_is_not_refined(tmp_path, rf
     render.run()
     if not kept:
         assert_same_as_fresh(output, scene, spp=12)
+
+
+def test_an_image_of_another_size_is_not_refined(tmp_path):
+    output = tmp_path / "a.exr"
+    header = rendering(output, spp=8, pass_spp=4).run()
+    image = read(output)
+    write_exr(output, image.pixels[:4, :4], image.channels, header)
+    assert rendering(output, spp=16, pass_spp=4).progress.done == 0
 
 
 @pytest.mark.parametrize("spp", [6, 32, 40])
