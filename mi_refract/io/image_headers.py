@@ -23,6 +23,7 @@ TAGS = {*range(254, 290), 292, 293, 296, 297, 305, 306, *range(315, 318), 320, *
 TAGS |= {338, 339, 347, *range(512, 522), 529, 530, 531, 700, *range(33300, 33307), 33432, 33723, 34377, 34665, 34675}
 TAGS |= {18246, 18249, 32995, 32997, 34853, 37724, *range(40091, 40096)}
 SIZES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}  # bytes by type; others: 1
+CUMULATIVE = {"hdr:EXPOSURE", "hdr:COLORCORR", "hdr:PIXASPECT"}  # several lines of a Radiance file multiply
 FRACTION = 5  # a TIFF type: numerator and denominator
 PSD = (4, 7, 8)  # Photoshop's colour modes CMYK, multichannel, duotone
 REFUSED = {
@@ -76,6 +77,10 @@ def hidden_metadata(path: Path) -> dict[str, bytes | float]:
     for name in values.keys() & REFUSED.keys():
         raise ImageError(f"{path}: {REFUSED[name]}")
     metadata: dict[str, bytes | float] = {name: b" ".join(several) for name, several in values.items()}
+    for name in values.keys() & CUMULATIVE:
+        with contextlib.suppress(ValueError):
+            factors = zip(*([float(word) for word in value.split()] for value in values[name]), strict=True)
+            metadata[name] = b" ".join(str(math.prod(column)).encode() for column in factors)
     with contextlib.suppress(KeyError, ValueError, ZeroDivisionError):
         metadata["PixelAspectRatio"] = 1 / float(metadata["hdr:PIXASPECT"])  # PIXASPECT is height over width
         del metadata["hdr:PIXASPECT"]

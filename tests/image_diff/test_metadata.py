@@ -231,6 +231,12 @@ SAME = {  # metadata equivalent to none, or two equivalent ones
     "stb.hdr": (hdr, ["EXPOSURE=          1.0000000000000"]),
     "Radiance.hdr": (hdr, ["pcomb -e 'ro=ri(1)'", "\tEXPOSURE=2", "COLORCORR= 1 1 1", "NCOMP=3"]),
     "exposure.hdr": (hdr, ["EXPOSURE=2"], ["EXPOSURE=2.0"]),
+    "pfilt.hdr": (
+        hdr,
+        ["EXPOSURE=4", "COLORCORR=1 2 1", "EXPOSURE=.5", "COLORCORR=3 .5 1"],
+        ["EXPOSURE=2", "COLORCORR=3 1 1"],
+    ),
+    "turned.hdr": (hdr, ["PIXASPECT=2", "PIXASPECT=.5", "EXPOSURE=1", "EXPOSURE=1"]),
     "ImageMagick.tif": (
         tiff,
         [{318: (5, [3127, 10000, 329, 1000]), 319: (5, [16, 25, 33, 100, 3, 10, 3, 5, 3, 20, 3, 50])}],
