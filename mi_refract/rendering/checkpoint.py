@@ -210,16 +210,17 @@ class CheckpointWriter:
         """`output`: of the render. `warnings`: receives a line whenever a checkpoint cannot be written."""
         self.path, self.progress, self.warnings = path_of(output), progress, warnings
         self.active, self.interval = False, INTERVAL
-        self._last, self._passes_before = time.monotonic(), progress.passes
+        self._last, self._passes_written = time.monotonic(), progress.passes
         self._thread: threading.Thread | None = None
 
     def write(self) -> None:
         """Write the checkpoint if there are new passes."""
         with self.progress.lock:
-            if not self.active or self.progress.passes == self._passes_before:
+            if not self.active or self.progress.passes == self._passes_written:
                 return
             try:
                 write(self.path, self.progress)
+                self._passes_written = self.progress.passes
             except OSError as error:
                 reason = error.strerror or error
                 self.warnings.append(f"{self.path}: checkpoint not written: {reason}; will be tried again")

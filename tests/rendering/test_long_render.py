@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from support.processes import python
 from support.readme import DOCS, python_blocks
-from support.renders import BALL, SCENES, pixels, rendering, stopped_after
+from support.renders import BALL, SCENES, leaf, pixels, rendering, stopped_after
 
 from mi_refract.cluster import on_worker
 from mi_refract.image_diff.comparison import Verdict
@@ -512,6 +512,18 @@ def test_a_checkpoint_that_cannot_be_written_is_a_warning(tmp_path, llvm_variant
     assert len(render.warnings) >= 2 and "No space left on device; will be tried again" in render.warnings[0]
     assert not any(exists[:3]) and any(exists) and (tmp_path / "a.exr").exists()
     assert "checkpoint not written: No space left" in capfd.readouterr().err
+
+
+def test_a_checkpoint_is_written_once_for_the_same_passes(tmp_path, monkeypatch):
+    progress, written = checkpoint.Progress({}), []
+    monkeypatch.setattr(checkpoint, "write", lambda path, progress: written.append(progress.passes))
+    writer = checkpoint.CheckpointWriter(tmp_path / "a.exr", progress, [])
+    writer.active = True
+    for _ in range(3):
+        progress.add(0, leaf(np.ones((1, 1, 3))), "here", 1.0, rest=False)
+        writer.write()
+        writer.write()
+    assert written == [1, 2, 3]
 
 
 def test_a_second_render_into_the_same_file_is_refused(tmp_path, llvm_variant):
