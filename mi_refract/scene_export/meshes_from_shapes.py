@@ -58,8 +58,7 @@ def meshes_of_shape(shape: Node, level: int, most: int = MOST, eye: Vertices | N
         _check_count(shape, 2 * math.prod(max(math.ceil(2 * scale), 1) for scale in surface.scales), most)
     elif shape.type in SHAPES:
         _check_count(shape, SHAPES[shape.type][0](level), most)
-    parts = _parts(shape, surface, level)
-    _check_count(shape, sum(len(faces) for _, faces in parts), most)  # triangles of a file are known after reading it
+    parts = _parts(shape, surface, level, most)
     shape.finish()
     if surface.one_sided and (is_flipped or not all(tessellation.is_closed(faces) for _, faces in parts)):
         raise shape.error("diffuse on one side of an open surface", "its BSDF in a `twosided`, or a closed shape")
@@ -104,8 +103,8 @@ def _check_count(shape: Node, count: int, most: int) -> None:
         raise shape.error(f"{count} triangles where {most} are left", f"{MOST} in all; a lower level, fewer cells")
 
 
-def _parts(shape: Node, surface: Surface, level: int) -> tuple[Triangles, ...]:
-    """Return triangles in the shape's own coordinates, one part per material."""
+def _parts(shape: Node, surface: Surface, level: int, most: int) -> tuple[Triangles, ...]:
+    """Return triangles in the shape's own coordinates, one part per material; of a file at most `most`."""
     if surface.scales:
         if shape.type != "rectangle":
             raise shape.error("a checkerboard", "one on a rectangle")
@@ -124,8 +123,12 @@ def _parts(shape: Node, surface: Surface, level: int) -> tuple[Triangles, ...]:
         raise ValueError(str(shape.error(f"{path}: {error}", "a mesh that Mitsuba reads"))) from None
     if mitsuba_mesh.has_normals(mesh):
         raise shape.error("smooth normals", "face_normals = true")
-    vertices, faces = mitsuba_mesh.arrays(mesh)
-    return ((vertices.astype(np.float64), faces.astype(np.int64)),)
+    vertices, faces = (array.astype(kind) for array, kind in zip(mitsuba_mesh.arrays(mesh), (float, int), strict=True))
+    _check_count(shape, len(faces), most)
+    if not tessellation.is_closed(faces):  # vertices may be split, as for texture coordinates
+        vertices, faces = tessellation.welded(vertices[faces])
+        faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    return ((vertices, faces),)
 
 
 def _frame(shape: Node) -> Vertices:

@@ -49,8 +49,9 @@ def welded(triangles: NDArray[np.float64]) -> Triangles:
 def is_closed(faces: Faces) -> bool:
     """Return whether each edge borders two faces, once in either direction. Precondition: the vertices are welded."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    directed = {(int(a), int(b)) for a, b in edges}
-    return len(directed) == len(edges) and all((b, a) in directed for a, b in directed)
+    count = faces.max(initial=0) + 1
+    forward, backward = (np.sort(edges @ np.array(digits)) for digits in ((count, 1), (1, count)))
+    return bool((np.diff(forward) > 0).all() and (forward == backward).all())
 
 
 def encloses(triangles: NDArray[np.float64], point: Vertices) -> bool:

@@ -448,9 +448,16 @@ def test_a_file_is_the_one_that_mitsuba_finds(folder, scene, tmp_path):
         ((2, 1, 0), 9, "diffuse on the inside only, seen from outside; expected"),
     ],
 )
-def test_a_camera_sees_the_diffuse_side_of_a_closed_mesh(order, size, refused, scene, tmp_path):
+@pytest.mark.parametrize("split", [False, True])
+def test_a_camera_sees_the_diffuse_side_of_a_closed_mesh(split, order, size, refused, scene, tmp_path):
+    """Of a cube whose vertices texture coordinates split, with a face between equal corners; of one on another."""
     vertices, faces = tessellation.cube()
-    lines = [f"v {x} {y} {z}" for x, y, z in size * vertices] + [f"f {a} {b} {c}" for a, b, c in faces[:, order] + 1]
+    if not split:
+        vertices, faces = np.concatenate([vertices, np.add(vertices, [0, 2, 0])]), np.concatenate([faces, faces + 8])
+    lines = [f"v {x} {y} {z}" for x, y, z in size * vertices]
+    if split:
+        lines += ["vt 0 0", "vt 1 0", "vt 0 1", "f 1/1 1/2 2/3"]
+    lines += [("f {}/1 {}/2 {}/3" if split else "f {} {} {}").format(*face) for face in faces[:, order] + 1]
     (tmp_path / "box.obj").write_text("\n".join(lines))
     flat = '<boolean name="face_normals" value="true"/>'
     obj = f'type="obj" id="box"><string name="filename" value="box.obj"/>{flat}'
@@ -459,7 +466,8 @@ def test_a_camera_sees_the_diffuse_side_of_a_closed_mesh(order, size, refused, s
         with pytest.raises(ValueError, match=refused):
             from_mitsuba.load(path)
         path = scene('type="cube" id="box">' + MOVED, f'{obj}<bsdf type="twosided"><bsdf type="diffuse"/></bsdf>')
-    assert from_mitsuba.load(path, level=0).meshes[1].vertices.max() == size
+    box = from_mitsuba.load(path, level=0).meshes[1]
+    assert box.vertices[:, 0].max() == size and len(box.vertices) == (8 if split else 16)
 
 
 @pytest.mark.parametrize("last, smooth", [(3, False), (10**9, False), (2**32 - 1, False), (10**9, True)])
@@ -484,6 +492,8 @@ COUNTED |= {
     f'type="rectangle"><emitter type="area">{BOARD.format(x, y)}</emitter>': count
     for x, y, count in ((2, 3, 48), (1.3, 0.4, 6), (0.2, 0.2, 2))
 }
+PRISM = f'<string name="filename" value="{SCENES}/meshes/prism.ply"/><boolean name="face_normals" value="true"/>'
+COUNTED[f'type="ply">{PRISM}{LAMP}'] = 8
 
 
 def first_shape(path, text):
@@ -493,13 +503,13 @@ def first_shape(path, text):
 
 @pytest.mark.parametrize("text", COUNTED)
 def test_number_of_triangles_is_checked_before_they_are_made(text, tmp_path):
-    """The count is exact; a level or a scale beyond any machine's memory is an error at once."""
+    """The count is exact; a level or a scale beyond any machine's memory is an error at once. Files are read first."""
     path, count = tmp_path / "scene.xml", COUNTED[text]
     meshes = meshes_from_shapes.meshes_of_shape(first_shape(path, text), 2, count)
     assert sum(len(mesh.faces) for mesh in meshes) == count
     with pytest.raises(ValueError, match=f": {count} triangles where {count - 1} are left; expected "):
         next(meshes_from_shapes.meshes_of_shape(first_shape(path, text), 2, count - 1))
-    if 'type="cube"' not in text and f'type="rectangle">{LAMP}' != text:
+    if not text.startswith(('type="cube"', 'type="ply"')) and f'type="rectangle">{LAMP}' != text:
         huge = text.replace('scale x="', 'scale x="999999999')
         with pytest.raises(ValueError, match="triangles where 16777216 are left"):
             next(meshes_from_shapes.meshes_of_shape(first_shape(path, huge), 60))
@@ -538,7 +548,8 @@ def test_solids_are_closed_and_outward_with_vertices_on_the_surface():
         assert (np.einsum("ij,ij->i", normals((vertices, faces)), vertices[faces].mean(1)) > 0).all()
         missing.append(4 / 3 * np.pi - volume((vertices, faces)))
     assert all(3 < coarse / fine < 4.2 for coarse, fine in itertools.pairwise(missing))
-    for defect in (faces[1:], np.concatenate([faces[:1, ::-1], faces[1:]]), np.concatenate([faces, faces[:1]])):
+    twice = [np.concatenate([faces, more]) for more in (faces[:1], faces[:, ::-1])]
+    for defect in (faces[1:], np.concatenate([faces[:1, ::-1], faces[1:]]), *twice):
         assert not tessellation.is_closed(defect)
     cube = tessellation.cube()
     assert len(cube[0]) == 8 and tessellation.is_closed(cube[1])
