@@ -60,7 +60,7 @@ def meshes_of_shape(shape: Node, level: int, most: int = MOST, eye: Vertices | N
         _check_count(shape, SHAPES[shape.type][0](level), most)
     parts = _parts(shape, surface, level, most)
     shape.finish()
-    if surface.one_sided and (is_flipped or not all(tessellation.is_closed(faces) for _, faces in parts)):
+    if surface.one_sided and not all(tessellation.is_closed(faces) for _, faces in parts):
         raise shape.error("diffuse on one side of an open surface", "its BSDF in a `twosided`, or a closed shape")
     for i, ((vertices, faces), material) in enumerate(zip(parts, surface.materials, strict=True)):
         if not len(faces):  # a checkerboard of one cell

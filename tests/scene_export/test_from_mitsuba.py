@@ -440,16 +440,18 @@ def test_a_file_is_the_one_that_mitsuba_finds(folder, scene, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "order, size, refused",
+    "order, flip, size, refused",
     [
-        ((2, 1, 0), 99, ""),  # a room
-        ((0, 1, 2), 9, ""),
-        ((0, 1, 2), 99, "diffuse on the outside only, around the camera; expected"),
-        ((2, 1, 0), 9, "diffuse on the inside only, seen from outside; expected"),
+        ((2, 1, 0), False, 99, ""),  # a room
+        ((0, 1, 2), True, 99, ""),
+        ((0, 1, 2), False, 9, ""),
+        ((0, 1, 2), False, 99, "diffuse on the outside only, around the camera; expected"),
+        ((2, 1, 0), False, 9, "diffuse on the inside only, seen from outside; expected"),
+        ((0, 1, 2), True, 9, "diffuse on the inside only, seen from outside; expected"),
     ],
 )
 @pytest.mark.parametrize("split", [False, True])
-def test_a_camera_sees_the_diffuse_side_of_a_closed_mesh(split, order, size, refused, scene, tmp_path):
+def test_a_camera_sees_the_diffuse_side_of_a_closed_mesh(split, order, flip, size, refused, scene, tmp_path):
     """Of a cube whose vertices texture coordinates split, with a face between equal corners; of one on another."""
     vertices, faces = tessellation.cube()
     if not split:
@@ -459,8 +461,8 @@ def test_a_camera_sees_the_diffuse_side_of_a_closed_mesh(split, order, size, ref
         lines += ["vt 0 0", "vt 1 0", "vt 0 1", "f 1/1 1/2 2/3"]
     lines += [("f {}/1 {}/2 {}/3" if split else "f {} {} {}").format(*face) for face in faces[:, order] + 1]
     (tmp_path / "box.obj").write_text("\n".join(lines))
-    flat = '<boolean name="face_normals" value="true"/>'
-    obj = f'type="obj" id="box"><string name="filename" value="box.obj"/>{flat}'
+    options = f'<boolean name="face_normals" value="true"/><boolean name="flip_normals" value="{str(flip).lower()}"/>'
+    obj = f'type="obj" id="box"><string name="filename" value="box.obj"/>{options}'
     path = scene('type="cube" id="box">' + MOVED, obj)
     if refused:
         with pytest.raises(ValueError, match=refused):
