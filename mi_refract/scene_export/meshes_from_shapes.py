@@ -198,17 +198,18 @@ def _scattering(bsdf: Node) -> Surface:
 
 
 def _glass(bsdf: Node) -> Glass:
-    """Read a glass: a Glass if two indices describe it, otherwise a VolumeGlass."""
+    """Read a glass: a Glass if two indices describe it (an absorption of 0 is none), otherwise a VolumeGlass."""
     sides = {"int_ior": "bk7", "ext_ior": "air"}
     with scene_parser.folders(*bsdf.scene.parsed.folders):
         inside, outside = (read_medium(bsdf.props, name, default) for name, default in sides.items())
-    sigmas = [_sigma(bsdf, side) if bsdf.type != "dielectric" else None for side in ("int", "ext")]
+    sigmas = {side: _sigma(bsdf, side) if bsdf.type != "dielectric" else BLACK for side in ("int", "ext")}
     parameters = [
         f"{name} = {bsdf.props.get(name, default)}"
         for (name, default), medium in zip(sides.items(), (inside, outside), strict=True)
         if medium.dispersive
     ]
-    parameters += [name for name in bsdf.names if name.endswith(("_absorption", "_colour"))]
+    absorbing = {f"{side}_{name}" for side in sigmas for name in ("absorption", "colour") if any(sigmas[side])}
+    parameters += [name for name in bsdf.names if name in absorbing]
     bsdf.ignore(*sides, "formula")
     bsdf.finish()
     n_int, n_ext = (float(medium.index(media.LINES["d"])) for medium in (inside, outside))
@@ -222,16 +223,16 @@ def _glass(bsdf: Node) -> Glass:
             raise bsdf.error(f"{', '.join(parameters)}: no index at {missing[0]}", "one from 400 to 700 nm")
         n = spectrum[LINES.index("d")]
         n_int, n_ext = (n * n_ext, n_ext) if n_int >= n_ext else (n_int, n * n_int)
-    return VolumeGlass(n_int, n_ext, ", ".join(parameters), spectrum, *(sigma or BLACK for sigma in sigmas))
+    return VolumeGlass(n_int, n_ext, ", ".join(parameters), spectrum, *sigmas.values())
 
 
-def _sigma(bsdf: Node, side: str) -> Colour | None:
-    """Return σ of a side in red, green and blue; None without absorption parameters."""
+def _sigma(bsdf: Node, side: str) -> Colour:
+    """Return σ of a side in red, green and blue."""
     sigma, colour, distance = f"{side}_absorption", f"{side}_colour", f"{side}_colour_distance"
     if sigma in bsdf.names:
         return bsdf.colour(sigma, None)
     if colour not in bsdf.names:
-        return None
+        return BLACK
     transmittance, length = bsdf.colour(colour, None), bsdf.value(float, distance)
     if not all(0 < x <= 1 for x in transmittance) or length <= 0:
         raise bsdf.error(

@@ -77,6 +77,9 @@ def test_load(scene):
     assert (plain.camera.width, plain.camera.height, plain.camera.origin) == (16, 8, (0, 1, -40))
     for name in ("dielectric", "refract_promoted"):
         assert from_mitsuba.load(scene(), defines={"bsdf": name}).meshes[0].material == Glass(1.333, 1.000277)
+    clear = '<float name="int_absorption" value="0"/><rgb name="ext_colour" value="1"/>'
+    clear += '<float name="ext_colour_distance" value="8"/>'
+    assert from_mitsuba.load(scene("<string", f"{clear}<string")).meshes[0].material == Glass(1.333, 1.000277)
     level = from_mitsuba.load(scene('value="5"', 'value="$level"'), level=0, defines={"level": "1"})
     assert level.max_depth == 1
     path_with_names = scene('<shape type="cube"', '<shape name="second" type="cube"', "<bsdf", '<bsdf name="glass"')
