@@ -200,8 +200,15 @@ def _scattering(bsdf: Node) -> Surface:
 def _glass(bsdf: Node) -> Glass:
     """Read a glass: a Glass if two indices describe it (an absorption of 0 is none), otherwise a VolumeGlass."""
     sides = {"int_ior": "bk7", "ext_ior": "air"}
-    with scene_parser.folders(*bsdf.scene.parsed.folders):
-        inside, outside = (read_medium(bsdf.props, name, default) for name, default in sides.items())
+    for name in sides:
+        if isinstance(texture := bsdf.take(name), Node):
+            raise bsdf.error(f"{name} is a {texture.type}", "the same index at all points")
+    try:
+        with scene_parser.folders(*bsdf.scene.parsed.folders):
+            inside, outside = (read_medium(bsdf.props, name, default) for name, default in sides.items())
+        n_int, n_ext = (float(medium.index(media.LINES["d"])) for medium in (inside, outside))
+    except ValueError as error:
+        raise ValueError(f"{bsdf.scene.path}: {bsdf}: {str(error).removeprefix(f'{PLUGIN}: ')}") from None
     sigmas = {side: _sigma(bsdf, side) if bsdf.type != "dielectric" else BLACK for side in ("int", "ext")}
     parameters = [
         f"{name} = {bsdf.props.get(name, default)}"
@@ -210,9 +217,8 @@ def _glass(bsdf: Node) -> Glass:
     ]
     absorbing = {f"{side}_{name}" for side in sigmas for name in ("absorption", "colour") if any(sigmas[side])}
     parameters += [name for name in bsdf.names if name in absorbing]
-    bsdf.ignore(*sides, "formula")
+    bsdf.ignore("formula")
     bsdf.finish()
-    n_int, n_ext = (float(medium.index(media.LINES["d"])) for medium in (inside, outside))
     if not parameters:
         return Glass(n_int, n_ext)
     spectrum: tuple[float, ...] = ()

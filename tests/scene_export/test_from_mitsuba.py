@@ -357,7 +357,15 @@ REFUSED = {
     "sampling_weight = 0": lamps('<emitter type="point"><float name="sampling_weight" value="0"/></emitter>'),
     "roughdielectric": ('type="$bsdf"', 'type="roughdielectric"'),
     "specular_transmittance": ("<string", '<float name="specular_transmittance" value="0.5"/><string'),
-    "unknown material": ('"water"', '"nonsense"'),
+    "scene.xml: dielectric: int_ior = 'nonsense': unknown material": (
+        '<bsdf type="$bsdf"><string name="int_ior" value="water"/>',
+        '<bsdf type="dielectric"><string name="int_ior" value="nonsense"/>',
+    ),
+    "scene.xml: refract: int_ior is a checkerboard": (
+        '<string name="int_ior" value="water"/>',
+        '<texture type="checkerboard" name="int_ior"/>',
+    ),
+    "scene.xml: refract: table(600: 1.5, 700: 1.4)": ('"water"', '"table(600: 1.5, 700: 1.4)"'),
     "sdfgrid": ('type="cube"', 'type="sdfgrid"'),
     "mirrors": ('<translate x="3"/>', '<scale x="-1"/>'),
     "mirrors or flattens": ('<translate x="3"/>', '<scale x="0"/>'),
