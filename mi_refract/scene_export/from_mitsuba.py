@@ -64,7 +64,7 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, defines: Mapping[s
             lamps.append(_lamp(child))
         elif child.kind == "Emitter" and sky is None:
             sky = _sky(child)
-        elif child.kind != "BSDF":  # named BSDFs are read with the shapes that use them
+        elif child.kind not in ("BSDF", "Texture"):  # named ones are read with the shapes that use them
             raise child.error(f"one {child.kind.lower()} too many", "shapes, and one sensor, integrator and sky")
     root.finish()
     if camera is None:

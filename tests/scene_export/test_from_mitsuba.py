@@ -593,6 +593,9 @@ def test_checkerboard_has_mitsubas_colours(scales):
 
 
 def test_default_colours_of_a_checkerboard(scene):
-    plain = from_mitsuba.load(scene(LIGHT, f"{AREA}{BOARD.format(1, 1)}"), level=0)
-    assert [mesh.material for mesh in plain.meshes[2:]] == [Light((0.4,) * 3), Light((0.2,) * 3)]
+    board = BOARD.format(1, 1)
+    named = board.replace('name="radiance"', 'id="board"'), f'{AREA}<ref id="board" name="radiance"/>'
+    for lamp in (f"{AREA}{board}", "".join(named)):
+        plain = from_mitsuba.load(scene(LIGHT, lamp), level=0)
+        assert [mesh.material for mesh in plain.meshes[2:]] == [Light((0.4,) * 3), Light((0.2,) * 3)]
     assert len(from_mitsuba.load(scene(LIGHT, f"{AREA}{BOARD.format(0.5, 0.5)}"), level=0).meshes) == 3  # one cell
