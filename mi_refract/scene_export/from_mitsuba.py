@@ -158,6 +158,8 @@ def _sky(emitter: Node) -> Colour | Environment:
         sky = emitter.colour("radiance", 1.0)
     elif emitter.type == "envmap":
         path, scale = emitter.scene.resolve(emitter.value(str, "filename")), emitter.value(float, "scale", 1.0)
+        if scale < 0:
+            raise emitter.error(f"scale = {scale}", "at least 0")
         try:
             pixels, header = read_exr(path)
             names = header["channels"]

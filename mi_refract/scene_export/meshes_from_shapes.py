@@ -187,12 +187,16 @@ def _scattering(bsdf: Node) -> Surface:
         bsdf.finish()
         if len(inner) != 1:
             raise bsdf.error("two BSDFs", "the same on both sides")
+        if inner[0].type in GLASSES:
+            raise bsdf.error(f"a {inner[0].type}", "a BSDF that transmits nothing")
         return replace(_scattering(inner[0]), one_sided=False)
     if bsdf.type in GLASSES:
         return Surface((_glass(bsdf),))
     if bsdf.type == "diffuse":
         colours, scales = _colours(bsdf, "reflectance", DEFAULT[0])
         bsdf.finish()
+        if (largest := max(map(max, colours))) > 1:
+            raise bsdf.error(f"a reflectance of {largest:g}", "at most 1")
         return Surface(tuple(map(Diffuse, colours)), scales, one_sided=any(colour != BLACK for colour in colours))
     raise bsdf.error("this BSDF is not supported", f"diffuse, twosided, {', '.join(GLASSES)}")
 

@@ -376,6 +376,15 @@ REFUSED = {
         f'type="cylinder"><transform name="to_world"><scale x="2" y="1" z="3"/></transform>{LAMP}',
     ),
     "around the camera": ('<translate x="3"/>', '<scale value="99"/>'),
+    "twosided: a dielectric; expected a BSDF that transmits nothing": (
+        'id="box">',
+        'id="box"><bsdf type="twosided"><bsdf type="dielectric"/></bsdf>',
+    ),
+    "diffuse: a reflectance of 2; expected at most 1": (
+        'id="box">',
+        'id="box"><bsdf type="diffuse"><rgb name="reflectance" value="0.5, 2, 0"/></bsdf>',
+    ),
+    "envmap: scale = -1.0": (CONSTANT, SKY.replace("/></", '/><float name="scale" value="-1"/></')),
     "one side of an open surface": ('type="cube"', 'type="rectangle"'),
     "bitmap": (LIGHT, f'{AREA}<texture type="bitmap" name="radiance"/>'),
     "a checkerboard": (LIGHT, f"{AREA.replace('rectangle', 'disk')}{BOARD.format(1, 1)}"),
