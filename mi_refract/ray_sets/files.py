@@ -37,7 +37,7 @@ from mi_refract.regimes import Array, Rays
 
 from . import header as headers
 from .header import FORMAT, PRECISIONS, Header
-from .ray_set import Answers, RaySet, checksum, indices
+from .ray_set import MOST_RAYS, Answers, RaySet, checksum, indices
 
 SUFFIXES = (".csv", ".npz")
 COLUMNS = ("id", "ax", "ay", "az", "nx", "ny", "nz", "n_from", "n_to")
@@ -46,7 +46,6 @@ ANSWER_COLUMNS = ("id", "bx", "by", "bz")
 TRANSMITTED, N_RATIO = "transmitted", "n_ratio"
 ANSWER_LAYOUTS = tuple((*ANSWER_COLUMNS, *more) for more in ((), (TRANSMITTED,), (N_RATIO,), (TRANSMITTED, N_RATIO)))
 LEAST_RATIO = 1e-9  # smallest `n_ratio` of an answer: a thousandth of the smallest ratio in any set
-MOST_RAYS = 2**28 // len(COLUMNS)  # 3e7: their numbers take 2 GiB, and checking them takes 8 GB
 TIMEOUT = 300.0  # seconds for a program
 # The names of the columns, in order. In an .npz file, `ax`, `ay`, `az` are one array `a` of shape (N, 3).
 Layout = tuple[str, ...]

@@ -30,6 +30,7 @@ Rows = NDArray[np.bool_] | NDArray[np.intp] | slice  # a mask (N,), indices, or 
 # Regimes whose vectors are unit up to the rounding of each component, as the documented formulas require.
 DEFAULT = tuple(name for name, regime in regimes.REGIMES.items() if regime.unit and not regime.rests_on_denormals)
 COUNT, PRECISION = 1000, "f32"
+MOST_RAYS = 2**28 // 9  # 3e7: their numbers, 9 each, take 2 GiB, and checking them takes 8 GB
 
 
 def indices(k: Array) -> tuple[Array, Array]:
@@ -140,8 +141,8 @@ def make(
     """`count` rays of each regime in `names`, by default those of `default`. Normals face the ray unless `two_sided`.
 
     `media`: specifications for `mi_refract.media`; each ray passes between one of these media and air, at one of the
-    `wavelengths` in nm. ValueError, one line, for an unknown regime or precision, a duplicate regime, or no rays; and
-    for media as in `header.of_media` and `header.check_regimes`.
+    `wavelengths` in nm. ValueError, one line, for an unknown regime or precision, a duplicate regime, no rays, or
+    more than MOST_RAYS; and for media as in `header.of_media` and `header.check_regimes`.
     """
     from mi_refract import __version__
 
@@ -153,6 +154,8 @@ def make(
         raise ValueError(f"precision {precision!r}: unknown; expected {', '.join(PRECISIONS)}")
     if not names or len(set(names)) < len(names) or count < 1 or seed < 0:
         raise ValueError(f"{count} rays of {list(names)}, seed {seed}; expected at least one ray, each regime once")
+    if count * len(names) > MOST_RAYS:
+        raise ValueError(f"{count} rays of each of {len(names)} regimes; expected up to {MOST_RAYS} rays in all")
     header: Header = {
         "format": FORMAT,
         "version": __version__,

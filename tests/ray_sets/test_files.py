@@ -197,6 +197,10 @@ INVALID = {
     "1000 rays of [], seed 0; expected at least one ray": {"names": []},
     "each regime once": {"names": ["generic", "generic"]},
     "seed -1": {"seed": -1},
+    "14913081 rays of each of 2 regimes; expected up to 29826161 rays in all": {
+        "names": ["generic", "critical"],
+        "count": 14913081,
+    },
     "3 media and 0 wavelengths; expected neither, or at least one of each": {**ALL, "wavelengths": ()},
     "0 media and 2 wavelengths; expected neither, or at least one of each": {**ALL, "media": ()},
     "2 times; expected each once": {**ALL, "media": (CROWN, FLINT, f" {CROWN}")},
