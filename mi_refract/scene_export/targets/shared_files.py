@@ -38,7 +38,7 @@ OWN_AXES: Axes = (0, 0, -1), (1, 0, 0), (0, 1, 0)  # Mitsuba's
 # and last row at the poles. A map is linear between its texels. A finer map reproduces this, except in cells that
 # contain a texel of the original map.
 FINER = 16
-LARGEST = 16384  # longest side of a finer map: a common limit of textures, and 1.6 GB; a longer original keeps its size
+LARGEST = 16384  # longest side of a finer map: a common limit of textures, and 1.6 GB; a longer original loses a row
 STRIP = 2**18  # texels that are computed at a time: intermediate results of 60 MB
 LIGHT_INSIDE = (
     "Radiance is not scaled by the square of the index inside glass. The image is the same if camera, lights and "
