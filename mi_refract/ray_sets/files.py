@@ -165,10 +165,6 @@ def _answers(table: Table) -> Answers:
     if len(wrong):
         text = f"{len(wrong)} ids are not whole numbers below 2^53, the first is {wrong[0]:g}"
         raise ValueError(f"{text}; expected the ids of the rays")
-    if transmitted is not None:
-        wrong = transmitted[~np.isin(transmitted, (0, 1))]
-        if len(wrong):
-            raise ValueError(f"{TRANSMITTED} is {wrong[0]} for {len(wrong)} rays; expected 0 or 1")
     if ratios is not None:
         wrong = ratios[~((ratios >= LEAST_RATIO) & (ratios <= 1 / LEAST_RATIO))]
         if len(wrong):

@@ -417,7 +417,7 @@ TABLES = {
     "line 2 is '1,0x1p0,2,3'": TOP + "1,0x1p0,2,3\n",
     "1 ids are not whole numbers below 2^53, the first is 1.5": TOP + "1.5,2,3,4\n",
     "3 ids are not whole numbers below 2^53, the first is nan": TOP + "nan,2,3,4\ninf,2,3,4\n1e300,2,3,4\n",
-    "transmitted is 2.0 for 2 rays; expected 0 or 1": "id,bx,by,bz,transmitted\n1,2,3,4,2\n2,2,3,4,nan\n",
+    "transmitted is 2.0; expected 0 or 1": "id,bx,by,bz,transmitted\n1,2,3,4,2\n2,2,3,4,nan\n",
     "not text; expected CSV": b"\xff\xfe\x00id",
     "not text; expected CSV in UTF-8": TOP.encode() + b"1,2,3,4\n\xff,2,3,4\n",
     "line 2 is longer than 1048576 characters": TOP + "1" * 2_000_000,

@@ -196,8 +196,8 @@ def radiance(environment: Environment, directions: Array) -> Array:
     height, width = pixels.shape[:2]
     column = np.arctan2(x, -z) / (2 * np.pi) * width - 0.5
     row = np.arctan2(np.hypot(x, z), y) / np.pi * (height - 1)
-    left, top = np.floor(column).astype(int), np.clip(np.floor(row).astype(int), 0, max(height - 2, 0))
-    right, bottom = (left + 1) % width, np.minimum(top + 1, height - 1)
+    left, top = np.floor(column).astype(int), np.clip(np.floor(row).astype(int), 0, height - 2)
+    right, bottom = (left + 1) % width, top + 1
     a, b = (column - left)[..., None], (row - top)[..., None]
     upper = (1 - a) * pixels[top, left % width] + a * pixels[top, right]
     lower = (1 - a) * pixels[bottom, left % width] + a * pixels[bottom, right]
