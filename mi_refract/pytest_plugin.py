@@ -2,8 +2,8 @@
 
 Put this into the conftest.py of the tests: `pytest_plugins = ["mi_refract.pytest_plugin"]`. The plugin is no entry
 point, because an entry point would load Mitsuba, and with it a libLLVM, into every pytest run of the environment,
-before a conftest.py could choose one. An image is a file or an array, H × W × C or H × W. A missing reference fails the
-test.
+before a conftest.py could choose one. An image is a file or an array, H × W × C or H × W; arrays of uint8 and uint16
+are sRGB codes, as in a PNG file. A missing reference fails the test.
 
 `--mi-refract-accept` copies images that are not equal over their references, as `mi-refract accept` does, if both are
 files, or if the reference is an EXR file and the image an array. `--mi-refract-report OUT.html` writes the page of
@@ -169,7 +169,7 @@ def _accept(reference: Path, test: Image, method: str, options: dict[str, Any], 
         with safe_files.temporary_folder() as folder:
             if not isinstance(test, str | os.PathLike):
                 image, test = image_file.named("test", test), folder / "test.exr"
-                image_file.write_exr(test, image.pixels, image.channels)
+                image_file.write_exr(test, image.pixels, image.channels, image.metadata)
                 options = options | {"ignore_metadata": ("*",)}  # an array has none
             settings = Settings.for_all(method=method, **options)
             copies = list(accept.changes(folders.diff(reference, test, settings, to_accept=True)))

@@ -148,7 +148,7 @@ TESTS = """
 import numpy as np
 
 def test_new(assert_image_equal):
-    assert_image_equal(np.ones((8, 8, 3)), "new.exr")
+    assert_image_equal(np.full((8, 8, 3), 200, np.uint8), "new.exr", "flip")
 
 def test_changed(assert_image_equal):
     assert_image_equal("test.exr", "old.exr", "exact")

@@ -257,18 +257,23 @@ def _opened(path: Path, kind: str, max_values: int, max_bytes: int, option: str 
 def named(name: str, pixels: ArrayLike) -> Image:
     """Return an image of an array, H × W × C or H × W, with a name instead of a file.
 
-    Three or four channels are called R, G, B (, A), others channel0, channel1 … Integers are not scaled. ValueError for
-    another shape, for values that are not numbers, and for integers beyond ±EXACT.
+    Three or four channels are called R, G, B (, A), others channel0, channel1 … uint8 and uint16 are sRGB codes, which
+    are mapped to 0 … 1 as those of a PNG file; other integers are not scaled. ValueError for another shape, for values
+    that are not numbers, and for integers beyond ±EXACT.
     """
     pixels = np.asarray(pixels)
     if pixels.ndim not in (2, 3) or not pixels.size or pixels.dtype.kind not in "fiu":
         raise ValueError(f"{name}: {pixels.dtype} {pixels.shape}; expected numbers, height × width × channels")
     if pixels.dtype.kind in "iu" and (largest := max(int(pixels.max()), -int(pixels.min()))) > EXACT:
         raise ValueError(f"{name}: {pixels.dtype} up to ±{largest}; expected integers up to 2⁵³")
-    pixels = pixels.reshape(*pixels.shape[:2], -1).astype(np.result_type(pixels.dtype, np.float32))
+    dtype, metadata = pixels.dtype, Metadata()
+    pixels = pixels.reshape(*pixels.shape[:2], -1).astype(np.result_type(dtype, np.float32))
+    if dtype.kind == "u" and dtype.itemsize <= 2:
+        pixels *= np.float32(1 / np.iinfo(dtype).max)  # rounded as by OpenImageIO
+        metadata["oiio:ColorSpace"] = "srgb_rec709_scene"
     count = pixels.shape[2]
     channels = tuple("RGBA"[:count]) if 3 <= count <= 4 else tuple(f"channel{i}" for i in range(count))
-    return Image(Path(name), pixels, channels)
+    return Image(Path(name), pixels, channels, metadata=metadata)
 
 
 def _parts(source: ImageInput) -> Iterator[tuple[int, int]]:

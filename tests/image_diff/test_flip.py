@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.special import ndtr
-from support.diff_images import DIFFERENT, EQUAL, INCONCLUSIVE, SMOOTH, of, save
+from support.diff_images import DIFFERENT, EQUAL, INCONCLUSIVE, SINGLE, SMOOTH, of, save
 
 from mi_refract.image_diff.flip import encoding, flip, local_error, one_way_change, patch_error, windows
 from mi_refract.image_diff.methods import compare
@@ -240,7 +240,25 @@ def test_integers_without_a_colour_space_are_srgb(tmp_path):
         for path in (tmp_path / f"a.{name}" for name in names.split()):
             save(path, SMOOTH[:8, :8], stored, {"oiio:ColorSpace": (space,)} if space else {})
             assert encoding(image_file.read(path)) == expected, (path, stored, space)
-    assert encoding(image_file.named("reference", SMOOTH)) == "linear"  # an array
+    for array, expected in ((SMOOTH, "linear"), (SMOOTH.astype(int), "linear"), (SMOOTH.astype(">u2"), "sRGB")):
+        assert encoding(image_file.named("reference", array)) == expected
+
+
+@pytest.mark.parametrize("kind", ["uint8", "uint16"])
+def test_arrays_of_codes_are_those_of_a_png(kind, tmp_path):
+    """In every bit, so that all methods agree; 47 of 255 codes in 3 × 3 pixels are different on a display."""
+    all_codes = np.arange(2**16).astype(kind).reshape(256, 256, 1)
+    read = image_file.read(save(tmp_path / "a.png", all_codes, kind)).pixels
+    np.testing.assert_array_equal(image_file.named("array", all_codes).pixels, read)
+    codes = np.full((2, 64, 64, 3), 128, kind)
+    codes[1, 30:33, 30:33] = 175
+    codes *= np.iinfo(kind).max // 255
+    arrays = [image_file.named("array", x) for x in codes]
+    files = [image_file.read(save(tmp_path / f"{i}.png", x, kind)) for i, x in enumerate(codes)]
+    for sides in (arrays, files, (arrays[0], files[1]), (files[0], arrays[1])):
+        assert compare("flip", *sides).metrics == compare("flip", *files).metrics
+        assert compare("flip", *sides).verdict is DIFFERENT
+    assert all(compare(method, arrays[0], files[0]).verdict is EQUAL for method in SINGLE)
 
 
 def test_hdr_and_ldr():
