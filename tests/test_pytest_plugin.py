@@ -187,7 +187,7 @@ def test_options_write_a_page_and_accept_images(pytester):
     assert {path.name: path.read_bytes() for path in pytester.path.glob("*.exr")} == before  # nothing is written
     accepted = run("--mi-refract-accept")
     accepted.assert_outcomes(passed=4, failed=2)
-    accepted.stdout.fnmatch_lines(["could not accept: unknown key 'fial'; expected *"])
+    accepted.stdout.fnmatch_lines(["could not accept: settings: unknown key `fial`; expected *"])
     after = {path.name: path.read_bytes() for path in pytester.path.glob("*.exr")}
     assert after == before | {"old.exr": before["test.exr"], "new.exr": after["new.exr"]}
 

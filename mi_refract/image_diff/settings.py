@@ -134,13 +134,11 @@ class Settings:
     def for_all(cls, **values: Any) -> Settings:
         """Return settings with these values for all images, such as `method="tolerance", fail=0.1`.
 
-        ValueError for an unknown key or method.
+        The keys are those of `Keys` and the options of all methods. ValueError for an unknown key, and for an invalid
+        value of a key; invalid options are errors of the images.
         """
-        if (method := values.get("method", AUTO)) not in ACCEPTED:
-            raise ValueError(f"method {method!r}; expected {', '.join(ACCEPTED)}")
-        if unknown := values.keys() - options_of(None) - {*ImageKeys.__struct_fields__}:
-            raise ValueError(f"unknown key {min(unknown)!r}; expected a key of [defaults], or skip")
-        return cls((Entry("", values, COMMAND_LINE),))
+        options = {key: values.pop(key) for key in [*values] if key in _options(None)}
+        return cls((Entry("", _checked_values(values, Keys, "settings") | options, COMMAND_LINE),))
 
     def of(self, name: str) -> ComparisonSpec:
         """Return the settings of the image of this name, from all layers that match it; a later layer wins.

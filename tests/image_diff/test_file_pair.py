@@ -223,7 +223,7 @@ def test_masked_nan_and_unselected_channels_are_ignored(sides):
     pixels[10, 5] = np.nan
     write_exr(sides[1], pixels)
     assert compared(*sides, method="exact", ignore=WHOLE).status == "equal"
-    result = compared(*sides, method="exact", channels=(("R", "R"),), ignore=WHOLE)
+    result = compared(*sides, method="exact", channels=["R"], ignore=WHOLE)
     assert result.reason.endswith("; not compared: G, B")
 
 

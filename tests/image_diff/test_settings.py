@@ -130,11 +130,30 @@ def test_skipped_images_and_invalid_entries_without_images_are_reported(folders)
     results = diff.diff(*folders, Settings(rules))
     assert outcomes(results)["added.exr"] == ("skipped", "unknown")
     assert (results.exit_code, len(results.of(Status.SKIPPED))) == (0, 3)
-    assert diff.diff(*folders, Settings.for_all(skip=True)).exit_code == 2
+    assert diff.diff(*folders, Settings((Entry("", {"skip": True}),))).exit_code == 2
     results = diff.diff(*folders, Settings((Entry("gone", {}, error="rules.toml: image[0]: unknown key"),)))
     (wrong,) = results.of(Status.ERROR)
     assert (wrong.name, wrong.error) == ("the settings, image[0]", "rules.toml: image[0]: unknown key")
     assert (results.exit_code, len(results.results)) == (2, 5)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"fale": 1}, "settings: unknown key `fale`; expected method"),
+        ({"method": "idiff"}, "settings: method: 'idiff'; expected auto"),
+        ({"mask": "../a.exr"}, "settings: mask: '../a.exr'; expected a relative path"),
+        ({"accept": "{stem}-*"}, "settings: accept: text; expected a list"),
+        ({"channels": ["R", "R"]}, "settings: channels: "),
+    ],
+)
+def test_values_for_all_images_are_checked(folders, values, message):
+    chosen = Settings.for_all(channels=["R", "B"], fail=np.float64(0.2), method="tolerance")
+    assert chosen.of("a") == ComparisonSpec("tolerance", {"fail": 0.2}, channels=(("R", "R"), ("B", "B")))
+    assert outcomes(diff.diff(*folders, chosen))["inner/changed.exr"] == ("equal", "unchanged")
+    with pytest.raises(ValueError) as error:
+        Settings.for_all(**values)
+    assert str(error.value).startswith(message)
 
 
 # The file ---------------------------------------------------------------------------------------------------------
