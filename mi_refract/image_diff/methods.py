@@ -215,6 +215,11 @@ def _compare(
         alike = [[as_shown(one, two.channels)], [as_shown(two, one.channels)]]
         result = _compare(method, alike, allow_nonfinite, named, all_options)
         return replace(result, reason=f"{result.reason}; {reading}")
+    shared, unshared = _shared(compared, takes_renders and single)
+    if unshared:
+        result = _compare(method, shared, allow_nonfinite, named, all_options)
+        reason = f"{unshared}; the other channels: {result.reason}"
+        return replace(result, verdict=Verdict.DIFFERENT, reason=reason, warning="")
     if takes_renders:
         result = function(*compared, allow_nonfinite=allow_nonfinite, **options)
         if single and result.is_equal and (untested := channels.untested(one, two)):
@@ -227,17 +232,13 @@ def _compare(
     elif not single:
         raise ValueError(f"{method}: {len(sides[0])} and {len(sides[1])} images; expected one per side")
     else:
-        a, b, unshared = shared_channels(one, two)
-        if reason := preconditions(a, b, allow_nonfinite):
-            result = nonfinite_result(method, reason, *aligned(a, b))
+        if reason := preconditions(one, two, allow_nonfinite):
+            result = nonfinite_result(method, reason, *aligned(one, two))
         else:
-            result = _compare_by_steps(method, a, b, options)
+            result = _compare_by_steps(method, one, two, options)
             may_be_noise = method in NOT_FOR_NOISE and result.verdict is Verdict.DIFFERENT
-            if may_be_noise and pixel_statistics.differ_like_noise(*(x.pixels for x in _finite_pair(a, b))):
+            if may_be_noise and pixel_statistics.differ_like_noise(*(x.pixels for x in _finite_pair(one, two))):
                 result = replace(result, reason=f"{result.reason}; {OTHER_NOISE}")
-        if unshared:
-            reason = f"{unshared}; the other channels: {result.reason}"
-            return replace(result, verdict=Verdict.DIFFERENT, reason=reason, warning="")
     is_finite = np.isfinite(means[0][0].pixels)
     if not result.is_equal or is_finite.all():
         return result
@@ -247,6 +248,22 @@ def _compare(
         return result.but(Verdict.INCONCLUSIVE, reason)
     count = int(is_finite.size - is_finite.sum())
     return replace(result, reason=f"{result.reason}; not compared: {count} of {is_finite.size} values, not finite")
+
+
+def _shared(sides: list[list[Image]], with_variances: bool) -> tuple[list[list[Image]], str]:
+    """Return the sides with the channels that both have, and a text about those that only one has; "" if none.
+
+    `with_variances`: channels that contain variances are not compared, but belong to others. ValueError if a further
+    image of a side lacks one of the channels.
+    """
+    one, two = sides[0][0], sides[1][0]
+    if not with_variances:
+        shared, _, unshared = shared_channels(one, two)
+        return [[only(image, shared.channels) for image in side] for side in sides] if unshared else sides, unshared
+    pair = channels.matched(one, two)
+    shared, _, unshared = shared_channels(*(only(image, channels.means(image.channels)) for image in pair))
+    names = {name: name for name in shared.channels}
+    return [[channels.selected(image, names)] for image in pair] if unshared else sides, unshared
 
 
 def _finite_pair(reference: Image, test: Image) -> tuple[Image, Image]:

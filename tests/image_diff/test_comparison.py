@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import ndimage
-from support.diff_images import DIFFERENT, EQUAL, INCONCLUSIVE, SINGLE, SMOOTH, of
+from support.diff_images import DIFFERENT, EQUAL, INCONCLUSIVE, SMOOTH, of
 
 from mi_refract.image_diff.comparison import groups, preconditions
 from mi_refract.image_diff.methods import METHODS, choice, compare
@@ -140,14 +140,14 @@ def test_headers_with_explicit_defaults_are_equal():
     assert not preconditions(of(SMOOTH), of(0 * SMOOTH))
 
 
-@pytest.mark.parametrize("method", ["auto", *SINGLE])
+@pytest.mark.parametrize("method", ["auto", *METHODS])
 def test_an_additional_channel_is_a_difference_and_is_named(method):
     ramp = np.arange(40 * 48.0).reshape(40, 48)
     cases = (("l.A", 1, "l.A (opaque: 1 everywhere)"), ("Z", ramp, "Z"), ("Z", 0, "Z (0 everywhere)"))
     for name, values, words in (*cases, ("A", 0.5, "A (0.5 everywhere)")):
         plain, more = of(SMOOTH), of(np.dstack([SMOOTH, np.broadcast_to(values, (40, 48))]), (*"RGB", name))
         for sides, word in (((plain, more), "added"), ((more, plain), "missing")):
-            result = compare(method, *sides)
+            result = judge(method, *sides)
             assert result.verdict is DIFFERENT
             assert result.reason.startswith(f"channels {word}: {words}; the other channels: ")
         assert "the other channels: 1 of 1920 pixels" in compare("exact", more, altered(0.9)).reason
