@@ -74,8 +74,9 @@ def compare_renders(
     EQUAL, however noisy, if both images contain their variance and are identical in every value of every channel.
     INCONCLUSIVE if the only tiles that differ are unsuited to a t-test (their noise comes from a few pixels, or their
     pixels share more noise than those of the rest of the image, or they have no noise and differ by little or in a few
-    pixels), or if the noise hides differences of `resolution`; then the
-    reason gives the number of samples that would decide. ValueError for fewer renders, the same render twice, and
+    pixels), or if the noise hides differences of `resolution`; then the reason gives the number of samples that would
+    decide. If all renders of a side are identical, that side has no noise; the reason says so, because a renderer that
+    ignores its seed looks the same. ValueError for fewer renders, for renders of which only some are identical, and
     images that cannot be compared.
     """
     single = len(reference) == len(test) == 1 and (has_variance(reference[0]) or has_variance(test[0]))
@@ -112,6 +113,11 @@ def compare_renders(
         reason = f"{_worst_difference(tests, reference[0], channels, tile)}; {reason}"
     elif verdict is Verdict.INCONCLUSIVE:
         reason += _deciding_samples(counts, unit, tests.quieter(resolution, hidden))
+    if not single:
+        for name, side in (("reference", reference), ("new image", test)):
+            if _all_identical(side) and (side[0].pixels != side[0].pixels[0, 0]).any():
+                same = f"all {len(side)} renders of the {name} are identical"
+                reason += f"; {same}: no noise, or the seeds have no effect"
     finest, differing = levels[0], tests.differing
     share_name = f"share of the tiles whose noise hides a difference of {resolution:.2g}"
     metrics = (
@@ -160,7 +166,7 @@ def _checked_counts(
         )
     for side in (reference, test):
         masked = side[0].mask is not None and not side[0].mask.all()
-        if masked or all(_identical(side[0], image) for image in side):
+        if masked or _all_identical(side):
             continue  # renders without noise may be the same, and so may what a mask leaves of others
         for a, b in itertools.combinations(side, 2):
             if _identical(a, b) and (a.pixels != a.pixels[0, 0]).any():  # black ones may be the same
@@ -172,6 +178,10 @@ def _checked_counts(
         return (len(reference), len(test)), "renders"
     n1, n2 = (sum(samples(image, name, count, least=1) for image in side) for name, count, side in sides)
     return (n1, n2), "samples per pixel"
+
+
+def _all_identical(side: Sequence[Image]) -> bool:
+    return all(_identical(side[0], image) for image in side[1:])
 
 
 def _identical(a: Image, b: Image) -> bool:

@@ -530,6 +530,11 @@ def test_the_same_render_twice_is_an_error(rng):
         welch([one, two, one], [three, four, five], allow_nonfinite=True)
     black = [of(0 * side[0].pixels)] * 2  # renders that find no light may be identical
     assert welch([*black, *side], renders(rng, 4)).verdict is not EQUAL
+    remark = "; all 3 renders of the {} are identical: no noise, or the seeds have no effect"
+    assert welch(side[:1] * 3, renders(rng, 4)).reason.endswith(remark.format("reference"))
+    assert welch(renders(rng, 4), side[:1] * 3).reason.endswith(remark.format("new image"))
+    for plain in (black, renders(rng, 3, deviation=0.0), side):
+        assert "identical" not in welch(plain, renders(rng, 4)).reason
 
 
 @pytest.mark.parametrize("scale", ["a lamp", "a channel"])
