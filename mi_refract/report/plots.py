@@ -244,5 +244,7 @@ def _page_svg(figure: Figure) -> str:
     text = re.sub(r"<metadata>.*?</metadata>|<style .*?</style>", "", text, flags=re.S)
     text = re.sub(r' xmlns(:xlink)?="[^"]*"|(?<=<g) id="[^"]*"| version="1.1"', "", text)
     text = text.replace("xlink:href=", "href=")
-    text = re.sub(r"\n\s*", "\n", re.sub(r"\d+\.\d{3,}", lambda m: f"{float(m[0]):.2f}", text))
+    # Coordinates are rounded; numbers in the text between tags are not.
+    text = re.sub(r">[^<]+<|\d+\.\d{3,}", lambda m: m[0] if m[0][0] == ">" else f"{float(m[0]):.2f}", text)
+    text = re.sub(r"\n\s*", "\n", text)
     return re.sub(r"#0102[01][0-9a-f]", lambda m: f"var({VARIABLES[m[0]]})", text)

@@ -289,6 +289,9 @@ def test_curves_have_a_guide_and_literal_names():
     style = (documents.TEMPLATES / "report.css").read_text("utf-8")
     values = [re.findall(rf"{name}: (#\w+)", style) for name in set(re.findall(r"--c\d+", svg))]
     assert len({light for light, _ in values}) == len({dark for _, dark in values}) == 12
+    svg = curves_svg({"n = 1.5168": [(1, 0.001), (2, 0.003)]}, Axes("x", "y", "linear", "linear"), salt="s")
+    assert ">n = 1.5168</text>" in svg and re.search(r">0\.0010*</text>", svg)
+    assert not re.search(r'"[^">]*\d\.\d{3}', svg)  # coordinates
     for wrong in ({"x_scale": "cubic"}, {"slope": 2, "y_scale": "linear"}):
         with pytest.raises(ValueError, match="axes: "):
             Axes(**wrong)
