@@ -67,6 +67,9 @@ class Compared:
                 words = [REPORT if word == "--report" else word for word in flags or ()]
                 return shlex.join(["pytest", *words, *[ACCEPT] * (verb == "accept"), *names])
 
+            def word(self, name: str) -> str:
+                return name  # pytest has no patterns
+
         return TestResults(root, root, tuple(sorted(self.results, key=lambda result: result.order)))
 
 

@@ -1,6 +1,8 @@
 """The fixtures for pytest, in these tests and in separate runs of pytest."""
 
+import html
 import re
+import shlex
 from types import SimpleNamespace
 
 import numpy as np
@@ -146,6 +148,7 @@ def test_the_plugin_works_from_a_conftest(pytester):
 
 TESTS = """
 import numpy as np
+import pytest
 
 def test_new(assert_image_equal):
     assert_image_equal(np.full((8, 8, 3), 200, np.uint8), "new.exr", "flip")
@@ -162,7 +165,8 @@ def test_equal_to_a_png(assert_image_equal):
 def test_two_arrays(assert_image_equal):
     assert_image_equal(np.ones((8, 8, 3)), np.zeros((8, 8, 3)))
 
-def test_wrong_option(assert_image_equal):
+@pytest.mark.parametrize("name", ["a*\u2081"])
+def test_wrong_option(assert_image_equal, name):
     assert_image_equal("test.exr", "old.exr", "exact", fial=1)
 """
 
@@ -183,6 +187,8 @@ def test_options_write_a_page_and_accept_images(pytester):
     page = (pytester.path / "out.html").read_text("utf-8")
     assert "6 images: 2 could not be compared, 2 different, 2 equal" in page
     assert f"pytest {name}changed" in page and f"pytest --mi-refract-accept {name}changed" in page
+    word = shlex.quote(rf"{name}wrong_option[a*\u2081]")  # as pytest writes it
+    assert f"pytest {word}" in html.unescape(page) and f'data-word="{word}"' in html.unescape(page)
     assert page.count('data-role="difference"') == 2
     assert {path.name: path.read_bytes() for path in pytester.path.glob("*.exr")} == before  # nothing is written
     accepted = run("--mi-refract-accept")
