@@ -112,7 +112,7 @@ def diff(
         if test is not None:  # REFERENCE compared with itself holds each variant as a new image
             unused += pairing.unused_templates(all_pairs)
         warnings = [f"{pattern}: matches no image" for pattern in unused]
-        checked = (*pairs, *pairing.wrong_entries(resolved, all_pairs))
+        checked = [*pairs, *(pairing.wrong_entries(resolved, all_pairs) if reference.is_dir() else ())]
         errors = [f"{pair.name}: {error}" for pair in checked if (error := pairing.error_of(pair, reference))]
         text_reports.print_table(text_reports.settings_table(pairs))
         for line in warnings + errors:

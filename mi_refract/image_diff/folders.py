@@ -72,11 +72,13 @@ def diff(
             f"{test if reference.is_dir() else reference}: not a folder; --renders expects folders"
         )
     unused: list[str] = []
+    pairs = pairing.named(all_pairs, names)
+    if test.is_dir() and not renders:
+        pairs += pairing.wrong_entries(settings, all_pairs)
     if reference.is_dir() and not renders:
         unused = settings.unused([pair.name for pair in all_pairs])
         if not to_accept:  # the first variant of a template may be about to be accepted
             unused += pairing.unused_templates(all_pairs)
-    pairs = [*pairing.named(all_pairs, names), *pairing.wrong_entries(settings, all_pairs)]
     results = Results(reference, test, (), renders, inconclusive, tuple(unused), settings.flags)
 
     def compare(pair: Result) -> Result:

@@ -133,9 +133,13 @@ def named(items: Sequence[Result], patterns: Sequence[str]) -> list[Result]:
 
 
 def wrong_entries(settings: Settings, pairs: Sequence[Result]) -> list[Result]:
-    """Return a result without sides for each invalid entry of the settings that no image reports as its error."""
+    """Return a result without sides for each invalid entry of the settings that no image of a folder reports.
+
+    None if the settings are those of a parent folder: their entries may be of other images.
+    """
     reported = {pair.how.error for pair in pairs}
-    wrong = [rule for rule in settings.rules if rule.error and rule.error not in reported]
+    rules = settings.rules if settings.above == Path() else ()
+    wrong = [rule for rule in rules if rule.error and rule.error not in reported]
     return [_pair(f"the settings, {rule.where}", None, None, Path(), rule.error) for rule in wrong]
 
 

@@ -132,6 +132,20 @@ def test_settings_and_masks_above_a_folder_are_read_within_a_repository(run, fol
     assert code == 2 and err.endswith("`map` is for whole folders; expected " + f"{old} as REFERENCE, or --settings\n")
 
 
+def test_a_wrong_entry_of_other_images_is_no_error_of_a_subfolder_or_a_file(run, folders, tmp_path):
+    old, new = folders
+    (tmp_path / ".git").mkdir()
+    (old / "mi-refract.toml").write_text('[[image]]\nname = "same.exr"\nfial = 1\nreason = "of others"\n')
+    assert [run("diff", old, new, *words)[0] for words in (["inner/*"], ["same.exr"], [])] == [1, 2, 2]
+    for name in ("inner", "inner/changed.exr"):
+        assert run("diff", old / name, new / name)[::2] == (1, "")
+        assert run("diff", old / name, new / name, "--check-settings")[::2] == (0, "")
+    assert run("diff", old / "removed.exr", new / "added.exr")[::2] == (0, "")
+    (old / "same.exr").unlink()
+    (new / "same.exr").unlink()
+    assert "image[0]: unknown key `fial`" in run("diff", old, new)[2]
+
+
 def test_check_settings(run, pair_with_settings):
     code, out, err = run("diff", *pair_with_settings, "--check-settings")
     assert (code, err) == (0, "mi-refract: gone.exr: matches no image\n")
