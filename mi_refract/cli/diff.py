@@ -108,11 +108,13 @@ def diff(
     if check_settings or test is None:
         all_pairs = pairing.pairs(reference, test or reference, resolved)
         pairs = pairing.named(all_pairs, names or [])
-        unused = resolved.unused([pair.name for pair in pairs])
-        if test is not None:  # REFERENCE compared with itself holds each variant as a new image
-            unused += pairing.unused_templates(all_pairs)
+        unused, checked = list[str](), list(pairs)
+        if reference.is_dir():
+            checked += pairing.wrong_entries(resolved, all_pairs)
+            unused = resolved.unused([pair.name for pair in all_pairs])
+            if test is not None:  # REFERENCE compared with itself holds each variant as a new image
+                unused += pairing.unused_templates(all_pairs)
         warnings = [f"{pattern}: matches no image" for pattern in unused]
-        checked = [*pairs, *(pairing.wrong_entries(resolved, all_pairs) if reference.is_dir() else ())]
         errors = [f"{pair.name}: {error}" for pair in checked if (error := pairing.error_of(pair, reference))]
         text_reports.print_table(text_reports.settings_table(pairs))
         for line in warnings + errors:

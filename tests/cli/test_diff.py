@@ -156,8 +156,9 @@ def test_check_settings(run, pair_with_settings):
     assert rows["equal.exr"] == ["auto", "defaults"]
     code, out, _ = run("diff", pair_with_settings[0], "--check-settings")
     assert (code, "louder-mac.exr" in out) == (0, True)
-    code, out, _ = run("diff", *pair_with_settings, "equal.exr", "--check-settings")
-    assert (code, "louder" in out) == (0, False)
+    code, out, err = run("diff", *pair_with_settings, "equal.exr", "--check-settings")
+    assert (code, "louder" in out, err) == (0, False, "mi-refract: gone.exr: matches no image\n")
+    assert run("diff", *(side / "equal.exr" for side in pair_with_settings), "--check-settings")[::2] == (0, "")
     (pair_with_settings[0] / "mi-refract.toml").write_text(
         '[[image]]\nname = "louder.exr"\nfale = 1\nreason = "loud"\n'
     )
