@@ -103,10 +103,11 @@ def paired(
         scale[..., numbers] = _scale(a[..., numbers], b[..., numbers])
     measured = changes(a / scale, b / scale, threshold)
     share = measured.share * a[..., 0].size / counted(reference)
+    rms = measured.rms * (a[..., 0].size / counted(reference)) ** 0.5  # pixels that are not compared do not change
     metrics = (
         Metric("share of changed pixels", share, changed),
         Metric("largest change", measured.largest, largest),
-        Metric("RMS change", measured.rms),
+        Metric("RMS change", rms),
         Metric("ratio of the means", _mean_ratio(a, b)),
     )
     reason = f"{compact(100 * share)} % of the pixels are changed, the largest by {measured.largest:.3g} of its value"
@@ -166,11 +167,12 @@ def tolerance(
     failed = _beyond(difference, a, b, fail, fail_relative).size
     warned = _beyond(difference, a, b, warn, warn_relative).size
     few = failed <= allow_failures
+    values = pixels * a.shape[2]  # in pixels that are not compared, the difference is 0
     metrics = (
         Metric("pixels beyond the tolerance", failed, max(allow_failures, _max_count(fail_percent, pixels))),
         Metric("largest difference", largest, None if few else _rounded(hard_fail, kind)),
-        Metric("mean difference", float(difference.mean(dtype=np.float64))),
-        Metric("RMS difference", float(np.sqrt(np.einsum("ijk,ijk->", *2 * [difference], dtype=float) / a.size))),
+        Metric("mean difference", float(difference.sum(dtype=np.float64) / values)),
+        Metric("RMS difference", float(np.sqrt(np.einsum("ijk,ijk->", *2 * [difference], dtype=float) / values))),
         Metric("pixels worth a warning", warned),
     )
     verdict = verdict_of(metrics)
