@@ -108,7 +108,8 @@ def resume(
         too_few = renderer.expected is not None and image.done < FEW and (spp is None or image.done < spp)
         if too_many or too_few:
             progress = Progress(progress.identity)
-    pass_spp = progress.identity.get(PASS) if progress.tree.passes else None
+    # Under `until` the size of passes changes; a rest beside former passes belongs to the last size.
+    pass_spp = progress.identity.get(PASS) if progress.tree.passes or (progress.base and progress.rest) else None
     if pass_spp and limits.pass_spp not in (None, pass_spp):
         expected = f"expected --pass-spp {pass_spp}, or --restart"
         raise ValueError(f"{saved}: has passes of {pass_spp} samples per pixel; {expected}")

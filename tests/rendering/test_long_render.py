@@ -474,24 +474,32 @@ def write_to_full_disk(*_):
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-# The last pass is the only one, comes after others, is replaced by a full pass, and by passes of another size.
+FOURS = {"pass_spp": 4}
+GROWING = {"defines": {"res": "64"}, "until": 1e-4, "spp": 100}  # passes of 8, then one of the 36 samples that are left
+
+
+# The last pass is the only one, comes after others, is replaced by a full pass, by passes of another size, and is kept
+# although its size is another than at the start.
 @pytest.mark.parametrize(
-    ("spp", "resumed", "kept"),
+    ("limits", "resumed", "kept"),
     [
-        (3, {"spp": 3, "pass_spp": 4}, 3),
-        (11, {"spp": 11, "pass_spp": 4}, 11),
-        (11, {"spp": 16, "pass_spp": 4}, 8),
-        (3, {"spp": 3, "pass_spp": 2}, 0),
+        (FOURS | {"spp": 3}, FOURS | {"spp": 3}, 3),
+        (FOURS | {"spp": 11}, FOURS | {"spp": 11}, 11),
+        (FOURS | {"spp": 11}, FOURS | {"spp": 16}, 8),
+        (FOURS | {"spp": 3}, {"spp": 3, "pass_spp": 2}, 0),
+        (GROWING, GROWING, 100),
     ],
 )
-def test_the_last_pass_is_kept_if_the_image_cannot_be_written(tmp_path, llvm_variant, monkeypatch, spp, resumed, kept):
+def test_the_last_pass_is_kept_if_the_image_cannot_be_written(
+    tmp_path, llvm_variant, monkeypatch, limits, resumed, kept
+):
     output = tmp_path / "a.exr"
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
         patch.setattr(rendered_file, "write", write_to_full_disk)
-        rendering(output, spp=spp, pass_spp=4).run()
+        rendering(output, **limits).run()
     render = rendering(output, **resumed)
     assert render.progress.done == kept
-    render.run()
+    assert render.run()["mi_refract:spp"] == resumed["spp"]
     assert_same_as_fresh(output, **resumed)
 
 
