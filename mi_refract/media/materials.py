@@ -40,7 +40,6 @@ from mi_refract.numerics import Number
 
 from . import glass_catalogs, index_files
 from .dispersion import (
-    ANY,
     CONSTANT,
     NANOMETRES,
     Abbe,
@@ -64,7 +63,8 @@ GLASS_CODE = re.compile(r"(\d{3})[-/]?(\d{3})(?:\.\d{3})?")  # 517642, or with S
 LEAST_CODE = 0.3  # n_d − 1 of a code below this has lost a 1: 003283 means n_d = 2.003, as no glass has n_d < 1.3
 LARGEST_N = 10.0  # largest index of formulas in the visible range: silicon has 6.9
 ABBE_NUMBERS = 5.0, 200.0  # range of V_d: glasses have 17 to 101
-SHORTEST, LONGEST = 30.0, 1e5  # nm: a table that ends below or starts above these is in another unit
+# nm: a wavelength below the first, and a table that ends below it or starts above the second, is in another unit.
+SHORTEST, LONGEST = 30.0, 1e5
 LONGEST_POLE = 1000.0  # µm²: in Sellmeier's formula of a glass, at least one C is below this, in the ultraviolet
 
 
@@ -246,7 +246,7 @@ def _formula(text: str, label: str) -> Medium:
         return ValueError(f"{label}: {quantity} = {value:g}; expected {unit}{power}; {remedy}")
 
     form: Dispersion
-    valid = ANY
+    valid = SHORTEST, math.inf
     if name == "cauchy":  # n = A + B/λ² + C/λ⁴ + …, B in nm², C in nm⁴ (A.-L. Cauchy)
         values = numbers(range(1, len(CAUCHY_NAMES) + 1), f"{name}(A, B, …), λ in {unit}, up to 8")
         for i, x in enumerate(values[1:], 1):

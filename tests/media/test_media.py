@@ -159,6 +159,12 @@ def test_a_medium_has_no_index_outside_its_range(wavelength, vectorised):
 
 
 # Invalid specifications ------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("spec", [spec for spec in CLOSED if spec != "1.5" and not spec.startswith("hold")])
+def test_a_formula_has_no_index_at_a_wavelength_in_micrometres(spec):
+    with pytest.raises(ValueError, match=r"no index at 0.5876 nm; expected a wavelength from .* nm"):
+        media.index(spec, 0.5876)
+
+
 
 BAD = {
     "cauchy(1.5, nan)": r"expected cauchy\(A, B, …\), λ in nm, up to 8, finite numbers",
