@@ -4,6 +4,7 @@ values, and errors of one line for anything else."""
 import math
 import re
 import sys
+from dataclasses import replace
 
 import drjit as dr
 import numpy as np
@@ -158,13 +159,13 @@ def test_a_medium_has_no_index_outside_its_range(wavelength, vectorised):
     assert material.index(400.0) == 1.53 and material.index(900.0) == 1.5
 
 
-# Invalid specifications ------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("spec", [spec for spec in CLOSED if spec != "1.5" and not spec.startswith("hold")])
 def test_a_formula_has_no_index_at_a_wavelength_in_micrometres(spec):
     with pytest.raises(ValueError, match=r"no index at 0.5876 nm; expected a wavelength from .* nm"):
         media.index(spec, 0.5876)
 
 
+# Invalid specifications ------------------------------------------------------------------------------------------
 
 BAD = {
     "cauchy(1.5, nan)": r"expected cauchy\(A, B, …\), λ in nm, up to 8, finite numbers",
@@ -281,6 +282,11 @@ def test_next_to_vacuum_a_catalogue_glass_has_its_index_in_vacuum(named):
         assert ratio(glass, named(name), 633.0) == pytest.approx(expected, rel=2e-8)
     assert ratio(named("vacuum"), glass, 633.0) == pytest.approx(1 / expected, rel=2e-8)
     assert ratio(glass, water, 633.0) == pytest.approx(expected / water.index(633.0), rel=2e-8)
+    edlen = replace(media.parse("AIR:edlen"), valid=(200.0, math.inf))
+    for wavelength in (200.0, 1700.0, 2500.0, 1e4):  # outside the range of Ciddor's formula
+        expected = 1.5 * (1 + (edlen.index(wavelength) - 1) * 288.15 / 293.15)
+        assert ratio(glass, named("vacuum"), wavelength) == pytest.approx(expected, abs=5e-7)
+    assert math.isnan(ratio(glass, named("vacuum"), 199.0))
 
 
 def test_the_ratio_is_nan_if_a_medium_has_no_index():

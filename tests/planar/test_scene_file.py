@@ -428,6 +428,8 @@ def test_indices_relative_to_vacuum_are_converted_to_air():
     expected = [media.index("MATERIAL:water", w) / media.LABORATORY_AIR.index(w) for w in (500.0, 600.0)]
     assert indices == pytest.approx(expected, rel=1e-15)
     assert Light().indices("AIR:ciddor", "n") == (1.0,)
+    with pytest.warns(UserWarning, match="air at 20 °C: the index at 2000 nm is an extrapolation; .* 230 to 1690 nm"):
+        assert Light(("",), (2000.0,)).indices("vacuum", "n") == pytest.approx((1 / 1.00026835,), abs=1e-8)
 
 
 @pytest.mark.parametrize("others", [[587.5618, 486.1327], [450.0, 550.0], 2])
