@@ -24,8 +24,8 @@ alone, both lobes are followed up to 64 boundaries deep, and the default of `spl
 With `caustics` = `path`, light that passes glass or a mirror before it reaches another surface is found by chance, or
 not at all where the lamp is a point, a spot or directional. `lamp` traces it from the lamps to all surfaces that the
 camera sees directly, along `light_paths` paths for each sample of the camera (`lamp_tracing`). It pays where lamps are
-small; with lamps nearly as large as the scene error × time was up to 2.4 of that of `path`. It takes area, point, spot
-and directional lamps, and perspective, thin-lens and orthographic cameras. In scenes with media of Mitsuba's, in
+small; with lamps nearly as large as the scene error × time is up to three times that of `path`. It takes area, point,
+spot and directional lamps, and perspective, thin-lens and orthographic cameras. In scenes with media of Mitsuba's, in
 frozen functions, within another integrator and where a parameter of the scene is differentiated it is an error. `auto`
 traces light from points, spots and directional lamps only, and from none where `lamp` would be an error: so derivatives
 are those of the image by path tracing. What is missing is named in a warning, once a scene (`SceneFeatures.missing`).
