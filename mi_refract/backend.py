@@ -299,11 +299,11 @@ def _try(path: str) -> Library:
 
 def _probe(name: str, environment: dict[str, str]) -> tuple[str, bool]:
     """(defect, lasting) of a backend, tried in a separate process. A lasting result would occur again."""
-    with temporary_folder() as folder:
-        # With an empty kernel cache, so that the kernels are compiled.
-        own = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "DRJIT_CACHE_DIR": str(folder)}
-        command = [sys.executable, "-c", _PROBE, name]
-        try:
+    command = [sys.executable, "-c", _PROBE, name]
+    try:
+        with temporary_folder() as folder:
+            # With an empty kernel cache, so that the kernels are compiled.
+            own = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "DRJIT_CACHE_DIR": str(folder)}
             result = subprocess.run(
                 command,
                 env=os.environ | own | environment,
@@ -315,10 +315,10 @@ def _probe(name: str, environment: dict[str, str]) -> tuple[str, bool]:
                 errors="replace",
                 check=False,
             )
-        except subprocess.TimeoutExpired:
-            return f"a tiny kernel took longer than {TIMEOUT:.0f} s", False
-        except OSError as error:
-            return f"no process could be started: {error.strerror}", False
+    except subprocess.TimeoutExpired:
+        return f"a tiny kernel took longer than {TIMEOUT:.0f} s", False
+    except OSError as error:
+        return f"no process could be started: {error.strerror}", False
     if result.returncode < 0:
         no_memory = re.search("out of memory|bad_alloc|annot allocate", result.stderr)
         lasting = not no_memory and result.returncode not in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT)

@@ -7,6 +7,7 @@ import mmap
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import drjit
@@ -238,6 +239,13 @@ def test_every_variant_is_usable_or_has_a_reason(usable_variants, monkeypatch):
     assert [variant for variant, reason in answers.items() if reason is None] == usable_variants
     assert {"scalar_rgb", "scalar_spectral", "scalar_spectral_polarized"} <= set(usable_variants)
     assert all(reason is None or one_line(reason) for reason in answers.values())
+
+
+def test_without_a_temporary_folder_no_compiled_backend_is_usable(monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    detected = backend.detect()
+    assert [name for name, entry in detected.items() if entry.usable] == ["scalar"]
+    assert detected["cuda"].reason == "no process could be started: No such file or directory"
 
 
 def test_activating_an_unknown_variant_or_one_that_cannot_run_is_an_error(monkeypatch):
