@@ -212,7 +212,7 @@ def absorbs_only(v: Variant, medium: MediumPlugin) -> bool:
 
 
 def check_integrator(scene: Scene) -> None:
-    """ValueError if a BSDF absorbs and the scene's integrator is not `refract_path`, and does not call only that.
+    """ValueError if a BSDF states absorption, even 0, and the integrator is not `refract_path` nor calls only that.
 
     ValueError also for shapes that Mitsuba renders wrong; see `check_shapes`.
     """

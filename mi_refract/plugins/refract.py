@@ -16,10 +16,11 @@
 | `formula` | string | a key of `mi_refract.FORMULAS`, or `auto` (default) | no | no |
 
 After a distance t in a medium, exp(−σ t) of the light is left; σ = 4πk/λ, and a colour, above 0 and up to 1, is
-exp(−σ t). Only `refract_path` renders absorption. A ratio of indices outside 2⁻²⁰ … 2²⁰ is an error; if an edit of a
-texture makes such a ratio, its light is lost. `auto` is the fastest formula that is right to the last bit. An edit of
-`eta` compiles no kernel. Coefficients of a dispersive material are exposed for λ in nm, also where its text or file has
-µm. `refract_<formula>` is the same plugin with that formula.
+exp(−σ t). Only `refract_path` renders absorption; it is also needed if a stated σ is 0, or a stated colour 1, as these
+can be edited. A ratio of indices outside 2⁻²⁰ … 2²⁰ is an error; if an edit of a texture makes such a ratio, its light
+is lost. `auto` is the fastest formula that is right to the last bit. An edit of `eta` compiles no kernel. Coefficients
+of a dispersive material are exposed for λ in nm, also where its text or file has µm. `refract_<formula>` is the same
+plugin with that formula.
 
 With integrators other than `refract_path`, and in RGB and mono variants, a dispersive index is its value at the d line.
 
@@ -505,7 +506,7 @@ def plugin_class(v: Variant) -> type:
         return v.is_spectral and isinstance(self.varying, DispersiveRatio)
 
     def absorbing(self: Refract) -> bool:
-        """Whether a side absorbs light, which only `refract_path` renders."""
+        """Whether a side has absorption, even if it is 0, which only `refract_path` renders."""
         return any(self.absorptions.values())
 
     members = {

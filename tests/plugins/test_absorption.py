@@ -169,8 +169,9 @@ def test_a_negative_value_of_a_spectrum_is_an_error(each_variant):
         mi.load_string(text)
 
 
-def test_sampling_without_following_media_is_an_error(each_variant):
-    bsdf = load(ext_colour=0.5, ext_colour_distance=1.0)
+@pytest.mark.parametrize("colour", [0.5, 1.0])  # 1 absorbs nothing, but can be edited
+def test_sampling_without_following_media_is_an_error(each_variant, colour):
+    bsdf = load(ext_colour=colour, ext_colour_distance=1.0)
     assert np.isfinite(sampled(bsdf, (0, 0, 1), 0.5, followed_context()).weight).all()
     assert refusal(sampled, bsdf, (0, 0, 1), 0.5).startswith(
         "refract: ext_colour; expected the integrator refract_path"
