@@ -34,7 +34,8 @@ def trace(
         ),
     ] = None,
     branches: Annotated[
-        int | None, typer.Option(min=0, help="Largest number of partial reflections on a path.")
+        int | None,
+        typer.Option(min=0, max=scene_file.MOST_BRANCHES, help="Largest number of partial reflections on a path."),
     ] = None,
     rays: Annotated[int | None, typer.Option(min=1, help="Number of rays in each beam of more than one ray.")] = None,
     max_depth: Annotated[int | None, typer.Option(min=1, help="Largest number of boundaries on a path.")] = None,

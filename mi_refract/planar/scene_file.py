@@ -31,6 +31,7 @@ from .shared_boundaries import Indices, Part, boundaries
 SIZE = 2**24  # bytes of the file
 PIECES = 2**22  # pieces of all curves, once for each colour
 RAYS = 2**24  # rays of all beams
+MOST_BRANCHES = 8  # partial reflections on a path
 FARTHEST = 1e100  # coordinate: products of two do not overflow
 
 Positive = Annotated[float, Meta(gt=0)]
@@ -259,7 +260,7 @@ class SceneTable(Struct, kw_only=True, forbid_unknown_fields=True):
     wavelengths: Annotated[Wavelengths | None, doc("nm, or how many from 380 to 730; replace `colours`")] = None
     light: Annotated[Literal["flat", "D65"], doc("powers of the wavelengths: equal, or those of daylight")] = "flat"
     max_depth: Annotated[int, Meta(ge=1, le=100_000), doc("largest number of boundaries that a ray meets")] = 16
-    branches: Annotated[int, Meta(ge=0, le=8), doc("largest number of partial reflections on a path")] = 0
+    branches: Annotated[int, Meta(ge=0, le=MOST_BRANCHES), doc("largest number of partial reflections on a path")] = 0
     view: Annotated[Box | None, doc("x0, x1, y0, y1 of the figure; by default it shows all shapes")] = None
     shape: Annotated[list[AnyShape], Meta(min_length=1), doc("[[shape]]: boundaries between media")]
     beam: Annotated[list[AnyBeam], Meta(min_length=1), doc("[[beam]]: rays to follow")]
