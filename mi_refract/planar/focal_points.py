@@ -32,7 +32,6 @@ Point = tuple[float, float]
 Cells = tuple[str, ...]
 ROUNDING = 2.0**-44  # a sum below this share of its terms counts as 0: the error of some hundred roundings
 GRAZING = 1e-6  # smallest cosine between an axis and a boundary's normal for which there is a paraxial limit
-PARALLEL = 1e-9  # sine of the angle between two lines that count as parallel
 SYMMETRIC = 1e-3  # sine of the angle by which two rays may differ from mirror images of each other
 SHARP = 0.25  # largest RMS distance at a real focus, as a share of that at the first boundary
 STEEPEST = math.radians(89)  # largest angle to the mean direction for which there is a spot
@@ -134,7 +133,7 @@ def spread(origins: Array, directions: Array) -> Spread:
     for last in (False, False, True):  # repeated from near the spot, where differences lose no digits
         arms = origins - centre
         y = arms @ across - slopes * (arms @ axis)
-        if not last and np.ptp(slopes) > PARALLEL:
+        if not last and np.ptp(slopes) > _parallel(directions):
             # var(y + s slope) is least at s = −cov(y, slope)/var(slope)
             centre = centre + across * y.mean() - axis * (y @ relative_slopes / (relative_slopes @ relative_slopes))
     spot_centre, offsets = centre + across * y.mean(), y - y.mean()
@@ -149,10 +148,15 @@ def closest_point(origins: Array, directions: Array) -> Array | None:
     """
     centre = origins.mean(axis=0)
     across = _turned(directions)
-    if np.linalg.svd(across, compute_uv=False)[-1] <= PARALLEL * math.sqrt(len(across)) or len(across) < 2:
+    if np.linalg.svd(across, compute_uv=False)[-1] <= _parallel(directions) * math.sqrt(len(across)) or len(across) < 2:
         return None
     distances = ((origins - centre) * across).sum(axis=1)
     return np.asarray(centre + np.linalg.lstsq(across, distances, rcond=None)[0])
+
+
+def _parallel(directions: Array) -> float:
+    """Sine of the angle between two lines that count as parallel: 1e-9, or 16 ε of their directions if that is more."""
+    return max(1e-9, 16 * float(np.finfo(directions.dtype).eps))
 
 
 def spot(origins: Array, directions: Array, plane: Plane) -> Spot | None:
@@ -324,7 +328,7 @@ def _group_spread(
     result = replace(result, aperture=n * math.hypot(*(directions[i] - directions[j])) / 2)
     # Where the outermost pair crosses, if it does.
     sine = _cross(directions[i], directions[j])
-    if abs(sine) > PARALLEL:
+    if abs(sine) > _parallel(directions):
         marginal = _point(origins[i] + directions[i] * (_cross(origins[j] - origins[i], directions[j]) / sine))
         result = replace(result, marginal=marginal)
     # The axis midway between the innermost pair, if it goes through the same events as the pair.

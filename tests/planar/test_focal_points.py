@@ -117,6 +117,20 @@ def test_a_slab_is_afocal():
     assert lines[4].split()[3:] == ["infinite", "–", "–", "–", "–"]
 
 
+def test_rays_that_are_parallel_up_to_rounding_have_no_focus(needs_variant):
+    """Of a lens that turns a fan of rays into parallel ones."""
+    needs_variant("llvm_ad_rgb")
+    lens = shapes.ellipse_lens(1.5, 9.0, 4.0, 3.0).between(1.5, 1.0)
+    collimated = scene(lens, np.zeros((10, 2)), unit(np.radians(np.linspace(170, 190, 10))))
+    exact, rounded = (
+        focal_points.groups(collimated, follow_scene(collimated, precision=precision, backend="llvm"))[0].spread
+        for precision in ("float64", "float32")
+    )
+    for spread in (exact, rounded):
+        assert (spread.rays, spread.focus, spread.marginal, spread.paraxial) == (10, None, None, None)
+    assert (rounded.rms, rounded.largest) == pytest.approx((exact.rms, exact.largest), rel=1e-5)
+
+
 # The paraxial limit --------------------------------------------------------------------------------------------
 
 
