@@ -158,7 +158,7 @@ BAD = {
     "no folder": (("-o", "{}/none/image.svg"), "is not a folder"),
     "folder": (("-o", "{}/folder.svg"), "is a folder"),
     "branches": (("--branches", "-1"), "--branches"),
-    "more branches than in a scene file": (("--branches", "9"), "'--branches': Input should be less than or equal to 8"),
+    "more branches than in a file": (("--branches", "9"), "'--branches': Input should be less than or equal to 8"),
     "no rays": (("--rays", "0"), "--rays"),
     "no depth": (("--max-depth", "0"), "--max-depth"),
     "formula": (("--formula", "snell"), "formula = 'snell': unknown; expected wedge"),
