@@ -146,6 +146,28 @@ def test_a_reference_without_a_caustic_fails_and_one_without_expected_light_else
         assert (detectable <= limits.CAUSTIC_DETECTABLE) == passes
 
 
+@pytest.mark.parametrize(("gap", "direct"), [(0.0006, False), (0.06, True)])
+def test_light_through_the_gaps_of_a_surface_is_no_direct_light(monkeypatch, llvm_variant, gap, direct):
+    """Water with a gap that some 3000th of the light passes, or a hundred times as much."""
+
+    def halves(bsdf):
+        place = mi.ScalarTransform4f
+        return {
+            name: {
+                "type": "rectangle",
+                "to_world": place().translate([side * (5 + gap / 2), 2.6, 0]).rotate([1, 0, 0], -90).scale([5, 10, 1]),
+                "bsdf": caustic_scenes.glass(bsdf, 1.333),
+            }
+            for name, side in (("left", -1), ("right", 1))
+        }
+
+    monkeypatch.setitem(caustic_scenes.BODIES, "pool", halves)
+    extent = dataclasses.replace(SMALL, renders=2, checked_spp=1024)
+    black = caustic_scenes.scene("pool", caustics.SQUARE, caustic_scenes.BLACK, 24)
+    assert Camera(black, mi.load_dict({"type": "path"}))(1024, seed=0)[0].any()
+    assert caustics.reference("pool", caustics.SQUARE, extent).direct == direct
+
+
 # Defects -------------------------------------------------------------------------------------------------------------
 
 

@@ -83,6 +83,7 @@ NOT_AIMED = 8  # factor of the samples of `ptracer` for lamps that it does not a
 # Factors of the tested samples: the caustic is dim or on few pixels, or the light seen in the water is noisy.
 MORE = {"diamond": 4, "ring": 8, "pool, square 0.2": 16}
 NOISE_RENDERS, NEARLY_BLACK = 4, 1e-6  # for the noise by class: renders per round; reflectance of the black floor
+LEAKS = 1e-3  # a smaller share of the light has passed between triangles, as one ray in some millions does
 BOUNDARIES = 6  # the most boundaries of light that counts for the energy of a caustic
 
 
@@ -225,7 +226,7 @@ def energy_rows(context: Context, body: str, lamp: str, methods: tuple[Method, .
 class Reference:
     """Independent renders of a case, and masks (height × width) of pixels that see no glass and of the caustic.
 
-    `direct`: whether light also reaches the camera without glass.
+    `direct`: whether light also reaches the camera without glass, more than passes between triangles.
     """
 
     renders: np.ndarray
@@ -245,7 +246,8 @@ def reference(body: str, lamp: str, extent: Extent) -> Reference:
     direct = camera_of(black, BUILTIN)(spp, seed=0)[0].mean(-1)
     # Another render selects the pixels: pixels selected by the noise of the references would be too bright in them.
     light = camera(spp, seed=FIRST_REFERENCE - 1)[0].mean(-1)
-    return Reference(renders, without_glass, without_glass & (light - direct > SHARE * light), bool(direct.any()))
+    caustic = without_glass & (light - direct > SHARE * light)
+    return Reference(renders, without_glass, caustic, bool(direct.mean() > LEAKS * light.mean()))
 
 
 def image_rows(
