@@ -167,7 +167,7 @@ def tolerance(
     failed = _beyond(difference, a, b, fail, fail_relative).size
     warned = _beyond(difference, a, b, warn, warn_relative).size
     few = failed <= allow_failures
-    values = pixels * a.shape[2]  # in pixels that are not compared, the difference is 0
+    values = max(pixels * a.shape[2], 1)  # in pixels that are not compared, the difference is 0
     metrics = (
         Metric("pixels beyond the tolerance", failed, max(allow_failures, _max_count(fail_percent, pixels))),
         Metric("largest difference", largest, None if few else _rounded(hard_fail, kind)),
