@@ -123,7 +123,8 @@ def _parts(shape: Node, surface: Surface, level: int, most: int) -> tuple[Triang
         raise ValueError(str(shape.error(f"{path}: {error}", "a mesh that Mitsuba reads"))) from None
     if mitsuba_mesh.has_normals(mesh):
         raise shape.error("smooth normals", "face_normals = true")
-    vertices, faces = (array.astype(kind) for array, kind in zip(mitsuba_mesh.arrays(mesh), (float, int), strict=True))
+    stored, indices = mitsuba_mesh.arrays(mesh)
+    vertices, faces = stored.astype(np.float64), indices.astype(np.int64)
     _check_count(shape, len(faces), most)
     if not tessellation.is_closed(faces):  # vertices may be split, as for texture coordinates
         vertices, faces = tessellation.welded(vertices[faces])
