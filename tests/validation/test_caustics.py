@@ -146,9 +146,9 @@ def test_a_reference_without_a_caustic_fails_and_one_without_expected_light_else
         assert (detectable <= limits.CAUSTIC_DETECTABLE) == passes
 
 
-@pytest.mark.parametrize(("gap", "direct"), [(0.0006, False), (0.06, True)])
+@pytest.mark.parametrize(("gap", "direct"), [(2e-5, False), (0.006, True)])
 def test_light_through_the_gaps_of_a_surface_is_no_direct_light(monkeypatch, llvm_variant, gap, direct):
-    """Water with a gap that some 3000th of the light passes, or a hundred times as much."""
+    """Water with a gap that some 1e-5 of the light passes, or 300 times as much."""
 
     def halves(bsdf):
         place = mi.ScalarTransform4f

@@ -83,7 +83,7 @@ NOT_AIMED = 8  # factor of the samples of `ptracer` for lamps that it does not a
 # Factors of the tested samples: the caustic is dim or on few pixels, or the light seen in the water is noisy.
 MORE = {"diamond": 4, "ring": 8, "pool, square 0.2": 16}
 NOISE_RENDERS, NEARLY_BLACK = 4, 1e-6  # for the noise by class: renders per round; reflectance of the black floor
-LEAKS = 1e-3  # a smaller share of the light has passed between triangles, as one ray in some millions does
+LEAKS = 1 / 30_000  # share of the light: about as many rays miss a boundary at edges (`plugins/medium_tracking`)
 BOUNDARIES = 6  # the most boundaries of light that counts for the energy of a caustic
 
 
