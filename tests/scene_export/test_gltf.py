@@ -233,6 +233,7 @@ MESHES = {
         Mesh("hollow", BALL[0] + 9, BALL[1], Glass(1.0, 1.5)),
         Mesh("far", BALL[0] + 18, BALL[1], Glass(1.5, 1.0)),
     ],
+    "grey: reflectance = (0.5, 1.5, 0.5); expected at most 1": [Mesh("grey", *PANE, Diffuse((0.5, 1.5, 0.5)))],
 }
 
 

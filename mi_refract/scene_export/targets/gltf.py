@@ -146,6 +146,8 @@ def _around_glass(plain: PlainScene, mesh: Mesh, outside: float) -> Mesh:
     ExportError for a material that glTF cannot hold.
     """
     material, place = mesh.material, f"{plain.name}: {mesh.name}"
+    if isinstance(material, Diffuse) and max(material.reflectance) > 1:
+        raise ExportError(f"{place}: reflectance = {material.reflectance}; expected at most 1 in glTF")
     if not isinstance(material, Glass):
         return mesh
     if not is_closed(mesh.faces):
