@@ -129,7 +129,8 @@ def _parts(shape: Node, surface: Surface, level: int, most: int) -> tuple[Triang
     if not tessellation.is_closed(faces):  # vertices may be split, as for texture coordinates
         vertices, faces = tessellation.welded(vertices[faces])
         faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-    return ((vertices, faces),)
+    used, faces = np.unique(faces, return_inverse=True)  # a file may have vertices without a face, however far away
+    return ((vertices[used], faces.reshape(-1, 3)),)
 
 
 def _frame(shape: Node) -> Vertices:
@@ -206,14 +207,20 @@ def _glass(bsdf: Node) -> Glass:
     """Read a glass: a Glass if two indices describe it (an absorption of 0 is none), otherwise a VolumeGlass."""
     sides = {"int_ior": "bk7", "ext_ior": "air"}
     for name in sides:
-        if isinstance(texture := bsdf.take(name), Node):
-            raise bsdf.error(f"{name} is a {texture.type}", "the same index at all points")
+        if isinstance(value := bsdf.take(name), Node):
+            raise bsdf.error(f"{name} is a {value.type}", "the same index at all points")
     try:
         with scene_parser.folders(*bsdf.scene.parsed.folders):
             inside, outside = (read_medium(bsdf.props, name, default) for name, default in sides.items())
         n_int, n_ext = (float(medium.index(media.LINES["d"])) for medium in (inside, outside))
     except ValueError as error:
         raise ValueError(f"{bsdf.scene.path}: {bsdf}: {str(error).removeprefix(f'{PLUGIN}: ')}") from None
+    if bsdf.type == "dielectric":
+        named = {name: bsdf.props[name] for name in sides if isinstance(bsdf.props.get(name), str)}
+        try:
+            mi.load_dict({"type": bsdf.type} | named)
+        except RuntimeError:
+            raise bsdf.error(", ".join(f"{k} = {v}" for k, v in named.items()), "a name that Mitsuba knows") from None
     sigmas = {side: _sigma(bsdf, side) if bsdf.type != "dielectric" else BLACK for side in ("int", "ext")}
     parameters = [
         f"{name} = {bsdf.props.get(name, default)}"

@@ -361,6 +361,10 @@ REFUSED = {
         '<bsdf type="$bsdf"><string name="int_ior" value="water"/>',
         '<bsdf type="dielectric"><string name="int_ior" value="nonsense"/>',
     ),
+    "int_ior = SCHOTT:N-BK7; expected a name that Mitsuba knows": (
+        '<bsdf type="$bsdf"><string name="int_ior" value="water"/>',
+        '<bsdf type="dielectric"><string name="int_ior" value="SCHOTT:N-BK7"/>',
+    ),
     "scene.xml: refract: int_ior is a checkerboard": (
         '<string name="int_ior" value="water"/>',
         '<texture type="checkerboard" name="int_ior"/>',
@@ -432,6 +436,18 @@ def test_other_errors(scene):
         from_mitsuba.load(scene(), level=9)
     with pytest.raises(ValueError, match="oops"):
         from_mitsuba.load(scene(), defines={"oops": "1"})
+
+
+def test_vertices_without_a_face_are_left_out(scene, tmp_path):
+    vertices, faces = tessellation.cube()
+    rows = [*vertices.tolist(), [1e6, 0, 0]]
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n" + "".join(f"property float {x}\n" for x in "xyz")
+    head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    lines = [" ".join(map(str, row)) for row in rows] + [f"3 {a} {b} {c}" for a, b, c in faces]
+    (tmp_path / "m.ply").write_text(head + "\n".join(lines) + "\n")
+    ply = 'type="ply"><string name="filename" value="m.ply"/><boolean name="face_normals" value="true"/>'
+    mesh = from_mitsuba.load(scene(BALL, ply)).meshes[0]
+    assert np.array_equal(mesh.vertices[mesh.faces], vertices[faces])
 
 
 def test_smooth_normals_are_refused(scene, tmp_path):

@@ -28,8 +28,8 @@ pip install bpy==5.0.1          (Python 3.11)
 python render.py --spp 256 --seeds 1 2 3 4 --out .
 """
 CYCLES_ASSUMPTIONS = (
-    "max_bounces and every other bounce limit are Mitsuba's max_depth - 2. min_light_bounces has the same value, which "
-    "switches Russian roulette off.",
+    "max_bounces and every other bounce limit are Mitsuba's max_depth - 2, at most 1024. min_light_bounces has the "
+    "same value, which switches Russian roulette off.",
     "A box filter of one pixel, no clamping, no blurred caustics (blur_glossy = 0), light_sampling_threshold = 0, no "
     "adaptive sampling, no denoising.",
     "A light emits on one side and is black from behind.",
