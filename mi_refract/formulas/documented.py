@@ -2,10 +2,12 @@
 
 Every formula is `f(a, n, k) -> (b, transmitted)` in the conventions of the package docstring. The entries of FORMULAS
 are total functions without branches on data: invalid input (a zero or non-finite vector, a ratio outside
-2⁻²⁰ … 2²⁰) gives NaN and False. The functions of this module skip that check (NaN still gives NaN), for callers that
-have made it, such as the plugin. `a` and `n` are 3-vectors of any Dr.Jit backend and precision, `k` is a number or an
-array of that precision; a wider `k` is rounded to it once. The documented formulas take unit `a` and `n`; an error of
-their lengths is an error of the result. Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted ().
+2⁻²⁰ … 2²⁰) gives NaN and False. The functions of this module skip that check, for callers that have made it, such as
+the plugin; NaN in `a` or `n` still gives NaN.
+
+`a` and `n` are 3-vectors of any Dr.Jit backend and precision, `k` is a number or an array of that precision; a wider
+`k` is rounded to it once. The documented formulas take unit `a` and `n`; an error of their lengths is an error of the
+result. Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted ().
 """
 
 from __future__ import annotations

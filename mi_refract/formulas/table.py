@@ -69,7 +69,9 @@ class Formula:
     def unchecked(
         self, a: Vector3, n: Vector3, k: Number, contrast: Number = None, local: LocalCosines | None = None
     ) -> Refracted:
-        """The formula without the checks of `__call__`, which are its precondition; NaN gives NaN and False.
+        """The formula without the checks of `__call__`, which are its precondition.
+
+        NaN in `a` or `n` gives NaN and False; for a `k` that is NaN the ray is reflected.
 
         `local`: the cosines of a float32 ray, if `n` is the literal z axis and the caller has computed them already.
         """

@@ -331,7 +331,7 @@ def refract(self: Refract, si: Interaction, active: Mask, wavelength: Number | N
     inner, outer, active = ratios(self, si, active, wavelength)
     k, eta = (dr.select(outside, *pair) for pair in ((outer, inner), (inner, outer)))
     side = Side(k, (k - 1) * (k + 1))
-    # Unchecked: the ratio was checked when it was set, and NaN stays NaN.
+    # Unchecked: the ratio was checked when it was set, and NaN in `a` stays NaN.
     local = local_cosines(a.x, a.y, a.z, side.contrast)
     wo, transmitted = self.formula.unchecked(a, self.v.Vector3f(0, 0, 1), *side, local)
     odds = fresnel.local_odds(local, transmitted, *side)
