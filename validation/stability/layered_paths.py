@@ -38,6 +38,7 @@ DIRECTION, MEDIAN_DIRECTION, PLACE = "direction", "median direction", "place"
 TERMS = {
     "direction": "largest |d − exact| anywhere on a path, divided by the sine of the angle of entry",
     "direction / condition": "the same, divided by the factor by which a decreasing cosine magnifies any error",
+    "direction / bound": "that over the bound of the ray's number of boundaries",
     PLACE: "largest distance from the exact path, divided by the exact path's extent across the layers",
     INDICES: "Snell's law in double precision for indices rounded to float32, the inputs of the built-in",
     RATIOS: "the same for ratios of neighbours rounded to float32, the inputs of the other formulas",
@@ -367,19 +368,23 @@ def _path_row(layers: Layers, name: str, exact: list[Path], parts: list[Deviatio
     """
     directions, places = ([float(getattr(part, x).max()) for part in parts] for x in ("direction", "place"))
     boundaries = [len(path.media) - 1 for path in exact]
+    conditioned = np.array([part.conditioned.max() for part in parts])
     values = {
         DIRECTION: max(directions),
-        "direction / condition": float(np.max([part.conditioned.max() for part in parts])),
+        "direction / condition": float(conditioned.max()),
         MEDIAN_DIRECTION: float(np.median(directions)),
         PLACE: max(places),
         "median place": float(np.median(places)),
         WRONG_PATH: float(sum(part.boundaries != m for part, m in zip(parts, boundaries, strict=True))),
     }
+    if not layers.round:
+        bounds = limits.PATH_BOUNDARY * (2 * np.array(boundaries) + 1)
+        values["direction / bound"] = float((conditioned / bounds).max())
     formula = FORMULAS.get(name.removeprefix(f"{PLUGIN}_"))
     budgets: dict[str, float] = {}
     if name == PLUGIN or (formula and formula.budget.at_the_limit):
         budgets = {WRONG_PATH: 0.0}
-        budgets |= {} if layers.round else {"direction / condition": (2 * max(boundaries) + 1) * limits.PATH_BOUNDARY}
+        budgets |= {} if layers.round else {"direction / bound": 1.0}
     return Row(NAME, name, f"{layers.scene}: path", values=values, budgets=budgets, **row)
 
 
