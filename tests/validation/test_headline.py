@@ -8,9 +8,9 @@ import pytest
 
 from mi_refract.report.row import Reason, Row
 from mi_refract.report.study_page import STATES
-from validation.directions import bsdf_samples, per_formula, search, sweep
+from validation.directions import per_formula, search, sweep
 from validation.efficiency import error_against_time
-from validation.ground_truth import standard_numbers, traced_bodies
+from validation.ground_truth import traced_bodies
 from validation.renders import against_dielectric
 from validation.run import headline, metrics
 from validation.stability import layered_paths, optical_chains
@@ -72,8 +72,7 @@ def test_the_names_are_those_of_the_studies():
         layered_paths: headline.PATHS,
     }
     assert all(name == study.NAME for study, name in named.items()) and per_formula.ALL == headline.EVERYTHING
-    judges = per_formula, sweep, search, bsdf_samples, traced_bodies, standard_numbers
-    assert tuple(study.NAME for study in judges) == headline.JUDGES and headline.SUMMARY == matrix.NAME
+    assert (per_formula.NAME, sweep.NAME, search.NAME) == headline.FORMULAS_IN and headline.SUMMARY == matrix.NAME
     known = {headline.COMMON, metrics.WORST_IN_U, metrics.MISCLASSIFIED, metrics.MISCLASSIFIED_FAR}
     assert known <= per_formula.TERMS.keys()
     assert metrics.EQUAL_TIME in error_against_time.TERMS
@@ -103,6 +102,8 @@ BODY = Row("ground_truth", "refract", "prism", "llvm_ad_rgb", {"error / bound": 
         ([dataclasses.replace(OURS, values=WORST | {"worst / u": 2.0})], 0, "yes", ["Yes."], ["no more than rounding"]),
         ([BODY], 0, "yes", ["Yes.", "Through 1 bodies", "all its rays stay within"], ["direction"]),
         ([dataclasses.replace(BODY, values={"error / bound": 2.0})], 0, "no", ["No:", "some of its rays leave"], []),
+        ([BODY, DARK], 0, "no", ["No: a check failed.", "all its rays stay within"], ["Yes"]),
+        ([OURS, dataclasses.replace(SPOILT, study="media")], 1, "no", ["A check of `promoted`"], ["trusted"]),
         ([BODY, dataclasses.replace(BODY, values={"error / bound": math.nan})], 0, "no", ["of its rays leave"], []),
         ([SCALAR, SLOW], 1, "yes", ["in double precision"], ["single"]),
         ([SCALAR, SLOW], 2, "plain", ["67 times as long", "use a compiled variant"], ["%"]),

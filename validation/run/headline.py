@@ -27,10 +27,8 @@ OURS, BUILTIN_FORMULA = ("compensated", "promoted"), "mi.fresnel + mi.refract"
 GROUND_TRUTH, RENDERS, EFFICIENCY, PATHS = "ground_truth", "renders", "efficiency", "paths"
 PLUGIN, BUILTIN, INTEGRATOR, METHODS = "refract", "dielectric", "refract_path", "every method"
 SUMMARY = "matrix"  # a study that repeats rows of others
-# Studies that judge formulas, those that judge `refract`, and their subjects.
-FORMULAS_IN = (DIRECTIONS, "sweep", "search")
-JUDGES = (*FORMULAS_IN, "samples", GROUND_TRUTH, "standard numbers")
-JUDGED = (*OURS, PLUGIN, f"{PLUGIN} − {BUILTIN}")
+FORMULAS_IN = (DIRECTIONS, "sweep", "search")  # studies that judge all formulas
+JUDGED = (*OURS, PLUGIN, f"{PLUGIN} − {BUILTIN}")  # subjects that judge `refract`, in any study
 MIRAGE, EXACT, ROUNDED = "mirage", "exact", "exact, indices in float32"
 LAYERS, SHALLOW = 1000, "89.55°"
 INSTALL = "python -m validation renderers --install"
@@ -51,9 +49,9 @@ def first_page(rows: Sequence[Row], profile: str = "") -> FirstPage:
     """Return questions and answers, an image of a scene in which the plugins differ, and a plot of error and time."""
     directions, renders, paths = (select(rows, study) for study in (DIRECTIONS, RENDERS, PATHS))
     ours = select(renders, subject=PLUGIN)
-    judged = [row for row in rows if row.study in JUDGES and row.subject in JUDGED]
-    facts = _directions(directions) | _renders(ours, select(rows, EFFICIENCY)) | _paths(rows, paths)
     own = [row for row in rows if row.study != SUMMARY]
+    judged = [row for row in own if row.subject in JUDGED]
+    facts = _directions(directions) | _renders(ours, select(rows, EFFICIENCY)) | _paths(rows, paths)
     broken = [name for name in OURS if any(row.verdict == "fail" for row in judged if row.subject == name)]
     facts |= {
         "bodies": select(rows, GROUND_TRUTH, PLUGIN, metric=metrics.ERROR_OVER_BOUND),
@@ -68,7 +66,11 @@ def first_page(rows: Sequence[Row], profile: str = "") -> FirstPage:
         "right": ("Is `refract` right?", judged, DIRECTIONS),
         "trusted": (
             "How far can each formula be trusted?",
-            [row for row in rows if row.study in FORMULAS_IN and row.subject != BUILTIN_FORMULA],
+            [
+                row
+                for row in own
+                if (row.study in FORMULAS_IN and row.subject != BUILTIN_FORMULA) or row.subject in OURS
+            ],
             DIRECTIONS,
         ),
         "fast": ("Is it as fast as `dielectric`?", [], EFFICIENCY if facts["equal_time"] else RENDERS),
