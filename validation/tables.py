@@ -24,6 +24,7 @@ from mi_refract.ray_sets.header import PRECISIONS
 from mi_refract.regimes import REGIMES
 from mi_refract.report.embedded_images import png
 from mi_refract.report.row import Row
+from validation import repeated
 from validation.diff import visible_changes
 from validation.directions import per_formula
 from validation.efficiency import caustics, changing_indices, chosen_settings, error_against_time
@@ -92,9 +93,9 @@ def write(rows: list[Row], context: Context, studies: list[str]) -> None:
 
 
 def _measured(rows: list[Row], study: str, needs: Iterable[str] = (), subject: str = "") -> list[Row]:
-    """Return the measured rows of a study (and a subject) that have all of these metrics."""
+    """Return the measured rows of a study (and a subject) that have all of these metrics, without other seeds."""
     measured = [row for row in rows if row.study == study and row.values and subject in ("", row.subject)]
-    return [row for row in measured if row.values.keys() >= set(needs)]
+    return [row for row in measured if row.values.keys() >= set(needs) and row.case == repeated.own_case(row.case)]
 
 
 def _table(text: str, heading: Iterable[str], lines: list[list[str]], missing: str) -> str:
@@ -441,7 +442,6 @@ def visible(rows: list[Row]) -> str:
     """Return the errors of FLIP for changes that a person does not see and for those that a person sees."""
     study, missing = visible_changes, "visible changes were planted"
     measured = _measured(rows, study.NAME)
-    # Without other seeds.
     kinds = [row for row in measured if row.case != study.LIMIT and row.subject in (*study.KINDS, study.EDGE)]
     metrics = (*study.MEASURED, study.ERROR)
     cells = [

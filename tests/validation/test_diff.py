@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from mi_refract.image_diff import flip, folders, self_test, tile_statistics
-from mi_refract.image_diff.methods import METHODS
+from mi_refract.image_diff.comparison import Verdict
+from mi_refract.image_diff.methods import METHODS, compare
 from mi_refract.image_diff.settings import Settings
 from validation import limits, tables
 from validation.diff import planted_defects, times, visible_changes, welch_nulls
+from validation.run import tightness
 
 
 def test_spoilt_glass_is_spoilt_as_it_says(scalar_context):
@@ -77,7 +79,8 @@ def test_what_nobody_sees_is_equal_and_what_a_person_sees_is_different():
     assert np.isnan(codes[0]) and codes[-1] < 12
     assert (np.diff(codes[~np.isnan(codes)]) <= 0).all()  # the wider, the fainter
     assert 1 < limit_rows[-1].values[visible_changes.PIXELS] <= 2
-    text = tables.visible([*rows.values(), *limit_rows])
+    other = [replace(row, case=f"{row.case}, other seed 1") for row in (*rows.values(), *limit_rows)]
+    text = tables.visible([*rows.values(), *limit_rows, *other])
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
     assert [line[0] for line in lines[2 : 2 + len(rows)]] == list(rows)
     assert (lines[2][2], lines[2][-1], lines[-1][:2]) == ("not seen", "0.0%", ["codes of 255", "never"])
@@ -144,6 +147,21 @@ def test_a_wrong_minimum_detectable_difference_fails_in_every_profile(factor, br
     )
     (row,) = welch_nulls.power_rows(min(welch_nulls.PLANTED.values()))
     assert row.broken.keys() == broken | ({"missed at half"} if "missed" in broken else set())
+
+
+def test_a_difference_that_is_detected_but_called_inconclusive_is_missed(monkeypatch):
+    def undecided(*pair, **options):
+        result = compare(*pair, **options)
+        return result.but(Verdict.INCONCLUSIVE, "undecided") if result.verdict is Verdict.DIFFERENT else result
+
+    monkeypatch.setattr(welch_nulls, "POWER", {"renders": ((256, 256),)})
+    monkeypatch.setattr(welch_nulls, "compare", undecided)
+    (row,) = welch_nulls.power_rows(min(welch_nulls.PLANTED.values()))
+    assert row.broken.keys() == {"missed"}
+
+
+def test_the_bounds_of_all_null_pairs_are_explained():
+    assert [x for x in welch_nulls.FORMS if not tightness.excluded(welch_nulls.NAME, x, "alarms")] == []
 
 
 def test_what_is_timed(tmp_path):

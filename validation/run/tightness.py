@@ -36,7 +36,7 @@ DIFFUSE = "roundings of thousands of nodes average out; 12.5 u = 7.5e-7 excludes
 PAIRS = (
     *("every form", "variances", "variance of the reference", "variance of the new image", "reference", "new image"),
     *("passes", "passes, filter of 0.5", "passes, filter of 3", "passes of one, filter of 1"),
-    *("renders", "renders, filter of 2", "renders without samples"),
+    *("renders", "renders, filter of 2", "renders, a tile denoised", "renders without samples"),
 )
 NULL_PAIRS = "null pairs, exact", "null pairs, tolerance", "null pairs, paired", "null pairs, flip"
 UNSEEN = (
