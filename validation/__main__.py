@@ -100,7 +100,9 @@ def _command(
     write_tables: Annotated[
         bool, typer.Option("--write-tables", help="Also write the tables of the documentation and the gallery.")
     ] = False,
-    goals: Annotated[bool, typer.Option("--goals", help="Also print the goals for run times.")] = False,
+    goals: Annotated[
+        bool, typer.Option("--goals", help="Also print the goals, most of which are for run times.")
+    ] = False,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Run tasks that measure no times on this Dask scheduler.")
     ] = None,

@@ -175,7 +175,7 @@ def sources() -> str:
     digest = hashlib.sha256()
     folder = Path(__file__).parent
     groups = [place.rglob("*") for place in (Path(mi_refract.__file__).parent, folder, SCENES)]
-    groups.append(folder.with_name("tests").rglob("*.py"))  # they must detect the mutants of our code
+    groups.append(folder.with_name("tests").rglob("*"))  # they must detect the mutants of our code
     for path in sorted(path for group in groups for path in group if path.is_file()):
         if path.suffix != ".pyc":
             digest.update(path.read_bytes())

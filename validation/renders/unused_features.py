@@ -208,8 +208,10 @@ def optimisation_rows(context: Context) -> list[Row]:
         before = float(balls.params[balls.eta][0])
         first, *later = (compiled(functools.partial(step, balls)) for _ in range(STEPS))
         values = {"compiled": sum(later), "compiled, first step": first}
-        values |= {"eta moved": abs(float(balls.params[balls.eta][0]) - before)}
-    return [_row("optimisation of eta", context.variant, values, {"compiled": 0.0}, replay={"steps": STEPS})]
+        moved = abs(float(balls.params[balls.eta][0]) - before)
+        values |= {"eta moved": moved, "eta did not move": float(not moved > 0)}
+    budgets = {"compiled": 0.0, "eta did not move": 0.0}
+    return [_row("optimisation of eta", context.variant, values, budgets, replay={"steps": STEPS})]
 
 
 def step(balls: Balls) -> Any:

@@ -38,7 +38,7 @@ TERMS = {
     FAILED: "number of broken budgets in the row of that study",
     RECORDED: per_ray.TERMS[RECORDED],
     OFF_RECORDED: "the error over the one recorded earlier, or the reciprocal if that is larger; a goal",
-    INCONCLUSIVE: "1 if noise could hide a relevant difference: not a pass, whatever the means are",
+    INCONCLUSIVE: "1 if noise could hide a relevant difference, whatever the means are; a goal",
     "differs": "1 if the images are different and this is known of the system; see its remark",
 }
 CHECKS = {per_ray.NAME: tuple(per_ray.SETS), rendered_images.NAME: tuple(rendered_images.SCENES)}
