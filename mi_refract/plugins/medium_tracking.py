@@ -44,7 +44,8 @@ STRAY = 0.01  # the largest share of wrong crossings of a shape that is not an e
 FEW = 2  # so many wrong crossings are not an error either, unless they are half of the crossings
 NEVER = 2**32 - 1  # the depth of a shape's first wrong crossing, if none exists
 # The share of the way from a ray's origin back to the surface that is searched for another surface. Rounding moves a
-# point by up to an eighth of this distance (`ray_origins`), or by a thousandth of Mitsuba's, which is larger.
+# point by up to an eighth of this distance (`ray_origins`), or by a thousandth of Mitsuba's, which is larger; but of a
+# cylinder with a distance D and a radius R by up to 3 u D²/R, and so of a sphere in an instance that makes it smaller.
 SEARCHED, SEARCHED_FAR = 3 / 4, 1 - 1 / 64
 # A null lobe does not change the medium. Rough and diffuse transmission do.
 THROUGH = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DiffuseTransmission
@@ -127,9 +128,8 @@ class MediumTracker:
     def __init__(self, v: Variant, scene: Scene, extent: float) -> None:
         """`v`: the variant's module. `extent`: that of the shapes with delta lobes; ∞ if rays start as Mitsuba's do."""
         self.v, self.scene, self.vectorised = v, scene, dr.is_jit_v(v.Float)
-        near = extent < math.inf
-        self.searched = SEARCHED if near else SEARCHED_FAR
-        thinnest = "1e-5 of its size and its largest coordinate" if near else "1e-4 of 1 + its largest coordinate"
+        self.near = extent < math.inf
+        thinnest = "1e-5 of its size and its largest coordinate" if self.near else "1e-4 of 1 + its largest coordinate"
         self.crossings = Crossings(v, scene, thinnest)
 
     def cross(
@@ -154,8 +154,13 @@ class MediumTracker:
         length = dr.norm(back)
         absorbs = through & (dr.max(beyond) > 0) & (length > 0)
         ray_back = v.Ray3f(ray.o, back / dr.select(length > 0, length, 1), ray.time, ray.wavelengths)
-        ray_back.maxt = length * self.searched
-        thin = absorbs & self.scene.ray_test(dr.detach(ray_back), absorbs)
+        ray_back.maxt = length * (SEARCHED if self.near else SEARCHED_FAR)
+        if self.near:
+            thin = absorbs & self.scene.ray_test(dr.detach(ray_back), absorbs)
+        else:  # rounding may move the surface itself into this range: another one, or one that faces the other way
+            found = self.scene.ray_intersect(dr.detach(ray_back), mi.RayFlags.Minimal, False, absorbs)
+            other = (found.shape != si.shape) | (found.prim_index != si.prim_index) | (dr.dot(found.n, si.n) < 0)
+            thin = absorbs & found.is_valid() & other
         self.crossings.add(si.shape, depth, through, through & (dr.max(excess) > 0), thin)
         return dr.select(through, beyond, sigma)
 

@@ -317,6 +317,24 @@ def test_a_sheet_that_rays_step_over_is_an_error_too_where_they_start_as_those_o
     assert "thicker than 1e-4 of 1 + its largest coordinate" in text
 
 
+NARROW = matched(int_absorption=2.0)
+ROD = {"type": "cylinder", "p0": [-9, 0, 0], "p1": [9, 0, 0], "bsdf": NARROW}
+UNEVEN = {
+    "a rod": {"rod": ROD | {"radius": 0.3}},
+    "a thin rod": {"rod": ROD | {"radius": 0.03}},
+    "a ball in an instance": grouped(ball={"type": "sphere", "bsdf": NARROW}),
+}
+UNEVEN["a ball in an instance"]["instance"] |= {"to_world": PLACE().scale(0.5)}
+
+
+@pytest.mark.parametrize("solid", UNEVEN)
+def test_a_solid_on_which_mitsubas_points_are_less_exact_is_no_thin_sheet(solid, rgb_variant):
+    wide = {"to_world": PLACE().look_at([0, 0, 6], [0, 0, 0], [0, 1, 0]).scale(0.03)}
+    image = radiance(sensor=wide, integrator=CHANCE, **UNEVEN[solid], spp=256)
+    thickness = {"a rod": 0.6, "a thin rod": 0.06, "a ball in an instance": 1.0}[solid]
+    assert (image > math.exp(-2 * thickness)).all() and (image < 1).all()
+
+
 @pytest.mark.parametrize("order", [("inner", "outer", "far"), ("far", "inner", "outer"), ("outer", "far", "inner")])
 def test_shapes_without_names_are_distinguished(order, rgb_variant):
     """The inner wall of a glass of water declares another σ than the outer one; a ball far away has no influence."""
