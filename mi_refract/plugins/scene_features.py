@@ -292,13 +292,20 @@ def mesh_attributes(node: mi.Object) -> list[str]:
 
 
 def all_shapes(scene: Scene) -> list[Shape]:
-    """Return the shapes of a scene, and those in its shape groups, which `scene.shapes()` omits."""
+    """Return the shapes that rays can meet: those of a scene, and those in its `shape_groups`.
+
+    `scene.shapes()` omits the latter.
+    """
     return [*scene.shapes(), *(shape for group in shape_groups(scene) for shape in shapes_of(group))]
 
 
 def shape_groups(scene: Scene) -> list[Any]:
-    """Return the shape groups of a scene."""
-    return [child for child in children(scene) if child.class_name() == "ShapeGroupPlugin"]
+    """Return the shape groups of a scene that instances show; rays meet no others."""
+    groups = [child for child in children(scene) if child.class_name() == "ShapeGroupPlugin"]
+    instances = [str(shape) for shape in scene.shapes() if groups and shape.class_name() == "Instance"]
+    # Mitsuba exposes the group of an instance only in `str`, and only its name.
+    names = {match[1] for text in instances if (match := re.search(r'name = "(.*)"', text))}
+    return [group for group in groups if group.id() in names]
 
 
 def shapes_of(group: mi.Object) -> list[Shape]:

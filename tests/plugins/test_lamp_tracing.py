@@ -331,6 +331,15 @@ def test_glass_of_no_size_casts_no_light(lamp, llvm_variant):
     np.testing.assert_array_equal(*images)
 
 
+@pytest.mark.parametrize("lamp", [point(), SUN])
+def test_a_group_that_no_instance_shows_casts_no_light(lamp, rgb_variant):
+    spp = 4 if dr.is_jit_v(mi.Float) else 1
+    parts = {"lamp": lamp, "ball": GROUP}
+    images = [tiles(scene(parts, caustics=caustics), spp, [0]) for caustics in ("auto", "path")]
+    assert images[0].all()
+    np.testing.assert_array_equal(*images)
+
+
 @pytest.mark.parametrize("rfilter", ["box", "gaussian", "lanczos"])
 def test_of_one_splat_the_sum_of_squares_is_the_square_of_the_sum(rfilter, typical_variant):
     sensor = mi.load_dict(camera(film={"rfilter": {"type": rfilter}}))

@@ -344,6 +344,12 @@ def test_what_would_be_left_to_chance_is_refused_by_name(other, kind, llvm_varia
     assert refusal(render, scene, 1, deterministic=True) == text
 
 
+def test_what_no_instance_shows_is_not_left_to_chance(llvm_variant):
+    group = {"type": "shapegroup", "matt": {"type": "sphere"}}
+    with_group, without = (render(glass_ball(sky=LIT, **parts), deterministic=True) for parts in ({"g": group}, {}))
+    np.testing.assert_array_equal(with_group, without)
+
+
 # What is left out, and what is refused -------------------------------------------------------------------------
 
 

@@ -64,6 +64,7 @@ LIT = {"sampleable", "lamps", "area"}
         ({"type": "point"}, SMALL),
         ({"type": "directional"}, SMALL | DISTANT),
         (LAMP | {"emitter": {"type": "directionalarea"}}, SMALL | {"area"}),
+        ({"type": "shapegroup", "a": sphere("roughdielectric")}, set()),  # no instance shows it
     ],
 )
 def test_each_part_adds_only_the_features_that_it_needs(part, expected, scalar_variant):
@@ -174,8 +175,9 @@ def test_unknown_plugins_need_everything(scalar_variant):
     instance = {"type": "instance", "group": {"type": "ref", "id": "group"}}
     assert facts(group=group, instance=instance) == EVERYTHING | {"area"}
     assert {*needs(group=group, instance=instance, lamp=POINT).missing(volumes=True)} == {CAST}
-    group["a"]["interior"] = MEDIUM
-    assert facts(group=group, instance=instance) == EVERYTHING | {"area", "media"}
+    cloudy = group | {"a": group["a"] | {"interior": MEDIUM}}
+    assert facts(group=cloudy, instance=instance) == EVERYTHING | {"area", "media"}
+    assert facts(group=group, other=cloudy | {"id": "other"}, instance=instance) == EVERYTHING | {"area"}
 
 
 @pytest.mark.parametrize(("reflectance", "black"), [(0.0, True), ({"type": "rgb", "value": 1e-9}, False)])
