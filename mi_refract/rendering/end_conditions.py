@@ -76,6 +76,8 @@ def relative_error(sums: PassSums) -> RelativeError:
 def without_noise(sums: PassSums) -> bool:
     """Return whether all samples of each pixel are equal, and no pixel is black: light there may be rarely found.
 
+    Opacity and AOVs may be 0.
+
     The rounding of sums of equal samples in float64 causes less than SAME. If one of n ≤ 2³² samples differs by one
     rounding in float32, it causes 6e-8/√n ≥ 9e-13.
     """
@@ -83,7 +85,8 @@ def without_noise(sums: PassSums) -> bool:
     if variance is None:
         return False
     mean = sums.mean
-    return bool((np.isfinite(mean) & (mean != 0) & (variance <= np.square(SAME * mean))).all())
+    equal = np.isfinite(mean) & (variance <= np.square(SAME * mean))
+    return bool(equal.all() and (mean[..., : sums.colours] != 0).all())
 
 
 def require_interval() -> None:

@@ -141,12 +141,17 @@ def test_invalid_options_are_refused_before_the_rendering(tmp_path, monkeypatch,
 
 
 def test_a_render_without_noise_ends_early_unless_it_is_black(tmp_path, llvm_variant):
-    for name, emitter in (("light", '<emitter type="constant"/>'), ("dark", "")):
+    light, deterministic = '<emitter type="constant"/>', '><boolean name="deterministic" value="true"/></integrator>'
+    for name, emitter in (("light", light), ("dark", "")):
         (tmp_path / f"{name}.xml").write_text(SKY.format(emitter))
+    rgba = '"hdrfilm"><string name="pixel_format" value="rgba"/>'
+    text = SKY.format(light).replace('"path"/>', f'"refract_path"{deterministic}').replace('"hdrfilm">', rgba)
+    (tmp_path / "clear.xml").write_text(text)
     ended = "no noise: the samples of every pixel agree"
     expected = {
         ("light", 64): (1, ended),
         ("light", 4): (16, ended),  # 4 samples are too few
+        ("clear", 64): (1, ended),  # opacity is 0 in every pixel, and nothing is truncated
         ("dark", 64): (4, "256 spp"),  # there may be light that no sample has found
         ("dark", 4): (64, "256 spp"),
     }
