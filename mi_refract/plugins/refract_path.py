@@ -319,8 +319,10 @@ def integrator_class(v: Variant) -> type:
             # Local memory has no derivatives, and the evaluated loops that derivatives need have no local memory.
             symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
             if self.deterministic and needs.chance:
+                frozen = " in a frozen function, where no diffuse counts as black"
+                chance = needs.chance + frozen * dr.flag(dr.JitFlag.FreezingScope)
                 expected = "expected only smooth dielectrics and conductors"
-                raise ValueError(f"{INTEGRATOR}: deterministic = true: {needs.chance}; {expected}")
+                raise ValueError(f"{INTEGRATOR}: deterministic = true: {chance}; {expected}")
             if self.deterministic and not symbolic:
                 raise ValueError(f"{INTEGRATOR}: deterministic = true; such a render cannot be differentiated")
             if not symbolic and needs.refracting and needs.smooth and needs.area:

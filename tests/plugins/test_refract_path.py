@@ -344,6 +344,21 @@ def test_what_would_be_left_to_chance_is_refused_by_name(other, kind, llvm_varia
     assert refusal(render, scene, 1, deterministic=True) == text
 
 
+def test_in_a_frozen_function_no_diffuse_counts_as_black(llvm_variant):
+    """So an area lamp needs another BSDF there; Mitsuba gives it a black diffuse."""
+    method, behind = mi.load_dict({"type": "refract_path", "deterministic": True}), PLACE().translate([0, 0, -2])
+
+    def image(**parts):
+        lamp = {"type": "rectangle", "to_world": behind, "emitter": {"type": "area"}} | parts
+        scene = glass_ball(lamp=lamp)
+        frozen = dr.freeze(lambda seed: mi.render(scene, integrator=method, spp=1, seed=seed))
+        return np.array(frozen(dr.opaque(mi.UInt32, 1)))
+
+    assert image(bsdf={"type": "conductor", "specular_reflectance": 0.0}).any()
+    text = "SmoothDiffuse at 'lamp' in a frozen function, where no diffuse counts as black; expected only smooth"
+    assert text in refusal(image)
+
+
 def test_what_no_instance_shows_is_not_left_to_chance(llvm_variant):
     group = {"type": "shapegroup", "matt": {"type": "sphere"}}
     with_group, without = (render(glass_ball(sky=LIT, **parts), deterministic=True) for parts in ({"g": group}, {}))
