@@ -27,8 +27,9 @@ camera sees directly, along `light_paths` paths for each sample of the camera (`
 small; with lamps nearly as large as the scene error × time is up to three times that of `path`. It takes area, point,
 spot and directional lamps, and perspective, thin-lens and orthographic cameras. In scenes with media of Mitsuba's, in
 frozen functions, within another integrator and where a parameter of the scene is differentiated it is an error. `auto`
-traces light from points, spots and directional lamps only, and from none where `lamp` would be an error: so derivatives
-are those of the image by path tracing. What is missing is named in a warning, once a scene (`SceneFeatures.missing`).
+traces light from points, spots and directional lamps only, and from none where `lamp` would be an error for any reason
+but an area lamp: so derivatives are those of the image by path tracing. What is missing is named in a warning, once a
+scene (`SceneFeatures.missing`).
 
 Rays of delta lobes start nearer to the surface that they leave than those of `path` (`ray_origins`): glass may be as
 thin as 4e-6 of the largest shape with such lobes and 2e-6 of its own largest coordinate together, or 2e-6 of the length

@@ -476,6 +476,15 @@ def test_what_lamps_cannot_be_traced_in_is_an_error_and_auto_is_path_tracing(par
         refused.integrator().render(refused, spp=1)
 
 
+@pytest.mark.parametrize("reason", ["a lamp with normals of its own", "a mirrored cylinder", "an attribute"])
+def test_auto_traces_lamps_of_zero_size_beside_area_lamps_that_cannot_be_traced(reason, llvm_variant):
+    parts, message = REFUSED[reason]
+    parts = parts() | {"bulb": point(2.5)}  # below the area lamps
+    by_path, default = (tiles(scene(parts, **more), 4, [0]) for more in ({"caustics": "path"}, {}))
+    assert (default >= 0.999 * by_path).all() and (default > 1.01 * by_path).any()
+    assert message in refusal(mi.render, scene(parts, caustics="lamp"), spp=4)
+
+
 def test_another_integrator_cannot_have_lamps_traced_nor_a_derivative(llvm_variant):
     loaded = scene({}, caustics="lamp")
     around = mi.load_dict({"type": "aov", "aovs": "d:depth", "image": {"type": "refract_path", "caustics": "lamp"}})
