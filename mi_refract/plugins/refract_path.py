@@ -363,6 +363,8 @@ def integrator_class(v: Variant) -> type:
             warnings = [f"missing {path_class}: {text}{untraced}" for path_class, text in missing.items()]
             if needs.thin:
                 warnings.append(f"{needs.thin}; expected a thicker shape, or one nearer to the origin")
+            if needs.inexact:
+                warnings.append(f"{needs.inexact}; expected a mesh, or a sphere that is scaled itself")
             for text in warnings if (needs, self.apart) != before else ():
                 mi.Log(mi.LogLevel.Warn, f"{INTEGRATOR}: {text}")  # type: ignore[operator]
             attached = vectorised and not dr.flag(dr.JitFlag.SymbolicLoops)

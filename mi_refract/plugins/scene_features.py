@@ -88,6 +88,7 @@ class SceneFeatures:
     chance: str  # the first plugin that is not in `DETERMINISTIC`, and its shape; "" if none exists
     delta_extent: float  # extent of the largest shape with delta lobes, for `ray_origins`
     thin: str  # the first shape of glass that is too thin for rays to enter, and why; "" if none exists
+    inexact: str  # the first shape of glass on which Mitsuba's points are less exact than rays need, and why; or ""
     unknown: tuple[str, ...] = ()
 
     @property
@@ -188,6 +189,13 @@ def inspect(scene: Scene, sensor: Sensor | None = None) -> SceneFeatures:
         for i, flags_of_shape in with_delta.items()
         if flags_of_shape & +lobes.DeltaTransmission and (text := ray_origins.too_thin(sizes[i], delta_extent))
     )
+    eyes = [x for x in (*scene.sensors(), sensor) if x is not None]
+    inexact = (
+        f"{shape_name(shapes, i)} {text}"
+        for i in with_delta
+        for instance in instances_of(scene, shapes[i])
+        if (text := ray_origins.inexact(shapes[i], instance, eyes))
+    )
     shape_media = any(shape.interior_medium() or shape.exterior_medium() for shape in shapes)
     return SceneFeatures(
         smooth=everything or bool(flags & +lobes.Smooth),
@@ -223,6 +231,7 @@ def inspect(scene: Scene, sensor: Sensor | None = None) -> SceneFeatures:
         chance=next(chance, ""),
         delta_extent=delta_extent,
         thin=next(thin, ""),
+        inexact=next(inexact, ""),
         unknown=unknown,
     )
 
@@ -302,10 +311,22 @@ def all_shapes(scene: Scene) -> list[Shape]:
 def shape_groups(scene: Scene) -> list[Any]:
     """Return the shape groups of a scene that instances show; rays meet no others."""
     groups = [child for child in children(scene) if child.class_name() == "ShapeGroupPlugin"]
-    instances = [str(shape) for shape in scene.shapes() if groups and shape.class_name() == "Instance"]
-    # Mitsuba exposes the group of an instance only in `str`, and only its name.
-    names = {match[1] for text in instances if (match := re.search(r'name = "(.*)"', text))}
-    return [group for group in groups if group.id() in names]
+    names = {group_name(x) for x in scene.shapes() if x.class_name() == "Instance"} if groups else set()
+    unknown = names - {group.id() for group in groups}  # another format of `str`: any group may be shown
+    return [group for group in groups if unknown or group.id() in names]
+
+
+def group_name(instance: Shape) -> str | None:
+    """Return the name of an instance's shape group, which Mitsuba exposes only in `str`."""
+    match = re.search(r'name = "(.*)"', str(instance))
+    return match[1] if match else None
+
+
+def instances_of(scene: Scene, shape: Shape) -> list[Shape | None]:
+    """Return the instances that may show a shape in a group; [None] for a shape that is in no group."""
+    names = {group.id() for group in shape_groups(scene) if shape in shapes_of(group)} | {None}
+    instances = [x for x in scene.shapes() if x.class_name() == "Instance"] if len(names) > 1 else []
+    return [x for x in instances if group_name(x) in names] or [None]
 
 
 def shapes_of(group: mi.Object) -> list[Shape]:

@@ -374,6 +374,40 @@ def test_glass_that_rays_step_over_is_reported(thickness, place, others, thin, s
     assert thin in text and bool(thin) == bool(text)
 
 
+def shown(scale, **parameters):
+    """Return an instance, scaled by `scale`, of a shape."""
+    group = {"type": "shapegroup", "id": "group", "solid": {"bsdf": GLASS, "id": "solid"} | parameters}
+    to_world = PLACE().scale(scale)
+    return {"group": group, "i": {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": to_world}}
+
+
+def pipe(radius, **parameters):
+    return {"solid": {"type": "cylinder", "radius": radius, "bsdf": GLASS, "id": "solid"} | parameters}
+
+
+@pytest.mark.parametrize(
+    ("parts", "distance", "text"),
+    [
+        (shown(0.5, type="sphere"), 6, ""),
+        (shown(0.2, type="sphere"), 6, "'solid' is a Sphere in an instance that scales it by 0.2, on which"),
+        (shown((1, 1, 0.2), type="sphere"), 6, "scales it by 0.2, on which Mitsuba's points err by up to 0.00069"),
+        (shown(0.5, type="sphere"), 30, "err by up to 0.00043, seen from 30, but rays start 8.9e-05 from"),
+        (shown(2, type="sphere"), 30, ""),
+        (shown(0.2, type="cube"), 30, ""),
+        (shown(0.2, type="sphere", bsdf={"type": "diffuse"}), 6, ""),
+        ({"solid": {"type": "sphere", "radius": 0.01, "bsdf": GLASS}}, 30, ""),
+        (pipe(0.1), 5, ""),
+        (pipe(0.1), 30, "'solid' is a Cylinder, on which Mitsuba's points err by up to 0.0021"),
+        (pipe(0.1, p0=[0, 0, 25], p1=[0, 0, 29]), 30, ""),  # nearer
+        (shown(0.1, type="cylinder"), 30, "'solid' is a Cylinder in an instance that scales it by 0.1, on which"),
+    ],
+)
+def test_shapes_on_which_mitsubas_points_are_not_exact_enough_are_reported(parts, distance, text, typical_variant):
+    at = PLACE().look_at([0, 0, distance], [0, 0, 0], [0, 1, 0])
+    reported = needs(sensor={"type": "perspective", "to_world": at}, **parts).inexact
+    assert text in reported and bool(text) == bool(reported)
+
+
 def test_the_size_of_merged_meshes_is_that_of_all_parts(llvm_variant):
     """Mitsuba's bounding box of such a mesh omits rectangles."""
     part = '<shape type="{}"><transform name="to_world"><scale value="{}"/></transform><ref id="glass"/></shape>'
