@@ -65,10 +65,14 @@ def filled(template: str, values: Mapping[str, str]) -> str:
 
 
 def expanded(template: str, values: Mapping[str, str], names: list[str]) -> list[str]:
-    """Return the names that match the filled template; `*` and `?` are special in the template, not in the values."""
+    """Return the names that match the filled template; `*` and `?` are special in the template, not in the values.
+
+    Here, they match no `/`: names have as many as the filled template.
+    """
     parts = re.split(r"(\{[^{}]*\}/?)", template)
     pattern = "".join(glob.escape(filled(x, values)) if x.startswith("{") else _for_fnmatch(x) for x in parts)
-    return [name for name in names if fnmatch.fnmatchcase(name, pattern)]
+    in_its_folder = [name for name in names if name.count("/") == pattern.count("/")]
+    return [name for name in in_its_folder if fnmatch.fnmatchcase(name, pattern)]
 
 
 def parsed(template: str, name: str) -> dict[str, str] | None:

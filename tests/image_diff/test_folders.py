@@ -438,6 +438,19 @@ def test_references_that_are_not_variants_and_unreadable_variants(variants):
     assert ball.reason.endswith("; its 2 variants differ, too")
 
 
+def test_wildcards_of_accept_match_no_slash(tmp_path):
+    """A variant is in the folder that its template names, for two folders as for two files."""
+    images(tmp_path, {"old/ball.exr": 1, "old/ball-anim/1.exr": 1.4, "old/mac/a/ball.exr": 1.4, "new/ball.exr": 1})
+    settings = Settings.for_all(accept=("{stem}-*{suffix}", "m*/{name}"))
+    assert outcomes(diff.diff(tmp_path / "old", tmp_path / "new", settings)) == {
+        "ball-anim/1.exr": ("different", "removed"),
+        "ball.exr": ("equal", "unchanged"),
+        "mac/a/ball.exr": ("different", "removed"),
+    }
+    image(tmp_path / "new/ball.exr", gain=1.4)
+    assert diff.diff(tmp_path / "old/ball.exr", tmp_path / "new/ball.exr", settings).exit_code == 1
+
+
 def test_an_inconclusive_variant_makes_the_result_inconclusive(tmp_path, monkeypatch):
     """The new image differs from the reference, but may be equal to the variant."""
     images(tmp_path, {"old/a.exr": 1, "old/a-2.exr": 1, "new/a.exr": 2})
