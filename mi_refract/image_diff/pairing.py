@@ -54,8 +54,11 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
             return [pair]
         deep = any("/" in template for template in pair.how.accept)
         entries = reference.parent.rglob("*") if deep else reference.parent.iterdir()
-        others = sorted(path for path in entries if path.is_file() and path != reference)
-        pair = _with_variants(pair, [path for path in others if not path.samefile(test)])
+        others = [path for path in sorted(entries) if path.is_file() and path != reference and not path.samefile(test)]
+        if not reference.parent.samefile(test.parent):  # a file that has a new image of its own is no variant
+            own = {path: test.parent / path.relative_to(reference.parent) for path in others}
+            others = [path for path in others if own[path] == test or not own[path].exists()]
+        pair = _with_variants(pair, others)
         return [_without(pair, _files_beside(pair, (reference.parent, test.parent)))]
     old, old_errors, old_hidden = images_in(reference) if has_reference else ({}, [], [])
     new, new_errors, new_hidden = images_in(test)

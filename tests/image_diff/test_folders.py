@@ -438,6 +438,19 @@ def test_references_that_are_not_variants_and_unreadable_variants(variants):
     assert ball.reason.endswith("; its 2 variants differ, too")
 
 
+def test_the_reference_of_another_new_image_is_no_variant_of_a_file(tmp_path):
+    """As for two folders; unless the new image itself has that name."""
+    images(tmp_path / "old", {"ball.exr": 1, "ball-red.exr": 1.4, "red/ball.exr": 1.4})
+    images(tmp_path / "new", {"ball.exr": 1.4, "ball-red.exr": 1.4, "red/ball.exr": 1.4})
+    for template in ("{stem}-*{suffix}", "*/{name}"):
+        settings = Settings.for_all(accept=(template,))
+        assert outcomes(diff.diff(tmp_path / "old", tmp_path / "new", settings))["ball.exr"][0] == "different"
+        (result,) = diff.diff(tmp_path / "old/ball.exr", tmp_path / "new/ball.exr", settings).results
+        assert (result.status, result.variants) == ("different", ())
+    (result,) = diff.diff(tmp_path / "old/ball.exr", tmp_path / "new/ball-red.exr", VARIANTS).results
+    assert (result.status, result.matched) == ("equal", tmp_path / "old/ball-red.exr")
+
+
 def test_wildcards_of_accept_match_no_slash(tmp_path):
     """A variant is in the folder that its template names, for two folders as for two files."""
     images(tmp_path, {"old/ball.exr": 1, "old/ball-anim/1.exr": 1.4, "old/mac/a/ball.exr": 1.4, "new/ball.exr": 1})
