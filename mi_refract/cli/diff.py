@@ -238,7 +238,8 @@ def _settings(
 ) -> Settings:
     """Return the settings of the options and of the settings file. ValueError or OSError if either is invalid."""
     # The folder of references may not exist yet.
-    folder = reference if reference.is_dir() or test.is_dir() else reference.parent
+    are_folders = reference.is_dir() or test.is_dir()
+    folder = reference if are_folders else reference.parent
     path = file or nearest(folder)
     flags = ["--method", method] if method else []
     for word in words:
@@ -251,7 +252,7 @@ def _settings(
     if error := for_all.of("").error:  # in the layers of all images: one error, not one an image
         raise ValueError(error)
     above = folder.resolve().relative_to(path.parent.resolve()) if path and not file else Path()
-    if path and above.parts and settings.maps:
+    if path and above.parts and settings.maps and are_folders:  # for files, see `pairing.pairs`
         raise ValueError(f"{path}: `map` is for whole folders; expected {path.parent} as REFERENCE, or --settings")
     return replace(settings, flags=tuple(flags), above=above)
 

@@ -57,7 +57,8 @@ def diff(
     `progress(done, total)`: called after each image.
 
     An error with one image is stored in its result. ValueError or OSError if nothing can be compared: a path that does
-    not exist, a file against a folder, an empty folder, a path that contains the other, a name that matches no image.
+    not exist, a file against a folder, files with a map, an empty folder, a path that contains the other, a name that
+    matches no image.
     """
     reference, test = Path(reference), Path(test)
     pairing.require_apart(reference, test, settings.maps, to_accept)

@@ -43,11 +43,16 @@ def require_apart(reference: Path, test: Path, maps: Sequence[Map] = (), new: bo
 
 
 def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
-    """Return the pairs of both sides, each with its `ComparisonSpec`. ValueError if a folder contains no image."""
+    """Return the pairs of both sides, each with its `ComparisonSpec`.
+
+    ValueError if a folder contains no image, and for files if the settings have a map.
+    """
     has_reference = reference.exists()
     if has_reference and reference.is_dir() != test.is_dir():
         raise ValueError(f"{reference}, {test}: cannot compare a folder with a file")
     if not test.is_dir():
+        if settings.maps:
+            raise ValueError(f"{test}: `map` is for whole folders; expected folders, and the image as NAME")
         pair = _pair(reference.name, reference if has_reference else None, test, reference)
         pair = replace(pair, how=settings.of(pair.name))
         if not pair.how.accept:

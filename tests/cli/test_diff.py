@@ -132,6 +132,21 @@ def test_settings_and_masks_above_a_folder_are_read_within_a_repository(run, fol
     assert code == 2 and err.endswith("`map` is for whole folders; expected " + f"{old} as REFERENCE, or --settings\n")
 
 
+@pytest.mark.parametrize("name", ["same.exr", "inner/changed.exr"])
+@pytest.mark.parametrize("words", [[], ["--settings", "mi-refract.toml"]])
+def test_a_map_is_refused_for_single_files(run, folders, monkeypatch, name, words):
+    old, new = folders
+    (old / ".git").mkdir()
+    rule = '[[image]]\nname = "*.exr"\nskip = true\nreason = "all"\n'
+    (old / "mi-refract.toml").write_text(f'[defaults]\nmap = {{ reference = "{{name}}", test = "{{name}}" }}\n{rule}')
+    monkeypatch.chdir(old)
+    sides = [folder / name for folder in folders]
+    for call in (["diff", *sides], ["accept", *sides, "--yes"], ["diff", sides[0], "--check-settings"]):
+        code, _, err = run(*call, *words)
+        assert code == 2 and "`map` is for whole folders; expected folders" in err and "or --settings" not in err
+    assert run("diff", old, new, "same.exr", *words)[1].endswith("1 skipped\n")
+
+
 def test_a_wrong_entry_of_other_images_is_no_error_of_a_subfolder_or_a_file(run, folders, tmp_path):
     old, new = folders
     (tmp_path / ".git").mkdir()
