@@ -244,7 +244,9 @@ def variant(target: Path, how: ComparisonSpec, name: str) -> Path:
     """
     if not name.strip() or name.startswith(".") or set(name) & set("/\\*?\0"):
         raise ValueError(f"--as-variant {name!r}; expected part of a file name, such as macos")
-    with_name = [template for template in how.accept if not set(template) & set("*?") and name in template]
+    no_fields = dict.fromkeys(name_patterns.FIELDS, "/")  # no name contains a slash
+    fixed = [template for template in how.accept if not set(template) & set("*?")]
+    with_name = [template for template in fixed if name in name_patterns.filled(template, no_fields)]
     with_star = [template for template in how.accept if template.count("*") == 1 and "?" not in template]
     for template in with_name + with_star:
         fields = {**name_patterns.fields(target.name), **how.fields, "*": name}

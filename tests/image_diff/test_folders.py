@@ -337,7 +337,7 @@ def test_templates_give_the_paths_of_masks_and_variants(tmp_path):
     assert pairing.beside("{stem}_mask.png", target, tmp_path) == tmp_path / "a/ball_mask.png"
     assert pairing.beside("{root}/masks/{dir}/{stem}.png", target, tmp_path) == tmp_path / "masks/a/ball.png"
     how = ComparisonSpec(accept=("{stem}-arm64{suffix}", "{stem}-macos{suffix}", "{stem}-*{suffix}"))
-    for name in ("macos", "arm64", "icx"):
+    for name in ("macos", "arm64", "icx", "fix", "stem"):  # the last two are in the names of fields
         assert pairing.variant(target, how, name) == tmp_path / f"a/ball-{name}.exr"
     with pytest.raises(
         ValueError, match=r"no template in `accept` contains icx or exactly one \*; add .*-icx\{suffix\}"
