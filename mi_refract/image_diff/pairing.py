@@ -265,9 +265,11 @@ def is_inside(path: Path, folder: Path) -> bool:
 def beside(template: str, target: Path, root: Path, above: Path = Path()) -> Path:
     """Return the path for a template: beside the image `target`, or after "{root}/" in the folder of the settings.
 
-    `root`: the compared folder; `above`: its path relative to the folder of the settings.
+    `root`: the compared folder, or the `target` if that is a folder of renders; `above`: its path relative to the
+    folder of the settings.
     """
-    values = name_patterns.fields((above / target.relative_to(root)).as_posix())
+    inside = above / target.relative_to(root)
+    values = name_patterns.fields(inside.as_posix() if inside.parts else root.resolve().name)
     path = Path(name_patterns.filled(template.removeprefix(ROOT), values))
     if not template.startswith(ROOT):
         return target.parent / path

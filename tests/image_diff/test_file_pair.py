@@ -180,6 +180,12 @@ def test_renders_are_masked(tmp_path):
         write_exr(path, pixels)
     assert folders.diff(old, new, renders=True).exit_code == 1
     assert folders.diff(old, new, Settings.for_all(ignore=((0, 16, 16, 16),)), renders=True).exit_code == 0
+    mask = np.ones(SIZE)
+    mask[16:, :16] = 0
+    write_exr(tmp_path / "old_mask.exr", mask)  # beside the folder of the reference, which its fields are of
+    for above in (Path(), Path("old")):
+        results = folders.diff(old, new, replace(Settings.for_all(mask="{stem}_mask.exr"), above=above), renders=True)
+        assert (results.exit_code, [result.error for result in results.results]) == (0, [""])
 
 
 def test_renders_may_be_the_same_where_a_mask_leaves_no_noise(tmp_path):
