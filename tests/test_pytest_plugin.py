@@ -217,6 +217,35 @@ def test_a_reference_is_not_accepted_for_two_images(pytester, exists):
     result.stdout.fnmatch_lines(["could not accept: *new.exr: also the reference of another image; expected *"])
 
 
+def test_an_array_that_float32_does_not_hold_is_not_accepted(pytester):
+    """It would differ from its file at every run."""
+    pytester.makeconftest('pytest_plugins = ["mi_refract.pytest_plugin"]')
+    pytester.makepyfile("""
+        import numpy as np
+        import pytest
+
+        @pytest.mark.parametrize("name", ["old.exr", "new.exr"])
+        @pytest.mark.parametrize("value", [0.1, 2**24 + 1])
+        def test_wide(assert_image_equal, name, value):
+            assert_image_equal(np.full((8, 8, 3), value), name, "exact")
+
+        @pytest.mark.parametrize(("value", "method"), [(0.5, "exact"), (0.1, "tolerance")])
+        def test_held(assert_image_equal, value, method):
+            assert_image_equal(np.full((8, 8, 3), value), f"{method}.exr", method)
+
+        def test_equal_ids(assert_image_equal):
+            assert_image_equal(np.full((8, 8, 3), 2**24 + 1), "ids.exr", "exact")
+    """)
+    image_file.write_exr(pytester.path / "old.exr", np.ones((8, 8, 3)))
+    save(pytester.path / "ids.exr", np.full((8, 8, 3), 2**24 + 1, np.uint32), "uint")
+    before = {path.name: path.read_bytes() for path in pytester.path.glob("*.exr")}
+    result = pytester.runpytest_subprocess("-p", "no:cacheprovider", "--mi-refract-accept")
+    result.assert_outcomes(passed=3, failed=4)
+    result.stdout.fnmatch_lines(["could not accept: *.exr: *; expected values that float32 holds"] * 4)
+    after = {path.name: path.read_bytes() for path in pytester.path.glob("*.exr")}
+    assert after == before | {name: after[name] for name in ("exact.exr", "tolerance.exr")}
+
+
 def test_the_page_shows_all_images_of_a_test(request, assert_image_equal, tmp_path):
     """Even if their metrics are equal."""
     from mi_refract.pytest_plugin import COMPARED, Compared  # pytest imports it first
