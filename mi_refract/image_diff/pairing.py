@@ -300,7 +300,7 @@ def images_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]], lis
 
     def add_error(path: Path, error: str) -> None:
         name = path.relative_to(folder).as_posix()
-        if "/." not in f"/{name}":
+        if name == "." or "/." not in f"/{name}":  # "." is the folder itself
             failed.append((name, error))
 
     for parent, folders, names in os.walk(folder, onerror=lambda error: add_error(Path(error.filename), str(error))):

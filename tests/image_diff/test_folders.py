@@ -143,6 +143,24 @@ def test_subfolders_that_cannot_be_read_are_errors(folders, monkeypatch):
     assert (results.exit_code, len(results.results)) == (2, 8)
 
 
+def test_a_folder_that_cannot_be_read_is_an_error_and_not_empty(folders, monkeypatch):
+    """The compared folder itself; also where its name begins with a dot."""
+    old, new = folders
+    new = new.rename(new.parent / ".new")
+    walk = os.walk
+
+    def refuse(folder, onerror):
+        if folder != new:
+            return walk(folder, onerror=onerror)
+        onerror(PermissionError(13, "Permission denied", str(folder)))
+        return iter(())
+
+    monkeypatch.setattr(os, "walk", refuse)
+    results = diff.diff(old, new)
+    assert [(r.name, r.error) for r in results.of(Status.ERROR)] == [(".", f"[Errno 13] Permission denied: '{new}'")]
+    assert results.exit_code == 2
+
+
 def test_hidden_images_are_skipped_and_unsupported_formats_are_errors(folders):
     """Images of unsupported formats are skipped, too, if the settings say so."""
     old, new = folders
