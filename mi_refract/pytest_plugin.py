@@ -3,7 +3,8 @@
 Put this into the conftest.py of the tests: `pytest_plugins = ["mi_refract.pytest_plugin"]`. The plugin is no entry
 point, because an entry point would load Mitsuba, and with it a libLLVM, into every pytest run of the environment,
 before a conftest.py could choose one. An image is a file or an array, H × W × C or H × W; arrays of uint8 and uint16
-are sRGB codes, as in a PNG file. A missing reference fails the test.
+are sRGB codes, as in a PNG file; one of a single channel has the name of that of the file that it is compared with. A
+missing reference fails the test.
 
 `--mi-refract-accept` copies images that are not equal over their references, as `mi-refract accept` does, if both are
 files, or if the reference is an EXR file and the image an array. `--mi-refract-report OUT.html` writes the page of
@@ -12,6 +13,7 @@ files, or if the reference is an EXR file and the image an array. `--mi-refract-
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shlex
 from collections.abc import Callable, Sequence
@@ -116,7 +118,8 @@ def assert_image_equal(request: pytest.FixtureRequest) -> Callable[..., Comparis
             are_files = all(isinstance(side, str | os.PathLike) for side in (reference, test))
             if are_files and Path(reference).samefile(test):
                 raise ValueError(f"{test}: the same file as the reference {reference}; expected two different files")
-            return images
+            one, two = images
+            return _named_like(one, two), _named_like(two, one)
 
         return _require_equal(request, method, sides, options)
 
@@ -150,7 +153,10 @@ def assert_image_unbiased(request: pytest.FixtureRequest) -> Callable[..., Compa
         tests = rendered("test", render, seed)
 
         def sides() -> tuple[list[ReadImage], list[ReadImage]]:
-            return read_renders(references) if isinstance(references, Path) else references, tests
+            if not isinstance(references, Path):
+                return references, tests
+            renders = read_renders(references)
+            return renders, [_named_like(image, renders[0]) for image in tests]
 
         return _require_equal(request, "welch", sides, options)
 
@@ -173,10 +179,13 @@ def _accept(reference: Path, test: Image, method: str, options: dict[str, Any], 
         with safe_files.temporary_folder() as folder:
             if not isinstance(test, str | os.PathLike):
                 image, test = image_file.named("test", test), folder / "test.exr"
+                existing: ReadImage | None = None
+                with contextlib.suppress(ValueError, OSError):  # missing, or an error that the comparison reports
+                    existing = image_file.read(reference)
+                    image = _named_like(image, existing)
                 image_file.write_exr(test, image.pixels, image.channels, image.metadata)
                 held = methods.compare(method, image_file.read(test), image, **options)
                 if held.verdict is Verdict.DIFFERENT:
-                    existing = image_file.read(reference) if reference.exists() else None
                     if existing and methods.compare(method, existing, image, **options).is_equal:  # ids of 32 bits
                         digests.setdefault(reference.resolve(), safe_files.digest(reference))
                         return
@@ -234,3 +243,9 @@ def _image(name: str, image: Image) -> ReadImage:
     from mi_refract.io import image_file
 
     return image_file.read(image) if isinstance(image, str | os.PathLike) else image_file.named(name, image)
+
+
+def _named_like(image: ReadImage, other: ReadImage) -> ReadImage:
+    """Return the image; if it is an array of one channel, with the name of the single channel of a file."""
+    is_gray = len(image.channels) == len(other.channels) == 1 and other.stored and not image.stored
+    return replace(image, channels=other.channels) if is_gray else image

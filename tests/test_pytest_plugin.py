@@ -38,6 +38,28 @@ def test_equal_images_pass(assert_image_equal, assert_image_unbiased, tmp_path):
     assert_image_unbiased(render, tmp_path / "renders", runs=6)
 
 
+def test_a_gray_array_is_compared_with_a_gray_file(assert_image_equal, assert_image_unbiased, tmp_path):
+    """In an array, the channel has no name; those of files count."""
+    codes = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    files = [save(tmp_path / "gray.png", codes[..., None], "uint8")]
+    for name in ("Y", "depth"):
+        image_file.write_exr(tmp_path / f"{name}.exr", IMAGE[..., :1], (name,))
+        files.append(tmp_path / f"{name}.exr")
+    for file, array in zip(files, (codes, IMAGE[..., 0], IMAGE[..., 0].astype(np.float32)), strict=True):
+        assert_image_equal(file, array)
+        assert_image_equal(array[..., None], file)
+        with pytest.raises(pytest.fail.Exception, match="different: "):
+            assert_image_equal(array[::-1], file)
+        with pytest.raises(pytest.fail.Exception, match=r"could not compare: .*channel1"):
+            assert_image_equal(np.dstack([array] * 2), file)
+    with pytest.raises(pytest.fail.Exception, match=r"could not compare: .*depth"):
+        assert_image_equal(files[1], files[2])
+    (tmp_path / "renders").mkdir()
+    for i in range(8):
+        image_file.write_exr(tmp_path / "renders" / f"{i}.exr", render(100 + i)[..., :1], ("Y",))
+    assert_image_unbiased(lambda seed: render(seed)[..., 0], tmp_path / "renders", runs=6)
+
+
 def test_the_documented_test_passes(assert_image_equal, assert_image_unbiased, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, image in {"out/ball": IMAGE, "references/ball": IMAGE + 1e-3, "references/ball/a": render(100)}.items():
@@ -215,6 +237,26 @@ def test_a_reference_is_not_accepted_for_two_images(pytester, exists):
     result = pytester.runpytest_subprocess("-p", "no:cacheprovider", "--mi-refract-accept")
     result.assert_outcomes(passed=2, failed=1)
     result.stdout.fnmatch_lines(["could not accept: *new.exr: also the reference of another image; expected *"])
+
+
+def test_an_accepted_gray_array_keeps_the_channel_of_its_reference(pytester):
+    pytester.makeconftest('pytest_plugins = ["mi_refract.pytest_plugin"]')
+    pytester.makepyfile("""
+        import numpy as np
+        import pytest
+
+        @pytest.mark.parametrize("name", ["equal", "changed", "new", "broken"])
+        def test_gray(assert_image_equal, name):
+            assert_image_equal(np.ones((8, 8)), f"{name}.exr", "exact")
+    """)
+    for name, value in (("equal", 1), ("changed", 2)):
+        image_file.write_exr(pytester.path / f"{name}.exr", np.full((8, 8, 1), value), ("Y",))
+    (pytester.path / "broken.exr").write_bytes(b"")
+    before = (pytester.path / "equal.exr").read_bytes()
+    pytester.runpytest_subprocess("-p", "no:cacheprovider", "--mi-refract-accept").assert_outcomes(passed=4)
+    assert (pytester.path / "equal.exr").read_bytes() == before
+    channels = {path.stem: image_file.read(path).channels for path in pytester.path.glob("*.exr")}
+    assert channels == {"equal": ("Y",), "changed": ("Y",), "new": ("channel0",), "broken": ("channel0",)}
 
 
 def test_an_array_that_float32_does_not_hold_is_not_accepted(pytester):
