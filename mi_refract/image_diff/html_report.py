@@ -219,15 +219,17 @@ def shown_of(result: Result, image_bytes: float, map_bytes: float) -> Shown:
         with _one_at_a_time:
             sides: dict[str, Image] = {}
             makers: list[Callable[[], Pane]] = []
-            for role, image in result.images.items():  # R, G, B, or else the first channel
-                names = tuple("RGB") if {*"RGB"} <= {*image.channels} else image.channels[:1]
+            channels = [image.channels for image in result.images.values()]
+            shared = [name for name in channels[0] if all(name in names for names in channels)] if channels else []
+            for role, image in result.images.items():  # R, G, B, or else the first channel that both have
+                names = tuple("RGB") if {*"RGB"} <= {*image.channels} else (*shared, *image.channels)[:1]
                 sides[role] = side = replace(image, pixels=image.select(names), channels=names)
                 paint = "code" if flip.encoding(side) == "sRGB" else "light"
                 note = "" if len(names) > 1 else f"channel {names[0]}"
                 makers.append(functools.partial(_pane, role, paint, None, side.pixels, image_bytes, note=note))
             maps = dict(result.comparison.maps) if result.comparison else {}
             one, two = sides.get("reference"), sides.get("test")
-            if one and two and one.pixels.shape == two.pixels.shape:
+            if one and two and one.pixels.shape == two.pixels.shape and one.channels == two.channels:
                 with np.errstate(invalid="ignore"):
                     change = two.pixels - one.pixels
                 makers.append(functools.partial(map_pane, "difference", change, map_bytes))

@@ -204,6 +204,26 @@ def test_the_first_channel_is_shown_of_images_without_colours(tmp_path):
     np.testing.assert_allclose(shown, image_file.read(sides[0]).select([channel])[..., 0], rtol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("channels", "shown"),
+    [
+        ((("a", "m", "n"), ("b", "m", "n")), ["channel m", "channel m", "difference"]),
+        ((("a",), ("b",)), ["channel a", "channel b"]),
+        ((("a", "z"), ("z",)), ["channel z", "channel z", "difference"]),
+    ],
+)
+def test_the_difference_is_that_of_a_channel_of_both_sides(tmp_path, channels, shown):
+    sides = [
+        image(tmp_path / side / "a.exr", np.stack([np.full((4, 6), ord(x) / 128 + bias) for x in names], -1), (), names)
+        for side, names, bias in zip(("old", "new"), channels, (0, 0.25), strict=True)
+    ]
+    (result,) = folders.diff(*sides, maps=True).results
+    panes = [pane for pane in html_report.shown_of(result, np.inf, np.inf).panes if pane["role"] != "flip"]
+    assert [pane["note"] or pane["role"] for pane in panes] == shown
+    for change in panes[2:]:
+        np.testing.assert_allclose(decoded(change["data"]) * change["scale"], 0.25, rtol=1e-3)
+
+
 def test_the_gain_of_a_map_follows_its_99th_percentile_and_the_strongest_pixels_remain():
     """One pixel of 2500 is `peak` times as large as the others; the gain is the exponent of a power of ten."""
     for peak, gain in ((1.0, 0), (10.0, 1), (31.7, 1.5), (100.0, 2), (1e9, 6), (0.0, 0)):
