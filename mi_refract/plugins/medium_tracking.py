@@ -44,8 +44,8 @@ STRAY = 0.01  # the largest share of wrong crossings of a shape that is not an e
 FEW = 2  # so many wrong crossings are not an error either, unless they are half of the crossings
 NEVER = 2**32 - 1  # the depth of a shape's first wrong crossing, if none exists
 # The share of the way from a ray's origin back to the surface that is searched for another surface. Rounding moves a
-# point by up to an eighth of this distance (`ray_origins`), or by a thousandth of Mitsuba's, which is larger; but of a
-# cylinder with a distance D and a radius R by up to 3 u D²/R, and so of a sphere in an instance that makes it smaller.
+# point by up to an eighth of this distance (`ray_origins`), or by a thousandth of Mitsuba's, which is larger; a point
+# on a cylinder or on a sphere in an instance by more (`ray_origins.inexact`).
 SEARCHED, SEARCHED_FAR = 3 / 4, 1 - 1 / 64
 # A null lobe does not change the medium. Rough and diffuse transmission do.
 THROUGH = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DiffuseTransmission

@@ -80,33 +80,37 @@ def too_thin(size: Size | None, extent: float) -> str:
     return f"is {size.thickness:.3g} thick, but rays start {place}, so its light is lost"
 
 
-def inexact(shape: Shape, instance: Shape | None, sensors: Sequence[Sensor]) -> str:
+def inexact(shape: Shape, instances: Sequence[Shape] | None, sensors: Sequence[Sensor]) -> str:
     """Return a text if Mitsuba's points on a shape err by more than the distance at which rays start; else "".
 
-    Points on a cylinder with the radius R, seen from D, err by up to 4 u D²/R; points on a sphere in an instance that
-    scales it by s < 1 to the radius R by up to 4 u D²/R (1/s − 1)². Both are records, of 200,000 rays.
+    `shape`: a cylinder, or a cylinder or a sphere in a group; `instances`: those that show the group. Points on a
+    cylinder with the radius R, seen from D, err by up to 4 u D²/R; points on a sphere in an instance that scales it by
+    s < 1 to the radius R by up to 4 u D²/R (1/s − 1)². Both are records, of 200,000 rays.
     """
-    kind = shape.class_name()
-    if dr.flag(dr.JitFlag.FreezingScope) or not (kind == "Cylinder" or (kind == "Sphere" and instance)):
+    if dr.flag(dr.JitFlag.FreezingScope):  # numbers cannot be read
         return ""
     import numpy as np
 
-    own, outer = (np.eye(4) if x is None else matrix(mi.traverse(x)["to_world"]) for x in (shape, instance))
-    scale = float(np.linalg.svd(outer[:3, :3], compute_uv=False).min())
-    radius = scale * float(np.linalg.norm(own[:3, 0]))
-    centre = (outer @ own @ [0, 0, 0.5 if kind == "Cylinder" else 0, 1])[:3]
+    kind, own = shape.class_name(), matrix(mi.traverse(shape)["to_world"])
     places = [matrix(sensor.world_transform())[:3, 3] for sensor in sensors]
-    distance = max((float(np.linalg.norm(place - centre)) for place in places), default=0.0)
-    factor = 1.0 if kind == "Cylinder" else max(1 / scale - 1, 0) ** 2
-    u, start = mi.math.RayEpsilon / MITSUBA, mi.math.RayEpsilon * (1 + float(np.abs(centre).max()))
-    error = 4 * u * distance**2 / radius * factor
-    if not error > start:
-        return ""
-    where = "" if instance is None else f" in an instance that scales it by {scale:.3g}"
-    return (
-        f"is a {kind}{where}, on which Mitsuba's points err by up to {error:.2g}, seen from {distance:.3g}, but rays "
-        f"start {start:.2g} from its surface"
-    )
+    for instance in instances or [None]:
+        outer = np.eye(4) if instance is None else matrix(mi.traverse(instance)["to_world"])
+        scale = float(np.linalg.svd(outer[:3, :3], compute_uv=False).min())
+        radius = scale * float(np.linalg.norm(own[:3, 0]))
+        if not radius > 0:  # no ray meets it
+            continue
+        centre = (outer @ own @ [0, 0, 0.5 if kind == "Cylinder" else 0, 1])[:3]
+        distance = max((float(np.linalg.norm(place - centre)) for place in places), default=0.0)
+        factor = 1.0 if kind == "Cylinder" else max(1 / scale - 1, 0) ** 2
+        start = mi.math.RayEpsilon * (1 + float(np.abs(centre).max()))
+        error = 4 * mi.math.RayEpsilon / MITSUBA * distance**2 / radius * factor
+        if error > start:
+            where = "" if instance is None else f" in an instance that scales it by {scale:.3g}"
+            return (
+                f"is a {kind}{where}, on which Mitsuba's points err by up to {error:.2g}, seen from {distance:.3g}, "
+                f"but rays start {start:.2g} from its surface"
+            )
+    return ""
 
 
 def matrix(transform: Any) -> NDArray[np.float64]:

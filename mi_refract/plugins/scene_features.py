@@ -192,9 +192,8 @@ def inspect(scene: Scene, sensor: Sensor | None = None) -> SceneFeatures:
     eyes = [x for x in (*scene.sensors(), sensor) if x is not None]
     inexact = (
         f"{shape_name(shapes, i)} {text}"
-        for i in with_delta
-        for instance in instances_of(scene, shapes[i])
-        if (text := ray_origins.inexact(shapes[i], instance, eyes))
+        for i, instances in _suspects(scene, shapes).items()
+        if i in with_delta and (text := ray_origins.inexact(shapes[i], instances, eyes))
     )
     shape_media = any(shape.interior_medium() or shape.exterior_medium() for shape in shapes)
     return SceneFeatures(
@@ -322,11 +321,20 @@ def group_name(instance: Shape) -> str | None:
     return match[1] if match else None
 
 
-def instances_of(scene: Scene, shape: Shape) -> list[Shape | None]:
-    """Return the instances that may show a shape in a group; [None] for a shape that is in no group."""
-    names = {group.id() for group in shape_groups(scene) if shape in shapes_of(group)} | {None}
-    instances = [x for x in scene.shapes() if x.class_name() == "Instance"] if len(names) > 1 else []
-    return [x for x in instances if group_name(x) in names] or [None]
+def _suspects(scene: Scene, shapes: list[Shape]) -> dict[int, list[Shape] | None]:
+    """Return the positions of cylinders, with None, and of cylinders and spheres in groups, with their instances.
+
+    `shapes`: `all_shapes` of the scene.
+    """
+    kinds, own = [shape.class_name() for shape in shapes], len(scene.shapes())
+    found: dict[int, list[Shape] | None] = {i: None for i in range(own) if kinds[i] == "Cylinder"}
+    if {"Cylinder", "Sphere"} & {*kinds[own:]}:
+        instances = [(group_name(shapes[i]), shapes[i]) for i in range(own) if kinds[i] == "Instance"]
+        groups = [group.id() for group in shape_groups(scene) for _ in shapes_of(group)]
+        for i, name in enumerate(groups, own):
+            if kinds[i] in ("Cylinder", "Sphere"):
+                found[i] = [instance for shown, instance in instances if shown in (name, None)]
+    return found
 
 
 def shapes_of(group: mi.Object) -> list[Shape]:
