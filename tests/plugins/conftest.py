@@ -1,5 +1,7 @@
 """Fixtures of tests of the plugins."""
 
+import gc
+
 import mitsuba as mi
 import pytest
 
@@ -13,3 +15,12 @@ def logged(monkeypatch):
     monkeypatch.setattr(index_parameter, "warned", set())
     monkeypatch.setattr(mi, "Log", lambda level, text: texts.append(text))
     return texts
+
+
+@pytest.fixture
+def no_collection():
+    """Switch off garbage collection: if it frees any scene while Dr.Jit records, the process crashes."""
+    gc.collect()
+    gc.disable()
+    yield
+    gc.enable()

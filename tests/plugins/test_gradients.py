@@ -5,7 +5,6 @@ of a new trace, also after an edit: Dr.Jit must know every array that BSDFs in m
 """
 
 import functools
-import gc
 import subprocess
 import sys
 
@@ -258,15 +257,6 @@ def test_prb_projective_equals_prb_if_no_edge_moves(variant):
 
 
 # Frozen --------------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def no_collection():
-    """Switch off garbage collection: if it frees any scene while Dr.Jit records, the process crashes."""
-    gc.collect()
-    gc.disable()
-    yield
-    gc.enable()
 
 
 STEPS = [

@@ -344,7 +344,7 @@ def test_what_would_be_left_to_chance_is_refused_by_name(other, kind, llvm_varia
     assert refusal(render, scene, 1, deterministic=True) == text
 
 
-def test_in_a_frozen_function_no_diffuse_counts_as_black(llvm_variant):
+def test_in_a_frozen_function_no_diffuse_counts_as_black(llvm_variant, no_collection):
     """So an area lamp needs another BSDF there; Mitsuba gives it a black diffuse."""
     method, behind = mi.load_dict({"type": "refract_path", "deterministic": True}), PLACE().translate([0, 0, -2])
 
