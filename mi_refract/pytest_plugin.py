@@ -3,7 +3,7 @@
 Put this into the conftest.py of the tests: `pytest_plugins = ["mi_refract.pytest_plugin"]`. The plugin is no entry
 point, because an entry point would load Mitsuba, and with it a libLLVM, into every pytest run of the environment,
 before a conftest.py could choose one. An image is a file or an array, H × W × C or H × W; arrays of uint8 and uint16
-are sRGB codes, as in a PNG file; one of a single channel has the name of that of the file that it is compared with. A
+are sRGB codes, as in a PNG file; an array of one channel takes the channel name of the file that it is compared with. A
 missing reference fails the test.
 
 `--mi-refract-accept` copies images that are not equal over their references, as `mi-refract accept` does, if both are
@@ -153,10 +153,8 @@ def assert_image_unbiased(request: pytest.FixtureRequest) -> Callable[..., Compa
         tests = rendered("test", render, seed)
 
         def sides() -> tuple[list[ReadImage], list[ReadImage]]:
-            if not isinstance(references, Path):
-                return references, tests
-            renders = read_renders(references)
-            return renders, [_named_like(image, renders[0]) for image in tests]
+            renders = read_renders(references) if isinstance(references, Path) else references
+            return [_named_like(x, tests[0]) for x in renders], [_named_like(x, renders[0]) for x in tests]
 
         return _require_equal(request, "welch", sides, options)
 

@@ -58,6 +58,9 @@ def test_a_gray_array_is_compared_with_a_gray_file(assert_image_equal, assert_im
     for i in range(8):
         image_file.write_exr(tmp_path / "renders" / f"{i}.exr", render(100 + i)[..., :1], ("Y",))
     assert_image_unbiased(lambda seed: render(seed)[..., 0], tmp_path / "renders", runs=6)
+    as_file = lambda seed: tmp_path / "renders" / f"{seed % 8}.exr"  # noqa: E731
+    assert_image_unbiased(as_file, lambda seed: render(seed)[..., 0], runs=6)
+    assert_image_unbiased(lambda seed: render(seed)[..., 0], as_file, runs=6)
 
 
 def test_the_documented_test_passes(assert_image_equal, assert_image_unbiased, tmp_path, monkeypatch):

@@ -67,7 +67,7 @@ def filled(template: str, values: Mapping[str, str]) -> str:
 def expanded(template: str, values: Mapping[str, str], names: list[str]) -> list[str]:
     """Return the names that match the filled template; `*` and `?` are special in the template, not in the values.
 
-    Here, they match no `/`: names have as many as the filled template.
+    They match no `/`, other than in `matches`.
     """
     parts = re.split(r"(\{[^{}]*\}/?)", template)
     pattern = "".join(glob.escape(filled(x, values)) if x.startswith("{") else _for_fnmatch(x) for x in parts)

@@ -58,11 +58,12 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Result]:
         if not pair.how.accept:
             return [pair]
         deep = any("/" in template for template in pair.how.accept)
-        entries = reference.parent.rglob("*") if deep else reference.parent.iterdir()
+        folder = reference.parent
+        entries = (folder.rglob("*") if deep else folder.iterdir()) if folder.exists() else ()
         others = [path for path in sorted(entries) if path.is_file() and path != reference and not path.samefile(test)]
-        if not reference.parent.samefile(test.parent):  # a file that has a new image of its own is no variant
-            own = {path: test.parent / path.relative_to(reference.parent) for path in others}
-            others = [path for path in others if own[path] == test or not own[path].exists()]
+        if folder.resolve() != test.parent.resolve():  # a file that has a new image of its own is no variant
+            own = ((path, test.parent / path.relative_to(folder)) for path in others)
+            others = [path for path, new in own if new == test or not new.exists()]
         pair = _with_variants(pair, others)
         return [_without(pair, _files_beside(pair, (reference.parent, test.parent)))]
     old, old_errors, old_hidden = images_in(reference) if has_reference else ({}, [], [])
@@ -272,7 +273,7 @@ def beside(template: str, target: Path, root: Path, above: Path = Path()) -> Pat
     values = name_patterns.fields(inside.as_posix() if inside.parts else root.resolve().name)
     path = Path(name_patterns.filled(template.removeprefix(ROOT), values))
     if not template.startswith(ROOT):
-        return target.parent / path
+        return (target.parent if target.name else target.resolve().parent) / path
     if path.is_relative_to(above):  # without "..", so that it equals the path that a search of the folder finds
         return root / path.relative_to(above)
     return root.joinpath(*[".."] * len(above.parts), path)

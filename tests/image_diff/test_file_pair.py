@@ -172,7 +172,7 @@ def test_masked_pixels_are_not_compared(sides, method):
         assert compared(*sides, method=method, **left_out).status == "equal"
 
 
-def test_renders_are_masked(tmp_path):
+def test_renders_are_masked(tmp_path, monkeypatch):
     old, new = (samples(tmp_path / name, first=first) for name, first in (("old", 0), ("new", 100)))
     for path in new.iterdir():
         pixels = read(path).pixels.copy()
@@ -186,6 +186,8 @@ def test_renders_are_masked(tmp_path):
     for above in (Path(), Path("old")):
         results = folders.diff(old, new, replace(Settings.for_all(mask="{stem}_mask.exr"), above=above), renders=True)
         assert (results.exit_code, [result.error for result in results.results]) == (0, [""])
+    monkeypatch.chdir(old)
+    assert folders.diff(Path(), new, Settings.for_all(mask="{stem}_mask.exr"), renders=True).exit_code == 0
 
 
 def test_renders_may_be_the_same_where_a_mask_leaves_no_noise(tmp_path):

@@ -15,8 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.diff_images import image, outcomes, samples, save
 
+from mi_refract.image_diff import accept, methods, name_patterns, pairing, text_reports
 from mi_refract.image_diff import folders as diff
-from mi_refract.image_diff import methods, name_patterns, pairing, text_reports
 from mi_refract.image_diff.comparison import Comparison, Verdict
 from mi_refract.image_diff.results import Result, Results, Status
 from mi_refract.image_diff.settings import ComparisonSpec, Entry, Map, Settings, from_words
@@ -467,6 +467,14 @@ def test_the_reference_of_another_new_image_is_no_variant_of_a_file(tmp_path):
         assert (result.status, result.variants) == ("different", ())
     (result,) = diff.diff(tmp_path / "old/ball.exr", tmp_path / "new/ball-red.exr", VARIANTS).results
     assert (result.status, result.matched) == ("equal", tmp_path / "old/ball-red.exr")
+
+
+@pytest.mark.parametrize("template", ["{stem}-*{suffix}", "*/{name}"])
+def test_the_folder_of_a_first_reference_need_not_exist(template, tmp_path):
+    image(tmp_path / "new/ball.exr")
+    sides, settings = (tmp_path / "old/ball.exr", tmp_path / "new/ball.exr"), Settings.for_all(accept=(template,))
+    (copy,) = accept.changes(diff.diff(*sides, settings, to_accept=True))
+    assert copy.reference == tmp_path / "old/ball.exr"
 
 
 def test_wildcards_of_accept_match_no_slash(tmp_path):
