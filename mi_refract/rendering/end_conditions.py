@@ -19,6 +19,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,10 +74,10 @@ def relative_error(sums: PassSums) -> RelativeError:
     return RelativeError(value, low, high, at_most=variance is not None)
 
 
-def without_noise(sums: PassSums) -> bool:
+def without_noise(sums: PassSums, channels: Sequence[str]) -> bool:
     """Return whether all samples of each pixel are equal, and no pixel is black: light there may be rarely found.
 
-    Opacity and AOVs may be 0.
+    `channels`: their names. Opacity and AOVs that are no colours may be 0.
 
     The rounding of sums of equal samples in float64 causes less than SAME. If one of n ≤ 2³² samples differs by one
     rounding in float32, it causes 6e-8/√n ≥ 9e-13.
@@ -86,7 +87,8 @@ def without_noise(sums: PassSums) -> bool:
         return False
     mean = sums.mean
     equal = np.isfinite(mean) & (variance <= np.square(SAME * mean))
-    return bool(equal.all() and (mean[..., : sums.colours] != 0).all())
+    colour = [i < sums.colours or name.rpartition(".")[2] in tuple("RGB") for i, name in enumerate(channels)]
+    return bool(equal.all() and (mean[..., colour] != 0).all())
 
 
 def require_interval() -> None:
@@ -156,9 +158,9 @@ class Limits:
         return self.until is not None or self.until_tile is not None
 
 
-def reached(limits: Limits, sums: PassSums) -> str:
+def reached(limits: Limits, sums: PassSums, channels: Sequence[str]) -> str:
     """Return why an image is good enough: no noise, or an error below its limit; "" if it is not."""
-    if without_noise(sums):
+    if without_noise(sums, channels):
         return NO_NOISE
     if sums.passes < FEW:  # their spread is a poor estimate
         return ""

@@ -299,7 +299,7 @@ class LongRender:
         if passes == 1 or _is_stop(passes):
             sums = progress.sums()
             assert sums is not None
-            if reason := reached(self.limits, sums):
+            if reason := reached(self.limits, sums, self.renderer.channels):
                 return reason
             colours = sums.total[..., : sums.colours]
             if passes > 1 and self.spp is None and self.limits.by_error and not np.any(colours > 0):

@@ -147,12 +147,19 @@ def test_a_render_without_noise_ends_early_unless_it_is_black(tmp_path, llvm_var
     rgba = '"hdrfilm"><string name="pixel_format" value="rgba"/>'
     text = SKY.format(light).replace('"path"/>', f'"refract_path"{deterministic}').replace('"hdrfilm">', rgba)
     (tmp_path / "clear.xml").write_text(text)
+    depth = '<string name="aovs" value="d:depth"/>'
+    unlit = '<integrator type="path"><boolean name="hide_emitters" value="true"/></integrator>'
+    text = SKY.format(light).replace(
+        'type="path"/>', f'type="aov">{depth}<integrator type="path"/>{unlit}</integrator>'
+    )
+    (tmp_path / "dark aov.xml").write_text(text)
     ended = "no noise: the samples of every pixel agree"
     expected = {
         ("light", 64): (1, ended),
         ("light", 4): (16, ended),  # 4 samples are too few
         ("clear", 64): (1, ended),  # opacity is 0 in every pixel, and nothing is truncated
         ("dark", 64): (4, "256 spp"),  # there may be light that no sample has found
+        ("dark aov", 64): (4, "256 spp"),  # in the image of a further integrator
         ("dark", 4): (64, "256 spp"),
     }
     for (name, pass_spp), (passes, reason) in expected.items():
@@ -243,7 +250,7 @@ def test_a_resumed_render_estimates_its_error_only_at_stops(tmp_path, llvm_varia
     rendering(tmp_path / "a.exr", spp=18, pass_spp=2).run()
     stops = set()
 
-    def reached(limits, sums):
+    def reached(limits, sums, channels):
         stops.add(sums.passes)
         return ""
 
