@@ -216,11 +216,12 @@ def _glass(bsdf: Node) -> Glass:
     except ValueError as error:
         raise ValueError(f"{bsdf.scene.path}: {bsdf}: {str(error).removeprefix(f'{PLUGIN}: ')}") from None
     if bsdf.type == "dielectric":
-        named = {name: bsdf.props[name] for name in sides if isinstance(bsdf.props.get(name), str)}
-        try:
-            mi.load_dict({"type": bsdf.type} | named)
-        except RuntimeError:
-            raise bsdf.error(", ".join(f"{k} = {v}" for k, v in named.items()), "a name that Mitsuba knows") from None
+        for name in sides:
+            try:
+                if isinstance(value := bsdf.props.get(name), str):
+                    mi.load_dict({"type": bsdf.type, name: value})
+            except RuntimeError:
+                raise bsdf.error(f"{name} = {value}", "a name that Mitsuba knows") from None
     sigmas = {side: _sigma(bsdf, side) if bsdf.type != "dielectric" else BLACK for side in ("int", "ext")}
     parameters = [
         f"{name} = {bsdf.props.get(name, default)}"

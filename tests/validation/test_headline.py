@@ -102,6 +102,7 @@ BODY = Row("ground_truth", "refract", "prism", "llvm_ad_rgb", {"error / bound": 
         ([dataclasses.replace(OURS, values=WORST | {"worst / u": 2.0})], 0, "yes", ["Yes."], ["no more than rounding"]),
         ([BODY], 0, "yes", ["Yes.", "Through 1 bodies", "all its rays stay within"], ["direction"]),
         ([dataclasses.replace(BODY, values={"error / bound": 2.0})], 0, "no", ["No:", "some of its rays leave"], []),
+        ([DARK], 0, "no", ["No: a check failed."], ["Yes"]),
         ([BODY, DARK], 0, "no", ["No: a check failed.", "all its rays stay within"], ["Yes"]),
         ([OURS, dataclasses.replace(SPOILT, study="media")], 1, "no", ["A check of `promoted`"], ["trusted"]),
         ([BODY, dataclasses.replace(BODY, values={"error / bound": math.nan})], 0, "no", ["of its rays leave"], []),
