@@ -202,8 +202,8 @@ def edited_groups(scene: Scene) -> list[Any]:
 def bounding_sphere(shape: Shape, edited: Sequence[Any] = ()) -> Sphere:
     """A sphere around the bounding box of a shape; the radius is infinite or NaN if the bounds are unknown.
 
-    Mitsuba's box of an instance is that of its group when that was loaded, and it does not expose the group. So the box
-    is extended by all groups that were `edited`.
+    Mitsuba's box of an instance is that of its group when that was loaded. So the box is extended by all groups that
+    were `edited`.
     """
     box = mitsuba_mesh.bounding_box(shape)
     if edited and shape.class_name() == "Instance":

@@ -159,7 +159,8 @@ class MediumTracker:
             thin = absorbs & self.scene.ray_test(dr.detach(ray_back), absorbs)
         else:  # rounding may move the surface itself into this range: another one, or one that faces the other way
             found = self.scene.ray_intersect(dr.detach(ray_back), mi.RayFlags.Minimal, False, absorbs)
-            other = (found.shape != si.shape) | (found.prim_index != si.prim_index) | (dr.dot(found.n, si.n) < 0)
+            other = (found.shape != si.shape) | (found.instance != si.instance)
+            other |= (found.prim_index != si.prim_index) | (dr.dot(found.n, si.n) < 0)
             thin = absorbs & found.is_valid() & other
         self.crossings.add(si.shape, depth, through, through & (dr.max(excess) > 0), thin)
         return dr.select(through, beyond, sigma)

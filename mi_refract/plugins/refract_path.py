@@ -321,7 +321,8 @@ def integrator_class(v: Variant) -> type:
             symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
             if self.deterministic and needs.chance:
                 frozen = " in a frozen function, where no diffuse counts as black"
-                chance = needs.chance + frozen * dr.flag(dr.JitFlag.FreezingScope)
+                is_diffuse = needs.chance.startswith("SmoothDiffuse at ")
+                chance = needs.chance + frozen * (is_diffuse and dr.flag(dr.JitFlag.FreezingScope))
                 expected = "expected only smooth dielectrics and conductors"
                 raise ValueError(f"{INTEGRATOR}: deterministic = true: {chance}; {expected}")
             if self.deterministic and not symbolic:
@@ -363,9 +364,10 @@ def integrator_class(v: Variant) -> type:
             warnings = [f"missing {path_class}: {text}{untraced}" for path_class, text in missing.items()]
             if needs.thin:
                 warnings.append(f"{needs.thin}; expected a thicker shape, or one nearer to the origin")
-            if needs.inexact:
-                warnings.append(f"{needs.inexact}; expected a mesh, or a sphere that is scaled itself")
-            for text in warnings if (needs, self.apart) != before else ():
+            warnings = warnings if (needs, self.apart) != before else []
+            if needs.inexact and not (before[0] and before[0].inexact):  # depends on the camera, so once for all places
+                warnings.append(needs.inexact)
+            for text in warnings:
                 mi.Log(mi.LogLevel.Warn, f"{INTEGRATOR}: {text}")  # type: ignore[operator]
             attached = vectorised and not dr.flag(dr.JitFlag.SymbolicLoops)
             instances = [shape for shape in scene.shapes() if attached and shape.class_name() == "Instance"]

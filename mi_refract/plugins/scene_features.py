@@ -13,7 +13,7 @@ import math
 import operator
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
@@ -88,7 +88,8 @@ class SceneFeatures:
     chance: str  # the first plugin that is not in `DETERMINISTIC`, and its shape; "" if none exists
     delta_extent: float  # extent of the largest shape with delta lobes, for `ray_origins`
     thin: str  # the first shape of glass that is too thin for rays to enter, and why; "" if none exists
-    inexact: str  # the first shape of glass on which Mitsuba's points are less exact than rays need, and why; or ""
+    # The first shape of glass on which Mitsuba's points err by more than rays allow, from a camera, and why; or "".
+    inexact: str = field(compare=False)
     unknown: tuple[str, ...] = ()
 
     @property
@@ -189,11 +190,12 @@ def inspect(scene: Scene, sensor: Sensor | None = None) -> SceneFeatures:
         for i, flags_of_shape in with_delta.items()
         if flags_of_shape & +lobes.DeltaTransmission and (text := ray_origins.too_thin(sizes[i], delta_extent))
     )
-    eyes = [x for x in (*scene.sensors(), sensor) if x is not None]
+    glass = [i for i, flags_of_shape in with_delta.items() if flags_of_shape & +lobes.DeltaTransmission]
+    places = ray_origins.places_of([x for x in (*scene.sensors(), sensor) if x is not None])
     inexact = (
         f"{shape_name(shapes, i)} {text}"
-        for i, instances in _suspects(scene, shapes).items()
-        if i in with_delta and (text := ray_origins.inexact(shapes[i], instances, eyes))
+        for i, instances in _suspects(scene, shapes, glass).items()
+        if (text := ray_origins.inexact(shapes[i], instances, places))
     )
     shape_media = any(shape.interior_medium() or shape.exterior_medium() for shape in shapes)
     return SceneFeatures(
@@ -321,19 +323,24 @@ def group_name(instance: Shape) -> str | None:
     return match[1] if match else None
 
 
-def _suspects(scene: Scene, shapes: list[Shape]) -> dict[int, list[Shape] | None]:
+def _suspects(scene: Scene, shapes: list[Shape], glass: list[int]) -> dict[int, list[Shape] | None]:
     """Return the positions of cylinders, with None, and of cylinders and spheres in groups, with their instances.
 
-    `shapes`: `all_shapes` of the scene.
+    `shapes`: `all_shapes` of the scene; `glass`: the positions that are examined.
     """
-    kinds, own = [shape.class_name() for shape in shapes], len(scene.shapes())
-    found: dict[int, list[Shape] | None] = {i: None for i in range(own) if kinds[i] == "Cylinder"}
-    if {"Cylinder", "Sphere"} & {*kinds[own:]}:
-        instances = [(group_name(shapes[i]), shapes[i]) for i in range(own) if kinds[i] == "Instance"]
+    own, found = len(scene.shapes()), dict[int, list[Shape] | None]()
+    in_groups: list[int] = []
+    for i in glass:
+        kind = shapes[i].class_name()
+        if i < own and kind == "Cylinder":
+            found[i] = None
+        elif i >= own and kind in ("Cylinder", "Sphere"):
+            in_groups.append(i)
+    if in_groups:
+        instances = [(group_name(x), x) for x in shapes[:own] if x.class_name() == "Instance"]
         groups = [group.id() for group in shape_groups(scene) for _ in shapes_of(group)]
-        for i, name in enumerate(groups, own):
-            if kinds[i] in ("Cylinder", "Sphere"):
-                found[i] = [instance for shown, instance in instances if shown in (name, None)]
+        for i in in_groups:
+            found[i] = [instance for name, instance in instances if name in (groups[i - own], None)]
     return found
 
 

@@ -317,6 +317,14 @@ def test_a_sheet_that_rays_step_over_is_an_error_too_where_they_start_as_those_o
     assert "thicker than 1e-4 of 1 + its largest coordinate" in text
 
 
+def test_a_second_instance_of_a_sheet_that_rays_step_over_is_an_error(rgb_variant):
+    """Rays that enter the first one start within or beyond the second one."""
+    group = grouped(pane=box(matched(int_absorption=100.0), 4e-4, 12, id="pane"))
+    shifted = group["instance"] | {"to_world": PLACE().translate([0, 0, -8e-4])}
+    text = refused(17.0, integrator=CHANCE, **group, second=shifted)
+    assert "'pane' absorbs, and is so thin that rays miss one of its sides" in text
+
+
 NARROW = matched(int_absorption=2.0)
 ROD = {"type": "cylinder", "p0": [-9, 0, 0], "p1": [9, 0, 0], "bsdf": NARROW}
 UNEVEN = {

@@ -357,6 +357,7 @@ def test_in_a_frozen_function_no_diffuse_counts_as_black(llvm_variant, no_collec
     assert image(bsdf={"type": "conductor", "specular_reflectance": 0.0}).any()
     text = "SmoothDiffuse at 'lamp' in a frozen function, where no diffuse counts as black; expected only smooth"
     assert text in refusal(image)
+    assert "RoughConductor at 'lamp'; expected only smooth" in refusal(image, bsdf={"type": "roughconductor"})
 
 
 def test_what_no_instance_shows_is_not_left_to_chance(llvm_variant):

@@ -389,23 +389,43 @@ def pipe(radius, **parameters):
     ("parts", "distance", "text"),
     [
         (shown(0.5, type="sphere"), 6, ""),
-        (shown(0.2, type="sphere"), 6, "'solid' is a Sphere in an instance that scales it by 0.2, on which"),
-        (shown((1, 1, 0.2), type="sphere"), 6, "scales it by 0.2, on which Mitsuba's points err by up to 0.00069"),
-        (shown(0.5, type="sphere"), 30, "err by up to 0.00043, seen from 30, but rays start 8.9e-05 from"),
+        (shown(0.2, type="sphere"), 6, "'solid' is a Sphere in an instance that scales it by 0.2, 6 from a camera: "),
+        (
+            shown((1, 1, 0.2), type="sphere"),
+            6,
+            "0.2, 6 from a camera: Mitsuba's points on it err by up to 0.00069",
+        ),
+        (
+            shown(0.5, type="sphere"),
+            30,
+            "err by up to 0.00043, but rays start 8.9e-05 from its surface; expected a",
+        ),
         (shown(2, type="sphere"), 30, ""),
         (shown(0.2, type="cube"), 30, ""),
         (shown(0.2, type="sphere", bsdf={"type": "diffuse"}), 6, ""),
         ({"solid": {"type": "sphere", "radius": 0.01, "bsdf": GLASS}}, 30, ""),
         (pipe(0.1), 5, ""),
-        (pipe(0.1), 30, "'solid' is a Cylinder, on which Mitsuba's points err by up to 0.0021"),
+        (pipe(0.1), 30, "'solid' is a Cylinder, 29.5 from a camera: Mitsuba's points on it err by up to 0.0021"),
         (pipe(0.1, p0=[0, 0, 25], p1=[0, 0, 29]), 30, ""),  # nearer
-        (shown(0.1, type="cylinder"), 30, "'solid' is a Cylinder in an instance that scales it by 0.1, on which"),
+        (pipe(0.1, bsdf={"type": "conductor"}), 30, ""),
+        (pipe(0.1, bsdf={"type": "null"}), 30, ""),
+        (shown(0.1, type="cylinder"), 30, "'solid' is a Cylinder in an instance that scales it by 0.1, 29.9 from"),
     ],
 )
 def test_shapes_on_which_mitsubas_points_are_not_exact_enough_are_reported(parts, distance, text, typical_variant):
     at = PLACE().look_at([0, 0, distance], [0, 0, 0], [0, 1, 0])
     reported = needs(sensor={"type": "perspective", "to_world": at}, **parts).inexact
     assert text in reported and bool(text) == bool(reported)
+
+
+def test_refract_path_warns_once_of_inexact_points_wherever_the_camera_is(logged, scalar_variant):
+    scene = under_a_pane(POINT, GLASS, more=pipe(0.01)["solid"])
+    method = mi.load_dict({"type": "refract_path", "caustics": "path"})
+    for distance in (1, 30, 40):
+        at = PLACE().look_at([0, 0, distance], [0, 0, 0], [0, 1, 0])
+        method.render(scene, mi.load_dict(camera(4) | {"to_world": at}), spp=1)
+    warnings = "missing L S+ D", "Mitsuba's points on it err by"
+    assert [x for text in logged for x in warnings if x in text] == [*warnings]
 
 
 def test_the_size_of_merged_meshes_is_that_of_all_parts(llvm_variant):
