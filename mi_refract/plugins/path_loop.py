@@ -331,8 +331,8 @@ class PathLoop:
             s.active = self._pop(s, active_next) if features.split_depth else active_next
             return (s,)
         bsdf = si.bsdf()
-        # The random numbers of a split path depend on its vertex in the tree.
-        key = (s.node * 0x9E3779B9 + s.depth) * 4 if features.split_depth else 0
+        # Keyed random numbers depend on the vertex: its depth, and in a split path its place in the tree.
+        key = (s.node * 0x9E3779B9 + s.depth if features.split_depth else s.depth) * 4
 
         # ---------------------- Emitter sampling ----------------------
         active_em = active_next & mi.has_flag(bsdf.flags(), LOBES.Smooth) if features.emitter_sampling else False

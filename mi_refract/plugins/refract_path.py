@@ -36,6 +36,10 @@ thin as 4e-6 of the largest shape with such lobes and 2e-6 of its own largest co
 of a ray that enters it, where that is more. A shape of less than the former is named in a warning
 (`SceneFeatures.thin`).
 
+In JIT variants a path's random numbers after the camera's are its own where it splits or the sampler is `multijitter`,
+`stratified`, `ldsampler` or `orthogonal`, with jitter: numbers of two dimensions are dependent in those samplers, which
+makes the expected image wrong.
+
 Derivatives are attached: rays move with the index. Edges that move across a pixel, or in the view of a surface that is
 not smooth, are not in them. A render that is differentiated does not split.
 """
@@ -49,14 +53,14 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refract.numerics import Mask, MediumPlugin, Number, Properties, Ray, Sampler, Scene, Sensor, Spectrum, Variant
+from mi_refract.numerics import Count, Mask, MediumPlugin, Number, Properties, Ray, Sampler, Scene, Sensor, Spectrum, Variant
 
 from . import lamp_tracing
 from .absorption import read_absorption
 from .index_parameter import warn_once
 from .medium_tracking import MediumTracker, ShapeMedia, check_media, extinction
 from .path_loop import PathFeatures, PathLoop
-from .sampling import KeyedMultijitter, SceneSampler, seeds_of
+from .sampling import KeyedMultijitter, SceneSampler, is_stratified, seed_of_pass, seeds_of
 from .scene_features import CAST, CURVES, SceneFeatures, all_shapes, check_shapes, differentiated, inspect
 
 INTEGRATOR = "refract_path"  # its name in Mitsuba
@@ -134,15 +138,19 @@ def integrator_class(v: Variant) -> type:
             self.needs: SceneFeatures | None = None  # of the scene rendered last
             self.rendering = False  # between `begin_render` and `end_render`
             self.sensor: Sensor | None = None  # of this render
+            self.seed: Any = None  # of this render, if known
             self.near: Any = None  # its `to_camera`
             self.apart = False  # lamps are traced in the scene rendered last
             self.unconnected = ""  # why that sensor's lamps cannot be traced
             self.untraced = ""  # why no lamps were traced in the scene rendered last, though `caustics` = `auto`
             self.loops: list[PathLoop] = []  # of this render: one a pass; in scalar variants one in all
 
-        def begin_render(self, sensor: Sensor) -> None:
-            """Call this before `sample` if `render` is not called; otherwise each sample inspects the scene again."""
-            self.loops, self.rendering = [], True
+        def begin_render(self, sensor: Sensor, seed: Any = None) -> None:
+            """Call this before `sample` if `render` is not called; otherwise each sample inspects the scene again.
+
+            `seed`: of the render; None: random numbers are seeded by the sampler, lane by lane.
+            """
+            self.loops, self.rendering, self.seed = [], True, seed
             self.sensor, self.near = sensor, to_camera(sensor)
             self.unconnected = lamp_tracing.refused_sensor(sensor)
 
@@ -155,7 +163,7 @@ def integrator_class(v: Variant) -> type:
 
         def forget(self) -> None:
             """End a render."""
-            self.loops, self.rendering, self.sensor = [], False, None
+            self.loops, self.rendering, self.sensor, self.seed = [], False, None, None
 
         def render(
             self,
@@ -167,7 +175,7 @@ def integrator_class(v: Variant) -> type:
             evaluate: bool = True,
         ) -> Any:
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            self.begin_render(sensor)
+            self.begin_render(sensor, seed)
             try:
                 image = super().render(scene, sensor, seed, spp, develop, evaluate)
                 if any(loop.features.lamps_traced for loop in self.loops):
@@ -245,8 +253,8 @@ def integrator_class(v: Variant) -> type:
             features = self.path_features(needs)
             count = min(self.samples_per_pass, sampler.sample_count()) if vectorised else 1
             numbers: Any = SceneSampler()
-            if vectorised and features.split_depth:
-                numbers = KeyedMultijitter(v, seeds_of(v, sampler), sampler.wavefront_size(), count)
+            if vectorised and (features.split_depth or is_stratified(sampler)):
+                numbers = KeyedMultijitter(v, self.seeds(sampler), sampler.wavefront_size(), count)
             media: ShapeMedia | MediumTracker | None = None
             if features.absorption:
                 media = ShapeMedia(v) if needs.shape_media else MediumTracker(v, scene, features.delta_extent)
@@ -254,6 +262,13 @@ def integrator_class(v: Variant) -> type:
             if self.rendering:
                 self.loops.append(loop)
             return loop
+
+        def seeds(self, sampler: Sampler) -> Count:
+            """The seed of the next pass, or one for each lane where the seed of the render is not known."""
+            own = self.sensor.sampler() if self.sensor else None
+            if self.seed is None or type(own) is not v.Sampler:  # a sampler in Python may have no `clone`
+                return seeds_of(v, sampler)
+            return seed_of_pass(v, own, self.seed, len(self.loops))
 
         def camera_medium(self, scene: Scene, ray: Ray, medium: MediumPlugin) -> tuple[Spectrum, Number]:
             """σ at the camera, and the way from there to the origin of the ray."""

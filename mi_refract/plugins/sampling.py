@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import drjit as dr
 
 from mi_refract.numerics import Count, Interaction, Mask, Number, Point2, Sampler, Scene, Spectrum, Variant
 
 ONE = 1 - 2.0**-24  # the largest float32 below 1
+GOLDEN = 0x9E3779B9  # 2³² over the golden ratio
+STRATIFIED = "MultijitterSampler", "StratifiedSampler", "LowDiscrepancySampler", "OrthogonalSampler"
 
 
 class SceneSampler:
@@ -43,9 +46,38 @@ class IndependentNumbers:
         return [self.generator.next_float32() for _ in range(count)]
 
 
+def is_stratified(sampler: Sampler) -> bool:
+    """Return whether a sampler is one of Mitsuba's that stratify the samples of a pixel, with jitter.
+
+    These add a constant for each dimension to one seed and permute the strata by the sums. The permutations of two
+    dimensions are dependent, so the expected image is wrong (study `efficiency`).
+    """
+    return sampler.class_name() in STRATIFIED and "jitter = 0" not in str(sampler)
+
+
 def seeds_of(v: Variant, sampler: Sampler) -> Count:
     """Return a seed for each lane, made of a point of the sampler."""
     return v.sample_tea_32(*(dr.reinterpret_array(v.UInt32, x) for x in dr.detach(sampler.next_2d())))[0]
+
+
+def seed_of_pass(v: Variant, sampler: Sampler, seed: Any, number: int) -> Count:
+    """Return one seed for all lanes of pass `number` of a render with this seed.
+
+    `sampler`: the sensor's, which may have a seed of its own.
+    """
+    probe = sampler.clone()
+    probe.seed(seed, 1)
+    word = v.sample_tea_32(seed, dr.reinterpret_array(v.UInt32, dr.detach(probe.next_1d())))[0]
+    word = v.sample_tea_32(word, dr.opaque(v.UInt32, number))[0]
+    dr.eval(word)  # data of the kernel, not a part of it
+    return word
+
+
+def mixed(word: Count) -> Count:
+    """Return the hash of a word: the finaliser of MurmurHash3."""
+    word = (word ^ (word >> 16)) * 0x85EBCA6B
+    word = (word ^ (word >> 13)) * 0xC2B2AE35
+    return word ^ (word >> 16)
 
 
 class KeyedMultijitter:
@@ -55,8 +87,8 @@ class KeyedMultijitter:
     dimensions. Here a number depends on its key. Each key is a dimension of its own that is stratified over the samples
     of a pixel: correlated multi-jittered sampling (Kensler 2013).
 
-    For camera paths the seeds come from the scene's sampler (`seeds_of`), which knows the seed and the pass of every
-    render, also if another integrator calls this one.
+    For camera paths the seed is that of the pass (`seed_of_pass`), or if another integrator calls this one, that of
+    its sampler (`seeds_of`), which takes longer.
     """
 
     def __init__(self, v: Variant, seed: Count, lanes: int, count: int) -> None:
@@ -72,25 +104,27 @@ class KeyedMultijitter:
         if self.count > 1 and dr.width(seed) > 1:
             seed = dr.gather(v.UInt32, seed, self.lane - self.index)  # the seed of the pixel's first lane
         self.pixel = v.sample_tea_32(pixel, seed)[0]
+        self.sample = v.sample_tea_32(self.lane, self.pixel)[0]
 
     def next_1d(self, sampler: Sampler, key: Count) -> Number:
         """Return a number in [0, 1). The n samples of a pixel with one key lie in n equal intervals, one in each."""
-        v, (permutation, noise) = self.v, self.v.sample_tea_32(self.pixel, key)
-        stratum = v.permute_kensler(self.index, self.count, permutation)
-        return self._placed(stratum, self._unit(v.sample_tea_32(self.lane, noise)[0]), self.count)
+        permutation = mixed(self.pixel + self.v.UInt32(key) * GOLDEN)
+        stratum = self.v.permute_kensler(self.index, self.count, permutation)
+        return self._placed(stratum, self._unit(mixed(self.sample ^ permutation)), self.count)
 
     def next_2d(self, sampler: Sampler, key: Count) -> Point2:
         """Return a point in [0, 1)², stratified in rows × columns cells, and in x and y each over all samples."""
-        v, (cell_seed, noise) = self.v, self.v.sample_tea_32(self.pixel, key)
+        v, cell_seed = self.v, mixed(self.pixel + self.v.UInt32(key) * GOLDEN)
         # Seeds with a constant difference give dependent permutations. So each seed is a hash of its own.
-        row_seed, column_seed = v.sample_tea_32(noise, cell_seed)
+        row_seed = mixed(cell_seed + GOLDEN)
+        column_seed = mixed(row_seed + GOLDEN)
         cell = v.permute_kensler(self.index, self.count, cell_seed)
         row = cell // self.columns
         column = cell - row * self.columns
         # Cells are divided likewise: no two samples share a fine row or a fine column.
         inner_row = v.permute_kensler(row, self.rows, row_seed)
         inner_column = v.permute_kensler(column, self.columns, column_seed)
-        x, y = (self._unit(word) for word in v.sample_tea_32(self.lane, noise))
+        x, y = (self._unit(mixed(self.sample ^ seed)) for seed in (row_seed, column_seed))
         x, y = self._placed(inner_row, x, self.rows), self._placed(inner_column, y, self.columns)
         return v.Point2f(self._placed(column, x, self.columns), self._placed(row, y, self.rows))
 

@@ -198,7 +198,7 @@ def _samples(scene: Scene, channels: tuple[str, ...], spp: int, seed: int) -> tu
 
     sensor, integrator = scene.sensors()[0], scene.integrator()
     if hasattr(integrator, "begin_render"):
-        integrator.begin_render(sensor)
+        integrator.begin_render(sensor, seed)
     sampler, spp = ADIntegrator.prepare(None, sensor, seed, spp, integrator.aov_names())
     ray, weight, position = ADIntegrator.sample_rays(None, scene, sensor, sampler)
     ray.scale_differential(1 / math.sqrt(spp))
@@ -232,7 +232,7 @@ def samples_of_pixels(
     scene, sensor = renderer.scene, renderer.scene.sensors()[0]
     spp, (width, _) = sampler.sample_count(), renderer.size
     if hasattr(integrator, "begin_render"):
-        integrator.begin_render(sensor)
+        integrator.begin_render(sensor, seed)
     sampler.set_samples_per_wavefront(spp)
     sampler.seed(seed, len(pixels) * spp)
     number = dr.arange(mi.UInt32, len(pixels) * spp) // dr.opaque(mi.UInt32, spp)
