@@ -30,7 +30,7 @@ ROOMS = {
     "stability": ("optical_chains", "energy", "derivatives", "layered_paths"),
     "renders": (
         *("against_dielectric", "colours", "unused_features", "invisible_changes"),
-        *("neighbours", "random_numbers", "gradients", "rendering_passes", "thin_panes"),
+        *("neighbours", "random_numbers", "samplers", "gradients", "rendering_passes", "thin_panes"),
     ),
     "efficiency": ("error_against_time", "scaling", "changing_indices", "caustics", "chosen_settings"),
     "media": ("catalogs", "ray_directions", "closed_forms", "renders"),

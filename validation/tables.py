@@ -32,7 +32,7 @@ from validation.ground_truth import standard_numbers
 from validation.planar import against_retrace
 from validation.planar import times as planar_times
 from validation.reference.standard_numbers import NUMBERS
-from validation.renders import against_dielectric, colours, gradients, thin_panes
+from validation.renders import against_dielectric, colours, gradients, samplers, thin_panes
 from validation.run import headline
 from validation.run import metrics as m
 from validation.run.array_settings import PLAIN
@@ -219,6 +219,23 @@ def panes(rows: list[Row]) -> str:
     ]
     text = _replay(measured, "Deviation of the mean radiance from 1. {spp} spp, {setting}.")
     return _table(text, ["pane", *(f"`{method}`" for method in methods)], lines, "panes were rendered")
+
+
+def biases(rows: list[Row]) -> str:
+    """Return the bias of an image by each stratified sampler, by integrator."""
+    measured, columns = _measured(rows, samplers.NAME), (samplers.BIAS, m.DETECTABLE_IMAGE, m.WELCH_ALARMS)
+    methods = dict.fromkeys(row.subject for row in measured)
+    by_case = {(row.case, row.subject): row for row in measured}
+    lines = [
+        [f"`{case}`", *(cell for method in methods for cell in _cells(by_case.get((case, method)), columns))]
+        for case in dict.fromkeys(row.case for row in measured)
+    ]
+    text = _replay(measured, "`{scene}`, {resolution}² pixels, {renders} renders of {spp} spp, {setting}.")
+    heading = [
+        "sampler",
+        *(x for method in methods for x in (f"`{method}`: bias", "detectable", "tiles and channels that differ")),
+    ]
+    return _table(text, heading, lines, "samplers were compared")
 
 
 def derivatives(rows: list[Row]) -> str:
@@ -499,6 +516,7 @@ TABLES = {
     "on a GPU": Table(f"{PAGES}/what-each-formula-costs.md", "directions.per_formula", on_a_gpu),
     "renders": Table(f"{PAGES}/refract-and-dielectric.md", "renders.against_dielectric", renders),
     "panes": Table(f"{PAGES}/refract-and-dielectric.md", "renders.thin_panes", panes),
+    "samplers": Table(f"{PAGES}/passes-bits-and-errors.md", "renders.samplers", biases),
     "derivatives": Table(f"{PAGES}/which-derivatives-are-correct.md", "renders.gradients", derivatives),
     "paths": Table(f"{PAGES}/refract-and-dielectric.md", "stability.layered_paths", paths),
     "efficiency": Table(f"{PAGES}/what-each-formula-costs.md", "efficiency.error_against_time", efficiency),

@@ -53,7 +53,19 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refract.numerics import Count, Mask, MediumPlugin, Number, Properties, Ray, Sampler, Scene, Sensor, Spectrum, Variant
+from mi_refract.numerics import (
+    Count,
+    Mask,
+    MediumPlugin,
+    Number,
+    Properties,
+    Ray,
+    Sampler,
+    Scene,
+    Sensor,
+    Spectrum,
+    Variant,
+)
 
 from . import lamp_tracing
 from .absorption import read_absorption

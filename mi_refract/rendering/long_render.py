@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeAlias
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -38,7 +39,7 @@ from .pass_plan import FEW, FIRST_LANES, LANES, PassPlan, next_stop, plan_passes
 from .pass_sums import ARITY, PassSums
 from .pilot import Pilot, choose, lines_of
 from .render_pass import PassRenderer, pass_renderer
-from .render_settings import AUTO, OWN, parse_settings, settings_text, with_settings
+from .render_settings import AUTO, BIASED, OWN, own_settings, parse_settings, settings_text, with_settings
 from .scene_files import formulas_in, load_parsed, naming, parse_scene
 
 
@@ -128,7 +129,21 @@ def resume(
         expected = "expected jitter, or one pass from the start: --spp N --pass-spp N"
         raise ValueError(f"{job.scene}: the sampler has no jitter, so all passes have points on one grid; {expected}")
     progress.identity[PASS] = plan.spp
-    return LongRender(job, path, limits, parsed, scene, renderer, spp, plan, progress, pilot_seconds)
+    warnings = _biases(job, parsed)
+    return LongRender(job, path, limits, parsed, scene, renderer, spp, plan, progress, pilot_seconds, warnings=warnings)
+
+
+def _biases(job: Job, parsed: ParsedScene) -> list[str]:
+    """Return a warning if the sampler biases the image, as Mitsuba's stratified ones do unless `refract_path` renders.
+
+    All passes have the same bias, so the stated error does not contain it.
+    """
+    sampler = own_settings(parsed)["sampler"]
+    own_numbers = dr.is_jit_v(mi.Float) and any(plugin == "refract_path" for _, plugin, *_ in parsed.nodes)
+    if sampler not in BIASED or own_numbers:
+        return []
+    expected = "expected the sampler `independent`, or the integrator `refract_path` in a JIT variant"
+    return [f"{job.scene}: Mitsuba's sampler {sampler} biases the image, which no stated error contains; {expected}"]
 
 
 def _choose(job: Job, parsed: ParsedScene, renderer: PassRenderer, spp: int | None, limits: Limits) -> Identity:

@@ -508,11 +508,19 @@ def test_other_seeds_have_other_numbers_whatever_calls(around, llvm_variant):
     assert np.square(images.mean(axis=0) - whole).mean() < np.square(images - whole).mean() / 8
 
 
-def test_passes_of_the_film_have_other_numbers(llvm_variant):
+@pytest.mark.parametrize("sampler", ["independent", "multijitter", "ldsampler"])
+def test_every_pass_has_a_seed_also_of_samplers_with_seeds_of_their_own(sampler, llvm_variant):
+    samplers = [mi.load_dict({"type": sampler, "seed": own}) for own in range(3)]
+    seeds = [sampling.seed_of_pass(mi, own, seed, p)[0] for own in samplers for seed in range(8) for p in range(8)]
+    assert len(set(seeds)) == 3 * 8 * 8
+
+
+@pytest.mark.parametrize(("sampler", "split_depth"), [("independent", 1), ("multijitter", 0)])
+def test_passes_of_the_film_have_other_numbers(sampler, split_depth, llvm_variant):
     """64 samples in passes have the noise of 64 at once within a factor of 4; 16 passes that repeat have 16 times."""
-    scene, passes = load("balls", 24), ({}, {"samples_per_pass": 4}, {"samples_per_pass": 16})
+    scene, passes = load("balls", 24, sampler=sampler), ({}, {"samples_per_pass": 4}, {"samples_per_pass": 16})
     once, *others = (
-        np.var([render(scene, 64, seed, split_depth=1, max_depth=8, **x) for seed in range(6)], axis=0).mean()
+        np.var([render(scene, 64, seed, split_depth=split_depth, max_depth=8, **x) for seed in range(6)], axis=0).mean()
         for x in passes
     )
     assert max(others) < 4 * once

@@ -194,6 +194,23 @@ def test_a_sampler_without_jitter_renders_a_single_pass(tmp_path, llvm_variant, 
     assert rendering(output, scene=scene, **more[0]).end() == "50 spp"
 
 
+def biased(tmp_path, sampler, integrator):
+    """Return whether a render of 8 × 8 pixels warns of the bias of its sampler."""
+    settings = f"sampler={sampler},integrator={integrator}"
+    warnings = resume(Job(BALL, {"res": "8"}, settings=settings), tmp_path / "a.exr", Limits(spp=4)).warnings
+    return any(f"{BALL}: Mitsuba's sampler {sampler} biases the image" in text for text in warnings)
+
+
+@pytest.mark.parametrize("sampler", ["multijitter", "ldsampler"])
+def test_a_sampler_that_biases_the_image_is_a_warning(tmp_path, llvm_variant, sampler):
+    assert biased(tmp_path, sampler, "path") and not biased(tmp_path, sampler, "refract_path")
+    assert not any(biased(tmp_path, other, "path") for other in ("independent", "orthogonal"))
+
+
+def test_scalar_variants_of_refract_path_have_mitsubas_numbers(tmp_path):
+    assert biased(tmp_path, "multijitter", "refract_path")
+
+
 def test_a_render_ends_at_the_first_limit_that_it_reaches(tmp_path, llvm_variant):
     for _ in range(2):  # the second time from the finished image
         render = rendering(tmp_path / "a.exr", until=0.1, pass_spp=2)

@@ -151,7 +151,7 @@ INVALID = {
     "empty": ("", "''; expected auto, or sampler=…, integrator=…, split_depth=…"),
     "an unknown name": ("smapler=independent", "expected auto, or sampler=…"),
     "auto and another": ("auto,split_depth=1", "'auto'; expected"),
-    "an unknown sampler": ("sampler=sobol", "sampler = 'sobol'; expected multijitter, stratified"),
+    "an unknown sampler": ("sampler=sobol", "sampler = 'sobol'; expected multijitter, orthogonal"),
     "an unknown integrator": ("integrator=volpath", "integrator = 'volpath'; expected path, refract_path"),
     "no depth": ("split_depth=", "split_depth = ''; expected 0 to 64"),
     "a negative depth": ("split_depth=-1", "split_depth = '-1'; expected 0 to 64"),

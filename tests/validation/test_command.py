@@ -24,7 +24,7 @@ from validation import runner, tables
 from validation.diff import planted_defects, visible_changes
 from validation.efficiency import caustic_scenes
 from validation.reference.standard_numbers import NUMBERS
-from validation.renders import gradients, thin_panes
+from validation.renders import gradients, samplers, thin_panes
 from validation.run import render_methods
 from validation.run.context import SCENES, beyond_builtin, here
 from validation.run.metrics import EQUAL_TIME, EQUAL_TIME_DEFAULTS
@@ -341,6 +341,7 @@ NAMED = {
     "on a GPU": [*FORMULAS, "ns per ray"],
     "renders": [path.stem for path in SCENES.glob("*.xml") if not beyond_builtin(path)],
     "panes": [f"{1000 * thickness:g} mm at {x:g} m" for thickness, x in thin_panes.PANES],
+    "samplers": ["multijitter", "orthogonal", "stratified", "ldsampler", *(m.name for m in samplers.COMPARED)],
     "paths": layered_paths.plugins(),
     "efficiency": [method.name for method in render_methods.METHODS],
     "caustics": [*caustic_scenes.BODIES, *caustic_scenes.LAMPS],

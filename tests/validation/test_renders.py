@@ -30,6 +30,7 @@ from validation.renders import (
     neighbours,
     random_numbers,
     rendering_passes,
+    samplers,
     unused_features,
 )
 from validation.run import render_methods
@@ -387,6 +388,14 @@ class Dependent(KeyedMultijitter):
 def test_numbers_that_are_not_uniform_are_detected(llvm_variant, source, count, failing):
     rows = random_numbers.rows(llvm_variant, (count,), 1, source)
     assert {row.case.split(",")[0] for row in rows if row.broken} == failing
+
+
+def test_the_bias_of_a_sampler_is_detected_and_refract_path_has_none(llvm_variant):
+    """False alarms: 1 in 1000 for each sampler of `refract_path`."""
+    by_path, ours = (samplers.rows(llvm_variant, method, 48) for method in samplers.COMPARED)
+    assert not any(row.broken for row in ours) and not any(row.budgets for row in by_path)
+    (worst,) = (row for row in by_path if row.case == "ldsampler")
+    assert worst.values["Welch alarms"] > 10 and 0.003 < abs(worst.values["bias of the image"]) < 0.01
 
 
 # Media ----------------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ __all__ = [
     "neighbours",
     "random_numbers",
     "rendering_passes",
+    "samplers",
     "thin_panes",
     "unused_features",
 ]
