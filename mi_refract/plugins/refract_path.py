@@ -47,6 +47,7 @@ not smooth, are not in them. A render that is differentiated does not split.
 from __future__ import annotations
 
 import math
+import signal
 import threading
 from typing import Any
 
@@ -125,6 +126,17 @@ def read_split(props: Properties, deterministic: bool) -> tuple[int, float]:
     return depth, float(weight)
 
 
+def restore_interrupts() -> None:
+    """Install Python's handler of SIGINT again, in the main thread.
+
+    While Mitsuba renders, SIGINT has a handler of Mitsuba's, which remembers one former handler. A render within a
+    render, as of every integrator in Python with a `render` of its own, would remember Mitsuba's and restore that one.
+    """
+    handler = signal.getsignal(signal.SIGINT)  # None: not one of Python's
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, handler)
+
+
 def integrator_class(v: Variant) -> type:
     """The class of the integrator for one variant, given its module."""
     vectorised = dr.is_jit_v(v.Float)
@@ -187,6 +199,7 @@ def integrator_class(v: Variant) -> type:
             evaluate: bool = True,
         ) -> Any:
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            restore_interrupts()
             self.begin_render(sensor, seed)
             try:
                 image = super().render(scene, sensor, seed, spp, develop, evaluate)

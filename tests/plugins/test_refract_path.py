@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import gc
 import math
+import signal
 import sys
 
 import drjit as dr
@@ -524,6 +525,17 @@ def test_passes_of_the_film_have_other_numbers(sampler, split_depth, llvm_varian
         for x in passes
     )
     assert max(others) < 4 * once
+
+
+@pytest.mark.parametrize("around", AROUND)
+def test_an_interruption_after_a_render_is_one(around, llvm_variant):
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        mi.render(load("balls", 8), integrator=within(around), spp=1)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, former)
 
 
 @pytest.mark.parametrize("around", AROUND)
