@@ -45,7 +45,7 @@ from . import ray_origins
 from .absorption import absorbed
 from .medium_tracking import MediumTracker, ShapeMedia
 from .refract import DISPERSED, followed_context
-from .sampling import ONE, KeyedMultijitter, NonConstantEmitters, SceneEmitters, SceneSampler
+from .sampling import GOLDEN, ONE, KeyedMultijitter, NonConstantEmitters, SceneEmitters, SceneSampler
 from .scene_features import BOUNDARIES, all_shapes, bsdf_name, children, nested, plugin_number
 
 # These values of `sample1` select the first and the last lobe of a boundary. A less probable lobe is not followed.
@@ -332,7 +332,7 @@ class PathLoop:
             return (s,)
         bsdf = si.bsdf()
         # Keyed random numbers depend on the vertex: its depth, and in a split path its place in the tree.
-        key = (s.node * 0x9E3779B9 + s.depth if features.split_depth else s.depth) * 4
+        key = (s.node * GOLDEN + s.depth if features.split_depth else s.depth) * 4
 
         # ---------------------- Emitter sampling ----------------------
         active_em = active_next & mi.has_flag(bsdf.flags(), LOBES.Smooth) if features.emitter_sampling else False

@@ -36,9 +36,9 @@ thin as 4e-6 of the largest shape with such lobes and 2e-6 of its own largest co
 of a ray that enters it, where that is more. A shape of less than the former is named in a warning
 (`SceneFeatures.thin`).
 
-In JIT variants a path's random numbers after the camera's are its own where it splits or the sampler is `multijitter`,
-`stratified`, `ldsampler` or `orthogonal`, with jitter: numbers of two dimensions are dependent in those samplers, which
-makes the expected image wrong.
+In JIT variants a path that splits has random numbers of its own after those of the camera. So have all paths where the
+sampler is `multijitter`, `stratified`, `ldsampler` or `orthogonal`: in Mitsuba's stratified samplers the numbers of two
+dimensions may be dependent, which biases the image (study `samplers`).
 
 Derivatives are attached: rays move with the index. Edges that move across a pixel, or in the view of a surface that is
 not smooth, are not in them. A render that is differentiated does not split.
@@ -73,7 +73,7 @@ from .absorption import read_absorption
 from .index_parameter import warn_once
 from .medium_tracking import MediumTracker, ShapeMedia, check_media, extinction
 from .path_loop import PathFeatures, PathLoop
-from .sampling import KeyedMultijitter, SceneSampler, is_stratified, seed_of_pass, seeds_of
+from .sampling import STRATIFIED, KeyedMultijitter, SceneSampler, seed_of_pass, seeds_of
 from .scene_features import CAST, CURVES, SceneFeatures, all_shapes, check_shapes, differentiated, inspect
 
 INTEGRATOR = "refract_path"  # its name in Mitsuba
@@ -278,7 +278,7 @@ def integrator_class(v: Variant) -> type:
             features = self.path_features(needs)
             count = min(self.samples_per_pass, sampler.sample_count()) if vectorised else 1
             numbers: Any = SceneSampler()
-            if vectorised and (features.split_depth or is_stratified(sampler)):
+            if vectorised and (features.split_depth or sampler.class_name() in STRATIFIED):
                 numbers = KeyedMultijitter(v, self.seeds(sampler), sampler.wavefront_size(), count)
             media: ShapeMedia | MediumTracker | None = None
             if features.absorption:

@@ -11,6 +11,8 @@ from mi_refract.numerics import Count, Interaction, Mask, Number, Point2, Sample
 
 ONE = 1 - 2.0**-24  # the largest float32 below 1
 GOLDEN = 0x9E3779B9  # 2³² over the golden ratio
+# Mitsuba's samplers that stratify the samples of a pixel. They permute the strata of each dimension by seeds with
+# constant differences, so the permutations of two dimensions may be dependent: study `samplers`.
 STRATIFIED = "MultijitterSampler", "StratifiedSampler", "LowDiscrepancySampler", "OrthogonalSampler"
 
 
@@ -46,30 +48,22 @@ class IndependentNumbers:
         return [self.generator.next_float32() for _ in range(count)]
 
 
-def is_stratified(sampler: Sampler) -> bool:
-    """Return whether a sampler is one of Mitsuba's that stratify the samples of a pixel, with jitter.
-
-    These add a constant for each dimension to one seed and permute the strata by the sums. The permutations of two
-    dimensions are dependent, so the expected image is wrong (study `efficiency`).
-    """
-    return sampler.class_name() in STRATIFIED and "jitter = 0" not in str(sampler)
-
-
 def seeds_of(v: Variant, sampler: Sampler) -> Count:
     """Return a seed for each lane, made of a point of the sampler."""
     return v.sample_tea_32(*(dr.reinterpret_array(v.UInt32, x) for x in dr.detach(sampler.next_2d())))[0]
 
 
-def seed_of_pass(v: Variant, sampler: Sampler, seed: Any, number: int) -> Count:
+def seed_of_pass(v: Variant, sampler: Sampler, seed: Any, number: Any) -> Count:
     """Return one seed for all lanes of pass `number` of a render with this seed.
 
     `sampler`: the sensor's, which may have a seed of its own.
     """
-    probe = sampler.clone()
+    probe, seed, number = sampler.clone(), v.UInt32(seed), v.UInt32(number)
+    dr.make_opaque(seed, number)  # data of the kernel: no other kernel for each seed
     probe.seed(seed, 1)
     word = v.sample_tea_32(seed, dr.reinterpret_array(v.UInt32, dr.detach(probe.next_1d())))[0]
-    word = v.sample_tea_32(word, dr.opaque(v.UInt32, number))[0]
-    dr.eval(word)  # data of the kernel, not a part of it
+    word = v.sample_tea_32(word, number)[0]
+    dr.eval(word)
     return word
 
 

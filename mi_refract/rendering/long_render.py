@@ -129,21 +129,23 @@ def resume(
         expected = "expected jitter, or one pass from the start: --spp N --pass-spp N"
         raise ValueError(f"{job.scene}: the sampler has no jitter, so all passes have points on one grid; {expected}")
     progress.identity[PASS] = plan.spp
-    warnings = _biases(job, parsed)
+    warnings = _biases(job, parsed, scene)
     return LongRender(job, path, limits, parsed, scene, renderer, spp, plan, progress, pilot_seconds, warnings=warnings)
 
 
-def _biases(job: Job, parsed: ParsedScene) -> list[str]:
-    """Return a warning if the sampler biases the image, as Mitsuba's stratified ones do unless `refract_path` renders.
+def _biases(job: Job, parsed: ParsedScene, scene: Scene) -> list[str]:
+    """Return a warning if the sampler biases the image. All passes have the same bias, so no stated error contains it.
 
-    All passes have the same bias, so the stated error does not contain it.
+    In JIT variants `refract_path` takes from the sampler only the numbers of the camera, which have no bias if they are
+    the two of a position.
     """
-    sampler = own_settings(parsed)["sampler"]
-    own_numbers = dr.is_jit_v(mi.Float) and any(plugin == "refract_path" for _, plugin, *_ in parsed.nodes)
-    if sampler not in BIASED or own_numbers:
+    sampler, camera = own_settings(parsed)["sampler"], scene.sensors()[0]
+    more = mi.is_spectral or camera.needs_aperture_sample() or camera.shutter_open_time() > 0
+    harmless = {"aov", "moment", "depth"} | ({"refract_path"} if dr.is_jit_v(mi.Float) and not more else set())
+    if sampler not in BIASED or {plugin for kind, plugin, *_ in parsed.nodes if kind == "Integrator"} <= harmless:
         return []
-    expected = "expected the sampler `independent`, or the integrator `refract_path` in a JIT variant"
-    return [f"{job.scene}: Mitsuba's sampler {sampler} biases the image, which no stated error contains; {expected}"]
+    expected = "expected independent, multijitter or orthogonal"
+    return [f"{job.scene}: the sampler {sampler} biases the image, which no stated error contains; {expected}"]
 
 
 def _choose(job: Job, parsed: ParsedScene, renderer: PassRenderer, spp: int | None, limits: Limits) -> Identity:

@@ -15,7 +15,7 @@ from mi_refract.plugins import scene_parser
 from mi_refract.plugins.scene_parser import Node, ParsedScene
 
 AUTO, OWN = "auto", "the scene's own"
-# In the order of preference. `independent` always fits; the last two bias images by `path` most (study `samplers`).
+# In the order of preference. `independent` always fits, so a pilot never chooses those after it, see `BIASED`.
 SAMPLERS = ("multijitter", "orthogonal", "independent", "stratified", "ldsampler")
 INTEGRATORS = ("path", "refract_path")
 NAMES = {
@@ -24,7 +24,8 @@ NAMES = {
     "split_depth": "[0-9]|[1-5][0-9]|6[0-4]",  # up to 64, the limit of `refract_path`
     "caustics": "path|lamp|auto",
 }
-BIASED = ("multijitter", "stratified", "ldsampler")  # in `path`; without jitter, a render is one pass
+# Mitsuba's samplers with which images by `path` have a bias that the study `samplers` detects.
+BIASED = ("stratified", "ldsampler")
 _SAMPLER_PARAMETERS = ("sample_count", "seed")  # of every sampler
 _TYPES = {"split_depth": "Integer", "caustics": "String"}  # parameters of `refract_path` that can be set
 DEFAULTS = {"split_depth": "0", "caustics": "auto"}

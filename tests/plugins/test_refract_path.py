@@ -500,10 +500,11 @@ def within(around, **parameters):
     return mi.load_dict(AROUND[around] | {"inner": inner} if AROUND[around] else inner)
 
 
+@pytest.mark.parametrize(("sampler", "split_depth"), [("independent", 1), ("multijitter", 0)])
 @pytest.mark.parametrize("around", AROUND)
-def test_other_seeds_have_other_numbers_whatever_calls(around, llvm_variant):
+def test_other_seeds_have_other_numbers_whatever_calls(around, sampler, split_depth, llvm_variant):
     """The mean of 16 images has 1/16 of the squared error of one; numbers that repeat leave most of it."""
-    scene, method = load("balls", 24), within(around, max_depth=8, split_depth=1)
+    scene, method = load("balls", 24, sampler=sampler), within(around, max_depth=8, split_depth=split_depth)
     images = np.array([np.array(mi.render(scene, integrator=method, spp=4, seed=s))[..., :3] for s in range(16)])
     whole = np.mean([render(scene, 1024, 100 + seed, max_depth=8, split_depth=1) for seed in range(2)], axis=0)
     assert np.square(images.mean(axis=0) - whole).mean() < np.square(images - whole).mean() / 8
@@ -518,13 +519,24 @@ def test_every_pass_has_a_seed_also_of_samplers_with_seeds_of_their_own(sampler,
 
 @pytest.mark.parametrize(("sampler", "split_depth"), [("independent", 1), ("multijitter", 0)])
 def test_passes_of_the_film_have_other_numbers(sampler, split_depth, llvm_variant):
-    """64 samples in passes have the noise of 64 at once within a factor of 4; 16 passes that repeat have 16 times."""
+    """64 samples in passes have the noise of 64 at once within a factor of 4; 16 passes that repeat have 7 times."""
     scene, passes = load("balls", 24, sampler=sampler), ({}, {"samples_per_pass": 4}, {"samples_per_pass": 16})
     once, *others = (
         np.var([render(scene, 64, seed, split_depth=split_depth, max_depth=8, **x) for seed in range(6)], axis=0).mean()
         for x in passes
     )
     assert max(others) < 4 * once
+
+
+@pytest.mark.parametrize(("sampler", "split_depth"), [("independent", 1), ("multijitter", 0)])
+def test_other_seeds_need_no_other_kernels(sampler, split_depth, llvm_variant):
+    scene, kernels = load("balls", 8, sampler=sampler), []
+    for seed in (10, 11, 12):  # the first render prepares the sky
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            render(scene, 4, seed, split_depth=split_depth)
+            kernels.append([kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])])
+    assert kernels[1] == kernels[2] != []
 
 
 @pytest.mark.parametrize("around", AROUND)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from support.processes import python
 from support.readme import DOCS, python_blocks
-from support.renders import BALL, SCENES, leaf, pixels, rendering, stopped_after
+from support.renders import BALL, SCENES, SMALL, leaf, pixels, rendering, stopped_after
 
 from mi_refract.cluster import on_worker
 from mi_refract.image_diff.comparison import Verdict
@@ -31,6 +31,8 @@ from mi_refract.rendering.render_pass import PassRenderer
 SCENE = SCENES / "nested.xml"
 SKY = """<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"><film type="hdrfilm">
 <integer name="width" value="8"/><integer name="height" value="8"/></film></sensor>{}</scene>"""
+
+LENS = '<float name="aperture_radius" value="0.1"/><float name="focus_distance" value="4"/>'
 
 pytestmark = pytest.mark.usefixtures("scalar_variant")
 
@@ -194,21 +196,36 @@ def test_a_sampler_without_jitter_renders_a_single_pass(tmp_path, llvm_variant, 
     assert rendering(output, scene=scene, **more[0]).end() == "50 spp"
 
 
-def biased(tmp_path, sampler, integrator):
+def biased(tmp_path, sampler, integrator, scene=BALL, defines=SMALL):
     """Return whether a render of 8 × 8 pixels warns of the bias of its sampler."""
-    settings = f"sampler={sampler},integrator={integrator}"
-    warnings = resume(Job(BALL, {"res": "8"}, settings=settings), tmp_path / "a.exr", Limits(spp=4)).warnings
-    return any(f"{BALL}: Mitsuba's sampler {sampler} biases the image" in text for text in warnings)
+    settings = f"sampler={sampler}" + (integrator and f",integrator={integrator}")
+    warnings = resume(Job(scene, defines, settings=settings), tmp_path / "a.exr", Limits(spp=4)).warnings
+    return any(f"{scene}: the sampler {sampler} biases the image" in text for text in warnings)
 
 
-@pytest.mark.parametrize("sampler", ["multijitter", "ldsampler"])
-def test_a_sampler_that_biases_the_image_is_a_warning(tmp_path, llvm_variant, sampler):
+@pytest.mark.parametrize("sampler", ["stratified", "ldsampler"])
+def test_a_sampler_that_biases_the_image_is_named(tmp_path, llvm_variant, sampler):
     assert biased(tmp_path, sampler, "path") and not biased(tmp_path, sampler, "refract_path")
-    assert not any(biased(tmp_path, other, "path") for other in ("independent", "orthogonal"))
+    assert not any(biased(tmp_path, other, "path") for other in ("independent", "multijitter", "orthogonal"))
+    lens = changed(tmp_path, ("perspective", "thinlens"), ('<float name="fov"', LENS + '<float name="fov"'))
+    assert biased(tmp_path, sampler, "refract_path", lens)
 
 
-def test_scalar_variants_of_refract_path_have_mitsubas_numbers(tmp_path):
-    assert biased(tmp_path, "multijitter", "refract_path")
+@pytest.mark.parametrize(("around", "named"), [("aov", False), ("moment", False), ("moment, path", True)])
+def test_a_biased_sampler_is_named_by_the_integrators_that_take_its_numbers(tmp_path, llvm_variant, around, named):
+    plugin, _, other = around.partition(", ")
+    inner = "".join(f'<integrator type="{name}"/>' for name in ("refract_path", other) if name)
+    text = f'<integrator type="{plugin}"><string name="aovs" value="d:depth"/>{inner}</integrator>'
+    if plugin == "moment":
+        text = text.replace('<string name="aovs" value="d:depth"/>', "")
+    (tmp_path / "sky.xml").write_text(
+        SKY.format('<emitter type="constant"/>').replace('<integrator type="path"/>', text)
+    )
+    assert biased(tmp_path, "ldsampler", "", tmp_path / "sky.xml", {}) == named
+
+
+def test_scalar_variants_of_refract_path_take_the_samplers_numbers(tmp_path):
+    assert biased(tmp_path, "ldsampler", "refract_path")
 
 
 def test_a_render_ends_at_the_first_limit_that_it_reaches(tmp_path, llvm_variant):

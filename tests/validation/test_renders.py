@@ -391,11 +391,11 @@ def test_numbers_that_are_not_uniform_are_detected(llvm_variant, source, count, 
 
 
 def test_the_bias_of_a_sampler_is_detected_and_refract_path_has_none(llvm_variant):
-    """False alarms: 1 in 1000 for each sampler of `refract_path`."""
+    """False alarms: 1 in 1000 for each sampler of `refract_path`. The bias of `path` is 4 standard errors inside."""
     by_path, ours = (samplers.rows(llvm_variant, method, 48) for method in samplers.COMPARED)
     assert not any(row.broken for row in ours) and not any(row.budgets for row in by_path)
     (worst,) = (row for row in by_path if row.case == "ldsampler")
-    assert worst.values["Welch alarms"] > 10 and 0.003 < abs(worst.values["bias of the image"]) < 0.01
+    assert worst.values["Welch alarms"] > 10 and 0.002 < abs(worst.values["bias of the image"]) < 0.01
 
 
 # Media ----------------------------------------------------------------------------------------------------------------

@@ -6,9 +6,9 @@ round, with the better of Mitsuba's stratified samplers. Ratios are formed withi
 is reported. A method must not gain time by bias: the run fails if the mean of its images differs from the built-in's,
 in a tile or in the whole image.
 
-In Mitsuba's stratified samplers the numbers of two dimensions are dependent, so the built-in with them has another
-expected image: the alarms of its row. `refract_path` has numbers of its own then, and is compared with the reference;
-`path` with another BSDF is compared with renders by the built-in with the same sampler.
+In Mitsuba's stratified samplers the numbers of two dimensions may be dependent, so the built-in with them may have
+another expected image: the alarms of its row. `refract_path` has numbers of its own then, and is compared with the
+reference; `path` with another BSDF is compared with renders by the built-in with the same sampler.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ TERMS = {
     EQUAL_TIME: "MSE × time over that of path + dielectric with the same sampler: 1 / relative efficiency",
     EQUAL_TIME_DEFAULTS: "the same over path + dielectric with `independent`, Mitsuba's default sampler",
     WELCH_ALARMS: "tiles and channels, and the whole image, whose mean differs from the reference's; at most one "
-    "method in 1000 by chance. Of path + dielectric with a stratified sampler: bias of Mitsuba's sampler, no budget",
+    "method in 1000 by chance. No budget for path + dielectric: with a stratified sampler these are its bias",
     DETECTABLE_IMAGE: "relative difference of the whole image's mean that is detected with a probability of 99 %",
 }
 AXES = {"x": "seconds", "y": "RMSE", "slope": -0.5}

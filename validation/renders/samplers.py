@@ -1,8 +1,8 @@
 """Samplers: does an image by a stratified sampler of Mitsuba have the expected image of `independent`?
 
-Mitsuba's stratified samplers permute the strata of a pixel by a seed for each dimension; these seeds have constant
-differences, so numbers of two dimensions are dependent, and all renders of a scene by `path` have the same bias.
-`refract_path` takes only the camera's numbers from them.
+Mitsuba's stratified samplers permute the strata of each dimension by seeds with constant differences. If numbers of two
+dimensions are dependent, all renders of a scene by `path` have the same bias. `refract_path` takes only the camera's
+numbers from the sampler: here the position in the pixel.
 """
 
 from __future__ import annotations
