@@ -23,13 +23,13 @@ alone, both lobes are followed up to 64 boundaries deep, and the default of `spl
 
 With `caustics` = `path`, light that passes glass or a mirror before it reaches another surface is found by chance, or
 not at all where the lamp is a point, a spot or directional. `lamp` traces it from the lamps to all surfaces that the
-camera sees directly, along `light_paths` paths for each sample of the camera (`lamp_tracing`). It pays where lamps are
-small; with lamps nearly as large as the scene error × time is up to three times that of `path`. It takes area, point,
-spot and directional lamps, and perspective, thin-lens and orthographic cameras. In scenes with media of Mitsuba's, in
-frozen functions, within another integrator and where a parameter of the scene is differentiated it is an error. `auto`
-traces light from points, spots and directional lamps only, and from none where `lamp` would be an error for any reason
-but an area lamp: so derivatives are those of the image by path tracing. What is missing is named in a warning, once a
-scene (`SceneFeatures.missing`).
+camera sees directly, along `light_paths` paths for each sample of the camera (`lamp_tracing`). It mostly pays where
+lamps are small; with lamps nearly as large as the scene error × time is up to three times that of `path`. It takes
+area, point, spot and directional lamps, and perspective, thin-lens and orthographic cameras. In scenes with media of
+Mitsuba's, in frozen functions, within another integrator and where a parameter of the scene is differentiated it is an
+error. `auto` traces light from points, spots and directional lamps only, and from none where `lamp` would be an error
+for any reason but an area lamp: so derivatives are those of the image by path tracing. What is missing is named in a
+warning, once a scene (`SceneFeatures.missing`).
 
 Rays of delta lobes start nearer to the surface that they leave than those of `path` (`ray_origins`): glass may be as
 thin as 4e-6 of the largest shape with such lobes and 2e-6 of its own largest coordinate together, or 2e-6 of the length
