@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -156,8 +157,9 @@ def _checked_counts(
 ) -> tuple[tuple[int, int], str]:
     """Return the samples per pixel of all renders of each side, or else the number of renders, and the unit.
 
-    ValueError for fewer than 2 renders a side, and for the same render twice, unless a mask leaves
-    pixels out: it would halve the measured noise.
+    ValueError for fewer than 2 renders a side, and unless a mask leaves pixels out, for the same render twice and for
+    two renders of a scene by `mi-refract render` with one seed, which share samples: the measured noise would be too
+    small.
     """
     if min(len(reference), len(test)) < 2:
         raise ValueError(
@@ -173,11 +175,21 @@ def _checked_counts(
                 raise ValueError(
                     f"{b.path}: the same image as {a.path}; expected independent renders with different seeds"
                 )
+            if (drawn := _drawn(a)) and drawn == _drawn(b):
+                raise ValueError(
+                    f"{b.path}: the scene and the seed of {a.path}; expected independent renders with different seeds"
+                )
     sides = list(zip(("reference", "test"), spp, (reference, test), strict=True))
     if not all(count or SPP in image.metadata for _, count, side in sides for image in side):
         return (len(reference), len(test)), "renders"
     n1, n2 = (sum(samples(image, name, count, least=1) for image in side) for name, count, side in sides)
     return (n1, n2), "samples per pixel"
+
+
+def _drawn(image: Image) -> list[Any]:
+    """Return what the samples of an image by `mi-refract render` depend on, other than their number; [] for others."""
+    identity = json.loads(image.metadata.get("mi_refract:identity", "{}"))
+    return [identity[name] for name in ("scene", "defines", "seed", "variant") if name in identity]
 
 
 def _all_identical(side: Sequence[Image]) -> bool:

@@ -24,7 +24,7 @@ def register(variant: Variant) -> None:
 import mitsuba  # noqa: E402, F401
 
 from .index_parameter import PLUGIN, read_ior, read_medium  # noqa: E402
-from .medium_tracking import check_integrator  # noqa: E402
+from .medium_tracking import check_integrator, defects  # noqa: E402
 from .refract_path import INTEGRATOR  # noqa: E402
 from .scene_features import SceneFeatures, all_shapes, inspect, missing_light  # noqa: E402
 
@@ -34,6 +34,7 @@ __all__ = [
     "SceneFeatures",
     "all_shapes",
     "check_integrator",
+    "defects",
     "film",
     "inspect",
     "missing_light",

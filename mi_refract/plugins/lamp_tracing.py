@@ -92,7 +92,7 @@ def has_area(lamp: Emitter) -> bool:
     return not lamp.is_environment() and not lamp.flags() & +mi.EmitterFlags.Delta
 
 
-def refused_lamps(scene: Scene, every: bool) -> str:
+def refused_lamps(v: Variant, scene: Scene, every: bool) -> str:
     """Why the lamps of a scene, with `every` or else only those of zero size, cannot be traced; "" if they can be."""
     lamps = [lamp for lamp in scene.emitters() if not lamp.is_environment() and (every or not has_area(lamp))]
     if untraced := {lamp.class_name() for lamp in lamps} - KINDS.keys():
@@ -106,7 +106,7 @@ def refused_lamps(scene: Scene, every: bool) -> str:
     if any(map(mesh_attributes, lamps)):
         return "an area lamp emits an attribute of its mesh"
     # Mitsuba returns the same matrix for light from the lamp, but its factors would have to be in reverse order.
-    if mi.is_polarized and any(
+    if v.is_polarized and any(
         bsdf_name(bsdf) == "LinearRetarder" for shape in all_shapes(scene) for bsdf in nested(shape.bsdf())
     ):
         return "a retarder"
@@ -145,7 +145,7 @@ def is_one_way(bsdf: BSDF) -> bool:
     return not {*map(bsdf_name, nested(bsdf))} <= KNOWN - ONE_WAY
 
 
-def outward(lamp: Emitter) -> tuple[float, ...]:
+def outward(v: Variant, lamp: Emitter) -> tuple[float, ...]:
     """The centre of a lamp on a sphere, and the sign of its normal; 0 for other lamps.
 
     Mitsuba's samples of positions on a turned or mirrored sphere have the normal of another place.
@@ -154,7 +154,7 @@ def outward(lamp: Emitter) -> tuple[float, ...]:
         return 0.0, 0.0, 0.0, 0.0
     ball = bounding_sphere(shape)
     x, y, z = ball.center
-    si = shape.ray_intersect(mi.Ray3f(mi.Point3f(x + 2 * ball.radius, y, z), mi.Vector3f(-1, 0, 0)))
+    si = shape.ray_intersect(v.Ray3f(v.Point3f(x + 2 * ball.radius, y, z), v.Vector3f(-1, 0, 0)))
     sign: Any = dr.slice(si.sh_frame.n.x)
     return x, y, z, float(sign)
 
@@ -386,7 +386,7 @@ class LampTracer:
         self.pointers = dr.gather(v.EmitterPtr, scene.emitters_dr(), v.UInt32(indices)) if self.vectorised else None
         # With a varying texture Mitsuba samples meshes with overlapping (u, v) and turned cylinders wrongly. They are
         # called directly: a call through a pointer is also traced for shapes that cannot be sampled.
-        self.round = [Table(v, column) for column in zip(*map(outward, self.lamps), strict=True)]
+        self.round = [Table(v, column) for column in zip(*(outward(v, x) for x in self.lamps), strict=True)]
         self.by_area = [i for i, lamp in enumerate(self.lamps) if by_area(lamp)]
         spheres = targets(scene)
         odds = [self._odds(lamp, spheres) for lamp in self.lamps]

@@ -37,7 +37,8 @@ from mi_refract.numerics import (
 
 from .absorption import BEYOND, HERE, absorbing_parameter
 from .index_parameter import warn_once
-from .scene_features import all_shapes, check_shapes, children, nested, plugin_number, shape_name
+from .refract import without_dispersion
+from .scene_features import all_shapes, check_shapes, children, inspect, nested, plugin_number, shape_name
 
 TOLERANCE = 1e-3  # relative: one side may give σ as a number and the other one as a colour
 STRAY = 0.01  # the largest share of wrong crossings of a shape that is not an error
@@ -217,17 +218,30 @@ def absorbs_only(v: Variant, medium: MediumPlugin) -> bool:
     return True
 
 
+def follows_media(integrator: Any) -> bool:
+    """Return whether an integrator is `refract_path`, or calls only integrators that are."""
+    called = [child for child in children(integrator) if hasattr(child, "aov_names")]
+    return type(integrator).__name__ == "RefractPath" or (bool(called) and all(map(follows_media, called)))
+
+
+def defects(scene: Scene) -> list[str]:
+    """Return what the scene's integrator renders wrong without an error, one line each.
+
+    These are: shapes of glass that are too thin for `refract_path`, or on which Mitsuba's points are inexact; and
+    dispersion with another integrator than `refract_path`.
+    """
+    features, ours = inspect(scene), follows_media(scene.integrator())
+    bsdfs = (bsdf for shape in all_shapes(scene) for bsdf in nested(shape.bsdf()))
+    grey = "" if ours else next((without_dispersion(x) for x in bsdfs if getattr(x, "dispersive", False)), "")
+    return [text for text in (features.thin if ours else "", features.inexact, grey) if text]
+
+
 def check_integrator(scene: Scene) -> None:
     """ValueError if a BSDF states absorption, even 0, and the integrator is not `refract_path` nor calls only that.
 
     ValueError also for shapes that Mitsuba renders wrong; see `check_shapes`.
     """
     check_shapes(scene)
-
-    def follows_media(integrator: Any) -> bool:
-        called = [child for child in children(integrator) if hasattr(child, "aov_names")]
-        return type(integrator).__name__ == "RefractPath" or (bool(called) and all(map(follows_media, called)))
-
     parameters = (absorbing_parameter(bsdf) for shape in all_shapes(scene) for bsdf in nested(shape.bsdf()))
     name = next(filter(None, parameters), "")
     if name and not follows_media(scene.integrator()):

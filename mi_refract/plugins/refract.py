@@ -264,8 +264,7 @@ def sample(
     both, followed = has_r and has_t, is_followed(ctx)
     by_wavelength = followed and self.dispersive
     if self.dispersive and not followed:
-        names = " in ".join(medium.name for medium in self.varying.sides.values())
-        warn_once(f"{PLUGIN}: {names}: all light has the index of the d line; expected the integrator refract_path")
+        warn_once(without_dispersion(self))
     ray, hit = refract(self, si, active, si.wavelengths[0] if by_wavelength else None), v.Bool(active)
     active, others = ray.active, other_rays(self, si, ray) if by_wavelength else []
 
@@ -456,6 +455,12 @@ def to_string(self: Refract) -> str:
     lines += [f"formula = {chosen}", *(f"{name} = {texture}" for name, texture in self.textures.items())]
     lines += [f"{side.name} = {side.texture}" for side in self.absorptions.values() if side]
     return "Refract[\n" + "".join("  " + line.replace("\n", "\n  ") + ",\n" for line in lines) + "]"
+
+
+def without_dispersion(bsdf: Refract) -> str:
+    """Return what another integrator than `refract_path` makes of a dispersive BSDF, and what is expected."""
+    names = " in ".join(medium.name for medium in bsdf.varying.sides.values())
+    return f"{PLUGIN}: {names}: all light has the index of the d line; expected the integrator refract_path"
 
 
 class LostLight:

@@ -53,6 +53,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mi_refract.numerics import (
     Count,
@@ -246,6 +247,12 @@ def integrator_class(v: Variant) -> type:
                 return None
             tracer = lamp_tracing.LampTracer(loop, sensor, lambda ray: self.camera_medium(scene, ray, None))
             paths = paths or max(1, round(self.light_paths * spp * tracer.camera.width * tracer.camera.height))
+            if type(own := sensor.sampler()) is v.Sampler:  # which may have a seed of its own
+                probe = own.clone()
+                probe.seed(seed, 1)
+                number: Any = dr.slice(probe.next_1d())
+                word = int(float(number) * 2**24)
+                seed = int(np.random.SeedSequence((seed, word)).generate_state(1)[0])
             return lamp_tracing.lamp_image(tracer, seed, paths, channels, squares=squares)
 
         def aov_names(self) -> list[str]:
@@ -347,7 +354,7 @@ def integrator_class(v: Variant) -> type:
                 "the scene has media": needs.media,
                 f"a {needs.delta_perturbed} has delta lobes": bool(needs.delta_perturbed),
                 self.unconnected: bool(self.unconnected),
-                (lamps := "" if frozen else lamp_tracing.refused_lamps(scene, self.caustics == "lamp")): bool(lamps),
+                (lamps := "" if frozen else lamp_tracing.refused_lamps(v, scene, self.caustics == "lamp")): bool(lamps),
             }
             reason = next((text for text, found in reasons.items() if found), "")
             if reason and self.caustics == "lamp":
@@ -403,7 +410,7 @@ def integrator_class(v: Variant) -> type:
             untraced = f"; its lamps are not traced: {self.untraced}" if self.untraced else ""
             warnings = [f"missing {path_class}: {text}{untraced}" for path_class, text in missing.items()]
             if needs.thin:
-                warnings.append(f"{needs.thin}; expected a thicker shape, or one nearer to the origin")
+                warnings.append(needs.thin)
             warnings = warnings if (needs, self.apart) != before else []
             if needs.inexact and not (before[0] and before[0].inexact):  # depends on the camera, so once for all places
                 warnings.append(needs.inexact)

@@ -103,7 +103,7 @@ class KeyedMultijitter:
     def next_1d(self, sampler: Sampler, key: Count) -> Number:
         """Return a number in [0, 1). The n samples of a pixel with one key lie in n equal intervals, one in each."""
         permutation = mixed(self.pixel + self.v.UInt32(key) * GOLDEN)
-        stratum = self.v.permute_kensler(self.index, self.count, permutation)
+        stratum = self._permuted(self.index, self.count, permutation)
         return self._placed(stratum, self._unit(mixed(self.sample ^ permutation)), self.count)
 
     def next_2d(self, sampler: Sampler, key: Count) -> Point2:
@@ -112,12 +112,12 @@ class KeyedMultijitter:
         # Seeds with a constant difference give dependent permutations. So each seed is a hash of its own.
         row_seed = mixed(cell_seed + GOLDEN)
         column_seed = mixed(row_seed + GOLDEN)
-        cell = v.permute_kensler(self.index, self.count, cell_seed)
+        cell = self._permuted(self.index, self.count, cell_seed)
         row = cell // self.columns
         column = cell - row * self.columns
         # Cells are divided likewise: no two samples share a fine row or a fine column.
-        inner_row = v.permute_kensler(row, self.rows, row_seed)
-        inner_column = v.permute_kensler(column, self.columns, column_seed)
+        inner_row = self._permuted(row, self.rows, row_seed)
+        inner_column = self._permuted(column, self.columns, column_seed)
         x, y = (self._unit(mixed(self.sample ^ seed)) for seed in (row_seed, column_seed))
         x, y = self._placed(inner_row, x, self.rows), self._placed(inner_column, y, self.columns)
         return v.Point2f(self._placed(column, x, self.columns), self._placed(row, y, self.rows))
@@ -128,6 +128,13 @@ class KeyedMultijitter:
         # Lanes and keys are small numbers in a row. After 4 rounds, the default, numbers of two keys are dependent.
         calls = [v.sample_tea_32(self.lane, self.pixel + key + i, rounds=8) for i in range(0, count, 2)]
         return [self._unit(word) for words in calls for word in words][:count]
+
+    def _permuted(self, index: Count, count: int, seed: Count) -> Count:
+        """Return the place of an index in a permutation of `count` ≤ 2³¹ numbers.
+
+        Mitsuba's function adds the seed at the end, modulo 2³² before it is modulo `count`, so the seed is below 2³¹.
+        """
+        return self.v.permute_kensler(index, count, seed & 0x7FFFFFFF)
 
     def _unit(self, word: Count) -> Number:
         """Return the upper 24 bits as a number in [0, 1)."""

@@ -186,7 +186,7 @@ def inspect(scene: Scene, sensor: Sensor | None = None) -> SceneFeatures:
     sizes = {i: ray_origins.size_of(shapes[i]) for i in with_delta}
     delta_extent = math.inf if unknown_shapes else ray_origins.extent_of([*sizes.values()])
     thin = (
-        f"{shape_name(shapes, i)} {text}"
+        f"{shape_name(shapes, i)} {text}; expected a thicker shape, or one nearer to the origin"
         for i, flags_of_shape in with_delta.items()
         if flags_of_shape & +lobes.DeltaTransmission and (text := ray_origins.too_thin(sizes[i], delta_extent))
     )

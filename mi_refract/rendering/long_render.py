@@ -29,7 +29,7 @@ from mi_refract.io.image_file import SUFFIXES, Metadata, installed_version, prov
 from mi_refract.io.safe_files import writable
 from mi_refract.io.text import printable
 from mi_refract.numerics import Scene
-from mi_refract.plugins import missing_light
+from mi_refract.plugins import defects, missing_light
 from mi_refract.plugins.scene_parser import ParsedScene
 
 from . import checkpoint, rendered_file
@@ -129,7 +129,7 @@ def resume(
         expected = "expected jitter, or one pass from the start: --spp N --pass-spp N"
         raise ValueError(f"{job.scene}: the sampler has no jitter, so all passes have points on one grid; {expected}")
     progress.identity[PASS] = plan.spp
-    warnings = _biases(job, parsed, scene)
+    warnings = [f"{job.scene}: {text}" for text in defects(scene)] + _biases(job, parsed, scene)
     return LongRender(job, path, limits, parsed, scene, renderer, spp, plan, progress, pilot_seconds, warnings=warnings)
 
 

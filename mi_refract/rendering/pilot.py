@@ -41,7 +41,7 @@ from mi_refract.plugins.scene_parser import ParsedScene
 
 from .pass_plan import MASK, PassPlan, seed_of
 from .pass_sums import Doubles
-from .render_pass import PassRenderer, quiet, samples_of_pixels, set_spp
+from .render_pass import PassRenderer, forgetting, quiet, samples_of_pixels, set_spp
 from .render_settings import AUTO, DEFAULTS, OWN, SAMPLERS, Settings, integrator_node, own_settings, settings_text
 
 SHARE = 0.05  # largest share of the render's time that the pilot takes, unless the smallest batches take more
@@ -382,16 +382,17 @@ class Pilot:
         `alone`: on processors, run the kernel in this thread only, and measure the time of this thread. With more
         threads the time would include waiting for work and for other programs.
         """
-        values = samples_of_pixels(self.renderer, integrator, sampler, pixels, seed)
-        with self._one_thread(alone):
-            before = self.clock()
-            dr.eval(values)
-            dr.sync_thread()
-            took = self.clock() - before if alone or self.cuda else math.inf
-        if hasattr(integrator, "end_render"):
-            if getattr(integrator, "apart", False) and self._lamps is None:
-                self._trace_lamps(integrator)
-            integrator.end_render()
+        with forgetting(integrator):
+            values = samples_of_pixels(self.renderer, integrator, sampler, pixels, seed)
+            with self._one_thread(alone):
+                before = self.clock()
+                dr.eval(values)
+                dr.sync_thread()
+                took = self.clock() - before if alone or self.cuda else math.inf
+            if hasattr(integrator, "end_render"):
+                if getattr(integrator, "apart", False) and self._lamps is None:
+                    self._trace_lamps(integrator)
+                integrator.end_render()
         return np.array([np.array(value) for value in values], np.float64), took
 
     @contextlib.contextmanager

@@ -80,7 +80,7 @@ class PassRenderer:
     def render(self, number: int, spp: int) -> PassSums:
         """Render pass `number` and return its sums. InterruptedError if Mitsuba stopped before the last sample."""
         within, film = None, self.scene.sensors()[0].film()
-        with quiet():
+        with quiet(), forgetting(self.scene.integrator()):
             if self.moments:
                 if dr.thread_count() < LEAST_THREADS:
                     dr.set_thread_count(LEAST_THREADS)
@@ -142,8 +142,21 @@ def pass_renderer(scene: Scene, seed: int) -> PassRenderer:
 
 
 @contextlib.contextmanager
+def forgetting(integrator: Any) -> Iterator[None]:
+    """Within this context an integrator may begin a render; afterwards, also after an error, it is in none."""
+    try:
+        yield
+    finally:
+        if hasattr(integrator, "forget"):
+            integrator.forget()
+
+
+@contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Suppress Mitsuba's warning that a sampler rounds up, which it repeats at every pass; plans account for it."""
+    """Suppress the warnings of Mitsuba and of our plugins, which would be repeated at every pass.
+
+    Mitsuba's is that a sampler rounds up, for which plans account; `resume` collects ours (`defects`, `missing_light`).
+    """
     logger: Any = mi.logger()  # type: ignore[operator]
     before = logger.log_level()
     logger.set_log_level(mi.LogLevel.Error)

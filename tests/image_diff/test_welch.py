@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import re
 from dataclasses import replace
 from functools import partial
@@ -518,6 +519,20 @@ def test_a_tile_with_the_noise_of_one_pixel_is_flagged(rng):
     for image in sides[1]:
         image.pixels[5, 5] += 100
     assert welch(*sides).verdict is INCONCLUSIVE
+
+
+def test_two_renders_with_one_seed_are_an_error(rng):
+    """They share samples, also if their numbers of samples differ."""
+
+    def drawn(**identity):
+        return {"mi_refract:identity": json.dumps({"scene": "a", "defines": {}, "seed": 0, "variant": "v"} | identity)}
+
+    side = [replace(x, metadata=drawn(seed=i)) for i, x in enumerate(renders(rng, 3))]
+    assert welch(side, renders(rng, 4)).verdict is not DIFFERENT
+    for other in (drawn(seed=1), drawn(seed=1, colours=3)):
+        with pytest.raises(ValueError, match=r"b\.exr: the scene and the seed of a\.exr; expected independent renders"):
+            welch(renders(rng, 4), [*side, replace(renders(rng, 1)[0], metadata=other, path=Path("b.exr"))])
+    welch([*side, replace(renders(rng, 1)[0], metadata=drawn(seed=1, scene="b"))], renders(rng, 4))
 
 
 def test_the_same_render_twice_is_an_error(rng):

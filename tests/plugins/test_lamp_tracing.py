@@ -4,6 +4,8 @@ Images of path tracing and of both parts together are compared by the difference
 with a false alarm in 10,000 runs of a test.
 """
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -358,9 +360,13 @@ def test_an_image_scales_with_its_lamps(factor, llvm_variant):
     np.testing.assert_allclose(other / factor, one, rtol=1e-5)
 
 
-def caustic(seed=0, paths=0, **integrator):
-    """The lamps' part of an image of 16 spp; `paths`: number of light paths, by default that of the integrator."""
-    loaded = scene({}, caustics="lamp", **integrator)
+def caustic(seed=0, paths=0, own=0, **integrator):
+    """The lamps' part of an image of 16 spp; `paths`: number of light paths, by default that of the integrator.
+
+    `own`: seed of the scene's sampler.
+    """
+    view = camera() | {"sampler": {"type": "independent", "seed": own}}
+    loaded = scene({"sensor": view}, caustics="lamp", **integrator)
     method, sensor = loaded.integrator(), loaded.sensors()[0]
     method.begin_render(sensor)
     method.path_loop(loaded, sensor.sampler())
@@ -368,6 +374,11 @@ def caustic(seed=0, paths=0, **integrator):
     method.end_render()
     assert image.any()
     return image
+
+
+def test_every_seed_has_light_paths_of_its_own_also_that_of_the_sampler(variant):
+    images = [caustic(seed, 64, own) for seed, own in ((0, 0), (1, 0), (0, 1))]
+    assert all((a != b).any() for a, b in itertools.combinations(images, 2))
 
 
 def test_roulette_ends_light_paths(llvm_variant):

@@ -510,6 +510,20 @@ def test_other_seeds_have_other_numbers_whatever_calls(around, sampler, split_de
     assert np.square(images.mean(axis=0) - whole).mean() < np.square(images - whole).mean() / 8
 
 
+def test_light_paths_lie_in_all_strata_whatever_the_seed_is(llvm_variant):
+    """One of 10⁶ keys has a permutation whose seed is near 2³²; 1000 intervals hold 100 numbers each, within rounding.
+
+    Mitsuba adds the seed to the index, modulo 2³²: a third of the intervals might be empty.
+    """
+    count = 100_003  # no power of two
+    numbers = sampling.KeyedMultijitter(mi, mi.UInt32(5), count, count)
+    hashes = np.array(sampling.mixed(numbers.pixel[0] + dr.arange(mi.UInt32, 10**6) * sampling.GOLDEN))
+    key = int(hashes.argmax())
+    assert hashes[key] > 2**32 - count / 2
+    held = np.bincount((np.array(numbers.next_1d(None, key), float) * 1000).astype(int), minlength=1000)
+    assert np.abs(held - count / 1000).max() < 3
+
+
 @pytest.mark.parametrize("sampler", ["independent", "multijitter", "ldsampler"])
 def test_every_pass_has_a_seed_also_of_samplers_with_seeds_of_their_own(sampler, llvm_variant):
     samplers = [mi.load_dict({"type": sampler, "seed": own}) for own in range(3)]

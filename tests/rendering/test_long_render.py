@@ -23,7 +23,7 @@ from mi_refract.cluster import on_worker
 from mi_refract.image_diff.comparison import Verdict
 from mi_refract.image_diff.methods import compare
 from mi_refract.io.image_file import read, read_exr, write_exr
-from mi_refract.rendering import checkpoint, long_render, rendered_file
+from mi_refract.rendering import checkpoint, long_render, render_pass, rendered_file
 from mi_refract.rendering.end_conditions import Limits
 from mi_refract.rendering.long_render import Job, render_to_exr, resume
 from mi_refract.rendering.render_pass import PassRenderer
@@ -194,6 +194,45 @@ def test_a_sampler_without_jitter_renders_a_single_pass(tmp_path, llvm_variant, 
         earlier.setattr(PassRenderer, "jitter", True)
         rendering(output, scene=scene, **more[0]).run()
     assert rendering(output, scene=scene, **more[0]).end() == "50 spp"
+
+
+GLASS = '<bsdf type="refract"/>'
+WRONG = {  # the integrator, shapes, and what is named
+    "dispersion": (
+        "path",
+        '<shape type="sphere"><bsdf type="refract"><string name="int_ior" value="SCHOTT:N-SF11"/></bsdf></shape>',
+        "all light has the index of the d line; expected the integrator refract_path",
+    ),
+    "thin": (
+        "refract_path",
+        f'<shape type="cube"><transform name="to_world"><scale z="1e-7"/></transform>{GLASS}</shape>',
+        "expected a thicker shape, or one nearer to the origin",
+    ),
+    "inexact": ("path", f'<shape type="cylinder"><float name="radius" value="1e-3"/>{GLASS}</shape>', "err by up to"),
+}
+
+
+@pytest.mark.parametrize(("integrator", "shapes", "words"), WRONG.values(), ids=WRONG)
+def test_what_is_rendered_wrong_is_named(tmp_path, llvm_spectral, integrator, shapes, words):
+    place = '<transform name="to_world"><lookat origin="0,0,9" target="0,0,0" up="0,1,0"/></transform>'
+    text = SKY.format('<emitter type="constant"/>' + shapes).replace('"path"', f'"{integrator}"')
+    (tmp_path / "a.xml").write_text(text.replace("<film", place + "<film"))
+    warnings = resume(Job(tmp_path / "a.xml"), tmp_path / "a.exr", Limits(spp=1)).warnings
+    assert any(text.startswith(f"{tmp_path}/a.xml: ") and words in text for text in warnings)
+
+
+def test_a_pass_that_fails_leaves_no_render_behind(tmp_path, llvm_variant, monkeypatch):
+    render = resume(Job(BALL, SMALL, settings="integrator=refract_path"), tmp_path / "a.exr", Limits(spp=4))
+    integrator, seen = render.scene.integrator(), []
+
+    def interrupted(*samples, **options):
+        seen.append(integrator.rendering)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(render_pass, "image_sums", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        render.renderer.render(0, 4)
+    assert seen == [True] and not integrator.rendering and not integrator.loops
 
 
 def biased(tmp_path, sampler, integrator, scene=BALL, defines=SMALL):
