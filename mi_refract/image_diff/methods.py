@@ -147,6 +147,7 @@ def choice(reference: Sequence[Image], test: Sequence[Image], *, spp: bool = Fal
     return "tolerance", ""
 
 
+@np.errstate(all="warn", under="ignore")  # NumPy's defaults: no error where a p-value underflows
 def compare(
     method: str,
     reference: Side,

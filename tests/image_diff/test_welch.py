@@ -521,6 +521,11 @@ def test_a_tile_with_the_noise_of_one_pixel_is_flagged(rng):
     assert welch(*sides).verdict is INCONCLUSIVE
 
 
+def test_a_program_that_raises_errors_of_numpy_may_compare(rng):
+    with np.errstate(all="raise"):
+        assert welch(renders(rng, 4), renders(rng, 4, gain=2.0)).verdict is DIFFERENT
+
+
 def test_two_renders_with_one_seed_are_an_error(rng):
     """They share samples, also if their numbers of samples differ."""
 
