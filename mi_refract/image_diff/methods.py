@@ -147,7 +147,6 @@ def choice(reference: Sequence[Image], test: Sequence[Image], *, spp: bool = Fal
     return "tolerance", ""
 
 
-@np.errstate(all="warn", under="ignore")  # NumPy's defaults: no error where a p-value underflows
 def compare(
     method: str,
     reference: Side,
@@ -189,7 +188,8 @@ def compare(
     if by_auto:
         has_spp = any(options.get(name) for name in ("spp", "spp_reference", "spp_test"))
         method, chosen_because = choice(*sides, spp=has_spp)
-    result = replace(_compare(method, sides, allow_nonfinite, named, options), chosen=chosen_because)
+    with np.errstate(all="warn", under="ignore"):  # NumPy's defaults: no error where a p-value underflows
+        result = replace(_compare(method, sides, allow_nonfinite, named, options), chosen=chosen_because)
     some_pixels_differ = by_auto and method == "tolerance" and result.is_equal and result.metrics[0].value > 0
     if some_pixels_differ and not options.keys() & DECIDING:
         a, b = _finite_pair(*(channels.without_variances(side[0], named) for side in sides))

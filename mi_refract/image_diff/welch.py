@@ -6,7 +6,7 @@ import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
@@ -77,8 +77,8 @@ def compare_renders(
     pixels share more noise than those of the rest of the image, or they have no noise and differ by little or in a few
     pixels), or if the noise hides differences of `resolution`; then the reason gives the number of samples that would
     decide. If all renders of a side are identical, that side has no noise; the reason says so, because a renderer that
-    ignores its seed looks the same. ValueError for fewer renders, for renders of which only some are identical, and
-    images that cannot be compared.
+    ignores its seed looks the same. ValueError for fewer renders, for renders of which only some are identical, for two
+    renders of a side by `mi-refract render` of one scene with one seed, and for images that cannot be compared.
     """
     single = len(reference) == len(test) == 1 and (has_variance(reference[0]) or has_variance(test[0]))
     one, two = reference[0], test[0]
@@ -157,8 +157,8 @@ def _checked_counts(
 ) -> tuple[tuple[int, int], str]:
     """Return the samples per pixel of all renders of each side, or else the number of renders, and the unit.
 
-    ValueError for fewer than 2 renders a side, and unless a mask leaves pixels out, for the same render twice and for
-    two renders of a scene by `mi-refract render` with one seed, which share samples: the measured noise would be too
+    ValueError for fewer than 2 renders a side; for two renders of a scene by `mi-refract render` with one seed, which
+    share samples; and unless a mask leaves pixels out, for the same render twice: the measured noise would be too
     small.
     """
     if min(len(reference), len(test)) < 2:
@@ -167,17 +167,20 @@ def _checked_counts(
             "with its variance, in channels such as m2_R or R.variance, or in a file (`variance`)"
         )
     for side in (reference, test):
+        if _all_identical(side):  # renders without noise may be the same
+            continue
+        drawn = dict[str, Image]()
+        for image in side:
+            if (key := _drawn(image)) and (other := drawn.setdefault(key, image)) is not image:
+                expected = "expected independent renders with different seeds"
+                raise ValueError(f"{image.path}: the scene and the seed of {other.path}; {expected}")
         masked = side[0].mask is not None and not side[0].mask.all()
-        if masked or _all_identical(side):
-            continue  # renders without noise may be the same, and so may what a mask leaves of others
+        if masked:
+            continue  # what it leaves of other renders may be the same
         for a, b in itertools.combinations(side, 2):
             if _identical(a, b) and (a.pixels != a.pixels[0, 0]).any():  # black ones may be the same
                 raise ValueError(
                     f"{b.path}: the same image as {a.path}; expected independent renders with different seeds"
-                )
-            if (drawn := _drawn(a)) and drawn == _drawn(b):
-                raise ValueError(
-                    f"{b.path}: the scene and the seed of {a.path}; expected independent renders with different seeds"
                 )
     sides = list(zip(("reference", "test"), spp, (reference, test), strict=True))
     if not all(count or SPP in image.metadata for _, count, side in sides for image in side):
@@ -186,10 +189,13 @@ def _checked_counts(
     return (n1, n2), "samples per pixel"
 
 
-def _drawn(image: Image) -> list[Any]:
-    """Return what the samples of an image by `mi-refract render` depend on, other than their number; [] for others."""
-    identity = json.loads(image.metadata.get("mi_refract:identity", "{}"))
-    return [identity[name] for name in ("scene", "defines", "seed", "variant") if name in identity]
+def _drawn(image: Image) -> str:
+    """Return what the random numbers of an image by `mi-refract render` depend on, as text; "" for other images."""
+    try:
+        identity = json.loads(image.metadata["mi_refract:identity"])
+        return json.dumps([identity[name] for name in ("scene", "defines", "seed")], sort_keys=True)
+    except (KeyError, TypeError, ValueError, RecursionError):
+        return ""
 
 
 def _all_identical(side: Sequence[Image]) -> bool:

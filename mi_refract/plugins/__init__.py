@@ -24,7 +24,7 @@ def register(variant: Variant) -> None:
 import mitsuba  # noqa: E402, F401
 
 from .index_parameter import PLUGIN, read_ior, read_medium  # noqa: E402
-from .medium_tracking import check_integrator, defects  # noqa: E402
+from .medium_tracking import check_integrator, defects, follows_media, sees_light  # noqa: E402
 from .refract_path import INTEGRATOR  # noqa: E402
 from .scene_features import SceneFeatures, all_shapes, inspect, missing_light  # noqa: E402
 
@@ -36,10 +36,12 @@ __all__ = [
     "check_integrator",
     "defects",
     "film",
+    "follows_media",
     "inspect",
     "missing_light",
     "read_ior",
     "read_medium",
     "register",
     "scene_parser",
+    "sees_light",
 ]

@@ -50,6 +50,7 @@ NEVER = 2**32 - 1  # the depth of a shape's first wrong crossing, if none exists
 SEARCHED, SEARCHED_FAR = 3 / 4, 1 - 1 / 64
 # A null lobe does not change the medium. Rough and diffuse transmission do.
 THROUGH = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DiffuseTransmission
+WITHOUT_LIGHT = {"DepthIntegrator", "AOVIntegrator", "MomentIntegrator"}  # unless they call others
 
 
 class Crossings:
@@ -224,15 +225,23 @@ def follows_media(integrator: Any) -> bool:
     return type(integrator).__name__ == "RefractPath" or (bool(called) and all(map(follows_media, called)))
 
 
+def sees_light(integrator: Any) -> bool:
+    """Return whether an integrator, or one that it calls, renders light; unknown ones do."""
+    called = [child for child in children(integrator) if hasattr(child, "aov_names")]
+    return any(map(sees_light, called)) or integrator.class_name() not in WITHOUT_LIGHT
+
+
 def defects(scene: Scene) -> list[str]:
     """Return what the scene's integrator renders wrong without an error, one line each.
 
-    These are: shapes of glass that are too thin for `refract_path`, or on which Mitsuba's points are inexact; and
-    dispersion with another integrator than `refract_path`.
+    These are: shapes of glass that are too thin for `refract_path`, or on which Mitsuba's points are inexact as seen
+    from a camera; and dispersion with an integrator of light other than `refract_path`.
     """
-    features, ours = inspect(scene), follows_media(scene.integrator())
+    features, integrator = inspect(scene), scene.integrator()
+    ours = follows_media(integrator)
     bsdfs = (bsdf for shape in all_shapes(scene) for bsdf in nested(shape.bsdf()))
-    grey = "" if ours else next((without_dispersion(x) for x in bsdfs if getattr(x, "dispersive", False)), "")
+    dispersive = (x for x in bsdfs if getattr(x, "dispersive", False) and not ours and sees_light(integrator))
+    grey = next(map(without_dispersion, dispersive), "")
     return [text for text in (features.thin if ours else "", features.inexact, grey) if text]
 
 

@@ -29,7 +29,7 @@ from mi_refract.io.image_file import SUFFIXES, Metadata, installed_version, prov
 from mi_refract.io.safe_files import writable
 from mi_refract.io.text import printable
 from mi_refract.numerics import Scene
-from mi_refract.plugins import defects, missing_light
+from mi_refract.plugins import defects, follows_media, missing_light, sees_light
 from mi_refract.plugins.scene_parser import ParsedScene
 
 from . import checkpoint, rendered_file
@@ -141,8 +141,8 @@ def _biases(job: Job, parsed: ParsedScene, scene: Scene) -> list[str]:
     """
     sampler, camera = own_settings(parsed)["sampler"], scene.sensors()[0]
     more = mi.is_spectral or camera.needs_aperture_sample() or camera.shutter_open_time() > 0
-    harmless = {"aov", "moment", "depth"} | ({"refract_path"} if dr.is_jit_v(mi.Float) and not more else set())
-    if sampler not in BIASED or {plugin for kind, plugin, *_ in parsed.nodes if kind == "Integrator"} <= harmless:
+    own_numbers = dr.is_jit_v(mi.Float) and not more and follows_media(scene.integrator())
+    if sampler not in BIASED or own_numbers or not sees_light(scene.integrator()):
         return []
     expected = "expected independent, multijitter or orthogonal"
     return [f"{job.scene}: the sampler {sampler} biases the image, which no stated error contains; {expected}"]

@@ -524,20 +524,23 @@ def test_a_tile_with_the_noise_of_one_pixel_is_flagged(rng):
 def test_a_program_that_raises_errors_of_numpy_may_compare(rng):
     with np.errstate(all="raise"):
         assert welch(renders(rng, 4), renders(rng, 4, gain=2.0)).verdict is DIFFERENT
+        assert np.geterr() == dict.fromkeys(np.geterr(), "raise")
 
 
 def test_two_renders_with_one_seed_are_an_error(rng):
-    """They share samples, also if their numbers of samples differ."""
+    """They share samples, also if their numbers of samples or their variants differ."""
 
     def drawn(**identity):
-        return {"mi_refract:identity": json.dumps({"scene": "a", "defines": {}, "seed": 0, "variant": "v"} | identity)}
+        return {"mi_refract:identity": json.dumps({"scene": "a", "defines": {}, "seed": 0} | identity)}
 
     side = [replace(x, metadata=drawn(seed=i)) for i, x in enumerate(renders(rng, 3))]
     assert welch(side, renders(rng, 4)).verdict is not DIFFERENT
-    for other in (drawn(seed=1), drawn(seed=1, colours=3)):
+    for other in (drawn(seed=1), drawn(seed=1, variant="cuda_ad_rgb")):
         with pytest.raises(ValueError, match=r"b\.exr: the scene and the seed of a\.exr; expected independent renders"):
             welch(renders(rng, 4), [*side, replace(renders(rng, 1)[0], metadata=other, path=Path("b.exr"))])
     welch([*side, replace(renders(rng, 1)[0], metadata=drawn(seed=1, scene="b"))], renders(rng, 4))
+    for foreign in ("null", "5", '["scene"]', "{", 2.5, '{"scene": "a", "defines": {}}'):
+        welch([replace(x, metadata={"mi_refract:identity": foreign}) for x in side], renders(rng, 4))
 
 
 def test_the_same_render_twice_is_an_error(rng):

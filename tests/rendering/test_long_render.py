@@ -197,28 +197,43 @@ def test_a_sampler_without_jitter_renders_a_single_pass(tmp_path, llvm_variant, 
 
 
 GLASS = '<bsdf type="refract"/>'
-WRONG = {  # the integrator, shapes, and what is named
-    "dispersion": (
-        "path",
-        '<shape type="sphere"><bsdf type="refract"><string name="int_ior" value="SCHOTT:N-SF11"/></bsdf></shape>',
-        "all light has the index of the d line; expected the integrator refract_path",
-    ),
-    "thin": (
-        "refract_path",
-        f'<shape type="cube"><transform name="to_world"><scale z="1e-7"/></transform>{GLASS}</shape>',
-        "expected a thicker shape, or one nearer to the origin",
-    ),
-    "inexact": ("path", f'<shape type="cylinder"><float name="radius" value="1e-3"/>{GLASS}</shape>', "err by up to"),
-}
+DISPERSIVE = (
+    '<shape type="sphere"><bsdf type="refract"><string name="int_ior" value="SCHOTT:N-SF11"/></bsdf></shape>',
+    "all light has the index of the d line; expected the integrator refract_path",
+)
+THIN = (
+    f'<shape type="cube"><transform name="to_world"><scale z="1e-7"/></transform>{GLASS}</shape>',
+    "expected a thicker shape, or one nearer to the origin",
+)
+INEXACT = f'<shape type="cylinder"><float name="radius" value="1e-3"/>{GLASS}</shape>', "err by up to"
+AOV = '<integrator type="aov"><string name="aovs" value="d:depth"/>{}</integrator>'
 
 
-@pytest.mark.parametrize(("integrator", "shapes", "words"), WRONG.values(), ids=WRONG)
-def test_what_is_rendered_wrong_is_named(tmp_path, llvm_spectral, integrator, shapes, words):
+def by(name):
+    return f'<integrator type="{name}"/>'
+
+
+@pytest.mark.parametrize(
+    ("integrator", "wrong", "named"),
+    [
+        (by("path"), DISPERSIVE, True),
+        (AOV.format(by("path")), DISPERSIVE, True),
+        (by("refract_path"), DISPERSIVE, False),
+        (AOV.format(by("refract_path")), DISPERSIVE, False),
+        (AOV.format(""), DISPERSIVE, False),
+        (by("depth"), DISPERSIVE, False),
+        (by("refract_path"), THIN, True),
+        (by("path"), THIN, False),
+        (by("path"), INEXACT, True),
+    ],
+)
+def test_what_is_rendered_wrong_is_named(tmp_path, llvm_spectral, integrator, wrong, named):
+    shapes, words = wrong
     place = '<transform name="to_world"><lookat origin="0,0,9" target="0,0,0" up="0,1,0"/></transform>'
-    text = SKY.format('<emitter type="constant"/>' + shapes).replace('"path"', f'"{integrator}"')
+    text = SKY.format('<emitter type="constant"/>' + shapes).replace(by("path"), integrator)
     (tmp_path / "a.xml").write_text(text.replace("<film", place + "<film"))
     warnings = resume(Job(tmp_path / "a.xml"), tmp_path / "a.exr", Limits(spp=1)).warnings
-    assert any(text.startswith(f"{tmp_path}/a.xml: ") and words in text for text in warnings)
+    assert [text.startswith(f"{tmp_path}/a.xml: ") and words in text for text in warnings] == [True] * named
 
 
 def test_a_pass_that_fails_leaves_no_render_behind(tmp_path, llvm_variant, monkeypatch):
