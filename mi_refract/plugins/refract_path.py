@@ -53,7 +53,6 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mi_refract.numerics import (
     Count,
@@ -248,6 +247,8 @@ def integrator_class(v: Variant) -> type:
             tracer = lamp_tracing.LampTracer(loop, sensor, lambda ray: self.camera_medium(scene, ray, None))
             paths = paths or max(1, round(self.light_paths * spp * tracer.camera.width * tracer.camera.height))
             if type(own := sensor.sampler()) is v.Sampler:  # which may have a seed of its own
+                import numpy as np
+
                 probe = own.clone()
                 probe.seed(seed, 1)
                 number: Any = dr.slice(probe.next_1d())
