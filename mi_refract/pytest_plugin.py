@@ -90,7 +90,7 @@ def pytest_configure(config: pytest.Config) -> None:
         from mi_refract.io.safe_files import writable
 
         try:
-            config.stash[COMPARED] = Compared(Page(writable(path, (".html", ".htm")).absolute()))
+            config.stash[COMPARED] = Compared(Page(writable(path, (".html", ".htm"))))
         except (ValueError, OSError) as error:
             raise pytest.UsageError(str(error)) from None
 

@@ -196,19 +196,6 @@ def test_wrong_option(assert_image_equal, name):
 """
 
 
-def test_the_page_is_written_to_the_folder_in_which_pytest_started(pytester):
-    pytester.makeconftest('pytest_plugins = ["mi_refract.pytest_plugin"]')
-    pytester.makepyfile("""
-        import os, numpy
-        def test_it(assert_image_equal, tmp_path):
-            os.chdir(tmp_path)
-            assert_image_equal(numpy.zeros((8, 8, 3)), numpy.zeros((8, 8, 3)), "exact")
-    """)
-    run = pytester.runpytest_subprocess("-p", "no:cacheprovider", "--mi-refract-report", "out.html")
-    run.assert_outcomes(passed=1)
-    assert (pytester.path / "out.html").is_file()
-
-
 def test_options_write_a_page_and_accept_images(pytester):
     pytester.makeconftest('pytest_plugins = ["mi_refract.pytest_plugin"]')
     name = f"{pytester.makepyfile(TESTS).name}::test_"
