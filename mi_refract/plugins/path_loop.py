@@ -46,7 +46,7 @@ from .absorption import absorbed
 from .medium_tracking import MediumTracker, ShapeMedia
 from .refract import DISPERSED, followed_context
 from .sampling import GOLDEN, ONE, KeyedMultijitter, NonConstantEmitters, SceneEmitters, SceneSampler
-from .scene_features import BOUNDARIES, all_shapes, bsdf_name, children, nested, plugin_number
+from .scene_features import BOUNDARIES, all_shapes, bsdf_name, children, may_vary, nested, plugin_number
 
 # These values of `sample1` select the first and the last lobe of a boundary. A less probable lobe is not followed.
 FIRST, LAST = 2.0**-25, ONE
@@ -200,7 +200,7 @@ def has_own_odds(bsdf: BSDF) -> bool:
     masks = [inner for inner in nested(bsdf) if bsdf_name(inner) == "MaskBSDF"]
     textures = (child for mask in masks for child in children(mask) if hasattr(child, "is_spatially_varying"))
     opacities = (value for mask in masks for key, value in mi.traverse(mask) if key.startswith("opacity"))
-    return any(texture.is_spatially_varying() for texture in textures) or any(map(dr.grad_enabled, opacities))
+    return any(map(may_vary, textures)) or any(map(dr.grad_enabled, opacities))
 
 
 class PathLoop:
@@ -345,7 +345,8 @@ class PathLoop:
                 active_em &= dr.max(dr.abs(v.unpolarized_spectrum(bsdf_value))) > 0
             shadow_ray = ray_origins.ray_to(v, si, ds.p, features.delta_extent)
             shadow_ray.maxt *= 1 - v.math.ShadowEpsilon
-            if features.lamps_at_infinity:
+            # In scalar variants a `directionalarea`, which has no samples, leaves no emitter.
+            if at_infinity := features.lamps_at_infinity and (self.vectorised or bool(ds.emitter)):
                 # Mitsuba places such a light beyond the scene's bounding box, in which merged rectangles are missing,
                 # and later edits, too. So these shadow rays have no end.
                 at_infinity = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
@@ -357,7 +358,7 @@ class PathLoop:
             if v.is_polarized:
                 bsdf_value = si.to_world_mueller(bsdf_value, -wo, si.wi)
             if features.absorption:
-                way = dr.select(at_infinity, dr.inf, ds.dist) if features.lamps_at_infinity else ds.dist
+                way = dr.select(at_infinity, dr.inf, ds.dist)
                 sigma = self.media.toward(s.sigma, si, ds.d, active_em)
                 emitter_weight = self.attenuated(emitter_weight, sigma, way)
             contribution = self.times(self.times(s.throughput, bsdf_value), emitter_weight)

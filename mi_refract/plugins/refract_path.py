@@ -74,7 +74,7 @@ from .index_parameter import warn_once
 from .medium_tracking import MediumTracker, ShapeMedia, check_media, extinction
 from .path_loop import PathFeatures, PathLoop
 from .sampling import STRATIFIED, KeyedMultijitter, SceneSampler, seed_of_pass, seeds_of
-from .scene_features import CAST, CURVES, SceneFeatures, all_shapes, check_shapes, differentiated, inspect
+from .scene_features import CAST, ONE_SIDED, SceneFeatures, all_shapes, check_shapes, differentiated, inspect
 
 INTEGRATOR = "refract_path"  # its name in Mitsuba
 MOST_PATHS = 4096  # that one sample may split into
@@ -424,7 +424,7 @@ def integrator_class(v: Variant) -> type:
                     f"{INTEGRATOR}: Mitsuba does not differentiate to_world of an instance; expected that of the "
                     "shapes in its group"
                 )
-            if needs.textured or CURVES & {shape.class_name() for shape in all_shapes(scene)}:
+            if needs.textured or ONE_SIDED & {shape.class_name() for shape in all_shapes(scene)}:
                 check_shapes(scene)
             if needs.absorbing or needs.media:
                 check_media(v, scene, self.sensor)

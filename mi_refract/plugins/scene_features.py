@@ -43,7 +43,7 @@ CONSTANT_TEXTURES = {
 PERTURBING = {"BumpMap", "NormalMap"}  # they change the shading normal of the interaction
 # BSDFs that can be split: one reflected and one refracted direction, selected by a threshold of `sample1`.
 BOUNDARIES = {"Refract", "SmoothDielectric"}
-CURVES = {"BSplineCurve", "LinearCurve"}
+ONE_SIDED = {"BSplineCurve", "Ellipsoids", "EllipsoidsMesh", "LinearCurve"}  # rays do not meet them from within
 # BSDFs that make no random choice if both lobes of `BOUNDARIES` are followed.
 DETERMINISTIC = BOUNDARIES | {"SmoothConductor", "TwoSidedBRDF"}
 # BSDFs that use only the shading normal of an interaction, as `RayFlags.ShadingFrame` gives it: no tangent, no (u, v).
@@ -213,8 +213,7 @@ def inspect(scene: Scene, sensor: Sensor | None = None) -> SceneFeatures:
         only_glass=not (everything or flags & +(lobes.Smooth | lobes.Delta1D)),
         textured=everything
         or any(
-            hasattr(child, "is_spatially_varying")
-            and (child.is_spatially_varying() or child.class_name() not in CONSTANT_TEXTURES)
+            hasattr(child, "is_spatially_varying") and may_vary(child)
             for node in (*bsdfs, *lamps)
             for child in children(node)
         )
@@ -265,7 +264,8 @@ def check_shapes(scene: Scene) -> None:
     """ValueError for shapes that Mitsuba renders wrong.
 
     A mesh attribute that a texture of `refract` reads and its shape lacks would be 0. An attribute that a lamp emits
-    would be read in the first face wherever a point on the lamp is sampled. Rays within a curve do not meet it.
+    would be read in the first face wherever a point on the lamp is sampled. Rays within a curve or an ellipsoid of
+    `ellipsoids` do not meet it.
     """
     shapes = all_shapes(scene)
     for i, shape in enumerate(shapes):
@@ -276,7 +276,7 @@ def check_shapes(scene: Scene) -> None:
                 "reads in one face only where it samples a lamp; expected a bitmap, or sampling_weight = 0"
             )
         for bsdf in nested(shape.bsdf()):
-            if bsdf_name(bsdf) in BOUNDARIES and shape.class_name() in CURVES:
+            if bsdf_name(bsdf) in BOUNDARIES and shape.class_name() in ONE_SIDED:
                 raise ValueError(
                     f"{shape_name(shapes, i)} is a {shape.class_name()} of glass, which rays do not "
                     "meet from within; expected a mesh"
@@ -287,6 +287,12 @@ def check_shapes(scene: Scene) -> None:
                         f"refract: {shape_name(shapes, i)} has no attribute {name!r}, which a texture of its BSDF "
                         "reads; expected a mesh with that attribute"
                     )
+
+
+def may_vary(texture: mi.Object) -> bool:
+    """Whether a texture may vary over a surface. Mitsuba's mesh attributes, also within `d65`, say that they do not."""
+    names = {x.class_name() for x in (texture, *children(texture))}
+    return bool(texture.is_spatially_varying()) or not names <= CONSTANT_TEXTURES
 
 
 def mesh_attributes(node: mi.Object) -> list[str]:
@@ -388,7 +394,7 @@ def _black(bsdf: BSDF) -> bool:
         return False
     (reflectance,) = children(bsdf)
     exact = reflectance.class_name() == "UniformSpectrum" or "spectral" not in bsdf.variant_name()
-    zero = exact and not reflectance.is_spatially_varying() and reflectance.max() == 0
+    zero = exact and not may_vary(reflectance) and reflectance.max() == 0
     # A reflectance of 0 that is differentiated counts: the derivative of the image is not 0.
     return zero and not any(dr.grad_enabled(value) for _, value in mi.traverse(bsdf))
 

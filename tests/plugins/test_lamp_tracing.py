@@ -129,6 +129,9 @@ GLASS = {"type": "ref", "id": "glass"}
 CROP = {"width": 40, "height": 30, "crop_width": 16, "crop_height": 16, "crop_offset_x": 14, "crop_offset_y": 9}
 
 
+# Rays at 45° to the film, with the caustic in the middle of the image as before.
+SHEAR = mi.ScalarTransform4f([[1, 0, 1, -8.39], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+SHEARED = camera("orthographic")["to_world"] @ SHEAR
 AFAR = mi.ScalarTransform4f().look_at([0, -20, 10], [-0.3, 0, 0], [0, 0, 1])
 WINDOW = mi.ScalarTransform4f().translate([0, 0, 0.02]).scale([1, 1, 0.002])
 AT_100 = mi.ScalarTransform4f().translate([100, 0, 0])
@@ -152,7 +155,11 @@ AGREE = {
     "roulette": agree(rr_depth=2),
     "splitting": agree(split_depth=2),
     "thin lens": agree(sensor=camera("thinlens", aperture_radius=0.3, focus_distance=6.0)),
+    "thin lens, focused behind far_clip": agree(
+        sensor=camera("thinlens", aperture_radius=0.1, focus_distance=30.0, far_clip=20.0)
+    ),
     "orthographic": agree(sensor=camera("orthographic")),
+    "oblique": agree(sensor=camera("orthographic", to_world=SHEARED)),
     "crop window": agree(sensor=camera(film=CROP)),
     "wide filter": agree(sensor=camera(film={"rfilter": {"type": "gaussian"}, "width": 24})),
     "clipped": agree(sensor=camera(near_clip=3.0, far_clip=6.4), more=BLOCKER),
@@ -215,6 +222,15 @@ def test_lamp_tracing_has_the_image_of_path_tracing(name, llvm_variant, tmp_path
         parts = {"ball": polyhedron(tmp_path) | {"bsdf": parts["bsdf"]}}
     images = [
         tiles(scene(parts, caustics=caustics, **integrator), 144, range(first, first + 16))
+        for caustics, first in (("path", 0), ("lamp", 100))
+    ]
+    assert difference(*images) < 1
+
+
+def test_a_lamp_with_a_moved_texture_within_d65_has_the_image_of_path_tracing(llvm_spectral):
+    moved = lamp() | {"emitter": {"type": "area", "radiance": {"type": "d65", "nested": HALF}}}
+    images = [
+        tiles(scene({"lamp": moved}, caustics=caustics), 144, range(first, first + 16))
         for caustics, first in (("path", 0), ("lamp", 100))
     ]
     assert difference(*images) < 1
@@ -442,17 +458,28 @@ def tilted_lamp():
     return mitsuba_mesh.make(mi, corners, faces, normals, properties=properties)
 
 
+def distance_grid():
+    x, y, z = np.meshgrid(*[np.linspace(-1, 1, 8)] * 3, indexing="ij")
+    to_world = mi.ScalarTransform4f().translate([-0.4, -0.4, 4]).scale(0.8)
+    grid = mi.TensorXf((np.hypot(np.hypot(x, y), z) - 0.7)[..., None].astype(np.float32))
+    return {"type": "sdfgrid", "grid": grid, "to_world": to_world, "emitter": {"type": "area", "radiance": 8.0}}
+
+
 def coloured_lamp(**parameters):
     corners, faces = np.array([[-1, -1, 3], [1, -1, 3], [1, 1, 3], [-1, 1, 3]], np.float32), [[0, 2, 1], [0, 3, 2]]
     radiance = {"type": "mesh_attribute", "name": "face_colour"}
+    channels = 1 if mi.is_spectral else 3
+    if mi.is_spectral:
+        radiance = {"type": "d65", "nested": radiance}
     properties = mi.Properties()
     properties["emitter"] = mi.load_dict({"type": "area", "radiance": radiance} | parameters)
     mesh = mitsuba_mesh.make(mi, corners, np.uint32(faces), properties=properties)
-    mesh.add_attribute("face_colour", 3, [0, 0, 0, 8, 8, 8])
+    mesh.add_attribute("face_colour", channels, [0] * channels + [8] * channels)
     return mesh
 
 
-def test_a_lamp_that_emits_an_attribute_cannot_be_sampled(llvm_variant):
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral"], indirect=True)
+def test_a_lamp_that_emits_an_attribute_cannot_be_sampled(variant):
     loaded = scene({"lamp": coloured_lamp()})
     with pytest.raises(ValueError, match=r"emits the attribute 'face_colour' of its mesh.*; expected a bitmap, or"):
         loaded.integrator().render(loaded, spp=1)
@@ -469,6 +496,7 @@ REFUSED = {
         lambda: {"lamp": TUBE | {"to_world": mi.ScalarTransform4f().scale([-1, 1, 1]), "emitter": {"type": "area"}}},
         "mirrored Cylinder",
     ),
+    "a lamp without samples": (lambda: {"lamp": distance_grid()}, "SDFGrid"),
     "an attribute": (lambda: {"lamp": coloured_lamp(sampling_weight=0.0), "more": lamp()}, "attribute of its mesh"),
     "glass with bumps": (lambda: {"ball": ball(bumps({"type": "refract"}))}, "BumpMap"),
 }
@@ -487,7 +515,9 @@ def test_what_lamps_cannot_be_traced_in_is_an_error_and_auto_is_path_tracing(par
         refused.integrator().render(refused, spp=1)
 
 
-@pytest.mark.parametrize("reason", ["a lamp with normals of its own", "a mirrored cylinder", "an attribute"])
+@pytest.mark.parametrize(
+    "reason", ["a lamp with normals of its own", "a mirrored cylinder", "a lamp without samples", "an attribute"]
+)
 def test_auto_traces_lamps_of_zero_size_beside_area_lamps_that_cannot_be_traced(reason, llvm_variant):
     parts, message = REFUSED[reason]
     parts = parts() | {"bulb": point(2.5)}  # below the area lamps

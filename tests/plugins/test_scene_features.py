@@ -50,6 +50,7 @@ LIT = {"sampleable", "lamps", "area"}
         (sphere("diffuse", reflectance=1e-6), {"smooth"}),
         (sphere("diffuse", reflectance=CHECKERS), {"smooth", "textured"}),
         (sphere("twosided", a={"type": "diffuse", "reflectance": CHECKERS}), {"smooth", "textured"}),
+        (sphere("diffuse", reflectance={"type": "mesh_attribute", "name": "vertex_color"}), {"smooth", "textured"}),
         (sphere("refract", specular_reflectance=CHECKERS), {"textured"}),
         (sphere("mask", a={"type": "refract"}), {"null", "both_numbers"}),
         (sphere("thindielectric"), {"null"}),
@@ -141,14 +142,16 @@ def test_a_mesh_without_vertices_has_no_size(scalar_variant):
     assert needs(empty=mi.Mesh("empty", 0, 0, props=properties)).delta_extent == math.inf
 
 
-@pytest.mark.parametrize("kind", ["bsplinecurve", "linearcurve"])
-def test_a_curve_of_glass_is_an_error(kind, llvm_variant, tmp_path):
+@pytest.mark.parametrize("kind", ["bsplinecurve", "linearcurve", "ellipsoids", "ellipsoidsmesh"])
+def test_glass_that_rays_do_not_meet_from_within_is_an_error(kind, llvm_variant, tmp_path):
     (tmp_path / "fibre.txt").write_text("\n".join(f"{x} 0 0 0.3" for x in range(4)))
-    fibre = {"type": kind, "filename": str(tmp_path / "fibre.txt"), "bsdf": {"type": "dielectric"}}
-    made = mi.load_dict(
-        {"type": "scene", "fibre": fibre, "integrator": {"type": "refract_path"}, "sensor": {"type": "perspective"}}
-    )
-    with pytest.raises(ValueError, match=r"'fibre' is a .*Curve of glass.*; expected a mesh"):
+    shape = {"filename": str(tmp_path / "fibre.txt")}
+    if "ellipsoids" in kind:
+        data = {"centers": [0, 0, 0], "scales": [1, 1, 1], "quaternions": [0, 0, 0, 1]}
+        shape = {name: mi.TensorXf([float(x) for x in row], (1, len(row))) for name, row in data.items()}
+    parts = {"integrator": {"type": "refract_path"}, "sensor": {"type": "perspective"}}
+    made = mi.load_dict({"type": "scene", "glass": {"type": kind, "bsdf": {"type": "dielectric"}} | shape} | parts)
+    with pytest.raises(ValueError, match=r"'glass' is a .* of glass.*; expected a mesh"):
         check_integrator(made)
 
 
@@ -302,6 +305,14 @@ def test_missing_light_is_black_and_ptracer_finds_it(lamp, bsdf, integrator, sca
     ours, theirs = np.array(mi.render(scene, spp=4)), np.array(mi.render(scene, spp=4000, integrator=tracer))
     assert theirs.mean() > 0
     assert ours.mean() == (0 if missing_light(scene) else pytest.approx(theirs.mean(), rel=0.1))
+
+
+def test_a_lamp_without_samples_is_black_beside_one_at_infinity(scalar_variant):
+    lamps = (x | {"to_world": PLACE().translate([9, 0, 2])} for x in (BEAM, SQUARE))
+    one, other = (
+        np.array(mi.render(under_a_pane(x, None, "refract_path", more=SUNLIGHT), spp=256)).mean() for x in lamps
+    )
+    assert one == pytest.approx(other, rel=0.1) and one > 0
 
 
 @pytest.mark.parametrize(
