@@ -84,6 +84,7 @@ AREA, PLACE, DIRECTION = range(3)  # kinds of lamps
 KINDS = {"AreaLight": AREA, "PointLight": PLACE, "SpotLight": PLACE, "DirectionalEmitter": DIRECTION}  # TRACED_LAMPS
 # The models of hair and thin slabs are not reciprocal; measured BSDFs interpolate wi and wo in different ways.
 ONE_WAY = PERTURBING | {"Hair", "Measured", "MeasuredPolarized", "PrincipledThin"}
+UNSAMPLED = {"Ellipsoids", "SDFGrid"}  # shapes whose `sample_position` returns 0
 LOBES = mi.BSDFFlags
 
 
@@ -100,6 +101,8 @@ def refused_lamps(v: Variant, scene: Scene, every: bool) -> str:
     shapes = [lamp.get_shape() for lamp in lamps if lamp.class_name() == "AreaLight"]
     if any(shape.is_mesh() and mitsuba_mesh.is_smooth(shape) for shape in shapes):
         return "the normals of an area lamp are not those of its faces"
+    if unsampled := {shape.class_name() for shape in shapes} & UNSAMPLED:
+        return f"Mitsuba samples no points on an area lamp of type {min(unsampled)}"
     # Mitsuba's position samples there have the normal of the other side.
     if any(shape.class_name() == "Cylinder" and dr.all(dr.det(matrix_of(shape, "to_world")) < 0) for shape in shapes):
         return "an area lamp on a mirrored Cylinder"
@@ -129,7 +132,8 @@ def by_area(lamp: Emitter) -> bool:
         return False
     textures = [x for x in children(lamp) if hasattr(x, "is_spatially_varying") and x.is_spatially_varying()]
     exact = lamp.get_shape().class_name() in ("Disk", "Rectangle")
-    matrices = (matrix_of(texture, "to_uv") for texture in textures)  # which Mitsuba ignores
+    inner = [child for texture in textures for child in children(texture)]  # of `d65`
+    matrices = (matrix_of(texture, "to_uv") for texture in (*textures, *inner))  # which Mitsuba ignores
     moved = (x is not None and bool(dr.any(x != dr.identity(type(x)), axis=None)) for x in matrices)
     return bool(textures) and (not exact or any(moved))
 
@@ -645,19 +649,25 @@ class Camera:
         film = sensor.film()
         self.width, self.height = (int(n) for n in film.crop_size())
         self.parallel = sensor.class_name() == "OrthographicCamera"
-        corner, right, down = (
-            sensor.sample_ray(0, 0, v.Point2f(*p), v.Point2f(0.5))[0] for p in ((0, 0), (1, 0), (0, 1))
-        )
-        self.axis = v.Vector3f(sensor.world_transform() @ v.Vector3f(0, 0, 1))
-        if self.parallel:
-            self.origin, self.d = corner.o, corner.d
-            x, y = right.o - corner.o, down.o - corner.o
-            # (x, y) of a point p on the film, from 0 to 1, is that of p − origin in the basis dual to x, y.
-            self.to_x = dr.cross(y, self.d) / dr.dot(x, dr.cross(y, self.d))
-            self.to_y = dr.cross(x, self.d) / dr.dot(y, dr.cross(x, self.d))
-        else:  # at the distance 1, through the middle of the lens
-            x, y = (ray.d / dr.dot(ray.d, self.axis) - corner.d / dr.dot(corner.d, self.axis) for ray in (right, down))
-        self.area = dr.norm(dr.cross(x, y))
+        rays = (sensor.sample_ray(0, 0, v.Point2f(*p), v.Point2f(0.5))[0] for p in ((0, 0), (1, 0), (0, 1)))
+        to_world = sensor.world_transform()
+        self.axis = v.Vector3f(to_world @ v.Vector3f(0, 0, 1))
+        if self.parallel:  # places on the film
+            self.axis, (corner, right, down) = dr.normalize(self.axis), (ray.o for ray in rays)
+        else:  # places at the distance 1, through the middle of the lens
+            self.origin = v.Point3f(to_world @ v.Point3f(0))
+            corner, right, down = (ray.d / dr.dot(ray.d, self.axis) for ray in rays)
+        self.has_lens = sensor.class_name() == "ThinLensCamera"
+        if self.has_lens:
+            lens = mi.traverse(sensor)
+            self.focus, radius = v.Float(lens["focus_distance"]), v.Float(lens["aperture_radius"])
+            self.lens_x, self.lens_y = (radius * v.Vector3f(to_world @ v.Vector3f(*x)) for x in ((1, 0, 0), (0, 1, 0)))
+        x, y = right - corner, down - corner
+        # (x, y) of a place p on the film, from 0 to 1, is that of p − corner in the basis dual to x, y.
+        normal = dr.cross(x, y)
+        self.corner, self.area = corner, dr.abs(dr.dot(normal, self.axis))
+        self.to_x = dr.cross(y, self.axis) / dr.dot(x, dr.cross(y, self.axis))
+        self.to_y = dr.cross(x, self.axis) / dr.dot(y, dr.cross(x, self.axis))
 
     def connect(self, si: Interaction, aperture: Point2, active: Mask) -> tuple[Point2, Ray, Number, Mask]:
         """Place on the film in pixels, the camera's ray through it, its importance; whether the film sees the point.
@@ -666,16 +676,21 @@ class Camera:
         """
         v, pixels = self.v, self.width * self.height
         if self.parallel:
-            apart = si.p - self.origin
-            place = v.Point2f(dr.dot(apart, self.to_x), dr.dot(apart, self.to_y))
-            importance, active = pixels / self.area, active & (dr.dot(apart, self.d) > 0)
+            seen, importance = si.p, pixels / self.area
+            active &= dr.dot(si.p - self.corner, self.axis) > 0
         else:
-            # Not the weight of this sample: Mitsuba's is 0 beyond a film that has no `principal_point_offset_x`.
-            ds, _ = self.sensor.sample_direction(si, aperture, active)
-            place = v.Point2f(ds.uv.x / self.width, ds.uv.y / self.height)
-            cosine = -dr.dot(ds.d, self.axis)
-            importance = _quotient(pixels, self.area * cosine**3 * dr.square(ds.dist))
-            active = active & (ds.pdf > 0)
+            # Not Mitsuba's `sample_direction`, which sees nothing if the focus is not between the clipping planes.
+            toward, shift = si.p - self.origin, v.Vector3f(0)
+            if self.has_lens:
+                disk = v.warp.square_to_uniform_disk_concentric(aperture)
+                on_lens = disk.x * self.lens_x + disk.y * self.lens_y
+                toward, shift = toward - on_lens, on_lens / self.focus
+            depth, distance = dr.dot(toward, self.axis), dr.norm(toward)
+            active &= depth > 0
+            seen = toward / dr.select(depth > 0, depth, 1) + shift
+            importance = _quotient(pixels, self.area * _quotient(depth, distance) ** 3 * dr.square(distance))
+        apart = seen - self.corner
+        place = v.Point2f(dr.dot(apart, self.to_x), dr.dot(apart, self.to_y))
         active &= (place.x >= 0) & (place.x < 1) & (place.y >= 0) & (place.y < 1)
         ray, _ = self.sensor.sample_ray(si.time, 0, place, aperture, active)
         ray.wavelengths = si.wavelengths
