@@ -289,7 +289,7 @@ def check_shapes(scene: Scene) -> None:
                     )
 
 
-def may_vary(texture: mi.Object) -> bool:
+def may_vary(texture: Any) -> bool:
     """Whether a texture may vary over a surface. Mitsuba's mesh attributes, also within `d65`, say that they do not."""
     names = {x.class_name() for x in (texture, *children(texture))}
     return bool(texture.is_spatially_varying()) or not names <= CONSTANT_TEXTURES
