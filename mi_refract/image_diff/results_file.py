@@ -18,7 +18,7 @@ import msgspec
 from mi_refract.io import safe_files
 from mi_refract.io.reference_pack import Origin
 from mi_refract.io.text import json_text, printable
-from mi_refract.io.typed_table import convert
+from mi_refract.io.typed_table import convert, doc
 from mi_refract.report import documents
 from mi_refract.report.row import write_strict_json
 
@@ -44,11 +44,7 @@ _PathText = Annotated[str, msgspec.Meta(min_length=1, pattern=r"^[^\0]*$")]
 _Number = float | Literal["nan", "inf", "-inf"]  # strict JSON has no numbers for these
 
 
-def _doc(meaning: str) -> msgspec.Meta:
-    return msgspec.Meta(description=meaning)
-
-
-_Digest = Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$"), _doc("SHA-256; empty where there is no file")]
+_Digest = Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$"), doc("SHA-256; empty where there is no file")]
 
 
 class Digests(msgspec.Struct):
@@ -70,43 +66,43 @@ class MeasuredNumber(msgspec.Struct):
 class Entry(msgspec.Struct):
     """One image, or with --renders one pair of folders."""
 
-    name: Annotated[str, _doc("path of the new image in its folder")]
-    status: Annotated[Status, _doc("the verdict; error: could not be compared")]
-    category: Annotated[Category, _doc("change of the image between the folders; unknown without a verdict")]
+    name: Annotated[str, doc("path of the new image in its folder")]
+    status: Annotated[Status, doc("the verdict; error: could not be compared")]
+    category: Annotated[Category, doc("change of the image between the folders; unknown without a verdict")]
     reason: str
-    warning: Annotated[str, _doc("bounds for warnings that an equal image exceeds, and remarks on its mask")]
-    error: Annotated[str, _doc("why the image could not be compared")]
-    reference: Annotated[_PathText | None, _doc("null: only among the new images")]
-    test: Annotated[_PathText | None, _doc("null: only among the references")]
-    target: Annotated[_PathText, _doc("path of the reference, which may not exist yet")]
-    digests: Annotated[Digests | None, _doc("null for an unreadable file and with --renders")]
+    warning: Annotated[str, doc("bounds for warnings that an equal image exceeds, and remarks on its mask")]
+    error: Annotated[str, doc("why the image could not be compared")]
+    reference: Annotated[_PathText | None, doc("null: only among the new images")]
+    test: Annotated[_PathText | None, doc("null: only among the references")]
+    target: Annotated[_PathText, doc("path of the reference, which may not exist yet")]
+    digests: Annotated[Digests | None, doc("null for an unreadable file and with --renders")]
     method: str
-    method_why: Annotated[str, _doc("why `auto` chose this method")]
-    options: Annotated[dict[str, Any], _doc("the options of the method that were set")]
-    channels: Annotated[list[tuple[str, str]], _doc("pairs [name in the reference, in the new image]; empty: all")]
-    variance: Annotated[str, _doc("template of the image that contains the variance")]
-    mask: Annotated[str, _doc("template of the mask")]
-    ignore: Annotated[list[tuple[int, int, int, int]], _doc("rectangles not compared: [x, y, width, height]")]
-    why_so: Annotated[str, _doc("`reason` in the settings")]
-    entries: Annotated[list[str], _doc("tables of the settings that apply")]
-    matched: Annotated[_PathText | None, _doc("the variant that the image is equal to")]
-    variants: Annotated[list[_PathText], _doc("variants: further references, by `accept` in the settings")]
+    method_why: Annotated[str, doc("why `auto` chose this method")]
+    options: Annotated[dict[str, Any], doc("the options of the method that were set")]
+    channels: Annotated[list[tuple[str, str]], doc("pairs [name in the reference, in the new image]; empty: all")]
+    variance: Annotated[str, doc("template of the image that contains the variance")]
+    mask: Annotated[str, doc("template of the mask")]
+    ignore: Annotated[list[tuple[int, int, int, int]], doc("rectangles not compared: [x, y, width, height]")]
+    why_so: Annotated[str, doc("`reason` in the settings")]
+    entries: Annotated[list[str], doc("tables of the settings that apply")]
+    matched: Annotated[_PathText | None, doc("the variant that the image is equal to")]
+    variants: Annotated[list[_PathText], doc("variants: further references, by `accept` in the settings")]
     metrics: list[MeasuredNumber]
-    minimum_detectable_difference: Annotated[_Number, _doc("relative; nan if the method has none")]
-    reproduce: Annotated[str, _doc("the command that compares this image again")]
-    accept: Annotated[str, _doc("the command that makes the new image the reference")]
+    minimum_detectable_difference: Annotated[_Number, doc("relative; nan if the method has none")]
+    reproduce: Annotated[str, doc("the command that compares this image again")]
+    accept: Annotated[str, doc("the command that makes the new image the reference")]
 
 
 class Document(Origin, frozen=True, kw_only=True):
     """The JSON of `mi-refract diff --json`. Keys may be added without a change of the number `schema`."""
 
     schema: Literal[1]
-    exit_code: Annotated[int, msgspec.Meta(ge=0, le=3), _doc("exit code of the command")]
-    sentence: Annotated[str, _doc("the last line of the output")]
+    exit_code: Annotated[int, msgspec.Meta(ge=0, le=3), doc("exit code of the command")]
+    sentence: Annotated[str, doc("the last line of the output")]
     reference: _PathText
     test: _PathText
-    renders: Annotated[bool, _doc("--renders: each folder contains renders of one image")]
-    counts: Annotated[dict[Status, int], _doc("number of images of each status")]
+    renders: Annotated[bool, doc("--renders: each folder contains renders of one image")]
+    counts: Annotated[dict[Status, int], doc("number of images of each status")]
     results: list[Entry]
 
 

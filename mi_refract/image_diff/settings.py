@@ -23,7 +23,7 @@ from msgspec import Meta
 
 from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.safe_files import read_bytes
-from mi_refract.io.typed_table import convert, key_table, parse_toml
+from mi_refract.io.typed_table import convert, doc, key_table, parse_toml
 
 from . import name_patterns
 from .channels import Names
@@ -217,33 +217,33 @@ def this_platform() -> frozenset[str]:
 class Keys(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     """The keys of `[defaults]`, of `[[image]]` and of `--set`."""
 
-    method: Annotated[str, Meta(description=f"the method: {', '.join(ACCEPTED)}")] = AUTO
-    allow_nonfinite: Annotated[bool, Meta(description="allow NaN or Inf where the other image has the same")] = False
+    method: Annotated[str, doc(f"the method: {', '.join(ACCEPTED)}")] = AUTO
+    allow_nonfinite: Annotated[bool, doc("allow NaN or Inf where the other image has the same")] = False
     ignore_metadata: Annotated[
-        tuple[Text, ...], Meta(description="names of metadata that may differ, such as view; `*` and `?` allowed")
+        tuple[Text, ...], doc("names of metadata that may differ, such as view; `*` and `?` allowed")
     ] = ()
     accept: Annotated[
-        tuple[str, ...],
-        Meta(min_length=1, description="further references beside the first: templates, `*` and `?` allowed"),
+        tuple[str, ...], Meta(min_length=1), doc("further references beside the first: templates, `*` and `?` allowed")
     ] = ()
     mask: Annotated[
         str | None,
-        Meta(
-            description="an image beside the reference: pixels are compared where a colour of it is at least 0.5, "
+        doc(
+            "an image beside the reference: pixels are compared where a colour of it is at least 0.5, "
             "alpha not counted; {root}: the top folder"
         ),
     ] = None
     ignore: Annotated[
         tuple[Rectangle, ...],
-        Meta(min_length=1, description="rectangles of pixels that are not compared: x, y, width, height"),
+        Meta(min_length=1),
+        doc("rectangles of pixels that are not compared: x, y, width, height"),
     ] = ()
     variance: Annotated[
         str | None,
-        Meta(description="an image with the variance of one sample of each pixel, beside the image of each side"),
+        doc("an image with the variance of one sample of each pixel, beside the image of each side"),
     ] = None
     channels: Annotated[
         list[Text] | dict[Text, Text] | None,
-        Meta(description='the channels to compare: names, or { "in the reference" = "in the new image", … }'),
+        doc('the channels to compare: names, or { "in the reference" = "in the new image", … }'),
     ] = None
 
     def __post_init__(self) -> None:
@@ -266,19 +266,19 @@ class DefaultsKeys(Keys, forbid_unknown_fields=True, kw_only=True):
 
     map: Annotated[
         Map | list[Map] | None,
-        Meta(description="templates { reference = …, test = … } of paths; without it, both sides have the same path"),
+        doc("templates { reference = …, test = … } of paths; without it, both sides have the same path"),
     ] = None
 
 
 class ImageKeys(Keys, forbid_unknown_fields=True, kw_only=True):
     """The keys of an `[[image]]` table."""
 
-    name: Annotated[Text, Meta(description="the image's path; `*` matches anything, `/` included, `?` one character")]
-    reason: Annotated[Text, Meta(description="why this image is not compared like the others")]
-    when: Annotated[
-        str | list[str] | None, Meta(description=f"the platforms, all by default: one or two of {', '.join(WORDS)}")
-    ] = None
-    skip: Annotated[bool, Meta(description="do not compare it")] = False
+    name: Annotated[Text, doc("the image's path; `*` matches anything, `/` included, `?` one character")]
+    reason: Annotated[Text, doc("why this image is not compared like the others")]
+    when: Annotated[str | list[str] | None, doc(f"the platforms, all by default: one or two of {', '.join(WORDS)}")] = (
+        None
+    )
+    skip: Annotated[bool, doc("do not compare it")] = False
 
     def __post_init__(self) -> None:
         """Raise ValueError also for a blank reason and for platforms that do not exist."""
@@ -389,7 +389,7 @@ def _checked_values(table: dict[str, Any], kind: type[Keys], where: str, method:
 
 def _struct(kind: type[msgspec.Struct], name: str, method: str | None) -> Any:
     """Return the struct `kind` with the options of a method added."""
-    fields = [(x.name, Annotated[x.type, Meta(description=x.help)], x.default) for x in _options(method).values()]
+    fields = [(x.name, Annotated[x.type, doc(x.help)], x.default) for x in _options(method).values()]
     return msgspec.defstruct(name, fields, bases=(kind,), forbid_unknown_fields=True, kw_only=True)
 
 

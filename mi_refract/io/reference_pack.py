@@ -19,7 +19,7 @@ from msgspec import Meta
 from mi_refract import __version__
 
 from . import safe_files
-from .typed_table import convert
+from .typed_table import convert, doc
 
 INDEX, SUMS = "mi-refract-pack.json", "SHA256SUMS"
 FORMAT: Literal["mi_refract pack 1"] = "mi_refract pack 1"
@@ -29,42 +29,38 @@ EXPECTED = "expected the pack as it was published"
 Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", description="SHA-256")]
 
 
-def _doc(meaning: str) -> Meta:
-    return Meta(description=meaning)
-
-
 class PackedFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A file of a pack."""
 
     sha256: Digest
-    content: Annotated[str, _doc("description of the content")]
-    schema: Annotated[str, _doc("for a JSON file: the file with its JSON Schema")] = ""
+    content: Annotated[str, doc("description of the content")]
+    schema: Annotated[str, doc("for a JSON file: the file with its JSON Schema")] = ""
 
 
 class PackIndex(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The content of INDEX."""
 
-    format: Annotated[Literal["mi_refract pack 1"], _doc("the format, and its version")]
-    version: Annotated[str, _doc("version of mi_refract that wrote the pack")]
-    quick: Annotated[bool, _doc("made with --quick: few rays, small images")]
-    made_with: Annotated[dict[str, str], _doc("versions and settings that the bytes depend on, by name")]
-    files: Annotated[dict[str, PackedFile], _doc("all other files except SHA256SUMS, by path with slashes")]
+    format: Annotated[Literal["mi_refract pack 1"], doc("the format, and its version")]
+    version: Annotated[str, doc("version of mi_refract that wrote the pack")]
+    quick: Annotated[bool, doc("made with --quick: few rays, small images")]
+    made_with: Annotated[dict[str, str], doc("versions and settings that the bytes depend on, by name")]
+    files: Annotated[dict[str, PackedFile], doc("all other files except SHA256SUMS, by path with slashes")]
 
 
 class PackReference(msgspec.Struct, frozen=True):
     """The pack of the references, as results name it."""
 
-    version: Annotated[str, _doc("version of mi_refract that wrote the pack")]
-    sha256: Annotated[Digest, _doc(f"SHA-256 of the pack's {INDEX}, which contains that of every file")]
-    path: Annotated[str, _doc("path of the references in the pack")]
+    version: Annotated[str, doc("version of mi_refract that wrote the pack")]
+    sha256: Annotated[Digest, doc(f"SHA-256 of the pack's {INDEX}, which contains that of every file")]
+    path: Annotated[str, doc("path of the references in the pack")]
 
 
 class Origin(msgspec.Struct, frozen=True, kw_only=True):
     """The origin of a file of results, so that a published result can be repeated."""
 
-    version: Annotated[str, _doc("version of mi_refract that wrote this")]
-    command: Annotated[str, _doc("the command line that wrote this")]
-    pack: Annotated[PackReference | None, _doc("the pack that contains the references; null: none")]
+    version: Annotated[str, doc("version of mi_refract that wrote this")]
+    command: Annotated[str, doc("the command line that wrote this")]
+    pack: Annotated[PackReference | None, doc("the pack that contains the references; null: none")]
 
 
 def origin(words: Sequence[str], pack: PackReference | None) -> Origin:
@@ -95,7 +91,14 @@ def of_references(reference: Path, answers: Path | None = None) -> PackReference
     if not path.is_file():
         raise ValueError(f"{path}: missing, or not a file; {EXPECTED}")
     text = safe_files.read_bytes(path, MOST)
-    index = _parsed(text, path)
+    try:
+        data = json.loads(text)
+    except (ValueError, RecursionError):
+        raise ValueError(f"{path}: damaged: not JSON; {EXPECTED}") from None
+    format_name = data.get("format") if isinstance(data, dict) else None
+    if format_name != FORMAT:
+        raise ValueError(f"{path}: a pack of another version: format {str(format_name)[:60]!r}; expected {FORMAT!r}")
+    index = convert(data, PackIndex, str(path))
     for name, file in index.files.items():
         if not (root / name).is_file():
             raise ValueError(f"{root / name}: missing, or not a file; {EXPECTED}")
@@ -121,14 +124,3 @@ def _is_pack(folder: Path) -> bool:
         return False
     with (folder / SUMS).open("rb") as file:
         return INDEX.encode() in file.read(MOST)
-
-
-def _parsed(text: bytes, path: Path) -> PackIndex:
-    try:
-        data = json.loads(text)
-    except (ValueError, RecursionError):
-        raise ValueError(f"{path}: damaged: not JSON; {EXPECTED}") from None
-    format_name = data.get("format") if isinstance(data, dict) else None
-    if format_name != FORMAT:
-        raise ValueError(f"{path}: a pack of another version: format {str(format_name)[:60]!r}; expected {FORMAT!r}")
-    return convert(data, PackIndex, str(path))

@@ -71,7 +71,7 @@ def convert(value: Any, kind: type[T], where: str, *, infinite: bool = False) ->
         message = f"{message[0].lower()}{message[1:]}".replace("object contains unknown field", "unknown key")
         message = message.replace(r"matching regex '\\S'", "that is not blank").replace(" | null`", "`")
         if message.startswith("expected "):
-            message = re.sub(_TYPES, _in_words, message)
+            message = re.sub(_TYPES, lambda x: " or ".join(_WORDS_OF_TYPES[n] for n in x[1].split(" | ")), message)
             message = re.sub(r"(.*), got (\D+)", r"\2; \1", message)
             message = re.sub(r"^(a table .*a list \[ … \])", r"\1 of tables, [[…]] in TOML", message)
         if missing := re.fullmatch(r"object missing required field `(\w+)`", message):
@@ -80,11 +80,6 @@ def convert(value: Any, kind: type[T], where: str, *, infinite: bool = False) ->
             names = _accepted_names(kind, value, path)
             message += f"; expected {', '.join(names)}" if names else ""
         raise ValueError(" ".join(f"{where}: {f'{key}: ' if key else ''}{message}".split())) from None
-
-
-def _in_words(types: re.Match[str]) -> str:
-    """Return the types of a message of msgspec in words: "a number or text" for `float | str`."""
-    return " or ".join(_WORDS_OF_TYPES[name] for name in types[1].split(" | "))
 
 
 def _accepted_names(kind: Any, value: Any, path: str) -> list[str]:
