@@ -141,7 +141,8 @@ def render(
     text += f", {header['mi_refract:render_seconds']:.2f} s"
     if error is not None and math.isfinite(error.value):
         text += f", relative error {shown_error(error)}"
-    print(printable(text if rendering.has_all_samples else f"{text}; ended by {rendering.ended_by}"))
+    has_all_samples = rendering.progress.done == rendering.spp
+    print(printable(text if has_all_samples else f"{text}; ended by {rendering.ended_by}"))
     if bad := header["mi_refract:nonfinite_pixels"]:
         print(printable(f"mi-refract: {output}: {bad} pixels are not finite"), file=sys.stderr)
     if variant is None and not backend.llvm().usable:

@@ -124,9 +124,11 @@ def aligned(reference: Image, test: Image) -> tuple[Pixels, Pixels]:
     ValueError if they differ in size, in names of channels, or in the position, aspect ratio or orientation of pixels
     by their headers.
     """
+    ratios = [image.metadata.get("PixelAspectRatio", 1.0) for image in (reference, test)]
+    same_ratio = all(isinstance(x, float | int) for x in ratios) and math.isclose(*ratios, rel_tol=ASPECT)
     for name, text_of in HEADER.items():
         expected, actual = text_of(reference), text_of(test)
-        if expected != actual and not (name == "pixel aspect ratio" and _same_aspect(reference, test)):
+        if expected != actual and not (name == "pixel aspect ratio" and same_ratio):
             hint = "; or `channels`: those to compare" if name == "channels" else ""
             raise ValueError(f"{test.path}: {name} {actual}; expected {expected}, as in {reference.path}{hint}")
     same_order = reference.channels == test.channels
@@ -221,11 +223,6 @@ def place(values: NDArray[np.bool_] | Pixels, image: Image) -> str:
     """Return the pixel and channel of the largest of the `values`, H × W × C: "x = 3, y = 5, channel R"."""
     y, x, c = np.unravel_index(int(values.argmax()), values.shape)
     return f"x = {x + image.origin[0]}, y = {y + image.origin[1]}, channel {image.channels[c]}"
-
-
-def _same_aspect(*images: Image) -> bool:
-    ratios = [image.metadata.get("PixelAspectRatio", 1.0) for image in images]
-    return all(isinstance(ratio, float | int) for ratio in ratios) and math.isclose(*ratios, rel_tol=ASPECT)
 
 
 def _located(image: Image, values: Pixels, marked: NDArray[np.bool_]) -> str:

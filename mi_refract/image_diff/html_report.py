@@ -29,6 +29,7 @@ from mi_refract.report.documents import rendered
 from mi_refract.report.embedded_images import EmbeddedImages, encoded, strongest
 
 from . import flip
+from .name_patterns import literal
 from .results import FAILED, Result, Results, Status
 from .text_reports import WORDS, sentence
 
@@ -110,8 +111,8 @@ class Page:
         has_names = results.test.is_dir() and not results.renders
         flags_of_rest = [*results.flags, "--report", "rest.html"]
         # Results without images, such as invalid settings, and names with control characters are left out.
-        named = [results.word(x.name) for x in rest if (x.reference or x.test) and printable(x.name) == x.name][:NAMED]
-        content = {
+        named = [literal(x.name) for x in rest if (x.reference or x.test) and printable(x.name) == x.name][:NAMED]
+        content: dict[str, Any] = {
             "title": "mi-refract diff",
             "sentence": sentence(results),
             "state": {0: "pass", 3: "empty"}.get(results.exit_code, "fail"),
@@ -125,11 +126,28 @@ class Page:
         }
         articles, lines = ARTICLES, LINES
         while True:
-            text = rendered("diff.html.j2", content | _limited(failures, equal, articles, lines), images)
-            if len(text) <= LIMIT or not lines:
+            further = failures[articles:]
+            dropped, dropped_equal = max(len(further) - lines, 0), max(len(equal) - lines, 0)
+            without_images = sum(entry["note"] == FULL for entry in failures[:articles])
+            left_out = {
+                f"images of {without_images} of {len(failures)} failures": without_images,
+                f"details of {len(further) - dropped} failures": len(further) - dropped,
+                f"{dropped} failures": dropped,
+                f"{dropped_equal} equal images": dropped_equal,
+            }
+            content |= {
+                "failures": failures[:articles],
+                "further": further[:lines],
+                "more_failures": dropped,
+                "equal": equal[:lines],
+                "more_equal": dropped_equal,
+                "left_out": [text for text, count in left_out.items() if count],
+            }
+            page = rendered("diff.html.j2", content, images)
+            if len(page) <= LIMIT or not lines:
                 break
             articles, lines = articles // 2, lines // 2
-        write_atomically(self.path, text)
+        write_atomically(self.path, page)
 
 
 def write(path: str | Path, results: Results, context: Mapping[str, Any] | None = None, replay: str = "") -> None:
@@ -138,27 +156,6 @@ def write(path: str | Path, results: Results, context: Mapping[str, Any] | None 
     for result in results.of(*FAILED):
         page.view(result, results)
     page.write(results, context or {}, replay)
-
-
-def _limited(failures: list[dict[str, Any]], equal: list[dict[str, Any]], articles: int, lines: int) -> dict[str, Any]:
-    """Return the content of the page with at most so many articles and lines, and what is left out."""
-    further = failures[articles:]
-    dropped, dropped_equal = max(len(further) - lines, 0), max(len(equal) - lines, 0)
-    without_images = sum(entry["note"] == FULL for entry in failures[:articles])
-    left_out = {
-        f"images of {without_images} of {len(failures)} failures": without_images,
-        f"details of {len(further) - dropped} failures": len(further) - dropped,
-        f"{dropped} failures": dropped,
-        f"{dropped_equal} equal images": dropped_equal,
-    }
-    return {
-        "failures": failures[:articles],
-        "further": further[:lines],
-        "more_failures": dropped,
-        "equal": equal[:lines],
-        "more_equal": dropped_equal,
-        "left_out": [text for text, count in left_out.items() if count],
-    }
 
 
 def item(
@@ -185,7 +182,7 @@ def item(
         "warning": result.warning,
         "metrics": metrics,
         "text": " ".join((result.name, result.status, result.category, why)).lower(),
-        "word": shlex.quote(results.word(result.name)) if result.test is not None and result.status in FAILED else "",
+        "word": shlex.quote(literal(result.name)) if result.test is not None and result.status in FAILED else "",
         "minimum_detectable": detectable if math.isfinite(detectable) else None,
         "panes": [images.add(pane) for pane in shown.panes] if images else [],
         "paired": len({(pane["width"], pane["height"]) for pane in shown.panes[:2]}) == 1 and len(shown.panes) > 1,

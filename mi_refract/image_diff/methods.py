@@ -106,15 +106,11 @@ class Method:
         }
 
 
-def _whole(image: Image, options: Options) -> tuple[tuple[Image, Options]]:
-    """Return the image alone: the share of pixels that may differ is one of all pixels, not of a part of them."""
-    return ((image, options),)
-
-
 METHODS = {
     "exact": Method(pixelwise.exact),
     "tolerance": Method(pixelwise.tolerance, pixelwise.tolerance_views, pixelwise.tolerance_accepts),
-    "paired": Method(pixelwise.paired, _whole, pixelwise.paired_accepts),
+    # Whole images only: the share of pixels that may differ is one of all pixels.
+    "paired": Method(pixelwise.paired, lambda image, options: [(image, options)], pixelwise.paired_accepts),
     "welch": Method(welch.compare_renders, takes_renders=True),
     "flip": Method(flip.flip, flip.views, looks_at=flip.looks_at),
 }

@@ -351,11 +351,6 @@ class LongRender:
         """The light that the scene's integrator misses, by class of paths: `missing_light` in one line; "" for none."""
         return "; ".join(f"{path_class}: {text}" for path_class, text in missing_light(self.scene).items())
 
-    @property
-    def has_all_samples(self) -> bool:
-        """Whether the image has the requested number of samples per pixel."""
-        return self.progress.done == self.spp
-
     def error(self) -> RelativeError | None:
         """Return the present error; None before the first pass."""
         sums = self.progress.sums()

@@ -131,18 +131,14 @@ def by_study(rows: Iterable[Row]) -> dict[str, list[Row]]:
     return studies
 
 
-def as_json(rows: Iterable[Row]) -> str:
-    """Return the rows as strict JSON, a list. Errors: TypeError for a value that JSON cannot represent."""
-    return json.dumps(strict([row.as_dict() for row in rows]), indent=1, allow_nan=False)
+def strict_json(document: object) -> str:
+    """Return the document as JSON; NaN and infinities become strings. TypeError for what JSON cannot represent."""
+    return json.dumps(strict(document), indent=1, allow_nan=False)
 
 
 def write_strict_json(path: str | Path, document: object) -> None:
-    """Write the document as JSON; NaN and infinities become strings.
-
-    Errors: TypeError for a value that JSON cannot represent; OSError.
-    """
-    text = json.dumps(strict(document), indent=1, allow_nan=False)
-    write_atomically(path, text + "\n")
+    """Write `strict_json` of the document. Errors: those of `strict_json`; OSError."""
+    write_atomically(path, strict_json(document) + "\n")
 
 
 def strict(value: object) -> Any:

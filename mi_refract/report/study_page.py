@@ -26,7 +26,7 @@ from mi_refract.io.text import beside_bound, compact
 
 from .embedded_images import EmbeddedImages, packed
 from .plots import Axes, Points, Scatter, curves_svg, drawable, scatter_svg
-from .row import Row, as_json, by_study
+from .row import Row, by_study, strict_json
 
 CONTROLS = ("first_page", "title", "studies", "scatter", "replay")  # entries of the context
 ROLES = ("reference", "test", "overlay", "difference")
@@ -215,7 +215,7 @@ def _study(name: str, rows: list[Row], context: Mapping[str, Any], images: Embed
         "scale": scale,
         "panels": _panels(rows, metrics, scale),
         "missing": not_run(rows),
-        "data": packed(as_json(rows)),
+        "data": packed(strict_json([row.as_dict() for row in rows])),
         "count": len(rows),
         "scatters": [scatter for scatter in scatters if scatter],
         "plots": plots,
