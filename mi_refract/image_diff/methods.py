@@ -228,14 +228,13 @@ def _compare(
                 return result.but(Verdict.INCONCLUSIVE, doubt)
     elif not single:
         raise ValueError(f"{method}: {len(sides[0])} and {len(sides[1])} images; expected one per side")
+    elif reason := preconditions(one, two, allow_nonfinite):
+        result = nonfinite_result(method, reason, *aligned(one, two))
     else:
-        if reason := preconditions(one, two, allow_nonfinite):
-            result = nonfinite_result(method, reason, *aligned(one, two))
-        else:
-            result = _compare_by_steps(method, one, two, options)
-            may_be_noise = method in NOT_FOR_NOISE and result.verdict is Verdict.DIFFERENT
-            if may_be_noise and pixel_statistics.differ_like_noise(*(x.pixels for x in _finite_pair(one, two))):
-                result = replace(result, reason=f"{result.reason}; {OTHER_NOISE}")
+        result = _compare_by_steps(method, one, two, options)
+        may_be_noise = method in NOT_FOR_NOISE and result.verdict is Verdict.DIFFERENT
+        if may_be_noise and pixel_statistics.differ_like_noise(*(x.pixels for x in _finite_pair(one, two))):
+            result = replace(result, reason=f"{result.reason}; {OTHER_NOISE}")
     is_finite = np.isfinite(means[0][0].pixels)
     if not result.is_equal or is_finite.all():
         return result

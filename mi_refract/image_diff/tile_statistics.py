@@ -415,11 +415,6 @@ def median_nonblack(sizes: Array) -> Array:
 # All tests of an image -----------------------------------------------------------------------------------------
 
 
-def sidak(family_error: float, count: int) -> float:
-    """Return the p at which one of `count` tests is an alarm (Šidák 1967): 1 − (1 − family_error)^(1/count)."""
-    return float(-np.expm1(np.log1p(-family_error) / max(count, 1)))
-
-
 class Alarms(NamedTuple):
     """Numbers of tests that differ.
 
@@ -457,8 +452,8 @@ class TileTests:
 
     @cached_property
     def threshold(self) -> float:
-        """The p at or below which a test is an alarm."""
-        return sidak(self.family_error, self.p.size)
+        """The p at or below which a test is an alarm: 1 − (1 − family_error)^(1/N) for N tests (Šidák 1967)."""
+        return float(-np.expm1(np.log1p(-self.family_error) / max(self.p.size, 1)))
 
     @cached_property
     def _flags(self) -> list[dict[str, Flags]]:

@@ -35,10 +35,10 @@ class EmbeddedImages:
         """
         if path not in self._files:
             image = read(self.folder / path)
-            pixels = shown(image.pixels, image.channels)[0]
-            if pixels is None:
+            is_rgb = {*"RGB"} <= {*image.channels}
+            if not is_rgb and len(image.channels) != 1:
                 raise ValueError(f"{image.path}: neither RGB nor gray, but channels {', '.join(image.channels)}")
-            self._files[path] = self.add(encoded(pixels))
+            self._files[path] = self.add(encoded(image.select("RGB") if is_rgb else image.pixels))
         return self._files[path]
 
     def add(self, image: dict[str, Any]) -> dict[str, Any]:
@@ -73,13 +73,6 @@ def encoded(pixels: Pixels, limit: float = np.inf, scale: float = 1.0) -> dict[s
 def packed(text: str) -> str:
     """Return text as base64 of its deflated UTF-8, which the page's script decodes."""
     return base64.b64encode(zlib.compress(text.encode(), 9)).decode()
-
-
-def shown(pixels: Pixels, channels: tuple[str, ...]) -> tuple[Pixels | None, str]:
-    """Return the part of an image that a page can show, RGB or its only channel, and its name; else (None, "")."""
-    if {"R", "G", "B"} <= set(channels):
-        return pixels[..., [channels.index(name) for name in "RGB"]], "RGB"
-    return (pixels, channels[0]) if len(channels) == 1 else (None, "")
 
 
 def strongest(values: Pixels, width: int) -> Pixels:
