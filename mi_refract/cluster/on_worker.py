@@ -61,7 +61,7 @@ def vector_width() -> str:
 def our_version() -> str:
     """Return this package's version, with a short hash of the names and contents of its source and glass files.
 
-    The hash tells two states of the source apart that have the same version.
+    The hash distinguishes states of the source that have the same version.
     """
     package, digest = Path(__file__).parents[1], hashlib.sha256()
     for path in sorted({*package.rglob("*.py"), *package.rglob("*.json")}):

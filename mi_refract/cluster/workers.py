@@ -133,7 +133,7 @@ def finished(client: Client, futures: Sequence[Future]) -> list[Future]:
 def fetched(client: Client, future: Future) -> tuple[Any, ...]:
     """Return (result,) of a future that is done, however long the transfer takes; () if its worker is lost meanwhile.
 
-    `future.result()` would wait until the task has run again, perhaps for workers that do not come back. Raises the
+    `future.result()` would wait until the task has run again, perhaps for workers that never return. Raises the
     task's own error, and the errors of `cluster_errors`.
     """
     with cluster_errors(client):
@@ -169,7 +169,7 @@ def results(
             workers.look()
             with cluster_errors(client):
                 for future, (index, arguments, allowed) in list(submitted.items()):
-                    # All allowed workers are lost: Dask would wait for them to come back.
+                    # All allowed workers are lost: Dask would wait for their return.
                     if workers.usable and allowed.isdisjoint(workers.usable) and not future.done():
                         del submitted[future]
                         client.cancel([future], force=True)

@@ -138,10 +138,7 @@ def moment_layer(image: Image) -> str:
 
 
 def _repeats(film: Pixels, nested: Pixels) -> bool:
-    """Return whether the film's colours (R, G, B or X, Y, Z or Y) equal X, Y, Z of `nested` except for rounding.
-
-    Pixels that are not finite in both images count as equal.
-    """
+    """Return whether the film's colours equal X, Y, Z of `nested`, except for rounding and pixels finite in neither."""
     nested = nested[..., 1:2] if film.shape[-1] == 1 else nested
     nonfinite = ~np.isfinite(film).all(-1, keepdims=True) & ~np.isfinite(nested).all(-1, keepdims=True)
     with np.errstate(invalid="ignore"):
@@ -300,10 +297,7 @@ def _whole(value: object) -> int:
 
 
 def _shared_factor(image: Image, of_passes: bool) -> float | None:
-    """Return `Estimate.shared` by the header; `of_passes`: the variance was estimated from passes.
-
-    Without filter in the header, pixels of passes may share samples, so it has to be estimated.
-    """
+    """Return `Estimate.shared` by the header; `of_passes`: the variance is that of passes, which may share samples."""
     radius, area = (
         float(text) if re.fullmatch(r"[0-9]{1,6}(\.[0-9]{1,20})?", text) else None
         for text in (str(image.metadata.get(name, "")) for name in (FILTER, AREA))

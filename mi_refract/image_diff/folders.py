@@ -173,7 +173,7 @@ def _compare_pair(result: Result, results: Results, *, keep: bool, digests: bool
             result = _judge(result, results.roots, read, functools.partial(image_file.read, digests=decoded))
             if decoded is not None:
                 result = replace(result, digests=_digests(result, results.roots, decoded))
-        except Exception as error:  # any error: the other pairs are compared all the same
+        except Exception as error:  # any error: the other pairs are still compared
             if safe_files.is_full_disk(error):  # the other pairs would fail, too
                 raise
             errors.print_traceback(error)

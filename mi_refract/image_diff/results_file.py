@@ -275,10 +275,7 @@ def read(path: str | Path, reference: Path | None = None, test: Path | None = No
 
 
 def _mapped_path(where: str, text: str, before: Path, now: Path) -> Path:
-    """Return the path in the folder `now` instead of `before`.
-
-    ValueError if it leads out of the folder, by `..` or by a link to a folder.
-    """
+    """Return the path in the folder `now` instead of `before`. ValueError if `..` or a link leads out of the folder."""
     path = Path(text)
     moved = now / path.relative_to(before) if path.is_relative_to(before) else None
     if moved is None or not (moved == now or pairing.is_inside(moved, now)):

@@ -155,18 +155,13 @@ def compare_renders(
 def _checked_counts(
     reference: Sequence[Image], test: Sequence[Image], spp: tuple[int, int]
 ) -> tuple[tuple[int, int], str]:
-    """Return the samples per pixel of all renders of each side, or else the number of renders, and the unit.
-
-    ValueError for fewer than 2 renders a side; for two renders of a scene by `mi-refract render` with one seed, which
-    share samples; and unless a mask leaves pixels out, for the same render twice: the measured noise would be too
-    small.
-    """
+    """Return the samples per pixel of all renders of each side, or else the number of renders, and the unit."""
     if min(len(reference), len(test)) < 2:
         raise ValueError(
             f"welch: {len(reference)} and {len(test)} renders; expected at least 2 per side, or one per side "
             "with its variance, in channels such as m2_R or R.variance, or in a file (`variance`)"
         )
-    for side in (reference, test):
+    for side in (reference, test):  # the measured noise of renders that share samples would be too small
         if _all_identical(side):  # renders without noise may be the same
             continue
         drawn = dict[str, Image]()

@@ -112,10 +112,7 @@ def _tabulated(kind: str, rows: Sequence[Sequence[float]]) -> Medium:
 
 
 def _refractiveindex_info(text: str) -> Medium:
-    """A medium from a page with formula 1, 2, 3, 5 or 6, or a table; of several entries the first with n.
-
-    The formulas are defined on refractiveindex.info in "Dispersion formulas".
-    """
+    """A medium from a page with formula 1, 2, 3, 5 or 6 of its "Dispersion formulas", or a table; the first with n."""
     try:
         import yaml
     except ModuleNotFoundError:

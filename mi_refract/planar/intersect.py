@@ -1,7 +1,7 @@
 """Intersect a ray in the plane with directed segments and arcs of conics: first by signs, then by distances. No optics.
 
-For a ray p + λd, f(V) = d × (V − p) tells on which side of the ray a vertex V lies; 0 counts as its left. If the ends A
-and B of a segment lie on different sides, the ray's line crosses the segment once, at μ = f(A)/(f(A) − f(B)) and
+For a ray p + λd, f(V) = d × (V − p) gives the side of the ray on which a vertex V lies; 0 counts as its left. If the
+ends A and B of a segment lie on different sides, the ray's line crosses the segment once, at μ = f(A)/(f(A) − f(B)) and
 
     λ = ((A − p) × (B − A)) / (d × (B − A))
 
@@ -28,10 +28,10 @@ from mi_refract.numerics import Mask, Number, ieee_divide
 from .array_backend import ArrayBackend, Index, Vector2, Vertices, negated
 from .segments import Segments
 
-NOWHERE = 0xFFFFFFFF  # stands for "no segment"
+NOWHERE = 0xFFFFFFFF  # no segment
 # For a ray that starts on a segment: least distance of the segment's ends from the ray, in units of its length.
 SIGN = 1e-22
-UNKNOWN = NOWHERE - 2  # numbers from here on stand for "no vertex"
+UNKNOWN = NOWHERE - 2  # numbers from here on are no vertex
 Root = tuple[Number, Number]  # s and r, up to a common factor
 Three = tuple[Any, Any, Any]  # for the start, the control point and the end
 Ends = tuple[Index, Index, Vector2, Vector2, Number]  # the last five fields of `Hit`

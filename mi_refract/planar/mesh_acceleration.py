@@ -183,10 +183,7 @@ class MeshAcceleration:
 
 
 def _stroke_scene(variant_name: str, a: Array, b: Array, vertices: Vertices) -> Any:
-    """A Mitsuba scene with one triangle per stroke, which cuts the plane z = 0 along the stroke.
-
-    First come the strokes of the segments from `a` to `b` (M × 2), then those of the vertices.
-    """
+    """A Mitsuba scene of a triangle per stroke, first of the segments from `a` to `b` (M × 2), then of the vertices."""
     import mitsuba as mi
 
     e = b - a

@@ -296,10 +296,7 @@ def _mirrored(d: Vector2, line: Vector2) -> Vector2:
 
 
 def _power_shares(d: Vector2, line: Vector2, k: Number, through: Mask) -> Vector2:
-    """The shares of the s and p waves that the ray carries on: Fresnel's T where it is refracted, R otherwise.
-
-    In a plane, no boundary turns one wave into the other.
-    """
+    """The shares of the s and p waves that the ray carries on: Fresnel's T where it is refracted, R otherwise."""
     cos_i = dr.minimum(dr.abs(cross(line, d)), 1)
     cos_t, transmitted = fresnel.refracted_cosine(cos_i, k)
     t_s, t_p, _ = fresnel.transmitted_powers(cos_i, cos_t, transmitted, k)

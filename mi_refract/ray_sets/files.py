@@ -222,11 +222,7 @@ class Table(NamedTuple):
 
 
 def _read(path: Path, layouts: Sequence[Layout], most: int, convert: Callable[[Table], T]) -> T:
-    """The result of `convert` for the table in a file, which must have one of the layouts and at most `most` rows.
-
-    ValueError, one line that begins with the path, for another format or an invalid table. OSError if the file cannot
-    be read.
-    """
+    """The result of `convert` for the table in a file, which must have one of the layouts and at most `most` rows."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise ValueError(f"{path}: expected a file name that ends in {' or '.join(SUFFIXES)}")
@@ -248,11 +244,7 @@ class _TooLongError(ValueError):
 
 
 def _read_csv(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
-    """The table in CSV text, whose column names must be one of the layouts, in order.
-
-    ValueError, one line, for bytes that are not text, other columns, a row that is too short, too long, or not numbers,
-    or more than `most` rows.
-    """
+    """The table in CSV text of at most `most` rows, whose column names must be one of the layouts, in order."""
     number, line, rows_left = 0, "", most + 1  # one more for the row of column names
 
     def lines(text: io.TextIOWrapper) -> Iterator[str]:
@@ -304,10 +296,7 @@ def _value(text: Any) -> Any:
 
 
 def _read_npz(stream: BinaryIO, layouts: Sequence[Layout], most: int) -> Table:
-    """The table in an archive, in the largest layout that it contains; no other array is unpacked.
-
-    ValueError, one line, for an invalid archive, and for arrays that are too large, before they are unpacked.
-    """
+    """The table in an archive, in its largest layout; no other array, and none that is too large, is unpacked."""
 
     def array_name(column: str) -> str:
         return column[0] if len(column) == 2 and column[1] in "xyz" else column

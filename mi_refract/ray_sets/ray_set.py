@@ -2,7 +2,7 @@
 
 A set contains one or several regimes of `mi_refract.regimes`, rounded to float32 or float64. The same regimes, count,
 precision and seed give the same set, bit for bit; in float64 only on processors with the same instructions, on which
-the last bit of NumPy's functions depends. The header's checksum tells sets apart. The ratio n_from / n_to is exact:
+the last bit of NumPy's functions depends. The header's checksum distinguishes sets. The ratio n_from / n_to is exact:
 n_to is a power of two, 1 if possible, and no index is below 1. So a program that divides them, in either precision,
 gets exactly the k of the ray. With media and wavelengths (see `header`), their ratios replace the regimes' own.
 """

@@ -127,10 +127,7 @@ def _weighted_sums(values: list[Number], position: Point2, film: Film) -> list[A
 
 @dr.syntax
 def _own_samples(values: list[Number], position: Point2, x: Number, y: Number, film: Film) -> list[list[Any]]:
-    """Return Σ w v by channel, and Σ w, over the samples of each pixel, with their weights in the pixels of a row.
-
-    `x`, `y`: of the pixel in the middle of the row.
-    """
+    """Return Σ w v by channel, and Σ w, over the samples of each pixel, with their weights in a row around x, y."""
     spp = dr.opaque(mi.UInt32, film.spp)
     first = dr.arange(mi.UInt32, film.width * film.height) * spp
     row = [[mi.Float64(0) for _ in range(len(values) + 1)] for _ in range(2 * film.reach + 1)]

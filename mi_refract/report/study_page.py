@@ -158,10 +158,7 @@ def phrase(row: Row, metric: str) -> str:
 
 
 def _shade(row: Row | None, metric: str, scale: tuple[float, float]) -> dict[str, Any]:
-    """Return a cell of the matrix: its number, its place on the logarithmic colour scale, its broken and missed bounds.
-
-    `beyond`: whether the number is larger than the end of the scale, or NaN.
-    """
+    """Return a cell of the matrix: number, place on the logarithmic colour scale, broken and missed bounds."""
     if row is None or not row.values:
         text, state, hint = ("not run", "not-run", row.reason) if row else ("·", "none", "")
         return {"text": text, "state": state, "depth": 0, "hint": hint, "broken": [], "beyond": False}
@@ -172,8 +169,8 @@ def _shade(row: Row | None, metric: str, scale: tuple[float, float]) -> dict[str
     return {
         "text": content["text"] if content else "·",
         "state": row.verdict,
-        "depth": round(place, 3) if value <= high else 1,  # also for NaN
-        "beyond": not value <= high,
+        "depth": round(place, 3) if value <= high else 1,
+        "beyond": not value <= high,  # also for NaN
         "hint": "\n".join(phrase(row, m) for m in row.values),
         "broken": [content["budget"] if content and m == metric else phrase(row, m) for m in exceeded],
     }

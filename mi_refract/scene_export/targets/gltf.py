@@ -141,10 +141,7 @@ def files(plain: PlainScene) -> Files:
 
 
 def _around_glass(plain: PlainScene, mesh: Mesh, outside: float) -> Mesh:
-    """Return the mesh; glass is turned so that its normals point out of the glass, into the outermost medium.
-
-    ExportError for a material that glTF cannot hold.
-    """
+    """Return the mesh; glass is turned so that its normals point out of the glass, into the outermost medium."""
     material, place = mesh.material, f"{plain.name}: {mesh.name}"
     if isinstance(material, Diffuse) and max(material.reflectance) > 1:
         raise ExportError(f"{place}: reflectance = {material.reflectance}; expected at most 1 in glTF")
