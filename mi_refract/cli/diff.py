@@ -202,9 +202,8 @@ def accept(
             results = folders.diff(reference, test, resolved, names=names or [], to_accept=True, progress=progress)
         text_reports.print_results(results)
     if reference_pack.of_references(results.reference):
-        raise ValueError(
-            f"{results.reference}: in a reference pack, which stays as published; expected your own references"
-        )
+        text = f"{results.reference}: in a reference pack, which stays as published"
+        raise ValueError(f"{text}; expected your own references")
     try:
         copies = list(accepting.changes(results, as_variant))
     except accepting.UnreadableImage as error:

@@ -120,9 +120,8 @@ def parse_share(text: str, option: str) -> float:
     except ValueError:
         value = 0.0
     if not 0 < value <= (1 if percent else PLAIN):
-        raise ValueError(
-            f"{option} {text}; expected more than 0 %, up to 100 %, such as 1% or 0.01 (up to {PLAIN} without %)"
-        )
+        expected = f"expected more than 0 %, up to 100 %, such as 1% or 0.01 (up to {PLAIN} without %)"
+        raise ValueError(f"{option} {text}; {expected}")
     return value
 
 

@@ -75,9 +75,8 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
         if decoded[result.test] != compared:
             raise _changed_error(result.test)
         if not result.how.options.get("allow_nonfinite") and not all(np.isfinite(x.pixels).all() for x in images):
-            raise ValueError(
-                f"{result.test}: values that are not finite; to accept them, compare with --set allow_nonfinite=true"
-            )
+            advice = "to accept them, compare with --set allow_nonfinite=true"
+            raise ValueError(f"{result.test}: values that are not finite; {advice}")
         if target.suffix.lower() != result.test.suffix.lower():
             raise ValueError(f"{target}: expected a name that ends in {result.test.suffix}, as {result.test} does")
         copies = [Copy(result.test, target, compared, result.digests.get(target, ""))]
@@ -87,9 +86,8 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
             if source.exists():
                 copies.insert(0, Copy(source, old, result.digests.get(source, ""), result.digests.get(old, "")))
             elif old.exists():
-                raise ValueError(
-                    f"{source}: no such file, and {old} belongs to a different render; expected a variance"
-                )
+                text = f"{source}: no such file, and {old} belongs to a different render"
+                raise ValueError(f"{text}; expected a variance")
         for copy in copies:
             for path, root in zip((copy.reference, copy.new), results.roots, strict=True):
                 if not pairing.is_inside(path, root):

@@ -256,9 +256,8 @@ def _estimate(image: Image, side: str, spp: int) -> Estimate:
             continue
         unknown = ~np.isfinite(v)
         if (wrong := unknown & np.isfinite(m)).any():
-            raise ValueError(
-                f"{image.path}: its variance of {name} is not finite {_first(image, wrong)}; expected finite values"
-            )
+            text = f"{image.path}: its variance of {name} is not finite {_first(image, wrong)}"
+            raise ValueError(f"{text}; expected finite values")
         variance[..., i] = np.where(unknown, 0, np.maximum(v, 0))
     freedom = spp - 1
     if FREEDOM in image.metadata and (image.variances or pairs):
@@ -277,9 +276,8 @@ def samples(image: Image, side: str, spp: int, least: int = 2) -> int:
     if count < least:
         where = "" if spp else " in its header"
         text = "none" if value is None else f"{value!r:.60}"
-        raise ValueError(
-            f"{image.path}: samples per pixel{where}: {text}; expected `spp` or `spp_{side}`, {least} to 10¹⁵"
-        )
+        expected = f"expected `spp` or `spp_{side}`, {least} to 10¹⁵"
+        raise ValueError(f"{image.path}: samples per pixel{where}: {text}; {expected}")
     return count
 
 

@@ -69,9 +69,8 @@ def diff(
         how = replace(replace(settings, above=settings.above.parent).of(name), above=settings.above)
         all_pairs = [Result(name, Status.DIFFERENT, reference, test, how, target=reference)]
     else:
-        raise NotADirectoryError(
-            f"{test if reference.is_dir() else reference}: not a folder; --renders expects folders"
-        )
+        file = test if reference.is_dir() else reference
+        raise NotADirectoryError(f"{file}: not a folder; --renders expects folders")
     unused: list[str] = []
     pairs = pairing.named(all_pairs, names)
     if test.is_dir() and not renders:

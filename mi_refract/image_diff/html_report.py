@@ -178,7 +178,7 @@ def item(
         "category": str(result.category),
         "method": comparison.method_in_words if comparison else "",
         "reason": result.reason,
-        "asked": result.how.reason,
+        "settings_reason": result.how.reason,
         "warning": result.warning,
         "metrics": metrics,
         "text": " ".join((result.name, result.status, result.category, why)).lower(),

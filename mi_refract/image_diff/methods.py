@@ -220,9 +220,8 @@ def _compare(
     if takes_renders:
         result = function(*compared, allow_nonfinite=allow_nonfinite, **options)
         if single and result.is_equal and (untested := channels.untested(one, two)):
-            by_tolerance = compare(
-                AUTO, *untested, allow_nonfinite=allow_nonfinite, ignore_metadata=["*"], **all_options
-            )
+            more: Options = {"allow_nonfinite": allow_nonfinite, "ignore_metadata": ["*"], **all_options}
+            by_tolerance = compare(AUTO, *untested, **more)
             if not by_tolerance.is_equal:
                 doubt = f"not tested, without variance: {', '.join(untested[0].channels)}: {by_tolerance.reason}"
                 return result.but(Verdict.INCONCLUSIVE, doubt)
@@ -300,15 +299,11 @@ def _compare_by_steps(method: str, a: Image, b: Image, options: Options) -> Comp
             result = comparison
             continue
         listed = ", ".join(names)
-        metrics = [replace(m, name=f"{m.name}, in {listed}") for m in comparison.metrics if m.bound is not None]
-        maps = {f"{name} of {listed}": values for name, values in comparison.maps.items() if name == by}
-        result = replace(
-            result,
-            verdict=min(result.verdict, comparison.verdict, key=[*Verdict].index),
-            reason=f"{result.reason}; by {by} {listed}: {comparison.reason}",
-            metrics=(*result.metrics, *metrics),
-            maps=result.maps | maps,
-        )
+        bounded = [replace(m, name=f"{m.name}, in {listed}") for m in comparison.metrics if m.bound is not None]
+        maps = result.maps | {f"{name} of {listed}": x for name, x in comparison.maps.items() if name == by}
+        verdict = min(result.verdict, comparison.verdict, key=[*Verdict].index)
+        reason = f"{result.reason}; by {by} {listed}: {comparison.reason}"
+        result = replace(result, verdict=verdict, reason=reason, metrics=(*result.metrics, *bounded), maps=maps)
     assert result is not None  # an image has channels
     return result
 

@@ -134,9 +134,8 @@ def named(items: Sequence[Result], patterns: Sequence[str]) -> list[Result]:
         is_name = pattern in names and "\\" not in pattern
         matched = {pattern} if is_name else {name for name in names if name_patterns.matches(pattern, name)}
         if not matched:
-            raise ValueError(
-                f"{pattern}: matches no image; expected the path of an image in its folder (wildcards: * and ?)"
-            )
+            expected = "expected the path of an image in its folder (wildcards: * and ?)"
+            raise ValueError(f"{pattern}: matches no image; {expected}")
         chosen |= matched
     return [item for item in items if not patterns or item.name in chosen]
 
@@ -252,10 +251,8 @@ def variant(target: Path, how: ComparisonSpec, name: str) -> Path:
     for template in with_name + with_star:
         fields = {**name_patterns.fields(target.name), **how.fields, "*": name}
         return target.parent / name_patterns.filled(template.replace("*", "{*}"), fields)
-    raise ValueError(
-        f"{target}: no template in `accept` contains {name} or exactly one *; add to [defaults] in mi-refract.toml: "
-        f'accept = ["{{stem}}-{name}{{suffix}}"]'
-    )
+    advice = f'add to [defaults] in mi-refract.toml: accept = ["{{stem}}-{name}{{suffix}}"]'
+    raise ValueError(f"{target}: no template in `accept` contains {name} or exactly one *; {advice}")
 
 
 def is_inside(path: Path, folder: Path) -> bool:

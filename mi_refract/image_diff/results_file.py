@@ -294,8 +294,7 @@ def with_settings(results: Results, settings: Settings) -> Results:
         target = result.target.relative_to(results.reference) if inside else Path()
         how = pairing.how_of(settings, result.name, target)
         if result.status in FAILED and (result.how.variance or how.variance):
-            raise ValueError(
-                f"{result.name}: `variance` is set, and the JSON has no digest of such files; accept it without --from"
-            )
+            text = f"{result.name}: `variance` is set, and the JSON has no digest of such files"
+            raise ValueError(f"{text}; accept it without --from")
         updated.append(replace(result, how=replace(how, options=result.how.options)))
     return replace(results, results=tuple(updated))

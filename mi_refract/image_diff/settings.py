@@ -45,6 +45,7 @@ COMMON_OPTIONS = frozenset(("allow_nonfinite", "ignore_metadata"))  # options of
 Text = Annotated[str, Meta(min_length=1)]
 Length = Annotated[int, Meta(ge=1)]
 Rectangle = tuple[int, int, Length, Length]  # x, y, width and height in pixels, with x and y as in messages
+Rectangles = Annotated[tuple[Rectangle, ...], Meta(min_length=1)]
 
 
 # Layers -------------------------------------------------------------------------------------------------------------
@@ -161,11 +162,8 @@ class Settings:
             for key, value in layer.values.items():
                 other = first_tables.setdefault((layer.pattern, key), layer)
                 if layer.pattern and key != "reason" and other.values[key] != value:
-                    return replace(
-                        spec,
-                        error=f"{layer.where}: {key}: {value!r}, but {other.values[key]!r} in {other.where} for the "
-                        f"same name {layer.pattern!r}; expected one of them",
-                    )
+                    error = f"{layer.where}: {key}: {value!r}, but {other.values[key]!r} in {other.where} for the same"
+                    return replace(spec, error=f"{error} name {layer.pattern!r}; expected one of them")
                 set_by[key] = layer.where
             method = layer.values.get("method", merged["method"])
             if method != merged["method"]:
@@ -232,11 +230,7 @@ class Keys(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
             "alpha not counted; {root}: the top folder"
         ),
     ] = None
-    ignore: Annotated[
-        tuple[Rectangle, ...],
-        Meta(min_length=1),
-        doc("rectangles of pixels that are not compared: x, y, width, height"),
-    ] = ()
+    ignore: Annotated[Rectangles, doc("rectangles of pixels that are not compared: x, y, width, height")] = ()
     variance: Annotated[
         str | None,
         doc("an image with the variance of one sample of each pixel, beside the image of each side"),

@@ -161,22 +161,20 @@ def _checked_counts(
             f"welch: {len(reference)} and {len(test)} renders; expected at least 2 per side, or one per side "
             "with its variance, in channels such as m2_R or R.variance, or in a file (`variance`)"
         )
+    expected = "expected independent renders with different seeds"
     for side in (reference, test):  # the measured noise of renders that share samples would be too small
         if _all_identical(side):  # renders without noise may be the same
             continue
         drawn = dict[str, Image]()
         for image in side:
             if (key := _drawn(image)) and (other := drawn.setdefault(key, image)) is not image:
-                expected = "expected independent renders with different seeds"
                 raise ValueError(f"{image.path}: the scene and the seed of {other.path}; {expected}")
         masked = side[0].mask is not None and not side[0].mask.all()
         if masked:
             continue  # what it leaves of other renders may be the same
         for a, b in itertools.combinations(side, 2):
             if _identical(a, b) and (a.pixels != a.pixels[0, 0]).any():  # black ones may be the same
-                raise ValueError(
-                    f"{b.path}: the same image as {a.path}; expected independent renders with different seeds"
-                )
+                raise ValueError(f"{b.path}: the same image as {a.path}; {expected}")
     sides = list(zip(("reference", "test"), spp, (reference, test), strict=True))
     if not all(count or SPP in image.metadata for _, count, side in sides for image in side):
         return (len(reference), len(test)), "renders"
@@ -255,10 +253,9 @@ def _verdict(tests: TileTests, resolution: float, hidden: float) -> tuple[Verdic
     if differing := ", ".join(f"{count} {name}" for name, count in counts.items() if count):
         return Verdict.DIFFERENT, f"{sum(counts.values())} of {tests.p.size} tests differ: {differing}"
     if silent or doubtful:
-        where = (
-            f"{silent} without noise, {doubtful} heavy-tailed, or with other noise than their pixels or renders show"
-        )
-        return Verdict.INCONCLUSIVE, f"only tiles that are unsuited to a t-test differ: {where}"
+        doubtful_ones = f"{doubtful} heavy-tailed, or with other noise than their pixels or renders show"
+        reason = f"only tiles that are unsuited to a t-test differ: {silent} without noise, {doubtful_ones}"
+        return Verdict.INCONCLUSIVE, reason
     if tests.levels[0].silent.all():
         return Verdict.EQUAL, "no noise, and no tile differs beyond the margin"
     visible, share = tests.minimum_detectable(), tests.hidden_share(resolution)

@@ -306,9 +306,8 @@ def _image(
     suffixes = dict(pair.split(":") for pair in oiio.get_string_attribute("extension_list").split(";") if pair)
     # The format "null" is always black.
     if path.suffix[1:].lower() not in suffixes.get(format_name, format_name).split(",") or format_name == "null":
-        raise ImageError(
-            f"{path}: holds an image of format {format_name}; expected the format that its file name indicates"
-        )
+        text = f"{path}: holds an image of format {format_name}"
+        raise ImageError(f"{text}; expected the format that its file name indicates")
     if spec.deep:
         raise ImageError(f"{path}: expected an image without deep samples")
     if min(spec.width, spec.height, spec.nchannels) < 1 or spec.depth > 1:
@@ -417,12 +416,9 @@ def srgb_decode(code: Pixels) -> Pixels:
 
 def any_channel(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return `flags.any(-1)`, for few channels ten times as fast: NumPy is slow for many short reductions."""
-    result: NDArray[np.bool_]
     if 0 < flags.shape[-1] <= FEW_CHANNELS:
-        result = functools.reduce(np.logical_or, np.moveaxis(flags, -1, 0))
-    else:
-        result = np.any(flags, -1)
-    return result
+        return np.asarray(functools.reduce(np.logical_or, np.moveaxis(flags, -1, 0)))
+    return np.asarray(np.any(flags, -1))
 
 
 def block_sum(pixels: Pixels, side: int) -> Pixels:

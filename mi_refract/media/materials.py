@@ -311,13 +311,11 @@ def _checked(medium: Medium, label: str) -> Medium:
         missing = np.isnan(n)
         if missing.any():
             at = visible[missing][0]
-            raise ValueError(
-                f"{label}: n is not positive at {at:.6g} nm; expected a positive index everywhere in 360 … 830 nm"
-            )
+            text = f"{label}: n is not positive at {at:.6g} nm"
+            raise ValueError(f"{text}; expected a positive index everywhere in 360 … 830 nm")
         large = n > LARGEST_N
         if large.any():
             at = f"n = {n[large][0]:g} at {visible[large][0]:.6g} nm"
-            raise ValueError(
-                f"{label}: {at}; expected up to {LARGEST_N:g} in 360 … 830 nm; coefficients in another unit?"
-            )
+            expected = f"expected up to {LARGEST_N:g} in 360 … 830 nm; coefficients in another unit?"
+            raise ValueError(f"{label}: {at}; {expected}")
     return medium

@@ -126,9 +126,8 @@ def linear_srgb(light: Light) -> Array:
     rgb: Array = (xyz * np.array(light.powers)[:, None]) @ matrix
     total = rgb.sum(0)
     if not total.any():
-        raise ValueError(
-            f"wavelengths: none of {', '.join(light.names[:3])} is visible; expected some from 360 to 830 nm"
-        )
+        text = f"wavelengths: none of {', '.join(light.names[:3])} is visible"
+        raise ValueError(f"{text}; expected some from 360 to 830 nm")
     largest = total.max()
     rgb /= total if total.min() > BALANCED * largest else largest
     return rgb

@@ -108,11 +108,8 @@ def predictions(rays: Rays, exact: oracle.Certified) -> Iterator[tuple[str, str,
         for vector, (read_a, read_n) in {"a": (a @ matrix.T, n), "n": (a, n @ matrix.T)}.items():
             # Programs differ if the normal is then on the other side.
             same_side = (read_a * read_n).sum(1, keepdims=True) * c > 0
-            yield (
-                "handedness",
-                f"{vector} was read as its {name}",
-                np.where(same_side, refract(read_a, read_n, k), np.nan),
-            )
+            misread = np.where(same_side, refract(read_a, read_n, k), np.nan)
+            yield "handedness", f"{vector} was read as its {name}", misread
 
     # The textbook formula, which is right for unit vectors only, with the vectors as they are in the rays.
     raw_a, raw_n = rays.a.astype(float), rays.n.astype(float)

@@ -57,8 +57,7 @@ class JudgedAnswers:
 
     def backward_within(self, most: float) -> Flags:
         """Whether the backward errors of the direction or decision and of the length are at most `most`, in u."""
-        within: Flags = np.maximum(self.backward, self.backward_length) <= most
-        return within
+        return np.asarray(np.maximum(self.backward, self.backward_length) <= most)
 
     @property
     def wrong(self) -> Flags:

@@ -247,9 +247,8 @@ class LongRender:
 
         with safe_files.held(lock_of(self.output), "a render", self.output, "another file"):
             if self._file_stamps() != self._files_before:
-                raise BlockingIOError(
-                    f"{self.output}: written by another render in the meantime; run the command again"
-                )
+                text = f"{self.output}: written by another render in the meantime"
+                raise BlockingIOError(f"{text}; run the command again")
             self.checkpoints.active = True
             try:
                 return self._run(passes or here, watch)

@@ -39,9 +39,8 @@ def scalar_seed_of(seed: int, number: int, width: int, height: int) -> int:
     pixels, in_blocks = width * height, -(-width // BLOCK) * -(-height // BLOCK) * BLOCK**2
     seeds, step = (MASK + 1) // pixels, -(-in_blocks // pixels)
     if number >= (most := seeds // step):
-        raise ValueError(
-            f"pass {number} of {pixels} pixels; scalar variants support up to {most}; use a larger --pass-spp"
-        )
+        text = f"pass {number} of {pixels} pixels; scalar variants support up to {most}"
+        raise ValueError(f"{text}; use a larger --pass-spp")
     return (_mix(seed) + number * step) % seeds
 
 

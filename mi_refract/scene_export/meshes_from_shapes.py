@@ -254,9 +254,8 @@ def _sigma(bsdf: Node, side: str) -> Colour:
         return BLACK
     transmittance, length = bsdf.colour(colour, None), bsdf.value(float, distance)
     if not all(0 < x <= 1 for x in transmittance) or length <= 0:
-        raise bsdf.error(
-            f"{colour} = {transmittance} after {distance} = {length}", "colours above 0 and up to 1, a length"
-        )
+        what = f"{colour} = {transmittance} after {distance} = {length}"
+        raise bsdf.error(what, "colours above 0 and up to 1, a length")
     r, g, b = (-math.log(x) / length for x in transmittance)
     return r, g, b
 

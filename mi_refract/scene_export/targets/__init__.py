@@ -68,9 +68,8 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
         *((mesh.name, mesh.vertices) for mesh in plain.meshes),
     ]:
         if (largest := float(np.abs(points).max(initial=0))) > bound:
-            raise ExportError(
-                f"{plain.name}: {name}: a coordinate of {largest:g}; expected up to {bound:g} for {target}"
-            )
+            text = f"{plain.name}: {name}: a coordinate of {largest:g}"
+            raise ExportError(f"{text}; expected up to {bound:g} for {target}")
     for lamp in plain.lamps:
         if lamp.kind not in HOLD_LAMPS.get(target, ()):
             fault = f"a {lamp.kind} lamp is not exported to {target}"

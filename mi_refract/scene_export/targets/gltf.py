@@ -154,10 +154,8 @@ def _around_glass(plain: PlainScene, mesh: Mesh, outside: float) -> Mesh:
         material = mesh.material
         assert isinstance(material, Glass)
     if not math.isclose(material.ext_ior, outside, rel_tol=1e-12):
-        media = f"media of {material.int_ior!r} and {material.ext_ior!r} touch"
-        raise ExportError(
-            f"{place}: {media}; expected the medium around all glass, {outside!r}, on one side, as in glTF"
-        )
+        expected = f"expected the medium around all glass, {outside!r}, on one side, as in glTF"
+        raise ExportError(f"{place}: media of {material.int_ior!r} and {material.ext_ior!r} touch; {expected}")
     if material.int_ior < outside:
         index = f"index {material.int_ior!r} is below {outside!r}, that of the medium around all glass"
         raise ExportError(f"{place}: {index}; expected at least that: glTF requires ior >= 1")
@@ -183,12 +181,10 @@ def _with_hollows(plain: PlainScene, meshes: Sequence[Mesh]) -> list[Mesh]:
             raise ExportError(f"{plain.name}: {hollow.name}: a hollow; expected the same glass around it")
         outer, inner = _with_normals(bodies[solid.name]), _with_normals(hollow)
         assert outer.normals is not None and inner.normals is not None
-        bodies[solid.name] = replace(
-            outer,
-            vertices=np.concatenate([outer.vertices, inner.vertices]),
-            faces=np.concatenate([outer.faces, inner.faces + len(outer.vertices)]),
-            normals=np.concatenate([outer.normals, inner.normals]),
-        )
+        vertices = np.concatenate([outer.vertices, inner.vertices])
+        faces = np.concatenate([outer.faces, inner.faces + len(outer.vertices)])
+        normals = np.concatenate([outer.normals, inner.normals])
+        bodies[solid.name] = replace(outer, vertices=vertices, faces=faces, normals=normals)
     return list(bodies.values())
 
 

@@ -65,13 +65,8 @@ def files(plain: PlainScene) -> Files:
     for material, name in names.items():
         if isinstance(material, Glass):
             inside, outside = numbers([material.int_ior]), numbers([material.ext_ior])
-            properties = [
-                'type = "glass"',
-                "kr = 1 1 1",
-                "kt = 1 1 1",
-                f"interiorior = {inside}",
-                f"exteriorior = {outside}",
-            ]
+            properties = ['type = "glass"', "kr = 1 1 1", "kt = 1 1 1"]
+            properties += [f"interiorior = {inside}", f"exteriorior = {outside}"]
         elif isinstance(material, Light):
             properties = ['type = "matte"', "kd = 0 0 0", f"emission = {numbers(material.radiance)}"]
         else:

@@ -40,14 +40,11 @@ CYCLES_ASSUMPTIONS = (
 
 def cycles_files(plain: PlainScene) -> Files:
     """Return the export's files by name."""
-    return (
-        json_and_ply(plain)
-        | sky_exr(plain, ((-1, 0, 0), (0, 1, 0), (0, 0, 1)))
-        | {
-            "render.py": resources(__package__).joinpath("render_cycles.py").read_bytes(),
-            "README.txt": readme(plain, "Cycles", CYCLES_COMMANDS, CYCLES_ASSUMPTIONS),
-        }
-    )
+    files = json_and_ply(plain) | sky_exr(plain, ((-1, 0, 0), (0, 1, 0), (0, 0, 1)))
+    return files | {
+        "render.py": resources(__package__).joinpath("render_cycles.py").read_bytes(),
+        "README.txt": readme(plain, "Cycles", CYCLES_COMMANDS, CYCLES_ASSUMPTIONS),
+    }
 
 
 # raysect -----------------------------------------------------------------------------------------------------------
