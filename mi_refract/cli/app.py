@@ -11,7 +11,7 @@ import importlib
 import sys
 import warnings
 from collections.abc import Callable
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 try:
     import typer
@@ -37,25 +37,17 @@ AllowPlugins = Annotated[
 ]
 
 
-class Command(NamedTuple):
-    """Where a command is defined, and its line in the help."""
-
-    module: str  # of this package
-    attribute: str  # of the module: a function, or a `typer.Typer` with subcommands
-    help: str
-
-
+# By command: its module, its function or `typer.Typer` of subcommands in that module, and its line in the help.
 COMMANDS = {
-    "render": Command("render", "render", "Render a Mitsuba scene, with our plugins, into an EXR file."),
-    "trace": Command("trace", "trace", "Trace rays through a planar scene; draw them, print focal points."),
-    "diff": Command("diff", "diff", "Compare images with their references: equal or different?"),
-    "accept": Command("diff", "accept", "Make the images that differ the new references."),
-    "self-test": Command("diff", "self_test", "Show which defects a comparison of images would detect."),
-    "rays": Command("rays", "app", "Check another program's refraction, ray by ray."),
-    "scene": Command("scene", "app", "Export a Mitsuba scene for another renderer."),
-    "doctor": Command("doctor", "doctor", "Show which Mitsuba variants run here, and what is missing."),
+    "render": ("render", "render", "Render a Mitsuba scene, with our plugins, into an EXR file."),
+    "trace": ("trace", "trace", "Trace rays through a planar scene; draw them, print focal points."),
+    "diff": ("diff", "diff", "Compare images with their references: equal or different?"),
+    "accept": ("diff", "accept", "Make the images that differ the new references."),
+    "self-test": ("diff", "self_test", "Show which defects a comparison of images would detect."),
+    "rays": ("rays", "app", "Check another program's refraction, ray by ray."),
+    "scene": ("scene", "app", "Export a Mitsuba scene for another renderer."),
+    "doctor": ("doctor", "doctor", "Show which Mitsuba variants run here, and what is missing."),
 }
-
 
 # The examples at the end of a command's help, by the command's name.
 EXAMPLES = {
@@ -123,8 +115,8 @@ class Commands(TyperGroup):
         """Return the command with that name. ValueError for an unknown name."""
         if cmd_name not in COMMANDS:
             raise ValueError(f"unknown command {cmd_name!r}; expected {', '.join(COMMANDS)}")
-        entry = COMMANDS[cmd_name]
-        command = getattr(importlib.import_module(f".{entry.module}", __package__), entry.attribute)
+        module, attribute, _ = COMMANDS[cmd_name]
+        command = getattr(importlib.import_module(f".{module}", __package__), attribute)
         if not isinstance(command, typer.Typer):
             single = typer.Typer(add_completion=False, rich_markup_mode=None)
             single.command(cmd_name)(command)
@@ -134,7 +126,7 @@ class Commands(TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write one line per command, without importing the commands."""
         with formatter.section("Commands"):
-            formatter.write_dl([(name, command.help) for name, command in COMMANDS.items()])
+            formatter.write_dl([(name, text) for name, (_, _, text) in COMMANDS.items()])
 
 
 app = typer.Typer(cls=Commands, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)

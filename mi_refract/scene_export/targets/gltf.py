@@ -74,8 +74,10 @@ def files(plain: PlainScene) -> Files:
             raise ExportError(f"{plain.name}: {lamp.name}: {angle}; expected at most 90 degrees, the limit of glTF")
     plain = outward(plain)
     outside = outermost_index(plain)
-    oriented = (_around_glass(plain, mesh, outside) for mesh in plain.meshes)
-    meshes = [mesh for mesh in map(_without_slivers, oriented) if len(mesh.faces)]
+    oriented = [_around_glass(plain, mesh, outside) for mesh in plain.meshes]
+    # Triangles of area 0 have no normal.
+    oriented = [replace(mesh, faces=mesh.faces[np.linalg.norm(_areas(mesh), axis=1) > 0]) for mesh in oriented]
+    meshes = [mesh for mesh in oriented if len(mesh.faces)]
     lights = [mesh for mesh in meshes if isinstance(mesh.material, Light)]
     offsets = {mesh.name: BACK * float(np.abs(mesh.vertices).max()) for mesh in lights}
     backs = [_back(mesh, offsets[mesh.name]) for mesh in lights]
@@ -117,7 +119,9 @@ def files(plain: PlainScene) -> Files:
             tree["extensions"] = {PUNCTUAL: {"lights": [_punctual(lamp) for lamp in plain.lamps]}}
             count = len(tree["nodes"])
             tree["scenes"][0]["nodes"] += range(count, count + len(plain.lamps))
-            tree["nodes"] += [_lamp_node(i, lamp) for i, lamp in enumerate(plain.lamps)]
+            for i, lamp in enumerate(plain.lamps):  # a lamp emits along its node's −z
+                matrix = (frame(lamp) * [1, -1, -1, 1]).T.ravel().tolist()
+                tree["nodes"].append({"name": lamp.name, "matrix": matrix, "extensions": {PUNCTUAL: {"light": i}}})
             extensions.add(PUNCTUAL)
         if extensions:
             tree["extensionsUsed"] = sorted(extensions)
@@ -212,11 +216,6 @@ def _areas(mesh: Mesh) -> Vertices:
     return np.cross(b - a, c - a) / 2
 
 
-def _without_slivers(mesh: Mesh) -> Mesh:
-    """Return the mesh without triangles of area 0, which have no normal."""
-    return replace(mesh, faces=mesh.faces[np.linalg.norm(_areas(mesh), axis=1) > 0])
-
-
 def _facet_normals(mesh: Mesh) -> Vertices:
     areas = _areas(mesh)
     return np.asarray(areas / np.linalg.norm(areas, axis=1, keepdims=True))
@@ -267,12 +266,6 @@ def _punctual(lamp: Lamp) -> dict[str, Any]:
         inner, outer = map(math.radians, _cone(lamp))
         entry["spot"] = {"innerConeAngle": inner, "outerConeAngle": outer}
     return entry
-
-
-def _lamp_node(index: int, lamp: Lamp) -> dict[str, Any]:
-    """Return the node of a lamp, which emits along the node's −z."""
-    matrix = frame(lamp) * [1, -1, -1, 1]
-    return {"name": lamp.name, "matrix": matrix.T.ravel().tolist(), "extensions": {PUNCTUAL: {"light": index}}}
 
 
 def _cone(lamp: SpotLamp) -> tuple[float, float]:
