@@ -59,7 +59,7 @@ def test_diff_as_a_subprocess(pair):
 def test_help_lists_each_command_and_each_command_has_help(name, capfd):
     assert app.main(["--help"]) == 0
     lines = capfd.readouterr().out.splitlines()
-    assert [line.split(None, 1)[1] for line in lines if line.startswith(f"  {name} ")] == [app.COMMANDS[name].help]
+    assert [line.split(None, 1)[1] for line in lines if line.startswith(f"  {name} ")] == [app.COMMANDS[name][2]]
     assert app.main([name, "--help"]) == 0
     out = capfd.readouterr().out
     assert out.startswith(f"Usage: mi-refract {name} ")
