@@ -52,9 +52,8 @@ def _require_dask() -> None:
     try:
         import distributed  # noqa: F401
     except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            f"--scheduler and --workers need Dask ({error.name} is missing): pip install 'mi-refract[cluster]'"
-        ) from None
+        text = f"--scheduler and --workers need Dask ({error.name} is missing)"
+        raise MissingExtraError(f"{text}: pip install 'mi-refract[cluster]'") from None
 
 
 @contextlib.contextmanager

@@ -74,16 +74,12 @@ def differences(theirs: Mapping[str, str], ours: Mapping[str, str], tolerated: C
     if theirs.get(UNUSABLE):
         return [theirs[UNUSABLE]]
     names = [name for name in ours if name not in (HOST, UNUSABLE, *tolerated)]
-    return [
-        f"{name} {theirs.get(name, 'unknown')}, here {ours[name]}" for name in names if theirs.get(name) != ours[name]
-    ]
+    return [f"{x} {theirs.get(x, 'unknown')}, here {ours[x]}" for x in names if theirs.get(x) != ours[x]]
 
 
 def machine(theirs: Mapping[str, str], ours: Mapping[str, str]) -> str:
     """Return the name of a worker's machine, with the tolerated differences."""
-    differing = [
-        f"{name} {theirs[name]}" for name in sorted(MIXED) if name in theirs and theirs[name] != ours.get(name)
-    ]
+    differing = [f"{x} {theirs[x]}" for x in sorted(MIXED) if x in theirs and theirs[x] != ours.get(x)]
     return f"{theirs[HOST]} ({'; '.join(differing)})" if differing else theirs[HOST]
 
 

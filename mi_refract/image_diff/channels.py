@@ -240,10 +240,8 @@ def _estimate(image: Image, side: str, spp: int) -> Estimate:
                 size = np.maximum(size, np.abs(other))
             if (below := v < -NEGATIVE * size).any():
                 hint = f"; of X, Y, Z that were written as colours, as Mitsuba's: channels = {list(XYZ)}"
-                raise ValueError(
-                    f"{image.path}: its variance of {name} is negative in {below.sum()} pixels, the first "
-                    f"{_first(image, below)}; expected at least 0{hint if name in 'RGB' else ''}"
-                )
+                text = f"{image.path}: its variance of {name} is negative in {below.sum()} pixels, the first"
+                raise ValueError(f"{text} {_first(image, below)}; expected at least 0{hint if name in 'RGB' else ''}")
         elif name in pairs:
             spread, is_moment = pairs[name]
             v = image.select([spread])[..., 0].astype(np.float64)

@@ -105,9 +105,8 @@ def compare(
                     variances = {name: np.where(mask, variance, 0) for name, variance in image.variances.items()}
                     images[i] = replace(image, pixels=pixels, mask=mask, variances=variances)
     if path.is_dir():
-        comparison = methods.compare(
-            how.method, reference, test, named=[name for name, _ in how.channels], **how.options
-        )
+        named = [name for name, _ in how.channels]
+        comparison = methods.compare(how.method, reference, test, named=named, **how.options)
         one, two = mean_image(reference), mean_image(test)
     else:
         comparison, (one, two) = _compare_parts(how, reference, test)

@@ -240,11 +240,8 @@ def shown_of(result: Result, image_bytes: float, map_bytes: float) -> Shown:
                 histogram = (counts / counts.sum()).tolist() if counts.any() else ()
             if "q" in maps:
                 maps["−log₁₀ q"] = -np.log10(np.maximum(maps.pop("q"), 1e-30))
-            makers += [
-                functools.partial(map_pane, name, values, map_bytes)
-                for name, values in maps.items()
-                if name != "difference" and (name != "flags" or values.any())
-            ]
+            drawn = [name for name in maps if name != "difference" and (name != "flags" or maps[name].any())]
+            makers += [functools.partial(map_pane, name, maps[name], map_bytes) for name in drawn]
             with ThreadPoolExecutor(os.cpu_count()) as pool:  # most of the work is deflate, which releases the GIL
                 return Shown(list(pool.map(lambda make: make(), makers)), result.unread, histogram)
     except Exception as error:  # any error: the page shows the other images

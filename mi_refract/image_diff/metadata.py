@@ -89,11 +89,7 @@ def _compared_metadata(image: Image, ignored: tuple[str, ...]) -> dict[str, str]
         values.setdefault(ALPHA, "0")
     else:
         values.pop(ALPHA, None)
-    return {
-        name: text
-        for name, text in values.items()
-        if text not in DEFAULTS.get(name, ()) and not _is_ignored(name, ignored)
-    }
+    return {n: x for n, x in values.items() if x not in DEFAULTS.get(n, ()) and not _is_ignored(n, ignored)}
 
 
 def _text(value: Any) -> str:

@@ -225,9 +225,8 @@ def _formula(text: str, label: str) -> Medium:
     """The medium of a formula with its numbers. ValueError with the likely mistake: another unit, or another order."""
     call = re.fullmatch(r"(\w+?)(_um)?\s*\((.*)\)", text)
     if not call or call[1] not in FORMULAS_OF_N or (call[2] and call[1] not in IN_MICROMETRES):
-        raise ValueError(
-            f"{label}; expected {', '.join(f'{known}(…)' for known in FORMULAS_OF_N)}, or with _um, such as table_um(…)"
-        )
+        known = ", ".join(f"{formula}(…)" for formula in FORMULAS_OF_N)
+        raise ValueError(f"{label}; expected {known}, or with _um, such as table_um(…)")
     name, arguments = call[1], call[3]
     unit, scale = ("µm", NANOMETRES) if call[2] else ("nm", 1)
 

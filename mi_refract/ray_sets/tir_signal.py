@@ -72,9 +72,8 @@ def _is_tangent(answers: ComparedAnswers) -> Flags:
     with np.errstate(all="ignore"):
         cosine = np.abs((unit(answers.rays.n) * answers.b).sum(1))
         along = cosine <= answers.tolerance * np.maximum(1, lengths(answers.b).astype(float))
-    return np.asarray(
-        along & answers.is_direction & ~(answers.exact.transmitted & (answers.exact.cos_t <= 2 * answers.tolerance))
-    )
+    transmitted_along = answers.exact.transmitted & (answers.exact.cos_t <= 2 * answers.tolerance)
+    return np.asarray(along & answers.is_direction & ~transmitted_along)
 
 
 DETECTORS: dict[str, Callable[[ComparedAnswers], Flags]] = {
@@ -98,9 +97,8 @@ def detect(pieces: Iterable[ComparedAnswers]) -> str:
         radicand, reflects = absolute_radicand(answers.rays), ~answers.exact.transmitted
         far = reflects & (radicand > np.maximum(CERTAIN, bound))
         signals = np.array([np.ones(len(far), bool), *(detector(answers) for detector in DETECTORS.values())])
-        counts += [
-            (mask & (answers.exact.cos_i > 0) & signals).sum(1) for mask in (reflects | (radicand <= bound), far)
-        ]
+        near_and_far = reflects | (radicand <= bound), far
+        counts += [(mask & (answers.exact.cos_i > 0) & signals).sum(1) for mask in near_and_far]
     (_, *near), (rays, *votes) = counts.tolist()
     if not rays:
         votes = near[:-1] if any(near[:-1]) else near
