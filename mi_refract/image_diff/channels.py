@@ -293,7 +293,7 @@ def _whole(value: object) -> int:
 
 
 def _shared_factor(image: Image, of_passes: bool) -> float | None:
-    """Return `Estimate.shared` by the header; `of_passes`: the variance is that of passes, which may share samples."""
+    """Return `Estimate.shared` by the header; `of_passes`: a variance of passes, whose pixels may share samples."""
     radius, area = (
         float(text) if re.fullmatch(r"[0-9]{1,6}(\.[0-9]{1,20})?", text) else None
         for text in (str(image.metadata.get(name, "")) for name in (FILTER, AREA))

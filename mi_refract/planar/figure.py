@@ -168,7 +168,7 @@ def _draw_media(panel: Axes, scene: PlanarScene) -> None:
 
 
 def _tint(rank: float, dark: bool) -> tuple[float, float, float]:
-    """A medium's colour by its rank above the outermost one, −1 … 1: blue if denser; `dark`: on a dark background."""
+    """A medium's colour by its rank, −1 … 1, above the outermost one: blue if denser, else yellow; `dark`: on dark."""
     hue = np.array(DENSE if rank > 0 else THIN)
     if dark:
         share = abs(rank) and 0.3 + 0.7 * abs(rank)

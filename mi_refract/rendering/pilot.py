@@ -143,7 +143,7 @@ def _variance(means: Doubles) -> float:
 
 
 def _found_variance(means: Doubles, independent: Doubles, light: float) -> float:
-    """Return σ²(x) of the light of lamps; `means`, `independent`: the parts of `Passes.found_light`; `light`: μ."""
+    """Return σ²(x) of lamps' light that path tracing found; `means`, `independent`: of `found_light`; `light`: μ."""
     mean, count = float(means.mean()), means[0].size
     variance = float(independent.mean()) if np.count_nonzero(means.any(0)) < FEW_FINDS else _variance(means)
     value = variance * light / mean if mean > 0 else 0.0

@@ -116,7 +116,7 @@ def with_settings(parsed: ParsedScene, settings: Settings) -> ParsedScene:
 
 
 def _find(nodes: list[Node], *kinds: str) -> int | None:
-    """Return the number of the first node of the first kind in the scene, of the second in that node …; or None."""
+    """Follow `kinds` from the scene, each to the first node of that kind. Return its number; None if there is none."""
     parent = 0
     for kind in kinds:
         number = next((child for child in _children(nodes, parent) if nodes[child][0] == kind), None)
