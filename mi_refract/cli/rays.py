@@ -211,8 +211,7 @@ def run(
         if command:
             raise ValueError(f"--renderer {renderer} and {command[0]}; expected one of them")
         wanted = {precision or "", given.precision if given else ""} - {""}
-        functions = [x for x in renderer_file.load(renderer).rays if wanted <= {x.precision}]
-        if not functions:
+        if not (functions := [x for x in renderer_file.load(renderer).rays if wanted <= {x.precision}]):
             in_both = f" in {' and '.join(sorted(wanted))}" if wanted else ""
             raise ValueError(f"{renderer}: no function{in_both}; expected [[rays]]")
         calls = [(renderer_file.filled(x.command), x.title, x.precision, x.tir, x.deviations) for x in functions]

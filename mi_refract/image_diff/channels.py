@@ -56,8 +56,7 @@ def spreads(channels: Sequence[str]) -> dict[str, tuple[str, bool]]:
         squares = [".".join([*parts[:i], f"m2_{parts[i]}", *parts[i + 1 :]]) for i in range(len(parts))]
         moments = [(spread, True) for spread in (*squares, SQUARES.format(name))]
         variances = [(form.format(name), False) for form in VARIANCES]
-        candidates = [pair for pair in (*moments, *variances) if pair[0] in existing]
-        if candidates:
+        if candidates := [pair for pair in (*moments, *variances) if pair[0] in existing]:
             pairs[name] = candidates[-1]
     return pairs
 
@@ -92,8 +91,7 @@ def selected(image: Image, names: Mapping[str, str]) -> Image:
         pixels = np.concatenate([image.pixels, image.select(RGB) @ TO_XYZ.T], -1)
         image = replace(image, pixels=pixels, channels=(*image.channels, *XYZ), variances=converted)
     pairs = spreads(image.channels)
-    missing = [name for name in names if name not in image.channels]
-    if missing:
+    if missing := [name for name in names if name not in image.channels]:
         expected = ", ".join(means(image.channels))
         raise ValueError(f"{image.path}: no channel {missing[0]!r}; in `channels` expected {expected}")
     new_names = dict(names)

@@ -153,8 +153,7 @@ def as_shown(image: Image, names: Collection[str]) -> Image:
 
 def identical_as_shown(reference: Image, test: Image) -> str:
     """Return how omitted channels are read, if only one image has them and all pixels are identical then; else ""."""
-    unshared = set(reference.channels) ^ set(test.channels)
-    if not unshared:
+    if not (unshared := set(reference.channels) ^ set(test.channels)):
         return ""
     one, two = as_shown(reference, test.channels), as_shown(test, reference.channels)
     comparable = one.pixels.shape == two.pixels.shape and set(one.channels) == set(two.channels)

@@ -41,8 +41,7 @@ def read_renders(folder: Path, max_values: int = MAX_VALUES, left_out: Collectio
     images_in_folder, failed, _ = pairing.images_in(folder)
     if failed:
         raise OSError(failed[0][1])
-    paths = [path for path in images_in_folder.values() if path not in left_out]
-    if not paths:
+    if not (paths := [path for path in images_in_folder.values() if path not in left_out]):
         raise ValueError(f"{folder}: contains no image; expected several renders of one image")
     read = functools.partial(image_file.read, max_values=max_values)
     with ThreadPoolExecutor(THREADS) as pool:

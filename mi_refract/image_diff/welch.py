@@ -169,8 +169,7 @@ def _checked_counts(
         for image in side:
             if (key := _drawn(image)) and (other := drawn.setdefault(key, image)) is not image:
                 raise ValueError(f"{image.path}: the scene and the seed of {other.path}; {expected}")
-        masked = side[0].mask is not None and not side[0].mask.all()
-        if masked:
+        if side[0].mask is not None and not side[0].mask.all():
             continue  # what it leaves of other renders may be the same
         for a, b in itertools.combinations(side, 2):
             if _identical(a, b) and (a.pixels != a.pixels[0, 0]).any():  # black ones may be the same

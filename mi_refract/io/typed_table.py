@@ -42,8 +42,7 @@ def parse_toml(text: str | bytes, kind: type[T], where: str, *, infinite: bool =
 
 def _line_of_error(text: str | bytes, error: str) -> str:
     """Return the line of an error of `tomllib`, with a hint if it has a frequent mistake; "" without a line number."""
-    match = re.search(r"at line (\d+)", error)
-    if not match:
+    if not (match := re.search(r"at line (\d+)", error)):
         return ""
     line = (text if isinstance(text, str) else text.decode()).split("\n")[int(match[1]) - 1].strip()
     mistakes = {

@@ -167,8 +167,7 @@ def table(pairs: Sequence[tuple[float, float]]) -> tuple[Table, dict[str, float]
     knots = tuple(w for w, _ in pairs)
     if len(knots) < 2 or not all(0 < a < b < math.inf for a, b in itertools.pairwise(knots)):
         raise ValueError("expected two or more wavelengths, increasing")
-    bad = [f"{n:g} at {w:g} nm" for w, n in pairs if not 0 < n < math.inf]
-    if bad:
+    if bad := [f"{n:g} at {w:g} nm" for w, n in pairs if not 0 < n < math.inf]:
         raise ValueError(f"n = {bad[0]}; expected a positive finite index")
     form = Table(knots)
     return form, dict(zip(form.names, (n for _, n in pairs), strict=True))

@@ -104,8 +104,7 @@ def _tabulated(kind: str, rows: Sequence[Sequence[float]]) -> Medium:
     wavelengths, columns = [row[0] for row in rows], dict(zip(kind, [*zip(*rows, strict=True)][1:], strict=True))
     form, coefficients = table([*zip(wavelengths, columns.get("n", [1.0] * len(rows)), strict=True)])
     k = columns.get("k", ())
-    bad = [x for x in k if not 0 <= x < math.inf]
-    if bad:
+    if bad := [x for x in k if not 0 <= x < math.inf]:
         raise ValueError(f"k = {bad[0]:g}; expected a finite number ≥ 0")
     valid = wavelengths[0], wavelengths[-1]
     return Medium("", form, coefficients if "n" in kind else {}, valid, k=(form.knots, tuple(k)) if k else None)
@@ -125,8 +124,7 @@ def _refractiveindex_info(text: str) -> Medium:
         absolute = conditions.get("n_is_absolute", conditions.get("n_absolute"))
     except (yaml.YAMLError, KeyError, TypeError, IndexError, AttributeError, ZeroDivisionError):
         raise ValueError("expected a page of refractiveindex.info, with DATA of one formula or table") from None
-    with_n = [medium for medium in media if medium.coefficients]
-    if not with_n:
+    if not (with_n := [medium for medium in media if medium.coefficients]):
         raise ValueError("no index; expected a formula, or tabulated n")
     k = next((medium.k for medium in media if medium.k), None)
     relative_to = ""

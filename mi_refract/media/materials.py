@@ -210,8 +210,7 @@ def _parse_text(text: str, label: str, find: Callable[[str], Path]) -> Medium:
     try:
         single = variant.lookup_ior(query, "ior", text)
     except RuntimeError as error:
-        glasses = ", ".join(glass_catalogs.called(text))
-        if glasses:
+        if glasses := ", ".join(glass_catalogs.called(text)):
             advice = f"a glass needs the name of its manufacturer: {glasses}"
             raise ValueError(f"{label}: unknown material; {advice}") from None
         expected = str(error).partition("choices are:")[2] or "the names of Mitsuba's table"

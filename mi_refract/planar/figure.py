@@ -97,8 +97,7 @@ def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> 
     height = max(min(5.2 / ratio**0.5, 10.4 / ratio, 7.0), 0.6)
     width, height = min(max(height * ratio, 3.6), 10.4) + 0.6, height + 0.95
     lines = [f"{scene.file}: {summary(scene, traced)}", *(f"× {line}" for line in mismatches(scene, traced))]
-    stopped = count(traced)["MAX_DEPTH"]
-    if stopped:
+    if stopped := count(traced)["MAX_DEPTH"]:
         lines.append(f"○ {stopped} stopped after `max_depth` boundaries, with another one ahead")
     inside = ((foci >= view[::2]) & (foci <= view[1::2])).all(axis=1)
     if inside.any():

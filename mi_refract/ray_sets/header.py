@@ -132,16 +132,14 @@ def of_media(specs: Sequence[str], wavelengths: Sequence[float], precision: str)
         raise ValueError(f"{text}; expected neither, or at least one of each")
     if max(len(specs), len(wavelengths)) > MOST_MEDIA:
         raise ValueError(f"{text}; expected up to {MOST_MEDIA} of each")
-    wrong = [x for x in wavelengths if not 0 < x < LARGEST_WAVELENGTH]
-    if wrong:
+    if wrong := [x for x in wavelengths if not 0 < x < LARGEST_WAVELENGTH]:
         raise ValueError(f"wavelength {wrong[0]:g}; expected nm, a number above 0")
     rounded = _rounded(wavelengths, precision)
     if len(np.unique(rounded)) < len(rounded) or not rounded.all():
         text = f"the wavelengths {shown(wavelengths)} are not all different in {precision}"
         raise ValueError(f"{text}; expected each once")
     names = [_parsed(spec).name for spec in specs]
-    repeated = [name for name in names if names.count(name) > 1]
-    if repeated:
+    if repeated := [name for name in names if names.count(name) > 1]:
         raise ValueError(f"medium {shown(repeated[0])}: {names.count(repeated[0])} times; expected each once")
     in_nm = [float(x) for x in wavelengths]
     _ratios(tuple(names), tuple(in_nm), precision)
@@ -151,8 +149,7 @@ def of_media(specs: Sequence[str], wavelengths: Sequence[float], precision: str)
 
 def check_regimes(header: Header) -> None:
     """ValueError, one line, for a regime that defines its own ratios, or for fewer rays than combinations of media."""
-    refused = [name for name in header["regimes"] if name in REGIMES and name not in TAKE_RATIOS]
-    if refused:
+    if refused := [name for name in header["regimes"] if name in REGIMES and name not in TAKE_RATIOS]:
         text = f"regime {refused[0]!r} defines its own ratios of indices"
         raise ValueError(f"{text}; with media, expected one of {', '.join(map(repr, TAKE_RATIOS))}")
     least = len(header["media"]) * len(header["wavelengths"])

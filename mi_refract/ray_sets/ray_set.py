@@ -148,8 +148,7 @@ def make(
     from mi_refract import __version__
 
     names = default(media) if names is None else tuple(names)
-    unknown = [name for name in names if name not in regimes.REGIMES]
-    if unknown:
+    if unknown := [name for name in names if name not in regimes.REGIMES]:
         raise ValueError(f"regime {unknown[0]!r}: unknown; expected {', '.join(map(repr, regimes.REGIMES))}")
     if precision not in PRECISIONS:
         raise ValueError(f"precision {precision!r}: unknown; expected {', '.join(PRECISIONS)}")

@@ -112,8 +112,7 @@ class RendererFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if not self.rays and self.images is None and self.install is None:  # for some, scripts of this project render
             raise ValueError("no [[rays]] and no [images]; expected one of them, or both")
         titles = [f"{function.title}, {function.precision}" for function in self.rays]
-        repeated = [title for title in titles if titles.count(title) > 1]
-        if repeated:
+        if repeated := [title for title in titles if titles.count(title) > 1]:
             raise ValueError(f"rays: two functions have the title {repeated[0]!r}; expected one")
 
 
@@ -133,8 +132,7 @@ def filled(command: tuple[str, ...], **values: object) -> list[str]:
     for word in command:
         try:
             parts = [(text, field, spec or conversion) for text, field, spec, conversion in Formatter().parse(word)]
-            wrong = [field for _, field, spec in parts if field is not None and (spec or field not in known)]
-            if wrong:
+            if wrong := [field for _, field, spec in parts if field is not None and (spec or field not in known)]:
                 raise ValueError(repr(wrong[0]))
         except ValueError as error:
             expected = ", ".join(f"{{{name}}}" for name in known)

@@ -81,8 +81,7 @@ def sentence(findings: Findings) -> str:
         else:
             text = f"{findings.right} of {answers} are right, {findings.answered - findings.right} only within the "
             text += f"error bound of the formula {findings.error_bound}; {worst}"
-            undecidable = findings.total("undecidable")
-            if undecidable:
+            if undecidable := findings.total("undecidable"):
                 text += f"; {undecidable} rays are undecidable (error bound above 0.1 rad)"
     different = findings.problem_count("index")
     return text + (f"; {different} answers are for a different ratio of indices" if different else "")
@@ -166,8 +165,7 @@ def summary(findings: Findings) -> RenderableType:
 
     grades = Table.grid(padding=(0, 2))
     for word, style in STYLES.items():
-        names = [errors.regime for errors in findings.regimes if grade(errors) == word]
-        if names:
+        if names := [errors.regime for errors in findings.regimes if grade(errors) == word]:
             every = 1 < len(names) == len(findings.regimes)
             grades.add_row(Text(word, style=style), Text("every regime" if every else printable("; ".join(names))))
     notes = [*map(problem_text, findings.problems), *ratio(findings), signal(findings), *explained(findings)]

@@ -142,8 +142,7 @@ def read(path: Path, identity: Identity, shape: tuple[int, int, int]) -> Progres
             header = json.loads(file.readline(_HEADER))
             if header["format"] != FORMAT:
                 raise ValueError(f"format {header['format']}")
-            differences = changes(header["identity"], identity)
-            if not differences:
+            if not (differences := changes(header["identity"], identity)):
                 return _progress(file, header, shape)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         text = f"{path}: damaged checkpoint ({type(error).__name__}: {error})"

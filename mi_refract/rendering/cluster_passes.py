@@ -252,8 +252,7 @@ class ClusterPasses:
 
     def _submit(self, level: int, first: int, task_level: int) -> _Node | None:
         """Submit a node to the workers that are usable now, and return it; None if there is no worker."""
-        usable = frozenset(self.workers.usable)
-        if not usable:
+        if not (usable := frozenset(self.workers.usable)):
             return None
         (offset, spp), bundle, client = self._series, self._bundle(usable), self.workers.client
         options: dict[str, Any] = {"retries": RETRIES, "pure": False, "priority": -next(self._count)}

@@ -364,8 +364,7 @@ class Pilot:
         return self._samplers[name]
 
     def _integrator(self, settings: Settings) -> Any:
-        changed = {name: value for name, value in settings.items() if name != "sampler"}
-        if not changed:
+        if not (changed := {name: value for name, value in settings.items() if name != "sampler"}):
             return self.renderer.scene.integrator()
         if (name := settings_text(changed)) not in self._integrators:
             node = integrator_node(self.parsed, changed)

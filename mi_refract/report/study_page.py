@@ -309,8 +309,7 @@ def _scatter(request: Mapping[str, Any], rows: list[Row], salt: str) -> dict[str
             panel.intervals.append((row.subject, low, high, row.values[y]))
         elif x in row.values and row.subject == floor:
             panel.floor = row.values[x]
-    lines = [points for panel in panels.values() for points in panel.points.values()]
-    if not lines:
+    if not (lines := [points for panel in panels.values() for points in panel.points.values()]):
         return None
     axes = Axes(x, y, x_scale="linear")
     svg = scatter_svg(panels, axes, floor=floor, front=request.get("front", False), salt=salt)
