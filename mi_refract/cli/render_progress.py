@@ -94,8 +94,7 @@ def _text(rendering: LongRender, seconds: float, new: int) -> str:
 
 def write_preview(path: Path, rendering: LongRender) -> None:
     """Write the current image as an sRGB PNG file. If that fails, add a warning to the render."""
-    image = rendering.image()
-    if image is None:
+    if (image := rendering.image()) is None:
         return
     colours = 3 if rendering.renderer.colours >= 3 else 1
     linear = np.nan_to_num(image[..., :colours], posinf=1e38, neginf=-1e38)  # the matrix may not overflow

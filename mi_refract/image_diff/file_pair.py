@@ -95,8 +95,7 @@ def compare(
     mask_path = pairing.beside(how.mask, result.target, roots[0], how.above) if how.mask else None
     if (mask_path or how.ignore or how.reads_variance) and reference[-1].place:
         raise ValueError(f"{path}: several parts or MIP levels; for masks and `variance` expected a single image")
-    mask = mask_of(reference[0], mask_path, how.ignore, how.max_values)
-    if mask is not None:
+    if (mask := mask_of(reference[0], mask_path, how.ignore, how.max_values)) is not None:
         for images in selected:
             for i, image in enumerate(images):
                 if image.pixels.shape[:2] == mask.shape:  # every method rejects other sizes

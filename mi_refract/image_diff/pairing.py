@@ -176,8 +176,7 @@ def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> 
     for name, file in new.items():
         if name not in pairs and realpath(file) not in references:
             for rule in maps:
-                values = name_patterns.parsed(rule.test, name)
-                if values is not None:
+                if (values := name_patterns.parsed(rule.test, name)) is not None:
                     target = name_patterns.filled(rule.reference, values)
                     pairs[name] = _pair(name, None, file, Path(target))
                     break

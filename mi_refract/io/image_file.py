@@ -71,8 +71,7 @@ def write_exr(
         spec.attribute(name, str(value) if isinstance(value, int) and not -(2**31) <= value < 2**31 else value)
     try:
         with safe_files.replacing(path, suffix=".exr") as temporary:  # OpenImageIO chooses the format by the suffix
-            output = oiio.ImageOutput.create(str(temporary))
-            if output is None:
+            if (output := oiio.ImageOutput.create(str(temporary))) is None:
                 raise OSError(one_line(oiio.geterror()))
             done = output.open(str(temporary), spec) and output.write_image(pixels)
             message = output.geterror()

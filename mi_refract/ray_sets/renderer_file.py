@@ -66,8 +66,7 @@ class RaysCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def recorded_range(self, name: str) -> tuple[float, float] | None:
         """The recorded angle of a set of rays as (from, to); None if none is recorded."""
-        value = self.recorded.get(name)
-        if value is None:
+        if (value := self.recorded.get(name)) is None:
             return None
         return (value[0], value[1]) if isinstance(value, list) else (value, value)
 

@@ -245,8 +245,7 @@ class ClusterPasses:
                 stop = min(next_stop(stop + self._series[0]) - self._series[0], last)
             task_level, largest = self.levels()
             level, begin = aligned_nodes(begin, stop, largest)[0]
-            new_node = self._submit(level, begin, min(task_level, level))
-            if new_node is None:
+            if (new_node := self._submit(level, begin, min(task_level, level))) is None:
                 return
             submitted.append(new_node)
 

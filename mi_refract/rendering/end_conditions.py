@@ -102,8 +102,7 @@ def worst_tile(sums: PassSums) -> float:
 
     Black tiles, without any variance, are left out: they say nothing about the others.
     """
-    variance = sums.variance
-    if variance is None:
+    if (variance := sums.variance) is None:
         return math.nan
     squared = _tile_means(variance[..., : sums.colours] / sums.spp)
     means = np.abs(_tile_means(sums.mean[..., : sums.colours]))
