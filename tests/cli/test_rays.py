@@ -7,7 +7,6 @@ import json
 import os
 import re
 import sys
-import time
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -113,15 +112,11 @@ def test_answers_do_not_select_the_rays(call):
 CHECK = ("check", "a.csv", "--rays", "r.csv")
 OF_MEDIA = ("--medium", CROWN, "--medium", FLINT, "--wavelengths", "486.1327,587.5618")
 BAD_OPTIONS = {
-    "regime 'generc': unknown": ("export", "--regime", "generc", "-o", "r.csv"),
-    "precision 'f16': unknown": ("export", "--precision", "f16", "-o", "r.csv"),
     "--count": ("export", "--count", "0", "-o", "r.csv"),
     "expected a file name that ends in .csv or .npz": ("export", "-o", "r.txt"),
     "is not a folder": ("export", "-o", "none/r.csv"),
     "--output": ("export",),
     "TIR signal 'zeros': unknown; expected auto, zero": (*CHECK, "--tir", "zeros"),
-    "error bound 'glsl': unknown; expected wedge": (*CHECK, "--error-bound", "glsl"),
-    "backward error 0; expected a positive number of roundings": (*CHECK, "--backward-error", "0"),
     "r.pdf: expected": (*CHECK, "--report", "r.pdf"),
     "No such file": CHECK,
     "COMMAND": ("run",),
@@ -130,11 +125,9 @@ BAD_OPTIONS = {
     "Invalid value for '--timeout'": ("run", "--timeout", "nan", "--", "true"),
     "--timeout inf; expected": ("run", "--timeout", "inf", "--", "true"),
     "./no-such-program x: cannot be started: No such file": ("run", *FEW, "--", "./no-such-program", "x"),
-    "1 media and 0 wavelengths; expected neither": ("run", "--medium", CROWN, "--", "true"),
     "--wavelengths F,d; expected numbers in nm": ("run", "--medium", CROWN, "--wavelengths", "F,d", "--", "true"),
     "--wavelengths ; expected numbers in nm": ("run", "--medium", CROWN, "--wavelengths", "", "--", "true"),
     "--wavelengths 5_00; expected numbers in nm": ("run", "--medium", CROWN, "--wavelengths", "5_00", "--", "true"),
-    "regime 'k ≫ 1' defines its own ratios": ("run", *OF_MEDIA, "--regime", "k >> 1", "--", "true"),
     "Missing command": (),
 }
 
@@ -220,45 +213,9 @@ def test_programs_that_fail(call, message):
     assert (code, out) == (2, "") and err.startswith(f"mi-refract: {sys.executable} -c ") and message in err
 
 
-CHILD = """
-import os, sys, time
-with open(sys.argv[1] + ".part", "w") as file:
-    file.write(str(os.getpid()))
-os.rename(sys.argv[1] + ".part", sys.argv[1])
-time.sleep(600)
-"""
-
-
-def parent(path, rest, **streams):
-    """Return a command that starts CHILD, which writes its process id to `path`."""
-    pipes = "".join(f", {name}=subprocess.{value}" for name, value in streams.items())
-    code = f"p = subprocess.Popen([sys.executable, '-c', {CHILD!r}, {str(path)!r}]{pipes})"
-    return [sys.executable, "-c", f"import os, subprocess, sys, time\n{code}\n{rest}"]
-
-
-def assert_ended(path):
-    """Check that the child no longer runs; it may still be a zombie."""
-    status, deadline = Path(f"/proc/{path.read_text()}/status"), time.monotonic() + 60
-    while status.exists() and "zombie" not in status.read_text() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not status.exists() or "zombie" in status.read_text()
-
-
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="asks /proc who runs")
-def test_timeout_and_answers_end_the_whole_process_group(call, tmp_path):
-    """A program whose child keeps stdout open; and one that answers, whose child has closed stdout and sleeps."""
-    for rest in ("p.wait()", ""):
-        for timeout in (2, 20, 100):  # a busy machine may take long to start two processes
-            code, _, err = call("run", *FEW, "--timeout", timeout, "--", *parent(tmp_path / "child", rest))
-            assert (code, f"did not finish within {timeout} s; set a longer --timeout" in err) == (2, True)
-            if (tmp_path / "child").exists():
-                break
-        assert_ended(tmp_path / "child")
-        (tmp_path / "child").unlink()
-    rest = f"while not os.path.exists({str(tmp_path / 'child')!r}):\n    time.sleep(0.01)\nprint('id,bx,by,bz')"
-    command = parent(tmp_path / "child", rest, stdin="DEVNULL", stdout="DEVNULL")
-    assert len(files.answers_of(command, ray_set.make(["generic"], 3)).ids) == 0
-    assert_ended(tmp_path / "child")
+def test_a_program_that_does_not_end_in_time(call):
+    code, _, err = call("run", *FEW, "--timeout", 0.2, "--", "sleep", "600")
+    assert (code, "did not finish within 0.2 s; set a longer --timeout" in err) == (2, True)
 
 
 def test_answers_beyond_a_pipe_buffer_and_environment_and_folder(tmp_path):

@@ -64,6 +64,23 @@ def test_a_program_is_ended_after_the_timeout(text):
     assert time.monotonic() - start < 30
 
 
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+@pytest.mark.parametrize(("streams", "rest"), [("", "wait"), ("", ""), ("<&- >&-", "echo x")])
+def test_what_a_program_started_is_ended_with_it(tmp_path, streams, rest):
+    """A child that keeps stdout open, after the timeout; one that has closed it, at the end of the program."""
+    text, pid = f'sh -c "$1" "$0" {streams} & until [ -e "$0" ]; do sleep 0.01; done; {rest}', tmp_path / "pid"
+    words = shell(text, pid, SLEEPER)
+    for timeout in (1, 20, 100):  # a busy machine may take long to start two processes
+        if streams:
+            assert process_group.run(words, b"", 60).out == b"x\n"
+        else:
+            with pytest.raises(TimeoutError):
+                process_group.run(words, b"", timeout)
+        if pid.exists():
+            break
+    until(lambda: not alive(int(pid.read_text())))
+
+
 PARENT = f"""
 import signal, sys
 from mi_refract.io import process_group

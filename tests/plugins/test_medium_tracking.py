@@ -71,10 +71,7 @@ LEFT = {
     "none": ({"slab": box(matched(int_absorption=0.0))}, 0),
     "0.3": ({"slab": box(matched(int_absorption=0.3))}, 0.3 * THICKNESS),
     "40": ({"slab": box(matched(int_absorption=40.0))}, 40.0 * THICKNESS),
-    "colours": (
-        {"slab": box(matched(int_absorption=rgb(0.1, 0.5, 2.0)))},
-        np.array([0.1, 0.5, 2.0]) * THICKNESS,
-    ),
+    "colours": ({"slab": box(matched(int_absorption=rgb(0.1, 0.5, 2.0)))}, np.array([0.1, 0.5, 2.0]) * THICKNESS),
     "colour": ({"slab": box(matched(int_colour=0.25, int_colour_distance=1.0))}, THICKNESS * math.log(4)),
     "nested media": ({"outer": box(matched(int_absorption=0.2)), "inner": INNER}, 0.2 * 1.5 + 0.9 * 0.5),
     "touching media": (SHEETS, 1.1),

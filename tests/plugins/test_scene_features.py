@@ -401,16 +401,8 @@ def pipe(radius, **parameters):
     [
         (shown(0.5, type="sphere"), 6, ""),
         (shown(0.2, type="sphere"), 6, "'solid' is a Sphere in an instance that scales it by 0.2, 6 from a camera: "),
-        (
-            shown((1, 1, 0.2), type="sphere"),
-            6,
-            "0.2, 6 from a camera: Mitsuba's points on it err by up to 0.00069",
-        ),
-        (
-            shown(0.5, type="sphere"),
-            30,
-            "err by up to 0.00043, but rays start 8.9e-05 from its surface; expected a",
-        ),
+        (shown((1, 1, 0.2), type="sphere"), 6, "0.2, 6 from a camera: Mitsuba's points on it err by up to 0.00069"),
+        (shown(0.5, type="sphere"), 30, "err by up to 0.00043, but rays start 8.9e-05 from its surface; expected a"),
         (shown(2, type="sphere"), 30, ""),
         (shown(0.2, type="cube"), 30, ""),
         (shown(0.2, type="sphere", bsdf={"type": "diffuse"}), 6, ""),
