@@ -154,23 +154,6 @@ def test_renders_in_the_same_array_or_file_are_distinguished(assert_image_unbias
         assert_image_unbiased(reused(2), reused(1))
 
 
-def test_the_plugin_works_from_a_conftest(pytester):
-    """In a separate process, because a run in this process would import extension modules twice, which fails."""
-    pytester.makeconftest('pytest_plugins = ["mi_refract.pytest_plugin"]')
-    pytester.makepyfile("""
-        import numpy as np
-
-        def test_equal(assert_image_equal):
-            assert_image_equal(np.ones((8, 8, 3)), np.ones((8, 8, 3)))
-
-        def test_different(assert_image_equal):
-            assert_image_equal(np.ones((8, 8, 3)), np.zeros((8, 8, 3)))
-    """)
-    result = pytester.runpytest_subprocess("-p", "no:cacheprovider")
-    result.assert_outcomes(passed=1, failed=1)
-    result.stdout.fnmatch_lines(["*tolerance: different: *"])
-
-
 TESTS = """
 import numpy as np
 import pytest
@@ -197,6 +180,7 @@ def test_wrong_option(assert_image_equal, name):
 
 
 def test_options_write_a_page_and_accept_images(pytester):
+    """In separate processes, because a run in this process would import extension modules twice, which fails."""
     pytester.makeconftest('pytest_plugins = ["mi_refract.pytest_plugin"]')
     name = f"{pytester.makepyfile(TESTS).name}::test_"
     for file, value in {"old": 0, "test": 1, "zero": 0}.items():

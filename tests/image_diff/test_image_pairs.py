@@ -142,10 +142,6 @@ def sees(method, name, change, a, b):
 # Changes that methods ignore -------------------------------------------------------------------------------------
 
 
-def half_floats(x, rng):
-    return x.astype(np.float16).astype(np.float32) if np.abs(x).max() < 6e4 else x
-
-
 def last_bits(x, rng):
     x = x.astype(np.float32)
     return np.where(x == 0, x, np.nextafter(x, np.where(rng.random(x.shape) < 0.5, -np.inf, np.inf).astype(np.float32)))
@@ -165,7 +161,7 @@ IDENTICAL = {
 CLOSE = {
     **IDENTICAL,
     "last bits": last_bits,
-    "half floats": half_floats,
+    "half floats": lambda x, rng: x.astype(np.float16).astype(np.float32) if np.abs(x).max() < 6e4 else x,
     "dust where it is black": lambda x, rng: np.where(x == 0, 1e-9 * np.abs(x).max(), x),
 }
 SAME_TO = {"exact": IDENTICAL, "paired": {name: by for name, by in CLOSE.items() if name != "half floats"}}

@@ -52,10 +52,6 @@ def denser(plain):
     return dataclasses.replace(plain, meshes=tuple(meshes))
 
 
-def wider(plain):
-    return dataclasses.replace(plain, camera=dataclasses.replace(plain.camera, fov_x_degrees=34.0))
-
-
 @pytest.fixture
 def judged(context, monkeypatch):
     """`judged(change)`: the row of a renderer that renders the changed prism by Mitsuba's `dielectric`."""
@@ -76,6 +72,7 @@ def test_verdicts_on_equal_different_and_noisy_images(judged, monkeypatch):
     assert (row.verdict, row.replay["verdict"], row.missed) == ("pass", "equal", {})
     assert row.values["RMSE / noise"] == pytest.approx(1, abs=0.1)
     assert list(row.images) == ["reference", "test", "difference"]
+    wider = lambda plain: dataclasses.replace(plain, camera=dataclasses.replace(plain.camera, fov_x_degrees=34.0))  # noqa: E731
     for change in (denser, wider):
         row = judged(change)
         assert (row.verdict, row.replay["verdict"]) == ("fail", "different") and row.values["tests that differ"] > 0

@@ -290,12 +290,6 @@ def test_defects_in_the_powers_are_seen(function, defect, seen, few, monkeypatch
     assert seen <= failing(energy.setting_rows(few, compiled("float32", True)))
 
 
-def test_mitsubas_function_loses_its_digits_near_k_of_1(few):
-    rows = {(row.subject, row.case): row for row in energy.setting_rows(few, compiled("float32", True))}
-    assert rows[energy.BUILTIN, "matched, grazing"].values["R / u"] > 1000
-    assert set(rows[NEAR_ONE].curves) == {"powers", energy.BUILTIN}
-
-
 @pytest.mark.parametrize(("case", "weight"), [("white furnace", 1.000001), ("basic radiance", 1.00001)])
 def test_a_plugin_that_gives_too_much_is_seen(case, weight, few, monkeypatch):
     """A `refract` whose weights are a millionth too large."""
@@ -377,15 +371,6 @@ def test_the_derivative_of_the_reflectance_keeps_its_digits_near_the_critical_an
 def context(tmp_path):
     profile = dataclasses.replace(PROFILES["standard"], resolution=48, spp=4)
     return Context(profile, tmp_path, "llvm_ad_rgb", backend.detect(), {})
-
-
-def test_no_layer_is_thinner_than_the_ray_offset():
-    for layers, where in (
-        (layered_paths.MIRAGE, layered_paths.POOL),
-        (layered_paths.FIBRE, abs(layered_paths.FIBRE.end)),
-    ):
-        assert len(layers.boundaries) + 1 == len(layers.indices) == {"mirage": 33, "fibre": 17}[layers.scene]
-        assert (-np.diff(layers.boundaries) > layered_paths.OFFSET * (1 + where)).all()
 
 
 def test_exact_paths_conserve_their_invariants_and_a_deviation_is_the_one_that_was_put_in():
