@@ -146,9 +146,8 @@ def test_the_length_of_an_answer_combined_from_two_changed_inputs():
     for signs in ((1, 1), (1, -1), (-1, 1)):
         parts = [np.sin(np.arcsin(e / K) + 2 * s * EPSILON) * K * (1 + s * EPSILON) for s in signs]
         b = np.stack([parts[0], np.sqrt(1 - parts[1] ** 2), 0 * K], 1) * rng.choice([1.0, 3.0])
-        errors = backward_error.of_lengths(
-            b, Rays(A * lengths(b)[:, None].round().astype(float), N, K), np.zeros(len(K), bool)
-        )
+        rays = Rays(A * lengths(b)[:, None].round().astype(float), N, K)
+        errors = backward_error.of_lengths(b, rays, np.zeros(len(K), bool))
         assert (errors <= EPSILON * (1 + 1e-5)).all()
         largest = max(largest, errors.max())
     assert largest > 0.3 * EPSILON

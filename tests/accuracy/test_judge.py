@@ -134,9 +134,8 @@ def test_errors_are_compared_with_the_bound_of_their_ray_and_needed_constants_ar
 
 def test_misclassified_blank_and_undecided_rays_are_wrong_and_not_compared():
     judgement = verdict(EXACT.direction, EXACT.transmitted ^ np.array([True, False, False, True]))
-    assert (
-        judgement.misjudged.tolist() == judgement.far.tolist() == judgement.wrong.tolist() == [True, False, False, True]
-    )
+    for mask in (judgement.misjudged, judgement.far, judgement.wrong):
+        assert mask.tolist() == [True, False, False, True]
     assert judgement.compared.tolist() == [False, True, True, False]
     assert judgement.values()["TIR misclassified, beyond its bound"] == 2 and judgement.share[[0, 3]].tolist() == [0, 0]
 
@@ -192,9 +191,8 @@ def other_decision(exact):
 @pytest.mark.parametrize(("side", "cos_i", "held"), [(4.0, 2 * U, False), (4.0, 32 * U, True), (0.0, 2 * U, True)])
 def test_either_side_is_right_near_the_surface_if_the_bound_leaves_the_side_open(side, cos_i, held, transmitted):
     """A ray into the denser medium that leaves on the wrong side, or is classified as tangential."""
-    judgement = judged(
-        (1, 0, -cos_i), 0.5, on_the_wrong_side if transmitted else other_decision, Budget(10, 14, 1, side=side)
-    )
+    answer = on_the_wrong_side if transmitted else other_decision
+    judgement = judged((1, 0, -cos_i), 0.5, answer, Budget(10, 14, 1, side=side))
     assert judgement.wrong.tolist() == [held]
     assert judgement.crossed.tolist() == [transmitted and not held]
 

@@ -43,9 +43,8 @@ def passes_by_mitsuba(scene, spp, seed=0, **parameters):
     """Return mean and variance of passes of one sample, of which a short render in a scalar variant consists."""
     loaded, threads = mi.load_file(str(scene), **parameters), dr.thread_count()
     dr.set_thread_count(1)
-    passes = np.array(
-        [np.array(mi.render(loaded, spp=1, seed=scalar_seed_of(seed, p, 8, 6))) for p in range(spp)], np.float64
-    )
+    seeds = [scalar_seed_of(seed, p, 8, 6) for p in range(spp)]
+    passes = np.array([np.array(mi.render(loaded, spp=1, seed=x)) for x in seeds], np.float64)
     dr.set_thread_count(threads)
     return passes.mean(0).astype(np.float32), passes.var(0, ddof=1)
 
@@ -140,11 +139,7 @@ BAD = {
     "no error": ({}, ("--until", ""), "--until ; expected more than 0 %"),
     "no error of tiles": ({}, ("--until-tile", ""), "--until-tile ; expected more than 0 %"),
     "no settings": ({}, ("--settings", "fast"), "--settings fast: 'fast'; expected auto, or sampler=…, integrator=…"),
-    "a pilot of a scalar variant": (
-        {},
-        ("--settings", "auto"),
-        "--settings auto: samples cannot be rendered one by one",
-    ),
+    "a pilot of a scalar variant": ({}, ("--settings", "auto"), "auto: samples cannot be rendered one by one"),
     "no time": ({}, ("--time", ""), "--time ; expected a time of more than 0"),
     "malformed": (SCENE.replace("</shape>", ""), (), "mismatch"),
     "unknown parameter": (SCENE.replace("max_depth", "max_dept"), (), "max_dept"),

@@ -32,9 +32,7 @@ def test_names_paths_levels_and_defines(export, tmp_path):
     assert code == 0 and "1650 triangles" in out
     text = (tmp_path / "sphere-mitsuba" / "scene.xml").read_text()
     assert '<integer name="width" value="17"/>' in text and 'name="max_depth" value="9"' in text
-    assert (
-        "1590 triangles" in export("sphere", "--to", "mitsuba", "--level", 0, "-o", "zero")[1]
-    )  # level 0 is not the default
+    assert "1590 triangles" in export("sphere", "--to", "mitsuba", "--level", 0, "-o", "zero")[1]  # not the default
 
 
 @pytest.mark.parametrize(

@@ -113,9 +113,7 @@ def test_a_matched_boundary_returns_the_same_bits(name, setting):
 @pytest.mark.parametrize("name", FORMULAS)
 def test_flipped_normals_and_powers_of_two_of_lengths_change_no_bit(name, setting):
     unit_regimes = [regime for regime, entry in REGIMES.items() if entry.unit and "denormal" not in regime]
-    rays = Rays.joined(
-        [make(regime, COUNTS[setting.backend] // 4, setting.precision, seed=21) for regime in unit_regimes]
-    )
+    rays = Rays.joined([make(x, COUNTS[setting.backend] // 4, setting.precision, seed=21) for x in unit_regimes])
     b, transmitted = evaluate(FORMULAS[name], rays, setting.vector)
     i, j = np.random.default_rng(22).integers(-12, 12, (2, len(rays), 1), endpoint=True)
     cases = [(0, Rays(rays.a, -rays.n, rays.k))]

@@ -61,10 +61,8 @@ def test_accept_copies_images_that_differ_and_keeps_removed_ones(run, folders, m
     before, names = tree(old), ("added.exr", "inner/changed.exr")
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
     code, out, err = run("accept", old, new)  # without a terminal
-    assert (code, err.partition(" ")[2]) == (
-        2,
-        "accept asks for confirmation on a terminal; without a terminal, pass --yes\n",
-    )
+    refusal = "accept asks for confirmation on a terminal; without a terminal, pass --yes\n"
+    assert (code, err.partition(" ")[2]) == (2, refusal)
     assert "changed.exr" in out and tree(old) == before
     code, out, err = run("accept", old, new, "--yes")
     assert (code, err) == (0, "")

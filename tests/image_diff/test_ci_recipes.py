@@ -275,9 +275,8 @@ def test_the_documented_gitlab_job_works(project, environment, programs, gain, c
 )
 def test_the_documented_ctest_works(project, environment, tmp_path, render, failed):
     (text,) = blocks(PAGE, "cmake")
-    (project / "CMakeLists.txt").write_text(
-        f"cmake_minimum_required(VERSION 3.18)\nproject(p NONE)\nenable_testing()\n{text}"
-    )
+    head = "cmake_minimum_required(VERSION 3.18)\nproject(p NONE)\nenable_testing()\n"
+    (project / "CMakeLists.txt").write_text(head + text)
     if render is None:
         executable(project / "render_all", "#!/bin/bash\nexit 1\n")
     else:

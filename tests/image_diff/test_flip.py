@@ -123,9 +123,7 @@ def test_sizes_and_weights_of_windows():
 def test_twice_the_size_at_twice_the_pixels_per_degree_has_the_same_error():
     one, two = VISIBLE["a cube turned from gray to yellow"]
     small, large = ([np.kron(codes[50:178, 150:278], np.ones((k, k, 1))) for codes in (one, two)] for k in (1, 2))
-    values = [
-        flip(*map(shown, sides), ppd=ppd).metrics[0].value for sides, ppd in ((small, 67), (large, 134), (large, 67))
-    ]
+    values = [flip(*map(shown, x), ppd=ppd).metrics[0].value for x, ppd in ((small, 67), (large, 134), (large, 67))]
     assert values[1] == pytest.approx(values[0], rel=0.03)
     assert values[2] > 1.2 * values[0]
 

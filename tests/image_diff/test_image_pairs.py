@@ -244,10 +244,7 @@ WRONG = {
         ("tolerance", "auto"),
         lambda rng: (of(0.0045 * GRAY), of([0.0005, 0.0045, 0.0005] * GRAY)),
     ),
-    "a dim channel at random": (
-        ("tolerance", "auto", "flip"),
-        lambda rng: beside(*0.0035 * rng.random((2, *SHAPE)), "id"),
-    ),
+    "a dim channel at random": (("tolerance", "auto", "flip"), lambda r: beside(*0.0035 * r.random((2, *SHAPE)), "id")),
     "a dim channel beside a bright one": (
         ("tolerance", "auto", "flip"),
         lambda rng: beside(

@@ -137,9 +137,7 @@ CASES = {
     ("integers of 32 bits", "TIFF"): (tiff, [{}, IDS], [{}, IDS + 1]),
     ("name of a part", "EXR"): (exr, *([{"oiio:subimagename": name} for name in names] for names in ("ab", "ba"))),
     ("name of a part", "TIFF"): (tiff, *([{285: (2, name)}] for name in (b"a\0", b"b\0"))),
-    ("view, left or right", "EXR"): (exr, *(
-        [{"oiio:subimagename": name, "view": name} for name in names] for names in ("ab", "ba")
-    )),
+    ("view, left or right", "EXR"): (exr, *([{"oiio:subimagename": x, "view": x} for x in y] for y in ("ab", "ba"))),
     ("environment map", "EXR"): (exr, [{}], [{"envmap": "latlong", "textureformat": "LatLong Environment"}]),
     ("second image", "EXR"): (exr, *([{"oiio:subimagename": y, "add": x * (y == "b")} for y in "ab"] for x in (0, 1))),
     ("second image", "PNG"): (frames, [0], [1]),

@@ -146,9 +146,8 @@ def test_tolerance_counts_every_pixel_that_pixelmatch_counts():
         for threshold in (0.05, 0.1, 0.2, 0.5):
             counted = yiq(one, two) > 35215 * threshold**2
             assert counted.any() and (np.abs(one - two).max(-1)[counted] > 255 * threshold).all()
-    header, _, cells = (
-        line.strip("| ").split(" | ")[1:] for line in re.findall(r"^\|.*\|$", sections()["pixelmatch"][0], re.M)
-    )
+    lines = re.findall(r"^\|.*\|$", sections()["pixelmatch"][0], re.M)
+    header, _, cells = (line.strip("| ").split(" | ")[1:] for line in lines)
     limits = [np.sqrt(35215 / yiq(np.array(change), np.zeros(3))) / 255 for change in LIMITS.values()]
     assert header == list(LIMITS)
     assert [float(cell) for cell in cells] == pytest.approx(limits, abs=0.006)
@@ -158,9 +157,7 @@ def test_tolerance_counts_every_pixel_that_pixelmatch_counts():
     ("option", "name"), [("mean", "mean FLIP error"), ("percentile_99", "99th percentile of the FLIP")]
 )
 def test_an_exceeded_bound_of_flip_is_named_first(option, name):
-    one, two = (
-        Image(Path("a.png"), x.astype(np.float32) / 255, tuple("RGB"), stored="uint8") for x in (PLAIN, PLAIN + 60)
-    )
+    one, two = (Image(Path("a.png"), np.float32(x) / 255, tuple("RGB"), stored="uint8") for x in (PLAIN, PLAIN + 60))
     result = methods.compare("flip", one, two, local=9.0, patch=9.0, one_way=900.0, **{option: 0.1})
     assert result.verdict is Verdict.DIFFERENT and result.reason.startswith(name)
     assert f" > {option} = 0.1; local FLIP error" in result.reason

@@ -367,9 +367,7 @@ def test_the_suggested_number_of_samples_decides(counts, whose):
     """Twice the number detects 5 % in enough tiles; half of it does not."""
     rng, options = np.random.default_rng(4), {"tile": 4, "hidden": 0.0}
     result = auto(*(lit(rng, count, 1.0, 0.0) for count in counts), **options)
-    words = re.search(
-        r"; about ([0-9,]+) samples per pixel (.*?)( \((.*) times as many\))? would decide$", result.reason
-    )
+    words = re.search(r"about ([0-9,]+) samples per pixel (.*?)( \((.*) times as many\))? would decide$", result.reason)
     assert (result.verdict, words[2]) == (INCONCLUSIVE, whose)
     times = None if whose == "a side" and counts[0] != counts[1] else float(words[4])
     assert not times or times == pytest.approx(int(words[1].replace(",", "")) / min(counts), rel=0.06)
@@ -426,11 +424,7 @@ def test_a_gain_too_small_for_a_tile_is_detected_in_the_whole_image(rng):
 @pytest.mark.parametrize(
     ("part", "gain", "words"),
     [
-        (
-            np.s_[16:32, 32:48],
-            0.9,
-            r"(9\.\d|10) % darker in R, 0.9\d* instead of .*, in the 16 × 16 pixels around \(140, 29\)",
-        ),
+        (np.s_[16:32, 32:48], 0.9, r"(9\.\d|10) % darker in R, 0.9\d* .*, in the 16 × 16 pixels around \(140, 29\)"),
         (np.s_[:], 1.02, r"[12]\.?\d? % brighter in R, 1.02\d* instead of .*, in the whole image"),
         (np.s_[64:70, 64:80], 2.0, r".* % brighter in R, .*, in the 16 × 6 pixels around \(172, 72\)"),
     ],

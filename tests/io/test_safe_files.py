@@ -49,9 +49,7 @@ with temporary_folder() as folder:
 def test_temporary_folders_of_killed_processes_are_removed(tmp_path, monkeypatch):
     """Those of running processes and of other hosts remain, and other files and folders with similar names."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    others = [
-        tmp_path / name for name in ("mi_refract_results", "mi_refract-1.part", "mi_refract-00000000-12345678.part")
-    ]
+    others = [tmp_path / x for x in ("mi_refract_results", "mi_refract-1.part", "mi_refract-00000000-12345678.part")]
     for other in others:
         other.mkdir()
     with python(HOLDING, TMPDIR=str(tmp_path)) as living, python(HOLDING, TMPDIR=str(tmp_path)) as killed:

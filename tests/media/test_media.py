@@ -507,17 +507,11 @@ def test_hold_extends_an_index_beyond_its_range_with_a_warning(vectorised):
 
 BAD_FILES = {
     "no.csv": (None, "No such file"),
-    "a.csv": (
-        "wl,n\n0.4,1.5\n0.5,1.5\n",
-        "header 'wl,n'; expected a column whose name contains nm or µm, a column n, ",
-    ),
+    "a.csv": ("wl,n\n0.4,1.5\n0.5,1.5\n", "header 'wl,n'; expected a column whose name contains nm or µm, a column n"),
     "b.csv": ("nm,n\n400,1.5\n", "two or more"),
     "c.csv": ("nm,n\n400,x\n500,1.5\n", "expected numbers in the columns nm, n"),
     "d.csv": ("nm,n\n400,1.5\n500\n", "expected numbers"),
-    "i.csv": (
-        "nm;n\n400;1,52\n500;1,51\n",
-        "expected numbers in the columns nm, n, with decimal points, and no more columns",
-    ),
+    "i.csv": ("nm;n\n400;1,52\n500;1,51\n", "expected numbers in the columns nm, n, with decimal points, and no more"),
     "e.csv": ("nm,n\n500,1.5\n400,1.5\n", "increasing"),
     "f.csv": ("nm,n,k\n400,1.5,-1\n500,1.5,0\n", "k = -1; expected a finite number ≥ 0"),
     "g.csv": ("nm,n\n400,15\n500,15\n", "n = 15 at 400 nm; expected up to 10"),
@@ -525,10 +519,7 @@ BAD_FILES = {
     "a.yml": ("just: text", "expected a page of refractiveindex.info"),
     "b.yml": ("[", "expected a page of refractiveindex.info"),
     "c.yml": (PAGE.format("formula 4", "1 2 3"), "formula 4; expected formula 1, 2, 3, 5 or 6, or a table"),
-    "d.yml": (
-        "DATA:\n  - type: tabulated k\n    data: |\n        0.4 1\n        0.5 1\n",
-        "no index; expected a formula",
-    ),
+    "d.yml": ("DATA:\n  - type: tabulated k\n    data: |\n        0.4 1\n        0.5 1\n", "no index; expected"),
     "e.yml": (PAGE.format("formula 2", "0 1 0.25"), "C1: n is infinite at 500 nm"),
     "f.yml": (
         "DATA:\n  - type: tabulated n\n    data: |\n        0.4 1 1 1\n        0.5\n",

@@ -86,10 +86,8 @@ def test_the_legend_shows_a_few_of_many_media(drawn):
 
 def test_media_of_nearly_the_same_index_have_different_tints(drawn):
     media = tuple(replace(SLANTED.regions[0], indices=(n,)) for n in (1.45, 1.48))
-    tints = [
-        np.array(patch.get_facecolor())
-        for patch in drawn(replace(SLANTED, regions=media)).axes[0].get_legend().get_patches()
-    ]
+    legend = drawn(replace(SLANTED, regions=media)).axes[0].get_legend()
+    tints = [np.array(patch.get_facecolor()) for patch in legend.get_patches()]
     assert np.abs(tints[2] - tints[1]).max() > 0.1 < np.abs(tints[1] - tints[0]).max()
 
 
@@ -195,9 +193,8 @@ def test_legs_contain_no_duplicates():
 def test_the_default_view_contains_all_boundaries():
     ball_scene = scene(ball(1.5), beam(3, 0.5, x=-9), (1, 0))
     far = 1 + 2 * drawing.MARGIN
-    np.testing.assert_allclose(
-        drawing.around(ball_scene, follow_scene(ball_scene), np.empty((0, 2))), (-far, far, -far, far)
-    )
+    view = drawing.around(ball_scene, follow_scene(ball_scene), np.empty((0, 2)))
+    np.testing.assert_allclose(view, (-far, far, -far, far))
 
 
 @pytest.mark.parametrize(("n", "focus"), [(1.5, 1.5), (1.1, 5.5), (1.01, None), (2.5, None)])

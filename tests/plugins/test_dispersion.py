@@ -301,11 +301,8 @@ def whites(variant):
     return means(scene(far=ball() | {"to_world": FAR}), 2048, 8, 100)
 
 
-METHODS = {
-    "by chance": {},
-    "both lobes": {"split_depth": 2},
-    "deterministic": {"deterministic": True, "split_weight": 1 / 4096},
-}
+METHODS = {"by chance": {}, "both lobes": {"split_depth": 2}}
+METHODS |= {"deterministic": {"deterministic": True, "split_weight": 1 / 4096}}
 
 
 @pytest.mark.parametrize("method", METHODS)

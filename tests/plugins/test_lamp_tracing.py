@@ -25,9 +25,8 @@ SIZE = 16
 
 def camera(kind="perspective", film=(), **parameters):
     at = mi.ScalarTransform4f().look_at([0, -6, 3], [-0.3, 0, 0], [0, 0, 1])  # the caustic of a ball
-    view = (
-        {"to_world": at @ mi.ScalarTransform4f().scale(0.8)} if kind == "orthographic" else {"to_world": at, "fov": 16}
-    )
+    narrow = at @ mi.ScalarTransform4f().scale(0.8)
+    view = {"to_world": narrow} if kind == "orthographic" else {"to_world": at, "fov": 16}
     size = {"width": SIZE, "height": SIZE, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     return {"type": kind, "film": {"type": "hdrfilm"} | size | dict(film)} | view | parameters
 
@@ -96,9 +95,7 @@ def difference(a, b):
 
     n = len(a)
     t = (a.mean(0) - b.mean(0)) / np.sqrt((a.var(0, ddof=1) + b.var(0, ddof=1)) / n + 1e-30)
-    least = stats.t.ppf(
-        1 - FALSE_ALARM / 2 / t.size, n - 1
-    )  # Bonferroni over the tiles; Welch's freedom is n − 1 or more
+    least = stats.t.ppf(1 - FALSE_ALARM / 2 / t.size, n - 1)  # Bonferroni; Welch's freedom is n − 1 or more
     return np.abs(t).max() / least
 
 
@@ -107,11 +104,8 @@ ROW = {f"b{i}": ball(center=(-2 + 0.5 * (i % 8), -1.2 + 0.5 * (i // 8), 0.5), ra
 IN_GLASS = {"lamp": glow((0, 0, 1.2), 0.5)}  # all light passes glass
 WHITE = {"type": "diffuse", "reflectance": 0.9}
 LEAF = {"type": "mask", "opacity": 0.6, "bsdf": {"type": "principledthin", "spec_trans": 0.3, "diff_trans": 1.0}}
-WALL = {
-    "type": "rectangle",
-    "to_world": mi.ScalarTransform4f().translate([-1.6, 0, 1]).rotate([0, 1, 0], 90).scale(2),
-    "bsdf": WHITE,
-}
+BESIDE = mi.ScalarTransform4f().translate([-1.6, 0, 1]).rotate([0, 1, 0], 90).scale(2)
+WALL = {"type": "rectangle", "to_world": BESIDE, "bsdf": WHITE}
 BLOCKER = {"type": "disk", "to_world": mi.ScalarTransform4f().look_at([0, -5, 2.5], [-0.3, 0, 0], [0, 0, 1]).scale(0.1)}
 TEXTURED = {"emitter": {"type": "area", "radiance": noise(4, 4, 3)}}
 GROUP = {"type": "shapegroup", "ball": ball(center=(0, 0, 0), radius=1.0)}
@@ -120,10 +114,8 @@ INSTANCE = {"type": "instance", "group": {"type": "ref", "id": "group"}} | {
 }
 TUBE = {"type": "cylinder", "p0": [-1, 0, 4], "p1": [1, 0, 4], "radius": 0.2}
 SHEET = mi.ScalarTransform4f().translate([0, 0, 0.3]).scale(1.5)
-BALL_LAMP = {
-    "type": "sphere",
-    "to_world": mi.ScalarTransform4f().translate([1, 0, 4]).rotate([0, 1, 0], 130).scale(0.5),
-}
+TURNED = mi.ScalarTransform4f().translate([1, 0, 4]).rotate([0, 1, 0], 130).scale(0.5)
+BALL_LAMP = {"type": "sphere", "to_world": TURNED}
 HALF = texture([[[1], [0]]], filter_type="nearest", to_uv=mi.ScalarTransform3f().translate([0.5, 0]))
 GLASS = {"type": "ref", "id": "glass"}
 CROP = {"width": 40, "height": 30, "crop_width": 16, "crop_height": 16, "crop_offset_x": 14, "crop_offset_y": 9}
@@ -279,9 +271,8 @@ def point(height=5.0, **parameters):
 SUN = {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0}
 OBLIQUE = SUN | {"direction": [-0.3, 0.2, -1.0]}
 FAR_AWAY = mi.ScalarTransform4f().look_at([3e6, -2e6, 1e7], [0, 0, 0], [0, 1, 0])
-PLAIN = floor({"type": "diffuse", "reflectance": 0.0}) | {
-    "to_world": mi.ScalarTransform4f().translate([0, 0, -1]).scale(1e7)
-}
+PLAIN = floor({"type": "diffuse", "reflectance": 0.0})
+PLAIN |= {"to_world": mi.ScalarTransform4f().translate([0, 0, -1]).scale(1e7)}
 ALIKE = {
     "a far point": (SUN, {"lamp": point(4e3)}),
     "a farther spot": (OBLIQUE, {"lamp": {"type": "spot", "to_world": FAR_AWAY, "intensity": 1.13e14}}),

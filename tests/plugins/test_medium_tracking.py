@@ -22,11 +22,8 @@ def matched(**parameters):
 
 
 def box(bsdf, thickness=THICKNESS, z=0.0, **parameters):
-    return {
-        "type": "cube",
-        "to_world": PLACE().translate([0, 0, z]).scale([20, 20, thickness / 2]),
-        "bsdf": bsdf,
-    } | parameters
+    to_world = PLACE().translate([0, 0, z]).scale([20, 20, thickness / 2])
+    return {"type": "cube", "to_world": to_world, "bsdf": bsdf} | parameters
 
 
 def sheet(bsdf, z):

@@ -303,9 +303,7 @@ def test_a_deterministic_image_errs_by_what_it_says_was_truncated(llvm_variant):
     """The ball from one point: no noise but the position in the pixel, which is its centre in every sample."""
     sensor = camera() | {"sampler": {"type": "multijitter", "jitter": False}}
     scene = glass_ball(sky=LIT, sensor=sensor)
-    exact, coarse = (
-        render(scene, 1, deterministic=True, split_weight=weight, max_depth=64) for weight in (2.5e-4, 0.05)
-    )
+    exact, coarse = (render(scene, 1, deterministic=True, split_weight=w, max_depth=64) for w in (2.5e-4, 0.05))
     assert exact.shape == (24, 24, 4)
     bound = coarse[..., 3:] * SKY.max()
     off = np.abs(coarse - exact)[..., :3]
@@ -399,10 +397,7 @@ def test_what_is_left_out_is_not_in_the_kernel_and_is_said(llvm_variant, monkeyp
         ({"rr_depth": 0}, "rr_depth = 0; expected an integer ≥ 1"),
         ({"samples_per_pass": 0}, "samples_per_pass = 0; expected an integer ≥ 1"),
         ({"split_depth": -1}, "split_depth = -1; expected an integer ≥ 0"),
-        (
-            {"split_depth": 13, "split_weight": 0.0},
-            "split into 8.19e+03 paths; expected 2^split_depth or 1/split_weight up to 4096",
-        ),
+        ({"split_depth": 13, "split_weight": 0.0}, "split into 8.19e+03 paths; expected 2^split_depth or "),
         ({"split_depth": 65}, "and split_depth up to 64"),
         ({"split_weight": 1.5}, "split_weight = 1.5; expected a number from 0 to 1"),
         ({"split_weight": float("nan")}, "split_weight = nan"),

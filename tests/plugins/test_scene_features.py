@@ -129,9 +129,7 @@ def test_shapes_that_mitsuba_merges_are_as_large_as_before(rgb_variant):
         "cube": {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.01)},
     }
     glass = {"type": "ref", "id": "glass"}
-    parts = {"type": "scene", "glass": {"type": "dielectric"}} | {
-        name: shapes[name] | {"bsdf": glass} for name in shapes
-    }
+    parts = {"type": "scene", "glass": {"type": "dielectric"}} | {x: shapes[x] | {"bsdf": glass} for x in shapes}
     merged, apart = (mi.load_dict(parts, optimize=merge) for merge in (True, False))
     assert len(merged.shapes()) < len(apart.shapes())
     assert inspect(merged).delta_extent == inspect(apart).delta_extent

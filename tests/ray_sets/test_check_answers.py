@@ -100,9 +100,8 @@ def test_the_exact_answers_are_exact(precision, names):
         assert (flagged.exit_code, flagged.tir, flagged.wrong) == (0, "flag", 0)
     if precision == "f32":  # the shortest decimals, read as float64, have errors of up to half an ulp
         printed = np.array([[float(str(x)) for x in row] for row in answers.b.astype(np.float32)])
-        assert (printed != answers.b).any() and check(
-            rays, Answers(rays.ids, printed), error_bound="promoted"
-        ).wrong == 0
+        assert (printed != answers.b).any()
+        assert check(rays, Answers(rays.ids, printed), error_bound="promoted").wrong == 0
 
 
 def test_the_errors_of_a_regime_are_right():
@@ -110,9 +109,8 @@ def test_the_errors_of_a_regime_are_right():
     rays, (known, answers) = standard_rays("f64"), exact("f64")
     rows = np.flatnonzero((rays.regime == "generic") & known.transmitted)
     angle = np.linspace(1e-5, 1e-3, len(rows))[:, None]
-    turned = 1.25 * (
-        np.cos(angle) * answers.b[rows] + np.sin(angle) * out_of_plane_units(answers.b[rows], rays.rays.n[rows])
-    )
+    across = out_of_plane_units(answers.b[rows], rays.rays.n[rows])
+    turned = 1.25 * (np.cos(angle) * answers.b[rows] + np.sin(angle) * across)
     findings = check(rays, changed(answers, rows, turned))
     generic = findings.regimes[0]
     compared = np.concatenate([angle.ravel(), np.zeros(generic.compared - len(rows))])
@@ -383,10 +381,8 @@ def compared_answers(radicands, b=None):
 )
 def test_detecting_the_signal_that_most_rays_agree_on(radicands, b, signal):
     for size in (3, 10):
-        assert (
-            tir_signal.detect(compared_answers(radicands[i : i + size], b[i : i + size]) for i in range(0, 10, size))
-            == signal
-        )
+        parts = (compared_answers(radicands[i : i + size], b[i : i + size]) for i in range(0, 10, size))
+        assert tir_signal.detect(parts) == signal
 
 
 @pytest.mark.parametrize("length", [1 / 3, 1.0, 3.0])
@@ -615,9 +611,8 @@ def test_lengths_are_judged_apart_from_directions(least, length, limit, wrong):
     assert not wrong or wrong in {regime.regime for regime in findings.regimes if regime.wrong}
 
 
-SOUND = (
-    GOOD | programs.FORMULAS | {f"{name}, made unit": programs.made_unit(f) for name, f in programs.FORMULAS.items()}
-)
+SOUND = GOOD | programs.FORMULAS
+SOUND |= {f"{name}, made unit": programs.made_unit(f) for name, f in programs.FORMULAS.items()}
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -714,9 +709,8 @@ def test_indices_and_directions_are_judged_apart(precision):
     assert (findings.ratio.id, findings.ratio.ray) == (70, header.described(rays.header, 70))
     (line,) = reports.ratio(findings)
     assert f"(id 70, {findings.ratio.ray}); up to 1e-5 counts as equal" in line
-    assert "2 answers used a different ratio of indices (n_ratio): ids 4, 70" in map(
-        reports.problem_text, findings.problems
-    )
+    texts = [*map(reports.problem_text, findings.problems)]
+    assert "2 answers used a different ratio of indices (n_ratio): ids 4, 70" in texts
 
 
 ULP = {precision: float(np.finfo(dtype).eps) for precision, dtype in ray_set.PRECISIONS.items()}

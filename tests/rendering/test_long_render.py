@@ -151,9 +151,7 @@ def test_a_render_without_noise_ends_early_unless_it_is_black(tmp_path, llvm_var
     (tmp_path / "clear.xml").write_text(text)
     depth = '<string name="aovs" value="d:depth"/>'
     unlit = '<integrator type="path"><boolean name="hide_emitters" value="true"/></integrator>'
-    text = SKY.format(light).replace(
-        'type="path"/>', f'type="aov">{depth}<integrator type="path"/>{unlit}</integrator>'
-    )
+    text = SKY.format(light).replace('type="path"/>', f'type="aov">{depth}{by("path")}{unlit}</integrator>')
     (tmp_path / "dark aov.xml").write_text(text)
     ended = "no noise: the samples of every pixel agree"
     expected = {
@@ -272,9 +270,7 @@ def test_a_biased_sampler_is_named_by_the_integrators_that_take_its_numbers(tmp_
     text = f'<integrator type="{plugin}"><string name="aovs" value="d:depth"/>{inner}</integrator>'
     if plugin == "moment":
         text = text.replace('<string name="aovs" value="d:depth"/>', "")
-    (tmp_path / "sky.xml").write_text(
-        SKY.format('<emitter type="constant"/>').replace('<integrator type="path"/>', text)
-    )
+    (tmp_path / "sky.xml").write_text(SKY.format('<emitter type="constant"/>').replace(by("path"), text))
     assert biased(tmp_path, "ldsampler", "", tmp_path / "sky.xml", {}) == named
 
 

@@ -119,9 +119,8 @@ def test_the_mean_weight_of_a_wide_filter_is_spp_in_every_pixel(tmp_path, llvm_v
 def test_the_header_contains_radius_and_area_of_the_filter(variant, rfilter, radius, area):
     """The area is (∫∫w)²/∫∫w². Of a Gaussian it is that of an infinite one; Mitsuba's ends at 4 standard deviations."""
     film = {"type": "hdrfilm", "width": 4, "height": 4, "filter": rfilter}
-    scene = mi.load_dict(
-        {"type": "scene", "integrator": {"type": "path"}, "sensor": {"type": "perspective", "film": film}}
-    )
+    view = {"type": "perspective", "film": film}
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "sensor": view})
     header = pass_renderer(scene, 0).filter_header
     assert header["mi_refract:filter_radius"] == radius
     assert header["mi_refract:filter_area"] == pytest.approx(area, rel=0.01)

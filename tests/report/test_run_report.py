@@ -123,11 +123,8 @@ def test_junit_counts_outcomes_per_suite_and_in_total(tmp_path):
     counts = [" ".join(suite.get(key) for key in ("tests", "failures", "errors", "skipped")) for suite in (root, *root)]
     assert counts == ["6 2 1 1", "4 1 1 1", "0 0 0 0", "2 1 0 0"]
     failure, error, skipped = (case[0] for case in root[0] if len(case))
-    assert (failure.tag, failure.attrib, failure.text) == (
-        "failure",
-        {"type": "different", "message": "why"},
-        "one\ntwo",
-    )
+    expected = "failure", {"type": "different", "message": "why"}, "one\ntwo"
+    assert (failure.tag, failure.attrib, failure.text) == expected
     assert error.get("message") == error.text == root.get("name") == printable(EVIL)
     assert (skipped.tag, skipped.get("type"), skipped.text) == ("skipped", None, None)
 

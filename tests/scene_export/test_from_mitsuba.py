@@ -238,9 +238,8 @@ def test_a_uniform_spectrum_is_tinted_as_a_lamp_and_grey_as_a_reflectance(value,
     (emitter,) = (shape.emitter() for shape in mitsuba_scene.shapes() if shape.is_emitter())
     (bsdf,) = (shape.bsdf() for shape in mitsuba_scene.shapes() if shape.id() == "box")
     expected = [mitsuba_scene.environment().eval(si), emitter.eval(si), bsdf.eval_diffuse_reflectance(si)]
-    np.testing.assert_allclose(
-        [plain.sky, lamp.material.radiance, box.material.reflectance], np.array(expected), rtol=1e-6
-    )
+    colours = [plain.sky, lamp.material.radiance, box.material.reflectance]
+    np.testing.assert_allclose(colours, np.array(expected), rtol=1e-6)
 
 
 @pytest.mark.parametrize("size", [1e-7, 1e-3, 1e3, 1e6, 1e12])

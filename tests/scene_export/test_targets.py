@@ -322,9 +322,8 @@ def test_glass_with_inward_normals_is_exported_as_the_same_glass(target):
     vertices, faces = tessellation.sphere(1)
     outward = Mesh("ball", vertices, faces, Glass(1.5, 1.0))
     inward = Mesh("ball", vertices, faces[:, ::-1], Glass(1.0, 1.5))
-    exports = [
-        targets.TARGETS[target](PlainScene("ball", (mesh,), (1.0, 1.0, 1.0), CAMERA, 8)) for mesh in (outward, inward)
-    ]
+    scenes = (PlainScene("ball", (mesh,), (1.0, 1.0, 1.0), CAMERA, 8) for mesh in (outward, inward))
+    exports = [targets.TARGETS[target](scene) for scene in scenes]
     assert exports[0] == exports[1]
 
 

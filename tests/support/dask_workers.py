@@ -50,10 +50,8 @@ def tls_settings(security: Any) -> dict[str, str]:
 @contextlib.contextmanager
 def program(*words: str, security: Any) -> Iterator[subprocess.Popen[bytes]]:
     """Run `dask WORDS` with TLS settings in its environment; kill it on exit."""
-    variables = {
-        "DASK_" + name.upper().replace(".", "__").replace("-", "_"): value
-        for name, value in tls_settings(security).items()
-    }
+    settings = tls_settings(security).items()
+    variables = {"DASK_" + name.upper().replace(".", "__").replace("-", "_"): value for name, value in settings}
     process = subprocess.Popen(
         [sys.executable, "-m", "dask", *words, "--no-dashboard"],
         env=ENVIRONMENT | variables,

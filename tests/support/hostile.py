@@ -17,6 +17,5 @@ def shows_more_than_text(form: str, allowed: str = "\n") -> list[str]:
     A GitHub runner executes `##[` anywhere in a line, and `::` at the beginning of a line, after spaces.
     """
     characters = sorted({*form} & {*BIDI, *CONTROLS, "\u2028", "\u200b", "\uffff", "\udcff"} - {*allowed})
-    return characters + [
-        line for line in form.split("\n") if "##[" in line or "##vso[" in line or line.lstrip()[:2] == "::"
-    ]
+    lines = (x for x in form.split("\n") if "##[" in x or "##vso[" in x or x.lstrip()[:2] == "::")
+    return [*characters, *lines]

@@ -185,9 +185,8 @@ def luxcore(folder, monkeypatch):
             material = f"scene.materials.{properties[f'scene.objects.{name}.material']}"
             scene.triangles[name] = ply(folder / file)
             if properties[f"{material}.type"] == "glass":
-                scene.indices[name] = (
-                    properties[f"{material}.interiorior"][0] / properties[f"{material}.exteriorior"][0]
-                )
+                inside, outside = (properties[f"{material}.{side}ior"][0] for side in ("interior", "exterior"))
+                scene.indices[name] = inside / outside
             elif f"{material}.emission" in properties:
                 scene.lights[name] = properties[f"{material}.emission"]
             else:
@@ -274,9 +273,7 @@ def cycles(folder, monkeypatch):
     for name, settings in data.lights.made.items():
         item, sun = data.objects.made[name], settings.kind == "SUN"
         assert item.data is settings and (settings.angle if sun else settings.shadow_soft_size) == 0
-        colour = np.multiply(settings.color, settings.energy) / (
-            1 if sun else 4 * np.pi
-        )  # W/m², or W in all directions
+        colour = np.multiply(settings.color, settings.energy) / (1 if sun else 4 * np.pi)  # W/m², or W
         position = None if sun else item.matrix_world[:3, 3]
         result.lamps[name] = lamp(colour, position, -item.matrix_world[:3, 2] if sun else None)
     for name, mesh in data.meshes.made.items():
@@ -296,9 +293,8 @@ def cycles(folder, monkeypatch):
             assert tree.source(surface, 0)[1] == "Backfacing"
             (front, _), (back, _) = (tree.source(surface, i) for i in (1, 2))
             assert (front.kind, back.inputs["Color"].default_value[:3]) == ("ShaderNodeEmission", (0, 0, 0))
-            result.lights[name] = (
-                np.array(front.inputs["Color"].default_value[:3]) * front.inputs["Strength"].default_value
-            )
+            inputs = front.inputs
+            result.lights[name] = np.array(inputs["Color"].default_value[:3]) * inputs["Strength"].default_value
     return result
 
 

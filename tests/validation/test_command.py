@@ -354,11 +354,7 @@ NAMED = {
     "caustics by others": [*caustic_energies.RENDERERS],
     "standard numbers": [*NUMBERS],
     "standard numbers by others": [
-        *(
-            number.name
-            for number in [*by_others.of_kind(*by_others.RAYS, "index"), *by_others.plates()]
-            if "glTF" not in number.name
-        ),
+        *(x.name for x in [*by_others.of_kind(*by_others.RAYS, "index"), *by_others.plates()] if "glTF" not in x.name),
         *(call.title for name, system in SYSTEMS.items() if name != "mi_refract" for call in system.calls),
         *(title for title in IMAGE_RENDERERS if title not in by_others.NOT_ASKED),
     ],

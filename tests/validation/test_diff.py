@@ -142,9 +142,7 @@ def test_a_side_that_does_not_know_its_noise_is_seen(defect, monkeypatch):
 def test_a_wrong_minimum_detectable_difference_fails_in_every_profile(factor, broken, monkeypatch):
     right = tile_statistics.TileTests.minimum_detectable
     monkeypatch.setattr(welch_nulls, "POWER", {"variances": ((64, 64),)})
-    monkeypatch.setattr(
-        tile_statistics.TileTests, "minimum_detectable", lambda self, level=0: factor * right(self, level)
-    )
+    monkeypatch.setattr(tile_statistics.TileTests, "minimum_detectable", lambda x, level=0: factor * right(x, level))
     (row,) = welch_nulls.power_rows(min(welch_nulls.PLANTED.values()))
     assert row.broken.keys() == broken | ({"missed at half"} if "missed" in broken else set())
 

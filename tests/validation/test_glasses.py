@@ -181,10 +181,7 @@ def test_wrong_traces_and_other_indices_are_told_apart():
         assert list(broken(traced(rays)).values()) == [{ERROR_OVER_BOUND}] * 4
     indices = known * [[1], [1 + 1e-8]]  # F2 of another maker, traced correctly
     own = [
-        [
-            [float(crossing(LENS, (1.0, *n, 1.0), height, exact_lens.START).place), 0.0, 1.0, 0.1]
-            for height in lenses.HEIGHTS
-        ]
+        [[float(crossing(LENS, (1.0, *n, 1.0), h, exact_lens.START).place), 0.0, 1.0, 0.1] for h in lenses.HEIGHTS]
         for n in indices.T
     ]
     rows = traced(own_glasses=np.array(own), indices=indices)

@@ -24,9 +24,8 @@ def case_of(name, rays):
 
 
 def as_paths(exact, **changes):
-    return Paths(
-        **{"points": exact.points, "directions": exact.directions, "hits": exact.hits, "events": exact.events} | changes
-    )
+    known = {name: getattr(exact, name) for name in ("points", "directions", "hits", "events")}
+    return Paths(**known | changes)
 
 
 def judged(paths, case, u=2.0**-53):

@@ -78,9 +78,8 @@ def test_packs_are_reproducible_and_writing_reports_progress(archive, tmp_path, 
     out, err = capfd.readouterr()
     assert f"{path}: " in out and re.findall(r"(\d+) of (\d+): scene", err) == [("4", "6"), ("5", "6"), ("6", "6")]
     entries = zipfile.ZipFile(path).infolist()
-    assert {x.date_time for x in entries} == {(1980, 1, 1, 0, 0, 0)} and entries == sorted(
-        entries, key=lambda x: x.filename
-    )
+    assert {x.date_time for x in entries} == {(1980, 1, 1, 0, 0, 0)}
+    assert entries == sorted(entries, key=lambda x: x.filename)
 
 
 def test_every_file_has_a_digest_and_every_json_a_schema(unpacked):
@@ -144,11 +143,8 @@ def test_the_c_program_judges_as_rays_check_does(pack, run, precision, mistake):
     assert (wrong, within, right) == (ours["wrong"], 104 - ours["wrong"] - ours["right"], ours["right"])
     # Rays and certified answers of different sets or numbers fail.
     Path("few.csv").write_text("".join(Path(f"rays/{precision}.csv").read_text().splitlines(keepends=True)[:40]))
-    for names in (
-        ("rays/f32.csv", "README.md"),
-        ("README.md", "README.md"),
-        ("few.csv", f"rays/certified-{precision}.csv"),
-    ):
+    readme, certified = "README.md", f"rays/certified-{precision}.csv"
+    for names in (("rays/f32.csv", readme), (readme, readme), ("few.csv", certified)):
         assert subprocess.run([program, *names], capture_output=True).returncode == 1
 
 
@@ -215,11 +211,8 @@ def test_results_name_pack_and_answers_and_are_reproducible(pack, answers, run):
     again = json.loads(Path("r.json").read_text())
     assert (again["functions"][0]["answers_sha256"], again["pack"]) == (digest, rays["pack"])
     shutil.copy("rays/f64.csv", pack.parent)
-    for path, expected in (
-        (pack.parent / "f64.csv", None),
-        ("../f64.csv", None),
-        ("images/../rays/f64.csv", rays["pack"]),
-    ):
+    inside = "images/../rays/f64.csv", rays["pack"]
+    for path, expected in ((pack.parent / "f64.csv", None), ("../f64.csv", None), inside):
         assert run("rays", "check", "answers.csv", "--rays", path, "--json", "r.json")[0] == 0
         assert json.loads(Path("r.json").read_text())["pack"] == expected
 
@@ -247,9 +240,7 @@ BAD = {  # error message → the defect
         INDEX, lambda text: text.replace(b"mi_refract pack 1", b"mi_refract pack 2")
     ),
     f"{INDEX}: files[...]: ": edited(INDEX, lambda text: text.replace(b'"sha256"', b'"sha1"', 1)),
-    f"{SUMS}: not the digests of {INDEX}": edited(
-        INDEX, lambda text: text.replace(b'"quick": true', b'"quick": false')
-    ),
+    f"{SUMS}: not the digests of {INDEX}": edited(INDEX, lambda x: x.replace(b'"quick": true', b'"quick": false')),
     "answers to another pack: ": of_another_pack,
 }
 

@@ -44,10 +44,8 @@ NOT_DRAWN = [(environments.Unable("no browser"), "not run"), (environments.Broke
 
 def denser(plain):
     """The scene with another index of its glass."""
-    glasses = [
-        dataclasses.replace(x.material, int_ior=2.0) if isinstance(x.material, Glass) else x.material
-        for x in plain.meshes
-    ]
+    materials = (mesh.material for mesh in plain.meshes)
+    glasses = [dataclasses.replace(x, int_ior=2.0) if isinstance(x, Glass) else x for x in materials]
     meshes = (dataclasses.replace(mesh, material=glass) for mesh, glass in zip(plain.meshes, glasses, strict=True))
     return dataclasses.replace(plain, meshes=tuple(meshes))
 

@@ -81,9 +81,8 @@ def test_a_loss_far_below_the_noise_is_detected(small):
 def test_images_without_noise_are_compared_without_a_statistical_test(small):
     """The furnace has no noise: no Welch test, but a wrong image fails. Images with NaN need the test."""
     mi.register_bsdf("refract_tinted", tinted)
-    right, wrong = (
-        against_dielectric._compare(small, SCENES / "furnace.xml", p)[0] for p in ("refract", "refract_tinted")
-    )
+    furnace = SCENES / "furnace.xml"
+    right, wrong = (against_dielectric._compare(small, furnace, p)[0] for p in ("refract", "refract_tinted"))
     assert right.verdict == "pass" and right.reason.startswith("left out: Welch's test")
     assert "Welch alarms" not in right.values and not right.curves
     assert not right.images and wrong.images  # an image of one colour is not shown
@@ -153,9 +152,8 @@ def test_a_plugin_that_computes_unused_features_is_detected(context, monkeypatch
 
     mi.register_bsdf("refract", type("Planted", (plugin,), {"sample": sample}))  # in this variant only
     try:
-        rows = unused_features.operation_rows(
-            dataclasses.replace(context, variants=dict.fromkeys(context.variants, "no"))
-        )
+        absent = dataclasses.replace(context, variants=dict.fromkeys(context.variants, "no"))
+        rows = unused_features.operation_rows(absent)
     finally:
         refract.register(mi.llvm_ad_rgb)
     assert (by_case(rows)["polarised"].verdict, by_case(rows)["polarised"].reason) == ("not run", "no")
@@ -401,9 +399,8 @@ def test_the_bias_of_a_sampler_is_detected_and_refract_path_has_none(llvm_varian
 # Media ----------------------------------------------------------------------------------------------------------------
 
 
-READS = pytest.mark.skipif(
-    any(find_spec(name) is None for name in catalogs.READERS), reason="no opticalglass: bash .ci/setup dev"
-)
+NO_READER = any(find_spec(name) is None for name in catalogs.READERS)
+READS = pytest.mark.skipif(NO_READER, reason="no opticalglass: bash .ci/setup dev")
 HERE = Context(PROFILES["quick"], Path(), "llvm_ad_rgb", backend.detect(), backend.usable_variants())
 GLASS = "cauchy(1.5046, 4200)"
 
