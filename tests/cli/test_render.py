@@ -116,6 +116,8 @@ def test_default_variant_is_the_best(render, scene, monkeypatch, needs_variant, 
     assert err == ("" if usable else note)
 
 
+NO_FILM = SCENE.replace("<rfilter", '<integer name="crop_width" value="0"/><rfilter')
+NO_SAMPLES = SCENE.replace('name="sample_count" value="4"', 'name="sample_count" value="0"')
 BAD = {
     "no scene": ({"scene": "none.xml"}, (), "none.xml: no such scene file"),
     "no checkout": ({"scene": "sphere.xml"}, (), f"no such scene file; the package has {SCENES / 'sphere.xml'}"),
@@ -146,16 +148,8 @@ BAD = {
     "a BSDF": ('<bsdf version="3.0.0" type="dielectric"/>', (), "contains a BSDF; expected a <scene>"),
     "no sensor": ('<scene version="3.0.0"/>', (), "the scene has no sensor"),
     "no integrator": (re.sub("<integrator.*/integrator>", "", SCENE), (), "scene.xml: the scene has no integrator"),
-    "a film without pixels": (
-        SCENE.replace("<rfilter", '<integer name="crop_width" value="0"/><rfilter'),
-        (),
-        "scene.xml: a film of 0 × 6 pixels; expected 1 to",
-    ),
-    "a scene without samples": (
-        SCENE.replace('name="sample_count" value="4"', 'name="sample_count" value="0"'),
-        (),
-        "scene.xml: the sampler's sample_count = 0; expected 1 or more, or --spp",
-    ),
+    "a film without pixels": (NO_FILM, (), "scene.xml: a film of 0 × 6 pixels; expected 1 to"),
+    "a scene without samples": (NO_SAMPLES, (), "the sampler's sample_count = 0; expected 1 or more, or --spp"),
     "empty": ("", (), "scene.xml"),
 }
 

@@ -64,10 +64,8 @@ def test_scenes_are_listed_with_their_titles(run):
     code, out, err = run("scene", "list")
     lines = out.splitlines()
     assert (code, err, lines[0]) == (0, "", f"in {SCENES}:")
-    assert {line.split()[0] for line in lines[1:]} == {
-        *(path.stem for path in SCENES.glob("*.xml")),
-        *(f"planar/{path.name}" for path in SCENES.glob("planar/*.toml")),
-    }
+    names = {x.stem for x in SCENES.glob("*.xml")} | {f"planar/{x.name}" for x in SCENES.glob("planar/*.toml")}
+    assert {line.split()[0] for line in lines[1:]} == names
     assert any(line.split(None, 1) == ["sphere", "A glass ball on a checkerboard"] for line in lines)
     assert all(len(line.split(None, 1)) == 2 for line in lines)
 

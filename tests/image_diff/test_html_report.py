@@ -81,10 +81,8 @@ def test_failures_come_first_with_numbers_and_commands_and_markup_is_escaped(tmp
     order = [text.index(place) for place in places]
     assert order == sorted(order)
     numbers = ('<td class="fail">12</td><td class="limit">&gt; 0', "≰ 1", "1e-9", "0.013", "≤ 1e-3")
-    causes = [
-        f'data-filter="{cause}">{cause}: <b>1</b> image<'
-        for cause in ("could not be compared", "tiles that differ", "removed")
-    ]
+    names = "could not be compared", "tiles that differ", "removed"
+    causes = [f'data-filter="{cause}">{cause}: <b>1</b> image<' for cause in names]
     for words in (*numbers, *causes, "1 &amp; 2", "12 tiles differ.", "p-value", "mi-refract diff a b"):
         assert words in text, words
     all_results = results(tmp_path)

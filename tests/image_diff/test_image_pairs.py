@@ -258,10 +258,7 @@ WRONG = {
     "a small lamp is dimmed": (("flip",), lambda rng: (lamp(1e3), lamp(10.0))),
     "a small lamp glows": (("flip",), lambda rng: (lamp(0.5), lamp(5e3))),
     **{
-        f"{what}, variance {variance:g}": (
-            ("welch", "auto"),
-            lambda rng, sides=sides, variance=variance: claimed(rng, *sides, variance),
-        )
+        f"{what}, variance {variance:g}": (("welch", "auto"), lambda rng, x=sides, v=variance: claimed(rng, *x, v))
         for variance in (0.0, 1.0, 1e2, 1e6)
         for what, sides in {
             "20 pixels are lit": (lit(), lit(20), RIGHT),
@@ -341,12 +338,8 @@ def right(method, seed=0):
             other = of(pixels[..., ::step], picture.channels[::step])
             same = np.array_equal(pixels, picture.pixels) or nan
             blind = (method, name) in BLIND and not same
-            yield (
-                f"{name}: {change}",
-                (image(picture, pixels if nan else None), other),
-                {"allow_nonfinite": nan},
-                {INCONCLUSIVE} if blind else {EQUAL},
-            )
+            pair = image(picture, pixels if nan else None), other
+            yield f"{name}: {change}", pair, {"allow_nonfinite": nan}, {INCONCLUSIVE} if blind else {EQUAL}
 
 
 @pytest.mark.parametrize("method", METHODS)

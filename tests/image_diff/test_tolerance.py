@@ -127,7 +127,8 @@ SIX = FLAT.copy()  # 6 of 600 pixels differ, one of them by more
 SIX[3, :6, 1] += 0.02
 SIX[3, 4, 1] += 0.03
 AT = "at x = 4, y = 3, channel G"
-DIFFER = "1 % of the pixels (6 of 600) differ by more than fail = 0.01"
+DIFFER, LARGE = "1 % of the pixels (6 of 600) differ by more than fail = 0.01", "largest difference 0.05"
+HARD, FEW, OVER = {"hard_fail": 0.03}, {"fail_relative": 0.03, "allow_failures": 6}, f"{LARGE} > hard_fail = 0.03 {AT}"
 WARNING = (
     "0.167 % of the pixels (1 of 600) differ by more than warn = 0.03 (> warn_percent = 0); "
     "largest difference 0.05 > hard_warn = 0.04"
@@ -139,30 +140,10 @@ WARN = {"fail_percent": 1.0, "warn": 0.03, "hard_warn": 0.04}
     "options, verdict, reason, warning",
     [
         ({"fail_percent": 0.5}, DIFFERENT, f"{DIFFER} (> fail_percent = 0.5); largest difference 0.05 {AT}", ""),
-        (
-            {"fail_percent": 1, "hard_fail": 0.03},
-            DIFFERENT,
-            f"largest difference 0.05 > hard_fail = 0.03 {AT}; {DIFFER} (≤ fail_percent = 1)",
-            "",
-        ),
-        (
-            {"allow_failures": 5, "hard_fail": 0.03},
-            DIFFERENT,
-            f"{DIFFER} (> fail_percent = 0, allow_failures = 5); largest difference 0.05 > hard_fail = 0.03 {AT}",
-            "",
-        ),
-        (
-            {"fail_relative": 0.03, "allow_failures": 6, "hard_fail": 0.03},
-            EQUAL,
-            f"{DIFFER}, fail_relative = 0.03 (≤ allow_failures = 6); largest difference 0.05 {AT}",
-            "",
-        ),
-        (
-            {"fail": 0.1, "hard_fail": 0.03},
-            EQUAL,
-            f"no pixel of 600 differs by more than fail = 0.1; largest difference 0.05 {AT}",
-            "",
-        ),
+        (HARD | {"fail_percent": 1}, DIFFERENT, f"{OVER}; {DIFFER} (≤ fail_percent = 1)", ""),
+        (HARD | {"allow_failures": 5}, DIFFERENT, f"{DIFFER} (> fail_percent = 0, allow_failures = 5); {OVER}", ""),
+        (HARD | FEW, EQUAL, f"{DIFFER}, fail_relative = 0.03 (≤ allow_failures = 6); {LARGE} {AT}", ""),
+        (HARD | {"fail": 0.1}, EQUAL, f"no pixel of 600 differs by more than fail = 0.1; {LARGE} {AT}", ""),
         ({"allow_failures": 300}, EQUAL, f"{DIFFER} (≤ allow_failures = 300); largest difference 0.05 {AT}", ""),
         (WARN, EQUAL, f"{DIFFER} (≤ fail_percent = 1); largest difference 0.05 {AT}", WARNING),
         (WARN | {"warn_percent": 0.2, "hard_warn": 0.06}, EQUAL, f"{DIFFER} (≤ fail_percent = 1); largest", ""),

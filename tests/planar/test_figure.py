@@ -214,11 +214,8 @@ def test_rays_that_do_not_converge_have_no_focus():
     """A fan from the centre of a ball, and rays that are parallel or cross in many places behind a slab."""
     fan = np.array([(1, y) for y in np.linspace(-0.3, 0.3, 9)])
     crossing = np.array([(1, y) for y in (0.2, -0.1, 0.3, -0.3)])
-    for unfocused in (
-        scene(ball(1.5), np.zeros((9, 2)), fan),
-        scene(GLASS, beam(5, 1.0), (1, 0)),
-        scene(GLASS, beam(4, 1.0), crossing),
-    ):
+    scenes = (ball(1.5), np.zeros((9, 2)), fan), (GLASS, beam(5, 1.0), (1, 0)), (GLASS, beam(4, 1.0), crossing)
+    for unfocused in (scene(*parts) for parts in scenes):
         assert not len(focal_points.foci(unfocused, follow_scene(unfocused)))
 
 

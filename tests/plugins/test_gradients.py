@@ -259,12 +259,8 @@ def test_prb_projective_equals_prb_if_no_edge_moves(variant):
 # Frozen --------------------------------------------------------------------------------------------------------------
 
 
-STEPS = [
-    (NUMBER, {"eta": 1.4}),
-    (NUMBER, {"eta": 1.4, "specular_transmittance": 0.6}),
-    (TEXTURE, {"color0": 1.35}),
-    (DISPERSIVE, {"int_ior_A": 1.45}),
-]
+STEPS = [(NUMBER, {"eta": 1.4}), (NUMBER, {"eta": 1.4, "specular_transmittance": 0.6})]
+STEPS += [(TEXTURE, {"color0": 1.35}), (DISPERSIVE, {"int_ior_A": 1.45})]
 
 
 @pytest.mark.parametrize("integrator", ["refract_path", "path"])

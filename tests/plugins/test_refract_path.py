@@ -137,10 +137,8 @@ def test_hidden_lamps_in_a_row_are_looked_past(shape, rgb_variant):
     wall = {"type": "rectangle", "to_world": PLACE().translate([0, 0, -2]).scale(4)}
     bulb = {"type": "point", "position": [3, 0, 0], "intensity": 9.0}
     scene = mi.load_dict({"type": "scene", "sensor": camera(4, 12), "wall": wall, "bulb": bulb} | parts)
-    theirs, ours = (
-        [method(scene, 16, first + i, max_depth=2, hide_emitters=True) for i in range(8)]
-        for method, first in ((by_path, 0), (render, 100))
-    )
+    ways = (by_path, 0), (render, 100)
+    theirs, ours = ([f(scene, 16, first + i, max_depth=2, hide_emitters=True) for i in range(8)] for f, first in ways)
     assert np.mean(theirs) > 0.05 and equal_means(theirs, ours)
 
 
@@ -610,10 +608,8 @@ def test_derivatives_off_the_glass_are_those_of_finite_differences(name, llvm_va
     bsdf, end, value = ROUGH[name]
     sheet = {"type": "rectangle", "to_world": PLACE().rotate([1, 0, 0], -30).scale(3), "bsdf": bsdf}
     light = {"type": "rectangle", "emitter": {"type": "area", "radiance": 1.0}}
-    above, below = (
-        light | {"to_world": PLACE().look_at(origin, [0, 0, 0], [1, 0, 0]).scale(0.8)}
-        for origin in ([0, 3.5, 2], [0, 0.5, -4])
-    )
+    places = [0, 3.5, 2], [0, 0.5, -4]
+    above, below = (light | {"to_world": PLACE().look_at(x, [0, 0, 0], [1, 0, 0]).scale(0.8)} for x in places)
     patches = np.random.default_rng(0).random((8, 16, 1)).astype(np.float32) * np.ones(3, np.float32)
     patchy = {"type": "envmap", "bitmap": mi.Bitmap(patches)}  # what a direction meets depends on it
     scene = glass_ball(16, ball=sheet, above=above, below=below, sky=patchy)

@@ -114,13 +114,8 @@ def test_the_errors_of_a_regime_are_right():
     findings = check(rays, changed(answers, rows, turned))
     generic = findings.regimes[0]
     compared = np.concatenate([angle.ravel(), np.zeros(generic.compared - len(rows))])
-    for value, expected in (
-        (generic.worst, 1e-3),
-        (generic.mean, compared.mean()),
-        (generic.p99, np.quantile(compared, 0.99)),
-        (generic.length_error, 0.25),
-    ):
-        assert value == pytest.approx(expected, rel=1e-6)
+    errors = generic.worst, generic.mean, generic.p99, generic.length_error
+    assert errors == pytest.approx((1e-3, compared.mean(), np.quantile(compared, 0.99), 0.25), rel=1e-6)
     assert generic.wrong == findings.wrong == len(rows) and generic.exact == generic.rays - len(rows)
     worst = generic.replay["id"]
     assert worst in rays.ids[rows] and findings.ulp == 2.0**-52
@@ -735,8 +730,6 @@ def test_rays_are_certified_for_the_ratio_that_the_program_used():
     findings = check(rays, Answers(rays.ids, np.where(known.transmitted[:, None], known.direction, 0), n_ratio=ratio))
     assert (findings.exit_code, findings.total("exact")) == (0, len(rays))
     rays = ray_set.make(["critical"], 400, **media_rays.ALL)
-    reporting, without = (
-        check(rays, media_rays.answered(rays, changed_ratios(rays, 1 + 1e-3), said=said), tir="zero")
-        for said in (True, False)
-    )
+    answers = (media_rays.answered(rays, changed_ratios(rays, 1 + 1e-3), said=said) for said in (True, False))
+    reporting, without = (check(rays, x, tir="zero") for x in answers)
     assert (reporting.wrong, reporting.total("tir_beyond_bound")) == (0, 0) and without.total("tir_beyond_bound") > 20

@@ -77,11 +77,8 @@ def test_files_keep_every_bit(tmp_path, precision, ending, options):
     for name in "ank":
         values, expected = getattr(rays_read.rays, name), getattr(rays.rays, name)
         assert (values.tobytes(), values.dtype) == (expected.tobytes(), expected.dtype)
-    assert (rays_read.header, list(rays_read.regime), rays_read.ids.tolist()) == (
-        rays.header,
-        list(rays.regime),
-        list(range(len(rays))),
-    )
+    found = rays_read.header, list(rays_read.regime), rays_read.ids.tolist()
+    assert found == (rays.header, list(rays.regime), list(range(len(rays))))
     np.testing.assert_array_equal(rays_read.numbers, rays.numbers)
     for seed in (5, 6):
         path2 = files.write(tmp_path / f"again.{ending}", ray_set.make(**options | {"seed": seed}, precision=precision))

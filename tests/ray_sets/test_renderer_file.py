@@ -161,10 +161,8 @@ def test_every_function_is_checked_and_reported_and_known_deviations_still_fail(
 def test_a_file_of_rays_is_for_the_functions_of_its_precision(folder, run, tmp_path, precision, option, titles):
     """The program rounds to float32: that is right for the first function, and wrong for the second."""
     functions = {"single": "f32", "double": "f64"}
-    text = "".join(
-        f"[[rays]]\ntitle = '{title}'\nprecision = '{x}'\ncommand = ['{{python}}', 'right.py']\n"
-        for title, x in functions.items()
-    )
+    entry = "[[rays]]\ntitle = '{}'\nprecision = '{}'\ncommand = ['{{python}}', 'right.py']\n"
+    text = "".join(entry.format(*function) for function in functions.items())
     where, rays, data = folder(f"title = 'T'\n{text}"), tmp_path / "rays.csv", tmp_path / "out.json"
     (where / "right.py").write_text(PROGRAM)
     run("rays", "export", "--precision", precision, "--regime", "generic", "--count", 20, "-o", rays)

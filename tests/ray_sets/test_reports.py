@@ -48,7 +48,9 @@ def findings(*regimes, problems=(), explanations=(), tir="zero", tir_given=False
 LARGEST = "the largest error is 3e-7 rad (critical)"
 SOME_RIGHT = f"16 of 20 answers are right, 4 only within the error bound of the formula decomposed; {LARGEST}"
 TWO = regime(), regime("critical", 3e-7)
-MISMATCH = "10 answers, but they do not match the rays"
+UNDECIDABLE = "2 rays are undecidable (error bound above 0.1 rad)"
+MISMATCH, WRONG = "10 answers, but they do not match the rays", "2 of 10 answers are wrong"
+MISMATCH_AND_WRONG = f"{MISMATCH}; 2 of them are wrong"
 NONE_OF_THEM = "none of the common mistakes explains the answers"
 LINE = "eta inverted: k was n_to / n_from (97.0% of the answers on which it has an effect)"
 HANDEDNESS = "handedness: text 0.25 (25.0% of the answers on which it has an effect)"
@@ -62,30 +64,15 @@ NEAREST = f"nearest of the common mistakes, no explanation: {HANDEDNESS}"
         (findings(*TWO), 0, SOME_RIGHT, []),
         (findings(*TWO, regime("k", math.nan, rays=0, compared=0, judged=0, right=0)), 0, SOME_RIGHT, []),
         (findings(*(replace(x, right=10) for x in TWO)), 0, f"20 answers, all right; {LARGEST}", []),
-        (
-            findings(regime(undecidable=2), TWO[1]),
-            0,
-            f"{SOME_RIGHT}; 2 rays are undecidable (error bound above 0.1 rad)",
-            [],
-        ),
+        (findings(regime(undecidable=2), TWO[1]), 0, f"{SOME_RIGHT}; {UNDECIDABLE}", []),
         (findings(regime(exact=10)), 0, "10 answers, all exact up to rounding", []),
-        (findings(regime(wrong=2), explanations=(NEVER,)), 1, "2 of 10 answers are wrong", [NONE_OF_THEM]),
+        (findings(regime(wrong=2), explanations=(NEVER,)), 1, WRONG, [NONE_OF_THEM]),
         (findings(regime(), tir=UNCLEAR), 1, "0 of 10 answers are wrong", []),
-        (
-            findings(regime(wrong=2), explanations=(LIKELY, CERTAIN)),
-            1,
-            "2 of 10 answers are wrong: eta inverted",
-            [LINE],
-        ),
-        (findings(regime(wrong=2), explanations=(CERTAIN, CERTAIN)), 1, "2 of 10 answers are wrong", [LINE, LINE]),
-        (findings(regime(wrong=2), explanations=(NEVER, LIKELY)), 1, "2 of 10 answers are wrong", [NEAREST]),
+        (findings(regime(wrong=2), explanations=(LIKELY, CERTAIN)), 1, f"{WRONG}: eta inverted", [LINE]),
+        (findings(regime(wrong=2), explanations=(CERTAIN, CERTAIN)), 1, WRONG, [LINE, LINE]),
+        (findings(regime(wrong=2), explanations=(NEVER, LIKELY)), 1, WRONG, [NEAREST]),
         (findings(regime(), problems=(MISSING,)), 2, MISMATCH, []),
-        (
-            findings(regime(wrong=2), problems=(MISSING,), explanations=(LIKELY,)),
-            2,
-            f"{MISMATCH}; 2 of them are wrong",
-            [],
-        ),
+        (findings(regime(wrong=2), problems=(MISSING,), explanations=(LIKELY,)), 2, MISMATCH_AND_WRONG, []),
         (findings(regime(judged=0)), 1, "10 answers, none with a decidable direction", []),
         (findings(regime(compared=0, judged=0)), 1, "10 answers, none with a direction", []),
     ],

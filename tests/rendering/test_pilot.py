@@ -376,9 +376,8 @@ def test_a_scene_keeps_an_integrator_other_than_path(tmp_path, llvm_variant, int
     """Also the one without noise."""
     flag = '<boolean name="deterministic" value="true"/>' * (integrator == "refract_path")
     own = f'<integrator type="{integrator}">{flag}</integrator>'
-    scene = re.sub("<integrator.*/integrator>", own, GLASS).replace(
-        "</transform></shape>", '</transform><bsdf type="conductor"/></shape>'
-    )
+    mirror = '</transform><bsdf type="conductor"/></shape>'
+    scene = re.sub("<integrator.*/integrator>", own, GLASS).replace("</transform></shape>", mirror)
     (tmp_path / "a.xml").write_text(scene)
     render = resume(Job(tmp_path / "a.xml", settings=AUTO), tmp_path / "a.exr", Limits(spp=4))
     costs = render.progress.identity["pilot"]["costs"]

@@ -43,10 +43,8 @@ def mitsuba_image(scene, number, spp, seed=3):
 
 # Against Mitsuba ------------------------------------------------------------------------------------------------------
 
-CROP = "".join(
-    f'<integer name="crop_{name}" value="{value}"/>'
-    for name, value in {"width": 7, "height": 5, "offset_x": 3, "offset_y": 6}.items()
-)
+CROPPED = {"width": 7, "height": 5, "offset_x": 3, "offset_y": 6}
+CROP = "".join(f'<integer name="crop_{name}" value="{value}"/>' for name, value in CROPPED.items())
 OUTPUTS = (
     ('<film type="hdrfilm">', f'<film type="hdrfilm">{CROP}'),
     (

@@ -205,10 +205,8 @@ def test_rows_that_share_no_metric_have_separate_tables(tmp_path):
 
 
 def test_the_matrix_marks_rows_whose_other_metric_broke(tmp_path):
-    rows = [
-        Row("directions", s, c, "llvm", {"worst": 1e-8, "misjudged": 0.0}, {"misjudged": 0.0})
-        for s, c in itertools.product("abc", "xyz")
-    ]
+    pairs = itertools.product("abc", "xyz")
+    rows = [Row("directions", s, c, "llvm", {"worst": 1e-8, "misjudged": 0.0}, {"misjudged": 0.0}) for s, c in pairs]
     assert '<table class="matrix"' in html(tmp_path, rows)
     assert '<table class="matrix"' not in html(tmp_path, rows[:6])
     rows[4] = dataclasses.replace(rows[4], values={"worst": 1e-8, "misjudged": 7.0})

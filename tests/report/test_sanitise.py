@@ -44,9 +44,8 @@ def results(tmp_path):
     comparison = Comparison("exact", Verdict.DIFFERENT, NAME, (Metric(NAME, 2.0, 1.0),))
     error = Result(NAME, Status.ERROR, tmp_path, tmp_path, how, error=NAME)
     added = Result(NAME, Status.DIFFERENT, None, tmp_path, how)
-    inconclusive, equal = (
-        Result(NAME, status, tmp_path, tmp_path, how, comparison) for status in (Status.INCONCLUSIVE, Status.EQUAL)
-    )
+    statuses = Status.INCONCLUSIVE, Status.EQUAL
+    inconclusive, equal = (Result(NAME, status, tmp_path, tmp_path, how, comparison) for status in statuses)
     all_results = (error, added, inconclusive, equal)
     return Results(tmp_path / "old", tmp_path / NAME.replace("/", ""), all_results, unused=(NAME,))
 

@@ -125,9 +125,8 @@ def run(command, folder, kill=None, number=signal.SIGKILL, size=None):
     words = [word.replace("FOLDER", str(folder)) for word in command.words]
     limit = resource.RLIM_INFINITY if size is None else size
     start = [sys.executable, *(("-c", LIMITED, str(limit)) if size is not None else ()), *words]
-    with subprocess.Popen(
-        start, env=ENVIRONMENT, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
-    ) as process:
+    streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    with subprocess.Popen(start, env=ENVIRONMENT, **streams) as process:
         try:
             if kill is not None:
                 time.sleep(kill)

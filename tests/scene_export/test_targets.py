@@ -100,12 +100,8 @@ def test_existing_files_are_kept_and_an_empty_folder_is_used(tmp_path):
     (tmp_path / "full" / "mine.txt").write_text("mine")
     (tmp_path / "file").write_text("mine")
     before = sorted(tmp_path.rglob("*"))
-    for name, words in (
-        ("full", "already contains files"),
-        ("file", "not a folder"),
-        ("none/below", "not a folder"),
-        ("file/below", "not a f"),
-    ):
+    cases = ("full", "already contains"), ("file", "not a folder"), ("none/below", "not a f"), ("file/below", "not a f")
+    for name, words in cases:
         with pytest.raises(OSError, match=words):
             targets.write(plain(GLASS), "obj+json", tmp_path / name)
     with pytest.raises(ValueError, match=r"'blender': unknown; expected cycles, luxcore, .*, mitsuba, obj\+json"):

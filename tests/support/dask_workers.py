@@ -52,12 +52,8 @@ def program(*words: str, security: Any) -> Iterator[subprocess.Popen[bytes]]:
     """Run `dask WORDS` with TLS settings in its environment; kill it on exit."""
     settings = tls_settings(security).items()
     variables = {"DASK_" + name.upper().replace(".", "__").replace("-", "_"): value for name, value in settings}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "dask", *words, "--no-dashboard"],
-        env=ENVIRONMENT | variables,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
+    command, silent = [sys.executable, "-m", "dask", *words, "--no-dashboard"], subprocess.DEVNULL
+    process = subprocess.Popen(command, env=ENVIRONMENT | variables, stdout=silent, stderr=silent)
     try:
         yield process
     finally:

@@ -16,13 +16,8 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(N
 
 def python(code: str, *arguments: object, **environment: str) -> subprocess.Popen[str]:
     """Start `python -c code arguments` with additional environment variables; its output is text in pipes."""
-    return subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, arguments)],
-        env=ENVIRONMENT | environment,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
+    command, pipe = [sys.executable, "-c", code, *map(str, arguments)], subprocess.PIPE
+    return subprocess.Popen(command, env=ENVIRONMENT | environment, text=True, stdout=pipe, stderr=pipe)
 
 
 def executable(path: Path, text: str) -> None:

@@ -87,11 +87,7 @@ def not_squared(a, n, k):
 
 # Programs by the name of their mistake.
 BAD = {
-    "eta inverted": [
-        lambda a, n, k: glsl(a, n, 1 / k),
-        lambda a, n, k: with_mirror(a, n, 1 / k),
-        lambda a, n, k: with_nan(a, n, 1 / k),
-    ],
+    "eta inverted": [lambda a, n, k, f=f: f(a, n, 1 / k) for f in (glsl, with_mirror, with_nan)],
     "an index ignored": [lambda a, n, k: glsl(a, n, indices(k)[0]), lambda a, n, k: glsl(a, n, 1 / indices(k)[1])],
     "eta not squared": [not_squared],
     "normal flipped": [lambda a, n, k: glsl(a, -n, k), lambda a, n, k: with_mirror(a, -n, k)],

@@ -138,10 +138,8 @@ def test_a_reference_without_a_caustic_fails_and_one_without_expected_light_else
     rng = np.random.default_rng(3)
     references, images = 1 + 0.01 * rng.normal(size=(2, 4, 16, 16, 3))
     some, none = rng.random((16, 16)) < 0.3, np.zeros((16, 16), bool)
-    for pixels, rest_is_lit, passes in (
-        *((some, True, True), (none, True, False), (none, False, False)),
-        *((~none, True, False), (~none, False, True)),
-    ):
+    cases = (some, True, True), (none, True, False), (none, False, False), (~none, True, False), (~none, False, True)
+    for pixels, rest_is_lit, passes in cases:
         detectable = caustics._tested(references, images, pixels, rest_is_lit)[DETECTABLE]
         assert (detectable <= limits.CAUSTIC_DETECTABLE) == passes
 

@@ -153,10 +153,8 @@ def broken(name, subject, lines, setting):
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
     seen = judge_formula(subject, rays, exact, setting.vector, budget_of(name))
     counted = [not setting.no_budget(budget_of(name), line.regime) for line in lines]
-    return [
-        (lines[i].line(), "misjudged" if seen.far[i] else f"{seen.share[i]:.3g} of the bound")
-        for i in np.flatnonzero(seen.wrong & counted).tolist()
-    ]
+    wrong = np.flatnonzero(seen.wrong & counted).tolist()
+    return [(lines[i].line(), "misjudged" if seen.far[i] else f"{seen.share[i]:.3g} of the bound") for i in wrong]
 
 
 def test_every_formula_is_within_its_budget_on_the_worst_rays_and_forms_that_cancel_are_not(setting):

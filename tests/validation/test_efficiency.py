@@ -195,10 +195,8 @@ def test_slow_subjects_are_detected_on_all_backends(tmp_path, variant, monkeypat
     context = Context(profile, tmp_path, variant, backend.detect(), backend.usable_variants())
     on_gpu = dataclasses.replace(context, profile=dataclasses.replace(profile, streamed_rays=1 << 22))
     monkeypatch.setattr(Setting, "subjects", {"decomposed": FORMULAS["decomposed"], "slow": slow})
-    single, double, scalar = (
-        next(x for x in settings(context) if x.label == label)
-        for label in ("llvm float32", "llvm float64", "scalar float64")
-    )
+    labels = "llvm float32", "llvm float64", "scalar float64"
+    single, double, scalar = (next(x for x in settings(context) if x.label == label) for label in labels)
     assert kernel_timing.goals("promoted", single) == {"time / plain": FORMULAS["promoted"].time_goal}
     assert kernel_timing.goals("wedge", double) == {"time / copy": 1 / 0.9}
     for subject, setting in (("promoted", double), ("wedge", scalar), (BUILTIN_KERNEL, single)):

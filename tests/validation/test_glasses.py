@@ -180,10 +180,9 @@ def test_wrong_traces_and_other_indices_are_told_apart():
     for rays in (moved, one, ours.astype(np.float32).astype(float), lost):
         assert list(broken(traced(rays)).values()) == [{ERROR_OVER_BOUND}] * 4
     indices = known * [[1], [1 + 1e-8]]  # F2 of another maker, traced correctly
-    own = [
-        [[float(crossing(LENS, (1.0, *n, 1.0), h, exact_lens.START).place), 0.0, 1.0, 0.1] for h in lenses.HEIGHTS]
-        for n in indices.T
-    ]
+    start = exact_lens.START
+    places = ([float(crossing(LENS, (1.0, *n, 1.0), h, start).place) for h in lenses.HEIGHTS] for n in indices.T)
+    own = [[[x, 0.0, 1.0, 0.1] for x in row] for row in places]
     rows = traced(own_glasses=np.array(own), indices=indices)
     assert broken(rows) == {f"{lenses.OWN}, height {h:g}": {lenses.INDEX_OFF} for h in lenses.HEIGHTS}
     assert all(row.values[lenses.FOCUS_OFF] > 1e-9 for row in rows if row.case.startswith(lenses.OWN))

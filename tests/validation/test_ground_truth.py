@@ -32,10 +32,8 @@ def test_the_exact_path_has_the_closed_answer_and_bounds_are_not_idle(name):
     for _ in range(30):
         shifts = {key: size * optical_systems.unit(rng.normal(size=(len(size), 3))) for key, size in sizes.items()}
         off = system.off(system.path(moved=lambda j, what, x, axis, s=shifts: x + s.get((j, what), 0)))
-        ratios += [
-            optical_systems.length(x - exact[answer])[..., 0] / (case.bounds[answer] - system.printed.get(answer, 0))
-            for answer, x in off.items()
-        ]
+        bounds = {answer: case.bounds[answer] - system.printed.get(answer, 0) for answer in off}
+        ratios += [optical_systems.length(x - exact[answer])[..., 0] / bounds[answer] for answer, x in off.items()]
     assert 0.1 < max(float(x.max()) for x in ratios) < 1
 
 

@@ -34,13 +34,8 @@ def archive(tmp_path_factory):
     if reason := backend.usable_variants()["llvm_ad_rgb"]:
         pytest.skip(f"a pack is rendered in llvm_ad_rgb: {reason}")
     folder = tmp_path_factory.mktemp("packs")
-    done = subprocess.run(
-        [sys.executable, "-m", "validation", *QUICK, folder],
-        cwd=ROOT,
-        env=ENVIRONMENT,
-        capture_output=True,
-        timeout=300,
-    )
+    words = [sys.executable, "-m", "validation", *QUICK, folder]
+    done = subprocess.run(words, cwd=ROOT, env=ENVIRONMENT, capture_output=True, timeout=300)
     assert done.returncode == 0, done.stderr
     (path,) = folder.iterdir()
     return path

@@ -489,10 +489,8 @@ def test_a_users_renderer_is_first_in_the_report(renderer, few, monkeypatch, tmp
     monkeypatch.setitem(command.ROOMS, "suite", ("matrix", "per_ray"))
     assert command.main(["suite", "--renderer", str(folder), "--out", str(out)]) == 1
     document = json.loads((out / "rows.json").read_text())
-    assert list(dict.fromkeys(row["subject"] for row in document["rows"] if row["study"] == "matrix")) == [
-        "Mine, refract, f64",
-        "another program, f64",
-    ]
+    subjects = dict.fromkeys(row["subject"] for row in document["rows"] if row["study"] == "matrix")
+    assert [*subjects] == ["Mine, refract, f64", "another program, f64"]
     first, *others = document["context"]["first_page"]["answers"]
     assert (first["question"], first["state"]) == ("Your renderer: Mine, refract, f64", "yes")
     assert first["text"].startswith("exact only for inputs more than 8 roundings off: k ≫ 1 (")

@@ -322,9 +322,8 @@ def test_verdicts_on_derivatives_do_not_depend_on_the_seed(off, verdict):
         draws = (1 + off) * (1 + 0.03 * rng.normal(size=64)), 1 + 0.01 * rng.normal(size=64)
         assert gradients.judged(draws[0].__getitem__, draws[1].__getitem__, case)[1] == verdict
     edge = replace(case, excluded="an edge moves")
-    assert gradients.judged(draws[0].__getitem__, draws[1].__getitem__, edge)[1] == (
-        verdict if verdict != "biased" else "missing: an edge moves"
-    )
+    expected = verdict if verdict != "biased" else "missing: an edge moves"
+    assert gradients.judged(draws[0].__getitem__, draws[1].__getitem__, edge)[1] == expected
 
 
 def test_parameters_without_derivatives_are_rejected(llvm_variant):

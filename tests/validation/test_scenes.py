@@ -88,10 +88,8 @@ def iors(path):
         props["ior"] = text if p.tag == "string" else float(text)
         return mi.lookup_ior(props, "ior", 1.0)
 
-    media = {
-        b.get("id"): tuple(value(b.find(f"*[@name='{n}']")) for n in ("int_ior", "ext_ior"))
-        for b in root.findall(".//bsdf[@type='$bsdf']")
-    }
+    glasses = root.findall(".//bsdf[@type='$bsdf']")
+    media = {b.get("id"): tuple(value(b.find(f"*[@name='{n}']")) for n in ("int_ior", "ext_ior")) for b in glasses}
     shapes = ((s.get("id"), r.get("id")) for s in root.iter("shape") for r in s.findall("ref"))
     return media, {shape: media[bsdf] for shape, bsdf in shapes if bsdf in media}
 

@@ -129,10 +129,8 @@ def test_a_decided_ray_may_not_turn_although_others_may():
     setting = compiled("float32")
     how = optical_chains.Extent((1000,), ("upright",), 1000, DEGREES, False)
     fed = enter(air(1000), np.array(DEGREES), np.full(7, 1000), UPRIGHT, np.float32).fed("ratios", np.float32)
-    right, wrong = (
-        optical_chains.mirage_row("promoted", subject, "mirage", fed, setting, how)[0]
-        for subject in (promoted, mirrored)
-    )
+    row = optical_chains.mirage_row
+    right, wrong = (row("promoted", x, "mirage", fed, setting, how)[0] for x in (promoted, mirrored))
     assert right.verdict == "pass" and right.values[MISCLASSIFIED] <= wrong.values[MISCLASSIFIED] <= 4
     assert wrong.broken == {MISCLASSIFIED_FAR: 0.0}
 
