@@ -292,9 +292,7 @@ def test_no_reference_is_written_through_a_link_to_a_folder(run, folders, tmp_pa
 
 @pytest.mark.parametrize("count", [2, 12])
 @pytest.mark.parametrize("by_json", [False, True])
-def test_after_an_error_replaced_files_are_listed_and_a_second_call_finishes(
-    run, tmp_path, monkeypatch, count, by_json
-):
+def test_after_an_error_replaced_files_are_listed_and_another_call_finishes(run, tmp_path, monkeypatch, count, by_json):
     old, new, out = tmp_path / "old", tmp_path / "new", tmp_path / "out.json"
     for i in range(count):
         image(old / f"{i:02}.exr")

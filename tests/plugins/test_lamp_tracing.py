@@ -553,9 +553,7 @@ def test_no_lamps_are_traced_where_a_sensor_outside_the_scene_is_differentiated(
         ("area", None, 16, "path"),
     ],
 )
-def test_by_default_lamps_are_traced_that_path_tracing_cannot_find(
-    lamp, differentiated, max_depth, means, llvm_variant
-):
+def test_by_default_lamps_are_traced_that_paths_cannot_find(lamp, differentiated, max_depth, means, llvm_variant):
     parts = {"lamp": point()} if lamp == "point" else {}
     images = []
     for parameters in ({}, {"caustics": means}):

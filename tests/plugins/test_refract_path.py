@@ -35,9 +35,7 @@ def by_path(scene, spp=16, seed=0, **parameters):
 
 
 @pytest.mark.parametrize(("name", "parameters"), [("sphere", {}), ("nested", {"max_depth": 6, "rr_depth": 1})])
-def test_where_nothing_is_left_out_the_numbers_and_the_image_are_those_of_path(
-    name, parameters, each_variant, monkeypatch
-):
+def test_where_nothing_is_left_out_numbers_and_image_are_those_of_path(name, parameters, each_variant, monkeypatch):
     """With Russian roulette and emitter sampling both integrators draw the same numbers in the same order."""
     if name == "nested" and not each_variant.endswith("rgb"):
         pytest.skip("RGB variants stand for the others")

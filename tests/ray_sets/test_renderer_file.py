@@ -118,9 +118,7 @@ INVERTED = PROGRAM.replace("rows[:, 7:8] / rows[:, 8:9]", "rows[:, 8:9] / rows[:
         (("right",), "auto", ("--", "true"), 2),
     ],
 )
-def test_every_function_is_checked_and_reported_and_known_deviations_still_fail(
-    folder, run, tmp_path, programs, signal, option, expected
-):
+def test_every_function_is_checked_and_known_deviations_fail(folder, run, tmp_path, programs, signal, option, expected):
     """The functions signal total internal reflection by zeros."""
     text = "title = 'T'\n"
     for i, name in enumerate(programs):

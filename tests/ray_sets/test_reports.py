@@ -20,16 +20,8 @@ from mi_refract.ray_sets.diagnosis import Explanation
 from mi_refract.ray_sets.ray_set import Answers
 from mi_refract.ray_sets.tir_signal import NONE, UNCLEAR
 
-ERRORS = (
-    "p99",
-    "mean",
-    "length_error",
-    "error_over_bound",
-    "backward_median",
-    "backward_p99",
-    "backward_worst",
-    "backward_length",
-)
+ERRORS = ("p99", "mean", "length_error", "error_over_bound")
+ERRORS += ("backward_median", "backward_p99", "backward_worst", "backward_length")
 MISSING = Problem("missing", 3, "ids 1, 5, 8")
 CERTAIN = Explanation("eta inverted", "k was n_to / n_from", 0.97, 1e-3, True)
 LIKELY, NEVER = (Explanation("handedness", f"text {share}", share, math.nan, False) for share in (0.25, 0.0))

@@ -586,9 +586,7 @@ GROWING = {"defines": {"res": "64"}, "until": 1e-4, "spp": 100}  # passes of 8, 
         (GROWING, GROWING, 100),
     ],
 )
-def test_the_last_pass_is_kept_if_the_image_cannot_be_written(
-    tmp_path, llvm_variant, monkeypatch, limits, resumed, kept
-):
+def test_the_last_pass_is_kept_if_no_image_can_be_written(tmp_path, llvm_variant, monkeypatch, limits, resumed, kept):
     output = tmp_path / "a.exr"
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
         patch.setattr(rendered_file, "write", write_to_full_disk)

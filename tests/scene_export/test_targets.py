@@ -167,9 +167,7 @@ SCENE = """<scene version="3.0.0">
     [(COLOUR, MAP), (TURNED, MAP), (TURNED, MAP[:2, :1].repeat(8, 1))],
     ids=["colour", "map", "zenith and horizon"],
 )
-def test_an_export_has_mitsubas_rays_surfaces_indices_lights_and_sky(
-    target, sky, pixels, tmp_path, monkeypatch, scalar_variant
-):
+def test_an_export_has_mitsubas_rays_surfaces_lights_sky(target, sky, pixels, tmp_path, monkeypatch, scalar_variant):
     """Mitsuba's rays are in float32: each of its transforms has an error of a few roundoffs.
 
     Triangles are counterclockwise from outside; an index is the index inside over that outside. A map of the sky is

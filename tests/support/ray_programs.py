@@ -115,13 +115,13 @@ BAD = {
 }
 
 
-def _with_root(radicand, tangent):
-    """Return b = k t − √R n for a radicand R and a tangent t, both functions of (a, n, k, n·a, n × a)."""
+def _with_root(radicand):
+    """Return b = k (n × a) × n − √R n for a radicand R, a function of (a, n, k, n·a, n × a)."""
 
     def refract(a, n, k):
-        terms = a, n, k[:, None], dot(n, a), np.cross(n, a)
-        r = radicand(*terms)
-        return np.where(r < 0, 0, k[:, None] * tangent(*terms) - np.sqrt(np.maximum(r, 0)) * n).astype(a.dtype)
+        k, w = k[:, None], np.cross(n, a)
+        r = radicand(a, n, k, dot(n, a), w)
+        return np.where(r < 0, 0, k * np.cross(w, n) - np.sqrt(np.maximum(r, 0)) * n).astype(a.dtype)
 
     return refract
 
@@ -147,11 +147,9 @@ def rotated(a, n, k):
 
 # The documented formulas in numpy.
 FORMULAS = {
-    "wedge": _with_root(lambda a, n, k, c, w: dot(a, a) - k * k * dot(w, w), lambda a, n, k, c, w: np.cross(w, n)),
-    "wedge_contrast": _with_root(
-        lambda a, n, k, c, w: c * c - (k * k - 1) * dot(w, w), lambda a, n, k, c, w: np.cross(w, n)
-    ),
-    "cross": _with_root(lambda a, n, k, c, w: 1 - dot(k * w, k * w), lambda a, n, k, c, w: np.cross(w, n)),
+    "wedge": _with_root(lambda a, n, k, c, w: dot(a, a) - k * k * dot(w, w)),
+    "wedge_contrast": _with_root(lambda a, n, k, c, w: c * c - (k * k - 1) * dot(w, w)),
+    "cross": _with_root(lambda a, n, k, c, w: 1 - dot(k * w, k * w)),
     "decomposed": glsl,
     "rotated": rotated,
 }

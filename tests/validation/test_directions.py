@@ -215,9 +215,7 @@ def test_small_mistakes_are_seen_where_they_matter_and_fail_where_they_are_not(p
 
 
 @pytest.mark.parametrize(("constant", "factor"), [("linear", 6), ("radicand", 6), ("linear", 1), ("linear", 0.2)])
-def test_a_budget_that_is_loose_or_too_tight_fails_the_full_sweep(
-    constant, factor, scalar_context, replace, monkeypatch
-):
+def test_a_loose_or_too_tight_budget_fails_the_full_sweep(constant, factor, scalar_context, replace, monkeypatch):
     monkeypatch.setattr(limits, "SLACK_FROM_RAYS", 60)
     budget, setting = FORMULAS["decomposed"].budget, settings(scalar_context())[0]
     replace("decomposed", budget=dataclasses.replace(budget, **{constant: factor * getattr(budget, constant)}))

@@ -243,9 +243,7 @@ def test_a_detectable_difference_is_detected_with_probability_one_half():
     ("pixel", "second_stop", "broken"),
     [(1.001, 16, set()), (math.nan, 16, {"beyond", "outside"}), (1.001, 12, {rendering_passes.ALIKE})],
 )
-def test_renders_in_passes_without_a_number_or_a_choice_of_the_stop_fail(
-    context, monkeypatch, pixel, second_stop, broken
-):
+def test_renders_in_passes_without_a_number_or_a_choice_of_stop_fail(context, monkeypatch, pixel, second_stop, broken):
     def resume(job, *_, **__):
         render = mock.Mock(image=lambda: np.full((2, 2, 3), 1.0 if job.seed >= 2**31 else pixel))
         render.error.return_value = mock.Mock(value=1e-3, low=0.5e-3, high=2e-3)
