@@ -89,6 +89,12 @@ def tiles(loaded, spp, seeds):
     return np.c_[each, each.mean(1)]
 
 
+def both_ways(parts, spp, **integrator):
+    """The tiles by path tracing and by lamp tracing, of 16 seeds each."""
+    ways = ("path", 0), ("lamp", 100)
+    return [tiles(scene(parts, caustics=x, **integrator), spp, range(first, first + 16)) for x, first in ways]
+
+
 def difference(a, b):
     """The largest |t| of the tiles over its quantile where both have the same means."""
     from scipy import stats
@@ -212,11 +218,7 @@ def test_lamp_tracing_has_the_image_of_path_tracing(name, llvm_variant, tmp_path
     parts, integrator = AGREE[name]
     if "bsdf" in parts:
         parts = {"ball": polyhedron(tmp_path) | {"bsdf": parts["bsdf"]}}
-    images = [
-        tiles(scene(parts, caustics=caustics, **integrator), 144, range(first, first + 16))
-        for caustics, first in (("path", 0), ("lamp", 100))
-    ]
-    assert difference(*images) < 1
+    assert difference(*both_ways(parts, 144, **integrator)) < 1
 
 
 def test_a_lamp_with_a_moved_texture_within_d65_has_the_image_of_path_tracing(llvm_spectral):
@@ -257,10 +259,7 @@ def test_polarised_light_that_glass_reflects_has_the_image_of_path_tracing(varia
         "more": floor({"type": "polarizer", "theta": {"type": "spectrum", "value": 90.0}})
         | {"to_world": facing(pane + 1.5 * to_lamp, -to_lamp, 0.8)},
     }
-    images = [
-        tiles(scene(parts, caustics=caustics, light_paths=2.0), 64, range(first, first + 16))
-        for caustics, first in (("path", 0), ("lamp", 100))
-    ]
+    images = both_ways(parts, 64, light_paths=2.0)
     assert images[0].all() and difference(*images) < 1
 
 
@@ -520,18 +519,9 @@ def test_auto_traces_lamps_of_zero_size_beside_area_lamps_that_cannot_be_traced(
 def test_another_integrator_cannot_have_lamps_traced_nor_a_derivative(llvm_variant):
     loaded = scene({}, caustics="lamp")
     around = mi.load_dict({"type": "aov", "aovs": "d:depth", "image": {"type": "refract_path", "caustics": "lamp"}})
-    with pytest.raises((RuntimeError, ValueError), match="another integrator calls it"):
-        around.render(loaded, spp=1)
-    parameters = mi.traverse(loaded)
-    key = next(key for key in parameters.keys() if key.endswith("bsdf.eta"))  # noqa: SIM118
-    dr.enable_grad(parameters[key])
-    parameters.update()
-    with pytest.raises((RuntimeError, ValueError)) as caught:
-        mi.render(loaded, parameters, spp=1)
-    errors = [caught.value]
-    while errors[-1].__cause__ is not None:
-        errors.append(errors[-1].__cause__)
-    assert any("the render is differentiated" in str(error) for error in errors)
+    assert "another integrator calls it" in refusal(around.render, loaded, spp=1)
+    params, _ = attached(loaded, "bsdf.eta")
+    assert "the render is differentiated" in refusal(mi.render, loaded, params, spp=1)
 
 
 def test_no_lamps_are_traced_where_a_sensor_outside_the_scene_is_differentiated(llvm_variant):
