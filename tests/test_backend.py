@@ -125,18 +125,7 @@ def test_files_that_are_not_llvm_are_defective(tmp_path, content, defect, monkey
         ("import os; os._exit(0)", "no answer", False),
         (WORKS, "", True),
     ],
-    ids=[
-        "abort",
-        "out of memory",
-        "segmentation fault",
-        "killed",
-        "hangs",
-        "raises",
-        "refused",
-        "too old",
-        "silent",
-        "works",
-    ],
+    ids=["abort", "out of memory", "segfault", "killed", "hangs", "raises", "refused", "too old", "silent", "works"],
 )
 def test_lasting_results_of_a_probe_are_stored(probed, monkeypatch, code, defect, lasting):
     monkeypatch.setattr(backend, "TIMEOUT", 3.0 if "sleep" in code else 60.0)

@@ -159,8 +159,6 @@ BAD = {
     "more branches than in a file": (("--branches", "9"), "'--branches': Input should be less than or equal to 8"),
     "no rays": (("--rays", "0"), "--rays"),
     "no depth": (("--max-depth", "0"), "--max-depth"),
-    "formula": (("--formula", "snell"), "formula = 'snell': unknown; expected wedge"),
-    "no float32": (("--backend", "scalar", "--precision", "float32"), "scalar arrays compute in double; expected"),
     "option": (("--nonesuch",), "--nonesuch"),
     "too much": (("--rays", "4000000"), "expected fewer rays"),
     "too deep": (("--max-depth", f"1{'0' * 30}"), "expected fewer rays"),
@@ -199,14 +197,7 @@ def test_keys_are_printed_without_a_scene(run):
     code, out, err = run("trace", "--keys")
     assert (code, err) == (0, "")
     assert out == scene_file.reference() + "\n"
-    keys = (
-        "title",
-        "wavelengths",
-        "focal_length  distance from the front to the focus (number > 0)",
-        "R1",
-        "from",
-        "scale",
-    )
+    keys = "title", "wavelengths", "focal_length  distance from the front to the focus", "R1", "from", "scale"
     assert all(f"\n  {key} " in out or f"\n  {key}\n" in out for key in keys)
     assert '[[shape]] kind = "luneburg": ' in out and '[[beam]] kind = "fan": ' in out
     assert max(map(len, out.splitlines())) <= 80

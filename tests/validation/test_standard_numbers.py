@@ -33,21 +33,11 @@ def value(name):
 # The table -------------------------------------------------------------------------------------------------------
 
 # Values with their well-known digits.
-KNOWN = {
-    "slab, n = 1.52, 0°": 0.91832,
-    "slab, n = 1.52, 30°": 0.91596,
-    "slab, n = 1.52, 45°": 0.90253,
-    "slab, n = 1.52, 60°": 0.84347,
-    "prism of 60°, n = 1.5": 37.181,
-    "prism of 60°, n = 1.5168": 38.647,
-    "prism of 60°, n = 1.52": 38.928,
-    "rainbow of order 1, n = 1.3333": 42.03,
-    "rainbow of order 2, n = 1.3333": 50.97,
-    "rainbow of order 1, n = 1.3318": 42.25,
-    "rainbow of order 2, n = 1.3318": 50.58,
-    "rainbow of order 1, n = 1.3435": 40.58,
-    "rainbow of order 2, n = 1.3435": 53.61,
-}
+SLABS, PRISMS = {0: 0.91832, 30: 0.91596, 45: 0.90253, 60: 0.84347}, {1.5: 37.181, 1.5168: 38.647, 1.52: 38.928}
+BOWS = {1.3333: (42.03, 50.97), 1.3318: (42.25, 50.58), 1.3435: (40.58, 53.61)}
+KNOWN = {f"slab, n = 1.52, {angle}°": share for angle, share in SLABS.items()}
+KNOWN |= {f"prism of 60°, n = {n}": angle for n, angle in PRISMS.items()}
+KNOWN |= {f"rainbow of order {i}, n = {n}": angle for n, angles in BOWS.items() for i, angle in enumerate(angles, 1)}
 
 
 @pytest.mark.parametrize("name", KNOWN)
