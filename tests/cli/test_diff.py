@@ -261,6 +261,7 @@ BAD = {
     "map": (BOTH + "--settings {}/map.toml", "defaults.map fits no image in"),
     "samples of files": ("{}/old/equal.exr {}/new/equal.exr --renders", "not a folder; --renders expects folders"),
     "option": (BOTH + "--method exact --set fail=1", "--set: unknown key `fail`"),
+    "option of neither": (BOTH + "--set threshold=1", "command line: threshold: not an option of auto; expected"),
     "inconclusive": (BOTH + "--inconclusive maybe", "maybe"),
     "no settings": (BOTH + "--settings {}/none.toml", "none.toml"),
     "bad settings": (BOTH + "--settings {}/bad.toml", "bad.toml: defaults: unknown key `fale`"),
