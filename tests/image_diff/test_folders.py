@@ -49,12 +49,9 @@ def test_results_are_sorted_by_the_ratio_to_the_bound(tmp_path):
 def test_folders_are_matched_by_name(folders):
     old, new = folders
     results = diff.diff(old, new)
-    assert outcomes(results) == {
-        "added.exr": ("different", "added"),
-        "inner/changed.exr": ("different", "changed"),
-        "removed.exr": ("different", "removed"),
-        "same.exr": ("equal", "unchanged"),
-    }
+    expected = {"added.exr": ("different", "added"), "inner/changed.exr": ("different", "changed")}
+    expected |= {"removed.exr": ("different", "removed"), "same.exr": ("equal", "unchanged")}
+    assert outcomes(results) == expected
     assert (results.exit_code, results.results[-1].name) == (1, "same.exr")  # failures first
     assert {r.name: r.reason for r in results.results if not r.comparison} == {
         "added.exr": "only among the new images",
@@ -427,11 +424,8 @@ def test_references_that_are_not_variants_and_unreadable_variants(variants):
     assert {result.status for result in results.results} == {"error"}
     assert "matches the reference" in results.results[0].error
     images(new, {"a/ball-arm.exr": 1.4})  # the variant has a new image with its name
-    assert outcomes(diff.diff(old, new, VARIANTS)) == {
-        "a/ball.exr": ("different", "changed"),
-        "a/ball-arm.exr": ("equal", "unchanged"),
-        "a/other.exr": ("equal", "unchanged"),
-    }
+    equal = dict.fromkeys(("a/ball-arm.exr", "a/other.exr"), ("equal", "unchanged"))
+    assert outcomes(diff.diff(old, new, VARIANTS)) == {"a/ball.exr": ("different", "changed")} | equal
     (new / "a/ball-arm.exr").unlink()
     image(old / "a/ball.exr", shape=(8, 8, 3))  # the reference cannot be compared, but a variant is equal
     assert outcomes(diff.diff(old, new, VARIANTS))["a/ball.exr"] == ("equal", "unchanged")
@@ -469,11 +463,9 @@ def test_wildcards_of_accept_match_no_slash(tmp_path):
     """A variant is in the folder that its template names, for two folders as for two files."""
     images(tmp_path, {"old/ball.exr": 1, "old/ball-anim/1.exr": 1.4, "old/mac/a/ball.exr": 1.4, "new/ball.exr": 1})
     settings = Settings.for_all(accept=("{stem}-*{suffix}", "m*/{name}"))
-    assert outcomes(diff.diff(tmp_path / "old", tmp_path / "new", settings)) == {
-        "ball-anim/1.exr": ("different", "removed"),
-        "ball.exr": ("equal", "unchanged"),
-        "mac/a/ball.exr": ("different", "removed"),
-    }
+    removed = dict.fromkeys(("ball-anim/1.exr", "mac/a/ball.exr"), ("different", "removed"))
+    expected = {"ball.exr": ("equal", "unchanged")} | removed
+    assert outcomes(diff.diff(tmp_path / "old", tmp_path / "new", settings)) == expected
     image(tmp_path / "new/ball.exr", gain=1.4)
     assert diff.diff(tmp_path / "old/ball.exr", tmp_path / "new/ball.exr", settings).exit_code == 1
 

@@ -235,10 +235,8 @@ def exponential(rng, share, n, m, known):
     """A pair of n and m samples of light that a `share` of samples finds, with the true variance of side `known`."""
     mean = 0.2 + np.linspace(0, 1, 32)[None, :, None] * np.ones((32, 32, 3))
     hits = [rng.binomial(spp, share, mean.shape) for spp in (n, m)]
-    sides = [
-        of(rng.gamma(np.maximum(k, 1e-9), mean / (spp * share)), metadata={"mi_refract:spp": spp})
-        for k, spp in zip(hits, (n, m), strict=True)
-    ]
+    pairs = zip(hits, (n, m), strict=True)
+    sides = [of(rng.gamma(np.maximum(k, 1e-9), mean / (x * share)), metadata={"mi_refract:spp": x}) for k, x in pairs]
     variance = np.moveaxis(np.square(mean) * (2 / share - 1), -1, 0)
     sides[known] = replace(sides[known], variances=dict(zip("RGB", variance, strict=True)))
     return sides
@@ -568,10 +566,8 @@ def test_a_much_brighter_tile_or_channel_hides_no_difference(scale, rng):
 
 STRIPES = np.where(np.indices(SHAPE)[1] // 2 % 2, 0.8, 0.4)
 RAMP = 0.3 + np.indices(SHAPE).sum(0) % 29 / 60
-INSIDE = {
-    "stripes inverted": (STRIPES, 1.2 - STRIPES),
-    "a ramp turned": (RAMP, np.concatenate([x[::-1, ::-1] for x in np.split(RAMP, 4)])[:, ::-1]),
-}
+TURNED = np.concatenate([x[::-1, ::-1] for x in np.split(RAMP, 4)])[:, ::-1]
+INSIDE = {"stripes inverted": (STRIPES, 1.2 - STRIPES), "a ramp turned": (RAMP, TURNED)}
 
 
 @pytest.mark.parametrize("what", INSIDE)

@@ -153,9 +153,8 @@ def test_other_wavelengths_are_reflected_if_the_first_is_index_matched(spectral_
 def test_an_index_within_1e_7_of_the_surroundings_is_not_rounded(spectral_variant):
     """κ = k² − 1 = 4e-7 at grazing incidence: in float32 the index would have an error of a third of n − 1."""
     excess, wavelength, angle = 2e-7, 500.0, math.pi / 2 - 1e-3
-    bent = sample(
-        load(f"cauchy_um(1, {excess * (wavelength / 1000) ** 2!r})"), tilted(angle), REFRACTED, (wavelength,) * 4
-    )
+    gas = load(f"cauchy_um(1, {excess * (wavelength / 1000) ** 2!r})")
+    bent = sample(gas, tilted(angle), REFRACTED, (wavelength,) * 4)
     sin_i, cos_i = (float(np.float32(x)) for x in (math.sin(angle), math.cos(angle)))
     expected = math.sqrt(1 - sin_i**2 / (sin_i**2 + cos_i**2) / (1 + excess) ** 2)
     assert -bent.wo[2] == pytest.approx(expected, rel=4e-7)

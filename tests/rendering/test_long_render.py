@@ -195,14 +195,10 @@ def test_a_sampler_without_jitter_renders_a_single_pass(tmp_path, llvm_variant, 
 
 
 GLASS = '<bsdf type="refract"/>'
-DISPERSIVE = (
-    '<shape type="sphere"><bsdf type="refract"><string name="int_ior" value="SCHOTT:N-SF11"/></bsdf></shape>',
-    "all light has the index of the d line; expected the integrator refract_path",
-)
-THIN = (
-    f'<shape type="cube"><transform name="to_world"><scale z="1e-7"/></transform>{GLASS}</shape>',
-    "expected a thicker shape, or one nearer to the origin",
-)
+PANE = f'<shape type="cube"><transform name="to_world"><scale z="1e-7"/></transform>{GLASS}</shape>'
+FLINT = '<shape type="sphere"><bsdf type="refract"><string name="int_ior" value="SCHOTT:N-SF11"/></bsdf></shape>'
+DISPERSIVE = FLINT, "all light has the index of the d line; expected the integrator refract_path"
+THIN = PANE, "expected a thicker shape, or one nearer to the origin"
 INEXACT = f'<shape type="cylinder"><float name="radius" value="1e-3"/>{GLASS}</shape>', "err by up to"
 AOV = '<integrator type="aov"><string name="aovs" value="d:depth"/>{}</integrator>'
 

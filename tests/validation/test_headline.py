@@ -64,13 +64,8 @@ def answer_to(question, *rows, **how):
 
 
 def test_the_names_are_those_of_the_studies():
-    named = {
-        per_formula: headline.DIRECTIONS,
-        traced_bodies: headline.GROUND_TRUTH,
-        against_dielectric: headline.RENDERS,
-        error_against_time: headline.EFFICIENCY,
-        layered_paths: headline.PATHS,
-    }
+    named = {per_formula: headline.DIRECTIONS, traced_bodies: headline.GROUND_TRUTH, layered_paths: headline.PATHS}
+    named |= {against_dielectric: headline.RENDERS, error_against_time: headline.EFFICIENCY}
     assert all(name == study.NAME for study, name in named.items()) and per_formula.ALL == headline.EVERYTHING
     assert (per_formula.NAME, sweep.NAME, search.NAME) == headline.FORMULAS_IN and headline.SUMMARY == matrix.NAME
     known = {headline.COMMON, metrics.WORST_IN_U, metrics.MISCLASSIFIED, metrics.MISCLASSIFIED_FAR}

@@ -51,17 +51,13 @@ b = np.where(d < 0, 0, k * a - (k * c + np.sqrt(np.abs(d))) * n)
 {{after}}
 table.write(rays, b, "a program 1.0")
 """
+STRAIGHT = "print('id,bx,by,bz,n_ratio'); [print(i, *v, 1, sep=',') for i, v in zip(rays.ids, a.tolist())]; sys.exit(0)"
 DEFECTS = {
     "index inverted": ("k = 1 / k", "", "wrong", ""),
     "no direction": ("", "b[7] = np.nan", "wrong", ""),
     "a set left out": ("", "rays.ids, b = rays.ids[:40], b[:40]", "unfit", ""),
     "an id missing": ("", "rays.ids, b = rays.ids[1:], b[1:]", "unfit", "id 0"),
-    "no refraction, by its own ratio": (
-        "",
-        "print('id,bx,by,bz,n_ratio'); [print(i, *v, 1, sep=',') for i, v in zip(rays.ids, a.tolist())]; sys.exit(0)",
-        "unfit",
-        "index id",
-    ),
+    "no refraction, by its own ratio": ("", STRAIGHT, "unfit", "index id"),
     "signalled by NaN": ("", "b = np.where(d < 0, np.nan, b)", "other TIR signal", ""),
     "exception": ("raise RuntimeError('out of glass')", "", "unanswered", "ended with status 1: RuntimeError: out of"),
     "killed": ("os.kill(os.getpid(), 9)", "", "unanswered", "was killed by SIGKILL"),
