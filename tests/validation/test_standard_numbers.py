@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.readme import DOCS
 
+from mi_refract import media
 from mi_refract.ray_sets import ray_set
 from mi_refract.ray_sets.ray_set import Answers
 from mi_refract.ray_sets.renderer_file import RaysCommand
@@ -113,6 +114,12 @@ def test_the_rhomb_retards_by_90_degrees_at_two_incidences_and_most_between_them
     largest = NUMBERS["largest retardation, n = 1.51"]
     assert largest.value == pytest.approx(2 * math.degrees(math.atan((1.51**2 - 1) / (2 * 1.51))), abs=1e-12)
     assert gentle < largest.given["incidence"] < steep and largest.slope("incidence") < 1e-6
+
+
+def test_the_package_has_the_indices_of_the_table():
+    for number in NUMBERS.values():
+        if number.kind == "index" and number.medium.startswith("SCHOTT"):
+            assert media.index(number.medium, number.given["nm"]) == pytest.approx(number.value, rel=1e-15)
 
 
 def test_diffuse_shares_add_up_to_1_and_conserve_etendue():
