@@ -74,6 +74,7 @@ class Segments:
                 raise ValueError(f"segments.{name}[{i}] = {values[i]}; expected more than 0")
         # Of two segments that coincide, neither would come first on a ray.
         key = np.column_stack([np.sort(self.vertices, axis=1), self.control, self.weight])
+        key[self.turn == 0, 2:] = 0  # of a straight segment, neither matters
         order = np.lexsort(key.T)
         same = (key[order[1:]] == key[order[:-1]]).all(1) & (key[order[1:], 0] != key[order[1:], 1])
         if same.any():

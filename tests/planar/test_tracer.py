@@ -362,6 +362,7 @@ BAD_SEGMENTS = [
     ({"control": [(0.0, 1.0)], "weight": [-1.0]}, "weight[0] = -1.0; expected more than 0"),
     (TWICE, "segments 0 and 1 coincide"),
     (TWICE | {"control": [(0.0, 0.5), (-0.0, 0.5)], "weight": [0.9, 0.9]}, "segments 0 and 1 coincide"),
+    (TWICE | {"control": [(0.5, 0.0), (0.3, 0.0)], "weight": [1.0, 2.0]}, "segments 0 and 1 coincide"),
 ]
 BAD_ARGUMENTS = [
     ({"max_depth": 0}, "max_depth = 0; expected a whole number, 1 or more"),
