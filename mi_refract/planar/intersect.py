@@ -350,7 +350,9 @@ class ConicArcs(LineSegments):
         sine, x, y = sign * cross(e, other), dr.norm(e), dr.norm(other)
         touching = dr.abs(sine) <= 64 * self.arrays.roundoff * x * y
         touching &= (bends[0] != 0) | (bends[1] != 0)
-        return dr.select(touching, bends[0] * y * y * y < bends[1] * x * x * x, sine < 0)
+        # Both sides over x² y²: a product of five lengths would leave the range of float32.
+        less = ieee_divide(bends[0], x * x) * y < ieee_divide(bends[1], y * y) * x
+        return dr.select(touching, less, sine < 0)
 
     def place(self, hit: Hit) -> tuple[Vector2, Vector2]:
         """The point of a hit, from the nearer end, and the arc's unit direction there."""

@@ -282,9 +282,10 @@ def test_arcs_that_meet_in_a_tip_are_crossed_in_order(follow):
         assert met.any() and (paths.indices[met, 0] == 1).all()
 
 
+@pytest.mark.parametrize("unit", [1, 1e9, 1e-9])
 @pytest.mark.parametrize("inside", [False, True])
 @pytest.mark.parametrize("swapped", [False, True])
-def test_a_ray_through_the_contact_of_two_balls_crosses_them_in_order(follow, inside, swapped):
+def test_a_ray_through_the_contact_of_two_balls_crosses_them_in_order(follow, inside, swapped, unit):
     """The arcs have the same direction there: their curvatures decide, whichever ball is listed first.
 
     Rotations test this with rounded coordinates.
@@ -298,8 +299,8 @@ def test_a_ray_through_the_contact_of_two_balls_crosses_them_in_order(follow, in
     for turn in np.linspace(0, 6, 21):
         d = np.array([math.cos(turn), math.sin(turn)])
         rotation = np.array([d, (-d[1], d[0])])
-        places = {name: getattr(both, name) @ rotation for name in ("start", "end", "control")}
-        paths = follow(dataclasses.replace(both, **places), [-3 * d, 5 * d], [d, -d])
+        places = {name: unit * getattr(both, name) @ rotation for name in ("start", "end", "control")}
+        paths = follow(dataclasses.replace(both, **places), [-3 * unit * d, 5 * unit * d], [d, -d])
         for i, expected in enumerate([indices, indices[::-1]]):
             assert story(paths, i)[1] == [REFRACTED] * 4 + [ESCAPED]
             assert paths.indices[i, :5] == pytest.approx(expected)
