@@ -258,6 +258,10 @@ class Tracer:
                 a, n = arrays.vector3(d.x, d.y, 0 * d.x), arrays.vector3(-line.y, line.x, 0 * d.x)
                 b, through = FORMULAS[self.formula].unchecked(a, n, k)
                 b = _unit(arrays.vector(b.x, b.y))
+            # k ≤ 1 reflects nothing totally; rounding does, where k and the sine are nearly 1. There `d` is the
+            # refracted direction, within the formula's error.
+            passes = (k <= 1) & (cross(line, d) != 0) & negated(through)
+            b, through = dr.select(passes, d, b), through | passes
             if reflect_bits is not None:
                 bit = (reflect_bits >> dr.minimum(j, REFLECT_BITS - 1)) & 1
                 forced = through & (j < REFLECT_BITS) & (bit == 1)

@@ -38,6 +38,20 @@ def test_total_reflection_in_a_light_guide_loses_no_power(follow):
     assert (guided == guided[0]).all()
 
 
+def test_rays_along_a_boundary_between_equal_media_pass_it(follow, setting):
+    """Rounding takes the sine of some of them beyond 1."""
+    rng = np.random.default_rng(0)
+    for turn in rng.uniform(0, 2 * np.pi, 10):
+        along, across = np.array([(math.cos(turn), math.sin(turn)), (-math.sin(turn), math.cos(turn))])
+        line = Segments([-50 * along], [50 * along], [1.5], [1.5])
+        angle = rng.uniform(0.5, 1, (200, 1)) * math.sqrt(setting.roundoff)
+        d = np.cos(angle) * along + np.sin(angle) * across
+        paths = follow(line, rng.uniform(-10, 10, (200, 1)) * along - 20 * d, d)
+        assert (paths.events[:, :2] == [REFRACTED, ESCAPED]).all()
+        assert paths.weights[:, 1] == pytest.approx(1, abs=4 * setting.roundoff)
+        assert paths.directions == pytest.approx(d, abs=4 * math.sqrt(setting.roundoff))
+
+
 def test_all_formulas_give_the_same_paths(follow, setting):
     o, d = np.array([(-1, y) for y in (0.21, 0.43, 0.77)]), np.array([(1, 0.3), (1, -0.2), (1, 0.1)])
     planar = follow(polygon(SQUARE), o, d)
