@@ -52,7 +52,7 @@ def boundaries(parts: list[Part]) -> tuple[tuple[Segments, ...], tuple[str, ...]
     _, weight_ids = _merged(weight[:, None])
     places = np.stack([np.minimum(first, last), np.maximum(first, last), control_ids, weight_ids], axis=1)
     _, originals, place_ids = np.unique(places, axis=0, return_index=True, return_inverse=True)
-    original = originals[place_ids]  # for each piece, the number of the first piece at the same place
+    original = originals[place_ids.ravel()]  # for each piece, the number of the first piece at the same place
     for j in np.flatnonzero((original != np.arange(len(owner))) & keep):
         i, part, earlier = int(original[j]), parts[owner[j]], parts[owner[original[j]]].where
         if not part.curve.closed:
@@ -75,4 +75,5 @@ def _merged(points: Array) -> tuple[Array, Numbers]:
         order = np.argsort(x)
         numbers[order] = np.cumsum(np.diff(x[order], prepend=x[order[0]]) > tolerance)
     _, first, ids = np.unique(groups, axis=0, return_index=True, return_inverse=True)
+    ids = ids.ravel()  # NumPy 2.0.0 returns a column
     return points[first[ids]], ids
