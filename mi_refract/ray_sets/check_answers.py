@@ -171,13 +171,17 @@ def check(
     `tir`: the signal of total internal reflection in the answers, one of TIR, or AUTO to detect it. `error_bound`: the
     formula of FORMULAS whose a-priori bound the errors must keep. `most_backward`: in u; an answer is wrong if the
     backward error of its direction or length is larger. `piece`: number of rays certified or judged at once; the
-    findings do not depend on it. ValueError as for `check_options`, for tir = FLAG without the column `transmitted`, or
-    answers whose header belongs to other rays.
+    findings do not depend on it. ValueError as for `check_options`, for tir = FLAG without the column `transmitted`,
+    for answers whose header belongs to other rays, or for a bound that numpy's `longdouble` is too short to check.
     """
     check_options(tir, error_bound, most_backward)
     if tir == FLAG and answers.transmitted is None:
         raise ValueError("TIR signal 'flag': expected answers with a column `transmitted`")
     header, precision = rays.header, rays.precision
+    at_the_limit = FORMULAS[error_bound].budget.at_the_limit
+    if precision == "f64" and at_the_limit and np.finfo(np.longdouble).nmant < 63:
+        expected = "another bound, or a system where it has 64 bits"
+        raise ValueError(f"error bound {error_bound!r} of f64: numpy.longdouble is too short here; expected {expected}")
     checksum = answers.header.get("checksum")
     if checksum not in (None, header["checksum"]):
         text = f"the answers belong to rays with the checksum {shown(checksum)}"
