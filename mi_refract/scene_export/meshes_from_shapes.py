@@ -77,8 +77,10 @@ def meshes_of_shape(shape: Node, level: int, most: int = MOST, eye: Vertices | N
         mesh = Mesh(f"{name}_{i}" if i else name, placed, faces, material, normals)
         if surface.one_sided and eye is not None:
             is_inward = mesh.volume() < 0
-            if tessellation.encloses(placed[faces[:, ::-1] if is_inward else faces], eye) != is_inward:
-                seen = "inside only, seen from outside" if is_inward else "outside only, around the camera"
+            is_behind = tessellation.encloses(placed[faces[:, ::-1] if is_inward else faces], eye) != is_inward
+            if is_behind or tessellation.has_body_inside_out(placed, faces, eye):
+                is_around = is_behind and not is_inward
+                seen = "outside only, around the camera" if is_around else "inside only, seen from outside"
                 raise shape.error(f"diffuse on the {seen}", "its BSDF in a `twosided`")
         yield mesh
 

@@ -54,13 +54,50 @@ def is_closed(faces: Faces) -> bool:
     return bool((np.diff(forward) > 0).all() and (forward == backward).all())
 
 
-def encloses(triangles: NDArray[np.float64], point: Vertices) -> bool:
-    """Return whether closed triangles (F, 3, 3) that face outward enclose a point (3), by the sum of solid angles."""
+def turns(triangles: NDArray[np.float64], point: Vertices) -> float:
+    """Return how often closed triangles (F, 3, 3) surround a point (3), by the sum of solid angles.
+
+    A body that faces outward counts 1 inside, one that faces inward −1.
+    """
     a, b, c = np.moveaxis(triangles - point, 1, 0)
     x, y, z = (np.linalg.norm(p, axis=1) for p in (a, b, c))
     ab, bc, ca = ((p * q).sum(1) for p, q in ((a, b), (b, c), (c, a)))
     halves = np.arctan2(np.linalg.det(np.stack([a, b, c], 1)), x * y * z + ab * z + bc * x + ca * y)
-    return bool(halves.sum() > np.pi)
+    return float(halves.sum() / (2 * np.pi))
+
+
+def encloses(triangles: NDArray[np.float64], point: Vertices) -> bool:
+    """Return whether closed triangles (F, 3, 3) that face outward enclose a point (3)."""
+    return turns(triangles, point) > 0.5
+
+
+def bodies(faces: Faces) -> Faces:
+    """Return for each face the first vertex of its body (F); faces that share a vertex belong to one body."""
+    first = np.arange(faces.max(initial=-1) + 1)
+    while True:
+        earlier = first.copy()
+        np.minimum.at(earlier, faces, first[faces].min(axis=1, keepdims=True))
+        earlier = earlier[earlier]
+        if (earlier == first).all():
+            return first[faces[:, 0]]
+        first = earlier
+
+
+def has_body_inside_out(vertices: Vertices, faces: Faces, eye: Vertices) -> bool:
+    """Return whether a point `eye` (3) outside a body that faces inward may see it. Precondition: all are closed.
+
+    It does not if the others surround that body in another way than `eye`: as a solid its cavity, or a room `eye`.
+    """
+    body, triangles = bodies(faces), vertices[faces]
+    volumes = np.bincount(body, np.linalg.det(triangles - vertices[body][:, None]))
+    around_eye = turns(triangles, eye)
+    for number in np.flatnonzero(volumes < 0):
+        own, others = triangles[body == number], triangles[body != number]
+        corners = own.reshape(-1, 3)
+        ends = corners[[*corners.argmin(axis=0), *corners.argmax(axis=0)]]  # not all in contact with another body
+        if turns(own, eye) > -0.5 and any(abs(turns(others, end) - around_eye) < 0.25 for end in ends):
+            return True
+    return False
 
 
 def basis(axis: Vertices) -> Vertices:

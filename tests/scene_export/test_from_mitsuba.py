@@ -507,6 +507,38 @@ def test_a_camera_sees_the_diffuse_side_of_a_closed_mesh(split, order, flip, siz
     assert box.vertices[:, 0].max() == size and len(box.vertices) == (8 if split else 16)
 
 
+ALONE, ROOM = (1, 0, 1), (99, 0, -1)  # half the side of a cube, the x of its middle, 1 if it faces outward
+
+
+@pytest.mark.parametrize(
+    "first, second, refused",
+    [
+        (ALONE, (1, 3, 1), False),
+        (ALONE, (1, 3, -1), True),
+        (ALONE, (0.5, 1.5, -1), True),  # in contact
+        (ALONE, (0.5, 0, -1), False),  # a cavity
+        (ALONE, (0.25, 0.75, -1), False),  # a cavity in contact with the surface
+        (ROOM, (1, 0, 1), False),
+        (ROOM, (1, 0, -1), True),
+        (ROOM, (9, 108, -1), False),  # the next room
+    ],
+)
+def test_a_body_of_a_mesh_that_faces_inward_is_refused_if_the_camera_sees_it(first, second, refused, scene, tmp_path):
+    vertices, faces = tessellation.cube()
+    lines = []
+    for i, (size, x, way) in enumerate((first, second)):
+        lines += ["v {} {} {}".format(*place) for place in size * vertices + [x, 0, 0]]
+        lines += ["f {} {} {}".format(*face) for face in faces[:, ::way] + 8 * i + 1]
+    (tmp_path / "two.obj").write_text("\n".join(lines))
+    obj = 'type="obj" id="box"><string name="filename" value="two.obj"/><boolean name="face_normals" value="true"/>'
+    path = scene('type="cube" id="box">' + MOVED, obj)
+    if refused:
+        with pytest.raises(ValueError, match="diffuse on the inside only, seen from outside; expected"):
+            from_mitsuba.load(path)
+    else:
+        assert len(from_mitsuba.load(path, level=0).meshes[1].faces) == 24
+
+
 @pytest.mark.parametrize("last, smooth", [(3, False), (10**9, False), (2**32 - 1, False), (10**9, True)])
 def test_a_face_with_a_missing_vertex_is_refused(last, smooth, scene, tmp_path):
     """Even for smooth meshes, for which Mitsuba writes a normal to each vertex of a face."""
