@@ -213,7 +213,10 @@ def _require_equal(
     from mi_refract.image_diff.results import Result, Status
     from mi_refract.image_diff.settings import ComparisonSpec
 
-    name, compared = request.node.nodeid, request.config.stash.get(COMPARED, None)
+    path, colon, rest = request.node.nodeid.partition("::")  # relative to pytest's root
+    with contextlib.suppress(ValueError):  # on another drive
+        path = os.path.relpath(request.config.rootpath / path, request.config.invocation_params.dir)
+    name, compared = Path(path).as_posix() + colon + rest, request.config.stash.get(COMPARED, None)
     result = Result(name, Status.ERROR, Path("reference"), Path("test"), ComparisonSpec(method))
     if compared:  # number the result, because a test may compare several images
         result = replace(result, target=Path(str(len(compared.results))))

@@ -207,6 +207,17 @@ def test_options_write_a_page_and_accept_images(pytester):
     assert after == before | {"old.exr": before["test.exr"], "new.exr": after["new.exr"]}
 
 
+def test_the_commands_of_a_page_run_in_the_folder_that_pytest_ran_in(pytester, monkeypatch):
+    pytester.makeini("[pytest]")
+    pytester.makeconftest('pytest_plugins = ["mi_refract.pytest_plugin"]')
+    folder = pytester.mkdir("below")
+    (folder / "test_below.py").write_text(TESTS, "utf-8")
+    monkeypatch.chdir(folder)
+    pytester.runpytest_subprocess("-p", "no:cacheprovider", "--mi-refract-report", "out.html")
+    page = (folder / "out.html").read_text("utf-8")
+    assert "pytest test_below.py::test_changed" in page and "below/test_below.py" not in page
+
+
 @pytest.mark.parametrize("exists", [False, True])
 def test_a_reference_is_not_accepted_for_two_images(pytester, exists):
     """Neither if the first image becomes the reference, nor if it equals the reference."""
