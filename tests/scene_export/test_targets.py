@@ -375,6 +375,22 @@ def test_coordinates_beyond_the_ends_of_rays_are_refused(target, farthest, tmp_p
             targets.write(scene(*sizes), target, tmp_path / f"{i}")
 
 
+@pytest.mark.parametrize(("target", "nearest"), targets.NEAREST.items())
+def test_glass_thinner_than_the_least_distance_of_rays_is_refused(target, nearest, tmp_path):
+    vertices, faces = tessellation.cube()
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+
+    def scene(thickness, material=GLASS, faces=faces):
+        plate = Mesh("plate", vertices * [1, 1, thickness / 2] @ turn, faces, material)
+        return dataclasses.replace(plain(), meshes=(plate,))
+
+    for i, accepted in enumerate([scene(1.1 * nearest), scene(0, LAMP), scene(0.1 * nearest, LAMP)]):
+        targets.write(accepted, target, tmp_path / f"{i}")
+    for order in (faces, faces[:, ::-1]):
+        with pytest.raises(ExportError, match=rf"plate: glass of mean thickness .*; expected .* for {target}$"):
+            targets.write(scene(0.9 * nearest, faces=order), target, tmp_path / "thin")
+
+
 def test_luxcore_hides_nothing_near_the_camera_or_far_from_it(tmp_path):
     text = (write_export("luxcore", tmp_path / "new") / "scene.scn").read_text()
     assert 0 < float(re.search(r"cliphither = (\S+)", text)[1]) <= 1e-9

@@ -16,7 +16,8 @@ import numpy as np
 from mi_refract.io import safe_files
 from mi_refract.io.errors import ExportError
 
-from ..plain_scene import PlainScene, VolumeGlass
+from ..plain_scene import Glass, PlainScene, VolumeGlass
+from ..tessellation import is_closed
 from . import gltf, luxcore, mitsuba, povray, radiance, scene_json, shared_files
 from .shared_files import Files
 
@@ -39,6 +40,8 @@ ALL_LAMPS = ("point", "spot", "directional")
 HOLD_LAMPS = {"cycles": ("point", "directional"), "mitsuba": ALL_LAMPS, "obj+json": ALL_LAMPS, "gltf": ALL_LAMPS}
 LEAST_DEPTH = {"cycles": 2, "luxcore": 2}  # these always sample lights at the first surface; other targets: 1
 FARTHEST = {"povray": 1e6, "radiance": 1e9}  # largest coordinates: rays of these end after 1e7 and 1e10 units
+# Least mean thickness of closed glass: rays of these miss surfaces nearer than 1e-4 and 1e-6 units to their start.
+NEAREST = {"povray": 1e-3, "radiance": 1e-5}
 
 
 def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> list[Path]:
@@ -70,6 +73,15 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
         if (largest := float(np.abs(points).max(initial=0))) > bound:
             text = f"{plain.name}: {name}: a coordinate of {largest:g}"
             raise ExportError(f"{text}; expected up to {bound:g} for {target}")
+    for mesh in plain.meshes:
+        if target in NEAREST and isinstance(mesh.material, Glass) and is_closed(mesh.faces):
+            a, b, c = mesh.triangles().swapaxes(0, 1)
+            area, volume = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2, abs(mesh.volume())
+            if 2 * volume < NEAREST[target] * area:
+                fault = f"glass of mean thickness {2 * volume / area:.3g}"
+                raise ExportError(
+                    f"{plain.name}: {mesh.name}: {fault}; expected {NEAREST[target]:g} or more for {target}"
+                )
     for lamp in plain.lamps:
         if lamp.kind not in HOLD_LAMPS.get(target, ()):
             fault = f"a {lamp.kind} lamp is not exported to {target}"
