@@ -29,7 +29,6 @@ from mi_refract.report.documents import rendered
 from mi_refract.report.embedded_images import EmbeddedImages, encoded, strongest
 
 from . import flip
-from .name_patterns import literal
 from .results import FAILED, Result, Results, Status
 from .text_reports import WORDS, sentence
 
@@ -111,7 +110,7 @@ class Page:
         has_names = results.test.is_dir() and not results.renders
         flags_of_rest = [*results.flags, "--report", "rest.html"]
         # Results without images, such as invalid settings, and names with control characters are left out.
-        named = [literal(x.name) for x in rest if (x.reference or x.test) and printable(x.name) == x.name][:NAMED]
+        named = [results.word(x.name) for x in rest if (x.reference or x.test) and printable(x.name) == x.name][:NAMED]
         content: dict[str, Any] = {
             "title": "mi-refract diff",
             "sentence": sentence(results),
@@ -182,7 +181,7 @@ def item(
         "warning": result.warning,
         "metrics": metrics,
         "text": " ".join((result.name, result.status, result.category, why)).lower(),
-        "word": shlex.quote(literal(result.name)) if result.test is not None and result.status in FAILED else "",
+        "word": shlex.quote(results.word(result.name)) if result.test is not None and result.status in FAILED else "",
         "minimum_detectable": detectable if math.isfinite(detectable) else None,
         "panes": [images.add(pane) for pane in shown.panes] if images else [],
         "paired": len({(pane["width"], pane["height"]) for pane in shown.panes[:2]}) == 1 and len(shown.panes) > 1,

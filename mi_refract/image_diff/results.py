@@ -184,6 +184,10 @@ class Results:
         words += ["--renders"] * (self.renders and verb == "diff")
         return shlex.join(["mi-refract", verb, *words, *["--"] * any(x.startswith("-") for x in names), *names])
 
+    def word(self, name: str) -> str:
+        """Return the argument of a command that selects the image of this name only. Subclasses override it."""
+        return literal(name)
+
     def reproduce(self, result: Result) -> str:
         """Return the command that compares this image again; "" if one side has none."""
         if result.reference is None or result.test is None:
@@ -197,4 +201,4 @@ class Results:
         return self.command("accept", *self._names(result), flags=[] if self.renders else None)
 
     def _names(self, result: Result) -> list[str]:
-        return [literal(result.name)] if self.test.is_dir() and not self.renders else []
+        return [self.word(result.name)] if self.test.is_dir() and not self.renders else []
