@@ -172,16 +172,14 @@ def check(
     formula of FORMULAS whose a-priori bound the errors must keep. `most_backward`: in u; an answer is wrong if the
     backward error of its direction or length is larger. `piece`: number of rays certified or judged at once; the
     findings do not depend on it. ValueError as for `check_options`, for tir = FLAG without the column `transmitted`,
-    for answers whose header belongs to other rays, or for a bound that numpy's `longdouble` is too short to check.
+    for answers whose header belongs to other rays, or for rays of f64 where numpy's `longdouble` has no more digits.
     """
     check_options(tir, error_bound, most_backward)
     if tir == FLAG and answers.transmitted is None:
         raise ValueError("TIR signal 'flag': expected answers with a column `transmitted`")
     header, precision = rays.header, rays.precision
-    at_the_limit = FORMULAS[error_bound].budget.at_the_limit
-    if precision == "f64" and at_the_limit and np.finfo(np.longdouble).nmant < 63:
-        expected = "another bound, or a system where it has 64 bits"
-        raise ValueError(f"error bound {error_bound!r} of f64: numpy.longdouble is too short here; expected {expected}")
+    if precision == "f64" and (bits := np.finfo(np.longdouble).nmant) < 63:
+        raise ValueError(f"rays of f64: numpy.longdouble has {bits + 1} bits on this system; expected 64 or more")
     checksum = answers.header.get("checksum")
     if checksum not in (None, header["checksum"]):
         text = f"the answers belong to rays with the checksum {shown(checksum)}"
