@@ -2,10 +2,10 @@
 
 `path` finds such light only if a path from the matt surface hits the lamp by chance, and never for lamps without size.
 
-*Energy*: the power on a disk below a ball and below a plano-convex lens, both on the axis of the lamp, against a
+Energy: the power on a disk below a ball and below a plano-convex lens, both on the axis of the lamp, against a
 converged quadrature over rays in a plane through that axis (`validation/reference/caustic_energy.py`).
 
-*Images*: six bodies over a matt floor, with lamps of several sizes and the same irradiance. The reference is the sum of
+Images: six bodies over a matt floor, with lamps of several sizes and the same irradiance. The reference is the sum of
 two of Mitsuba's integrators that share no path: `ptracer` for what is seen on scattering surfaces, `path` for what is
 seen in glass. All methods have the sampler `independent` and as many samples. MSE × time is relative to path +
 dielectric, for the whole image and for the caustic: pixels that see no glass and receive more than a quarter of their
@@ -13,7 +13,7 @@ light through it. If `path` hit no lamp, its error is underestimated, so these r
 lamp lights through glass and is seen through glass again is noise in all methods and is not compared. The reference has
 this noise too, so the MSE of a whole image with a very small lamp says little.
 
-*Noise by class*: the classes of paths that the noise with small lamps comes from. Of what is seen in glass, L S+ E is
+Noise by class: the classes of paths that the noise with small lamps comes from. Of what is seen in glass, L S+ E is
 measured with a nearly black floor, L D (S|D)* S E with a point lamp, and L S+ D (S|D)* S E is the rest.
 """
 
