@@ -236,7 +236,11 @@ class Reference:
 
 
 def reference(body: str, lamp: str, extent: Extent) -> Reference:
-    """Render the reference by the sum of Mitsuba's two integrators."""
+    """Render the reference by the sum of Mitsuba's two integrators.
+
+    `ptracer` starts its rays to the camera 9e-5 (1 + |p|) above a point p, so it sees past silhouettes: in direct light
+    alone, tiles around a black ring are 0.1 to 0.2 % brighter than by `path`. "ring, spot" in `full` detects that.
+    """
     scene, black = (scenes.scene(body, lamp, bsdf, extent.resolution) for bsdf in (DIELECTRIC, scenes.BLACK))
     spp = extent.checked(body, lamp)
     aimed = lamp not in (caustic_energy.POINT, caustic_energy.PARALLEL)
