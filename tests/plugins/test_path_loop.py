@@ -217,3 +217,11 @@ def test_a_differentiated_sample_has_the_weight_of_the_sample(variant):
     d = si.to_world(bs.wo)
     found, *_ = path_loop.at_fixed_direction(mi, context, si, bsdf, bs, expected, d, True, False, False)
     np.testing.assert_allclose(np.array(found), np.array(expected), rtol=1e-3, atol=1e-4)
+
+
+def test_a_mask_of_a_mesh_attribute_within_another_bsdf_has_odds_of_its_own(llvm_variant):
+    """Mitsuba says that a mesh attribute does not vary over a surface."""
+    matt = {"type": "diffuse"}
+    for opacity, own in (({"type": "mesh_attribute", "name": "vertex_opacity"}, True), (0.5, False)):
+        mask = {"type": "mask", "opacity": opacity, "a": matt}
+        assert path_loop.has_own_odds(mi.load_dict({"type": "blendbsdf", "a": mask, "b": matt, "weight": 0.5})) == own
